@@ -1,0 +1,1 @@
+"""The core: scenarios in, verdicts out."""

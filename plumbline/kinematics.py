@@ -1,0 +1,76 @@
+"""Rigid-body kinematics of unit quaternions, shared by scenario loading, adapters and measures.
+
+Written apart from `reference_impl`, whose Euler-parameter algebra is under test.
+Imports nothing of the project but its types.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from plumbline.records import Array, Model, State
+
+
+def rotation(p: Array) -> Array:
+    """Rotation matrix (..., 3, 3), body → world, of quaternions p (..., 4), scalar first.
+
+    The homogeneous-quadratic form divided by pᵀp: a rotation for every p ≠ 0.
+    """
+    p = np.asarray(p, dtype=float)
+    w, x, y, z = np.moveaxis(p, -1, 0)
+    s = w * w + x * x + y * y + z * z
+    rows = [
+        [s - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), s - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), s - 2 * (x * x + y * y)],
+    ]
+    return np.asarray(np.stack([np.stack(row, -1) for row in rows], -2) / s[..., None, None])
+
+
+def multiply(a: Array, b: Array) -> Array:
+    """Quaternion product a b, (..., 4) each, scalar first: rotation(a b) = rotation(a) rotation(b)."""
+    aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
+    scalar = aw * bw - np.sum(av * bv, -1, keepdims=True)
+    return np.concatenate([scalar, aw * bv + bw * av + np.cross(av, bv)], -1)
+
+
+def conjugate(p: Array) -> Array:
+    """Conjugate quaternion (..., 4): the inverse rotation of a unit one."""
+    return np.asarray(p * np.array([1.0, -1.0, -1.0, -1.0]))
+
+
+def rate(p: Array, omega: Array) -> Array:
+    """ṗ = ½ L(p)ᵀ ω′ (..., 4) of unit quaternions p and body-frame ω′ (..., 3)."""
+    return 0.5 * multiply(p, np.concatenate([np.zeros_like(omega[..., :1]), omega], -1))
+
+
+def angular_velocity(p: Array, pdot: Array) -> Array:
+    """ω′ = 2 L(p) ṗ (..., 3), body frame, as the notes define it (also off pᵀp = 1)."""
+    return 2.0 * multiply(conjugate(p), pdot)[..., 1:]
+
+
+def lift(model: Model, p: Array, omega: Array, u: Array, udot: Array) -> State:
+    """The exact state that follows from minimal coordinates: r and v from the pivot outwards."""
+    a = rotation(p)  # (N, 3, 3)
+    r, v = np.empty((model.n, 3)), np.empty((model.n, 3))
+    tip, tip_v = np.zeros(3), np.zeros(3)
+    for k in range(model.n):
+        hang = tip + model.length[k] * u[k]
+        hang_v = tip_v + model.length[k] * udot[k]
+        r[k] = hang - a[k] @ model.proximal[k]
+        v[k] = hang_v - a[k] @ np.cross(omega[k], model.proximal[k])
+        tip = r[k] + a[k] @ model.distal[k]
+        tip_v = v[k] + a[k] @ np.cross(omega[k], model.distal[k])
+    return State(p=p, omega=omega, u=u, udot=udot, r=r, v=v)
+
+
+def joint_vectors(model: Model, r: Array, p: Array) -> Array:
+    """d_k (..., N, 3), world frame: from where joint k hangs to body k's proximal point.
+
+    Zero for an exact ball joint, of length ℓ_k for an exact rod.  p is normalised first.
+    """
+    a = rotation(p)
+    near = r + np.einsum("...kij,kj->...ki", a, model.proximal)
+    far = r + np.einsum("...kij,kj->...ki", a, model.distal)
+    hang = np.concatenate([np.zeros_like(far[..., :1, :]), far[..., :-1, :]], -2)
+    return np.asarray(near - hang)

@@ -1,0 +1,1 @@
+"""The handwritten notes in NumPy and SciPy; usable alone."""
