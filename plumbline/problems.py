@@ -1,0 +1,41 @@
+"""What is wrong with a file, and where: the errors a user can mend."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One mistake in a file: where it is, what is wrong, what would be valid."""
+
+    file: str
+    line: int  # from 1; 0 where there is no position
+    column: int  # from 1
+    field: str  # path of the field, as `bodies[0].mass`; empty where it is the whole file
+    message: str
+    valid: str = ""
+
+    def __str__(self) -> str:
+        where = f"{self.file}:{self.line}:{self.column}" if self.line else self.file
+        parts = [where, self.field, self.message] if self.field else [where, self.message]
+        return ": ".join(parts) + (f"; valid would be {self.valid}" if self.valid else "")
+
+
+class ScenarioError(ValueError):
+    """A scenario that cannot be used; carries every problem that was found, one per line as text."""
+
+    def __init__(self, problems: Iterable[Problem]):
+        self.problems = tuple(sorted(problems, key=lambda p: (p.file, p.line, p.column, p.field)))
+        super().__init__("\n".join(map(str, self.problems)))
+
+    def __reduce__(self) -> tuple[type[ScenarioError], tuple[tuple[Problem, ...]]]:
+        return type(self), (self.problems,)
+
+
+def nearest(word: str, known: Sequence[str]) -> str:
+    """``did you mean …?`` for the closest known word, or an empty string."""
+    close = get_close_matches(word.lower(), [k.lower() for k in known], n=1, cutoff=0.5)
+    return next((f"did you mean {k!r}?" for k in known if close and k.lower() == close[0]), "")
