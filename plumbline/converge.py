@@ -1,0 +1,118 @@
+"""Step refinement: observed order, extrapolated limit and its uncertainty.
+
+A ladder is the same motion at steps h, h/2, h/4, …, sampled at times that every step hits.
+Source: Romberg's scheme for an error expansion with known powers of h; E. Hairer,
+S. P. Nørsett, G. Wanner, Solving Ordinary Differential Equations I, II.9.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from plumbline.records import Array, Integrator
+
+ORDER_MARGIN = 0.1  # two orders closer than this are the same order (verification.md)
+ABOVE_FLOOR = 32.0  # a difference this far above rounding shows its order to 0.05: log2(1 + 1/32)
+LADDER = {1: (9, 14), 2: (8, 12), 4: (7, 11)}  # order: coarsest and finest step, as -log2 of seconds
+BODY_STEPS = 2**20  # most steps × bodies of the finest run of the quick form
+RTOLS = (1e-7, 1e-9, 1e-11, 1e-13)  # the ladder of an adaptive method; below 1e-13 is rounding
+
+
+def ladder(integrator: Integrator, bodies: int, duration: float, finer: int = 0) -> list[float]:
+    """Resolutions from coarse to fine: steps in s, powers of two; or relative tolerances.
+
+    The finest step halves ``finer`` times more (the nightly's form); long chains stop where
+    the work of the finest run would pass `BODY_STEPS`, always leaving four steps.
+    """
+    if integrator.kind == "tolerance":
+        return list(RTOLS)
+    coarse, fine = LADDER[integrator.order]
+    affordable = int(np.floor(np.log2(BODY_STEPS / (bodies * max(duration, 1.0)))))
+    fine = max(min(fine, affordable), coarse + 3) + finer
+    return [2.0**-k for k in range(coarse, fine + 1)]
+
+
+def largest(y: Array) -> float:
+    """Largest Euclidean length over all leading axes; inf where anything is not finite."""
+    size = float(np.max(np.linalg.norm(y, axis=-1), initial=0.0))
+    return size if np.isfinite(size) else np.inf
+
+
+@dataclass(frozen=True)
+class Order:
+    """The order that a ladder shows over one window of time."""
+
+    value: float | None  # the last trusted order; None where nothing could be observed
+    asymptotic: bool  # two consecutive orders within ORDER_MARGIN of each other, above the floor
+    at_floor: bool  # differences are rounding at every step: there is nothing to observe
+    orders: tuple[float, ...]  # all consecutive ones, coarse to fine
+    differences: tuple[float, ...]  # between consecutive steps
+
+
+def observed_order(ys: Sequence[Array], floor: float) -> Order:
+    """Order from consecutive differences D_k = max |y_k - y_{k+1}|, log2(D_k / D_{k+1}).
+
+    ``ys`` are (T, N, width) samples, coarse to fine; ``floor`` is the size of rounding: a difference
+    counts only above `ABOVE_FLOOR` times it, where rounding changes an order by less than half the
+    margin.  The finest pair of consecutive orders that agree is the asymptotic range.
+    """
+    differences = [largest(a - b) for a, b in zip(ys[:-1], ys[1:], strict=True)]
+    orders = []
+    for coarse, fine in zip(differences[:-1], differences[1:], strict=True):
+        usable = np.isfinite(coarse) and fine > ABOVE_FLOOR * floor
+        orders.append(float(np.log2(coarse / fine)) if usable else np.nan)
+    at_floor = all(d <= ABOVE_FLOOR * floor for d in differences)
+    pairs = [
+        (a, b) for a, b in zip(orders[:-1], orders[1:], strict=True) if abs(a - b) <= ORDER_MARGIN
+    ]  # NaN compares false
+    if pairs:
+        return Order(pairs[-1][1], True, False, tuple(orders), tuple(differences))
+    finite = [order for order in orders if np.isfinite(order)]
+    return Order(finite[-1] if finite else None, False, at_floor, tuple(orders), tuple(differences))
+
+
+@dataclass(frozen=True, eq=False)
+class Limit:
+    """The motion at step zero, as far as the ladder can tell."""
+
+    y: Array  # (T, N, width)
+    uncertainty: Array  # (T,) running maximum over time, same unit
+    column: int  # how many powers were eliminated
+
+
+def romberg(ys: Sequence[Array], powers: Sequence[int]) -> Limit:
+    """Extrapolate samples ``ys`` (coarse to fine, steps halving) with errors in h**powers.
+
+    Column m has the first m powers eliminated.  Its uncertainty is the difference of its last two
+    rows: the error of the row before the last, so an overestimate by the next power's factor (column 0
+    of a first-order method, whose factor is 1, takes it twice).  The column with the smallest one is
+    the limit.  Rows that are not finite are left out.
+    """
+    finite = [k for k, y in enumerate(ys) if np.all(np.isfinite(y))]
+    usable = list(ys[finite[0] :]) if finite and all(k in finite for k in range(finite[0], len(ys))) else []
+    if len(usable) < 2:
+        raise ValueError("fewer than two finite runs: nothing to extrapolate")
+    column = usable
+    best = _limit(column, 0)
+    for m, power in enumerate(powers[: len(usable) - 2], start=1):
+        factor = 2.0**power - 1.0
+        column = [
+            fine + (fine - coarse) / factor for coarse, fine in zip(column[:-1], column[1:], strict=True)
+        ]
+        candidate = _limit(column, m)
+        if candidate.uncertainty[-1] < best.uncertainty[-1]:
+            best = candidate
+    return best
+
+
+def _limit(column: Sequence[Array], m: int) -> Limit:
+    gap = np.max(np.linalg.norm(column[-1] - column[-2], axis=-1), axis=1)
+    return Limit(column[-1], np.maximum.accumulate(gap * (2 if m == 0 else 1)), m)
+
+
+def tightest(ys: Sequence[Array]) -> Limit:
+    """The limit of an adaptive method's ladder: its tightest run, uncertain by the step before it."""
+    return _limit(ys, 1)

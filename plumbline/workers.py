@@ -1,0 +1,155 @@
+"""Worker processes that can be killed: a crash, hang or memory blow-up loses one task and says so.
+
+Each worker runs in a scratch folder of its own, has its output thrown away at the level of file
+descriptors (engines print from C++), one BLAS thread, a limit of address space, and dies with
+its parent.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import multiprocessing
+import os
+import signal
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from pebble import ProcessExpired, ProcessPool
+
+ONE_THREAD = dict.fromkeys(
+    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
+)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What one task may use."""
+
+    seconds: float = 300.0  # wall clock
+    gigabytes: float = 8.0  # address space of the worker
+
+
+@dataclass(frozen=True)
+class Task:
+    """A call to make in a worker: a picklable function and its arguments."""
+
+    key: Any
+    call: Callable[..., Any]
+    arguments: tuple[Any, ...] = ()
+    limits: Limits = field(default_factory=Limits)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What became of a task: its value, or the sentence that says how it was lost."""
+
+    key: Any
+    value: Any = None
+    lost: str | None = None
+
+
+class Workers:
+    """A pool of ``jobs`` workers; `run` yields outcomes as they come, a lost worker costs one of them."""
+
+    def __init__(self, jobs: int, limits: Limits | None = None) -> None:
+        self.jobs = jobs
+        self.limits = limits or Limits()
+        self._scratch = tempfile.TemporaryDirectory(prefix="plumbline-", ignore_cleanup_errors=True)
+        os.environ.update(ONE_THREAD)  # inherited by the spawned interpreters, before NumPy loads there
+        self._pool = ProcessPool(
+            max_workers=jobs,
+            context=multiprocessing.get_context("spawn"),
+            initializer=prepare,
+            initargs=(self._scratch.name, self.limits.gigabytes, os.getpid()),
+        )
+
+    def __enter__(self) -> Workers:
+        """The pool itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Kill what still runs and remove the scratch folders."""
+        self._pool.stop()
+        self._pool.join()
+        self._scratch.cleanup()
+
+    def run(self, tasks: Iterable[Task]) -> Iterator[Outcome]:
+        """Outcomes in the order of completion; only a few tasks are handed over at a time."""
+        waiting: dict[Future[Any], Task] = {}
+        source = iter(tasks)
+        exhausted = False
+        while waiting or not exhausted:
+            while not exhausted and len(waiting) < 2 * self.jobs:
+                task = next(source, None)
+                if task is None:
+                    exhausted = True
+                    break
+                future = self._pool.schedule(task.call, args=task.arguments, timeout=task.limits.seconds)
+                waiting[future] = task
+            if not waiting:
+                return
+            done, _ = wait(waiting, return_when=FIRST_COMPLETED)
+            for future in done:
+                yield outcome(waiting.pop(future), future)
+
+
+def outcome(task: Task, future: Future[Any]) -> Outcome:
+    """The value of a finished future, or how its worker was lost."""
+    try:
+        return Outcome(task.key, future.result())
+    except TimeoutError:
+        return Outcome(task.key, lost=f"hung: no answer within {task.limits.seconds:g} s, worker killed")
+    except ProcessExpired as expired:
+        return Outcome(task.key, lost=f"crashed: the worker {exit_words(expired.exitcode)}")
+    except MemoryError:
+        return Outcome(task.key, lost=f"out of memory: over {task.limits.gigabytes:g} GB of address space")
+    except CancelledError:
+        return Outcome(task.key, lost="cancelled")
+    except Exception as error:  # ImportError among them: the caller tells "not installed" by its name
+        return Outcome(task.key, lost=f"{type(error).__name__}: {error}")
+
+
+def exit_words(code: int) -> str:
+    """An exit code in words: the signal's name where one ended the process."""
+    if code < 0:
+        try:
+            return f"died of {signal.Signals(-code).name}"
+        except ValueError:
+            return f"died of signal {-code}"
+    return f"exited with code {code}"
+
+
+def prepare(scratch: str, gigabytes: float, parent: int) -> None:
+    """Initialise a worker process: called by the pool, in the worker, before any task."""
+    os.environ.update(ONE_THREAD)
+    os.chdir(tempfile.mkdtemp(dir=scratch))
+    sink = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(sink, 1)
+    os.dup2(sink, 2)
+    os.close(sink)
+    die_with_parent(parent)
+    with contextlib.suppress(ImportError, ValueError, OSError):  # no such limit on Windows
+        import resource
+
+        size = int(gigabytes * 2**30)
+        resource.setrlimit(resource.RLIMIT_AS, (size, size))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+
+
+def die_with_parent(parent: int) -> None:
+    """Ask Linux to kill this process when its parent ends, however it ends."""
+    if not sys.platform.startswith("linux"):
+        return
+    pr_set_pdeathsig = 1  # linux/prctl.h
+    ctypes.CDLL(None, use_errno=True).prctl(pr_set_pdeathsig, signal.SIGKILL)
+    if os.getppid() != parent and not Path(f"/proc/{parent}").exists():
+        os._exit(1)  # it ended before we asked

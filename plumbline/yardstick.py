@@ -1,0 +1,125 @@
+"""What engines are measured with: the truth of a scenario, how sure it is, and how sharp it must be.
+
+Runs inside a worker.  State level: the notes' direct system, equilibrated and refined.  Along
+trajectories: the closed form where the scenario has one, else the notes' form by DOP853 at two
+tolerances, ten times their difference being its uncertainty.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from plumbline.bound import Bound, state_bound
+from plumbline.horizon import growth
+from plumbline.kinematics import lift
+from plumbline.measures import attitude_error, position_error
+from plumbline.records import Array, Model, State, StateQuantities, Trajectory
+from plumbline.registry import adapter
+from plumbline.sampling import seed_of
+
+FINE, COARSE = 1e-13, 3e-13  # relative tolerances of the truth's two runs
+PART = 1e-4  # a mistake of this relative size in a parameter must be visible, or the verdict is unresolved
+
+
+@dataclass(frozen=True, eq=False)
+class StateTruth:
+    """True quantities at a list of states, and the tolerance of each."""
+
+    states: list[State]
+    quantities: list[StateQuantities]
+    bounds: list[Bound]
+    method: str
+
+
+@dataclass(frozen=True, eq=False)
+class MotionTruth:
+    """The true motion at the sample times, and what may be concluded from it."""
+
+    trajectory: Trajectory
+    position_uncertainty: Array  # (T,) m, running maximum
+    attitude_uncertainty: Array  # (T,) rad, running maximum
+    growth: Array  # (T,) –: of a small perturbation, running maximum
+    visible_position: Array  # (T,) m: the least that a mistake of one part in 10⁴ does, up to t
+    visible_attitude: Array  # (T,) rad
+    length: float  # m: the stretched chain, the scale of rounding in positions
+    method: str
+
+
+def state_truth(model: Model, states: Sequence[State]) -> StateTruth:
+    """True state quantities and their rounding bounds."""
+    return StateTruth(
+        list(states),
+        adapter("reference").evaluate(model, states),
+        [state_bound(model, state) for state in states],
+        "the notes' direct system, equilibrated and refined, in double precision",
+    )
+
+
+def motion_truth(model: Model, state: State, times: Array, exact: tuple[Array, Array] | None) -> MotionTruth:
+    """True motion from ``state`` at ``times``; ``exact`` is a closed form's (r, p) where there is one."""
+    reference = adapter("reference")
+    run = reference.simulate(model, state, times, "dop853", FINE)
+    second = reference.simulate(model, state, times, "dop853", COARSE)
+    r, p, factor = second.r, second.p, 10.0
+    method = f"the notes' form by DOP853 at rtol {FINE:g} and {COARSE:g}; ten times their difference"
+    if exact is not None:
+        run, factor = replace(run, r=exact[0], p=exact[1]), 0.0
+        method = "closed form; rounding only"
+    return MotionTruth(
+        run,
+        factor * np.maximum.accumulate(position_error(run.r, r)),
+        factor * np.maximum.accumulate(attitude_error(run.p, p)),
+        np.maximum.accumulate(growth(model, state, times)),
+        *visible(model, state, times),
+        length=float(np.sum(reach(model))),
+        method=method,
+    )
+
+
+def reach(model: Model) -> Array:
+    """(N,) m: from where body k hangs to where the next one does, stretched; at least to its centre."""
+    span = np.linalg.norm(model.proximal - model.distal, axis=1)
+    span[-1] = np.linalg.norm(model.proximal[-1])
+    return np.asarray(model.length + np.maximum(span, np.linalg.norm(model.proximal, axis=1)))
+
+
+def visible(model: Model, state: State, times: Array) -> tuple[Array, Array]:
+    """Least effects (T,) m and (T,) rad, up to each time, of mistakes of one part in 10⁴.
+
+    Gravity, the masses, the inertias, the attachments are wrong in turn, each entry by ±1e-4 of
+    itself with random signs; the same minimal state is lifted onto the wrong model.  Mistakes that
+    no motion of this scenario shows (mass of a single body, anything of a body at rest) do not count.
+    """
+    rng = np.random.default_rng(seed_of("visible"))
+
+    def off(x: Array) -> Array:
+        return np.asarray(x * (1 + PART * rng.choice([-1.0, 1.0], size=x.shape)))
+
+    scaled = 1 + PART * rng.choice([-1.0, 1.0], size=(model.n, 1, 1))
+    wrong = [
+        replace(model, gravity=model.gravity * (1 + PART)),
+        replace(model, mass=off(model.mass)),
+        replace(model, inertia=model.inertia * scaled),
+        replace(model, proximal=off(model.proximal), distal=off(model.distal)),
+    ]
+    reference = adapter("reference")
+    right = reference.simulate(model, state, times, "dop853", 1e-9)
+    position, attitude = [], []
+    for other in wrong:
+        start = lift(other, state.p, state.omega, state.u, state.udot)
+        run = reference.simulate(other, start, times, "dop853", 1e-9)
+        position.append(position_error(right.r, run.r))
+        attitude.append(attitude_error(right.p, run.p))
+    scale = PART * float(np.sum(reach(model)))
+    return least_visible(position, 1e-3 * scale), least_visible(attitude, 1e-3 * PART)
+
+
+def least_visible(effects: Sequence[Array], threshold: float) -> Array:
+    """(T,) running maximum of the smallest effect that passes the threshold at all; inf if none does."""
+    seen = [np.maximum.accumulate(e) for e in effects if np.max(e) > threshold]
+    if not seen:
+        return np.full(len(effects[0]), np.inf)
+    return np.asarray(np.min(seen, axis=0))
