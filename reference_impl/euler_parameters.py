@@ -42,12 +42,12 @@ def A(p: Field) -> Field:
 
 
 def L(p: Field) -> Field:
-    """The notes' L = [−e, p0 I − ẽ], (..., 3, 4): ω′ = 2 L(p) ṗ in the body frame."""
+    """The notes' matrix [−e, p0 I − ẽ], (..., 3, 4): ω′ = 2 Lṗ, body frame."""
     return np.concatenate([-p[..., 1:, None], p[..., 0, None, None] * I3 - tilde(p[..., 1:])], -1)
 
 
 def G(p: Field) -> Field:
-    """The notes' G = [−e, p0 I + ẽ], (..., 3, 4): A = G Lᵀ + (pᵀp − 1) I."""
+    """The notes' matrix [−e, p0 I + ẽ], (..., 3, 4): A = G Lᵀ + (pᵀp − 1) I."""
     return np.concatenate([-p[..., 1:, None], p[..., 0, None, None] * I3 + tilde(p[..., 1:])], -1)
 
 

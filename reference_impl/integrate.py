@@ -1,0 +1,102 @@
+"""The notes' first-order form (N6), raw: no stabilisation, so that its drift is a result (E4)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.integrate import DOP853
+
+from reference_impl.chain import Array, Chain
+from reference_impl.euler_parameters import angular_velocity
+from reference_impl.system import System
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """Samples at the asked times, as integrated: p is neither normalised nor projected."""
+
+    t: Array  # (T,) s
+    r: Array  # (T, N, 3) m
+    p: Array  # (T, N, 4) –
+    v: Array  # (T, N, 3) m/s, ṙ
+    pdot: Array  # (T, N, 4) 1/s
+    steps: int  # steps taken
+    evaluations: int  # of the right-hand side
+
+
+def pack(r: Array, p: Array, v: Array, pdot: Array) -> Array:
+    """(N6) y = (r, p, ṙ, ṗ), (14 N,)."""
+    return np.concatenate([x.ravel() for x in (r, p, v, pdot)])
+
+
+def unpack(y: Array, n: int) -> tuple[Array, Array, Array, Array]:
+    """Parts r (..., N, 3), p (..., N, 4), ṙ, ṗ of y (..., 14 N)."""
+    ends = np.cumsum([3 * n, 4 * n, 3 * n])
+    parts = zip(np.split(y, ends, axis=-1), (3, 4, 3, 4), strict=True)
+    r, p, v, pdot = (part.reshape(*y.shape[:-1], n, width) for part, width in parts)
+    return r, p, v, pdot
+
+
+def rate(system: System, y: Array, gamma_defect: float | Array = 0.0) -> Array:
+    """(N6) ẏ = (ṙ, ṗ, r̈, p̈), (14 N,); ``gamma_defect`` as `System.solve`."""
+    r, p, v, pdot = unpack(y, system.chain.n)
+    x = system.solve(r, p, v, pdot, gamma_defect)
+    return pack(v, pdot, x.acceleration, x.pddot)
+
+
+def natural_sizes(chain: Chain, r: Array, p: Array, v: Array, pdot: Array) -> Array:
+    """(14 N,) the size that each part of y has in this motion: what an absolute tolerance is relative to.
+
+    A coordinate that passes through zero needs no more digits there than the motion as a whole: the
+    stretched chain for r, 1 for p, and for the rates what is there at the start or what falling through the
+    chain's own length reaches, whichever is larger.
+    """
+    reach = float(np.sum(chain.length + np.linalg.norm(chain.proximal, axis=1)))
+    reach += float(np.sum(np.linalg.norm(chain.distal[:-1], axis=1)))
+    reach = max(reach, float(np.max(np.abs(r)))) or 1.0
+    fall = float(np.sqrt(np.linalg.norm(chain.gravity) * reach))
+    omega = float(np.max(np.abs(angular_velocity(p, pdot))))
+    speed = max(fall, float(np.max(np.abs(v))), omega * reach)
+    sizes = (reach, 1.0, speed, max(speed / reach, omega) / 2)
+    return np.repeat(sizes, np.array([3, 4, 3, 4]) * chain.n)
+
+
+def integrate(
+    chain: Chain,
+    r: Array,
+    p: Array,
+    v: Array,
+    pdot: Array,
+    times: Array,
+    rtol: float,
+    gamma_defect: float | Array = 0.0,
+) -> Run:
+    """(N6) by DOP853, sampled at ``times`` (T,) from its dense output; times[0] is the initial time.
+
+    Initial r, ṙ (N, 3) m, m/s and p, ṗ (N, 4) –, 1/s.  The absolute tolerance is ``rtol`` times
+    `natural_sizes`.  scipy holds rtol at 2.2e-14 at least.
+
+    Raises SingularSystem where S is singular on the way, ArithmeticError where the step size vanishes.
+    """
+    system, n = System(chain), chain.n
+    start = pack(r, p, v, pdot)
+    atol = rtol * natural_sizes(chain, r, p, v, pdot)
+    samples = np.empty((len(times), 14 * n))
+    samples[0], done, steps = start, 1, 0
+    solver = DOP853(
+        lambda _, y: rate(system, y, gamma_defect), times[0], start, times[-1], rtol=rtol, atol=atol
+    )
+    while done < len(times):
+        message = solver.step()
+        if solver.status == "failed":
+            raise ArithmeticError(f"DOP853 stopped at t = {solver.t} s: {message}")
+        steps += 1
+        reached = int(np.searchsorted(times, solver.t, side="right"))
+        if reached > done:
+            samples[done:reached] = solver.dense_output()(times[done:reached]).T
+            if times[reached - 1] == solver.t:
+                samples[reached - 1] = solver.y
+            done = reached
+    r_, p_, v_, pdot_ = unpack(samples, n)
+    return Run(t=times, r=r_, p=p_, v=v_, pdot=pdot_, steps=steps, evaluations=solver.nfev)

@@ -1,0 +1,98 @@
+"""The joints of an open chain of N bodies, any mix of rods and balls: C, C_r, C_p, γ.
+
+Joint k has one row (rod) or three (ball) and touches body k, its near body, and body k−1, its far
+body; the far body of joint 0 is the pivot.  With x = r_k − r_{k−1}, a = A_{k−1} s_{k−1,distal} and
+b = A_k s_{k,proximal} (r, a and their rates are 0 at the pivot), d = x + b − a and
+
+    rod   C = xᵀx + 2 xᵀ(b − a) + bᵀb − 2 aᵀb + aᵀa − ℓ²,  bᵀb and aᵀa replaced by s-products (E2)
+          C_r near, far =  2 dᵀ, −2 dᵀ                                                     (S2, D3)
+          C_p near, far =  4 (x − a)ᵀH_near, −4 (x + b)ᵀH_far                              (S3, D4)
+    ball  C = d,  C_r = I, −I,  C_p = 2 H_near, −2 H_far                                   (E1, N8)
+
+and γ = −d_t(C_r) ṙ − d_t(C_p) ṗ with Ȧ = 2 G L̇ᵀ in the rods' rows, as the notes have it (E3).
+The ball's γ = −2 Ḣ_near ṗ_near + 2 Ḣ_far ṗ_far is exact for every p.  The rods' rows of one and two
+bodies are S1–S4 and D2–D6: `printed`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reference_impl.chain import Chain
+from reference_impl.euler_parameters import A, A_rate, Field, H, dot
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """The joints' rows in the order of the joints; c rows in all, c = Σ (1 per rod, 3 per ball)."""
+
+    joint: NDArray[np.intp]  # (c,) the joint of the row; its near body
+    C: Field  # (c,) m² of a rod, m of a ball
+    r_near: Field  # (c, 3) ∂C/∂r of the near body; of the far body it is −r_near
+    p_near: Field  # (c, 4) ∂C/∂p of the near body
+    p_far: Field  # (c, 4) ∂C/∂p of the far body; 0 for the pivot
+    gamma: Field  # (c,) C̈ = C_r r̈ + C_p p̈ − γ
+    d: Field  # (N, 3) m, world frame, from where joint k hangs to the near body's proximal point
+
+    def rate(self, v: Field, pdot: Field) -> Field:
+        """Ċ = C_r ṙ + C_p ṗ, (c,); ṙ (N, 3), ṗ (N, 4)."""
+        far_v, far_pdot = after_pivot(v), after_pivot(pdot)
+        k = self.joint
+        moved = dot(self.r_near, v[k] - far_v[k])
+        return np.asarray(moved + dot(self.p_near, pdot[k]) + dot(self.p_far, far_pdot[k]))
+
+
+def after_pivot(x: Field) -> Field:
+    """The far body's value for every joint: zeros for the pivot, then x of bodies 0 … N−2."""
+    return np.concatenate([np.zeros_like(x[:1]), x[:-1]])
+
+
+def row_joints(chain: Chain) -> NDArray[np.intp]:
+    """(c,) the joint of each row."""
+    return np.repeat(np.arange(chain.n), np.where(chain.rods, 1, 3))
+
+
+def rows(chain: Chain, r: Field, p: Field, v: Field, pdot: Field) -> Rows:
+    """C, C_r, C_p and γ of every joint at r, ṙ (N, 3), p, ṗ (N, 4), on or off the manifold."""
+    s_near, s_far = chain.proximal, after_pivot(chain.distal)
+    # The pivot has no Euler parameters: those of body 0 stand in, and s = 0 takes them out: H(p, 0) = 0.
+    p_far, pdot_far = np.concatenate([p[:1], p[:-1]]), np.concatenate([pdot[:1], pdot[:-1]])
+    x, xdot = r - after_pivot(r), v - after_pivot(v)
+    H_near, H_far = H(np.stack([p, pdot]), s_near), H(np.stack([p_far, pdot_far]), s_far)  # (2, N, 3, 4)
+    b, a = _times(A(p), s_near), _times(A(p_far), s_far)
+    d = x + b - a
+
+    rod, ball = np.flatnonzero(chain.rods), np.flatnonzero(~chain.rods)
+    joint, order = row_joints(chain), np.argsort(np.concatenate([rod, np.repeat(ball, 3)]), kind="stable")
+    parts: list[tuple[Field, ...]] = []
+    if len(rod):
+        k = rod
+        bdot, adot = _times(A_rate(p[k], pdot[k]), s_near[k]), _times(A_rate(p_far[k], pdot_far[k]), s_far[k])
+        y, ydot, z, zdot = x[k] - a[k], xdot[k] - adot, x[k] + b[k], xdot[k] + bdot
+        C = dot(x[k], x[k]) + 2 * dot(x[k], b[k] - a[k]) - 2 * dot(a[k], b[k])
+        C = C + dot(s_near[k], s_near[k]) + dot(s_far[k], s_far[k]) - chain.length[k] ** 2
+        near_rate = _left(ydot, H_near[0, k]) + _left(y, H_near[1, k])
+        far_rate = _left(zdot, H_far[0, k]) + _left(z, H_far[1, k])
+        gamma = -2 * dot(zdot - adot, xdot[k]) - 4 * dot(near_rate, pdot[k]) + 4 * dot(far_rate, pdot_far[k])
+        parts.append((C, 2 * d[k], 4 * _left(y, H_near[0, k]), -4 * _left(z, H_far[0, k]), gamma))
+    if len(ball):
+        k = ball
+        gamma = 2 * (_times(H_far[1, k], pdot_far[k]) - _times(H_near[1, k], pdot[k]))
+        identity = np.broadcast_to(np.eye(3, dtype=int), (len(k), 3, 3))
+        blocks = (d[k], identity, 2 * H_near[0, k], -2 * H_far[0, k], gamma)
+        parts.append(tuple(np.reshape(block, (3 * len(k), *np.shape(block)[2:])) for block in blocks))
+    C, r_near, p_near, far, gamma = (np.concatenate(column)[order] for column in zip(*parts, strict=True))
+    return Rows(joint=joint, C=C, r_near=r_near, p_near=p_near, p_far=far, gamma=gamma, d=d)
+
+
+def _times(matrix: Field, vector: Field) -> Field:
+    """Matrix times vector, batched."""
+    return np.asarray((matrix @ vector[..., None])[..., 0])
+
+
+def _left(vector: Field, matrix: Field) -> Field:
+    """Row vector times matrix, batched."""
+    return np.asarray((vector[..., None, :] @ matrix)[..., 0, :])

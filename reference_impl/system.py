@@ -1,0 +1,232 @@
+"""The system S x = b of the notes (N1–N5) for a chain: assembled as printed, solved, and read (E5)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+
+from reference_impl.chain import Array, Chain
+from reference_impl.errors import SingularSystem
+from reference_impl.euler_parameters import L, angular_velocity, dot
+from reference_impl.joints import Rows, after_pivot, row_joints, rows
+
+EPS = float(np.finfo(float).eps)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The unknowns x of (N5) and what they mean (E5)."""
+
+    acceleration: Array  # (N, 3) m/s², r̈, world frame
+    pddot: Array  # (N, 4) 1/s², p̈
+    multiplier: Array  # (c,) λ by row of `joint`: N/m for a rod's row, N for a ball's three
+    norm_multiplier: Array  # (N,) λ_E: no physical meaning, not comparable across formulations (E2)
+    joint: NDArray[np.intp]  # (c,) the joint of each row
+    tension: Array  # (N,) N, 2 ℓ λ of the rods, positive in tension; NaN at ball joints
+    joint_reaction: Array  # (N, 3) N, force on body k at its proximal point, world frame: −C_rᵀ λ
+
+
+class System:
+    """S x = b of one chain; the sparsity of S is found once, S and b are assembled for every state.
+
+    `assemble` is the specification: S and b dense, blocks and signs as printed in (N5), unknowns in
+    the printed order (r̈, p̈, λ, λ_E).  `solve` takes the same entries body by body, in the order
+    (λ_k, r̈_k, p̈_k, λ_E,k), where they fill a band of width 10 beside the diagonal whatever N is.
+    """
+
+    def __init__(self, chain: Chain) -> None:
+        self.chain = chain
+        n, joint = chain.n, row_joints(chain)
+        c = len(joint)
+        r, p = np.arange(3 * n).reshape(n, 3), 3 * n + np.arange(4 * n).reshape(n, 4)
+        row, norm = 7 * n + np.arange(c), 7 * n + c + np.arange(n)
+        self.joint, self.size = joint, 8 * n + c
+        self._near, self._far = joint, np.flatnonzero(joint > 0)
+        near, far = joint, joint[self._far] - 1
+        # Where each block of `_blocks` stands: rows and columns, broadcast against each other.
+        places = [
+            (r, r),
+            (p[:, :, None], p[:, None, :]),
+            (row[:, None], r[near]),
+            (row[self._far, None], r[far]),
+            (row[:, None], p[near]),
+            (row[self._far, None], p[far]),
+            (norm[:, None], p),
+        ]
+        i, j = (np.concatenate([np.broadcast_arrays(*x)[side].ravel() for x in places]) for side in (0, 1))
+        self._lower = sum(np.broadcast(*x).size for x in places[:2])  # constraint blocks stand in S twice
+        self._i, self._j = np.concatenate([i, j[self._lower :]]), np.concatenate([j, i[self._lower :]])
+
+        owner = np.concatenate([np.repeat(np.arange(n), 3), np.repeat(np.arange(n), 4), joint, np.arange(n)])
+        kind = np.repeat([1, 2, 0, 3], [3 * n, 4 * n, c, n])
+        self._order = np.lexsort((np.arange(self.size), kind, owner))  # position in the band → printed
+        place = np.argsort(self._order)
+        i, j = place[self._i], place[self._j]
+        self._width = int(np.max(np.abs(i - j)))
+        self._band = (2 * self._width + i - j, j)
+        by_row = np.argsort(i, kind="stable")
+        self._row_start = np.searchsorted(i[by_row], np.arange(self.size))
+        self._by_row, self._row, self._column = by_row, i[by_row], j[by_row]
+        self._unsort = np.argsort(by_row)
+
+    def assemble(self, r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, Array]:
+        """(N5) S (m, m) and b (m,), m = 8 N + c, at r, ṙ (N, 3), p, ṗ (N, 4), on or off the manifold."""
+        values, b, _ = self._blocks(r, p, v, pdot)
+        S = np.zeros((self.size, self.size))
+        S[self._i, self._j] = values
+        return S, b
+
+    def solve(self, r: Array, p: Array, v: Array, pdot: Array, gamma_defect: float | Array = 0.0) -> Solution:
+        """r̈, p̈, λ, λ_E of (N5) at r, ṙ (N, 3) and p, ṗ (N, 4).
+
+        S is equilibrated symmetrically by powers of two (its blocks have the units kg, kg m² and m,
+        and would otherwise decide the pivots), factored with partial pivoting and refined once.
+        ``gamma_defect`` (a number or (c,)) is added to γ: a planted fault whose growth is known (E4).
+
+        Raises SingularSystem, which names the body and the cause (E1, E7).
+        """
+        with np.errstate(all="ignore"):  # what overflows is named below
+            values, b, joints = self._blocks(r, p, v, pdot)
+        n, c = self.chain.n, len(self.joint)
+        b[7 * n : 7 * n + c] += gamma_defect
+        check(
+            self.chain,
+            r,
+            p,
+            joints.d,
+            self.chain.rods,
+            bool(np.isfinite(values).all() & np.isfinite(b).all()),
+        )
+
+        entries = values[self._by_row]
+        scale = np.ones(self.size)
+        for _ in range(3):  # Ruiz: rows and columns alike tend to a largest entry of 1
+            largest = np.maximum.reduceat(np.abs(entries) * scale[self._column], self._row_start) * scale
+            scale *= power_of_two(largest)
+        entries *= scale[self._row] * scale[self._column]
+        band = np.zeros((3 * self._width + 1, self.size))
+        band[self._band] = entries[self._unsort]
+        lu, pivots, _ = lapack.dgbtrf(band, self._width, self._width, overwrite_ab=True)
+        check_pivots(self.chain, lu[2 * self._width])
+        right = b[self._order] * scale
+        x, _ = lapack.dgbtrs(lu, self._width, self._width, right, pivots)
+        residual = right - np.add.reduceat(entries * x[self._column], self._row_start)
+        x += lapack.dgbtrs(lu, self._width, self._width, residual, pivots)[0]
+        solution = np.empty(self.size)
+        solution[self._order] = x * scale
+        return self._read(solution, joints)
+
+    def _blocks(self, r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, Array, Rows]:
+        """The entries of S in the order of `_i`, `_j`, then b, and the joints they come from."""
+        chain = self.chain
+        joints = rows(chain, r, p, v, pdot)
+        L_, L_rate = L(p), L(pdot)
+        JL = chain.inertia @ L_
+        blocks = (
+            np.repeat(chain.mass, 3),  # M
+            4 * (L_.swapaxes(-1, -2) @ JL),  # 4 LᵀJL
+            joints.r_near,  # C_r
+            -joints.r_near[self._far],
+            joints.p_near,  # C_p
+            joints.p_far[self._far],
+            2 * p,  # C_E,p
+        )
+        values = np.concatenate([np.ravel(block) for block in blocks])
+        force = chain.mass[:, None] * chain.gravity + chain.force - chain.drag_force[:, None] * v
+        moment = chain.moment - chain.drag_moment[:, None] * angular_velocity(p, pdot)
+        quadratic = chain.inertia @ (L_rate @ p[..., None])
+        p_force = 8 * (L_rate.swapaxes(-1, -2) @ quadratic) + 2 * (L_.swapaxes(-1, -2) @ moment[..., None])
+        b = np.concatenate([force.ravel(), p_force.ravel(), joints.gamma, -2 * dot(pdot, pdot)])
+        return np.concatenate([values, values[self._lower :]]), b, joints
+
+    def _read(self, x: Array, joints: Rows) -> Solution:
+        """The parts of x, and λ as forces."""
+        n, c = self.chain.n, len(self.joint)
+        multiplier = x[7 * n : 7 * n + c]
+        reaction = -np.add.reduceat(
+            multiplier[:, None] * joints.r_near, np.searchsorted(self.joint, np.arange(n))
+        )
+        tension = np.full(n, np.nan)
+        rod = self.chain.rods
+        tension[rod] = 2 * self.chain.length[rod] * multiplier[rod[self.joint]]
+        return Solution(
+            acceleration=x[: 3 * n].reshape(n, 3),
+            pddot=x[3 * n : 7 * n].reshape(n, 4),
+            multiplier=multiplier,
+            norm_multiplier=x[7 * n + c :],
+            joint=self.joint,
+            tension=tension,
+            joint_reaction=np.asarray(reaction),
+        )
+
+
+def solve_dense(S: Array, b: Array) -> Array:
+    """X of S x = b, dense, equilibrated and refined as `System.solve`; SingularSystem if S is singular."""
+    scale = np.ones(len(b))
+    for _ in range(3):
+        scale *= power_of_two(np.max(np.abs(S) * scale, axis=1) * scale)
+    S = S * scale[:, None] * scale
+    lu, pivots, _ = lapack.dgetrf(S)
+    if singular(np.diagonal(lu)):
+        raise SingularSystem("S is singular to rounding")
+    x, _ = lapack.dgetrs(lu, pivots, b * scale)
+    x += lapack.dgetrs(lu, pivots, b * scale - S @ x)[0]
+    return np.asarray(x * scale)
+
+
+def power_of_two(largest: Array) -> Array:
+    """The power of two nearest below 1/√largest, 1 where that is 0: scaling by it rounds nothing."""
+    return np.where(largest > 0, np.ldexp(1.0, -(np.frexp(largest)[1] // 2)), 1.0)
+
+
+def singular(pivots: Array) -> bool:
+    """Whether the pivots of an equilibrated matrix say that it is singular to rounding."""
+    size = np.abs(pivots)
+    return not bool(np.min(size) > len(size) * EPS * np.max(size))
+
+
+def check(chain: Chain, r: Array, p: Array, d: Array, rods: NDArray[np.bool_], finite: bool) -> None:
+    """Raise SingularSystem where the state alone says that S is singular, and of which body (E1, E7).
+
+    ``d`` (N, 3) is where rod k points; below its own rounding (16 ε of the vectors it is the sum of)
+    it is zero, and a row made of it would be noise.
+    """
+    if not finite:
+        bad = ~(np.isfinite(r).all(-1) & np.isfinite(p).all(-1) & np.isfinite(d).all(-1))
+        where = (
+            f"body {int(np.argmax(bad)) + 1} is not finite" if bad.any() else "a rate or a load is not finite"
+        )
+        raise SingularSystem(f"{where}: S x = b has no meaning")
+    norms = dot(p, p)
+    if np.any(norms == 0):
+        body = int(np.argmin(norms)) + 1
+        raise SingularSystem(f"p of body {body} is 0: 4 LᵀJL and the normalisation row vanish with it (E7)")
+    spans = [r, after_pivot(r), chain.proximal, after_pivot(chain.distal)]
+    rounding = 16 * EPS * np.max(np.abs(spans), axis=(0, 2))
+    collapsed = rods & (np.sqrt(dot(d, d)) <= rounding)
+    if collapsed.any():
+        body = int(np.argmax(collapsed)) + 1
+        raise SingularSystem(
+            f"the rod above body {body} has length 0: C = dᵀd has no gradient at d = 0, so C_r and C_p "
+            "vanish (E1); a joint of length 0 is a ball joint, d = 0"
+        )
+
+
+def check_pivots(chain: Chain, pivots: Array) -> None:
+    """Raise SingularSystem with the likeliest cause where the factored S is singular to rounding."""
+    if not singular(pivots):
+        return
+    if np.any(chain.mass <= 0):
+        raise SingularSystem(f"the mass of body {int(np.argmin(chain.mass)) + 1} is {np.min(chain.mass)} kg")
+    principal = np.linalg.eigvalsh(chain.inertia)
+    flat = principal[:, 0] <= chain.n * EPS * principal[:, 2]
+    if flat.any():
+        body = int(np.argmax(flat))
+        raise SingularSystem(
+            f"the inertia of body {body + 1} is singular, principal values {principal[body].tolist()} kg m², "
+            "so 4 LᵀJL has rank 2 or less (E7)"
+        )
+    raise SingularSystem("the joint rows are not independent at this state: S is singular to rounding")
