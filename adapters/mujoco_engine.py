@@ -1,0 +1,262 @@
+"""MuJoCo: a joint-space engine; every link and every massless rod is a body on a ball joint.
+
+Maps (R_b: rotation of engine body b, body → world; a(b): its parent; z_b: a rod's own axis):
+
+    link k    body frame: the project's, at the centre of mass;  joint at s_prox(k)
+              pos = s_dist(k−1) − s_prox(k), or (0, 0, −ℓ_k) − s_prox(k) where it hangs on a rod
+    rod k     body frame and joint at the point where the rod hangs, u_k = −R z;  pos = s_dist(k−1)
+              mass 0, inertia diag(0, 0, J_z): exact for any J_z while the rod's axial spin is zero,
+              which ball joints at both ends conserve
+    qpos_b  = conj(q_a) q_b, scalar first
+    qvel_b  = ω_b − R_bᵀ R_a ω_a,  ω in the body's own frame;  for a rod ω_b = R_bᵀ (u × u̇)
+    qvel    = T ν,  ν = (u̇ of the rods, ω′ of the links);  M = Tᵀ M_engine T
+    r̈       = objectAcceleration + g  (MuJoCo's base accelerates with −g)
+    ω̇′      = R_kᵀ α
+    L       = L_com + Σm r_com × v_com  of the whole tree
+
+Loads act inside every integrator stage: the world force is `xfrc_applied`; n′ − c_r ω′ and −c_t ṙ
+are actuators on a site at the centre of mass, a constant and a velocity bias along each axis.
+`cfrc_int` counts actuator forces as if the joint carried them, so before asking for it the drag
+force that acted is named as an applied one too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from plumbline import kinematics
+from plumbline.adapter import Adapter
+from plumbline.records import Array, EngineFailure, Integrator, Model, State, StateQuantities, Trajectory
+
+ALL = (1, 2, 3, 4, 5, 6)
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+class Mujoco(Adapter):
+    """MuJoCo's forward dynamics and its fixed-step integrators."""
+
+    name = "mujoco"
+    title = "MuJoCo"
+    package = "mujoco"
+    integrators = (
+        Integrator("Euler", "step", 1, ALL, note="semi-implicit Euler"),
+        Integrator("implicit", "step", 1, ALL, note="Euler, implicit in velocity with Coriolis terms"),
+        Integrator(
+            "implicitfast",
+            "step",
+            1,
+            ALL,
+            alias_of="Euler",
+            note="implicit in velocity without Coriolis terms: equals Euler on undamped chains",
+        ),
+        Integrator("RK4", "step", 4, (4, 5, 6, 7, 8), note="classical Runge–Kutta on the rotation group"),
+    )
+
+    def version(self) -> str:
+        """Version of the loaded library."""
+        return str(mujoco.mj_versionString())
+
+    def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
+        chain = _Chain(model)
+        with _watched(chain.d):
+            return [chain.quantities(state) for state in states]
+
+    def _simulate(
+        self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
+    ) -> Trajectory:
+        chain = _Chain(model)
+        chain.m.opt.timestep = resolution
+        chain.m.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.name.upper()}")
+        chain.set(state)
+        counts = np.round(times / resolution).astype(int)
+        t, rows = [0.0], [chain.sample()]
+        with _watched(chain.d):
+            for done in np.diff(counts):
+                mujoco.mj_step(chain.m, chain.d, nstep=int(done))
+                t.append(chain.d.time)  # the engine's own clock: a rewound one is seen by the contract
+                rows.append(chain.sample())
+        r, p, v, pdot = (np.array(column) for column in zip(*rows, strict=True))
+        return Trajectory(t=np.array(t), r=r, p=p, v=v, pdot=pdot, steps=int(counts[-1]))
+
+
+class _Chain:
+    """A compiled chain and its data.  ``link[k]``, ``parent[b]``: engine body ids, 0 the world."""
+
+    def __init__(self, model: Model) -> None:
+        spec = mujoco.MjSpec()
+        spec.compiler.autolimits = False
+        spec.option.gravity = model.gravity
+        spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self.model = model
+        self.link: list[int] = []
+        self.mass: list[float] = [0.0]
+        self.inertia: list[Array] = [np.zeros(3)]
+        parent, hang = spec.worldbody, np.zeros(3)
+        for k in range(model.n):
+            principal, axes = _principal(model.inertia[k])
+            if model.length[k] > 0:
+                parent = self._body(parent, hang, np.zeros(3), 0.0, np.array([0, 0, principal.mean()]))
+                hang = np.array([0, 0, -model.length[k]])
+            at = model.proximal[k]
+            parent = self._body(parent, hang - at, at, model.mass[k], principal, axes)
+            self.link.append(len(self.mass) - 1)
+            hang = model.distal[k]
+            _actuate(spec, parent, k, model)
+        m = self.m = spec.compile()
+        # After compiling: the compiler refuses massless bodies, and cannot adjust what it does not see.
+        m.body_mass[:] = self.mass
+        m.body_inertia[:] = self.inertia
+        d = self.d = mujoco.MjData(m)
+        mujoco.mj_setConst(m, d)
+        self.applied = np.zeros((m.nbody, 6))
+        self.applied[self.link, :3] = model.force
+        self.probe = mujoco.MjData(m)
+
+    def _body(
+        self, parent: Any, pos: Array, joint: Array, mass: float, inertia: Array, axes: Array = UPRIGHT
+    ) -> Any:
+        """A body on a ball joint, compiled with unit mass; ``mass`` and ``inertia`` are set afterwards."""
+        body = parent.add_body(
+            pos=pos, mass=1.0, inertia=np.ones(3), ipos=np.zeros(3), iquat=axes, explicitinertial=True
+        )
+        body.add_joint(type=mujoco.mjtJoint.mjJNT_BALL, pos=joint)
+        self.mass.append(mass)
+        self.inertia.append(inertia)
+        return body
+
+    def frames(self, state: State) -> tuple[Array, Array]:
+        """Quaternions (nbody, 4) of the engine's bodies; E (nbody, 3, nu): their ω = E ν, in own frames."""
+        rods = np.flatnonzero(self.model.rods)
+        q = np.zeros((self.m.nbody, 4))
+        q[0, 0] = 1
+        E = np.zeros((self.m.nbody, 3, 3 * (len(rods) + self.model.n)))
+        for k, b in enumerate(self.link):
+            q[b] = state.p[k]
+            E[b, :, 3 * (len(rods) + k) :][:, :3] = np.eye(3)
+        for j, (b, u) in enumerate(zip(np.array(self.link)[rods] - 1, state.u[rods], strict=True)):
+            q[b] = _hanging(u)
+            E[b, :, 3 * j : 3 * j + 3] = kinematics.rotation(q[b]).T @ np.cross(u, np.eye(3)).T
+        return q, E
+
+    def set(self, state: State) -> Array:
+        """Write a state; returns T (nv, nu)."""
+        m, d = self.m, self.d
+        q, E = self.frames(state)
+        up = m.body_parentid[1:]
+        turn = kinematics.rotation(kinematics.multiply(kinematics.conjugate(q[1:]), q[up]))  # R_bᵀ R_a
+        T = (E[1:] - turn @ E[up]).reshape(m.nv, -1)
+        nu = np.concatenate([state.udot[self.model.rods].ravel(), state.omega.ravel()])
+        mujoco.mj_resetData(m, d)
+        d.qpos = kinematics.multiply(kinematics.conjugate(q[up]), q[1:]).ravel()
+        d.qvel = T @ nu
+        d.xfrc_applied = self.applied
+        return np.asarray(T)
+
+    def quantities(self, state: State) -> StateQuantities:
+        """Everything the engine says of a state."""
+        m, d, link = self.m, self.d, self.link
+        T = self.set(state)
+        mujoco.mj_forward(m, d)
+        mujoco.mj_energyPos(m, d)
+        mujoco.mj_energyVel(m, d)
+        mujoco.mj_subtreeVel(m, d)
+        velocity = self._object(mujoco.mj_objectVelocity, d)
+        d.xfrc_applied[link, :3] -= self.model.drag_force[:, None] * velocity[:, 3:]
+        mujoco.mj_rnePostConstraint(m, d)
+        acceleration = self._object(mujoco.mj_objectAcceleration, d)
+        M = np.zeros((m.nv, m.nv))
+        mujoco.mj_fullM(m, d, M)
+        com, momentum = d.subtree_com[0], m.body_subtreemass[0] * d.subtree_linvel[0]
+        return StateQuantities(
+            acceleration=acceleration[:, 3:] + self.model.gravity,
+            angular_acceleration=_to_body(d.xmat[link], acceleration[:, :3]),
+            joint_reaction=d.cfrc_int[link, 3:].copy(),
+            kinetic_energy=float(d.energy[1]),
+            potential_energy=float(d.energy[0]),
+            angular_momentum=d.subtree_angmom[0] + np.cross(com, momentum),
+            mass_matrix=T.T @ M @ T,
+        )
+
+    def sample(self) -> tuple[Array, Array, Array, Array]:
+        """r, p, v, ṗ of the links; read in a second data, so that reading leaves no mark on the run."""
+        m, probe = self.m, self.probe
+        probe.qpos, probe.qvel = self.d.qpos, self.d.qvel
+        mujoco.mj_kinematics(m, probe)
+        mujoco.mj_comPos(m, probe)
+        mujoco.mj_comVel(m, probe)
+        velocity = self._object(mujoco.mj_objectVelocity, probe)
+        p = probe.xquat[self.link]
+        omega = _to_body(probe.xmat[self.link], velocity[:, :3])
+        return probe.xpos[self.link], p, velocity[:, 3:], kinematics.rate(p, omega)
+
+    def _object(self, of: Callable[..., None], data: Any) -> Array:
+        """``of`` (mj_objectVelocity, mj_objectAcceleration) of the links (N, 6), rotation first, world"""
+        out = np.empty((self.model.n, 6))
+        for k, b in enumerate(self.link):
+            of(self.m, data, mujoco.mjtObj.mjOBJ_BODY, b, out[k], 0)
+        return out
+
+
+def _actuate(spec: Any, body: Any, k: int, model: Model) -> None:
+    """n′ − c_r ω′ and −c_t ṙ of body k where they act: force = bias + rate · velocity along each axis."""
+    body.add_site(name=f"com{k}")
+    biases = np.concatenate([np.zeros(3), model.moment[k]])
+    rates = -np.repeat([model.drag_force[k], model.drag_moment[k]], 3)
+    for gear, bias, rate in zip(np.eye(6), biases, rates, strict=True):
+        if bias or rate:
+            spec.add_actuator(
+                trntype=mujoco.mjtTrn.mjTRN_SITE,
+                target=f"com{k}",
+                gear=gear,
+                gainprm=np.zeros(10),
+                biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+                biasprm=[bias, 0, rate, 0, 0, 0, 0, 0, 0, 0],
+            )
+
+
+def _principal(J: Array) -> tuple[Array, Array]:
+    """Principal inertias (3,) and the quaternion of their axes; a diagonal J stays as it is, unrounded.
+
+    MuJoCo's own diagonalisation of a full inertia is less accurate.
+    """
+    if not np.any(J - np.diag(np.diag(J))):
+        return np.diag(J), UPRIGHT
+    values, axes = np.linalg.eigh(J)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    q = np.empty(4)
+    mujoco.mju_mat2Quat(q, axes.ravel())
+    return values, q
+
+
+def _hanging(u: Array) -> Array:
+    """A unit quaternion that turns −z into u; which one, nothing feels: the rod may turn about its axis.
+
+    The shortest turn; for u above the horizontal after a half turn about y, away from its singularity.
+    """
+    x, y, z = u
+    q = np.array([1 - z, y, -x, 0] if z <= 0 else [-x, 0, 1 + z, -y])
+    return np.asarray(q / np.linalg.norm(q))
+
+
+def _to_body(xmat: Array, vector: Array) -> Array:
+    """Rᵀ v of each body: xmat (N, 9), vector (N, 3)."""
+    return np.asarray(np.einsum("kji,kj->ki", xmat.reshape(-1, 3, 3), vector))
+
+
+@contextmanager
+def _watched(d: Any) -> Iterator[None]:
+    """Any warning MuJoCo counts is a failure; its text goes into the error and not into a log file."""
+    texts: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(texts.append)
+    try:
+        yield
+    finally:
+        mujoco.set_mju_user_warning(before)
+    if texts or any(warning.number for warning in d.warning):
+        raise EngineFailure(f"MuJoCo warned by t = {d.time:g} s: {texts[0] if texts else 'no text'}")
