@@ -74,3 +74,42 @@ def joint_vectors(model: Model, r: Array, p: Array) -> Array:
     far = r + np.einsum("...kij,kj->...ki", a, model.distal)
     hang = np.concatenate([np.zeros_like(far[..., :1, :]), far[..., :-1, :]], -2)
     return np.asarray(near - hang)
+
+
+def velocity_map(model: Model, state: State) -> Array:
+    """Map W (6N, nu) of the minimal rates to the bodies': (v_0, ω′_0, v_1, ω′_1, …) = W ν.
+
+    ν = (udot of the rods in order, then omega of all bodies), as `StateQuantities.mass_matrix`
+    has it.  A rod moves its lower end by ℓ (u × udot) × u = ℓ (I − u uᵀ) udot, so the axial part of
+    udot moves nothing; a body's ω′ moves a point s of it by −A s̃ ω′ (world frame).  The kinetic
+    energy of the bodies is ½ νᵀ Wᵀ diag(m_k I, J_k) W ν: `mass_matrix`.
+    """
+    n, rods = model.n, np.flatnonzero(model.rods)
+    a = rotation(state.p)
+
+    def lever(s: Array) -> Array:
+        """−A s̃ (N, 3, 3): the velocity of point s of each body per ω′ of the body."""
+        return np.asarray(np.cross(s[:, None, :], a))  # row i: aᵢ·(ω′ × s) = (s × aᵢ)·ω′
+
+    prox, dist = lever(model.proximal), lever(model.distal)
+    out = np.zeros((n, 6, 3 * (len(rods) + n)))
+    tip = np.zeros((3, out.shape[-1]))  # velocity of where the next body hangs, as a function of ν
+    for k in range(n):
+        own = slice(3 * (len(rods) + k), 3 * (len(rods) + k) + 3)
+        if model.length[k] > 0:
+            rod = 3 * int(np.searchsorted(rods, k))
+            tip[:, rod : rod + 3] = model.length[k] * (np.eye(3) - np.outer(state.u[k], state.u[k]))
+        out[k, :3] = tip
+        out[k, :3, own] = -prox[k]
+        out[k, 3:, own] = np.eye(3)
+        tip = out[k, :3].copy()
+        tip[:, own] += dist[k]
+    return out.reshape(6 * n, -1)
+
+
+def mass_matrix(model: Model, state: State) -> Array:
+    """M (nu, nu) of `StateQuantities.mass_matrix` from the map W: Wᵀ diag(m_k I, J_k) W."""
+    w = velocity_map(model, state).reshape(model.n, 6, -1)
+    linear, angular = w[:, :3], w[:, 3:]
+    out = np.einsum("k,kia,kib->ab", model.mass, linear, linear)
+    return np.asarray(out + np.einsum("kia,kij,kjb->ab", angular, model.inertia, angular, optimize=True))

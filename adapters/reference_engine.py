@@ -1,0 +1,94 @@
+"""The notes as an engine among the others: `reference_impl` behind the contract.
+
+State: ṗ = ½ L(p)ᵀ ω′ on the way in; ω̇′ = 2 L(p) p̈ on the way out (L̇ ṗ = 0, N9).
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+
+from plumbline.adapter import Adapter
+from plumbline.kinematics import velocity_map
+from plumbline.records import Array, EngineFailure, Integrator, Model, State, StateQuantities, Trajectory
+from reference_impl.chain import Chain
+from reference_impl.errors import SingularSystem
+from reference_impl.euler_parameters import A, L, rate
+from reference_impl.integrate import integrate
+from reference_impl.system import System
+
+
+class Reference(Adapter):
+    """The notes' own system S x = b (N5) and first-order form (N6), raw."""
+
+    name: ClassVar[str] = "reference"
+    title: ClassVar[str] = "Reference (the notes)"
+    package: ClassVar[str] = "plumbline"
+    integrators: ClassVar[tuple[Integrator, ...]] = (
+        Integrator(
+            "dop853",
+            "tolerance",
+            8,
+            note="scipy's DOP853 on y = (r, p, ṙ, ṗ), no stabilisation; resolution is rtol, atol is rtol "
+            "times the natural size of each part of y",
+        ),
+    )
+
+    def version(self) -> str:
+        """Version of this checkout."""
+        project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
+        return str(project["project"]["version"])
+
+    def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
+        system = System(chain(model))
+        return [quantities(system, model, state) for state in states]
+
+    def _simulate(
+        self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
+    ) -> Trajectory:
+        pdot = rate(state.p, state.omega)
+        try:
+            run = integrate(chain(model), state.r, state.p, state.v, pdot, times, resolution)
+        except ArithmeticError as error:
+            raise EngineFailure(f"{self.title}: {error}") from error
+        return Trajectory(t=run.t, r=run.r, p=run.p, v=run.v, pdot=run.pdot, steps=run.steps)
+
+
+def chain(model: Model) -> Chain:
+    """The same chain in the notes' own type."""
+    return Chain(**{field.name: getattr(model, field.name) for field in fields(Chain)})
+
+
+def quantities(system: System, model: Model, state: State) -> StateQuantities:
+    """All that the notes say of one state."""
+    try:
+        x = system.solve(state.r, state.p, state.v, rate(state.p, state.omega))
+    except SingularSystem as error:
+        raise EngineFailure(f"{Reference.title}: {error}") from error
+    momentum = model.mass[:, None] * state.v
+    spin = (model.inertia @ state.omega[..., None])[..., 0]  # J ω′, body frame
+    world_spin = (A(state.p) @ spin[..., None])[..., 0]
+    return StateQuantities(
+        acceleration=x.acceleration,
+        angular_acceleration=2 * (L(state.p) @ x.pddot[..., None])[..., 0],
+        joint_reaction=x.joint_reaction,
+        kinetic_energy=float(np.sum(momentum * state.v) + np.sum(state.omega * spin)) / 2,
+        potential_energy=-float(np.sum(model.mass * (state.r @ model.gravity))),
+        angular_momentum=np.sum(np.cross(state.r, momentum) + world_spin, axis=0),
+        mass_matrix=notes_mass_matrix(system, model, state),
+    )
+
+
+def notes_mass_matrix(system: System, model: Model, state: State) -> Array:
+    """diag(M, 4 LᵀJL) of (N5) in the contract's rates: Zᵀ S_top Z with (ṙ, ṗ) = Z ν and ṗ = ½ Lᵀ ω′."""
+    n = model.n
+    S, _ = system.assemble(state.r, state.p, state.v, rate(state.p, state.omega))
+    bodies = velocity_map(model, state).reshape(n, 6, -1)
+    pdot = L(state.p).swapaxes(-1, -2) @ bodies[:, 3:] / 2
+    z = np.concatenate([bodies[:, :3].reshape(3 * n, -1), pdot.reshape(4 * n, -1)])
+    return np.asarray(z.T @ S[: 7 * n, : 7 * n] @ z)
