@@ -1,0 +1,125 @@
+"""What both Exudyn formulations share: settings, loads at a centre of mass, and a watched run."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import exudyn
+import numpy as np
+
+from plumbline.records import Array, EngineFailure, Model
+
+items: Any = exudyn.itemInterface  # its constructors are untyped
+
+Sample = tuple[Array, Array]  # coordinates and their rates as the engine holds them
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """A scratch working directory and no console output: Exudyn writes to both."""
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch, contextlib.chdir(scratch):
+        before = exudyn.config.printToConsole, exudyn.config.suppressWarnings
+        exudyn.config.printToConsole, exudyn.config.suppressWarnings = False, True
+        try:
+            yield
+        finally:
+            exudyn.config.printToConsole, exudyn.config.suppressWarnings = before
+
+
+def system() -> tuple[Any, Any]:
+    """An empty system and the container that keeps it alive."""
+    container = exudyn.SystemContainer()
+    return container.AddSystem(), container
+
+
+def settings() -> Any:
+    """Fixed steps, Newton to 1e-12, nothing written."""
+    chosen = exudyn.SimulationSettings()
+    chosen.solution.file.write = False
+    chosen.solution.sensors.active = False
+    time = chosen.timeIntegration
+    time.verboseMode = 0
+    time.adaptiveStep = False
+    time.automaticStepSize = False
+    time.newton.absoluteTolerance = time.newton.relativeTolerance = 1e-12
+    time.newton.maxIterations = 100  # its Jacobian leaves out C_qᵀλ's, so that taut rods converge linearly
+    return chosen
+
+
+def add_loads(mbs: Any, model: Model, k: int, marker: Any, ground: Any, moment: Array) -> None:
+    """Applied force (world), moment (marker's frame, turning with it) and drag at a centre-of-mass marker.
+
+    All are evaluated wherever the integrator evaluates forces.  Drag is a damper to the ground with
+    isotropic damping: F = -c_t ṙ, and -c_r ω in the world is -c_r ω′ in the body.
+    """
+    if np.any(model.force[k]):
+        mbs.AddLoad(items.LoadForceVector(markerNumber=marker, loadVector=model.force[k].tolist()))
+    if np.any(moment):
+        mbs.AddLoad(items.LoadTorqueVector(markerNumber=marker, loadVector=moment.tolist(), bodyFixed=True))
+    if model.drag_force[k] or model.drag_moment[k]:
+        damping = np.diag(np.repeat([model.drag_force[k], model.drag_moment[k]], 3))
+        mbs.AddObject(
+            items.ObjectConnectorRigidBodySpringDamper(
+                markerNumbers=[ground, marker], stiffness=np.zeros((6, 6)), damping=damping
+            )
+        )
+
+
+def run(
+    solver: Any,
+    mbs: Any,
+    chosen: Any,
+    times: Array,
+    step: float,
+    watch: Callable[[float, Array], None] | None = None,
+) -> list[Sample]:
+    """Coordinates and rates at ``times``, a row each; ``watch(t, coordinates)`` sees every step, may raise.
+
+    Raises EngineFailure with the engine's own words where a step fails, and where the number of
+    steps or the final time is not the one asked for: Exudyn reports an early stop as a success.
+    """
+    data = mbs.systemData
+    steps = round(float(times[-1] / step))
+    wanted = set(np.rint(times / step).astype(int).tolist())
+    rows = [(data.GetODE2Coordinates(), data.GetODE2Coordinates_t())]
+    if steps == 0:
+        return rows
+    taken = 0
+    stopped: Exception | None = None
+
+    def after_step(mbs: Any, t: float) -> bool:
+        nonlocal taken, stopped
+        if t == 0:  # it is called once before the first step
+            return True
+        taken += 1
+        if taken in wanted:
+            rows.append((data.GetODE2Coordinates(), data.GetODE2Coordinates_t()))
+        if watch is not None:
+            try:
+                watch(t, data.GetODE2Coordinates())
+            except Exception as error:  # carried around the engine, which would wrap it in its own
+                stopped = error
+                return False
+        return True
+
+    mbs.SetPostStepUserFunction(after_step)
+    chosen.timeIntegration.numberOfSteps = steps
+    chosen.timeIntegration.endTime = float(times[-1])
+    try:
+        finished = solver.SolveSystem(mbs, chosen)
+    except (RuntimeError, ValueError, exudyn.ExudynError) as error:
+        raise EngineFailure(f"Exudyn stopped after {taken} of {steps} steps: {error}") from error
+    finally:
+        mbs.SetPostStepUserFunction(0)
+    if stopped is not None:
+        raise stopped
+    end = data.GetTime()
+    if not finished or taken != steps or abs(end - times[-1]) > 1e-9 * times[-1]:
+        words = " ".join(str(solver.GetErrorString()).split()) or "no reason given"
+        raise EngineFailure(
+            f"Exudyn stopped at t = {end} s after {taken} steps, asked for {steps} to {times[-1]} s: {words}"
+        )
+    return rows
