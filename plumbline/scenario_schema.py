@@ -303,12 +303,12 @@ class Load(Part):
     """Constant loads on a body."""
 
     force: Vector = Field(
-        [0.0, 0.0, 0.0],
+        default=[0.0, 0.0, 0.0],
         description="Force at the centre of mass, constant in the world frame.",
         json_schema_extra={"unit": "N"},
     )
     moment: Vector = Field(
-        [0.0, 0.0, 0.0],
+        default=[0.0, 0.0, 0.0],
         description="Moment, constant in the body's frame (the notes' n′): it turns with the body.",
         json_schema_extra={"unit": "N m"},
     )
@@ -318,13 +318,13 @@ class Drag(Part):
     """Linear drag on a body."""
 
     force: float = Field(
-        0.0,
+        default=0.0,
         ge=0,
         description="c_t ≥ 0: the force −c_t ṙ at the centre of mass.",
         json_schema_extra={"unit": "N s/m"},
     )
     moment: float = Field(
-        0.0, ge=0, description="c_r ≥ 0: the moment −c_r ω′.", json_schema_extra={"unit": "N m s"}
+        default=0.0, ge=0, description="c_r ≥ 0: the moment −c_r ω′.", json_schema_extra={"unit": "N m s"}
     )
 
 
