@@ -1,0 +1,310 @@
+"""Certified truth at one state: the notes' system enclosed in ball arithmetic (python-flint).
+
+Starts from the minimal state (p, ω′, u, u̇ as doubles), normalises and lifts it exactly and solves for the
+joint forces: eliminated onto the joints the system is symmetric, positive definite and block-tridiagonal,
+so a chain costs O(N).  With s̃ the cross-product matrix and s, I in world axes, a body's point mobility is
+
+    Y(s, t) = 1/m − s̃ I⁻¹ t̃        (force at t → acceleration at s)
+
+and joint k, E = I for a ball and u for a rod, gives  E_kᵀ d̈_k = −ℓ u̇² (rod) or 0 (ball), F_k = E_k λ_k.
+All quantities come back with a radius that encloses every rounding made on the way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from plumbline.records import Array, Model, State, StateQuantities
+from plumbline.truth import tool
+
+RADIUS = 1e-25  # relative to the largest magnitude of the quantity's own terms
+MAX_BITS = 20_000
+
+
+class NotCertified(ArithmeticError):
+    """No finite enclosure was found: the system is singular at this state, or nearly so."""
+
+
+@dataclass(frozen=True, eq=False)
+class Certified:
+    """State quantities whose error is known.
+
+    ``quantities`` are the enclosures' midpoints rounded to double; ``radius`` holds per quantity the largest
+    distance from the truth, that last rounding excluded (it adds half a unit in the last place);
+    ``tension`` (N,) N is each rod's, 2 ℓ λ of the notes (E5), positive when it pulls, 0 for a ball joint;
+    ``bits`` the precision that was needed.
+    """
+
+    quantities: StateQuantities
+    tension: Array
+    radius: dict[str, float]
+    bits: int
+
+
+def rod_multiplier(model: Model, certified: Certified) -> Array:
+    """λ (N,) N/m of the notes' C = dᵀd per rod (E5: tension = 2 ℓ λ), 0 for ball joints."""
+    return np.where(model.rods, certified.tension / (2 * np.where(model.rods, model.length, 1.0)), 0.0)
+
+
+def certify(model: Model, state: State, mass_matrix: bool = False, bits: int = 200) -> Certified:
+    """Rigorous state quantities, SI units, frames as in `StateQuantities`.
+
+    Precision is raised from ``bits`` until every radius is below 1e-25 of its quantity's terms.
+    Raises TruthUnavailable without python-flint, NotCertified where the system is singular.
+    """
+    while bits <= MAX_BITS:
+        balls = enclose(model, state, bits, mass_matrix)
+        if balls is not None and all(_sharp(name, balls) for name in balls if name != "scale"):
+            break
+        bits = bits * 3 // 2
+    else:
+        raise NotCertified(
+            f"no enclosure below {RADIUS:g} relative at {MAX_BITS} bits: singular or nearly so"
+        )
+    quantities = {name: ball for name, ball in balls.items() if name != "scale"}
+    middle = {name: _doubles(ball) for name, ball in quantities.items()}
+    radius = {name: max(float(x.rad()) for x in _flat(ball)) for name, ball in quantities.items()}
+    answer = StateQuantities(
+        acceleration=middle["acceleration"],
+        angular_acceleration=middle["angular_acceleration"],
+        joint_reaction=middle["joint_reaction"],
+        kinetic_energy=float(middle["kinetic_energy"][0]),
+        potential_energy=float(middle["potential_energy"][0]),
+        angular_momentum=middle["angular_momentum"],
+    )
+    if mass_matrix:
+        answer = replace(answer, mass_matrix=middle["mass_matrix"])
+    return Certified(answer, middle["tension"], radius, bits)
+
+
+def enclose(model: Model, state: State, bits: int, mass_matrix: bool = False) -> dict[str, Any] | None:
+    """Enclosures (python-flint ``arb``) of every quantity at ``bits``, None where an inverse had none.
+
+    Vectors per body are lists of N lists of 3, scalars lists of one; "scale" holds the sizes, as floats,
+    that radii are compared with.
+    """
+    flint = tool("flint")
+    with flint.ctx.workprec(bits):
+        try:
+            return _solve(_Chain(flint, model, state), mass_matrix)
+        except ZeroDivisionError:
+            return None
+
+
+class _Chain:
+    """The model and state in balls, world axes: every vector a 3×1 ``arb_mat``."""
+
+    def __init__(self, flint: Any, model: Model, state: State) -> None:
+        self.flint, self.model, self.n = flint, model, model.n
+        self.mat, self.arb = flint.arb_mat, flint.arb
+        self.A = [self.rotation(p) for p in state.p]
+        self.m = [self.arb(float(m)) for m in model.mass]
+        self.ell = [self.arb(float(length)) for length in model.length]
+        self.J = [self.matrix(J) for J in model.inertia]
+        self.w_body = [self.vector(w) for w in state.omega]
+        self.w = [a * w for a, w in zip(self.A, self.w_body, strict=True)]
+        self.sp = [a * self.vector(s) for a, s in zip(self.A, model.proximal, strict=True)]
+        self.sd = [a * self.vector(s) for a, s in zip(self.A, model.distal, strict=True)]
+        self.I = [a * J * a.transpose() for a, J in zip(self.A, self.J, strict=True)]
+        self.I_inverse = [a * J.inv() * a.transpose() for a, J in zip(self.A, self.J, strict=True)]
+        self.g = self.vector(model.gravity)
+        self.zero = self.vector((0.0, 0.0, 0.0))
+        self.eye = self.matrix(np.eye(3))
+        self.u, self.udot = [], []
+        for k in range(self.n):
+            u, udot = self.zero, self.zero
+            if model.rods[k]:
+                u, udot = self.vector(state.u[k]), self.vector(state.udot[k])
+                u = u * (1 / self.dot(u, u).sqrt())
+                udot = udot - u * self.dot(u, udot)
+            self.u.append(u)
+            self.udot.append(udot)
+        self.r, self.v = self.lifted()
+
+    def vector(self, v: Iterable[float]) -> Any:
+        return self.mat(3, 1, [self.arb(float(x)) for x in v])
+
+    def matrix(self, m: Array) -> Any:
+        return self.mat(3, 3, [self.arb(float(x)) for x in np.ravel(m)])
+
+    def cross(self, a: Any) -> Any:
+        """ã: ã b = a × b."""
+        x, y, z = a[0, 0], a[1, 0], a[2, 0]
+        return self.mat(3, 3, [0, -z, y, z, 0, -x, -y, x, 0])
+
+    @staticmethod
+    def dot(a: Any, b: Any) -> Any:
+        return a[0, 0] * b[0, 0] + a[1, 0] * b[1, 0] + a[2, 0] * b[2, 0]
+
+    def rotation(self, p: Array) -> Any:
+        """A (N7) of the normalised quaternion: the homogeneous quadratic form over pᵀp."""
+        w, x, y, z = (self.arb(float(c)) for c in p)
+        ww, xx, yy, zz = w * w, x * x, y * y, z * z
+        entries = [
+            [ww + xx - yy - zz, 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), ww - xx + yy - zz, 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), ww - xx - yy + zz],
+        ]
+        return self.mat(entries) * (1 / (ww + xx + yy + zz))
+
+    def lifted(self) -> tuple[list[Any], list[Any]]:
+        """Centres of mass and their velocities, from the pivot outwards."""
+        tip, tip_v, r, v = self.zero, self.zero, [], []
+        for k in range(self.n):
+            w = self.cross(self.w[k])
+            r.append(tip + self.u[k] * self.ell[k] - self.sp[k])
+            v.append(tip_v + self.udot[k] * self.ell[k] - w * self.sp[k])
+            tip, tip_v = r[k] + self.sd[k], v[k] + w * self.sd[k]
+        return r, v
+
+
+def _solve(c: _Chain, mass_matrix: bool) -> dict[str, Any]:
+    """Block elimination along the chain, then accelerations, energies and momentum."""
+    model, n = c.model, c.n
+    free, turn, near, far, Ypp, Ypd, Ydd = [], [], [], [], [], [], []
+    for k in range(n):
+        force = c.vector(model.force[k]) - c.v[k] * c.arb(float(model.drag_force[k])) + c.g * c.m[k]
+        moment = c.A[k] * c.vector(model.moment[k]) - c.w[k] * c.arb(float(model.drag_moment[k]))
+        w, sp, sd = c.cross(c.w[k]), c.cross(c.sp[k]), c.cross(c.sd[k])
+        free.append(force * (1 / c.m[k]))
+        turn.append(c.I_inverse[k] * (moment - w * (c.I[k] * c.w[k])))
+        near.append(free[k] - sp * turn[k] + w * (w * c.sp[k]))
+        far.append(free[k] - sd * turn[k] + w * (w * c.sd[k]))
+        by_m = c.eye * (1 / c.m[k])
+        Ypp.append(by_m - sp * c.I_inverse[k] * sp)
+        Ypd.append(by_m - sp * c.I_inverse[k] * sd)
+        Ydd.append(by_m - sd * c.I_inverse[k] * sd)
+
+    # K λ = e: forward elimination, back-substitution
+    E = [c.u[k] if model.rods[k] else c.eye for k in range(n)]
+    pivot: list[Any] = []
+    rhs: list[Any] = []
+    off: list[Any] = []
+    for k in range(n):
+        D, e = Ypp[k], near[k] * -1
+        if k:
+            D, e = D + Ydd[k - 1], e + far[k - 1]
+        D, e = E[k].transpose() * D * E[k], E[k].transpose() * e
+        if model.rods[k]:
+            e = e - c.mat(1, 1, [c.ell[k] * c.dot(c.udot[k], c.udot[k])])
+        if k:
+            off.append((E[k - 1].transpose() * Ypd[k - 1] * E[k]) * -1)
+            gain = off[-1].transpose() * pivot[-1]
+            D, e = D - gain * off[-1], e - gain * rhs[-1]
+        pivot.append(D.inv())
+        rhs.append(e)
+    F: list[Any] = [None] * n
+    multiplier = None
+    for k in reversed(range(n)):
+        e = rhs[k] if multiplier is None else rhs[k] - off[k] * multiplier
+        multiplier = pivot[k] * e
+        F[k] = E[k] * multiplier
+
+    acceleration, angular, kinetic, potential, momentum = [], [], c.arb(0), c.arb(0), c.zero
+    for k in range(n):
+        below = F[k + 1] if k + 1 < n else c.zero
+        acceleration.append(free[k] + (F[k] - below) * (1 / c.m[k]))
+        alpha = turn[k] + c.I_inverse[k] * (c.cross(c.sp[k]) * F[k] - c.cross(c.sd[k]) * below)
+        angular.append(c.A[k].transpose() * alpha)
+        spin = c.I[k] * c.w[k]
+        kinetic += (c.m[k] * c.dot(c.v[k], c.v[k]) + c.dot(c.w[k], spin)) / 2
+        potential -= c.m[k] * c.dot(c.g, c.r[k])
+        momentum += c.cross(c.r[k]) * c.v[k] * c.m[k] + spin
+    balls: dict[str, Any] = {
+        "acceleration": [_list(a) for a in acceleration],
+        "angular_acceleration": [_list(a) for a in angular],
+        "joint_reaction": [_list(f) for f in F],
+        "kinetic_energy": [kinetic],
+        "potential_energy": [potential],
+        "angular_momentum": _list(momentum),
+        "tension": [-c.dot(c.u[k], F[k]) for k in range(n)],
+        "r": [_list(r) for r in c.r],
+        "v": [_list(v) for v in c.v],
+    }
+    if mass_matrix:
+        balls["mass_matrix"] = _mass_matrix(c)
+    return balls | {"scale": _scale(c, balls)}
+
+
+def _mass_matrix(c: _Chain) -> list[list[Any]]:
+    """M (nu, nu) of `StateQuantities.mass_matrix`: the velocity of centre b is Σ T_bi ν_i.
+
+    T_bi is the same, c_i, for every body below i, so with μ_j the mass below j and i < j,
+    M_ij = c_iᵀ (m_j T_jj + μ_j c_j).
+    """
+    rods = [k for k in range(c.n) if c.model.rods[k]]
+    below = [sum(c.m[k + 1 :], c.arb(0)) for k in range(c.n)]
+    turn = [c.A[k] for k in range(c.n)]
+    bent = [c.cross(c.u[k]) for k in range(c.n)]
+    # per column: its body, what it gives to the centres below, and to the body's own
+    slides = [(k, bent[k] * bent[k] * -c.ell[k]) for k in rods]
+    columns = [(k, slide, slide) for k, slide in slides] + [
+        (k, (c.cross(c.sp[k]) - c.cross(c.sd[k])) * turn[k], c.cross(c.sp[k]) * turn[k]) for k in range(c.n)
+    ]
+    size = 3 * len(columns)
+    M = [[c.arb(0)] * size for _ in range(size)]
+    for i, (bi, carried_i, own_i) in enumerate(columns):
+        for j, (bj, carried_j, own_j) in enumerate(columns):
+            if bj < bi:
+                continue
+            at_j = own_i if bi == bj else carried_i
+            block = at_j.transpose() * own_j * c.m[bj] + carried_i.transpose() * carried_j * below[bj]
+            if i == j and i >= len(rods):
+                block = block + c.J[bi]
+            for row in range(3):
+                for column in range(3):
+                    M[3 * i + row][3 * j + column] = block[row, column]
+                    M[3 * j + column][3 * i + row] = block[row, column]
+    return M
+
+
+def _scale(c: _Chain, balls: dict[str, Any]) -> dict[str, float]:
+    """Sizes of each quantity's own terms: radii are compared with them, so an exact zero may come out."""
+    model = c.model
+    norm = np.linalg.norm
+    lever = float(np.sum(norm(model.proximal, axis=1) + norm(model.distal, axis=1) + model.length))
+    spins = c.w + [c.cross(c.u[k]) * c.udot[k] for k in range(c.n)]
+    rate = float(np.max(norm(_doubles([_list(w) for w in spins]), axis=1)))
+    g = float(norm(model.gravity))
+    size = {name: float(np.max(np.abs(_doubles(ball)))) for name, ball in balls.items()}
+    a = max(size["acceleration"], g, rate**2 * lever)
+    mass, inertia = float(np.sum(model.mass)), float(np.sum(norm(model.inertia, axis=(1, 2))))
+    force = max(size["joint_reaction"], mass * a)
+    return {
+        "acceleration": a,
+        "angular_acceleration": max(size["angular_acceleration"], rate**2, a / lever if lever else 0.0),
+        "joint_reaction": force,
+        "tension": force,
+        "kinetic_energy": size["kinetic_energy"],
+        "potential_energy": max(size["potential_energy"], mass * g * lever),
+        "angular_momentum": max(size["angular_momentum"], (mass * lever**2 + inertia) * rate),
+        "r": max(size["r"], lever),
+        "v": max(size["v"], lever * rate),
+        "mass_matrix": size.get("mass_matrix", 0.0),
+    }
+
+
+def _sharp(name: str, balls: dict[str, Any]) -> bool:
+    """Whether every radius of the quantity is small enough (an infinite or NaN one is not)."""
+    return all(float(x.rad()) <= RADIUS * balls["scale"][name] for x in _flat(balls[name]))
+
+
+def _list(v: Any) -> list[Any]:
+    """The three balls of a 3×1 matrix."""
+    return list(v.entries())
+
+
+def _flat(ball: list[Any]) -> list[Any]:
+    """All balls of a list or of a list of lists."""
+    return [x for row in ball for x in row] if isinstance(ball[0], list) else ball
+
+
+def _doubles(ball: list[Any]) -> Array:
+    """Midpoints rounded to double, in the ball list's shape."""
+    return np.array(
+        [[float(x.mid()) for x in row] if isinstance(row, list) else float(row.mid()) for row in ball]
+    )

@@ -1,0 +1,70 @@
+"""Random pendulums and states for the tests: full inertia tensors, offset attachments, any mix of joints."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from plumbline.kinematics import lift
+from plumbline.records import Array, Model, State
+
+
+def random_chain(
+    rng: np.random.Generator,
+    rods: list[bool] | list[int],
+    decades: float = 0.0,
+    rate: float = 2.0,
+    loads: bool = False,
+    drag: bool = False,
+) -> tuple[Model, State]:
+    """A chain with these joints; masses log-uniform over ± ``decades``, rates Gaussian of size ``rate``."""
+    n, held = len(rods), np.array(rods, dtype=bool)[:, None]
+    mass = 10 ** rng.uniform(-decades, decades, n)
+    axes = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+    size = rng.uniform(0.1, 0.6, (n, 3)) ** 2
+    principal = mass[:, None] / 5 * (size.sum(1, keepdims=True) - size)  # ellipsoids: always physical
+    inertia = axes @ (principal[..., None] * axes.mT)
+    model = Model(
+        mass=mass,
+        inertia=(inertia + inertia.mT) / 2,
+        proximal=0.3 * rng.normal(size=(n, 3)),
+        distal=0.3 * rng.normal(size=(n, 3)) * (np.arange(n) < n - 1)[:, None],
+        length=np.where(held[:, 0], rng.uniform(0.2, 1.0, n), 0.0),
+        gravity=np.array([0.0, 0.0, -9.81]),
+        force=loads * mass[:, None] * rng.normal(size=(n, 3)),
+        moment=loads * mass[:, None] * rng.normal(size=(n, 3)),
+        drag_force=drag * mass * rng.uniform(0, 1, n),
+        drag_moment=drag * mass * rng.uniform(0, 0.1, n),
+    )
+    p = rng.normal(size=(n, 4))
+    p /= np.linalg.norm(p, axis=1, keepdims=True)
+    u = rng.normal(size=(n, 3))
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    udot = np.cross(rate * rng.normal(size=(n, 3)), u)
+    state = lift(model, p, rate * rng.normal(size=(n, 3)), np.where(held, u, 0.0), np.where(held, udot, 0.0))
+    return model, state
+
+
+def rescaled(model: Model, state: State, length: float, mass: float, time: float) -> tuple[Model, State]:
+    """The same pendulum with lengths, masses and times measured in other units (values multiplied)."""
+    force = mass * length / time**2
+    scaled = replace(
+        model,
+        mass=model.mass * mass,
+        inertia=model.inertia * mass * length**2,
+        proximal=model.proximal * length,
+        distal=model.distal * length,
+        length=model.length * length,
+        gravity=model.gravity * length / time**2,
+        force=model.force * force,
+        moment=model.moment * force * length,
+        drag_force=model.drag_force * mass / time,
+        drag_moment=model.drag_moment * mass * length**2 / time,
+    )
+    return scaled, lift(scaled, state.p, state.omega / time, state.u, state.udot / time)
+
+
+def norms(difference: Array) -> Array:
+    """Euclidean norm per body."""
+    return np.asarray(np.linalg.norm(difference, axis=-1))
