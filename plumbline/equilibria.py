@@ -53,7 +53,7 @@ def _turn(p: Any, s: Any) -> Any:
 
 
 def _moved(p: Any, u: Any, step: Any) -> tuple[Any, Any]:
-    """(p, u) after a small step (6 N): rotation vectors of the bodies, displacements of the rods' directions."""
+    """(p, u) after a small step (6 N): turns of the bodies, shifts of the rods' directions."""
     turn, shift = step.reshape(2, -1, 3)
     w, e = p[:, :1], p[:, 1:]
     new = np.concatenate(
