@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import tempfile
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, TypeVar
 
 import exudyn
 import numpy as np
@@ -14,7 +14,7 @@ from plumbline.records import Array, EngineFailure, Model
 
 items: Any = exudyn.itemInterface  # its constructors are untyped
 
-Sample = tuple[Array, Array]  # coordinates and their rates as the engine holds them
+Row = TypeVar("Row")
 
 
 @contextlib.contextmanager
@@ -74,17 +74,17 @@ def run(
     chosen: Any,
     times: Array,
     step: float,
-    watch: Callable[[float, Array], None] | None = None,
-) -> list[Sample]:
-    """Coordinates and rates at ``times``, a row each; ``watch(t, coordinates)`` sees every step, may raise.
+    read: Callable[[], Row],
+    watch: Callable[[float], None] | None = None,
+) -> list[Row]:
+    """What ``read`` finds at each of ``times``; ``watch(t)`` is called after every step and may raise.
 
     Raises EngineFailure with the engine's own words where a step fails, and where the number of
     steps or the final time is not the one asked for: Exudyn reports an early stop as a success.
     """
-    data = mbs.systemData
     steps = round(float(times[-1] / step))
     wanted = set(np.rint(times / step).astype(int).tolist())
-    rows = [(data.GetODE2Coordinates(), data.GetODE2Coordinates_t())]
+    rows = [read()]
     if steps == 0:
         return rows
     taken = 0
@@ -95,15 +95,14 @@ def run(
         if t == 0:  # it is called once before the first step
             return True
         taken += 1
-        if taken in wanted:
-            rows.append((data.GetODE2Coordinates(), data.GetODE2Coordinates_t()))
-        if watch is not None:
-            try:
-                watch(t, data.GetODE2Coordinates())
-            except Exception as error:  # carried around the engine, which would wrap it in its own
-                stopped = error
-                return False
-        return True
+        try:
+            if watch is not None:
+                watch(t)
+            if taken in wanted:
+                rows.append(read())
+        except Exception as error:  # carried around the engine, which would wrap it in one of its own
+            stopped = error
+        return stopped is None
 
     mbs.SetPostStepUserFunction(after_step)
     chosen.timeIntegration.numberOfSteps = steps
@@ -112,11 +111,9 @@ def run(
         finished = solver.SolveSystem(mbs, chosen)
     except (RuntimeError, ValueError, exudyn.ExudynError) as error:
         raise EngineFailure(f"Exudyn stopped after {taken} of {steps} steps: {error}") from error
-    finally:
-        mbs.SetPostStepUserFunction(0)
     if stopped is not None:
         raise stopped
-    end = data.GetTime()
+    end = mbs.systemData.GetTime()
     if not finished or taken != steps or abs(end - times[-1]) > 1e-9 * times[-1]:
         words = " ".join(str(solver.GetErrorString()).split()) or "no reason given"
         raise EngineFailure(

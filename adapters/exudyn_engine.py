@@ -111,7 +111,15 @@ class Exudyn(Adapter):
             alpha.spectralRadius = 0.9
         with quiet():
             chain = Chain(model, state)
-            rows = run(exudyn.MainSolverImplicitSecondOrder(), chain.mbs, chosen, times, resolution)
+            data = chain.mbs.systemData
+            rows = run(
+                exudyn.MainSolverImplicitSecondOrder(),
+                chain.mbs,
+                chosen,
+                times,
+                resolution,
+                lambda: (data.GetODE2Coordinates(), data.GetODE2Coordinates_t()),
+            )
         start = np.concatenate([state.r, state.p], axis=1)
         q = start + np.array([row[0] for row in rows]).reshape(-1, model.n, 7)
         qdot = np.array([row[1] for row in rows]).reshape(-1, model.n, 7)
