@@ -7,6 +7,7 @@ S. P. Nørsett, G. Wanner, Solving Ordinary Differential Equations I, II.9.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,7 +17,7 @@ from plumbline.records import Array, Integrator
 
 ORDER_MARGIN = 0.1  # two orders closer than this are the same order (verification.md)
 ABOVE_FLOOR = 32.0  # a difference this far above rounding shows its order to 0.05: log2(1 + 1/32)
-LADDER = {1: (9, 14), 2: (8, 12), 4: (7, 11)}  # order: coarsest and finest step, as -log2 of seconds
+LADDER = {1: (9, 15), 2: (8, 12), 4: (7, 12)}  # order: coarsest and finest step, as -log2 of seconds
 BODY_STEPS = 2**20  # most steps × bodies of the finest run of the quick form
 RTOLS = (1e-7, 1e-9, 1e-11, 1e-13)  # the ladder of an adaptive method; below 1e-13 is rounding
 
@@ -59,14 +60,14 @@ def observed_order(ys: Sequence[Array], floor: float) -> Order:
     counts only above `ABOVE_FLOOR` times it, where rounding changes an order by less than half the
     margin.  The finest pair of consecutive orders that agree is the asymptotic range.
     """
-    differences = [largest(a - b) for a, b in zip(ys[:-1], ys[1:], strict=True)]
+    differences = [largest(a - b) for a, b in itertools.pairwise(ys)]
     orders = []
-    for coarse, fine in zip(differences[:-1], differences[1:], strict=True):
+    for coarse, fine in itertools.pairwise(differences):
         usable = np.isfinite(coarse) and fine > ABOVE_FLOOR * floor
         orders.append(float(np.log2(coarse / fine)) if usable else np.nan)
     at_floor = all(d <= ABOVE_FLOOR * floor for d in differences)
     pairs = [
-        (a, b) for a, b in zip(orders[:-1], orders[1:], strict=True) if abs(a - b) <= ORDER_MARGIN
+        (a, b) for a, b in itertools.pairwise(orders) if abs(a - b) <= ORDER_MARGIN
     ]  # NaN compares false
     if pairs:
         return Order(pairs[-1][1], True, False, tuple(orders), tuple(differences))
@@ -100,7 +101,7 @@ def romberg(ys: Sequence[Array], powers: Sequence[int]) -> Limit:
     for m, power in enumerate(powers[: len(usable) - 2], start=1):
         factor = 2.0**power - 1.0
         column = [
-            fine + (fine - coarse) / factor for coarse, fine in zip(column[:-1], column[1:], strict=True)
+            fine + (fine - coarse) / factor for coarse, fine in itertools.pairwise(column)
         ]
         candidate = _limit(column, m)
         if candidate.uncertainty[-1] < best.uncertainty[-1]:

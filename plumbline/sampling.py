@@ -16,7 +16,7 @@ def seed_of(*parts: str) -> int:
 
 
 def random_states(model: Model, count: int, seed: int) -> list[State]:
-    """``count`` states of the model's geometry: attitudes and rod directions uniform, rates from slow to fast.
+    """``count`` states of the model's geometry: attitudes and rod directions uniform, rates slow to fast.
 
     Rates are Gaussian with a standard deviation drawn per state, log-uniform from a tenth to
     four times the pendulum's own rate √(g/ℓ), so that gravity dominates in some states and the

@@ -21,6 +21,7 @@ from plumbline.registry import adapter
 from plumbline.sampling import seed_of
 
 FINE, COARSE = 1e-13, 3e-13  # relative tolerances of the truth's two runs
+ROUNDING = 1e3 * 2.0**-52  # of a whole run, before growth: trials saw at most 115 ε G (verification.md)
 PART = 1e-4  # a mistake of this relative size in a parameter must be visible, or the verdict is unresolved
 
 

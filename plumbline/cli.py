@@ -1,0 +1,348 @@
+"""The command line: `python -m plumbline`."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import sys
+import tempfile
+from collections.abc import Callable, Iterable
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from plumbline import scenario as scenarios
+from plumbline.problems import ScenarioError
+from plumbline.registry import ENGINES
+from plumbline.run import Plan, Result, describe_all, execute, save
+from plumbline.store import plain, row_record
+from plumbline.workers import Limits, Workers
+
+DEFAULT_OUT = Path("reports") / "out"
+EXIT_CODES = """
+\b
+Exit codes:
+  0  everything agrees, or differs as recorded in plumbline/known.yaml
+  1  a disagreement, or a cell unresolved or unsupported that is not recorded
+  2  bad usage or a bad scenario file
+  3  an engine failed: raised, crashed, hung, ran out of memory, was not finite
+An engine that is not installed is a verdict and changes no exit code.
+"""
+
+
+class Group(click.Group):
+    """Bad usage suggests the nearest command."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Name the nearest command where there is none of that name."""
+        if args and args[0] not in self.commands:
+            near = get_close_matches(args[0], self.commands, 1)
+            hint = f" Did you mean {near[0]!r}?" if near else f" There are: {', '.join(self.commands)}."
+            raise click.UsageError(f"no command {args[0]!r}.{hint}")
+        return super().resolve_command(ctx, args)
+
+
+@click.group(cls=Group, epilog=EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]})
+def main() -> None:
+    r"""Run identical pendulums through the notes' equations and multibody engines, and say who is wrong.
+
+    \b
+    Start with:
+      python -m plumbline list scenarios
+      python -m plumbline run double-tumbling-balls
+      python -m plumbline run                  (everything; a few minutes)
+    """
+
+
+@main.command("list")
+@click.argument("what", type=click.Choice(["scenarios", "engines"]))
+@click.option("--json", "as_json", is_flag=True, help="JSON on stdout, for other programs.")
+def list_(what: str, as_json: bool) -> None:
+    """List the scenarios of the catalogue, or the engines with their versions and integrators."""
+    records = list_scenarios() if what == "scenarios" else list_engines()
+    if as_json:
+        click.echo(json.dumps(records, ensure_ascii=False, indent=1))
+        return
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in records[0]:
+        if column not in ("purpose", "file"):
+            table.add_column(column, overflow="fold")
+    for record in records:
+        table.add_row(
+            *(
+                ", ".join(v) if isinstance(v, list) else str(v)
+                for k, v in record.items()
+                if k not in ("purpose", "file")
+            )
+        )
+    console(sys.stdout).print(table)
+
+
+def list_scenarios() -> list[dict[str, Any]]:
+    """One record per scenario of the catalogue."""
+    found = scenarios.load_many(scenarios.catalogue())
+    return [
+        {
+            "name": s.name,
+            "family": s.family,
+            "bodies": s.model.n,
+            "title": s.title,
+            "purpose": s.purpose,
+            "file": str(s.path),
+        }
+        for s in found
+    ]
+
+
+def list_engines() -> list[dict[str, Any]]:
+    """One record per engine of the registry, asked in worker processes."""
+    with Workers(1) as workers:
+        found = describe_all(workers, list(ENGINES))
+    return [
+        {
+            "name": name,
+            "title": info.title,
+            "version": info.version or "not installed",
+            "integrators": [i.name for i in info.integrators],
+        }
+        for name, info in found.items()
+    ]
+
+
+@main.command(epilog=EXIT_CODES)
+@click.argument("names", nargs=-1, metavar="[SCENARIO]...")
+@click.option("--family", "families", multiple=True, help="Only scenarios of this family (may be repeated).")
+@click.option("--engine", "engines", multiple=True, help="Only this engine (may be repeated). Default: all.")
+@click.option(
+    "--level",
+    type=click.Choice(["state", "trajectory", "all"]),
+    default="all",
+    show_default=True,
+    help="state: accelerations, reactions, energies at 51 states. trajectory: orders, limits, drifts.",
+)
+@click.option("--jobs", type=click.IntRange(1), default=None, help="Worker processes. Default: one per core.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=DEFAULT_OUT, show_default=True, help="Output folder."
+)
+@click.option("--json", "as_json", is_flag=True, help="The rows as JSON on stdout instead of the table.")
+@click.option(
+    "--accept",
+    type=click.FloatRange(0, min_open=True),
+    default=None,
+    help="Your own relative tolerance, shown beside each derived verdict, never in its place.",
+)
+@click.option(
+    "--timeout",
+    type=click.FloatRange(0, min_open=True),
+    default=300.0,
+    show_default=True,
+    help="Seconds per task.",
+)
+@click.option(
+    "--memory", type=click.FloatRange(0, min_open=True), default=8.0, show_default=True, help="GB per worker."
+)
+def run(
+    names: tuple[str, ...], families: tuple[str, ...], engines: tuple[str, ...], level: Any, jobs: int | None,
+    out: Path, as_json: bool, accept: float | None, timeout: float, memory: float,
+) -> None:  # fmt: skip
+    r"""Compare scenarios (names of the catalogue, or paths of YAML files; default: all) on all engines.
+
+    \b
+    Examples:
+      python -m plumbline run                                    everything
+      python -m plumbline run double-tumbling-balls --engine mujoco
+      python -m plumbline run --family chain --level state
+      python -m plumbline run my-pendulum.yaml --out results --json | jq .sentence
+    """
+    chosen = choose_scenarios(names, families)
+    chosen_engines = choose_engines(engines)
+    folder = writable(out)
+    whole = not names and not families and not engines and level == "all"
+    plan = Plan(
+        chosen,
+        chosen_engines,
+        level,
+        jobs or os.cpu_count() or 1,
+        Limits(timeout, memory),
+        accept=accept,
+        whole=whole,
+    )
+    with progress_to(sys.stderr) as progress:
+        result = execute(plan, progress)
+    save(result, folder, shlex.join(["python", "-m", "plumbline", *sys.argv[1:]]))
+    from reports import junit, page, step_summary
+
+    report = page.write(folder)
+    junit.write(folder)
+    step_summary.write(folder)
+    if as_json:
+        document = {
+            "run": result.run,
+            "sentence": result.run["sentence"],
+            "rows": [row_record(r) for r in result.rows],
+        }
+        click.echo(json.dumps(plain(document), ensure_ascii=False, indent=1))
+    else:
+        tell(result)
+    click.echo(f"report: {report}", err=as_json)
+    sys.exit(result.run["exit_code"])
+
+
+@main.command()
+@click.argument("files", nargs=-1, required=True, metavar="FILE...", type=click.Path(path_type=Path))
+def check(files: tuple[Path, ...]) -> None:
+    """Validate scenario files: every problem of every file at once, as file:line:column."""
+    found = read_scenarios(files)
+    for s in found:
+        joints = ", ".join("rod" if rod else "ball" for rod in s.model.rods[:6]) + (
+            " …" if s.model.n > 6 else ""
+        )
+        click.echo(f"{s.path}: ok: {s.name}, {s.model.n} {'body' if s.model.n == 1 else 'bodies'} ({joints})")
+
+
+@main.command()
+def schema() -> None:
+    """Print the JSON Schema of scenario files, for editors and other programs."""
+    click.echo(json.dumps(scenarios.schema(), ensure_ascii=False, indent=1))
+
+
+# --- choosing ---------------------------------------------------------------------------------
+
+
+def read_scenarios(names: Iterable[str | Path]) -> list[scenarios.Scenario]:
+    """Scenarios by name or path; every problem goes to stderr and ends with exit code 2."""
+    try:
+        return scenarios.load_many(names)
+    except ScenarioError as error:
+        click.echo(str(error), err=True)
+        sys.exit(2)
+
+
+def choose_scenarios(names: tuple[str, ...], families: tuple[str, ...]) -> list[scenarios.Scenario]:
+    """The asked scenarios, or the catalogue; narrowed to the asked families."""
+    found = read_scenarios(names or tuple(scenarios.catalogue()))
+    known_families = {s.family for s in found}
+    for family in families:
+        if family not in known_families:
+            raise click.BadParameter(
+                f"no family {family!r}{nearest(family, known_families)}", param_hint="--family"
+            )
+    return [s for s in found if not families or s.family in families]
+
+
+def choose_engines(engines: tuple[str, ...]) -> list[str]:
+    """The asked engines in the registry's order, or all of them."""
+    for engine in engines:
+        if engine not in ENGINES:
+            raise click.BadParameter(f"no engine {engine!r}{nearest(engine, ENGINES)}", param_hint="--engine")
+    return [name for name in ENGINES if not engines or name in engines]
+
+
+def nearest(word: str, names: Iterable[str]) -> str:
+    """A suggestion: the nearest name, or the list of them."""
+    names = list(names)
+    near = get_close_matches(word, names, 1)
+    return f"; did you mean {near[0]!r}?" if near else f"; there are: {', '.join(sorted(names))}"
+
+
+def writable(folder: Path) -> Path:
+    """The output folder, made and tried before any work is done; exit code 2 where it cannot be written."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise click.BadParameter(f"cannot write to {folder}: {error.strerror}", param_hint="--out") from None
+    return folder
+
+
+# --- telling ----------------------------------------------------------------------------------
+
+
+def console(file: Any) -> Console:
+    """A console that wraps to the terminal, or never where the output is piped."""
+    return Console(file=file, width=None if file.isatty() else 200, highlight=False)
+
+
+class progress_to:  # noqa: N801 - used like the function that it stands for
+    """A progress bar on a terminal, plain lines (each tenth) otherwise."""
+
+    def __init__(self, file: Any) -> None:
+        self.bar = Progress(
+            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+            console=Console(file=file), transient=True, disable=not file.isatty(),
+        )  # fmt: skip
+        self.file = file
+        self.tenth = 0
+
+    def __enter__(self) -> Callable[[int, int, str], None]:
+        """The function to call after each task."""
+        self.bar.start()
+        self.task = self.bar.add_task("running", total=None)
+        return self.tell
+
+    def __exit__(self, *_: object) -> None:
+        """Remove the bar."""
+        self.bar.stop()
+
+    def tell(self, done: int, total: int, what: str) -> None:
+        """Show how far the run is."""
+        self.bar.update(self.task, completed=done, total=total, description=what[:48].ljust(48))
+        if not self.file.isatty() and done * 10 // total > self.tenth:
+            self.tenth = done * 10 // total
+            print(f"{done} of {total} tasks done", file=self.file, flush=True)
+
+
+GLYPHS = {
+    "agrees": "[green]✓[/]", "disagrees": "[red bold]✗[/]", "unresolved": "[yellow]?[/]",
+    "unsupported": "[dim]–[/]", "not installed": "[dim]∅[/]", "failed": "[red bold]![/]",
+}  # fmt: skip
+WORST_FIRST = ("failed", "disagrees", "unresolved", "unsupported", "not installed", "agrees")
+
+
+def tell(result: Result) -> None:
+    """The matrix of scenario × engine, the sentences of what does not agree, the verdict."""
+    out = console(sys.stdout)
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("scenario")
+    for name, info in result.engines.items():
+        table.add_column(f"{name} {info.version}".strip())
+    for scenario in result.scenarios:
+        cells = []
+        for engine in result.engines:
+            rows = [r for r in result.rows if r.scenario == scenario and r.engine == engine]
+            cells.append(cell_text(rows))
+        table.add_row(scenario, *cells)
+    out.print(table)
+    out.print(
+        "[dim]each cell: agreeing rows / all rows, then the worst error over its tolerance; "
+        "✓ agrees  ✗ disagrees  ? unresolved  – unsupported  ∅ not installed  ! failed[/]"
+    )
+    for row in result.rows:
+        if row.verdict != "agrees" and row.known is None:
+            out.print(f"{GLYPHS[row.verdict]} {row.key}: ", end="")
+            out.print(row.reason, markup=False)
+    for entry in result.stale:
+        out.print(f"[red]![/] known entry {entry.id} no longer occurs: remove it from plumbline/known.yaml")
+    out.print(f"[bold]{result.run['sentence']}[/]")
+
+
+def cell_text(rows: list[Any]) -> str:
+    """One cell of the matrix: worst verdict that nothing explains, counts, worst error over tolerance."""
+    if not rows:
+        return ""
+    open_rows = [r for r in rows if r.known is None] or rows
+    worst = min((r.verdict for r in open_rows), key=WORST_FIRST.index)
+    agreeing = sum(r.verdict == "agrees" for r in rows)
+    ratios = [
+        r.value / r.tolerance for r in rows if r.value is not None and r.tolerance and r.verdict == "agrees"
+    ]
+    return f"{GLYPHS[worst]} {agreeing}/{len(rows)}" + (f" {max(ratios):.1g}" if ratios else "")

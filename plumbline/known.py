@@ -1,0 +1,107 @@
+"""Known discrepancies and expected gaps: the one file that may excuse a verdict, entry by entry.
+
+known.yaml lists scenario, engine, version range, level, integrator, quantity (patterns with *), the
+expected verdict, its evidence and its reason.  An entry that covers cells of a run and explains none of
+them has had its day and fails.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Literal
+
+from packaging.specifiers import InvalidSpecifier, SpecifierSet
+from packaging.version import InvalidVersion, Version
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, field_validator
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from plumbline.records import Row
+
+FILE = Path(__file__).with_name("known.yaml")
+
+
+class Entry(BaseModel):
+    """One expected verdict that is not "agrees"."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    id: str
+    scenario: str
+    engine: str
+    versions: str = ""  # PEP 440 range; empty: any
+    level: str = "*"
+    integrator: str = "*"
+    quantity: str = "*"
+    verdict: Literal["disagrees", "unresolved", "unsupported", "failed"]
+    evidence: str  # what shows it: a measurement, a script, a document
+    reason: str  # why it is so
+
+    @field_validator("versions")
+    @classmethod
+    def _is_a_range(cls, text: str) -> str:
+        try:
+            SpecifierSet(text)
+        except InvalidSpecifier as error:
+            raise ValueError(f"{error}; a version range is written like '>=1.13,<2'") from None
+        return text
+
+    def covers(self, row: Row) -> bool:
+        """Whether the entry speaks of that row's cell, whatever its verdict."""
+        names = ("scenario", "engine", "level", "integrator", "quantity")
+        return all(fnmatchcase(getattr(row, n), getattr(self, n)) for n in names) and self.in_range(row)
+
+    def in_range(self, row: Row) -> bool:
+        """Whether the engine's version is in the entry's range; pre-releases count."""
+        if not self.versions:
+            return True
+        try:
+            return SpecifierSet(self.versions).contains(Version(row.engine_version), prereleases=True)
+        except InvalidVersion:
+            return False
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Rows with their excuses, and entries that excused nothing."""
+
+    rows: list[Row]
+    stale: list[Entry]
+
+
+def load(path: Path = FILE) -> list[Entry]:
+    """The entries of a file; ValueError naming file and entry where it is not valid."""
+    try:
+        raw = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+        entries = TypeAdapter(list[Entry]).validate_python(raw or [])
+    except (OSError, YAMLError, ValidationError) as error:
+        raise ValueError(f"{path}: {error}") from None
+    twice = {e.id for e in entries if sum(e.id == other.id for other in entries) > 1}
+    if twice:
+        raise ValueError(f"{path}: ids used twice: {', '.join(sorted(twice))}")
+    return entries
+
+
+def excuse(rows: Iterable[Row], entries: Sequence[Entry], *, whole: bool) -> Judged:
+    """Mark rows that an entry expects; with ``whole`` (a run of the full matrix) find stale entries.
+
+    Where only a part of the matrix ran, an entry is stale if it covers rows that ran and excuses none
+    and has no pattern in its scenario: a pattern may have its case among the cells that did not run.
+    """
+    marked, used, covered = [], set(), set()
+    for row in rows:
+        about = [e for e in entries if e.covers(row)]
+        covered |= {e.id for e in about}
+        match = next((e for e in about if e.verdict == row.verdict), None)
+        if match:
+            used.add(match.id)
+        marked.append(replace(row, known=match.id if match else None))
+    stale = [
+        e
+        for e in entries
+        if e.id not in used and e.id in covered and (whole or not set("*?[") & set(e.scenario))
+    ]
+    return Judged(marked, stale)

@@ -1,0 +1,456 @@
+"""Trajectories and invariants: what one integrator's ladder of steps says, against the truth.
+
+The limit of the ladder (step zero) is compared with the truth within the uncertainties of both and
+the growth of rounding; the order that the ladder shows with the declared one; and every invariant's
+drift must vanish with the step.  Where a window of time cannot tell, its half is tried, down to an
+eighth; a disagreement in a longer window is never overruled by a shorter one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from plumbline.converge import ORDER_MARGIN, Limit, Order, observed_order, romberg, tightest
+from plumbline.findings import Findings, Subject
+from plumbline.kinematics import angular_velocity
+from plumbline.measures import (
+    UNITS,
+    Invariants,
+    attitude_error,
+    invariants,
+    kinetic_energy,
+    position_error,
+    potential_energy,
+)
+from plumbline.records import Array, Integrator, Model, Row, Trajectory, Verdict
+from plumbline.work import Climb, Rung
+from plumbline.yardstick import PART, ROUNDING, MotionTruth
+
+EPS = 2.0**-52
+PER_STEP = 8 * EPS  # rounding of an invariant in one step, of its scale: a handful of operations
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What a limit says in one window of time."""
+
+    verdict: Verdict
+    reason: str
+    at: int  # index of the window's last sample
+
+
+def judge_motion(
+    who: Subject, model: Model, truth: MotionTruth, integrator: Integrator, climb: Climb, horizon: float
+) -> Findings:
+    """Verdicts on order, limits and invariants of one integrator's ladder, up to the horizon."""
+    found = Findings()
+    if climb.unsupported is not None:
+        found.rows.append(who.row("trajectory", integrator.name, "all", "unsupported", climb.unsupported))
+        return found
+    finest = climb.rungs[-1]
+    if finest.trajectory is None:
+        reason = f"at the finest resolution {finest.resolution:g}: {finest.failure}"
+        found.rows.append(who.row("trajectory", integrator.name, "all", "failed", reason))
+        return found
+    ladder = Ladder(who, model, truth, integrator, climb.rungs, horizon)
+    found.rows += [*ladder.motion(), *ladder.drifts()]
+    found.convergence += ladder.convergence()
+    found.curves += ladder.curves()
+    found.trajectories += poses(who, integrator.name, finest.resolution, finest.trajectory)
+    return found
+
+
+@dataclass
+class Ladder:
+    """One integrator's runs on one scenario, coarse to fine, and what they say together."""
+
+    who: Subject
+    model: Model
+    truth: MotionTruth
+    integrator: Integrator
+    rungs: Sequence[Rung]
+    horizon: float  # s, up to which positions may be compared
+    finest: Trajectory = field(init=False)
+    positions: list[Array] = field(init=False)  # per rung (T, N, 3)
+    attitudes: list[Array] = field(init=False)  # per rung (T, N, 4)
+    drift: list[Invariants | None] = field(init=False)
+    rounding: Array = field(init=False)  # (T,) of a whole run, grown, for a scale of 1
+
+    def __post_init__(self) -> None:
+        last = self.rungs[-1].trajectory
+        assert last is not None
+        self.finest = last
+        self.positions = [self.samples(rung, "r") for rung in self.rungs]
+        self.attitudes = [self.samples(rung, "p") for rung in self.rungs]
+        runs = [rung.trajectory for rung in self.rungs]
+        self.drift = [None if run is None else invariants(self.model, run) for run in runs]
+        self.rounding = ROUNDING * self.truth.growth
+        self.shown, self.shown_until = self.seen_order()
+
+    @property
+    def times(self) -> Array:
+        """(T,) s."""
+        return self.truth.trajectory.t
+
+    @property
+    def common(self) -> dict[str, Any]:
+        """What every row of this ladder says besides its quantity."""
+        return {"alias_of": self.integrator.alias_of, "wall_time": sum(rung.cost for rung in self.rungs)}
+
+    def samples(self, rung: Rung, name: str) -> Array:
+        """(T, N, width), NaN where the rung did not stay finite; quaternions signed like the finest run's."""
+        fine: Array = getattr(self.finest, name)
+        if rung.trajectory is None:
+            return np.full_like(fine, np.nan)
+        y: Array = getattr(rung.trajectory, name)
+        if name == "p":
+            y = y * np.where(np.sum(y * fine, axis=-1, keepdims=True) < 0, -1.0, 1.0)
+        return y
+
+    def limit(self, ys: Sequence[Array]) -> Limit:
+        """The motion at step zero (or at the tightest tolerance), with its uncertainty."""
+        if self.integrator.kind == "tolerance":
+            return tightest(ys)
+        return romberg(ys, self.integrator.powers)
+
+    def windows(self, until: float) -> list[int]:
+        """Numbers of samples to compare: up to ``until``, then a half, a quarter, an eighth of it."""
+        end = min(until, float(self.times[-1]))
+        ends = [end / 2**k * (1 + 1e-12) for k in range(4)]
+        numbers = [int(np.searchsorted(self.times, e, side="right")) for e in ends]
+        return [number for number in dict.fromkeys(numbers) if number >= 3] or [min(3, len(self.times))]
+
+    # order
+
+    def seen_order(self) -> tuple[Order, float]:
+        """The order of the longest window that shows one, and that window's end in s."""
+        tried = []
+        for number in self.windows(self.horizon):
+            floor = float(self.truth.length * self.rounding[number - 1])
+            order = observed_order([y[:number] for y in self.positions], floor)
+            tried.append((order, float(self.times[number - 1])))
+            if order.asymptotic or order.at_floor:
+                return tried[-1]
+        return tried[0]
+
+    def order_row(self) -> Row:
+        """Does the integrator show the order of its name?"""
+        order, declared = self.shown, self.integrator.order
+        coarse, fine = self.rungs[0].resolution, self.rungs[-1].resolution
+        steps = f"steps {coarse:g} … {fine:g} s, t ≤ {self.shown_until:g} s"
+        listed = ", ".join(f"{o:.2f}" for o in order.orders)
+        off = None if order.value is None else abs(order.value - declared)
+        verdict: Verdict = "agrees"
+        if order.at_floor:
+            off, reason = None, f"order not observable: differences are rounding at every step ({steps})"
+        elif not order.asymptotic or off is None:
+            verdict, reason = "unresolved", f"not in the asymptotic range: orders {listed} over {steps}"
+        else:
+            verdict = "agrees" if off <= ORDER_MARGIN else "disagrees"
+            reason = f"shows order {order.value:.2f}, declared {declared} ({steps})"
+        return self.who.row(
+            "trajectory",
+            self.integrator.name,
+            "order",
+            verdict,
+            reason,
+            value=off,
+            tolerance=ORDER_MARGIN,
+            order=None if order.at_floor else order.value,
+            declared_order=declared,
+            horizon=self.shown_until,
+            derivation=f"log2 of ratios of consecutive differences of positions over {steps}: {listed}; "
+            f"two consecutive ones within {ORDER_MARGIN} of each other show the asymptotic range",
+            **self.common,
+        )
+
+    # positions and attitudes
+
+    def motion(self) -> list[Row]:
+        """Order, and positions and attitudes against the truth."""
+        truth = self.truth
+        true = truth.trajectory
+        rows = [self.order_row()] if self.integrator.kind == "step" else []
+        rows += self.against_truth(
+            "position", "m", self.positions, lambda y: position_error(y, true.r),
+            truth.position_uncertainty, truth.visible_position, truth.length, 1.0,
+        )  # fmt: skip
+        # |δp| of a unit quaternion is half the rotation angle
+        rows += self.against_truth(
+            "attitude", "rad", self.attitudes, lambda y: attitude_error(y, true.p),
+            truth.attitude_uncertainty, truth.visible_attitude, 2.0, 2.0,
+        )  # fmt: skip
+        return rows
+
+    def against_truth(
+        self,
+        name: str,
+        unit: str,
+        ys: Sequence[Array],
+        error_of: Callable[[Array], Array],
+        uncertain: Array,
+        visible: Array,
+        scale: float,
+        factor: float,
+    ) -> list[Row]:
+        """Two rows: the limit against the truth; the finest run, within the ladder's own estimate of it."""
+        who, method = self.who, self.integrator.name
+        try:
+            limit = self.limit(ys)
+        except ValueError as error:
+            return [who.row("trajectory", method, f"{name}_limit", "unresolved", str(error), unit)]
+        off = np.maximum.accumulate(error_of(limit.y))
+        ladder, rounding = factor * limit.uncertainty, scale * self.rounding
+        tolerance = ladder + uncertain + rounding
+        found = self.compare(name, unit, off, tolerance, visible)
+        at, end = found.at, float(self.times[found.at])
+        how = (
+            f"{limit.column} powers of h from {self.integrator.powers} eliminated over {len(ys)} steps"
+            if self.integrator.kind == "step"
+            else f"tightest of {len(ys)} tolerances"
+        )
+        common = {**self.common, "uncertainty": float(ladder[at] + uncertain[at]), "horizon": end}
+        own = np.maximum.accumulate(error_of(ys[-1]))[at]
+        estimate = float(
+            factor * np.max(np.linalg.norm((ys[-1] - limit.y)[: at + 1], axis=-1)) + tolerance[at]
+        )
+        step = self.rungs[-1].resolution
+        what = "step" if self.integrator.kind == "step" else "tolerance"
+        follows = "agrees" if own <= estimate else "disagrees"
+        return [
+            who.row(
+                "trajectory",
+                method,
+                f"{name}_limit",
+                found.verdict,
+                found.reason,
+                unit,
+                value=float(off[at]),
+                tolerance=float(tolerance[at]),
+                derivation=f"up to t = {end:g} s: limit ({how}) ± {ladder[at]:.2g}, "
+                f"truth ({self.truth.method}) ± {uncertain[at]:.2g}, "
+                f"rounding 10³ ε G(t) × {scale:.3g} {unit} = {rounding[at]:.2g}; "
+                f"a mistake of {PART:g} in a parameter makes {visible[at]:.2g}",
+                extra={"visible": float(min(visible[at], 1e308)), "growth": float(self.truth.growth[at])},
+                **common,
+            ),
+            who.row(
+                "trajectory",
+                method,
+                name,
+                follows if found.verdict == "agrees" else found.verdict,
+                f"{name} at {what} {step:g} is {own:.2g} {unit} from the truth, "
+                f"the ladder says {estimate:.2g}",
+                unit,
+                value=float(own),
+                tolerance=estimate,
+                derivation=f"from the finest run to the limit, plus the limit's tolerance, t ≤ {end:g} s",
+                extra={"resolution": step},
+                **common,
+            ),
+        ]
+
+    def compare(self, name: str, unit: str, off: Array, tolerance: Array, visible: Array) -> Comparison:
+        """The longest window that can tell; where none can, the longest one and why."""
+        show = self.shown
+        trusted = self.integrator.kind == "tolerance" or show.asymptotic or show.at_floor
+        unresolved: Comparison | None = None
+        for number in self.windows(self.horizon):
+            at = number - 1
+            until = f"up to t = {self.times[at]:g} s"
+            if off[at] <= tolerance[at] <= visible[at]:
+                return Comparison(
+                    "agrees", f"{name} limit within {off[at]:.2g} {unit} of the truth {until}", at
+                )
+            if off[at] > tolerance[at] and trusted:
+                reason = (
+                    f"the {name} at step zero is {off[at]:.3g} {unit} from the truth {until}, "
+                    f"{off[at] / tolerance[at]:.3g} times the uncertainties"
+                )
+                return Comparison("disagrees", reason, at)
+            if off[at] > tolerance[at]:
+                reason = f"{name} limit {off[at]:.2g} {unit} off {until}, but the ladder shows no order"
+            else:
+                reason = (
+                    f"uncertainty {tolerance[at]:.2g} {unit} {until} is above the {visible[at]:.2g} {unit} "
+                    f"that a mistake of {PART:g} would make"
+                )
+            unresolved = unresolved or Comparison("unresolved", reason, at)
+        assert unresolved is not None
+        return unresolved
+
+    # invariants
+
+    def drifts(self) -> list[Row]:
+        """Every invariant that is conserved here: its drift in the finest run, and at step zero."""
+        rows = []
+        for quantity, unit in UNITS.items():
+            series = [None if d is None else getattr(d, quantity) for d in self.drift]
+            if series[-1] is not None:
+                ys = [np.full_like(series[-1], np.nan) if s is None else s for s in series]
+                rows.append(self.drift_row(quantity, unit, ys))
+        return rows
+
+    def drift_row(self, quantity: str, unit: str, ys: Sequence[Array]) -> Row:
+        """The limit of a drift is zero, within its uncertainty and the rounding of so many steps."""
+        name, scale, last = quantity.replace("_", " "), self.scales()[quantity], self.drift[-1]
+        assert last is not None
+        floor = PER_STEP * max(self.finest.steps, 64) * scale
+        by_quadrature = last.work_uncertainty if quantity == "energy_drift" else 0.0
+        drift = np.maximum.accumulate(np.max(np.linalg.norm(ys[-1], axis=-1), axis=1))
+        base = f"rounding of {self.finest.steps} steps, {PER_STEP:.1g} × {scale:.3g} {unit} each: {floor:.2g}"
+
+        def row(verdict: Verdict, reason: str, at: int, tolerance: float, why: str, **extra: float) -> Row:
+            return self.who.row(
+                "invariants",
+                self.integrator.name,
+                quantity,
+                verdict,
+                reason,
+                unit,
+                value=float(drift[at]),
+                tolerance=tolerance,
+                derivation=why,
+                horizon=float(self.times[at]),
+                extra={"scale": scale, "whole": float(drift[-1]), **extra},
+                **self.common,
+            )
+
+        end = len(self.times) - 1
+        if drift[end] <= floor:
+            return row("agrees", f"{name} {drift[end]:.2g} {unit}: rounding", end, floor, base)
+        try:
+            limit = self.limit(ys)
+        except ValueError as error:
+            return row("unresolved", str(error), end, floor, base)
+        left = np.maximum.accumulate(np.max(np.linalg.norm(limit.y, axis=-1), axis=1))
+        tolerance = limit.uncertainty + floor + by_quadrature
+        trusted = self.integrator.kind == "tolerance" or observed_order(ys, floor).asymptotic
+        unresolved: Row | None = None
+        for number in self.windows(float(self.times[-1])):
+            at = number - 1
+            own = float(np.max(np.linalg.norm((ys[-1] - limit.y)[:number], axis=-1)))
+            allowed = own + float(tolerance[at])
+            zero = f"{left[at]:.2g} ± {tolerance[at]:.2g} {unit} at step zero, t ≤ {self.times[at]:g} s"
+            why = (
+                f"{own:.2g} from the finest step to step zero, itself ± {limit.uncertainty[at]:.2g}; "
+                f"{base}; the work by quadrature ± {by_quadrature:.2g}"
+            )
+            if left[at] <= tolerance[at] <= PART * scale:
+                reason = f"{name} {drift[at]:.2g} {unit} at the finest step, {zero}"
+                return row("agrees", reason, at, allowed, why, limit=float(left[at]))
+            if left[at] > tolerance[at] and trusted:
+                reason = f"{name} does not vanish with the step: {zero}"
+                return row("disagrees", reason, at, float(tolerance[at]), why, limit=float(left[at]))
+            reason = f"{name} {drift[at]:.2g} {unit}: {zero} cannot tell"
+            unresolved = unresolved or row("unresolved", reason, at, allowed, why, limit=float(left[at]))
+        assert unresolved is not None
+        return unresolved
+
+    def scales(self) -> dict[str, float]:
+        """Sizes of what the invariants are made of: energies, momenta, lengths, speeds."""
+        true, model = self.truth.trajectory, self.model
+        omega = angular_velocity(true.p, true.pdot)
+        kinetic = float(np.max(kinetic_energy(model, true.v, omega)))
+        potential = float(np.max(np.sum(model.mass * np.abs(true.r @ model.gravity), axis=-1)))
+        swing = float(np.ptp(potential_energy(model, true.r)))
+        speed = float(np.max(np.linalg.norm(true.v, axis=-1), initial=0.0))
+        spin = float(np.max(np.linalg.norm(omega, axis=-1), initial=0.0))
+        arm = float(np.max(np.linalg.norm(true.r, axis=-1), initial=0.0))
+        inertia = float(np.sum(np.linalg.norm(model.inertia, axis=(1, 2))))
+        return {
+            "energy_drift": max(kinetic, potential, swing),
+            "momentum_drift": float(np.sum(model.mass)) * arm * speed + inertia * spin,
+            "joint_gap": max(self.truth.length, arm),
+            "gap_rate": max(speed, spin * self.truth.length),
+            "norm_drift": 1.0,
+        }
+
+    # tables
+
+    def convergence(self) -> list[dict[str, Any]]:
+        """Error against the truth up to the horizon, cost and order at every resolution."""
+        end = self.windows(self.horizon)[0]
+        true = self.truth.trajectory
+        orders = [float("nan")] * 2 + list(self.shown.orders)
+        records = []
+        for i, rung in enumerate(self.rungs):
+            errors = {
+                "position": position_error(self.positions[i][:end], true.r[:end]),
+                "attitude": attitude_error(self.attitudes[i][:end], true.p[:end]),
+            }
+            records += [
+                {
+                    **self.cell(rung.resolution),
+                    "quantity": name,
+                    "error": float(np.max(error)),
+                    "cost": rung.cost,
+                    "steps": rung.trajectory.steps if rung.trajectory else 0,
+                    "order": orders[i] if i < len(orders) else float("nan"),
+                }
+                for name, error in errors.items()
+            ]
+        return records
+
+    def cell(self, resolution: float) -> dict[str, Any]:
+        """The columns that name a run."""
+        return {
+            "scenario": self.who.scenario,
+            "engine": self.who.engine,
+            "integrator": self.integrator.name,
+            "resolution": resolution,
+        }
+
+    def curves(self) -> list[dict[str, Any]]:
+        """Series of the finest run: errors and drifts over time, with the tolerance on positions."""
+        last, true = self.drift[-1], self.truth.trajectory
+        assert last is not None
+        nothing = np.full(len(self.times), np.nan)
+        columns = {
+            "t": self.times,
+            "position_error": position_error(self.finest.r, true.r),
+            "attitude_error": attitude_error(self.finest.p, true.p),
+            "limit_error": nothing,
+            "tolerance": nothing,
+        }
+        try:
+            limit = self.limit(self.positions)
+        except ValueError:
+            pass
+        else:
+            columns["limit_error"] = position_error(limit.y, true.r)
+            rounding = self.truth.length * self.rounding
+            columns["tolerance"] = limit.uncertainty + self.truth.position_uncertainty + rounding
+        for name in UNITS:
+            series = getattr(last, name)
+            columns[name] = nothing if series is None else np.max(np.linalg.norm(series, axis=-1), axis=1)
+        names = self.cell(self.rungs[-1].resolution)
+        return [
+            {**names, **{name: float(column[i]) for name, column in columns.items()}}
+            for i in range(len(self.times))
+        ]
+
+
+def poses(who: Subject, integrator: str, resolution: float, run: Trajectory) -> list[dict[str, Any]]:
+    """Sampled poses as records: one per time and body."""
+    names = ("rx", "ry", "rz", "p0", "p1", "p2", "p3")
+    cell = {
+        "scenario": who.scenario,
+        "engine": who.engine,
+        "integrator": integrator,
+        "resolution": resolution,
+    }
+    return [
+        {
+            **cell,
+            "t": float(run.t[i]),
+            "body": k,
+            **dict(zip(names, map(float, (*run.r[i, k], *run.p[i, k])), strict=True)),
+        }
+        for i in range(len(run.t))
+        for k in range(run.r.shape[1])
+    ]

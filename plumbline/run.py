@@ -1,0 +1,302 @@
+"""The matrix: scenarios × engines × levels, through workers, to judged rows and tables."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from plumbline import known, store, work, yardstick
+from plumbline.converge import ladder
+from plumbline.exact import solution
+from plumbline.findings import Findings, Subject
+from plumbline.motion_verdicts import judge_motion
+from plumbline.records import Integrator, Row
+from plumbline.registry import ENGINES, adapter
+from plumbline.sampling import random_states, seed_of
+from plumbline.scenario import Scenario
+from plumbline.state_verdicts import judge_states
+from plumbline.workers import Limits, Outcome, Task, Workers
+from plumbline.yardstick import ROUNDING, MotionTruth, StateTruth
+
+STATES = 50  # random states per scenario, besides the initial one
+HORIZON_TOLERANCE = 1e-9  # m: positions are compared while rounding, grown, stays below this
+
+Levels = Literal["state", "trajectory", "all"]
+Progress = Callable[[int, int, str], None]  # done, total, what was last
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to run."""
+
+    scenarios: Sequence[Scenario]
+    engines: Sequence[str]
+    level: Levels = "all"
+    jobs: int = 1
+    limits: Limits = field(default_factory=Limits)
+    states: int = STATES
+    finer: int = 0  # how many times the finest step halves beyond the quick form
+    accept: float | None = None  # relative to each quantity's scale; shown beside the verdict only
+    whole: bool = False  # the full catalogue on all engines: every known entry must occur
+
+
+@dataclass(frozen=True)
+class EngineInfo:
+    """An engine as it is installed here, or why it is not."""
+
+    name: str
+    title: str
+    version: str
+    integrators: tuple[Integrator, ...]
+    missing: str | None = None
+
+
+@dataclass
+class Result:
+    """A judged run, as the store writes it and the command line tells it."""
+
+    rows: list[Row]
+    stale: list[known.Entry]
+    engines: dict[str, EngineInfo]
+    scenarios: dict[str, dict[str, Any]]
+    tables: dict[str, list[dict[str, Any]]]
+    run: dict[str, Any]
+
+
+def describe(engine: str) -> EngineInfo:
+    """Import an engine (in a worker) and say what it is; an ImportError means it is not installed."""
+    try:
+        found = adapter(engine)
+    except ImportError as error:
+        return EngineInfo(engine, engine, "", (), f"{engine} is not installed here: {error}")
+    return EngineInfo(engine, found.title, found.version(), found.integrators)
+
+
+def describe_all(workers: Workers, engines: Sequence[str]) -> dict[str, EngineInfo]:
+    """Every engine's description; one that crashes on import is missing for that reason."""
+    found = {}
+    for outcome in workers.run(Task(name, describe, (name,), workers.limits) for name in engines):
+        found[outcome.key] = outcome.value or EngineInfo(outcome.key, outcome.key, "", (), outcome.lost)
+    return {name: found[name] for name in engines}
+
+
+def execute(plan: Plan, progress: Progress) -> Result:
+    """Run the whole plan; cells that are lost become rows that say so."""
+    begin, started = time.monotonic(), datetime.now(UTC)
+    with Workers(plan.jobs, plan.limits) as workers:
+        engines = describe_all(workers, plan.engines)
+        # the longest first, so that no long task is left alone at the end
+        order = sorted(plan.scenarios, key=lambda s: -s.model.n)
+        benches = {s.name: Bench(plan, s, engines) for s in order}
+        tasks = [task for bench in benches.values() for task in bench.tasks()]
+        for done, outcome in enumerate(workers.run(tasks), start=1):
+            benches[outcome.key[0]].take(outcome)
+            progress(done, len(tasks), " ".join(outcome.key))
+    found = Findings()
+    for scenario in plan.scenarios:
+        found.extend(benches[scenario.name].findings)
+    judged = known.excuse(found.rows, known.load(), whole=plan.whole)
+    summaries = {s.name: benches[s.name].summary() for s in plan.scenarios}
+    result = Result(judged.rows, judged.stale, engines, summaries, found.tables(), {})
+    result.run = {
+        "id": started.strftime("%Y%m%dT%H%M%SZ"),
+        "started": started.isoformat(timespec="seconds"),
+        "duration": time.monotonic() - begin,
+        "machine": {"system": platform.platform(), "processor": platform.machine(), "jobs": plan.jobs},
+        "commit": commit(),
+        "python": platform.python_version(),
+        "versions": {name: info.version for name, info in engines.items()},
+        "level": plan.level,
+        "states": plan.states + 1,
+        "sentence": sentence(result),
+        "exit_code": exit_code(result),
+        "stale": [entry.id for entry in judged.stale],
+    }
+    return result
+
+
+def save(result: Result, folder: Path, command: str) -> None:
+    """Store a result in ``folder``."""
+    engines = {
+        name: {**asdict(info), "installed": info.missing is None} for name, info in result.engines.items()
+    }
+    run = {**result.run, "command": command}
+    store.write(folder, run, result.scenarios, engines, result.rows, result.tables)
+
+
+class Bench:
+    """One scenario on all engines: makes the tasks, takes their outcomes, judges once the truth is there."""
+
+    def __init__(self, plan: Plan, scenario: Scenario, engines: dict[str, EngineInfo]) -> None:
+        self.plan, self.scenario, self.engines = plan, scenario, engines
+        self.findings = Findings()
+        self.truths: dict[str, StateTruth | MotionTruth] = {}
+        self.early: list[Outcome] = []  # engines' answers that came before the truth
+        self.states = [
+            scenario.state,
+            *random_states(scenario.model, plan.states, seed_of("states", scenario.digest)),
+        ]
+
+    def tasks(self) -> Iterator[Task]:
+        """Truth first, then every engine's cells."""
+        s, limits = self.scenario, self.plan.limits
+        if self.plan.level in ("state", "all"):
+            yield Task((s.name, "truth", "state"), yardstick.state_truth, (s.model, self.states), limits)
+        if self.plan.level in ("trajectory", "all"):
+            arguments = (s.model, s.state, s.times, solution(s))
+            yield Task((s.name, "truth", "trajectory"), yardstick.motion_truth, arguments, limits)
+        for name, info in self.engines.items():
+            if info.missing is not None:
+                self.findings.rows.append(
+                    self.who(name).row("state", "-", "all", "not installed", info.missing)
+                )
+                continue
+            if self.plan.level in ("state", "all"):
+                yield Task((s.name, name, "state"), work.evaluate, (name, s.model, self.states), limits)
+            if self.plan.level in ("trajectory", "all"):
+                for integrator in info.integrators:
+                    steps = ladder(integrator, s.model.n, s.duration, self.plan.finer)
+                    arguments = (name, integrator.name, s.model, s.state, s.times, steps)
+                    yield Task((s.name, name, "trajectory", integrator.name), work.climb, arguments, limits)
+
+    def who(self, engine: str) -> Subject:
+        """The subject of this scenario's rows about an engine."""
+        info = self.engines[engine]
+        return Subject(self.scenario.name, self.scenario.family, engine, info.title, info.version)
+
+    def take(self, outcome: Outcome) -> None:
+        """Keep a truth and judge what waited for it; judge an answer or let it wait."""
+        _, subject, level, *_ = outcome.key
+        if subject != "truth":
+            self.early.append(outcome)
+        elif outcome.lost is None:
+            self.truths[level] = outcome.value
+        else:
+            self.truths[level] = Lost(outcome.lost)
+        waiting, self.early = self.early, []
+        for answer in waiting:
+            if answer.key[2] in self.truths:
+                self.findings.extend(self.judge(answer))
+            else:
+                self.early.append(answer)
+
+    def judge(self, outcome: Outcome) -> Findings:
+        """Verdicts on one cell."""
+        _, engine, level, *integrators = outcome.key
+        who, truth = self.who(engine), self.truths[level]
+        name = integrators[0] if integrators else "-"
+        lost = outcome.lost or (f"no truth to judge by: {truth.reason}" if isinstance(truth, Lost) else None)
+        if lost:
+            return Findings(rows=[who.row(level, name, "all", "failed", lost)])
+        if isinstance(truth, StateTruth):
+            found = judge_states(who, truth, outcome.value)
+        else:
+            integrator = next(i for i in self.engines[engine].integrators if i.name == name)
+            horizon = horizon_of(truth)
+            found = judge_motion(who, self.scenario.model, truth, integrator, outcome.value, horizon)
+        if self.plan.accept is not None:
+            found.rows = [replace(row, accept=self.plan.accept) for row in found.rows]
+        return found
+
+    def summary(self) -> dict[str, Any]:
+        """What the store keeps of the scenario."""
+        s, truth = self.scenario, self.truths.get("trajectory")
+        about = {
+            "family": s.family,
+            "title": s.title,
+            "purpose": s.purpose,
+            "file": s.path.name,
+            "bodies": s.model.n,
+            "joints": ["rod" if rod else "ball" for rod in s.model.rods],
+            "duration": s.duration,
+            "sample": s.sample,
+            "exact": s.exact,
+            "digest": s.digest,
+            "model": {key: np.asarray(value).tolist() for key, value in vars(s.model).items()},
+        }
+        if isinstance(truth, MotionTruth):
+            about |= {
+                "horizon": horizon_of(truth),
+                "growth": float(truth.growth[-1]),
+                "truth": truth.method,
+                "truth_uncertainty": float(truth.position_uncertainty[-1]),
+            }
+        return about
+
+
+@dataclass(frozen=True)
+class Lost:
+    """A truth that could not be had."""
+
+    reason: str
+
+
+def horizon_of(truth: MotionTruth) -> float:
+    """T_h in s: the last sample at which rounding and the truth's error, grown, are below the tolerance."""
+    reached = truth.length * ROUNDING * truth.growth + truth.position_uncertainty
+    good = np.maximum.accumulate(reached) <= HORIZON_TOLERANCE
+    return float(truth.trajectory.t[np.flatnonzero(good)[-1]]) if good.any() else 0.0
+
+
+def counts(rows: Sequence[Row]) -> dict[str, int]:
+    """Rows by verdict, in a fixed order, without those that have none."""
+    names = ("agrees", "disagrees", "unresolved", "unsupported", "not installed", "failed")
+    found = {name: sum(row.verdict == name for row in rows) for name in names}
+    return {name: number for name, number in found.items() if number}
+
+
+def sentence(result: Result) -> str:
+    """The verdict in one sentence: counts, the disagreements by name, what is expected."""
+    verb = {"agrees": "agree", "disagrees": "disagree"}
+    parts = []
+    for verdict, number in counts(result.rows).items():
+        part = f"{number} {verb.get(verdict, verdict)}"
+        new = [row for row in result.rows if row.verdict == verdict and row.known is None]
+        old = number - len(new)
+        if verdict in ("disagrees", "failed") and new:
+            named = [f"{row.engine}, {row.scenario}: {row.quantity}" for row in new[:3]]
+            more = f" and {len(new) - 3} more" if len(new) > 3 else ""
+            part += f" ({'; '.join(named)}{more})"
+        if old:
+            part += f" ({old} as recorded)"
+        parts.append(part)
+    text = ", ".join(parts) or "nothing was compared"
+    if result.stale:
+        text += (
+            f"; {len(result.stale)} known entries no longer occur ({', '.join(e.id for e in result.stale)})"
+        )
+    return text
+
+
+def exit_code(result: Result) -> int:
+    """0 all agree or differ as recorded; 1 a disagreement or an unexpected gap; 3 an engine failed."""
+    new = {row.verdict for row in result.rows if row.known is None}
+    if "failed" in new:
+        return 3
+    return 1 if new & {"disagrees", "unresolved", "unsupported"} or result.stale else 0
+
+
+def commit() -> str | None:
+    """The checkout's commit, with a + where files differ from it; None outside git."""
+    here = Path(__file__).parent
+    try:
+        done = subprocess.run(
+            ["git", "describe", "--always", "--dirty=+", "--abbrev=12"],
+            cwd=here, capture_output=True, text=True, check=True, timeout=10,
+        )  # fmt: skip
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
+
+
+def all_engines() -> list[str]:
+    """Names of every engine of the registry."""
+    return list(ENGINES)

@@ -1,0 +1,117 @@
+"""State level: each engine's answer against the truth, per body, within the rounding bound."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from plumbline.bound import BLUNT
+from plumbline.findings import Findings, Subject
+from plumbline.records import Array, Row
+from plumbline.work import Evaluation
+from plumbline.yardstick import StateTruth
+
+UNITS = {
+    "acceleration": "m/s²",
+    "angular_acceleration": "rad/s²",
+    "joint_reaction": "N",
+    "kinetic_energy": "J",
+    "potential_energy": "J",
+    "angular_momentum": "kg m²/s",
+    "mass_matrix": "kg m²",
+}
+TINY = float(np.finfo(float).tiny)  # an exact zero against a tolerance of zero is no error
+
+
+def judge_states(who: Subject, truth: StateTruth, said: Evaluation) -> Findings:
+    """Verdicts on every state quantity, worst over bodies and states."""
+    found = Findings()
+    if said.unsupported is not None:
+        found.rows.append(who.row("state", "-", "all", "unsupported", said.unsupported))
+        return found
+    if said.failure is not None:
+        found.rows.append(who.row("state", "-", "all", "failed", said.failure))
+        return found
+    for quantity, unit in UNITS.items():
+        if any(getattr(answer, quantity) is None for answer in said.quantities):
+            reason = f"{who.title} offers no {quantity.replace('_', ' ')} of its own"
+            found.rows.append(who.row("state", "-", quantity, "unsupported", reason, unit))
+            continue
+        records = compare(who, quantity, truth, said)
+        found.states += records
+        found.rows.append(row(who, quantity, unit, records, truth.method, said.cost))
+    return found
+
+
+def compare(who: Subject, quantity: str, truth: StateTruth, said: Evaluation) -> list[dict[str, Any]]:
+    """One record per state: the error, bound and scale of the body that comes nearest to its bound."""
+    records = []
+    answers = zip(said.quantities, truth.quantities, truth.bounds, strict=True)
+    for index, (answer, true, bound) in enumerate(answers):
+        error = sizes(quantity, np.asarray(getattr(answer, quantity)) - getattr(true, quantity))
+        tolerance = np.broadcast_to(bound.tolerance(quantity), error.shape)
+        scale = np.broadcast_to(bound.scale[quantity], error.shape)
+        body = int(np.argmax(error / np.maximum(tolerance, TINY)))
+        records.append(
+            {
+                "scenario": who.scenario,
+                "engine": who.engine,
+                "quantity": quantity,
+                "state": index,
+                "body": body,
+                "error": float(error[body]),
+                "bound": float(tolerance[body]),
+                "scale": float(scale[body]),
+            }
+        )
+    return records
+
+
+def sizes(quantity: str, difference: Array) -> Array:
+    """(N,) Euclidean lengths per body; one number for scalars, momentum, the matrix's worst entry."""
+    if quantity == "mass_matrix":
+        return np.array([np.max(np.abs(difference))])
+    return np.atleast_1d(np.linalg.norm(np.atleast_1d(difference), axis=-1))
+
+
+def row(
+    who: Subject, quantity: str, unit: str, records: Sequence[dict[str, Any]], method: str, cost: float
+) -> Row:
+    """The verdict on one quantity: its worst error over bound decides, a blunt bound decides nothing."""
+    ratios = np.array([record["error"] / max(record["bound"], TINY) for record in records])
+    worst = records[int(np.argmax(ratios))]
+    scaled = [record for record in records if record["scale"] > 0]
+    relative = max((record["error"] / record["scale"] for record in scaled), default=0.0)
+    bluntness = float(np.median([record["bound"] / record["scale"] for record in scaled] or [0.0]))
+    name, ratio, count = quantity.replace("_", " "), float(np.max(ratios)), len(records)
+    where = f"state {worst['state']}, body {worst['body'] + 1}"
+    common = {
+        "value": worst["error"],
+        "tolerance": worst["bound"],
+        "derivation": (
+            f"first-order rounding bound per body and state, {worst['bound']:.2g} {unit} at {where}, "
+            f"{bluntness:.1g} of the scale in the median of {count} states; truth: {method}"
+        ),
+        "wall_time": cost,
+        "extra": {
+            "ratio": ratio,
+            "relative": float(relative),
+            "states": float(count),
+            "bound_relative": bluntness,
+            "state": float(worst["state"]),
+            "body": float(worst["body"] + 1),
+        },
+    }
+    if ratio > 1:
+        reason = (
+            f"{who.title}'s {name} is off by {worst['error']:.3g} {unit} at {where}, {ratio:.3g} times the "
+            f"rounding bound; {int(np.sum(ratios > 1))} of {count} states disagree"
+        )
+        return who.row("state", "-", quantity, "disagrees", reason, unit, **common)
+    if bluntness > BLUNT:
+        reason = f"blunt: the rounding bound is {bluntness:.1g} of the scale, above {BLUNT:g}"
+        return who.row("state", "-", quantity, "unresolved", reason, unit, **common)
+    reason = f"{name} within {ratio:.2g} of the rounding bound at {count} states"
+    return who.row("state", "-", quantity, "agrees", reason, unit, **common)
