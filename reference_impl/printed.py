@@ -33,7 +33,7 @@ def single_C_p(r: Field, p: Field, s1: Field) -> Field:
 
 def single_gamma(r: Field, p: Field, v: Field, pdot: Field, s1: Field) -> Field:
     """(S4) γ = −2 ṙᵀṙ − 4 s₁ᵀL̇Gᵀṙ − 4 [(ṙᵀG + rᵀĠ) B(s₁) + ṙᵀs₁ pᵀ + rᵀs₁ ṗᵀ] ṗ."""
-    bracket = (v @ G(p) + r @ G(pdot)) @ B(s1) + (v @ s1) * p + (r @ s1) * pdot
+    bracket = (v @ G(p) + r @ G(pdot)) @ B(s1) + v @ outer(s1, p) + r @ outer(s1, pdot)
     return np.asarray(-2 * (v @ v) - 4 * (s1 @ L(pdot) @ G(p).T @ v) - 4 * (bracket @ pdot))
 
 

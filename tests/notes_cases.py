@@ -1,0 +1,78 @@
+"""What the tests of the notes share: random chains and states, on and off the manifold, and exact symbols.
+
+The functions of `reference_impl` are algebra of +, − and ×, so the tests run those very functions on
+polynomials over the rationals: an identity that holds there holds for all values.
+"""
+
+import numpy as np
+from sympy import QQ
+from sympy.polys.rings import ring
+
+from plumbline.kinematics import lift
+from reference_impl.chain import Chain
+from reference_impl.euler_parameters import rate
+
+
+def random_chain(rng, rods, loads=True):
+    """A generic chain: full inertia tensors, off-axis attachments, every load; rods: one bool per joint."""
+    n = len(rods)
+    turn = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+    a, b, c = rng.uniform(0.02, 0.1, (3, n))
+    principal = np.stack([b + c, a + c, a + b], -1)  # any a, b, c > 0 are a body's second moments
+    return Chain(
+        mass=rng.uniform(0.5, 2, n),
+        inertia=(turn * principal[:, None, :]) @ turn.swapaxes(-1, -2),
+        proximal=rng.uniform(-0.4, 0.4, (n, 3)),
+        distal=rng.uniform(-0.4, 0.4, (n, 3)),
+        length=np.where(rods, rng.uniform(0.3, 0.6, n), 0.0),
+        gravity=np.array([0.3, -0.2, -9.7]),
+        force=loads * rng.normal(size=(n, 3)),
+        moment=loads * rng.normal(size=(n, 3)),
+        drag_force=loads * rng.uniform(0.1, 0.3, n),
+        drag_moment=loads * rng.uniform(0.01, 0.1, n),
+    )
+
+
+def on_manifold(chain, rng):
+    """r, p, ṙ, ṗ that satisfy every constraint and its rate to rounding."""
+    n = chain.n
+    p, u = rng.normal(size=(n, 4)), rng.normal(size=(n, 3))
+    p /= np.linalg.norm(p, axis=1, keepdims=True)
+    u /= np.linalg.norm(u, axis=1, keepdims=True)
+    omega, udot = rng.normal(size=(n, 3)), np.cross(u, rng.normal(size=(n, 3)))
+    state = lift(chain, p, omega, u, udot)
+    return state.r, p, state.v, rate(p, omega)
+
+
+def off_manifold(chain, rng):
+    """r, p, ṙ, ṗ that satisfy nothing: no joint, no norm, pᵀṗ ≠ 0."""
+    return tuple(x + 0.2 * rng.normal(size=x.shape) for x in on_manifold(chain, rng))
+
+
+class Symbols:
+    """Symbols r, p, ṙ, ṗ, s of N bodies and ℓ, and differentiation of what is built of them."""
+
+    def __init__(self, bodies, attachments):
+        n, counts = bodies, {"r": 3 * bodies, "p": 4 * bodies, "v": 3 * bodies, "w": 4 * bodies}
+        names = [
+            f"{k}{i}" for k, m in {**counts, "s": 3 * attachments, "l": bodies}.items() for i in range(m)
+        ]
+        self.ring, *generators = ring(names, QQ)
+        parts = np.split(np.array(generators, object), np.cumsum([*counts.values(), 3 * attachments]))
+        self.q = np.concatenate(parts[:2])
+        self.qdot = np.concatenate(parts[2:4])
+        shapes = [(n, 3), (n, 4), (n, 3), (n, 4), (attachments, 3), (n,)]
+        self.r, self.p, self.v, self.pdot, self.s, self.length = map(np.reshape, parts, shapes)
+
+    def gradient(self, x, variables):
+        """∂x/∂variables, shape of x + shape of variables."""
+        flat = [self.ring(entry).diff(v) for entry in np.ravel(x) for v in np.ravel(variables)]
+        return np.array(flat, object).reshape(*np.shape(x), *np.shape(variables))
+
+    def rate(self, x):
+        """d_t x along (ṙ, ṗ)."""
+        return self.gradient(x, self.q) @ self.qdot
+
+    def zero(self, x):
+        """Whether every entry is the polynomial 0."""
+        return all(self.ring(entry) == 0 for entry in np.ravel(x))
