@@ -7,6 +7,7 @@ PYTHON := .venv/bin/python
 # The locks name exact versions and hashes and no address, so any index or mirror serves them.
 INSTALL = $(UV) pip install --quiet --require-hashes --python $(PYTHON)
 export UV_PYTHON_DOWNLOADS := never
+export UV_SYSTEM_CERTS := true
 export OMP_NUM_THREADS := 1
 
 .PHONY: help run test nightly bench lint report lock clean
