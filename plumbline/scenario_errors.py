@@ -93,6 +93,8 @@ def _words(error: ErrorDetails, model: type[BaseModel], info: FieldInfo | None) 
             ]
             bound = context.get("gt", context.get("ge", context.get("le")))
             return f"is {given!r}", f"a number {sign} {bound:g}"
+        case "model_type" | "model_attributes_type" | "dict_type" if not error["loc"]:
+            return f"is {_what(given)}", "a mapping that starts with schema_version: 1"
         case "list_type" | "model_type" | "model_attributes_type" | "dict_type" | "string_type":
             return f"is {_what(given)}", _described(info, kind)
         case "too_short" | "too_long":

@@ -13,15 +13,19 @@ from pathlib import Path
 from typing import Any
 
 from ruamel.yaml import YAML
+from ruamel.yaml.composer import Composer
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
 from plumbline.problems import Problem, ScenarioError
 
-MAX_BYTES = 1_000_000  # about 4,000 bodies in full; longer chains repeat
-MAX_NODES = 200_000  # after aliases are followed
+MAX_BYTES = 1_000_000
+MAX_NODES = 50_000  # about 1,000 bodies in full, 6 s of reading; longer chains repeat
 MAX_DEPTH = 20
+
+TOO_DEEP = "is nested too deeply", f"at most {MAX_DEPTH} levels"
+TOO_MANY = f"has more than {MAX_NODES} values (aliases followed)", "fewer values; `repeat` makes long chains"
 
 Key = str | int
 Position = tuple[int, int]
@@ -40,6 +44,26 @@ class Source:
     def stop(self, message: str, valid: str = "", at: Position = (0, 0)) -> ScenarioError:
         """The error of a file that cannot be read on."""
         return ScenarioError([Problem(self.file, *at, "", message, valid)])
+
+
+class _Stop(Exception):
+    """(message, what is valid, mark) of a file that is not read on."""
+
+
+class _Composer(Composer):  # type: ignore[misc,unused-ignore]
+    """Stops at once where a file is too deep or too large to be a scenario."""
+
+    nodes = depth = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        self.nodes += 1
+        if self.nodes > MAX_NODES or self.depth > MAX_DEPTH:
+            much, valid = TOO_DEEP if self.depth > MAX_DEPTH else TOO_MANY
+            raise _Stop(much, valid, self.parser.peek_event().start_mark)
+        self.depth += 1
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
 
 
 def dotted(path: tuple[Key, ...]) -> str:
@@ -73,8 +97,12 @@ def read(path: Path) -> Source:
 def parse(source: Source, content: str) -> Source:
     """Fill in data, positions and problems from YAML text."""
     yaml = YAML(typ="safe", pure=True)
+    yaml.Composer = _Composer
     try:
         root = yaml.compose(content)
+    except _Stop as stop:
+        message, valid, mark = stop.args
+        raise source.stop(message, valid, (mark.line + 1, mark.column + 1)) from None
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         at = (mark.line + 1, mark.column + 1) if mark else (1, 1)
@@ -88,8 +116,6 @@ def parse(source: Source, content: str) -> Source:
         raise source.stop(
             f"the character U+{char:04X} is not allowed in YAML", "printable text", at
         ) from None
-    except RecursionError:
-        raise source.stop("is nested too deeply", f"at most {MAX_DEPTH} levels", (1, 1)) from None
     except (YAMLError, ValueError) as error:
         raise source.stop(f"is not YAML: {error}", "YAML 1.2", (1, 1)) from None
     if root is None or (isinstance(root, ScalarNode) and str(root.tag).endswith(":null")):
@@ -103,9 +129,9 @@ def _plain(source: Source, node: Node, path: tuple[Key, ...], budget: list[int])
     at = node.start_mark.line + 1, node.start_mark.column + 1
     budget[0] -= 1
     if budget[0] < 0:
-        raise source.stop(f"has more than {MAX_NODES} values (aliases followed)", "fewer aliases", at)
+        raise source.stop(*TOO_MANY, at)
     if len(path) > MAX_DEPTH:
-        raise source.stop("is nested too deeply", f"at most {MAX_DEPTH} levels", at)
+        raise source.stop(*TOO_DEEP, at)
     source.values[path] = at
     if isinstance(node, MappingNode):
         mapping: dict[str, Any] = {}
@@ -137,7 +163,10 @@ def _scalar(source: Source, node: Node, path: tuple[Key, ...], at: Position) -> 
     if not str(node.tag).startswith("tag:yaml.org,2002:"):
         kind = "tag"
     if kind in ("int", "float"):
-        return _number(written)
+        try:
+            return _number(written)
+        except ValueError:  # the tag says a number, the text does not
+            return written
     if kind == "bool":
         return written.lower() == "true"
     if kind == "null":
