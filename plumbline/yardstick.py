@@ -1,6 +1,6 @@
 """What engines are measured with: the truth of a scenario, how sure it is, and how sharp it must be.
 
-Runs inside a worker.  State level: the notes' direct system, equilibrated and refined.  Along
+Runs inside a worker.  State level: rigorous enclosures in ball arithmetic.  Along
 trajectories: the closed form where the scenario has one, else the notes' form by DOP853 at two
 tolerances, ten times their difference being its uncertainty.
 """
@@ -19,6 +19,8 @@ from plumbline.measures import attitude_error, position_error
 from plumbline.records import Array, Model, State, StateQuantities, Trajectory
 from plumbline.registry import adapter
 from plumbline.sampling import seed_of
+from plumbline.truth import TruthUnavailable
+from plumbline.truth.certified import certify
 
 FINE, COARSE = 1e-13, 3e-13  # relative tolerances of the truth's two runs
 ROUNDING = 1e3 * 2.0**-52  # of a whole run, before growth: trials saw at most 115 ε G (verification.md)
@@ -50,13 +52,17 @@ class MotionTruth:
 
 
 def state_truth(model: Model, states: Sequence[State]) -> StateTruth:
-    """True state quantities and their rounding bounds."""
-    return StateTruth(
-        list(states),
-        adapter("reference").evaluate(model, states),
-        [state_bound(model, state) for state in states],
-        "the notes' direct system, equilibrated and refined, in double precision",
-    )
+    """True state quantities and their rounding bounds; certified where the truth tools are installed."""
+    bounds = [state_bound(model, state) for state in states]
+    try:
+        certified = [certify(model, state, mass_matrix=True) for state in states]
+    except TruthUnavailable:
+        said = adapter("reference").evaluate(model, states)
+        method = "the notes' direct system in double precision (truth tools are not installed)"
+        return StateTruth(list(states), said, bounds, method)
+    bits = max(answer.bits for answer in certified)
+    method = f"certified: enclosed in ball arithmetic of {bits} bits"
+    return StateTruth(list(states), [answer.quantities for answer in certified], bounds, method)
 
 
 def motion_truth(model: Model, state: State, times: Array, exact: tuple[Array, Array] | None) -> MotionTruth:

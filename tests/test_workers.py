@@ -1,0 +1,111 @@
+"""Worker processes: every way to lose one costs one task, and says how."""
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from plumbline.workers import Limits, Task, Workers
+
+
+def double(x: int) -> int:
+    return 2 * x
+
+
+def segfault() -> None:
+    ctypes.string_at(0)
+
+
+def abort() -> None:
+    os.abort()
+
+
+def hang() -> None:
+    time.sleep(600)
+
+
+def hang_with_the_lock() -> None:
+    """Native code that never returns and never lets go of the interpreter lock."""
+    ctypes.PyDLL(None).sleep(600)
+
+
+def devour() -> int:
+    return len(bytearray(64 * 2**30))
+
+
+def leave() -> None:
+    os._exit(7)
+
+
+def misbehave() -> str:
+    """Write a file into the working folder and flood both outputs, as engines do."""
+    Path("dropped.txt").write_text("x")
+    os.write(1, b"noise\n" * 10_000)
+    os.write(2, b"noise\n" * 10_000)
+    return os.getcwd()
+
+
+def pid() -> int:
+    return os.getpid()
+
+
+LOSSES = [
+    (segfault, "crashed: the worker died of SIGSEGV"),
+    (abort, "crashed: the worker died of SIGABRT"),
+    (leave, "crashed: the worker exited with code 7"),
+    (devour, "out of memory"),
+    (hang, "hung: no answer within"),
+    (hang_with_the_lock, "hung: no answer within"),
+]
+
+
+def test_each_loss_costs_one_task_and_says_so():
+    limits = Limits(seconds=5, gigabytes=4)
+    quick = Limits(seconds=2, gigabytes=4)
+    with Workers(2, limits) as workers:
+        tasks = [Task(("fine", i), double, (i,), limits) for i in range(6)]
+        for k, (loss, _) in enumerate(LOSSES):
+            tasks.insert(2 * k, Task(("lost", k), loss, (), quick))
+        outcomes = {o.key: o for o in workers.run(tasks)}
+    assert [outcomes["fine", i].value for i in range(6)] == [2 * i for i in range(6)]
+    for k, (loss, words) in enumerate(LOSSES):
+        assert words in (outcomes["lost", k].lost or ""), loss.__name__
+
+
+def test_files_and_output_of_an_engine_go_nowhere(capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with Workers(1) as workers:
+        (outcome,) = workers.run([Task("x", misbehave)])
+    assert outcome.value != str(tmp_path)
+    assert not Path(outcome.value).exists(), "the scratch folder is removed"
+    assert list(tmp_path.iterdir()) == []
+    assert "noise" not in "".join(capfd.readouterr())
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the parent-death signal is Linux's")
+def test_no_orphan_is_left_when_the_parent_is_killed(tmp_path):
+    script = tmp_path / "parent.py"
+    script.write_text(
+        "import sys\n"
+        f"sys.path[:0] = {[str(Path(__file__).parents[1]), str(Path(__file__).parent)]!r}\n"
+        "from test_workers import hang, pid\n"
+        "from plumbline.workers import Task, Workers\n"
+        "if __name__ == '__main__':\n"
+        "    with Workers(1) as workers:\n"
+        "        for outcome in workers.run([Task(0, pid), Task(1, hang)]):\n"
+        "            print(outcome.value, flush=True)\n"
+    )
+    parent = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    worker = int(parent.stdout.readline())
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    deadline = time.monotonic() + 20
+    while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{worker}").exists()
