@@ -126,7 +126,7 @@ class Tree:
                 numberOfODE2Coordinates=len(links),
             )
         )
-        tree = mbs.AddObject(
+        self.tree = mbs.AddObject(
             items.ObjectKinematicTree(
                 nodeNumber=node,
                 gravity=model.gravity.tolist(),
@@ -152,7 +152,7 @@ class Tree:
         }
         self.frames = np.array([turn.frame for turn in self.turns if turn.count == 3])  # (N, 3, 3) B
         for k, link in enumerate(self.last):
-            place = {"objectNumber": tree, "linkNumber": link, "localPosition": coms[link].tolist()}
+            place = {"objectNumber": self.tree, "linkNumber": link, "localPosition": coms[link].tolist()}
             marker = mbs.AddMarker(items.MarkerKinematicTreeRigid(**place))
             add_loads(mbs, model, k, marker, ground, self.frames[k].T @ model.moment[k])
             for what, found in self.sensors.items():
@@ -259,9 +259,13 @@ def explicit() -> Any:
 
 
 def evaluate(model: Model, state: State) -> StateQuantities:
-    """Accelerations, kinetic energy and mass matrix from the tree's M and f: M q̈ = f.
+    """All but joint forces, which minimal coordinates do not have, from the tree's own M, f and outputs.
 
-    A tree in minimal coordinates has no joint forces; Exudyn gives it no potential energy either.
+        M q̈ = f,   T = ½ q̇ᵀ M q̇,   V = -Σ m g·r of its links,   μ = M q̇
+
+    The momentum μ of an angle is the angular momentum of all beyond it about that angle's axis.  A ball at
+    the pivot has three axes there; a rod has two, and along u the angular momentum about the pivot is that
+    about the rod's end, where the ball's axes are.
     """
     tree = Tree(model, state)
     chosen = explicit()
@@ -276,9 +280,19 @@ def evaluate(model: Model, state: State) -> StateQuantities:
     finally:
         solver.FinalizeSolver(tree.mbs, chosen)
     tree.mbs.systemData.SetODE2Coordinates_tt(np.linalg.solve(M, f))
+    momentum = M @ tree.rates
+    first, *rest = tree.turns
+    L = first.axes[:, ::-1][:, : first.count] @ momentum[: first.count]
+    if first.count == 2:
+        beyond = rest[0].axes[:, ::-1] @ momentum[2:5]
+        L = L + first.axes[:, 0] * (first.axes[:, 0] @ beyond)
+    masses = np.array(tree.mbs.GetObjectParameter(tree.tree, "linkMasses"))[tree.last]
+    gravity = np.array(tree.mbs.GetObjectParameter(tree.tree, "gravity"))
     return StateQuantities(
         acceleration=tree.sense(Output.Acceleration),
         angular_acceleration=tree.sense(Output.AngularAccelerationLocal),
-        kinetic_energy=float(0.5 * tree.rates @ M @ tree.rates),
+        kinetic_energy=float(0.5 * tree.rates @ momentum),
+        potential_energy=float(-masses @ (tree.sense(Output.Position) @ gravity)),
+        angular_momentum=L,
         mass_matrix=tree.W.T @ M @ tree.W,
     )
