@@ -40,7 +40,13 @@ class ScenarioError(ValueError):
         return type(self), (self.problems,)
 
 
+def closest(word: str, known: Sequence[str]) -> str:
+    """The closest known word, or an empty string where none is close."""
+    close = get_close_matches(word.lower(), [k.lower() for k in known], n=1, cutoff=0.5)
+    return next((k for k in known if close and k.lower() == close[0]), "")
+
+
 def nearest(word: str, known: Sequence[str]) -> str:
     """``did you mean …?`` for the closest known word, or an empty string."""
-    close = get_close_matches(word.lower(), [k.lower() for k in known], n=1, cutoff=0.5)
-    return next((f"did you mean {k!r}?" for k in known if close and k.lower() == close[0]), "")
+    close = closest(word, known)
+    return f"did you mean {close!r}?" if close else ""

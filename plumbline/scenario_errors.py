@@ -10,7 +10,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from plumbline.problems import Problem, nearest
+from plumbline.problems import Problem, closest, nearest
 from plumbline.scenario_schema import SCHEMA_VERSION, Ball, Body, Document, Rod, Run
 from plumbline.yaml_source import Key, Source, dotted
 
@@ -18,8 +18,14 @@ TAGS: dict[str, type[BaseModel]] = {"ball": Ball, "rod": Rod, "body": Body, "run
 
 
 def translate(source: Source, errors: Iterable[ErrorDetails]) -> list[Problem]:
-    """One Problem for each of pydantic's errors."""
-    return [_problem(source, error) for error in errors]
+    """One Problem for each of pydantic's errors; a field that is only misspelt is not missing besides."""
+    resolved = [(error, *_resolve(source, error["loc"])[:2]) for error in errors]
+    meant = {
+        (*path[:-1], closest(str(path[-1]), list(model.model_fields)))
+        for error, path, model in resolved
+        if error["type"] == "extra_forbidden"
+    }
+    return [_problem(source, e) for e, path, _ in resolved if e["type"] != "missing" or path not in meant]
 
 
 def _problem(source: Source, error: ErrorDetails) -> Problem:
@@ -83,7 +89,9 @@ def _words(error: ErrorDetails, model: type[BaseModel], info: FieldInfo | None) 
             return f"has no kind{hint}", "kind: ball or kind: rod"
         case "union_tag_invalid":
             return f"has the kind {context.get('tag')!r}", "kind: ball or kind: rod"
-        case "float_type" | "int_type" | "float_parsing" | "int_from_float":
+        case "int_type" | "int_from_float":
+            return f"is {_what(given)}, not a whole number", "a whole number"
+        case "float_type":
             return _not_a_number(given), _number(info)
         case "finite_number":
             return f"is {given!r}, not a finite number", _number(info)
@@ -115,6 +123,8 @@ def _words(error: ErrorDetails, model: type[BaseModel], info: FieldInfo | None) 
 
 
 def _not_a_number(given: Any) -> str:
+    if isinstance(given, str) and re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", given):
+        return f"is the text {given!r}, not a number: leave out the quotes"
     if isinstance(given, str) and (match := re.fullmatch(r"\s*([-+.\deE]*\d)\s*([^\d\s].*)", given)):
         return f"is the text {given!r}: write the number alone, {match[1]}, without {match[2]!r}"
     return f"is {_what(given)}, not a number"

@@ -152,6 +152,8 @@ def _plain(source: Source, node: Node, path: tuple[Key, ...], budget: list[int])
                 continue
             source.keys[(*path, key)] = key_at
             mapping[key] = _plain(source, value_node, (*path, key), budget)
+            if value_node.start_mark.index == value_node.end_mark.index:  # nothing stands there: show the key
+                source.values[(*path, key)] = key_at
         return mapping
     if isinstance(node, SequenceNode):
         return [_plain(source, item, (*path, index), budget) for index, item in enumerate(node.value)]
