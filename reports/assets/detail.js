@@ -1,0 +1,296 @@
+// One cell: what was compared with what, curves, motion, convergence, states, and how to repeat it.
+import { chunk, fromCode } from "./chunks.js";
+import { keys, panels, strokeOf } from "./curves.js";
+import { track } from "./matrix.js";
+import { motion } from "./motion.js";
+import { axes, decades, path } from "./plot.js";
+import { amend, href } from "./route.js";
+import { copyable, h, number, svg } from "./text.js";
+
+/** @typedef {import("./payload").Index} Index @typedef {import("./payload").ScenarioChunk} ScenarioChunk @typedef {import("./payload").Study} Study */
+
+/** @type {(() => void)[]} what the cell on show must end before the next */
+let ending = [];
+
+export function closeCell() {
+  for (const end of ending) end();
+  ending = [];
+}
+
+/**
+ * @param {HTMLElement} root @param {Index} index @param {Record<string, string>} fields @param {string} back link to the matrix as it was left
+ */
+export async function showCell(root, index, fields, back) {
+  closeCell();
+  const s = index.scenarios.indexOf(fields.scenario);
+  const e = index.engines.indexOf(fields.engine);
+  if (s < 0 || e < 0) {
+    root.replaceChildren(h("h2", { class: "cell-title", tabindex: -1 }, "No such cell"), h("p", {}, `This run has no scenario “${fields.scenario}” with engine “${fields.engine}”. `, h("a", { href: back }, "To the matrix")));
+    return;
+  }
+  const [data, studies] = /** @type {[ScenarioChunk, Study[]]} */ (await Promise.all([chunk(`scenario-${s}`), chunk("convergence")]));
+  const ours = [...index.rows.scenario.keys()].filter((i) => index.rows.scenario[i] === s && index.rows.engine[i] === e);
+  const { scenario } = data;
+  const title = index.engine_titles[e];
+  /** @param {number} step */
+  const neighbour = (step) => index.scenarios[(s + step + index.scenarios.length) % index.scenarios.length];
+  const joints = [...new Set(scenario.joints)].map((kind) => `${scenario.joints.filter((j) => j === kind).length} ${kind}${scenario.joints.filter((j) => j === kind).length === 1 ? "" : "s"}`).join(", ");
+  const version = ours.map((i) => data.rows[i]?.engine_version).find(Boolean);
+  root.replaceChildren(
+    h("nav", { class: "crumbs", "aria-label": "Place in the report" },
+      h("a", { href: back }, "← Matrix"), h("span", {}, scenario.family), h("span", { class: "sep" }),
+      h("a", { href: href({ scenario: neighbour(-1), engine: fields.engine }), rel: "prev" }, `‹ ${neighbour(-1)}`),
+      h("a", { href: href({ scenario: neighbour(1), engine: fields.engine }), rel: "next" }, `${neighbour(1)} ›`)),
+    h("h2", { class: "cell-title", tabindex: -1 }, fields.scenario, h("span", { class: "on" }, ` on ${title}`)),
+    h("p", { class: "purpose" }, `${scenario.title}. ${scenario.purpose}`),
+    h("dl", { class: "facts" },
+      fact("Bodies", scenario.bodies), fact("Joints", joints), fact("Duration", `${number(scenario.duration, 3)} s`),
+      fact("Horizon", scenario.horizon === null ? "–" : `${number(scenario.horizon, 3)} s`),
+      fact("Exact solution", typeof scenario.exact === "string" ? scenario.exact : scenario.exact ? "yes" : "none"),
+      fact("Uncertainty of truth", scenario.truth_uncertainty === null ? "–" : `${number(scenario.truth_uncertainty)} m`),
+      fact("Engine", `${title} ${version ?? ""}`), fact("File", scenario.file), fact("Digest", scenario.digest)),
+    h("ul", { class: "enginetabs" }, index.engines.map((name, k) => {
+      const theirs = speaker(index, s, k);
+      return h("li", {}, h("a", { href: href({ scenario: fields.scenario, engine: name }), "aria-current": k === e ? "page" : null },
+        theirs === null ? null : h("span", { class: `g ${index.slugs[index.rows.verdict[theirs]]}`, "aria-hidden": "true" }, index.glyphs[index.rows.verdict[theirs]]),
+        theirs === null ? null : h("span", { class: "vh" }, index.verdicts[index.rows.verdict[theirs]] + " "), index.engine_titles[k]));
+    })));
+  const told = new Set();
+  for (const i of ours) {
+    const row = data.rows[i];
+    if (!row?.diagnosis || told.has(row.diagnosis)) continue;
+    told.add(row.diagnosis);
+    root.append(h("p", { class: `callout ${index.slugs[index.rows.verdict[i]]}` }, row.diagnosis, h("small", {}, `Diagnosis of ${index.levels[index.rows.level[i]]}, ${index.quantitys[index.rows.quantity[i]]}`)));
+  }
+  root.append(h("h3", {}, "What was compared"), compared(index, data, ours, fields));
+  moving(root, data, fields);
+  const plots = h("div", { class: "plots" });
+  const study = studies.filter((one) => one.scenario === fields.scenario && one.engine === fields.engine);
+  for (const kind of /** @type {const} */ (["step", "tolerance"])) {
+    const plot = workPrecision(study.filter((one) => one.kind === kind && one.quantity === "position"), kind);
+    if (plot) plots.append(plot);
+  }
+  const spread = stateSpread(data.states.filter((one) => one.engine === fields.engine));
+  if (spread) plots.append(spread);
+  if (plots.childElementCount) root.append(h("h3", {}, "Convergence and states"), plots);
+  root.append(h("h3", {}, "Repeat this cell"));
+  for (const level of new Set(ours.map((i) => index.levels[index.rows.level[i]]))) {
+    const line = data.commands[`${fields.engine}/${level}`];
+    if (line && ![...root.querySelectorAll("pre")].some((pre) => pre.textContent === line)) root.append(copyable(line, `command for ${level}`));
+  }
+  for (const i of ours) {
+    const script = data.rows[i]?.script;
+    if (script) root.append(h("details", {}, h("summary", {}, `Stand-alone script: ${index.levels[index.rows.level[i]]}, ${index.quantitys[index.rows.quantity[i]]}`), copyable(script, "script")));
+  }
+}
+
+/** @param {string} name @param {string | number} value */
+const fact = (name, value) => h("div", {}, h("dt", {}, name), h("dd", {}, value));
+
+/**
+ * The row that speaks for a cell; null for an empty one.
+ * @param {Index} index @param {number} s @param {number} e
+ */
+function speaker(index, s, e) {
+  const { rows } = index;
+  let found = -1;
+  for (let i = 0; i < rows.scenario.length; i++) {
+    if (rows.scenario[i] !== s || rows.engine[i] !== e) continue;
+    if (found < 0 || rows.severity[i] > rows.severity[found] || (rows.severity[i] === rows.severity[found] && rows.ratio[i] > rows.ratio[found])) found = i;
+  }
+  return found < 0 ? null : found;
+}
+
+/** @param {Index} index @param {ScenarioChunk} data @param {number[]} ours @param {Record<string, string>} fields */
+function compared(index, data, ours, fields) {
+  const body = h("tbody");
+  const { rows } = index;
+  let level = -1;
+  for (const i of ours) {
+    const row = data.rows[i] ?? {};
+    if (rows.level[i] !== level) {
+      level = rows.level[i];
+      body.append(h("tr", { class: "lvl" }, h("td", { colspan: 9 }, index.levels[level])));
+    }
+    const slug = index.slugs[rows.verdict[i]];
+    const place = [index.levels[level], index.integrators[rows.integrator[i]], index.quantitys[rows.quantity[i]]].join("/");
+    const ratio = fromCode(rows.ratio[i]);
+    const more = h("tr", { class: "more", hidden: true }, h("td", { colspan: 9 }, derivation(row)));
+    const button = h("button", { type: "button", class: "row", "aria-expanded": "false", click: () => toggle(Boolean(more.hidden), true) }, index.quantitys[rows.quantity[i]].replaceAll("_", " "));
+    const line = h("tr", { class: slug },
+      h("td", {}, h("span", { class: `g ${slug}`, "aria-hidden": "true" }, index.glyphs[rows.verdict[i]]), h("span", {}, index.verdicts[rows.verdict[i]] + (row.known ? " †" : ""))),
+      h("td", {}, button), h("td", {}, index.integrators[rows.integrator[i]], row.alias_of ? h("span", { class: "why" }, ` = ${row.alias_of}`) : null),
+      h("td", { class: "r" }, `${number(row.value)} ${row.value === undefined ? "" : (row.unit ?? "")}`), h("td", { class: "r" }, number(row.tolerance)),
+      h("td", { class: "r" }, Number.isNaN(ratio) ? "–" : number(ratio)), h("td", { class: "mini" }, Number.isNaN(ratio) ? null : track(ratio)),
+      h("td", { class: "r" }, row.order === undefined ? "–" : number(row.order, 3) + (row.declared_order ? ` / ${row.declared_order}` : "")),
+      h("td", { class: "why" }, index.reasons[i]));
+    /** @param {boolean} open @param {boolean} tell */
+    function toggle(open, tell) {
+      more.hidden = !open;
+      line.classList.toggle("open", open);
+      button.setAttribute("aria-expanded", String(open));
+      if (tell) amend({ row: open ? place : "" });
+    }
+    body.append(line, more);
+    if (fields.row === place) {
+      toggle(true, false);
+      queueMicrotask(() => button.focus({ preventScroll: true }));
+    }
+  }
+  return h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "What was compared" }, h("table", { class: "plain compared" },
+    h("thead", {}, h("tr", {}, ["Verdict", "Quantity", "Integrator"].map((t) => h("th", { scope: "col" }, t)),
+      ["Error", "Tolerance", "Ratio"].map((t) => h("th", { scope: "col", class: "r" }, t)), h("th", { scope: "col" }, h("span", { class: "vh" }, "Ratio on a log scale")),
+      h("th", { scope: "col", class: "r", title: "observed / declared" }, "Order"), h("th", { scope: "col" }, "Reason"))), body));
+}
+
+/** @param {import("./payload").RowDetail} row */
+function derivation(row) {
+  const list = h("dl", { class: "derive" });
+  /** @param {string} name @param {string | number | null | undefined} value */
+  const say = (name, value) => value !== null && value !== undefined && value !== "" && list.append(h("dt", {}, name), h("dd", {}, value));
+  say("Diagnosis", row.diagnosis);
+  say("Tolerance", row.tolerance === undefined ? null : `${number(row.tolerance, 4)} ${row.unit ?? ""}${row.derivation ? ": " + row.derivation : ""}`);
+  say("Measured", row.value === undefined ? null : `${number(row.value, 4)} ${row.unit ?? ""}`);
+  say("Uncertainty", row.uncertainty === undefined ? null : `${number(row.uncertainty, 3)} ${row.unit ?? ""}, of the truth and of the limit together`);
+  say("Horizon", row.horizon === undefined ? null : `${number(row.horizon, 3)} s, up to which positions were compared`);
+  say("Order", row.order === undefined ? null : `observed ${number(row.order, 4)}${row.declared_order ? `, declared ${row.declared_order}` : ""}`);
+  say("Alias", row.alias_of ? `equals ${row.alias_of} here, so it is not independent evidence` : null);
+  say("Recorded as", row.known);
+  say("Asked for", row.accept === undefined ? null : `${number(row.accept)} ${row.unit ?? ""}: the error is ${(row.value ?? Infinity) <= row.accept ? "within" : "above"} the tolerance given on the command line; the verdict does not depend on it`);
+  for (const [name, value] of Object.entries(row.extra ?? {})) say(name.replaceAll("_", " "), number(value, 4));
+  say("Work", row.wall_time === undefined ? null : `${number(row.wall_time)} s`);
+  return list;
+}
+
+/** @param {HTMLElement} root @param {ScenarioChunk} data @param {Record<string, string>} fields */
+function moving(root, data, fields) {
+  const curves = data.curves ?? [];
+  if (!curves.length && !data.motion) return;
+  const end = Math.max(...curves.map((set) => set.t[set.t.length - 1]), data.motion ? data.motion.t[data.motion.t.length - 1] : 0);
+  const crossings = curves.filter((set) => set.engine === fields.engine && set.crossing !== null);
+  const first = crossings.length ? crossings.reduce((a, b) => (/** @type {number} */ (b.crossing) < /** @type {number} */ (a.crossing) ? b : a)) : null;
+  root.append(h("h3", {}, "Motion and curves"));
+  /** @type {ReturnType<typeof panels> | null} */
+  let drawn = null;
+  const stage = motion(data, {
+    engine: fields.engine, end, start: Number(fields.t) || 0, magnify: fields.mag === undefined ? null : Number(fields.mag),
+    crossing: first ? { t: /** @type {number} */ (first.crossing), name: first.integrator } : null,
+    onTime: (t) => drawn?.setTime(t),
+    onRest: (state) => amend(state),
+  });
+  root.append(stage.root);
+  ending.push(stage.destroy);
+  const choice = h("select", { "aria-label": "Curves shown" }, h("option", { value: "" }, "this engine, every integrator"), h("option", { value: "all" }, "every engine, its best integrator"));
+  choice.value = fields.curves === "all" ? "all" : "";
+  const legend = h("div");
+  const area = h("div", { class: "panels" });
+  if (curves.length) root.append(h("div", { class: "crumbs" }, choice, legend), area);
+  const draw = () => {
+    drawn?.destroy();
+    area.replaceChildren();
+    const sets = choice.value === "all" ? best(curves) : curves.filter((set) => set.engine === fields.engine);
+    const series = sets.map((set, k) => ({ set, name: choice.value === "all" ? `${set.engine} ${set.integrator}` : set.integrator, stroke: strokeOf(k) }));
+    if (!series.length) area.append(h("p", { class: "note" }, "No trajectory of this engine was stored; the rows above say why."));
+    legend.replaceChildren(keys(series, sets.some((set) => set.tolerance)));
+    drawn = panels(area, series, data.scenario.horizon, (t) => stage.setTime(t));
+    drawn.setTime(stage.time());
+  };
+  choice.addEventListener("change", () => {
+    amend({ curves: choice.value });
+    draw();
+  });
+  if (curves.length) draw();
+  ending.push(() => drawn?.destroy());
+}
+
+/**
+ * Of each engine the curve that ends with the smallest error.
+ * @param {import("./payload").CurveSet[]} curves
+ */
+function best(curves) {
+  /** @param {import("./payload").CurveSet} set */
+  const last = (set) => {
+    const error = set.position_error ? fromCode(set.position_error[set.position_error.length - 1]) : 0;
+    return Number.isNaN(error) ? Infinity : error;
+  };
+  /** @type {Map<string, import("./payload").CurveSet>} */
+  const found = new Map();
+  for (const set of curves) {
+    const other = found.get(set.engine);
+    if (!other || last(set) < last(other)) found.set(set.engine, set);
+  }
+  return [...found.values()];
+}
+
+/** @param {Study[]} studies @param {"step" | "tolerance"} kind */
+function workPrecision(studies, kind) {
+  const xs = decades(studies.flatMap((one) => one.resolution.map((v) => v ?? 0)));
+  const ys = decades(studies.flatMap((one) => one.error.map((v) => v ?? 0)));
+  if (!xs || !ys) return null;
+  const name = kind === "step" ? "step" : "relative tolerance";
+  const words = studies.map((one) => `${one.integrator} order ${number(lastNumber(one.order), 3)}`).join(", ");
+  const plot = axes({ title: `Position error at the end against ${name}`, x: { label: kind === "step" ? "step [s]" : "relative tolerance", min: xs[0], max: xs[1] }, y: { label: "error [m]", min: ys[0], max: ys[1] }, right: 110, label: `Error against ${name}: ${words}` });
+  studies.forEach((one, k) => {
+    const { css } = strokeOf(k);
+    plot.root.append(svg("path", { class: `ln ${css}`, d: path(plot, one.resolution, one.error) }));
+    one.resolution.forEach((x, j) => {
+      const y = one.error[j];
+      if (!x || !y) return;
+      plot.root.append(svg("circle", { class: `pt ${css}`, cx: plot.x(x).toFixed(1), cy: plot.y(y).toFixed(1), r: 3 }, svg("title", {}, `${one.integrator}: ${number(x, 3)} → ${number(y, 3)} m${one.order[j] === null ? "" : `, order ${number(one.order[j], 3)}`}`)));
+    });
+    const at = one.error.findIndex((y) => y !== null && y > 0);
+    if (at < 0) return;
+    const y = plot.y(one.error[at] ?? 1);
+    const order = lastNumber(one.order);
+    plot.root.append(svg("text", { class: `series ${css}`, x: plot.x(one.resolution[at] ?? 1) + 7, y: y + 4 }, one.integrator + (kind === "step" && order !== null ? ` ${number(order, 3)}` : "")));
+    if (kind === "step" && one.declared) triangle(plot, one, one.declared);
+  });
+  return h("div", {}, plot.root);
+}
+
+/** @param {(number | null)[]} values */
+const lastNumber = (values) => [...values].reverse().find((v) => v !== null) ?? null;
+
+/**
+ * The declared order as a slope, under the middle of the curve.
+ * @param {import("./plot.js").Plot} plot @param {Study} one @param {number} order
+ */
+function triangle(plot, one, order) {
+  const good = one.resolution.map((x, j) => [x ?? 0, one.error[j] ?? 0]).filter(([x, y]) => x > 0 && y > 0);
+  if (good.length < 2) return;
+  const [x1, y1] = good[Math.floor((good.length - 2) / 2)];
+  const x0 = good[Math.floor((good.length - 2) / 2) + 1][0];
+  const y0 = y1 * (x0 / x1) ** order;
+  const drop = 9;
+  const [a, b, top, low] = [plot.x(x0), plot.x(x1), plot.y(y1) + drop, plot.y(y0) + drop];
+  if (low > plot.bottom) return;
+  plot.root.append(svg("path", { class: "tri", d: `M${a} ${low}H${b}V${top}Z` }), svg("text", { x: b + 4, y: (top + low) / 2 + 4 }, String(order)));
+}
+
+/** @param {import("./payload").StateSpread[]} spreads */
+function stateSpread(spreads) {
+  const values = spreads.map((one) => Array.from(one.ratio, fromCode));
+  const range = decades([...values.flat(), 1]);
+  if (!range || !spreads.length) return null;
+  const low = Math.max(range[0], 1e-8);
+  const high = Math.max(range[1], 10);
+  const step = 34;
+  const height = 62 + step * spreads.length;
+  const words = spreads.map((one, k) => `${one.quantity} worst ${number(Math.max(...values[k].filter((v) => !Number.isNaN(v))))}`).join(", ");
+  const plot = axes({ title: `Error over its bound at ${values[0].length} states`, x: { label: "error / bound", min: low, max: high }, y: { label: "", min: 0, max: spreads.length, log: false, ticks: [] }, height, left: 132, label: `Error over bound: ${words}` });
+  plot.root.append(svg("path", { class: "tol", d: `M${plot.x(1)} ${plot.top}V${plot.bottom}` }));
+  spreads.forEach((one, k) => {
+    const y = plot.y(spreads.length - k - 0.5);
+    const sorted = values[k].filter((v) => v > 0 && Number.isFinite(v)).sort((a, b) => a - b);
+    plot.root.append(svg("text", { x: 126, y: y + 4, "text-anchor": "end" }, one.quantity.replaceAll("_", " ")));
+    if (sorted.length) {
+      const [q1, q2, q3] = [0.25, 0.5, 0.75].map((q) => plot.x(Math.max(low, sorted[Math.floor(q * (sorted.length - 1))])));
+      plot.root.append(svg("rect", { class: "box s0", x: q1, y: y - 9, width: Math.max(1, q3 - q1), height: 18 }), svg("path", { class: "ln s0", d: `M${q2} ${y - 9}V${y + 9}` }));
+    }
+    values[k].forEach((v, state) => {
+      const at = Number.isNaN(v) ? high : Math.min(Math.max(v, low), high);
+      plot.root.append(svg("circle", { class: v <= 1 ? "pt s0" : "bad", cx: plot.x(at).toFixed(1), cy: (y - 8 + ((state * 7) % 17)).toFixed(1), r: 1.8 }, svg("title", {}, `state ${state}: ${number(v, 3)}`)));
+    });
+  });
+  return h("div", {}, plot.root, h("p", { class: "why" }, spreads.map((one) => `${one.quantity.replaceAll("_", " ")}: worst at state ${one.worst[0]}, body ${one.worst[1]} (${number(one.error)}; bound in the median ${number(one.bound)})`).join(" · ")));
+}

@@ -1,0 +1,52 @@
+// What reports/payload.py writes and the page reads.
+
+export interface Index {
+  scenarios: string[]; families: string[]; titles: string[]; engines: string[]; engine_titles: string[];
+  verdicts: string[]; glyphs: string[]; slugs: string[]; reasons: string[];
+  levels: string[]; integrators: string[]; quantitys: string[];
+  commit: string | null; green: string | null;
+  rows: {
+    scenario: Uint16Array; engine: Uint8Array; verdict: Uint8Array; level: Uint8Array; integrator: Uint8Array;
+    quantity: Uint16Array; severity: Uint8Array; fresh: Uint8Array; ratio: Uint16Array;
+  };
+}
+
+export interface RowDetail {
+  unit?: string; value?: number | null; tolerance?: number | null; uncertainty?: number | null; horizon?: number | null;
+  order?: number | null; declared_order?: number; alias_of?: string; known?: string; diagnosis?: string; accept?: number;
+  wall_time?: number; derivation?: string; extra?: Record<string, number | null>; script?: string; engine_version?: string;
+}
+
+export interface CurveSet {
+  engine: string; integrator: string; resolution: number; t: Float32Array; crossing: number | null;
+  tolerance?: Uint16Array; position_error?: Uint16Array; attitude_error?: Uint16Array; energy_drift?: Uint16Array;
+  momentum_drift?: Uint16Array; joint_gap?: Uint16Array; gap_rate?: Uint16Array; norm_drift?: Uint16Array;
+}
+
+export type Vec = [number, number, number];
+export interface Shape { proximal: Vec; distal: Vec; length: number; axes: Vec[]; half: Vec }
+export interface MotionData {
+  t: Float32Array; bodies: number; base: [string, string]; span: number; r: Int16Array; p: Int16Array; shape: Shape[];
+  runs: { engine: string; integrator: string; scale: Float32Array; d: Int8Array }[];
+}
+
+export interface StateSpread { engine: string; quantity: string; ratio: Uint16Array; worst: [number, number]; bound: number; error: number }
+
+export interface ScenarioChunk {
+  scenario: {
+    family: string; title: string; purpose: string; file: string; bodies: number; joints: string[]; duration: number;
+    sample: number; exact: string | null | boolean; horizon: number | null; truth_uncertainty: number | null; digest: string;
+  };
+  rows: Record<string, RowDetail>; commands: Record<string, string>;
+  states: StateSpread[]; curves: CurveSet[] | null; motion: MotionData | null;
+}
+
+export interface Study {
+  scenario: string; engine: string; integrator: string; quantity: string; kind: "step" | "tolerance"; declared: number | null;
+  alias: string | null; resolution: (number | null)[]; error: (number | null)[]; cost: (number | null)[]; order: (number | null)[];
+}
+
+export interface HistoryChunk {
+  nights: { id: string; started: string; commit: string | null; versions: Record<string, string>; exit_code: number; sentence: string }[];
+  damaged: string[]; value: Uint16Array; ratio: Uint16Array; verdict: Uint8Array;
+}

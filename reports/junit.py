@@ -1,0 +1,76 @@
+"""junit.xml: one test case per judged quantity, for the services that read it."""
+
+from __future__ import annotations
+
+import os
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+from reports.results import Record, Results
+from reports.verdicts import needs_attention, number
+
+
+def write(out_dir: Path) -> Path:
+    """Write OUT/junit.xml from OUT's stored results; returns its path.
+
+    A suite per scenario, a case per row.  What nobody expected is a failure (a disagreement, a gap
+    that is not recorded) or an error (the engine failed); what is recorded, and an engine that is not
+    installed, is skipped with its reason.
+    """
+    results = Results.load(out_dir)
+    suites = ET.Element("testsuites", name="plumbline", time=f"{float(results.run['duration']):.3f}")
+    totals = {"tests": 0, "failures": 0, "errors": 0, "skipped": 0}
+    for name, scenario in results.scenarios.items():
+        rows = [row for row in results.rows if row["scenario"] == name]
+        suite = ET.SubElement(suites, "testsuite", name=name, timestamp=str(results.run["started"])[:19])
+        ET.SubElement(ET.SubElement(suite, "properties"), "property", name="family", value=scenario["family"])
+        counted = dict.fromkeys(totals, 0)
+        for row in rows:
+            outcome = _case(suite, row)
+            counted["tests"] += 1
+            if outcome:
+                counted[outcome] += 1
+        suite.attrib |= {k: str(v) for k, v in counted.items()}
+        suite.set("time", f"{sum(row['wall_time'] for row in rows):.3f}")
+        totals = {k: v + counted[k] for k, v in totals.items()}
+    suites.attrib |= {k: str(v) for k, v in totals.items()}
+    path = out_dir / "junit.xml"
+    temporary = path.with_name(f".junit.{os.getpid()}.xml")
+    try:
+        ET.ElementTree(suites).write(temporary, encoding="utf-8", xml_declaration=True)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def _case(suite: ET.Element, row: Record) -> str | None:
+    """Add the row's test case; which total it counts in besides "tests"."""
+    what = row["quantity"] if row["integrator"] == "-" else f"{row['quantity']}[{row['integrator']}]"
+    case = ET.SubElement(
+        suite,
+        "testcase",
+        classname=f"{row['scenario']}.{row['engine']}.{row['level']}",
+        name=what,
+        time=f"{row['wall_time']:.3f}",
+    )
+    message = f"{row['verdict']}: {row['reason']}"
+    if needs_attention(row):
+        kind = "error" if row["verdict"] == "failed" else "failure"
+        ET.SubElement(case, kind, message=message, type=row["verdict"]).text = _detail(row)
+        return "errors" if kind == "error" else "failures"
+    if row["verdict"] != "agrees":
+        recorded = f"recorded as {row['known']}; " if row.get("known") else ""
+        ET.SubElement(case, "skipped", message=recorded + message)
+        return "skipped"
+    return None
+
+
+def _detail(row: Record) -> str:
+    lines = [
+        f"error {number(row['value'], 4)}, tolerance {number(row['tolerance'], 4)} [{row['unit']}]",
+        row["derivation"],
+        row["diagnosis"] or "",
+        f"engine version {row['engine_version']}, key {row['key']}",
+    ]
+    return "\n".join(line for line in lines if line)

@@ -1,0 +1,112 @@
+"""Numbers, small enough to travel in one HTML file: peak-keeping decimation, quantisation, packing.
+
+A chunk is gzip(length of the header, header as JSON, arrays), in base64; the page inflates it when it
+is first looked at.  In the header an array stands as {"$": [offset, length, type]}.
+"""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import json
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from plumbline.records import Array
+
+STEPS_PER_DECADE = 500  # log-scale curves are rounded to 10^(1/500), 0.46 %
+FLOOR = -40.0  # decade of code 2; code 0 is "no number", code 1 an exact zero
+
+
+def buckets(count: int, points: int) -> np.ndarray:
+    """Edges of at most ``points // 2`` buckets of consecutive samples; one per sample where they fit."""
+    if count <= points:
+        return np.arange(count + 1)
+    return np.unique(np.linspace(0, count, points // 2 + 1).astype(int))
+
+
+def decimate_times(t: Array, points: int) -> Array:
+    """The times that go with `decimate`: first and last of each bucket."""
+    edges = buckets(len(t), points)
+    return t if len(edges) == len(t) + 1 else np.stack([t[edges[:-1]], t[edges[1:] - 1]], 1).ravel()
+
+
+def decimate(y: Array, points: int) -> Array:
+    """Minimum and maximum of each bucket, in the order they occur: no peak is lost.
+
+    A value that is not finite stays: a bucket that holds one ends in NaN.
+    """
+    edges = buckets(len(y), points)
+    if len(edges) == len(y) + 1:
+        return y
+    out = np.empty((len(edges) - 1, 2))
+    for k, (a, b) in enumerate(pairwise(edges)):
+        part = y[a:b]
+        finite = np.isfinite(part)
+        if not finite.all():
+            out[k] = part[finite].max() if finite.any() else np.nan, np.nan
+            continue
+        low, high = int(part.argmin()), int(part.argmax())
+        out[k] = part[[low, high]] if low <= high else part[[high, low]]
+    return out.ravel()
+
+
+def log_codes(y: Array) -> np.ndarray:
+    """|y| as uint16: 0 not finite, 1 exact zero, else 2 + 500 (log10 |y| + 40)."""
+    size = np.abs(np.asarray(y, dtype=float))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        codes = np.clip(np.round((np.log10(size) - FLOOR) * STEPS_PER_DECADE), 0, 65000) + 2
+    codes = np.where(size == 0, 1, np.where(np.isfinite(size), codes, 0))
+    return codes.astype(np.uint16)
+
+
+class Packer:
+    """Collects the arrays of one chunk."""
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+        self._size = 0
+
+    def add(self, array: np.ndarray) -> dict[str, list[Any]]:
+        """Store a float32, uint16, int16, uint8 or int8 array; what stands for it in the header."""
+        kind = {"float32": "f4", "uint16": "u2", "int16": "i2", "uint8": "u1", "int8": "i1"}[array.dtype.name]
+        data = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<")).tobytes()
+        if kind in ("u2", "i2"):  # low bytes, then high bytes: the high ones hardly change and compress well
+            data = data[0::2] + data[1::2]
+        reference = {"$": [self._size, int(array.size), kind]}
+        padding = bytes(-len(data) % 4)
+        self._parts.append(data + padding)
+        self._size += len(data) + len(padding)
+        return reference
+
+    def chunk(self, header: Any) -> str:
+        """The finished chunk, base64."""
+        text = json.dumps(header, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
+        text += b" " * (-len(text) % 4)
+        body = len(text).to_bytes(4, "little") + text + b"".join(self._parts)
+        return base64.b64encode(gzip.compress(body, 9, mtime=0)).decode()
+
+
+def unpack(chunk: str) -> Any:
+    """Header of a chunk with its arrays in place, as the page's own ``chunks.js`` does it."""
+    body = gzip.decompress(base64.b64decode(chunk))
+    length = int.from_bytes(body[:4], "little")
+    data = body[4 + length :]
+
+    def fill(value: Any) -> Any:
+        if isinstance(value, list):
+            return [fill(v) for v in value]
+        if not isinstance(value, dict):
+            return value
+        if "$" not in value:
+            return {k: fill(v) for k, v in value.items()}
+        offset, size, kind = value["$"]
+        width = int(kind[1])
+        raw = data[offset : offset + size * width]
+        if width == 2:
+            raw = bytes(b for pair in zip(raw[:size], raw[size:], strict=True) for b in pair)
+        return np.frombuffer(raw, dtype="<" + kind)
+
+    return fill(json.loads(body[4 : 4 + length]))

@@ -1,0 +1,347 @@
+"""What the page's script works on: an index of all rows, one chunk per scenario, convergence and history."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from plumbline.kinematics import conjugate, multiply
+from plumbline.records import Array
+from reports.history import History
+from reports.pack import Packer, decimate, decimate_times, log_codes
+from reports.results import Columns, Record, Results, groups
+from reports.verdicts import MARKS, ratio, severity
+
+CURVES = (
+    "position_error",
+    "attitude_error",
+    "energy_drift",
+    "momentum_drift",
+    "joint_gap",
+    "gap_rate",
+    "norm_drift",
+)
+CLI_LEVEL = {"state": "state", "trajectory": "trajectory", "invariants": "trajectory"}
+MOTION_BYTES = 90_000  # of one scenario's motion, before compression
+_DETAIL = (
+    "unit",
+    "value",
+    "tolerance",
+    "uncertainty",
+    "horizon",
+    "order",
+    "declared_order",
+    "alias_of",
+    "known",
+    "diagnosis",
+    "accept",
+    "wall_time",
+    "derivation",
+    "extra",
+    "engine_version",
+)
+
+
+def command(row: Record, scenario: Record) -> str:
+    """The command line that repeats just this cell, quoted for a POSIX shell."""
+    known_by_name = str(scenario.get("file", "")).replace("\\", "/").startswith(
+        "scenarios/"
+    ) or not scenario.get("file")
+    what = row["scenario"] if known_by_name else scenario["file"]
+    level = CLI_LEVEL.get(row["level"], "all")
+    words = ["python", "-m", "plumbline", "run", "--engine", row["engine"], "--level", level]
+    words[4:4] = [] if what.startswith("-") else [what]
+    return shlex.join(words + (["--", what] if what.startswith("-") else []))
+
+
+def finite(value: Any, digits: int = 6) -> Any:
+    """A JSON number of a few digits; None for what JSON cannot say."""
+    if value is None or isinstance(value, str):
+        return value
+    return float(f"{float(value):.{digits}g}") if np.isfinite(value) else None
+
+
+def index_chunk(results: Results, history: History) -> str:
+    """Every row, one small number per field, and the dictionaries the numbers point into."""
+    packer = Packer()
+    header: dict[str, Any] = {
+        "scenarios": list(results.scenarios),
+        "families": [s["family"] for s in results.scenarios.values()],
+        "titles": [s["title"] for s in results.scenarios.values()],
+        "engines": list(results.engines),
+        "engine_titles": [e["title"] for e in results.engines.values()],
+        "verdicts": list(MARKS),
+        "glyphs": [m.glyph for m in MARKS.values()],
+        "slugs": [m.slug for m in MARKS.values()],
+        "reasons": [row["reason"] for row in results.rows],
+        "commit": results.run.get("commit"),
+        "green": history.last_green.run["started"] if history.last_green else None,
+    }
+    for name in ("level", "integrator", "quantity"):
+        header[name + "s"] = list(dict.fromkeys(row[name] for row in results.rows))
+    rows: dict[str, Any] = {}
+    for name, plural, kind in (
+        ("scenario", "scenarios", np.uint16),
+        ("engine", "engines", np.uint8),
+        ("verdict", "verdicts", np.uint8),
+        ("level", "levels", np.uint8),
+        ("integrator", "integrators", np.uint8),
+        ("quantity", "quantitys", np.uint16),
+    ):
+        place = {value: k for k, value in enumerate(header[plural])}
+        rows[name] = packer.add(np.array([place[row[name]] for row in results.rows], dtype=kind))
+    rows["severity"] = packer.add(np.array([severity(row) for row in results.rows], dtype=np.uint8))
+    rows["fresh"] = packer.add(np.array([history.is_new(row) for row in results.rows], dtype=np.uint8))
+    quotients = [ratio(row) for row in results.rows]
+    rows["ratio"] = packer.add(log_codes(np.array([np.nan if q is None else q for q in quotients])))
+    header["rows"] = rows
+    return packer.chunk(header)
+
+
+def scenario_chunk(name: str, results: Results, tables: dict[str, Columns], points: int) -> str:
+    """Everything the cells of one scenario show; ``points`` samples per curve at most, 0 for no curves."""
+    packer = Packer()
+    scenario = results.scenarios[name]
+    details: dict[str, Record] = {}
+    commands: dict[str, str] = {}
+    for place, row in enumerate(results.rows):
+        if row["scenario"] != name:
+            continue
+        detail: Record = {k: row.get(k) for k in _DETAIL if row.get(k) not in (None, "", {})}
+        for field in ("value", "tolerance", "uncertainty", "horizon", "order", "accept", "wall_time"):
+            if field in detail:
+                detail[field] = finite(detail[field])
+        if "extra" in detail:
+            detail["extra"] = {k: finite(v) for k, v in detail["extra"].items()}
+        if row["key"] in results.scripts:
+            detail["script"] = results.scripts[row["key"]]
+        details[str(place)] = detail
+        commands[f"{row['engine']}/{row['level']}"] = command(row, scenario)
+    header = {
+        "scenario": {
+            k: finite(v) if isinstance(v, float) else v for k, v in scenario.items() if k != "model"
+        },
+        "rows": details,
+        "commands": commands,
+        "states": _states(name, tables, packer),
+        "curves": _curves(name, tables, packer, points) if points else None,
+        "motion": _motion(name, scenario, tables, packer, points) if points else None,
+    }
+    return packer.chunk(header)
+
+
+def _of(name: str, columns: Columns) -> Columns:
+    if not columns:
+        return {}
+    chosen = columns["scenario"] == name
+    return {k: v[chosen] for k, v in columns.items()} if chosen.any() else {}
+
+
+def _states(name: str, tables: dict[str, Columns], packer: Packer) -> list[Record]:
+    states = _of(name, tables["states"])
+    found = []
+    for (engine, quantity), rows in groups(states, "engine", "quantity"):
+        error, bound = states["error"][rows].astype(float), states["bound"][rows].astype(float)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            quotient = error / bound
+        order = np.argsort(states["state"][rows], kind="stable")
+        top = int(np.argmax(np.where(np.isfinite(quotient), quotient, np.inf)))
+        found.append(
+            {
+                "engine": engine,
+                "quantity": quantity,
+                "ratio": packer.add(log_codes(quotient[order])),
+                "worst": [int(states["state"][rows][top]), int(states["body"][rows][top]) + 1],
+                "bound": finite(np.median(bound), 3),
+                "error": finite(error[top], 3),
+            }
+        )
+    return found
+
+
+def _curves(name: str, tables: dict[str, Columns], packer: Packer, points: int) -> list[Record]:
+    curves = _of(name, tables["curves"])
+    found: list[Record] = []
+    times: dict[bytes, Any] = {}
+    for (engine, integrator), rows in groups(curves, "engine", "integrator"):
+        t = curves["t"][rows].astype(float)
+        error, tolerance = (
+            curves["position_error"][rows].astype(float),
+            curves["tolerance"][rows].astype(float),
+        )
+        above = ~(error <= tolerance) & np.isfinite(tolerance)
+        shared = t.tobytes()
+        if shared not in times:
+            times[shared] = packer.add(decimate_times(t, points).astype(np.float32))
+        one: Record = {
+            "engine": engine,
+            "integrator": integrator,
+            "resolution": finite(curves["resolution"][rows][0]),
+            "t": times[shared],
+            "crossing": finite(t[int(np.argmax(above))]) if above.any() else None,
+        }
+        if np.isfinite(tolerance).any():
+            one["tolerance"] = packer.add(log_codes(decimate(tolerance, points)))
+        for curve in CURVES:
+            if curve in curves and np.any(curves[curve][rows] != 0):
+                one[curve] = packer.add(log_codes(decimate(curves[curve][rows].astype(float), points)))
+        found.append(one)
+    return found
+
+
+def _final_errors(name: str, tables: dict[str, Columns]) -> dict[tuple[str, ...], float]:
+    curves = _of(name, tables["curves"])
+    errors = {}
+    for key, rows in groups(curves, "engine", "integrator"):
+        worst = float(np.max(curves["position_error"][rows]))
+        errors[key] = worst if np.isfinite(worst) else np.inf
+    return errors
+
+
+def _motion(
+    name: str, scenario: Record, tables: dict[str, Columns], packer: Packer, points: int
+) -> Record | None:
+    """Poses of the reference, and how far every other run is from them, one scale per frame.
+
+    A run's pose is r = r_ref + scale·d/127, attitude = exp(scale·w/127) attitude_ref: so 1e-9 survives.
+    """
+    poses = _of(name, tables["trajectories"])
+    runs = dict(groups(poses, "engine", "integrator"))
+    if not runs:
+        return None
+    n = int(scenario["bodies"])
+    errors = _final_errors(name, tables)
+    engines = dict.fromkeys(engine for engine, _ in runs)
+    best = [min((k for k in runs if k[0] == e), key=lambda k: errors.get(k, np.inf)) for e in engines]
+    shown = list(runs) if n <= 3 else best
+    base = next((k for k in best if k[0] == "reference"), best[0])
+    r0, p0, t = _poses(poses, runs[base], n)
+    frames = int(np.clip(MOTION_BYTES * points / 300 / (n * (14 + 6 * len(shown))), 24, points))
+    pick = np.unique(np.linspace(0, len(t) - 1, min(frames, len(t))).round().astype(int))
+    span = float(np.max(np.abs(r0))) or 1.0
+    header: Record = {
+        "t": packer.add(t[pick].astype(np.float32)),
+        "bodies": n,
+        "base": list(base),
+        "span": span,
+        "r": packer.add(np.round(r0[pick] / span * 32767).astype(np.int16)),
+        "p": packer.add(np.round(p0[pick] * 32767).astype(np.int16)),
+        "shape": _shapes(scenario),
+        "runs": [],
+    }
+    for key in shown:
+        r, p, times = _poses(poses, runs[key], n)
+        if len(times) != len(t) or np.any(np.abs(times - t) > 1e-9 * max(1.0, t[-1])):
+            continue
+        difference = np.concatenate([r - r0, rotation_vector(p, p0)], -1)[pick]
+        usable = np.isfinite(difference).all((1, 2))
+        scale = np.abs(np.where(usable[:, None, None], difference, 0)).max((1, 2))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            small = np.where(scale[:, None, None] > 0, difference / scale[:, None, None], 0) * 127
+        header["runs"].append(
+            {
+                "engine": key[0],
+                "integrator": key[1],
+                "scale": packer.add(np.where(usable, scale, np.nan).astype(np.float32)),
+                "d": packer.add(np.round(np.where(usable[:, None, None], small, 0)).astype(np.int8)),
+            }
+        )
+    return header
+
+
+def _poses(poses: Columns, rows: np.ndarray, n: int) -> tuple[Array, Array, Array]:
+    """R (T, n, 3), unit p (T, n, 4) and t (T,) of one run, whatever the order of its rows."""
+    order = rows[np.lexsort((poses["body"][rows], poses["t"][rows]))]
+    r = np.stack([poses[k][order] for k in ("rx", "ry", "rz")], -1).reshape(-1, n, 3).astype(float)
+    p = np.stack([poses[k][order] for k in ("p0", "p1", "p2", "p3")], -1).reshape(-1, n, 4).astype(float)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return r, p / np.linalg.norm(p, axis=-1, keepdims=True), poses["t"][order][::n].astype(float)
+
+
+def rotation_vector(p: Array, p0: Array) -> Array:
+    """World-frame rotation vector (..., 3) from attitude p0 to attitude p, rad; exact for tiny angles."""
+    q = multiply(p, conjugate(p0))
+    q = np.where(q[..., :1] < 0, -q, q)
+    size = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        factor = np.where(size > 1e-12, 2 * np.arctan2(size, q[..., :1]) / size, 2.0)
+    return np.asarray(factor * q[..., 1:])
+
+
+def _shapes(scenario: Record) -> list[Record]:
+    """Per body: attachment points, rod, and the box with its principal moments (axes, half sides)."""
+    model = scenario["model"]
+    mass = np.asarray(model["mass"], dtype=float)
+    shapes = []
+    for k in range(len(mass)):
+        moments, axes = np.linalg.eigh(np.asarray(model["inertia"][k], dtype=float))
+        half = np.sqrt(np.clip(1.5 / mass[k] * (moments.sum() - 2 * moments), 0, None))
+        shapes.append(
+            {
+                "proximal": [finite(x) for x in model["proximal"][k]],
+                "distal": [finite(x) for x in model["distal"][k]],
+                "length": finite(model["length"][k]),
+                "axes": [[finite(x, 4) for x in axis] for axis in axes.T],
+                "half": [finite(x, 4) for x in half],
+            }
+        )
+    return shapes
+
+
+def convergence_chunk(results: Results, tables: dict[str, Columns]) -> str:
+    """Every convergence study: error, cost and observed order at each resolution, coarse to fine."""
+    columns = tables["convergence"]
+    kinds = {(e, i["name"]): i for e, engine in results.engines.items() for i in engine["integrators"]}
+    studies = []
+    for (scenario, engine, integrator, quantity), rows in groups(
+        columns, "scenario", "engine", "integrator", "quantity"
+    ):
+        order = rows[np.argsort(-columns["resolution"][rows].astype(float), kind="stable")]
+        method = kinds.get((engine, integrator), {})
+        studies.append(
+            {
+                "scenario": scenario,
+                "engine": engine,
+                "integrator": integrator,
+                "quantity": quantity,
+                "kind": method.get("kind", "step"),
+                "declared": method.get("order"),
+                "alias": method.get("alias_of"),
+                **{
+                    k: [finite(v, 4) for v in columns[k][order]]
+                    for k in ("resolution", "error", "cost", "order")
+                },
+            }
+        )
+    return Packer().chunk(studies)
+
+
+def history_chunk(results: Results, history: History) -> str:
+    """Value, error over tolerance and verdict of each of this run's keys over the nights, this run last."""
+    packer = Packer()
+    verdicts = {verdict: k + 1 for k, verdict in enumerate(MARKS)}
+    nights: Sequence[dict[str, Record]] = [
+        *(night.rows for night in history.nights),
+        {row["key"]: row for row in results.rows},
+    ]
+    found = [[night.get(row["key"]) for night in nights] for row in results.rows]
+
+    def table(of: Any) -> np.ndarray:
+        return np.array(
+            [[np.nan if r is None or of(r) is None else of(r) for r in line] for line in found], float
+        )
+
+    header = {
+        "nights": [
+            {k: run.get(k) for k in ("id", "started", "commit", "versions", "exit_code", "sentence")}
+            for run in (*(night.run for night in history.nights), results.run)
+        ],
+        "damaged": history.damaged,
+        "value": packer.add(log_codes(table(lambda r: r.get("value")))),
+        "ratio": packer.add(log_codes(table(ratio))),
+        "verdict": packer.add(np.nan_to_num(table(lambda r: verdicts[r["verdict"]])).astype(np.uint8)),
+    }
+    return packer.chunk(header)

@@ -1,0 +1,93 @@
+"""Stored results, read back: results.json and the Parquet tables of one output folder."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+
+Record = dict[str, Any]
+Columns = dict[str, np.ndarray]
+
+# What neither XML 1.0 nor a reader can show (control characters, lone surrogates, U+FFFE/F) and what
+# would turn the text around it (bidirectional controls); all become U+FFFD.
+_UNPRINTABLE = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]"
+)
+
+
+def clean(value: Any) -> Any:
+    """The same value with every unprintable character of every text in it replaced by U+FFFD."""
+    if isinstance(value, str):
+        return _UNPRINTABLE.sub("\N{REPLACEMENT CHARACTER}", value)
+    if isinstance(value, dict):
+        return {clean(k): clean(v) for k, v in value.items()}
+    if isinstance(value, list):
+        return [clean(v) for v in value]
+    return value
+
+
+@dataclass(frozen=True)
+class Results:
+    """One run: ``results.json`` read and cleaned, tables on demand."""
+
+    folder: Path
+    run: Record
+    scenarios: dict[str, Record]
+    engines: dict[str, Record]
+    rows: list[Record]
+
+    @classmethod
+    def load(cls, folder: Path) -> Results:
+        """Read OUT/results.json; raises OSError or ValueError where it is missing or not JSON."""
+        stored = clean(json.loads((folder / "results.json").read_text(encoding="utf-8")))
+        return cls(folder, stored["run"], stored["scenarios"], stored["engines"], stored["rows"])
+
+    def table(self, name: str) -> Columns:
+        """Columns of OUT/<name>.parquet as NumPy arrays, texts cleaned; {} where the file is absent."""
+        path = self.folder / f"{name}.parquet"
+        if not path.exists():
+            return {}
+        table = pq.read_table(path)
+        columns: Columns = {}
+        for column in table.column_names:
+            values = table[column].to_numpy(zero_copy_only=False)
+            columns[column] = _clean_texts(values) if values.dtype == object else values
+        return columns
+
+    @cached_property
+    def scripts(self) -> dict[str, str]:
+        """Stand-alone script of each row key that has one (OUT/scripts/index.json)."""
+        index = self.folder / "scripts" / "index.json"
+        if not index.exists():
+            return {}
+        files = json.loads(index.read_text(encoding="utf-8"))
+        inside = {k: (index.parent / Path(name).name) for k, name in files.items()}
+        return {
+            clean(k): clean(path.read_text(encoding="utf-8", errors="replace"))
+            for k, path in inside.items()
+            if path.is_file()
+        }
+
+
+def _clean_texts(values: np.ndarray) -> np.ndarray:
+    known: dict[Any, Any] = {}
+    return np.array([known.setdefault(v, clean(v)) for v in values.tolist()], dtype=object)
+
+
+def groups(columns: Columns, *by: str) -> Iterator[tuple[tuple[str, ...], np.ndarray]]:
+    """Row indices of each distinct combination of the named columns, in order of first appearance."""
+    if not columns:
+        return
+    found: dict[tuple[str, ...], list[int]] = {}
+    for index, key in enumerate(zip(*(columns[name].tolist() for name in by), strict=True)):
+        found.setdefault(key, []).append(index)
+    for key, indices in found.items():
+        yield key, np.array(indices)

@@ -1,0 +1,107 @@
+"""summary.md: what a GitHub Actions step shows of a run, below its limit of 1 MiB."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from reports.results import Record, Results
+from reports.verdicts import MARKS, counts, needs_attention, number, ratio, severity
+
+LIMIT = 1_000_000  # bytes; GitHub drops a step's summary above 1 MiB = 1,048,576 bytes
+_SPECIAL = re.compile(r"[^0-9A-Za-z .,;:()/+%=\u0080-\uffff-]")
+
+
+def write(out_dir: Path) -> Path:
+    """Write OUT/summary.md from OUT's stored results; returns its path."""
+    path = out_dir / "summary.md"
+    temporary = path.with_name(f".summary.{os.getpid()}.md")
+    try:
+        temporary.write_text(render(Results.load(out_dir)), encoding="utf-8")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def escape(text: Any, longest: int = 400) -> str:
+    """Text that Markdown and its HTML show as it is: every special character as a numeric reference.
+
+    One line of at most ``longest`` characters; a "-" or number at the start cannot open a list either.
+    """
+    line = " ".join(str(text).split())
+    line = line if len(line) <= longest else line[: longest - 1] + "…"
+    line = _SPECIAL.sub(lambda match: f"&#{ord(match[0])};", line)
+    return re.sub(r"https?:|www\.", lambda match: match[0].replace(":", "&#58;").replace(".", "&#46;"), line)
+
+
+def render(results: Results) -> str:
+    """The summary as Markdown: sentence, counts, engines by family, then as many findings as fit."""
+    run = results.run
+    tally = counts(results.rows)
+    lines = [
+        f"## {escape(run['sentence'], 2000)}",
+        "",
+        " · ".join(f"{mark.glyph} **{tally[v]}** {mark.plural}" for v, mark in MARKS.items() if tally[v]),
+        "",
+        *_table(results),
+        "",
+    ]
+    attention = sorted(
+        (row for row in results.rows if needs_attention(row)),
+        key=lambda r: (-severity(r), -(ratio(r) or 0.0)),
+    )
+    tail = [
+        "",
+        f"Run {escape(run['id'])}, {escape(run['started'])}, {float(run['duration']):.0f} s, "
+        f"commit {escape(run['commit'] or '–')}, Python {escape(run['python'])}, {escape(run['platform'])}. "
+        "The artefact report.html has every cell.",
+        "",
+    ]
+    if attention:
+        lines += ["### What needs attention", "", "| | scenario | engine | what | error / tolerance | why |"]
+        lines += ["|---|---|---|---|---|---|"]
+    room = LIMIT - len("\n".join(lines + tail).encode()) - 200
+    for place, row in enumerate(attention):
+        line = _finding(row)
+        room -= len(line.encode()) + 1
+        if room < 0:
+            lines += ["", f"… and {len(attention) - place} more."]
+            break
+        lines.append(line)
+    return "\n".join(lines + tail)
+
+
+def _table(results: Results) -> list[str]:
+    """Counts of each verdict by family and engine; the first hundred families where there are more."""
+    cells: dict[tuple[str, str], Counter[str]] = {}
+    for row in results.rows:
+        cells.setdefault((row["family"], row["engine"]), Counter())[row["verdict"]] += 1
+    families = list(dict.fromkeys(row["family"] for row in results.rows))
+    heads = [f"{escape(e['title'])} {escape(e['version'] or '')}" for e in results.engines.values()]
+    lines = ["| family | " + " | ".join(heads) + " |", "|---" * (len(heads) + 1) + "|"]
+    for family in families[:100]:
+        said = []
+        for engine in results.engines:
+            found = cells.get((family, engine), Counter())
+            said.append(" ".join(f"{m.glyph}&nbsp;{found[v]}" for v, m in MARKS.items() if found[v]))
+        lines.append(f"| {escape(family)} | " + " | ".join(said) + " |")
+    return lines + ([f"\n… and {len(families) - 100} more families."] if len(families) > 100 else [])
+
+
+def _finding(row: Record) -> str:
+    mark = MARKS[row["verdict"]]
+    what = ", ".join(row[k] for k in ("level", "integrator", "quantity") if row[k] != "-")
+    why = escape(row["reason"]) + (f" *{escape(row['diagnosis'])}*" if row.get("diagnosis") else "")
+    cells = (
+        f"{mark.glyph} {row['verdict']}",
+        escape(row["scenario"], 120),
+        escape(row["engine"]),
+        escape(what),
+        number(ratio(row)),
+        why,
+    )
+    return "| " + " | ".join(cells) + " |"
