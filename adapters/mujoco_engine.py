@@ -100,7 +100,7 @@ class _Chain:
         for k in range(model.n):
             principal, axes = _principal(model.inertia[k])
             if model.length[k] > 0:
-                parent = self._body(parent, hang, np.zeros(3), 0.0, np.array([0, 0, principal.mean()]))
+                parent = self._body(parent, hang, np.zeros(3), 0.0, np.array([0, 0, 0.01 * principal.mean()]))
                 hang = np.array([0, 0, -model.length[k]])
             at = model.proximal[k]
             parent = self._body(parent, hang - at, at, model.mass[k], principal, axes)

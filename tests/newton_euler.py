@@ -15,8 +15,6 @@ from scipy.integrate import solve_ivp
 from plumbline import kinematics
 from plumbline.records import Array, Model, State
 
-Long = np.longdouble
-
 
 @dataclass(frozen=True, eq=False)
 class Truth:
@@ -27,31 +25,36 @@ class Truth:
     joint_reaction: Array
 
 
-def solve(model: Model, state: State) -> Truth:
+def solve(model: Model, state: State, number: type = np.longdouble) -> Truth:
     """The accelerations and joint forces at a state, from p, ω′, u and u̇ alone (r and v follow)."""
+
+    def exact(x: Array) -> Array:
+        return np.asarray(x, number)
+
     n = model.n
-    A = np.zeros((9 * n, 9 * n), Long)
-    b = np.zeros(9 * n, Long)
-    R = _rotation(state.p)
-    omega, u, udot = (np.asarray(x, Long) for x in (state.omega, state.u, state.udot))
-    J, near, far = (np.asarray(x, Long) for x in (model.inertia, model.proximal, model.distal))
-    v = _velocities(model, R, omega, udot)
+    A = np.zeros((9 * n, 9 * n), number)
+    b = np.zeros(9 * n, number)
+    R = _rotation(exact(state.p))
+    omega, u, udot = exact(state.omega), exact(state.u), exact(state.udot)
+    J, near, far = exact(model.inertia), exact(model.proximal), exact(model.distal)
+    mass, length = exact(model.mass), exact(model.length)
+    drag_force, drag_moment = exact(model.drag_force), exact(model.drag_moment)
+    v = _velocities(R, omega, length[:, None] * udot, near, far)
     acc, ang, force = (lambda k, o=o: slice(9 * k + o, 9 * k + o + 3) for o in (0, 3, 6))
     for k in range(n):
         w = omega[k]
         # Newton: m r̈ − F_k + F_{k+1} = applied;  Euler, in the body frame, about the centre of mass.
-        A[acc(k), acc(k)] = Long(model.mass[k]) * np.eye(3)
+        A[acc(k), acc(k)] = mass[k] * np.eye(3)
         A[acc(k), force(k)] = -np.eye(3)
-        drag = Long(model.drag_force[k])
-        b[acc(k)] = Long(model.mass[k]) * model.gravity + model.force[k] - drag * v[k]
+        b[acc(k)] = mass[k] * model.gravity + model.force[k] - drag_force[k] * v[k]
         A[ang(k), ang(k)] = J[k]
         A[ang(k), force(k)] = -_skew(near[k]) @ R[k].T
-        b[ang(k)] = model.moment[k] - Long(model.drag_moment[k]) * w - np.cross(w, J[k] @ w)
+        b[ang(k)] = model.moment[k] - drag_moment[k] * w - np.cross(w, J[k] @ w)
         if k + 1 < n:
             A[acc(k), force(k + 1)] = np.eye(3)
             A[ang(k), force(k + 1)] = _skew(far[k]) @ R[k].T
         # The joint: difference of the accelerations of the two attachment points = d̈ = ℓ ü.
-        rows = np.zeros((3, 9 * n), Long)
+        rows = np.zeros((3, 9 * n), number)
         rows[:, acc(k)], rows[:, ang(k)] = np.eye(3), -R[k] @ _skew(near[k])
         known = -R[k] @ np.cross(w, np.cross(w, near[k]))
         if k > 0:
@@ -59,8 +62,8 @@ def solve(model: Model, state: State) -> Truth:
             known += R[k - 1] @ np.cross(omega[k - 1], np.cross(omega[k - 1], far[k - 1]))
         if model.length[k] > 0:
             along, across = u[k] / np.sqrt(u[k] @ u[k]), _perpendicular(u[k])
-            known = np.array([along @ known - Long(model.length[k]) * (udot[k] @ udot[k]), 0, 0])
-            rows = np.vstack([along @ rows, np.zeros((2, 9 * n), Long)])
+            known = np.array([along @ known - length[k] * (udot[k] @ udot[k]), 0, 0])
+            rows = np.vstack([along @ rows, np.zeros((2, 9 * n), number)])
             rows[1:, force(k)] = across
         A[force(k)], b[force(k)] = rows, known
     x = _solve(A, b).reshape(n, 9)
@@ -78,7 +81,7 @@ def integrate(model: Model, state: State, times: Array, rtol: float = 3e-14) -> 
 
     def rhs(_t: float, y: Array) -> Array:
         at = unpack(y)
-        truth = solve(model, at)
+        truth = solve(model, at, float)  # rounding, like that of the integrator
         d_ddot = _attachment_acceleration(model, at, truth)
         uddot = np.where(model.rods[:, None], d_ddot / np.where(model.rods, model.length, 1)[:, None], 0)
         parts = kinematics.rate(at.p, at.omega), truth.angular_acceleration, at.udot, uddot
@@ -121,20 +124,18 @@ def mass_matrix(model: Model, state: State) -> Array:
 
 
 def _rotation(p: Array) -> Array:
-    """A (N, 3, 3) of p/‖p‖ in extended precision, from A v = v + 2 e × (e × v + p0 v)."""
-    q = np.asarray(p, Long)
-    q = q / np.sqrt(np.sum(q * q, -1, keepdims=True))
+    """A (N, 3, 3) of p/‖p‖, from A v = v + 2 e × (e × v + p0 v)."""
+    q = p / np.sqrt(np.sum(p * p, -1, keepdims=True))
     E = np.array([_skew(e) for e in q[:, 1:]])
-    return np.asarray(np.eye(3, dtype=Long) + 2 * (E @ E + q[:, :1, None] * E))
+    return np.asarray(np.eye(3, dtype=p.dtype) + 2 * (E @ E + q[:, :1, None] * E))
 
 
-def _velocities(model: Model, R: Array, omega: Array, udot: Array) -> Array:
-    v = np.zeros((model.n, 3), Long)
-    tip = np.zeros(3, Long)
-    for k in range(model.n):
-        hang = tip + Long(model.length[k]) * udot[k]
-        v[k] = hang - R[k] @ np.cross(omega[k], np.asarray(model.proximal[k], Long))
-        tip = v[k] + R[k] @ np.cross(omega[k], np.asarray(model.distal[k], Long))
+def _velocities(R: Array, omega: Array, rod_rate: Array, near: Array, far: Array) -> Array:
+    v = np.zeros_like(omega)
+    tip = np.zeros_like(omega[0])
+    for k in range(len(v)):
+        v[k] = tip + rod_rate[k] - R[k] @ np.cross(omega[k], near[k])
+        tip = v[k] + R[k] @ np.cross(omega[k], far[k])
     return v
 
 
@@ -161,16 +162,15 @@ def _perpendicular(u: Array) -> Array:
 
 
 def _solve(A: Array, b: Array) -> Array:
-    """Equilibrated double-precision inverse, refined against extended-precision residuals to stagnation."""
+    """Equilibrated double-precision inverse, refined against residuals in the numbers' own precision."""
     row = 1 / np.max(np.abs(A), 1)
     column = 1 / np.max(np.abs(row[:, None] * A), 0)
     scaled = row[:, None] * A * column
     inverse = np.linalg.inv(scaled.astype(float))
     x = np.zeros_like(b)
     for _ in range(8):
-        residual = row * b - scaled @ x
-        step = (inverse @ residual.astype(float)).astype(Long)
+        step = (inverse @ (row * b - scaled @ x).astype(float)).astype(b.dtype)
         x = x + step
-        if np.max(np.abs(step)) <= 1e-18 * np.max(np.abs(x)):
+        if np.max(np.abs(step)) <= 4 * np.finfo(b.dtype).eps * np.max(np.abs(x)):
             break
     return np.asarray(column * x, dtype=float)

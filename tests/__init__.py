@@ -1,0 +1,1 @@
+"""The tests; a package, so that worker processes find its helpers by name."""

@@ -1,0 +1,71 @@
+"""Small generic pendulums for tests: full inertias, offset attachments, nothing in a special direction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from plumbline import kinematics
+from plumbline.records import Array, Model, State
+
+JOINTS = {  # b: hung by a ball joint, r: by a rod
+    "ball": "b",
+    "rod": "r",
+    "balls": "bb",
+    "rods": "rr",
+    "rod-ball": "rb",
+    "ball-rod": "br",
+    "mixed": "rbbrr",
+    "balls-10": "b" * 10,
+    "rods-10": "r" * 10,
+}
+
+
+@cache
+def model(joints: str, loads: bool = False, drag: bool = False, seed: int = 0) -> Model:
+    """A pendulum with one letter of ``joints`` per body, drawn from ``seed``."""
+    n = len(joints)
+    rng = np.random.default_rng([seed, *joints.encode()])
+    inertia = []
+    for _ in range(n):
+        frame = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        a, b, c = rng.uniform(0.01, 0.04, 3)  # of three masses on axes: any such tensor is physical
+        inertia.append(frame @ np.diag([b + c, a + c, a + b]) @ frame.T)
+    J = np.array(inertia)
+    return Model(
+        mass=rng.uniform(0.5, 2.0, n),
+        inertia=(J + J.transpose(0, 2, 1)) / 2,
+        proximal=0.25 * _unit(rng, n),
+        distal=0.25 * _unit(rng, n),
+        length=np.where([j == "r" for j in joints], 0.4, 0.0),
+        gravity=np.array([0.7, -0.4, -9.7]),
+        force=loads * rng.normal(size=(n, 3)),
+        moment=loads * 0.3 * rng.normal(size=(n, 3)),
+        drag_force=drag * rng.uniform(0.1, 0.3, n),
+        drag_moment=drag * rng.uniform(0.01, 0.03, n),
+    )
+
+
+def state(subject: Model, seed: int = 0, rate: float = 3.0) -> State:
+    """A random state on the manifold; ``rate`` (rad/s) is the standard deviation of every angular rate."""
+    rng = np.random.default_rng(seed)
+    n, rod = subject.n, subject.rods[:, None]
+    p = rng.normal(size=(n, 4))
+    u = _unit(rng, n)
+    udot = np.cross(rate * rng.normal(size=(n, 3)), u)
+    omega = rate * rng.normal(size=(n, 3))
+    p /= np.linalg.norm(p, axis=1, keepdims=True)
+    return kinematics.lift(subject, p, omega, np.where(rod, u, 0.0), np.where(rod, udot, 0.0))
+
+
+def flipped(at: State) -> State:
+    """The same state with −p for every second body, the first included."""
+    signs = np.where(np.arange(len(at.p)) % 2, 1.0, -1.0)[:, None]
+    return replace(at, p=signs * at.p)
+
+
+def _unit(rng: np.random.Generator, n: int) -> Array:
+    x = rng.normal(size=(n, 3))
+    return np.asarray(x / np.linalg.norm(x, axis=1, keepdims=True))

@@ -1,0 +1,84 @@
+"""One killable process per engine, kept for the session: a crash or a hang of an engine fails one test."""
+
+from __future__ import annotations
+
+import atexit
+import multiprocessing
+import os
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before any child loads a BLAS
+
+from pebble import ProcessPool
+
+from plumbline.adapter import Adapter
+from plumbline.registry import adapter
+
+TIMEOUT = 60.0  # s
+
+
+def call(
+    engine: str,
+    method: str,
+    *args: Any,
+    tamper: dict[str, Callable[..., Any]] | None = None,
+    timeout: float = TIMEOUT,
+) -> Any:
+    """``adapter(engine).method(*args)`` in the engine's own process; what it raises is raised here.
+
+    ``tamper`` replaces methods of the adapter by functions of (its own method, *args), to see
+    what the contract's checks make of it.  Raises pebble.ProcessExpired when the process dies,
+    TimeoutError when it must be killed; the next call gets a new process.
+    """
+    return run(engine, _invoke, engine, method, args, tamper or {}, timeout=timeout)
+
+
+def attribute(engine: str, name: str) -> Any:
+    """A class attribute of the adapter, read in its own process."""
+    return run(engine, _attribute, engine, name)
+
+
+def run(engine: str, function: Callable[..., Any], *args: Any, timeout: float = TIMEOUT) -> Any:
+    """Any picklable function in the engine's process."""
+    return _pool(engine).schedule(function, args=args, timeout=timeout).result()
+
+
+@cache
+def _pool(engine: str) -> ProcessPool:
+    pool = ProcessPool(max_workers=1, context=multiprocessing.get_context("spawn"))
+    atexit.register(_close, pool)
+    return pool
+
+
+def _close(pool: ProcessPool) -> None:
+    pool.stop()
+    pool.join()
+
+
+@cache
+def _adapter(engine: str) -> Adapter:
+    return adapter(engine)
+
+
+def _invoke(engine: str, method: str, args: tuple[Any, ...], tamper: dict[str, Callable[..., Any]]) -> Any:
+    subject = _adapter(engine)
+    if tamper:
+        subject = _doctored(subject, tamper)
+    return getattr(subject, method)(*args)
+
+
+def _attribute(engine: str, name: str) -> Any:
+    return getattr(_adapter(engine), name)
+
+
+def _doctored(real: Adapter, tamper: dict[str, Callable[..., Any]]) -> Adapter:
+    """An instance of a subclass of the real adapter in which some methods pass through a tampering hand."""
+
+    def wrap(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda self, *args: function(lambda *a: getattr(real, name)(*a), *args)
+
+    members = {name: wrap(name, function) for name, function in tamper.items()}
+    doctored: Adapter = type("Doctored", (type(real),), members)()
+    return doctored
