@@ -98,7 +98,7 @@ def check_state(model: Model, state: State) -> None:
     norms = np.linalg.norm(state.p, axis=-1)
     if np.any(np.abs(norms - 1) > UNIT):
         raise BadInput(f"state.p is not normalised: |p| = {norms.tolist()}")
-    for array_name in ("mass", "inertia", "proximal", "distal", "length", "gravity", "force", "moment"):
+    for array_name in vars(model):
         if not np.all(np.isfinite(getattr(model, array_name))):
             raise BadInput(f"model.{array_name} is not finite")
 
@@ -112,6 +112,7 @@ def check_quantities(model: Model, answer: StateQuantities, what: str) -> None:
         "angular_momentum": (3,),
         "kinetic_energy": (),
         "potential_energy": (),
+        "mass_matrix": (3 * (model.n + int(model.rods.sum())),) * 2,
     }
     for name, shape in shapes.items():
         value = getattr(answer, name)
