@@ -1,6 +1,6 @@
 """The single and the double pendulum exactly as the notes print them: S1–S5 and D1–D6.
 
-One function per equation, on one state, in the order of the notes; nothing is shared with
+One function per equation, on one state, in the order of the notes; the equations share nothing with
 the general chain of `joints`, so that each can be held against the other.  Both joints are rods
 (E1); a length of 0 is accepted here and makes S singular, which is what E1 says of the notes read
 literally.  Exact on any number field, as `euler_parameters`.
@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from reference_impl.chain import Chain
+from reference_impl.chain import Array, Chain
 from reference_impl.euler_parameters import A, A_rate, B, Field, G, H, L, outer
+from reference_impl.joints import rows
+from reference_impl.system import check, solve_dense
 
 # --- single pendulum: r, p, ṙ, ṗ of the body, s₁ its attachment, ℓ the rod -------------------------------
 
@@ -147,3 +149,11 @@ def system(chain: Chain, r: Field, p: Field, v: Field, pdot: Field) -> tuple[Fie
     quadratic = 8 * L_rate.T @ (J @ (L_rate @ p.ravel()))
     b = [force.ravel(), quadratic + 2 * L_.T @ moment.ravel(), gamma, [norm_gamma(x)[()] for x in pdot]]
     return S, np.concatenate(b)
+
+
+def solve(chain: Chain, r: Array, p: Array, v: Array, pdot: Array) -> Array:
+    """(N5) (r̈, p̈, λ, λ_E), (9 N,), of `system`; SingularSystem names the cause and the body (E1, E7)."""
+    d = rows(chain, r, p, v, pdot).d
+    S, b = system(chain, r, p, v, pdot)
+    check(chain, r, p, d, np.full(chain.n, True), (S, b))
+    return solve_dense(S, b)

@@ -92,14 +92,7 @@ class System:
             values, b, joints = self._blocks(r, p, v, pdot)
         n, c = self.chain.n, len(self.joint)
         b[7 * n : 7 * n + c] += gamma_defect
-        check(
-            self.chain,
-            r,
-            p,
-            joints.d,
-            self.chain.rods,
-            bool(np.isfinite(values).all() & np.isfinite(b).all()),
-        )
+        check(self.chain, r, p, joints.d, self.chain.rods, (values, b))
 
         entries = values[self._by_row]
         scale = np.ones(self.size)
@@ -188,18 +181,18 @@ def singular(pivots: Array) -> bool:
     return not bool(np.min(size) > len(size) * EPS * np.max(size))
 
 
-def check(chain: Chain, r: Array, p: Array, d: Array, rods: NDArray[np.bool_], finite: bool) -> None:
+def check(
+    chain: Chain, r: Array, p: Array, d: Array, rods: NDArray[np.bool_], entries: tuple[Array, ...]
+) -> None:
     """Raise SingularSystem where the state alone says that S is singular, and of which body (E1, E7).
 
     ``d`` (N, 3) is where rod k points; below its own rounding (16 ε of the vectors it is the sum of)
-    it is zero, and a row made of it would be noise.
+    it is zero, and a row made of it would be noise.  ``entries`` are those of S and b.
     """
-    if not finite:
-        bad = ~(np.isfinite(r).all(-1) & np.isfinite(p).all(-1) & np.isfinite(d).all(-1))
-        where = (
-            f"body {int(np.argmax(bad)) + 1} is not finite" if bad.any() else "a rate or a load is not finite"
-        )
-        raise SingularSystem(f"{where}: S x = b has no meaning")
+    if not all(np.isfinite(x).all() for x in (*entries, d)):
+        bad = ~(np.isfinite(r).all(-1) & np.isfinite(p).all(-1))
+        where = f"the position of body {int(np.argmax(bad)) + 1}" if bad.any() else "a rate or a load"
+        raise SingularSystem(f"{where} is not finite, so S x = b has no meaning")
     norms = dot(p, p)
     if np.any(norms == 0):
         body = int(np.argmin(norms)) + 1
@@ -210,8 +203,8 @@ def check(chain: Chain, r: Array, p: Array, d: Array, rods: NDArray[np.bool_], f
     if collapsed.any():
         body = int(np.argmax(collapsed)) + 1
         raise SingularSystem(
-            f"the rod above body {body} has length 0: C = dᵀd has no gradient at d = 0, so C_r and C_p "
-            "vanish (E1); a joint of length 0 is a ball joint, d = 0"
+            f"the rod above body {body} has length 0: at d = 0 C = dᵀd has no gradient, C_r is 0 and C_p "
+            "at most a multiple of the normalisation row pᵀ (E1, E2); a joint of length 0 is a ball joint, d = 0"
         )
 
 

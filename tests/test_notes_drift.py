@@ -1,0 +1,88 @@
+"""E4: the raw form drifts; how much, how fast, and that an injected defect of γ grows as δ t and δ t²/2."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from reference_impl.drift import BINS, drift, growth
+from reference_impl.integrate import integrate
+from reference_impl.joints import rows
+from tests.notes_cases import on_manifold, random_chain
+
+DEFECT = 1e-4
+
+
+@pytest.mark.parametrize("rods", [[True], [False], [True, False, True]], ids=str)
+def test_an_injected_defect_comes_out_as_delta_t_and_half_delta_t_squared(rods):
+    """One δ per row, all different, signs mixed; truncation (rtol 1e-12) is far below 1 % of it."""
+    rng = np.random.default_rng(len(rods))
+    chain = random_chain(rng, rods)
+    state = on_manifold(chain, rng)
+    count = int(np.sum(np.where(rods, 1, 3)))
+    delta = DEFECT * (1 + np.arange(count)) * (-1.0) ** np.arange(count)
+    times = np.linspace(0, 2, 9)
+    run = integrate(chain, *state, times, 1e-12, gamma_defect=delta)
+    for t, *sample in zip(times[1:], run.r[1:], run.p[1:], run.v[1:], run.pdot[1:], strict=True):
+        joints = rows(chain, *sample)
+        np.testing.assert_allclose(joints.C, delta * t**2 / 2, rtol=0.01)
+        np.testing.assert_allclose(joints.rate(*sample[2:]), delta * t, rtol=0.01)
+
+
+def test_an_injected_defect_has_exponents_1_and_2():
+    rng = np.random.default_rng(7)
+    chain = random_chain(rng, [True])
+    length = chain.length[0]
+    measured = drift(
+        chain, *on_manifold(chain, rng), 1e-11, np.array([0.1, 1, 10]), gamma_defect=DEFECT, samples=10
+    )
+    assert abs(measured.joint_gap.exponent - 2) < 0.02
+    assert abs(measured.gap_rate.exponent - 1) < 0.02
+    np.testing.assert_allclose(
+        measured.joint_gap.maxima * 2 * length, DEFECT * np.array([1, 100]) / 2, rtol=0.01
+    )
+    np.testing.assert_allclose(measured.gap_rate.maxima * 2 * length, DEFECT * np.array([1, 10]), rtol=0.01)
+
+
+def falls_with_the_tolerance(rods, decades, tolerances):
+    """Drift at each tolerance; every maximum falls by a decade at least for three decades of tolerance."""
+    rng = np.random.default_rng(4)
+    chain = random_chain(rng, rods, loads=False)
+    state = on_manifold(chain, rng)
+    runs = [drift(chain, *state, rtol, np.array(decades)) for rtol in tolerances]
+    for coarse, fine in pairwise(runs):
+        for name in ("joint_gap", "gap_rate", "norm"):
+            before, after = getattr(coarse, name).maxima, getattr(fine, name).maxima
+            assert np.all(after < 0.1 * before), f"{name}: {before} at {coarse.rtol}, {after} at {fine.rtol}"
+    return runs
+
+
+@pytest.mark.parametrize("rods", [[True], [False]], ids=["rod", "ball"])
+def test_drift_falls_with_the_tolerance(rods):
+    runs = falls_with_the_tolerance(rods, [0.1, 1, 10], (1e-4, 1e-7, 1e-10))
+    for run in runs:
+        assert run.joint_gap.maxima.shape == (2,) and run.steps > 10
+        assert run.joint_gap.maxima[1] > run.joint_gap.maxima[0] > 0, "the raw form has no stabilisation"
+
+
+@pytest.mark.full
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("rods", [[True], [False], [True, True]], ids=["rod", "ball", "two rods"])
+def test_drift_to_100_s(rods):
+    for run in falls_with_the_tolerance(rods, [0.1, 1, 10, 100], (1e-6, 1e-9, 1e-12)):
+        assert np.all(np.diff(run.joint_gap.maxima) > 0)
+        assert 0 < run.joint_gap.exponent < 3 and np.isfinite(run.joint_gap.interval)
+
+
+def test_the_fit_recovers_a_power_law_and_says_how_sure_it_is():
+    ends = 10 ** (np.arange(1, 2 * BINS + 1) / BINS)
+    exact = growth(3e-9 * ends**1.7, ends)
+    assert abs(exact.exponent - 1.7) < 1e-12 and exact.interval < 1e-6
+    np.testing.assert_allclose(exact.maxima, 3e-9 * np.array([10, 100]) ** 1.7)
+    rng = np.random.default_rng(0)
+    covered = 0
+    for _ in range(200):
+        noisy = growth(np.exp(0.3 * rng.normal(size=len(ends))) * ends**1.7, ends)
+        covered += abs(noisy.exponent - 1.7) < noisy.interval
+    assert covered >= 180, "a 95 % interval holds the exponent in about 190 of 200 draws"
+    assert growth(np.zeros(2 * BINS), ends).interval == np.inf

@@ -1,0 +1,206 @@
+"""The system of the notes, N1–N6: Lagrange's equation, S and b as printed, their solution, N6."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.special import ellipk
+
+from reference_impl import printed
+from reference_impl.euler_parameters import A, L, angular_velocity
+from reference_impl.euler_parameters import rate as pdot_of
+from reference_impl.integrate import integrate, pack, rate, unpack
+from reference_impl.system import System, solve_dense
+from tests.notes_cases import Symbols, off_manifold, on_manifold, random_chain
+
+MIXES = [[True], [False], [True, True], [False, False], [True, False, False, True, False], [False, True] * 5]
+
+
+def vector(x):
+    return np.concatenate([x.acceleration.ravel(), x.pddot.ravel(), x.multiplier, x.norm_multiplier])
+
+
+def test_N2_is_lagranges_equation():
+    """d_t ∂T/∂ṗ − ∂T/∂p = 4 LᵀJL p̈ − 8 L̇ᵀJL̇ p of T = 2 ṗᵀLᵀJLṗ; n′ does the power n′ᵀω′: for every p."""
+    x = Symbols(bodies=2, attachments=3)
+    p, pdot, pddot, moment = x.p[0], x.pdot[0], x.p[1], x.r[0]
+    J = x.s + x.s.T
+    T = 2 * (pdot @ L(p).T @ J @ L(p) @ pdot)
+    momentum = x.gradient(T, pdot)
+    left = x.gradient(momentum, p) @ pdot + x.gradient(momentum, pdot) @ pddot - x.gradient(T, p)
+    quadratic = 8 * (L(pdot).T @ J @ L(pdot) @ p)
+    assert x.zero(left - 4 * (L(p).T @ J @ L(p) @ pddot) + quadratic)
+    assert x.zero(quadratic + 8 * (L(pdot).T @ J @ L(p) @ pdot)), "the sign that the lost dots decide"
+    assert x.zero(x.gradient(moment @ angular_velocity(p, pdot), pdot) - 2 * (L(p).T @ moment))
+
+
+@pytest.mark.parametrize("states", [on_manifold, off_manifold])
+@pytest.mark.parametrize("n", [1, 2])
+def test_N5_is_assembled_as_printed(n, states):
+    rng = np.random.default_rng(n)
+    chain = random_chain(rng, [True] * n)
+    state = states(chain, rng)
+    S, b = System(chain).assemble(*state)
+    S_printed, b_printed = printed.system(chain, *state)
+    np.testing.assert_allclose(S, S_printed, rtol=1e-14, atol=1e-15)
+    np.testing.assert_allclose(b, b_printed, rtol=1e-14, atol=1e-14)
+
+
+@pytest.mark.parametrize("states", [on_manifold, off_manifold])
+@pytest.mark.parametrize("rods", MIXES, ids=str)
+def test_the_band_and_the_dense_form_give_the_same_solution(rods, states):
+    """Both solve S x = b to a backward error of a few roundings, so they differ by that times κ at most."""
+    rng = np.random.default_rng(len(rods))
+    chain = random_chain(rng, rods)
+    state = states(chain, rng)
+    system = System(chain)
+    S, b = system.assemble(*state)
+    x, dense = vector(system.solve(*state)), solve_dense(S, b)
+    np.testing.assert_allclose(x, dense, rtol=0, atol=1e-14 * np.max(np.abs(dense)))
+    residual = np.abs(S @ x - b) / (np.abs(S) @ np.abs(x) + np.abs(b))
+    assert np.max(residual) < 16 * np.finfo(float).eps
+
+
+@pytest.mark.parametrize("rods", MIXES, ids=str)
+def test_the_solution_obeys_newton_and_euler(rods):
+    """m r̈ = F + reactions and J ω̇′ + ω′ × J ω′ = moments of the reactions about the centre of mass + n′."""
+    rng = np.random.default_rng(11 + len(rods))
+    chain = random_chain(rng, rods)
+    r, p, v, pdot = on_manifold(chain, rng)
+    x = System(chain).solve(r, p, v, pdot)
+    omega, turn = angular_velocity(p, pdot), A(p)
+    near, far = x.joint_reaction, -np.concatenate([x.joint_reaction[1:], np.zeros((1, 3))])
+    load = chain.mass[:, None] * chain.gravity + chain.force - chain.drag_force[:, None] * v
+    np.testing.assert_allclose(chain.mass[:, None] * x.acceleration, load + near + far, atol=1e-12)
+
+    def body(force):
+        return (turn.swapaxes(-1, -2) @ force[..., None])[..., 0]
+
+    def inertial(w):
+        return (chain.inertia @ w[..., None])[..., 0]
+
+    moment = np.cross(chain.proximal, body(near)) + np.cross(chain.distal, body(far))
+    moment += chain.moment - chain.drag_moment[:, None] * omega
+    omega_dot = 2 * (L(p) @ x.pddot[..., None])[..., 0]
+    np.testing.assert_allclose(inertial(omega_dot) + np.cross(omega, inertial(omega)), moment, atol=1e-12)
+
+
+def test_units_do_not_decide_the_digits():
+    """The same motion with masses × 2^±20: without equilibration the pivots would follow the units."""
+    rng = np.random.default_rng(5)
+    chain = random_chain(rng, [True, False, True])
+    state = on_manifold(chain, rng)
+    x = System(chain).solve(*state)
+    loads = ("mass", "inertia", "force", "moment", "drag_force", "drag_moment")
+    for scale in (2.0**-20, 2.0**20):
+        scaled = dataclasses.replace(chain, **{name: scale * getattr(chain, name) for name in loads})
+        y = System(scaled).solve(*state)
+        np.testing.assert_allclose(y.acceleration, x.acceleration, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(y.joint_reaction / scale, x.joint_reaction, rtol=0, atol=1e-13)
+
+
+def test_energy_changes_by_the_power_of_the_loads():
+    """Ė = Σ F·ṙ + n′·ω′ (gravity in E): workless joints, rods and balls."""
+    rng = np.random.default_rng(6)
+    chain = random_chain(rng, [True, False, True, False])
+    r, p, v, pdot = on_manifold(chain, rng)
+    x = System(chain).solve(r, p, v, pdot)
+    omega, omega_dot = angular_velocity(p, pdot), 2 * (L(p) @ x.pddot[..., None])[..., 0]
+    inertial = np.einsum("nij,nj->ni", chain.inertia, omega)
+    energy_rate = np.sum(chain.mass[:, None] * v * (x.acceleration - chain.gravity)) + np.sum(
+        inertial * omega_dot
+    )
+    power = np.sum((chain.force - chain.drag_force[:, None] * v) * v)
+    power += np.sum((chain.moment - chain.drag_moment[:, None] * omega) * omega)
+    assert abs(energy_rate - power) < 1e-12
+
+
+def test_N6_orders_y_as_r_p_v_pdot():
+    rng = np.random.default_rng(8)
+    chain = random_chain(rng, [True, False])
+    state = on_manifold(chain, rng)
+    y = pack(*state)
+    for part, back in zip(state, unpack(y, 2), strict=True):
+        np.testing.assert_array_equal(part, back)
+    system = System(chain)
+    x = system.solve(*state)
+    ydot = unpack(rate(system, y), 2)
+    for part, expected in zip(ydot, (state[2], state[3], x.acceleration, x.pddot), strict=True):
+        np.testing.assert_array_equal(part, expected)
+
+
+def planar(amplitude, arm=0.4, mass=1.3, about_centre=0.05):
+    """A body on a ball joint that swings about the y axis, at rest at ``amplitude``."""
+    rng = np.random.default_rng(0)
+    chain = dataclasses.replace(
+        random_chain(rng, [False], loads=False),
+        mass=np.array([mass]),
+        inertia=about_centre * np.eye(3)[None],
+        proximal=np.array([[0, 0, arm]]),
+        gravity=np.array([0, 0, -9.81]),
+    )
+    p = np.array([[np.cos(amplitude / 2), 0, np.sin(amplitude / 2), 0]])
+    omega_0 = np.sqrt(mass * 9.81 * arm / (about_centre + mass * arm**2))
+    r = -(A(p) @ chain.proximal[..., None])[..., 0]
+    return chain, (r, p, np.zeros((1, 3)), np.zeros((1, 4))), 4 * ellipk(np.sin(amplitude / 2) ** 2) / omega_0
+
+
+def test_N6_swings_with_the_exact_period():
+    """After one period 4 K(sin²(θ₀/2)) / ω₀ of a 170° swing the body is back, with rtol's accuracy."""
+    chain, state, period = planar(np.radians(170))
+    errors = []
+    for rtol in (1e-6, 1e-9, 1e-12):
+        run = integrate(chain, *state, np.array([0, period / 2, period]), rtol)
+        errors.append(np.max(np.abs(run.r[-1] - state[0])))
+        np.testing.assert_allclose(run.r[1, 0, 0], -state[0][0, 0], atol=1e3 * rtol)
+    assert errors[2] < 1e-9, errors
+    assert errors[2] < 1e-3 * errors[1] * 10 and errors[1] < 1e-3 * errors[0] * 10, errors
+
+
+def test_samples_do_not_change_the_steps():
+    """Dense output: the same steps whatever times are asked, and the last sample is a step's own end."""
+    rng = np.random.default_rng(9)
+    chain = random_chain(rng, [True, False])
+    state = on_manifold(chain, rng)
+    few = integrate(chain, *state, np.array([0.0, 1.0]), 1e-10)
+    many = integrate(chain, *state, np.linspace(0, 1, 101), 1e-10)
+    assert (few.steps, few.t.size, many.t.size) == (many.steps, 2, 101)
+    np.testing.assert_array_equal(few.r[-1], many.r[-1])
+    gap = np.abs(integrate(chain, *state, np.array([0.0, 0.37]), 1e-10).r[-1] - many.r[37])
+    assert np.max(gap) < 1e-9
+
+
+def test_at_rest_stays_at_rest():
+    chain, state, _ = planar(0.0)
+    run = integrate(chain, *state, np.linspace(0, 5, 6), 1e-10)
+    np.testing.assert_array_equal(run.r, np.broadcast_to(state[0], run.r.shape))
+
+
+def test_fifty_bodies():
+    """A chain of 50 balls: solved in its band, to rounding of the dense form; width 10 whatever N."""
+    rng = np.random.default_rng(50)
+    chain = random_chain(rng, [False] * 50)
+    state = on_manifold(chain, rng)
+    system = System(chain)
+    dense = solve_dense(*system.assemble(*state))
+    np.testing.assert_allclose(
+        vector(system.solve(*state)), dense, rtol=0, atol=1e-13 * np.max(np.abs(dense))
+    )
+    assert system._width <= 10
+
+
+def test_one_and_two_bodies_are_what_the_notes_print():
+    rng = np.random.default_rng(3)
+    chain = random_chain(rng, [True] * 3)
+    with pytest.raises(ValueError, match="one and two bodies"):
+        printed.system(chain, *on_manifold(chain, rng))
+
+
+def test_pdot_of_is_on_the_sphere():
+    """ṗ = ½ Lᵀω′ and p̈ of the solution satisfy pᵀp̈ = −ṗᵀṗ (N4)."""
+    rng = np.random.default_rng(4)
+    chain = random_chain(rng, [False, True])
+    r, p, v, pdot = on_manifold(chain, rng)
+    np.testing.assert_allclose(pdot_of(p, angular_velocity(p, pdot)), pdot, atol=1e-15)
+    x = System(chain).solve(r, p, v, pdot)
+    np.testing.assert_allclose(np.sum(p * x.pddot, -1), -np.sum(pdot * pdot, -1), atol=1e-13)
