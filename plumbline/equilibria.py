@@ -27,6 +27,8 @@ def relative_equilibrium(model: Model, rate: float, p: Array, u: Array) -> tuple
     for _ in range(60):
         residual = _residual(model, rate, p, u)
         size = float(np.max(np.abs(residual)))
+        if not np.isfinite(size):
+            raise ValueError("no relative equilibrium found near the guess: the residual is not finite")
         if size >= best / 2 and best < 1e-12:
             break
         best, last = size, (p, u)

@@ -126,11 +126,12 @@ def find(name: str | Path) -> Path:
 
 
 def slug(name: str) -> str:
-    """A file name for a scenario's name: letters, digits, dots and dashes, distinct where the names are."""
-    plain = re.sub(r"[^A-Za-z0-9.-]+", "-", name).strip("-.")[:60]
-    return (
-        plain if plain == name else f"{plain or 'scenario'}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
-    )
+    """A file name for a scenario's name, safe and distinct also where capitals do not count."""
+    plain = re.sub(r"[^a-z0-9-]+", "-", name.lower()).strip("-")[:60]
+    reserved = re.fullmatch("con|prn|aux|nul|(com|lpt)[0-9]", plain)  # devices on Windows
+    if plain == name and not reserved:
+        return plain
+    return f"{plain or 'scenario'}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
 def schema() -> dict[str, Any]:
