@@ -296,8 +296,7 @@ class Forest:
         d = np.ones((3, self.size)) if d is None else d
         for chain, at in zip(self.chains, self.start, strict=False):
             part = slice(at, at + chain.n)
-            finite = bool(np.isfinite(q[:, part]).all())
-            check(chain, q[:3, part].T, q[3:7, part].T, d[:, part].T, chain.rods, finite)
+            check(chain, q[:3, part].T, q[3:7, part].T, d[:, part].T, chain.rods, (q[:, part],))
         if certain:
             raise SingularSystem(
                 "the joint rows are not independent at this state: S is singular to rounding"

@@ -1,0 +1,265 @@
+"""Gauss–Legendre collocation of r̈, p̈ = f(r, p, ṙ, ṗ) by Picard sweeps, for one chain or a whole batch.
+
+A step holds S nodes of every body in one forest, so that a sweep costs one right-hand side of S times
+the bodies and no more NumPy calls than a single state.  With a the accelerations at the nodes c and A the
+collocation matrix (Hairer, Nørsett, Wanner, Solving ODEs I, II.7)
+
+    V = v₀ + h A a,  Q = q₀ + h A V,  a ← f(Q, V)  until a stops changing,
+    v₁ = v₀ + h Σ bⱼ aⱼ,  q₁ = q₀ + h v₀ + h² Σ bⱼ (1 − cⱼ) aⱼ,       order 2 S, symmetric.
+
+a starts from the last step's polynomial, extrapolated.  Inside the step a is that polynomial of degree
+S − 1, and its integrals are the dense output.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache
+
+import numpy as np
+from numpy.polynomial.legendre import leggauss, legvander
+
+from reference_impl.chain import Array, Chain
+from reference_impl.forest import Forest, lay
+from reference_impl.integrate import Run, natural_sizes
+
+SWEEPS = 14  # at most in a step; more are better spent on a shorter step
+FASTEST = 10  # sweeps: a step that needs more is made shorter, one that needs fewer may grow
+
+
+@dataclass(frozen=True, eq=False)
+class BatchRun(Run):
+    """A run of all chains together: N counts the bodies of all, ``evaluations`` the sweeps."""
+
+    rejected: int = 0  # steps that were repeated shorter
+    hindered: int = 0  # steps whose size the sweeps' convergence decided and not the tolerance: stiffness
+    note: str = ""  # a sentence where another method took over
+
+
+@dataclass(frozen=True, eq=False)
+class Gauss:
+    """Tables of the S-point Gauss–Legendre collocation on [0, 1]."""
+
+    c: Array  # (S,) nodes
+    b: Array  # (S,) weights
+    A: Array  # (S, S): ∫₀^cᵢ of the polynomial through the nodes
+    modes: Array  # (S, S): node values → Legendre coefficients
+    ahead: dict[float, Array] = field(default_factory=dict)
+
+    def extrapolation(self, ratio: float) -> Array:
+        """(S, S) from this step's node values to those of the next one, ``ratio`` times as long."""
+        if ratio not in self.ahead:
+            if len(self.ahead) > 64:
+                self.ahead.clear()
+            self.ahead[ratio] = legvander(1 + 2 * ratio * self.c, len(self.c) - 1) @ self.modes
+        return self.ahead[ratio]
+
+    def integrals(self, tau: Array) -> tuple[Array, Array]:
+        """(T, S) each: the first and second integral from 0 to ``tau`` (T,) per Legendre mode."""
+        S, x = len(self.c), 2 * tau - 1
+        P = np.concatenate([-np.ones((len(x), 1)), legvander(x, S + 1)], axis=1)  # P₋₁ = −1, P₀, …
+        odd = 2 * np.arange(S + 1) + 1
+        once = (P[:, 2:] - P[:, :-2]) / odd / 2  # τ, then ½ (P_{k+1} − P_{k−1}) / (2k + 1)
+        twice = np.empty((len(x), S))
+        twice[:, 0] = tau**2 / 2
+        twice[:, 1:] = (once[:, 2:] - once[:, :-2]) / odd[1:S] / 2
+        return once[:, :S], twice
+
+
+@cache
+def gauss(S: int) -> Gauss:
+    """The tables for S nodes."""
+    x, w = leggauss(S)
+    modes = (legvander(x, S - 1) * w[:, None]).T * (np.arange(S)[:, None] + 0.5)
+    table = Gauss(c=(1 + x) / 2, b=w / 2, A=np.empty((S, S)), modes=modes)
+    np.matmul(table.integrals(table.c)[0], modes, out=table.A)
+    return table
+
+
+def integrate(
+    chains: Sequence[Chain] | Forest,
+    r: Array,
+    p: Array,
+    v: Array,
+    pdot: Array,
+    times: Array,
+    rtol: float,
+    *,
+    nodes: int = 12,
+    dense: bool = True,
+    baumgarte: float = 0.0,
+    projected: bool = False,
+) -> BatchRun:
+    """Motion of all chains with common steps, sampled at ``times`` (T,); times[0] is the initial time.
+
+    Initial r, ṙ (M, 3) m, m/s and p, ṗ (M, 4) –, 1/s, the bodies of all chains in order.
+
+    ``dense``: ``rtol`` holds for the polynomial inside the step, measured by its last Legendre modes in
+    the `natural_sizes` of each chain.  Without it the steps end on ``times`` and ``rtol`` holds there
+    only: the ends of steps have order 2 S where the polynomial has S, so the square of the tail counts.
+    ``baumgarte`` a (1/s) and ``projected`` (onto the manifold after each step) stabilise; without
+    them it is the notes' raw form.
+
+    Where sweeps converge only for steps much shorter than the tolerance asks for (stiffness), DOP853 takes
+    over, and ``note`` says so.
+
+    Raises SingularSystem where S is singular on the way, ArithmeticError where the step vanishes.
+    """
+    forest = chains if isinstance(chains, Forest) else Forest(chains)
+    stepper = _Stepper(forest, lay(r, p), lay(v, pdot), rtol, gauss(nodes), dense, baumgarte)
+    stepper.sizes(r, p, v, pdot)
+    span = float(times[-1] - times[0])
+    t, steps, rejected, hindered, in_a_row, done = float(times[0]), 0, 0, 0, 0, 1
+    samples = np.empty((2, len(times), 7, forest.size))
+    samples[:, 0] = stepper.q, stepper.v
+    note = ""
+    while done < len(times):
+        goal = float(times[-1] if dense else times[done])
+        h = min(stepper.h, goal - t)
+        if not dense:  # equal steps to the next time, no crumb at the end
+            h = (goal - t) / np.ceil((goal - t) / stepper.h * (1 - 1e-12))
+        if h < 1e-13 * max(span, abs(t)) and goal - t > h:
+            raise ArithmeticError(f"collocation stopped at t = {t} s: the step vanishes")
+        ok, slow = stepper.step(h)
+        if not ok:
+            rejected += 1
+            in_a_row += slow
+            continue
+        steps += 1
+        hindered, in_a_row = hindered + slow, in_a_row * slow + slow
+        ends = goal - (t + h) <= 1e-14 * max(abs(goal), span)
+        reached_t = goal if ends else t + h
+        reached = int(np.searchsorted(times, reached_t, side="right"))
+        if reached > done:
+            samples[:, done:reached] = stepper.inside((times[done:reached] - t) / h)
+        if projected:
+            stepper.project()
+        if reached > done and times[reached - 1] == reached_t:
+            samples[:, reached - 1] = stepper.q, stepper.v
+        t, done = reached_t, reached
+    values = samples.swapaxes(-1, -2)
+    return BatchRun(
+        t=times,
+        r=values[0, ..., :3],
+        p=values[0, ..., 3:],
+        v=values[1, ..., :3],
+        pdot=values[1, ..., 3:],
+        steps=steps,
+        evaluations=stepper.sweeps,
+        rejected=rejected,
+        hindered=hindered,
+        note=note,
+    )
+
+
+class _Stepper:
+    """The state of all chains, and one step of it."""
+
+    def __init__(
+        self, forest: Forest, q: Array, v: Array, rtol: float, table: Gauss, dense: bool, baumgarte: float
+    ) -> None:
+        S = len(table.c)
+        self.forest, self.tiled, self.table = forest, forest.tile(S), table
+        self.q, self.v, self.rtol, self.dense, self.baumgarte = q, v, rtol, dense, baumgarte
+        self.q_lost, self.v_lost = np.zeros_like(q), np.zeros_like(v)  # what rounding took from the sums
+        self.a: Array = np.empty(0)
+        self.last_h = 0.0
+        self.sweeps = 0
+        self.h = 0.0
+
+    def sizes(self, r: Array, p: Array, v: Array, pdot: Array) -> None:
+        """Natural sizes (7, M) of q and v, chain by chain, and the first step from their ratio."""
+        q_size, v_size = np.empty_like(self.q), np.empty_like(self.v)
+        for chain, at in zip(self.forest.chains, self.forest.start, strict=False):
+            body = slice(at, at + chain.n)
+            y = natural_sizes(chain, r[body], p[body], v[body], pdot[body])
+            first, second = y[0], y[3 * chain.n]
+            q_size[:3, body], q_size[3:, body] = first, second
+            v_size[:3, body], v_size[3:, body] = y[7 * chain.n], y[10 * chain.n]
+        self.q_size, self.v_size = q_size, v_size
+        self.h = 0.3 * float(np.min(q_size / v_size, where=v_size > 0, initial=np.inf))
+        if not np.isfinite(self.h):
+            self.h = 1.0
+
+    def step(self, h: float) -> tuple[bool, bool]:
+        """Try a step: (whether it was made, whether the sweeps were what limited it). Sets the next ``h``."""
+        table, S, M = self.table, len(self.table.c), self.forest.size
+        if self.a.size:
+            a = table.extrapolation(h / self.last_h) @ self.a
+        else:
+            here = self.forest.acceleration(self.q, self.v, self.baumgarte)
+            a = np.repeat(here[:, None], S, axis=1)
+        q0, v0, weight = self.q[:, None], self.v[:, None], 1 / self.v_size[:, None]
+        before, rate, converged, count = np.inf, 0.0, False, 0
+        hA = h * table.A
+        while count < SWEEPS and not converged:
+            V = v0 + hA @ a
+            Q = q0 + hA @ V
+            new = self.tiled.acceleration(Q.reshape(7, -1), V.reshape(7, -1), self.baumgarte)
+            new = new.reshape(7, S, M)
+            change = h * float(np.max(np.abs(new - a) * weight))
+            a, count = new, count + 1
+            rate = change / before if count > 1 else 1.0
+            # Quiet at the floor that rounding in a sets: no sweep improves on it.
+            floor = 1e-12 * h * float(np.max(np.abs(a) * weight)) if count > 1 and rate > 0.3 else 0.0
+            converged = change * min(rate, 1.0) <= 0.1 * self.rtol or change <= floor
+            if count > 3 and rate > 0.6 and not converged:
+                break
+            before = change
+        self.sweeps += count
+        if not converged:
+            self.h = 0.6 * h
+            return False, True
+        tail = self._tail(a, h)
+        grow = 0.9 * (1 / max(tail, 1e-30)) ** (1 / S)
+        patience = (FASTEST / count) ** 0.5 if count != FASTEST else 1.0
+        slow = patience < min(grow, 1.0)
+        if tail > 1:
+            self.h = h * max(0.3, grow)
+            return False, False
+        factor = min(grow, patience, 1.6)
+        if factor < 0.95 or factor > 1.15:  # a kept step length keeps its extrapolation matrix
+            self.h = h * factor
+        self._advance(a, h)
+        return True, slow
+
+    def _tail(self, a: Array, h: float) -> float:
+        """The error of the step over the tolerance, from the last two Legendre modes of a."""
+        S = len(self.table.c)
+        modes = np.abs(self.table.modes[-2:] @ a)  # (7, 2, M)
+        last = np.max(modes, axis=1)
+        if not self.dense:
+            size = np.max(np.abs(a), axis=1)
+            last = last**2 / np.where(size > 0, size, 1.0)
+        velocity = h / (2 * S) * last / self.v_size
+        position = (h / (2 * S)) ** 2 * last / self.q_size
+        return float(max(np.max(velocity), np.max(position))) / self.rtol
+
+    def _advance(self, a: Array, h: float) -> None:
+        """To the end of the step, with compensated sums (Kahan)."""
+        table = self.table
+        self.a, self.last_h, self.q0, self.v0 = a, h, self.q, self.v
+        dv = h * np.einsum("j,ijm->im", table.b, a)
+        dq = h * (self.v + h * np.einsum("j,ijm->im", table.b * (1 - table.c), a))
+        self.q, self.q_lost = _add(self.q, dq + self.q_lost)
+        self.v, self.v_lost = _add(self.v, dv + self.v_lost)
+
+    def inside(self, tau: Array) -> Array:
+        """(2, T, 7, M) q and v at fractions ``tau`` of the last step."""
+        once, twice = self.table.integrals(tau)
+        modes, h = self.table.modes @ self.a, self.last_h
+        v = self.v0 + h * np.einsum("tk,ikm->tim", once, modes)
+        q = self.q0 + h * (tau[:, None, None] * self.v0 + h * np.einsum("tk,ikm->tim", twice, modes))
+        return np.stack([q, v])
+
+    def project(self) -> None:
+        """Onto the manifold."""
+        self.q, self.v = self.forest.project(self.q, self.v)
+        self.q_lost, self.v_lost = np.zeros_like(self.q), np.zeros_like(self.v)
+
+
+def _add(total: Array, part: Array) -> tuple[Array, Array]:
+    """Sum, and what its rounding lost (Kahan)."""
+    out = total + part
+    return out, part - (out - total)
