@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reference_impl.chain import Chain
-from reference_impl.euler_parameters import A, A_rate, Field, H, dot
+from reference_impl.euler_parameters import I3, A, A_rate, Field, H, dot
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,33 +57,36 @@ def row_joints(chain: Chain) -> NDArray[np.intp]:
 
 def rows(chain: Chain, r: Field, p: Field, v: Field, pdot: Field) -> Rows:
     """C, C_r, C_p and γ of every joint at r, ṙ (N, 3), p, ṗ (N, 4), on or off the manifold."""
-    s_near, s_far = chain.proximal, after_pivot(chain.distal)
+    s = np.stack([chain.proximal, after_pivot(chain.distal)])  # (2, N, 3): near and far point of each joint
     # The pivot has no Euler parameters: those of body 0 stand in, and s = 0 takes them out: H(p, 0) = 0.
-    p_far, pdot_far = np.concatenate([p[:1], p[:-1]]), np.concatenate([pdot[:1], pdot[:-1]])
+    q, qdot = (np.stack([y, np.concatenate([y[:1], y[:-1]])]) for y in (p, pdot))  # (2, N, 4)
     x, xdot = r - after_pivot(r), v - after_pivot(v)
-    H_near, H_far = H(np.stack([p, pdot]), s_near), H(np.stack([p_far, pdot_far]), s_far)  # (2, N, 3, 4)
-    b, a = _times(A(p), s_near), _times(A(p_far), s_far)
+    (H_near, H_far), (H_near_rate, H_far_rate) = H(np.stack([q, qdot]), s)  # (N, 3, 4) each
+    b, a = _times(A(q), s)
     d = x + b - a
 
-    rod, ball = np.flatnonzero(chain.rods), np.flatnonzero(~chain.rods)
-    joint, order = row_joints(chain), np.argsort(np.concatenate([rod, np.repeat(ball, 3)]), kind="stable")
+    is_rod = chain.rods
+    rod, ball = np.flatnonzero(is_rod), np.flatnonzero(~is_rod)
     parts: list[tuple[Field, ...]] = []
     if len(rod):
         k = rod
-        bdot, adot = _times(A_rate(p[k], pdot[k]), s_near[k]), _times(A_rate(p_far[k], pdot_far[k]), s_far[k])
+        bdot, adot = _times(A_rate(q[:, k], qdot[:, k]), s[:, k])
         y, ydot, z, zdot = x[k] - a[k], xdot[k] - adot, x[k] + b[k], xdot[k] + bdot
         C = dot(x[k], x[k]) + 2 * dot(x[k], b[k] - a[k]) - 2 * dot(a[k], b[k])
-        C = C + dot(s_near[k], s_near[k]) + dot(s_far[k], s_far[k]) - chain.length[k] ** 2
-        near_rate = _left(ydot, H_near[0, k]) + _left(y, H_near[1, k])
-        far_rate = _left(zdot, H_far[0, k]) + _left(z, H_far[1, k])
-        gamma = -2 * dot(zdot - adot, xdot[k]) - 4 * dot(near_rate, pdot[k]) + 4 * dot(far_rate, pdot_far[k])
-        parts.append((C, 2 * d[k], 4 * _left(y, H_near[0, k]), -4 * _left(z, H_far[0, k]), gamma))
+        C = C + dot(s[:, k], s[:, k]).sum(0) - chain.length[k] ** 2
+        near_rate = _left(ydot, H_near[k]) + _left(y, H_near_rate[k])
+        far_rate = _left(zdot, H_far[k]) + _left(z, H_far_rate[k])
+        gamma = (
+            -2 * dot(zdot - adot, xdot[k]) - 4 * dot(near_rate, qdot[0, k]) + 4 * dot(far_rate, qdot[1, k])
+        )
+        parts.append((C, 2 * d[k], 4 * _left(y, H_near[k]), -4 * _left(z, H_far[k]), gamma))
     if len(ball):
         k = ball
-        gamma = 2 * (_times(H_far[1, k], pdot_far[k]) - _times(H_near[1, k], pdot[k]))
-        identity = np.broadcast_to(np.eye(3, dtype=int), (len(k), 3, 3))
-        blocks = (d[k], identity, 2 * H_near[0, k], -2 * H_far[0, k], gamma)
+        gamma = 2 * (_times(H_far_rate[k], qdot[1, k]) - _times(H_near_rate[k], qdot[0, k]))
+        identity = np.broadcast_to(I3, (len(k), 3, 3))
+        blocks = (d[k], identity, 2 * H_near[k], -2 * H_far[k], gamma)
         parts.append(tuple(np.reshape(block, (3 * len(k), *np.shape(block)[2:])) for block in blocks))
+    joint, order = row_joints(chain), np.argsort(np.concatenate([rod, np.repeat(ball, 3)]), kind="stable")
     C, r_near, p_near, far, gamma = (np.concatenate(column)[order] for column in zip(*parts, strict=True))
     return Rows(joint=joint, C=C, r_near=r_near, p_near=p_near, p_far=far, gamma=gamma, d=d)
 
