@@ -18,7 +18,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from plumbline import scenario as scenarios
-from plumbline.problems import ScenarioError
+from plumbline.exact import NotThatMotion, solution
+from plumbline.problems import Problem, ScenarioError
 from plumbline.registry import ENGINES
 from plumbline.run import Plan, Result, describe_all, execute, save
 from plumbline.store import plain, row_record
@@ -220,10 +221,18 @@ def schema() -> None:
 def read_scenarios(names: Iterable[str | Path]) -> list[scenarios.Scenario]:
     """Scenarios by name or path; every problem goes to stderr and ends with exit code 2."""
     try:
-        return scenarios.load_many(names)
+        found = scenarios.load_many(names)
+        for s in found:
+            try:
+                solution(s)
+            except NotThatMotion as error:
+                raise ScenarioError(
+                    [Problem(str(s.path), 0, 0, "exact", str(error), "no exact, or another")]
+                ) from None
     except ScenarioError as error:
         click.echo(str(error), err=True)
         sys.exit(2)
+    return found
 
 
 def choose_scenarios(names: tuple[str, ...], families: tuple[str, ...]) -> list[scenarios.Scenario]:

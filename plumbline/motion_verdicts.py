@@ -176,12 +176,12 @@ class Ladder:
         true = truth.trajectory
         rows = [self.order_row()] if self.integrator.kind == "step" else []
         rows += self.against_truth(
-            "position", "m", self.positions, lambda y: position_error(y, true.r),
+            "position", "m", self.positions, true.r, position_error,
             truth.position_uncertainty, truth.visible_position, truth.length, 1.0,
         )  # fmt: skip
         # |δp| of a unit quaternion is half the rotation angle
         rows += self.against_truth(
-            "attitude", "rad", self.attitudes, lambda y: attitude_error(y, true.p),
+            "attitude", "rad", self.attitudes, true.p, attitude_error,
             truth.attitude_uncertainty, truth.visible_attitude, 2.0, 2.0,
         )  # fmt: skip
         return rows
@@ -191,7 +191,8 @@ class Ladder:
         name: str,
         unit: str,
         ys: Sequence[Array],
-        error_of: Callable[[Array], Array],
+        true: Array,
+        distance: Callable[[Array, Array], Array],
         uncertain: Array,
         visible: Array,
         scale: float,
@@ -203,7 +204,7 @@ class Ladder:
             limit = self.limit(ys)
         except ValueError as error:
             return [who.row("trajectory", method, f"{name}_limit", "unresolved", str(error), unit)]
-        off = np.maximum.accumulate(error_of(limit.y))
+        off = np.maximum.accumulate(distance(limit.y, true))
         ladder, rounding = factor * limit.uncertainty, scale * self.rounding
         tolerance = ladder + uncertain + rounding
         found = self.compare(name, unit, off, tolerance, visible)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import subprocess
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -110,10 +112,12 @@ def execute(plan: Plan, progress: Progress) -> Result:
         "id": started.strftime("%Y%m%dT%H%M%SZ"),
         "started": started.isoformat(timespec="seconds"),
         "duration": time.monotonic() - begin,
-        "machine": {"system": platform.platform(), "processor": platform.machine(), "jobs": plan.jobs},
+        "platform": platform.platform(),
+        "machine": {"processor": platform.machine(), "cores": str(os.cpu_count()), "jobs": str(plan.jobs)},
         "commit": commit(),
         "python": platform.python_version(),
         "versions": {name: info.version for name, info in engines.items()},
+        "truth": truth_words(benches.values()),
         "level": plan.level,
         "states": plan.states + 1,
         "sentence": sentence(result),
@@ -138,7 +142,7 @@ class Bench:
     def __init__(self, plan: Plan, scenario: Scenario, engines: dict[str, EngineInfo]) -> None:
         self.plan, self.scenario, self.engines = plan, scenario, engines
         self.findings = Findings()
-        self.truths: dict[str, StateTruth | MotionTruth] = {}
+        self.truths: dict[str, StateTruth | MotionTruth | Lost] = {}
         self.early: list[Outcome] = []  # engines' answers that came before the truth
         self.states = [
             scenario.state,
@@ -146,12 +150,14 @@ class Bench:
         ]
 
     def tasks(self) -> Iterator[Task]:
-        """Truth first, then every engine's cells."""
+        """Truth first (unless it is there already), then every engine's cells."""
         s, limits = self.scenario, self.plan.limits
-        if self.plan.level in ("state", "all"):
+        if self.plan.level in ("state", "all") and "state" not in self.truths:
             yield Task((s.name, "truth", "state"), yardstick.state_truth, (s.model, self.states), limits)
-        if self.plan.level in ("trajectory", "all"):
-            arguments = (s.model, s.state, s.times, solution(s))
+        if self.plan.level in ("trajectory", "all") and "trajectory" not in self.truths:
+            closed = solution(s)
+            exact = (*closed(s.times), closed.source) if closed and closed.amplitude == 0 else None
+            arguments = (s.model, s.state, s.times, exact)
             yield Task((s.name, "truth", "trajectory"), yardstick.motion_truth, arguments, limits)
         for name, info in self.engines.items():
             if info.missing is not None:
@@ -244,6 +250,17 @@ def horizon_of(truth: MotionTruth) -> float:
     reached = truth.length * ROUNDING * truth.growth + truth.position_uncertainty
     good = np.maximum.accumulate(reached) <= HORIZON_TOLERANCE
     return float(truth.trajectory.t[np.flatnonzero(good)[-1]]) if good.any() else 0.0
+
+
+def truth_words(benches: Iterable[Bench]) -> str:
+    """What the verdicts were measured with, and on how many scenarios each."""
+    methods = Counter(
+        f"{level} level: {truth.method}"
+        for bench in benches
+        for level, truth in bench.truths.items()
+        if not isinstance(truth, Lost)
+    )
+    return "; ".join(f"{method} ({number} scenarios)" for method, number in methods.most_common())
 
 
 def counts(rows: Sequence[Row]) -> dict[str, int]:

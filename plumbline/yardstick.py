@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from plumbline.bound import Bound, state_bound
+from plumbline.flow import flow
 from plumbline.horizon import growth
 from plumbline.kinematics import lift
 from plumbline.measures import attitude_error, position_error
@@ -65,16 +66,17 @@ def state_truth(model: Model, states: Sequence[State]) -> StateTruth:
     return StateTruth(list(states), [answer.quantities for answer in certified], bounds, method)
 
 
-def motion_truth(model: Model, state: State, times: Array, exact: tuple[Array, Array] | None) -> MotionTruth:
-    """True motion from ``state`` at ``times``; ``exact`` is a closed form's (r, p) where there is one."""
-    reference = adapter("reference")
-    run = reference.simulate(model, state, times, "dop853", FINE)
-    second = reference.simulate(model, state, times, "dop853", COARSE)
+def motion_truth(
+    model: Model, state: State, times: Array, exact: tuple[Array, Array, str] | None
+) -> MotionTruth:
+    """True motion from ``state`` at ``times``; ``exact`` is a closed form's (r, p, source), if there is one."""
+    (run,) = flow([model], [state], times, FINE)
+    (second,) = flow([model], [state], times, COARSE)
     r, p, factor = second.r, second.p, 10.0
     method = f"the notes' form by DOP853 at rtol {FINE:g} and {COARSE:g}; ten times their difference"
     if exact is not None:
         run, factor = replace(run, r=exact[0], p=exact[1]), 0.0
-        method = "closed form; rounding only"
+        method = f"closed form: {exact[2]}"
     return MotionTruth(
         run,
         factor * np.maximum.accumulate(position_error(run.r, r)),
@@ -105,23 +107,23 @@ def visible(model: Model, state: State, times: Array) -> tuple[Array, Array]:
     def off(x: Array) -> Array:
         return np.asarray(x * (1 + PART * rng.choice([-1.0, 1.0], size=x.shape)))
 
-    scaled = 1 + PART * rng.choice([-1.0, 1.0], size=(model.n, 1, 1))
-    wrong = [
+    entries = off(np.ones((model.n, 3, 3)))
+    lopsided = model.inertia * (entries + entries.mT) / 2  # scaled as a whole a free body would not show it
+    models = [
+        model,
         replace(model, gravity=model.gravity * (1 + PART)),
         replace(model, mass=off(model.mass)),
-        replace(model, inertia=model.inertia * scaled),
+        replace(model, inertia=lopsided),
         replace(model, proximal=off(model.proximal), distal=off(model.distal)),
     ]
-    reference = adapter("reference")
-    right = reference.simulate(model, state, times, "dop853", 1e-9)
-    position, attitude = [], []
-    for other in wrong:
-        start = lift(other, state.p, state.omega, state.u, state.udot)
-        run = reference.simulate(other, start, times, "dop853", 1e-9)
-        position.append(position_error(right.r, run.r))
-        attitude.append(attitude_error(right.p, run.p))
+    right, *wrong = flow(
+        models, [lift(m, state.p, state.omega, state.u, state.udot) for m in models], times, 1e-9
+    )
     scale = PART * float(np.sum(reach(model)))
-    return least_visible(position, 1e-3 * scale), least_visible(attitude, 1e-3 * PART)
+    return (
+        least_visible([position_error(right.r, run.r) for run in wrong], 1e-3 * scale),
+        least_visible([attitude_error(right.p, run.p) for run in wrong], 1e-3 * PART),
+    )
 
 
 def least_visible(effects: Sequence[Array], threshold: float) -> Array:

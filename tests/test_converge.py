@@ -20,7 +20,9 @@ def rungs(order: int, powers: tuple[int, ...], count: int = 6, size: float = 1.0
     return limit, [limit + size * sum(w * h**p for w, p in zip(wobble, powers, strict=True)) for h in hs]
 
 
-@pytest.mark.parametrize(("order", "powers"), [(1, (1, 2, 3)), (2, (2, 4, 6)), (2, (2, 3, 4)), (4, (4, 5, 6))])
+@pytest.mark.parametrize(
+    ("order", "powers"), [(1, (1, 2, 3)), (2, (2, 4, 6)), (2, (2, 3, 4)), (4, (4, 5, 6))]
+)
 def test_the_order_is_seen_and_the_limit_is_reached(order, powers):
     limit, ys = rungs(order, powers)
     seen = observed_order(ys, 1e-16)

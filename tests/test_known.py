@@ -1,0 +1,89 @@
+"""The only file that may excuse a verdict, and how an entry loses its place."""
+
+import pytest
+
+from plumbline import known
+from plumbline.findings import Subject
+
+WHO = Subject("tumbling-ball", "single", "mujoco", "MuJoCo", "4.0.0")
+ENTRY = {
+    "id": "a", "scenario": "tumbling-ball", "engine": "mujoco", "quantity": "acceleration",
+    "verdict": "disagrees", "evidence": "seen", "reason": "because",
+}  # fmt: skip
+
+
+def entry(**changes):
+    return known.Entry(**{**ENTRY, **changes})
+
+
+def row(verdict="disagrees", quantity="acceleration", who=WHO):
+    return who.row("state", "-", quantity, verdict, "why")
+
+
+def test_an_entry_marks_its_row_and_no_other():
+    rows = [row(), row(quantity="joint_reaction"), row("unresolved")]
+    judged = known.excuse(rows, [entry()], whole=True)
+    assert [r.known for r in judged.rows] == ["a", None, None]
+    assert judged.stale == []
+
+
+def test_an_entry_that_no_longer_occurs_is_stale():
+    judged = known.excuse([row("agrees")], [entry()], whole=False)
+    assert [e.id for e in judged.stale] == ["a"]
+
+
+def test_what_did_not_run_is_not_stale():
+    assert known.excuse([], [entry()], whole=False).stale == []
+
+
+def test_a_pattern_is_stale_only_when_the_whole_matrix_ran():
+    wide = entry(scenario="*")
+    assert known.excuse([row("agrees")], [wide], whole=False).stale == []
+    assert known.excuse([row("agrees")], [wide], whole=True).stale == [wide]
+
+
+@pytest.mark.parametrize(
+    ("versions", "excused"), [(">=4", True), ("<4", False), ("", True), ("==4.0.*", True)]
+)
+def test_version_ranges(versions, excused):
+    judged = known.excuse([row()], [entry(versions=versions)], whole=False)
+    assert (judged.rows[0].known == "a") is excused
+    assert judged.stale == [], "an entry about another version is not about this run"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("- {id: a}", "scenario"),
+        ("- {id: a, scenario: x, engine: y, verdict: agrees, evidence: e, reason: r}", "verdict"),
+        (
+            "- {id: a, scenario: x, engine: y, verdict: failed, evidence: e, reason: r, quantitty: z}",
+            "quantitty",
+        ),
+        (
+            "- {id: a, scenario: x, engine: y, versions: new, verdict: failed, evidence: e, reason: r}",
+            "range",
+        ),
+        ("- [", "known"),
+    ],
+)
+def test_a_bad_file_is_refused_by_name(tmp_path, text, words):
+    path = tmp_path / "known.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=words) as caught:
+        known.load(path)
+    assert str(path) in str(caught.value)
+
+
+def test_an_id_twice_is_refused(tmp_path):
+    path = tmp_path / "known.yaml"
+    line = "- {id: a, scenario: x, engine: y, verdict: failed, evidence: e, reason: r}\n"
+    path.write_text(line * 2)
+    with pytest.raises(ValueError, match="twice: a"):
+        known.load(path)
+
+
+def test_the_projects_own_file_is_valid_and_gives_evidence():
+    for e in known.load():
+        assert len(e.evidence) > 20
+        assert len(e.reason) > 20

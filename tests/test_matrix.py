@@ -1,0 +1,67 @@
+"""The product as tests: every scenario × engine × level is a test of its own.
+
+`pytest -k "double and mujoco"` runs those of one family and engine; the failure message is the
+verdict's own sentence.  By default the long chains run at state level only; `-m full` runs the rest.
+"""
+
+import os
+
+import pytest
+
+from plumbline import known, scenario
+from plumbline.registry import ENGINES
+from plumbline.run import Bench, Plan, describe_all
+from plumbline.workers import Limits, Workers
+
+LONG = 5  # bodies: longer chains climb their ladders in the full form only
+LEVELS = ("state", "trajectory")
+
+
+def cells():
+    for name, path in scenario.catalogue().items():
+        bodies = scenario.load(path).model.n
+        for engine in ENGINES:
+            for level in LEVELS:
+                marks = [pytest.mark.xdist_group(name)]  # one process per scenario: its truth is found once
+                if level == "trajectory" and bodies > LONG:
+                    marks.append(pytest.mark.full)
+                family = path.parent.name
+                label = name if family in name else f"{family}-{name}"
+                yield pytest.param(name, engine, level, id=f"{label}-{engine}-{level}", marks=marks)
+
+
+@pytest.fixture(scope="session")
+def workers():
+    with Workers(1 if "PYTEST_XDIST_WORKER" in os.environ else os.cpu_count() or 1) as pool:
+        yield pool
+
+
+@pytest.fixture(scope="session")
+def engines(workers):
+    return describe_all(workers, list(ENGINES))
+
+
+@pytest.fixture(scope="session")
+def truths():
+    return {}
+
+
+@pytest.mark.parametrize(("name", "engine", "level"), cells())
+@pytest.mark.timeout(900)
+def test_cell(name, engine, level, workers, engines, truths):
+    found = scenario.load(scenario.find(name))
+    info = engines[engine]
+    if info.missing:
+        pytest.skip(info.missing)
+    plan = Plan([found], [engine], level, limits=Limits(600))
+    bench = Bench(plan, found, {engine: info})
+    bench.truths.update(truths.get((name, level), {}))
+    for outcome in workers.run(bench.tasks()):
+        bench.take(outcome)
+    truths[name, level] = dict(bench.truths)
+    rows = bench.findings.rows
+    assert rows, "no answer at all"
+    judged = known.excuse(rows, known.load(), whole=False)
+    wrong = [f"{r.key} {r.verdict}: {r.reason}" for r in judged.rows if r.verdict != "agrees" and r.known is None]
+    stale = [f"known entry {e.id} no longer occurs" for e in judged.stale]
+    assert not wrong + stale, "\n".join(wrong + stale)

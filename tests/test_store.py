@@ -1,0 +1,81 @@
+"""The output folder is whole or as it was; what was written is read back."""
+
+import json
+import os
+
+import pytest
+
+from plumbline import store
+from plumbline.findings import Subject
+
+ROW = Subject("s", "single", "mujoco", "MuJoCo", "4.0").row(
+    "state",
+    "-",
+    "acceleration",
+    "agrees",
+    "fine",
+    "m/s²",
+    value=1e-15,
+    tolerance=float("inf"),
+    extra={"ratio": float("nan")},
+)
+STATES = [
+    {
+        "scenario": "s",
+        "engine": "mujoco",
+        "quantity": "q",
+        "state": 0,
+        "body": 0,
+        "error": 0.1,
+        "bound": 1.0,
+        "scale": 2.0,
+    }
+]
+
+
+def write(folder):
+    store.write(folder, {"id": "x"}, {"s": {"title": "<b>"}}, {}, [ROW], {"states": STATES})
+
+
+def test_what_is_written_is_read_back(tmp_path):
+    write(tmp_path / "new")
+    document = store.read(tmp_path / "new")
+    (row,) = document["rows"]
+    assert row["key"] == "s/mujoco/state/-/acceleration"
+    assert row["value"] == 1e-15
+    assert row["tolerance"] is None, "JSON has no infinity"
+    assert row["extra"] == {"ratio": None}
+    assert store.read_table(tmp_path / "new", "states") == STATES
+    (summary,) = store.read_table(tmp_path / "new", "summary")
+    assert summary["key"] == row["key"]
+
+
+def test_nothing_temporary_is_left(tmp_path):
+    write(tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["results.json", "states.parquet", "summary.parquet"]
+
+
+def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "results.json"
+    store.write_atomically(path, b"old")
+
+    def full(_: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space"):
+        store.write_atomically(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "{}", json.dumps({"schema_version": 99}), "\xff"])
+def test_foreign_or_broken_results_are_refused_by_name(tmp_path, text):
+    (tmp_path / "results.json").write_text(text, encoding="latin-1")
+    with pytest.raises(ValueError, match=r"results\.json"):
+        store.read(tmp_path)
+
+
+def test_no_results_says_how_to_make_them(tmp_path):
+    with pytest.raises(ValueError, match="plumbline run"):
+        store.read(tmp_path)
