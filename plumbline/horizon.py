@@ -45,4 +45,4 @@ def growth(model: Model, state: State, times: Array) -> Array:
         np.maximum(position_error(run.r, runs[0].r) / arm, attitude_error(run.p, runs[0].p))
         for run in runs[1:]
     ]
-    return np.maximum(np.max(away, axis=0) / TWIN, 1.0)
+    return np.asarray(np.maximum(np.max(away, axis=0) / TWIN, 1.0))

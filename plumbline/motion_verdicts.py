@@ -215,13 +215,11 @@ class Ladder:
             else f"tightest of {len(ys)} tolerances"
         )
         common = {**self.common, "uncertainty": float(ladder[at] + uncertain[at]), "horizon": end}
-        own = np.maximum.accumulate(error_of(ys[-1]))[at]
-        estimate = float(
-            factor * np.max(np.linalg.norm((ys[-1] - limit.y)[: at + 1], axis=-1)) + tolerance[at]
-        )
+        own = np.maximum.accumulate(distance(ys[-1], true))[at]
+        estimate = float(np.max(distance(ys[-1], limit.y)[: at + 1]) + tolerance[at])
         step = self.rungs[-1].resolution
         what = "step" if self.integrator.kind == "step" else "tolerance"
-        follows = "agrees" if own <= estimate else "disagrees"
+        follows: Verdict = "agrees" if own <= estimate else "disagrees"
         return [
             who.row(
                 "trajectory",

@@ -170,8 +170,8 @@ class Bench:
             if self.plan.level in ("trajectory", "all"):
                 for integrator in info.integrators:
                     steps = ladder(integrator, s.model.n, s.duration, self.plan.finer)
-                    arguments = (name, integrator.name, s.model, s.state, s.times, steps)
-                    yield Task((s.name, name, "trajectory", integrator.name), work.climb, arguments, limits)
+                    climb = (name, integrator.name, s.model, s.state, s.times, steps)
+                    yield Task((s.name, name, "trajectory", integrator.name), work.climb, climb, limits)
 
     def who(self, engine: str) -> Subject:
         """The subject of this scenario's rows about an engine."""
@@ -199,8 +199,8 @@ class Bench:
         _, engine, level, *integrators = outcome.key
         who, truth = self.who(engine), self.truths[level]
         name = integrators[0] if integrators else "-"
-        lost = outcome.lost or (f"no truth to judge by: {truth.reason}" if isinstance(truth, Lost) else None)
-        if lost:
+        if outcome.lost or isinstance(truth, Lost):
+            lost = outcome.lost or f"no truth to judge by: {getattr(truth, 'reason', '')}"
             return Findings(rows=[who.row(level, name, "all", "failed", lost)])
         if isinstance(truth, StateTruth):
             found = judge_states(who, truth, outcome.value)

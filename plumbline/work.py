@@ -70,7 +70,7 @@ def climb(
 ) -> Climb:
     """The same motion at each resolution; a rung that does not stay finite is kept as such."""
     chosen = adapter(engine)
-    rungs = []
+    rungs: list[Rung] = []
     for resolution in resolutions:
         begin = time.process_time()
         trajectory, failure = None, None

@@ -78,7 +78,7 @@ class Workers:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Kill what still runs and remove the scratch folders."""
-        self._pool.stop()
+        self._pool.stop()  # type: ignore[no-untyped-call]
         self._pool.join()
         self._scratch.cleanup()
 
@@ -93,7 +93,9 @@ class Workers:
                 if task is None:
                     exhausted = True
                     break
-                future = self._pool.schedule(task.call, args=task.arguments, timeout=task.limits.seconds)
+                future: Future[Any] = self._pool.schedule(
+                    task.call, args=task.arguments, timeout=task.limits.seconds
+                )
                 waiting[future] = task
             if not waiting:
                 return

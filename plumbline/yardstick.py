@@ -69,7 +69,7 @@ def state_truth(model: Model, states: Sequence[State]) -> StateTruth:
 def motion_truth(
     model: Model, state: State, times: Array, exact: tuple[Array, Array, str] | None
 ) -> MotionTruth:
-    """True motion from ``state`` at ``times``; ``exact`` is a closed form's (r, p, source), if there is one."""
+    """True motion from ``state`` at ``times``; ``exact`` is a closed form's (r, p, source), if any."""
     (run,) = flow([model], [state], times, FINE)
     (second,) = flow([model], [state], times, COARSE)
     r, p, factor = second.r, second.p, 10.0
