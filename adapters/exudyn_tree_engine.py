@@ -38,9 +38,8 @@ from plumbline.records import (
 )
 
 Output = exudyn.OutputVariableType
-NEAR = (
-    0.1  # cosine of a middle angle, 84.3°: rates grow as its inverse, a Runge-Kutta error as its fifth power
-)
+# cosine of a middle angle, 84.3°: the other two angles' rates grow as its inverse
+NEAR = 0.1
 
 
 @dataclass(frozen=True, eq=False)
