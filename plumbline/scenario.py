@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import ValidationError
 
 from plumbline.kinematics import lift, multiply, rotation
-from plumbline.problems import Problem, ScenarioError, nearest
+from plumbline.problems import Problem, ScenarioError, closest, nearest
 from plumbline.records import Array, Model, State
 from plumbline.scenario_errors import translate
 from plumbline.scenario_schema import (
@@ -26,7 +26,7 @@ from plumbline.scenario_schema import (
     inertia_matrix,
     unit_vector,
 )
-from plumbline.yaml_source import Source, dotted, parse, read
+from plumbline.yaml_source import Key, Source, dotted, parse, read
 
 __all__ = [
     "Problem",
@@ -188,27 +188,28 @@ def _build(source: Source, path: Path) -> Scenario:
 
 def _distal_problems(source: Source) -> Iterator[Problem]:
     """Bodies that carry another one without saying where; found in the raw data, so beside other problems."""
+    valid = "the point, in the frame of this body, from which the next one hangs, as [0, 0, -0.2] (m)"
     items = source.data.get("bodies") if isinstance(source.data, dict) else None
     items = items if isinstance(items, list) else []
     for index, item in enumerate(items):
-        last = index == len(items) - 1
-        run = item.get("cycle") if isinstance(item, dict) else None
-        bodies = list(enumerate(run)) if isinstance(run, list) else [(None, item)]
-        count = item.get("repeat", 2) if run else 1
-        for place, body in bodies:
-            path = ("bodies", index) if place is None else ("bodies", index, "cycle", place)
-            if (
-                isinstance(body, dict)
-                and body.get("distal") is None
-                and not (last and count == (place or 0) + 1)
-            ):
-                at = source.values[path]
-                valid = (
-                    "the point, in the frame of this body, from which the next one hangs, as [0, 0, -0.2] (m)"
-                )
-                yield Problem(
-                    source.file, *at, dotted((*path, "distal")), "is missing: a body follows", valid
-                )
+        written: list[tuple[tuple[Key, ...], Any]] = [(("bodies", index), item)]
+        count = 1
+        if isinstance(item, dict) and isinstance(item.get("cycle"), list):
+            written = [(("bodies", index, "cycle", k), body) for k, body in enumerate(item["cycle"])]
+            count = item.get("repeat", 0)
+        for place, (path, body) in enumerate(written):
+            ends = index == len(items) - 1 and count == place + 1  # the chain's last body, copied once
+            if ends or not isinstance(body, dict) or body.get("distal") is not None:
+                continue
+            if any(closest(key, ["distal"]) for key in body if key not in Body.model_fields):
+                continue  # misspelt, and named as such
+            yield Problem(
+                source.file,
+                *source.values[path],
+                dotted((*path, "distal")),
+                "is missing: a body follows",
+                valid,
+            )
 
 
 def _expand(document: Document) -> Iterator[tuple[Body, Array]]:

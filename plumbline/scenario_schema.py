@@ -178,8 +178,8 @@ class Inertia(Part):
     )
     six: Annotated[list[float], Len(6, 6)] | None = Field(
         None,
-        description="xx, yy, zz, xy, xz, yz of the matrix (off-diagonal entries as they stand in the matrix, "
-        "minus the products of inertia).",
+        description="xx, yy, zz, xy, xz, yz of the matrix; off the diagonal with the matrix's own sign, "
+        "J_xy = −∫ x y dm.",
         json_schema_extra={"unit": "kg m²"},
     )
     matrix: Annotated[list[Vector], Len(3, 3)] | None = Field(
@@ -250,7 +250,9 @@ class Rod(Part):
     """A massless rigid rod with a ball joint at both ends (the notes' own joint)."""
 
     kind: Literal["rod"] = Field(description="`rod`.")
-    length: float = Field(description="Length, greater than 0.", json_schema_extra={"unit": "m"})
+    length: float = Field(
+        description="Length, greater than 0.", json_schema_extra={"unit": "m", "exclusiveMinimum": 0}
+    )
     direction: Vector = Field(
         description="From where the rod hangs to the body's proximal point, world frame, at t = 0. Of any "
         "length but 0: it is normalised.",
