@@ -77,10 +77,7 @@ def _fill(results: Results, history: History, chunks: dict[str, str], points: in
         lstrip_blocks=True,
     )
     environment.filters |= {"number": number, "when": _when, "seconds": _seconds}
-    attention = sorted(
-        (row for row in results.rows if needs_attention(row)),
-        key=lambda r: (-severity(r), -(ratio(r) or 0.0)),
-    )
+    attention = _attention(results.rows)
     return environment.get_template("report.html").render(
         run=results.run,
         policy="; ".join(
@@ -161,6 +158,15 @@ def track(quotient: float | None) -> float | None:
     if quotient is None:
         return None
     return round(min(max((math.log10(max(quotient, 1e-30)) + 4) * 12, 0), 96), 1)
+
+
+def _attention(rows: list[Record]) -> list[Record]:
+    """What nobody expected, one entry per cell and verdict: its worst row and how many more there are."""
+    found: dict[tuple[str, ...], Record] = {}
+    for row in sorted(filter(needs_attention, rows), key=lambda r: (-severity(r), -(ratio(r) or 0.0))):
+        entry = found.setdefault((row["scenario"], row["engine"], row["verdict"]), {"row": row, "more": -1})
+        entry["more"] += 1
+    return list(found.values())
 
 
 def _expected(rows: list[Record]) -> list[Record]:

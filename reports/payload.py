@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import glob
 import shlex
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from reports.verdicts import MARKS, ratio, severity
 
 CURVES = (
     "position_error",
+    "limit_error",
     "attitude_error",
     "energy_drift",
     "momentum_drift",
@@ -25,6 +28,7 @@ CURVES = (
     "norm_drift",
 )
 CLI_LEVEL = {"state": "state", "trajectory": "trajectory", "invariants": "trajectory"}
+CATALOGUE = Path(__file__).parent.parent / "scenarios"
 MOTION_BYTES = 90_000  # of one scenario's motion, before compression
 _DETAIL = (
     "unit",
@@ -47,10 +51,9 @@ _DETAIL = (
 
 def command(row: Record, scenario: Record) -> str:
     """The command line that repeats just this cell, quoted for a POSIX shell."""
-    known_by_name = str(scenario.get("file", "")).replace("\\", "/").startswith(
-        "scenarios/"
-    ) or not scenario.get("file")
-    what = row["scenario"] if known_by_name else scenario["file"]
+    file = str(scenario.get("file") or "")
+    ours = not file or any(CATALOGUE.glob(f"*/{glob.escape(Path(file).name)}"))
+    what = row["scenario"] if ours else file
     level = CLI_LEVEL.get(row["level"], "all")
     words = ["python", "-m", "plumbline", "run", "--engine", row["engine"], "--level", level]
     words[4:4] = [] if what.startswith("-") else [what]
@@ -168,11 +171,9 @@ def _curves(name: str, tables: dict[str, Columns], packer: Packer, points: int) 
     times: dict[bytes, Any] = {}
     for (engine, integrator), rows in groups(curves, "engine", "integrator"):
         t = curves["t"][rows].astype(float)
-        error, tolerance = (
-            curves["position_error"][rows].astype(float),
-            curves["tolerance"][rows].astype(float),
-        )
-        above = ~(error <= tolerance) & np.isfinite(tolerance)
+        tolerance = curves["tolerance"][rows].astype(float)
+        judged = _judged(curves, rows)
+        above = ~(curves[judged][rows] <= tolerance) & np.isfinite(tolerance)
         shared = t.tobytes()
         if shared not in times:
             times[shared] = packer.add(decimate_times(t, points).astype(np.float32))
@@ -184,12 +185,19 @@ def _curves(name: str, tables: dict[str, Columns], packer: Packer, points: int) 
             "crossing": finite(t[int(np.argmax(above))]) if above.any() else None,
         }
         if np.isfinite(tolerance).any():
+            one["judged"] = judged
             one["tolerance"] = packer.add(log_codes(decimate(tolerance, points)))
         for curve in CURVES:
-            if curve in curves and np.any(curves[curve][rows] != 0):
+            if curve in curves and np.any(np.isfinite(curves[curve][rows]) & (curves[curve][rows] != 0)):
                 one[curve] = packer.add(log_codes(decimate(curves[curve][rows].astype(float), points)))
         found.append(one)
     return found
+
+
+def _judged(curves: Columns, rows: np.ndarray) -> str:
+    """The curve that the tolerance is for: the limit of the steps' error where there is one."""
+    limited = "limit_error" in curves and np.isfinite(curves["limit_error"][rows]).any()
+    return "limit_error" if limited else "position_error"
 
 
 def _final_errors(name: str, tables: dict[str, Columns]) -> dict[tuple[str, ...], float]:

@@ -22,6 +22,24 @@ _UNPRINTABLE = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]"
 )
 
+# What a run of one level only, or of another program, may leave out.
+_NOT_SAID: Record = {
+    "truth": "",
+    "machine": {},
+    "commit": None,
+    "command": "",
+    "platform": "",
+    "versions": {},
+}
+_UNKNOWN: Record = {
+    "horizon": None,
+    "truth_uncertainty": None,
+    "exact": None,
+    "truth": None,
+    "file": "",
+    "digest": "",
+}
+
 
 def clean(value: Any) -> Any:
     """The same value with every unprintable character of every text in it replaced by U+FFFD."""
@@ -48,7 +66,8 @@ class Results:
     def load(cls, folder: Path) -> Results:
         """Read OUT/results.json; raises OSError or ValueError where it is missing or not JSON."""
         stored = clean(json.loads((folder / "results.json").read_text(encoding="utf-8")))
-        return cls(folder, stored["run"], stored["scenarios"], stored["engines"], stored["rows"])
+        scenarios = {name: _UNKNOWN | about for name, about in stored["scenarios"].items()}
+        return cls(folder, _NOT_SAID | stored["run"], scenarios, stored["engines"], stored["rows"])
 
     def table(self, name: str) -> Columns:
         """Columns of OUT/<name>.parquet as NumPy arrays, texts cleaned; {} where the file is absent."""

@@ -52,7 +52,14 @@ def needs_attention(row: Record) -> bool:
 
 
 def ratio(row: Record) -> float | None:
-    """Error over tolerance; None where either is missing or the quotient says nothing."""
+    """Error over tolerance; None where either is missing or the quotient says nothing.
+
+    Where the worst of many comparisons, each with a tolerance of its own, is not the largest error,
+    the row says so in ``extra["ratio"]``.
+    """
+    told = row["extra"].get("ratio")
+    if told is not None and math.isfinite(told):
+        return float(told)
     value, tolerance = row.get("value"), row.get("tolerance")
     if value is None or tolerance is None or not math.isfinite(value) or not tolerance > 0:
         return None

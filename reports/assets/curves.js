@@ -6,7 +6,8 @@ import { decade, h, ink, number, svg } from "./text.js";
 /** @typedef {import("./payload").CurveSet} CurveSet */
 
 const PANELS = /** @type {const} */ ([
-  ["position_error", "Position error", "m"],
+  ["position_error", "Position error, finest run", "m"],
+  ["limit_error", "Position error, limit of the steps", "m"],
   ["attitude_error", "Attitude error", "rad"],
   ["energy_drift", "Energy drift", "J"],
   ["momentum_drift", "Angular momentum drift", "kg m²/s"],
@@ -35,9 +36,9 @@ export function panels(root, series, horizon, onTime) {
   for (const [field, title, unit] of PANELS) {
     const having = series.filter(({ set }) => set[field]);
     const curves = having.map(({ set }) => Array.from(/** @type {Uint16Array} */ (set[field]), fromCode));
-    const tolerance = field === "position_error" ? having.find(({ set }) => set.tolerance)?.set : undefined;
-    const limit = tolerance ? Array.from(/** @type {Uint16Array} */ (tolerance.tolerance), fromCode) : null;
-    const range = decades([...curves.flat(), ...(limit ?? [])]);
+    const judged = having.filter(({ set }) => set.judged === field);
+    const limits = judged.map(({ set }) => Array.from(/** @type {Uint16Array} */ (set.tolerance), fromCode));
+    const range = decades([...curves.flat(), ...limits.flat()]);
     if (!range) continue;
     const readout = h("span");
     const box = h("div", { class: "panel" }, h("h4", {}, `${title} [${unit}]`, readout));
@@ -46,9 +47,9 @@ export function panels(root, series, horizon, onTime) {
     const resting = "max " + number(Math.max(...highest.map(([, v]) => Number(v)))) + " " + unit;
     readout.textContent = resting;
     const times = Array.from(having[0].set.t);
-    const same = having.every(({ set }) => set.t.length === times.length);
-    const lines = [...curves, ...(limit ? [limit] : [])].map((ys) => ys.map((v) => (v > 0 ? v : null)));
-    const tables = /** @type {uPlot.AlignedData[]} */ (lines.map((ys, k) => [Array.from((k < having.length ? having[k].set : /** @type {CurveSet} */ (tolerance)).t), ys]));
+    const same = having.every(({ set }) => set.t === having[0].set.t || set.t.every((v, k) => v === times[k]));
+    const lines = [...curves, ...limits].map((ys) => ys.map((v) => (v > 0 ? v : null)));
+    const tables = /** @type {uPlot.AlignedData[]} */ ([...having, ...judged].map(({ set }, k) => [Array.from(set.t), lines[k]]));
     const data = /** @type {uPlot.AlignedData} */ (same ? [times, ...lines] : uPlot.join(tables));
     const marker = h("div", { class: "now-line" });
     const axis = { stroke: ink("--soft"), font: `11px ${ink("--sans")}`, grid: { stroke: ink("--grid"), width: 1 }, ticks: { show: false }, gap: 4 };
@@ -66,14 +67,14 @@ export function panels(root, series, horizon, onTime) {
         series: [
           {},
           ...having.map(({ name, stroke }) => ({ label: name, stroke: ink(stroke.colour), dash: stroke.dash, width: 1.4, points: { show: false }, spanGaps: false })),
-          ...(limit ? [{ label: "tolerance", stroke: ink("--disagrees"), dash: [5, 3], width: 1.2, points: { show: false } }] : []),
+          ...judged.map(({ name, stroke }) => ({ label: `tolerance of ${name}`, stroke: ink(judged.length > 1 ? stroke.colour : "--disagrees"), dash: [2, 3], width: 1.1, points: { show: false } })),
         ],
         hooks: {
           drawClear: [(u) => shadeHorizon(u, horizon)],
           setCursor: [(u) => {
             const at = u.cursor.idx;
             readout.textContent = at === null || at === undefined ? resting
-              : `${number(u.data[0][at], 3)} s: ` + [...having.map(({ name }) => name), ...(limit ? ["tolerance"] : [])].slice(0, 4).map((name, k) => `${name} ${number(u.data[k + 1][at])}`).join(" · ");
+              : `${number(u.data[0][at], 3)} s: ` + [...having.map(({ name }) => name), ...judged.map(({ name }) => "tolerance of " + name)].slice(0, 3).map((name, k) => `${name} ${number(u.data[k + 1][at])}`).join(" · ");
           }],
         },
       },
@@ -116,8 +117,8 @@ function shadeHorizon(u, horizon) {
   ctx.fillStyle = ink("--soft");
   ctx.font = `${11 * devicePixelRatio}px ${ink("--sans")}`;
   ctx.textAlign = "left";
-  ctx.textBaseline = "top";
-  ctx.fillText("beyond the horizon", from + 5 * devicePixelRatio, bbox.top + 4 * devicePixelRatio);
+  ctx.textBaseline = "bottom";
+  if (bbox.left + bbox.width - from > 110 * devicePixelRatio) ctx.fillText("beyond the horizon", from + 5 * devicePixelRatio, bbox.top + bbox.height - 3 * devicePixelRatio);
   ctx.restore();
 }
 
@@ -128,5 +129,5 @@ function shadeHorizon(u, horizon) {
 export function keys(series, tolerance) {
   return h("ul", { class: "keys" },
     series.map(({ name, stroke }) => h("li", {}, svg("svg", { class: "plot", viewBox: "0 0 26 8" }, svg("path", { class: `ln ${stroke.css}`, d: "M0 4H26" })), name)),
-    tolerance ? h("li", {}, svg("svg", { class: "plot", viewBox: "0 0 26 8" }, svg("path", { class: "tol", d: "M0 4H26" })), "tolerance of the position error") : null);
+    tolerance ? h("li", {}, svg("svg", { class: "plot", viewBox: "0 0 26 8" }, svg("path", { class: "tol dot", d: "M0 4H26" })), "dotted: the tolerance of that curve") : null);
 }

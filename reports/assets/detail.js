@@ -46,7 +46,7 @@ export async function showCell(root, index, fields, back) {
     h("dl", { class: "facts" },
       fact("Bodies", scenario.bodies), fact("Joints", joints), fact("Duration", `${number(scenario.duration, 3)} s`),
       fact("Horizon", scenario.horizon === null ? "–" : `${number(scenario.horizon, 3)} s`),
-      fact("Exact solution", typeof scenario.exact === "string" ? scenario.exact : scenario.exact ? "yes" : "none"),
+      fact("Truth", scenario.truth ?? "–"), fact("Exact solution", typeof scenario.exact === "string" ? scenario.exact : scenario.exact ? "yes" : "none"),
       fact("Uncertainty of truth", scenario.truth_uncertainty === null ? "–" : `${number(scenario.truth_uncertainty)} m`),
       fact("Engine", `${title} ${version ?? ""}`), fact("File", scenario.file), fact("Digest", scenario.digest)),
     h("ul", { class: "enginetabs" }, index.engines.map((name, k) => {
@@ -106,7 +106,9 @@ function compared(index, data, ours, fields) {
   const body = h("tbody");
   const { rows } = index;
   let level = -1;
-  for (const i of ours) {
+  const order = ["state", "trajectory", "invariants", "relations"];
+  const sorted = [...ours].sort((a, b) => order.indexOf(index.levels[rows.level[a]]) - order.indexOf(index.levels[rows.level[b]]) || rows.integrator[a] - rows.integrator[b] || a - b);
+  for (const i of sorted) {
     const row = data.rows[i] ?? {};
     if (rows.level[i] !== level) {
       level = rows.level[i];
@@ -169,7 +171,8 @@ function moving(root, data, fields) {
   const end = Math.max(...curves.map((set) => set.t[set.t.length - 1]), data.motion ? data.motion.t[data.motion.t.length - 1] : 0);
   const crossings = curves.filter((set) => set.engine === fields.engine && set.crossing !== null);
   const first = crossings.length ? crossings.reduce((a, b) => (/** @type {number} */ (b.crossing) < /** @type {number} */ (a.crossing) ? b : a)) : null;
-  root.append(h("h3", {}, "Motion and curves"));
+  const room = h("section", { class: "moving", "aria-label": "Motion and curves" });
+  root.append(h("h3", {}, "Motion and curves"), room);
   /** @type {ReturnType<typeof panels> | null} */
   let drawn = null;
   const stage = motion(data, {
@@ -178,13 +181,14 @@ function moving(root, data, fields) {
     onTime: (t) => drawn?.setTime(t),
     onRest: (state) => amend(state),
   });
-  root.append(stage.root);
+  room.append(stage.root);
   ending.push(stage.destroy);
   const choice = h("select", { "aria-label": "Curves shown" }, h("option", { value: "" }, "this engine, every integrator"), h("option", { value: "all" }, "every engine, its best integrator"));
   choice.value = fields.curves === "all" ? "all" : "";
   const legend = h("div");
   const area = h("div", { class: "panels" });
-  if (curves.length) root.append(h("div", { class: "crumbs" }, choice, legend), area);
+  if (curves.length) room.append(h("div", { class: "crumbs" }, choice, legend), area);
+  room.append(stage.transport);
   const draw = () => {
     drawn?.destroy();
     area.replaceChildren();
@@ -229,7 +233,9 @@ function workPrecision(studies, kind) {
   if (!xs || !ys) return null;
   const name = kind === "step" ? "step" : "relative tolerance";
   const words = studies.map((one) => `${one.integrator} order ${number(lastNumber(one.order), 3)}`).join(", ");
-  const plot = axes({ title: `Position error at the end against ${name}`, x: { label: kind === "step" ? "step [s]" : "relative tolerance", min: xs[0], max: xs[1] }, y: { label: "error [m]", min: ys[0], max: ys[1] }, right: 110, label: `Error against ${name}: ${words}` });
+  const plot = axes({ title: `Position error up to the horizon against ${name}`, x: { label: kind === "step" ? "step [s]" : "relative tolerance", min: xs[0], max: xs[1] }, y: { label: "error [m]", min: ys[0], max: ys[1] }, right: 110, label: `Error against ${name}: ${words}` });
+  /** @type {{ y: number, x: number, text: string, css: string }[]} */
+  const labels = [];
   studies.forEach((one, k) => {
     const { css } = strokeOf(k);
     plot.root.append(svg("path", { class: `ln ${css}`, d: path(plot, one.resolution, one.error) }));
@@ -242,8 +248,12 @@ function workPrecision(studies, kind) {
     if (at < 0) return;
     const y = plot.y(one.error[at] ?? 1);
     const order = lastNumber(one.order);
-    plot.root.append(svg("text", { class: `series ${css}`, x: plot.x(one.resolution[at] ?? 1) + 7, y: y + 4 }, one.integrator + (kind === "step" && order !== null ? ` ${number(order, 3)}` : "")));
+    labels.push({ y: y + 4, x: plot.x(one.resolution[at] ?? 1) + 7, css, text: one.integrator + (kind === "step" && order !== null ? ` ${number(order, 3)}` : "") });
     if (kind === "step" && one.declared) triangle(plot, one, one.declared);
+  });
+  labels.sort((a, b) => a.y - b.y).forEach((label, k) => {
+    if (k) label.y = Math.max(label.y, labels[k - 1].y + 13); // labels of curves that start together stand below each other
+    plot.root.append(svg("text", { class: `series ${label.css}`, x: label.x, y: label.y }, label.text));
   });
   return h("div", {}, plot.root);
 }

@@ -112,7 +112,7 @@ export function motion(data, o) {
   const transport = h("div", { class: "transport", role: "group", "aria-label": "Time and difference" }, play, slider, clock, speed, jump,
     m ? h("label", {}, magnified, "Magnify differences") : null, m ? power : null, m ? scale : null);
   const stage = h("div", { class: "stage" });
-  const root = h("div", { class: "motion" }, m ? stage : null, transport);
+  const root = h("div", { class: "motion" }, m ? stage : null);
 
   if (m) {
     const engines = [...new Set(m.runs.map((run) => run.engine))];
@@ -249,6 +249,7 @@ export function motion(data, o) {
   setTime(now);
   return {
     root,
+    transport,
     setTime: (/** @type {number} */ t) => { setTime(t); rest(); },
     time: () => now,
     destroy() {

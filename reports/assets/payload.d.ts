@@ -19,7 +19,7 @@ export interface RowDetail {
 
 export interface CurveSet {
   engine: string; integrator: string; resolution: number; t: Float32Array; crossing: number | null;
-  tolerance?: Uint16Array; position_error?: Uint16Array; attitude_error?: Uint16Array; energy_drift?: Uint16Array;
+  tolerance?: Uint16Array; judged?: string; limit_error?: Uint16Array; position_error?: Uint16Array; attitude_error?: Uint16Array; energy_drift?: Uint16Array;
   momentum_drift?: Uint16Array; joint_gap?: Uint16Array; gap_rate?: Uint16Array; norm_drift?: Uint16Array;
 }
 
@@ -35,7 +35,7 @@ export interface StateSpread { engine: string; quantity: string; ratio: Uint16Ar
 export interface ScenarioChunk {
   scenario: {
     family: string; title: string; purpose: string; file: string; bodies: number; joints: string[]; duration: number;
-    sample: number; exact: string | null | boolean; horizon: number | null; truth_uncertainty: number | null; digest: string;
+    sample: number; exact: string | null | boolean; horizon: number | null; truth_uncertainty: number | null; digest: string; truth: string | null;
   };
   rows: Record<string, RowDetail>; commands: Record<string, string>;
   states: StateSpread[]; curves: CurveSet[] | null; motion: MotionData | null;
