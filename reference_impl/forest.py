@@ -31,7 +31,7 @@ from reference_impl.system import EPS, Solution, check
 
 
 def _bilinear(rows: list[str]) -> Array:
-    """(k, 16) matrix from the flattened outer product of two 4-vectors to k sums of terms '±ij': ± a_i b_j."""
+    """(k, 16) matrix from the flattened outer product of two 4-vectors to k sums of terms ±ij: ± a_i b_j."""
     matrix = np.zeros((len(rows), 4, 4))
     for row, terms in zip(matrix, rows, strict=True):
         for term in terms.split():

@@ -1,0 +1,127 @@
+"""Collocation against DOP853 on the direct form, closed relations, and its own order."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from adapters.reference_engine import chain
+from plumbline.kinematics import rate
+from plumbline.records import Model, State
+from reference_impl import integrate as raw
+from reference_impl.chain import Array
+from reference_impl.collocation import BatchRun, gauss, integrate
+from reference_impl.forest import Forest
+from tests.random_chains import random_chain
+
+TIMES = np.linspace(0.0, 1.0, 11)
+
+
+def start(state: State) -> tuple[Array, Array, Array, Array]:
+    return state.r, state.p, state.v, rate(state.p, state.omega)
+
+
+def run(model: Model, state: State, rtol: float, times: Array = TIMES, **options: object) -> BatchRun:
+    return integrate([chain(model)], *start(state), times, rtol, **options)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("S", [4, 12, 20])
+def test_tables_integrate_polynomials_exactly(S: int) -> None:
+    """∫₀^c of x^k for k < S by A, ∫₀¹ for k < 2 S by b, and both integrals of the dense output."""
+    table = gauss(S)
+    for k in range(S):
+        values = table.c**k
+        assert np.max(np.abs(table.A @ values - table.c ** (k + 1) / (k + 1))) < 4e-15
+        tau = np.linspace(0, 1, 7)
+        once, twice = table.integrals(tau)
+        assert np.max(np.abs(once @ table.modes @ values - tau ** (k + 1) / (k + 1))) < 4e-15
+        assert np.max(np.abs(twice @ table.modes @ values - tau ** (k + 2) / (k + 1) / (k + 2))) < 4e-15
+    for k in range(2 * S):
+        assert abs(table.b @ table.c**k - 1 / (k + 1)) < 4e-15
+
+
+@pytest.mark.parametrize("rods", [[False], [False, False], [True], [True, False], [False, True, False]])
+def test_two_methods_share_their_digits(rods: list[bool]) -> None:
+    """Direct form with DOP853, structured form with collocation: nothing in common but the notes."""
+    model, state = random_chain(np.random.default_rng(31), rods, loads=True, drag=True)
+    dop = raw.integrate(chain(model), *start(state), TIMES, 1e-13)
+    ours = run(model, state, 1e-13)
+    assert np.max(np.abs(ours.r - dop.r)) < (2e-11 if any(rods) else 1e-12)
+    assert np.max(np.abs(ours.p - dop.p)) < (2e-11 if any(rods) else 1e-12)
+    assert np.array_equal(ours.r[0], state.r)
+    assert ours.t is TIMES
+
+
+@pytest.mark.parametrize("dense", [True, False])
+def test_the_error_follows_the_tolerance(dense: bool) -> None:
+    model, state = random_chain(np.random.default_rng(32), [False, False])
+    truth = run(model, state, 1e-14)
+    growth = 1e3  # of a local error by t = 1 s, at most (a perturbation of this motion grows 1e2-fold)
+    for rtol in (1e-5, 1e-7, 1e-9, 1e-11):
+        error = np.max(np.abs(run(model, state, rtol, dense=dense).r - truth.r))
+        assert error < growth * rtol
+
+
+def test_dense_output_inside_the_steps() -> None:
+    """Samples between the ends of steps are as good as those at the ends."""
+    model, state = random_chain(np.random.default_rng(33), [False, True])
+    fine = np.linspace(0, 0.5, 83)
+    inside, ends = run(model, state, 1e-10, fine), run(model, state, 1e-13, fine, dense=False)
+    assert inside.steps < 40 < ends.steps
+    assert np.max(np.abs(inside.r - ends.r)) < 1e-8
+    assert np.max(np.abs(inside.pdot - ends.pdot)) < 1e-7
+
+
+def test_order_is_twice_the_nodes() -> None:
+    """S = 2 nodes with fixed steps: order 4 at the ends of steps."""
+    model, state = random_chain(np.random.default_rng(34), [False], rate=1.0)
+    truth = run(model, state, 1e-14, TIMES[[0, -1]])
+    error = []
+    for count in (40, 80, 160):
+        # A tolerance out of reach of the tail leaves the step at the distance of the times.
+        times = np.linspace(0, 1, count + 1)
+        fixed = run(model, state, 1e3, times, dense=False, nodes=2, sweep_tolerance=1e-13)
+        assert fixed.steps == count
+        error.append(np.max(np.abs(fixed.r[-1] - truth.r[-1])))
+    orders = np.log2(np.array(error[:-1]) / error[1:])
+    assert np.all(np.abs(orders - 4) < 0.1), orders
+
+
+def test_a_batch_is_every_chain_alone() -> None:
+    rng = np.random.default_rng(35)
+    drawn = [random_chain(rng, rods) for rods in ([False], [True, False], [False, False, False], [True])]
+    packed = [np.concatenate(parts) for parts in zip(*(start(state) for _, state in drawn), strict=True)]
+    batch = integrate([chain(model) for model, _ in drawn], *packed, TIMES, 1e-12)
+    at = 0
+    for model, state in drawn:
+        alone = run(model, state, 1e-12)
+        assert np.max(np.abs(batch.r[:, at : at + model.n] - alone.r)) < 1e-9
+        at += model.n
+
+
+def test_stiffness_is_said() -> None:
+    model, state = random_chain(np.random.default_rng(36), [False, False])
+    stiff = replace(model, drag_force=model.mass * 3e3)
+    assert "stiff" in run(stiff, state, 1e-6, TIMES[:2]).note
+    assert run(model, state, 1e-6).note == ""
+
+
+def test_rest_stays_at_rest() -> None:
+    model, state = random_chain(np.random.default_rng(37), [False])
+    still = replace(model, gravity=np.zeros(3))
+    resting = replace(state, omega=np.zeros((1, 3)), v=np.zeros((1, 3)))
+    moved = run(still, resting, 1e-10)
+    assert np.array_equal(moved.r[-1], state.r)
+    assert np.array_equal(moved.p[-1], state.p)
+
+
+def test_a_long_chain_runs() -> None:
+    """300 bodies; the work per body does not grow."""
+    model, state = random_chain(np.random.default_rng(38), [False] * 300, rate=0.1)
+    moved = run(model, state, 1e-6, np.array([0.0, 0.02]))
+    gap = Forest([chain(model)]).gaps(
+        np.vstack([moved.r[-1].T, moved.p[-1].T]), np.vstack([moved.v[-1].T, moved.pdot[-1].T])
+    )[0]
+    assert np.max(np.abs(gap)) < 1e-6
