@@ -371,14 +371,15 @@ def test_a_run_is_its_bodies_written_out(cycle, repeat, axis, degrees):
 
 
 def test_a_rods_rate_may_be_typed_with_finite_digits():
-    text = (scenarios.CATALOGUE / "single" / "spherical.yaml").read_text()
-    s = scenarios.loads(text)
-    close(s.state.udot[0], [0.4, 2.5, 0.3])
-    assert s.state.u[0] @ s.state.udot[0] == pytest.approx(0, abs=2 * EPS)
+    """A part of 1e-13 along the rod is rounding: accepted, and then taken out."""
+    text = (scenarios.CATALOGUE / "single" / "spherical.yaml").read_text(encoding="utf-8")
+    s = scenarios.loads(text.replace("[0.4, 2.5, 0.3]", "[0.8, 0, 0.6000000000003]"))
+    close(s.state.udot[0], [0.8, 0, 0.6], 2000)
+    assert abs(s.state.u[0] @ s.state.udot[0]) <= 2 * EPS
 
 
 def test_the_digest_is_of_the_content():
-    text = (scenarios.CATALOGUE / "single" / "tumbling-rod.yaml").read_text()
+    text = (scenarios.CATALOGUE / "single" / "tumbling-rod.yaml").read_text(encoding="utf-8")
     base = scenarios.loads(text).digest
     assert scenarios.loads("# a comment\n" + text.replace("1.3", "1.30")).digest == base
     assert scenarios.loads(as_yaml(YAML(typ="safe").load(text))).digest == base
@@ -387,7 +388,7 @@ def test_the_digest_is_of_the_content():
 
 
 def test_names_may_be_any_text_and_slugs_are_safe_and_distinct():
-    text = (scenarios.CATALOGUE / "single" / "rest.yaml").read_text()
+    text = (scenarios.CATALOGUE / "single" / "rest.yaml").read_text(encoding="utf-8")
     wild = [
         "<img onerror=alert(1)>",
         "a; rm -rf /",
