@@ -84,8 +84,8 @@ class System:
 
         S is equilibrated symmetrically by powers of two (its blocks have the units kg, kg m² and m,
         and would otherwise decide the pivots), factored with partial pivoting and refined once.  Measured
-        on chains of four, masses over 1e±3, r̈ over max(‖r̈‖, g): 1e-15, where it is 9e-15 without refinement
-        and 4e-14 without both; more passes of equilibration change nothing.
+        on chains of four, masses over 1e±3: |S x − b| ≤ 1.0 ε (|S||x| + |b|) in every row, where it is up to
+        830 ε without the refinement; more passes of equilibration change nothing.
         ``gamma_defect`` (a number or (c,)) is added to γ: a planted fault whose growth is known (E4).
 
         Raises SingularSystem, which names the body and the cause (E1, E7).

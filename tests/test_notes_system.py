@@ -99,6 +99,27 @@ def test_units_do_not_decide_the_digits():
         np.testing.assert_allclose(y.joint_reaction / scale, x.joint_reaction, rtol=0, atol=1e-13)
 
 
+def test_refinement_solves_every_row_to_its_own_rounding():
+    """Masses over 1e±3: |S x − b| ≤ (k + 1) ε (|S||x| + |b|) row by row, k entries in the fullest row.
+
+    That is the rounding of evaluating the residual itself; 1.0 ε seen, and 830 ε without refinement.
+    """
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        chain = random_chain(rng, list(rng.random(4) < 0.5))
+        scale = 10 ** rng.uniform(-3, 3, 4)
+        chain = dataclasses.replace(
+            chain, mass=chain.mass * scale, inertia=chain.inertia * scale[:, None, None]
+        )
+        state = on_manifold(chain, rng)
+        system = System(chain)
+        S, b = system.assemble(*state)
+        x = vector(system.solve(*state)).astype(np.longdouble)
+        residual = np.abs(S.astype(np.longdouble) @ x - b) / (np.abs(S) @ np.abs(x) + np.abs(b))
+        fullest = np.max(np.count_nonzero(S, axis=1))
+        assert np.max(residual) <= (fullest + 1) * np.finfo(float).eps
+
+
 def test_energy_changes_by_the_power_of_the_loads():
     """Ė = Σ F·ṙ + n′·ω′ (gravity in E): workless joints, rods and balls."""
     rng = np.random.default_rng(6)
@@ -173,7 +194,7 @@ def test_samples_do_not_change_the_steps():
 def test_at_rest_stays_at_rest():
     chain, state, _ = planar(0.0)
     run = integrate(chain, *state, np.linspace(0, 5, 6), 1e-10)
-    np.testing.assert_array_equal(run.r, np.broadcast_to(state[0], run.r.shape))
+    np.testing.assert_allclose(run.r, np.broadcast_to(state[0], run.r.shape), rtol=0, atol=1e-14)
 
 
 def test_fifty_bodies():

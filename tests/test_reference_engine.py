@@ -48,6 +48,8 @@ def test_energy_momentum_and_mass_matrix_belong_together(rods):
     spin = np.einsum("nij,njk,nk->ni", rotation(state.p), model.inertia, state.omega)
     momentum = np.cross(state.r, model.mass[:, None] * state.v) + spin
     np.testing.assert_allclose(said.angular_momentum, momentum.sum(0), atol=1e-14)
+    weight = -model.mass[:, None] * model.gravity
+    np.testing.assert_allclose(said.potential_energy, np.sum(weight * state.r), rtol=1e-13)
 
 
 @pytest.mark.parametrize("rods", [[True, False], [False, True]], ids=str)
