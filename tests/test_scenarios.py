@@ -378,6 +378,22 @@ def test_a_rods_rate_may_be_typed_with_finite_digits():
     assert abs(s.state.u[0] @ s.state.udot[0]) <= 2 * EPS
 
 
+def test_a_run_turns_its_rods_rates_too():
+    rod = {"kind": "rod", "length": 0.5, "direction": [0.6, 0, -0.8], "rate": [0.8, 1.5, 0.6]}
+    body = {
+        "mass": 1,
+        "inertia": {"principal": [1, 1, 1]},
+        "joint": rod,
+        "proximal": [0, 0, 1],
+        "distal": [0, 0, -1],
+    }
+    body["attitude"] = {"quaternion": [1, 0, 0, 0]}
+    run = {"repeat": 3, "cycle": [body], "turn": {"axis": [0, 0, 1], "degrees": 90}}
+    s = scenarios.loads(as_yaml(document([run])))
+    close(s.state.u, [[0.6, 0, -0.8], [0, 0.6, -0.8], [-0.6, 0, -0.8]])
+    close(s.state.udot, [[0.8, 1.5, 0.6], [-1.5, 0.8, 0.6], [-0.8, -1.5, 0.6]])
+
+
 def test_the_digest_is_of_the_content():
     text = (scenarios.CATALOGUE / "single" / "tumbling-rod.yaml").read_text(encoding="utf-8")
     base = scenarios.loads(text).digest
