@@ -16,10 +16,11 @@ import numpy as np
 from plumbline.adapter import Adapter
 from plumbline.kinematics import velocity_map
 from plumbline.records import Array, EngineFailure, Integrator, Model, State, StateQuantities, Trajectory
+from reference_impl import collocation
 from reference_impl.chain import Chain
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import A, L, rate
-from reference_impl.integrate import integrate
+from reference_impl.integrate import Run, integrate
 from reference_impl.system import System
 
 
@@ -37,6 +38,14 @@ class Reference(Adapter):
             note="scipy's DOP853 on y = (r, p, ṙ, ṗ), no stabilisation; resolution is rtol, atol is rtol "
             "times the natural size of each part of y",
         ),
+        Integrator(
+            "collocation",
+            "tolerance",
+            24,
+            symmetric=True,
+            note="12-point Gauss–Legendre collocation by Picard sweeps on the structured form of the same "
+            "equations, no stabilisation; resolution is rtol of the dense output",
+        ),
     )
 
     def version(self) -> str:
@@ -53,7 +62,11 @@ class Reference(Adapter):
     ) -> Trajectory:
         pdot = rate(state.p, state.omega)
         try:
-            run = integrate(chain(model), state.r, state.p, state.v, pdot, times, resolution)
+            if integrator.name == "collocation":
+                start = state.r, state.p, state.v, pdot
+                run: Run = collocation.integrate([chain(model)], *start, times, resolution)
+            else:
+                run = integrate(chain(model), state.r, state.p, state.v, pdot, times, resolution)
         except ArithmeticError as error:
             raise EngineFailure(f"{self.title}: {error}") from error
         return Trajectory(t=run.t, r=run.r, p=run.p, v=run.v, pdot=run.pdot, steps=run.steps)

@@ -100,8 +100,8 @@ def integrate(
     the `natural_sizes` of each chain.  Without it the steps end on ``times`` and ``rtol`` holds there
     only: the ends of steps have order 2 S where the polynomial has S, so the square of the tail counts.
     ``sweep_tolerance`` ends the sweeps, 0.1 ``rtol`` where it is not given.
-    ``baumgarte`` a (1/s) and ``projected`` (onto the manifold after each step) stabilise; without
-    them it is the notes' raw form.
+    ``baumgarte`` a (1/s) and ``projected`` (every step's end and every sample, onto the manifold) stabilise;
+    without them it is the notes' raw form.
 
     Where sweeps converge only for steps shorter than the tolerance asks for (stiffness: short rods, strong
     drag), the steps follow the sweeps and ``note`` says so.  DOP853 is no way out there, being bound by its
@@ -134,7 +134,10 @@ def integrate(
         reached_t = goal if ends else t + h
         reached = int(np.searchsorted(times, reached_t, side="right"))
         if reached > done:
-            samples[:, done:reached] = stepper.inside((times[done:reached] - t) / h)
+            within = stepper.inside((times[done:reached] - t) / h)
+            if projected:
+                within = np.stack([forest.project(q, v) for q, v in within.swapaxes(0, 1)], axis=1)
+            samples[:, done:reached] = within
         if projected:
             stepper.project()
         if reached > done and times[reached - 1] == reached_t:

@@ -9,6 +9,7 @@ from scipy.integrate import DOP853
 
 from reference_impl.chain import Array, Chain
 from reference_impl.euler_parameters import angular_velocity
+from reference_impl.forest import Forest, lay
 from reference_impl.system import System
 
 
@@ -45,6 +46,13 @@ def rate(system: System, y: Array, gamma_defect: float | Array = 0.0) -> Array:
     return pack(v, pdot, x.acceleration, x.pddot)
 
 
+def structured_rate(forest: Forest, y: Array) -> Array:
+    """(N6) ẏ (14 N,) from the structured form: equal to `rate` to rounding, in less time."""
+    r, p, v, pdot = unpack(y, forest.size)
+    a = forest.acceleration(lay(r, p), lay(v, pdot))
+    return pack(v, pdot, a[:3].T, a[3:].T)
+
+
 def natural_sizes(chain: Chain, r: Array, p: Array, v: Array, pdot: Array) -> Array:
     """(14 N,) the size that each part of y has in this motion: what an absolute tolerance is relative to.
 
@@ -71,11 +79,13 @@ def integrate(
     times: Array,
     rtol: float,
     gamma_defect: float | Array = 0.0,
+    structured: bool = False,
 ) -> Run:
     """(N6) by DOP853, sampled at ``times`` (T,) from its dense output; times[0] is the initial time.
 
     Initial r, ṙ (N, 3) m, m/s and p, ṗ (N, 4) –, 1/s.  The absolute tolerance is ``rtol`` times
-    `natural_sizes`.  scipy holds rtol at 2.2e-14 at least.
+    `natural_sizes`.  scipy holds rtol at 2.2e-14 at least.  ``structured`` takes the right-hand side from
+    `forest` in place of the direct form, for long chains; γ has no defect there.
 
     Raises SingularSystem where S is singular on the way, ArithmeticError where the step size vanishes.
     """
@@ -84,9 +94,14 @@ def integrate(
     atol = rtol * natural_sizes(chain, r, p, v, pdot)
     samples = np.empty((len(times), 14 * n))
     samples[0], done, steps = start, 1, 0
-    solver = DOP853(
-        lambda _, y: rate(system, y, gamma_defect), times[0], start, times[-1], rtol=rtol, atol=atol
-    )
+    if structured and np.any(gamma_defect):
+        raise ValueError("a defect of γ is planted in the direct form only")
+    forest = Forest([chain]) if structured else None
+
+    def right(_: float, y: Array) -> Array:
+        return rate(system, y, gamma_defect) if forest is None else structured_rate(forest, y)
+
+    solver = DOP853(right, times[0], start, times[-1], rtol=rtol, atol=atol)
     while done < len(times):
         message = solver.step()
         if solver.status == "failed":
