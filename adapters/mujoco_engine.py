@@ -52,7 +52,7 @@ class Mujoco(Adapter):
             1,
             ALL,
             alias_of="Euler",
-            note="implicit in velocity without Coriolis terms: equals Euler on undamped chains",
+            note="implicit in velocity without Coriolis terms: equals Euler bit for bit unless there is drag",
         ),
         Integrator("RK4", "step", 4, (4, 5, 6, 7, 8), note="classical Runge–Kutta on the rotation group"),
     )
