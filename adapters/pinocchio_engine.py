@@ -320,3 +320,14 @@ class Pinocchio(Adapter):
             rows.append((q, v))
         qs, vs = (np.array(column) for column in zip(*rows, strict=True))
         return chain.trajectory(times, qs, vs, int(at[-1]))
+
+
+class PinocchioAba(Pinocchio):
+    """State quantities with accelerations by `aba`: the engine's other algorithm, a column of its own."""
+
+    name = "pinocchio-aba"
+    title = "Pinocchio (aba)"
+    integrators: ClassVar[tuple[Integrator, ...]] = ()
+
+    def __init__(self) -> None:
+        super().__init__("aba")

@@ -10,6 +10,7 @@ ENGINES = {
     "reference": "adapters.reference_engine:Reference",
     "mujoco": "adapters.mujoco_engine:Mujoco",
     "pinocchio": "adapters.pinocchio_engine:Pinocchio",
+    "pinocchio-aba": "adapters.pinocchio_engine:PinocchioAba",
     "pinocchio-maximal": "adapters.pinocchio_maximal_engine:PinocchioMaximal",
     "exudyn": "adapters.exudyn_engine:Exudyn",
     "exudyn-tree": "adapters.exudyn_tree_engine:ExudynTree",

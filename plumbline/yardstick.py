@@ -1,8 +1,8 @@
 """What engines are measured with: the truth of a scenario, how sure it is, and how sharp it must be.
 
 Runs inside a worker.  State level: rigorous enclosures in ball arithmetic.  Along
-trajectories: the closed form where the scenario has one, else the notes' form by DOP853 at two
-tolerances, ten times their difference being its uncertainty.
+trajectories: the closed form where the scenario has one, else the notes' form by two methods of
+different kind, collocation and DOP853, their difference being its uncertainty.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from plumbline.sampling import seed_of
 from plumbline.truth import TruthUnavailable
 from plumbline.truth.certified import certify
 
-FINE, COARSE = 1e-13, 3e-13  # relative tolerances of the truth's two runs
+FINE, COARSE = 1e-14, 1e-13  # relative tolerances of the truth's two runs
 ROUNDING = 1e3 * 2.0**-52  # of a whole run, before growth: trials saw at most 115 ε G (verification.md)
 PART = 1e-4  # a mistake of this relative size in a parameter must be visible, or the verdict is unresolved
 
@@ -71,16 +71,17 @@ def motion_truth(
 ) -> MotionTruth:
     """True motion from ``state`` at ``times``; ``exact`` is a closed form's (r, p, source), if any."""
     (run,) = flow([model], [state], times, FINE)
-    (second,) = flow([model], [state], times, COARSE)
-    r, p, factor = second.r, second.p, 10.0
-    method = f"the notes' form by DOP853 at rtol {FINE:g} and {COARSE:g}; ten times their difference"
+    (second,) = flow([model], [state], times, COARSE, "dop853")
+    r, p = second.r, second.p
+    method = f"the notes' form by collocation at rtol {FINE:g} and by DOP853 at {COARSE:g}; their difference"
     if exact is not None:
-        run, factor = replace(run, r=exact[0], p=exact[1]), 0.0
-        method = f"closed form: {exact[2]}"
+        r, p, source = exact
+        run = replace(run, r=r, p=p)
+        method = f"closed form: {source}"
     return MotionTruth(
         run,
-        factor * np.maximum.accumulate(position_error(run.r, r)),
-        factor * np.maximum.accumulate(attitude_error(run.p, p)),
+        np.maximum.accumulate(position_error(run.r, r)),
+        np.maximum.accumulate(attitude_error(run.p, p)),
         np.maximum.accumulate(growth(model, state, times)),
         *visible(model, state, times),
         length=float(np.sum(reach(model))),
