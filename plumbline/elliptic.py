@@ -32,7 +32,7 @@ def first(phi: Array | float, m1: float) -> Array:
     """F(φ | m), Legendre's integral of the first kind, every φ.  DLMF 19.25.5, Carlson's R_F."""
     turns, s, c = _folded(phi)
     part = s * elliprf(c * c, c * c + m1 * s * s, 1.0)
-    return np.asarray(part + np.where(turns == 0, 0.0, 2 * turns * elliprf(0.0, m1, 1.0)))
+    return np.asarray(part + 2 * turns * elliprf(0.0, m1, 1.0) if np.any(turns) else part)
 
 
 def third(n: float, phi: Array | float, m1: float) -> Array:
