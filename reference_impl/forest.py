@@ -55,8 +55,9 @@ _RATES = _bilinear(  # (pᵀṗ, L(p) ṗ)
         "+03 -12 +21 -30",
     ]
 )
-_ROTATION = _bilinear(  # π R, row by row
+_ROTATION = _bilinear(  # π, then π R row by row
     [
+        "+00 +11 +22 +33",
         *("+00 +11 -22 -33", "+12 +21 -03 -30", "+13 +31 +02 +20"),
         *("+12 +21 +03 +30", "+00 -11 +22 -33", "+23 +32 -01 -10"),
         *("+13 +31 -02 -20", "+23 +32 +01 +10", "+00 -11 -22 +33"),
@@ -97,8 +98,7 @@ class Joints:
 
     d: Array | None  # (3, M) m, world frame, joint k's gap or rod; None for balls only
     U: Array | None  # (3, c, M) force on body k per μ_k
-    near: Array  # (c, 3, M) U_nearᵀ X of body k's proximal point
-    far: Array  # (c, 3, M) U_farᵀ X of body k−1's distal point; 0 at the pivot
+    rows: Array  # (2, c, 3, M) U_nearᵀ X of body k's proximal, U_farᵀ X of body k−1's distal point (pivot: 0)
     U_near: Array | None  # (3, c, M) as U, with the notes' own lever off pᵀp = 1 (E2)
     U_far: Array | None
     factor: tuple[Array, ...]
@@ -152,6 +152,8 @@ class Forest:
         self.link = np.ones(self.size)  # 0 where a body hangs on the pivot
         self.link[self.start[:-1]] = 0
         self.rods = length > 0
+        self.hung_mass = self._hung(self.per_mass)  # (M,) 1/kg of the body it hangs on
+        self.pair_mass = self.per_mass + self.hung_mass
         self.width = 1 if np.all(self.rods) else 3  # c
         self.balls_only = not np.any(self.rods)
 
@@ -161,29 +163,16 @@ class Forest:
         tiled.__dict__.update(self.__dict__)
         tiled.chains, tiled.size = self.chains * count, self.size * count
         tiled.start = np.cumsum([0, *(chain.n for chain in tiled.chains)])
-        for name in (
-            "per_mass",
-            "J",
-            "K",
-            "s",
-            "B",
-            "free",
-            "moment",
-            "drag_moment",
-            "drag",
-            "length",
-            "link",
-        ):
-            array = getattr(self, name)
-            setattr(tiled, name, np.tile(array, count))
-        tiled.rods = np.tile(self.rods, count)
+        for name, value in vars(self).items():
+            if isinstance(value, np.ndarray) and name != "start":  # the last axis counts bodies
+                setattr(tiled, name, np.tile(value, count))
         return tiled
 
     # -- kinematics ---------------------------------------------------------------------------------
 
-    def _hung(self, x: Array) -> Array:
+    def _hung(self, x: Array, out: Array | None = None) -> Array:
         """(..., M): the value at the body that body k hangs on, 0 for the pivot."""
-        moved = np.empty_like(x)
+        moved = np.empty_like(x) if out is None else out
         moved[..., 0] = 0
         np.multiply(x[..., :-1], self.link[1:], out=moved[..., 1:])
         return moved
@@ -198,9 +187,10 @@ class Forest:
     def _points(self, q: Array) -> tuple[Array, Array, Array, Array]:
         """Return π (M,), R (3, 3, M), R s (2, 3, M) and A s (2, 3, M) = π R s + (π − 1) s."""
         p = q[3:]
-        norm = _dot(p, p)
+        squares = _ROTATION @ (p[:, None] * p).reshape(16, -1)
+        norm = squares[0]
         with np.errstate(all="ignore"):  # p = 0 and what is not finite is named where D is factored
-            R = ((_ROTATION @ (p[:, None] * p).reshape(16, -1)) / norm).reshape(3, 3, -1)
+            R = (squares[1:] / norm).reshape(3, 3, -1)
         Rs = _turn(R, self.s)
         return norm, R, Rs, norm * Rs + (norm - 1) * self.s
 
@@ -232,30 +222,31 @@ class Forest:
     def _joints(self, q: Array, norm: Array, R: Array, As: Array) -> tuple[Joints, Array]:
         """The joints' rows and D factored; also X (2, 3, 3, M). SingularSystem with the cause."""
         X = np.einsum("ijm,cjkm->cikm", R, self.B)
-        c, per_mass = self.width, self.per_mass
-        hung_mass = self._hung(per_mass)
+        c = self.width
         d = U = U_near = U_far = None
         if self.balls_only:
-            near, far = X[0], self._hung(X[1])
-            blocks = np.zeros((2, 3, 3, self.size))
-            blocks[0, [0, 1, 2], [0, 1, 2]] = per_mass + hung_mass
-            blocks[1, [0, 1, 2], [0, 1, 2]] = hung_mass
+            rows = X.copy()
+            self._hung(X[1], out=rows[1])
+            blocks: Array = np.zeros((2, 3, 3, self.size))
+            diagonals = blocks.reshape(2, 9, -1)[:, ::4]
+            diagonals[0], diagonals[1] = self.pair_mass, self.hung_mass
         else:
             d = q[:3] + As[0] - self._hung(q[:3] + As[1])
-            off = norm - 1
             self._check_rods(q, d)
+            off = norm - 1
             U = self._padded(2 * d)
             U_near = self._padded(2 * (d - off * self.s[0]))
             U_far = self._padded(2 * (d + self._hung(off * self.s[1])))
-            near = np.einsum("icm,ijm->cjm", U_near, X[0])
-            far = np.einsum("icm,ijm->cjm", U_far, self._hung(X[1]))
+            rows = np.empty((2, c, 3, self.size))
+            np.einsum("icm,ijm->cjm", U_near, X[0], out=rows[0])
+            np.einsum("icm,ijm->cjm", U_far, self._hung(X[1]), out=rows[1])
             blocks = np.empty((2, c, c, self.size))
-            blocks[0] = np.einsum("icm,iem->cem", U, U) * (per_mass + hung_mass)
-            blocks[1] = np.einsum("icm,iem->cem", U, self._hung(U)) * hung_mass
+            blocks[0] = np.einsum("icm,iem->cem", U, U) * self.pair_mass
+            blocks[1] = np.einsum("icm,iem->cem", U, self._hung(U)) * self.hung_mass
             if c == 3:
                 blocks[0, [1, 2], [1, 2]] += self.rods  # the empty rows
-        blocks[0] += np.einsum("cim,eim->cem", near, near) + np.einsum("cim,eim->cem", far, far)
-        blocks[1] += np.einsum("cim,eim->cem", far, self._hung(near))
+        blocks[0] += np.einsum("kcim,keim->cem", rows, rows)
+        blocks[1] += np.einsum("cim,eim->cem", rows[1], self._hung(rows[0]))
         if c == 1:
             beside = -blocks[1, 0, 0, 1:] if self.size > 1 else np.zeros(1)  # LAPACK's wrapper wants one
             diagonal, coupling, info = lapack.dpttrf(blocks[0, 0, 0], beside)
@@ -272,9 +263,9 @@ class Forest:
             cholesky, info = lapack.dpbtrf(band.reshape(-1, 6).T, lower=1, overwrite_ab=1)
             factor = (cholesky,)
             pivots, largest = cholesky[0] ** 2, diagonal
-        if info != 0 or not np.all(pivots > 8 * EPS * largest):
+        if info != 0 or not (pivots > 8 * EPS * largest).all():
             self._diagnose(q, d)
-        return Joints(d=d, U=U, near=near, far=far, U_near=U_near, U_far=U_far, factor=factor), X
+        return Joints(d=d, U=U, rows=rows, U_near=U_near, U_far=U_far, factor=factor), X
 
     def _padded(self, w: Array) -> Array:
         """U (3, c, M): w of rods, the identity of balls."""
@@ -293,7 +284,9 @@ class Forest:
 
     def _diagnose(self, q: Array, d: Array | None, certain: bool = True) -> None:
         """Raise SingularSystem that names the chain's body and the cause (E1, E7)."""
-        d = np.ones((3, self.size)) if d is None else d
+        d = (
+            np.ones((3, self.size)) if d is None else np.where(np.isfinite(d), d, 1.0)
+        )  # R is not, where p = 0
         for chain, at in zip(self.chains, self.start, strict=False):
             part = slice(at, at + chain.n)
             check(chain, q[:3, part].T, q[3:7, part].T, d[:, part].T, chain.rods, (q[:, part],))
@@ -310,7 +303,8 @@ class Forest:
             mu = lapack.dpbtrs(*joints.factor, -h.T.reshape(-1, 1), lower=1)[0].reshape(-1, 3).T
         f = self._force(joints, mu)
         linear = (f - self._next(f)) * self.per_mass
-        return mu, linear, _along(joints.near, mu) - self._next(_along(joints.far, mu))
+        near, far = np.einsum("kcjm,cm->kjm", joints.rows, mu)
+        return mu, linear, near - self._next(far)
 
     @staticmethod
     def _force(joints: Joints, mu: Array) -> Array:
@@ -454,11 +448,6 @@ class Forest:
         p = q[3:]
         turn = _LT @ (p[:, None] * (0.5 * _turn(self.K, turned))).reshape(12, -1) / norm
         return np.concatenate([linear, turn])
-
-
-def _along(rows: Array, mu: Array) -> Array:
-    """Rows (c, 3, M) transposed, times μ (c, M)."""
-    return np.asarray(np.einsum("cjm,cm->jm", rows, mu))
 
 
 def lay(a: Array, b: Array) -> Array:
