@@ -18,10 +18,14 @@ export async function showCost(root, index, fields) {
   const studies = all.filter((one) => one.quantity === choice.value);
   const unit = choice.value === "attitude" ? "rad" : "m";
   const methods = [...new Set(studies.map((one) => `${one.engine} ${one.integrator}`))];
-  const strokes = new Map(methods.map((name, k) => [name, strokeOf(k)]));
+  const strokes = new Map(methods.map((name) => {
+    const engine = name.slice(0, name.indexOf(" "));
+    const siblings = methods.filter((other) => other.startsWith(engine + " "));
+    return [name, strokeOf((index.engines.indexOf(engine) % 6) + 6 * siblings.indexOf(name))]; // colour says the engine, dashes the integrator
+  }));
   root.replaceChildren(
-    h("h2", { class: "cell-title", tabindex: -1 }, "Convergence and cost"),
-    h("p", { class: "purpose" }, "Error at the end of the run against the CPU time that it took: thin lines are scenarios, bold ones the geometric mean of the family at each refinement. Lower and further left is better."),
+    h("h1", { class: "cell-title", tabindex: -1 }, "Convergence and cost"),
+    h("p", { class: "purpose" }, "Error, up to the scenario's horizon, against the CPU time that it took: thin lines are scenarios, bold ones the geometric mean of the family at each refinement. Lower and further left is better."),
     h("p", {}, h("label", { class: "pick" }, "Quantity", choice)),
     h("ul", { class: "keys" }, methods.map((name) => h("li", {}, svg("svg", { class: "plot", viewBox: "0 0 26 8" }, svg("path", { class: `ln ${strokes.get(name)?.css}`, d: "M0 4H26" })), name))));
   if (!studies.length) {
@@ -52,7 +56,7 @@ export async function showCost(root, index, fields) {
     }
     plots.append(h("div", {}, plot.root));
   }
-  root.append(plots, h("h3", {}, `CPU time to reach an error, geometric mean over the scenarios that reach it`), costTable(studies, methods, unit), h("h3", {}, "Observed order"), orderTable(studies, methods));
+  root.append(plots, h("h2", { class: "sub" }, `CPU time to reach an error, geometric mean over the scenarios that reach it`), costTable(studies, methods, unit), h("h2", { class: "sub" }, "Observed order"), orderTable(studies, methods));
 }
 
 /** @param {number[]} values */

@@ -41,7 +41,7 @@ export function panels(root, series, horizon, onTime) {
     const range = decades([...curves.flat(), ...limits.flat()]);
     if (!range) continue;
     const readout = h("span");
-    const box = h("div", { class: "panel" }, h("h4", {}, `${title} [${unit}]`, readout));
+    const box = h("div", { class: "panel" }, h("h3", {}, `${title} [${unit}]`, readout));
     root.append(box);
     const highest = having.map(({ name }, k) => [name, curves[k].reduce((a, b) => (b > a ? b : a), 0)]);
     const resting = "max " + number(Math.max(...highest.map(([, v]) => Number(v)))) + " " + unit;

@@ -25,7 +25,7 @@ export async function showCell(root, index, fields, back) {
   const s = index.scenarios.indexOf(fields.scenario);
   const e = index.engines.indexOf(fields.engine);
   if (s < 0 || e < 0) {
-    root.replaceChildren(h("h2", { class: "cell-title", tabindex: -1 }, "No such cell"), h("p", {}, `This run has no scenario “${fields.scenario}” with engine “${fields.engine}”. `, h("a", { href: back }, "To the matrix")));
+    root.replaceChildren(h("h1", { class: "cell-title", tabindex: -1 }, "No such cell"), h("p", {}, `This run has no scenario “${fields.scenario}” with engine “${fields.engine}”. `, h("a", { href: back }, "To the matrix")));
     return;
   }
   const [data, studies] = /** @type {[ScenarioChunk, Study[]]} */ (await Promise.all([chunk(`scenario-${s}`), chunk("convergence")]));
@@ -41,14 +41,14 @@ export async function showCell(root, index, fields, back) {
       h("a", { href: back }, "← Matrix"), h("span", {}, scenario.family), h("span", { class: "sep" }),
       h("a", { href: href({ scenario: neighbour(-1), engine: fields.engine }), rel: "prev" }, `‹ ${neighbour(-1)}`),
       h("a", { href: href({ scenario: neighbour(1), engine: fields.engine }), rel: "next" }, `${neighbour(1)} ›`)),
-    h("h2", { class: "cell-title", tabindex: -1 }, fields.scenario, h("span", { class: "on" }, ` on ${title}`)),
+    h("h1", { class: "cell-title", tabindex: -1 }, fields.scenario, h("span", { class: "on" }, ` on ${title}`)),
     h("p", { class: "purpose" }, `${scenario.title}. ${scenario.purpose}`),
     h("dl", { class: "facts" },
       fact("Bodies", scenario.bodies), fact("Joints", joints), fact("Duration", `${number(scenario.duration, 3)} s`),
       fact("Horizon", scenario.horizon === null ? "–" : `${number(scenario.horizon, 3)} s`),
       fact("Truth", scenario.truth ?? "–"), fact("Exact solution", typeof scenario.exact === "string" ? scenario.exact : scenario.exact ? "yes" : "none"),
       fact("Uncertainty of truth", scenario.truth_uncertainty === null ? "–" : `${number(scenario.truth_uncertainty)} m`),
-      fact("Engine", `${title} ${version ?? ""}`), fact("File", scenario.file), fact("Digest", scenario.digest)),
+      fact("Engine", `${title} ${version ?? ""}`), fact("File", scenario.file), fact("Digest", scenario.digest.slice(0, 12))),
     h("ul", { class: "enginetabs" }, index.engines.map((name, k) => {
       const theirs = speaker(index, s, k);
       return h("li", {}, h("a", { href: href({ scenario: fields.scenario, engine: name }), "aria-current": k === e ? "page" : null },
@@ -62,8 +62,8 @@ export async function showCell(root, index, fields, back) {
     told.add(row.diagnosis);
     root.append(h("p", { class: `callout ${index.slugs[index.rows.verdict[i]]}` }, row.diagnosis, h("small", {}, `Diagnosis of ${index.levels[index.rows.level[i]]}, ${index.quantitys[index.rows.quantity[i]]}`)));
   }
-  root.append(h("h3", {}, "What was compared"), compared(index, data, ours, fields));
-  moving(root, data, fields);
+  root.append(h("h2", { class: "sub" }, "What was compared"), compared(index, data, ours, fields));
+  moving(root, index, data, fields);
   const plots = h("div", { class: "plots" });
   const study = studies.filter((one) => one.scenario === fields.scenario && one.engine === fields.engine);
   for (const kind of /** @type {const} */ (["step", "tolerance"])) {
@@ -72,8 +72,8 @@ export async function showCell(root, index, fields, back) {
   }
   const spread = stateSpread(data.states.filter((one) => one.engine === fields.engine));
   if (spread) plots.append(spread);
-  if (plots.childElementCount) root.append(h("h3", {}, "Convergence and states"), plots);
-  root.append(h("h3", {}, "Repeat this cell"));
+  if (plots.childElementCount) root.append(h("h2", { class: "sub" }, "Convergence and states"), plots);
+  root.append(h("h2", { class: "sub" }, "Repeat this cell"));
   for (const level of new Set(ours.map((i) => index.levels[index.rows.level[i]]))) {
     const line = data.commands[`${fields.engine}/${level}`];
     if (line && ![...root.querySelectorAll("pre")].some((pre) => pre.textContent === line)) root.append(copyable(line, `command for ${level}`));
@@ -101,48 +101,83 @@ function speaker(index, s, e) {
   return found < 0 ? null : found;
 }
 
-/** @param {Index} index @param {ScenarioChunk} data @param {number[]} ours @param {Record<string, string>} fields */
+const LEVELS = ["state", "trajectory", "invariants", "relations"];
+
+/** The name of a row within its cell. @param {Index} index @param {number} i */
+const placeOf = ({ rows, levels, integrators, quantitys }, i) => [levels[rows.level[i]], integrators[rows.integrator[i]], quantitys[rows.quantity[i]]].join("/");
+
+/**
+ * Every row of the cell: quantities down, integrators across, one table per set of integrators; and
+ * below them the one that is chosen, with its tolerance's derivation.
+ * @param {Index} index @param {ScenarioChunk} data @param {number[]} ours @param {Record<string, string>} fields
+ */
 function compared(index, data, ours, fields) {
-  const body = h("tbody");
   const { rows } = index;
-  let level = -1;
-  const order = ["state", "trajectory", "invariants", "relations"];
-  const sorted = [...ours].sort((a, b) => order.indexOf(index.levels[rows.level[a]]) - order.indexOf(index.levels[rows.level[b]]) || rows.integrator[a] - rows.integrator[b] || a - b);
-  for (const i of sorted) {
-    const row = data.rows[i] ?? {};
-    if (rows.level[i] !== level) {
-      level = rows.level[i];
-      body.append(h("tr", { class: "lvl" }, h("td", { colspan: 9 }, index.levels[level])));
+  const told = h("div", { class: "told", "aria-live": "polite" });
+  const tables = h("div", { class: "tables" });
+  /** @type {Map<number, HTMLButtonElement>} */
+  const buttons = new Map();
+  /** @param {number} i @param {boolean} tell */
+  const choose = (i, tell) => {
+    for (const [k, button] of buttons) button.setAttribute("aria-pressed", String(k === i));
+    told.replaceChildren(chosenRow(index, data.rows[i] ?? {}, i));
+    if (tell) amend({ row: placeOf(index, i) });
+  };
+  const byState = ours.filter((i) => index.integrators[rows.integrator[i]] === "-");
+  const moving = ours.filter((i) => index.integrators[rows.integrator[i]] !== "-");
+  for (const part of [byState, moving]) {
+    if (!part.length) continue;
+    const integrators = [...new Set(part.map((i) => rows.integrator[i]))];
+    const body = h("tbody");
+    const lines = [...new Set(part.map((i) => `${LEVELS.indexOf(index.levels[rows.level[i]])}/${rows.quantity[i]}`))].sort((a, b) => parseInt(a) - parseInt(b));
+    let level = "";
+    for (const line of lines) {
+      const these = part.filter((i) => `${LEVELS.indexOf(index.levels[rows.level[i]])}/${rows.quantity[i]}` === line);
+      const name = index.levels[rows.level[these[0]]];
+      if (name !== level) body.append(h("tr", { class: "lvl" }, h("th", { scope: "rowgroup", colspan: integrators.length + 1 }, (level = name))));
+      const unit = these.map((i) => data.rows[i]?.unit).find(Boolean);
+      body.append(h("tr", {}, h("th", { scope: "row" }, index.quantitys[rows.quantity[these[0]]].replaceAll("_", " "), h("span", { class: "why" }, unitOf(unit) && ` [${unit}]`)),
+        integrators.map((integrator) => {
+          const i = these.find((k) => rows.integrator[k] === integrator);
+          if (i === undefined) return h("td", {}, "");
+          const row = data.rows[i] ?? {};
+          const slug = index.slugs[rows.verdict[i]];
+          const ratio = fromCode(rows.ratio[i]);
+          const button = h("button", { type: "button", class: "row", "aria-pressed": "false", title: index.reasons[i], click: () => choose(i, true) },
+            h("span", { class: `g ${slug}`, "aria-hidden": "true" }, index.glyphs[rows.verdict[i]]), h("span", { class: "vh" }, index.verdicts[rows.verdict[i]] + ", "),
+            h("span", { class: "q" }, row.value === undefined || row.value === null ? index.verdicts[rows.verdict[i]] : number(row.value)),
+            row.known ? h("sup", {}, "†") : null,
+            row.tolerance === undefined || row.tolerance === null ? null : h("span", { class: "why" }, `of ${number(row.tolerance)}`),
+            Number.isNaN(ratio) ? null : track(ratio));
+          buttons.set(i, button);
+          return h("td", { class: slug }, button);
+        })));
     }
-    const slug = index.slugs[rows.verdict[i]];
-    const place = [index.levels[level], index.integrators[rows.integrator[i]], index.quantitys[rows.quantity[i]]].join("/");
-    const ratio = fromCode(rows.ratio[i]);
-    const more = h("tr", { class: "more", hidden: true }, h("td", { colspan: 9 }, derivation(row)));
-    const button = h("button", { type: "button", class: "row", "aria-expanded": "false", click: () => toggle(Boolean(more.hidden), true) }, index.quantitys[rows.quantity[i]].replaceAll("_", " "));
-    const line = h("tr", { class: slug },
-      h("td", {}, h("span", { class: `g ${slug}`, "aria-hidden": "true" }, index.glyphs[rows.verdict[i]]), h("span", {}, index.verdicts[rows.verdict[i]] + (row.known ? " †" : ""))),
-      h("td", {}, button), h("td", {}, index.integrators[rows.integrator[i]], row.alias_of ? h("span", { class: "why" }, ` = ${row.alias_of}`) : null),
-      h("td", { class: "r" }, `${number(row.value)} ${row.value === undefined ? "" : (row.unit ?? "")}`), h("td", { class: "r" }, number(row.tolerance)),
-      h("td", { class: "r" }, Number.isNaN(ratio) ? "–" : number(ratio)), h("td", { class: "mini" }, Number.isNaN(ratio) ? null : track(ratio)),
-      h("td", { class: "r" }, row.order === undefined ? "–" : number(row.order, 3) + (row.declared_order ? ` / ${row.declared_order}` : "")),
-      h("td", { class: "why" }, index.reasons[i]));
-    /** @param {boolean} open @param {boolean} tell */
-    function toggle(open, tell) {
-      more.hidden = !open;
-      line.classList.toggle("open", open);
-      button.setAttribute("aria-expanded", String(open));
-      if (tell) amend({ row: open ? place : "" });
-    }
-    body.append(line, more);
-    if (fields.row === place) {
-      toggle(true, false);
-      queueMicrotask(() => button.focus({ preventScroll: true }));
-    }
+    tables.append(h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": part === byState ? "Without an integrator" : "By integrator" },
+      h("table", { class: "plain compared" },
+        h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Quantity"), integrators.map((k) => {
+          const alias = part.map((i) => (rows.integrator[i] === k ? data.rows[i]?.alias_of : undefined)).find(Boolean);
+          return h("th", { scope: "col" }, index.integrators[k] === "-" ? "error, of its bound" : index.integrators[k], alias ? h("span", { class: "why" }, ` = ${alias}`) : null);
+        }))), body)));
   }
-  return h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "What was compared" }, h("table", { class: "plain compared" },
-    h("thead", {}, h("tr", {}, ["Verdict", "Quantity", "Integrator"].map((t) => h("th", { scope: "col" }, t)),
-      ["Error", "Tolerance", "Ratio"].map((t) => h("th", { scope: "col", class: "r" }, t)), h("th", { scope: "col" }, h("span", { class: "vh" }, "Ratio on a log scale")),
-      h("th", { scope: "col", class: "r", title: "observed / declared" }, "Order"), h("th", { scope: "col" }, "Reason"))), body));
+  const worst = ours.reduce((a, b) => (rows.severity[b] > rows.severity[a] || (rows.severity[b] === rows.severity[a] && rows.ratio[b] > rows.ratio[a]) ? b : a), ours[0]);
+  const asked = ours.find((i) => placeOf(index, i) === fields.row);
+  if (ours.length) choose(asked ?? worst, false);
+  if (asked !== undefined) queueMicrotask(() => buttons.get(asked)?.focus({ preventScroll: true }));
+  return h("div", {}, tables, told);
+}
+
+/** "" for a pure number. @param {string | undefined} unit */
+const unitOf = (unit) => (unit && unit !== "1" && unit !== "–" ? unit : "");
+
+/** @param {Index} index @param {import("./payload").RowDetail} row @param {number} i */
+function chosenRow(index, row, i) {
+  const { rows } = index;
+  const slug = index.slugs[rows.verdict[i]];
+  const integrator = index.integrators[rows.integrator[i]];
+  return h("section", { class: `chosen ${slug}`, "aria-label": "Chosen comparison" },
+    h("h3", {}, h("span", { class: `g ${slug}`, "aria-hidden": "true" }, index.glyphs[rows.verdict[i]]), ` ${index.quantitys[rows.quantity[i]].replaceAll("_", " ")}${integrator === "-" ? "" : `, ${integrator}`} `, h("span", { class: "what" }, index.verdicts[rows.verdict[i]])),
+    h("p", { class: "reason" }, index.reasons[i]), derivation(row));
 }
 
 /** @param {import("./payload").RowDetail} row */
@@ -151,32 +186,32 @@ function derivation(row) {
   /** @param {string} name @param {string | number | null | undefined} value */
   const say = (name, value) => value !== null && value !== undefined && value !== "" && list.append(h("dt", {}, name), h("dd", {}, value));
   say("Diagnosis", row.diagnosis);
-  say("Tolerance", row.tolerance === undefined ? null : `${number(row.tolerance, 4)} ${row.unit ?? ""}${row.derivation ? ": " + row.derivation : ""}`);
-  say("Measured", row.value === undefined ? null : `${number(row.value, 4)} ${row.unit ?? ""}`);
-  say("Uncertainty", row.uncertainty === undefined ? null : `${number(row.uncertainty, 3)} ${row.unit ?? ""}, of the truth and of the limit together`);
+  say("Tolerance", row.tolerance === undefined ? null : `${number(row.tolerance, 4)} ${unitOf(row.unit)}${row.derivation ? ": " + row.derivation : ""}`);
+  say("Measured", row.value === undefined ? null : `${number(row.value, 4)} ${unitOf(row.unit)}`);
+  say("Uncertainty", row.uncertainty === undefined ? null : `${number(row.uncertainty, 3)} ${unitOf(row.unit)}, of the truth and of the limit together`);
   say("Horizon", row.horizon === undefined ? null : `${number(row.horizon, 3)} s, up to which positions were compared`);
   say("Order", row.order === undefined ? null : `observed ${number(row.order, 4)}${row.declared_order ? `, declared ${row.declared_order}` : ""}`);
   say("Alias", row.alias_of ? `equals ${row.alias_of} here, so it is not independent evidence` : null);
   say("Recorded as", row.known);
-  say("Asked for", row.accept === undefined ? null : `${number(row.accept)} ${row.unit ?? ""}: the error is ${(row.value ?? Infinity) <= row.accept ? "within" : "above"} the tolerance given on the command line; the verdict does not depend on it`);
+  say("Asked for", row.accept === undefined ? null : `${number(row.accept)} ${unitOf(row.unit)}: the error is ${(row.value ?? Infinity) <= row.accept ? "within" : "above"} the tolerance given on the command line; the verdict does not depend on it`);
   for (const [name, value] of Object.entries(row.extra ?? {})) say(name.replaceAll("_", " "), number(value, 4));
   say("Work", row.wall_time === undefined ? null : `${number(row.wall_time)} s`);
   return list;
 }
 
-/** @param {HTMLElement} root @param {ScenarioChunk} data @param {Record<string, string>} fields */
-function moving(root, data, fields) {
+/** @param {HTMLElement} root @param {Index} index @param {ScenarioChunk} data @param {Record<string, string>} fields */
+function moving(root, index, data, fields) {
   const curves = data.curves ?? [];
   if (!curves.length && !data.motion) return;
   const end = Math.max(...curves.map((set) => set.t[set.t.length - 1]), data.motion ? data.motion.t[data.motion.t.length - 1] : 0);
   const crossings = curves.filter((set) => set.engine === fields.engine && set.crossing !== null);
   const first = crossings.length ? crossings.reduce((a, b) => (/** @type {number} */ (b.crossing) < /** @type {number} */ (a.crossing) ? b : a)) : null;
   const room = h("section", { class: "moving", "aria-label": "Motion and curves" });
-  root.append(h("h3", {}, "Motion and curves"), room);
+  root.append(h("h2", { class: "sub" }, "Motion and curves"), room);
   /** @type {ReturnType<typeof panels> | null} */
   let drawn = null;
   const stage = motion(data, {
-    engine: fields.engine, end, start: Number(fields.t) || 0, magnify: fields.mag === undefined ? null : Number(fields.mag),
+    engine: fields.engine, engines: index.engines, end, start: Number(fields.t) || 0, magnify: fields.mag === undefined ? null : Number(fields.mag),
     crossing: first ? { t: /** @type {number} */ (first.crossing), name: first.integrator } : null,
     onTime: (t) => drawn?.setTime(t),
     onRest: (state) => amend(state),
@@ -193,7 +228,7 @@ function moving(root, data, fields) {
     drawn?.destroy();
     area.replaceChildren();
     const sets = choice.value === "all" ? best(curves) : curves.filter((set) => set.engine === fields.engine);
-    const series = sets.map((set, k) => ({ set, name: choice.value === "all" ? `${set.engine} ${set.integrator}` : set.integrator, stroke: strokeOf(k) }));
+    const series = sets.map((set, k) => ({ set, name: choice.value === "all" ? `${set.engine} ${set.integrator}` : set.integrator, stroke: strokeOf(choice.value === "all" ? index.engines.indexOf(set.engine) : k) }));
     if (!series.length) area.append(h("p", { class: "note" }, "No trajectory of this engine was stored; the rows above say why."));
     legend.replaceChildren(keys(series, sets.some((set) => set.tolerance)));
     drawn = panels(area, series, data.scenario.horizon, (t) => stage.setTime(t));
@@ -302,5 +337,6 @@ function stateSpread(spreads) {
       plot.root.append(svg("circle", { class: v <= 1 ? "pt s0" : "bad", cx: plot.x(at).toFixed(1), cy: (y - 8 + ((state * 7) % 17)).toFixed(1), r: 1.8 }, svg("title", {}, `state ${state}: ${number(v, 3)}`)));
     });
   });
-  return h("div", {}, plot.root, h("p", { class: "why" }, spreads.map((one) => `${one.quantity.replaceAll("_", " ")}: worst at state ${one.worst[0]}, body ${one.worst[1]} (${number(one.error)}; bound in the median ${number(one.bound)})`).join(" · ")));
+  const top = spreads.reduce((a, b) => (Math.max(...b.ratio) > Math.max(...a.ratio) ? b : a));
+  return h("div", {}, plot.root, h("p", { class: "why" }, `Nearest to its bound: ${top.quantity.replaceAll("_", " ")} at state ${top.worst[0]}, body ${top.worst[1]} (error ${number(top.error)}; the bound is ${number(top.bound)} in the median)`));
 }

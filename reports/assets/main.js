@@ -42,7 +42,7 @@ async function follow() {
   const now = document.documentElement.dataset.shown;
   if (now !== before || now === "cell") {
     scrollTo(0, 0);
-    if (!read().row) /** @type {HTMLElement | null} */ (document.querySelector(`#${now}-view h2[tabindex]`))?.focus({ preventScroll: true });
+    if (!read().row) /** @type {HTMLElement | null} */ (document.querySelector(`#${now}-view h1[tabindex]`))?.focus({ preventScroll: true });
   }
 }
 

@@ -87,7 +87,7 @@ function displaced(poses, difference, magnify) {
 /**
  * The stage with its transport.
  * @param {import("./payload").ScenarioChunk} data
- * @param {{ engine: string, end: number, start: number, magnify: number | null, crossing: { t: number, name: string } | null,
+ * @param {{ engine: string, engines: string[], end: number, start: number, magnify: number | null, crossing: { t: number, name: string } | null,
  *   onTime: (t: number) => void, onRest: (state: Record<string, any>) => void }} o
  */
 export function motion(data, o) {
@@ -115,9 +115,9 @@ export function motion(data, o) {
   const root = h("div", { class: "motion" }, m ? stage : null);
 
   if (m) {
-    const engines = [...new Set(m.runs.map((run) => run.engine))];
-    engines.forEach((engine, k) => {
+    o.engines.forEach((engine, k) => {
       const runs = m.runs.filter((run) => run.engine === engine);
+      if (!runs.length) return;
       const run = runs.reduce((a, b) => (final(b) < final(a) ? b : a));
       const note = h("span", { class: "off" });
       const canvas = h("canvas", { tabindex: 0, role: "img" });

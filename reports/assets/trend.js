@@ -12,7 +12,7 @@ const SHOWN = 48;
 /** @param {HTMLElement} root @param {Index} index @param {Record<string, string>} fields */
 export async function showTrend(root, index, fields) {
   const past = /** @type {HistoryChunk | null} */ (await chunk("history"));
-  root.replaceChildren(h("h2", { class: "cell-title", tabindex: -1 }, "Trends"));
+  root.replaceChildren(h("h1", { class: "cell-title", tabindex: -1 }, "Trends"));
   if (!past) {
     root.append(h("p", { class: "note" }, "This report was made without a history; give one with --history."));
     return;
@@ -33,8 +33,8 @@ export async function showTrend(root, index, fields) {
   root.append(
     h("p", { class: "purpose" }, `Error over tolerance on ${count} nights, ${nights[0].started.slice(0, 10)} to ${nights[count - 1].started.slice(0, 10)}; the dashed line is the tolerance, an upright one a change of that engine's version. Those that moved most come first.`),
     past.damaged.length ? h("p", { class: "note" }, `Skipped as damaged: ${past.damaged.join(", ")}`) : "",
-    h("h3", {}, "Nights"), nightTable(past, index),
-    h("h3", {}, `${rows.length} keys`, narrowed ? ` (${narrowed})` : ""),
+    h("h2", { class: "sub" }, "Nights"), nightTable(past, index),
+    h("h2", { class: "sub" }, `${rows.length} keys`, narrowed ? ` (${narrowed})` : ""),
     h("p", { class: "keys" }, index.engines.map((name) => h("a", { href: href({ view: "trend", engine: name }), "aria-current": fields.engine === name ? "true" : null }, name)), h("a", { href: "#view=trend" }, "all engines")),
     h("div", { class: "trends" }, rows.slice(0, SHOWN).map((i) => trend(past, index, i))));
   if (rows.length > SHOWN) root.append(h("p", { class: "why" }, `… and ${rows.length - SHOWN} that moved less; narrow them by engine, or by any filter of the matrix in the address.`));
