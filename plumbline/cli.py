@@ -18,6 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from plumbline import scenario as scenarios
+from plumbline.cells import Cells
 from plumbline.exact import NotThatMotion, solution
 from plumbline.problems import Problem, ScenarioError
 from plumbline.registry import ENGINES
@@ -167,6 +168,7 @@ def run(
     chosen_engines = choose_engines(engines)
     folder = writable(out)
     whole = not names and not families and not engines and level == "all"
+    cells = Cells(folder / "cells", lambda sentence: click.echo(sentence, err=True))
     plan = Plan(
         chosen,
         chosen_engines,
@@ -175,10 +177,12 @@ def run(
         Limits(timeout, memory),
         accept=accept,
         whole=whole,
+        memory=cells,
     )
     with progress_to(sys.stderr) as progress:
         result = execute(plan, progress)
     save(result, folder, shlex.join(["python", "-m", "plumbline", *sys.argv[1:]]))
+    cells.clear()
     from reports import junit, page, step_summary
 
     report = page.write(folder)

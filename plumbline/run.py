@@ -25,7 +25,7 @@ from plumbline.registry import ENGINES, adapter
 from plumbline.sampling import random_states, seed_of
 from plumbline.scenario import Scenario
 from plumbline.state_verdicts import judge_states
-from plumbline.workers import Limits, Outcome, Task, Workers
+from plumbline.workers import Limits, Memory, Outcome, Task, Workers
 from plumbline.yardstick import ROUNDING, MotionTruth, StateTruth
 
 STATES = 50  # random states per scenario, besides the initial one
@@ -48,6 +48,7 @@ class Plan:
     finer: int = 0  # how many times the finest step halves beyond the quick form
     accept: float | None = None  # relative to each quantity's scale; shown beside the verdict only
     whole: bool = False  # the full catalogue on all engines: every known entry must occur
+    memory: Memory = field(default_factory=Memory)  # of cells that need not run again
 
 
 @dataclass(frozen=True)
@@ -99,12 +100,12 @@ def execute(plan: Plan, progress: Progress) -> Result:
         order = sorted(plan.scenarios, key=lambda s: -s.model.n)
         benches = {s.name: Bench(plan, s, engines) for s in order}
         tasks = [task for bench in benches.values() for task in bench.tasks()]
-        for done, outcome in enumerate(workers.run(tasks), start=1):
+        for done, outcome in enumerate(workers.run(tasks, plan.memory), start=1):
             benches[outcome.key[0]].take(outcome)
             progress(done, len(tasks), " ".join(outcome.key))
     found = Findings()
     for scenario in plan.scenarios:
-        found.extend(benches[scenario.name].findings)
+        found.extend(benches[scenario.name].findings())
     judged = known.excuse(found.rows, known.load(), whole=plan.whole)
     summaries = {s.name: benches[s.name].summary() for s in plan.scenarios}
     result = Result(judged.rows, judged.stale, engines, summaries, found.tables(), {})
@@ -141,7 +142,7 @@ class Bench:
 
     def __init__(self, plan: Plan, scenario: Scenario, engines: dict[str, EngineInfo]) -> None:
         self.plan, self.scenario, self.engines = plan, scenario, engines
-        self.findings = Findings()
+        self.judged: dict[Any, Findings] = {}  # by cell, in the order of the tasks
         self.truths: dict[str, StateTruth | MotionTruth | Lost] = {}
         self.early: list[Outcome] = []  # engines' answers that came before the truth
         self.states = [
@@ -161,17 +162,29 @@ class Bench:
             yield Task((s.name, "truth", "trajectory"), yardstick.motion_truth, arguments, limits)
         for name, info in self.engines.items():
             if info.missing is not None:
-                self.findings.rows.append(
-                    self.who(name).row("state", "-", "all", "not installed", info.missing)
-                )
+                row = self.who(name).row("state", "-", "all", "not installed", info.missing)
+                self.judged[s.name, name] = Findings([row])
                 continue
             if self.plan.level in ("state", "all"):
-                yield Task((s.name, name, "state"), work.evaluate, (name, s.model, self.states), limits)
+                yield self.cell((s.name, name, "state"), work.evaluate, s.model, self.states)
             if self.plan.level in ("trajectory", "all"):
                 for integrator in info.integrators:
                     steps = ladder(integrator, s.model.n, s.duration, self.plan.finer)
-                    climb = (name, integrator.name, s.model, s.state, s.times, steps)
-                    yield Task((s.name, name, "trajectory", integrator.name), work.climb, climb, limits)
+                    key = (s.name, name, "trajectory", integrator.name)
+                    yield self.cell(key, work.climb, integrator.name, s.model, s.state, s.times, steps)
+
+    def cell(self, key: tuple[str, ...], call: Callable[..., Any], *arguments: Any) -> Task:
+        """The task of one cell; its place among the findings is that of its making."""
+        self.judged[key] = Findings()
+        engine = key[1]
+        return Task(key, call, (engine, *arguments), self.plan.limits, self.engines[engine].version)
+
+    def findings(self) -> Findings:
+        """All that was found, in the order of the tasks, whichever answered first."""
+        found = Findings()
+        for part in self.judged.values():
+            found.extend(part)
+        return found
 
     def who(self, engine: str) -> Subject:
         """The subject of this scenario's rows about an engine."""
@@ -190,7 +203,7 @@ class Bench:
         waiting, self.early = self.early, []
         for answer in waiting:
             if answer.key[2] in self.truths:
-                self.findings.extend(self.judge(answer))
+                self.judged[answer.key] = self.judge(answer)
             else:
                 self.early.append(answer)
 

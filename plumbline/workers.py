@@ -44,6 +44,7 @@ class Task:
     call: Callable[..., Any]
     arguments: tuple[Any, ...] = ()
     limits: Limits = field(default_factory=Limits)
+    version: str = ""  # of the engine that answers; a part of the answer's content key
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,17 @@ class Outcome:
     key: Any
     value: Any = None
     lost: str | None = None
+
+
+class Memory:
+    """What is known of tasks from before; this one knows nothing."""
+
+    def get(self, task: Task) -> Outcome | None:
+        """The outcome of a task that need not run again."""
+        return None
+
+    def put(self, task: Task, outcome: Outcome) -> None:
+        """Take note of a task's outcome."""
 
 
 class Workers:
@@ -82,8 +94,12 @@ class Workers:
         self._pool.join()
         self._scratch.cleanup()
 
-    def run(self, tasks: Iterable[Task]) -> Iterator[Outcome]:
-        """Outcomes in the order of completion; only a few tasks are handed over at a time."""
+    def run(self, tasks: Iterable[Task], memory: Memory | None = None) -> Iterator[Outcome]:
+        """Outcomes in the order of completion; only a few tasks are handed over at a time.
+
+        What ``memory`` has is not run again; it is told of every other outcome before the caller.
+        """
+        memory = memory or Memory()
         waiting: dict[Future[Any], Task] = {}
         source = iter(tasks)
         exhausted = False
@@ -93,6 +109,10 @@ class Workers:
                 if task is None:
                     exhausted = True
                     break
+                before = memory.get(task)
+                if before is not None:
+                    yield before
+                    continue
                 future: Future[Any] = self._pool.schedule(
                     task.call, args=task.arguments, timeout=task.limits.seconds
                 )
@@ -101,7 +121,10 @@ class Workers:
                 return
             done, _ = wait(waiting, return_when=FIRST_COMPLETED)
             for future in done:
-                yield outcome(waiting.pop(future), future)
+                task = waiting.pop(future)
+                found = outcome(task, future)
+                memory.put(task, found)
+                yield found
 
 
 def outcome(task: Task, future: Future[Any]) -> Outcome:

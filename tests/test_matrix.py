@@ -59,7 +59,7 @@ def test_cell(name, engine, level, workers, engines, truths):
     for outcome in workers.run(bench.tasks()):
         bench.take(outcome)
     truths[name, level] = dict(bench.truths)
-    rows = bench.findings.rows
+    rows = bench.findings().rows
     assert rows, "no answer at all"
     judged = known.excuse(rows, known.load(), whole=False)
     wrong = [f"{r.key} {r.verdict}: {r.reason}" for r in judged.rows if r.verdict != "agrees" and r.known is None]
