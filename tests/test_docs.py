@@ -1,8 +1,9 @@
 """The worked pages do what they say: their code blocks are run, in order, in a copy of the checkout.
 
-A fenced block's info string says what becomes of it: ``file=PATH`` writes it there, ``bash run``
-runs it (it must succeed), ``text output`` is what the run before it printed, where ``…`` stands
-for anything.  Other blocks are only shown.
+A fenced block's info string says what becomes of it: ``file=PATH`` writes it there,
+``into=PATH:NAME`` puts it below the line of that file that starts with NAME (a table that is added
+to), ``bash run`` runs it (it must succeed), ``text output`` is what the run before it printed, where
+``…`` stands for anything.  Other blocks are only shown.
 """
 
 from __future__ import annotations
@@ -39,6 +40,16 @@ def play(page: str, folder: Path) -> int:
             path = folder / target[1]
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_text(body, encoding="utf-8")
+        elif place := re.search(r"\binto=([^\s:]+):(\w+)", info):
+            path = folder / place[1]
+            text, count = re.subn(
+                rf"^{place[2]}\b.*\n",
+                lambda line, new=body: line[0] + new,
+                path.read_text("utf-8"),
+                flags=re.M,
+            )
+            assert count == 1, f"{place[2]} starts {count} lines of {place[1]}"
+            path.write_text(text, encoding="utf-8")
         elif info == "bash run":
             ran = subprocess.run(
                 ["bash", "-e", "-c", body],
@@ -75,6 +86,9 @@ def test_a_worked_page_does_what_it_says(name, tmp_path):
 def test_the_player_sees_a_page_that_lies(tmp_path):
     right = "```text file=a/b.txt\nhello\n```\n```bash run\ncat a/b.txt\n```\n```text output\nhe…\n```\n"
     assert play(right, tmp_path) == 3
+    (tmp_path / "table.py").write_text("OTHER = {\n}\nTABLE = {\n}\n")
+    assert play("```python into=table.py:TABLE\n    1: 2,\n```\n", tmp_path) == 1
+    assert (tmp_path / "table.py").read_text() == "OTHER = {\n}\nTABLE = {\n    1: 2,\n}\n"
     for old, new in (("he…", "hi…"), ("cat a/b.txt", "cat a/c.txt"), ("text output", "text output now")):
         with pytest.raises(AssertionError):
             play(right.replace(old, new), tmp_path)
