@@ -47,14 +47,9 @@ _PRODUCT = _bilinear(  # quaternion product a b, by components
         "+03 +12 -21 +30",
     ]
 )
-_RATES = _bilinear(  # (pᵀṗ, L(p) ṗ)
-    [
-        "+00 +11 +22 +33",
-        "+01 -10 -23 +32",
-        "+02 +13 -20 -31",
-        "+03 -12 +21 -30",
-    ]
-)
+_FIRST, _SECOND = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]  # the six products ωᵢ ωⱼ
+_OMEGA = 2 * _bilinear(["+01 -10 -23 +32", "+02 +13 -20 -31", "+03 -12 +21 -30"])  # 2 L(p) ṗ
+_RATES = np.concatenate([_bilinear(["+00 +11 +22 +33"]), _OMEGA[_FIRST], _OMEGA[_SECOND]])  # pᵀṗ and these
 _ROTATION = _bilinear(  # π, then π R row by row
     [
         "+00 +11 +22 +33",
@@ -63,7 +58,15 @@ _ROTATION = _bilinear(  # π, then π R row by row
         *("+13 +31 -02 -20", "+23 +32 +01 +10", "+00 -11 -22 +33"),
     ]
 )
-_LT = _PRODUCT.reshape(4, 4, 4)[:, :, 1:].reshape(4, 12)  # L(p)ᵀ α, from the outer product of p and α
+_HALF_LT = 0.5 * _PRODUCT.reshape(4, 4, 4)[:, :, 1:].reshape(
+    4, 12
+)  # ½ L(p)ᵀ α, from the outer product of p and α
+# The lower band of D: column 3k+j holds rows j, j+1 … of its own block and then the next block's, 6 in all.
+_BAND = [
+    *(0, 3, 6, 9, 12, 15),  # cells 3 i + j of the own block, 9 + 3 i + j of the next
+    *(4, 7, 10, 13, 16, 18),  # 18: zeros
+    *(8, 11, 14, 17, 18, 18),
+]
 _CROSS = np.zeros((9, 3))  # ω → ω̃, row by row
 _CROSS[[7, 2, 3], [0, 1, 2]], _CROSS[[5, 6, 1], [0, 1, 2]] = 1.0, -1.0
 
@@ -143,17 +146,28 @@ class Forest:
         self.per_mass = 1 / mass  # (M,) 1/kg
         self.J, self.K = last(inertia), last(K)  # (3, 3, M)
         self.s = last(points)  # (2, 3, M) m, proximal and distal point, body frame
-        self.B = last(-skew(points) @ K[:, None])  # (2, 3, 3, M): −s̃ K
         self.free = last(weight / mass[:, None])  # (3, M) m/s²
-        self.moment, self.drag_moment = last(moment), drag_moment
         self.drag = drag_force / mass  # (M,) 1/s
         self.dragged = bool(np.any(drag_force) or np.any(drag_moment))
+        # β = K⁻¹ J⁻¹ (n′ − ω×Jω/π) and, in the body frame, the points about the centre, B β + ω×(ω×s)/π:
+        # (9, M) constant, and (9, 6, M) of the ωᵢ ωⱼ/π; with drag (9, 9, M), the last three of ω.
+        cross, one = _CROSS.reshape(3, 3, 3), np.eye(3)
+        gyro = -np.einsum("mki,kja,mjd->miad", K, cross, inertia)
+        pull = np.einsum("ia,mcd->mciad", one, points) - np.einsum("ad,mci->mciad", one, points)
+        B = -skew(points) @ K[:, None]  # (M, 2, 3, 3)
+        self.B = last(B)
+        spin = np.concatenate([gyro, (np.einsum("mcik,mkad->mciad", B, gyro) + pull).reshape(-1, 6, 3, 3)], 1)
+        spin = spin[..., _FIRST, _SECOND] + spin[..., _SECOND, _FIRST] * (np.arange(6) > 2)
+        turned = np.concatenate([K.mT, (B @ K.mT[:, None]).reshape(-1, 6, 3)], 1)  # from a moment
+        if self.dragged:
+            spin = np.concatenate([spin, -turned * drag_moment[:, None, None]], -1)
+        self.spin, self.push = last(spin), last(np.matvec(turned, moment))
         self.length = length
         self.link = np.ones(self.size)  # 0 where a body hangs on the pivot
         self.link[self.start[:-1]] = 0
         self.rods = length > 0
-        self.hung_mass = self._hung(self.per_mass)  # (M,) 1/kg of the body it hangs on
-        self.pair_mass = self.per_mass + self.hung_mass
+        self.pair_mass = self.per_mass + self._hung(self.per_mass)  # (M,) 1/kg
+        self.next_mass = self.per_mass * self._next(np.ones(self.size))  # 0 where nothing hangs on a body
         self.width = 1 if np.all(self.rods) else 3  # c
         self.balls_only = not np.any(self.rods)
 
@@ -184,20 +198,23 @@ class Forest:
         np.multiply(x[..., 1:], self.link[1:], out=moved[..., :-1])
         return moved
 
-    def _points(self, q: Array) -> tuple[Array, Array, Array, Array]:
-        """Return π (M,), R (3, 3, M), R s (2, 3, M) and A s (2, 3, M) = π R s + (π − 1) s."""
-        p = q[3:]
-        squares = _ROTATION @ (p[:, None] * p).reshape(16, -1)
-        norm = squares[0]
+    def _turned(self, q: Array) -> tuple[Array, Array]:
+        """Return π (M,) and R (3, 3, M)."""
+        squares = _ROTATION @ (q[3:, None] * q[3:]).reshape(16, -1)
         with np.errstate(all="ignore"):  # p = 0 and what is not finite is named where D is factored
-            R = (squares[1:] / norm).reshape(3, 3, -1)
+            return squares[0], (squares[1:] / squares[0]).reshape(3, 3, -1)
+
+    def _points(self, norm: Array, R: Array) -> tuple[Array, Array]:
+        """Return R s (2, 3, M) and A s (2, 3, M) = π R s + (π − 1) s."""
         Rs = _turn(R, self.s)
-        return norm, R, Rs, norm * Rs + (norm - 1) * self.s
+        return Rs, norm * Rs + (norm - 1) * self.s
 
     def gaps(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Return d and ḋ (3, M) of every joint, from where it hangs to body k's proximal point."""
-        _, R, Rs, As = self._points(q)
-        sigma, omega = self._rates(q, v)
+        norm, R = self._turned(q)
+        Rs, As = self._points(norm, R)
+        rates = self._rates(q, v)
+        sigma, omega = rates[0], rates[1:4]
         velocity = _turn(R, _turn(_tilde(omega), self.s))
         velocity += 2 * sigma * (Rs + self.s)
         d = q[:3] + As[0] - self._hung(q[:3] + As[1])
@@ -212,24 +229,24 @@ class Forest:
         first = np.array([[1.0], [0], [0]])
         return np.where(self.rods, rod[0] * first, d), np.where(self.rods, rod[1] * first, rate)
 
-    def _rates(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return σ = pᵀṗ (M,) and ω = 2 L ṗ (3, M)."""
-        rates = _RATES @ (q[3:, None] * v[3:]).reshape(16, -1)
-        return rates[0], 2 * rates[1:]
+    def _rates(self, q: Array, v: Array) -> Array:
+        """(13, M): σ = pᵀṗ; ω = 2 L ṗ and then the rest of the first, then the second factors of ωᵢ ωⱼ."""
+        return np.asarray(_RATES @ (q[3:, None] * v[3:]).reshape(16, -1))
 
     # -- the joint system ---------------------------------------------------------------------------
 
-    def _joints(self, q: Array, norm: Array, R: Array, As: Array) -> tuple[Joints, Array]:
-        """The joints' rows and D factored; also X (2, 3, 3, M). SingularSystem with the cause."""
+    def _joints(self, q: Array, norm: Array, R: Array, As: Array | None) -> Joints:
+        """The joints' rows and D factored; A s where there are rods. SingularSystem with the cause."""
         X = np.einsum("ijm,cjkm->cikm", R, self.B)
         c = self.width
         d = U = U_near = U_far = None
-        if self.balls_only:
-            rows = X.copy()
-            self._hung(X[1], out=rows[1])
-            blocks: Array = np.zeros((2, 3, 3, self.size))
-            diagonals = blocks.reshape(2, 9, -1)[:, ::4]
-            diagonals[0], diagonals[1] = self.pair_mass, self.hung_mass
+        # D's blocks: (c, c, M) on the diagonal, (c, c, M) of joint k + 1 with joint k, and zeros to fill up.
+        cells = np.zeros((2 * c * c + 1, self.size))
+        own, after = cells[:-1].reshape(2, c, c, -1)
+        if As is None:
+            rows = X
+            rows[1] = self._hung(X[1])
+            cells[: c * c : c + 1], cells[c * c : -1 : c + 1] = self.pair_mass, -self.next_mass
         else:
             d = q[:3] + As[0] - self._hung(q[:3] + As[1])
             self._check_rods(q, d)
@@ -240,32 +257,25 @@ class Forest:
             rows = np.empty((2, c, 3, self.size))
             np.einsum("icm,ijm->cjm", U_near, X[0], out=rows[0])
             np.einsum("icm,ijm->cjm", U_far, self._hung(X[1]), out=rows[1])
-            blocks = np.empty((2, c, c, self.size))
-            blocks[0] = np.einsum("icm,iem->cem", U, U) * self.pair_mass
-            blocks[1] = np.einsum("icm,iem->cem", U, self._hung(U)) * self.hung_mass
+            np.multiply(np.einsum("icm,iem->cem", U, U), self.pair_mass, out=own)
+            np.multiply(np.einsum("icm,iem->cem", self._next(U), U), -self.next_mass, out=after)
             if c == 3:
-                blocks[0, [1, 2], [1, 2]] += self.rods  # the empty rows
-        blocks[0] += np.einsum("kcim,keim->cem", rows, rows)
-        blocks[1] += np.einsum("cim,eim->cem", rows[1], self._hung(rows[0]))
+                own[[1, 2], [1, 2]] += self.rods  # the empty rows
+        own += np.einsum("kcim,keim->cem", rows, rows)
+        after[..., :-1] -= np.einsum("cim,eim->cem", rows[1, ..., 1:], rows[0, ..., :-1])
         if c == 1:
-            beside = -blocks[1, 0, 0, 1:] if self.size > 1 else np.zeros(1)  # LAPACK's wrapper wants one
-            diagonal, coupling, info = lapack.dpttrf(blocks[0, 0, 0], beside)
-            factor: tuple[Array, ...] = (diagonal, coupling)
-            pivots, largest = diagonal, blocks[0, 0, 0]
+            beside = after[0, 0, :-1] if self.size > 1 else np.zeros(1)  # LAPACK's wrapper wants one
+            pivots, coupling, info = lapack.dpttrf(own[0, 0], beside)
+            factor: tuple[Array, ...] = (pivots, coupling)
+            largest = own[0, 0]
         else:
-            # Lower band: column 3k+j holds rows j … 2 of D_k, then rows 0 … 2 of −(block k+1, k).
-            band = np.zeros((self.size, 3, 6))
-            after = blocks[1, :, :, 1:]
-            for j in range(3):
-                band[:, j, : 3 - j] = blocks[0, j:, j].T
-                band[:-1, j, 3 - j : 6 - j] = -after[:, j].T
-            diagonal = band[:, :, 0].ravel()
-            cholesky, info = lapack.dpbtrf(band.reshape(-1, 6).T, lower=1, overwrite_ab=1)
+            band = np.ascontiguousarray(cells[_BAND].T).reshape(-1, 6)
+            cholesky, info = lapack.dpbtrf(band.T, lower=1)
             factor = (cholesky,)
-            pivots, largest = cholesky[0] ** 2, diagonal
+            pivots, largest = cholesky[0] ** 2, band[:, 0]
         if info != 0 or not (pivots > 8 * EPS * largest).all():
             self._diagnose(q, d)
-        return Joints(d=d, U=U, rows=rows, U_near=U_near, U_far=U_far, factor=factor), X
+        return Joints(d=d, U=U, rows=rows, U_near=U_near, U_far=U_far, factor=factor)
 
     def _padded(self, w: Array) -> Array:
         """U (3, c, M): w of rods, the identity of balls."""
@@ -321,25 +331,26 @@ class Forest:
         """
         return self._motion(q, v, baumgarte)[0]
 
-    def _motion(self, q: Array, v: Array, a: float) -> tuple[Array, Array, Joints, Array, Array, Array]:
-        """(r̈; p̈), μ, the joints, R s, A s and ω."""
-        norm, R, Rs, As = self._points(q)
-        joints, X = self._joints(q, norm, R, As)
-        sigma, omega = self._rates(q, v)
-        spin = _tilde(omega)
-        torque = self.moment - _turn(spin, _turn(self.J, omega)) / norm
+    def _motion(self, q: Array, v: Array, a: float) -> tuple[Array, Array, Joints, Array]:
+        """(r̈; p̈), μ, the joints and ω."""
+        norm, R = self._turned(q)
+        Rs, As = (None, None) if self.balls_only else self._points(norm, R)
+        joints = self._joints(q, norm, R, As)
+        rates = self._rates(q, v)
+        sigma, omega = rates[0], rates[1:4]
+        terms = rates[1:7] * rates[7:] / norm
         linear = self.free
         if self.dragged:
-            torque = torque - self.drag_moment * omega
+            terms = np.concatenate([terms, omega])
             linear = linear - self.drag * v[:3]
-        beta = np.einsum("jim,jm->im", self.K, torque)
-        swing = _turn(spin, self.s)  # ω × s
-        point = np.einsum("cikm,km->cim", X, beta) + _turn(R, _turn(spin, swing) / norm)
-        near, far = linear + point[0], self._hung(linear + point[1])
-        if joints.d is None:
-            h = near - far
-        else:
-            h = self._rod_rows(joints, linear, point, near - far, v, sigma, Rs, _turn(R, swing))
+        moved = self.push + _turn(self.spin, terms)
+        beta, point = moved[:3], _turn(R, moved[3:].reshape(2, 3, -1))
+        point += linear
+        h = point[0] - self._hung(point[1])
+        if Rs is not None:
+            h = self._rod_rows(
+                joints, linear, point - linear, h, v, sigma, Rs, _turn(R, _turn(_tilde(omega), self.s))
+            )
         if a:
             C, rate = self.constraints(q, v)
             h = h + 2 * a * rate + a * a * C
@@ -352,11 +363,11 @@ class Forest:
             stretch = stretch + 2 * a * sigma + 0.5 * a * a * (norm - 1)
         out = np.empty_like(q)
         np.add(linear, pulled, out=out[:3])
-        np.subtract(_LT @ (p[:, None] * (0.5 * alpha)).reshape(12, -1), p * stretch, out=out[3:])
+        np.subtract(_HALF_LT @ (p[:, None] * alpha).reshape(12, -1), p * stretch, out=out[3:])
         out[3:] /= norm
         if not np.isfinite(out.sum()):  # an overflow, or a rate or load that is not a number
             self._diagnose(np.concatenate([q, v]), joints.d)
-        return out, mu, joints, Rs, As, omega
+        return out, mu, joints, omega
 
     def _rod_rows(
         self,
@@ -397,7 +408,8 @@ class Forest:
         q, qdot = lay(r, p), lay(v, pdot)
         if not np.isfinite(q).all():
             self._diagnose(q, None)
-        motion, mu, joints, Rs, As, omega = self._motion(q, qdot, 0.0)
+        motion, mu, joints, omega = self._motion(q, qdot, 0.0)
+        Rs, As = self._points(*self._turned(q))
         reaction = self._force(joints, mu)
         turn_near, turn_far = reaction, self._next(reaction)  # C_pᵀμ = Wᵀ of these
         if joints.d is not None:
@@ -442,11 +454,10 @@ class Forest:
 
     def _correction(self, q: Array, h: Array) -> Array:
         """(7, M) −M⁻¹ Cᵀ D⁻¹ h, tangent to pᵀp = const."""
-        norm, R, _, As = self._points(q)
-        joints, _ = self._joints(q, norm, R, As)
+        norm, R = self._turned(q)
+        joints = self._joints(q, norm, R, None if self.balls_only else self._points(norm, R)[1])
         _, linear, turned = self._multiply_back(joints, h)
-        p = q[3:]
-        turn = _LT @ (p[:, None] * (0.5 * _turn(self.K, turned))).reshape(12, -1) / norm
+        turn = _HALF_LT @ (q[3:, None] * _turn(self.K, turned)).reshape(12, -1) / norm
         return np.concatenate([linear, turn])
 
 
