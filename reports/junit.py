@@ -21,7 +21,7 @@ def write(out_dir: Path) -> Path:
     suites = ET.Element("testsuites", name="plumbline", time=f"{float(results.run['duration']):.3f}")
     totals = {"tests": 0, "failures": 0, "errors": 0, "skipped": 0}
     for name, scenario in results.scenarios.items():
-        rows = [row for row in results.rows if row["scenario"] == name]
+        rows = [results.rows[place] for place in results.places[name]]
         suite = ET.SubElement(suites, "testsuite", name=name, timestamp=str(results.run["started"])[:19])
         ET.SubElement(ET.SubElement(suite, "properties"), "property", name="family", value=scenario["family"])
         counted = dict.fromkeys(totals, 0)

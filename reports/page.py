@@ -26,6 +26,7 @@ MODULES = ("chunks", "text", "route", "plot", "matrix", "curves", "motion", "det
 BUDGET = 2_000_000  # bytes, for the default catalogue
 NIGHTLY_BUDGET = 8_000_000  # bytes, with a history or more than 60 scenarios
 POINTS = (360, 240, 160, 100, 60)  # samples per curve, tried in turn until the page is within its budget
+LINES = 500  # scenarios in the page at most
 LISTED = 60  # findings written out in the static page
 
 
@@ -50,24 +51,31 @@ def write(out_dir: Path, history: Path | None = None) -> Path:
 
 def render(results: Results, history: History) -> str:
     """The page as text, with as many points per curve as its budget allows."""
-    tables = {k: results.table(k) for k in ("states", "curves", "trajectories", "convergence")}
     budget = NIGHTLY_BUDGET if history.nights or len(results.scenarios) > 60 else BUDGET
+    shown = results.only(_shown(results))
+    tables = {k: shown.by_scenario(k) for k in ("states", "curves", "trajectories")}
     chunks = {
-        "index": payload.index_chunk(results, history),
-        "convergence": payload.convergence_chunk(results, tables),
+        "index": payload.index_chunk(shown, history),
+        "convergence": payload.convergence_chunk(shown),
     }
     if history.nights:
-        chunks["history"] = payload.history_chunk(results, history)
+        chunks["history"] = payload.history_chunk(shown, history)
     for points in (*POINTS, 0):
-        for k, name in enumerate(results.scenarios):
-            chunks[f"scenario-{k}"] = payload.scenario_chunk(name, results, tables, points)
-        html = _fill(results, history, chunks, points)
+        for k, name in enumerate(shown.scenarios):
+            chunks[f"scenario-{k}"] = payload.scenario_chunk(name, shown, tables, points)
+        html = _fill(results, shown, history, chunks, points)
         if len(html.encode()) <= budget:
             break
     return html
 
 
-def _fill(results: Results, history: History, chunks: dict[str, str], points: int) -> str:
+def _shown(results: Results) -> set[str]:
+    """The scenarios that the page has room for: those with anything unexpected first, then as they come."""
+    worrying = dict.fromkeys(row["scenario"] for row in results.rows if needs_attention(row))
+    return set([*worrying, *(name for name in results.scenarios if name not in worrying)][:LINES])
+
+
+def _fill(results: Results, shown: Results, history: History, chunks: dict[str, str], points: int) -> str:
     script, style = bundle(), _style()
     environment = Environment(
         loader=FileSystemLoader(HERE / "templates"),
@@ -78,6 +86,7 @@ def _fill(results: Results, history: History, chunks: dict[str, str], points: in
     )
     environment.filters |= {"number": number, "when": _when, "seconds": _seconds}
     attention = _attention(results.rows)
+    unshown = results.scenarios.keys() - shown.scenarios.keys()
     return environment.get_template("report.html").render(
         run=results.run,
         policy="; ".join(
@@ -97,8 +106,9 @@ def _fill(results: Results, history: History, chunks: dict[str, str], points: in
         counts=counts(results.rows),
         total=len(results.rows),
         engines=results.engines,
-        scenarios=results.scenarios,
-        families=_families(results),
+        families=_families(shown),
+        unshown=len(unshown),
+        unshown_fine=not any(entry["row"]["scenario"] in unshown for entry in attention),
         attention=attention[:LISTED],
         unlisted=len(attention) - LISTED,
         expected=_expected(results.rows),
@@ -107,7 +117,6 @@ def _fill(results: Results, history: History, chunks: dict[str, str], points: in
         comparison=_comparison(results, history),
         damaged=history.damaged,
         nights=len(history.nights),
-        points=points,
         decimated=points,
         notice=(HERE / "assets" / "vendor" / "uPlot.LICENSE").read_text(encoding="utf-8"),
         rendered=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),

@@ -48,6 +48,8 @@ _DETAIL = (
     "engine_version",
 )
 
+Tables = dict[str, dict[str, Columns]]  # by table, then scenario
+
 
 def command(row: Record, scenario: Record) -> str:
     """The command line that repeats just this cell, quoted for a POSIX shell."""
@@ -104,15 +106,14 @@ def index_chunk(results: Results, history: History) -> str:
     return packer.chunk(header)
 
 
-def scenario_chunk(name: str, results: Results, tables: dict[str, Columns], points: int) -> str:
+def scenario_chunk(name: str, results: Results, tables: Tables, points: int) -> str:
     """Everything the cells of one scenario show; ``points`` samples per curve at most, 0 for no curves."""
     packer = Packer()
     scenario = results.scenarios[name]
     details: dict[str, Record] = {}
     commands: dict[str, str] = {}
-    for place, row in enumerate(results.rows):
-        if row["scenario"] != name:
-            continue
+    for place in results.places[name]:
+        row = results.rows[place]
         detail: Record = {k: row.get(k) for k in _DETAIL if row.get(k) not in (None, "", {})}
         for field in ("value", "tolerance", "uncertainty", "horizon", "order", "accept", "wall_time"):
             if field in detail:
@@ -136,15 +137,8 @@ def scenario_chunk(name: str, results: Results, tables: dict[str, Columns], poin
     return packer.chunk(header)
 
 
-def _of(name: str, columns: Columns) -> Columns:
-    if not columns:
-        return {}
-    chosen = columns["scenario"] == name
-    return {k: v[chosen] for k, v in columns.items()} if chosen.any() else {}
-
-
-def _states(name: str, tables: dict[str, Columns], packer: Packer) -> list[Record]:
-    states = _of(name, tables["states"])
+def _states(name: str, tables: Tables, packer: Packer) -> list[Record]:
+    states = tables["states"].get(name, {})
     found = []
     for (engine, quantity), rows in groups(states, "engine", "quantity"):
         error, bound = states["error"][rows].astype(float), states["bound"][rows].astype(float)
@@ -165,8 +159,8 @@ def _states(name: str, tables: dict[str, Columns], packer: Packer) -> list[Recor
     return found
 
 
-def _curves(name: str, tables: dict[str, Columns], packer: Packer, points: int) -> list[Record]:
-    curves = _of(name, tables["curves"])
+def _curves(name: str, tables: Tables, packer: Packer, points: int) -> list[Record]:
+    curves = tables["curves"].get(name, {})
     found: list[Record] = []
     times: dict[bytes, Any] = {}
     for (engine, integrator), rows in groups(curves, "engine", "integrator"):
@@ -200,8 +194,8 @@ def _judged(curves: Columns, rows: np.ndarray) -> str:
     return "limit_error" if limited else "position_error"
 
 
-def _final_errors(name: str, tables: dict[str, Columns]) -> dict[tuple[str, ...], float]:
-    curves = _of(name, tables["curves"])
+def _final_errors(name: str, tables: Tables) -> dict[tuple[str, ...], float]:
+    curves = tables["curves"].get(name, {})
     errors = {}
     for key, rows in groups(curves, "engine", "integrator"):
         worst = float(np.max(curves["position_error"][rows]))
@@ -209,14 +203,12 @@ def _final_errors(name: str, tables: dict[str, Columns]) -> dict[tuple[str, ...]
     return errors
 
 
-def _motion(
-    name: str, scenario: Record, tables: dict[str, Columns], packer: Packer, points: int
-) -> Record | None:
+def _motion(name: str, scenario: Record, tables: Tables, packer: Packer, points: int) -> Record | None:
     """Poses of the reference, and how far every other run is from them, one scale per frame.
 
     A run's pose is r = r_ref + scale·d/127, attitude = exp(scale·w/127) attitude_ref: so 1e-9 survives.
     """
-    poses = _of(name, tables["trajectories"])
+    poses = tables["trajectories"].get(name, {})
     runs = dict(groups(poses, "engine", "integrator"))
     if not runs:
         return None
@@ -299,14 +291,16 @@ def _shapes(scenario: Record) -> list[Record]:
     return shapes
 
 
-def convergence_chunk(results: Results, tables: dict[str, Columns]) -> str:
+def convergence_chunk(results: Results) -> str:
     """Every convergence study: error, cost and observed order at each resolution, coarse to fine."""
-    columns = tables["convergence"]
+    columns = results.table("convergence")
     kinds = {(e, i["name"]): i for e, engine in results.engines.items() for i in engine["integrators"]}
     studies = []
     for (scenario, engine, integrator, quantity), rows in groups(
         columns, "scenario", "engine", "integrator", "quantity"
     ):
+        if scenario not in results.scenarios:
+            continue
         order = rows[np.argsort(-columns["resolution"][rows].astype(float), kind="stable")]
         method = kinds.get((engine, integrator), {})
         studies.append(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -80,6 +80,27 @@ class Results:
             values = table[column].to_numpy(zero_copy_only=False)
             columns[column] = _clean_texts(values) if values.dtype == object else values
         return columns
+
+    @cached_property
+    def places(self) -> dict[str, list[int]]:
+        """Indices of each scenario's rows."""
+        found: dict[str, list[int]] = {name: [] for name in self.scenarios}
+        for place, row in enumerate(self.rows):
+            found[row["scenario"]].append(place)
+        return found
+
+    def by_scenario(self, name: str) -> dict[str, Columns]:
+        """The named table, split by scenario."""
+        columns = self.table(name)
+        return {
+            scenario: {k: values[rows] for k, values in columns.items()}
+            for (scenario,), rows in groups(columns, "scenario")
+        }
+
+    def only(self, names: Collection[str]) -> Results:
+        """The same run with these scenarios alone."""
+        kept = {name: about for name, about in self.scenarios.items() if name in names}
+        return replace(self, scenarios=kept, rows=[row for row in self.rows if row["scenario"] in kept])
 
     @cached_property
     def scripts(self) -> dict[str, str]:

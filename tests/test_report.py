@@ -282,6 +282,29 @@ def test_the_default_catalogue_stays_under_2_megabytes(
     assert size <= page.BUDGET
 
 
+def test_a_night_of_thousands_of_scenarios_stays_under_8_megabytes(out: Path, tmp_path: Path) -> None:
+    stored = json.loads((out / "results.json").read_text())
+    name = "double-tumbling"
+    rows, about = [r for r in stored["rows"] if r["scenario"] == name], stored["scenarios"][name]
+    stored["scenarios"] = {f"random-{k}": about for k in range(2500)}
+    stored["rows"] = [
+        {**row, "scenario": f"random-{k}", "key": row["key"].replace(name, f"random-{k}")}
+        for k in range(2500)
+        for row in rows
+    ]
+    late = stored["rows"][-1]
+    late |= {"verdict": "disagrees", "known": None, "reason": "the needle"}
+    (tmp_path / "results.json").write_text(json.dumps(stored))
+    began = time.perf_counter()
+    text = page.write(tmp_path).read_text()
+    print(f"{len(stored['rows']):,} rows: {len(text):,} bytes in {time.perf_counter() - began:.1f} s")
+    assert len(text.encode()) <= page.NIGHTLY_BUDGET
+    assert "random-2499" in text and "the needle" in text
+    assert "2000 more scenarios are not in this page" in text
+    assert "those with anything unexpected are all here" in text
+    assert f"<b>{sum(row['verdict'] == 'agrees' for row in stored['rows'])}</b><span>agree" in text
+
+
 def test_a_page_above_its_budget_has_fewer_points(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     results = Results.load(out)
     whole = page.render(results, History())

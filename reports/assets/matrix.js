@@ -126,7 +126,7 @@ function cellOf(index, i) {
  */
 export function track(ratio) {
   const at = Math.min(Math.max((Math.log10(Math.max(ratio, 1e-30)) + 4) * 12, 0), 96);
-  return svg("svg", { class: "track", viewBox: "-3 0 102 6", "aria-hidden": "true" },
+  return svg("svg", { class: "track", viewBox: "-3 0 102 6", preserveAspectRatio: "xMinYMid", "aria-hidden": "true" },
     svg("path", { d: "M0 3H96M48 .5v5" }), svg("circle", { cx: at.toFixed(1), cy: 3, r: 2.4 }));
 }
 
