@@ -1,0 +1,113 @@
+"""Growth of perturbations and the horizon: one known in closed form, and divergence as it is observed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from plumbline.horizon import _between, _minimal, growth, horizon, twins
+from plumbline.kinematics import lift, rate
+from plumbline.measures import position_error
+from plumbline.scenario import find, load
+from tests.random_chains import random_chain
+
+EPS = 2.0**-53
+CHAOTIC = [
+    "double-planar-large",
+    "double-tumbling-balls",
+    "double-tumbling-rods",
+    "double-rod-then-ball",
+    "double-ball-then-rod",
+    "chain-3-balls",
+    "chain-3-rods",
+    "chain-5-mixed",
+]
+
+
+def upright():
+    """A body standing on its pivot, and the rate λ at which it leaves there."""
+    model, _ = random_chain(np.random.default_rng(0), [0])
+    model = replace(model, inertia=np.diag([0.02, 0.02, 0.01])[None], proximal=np.array([[0, 0, -0.3]]))
+    state = lift(model, np.array([[1.0, 0, 0, 0]]), *np.zeros((3, 1, 3)))
+    return model, state, float(np.sqrt(model.mass[0] * 9.81 * 0.3 / (0.02 + model.mass[0] * 0.09)))
+
+
+def test_growth_is_exponential_as_far_as_it_goes():
+    """Far beyond where a twin of 1e-7 has moved as far as it can."""
+    model, state, own = upright()
+    times = np.linspace(0, 24 / own, 121)
+    found = growth(model, state, times)
+    slope = np.diff(np.log(found[20:])) / np.diff(times[20:])
+    assert found[-1] > 1e9
+    assert slope == pytest.approx(np.full(100, own), rel=0.02)
+
+
+def test_a_stable_swing_grows_no_faster_than_time():
+    scenario = load(find("planar-small"))
+    found = growth(scenario.model, scenario.state, np.arange(81) * 0.05)
+    assert 1 <= np.max(found) < 10
+
+
+@pytest.mark.parametrize("rods", [[0], [1], [0, 1, 1]], ids=str)
+def test_twins_are_on_the_manifold_and_close(rods):
+    model, state = random_chain(np.random.default_rng(3), rods)
+    for twin in twins(model, state):
+        assert 1e-9 < np.max(np.abs(twin.r - state.r)) < 1e-5
+        assert np.sum(twin.u * twin.udot, axis=1) == pytest.approx(np.zeros(len(rods)), abs=1e-14)
+        back = _minimal(model, twin.r, twin.p, twin.v, rate(twin.p, twin.omega))
+        for name in ("p", "omega", "u", "udot", "r", "v"):
+            assert getattr(back, name) == pytest.approx(getattr(twin, name), abs=1e-13), name
+        half = _between(model, state, twin, 0.5)
+        for name in ("p", "omega", "u", "udot", "r", "v"):
+            middle = (getattr(twin, name) + getattr(state, name)) / 2
+            assert getattr(half, name) == pytest.approx(middle, abs=1e-11), name
+
+
+def test_horizon_is_the_last_tolerable_time():
+    times, found = np.arange(5.0), np.array([1.0, 10.0, 5.0, 100.0, 50.0])
+    assert horizon(times, found, 1e-3, 0.02) == 2.0
+    assert horizon(times, found, 1e-3, 1.0) == 4.0
+    assert horizon(times, found, 1e-3, 1e-4) == 0.0
+    assert horizon(times, found, np.full(5, 1e-3), 0.07) == 2.0, "what was lost does not come back"
+
+
+@pytest.mark.parametrize("name", CHAOTIC[:2])
+def test_observed_divergence(name):
+    check_divergence(name, "extended", 15.0)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", CHAOTIC)
+def test_observed_divergence_from_quad(name):
+    check_divergence(name, "quad", 12.0)
+
+
+def check_divergence(name, yardstick, duration):
+    """Double parts from a higher precision no earlier than T_h and at most at twice T_h.
+
+    The double run is Taylor's method in minimal coordinates, whose own error is rounding: δ₀ = 10 ε of the
+    reach (over all scenarios of the catalogue it was 0.002 … 10 ε G of the reach, 220 at a mass ratio of
+    1000, where the equations' conditioning enters).
+    """
+    pytest.importorskip("heyoka")
+    from plumbline.truth.taylor import taylor
+
+    scenario = load(find(name))
+    times = np.arange(round(duration / 0.05) + 1) * 0.05
+    double, fine = (taylor(scenario.model, scenario.state, times, kind) for kind in ("double", yardstick))
+    observed = position_error(double.r, np.asarray(fine.r, dtype=float))
+    reach = np.max(np.linalg.norm(double.r, axis=-1))
+    found = growth(scenario.model, scenario.state, times)
+    seen = 0
+    for tolerance in (1e-10, 1e-9, 1e-8, 1e-7, 1e-6):
+        passed = np.flatnonzero(observed > tolerance)
+        until = horizon(times, found, 10 * EPS * reach, tolerance)
+        if not len(passed):
+            assert until > 0.4 * duration, "the horizon ends early in a run that stays together"
+            continue
+        seen += 1
+        print(f"{name}: {tolerance:g} m is passed at {times[passed[0]]:.2f} s, T_h = {until:.2f} s")
+        assert until <= times[passed[0]] <= 2 * until
+    assert seen, "no divergence was seen: nothing was validated"
