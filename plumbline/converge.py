@@ -20,11 +20,6 @@ ABOVE_FLOOR = 32.0  # a difference this far above rounding shows its order to 0.
 LADDER = {1: (9, 15), 2: (8, 12), 4: (7, 12)}  # order: coarsest and finest step, as -log2 of seconds
 BODY_STEPS = 2**19  # most steps × bodies of the finest run of the quick form
 RTOLS = (1e-6, 1e-8, 1e-10, 1e-12)  # tighter, the rounding of engines stalls the step on long chains
-    1e-6,
-    1e-8,
-    1e-10,
-    1e-12,
-)  # of an adaptive method; below, engines' own rounding stalls it on long chains
 
 
 def ladder(integrator: Integrator, bodies: int, duration: float, finer: int = 0) -> list[float]:
