@@ -346,6 +346,12 @@ def test_hostile_names_stay_text_in_every_view(open_page: Open) -> None:
         page.evaluate("location.hash = 'view=cost'")
         page.wait_for_selector("html[data-shown=cost]")
         assert page.locator("img").count() == 0
+    reason = open_page(link(scenario="chain-10", engine="exudyn"))  # its reason is hostile too
+    assert fixture.HOSTILE in reason.locator(".chosen .reason").inner_text()
+    filtered = open_page(link(q="onerror"))
+    assert len(visible_lines(filtered)) == 2
+    for page in (reason, filtered):
+        assert page.locator("img").count() == 0
 
 
 def test_an_injected_script_is_refused(chromium: Any, out: Path) -> None:
