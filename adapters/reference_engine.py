@@ -41,9 +41,9 @@ class Reference(Adapter):
         Integrator(
             "collocation",
             "tolerance",
-            24,
+            32,
             symmetric=True,
-            note="12-point Gauss–Legendre collocation by Picard sweeps on the structured form of the same "
+            note="16-point Gauss–Legendre collocation by Picard sweeps on the structured form of the same "
             "equations, no stabilisation; resolution is rtol of the dense output",
         ),
     )

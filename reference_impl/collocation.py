@@ -24,8 +24,9 @@ from reference_impl.chain import Array, Chain
 from reference_impl.forest import Forest, lay
 from reference_impl.integrate import Run, natural_sizes
 
+NODES = 16  # a sweep of a small chain costs NumPy's calls and not its nodes: 8 … 20 were tried
 SWEEPS = 14  # at most in a step; more are better spent on a shorter step
-FASTEST = 10  # sweeps: a step that needs more is made shorter, one that needs fewer may grow
+USUAL = 6  # sweeps: a step that needs more is made shorter, one that needs fewer may grow
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,15 +46,15 @@ class Gauss:
     b: Array  # (S,) weights
     A: Array  # (S, S): ∫₀^cᵢ of the polynomial through the nodes
     modes: Array  # (S, S): node values → Legendre coefficients
-    ahead: dict[float, Array] = field(default_factory=dict)
+    known: dict[float, Array] = field(default_factory=dict)
 
-    def extrapolation(self, ratio: float) -> Array:
-        """(S, S) from this step's node values to those of the next one, ``ratio`` times as long."""
-        if ratio not in self.ahead:
-            if len(self.ahead) > 64:
-                self.ahead.clear()
-            self.ahead[ratio] = legvander(1 + 2 * ratio * self.c, len(self.c) - 1) @ self.modes
-        return self.ahead[ratio]
+    def ahead(self, ratio: float) -> Array:
+        """(S, S) Legendre modes → values at the nodes of the next step, ``ratio`` times as long."""
+        if ratio not in self.known:
+            if len(self.known) > 64:
+                self.known.clear()
+            self.known[ratio] = np.asarray(legvander(1 + 2 * ratio * self.c, len(self.c) - 1), dtype=float)
+        return self.known[ratio]
 
     def integrals(self, tau: Array) -> tuple[Array, Array]:
         """(T, S) each: the first and second integral from 0 to ``tau`` (T,) per Legendre mode."""
@@ -86,7 +87,7 @@ def integrate(
     times: Array,
     rtol: float,
     *,
-    nodes: int = 12,
+    nodes: int = NODES,
     sweep_tolerance: float | None = None,
     dense: bool = True,
     baumgarte: float = 0.0,
@@ -122,7 +123,7 @@ def integrate(
         goal = float(times[-1] if dense else times[done])
         h = min(stepper.h, goal - t)
         if not dense:  # equal steps to the next time, no crumb at the end
-            h = (goal - t) / np.ceil((goal - t) / stepper.h * (1 - 1e-12))
+            h = (goal - t) / max(1.0, np.ceil((goal - t) / stepper.h - 0.15))
         if h < 1e-13 * max(span, abs(t)) and goal - t > h:
             raise ArithmeticError(f"collocation stopped at t = {t} s: the step vanishes")
         ok, slow = stepper.step(h)
@@ -169,7 +170,8 @@ class _Stepper:
         self.forest, self.tiled, self.table = forest, forest.tile(S), table
         self.q, self.v, self.rtol, self.dense, self.baumgarte = q, v, rtol, dense, baumgarte
         self.q_lost, self.v_lost = np.zeros_like(q), np.zeros_like(v)  # what rounding took from the sums
-        self.a: Array = np.empty(0)
+        self.modes: Array = np.empty(0)  # (7, S, M) Legendre modes of the last step's accelerations
+        self.new_modes: Array = np.empty(0)
         self.last_h = 0.0
         self.sweeps = 0
         self.h, self.quiet = 0.0, 0.1 * rtol
@@ -191,8 +193,8 @@ class _Stepper:
     def step(self, h: float) -> tuple[bool, bool]:
         """Try a step: (whether it was made, whether the sweeps were what limited it). Sets the next ``h``."""
         table, S, M = self.table, len(self.table.c), self.forest.size
-        if self.a.size:
-            a = table.extrapolation(h / self.last_h) @ self.a
+        if self.modes.size:
+            a = self._guess(h / self.last_h)
         else:
             here = self.forest.acceleration(self.q, self.v, self.baumgarte)
             a = np.repeat(here[:, None], S, axis=1)
@@ -210,7 +212,7 @@ class _Stepper:
             # Quiet at the floor that rounding in a sets: no sweep improves on it.
             floor = 1e-12 * h * float(np.max(np.abs(a) * weight)) if count > 1 and rate > 0.3 else 0.0
             converged = change * min(rate, 1.0) <= self.quiet or change <= floor
-            if count > 3 and rate > 0.6 and not converged:
+            if count > 3 and rate > 0.8 and not converged:
                 break
             before = change
         self.sweeps += count
@@ -219,7 +221,7 @@ class _Stepper:
             return False, True
         tail = self._tail(a, h)
         grow = 0.9 * (1 / max(tail, 1e-30)) ** (1 / S)
-        patience = (FASTEST / count) ** 0.5 if count != FASTEST else 1.0
+        patience = (USUAL / count) ** 0.5
         slow = grow > 1.6 and patience < 1.1
         if tail > 1:
             self.h = h * max(0.3, grow)
@@ -230,11 +232,22 @@ class _Stepper:
         self._advance(a, h)
         return True, slow
 
+    def _guess(self, ratio: float) -> Array:
+        """The last step's polynomial at the nodes of the next one, cut where its terms there are smallest.
+
+        A Legendre mode k grows (1 + 2 ratio + …)ᵏ-fold outside its step, and the last ones are rounding and
+        aliasing: beyond the smallest term each one adds more error than it takes away.
+        """
+        ahead = self.table.ahead(ratio)
+        terms = np.max(np.abs(self.modes) / self.v_size[:, None], axis=(0, 2)) * ahead[-1]
+        keep = 2 + int(np.argmin(terms[1:]))
+        return np.asarray(ahead[:, :keep] @ self.modes[:, :keep])
+
     def _tail(self, a: Array, h: float) -> float:
         """The error of the step over the tolerance, from the last two Legendre modes of a."""
         S = len(self.table.c)
-        modes = np.abs(self.table.modes[-2:] @ a)  # (7, 2, M)
-        last = np.max(modes, axis=1)
+        self.new_modes = self.table.modes @ a  # (7, S, M)
+        last = np.max(np.abs(self.new_modes[:, -2:]), axis=1)
         if not self.dense:
             size = np.max(np.abs(a), axis=1)
             last = last**2 / np.where(size > 0, size, 1.0)
@@ -245,7 +258,7 @@ class _Stepper:
     def _advance(self, a: Array, h: float) -> None:
         """To the end of the step, with compensated sums (Kahan)."""
         table = self.table
-        self.a, self.last_h, self.q0, self.v0 = a, h, self.q, self.v
+        self.modes, self.last_h, self.q0, self.v0 = self.new_modes, h, self.q, self.v
         dv = h * np.einsum("j,ijm->im", table.b, a)
         dq = h * (self.v + h * np.einsum("j,ijm->im", table.b * (1 - table.c), a))
         self.q, self.q_lost = _add(self.q, dq + self.q_lost)
@@ -254,7 +267,7 @@ class _Stepper:
     def inside(self, tau: Array) -> Array:
         """(2, T, 7, M) q and v at fractions ``tau`` of the last step."""
         once, twice = self.table.integrals(tau)
-        modes, h = self.table.modes @ self.a, self.last_h
+        modes, h = self.modes, self.last_h
         v = self.v0 + h * np.einsum("tk,ikm->tim", once, modes)
         q = self.q0 + h * (tau[:, None, None] * self.v0 + h * np.einsum("tk,ikm->tim", twice, modes))
         return np.stack([q, v])

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from reference_impl.chain import Array, Chain
-from reference_impl.collocation import BatchRun, integrate
+from reference_impl.collocation import NODES, BatchRun, integrate
 from reference_impl.euler_parameters import angular_velocity
 from reference_impl.forest import Forest, lay
 
@@ -45,7 +45,7 @@ def run(
     times: Array,
     rtol: float,
     rate: float = BAUMGARTE,
-    nodes: int = 12,
+    nodes: int = NODES,
 ) -> BatchRun:
     """Collocation of one of `VARIANTS`; arguments as `collocation.integrate`, ``rate`` a in 1/s."""
     if variant not in VARIANTS:
