@@ -313,6 +313,10 @@ def test_trends_mark_versions_and_bad_nights(open_page: Open) -> None:
     assert page.locator(".trends svg .mark").count() > 3
     assert page.locator(".trends").get_by_text("4.0.0").first.is_visible()
     assert page.get_by_text("Skipped as damaged: 2026-11-02", exact=True).is_visible()
+    page.get_by_label("Search keys").fill("double-two-rods joint_reaction")
+    page.keyboard.press("Enter")
+    page.get_by_role("heading", name="1 key (engine: mujoco").wait_for()
+    assert "q=double-two-rods+joint_reaction" in page.url
     first = open_page(link(view="trend")).locator(".trends > div").first
     assert first.locator("rect.bad").count() == 2  # last night and this one
 

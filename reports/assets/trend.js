@@ -2,7 +2,7 @@
 import { chunk, fromCode } from "./chunks.js";
 import { chosen, filtersOf } from "./matrix.js";
 import { axes, decades, path } from "./plot.js";
-import { href } from "./route.js";
+import { amend, href, read } from "./route.js";
 import { h, number, svg } from "./text.js";
 
 /** @typedef {import("./payload").Index} Index @typedef {import("./payload").HistoryChunk} HistoryChunk */
@@ -29,13 +29,15 @@ export async function showTrend(root, index, fields) {
   };
   const scores = new Map(rows.map((i) => [i, moved(i)]));
   rows.sort((a, b) => (scores.get(b) ?? 0) - (scores.get(a) ?? 0));
+  const search = h("input", { type: "search", value: fields.q ?? "", placeholder: "scenario, quantity, verdict", spellcheck: "false", change: () => { amend({ q: search.value }); showTrend(root, index, read()).then(() => root.querySelector("input")?.focus()); } });
   const narrowed = Object.entries(filtersOf(fields)).map(([name, value]) => `${name}: ${value}`).join(", ");
   root.append(
     h("p", { class: "purpose" }, `Error over tolerance on ${count} nights, ${nights[0].started.slice(0, 10)} to ${nights[count - 1].started.slice(0, 10)}; the dashed line is the tolerance, an upright one a change of that engine's version. Those that moved most come first.`),
     past.damaged.length ? h("p", { class: "note" }, `Skipped as damaged: ${past.damaged.join(", ")}`) : "",
     h("h2", { class: "sub" }, "Nights"), nightTable(past, index),
-    h("h2", { class: "sub" }, `${rows.length} keys`, narrowed ? ` (${narrowed})` : ""),
-    h("p", { class: "keys" }, index.engines.map((name) => h("a", { href: href({ view: "trend", engine: name }), "aria-current": fields.engine === name ? "true" : null }, name)), h("a", { href: "#view=trend" }, "all engines")),
+    h("h2", { class: "sub" }, `${rows.length} key${rows.length === 1 ? "" : "s"}`, narrowed ? ` (${narrowed})` : ""),
+    h("div", { class: "filters", role: "search" }, h("label", {}, "Search keys", search)),
+    h("p", { class: "keys" }, index.engines.map((name) => h("a", { href: href({ ...fields, view: "trend", engine: name }), "aria-current": fields.engine === name ? "true" : null }, name)), h("a", { href: "#view=trend" }, "all engines")),
     h("div", { class: "trends" }, rows.slice(0, SHOWN).map((i) => trend(past, index, i))));
   if (rows.length > SHOWN) root.append(h("p", { class: "why" }, `… and ${rows.length - SHOWN} that moved less; narrow them by engine, or by any filter of the matrix in the address.`));
 }
@@ -47,6 +49,7 @@ function trend(past, index, i) {
   const engine = index.engines[index.rows.engine[i]];
   const name = [index.scenarios[index.rows.scenario[i]], engine, index.levels[index.rows.level[i]], index.integrators[index.rows.integrator[i]], index.quantitys[index.rows.quantity[i]]];
   const link = h("a", { href: href({ scenario: name[0], engine, row: name.slice(2).join("/") }) }, name.filter((part) => part !== "-").join(" · "));
+  const values = [...past.value.subarray(i * count, (i + 1) * count)].map(fromCode);
   const ratios = [...past.ratio.subarray(i * count, (i + 1) * count)].map(fromCode);
   const range = decades([...ratios, 1]) ?? [0.1, 10];
   const plot = axes({
@@ -68,7 +71,7 @@ function trend(past, index, i) {
     const slug = index.slugs[verdict - 1];
     const y = v > 0 ? Math.min(Math.max(plot.y(v), plot.top), plot.bottom) : plot.bottom;
     plot.root.append(svg(slug === "agrees" ? "circle" : "rect", slug === "agrees" ? { class: "pt s0", cx: plot.x(k), cy: y, r: 2 } : { class: "bad", x: plot.x(k) - 3, y: y - 3, width: 6, height: 6 },
-      svg("title", {}, `${nights[k].started.slice(0, 10)}: ${index.verdicts[verdict - 1]}, ${number(v)}`)));
+      svg("title", {}, `${nights[k].started.slice(0, 10)}: ${index.verdicts[verdict - 1]}, error ${number(values[k])}, ${number(v)} of its tolerance`)));
   });
   return h("div", {}, link, plot.root);
 }
