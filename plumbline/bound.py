@@ -21,7 +21,6 @@ from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from plumbline.kinematics import rotation
 from plumbline.records import Array, Model, State
@@ -36,8 +35,8 @@ BLUNT = 1e-8  # a tolerance above this fraction of its scale could hide a mistak
 class Bound:
     """Tolerances for one state; differences of 3-vectors are compared by their Euclidean norm.
 
-    ``scale`` holds, per field, what the tolerance is relative to: max(‖r̈‖, g), max(‖ω̇‖, the joints'
-    angular accelerations), max(‖F‖, m g), and the sums of magnitudes behind the scalars.
+    ``scale`` holds, per field, what the tolerance is relative to: max(‖r̈‖, g), the largest moment of the
+    body's Euler equation over |J|, max(‖F‖, m g), and the sums of magnitudes behind the scalars.
     """
 
     acceleration: Array  # (N,) m/s²
@@ -76,69 +75,26 @@ def state_bound(model: Model, state: State) -> Bound:
 
     Needs m > 0 and a positive definite inertia; raises numpy's LinAlgError on a singular system.
     """
-    n = model.n
-    body, norm = np.arange(n), np.linalg.norm
-    A = rotation(state.p)
-    inertia = A @ model.inertia @ A.mT  # (N, 3, 3) world axes
-    sp, sd = _turn(A, model.proximal), _turn(A, model.distal)
-    sd[-1] = 0.0  # nothing hangs there
-    omega, u, udot = _turn(A, state.omega), state.u, state.udot
-    g = float(norm(model.gravity))
-    load = model.force - model.drag_force[:, None] * state.v
-    torque = _turn(A, model.moment) - model.drag_moment[:, None] * omega
+    system = _System(model, state)
+    body, norm, rods, m = np.arange(model.n), np.linalg.norm, model.rods, model.mass
+    sp, sd, omega, a, alpha = system.sp, system.sd, system.omega, system.acceleration, system.alpha
+    u, g, ell = state.u, float(norm(model.gravity)), np.where(rods, model.length, np.inf)
     J, J_min = norm(model.inertia, axis=(1, 2)), np.linalg.eigvalsh(model.inertia)[:, 0]
-    rods, m = model.rods, model.mass
-    ell = np.where(rods, model.length, np.inf)
-
-    # ---- S_r: M x − Cᵀ λ = f, C x = γ, x = (r̈, α), F = E λ with E = u for a rod, I for a ball
-    E = np.where(rods[:, None, None], u[:, :, None] * np.array([1.0, 0.0, 0.0]), np.eye(3))
-    C = np.zeros((n, 3, n, 6))
-    C[body, :, body, :3], C[body, :, body, 3:] = E.mT, -E.mT @ _cross(sp)
-    C[body[1:], :, body[:-1], :3], C[body[1:], :, body[:-1], 3:] = -E[1:].mT, E[1:].mT @ _cross(sd[:-1])
-    M_inverse = np.zeros((n, 6, n, 6))
-    M_inverse[body, :3, body, :3] = np.eye(3) / m[:, None, None]
-    M_inverse[body, 3:, body, 3:] = np.linalg.inv(inertia)
-    C_flat, M_flat = C.reshape(3 * n, 6 * n), M_inverse.reshape(6 * n, 6 * n)
-    CM = C_flat @ M_flat
-    held = np.repeat(~rods, 3).reshape(n, 3) | (np.arange(3) == 0)  # a rod fills one of its three rows
-    K = CM @ C_flat.T + np.diag(~held.ravel())
-    d = 1 / np.sqrt(np.diag(K))
-    K_inverse = np.linalg.inv(K * d * d[:, None]) * d * d[:, None] * np.outer(held, held)
-    X = CM.T @ K_inverse  # (6N, 3N): x per joint row
-    S_inverse = np.block([[M_flat - X @ CM, X], [-X.T, K_inverse]])  # rows (r̈, α)…, λ…
-    S_inverse = np.concatenate(
-        [_rows(S_inverse[: 6 * n], 2), _rows(S_inverse[6 * n :], 1)], 1
-    )  # (N, 3, 3, 9N)
-    S_inverse[:, 2] = E @ S_inverse[:, 2]  # λ → F
-    columns = S_inverse.reshape(n, 3, 3, 9 * n)
-    by_x = columns[..., : 6 * n].reshape(n, 3, 3, n, 2, 3)
-    B = np.concatenate(
-        [norm(by_x, axis=(2, 5)), norm(columns[..., 6 * n :].reshape(n, 3, 3, n, 1, 3), axis=(2, 5))], -1
-    )
-
-    centripetal_p, centripetal_d = (np.cross(omega, np.cross(omega, s)) for s in (sp, sd))
-    gamma = -centripetal_p
-    gamma[1:] += centripetal_d[:-1]
-    gamma = (E.mT @ gamma[..., None])[..., 0]
-    gamma[:, 0] -= np.where(rods, model.length * np.sum(udot**2, -1), 0.0)
-    f = np.concatenate(
-        [m[:, None] * model.gravity + load, torque - np.cross(omega, _turn(inertia, omega))], -1
-    )
-    x, F = _solve(columns, f, gamma)
-    a, alpha = x[:, 0], x[:, 1]
+    load, torque = norm(system.load, axis=1), norm(system.torque, axis=1)
 
     # ---- sizes of the terms
-    nA, nF, nAlpha, nOmega = norm(a, axis=1), norm(F, axis=1), norm(alpha, axis=1), norm(omega, axis=1)
-    sp_n, sd_n, rod_rate = norm(sp, axis=1), norm(sd, axis=1), np.where(rods, norm(udot, axis=1), 0.0)
+    nA, nAlpha, nOmega, nF = (norm(x, axis=1) for x in (a, alpha, omega, system.F))
+    sp_n, sd_n, rod_rate = norm(sp, axis=1), norm(sd, axis=1), np.where(rods, norm(state.udot, axis=1), 0.0)
     W = np.maximum.accumulate(np.maximum(nOmega, rod_rate))
     nF_next, spin = _next(nF), J * nOmega * W
     reach = np.maximum(sp_n * nAlpha, sp_n * nOmega * W)
     hang = np.maximum(nA, np.maximum(sd_n * nAlpha, sd_n * nOmega * W))
-    force = np.max([m * nA, m * g, nF, nF_next, norm(load, axis=1)], 0)
-    moment = np.max([J * nAlpha, spin, sp_n * nF, sd_n * nF_next, norm(torque, axis=1)], 0)
+    force = np.max([m * nA, m * g, nF, nF_next, load], 0)
+    moment = np.max([J * nAlpha, spin, sp_n * nF, sd_n * nF_next, torque], 0)
     joint = np.max([nA, reach, _previous(hang), np.where(rods, model.length * rod_rate * W, 0.0)], 0)
     answer = np.stack([np.maximum(nA, g), nAlpha, nF], 1)
 
+    B = system.norms()
     tB = _through(B, force, moment, joint) + answer
 
     # rods: u = d/ℓ where d is a difference of positions of size R, its rate one of velocities of size V
@@ -150,7 +106,7 @@ def state_bound(model: Model, state: State) -> Bound:
     tX[:, 2] += FR
 
     free = (nF + nF_next + m * g) / m
-    turn = (sp_n * nF + sd_n * nF_next + spin + norm(torque, axis=1)) / J_min
+    turn = (sp_n * nF + sd_n * nF_next + spin + torque) / J_min
     tS = _through(B, 0 * m, 0 * m, free + sp_n * turn + _previous(free + sd_n * turn))
 
     # ---- joint space: one joint per ball, two per rod (where it hangs, and its tip)
@@ -158,31 +114,18 @@ def state_bound(model: Model, state: State) -> Bound:
     at = np.concatenate([(tip - model.length[:, None] * u)[rods], tip])
     below = of_body[:, None] <= body  # (joints, N)
     D = np.where(below, norm(at[:, None] - state.r, axis=2), 0.0)
-    rod_omega, d_dot2 = np.cross(u, udot), _joint_acceleration(a, alpha, sp, sd, centripetal_p, centripetal_d)
-    rod_alpha = np.cross(u, d_dot2) / ell[:, None]
-    joint_rate = norm(
-        np.concatenate(
-            [
-                (rod_omega - _previous(omega))[rods],
-                omega - np.where(rods[:, None], rod_omega, _previous(omega)),
-            ]
-        ),
-        axis=1,
-    )
-    joint_acc = norm(
-        np.concatenate(
-            [
-                (rod_alpha - _previous(alpha))[rods],
-                alpha - np.where(rods[:, None], rod_alpha, _previous(alpha)),
-            ]
-        ),
-        axis=1,
-    )
+
+    def relative(own: Array, rod: Array) -> Array:
+        """Norms (joints,) of what each joint turns by: rods against the body above, bodies against either."""
+        above = _previous(own)
+        turns = np.concatenate([(rod - above)[rods], own - np.where(rods[:, None], rod, above)])
+        return np.asarray(norm(turns, axis=1))
+
+    joint_rate, joint_acc = relative(omega, np.cross(u, state.udot)), relative(alpha, system.rod_alpha())
     mass_scale = (D * m) @ D.T + (below * J) @ below.T
-    drive = below @ (J * W**2 + norm(torque, axis=1)) + D @ (m * (g + nA) + norm(load, axis=1))
+    drive = below @ (J * W**2 + torque) + D @ (m * (g + nA) + load)
     tau = mass_scale @ joint_acc + drive
-    pairs = _torque_pairs(columns, rods, u, ell, sp, sd)  # (joints, N, 3)
-    tJ = np.einsum("jnq,j->nq", pairs, tau)
+    tJ = np.einsum("jnq,j->nq", system.torque_pairs(), tau)
 
     swing = D.T @ joint_acc
     carried = m * (nA + swing + g)
@@ -206,7 +149,7 @@ def state_bound(model: Model, state: State) -> Bound:
         mass_matrix=summed * mass_entry,
         scale={
             "acceleration": answer[:, 0],
-            "angular_acceleration": np.maximum(nAlpha, below.T @ joint_acc),
+            "angular_acceleration": np.max([nAlpha, moment / J, below.T @ joint_acc], 0),
             "joint_reaction": np.maximum(nF, m * g),
             "kinetic_energy": kinetic,
             "potential_energy": potential,
@@ -214,6 +157,95 @@ def state_bound(model: Model, state: State) -> Bound:
             "mass_matrix": mass_entry,
         },
     )
+
+
+class _System:
+    """The Newton–Euler system of the chain at one state, its inverse and its solution; world axes.
+
+    With x = (r̈, α) per body and F = E λ per joint, E = u for a rod (padded to 3×3) and I for a ball,
+
+        M x − Cᵀ λ = f,    C x = γ,    K = C M⁻¹ Cᵀ
+
+    ``columns`` (N, 3, 3, 9N): r̈, α, F of each body per unit of each row (6N of f, then 3N of γ).
+    """
+
+    def __init__(self, model: Model, state: State) -> None:
+        n, body, rods = model.n, np.arange(model.n), model.rods
+        A = rotation(state.p)
+        inertia = A @ model.inertia @ A.mT
+        self.n, self.rods, self.u, self.length = n, rods, state.u, model.length
+        self.sp, self.sd = _turn(A, model.proximal), _turn(A, model.distal)
+        self.sd[-1] = 0.0  # nothing hangs there
+        self.omega = omega = _turn(A, state.omega)
+        self.load = model.force - model.drag_force[:, None] * state.v
+        self.torque = _turn(A, model.moment) - model.drag_moment[:, None] * omega
+
+        E = np.where(rods[:, None, None], state.u[:, :, None] * np.array([1.0, 0.0, 0.0]), np.eye(3))
+        C = np.zeros((n, 3, n, 6))
+        C[body, :, body, :3], C[body, :, body, 3:] = E.mT, -E.mT @ _cross(self.sp)
+        up, down = body[1:], body[:-1]
+        C[up, :, down, :3], C[up, :, down, 3:] = -E[1:].mT, E[1:].mT @ _cross(self.sd[:-1])
+        M_inverse = np.zeros((n, 6, n, 6))
+        M_inverse[body, :3, body, :3] = np.eye(3) / model.mass[:, None, None]
+        M_inverse[body, 3:, body, 3:] = np.linalg.inv(inertia)
+        C_flat, M_flat = C.reshape(3 * n, 6 * n), M_inverse.reshape(6 * n, 6 * n)
+        CM = C_flat @ M_flat
+        held = np.repeat(~rods, 3).reshape(n, 3) | (np.arange(3) == 0)  # a rod fills one of its three rows
+        K = CM @ C_flat.T + np.diag(~held.ravel())
+        d = 1 / np.sqrt(np.diag(K))  # equilibrated: units must not decide what a pivot is
+        K_inverse = np.linalg.inv(K * d * d[:, None]) * d * d[:, None] * np.outer(held, held)
+        X = CM.T @ K_inverse
+        x_rows = np.concatenate([M_flat - X @ CM, X], 1).reshape(n, 2, 3, 9 * n)
+        F_rows = E @ np.concatenate([-X.T, K_inverse], 1).reshape(n, 3, 9 * n)
+        self.columns = np.concatenate([x_rows, F_rows[:, None]], 1)
+
+        self.centripetal_p, self.centripetal_d = (
+            np.cross(omega, np.cross(omega, s)) for s in (self.sp, self.sd)
+        )
+        gamma = (E.mT @ (_previous(self.centripetal_d) - self.centripetal_p)[..., None])[..., 0]
+        gamma[:, 0] -= np.where(rods, model.length * np.sum(state.udot**2, -1), 0.0)
+        force = model.mass[:, None] * model.gravity + self.load
+        moment = self.torque - np.cross(omega, _turn(inertia, omega))
+        rows = np.concatenate([np.concatenate([force, moment], -1).ravel(), gamma.ravel()])
+        self.acceleration, self.alpha, self.F = np.moveaxis(self.columns @ rows, 1, 0)  # (N, 3) each
+
+    def norms(self) -> Array:
+        """B (N, 3, N, 3): Frobenius norms of the blocks of the inverse, rows (r̈, α, F), columns (f, n, γ)."""
+        n, norm = self.n, np.linalg.norm
+        of_x = norm(self.columns[..., : 6 * n].reshape(n, 3, 3, n, 2, 3), axis=(2, 5))
+        of_joint = norm(self.columns[..., 6 * n :].reshape(n, 3, 3, n, 1, 3), axis=(2, 5))
+        return np.concatenate([of_x, of_joint], -1)
+
+    def rod_alpha(self) -> Array:
+        """Angular acceleration (N, 3) of each rod without axial spin, u × d̈/ℓ; 0 for a ball."""
+        near = self.acceleration + np.cross(self.alpha, self.sp) + self.centripetal_p
+        far = self.acceleration + np.cross(self.alpha, self.sd) + self.centripetal_d
+        ell = np.where(self.rods, self.length, np.inf)[:, None]
+        return np.cross(self.u, near - _previous(far)) / ell
+
+    def torque_pairs(self) -> Array:
+        """(joints, N, 3): norms of the answers to a unit torque pair at each joint, rods' upper joints first.
+
+        A torque τ on a massless rod is balanced by forces ∓(τ × u)/ℓ at its ends.
+        """
+        wrench = self.columns[..., : 6 * self.n].reshape(self.n, 3, 3, self.n, 2, 3)
+        force, moment = np.moveaxis(wrench[..., 0, :], 3, 0), np.moveaxis(wrench[..., 1, :], 3, 0)
+
+        def push(k: int, s: Array) -> Array:
+            """Answer (N, 3, 3, 3) to a force at a point of body k."""
+            return np.asarray(force[k] + moment[k] @ _cross(s[None])[0])
+
+        upper, lower = [], []
+        for k in range(self.n):
+            above = moment[k - 1] if k else np.zeros_like(moment[0])
+            if not self.rods[k]:
+                lower.append(moment[k] - above)
+                continue
+            ends = push(k, self.sp[k]) - (push(k - 1, self.sd[k - 1]) if k else 0.0)
+            through = -ends @ _cross(self.u[k][None])[0] / self.length[k]  # (τ × u)/ℓ = −ũ τ/ℓ
+            upper.append(through - above)
+            lower.append(moment[k] - through)
+        return np.asarray(np.linalg.norm(np.array(upper + lower), axis=(3, 4)))
 
 
 def _turn(A: Array, s: Array) -> Array:
@@ -238,57 +270,6 @@ def _previous(v: Array) -> Array:
     return np.concatenate([np.zeros_like(v[:1]), v[:-1]])
 
 
-def _rows(block: Array, kinds: int) -> Array:
-    """(3·kinds·N, c) → (N, kinds, 3, c)."""
-    return block.reshape(-1, kinds, 3, block.shape[1])
-
-
 def _through(B: Array, force: Array, moment: Array, joint: Array) -> Array:
     """B ρ (N, 3): first-order answer, per body and quantity, to errors of these sizes in the rows."""
-    n = len(force)
-    rho = np.stack([force, moment, joint], 1)
-    return np.asarray(B.reshape(3 * n, 3 * n) @ rho.ravel()).reshape(n, 3)
-
-
-def _solve(columns: Array, f: Array, gamma: Array) -> tuple[Array, Array]:
-    """The answer x (N, 2, 3) and F (N, 3) from the inverse."""
-    answer = columns @ np.concatenate([f.ravel(), gamma.ravel()])
-    return answer[:, :2], answer[:, 2]
-
-
-def _joint_acceleration(a: Array, alpha: Array, sp: Array, sd: Array, cp: Array, cd: Array) -> Array:
-    """d̈ (N, 3): acceleration of each proximal point relative to where it hangs."""
-    near = a + np.cross(alpha, sp) + cp
-    far = a + np.cross(alpha, sd) + cd
-    near[1:] -= far[:-1]
-    return near
-
-
-def _torque_pairs(
-    columns: Array, rods: NDArray[np.bool_], u: Array, ell: Array, sp: Array, sd: Array
-) -> Array:
-    """(joints, N, 3): norms of the answers to a unit torque pair at each joint, rods' upper joints first.
-
-    A torque τ on a massless rod is balanced by forces ∓(τ × u)/ℓ at its ends.
-    """
-    n = len(rods)
-    wrench = columns[..., : 6 * n].reshape(n, 3, 3, n, 2, 3)
-    force, moment = (
-        np.moveaxis(wrench[..., 0, :], 3, 0),
-        np.moveaxis(wrench[..., 1, :], 3, 0),
-    )  # (N, n, 3, 3, 3)
-
-    def push(k: int, s: Array) -> Array:  # force at a point of body k
-        return np.asarray(force[k] + moment[k] @ _cross(s[None])[0])
-
-    upper, lower = [], []
-    for k in range(n):
-        above = moment[k - 1] if k else np.zeros_like(moment[0])
-        if not rods[k]:
-            lower.append(moment[k] - above)
-            continue
-        ends = push(k, sp[k]) - (push(k - 1, sd[k - 1]) if k else 0.0)
-        through = -ends @ _cross(u[k][None])[0] / ell[k]  # G = (τ × u)/ℓ = −ũ τ/ℓ
-        upper.append(through - above)
-        lower.append(moment[k] - through)
-    return np.asarray(np.linalg.norm(np.array(upper + lower), axis=(3, 4)))
+    return np.asarray(np.einsum("nqkc,kc->nq", B, np.stack([force, moment, joint], 1)))

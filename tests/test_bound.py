@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import time
 import warnings
 from dataclasses import replace
@@ -14,6 +15,7 @@ from plumbline.kinematics import lift
 from plumbline.records import Unsupported
 from plumbline.registry import ENGINES, adapter
 from plumbline.sampling import random_states
+from plumbline.scenario import find, load
 from tests.random_chains import norms, random_chain, rescaled
 
 VECTORS = ("acceleration", "angular_acceleration", "joint_reaction")
@@ -56,13 +58,17 @@ def test_other_units_change_nothing(rods, units):
         assert there.bluntness(quantity) == pytest.approx(here.bluntness(quantity), rel=1e-7), quantity
 
 
-@pytest.mark.parametrize("name", ENGINES)
+LOSES_DIGITS = "pinocchio-aba"  # on long chains and wide mass ratios, really: see the test after these
+HONEST = [name for name in ENGINES if name != LOSES_DIGITS]
+
+
+@pytest.mark.parametrize("name", HONEST)
 def test_no_honest_engine_is_blamed(name):
-    honest(name, 60)
+    honest(name, 40)
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", ENGINES)
+@pytest.mark.parametrize("name", HONEST)
 def test_no_honest_engine_is_blamed_in_two_thousand_chains(name):
     honest(name, 2000)
 
@@ -93,6 +99,29 @@ def honest(name, count):
     print(name, checks, {quantity: f"{ratio:.3f}" for quantity, ratio in worst.items()})
     assert checks > count
     assert max(worst.values()) < 0.5, worst
+
+
+def test_a_real_loss_of_digits_is_blamed():
+    """The articulated-body recursion on a chain of 50 balls is off by far more than roundings explain."""
+    pytest.importorskip("flint")
+    pytest.importorskip("pinocchio")
+    from plumbline.truth.certified import certify
+
+    scenario = load(find("chain-50-balls"))
+    (state,) = random_states(scenario.model, 1, seed=3)
+    true, bound = certify(scenario.model, state).quantities, state_bound(scenario.model, state)
+    recursion, matrix = (
+        adapter(name).evaluate(scenario.model, [state])[0] for name in (LOSES_DIGITS, "pinocchio")
+    )
+    assert max(over_bound(recursion, true, bound).values()) > 10
+    assert max(over_bound(matrix, true, bound).values()) < 0.5
+
+
+def test_scales_do_not_vanish_with_the_answer():
+    """In steady conical motion and at rest ω̇′ is zero, and a tolerance relative to it would mean nothing."""
+    for name in ("double-conical", "planar-rotating", "rest", "chain-10-small"):
+        scenario = load(find(name))
+        assert state_bound(scenario.model, scenario.state).bluntness("angular_acceleration") < BLUNT, name
 
 
 PLANTED = {
@@ -135,8 +164,8 @@ def smallest_seen(what, rods):
             said = [certify(wrong, state).quantities for state in relifted]
             return any(max(over_bound(*each).values()) > 1 for each in zip(said, true, bounds, strict=True))
 
-        decades = np.arange(-14, -5, 0.25)
-        worst = max(worst, next((10**x for x in decades if seen(10**x)), 1.0))
+        grid = 10 ** np.arange(-14, -5, 0.25)
+        worst = max(worst, grid[bisect.bisect_left(grid, True, hi=len(grid) - 1, key=seen)])
     return worst
 
 
