@@ -35,6 +35,8 @@ class Adapter(ABC):
     title: ClassVar[str]  # as shown in the report
     package: ClassVar[str]  # distribution whose version is reported
     integrators: ClassVar[tuple[Integrator, ...]]
+    supported: ClassVar[str] = ""  # PEP 440 range of versions that the adapter works with
+    needs: ClassVar[tuple[str, ...]] = ()  # more that an environment of another version needs
 
     @abstractmethod
     def version(self) -> str:

@@ -18,6 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from plumbline import scenario as scenarios
+from plumbline import versions
 from plumbline.cells import Cells
 from plumbline.exact import NotThatMotion, solution
 from plumbline.problems import Problem, ScenarioError
@@ -122,7 +123,13 @@ def list_engines() -> list[dict[str, Any]]:
 @main.command(epilog=EXIT_CODES)
 @click.argument("names", nargs=-1, metavar="[SCENARIO]...")
 @click.option("--family", "families", multiple=True, help="Only scenarios of this family (may be repeated).")
-@click.option("--engine", "engines", multiple=True, help="Only this engine (may be repeated). Default: all.")
+@click.option(
+    "--engine",
+    "engines",
+    multiple=True,
+    help="Only this engine (may be repeated); mujoco@3.12.0, @latest, @pre or @path/to.whl for another "
+    "version than the installed one. Default: all.",
+)
 @click.option(
     "--level",
     type=click.Choice(["state", "trajectory", "all"]),
@@ -201,6 +208,69 @@ def run(
     sys.exit(result.run["exit_code"])
 
 
+@main.command(epilog=EXIT_CODES)
+@click.argument("names", nargs=-1, metavar="[SCENARIO]...")
+@click.option("--engine", "engines", multiple=True, help="Only this engine (may be repeated). Default: all.")
+@click.option(
+    "--random", "count", type=click.IntRange(0), default=200, show_default=True, help="Random scenarios."
+)
+@click.option(
+    "--seed", type=click.IntRange(0), default=None, help="Their seed. Default: drawn, told, stored."
+)
+@click.option(
+    "--finer",
+    type=click.IntRange(0, 4),
+    default=1,
+    show_default=True,
+    help="Halvings of the step beyond those of `run`.",
+)
+@click.option("--jobs", type=click.IntRange(1), default=None, help="Worker processes. Default: one per core.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    default=Path("nightly"),
+    show_default=True,
+    help="Output folder; complete nights are in its folder `history`.",
+)
+@click.option(
+    "--timeout",
+    type=click.FloatRange(0, min_open=True),
+    default=1800.0,
+    show_default=True,
+    help="Seconds per task.",
+)
+@click.option(
+    "--memory", type=click.FloatRange(0, min_open=True), default=8.0, show_default=True, help="GB per worker."
+)
+def nightly(
+    names: tuple[str, ...], engines: tuple[str, ...], count: int, seed: int | None, finer: int,
+    jobs: int | None, out: Path, timeout: float, memory: float,
+) -> None:  # fmt: skip
+    r"""Run everything, unattended: catalogue, finer steps, random scenarios, and remember the night.
+
+    Killed at any moment, the same command goes on where it stopped.
+
+    \b
+    Examples:
+      python -m plumbline nightly                               everything
+      python -m plumbline nightly --random 1000 --seed 7 --out nights
+      python -m plumbline history nightly
+    """
+    from plumbline.nightly import nightly as run_night
+
+    chosen, chosen_engines, folder = choose_scenarios(names, ()), choose_engines(engines), writable(out)
+    with progress_to(sys.stderr) as progress:
+        result, place = run_night(
+            folder, chosen, chosen_engines, random=count, seed=seed, jobs=jobs or os.cpu_count() or 1,
+            limits=Limits(timeout, memory), whole=not names and not engines, finer=finer, progress=progress,
+            command=shlex.join(["python", "-m", "plumbline", *sys.argv[1:]]),
+            tell=lambda sentence: click.echo(sentence, err=True),
+        )  # fmt: skip
+    tell(result)
+    click.echo(f"report: {place / 'report.html'}")
+    sys.exit(result.run["exit_code"])
+
+
 @main.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILE...", type=click.Path(path_type=Path))
 def check(files: tuple[Path, ...]) -> None:
@@ -252,11 +322,16 @@ def choose_scenarios(names: tuple[str, ...], families: tuple[str, ...]) -> list[
 
 
 def choose_engines(engines: tuple[str, ...]) -> list[str]:
-    """The asked engines in the registry's order, or all of them."""
+    """The asked engines in the registry's order, then as they were asked; or all of them."""
     for engine in engines:
-        if engine not in ENGINES:
-            raise click.BadParameter(f"no engine {engine!r}{nearest(engine, ENGINES)}", param_hint="--engine")
-    return [name for name in ENGINES if not engines or name in engines]
+        base, _ = versions.split(engine)
+        if base not in ENGINES:
+            raise click.BadParameter(f"no engine {base!r}{nearest(base, ENGINES)}", param_hint="--engine")
+        problem = versions.problem_of(engine)
+        if problem:
+            raise click.BadParameter(f"{engine}: {problem}", param_hint="--engine")
+    order = list(ENGINES)
+    return sorted(dict.fromkeys(engines), key=lambda e: order.index(versions.split(e)[0])) or order
 
 
 def nearest(word: str, names: Iterable[str]) -> str:
@@ -318,6 +393,7 @@ GLYPHS = {
     "agrees": "[green]✓[/]", "disagrees": "[red bold]✗[/]", "unresolved": "[yellow]?[/]",
     "unsupported": "[dim]–[/]", "not installed": "[dim]∅[/]", "failed": "[red bold]![/]",
 }  # fmt: skip
+SHOWN = 60  # scenarios; of more, those where everything agrees are left out of the table
 WORST_FIRST = ("failed", "disagrees", "unresolved", "unsupported", "not installed", "agrees")
 
 
@@ -328,12 +404,13 @@ def tell(result: Result) -> None:
     table.add_column("scenario")
     for name, info in result.engines.items():
         table.add_column(f"{name} {info.version}".strip())
+    rows_of: dict[str, list[Any]] = {scenario: [] for scenario in result.scenarios}
+    for row in result.rows:
+        rows_of[row.scenario].append(row)
     for scenario in result.scenarios:
-        cells = []
-        for engine in result.engines:
-            rows = [r for r in result.rows if r.scenario == scenario and r.engine == engine]
-            cells.append(cell_text(rows))
-        table.add_row(scenario, *cells)
+        of = [[r for r in rows_of[scenario] if r.engine == engine] for engine in result.engines]
+        if len(result.scenarios) <= SHOWN or any(r.verdict != "agrees" for rows in of for r in rows):
+            table.add_row(scenario, *map(cell_text, of))
     out.print(table)
     out.print(
         "[dim]each cell: agreeing rows / all rows, then the worst error over its tolerance; "

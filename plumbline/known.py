@@ -50,9 +50,13 @@ class Entry(BaseModel):
         return text
 
     def covers(self, row: Row) -> bool:
-        """Whether the entry speaks of that row's cell, whatever its verdict."""
-        names = ("scenario", "engine", "level", "integrator", "quantity")
-        return all(fnmatchcase(getattr(row, n), getattr(self, n)) for n in names) and self.in_range(row)
+        """Whether the entry speaks of that row's cell, whatever its verdict; of an engine in any version."""
+        names = ("scenario", "level", "integrator", "quantity")
+        engine = row.engine.partition("@")[0]
+        here = fnmatchcase(engine, self.engine)
+        return (
+            here and all(fnmatchcase(getattr(row, n), getattr(self, n)) for n in names) and self.in_range(row)
+        )
 
     def in_range(self, row: Row) -> bool:
         """Whether the engine's version is in the entry's range; pre-releases count."""

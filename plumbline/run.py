@@ -15,20 +15,22 @@ from typing import Any, Literal
 
 import numpy as np
 
-from plumbline import known, store, work, yardstick
+from plumbline import known, store, versions, work, yardstick
 from plumbline.converge import ladder
 from plumbline.exact import solution
 from plumbline.findings import Findings, Subject
 from plumbline.motion_verdicts import judge_motion
-from plumbline.records import Integrator, Row
-from plumbline.registry import ENGINES, adapter
+from plumbline.records import Row, Verdict
+from plumbline.registry import ENGINES
 from plumbline.sampling import random_states, seed_of
 from plumbline.scenario import Scenario
 from plumbline.state_verdicts import judge_states
+from plumbline.work import EngineInfo
 from plumbline.workers import Limits, Memory, Outcome, Task, Workers
 from plumbline.yardstick import ROUNDING, MotionTruth, StateTruth
 
 STATES = 50  # random states per scenario, besides the initial one
+PROBE_STATES = 9  # the same of a probe: there are many of them
 HORIZON_TOLERANCE = 1e-9  # m: positions are compared while rounding, grown, stays below this
 
 Levels = Literal["state", "trajectory", "all"]
@@ -48,18 +50,8 @@ class Plan:
     finer: int = 0  # how many times the finest step halves beyond the quick form
     accept: float | None = None  # relative to each quantity's scale; shown beside the verdict only
     whole: bool = False  # the full catalogue on all engines: every known entry must occur
+    probes: frozenset[str] = frozenset()  # names of scenarios asked about at state level only, at few states
     memory: Memory = field(default_factory=Memory)  # of cells that need not run again
-
-
-@dataclass(frozen=True)
-class EngineInfo:
-    """An engine as it is installed here, or why it is not."""
-
-    name: str
-    title: str
-    version: str
-    integrators: tuple[Integrator, ...]
-    missing: str | None = None
 
 
 @dataclass
@@ -74,20 +66,26 @@ class Result:
     run: dict[str, Any]
 
 
-def describe(engine: str) -> EngineInfo:
-    """Import an engine (in a worker) and say what it is; an ImportError means it is not installed."""
-    try:
-        found = adapter(engine)
-    except ImportError as error:
-        return EngineInfo(engine, engine, "", (), f"{engine} is not installed here: {error}")
-    return EngineInfo(engine, found.title, found.version(), found.integrators)
-
-
 def describe_all(workers: Workers, engines: Sequence[str]) -> dict[str, EngineInfo]:
-    """Every engine's description; one that crashes on import is missing for that reason."""
-    found = {}
-    for outcome in workers.run(Task(name, describe, (name,), workers.limits) for name in engines):
-        found[outcome.key] = outcome.value or EngineInfo(outcome.key, outcome.key, "", (), outcome.lost)
+    """Every engine's description, of the version asked for; one that crashes on import is missing for it."""
+    found: dict[str, EngineInfo] = {}
+    tasks = []
+    for name in engines:
+        base, version = versions.split(name)
+        try:
+            python = versions.interpreter(name) if version else ""
+        except versions.NoSuchEnvironment as error:
+            found[name] = EngineInfo(name, name, "", (), str(error))
+            continue
+        tasks.append(Task(name, work.describe, (base,), workers.limits, python=python))
+    pythons = {task.key: task.python for task in tasks}
+    for outcome in workers.run(tasks):
+        name = outcome.key
+        info = outcome.value or EngineInfo(name, name, "", (), outcome.lost)
+        if pythons[name]:
+            title = info.title if info.missing else f"{info.title} {info.version}"
+            info = replace(info, name=name, title=title, python=pythons[name])
+        found[name] = info
     return {name: found[name] for name in engines}
 
 
@@ -145,29 +143,33 @@ class Bench:
         self.judged: dict[Any, Findings] = {}  # by cell, in the order of the tasks
         self.truths: dict[str, StateTruth | MotionTruth | Lost] = {}
         self.early: list[Outcome] = []  # engines' answers that came before the truth
+        probe = scenario.name in plan.probes
+        self.level: Levels = "state" if probe else plan.level
+        count = min(plan.states, PROBE_STATES) if probe else plan.states
         self.states = [
             scenario.state,
-            *random_states(scenario.model, plan.states, seed_of("states", scenario.digest)),
+            *random_states(scenario.model, count, seed_of("states", scenario.digest)),
         ]
 
     def tasks(self) -> Iterator[Task]:
         """Truth first (unless it is there already), then every engine's cells."""
         s, limits = self.scenario, self.plan.limits
-        if self.plan.level in ("state", "all") and "state" not in self.truths:
+        if self.level in ("state", "all") and "state" not in self.truths:
             yield Task((s.name, "truth", "state"), yardstick.state_truth, (s.model, self.states), limits)
-        if self.plan.level in ("trajectory", "all") and "trajectory" not in self.truths:
+        if self.level in ("trajectory", "all") and "trajectory" not in self.truths:
             closed = solution(s)
             exact = (*closed(s.times), closed.source) if closed and closed.amplitude == 0 else None
             arguments = (s.model, s.state, s.times, exact)
             yield Task((s.name, "truth", "trajectory"), yardstick.motion_truth, arguments, limits)
         for name, info in self.engines.items():
             if info.missing is not None:
-                row = self.who(name).row("state", "-", "all", "not installed", info.missing)
+                verdict: Verdict = "unsupported" if info.version else "not installed"
+                row = self.who(name).row("state", "-", "all", verdict, info.missing)
                 self.judged[s.name, name] = Findings([row])
                 continue
-            if self.plan.level in ("state", "all"):
+            if self.level in ("state", "all"):
                 yield self.cell((s.name, name, "state"), work.evaluate, s.model, self.states)
-            if self.plan.level in ("trajectory", "all"):
+            if self.level in ("trajectory", "all"):
                 for integrator in info.integrators:
                     steps = ladder(integrator, s.model.n, s.duration, self.plan.finer)
                     key = (s.name, name, "trajectory", integrator.name)
@@ -176,8 +178,9 @@ class Bench:
     def cell(self, key: tuple[str, ...], call: Callable[..., Any], *arguments: Any) -> Task:
         """The task of one cell; its place among the findings is that of its making."""
         self.judged[key] = Findings()
-        engine = key[1]
-        return Task(key, call, (engine, *arguments), self.plan.limits, self.engines[engine].version)
+        base, _ = versions.split(key[1])
+        info = self.engines[key[1]]
+        return Task(key, call, (base, *arguments), self.plan.limits, info.version, info.python)
 
     def findings(self) -> Findings:
         """All that was found, in the order of the tasks, whichever answered first."""

@@ -9,11 +9,15 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib import metadata
+
+from packaging.specifiers import SpecifierSet
 
 from plumbline.records import (
     Array,
     BadInput,
     EngineFailure,
+    Integrator,
     Model,
     State,
     StateQuantities,
@@ -21,6 +25,19 @@ from plumbline.records import (
     Unsupported,
 )
 from plumbline.registry import adapter
+from plumbline.versions import declared
+
+
+@dataclass(frozen=True)
+class EngineInfo:
+    """An engine as it is installed here (or in the environment of ``python``), or why it does not run."""
+
+    name: str
+    title: str
+    version: str
+    integrators: tuple[Integrator, ...]
+    missing: str | None = None
+    python: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +66,21 @@ class Climb:
 
     rungs: list[Rung]
     unsupported: str | None
+
+
+def describe(engine: str) -> EngineInfo:
+    """Import an engine and say what it is; an ImportError means it is not installed."""
+    try:
+        found = adapter(engine)
+    except ImportError as error:
+        return EngineInfo(engine, engine, "", (), f"{engine} is not installed here: {error}")
+    except AttributeError as error:  # an interface that this version does not have
+        version = metadata.version(declared(engine, "package"))
+        return EngineInfo(engine, engine, version, (), f"the adapter cannot use version {version}: {error}")
+    version, missing = found.version(), None
+    if found.supported and not SpecifierSet(found.supported).contains(version, prereleases=True):
+        missing = f"the adapter supports versions {found.supported} of {found.package}, this is {version}"
+    return EngineInfo(engine, found.title, version, found.integrators, missing)
 
 
 def evaluate(engine: str, model: Model, states: Sequence[State]) -> Evaluation:

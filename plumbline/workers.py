@@ -8,20 +8,19 @@ its parent.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import multiprocessing
 import os
-import signal
-import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from dataclasses import dataclass, field
-from pathlib import Path
 from types import TracebackType
 from typing import Any
 
 from pebble import ProcessExpired, ProcessPool
+
+from plumbline.fate import die_with_parent
+from plumbline.remote import Crashed, Elsewhere, call, exit_words
 
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
@@ -45,6 +44,7 @@ class Task:
     arguments: tuple[Any, ...] = ()
     limits: Limits = field(default_factory=Limits)
     version: str = ""  # of the engine that answers; a part of the answer's content key
+    python: str = ""  # the interpreter of another environment to make the call in; empty: this one's
 
 
 @dataclass(frozen=True)
@@ -113,9 +113,7 @@ class Workers:
                 if before is not None:
                     yield before
                     continue
-                future: Future[Any] = self._pool.schedule(
-                    task.call, args=task.arguments, timeout=task.limits.seconds
-                )
+                future: Future[Any] = self._pool.schedule(perform, args=(task,), timeout=task.limits.seconds)
                 waiting[future] = task
             if not waiting:
                 return
@@ -127,6 +125,13 @@ class Workers:
                 yield found
 
 
+def perform(task: Task) -> Any:
+    """Make a task's call, here or in the environment that it names."""
+    if task.python:
+        return call(task.python, task.call, *task.arguments)
+    return task.call(*task.arguments)
+
+
 def outcome(task: Task, future: Future[Any]) -> Outcome:
     """The value of a finished future, or how its worker was lost."""
     try:
@@ -135,22 +140,16 @@ def outcome(task: Task, future: Future[Any]) -> Outcome:
         return Outcome(task.key, lost=f"hung: no answer within {task.limits.seconds:g} s, worker killed")
     except ProcessExpired as expired:
         return Outcome(task.key, lost=f"crashed: the worker {exit_words(expired.exitcode)}")
+    except Crashed as crashed:
+        return Outcome(task.key, lost=f"crashed: the worker {crashed}")
+    except Elsewhere as error:
+        return Outcome(task.key, lost=str(error))
     except MemoryError:
         return Outcome(task.key, lost=f"out of memory: over {task.limits.gigabytes:g} GB of address space")
     except CancelledError:
         return Outcome(task.key, lost="cancelled")
     except Exception as error:  # ImportError among them: the caller tells "not installed" by its name
         return Outcome(task.key, lost=f"{type(error).__name__}: {error}")
-
-
-def exit_words(code: int) -> str:
-    """An exit code in words: the signal's name where one ended the process."""
-    if code < 0:
-        try:
-            return f"died of {signal.Signals(-code).name}"
-        except ValueError:
-            return f"died of signal {-code}"
-    return f"exited with code {code}"
 
 
 def prepare(scratch: str, gigabytes: float, parent: int) -> None:
@@ -168,13 +167,3 @@ def prepare(scratch: str, gigabytes: float, parent: int) -> None:
         size = int(gigabytes * 2**30)
         resource.setrlimit(resource.RLIMIT_AS, (size, size))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-
-
-def die_with_parent(parent: int) -> None:
-    """Ask Linux to kill this process when its parent ends, however it ends."""
-    if not sys.platform.startswith("linux"):
-        return
-    pr_set_pdeathsig = 1  # linux/prctl.h
-    ctypes.CDLL(None, use_errno=True).prctl(pr_set_pdeathsig, signal.SIGKILL)
-    if os.getppid() != parent and not Path(f"/proc/{parent}").exists():
-        os._exit(1)  # it ended before we asked

@@ -1,0 +1,124 @@
+"""The nightly: everything, unattended; one folder per night, and what is unfinished beside them.
+
+    OUT/unfinished/plan.json   seed and number of the random scenarios, when it was begun
+    OUT/unfinished/cells/      finished cells (`plumbline.cells`)
+    OUT/unfinished/night/      results as they are written
+    OUT/history/ID/            a complete night, moved there by one rename
+
+Killed at any moment, the same command reads the plan and goes on; a folder in history is never half.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from plumbline import scenario as scenarios
+from plumbline.cells import Cells
+from plumbline.random_scenarios import FAMILY, random_scenarios
+from plumbline.run import Plan, Progress, Result, execute, save
+from plumbline.store import write_atomically
+from plumbline.workers import Limits
+
+FINER = 1  # halvings beyond the quick ladders
+
+
+@dataclass(frozen=True)
+class Night:
+    """What one night adds to the catalogue, and when it was begun."""
+
+    seed: int
+    random: int
+    started: str  # ISO 8601, UTC
+
+    @classmethod
+    def begun(cls, folder: Path, seed: int | None, random: int) -> Night:
+        """The unfinished night of ``folder`` if it is the same one, else a new one, written down."""
+        path = folder / "plan.json"
+        try:
+            night = cls(**json.loads(path.read_text(encoding="utf-8")))
+            if night.random == random and seed in (None, night.seed):
+                return night
+        except (OSError, ValueError, TypeError):
+            pass  # none, or damaged: a new one
+        night = cls(secrets.randbits(32) if seed is None else seed, random, now())
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, json.dumps(asdict(night)).encode())
+        return night
+
+
+def now() -> str:
+    """The time, UTC, to the second."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def nightly(
+    out: Path,
+    chosen: Sequence[scenarios.Scenario],
+    engines: Sequence[str],
+    *,
+    random: int,
+    seed: int | None,
+    jobs: int,
+    limits: Limits,
+    whole: bool,
+    command: str,
+    finer: int = FINER,
+    progress: Progress,
+    tell: Callable[[str], None],
+) -> tuple[Result, Path]:
+    """Run a night, or what is left of it; returns its result and its folder in OUT/history."""
+    unfinished = out / "unfinished"
+    night = Night.begun(unfinished, seed, random)
+    kept = sum(1 for _ in unfinished.glob("cells/*.cell"))
+    tell(f"random scenarios: {night.random}, seed {night.seed}")
+    if kept:
+        tell(f"going on with the night begun {night.started}: {kept} cells are done")
+    drawn = list(random_scenarios(night.seed, night.random))
+    plan = Plan(
+        [*chosen, *drawn],
+        engines,
+        jobs=jobs,
+        limits=limits,
+        finer=finer,
+        whole=whole,
+        probes=frozenset(s.name for s in drawn),
+        memory=Cells(unfinished / "cells", tell),
+    )
+    result = execute(plan, progress)
+    result.run |= {"started": night.started, "random": night.random, "seed": night.seed}
+    folder = unfinished / "night"
+    shutil.rmtree(folder, ignore_errors=True)
+    save(result, folder, command)
+    write_files_of_random(result, drawn, folder / "scenarios")
+    write_reports(folder, out / "history")
+    place = out / "history" / result.run["id"]
+    place.parent.mkdir(exist_ok=True)
+    os.replace(folder, place)
+    shutil.rmtree(unfinished)
+    return result, place
+
+
+def write_files_of_random(result: Result, drawn: Sequence[scenarios.Scenario], folder: Path) -> None:
+    """The scenario file of every random scenario with a row that does not agree: `run FILE` repeats it."""
+    wanted = {row.scenario for row in result.rows if row.family == FAMILY and row.verdict != "agrees"}
+    for s in drawn:
+        if s.name in wanted:
+            folder.mkdir(exist_ok=True)
+            text = json.dumps(s.document, indent=1)  # JSON is YAML
+            write_atomically(folder / f"{s.name}.yaml", text.encode())
+
+
+def write_reports(folder: Path, history: Path) -> None:
+    """Report, JUnit and step summary of a stored run, with the nights before it."""
+    from reports import junit, page, step_summary
+
+    page.write(folder, history)
+    junit.write(folder)
+    step_summary.write(folder)
