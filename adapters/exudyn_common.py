@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import tempfile
 from collections.abc import Callable, Iterator
+from inspect import signature
 from typing import Any, TypeVar
 
 import exudyn
@@ -15,12 +16,19 @@ from plumbline.records import Array, EngineFailure, Model
 items: Any = exudyn.itemInterface  # its constructors are untyped
 
 Row = TypeVar("Row")
+SUPPORTED = ">=1.9,<2"
+Raised: type[Exception] = getattr(exudyn, "ExudynError", RuntimeError)  # its own errors, since 1.12
 
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
     """A scratch working directory and no console output: Exudyn writes to both."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch, contextlib.chdir(scratch):
+        if not hasattr(exudyn, "config"):  # before 1.10; it has no way to ask what was set before
+            exudyn.SetWriteToConsole(False)
+            exudyn.SuppressWarnings(True)
+            yield
+            return
         before = exudyn.config.printToConsole, exudyn.config.suppressWarnings
         exudyn.config.printToConsole, exudyn.config.suppressWarnings = False, True
         try:
@@ -38,8 +46,12 @@ def system() -> tuple[Any, Any]:
 def settings() -> Any:
     """Fixed steps, Newton to 1e-12, nothing written."""
     chosen = exudyn.SimulationSettings()
-    chosen.solution.file.write = False
-    chosen.solution.sensors.active = False
+    if hasattr(chosen, "solution"):
+        chosen.solution.file.write = False
+        chosen.solution.sensors.active = False
+    else:  # before 1.12
+        chosen.solutionSettings.writeSolutionToFile = False
+        chosen.solutionSettings.sensorsStoreAndWriteFiles = False
     time = chosen.timeIntegration
     time.verboseMode = 0
     time.adaptiveStep = False
@@ -47,6 +59,40 @@ def settings() -> Any:
     time.newton.absoluteTolerance = time.newton.relativeTolerance = 1e-12
     time.newton.maxIterations = 100  # its Jacobian leaves out C_qᵀλ's, so that taut rods converge linearly
     return chosen
+
+
+def rigid_body(node: Any, mass: float, J: Array) -> Any:
+    """A body of that mass and inertia (about its centre of mass, its own axes) on a node."""
+    sizes = {"mass": mass, "inertia": [J[0, 0], J[1, 1], J[2, 2], J[1, 2], J[0, 2], J[0, 1]]}
+    if "mass" not in signature(items.ObjectRigidBody).parameters:  # before 1.12
+        sizes = {f"physics{name.capitalize()}": value for name, value in sizes.items()}
+    return items.ObjectRigidBody(nodeNumber=node, **sizes)
+
+
+def sparse(chosen: Any) -> None:
+    """The sparse linear solver."""
+    kind = exudyn.LinearSolverType.EigenSparse
+    if hasattr(chosen, "linearSolver"):
+        chosen.linearSolver.solverType = kind
+    else:  # before 1.12
+        chosen.linearSolverType = kind
+
+
+def runge_kutta(chosen: Any) -> None:
+    """RK44, without the accelerations at the end of a step, which nothing here reads."""
+    time, kind = chosen.timeIntegration, exudyn.DynamicSolverType.RK44
+    if hasattr(time, "solverType"):
+        time.solverType = kind
+        time.explicit.computeEndOfStepAccelerations = False
+    else:  # before 1.12
+        time.explicitIntegration.dynamicSolverType = kind
+        time.explicitIntegration.computeEndOfStepAccelerations = False
+
+
+def version() -> str:
+    """Version of the Exudyn that runs."""
+    config = getattr(exudyn, "config", None)  # since 1.10
+    return str(exudyn.GetVersionString() if config is None else config.Version())
 
 
 def add_loads(mbs: Any, model: Model, k: int, marker: Any, ground: Any, moment: Array) -> None:
@@ -109,7 +155,7 @@ def run(
     chosen.timeIntegration.endTime = float(times[-1])
     try:
         finished = solver.SolveSystem(mbs, chosen)
-    except (RuntimeError, ValueError, exudyn.ExudynError) as error:
+    except (RuntimeError, ValueError, Raised) as error:
         raise EngineFailure(f"Exudyn stopped after {taken} of {steps} steps: {error}") from error
     if stopped is not None:
         raise stopped

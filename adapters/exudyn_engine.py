@@ -16,7 +16,18 @@ import exudyn
 import numpy as np
 import scipy.linalg
 
-from adapters.exudyn_common import add_loads, items, quiet, run, settings, system
+from adapters.exudyn_common import (
+    SUPPORTED,
+    add_loads,
+    items,
+    quiet,
+    rigid_body,
+    run,
+    settings,
+    sparse,
+    system,
+    version,
+)
 from plumbline.adapter import Adapter
 from plumbline.kinematics import angular_velocity, rate, rotation
 from plumbline.records import Array, EngineFailure, Integrator, Model, State, StateQuantities, Trajectory
@@ -35,19 +46,12 @@ class Chain:
         pdot = rate(state.p, state.omega)
         self.nodes, self.bodies, self.joints = [], [], []
         for k in range(model.n):
-            J = model.inertia[k]
             node = mbs.AddNode(
                 items.NodeRigidBodyEP(
                     referenceCoordinates=[*state.r[k], *state.p[k]], initialVelocities=[*state.v[k], *pdot[k]]
                 )
             )
-            body = mbs.AddObject(
-                items.ObjectRigidBody(
-                    mass=model.mass[k],
-                    inertia=[J[0, 0], J[1, 1], J[2, 2], J[1, 2], J[0, 2], J[0, 1]],
-                    nodeNumber=node,
-                )
-            )
+            body = mbs.AddObject(rigid_body(node, model.mass[k], model.inertia[k]))
 
             def marker(point: Array, body: Any = body) -> Any:
                 return mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=body, localPosition=point.tolist()))
@@ -73,6 +77,7 @@ class Exudyn(Adapter):
     name = "exudyn"
     title = "Exudyn"
     package = "exudyn"
+    supported = SUPPORTED
     integrators: ClassVar[tuple[Integrator, ...]] = (
         Integrator(
             "trapezoidal",
@@ -93,7 +98,7 @@ class Exudyn(Adapter):
 
     def version(self) -> str:
         """Version of the Exudyn that runs."""
-        return str(exudyn.GetVersionString())
+        return version()
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         with quiet():
@@ -103,7 +108,7 @@ class Exudyn(Adapter):
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
         chosen = settings()
-        chosen.linearSolver.solverType = exudyn.LinearSolverType.EigenSparse
+        sparse(chosen)
         alpha = chosen.timeIntegration.generalizedAlpha
         if integrator.name == "trapezoidal":
             alpha.useNewmark = alpha.useIndex2Constraints = True
@@ -185,13 +190,14 @@ def evaluate(model: Model, state: State) -> StateQuantities:
     r = output(Output.Position)
     weight = (M @ np.tile([*model.gravity, 0, 0, 0, 0], n)).reshape(n, 7)[:, :3]
     basis = _rates(model, state)
+    kinetic = 0.5 * np.sum(qdot * momentum)
+    if hasattr(Output, "KineticEnergy"):  # an output of bodies since 1.12
+        kinetic = np.sum([mbs.GetObjectOutputBody(body, Output.KineticEnergy) for body in chain.bodies])
     return StateQuantities(
         acceleration=output(Output.Acceleration),
         angular_acceleration=output(Output.AngularAccelerationLocal),
         joint_reaction=reaction,
-        kinetic_energy=float(
-            np.sum([mbs.GetObjectOutputBody(b, Output.KineticEnergy) for b in chain.bodies])
-        ),
+        kinetic_energy=float(kinetic),
         potential_energy=float(-np.sum(weight * r)),  # its own PotentialEnergy is always 0
         angular_momentum=np.sum(np.cross(r, momentum[:, :3]), 0)
         + np.einsum("kij,kj->i", rotation(state.p), spin),

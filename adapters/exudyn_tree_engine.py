@@ -23,7 +23,17 @@ from typing import Any, ClassVar
 import exudyn
 import numpy as np
 
-from adapters.exudyn_common import add_loads, items, quiet, run, settings, system
+from adapters.exudyn_common import (
+    SUPPORTED,
+    add_loads,
+    items,
+    quiet,
+    run,
+    runge_kutta,
+    settings,
+    system,
+    version,
+)
 from plumbline.adapter import Adapter
 from plumbline.kinematics import conjugate, multiply, rate, rotation
 from plumbline.records import (
@@ -220,13 +230,14 @@ class ExudynTree(Adapter):
     name = "exudyn-tree"
     title = "Exudyn (kinematic tree)"
     package = "exudyn"
+    supported = SUPPORTED
     integrators: ClassVar[tuple[Integrator, ...]] = (
         Integrator("RK44", "step", 4, (4, 5, 6, 7, 8), note="classical Runge-Kutta on joint angles"),
     )
 
     def version(self) -> str:
         """Version of the Exudyn that runs."""
-        return str(exudyn.GetVersionString())
+        return version()
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         with quiet():
@@ -252,8 +263,7 @@ class ExudynTree(Adapter):
 def explicit() -> Any:
     """Settings of RK44."""
     chosen = settings()
-    chosen.timeIntegration.solverType = exudyn.DynamicSolverType.RK44
-    chosen.timeIntegration.explicit.computeEndOfStepAccelerations = False
+    runge_kutta(chosen)
     return chosen
 
 
