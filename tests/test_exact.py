@@ -79,8 +79,8 @@ SHORT = [name for name, scenario in NAMED.items() if not scenario.exact.startswi
 @pytest.mark.parametrize("name", SHORT)
 def test_catalogue(name):
     position, attitude = errors(NAMED[name])
-    assert position < 1e-12
-    assert attitude < 1e-12
+    assert position < 1e-13
+    assert attitude < 1e-13
 
 
 @pytest.mark.parametrize("name", SHORT)
