@@ -45,7 +45,7 @@ def system() -> tuple[Any, Any]:
 
 def settings() -> Any:
     """Fixed steps, Newton to 1e-12, nothing written."""
-    chosen = exudyn.SimulationSettings()
+    chosen: Any = exudyn.SimulationSettings()
     if hasattr(chosen, "solution"):
         chosen.solution.file.write = False
         chosen.solution.sensors.active = False

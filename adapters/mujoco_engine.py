@@ -43,6 +43,7 @@ class Mujoco(Adapter):
     name = "mujoco"
     title = "MuJoCo"
     package = "mujoco"
+    supported = ">=3.2,<5"
     integrators = (
         Integrator("Euler", "step", 1, ALL, note="semi-implicit Euler"),
         Integrator("implicit", "step", 1, ALL, note="Euler, implicit in velocity with Coriolis terms"),
@@ -89,9 +90,7 @@ class _Chain:
 
     def __init__(self, model: Model) -> None:
         spec = mujoco.MjSpec()
-        spec.compiler.autolimits = False
-        spec.option.gravity = model.gravity
-        spec.option.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        getattr(spec, "compiler", spec).autolimits = False  # on the spec itself in 3.2.0 to 3.2.4
         self.model = model
         self.link: list[int] = []
         self.mass: list[float] = [0.0]
@@ -108,6 +107,10 @@ class _Chain:
             hang = model.distal[k]
             _actuate(spec, parent, k, model)
         m = self.m = spec.compile()
+        m.opt.gravity = model.gravity
+        flags = mujoco.mjtDisableBit
+        # 3.2.0 always resets; its clock then tells, as every reset is told by the contract
+        m.opt.disableflags = flags.mjDSBL_CONTACT | getattr(flags, "mjDSBL_AUTORESET", 0)
         # After compiling: the compiler refuses massless bodies, and cannot adjust what it does not see.
         m.body_mass[:] = self.mass
         m.body_inertia[:] = self.inertia
@@ -121,10 +124,11 @@ class _Chain:
         self, parent: Any, pos: Array, joint: Array, mass: float, inertia: Array, axes: Array = UPRIGHT
     ) -> Any:
         """A body on a ball joint, compiled with unit mass; ``mass`` and ``inertia`` are set afterwards."""
-        body = parent.add_body(
-            pos=pos, mass=1.0, inertia=np.ones(3), ipos=np.zeros(3), iquat=axes, explicitinertial=True
-        )
-        body.add_joint(type=mujoco.mjtJoint.mjJNT_BALL, pos=joint)
+        body = _made(
+            parent.add_body(),
+            pos=pos, mass=1.0, inertia=np.ones(3), ipos=np.zeros(3), iquat=axes, explicitinertial=True,
+        )  # fmt: skip
+        _made(body.add_joint(), type=mujoco.mjtJoint.mjJNT_BALL, pos=joint)
         self.mass.append(mass)
         self.inertia.append(inertia)
         return body
@@ -161,16 +165,18 @@ class _Chain:
         """Everything the engine says of a state."""
         m, d, link = self.m, self.d, self.link
         T = self.set(state)
+        m.opt.enableflags = mujoco.mjtEnableBit.mjENBL_ENERGY
         mujoco.mj_forward(m, d)
-        mujoco.mj_energyPos(m, d)
-        mujoco.mj_energyVel(m, d)
         mujoco.mj_subtreeVel(m, d)
         velocity = self._object(mujoco.mj_objectVelocity, d)
         d.xfrc_applied[link, :3] -= self.model.drag_force[:, None] * velocity[:, 3:]
         mujoco.mj_rnePostConstraint(m, d)
         acceleration = self._object(mujoco.mj_objectAcceleration, d)
         M = np.zeros((m.nv, m.nv))
-        mujoco.mj_fullM(m, d, M)
+        try:
+            mujoco.mj_fullM(m, d, M)
+        except TypeError:  # older ones, 3.4 among them
+            mujoco.mj_fullM(m, M, d.qM)
         com, momentum = d.subtree_com[0], m.body_subtreemass[0] * d.subtree_linvel[0]
         return StateQuantities(
             acceleration=acceleration[:, 3:] + self.model.gravity,
@@ -202,14 +208,22 @@ class _Chain:
         return out
 
 
+def _made(element: Any, **attributes: Any) -> Any:
+    """An element of a spec with these attributes; only later versions take them as arguments."""
+    for name, value in attributes.items():
+        setattr(element, name, value)
+    return element
+
+
 def _actuate(spec: Any, body: Any, k: int, model: Model) -> None:
     """n′ − c_r ω′ and −c_t ṙ of body k where they act: force = bias + rate · velocity along each axis."""
-    body.add_site(name=f"com{k}")
+    _made(body.add_site(), name=f"com{k}")
     biases = np.concatenate([np.zeros(3), model.moment[k]])
     rates = -np.repeat([model.drag_force[k], model.drag_moment[k]], 3)
     for gear, bias, rate in zip(np.eye(6), biases, rates, strict=True):
         if bias or rate:
-            spec.add_actuator(
+            _made(
+                spec.add_actuator(),
                 trntype=mujoco.mjtTrn.mjTRN_SITE,
                 target=f"com{k}",
                 gear=gear,
