@@ -170,11 +170,20 @@ def track(quotient: float | None) -> float | None:
 
 
 def _attention(rows: list[Record]) -> list[Record]:
-    """What nobody expected, one entry per cell and verdict: its worst row and how many more there are."""
+    """What nobody expected, worst first: an entry per cell and verdict, gaps of one reason together.
+
+    Each has its worst row, how many more rows there are and the other scenarios they are in.
+    """
     found: dict[tuple[str, ...], Record] = {}
     for row in sorted(filter(needs_attention, rows), key=lambda r: (-severity(r), -(ratio(r) or 0.0))):
-        entry = found.setdefault((row["scenario"], row["engine"], row["verdict"]), {"row": row, "more": -1})
+        gap = row["verdict"] == "unsupported"
+        key = (row["engine"], row["verdict"], row["reason"] if gap else row["scenario"])
+        entry = found.setdefault(key, {"row": row, "more": -1, "scenarios": {}})
         entry["more"] += 1
+        entry["scenarios"][row["scenario"]] = None
+    for entry in found.values():
+        del entry["scenarios"][entry["row"]["scenario"]]
+        entry["more"] -= len(entry["scenarios"])
     return list(found.values())
 
 

@@ -344,6 +344,6 @@ def history_chunk(results: Results, history: History) -> str:
         "damaged": history.damaged,
         "value": packer.add(log_codes(table(lambda r: r.get("value")))),
         "ratio": packer.add(log_codes(table(ratio))),
-        "verdict": packer.add(np.nan_to_num(table(lambda r: verdicts[r["verdict"]])).astype(np.uint8)),
+        "verdict": packer.add(np.nan_to_num(table(lambda r: verdicts.get(r["verdict"], 0))).astype(np.uint8)),
     }
     return packer.chunk(header)

@@ -57,7 +57,7 @@ def ratio(row: Record) -> float | None:
     Where the worst of many comparisons, each with a tolerance of its own, is not the largest error,
     the row says so in ``extra["ratio"]``.
     """
-    told = row["extra"].get("ratio")
+    told = (row.get("extra") or {}).get("ratio")
     if told is not None and math.isfinite(told):
         return float(told)
     value, tolerance = row.get("value"), row.get("tolerance")

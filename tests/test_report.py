@@ -347,6 +347,19 @@ def test_a_run_of_the_state_level_alone_has_a_page(out: Path, tmp_path: Path) ->
     assert data["scenario-0"]["curves"] == [] and data["scenario-0"]["motion"] is None  # type: ignore[index,call-overload]
 
 
+def test_gaps_of_one_reason_are_one_finding(out: Path) -> None:
+    results = Results.load(out)
+    gap = next(row for row in results.rows if row["verdict"] == "unsupported")
+    rows = [{**gap, "known": None, "scenario": f"s{k}"} for k in range(9)]
+    rows += [{**gap, "known": None, "scenario": "s0", "quantity": "energy"}]
+    rows += [{**gap, "known": None, "scenario": "s1", "reason": "another"}]
+    first, second = page._attention(rows)
+    assert (len(first["scenarios"]), first["more"]) == (8, 1) and first["row"]["scenario"] not in first[
+        "scenarios"
+    ]
+    assert (len(second["scenarios"]), second["more"]) == (0, 0)
+
+
 def test_a_report_that_cannot_be_written_leaves_the_old_one(
     out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -3,7 +3,7 @@ import { chunk } from "./chunks.js";
 import { strokeOf } from "./curves.js";
 import { axes, decades, path } from "./plot.js";
 import { amend, read } from "./route.js";
-import { h, number, svg } from "./text.js";
+import { decade, h, number, svg } from "./text.js";
 
 /** @typedef {import("./payload").Study} Study @typedef {import("./payload").Index} Index */
 
@@ -21,7 +21,7 @@ export async function showCost(root, index, fields) {
   const strokes = new Map(methods.map((name) => {
     const engine = name.slice(0, name.indexOf(" "));
     const siblings = methods.filter((other) => other.startsWith(engine + " "));
-    return [name, strokeOf((index.engines.indexOf(engine) % 6) + 6 * siblings.indexOf(name))]; // colour says the engine, dashes the integrator
+    return [name, strokeOf((index.engines.indexOf(engine) % 8) + 8 * siblings.indexOf(name))]; // colour says the engine, dashes the integrator
   }));
   root.replaceChildren(
     h("h1", { class: "cell-title", tabindex: -1 }, "Convergence and cost"),
@@ -80,7 +80,7 @@ function timeTo(one, target) {
 /** @param {Study[]} studies @param {string[]} methods @param {string} unit */
 function costTable(studies, methods, unit) {
   return h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "CPU time to reach an error" }, h("table", { class: "plain" },
-    h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Engine and integrator"), TARGETS.map((t) => h("th", { scope: "col", class: "r" }, `${number(t, 1)} ${unit}`)))),
+    h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Engine and integrator"), TARGETS.map((t) => h("th", { scope: "col", class: "r" }, `${decade(Math.round(Math.log10(t)))} ${unit}`)))),
     h("tbody", {}, methods.map((name) => {
       const group = studies.filter((one) => `${one.engine} ${one.integrator}` === name);
       return h("tr", {}, h("th", { scope: "row" }, name), TARGETS.map((target) => {

@@ -21,7 +21,7 @@ const DASHES = [[], [7, 4], [2, 3], [9, 3, 2, 3]];
  * The colour and dash of the k-th series, the same in every picture of a view.
  * @param {number} k
  */
-export const strokeOf = (k) => ({ colour: `--c${k % 6}`, dash: DASHES[Math.floor(k / 6) % 4], css: `s${k % 6} d${Math.floor(k / 6) % 4}` });
+export const strokeOf = (k) => ({ colour: `--c${k % 8}`, dash: DASHES[Math.floor(k / 8) % 4], css: `s${k % 8} d${Math.floor(k / 8) % 4}` });
 
 /**
  * Panels into `root`. `onTime` is called where a panel is clicked.

@@ -122,7 +122,7 @@ export function motion(data, o) {
       const note = h("span", { class: "off" });
       const canvas = h("canvas", { tabindex: 0, role: "img" });
       /** @type {View} */
-      const view = { canvas, note, run, runs, colour: `--c${k % 6}` };
+      const view = { canvas, note, run, runs, colour: `--c${k % 8}` };
       const choice = h("select", { "aria-label": `Integrator of ${engine}`, change: () => { view.run = runs[Number(choice.value)]; label(view); draw(view); } }, runs.map((one, i) => h("option", { value: i, selected: one === run }, one.integrator)));
       stage.append(h("figure", { class: engine === o.engine ? "mine" : "" }, h("figcaption", {}, h("b", {}, engine), runs.length > 1 ? choice : h("span", {}, run.integrator)), canvas, h("figcaption", {}, note)));
       label(view);
