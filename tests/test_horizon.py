@@ -75,16 +75,24 @@ def test_horizon_is_the_last_tolerable_time():
 
 @pytest.mark.parametrize("name", CHAOTIC[:2])
 def test_observed_divergence(name):
-    check_divergence(name, "extended", 15.0)
+    check_divergence(name, "extended")
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", CHAOTIC)
+@pytest.mark.parametrize("name", CHAOTIC[2:])
+def test_observed_divergence_on_every_chaotic_scenario(name):
+    check_divergence(name, "extended")
+
+
+@pytest.mark.full
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("name", [name for name in CHAOTIC if name.startswith("double")])
 def test_observed_divergence_from_quad(name):
-    check_divergence(name, "quad", 12.0)
+    """A minute each; longer chains take many, and extended precision, 2000 times finer, must do there."""
+    check_divergence(name, "quad")
 
 
-def check_divergence(name, yardstick, duration):
+def check_divergence(name, yardstick, duration=15.0):
     """Double parts from a higher precision no earlier than T_h and at most at twice T_h.
 
     The double run is Taylor's method in minimal coordinates, whose own error is rounding: δ₀ = 10 ε of the
