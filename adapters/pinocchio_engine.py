@@ -237,6 +237,14 @@ def rkmk4(chain: Chain, q: Array, v: Array, h: float) -> tuple[Array, Array]:
     return pin.integrate(chain.pin, q, theta), v + h / 6 * (b1 + 2 * b2 + 2 * b3 + b4)
 
 
+def tangent(model: pin.Model, q: Array, v: Array) -> Array:
+    """q̇ (nq,) of a velocity v (nv,)."""
+    if hasattr(pin, "tangentMapProduct"):
+        return np.asarray(pin.tangentMapProduct(model, q, v[:, None])).ravel()
+    p = np.roll(q.reshape(-1, 4), 1, axis=1)  # before 4.0: of spherical joints, ½ q v
+    return np.roll(rate(p, v.reshape(-1, 3)), -1, axis=1).ravel()
+
+
 def dop853(chain: Chain, q: Array, v: Array, times: Array, rtol: float) -> tuple[Array, Array, int]:
     """Rows (T, 4 nj) and (T, 3 nj) and the number of steps of q̇ = tangentMap(q) v, v̇ = a(q, v).
 
@@ -248,7 +256,7 @@ def dop853(chain: Chain, q: Array, v: Array, times: Array, rtol: float) -> tuple
     def field(_: float, y: Array) -> Array:
         q, v = y[:nq], y[nq:]
         a = chain.acceleration(pin.normalize(chain.pin, q), v)
-        return np.concatenate([pin.tangentMapProduct(chain.pin, q, v[:, None]).ravel(), a])
+        return np.concatenate([tangent(chain.pin, q, v), a])
 
     y, steps = np.concatenate([q, v]), 0
     rows = [y]
@@ -275,6 +283,8 @@ class Pinocchio(Adapter):
     name: ClassVar[str] = "pinocchio"
     title: ClassVar[str] = "Pinocchio"
     package: ClassVar[str] = "pin"
+    supported = ">=3.3.1,<5"
+    needs = (("<4", "cmeel-urdfdom<5"), ("<4", "cmeel-tinyxml2<11"))  # what those wheels were linked with
     integrators: ClassVar[tuple[Integrator, ...]] = (
         Integrator(
             "semi-implicit-euler",

@@ -51,7 +51,10 @@ class Flyers:
             self.contacts.append(pin.RigidConstraintModel(kind, self.pin, *here, *there, frame))
             self.contact_data.append(self.contacts[-1].createData())
         self.data = self.pin.createData()
-        pin.initConstraintDynamics(self.pin, self.data, self.contacts, self.contact_data)
+        try:
+            pin.initConstraintDynamics(self.pin, self.data, self.contacts, self.contact_data)
+        except TypeError:  # before 4.0
+            pin.initConstraintDynamics(self.pin, self.data, self.contacts)
 
     def _frame(self, joint: int, placement: pin.SE3) -> int:
         name = f"point {self.pin.nframes}"
@@ -118,6 +121,8 @@ class PinocchioMaximal(Adapter):
     name: ClassVar[str] = "pinocchio-maximal"
     title: ClassVar[str] = "Pinocchio, maximal coordinates"
     package: ClassVar[str] = "pin"
+    supported = ">=3.3.1,<5"
+    needs = (("<4", "cmeel-urdfdom<5"), ("<4", "cmeel-tinyxml2<11"))  # what those wheels were linked with
     integrators: ClassVar[tuple[Integrator, ...]] = ()
 
     def version(self) -> str:

@@ -36,7 +36,8 @@ class Adapter(ABC):
     package: ClassVar[str]  # distribution whose version is reported
     integrators: ClassVar[tuple[Integrator, ...]]
     supported: ClassVar[str] = ""  # PEP 440 range of versions that the adapter works with
-    needs: ClassVar[tuple[str, ...]] = ()  # more that an environment of another version needs
+    # Requirements of environments with another version: (range of versions, what they need besides).
+    needs: ClassVar[tuple[tuple[str, str], ...]] = ()
 
     @abstractmethod
     def version(self) -> str:

@@ -16,6 +16,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from packaging.specifiers import SpecifierSet
 from packaging.utils import InvalidWheelFilename, parse_wheel_filename
 from packaging.version import InvalidVersion, Version
 
@@ -84,7 +85,9 @@ def interpreter(name: str) -> str:
         label = requirement.partition("==")[2]
     else:
         requirement, label = f"{package}=={version}", version
-    wanted = [requirement, *BESIDE, *(declared(base, "needs") or ())]
+    number = str(parse_wheel_filename(Path(version).name)[1]) if version.endswith(".whl") else label
+    more = (need for when, need in declared(base, "needs") or () if SpecifierSet(when).contains(number))
+    wanted = [requirement, *BESIDE, *more]
     tag = hashlib.sha256("\n".join([*wanted, sys.version]).encode()).hexdigest()[:8]
     place = cache() / f"{package}-{label}-{tag}"
     if not python_of(place).exists():
