@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import json
 import os
 import shlex
@@ -269,6 +270,42 @@ def nightly(
     tell(result)
     click.echo(f"report: {place / 'report.html'}")
     sys.exit(result.run["exit_code"])
+
+
+@main.command()
+@click.argument("file", metavar="FILE", type=click.Path(path_type=Path))
+@click.option("--jobs", type=click.IntRange(1), default=None, help="Worker processes. Default: one per core.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=Path("sweep"), show_default=True, help="Output folder."
+)
+def sweep(file: Path, jobs: int | None, out: Path) -> None:
+    """Vary a scenario's parameters over a grid or distributions; FILE as `plumbline/sweep.py` shows it.
+
+    Writes sweep.parquet: one row per cell and implementation. Exit codes as for run.
+    """
+    from plumbline import sweep as sweeps
+
+    try:
+        spec, cells = sweeps.load(file)
+    except ScenarioError as error:
+        click.echo(str(error), err=True)
+        sys.exit(2)
+    folder = writable(out)
+    table = sweeps.run(spec, cells, jobs or os.cpu_count() or 1)
+    path = sweeps.write(table, folder)
+    counts = collections.Counter(
+        zip(*(table[k].to_pylist() for k in ("implementation", "verdict")), strict=True)
+    )
+    click.echo(f"{len(cells)} cells: " + "; ".join(f"{e} {v} {k}" for (e, v), k in sorted(counts.items())))
+    poor = table.filter(
+        [v not in ("agrees", "not installed") for v in table["verdict"].to_pylist()]
+    ).to_pylist()
+    for row in poor[:10]:
+        click.echo(f"cell {row['cell']}, {row['implementation']}: {row['verdict']}: {row['reason']}")
+    click.echo(f"results: {path}")
+    lost = sum(k for (_, v), k in counts.items() if v == "failed")
+    judged = sum(k for (_, v), k in counts.items() if v not in ("agrees", "failed", "not installed"))
+    sys.exit(3 if lost else 1 if judged else 0)
 
 
 @main.command()
