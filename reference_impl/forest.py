@@ -19,7 +19,7 @@ system D μ = −h for λ, solved by banded Cholesky; the rest is back-substitut
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import lapack
@@ -62,11 +62,13 @@ _HALF_LT = 0.5 * _PRODUCT.reshape(4, 4, 4)[:, :, 1:].reshape(
     4, 12
 )  # ½ L(p)ᵀ α, from the outer product of p and α
 # The lower band of D: column 3k+j holds rows j, j+1 … of its own block and then the next block's, 6 in all.
-_BAND = [
-    *(0, 3, 6, 9, 12, 15),  # cells 3 i + j of the own block, 9 + 3 i + j of the next
-    *(4, 7, 10, 13, 16, 18),  # 18: zeros
-    *(8, 11, 14, 17, 18, 18),
-]
+_BAND = np.array(
+    [
+        *(0, 3, 6, 9, 12, 15),  # cells 3 i + j of the own block, 9 + 3 i + j of the next
+        *(4, 7, 10, 13, 16, 18),  # 18: zeros
+        *(8, 11, 14, 17, 18, 18),
+    ]
+)
 _CROSS = np.zeros((9, 3))  # ω → ω̃, row by row
 _CROSS[[7, 2, 3], [0, 1, 2]], _CROSS[[5, 6, 1], [0, 1, 2]] = 1.0, -1.0
 
@@ -91,8 +93,7 @@ def _dot(a: Array, b: Array) -> Array:
     return np.asarray(np.einsum("i...,i...->...", a, b))
 
 
-@dataclass(frozen=True, eq=False)
-class Joints:
+class Joints(NamedTuple):
     """The joints' rows at one configuration and the factor of D, for any right-hand side.
 
     For balls only, c = 3 and U is the identity (``U`` None); for rods only, c = 1; mixed, c = 3 with a
@@ -170,6 +171,9 @@ class Forest:
         self.next_mass = self.per_mass * self._next(np.ones(self.size))  # 0 where nothing hangs on a body
         self.width = 1 if np.all(self.rods) else 3  # c
         self.balls_only = not np.any(self.rods)
+        self.cells = np.zeros((2 * self.width**2 + 1, self.size))  # D's blocks, see _joints
+        if self.balls_only:  # I/m, the part that never changes
+            self.cells[0:9:4], self.cells[9:18:4] = self.pair_mass, -self.next_mass
 
     def tile(self, count: int) -> Forest:
         """The same chains ``count`` times over: all of them, then all again."""
@@ -241,12 +245,11 @@ class Forest:
         c = self.width
         d = U = U_near = U_far = None
         # D's blocks: (c, c, M) on the diagonal, (c, c, M) of joint k + 1 with joint k, and zeros to fill up.
-        cells = np.zeros((2 * c * c + 1, self.size))
+        cells = self.cells.copy()
         own, after = cells[:-1].reshape(2, c, c, -1)
         if As is None:
             rows = X
             rows[1] = self._hung(X[1])
-            cells[: c * c : c + 1], cells[c * c : -1 : c + 1] = self.pair_mass, -self.next_mass
         else:
             d = q[:3] + As[0] - self._hung(q[:3] + As[1])
             self._check_rods(q, d)
@@ -269,7 +272,7 @@ class Forest:
             factor: tuple[Array, ...] = (pivots, coupling)
             largest = own[0, 0]
         else:
-            band = np.ascontiguousarray(cells[_BAND].T).reshape(-1, 6)
+            band = np.ascontiguousarray(cells.take(_BAND, axis=0).T).reshape(-1, 6)
             cholesky, info = lapack.dpbtrf(band.T, lower=1)
             factor = (cholesky,)
             pivots, largest = cholesky[0] ** 2, band[:, 0]
