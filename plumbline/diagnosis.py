@@ -78,6 +78,8 @@ def diagnose(
     gravity, without loads and drag.
     """
     seen = observe(model, said, truth)
+    if max(seen.off(seen.right).values()) <= EXPLAINED:
+        return "accelerations, reactions, energies and momentum are right: it is in the mass matrix alone"
     whole = explanations(seen)
     if whole:
         text = "behaves as if " + "; or, which these data cannot tell apart, as if ".join(whole)

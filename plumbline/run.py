@@ -20,7 +20,7 @@ from plumbline.converge import ladder
 from plumbline.exact import solution
 from plumbline.findings import Findings, Subject
 from plumbline.motion_verdicts import judge_motion
-from plumbline.records import Row, Verdict
+from plumbline.records import Row, StateQuantities, Verdict
 from plumbline.registry import ENGINES
 from plumbline.sampling import random_states, seed_of
 from plumbline.scenario import Scenario
@@ -101,6 +101,9 @@ def execute(plan: Plan, progress: Progress) -> Result:
         for done, outcome in enumerate(workers.run(tasks, plan.memory), start=1):
             benches[outcome.key[0]].take(outcome)
             progress(done, len(tasks), " ".join(outcome.key))
+        questions = [task for bench in benches.values() for task in bench.questions()]
+        for outcome in workers.run(questions):
+            benches[outcome.key[0]].explain(outcome)
     found = Findings()
     for scenario in plan.scenarios:
         found.extend(benches[scenario.name].findings())
@@ -143,6 +146,7 @@ class Bench:
         self.judged: dict[Any, Findings] = {}  # by cell, in the order of the tasks
         self.truths: dict[str, StateTruth | MotionTruth | Lost] = {}
         self.early: list[Outcome] = []  # engines' answers that came before the truth
+        self.disputed: dict[Any, list[StateQuantities]] = {}  # answers of cells that disagree at state level
         probe = scenario.name in plan.probes
         self.level: Levels = "state" if probe else plan.level
         count = min(plan.states, PROBE_STATES) if probe else plan.states
@@ -220,6 +224,8 @@ class Bench:
             return Findings(rows=[who.row(level, name, "all", "failed", lost)])
         if isinstance(truth, StateTruth):
             found = judge_states(who, truth, outcome.value)
+            if any(row.verdict == "disagrees" for row in found.rows):
+                self.disputed[outcome.key] = outcome.value.quantities
         else:
             integrator = next(i for i in self.engines[engine].integrators if i.name == name)
             horizon = horizon_of(truth)
@@ -227,6 +233,19 @@ class Bench:
         if self.plan.accept is not None:
             found.rows = [replace(row, accept=self.plan.accept) for row in found.rows]
         return found
+
+    def questions(self) -> Iterator[Task]:
+        """One task per cell that disagrees at state level: which term is it?"""
+        for key, said in self.disputed.items():
+            (base, _), info = versions.split(key[1]), self.engines[key[1]]
+            arguments = (base, self.scenario.model, said, self.truths["state"])
+            yield Task(key, work.explain, arguments, self.plan.limits, info.version, info.python)
+
+    def explain(self, outcome: Outcome) -> None:
+        """Take the answer to a question into the rows that disagree."""
+        text = outcome.value or f"no diagnosis: {outcome.lost}"
+        cell = self.judged[outcome.key]
+        cell.rows = [replace(r, diagnosis=text) if r.verdict == "disagrees" else r for r in cell.rows]
 
     def summary(self) -> dict[str, Any]:
         """What the store keeps of the scenario."""
@@ -295,9 +314,9 @@ def sentence(result: Result) -> str:
         new = [row for row in result.rows if row.verdict == verdict and row.known is None]
         old = number - len(new)
         if verdict in ("disagrees", "failed") and new:
-            named = [f"{row.engine}, {row.scenario}: {row.quantity}" for row in new[:3]]
-            more = f" and {len(new) - 3} more" if len(new) > 3 else ""
-            part += f" ({'; '.join(named)}{more})"
+            named = list(dict.fromkeys(f"{row.engine}, {row.scenario}: {row.quantity}" for row in new))
+            more = f" and {len(named) - 3} more" if len(named) > 3 else ""
+            part += f" ({'; '.join(named[:3])}{more})"
         if old:
             part += f" ({old} as recorded)"
         parts.append(part)

@@ -10,6 +10,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import metadata
+from typing import TYPE_CHECKING
 
 from packaging.specifiers import SpecifierSet
 
@@ -26,6 +27,9 @@ from plumbline.records import (
 )
 from plumbline.registry import adapter
 from plumbline.versions import declared
+
+if TYPE_CHECKING:
+    from plumbline.yardstick import StateTruth
 
 
 @dataclass(frozen=True)
@@ -114,6 +118,13 @@ def climb(
             failure = words(error)
         rungs.append(Rung(resolution, trajectory, failure, time.process_time() - begin))
     return Climb(rungs, None)
+
+
+def explain(engine: str, model: Model, said: list[StateQuantities], truth: StateTruth) -> str:
+    """Which term is wrong in answers that disagree with the truth: a sentence."""
+    from plumbline.diagnosis import diagnose  # only a dispute needs it
+
+    return diagnose(model, said, truth, adapter(engine).evaluate)
 
 
 def words(error: Exception) -> str:
