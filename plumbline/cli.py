@@ -309,6 +309,51 @@ def sweep(file: Path, jobs: int | None, out: Path) -> None:
 
 
 @main.command()
+@click.argument("folder", default="nightly", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option("--key", "pattern", default=None, help="Trend of the rows whose key matches (* and ?).")
+@click.option("--json", "as_json", is_flag=True, help="JSON on stdout, for other programs.")
+def history(folder: Path, pattern: str | None, as_json: bool) -> None:
+    r"""What the nights in FOLDER say together: counts, first bad nights, changes since the last green.
+
+    \b
+    Examples:
+      python -m plumbline history nightly
+      python -m plumbline history nightly --key "double-*/mujoco/state/*"
+    """
+    from plumbline.history import History
+
+    told = History(folder).document(pattern)
+    if as_json:
+        click.echo(json.dumps(told, ensure_ascii=False, indent=1))
+        return
+    out = console(sys.stdout)
+    for name, records in (("nights", told["nights"]), ("trend", told.get("trend", []))):
+        table = Table(
+            *(records[0] if records else ()), box=None, pad_edge=False, header_style="bold", title=name
+        )
+        for record in records:
+            table.add_row(
+                *(
+                    "" if v is None else f"{v:.3g}" if isinstance(v, float) else str(v)
+                    for v in record.values()
+                )
+            )
+        if records:
+            out.print(table)
+    lines = [f"damaged, left out: {sentence}" for sentence in told["damaged"]]
+    lines += [f"version: {sentence}" for sentence in told["versions"]]
+    for bad in told["first_bad"]:
+        good = f"last good {bad['last_good']}" if bad["last_good"] else "never good"
+        lines.append(f"{bad['key']} {bad['verdict']} since {bad['first_bad']} ({good}): {bad['reason']}")
+    for change in told["since_green"]:
+        lines.append(
+            f"since the last green {told['last_green']}: {change['key']} {change['was']} → {change['is']}"
+        )
+    for line in lines or ["nothing is bad, nothing changed"]:
+        out.print(line, markup=False)
+
+
+@main.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILE...", type=click.Path(path_type=Path))
 def check(files: tuple[Path, ...]) -> None:
     """Validate scenario files: every problem of every file at once, as file:line:column."""
@@ -469,7 +514,5 @@ def cell_text(rows: list[Any]) -> str:
     open_rows = [r for r in rows if r.known is None] or rows
     worst = min((r.verdict for r in open_rows), key=WORST_FIRST.index)
     agreeing = sum(r.verdict == "agrees" for r in rows)
-    ratios = [
-        r.value / r.tolerance for r in rows if r.value is not None and r.tolerance and r.verdict == "agrees"
-    ]
+    ratios = [r.extra["ratio"] for r in rows if r.verdict == "agrees" and "ratio" in r.extra]
     return f"{GLYPHS[worst]} {agreeing}/{len(rows)}" + (f" {max(ratios):.1g}" if ratios else "")

@@ -132,7 +132,8 @@ def execute(plan: Plan, progress: Progress) -> Result:
 def save(result: Result, folder: Path, command: str) -> None:
     """Store a result in ``folder``."""
     engines = {
-        name: {**asdict(info), "installed": info.missing is None} for name, info in result.engines.items()
+        name: {**asdict(replace(info, python="")), "installed": info.missing is None}
+        for name, info in result.engines.items()
     }
     run = {**result.run, "command": command}
     store.write(folder, run, result.scenarios, engines, result.rows, result.tables)

@@ -1,0 +1,123 @@
+"""Nights in a folder, asked together; a damaged one is named and left out."""
+
+import json
+
+import pytest
+from click.testing import CliRunner
+
+from plumbline import store
+from plumbline.cli import main
+from plumbline.findings import Subject
+from plumbline.history import History
+
+KEY = "s/mujoco/state/-/acceleration"
+
+
+def night(folder, day, verdicts, version="4.0", known=None, family="single"):
+    """A stored run of one scenario per verdict; scenario "s" first, then "s1", …"""
+    rows = []
+    for k, verdict in enumerate(verdicts):
+        who = Subject(f"s{k or ''}", family, "mujoco", "MuJoCo", version)
+        more = {"value": 10.0**-day, "tolerance": 1.0, "known": known}
+        rows.append(who.row("state", "-", "acceleration", verdict, f"it {verdict}", "m/s²", **more))
+    bad = any(v != "agrees" for v in verdicts) and known is None
+    run = {
+        "id": f"2026010{day}T000000Z",
+        "started": f"2026-01-0{day}T00:00:00+00:00",
+        "exit_code": int(bad),
+        "sentence": "",
+        "versions": {"mujoco": version},
+    }
+    store.write(folder / run["id"], run, {}, {}, rows, {})
+
+
+def test_first_bad_night_and_last_green(tmp_path):
+    night(tmp_path, 1, ["disagrees", "agrees"])  # an old trouble that went away
+    night(tmp_path, 2, ["agrees", "agrees"])
+    night(tmp_path, 3, ["agrees", "unresolved"], known="k")  # expected: green
+    night(tmp_path, 4, ["disagrees", "agrees"], version="4.1")
+    night(tmp_path, 5, ["failed", "agrees"], version="4.1")
+    history = History(tmp_path)
+    (found,) = history.first_bad()
+    assert (found["key"], found["first_bad"], found["last_good"]) == (
+        KEY,
+        "20260104T000000Z",
+        "20260103T000000Z",
+    )
+    green, changes = history.since_green()
+    assert green == "20260103T000000Z"
+    assert [(c["key"], c["was"], c["is"]) for c in changes] == [
+        (KEY, "agrees", "failed"),
+        ("s1/mujoco/state/-/acceleration", "unresolved", "agrees"),
+    ]
+    assert [n["bad"] for n in history.overview()] == [1, 0, 0, 1, 1]
+    assert history.version_changes() == ["20260104T000000Z: mujoco 4.0 → 4.1"]
+    assert [t["value"] for t in history.trend("s/mujoco/*")] == [10.0**-d for d in range(1, 6)]
+
+
+def test_a_key_that_was_never_good(tmp_path):
+    night(tmp_path, 1, ["disagrees"])
+    night(tmp_path, 2, ["disagrees"])
+    history = History(tmp_path)
+    assert [(f["first_bad"], f["last_good"]) for f in history.first_bad()] == [("20260101T000000Z", None)]
+    assert history.since_green() == (None, [])
+
+
+def test_random_scenarios_are_counted_only(tmp_path):
+    night(tmp_path, 1, ["agrees", "agrees"], family="random")
+    night(tmp_path, 2, ["disagrees"], family="random")
+    history = History(tmp_path)
+    assert history.first_bad() == [] and history.since_green()[1] == []
+    assert [n["random"] for n in history.overview()] == [2, 1]
+
+
+def spoil_json(folder):
+    (folder / "results.json").write_text("{")
+
+
+def spoil_parquet(folder):
+    path = folder / "summary.parquet"
+    path.write_bytes(path.read_bytes()[:-8])
+
+
+def drop_parquet(folder):
+    (folder / "summary.parquet").unlink()
+
+
+def other_schema(folder):
+    document = json.loads((folder / "results.json").read_text())
+    (folder / "results.json").write_text(json.dumps(document | {"schema_version": 99}))
+
+
+def fewer_rows(folder):
+    document = json.loads((folder / "results.json").read_text())
+    (folder / "results.json").write_text(json.dumps(document | {"rows": []}))
+
+
+@pytest.mark.parametrize("spoil", [spoil_json, spoil_parquet, drop_parquet, other_schema, fewer_rows])
+def test_a_damaged_night_is_named_and_left_out(tmp_path, spoil):
+    for day in (1, 2, 3):
+        night(tmp_path, day, ["agrees"])
+    spoil(tmp_path / "20260102T000000Z")
+    history = History(tmp_path)
+    assert [n.id for n in history.nights] == ["20260101T000000Z", "20260103T000000Z"]
+    assert len(history.damaged) == 1 and history.damaged[0].startswith("20260102T000000Z: ")
+
+
+def test_an_empty_folder_has_no_nights(tmp_path):
+    document = History(tmp_path).document("*")
+    assert document.pop("last_green") is None
+    assert set(document) == {"nights", "damaged", "versions", "first_bad", "since_green", "trend"}
+    assert all(part == [] for part in document.values())
+
+
+def test_the_command_says_it(tmp_path):
+    night(tmp_path / "history", 1, ["agrees"])
+    night(tmp_path / "history", 2, ["disagrees"])
+    said = CliRunner().invoke(main, ["history", str(tmp_path)])
+    assert said.exit_code == 0, said.output
+    assert f"{KEY} disagrees since 20260102T000000Z" in " ".join(said.output.split())
+    data = CliRunner().invoke(main, ["history", str(tmp_path), "--key", "s/*", "--json"])
+    assert len(json.loads(data.output)["trend"]) == 2
+    nothing = CliRunner().invoke(main, ["history", str(tmp_path / "absent")])
+    assert nothing.exit_code == 2

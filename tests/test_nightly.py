@@ -1,0 +1,114 @@
+"""The nightly: random scenarios that are the same again, a whole folder per night, and what is left over."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plumbline import nightly, scenario
+from plumbline.history import History
+from plumbline.nightly import Night
+from plumbline.random_scenarios import FAMILY, MOST_BODIES, document, random_scenario, random_scenarios
+from plumbline.workers import Limits
+
+
+def quiet(*_):
+    pass
+
+
+def test_a_random_scenario_depends_on_its_seed_and_number_alone():
+    first = list(random_scenarios(5, 12))
+    assert [s.digest for s in first] == [random_scenario(5, k).digest for k in range(12)]
+    assert first[3].digest != random_scenario(6, 3).digest
+    assert len({s.digest for s in first}) == 12
+
+
+def test_random_scenarios_cover_what_they_promise():
+    drawn = list(random_scenarios(1, 300))
+    mass = np.concatenate([s.model.mass for s in drawn])
+    assert {s.model.n for s in drawn} == set(range(1, MOST_BODIES + 1))
+    assert mass.min() < 1e-2 and mass.max() > 1e2
+    assert any(s.model.has_loads for s in drawn) and any(s.model.has_drag for s in drawn)
+    rods = np.concatenate([s.model.rods for s in drawn])
+    assert 0.3 < rods.mean() < 0.5
+    off_diagonal = np.concatenate([s.model.inertia[:, [0, 0, 1], [1, 2, 2]] for s in drawn])
+    assert np.all(off_diagonal != 0)
+
+
+def test_a_random_scenario_is_a_file_like_any_other(tmp_path):
+    path = tmp_path / "some.yaml"
+    path.write_text(json.dumps(document(3, 4)))
+    assert scenario.load(path).digest == random_scenario(3, 4).digest
+
+
+def run(out, **more):
+    chosen = scenario.load_many(["rest"])
+    options = {"random": 3, "seed": 11, "jobs": 1, "limits": Limits(), "whole": False, "finer": 0} | more
+    progress = options.pop("progress", quiet)
+    return nightly.nightly(
+        out, chosen, ["mujoco"], command="-", progress=progress, tell=quiet, **options
+    )  # fmt: skip
+
+
+def test_a_night_is_whole_and_remembered(tmp_path):
+    result, place = run(tmp_path)
+    assert {p.name for p in place.iterdir()} >= {
+        "results.json", "summary.parquet", "states.parquet", "curves.parquet", "junit.xml", "report.html", "summary.md",
+    }  # fmt: skip
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["history"]
+    stored = json.loads((place / "results.json").read_text())["run"]
+    assert (stored["seed"], stored["random"]) == (11, 3)
+    assert {r.scenario for r in result.rows if r.family == FAMILY} == {f"random-11-{k}" for k in range(3)}
+    assert all(r.level == "state" for r in result.rows if r.family == FAMILY)
+    assert {r.level for r in result.rows if r.scenario == "rest"} == {"state", "trajectory", "invariants"}
+    (seen,) = History(tmp_path).overview()
+    assert seen["id"] == place.name and seen["random"] == 3
+
+
+class Killed(Exception):
+    pass
+
+
+def test_an_unfinished_night_goes_on_with_its_seed(tmp_path):
+    def progress(done, *_):
+        if done == 4:
+            raise Killed
+
+    with pytest.raises(Killed):
+        run(tmp_path, seed=None, progress=progress)
+    begun = json.loads((tmp_path / "unfinished" / "plan.json").read_text())
+    assert not (tmp_path / "history").exists()
+    kept = sorted(tmp_path.glob("unfinished/cells/*.cell"))
+    assert len(kept) == 4
+    for path in kept:  # what is kept is used: no cell of it is written again
+        path.chmod(0o400)
+    result, _ = run(tmp_path, seed=None)
+    assert result.run["seed"] == begun["seed"] and result.run["started"] == begun["started"]
+    calm, _ = run(tmp_path / "calm", seed=begun["seed"])
+    assert [(r.key, r.value, r.verdict) for r in result.rows] == [
+        (r.key, r.value, r.verdict) for r in calm.rows
+    ]
+
+
+@pytest.mark.parametrize("spoilt", ["", "{", '{"seed": 1}', "[]"])
+def test_a_damaged_plan_begins_a_new_night(tmp_path, spoilt):
+    (tmp_path / "plan.json").write_text(spoilt)
+    night = Night.begun(tmp_path, None, 7)
+    assert Night.begun(tmp_path, None, 7) == night
+    assert Night.begun(tmp_path, night.seed + 1, 7) != night
+
+
+def test_a_file_is_kept_of_what_does_not_agree(tmp_path):
+    from plumbline.findings import Subject
+    from plumbline.run import Result
+
+    drawn = list(random_scenarios(2, 2))
+    rows = [
+        Subject(s.name, FAMILY, "mujoco", "MuJoCo", "4").row("state", "-", "acceleration", verdict, "why")
+        for s, verdict in zip(drawn, ("agrees", "disagrees"), strict=True)
+    ]
+    folder = Path(tmp_path)
+    nightly.write_files_of_random(Result(rows, [], {}, {}, {}, {}), drawn, folder)
+    (path,) = folder.iterdir()
+    assert scenario.load(path).digest == drawn[1].digest

@@ -1,0 +1,154 @@
+"""Other versions of an engine: names, the other environment's process, and what is supported."""
+
+import ctypes
+import operator
+import os
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import psutil
+import pytest
+from packaging.version import Version
+
+from plumbline import known, scenario, versions, work
+from plumbline.findings import Subject
+from plumbline.registry import ENGINES
+from plumbline.run import Plan, execute
+from plumbline.workers import Limits, Task, Workers
+
+HERE = sys.executable  # the installed environment stands for another one: the way there and back is the same
+
+
+def quiet(*_):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("mujoco", None),
+        ("mujoco@3.12.0", None),
+        ("mujoco@4.0.0rc1", None),
+        ("pinocchio-aba@latest", None),
+        ("exudyn@pre", None),
+        ("mujoco@", "is not a version"),
+        ("mujoco@newest", "is not a version"),
+        ("mujoco@absent-1.0-py3-none-any.whl", "there is no file"),
+        ("mujoco@some.whl", "Invalid wheel filename"),
+    ],
+)
+def test_the_version_part_of_a_name(name, words):
+    found = versions.problem_of(name)
+    assert found is None if words is None else words in found
+
+
+@pytest.mark.parametrize("engine", [e for e in ENGINES if e != "reference"])
+def test_what_an_adapter_declares_is_read_without_importing_it(engine):
+    from plumbline.registry import adapter
+
+    found = adapter(engine)
+    assert versions.declared(engine, "package") == found.package
+    assert tuple(versions.declared(engine, "needs") or ()) == found.needs
+    assert work.describe(engine).missing is None, "the installed version is in the declared range"
+
+
+def test_a_version_out_of_range_says_so(monkeypatch):
+    from adapters.mujoco_engine import Mujoco
+
+    monkeypatch.setattr(Mujoco, "supported", "<1")
+    assert "supports versions <1 of mujoco, this is" in work.describe("mujoco").missing
+
+
+def test_known_entries_hold_for_an_engine_in_any_version_of_their_range():
+    entry = known.Entry(
+        id="a", scenario="*", engine="mujoco", versions="<4", verdict="disagrees", evidence="e", reason="r"
+    )
+    row = Subject("s", "f", "mujoco@3.12.0", "MuJoCo", "3.12.0").row(
+        "trajectory", "RK4", "order", "disagrees", ""
+    )
+    assert entry.covers(row) and not entry.covers(replace(row, engine_version="4.0.0"))
+    assert not entry.covers(replace(row, engine="mujocox"))
+
+
+# --- the other environment's process -----------------------------------------------------------
+
+
+def there(key, call, *arguments, limits=None):
+    return Task(key, call, arguments, limits or Limits(30, 4), python=HERE)
+
+
+def test_losses_over_there_are_told_like_those_here():
+    tasks = [
+        there("a", operator.mul, 1, 2), there("pid", os.getpid), there("noise", print, "x" * 100_000),
+        there("segfault", ctypes.string_at, 0), there("b", operator.mul, 2, 2),
+        there("devour", bytearray, 64 * 2**30),
+        there("complain", operator.getitem, {}, "no"), there("hang", time.sleep, 600, limits=Limits(3, 4)),
+        there("c", operator.mul, 3, 2), there("pid2", os.getpid),
+    ]  # fmt: skip
+    with Workers(1, Limits(30, 4)) as workers:
+        found = {o.key: o for o in workers.run(tasks)}
+    lost = {key: o.lost for key, o in found.items() if o.lost}
+    assert lost.pop("segfault") == "crashed: the worker died of SIGSEGV"
+    assert lost.pop("complain") == "KeyError: 'no'"
+    assert "out of memory" in lost.pop("devour")
+    assert "hung" in lost.pop("hang")
+    assert not lost
+    assert [found[key].value for key in "abc"] == [2, 4, 6]
+    alive = [psutil.Process(p) for p in (found["pid"].value, found["pid2"].value) if psutil.pid_exists(p)]
+    assert not psutil.wait_procs(alive, timeout=10)[1], "a child outlived its worker"
+
+
+def test_an_engine_says_the_same_in_both_places():
+    s = scenario.load_many(["double-tumbling-balls"])[0]
+    with Workers(1) as workers:
+        here, away = (
+            o.value.quantities[0]
+            for python in ("", HERE)
+            for o in workers.run([Task("k", work.evaluate, ("mujoco", s.model, [s.state]), python=python)])
+        )
+    assert np.array_equal(here.acceleration, away.acceleration)
+    assert np.array_equal(here.mass_matrix, away.mass_matrix)
+
+
+# --- real versions: fetched once, then from the cache ------------------------------------------
+
+OLD = [
+    "mujoco@3.2.0", "mujoco@3.3.0", "mujoco@3.12.0", "pinocchio@3.3.1", "pinocchio@3.9.0", "pinocchio@4.0.0",
+    "pinocchio-aba@3.3.1", "pinocchio-maximal@3.9.0", "exudyn@1.9.0", "exudyn@1.10.0", "exudyn@1.11.0",
+    "exudyn-tree@1.9.0",
+]  # fmt: skip
+
+
+@pytest.mark.full
+@pytest.mark.timeout(1800)
+def test_the_supported_versions_work_beside_the_installed_ones(tmp_path):
+    chosen = scenario.load_many(["tumbling-ball", "tumbling-rod"])
+    result = execute(Plan(chosen, ["mujoco", *OLD], limits=Limits(600)), quiet)
+    for name in OLD:
+        assert result.engines[name].missing is None
+        assert Version(result.engines[name].version) == Version(name.partition("@")[2])
+    wrong = {r.key: r for r in result.rows if r.verdict in ("disagrees", "failed")}
+    old = {f"{s.name}/{name}/trajectory/RK4/order" for s in chosen for name in OLD if "mujoco" in name}
+    assert wrong.keys() == old, "MuJoCo's RK4 is of order 2 before 4.0, and nothing else differs"
+    assert all(1.9 < wrong[key].order < 2.1 for key in old)
+
+
+@pytest.mark.full
+@pytest.mark.timeout(900)
+def test_a_version_that_cannot_be_had_is_a_verdict():
+    chosen = scenario.load_many(["rest"])
+    result = execute(Plan(chosen, ["mujoco@99.0.0", "mujoco@3.1.6"], "state"), quiet)
+    absent, refused = result.rows
+    assert absent.verdict == "not installed" and "99.0.0" in absent.reason
+    assert refused.verdict == "unsupported" and "supports versions >=3.2" in refused.reason
+
+
+def test_a_bad_version_is_bad_usage():
+    done = subprocess.run(
+        [HERE, "-m", "plumbline", "run", "rest", "--engine", "mujoco@three"],
+        cwd=versions.ROOT, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 2 and "'three' is not a version" in done.stderr
