@@ -1,0 +1,124 @@
+"""`python -m bench.figures FILE.json [FOLDER]`: the goals with what was measured, and the picture.
+
+Reads what pytest-benchmark stored; writes figures.json and work-precision.svg into the folder (the
+file's own where none is given) and prints the table.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import escape
+
+import numpy as np
+
+COLOURS = ("#0b6e99", "#7a4fa3", "#b85c00", "#2e7d32", "#b3261e", "#5d6b7a", "#8a6d00", "#c2185b", "#00796b")
+
+
+def goals(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The goals whose measurement is among ``found``: what, goal, measured (a ratio or exponent)."""
+
+    def pick(kind: str, **where: Any) -> dict[str, Any] | None:
+        fits = (r for r in found if r["kind"] == kind and all(r.get(k) == v for k, v in where.items()))
+        return next(fits, None)
+
+    table: list[tuple[str, float, dict[str, Any] | None, tuple[str, str]]] = [
+        ("right-hand side over SuperLU's solve of the same S, N = 1000", 0.3,
+         pick("single", bodies=1000, joints="balls"), ("ratio", "superlu")),
+        ("right-hand side over MuJoCo's forward, N = 100", 0.25,
+         pick("single", bodies=100, joints="balls"), ("ratio", "mujoco")),
+        ("right-hand side over Pinocchio's aba, N = 100", 4,
+         pick("single", bodies=100, joints="balls"), ("ratio", "pinocchio")),
+        ("per state in a batch of 256, one body, over MuJoCo's forward", 1,
+         pick("batch", bodies=1, batch=256), ("ratio", "mujoco")),
+        ("per state in a batch of 256, one body, over Pinocchio's aba", 2.5,
+         pick("batch", bodies=1, batch=256), ("ratio", "pinocchio")),
+        ("error 1e-10 at 2 s, two balls: CPU time over the best engine's own integrator", 1,
+         pick("work-precision", batch=1), ("ratio to the best engine", "1e-10")),
+        ("the same in a batch of 64 at 1e-9", 0.4,
+         pick("work-precision", batch=64), ("ratio to the best engine", "1e-09")),
+    ]  # fmt: skip
+    rows = [
+        {"what": what, "goal": goal, "measured": record[group][name]}
+        for what, goal, record, (group, name) in table
+        if record is not None
+    ]
+    for joints in ("balls", "rods"):
+        if record := pick("growth", joints=joints):
+            what = f"growth exponent of the right-hand side, N = 100 → 10,000, {joints}"
+            rows.append({"what": what, "goal": 1.05, "measured": record["exponent"]})
+    return rows
+
+
+def picture(curves: dict[str, list[dict[str, float]]], title: str) -> str:
+    """Work–precision curves as SVG: error (m) falls to the right, CPU time (s) rises; both logarithmic."""
+    points = [p for curve in curves.values() for p in curve if 0 < p["error"] < 1 and p["seconds"] > 0]
+    errors, seconds = ([np.log10(p[k]) for p in points] for k in ("error", "seconds"))
+    left, right = int(np.ceil(max(errors))), int(np.floor(min(errors)))
+    low, high = int(np.floor(min(seconds))), int(np.ceil(max(seconds)))
+    width, height, margin, legend = 760, 440, 56, 250
+
+    def x(error: float) -> float:
+        return margin + (left - np.log10(error)) / (left - right) * (width - margin - legend)
+
+    def y(spent: float) -> float:
+        return height - margin - (np.log10(spent) - low) / (high - low) * (height - 2 * margin)
+
+    out = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" role="img" '
+        f'font-family="system-ui, sans-serif" font-size="12"><title>{escape(title)}</title>',
+        f'<rect width="{width}" height="{height}" fill="#fff"/>',
+        f'<text x="{margin}" y="24" font-size="14">{escape(title)}</text>',
+    ]
+    for k in range(right, left + 1, 2):
+        at = x(10.0**k)
+        out.append(f'<path d="M{at:.1f} {margin}V{height - margin}" stroke="#ddd"/>')
+        out.append(f'<text x="{at:.1f}" y="{height - margin + 18}" text-anchor="middle">1e{k}</text>')
+    for k in range(low, high + 1):
+        at = y(10.0**k)
+        out.append(f'<path d="M{margin} {at:.1f}H{width - legend}" stroke="#ddd"/>')
+        out.append(f'<text x="{margin - 6}" y="{at + 4:.1f}" text-anchor="end">1e{k}</text>')
+    out.append(
+        f'<text x="{(margin + width - legend) / 2}" y="{height - 14}" text-anchor="middle">'
+        "error at 2 s (m)</text>"
+    )
+    out.append(f'<text x="14" y="{margin - 14}">CPU time (s)</text>')
+    for index, (name, curve) in enumerate(curves.items()):
+        colour = COLOURS[index % len(COLOURS)]
+        kept = [p for p in curve if 0 < p["error"] < 1 and p["seconds"] > 0]
+        line = " ".join(f"{x(p['error']):.1f},{y(p['seconds']):.1f}" for p in kept)
+        thick = 3 if name.startswith("reference coll") else 1.5
+        out.append(f'<polyline points="{line}" fill="none" stroke="{colour}" stroke-width="{thick}"/>')
+        out += [
+            f'<circle cx="{x(p["error"]):.1f}" cy="{y(p["seconds"]):.1f}" r="3" fill="{colour}"/>'
+            for p in kept
+        ]
+        at = margin + 20 * index
+        out.append(f'<path d="M{width - legend + 16} {at}h22" stroke="{colour}" stroke-width="{thick}"/>')
+        out.append(f'<text x="{width - legend + 44}" y="{at + 4}">{escape(name)}</text>')
+    return "\n".join([*out, "</svg>"]) + "\n"
+
+
+def main(arguments: list[str]) -> None:
+    """Write and print the figures of a stored run."""
+    stored = Path(arguments[0])
+    folder = Path(arguments[1]) if len(arguments) > 1 else stored.parent
+    found = [b["extra_info"] for b in json.loads(stored.read_text())["benchmarks"] if b["extra_info"]]
+    rows = goals(found)
+    for row in rows:
+        met = "met" if row["measured"] <= row["goal"] else "not met"
+        print(f"{row['what']}: {row['measured']:.3g} (goal {row['goal']:g}, {met})")
+    (folder / "figures.json").write_text(json.dumps({"goals": rows, "records": found}, indent=1) + "\n")
+    for record in found:
+        if record["kind"] == "work-precision":
+            batch = record["batch"]
+            name = "work-precision.svg" if batch == 1 else f"work-precision-{batch}.svg"
+            many = f"a batch of {batch}" if batch > 1 else "one pendulum"
+            title = f"Two bodies on ball joints, {many}: CPU time to an error"
+            (folder / name).write_text(picture(record["curves"], title))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,106 @@
+"""Work–precision: CPU time to come within an error at t = 2 s, integrator by integrator."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from time import process_time
+
+import numpy as np
+
+from adapters.reference_engine import chain
+from plumbline.adapter import Adapter
+from plumbline.kinematics import rate
+from plumbline.records import Array, Model, State
+from reference_impl import integrate as raw
+from reference_impl.collocation import integrate
+
+END = np.array([0.0, 2.0])
+TOLERANCES = (1e-3, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-12)
+
+
+@dataclass(frozen=True)
+class Point:
+    """One run: the resolution it was asked for, its error (m) at the end and its CPU time (s)."""
+
+    resolution: float
+    error: float
+    seconds: float
+
+
+def stacked(states: Sequence[State]) -> tuple[Array, Array, Array, Array]:
+    """r, p, ṙ, ṗ of a batch, body first."""
+    r, p, v = (np.concatenate([getattr(state, name) for state in states]) for name in ("r", "p", "v"))
+    return r, p, v, np.concatenate([rate(state.p, state.omega) for state in states])
+
+
+def truth(model: Model, states: Sequence[State]) -> Array:
+    """(bodies of all states, 3) m at the end, by collocation at the tightest tolerance, one by one."""
+    runs = [integrate([chain(model)], *stacked([state]), END, 1e-14) for state in states]
+    return np.concatenate([run.r[-1] for run in runs])
+
+
+def measure(run: Callable[[], Array], expected: Array, resolution: float, again: int = 3) -> Point:
+    """The best of ``again`` runs."""
+    seconds = []
+    for _ in range(again):
+        start = process_time()
+        found = run()
+        seconds.append(process_time() - start)
+    return Point(resolution, float(np.max(np.linalg.norm(found - expected, axis=-1))), min(seconds))
+
+
+def collocation(model: Model, states: Sequence[State], expected: Array) -> list[Point]:
+    """The reference's collocation on all states in one batch; the time of a run of one step is taken off."""
+    chains, start, points = [chain(model)] * len(states), stacked(states), []
+    for rtol in TOLERANCES:
+
+        def run(until: Array, rtol: float = rtol) -> Array:
+            return integrate(chains, *start, until, rtol, dense=False).r[-1]
+
+        setup = measure(lambda run=run: run(END * 5e-4), expected, rtol).seconds
+        point = measure(lambda run=run: run(END), expected, rtol)
+        points.append(Point(rtol, point.error, point.seconds - setup))
+    return points
+
+
+def dop853(model: Model, states: Sequence[State], expected: Array, structured: bool) -> list[Point]:
+    """The reference's DOP853 on either form, state by state."""
+
+    def run(rtol: float) -> Array:
+        ends = [
+            raw.integrate(chain(model), *stacked([state]), END, rtol, structured=structured).r[-1]
+            for state in states
+        ]
+        return np.concatenate(ends)
+
+    return [measure(lambda rtol=rtol: run(rtol), expected, rtol, 1) for rtol in TOLERANCES[1::2]]
+
+
+def fixed_step(
+    engine: Adapter, integrator: str, model: Model, states: Sequence[State], expected: Array, longest: float
+) -> list[Point]:
+    """An engine's own integrator; the time of building its model (a run of one step) is taken off."""
+    points = []
+    for step in (1.6e-2, 8e-3, 4e-3, 2e-3, 1e-3, 5e-4, 2.5e-4, 1.25e-4, 6.25e-5):
+
+        def run(until: Array, step: float = step) -> Array:
+            runs = [engine.simulate(model, state, until, integrator, step) for state in states]
+            return np.concatenate([run.r[-1] for run in runs])
+
+        setup = measure(lambda step=step: run(np.array([0.0, step])), expected, step, 2).seconds
+        point = measure(lambda: run(END), expected, step, 2)
+        points.append(Point(step, point.error, max(point.seconds - setup, 1e-9)))
+        if point.seconds > longest:
+            break
+    return points
+
+
+def cost(points: Sequence[Point], error: float) -> float:
+    """CPU seconds at which the curve first reaches ``error``, log–log between its points; NaN if never."""
+    for worse, better in pairwise(points):
+        if better.error <= error < worse.error:
+            weight = np.log(error / worse.error) / np.log(better.error / worse.error)
+            return float(np.exp((1 - weight) * np.log(worse.seconds) + weight * np.log(better.seconds)))
+    return points[0].seconds if points and points[0].error <= error else float("nan")
