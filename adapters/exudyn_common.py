@@ -19,6 +19,8 @@ Row = TypeVar("Row")
 SUPPORTED = ">=1.9,<2"
 Raised: type[Exception] = getattr(exudyn, "ExudynError", RuntimeError)  # its own errors, since 1.12
 
+NEWTON = 1e-12  # relative and absolute; at the engine's defaults extrapolation stops at 2e-9
+
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
@@ -44,7 +46,7 @@ def system() -> tuple[Any, Any]:
 
 
 def settings() -> Any:
-    """Fixed steps, Newton to 1e-12, nothing written."""
+    """Fixed steps, Newton to `NEWTON`, nothing written."""
     chosen: Any = exudyn.SimulationSettings()
     if hasattr(chosen, "solution"):
         chosen.solution.file.write = False
@@ -56,7 +58,7 @@ def settings() -> Any:
     time.verboseMode = 0
     time.adaptiveStep = False
     time.automaticStepSize = False
-    time.newton.absoluteTolerance = time.newton.relativeTolerance = 1e-12
+    time.newton.absoluteTolerance = time.newton.relativeTolerance = NEWTON
     time.newton.maxIterations = 100  # its Jacobian leaves out C_qᵀλ's, so that taut rods converge linearly
     return chosen
 

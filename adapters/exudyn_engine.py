@@ -17,6 +17,7 @@ import numpy as np
 import scipy.linalg
 
 from adapters.exudyn_common import (
+    NEWTON,
     SUPPORTED,
     add_loads,
     items,
@@ -85,6 +86,7 @@ class Exudyn(Adapter):
             2,
             (2, 4, 6, 8, 10, 12),
             symmetric=True,
+            solver=NEWTON,
             note="TrapezoidalIndex2: implicit trapezoidal rule, constraints on velocities",
         ),
         Integrator(
@@ -92,6 +94,7 @@ class Exudyn(Adapter):
             "step",
             2,
             (2, 3, 4, 5, 6),
+            solver=NEWTON,
             note="generalized-α with spectral radius 0.9, constraints on positions (index 3)",
         ),
     )

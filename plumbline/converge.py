@@ -15,9 +15,10 @@ import numpy as np
 
 from plumbline.records import Array, Integrator
 
-ORDER_MARGIN = 0.1  # two orders closer than this are the same order (verification.md)
+ORDER_MARGIN = 0.1  # two consecutive orders this near to the declared one show it (verification.md)
+DRIFTS = 3.0  # three consecutive orders show another one if it is this many of their own changes away
 ABOVE_FLOOR = 32.0  # a difference this far above rounding shows its order to 0.05: log2(1 + 1/32)
-LADDER = {1: (9, 15), 2: (8, 12), 4: (7, 12)}  # order: coarsest and finest step, as -log2 of seconds
+LADDER = {1: (9, 15), 2: (8, 12), 4: (5, 12)}  # order: coarsest and finest step, as -log2 of seconds
 BODY_STEPS = 2**19  # most steps × bodies of the finest run of the quick form
 RTOLS = (1e-6, 1e-8, 1e-10, 1e-12)  # tighter, the rounding of engines stalls the step on long chains
 
@@ -47,30 +48,38 @@ class Order:
     """The order that a ladder shows over one window of time."""
 
     value: float | None  # the last trusted order; None where nothing could be observed
-    asymptotic: bool  # two consecutive orders within ORDER_MARGIN of each other, above the floor
+    asymptotic: bool  # two consecutive orders near the declared one, or three that stay away from it
     at_floor: bool  # differences are rounding at every step: there is nothing to observe
     orders: tuple[float, ...]  # all consecutive ones, coarse to fine
     differences: tuple[float, ...]  # between consecutive steps
 
 
-def observed_order(ys: Sequence[Array], floor: float) -> Order:
+def observed_order(ys: Sequence[Array], floor: float, declared: int) -> Order:
     """Order from consecutive differences D_k = max |y_k - y_{k+1}|, log2(D_k / D_{k+1}).
 
     ``ys`` are (T, N, width) samples, coarse to fine; ``floor`` is the size of rounding: a difference
     counts only above `ABOVE_FLOOR` times it, where rounding changes an order by less than half the
-    margin.  The finest pair of consecutive orders that agree is the asymptotic range.
+    margin.  The finest pair of consecutive orders both within `ORDER_MARGIN` of ``declared`` shows that
+    order; else the finest three that change by less than a `DRIFTS`-th of their distance to it show
+    another.  Orders still on their way show nothing.
     """
     differences = [largest(a - b) for a, b in itertools.pairwise(ys)]
     orders = []
     for coarse, fine in itertools.pairwise(differences):
-        usable = np.isfinite(coarse) and fine > ABOVE_FLOOR * floor
+        usable = 0 < coarse < np.inf and fine > ABOVE_FLOOR * floor
         orders.append(float(np.log2(coarse / fine)) if usable else np.nan)
     at_floor = all(d <= ABOVE_FLOOR * floor for d in differences)
-    pairs = [
-        (a, b) for a, b in itertools.pairwise(orders) if abs(a - b) <= ORDER_MARGIN
+    near = [
+        b
+        for a, b in itertools.pairwise(orders)
+        if abs(a - declared) <= ORDER_MARGIN and abs(b - declared) <= ORDER_MARGIN
     ]  # NaN compares false
-    if pairs:
-        return Order(pairs[-1][1], True, False, tuple(orders), tuple(differences))
+    triples = zip(orders, orders[1:], orders[2:], strict=False)
+    other = [
+        c for a, b, c in triples if abs(c - declared) > ORDER_MARGIN + DRIFTS * (abs(b - a) + abs(c - b))
+    ]
+    if near or other:
+        return Order((near or other)[-1], True, False, tuple(orders), tuple(differences))
     finite = [order for order in orders if np.isfinite(order)]
     return Order(finite[-1] if finite else None, False, at_floor, tuple(orders), tuple(differences))
 
@@ -87,31 +96,33 @@ class Limit:
 def romberg(ys: Sequence[Array], powers: Sequence[int]) -> Limit:
     """Extrapolate samples ``ys`` (coarse to fine, steps halving) with errors in h**powers.
 
-    Column m has the first m powers eliminated.  Its uncertainty is the difference of its last two
-    rows: the error of the row before the last, so an overestimate by the next power's factor (column 0
-    of a first-order method, whose factor is 1, takes it twice).  The column with the smallest one is
-    the limit.  Rows that are not finite are left out.
+    Column m has the first m powers eliminated.  Its uncertainty is the larger of the distance to its row
+    before the last and to the column before: the errors of those, so an overestimate where the ladder
+    converges and the size of the noise where it does not (column 0, which has no column before,
+    takes the distance twice).  The column with the smallest one is the limit.  Rows that are not finite
+    are left out.
     """
     finite = [k for k, y in enumerate(ys) if np.all(np.isfinite(y))]
     usable = list(ys[finite[0] :]) if finite and all(k in finite for k in range(finite[0], len(ys))) else []
     if len(usable) < 2:
         raise ValueError("fewer than two finite runs: nothing to extrapolate")
     column = usable
-    best = _limit(column, 0)
+    best = _limit(column, 0, 2 * column[-2] - column[-1])
     for m, power in enumerate(powers[: len(usable) - 2], start=1):
-        factor = 2.0**power - 1.0
+        factor, before = 2.0**power - 1.0, column[-1]
         column = [fine + (fine - coarse) / factor for coarse, fine in itertools.pairwise(column)]
-        candidate = _limit(column, m)
+        candidate = _limit(column, m, before)
         if candidate.uncertainty[-1] < best.uncertainty[-1]:
             best = candidate
     return best
 
 
-def _limit(column: Sequence[Array], m: int) -> Limit:
-    gap = np.max(np.linalg.norm(column[-1] - column[-2], axis=-1), axis=1)
-    return Limit(column[-1], np.maximum.accumulate(gap * (2 if m == 0 else 1)), m)
+def _limit(column: Sequence[Array], m: int, before: Array) -> Limit:
+    """The last of a column, uncertain by its row before the last or by ``before``, whichever is farther."""
+    gaps = [np.max(np.linalg.norm(column[-1] - other, axis=-1), axis=1) for other in (column[-2], before)]
+    return Limit(column[-1], np.maximum.accumulate(np.maximum(*gaps)), m)
 
 
 def tightest(ys: Sequence[Array]) -> Limit:
     """The limit of an adaptive method's ladder: its tightest run, uncertain by the step before it."""
-    return _limit(ys, 1)
+    return _limit(ys, 0, ys[-2])

@@ -135,6 +135,7 @@ class Integrator:
     order: int  # declared order; of the underlying method for kind "tolerance"
     powers: tuple[int, ...] = ()  # exponents of h in the error expansion, ascending
     symmetric: bool = False  # time-symmetric: reversing the velocities retraces the path
+    solver: float = 0.0  # relative tolerance to which an implicit step's equations are solved
     alias_of: str | None = None  # equals that integrator here, so it is not independent evidence
     note: str = ""  # a sentence on what it is
 

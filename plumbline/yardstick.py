@@ -90,10 +90,15 @@ def motion_truth(
 
 
 def reach(model: Model) -> Array:
-    """(N,) m: from where body k hangs to where the next one does, stretched; at least to its centre."""
+    """(N,) m: from where body k hangs to where the next one does, stretched; at least to its centre.
+
+    And at least the body's radius of gyration: a body that hangs at its centre of mass has a size too.
+    """
     span = np.linalg.norm(model.proximal - model.distal, axis=1)
-    span[-1] = np.linalg.norm(model.proximal[-1])
-    return np.asarray(model.length + np.maximum(span, np.linalg.norm(model.proximal, axis=1)))
+    span[-1] = 0.0
+    gyration = np.sqrt(np.trace(model.inertia, axis1=1, axis2=2) / (2 * model.mass))
+    sizes = [span, np.linalg.norm(model.proximal, axis=1), gyration]
+    return np.asarray(model.length + np.max(sizes, axis=0))
 
 
 def visible(model: Model, state: State, times: Array) -> tuple[Array, Array]:

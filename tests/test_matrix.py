@@ -62,6 +62,8 @@ def test_cell(name, engine, level, workers, engines, truths):
     rows = bench.findings().rows
     assert rows, "no answer at all"
     judged = known.excuse(rows, known.load(), whole=False)
-    wrong = [f"{r.key} {r.verdict}: {r.reason}" for r in judged.rows if r.verdict != "agrees" and r.known is None]
+    wrong = [
+        f"{r.key} {r.verdict}: {r.reason}" for r in judged.rows if r.verdict != "agrees" and r.known is None
+    ]
     stale = [f"known entry {e.id} no longer occurs" for e in judged.stale]
     assert not wrong + stale, "\n".join(wrong + stale)

@@ -1,12 +1,15 @@
 """The output folder is whole or as it was; what was written is read back."""
 
+import dataclasses
 import json
 import os
+from pathlib import Path
 
 import pytest
 
 from plumbline import store
 from plumbline.findings import Subject
+from plumbline.records import Row
 
 ROW = Subject("s", "single", "mujoco", "MuJoCo", "4.0").row(
     "state",
@@ -79,3 +82,12 @@ def test_foreign_or_broken_results_are_refused_by_name(tmp_path, text):
 def test_no_results_says_how_to_make_them(tmp_path):
     with pytest.raises(ValueError, match="plumbline run"):
         store.read(tmp_path)
+
+
+def test_the_field_reference_names_every_field_and_column():
+    text = (Path(__file__).parents[1] / "docs" / "results.md").read_text()
+    for field in dataclasses.fields(Row):
+        assert f"`{field.name}`" in text, field.name
+    for name, schema in store.TABLES.items():
+        if name != "summary":
+            assert f"- `{name}`: {', '.join(schema.names)}" in text, name
