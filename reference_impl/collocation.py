@@ -202,11 +202,16 @@ class _Stepper:
         before, rate, converged, count = np.inf, 0.0, False, 0
         hA = h * table.A
         while count < SWEEPS and not converged:
-            V = v0 + hA @ a
-            Q = q0 + hA @ V
+            V = hA @ a
+            V += v0
+            Q = hA @ V
+            Q += q0
             new = self.tiled.acceleration(Q.reshape(7, -1), V.reshape(7, -1), self.baumgarte)
             new = new.reshape(7, S, M)
-            change = h * float(np.max(np.abs(new - a) * weight))
+            a -= new
+            np.abs(a, out=a)
+            a *= weight
+            change = h * float(a.max())
             a, count = new, count + 1
             rate = change / before if count > 1 else 1.0
             # Quiet at the floor that rounding in a sets: no sweep improves on it.
