@@ -8,7 +8,8 @@ import os
 import shlex
 import sys
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from plumbline.exact import NotThatMotion, solution
 from plumbline.problems import Problem, ScenarioError
 from plumbline.registry import ENGINES
 from plumbline.run import Plan, Result, describe_all, execute, save
-from plumbline.store import plain, row_record
+from plumbline.store import plain, read, row_record
 from plumbline.workers import Limits, Workers
 
 DEFAULT_OUT = Path("reports") / "out"
@@ -36,6 +37,7 @@ Exit codes:
   1  a disagreement, or a cell unresolved or unsupported that is not recorded
   2  bad usage or a bad scenario file
   3  an engine failed: raised, crashed, hung, ran out of memory, was not finite
+  4  the machine failed: disk full, input/output error; the same command goes on from there
 An engine that is not installed is a verdict and changes no exit code.
 """
 
@@ -187,15 +189,16 @@ def run(
         whole=whole,
         memory=cells,
     )
-    with progress_to(sys.stderr) as progress:
-        result = execute(plan, progress)
-    save(result, folder, shlex.join(["python", "-m", "plumbline", *sys.argv[1:]]))
-    cells.clear()
     from reports import junit, page, step_summary
 
-    report = page.write(folder)
-    junit.write(folder)
-    step_summary.write(folder)
+    with machine_faults_told():
+        with progress_to(sys.stderr) as progress:
+            result = execute(plan, progress)
+        save(result, folder, shlex.join(["python", "-m", "plumbline", *sys.argv[1:]]))
+        report = page.write(folder)
+        junit.write(folder)
+        step_summary.write(folder)
+        cells.clear()
     if as_json:
         document = {
             "run": result.run,
@@ -205,7 +208,7 @@ def run(
         click.echo(json.dumps(plain(document), ensure_ascii=False, indent=1))
     else:
         tell(result)
-    click.echo(f"report: {report}", err=as_json)
+    click.echo(f"report: {written}", err=as_json)
     sys.exit(result.run["exit_code"])
 
 
@@ -260,7 +263,7 @@ def nightly(
     from plumbline.nightly import nightly as run_night
 
     chosen, chosen_engines, folder = choose_scenarios(names, ()), choose_engines(engines), writable(out)
-    with progress_to(sys.stderr) as progress:
+    with machine_faults_told(), progress_to(sys.stderr) as progress:
         result, place = run_night(
             folder, chosen, chosen_engines, random=count, seed=seed, jobs=jobs or os.cpu_count() or 1,
             limits=Limits(timeout, memory), whole=not names and not engines, finer=finer, progress=progress,
@@ -354,6 +357,33 @@ def history(folder: Path, pattern: str | None, as_json: bool) -> None:
 
 
 @main.command()
+@click.argument("folder", default=DEFAULT_OUT, type=click.Path(path_type=Path))
+@click.option(
+    "--history",
+    "nights",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    default=None,
+    help="Folder of earlier nights: adds trends and the comparison with the last green one.",
+)
+def report(folder: Path, nights: Path | None) -> None:
+    """Write report.html, junit.xml and summary.md again, from the results stored in FOLDER."""
+    try:
+        read(folder)
+    except ValueError as error:
+        raise click.UsageError(str(error)) from None
+    click.echo(f"report: {render(writable(folder), nights)}")
+
+
+def render(folder: Path, nights: Path | None = None) -> Path:
+    """Write what is made from stored results; returns the report's path."""
+    from reports import junit, page, step_summary
+
+    junit.write(folder)
+    step_summary.write(folder)
+    return page.write(folder, nights)
+
+
+@main.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILE...", type=click.Path(path_type=Path))
 def check(files: tuple[Path, ...]) -> None:
     """Validate scenario files: every problem of every file at once, as file:line:column."""
@@ -432,6 +462,17 @@ def writable(folder: Path) -> Path:
     except OSError as error:
         raise click.BadParameter(f"cannot write to {folder}: {error.strerror}", param_hint="--out") from None
     return folder
+
+
+@contextmanager
+def machine_faults_told() -> Iterator[None]:
+    """A write that fails ends the run with exit code 4 and says how to go on; finished cells are kept."""
+    try:
+        yield
+    except OSError as error:
+        click.echo(f"stopped by the machine: {error}", err=True)
+        click.echo("What is finished is kept: the same command goes on from there.", err=True)
+        sys.exit(4)
 
 
 # --- telling ----------------------------------------------------------------------------------

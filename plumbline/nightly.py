@@ -10,6 +10,7 @@ Killed at any moment, the same command reads the plan and goes on; a folder in h
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import secrets
@@ -22,7 +23,7 @@ from pathlib import Path
 from plumbline import scenario as scenarios
 from plumbline.cells import Cells
 from plumbline.random_scenarios import FAMILY, random_scenarios
-from plumbline.run import Plan, Progress, Result, execute, save
+from plumbline.run import Levels, Plan, Progress, Result, execute, save
 from plumbline.store import write_atomically
 from plumbline.workers import Limits
 
@@ -70,6 +71,7 @@ def nightly(
     whole: bool,
     command: str,
     finer: int = FINER,
+    level: Levels = "all",
     progress: Progress,
     tell: Callable[[str], None],
 ) -> tuple[Result, Path]:
@@ -84,6 +86,7 @@ def nightly(
     plan = Plan(
         [*chosen, *drawn],
         engines,
+        level,
         jobs=jobs,
         limits=limits,
         finer=finer,
@@ -98,11 +101,17 @@ def nightly(
     save(result, folder, command)
     write_files_of_random(result, drawn, folder / "scenarios")
     write_reports(folder, out / "history")
-    place = out / "history" / result.run["id"]
+    place = free(out / "history" / result.run["id"])
     place.parent.mkdir(exist_ok=True)
     os.replace(folder, place)
     shutil.rmtree(unfinished)
     return result, place
+
+
+def free(place: Path) -> Path:
+    """``place``, or with a number after it where a clock that was set back gave another night its name."""
+    names = itertools.chain([place], (place.with_name(f"{place.name}-{k}") for k in itertools.count(2)))
+    return next(name for name in names if not name.exists())
 
 
 def write_files_of_random(result: Result, drawn: Sequence[scenarios.Scenario], folder: Path) -> None:

@@ -7,6 +7,7 @@ docs/results.md.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import tempfile
@@ -62,7 +63,8 @@ def write_atomically(path: Path, data: bytes) -> None:
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
     except BaseException:
-        os.unlink(temporary)
+        with contextlib.suppress(OSError):  # what stopped the writing may stop this too, and is what to tell
+            os.unlink(temporary)
         raise
 
 

@@ -54,7 +54,8 @@ def run(out, **more):
 def test_a_night_is_whole_and_remembered(tmp_path):
     result, place = run(tmp_path)
     assert {p.name for p in place.iterdir()} >= {
-        "results.json", "summary.parquet", "states.parquet", "curves.parquet", "junit.xml", "report.html", "summary.md",
+        "results.json", "summary.parquet", "states.parquet", "curves.parquet", "junit.xml",
+        "report.html", "summary.md",
     }  # fmt: skip
     assert sorted(p.name for p in tmp_path.iterdir()) == ["history"]
     stored = json.loads((place / "results.json").read_text())["run"]
