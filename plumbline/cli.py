@@ -19,6 +19,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+import reports
 from plumbline import scenario as scenarios
 from plumbline import versions
 from plumbline.cells import Cells
@@ -189,15 +190,11 @@ def run(
         whole=whole,
         memory=cells,
     )
-    from reports import junit, page, step_summary
-
     with machine_faults_told():
         with progress_to(sys.stderr) as progress:
             result = execute(plan, progress)
         save(result, folder, shlex.join(["python", "-m", "plumbline", *sys.argv[1:]]))
-        report = page.write(folder)
-        junit.write(folder)
-        step_summary.write(folder)
+        written = reports.write(folder)
         cells.clear()
     if as_json:
         document = {
@@ -371,16 +368,7 @@ def report(folder: Path, nights: Path | None) -> None:
         read(folder)
     except ValueError as error:
         raise click.UsageError(str(error)) from None
-    click.echo(f"report: {render(writable(folder), nights)}")
-
-
-def render(folder: Path, nights: Path | None = None) -> Path:
-    """Write what is made from stored results; returns the report's path."""
-    from reports import junit, page, step_summary
-
-    junit.write(folder)
-    step_summary.write(folder)
-    return page.write(folder, nights)
+    click.echo(f"report: {reports.write(writable(folder), nights)}")
 
 
 @main.command()

@@ -20,6 +20,7 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+import reports
 from plumbline import scenario as scenarios
 from plumbline.cells import Cells
 from plumbline.random_scenarios import FAMILY, random_scenarios
@@ -100,7 +101,7 @@ def nightly(
     shutil.rmtree(folder, ignore_errors=True)
     save(result, folder, command)
     write_files_of_random(result, drawn, folder / "scenarios")
-    write_reports(folder, out / "history")
+    reports.write(folder, out / "history")
     place = free(out / "history" / result.run["id"])
     place.parent.mkdir(exist_ok=True)
     os.replace(folder, place)
@@ -122,12 +123,3 @@ def write_files_of_random(result: Result, drawn: Sequence[scenarios.Scenario], f
             folder.mkdir(exist_ok=True)
             text = json.dumps(s.document, indent=1)  # JSON is YAML
             write_atomically(folder / f"{s.name}.yaml", text.encode())
-
-
-def write_reports(folder: Path, history: Path) -> None:
-    """Report, JUnit and step summary of a stored run, with the nights before it."""
-    from reports import junit, page, step_summary
-
-    page.write(folder, history)
-    junit.write(folder)
-    step_summary.write(folder)

@@ -53,6 +53,10 @@ def test_a_run_writes_everything_and_exits_by_its_verdict(tmp_path):
     document = json.loads((tmp_path / "o o" / "results.json").read_text())
     assert document["schema_version"] == 1
     assert {row["verdict"] for row in document["rows"]} == {"agrees"}
+    (tmp_path / "o o" / "report.html").unlink()
+    again = plumbline("report", tmp_path / "o o")
+    assert again.returncode == 0, again.stderr
+    assert (tmp_path / "o o" / "report.html").exists()
 
 
 def test_json_is_alone_on_stdout_and_accept_is_shown_beside(tmp_path):
@@ -96,6 +100,7 @@ def test_a_scenario_of_ones_own_by_path_and_a_family(tmp_path):
         (["run", "--accept", "-1"], "accept"),
         (["rnu"], "Did you mean 'run'"),
         (["check"], "FILE"),
+        (["report", "nowhere"], "no results here"),
         (["check", "nowhere.yaml"], "nowhere.yaml"),
     ],
 )
