@@ -1,8 +1,8 @@
 """Known discrepancies and expected gaps: the one file that may excuse a verdict, entry by entry.
 
-known.yaml lists scenario, engine, version range, level, integrator, quantity (patterns with *), the
-expected verdict, its evidence and its reason.  An entry that covers cells of a run and explains none of
-them has had its day and fails.
+known.yaml lists scenario (a name, a pattern with *, or a list of names), engine, version range, level,
+integrator, quantity, the expected verdict, its evidence and its reason.  An entry that covers cells
+of a run and explains none of them has had its day and fails.
 """
 
 from __future__ import annotations
@@ -80,13 +80,22 @@ def load(path: Path = FILE) -> list[Entry]:
     """The entries of a file; ValueError naming file and entry where it is not valid."""
     try:
         raw = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
-        entries = TypeAdapter(list[Entry]).validate_python(raw or [])
+        entries = TypeAdapter(list[Entry]).validate_python(
+            [one for item in raw or [] for one in spread(item)]
+        )
     except (OSError, YAMLError, ValidationError) as error:
         raise ValueError(f"{path}: {error}") from None
-    twice = {e.id for e in entries if sum(e.id == other.id for other in entries) > 1}
+    twice = [e.id for i, e in enumerate(entries) if any(e.id == other.id for other in entries[:i])]
     if twice:
-        raise ValueError(f"{path}: ids used twice: {', '.join(sorted(twice))}")
+        raise ValueError(f"{path}: ids used twice: {', '.join(twice)}")
     return entries
+
+
+def spread(item: object) -> list[object]:
+    """One entry per scenario where the file lists several; each must occur, under an id of its own."""
+    if not isinstance(item, dict) or not isinstance(item.get("scenario"), list):
+        return [item]
+    return [{**item, "scenario": name, "id": f"{item.get('id')}: {name}"} for name in item["scenario"]]
 
 
 def excuse(rows: Iterable[Row], entries: Sequence[Entry], *, whole: bool) -> Judged:

@@ -75,6 +75,12 @@ def test_a_bad_file_is_refused_by_name(tmp_path, text, words):
     assert str(path) in str(caught.value)
 
 
+def test_a_list_of_scenarios_is_an_entry_for_each(tmp_path):
+    path = tmp_path / "known.yaml"
+    path.write_text("- {id: a, scenario: [x, y], engine: z, verdict: failed, evidence: e, reason: r}\n")
+    assert [(e.id, e.scenario) for e in known.load(path)] == [("a: x", "x"), ("a: y", "y")]
+
+
 def test_an_id_twice_is_refused(tmp_path):
     path = tmp_path / "known.yaml"
     line = "- {id: a, scenario: x, engine: y, verdict: failed, evidence: e, reason: r}\n"
