@@ -389,6 +389,39 @@ def schema() -> None:
     click.echo(json.dumps(scenarios.schema(), ensure_ascii=False, indent=1))
 
 
+@main.command()
+@click.argument("result", type=click.Path(path_type=Path, exists=True))
+@click.argument("keys", nargs=-1, metavar="[KEY]...")
+def reproduce(result: Path, keys: tuple[str, ...]) -> None:
+    r"""Write a stand-alone script that shows a disagreement, for the engine's maintainers.
+
+    RESULT is a results folder or its results.json; KEY a row's key. Without KEY the disagreements are listed.
+
+    \b
+    Examples:
+      python -m plumbline reproduce reports/out
+      python -m plumbline reproduce reports/out chain-50-balls/pinocchio-aba/state/-/acceleration
+    """
+    from plumbline import reproduce as scripts
+
+    folder = result if result.is_dir() else result.parent
+    try:
+        if not keys:
+            rows = scripts.disputed(read(folder))
+            for row in rows:
+                click.echo(f"{row['key']}: {row['diagnosis'] or row['reason']}")
+            click.echo(f"{len(rows)} disagreements" if rows else "nothing disagrees", err=True)
+            return
+        told = scripts.write(folder, keys)
+    except ValueError as error:
+        raise click.UsageError(str(error)) from None
+    for key, name in told.items():
+        path = folder / "scripts" / name
+        if not path.is_file():
+            raise click.ClickException(f"{key}: {name}")
+        click.echo(str(path))
+
+
 # --- choosing ---------------------------------------------------------------------------------
 
 

@@ -11,6 +11,7 @@ import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +60,9 @@ def disputed(document: dict[str, Any]) -> list[dict[str, Any]]:
     return [row for row in document["rows"] if row["verdict"] == "disagrees"]
 
 
-def write(folder: Path, keys: Sequence[str] | None = None, limits: Limits | None = None) -> dict[str, str]:
+def write(
+    folder: Path, keys: Sequence[str] | None = None, limits: Limits | None = None, jobs: int = 1
+) -> dict[str, str]:
     """Scripts of rows (all that disagree by default) in folder/scripts; key → file name or why there is none.
 
     One script serves all rows of a cell.  index.json there lists the files by row key.
@@ -67,7 +70,14 @@ def write(folder: Path, keys: Sequence[str] | None = None, limits: Limits | None
     document = store.read(folder)
     rows = [row for row in disputed(document) if keys is None or row["key"] in keys]
     for key in set(keys or ()) - {row["key"] for row in rows}:
-        raise NotReproducible(f"no row {key!r} disagrees here")
+        near = get_close_matches(key, [row["key"] for row in disputed(document)], 1)
+        raise NotReproducible(
+            f"no row {key!r} disagrees here{f'; did you mean {near[0]!r}?' if near else ''}"
+        )
+    scripts = folder / "scripts"
+    if keys is None and scripts.is_dir():  # of an earlier run in the same folder
+        for old in (*scripts.glob("*.py"), *scripts.glob("index.json")):
+            old.unlink()
     told: dict[str, str] = {}
     tasks: list[Task] = []
     cells: dict[tuple[str, str], list[dict[str, Any]]] = {}
@@ -80,19 +90,18 @@ def write(folder: Path, keys: Sequence[str] | None = None, limits: Limits | None
         cell = (row["scenario"], row["engine"])
         cells.setdefault(cell, []).append(row)
         if len(cells[cell]) == 1:
-            tasks.append(Task(cell, shrunk, (row["engine"].split("@")[0], *case), limits or Limits()))
+            tasks.append(Task(cell, shrunk, (row["engine"], *case), limits or Limits()))
     if not tasks:
         return told
-    scripts = folder / "scripts"
     scripts.mkdir(exist_ok=True)
-    with Workers(1, limits) as workers:
+    with Workers(jobs, limits) as workers:
         for outcome in workers.run(tasks):
             for row in cells[outcome.key]:
                 if not isinstance(outcome.value, Shown):
                     told[row["key"]] = outcome.lost or "asked again, the engine agrees: nothing to show"
                     continue
                 name = file_name(cells[outcome.key][0]["key"])
-                text = script(row["engine"].split("@")[0], outcome.value, cells[outcome.key][0])
+                text = script(row["engine"], outcome.value, cells[outcome.key][0])
                 store.write_atomically(scripts / name, text.encode())
                 told[row["key"]] = name
     index = {key: name for key, name in told.items() if (scripts / name).is_file()}
@@ -105,7 +114,9 @@ def write(folder: Path, keys: Sequence[str] | None = None, limits: Limits | None
 
 def found(document: dict[str, Any], row: dict[str, Any]) -> tuple[Model, State]:
     """Model and state of a row of results.json; NotReproducible where there is no single state to show."""
-    engine = row["engine"].split("@")[0]
+    engine = row["engine"]
+    if "@" in engine:
+        raise NotReproducible(f"{engine} runs in an environment of its own, which scripts are not made in")
     if row["level"] != "state":
         raise NotReproducible("only state-level rows have a script: there is no single state in a trajectory")
     if engine not in ENGINE_LINES:
@@ -149,7 +160,7 @@ def shrunk(engine: str, model: Model, state: State) -> Shown | None:
     best = shown(engine, model, state)
     if best is None or best.ratio <= 1:
         return None
-    enough = max(min(best.ratio / 2, PLAIN), 1.0)
+    enough = best.ratio
 
     def take(candidate: tuple[Model, State]) -> bool:
         nonlocal best
@@ -159,16 +170,11 @@ def shrunk(engine: str, model: Model, state: State) -> Shown | None:
         best = case
         return True
 
-    def simplify() -> None:
-        assert best is not None
+    for goal in (100 * PLAIN, PLAIN):  # in two rounds: each simplification may cost some of what is shown
+        enough = max(min(best.ratio / 2, goal), 1.0)
+        any(take(part) for part in fewer(best.model, best.state))
         for change in simpler(best.model):
             take(change(best.model, best.state))
-
-    simplify()  # before bodies are taken away: each simplification may cost some of what is shown
-    for part in fewer(best.model, best.state):
-        if take(part):
-            break
-    simplify()
     return best
 
 

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from plumbline import known, store, versions, work, yardstick
+from plumbline import known, reproduce, store, versions, work, yardstick
 from plumbline.converge import ladder
 from plumbline.exact import solution
 from plumbline.findings import Findings, Subject
@@ -130,13 +130,14 @@ def execute(plan: Plan, progress: Progress) -> Result:
 
 
 def save(result: Result, folder: Path, command: str) -> None:
-    """Store a result in ``folder``."""
+    """Store a result in ``folder``, with a script for every disagreement that one can be made of."""
     engines = {
         name: {**asdict(replace(info, python="")), "installed": info.missing is None}
         for name, info in result.engines.items()
     }
     run = {**result.run, "command": command}
     store.write(folder, run, result.scenarios, engines, result.rows, result.tables)
+    reproduce.write(folder)
 
 
 class Bench:
@@ -263,6 +264,7 @@ class Bench:
             "exact": s.exact,
             "digest": s.digest,
             "model": {key: np.asarray(value).tolist() for key, value in vars(s.model).items()},
+            "state": {key: getattr(s.state, key).tolist() for key in ("p", "omega", "u", "udot")},
         }
         if isinstance(truth, MotionTruth):
             about |= {
