@@ -160,7 +160,7 @@ def shrunk(engine: str, model: Model, state: State) -> Shown | None:
     best = shown(engine, model, state)
     if best is None or best.ratio <= 1:
         return None
-    enough = best.ratio
+    most = enough = best.ratio
 
     def take(candidate: tuple[Model, State]) -> bool:
         nonlocal best
@@ -171,7 +171,7 @@ def shrunk(engine: str, model: Model, state: State) -> Shown | None:
         return True
 
     for goal in (100 * PLAIN, PLAIN):  # in two rounds: each simplification may cost some of what is shown
-        enough = max(min(best.ratio / 2, goal), 1.0)
+        enough = max(min(most / 2, goal), 1.0)
         any(take(part) for part in fewer(best.model, best.state))
         for change in simpler(best.model):
             take(change(best.model, best.state))
