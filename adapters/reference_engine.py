@@ -35,6 +35,7 @@ class Reference(Adapter):
             "dop853",
             "tolerance",
             8,
+            tightest=1e-13,
             note="scipy's DOP853 on y = (r, p, ṙ, ṗ), no stabilisation; resolution is rtol, atol is rtol "
             "times the natural size of each part of y",
         ),
@@ -43,6 +44,7 @@ class Reference(Adapter):
             "tolerance",
             32,
             symmetric=True,
+            tightest=1e-14,
             note="16-point Gauss–Legendre collocation by Picard sweeps on the structured form of the same "
             "equations, no stabilisation; resolution is rtol of the dense output",
         ),

@@ -20,7 +20,7 @@ DRIFTS = 3.0  # three consecutive orders show another one if it is this many of 
 ABOVE_FLOOR = 32.0  # a difference this far above rounding shows its order to 0.05: log2(1 + 1/32)
 LADDER = {1: (9, 15), 2: (8, 12), 4: (5, 12)}  # order: coarsest and finest step, as -log2 of seconds
 BODY_STEPS = 2**19  # most steps × bodies of the finest run of the quick form
-RTOLS = (1e-6, 1e-8, 1e-10, 1e-12)  # tighter, the rounding of engines stalls the step on long chains
+RTOLS = (1e6, 1e4, 1e2, 1.0)  # relative tolerances of an adaptive method, over its tightest
 
 
 def ladder(integrator: Integrator, bodies: int, duration: float, finer: int = 0) -> list[float]:
@@ -30,7 +30,7 @@ def ladder(integrator: Integrator, bodies: int, duration: float, finer: int = 0)
     the work of the finest run would pass `BODY_STEPS`, always leaving four steps.
     """
     if integrator.kind == "tolerance":
-        return list(RTOLS)
+        return [integrator.tightest * factor for factor in RTOLS]
     coarse, fine = LADDER[integrator.order]
     affordable = int(np.floor(np.log2(BODY_STEPS / (bodies * max(duration, 1.0)))))
     fine = max(min(fine, affordable), coarse + 3) + finer
@@ -60,8 +60,7 @@ def observed_order(ys: Sequence[Array], floor: float, declared: int) -> Order:
     ``ys`` are (T, N, width) samples, coarse to fine; ``floor`` is the size of rounding: a difference
     counts only above `ABOVE_FLOOR` times it, where rounding changes an order by less than half the
     margin.  The finest pair of consecutive orders both within `ORDER_MARGIN` of ``declared`` shows that
-    order; else the finest three that change by less than a `DRIFTS`-th of their distance to it show
-    another.  Orders still on their way show nothing.
+    order; else the finest three may (`approached`).
     """
     differences = [largest(a - b) for a, b in itertools.pairwise(ys)]
     orders = []
@@ -74,14 +73,30 @@ def observed_order(ys: Sequence[Array], floor: float, declared: int) -> Order:
         for a, b in itertools.pairwise(orders)
         if abs(a - declared) <= ORDER_MARGIN and abs(b - declared) <= ORDER_MARGIN
     ]  # NaN compares false
-    triples = zip(orders, orders[1:], orders[2:], strict=False)
-    other = [
-        c for a, b, c in triples if abs(c - declared) > ORDER_MARGIN + DRIFTS * (abs(b - a) + abs(c - b))
-    ]
-    if near or other:
-        return Order((near or other)[-1], True, False, tuple(orders), tuple(differences))
+    trusted = [k for k, order in enumerate(orders) if np.isfinite(order)]
+    last = orders[trusted[-1] - 2 : trusted[-1] + 1] if trusted and trusted[-1] >= 2 else []
+    shown = near[-1] if near else approached(last, declared)
+    if shown is not None:
+        return Order(shown, True, False, tuple(orders), tuple(differences))
     finite = [order for order in orders if np.isfinite(order)]
     return Order(finite[-1] if finite else None, False, at_floor, tuple(orders), tuple(differences))
+
+
+def approached(last: Sequence[float], declared: int) -> float | None:
+    """The order that the three finest orders lead to, or None while they lead nowhere.
+
+    Observed orders are off by c h + …: where two halvings of the step have each about halved what is
+    left, another halving is foreseen; where three stay away by many times their own changes, it is
+    another order.
+    """
+    if len(last) < 3 or not np.all(np.isfinite(last)):
+        return None
+    left = np.asarray(last) - declared
+    halved = bool(np.all(np.abs(left[1:] / left[:-1] - 0.5) <= 0.2))
+    if halved and abs(left[2]) <= 2 * ORDER_MARGIN:
+        return float(2 * last[2] - last[1])
+    changes = abs(last[1] - last[0]) + abs(last[2] - last[1])
+    return float(last[2]) if abs(left[2]) > ORDER_MARGIN + DRIFTS * changes else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,8 @@
 """Known discrepancies and expected gaps: the one file that may excuse a verdict, entry by entry.
 
-known.yaml lists scenario (a name, a pattern with *, or a list of names), engine, version range, level,
-integrator, quantity, the expected verdict, its evidence and its reason.  An entry that covers cells
-of a run and explains none of them has had its day and fails.
+known.yaml lists scenario, engine, version range, level, integrator, quantity (patterns with *;
+scenario, integrator and quantity may be lists), the expected verdict, its evidence and its reason.
+An entry that covers cells of a run and explains none of them has had its day and fails.
 """
 
 from __future__ import annotations
@@ -92,17 +92,20 @@ def load(path: Path = FILE) -> list[Entry]:
 
 
 def spread(item: object) -> list[object]:
-    """One entry per scenario where the file lists several; each must occur, under an id of its own."""
-    if not isinstance(item, dict) or not isinstance(item.get("scenario"), list):
-        return [item]
-    return [{**item, "scenario": name, "id": f"{item.get('id')}: {name}"} for name in item["scenario"]]
+    """One entry for each scenario, integrator or quantity of a list, with an id of its own: each must occur."""
+    for field in ("scenario", "integrator", "quantity"):
+        if isinstance(item, dict) and isinstance(item.get(field), list):
+            each = [{**item, field: name, "id": f"{item.get('id')}: {name}"} for name in item[field]]
+            return [one for entry in each for one in spread(entry)]
+    return [item]
 
 
-def excuse(rows: Iterable[Row], entries: Sequence[Entry], *, whole: bool) -> Judged:
+def excuse(rows: Iterable[Row], entries: Sequence[Entry], *, whole: bool, finer: bool = False) -> Judged:
     """Mark rows that an entry expects; with ``whole`` (a run of the full matrix) find stale entries.
 
     Where only a part of the matrix ran, an entry is stale if it covers rows that ran and excuses none
     and has no pattern in its scenario: a pattern may have its case among the cells that did not run.
+    ``finer`` ladders than the usual ones may resolve what is recorded as unresolved.
     """
     marked, used, covered = [], set(), set()
     for row in rows:
@@ -115,6 +118,9 @@ def excuse(rows: Iterable[Row], entries: Sequence[Entry], *, whole: bool) -> Jud
     stale = [
         e
         for e in entries
-        if e.id not in used and e.id in covered and (whole or not set("*?[") & set(e.scenario))
+        if e.id not in used
+        and e.id in covered
+        and not (finer and e.verdict == "unresolved")
+        and (whole or not set("*?[") & set(e.scenario))
     ]
     return Judged(marked, stale)

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plumbline.converge import ladder, observed_order, romberg
+from plumbline.converge import approached, ladder, observed_order, romberg
 from plumbline.records import Integrator
 
 TIMES = np.linspace(0, 2, 17)
@@ -41,6 +41,22 @@ def test_order_two_under_an_order_four_name_is_seen_as_two():
     seen = observed_order(ys, 1e-16, 4)
     assert seen.asymptotic
     assert seen.value == pytest.approx(2, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("last", "shown"),
+    [
+        ((4.55, 4.3, 4.15), 4.0),  # each halving of the step halves what is left
+        ((2.1, 2.05, 2.02), 2.02),  # stays away from 4
+        ((4.38, 4.5, 4.3), None),
+        ((3.6, 3.7, 3.78), None),
+        ((float("nan"), 4.3, 4.15), None),
+        ((4.3, 4.15), None),
+    ],
+)
+def test_what_three_orders_lead_to(last, shown):
+    found = approached(last, 4)
+    assert found == (None if shown is None else pytest.approx(shown))
 
 
 def test_an_order_on_its_way_shows_nothing():

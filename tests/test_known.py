@@ -81,6 +81,12 @@ def test_a_list_of_scenarios_is_an_entry_for_each(tmp_path):
     assert [(e.id, e.scenario) for e in known.load(path)] == [("a: x", "x"), ("a: y", "y")]
 
 
+def test_finer_ladders_may_resolve_what_was_not():
+    open_ = entry(verdict="unresolved")
+    assert known.excuse([row("agrees")], [open_], whole=True).stale == [open_]
+    assert known.excuse([row("agrees")], [open_], whole=True, finer=True).stale == []
+
+
 def test_an_id_twice_is_refused(tmp_path):
     path = tmp_path / "known.yaml"
     line = "- {id: a, scenario: x, engine: y, verdict: failed, evidence: e, reason: r}\n"
