@@ -28,7 +28,7 @@ from plumbline.problems import Problem, ScenarioError
 from plumbline.registry import ENGINES
 from plumbline.run import Plan, Result, describe_all, execute, save
 from plumbline.store import plain, read, row_record
-from plumbline.workers import Limits, Workers
+from plumbline.workers import Limits, NoCrew, Workers
 
 DEFAULT_OUT = Path("reports") / "out"
 EXIT_CODES = """
@@ -142,6 +142,7 @@ def list_engines() -> list[dict[str, Any]]:
     help="state: accelerations, reactions, energies at 51 states. trajectory: orders, limits, drifts.",
 )
 @click.option("--jobs", type=click.IntRange(1), default=None, help="Worker processes. Default: one per core.")
+@click.option("--scheduler", metavar="ADDRESS", help="A dask cluster to run on instead, as tcp://HOST:8786.")
 @click.option(
     "--out", type=click.Path(path_type=Path), default=DEFAULT_OUT, show_default=True, help="Output folder."
 )
@@ -164,7 +165,7 @@ def list_engines() -> list[dict[str, Any]]:
 )
 def run(
     names: tuple[str, ...], families: tuple[str, ...], engines: tuple[str, ...], level: Any, jobs: int | None,
-    out: Path, as_json: bool, accept: float | None, timeout: float, memory: float,
+    scheduler: str | None, out: Path, as_json: bool, accept: float | None, timeout: float, memory: float,
 ) -> None:  # fmt: skip
     r"""Compare scenarios (names of the catalogue, or paths of YAML files; default: all) on all engines.
 
@@ -189,6 +190,7 @@ def run(
         accept=accept,
         whole=whole,
         memory=cells,
+        scheduler=scheduler,
     )
     with machine_faults_told():
         with progress_to(sys.stderr) as progress:
@@ -226,6 +228,7 @@ def run(
     help="Halvings of the step beyond those of `run`.",
 )
 @click.option("--jobs", type=click.IntRange(1), default=None, help="Worker processes. Default: one per core.")
+@click.option("--scheduler", metavar="ADDRESS", help="A dask cluster to run on instead, as tcp://HOST:8786.")
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
@@ -245,7 +248,7 @@ def run(
 )
 def nightly(
     names: tuple[str, ...], engines: tuple[str, ...], count: int, seed: int | None, finer: int,
-    jobs: int | None, out: Path, timeout: float, memory: float,
+    jobs: int | None, scheduler: str | None, out: Path, timeout: float, memory: float,
 ) -> None:  # fmt: skip
     r"""Run everything, unattended: catalogue, finer steps, random scenarios, and remember the night.
 
@@ -264,6 +267,7 @@ def nightly(
         result, place = run_night(
             folder, chosen, chosen_engines, random=count, seed=seed, jobs=jobs or os.cpu_count() or 1,
             limits=Limits(timeout, memory), whole=not names and not engines, finer=finer, progress=progress,
+            scheduler=scheduler,
             command=shlex.join(["python", "-m", "plumbline", *sys.argv[1:]]),
             tell=lambda sentence: click.echo(sentence, err=True),
         )  # fmt: skip
@@ -306,6 +310,52 @@ def sweep(file: Path, jobs: int | None, out: Path) -> None:
     lost = sum(k for (_, v), k in counts.items() if v == "failed")
     judged = sum(k for (_, v), k in counts.items() if v not in ("agrees", "failed", "not installed"))
     sys.exit(3 if lost else 1 if judged else 0)
+
+
+@main.command()
+@click.argument("names", nargs=-1, metavar="[SCENARIO]...")
+@click.option(
+    "--longest",
+    type=click.FloatRange(0, min_open=True),
+    default=120.0,
+    show_default=True,
+    help="CPU seconds that one run may take; later times are left out where they would cost more.",
+)
+@click.option(
+    "--out", type=click.Path(path_type=Path), default=DEFAULT_OUT, show_default=True, help="Output folder."
+)
+def drift(names: tuple[str, ...], longest: float, out: Path) -> None:
+    r"""Measure the drift of raw, Baumgarte and projected runs in 10, 100, 1000 s (default: two bodies).
+
+    Writes drift.parquet, and report.html again where OUT holds results: the report shows the table.
+
+    \b
+    Examples:
+      python -m plumbline drift
+      python -m plumbline drift double-tumbling-rods --longest 30 --out results
+    """
+    from plumbline import drift as drifts
+
+    chosen = read_scenarios(names or ("tumbling-ball", "tumbling-rod"))
+    folder = writable(out)
+    with machine_faults_told():
+        with progress_to(sys.stderr) as progress:
+            found = drifts.table(
+                chosen, longest, progress=progress, tell=lambda words: click.echo(words, err=True)
+            )
+        path = drifts.write(found, folder)
+        shown = Table(box=None, pad_edge=False, header_style="bold")
+        for column in found.column_names:
+            shown.add_column(column)
+        for row in found.to_pylist():
+            shown.add_row(
+                *(f"{v:.2g}" if isinstance(v, float) else "" if v is None else str(v) for v in row.values())
+            )
+        console(sys.stdout).print(shown)
+        click.echo(f"results: {path}")
+        if (folder / "results.json").is_file():
+            click.echo(f"report: {reports.write(folder)}")
+    sys.exit(3 if any(r.startswith("failed") for r in found["reason"].to_pylist()) else 0)
 
 
 @main.command()
@@ -490,6 +540,8 @@ def machine_faults_told() -> Iterator[None]:
     """A write that fails ends the run with exit code 4 and says how to go on; finished cells are kept."""
     try:
         yield
+    except NoCrew as error:
+        raise click.BadParameter(str(error), param_hint="--scheduler") from None
     except OSError as error:
         click.echo(f"stopped by the machine: {error}", err=True)
         click.echo("What is finished is kept: the same command goes on from there.", err=True)

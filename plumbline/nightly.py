@@ -73,6 +73,7 @@ def nightly(
     command: str,
     finer: int = FINER,
     level: Levels = "all",
+    scheduler: str | None = None,
     progress: Progress,
     tell: Callable[[str], None],
 ) -> tuple[Result, Path]:
@@ -92,6 +93,7 @@ def nightly(
         limits=limits,
         finer=finer,
         whole=whole,
+        scheduler=scheduler,
         probes=frozenset(s.name for s in drawn),
         memory=Cells(unfinished / "cells", tell),
     )

@@ -56,6 +56,10 @@ class Outcome:
     lost: str | None = None
 
 
+class NoCrew(Exception):
+    """Those who should do the work cannot be had; the message says why."""
+
+
 class Memory:
     """What is known of tasks from before; this one knows nothing."""
 
