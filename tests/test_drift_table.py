@@ -1,0 +1,65 @@
+"""The drift table: what is measured, what is left out for its cost, and what the report shows of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from click.testing import CliRunner
+
+from plumbline import drift
+from plumbline import scenario as scenarios
+from plumbline.cli import main
+from reference_impl.stabilised import VARIANTS
+
+
+def measured(names: Sequence[str], longest: float, **options: Any) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = drift.table(
+        scenarios.load_many(names), longest, rtols=(1e-6,), **options
+    ).to_pylist()
+    return found
+
+
+def test_every_variant_and_time_has_a_row_and_the_drift_is_the_raw_one(tmp_path: Path) -> None:
+    told: list[str] = []
+    rows = measured(["tumbling-ball"], 60, times=(1.0, 10.0), tell=told.append)
+    assert [(row["variant"], row["time"]) for row in rows] == [(v, t) for v in VARIANTS for t in (1.0, 10.0)]
+    late = {row["variant"]: row for row in rows if row["time"] == 10.0}
+    assert late["raw"]["gap"] > 10 * late["baumgarte"]["gap"] > 1e-11
+    assert late["projected"]["gap"] < 1e-14
+    assert all(0 < row["energy"] < 1e-5 and row["cpu_seconds"] > 0 and not row["reason"] for row in rows)
+    assert len(told) == len(VARIANTS)
+    assert all("to 10 s, about" in sentence for sentence in told)
+
+
+def test_a_time_that_costs_too_much_is_left_out_and_says_so() -> None:
+    rows = measured(["tumbling-ball"], 0.001, times=(1.0, 10.0))
+    for first, second in zip(rows[::2], rows[1::2], strict=True):
+        assert first["gap"] is not None
+        assert first["reason"] == ""
+        assert second["gap"] is None
+        assert "left out: would cost" in second["reason"]
+
+
+def test_a_run_that_fails_is_a_row_with_its_reason() -> None:
+    (s,) = scenarios.load_many(["tumbling-ball"])
+    massless = replace(s, model=replace(s.model, mass=np.zeros(1)))
+    rows = drift.table([massless], 60, times=(1.0, 10.0), rtols=(1e-6,)).to_pylist()
+    assert len(rows) == 2 * len(VARIANTS)
+    assert all(row["gap"] is None and "failed: the mass of body 1" in row["reason"] for row in rows)
+
+
+def test_the_command_writes_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drift.table, "__defaults__", ((0.5, 1.0), (1e-6,), *drift.table.__defaults__[2:]))
+    ran = CliRunner().invoke(main, ["drift", "tumbling-rod", "--out", str(tmp_path)])
+    assert ran.exit_code == 0, ran.output
+    kept = pq.read_table(tmp_path / "drift.parquet")
+    assert kept.schema.names == drift.SCHEMA.names
+    assert {row["time"] for row in kept.to_pylist()} == {0.5, 1.0}
+    assert "baumgarte" in ran.output
+    assert CliRunner().invoke(main, ["drift", "no-such-thing", "--out", str(tmp_path)]).exit_code == 2
