@@ -92,7 +92,7 @@ def load(path: Path = FILE) -> list[Entry]:
 
 
 def spread(item: object) -> list[object]:
-    """One entry for each scenario, integrator or quantity of a list, with an id of its own: each must occur."""
+    """One entry for each scenario, integrator or quantity of a list, each with an id: each must occur."""
     for field in ("scenario", "integrator", "quantity"):
         if isinstance(item, dict) and isinstance(item.get(field), list):
             each = [{**item, field: name, "id": f"{item.get('id')}: {name}"} for name in item[field]]
