@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -26,8 +26,11 @@ from plumbline.sampling import random_states, seed_of
 from plumbline.scenario import Scenario
 from plumbline.state_verdicts import judge_states
 from plumbline.work import EngineInfo
-from plumbline.workers import Limits, Memory, Outcome, Task, Workers
+from plumbline.workers import Limits, Memory, NoCrew, Outcome, Task, Workers
 from plumbline.yardstick import ROUNDING, MotionTruth, StateTruth
+
+if TYPE_CHECKING:
+    from plumbline.cluster import Cluster
 
 STATES = 50  # random states per scenario, besides the initial one
 PROBE_STATES = 9  # the same of a probe: there are many of them
@@ -50,6 +53,7 @@ class Plan:
     finer: int = 0  # how many times the finest step halves beyond the quick form
     accept: float | None = None  # relative to each quantity's scale; shown beside the verdict only
     whole: bool = False  # the full catalogue on all engines: every known entry must occur
+    scheduler: str | None = None  # address of a dask cluster to run on, instead of ``jobs`` workers here
     probes: frozenset[str] = frozenset()  # names of scenarios asked about at state level only, at few states
     memory: Memory = field(default_factory=Memory)  # of cells that need not run again
 
@@ -66,7 +70,7 @@ class Result:
     run: dict[str, Any]
 
 
-def describe_all(workers: Workers, engines: Sequence[str]) -> dict[str, EngineInfo]:
+def describe_all(workers: Workers | Cluster, engines: Sequence[str]) -> dict[str, EngineInfo]:
     """Every engine's description, of the version asked for; one that crashes on import is missing for it."""
     found: dict[str, EngineInfo] = {}
     tasks = []
@@ -92,7 +96,7 @@ def describe_all(workers: Workers, engines: Sequence[str]) -> dict[str, EngineIn
 def execute(plan: Plan, progress: Progress) -> Result:
     """Run the whole plan; cells that are lost become rows that say so."""
     begin, started = time.monotonic(), datetime.now(UTC)
-    with Workers(plan.jobs, plan.limits) as workers:
+    with crew(plan) as workers:
         engines = describe_all(workers, plan.engines)
         # the longest first, so that no long task is left alone at the end
         order = sorted(plan.scenarios, key=lambda s: -s.model.n)
@@ -107,7 +111,7 @@ def execute(plan: Plan, progress: Progress) -> Result:
     found = Findings()
     for scenario in plan.scenarios:
         found.extend(benches[scenario.name].findings())
-    judged = known.excuse(found.rows, known.load(), whole=plan.whole)
+    judged = known.excuse(found.rows, known.load(), whole=plan.whole, finer=plan.finer > 0)
     summaries = {s.name: benches[s.name].summary() for s in plan.scenarios}
     result = Result(judged.rows, judged.stale, engines, summaries, found.tables(), {})
     result.run = {
@@ -127,6 +131,17 @@ def execute(plan: Plan, progress: Progress) -> Result:
         "stale": [entry.id for entry in judged.stale],
     }
     return result
+
+
+def crew(plan: Plan) -> Workers | Cluster:
+    """Those who do the work: worker processes here, or a cluster's."""
+    if plan.scheduler is None:
+        return Workers(plan.jobs, plan.limits)
+    try:
+        from plumbline.cluster import Cluster  # an optional dependency
+    except ImportError as error:
+        raise NoCrew(f"a cluster needs the packages of the group `cluster`: {error}") from None
+    return Cluster(plan.scheduler, plan.limits)
 
 
 def save(result: Result, folder: Path, command: str) -> None:
