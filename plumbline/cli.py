@@ -359,52 +359,6 @@ def drift(names: tuple[str, ...], longest: float, out: Path) -> None:
 
 
 @main.command()
-@click.argument("names", nargs=-1, metavar="[SCENARIO]...")
-@click.option(
-    "--longest",
-    type=click.FloatRange(0, min_open=True),
-    default=120.0,
-    show_default=True,
-    help="CPU seconds that one run may take; later times are left out where they would cost more.",
-)
-@click.option(
-    "--out", type=click.Path(path_type=Path), default=DEFAULT_OUT, show_default=True, help="Output folder."
-)
-def drift(names: tuple[str, ...], longest: float, out: Path) -> None:
-    r"""Measure the drift of raw, Baumgarte and projected runs in 10, 100, 1000 s (default: two bodies).
-
-    Writes drift.parquet, and report.html again where OUT holds results: the report shows the table.
-
-    \b
-    Examples:
-      python -m plumbline drift
-      python -m plumbline drift double-tumbling-rods --longest 30 --out results
-    """
-    from plumbline import drift as drifts
-
-    chosen = read_scenarios(names or ("tumbling-ball", "tumbling-rod"))
-    folder = writable(out)
-    with machine_faults_told():
-        with progress_to(sys.stderr) as progress:
-            found = drifts.table(
-                chosen, longest, progress=progress, tell=lambda words: click.echo(words, err=True)
-            )
-        path = drifts.write(found, folder)
-        shown = Table(box=None, pad_edge=False, header_style="bold")
-        for column in found.column_names:
-            shown.add_column(column)
-        for row in found.to_pylist():
-            shown.add_row(
-                *(f"{v:.2g}" if isinstance(v, float) else "" if v is None else str(v) for v in row.values())
-            )
-        console(sys.stdout).print(shown)
-        click.echo(f"results: {path}")
-        if (folder / "results.json").is_file():
-            click.echo(f"report: {reports.write(folder)}")
-    sys.exit(3 if any(r.startswith("failed") for r in found["reason"].to_pylist()) else 0)
-
-
-@main.command()
 @click.argument("folder", default="nightly", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.option("--key", "pattern", default=None, help="Trend of the rows whose key matches (* and ?).")
 @click.option("--json", "as_json", is_flag=True, help="JSON on stdout, for other programs.")
