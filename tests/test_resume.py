@@ -111,10 +111,10 @@ def test_five_kills_change_nothing(tmp_path):
 
 @pytest.mark.full
 @pytest.mark.timeout(3600)
-def test_a_hundred_kills_change_nothing(tmp_path, record_property):
+def test_a_hundred_kills_change_nothing(tmp_path, record_testsuite_property):
     kills, finished = survive(tmp_path, 100, "all")
-    record_property("kills", kills)
-    record_property("runs finished between them", finished)
+    record_testsuite_property("kills", kills)
+    record_testsuite_property("runs finished between them", finished)
 
 
 # --- the same in one process: which cells run, and which do not --------------------------------

@@ -163,10 +163,10 @@ def test_a_full_disk_at_every_step_of_every_write(disk, tmp_path):
 
 @pytest.mark.full
 @pytest.mark.timeout(3600)
-def test_every_error_at_every_step_once_and_for_good(disk, tmp_path, record_property):
+def test_every_error_at_every_step_once_and_for_good(disk, tmp_path, record_testsuite_property):
     steps, faults = every_step(disk, tmp_path, ERRORS, [False, True])
-    record_property("steps of writing", steps)
-    record_property("faults injected", faults)
+    record_testsuite_property("steps of writing", steps)
+    record_testsuite_property("faults injected", faults)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limits of file size")
