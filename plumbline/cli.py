@@ -285,9 +285,10 @@ def nightly(
 def sweep(file: Path, jobs: int | None, out: Path) -> None:
     """Vary a scenario's parameters over a grid or distributions; FILE as `plumbline/sweep.py` shows it.
 
-    Writes sweep.parquet: one row per cell and implementation. Exit codes as for run.
+    Writes sweep.parquet, one row per cell and implementation, and its map, sweep.html. Exit codes as for run.
     """
     from plumbline import sweep as sweeps
+    from reports import sweep_page
 
     try:
         spec, cells = sweeps.load(file)
@@ -297,6 +298,7 @@ def sweep(file: Path, jobs: int | None, out: Path) -> None:
     folder = writable(out)
     table = sweeps.run(spec, cells, jobs or os.cpu_count() or 1)
     path = sweeps.write(table, folder)
+    drawn = sweep_page.write(folder)
     counts = collections.Counter(
         zip(*(table[k].to_pylist() for k in ("implementation", "verdict")), strict=True)
     )
@@ -307,6 +309,7 @@ def sweep(file: Path, jobs: int | None, out: Path) -> None:
     for row in poor[:10]:
         click.echo(f"cell {row['cell']}, {row['implementation']}: {row['verdict']}: {row['reason']}")
     click.echo(f"results: {path}")
+    click.echo(f"map: {drawn}")
     lost = sum(k for (_, v), k in counts.items() if v == "failed")
     judged = sum(k for (_, v), k in counts.items() if v not in ("agrees", "failed", "not installed"))
     sys.exit(3 if lost else 1 if judged else 0)

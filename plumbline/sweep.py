@@ -238,7 +238,10 @@ def run(
         record |= by_index[record["cell"]].values
     records.sort(key=lambda record: (record["cell"], record["implementation"] != "reference"))
     names = [*next(iter(cells)).values, *(n for n in COLUMNS if n not in next(iter(cells)).values)]
-    schema = pa.schema([(name, COLUMNS.get(name, pa.float64())) for name in names])
+    schema = pa.schema(
+        [(name, COLUMNS.get(name, pa.float64())) for name in names],
+        metadata={"sweep": sweep.model_dump_json(by_alias=True)},
+    )
     return pa.Table.from_pylist([plain(record) for record in records], schema=schema)
 
 

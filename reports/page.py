@@ -16,7 +16,7 @@ from urllib.parse import urlencode
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from reports import payload
+from reports import fast_reference, payload
 from reports.history import History
 from reports.results import Record, Results
 from reports.verdicts import MARKS, counts, needs_attention, number, ratio, severity, worst
@@ -33,14 +33,16 @@ LISTED = 60  # findings written out in the static page
 def write(out_dir: Path, history: Path | None = None) -> Path:
     """Render OUT/report.html from OUT's stored results (and earlier runs in ``history``); returns its path.
 
-    Written under a temporary name and renamed, so a reader never meets half a page.
     Raises OSError or ValueError where OUT/results.json cannot be read or the page cannot be written.
     """
     results = Results.load(out_dir)
     past = History.load(history, results)
-    html = render(results, past)
-    path = out_dir / "report.html"
-    temporary = path.with_name(f".report.{os.getpid()}.html")
+    return put(out_dir / "report.html", render(results, past))
+
+
+def put(path: Path, html: str) -> Path:
+    """Write a page under a temporary name, then rename it."""
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}.html")
     try:
         temporary.write_text(html, encoding="utf-8")
         temporary.replace(path)
@@ -76,50 +78,39 @@ def _shown(results: Results) -> set[str]:
 
 
 def _fill(results: Results, shown: Results, history: History, chunks: dict[str, str], points: int) -> str:
-    script, style = bundle(), _style()
-    environment = Environment(
-        loader=FileSystemLoader(HERE / "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {"number": number, "when": _when, "seconds": _seconds}
+    script, style = bundle(), stylesheet()
     attention = _attention(results.rows)
     unshown = results.scenarios.keys() - shown.scenarios.keys()
-    return environment.get_template("report.html").render(
-        run=results.run,
-        policy="; ".join(
-            (
-                "default-src 'none'",
-                f"script-src {_hash(script)}",
-                f"style-src {_hash(style)}",
-                "img-src data:",
-                "base-uri 'none'",
-                "form-action 'none'",
-            )
-        ),
-        script=Markup(script),
-        style=Markup(style),
-        chunks=chunks,
-        marks=MARKS,
-        counts=counts(results.rows),
-        total=len(results.rows),
-        engines=results.engines,
-        families=_families(shown),
-        unshown=len(unshown),
-        unshown_fine=not any(entry["row"]["scenario"] in unshown for entry in attention),
-        attention=attention[:LISTED],
-        unlisted=len(attention) - LISTED,
-        expected=_expected(results.rows),
-        ratio=ratio,
-        link=lambda row: cell_link(row["scenario"], row["engine"], row),
-        comparison=_comparison(results, history),
-        damaged=history.damaged,
-        nights=len(history.nights),
-        decimated=points,
-        notice=(HERE / "assets" / "vendor" / "uPlot.LICENSE").read_text(encoding="utf-8"),
-        rendered=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
+    return (
+        environment()
+        .get_template("report.html")
+        .render(
+            run=results.run,
+            policy=policy(style, script),
+            script=Markup(script),
+            style=Markup(style),
+            chunks=chunks,
+            marks=MARKS,
+            counts=counts(results.rows),
+            total=len(results.rows),
+            engines=results.engines,
+            families=_families(shown),
+            unshown=len(unshown),
+            unshown_fine=not any(entry["row"]["scenario"] in unshown for entry in attention),
+            attention=attention[:LISTED],
+            unlisted=len(attention) - LISTED,
+            expected=_expected(results.rows),
+            ratio=ratio,
+            link=lambda row: cell_link(row["scenario"], row["engine"], row),
+            comparison=_comparison(results, history),
+            damaged=history.damaged,
+            nights=len(history.nights),
+            drifts=fast_reference.drifts(results.folder),
+            benchmarks=fast_reference.benchmarks(results.folder),
+            decimated=points,
+            notice=(HERE / "assets" / "vendor" / "uPlot.LICENSE").read_text(encoding="utf-8"),
+            rendered=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
+        )
     )
 
 
@@ -248,7 +239,29 @@ def bundle() -> str:
     return script
 
 
-def _style() -> str:
+def environment() -> Environment:
+    """The templates, with everything escaped and nothing undefined let through."""
+    made = Environment(
+        loader=FileSystemLoader(HERE / "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    made.filters |= {"number": number, "when": _when, "seconds": _seconds}
+    return made
+
+
+def policy(style: str, script: str | None = None) -> str:
+    """The Content-Security-Policy of a page with this style and at most this script: no request, no other."""
+    sources = ["default-src 'none'", f"style-src {_hash(style)}", "img-src data:"]
+    if script is not None:
+        sources.insert(1, f"script-src {_hash(script)}")
+    return "; ".join([*sources, "base-uri 'none'", "form-action 'none'"])
+
+
+def stylesheet() -> str:
+    """The style of uPlot and the pages' own."""
     vendor = (HERE / "assets" / "vendor" / "uPlot.min.css").read_text(encoding="utf-8")
     return vendor + (HERE / "assets" / "style.css").read_text(encoding="utf-8")
 

@@ -1,0 +1,80 @@
+"""The report's two tables about the reference itself: how its variants drift, and what it costs.
+
+Both are read from the output folder where it holds them, else from the stored copies in ``bench/results``.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from pathlib import Path
+
+from reports.results import Record, Results, clean
+
+STORED = Path(__file__).parent.parent / "bench" / "results"
+DRIFTS = {  # column: title, unit
+    "gap": ("Joint gap", "m"),
+    "gap_rate": ("Gap rate", "m/s"),
+    "norm": ("|‖p‖ − 1|", ""),
+    "energy": ("Energy error", "of m g reach"),
+}
+PICTURES = {
+    "work-precision.svg": "CPU time against the error at 2 s, one pendulum: the reference and the engines",
+    "work-precision-64.svg": "CPU time against the error at 2 s, 64 in a batch: reference and engines",
+}
+
+
+def drifts(folder: Path, stored: Path = STORED) -> Record | None:
+    """The drift table as the template takes it: times, and per scenario and rtol a line per variant.
+
+    None where there is no drift.parquet.
+    """
+    place = _place("drift.parquet", folder, stored)
+    if place is None:
+        return None
+    table = Results(place, {}, {}, {}, []).table("drift")
+    records = [
+        dict(zip(table, row, strict=True)) for row in zip(*(c.tolist() for c in table.values()), strict=True)
+    ]
+    times = sorted({record["time"] for record in records})
+    blocks: dict[tuple[str, float], dict[str, Record]] = {}
+    for record in records:
+        line = blocks.setdefault((record["scenario"], record["rtol"]), {}).setdefault(
+            record["variant"], {"at": {}, "cost": None, "reasons": {}}
+        )
+        if record["reason"]:
+            line["reasons"][record["reason"]] = None
+        else:
+            line["at"][record["time"]] = record
+            line["cost"] = record["cpu_seconds"]
+    return {"times": times, "columns": DRIFTS, "blocks": blocks, "stored": place != folder}
+
+
+def benchmarks(folder: Path, stored: Path = STORED) -> Record | None:
+    """The goals with what was measured, a note on how, and the work–precision pictures as data URIs.
+
+    A picture becomes an image, so that nothing in it can run or load. None where there is no figures.json.
+    """
+    place = _place("figures.json", folder, stored)
+    if place is None:
+        return None
+    goals = clean(json.loads((place / "figures.json").read_text(encoding="utf-8"))["goals"])
+    note = place / "README.md"
+    return {
+        "goals": [goal | {"met": goal["measured"] <= goal["goal"]} for goal in goals],
+        "pictures": [
+            {"title": title, "uri": _data_uri(place / name)}
+            for name, title in PICTURES.items()
+            if (place / name).is_file()
+        ],
+        "note": clean(note.read_text(encoding="utf-8")) if place != folder and note.is_file() else "",
+        "stored": place != folder,
+    }
+
+
+def _place(name: str, *folders: Path) -> Path | None:
+    return next((folder for folder in folders if (folder / name).is_file()), None)
+
+
+def _data_uri(path: Path) -> str:
+    return f"data:image/svg+xml;base64,{base64.b64encode(path.read_bytes()).decode()}"

@@ -1,0 +1,143 @@
+"""sweep.html: the map of a parameter sweep, one file without a script, from its stored rows."""
+
+from __future__ import annotations
+
+import json
+import math
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow.parquet as pq
+from markupsafe import Markup
+
+from reports import page
+from reports.results import Record, clean
+from reports.verdicts import MARKS, counts, severity
+
+STEPS = 24  # values of an axis that are shown one by one; more are gathered into intervals
+INTERVALS = 16
+LISTED = 60  # rows that do not agree, written out
+SHADES = 8
+MAPS = {  # per implementation: column, title
+    True: (("uncertainty", "uncertainty, m"), ("reach", "reach of the last body, m")),  # the reference
+    False: (("position_error", "largest distance from the reference, m"),),
+}
+
+
+class Axis(NamedTuple):
+    """A parameter's values along one side of the map; ``edges`` where they are intervals, else None."""
+
+    name: str
+    titles: list[str]
+    values: list[float]
+    edges: list[float] | None
+
+    def place(self, value: float) -> int:
+        """Which value or interval it belongs to."""
+        if self.edges is None:
+            return self.values.index(value)
+        return min(max(bisect_right(self.edges, value) - 1, 0), len(self.edges) - 2)
+
+
+def write(folder: Path) -> Path:
+    """Render FOLDER/sweep.html from FOLDER/sweep.parquet; its path.
+
+    Raises OSError or pyarrow's ArrowInvalid where the table cannot be read.
+    """
+    table = pq.read_table(folder / "sweep.parquet")
+    names = clean(table.column_names)
+    rows = clean(table.rename_columns(names).to_pylist())
+    about = clean(json.loads((table.schema.metadata or {}).get(b"sweep", b"{}")))
+    return page.put(folder / "sweep.html", render(names[: names.index("cell")], rows, about))
+
+
+def render(parameters: Sequence[str], rows: Sequence[Record], about: Record) -> str:
+    """The page as text; ``parameters`` are the varied columns, ``about`` the sweep's file."""
+    varied = [name for name in parameters if len({row[name] for row in rows}) > 1] or list(parameters)
+    across = axis(varied[0], rows)
+    down = axis(varied[1], rows) if len(varied) > 1 else None
+    implementations: dict[str, list[Record]] = {}
+    for row in rows:
+        implementations.setdefault(row["implementation"], []).append(row)
+    maps = [
+        {
+            "name": name,
+            "integrator": next((r["integrator"] for r in theirs if r["integrator"]), ""),
+            "title": title,
+            "counts": counts(theirs),
+            **chart(theirs, column, across, down),
+        }
+        for name, theirs in implementations.items()
+        for column, title in MAPS[name == "reference"]
+    ]
+    poor = [row for row in rows if row["verdict"] not in ("agrees", "not installed")]
+    cells = len({row["cell"] for row in rows})
+    told = Counter((row["implementation"], row["verdict"]) for row in rows)
+    style = page.stylesheet()
+    return (
+        page.environment()
+        .get_template("sweep.html")
+        .render(
+            policy=page.policy(style),
+            style=Markup(style),
+            sentence=f"{cells} cells: "
+            + "; ".join(f"{name} {verdict} {k}" for (name, verdict), k in told.items()),
+            scenario=about.get("scenario", ""),
+            about=about,
+            across=across,
+            down=down,
+            folded=varied[2:],
+            maps=maps,
+            marks=MARKS,
+            poor=poor[:LISTED],
+            unlisted=len(poor) - LISTED,
+            parameters=parameters,
+            shades=SHADES,
+        )
+    )
+
+
+def axis(name: str, rows: Sequence[Record]) -> Axis:
+    """The parameter's values, or intervals of them where there are too many to show one by one."""
+    values = sorted({float(row[name]) for row in rows})
+    if len(values) <= STEPS:
+        return Axis(name, [f"{value:.4g}" for value in values], values, None)
+    ratios = values[0] > 0 and values[-1] > 100 * values[0]
+    edges = (np.geomspace if ratios else np.linspace)(values[0], values[-1], INTERVALS + 1).tolist()
+    return Axis(name, [f"{a:.3g} … {b:.3g}" for a, b in pairwise(edges)], edges, edges)
+
+
+def chart(rows: Sequence[Record], column: str, across: Axis, down: Axis | None) -> Record:
+    """Per place of the map its worst row, largest value, count and shade; the shades' range.
+
+    Shades are steps of the value's logarithm between the smallest and the largest on this map.
+    """
+    held: dict[tuple[int, int], list[Record]] = {}
+    for row in rows:
+        place = down.place(row[down.name]) if down else 0, across.place(row[across.name])
+        held.setdefault(place, []).append(row)
+
+    def size(row: Record) -> float:
+        return -math.inf if row[column] is None or math.isnan(row[column]) else float(row[column])
+
+    largest = {place: max(map(size, theirs)) for place, theirs in held.items()}
+    logs = {place: math.log10(value) for place, value in largest.items() if 0 < value < math.inf}
+    low, high = min(logs.values(), default=0.0), max(logs.values(), default=0.0)
+    cells: dict[tuple[int, int], dict[str, Any]] = {}
+    for place, theirs in held.items():
+        speaker = max(theirs, key=lambda row: (severity(row), size(row)))
+        value = largest[place]
+        part = (logs[place] - low) / (high - low) if place in logs and high > low else 0.0
+        cells[place] = {
+            "row": speaker,
+            "mark": MARKS[speaker["verdict"]],
+            "value": value if value > -math.inf else None,
+            "count": len(theirs),
+            "shade": round(part * (SHADES - 1)),
+        }
+    return {"cells": cells, "low": 10**low if logs else None, "high": 10**high if logs else None}
