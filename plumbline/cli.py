@@ -318,6 +318,15 @@ def sweep(file: Path, jobs: int | None, out: Path) -> None:
 @main.command()
 @click.argument("names", nargs=-1, metavar="[SCENARIO]...")
 @click.option(
+    "--rtol",
+    "rtols",
+    type=click.FloatRange(1e-14, 1e-2),
+    multiple=True,
+    default=(1e-6, 1e-9, 1e-12),
+    show_default=True,
+    help="Tolerance of the runs (may be repeated).",
+)
+@click.option(
     "--longest",
     type=click.FloatRange(0, min_open=True),
     default=120.0,
@@ -327,7 +336,7 @@ def sweep(file: Path, jobs: int | None, out: Path) -> None:
 @click.option(
     "--out", type=click.Path(path_type=Path), default=DEFAULT_OUT, show_default=True, help="Output folder."
 )
-def drift(names: tuple[str, ...], longest: float, out: Path) -> None:
+def drift(names: tuple[str, ...], rtols: tuple[float, ...], longest: float, out: Path) -> None:
     r"""Measure the drift of raw, Baumgarte and projected runs in 10, 100, 1000 s (default: two bodies).
 
     Writes drift.parquet, and report.html again where OUT holds results: the report shows the table.
@@ -344,7 +353,11 @@ def drift(names: tuple[str, ...], longest: float, out: Path) -> None:
     with machine_faults_told():
         with progress_to(sys.stderr) as progress:
             found = drifts.table(
-                chosen, longest, progress=progress, tell=lambda words: click.echo(words, err=True)
+                chosen,
+                longest,
+                rtols=rtols,
+                progress=progress,
+                tell=lambda words: click.echo(words, err=True),
             )
         path = drifts.write(found, folder)
         shown = Table(box=None, pad_edge=False, header_style="bold")

@@ -20,7 +20,6 @@ from plumbline.store import plain, write_atomically
 from reference_impl.chain import Chain
 from reference_impl.stabilised import VARIANTS, drift_table
 
-RTOLS = (1e-6, 1e-9, 1e-12)
 TIMES = (10.0, 100.0, 1000.0)  # s
 SCHEMA = pa.schema(
     [
@@ -42,8 +41,8 @@ SCHEMA = pa.schema(
 def table(
     chosen: Sequence[Scenario],
     longest: float,
+    rtols: Sequence[float],
     times: Sequence[float] = TIMES,
-    rtols: Sequence[float] = RTOLS,
     progress: Callable[[int, int, str], None] = lambda done, total, what: None,
     tell: Callable[[str], None] = lambda sentence: None,
 ) -> pa.Table:
