@@ -15,7 +15,7 @@ from typing import Literal
 
 from packaging.specifiers import InvalidSpecifier, SpecifierSet
 from packaging.version import InvalidVersion, Version
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, field_validator, model_validator
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
@@ -37,6 +37,7 @@ class Entry(BaseModel):
     integrator: str = "*"
     quantity: str = "*"
     verdict: Literal["disagrees", "unresolved", "unsupported", "failed"]
+    sometimes: bool = False  # of random scenarios, which may or may not show it
     evidence: str  # what shows it: a measurement, a script, a document
     reason: str  # why it is so
 
@@ -48,6 +49,12 @@ class Entry(BaseModel):
         except InvalidSpecifier as error:
             raise ValueError(f"{error}; a version range is written like '>=1.13,<2'") from None
         return text
+
+    @model_validator(mode="after")
+    def _only_chance_is_excused(self) -> Entry:
+        if self.sometimes and not self.scenario.startswith("random-"):
+            raise ValueError("`sometimes` is for random scenarios (random-*): others show it or do not")
+        return self
 
     def covers(self, row: Row) -> bool:
         """Whether the entry speaks of that row's cell, whatever its verdict; of an engine in any version."""
@@ -119,6 +126,7 @@ def excuse(rows: Iterable[Row], entries: Sequence[Entry], *, whole: bool, finer:
         e
         for e in entries
         if e.id not in used
+        and not e.sometimes
         and e.id in covered
         and not (finer and e.verdict == "unresolved")
         and (whole or not set("*?[") & set(e.scenario))

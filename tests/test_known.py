@@ -81,6 +81,15 @@ def test_a_list_of_scenarios_is_an_entry_for_each(tmp_path):
     assert [(e.id, e.scenario) for e in known.load(path)] == [("a: x", "x"), ("a: y", "y")]
 
 
+def test_only_random_scenarios_may_show_it_sometimes():
+    chance = entry(scenario="random-*", sometimes=True)
+    who = Subject("random-1-2", "random", "mujoco", "MuJoCo", "4.0.0")
+    assert known.excuse([row("agrees", who=who)], [chance], whole=True).stale == []
+    assert known.excuse([row(who=who)], [chance], whole=True).rows[0].known == "a"
+    with pytest.raises(ValueError, match="random"):
+        entry(sometimes=True)
+
+
 def test_finer_ladders_may_resolve_what_was_not():
     open_ = entry(verdict="unresolved")
     assert known.excuse([row("agrees")], [open_], whole=True).stale == [open_]
