@@ -59,7 +59,8 @@ def benchmarks(folder: Path, stored: Path = STORED) -> Record | None:
     if place is None:
         return None
     goals = clean(json.loads((place / "figures.json").read_text(encoding="utf-8"))["goals"])
-    note = place / "README.md"
+    readme = place / "README.md"
+    note = clean(readme.read_text(encoding="utf-8")).split("\n\n")[0] if readme.is_file() else ""
     return {
         "goals": [goal | {"met": goal["measured"] <= goal["goal"]} for goal in goals],
         "pictures": [
@@ -67,7 +68,7 @@ def benchmarks(folder: Path, stored: Path = STORED) -> Record | None:
             for name, title in PICTURES.items()
             if (place / name).is_file()
         ],
-        "note": clean(note.read_text(encoding="utf-8")) if place != folder and note.is_file() else "",
+        "note": note.replace("`", "") if place != folder else "",
         "stored": place != folder,
     }
 
