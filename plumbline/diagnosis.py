@@ -26,6 +26,7 @@ QUANTITIES = (
 )  # fmt: skip
 STATES = 8  # looked at; fewer for long chains
 SEEN = 3.0  # amounts below this many rounding bounds of their own are no change
+NEAR = 8.0  # bounds: of a hundred causes with an amount to fit, some explain a nearer difference by chance
 EXPLAINED = 1.0  # a prediction agrees within the sum of both states' bounds
 ITERATIONS = 12
 CANDIDATES = 12
@@ -80,8 +81,11 @@ def diagnose(
     seen = observe(model, said, truth)
     if max(seen.off(seen.right).values()) <= EXPLAINED:
         return "accelerations, reactions, energies and momentum are right: it is in the mass matrix alone"
-    whole = explanations(seen)
-    if whole:
+    near = max(seen.off(seen.right).values()) <= NEAR
+    whole = [] if near else explanations(seen)
+    if near:
+        text = "too near the rounding bound for any one term to be named"
+    elif whole:
         text = "behaves as if " + "; or, which these data cannot tell apart, as if ".join(whole)
     else:
         texts = {q: misread(seen, q) for q, ratio in seen.off(seen.right).items() if ratio > EXPLAINED}

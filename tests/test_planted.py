@@ -166,6 +166,14 @@ def test_what_has_no_single_cause_is_not_named(defect):
     assert wrong and text.startswith("no single change"), text
 
 
+def test_a_difference_next_to_the_bound_is_not_named():
+    model, truth = subject("balls", False)
+    said = list(truth.quantities)
+    shift = 1.8 * truth.bounds[3].acceleration[:, None] * np.array([[0.6, -0.48, 0.64]])
+    said[3] = replace(said[3], acceleration=said[3].acceleration + shift)
+    assert diagnose(model, said, truth).startswith("too near the rounding bound")
+
+
 def test_where_the_difference_lives_is_said():
     at = {d.name: state_report(d)[1] for d in STATE_DEFECTS}
     assert "vanishes at rest, persists without gravity" in at["gyroscopic-dropped"]
