@@ -1,12 +1,15 @@
-"""`python -m bench.figures FILE.json [FOLDER]`: the goals with what was measured, and the picture.
+"""`python -m bench.figures [FILE.json [FOLDER]]`: the goals with what was measured, and the picture.
 
-Reads what pytest-benchmark stored; writes figures.json and work-precision.svg into the folder (the
-file's own where none is given) and prints the table.
+Reads what pytest-benchmark stored, or runs it where no file is given (several minutes; then the folder is
+reports/out, where `python -m plumbline report` shows the figures).  Writes figures.json and the pictures into
+the folder (the file's own where none is given) and prints the table.
 """
 
 from __future__ import annotations
 
 import json
+import os
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -101,9 +104,19 @@ def picture(curves: dict[str, list[dict[str, float]]], title: str) -> str:
     return "\n".join([*out, "</svg>"]) + "\n"
 
 
+def measured(folder: Path) -> Path:
+    """Run all benchmarks with one BLAS thread; the path of what pytest-benchmark stored."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "benchmarks.json"
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", "bench", f"--benchmark-json={path}"]
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    subprocess.run(command, env=os.environ | threads, check=True)
+    return path
+
+
 def main(arguments: list[str]) -> None:
-    """Write and print the figures of a stored run."""
-    stored = Path(arguments[0])
+    """Write and print the figures of a stored run, or of one made now."""
+    stored = Path(arguments[0]) if arguments else measured(Path("reports") / "out")
     folder = Path(arguments[1]) if len(arguments) > 1 else stored.parent
     found = [b["extra_info"] for b in json.loads(stored.read_text())["benchmarks"] if b["extra_info"]]
     rows = goals(found)
