@@ -59,7 +59,7 @@ class Group(click.Group):
 
 @click.group(cls=Group, epilog=EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]})
 def main() -> None:
-    r"""Run identical pendulums through the notes' equations and multibody engines, and say who is wrong.
+    """Run identical pendulums through the notes' equations and multibody engines, and say who is wrong.
 
     \b
     Start with:
@@ -167,7 +167,7 @@ def run(
     names: tuple[str, ...], families: tuple[str, ...], engines: tuple[str, ...], level: Any, jobs: int | None,
     scheduler: str | None, out: Path, as_json: bool, accept: float | None, timeout: float, memory: float,
 ) -> None:  # fmt: skip
-    r"""Compare scenarios (names of the catalogue, or paths of YAML files; default: all) on all engines.
+    """Compare scenarios (names of the catalogue, or paths of YAML files; default: all) on all engines.
 
     \b
     Examples:
@@ -250,7 +250,7 @@ def nightly(
     names: tuple[str, ...], engines: tuple[str, ...], count: int, seed: int | None, finer: int,
     jobs: int | None, scheduler: str | None, out: Path, timeout: float, memory: float,
 ) -> None:  # fmt: skip
-    r"""Run everything, unattended: catalogue, finer steps, random scenarios, and remember the night.
+    """Run everything, unattended: catalogue, finer steps, random scenarios, and remember the night.
 
     Killed at any moment, the same command goes on where it stopped.
 
@@ -337,7 +337,7 @@ def sweep(file: Path, jobs: int | None, out: Path) -> None:
     "--out", type=click.Path(path_type=Path), default=DEFAULT_OUT, show_default=True, help="Output folder."
 )
 def drift(names: tuple[str, ...], rtols: tuple[float, ...], longest: float, out: Path) -> None:
-    r"""Measure the drift of raw, Baumgarte and projected runs in 10, 100, 1000 s (default: two bodies).
+    """Measure the drift of raw, Baumgarte and projected runs in 10, 100, 1000 s (default: two bodies).
 
     Writes drift.parquet, and report.html again where OUT holds results: the report shows the table.
 
@@ -379,7 +379,7 @@ def drift(names: tuple[str, ...], rtols: tuple[float, ...], longest: float, out:
 @click.option("--key", "pattern", default=None, help="Trend of the rows whose key matches (* and ?).")
 @click.option("--json", "as_json", is_flag=True, help="JSON on stdout, for other programs.")
 def history(folder: Path, pattern: str | None, as_json: bool) -> None:
-    r"""What the nights in FOLDER say together: counts, first bad nights, changes since the last green.
+    """What the nights in FOLDER say together: counts, first bad nights, changes since the last green.
 
     \b
     Examples:
@@ -459,7 +459,7 @@ def schema() -> None:
 @click.argument("result", type=click.Path(path_type=Path, exists=True))
 @click.argument("keys", nargs=-1, metavar="[KEY]...")
 def reproduce(result: Path, keys: tuple[str, ...]) -> None:
-    r"""Write a stand-alone script that shows a disagreement, for the engine's maintainers.
+    """Write a stand-alone script that shows a disagreement, for the engine's maintainers.
 
     RESULT is a results folder or its results.json; KEY a row's key. Without KEY the disagreements are listed.
 

@@ -30,7 +30,8 @@ def test_help_teaches_and_documents_exit_codes():
         "3  an engine failed",
     ):
         assert words in said.stdout
-    assert "Examples" in plumbline("run", "--help").stdout
+    assert "\n    python -m plumbline run --family chain --level state\n" in plumbline("run", "--help").stdout
+    assert "\\b" not in said.stdout
 
 
 def test_list_scenarios_and_engines_as_text_and_json():
