@@ -62,7 +62,8 @@ def test_a_night_is_whole_and_remembered(tmp_path):
     assert (stored["seed"], stored["random"]) == (11, 3)
     assert {r.scenario for r in result.rows if r.family == FAMILY} == {f"random-11-{k}" for k in range(3)}
     assert all(r.level == "state" for r in result.rows if r.family == FAMILY)
-    assert {r.level for r in result.rows if r.scenario == "rest"} == {"state", "trajectory", "invariants"}
+    levels = {"state", "trajectory", "invariants", "relations"}
+    assert {r.level for r in result.rows if r.scenario == "rest"} == levels
     (seen,) = History(tmp_path).overview()
     assert seen["id"] == place.name and seen["random"] == 3
 
