@@ -7,28 +7,29 @@ import json
 import os
 import shlex
 import sys
-import tempfile
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 import click
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 import reports
 from plumbline import scenario as scenarios
-from plumbline import versions
 from plumbline.cells import Cells
-from plumbline.exact import NotThatMotion, solution
-from plumbline.problems import Problem, ScenarioError
+from plumbline.choose import (
+    choose_engines,
+    choose_scenarios,
+    machine_faults_told,
+    read_scenarios,
+    writable,
+)
+from plumbline.problems import ScenarioError
 from plumbline.registry import ENGINES
-from plumbline.run import Plan, Result, describe_all, execute, save
+from plumbline.run import Plan, describe_all, execute, save
 from plumbline.store import plain, read, row_record
-from plumbline.workers import Limits, NoCrew, Workers
+from plumbline.tell import console, progress_to, tell
+from plumbline.workers import Limits, Workers
 
 DEFAULT_OUT = Path("reports") / "out"
 EXIT_CODES = """
@@ -296,9 +297,10 @@ def sweep(file: Path, jobs: int | None, out: Path) -> None:
         click.echo(str(error), err=True)
         sys.exit(2)
     folder = writable(out)
-    table = sweeps.run(spec, cells, jobs or os.cpu_count() or 1)
-    path = sweeps.write(table, folder)
-    drawn = sweep_page.write(folder)
+    with machine_faults_told():
+        table = sweeps.run(spec, cells, jobs or os.cpu_count() or 1)
+        path = sweeps.write(table, folder)
+        drawn = sweep_page.write(folder)
     counts = collections.Counter(
         zip(*(table[k].to_pylist() for k in ("implementation", "verdict")), strict=True)
     )
@@ -486,163 +488,3 @@ def reproduce(result: Path, keys: tuple[str, ...]) -> None:
         if not path.is_file():
             raise click.ClickException(f"{key}: {name}")
         click.echo(str(path))
-
-
-# --- choosing ---------------------------------------------------------------------------------
-
-
-def read_scenarios(names: Iterable[str | Path]) -> list[scenarios.Scenario]:
-    """Scenarios by name or path; every problem goes to stderr and ends with exit code 2."""
-    try:
-        found = scenarios.load_many(names)
-        for s in found:
-            try:
-                solution(s)
-            except NotThatMotion as error:
-                raise ScenarioError(
-                    [Problem(str(s.path), 0, 0, "exact", str(error), "no exact, or another")]
-                ) from None
-    except ScenarioError as error:
-        click.echo(str(error), err=True)
-        sys.exit(2)
-    return found
-
-
-def choose_scenarios(names: tuple[str, ...], families: tuple[str, ...]) -> list[scenarios.Scenario]:
-    """The asked scenarios, or the catalogue; narrowed to the asked families."""
-    found = read_scenarios(names or tuple(scenarios.catalogue()))
-    known_families = {s.family for s in found}
-    for family in families:
-        if family not in known_families:
-            raise click.BadParameter(
-                f"no family {family!r}{nearest(family, known_families)}", param_hint="--family"
-            )
-    return [s for s in found if not families or s.family in families]
-
-
-def choose_engines(engines: tuple[str, ...]) -> list[str]:
-    """The asked engines in the registry's order, then as they were asked; or all of them."""
-    for engine in engines:
-        base, _ = versions.split(engine)
-        if base not in ENGINES:
-            raise click.BadParameter(f"no engine {base!r}{nearest(base, ENGINES)}", param_hint="--engine")
-        problem = versions.problem_of(engine)
-        if problem:
-            raise click.BadParameter(f"{engine}: {problem}", param_hint="--engine")
-    order = list(ENGINES)
-    return sorted(dict.fromkeys(engines), key=lambda e: order.index(versions.split(e)[0])) or order
-
-
-def nearest(word: str, names: Iterable[str]) -> str:
-    """A suggestion: the nearest name, or the list of them."""
-    names = list(names)
-    near = get_close_matches(word, names, 1)
-    return f"; did you mean {near[0]!r}?" if near else f"; there are: {', '.join(sorted(names))}"
-
-
-def writable(folder: Path) -> Path:
-    """The output folder, made and tried before any work is done; exit code 2 where it cannot be written."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise click.BadParameter(f"cannot write to {folder}: {error.strerror}", param_hint="--out") from None
-    return folder
-
-
-@contextmanager
-def machine_faults_told() -> Iterator[None]:
-    """A write that fails ends the run with exit code 4 and says how to go on; finished cells are kept."""
-    try:
-        yield
-    except NoCrew as error:
-        raise click.BadParameter(str(error), param_hint="--scheduler") from None
-    except OSError as error:
-        click.echo(f"stopped by the machine: {error}", err=True)
-        click.echo("What is finished is kept: the same command goes on from there.", err=True)
-        sys.exit(4)
-
-
-# --- telling ----------------------------------------------------------------------------------
-
-
-def console(file: Any) -> Console:
-    """A console that wraps to the terminal, or never where the output is piped."""
-    return Console(file=file, width=None if file.isatty() else 200, highlight=False)
-
-
-class progress_to:  # noqa: N801 - used like the function that it stands for
-    """A progress bar on a terminal, plain lines (each tenth) otherwise."""
-
-    def __init__(self, file: Any) -> None:
-        self.bar = Progress(
-            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
-            console=Console(file=file), transient=True, disable=not file.isatty(),
-        )  # fmt: skip
-        self.file = file
-        self.tenth = 0
-
-    def __enter__(self) -> Callable[[int, int, str], None]:
-        """The function to call after each task."""
-        self.bar.start()
-        self.task = self.bar.add_task("running", total=None)
-        return self.tell
-
-    def __exit__(self, *_: object) -> None:
-        """Remove the bar."""
-        self.bar.stop()
-
-    def tell(self, done: int, total: int, what: str) -> None:
-        """Show how far the run is."""
-        self.bar.update(self.task, completed=done, total=total, description=what[:48].ljust(48))
-        if not self.file.isatty() and done * 10 // total > self.tenth:
-            self.tenth = done * 10 // total
-            print(f"{done} of {total} tasks done", file=self.file, flush=True)
-
-
-GLYPHS = {
-    "agrees": "[green]✓[/]", "disagrees": "[red bold]✗[/]", "unresolved": "[yellow]?[/]",
-    "unsupported": "[dim]–[/]", "not installed": "[dim]∅[/]", "failed": "[red bold]![/]",
-}  # fmt: skip
-SHOWN = 60  # scenarios; of more, those where everything agrees are left out of the table
-WORST_FIRST = ("failed", "disagrees", "unresolved", "unsupported", "not installed", "agrees")
-
-
-def tell(result: Result) -> None:
-    """The matrix of scenario × engine, the sentences of what does not agree, the verdict."""
-    out = console(sys.stdout)
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("scenario")
-    for name, info in result.engines.items():
-        table.add_column(f"{name} {info.version}".strip())
-    rows_of: dict[str, list[Any]] = {scenario: [] for scenario in result.scenarios}
-    for row in result.rows:
-        rows_of[row.scenario].append(row)
-    for scenario in result.scenarios:
-        of = [[r for r in rows_of[scenario] if r.engine == engine] for engine in result.engines]
-        if len(result.scenarios) <= SHOWN or any(r.verdict != "agrees" for rows in of for r in rows):
-            table.add_row(scenario, *map(cell_text, of))
-    out.print(table)
-    out.print(
-        "[dim]each cell: agreeing rows / all rows, then the worst error over its tolerance; "
-        "✓ agrees  ✗ disagrees  ? unresolved  – unsupported  ∅ not installed  ! failed[/]"
-    )
-    for row in result.rows:
-        if row.verdict != "agrees" and row.known is None:
-            out.print(f"{GLYPHS[row.verdict]} {row.key}: ", end="")
-            out.print(row.reason, markup=False)
-    for entry in result.stale:
-        out.print(f"[red]![/] known entry {entry.id} no longer occurs: remove it from plumbline/known.yaml")
-    out.print(f"[bold]{result.run['sentence']}[/]")
-
-
-def cell_text(rows: list[Any]) -> str:
-    """One cell of the matrix: worst verdict that nothing explains, counts, worst error over tolerance."""
-    if not rows:
-        return ""
-    open_rows = [r for r in rows if r.known is None] or rows
-    worst = min((r.verdict for r in open_rows), key=WORST_FIRST.index)
-    agreeing = sum(r.verdict == "agrees" for r in rows)
-    ratios = [r.extra["ratio"] for r in rows if r.verdict == "agrees" and "ratio" in r.extra]
-    return f"{GLYPHS[worst]} {agreeing}/{len(rows)}" + (f" {max(ratios):.1g}" if ratios else "")

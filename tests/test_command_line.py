@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
@@ -88,6 +89,19 @@ def test_a_scenario_of_ones_own_by_path_and_a_family(tmp_path):
     said = plumbline("check", mine)
     assert said.returncode == 0
     assert "ok" in said.stdout
+
+
+def test_a_name_stays_text_on_the_terminal_in_html_and_in_junit(tmp_path):
+    name = "[/red] <img src=x onerror=alert(1)> & 'quoted' $(reboot)"
+    mine = tmp_path / "hostile.yaml"
+    rest = (ROOT / "scenarios" / "single" / "rest.yaml").read_text()
+    mine.write_text(rest.replace("schema_version: 1", f"schema_version: 1\nname: {json.dumps(name)}"))
+    said = plumbline("run", mine, "--engine", "mujoco", "--level", "state", "--out", tmp_path / "out")
+    assert said.returncode == 0, said.stdout + said.stderr
+    assert name[:30] in said.stdout
+    assert "<img" not in (tmp_path / "out" / "report.html").read_text()
+    cases = ElementTree.parse(tmp_path / "out" / "junit.xml").iter("testcase")
+    assert any(name in (case.get("name") or "") + (case.get("classname") or "") for case in cases)
 
 
 @pytest.mark.parametrize(
