@@ -46,7 +46,7 @@ def truths():
     return {}
 
 
-@pytest.mark.parametrize(("name", "engine", "level"), cells())
+@pytest.mark.parametrize(("name", "engine", "level"), list(cells()))
 @pytest.mark.timeout(900)
 def test_cell(name, engine, level, workers, engines, truths):
     found = scenario.load(scenario.find(name))
