@@ -20,5 +20,6 @@ def tool(module: str) -> Any:
         return import_module(module)
     except ImportError as error:
         raise TruthUnavailable(
-            f"truth tools not installed ({module} is missing: {error}); `uv pip install -r locks/truth.lock` installs them"
+            f"truth tools not installed ({module} is missing: {error}); "
+            "`uv pip install -r locks/truth.lock` installs them"
         ) from error
