@@ -109,7 +109,8 @@ class Ladder:
     @property
     def common(self) -> dict[str, Any]:
         """What every row of this ladder says besides its quantity."""
-        return {"alias_of": self.integrator.alias_of, "wall_time": sum(rung.cost for rung in self.rungs)}
+        alias = None if self.model.has_drag else self.integrator.alias_of  # drag is where they part
+        return {"alias_of": alias, "wall_time": sum(rung.cost for rung in self.rungs)}
 
     def samples(self, rung: Rung, name: str) -> Array:
         """(T, N, width), NaN where the rung did not stay finite; quaternions signed like the finest run's."""

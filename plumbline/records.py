@@ -137,7 +137,7 @@ class Integrator:
     symmetric: bool = False  # time-symmetric: reversing the velocities retraces the path
     solver: float = 0.0  # relative tolerance to which an implicit step's equations are solved
     tightest: float = 1e-12  # for kind "tolerance": below, rounding on long chains stalls the step
-    alias_of: str | None = None  # equals that integrator here, so it is not independent evidence
+    alias_of: str | None = None  # equals that integrator without drag: not independent evidence
     note: str = ""  # a sentence on what it is
 
 

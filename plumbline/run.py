@@ -21,7 +21,6 @@ from plumbline.exact import solution
 from plumbline.findings import Findings, Subject
 from plumbline.motion_verdicts import judge_motion
 from plumbline.records import Row, StateQuantities, Verdict
-from plumbline.registry import ENGINES
 from plumbline.sampling import random_states, seed_of
 from plumbline.scenario import Scenario
 from plumbline.state_verdicts import judge_states
@@ -335,6 +334,9 @@ def sentence(result: Result) -> str:
         part = f"{number} {verb.get(verdict, verdict)}"
         new = [row for row in result.rows if row.verdict == verdict and row.known is None]
         old = number - len(new)
+        aliases = sum(row.alias_of is not None for row in result.rows if row.verdict == verdict)
+        if verdict == "agrees" and aliases:
+            part += f" ({aliases} by an alias of another integrator)"
         if verdict in ("disagrees", "failed") and new:
             named = list(dict.fromkeys(f"{row.engine}, {row.scenario}: {row.quantity}" for row in new))
             more = f" and {len(named) - 3} more" if len(named) > 3 else ""
@@ -369,8 +371,3 @@ def commit() -> str | None:
     except (OSError, subprocess.SubprocessError):
         return None
     return done.stdout.strip()
-
-
-def all_engines() -> list[str]:
-    """Names of every engine of the registry."""
-    return list(ENGINES)

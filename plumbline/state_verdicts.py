@@ -110,8 +110,8 @@ def row(
             f"rounding bound; {int(np.sum(ratios > 1))} of {count} states disagree"
         )
         return who.row("state", "-", quantity, "disagrees", reason, unit, **common)
-    if bluntness > BLUNT:
-        reason = f"blunt: the rounding bound is {bluntness:.1g} of the scale, above {BLUNT:g}"
+    if not (ratio <= 1 and bluntness <= BLUNT):  # a bound that is not a number decides nothing either
+        reason = f"blunt: the rounding bound is {bluntness:.1g} of the scale, above {BLUNT:g} or no number"
         return who.row("state", "-", quantity, "unresolved", reason, unit, **common)
     reason = f"{name} within {ratio:.2g} of the rounding bound at {count} states"
     return who.row("state", "-", quantity, "agrees", reason, unit, **common)
