@@ -117,6 +117,11 @@ def feed(digest: Any, value: Any) -> None:
             for item in value:
                 feed(digest, item)
             return
+        case dict():
+            digest.update(f"dict {len(value)}\n".encode())
+            for item in value.items():
+                feed(digest, item)
+            return
         case _ if is_dataclass(value) and not isinstance(value, type):
             digest.update(f"{type(value).__name__} {len(fields(value))}\n".encode())
             for field in fields(value):

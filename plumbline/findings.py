@@ -7,6 +7,8 @@ from typing import Any
 
 from plumbline.records import Level, Row, Verdict
 
+Columns = dict[str, Any]  # column name → its values (n,), or the one value of all n records
+
 
 @dataclass(frozen=True)
 class Subject:
@@ -38,20 +40,7 @@ class Subject:
 
 @dataclass
 class Findings:
-    """Rows and the tables behind them, as the store keeps them: column name → value per record."""
+    """Rows, and parts of the tables behind them by their name in the store."""
 
     rows: list[Row] = field(default_factory=list)
-    states: list[dict[str, Any]] = field(default_factory=list)
-    convergence: list[dict[str, Any]] = field(default_factory=list)
-    curves: list[dict[str, Any]] = field(default_factory=list)
-    trajectories: list[dict[str, Any]] = field(default_factory=list)
-
-    def extend(self, other: Findings) -> None:
-        """Take in another's rows and tables."""
-        self.rows += other.rows
-        for name, table in self.tables().items():
-            table += getattr(other, name)
-
-    def tables(self) -> dict[str, list[dict[str, Any]]]:
-        """The tables by their name in the store."""
-        return {name: getattr(self, name) for name in ("states", "convergence", "curves", "trajectories")}
+    tables: list[tuple[str, Columns]] = field(default_factory=list)

@@ -8,7 +8,7 @@ An entry that covers cells of a run and explains none of them has had its day an
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Literal
@@ -75,14 +75,6 @@ class Entry(BaseModel):
             return False
 
 
-@dataclass(frozen=True)
-class Judged:
-    """Rows with their excuses, and entries that excused nothing."""
-
-    rows: list[Row]
-    stale: list[Entry]
-
-
 def load(path: Path = FILE) -> list[Entry]:
     """The entries of a file; ValueError naming file and entry where it is not valid."""
     try:
@@ -107,28 +99,39 @@ def spread(item: object) -> list[object]:
     return [item]
 
 
-def excuse(rows: Iterable[Row], entries: Sequence[Entry], *, whole: bool, finer: bool = False) -> Judged:
-    """Mark rows that an entry expects; with ``whole`` (a run of the full matrix) find stale entries.
+class Excuses:
+    """Entries as they are used: rows come by and by, and at the end an entry may have excused nothing."""
 
-    Where only a part of the matrix ran, an entry is stale if it covers rows that ran and excuses none
-    and has no pattern in its scenario: a pattern may have its case among the cells that did not run.
-    ``finer`` ladders than the usual ones may resolve what is recorded as unresolved.
-    """
-    marked, used, covered = [], set(), set()
-    for row in rows:
-        about = [e for e in entries if e.covers(row)]
-        covered |= {e.id for e in about}
-        match = next((e for e in about if e.verdict == row.verdict), None)
-        if match:
-            used.add(match.id)
-        marked.append(replace(row, known=match.id if match else None))
-    stale = [
-        e
-        for e in entries
-        if e.id not in used
-        and not e.sometimes
-        and e.id in covered
-        and not (finer and e.verdict == "unresolved")
-        and (whole or not set("*?[") & set(e.scenario))
-    ]
-    return Judged(marked, stale)
+    def __init__(self, entries: Sequence[Entry]) -> None:
+        self.entries = entries
+        self.used: set[str] = set()
+        self.covered: set[str] = set()
+
+    def mark(self, rows: Iterable[Row]) -> list[Row]:
+        """The rows, with the entry that expects their verdict where there is one."""
+        marked = []
+        for row in rows:
+            about = [e for e in self.entries if e.covers(row)]
+            self.covered |= {e.id for e in about}
+            match = next((e for e in about if e.verdict == row.verdict), None)
+            if match:
+                self.used.add(match.id)
+            marked.append(replace(row, known=match.id if match else None))
+        return marked
+
+    def stale(self, *, whole: bool, finer: bool = False) -> list[Entry]:
+        """Entries that have had their day; with ``whole`` (a run of the full matrix) all that excused none.
+
+        Where only a part of the matrix ran, an entry is stale if it covers rows that ran and excuses none
+        and has no pattern in its scenario: a pattern may have its case among the cells that did not run.
+        ``finer`` ladders than the usual ones may resolve what is recorded as unresolved.
+        """
+        return [
+            e
+            for e in self.entries
+            if e.id not in self.used
+            and not e.sometimes
+            and e.id in self.covered
+            and not (finer and e.verdict == "unresolved")
+            and (whole or not set("*?[") & set(e.scenario))
+        ]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from plumbline.converge import DRIFTS, ORDER_MARGIN, Limit, Order, observed_order, romberg, tightest
-from plumbline.findings import Findings, Subject
+from plumbline.findings import Columns, Findings, Subject
 from plumbline.kinematics import angular_velocity
 from plumbline.measures import (
     UNITS,
@@ -58,9 +58,11 @@ def judge_motion(
         return found
     ladder = Ladder(who, model, truth, integrator, climb.rungs, horizon)
     found.rows += [*ladder.motion(), *ladder.drifts()]
-    found.convergence += ladder.convergence()
-    found.curves += ladder.curves()
-    found.trajectories += poses(who, integrator.name, finest.resolution, finest.trajectory)
+    names: Columns = {"scenario": who.scenario, "engine": who.engine, "integrator": integrator.name}
+    found.tables.append(("convergence", names | ladder.convergence()))
+    names["resolution"] = finest.resolution
+    found.tables.append(("curves", names | ladder.curves()))
+    found.tables.append(("trajectories", names | poses(finest.trajectory)))
     return found
 
 
@@ -405,40 +407,24 @@ class Ladder:
 
     # tables
 
-    def convergence(self) -> list[dict[str, Any]]:
+    def convergence(self) -> Columns:
         """Error against the truth up to the horizon, cost and order at every resolution."""
         end = self.windows(self.horizon)[0]
         true = self.truth.trajectory
-        orders = [float("nan")] * 2 + list(self.shown.orders)
+        orders = [np.nan] * 2 + list(self.shown.orders)
         records = []
         for i, rung in enumerate(self.rungs):
-            errors = {
-                "position": position_error(self.positions[i][:end], true.r[:end]),
-                "attitude": attitude_error(self.attitudes[i][:end], true.p[:end]),
-            }
-            records += [
-                {
-                    **self.cell(rung.resolution),
-                    "quantity": name,
-                    "error": float(np.max(error)),
-                    "cost": rung.cost,
-                    "steps": rung.trajectory.steps if rung.trajectory else 0,
-                    "order": orders[i] if i < len(orders) else float("nan"),
-                }
-                for name, error in errors.items()
-            ]
-        return records
+            steps = rung.trajectory.steps if rung.trajectory else 0
+            order = orders[i] if i < len(orders) else np.nan
+            for name, error in (
+                ("position", position_error(self.positions[i][:end], true.r[:end])),
+                ("attitude", attitude_error(self.attitudes[i][:end], true.p[:end])),
+            ):
+                records.append((rung.resolution, name, np.max(error), rung.cost, steps, order))
+        names = ("resolution", "quantity", "error", "cost", "steps", "order")
+        return dict(zip(names, map(list, zip(*records, strict=True)), strict=True))
 
-    def cell(self, resolution: float) -> dict[str, Any]:
-        """The columns that name a run."""
-        return {
-            "scenario": self.who.scenario,
-            "engine": self.who.engine,
-            "integrator": self.integrator.name,
-            "resolution": resolution,
-        }
-
-    def curves(self) -> list[dict[str, Any]]:
+    def curves(self) -> Columns:
         """Series of the finest run: errors and drifts over time, with the tolerance on positions."""
         last, true = self.drift[-1], self.truth.trajectory
         assert last is not None
@@ -461,29 +447,15 @@ class Ladder:
         for name in UNITS:
             series = getattr(last, name)
             columns[name] = nothing if series is None else np.max(np.linalg.norm(series, axis=-1), axis=1)
-        names = self.cell(self.rungs[-1].resolution)
-        return [
-            {**names, **{name: float(column[i]) for name, column in columns.items()}}
-            for i in range(len(self.times))
-        ]
+        return columns
 
 
-def poses(who: Subject, integrator: str, resolution: float, run: Trajectory) -> list[dict[str, Any]]:
-    """Sampled poses as records: one per time and body."""
-    names = ("rx", "ry", "rz", "p0", "p1", "p2", "p3")
-    cell = {
-        "scenario": who.scenario,
-        "engine": who.engine,
-        "integrator": integrator,
-        "resolution": resolution,
+def poses(run: Trajectory) -> Columns:
+    """Sampled poses, one record per time and body."""
+    samples, bodies = run.r.shape[:2]
+    values = np.concatenate([run.r, run.p], axis=-1).reshape(-1, 7).T
+    return {
+        "t": np.repeat(run.t, bodies),
+        "body": np.tile(np.arange(bodies), samples),
+        **dict(zip(("rx", "ry", "rz", "p0", "p1", "p2", "p3"), values, strict=True)),
     }
-    return [
-        {
-            **cell,
-            "t": float(run.t[i]),
-            "body": k,
-            **dict(zip(names, map(float, (*run.r[i, k], *run.p[i, k])), strict=True)),
-        }
-        for i in range(len(run.t))
-        for k in range(run.r.shape[1])
-    ]

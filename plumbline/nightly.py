@@ -23,7 +23,7 @@ from pathlib import Path
 import reports
 from plumbline import scenario as scenarios
 from plumbline.cells import Cells
-from plumbline.random_scenarios import FAMILY, random_scenarios
+from plumbline.random_scenarios import FAMILY, RandomScenarios
 from plumbline.run import Levels, Plan, Progress, Result, execute, save
 from plumbline.store import write_atomically
 from plumbline.workers import Limits
@@ -84,9 +84,9 @@ def nightly(
     tell(f"random scenarios: {night.random}, seed {night.seed}")
     if kept:
         tell(f"going on with the night begun {night.started}: {kept} cells are done")
-    drawn = list(random_scenarios(night.seed, night.random))
+    drawn = RandomScenarios(night.seed, night.random)
     plan = Plan(
-        [*chosen, *drawn],
+        chosen,
         engines,
         level,
         jobs=jobs,
@@ -94,7 +94,7 @@ def nightly(
         finer=finer,
         whole=whole,
         scheduler=scheduler,
-        probes=frozenset(s.name for s in drawn),
+        probes=drawn,
         memory=Cells(unfinished / "cells", tell),
     )
     result = execute(plan, progress)
@@ -118,10 +118,9 @@ def free(place: Path) -> Path:
 
 
 def write_files_of_random(result: Result, drawn: Sequence[scenarios.Scenario], folder: Path) -> None:
-    """The scenario file of every random scenario with a row that does not agree: `run FILE` repeats it."""
-    wanted = {row.scenario for row in result.rows if row.family == FAMILY and row.verdict != "agrees"}
-    for s in drawn:
-        if s.name in wanted:
-            folder.mkdir(exist_ok=True)
-            text = json.dumps(s.document, indent=1)  # JSON is YAML
-            write_atomically(folder / f"{s.name}.yaml", text.encode())
+    """The scenario file of every random scenario that someone should see: `run FILE` repeats it."""
+    wanted = {row.scenario for row in result.rows if row.family == FAMILY}
+    for s in (drawn[int(name.rpartition("-")[2])] for name in sorted(wanted)):
+        folder.mkdir(exist_ok=True)
+        text = json.dumps(s.document, indent=1)  # JSON is YAML
+        write_atomically(folder / f"{s.name}.yaml", text.encode())

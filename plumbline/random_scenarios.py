@@ -7,8 +7,8 @@ the others.  Each is a document like any scenario file's and passes the same che
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, overload
 
 import numpy as np
 
@@ -24,9 +24,25 @@ PURPOSE = (
 )
 
 
-def random_scenarios(seed: int, count: int) -> Iterator[Scenario]:
-    """The first ``count`` scenarios of a seed, made one by one."""
-    return (random_scenario(seed, k) for k in range(count))
+class RandomScenarios(Sequence[Scenario]):
+    """The first ``count`` scenarios of a seed, each made when it is asked for."""
+
+    def __init__(self, seed: int, count: int) -> None:
+        self.seed, self.numbers = seed, range(count)
+
+    def __len__(self) -> int:
+        """How many."""
+        return len(self.numbers)
+
+    @overload
+    def __getitem__(self, k: int) -> Scenario: ...
+    @overload
+    def __getitem__(self, k: slice) -> list[Scenario]: ...
+    def __getitem__(self, k: int | slice) -> Scenario | list[Scenario]:
+        """Scenario k."""
+        if isinstance(k, slice):
+            return [random_scenario(self.seed, number) for number in self.numbers[k]]
+        return random_scenario(self.seed, self.numbers[k])
 
 
 def random_scenario(seed: int, k: int) -> Scenario:

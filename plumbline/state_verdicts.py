@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 import numpy as np
 
 from plumbline.bound import BLUNT
-from plumbline.findings import Findings, Subject
+from plumbline.findings import Columns, Findings, Subject
 from plumbline.records import Array, Row
 from plumbline.work import Evaluation
 from plumbline.yardstick import StateTruth
@@ -39,14 +36,16 @@ def judge_states(who: Subject, truth: StateTruth, said: Evaluation) -> Findings:
             reason = f"{who.title} offers no {quantity.replace('_', ' ')} of its own"
             found.rows.append(who.row("state", "-", quantity, "unsupported", reason, unit))
             continue
-        records = compare(who, quantity, truth, said)
-        found.states += records
-        found.rows.append(row(who, quantity, unit, records, truth.method, said.cost))
+        worst = compare(quantity, truth, said)
+        found.tables.append(
+            ("states", {"scenario": who.scenario, "engine": who.engine, "quantity": quantity, **worst})
+        )
+        found.rows.append(row(who, quantity, unit, worst, truth.method, said.cost))
     return found
 
 
-def compare(who: Subject, quantity: str, truth: StateTruth, said: Evaluation) -> list[dict[str, Any]]:
-    """One record per state: the error, bound and scale of the body that comes nearest to its bound."""
+def compare(quantity: str, truth: StateTruth, said: Evaluation) -> Columns:
+    """Per state (S,): the error, bound and scale of the body that comes nearest to its bound."""
     records = []
     answers = zip(said.quantities, truth.quantities, truth.bounds, strict=True)
     for index, (answer, true, bound) in enumerate(answers):
@@ -54,19 +53,9 @@ def compare(who: Subject, quantity: str, truth: StateTruth, said: Evaluation) ->
         tolerance = np.broadcast_to(bound.tolerance(quantity), error.shape)
         scale = np.broadcast_to(bound.scale[quantity], error.shape)
         body = int(np.argmax(error / np.maximum(tolerance, TINY)))
-        records.append(
-            {
-                "scenario": who.scenario,
-                "engine": who.engine,
-                "quantity": quantity,
-                "state": index,
-                "body": body,
-                "error": float(error[body]),
-                "bound": float(tolerance[body]),
-                "scale": float(scale[body]),
-            }
-        )
-    return records
+        records.append((index, body, error[body], tolerance[body], scale[body]))
+    names = ("state", "body", "error", "bound", "scale")
+    return {name: np.array(column) for name, column in zip(names, zip(*records, strict=True), strict=True)}
 
 
 def sizes(quantity: str, difference: Array) -> Array:
@@ -76,37 +65,37 @@ def sizes(quantity: str, difference: Array) -> Array:
     return np.atleast_1d(np.linalg.norm(np.atleast_1d(difference), axis=-1))
 
 
-def row(
-    who: Subject, quantity: str, unit: str, records: Sequence[dict[str, Any]], method: str, cost: float
-) -> Row:
+def row(who: Subject, quantity: str, unit: str, found: Columns, method: str, cost: float) -> Row:
     """The verdict on one quantity: its worst error over bound decides, a blunt bound decides nothing."""
-    ratios = np.array([record["error"] / max(record["bound"], TINY) for record in records])
-    worst = records[int(np.argmax(ratios))]
-    scaled = [record for record in records if record["scale"] > 0]
-    relative = max((record["error"] / record["scale"] for record in scaled), default=0.0)
-    bluntness = float(np.median([record["bound"] / record["scale"] for record in scaled] or [0.0]))
-    name, ratio, count = quantity.replace("_", " "), float(np.max(ratios)), len(records)
-    where = f"state {worst['state']}, body {worst['body'] + 1}"
+    error, bound, scale = found["error"], found["bound"], found["scale"]
+    ratios, there = error / np.maximum(bound, TINY), scale > 0
+    at = int(np.argmax(ratios))
+    relative = float(np.max(error[there] / scale[there], initial=0.0))
+    bluntness = float(np.median(bound[there] / scale[there])) if there.any() else 0.0
+    worst, allowed = float(error[at]), float(bound[at])
+    state, body = int(found["state"][at]), int(found["body"][at]) + 1
+    name, ratio, count = quantity.replace("_", " "), float(np.max(ratios)), len(ratios)
+    where = f"state {state}, body {body}"
     common = {
-        "value": worst["error"],
-        "tolerance": worst["bound"],
+        "value": worst,
+        "tolerance": allowed,
         "derivation": (
-            f"first-order rounding bound per body and state, {worst['bound']:.2g} {unit} at {where}, "
+            f"first-order rounding bound per body and state, {allowed:.2g} {unit} at {where}, "
             f"{bluntness:.1g} of the scale in the median of {count} states; truth: {method}"
         ),
         "wall_time": cost,
         "extra": {
             "ratio": ratio,
-            "relative": float(relative),
+            "relative": relative,
             "states": float(count),
             "bound_relative": bluntness,
-            "state": float(worst["state"]),
-            "body": float(worst["body"] + 1),
+            "state": float(state),
+            "body": float(body),
         },
     }
     if ratio > 1:
         reason = (
-            f"{who.title}'s {name} is off by {worst['error']:.3g} {unit} at {where}, {ratio:.3g} times the "
+            f"{who.title}'s {name} is off by {worst:.3g} {unit} at {where}, {ratio:.3g} times the "
             f"rounding bound; {int(np.sum(ratios > 1))} of {count} states disagree"
         )
         return who.row("state", "-", quantity, "disagrees", reason, unit, **common)

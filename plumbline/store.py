@@ -11,20 +11,23 @@ import contextlib
 import json
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from plumbline.findings import Columns
 from plumbline.records import Row
 
 SCHEMA_VERSION = 1
 TEXT = pa.string()
 REAL = pa.float64()
 WHOLE = pa.int32()
+GROUP = 65_536  # records encoded together
 
 
 def _schema(**columns: pa.DataType) -> pa.Schema:
@@ -84,21 +87,62 @@ def row_record(row: Row) -> dict[str, Any]:
     return {"key": row.key, **plain(asdict(row))}
 
 
-def write_table(folder: Path, name: str, records: Sequence[dict[str, Any]]) -> None:
-    """One Parquet table: zstd, floats split by byte."""
-    schema = TABLES[name]
-    table = pa.Table.from_pylist(list(records), schema=schema)
-    sink = pa.BufferOutputStream()
-    reals = [f.name for f in schema if f.type == REAL]
-    texts = [f.name for f in schema if f.type == TEXT]
-    pq.write_table(
-        table,
-        sink,
-        compression="zstd",
-        use_dictionary=texts,
-        column_encoding=dict.fromkeys(reals, "BYTE_STREAM_SPLIT"),
-    )
-    write_atomically(folder / f"{name}.parquet", sink.getvalue().to_pybytes())
+class Tables:
+    """The tables of a run, encoded as they come: ten thousand cells take a few megabytes.
+
+    Parquet in zstd, floats split by byte, in row groups of `GROUP` records.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: dict[str, list[pa.Table]] = {}
+        self._files: dict[str, tuple[pa.BufferOutputStream, pq.ParquetWriter]] = {}
+
+    def add(self, name: str, columns: Columns) -> None:
+        """Take in records of the table ``name``."""
+        schema = TABLES[name]
+        count = next((len(c) for c in columns.values() if isinstance(c, list | np.ndarray)), 1)
+        arrays = [
+            pa.array(columns[field.name], field.type)
+            if isinstance(columns[field.name], list | np.ndarray)
+            else pa.repeat(pa.scalar(columns[field.name], field.type), count)
+            for field in schema
+        ]
+        waiting = self._waiting.setdefault(name, [])
+        waiting.append(pa.Table.from_arrays(arrays, schema=schema))
+        if sum(map(len, waiting)) >= GROUP:
+            self._encode(name)
+
+    def add_rows(self, rows: Iterable[Row]) -> None:
+        """Take in rows for the summary."""
+        records = [row_record(row) for row in rows]
+        if records:
+            names = TABLES["summary"].names
+            columns: Columns = {name: [r.get(name) for r in records] for name in names}
+            columns["extra"] = [json.dumps(r["extra"]) for r in records]
+            self.add("summary", columns)
+
+    def _encode(self, name: str) -> None:
+        if name not in self._files:
+            schema, sink = TABLES[name], pa.BufferOutputStream()
+            writer = pq.ParquetWriter(
+                sink,
+                schema,
+                compression="zstd",
+                use_dictionary=[f.name for f in schema if f.type == TEXT],
+                column_encoding={f.name: "BYTE_STREAM_SPLIT" for f in schema if f.type == REAL},
+            )
+            self._files[name] = sink, writer
+        self._files[name][1].write_table(pa.concat_tables(self._waiting.pop(name, [])), GROUP)
+
+    def write(self, folder: Path) -> None:
+        """Write each as FOLDER/NAME.parquet; nothing can be added any more."""
+        for name in TABLES:
+            if name in self._waiting or name not in self._files:
+                self._waiting.setdefault(name, []).append(TABLES[name].empty_table())
+                self._encode(name)
+            sink, writer = self._files[name]
+            writer.close()
+            write_atomically(folder / f"{name}.parquet", sink.getvalue().to_pybytes())
 
 
 def read_table(folder: Path, name: str) -> list[dict[str, Any]]:
@@ -113,20 +157,17 @@ def write(
     scenarios: dict[str, Any],
     engines: dict[str, Any],
     rows: Sequence[Row],
-    tables: dict[str, list[dict[str, Any]]],
+    tables: Tables,
 ) -> None:
-    """Write one run's results; ``tables`` by name as in `TABLES`, without the summary."""
+    """Write one run's results; the summary in ``tables`` holds ``rows`` and may hold more (of probes)."""
     folder.mkdir(parents=True, exist_ok=True)
-    records = [row_record(row) for row in rows]
-    for name, table in tables.items():
-        write_table(folder, name, table)
-    write_table(folder, "summary", [{**r, "extra": json.dumps(r["extra"])} for r in records])
+    tables.write(folder)
     document = {
         "schema_version": SCHEMA_VERSION,
         "run": run,
         "scenarios": scenarios,
         "engines": engines,
-        "rows": records,
+        "rows": [row_record(row) for row in rows],
     }
     # results.json last: its presence says that the folder is complete
     text = json.dumps(plain(document), ensure_ascii=False, indent=1)

@@ -28,7 +28,9 @@ def night(folder, day, verdicts, version="4.0", known=None, family="single"):
         "sentence": "",
         "versions": {"mujoco": version},
     }
-    store.write(folder / run["id"], run, {}, {}, rows, {})
+    tables = store.Tables()
+    tables.add_rows(rows)
+    store.write(folder / run["id"], run, {}, {}, rows, tables)
 
 
 def test_first_bad_night_and_last_green(tmp_path):

@@ -1,5 +1,7 @@
 """The only file that may excuse a verdict, and how an entry loses its place."""
 
+from types import SimpleNamespace
+
 import pytest
 
 from plumbline import known
@@ -20,33 +22,39 @@ def row(verdict="disagrees", quantity="acceleration", who=WHO):
     return who.row("state", "-", quantity, verdict, "why")
 
 
+def judged_by(rows, entries, **form):
+    """Rows with their excuses, and what is stale then."""
+    excuses = known.Excuses(entries)
+    return SimpleNamespace(rows=excuses.mark(rows), stale=excuses.stale(**form))
+
+
 def test_an_entry_marks_its_row_and_no_other():
     rows = [row(), row(quantity="joint_reaction"), row("unresolved")]
-    judged = known.excuse(rows, [entry()], whole=True)
+    judged = judged_by(rows, [entry()], whole=True)
     assert [r.known for r in judged.rows] == ["a", None, None]
     assert judged.stale == []
 
 
 def test_an_entry_that_no_longer_occurs_is_stale():
-    judged = known.excuse([row("agrees")], [entry()], whole=False)
+    judged = judged_by([row("agrees")], [entry()], whole=False)
     assert [e.id for e in judged.stale] == ["a"]
 
 
 def test_what_did_not_run_is_not_stale():
-    assert known.excuse([], [entry()], whole=False).stale == []
+    assert judged_by([], [entry()], whole=False).stale == []
 
 
 def test_a_pattern_is_stale_only_when_the_whole_matrix_ran():
     wide = entry(scenario="*")
-    assert known.excuse([row("agrees")], [wide], whole=False).stale == []
-    assert known.excuse([row("agrees")], [wide], whole=True).stale == [wide]
+    assert judged_by([row("agrees")], [wide], whole=False).stale == []
+    assert judged_by([row("agrees")], [wide], whole=True).stale == [wide]
 
 
 @pytest.mark.parametrize(
     ("versions", "excused"), [(">=4", True), ("<4", False), ("", True), ("==4.0.*", True)]
 )
 def test_version_ranges(versions, excused):
-    judged = known.excuse([row()], [entry(versions=versions)], whole=False)
+    judged = judged_by([row()], [entry(versions=versions)], whole=False)
     assert (judged.rows[0].known == "a") is excused
     assert judged.stale == [], "an entry about another version is not about this run"
 
@@ -84,16 +92,16 @@ def test_a_list_of_scenarios_is_an_entry_for_each(tmp_path):
 def test_only_random_scenarios_may_show_it_sometimes():
     chance = entry(scenario="random-*", sometimes=True)
     who = Subject("random-1-2", "random", "mujoco", "MuJoCo", "4.0.0")
-    assert known.excuse([row("agrees", who=who)], [chance], whole=True).stale == []
-    assert known.excuse([row(who=who)], [chance], whole=True).rows[0].known == "a"
+    assert judged_by([row("agrees", who=who)], [chance], whole=True).stale == []
+    assert judged_by([row(who=who)], [chance], whole=True).rows[0].known == "a"
     with pytest.raises(ValueError, match="random"):
         entry(sometimes=True)
 
 
 def test_finer_ladders_may_resolve_what_was_not():
     open_ = entry(verdict="unresolved")
-    assert known.excuse([row("agrees")], [open_], whole=True).stale == [open_]
-    assert known.excuse([row("agrees")], [open_], whole=True, finer=True).stale == []
+    assert judged_by([row("agrees")], [open_], whole=True).stale == [open_]
+    assert judged_by([row("agrees")], [open_], whole=True, finer=True).stale == []
 
 
 def test_an_id_twice_is_refused(tmp_path):

@@ -9,8 +9,9 @@ import os
 import pytest
 
 from plumbline import known, scenario
+from plumbline.bench import Bench
 from plumbline.registry import ENGINES
-from plumbline.run import Bench, Plan, describe_all
+from plumbline.run import Plan, describe_all
 from plumbline.workers import Limits, Workers
 
 LONG = 5  # bodies: longer chains climb their ladders in the full form only
@@ -63,9 +64,11 @@ def test_cell(name, engine, level, workers, engines, truths):
     truths[name, level] = dict(bench.truths)
     rows = bench.findings().rows
     assert rows, "no answer at all"
-    judged = known.excuse(rows, known.load(), whole=False)
+    excuses = known.Excuses(known.load())
     wrong = [
-        f"{r.key} {r.verdict}: {r.reason}" for r in judged.rows if r.verdict != "agrees" and r.known is None
+        f"{r.key} {r.verdict}: {r.reason}"
+        for r in excuses.mark(rows)
+        if r.verdict != "agrees" and r.known is None
     ]
-    stale = [f"known entry {e.id} no longer occurs" for e in judged.stale]
+    stale = [f"known entry {e.id} no longer occurs" for e in excuses.stale(whole=False)]
     assert not wrong + stale, "\n".join(wrong + stale)

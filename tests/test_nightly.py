@@ -9,7 +9,7 @@ import pytest
 from plumbline import nightly, scenario
 from plumbline.history import History
 from plumbline.nightly import Night
-from plumbline.random_scenarios import FAMILY, MOST_BODIES, document, random_scenario, random_scenarios
+from plumbline.random_scenarios import FAMILY, MOST_BODIES, RandomScenarios, document, random_scenario
 from plumbline.workers import Limits
 
 
@@ -18,14 +18,14 @@ def quiet(*_):
 
 
 def test_a_random_scenario_depends_on_its_seed_and_number_alone():
-    first = list(random_scenarios(5, 12))
+    first = list(RandomScenarios(5, 12))
     assert [s.digest for s in first] == [random_scenario(5, k).digest for k in range(12)]
     assert first[3].digest != random_scenario(6, 3).digest
     assert len({s.digest for s in first}) == 12
 
 
 def test_random_scenarios_cover_what_they_promise():
-    drawn = list(random_scenarios(1, 300))
+    drawn = list(RandomScenarios(1, 300))
     mass = np.concatenate([s.model.mass for s in drawn])
     assert {s.model.n for s in drawn} == set(range(1, MOST_BODIES + 1))
     assert mass.min() < 1e-2 and mass.max() > 1e2
@@ -105,7 +105,7 @@ def test_a_file_is_kept_of_what_does_not_agree(tmp_path):
     from plumbline.findings import Subject
     from plumbline.run import Result
 
-    drawn = list(random_scenarios(2, 2))
+    drawn = list(RandomScenarios(2, 2))
     rows = [
         Subject(s.name, FAMILY, "mujoco", "MuJoCo", "4").row("state", "-", "acceleration", verdict, "why")
         for s, verdict in zip(drawn, ("agrees", "disagrees"), strict=True)

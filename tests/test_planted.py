@@ -15,12 +15,12 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
+from plumbline.bench import horizon_of
 from plumbline.converge import ladder
 from plumbline.diagnosis import diagnose
 from plumbline.findings import Subject
 from plumbline.motion_verdicts import judge_motion
 from plumbline.registry import adapter
-from plumbline.run import horizon_of
 from plumbline.sampling import random_states
 from plumbline.state_verdicts import judge_states
 from plumbline.work import Evaluation, climb

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from plumbline.bench import horizon_of
 from plumbline.bound import state_bound
 from plumbline.findings import Subject
 from plumbline.motion_verdicts import judge_motion
 from plumbline.registry import adapter
-from plumbline.run import horizon_of
 from plumbline.sampling import random_states
 from plumbline.state_verdicts import judge_states
 from plumbline.work import Evaluation, climb

@@ -5,6 +5,8 @@ import json
 import os
 from pathlib import Path
 
+import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from plumbline import store
@@ -27,17 +29,33 @@ STATES = [
         "scenario": "s",
         "engine": "mujoco",
         "quantity": "q",
-        "state": 0,
+        "state": k,
         "body": 0,
-        "error": 0.1,
+        "error": 0.1 * k,
         "bound": 1.0,
         "scale": 2.0,
     }
+    for k in range(3)
 ]
 
 
 def write(folder):
-    store.write(folder, {"id": "x"}, {"s": {"title": "<b>"}}, {}, [ROW], {"states": STATES})
+    tables = store.Tables()
+    names = {"scenario": "s", "engine": "mujoco", "quantity": "q"}
+    for part in ([0], [1, 2]):
+        tables.add(
+            "states",
+            names
+            | {
+                "state": part,
+                "body": [0] * len(part),
+                "error": 0.1 * np.array(part, float),
+                "bound": 1.0,
+                "scale": 2.0,
+            },
+        )
+    tables.add_rows([ROW])
+    store.write(folder, {"id": "x"}, {"s": {"title": "<b>"}}, {}, [ROW], tables)
 
 
 def test_what_is_written_is_read_back(tmp_path):
@@ -55,7 +73,31 @@ def test_what_is_written_is_read_back(tmp_path):
 
 def test_nothing_temporary_is_left(tmp_path):
     write(tmp_path)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["results.json", "states.parquet", "summary.parquet"]
+    assert {p.name for p in tmp_path.iterdir()} == {"results.json"} | {f"{n}.parquet" for n in store.TABLES}
+
+
+def test_many_records_take_several_row_groups_and_none_is_lost(tmp_path, monkeypatch):
+    monkeypatch.setattr(store, "GROUP", 7)
+    tables = store.Tables()
+    for k in range(20):
+        column = np.arange(3.0) + 3 * k
+        tables.add(
+            "states",
+            {
+                "scenario": "s",
+                "engine": f"e{k}",
+                "quantity": "q",
+                "state": column.astype(int),
+                "body": [0] * 3,
+                "error": column,
+                "bound": 1.0,
+                "scale": 2.0,
+            },
+        )
+    tables.write(tmp_path)
+    assert [r["error"] for r in store.read_table(tmp_path, "states")] == list(range(60))
+    assert pq.ParquetFile(tmp_path / "states.parquet").num_row_groups > 2
+    assert store.read_table(tmp_path, "curves") == []
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):

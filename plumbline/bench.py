@@ -1,0 +1,216 @@
+"""One scenario on all engines: makes the tasks, judges their outcomes once the truth is there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from plumbline import relations, versions, work, yardstick
+from plumbline.converge import ladder
+from plumbline.exact import solution
+from plumbline.findings import Findings, Subject
+from plumbline.motion_verdicts import judge_motion
+from plumbline.records import StateQuantities, Verdict
+from plumbline.sampling import random_states, seed_of
+from plumbline.scenario import Scenario
+from plumbline.state_verdicts import judge_states
+from plumbline.work import EngineInfo
+from plumbline.workers import Outcome, Task
+from plumbline.yardstick import ROUNDING, MotionTruth, StateTruth
+
+if TYPE_CHECKING:
+    from plumbline.run import Plan
+
+PROBE_STATES = 9  # random states of a probe: there are many probes
+HORIZON_TOLERANCE = 1e-9  # m: positions are compared while rounding, grown, stays below this
+
+Key = tuple[str, ...]  # scenario, engine or "truth" or "why", level, …
+
+
+@dataclass(frozen=True)
+class Lost:
+    """A truth that could not be had."""
+
+    reason: str
+
+
+class Bench:
+    """A scenario's cells: ``keys`` of its tasks, and ``judged`` by key as their outcomes come."""
+
+    def __init__(
+        self, plan: Plan, scenario: Scenario, engines: dict[str, EngineInfo], probe: bool = False
+    ) -> None:
+        self.plan, self.scenario, self.engines = plan, scenario, engines
+        self.level = "state" if probe else plan.level
+        self.keys = list(keys(scenario.name, engines, self.level))
+        self.open = set(self.keys)  # not answered yet
+        self.judged: dict[Key, Findings] = {}
+        self.truths: dict[str, StateTruth | MotionTruth | Lost] = {}
+        self.early: list[Outcome] = []  # engines' answers that came before the truth
+        count = min(plan.states, PROBE_STATES) if probe else plan.states
+        self.states = [
+            scenario.state,
+            *random_states(scenario.model, count, seed_of("states", scenario.digest)),
+        ]
+
+    def tasks(self) -> Iterator[Task]:
+        """Truth first (unless it is there already), then every engine's cells."""
+        for key in self.keys:
+            if key[1] != "truth":
+                yield self.cell(key)
+            elif key[2] not in self.truths:
+                yield self.truth(key)
+
+    def truth(self, key: Key) -> Task:
+        """The task of what the engines are measured with at one level."""
+        s = self.scenario
+        if key[2] == "state":
+            return Task(key, yardstick.state_truth, (s.model, self.states), self.plan.limits)
+        closed = solution(s)
+        exact = (*closed(s.times), closed.source) if closed and closed.amplitude == 0 else None
+        return Task(key, yardstick.motion_truth, (s.model, s.state, s.times, exact), self.plan.limits)
+
+    def cell(self, key: Key) -> Task:
+        """The task of one cell."""
+        s, (_, name, level, *rest) = self.scenario, key
+        info = self.engines[name]
+        call: Callable[..., Any] = {"state": work.evaluate, "relations": relations.check}.get(
+            level, work.climb
+        )
+        arguments: tuple[Any, ...] = (s.model, self.states)
+        if level == "trajectory":
+            integrator = next(i for i in info.integrators if i.name == rest[0])
+            steps = ladder(integrator, s.model.n, s.duration, self.plan.finer)
+            arguments = (integrator.name, s.model, s.state, s.times, steps)
+        base, _ = versions.split(name)
+        return Task(key, call, (base, *arguments), self.plan.limits, info.version, info.python)
+
+    @property
+    def done(self) -> bool:
+        """Whether nothing is on its way any more."""
+        return not self.open
+
+    def findings(self) -> Findings:
+        """All that was found, in the order of the tasks, whichever answered first."""
+        found = Findings()
+        for name, info in self.engines.items():
+            if info.missing is not None:
+                verdict: Verdict = "unsupported" if info.version else "not installed"
+                found.rows.append(self.who(name).row("state", "-", "all", verdict, info.missing))
+            for key in self.keys:
+                if key[1] == name and key in self.judged:
+                    found.rows += self.judged[key].rows
+                    found.tables += self.judged[key].tables
+        return found
+
+    def who(self, engine: str) -> Subject:
+        """The subject of this scenario's rows about an engine."""
+        info = self.engines[engine]
+        return Subject(self.scenario.name, self.scenario.family, engine, info.title, info.version)
+
+    def take(self, outcome: Outcome) -> list[Task]:
+        """Keep a truth and judge what waited for it, judge an answer or let it wait; new questions."""
+        self.open.discard(outcome.key)
+        if outcome.key[1] == "why":
+            self.explain(outcome)
+        elif outcome.key[1] != "truth":
+            self.early.append(outcome)
+        elif outcome.lost is None:
+            self.truths[outcome.key[2]] = outcome.value
+        else:
+            self.truths[outcome.key[2]] = Lost(outcome.lost)
+        questions = []
+        waiting, self.early = self.early, []
+        for answer in waiting:
+            if answer.key[2] not in self.truths and answer.key[2] != "relations":
+                self.early.append(answer)
+                continue
+            found = self.judged[answer.key] = self.judge(answer)
+            if answer.key[2] == "state" and any(row.verdict == "disagrees" for row in found.rows):
+                questions.append(self.question(answer.key[1], answer.value.quantities))
+        self.open |= {task.key for task in questions}
+        return questions
+
+    def judge(self, outcome: Outcome) -> Findings:
+        """Verdicts on one cell."""
+        _, engine, level, *integrators = outcome.key
+        who, truth = self.who(engine), self.truths.get(level)
+        name = integrators[0] if integrators else "-"
+        if outcome.lost or isinstance(truth, Lost):
+            lost = outcome.lost or f"no truth to judge by: {getattr(truth, 'reason', '')}"
+            return Findings(rows=[who.row(level, name, "all", "failed", lost)])
+        if truth is None:
+            found = relations.judge_relations(who, outcome.value)
+        elif isinstance(truth, StateTruth):
+            found = judge_states(who, truth, outcome.value)
+        else:
+            integrator = next(i for i in self.engines[engine].integrators if i.name == name)
+            horizon = horizon_of(truth)
+            found = judge_motion(who, self.scenario.model, truth, integrator, outcome.value, horizon)
+        if self.plan.accept is not None:
+            found.rows = [replace(row, accept=self.plan.accept) for row in found.rows]
+        return found
+
+    def question(self, engine: str, said: list[StateQuantities]) -> Task:
+        """Which term is it, in a cell that disagrees at state level?"""
+        (base, _), info = versions.split(engine), self.engines[engine]
+        arguments = (base, self.scenario.model, said, self.truths["state"])
+        key = (self.scenario.name, "why", engine)
+        return Task(key, work.explain, arguments, self.plan.limits, info.version, info.python)
+
+    def explain(self, outcome: Outcome) -> None:
+        """Take the answer to a question into the rows that disagree."""
+        text = outcome.value or f"no diagnosis: {outcome.lost}"
+        cell = self.judged[self.scenario.name, outcome.key[2], "state"]
+        cell.rows = [replace(r, diagnosis=text) if r.verdict == "disagrees" else r for r in cell.rows]
+
+    def summary(self) -> dict[str, Any]:
+        """What the store keeps of the scenario."""
+        s, truth = self.scenario, self.truths.get("trajectory")
+        about = {
+            "family": s.family,
+            "title": s.title,
+            "purpose": s.purpose,
+            "file": s.path.name,
+            "bodies": s.model.n,
+            "joints": ["rod" if rod else "ball" for rod in s.model.rods],
+            "duration": s.duration,
+            "sample": s.sample,
+            "exact": s.exact,
+            "digest": s.digest,
+            "model": {key: np.asarray(value).tolist() for key, value in vars(s.model).items()},
+            "state": {key: getattr(s.state, key).tolist() for key in ("p", "omega", "u", "udot")},
+        }
+        if isinstance(truth, MotionTruth):
+            about |= {
+                "horizon": horizon_of(truth),
+                "growth": float(truth.growth[-1]),
+                "truth": truth.method,
+                "truth_uncertainty": float(truth.position_uncertainty[-1]),
+            }
+        return about
+
+
+def keys(scenario: str, engines: dict[str, EngineInfo], level: str) -> Iterator[Key]:
+    """The keys of a scenario's tasks, in the order in which they are made."""
+    levels = [one for one in ("state", "trajectory") if level in (one, "all")]
+    yield from ((scenario, "truth", one) for one in levels)
+    for name, info in engines.items():
+        if info.missing is not None:
+            continue
+        if "state" in levels:
+            yield scenario, name, "state"
+        if level == "all":
+            yield scenario, name, "relations"
+        if "trajectory" in levels:
+            yield from ((scenario, name, "trajectory", i.name) for i in info.integrators)
+
+
+def horizon_of(truth: MotionTruth) -> float:
+    """T_h in s: the last sample at which rounding and the truth's error, grown, are below the tolerance."""
+    reached = truth.length * ROUNDING * truth.growth + truth.position_uncertainty
+    good = np.maximum.accumulate(reached) <= HORIZON_TOLERANCE
+    return float(truth.trajectory.t[np.flatnonzero(good)[-1]]) if good.any() else 0.0
