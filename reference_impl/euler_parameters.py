@@ -18,11 +18,32 @@ Field = NDArray[Any]  # float, complex or exact entries
 I3 = np.eye(3, dtype=int)  # integers: exact in every field
 
 
+def _linear(*rows: str) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Places and signs of a matrix whose every entry is 0 or ± a component of the vector it is made of.
+
+    Taken at once: the matrices below are most of what a right-hand side costs in calls.
+    """
+    entries = np.array([row.split() for row in rows])
+    place = np.array([[int(entry[-1]) for entry in row] for row in entries])
+    sign = np.array([[{"-": -1, "+": 1, "0": 0}[entry[0]] for entry in row] for row in entries])
+    return place, sign
+
+
+_TILDE = _linear("00 -2 +1", "+2 00 -0", "-1 +0 00")
+_L = _linear("-1 +0 +3 -2", "-2 -3 +0 +1", "-3 +2 -1 +0")
+_G = _linear("-1 +0 -3 +2", "-2 +3 +0 -1", "-3 -2 +1 +0")
+_B = _linear("00 -0 -1 -2", "+0 00 +2 -1", "+1 -2 00 +0", "+2 +1 -0 00")
+
+
+def _matrix(x: Field, linear: tuple[NDArray[Any], NDArray[Any]]) -> Field:
+    """The matrix (..., i, j) of x (..., k)."""
+    place, sign = linear
+    return np.asarray(x.take(place, axis=-1) * sign)
+
+
 def tilde(v: Field) -> Field:
     """Cross-product matrix ṽ (..., 3, 3) of v (..., 3): ṽ w = v × w."""
-    out = np.zeros((*v.shape, 3), v.dtype)
-    out[..., 2, 1], out[..., 0, 2], out[..., 1, 0] = v[..., 0], v[..., 1], v[..., 2]
-    return out - out.swapaxes(-1, -2)
+    return _matrix(v, _TILDE)
 
 
 def outer(a: Field, b: Field) -> Field:
@@ -43,19 +64,17 @@ def A(p: Field) -> Field:
 
 def L(p: Field) -> Field:
     """The notes' matrix [−e, p0 I − ẽ], (..., 3, 4): ω′ = 2 Lṗ, body frame."""
-    return np.concatenate([-p[..., 1:, None], p[..., 0, None, None] * I3 - tilde(p[..., 1:])], -1)
+    return _matrix(p, _L)
 
 
 def G(p: Field) -> Field:
     """The notes' matrix [−e, p0 I + ẽ], (..., 3, 4): A = G Lᵀ + (pᵀp − 1) I."""
-    return np.concatenate([-p[..., 1:, None], p[..., 0, None, None] * I3 + tilde(p[..., 1:])], -1)
+    return _matrix(p, _G)
 
 
 def B(s: Field) -> Field:
     """(N8) B = [[0, −sᵀ], [s, −s̃]], (..., 4, 4)."""
-    out = np.zeros((*s.shape[:-1], 4, 4), s.dtype)
-    out[..., 0, 1:], out[..., 1:, 0], out[..., 1:, 1:] = -s, s, -tilde(s)
-    return out
+    return _matrix(s, _B)
 
 
 def H(p: Field, s: Field) -> Field:

@@ -17,12 +17,13 @@ bodies are S1–S4 and D2–D6: `printed`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reference_impl.chain import Chain
-from reference_impl.euler_parameters import I3, A, A_rate, Field, H, dot
+from reference_impl.euler_parameters import I3, A, A_rate, B, Field, G, dot, outer
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,25 +56,55 @@ def row_joints(chain: Chain) -> NDArray[np.intp]:
     return np.repeat(np.arange(chain.n), np.where(chain.rods, 1, 3))
 
 
+@dataclass(frozen=True, eq=False)
+class Layout:
+    """What the rows of a chain have in common at every state."""
+
+    bodies: NDArray[np.intp]  # (2, N) near and far body of each joint; the pivot's is body 0, see `s`
+    s: Field  # (2, N, 3) m, their points; 0 for the pivot, which takes body 0 out: H(p, 0) = 0
+    B: Field  # (2, N, 4, 4) B(s)
+    squares: Field  # (N,) m²: sᵀs of both points less ℓ²
+    rod: NDArray[np.intp]  # joints that are rods
+    ball: NDArray[np.intp]
+    joint: NDArray[np.intp]  # (c,) the joint of each row
+    order: NDArray[np.intp]  # (c,) rows of the rods, then of the balls, in the order of the joints
+
+
+@lru_cache(maxsize=64)  # chains are never changed, and a run asks for the same one ten thousand times
+def layout(chain: Chain) -> Layout:
+    """The layout of one chain's rows."""
+    k = np.arange(chain.n)
+    s = np.stack([chain.proximal, after_pivot(chain.distal)])
+    rod, ball = np.flatnonzero(chain.rods), np.flatnonzero(~chain.rods)
+    return Layout(
+        bodies=np.stack([k, np.maximum(k - 1, 0)]),
+        s=s,
+        B=B(s),
+        squares=dot(s, s).sum(0) - chain.length**2,
+        rod=rod,
+        ball=ball,
+        joint=row_joints(chain),
+        order=np.argsort(np.concatenate([rod, np.repeat(ball, 3)]), kind="stable"),
+    )
+
+
 def rows(chain: Chain, r: Field, p: Field, v: Field, pdot: Field) -> Rows:
     """C, C_r, C_p and γ of every joint at r, ṙ (N, 3), p, ṗ (N, 4), on or off the manifold."""
-    s = np.stack([chain.proximal, after_pivot(chain.distal)])  # (2, N, 3): near and far point of each joint
-    # The pivot has no Euler parameters: those of body 0 stand in, and s = 0 takes them out: H(p, 0) = 0.
-    q, qdot = (np.stack([y, np.concatenate([y[:1], y[:-1]])]) for y in (p, pdot))  # (2, N, 4)
+    fixed = layout(chain)
+    s, rod, ball = fixed.s, fixed.rod, fixed.ball
+    q, qdot = p[fixed.bodies], pdot[fixed.bodies]  # (2, N, 4): near and far body of each joint
     x, xdot = r - after_pivot(r), v - after_pivot(v)
-    (H_near, H_far), (H_near_rate, H_far_rate) = H(np.stack([q, qdot]), s)  # (N, 3, 4) each
+    both = np.stack([q, qdot])
+    (H_near, H_far), (H_near_rate, H_far_rate) = G(both) @ fixed.B + outer(s, both)  # H, Ḣ (D4)
     b, a = _times(A(q), s)
     d = x + b - a
 
-    is_rod = chain.rods
-    rod, ball = np.flatnonzero(is_rod), np.flatnonzero(~is_rod)
     parts: list[tuple[Field, ...]] = []
     if len(rod):
         k = rod
         bdot, adot = _times(A_rate(q[:, k], qdot[:, k]), s[:, k])
         y, ydot, z, zdot = x[k] - a[k], xdot[k] - adot, x[k] + b[k], xdot[k] + bdot
-        C = dot(x[k], x[k]) + 2 * dot(x[k], b[k] - a[k]) - 2 * dot(a[k], b[k])
-        C = C + dot(s[:, k], s[:, k]).sum(0) - chain.length[k] ** 2
+        C = dot(x[k], x[k]) + 2 * dot(x[k], b[k] - a[k]) - 2 * dot(a[k], b[k]) + fixed.squares[k]
         near_rate = _left(ydot, H_near[k]) + _left(y, H_near_rate[k])
         far_rate = _left(zdot, H_far[k]) + _left(z, H_far_rate[k])
         gamma = (
@@ -86,9 +117,11 @@ def rows(chain: Chain, r: Field, p: Field, v: Field, pdot: Field) -> Rows:
         identity = np.broadcast_to(I3, (len(k), 3, 3))
         blocks = (d[k], identity, 2 * H_near[k], -2 * H_far[k], gamma)
         parts.append(tuple(np.reshape(block, (3 * len(k), *np.shape(block)[2:])) for block in blocks))
-    joint, order = row_joints(chain), np.argsort(np.concatenate([rod, np.repeat(ball, 3)]), kind="stable")
-    C, r_near, p_near, far, gamma = (np.concatenate(column)[order] for column in zip(*parts, strict=True))
-    return Rows(joint=joint, C=C, r_near=r_near, p_near=p_near, p_far=far, gamma=gamma, d=d)
+    columns = parts[0]
+    if len(parts) == 2:
+        columns = tuple(np.concatenate(column)[fixed.order] for column in zip(*parts, strict=True))
+    C, r_near, p_near, p_far, gamma = columns
+    return Rows(joint=fixed.joint, C=C, r_near=r_near, p_near=p_near, p_far=p_far, gamma=gamma, d=d)
 
 
 def _times(matrix: Field, vector: Field) -> Field:
