@@ -1,5 +1,6 @@
 """A run that is killed goes on where it stopped, and ends as if it had not been."""
 
+import contextlib
 import json
 import os
 import random
@@ -71,8 +72,12 @@ def killed(out, after, from_new_cell, *more):
 
 
 def cells(out):
-    """Path and time of every stored cell."""
-    return {path: path.stat().st_mtime_ns for path in out.glob("cells/*.cell")}
+    """Path and time of every stored cell; a run that ends meanwhile clears them away."""
+    found = {}
+    for path in out.glob("cells/*.cell"):
+        with contextlib.suppress(FileNotFoundError):
+            found[path] = path.stat().st_mtime_ns
+    return found
 
 
 def survive(tmp_path, kills, level):
