@@ -126,3 +126,27 @@ def joint_rates(model: Model, run: Trajectory, omega: Array) -> Array:
     near = run.v + np.einsum("tkij,tkj->tki", a, np.cross(omega, model.proximal))
     far = run.v + np.einsum("tkij,tkj->tki", a, np.cross(omega, model.distal))
     return np.asarray(near - np.concatenate([np.zeros_like(far[:, :1]), far[:, :-1]], axis=1))
+
+
+def scales(model: Model, run: Trajectory, length: float) -> dict[str, float]:
+    """Sizes of what the invariants of a run are made of: energies, momenta, lengths, speeds; as `UNITS`.
+
+    ``length`` (m) is that of the stretched chain.  A pendulum at rest rounds too: speeds are at least
+    that of a fall through it.
+    """
+    omega = angular_velocity(run.p, run.pdot)
+    kinetic = float(np.max(kinetic_energy(model, run.v, omega)))
+    potential = float(np.max(np.sum(model.mass * np.abs(run.r @ model.gravity), axis=-1)))
+    swing = float(np.ptp(potential_energy(model, run.r)))
+    fall = float(np.sqrt(np.linalg.norm(model.gravity) * length))
+    speed = max(fall, float(np.max(np.linalg.norm(run.v, axis=-1))))
+    spin = max(fall / length, float(np.max(np.linalg.norm(omega, axis=-1))))
+    arm = float(np.max(np.linalg.norm(run.r, axis=-1), initial=0.0))
+    inertia = float(np.sum(np.linalg.norm(model.inertia, axis=(1, 2))))
+    return {
+        "energy_drift": max(kinetic, potential, swing),
+        "momentum_drift": float(np.sum(model.mass)) * arm * speed + inertia * spin,
+        "joint_gap": max(length, arm),
+        "gap_rate": max(speed, spin * length),
+        "norm_drift": 1.0,
+    }
