@@ -9,8 +9,9 @@ INSTALL = $(UV) pip install --quiet --require-hashes --python $(PYTHON)
 export UV_PYTHON_DOWNLOADS := never
 export UV_SYSTEM_CERTS := true
 export OMP_NUM_THREADS := 1
+MUTANTS ?= --sample 300 --seed 1 --jobs 2
 
-.PHONY: help run test nightly bench lint lock clean
+.PHONY: help run test nightly bench mutants lint lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' Makefile | sed 's/:.*##/\t/' | expand -t 12
@@ -33,6 +34,9 @@ nightly: .venv/test.done  ## the full matrix with random scenarios, then the lon
 bench: .venv/test.done  ## right-hand sides and work-precision beside the engines, as ratios within one run
 	$(PYTHON) -m bench.figures
 
+mutants: .venv/mutation.done  ## do the tests notice mistakes? a sample; MUTANTS="--jobs 2" tries all
+	$(PYTHON) -m tests.mutation reference_impl judging $(MUTANTS)
+
 .uv/bin/uv:
 	python3 -m venv .uv
 	.uv/bin/python -m pip install --quiet uv==$(UV_VERSION)
@@ -53,6 +57,10 @@ bench: .venv/test.done  ## right-hand sides and work-precision beside the engine
 	$(INSTALL) -r locks/test.lock
 	@touch $@ .venv/main.done .venv/truth.tried
 
+.venv/mutation.done: locks/mutation.lock .venv/test.done
+	$(INSTALL) -r locks/mutation.lock
+	@touch $@
+
 # The page's own checks (axe, tsc, eslint) need npm; where it is missing their tests say so and skip.
 reports/node_modules/.tried: reports/package-lock.json
 	-cd reports && npm ci --no-audit --no-fund --loglevel=error
@@ -64,6 +72,7 @@ lock: | .venv/pyvenv.cfg  ## resolve the dependencies again (needs the network)
 	$(LOCK) --upgrade -o locks/main.lock
 	$(LOCK) -c locks/main.lock --group truth -o locks/truth.lock
 	$(LOCK) -c locks/truth.lock $(addprefix --group ,test truth browser history cluster bench) -o locks/test.lock
+	$(LOCK) -c locks/test.lock --group mutation -o locks/mutation.lock
 
 clean:  ## remove the environment and what runs made
 	rm -rf .venv .uv reports/node_modules reports/out

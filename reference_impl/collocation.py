@@ -33,9 +33,9 @@ USUAL = 6  # sweeps: a step that needs more is made shorter, one that needs fewe
 class BatchRun(Run):
     """A run of all chains together: N counts the bodies of all, ``evaluations`` the sweeps."""
 
-    rejected: int = 0  # steps that were repeated shorter
-    hindered: int = 0  # steps whose size the sweeps' convergence decided and not the tolerance: stiffness
-    note: str = ""  # a sentence where the problem is stiff for the sweeps
+    rejected: int  # steps that were repeated shorter
+    hindered: int  # steps whose size the sweeps' convergence decided and not the tolerance: stiffness
+    note: str  # a sentence where the problem is stiff for the sweeps
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,9 +112,9 @@ def integrate(
     Raises SingularSystem where S is singular on the way, ArithmeticError where the step vanishes.
     """
     forest = chains if isinstance(chains, Forest) else Forest(chains)
-    stepper = _Stepper(forest, lay(r, p), lay(v, pdot), rtol, gauss(nodes), dense, baumgarte)
+    quiet = 0.1 * rtol if sweep_tolerance is None else sweep_tolerance
+    stepper = _Stepper(forest, lay(r, p), lay(v, pdot), rtol, quiet, gauss(nodes), dense, baumgarte)
     stepper.sizes(r, p, v, pdot)
-    stepper.quiet = 0.1 * rtol if sweep_tolerance is None else sweep_tolerance
     span = float(times[-1] - times[0])
     t, steps, rejected, hindered, done = float(times[0]), 0, 0, 0, 1
     samples = np.empty((2, len(times), 7, forest.size))
@@ -163,18 +163,27 @@ def integrate(
 class _Stepper:
     """The state of all chains, and one step of it."""
 
+    h: float  # s, of the next step
+    last_h: float
+    new_modes: Array
+
     def __init__(
-        self, forest: Forest, q: Array, v: Array, rtol: float, table: Gauss, dense: bool, baumgarte: float
+        self,
+        forest: Forest,
+        q: Array,
+        v: Array,
+        rtol: float,
+        quiet: float,
+        table: Gauss,
+        dense: bool,
+        baumgarte: float,
     ) -> None:
-        S = len(table.c)
-        self.forest, self.tiled, self.table = forest, forest.tile(S), table
-        self.q, self.v, self.rtol, self.dense, self.baumgarte = q, v, rtol, dense, baumgarte
+        self.forest, self.tiled, self.table = forest, forest.tile(len(table.c)), table
+        self.q, self.v, self.rtol, self.quiet = q, v, rtol, quiet
+        self.dense, self.baumgarte = dense, baumgarte
         self.q_lost, self.v_lost = np.zeros_like(q), np.zeros_like(v)  # what rounding took from the sums
         self.modes: Array = np.empty(0)  # (7, S, M) Legendre modes of the last step's accelerations
-        self.new_modes: Array = np.empty(0)
-        self.last_h = 0.0
         self.sweeps = 0
-        self.h, self.quiet = 0.0, 0.1 * rtol
 
     def sizes(self, r: Array, p: Array, v: Array, pdot: Array) -> None:
         """Natural sizes (7, M) of q and v, chain by chain, and the first step from their ratio."""

@@ -15,7 +15,7 @@ from reference_impl import integrate as raw
 from reference_impl.chain import Array
 from reference_impl.collocation import BatchRun, gauss, integrate
 from reference_impl.forest import Forest
-from tests.random_chains import random_chain
+from tests.random_chains import random_chain, rescaled
 
 TIMES = np.linspace(0.0, 1.0, 11)
 
@@ -127,3 +127,71 @@ def test_a_long_chain_runs() -> None:
         np.vstack([moved.r[-1].T, moved.p[-1].T]), np.vstack([moved.v[-1].T, moved.pdot[-1].T])
     )[0]
     assert np.max(np.abs(gap)) < 1e-6
+
+
+@pytest.mark.parametrize("dense", [True, False])
+@pytest.mark.parametrize("rods", [[False, False], [True, False]], ids=str)
+def test_other_units_take_the_same_steps(rods: list[bool], dense: bool) -> None:
+    """Lengths and times by powers of two, masses by powers of four (roots): every digit is the same."""
+    model, state = random_chain(np.random.default_rng(39), rods, loads=True, drag=True)
+    times = TIMES[:4]
+    here = run(model, state, 1e-9, times, dense=dense)
+    for length, mass, second in (
+        (2.0**6, 1.0, 1.0),
+        (1.0, 2.0**-8, 1.0),
+        (1.0, 1.0, 2.0**5),
+        (0.25, 4.0, 0.5),
+    ):
+        there = run(*rescaled(model, state, length, mass, second), 1e-9, times * second, dense=dense)
+        assert (there.steps, there.evaluations) == (here.steps, here.evaluations)
+        assert np.array_equal(there.r, here.r * length)
+        assert np.array_equal(there.p, here.p)
+        assert np.array_equal(there.v, here.v * length / second)
+
+
+class Watched:
+    """A run whose steps, and questions to the right-hand side, are written down."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.tried: list[tuple[float, int, bool, bool]] = []  # h, sweeps, made, limited by the sweeps
+        self.asked = 0
+        step, acceleration = collocation._Stepper.step, Forest.acceleration
+
+        def noted(stepper: collocation._Stepper, h: float) -> tuple[bool, bool]:
+            before = stepper.sweeps
+            made = step(stepper, h)
+            self.tried.append((h, stepper.sweeps - before, *made))
+            return made
+
+        def counted(forest: Forest, *args: object) -> Array:
+            self.asked += 1
+            return acceleration(forest, *args)  # type: ignore[arg-type]
+
+        monkeypatch.setattr(collocation._Stepper, "step", noted)
+        monkeypatch.setattr(Forest, "acceleration", counted)
+
+
+@pytest.mark.parametrize("rods, rtol", [([False, False], 1e-3), ([False, False], 1e-12), ([True], 1e-8)])
+def test_a_run_says_what_it_did(rods: list[bool], rtol: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, state = random_chain(np.random.default_rng(40), rods, rate=4.0)
+    watched = Watched(monkeypatch)
+    done = run(model, state, rtol, np.array([0.0, 0.7, 2.1]))
+    made = np.array([h for h, _, ok, _ in watched.tried if ok])
+    assert (done.steps, done.rejected) == (len(made), len(watched.tried) - len(made))
+    assert done.hindered == sum(ok and slow for _, _, ok, slow in watched.tried)
+    assert done.evaluations == sum(sweeps for _, sweeps, _, _ in watched.tried)
+    assert watched.asked == done.evaluations + 2  # for the sizes, and the first guess
+    assert abs(np.sum(made) - 2.1) < 1e-13
+    assert np.all(made[1:] <= made[:-1] * (1.6 + 1e-12)), "a step grows to 1.6 times the last at most"
+    assert np.min(made[:-1]) > 0.01 * np.max(made), "no crumbs"
+
+
+def test_steps_that_take_many_sweeps_are_followed_by_shorter_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Strong drag: the sweeps decide, so the step is cut before it would have to be repeated."""
+    model, state = random_chain(np.random.default_rng(36), [False, False])
+    watched = Watched(monkeypatch)
+    done = run(replace(model, drag_force=model.mass * 3e3), state, 1e-6, TIMES[:2])
+    for (h, sweeps, made, _), (after, *_) in zip(watched.tried[:-2], watched.tried[1:-1], strict=True):
+        assert not made or sweeps <= 8 or after < 0.95 * h, (h, sweeps, after)
+    assert done.rejected < 0.1 * done.steps
+    assert max(sweeps for _, sweeps, made, _ in watched.tried if made) <= collocation.SWEEPS

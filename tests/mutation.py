@@ -1,0 +1,445 @@
+"""Mutation testing: small mistakes are put into the code, one at a time, and the tests have to notice each.
+
+    python -m tests.mutation reference_impl judging           every mutant of both
+    python -m tests.mutation judging --sample 300 --seed 1    300 of them, drawn at random
+    python -m tests.mutation plumbline/known.py --again       of one file, those that survived last time
+
+The mistakes are mutmut's.  Each is made in the memory of a forked child that holds every library already
+imported, so no file is ever changed and a mutant costs the tests it meets and half a second.  The tests run
+in a copy of the checkout, first once in full to learn which test reaches which line; a mutant meets those
+that reach its line, quickest first, until one fails.  See docs/mutation.md for what is left out and why.
+
+Ends with 1 where fewer than 95 % are noticed, where one survives that `survivors.yaml` does not list with a
+reason, or where that file lists one that is noticed or no longer there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import gc
+import importlib
+import json
+import os
+import random
+import re
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from importlib.util import spec_from_loader
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import coverage
+import libcst as cst
+import pytest
+from libcst.metadata import MetadataWrapper, ParentNodeProvider, PositionProvider
+from mutmut.mutation.mutators import mutation_operators
+from ruamel.yaml import YAML
+
+LEAST = 0.95  # of the mutants have to be noticed
+SLOWEST = 8.0  # s of processor time: a test that takes longer is not asked
+MEMORY = 8 * 2**30  # bytes of address space of a child
+PLUGINS = ("no:cacheprovider", "pytest_timeout", "_hypothesis_pytestplugin")  # others only take time
+SURVIVORS = "tests/survivors.yaml"
+NOTES = ("notes_*", "forest", "collocation", "stabilised", "short_rods", "reference_engine")
+JUDGES = (
+    "bound", "converge", "diagnosis", "horizon", "known", "measures", "motion_verdicts", "relations",
+    "state_verdicts", "yardstick",
+)  # fmt: skip
+TARGETS = {
+    "reference_impl": ["reference_impl/*.py"],
+    "judging": [f"plumbline/{name}.py" for name in JUDGES],
+}
+TESTS = {  # by folder, those that have to notice
+    "reference_impl": [f"tests/test_{name}.py" for name in NOTES],
+    "plumbline": [f"tests/test_{name}.py" for name in (*JUDGES, "exact", "planted", "versions")],
+}
+
+
+# --- mutants ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One mistake in one file."""
+
+    file: str
+    line: int
+    reach: tuple[int, int]  # lines of which a test must run one to meet it
+    was: str
+    now: str
+    code: str
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """What names it in `SURVIVORS`, whatever its line."""
+        return self.file, self.was, self.now
+
+
+def is_text(node: cst.CSTNode | None) -> bool:
+    """Whether a node is words for people: a string with a blank and three letters of a word."""
+    if isinstance(node, cst.SimpleString):
+        return bool(re.search(r"\s", node.value) and re.search(r"[a-z]{3}", node.value))
+    if isinstance(node, cst.FormattedString):
+        words = "".join(part.value for part in node.parts if isinstance(part, cst.FormattedStringText))
+        return bool(re.search(r"\s", words) and re.search(r"[a-z]{3}", words))
+    if isinstance(node, cst.ConcatenatedString):
+        return is_text(node.left) or is_text(node.right)
+    return False
+
+
+def lost(before: cst.Call, after: cst.Call) -> cst.Arg | None:
+    """The argument that a mutated call has no longer, or has as None."""
+    for i, arg in enumerate(before.args):
+        if i >= len(after.args) or after.args[i] is not arg:
+            return arg
+    return None
+
+
+def counts(node: cst.CSTNode, mutated: cst.CSTNode) -> bool:
+    """False for mutants of what has no behaviour: texts for people, types, `strict` of zip, warnings."""
+    if is_text(node):
+        return False
+    if isinstance(node, cst.SimpleString) and isinstance(mutated, cst.SimpleString) and "->" in node.value:
+        return mutated.value.lower() != node.value  # einsum knows its indices by any letter
+    if isinstance(node, cst.Assign | cst.AnnAssign):
+        value = node.value
+        alias = isinstance(value, cst.Subscript) and isinstance(value.value, cst.Name)
+        named = alias and value.value.value in ("NDArray", "Callable")  # type: ignore[union-attr]
+        return not is_text(value) and not named
+    if isinstance(node, cst.Call) and isinstance(mutated, cst.Call):
+        arg = lost(node, mutated)
+        function = node.func.attr.value if isinstance(node.func, cst.Attribute) else ""
+        function = node.func.value if isinstance(node.func, cst.Name) else function
+        if arg is None or function in ("cast", "errstate"):
+            return function not in ("cast", "errstate")
+        return not is_text(arg.value) and not (arg.keyword and arg.keyword.value == "strict")
+    return True
+
+
+class Finder(cst.CSTVisitor):
+    """Every mistake that mutmut's operators make in one file."""
+
+    METADATA_DEPENDENCIES = (PositionProvider, ParentNodeProvider)
+
+    def __init__(self) -> None:
+        self.found: list[tuple[cst.CSTNode, cst.CSTNode, int, tuple[int, int]]] = []
+        self.deaf = 0  # inside of what has no behaviour
+
+    def on_visit(self, node: cst.CSTNode) -> bool:
+        """Gather the node's mutants; False where nothing inside of it is looked at."""
+        if isinstance(node, cst.Annotation | cst.Decorator | cst.Import | cst.ImportFrom | cst.Assert):
+            return False
+        if isinstance(node, cst.Expr) and isinstance(node.value, cst.SimpleString | cst.ConcatenatedString):
+            return False  # a docstring
+        if isinstance(node, cst.Arg) and node.keyword and node.keyword.value == "strict":
+            return False
+        for kind, operator in mutation_operators:
+            if isinstance(node, kind):
+                found = [m for m in operator(node) if counts(node, m)]
+                self.found += [(node, m, *self.lines(node)) for m in found]
+        return True
+
+    def lines(self, node: cst.CSTNode) -> tuple[int, tuple[int, int]]:
+        """The node's line, and the lines of its statement up to it."""
+        place = self.get_metadata(PositionProvider, node)
+        around: Any = node
+        while not isinstance(around, cst.SimpleStatementLine | cst.BaseCompoundStatement):
+            around = self.get_metadata(ParentNodeProvider, around)
+        whole = self.get_metadata(PositionProvider, around)
+        simple = isinstance(around, cst.SimpleStatementLine)
+        return place.start.line, (whole.start.line, whole.end.line if simple else place.end.line)
+
+
+def mutants(files: Sequence[str], sample: int | None, seed: int) -> list[Mutant]:
+    """All mutants of the files, or ``sample`` of them drawn with ``seed``."""
+    places = []
+    for file in files:
+        wrapper = MetadataWrapper(cst.parse_module(Path(file).read_text(encoding="utf-8")))
+        finder = Finder()
+        wrapper.visit(finder)
+        places += [(file, wrapper.module, *found) for found in finder.found]
+    print(f"{len(places)} mutants in {len(files)} files", flush=True)
+    if sample is not None:
+        chosen = random.Random(seed).sample(range(len(places)), min(sample, len(places)))
+        places = [places[i] for i in sorted(chosen)]
+    made = []
+    for file, module, node, mutated, line, reach in places:
+        changed = module.deep_replace(node, mutated)
+        code = changed.code  # type: ignore[union-attr]
+        diff = list(difflib.ndiff(module.code.splitlines(), code.splitlines()))
+        was, now = (
+            "\n".join(text[2:].strip() for text in diff if text.startswith(sign)) for sign in ("- ", "+ ")
+        )
+        try:
+            compile(code, file, "exec")
+        except SyntaxError:
+            continue
+        if was or now:
+            made.append(Mutant(file, line, reach, was, now, code))
+    return made
+
+
+# --- which test reaches what --------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Reach:
+    """What one undisturbed run of the tests showed."""
+
+    seconds: dict[str, float]  # of processor time, of each test that passes
+    lines: dict[str, dict[int, list[str]]]  # file → line → tests, "" for the import
+    libraries: list[str]  # imported modules that are not the project's
+
+    def tests(self, mutant: Mutant) -> list[str]:
+        """Those that may notice it, quickest first: all of the file's where its line runs on import."""
+        lines = self.lines.get(mutant.file, {})
+        first, last = mutant.reach
+        near = {test for line in range(first, last + 1) for test in lines.get(line, ())}
+        if "" in near:
+            near = {test for tests in lines.values() for test in tests}
+        return sorted(near & self.seconds.keys(), key=lambda test: self.seconds[test])
+
+
+class Watch:
+    """A pytest plugin: which lines each test runs, and for how long."""
+
+    def __init__(self, files: Sequence[str]) -> None:
+        self.files = files
+        self.coverage = coverage.Coverage(data_file=None, config_file=False, include=list(files))
+        self.seconds: dict[str, float] = {}
+        self.failed: set[str] = set()
+
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item: pytest.Item) -> Generator[None, object, object]:
+        """Time the test and its fixtures, under its name."""
+        self.coverage.switch_context(item.nodeid)
+        start = time.process_time()
+        try:
+            return (yield)
+        finally:
+            self.seconds[item.nodeid] = time.process_time() - start
+            self.coverage.switch_context("")
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """A test that does not pass undisturbed notices nothing."""
+        if report.outcome != "passed":
+            self.failed.add(report.nodeid)
+
+    def seen(self) -> Reach:
+        """The outcome."""
+        data = self.coverage.get_data()
+        lines = {file: data.contexts_by_lineno(str(Path(file).resolve())) for file in self.files}
+        seconds = {t: s for t, s in self.seconds.items() if t not in self.failed and s <= SLOWEST}
+        left = {t: round(s, 1) for t, s in self.seconds.items() if t in self.failed or s > SLOWEST}
+        if left:
+            print(f"not asked (s): {left}", flush=True)
+        ours = {path.name for path in Path.cwd().iterdir()}
+        names = [name for name in sys.modules if name.split(".")[0] not in ours | {"__main__"}]
+        return Reach(seconds, lines, names)
+
+
+def run_tests(tests: Sequence[str], *plugins: object) -> int:
+    """Run pytest in this process: 0 where all pass."""
+    options = [word for name in PLUGINS for word in ("-p", name)]
+    return int(pytest.main(["-q", "-x", "--timeout=0", "--hypothesis-seed=0", *options, *tests], [*plugins]))
+
+
+def reach_of(tests: Sequence[str], files: Sequence[str]) -> Reach:
+    """Run every test once, in a child, and see which lines it reaches."""
+    existing = sorted({str(path) for pattern in tests for path in Path().glob(pattern)})
+    with tempfile.NamedTemporaryFile("r", encoding="utf-8") as answer:
+        child = os.fork()
+        if child == 0:
+            watch = Watch(files)
+            watch.coverage.start()
+            code = run_tests(existing, watch)
+            watch.coverage.stop()
+            Path(answer.name).write_text(json.dumps(asdict(watch.seen())), encoding="utf-8")
+            os._exit(code)
+        _, status = os.waitpid(child, 0)
+        if status:
+            raise SystemExit("the tests do not pass without any mutant: nothing can be said")
+        said = json.load(answer)
+    lines = {file: {int(k): v for k, v in by_line.items()} for file, by_line in said["lines"].items()}
+    return Reach(said["seconds"], lines, said["libraries"])
+
+
+# --- trial --------------------------------------------------------------------------------------
+
+
+class Mutated(MetaPathFinder, Loader):
+    """Imports one module from changed code."""
+
+    def __init__(self, mutant: Mutant) -> None:
+        self.mutant = mutant
+        self.name = mutant.file.removesuffix(".py").replace("/", ".")
+
+    def find_spec(self, fullname: str, path: object, target: object = None) -> ModuleSpec | None:
+        """Ours, or None."""
+        file = str(Path(self.mutant.file).resolve())
+        return spec_from_loader(fullname, self, origin=file) if fullname == self.name else None
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Run the changed code as the module."""
+        exec(compile(self.mutant.code, str(Path(self.mutant.file).resolve()), "exec"), module.__dict__)
+
+
+class Patience:
+    """A pytest plugin that ends the process where a test takes much longer than it did undisturbed."""
+
+    def __init__(self, seconds: dict[str, float]) -> None:
+        self.seconds = seconds
+        self.wait(20.0)  # for imports
+
+    def wait(self, seconds: float) -> None:
+        """So much processor time from now, or twenty times that on the clock."""
+        signal.setitimer(signal.ITIMER_PROF, seconds)
+        signal.setitimer(signal.ITIMER_REAL, 20 * seconds)
+
+    def pytest_runtest_logstart(self, nodeid: str) -> None:
+        """A test begins."""
+        self.wait(3 + 5 * self.seconds[nodeid])
+
+
+def trial(mutant: Mutant, tests: Sequence[str], seconds: dict[str, float]) -> int:
+    """Fork a child that runs the tests on the mutant; its process id."""
+    child = os.fork()
+    if child:
+        return child
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(nowhere, stream)
+    sys.meta_path.insert(0, Mutated(mutant))
+    code = 1
+    try:
+        code = run_tests(tests, Patience(seconds))
+    finally:
+        os._exit(code)
+
+
+def trials(found: Sequence[Mutant], reach: Reach, jobs: int) -> Iterator[tuple[Mutant, str]]:
+    """Each mutant with what became of it: noticed, endless, survived or unreached."""
+    running: dict[int, Mutant] = {}
+    waiting = list(reversed(found))
+    while waiting or running:
+        while waiting and len(running) < jobs:
+            mutant = waiting.pop()
+            tests = reach.tests(mutant)
+            if tests:
+                running[trial(mutant, tests, reach.seconds)] = mutant
+            else:
+                yield mutant, "unreached"
+        if running:
+            child, status = os.wait()
+            ended = os.waitstatus_to_exitcode(status)
+            endless = ended in (-signal.SIGPROF, -signal.SIGALRM)
+            yield running.pop(child), "survived" if ended == 0 else "endless" if endless else "noticed"
+
+
+# --- the command --------------------------------------------------------------------------------
+
+
+def inside(target: str, options: argparse.Namespace) -> int:
+    """In the copy: find the mutants of a target, try them, judge."""
+    files = sorted(str(path) for pattern in TARGETS.get(target, [target]) for path in Path().glob(pattern))
+    tests = TESTS.get(target.split("/")[0], TESTS["plumbline"])
+    found = mutants(files, options.sample, options.seed)
+    table = Path(options.out) / f"{target.replace('/', '-')}.json"
+    if options.again:
+        last = json.loads(table.read_text(encoding="utf-8"))
+        left = {(m["file"], m["was"], m["now"]) for m in last if m["became"] in ("survived", "unreached")}
+        found = [mutant for mutant in found if mutant.key in left]
+    start = time.monotonic()
+    reach = reach_of(tests, files)
+    print(f"{len(reach.seconds)} tests in {time.monotonic() - start:.0f} s", flush=True)
+    for name in reach.libraries:
+        try:
+            importlib.import_module(name)
+        except Exception:  # a name that cannot be imported on its own is imported by the child
+            continue
+    gc.collect()
+    gc.freeze()  # else every child would go through all of it, and copy it
+    became = []
+    for mutant, what in trials(found, reach, options.jobs):
+        became.append((mutant, what))
+        if what in ("survived", "unreached"):
+            print(f"{what}: {mutant.file}:{mutant.line}\n  - {mutant.was}\n  + {mutant.now}", flush=True)
+        if len(became) % 50 == 0:
+            print(f"{len(became)} of {len(found)}, {time.monotonic() - start:.0f} s", flush=True)
+    table.parent.mkdir(parents=True, exist_ok=True)
+    records = [{**asdict(mutant), "code": None, "became": what} for mutant, what in became]
+    table.write_text(json.dumps(records, indent=1, ensure_ascii=False), encoding="utf-8")
+    return judge(became, files)
+
+
+def judge(became: Sequence[tuple[Mutant, str]], files: Sequence[str]) -> int:
+    """Print the figures; 1 where something is amiss."""
+    kinds = Counter(what for _, what in became)
+    rate = (kinds["noticed"] + kinds["endless"]) / max(len(became), 1)
+    listed = {(e["file"], e["was"], e["now"]): e["why"] for e in YAML(typ="safe").load(Path(SURVIVORS)) or ()}
+    left = [mutant for mutant, what in became if what in ("survived", "unreached")]
+    new = [mutant for mutant in left if mutant.key not in listed]
+    stale = [mutant for mutant, what in became if mutant.key in listed and mutant not in left]
+    print(
+        f"{len(became)} mutants of {', '.join(files)}: {100 * rate:.1f} % noticed, {kinds['endless']} of "
+        f"them by never ending; {len(left)} survive, {len(left) - len(new)} of them listed in {SURVIVORS}"
+    )
+    for mutant in new:
+        print(f"not listed: {mutant.file}:{mutant.line}\n  - {mutant.was}\n  + {mutant.now}")
+    for mutant in stale:
+        print(f"listed, and noticed: {mutant.file}:{mutant.line}\n  - {mutant.was}\n  + {mutant.now}")
+    return int(rate < LEAST or bool(new) or bool(stale))
+
+
+def copied(target: Path) -> None:
+    """The checkout's files, without what git ignores."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        check=True, capture_output=True, text=True,
+    ).stdout  # fmt: skip
+    for name in filter(None, listed.split("\0")):
+        if Path(name).is_file():
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(name, target / name)
+
+
+def main() -> int:
+    """Copy the checkout and go on there."""
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.mutation", description=(__doc__ or "").split("\n")[0]
+    )
+    parser.add_argument("target", nargs="+", help=f"{', '.join(TARGETS)}, or files")
+    parser.add_argument("--sample", type=int, help="so many mutants, drawn at random; default all")
+    parser.add_argument("--seed", type=int, default=1, help="of the sample")
+    parser.add_argument("--jobs", type=int, default=1, help="children at a time")
+    parser.add_argument(
+        "--out", default="reports/out/mutation", help="folder of the outcome, a JSON file per target"
+    )
+    parser.add_argument("--again", action="store_true", help="only those that survived last time")
+    parser.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.inside:
+        return max([inside(target, options) for target in options.target])
+    with tempfile.TemporaryDirectory(prefix="plumbline-mutation-") as folder:
+        copied(Path(folder))
+        command = [sys.executable, "-m", "tests.mutation", *sys.argv[1:], "--inside"]
+        command += ["--out", str(Path(options.out).resolve())]
+        plain = {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTHONDONTWRITEBYTECODE": "", "OMP_NUM_THREADS": "1"}
+        return subprocess.run(command, cwd=folder, env=os.environ | plain, check=False).returncode
+
+
+if __name__ == "__main__":
+    sys.exit(main())
