@@ -6,9 +6,14 @@ from pathlib import Path
 
 
 def write(folder: Path, history: Path | None = None) -> Path:
-    """Write report.html, junit.xml and summary.md of the results in ``folder``; returns the report's path."""
-    from reports import junit, page, step_summary
+    """Write report.html, junit.xml and summary.md of the results in ``folder``; returns the report's path.
 
-    junit.write(folder)
-    step_summary.write(folder)
-    return page.write(folder, history)
+    Raises OSError or ValueError where results.json cannot be read or a file cannot be written.
+    """
+    from reports import junit, page, step_summary
+    from reports.results import Results
+
+    results = Results.load(folder)
+    junit.write(results)
+    step_summary.write(results)
+    return page.write(results, history)

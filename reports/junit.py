@@ -10,14 +10,13 @@ from reports.results import Record, Results
 from reports.verdicts import needs_attention, number
 
 
-def write(out_dir: Path) -> Path:
-    """Write OUT/junit.xml from OUT's stored results; returns its path.
+def write(results: Results) -> Path:
+    """Write junit.xml beside the stored results; returns its path.
 
     A suite per scenario, a case per row.  What nobody expected is a failure (a disagreement, a gap
     that is not recorded) or an error (the engine failed); what is recorded, and an engine that is not
     installed, is skipped with its reason.
     """
-    results = Results.load(out_dir)
     suites = ET.Element("testsuites", name="plumbline", time=f"{float(results.run['duration']):.3f}")
     totals = {"tests": 0, "failures": 0, "errors": 0, "skipped": 0}
     for name, scenario in results.scenarios.items():
@@ -34,7 +33,7 @@ def write(out_dir: Path) -> Path:
         suite.set("time", f"{sum(row['wall_time'] for row in rows):.3f}")
         totals = {k: v + counted[k] for k, v in totals.items()}
     suites.attrib |= {k: str(v) for k, v in totals.items()}
-    path = out_dir / "junit.xml"
+    path = results.folder / "junit.xml"
     temporary = path.with_name(f".junit.{os.getpid()}.xml")
     try:
         ET.ElementTree(suites).write(temporary, encoding="utf-8", xml_declaration=True)

@@ -19,7 +19,7 @@ from markupsafe import Markup
 from reports import fast_reference, payload
 from reports.history import History
 from reports.results import Record, Results
-from reports.verdicts import MARKS, counts, needs_attention, number, ratio, severity, worst
+from reports.verdicts import MARKS, needs_attention, number, ratio, severity, tally, worst
 
 HERE = Path(__file__).parent
 MODULES = ("chunks", "text", "route", "plot", "matrix", "curves", "motion", "detail", "cost", "trend", "main")
@@ -30,14 +30,12 @@ LINES = 500  # scenarios in the page at most
 LISTED = 60  # findings written out in the static page
 
 
-def write(out_dir: Path, history: Path | None = None) -> Path:
-    """Render OUT/report.html from OUT's stored results (and earlier runs in ``history``); returns its path.
+def write(results: Results, history: Path | None = None) -> Path:
+    """Render report.html beside the stored results (and earlier runs in ``history``); returns its path.
 
-    Raises OSError or ValueError where OUT/results.json cannot be read or the page cannot be written.
+    Raises OSError where the page cannot be written.
     """
-    results = Results.load(out_dir)
-    past = History.load(history, results)
-    return put(out_dir / "report.html", render(results, past))
+    return put(results.folder / "report.html", render(results, History.load(history, results)))
 
 
 def put(path: Path, html: str) -> Path:
@@ -91,8 +89,9 @@ def _fill(results: Results, shown: Results, history: History, chunks: dict[str, 
             style=Markup(style),
             chunks=chunks,
             marks=MARKS,
-            counts=counts(results.rows),
-            total=len(results.rows),
+            counts=tally(results),
+            total=tally(results).total(),
+            probes=_probes(results),
             engines=results.engines,
             families=_families(shown),
             unshown=len(unshown),
@@ -219,6 +218,17 @@ def _comparison(results: Results, history: History) -> Record | None:
         "added": len(keys - green.rows.keys()),
         "versions": [(e, before.get(e, "–"), v) for e, v in now.items() if before.get(e) != v],
     }
+
+
+def _probes(results: Results) -> Record | None:
+    """What the random scenarios came to: how many, and the worst error over bound by quantity and engine."""
+    said = results.run["probes"]
+    if not said:
+        return None
+    worst: dict[str, dict[str, Record]] = {}
+    for cell in said["worst"]:
+        worst.setdefault(cell["quantity"], {})[cell["engine"]] = cell
+    return {"scenarios": said["scenarios"], "worst": worst}
 
 
 def bundle() -> str:

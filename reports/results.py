@@ -24,6 +24,7 @@ _UNPRINTABLE = re.compile(
 
 # What a run of one level only, or of another program, may leave out.
 _NOT_SAID: Record = {
+    "probes": {},
     "truth": "",
     "machine": {},
     "commit": None,
@@ -44,7 +45,8 @@ _UNKNOWN: Record = {
 def clean(value: Any) -> Any:
     """The same value with every unprintable character of every text in it replaced by U+FFFD."""
     if isinstance(value, str):
-        return _UNPRINTABLE.sub("\N{REPLACEMENT CHARACTER}", value)
+        plain = value.isascii() and value.isprintable()  # most are, and this is quicker told
+        return value if plain else _UNPRINTABLE.sub("\N{REPLACEMENT CHARACTER}", value)
     if isinstance(value, dict):
         return {clean(k): clean(v) for k, v in value.items()}
     if isinstance(value, list):

@@ -9,18 +9,18 @@ from pathlib import Path
 from typing import Any
 
 from reports.results import Record, Results
-from reports.verdicts import MARKS, counts, needs_attention, number, ratio, severity
+from reports.verdicts import MARKS, needs_attention, number, ratio, severity, tally
 
 LIMIT = 1_000_000  # bytes; GitHub drops a step's summary above 1 MiB = 1,048,576 bytes
 _SPECIAL = re.compile(r"[^0-9A-Za-z .,;:()/+%=\u0080-\uffff-]")
 
 
-def write(out_dir: Path) -> Path:
-    """Write OUT/summary.md from OUT's stored results; returns its path."""
-    path = out_dir / "summary.md"
+def write(results: Results) -> Path:
+    """Write summary.md beside the stored results; returns its path."""
+    path = results.folder / "summary.md"
     temporary = path.with_name(f".summary.{os.getpid()}.md")
     try:
-        temporary.write_text(render(Results.load(out_dir)), encoding="utf-8")
+        temporary.write_text(render(results), encoding="utf-8")
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -41,13 +41,14 @@ def escape(text: Any, longest: int = 400) -> str:
 def render(results: Results) -> str:
     """The summary as Markdown: sentence, counts, engines by family, then as many findings as fit."""
     run = results.run
-    tally = counts(results.rows)
+    told = tally(results)
     lines = [
         f"## {escape(run['sentence'], 2000)}",
         "",
-        " · ".join(f"{mark.glyph} **{tally[v]}** {mark.plural}" for v, mark in MARKS.items() if tally[v]),
+        " · ".join(f"{mark.glyph} **{told[v]}** {mark.plural}" for v, mark in MARKS.items() if told[v]),
         "",
         *_table(results),
+        *_probes(results),
         "",
     ]
     attention = sorted(
@@ -90,6 +91,21 @@ def _table(results: Results) -> list[str]:
             said.append(" ".join(f"{m.glyph}&nbsp;{found[v]}" for v, m in MARKS.items() if found[v]))
         lines.append(f"| {escape(family)} | " + " | ".join(said) + " |")
     return lines + ([f"\n… and {len(families) - 100} more families."] if len(families) > 100 else [])
+
+
+def _probes(results: Results) -> list[str]:
+    """A line on the random scenarios: how many, and the worst error over its bound of those that agree."""
+    said = results.run["probes"]
+    if not said:
+        return []
+    worst = max(said["worst"], key=lambda cell: cell["ratio"], default=None)
+    text = f"{said['scenarios']} random scenarios at state level"
+    if worst:
+        text += (
+            f"; of those that agree the worst error is {number(worst['ratio'])} of its bound "
+            f"({escape(worst['engine'])}, {escape(worst['quantity'])}, {escape(worst['scenario'])})"
+        )
+    return ["", text + "."]
 
 
 def _finding(row: Record) -> str:

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
-from reports.results import Record
+from reports.results import Record, Results
 
 
 class Mark(NamedTuple):
@@ -74,6 +74,11 @@ def worst(rows: Iterable[Record]) -> Record:
 def counts(rows: Iterable[Record]) -> Counter[str]:
     """Number of rows by verdict."""
     return Counter(row["verdict"] for row in rows)
+
+
+def tally(results: Results) -> Counter[str]:
+    """Number of a run's rows by verdict, those of random scenarios that are only counted among them."""
+    return counts(results.rows) + Counter(results.run["probes"].get("folded", {}))
 
 
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

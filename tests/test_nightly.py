@@ -1,15 +1,19 @@
 """The nightly: random scenarios that are the same again, a whole folder per night, and what is left over."""
 
 import json
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from plumbline import nightly, scenario
+from plumbline.findings import Subject
 from plumbline.history import History
 from plumbline.nightly import Night
+from plumbline.probes import Probes
 from plumbline.random_scenarios import FAMILY, MOST_BODIES, RandomScenarios, document, random_scenario
+from plumbline.run import Result
+from plumbline.store import Tables, read_table
 from plumbline.workers import Limits
 
 
@@ -60,8 +64,17 @@ def test_a_night_is_whole_and_remembered(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["history"]
     stored = json.loads((place / "results.json").read_text())["run"]
     assert (stored["seed"], stored["random"]) == (11, 3)
-    assert {r.scenario for r in result.rows if r.family == FAMILY} == {f"random-11-{k}" for k in range(3)}
-    assert all(r.level == "state" for r in result.rows if r.family == FAMILY)
+    assert not [r for r in result.rows if r.family == FAMILY], "what agrees is folded"
+    folded, random = result.probes.folded, [r for r in read_table(place, "summary") if r["family"] == FAMILY]
+    assert {r["scenario"] for r in random} == {f"random-11-{k}" for k in range(3)}
+    assert all(r["level"] == "state" for r in random) and folded.total() == len(random)
+    assert stored["probes"]["scenarios"] == 3 and len(stored["probes"]["worst"]) == 7
+    assert max(cell["ratio"] for cell in stored["probes"]["worst"]) == max(
+        json.loads(r["extra"])["ratio"] for r in random if r["verdict"] == "agrees"
+    )
+    assert f"{len(result.rows) + folded.total()} agree" in stored["sentence"]
+    assert "3 random scenarios" in (place / "report.html").read_text()
+    assert "3 random scenarios" in (place / "summary.md").read_text()
     levels = {"state", "trajectory", "invariants", "relations"}
     assert {r.level for r in result.rows if r.scenario == "rest"} == levels
     (seen,) = History(tmp_path).overview()
@@ -101,16 +114,17 @@ def test_a_damaged_plan_begins_a_new_night(tmp_path, spoilt):
     assert Night.begun(tmp_path, night.seed + 1, 7) != night
 
 
-def test_a_file_is_kept_of_what_does_not_agree(tmp_path):
-    from plumbline.findings import Subject
-    from plumbline.run import Result
-
-    drawn = list(RandomScenarios(2, 2))
-    rows = [
-        Subject(s.name, FAMILY, "mujoco", "MuJoCo", "4").row("state", "-", "acceleration", verdict, "why")
-        for s, verdict in zip(drawn, ("agrees", "disagrees"), strict=True)
-    ]
-    folder = Path(tmp_path)
-    nightly.write_files_of_random(Result(rows, [], {}, {}, {}, {}), drawn, folder)
-    (path,) = folder.iterdir()
-    assert scenario.load(path).digest == drawn[1].digest
+def test_what_someone_should_see_is_kept_whole_with_its_file(tmp_path):
+    drawn = RandomScenarios(2, 3)
+    probes, kept = Probes(), []
+    for s, verdict in zip(drawn, ("agrees", "disagrees", "unsupported"), strict=True):
+        who = Subject(s.name, FAMILY, "mujoco", "MuJoCo", "4")
+        fine = who.row("state", "-", "joint_reaction", "agrees", "why", extra={"ratio": 0.5})
+        kept += probes.take([fine, who.row("state", "-", "acceleration", verdict, "why")])
+    assert [r.verdict for r in kept] == ["agrees", "disagrees", "agrees", "unsupported"]
+    assert probes.folded == {"agrees": 2} and probes.worst["mujoco", "joint_reaction"] == (0.5, drawn[0].name)
+    excused = replace(kept[-1], known="k")
+    assert probes.take([excused]) == [], "a recorded gap of every probe is only counted"
+    nightly.write_files_of_random(Result(kept, [], {}, {}, probes, Tables(), {}), drawn, tmp_path)
+    found = sorted(tmp_path.iterdir())
+    assert [scenario.load(path).digest for path in found] == [drawn[1].digest, drawn[2].digest]

@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from plumbline import drift, sweep
 from plumbline.cli import main
 from reports import fast_reference, page, picture, sweep_page
-from reports.results import clean
+from reports.results import Results, clean
 from tests import report_fixture as fixture
 from tests.report_fixture import HOSTILE, NASTY
 
@@ -68,7 +68,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     svg = (fast_reference.STORED / "work-precision.svg").read_text(encoding="utf-8")
     trap = '<script>alert(3)</script><image href="https://example.org/x.png"/></svg>'
     (folder / "work-precision.svg").write_text(svg.replace("</svg>", trap))
-    page.write(folder)
+    page.write(Results.load(folder))
     names = [*list(sweep_rows()[0])[:2], *sweep.COLUMNS]
     schema = pa.schema(
         [(name, sweep.COLUMNS.get(name, pa.float64())) for name in names],

@@ -36,7 +36,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def text(out: Path) -> str:
-    return page.write(out).read_text(encoding="utf-8")
+    return page.write(Results.load(out)).read_text(encoding="utf-8")
 
 
 class Parsed(HTMLParser):
@@ -274,7 +274,7 @@ def test_the_default_catalogue_stays_under_2_megabytes(
 ) -> None:
     out = fixture.build(tmp_path / "big", hostile=False, scenarios=30, samples=200)
     began = time.perf_counter()
-    size = page.write(out).stat().st_size
+    size = page.write(Results.load(out)).stat().st_size
     took = time.perf_counter() - began
     record_property("bytes", size)  # type: ignore[operator]
     record_property("seconds", took)  # type: ignore[operator]
@@ -296,7 +296,7 @@ def test_a_night_of_thousands_of_scenarios_stays_under_8_megabytes(out: Path, tm
     late |= {"verdict": "disagrees", "known": None, "reason": "the needle"}
     (tmp_path / "results.json").write_text(json.dumps(stored))
     began = time.perf_counter()
-    text = page.write(tmp_path).read_text()
+    text = page.write(Results.load(tmp_path)).read_text()
     print(f"{len(stored['rows']):,} rows: {len(text):,} bytes in {time.perf_counter() - began:.1f} s")
     assert len(text.encode()) <= page.NIGHTLY_BUDGET
     assert "random-2499" in text and "the needle" in text
@@ -343,7 +343,7 @@ def test_a_run_of_the_state_level_alone_has_a_page(out: Path, tmp_path: Path) ->
     del stored["run"]["truth"]
     (few / "results.json").write_text(json.dumps(stored))
     shutil.copy(out / "states.parquet", few)
-    data = chunks(page.write(few).read_text())
+    data = chunks(page.write(Results.load(few)).read_text())
     assert data["scenario-0"]["curves"] == [] and data["scenario-0"]["motion"] is None  # type: ignore[index,call-overload]
 
 
@@ -364,7 +364,7 @@ def test_a_report_that_cannot_be_written_leaves_the_old_one(
     out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     copy = shutil.copytree(out, tmp_path / "copy")
-    old = page.write(copy).read_bytes()
+    old = page.write(Results.load(copy)).read_bytes()
 
     def full(self: Path, data: str, encoding: str) -> int:
         self.write_bytes(data.encode(encoding)[:1000])
@@ -372,14 +372,14 @@ def test_a_report_that_cannot_be_written_leaves_the_old_one(
 
     monkeypatch.setattr(Path, "write_text", full)
     with pytest.raises(OSError, match="No space"):
-        page.write(copy)
+        page.write(Results.load(copy))
     assert (copy / "report.html").read_bytes() == old
     assert [p.name for p in copy.iterdir() if p.name.startswith(".")] == []
 
 
 def test_junit_counts_what_it_holds_and_survives_every_text(out: Path) -> None:
     results = Results.load(out)
-    root = ET.parse(junit.write(out)).getroot()
+    root = ET.parse(junit.write(Results.load(out))).getroot()
     cases = root.findall("./testsuite/testcase")
     assert len(cases) == len(results.rows) == int(root.get("tests", ""))
     for tag, total in (("failure", "failures"), ("error", "errors"), ("skipped", "skipped")):
@@ -391,7 +391,7 @@ def test_junit_counts_what_it_holds_and_survives_every_text(out: Path) -> None:
 
 
 def test_the_step_summary_shows_text_as_text_and_keeps_its_limit(out: Path) -> None:
-    text = step_summary.write(out).read_text(encoding="utf-8")
+    text = step_summary.write(Results.load(out)).read_text(encoding="utf-8")
     assert "<" not in text and "`" not in text
     assert html.unescape(step_summary.escape(fixture.HOSTILE)) == fixture.HOSTILE
     assert not re.search(r"(?<!&)[|*_#\[\]`<>@]", step_summary.escape("|*_#[]`<>@me"))
