@@ -1,0 +1,88 @@
+"""Random scenarios through the whole harness: honest engines are not accused, and memory stays as it is."""
+
+import os
+import resource
+import sys
+import time
+
+import pytest
+
+from plumbline.random_scenarios import RandomScenarios
+from plumbline.registry import ENGINES
+from plumbline.run import Plan, execute
+from plumbline.workers import Limits
+
+for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
+    pytest.importorskip(engine)
+
+DEFECTIVE = {"pinocchio-aba"}  # loses digits: plumbline/known.yaml has the evidence, and crba + solve agrees
+
+
+def peak():
+    """Largest size of this process so far, MB."""
+    size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return size / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+def probed(seed, count, states):
+    """The result, and the process's peak at each tenth of the tasks."""
+    peaks = []
+
+    def progress(done, total, _):
+        if done * 10 // total > len(peaks):
+            peaks.append(peak())
+
+    jobs = 1 if "PYTEST_XDIST_WORKER" in os.environ else os.cpu_count() or 1
+    plan = Plan(
+        [], list(ENGINES), jobs=jobs, limits=Limits(600), states=states, probes=RandomScenarios(seed, count)
+    )
+    return execute(plan, progress), peaks
+
+
+def accused(result):
+    return [f"{r.key}: {r.reason}" for r in result.rows if r.verdict in ("disagrees", "failed")
+            and r.engine not in DEFECTIVE]  # fmt: skip
+
+
+def told(result):
+    """Rows by verdict."""
+    counted = result.probes.folded.copy()
+    counted.update(row.verdict for row in result.rows)
+    return counted
+
+
+def test_honest_engines_are_not_accused():
+    result, _ = probed(seed=2026, count=200, states=1)
+    assert not accused(result) and result.run["exit_code"] == 0, accused(result)
+    assert result.probes.scenarios == 200
+    counted = told(result)
+    assert counted["agrees"] > 200 * len(ENGINES) * 6
+    assert counted["unresolved"] < 0.01 * counted.total(), "too blunt to see anything"
+    assert max(c["ratio"] for c in result.run["probes"]["worst"] if c["engine"] not in DEFECTIVE) < 0.5
+
+
+@pytest.mark.full
+@pytest.mark.timeout(7200)
+def test_fourteen_thousand_cells_in_the_memory_of_a_few(record_testsuite_property, capsys):
+    begin = time.monotonic()
+    result, peaks = probed(seed=1, count=2000, states=9)
+    cells = 2000 * len(ENGINES)
+    figures = {
+        "cells": cells,
+        "cells per second": round(cells / (time.monotonic() - begin), 1),
+        "rows": told(result).total(),
+        "rows kept one by one": len(result.rows),
+        "disagree": told(result)["disagrees"],
+        "unresolved": told(result)["unresolved"],
+        "worst honest error over bound": max(
+            c["ratio"] for c in result.run["probes"]["worst"] if c["engine"] not in DEFECTIVE
+        ),
+        "MB at each tenth": [round(size) for size in peaks],
+    }
+    for name, figure in figures.items():
+        record_testsuite_property(name, figure)
+    with capsys.disabled():
+        print(f"\nrandom scenarios: {figures}")
+    assert not accused(result) and result.run["exit_code"] == 0, accused(result)
+    grown = peaks[-1] - peaks[1]
+    assert grown / (0.8 * cells) < 2 / 1024, f"{grown:.0f} MB in {0.8 * cells:.0f} cells"  # 2 kB a cell
