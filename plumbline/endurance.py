@@ -118,6 +118,8 @@ def endure(engine: str, integrator: str, model: Model, state: State, sample: flo
                 break
             except Unsupported as refusal:
                 return Endured(runs, sizes, str(refusal))
+            except MemoryError:
+                raise  # the worker's limit, told as such
             except Exception as error:  # an engine may raise anything: its words belong in the results
                 failure = failure or words(error)
         runs.append(reduced(model, trajectory, resolution, failure, begin))

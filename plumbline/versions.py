@@ -13,14 +13,16 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import zipfile
 from pathlib import Path
 from typing import Any
 
 from packaging.specifiers import SpecifierSet
-from packaging.utils import InvalidWheelFilename, parse_wheel_filename
+from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel_filename
 from packaging.version import InvalidVersion, Version
 
 from plumbline.registry import ENGINES
+from plumbline.scratch import Scratch
 
 ROOT = Path(__file__).resolve().parent.parent
 BESIDE = ("numpy", "scipy", "packaging")  # what adapters and the worker's side of the core import
@@ -39,20 +41,29 @@ def split(name: str) -> tuple[str, str]:
 
 def problem_of(name: str) -> str | None:
     """What is wrong with the version part of a name, in a sentence, before anything is fetched."""
-    _, version = split(name)
+    base, version = split(name)
     if "@" not in name or version in ("latest", "pre"):
         return None
     if version.endswith(".whl"):
-        try:
-            parse_wheel_filename(Path(version).name)
-        except InvalidWheelFilename as error:
-            return str(error)
-        return None if Path(version).is_file() else f"there is no file {version}"
+        return problem_of_wheel(Path(version), declared(base, "package"))
     try:
         Version(version)
     except InvalidVersion:
         return f"{version!r} is not a version; write one as 3.12.0, or latest, pre, or the path of a wheel"
     return None
+
+
+def problem_of_wheel(path: Path, package: str) -> str | None:
+    """What is wrong with a wheel of ``package``, as far as its name and its outside show it."""
+    try:
+        found, *_ = parse_wheel_filename(path.name)
+    except InvalidWheelFilename as error:
+        return str(error)
+    if found != canonicalize_name(package):
+        return f"{path} is a wheel of {found}, not of {package}"
+    if not path.is_file():
+        return f"there is no file {path}"
+    return None if zipfile.is_zipfile(path) else f"{path} is not a wheel: it is no zip file"
 
 
 def declared(engine: str, attribute: str) -> Any:
@@ -92,8 +103,8 @@ def interpreter(name: str) -> str:
     place = cache() / f"{package}-{label}-{tag}"
     if not python_of(place).exists():
         place.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=place.parent, prefix=".making-") as scratch:
-            made = Path(scratch) / "environment"
+        with Scratch(".making-", place.parent) as scratch:
+            made = scratch / "environment"
             uv("venv", "--relocatable", "--python", sys.executable, str(made))
             uv("pip", "install", "--python", str(python_of(made)), *wanted)
             try:

@@ -96,6 +96,8 @@ def evaluate(engine: str, model: Model, states: Sequence[State]) -> Evaluation:
         quantities = adapter(engine).evaluate(model, states)
     except Unsupported as refusal:
         unsupported = str(refusal)
+    except MemoryError:
+        raise  # the worker's limit, told as such
     except Exception as error:  # an engine may raise anything: its words belong in the results
         failure = words(error)
     return Evaluation(quantities, unsupported, failure, time.process_time() - begin)
@@ -114,6 +116,8 @@ def climb(
             trajectory = chosen.simulate(model, state, times, integrator, resolution)
         except Unsupported as refusal:
             return Climb(rungs, str(refusal))
+        except MemoryError:
+            raise
         except Exception as error:  # as above
             failure = words(error)
         rungs.append(Rung(resolution, trajectory, failure, time.process_time() - begin))

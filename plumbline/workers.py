@@ -11,6 +11,7 @@ import contextlib
 import multiprocessing
 import os
 import tempfile
+import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from dataclasses import dataclass, field
@@ -21,10 +22,14 @@ from pebble import ProcessExpired, ProcessPool
 
 from plumbline.fate import die_with_parent
 from plumbline.remote import Crashed, Elsewhere, call, exit_words
+from plumbline.scratch import Scratch
 
 ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
+
+
+TICK = 0.2  # s between looks at what runs too long
 
 
 @dataclass(frozen=True)
@@ -77,13 +82,13 @@ class Workers:
     def __init__(self, jobs: int, limits: Limits | None = None) -> None:
         self.jobs = jobs
         self.limits = limits or Limits()
-        self._scratch = tempfile.TemporaryDirectory(prefix="plumbline-", ignore_cleanup_errors=True)
+        self._scratch = Scratch()
         os.environ.update(ONE_THREAD)  # inherited by the spawned interpreters, before NumPy loads there
         self._pool = ProcessPool(
             max_workers=jobs,
             context=multiprocessing.get_context("spawn"),
             initializer=prepare,
-            initargs=(self._scratch.name, self.limits.gigabytes, os.getpid()),
+            initargs=(str(self._scratch.path), self.limits.gigabytes, os.getpid()),
         )
 
     def __enter__(self) -> Workers:
@@ -96,7 +101,7 @@ class Workers:
         """Kill what still runs and remove the scratch folders."""
         self._pool.stop()  # type: ignore[no-untyped-call]
         self._pool.join()
-        self._scratch.cleanup()
+        self._scratch.remove()
 
     def run(self, tasks: Iterable[Task], memory: Memory | None = None) -> Iterator[Outcome]:
         """Outcomes in the order of completion; only a few tasks are handed over at a time.
@@ -105,6 +110,7 @@ class Workers:
         """
         memory = memory or Memory()
         waiting: dict[Future[Any], Task] = {}
+        began: dict[Future[Any], float] = {}
         source = iter(tasks)
         exhausted = False
         while waiting or not exhausted:
@@ -117,13 +123,15 @@ class Workers:
                 if before is not None:
                     yield before
                     continue
-                future: Future[Any] = self._pool.schedule(perform, args=(task,), timeout=task.limits.seconds)
+                future: Future[Any] = self._pool.schedule(perform, args=(task,))
                 waiting[future] = task
             if not waiting:
                 return
-            done, _ = wait(waiting, return_when=FIRST_COMPLETED)
+            done, _ = wait(waiting, timeout=TICK, return_when=FIRST_COMPLETED)
+            stop_late(waiting, began)
             for future in done:
                 task = waiting.pop(future)
+                began.pop(future, None)
                 found = outcome(task, future)
                 memory.put(task, found)
                 yield found
@@ -136,11 +144,22 @@ def perform(task: Task) -> Any:
     return task.call(*task.arguments)
 
 
+def stop_late(waiting: dict[Future[Any], Task], began: dict[Future[Any], float]) -> None:
+    """Cancel what runs longer than its limit, which kills its worker.
+
+    The pool would do it by the clock of the wall: set forward it kills what is in time, set back it waits.
+    """
+    now = time.monotonic()
+    for future, task in waiting.items():
+        if future.running() and now - began.setdefault(future, now) > task.limits.seconds:
+            future.cancel()
+
+
 def outcome(task: Task, future: Future[Any]) -> Outcome:
     """The value of a finished future, or how its worker was lost."""
     try:
         return Outcome(task.key, future.result())
-    except TimeoutError:
+    except CancelledError:  # by `stop_late`, and by nobody else
         return Outcome(task.key, lost=f"hung: no answer within {task.limits.seconds:g} s, worker killed")
     except ProcessExpired as expired:
         return Outcome(task.key, lost=f"crashed: the worker {exit_words(expired.exitcode)}")
@@ -150,8 +169,6 @@ def outcome(task: Task, future: Future[Any]) -> Outcome:
         return Outcome(task.key, lost=str(error))
     except MemoryError:
         return Outcome(task.key, lost=f"out of memory: over {task.limits.gigabytes:g} GB of address space")
-    except CancelledError:
-        return Outcome(task.key, lost="cancelled")
     except Exception as error:  # ImportError among them: the caller tells "not installed" by its name
         return Outcome(task.key, lost=f"{type(error).__name__}: {error}")
 
