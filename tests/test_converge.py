@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plumbline.converge import approached, ladder, observed_order, romberg
+from plumbline.converge import approached, ladder, largest, observed_order, romberg, tightest
 from plumbline.records import Integrator
 
 TIMES = np.linspace(0, 2, 17)
@@ -99,3 +99,109 @@ def test_ladders_halve_and_keep_four_rungs(bodies, order, duration):
     steps = ladder(Integrator("x", "step", order, (order,)), bodies, duration)
     assert len(steps) >= 4
     assert all(a == 2 * b for a, b in itertools.pairwise(steps))
+
+
+@pytest.mark.parametrize(
+    ("order", "bodies", "duration", "finer", "coarse", "fine"),
+    [
+        (4, 1, 2.0, 0, 5, 12),
+        (1, 1, 2.0, 0, 9, 15),
+        (2, 2, 10.0, 0, 8, 12),
+        (1, 8, 2.0, 0, 9, 15),  # 2^15 steps a second for 2 s of 8 bodies are just affordable
+        (1, 9, 2.0, 0, 9, 14),
+        (1, 8, 0.1, 0, 9, 15),  # less than a second counts as one
+        (2, 60, 100.0, 0, 8, 11),  # four steps, whatever they cost
+        (4, 1, 2.0, 1, 5, 13),
+        (2, 60, 100.0, 2, 8, 13),
+    ],
+)
+def test_a_ladder_is_as_long_as_is_affordable(order, bodies, duration, finer, coarse, fine):
+    steps = ladder(Integrator("x", "step", order, (order,)), bodies, duration, finer)
+    assert steps == [2.0**-k for k in range(coarse, fine + 1)]
+
+
+def test_an_adaptive_method_climbs_by_tolerances():
+    method = Integrator("x", "tolerance", 8, tightest=1e-13)
+    assert ladder(method, 50, 100.0) == pytest.approx([1e-7, 1e-9, 1e-11, 1e-13], rel=1e-12)
+
+
+def test_the_largest_length_is_over_everything_but_the_last_axis():
+    y = np.zeros((2, 3, 2))
+    y[1, 2] = [3, -4]
+    assert largest(y) == 5.0
+    assert largest(np.zeros((0, 3, 2))) == 0.0
+    y[0, 0, 0] = np.nan
+    assert largest(y) == np.inf
+
+
+def geometric(*differences):
+    """Runs (1, 1, 1) whose consecutive differences are these, coarse to fine."""
+    return [np.full((1, 1, 1), x) for x in np.cumsum([0.0, *differences])]
+
+
+def test_orders_are_logarithms_of_ratios_of_differences():
+    seen = observed_order(geometric(64.0, 16.0, 4.0, 0.5), 1e-9, 2)
+    assert seen.orders == (2.0, 2.0, 3.0)
+    assert seen.differences == (64.0, 16.0, 4.0, 0.5)
+    assert (seen.value, seen.asymptotic, seen.at_floor) == (2.0, True, False)
+
+
+@pytest.mark.parametrize(
+    ("floor", "used"), [(0.5 / 32 * 0.99, 3), (0.5 / 32, 2), (4.0 / 32, 1), (16.0 / 32, 0)]
+)
+def test_a_difference_counts_above_32_floors(floor, used):
+    seen = observed_order(geometric(64.0, 16.0, 4.0, 0.5), floor, 5)
+    assert np.isfinite(seen.orders).tolist() == [k < used for k in range(3)]
+    assert seen.value == ([2.0, 2.0, 3.0][used - 1] if used else None)
+    assert not seen.asymptotic and not seen.at_floor
+
+
+@pytest.mark.parametrize(("floor", "at_floor"), [(2.0, True), (1.99, False)])
+def test_all_differences_within_32_floors_are_rounding(floor, at_floor):
+    assert observed_order(geometric(64.0, 16.0, 4.0), floor, 2).at_floor is at_floor
+
+
+@pytest.mark.parametrize(
+    ("orders", "declared", "shown"),
+    [
+        ((2.05, 1.95), 2, 1.95),
+        ((2.15, 2.0), 2, None),
+        ((2.0, 1.85), 2, None),
+        ((2.0, 2.0, 2.5), 2, 2.0),  # shown once; the last one may be rounding
+        ((3.0, 2.09, 2.08), 2, 2.08),
+    ],
+)
+def test_two_consecutive_orders_near_the_declared_one_show_it(orders, declared, shown):
+    sizes = 1e3 * 2.0 ** -np.cumsum([0.0, *orders])
+    seen = observed_order(geometric(*sizes), 1e-12, declared)
+    assert seen.asymptotic is (shown is not None)
+    assert shown is None or seen.value == pytest.approx(shown, abs=1e-9)
+
+
+def test_romberg_is_richardson_by_hand():
+    """Errors h + h²: one column leaves h² alone, two leave nothing; the uncertainty is the column's gaps."""
+    limit, hs = 5.0, (1.0, 0.5, 0.25, 0.125)
+    ys = [np.full((1, 1, 1), limit + h + h**2) for h in hs]
+    found = romberg(ys, (1, 2))
+    assert found.column == 2 and found.y == pytest.approx(limit, abs=1e-14)
+    first = romberg(ys, (1,))
+    assert first.column == 1 and first.y == pytest.approx(limit - 0.25 * 0.125, abs=1e-14)
+    # The row before: 5 − 0.5 · 0.25; the column before: 5 + 1/8 + 1/64.
+    assert first.uncertainty == pytest.approx([0.125 + 1 / 64 + 0.25 * 0.125], abs=1e-14)
+    bare = romberg(ys[:2], (1,))  # nothing to eliminate with: twice the last difference
+    assert bare.column == 0 and bare.y == ys[1] and bare.uncertainty == pytest.approx([2 * 1.25])
+
+
+def test_an_uncertainty_never_shrinks_with_time():
+    ys = [np.array([0.0, 4.0, 1.0])[:, None, None] * h for h in (1.0, 0.5)]
+    assert tightest(ys).uncertainty.tolist() == [0.0, 2.0, 2.0]
+    assert tightest(ys).y is ys[-1] and tightest(ys).column == 0
+
+
+def test_a_run_that_is_not_finite_in_between_leaves_the_finer_ones_alone():
+    ys = geometric(4.0, 1.0, 0.25)
+    with pytest.raises(ValueError, match="fewer than two"):
+        romberg([ys[0], np.full_like(ys[0], np.nan), ys[2]][:2], (1,))
+    with pytest.raises(ValueError, match="fewer than two"):
+        romberg([ys[0], np.full_like(ys[0], np.nan), ys[2], ys[3]], (1,))
+    assert romberg([np.full_like(ys[0], np.inf), *ys[1:]], (2,)).y == romberg(ys[1:], (2,)).y

@@ -116,3 +116,66 @@ def test_the_projects_own_file_is_valid_and_gives_evidence():
     for e in known.load():
         assert len(e.evidence) > 20
         assert len(e.reason) > 20
+
+
+@pytest.mark.parametrize(
+    ("changes", "covers"),
+    [
+        ({}, True),
+        ({"scenario": "tumbling-*"}, True),
+        ({"scenario": "tumbling"}, False),
+        ({"engine": "mujoc?"}, True),
+        ({"engine": "pinocchio"}, False),
+        ({"level": "state"}, True),
+        ({"level": "trajectory"}, False),
+        ({"integrator": "-"}, True),
+        ({"integrator": "RK4"}, False),
+        ({"quantity": "acc*"}, True),
+        ({"quantity": "ACCELERATION"}, False),
+    ],
+)
+@pytest.mark.parametrize("engine", ["mujoco", "mujoco@3.12.0"])
+def test_an_entry_covers_what_all_its_patterns_match(changes, covers, engine):
+    who = Subject("tumbling-ball", "single", engine, "MuJoCo", "4.0.0")
+    assert entry(**changes).covers(row(who=who)) is covers
+
+
+@pytest.mark.parametrize(
+    ("version", "versions", "inside"),
+    [
+        ("4.1.0rc1", ">=4", True),
+        ("3.9", ">=4", False),
+        ("built here", ">=4", False),
+        ("built here", "", True),
+    ],
+)
+def test_versions_that_are_none_and_those_before_a_release(version, versions, inside):
+    who = Subject("tumbling-ball", "single", "mujoco", "MuJoCo", version)
+    assert entry(versions=versions).covers(row(who=who)) is inside
+
+
+def test_the_entry_with_the_rows_verdict_excuses_it_and_the_other_is_stale():
+    both = [entry(id="open", verdict="unresolved"), entry(id="off")]
+    judged = judged_by([row()], both, whole=True)
+    assert judged.rows[0].known == "off"
+    assert [e.id for e in judged.stale] == ["open"]
+
+
+@pytest.mark.parametrize("pattern", ["tumbling-*", "tumbling-bal?", "tumbling-[b]all"])
+def test_every_kind_of_pattern_waits_for_the_whole_matrix(pattern):
+    wide = entry(scenario=pattern)
+    assert judged_by([row("agrees")], [wide], whole=False).stale == []
+    assert judged_by([row("agrees")], [wide], whole=True).stale == [wide]
+
+
+def test_lists_of_several_fields_are_an_entry_for_each_pair(tmp_path):
+    path = tmp_path / "known.yaml"
+    lists = "scenario: x, integrator: [RK4, Euler], quantity: [order, position]"
+    path.write_text(f"- {{id: a, {lists}, engine: z, verdict: failed, evidence: e, reason: r}}\n")
+    found = known.load(path)
+    assert [(e.integrator, e.quantity) for e in found] == [
+        ("RK4", "order"), ("RK4", "position"), ("Euler", "order"), ("Euler", "position"),
+    ]  # fmt: skip
+    assert [e.id for e in found][:2] == ["a: RK4: order", "a: RK4: position"]
+    path.write_text("")
+    assert known.load(path) == []

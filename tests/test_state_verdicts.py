@@ -11,7 +11,7 @@ from plumbline.findings import Subject
 from plumbline.motion_verdicts import judge_motion
 from plumbline.registry import adapter
 from plumbline.sampling import random_states
-from plumbline.state_verdicts import judge_states
+from plumbline.state_verdicts import UNITS, judge_states
 from plumbline.work import Evaluation, climb
 from plumbline.yardstick import StateTruth, motion_truth
 from tests import pendulums
@@ -56,3 +56,94 @@ def test_implicitfast_is_an_alias_of_euler_only_without_drag(drag):
     rows = judge_motion(WHO, model, truth, fast, runs["implicitfast"], horizon_of(truth)).rows
     assert {row.alias_of for row in rows} == ({None} if drag else {"Euler"})
     assert same is not drag
+
+
+def judged(*off, bounds=None, **evaluation):
+    """Findings on answers that are ``off`` by so many bounds of acceleration: (state, body, bounds)."""
+    right = adapter("reference").evaluate(MODEL, STATES)
+    bounds = bounds or [state_bound(MODEL, s) for s in STATES]
+    said = list(right)
+    for state, body, by in off:
+        shift = np.zeros((2, 3))
+        shift[body] = by * bounds[state].acceleration[body] * np.array([2.0, -1.0, 2.0]) / 3
+        said[state] = replace(said[state], acceleration=said[state].acceleration + shift)
+    answer = {"quantities": said, "unsupported": None, "failure": None, "cost": 0.25} | evaluation
+    return judge_states(WHO, StateTruth(STATES, right, bounds, "itself"), Evaluation(**answer))
+
+
+def test_the_row_is_of_the_body_that_is_worst_by_its_own_bound():
+    bounds = [state_bound(MODEL, s) for s in STATES]
+    # The larger error in m/s² is elsewhere: body 1 of state 0 gets a bound a thousand times as wide.
+    wide = bounds[0].acceleration * [1e3, 1.0]
+    bounds[0] = replace(bounds[0], acceleration=wide)
+    found = judged((0, 0, 0.5), (2, 1, 3.0), bounds=bounds)
+    row = found.rows[0]
+    sharp = bounds[2].acceleration[1]
+    assert (row.quantity, row.verdict, row.unit, row.level) == ("acceleration", "disagrees", "m/s²", "state")
+    assert row.value == pytest.approx(3 * sharp, rel=1e-2) and row.tolerance == sharp
+    assert (row.extra["state"], row.extra["body"], row.extra["states"]) == (2.0, 2.0, 3.0)
+    assert row.extra["ratio"] == pytest.approx(3, rel=1e-2)
+    assert row.wall_time == 0.25
+    assert "state 2, body 2" in row.reason and "1 of 3 states disagree" in row.reason
+    (name, table), *_ = found.tables
+    assert name == "states" and (table["scenario"], table["engine"]) == ("s", "reference")
+    assert table["quantity"] == "acceleration"
+    assert table["state"].tolist() == [0, 1, 2] and table["body"].tolist() == [0, 0, 1]
+    assert table["error"] == pytest.approx([0.5 * wide[0], 0, 3 * sharp], rel=1e-2)
+    assert table["bound"][[0, 2]].tolist() == [wide[0], sharp]
+    scales = [bounds[i].scale["acceleration"][body] for i, body in ((0, 0), (1, 0), (2, 1))]
+    assert table["scale"].tolist() == scales
+    assert row.extra["relative"] == pytest.approx(max(table["error"] / scales), rel=1e-12)
+    assert row.extra["bound_relative"] == pytest.approx(np.median(table["bound"] / scales), rel=1e-12)
+
+
+@pytest.mark.parametrize(("by", "expected"), [(0.98, "agrees"), (1.02, "disagrees")])
+def test_one_bound_is_the_border(by, expected):
+    rows = judged((1, 0, by)).rows
+    assert rows[0].verdict == expected
+    assert all(
+        row.verdict == "agrees" and row.value == 0 for row in rows[1:] if row.quantity != "mass_matrix"
+    )
+    assert [row.quantity for row in rows] == list(UNITS)
+    assert [row.unit for row in rows] == list(UNITS.values())
+    assert rows[0].extra["bound_relative"] < 1e-9 and rows[1].extra["ratio"] == 0.0
+
+
+def test_what_an_engine_does_not_offer_or_deliver_is_told():
+    right = adapter("reference").evaluate(MODEL, STATES)
+    less = [*right[:2], replace(right[2], joint_reaction=None)]
+    rows = judged(quantities=less).rows
+    (gone,) = (row for row in rows if row.quantity == "joint_reaction")
+    assert (gone.verdict, gone.unit) == ("unsupported", "N")
+    assert gone.reason == "Reference offers no joint reaction of its own"
+    assert len(rows) == len(UNITS)
+    for field, verdict in (("unsupported", "unsupported"), ("failure", "failed")):
+        (row,) = judged(**{field: "because"}).rows
+        assert (row.quantity, row.verdict, row.reason) == ("all", verdict, "because")
+        assert (row.integrator, row.level, row.value) == ("-", "state", None)
+
+
+def test_vectors_count_by_their_length_and_matrices_by_their_worst_entry():
+    right = adapter("reference").evaluate(MODEL, STATES)
+    matrix = right[0].mass_matrix.copy()
+    matrix[0, 1] -= 1.0
+    matrix[3, 4] += 0.5
+    momentum = right[0].angular_momentum + np.array([2.0, 3.0, 6.0])
+    energy = right[0].kinetic_energy - 5.0
+    changed = replace(right[0], mass_matrix=matrix, angular_momentum=momentum, kinetic_energy=energy)
+    rows = {row.quantity: row for row in judged(quantities=[changed, *right[1:]]).rows}
+    assert rows["mass_matrix"].value == 1.0
+    assert rows["angular_momentum"].value == pytest.approx(7, rel=1e-12)
+    assert rows["kinetic_energy"].value == pytest.approx(5, rel=1e-12)
+    assert all(rows[q].extra["body"] == 1 for q in ("mass_matrix", "angular_momentum", "kinetic_energy"))
+
+
+def test_a_scale_of_zero_is_no_reason_to_be_blunt():
+    """At rest there is no kinetic energy, no tolerance for it, and 0 = 0."""
+    still = [replace(s, omega=0 * s.omega, v=0 * s.v) for s in STATES]
+    right = adapter("reference").evaluate(MODEL, still)
+    bounds = [state_bound(MODEL, s) for s in still]
+    found = judge_states(WHO, StateTruth(still, right, bounds, "itself"), Evaluation(right, None, None, 0.0))
+    row = next(row for row in found.rows if row.quantity == "kinetic_energy")
+    assert (row.verdict, row.value, row.tolerance) == ("agrees", 0.0, 0.0)
+    assert (row.extra["relative"], row.extra["bound_relative"]) == (0.0, 0.0)
