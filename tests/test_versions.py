@@ -3,10 +3,13 @@
 import ctypes
 import operator
 import os
+import shutil
 import subprocess
 import sys
 import time
+import zipfile
 from dataclasses import replace
+from importlib import metadata
 
 import numpy as np
 import psutil
@@ -146,6 +149,92 @@ def test_a_version_that_cannot_be_had_is_a_verdict():
     absent, refused = result.rows
     assert absent.verdict == "not installed" and "99.0.0" in absent.reason
     assert refused.verdict == "unsupported" and "supports versions >=3.2" in refused.reason
+
+
+# --- what is no version, no wheel, or cannot be fetched ------------------------------------------
+
+
+def uv_there():
+    return shutil.which("uv") or (versions.ROOT / ".uv" / "bin" / "uv").exists()
+
+
+needs_uv = pytest.mark.skipif(not uv_there(), reason="uv is not installed here")
+
+
+@pytest.fixture
+def index():
+    """Skips with the reason where no package index answers."""
+    try:
+        versions.newest("packaging", pre=False)
+    except versions.NoSuchEnvironment as error:
+        pytest.skip(f"no package index can be reached: {error}")
+
+
+def wheel(folder, package="mujoco"):
+    """The installed distribution packed again as the wheel that it came from."""
+    found = metadata.distribution(package)
+    (tag,) = [line[5:] for line in found.read_text("WHEEL").splitlines() if line.startswith("Tag: ")][:1]
+    path = folder / f"{package}-{found.version}-{tag}.whl"
+    with zipfile.ZipFile(path, "w") as archive:
+        for file in found.files or ():
+            if ".." not in file.parts and "__pycache__" not in file.parts:
+                archive.write(found.locate_file(file), file.as_posix())
+    return path
+
+
+def test_a_file_that_is_no_wheel_is_bad_usage(tmp_path):
+    path = tmp_path / "mujoco-4.0.0-py3-none-any.whl"
+    path.write_text("no zip")
+    assert "is not a wheel: it is no zip file" in versions.problem_of(f"mujoco@{path}")
+    done = subprocess.run(
+        [HERE, "-m", "plumbline", "run", "rest", "--engine", f"exudyn@{path}"],
+        cwd=versions.ROOT, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 2 and "is a wheel of mujoco, not of exudyn" in " ".join(done.stderr.split())
+
+
+@needs_uv
+@pytest.mark.parametrize("version", ["9.9.9", "latest"])
+def test_an_index_that_does_not_answer_is_told(tmp_path, monkeypatch, version):
+    for name in ("UV_INDEX_URL", "UV_EXTRA_INDEX_URL", "UV_INDEX", "UV_FIND_LINKS"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("UV_DEFAULT_INDEX", "http://127.0.0.1:9/simple")  # the port of discard: refused
+    monkeypatch.setenv("UV_HTTP_RETRIES", "0")
+    monkeypatch.setenv("UV_CACHE_DIR", str(tmp_path / "uv"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    result = execute(Plan(scenario.load_many(["rest"]), [f"mujoco@{version}"], "state"), quiet)
+    (row,) = result.rows
+    assert row.verdict == "not installed"
+    assert "uv cannot make an environment" in row.reason and "http://127.0.0.1:9/simple/mujoco" in row.reason
+    assert not list((tmp_path / "plumbline").rglob("*.py")), "half an environment is left"
+
+
+@pytest.mark.full
+@needs_uv
+@pytest.mark.timeout(1800)
+def test_latest_pre_and_a_wheel_run_beside_the_installed_one(tmp_path, index):
+    names = ["mujoco", "mujoco@latest", "mujoco@pre", f"mujoco@{wheel(tmp_path)}"]
+    result = execute(Plan(scenario.load_many(["tumbling-ball"]), names, "state", limits=Limits(600)), quiet)
+    found = {name: result.engines[name] for name in names}
+    assert [info.missing for info in found.values()] == [None] * 4
+    latest, newest = (Version(found[f"mujoco@{which}"].version) for which in ("latest", "pre"))
+    assert not latest.is_prerelease and newest >= latest >= Version("4.0.0")
+    assert found[names[3]].version == found["mujoco"].version
+    values = {name: [row.value for row in result.rows if row.engine == name] for name in ("mujoco", names[3])}
+    assert values["mujoco"] == values[names[3]], "the same wheel says the same"
+    assert {row.verdict for row in result.rows} == {"agrees"}
+
+
+@pytest.mark.full
+@needs_uv
+@pytest.mark.timeout(900)
+def test_a_wheel_without_a_content_is_told(tmp_path, index):
+    path = tmp_path / "mujoco-4.0.0-py3-none-any.whl"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("mujoco/__init__.py", "")
+    result = execute(Plan(scenario.load_many(["rest"]), [f"mujoco@{path}"], "state"), quiet)
+    (row,) = result.rows
+    assert row.verdict == "not installed" and "uv cannot make an environment" in row.reason
 
 
 def test_a_bad_version_is_bad_usage():
