@@ -7,7 +7,8 @@
 The mistakes are mutmut's.  Each is made in the memory of a forked child that holds every library already
 imported, so no file is ever changed and a mutant costs the tests it meets and half a second.  The tests run
 in a copy of the checkout, first once in full to learn which test reaches which line; a mutant meets those
-that reach its line, quickest first, until one fails.  See docs/mutation.md for what is left out and why.
+that reach its line, quickest first, until one fails or `PATIENCE` ends.  docs/mutation.md says what is left
+out, and why.
 
 Ends with 1 where fewer than 95 % are noticed, where one survives that `survivors.yaml` does not list with a
 reason, or where that file lists one that is noticed or no longer there.
@@ -19,6 +20,7 @@ import argparse
 import difflib
 import gc
 import importlib
+import itertools
 import json
 import os
 import random
@@ -48,7 +50,7 @@ from mutmut.mutation.mutators import mutation_operators
 from ruamel.yaml import YAML
 
 LEAST = 0.95  # of the mutants have to be noticed
-SLOWEST = 8.0  # s of processor time: a test that takes longer is not asked
+PATIENCE = 8.0  # s of processor time, undisturbed, of the tests that one mutant meets at most
 MEMORY = 8 * 2**30  # bytes of address space of a child
 PLUGINS = ("no:cacheprovider", "pytest_timeout", "_hypothesis_pytestplugin")  # others only take time
 SURVIVORS = "tests/survivors.yaml"
@@ -209,7 +211,9 @@ class Reach:
         near = {test for line in range(first, last + 1) for test in lines.get(line, ())}
         if "" in near:
             near = {test for tests in lines.values() for test in tests}
-        return sorted(near & self.seconds.keys(), key=lambda test: self.seconds[test])
+        quickest = sorted(near & self.seconds.keys(), key=lambda test: self.seconds[test])
+        spent = itertools.accumulate(self.seconds[test] for test in quickest)
+        return [test for test, seconds in zip(quickest, spent, strict=True) if seconds <= PATIENCE]
 
 
 class Watch:
@@ -241,10 +245,7 @@ class Watch:
         """The outcome."""
         data = self.coverage.get_data()
         lines = {file: data.contexts_by_lineno(str(Path(file).resolve())) for file in self.files}
-        seconds = {t: s for t, s in self.seconds.items() if t not in self.failed and s <= SLOWEST}
-        left = {t: round(s, 1) for t, s in self.seconds.items() if t in self.failed or s > SLOWEST}
-        if left:
-            print(f"not asked (s): {left}", flush=True)
+        seconds = {t: s for t, s in self.seconds.items() if t not in self.failed}
         ours = {path.name for path in Path.cwd().iterdir()}
         names = [name for name in sys.modules if name.split(".")[0] not in ours | {"__main__"}]
         return Reach(seconds, lines, names)
@@ -296,7 +297,7 @@ class Mutated(MetaPathFinder, Loader):
         exec(compile(self.mutant.code, str(Path(self.mutant.file).resolve()), "exec"), module.__dict__)
 
 
-class Patience:
+class Limit:
     """A pytest plugin that ends the process where a test takes much longer than it did undisturbed."""
 
     def __init__(self, seconds: dict[str, float]) -> None:
@@ -325,7 +326,7 @@ def trial(mutant: Mutant, tests: Sequence[str], seconds: dict[str, float]) -> in
     sys.meta_path.insert(0, Mutated(mutant))
     code = 1
     try:
-        code = run_tests(tests, Patience(seconds))
+        code = run_tests(tests, Limit(seconds))
     finally:
         os._exit(code)
 

@@ -195,3 +195,30 @@ def test_steps_that_take_many_sweeps_are_followed_by_shorter_ones(monkeypatch: p
         assert not made or sweeps <= 8 or after < 0.95 * h, (h, sweeps, after)
     assert done.rejected < 0.1 * done.steps
     assert max(sweeps for _, sweeps, made, _ in watched.tried if made) <= collocation.SWEEPS
+
+
+@pytest.mark.parametrize("dense", [True, False])
+def test_the_last_step_ends_where_it_should(dense: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """t + (end − t) is not always the end in double precision; what is missing is no step of its own."""
+    model, state = random_chain(np.random.default_rng(41), [False])
+    rng = np.random.default_rng(41)
+    missed = 0
+    for start_, span in rng.uniform(0.01, 1.0, (60, 2)):
+        watched = Watched(monkeypatch)
+        times = np.array([start_, start_ + 0.4 * span, start_ + span])
+        done = run(model, state, 1e-4, times, dense=dense, nodes=8)
+        made = [h for h, _, ok, _ in watched.tried if ok]
+        missed += start_ + sum(made) != times[-1]
+        assert min(made) > 1e-6 * span
+        assert np.all(np.isfinite(done.r))
+        monkeypatch.undo()
+    assert missed > 0, "none of the runs was a case of it"
+
+
+def test_a_step_that_vanishes_is_an_error() -> None:
+    """Drag of 1e13/s holds the sweeps to steps of 1e-13 s: nothing beside 1000 s, but much of 1e-12 s."""
+    model, state = random_chain(np.random.default_rng(42), [False])
+    model = replace(model, drag_force=1e13 * model.mass)
+    with pytest.raises(ArithmeticError, match=r"stopped at t = 0\.0 s: the step vanishes"):
+        run(model, state, 1e-6, np.array([0.0, 1e3]))
+    assert run(model, state, 1e-6, np.array([0.0, 1e-12])).steps > 2
