@@ -157,9 +157,9 @@ def check_trajectory(model: Model, state: State, times: Array, run: Trajectory, 
     if np.any(repeated):
         at = times[1 + int(np.argmax(repeated))]
         raise EngineFailure(f"{what}: the row at t = {at} s repeats the one before while moving")
-    # A return to the exact initial row while the pendulum moves is a reset, not a period: no
-    # integrator closes an orbit to the last bit of every coordinate and rate.
-    reset = np.all(rows[1:] == rows[0], axis=1) & moving[1:]
+    # A return to the exact initial row (which may be at rest) of a pendulum that moved is a reset, not a
+    # period: no integrator closes an orbit to the last bit of every coordinate and rate.
+    reset = np.all(rows[1:] == rows[0], axis=1) & np.logical_or.accumulate(moving)[1:]
     if np.any(reset):
         at = times[1 + int(np.argmax(reset))]
         raise EngineFailure(f"{what}: the row at t = {at} s is the initial state again (a silent reset)")
