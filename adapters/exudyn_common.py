@@ -71,9 +71,9 @@ def rigid_body(node: Any, mass: float, J: Array) -> Any:
     return items.ObjectRigidBody(nodeNumber=node, **sizes)
 
 
-def sparse(chosen: Any) -> None:
-    """The sparse linear solver."""
-    kind = exudyn.LinearSolverType.EigenSparse
+def linear(chosen: Any, name: str) -> None:
+    """The linear solver of that name."""
+    kind = getattr(exudyn.LinearSolverType, name)
     if hasattr(chosen, "linearSolver"):
         chosen.linearSolver.solverType = kind
     else:  # before 1.12

@@ -5,6 +5,9 @@ first as here, so nothing is converted.  Exudyn keeps displacements from a refer
 initial state itself, so that the displacements start from an exact zero.
 The rod's constraint is ‖d‖ - ℓ, so its multiplier is the tension (2ℓ times the notes' λ); reactions are
 read as -C_rᵀ λ, whatever the constraint's scale and sign.
+
+Welded halves are nodes of their own with a rigid joint between: the body hangs by its first half, the next
+body on its last, and what is said of the body is said of the point on its first half where its centre is.
 """
 
 from __future__ import annotations
@@ -21,55 +24,79 @@ from adapters.exudyn_common import (
     SUPPORTED,
     add_loads,
     items,
+    linear,
     quiet,
     rigid_body,
     run,
     settings,
-    sparse,
     system,
     version,
 )
 from plumbline.adapter import Adapter
 from plumbline.kinematics import angular_velocity, rate, rotation
+from plumbline.parts import Parts, whole
 from plumbline.records import Array, EngineFailure, Integrator, Model, State, StateQuantities, Trajectory
 
 Output = exudyn.OutputVariableType
 
 
 class Chain:
-    """The assembled system at one state."""
+    """The assembled system at one state; the pieces of all bodies in a row.
 
-    def __init__(self, model: Model, state: State) -> None:
+    ``first[k]``, ``last[k]``: the pieces that body k hangs by and that the next one hangs on;
+    ``of[i]``, ``centre[i]``: the body of piece i and where in it the piece's own centre of mass is.
+    """
+
+    def __init__(self, model: Model, state: State, parts: Parts | None = None) -> None:
         self.mbs, self.container = system()
-        mbs = self.mbs
+        mbs, parts = self.mbs, parts or whole(model)
         ground = mbs.AddObject(items.ObjectGround())
         pivot = hang = mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=ground))
-        pdot = rate(state.p, state.omega)
-        self.nodes, self.bodies, self.joints = [], [], []
+        self.nodes, self.joints, self.welds = [], [], []
+        self.bodies: list[Any] = []
+        self.first, self.last, self.of = [], [], []
+        self.centre = [part.centre for pieces in parts for part in pieces]
+        self.qdot = np.empty((len(self.centre), 7))
+        turn, pdot, gravity = rotation(state.p), rate(state.p, state.omega), model.gravity.tolist()
         for k in range(model.n):
-            node = mbs.AddNode(
-                items.NodeRigidBodyEP(
-                    referenceCoordinates=[*state.r[k], *state.p[k]], initialVelocities=[*state.v[k], *pdot[k]]
+            self.first.append(len(self.bodies))
+            for part in parts[k]:
+                arm = turn[k] @ part.centre, turn[k] @ np.cross(state.omega[k], part.centre)
+                qdot = self.qdot[len(self.bodies)] = *(state.v[k] + arm[1]), *pdot[k]
+                node = mbs.AddNode(
+                    items.NodeRigidBodyEP(
+                        referenceCoordinates=[*(state.r[k] + arm[0]), *state.p[k]], initialVelocities=[*qdot]
+                    )
                 )
-            )
-            body = mbs.AddObject(rigid_body(node, model.mass[k], model.inertia[k]))
-
-            def marker(point: Array, body: Any = body) -> Any:
-                return mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=body, localPosition=point.tolist()))
-
-            ends = [hang, marker(model.proximal[k])]
+                body = mbs.AddObject(rigid_body(node, part.mass, part.inertia))
+                weight = mbs.AddMarker(items.MarkerBodyMass(bodyNumber=body))
+                mbs.AddLoad(items.LoadMassProportional(markerNumber=weight, loadVector=gravity))
+                self.nodes.append(node)
+                self.bodies.append(body)
+                self.of.append(k)
+            self.last.append(len(self.bodies) - 1)
+            ends = [hang, self.marker(self.first[k], model.proximal[k])]
             if model.length[k] > 0:
                 joint = items.ObjectConnectorDistance(markerNumbers=ends, distance=model.length[k])
             else:
                 joint = items.ObjectJointSpherical(markerNumbers=ends)
             self.joints.append(mbs.AddObject(joint))
-            self.nodes.append(node)
-            self.bodies.append(body)
-            weight = mbs.AddMarker(items.MarkerBodyMass(bodyNumber=body))
-            mbs.AddLoad(items.LoadMassProportional(markerNumber=weight, loadVector=model.gravity.tolist()))
-            add_loads(mbs, model, k, marker(np.zeros(3)), pivot, model.moment[k])
-            hang = marker(model.distal[k])
+            if self.last[k] > self.first[k]:
+                middle = [self.marker(piece, np.zeros(3)) for piece in (self.first[k], self.last[k])]
+                self.welds.append(mbs.AddObject(items.ObjectJointGeneric(markerNumbers=middle)))
+            add_loads(mbs, model, k, self.marker(self.first[k], np.zeros(3)), pivot, model.moment[k])
+            hang = self.marker(self.last[k], model.distal[k])
         mbs.Assemble()
+
+    def marker(self, piece: int, point: Array) -> Any:
+        """A marker on a piece, at a point of its body."""
+        local = (point - self.centre[piece]).tolist()
+        return self.mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=self.bodies[piece], localPosition=local))
+
+    def at(self, piece: int, what: Any, point: Array) -> Array:
+        """(3,) an output of a piece at a point of its body."""
+        local = (point - self.centre[piece]).tolist()
+        return np.array(self.mbs.GetObjectOutputBody(self.bodies[piece], what, local))
 
 
 class Exudyn(Adapter):
@@ -99,52 +126,82 @@ class Exudyn(Adapter):
         ),
     )
 
+    solvers = ("EXUdense", "EigenDense")
+    unwelded = ""
+
     def version(self) -> str:
         """Version of the Exudyn that runs."""
         return version()
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         with quiet():
-            return [evaluate(model, state) for state in states]
+            return [evaluate(model, state, self.parts(model)) for state in states]
 
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
-        chosen = settings()
-        sparse(chosen)
+        with quiet():
+            chain = Chain(model, state)
+            rows = self._rows(chain, times, integrator, resolution)
+        return trajectory(model, state, times, rows, resolution)
+
+    def _retrace(
+        self, model: Model, state: State, end: float, integrator: Integrator, resolution: float
+    ) -> Trajectory:
+        initial, leg = exudyn.ConfigurationType.Initial, np.array([0.0, end])
+        with quiet():
+            chain = Chain(model, state)
+            data = chain.mbs.systemData
+            there = self._rows(chain, leg, integrator, resolution)
+            q, qdot, qddot = there[-1]
+            data.SetODE2Coordinates(q, initial)
+            data.SetODE2Coordinates_t(-qdot, initial)
+            data.SetODE2Coordinates_tt(qddot, initial)  # carried from step to step: a part of its state
+            data.SetTime(0.0, initial)
+            back = self._rows(chain, leg, integrator, resolution, afresh=False)
+        return trajectory(model, state, np.array([0.0, end, 2 * end]), [*there, back[-1]], resolution)
+
+    def _rows(
+        self, chain: Chain, times: Array, integrator: Integrator, step: float, afresh: bool = True
+    ) -> list[tuple[Array, Array, Array]]:
+        """Displacements, rates, accelerations (7N,) at ``times``; ``afresh``: the first accelerations too."""
+        chosen, data = settings(), chain.mbs.systemData
+        linear(chosen, self.option or "EigenSparse")
         alpha = chosen.timeIntegration.generalizedAlpha
+        alpha.computeInitialAccelerations = afresh
         if integrator.name == "trapezoidal":
             alpha.useNewmark = alpha.useIndex2Constraints = True
         else:
             alpha.spectralRadius = 0.9
-        with quiet():
-            chain = Chain(model, state)
-            data = chain.mbs.systemData
-            rows = run(
-                exudyn.MainSolverImplicitSecondOrder(),
-                chain.mbs,
-                chosen,
-                times,
-                resolution,
-                lambda: (data.GetODE2Coordinates(), data.GetODE2Coordinates_t()),
-            )
-        start = np.concatenate([state.r, state.p], axis=1)
-        q = start + np.array([row[0] for row in rows]).reshape(-1, model.n, 7)
-        qdot = np.array([row[1] for row in rows]).reshape(-1, model.n, 7)
-        steps = round(float(times[-1] / resolution))
-        return Trajectory(times.copy(), q[..., :3], q[..., 3:], qdot[..., :3], qdot[..., 3:], steps)
+        parts = data.GetODE2Coordinates, data.GetODE2Coordinates_t, data.GetODE2Coordinates_tt
+        solver = exudyn.MainSolverImplicitSecondOrder()
+        return run(solver, chain.mbs, chosen, times, step, lambda: tuple(part() for part in parts))
 
 
-def evaluate(model: Model, state: State) -> StateQuantities:
+def trajectory(
+    model: Model, state: State, times: Array, rows: list[tuple[Array, Array, Array]], step: float
+) -> Trajectory:
+    """What was read of a run from ``state``."""
+    start = np.concatenate([state.r, state.p], axis=1)
+    q = start + np.array([row[0] for row in rows]).reshape(-1, model.n, 7)
+    qdot = np.array([row[1] for row in rows]).reshape(-1, model.n, 7)
+    return Trajectory(
+        times.copy(), q[..., :3], q[..., 3:], qdot[..., :3], qdot[..., 3:], round(float(times[-1] / step))
+    )
+
+
+def evaluate(model: Model, state: State, parts: Parts) -> StateQuantities:
     """Everything from Exudyn's own mass matrix M, right-hand side f, constraint Jacobian C and outputs.
 
     Its own initial accelerations are finite differences, wrong by some 1e-6, and are not used:
 
         ⎡ M  Cᵀ ⎤ ⎡ q̈ ⎤   ⎡ f ⎤
         ⎣ C  0  ⎦ ⎣ λ ⎦ = ⎣ γ ⎦,     γ from the accelerations Exudyn gives the attachments at q̈ = 0.
+
+    Pieces of one body turn alike, so that γ of a weld's rotations is 0.
     """
-    chain = Chain(model, state)
-    mbs, data, n = chain.mbs, chain.mbs.systemData, model.n
+    chain = Chain(model, state, parts)
+    mbs, data, n = chain.mbs, chain.mbs.systemData, len(chain.bodies)
     chosen = settings()
     chosen.timeIntegration.generalizedAlpha.computeInitialAccelerations = False
     solver: Any = exudyn.MainSolverImplicitSecondOrder()
@@ -163,59 +220,59 @@ def evaluate(model: Model, state: State) -> StateQuantities:
     finally:
         solver.FinalizeSolver(mbs, chosen)
 
-    pdot = rate(state.p, state.omega)
     gamma = np.zeros(len(C))
     data.SetODE2Coordinates_tt(np.zeros(7 * n))
-    for k, (node, joint) in enumerate(zip(chain.nodes, chain.joints, strict=True)):
-        gamma[data.GetNodeLTGAE(node)] = -2 * pdot[k] @ pdot[k]
+    for i, node in enumerate(chain.nodes):
+        gamma[data.GetNodeLTGAE(node)] = -2 * chain.qdot[i, 3:] @ chain.qdot[i, 3:]
+    for k, joint in enumerate(chain.joints):
         bend = _relative(model, chain, k, Output.Acceleration)
         if model.length[k] > 0:  # (‖d‖)¨ = (dᵀd̈ + ḋᵀḋ - (‖d‖˙)²) / ‖d‖, and ‖d‖˙ = 0 on the manifold
             d, ddot = (_relative(model, chain, k, what) for what in (Output.Position, Output.Velocity))
             bend = (d @ bend + ddot @ ddot) / np.linalg.norm(d)
         gamma[data.GetObjectLTGAE(joint)] = -bend
+    for weld, one, other in zip(chain.welds, chain.first, chain.last, strict=False):
+        rows = data.GetObjectLTGAE(weld)[:3]
+        there, here = (chain.at(piece, Output.Acceleration, np.zeros(3)) for piece in (other, one))
+        bend = there - here
+        gamma[rows] = -C[rows, 7 * other : 7 * other + 3] @ bend
 
     x = _solve(np.block([[M, C.T], [C, np.zeros((len(C), len(C)))]]), np.concatenate([f, gamma]))
     data.SetODE2Coordinates_tt(x[: 7 * n])
     multiplier = x[7 * n :]
     reaction = np.array(
         [
-            -C[data.GetObjectLTGAE(joint), 7 * k : 7 * k + 3].T @ multiplier[data.GetObjectLTGAE(joint)]
-            for k, joint in enumerate(chain.joints)
+            -C[data.GetObjectLTGAE(joint), 7 * i : 7 * i + 3].T @ multiplier[data.GetObjectLTGAE(joint)]
+            for i, joint in zip(chain.first, chain.joints, strict=True)
         ]
     )
 
     def output(what: Any) -> Array:
-        return np.array([mbs.GetObjectOutputBody(body, what) for body in chain.bodies])
+        return np.array([chain.at(i, what, np.zeros(3)) for i in chain.first])
 
-    qdot = np.concatenate([state.v, pdot], axis=1)  # (N, 7)
-    momentum = (M @ qdot.ravel()).reshape(n, 7)  # 4LᵀJLṗ = 2LᵀJω′, and L Lᵀ = I gives Jω′ = ½ L (…)
-    spin = angular_velocity(state.p, momentum[:, 3:]) / 4  # angular_velocity is 2 L(p) (…)
-    r = output(Output.Position)
+    momentum = (M @ chain.qdot.ravel()).reshape(n, 7)  # 4LᵀJLṗ = 2LᵀJω′, and L Lᵀ = I gives Jω′ = ½ L (…)
+    p = state.p[chain.of]
+    spin = angular_velocity(p, momentum[:, 3:]) / 4  # angular_velocity is 2 L(p) (…)
+    r = np.array([mbs.GetObjectOutputBody(body, Output.Position) for body in chain.bodies])
     weight = (M @ np.tile([*model.gravity, 0, 0, 0, 0], n)).reshape(n, 7)[:, :3]
-    basis = _rates(model, state)
-    kinetic = 0.5 * np.sum(qdot * momentum)
+    kinetic = 0.5 * np.sum(chain.qdot * momentum)
     if hasattr(Output, "KineticEnergy"):  # an output of bodies since 1.12
         kinetic = np.sum([mbs.GetObjectOutputBody(body, Output.KineticEnergy) for body in chain.bodies])
+    basis = None if chain.welds else _rates(model, state)  # of pieces the engine has no mass matrix on ν
     return StateQuantities(
         acceleration=output(Output.Acceleration),
         angular_acceleration=output(Output.AngularAccelerationLocal),
         joint_reaction=reaction,
         kinetic_energy=float(kinetic),
         potential_energy=float(-np.sum(weight * r)),  # its own PotentialEnergy is always 0
-        angular_momentum=np.sum(np.cross(r, momentum[:, :3]), 0)
-        + np.einsum("kij,kj->i", rotation(state.p), spin),
-        mass_matrix=basis.T @ M @ basis,
+        angular_momentum=np.sum(np.cross(r, momentum[:, :3]), 0) + np.einsum("kij,kj->i", rotation(p), spin),
+        mass_matrix=None if basis is None else basis.T @ M @ basis,
     )
 
 
 def _relative(model: Model, chain: Chain, k: int, what: Any) -> Array:
     """(3,) an output of joint k: at body k's proximal point less that at the point where the joint hangs."""
-
-    def at(body: int, point: Array) -> Array:
-        return np.array(chain.mbs.GetObjectOutputBody(chain.bodies[body], what, point.tolist()))
-
-    here = at(k, model.proximal[k])
-    return here - at(k - 1, model.distal[k - 1]) if k else here
+    here = chain.at(chain.first[k], what, model.proximal[k])
+    return here - chain.at(chain.last[k - 1], what, model.distal[k - 1]) if k else here
 
 
 def _rates(model: Model, state: State) -> Array:

@@ -27,6 +27,7 @@ from adapters.exudyn_common import (
     SUPPORTED,
     add_loads,
     items,
+    linear,
     quiet,
     run,
     runge_kutta,
@@ -234,6 +235,8 @@ class ExudynTree(Adapter):
     integrators: ClassVar[tuple[Integrator, ...]] = (
         Integrator("RK44", "step", 4, (4, 5, 6, 7, 8), note="classical Runge-Kutta on joint angles"),
     )
+    solvers = ("EigenSparse",)
+    unwelded = "a kinematic tree has revolute and prismatic joints, none that holds two links rigidly"
 
     def version(self) -> str:
         """Version of the Exudyn that runs."""
@@ -255,7 +258,9 @@ class ExudynTree(Adapter):
                 omega = tree.sense(Output.AngularVelocityLocal)
                 return tree.sense(Output.Position), p, tree.sense(Output.Velocity), rate(p, omega)
 
-            rows = run(solver, tree.mbs, explicit(), times, resolution, read, tree.watch)
+            chosen = explicit()
+            linear(chosen, self.option or "EXUdense")
+            rows = run(solver, tree.mbs, chosen, times, resolution, read, tree.watch)
         r, p, v, pdot = (np.array(column) for column in zip(*rows, strict=True))
         return Trajectory(times.copy(), r, p, v, pdot, round(float(times[-1] / resolution)))
 

@@ -18,6 +18,10 @@ Loads act inside every integrator stage: the world force is `xfrc_applied`; n′
 are actuators on a site at the centre of mass, a constant and a velocity bias along each axis.
 `cfrc_int` counts actuator forces as if the joint carried them, so before asking for it the drag
 force that acted is named as an applied one too.
+
+Welded halves are bodies without a joint on a massless one in their body's place.  The other way to the
+accelerations is a dense solve with `mj_fullM`.  The engine's choices of solver (PGS, CG, Newton) and
+Jacobian (dense, sparse) are of active constraints: there are none here, and the answers the same bit for bit.
 """
 
 from __future__ import annotations
@@ -31,6 +35,7 @@ import numpy as np
 
 from plumbline import kinematics
 from plumbline.adapter import Adapter
+from plumbline.parts import Part, Parts, whole
 from plumbline.records import Array, EngineFailure, Integrator, Model, State, StateQuantities, Trajectory
 
 ALL = (1, 2, 3, 4, 5, 6)
@@ -57,13 +62,15 @@ class Mujoco(Adapter):
         ),
         Integrator("RK4", "step", 4, (4, 5, 6, 7, 8), note="classical Runge–Kutta on the rotation group"),
     )
+    options = ("dense mass matrix",)
+    unwelded = ""
 
     def version(self) -> str:
         """Version of the loaded library."""
         return str(mujoco.mj_versionString())
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-        chain = _Chain(model)
+        chain = _Chain(model, self.parts(model), dense=bool(self.option))
         with _watched(chain.d):
             return [chain.quantities(state) for state in states]
 
@@ -86,24 +93,28 @@ class Mujoco(Adapter):
 
 
 class _Chain:
-    """A compiled chain and its data.  ``link[k]``, ``parent[b]``: engine body ids, 0 the world."""
+    """A compiled chain and its data.  Engine body ids: ``link[k]`` of link k, ``turning`` all on joints."""
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Model, parts: Parts | None = None, dense: bool = False) -> None:
         spec = mujoco.MjSpec()
         getattr(spec, "compiler", spec).autolimits = False  # on the spec itself in 3.2.0 to 3.2.4
-        self.model = model
+        self.model, self.dense = model, dense
         self.link: list[int] = []
+        self.turning: list[int] = []
         self.mass: list[float] = [0.0]
         self.inertia: list[Array] = [np.zeros(3)]
         parent, hang = spec.worldbody, np.zeros(3)
         for k in range(model.n):
-            principal, axes = _principal(model.inertia[k])
             if model.length[k] > 0:
-                parent = self._body(parent, hang, np.zeros(3), 0.0, np.array([0, 0, 0.01 * principal.mean()]))
+                axial = np.array([0, 0, 0.01 * _principal(model.inertia[k])[0].mean()])
+                parent = self._body(parent, hang, 0.0, axial, joint=np.zeros(3))
                 hang = np.array([0, 0, -model.length[k]])
-            at = model.proximal[k]
-            parent = self._body(parent, hang - at, at, model.mass[k], principal, axes)
+            at, pieces = model.proximal[k], (parts or whole(model))[k]
+            one = pieces[0] if len(pieces) == 1 else Part(0.0, np.zeros(3), np.zeros((3, 3)))
+            parent = self._body(parent, hang - at, one.mass, *_principal(one.inertia), joint=at)
             self.link.append(len(self.mass) - 1)
+            for piece in pieces if len(pieces) > 1 else ():  # before the next link: ids go depth first
+                self._body(parent, piece.centre, piece.mass, *_principal(piece.inertia))
             hang = model.distal[k]
             _actuate(spec, parent, k, model)
         m = self.m = spec.compile()
@@ -121,14 +132,22 @@ class _Chain:
         self.probe = mujoco.MjData(m)
 
     def _body(
-        self, parent: Any, pos: Array, joint: Array, mass: float, inertia: Array, axes: Array = UPRIGHT
+        self,
+        parent: Any,
+        pos: Array,
+        mass: float,
+        inertia: Array,
+        axes: Array = UPRIGHT,
+        joint: Array | None = None,
     ) -> Any:
-        """A body on a ball joint, compiled with unit mass; ``mass`` and ``inertia`` are set afterwards."""
+        """A body on a ball joint, or welded; of unit mass until ``mass`` and ``inertia`` are set."""
         body = _made(
             parent.add_body(),
             pos=pos, mass=1.0, inertia=np.ones(3), ipos=np.zeros(3), iquat=axes, explicitinertial=True,
         )  # fmt: skip
-        _made(body.add_joint(), type=mujoco.mjtJoint.mjJNT_BALL, pos=joint)
+        if joint is not None:
+            _made(body.add_joint(), type=mujoco.mjtJoint.mjJNT_BALL, pos=joint)
+            self.turning.append(len(self.mass))
         self.mass.append(mass)
         self.inertia.append(inertia)
         return body
@@ -151,12 +170,12 @@ class _Chain:
         """Write a state; returns T (nv, nu)."""
         m, d = self.m, self.d
         q, E = self.frames(state)
-        up = m.body_parentid[1:]
-        turn = kinematics.rotation(kinematics.multiply(kinematics.conjugate(q[1:]), q[up]))  # R_bᵀ R_a
-        T = (E[1:] - turn @ E[up]).reshape(m.nv, -1)
+        own, up = self.turning, m.body_parentid[self.turning]
+        turn = kinematics.rotation(kinematics.multiply(kinematics.conjugate(q[own]), q[up]))  # R_bᵀ R_a
+        T = (E[own] - turn @ E[up]).reshape(m.nv, -1)
         nu = np.concatenate([state.udot[self.model.rods].ravel(), state.omega.ravel()])
         mujoco.mj_resetData(m, d)
-        d.qpos = kinematics.multiply(kinematics.conjugate(q[up]), q[1:]).ravel()
+        d.qpos = kinematics.multiply(kinematics.conjugate(q[up]), q[own]).ravel()
         d.qvel = T @ nu
         d.xfrc_applied = self.applied
         return np.asarray(T)
@@ -168,15 +187,17 @@ class _Chain:
         m.opt.enableflags = mujoco.mjtEnableBit.mjENBL_ENERGY
         mujoco.mj_forward(m, d)
         mujoco.mj_subtreeVel(m, d)
-        velocity = self._object(mujoco.mj_objectVelocity, d)
-        d.xfrc_applied[link, :3] -= self.model.drag_force[:, None] * velocity[:, 3:]
-        mujoco.mj_rnePostConstraint(m, d)
-        acceleration = self._object(mujoco.mj_objectAcceleration, d)
         M = np.zeros((m.nv, m.nv))
         try:
             mujoco.mj_fullM(m, d, M)
         except TypeError:  # older ones, 3.4 among them
             mujoco.mj_fullM(m, M, d.qM)
+        if self.dense:
+            d.qacc = np.linalg.solve(M, d.qfrc_smooth)
+        velocity = self._object(mujoco.mj_objectVelocity, d)
+        d.xfrc_applied[link, :3] -= self.model.drag_force[:, None] * velocity[:, 3:]
+        mujoco.mj_rnePostConstraint(m, d)
+        acceleration = self._object(mujoco.mj_objectAcceleration, d)
         com, momentum = d.subtree_com[0], m.body_subtreemass[0] * d.subtree_linvel[0]
         return StateQuantities(
             acceleration=acceleration[:, 3:] + self.model.gravity,

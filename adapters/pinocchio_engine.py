@@ -26,7 +26,7 @@ Applied loads enter as `fext`: force and moment on the joint's body, in and abou
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, Self, cast
 
 import numpy as np
 import pinocchio as pin
@@ -34,6 +34,7 @@ from scipy.integrate import DOP853
 
 from plumbline.adapter import Adapter
 from plumbline.kinematics import conjugate, multiply, rate, rotation
+from plumbline.parts import Parts, whole
 from plumbline.records import (
     Array,
     EngineFailure,
@@ -45,7 +46,7 @@ from plumbline.records import (
 )
 
 WORLD = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-Algorithm = Literal["aba", "aba-world", "crba"]
+Algorithm = Literal["aba", "aba-world", "crba", "cholesky", "forwardDynamics"]
 
 
 class Chain:
@@ -55,8 +56,9 @@ class Chain:
     q is (4 nj,), v is (3 nj,) in Pinocchio's conventions.
     """
 
-    def __init__(self, model: Model, algorithm: Algorithm):
+    def __init__(self, model: Model, algorithm: Algorithm, parts: Parts | None = None):
         self.source, self.algorithm = model, algorithm
+        parts = parts or whole(model)
         self.pin = pin.Model()
         self.pin.gravity = pin.Motion(model.gravity, np.zeros(3))
         self.bodies: list[int] = []  # joint of body k
@@ -71,8 +73,10 @@ class Chain:
                 hang = np.array([0.0, 0.0, model.length[k]])
             joint = self._add(joint, hang, f"body {k}")
             centre = pin.SE3(np.eye(3), -model.proximal[k])
-            inertia = pin.Inertia(float(model.mass[k]), np.zeros(3), model.inertia[k])
-            self.pin.appendBodyToJoint(joint, inertia, centre)
+            for part in parts[k]:  # the engine welds what is appended to one joint
+                inertia = pin.Inertia(part.mass, np.zeros(3), part.inertia)
+                place = pin.SE3(np.eye(3), part.centre - model.proximal[k])
+                self.pin.appendBodyToJoint(joint, inertia, place)
             frame = pin.Frame(f"com {k}", joint, centre, pin.FrameType.OP_FRAME)
             self.frames.append(self.pin.addFrame(frame))
             self.bodies.append(joint)
@@ -132,9 +136,17 @@ class Chain:
     def acceleration(self, q: Array, v: Array) -> Array:
         """v̇ (3 nj,) under gravity and loads, by the chosen algorithm."""
         self.load(q, v)
-        if self.algorithm == "crba":
-            bias = pin.rnea(self.pin, self.data, q, v, self.no_torque, self.fext)
-            return np.linalg.solve(pin.crba(self.pin, self.data, q), -bias)
+        if self.algorithm in ("crba", "cholesky", "forwardDynamics"):
+            engine, data = self.pin, self.data
+            bias = pin.rnea(engine, data, q, v, self.no_torque, self.fext)
+            if self.algorithm == "forwardDynamics":  # it counts the velocity terms and gravity itself
+                force, no_rows = pin.nonLinearEffects(engine, data, q, v) - bias, np.zeros((0, engine.nv))
+                return np.asarray(pin.forwardDynamics(engine, data, q, v, force, no_rows, np.zeros(0), 0.0))
+            mass = pin.crba(engine, data, q)
+            if self.algorithm == "crba":
+                return np.linalg.solve(mass, -bias)
+            pin.cholesky.decompose(engine, data)  # along the tree's branches: sparse
+            return np.ravel(pin.cholesky.solve(engine, data, -bias))
         convention = pin.Convention.WORLD if self.algorithm == "aba-world" else pin.Convention.LOCAL
         return np.asarray(pin.aba(self.pin, self.data, q, v, self.no_torque, self.fext, convention))
 
@@ -276,7 +288,8 @@ class Pinocchio(Adapter):
     """Pinocchio on a chain of spherical joints.
 
     ``algorithm`` chooses how state evaluation finds accelerations: "crba" solves with the engine's
-    mass matrix, "aba" and "aba-world" are its articulated-body algorithm in local and in world
+    mass matrix densely, "cholesky" with its own sparse factors, "forwardDynamics" in its solver for
+    constraints without any, "aba" and "aba-world" are its articulated-body algorithm in local and in world
     coordinates.  The integrators keep to the algorithm their note names.
     """
 
@@ -303,15 +316,24 @@ class Pinocchio(Adapter):
         Integrator("dop853", "tolerance", 8, note="SciPy's DOP853 on (q, v) with crba and the tangent map"),
     )
 
+    options: ClassVar[tuple[Algorithm, ...]] = ("cholesky", "forwardDynamics")
+    unwelded = ""
+
     def __init__(self, algorithm: Algorithm = "crba"):
         self.algorithm: Algorithm = algorithm
+
+    def by(self, option: str) -> Self:
+        """The same engine by another of its algorithms."""
+        other = super().by(option)
+        other.algorithm = cast(Algorithm, option)
+        return other
 
     def version(self) -> str:
         """Version of the pin wheel."""
         return str(pin.__version__)
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-        chain = Chain(model, self.algorithm)
+        chain = Chain(model, self.algorithm, self.parts(model))
         return [chain.quantities(state) for state in states]
 
     def _simulate(
@@ -338,6 +360,7 @@ class PinocchioAba(Pinocchio):
     name = "pinocchio-aba"
     title = "Pinocchio (aba)"
     integrators: ClassVar[tuple[Integrator, ...]] = ()
+    options = ("crba",)
 
     def __init__(self) -> None:
         super().__init__("aba")

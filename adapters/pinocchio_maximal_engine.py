@@ -12,6 +12,8 @@ a rod among the joints `forwardDynamics`, on rows of the engine's own frame Jaco
 accelerations γ at v̇ = 0 of the attachment points: with Δ for near minus far, d = ℓ u,
 
     ball  ΔJ v̇ + Δγ = 0,        rod  uᵀ ΔJ v̇ + uᵀ Δγ + ℓ u̇ᵀu̇ = 0.
+
+Its other way: the same rows through the engine's inverse of the whole KKT matrix.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ import pinocchio as pin
 
 from plumbline.adapter import Adapter
 from plumbline.kinematics import rotation, velocity_map
+from plumbline.parts import Parts
 from plumbline.records import Array, Integrator, Model, State, StateQuantities, Unsupported
 
 WORLD = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
@@ -33,14 +36,15 @@ LARGEST = 30  # bodies; the engine's workspace grows with N³: 0.4 GB here, 1.5 
 class Flyers:
     """A `Model` as free bodies and constraints. Pinocchio's q is (7 N,), its v (6 N,)."""
 
-    def __init__(self, model: Model):
-        self.source = model
+    def __init__(self, model: Model, parts: Parts, inverse: bool = False):
+        self.source, self.inverse = model, inverse
         self.pin = pin.Model()
         self.pin.gravity = pin.Motion(model.gravity, np.zeros(3))
         for k in range(model.n):
             joint = self.pin.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"body {k}")
-            inertia = pin.Inertia(float(model.mass[k]), np.zeros(3), model.inertia[k])
-            self.pin.appendBodyToJoint(joint, inertia, pin.SE3.Identity())
+            for part in parts[k]:  # the engine welds what is appended to one joint
+                inertia = pin.Inertia(part.mass, np.zeros(3), part.inertia)
+                self.pin.appendBodyToJoint(joint, inertia, _at(part.centre))
         # Attachment points of joint k: (joint, placement) on body k, and on body k-1 or the world.
         near = [(k + 1, _at(model.proximal[k])) for k in range(model.n)]
         far = [(k, _at(model.distal[k - 1] if k else np.zeros(3))) for k in range(model.n)]
@@ -70,7 +74,7 @@ class Flyers:
         force = np.matvec(turn.mT, model.force) - model.drag_force[:, None] * local
         moment = model.moment - model.drag_moment[:, None] * state.omega
         tau = np.hstack([force, moment]).ravel()
-        if np.any(model.rods):
+        if self.inverse or np.any(model.rods):
             reaction = self._rows(state, q, v, tau)
         else:
             pin.constraintDynamics(engine, data, q, v, tau, self.contacts, self.contact_data)
@@ -105,9 +109,17 @@ class Flyers:
             jacobian.append(along @ (j_near - j_far))
             drift.append(along @ (g_near - g_far) + model.length[k] * state.udot[k] @ state.udot[k])
             directions.append(along)
-        pin.forwardDynamics(engine, data, q, v, tau, np.vstack(jacobian), np.concatenate(drift), 0.0)
+        rows, bend = np.vstack(jacobian), np.concatenate(drift)
+        if self.inverse:
+            force = tau - pin.nonLinearEffects(engine, data, q, v)
+            inverse = pin.computeKKTContactDynamicMatrixInverse(engine, data, q, rows, 0.0)
+            x = inverse @ np.concatenate([force, -bend])
+            data.ddq, multiplier = x[: engine.nv], -x[engine.nv :]
+        else:
+            pin.forwardDynamics(engine, data, q, v, tau, rows, bend, 0.0)
+            multiplier = data.lambda_c
         ends = np.cumsum([len(along) for along in directions])[:-1]
-        multipliers = np.split(data.lambda_c, ends)
+        multipliers = np.split(multiplier, ends)
         return np.array([along.T @ m for along, m in zip(directions, multipliers, strict=True)])
 
 
@@ -124,6 +136,8 @@ class PinocchioMaximal(Adapter):
     supported = ">=3.3.1,<5"
     needs = (("<4", "cmeel-urdfdom<5"), ("<4", "cmeel-tinyxml2<11"))  # what those wheels were linked with
     integrators: ClassVar[tuple[Integrator, ...]] = ()
+    options = ("inverse of the KKT matrix",)
+    unwelded = ""
 
     def version(self) -> str:
         """Version of the pin wheel."""
@@ -135,7 +149,7 @@ class PinocchioMaximal(Adapter):
                 f"the engine's workspace for {model.n} free bodies, growing with their cube, is too large; "
                 f"in maximal coordinates Pinocchio is asked about {LARGEST} at most"
             )
-        flyers = Flyers(model)
+        flyers = Flyers(model, self.parts(model), inverse=bool(self.option))
         return [flyers.quantities(state) for state in states]
 
     def _simulate(self, *_: object) -> None:  # type: ignore[override]

@@ -6,7 +6,7 @@ State: ṗ = ½ L(p)ᵀ ω′ on the way in; ω̇′ = 2 L(p) p̈ on the way out
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import ClassVar
@@ -20,8 +20,9 @@ from reference_impl import collocation
 from reference_impl.chain import Chain
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import A, L, rate
+from reference_impl.forest import Forest
 from reference_impl.integrate import Run, integrate
-from reference_impl.system import System
+from reference_impl.system import Solution, System
 
 
 class Reference(Adapter):
@@ -50,6 +51,9 @@ class Reference(Adapter):
         ),
     )
 
+    options = ("dense factors", "O(N) form")
+    unwelded = "the notes know ball joints and rods, no joint that holds two bodies rigidly"
+
     def version(self) -> str:
         """Version of this checkout."""
         project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
@@ -57,7 +61,11 @@ class Reference(Adapter):
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         system = System(chain(model))
-        return [quantities(system, model, state) for state in states]
+        solve: Callable[..., Solution] = system.solve
+        if self.option:
+            dense = self.option == "dense factors"
+            solve = system.solve_densely if dense else Forest([chain(model)]).solve
+        return [quantities(system, model, state, solve) for state in states]
 
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
@@ -73,16 +81,31 @@ class Reference(Adapter):
             raise EngineFailure(f"{self.title}: {error}") from error
         return Trajectory(t=run.t, r=run.r, p=run.p, v=run.v, pdot=run.pdot, steps=run.steps)
 
+    def _retrace(
+        self, model: Model, state: State, end: float, integrator: Integrator, resolution: float
+    ) -> Trajectory:
+        def legs(r: Array, p: Array, v: Array, pdot: Array) -> Run:
+            return collocation.integrate([chain(model)], r, p, v, pdot, np.array([0.0, end]), resolution)
+
+        try:
+            there = legs(state.r, state.p, state.v, rate(state.p, state.omega))
+            back = legs(there.r[-1], there.p[-1], -there.v[-1], -there.pdot[-1])
+        except ArithmeticError as error:
+            raise EngineFailure(f"{self.title}: {error}") from error
+        names, times = ("r", "p", "v", "pdot"), np.array([0.0, end, 2 * end])
+        rows = {name: np.vstack([getattr(there, name), getattr(back, name)[1:]]) for name in names}
+        return Trajectory(t=times, **rows, steps=there.steps + back.steps)
+
 
 def chain(model: Model) -> Chain:
     """The same chain in the notes' own type."""
     return Chain(**{field.name: getattr(model, field.name) for field in fields(Chain)})
 
 
-def quantities(system: System, model: Model, state: State) -> StateQuantities:
-    """All that the notes say of one state."""
+def quantities(system: System, model: Model, state: State, solve: Callable[..., Solution]) -> StateQuantities:
+    """All that the notes say of one state, S x = b solved by ``solve``."""
     try:
-        x = system.solve(state.r, state.p, state.v, rate(state.p, state.omega))
+        x = solve(state.r, state.p, state.v, rate(state.p, state.omega))
     except SingularSystem as error:
         raise EngineFailure(f"{Reference.title}: {error}") from error
     momentum = model.mass[:, None] * state.v

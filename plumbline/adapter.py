@@ -10,10 +10,12 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import ClassVar
+from copy import copy
+from typing import ClassVar, Self
 
 import numpy as np
 
+from plumbline.parts import Parts, halves, whole
 from plumbline.records import (
     Array,
     BadInput,
@@ -23,6 +25,7 @@ from plumbline.records import (
     State,
     StateQuantities,
     Trajectory,
+    Unsupported,
 )
 
 UNIT = 8 * np.finfo(float).eps  # a quaternion normalised in double is this close to |p| = 1
@@ -38,6 +41,12 @@ class Adapter(ABC):
     supported: ClassVar[str] = ""  # PEP 440 range of versions that the adapter works with
     # Requirements of environments with another version: (range of versions, what they need besides).
     needs: ClassVar[tuple[tuple[str, str], ...]] = ()
+    # Ways of the engine to the same answers other than its usual one: for evaluating states, for simulating.
+    options: ClassVar[tuple[str, ...]] = ()
+    solvers: ClassVar[tuple[str, ...]] = ()
+    unwelded: ClassVar[str] = "the adapter welds nothing"  # why not; empty where it does
+    option: str = ""  # the one of `options` or `solvers` in use
+    halved: bool = False  # whether bodies are two welded halves
 
     @abstractmethod
     def version(self) -> str:
@@ -59,6 +68,32 @@ class Adapter(ABC):
             if candidate.name == name:
                 return candidate
         raise KeyError(f"{self.name} has no integrator {name!r}; it has {[i.name for i in self.integrators]}")
+
+    def by(self, option: str) -> Self:
+        """The same engine by another of its ways; KeyError names the ones there are."""
+        if option not in (ways := (*self.options, *self.solvers)):
+            raise KeyError(f"{self.name} has no option {option!r}; it has {list(ways)}")
+        other = copy(self)
+        other.option = option
+        return other
+
+    def welding(self) -> Self:
+        """The same engine, evaluating every body as two welded halves; Unsupported where it cannot weld."""
+        if self.unwelded:
+            raise Unsupported(self.unwelded)
+        other = copy(self)
+        other.halved = True
+        return other
+
+    def parts(self, model: Model) -> Parts:
+        """What the engine is to build every body of."""
+        return halves(model) if self.halved else whole(model)
+
+    def _retrace(
+        self, model: Model, state: State, end: float, integrator: Integrator, resolution: float
+    ) -> Trajectory:
+        """To ``end``, all that the integrator carries reversed in time, and as long back: three rows."""
+        raise Unsupported(f"the adapter does not turn a run of {integrator.name} round")
 
     def evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         """State quantities at each state.
@@ -86,6 +121,19 @@ class Adapter(ABC):
         trajectory = self._simulate(model, state, times, method, resolution)
         check_trajectory(model, state, times, trajectory, f"{self.name} {integrator}")
         return trajectory
+
+    def retrace(
+        self, model: Model, state: State, end: float, integrator: str, resolution: float
+    ) -> Trajectory:
+        """There and back by a symmetric integrator: rows at 0, ``end`` and 2 ``end``; errors as `simulate`.
+
+        The last row is the first one with opposite rates, but for rounding and the step's solver.
+        """
+        check_state(model, state)
+        times = np.array([0.0, end, 2 * end])
+        run = self._retrace(model, state, end, self.integrator(integrator), resolution)
+        check_samples(model, times, run, f"{self.name} {integrator}")
+        return run
 
 
 def check_state(model: Model, state: State) -> None:
@@ -138,8 +186,8 @@ def check_times(times: Array, step: float) -> None:
         raise BadInput(f"sample times are not multiples of the step {step}")
 
 
-def check_trajectory(model: Model, state: State, times: Array, run: Trajectory, what: str) -> None:
-    """An early stop, a silent reset, repeated or non-finite rows are failures, never data."""
+def check_samples(model: Model, times: Array, run: Trajectory, what: str) -> None:
+    """An early stop and rows that are not finite are failures, never data."""
     if np.shape(run.t) != np.shape(times) or np.max(np.abs(run.t - times)) > 1e-9 * max(1.0, times[-1]):
         last = run.t[-1] if len(run.t) else float("nan")
         raise EngineFailure(f"{what}: sampled {len(run.t)} of {len(times)} times, last at t = {last} s")
@@ -151,6 +199,11 @@ def check_trajectory(model: Model, state: State, times: Array, run: Trajectory, 
         finite = np.all(np.isfinite(array), axis=(1, 2))
         if not np.all(finite):
             raise EngineFailure(f"{what}: {name} is not finite from t = {times[np.argmin(finite)]} s")
+
+
+def check_trajectory(model: Model, state: State, times: Array, run: Trajectory, what: str) -> None:
+    """As `check_samples`; so are a silent reset and repeated rows."""
+    check_samples(model, times, run, what)
     rows = np.concatenate([getattr(run, k).reshape(len(times), -1) for k in ("r", "p", "v", "pdot")], axis=1)
     moving = np.any(run.v != 0, axis=(1, 2)) | np.any(run.pdot != 0, axis=(1, 2))
     repeated = np.all(rows[1:] == rows[:-1], axis=1) & moving[1:]

@@ -26,6 +26,7 @@ from typing import cast
 import numpy as np
 
 from plumbline.kinematics import rotation
+from plumbline.parts import Parts, arms
 from plumbline.records import Array, Model, State
 
 EPS = 2.0**-53
@@ -73,8 +74,12 @@ class Bound:
         return f"{how}: at most {worst:.1e}, {self.bluntness(quantity):.1e} of its scale"
 
 
-def state_bound(model: Model, state: State) -> Bound:
+def state_bound(model: Model, state: State, parts: Parts | None = None) -> Bound:
     """Rounding tolerances of every state quantity of ``model`` at ``state`` (SI units, norms).
+
+    ``parts``: of what an engine welds the bodies.  Its terms are those of a piece then: the levers and
+    accelerations of one whose centre is c off, longer by ‖c‖ and ‖c‖(‖ω̇‖ + ‖ω‖W), on the mass and least
+    inertia of the lightest; and the weld carries the weight and inertia of a piece, with the lever c.
 
     Needs m > 0 and a positive definite inertia; raises numpy's LinAlgError on a singular system.
     """
@@ -89,18 +94,25 @@ def state_bound(model: Model, state: State) -> Bound:
     nA, nAlpha, nOmega, nF = (norm(x, axis=1) for x in (a, alpha, omega, system.F))
     sp_n, sd_n, rod_rate = norm(sp, axis=1), norm(sd, axis=1), np.where(rods, norm(state.udot, axis=1), 0.0)
     W = np.maximum.accumulate(np.maximum(nOmega, rod_rate))
+    arm, light, weld = np.zeros(model.n), m, np.zeros(model.n)
+    if parts is not None:
+        arm, light = arms(parts), np.array([min(part.mass for part in pieces) for pieces in parts])
+        inertias = np.array([[part.inertia for part in pieces] for pieces in parts])
+        J_min = np.min(np.linalg.eigvalsh(inertias), axis=(1, 2))
+        nA, sp_n, sd_n = nA + arm * (nAlpha + nOmega * W), sp_n + arm, sd_n + arm
+        weld = m * (nA + g)
     nF_next, spin = _next(nF), J * nOmega * W
     reach = np.maximum(sp_n * nAlpha, sp_n * nOmega * W)
     hang = np.maximum(nA, np.maximum(sd_n * nAlpha, sd_n * nOmega * W))
     force = np.max([m * nA, m * g, nF, nF_next, load], 0)
-    moment = np.max([J * nAlpha, spin, sp_n * nF, sd_n * nF_next, torque], 0)
+    moment = np.max([J * nAlpha, spin, sp_n * nF, sd_n * nF_next, torque, arm * weld], 0)
     joint = np.max([nA, reach, _previous(hang), np.where(rods, model.length * rod_rate * W, 0.0)], 0)
     answer = np.stack([np.maximum(nA, g), nAlpha, nF], 1)
 
     B = system.norms()
     tB = _through(B, force, moment, joint) + answer
 
-    free = (nF + nF_next + m * g) / m
+    free = (nF + nF_next + m * g + weld) / light
     turn = (sp_n * nF + sd_n * nF_next + spin + torque) / J_min
     tS = _through(B, 0 * m, 0 * m, free + sp_n * turn + _previous(free + sd_n * turn))
 
@@ -109,7 +121,7 @@ def state_bound(model: Model, state: State) -> Bound:
     tip = state.r + sp
     at = np.concatenate([(tip - model.length[:, None] * u)[rods], tip])
     below = of_body[:, None] <= body  # (joints, N)
-    D = np.where(below, norm(at[:, None] - state.r, axis=2), 0.0)
+    D = np.where(below, norm(at[:, None] - state.r, axis=2) + arm, 0.0)
 
     def relative(own: Array, rod: Array) -> Array:
         """Norms (joints,) of what each joint turns by: rods against the body above, bodies against either."""

@@ -111,6 +111,11 @@ class System:
         solution[self._order] = x * scale
         return self._read(solution, joints)
 
+    def solve_densely(self, r: Array, p: Array, v: Array, pdot: Array) -> Solution:
+        """As `solve`, by dense factors of the assembled S: another way to the same x."""
+        S, b = self.assemble(r, p, v, pdot)
+        return self._read(solve_dense(S, b), rows(self.chain, r, p, v, pdot))
+
     def _blocks(self, r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, Array, Rows]:
         """The entries of S in the order of `_i`, `_j`, then b, and the joints they come from."""
         chain = self.chain

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache, partialmethod
+from itertools import product
 from unittest.mock import patch
 
 import numpy as np
 import pytest
 
+from plumbline.bound import state_bound
 from plumbline.findings import Subject
-from plumbline.records import Unsupported
+from plumbline.parts import halved, halves
+from plumbline.records import EngineFailure, Unsupported
 from plumbline.registry import ENGINES, adapter
-from plumbline.relations import RELATIONS, check, judge_relations
+from plumbline.relations import QUANTITIES, RELATIONS, check, judge_relations, runs
 from plumbline.suspect import answer, case
 from tests import pendulums
 from tests.pendulums import JOINTS
@@ -52,7 +56,12 @@ def test_every_engine_keeps_every_relation(engine, joints):
     model = pendulums.model(JOINTS[joints], loads=True)
     found = check(engine, model, states(model))
     rows = judge_relations(Subject("s", "f", engine, engine, "0"), found).rows
-    assert len(rows) >= 5 and all(row.verdict == "agrees" for row in rows), [r.reason for r in rows]
+    refused = [row.quantity for row in rows if row.verdict == "unsupported"]
+    assert refused == (["two welded halves"] if engine in ("reference", "exudyn-tree") else [])
+    assert len(rows) >= 7 and len({(row.integrator, row.quantity) for row in rows}) == len(rows)
+    assert all(row.verdict == "agrees" for row in rows if row.quantity not in refused), [
+        row.reason for row in rows
+    ]
 
 
 def of(name: str) -> Defect:
@@ -114,3 +123,185 @@ def test_noise_breaks_what_is_not_bitwise():
     model = pendulums.model(JOINTS["balls"])
     with patch("plumbline.relations.adapter", lambda _: engine):
         assert all(h.ratio > 1 for h in check("mujoco", model, states(model)))
+
+
+# -- the engine's other ways, and welded halves -----------------------------------------------------
+
+
+def one_sided(defect: Defect):
+    """The real engine with a defect in its usual way alone: its other ways and welded bodies are sound."""
+    real = type(adapter(defect.engine))
+    engine = plant(real, defect)
+    engine.by = lambda option: real().by(option)
+    engine.welding = lambda: real().welding()
+    return engine
+
+
+WAYS = [(engine, f"by {option}") for engine in ENGINES for option in type(adapter(engine)).options]
+WELDERS = [(engine, "two welded halves") for engine in ENGINES if not type(adapter(engine)).unwelded]
+
+
+@pytest.mark.parametrize("defect", ["inertia-xx-1e-6", "distal-1e-5"])
+@pytest.mark.parametrize(("engine", "relation"), WAYS + WELDERS)
+def test_a_defect_in_one_way_of_the_engine_breaks_it(engine, relation, defect):
+    model = pendulums.model(JOINTS["balls"])
+    bent = one_sided(replace(of(defect), engine=engine))
+    with patch("plumbline.relations.adapter", lambda n: bent if n == engine else adapter(n)):
+        (found,) = (h for h in check(engine, model, states(model)) if h.relation == relation)
+    assert found.ratio > 1, found
+
+
+@pytest.mark.parametrize("change", ["inertia", "centre", "mass"])
+@pytest.mark.parametrize("engine", [engine for engine, _ in WELDERS])
+def test_a_half_that_is_welded_wrongly_breaks_it(engine, change):
+    """One number of one half off by 1e-6 of it: what the engine welds is not the body then."""
+
+    def wrong(model):
+        one, other = (parts := halves(model))[-1]
+        parts[-1] = one, replace(other, **{change: getattr(other, change) * (1 + 1e-6)})
+        return parts
+
+    model = pendulums.model(JOINTS["balls"])
+    with patch("plumbline.adapter.halves", wrong):
+        (found,) = (h for h in check(engine, model, states(model)) if h.relation == "two welded halves")
+    assert found.ratio > 1, found
+
+
+@pytest.mark.parametrize("shape", [[2.0, 3.0, 4.0], [1.0, 1.0, 2.0], [1.0, 1.0, 1e-6], [1.0, 1.0, 1.0]])
+def test_two_halves_are_physical_and_make_the_body(shape):
+    turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    inertia = turn @ np.diag(shape) @ turn.T
+    inertia = (inertia + inertia.T) / 2
+    pair = halved(3.0, inertia)
+    size, eye = np.linalg.norm(inertia), np.eye(3)
+    assert sum(part.mass for part in pair) == 3.0
+    assert np.all(pair[0].mass * pair[0].centre + pair[1].mass * pair[1].centre == 0)
+    assert np.linalg.norm(pair[0].centre) > 0.3 * np.sqrt(size / 3.0) / 2
+    together = sum(
+        part.inertia + part.mass * (part.centre @ part.centre * eye - np.outer(part.centre, part.centre))
+        for part in pair
+    )
+    np.testing.assert_allclose(together, inertia, rtol=0, atol=1e-15 * size)
+    for part in pair:
+        a, b, c = np.linalg.eigvalsh(part.inertia)
+        assert a > 0 and a + b >= c - 1e-15 * size
+        assert a >= shape[0 if shape[0] < shape[2] else 2] / 8 * (1 - 1e-9)
+
+
+def test_halves_have_roundings_of_their_own():
+    """Hung at its centre a body has no potential energy to round; its halves' must cancel."""
+    model = pendulums.model(JOINTS["ball"])
+    model = replace(model, proximal=0 * model.proximal)
+    at = pendulums.state(model, 1)
+    plain, welded = state_bound(model, at), state_bound(model, at, halves(model))
+    assert plain.potential_energy == 0 < welded.potential_energy
+    (whole,), (two,) = (e.evaluate(model, [at]) for e in (adapter("mujoco"), adapter("mujoco").welding()))
+    assert 0 <= abs(two.potential_energy - whole.potential_energy) <= welded.potential_energy
+    for q in QUANTITIES:
+        assert np.all(np.asarray(welded.tolerance(q)) >= plain.tolerance(q))
+
+
+@pytest.mark.parametrize("joints", ["mixed", "balls-10"])
+def test_mujoco_s_solvers_have_nothing_to_do(joints):
+    """Solver and Jacobian are of active constraints: without any, the answers are the same bit for bit."""
+    mujoco = pytest.importorskip("mujoco")
+    engine = pytest.importorskip("adapters.mujoco_engine")
+    model = pendulums.model(JOINTS[joints], loads=True, drag=True)
+    usual = adapter("mujoco").evaluate(model, states(model))
+    kinds, jacobians = ("PGS", "CG", "NEWTON"), ("DENSE", "SPARSE")
+    for kind, jacobian in product(kinds, jacobians):
+        chain = engine._Chain(model)
+        chain.m.opt.solver = getattr(mujoco.mjtSolver, f"mjSOL_{kind}")
+        chain.m.opt.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{jacobian}")
+        for at, right in zip(states(model), usual, strict=True):
+            said = chain.quantities(at)
+            assert chain.d.nefc == 0
+            assert all(np.array_equal(getattr(said, q), getattr(right, q)) for q in vars(right))
+
+
+def test_an_option_that_there_is_not_is_refused():
+    with pytest.raises(KeyError, match="dense mass matrix"):
+        adapter("mujoco").by("sparse")
+    with pytest.raises(Unsupported, match="rigidly"):
+        adapter("reference").welding()
+
+
+# -- short runs ------------------------------------------------------------------------------------
+
+
+@cache
+def exudyn():
+    return pytest.importorskip("adapters.exudyn_engine").Exudyn
+
+
+def ran(engine, relation, joints="balls", integrator="trapezoidal"):
+    model = pendulums.model(JOINTS[joints])
+    (found,) = (
+        held
+        for held in runs(engine, model, pendulums.state(model, 1))
+        if (held.relation, held.integrator) == (relation, integrator)
+    )
+    return found
+
+
+@pytest.mark.parametrize("joints", ["balls", "rods", "mixed"])
+def test_a_symmetric_integrator_comes_back(joints):
+    assert ran(exudyn()(), "reversed in time", joints).ratio < 0.3
+    assert ran(adapter("reference"), "reversed in time", joints, "collocation").ratio < 0.3
+
+
+def damped(real):
+    """A millionth of a newton metre second on every body: it knows the direction of time."""
+
+    class Damped(real):
+        def _retrace(self, model, *more):
+            return super()._retrace(replace(model, drag_moment=np.full(model.n, 1e-6)), *more)
+
+    return Damped
+
+
+@pytest.mark.parametrize("engine", ["exudyn", "reference"])
+def test_damping_is_not_reversed(engine):
+    real = damped(type(adapter(engine)))
+    integrator = next(i.name for i in real.integrators if i.symmetric)
+    assert ran(real(), "reversed in time", integrator=integrator).ratio > 1
+
+
+def test_a_scheme_that_is_not_symmetric_does_not_come_back():
+    class Alpha(exudyn()):
+        integrators = tuple(replace(i, symmetric=True) for i in exudyn().integrators)
+
+    assert ran(Alpha(), "reversed in time").ratio < 0.3
+    assert ran(Alpha(), "reversed in time", integrator="generalized-alpha").ratio > 1e3
+
+
+def test_accelerations_that_are_not_carried_break_the_way_back():
+    class Forgetful(exudyn()):
+        _rows = partialmethod(lambda self, *more, afresh=True: exudyn()._rows(self, *more, afresh=True))
+
+    assert ran(Forgetful(), "reversed in time").ratio > 1
+
+
+@pytest.mark.parametrize("engine", ["exudyn", "exudyn-tree"])
+def test_a_linear_solver_that_solves_something_else_is_seen(engine):
+    sound = adapter(engine)
+    bent = plant(type(sound), replace(of("distal-1e-5"), engine=engine))
+    sound.by = bent.by
+    for held in runs(sound, model := pendulums.model(JOINTS["balls"]), pendulums.state(model, 1)):
+        assert (held.ratio > 1) == held.relation.startswith("by "), held
+
+
+def test_drag_is_not_reversed_and_a_failing_run_is_told():
+    model = pendulums.model(JOINTS["ball"], drag=True)
+    found = list(runs(exudyn()(), model, pendulums.state(model)))
+    assert found and not any(held.relation == "reversed in time" for held in found)
+
+    class Failing(exudyn()):
+        def _rows(self, *_, **__):
+            raise EngineFailure("it stopped")
+
+    model = pendulums.model(JOINTS["ball"])
+    found = list(runs(Failing(), model, pendulums.state(model)))
+    rows = judge_relations(Subject("s", "f", "e", "E", "0"), found).rows
+    assert {(row.verdict, row.reason) for row in rows} == {("failed", "it stopped")}
+    assert {row.integrator for row in rows} == {"trapezoidal", "generalized-alpha"}
