@@ -55,13 +55,14 @@ class Cells(Memory):
         if hashlib.sha256(data[32:]).digest() != data[:32]:
             self.tell(f"{path}: damaged; the cell runs again")
             return None
-        return Outcome(task.key, pickle.loads(data[32:]))
+        value, cost = pickle.loads(data[32:])
+        return Outcome(task.key, value, cost=cost)
 
     def put(self, task: Task, outcome: Outcome) -> None:
         """Keep an answer.  A lost cell is not kept: what killed it may have been the machine."""
         if outcome.lost is None:
             self.folder.mkdir(parents=True, exist_ok=True)
-            body = pickle.dumps(outcome.value, protocol=5)
+            body = pickle.dumps((outcome.value, outcome.cost), protocol=5)
             write_atomically(self.path(task), hashlib.sha256(body).digest() + body)
 
     def clear(self) -> None:

@@ -197,7 +197,8 @@ def run(
         with progress_to(sys.stderr) as progress:
             result = execute(plan, progress)
         save(result, folder, shlex.join(["python", "-m", "plumbline", *sys.argv[1:]]))
-        written = reports.write(folder)
+        with result.split.measure("report"):
+            written = reports.write(folder)
         cells.clear()
     if as_json:
         document = {
@@ -209,6 +210,7 @@ def run(
     else:
         tell(result)
     click.echo(f"report: {written}", err=as_json)
+    click.echo(result.split.sentence(), err=True)
     sys.exit(result.run["exit_code"])
 
 
@@ -274,6 +276,7 @@ def nightly(
         )  # fmt: skip
     tell(result)
     click.echo(f"report: {place / 'report.html'}")
+    click.echo(result.split.sentence(), err=True)
     sys.exit(result.run["exit_code"])
 
 

@@ -103,7 +103,8 @@ def nightly(
     shutil.rmtree(folder, ignore_errors=True)
     save(result, folder, command)
     write_files_of_random(result, drawn, folder / "scenarios")
-    reports.write(folder, out / "history")
+    with result.split.measure("report"):
+        reports.write(folder, out / "history")
     place = free(out / "history" / result.run["id"])
     place.parent.mkdir(exist_ok=True)
     os.replace(folder, place)

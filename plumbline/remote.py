@@ -15,6 +15,7 @@ import signal
 import struct
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
@@ -81,6 +82,12 @@ def call(python: str, function: Callable[..., Any], *arguments: Any) -> Any:
             raise MemoryError
         raise Elsewhere(": ".join(value))
     return value
+
+
+def timed(function: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
+    """``function(*arguments)``, and the CPU time in s that this process spent on it."""
+    begin = time.process_time()
+    return function(*arguments), time.process_time() - begin
 
 
 def exit_words(code: int) -> str:

@@ -19,6 +19,7 @@ from plumbline.bench import Bench, Lost, keys
 from plumbline.probes import Probes
 from plumbline.records import Row, Verdict
 from plumbline.scenario import Scenario
+from plumbline.split import Split
 from plumbline.work import EngineInfo
 from plumbline.workers import Limits, Memory, NoCrew, Task, Workers
 
@@ -63,6 +64,7 @@ class Result:
     scenarios: dict[str, dict[str, Any]]
     probes: Probes
     tables: store.Tables
+    split: Split
     run: dict[str, Any]
 
 
@@ -96,6 +98,7 @@ def execute(plan: Plan, progress: Progress) -> Result:
     rows: dict[str, list[Row]] = {s.name: [] for s in plan.scenarios}
     summaries: dict[str, dict[str, Any]] = {s.name: {} for s in plan.scenarios}
     methods: Counter[str] = Counter()
+    split = Split()
     open_: dict[str, Bench] = {}  # in the order of their making, which is that of the tables
     questions: deque[Task] = deque()
 
@@ -123,21 +126,22 @@ def execute(plan: Plan, progress: Progress) -> Result:
         rows[bench.scenario.name] = marked
         summaries[bench.scenario.name] = bench.summary()
 
-    with crew(plan) as workers:
+    with split.work(), crew(plan) as workers:
         engines = describe_all(workers, plan.engines)
         total = sum(sum(1 for _ in keys("", engines, plan.level)) for _ in plan.scenarios)
         total += len(plan.probes) * sum(1 for _ in keys("", engines, "state"))
         done = 0
         source: Iterable[Task] = tasks()
         while True:
-            for outcome in workers.run(source, plan.memory):
-                bench = open_[outcome.key[0]]
-                asked = bench.take(outcome)
+            for outcome in workers.run(source, split.storing(plan.memory)):
+                split.count(outcome)
+                with split.measure("judging"):
+                    asked = open_[outcome.key[0]].take(outcome)
+                    while open_ and (first := next(iter(open_.values()))).done:
+                        retire(open_.pop(first.scenario.name))
                 questions.extend(asked)
                 done, total = done + 1, total + len(asked)
                 progress(done, total, " ".join(outcome.key))
-                while open_ and (first := next(iter(open_.values()))).done:
-                    retire(open_.pop(first.scenario.name))
             if not questions:
                 break
             source = list(questions)  # what came up when all tasks had been handed over
@@ -145,7 +149,7 @@ def execute(plan: Plan, progress: Progress) -> Result:
     result = Result(
         [row for name in rows for row in rows[name]],
         excuses.stale(whole=plan.whole, finer=plan.finer > 0),
-        engines, summaries, probes, tables, {},
+        engines, summaries, probes, tables, split, {},
     )  # fmt: skip
     result.run = {
         "id": started.strftime("%Y%m%dT%H%M%SZ"),
@@ -185,9 +189,11 @@ def save(result: Result, folder: Path, command: str) -> None:
         name: {**asdict(replace(info, python="")), "installed": info.missing is None}
         for name, info in result.engines.items()
     }
-    run = {**result.run, "command": command}
-    store.write(folder, run, result.scenarios, engines, result.rows, result.tables)
-    reproduce.write(folder)
+    run = {**result.run, "command": command, "cpu": result.split.seconds}
+    with result.split.measure("storage"):
+        store.write(folder, run, result.scenarios, engines, result.rows, result.tables)
+    with result.split.measure("report"):
+        reproduce.write(folder)
 
 
 def truth_words(bench: Bench) -> list[str]:

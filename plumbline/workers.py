@@ -21,7 +21,7 @@ from typing import Any
 from pebble import ProcessExpired, ProcessPool
 
 from plumbline.fate import die_with_parent
-from plumbline.remote import Crashed, Elsewhere, call, exit_words
+from plumbline.remote import Crashed, Elsewhere, call, exit_words, timed
 from plumbline.scratch import Scratch
 
 ONE_THREAD = dict.fromkeys(
@@ -59,6 +59,7 @@ class Outcome:
     key: Any
     value: Any = None
     lost: str | None = None
+    cost: float = 0.0  # CPU s of the call
 
 
 class NoCrew(Exception):
@@ -137,11 +138,12 @@ class Workers:
                 yield found
 
 
-def perform(task: Task) -> Any:
-    """Make a task's call, here or in the environment that it names."""
+def perform(task: Task) -> tuple[Any, float]:
+    """Make a task's call, here or in the environment that it names: its value and its CPU time in s."""
     if task.python:
-        return call(task.python, task.call, *task.arguments)
-    return task.call(*task.arguments)
+        value, cost = call(task.python, timed, task.call, *task.arguments)
+        return value, cost
+    return timed(task.call, *task.arguments)
 
 
 def stop_late(waiting: dict[Future[Any], Task], began: dict[Future[Any], float]) -> None:
@@ -158,7 +160,8 @@ def stop_late(waiting: dict[Future[Any], Task], began: dict[Future[Any], float])
 def outcome(task: Task, future: Future[Any]) -> Outcome:
     """The value of a finished future, or how its worker was lost."""
     try:
-        return Outcome(task.key, future.result())
+        value, cost = future.result()
+        return Outcome(task.key, value, cost=cost)
     except CancelledError:  # by `stop_late`, and by nobody else
         return Outcome(task.key, lost=f"hung: no answer within {task.limits.seconds:g} s, worker killed")
     except ProcessExpired as expired:

@@ -13,6 +13,7 @@ from plumbline.nightly import Night
 from plumbline.probes import Probes
 from plumbline.random_scenarios import FAMILY, MOST_BODIES, RandomScenarios, document, random_scenario
 from plumbline.run import Result
+from plumbline.split import Split
 from plumbline.store import Tables, read_table
 from plumbline.workers import Limits
 
@@ -125,6 +126,6 @@ def test_what_someone_should_see_is_kept_whole_with_its_file(tmp_path):
     assert probes.folded == {"agrees": 2} and probes.worst["mujoco", "joint_reaction"] == (0.5, drawn[0].name)
     excused = replace(kept[-1], known="k")
     assert probes.take([excused]) == [], "a recorded gap of every probe is only counted"
-    nightly.write_files_of_random(Result(kept, [], {}, {}, probes, Tables(), {}), drawn, tmp_path)
+    nightly.write_files_of_random(Result(kept, [], {}, {}, probes, Tables(), Split(), {}), drawn, tmp_path)
     found = sorted(tmp_path.iterdir())
     assert [scenario.load(path).digest for path in found] == [drawn[1].digest, drawn[2].digest]

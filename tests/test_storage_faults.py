@@ -37,7 +37,8 @@ class Here:
         for task in tasks:
             found = memory.get(task)
             if found is None:
-                found = Outcome(task.key, workers.perform(task))
+                value, cost = workers.perform(task)
+                found = Outcome(task.key, value, cost=cost)
                 memory.put(task, found)
             yield found
 
