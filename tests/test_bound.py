@@ -10,8 +10,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.bound import BLUNT, EPS, ROUNDINGS, state_bound
-from plumbline.kinematics import lift
+from plumbline.bound import BLUNT, EPS, ROUNDINGS, SUMMANDS, Bound, state_bound
+from plumbline.kinematics import lift, rotation
+from plumbline.parts import halves, whole
 from plumbline.records import Unsupported
 from plumbline.registry import ENGINES, adapter
 from plumbline.sampling import random_states
@@ -204,3 +205,212 @@ def test_fifty_bodies_take_milliseconds():
         state_bound(model, state)
         spent.append(time.thread_time() - start)
     assert min(spent) < 0.2
+
+
+class ByDefinition:
+    """The bound term by term, from a dense inverse with the force of every joint among the unknowns."""
+
+    def __init__(self, model, state, parts):
+        self.model, self.state, n = model, state, model.n
+        A = rotation(state.p)
+        self.J = [A[k] @ model.inertia[k] @ A[k].T for k in range(n)]
+        self.sp = [A[k] @ model.proximal[k] for k in range(n)]
+        self.sd = [A[k] @ model.distal[k] if k + 1 < n else np.zeros(3) for k in range(n)]
+        self.omega = [A[k] @ state.omega[k] for k in range(n)]
+        self.load = [model.force[k] - model.drag_force[k] * state.v[k] for k in range(n)]
+        self.torque = [A[k] @ model.moment[k] - model.drag_moment[k] * self.omega[k] for k in range(n)]
+        self.gravity = float(np.linalg.norm(model.gravity))
+        pieces = whole(model) if parts is None else parts
+        self.arm = [max(np.linalg.norm(part.centre) for part in body) for body in pieces]
+        self.light = [min(part.mass for part in body) for body in pieces]
+        self.J_min = [min(np.linalg.eigvalsh(part.inertia)[0] for part in body) for body in pieces]
+        self.welded = parts is not None
+        self.solve()
+
+    def solve(self):
+        """Unknowns r̈, α, F per body; rows Newton, Euler, joint (a rod: along it, and F across it is 0)."""
+        n, model, u = self.model.n, self.model, self.state.u
+        S, b = np.zeros((n, 3, 3, n, 3, 3)), np.zeros((n, 3, 3))
+        eye = np.eye(3)
+        for k in range(n):
+            near, far = skew(self.sp[k]), skew(self.sd[k])
+            spin = np.cross(self.omega[k], self.J[k] @ self.omega[k])
+            S[k, 0, :, k, 0], S[k, 0, :, k, 2] = model.mass[k] * eye, -eye
+            S[k, 1, :, k, 1], S[k, 1, :, k, 2] = self.J[k], -near
+            b[k, 0] = model.mass[k] * model.gravity + self.load[k]
+            b[k, 1] = self.torque[k] - spin
+            if k + 1 < n:
+                S[k, 0, :, k + 1, 2], S[k, 1, :, k + 1, 2] = eye, far
+            S[k, 2, :, k, 0], S[k, 2, :, k, 1] = eye, -near
+            b[k, 2] = -self.inward(k, self.sp)
+            if k:
+                S[k, 2, :, k - 1, 0], S[k, 2, :, k - 1, 1] = -eye, skew(self.sd[k - 1])
+                b[k, 2] += self.inward(k - 1, self.sd)
+            if model.rods[k]:
+                across = np.linalg.svd(u[k][None])[2][1:]
+                rate = self.state.udot[k]
+                S[k, 2, 0], b[k, 2, 0] = np.einsum("i,i...->...", u[k], S[k, 2]), u[k] @ b[k, 2]
+                b[k, 2, 0] -= model.length[k] * rate @ rate
+                S[k, 2, 1:], b[k, 2, 1:] = 0.0, 0.0
+                S[k, 2, 1:, k, 2] = across
+        self.inverse = np.linalg.inv(S.reshape(9 * n, 9 * n)).reshape(n, 3, 3, n, 3, 3)
+        self.a, self.alpha, self.F = np.moveaxis(np.einsum("nqikcj,kcj->nqi", self.inverse, b), 1, 0)
+
+    def inward(self, k, s):
+        return np.cross(self.omega[k], np.cross(self.omega[k], s[k]))
+
+    def through(self, force, moment, joint):
+        """Σ ‖block of the inverse‖ · size of the row's terms; (N, 3)."""
+        out = np.zeros((self.model.n, 3))
+        for k, sizes in enumerate(zip(force, moment, joint, strict=True)):
+            for c, size in enumerate(sizes):
+                block = self.inverse[:, :, :, k, c]
+                if c == 2 and self.model.rods[k]:
+                    block = block[..., :1]  # the rows that hold F along the rod are exact
+                out += size * np.linalg.norm(block, axis=(2, 3))
+        return out
+
+    def joints(self):
+        """(rod or body k, it is the upper joint of a rod) in any order."""
+        return [(k, True) for k in np.flatnonzero(self.model.rods)] + [
+            (k, False) for k in range(self.model.n)
+        ]
+
+    def rod_push(self, k, tau):
+        """What a torque τ on the massless rod k does: forces (τ × u)/ℓ on what it ends at."""
+        n, push = self.model.n, np.cross(tau, self.state.u[k]) / self.model.length[k]
+        b = np.zeros((n, 3, 3))
+        b[k, 0], b[k, 1] = push, np.cross(self.sp[k], push)
+        if k:
+            b[k - 1, 0], b[k - 1, 1] = -push, np.cross(self.sd[k - 1], -push)
+        return b
+
+    def pair(self, k, upper):
+        """(N, 3): size of the answer to unit torque pairs at a joint."""
+        answers = []
+        for tau in np.eye(3):
+            b = np.zeros((self.model.n, 3, 3))
+            if upper:
+                b += self.rod_push(k, tau)
+            elif self.model.rods[k]:
+                b -= self.rod_push(k, tau)
+            if not upper:
+                b[k, 1] += tau
+            if k and (upper or not self.model.rods[k]):
+                b[k - 1, 1] -= tau
+            answers.append(np.einsum("nqikcj,kcj->nqi", self.inverse, b))
+        return np.sqrt(np.sum(np.square(answers), axis=(0, 3)))
+
+    def turn(self, k, upper, of_body, of_rod):
+        """How fast a joint turns."""
+        above = of_body[k - 1] if k else np.zeros(3)
+        if upper:
+            return np.linalg.norm(of_rod[k] - above)
+        return np.linalg.norm(of_body[k] - (of_rod[k] if self.model.rods[k] else above))
+
+    def bound(self):
+        model, state, n, g, size = self.model, self.state, self.model.n, self.gravity, np.linalg.norm
+        m, rods, arm = model.mass, model.rods, self.arm
+        after = [size(self.F[k + 1]) if k + 1 < n else 0.0 for k in range(n)]
+        J = [size(x) for x in model.inertia]
+        rod_rate = [size(state.udot[k]) if rods[k] else 0.0 for k in range(n)]
+        W = [max(max(size(self.omega[j]), rod_rate[j]) for j in range(k + 1)) for k in range(n)]
+        F, alpha, rate = ([size(x) for x in y] for y in (self.F, self.alpha, self.omega))
+        a = [size(self.a[k]) + arm[k] * (alpha[k] + rate[k] * W[k]) for k in range(n)]
+        sp = [size(self.sp[k]) + arm[k] for k in range(n)]
+        sd = [size(self.sd[k]) + arm[k] for k in range(n)]
+        weld = [m[k] * (a[k] + g) if self.welded else 0.0 for k in range(n)]
+        load, torque = [size(x) for x in self.load], [size(x) for x in self.torque]
+
+        force, moment, joint, row = [], [], [], []
+        for k in range(n):
+            force.append(max(m[k] * a[k], m[k] * g, F[k], after[k], load[k]))
+            terms = [J[k] * alpha[k], J[k] * rate[k] * W[k], sp[k] * F[k], sd[k] * after[k], torque[k]]
+            moment.append(max(*terms, arm[k] * weld[k]))
+            joint.append(max(a[k], sp[k] * alpha[k], sp[k] * rate[k] * W[k]))
+            if k:
+                i = k - 1
+                joint[k] = max(joint[k], a[i], sd[i] * alpha[i], sd[i] * rate[i] * W[i])
+            if rods[k]:
+                joint[k] = max(joint[k], model.length[k] * rod_rate[k] * W[k])
+            free = (F[k] + after[k] + m[k] * g + weld[k]) / self.light[k]
+            turn = (sp[k] * F[k] + sd[k] * after[k] + J[k] * rate[k] * W[k] + torque[k]) / self.J_min[k]
+            row.append((free, turn))
+        answer = np.array([(max(a[k], g), alpha[k], F[k]) for k in range(n)])
+        total = self.through(force, moment, joint) + answer
+        elimination = [
+            row[k][0] + sp[k] * row[k][1] + (row[k - 1][0] + sd[k - 1] * row[k - 1][1] if k else 0.0)
+            for k in range(n)
+        ]
+        total += self.through(np.zeros(n), np.zeros(n), elimination)
+
+        rods_turn = np.cross(state.u, state.udot)
+        inward = [[self.inward(k, s) for k in range(n)] for s in (self.sp, self.sd)]
+        near = [self.a[k] + np.cross(self.alpha[k], self.sp[k]) + inward[0][k] for k in range(n)]
+        far = [self.a[k] + np.cross(self.alpha[k], self.sd[k]) + inward[1][k] for k in range(n)]
+        ddot = [near[k] - (far[k - 1] if k else 0.0) for k in range(n)]
+        rods_alpha = [np.cross(state.u[k], ddot[k]) / (model.length[k] or np.inf) for k in range(n)]
+        where = {}
+        for k, upper in self.joints():
+            place = state.r[k] + self.sp[k] - (model.length[k] * state.u[k] if upper else 0.0)
+            where[k, upper] = [size(place - state.r[b]) + arm[b] if b >= k else 0.0 for b in range(n)]
+        D = {i: np.array(x) for i, x in where.items()}
+        below = {(k, upper): np.arange(n) >= k for k, upper in where}
+        acc = {i: self.turn(*i, self.alpha, rods_alpha) for i in where}
+        spd = {i: self.turn(*i, self.omega, rods_turn) for i in where}
+        matrix = {(i, j): np.sum(m * D[i] * D[j] + J * (below[i] & below[j])) for i in D for j in D}
+        for i in D:
+            tau = sum(matrix[i, j] * acc[j] for j in D)
+            tau += sum(J[b] * W[b] ** 2 + torque[b] for b in range(n) if below[i][b])
+            tau += sum(D[i][b] * (m[b] * (g + a[b]) + load[b]) for b in range(n))
+            total += tau * self.pair(*i)
+        swing, turned = (sum(x[i] * acc[i] for i in D) for x in (D, below))
+        carried = m * (a + swing + g)
+        total += np.stack([swing + a, turned, [np.sum(carried[k:]) for k in range(n)]], 1)
+        tolerance = ROUNDINGS * EPS * total
+
+        speed, spin = (sum(x[i] * spd[i] for i in D) for x in (D, below))
+        lever = np.cumsum(np.add(sp, model.length)) + [sum(sd[:k]) for k in range(n)]
+        scalars = {
+            "kinetic_energy": 0.5 * np.sum(m * speed**2 + J * spin**2),
+            "potential_energy": g * np.sum(m * lever),
+            "angular_momentum": np.sum(m * lever * speed + J * spin),
+            "mass_matrix": max(matrix.values()),
+        }
+        scale = {
+            "acceleration": answer[:, 0],
+            "angular_acceleration": np.max([alpha, np.divide(moment, J), turned], 0),
+            "joint_reaction": np.maximum(F, m * g),
+        }
+        vectors = dict(zip(VECTORS, tolerance.T, strict=True))
+        return Bound(**vectors, **{q: SUMMANDS * EPS * x for q, x in scalars.items()}, scale=scale | scalars)
+
+
+def skew(s):
+    return np.cross(np.eye(3), s)
+
+
+@pytest.mark.parametrize("rods", [[0], [1], [0, 1, 0], [1, 0, 1, 1], [0, 0, 0]], ids=str)
+@pytest.mark.parametrize("welded", [False, True])
+def test_the_bound_is_its_definition(rods, welded):
+    """Each term may be the largest somewhere: slow and fast, light and heavy, loaded or not."""
+    rng = np.random.default_rng(6)
+    for rate, gravity, loads, shrink in (
+        *((0.0, 1.0, 0.0, 1.0), (1.0, 1.0, 1.0, 1.0), (30.0, 1.0, 1.0, 1.0)),
+        *((1.0, 0.0, 1e3, 1.0), (3.0, 1e-3, 0.0, 1.0), (3.0, 1.0, 1.0, 1e-4), (0.1, 1.0, 30.0, 1e-2)),
+    ):
+        model, state = random_chain(rng, rods, decades=1, rate=rate, loads=True, drag=True)
+        model = replace(
+            model,
+            gravity=gravity * model.gravity,
+            force=loads * model.force,
+            moment=loads * model.moment,
+            inertia=shrink * model.inertia,
+        )
+        parts = halves(model) if welded else None
+        ours, theirs = ByDefinition(model, state, parts).bound(), state_bound(model, state, parts)
+        for quantity in ours.scale:
+            here, there = theirs.tolerance(quantity), ours.tolerance(quantity)
+            np.testing.assert_allclose(here, there, rtol=1e-7, err_msg=quantity)
+            np.testing.assert_allclose(theirs.scale[quantity], ours.scale[quantity], rtol=1e-7)
+            assert theirs.bluntness(quantity) == pytest.approx(ours.bluntness(quantity), rel=1e-7)
