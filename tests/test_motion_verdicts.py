@@ -1,0 +1,350 @@
+"""What decides the rows about motion, on ladders whose errors are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from plumbline.findings import Subject
+from plumbline.flow import flow
+from plumbline.kinematics import angular_velocity, multiply
+from plumbline.measures import invariants
+from plumbline.motion_verdicts import PER_STEP, Ladder, judge_motion
+from plumbline.records import Integrator, Trajectory
+from plumbline.work import Climb, Rung
+from plumbline.yardstick import PART, ROUNDING, MotionTruth
+from tests import pendulums
+
+TIMES = np.linspace(0, 2, 17)
+MODEL = pendulums.model("b")
+TRUE = flow(MODEL, pendulums.state(MODEL, seed=2, rate=0.5), TIMES, 1e-13)
+WHO = Subject("s", "f", "mujoco", "MuJoCo", "4")
+METHOD = Integrator("Heun", "step", 2, (2, 3, 4))
+STEPS = tuple(2.0**-k for k in range(5, 11))
+ALONG = np.array([2.0, -1.0, 2.0]) / 3
+
+
+def truth(**changes):
+    one = np.ones(17)
+    held = MotionTruth(
+        TRUE, 1e-12 * one, 2e-12 * one, 1 + TIMES, 1e-6 * one, 2e-6 * one, length=0.4, method="made"
+    )
+    return replace(held, **changes)
+
+
+def run(error, attitude=None, speed=None, steps=100):
+    """The truth, off by ``error`` t m along one direction, ``attitude`` t rad and ``speed`` t m/s."""
+    attitude, speed = (error if x is None else x for x in (attitude, speed))
+    off = TIMES[:, None, None] * ALONG
+    half = attitude * TIMES / 2
+    turn = np.stack([np.cos(half), *(np.sin(half) * ALONG[:, None])], -1)[:, None]
+    p = multiply(TRUE.p, turn)
+    return Trajectory(TIMES, TRUE.r + error * off, p, TRUE.v + speed * off, TRUE.pdot, steps)
+
+
+def climbed(errors=None, **more):
+    """A ladder with error c h² and cost 1, 2, 3, … s; or with these errors."""
+    errors = [0.01 * h**2 for h in STEPS] if errors is None else errors
+    rungs = [
+        Rung(h, run(e, **more), None, i + 1.0) for i, (h, e) in enumerate(zip(STEPS, errors, strict=True))
+    ]
+    return Climb(rungs, None)
+
+
+def rows(climb=None, method=METHOD, horizon=2.0, model=MODEL, **changes):
+    found = judge_motion(WHO, model, truth(**changes), method, climb or climbed(), horizon)
+    return {row.quantity: row for row in found.rows}
+
+
+def ladder(climb=None, method=METHOD, horizon=2.0, model=MODEL, **changes):
+    return Ladder(WHO, model, truth(**changes), method, (climb or climbed()).rungs, horizon)
+
+
+def test_a_sound_ladder_agrees_in_everything_and_says_what_it_measured():
+    found = rows()
+    assert list(found) == [
+        "order", "position_limit", "position", "attitude_limit", "attitude",
+        "energy_drift", "momentum_drift", "joint_gap", "gap_rate", "norm_drift",
+    ]  # fmt: skip
+    assert {row.verdict for row in found.values()} == {"agrees"}
+    assert {row.integrator for row in found.values()} == {"Heun"}
+    assert {row.wall_time for row in found.values()} == {21.0}
+    order = found["order"]
+    assert (order.value, order.order) == (pytest.approx(0, abs=1e-6), pytest.approx(2, abs=1e-6))
+    assert (order.tolerance, order.declared_order, order.horizon) == (0.1, 2, 2.0)
+    assert (order.level, order.unit) == ("trajectory", "1")
+    assert "steps 0.03125 … 0.000976562 s, t ≤ 2 s" in order.reason and "shows order 2.00" in order.reason
+    assert "2.00, 2.00, 2.00, 2.00" in order.derivation
+    rounding = ROUNDING * 3.0 * 0.4
+    limit, own = found["position_limit"], found["position"]
+    assert limit.value < 1e-15 and limit.horizon == 2.0 and limit.unit == own.unit == "m"
+    assert limit.uncertainty == pytest.approx(1e-12, rel=1e-2)
+    assert limit.tolerance == pytest.approx(1e-12 + rounding, rel=1e-2)
+    assert limit.extra == {"ratio": limit.value / limit.tolerance, "visible": 1e-6, "growth": 3.0}
+    assert own.value == pytest.approx(0.02 * STEPS[-1] ** 2, rel=1e-6)
+    assert own.tolerance == pytest.approx(own.value + limit.tolerance, rel=1e-6)
+    assert own.extra == {"ratio": limit.extra["ratio"], "resolution": STEPS[-1]}
+    assert "at step 0.000976562" in own.reason
+    turned = found["attitude"]
+    assert turned.value == pytest.approx(0.02 * STEPS[-1] ** 2, rel=1e-4) and turned.unit == "rad"
+    assert found["attitude_limit"].tolerance == pytest.approx(2e-12 + 2 * ROUNDING * 3.0, rel=0.1)
+    assert found["attitude_limit"].extra["visible"] == 2e-6
+    assert "powers of h from (2, 3, 4) eliminated over 6 steps" in limit.derivation
+    assert "a mistake of 0.0001 in a parameter makes 1e-06" in limit.derivation
+
+
+@pytest.mark.parametrize(("until", "numbers"), [(2.0, [17, 9, 5, 3]), (9.0, [17, 9, 5, 3]), (1.0, [9, 5, 3])])
+def test_windows_halve_down_to_an_eighth_with_three_samples_at_least(until, numbers):
+    assert ladder().windows(until) == numbers
+    assert ladder().windows(0.3) == [3]
+    assert ladder().windows(0.1) == [3]
+
+
+def test_an_order_that_stays_away_disagrees_and_one_on_its_way_decides_nothing():
+    one = rows(climbed([0.01 * h for h in STEPS]), replace(METHOD, powers=(1, 2, 3)))["order"]
+    assert (one.verdict, one.order, one.value) == ("disagrees", pytest.approx(1), pytest.approx(1))
+    lost = rows(climbed([0.01, 0.003, 0.002, 0.0003, 0.0002, 0.00001]))["order"]
+    assert lost.verdict == "unresolved" and lost.reason.startswith("not in the asymptotic range: orders ")
+    floor = rows(climbed([1e-16, 0, 1e-16, 0, 1e-16, 0]))["order"]
+    assert (floor.verdict, floor.order, floor.value) == ("agrees", None, None)
+    assert "not observable" in floor.reason and floor.horizon == 2.0
+
+
+def test_order_is_of_positions_and_velocities_over_their_scales():
+    """Positions without error and velocities of order 1: an order 1, not a rounding floor."""
+    made = [Rung(h, run(0.0, 0.0, 0.01 * h), None, 0.0) for h in STEPS]
+    held = ladder(Climb(made, None))
+    assert held.shown.value == pytest.approx(1)
+    sizes = held.truth.length, held.scales()["gap_rate"]
+    expected = np.concatenate([TRUE.r / sizes[0], made[0].trajectory.v / sizes[1]], -1)
+    np.testing.assert_allclose(held.phases[0], expected, rtol=1e-13)
+
+
+def test_a_limit_elsewhere_disagrees_only_where_the_ladder_shows_its_order():
+    shifted = [1e-9 + 0.01 * h**2 for h in STEPS]
+    found = rows(climbed(shifted))
+    limit = found["position_limit"]
+    assert limit.verdict == found["position"].verdict == found["attitude_limit"].verdict == "disagrees"
+    assert limit.value == pytest.approx(2e-9, rel=1e-3) and limit.horizon == 2.0
+    assert f"{limit.value / limit.tolerance:.3g} times the uncertainties" in limit.reason
+    assert limit.extra["ratio"] == pytest.approx(limit.value / limit.tolerance)
+    wild = [1e-9 + e for e in (0.01, 0.003, 0.002, 0.0003, 0.0002, 0.0002)]
+    lost = rows(climbed(wild))["position_limit"]
+    assert lost.verdict == "unresolved"
+    tight = rows(climbed([1e-9] * 6))["position_limit"]  # at the floor at every step: trusted
+    assert tight.verdict == "disagrees"
+
+
+def test_a_shorter_window_may_tell_where_the_long_one_cannot():
+    late = np.where(TIMES > 1, 1e-3, 1e-12)
+    found = rows(position_uncertainty=late)
+    limit = found["position_limit"]
+    assert (limit.verdict, limit.horizon) == ("agrees", 1.0)
+    assert limit.extra["growth"] == 2.0 and "up to t = 1 s" in limit.reason
+    assert found["position"].value == pytest.approx(0.01 * STEPS[-1] ** 2, rel=1e-6)
+    assert found["attitude_limit"].horizon == 2.0
+    blind = rows(visible_position=np.full(17, 1e-14))["position_limit"]
+    assert (blind.verdict, blind.horizon) == ("unresolved", 2.0)
+    assert "is above the 1e-14 m that a mistake of 0.0001 would make" in blind.reason
+    endless = rows(visible_position=np.full(17, np.inf))["position_limit"]
+    assert endless.verdict == "agrees" and endless.extra["visible"] == 1e308
+    short = rows(horizon=0.5)["position_limit"]
+    assert short.horizon == 0.5
+
+
+def test_the_border_is_the_tolerance_and_the_tolerance_what_is_visible():
+    tolerance = rows()["position_limit"].tolerance
+    for shift, verdict in ((0.95 * tolerance / 2, "agrees"), (1.05 * tolerance / 2, "disagrees")):
+        assert rows(climbed([shift + 0.01 * h**2 for h in STEPS]))["position_limit"].verdict == verdict
+    for visible, horizon in ((1.01 * tolerance, 2.0), (0.99 * tolerance, 1.0)):  # rounding grows with time
+        assert rows(visible_position=np.full(17, visible))["position_limit"].horizon == horizon
+
+
+def test_runs_that_did_not_stay_finite_are_points_of_the_study():
+    some = climbed()
+    some.rungs[0] = replace(some.rungs[0], trajectory=None, failure="blew up")
+    found = judge_motion(WHO, MODEL, truth(), METHOD, some, 2.0)
+    assert {row.verdict for row in found.rows} == {"agrees"}
+    table = dict(found.tables)["convergence"]
+    assert table["steps"][:3] == [0, 0, 100] and np.isnan(table["error"][0])
+    for rung in range(5):
+        some.rungs[rung] = replace(some.rungs[rung], trajectory=None)
+    alone = judge_motion(WHO, MODEL, truth(), METHOD, some, 2.0)
+    said = {row.quantity: row for row in alone.rows}
+    for name in ("position_limit", "attitude_limit"):
+        assert said[name].verdict == "unresolved" and "fewer than two" in said[name].reason
+    assert "position" not in said
+    assert np.all(np.isnan(dict(alone.tables)["curves"]["limit_error"]))
+    some.rungs[-1] = replace(some.rungs[-1], trajectory=None, failure="NaN at 1 s")
+    (lost,) = judge_motion(WHO, MODEL, truth(), METHOD, some, 2.0).rows
+    assert (lost.quantity, lost.verdict) == ("all", "failed")
+    assert lost.reason == "at the finest resolution 0.000976562: NaN at 1 s"
+    (never,) = judge_motion(WHO, MODEL, truth(), METHOD, Climb([], "no drag here"), 2.0).rows
+    assert (never.quantity, never.verdict, never.reason) == ("all", "unsupported", "no drag here")
+
+
+def test_a_method_with_a_tolerance_has_no_order_and_its_tightest_run_is_the_limit():
+    method = Integrator("DOP853", "tolerance", 8)
+    found = rows(climbed([1e-6, 1e-8, 1e-10, 1e-11, 2e-12, 1e-12]), method)
+    assert "order" not in found
+    limit = found["position_limit"]
+    assert limit.verdict == "agrees" and "tightest of 6 tolerances" in limit.derivation
+    assert limit.value == pytest.approx(2e-12, rel=1e-2)
+    assert limit.uncertainty == pytest.approx(1e-12 + 2e-12, rel=1e-2)
+    assert found["position"].reason.startswith("position at tolerance 0.000976562 is 2e-12 m")
+    off = rows(climbed([1e-6 + e for e in (1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 0)]), method)["position_limit"]
+    assert off.verdict == "disagrees", "trusted without any order"
+    floor = found["energy_drift"]
+    each = PER_STEP + STEPS[-1]
+    assert floor.tolerance == pytest.approx(each * 100 * floor.extra["scale"], rel=1e-12)
+
+
+def test_an_implicit_solver_walks_at_random():
+    method = replace(METHOD, solver=1e-11)
+    held = ladder(method=method)
+    np.testing.assert_allclose(held.rounding, (ROUNDING + 1e-10) * (1 + TIMES), rtol=1e-12)
+    assert held.words() == "(10³ ε + 1e-11 of the step's solver × √100) G(t)"
+    assert ladder().words() == "10³ ε G(t)"
+
+
+def test_an_alias_is_told_and_drag_parts_it():
+    method = replace(METHOD, alias_of="Euler")
+    assert {row.alias_of for row in rows(method=method).values()} == {"Euler"}
+    dragged = replace(MODEL, drag_moment=np.array([0.1]))
+    assert {row.alias_of for row in rows(method=method, model=dragged).values()} == {None}
+
+
+def test_attitudes_have_two_signs():
+    some = climbed()
+    some.rungs[2] = replace(
+        some.rungs[2], trajectory=replace(some.rungs[2].trajectory, p=-some.rungs[2].trajectory.p)
+    )
+    assert rows(some)["attitude_limit"].verdict == "agrees"
+
+
+# --- invariants ---------------------------------------------------------------------------------
+
+
+def test_scales_are_sizes_of_what_the_invariants_are_made_of():
+    model = pendulums.model("br")
+    state = pendulums.state(model, seed=3, rate=4.0)
+    true = flow(model, state, TIMES, 1e-12)
+    held = Ladder(WHO, model, truth(trajectory=true), METHOD, [Rung(0.1, true, None, 0.0)], 2.0)
+    scales, omega = held.scales(), angular_velocity(true.p, true.pdot)
+    g = np.linalg.norm(model.gravity)
+    kinetic = [
+        sum(model.mass[k] * v[k] @ v[k] / 2 + w[k] @ model.inertia[k] @ w[k] / 2 for k in range(2))
+        for v, w in zip(true.v, omega, strict=True)
+    ]
+    height = [model.mass * (r @ model.gravity) for r in true.r]
+    potential = np.max([np.sum(np.abs(x)) for x in height])
+    swing = np.ptp([np.sum(x) for x in height])
+    assert scales["energy_drift"] == pytest.approx(max(*kinetic, potential, swing), rel=1e-12)
+    fall = np.sqrt(g * 0.4)
+    speed = max(fall, *np.linalg.norm(true.v, axis=-1).ravel())
+    spin = max(fall / 0.4, *np.linalg.norm(omega, axis=-1).ravel())
+    arm = np.max(np.linalg.norm(true.r, axis=-1))
+    inertia = sum(np.linalg.norm(J) for J in model.inertia)
+    assert scales["momentum_drift"] == pytest.approx(sum(model.mass) * arm * speed + inertia * spin)
+    assert scales["joint_gap"] == max(0.4, arm) and scales["norm_drift"] == 1.0
+    assert scales["gap_rate"] == pytest.approx(max(speed, spin * 0.4), rel=1e-12)
+    long = replace(held, truth=truth(trajectory=true, length=50.0)).scales()  # a fall is faster than this
+    assert long["joint_gap"] == 50.0
+    assert long["gap_rate"] == pytest.approx(
+        max(np.sqrt(g * 50), np.max(np.linalg.norm(omega, axis=-1)) * 50)
+    )
+
+
+def test_a_drift_that_falls_with_the_step_agrees_and_one_that_does_not_disagrees():
+    found = rows()["joint_gap"]
+    whole = 0.02 * STEPS[-1] ** 2
+    assert (found.verdict, found.level, found.unit, found.horizon) == ("agrees", "invariants", "m", 2.0)
+    assert found.value == pytest.approx(whole, rel=0.1) and found.extra["whole"] == found.value
+    floor = PER_STEP * 100 * found.extra["scale"]
+    assert found.tolerance == pytest.approx(found.value + floor, rel=1e-3)
+    assert found.extra["limit"] < 1e-14 and "at the finest step" in found.reason
+    stays = rows(climbed([1e-6 + 0.01 * h**2 for h in STEPS]))["joint_gap"]
+    assert stays.verdict == "disagrees" and "does not vanish with the step" in stays.reason
+    assert stays.extra["limit"] == pytest.approx(2e-6, rel=0.1)
+    assert stays.extra["ratio"] == pytest.approx(stays.extra["limit"] / stays.tolerance, rel=1e-9)
+    wild = rows(climbed([0.01, 0.003, 0.002, 0.0003, 0.0002, 0.0001]))["joint_gap"]
+    assert wild.verdict == "unresolved" and wild.reason.endswith("cannot tell")
+    alone = climbed()
+    for rung in range(5):
+        alone.rungs[rung] = replace(alone.rungs[rung], trajectory=None)
+    assert rows(alone)["joint_gap"].verdict == "unresolved"
+
+
+@pytest.mark.parametrize(("steps", "counted"), [(10, 64), (64, 64), (1000, 1000)])
+def test_a_drift_of_rounding_agrees_at_once(steps, counted):
+    """So much in every step, of at least 64 steps."""
+    base = rows(climbed([0.0] * 6, steps=steps))["norm_drift"]
+    assert base.verdict == "agrees" and base.reason.endswith("rounding")
+    assert base.tolerance == pytest.approx(PER_STEP * counted, rel=1e-12)
+    assert base.extra["ratio"] == pytest.approx(base.value / base.tolerance)
+    held = climbed([0.0] * 6, steps=steps)
+    for factor, said in ((0.9, True), (1.1, False)):
+        grown = TRUE.p * (1 + factor * base.tolerance * TIMES / 2)[:, None, None]
+        held.rungs[-1] = replace(held.rungs[-1], trajectory=replace(held.rungs[-1].trajectory, p=grown))
+        assert rows(held)["norm_drift"].reason.endswith("rounding") is said
+
+
+def test_what_the_quadrature_of_the_work_leaves_open_is_allowed():
+    """Drag: energy by the samples' spline; its uncertainty is part of the tolerance, and only there."""
+    model = pendulums.model("b", drag=True)
+    true = flow(model, pendulums.state(model, seed=2, rate=3.0), TIMES, 1e-13)
+    rungs = [Rung(h, replace(true, v=true.v * (1 + h**2 * TIMES[:, None, None])), None, 0.0) for h in STEPS]
+    found = rows(Climb(rungs, None), model=model, trajectory=true)
+    uncertain = invariants(model, rungs[-1].trajectory).work_uncertainty
+    assert uncertain > 1e-8
+    row = found["energy_drift"]
+    assert f"the work by quadrature ± {uncertain:.2g}" in row.derivation
+    assert "quadrature ± 0" in found["gap_rate"].derivation
+    assert row.extra["limit"] < uncertain and row.verdict == "agrees"
+    assert "momentum_drift" not in found
+
+
+# --- tables -------------------------------------------------------------------------------------
+
+
+def test_the_tables_hold_every_rung_every_sample_and_every_pose():
+    found = dict(judge_motion(WHO, MODEL, truth(), METHOD, climbed(), 1.0).tables)
+    table = found["convergence"]
+    assert (table["scenario"], table["engine"], table["integrator"]) == ("s", "mujoco", "Heun")
+    assert table["quantity"] == ["position", "attitude"] * 6
+    assert table["resolution"] == [h for h in STEPS for _ in range(2)]
+    assert table["cost"] == [float(i) for i in range(1, 7) for _ in range(2)] and set(table["steps"]) == {100}
+    np.testing.assert_allclose(table["error"][::2], [0.01 * h**2 for h in STEPS], rtol=1e-6)
+    np.testing.assert_allclose(table["error"][1::2], [0.01 * h**2 for h in STEPS], rtol=1e-4)
+    np.testing.assert_allclose(table["order"][::2], [np.nan, np.nan, 2, 2, 2, 2], rtol=1e-6)
+    curves = found["curves"]
+    assert curves["resolution"] == STEPS[-1] and curves["t"] is TIMES
+    np.testing.assert_allclose(curves["position_error"], 0.01 * STEPS[-1] ** 2 * TIMES, atol=1e-15)
+    np.testing.assert_allclose(curves["attitude_error"], 0.01 * STEPS[-1] ** 2 * TIMES, atol=1e-14)
+    assert np.max(curves["limit_error"]) < 1e-14
+    np.testing.assert_allclose(curves["tolerance"], 1e-12 + 0.4 * ROUNDING * (1 + TIMES), rtol=0.05)
+    finest = climbed().rungs[-1].trajectory
+    held = invariants(MODEL, finest)
+    np.testing.assert_allclose(curves["joint_gap"], np.linalg.norm(held.joint_gap[:, 0], axis=-1))
+    np.testing.assert_allclose(curves["norm_drift"], np.abs(held.norm_drift[:, 0, 0]))
+    bare = dict(
+        judge_motion(WHO, replace(MODEL, gravity=0 * MODEL.gravity), truth(), METHOD, climbed(), 1.0).tables
+    )
+    assert np.all(np.isnan(bare["curves"]["momentum_drift"]))
+    poses = found["trajectories"]
+    assert poses["t"].tolist() == TIMES.tolist() and set(poses["body"]) == {0}
+    np.testing.assert_array_equal(poses["rz"], finest.r[:, 0, 2])
+    np.testing.assert_array_equal(poses["p3"], finest.p[:, 0, 3])
+    assert poses["resolution"] == STEPS[-1]
+
+
+def test_poses_are_in_order_of_time_then_body():
+    from plumbline.motion_verdicts import poses
+
+    r, p = np.arange(12.0).reshape(2, 2, 3), 100 + np.arange(16.0).reshape(2, 2, 4)
+    table = poses(Trajectory(np.array([0.0, 1.0]), r, p, r, p, 1))
+    assert table["t"].tolist() == [0, 0, 1, 1] and table["body"].tolist() == [0, 1, 0, 1]
+    assert table["rx"].tolist() == [0, 3, 6, 9] and table["p0"].tolist() == [100, 104, 108, 112]
+    assert list(table)[2:] == ["rx", "ry", "rz", "p0", "p1", "p2", "p3"]
