@@ -36,6 +36,7 @@ def test_an_injected_defect_has_exponents_1_and_2():
     measured = drift(
         chain, *on_manifold(chain, rng), 1e-11, np.array([0.1, 1, 10]), gamma_defect=DEFECT, samples=10
     )
+    assert (measured.rtol, measured.decades.tolist()) == (1e-11, [0.1, 1, 10]) and measured.steps > 10
     assert abs(measured.joint_gap.exponent - 2) < 0.02
     assert abs(measured.gap_rate.exponent - 1) < 0.02
     np.testing.assert_allclose(
