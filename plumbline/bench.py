@@ -10,6 +10,7 @@ import numpy as np
 
 from plumbline import relations, versions, work, yardstick
 from plumbline.converge import ladder
+from plumbline.endurance import course, endure, judge_endurance
 from plumbline.exact import solution
 from plumbline.findings import Findings, Subject
 from plumbline.motion_verdicts import judge_motion
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from plumbline.run import Plan
 
 PROBE_STATES = 9  # random states of a probe: there are many probes
+TRUTHLESS = ("relations", "endurance")  # levels judged without a truth
 HORIZON_TOLERANCE = 1e-9  # m: positions are compared while rounding, grown, stays below this
 
 Key = tuple[str, ...]  # scenario, engine or "truth" or "why", level, …
@@ -45,7 +47,7 @@ class Bench:
     ) -> None:
         self.plan, self.scenario, self.engines = plan, scenario, engines
         self.level = "state" if probe else plan.level
-        self.keys = list(keys(scenario.name, engines, self.level))
+        self.keys = list(keys(scenario.name, engines, self.level, plan.endurance > 0))
         self.open = set(self.keys)  # not answered yet
         self.judged: dict[Key, Findings] = {}
         self.truths: dict[str, StateTruth | MotionTruth | Lost] = {}
@@ -85,6 +87,10 @@ class Bench:
             integrator = next(i for i in info.integrators if i.name == rest[0])
             steps = ladder(integrator, s.model.n, s.duration, self.plan.finer)
             arguments = (integrator.name, s.model, s.state, s.times, steps)
+        elif level == "endurance":
+            call, integrator = endure, next(i for i in info.integrators if i.name == rest[0])
+            length = course(integrator, s.model.n, self.plan.endurance)
+            arguments = (integrator.name, s.model, s.state, s.sample, length)
         base, _ = versions.split(name)
         return Task(key, call, (base, *arguments), self.plan.limits, info.version, info.python)
 
@@ -125,7 +131,7 @@ class Bench:
         questions = []
         waiting, self.early = self.early, []
         for answer in waiting:
-            if answer.key[2] not in self.truths and answer.key[2] != "relations":
+            if answer.key[2] not in self.truths and answer.key[2] not in TRUTHLESS:
                 self.early.append(answer)
                 continue
             found = self.judged[answer.key] = self.judge(answer)
@@ -141,8 +147,14 @@ class Bench:
         name = integrators[0] if integrators else "-"
         if outcome.lost or isinstance(truth, Lost):
             lost = outcome.lost or f"no truth to judge by: {getattr(truth, 'reason', '')}"
+            if level == "endurance":
+                return Findings(rows=[who.row("invariants", name, "all_long", "failed", lost)])
             return Findings(rows=[who.row(level, name, "all", "failed", lost)])
-        if truth is None:
+        if level == "endurance":
+            integrator = next(i for i in self.engines[engine].integrators if i.name == name)
+            regular = self.scenario.exact is not None
+            found = judge_endurance(who, integrator, outcome.value, regular)
+        elif truth is None:
             found = relations.judge_relations(who, outcome.value)
         elif isinstance(truth, StateTruth):
             found = judge_states(who, truth, outcome.value)
@@ -194,7 +206,7 @@ class Bench:
         return about
 
 
-def keys(scenario: str, engines: dict[str, EngineInfo], level: str) -> Iterator[Key]:
+def keys(scenario: str, engines: dict[str, EngineInfo], level: str, endurance: bool = False) -> Iterator[Key]:
     """The keys of a scenario's tasks, in the order in which they are made."""
     levels = [one for one in ("state", "trajectory") if level in (one, "all")]
     yield from ((scenario, "truth", one) for one in levels)
@@ -207,6 +219,8 @@ def keys(scenario: str, engines: dict[str, EngineInfo], level: str) -> Iterator[
             yield scenario, name, "relations"
         if "trajectory" in levels:
             yield from ((scenario, name, "trajectory", i.name) for i in info.integrators)
+            if endurance:
+                yield from ((scenario, name, "endurance", i.name) for i in info.integrators)
 
 
 def horizon_of(truth: MotionTruth) -> float:

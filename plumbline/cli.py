@@ -230,6 +230,13 @@ def run(
     show_default=True,
     help="Halvings of the step beyond those of `run`.",
 )
+@click.option(
+    "--endurance",
+    type=click.FloatRange(0),
+    default=100.0,
+    show_default=True,
+    help="Seconds of the long runs whose invariants are judged; 0 for none.",
+)
 @click.option("--jobs", type=click.IntRange(1), default=None, help="Worker processes. Default: one per core.")
 @click.option("--scheduler", metavar="ADDRESS", help="A dask cluster to run on instead, as tcp://HOST:8786.")
 @click.option(
@@ -251,7 +258,7 @@ def run(
 )
 def nightly(
     names: tuple[str, ...], engines: tuple[str, ...], count: int, seed: int | None, finer: int,
-    jobs: int | None, scheduler: str | None, out: Path, timeout: float, memory: float,
+    endurance: float, jobs: int | None, scheduler: str | None, out: Path, timeout: float, memory: float,
 ) -> None:  # fmt: skip
     """Run everything, unattended: catalogue, finer steps, random scenarios, and remember the night.
 
@@ -270,7 +277,7 @@ def nightly(
         result, place = run_night(
             folder, chosen, chosen_engines, random=count, seed=seed, jobs=jobs or os.cpu_count() or 1,
             limits=Limits(timeout, memory), whole=not names and not engines, finer=finer, progress=progress,
-            scheduler=scheduler,
+            endurance=endurance, scheduler=scheduler,
             command=shlex.join(["python", "-m", "plumbline", *sys.argv[1:]]),
             tell=lambda sentence: click.echo(sentence, err=True),
         )  # fmt: skip

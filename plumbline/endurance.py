@@ -47,6 +47,14 @@ class Course:
 
     seconds: float
     resolutions: tuple[float, ...]  # steps in s or relative tolerances, coarse to fine
+    asked: float  # s
+
+    @property
+    def words(self) -> str:
+        """What was left out."""
+        if self.seconds == self.asked:
+            return ""
+        return f"; the limit of steps × bodies allows {self.seconds:g} s of {self.asked:g} s"
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +85,7 @@ class Endured:
 
     runs: list[LongRun]
     scales: dict[str, float]
+    plan: Course
     unsupported: str | None = None
 
 
@@ -90,7 +99,7 @@ def course(integrator: Integrator, bodies: int, seconds: float) -> Course:
         affordable = BODY_STEPS[integrator.order] / bodies / 2**fine
         resolutions = tuple(2.0**-k for k in range(coarse, fine + 1))
     halvings = max(0, int(np.ceil(np.log2(seconds / affordable))))
-    return Course(seconds / 2**halvings, resolutions)
+    return Course(seconds / 2**halvings, resolutions, seconds)
 
 
 def windows(seconds: float) -> list[float]:
@@ -117,7 +126,7 @@ def endure(engine: str, integrator: str, model: Model, state: State, sample: flo
                 trajectory = chosen.simulate(model, state, times, integrator, resolution)
                 break
             except Unsupported as refusal:
-                return Endured(runs, sizes, str(refusal))
+                return Endured(runs, sizes, plan, str(refusal))
             except MemoryError:
                 raise  # the worker's limit, told as such
             except Exception as error:  # an engine may raise anything: its words belong in the results
@@ -125,7 +134,7 @@ def endure(engine: str, integrator: str, model: Model, state: State, sample: flo
         runs.append(reduced(model, trajectory, resolution, failure, begin))
         if trajectory is not None:
             sizes = scales(model, trajectory, float(np.sum(reach(model))))
-    return Endured(runs, sizes)
+    return Endured(runs, sizes, plan)
 
 
 def reduced(
@@ -160,9 +169,7 @@ def window(series: Array) -> Window:
 # --- judging ------------------------------------------------------------------------------------
 
 
-def judge_endurance(
-    who: Subject, integrator: Integrator, endured: Endured, asked: float, regular: bool
-) -> Findings:
+def judge_endurance(who: Subject, integrator: Integrator, endured: Endured, regular: bool) -> Findings:
     """Rows of level "invariants", a quantity's being named ``*_long``; ``regular``: motion without chaos."""
     found = Findings()
     cost = sum(run.cost for run in endured.runs)
@@ -176,11 +183,13 @@ def judge_endurance(
     finest = endured.runs[-1]
     if not finest.windows:
         return whole("failed", f"at the finest resolution {finest.resolution:g}: {finest.failure}")
-    if finest.failure is not None and not blown_up(endured, asked):
-        return whole("failed", f"within {asked:g} s at {finest.resolution:g}: {finest.failure}")
+    if finest.failure is not None and not blown_up(endured):
+        return whole(
+            "failed", f"within {endured.plan.seconds:g} s at {finest.resolution:g}: {finest.failure}"
+        )
     for quantity, unit in UNITS.items():
         if quantity in finest.windows:
-            judge = Judge(who, integrator, endured, asked, quantity, unit)
+            judge = Judge(who, integrator, endured, quantity, unit)
             found.rows.append(judge.row())
             if quantity == "energy_drift" and integrator.symmetric and integrator.kind == "step" and regular:
                 found.rows.append(judge.growth_row())
@@ -188,11 +197,11 @@ def judge_endurance(
     return found
 
 
-def blown_up(endured: Endured, asked: float) -> bool:
+def blown_up(endured: Endured) -> bool:
     """Whether the finest run's energy, drifting on as it did, would leave its range: a step too coarse."""
     finest = endured.runs[-1]
     drift = finest.windows["energy_drift"][finest.reached].largest
-    return drift * asked / finest.reached > SMALL * endured.scales["energy_drift"]
+    return drift * endured.plan.seconds / finest.reached > SMALL * endured.scales["energy_drift"]
 
 
 @dataclass(frozen=True)
@@ -202,7 +211,6 @@ class Judge:
     who: Subject
     integrator: Integrator
     endured: Endured
-    asked: float  # s
     quantity: str
     unit: str
 
@@ -330,7 +338,7 @@ class Judge:
         kept = self.finest.windows[self.quantity]
         beyond = ""
         if self.finest.failure is not None:
-            beyond = f"; in {self.asked:g} s {self.finest.failure}"
+            beyond = f"; in {self.endured.plan.seconds:g} s {self.finest.failure}"
         elif end < self.finest.reached:
             last = kept[self.finest.reached]
             beyond = f"; {last.largest:.2g} {self.unit} within {self.finest.reached:g} s, which cannot tell"
@@ -342,11 +350,11 @@ class Judge:
             self.unit,
             value=kept[end].largest,
             tolerance=tolerance,
-            derivation=why,
+            derivation=why + self.endured.plan.words,
             horizon=end,
             order=order,
             declared_order=self.integrator.order if order is not None else None,
-            extra={"scale": self.scale, "asked": self.asked, **extra},
+            extra={"scale": self.scale, "asked": self.endured.plan.asked, **extra},
         )
 
     def new(self, quantity: str, verdict: Verdict, reason: str, unit: str, **more: Any) -> Row:

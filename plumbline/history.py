@@ -31,6 +31,7 @@ class Night:
     sentence: str
     versions: dict[str, str]
     folder: Path
+    number: int = 0  # a night's, in the order in which they were made; 0 of other runs
 
 
 class History:
@@ -47,7 +48,7 @@ class History:
                 self.nights.append(self._night(path.parent))
             except (OSError, ValueError, KeyError, TypeError, duckdb.Error) as error:
                 self.damaged.append(f"{path.parent.name}: {' '.join(str(error).split())}")
-        self.nights.sort(key=lambda night: night.started)
+        self.nights.sort(key=lambda night: (night.number, night.started))
         self._load()
 
     def _night(self, folder: Path) -> Night:
@@ -55,7 +56,7 @@ class History:
         run = document["run"]
         night = Night(
             str(run["id"]), str(run["started"]), int(run["exit_code"]), str(run["sentence"]),
-            {str(k): str(v) for k, v in run["versions"].items()}, folder,
+            {str(k): str(v) for k, v in run["versions"].items()}, folder, int(run.get("night", 0)),
         )  # fmt: skip
         table = str(folder / "summary.parquet")
         (stored,) = self._one("SELECT count(key) + 0 * count(verdict) FROM read_parquet(?)", [table])
@@ -103,7 +104,7 @@ class History:
                    count(*) FILTER ({BAD}) AS bad,
                    count(*) FILTER (known IS NOT NULL) AS as_recorded,
                    count(DISTINCT scenario) FILTER (family = '{FAMILY}') AS random
-            FROM nights LEFT JOIN rows USING (night) GROUP BY ALL ORDER BY started
+            FROM nights LEFT JOIN rows USING (night) GROUP BY ALL ORDER BY min(night)
             """
         )
 
@@ -112,7 +113,7 @@ class History:
         return self.ask(
             """
             SELECT key, id, started, value, tolerance, unit, value / nullif(tolerance, 0) AS ratio, verdict
-            FROM rows JOIN nights USING (night) WHERE key GLOB ? ORDER BY key, started
+            FROM rows JOIN nights USING (night) WHERE key GLOB ? ORDER BY key, night
             """,
             [pattern],
         )

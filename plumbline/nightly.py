@@ -10,6 +10,7 @@ Killed at any moment, the same command reads the plan and goes on; a folder in h
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
 import os
@@ -25,7 +26,7 @@ from plumbline import scenario as scenarios
 from plumbline.cells import Cells
 from plumbline.random_scenarios import FAMILY, RandomScenarios
 from plumbline.run import Levels, Plan, Progress, Result, execute, save
-from plumbline.store import write_atomically
+from plumbline.store import read, write_atomically
 from plumbline.workers import Limits
 
 FINER = 1  # halvings beyond the quick ladders
@@ -72,6 +73,7 @@ def nightly(
     whole: bool,
     command: str,
     finer: int = FINER,
+    endurance: float = 0.0,
     level: Levels = "all",
     scheduler: str | None = None,
     progress: Progress,
@@ -92,6 +94,7 @@ def nightly(
         jobs=jobs,
         limits=limits,
         finer=finer,
+        endurance=endurance,
         whole=whole,
         scheduler=scheduler,
         probes=drawn,
@@ -99,6 +102,7 @@ def nightly(
     )
     result = execute(plan, progress)
     result.run |= {"started": night.started, "random": night.random, "seed": night.seed}
+    result.run["night"] = number(out / "history")
     folder = unfinished / "night"
     shutil.rmtree(folder, ignore_errors=True)
     save(result, folder, command)
@@ -110,6 +114,15 @@ def nightly(
     os.replace(folder, place)
     shutil.rmtree(unfinished)
     return result, place
+
+
+def number(history: Path) -> int:
+    """The number of a new night: they are told in this order, whatever the clock says."""
+    highest = 0
+    for path in history.glob("*/results.json"):
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # damaged: `history` names it
+            highest = max(highest, int(read(path.parent)["run"]["night"]))
+    return highest + 1
 
 
 def free(place: Path) -> Path:

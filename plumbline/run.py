@@ -43,6 +43,7 @@ class Plan:
     limits: Limits = field(default_factory=Limits)
     states: int = STATES
     finer: int = 0  # how many times the finest step halves beyond the quick form
+    endurance: float = 0.0  # s of the long runs whose invariants are judged; 0: none
     accept: float | None = None  # relative to each quantity's scale; shown beside the verdict only
     whole: bool = False  # the full catalogue on all engines: every known entry must occur
     scheduler: str | None = None  # address of a dask cluster to run on, instead of ``jobs`` workers here
@@ -128,7 +129,7 @@ def execute(plan: Plan, progress: Progress) -> Result:
 
     with split.work(), crew(plan) as workers:
         engines = describe_all(workers, plan.engines)
-        total = sum(sum(1 for _ in keys("", engines, plan.level)) for _ in plan.scenarios)
+        total = sum(sum(1 for _ in keys("", engines, plan.level, plan.endurance > 0)) for _ in plan.scenarios)
         total += len(plan.probes) * sum(1 for _ in keys("", engines, "state"))
         done = 0
         source: Iterable[Task] = tasks()
