@@ -14,6 +14,7 @@ from reference_impl.chain import Chain
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import L
 from reference_impl.forest import Forest, lay
+from reference_impl.joints import rows
 from reference_impl.system import Solution, System
 from tests.random_chains import random_chain
 
@@ -29,15 +30,15 @@ def parts(solution: Solution, forest: Forest) -> list[Solution]:
     """The forest's answer chain by chain."""
     out = []
     for index, one in enumerate(forest.chains):
-        rows = (solution.joint >= forest.start[index]) & (solution.joint < forest.start[index + 1])
+        mine = (solution.joint >= forest.start[index]) & (solution.joint < forest.start[index + 1])
         body = slice(forest.start[index], forest.start[index + 1])
         out.append(
             Solution(
                 acceleration=solution.acceleration[body],
                 pddot=solution.pddot[body],
-                multiplier=solution.multiplier[rows],
+                multiplier=solution.multiplier[mine],
                 norm_multiplier=solution.norm_multiplier[body],
-                joint=solution.joint[rows] - forest.start[index],
+                joint=solution.joint[mine] - forest.start[index],
                 tension=solution.tension[body],
                 joint_reaction=solution.joint_reaction[body],
             )
@@ -150,3 +151,58 @@ def test_a_rod_of_length_zero_is_singular() -> None:
     r[2] -= gap
     with pytest.raises(SingularSystem, match="rod above body 3 has length 0"):
         Forest([literal]).solve(r, state.p, state.v, rate(state.p, state.omega))
+
+
+@KINDS
+def test_constraints_are_gaps_of_balls_and_squares_of_rods(mix: str) -> None:
+    """C and its rate along (ṙ, ṗ), where joints are open and p is a unit quaternion; a rod has one row."""
+    rng = np.random.default_rng(25)
+    rods = {"balls": [False] * 5, "rods": [True] * 5, "mixed": [True, False, True, True, False]}[mix]
+    model, state = random_chain(rng, rods)
+    r, v = state.r + 0.1 * rng.normal(size=(5, 3)), state.v + 0.1 * rng.normal(size=(5, 3))
+    pdot, one = rate(state.p, state.omega), chain(model)
+    forest, direct = Forest([one]), rows(one, r, state.p, v, pdot)
+    found = forest.constraints(lay(r, state.p), lay(v, pdot))
+    for ours, theirs in zip(found, (direct.C, direct.rate(v, pdot)), strict=True):
+        assert ours.shape == (1 if mix == "rods" else 3, 5)
+        kept = np.array([[row == 0 or not rod for row in range(len(ours))] for rod in one.rods])
+        np.testing.assert_allclose(ours.T[kept], theirs, rtol=0, atol=1e-13)
+        assert not np.any(ours.T[~kept])
+
+
+@pytest.mark.parametrize("at, words", [(0, "body 1"), (3, "body 2"), (6, "body 2")])
+def test_a_cause_is_named_by_the_body_of_its_own_chain(at: int, words: str) -> None:
+    """Chains of 2, 3 and 2 bodies; the bodies of all are counted from 0."""
+    rng = np.random.default_rng(26)
+    drawn = [random_chain(rng, [False] * n) for n in (2, 3, 2)]
+    r, p, v = (np.concatenate([getattr(s, name) for _, s in drawn]) for name in ("r", "p", "v"))
+    pdot = np.concatenate([rate(s.p, s.omega) for _, s in drawn])
+    forest = Forest([chain(model) for model, _ in drawn])
+    for broken, what in ((p, 0.0), (r, np.nan)):
+        kept = broken[at].copy()
+        broken[at] = what
+        with pytest.raises(SingularSystem, match=words):
+            forest.solve(r, p, v, pdot)
+        broken[at] = kept
+
+
+@KINDS
+@pytest.mark.parametrize("a", [0.5, 8.0])
+def test_baumgarte_adds_2a_and_a_squared_to_every_constraint(mix: str, a: float) -> None:
+    """C̈ + 2 a Ċ + a² C = 0 of joints that are open, and of pᵀp − 1."""
+    rng = np.random.default_rng(27)
+    model, state = random_chain(rng, MIXES[mix](rng, 4), loads=True, drag=True)
+    forest, pdot, h = Forest([chain(model)]), rate(state.p, state.omega), 1e-6
+    q, v = lay(state.r, state.p), lay(state.v, pdot)
+    q[:3] += 0.1 * rng.normal(size=(3, 4))
+    v[:3] += 0.1 * rng.normal(size=(3, 4))
+    acceleration = forest.acceleration(q, v, a)
+    C, C_rate = forest.constraints(q, v)
+    ends = [forest.constraints(q + s * h * v, v + s * h * acceleration)[1] for s in (1, -1)]
+    second = (ends[0] - ends[1]) / (2 * h)
+    np.testing.assert_allclose(second, -2 * a * C_rate - a * a * C, rtol=0, atol=1e-6 * (1 + a * a))
+    q[3:], v[3:] = 1.1 * q[3:], v[3:] + 0.1 * q[3:]
+    p, p_rate, p_second = q[3:], v[3:], forest.acceleration(q, v, a)[3:]
+    E, E_rate = np.sum(p * p, 0) - 1, 2 * np.sum(p * p_rate, 0)
+    E_second = 2 * np.sum(p_rate * p_rate + p * p_second, 0)
+    np.testing.assert_allclose(E_second, -2 * a * E_rate - a * a * E, rtol=0, atol=1e-11 * (1 + a * a))

@@ -9,7 +9,7 @@ from scipy.special import ellipk
 from reference_impl import printed
 from reference_impl.euler_parameters import A, L, angular_velocity
 from reference_impl.euler_parameters import rate as pdot_of
-from reference_impl.integrate import integrate, pack, rate, unpack
+from reference_impl.integrate import integrate, natural_sizes, pack, rate, unpack
 from reference_impl.system import System, solve_dense
 from tests.notes_cases import Symbols, off_manifold, on_manifold, random_chain
 
@@ -189,6 +189,31 @@ def test_samples_do_not_change_the_steps():
     np.testing.assert_array_equal(few.r[-1], many.r[-1])
     gap = np.abs(integrate(chain, *state, np.array([0.0, 0.37]), 1e-10).r[-1] - many.r[37])
     assert np.max(gap) < 1e-9
+
+
+def test_natural_sizes_are_of_the_stretched_chain_its_fall_and_its_motion():
+    rng = np.random.default_rng(12)
+    chain = random_chain(rng, [True, False, True])
+    near, far = (np.linalg.norm(s, axis=1) for s in (chain.proximal, chain.distal))
+    reach = np.sum(chain.length) + np.sum(near) + far[0] + far[1]
+    fall = np.sqrt(np.linalg.norm(chain.gravity) * reach)
+    r, p, v, _ = on_manifold(chain, rng)
+
+    def sizes(r, v, omega, chain=chain):
+        y = natural_sizes(chain, r, p, v, pdot_of(p, omega))
+        parts = np.split(y, np.cumsum([9, 12, 9]))
+        assert [len(part) for part in parts] == [9, 12, 9, 12] and all(np.ptp(part) == 0 for part in parts)
+        return [part[0] for part in parts]
+
+    still, turn = np.zeros((3, 3)), np.array([[0, 0, 0], [0, -40.0, 0], [1, 0, 0]])
+    assert sizes(r, still, still) == pytest.approx([reach, 1, fall, fall / reach / 2], rel=1e-14)
+    fast = sizes(r, v - np.array([[0, 0, 0], [0, 0, 50.0], [0, 0, 0]]), still)
+    assert fast[2] == np.max(np.abs(v[1, 2] - 50)) and fast[3] == pytest.approx(fast[2] / reach / 2)
+    assert sizes(r, still, turn) == pytest.approx([reach, 1, 40 * reach, 20], rel=1e-13)
+    away = sizes(r - [[0, 9.0, 0]] * np.ones((3, 1)), still, still)
+    assert away[0] == np.max(np.abs(r - [0, 9.0, 0])) > reach
+    point = dataclasses.replace(chain, proximal=still, distal=still, length=np.zeros(3), gravity=np.zeros(3))
+    assert sizes(still, still, still, point) == [1, 1, 0, 0]
 
 
 def test_at_rest_stays_at_rest():
