@@ -1,0 +1,169 @@
+"""The steps of a diagnosis, each on answers made for it; whole diagnoses are in `test_planted`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from plumbline.diagnosis import (
+    QUANTITIES,
+    Difference,
+    derivatives,
+    diagnose,
+    explanations,
+    misread,
+    observe,
+    worst,
+)
+from plumbline.hypotheses import causes
+from plumbline.sampling import random_states
+from plumbline.suspect import answer
+from plumbline.yardstick import state_truth
+from tests import pendulums
+
+VECTORS = QUANTITIES[:3]
+
+
+@cache
+def known(joints="bb", count=10):
+    model = pendulums.model(joints)
+    return model, state_truth(model, random_states(model, count, seed=4))
+
+
+def changed(quantity, to, joints="bb", count=10):
+    """True answers with one quantity put through ``to`` (index, value, bound)."""
+    model, truth = known(joints, count)
+    said = [
+        replace(a, **{quantity: to(i, getattr(a, quantity), np.asarray(b.tolerance(quantity)))})
+        for i, (a, b) in enumerate(zip(truth.quantities, truth.bounds, strict=True))
+    ]
+    return model, said, truth
+
+
+def test_distances_are_in_bounds():
+    vectors = np.array([[[3.0, 4, 0], [0, 0, 1]], [[0, 0, 0], [6, 0, 8]]])
+    assert worst(vectors, np.array([[1.0, 1.0], [1.0, 4.0]])) == 5.0
+    assert worst(vectors[1:], np.array([[1.0, 4.0]])) == 2.5
+    assert worst(np.array([-3.0, 2.0]), np.array([1.0, 1.0])) == 3.0
+    assert worst(np.array([0.0]), np.array([0.0])) == 0.0
+    assert worst(np.array([1.0]), np.array([0.0])) > 1e300
+
+
+def test_a_difference_is_measured_per_quantity_and_as_one_vector():
+    one, two = np.array([[[2.0, 0, 0]]]), np.array([6.0])
+    said = {"acceleration": one, "kinetic_energy": two}
+    seen = Difference(
+        known()[0], said, said, {"acceleration": np.array([[0.5]]), "kinetic_energy": np.array([3.0])}, {}
+    )
+    still = {q: 0 * x for q, x in said.items()}
+    assert seen.off(still) == {"acceleration": 4.0, "kinetic_energy": 2.0}
+    wide = {"acceleration": np.array([[4.0]]), "kinetic_energy": np.array([6.0])}
+    assert seen.off(still, wide) == {"acceleration": 0.5, "kinetic_energy": 1.0}
+    assert seen.weighted(said).tolist() == [4.0, 0, 0, 2.0]
+
+
+@pytest.mark.parametrize(("at", "first"), [(0, 0), (3, 0), (5, 1), (9, 2)])
+def test_eight_states_around_the_worst_one_are_looked_at(at, first):
+    model, said, truth = changed("acceleration", lambda i, a, b: a + 100 * b[:, None] * (i == at))
+    seen = observe(model, said, truth)
+    assert len(seen.case.p) == 8
+    for k in range(8):
+        assert np.array_equal(seen.case.p[k], truth.states[first + k].p)
+        assert np.array_equal(seen.said["acceleration"][k], said[first + k].acceleration)
+        assert np.array_equal(seen.right["acceleration"][k], truth.quantities[first + k].acceleration)
+        assert np.array_equal(seen.bounds["joint_reaction"][k], truth.bounds[first + k].joint_reaction)
+        if first + k:
+            before = truth.quantities[first + k - 1]
+            assert np.array_equal(seen.before["acceleration"][k], before.acceleration)
+    assert set(seen.said) == set(QUANTITIES)
+    less = [replace(said[0], joint_reaction=None), *said[1:]]
+    assert "joint_reaction" not in observe(model, less, truth).said
+
+
+@pytest.mark.parametrize(("bodies", "states"), [(6, 8), (7, 4), (12, 4), (13, 2)])
+def test_fewer_states_of_long_chains(bodies, states):
+    model = pendulums.model("b" * bodies)
+    at = random_states(model, 9, seed=1)
+    truth = state_truth(model, at)
+    assert len(observe(model, truth.quantities, truth).case.p) == states
+    assert len(observe(model, truth.quantities[:1], truth_of(truth, 1)).case.p) == 1
+
+
+def truth_of(truth, count):
+    return replace(
+        truth, states=truth.states[:count], quantities=truth.quantities[:count], bounds=truth.bounds[:count]
+    )
+
+
+def test_slopes_are_those_of_the_answers():
+    """By every fifth cause, against differences a hundred times as far."""
+    model, truth = known()
+    seen = observe(model, truth.quantities, truth)
+    for cause in [c for c in causes(seen.case) if c.scale is not None][::5]:
+        (slope,) = derivatives(seen, [(cause, cause.usual)])
+        ends = [answer(cause.alter(seen.case, cause.usual + s * 1e-4 * cause.scale)) for s in (1, -1)]
+        by_hand = seen.weighted({q: (ends[0][q] - ends[1][q]) / (2e-4 * cause.scale) for q in seen.said})
+        np.testing.assert_allclose(slope, by_hand, rtol=1e-5, atol=1e-5 * np.max(np.abs(by_hand)))
+
+
+@pytest.mark.parametrize("quantity", VECTORS)
+@pytest.mark.parametrize(
+    ("to", "words"),
+    [
+        (lambda i, x, b: -x, "{} with the opposite sign were given"),
+        (lambda i, x, b: 1.25 * x, "{} were 1.25 times as large"),
+        (lambda i, x, b: x + np.array([1e-3, 0, 2e-3]), "a constant were added to the {} at every state"),
+        (lambda i, x, b: np.asarray(np.float32(x), float), "{} were rounded to single precision"),
+    ],
+    ids=["sign", "factor", "constant", "single"],
+)
+def test_a_misread_quantity_is_named(quantity, to, words):
+    model, said, truth = changed(quantity, to)
+    assert misread(observe(model, said, truth), quantity) == words.format(quantity.replace("_", " "))
+
+
+def test_a_stale_field_and_an_origin_elsewhere_are_named():
+    model, truth = known()
+    stale = [truth.quantities[-1], *truth.quantities[:-1]]
+    said = [replace(a, joint_reaction=b.joint_reaction) for a, b in zip(truth.quantities, stale, strict=True)]
+    text = misread(observe(model, said, truth), "joint_reaction")
+    assert text == "joint reaction of the state before were given (a stale field)"
+    model, said, truth = changed("potential_energy", lambda i, x, b: x + 0.75)
+    seen = observe(model, said, truth)
+    assert misread(seen, "potential_energy") == (
+        "origin of the potential energy were elsewhere: 0.75 J more at every state"
+    )
+    assert misread(seen, "kinetic_energy") != misread(seen, "potential_energy")
+
+
+def test_what_is_in_no_pattern_is_not_misread():
+    rng = np.random.default_rng(1)
+    model, said, truth = changed("acceleration", lambda i, x, b: x * (1 + 1e-6 * rng.normal(size=x.shape)))
+    seen = observe(model, said, truth)
+    assert misread(seen, "acceleration") is None
+    assert explanations(seen) == []
+    text = diagnose(model, said, truth)
+    assert text == "no single change of a parameter, term or convention explains the acceleration"
+
+
+def test_a_difference_within_the_bound_is_in_the_mass_matrix():
+    model, said, truth = changed("acceleration", lambda i, x, b: x + 0.4 * b[:, None])
+    assert diagnose(model, said, truth).endswith("it is in the mass matrix alone")
+    model, said, truth = changed("acceleration", lambda i, x, b: x + 4.0 * b[:, None])
+    assert diagnose(model, said, truth) == "too near the rounding bound for any one term to be named"
+
+
+def test_an_engine_that_fails_when_asked_again_is_told():
+    model, said, truth = changed("acceleration", lambda i, x, b: 1.5 * x)
+
+    def evaluate(asked, states):
+        if not np.any(asked.gravity):
+            raise RuntimeError("no\n  weight")
+        return [replace(t, acceleration=1.5 * t.acceleration) for t in state_truth(asked, states).quantities]
+
+    text = diagnose(model, said, truth, evaluate)
+    assert text.startswith("behaves as if acceleration were 1.5 times as large (the difference ")
+    assert text.endswith("persists at rest, fails without gravity: no weight)")
