@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from adapters.reference_engine import chain
 from plumbline.kinematics import rate
+from reference_impl.euler_parameters import angular_velocity
 from reference_impl.forest import Forest, lay
-from reference_impl.stabilised import VARIANTS, constraint_errors, drift_table, run
+from reference_impl.joints import rows
+from reference_impl.stabilised import VARIANTS, constraint_errors, drift_table, energy_error, run
 from tests.random_chains import random_chain
 
 
@@ -71,3 +75,81 @@ def test_energy_over_a_thousand_seconds() -> None:
     row = drift_table(*start, rtols=(1e-13,), times=(1000.0,), variants=("projected",))[0]
     assert row.energy <= 1e-12
     assert row.gap < 1e-14
+
+
+@pytest.mark.parametrize("rods", [[True, False, True], [False], [True]], ids=str)
+def test_constraint_errors_are_metres_and_metres_a_second(rods: list[bool]) -> None:
+    """A rod's stretch and its rate, a ball's distance and speed, each the worst of its state, from `rows`."""
+    rng = np.random.default_rng(65)
+    model, state = random_chain(rng, rods)
+    one, pdot = chain(model), rate(state.p, state.omega)
+    motion = run("raw", one, state.r, state.p, state.v, pdot, np.linspace(0, 0.1, 3), 1e-6)
+    n = model.n
+    moved = replace(
+        motion,
+        r=motion.r + 0.02 * rng.normal(size=(3, n, 3)),
+        v=motion.v + 0.3 * rng.normal(size=(3, n, 3)),
+    )
+    found = constraint_errors(one, moved)
+    for t in range(3):
+        joints = rows(one, moved.r[t], moved.p[t], moved.v[t], moved.pdot[t])
+        rates = joints.rate(moved.v[t], moved.pdot[t])
+        gaps, speeds = [], []
+        for k in range(n):
+            distance = np.linalg.norm(joints.d[k])
+            gaps.append(abs(distance - one.length[k]))
+            speed = rates[joints.joint == k]
+            speeds.append(abs(speed[0]) / (2 * distance) if rods[k] else np.linalg.norm(speed))
+        assert found[0][t] == pytest.approx(max(gaps), abs=1e-6)
+        assert found[1][t] == pytest.approx(max(speeds), rel=1e-4)
+        assert found[2][t] == pytest.approx(np.max(np.abs(np.linalg.norm(moved.p[t], axis=1) - 1)), abs=1e-15)
+    still = constraint_errors(one, replace(motion, p=1.5 * motion.p))
+    assert still[2] == pytest.approx(np.full(3, 0.5), abs=1e-6)
+
+
+def test_energy_is_over_the_weight_and_reach_of_the_stretched_chain() -> None:
+    model, state = random_chain(np.random.default_rng(66), [True, False, True])
+    one, pdot = chain(model), rate(state.p, state.omega)
+    motion = run("projected", one, state.r, state.p, state.v, pdot, np.linspace(0, 0.1, 3), 1e-12)
+    near, far = np.linalg.norm(model.proximal, axis=1), np.linalg.norm(model.distal, axis=1)
+    hang = [model.length[0] + near[0], 0.0, 0.0]
+    hang[1] = hang[0] + far[0] + near[1]
+    hang[2] = hang[1] + far[1] + model.length[2] + near[2]
+    scale = 9.81 * float(np.sum(model.mass * hang))
+    assert np.max(energy_error(one, motion)) < 1e-11
+    lifted = replace(motion, r=motion.r + np.array([0.0, 0.5, 1.0])[:, None, None] * [0, 0, 1.0])
+    raised = 9.81 * float(np.sum(model.mass)) * np.array([0, 0.5, 1]) / scale
+    assert energy_error(one, lifted) == pytest.approx(raised, abs=1e-10)
+    faster = replace(motion, v=motion.v * np.array([1.0, 1.0, 2.0])[:, None, None])
+    more = 1.5 * float(np.sum(model.mass * np.sum(motion.v[2] ** 2, axis=1))) / scale
+    assert energy_error(one, faster) == pytest.approx([0, 0, more], abs=1e-10)
+    spun = replace(motion, pdot=motion.pdot * np.array([1.0, 1.0, 3.0])[:, None, None])
+    omega = angular_velocity(motion.p[2], motion.pdot[2])
+    turned = 4 * float(np.einsum("ki,kij,kj", omega, model.inertia, omega)) / scale
+    assert energy_error(one, spun) == pytest.approx([0, 0, turned], abs=1e-10)
+    loaded = replace(one, drag_moment=np.array([0, 0, 0.1]))
+    assert np.all(np.isnan(energy_error(loaded, motion)))
+
+
+def test_a_table_has_a_row_for_each_variant_tolerance_and_time() -> None:
+    """The maxima up to a time, and the share of the steps that falls to it."""
+    model, state = random_chain(np.random.default_rng(67), [False])
+    start = chain(model), state.r, state.p, state.v, rate(state.p, state.omega)
+    rtols, times = (1e-4, 1e-6), (0.5, 2.0, 4.0)
+    table = drift_table(*start, rtols=rtols, times=times, samples=8, variants=("raw", "projected"))
+    expected = [(v, rtol, end) for v in ("raw", "projected") for rtol in rtols for end in times]
+    assert [(row.variant, row.rtol, row.time) for row in table] == expected
+    grid = np.unique(np.concatenate([np.linspace(0, end, 9) for end in times]))
+    motion = run("raw", *start, grid, 1e-4)
+    errors = [*constraint_errors(start[0], motion), energy_error(start[0], motion)]
+    for row in table[:3]:
+        upto = [float(np.max(error[grid <= row.time])) for error in errors]
+        assert [row.gap, row.gap_rate, row.norm, row.energy] == upto
+        assert row.steps == round(motion.steps * row.time / 4.0)
+
+
+def test_there_are_three_variants_and_no_other() -> None:
+    model, state = random_chain(np.random.default_rng(68), [False])
+    start = chain(model), state.r, state.p, state.v, rate(state.p, state.omega)
+    with pytest.raises(ValueError, match="no variant 'damped'"):
+        run("damped", *start, np.array([0.0, 0.1]), 1e-6)
