@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from adapters.reference_engine import chain
 from plumbline.kinematics import rate
 from reference_impl.collocation import integrate
-from reference_impl.short_rods import converge, hang
+from reference_impl.short_rods import converge, directions, hang
+from reference_impl.system import System
 from tests.random_chains import random_chain
 
 LENGTHS = [0.4, 1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6]
@@ -35,3 +38,51 @@ def test_off_the_slow_manifold_the_rod_swings_fast() -> None:
     fast = integrate([rods], state.r + 1e-4 * aside, state.p, v, pdot, np.linspace(0, 0.02, 21), 1e-8)
     jerk = [np.max(np.abs(np.diff(x.v, 2, axis=0))) for x in (slow, fast)]
     assert jerk[1] > 30 * jerk[0]
+
+
+def test_a_family_is_what_its_fields_say() -> None:
+    """Largest differences from the ball, of r̈ and F by the direct form and of the motion; their orders."""
+    model, state = random_chain(np.random.default_rng(45), [False, False], loads=True)
+    ball, pdot, times = chain(model), rate(state.p, state.omega), np.linspace(0, 0.05, 6)
+    start = state.r, state.p, state.v, pdot
+    lengths = [0.1, 0.02]
+    family = converge(ball, *start, lengths, times, 1e-10)
+    limit, motion = System(ball).solve(*start), integrate([ball], *start, times, 1e-10)
+    for k, length in enumerate(lengths):
+        rods, r, v = hang(ball, *start, length)
+        x = System(rods).solve(r, state.p, v, pdot)
+        far = integrate([rods], r, state.p, v, pdot, times, 1e-10)
+        for found, a, b in (
+            (family.acceleration, x.acceleration, limit.acceleration),
+            (family.reaction, x.joint_reaction, limit.joint_reaction),
+            (family.position, far.r, motion.r),
+        ):
+            assert found[k] == pytest.approx(np.max(np.linalg.norm(a - b, axis=-1)), rel=1e-7)
+        assert family.runs[k].r.shape == (6, 2, 3)
+    assert family.length.tolist() == lengths
+    errors = np.stack([family.acceleration, family.reaction, family.position])
+    assert family.rate[:, 0] == pytest.approx(np.log(errors[:, 0] / errors[:, 1]) / np.log(5))
+
+
+def test_a_rod_starts_along_the_balls_force_and_turns_with_it() -> None:
+    """u = −F/‖F‖ and its rate along the ball's motion, by differences; a joint without force has none."""
+    model, state = random_chain(np.random.default_rng(46), [False, False])
+    ball, pdot, h = chain(model), rate(state.p, state.omega), 1e-3
+    u, udot = directions(ball, state.r, state.p, state.v, pdot)
+    motion = integrate([ball], state.r, state.p, state.v, pdot, np.array([0, h, 2 * h]), 1e-13)
+    force = [
+        System(ball).solve(*s).joint_reaction
+        for s in zip(motion.r, motion.p, motion.v, motion.pdot, strict=True)
+    ]
+    along = [-F / np.linalg.norm(F, axis=1, keepdims=True) for F in force]
+    assert u == pytest.approx(along[0], abs=1e-12)
+    slope = (-3 * along[0] + 4 * along[1] - along[2]) / (2 * h)
+    assert udot == pytest.approx(slope, abs=1e-3 * np.max(np.abs(udot)))
+    assert np.sum(u * udot, axis=1) == pytest.approx(np.zeros(2), abs=1e-14)
+    rods, r, v = hang(ball, state.r, state.p, state.v, pdot, 0.25)
+    assert rods.length.tolist() == [0.25, 0.25]
+    assert r - state.r == pytest.approx(0.25 * np.cumsum(u, axis=0), abs=1e-15)
+    assert v - state.v == pytest.approx(0.25 * np.cumsum(udot, axis=0), abs=1e-14)
+    weightless = replace(ball, force=-ball.mass[:, None] * ball.gravity)
+    with pytest.raises(ValueError, match="joint 1 carries no force"):
+        directions(weightless, state.r, state.p, 0 * state.v, 0 * pdot)
