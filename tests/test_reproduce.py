@@ -1,21 +1,34 @@
-"""Scripts of disagreements: they run with the engine and numpy alone, and show what the harness saw."""
+"""Scripts of disagreements: they run with the engine and numpy alone, and show what the harness saw.
+
+An engine with a defect is one whose own module was changed: the same few lines are executed before the
+harness asks it and before the script runs, so that both meet the same engine.
+"""
 
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import sys
+from contextlib import contextmanager, redirect_stdout
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from plumbline import reproduce, store
+from plumbline import relations, reproduce, shown, store, versions
 from plumbline.cli import main
-from plumbline.registry import adapter
-from plumbline.reproduce import ENGINE_LINES, NotReproducible, Shown, file_name, script, shown, shrunk
+from plumbline.converge import ladder
+from plumbline.registry import ENGINES, adapter
+from plumbline.reproduce import NotReproducible, disagreement, file_name, shown_by_script
+from plumbline.script_text import ENGINE_LINES, PARTS, part, script, unscripted
+from plumbline.shown import AlongRuns, AtState, Engine, Question, Related, shrunk
+from plumbline.shrink import Case
 from plumbline.workers import Outcome
 from tests import pendulums
 from tests.pendulums import JOINTS
@@ -24,50 +37,251 @@ from tests.planted import STATE_DEFECTS, plant
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(engine)
 
+ROOT = Path(__file__).resolve().parent.parent
 HOSTILE = '<img src=x onerror="alert(1)">\n"""\nimport os; os.abort()  # \\ \'\'\' \r ; # ünï'
-ROW = {"scenario": HOSTILE, "quantity": "acceleration", "engine_version": "0", "extra": {"state": 3.0}}
+QUANTITIES = (*relations.QUANTITIES, "mass_matrix")
+DRIFTS = ("energy_drift", "momentum_drift", "joint_gap", "gap_rate", "norm_drift")
+ROW = {"scenario": HOSTILE, "quantity": HOSTILE, "engine_version": "4", "integrator": HOSTILE,
+       "extra": {"state": 3.0}}  # fmt: skip
+INTEGRATORS = [(name, i.name) for name in ENGINES for i in adapter(name).integrators]
 
 
-def run(text: str, tmp_path) -> str:
+def run(text: str, tmp_path, before: str = "", python: str = sys.executable) -> str:
+    """The output of a script in a process of its own; ``before`` is executed first."""
     path = tmp_path / "shown.py"
     path.write_text(text, encoding="utf-8")
+    first = f"{before}\nimport runpy\nrunpy.run_path({str(path)!r}, run_name='__main__')"
+    ours = str(ROOT) if "from reference_impl" in text else ""
     done = subprocess.run(
-        [sys.executable, "-I", path], cwd=tmp_path, capture_output=True, text=True, timeout=60
-    )
+        [python, "-P", "-c", first] if before else [python, "-P", path],
+        cwd=tmp_path, capture_output=True, text=True, timeout=120, encoding="utf-8",
+        env={**os.environ, "PYTHONPATH": ours, "PYTHONIOENCODING": "utf-8", "OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
+def executed(text: str) -> tuple[str, dict]:
+    """The output of a script and its names, in this process: many of them, quickly."""
+    names = {"__name__": "__main__"}
+    with redirect_stdout(StringIO()) as said:
+        exec(compile(text, "script", "exec"), names)
+    return said.getvalue(), names
+
+
+@contextmanager
+def defective(lines: str):
+    """The engines' modules after these lines; as they were afterwards."""
+    import exudyn.itemInterface
+    import mujoco
+    import pinocchio
+
+    from reference_impl.system import System
+
+    places = (exudyn.itemInterface, mujoco, pinocchio, System)
+    before = [dict(vars(place)) for place in places]
+    try:
+        exec(lines, {})
+        yield
+    finally:
+        for place, names in zip(places, before, strict=True):
+            for name, value in names.items():
+                if vars(place).get(name) is not value:
+                    setattr(place, name, value)
+
+
 def ratios(text: str) -> list[float]:
-    return [float(x) for x in re.findall(r"over what rounding explains: (\S+)", text)]
+    return [float(x) for x in re.findall(r"^  over (?:what|the) .*: (\S+)$", text, re.M)]
 
 
-def case(engine: str, joints: str) -> Shown:
+def row(engine: str, **more):
+    return ROW | {"engine": engine} | more
+
+
+def at_state(engine: str, joints: str) -> shown.ShownState:
     model = pendulums.model(JOINTS[joints], loads=True, drag=True)
-    found = shown(engine, model, pendulums.state(model, seed=3))
+    found = AtState(Engine(engine), QUANTITIES)(Case(model, pendulums.state(model, seed=3)))
     assert found is not None
     return found
 
 
-@pytest.mark.parametrize("joints", ["balls", "rod-ball"])
-@pytest.mark.parametrize("engine", sorted(ENGINE_LINES))
-def test_a_script_asks_the_engine_as_the_adapter_does(engine, joints, tmp_path):
-    """Where nothing disagrees the script must not disagree either: no mistake of its own."""
-    text = script(engine, case(engine, joints), ROW | {"engine": engine})
-    imports = set(re.findall(r"^import (\w+)", text, re.M))
-    assert imports <= {"numpy", "mujoco", "pinocchio", "exudyn"} and "plumbline" not in imports
-    found = ratios(run(text, tmp_path))
-    assert len(found) >= 4 and max(found) < 1, found
+def runs(engine: str, integrator: str, joints: str, level: str, loads: bool, until: float = 0.25):
+    """A measure of runs of a slow tumble, and the case."""
+    method = adapter(engine).integrator(integrator)
+    model = pendulums.model(JOINTS[joints], loads=loads, drag=loads)
+    steps = tuple(2.0**-k for k in (6, 7, 8)) if method.kind == "step" else (1e-8, 1e-10, method.tightest)
+    case = Case(model, pendulums.state(model, seed=3, rate=1.0), until, steps)
+    wanted = DRIFTS if level == "invariants" else ("order", "position_limit", "attitude_limit")
+    return AlongRuns(Engine(engine), integrator, level, wanted), case
 
 
-def test_hostile_names_stay_text(tmp_path):
-    text = script("mujoco", case("mujoco", "ball"), ROW | {"engine": "mujoco"})
-    head = text.split("import mujoco")[0]
-    assert all(line.startswith("#") or not line for line in head.splitlines())
-    assert "os.abort" in head
-    run(text, tmp_path)
-    assert re.fullmatch(r"[A-Za-z0-9._-]+\.py", file_name(HOSTILE))
-    assert file_name("a/b") != file_name("a-b")
+# --- a script asks the engine as the adapter does: it has no mistake of its own ----------------------
+
+
+@pytest.mark.parametrize(
+    ("engine", "joints"), [("pinocchio-maximal", "balls"), *((name, "rod-ball") for name in ENGINE_LINES)]
+)
+def test_a_script_of_a_state_asks_as_the_adapter_does(engine, joints):
+    text = script(row(engine), at_state(engine, joints))
+    found = ratios(executed(text)[0])
+    assert len(found) >= 6 and max(found) < 1, found
+    assert "plumbline" not in text
+
+
+@pytest.mark.parametrize(
+    ("engine", "integrator"), INTEGRATORS, ids=["-".join(names) for names in INTEGRATORS]
+)
+def test_a_script_of_runs_steps_as_the_adapter_does(engine, integrator):
+    """To rounding, or to the tolerance of an implicit step's solver, on balls and rods with every load."""
+    measure, case = runs(engine, integrator, "rod-ball", "trajectory", loads=True, until=0.0625)
+    found = measure(case)
+    text = script(row(engine), found)
+    assert ("scipy" in text) == (integrator == "dop853" and engine != "reference") and "plumbline" not in text
+    said, names = executed(text)
+    assert max(ratios(said)[-2:]) < 1
+    _, rungs = measure.runs(case, measure.times(case))
+    for rung, mine in zip(rungs, names["runs"], strict=True):
+        for name, values in zip(("r", "p", "v"), mine, strict=False):
+            assert np.max(np.abs(values - getattr(rung.trajectory, name))) < 1e-10, (name, rung.resolution)
+
+
+@pytest.mark.parametrize(("engine", "loads", "count"), [("exudyn", False, 5), ("pinocchio", True, 4)])
+def test_a_script_measures_drifts_as_the_harness_does(engine, loads, count):
+    """Momentum is not conserved under loads; the work of moments and drag is integrated without SciPy."""
+    measure, case = runs(engine, {"pinocchio": "rkmk4", "exudyn": "trapezoidal"}[engine],
+                         "rod-ball", "invariants", loads, until=1.0)  # fmt: skip
+    found = measure(case)
+    said, _ = executed(script(row(engine), found))
+    assert len(ratios(said)) == count and max(ratios(said)) < 1
+    truth, rungs = measure.runs(case, measure.times(case))
+    who = shown.Subject("", "", "", "", "")
+    ladder_ = shown.Ladder(who, case.model, truth, measure.integrator, rungs, 1.0)
+    for quantity in found.drifts:
+        printed = re.search(rf"{quantity} by(?:.*\n)+?  step {case.steps[-1]}: (\S+)", said)[1]
+        harness = np.max(np.linalg.norm(getattr(ladder_.drift[-1], quantity)[-1], axis=-1))
+        by_quadrature = ladder_.drift[-1].work_uncertainty * (quantity == "energy_drift")
+        assert float(printed) == pytest.approx(harness, rel=0.01, abs=1e-13 + 2 * by_quadrature), quantity
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "exudyn"])
+@pytest.mark.parametrize("relation", [r.name for r in relations.RELATIONS])
+def test_a_script_of_a_relation_finds_what_the_harness_finds(engine, relation):
+    model = pendulums.model(JOINTS["rod-ball"], loads=True, drag=relation != "time reversed")
+    found = Related(Engine(engine), relation)(Case(model, pendulums.state(model, seed=3)))
+    assert found.ratio < 1
+    seen = ratios(executed(script(row(engine, level="relations"), found))[0])
+    assert len(seen) == 6 and max(seen) < 1
+    wrong = replace(found, back={q: way * 1.001 for q, way in found.back.items()})
+    assert min(ratios(executed(script(row(engine, level="relations"), wrong))[0])) > 1, "blind"
+
+
+@pytest.mark.parametrize(
+    ("engine", "relation"),
+    [(name, f"as {other}") for name, other in relations.FORMULATIONS.items()]
+    + [("pinocchio", f"by {way}") for way in adapter("pinocchio").options]
+    + [("pinocchio-aba", "by crba"), ("pinocchio", "two welded halves")],
+)
+def test_a_script_asks_the_engine_in_its_other_way(engine, relation):
+    model = pendulums.model(JOINTS["rod-ball"], loads=True, drag=True)
+    found = Related(Engine(engine), relation)(Case(model, pendulums.state(model, seed=3)))
+    text = script(row(engine, level="relations"), found)
+    assert max(ratios(executed(text)[0])) < 1
+    second = re.search(r"second = .*", text)[0]
+    spoilt = text.replace(second, f"c.mass = c.mass * 1.001\n{second}\n")
+    heavier = "[[(m * 1.001, s, J) for m, s, J in x] for x in halves]"
+    spoilt = spoilt.replace("c.pieces = halves", f"c.pieces = {heavier}")
+    assert max(ratios(executed(spoilt)[0])) > 1, "the second answer is not asked for"
+
+
+# --- defects in the engines themselves ----------------------------------------------------------------
+
+HEAVY = """import mujoco
+real = mujoco.mj_setConst
+def heavy(m, d):
+    m.body_mass[-1] *= 1.0001
+    real(m, d)
+mujoco.mj_setConst = heavy
+"""
+EULER = """import mujoco, types
+mujoco.mjtIntegrator = types.SimpleNamespace(mjINT_RK4=mujoco.mjtIntegrator.mjINT_EULER)
+"""
+NO_DEXP = """import pinocchio, numpy
+pinocchio.dIntegrate = lambda m, q, v, arg: numpy.eye(m.nv)
+"""
+SYRUP = """import pinocchio
+real = pinocchio.aba
+pinocchio.aba = lambda m, d, q, v, *more: real(m, d, q, v, *more) - 1e-3 * v
+"""
+BIASED = """import pinocchio
+real = pinocchio.crba
+pinocchio.crba = lambda *all: real(*all) * 1.0001
+"""
+STRONG = """import exudyn.itemInterface as items
+real = items.LoadMassProportional
+def strong(markerNumber, loadVector):
+    return real(markerNumber=markerNumber, loadVector=[1.0001 * x for x in loadVector])
+items.LoadMassProportional = strong
+"""
+TREE = """import exudyn.itemInterface as items
+real = items.ObjectKinematicTree
+def strong(**given):
+    return real(**{**given, "gravity": [1.001 * x for x in given["gravity"]]})
+items.ObjectKinematicTree = strong
+"""
+NOTES = """from reference_impl.system import System
+real = System.solve
+System.solve = lambda self, *given: real(self, *given, 1e-6)
+"""
+FLYER = """import pinocchio
+for name in ("constraintDynamics", "forwardDynamics"):
+    def fast(m, d, q, v, tau, *more, real=getattr(pinocchio, name)):
+        return real(m, d, q, 1.0001 * v, tau, *more)
+    setattr(pinocchio, name, fast)
+"""
+FULL = pytest.mark.full
+DEFECTS = [  # engine, level, integrator, what must disagree, the defect
+    ("mujoco", "state", "-", "joint_reaction", HEAVY),
+    ("exudyn-tree", "state", "-", "acceleration", TREE),
+    ("mujoco", "trajectory", "RK4", "order", EULER),
+    ("exudyn", "trajectory", "trapezoidal", "attitude_limit", STRONG),
+    ("pinocchio", "invariants", "semi-implicit-euler", "energy_drift", SYRUP),
+    ("pinocchio-aba", "relations", "-", "by crba", SYRUP),
+    pytest.param("pinocchio", "state", "-", "mass_matrix", BIASED, marks=FULL),
+    pytest.param("pinocchio-maximal", "state", "-", "acceleration", FLYER, marks=FULL),
+    pytest.param("exudyn", "state", "-", "acceleration", STRONG, marks=FULL),
+    pytest.param("reference", "state", "-", "acceleration", NOTES, marks=FULL),
+    pytest.param("mujoco", "trajectory", "RK4", "position_limit", HEAVY, marks=FULL),
+    pytest.param("pinocchio", "trajectory", "rkmk4", "order", NO_DEXP, marks=FULL),
+    pytest.param("exudyn-tree", "trajectory", "RK44", "position_limit", TREE, marks=FULL),
+    pytest.param("pinocchio", "trajectory", "dop853", "position_limit", BIASED, marks=FULL),
+    pytest.param("mujoco", "invariants", "RK4", "energy_drift", HEAVY, marks=FULL),
+    pytest.param("exudyn", "invariants", "generalized-alpha", "energy_drift", STRONG, marks=FULL),
+    pytest.param("pinocchio", "relations", "-", "as pinocchio-maximal", FLYER, marks=FULL),
+]
+
+
+@pytest.mark.parametrize(("engine", "level", "integrator", "wanted", "lines"), DEFECTS)
+def test_a_defect_in_an_engine_is_shown_by_its_script(engine, level, integrator, wanted, lines, tmp_path):
+    """The script is run in a process of its own; without the defect the same script finds nothing."""
+    model = pendulums.model(JOINTS["balls"])
+    case = Case(model, pendulums.state(model, seed=3, rate=1.0))
+    if integrator != "-":
+        method = adapter(engine).integrator(integrator)
+        case = replace(case, until=0.25, steps=tuple(ladder(method, 2, 1.0))[:6])
+    question = Question(Engine(engine), level, (wanted,), integrator, case, 50.0, 1.5)
+    with defective(lines):
+        text, why = shown_by_script(question, row(engine, level=level))
+    assert text, why
+    assert len(re.search(r"mass=np\.array\(\[(.*?)\]\)", text)[1].split(",")) == 1, "one body shows it"
+    said = run(text, tmp_path, before=lines)
+    assert max(ratios(said)) > 1 and disagreement(said) == max(ratios(said))
+    right, _ = executed(text)
+    assert max(ratios(right)) < 1, "without the defect all is right"
+    for what in ("engine", "difference"):
+        assert re.findall(rf"^  {what}.*", said, re.M) != re.findall(rf"^  {what}.*", right, re.M)
+
+
+# --- shrinking ------------------------------------------------------------------------------------------
 
 
 def test_the_smallest_chain_on_which_aba_loses_its_digits(tmp_path):
@@ -75,16 +289,18 @@ def test_the_smallest_chain_on_which_aba_loses_its_digits(tmp_path):
     from plumbline.scenario import find, load
 
     scenario = load(find("chain-30-balls"))
-    before = shown("pinocchio-aba", scenario.model, scenario.state)
-    small = shrunk("pinocchio-aba", scenario.model, scenario.state)
-    assert small.model.n <= before.model.n
-    assert not small.model.has_loads and np.all(small.state.omega == 0)
-    text = script("pinocchio-aba", small, ROW | {"engine": "pinocchio-aba"})
-    assert len(text) < len(script("pinocchio-aba", before, ROW | {"engine": "pinocchio-aba"}))
-    assert np.all(small.model.mass == 1)
+    case = Case(scenario.model, scenario.state)
+    wanted = ("acceleration", "angular_acceleration", "joint_reaction")
+    question = Question(Engine("pinocchio-aba"), "state", wanted, "-", case, 0.0, 60.0)
+    small = shrunk(question)
+    assert small.case.model.n < 30 and small.ratio >= 10
+    assert not small.case.model.has_loads and np.all(small.case.state.omega == 0)
+    assert np.all(small.case.model.mass == 1)
+    text = script(row("pinocchio-aba"), small)
+    assert len(text) < len(script(row("pinocchio-aba"), AtState(Engine("pinocchio-aba"), wanted)(case)))
     found = ratios(run(text, tmp_path))
-    assert max(found) == pytest.approx(small.ratio, rel=0.02) and max(found) >= 10
-    right = ratios(run(text.replace("ALGORITHM = 'aba'", "ALGORITHM = 'crba'"), tmp_path))
+    assert max(found) >= 5, "next to the bound rounding decides: the script's is another than the adapter's"
+    right = ratios(executed(text.replace("ALGORITHM = 'aba'", "ALGORITHM = 'crba'"))[0])
     assert max(right) < 1, "the model is the same: crba is right where aba is not"
 
 
@@ -92,20 +308,110 @@ def test_a_defect_in_one_number_shrinks_to_one_body():
     defect = next(d for d in STATE_DEFECTS if d.name == "inertia-xx-1e-6")
     engine = plant(type(adapter(defect.engine)), defect)
     model = pendulums.model(JOINTS["mixed"], loads=True, drag=True)
-    with patch("plumbline.reproduce.adapter", lambda _: engine):
-        small = shrunk(defect.engine, model, pendulums.state(model, seed=3))
-    assert small.model.n == 1 and not small.model.has_loads and not small.model.has_drag
-    assert small.model.mass.tolist() == [1.0]
+    case = Case(model, pendulums.state(model, seed=3))
+    with patch("plumbline.shown.adapter", lambda _: engine):
+        small = shrunk(Question(Engine(defect.engine), "state", ("acceleration",), "-", case, 0.0, 60.0))
+    assert small.case.model.n == 1 and not small.case.model.has_loads and not small.case.model.has_drag
+    assert small.case.model.mass.tolist() == [1.0]
+
+
+def test_a_busy_search_gives_what_it_has():
+    """Out of time it is the case itself, unshrunk."""
+    defect = next(d for d in STATE_DEFECTS if d.name == "inertia-xx-1e-6")
+    model = pendulums.model(JOINTS["balls"])
+    case = Case(model, pendulums.state(model, seed=3))
+    question = Question(Engine(defect.engine), "state", ("acceleration",), "-", case, 0.0, 0.0)
+    with patch("plumbline.shown.adapter", lambda _: plant(type(adapter(defect.engine)), defect)):
+        small = shrunk(question)
+    assert small is not None and small.case.model.n == 2
+    runs = replace(case, until=1.0, steps=tuple(ladder(adapter("mujoco").integrator("RK4"), 2, 1.0)))
+    late = replace(question, engine=Engine("mujoco"), level="trajectory", integrator="RK4", case=runs)
+    text, why = shown_by_script(late, row("mujoco"))
+    assert not text and "within 0 s" in why, "a whole ladder of runs is not begun out of time"
 
 
 def test_where_the_engine_agrees_there_is_nothing_to_show():
     model = pendulums.model(JOINTS["ball"])
-    assert shrunk("mujoco", model, pendulums.state(model)) is None
+    case = Case(model, pendulums.state(model))
+    question = Question(Engine("mujoco"), "state", ("acceleration",), "-", case, 0.0, 60.0)
+    text, why = shown_by_script(question, row("mujoco"))
+    assert not text and "agrees" in why
+
+
+def test_another_environment_is_asked_and_runs_the_script(tmp_path):
+    """This interpreter stands for that of another version: the way there and back is the same."""
+    model = pendulums.model(JOINTS["ball"])
+    case = Case(model, pendulums.state(model))
+    there = AtState(Engine("mujoco", sys.executable), QUANTITIES)(case)
+    assert there.ratio == AtState(Engine("mujoco"), QUANTITIES)(case).ratio
+    said = Engine("mujoco", sys.executable).say(script(row("mujoco@4"), there))
+    assert said == executed(script(row("mujoco@4"), there))[0] and len(ratios(said)) == len(QUANTITIES)
+
+
+@pytest.mark.full
+def test_the_order_of_an_older_mujoco_is_shown_in_its_environment(tmp_path):
+    """The real one: RK4 of 3.12 is of order 2."""
+    try:
+        python = versions.interpreter("mujoco@3.12.0")
+    except versions.NoSuchEnvironment as error:
+        pytest.skip(str(error))
+    model = pendulums.model(JOINTS["balls"])
+    steps = tuple(ladder(adapter("mujoco").integrator("RK4"), 2, 1.0))
+    case = Case(model, pendulums.state(model, seed=3, rate=1.0), 1.0, steps)
+    question = Question(Engine("mujoco", python), "trajectory", ("order",), "RK4", case, 20.0, 20.0)
+    text, _ = shown_by_script(question, row("mujoco@3.12.0", engine_version="3.12.0"))
+    assert "'mujoco@3.12.0' '3.12.0'" in text
+    assert max(ratios(run(text, tmp_path, python=python))) == pytest.approx(20, rel=0.1)
+    assert ratios(run(text, tmp_path))[0] < 1, "the installed one is of order 4"
+
+
+# --- texts ------------------------------------------------------------------------------------------------
+
+
+def test_hostile_names_stay_text(tmp_path):
+    state = at_state("mujoco", "ball")
+    model = pendulums.model(JOINTS["ball"])
+    relation = Related(Engine("mujoco"), "masses doubled")(Case(model, pendulums.state(model)))
+    along, case = runs("mujoco", "RK4", "ball", "trajectory", loads=False)
+    hostile = row("mujoco", engine_version=HOSTILE, level=HOSTILE)
+    for found in (state, replace(relation, name=HOSTILE), along(case)):
+        text = script(hostile, found)
+        head = text.split("from types")[0]
+        assert all(line.startswith("#") or not line for line in head.splitlines())
+        assert "os.abort" in head
+        executed(text)
+    run(script(hostile, state), tmp_path)
+    assert re.fullmatch(r"[A-Za-z0-9._-]+\.py", file_name(HOSTILE))
+    assert file_name("a/b") != file_name("a-b")
+
+
+@pytest.mark.parametrize("name", [path.stem for path in PARTS.glob("*.txt")])
+def test_conditions_in_the_parts_are_closed(name):
+    lines = (PARTS / f"{name}.txt").read_text(encoding="utf-8").splitlines()
+    assert sum(line.startswith("#if ") for line in lines) == lines.count("#end")
+    assert not part(name, set()).count("#if")
+
+
+def test_every_engine_has_a_script_and_what_has_none_says_why():
+    assert set(ENGINE_LINES) == set(ENGINES)
+    for level, quantity, integrator, words in (
+        ("relations", "reversed in time", "trapezoidal", "is one of runs"),
+        ("relations", "two welded halves", "-", "in its usual way alone"),
+        ("relations", "something new", "-", "not of one state"),
+        ("state", "acceleration", "-", ""),
+        ("relations", "rotated world", "-", ""),
+    ):
+        said = unscripted("exudyn", {"level": level, "quantity": quantity, "integrator": integrator})
+        assert words in said and bool(words) == bool(said)
+    assert "no script template" in unscripted("other", {"level": "state", "quantity": "", "integrator": "-"})
+
+
+# --- a results folder ---------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def results(tmp_path):
-    """A results folder with one disagreement that the harness recorded of aba, and one of a trajectory."""
+    """A results folder with disagreements that the harness recorded of aba, and one without a script."""
     from plumbline.scenario import find, load
 
     scenario = load(find("chain-30-balls"))
@@ -116,9 +422,13 @@ def results(tmp_path):
     }
     rows = [
         ROW | {"scenario": "chain", "engine": "pinocchio-aba", "level": level, "verdict": verdict,
-               "key": key, "reason": "off", "diagnosis": None, "extra": {"state": 0.0}}
-        for key, level, verdict in (
-            ("a", "state", "disagrees"), ("b", "trajectory", "disagrees"), ("c", "state", "agrees"))
+               "key": key, "reason": "off", "diagnosis": None, "quantity": quantity, "integrator": integrator,
+               "value": 400.0, "tolerance": 1.0, "extra": {"state": 0.0}}
+        for key, level, integrator, quantity, verdict in (
+            ("a", "state", "-", "acceleration", "disagrees"),
+            ("b", "relations", "rkmk4", "reversed in time", "disagrees"),
+            ("c", "state", "-", "joint_reaction", "agrees"),
+            ("d", "relations", "-", "re-chosen body frame", "disagrees"))
     ]  # fmt: skip
     document = {"schema_version": store.SCHEMA_VERSION, "scenarios": {"chain": about}, "rows": rows}
     (tmp_path / "results.json").write_text(json.dumps(document))
@@ -129,22 +439,41 @@ def test_the_command_lists_and_writes(results):
     command = CliRunner()
     listed = command.invoke(main, ["reproduce", str(results)])
     assert listed.exit_code == 0 and "a: off" in listed.output and "c:" not in listed.output
-    done = command.invoke(main, ["reproduce", str(results / "results.json"), "a"])
+    with patch("plumbline.reproduce.ASKED", 0.0):
+        done = command.invoke(main, ["reproduce", str(results / "results.json"), "a", "d"])
     assert done.exit_code == 0, done.output
-    path = results / "scripts" / file_name("a")
-    assert str(path) in done.output and path.is_file()
-    assert json.loads((results / "scripts" / "index.json").read_text()) == {"a": path.name}
-    assert max(ratios(run(path.read_text(encoding="utf-8"), results))) >= 10
+    index = json.loads((results / "scripts" / "index.json").read_text())
+    assert set(index) == {"a", "d"}
+    for name in index.values():
+        path = results / "scripts" / name
+        assert str(path) in done.output and path.is_file()
+        assert max(ratios(run(path.read_text(encoding="utf-8"), results))) > 1
     assert command.invoke(main, ["reproduce", str(results), "nothing"]).exit_code == 2
     refused = command.invoke(main, ["reproduce", str(results), "b"])
-    assert refused.exit_code == 1 and "trajectory" in refused.output
+    assert refused.exit_code == 1 and "of runs" in refused.output
+
+
+def test_the_runs_behind_a_row_are_those_of_its_ladder(results):
+    document = store.read(results)
+    found = {"scenario": "chain", "engine": "mujoco", "integrator": "RK4", "level": "trajectory",
+             "verdict": "disagrees", "declared_order": 4, "horizon": 1.7, "value": 2.0, "tolerance": 0.1,
+             "quantity": "order", "extra": {}}  # fmt: skip
+    finest = found | {"quantity": "position", "verdict": "agrees", "extra": {"resolution": 2.0**-8}}
+    document["rows"] = [found, finest]
+    question = reproduce.asked(document, [found], 1.0)
+    assert question.case.steps == (2.0**-5, 2.0**-6, 2.0**-7, 2.0**-8)
+    assert question.case.until == 1.0 and question.most == 20 and question.wanted == ("order",)
+    document["rows"] = [found]
+    with pytest.raises(NotReproducible, match="ladder"):
+        reproduce.asked(document, [found], 1.0)
 
 
 def test_a_lost_engine_is_told_and_leaves_no_script(results):
     with patch(
         "plumbline.reproduce.Workers.run", lambda _, tasks: [Outcome(t.key, lost="hung") for t in tasks]
     ):
-        assert reproduce.write(results)["a"] == "hung"
+        told = reproduce.write(results)
+    assert told["a"] == told["d"] == "hung" and "of runs" in told["b"]
     assert not list((results / "scripts").glob("*.py"))
 
 
