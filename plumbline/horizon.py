@@ -7,6 +7,8 @@ that G stays the growth of a small perturbation however large it gets.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from plumbline.kinematics import angular_velocity, conjugate, joint_vectors, lift, multiply, rate, rotation
@@ -40,12 +42,21 @@ def growth(model: Model, state: State, times: Array) -> Array:
     Distances are in units of the perturbation: of positions over size × the largest distance from the
     pivot, of attitudes over the size itself, whichever is larger.
     """
-    forest = Forest([Chain(**vars(model))]).tile(TWINS + 1)
-    base, near = state, twins(model, state)
+    return growth_beside(model, state, times, [])[0]
+
+
+def growth_beside(
+    model: Model, state: State, times: Array, others: Sequence[tuple[Model, State]]
+) -> tuple[Array, Array, Array]:
+    """G (T,), and r, p (1 + others, T, N, ·) of the model and ``others``, as many bodies, in common steps."""
+    forest = Forest([Chain(**vars(m)) for m in ([model] * (TWINS + 1) + [m for m, _ in others])])
+    states = [state, *twins(model, state), *(s for _, s in others)]
     size, grown = np.full(TWINS, TWIN), np.empty((TWINS, len(times)))
     scale, done, arm = np.ones(TWINS), 0, 1e-3
+    r, p, v, pdot = _run(forest, states, times)
+    shown = [0, *range(TWINS + 1, len(states))]
+    beside = r[shown], p[shown]
     while True:
-        r, p, v, pdot = _run(forest, [base, *near], times[done:])
         arm = max(arm, float(np.max(np.linalg.norm(r[0], axis=-1))))
         away = np.array(
             [
@@ -53,9 +64,9 @@ def growth(model: Model, state: State, times: Array) -> Array:
                 for k in range(1, TWINS + 1)
             ]
         )
-        grown[:, done:] = scale[:, None] * away / size[:, None]
+        grown[:, done : done + away.shape[1]] = scale[:, None] * away / size[:, None]
         far = np.flatnonzero(np.any(away > FAR * TWIN, axis=0))
-        stop = max(int(far[0]), 1) if len(far) else len(times)
+        stop = max(int(far[0]), 1) if len(far) else away.shape[1] - 1
         if done + stop >= len(times) - 1:
             break
         base, *close = (
@@ -67,7 +78,10 @@ def growth(model: Model, state: State, times: Array) -> Array:
             _between(model, base, twin, part) for twin, part in zip(close, size / away[:, stop], strict=True)
         ]
         done += stop
-    return np.asarray(np.maximum(np.max(grown, axis=0), 1.0))
+        if others:
+            forest, others = Forest([Chain(**vars(model))]).tile(TWINS + 1), []
+        r, p, v, pdot = _run(forest, [base, *near], times[done : done + 2 * stop + 1])
+    return np.asarray(np.maximum(np.max(grown, axis=0), 1.0)), *beside
 
 
 def twins(model: Model, state: State, size: float = TWIN, count: int = TWINS) -> list[State]:

@@ -1,8 +1,8 @@
 """What engines are measured with: the truth of a scenario, how sure it is, and how sharp it must be.
 
-Runs inside a worker.  State level: rigorous enclosures in ball arithmetic.  Along
-trajectories: the closed form where the scenario has one, else the notes' form by two methods of
-different kind, collocation and DOP853, their difference being its uncertainty.
+Runs inside a worker.  State level: rigorous enclosures in ball arithmetic.  Along trajectories: the closed
+form where the scenario has one, else Taylor's method in minimal coordinates; uncertain by the difference
+from a method of another kind (`plumbline.truth.trajectory`).
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from plumbline.bound import Bound, state_bound
-from plumbline.flow import flow
-from plumbline.horizon import growth
+from plumbline.horizon import growth_beside
 from plumbline.kinematics import lift
 from plumbline.measures import attitude_error, position_error
 from plumbline.records import Array, Model, State, StateQuantities, Trajectory
@@ -22,9 +21,10 @@ from plumbline.registry import adapter
 from plumbline.sampling import seed_of
 from plumbline.truth import TruthUnavailable
 from plumbline.truth.certified import certify
+from plumbline.truth.trajectory import COMPILED, Exact, trajectory_truth
 
-FINE, COARSE = 1e-14, 1e-13  # relative tolerances of the truth's two runs
 ROUNDING = 1e3 * 2.0**-52  # of a whole run, before growth: trials saw at most 115 ε G (verification.md)
+PARTED = "; they part by more than rounding explains: one of the two is wrong, or at its limits"
 PART = 1e-4  # a mistake of this relative size in a parameter must be visible, or the verdict is unresolved
 
 
@@ -67,25 +67,26 @@ def state_truth(model: Model, states: Sequence[State]) -> StateTruth:
 
 
 def motion_truth(
-    model: Model, state: State, times: Array, exact: tuple[Array, Array, str] | None
+    model: Model, state: State, times: Array, exact: Exact | None, compiled: int = COMPILED
 ) -> MotionTruth:
-    """True motion from ``state`` at ``times``; ``exact`` is a closed form's (r, p, source), if any."""
-    (run,) = flow([model], [state], times, FINE)
-    (second,) = flow([model], [state], times, COARSE, "dop853")
-    r, p = second.r, second.p
-    method = f"the notes' form by collocation at rtol {FINE:g} and by DOP853 at {COARSE:g}; their difference"
-    if exact is not None:
-        r, p, source = exact
-        run = replace(run, r=r, p=p)
-        method = f"closed form: {source}"
+    """True motion from ``state`` at ``times``; ``exact`` is a closed form's (r, p, source), if any.
+
+    Taylor's method is asked of up to ``compiled`` bodies: of none by 0, for where it brought a worker down.
+    """
+    found = trajectory_truth(model, state, times, exact, compiled)
+    grown, r, p = growth_beside(model, state, times, mistaken(model, state))
+    grown, length = np.maximum.accumulate(grown), float(np.sum(reach(model)))
+    apart = (found.position_uncertainty > length * ROUNDING * grown) | (
+        found.attitude_uncertainty > 2 * ROUNDING * grown
+    )
     return MotionTruth(
-        run,
-        np.maximum.accumulate(position_error(run.r, r)),
-        np.maximum.accumulate(attitude_error(run.p, p)),
-        np.maximum.accumulate(growth(model, state, times)),
-        *visible(model, state, times),
-        length=float(np.sum(reach(model))),
-        method=method,
+        found.trajectory,
+        found.position_uncertainty,
+        found.attitude_uncertainty,
+        grown,
+        *visible(model, r, p),
+        length=length,
+        method=found.method + (PARTED if apart.any() else ""),
     )
 
 
@@ -101,12 +102,11 @@ def reach(model: Model) -> Array:
     return np.asarray(model.length + np.max(sizes, axis=0))
 
 
-def visible(model: Model, state: State, times: Array) -> tuple[Array, Array]:
-    """Least effects (T,) m and (T,) rad, up to each time, of mistakes of one part in 10⁴.
+def mistaken(model: Model, state: State) -> list[tuple[Model, State]]:
+    """The model with mistakes of one part in 10⁴, and the same minimal state lifted onto each of them.
 
-    Gravity, the masses, the inertias, the attachments are wrong in turn, each entry by ±1e-4 of
-    itself with random signs; the same minimal state is lifted onto the wrong model.  Mistakes that
-    no motion of this scenario shows (mass of a single body, anything of a body at rest) do not count.
+    Gravity, the masses, the inertias, the attachments are wrong in turn, each entry by ±1e-4 of itself with
+    random signs.
     """
     rng = np.random.default_rng(seed_of("visible"))
 
@@ -116,19 +116,24 @@ def visible(model: Model, state: State, times: Array) -> tuple[Array, Array]:
     entries = off(np.ones((model.n, 3, 3)))
     lopsided = model.inertia * (entries + entries.mT) / 2  # scaled as a whole a free body would not show it
     models = [
-        model,
         replace(model, gravity=model.gravity * (1 + PART)),
         replace(model, mass=off(model.mass)),
         replace(model, inertia=lopsided),
         replace(model, proximal=off(model.proximal), distal=off(model.distal)),
     ]
-    right, *wrong = flow(
-        models, [lift(m, state.p, state.omega, state.u, state.udot) for m in models], times, 1e-9
-    )
+    return [(m, lift(m, state.p, state.omega, state.u, state.udot)) for m in models]
+
+
+def visible(model: Model, r: Array, p: Array) -> tuple[Array, Array]:
+    """Least effects (T,) m and rad, up to each time, of mistakes: r and p of the right motion, then theirs.
+
+    Mistakes that no motion of this scenario shows (mass of a single body, anything of a body at rest) do not
+    count.
+    """
     scale = PART * float(np.sum(reach(model)))
     return (
-        least_visible([position_error(right.r, run.r) for run in wrong], 1e-3 * scale),
-        least_visible([attitude_error(right.p, run.p) for run in wrong], 1e-3 * PART),
+        least_visible([position_error(r[0], wrong) for wrong in r[1:]], 1e-3 * scale),
+        least_visible([attitude_error(p[0], wrong) for wrong in p[1:]], 1e-3 * PART),
     )
 
 
