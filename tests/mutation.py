@@ -17,7 +17,6 @@ reason, or where that file lists one that is noticed or no longer there.
 from __future__ import annotations
 
 import argparse
-import difflib
 import gc
 import importlib
 import itertools
@@ -178,12 +177,8 @@ def mutants(files: Sequence[str], sample: int | None, seed: int) -> list[Mutant]
         places = [places[i] for i in sorted(chosen)]
     made = []
     for file, module, node, mutated, line, reach in places:
-        changed = module.deep_replace(node, mutated)
-        code = changed.code  # type: ignore[union-attr]
-        diff = list(difflib.ndiff(module.code.splitlines(), code.splitlines()))
-        was, now = (
-            "\n".join(text[2:].strip() for text in diff if text.startswith(sign)) for sign in ("- ", "+ ")
-        )
+        code = module.deep_replace(node, mutated).code  # type: ignore[union-attr]
+        was, now = changed_lines(module.code.splitlines(), code.splitlines())
         try:
             compile(code, file, "exec")
         except SyntaxError:
@@ -191,6 +186,20 @@ def mutants(files: Sequence[str], sample: int | None, seed: int) -> list[Mutant]
         if was or now:
             made.append(Mutant(file, line, reach, was, now, code))
     return made
+
+
+def changed_lines(before: Sequence[str], after: Sequence[str]) -> tuple[str, str]:
+    """What stands between the first and the last line that differ, in both."""
+
+    def alike(one: Sequence[str], other: Sequence[str]) -> int:
+        """How many lines are the same at the start."""
+        return len(list(itertools.takewhile(lambda pair: pair[0] == pair[1], zip(one, other, strict=False))))
+
+    first = alike(before, after)
+    rest = before[first:], after[first:]
+    last = alike(rest[0][::-1], rest[1][::-1])
+    was, now = ("\n".join(line.strip() for line in side[: len(side) - last]) for side in rest)
+    return was, now
 
 
 # --- which test reaches what --------------------------------------------------------------------

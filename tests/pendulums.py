@@ -8,7 +8,9 @@ from functools import cache
 import numpy as np
 
 from plumbline import kinematics
-from plumbline.records import Array, Model, State
+from plumbline.records import Array, Model, State, Trajectory
+from reference_impl.chain import Chain
+from reference_impl.collocation import integrate
 
 JOINTS = {  # b: hung by a ball joint, r: by a rod
     "ball": "b",
@@ -58,6 +60,13 @@ def state(subject: Model, seed: int = 0, rate: float = 3.0) -> State:
     omega = rate * rng.normal(size=(n, 3))
     p /= np.linalg.norm(p, axis=1, keepdims=True)
     return kinematics.lift(subject, p, omega, np.where(rod, u, 0.0), np.where(rod, udot, 0.0))
+
+
+def motion(subject: Model, at: State, times: Array) -> Trajectory:
+    """The motion by the reference's collocation, held on its manifold."""
+    start = at.r, at.p, at.v, kinematics.rate(at.p, at.omega)
+    run = integrate([Chain(**vars(subject))], *start, times, 1e-13, projected=True)
+    return Trajectory(times, run.r, run.p, run.v, run.pdot, run.steps)
 
 
 def flipped(at: State) -> State:

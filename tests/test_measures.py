@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.flow import flow
 from plumbline.kinematics import joint_vectors, lift, multiply, rate
 from plumbline.measures import (
     UNITS,
@@ -21,7 +20,7 @@ from plumbline.measures import (
     work,
 )
 from plumbline.records import Array, Model, Trajectory
-from tests import newton_euler
+from tests import newton_euler, pendulums
 from tests.random_chains import random_chain
 
 TIMES = np.linspace(0.0, 1.0, 41)
@@ -29,7 +28,7 @@ TIMES = np.linspace(0.0, 1.0, 41)
 
 def motion(rods: list[bool], times: Array = TIMES, **options: bool) -> tuple[Model, Trajectory]:
     model, state = random_chain(np.random.default_rng(70), rods, **options)
-    return model, flow(model, state, times, 1e-13)
+    return model, pendulums.motion(model, state, times)
 
 
 def test_position_error_is_the_largest_distance_of_a_body() -> None:

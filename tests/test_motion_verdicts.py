@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from plumbline.findings import Subject
-from plumbline.flow import flow
 from plumbline.kinematics import angular_velocity, multiply
 from plumbline.measures import invariants
 from plumbline.motion_verdicts import PER_STEP, Ladder, judge_motion
@@ -19,7 +18,7 @@ from tests import pendulums
 
 TIMES = np.linspace(0, 2, 17)
 MODEL = pendulums.model("b")
-TRUE = flow(MODEL, pendulums.state(MODEL, seed=2, rate=0.5), TIMES, 1e-13)
+TRUE = pendulums.motion(MODEL, pendulums.state(MODEL, seed=2, rate=0.5), TIMES)
 WHO = Subject("s", "f", "mujoco", "MuJoCo", "4")
 METHOD = Integrator("Heun", "step", 2, (2, 3, 4))
 STEPS = tuple(2.0**-k for k in range(5, 11))
@@ -230,7 +229,7 @@ def test_attitudes_have_two_signs():
 def test_scales_are_sizes_of_what_the_invariants_are_made_of():
     model = pendulums.model("br")
     state = pendulums.state(model, seed=3, rate=4.0)
-    true = flow(model, state, TIMES, 1e-12)
+    true = pendulums.motion(model, state, TIMES)
     held = Ladder(WHO, model, truth(trajectory=true), METHOD, [Rung(0.1, true, None, 0.0)], 2.0)
     scales, omega = held.scales(), angular_velocity(true.p, true.pdot)
     g = np.linalg.norm(model.gravity)
@@ -294,7 +293,7 @@ def test_a_drift_of_rounding_agrees_at_once(steps, counted):
 def test_what_the_quadrature_of_the_work_leaves_open_is_allowed():
     """Drag: energy by the samples' spline; its uncertainty is part of the tolerance, and only there."""
     model = replace(MODEL, drag_moment=np.array([1e-5]))
-    true = flow(model, pendulums.state(model, seed=2, rate=0.5), TIMES, 1e-13)
+    true = pendulums.motion(model, pendulums.state(model, seed=2, rate=0.5), TIMES)
     rungs = [Rung(h, replace(true, v=true.v * (1 + h**2 * TIMES[:, None, None])), None, 0.0) for h in STEPS]
     found = rows(Climb(rungs, None), model=model, trajectory=true)
     uncertain = invariants(model, rungs[-1].trajectory).work_uncertainty
