@@ -104,7 +104,7 @@ class History:
                    count(*) FILTER ({BAD}) AS bad,
                    count(*) FILTER (known IS NOT NULL) AS as_recorded,
                    count(DISTINCT scenario) FILTER (family = '{FAMILY}') AS random
-            FROM nights LEFT JOIN rows USING (night) GROUP BY ALL ORDER BY min(night)
+            FROM nights LEFT JOIN rows USING (night) GROUP BY night, id, started, exit_code ORDER BY night
             """
         )
 

@@ -101,15 +101,15 @@ def nightly(
         memory=Cells(unfinished / "cells", tell),
     )
     result = execute(plan, progress)
+    place = free(out / "history" / result.run["id"])
+    result.run |= {"id": place.name, "night": number(place.parent)}
     result.run |= {"started": night.started, "random": night.random, "seed": night.seed}
-    result.run["night"] = number(out / "history")
     folder = unfinished / "night"
     shutil.rmtree(folder, ignore_errors=True)
     save(result, folder, command)
     write_files_of_random(result, drawn, folder / "scenarios")
     with result.split.measure("report"):
         reports.write(folder, out / "history")
-    place = free(out / "history" / result.run["id"])
     place.parent.mkdir(exist_ok=True)
     os.replace(folder, place)
     shutil.rmtree(unfinished)

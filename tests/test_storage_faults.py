@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -196,3 +197,24 @@ def test_a_clock_set_back_overwrites_no_night(tmp_path):
     assert nightly.free(place) == place
     place.mkdir()
     assert nightly.free(place).name == "20260101T000000Z-2"
+
+
+def test_nights_are_told_in_the_order_in_which_they_were_made(tmp_path, monkeypatch):
+    """The clock is set back, forward within the second night, and then shows the first one again."""
+    monkeypatch.setattr(run, "Workers", Here)
+    monkeypatch.setattr(nightly, "Plan", lambda *a, **k: Plan(*a, **k, states=1))
+    days = iter([10, 10, 5, 8, 10, 10])  # when a night begins, and when its run does
+
+    class Clock(datetime):
+        @classmethod
+        def now(cls, tz=None):
+            return datetime(2026, 1, next(days), tzinfo=tz)
+
+    monkeypatch.setattr(nightly, "datetime", Clock)
+    monkeypatch.setattr(run, "datetime", Clock)
+    made = [night(tmp_path)[1].name for _ in range(3)]
+    assert made == ["20260110T000000Z", "20260108T000000Z", "20260110T000000Z-2"]
+    history = History(tmp_path)
+    assert [n.folder.name for n in history.nights] == made
+    assert [n["id"] for n in history.overview()] == made
+    assert [t["id"] for t in history.trend("rest/mujoco/state/-/acceleration")] == made

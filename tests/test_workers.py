@@ -5,12 +5,16 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
 import pytest
 
+from plumbline.scratch import sweep
 from plumbline.workers import Limits, Task, Workers
+
+ROOT = Path(__file__).parents[1]
 
 
 def double(x: int) -> int:
@@ -85,6 +89,59 @@ def test_files_and_output_of_an_engine_go_nowhere(capfd, tmp_path, monkeypatch):
     assert not Path(outcome.value).exists(), "the scratch folder is removed"
     assert list(tmp_path.iterdir()) == []
     assert "noise" not in "".join(capfd.readouterr())
+
+
+def nap(seconds: float) -> float:
+    time.sleep(seconds)
+    return seconds
+
+
+def test_a_clock_that_is_set_neither_kills_nor_spares(monkeypatch):
+    """By the clock of the wall the nap would be over its limit, and the hang within it for an hour."""
+    real, off = time.time, [0.0]
+    monkeypatch.setattr(time, "time", lambda: real() + off[0])
+    with Workers(2) as workers:
+        for step in (3600.0, -3600.0):
+            tasks = [
+                Task("go", double, (1,)),
+                Task("nap", nap, (2.0,), Limits(seconds=60)),
+                Task("hang", hang, (), Limits(seconds=3)),
+            ]
+            found = {}
+            for outcome in workers.run(tasks):
+                if outcome.key == "go":
+                    off[0] += step  # while the others run
+                found[outcome.key] = outcome
+            assert found["nap"].value == 2.0
+            assert "hung" in (found["hang"].lost or "")
+
+
+def test_what_a_killed_run_leaves_is_removed_by_the_next(tmp_path, monkeypatch):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    script = (
+        "import time; from plumbline.scratch import Scratch\n"
+        "mine = Scratch(); print(mine.path, flush=True); time.sleep(600)"
+    )
+    owners = [
+        subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+        for _ in range(2)
+    ]
+    dead, alive = (Path(p.stdout.readline().strip()) for p in owners)
+    (dead / "deep").mkdir()
+    (dead / "deep" / "file").write_text("x")
+    (tmp_path / "plumbline-of-somebody").mkdir()  # none of ours: nobody locks it
+    owners[0].kill()
+    owners[0].wait()
+    assert dead.is_dir() and alive.is_dir(), "nobody has come by yet"
+    with Workers(1) as workers:
+        mine = workers._scratch.path
+        assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith("plumbline-")) == sorted(
+            [alive.name, mine.name, "plumbline-of-somebody"]
+        )
+    owners[1].kill()
+    owners[1].wait()
+    assert not mine.exists() and sweep("plumbline-") == [alive]
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the parent-death signal is Linux's")
