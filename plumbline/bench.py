@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from plumbline import relations, versions, work, yardstick
+from plumbline import outlier, relations, versions, work, yardstick
 from plumbline.converge import ladder
 from plumbline.endurance import course, endure, judge_endurance
 from plumbline.exact import solution
@@ -110,6 +110,7 @@ class Bench:
                 if key[1] == name and key in self.judged:
                     found.rows += self.judged[key].rows
                     found.tables += self.judged[key].tables
+        found.rows = outlier.told(found.rows)
         return found
 
     def who(self, engine: str) -> Subject:

@@ -20,6 +20,7 @@ from plumbline.suspect import answer, case
 from tests import pendulums
 from tests.pendulums import JOINTS
 from tests.planted import STATE_DEFECTS, Defect, field, model_change, parameter, plant
+from tests.random_chains import random_chain
 
 for engine in ("mujoco", "pinocchio", "exudyn"):
     pytest.importorskip(engine)
@@ -305,3 +306,29 @@ def test_drag_is_not_reversed_and_a_failing_run_is_told():
     rows = judge_relations(Subject("s", "f", "e", "E", "0"), found).rows
     assert {(row.verdict, row.reason) for row in rows} == {("failed", "it stopped")}
     assert {row.integrator for row in rows} == {"trapezoidal", "generalized-alpha"}
+
+
+def test_a_step_too_coarse_to_be_solved_is_taken_finer():
+    tried = []
+
+    class Stiff(exudyn()):
+        def _rows(self, chain, times, integrator, step, afresh=True):
+            tried.append(step)
+            if step > max(tried) / 4:
+                raise EngineFailure("no convergence")
+            return super()._rows(chain, times, integrator, step, afresh)
+
+    found = ran(Stiff(), "reversed in time")
+    assert found.ratio < 0.3 and min(tried) == max(tried) / 4
+
+
+def test_a_light_body_among_heavy_ones_is_solved_less_sharply():
+    """The step's residual is small beside the heaviest body's: 2.6 times over without the ratio of masses."""
+    rng = np.random.default_rng([7, 174])
+    n, _ = int(rng.integers(1, 9)), rng.choice(3)
+    rods, rate = list(rng.random(n) < 0.4), float(rng.choice([0.5, 2, 10]))
+    loads, _ = rng.random() < 0.5, rng.random()
+    model, state = random_chain(rng, rods, decades=3, rate=rate, loads=bool(loads))
+    assert np.max(model.mass) > 1e2 * np.min(model.mass)
+    (held,) = (h for h in runs(exudyn()(), model, state) if h.relation == "reversed in time")
+    assert held.ratio < 0.3
