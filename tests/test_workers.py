@@ -100,19 +100,20 @@ def test_a_clock_that_is_set_neither_kills_nor_spares(monkeypatch):
     """By the clock of the wall the nap would be over its limit, and the hang within it for an hour."""
     real, off = time.time, [0.0]
     monkeypatch.setattr(time, "time", lambda: real() + off[0])
-    with Workers(2) as workers:
+    with Workers(3) as workers:
+        list(workers.run([Task(k, nap, (1.0,)) for k in range(6)]))  # now all three are there
         for step in (3600.0, -3600.0):
             tasks = [
-                Task("go", double, (1,)),
-                Task("nap", nap, (2.0,), Limits(seconds=60)),
-                Task("hang", hang, (), Limits(seconds=3)),
+                Task("nap", nap, (3.0,), Limits(seconds=60)),
+                Task("hang", hang, (), Limits(seconds=4)),
+                Task("go", nap, (1.0,)),
             ]
             found = {}
             for outcome in workers.run(tasks):
                 if outcome.key == "go":
                     off[0] += step  # while the others run
                 found[outcome.key] = outcome
-            assert found["nap"].value == 2.0
+            assert found["nap"].value == 3.0
             assert "hung" in (found["hang"].lost or "")
 
 
