@@ -44,7 +44,7 @@ from typing import Any
 import coverage
 import libcst as cst
 import pytest
-from libcst.metadata import MetadataWrapper, ParentNodeProvider, PositionProvider
+from libcst.metadata import CodeRange, MetadataWrapper, ParentNodeProvider, PositionProvider
 from mutmut.mutation.mutators import mutation_operators
 from ruamel.yaml import YAML
 
@@ -135,8 +135,7 @@ class Finder(cst.CSTVisitor):
     METADATA_DEPENDENCIES = (PositionProvider, ParentNodeProvider)
 
     def __init__(self) -> None:
-        self.found: list[tuple[cst.CSTNode, cst.CSTNode, int, tuple[int, int]]] = []
-        self.deaf = 0  # inside of what has no behaviour
+        self.found: list[tuple[CodeRange, cst.CSTNode, tuple[int, int]]] = []
 
     def on_visit(self, node: cst.CSTNode) -> bool:
         """Gather the node's mutants; False where nothing inside of it is looked at."""
@@ -148,19 +147,18 @@ class Finder(cst.CSTVisitor):
             return False
         for kind, operator in mutation_operators:
             if isinstance(node, kind):
-                found = [m for m in operator(node) if counts(node, m)]
-                self.found += [(node, m, *self.lines(node)) for m in found]
+                place = self.get_metadata(PositionProvider, node)
+                self.found += [(place, m, self.lines(node)) for m in operator(node) if counts(node, m)]
         return True
 
-    def lines(self, node: cst.CSTNode) -> tuple[int, tuple[int, int]]:
-        """The node's line, and the lines of its statement up to it."""
-        place = self.get_metadata(PositionProvider, node)
+    def lines(self, node: cst.CSTNode) -> tuple[int, int]:
+        """The lines of the node's statement; of a compound one, up to the node."""
         around: Any = node
         while not isinstance(around, cst.SimpleStatementLine | cst.BaseCompoundStatement):
             around = self.get_metadata(ParentNodeProvider, around)
-        whole = self.get_metadata(PositionProvider, around)
-        simple = isinstance(around, cst.SimpleStatementLine)
-        return place.start.line, (whole.start.line, whole.end.line if simple else place.end.line)
+        end = around if isinstance(around, cst.SimpleStatementLine) else node
+        first, last = (self.get_metadata(PositionProvider, x) for x in (around, end))
+        return first.start.line, last.end.line
 
 
 def mutants(files: Sequence[str], sample: int | None, seed: int) -> list[Mutant]:
@@ -176,30 +174,38 @@ def mutants(files: Sequence[str], sample: int | None, seed: int) -> list[Mutant]
         chosen = random.Random(seed).sample(range(len(places)), min(sample, len(places)))
         places = [places[i] for i in sorted(chosen)]
     made = []
-    for file, module, node, mutated, line, reach in places:
-        code = module.deep_replace(node, mutated).code  # type: ignore[union-attr]
+    for file, module, place, mutated, reach in places:
+        code = spliced(module.code, place, module.code_for_node(mutated))
         was, now = changed_lines(module.code.splitlines(), code.splitlines())
         try:
             compile(code, file, "exec")
         except SyntaxError:
             continue
         if was or now:
-            made.append(Mutant(file, line, reach, was, now, code))
+            made.append(Mutant(file, place.start.line, reach, was, now, code))
     return made
 
 
+def spliced(code: str, place: CodeRange, text: str) -> str:
+    """The code with the text in that place."""
+    lines = code.splitlines(keepends=True)
+    first, last = place.start.line - 1, place.end.line - 1
+    changed = lines[first][: place.start.column] + text + lines[last][place.end.column :]
+    return "".join([*lines[:first], changed, *lines[last + 1 :]])
+
+
 def changed_lines(before: Sequence[str], after: Sequence[str]) -> tuple[str, str]:
-    """What stands between the first and the last line that differ, in both."""
+    """What stands between the first and the last line that differ by more than blanks, in both."""
+    one, other = ([line.strip() for line in lines] for lines in (before, after))
 
     def alike(one: Sequence[str], other: Sequence[str]) -> int:
         """How many lines are the same at the start."""
         return len(list(itertools.takewhile(lambda pair: pair[0] == pair[1], zip(one, other, strict=False))))
 
-    first = alike(before, after)
-    rest = before[first:], after[first:]
-    last = alike(rest[0][::-1], rest[1][::-1])
-    was, now = ("\n".join(line.strip() for line in side[: len(side) - last]) for side in rest)
-    return was, now
+    first = alike(one, other)
+    one, other = one[first:], other[first:]
+    last = alike(one[::-1], other[::-1])
+    return "\n".join(one[: len(one) - last]), "\n".join(other[: len(other) - last])
 
 
 # --- which test reaches what --------------------------------------------------------------------
