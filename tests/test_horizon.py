@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.horizon import _between, _minimal, growth, horizon, twins
+from plumbline.flow import flow
+from plumbline.horizon import _between, _minimal, growth, growth_beside, horizon, twins
 from plumbline.kinematics import lift, rate
 from plumbline.measures import position_error
 from plumbline.scenario import find, load
@@ -63,6 +64,20 @@ def test_twins_are_on_the_manifold_and_close(rods):
         for name in ("p", "omega", "u", "udot", "r", "v"):
             middle = (getattr(twin, name) + getattr(state, name)) / 2
             assert getattr(half, name) == pytest.approx(middle, abs=1e-11), name
+
+
+def test_others_run_beside_it_as_they_do_alone():
+    """Past the time at which twins have moved so far that they run on without the others."""
+    model, state, own = upright()
+    heavier = replace(model, mass=2 * model.mass, inertia=3 * model.inertia)
+    leaning = twins(heavier, state, size=1e-3, count=1)[0]
+    times = np.linspace(0, 16 / own, 41)
+    found, r, p = growth_beside(model, state, times, [(heavier, leaning)])
+    assert found == pytest.approx(growth(model, state, times), rel=1e-3)
+    for run, (m, s) in enumerate([(model, state), (heavier, leaning)]):
+        alone = flow(m, s, times, 1e-12)
+        assert np.max(position_error(r[run], alone.r)) < 1e-7
+        assert np.max(np.abs(p[run] - alone.p)) < 1e-6
 
 
 def test_horizon_is_the_last_tolerable_time():

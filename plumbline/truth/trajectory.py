@@ -2,8 +2,8 @@
 
 Heyoka's Taylor method in minimal coordinates, and the notes' form on its manifold by the reference's
 collocation: other equations, other coordinates, another integrator.  What they differ by is the
-uncertainty.  The second is held to 1e-13, so that is what the uncertainty is made of: the first is better by
-far, as quad precision says, which is its yardstick (tests).
+uncertainty.  It is the second's rounding: in extended precision the first is better by far, as quad precision
+says, which is its yardstick (tests).
 """
 
 from __future__ import annotations
@@ -19,9 +19,7 @@ from plumbline.records import Array, Model, State, Trajectory
 from plumbline.truth import TruthUnavailable
 from plumbline.truth.taylor import Precision, taylor
 
-RTOL = (
-    1e-13  # of the notes' form, relative: 1e-14 is no closer to extended precision, rounding is all there is
-)
+RTOL = 1e-13  # of the notes' form: at 1e-14 it is no closer to extended precision, the rest is rounding
 EXTENDED = 5  # bodies: 2 s of ten take 2.0 s in extended precision, 0.6 s in double; fifty 14 s and 4 s
 COMPILED = 50  # bodies: 2 s to compile fifty
 Exact = tuple[Array, Array, str]  # a closed form's r (T, N, 3) m, p (T, N, 4), and its source
