@@ -223,7 +223,7 @@ class Reach:
         """Those that may notice it, quickest first: all of the file's where its line runs on import."""
         lines = self.lines.get(mutant.file, {})
         first, last = mutant.reach
-        near = {test for line in range(first, last + 1) for test in lines.get(line, ())}
+        near = {test for line, some in lines.items() if first <= line <= last for test in some}
         if "" in near:
             near = {test for tests in lines.values() for test in tests}
         quickest = sorted(near & self.seconds.keys(), key=lambda test: self.seconds[test])
@@ -388,6 +388,9 @@ def inside(target: str, options: argparse.Namespace) -> int:
             continue
     gc.collect()
     gc.freeze()  # else every child would go through all of it, and copy it
+    controls = [Mutant(file, 0, (0, 10**6), "", "", Path(file).read_text(encoding="utf-8")) for file in files]
+    if any(what not in ("survived", "unreached") for _, what in trials(controls, reach, options.jobs)):
+        raise SystemExit("the tests do not pass in a child without any mutant: nothing can be said")
     became = []
     for mutant, what in trials(found, reach, options.jobs):
         became.append((mutant, what))
