@@ -38,6 +38,7 @@ CONTROLLED = 0.125  # s between samples of a method with step control, which end
 SMALL = 0.1  # of an invariant's scale: a larger drift has left the range in which it is one
 SIGMAS = 3.0
 PER_STEP = 8 * 2.0**-52  # rounding of an invariant in one step, of its scale: a handful of operations
+UNSTABLE = 2.0  # times as fast as time: neither a bounded drift nor a secular one grows so
 SYMMETRIC_GROWTH = 0.5  # log2 of the drift's growth when time doubles: 0 if it is bounded, 1 if secular
 
 
@@ -317,6 +318,14 @@ class Judge:
         common = {"value": grown, "tolerance": SYMMETRIC_GROWTH, "horizon": end}
         if window.largest <= floor:
             return self.new(name, "agrees", f"{self.name} is rounding", "1", **common)
+        kept = self.finest.windows[self.quantity]
+        for a, b in itertools.pairwise(t for t in sorted(kept) if t >= SHORTEST):
+            if kept[b].largest > UNSTABLE * b / a * kept[a].largest:
+                reason = (
+                    f"an unstable motion: {self.name} {kept[a].largest:.2g} {self.unit} by {a:g} s, "
+                    f"{kept[b].largest:.2g} by {b:g} s, which neither a bounded drift nor a leak does"
+                )
+                return self.new(name, "unresolved", reason, "1", **common)
         verdict: Verdict = "agrees" if grown < SYMMETRIC_GROWTH else "disagrees"
         reason = (
             f"{self.name} {window.half:.2g} {self.unit} by {end / 2:g} s, {window.largest:.2g} by {end:g} s: "
