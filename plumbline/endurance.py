@@ -361,8 +361,8 @@ class Judge:
             tolerance=tolerance,
             derivation=why + self.endured.plan.words,
             horizon=end,
-            order=order,
-            declared_order=self.integrator.order if order is not None else None,
+            order=order if self.integrator.kind == "step" else None,
+            declared_order=self.integrator.order if order and self.integrator.kind == "step" else None,
             extra={"scale": self.scale, "asked": self.endured.plan.asked, **extra},
         )
 

@@ -116,14 +116,21 @@ def disagreement(said: str) -> float:
 
 def cell_of(row: dict[str, Any]) -> tuple[str, ...]:
     """What rows share a script: scenario, engine, level and integrator, or relation."""
-    relation = (row["quantity"],) if row["level"] == "relations" else ()
-    return row["scenario"], row["engine"], row["level"], row["integrator"], *relation
+    apart = (row["quantity"],) if row["level"] == "relations" else ("long",) if long(row) else ()
+    return row["scenario"], row["engine"], row["level"], row["integrator"], *apart
+
+
+def long(row: dict[str, Any]) -> bool:
+    """Whether a row is about the nightly's long runs (`endurance`)."""
+    return "_long" in row["quantity"]
 
 
 def asked(document: dict[str, Any], rows: list[dict[str, Any]], seconds: float) -> Question:
     """What to shrink for the rows of one cell; NotReproducible where there is nothing to ask again."""
     row = rows[0]
     base, version = versions.split(row["engine"])
+    if long(row):
+        raise NotReproducible("a long run has no short case: the nightly of this scenario and engine runs it")
     if why := unscripted(base, row):
         raise NotReproducible(why)
     try:
