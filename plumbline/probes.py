@@ -22,17 +22,18 @@ class Probes:
     worst: dict[tuple[str, str], tuple[float, str]] = field(default_factory=dict)  # by engine and quantity
 
     def take(self, rows: Sequence[Row]) -> list[Row]:
-        """Count a probe's rows, known ones marked; all of them where one should be seen, else none."""
+        """Count a probe's rows, known ones marked; those of engines of which one should be seen are kept."""
         self.scenarios += 1
-        if any(row.verdict not in CALM or (row.verdict == "unsupported" and not row.known) for row in rows):
-            return list(rows)
+        seen = {row.engine for row in rows if remarkable(row)}
         for row in rows:
+            if row.engine in seen:
+                continue
             self.folded[row.verdict] += 1
             if "ratio" in row.extra:
                 cell = row.engine, row.quantity
                 found = row.extra["ratio"], row.scenario
                 self.worst[cell] = max(found, self.worst.get(cell, (-1.0, "")))
-        return []
+        return [row for row in rows if row.engine in seen]
 
     def summary(self) -> dict[str, Any]:
         """As results.json holds it."""
@@ -44,3 +45,8 @@ class Probes:
                 for (engine, quantity), (ratio, scenario) in self.worst.items()
             ],
         }
+
+
+def remarkable(row: Row) -> bool:
+    """Whether someone should see what is said of a probe, recorded or not."""
+    return row.verdict not in CALM or (row.verdict == "unsupported" and not row.known)

@@ -27,7 +27,7 @@ SCHEMA_VERSION = 1
 TEXT = pa.string()
 REAL = pa.float64()
 WHOLE = pa.int32()
-GROUP = 65_536  # records encoded together
+GROUP = 8_192  # records encoded together: what waits is small
 
 
 def _schema(**columns: pa.DataType) -> pa.Schema:

@@ -121,9 +121,11 @@ def test_what_someone_should_see_is_kept_whole_with_its_file(tmp_path):
     for s, verdict in zip(drawn, ("agrees", "disagrees", "unsupported"), strict=True):
         who = Subject(s.name, FAMILY, "mujoco", "MuJoCo", "4")
         fine = who.row("state", "-", "joint_reaction", "agrees", "why", extra={"ratio": 0.5})
-        kept += probes.take([fine, who.row("state", "-", "acceleration", verdict, "why")])
+        other = replace(fine, engine="exudyn")
+        kept += probes.take([other, fine, who.row("state", "-", "acceleration", verdict, "why")])
     assert [r.verdict for r in kept] == ["agrees", "disagrees", "agrees", "unsupported"]
-    assert probes.folded == {"agrees": 2} and probes.worst["mujoco", "joint_reaction"] == (0.5, drawn[0].name)
+    assert {r.engine for r in kept} == {"mujoco"}, "of the same probe, what another engine says calmly is folded"
+    assert probes.folded == {"agrees": 5} and probes.worst["mujoco", "joint_reaction"] == (0.5, drawn[0].name)
     excused = replace(kept[-1], known="k")
     assert probes.take([excused]) == [], "a recorded gap of every probe is only counted"
     nightly.write_files_of_random(Result(kept, [], {}, {}, probes, Tables(), Split(), {}), drawn, tmp_path)
