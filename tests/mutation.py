@@ -64,7 +64,7 @@ TARGETS = {
 }
 TESTS = {  # by folder, those that have to notice
     "reference_impl": [f"tests/test_{name}.py" for name in NOTES],
-    "plumbline": [f"tests/test_{name}.py" for name in (*JUDGES, "planted")],
+    "plumbline": [f"tests/test_{name}.py" for name in (*JUDGES, "planted", "relation_parts")],
 }
 
 
