@@ -175,7 +175,9 @@ def test_bounds_stay_sharp_and_say_how_they_came_about():
     bound = state_bound(model, state)
     for quantity in bound.scale:
         assert 8 * EPS < bound.bluntness(quantity) < BLUNT, quantity
-    assert str(ROUNDINGS) in bound.explain("acceleration")
+        how = "terms of the Newton-Euler equations" if quantity in VECTORS else "sum of the magnitudes"
+        assert how in bound.explain(quantity)
+        assert str(ROUNDINGS if quantity in VECTORS else SUMMANDS) in bound.explain(quantity)
     assert f"{np.max(bound.acceleration):.1e}" in bound.explain("acceleration")
 
 

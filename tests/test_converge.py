@@ -52,6 +52,7 @@ def test_order_two_under_an_order_four_name_is_seen_as_two():
         ((3.6, 3.7, 3.78), None),
         ((float("nan"), 4.3, 4.15), None),
         ((4.3, 4.15), None),
+        ((4.22, 4.2, 4.18), None),  # near 4 and hardly moving: neither on its way there nor far enough
     ],
 )
 def test_what_three_orders_lead_to(last, shown):
