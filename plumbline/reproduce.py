@@ -137,7 +137,9 @@ def asked(document: dict[str, Any], rows: list[dict[str, Any]], seconds: float) 
         engine = Engine(base, versions.interpreter(row["engine"]) if version else "")
     except versions.NoSuchEnvironment as error:
         raise NotReproducible(str(error)) from None
-    about = document["scenarios"][row["scenario"]]
+    about = document["scenarios"].get(row["scenario"])
+    if about is None:
+        raise NotReproducible(f"the results do not hold the scenario {row['scenario']!r}")
     model = Model(**{name: np.array(value, float) for name, value in about["model"].items()})
     if row["level"] in ("trajectory", "invariants"):
         case = runs_of(document, rows, model, start(model, about))

@@ -41,6 +41,8 @@ ENGINE_LINES = {
         ],
     ),
 }
+WELDERS = ("mujoco", "pinocchio", "pinocchio-aba", "pinocchio-maximal")  # that can be of two halves
+SWITCHED = ("reference", "mujoco", "pinocchio", "pinocchio-aba")  # that know the engine's options
 SHORT = 80  # characters of a literal that stays on a line
 MODEL_WORDS = {
     "mass": "kg",
@@ -103,9 +105,8 @@ def unscripted(engine: str, row: dict[str, Any]) -> str:
         return ""
     if not (relation == WELDED or relation.startswith(BY)):
         return f"the relation {relation!r} is not of one state described or asked about in two ways"
-    if engine not in ("pinocchio", "pinocchio-aba"):
-        return f"the script of {engine} asks the engine in its usual way alone, not {relation!r}"
-    return ""
+    able = WELDERS if relation == WELDED else SWITCHED
+    return "" if engine in able else f"the script of {engine} does not know the relation {relation!r}"
 
 
 def jointed(engine: str) -> bool:
@@ -148,8 +149,7 @@ def flags_of(shown: Shown, engine: str, version: str) -> set[str]:
             flags.add(kinds.get(shown.way, "switched"))
         if "mass_matrix" in (shown.bound if isinstance(shown, ShownState) else ()):
             flags.add("mass_matrix")
-    if "welded" not in flags:
-        flags.add("whole")
+    flags |= {word for word, other in (("whole", "welded"), ("usual", "switched")) if other not in flags}
     try:
         old = engine.startswith("exudyn") and Version(version) < Version("1.12")
     except InvalidVersion:
@@ -203,9 +203,11 @@ def needs(engine: str, shown: Shown) -> list[str]:
 def settings(engine: str, shown: Shown) -> list[str]:
     """Choices that are one word."""
     lines = []
-    if engine.startswith("pinocchio") or isinstance(shown, ShownRelation):
+    if engine.startswith("pinocchio"):
         stepped = isinstance(shown, ShownRun) and shown.integrator.kind == "step"
         lines.append(f"ALGORITHM = {'aba' if engine == 'pinocchio-aba' or stepped else 'crba'!r}")
+    elif isinstance(shown, ShownRelation) and shown.way.startswith(BY):
+        lines.append('ALGORITHM = "usual"')
     if isinstance(shown, ShownRun):
         lines.append(f"INTEGRATOR = {shown.integrator.name!r}")
     return [*lines, ""] if lines else []
