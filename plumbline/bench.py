@@ -154,7 +154,7 @@ class Bench:
         if level == "endurance":
             integrator = next(i for i in self.engines[engine].integrators if i.name == name)
             regular = self.scenario.exact is not None
-            found = judge_endurance(who, integrator, outcome.value, regular)
+            found = judge_endurance(who, self.scenario.model, integrator, outcome.value, regular)
         elif truth is None:
             found = relations.judge_relations(who, outcome.value)
         elif isinstance(truth, StateTruth):

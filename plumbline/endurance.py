@@ -170,7 +170,9 @@ def window(series: Array) -> Window:
 # --- judging ------------------------------------------------------------------------------------
 
 
-def judge_endurance(who: Subject, integrator: Integrator, endured: Endured, regular: bool) -> Findings:
+def judge_endurance(
+    who: Subject, model: Model, integrator: Integrator, endured: Endured, regular: bool
+) -> Findings:
     """Rows of level "invariants", a quantity's being named ``*_long``; ``regular``: motion without chaos."""
     found = Findings()
     cost = sum(run.cost for run in endured.runs)
@@ -194,7 +196,8 @@ def judge_endurance(who: Subject, integrator: Integrator, endured: Endured, regu
             found.rows.append(judge.row())
             if quantity == "energy_drift" and integrator.symmetric and integrator.kind == "step" and regular:
                 found.rows.append(judge.growth_row())
-    found.rows = [replace(row, wall_time=cost) for row in found.rows]
+    alias = None if model.has_drag else integrator.alias_of  # drag is where they part
+    found.rows = [replace(row, wall_time=cost, alias_of=alias) for row in found.rows]
     return found
 
 
@@ -272,11 +275,10 @@ class Judge:
         usable = [
             run
             for run in self.endured.runs
-            if end in run.windows.get(self.quantity, {})
-            and run.windows[self.quantity][end].largest <= SMALL * self.scale
+            if end in run.windows.get(self.quantity, {}) and self.in_range(run, end)
         ]
         if len(usable) < 2 or usable[-1] is not self.finest:
-            reason = f"{what}, a fair part of its scale {self.scale:.2g} {self.unit}: too coarse a step"
+            reason = f"{what}; it or another has left its range, {SMALL:g} of its scale: too coarse a step"
             return self.verdict("unresolved", reason, end, SMALL * self.scale, "")
         floor = self.rounding(end / BLOCKS)
         whole = Fall.between(usable[0], self.finest, self.quantity, end)
@@ -298,6 +300,11 @@ class Judge:
             reason = f"{what} does not vanish: {falls}, due {self.due:.3g}"
             return self.verdict("disagrees", reason, end, tolerance, why, whole.order)
         return self.verdict("unresolved", f"{what}: {falls} cannot tell", end, tolerance, why, whole.order)
+
+    def in_range(self, run: LongRun, end: float) -> bool:
+        """Whether a run still is of the same motion: nothing that is conserved has gone far."""
+        sizes = self.endured.scales
+        return all(kept[end].largest <= SMALL * sizes[name] for name, kept in run.windows.items())
 
     @property
     def due(self) -> float:

@@ -30,7 +30,9 @@ def long(name, engine, integrator, seconds=100.0):
     plan = course(method, s.model.n, seconds)
     endured = endure(chosen.name, integrator, s.model, s.state, s.sample, plan)
     who = Subject(name, s.family, chosen.name, chosen.title, "1")
-    return {row.quantity: row for row in judge_endurance(who, method, endured, s.exact is not None).rows}
+    return {
+        row.quantity: row for row in judge_endurance(who, s.model, method, endured, s.exact is not None).rows
+    }
 
 
 @pytest.fixture
@@ -178,6 +180,7 @@ def test_a_run_has_long_cells_beside_the_others():
     assert len(rows) == 4 * 5 and {row.level for row in rows} == {"invariants"}
     assert len({row.key for row in result.rows}) == len(result.rows)
     assert {row.verdict for row in rows} == {"agrees"}
+    assert {row.integrator for row in rows if row.alias_of} == {"implicitfast"}
 
 
 def test_a_long_disagreement_is_told_to_have_no_script(tmp_path):
