@@ -16,16 +16,7 @@ import numpy as np
 
 from plumbline.converge import DRIFTS, ORDER_MARGIN, Limit, Order, observed_order, romberg, tightest
 from plumbline.findings import Columns, Findings, Subject
-from plumbline.kinematics import angular_velocity
-from plumbline.measures import (
-    UNITS,
-    Invariants,
-    attitude_error,
-    invariants,
-    kinetic_energy,
-    position_error,
-    potential_energy,
-)
+from plumbline.measures import UNITS, Invariants, attitude_error, invariants, position_error, scales
 from plumbline.records import Array, Integrator, Model, Row, Trajectory, Verdict
 from plumbline.work import Climb, Rung
 from plumbline.yardstick import PART, ROUNDING, MotionTruth
@@ -383,27 +374,8 @@ class Ladder:
         return unresolved
 
     def scales(self) -> dict[str, float]:
-        """Sizes of what the invariants are made of: energies, momenta, lengths, speeds.
-
-        A pendulum at rest rounds too: speeds are at least that of a fall through its own length.
-        """
-        true, model = self.truth.trajectory, self.model
-        omega = angular_velocity(true.p, true.pdot)
-        kinetic = float(np.max(kinetic_energy(model, true.v, omega)))
-        potential = float(np.max(np.sum(model.mass * np.abs(true.r @ model.gravity), axis=-1)))
-        swing = float(np.ptp(potential_energy(model, true.r)))
-        fall = float(np.sqrt(np.linalg.norm(model.gravity) * self.truth.length))
-        speed = max(fall, float(np.max(np.linalg.norm(true.v, axis=-1))))
-        spin = max(fall / self.truth.length, float(np.max(np.linalg.norm(omega, axis=-1))))
-        arm = float(np.max(np.linalg.norm(true.r, axis=-1), initial=0.0))
-        inertia = float(np.sum(np.linalg.norm(model.inertia, axis=(1, 2))))
-        return {
-            "energy_drift": max(kinetic, potential, swing),
-            "momentum_drift": float(np.sum(model.mass)) * arm * speed + inertia * spin,
-            "joint_gap": max(self.truth.length, arm),
-            "gap_rate": max(speed, spin * self.truth.length),
-            "norm_drift": 1.0,
-        }
+        """Sizes of what the invariants of the true motion are made of."""
+        return scales(self.model, self.truth.trajectory, self.truth.length)
 
     # tables
 

@@ -14,6 +14,7 @@ from plumbline.diagnosis import (
     derivatives,
     diagnose,
     explanations,
+    fitted,
     misread,
     observe,
     worst,
@@ -167,3 +168,15 @@ def test_an_engine_that_fails_when_asked_again_is_told():
     text = diagnose(model, said, truth, evaluate)
     assert text.startswith("behaves as if acceleration were 1.5 times as large (the difference ")
     assert text.endswith("persists at rest, fails without gravity: no weight)")
+
+
+def test_where_nothing_is_different_no_amount_is_seen():
+    model, truth = known()
+    seen = observe(model, truth.quantities, truth)
+    right = answer(seen.case)
+    amounts = [cause for cause in causes(seen.case) if cause.scale is not None]
+    assert {cause.usual for cause in amounts} >= {0.0, 1.0}
+    for cause in amounts:
+        (slope,) = derivatives(seen, [(cause, cause.usual)])
+        if np.any(slope):
+            assert fitted(seen, right, cause, slope) is None

@@ -69,6 +69,7 @@ def test_a_sound_ladder_agrees_in_everything_and_says_what_it_measured():
     ]  # fmt: skip
     assert {row.verdict for row in found.values()} == {"agrees"}
     assert {row.integrator for row in found.values()} == {"Heun"}
+    assert [row.level for row in found.values()] == ["trajectory"] * 5 + ["invariants"] * 5
     assert {row.wall_time for row in found.values()} == {21.0}
     order = found["order"]
     assert (order.value, order.order) == (pytest.approx(0, abs=1e-6), pytest.approx(2, abs=1e-6))
@@ -174,14 +175,17 @@ def test_runs_that_did_not_stay_finite_are_points_of_the_study():
     said = {row.quantity: row for row in alone.rows}
     for name in ("position_limit", "attitude_limit"):
         assert said[name].verdict == "unresolved" and "fewer than two" in said[name].reason
+        assert (said[name].level, said[name].integrator) == ("trajectory", "Heun")
+        assert said[name].unit == ("m" if name == "position_limit" else "rad")
     assert "position" not in said
     assert np.all(np.isnan(dict(alone.tables)["curves"]["limit_error"]))
     some.rungs[-1] = replace(some.rungs[-1], trajectory=None, failure="NaN at 1 s")
     (lost,) = judge_motion(WHO, MODEL, truth(), METHOD, some, 2.0).rows
-    assert (lost.quantity, lost.verdict) == ("all", "failed")
+    assert (lost.quantity, lost.verdict, lost.integrator) == ("all", "failed", "Heun")
     assert lost.reason == "at the finest resolution 0.000976562: NaN at 1 s"
     (never,) = judge_motion(WHO, MODEL, truth(), METHOD, Climb([], "no drag here"), 2.0).rows
     assert (never.quantity, never.verdict, never.reason) == ("all", "unsupported", "no drag here")
+    assert (lost.level, never.level, never.integrator) == ("trajectory", "trajectory", "Heun")
 
 
 def test_a_method_with_a_tolerance_has_no_order_and_its_tightest_run_is_the_limit():
@@ -198,6 +202,8 @@ def test_a_method_with_a_tolerance_has_no_order_and_its_tightest_run_is_the_limi
     floor = found["energy_drift"]
     each = PER_STEP + STEPS[-1]
     assert floor.tolerance == pytest.approx(each * 100 * floor.extra["scale"], rel=1e-12)
+    stays = rows(climbed([0.5 + e for e in (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 0)]), method)["joint_gap"]
+    assert stays.verdict == "disagrees", "trusted without any order"
 
 
 def test_an_implicit_solver_walks_at_random():
@@ -270,6 +276,8 @@ def test_a_drift_that_falls_with_the_step_agrees_and_one_that_does_not_disagrees
     assert stays.extra["ratio"] == pytest.approx(stays.extra["limit"] / stays.tolerance, rel=1e-9)
     wild = rows(climbed([0.1, 0.03, 0.02, 0.003, 0.002, 0.001]))["joint_gap"]
     assert wild.verdict == "unresolved" and wild.reason.endswith("cannot tell")
+    untold = rows(climbed([1e-3 + e for e in (0.0, 1e-5, -1e-5, 2e-5, 1e-5, 0)]))["joint_gap"]
+    assert untold.extra["ratio"] > 1 and untold.verdict == "unresolved", "no order, no trust"
     alone = climbed()
     for rung in range(5):
         alone.rungs[rung] = replace(alone.rungs[rung], trajectory=None)

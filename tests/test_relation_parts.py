@@ -19,6 +19,7 @@ from plumbline.relations import (
     Relation,
     allowed,
     apart,
+    check,
     held,
     judge_relations,
     quickest,
@@ -189,3 +190,13 @@ def test_a_run_may_be_off_by_its_rounding_its_solver_and_its_accelerations_grown
     assert limit == pytest.approx((ROUNDING + solved + pushed) * grown, rel=1e-12)
     bare = replace(method, solver=0.0, tightest=0.0)
     assert allowed(bare, MODEL, at, end, steps) == pytest.approx((ROUNDING + pushed) * grown, rel=1e-12)
+
+
+@pytest.mark.parametrize("drag", [False, True])
+def test_every_relation_is_asked_but_time_reversed_with_drag(drag: bool) -> None:
+    model = pendulums.model("b", drag=drag)
+    names = [found.relation for found in check("pinocchio", model, [pendulums.state(model)])]
+    told = ["rotated world", "re-chosen body frame", "masses doubled", "lengths × 4"]
+    told += [] if drag else ["time reversed"]
+    assert names[: len(told)] == told and ("time reversed" in names) is not drag
+    assert "as pinocchio-maximal" in names and "two welded halves" in names

@@ -106,6 +106,7 @@ def test_one_bound_is_the_border(by, expected):
     )
     assert [row.quantity for row in rows] == list(UNITS)
     assert [row.unit for row in rows] == list(UNITS.values())
+    assert {(row.level, row.integrator, row.engine) for row in rows} == {("state", "-", "reference")}
     assert rows[0].extra["bound_relative"] < 1e-9 and rows[1].extra["ratio"] == 0.0
 
 
