@@ -139,7 +139,10 @@ def flags_of(shown: Shown, engine: str, version: str) -> set[str]:
     if isinstance(shown, ShownRun):
         kind = "fixed" if shown.integrator.kind == "step" else "adaptive"
         flags |= {"motion", kind, shown.integrator.name, *shown.drifts}
-        flags.add("invariants" if shown.drifts else "trajectory")
+        flags |= {"ordered"} if shown.ordered else set()
+        flags |= {"limited"} if shown.limited else set()
+        flags |= {"invariants"} if shown.drifts else set()
+        flags |= {"extrapolated"} if shown.limited or shown.drifts else set()
         if flags & {"joint_gap", "gap_rate"}:
             flags.add("gaps")
     else:
@@ -263,19 +266,23 @@ def run_evidence(shown: ShownRun) -> list[str]:
     words = ("step", "at step zero") if fixed else ("tolerance", "at the tightest tolerance")
     lines = [
         "",
-        f"step_word, limit_words = {words!r}",
         f"times = {times}  # s",
         f"steps = {list(shown.case.steps)!r}  # {'s' if fixed else 'relative tolerances'}",
-        f"powers = {list(shown.integrator.powers)!r}  # of the step, in the error",
-        f"eliminated = {shown.eliminated!r}",
-        f"uncertain = {shown.uncertain!r}  # of the limit, the truth and rounding together",
     ]
-    if not shown.drifts:
-        if fixed:
-            lines += [
-                f"declared, margin = {shown.integrator.order!r}, {ORDER_MARGIN!r}  # order",
-                f"sizes = {tuple(map(float, shown.sizes))!r}  # m and m/s, of the chain",
-            ]
+    if shown.ordered:
+        lines += [
+            f"declared, margin = {shown.integrator.order!r}, {ORDER_MARGIN!r}  # order",
+            f"sizes = {tuple(map(float, shown.sizes))!r}  # m and m/s, of the chain",
+        ]
+    if shown.limited or shown.drifts:
+        lines += [
+            f"step_word, limit_words = {words!r}",
+            f"powers = {list(shown.integrator.powers)!r}  # of the step, in the error",
+            f"eliminated = {shown.eliminated!r}  # so many of them",
+            "# of the limit, of the truth and of rounding together",
+            f"uncertain = {shown.uncertain!r}",
+        ]
+    if shown.limited:
         lines += ["# at the end, by two integrators on the notes' equations", "true = {"]
         for name, value in (("position", shown.true_r), ("attitude", shown.true_p)):
             lines.append(f'    "{name}": np.array({nested(value, "    ")}),')

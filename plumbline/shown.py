@@ -110,7 +110,9 @@ class ShownRun:
     ratio: float
     times: Array  # (T,) s
     integrator: Integrator
-    drifts: tuple[str, ...]  # invariants that drift; empty at trajectory level
+    ordered: bool  # whether the order is in dispute
+    limited: bool  # whether positions or attitudes at step zero are
+    drifts: tuple[str, ...]  # invariants that drift
     true_r: Array  # (N, 3) m at the end
     true_p: Array  # (N, 4) at the end
     sizes: tuple[float, float]  # m and m/s: what r and v are measured in where orders are observed
@@ -336,7 +338,8 @@ class AlongRuns:
             series = {q: [getattr(d, q) for d in ladder.drift] for q in shown}
             uncertain = {q: rows[q] for q in shown}
         return ShownRun(
-            case, min(off, default=0.0), times, self.integrator, tuple(series) if self.drifting else (),
+            case, min(off, default=0.0), times, self.integrator, "order" in self.wanted and "order" in rows,
+            bool(set(LIMITS) & set(self.wanted)), tuple(series) if self.drifting else (),
             truth.trajectory.r[-1], truth.trajectory.p[-1], (truth.length, ladder.scales()["gap_rate"]),
             {q: ladder.limit(ys).column for q, ys in series.items()},
             {q: float(row.tolerance) for q, row in uncertain.items() if row and row.tolerance},
