@@ -28,6 +28,7 @@ TEXT = pa.string()
 REAL = pa.float64()
 WHOLE = pa.int32()
 GROUP = 8_192  # records encoded together: what waits is small
+PARTS = 32  # tables of a few records that wait apart: each is tens of kilobytes besides its records
 
 
 def _schema(**columns: pa.DataType) -> pa.Schema:
@@ -111,6 +112,8 @@ class Tables:
         waiting.append(pa.Table.from_arrays(arrays, schema=schema))
         if sum(map(len, waiting)) >= GROUP:
             self._encode(name)
+        elif len(waiting) >= PARTS:
+            waiting[:] = [pa.concat_tables(waiting).combine_chunks()]
 
     def add_rows(self, rows: Iterable[Row]) -> None:
         """Take in rows for the summary."""
