@@ -51,6 +51,7 @@ class Bench:
         self.open = set(self.keys)  # not answered yet
         self.judged: dict[Key, Findings] = {}
         self.truths: dict[str, StateTruth | MotionTruth | Lost] = {}
+        self.again = False  # whether the motion's truth was asked for a second time
         self.early: list[Outcome] = []  # engines' answers that came before the truth
         count = min(plan.states, PROBE_STATES) if probe else plan.states
         self.states = [
@@ -66,14 +67,15 @@ class Bench:
             elif key[2] not in self.truths:
                 yield self.truth(key)
 
-    def truth(self, key: Key) -> Task:
-        """The task of what the engines are measured with at one level."""
+    def truth(self, key: Key, *uncompiled: int) -> Task:
+        """The task of what the engines are measured with; ``uncompiled``: 0 to do without a compiler."""
         s = self.scenario
         if key[2] == "state":
             return Task(key, yardstick.state_truth, (s.model, self.states), self.plan.limits)
         closed = solution(s)
         exact = (*closed(s.times), closed.source) if closed and closed.amplitude == 0 else None
-        return Task(key, yardstick.motion_truth, (s.model, s.state, s.times, exact), self.plan.limits)
+        arguments = (s.model, s.state, s.times, exact, *uncompiled)
+        return Task(key, yardstick.motion_truth, arguments, self.plan.limits)
 
     def cell(self, key: Key) -> Task:
         """The task of one cell."""
@@ -120,6 +122,9 @@ class Bench:
 
     def take(self, outcome: Outcome) -> list[Task]:
         """Keep a truth and judge what waited for it, judge an answer or let it wait; new questions."""
+        if outcome.lost and outcome.key[1:] == ("truth", "trajectory") and not self.again:
+            self.again = True  # compiled code brought the worker down: a truth is to be had without
+            return [self.truth(outcome.key, 0)]
         self.open.discard(outcome.key)
         if outcome.key[1] == "why":
             self.explain(outcome)

@@ -1,0 +1,84 @@
+"""A scenario's cells: what waits for the truth, and what a lost truth costs."""
+
+import os
+from dataclasses import replace
+
+import pytest
+
+from plumbline import scenario
+from plumbline.bench import Bench
+from plumbline.run import Plan, describe_all, execute
+from plumbline.workers import Limits, Outcome, Workers
+
+pytest.importorskip("mujoco")
+
+
+@pytest.fixture(scope="module")
+def engines():
+    with Workers(1) as workers:
+        return describe_all(workers, ["reference", "mujoco"])
+
+
+def made(engines, level):
+    chosen = scenario.load(scenario.find("rest"))
+    return Bench(Plan([chosen], list(engines), level, states=2), chosen, engines)
+
+
+def answered(task, **lost):
+    return Outcome(task.key, **lost) if lost else Outcome(task.key, task.call(*task.arguments))
+
+
+def test_answers_wait_for_the_truth_whatever_comes_first(engines):
+    rows = []
+    for turned in (False, True):
+        bench = made(engines, "state")
+        tasks = list(bench.tasks())
+        for task in reversed(tasks) if turned else tasks:
+            assert not bench.done
+            bench.take(answered(task))
+        assert bench.done
+        rows.append([(r.key, r.value, r.verdict) for r in bench.findings().rows])
+    assert rows[0] == rows[1] and len(rows[0]) == 14
+
+
+def test_a_motion_truth_whose_worker_died_is_asked_for_once_more_without_a_compiler(engines):
+    bench = made(engines, "trajectory")
+    truth, *cells = bench.tasks()
+    for task in cells:
+        bench.take(answered(task))
+    (second,) = bench.take(Outcome(truth.key, lost="crashed: the worker died of SIGSEGV"))
+    assert second.key == truth.key and second.arguments[-1] == 0 and not bench.done
+    assert bench.take(answered(second)) == [] and bench.done
+    assert all(row.verdict == "agrees" for row in bench.findings().rows)
+    assert "Taylor" not in bench.truths["trajectory"].method.split("closed form")[0]
+
+
+def test_a_truth_that_is_lost_twice_fails_every_cell_and_says_so(engines):
+    bench = made(engines, "trajectory")
+    truth, *cells = bench.tasks()
+    for task in cells:
+        bench.take(answered(task))
+    bench.take(Outcome(truth.key, lost="crashed"))
+    assert bench.take(Outcome(truth.key, lost="crashed twice")) == [] and bench.done
+    rows = bench.findings().rows
+    assert len(rows) == len(cells)
+    assert all(r.verdict == "failed" and r.reason == "no truth to judge by: crashed twice" for r in rows)
+
+
+def crash(*_):
+    """Ends its process as a crash does."""
+    os._exit(11)
+
+
+def test_in_a_run_the_second_truth_is_handed_over(monkeypatch):
+    truth, asked = Bench.truth, []
+
+    def first_crashes(self, key, *uncompiled):
+        asked.append(truth(self, key, *uncompiled))
+        return asked[-1] if uncompiled else replace(asked[-1], call=crash)
+
+    monkeypatch.setattr(Bench, "truth", first_crashes)
+    chosen = scenario.load(scenario.find("rest"))
+    result = execute(Plan([chosen], ["mujoco"], "trajectory", limits=Limits(120)), lambda *_: None)
+    assert len(asked) == 2
+    assert result.run["exit_code"] == 0, result.run["sentence"]
