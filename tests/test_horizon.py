@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from plumbline.flow import flow
-from plumbline.horizon import _between, _minimal, growth, growth_beside, horizon, twins
+from plumbline.horizon import FAR, TWIN, TWINS, _between, _minimal, growth, growth_beside, horizon, twins
 from plumbline.kinematics import lift, rate
-from plumbline.measures import position_error
+from plumbline.measures import attitude_error, position_error
 from plumbline.scenario import find, load
+from tests import pendulums
 from tests.random_chains import random_chain
 
 EPS = 2.0**-53
@@ -78,6 +79,43 @@ def test_others_run_beside_it_as_they_do_alone():
         alone = flow(m, s, times, 1e-12)
         assert np.max(position_error(r[run], alone.r)) < 1e-7
         assert np.max(np.abs(p[run] - alone.p)) < 1e-6
+
+
+@pytest.mark.parametrize("rods", [[0, 0], [1], [0, 1]], ids=str)
+def test_growth_is_how_far_the_worst_twin_has_gone(rods):
+    """Over the size it was turned by; positions over the largest distance from the pivot."""
+    model, state = random_chain(np.random.default_rng(5), rods)
+    times = np.linspace(0, 0.6, 13)
+    base, *others = (pendulums.motion(model, s, times) for s in (state, *twins(model, state)))
+    arm = np.max(np.linalg.norm(base.r, axis=-1))
+    gone = [np.maximum(position_error(x.r, base.r) / arm, attitude_error(x.p, base.p)) / TWIN for x in others]
+    expected = np.maximum(np.max(gone, axis=0), 1.0)
+    assert 2 < np.max(expected) < FAR
+    assert growth(model, state, times) == pytest.approx(expected, rel=0.01)
+
+
+@pytest.mark.parametrize(("rate_", "unit"), [(0.0, 1.0), (30.0, 30.0)])
+def test_twins_are_turned_by_their_size_and_rates_by_it_of_the_motion(rate_, unit):
+    model, state = random_chain(np.random.default_rng(6), [0, 1, 0], rate=rate_)
+    found = twins(model, state, 1e-6, 40)
+    assert len(found) == 40 and len(twins(model, state)) == TWINS
+    angles = [attitude_error(x.p[:, None], state.p[:, None]) for x in found]
+    # Of a normal vector with variance 1 in each of three directions; rates are as large as the fastest.
+    assert np.sqrt(np.mean(np.square(angles))) == pytest.approx(np.sqrt(3) * 1e-6, rel=0.2)
+    fastest = max(np.max(np.abs(state.omega)), np.max(np.abs(state.udot)), 1.0)
+    assert fastest >= unit * 0.5
+    spread = [x.omega - state.omega for x in found]
+    assert np.sqrt(np.mean(np.square(spread))) == pytest.approx(fastest * 1e-6, rel=0.2)
+    turned = [np.linalg.norm(x.u[1] - state.u[1]) for x in found]
+    assert np.sqrt(np.mean(np.square(turned))) == pytest.approx(np.sqrt(2) * 1e-6, rel=0.3)
+    rates = [np.linalg.norm(x.udot[1] - state.udot[1]) for x in found]
+    tilt = np.linalg.norm(state.udot[1])  # u̇ stays across u, which has turned
+    expected = np.sqrt(2 * fastest**2 + tilt**2) * 1e-6
+    assert np.sqrt(np.mean(np.square(rates))) == pytest.approx(expected, rel=0.3)
+    assert not any(np.any(x.u[[0, 2]]) or np.any(x.udot[[0, 2]]) for x in found)
+    assert np.linalg.norm([x.u[1] for x in found], axis=1) == pytest.approx(np.ones(40), abs=1e-14)
+    again = twins(model, state, 1e-6, 40)
+    assert all(np.array_equal(x.p, y.p) for x, y in zip(found, again, strict=True)), "always the same"
 
 
 def test_horizon_is_the_last_tolerable_time():
