@@ -75,17 +75,17 @@ class LongRun:
     steps: int
     reached: float  # s
     failure: str | None  # of the longest run that was tried, where a shorter one was made instead
-    work_uncertainty: float  # J
+    work_uncertainty: dict[float, float]  # J, by window
+    scales: dict[float, dict[str, float]]  # by window: sizes of what the invariants are made of
     windows: dict[str, dict[float, Window]]
     cost: float  # CPU s, of what failed too
 
 
 @dataclass(frozen=True, eq=False)
 class Endured:
-    """All runs of one integrator, coarse to fine, and the sizes of what its invariants are made of."""
+    """All runs of one integrator, coarse to fine."""
 
     runs: list[LongRun]
-    scales: dict[str, float]
     plan: Course
     unsupported: str | None = None
 
@@ -118,7 +118,6 @@ def endure(engine: str, integrator: str, model: Model, state: State, sample: flo
     if method.kind == "tolerance" and not (model.has_drag or np.any(model.moment)):
         sample *= max(1, round(CONTROLLED / sample))  # where work is by quadrature, it needs all samples
     runs: list[LongRun] = []
-    sizes: dict[str, float] = {}
     for resolution in plan.resolutions:
         begin, failure, trajectory = time.process_time(), None, None
         for seconds in reversed([t for t in windows(plan.seconds) if t >= min(SHORTEST, plan.seconds)]):
@@ -127,15 +126,13 @@ def endure(engine: str, integrator: str, model: Model, state: State, sample: flo
                 trajectory = chosen.simulate(model, state, times, integrator, resolution)
                 break
             except Unsupported as refusal:
-                return Endured(runs, sizes, plan, str(refusal))
+                return Endured(runs, plan, str(refusal))
             except MemoryError:
                 raise  # the worker's limit, told as such
             except Exception as error:  # an engine may raise anything: its words belong in the results
                 failure = failure or words(error)
         runs.append(reduced(model, trajectory, resolution, failure, begin))
-        if trajectory is not None:
-            sizes = scales(model, trajectory, float(np.sum(reach(model))))
-    return Endured(runs, sizes, plan)
+    return Endured(runs, plan)
 
 
 def reduced(
@@ -143,16 +140,22 @@ def reduced(
 ) -> LongRun:
     """What is kept of a run that began at ``begin`` (process time)."""
     if run is None:
-        return LongRun(resolution, 0, 0.0, failure, 0.0, {}, time.process_time() - begin)
-    found = invariants(model, run)
-    end = float(run.t[-1])
-    kept = {}
-    for quantity in UNITS:
-        series = getattr(found, quantity)
-        if series is not None:
-            kept[quantity] = {t: window(series[: int(np.searchsorted(run.t, t)) + 1]) for t in windows(end)}
+        return LongRun(resolution, 0, 0.0, failure, {}, {}, {}, time.process_time() - begin)
+    length, end = float(np.sum(reach(model))), float(run.t[-1])
+    kept: dict[str, dict[float, Window]] = {}
+    sizes, by_quadrature = {}, {}
+    for t in windows(end):
+        number = int(np.searchsorted(run.t, t)) + 1
+        t_, r, p, v, pdot = (getattr(run, name)[:number] for name in ("t", "r", "p", "v", "pdot"))
+        part = Trajectory(t_, r, p, v, pdot, run.steps)
+        found = invariants(model, part)
+        sizes[t], by_quadrature[t] = scales(model, part, length), found.work_uncertainty
+        for quantity in UNITS:
+            series = getattr(found, quantity)
+            if series is not None:
+                kept.setdefault(quantity, {})[t] = window(series)
     cost = time.process_time() - begin
-    return LongRun(resolution, run.steps, end, failure, found.work_uncertainty, kept, cost)
+    return LongRun(resolution, run.steps, end, failure, by_quadrature, sizes, kept, cost)
 
 
 def window(series: Array) -> Window:
@@ -205,7 +208,9 @@ def blown_up(endured: Endured) -> bool:
     """Whether the finest run's energy, drifting on as it did, would leave its range: a step too coarse."""
     finest = endured.runs[-1]
     drift = finest.windows["energy_drift"][finest.reached].largest
-    return drift * endured.plan.seconds / finest.reached > SMALL * endured.scales["energy_drift"]
+    return (
+        drift * endured.plan.seconds / finest.reached > SMALL * finest.scales[finest.reached]["energy_drift"]
+    )
 
 
 @dataclass(frozen=True)
@@ -223,23 +228,22 @@ class Judge:
         """The quantity in words."""
         return self.quantity.replace("_", " ")
 
-    @property
-    def scale(self) -> float:
-        """The size of what the invariant is made of."""
-        return self.endured.scales[self.quantity]
+    def scale(self, end: float) -> float:
+        """The size of what the invariant is made of, in one window."""
+        return self.finest.scales[end][self.quantity]
 
     @property
     def finest(self) -> LongRun:
         """The run that is judged."""
         return self.endured.runs[-1]
 
-    def rounding(self, seconds: float) -> float:
-        """What rounding, an implicit step's solver and the quadrature of work leave in so much time."""
-        steps = max(self.finest.steps * seconds / self.finest.reached, 64.0)
+    def rounding(self, end: float, parts: int = 1) -> float:
+        """What rounding, an implicit step's solver and the quadrature of work leave in a part of a window."""
+        steps = max(self.finest.steps * end / self.finest.reached / parts, 64.0)
         # solved to a tolerance: so many independent mistakes add up like a random walk
         passed = steps * PER_STEP + np.sqrt(steps) * self.integrator.solver
-        by_quadrature = self.finest.work_uncertainty if self.quantity == "energy_drift" else 0.0
-        return float(passed * self.scale) + by_quadrature
+        by_quadrature = self.finest.work_uncertainty[end] if self.quantity == "energy_drift" else 0.0
+        return float(passed * self.scale(end)) + by_quadrature
 
     def row(self) -> Row:
         """The longest window that can tell; a disagreement in it is never overruled by a shorter one."""
@@ -259,14 +263,13 @@ class Judge:
         what, passed = f"{self.name} {drift:.2g} {self.unit} within {end:g} s", "rounding"
         if self.integrator.kind == "tolerance":
             rtol = self.finest.resolution
-            floor += self.finest.steps * end / self.finest.reached * rtol * self.scale
+            floor += self.finest.steps * end / self.finest.reached * rtol * self.scale(end)
             passed = f"what the tolerance {rtol:g} lets pass in every step"
-        why = (
-            f"{self.finest.steps} steps in {self.finest.reached:g} s, a scale of {self.scale:.3g} {self.unit}"
-        )
+        scale = self.scale(end)
+        why = f"{self.finest.steps} steps in {self.finest.reached:g} s, a scale of {scale:.3g} {self.unit}"
         if drift > floor:
             return self.by_order(end, what)
-        if floor <= PART * self.scale:
+        if floor <= PART * self.scale(end):
             return self.verdict("agrees", f"{what}: {passed}", end, floor, why)
         return self.verdict("unresolved", f"{what}: {floor:.2g} {self.unit} may be {passed}", end, floor, why)
 
@@ -278,9 +281,12 @@ class Judge:
             if end in run.windows.get(self.quantity, {}) and self.in_range(run, end)
         ]
         if len(usable) < 2 or usable[-1] is not self.finest:
-            reason = f"{what}; it or another has left its range, {SMALL:g} of its scale: too coarse a step"
-            return self.verdict("unresolved", reason, end, SMALL * self.scale, "")
-        floor = self.rounding(end / BLOCKS)
+            reason = (
+                f"{what}; of {len(self.endured.runs)} runs {len(usable)} reached it with every drift below "
+                f"{SMALL:g} of its scale: too coarse a step"
+            )
+            return self.verdict("unresolved", reason, end, SMALL * self.scale(end), "")
+        floor = self.rounding(end, BLOCKS)
         whole = Fall.between(usable[0], self.finest, self.quantity, end)
         allowed = whole.allowed(self.due, floor)
         tolerance = self.finest.windows[self.quantity][end].largest * allowed / whole.fine
@@ -303,7 +309,7 @@ class Judge:
 
     def in_range(self, run: LongRun, end: float) -> bool:
         """Whether a run still is of the same motion: nothing that is conserved has gone far."""
-        sizes = self.endured.scales
+        sizes = self.finest.scales[end]
         return all(kept[end].largest <= SMALL * sizes[name] for name, kept in run.windows.items())
 
     @property
@@ -370,7 +376,7 @@ class Judge:
             horizon=end,
             order=order if self.integrator.kind == "step" else None,
             declared_order=self.integrator.order if order and self.integrator.kind == "step" else None,
-            extra={"scale": self.scale, "asked": self.endured.plan.asked, **extra},
+            extra={"scale": self.scale(end), "asked": self.endured.plan.asked, **extra},
         )
 
     def new(self, quantity: str, verdict: Verdict, reason: str, unit: str, **more: Any) -> Row:
