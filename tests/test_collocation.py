@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -117,6 +118,10 @@ def test_rest_stays_at_rest() -> None:
     moved = run(still, resting, 1e-10)
     assert np.array_equal(moved.r[-1], state.r)
     assert np.array_equal(moved.p[-1], state.p)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ends = run(still, resting, 1e-10, dense=False)
+    assert np.array_equal(ends.r[-1], state.r) and ends.steps == len(TIMES) - 1
 
 
 def test_a_long_chain_runs() -> None:

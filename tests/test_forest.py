@@ -16,7 +16,7 @@ from reference_impl.euler_parameters import L
 from reference_impl.forest import Forest, lay
 from reference_impl.joints import rows
 from reference_impl.system import Solution, System
-from tests.random_chains import random_chain
+from tests.random_chains import random_chain, rescaled
 
 MIXES = {
     "balls": lambda rng, n: [False] * n,
@@ -206,3 +206,56 @@ def test_baumgarte_adds_2a_and_a_squared_to_every_constraint(mix: str, a: float)
     E, E_rate = np.sum(p * p, 0) - 1, 2 * np.sum(p * p_rate, 0)
     E_second = 2 * np.sum(p_rate * p_rate + p * p_second, 0)
     np.testing.assert_allclose(E_second, -2 * a * E_rate - a * a * E, rtol=0, atol=1e-11 * (1 + a * a))
+
+
+@KINDS
+def test_a_pendulum_of_any_size_is_solved_alike(mix: str) -> None:
+    """Micrometres and milligrams, kilometres and kilotons: no threshold has a unit."""
+    rng = np.random.default_rng(28)
+    model, state = random_chain(rng, MIXES[mix](rng, 3), loads=True, drag=True)
+    here = Forest([chain(model)]).solve(state.r, state.p, state.v, rate(state.p, state.omega))
+    for length, mass, second in ((1e-6, 1e-9, 1e-3), (1e3, 1e6, 1e2)):
+        small, at = rescaled(model, state, length, mass, second)
+        there = Forest([chain(small)]).solve(at.r, at.p, at.v, rate(at.p, at.omega))
+        for name, unit in (
+            ("acceleration", length / second**2),
+            ("pddot", 1 / second**2),
+            ("joint_reaction", mass * length / second**2),
+        ):
+            mine, theirs = getattr(here, name), getattr(there, name) / unit
+            np.testing.assert_allclose(theirs, mine, rtol=0, atol=1e-10 * np.max(np.abs(mine)))
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e6, 1e-6])
+def test_a_collapsed_rod_is_one_of_its_own_rounding(scale: float) -> None:
+    model, state = random_chain(np.random.default_rng(24), [False, False, True])
+    model, state = rescaled(model, state, scale, 1.0, 1.0)
+    r = state.r.copy()
+    r[2] -= state.u[2] * model.length[2]
+    with pytest.raises(SingularSystem, match="rod above body 3 has length 0"):
+        Forest([chain(model)]).solve(r, state.p, state.v, rate(state.p, state.omega))
+
+
+def test_what_is_lost_to_rounding_or_overflow_is_told() -> None:
+    """Bodies of 1 and 1e20 kg hold each other by rows that double precision cannot tell apart."""
+    model, state = random_chain(np.random.default_rng(24), [False] * 3)
+    heavy = np.array([1.0, 1e20, 1.0])
+    uneven = replace(model, mass=heavy * model.mass, inertia=heavy[:, None, None] * model.inertia)
+    pdot = rate(state.p, state.omega)
+    with pytest.raises(SingularSystem, match="joint rows are not independent"):
+        Forest([chain(uneven)]).solve(state.r, state.p, state.v, pdot)
+    forest, fast = Forest([chain(model)]), pdot.copy()
+    fast[1, 2] = np.inf
+    with pytest.raises(SingularSystem, match="a rate or a load is not finite"), np.errstate(all="ignore"):
+        forest.acceleration(lay(state.r, state.p), lay(state.v, fast))
+
+
+def test_the_copies_of_a_tiled_forest_have_names_too() -> None:
+    model, state = random_chain(np.random.default_rng(29), [False, False, False])
+    forest = Forest([chain(model)]).tile(2)
+    q, v = lay(state.r, state.p), lay(state.v, rate(state.p, state.omega))
+    q, v = np.tile(q, 2), np.tile(v, 2)
+    q[3:, 4] = 0.0
+    with pytest.raises(SingularSystem, match="p of body 2"):
+        forest.acceleration(q, v)
+    assert forest.start.tolist() == [0, 3, 6]

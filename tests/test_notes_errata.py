@@ -234,6 +234,19 @@ def test_E7_singular_inertia_names_the_body():
         integrate(dataclasses.replace(chain, inertia=inertia), *state, np.array([0.0, 1.0]), 1e-6)
 
 
+@pytest.mark.parametrize("heavy", [1.0, 1e6, 1e-6])
+def test_E7_an_inertia_is_flat_beside_its_own_size(heavy):
+    """A stick along a slanting axis has a least principal value of rounding, in any unit."""
+    chain, state = hanging([False, True])
+    turn = np.linalg.qr(np.random.default_rng(15).normal(size=(3, 3)))[0]
+    inertia, proximal = heavy * chain.inertia, chain.proximal.copy()
+    stick = turn @ np.diag([0.02, 0.02, 0]) @ turn.T
+    inertia[1], proximal[1] = heavy * (stick + stick.T) / 2, 0.3 * turn[:, 2]
+    flat = dataclasses.replace(chain, mass=heavy * chain.mass, inertia=inertia, proximal=proximal)
+    with pytest.raises(SingularSystem, match=r"inertia of body 2 is singular.*E7"):
+        System(flat).solve(*state)
+
+
 def test_a_singular_inertia_that_the_joint_makes_good_is_solved():
     """J of a thin stick hung off its axis: S is regular, and its solution is the limit of thicker sticks."""
     rng = np.random.default_rng(9)

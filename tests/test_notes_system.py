@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import ellipk
 
+from reference_impl import integrate as integrator
 from reference_impl import printed
 from reference_impl.euler_parameters import A, L, angular_velocity
 from reference_impl.euler_parameters import rate as pdot_of
@@ -214,6 +215,40 @@ def test_natural_sizes_are_of_the_stretched_chain_its_fall_and_its_motion():
     assert away[0] == np.max(np.abs(r - [0, 9.0, 0])) > reach
     point = dataclasses.replace(chain, proximal=still, distal=still, length=np.zeros(3), gravity=np.zeros(3))
     assert sizes(still, still, still, point) == [1, 1, 0, 0]
+
+
+def test_the_structured_form_integrates_the_same_and_steps_are_counted(monkeypatch):
+    rng = np.random.default_rng(13)
+    chain = random_chain(rng, [True, False, True])
+    state, times = on_manifold(chain, rng), np.linspace(0, 0.3, 4)
+    counted = []
+
+    class Counted(integrator.DOP853):
+        def step(self):
+            counted.append(self.t)
+            return super().step()
+
+    monkeypatch.setattr(integrator, "DOP853", Counted)
+    direct = integrate(chain, *state, times, 1e-10)
+    assert direct.steps == len(counted) and direct.evaluations > 10 * direct.steps
+    structured = integrate(chain, *state, times, 1e-10, structured=True)
+    assert structured.steps == direct.steps and structured.evaluations == direct.evaluations
+    for name in ("r", "p", "v", "pdot"):
+        np.testing.assert_allclose(getattr(structured, name), getattr(direct, name), rtol=0, atol=1e-10)
+    with pytest.raises(ValueError, match="direct form only"):
+        integrate(chain, *state, times, 1e-10, gamma_defect=1e-9, structured=True)
+
+
+def test_the_printed_system_is_exact_on_complex_numbers():
+    """dS/dp along a direction by a complex step is that by differences: no part drops the imaginary one."""
+    rng = np.random.default_rng(14)
+    chain = random_chain(rng, [True, True])
+    r, p, v, pdot = on_manifold(chain, rng)
+    along, h = rng.normal(size=p.shape), 1e-6
+    S, b = printed.system(chain, r, p + 1e-30j * along, v, pdot)
+    ends = [printed.system(chain, r, p + s * h * along, v, pdot) for s in (1, -1)]
+    for x, (up, down) in zip((S, b), zip(*ends, strict=True), strict=True):
+        np.testing.assert_allclose(x.imag / 1e-30, (up - down) / (2 * h), rtol=0, atol=1e-8)
 
 
 def test_at_rest_stays_at_rest():

@@ -153,3 +153,17 @@ def test_there_are_three_variants_and_no_other() -> None:
     start = chain(model), state.r, state.p, state.v, rate(state.p, state.omega)
     with pytest.raises(ValueError, match="no variant 'damped'"):
         run("damped", *start, np.array([0.0, 0.1]), 1e-6)
+
+
+def test_projection_from_afar_ends_on_unit_quaternions() -> None:
+    """From 5 % off what is left of the gaps is of higher order, but p is normalised to rounding."""
+    rng = np.random.default_rng(69)
+    model, state = random_chain(rng, [True, False, False])
+    forest = Forest([chain(model)])
+    q, v = lay(state.r, state.p), lay(state.v, rate(state.p, state.omega))
+    far = q + 0.05 * rng.normal(size=q.shape)
+    near = forest.project(far, v + 0.05 * rng.normal(size=q.shape))
+    assert np.max(np.abs(np.sum(near[0][3:] ** 2, axis=0) - 1)) < 1e-15
+    assert np.max(np.abs(np.sum(near[0][3:] * near[1][3:], axis=0))) < 1e-15
+    left, before = (np.max(np.abs(forest.constraints(x, v)[0])) for x in (near[0], far))
+    assert left < 0.02 * before
