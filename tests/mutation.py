@@ -36,7 +36,7 @@ from collections.abc import Generator, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
-from importlib.util import spec_from_loader
+from importlib.util import spec_from_file_location
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -305,7 +305,7 @@ class Mutated(MetaPathFinder, Loader):
     def find_spec(self, fullname: str, path: object, target: object = None) -> ModuleSpec | None:
         """Ours, or None."""
         file = str(Path(self.mutant.file).resolve())
-        return spec_from_loader(fullname, self, origin=file) if fullname == self.name else None
+        return spec_from_file_location(fullname, file, loader=self) if fullname == self.name else None
 
     def exec_module(self, module: ModuleType) -> None:
         """Run the changed code as the module."""
