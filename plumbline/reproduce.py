@@ -62,7 +62,12 @@ def write(
     cells: dict[tuple[str, ...], list[dict[str, Any]]] = {}
     for row in rows:
         cells.setdefault(cell_of(row), []).append(row)
+    at_state = {cell[:2] for cell in cells if cell[2] == "state"}
     for cell, its in cells.items():
+        if keys is None and cell[2:4] == ("relations", "-") and cell[:2] in at_state:
+            why = "the state-level script of this engine and scenario shows it; ask for this row by its key"
+            told |= {row["key"]: why for row in its}
+            continue
         every = [row for row in disputed(document) if cell_of(row) == cell]
         try:
             question = asked(document, every, UNASKED if keys is None else ASKED)

@@ -479,7 +479,8 @@ def test_a_lost_engine_is_told_and_leaves_no_script(results):
         "plumbline.reproduce.Workers.run", lambda _, tasks: [Outcome(t.key, lost="hung") for t in tasks]
     ):
         told = reproduce.write(results)
-    assert told["a"] == told["d"] == "hung" and "of runs" in told["b"]
+        assert reproduce.write(results, ["d"]) == {"d": "hung"}
+    assert told["a"] == "hung" and "of runs" in told["b"] and "the state-level script" in told["d"]
     assert not list((results / "scripts").glob("*.py"))
 
 
