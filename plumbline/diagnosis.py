@@ -200,8 +200,7 @@ def fits(seen: Difference, model_right: dict[str, Array], data: Array, found: Se
 
 def fitted(seen: Difference, model_right: dict[str, Array], cause: Cause, slope: Array) -> Fit | None:
     """Gauss–Newton from the usual amount; None where it does not settle on a change that is seen."""
-    x, fine = cause.usual, 1 / float(np.linalg.norm(slope))
-    best = np.inf
+    x, fine, best = cause.usual, np.inf, np.inf
     for _ in range(ITERATIONS):
         try:
             predicted = predict(seen, model_right, cause.alter(seen.case, x))

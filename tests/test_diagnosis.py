@@ -20,6 +20,7 @@ from plumbline.diagnosis import (
     worst,
 )
 from plumbline.hypotheses import causes
+from plumbline.kinematics import lift
 from plumbline.sampling import random_states
 from plumbline.suspect import answer
 from plumbline.yardstick import state_truth
@@ -180,3 +181,27 @@ def test_where_nothing_is_different_no_amount_is_seen():
         (slope,) = derivatives(seen, [(cause, cause.usual)])
         if np.any(slope):
             assert fitted(seen, right, cause, slope) is None
+
+
+@pytest.mark.parametrize(
+    "to", [lambda i, x, b: x + 0.5, lambda i, x, b: known("b" * 13, 9)[1].quantities[i - 1].acceleration]
+)
+def test_two_states_show_neither_a_constant_nor_a_stale_field(to):
+    """Of thirteen bodies two states are looked at, too few to see a pattern over states."""
+    model, said, truth = changed("acceleration", to, "b" * 13, 9)
+    assert misread(observe(model, said, truth), "acceleration") is None
+    model, said, truth = changed("acceleration", lambda i, x, b: x + 0.5, "b" * 7, 9)
+    assert "a constant were added" in str(misread(observe(model, said, truth), "acceleration"))
+
+
+def test_a_pendulum_at_rest_is_asked_at_rest_too():
+    model = pendulums.model("rb")
+    still = [lift(model, s.p, 0 * s.omega, s.u, 0 * s.udot) for s in random_states(model, 4, seed=3)]
+    truth = state_truth(model, still)
+
+    def evaluate(asked, states):
+        right = state_truth(asked, states).quantities
+        return [replace(t, acceleration=1.5 * t.acceleration) for t in right]
+
+    text = diagnose(model, evaluate(model, still), truth, evaluate)
+    assert text.endswith("(the difference persists at rest, vanishes without gravity)")
