@@ -179,3 +179,11 @@ def test_lists_of_several_fields_are_an_entry_for_each_pair(tmp_path):
     assert [e.id for e in found][:2] == ["a: RK4: order", "a: RK4: position"]
     path.write_text("")
     assert known.load(path) == []
+
+
+def test_what_an_entry_does_not_say_is_anything():
+    bare = {name: ENTRY[name] for name in ("id", "scenario", "engine", "verdict", "evidence", "reason")}
+    about = known.Entry(**bare)
+    for level, integrator, quantity in (("state", "-", "energy"), ("trajectory", "RK4", "position_limit")):
+        assert about.covers(WHO.row(level, integrator, quantity, "disagrees", "why"))
+    assert not about.sometimes and about.versions == ""

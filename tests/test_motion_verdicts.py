@@ -69,6 +69,8 @@ def test_a_sound_ladder_agrees_in_everything_and_says_what_it_measured():
     ]  # fmt: skip
     assert {row.verdict for row in found.values()} == {"agrees"}
     assert {row.integrator for row in found.values()} == {"Heun"}
+    units = ["1", "m", "m", "rad", "rad", "J", "kg m²/s", "m", "m/s", "1"]
+    assert [row.unit for row in found.values()] == units
     assert [row.level for row in found.values()] == ["trajectory"] * 5 + ["invariants"] * 5
     assert {row.wall_time for row in found.values()} == {21.0}
     order = found["order"]

@@ -138,7 +138,8 @@ def test_a_sample_is_taken_as_it_is_and_back_with_opposite_rates() -> None:
         assert np.array_equal(found.r, at.r) and np.array_equal(found.p, at.p)
         assert np.array_equal(found.v, sign * at.v)
         assert found.omega == pytest.approx(sign * angular_velocity(at.p, run.pdot[1]), abs=1e-14)
-        assert not np.any(found.u) and not np.any(found.udot)
+        for nothing in (found.u, found.udot):
+            assert nothing.shape == (2, 3) and not np.any(nothing)
     assert not np.any(row(run, 0).r)
 
 
