@@ -33,17 +33,17 @@ def pack(r: Array, p: Array, v: Array, pdot: Array) -> Array:
 
 def unpack(y: Array, n: int) -> tuple[Array, Array, Array, Array]:
     """Parts r (..., N, 3), p (..., N, 4), ṙ, ṗ of y (..., 14 N)."""
-    ends = np.cumsum([3 * n, 4 * n, 3 * n])
-    parts = zip(np.split(y, ends, axis=-1), (3, 4, 3, 4), strict=True)
-    r, p, v, pdot = (part.reshape(*y.shape[:-1], n, width) for part, width in parts)
+    lead = y.shape[:-1]
+    r, p = y[..., : 3 * n].reshape(*lead, n, 3), y[..., 3 * n : 7 * n].reshape(*lead, n, 4)
+    v, pdot = y[..., 7 * n : 10 * n].reshape(*lead, n, 3), y[..., 10 * n :].reshape(*lead, n, 4)
     return r, p, v, pdot
 
 
 def rate(system: System, y: Array, gamma_defect: float | Array = 0.0) -> Array:
     """(N6) ẏ = (ṙ, ṗ, r̈, p̈), (14 N,); ``gamma_defect`` as `System.solve`."""
     r, p, v, pdot = unpack(y, system.chain.n)
-    x = system.solve(r, p, v, pdot, gamma_defect)
-    return pack(v, pdot, x.acceleration, x.pddot)
+    x, _ = system.unknowns(r, p, v, pdot, gamma_defect)
+    return np.concatenate([v.ravel(), pdot.ravel(), x[: 7 * system.chain.n]])  # r̈, p̈ come first
 
 
 def structured_rate(forest: Forest, y: Array) -> Array:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reference_impl.chain import Chain
-from reference_impl.euler_parameters import I3, A, A_rate, B, Field, G, dot, outer
+from reference_impl.euler_parameters import I3, A, B, Field, G, L, dot, outer
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +64,10 @@ class Layout:
     s: Field  # (2, N, 3) m, their points; 0 for the pivot, which takes body 0 out: H(p, 0) = 0
     B: Field  # (2, N, 4, 4) B(s)
     squares: Field  # (N,) m²: sᵀs of both points less ℓ²
-    rod: NDArray[np.intp]  # joints that are rods
-    ball: NDArray[np.intp]
+    rod: NDArray[np.intp] | slice  # joints that are rods; all of them as a slice, which copies nothing
+    ball: NDArray[np.intp] | slice
+    rods: int  # how many
+    balls: int
     joint: NDArray[np.intp]  # (c,) the joint of each row
     order: NDArray[np.intp]  # (c,) rows of the rods, then of the balls, in the order of the joints
 
@@ -81,8 +83,10 @@ def layout(chain: Chain) -> Layout:
         s=s,
         B=B(s),
         squares=dot(s, s).sum(0) - chain.length**2,
-        rod=rod,
-        ball=ball,
+        rod=rod if len(ball) else slice(None),
+        ball=ball if len(rod) else slice(None),
+        rods=len(rod),
+        balls=len(ball),
         joint=row_joints(chain),
         order=np.argsort(np.concatenate([rod, np.repeat(ball, 3)]), kind="stable"),
     )
@@ -91,18 +95,21 @@ def layout(chain: Chain) -> Layout:
 def rows(chain: Chain, r: Field, p: Field, v: Field, pdot: Field) -> Rows:
     """C, C_r, C_p and γ of every joint at r, ṙ (N, 3), p, ṗ (N, 4), on or off the manifold."""
     fixed = layout(chain)
-    s, rod, ball = fixed.s, fixed.rod, fixed.ball
+    s = fixed.s
     q, qdot = p[fixed.bodies], pdot[fixed.bodies]  # (2, N, 4): near and far body of each joint
-    x, xdot = r - after_pivot(r), v - after_pivot(v)
+    x, xdot = r.copy(), v.copy()  # from the far body to the near one
+    x[1:] -= r[:-1]
+    xdot[1:] -= v[:-1]
     both = np.stack([q, qdot])
-    (H_near, H_far), (H_near_rate, H_far_rate) = G(both) @ fixed.B + outer(s, both)  # H, Ḣ (D4)
+    turn = G(both)
+    (H_near, H_far), (H_near_rate, H_far_rate) = turn @ fixed.B + outer(s, both)  # H, Ḣ (D4)
     b, a = _times(A(q), s)
     d = x + b - a
 
     parts: list[tuple[Field, ...]] = []
-    if len(rod):
-        k = rod
-        bdot, adot = _times(A_rate(q[:, k], qdot[:, k]), s[:, k])
+    if fixed.rods:
+        k = fixed.rod
+        bdot, adot = 2 * _times(turn[0][:, k], _left(s[:, k], L(qdot[:, k])))  # Ȧ s, Ȧ = 2 G L̇ᵀ (N10)
         y, ydot, z, zdot = x[k] - a[k], xdot[k] - adot, x[k] + b[k], xdot[k] + bdot
         C = dot(x[k], x[k]) + 2 * dot(x[k], b[k] - a[k]) - 2 * dot(a[k], b[k]) + fixed.squares[k]
         near_rate = _left(ydot, H_near[k]) + _left(y, H_near_rate[k])
@@ -111,12 +118,12 @@ def rows(chain: Chain, r: Field, p: Field, v: Field, pdot: Field) -> Rows:
             -2 * dot(zdot - adot, xdot[k]) - 4 * dot(near_rate, qdot[0, k]) + 4 * dot(far_rate, qdot[1, k])
         )
         parts.append((C, 2 * d[k], 4 * _left(y, H_near[k]), -4 * _left(z, H_far[k]), gamma))
-    if len(ball):
-        k = ball
+    if fixed.balls:
+        k = fixed.ball
         gamma = 2 * (_times(H_far_rate[k], qdot[1, k]) - _times(H_near_rate[k], qdot[0, k]))
-        identity = np.broadcast_to(I3, (len(k), 3, 3))
+        identity = np.broadcast_to(I3, (fixed.balls, 3, 3))
         blocks = (d[k], identity, 2 * H_near[k], -2 * H_far[k], gamma)
-        parts.append(tuple(np.reshape(block, (3 * len(k), *np.shape(block)[2:])) for block in blocks))
+        parts.append(tuple(np.reshape(block, (3 * fixed.balls, *np.shape(block)[2:])) for block in blocks))
     columns = parts[0]
     if len(parts) == 2:
         columns = tuple(np.concatenate(column)[fixed.order] for column in zip(*parts, strict=True))

@@ -44,6 +44,10 @@ class System:
         r, p = np.arange(3 * n).reshape(n, 3), 3 * n + np.arange(4 * n).reshape(n, 4)
         row, norm = 7 * n + np.arange(c), 7 * n + c + np.arange(n)
         self.joint, self.size = joint, 8 * n + c
+        self._rods, self._first = chain.rods, np.searchsorted(joint, np.arange(n))  # each joint's first row
+        self._masses = np.repeat(chain.mass, 3)
+        self._drag = bool(chain.drag_force.any() or chain.drag_moment.any())
+        self._weight = chain.mass[:, None] * chain.gravity + chain.force
         self._near, self._far = joint, np.flatnonzero(joint > 0)
         near, far = joint, joint[self._far] - 1
         # Where each block of `_blocks` stands: rows and columns, broadcast against each other.
@@ -80,7 +84,13 @@ class System:
         return S, b
 
     def solve(self, r: Array, p: Array, v: Array, pdot: Array, gamma_defect: float | Array = 0.0) -> Solution:
-        """r̈, p̈, λ, λ_E of (N5) at r, ṙ (N, 3) and p, ṗ (N, 4).
+        """r̈, p̈, λ, λ_E of (N5) at r, ṙ (N, 3) and p, ṗ (N, 4), and what they mean; as `unknowns`."""
+        return self._read(*self.unknowns(r, p, v, pdot, gamma_defect))
+
+    def unknowns(
+        self, r: Array, p: Array, v: Array, pdot: Array, gamma_defect: float | Array = 0.0
+    ) -> tuple[Array, Rows]:
+        """The unknowns of (N5), x (m,) in the printed order, and the joints' rows.
 
         S is equilibrated symmetrically by powers of two (its blocks have the units kg, kg m² and m,
         and would otherwise decide the pivots), factored with partial pivoting and refined once.  Measured
@@ -92,9 +102,9 @@ class System:
         """
         with np.errstate(all="ignore"):  # what overflows is named below
             values, b, joints = self._blocks(r, p, v, pdot)
-        n, c = self.chain.n, len(self.joint)
-        b[7 * n : 7 * n + c] += gamma_defect
-        check(self.chain, r, p, joints.d, self.chain.rods, (values, b))
+            n, c = self.chain.n, len(self.joint)
+            b[7 * n : 7 * n + c] += gamma_defect
+            check(self.chain, r, p, joints.d, self._rods, (values, b, v))
 
         entries = values[self._by_row]
         scale = power_of_two(np.maximum.reduceat(np.abs(entries), self._row_start))
@@ -109,7 +119,7 @@ class System:
         x += lapack.dgbtrs(lu, self._width, self._width, residual, pivots)[0]
         solution = np.empty(self.size)
         solution[self._order] = x * scale
-        return self._read(solution, joints)
+        return solution, joints
 
     def solve_densely(self, r: Array, p: Array, v: Array, pdot: Array) -> Solution:
         """As `solve`, by dense factors of the assembled S: another way to the same x."""
@@ -123,7 +133,7 @@ class System:
         L_, L_rate = L(p), L(pdot)
         JL = chain.inertia @ L_
         blocks = (
-            np.repeat(chain.mass, 3),  # M
+            self._masses,  # M
             4 * (L_.swapaxes(-1, -2) @ JL),  # 4 LᵀJL
             joints.r_near,  # C_r
             -joints.r_near[self._far],
@@ -132,8 +142,10 @@ class System:
             2 * p,  # C_E,p
         )
         values = np.concatenate([np.ravel(block) for block in blocks])
-        force = chain.mass[:, None] * chain.gravity + chain.force - chain.drag_force[:, None] * v
-        moment = chain.moment - chain.drag_moment[:, None] * angular_velocity(p, pdot)
+        force, moment = self._weight, chain.moment
+        if self._drag:
+            force = force - chain.drag_force[:, None] * v
+            moment = moment - chain.drag_moment[:, None] * angular_velocity(p, pdot)
         quadratic = chain.inertia @ (L_rate @ p[..., None])
         p_force = 8 * (L_rate.swapaxes(-1, -2) @ quadratic) + 2 * (L_.swapaxes(-1, -2) @ moment[..., None])
         b = np.concatenate([force.ravel(), p_force.ravel(), joints.gamma, -2 * dot(pdot, pdot)])
@@ -143,11 +155,8 @@ class System:
         """The parts of x, and λ as forces."""
         n, c = self.chain.n, len(self.joint)
         multiplier = x[7 * n : 7 * n + c]
-        reaction = -np.add.reduceat(
-            multiplier[:, None] * joints.r_near, np.searchsorted(self.joint, np.arange(n))
-        )
-        tension = np.full(n, np.nan)
-        rod = self.chain.rods
+        reaction = -np.add.reduceat(multiplier[:, None] * joints.r_near, self._first)
+        tension, rod = np.full(n, np.nan), self._rods
         tension[rod] = 2 * self.chain.length[rod] * multiplier[rod[self.joint]]
         return Solution(
             acceleration=x[: 3 * n].reshape(n, 3),
@@ -189,16 +198,18 @@ def check(
     """Raise SingularSystem where the state alone says that S is singular, and of which body (E1, E7).
 
     ``d`` (N, 3) is where rod k points; below its own rounding (16 ε of the vectors it is the sum of)
-    it is zero, and a row made of it would be noise.  ``entries`` are those of S and b.
+    it is zero, and a row made of it would be noise.  ``entries`` are those of S and b, and ṙ.
     """
-    if not all(np.isfinite(x).all() for x in (*entries, d)):
+    if not np.isfinite(sum(x.sum() for x in (*entries, d))):  # no sum of finite entries means as much
         bad = ~(np.isfinite(r).all(-1) & np.isfinite(p).all(-1))
         where = f"the position of body {int(np.argmax(bad)) + 1}" if bad.any() else "a rate or a load"
         raise SingularSystem(f"{where} is not finite, so S x = b has no meaning")
     norms = dot(p, p)
-    if np.any(norms == 0):
+    if not norms.all():
         body = int(np.argmin(norms)) + 1
         raise SingularSystem(f"p of body {body} is 0: 4 LᵀJL and the normalisation row vanish with it (E7)")
+    if not rods.any():
+        return
     spans = [r, after_pivot(r), chain.proximal, after_pivot(chain.distal)]
     rounding = 16 * EPS * np.max(np.abs(spans), axis=(0, 2))
     collapsed = rods & (np.sqrt(dot(d, d)) <= rounding)
