@@ -11,7 +11,7 @@ that reach its line, quickest first, until one fails or `PATIENCE` ends.  docs/m
 out, and why.
 
 Ends with 1 where fewer than 95 % are noticed, where one survives that `survivors.yaml` does not list with a
-reason, or where that file lists one that is noticed or no longer there.
+reason, or where one is noticed that it lists.
 """
 
 from __future__ import annotations
@@ -388,7 +388,8 @@ def inside(target: str, options: argparse.Namespace) -> int:
             continue
     gc.collect()
     gc.freeze()  # else every child would go through all of it, and copy it
-    controls = [Mutant(file, 0, (0, 10**6), "", "", Path(file).read_text(encoding="utf-8")) for file in files]
+    sound = {mutant.file: Path(mutant.file).read_text(encoding="utf-8") for mutant in found}
+    controls = [Mutant(file, 0, (0, 10**6), "", "", code) for file, code in sound.items()]
     if any(what not in ("survived", "unreached") for _, what in trials(controls, reach, options.jobs)):
         raise SystemExit("the tests do not pass in a child without any mutant: nothing can be said")
     became = []
