@@ -27,6 +27,8 @@ from plumbline.shrink import Case, OutOfTime
 from plumbline.workers import Limits, Task, Workers
 
 ASKED, UNASKED = 60.0, 3.0  # s of computing for a script that was asked for, and at the end of a run
+TRIES = 6  # at least so many make a case smaller: where they take longer than `UNASKED`, none is begun
+ASK = "ask for this row by its key"
 
 
 class NotReproducible(ValueError):
@@ -65,7 +67,12 @@ def write(
     at_state = {cell[:2] for cell in cells if cell[2] == "state"}
     for cell, its in cells.items():
         if keys is None and cell[2:4] == ("relations", "-") and cell[:2] in at_state:
-            why = "the state-level script of this engine and scenario shows it; ask for this row by its key"
+            why = f"the state-level script of this engine and scenario shows it; {ASK}"
+            told |= {row["key"]: why for row in its}
+            continue
+        cost = its[0].get("wall_time", 0.0) if cell[2] in ("trajectory", "invariants") else 0.0
+        if keys is None and cost > UNASKED / TRIES:
+            why = f"one try takes {cost:.1f} s of computing, too long at the end of a run; {ASK}"
             told |= {row["key"]: why for row in its}
             continue
         every = [row for row in disputed(document) if cell_of(row) == cell]
@@ -110,7 +117,7 @@ def shown_by_script(question: Question, row: dict[str, Any]) -> tuple[str, str]:
                 if disagreement(question.engine.say(text)) > 1:
                     return text, ""
     except OutOfTime:
-        return "", f"no small case within {question.seconds:g} s of computing; ask for this row by its key"
+        return "", f"no small case within {question.seconds:g} s of computing; {ASK}"
     return "", "asked again, the engine agrees: nothing to show"
 
 

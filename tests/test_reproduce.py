@@ -484,6 +484,26 @@ def test_a_lost_engine_is_told_and_leaves_no_script(results):
     assert not list((results / "scripts").glob("*.py"))
 
 
+def test_at_the_end_of_a_run_nothing_long_is_begun(results):
+    document = store.read(results)
+    slow = {
+        "key": "s",
+        "level": "trajectory",
+        "integrator": "rkmk4",
+        "quantity": "attitude",
+        "wall_time": 2.0,
+    }
+    document["rows"] = [document["rows"][0] | slow]
+    (results / "results.json").write_text(json.dumps(document))
+    with patch("plumbline.reproduce.Workers", side_effect=AssertionError("began")):
+        told = reproduce.write(results)
+    assert told == {
+        "s": "one try takes 2.0 s of computing, too long at the end of a run; ask for this row by its key"
+    }
+    with patch("plumbline.reproduce.asked", side_effect=NotReproducible("began")):
+        assert reproduce.write(results, ["s"]) == {"s": "began"}
+
+
 def test_a_row_that_is_not_there_is_refused(results):
     with pytest.raises(NotReproducible, match="no row 'x'"):
         reproduce.write(results, ["x"])
