@@ -124,7 +124,7 @@ def test_what_someone_should_see_is_kept_whole_with_its_file(tmp_path):
         other = replace(fine, engine="exudyn")
         kept += probes.take([other, fine, who.row("state", "-", "acceleration", verdict, "why")])
     assert [r.verdict for r in kept] == ["agrees", "disagrees", "agrees", "unsupported"]
-    assert {r.engine for r in kept} == {"mujoco"}, "of the same probe, what another engine says calmly is folded"
+    assert {r.engine for r in kept} == {"mujoco"}, "what another engine says calmly of it is folded"
     assert probes.folded == {"agrees": 5} and probes.worst["mujoco", "joint_reaction"] == (0.5, drawn[0].name)
     excused = replace(kept[-1], known="k")
     assert probes.take([excused]) == [], "a recorded gap of every probe is only counted"
