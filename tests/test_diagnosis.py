@@ -129,7 +129,7 @@ def test_a_misread_quantity_is_named(quantity, to, words):
 
 def test_a_stale_field_and_an_origin_elsewhere_are_named():
     model, truth = known()
-    stale = [truth.quantities[-1], *truth.quantities[:-1]]
+    stale = [truth.quantities[0], *truth.quantities[:-1]]  # the first has none before it
     said = [replace(a, joint_reaction=b.joint_reaction) for a, b in zip(truth.quantities, stale, strict=True)]
     text = misread(observe(model, said, truth), "joint_reaction")
     assert text == "joint reaction of the state before were given (a stale field)"
@@ -195,7 +195,7 @@ def test_two_states_show_neither_a_constant_nor_a_stale_field(to):
 
 
 def test_a_pendulum_at_rest_is_asked_at_rest_too():
-    model = pendulums.model("rb")
+    model = replace(pendulums.model("rb"), gravity=np.array([0, 0, -9.81]))
     still = [lift(model, s.p, 0 * s.omega, s.u, 0 * s.udot) for s in random_states(model, 4, seed=3)]
     truth = state_truth(model, still)
 
@@ -205,3 +205,15 @@ def test_a_pendulum_at_rest_is_asked_at_rest_too():
 
     text = diagnose(model, evaluate(model, still), truth, evaluate)
     assert text.endswith("(the difference persists at rest, vanishes without gravity)")
+
+
+def test_what_lives_in_the_loads_vanishes_without_them():
+    model = pendulums.model("b", loads=True, drag=True)
+    truth = state_truth(model, random_states(model, 4, seed=6))
+    none = {name: 0 * getattr(model, name) for name in ("force", "moment", "drag_force", "drag_moment")}
+
+    def evaluate(asked, states):
+        return state_truth(replace(asked, **none), states).quantities
+
+    text = diagnose(model, evaluate(model, truth.states), truth, evaluate)
+    assert text.endswith("persists at rest, persists without gravity, vanishes without loads and drag)")

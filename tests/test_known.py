@@ -187,3 +187,5 @@ def test_what_an_entry_does_not_say_is_anything():
     for level, integrator, quantity in (("state", "-", "energy"), ("trajectory", "RK4", "position_limit")):
         assert about.covers(WHO.row(level, integrator, quantity, "disagrees", "why"))
     assert not about.sometimes and about.versions == ""
+    with pytest.raises(ValueError, match="frozen"):
+        about.quantity = "energy"

@@ -147,7 +147,9 @@ def test_a_shorter_window_may_tell_where_the_long_one_cannot():
     assert limit.extra["growth"] == 2.0 and "up to t = 1 s" in limit.reason
     assert found["position"].value == pytest.approx(0.01 * STEPS[-1] ** 2, rel=1e-6)
     assert found["attitude_limit"].horizon == 2.0
-    blind = rows(visible_position=np.full(17, 1e-14))["position_limit"]
+    both = rows(visible_position=np.full(17, 1e-14))
+    blind = both["position_limit"]
+    assert both["position"].verdict == "unresolved", "the finest run is no better than its limit"
     assert (blind.verdict, blind.horizon) == ("unresolved", 2.0)
     assert "is above the 1e-14 m that a mistake of 0.0001 would make" in blind.reason
     endless = rows(visible_position=np.full(17, np.inf))["position_limit"]
@@ -199,7 +201,8 @@ def test_a_method_with_a_tolerance_has_no_order_and_its_tightest_run_is_the_limi
     assert limit.value == pytest.approx(2e-12, rel=1e-2)
     assert limit.uncertainty == pytest.approx(1e-12 + 2e-12, rel=1e-2)
     assert found["position"].reason.startswith("position at tolerance 0.000976562 is 2e-12 m")
-    off = rows(climbed([1e-6 + e for e in (1e-7, 1e-8, 1e-9, 1e-10, 1e-11, 0)]), method)["position_limit"]
+    wild = (1e-7, 5e-8, 4.9e-8, 1e-9, 9e-10, 0)  # no order of any kind
+    off = rows(climbed([1e-6 + e for e in wild]), method)["position_limit"]
     assert off.verdict == "disagrees", "trusted without any order"
     floor = found["energy_drift"]
     each = PER_STEP + STEPS[-1]
@@ -224,10 +227,13 @@ def test_an_alias_is_told_and_drag_parts_it():
 
 
 def test_attitudes_have_two_signs():
-    some = climbed()
-    some.rungs[2] = replace(
-        some.rungs[2], trajectory=replace(some.rungs[2].trajectory, p=-some.rungs[2].trajectory.p)
-    )
+    some, right = climbed(), ladder()
+    for rung in (2, 4):
+        run = some.rungs[rung].trajectory
+        some.rungs[rung] = replace(some.rungs[rung], trajectory=replace(run, p=-run.p))
+    for mine, theirs in zip(ladder(some).attitudes, right.attitudes, strict=True):
+        assert np.array_equal(mine, theirs)
+    assert np.array_equal(right.positions[1], climbed().rungs[1].trajectory.r)
     assert rows(some)["attitude_limit"].verdict == "agrees"
 
 

@@ -51,7 +51,7 @@ def test_values_are_what_is_offered_times_its_factor() -> None:
     assert np.array_equal(twice.inertia, MODEL.inertia)
 
 
-def compared(*shifts, relation=None, refuse=()):
+def compared(*shifts, relation=None, refuse=(), refuse_here=()):
     """The relation of an engine with itself, answers shifted: (state, quantity, so many bounds of both)."""
     bounds = [state_bound(MODEL, s) for s in STATES]
     said = list(adapter("reference").evaluate(MODEL, STATES))
@@ -69,6 +69,7 @@ def compared(*shifts, relation=None, refuse=()):
             raise Unsupported(f"not state {index}")
         return [other[index]]
 
+    said = [Unsupported(f"nor state {k}") if k in refuse_here else x for k, x in enumerate(said)]
     relation = relation or Relation("as itself", lambda m, s: (m, s), same)
     return held(relation, said, there, MODEL, STATES, bounds, bounds)
 
@@ -87,6 +88,8 @@ def test_equal_answers_and_refused_ones() -> None:
     some = compared((0, "acceleration", 5.0), (1, "acceleration", 3.0), refuse=(0,))
     assert (some.states, some.state) == (2, 1) and some.refused == "not state 0"
     assert some.ratio == pytest.approx(3, rel=0.01)
+    mine = compared((2, "acceleration", 5.0), (1, "acceleration", 3.0), refuse_here=(2,))
+    assert (mine.states, mine.state, mine.refused) == (2, 1, "nor state 2")
     none = compared(refuse=(0, 1, 2))
     assert (none.ratio, none.states, none.verdict) == (None, 0, "unsupported")
 
@@ -173,6 +176,7 @@ def test_rows_say_what_held_what_did_not_and_what_was_refused() -> None:
     assert "E's joint reaction at state 2 differs by 1.5 times the rounding bounds of both" in rows[1].reason
     assert "to 0.5 of what rounding and the step's solver explain, 64 steps" in rows[3].reason
     assert "velocity at the end differs by 7 times" in rows[4].reason
+    assert rows[4].reason.endswith("what rounding and the step's solver explain")
     assert [r.reason for r in rows[5:]] == ["it stopped", "no such solver"]
     assert [r.quantity for r in rows][:2] == ["masses doubled"] * 2
 
@@ -201,3 +205,11 @@ def test_every_relation_is_asked_but_time_reversed_with_drag(drag: bool) -> None
     told += [] if drag else ["time reversed"]
     assert names[: len(told)] == told and ("time reversed" in names) is not drag
     assert "as pinocchio-maximal" in names and "two welded halves" in names
+
+
+def test_long_chains_are_asked_at_half_as_many_states() -> None:
+    pytest.importorskip("pinocchio")
+    for bodies, states in ((12, 4), (13, 2)):
+        model = pendulums.model("b" * bodies)
+        found = check("pinocchio", model, [pendulums.state(model, seed=k, rate=0.5) for k in range(6)])
+        assert {one.states for one in found if not one.steps and one.ratio is not None} == {states}

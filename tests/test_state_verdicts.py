@@ -115,7 +115,7 @@ def test_what_an_engine_does_not_offer_or_deliver_is_told():
     less = [*right[:2], replace(right[2], joint_reaction=None)]
     rows = judged(quantities=less).rows
     (gone,) = (row for row in rows if row.quantity == "joint_reaction")
-    assert (gone.verdict, gone.unit) == ("unsupported", "N")
+    assert (gone.verdict, gone.unit, gone.level, gone.integrator) == ("unsupported", "N", "state", "-")
     assert gone.reason == "Reference offers no joint reaction of its own"
     assert len(rows) == len(UNITS)
     for field, verdict in (("unsupported", "unsupported"), ("failure", "failed")):
