@@ -237,6 +237,12 @@ def run(
     show_default=True,
     help="Seconds of the long runs whose invariants are judged; 0 for none.",
 )
+@click.option(
+    "--instrument/--no-instrument",
+    default=True,
+    show_default=True,
+    help="The instrument's own test: planted mistakes must be reported and named.",
+)
 @click.option("--jobs", type=click.IntRange(1), default=None, help="Worker processes. Default: one per core.")
 @click.option("--scheduler", metavar="ADDRESS", help="A dask cluster to run on instead, as tcp://HOST:8786.")
 @click.option(
@@ -258,9 +264,11 @@ def run(
 )
 def nightly(
     names: tuple[str, ...], engines: tuple[str, ...], count: int, seed: int | None, finer: int,
-    endurance: float, jobs: int | None, scheduler: str | None, out: Path, timeout: float, memory: float,
+    endurance: float, instrument: bool, jobs: int | None, scheduler: str | None, out: Path, timeout: float,
+    memory: float,
 ) -> None:  # fmt: skip
-    """Run everything, unattended: catalogue, finer steps, random scenarios, and remember the night.
+    """Run everything, unattended: catalogue, finer steps, long runs, random scenarios, the instrument's own
+    test; and remember the night.
 
     Killed at any moment, the same command goes on where it stopped.
 
@@ -270,6 +278,7 @@ def nightly(
       python -m plumbline nightly --random 1000 --seed 7 --out nights
       python -m plumbline history nightly
     """
+    from plumbline.instrument import check
     from plumbline.nightly import nightly as run_night
 
     chosen, chosen_engines, folder = choose_scenarios(names, ()), choose_engines(engines), writable(out)
@@ -277,7 +286,7 @@ def nightly(
         result, place = run_night(
             folder, chosen, chosen_engines, random=count, seed=seed, jobs=jobs or os.cpu_count() or 1,
             limits=Limits(timeout, memory), whole=not names and not engines, finer=finer, progress=progress,
-            endurance=endurance, scheduler=scheduler,
+            endurance=endurance, scheduler=scheduler, instrument=check if instrument else None,
             command=shlex.join(["python", "-m", "plumbline", *sys.argv[1:]]),
             tell=lambda sentence: click.echo(sentence, err=True),
         )  # fmt: skip

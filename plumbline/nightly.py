@@ -2,7 +2,7 @@
 
     OUT/unfinished/plan.json   seed and number of the random scenarios, when it was begun
     OUT/unfinished/cells/      finished cells (`plumbline.cells`)
-    OUT/unfinished/night/      results as they are written
+    OUT/unfinished/night/      results as they are written, and what the instrument's own test said
     OUT/history/ID/            a complete night, moved there by one rename
 
 Killed at any moment, the same command reads the plan and goes on; a folder in history is never half.
@@ -24,6 +24,7 @@ from pathlib import Path
 import reports
 from plumbline import scenario as scenarios
 from plumbline.cells import Cells
+from plumbline.instrument import Answer
 from plumbline.random_scenarios import FAMILY, RandomScenarios
 from plumbline.run import Levels, Plan, Progress, Result, execute, save
 from plumbline.store import read, write_atomically
@@ -76,12 +77,19 @@ def nightly(
     endurance: float = 0.0,
     level: Levels = "all",
     scheduler: str | None = None,
+    instrument: Callable[[Path], Answer] | None = None,
     progress: Progress,
     tell: Callable[[str], None],
 ) -> tuple[Result, Path]:
-    """Run a night, or what is left of it; returns its result and its folder in OUT/history."""
+    """Run a night, or what is left of it; returns its result and its folder in OUT/history.
+
+    ``instrument`` is the instrument's own test, given the place of its JUnit file.
+    """
     unfinished = out / "unfinished"
     night = Night.begun(unfinished, seed, random)
+    if remembered(night, out / "history"):  # killed as it was done: only this was left of it
+        shutil.rmtree(unfinished)
+        night = Night.begun(unfinished, seed, random)
     kept = sum(1 for _ in unfinished.glob("cells/*.cell"))
     tell(f"random scenarios: {night.random}, seed {night.seed}")
     if kept:
@@ -106,6 +114,15 @@ def nightly(
     result.run |= {"started": night.started, "random": night.random, "seed": night.seed}
     folder = unfinished / "night"
     shutil.rmtree(folder, ignore_errors=True)
+    if instrument is not None:
+        folder.mkdir()
+        answer = instrument(folder / "instrument.xml")
+        result.run |= {
+            "instrument": answer.figures,
+            "sentence": f"{result.run['sentence']}; {answer.sentence}",
+        }
+        if answer.trouble:
+            result.run["exit_code"] = result.run["exit_code"] or 1
     save(result, folder, command)
     write_files_of_random(result, drawn, folder / "scenarios")
     with result.split.measure("report"):
@@ -114,6 +131,18 @@ def nightly(
     os.replace(folder, place)
     shutil.rmtree(unfinished)
     return result, place
+
+
+def remembered(night: Night, history: Path) -> bool:
+    """Whether that very night is complete already."""
+    if not (history.parent / "unfinished" / "cells").is_dir():
+        return False
+    for path in history.glob("*/results.json"):
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # damaged: `history` names it
+            run = read(path.parent)["run"]
+            if (run["started"], run["seed"], run["random"]) == (night.started, night.seed, night.random):
+                return True
+    return False
 
 
 def number(history: Path) -> int:

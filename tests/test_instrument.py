@@ -1,0 +1,92 @@
+"""The nightly asks the instrument's own test, and what that says counts."""
+
+import json
+
+import pytest
+
+from plumbline import instrument, nightly, scenario
+from plumbline.instrument import Answer
+from plumbline.workers import Limits
+
+GOOD = """
+def test_rates(record_property):
+    record_property("planted", 3)
+    record_property("reported", 3)
+"""
+BAD = (
+    GOOD
+    + """
+def test_that_fails():
+    assert False
+"""
+)
+SKIPPED = """
+import pytest
+pytest.importorskip("no_such_module_at_all")
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "figures", "trouble"),
+    [
+        (GOOD, {"planted": 3, "reported": 3}, ""),
+        (BAD, {"planted": 3, "reported": 3}, "test_that_fails"),
+        (SKIPPED, {}, "skipped"),
+        ("import nothing_of_that_name", {}, "cannot be read"),
+        ("", {}, "empty"),
+    ],
+)
+def test_the_answer_is_that_of_the_tests(tmp_path, text, figures, trouble):
+    (tmp_path / "test_it.py").write_text(text)
+    answer = instrument.check(tmp_path / "said.xml", str(tmp_path / "test_it.py"))
+    assert answer.figures == figures
+    assert trouble in answer.trouble and bool(trouble) == bool(answer.trouble)
+    assert ("failed" in answer.sentence) == bool(trouble)
+
+
+def test_one_that_hangs_is_ended(tmp_path):
+    (tmp_path / "test_it.py").write_text("import time\ndef test_a(): time.sleep(60)\n")
+    answer = instrument.check(tmp_path / "said.xml", str(tmp_path / "test_it.py"), patience=3)
+    assert answer.trouble == "no answer within 3 s"
+
+
+@pytest.mark.parametrize("trouble", ["", "half of them"])
+def test_a_night_with_a_dull_instrument_is_not_green(tmp_path, trouble):
+    pytest.importorskip("mujoco")
+
+    def said(report):
+        report.write_text("<testsuite/>")
+        return Answer({"planted": 67, "reported": 67}, trouble)
+
+    _, place = nightly.nightly(
+        tmp_path, scenario.load_many(["rest"]), ["mujoco"], random=0, seed=1, jobs=1, limits=Limits(),
+        whole=False, command="-", level="state", instrument=said, progress=lambda *_: None,
+        tell=lambda _: None,
+    )  # fmt: skip
+    run = json.loads((place / "results.json").read_text())["run"]
+    assert run["exit_code"] == bool(trouble) and run["instrument"]["planted"] == 67
+    assert ("67 planted" in run["sentence"]) == (not trouble) and trouble in run["sentence"]
+    assert (place / "instrument.xml").is_file()
+
+
+def test_a_night_killed_as_it_was_done_is_not_had_twice(tmp_path, monkeypatch):
+    pytest.importorskip("mujoco")
+
+    def night():
+        return nightly.nightly(
+            tmp_path, scenario.load_many(["rest"]), ["mujoco"], random=0, seed=None, jobs=1, limits=Limits(),
+            whole=False, command="-", level="state", progress=lambda *_: None, tell=lambda _: None,
+        )  # fmt: skip
+
+    def killed(_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(nightly.shutil, "rmtree", lambda path, **more: None if more else killed(path))
+        night()
+    (first,) = (tmp_path / "history").iterdir()
+    assert (tmp_path / "unfinished" / "plan.json").exists()
+    result, place = night()
+    seeds = [json.loads((p / "results.json").read_text())["run"]["seed"] for p in (first, place)]
+    assert place != first and seeds[0] != seeds[1] == result.run["seed"]
+    assert not (tmp_path / "unfinished").exists()
