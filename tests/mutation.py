@@ -175,6 +175,8 @@ def mutants(files: Sequence[str], sample: int | None, seed: int) -> list[Mutant]
         places = [places[i] for i in sorted(chosen)]
     made = []
     for file, module, place, mutated, reach in places:
+        if isinstance(mutated, cst.BaseExpression):
+            mutated = mutated.with_changes(lpar=(), rpar=())  # its place does not hold them
         code = spliced(module.code, place, module.code_for_node(mutated))
         was, now = changed_lines(module.code.splitlines(), code.splitlines())
         try:
