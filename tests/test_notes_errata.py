@@ -11,7 +11,7 @@ from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import I3, A, A_rate, L, dAs_dp, dot, rate
 from reference_impl.integrate import integrate
 from reference_impl.joints import rows
-from reference_impl.system import System, solve_dense
+from reference_impl.system import System, check, solve_dense
 from tests.notes_cases import Symbols, off_manifold, on_manifold, random_chain
 
 
@@ -232,6 +232,20 @@ def test_E7_singular_inertia_names_the_body():
         System(dataclasses.replace(chain, inertia=inertia)).solve(*state)
     with pytest.raises(SingularSystem, match=r"inertia of body 2 is singular.*E7"):
         integrate(dataclasses.replace(chain, inertia=inertia), *state, np.array([0.0, 1.0]), 1e-6)
+
+
+def test_E1_a_rod_is_as_short_as_its_own_surroundings_allow():
+    """A rod of 1e-9 m is a direction beside bodies of decimetres, and rounding 1e7 m from the pivot."""
+    rng = np.random.default_rng(16)
+    chain = random_chain(rng, [True, True])
+    r, p, *_ = on_manifold(chain, rng)
+    far = np.array([[0, 0, 0], [1e7, 0, 0]])
+    d, entries = 1e-9 * np.eye(3)[:2], (np.ones(1),)
+    check(chain, r, p, d, chain.rods, entries)
+    with pytest.raises(SingularSystem, match="rod above body 2 has length 0"):
+        check(chain, r + far, p, d, chain.rods, entries)
+    with pytest.raises(SingularSystem, match="rod above body 1 has length 0"):
+        check(chain, r + far[::-1], p, d, chain.rods, entries)
 
 
 @pytest.mark.parametrize("heavy", [1.0, 1e6, 1e-6])

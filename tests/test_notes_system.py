@@ -58,6 +58,10 @@ def test_the_band_and_the_dense_form_give_the_same_solution(rods, states):
     S, b = system.assemble(*state)
     x, dense = vector(system.solve(*state)), solve_dense(S, b)
     np.testing.assert_allclose(x, dense, rtol=0, atol=1e-14 * np.max(np.abs(dense)))
+    read, densely = system.solve(*state), system.solve_densely(*state)
+    np.testing.assert_array_equal(vector(densely), dense)
+    reaction = 1e-13 * np.max(np.abs(read.joint_reaction))
+    np.testing.assert_allclose(densely.joint_reaction, read.joint_reaction, rtol=0, atol=reaction)
     residual = np.abs(S @ x - b) / (np.abs(S) @ np.abs(x) + np.abs(b))
     assert np.max(residual) < 16 * np.finfo(float).eps
 
