@@ -404,10 +404,10 @@ def inside(target: str, options: argparse.Namespace) -> int:
     table.parent.mkdir(parents=True, exist_ok=True)
     records = [{**asdict(mutant), "code": None, "became": what} for mutant, what in became]
     table.write_text(json.dumps(records, indent=1, ensure_ascii=False), encoding="utf-8")
-    return judge(became, files)
+    return judge(became, files, LEAST if not options.again else 0.0)
 
 
-def judge(became: Sequence[tuple[Mutant, str]], files: Sequence[str]) -> int:
+def judge(became: Sequence[tuple[Mutant, str]], files: Sequence[str], least: float) -> int:
     """Print the figures; 1 where something is amiss."""
     kinds = Counter(what for _, what in became)
     rate = (kinds["noticed"] + kinds["endless"]) / max(len(became), 1)
@@ -423,7 +423,7 @@ def judge(became: Sequence[tuple[Mutant, str]], files: Sequence[str]) -> int:
         print(f"not listed: {mutant.file}:{mutant.line}\n  - {mutant.was}\n  + {mutant.now}")
     for mutant in stale:
         print(f"listed, and noticed: {mutant.file}:{mutant.line}\n  - {mutant.was}\n  + {mutant.now}")
-    return int(rate < LEAST or bool(new) or bool(stale))
+    return int(rate < least or bool(new) or bool(stale))
 
 
 def copied(target: Path) -> None:
