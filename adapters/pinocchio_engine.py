@@ -31,6 +31,7 @@ from typing import ClassVar, Literal, Self, cast
 import numpy as np
 import pinocchio as pin
 from scipy.integrate import DOP853
+from scipy.linalg import lapack
 
 from plumbline.adapter import Adapter
 from plumbline.kinematics import conjugate, multiply, rate, rotation
@@ -46,6 +47,7 @@ from plumbline.records import (
 )
 
 WORLD = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+WHOLE = 10  # joints up to which their 3 × 3 blocks are solved faster as one matrix
 Algorithm = Literal["aba", "aba-world", "crba", "cholesky", "forwardDynamics"]
 
 
@@ -153,6 +155,8 @@ class Chain:
     def flow(self, q: Array, theta: Array, v: Array) -> Array:
         """θ̇ (3 nj,) with d/dt integrate(q, θ) = v: dexp⁻¹ of θ applied to v, joint by joint."""
         dexp = pin.dIntegrate(self.pin, q, theta, pin.ArgumentPosition.ARG1)
+        if self.nj <= WHOLE:
+            return np.asarray(lapack.dgesv(dexp, v)[2])
         each = np.arange(self.nj)
         blocks = dexp.reshape(self.nj, 3, self.nj, 3)[each, :, each, :]  # the rest is zero
         return np.linalg.solve(blocks, v.reshape(-1, 3, 1)).ravel()
