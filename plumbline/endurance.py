@@ -35,6 +35,7 @@ DECADES = (0.1, 1.0, 10.0, 100.0, 1000.0)  # s: largest drifts are kept up to ea
 SHORTEST = 1.0  # s: what a run that fails falls back to, by decades
 BLOCKS = 16  # of time, in each window
 CONTROLLED = 0.125  # s between samples of a method with step control, which ends a step at each
+IN_TOLERANCE = 0.5  # order of a drift in the tolerance of a method with step control, at least
 SMALL = 0.1  # of an invariant's scale: a larger drift has left the range in which it is one
 SIGMAS = 3.0
 PER_STEP = 8 * 2.0**-52  # rounding of an invariant in one step, of its scale: a handful of operations
@@ -316,11 +317,11 @@ class Judge:
     def due(self) -> float:
         """The order of the drift in the step, at least; in the tolerance where that controls the step.
 
-        Conserved quantities often drift with a higher one.  A local error of order p + 1 held at the
-        tolerance makes the step its (p + 1)-th root.
+        Conserved quantities often drift with a higher one.  Step control holds the error of a step below
+        the tolerance, not at it: of the notes' collocation on a free top the energy's drift vanishes with
+        orders of 0.74 … 1.15 in the tolerance from decade to decade, down to 2e-10 J.
         """
-        p = self.integrator.order
-        return (p if self.integrator.kind == "step" else p / (p + 1)) - ORDER_MARGIN
+        return self.integrator.order - ORDER_MARGIN if self.integrator.kind == "step" else IN_TOLERANCE
 
     def growth_row(self) -> Row:
         """Whether a symmetric method's drift is bounded: the second half of the time adds little to it."""

@@ -38,6 +38,7 @@ class Entry(BaseModel):
     quantity: str = "*"
     verdict: Literal["disagrees", "unresolved", "unsupported", "failed"]
     sometimes: bool = False  # of random scenarios, which may or may not show it
+    finer: bool = False  # of the nightly's finer ladders alone
     evidence: str  # what shows it: a measurement, a script, a document
     reason: str  # why it is so
 
@@ -102,8 +103,10 @@ def spread(item: object) -> list[object]:
 class Excuses:
     """Entries as they are used: rows come by and by, and at the end an entry may have excused nothing."""
 
-    def __init__(self, entries: Sequence[Entry]) -> None:
-        self.entries = entries
+    def __init__(self, entries: Sequence[Entry], finer: bool = False) -> None:
+        """``finer``: the rows come from finer ladders than `run`'s."""
+        self.entries = [e for e in entries if finer or not e.finer]
+        self.finer = finer
         self.used: set[str] = set()
         self.covered: set[str] = set()
 
@@ -119,12 +122,12 @@ class Excuses:
             marked.append(replace(row, known=match.id if match else None))
         return marked
 
-    def stale(self, *, whole: bool, finer: bool = False) -> list[Entry]:
+    def stale(self, *, whole: bool) -> list[Entry]:
         """Entries that have had their day; with ``whole`` (a run of the full matrix) all that excused none.
 
         Where only a part of the matrix ran, an entry is stale if it covers rows that ran and excuses none
         and has no pattern in its scenario: a pattern may have its case among the cells that did not run.
-        ``finer`` ladders than the usual ones may resolve what is recorded as unresolved.
+        Finer ladders than the usual ones may resolve what is recorded as unresolved.
         """
         return [
             e
@@ -132,6 +135,6 @@ class Excuses:
             if e.id not in self.used
             and not e.sometimes
             and e.id in self.covered
-            and not (finer and e.verdict == "unresolved")
+            and not (self.finer and e.verdict == "unresolved")
             and (whole or not set("*?[") & set(e.scenario))
         ]

@@ -95,7 +95,7 @@ def describe_all(workers: Workers | Cluster, engines: Sequence[str]) -> dict[str
 def execute(plan: Plan, progress: Progress) -> Result:
     """Run the whole plan; cells that are lost become rows that say so."""
     begin, started = time.monotonic(), datetime.now(UTC)
-    excuses, tables, probes = known.Excuses(known.load()), store.Tables(), Probes()
+    excuses, tables, probes = known.Excuses(known.load(), plan.finer > 0), store.Tables(), Probes()
     rows: dict[str, list[Row]] = {s.name: [] for s in plan.scenarios}
     summaries: dict[str, dict[str, Any]] = {s.name: {} for s in plan.scenarios}
     methods: Counter[str] = Counter()
@@ -149,7 +149,7 @@ def execute(plan: Plan, progress: Progress) -> Result:
             questions.clear()
     result = Result(
         [row for name in rows for row in rows[name]],
-        excuses.stale(whole=plan.whole, finer=plan.finer > 0),
+        excuses.stale(whole=plan.whole),
         engines, summaries, probes, tables, split, {},
     )  # fmt: skip
     result.run = {

@@ -22,10 +22,10 @@ def row(verdict="disagrees", quantity="acceleration", who=WHO):
     return who.row("state", "-", quantity, verdict, "why")
 
 
-def judged_by(rows, entries, **form):
+def judged_by(rows, entries, whole, finer=False):
     """Rows with their excuses, and what is stale then."""
-    excuses = known.Excuses(entries)
-    return SimpleNamespace(rows=excuses.mark(rows), stale=excuses.stale(**form))
+    excuses = known.Excuses(entries, finer)
+    return SimpleNamespace(rows=excuses.mark(rows), stale=excuses.stale(whole=whole))
 
 
 def test_an_entry_marks_its_row_and_no_other():
@@ -189,3 +189,11 @@ def test_what_an_entry_does_not_say_is_anything():
     assert not about.sometimes and about.versions == ""
     with pytest.raises(ValueError, match="frozen"):
         about.quantity = "energy"
+
+
+def test_what_finer_ladders_alone_show_is_expected_of_them_alone():
+    nightly = entry(finer=True)
+    usual, finer = (judged_by([row()], [nightly], whole=True, finer=f) for f in (False, True))
+    assert usual.rows[0].known is None and usual.stale == []
+    assert finer.rows[0].known == "a" and finer.stale == []
+    assert judged_by([row("agrees")], [nightly], whole=True, finer=True).stale == [nightly]
