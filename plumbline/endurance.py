@@ -331,7 +331,9 @@ class Judge:
         name = f"{self.quantity}_long_growth"
         common = {"value": grown, "tolerance": SYMMETRIC_GROWTH, "horizon": end}
         if window.largest <= floor:
-            return self.new(name, "agrees", f"{self.name} is rounding", "1", **common)
+            return self.new(
+                name, "agrees", f"{self.name} is rounding: its growth says nothing", "1", horizon=end
+            )
         kept = self.finest.windows[self.quantity]
         for a, b in itertools.pairwise(t for t in sorted(kept) if t >= SHORTEST):
             if kept[b].largest > UNSTABLE * b / a * kept[a].largest:
