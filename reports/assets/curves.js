@@ -82,7 +82,11 @@ export function panels(root, series, horizon, onTime) {
       box,
     );
     plot.over.append(marker);
-    plot.over.addEventListener("click", (event) => onTime(plot.posToVal(event.offsetX, "x")));
+    // Before uPlot hears of it, which keeps a click to itself where it takes the pointer for moving; and from
+    // the panel's own edge: the target may be a point of the cursor inside it.
+    box.addEventListener("click", (event) => {
+      if (plot.over.contains(/** @type {Node} */ (event.target))) onTime(plot.posToVal(event.clientX - plot.over.getBoundingClientRect().left, "x"));
+    }, true);
     plot.root.setAttribute("role", "img");
     plot.root.setAttribute("aria-label", `${title} over time, log scale; largest: ${highest.map(([name, v]) => `${name} ${number(Number(v))} ${unit}`).join(", ")}`);
     shown.push({ plot, marker });
