@@ -14,7 +14,7 @@ from plumbline.endurance import course, endure, judge_endurance
 from plumbline.exact import solution
 from plumbline.findings import Findings, Subject
 from plumbline.motion_verdicts import judge_motion
-from plumbline.records import StateQuantities, Verdict
+from plumbline.records import Integrator, StateQuantities, Verdict
 from plumbline.sampling import random_states, seed_of
 from plumbline.scenario import Scenario
 from plumbline.state_verdicts import judge_states
@@ -86,11 +86,11 @@ class Bench:
         )
         arguments: tuple[Any, ...] = (s.model, self.states)
         if level == "trajectory":
-            integrator = next(i for i in info.integrators if i.name == rest[0])
+            integrator = self.integrator(name, rest[0])
             steps = ladder(integrator, s.model.n, s.duration, self.plan.finer)
             arguments = (integrator.name, s.model, s.state, s.times, steps)
         elif level == "endurance":
-            call, integrator = endure, next(i for i in info.integrators if i.name == rest[0])
+            call, integrator = endure, self.integrator(name, rest[0])
             length = course(integrator, s.model.n, self.plan.endurance)
             arguments = (integrator.name, s.model, s.state, s.sample, length)
         base, _ = versions.split(name)
@@ -119,6 +119,10 @@ class Bench:
         """The subject of this scenario's rows about an engine."""
         info = self.engines[engine]
         return Subject(self.scenario.name, self.scenario.family, engine, info.title, info.version)
+
+    def integrator(self, engine: str, name: str) -> Integrator:
+        """An engine's integrator by its name."""
+        return next(i for i in self.engines[engine].integrators if i.name == name)
 
     def take(self, outcome: Outcome) -> list[Task]:
         """Keep a truth and judge what waited for it, judge an answer or let it wait; new questions."""
@@ -157,7 +161,7 @@ class Bench:
                 return Findings(rows=[who.row("invariants", name, "all_long", "failed", lost)])
             return Findings(rows=[who.row(level, name, "all", "failed", lost)])
         if level == "endurance":
-            integrator = next(i for i in self.engines[engine].integrators if i.name == name)
+            integrator = self.integrator(engine, name)
             regular = self.scenario.exact is not None
             found = judge_endurance(who, self.scenario.model, integrator, outcome.value, regular)
         elif truth is None:
@@ -165,7 +169,7 @@ class Bench:
         elif isinstance(truth, StateTruth):
             found = judge_states(who, truth, outcome.value)
         else:
-            integrator = next(i for i in self.engines[engine].integrators if i.name == name)
+            integrator = self.integrator(engine, name)
             horizon = horizon_of(truth)
             found = judge_motion(who, self.scenario.model, truth, integrator, outcome.value, horizon)
         if self.plan.accept is not None:
