@@ -4,11 +4,10 @@
     python -m tests.mutation judging --sample 300 --seed 1    300 of them, drawn at random
     python -m tests.mutation plumbline/known.py --again       of one file, those that survived last time
 
-The mistakes are mutmut's.  Each is made in the memory of a forked child that holds every library already
-imported, so no file is ever changed and a mutant costs the tests it meets and half a second.  The tests run
-in a copy of the checkout, first once in full to learn which test reaches which line; a mutant meets those
-that reach its line, quickest first, until one fails or `PATIENCE` ends.  docs/mutation.md says what is left
-out, and why.
+The mistakes are mutmut's.  Each is made in the memory of a forked child, so no file is ever changed and a
+mutant costs the tests it meets and little more.  The tests run in a copy of the checkout, first once in full
+to learn which test reaches which line; a mutant meets those that reach its line, quickest first, until one
+fails or `PATIENCE` ends.  docs/mutation.md says what is left out, and why.
 
 Ends with 1 where fewer than 95 % are noticed, where one survives that `survivors.yaml` does not list with a
 reason, or where one is noticed that it lists.
@@ -19,6 +18,7 @@ from __future__ import annotations
 import argparse
 import gc
 import importlib
+import inspect
 import itertools
 import json
 import os
@@ -38,8 +38,8 @@ from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from importlib.util import spec_from_file_location
 from pathlib import Path
-from types import ModuleType
-from typing import Any
+from types import CodeType, FunctionType, ModuleType
+from typing import IO, Any, NoReturn
 
 import coverage
 import libcst as cst
@@ -62,6 +62,7 @@ TARGETS = {
     "reference_impl": ["reference_impl/*.py"],
     "judging": [f"plumbline/{name}.py" for name in JUDGES],
 }
+Live = dict[tuple[str, int], list[FunctionType]]  # functions of a file by name and first line
 TESTS = {  # by folder, those that have to notice
     "reference_impl": [f"tests/test_{name}.py" for name in NOTES],
     "plumbline": [f"tests/test_{name}.py" for name in (*JUDGES, "planted", "relation_parts")],
@@ -276,13 +277,12 @@ def run_tests(tests: Sequence[str], *plugins: object) -> int:
 
 def reach_of(tests: Sequence[str], files: Sequence[str]) -> Reach:
     """Run every test once, in a child, and see which lines it reaches."""
-    existing = sorted({str(path) for pattern in tests for path in Path().glob(pattern)})
     with tempfile.NamedTemporaryFile("r", encoding="utf-8") as answer:
         child = os.fork()
         if child == 0:
             watch = Watch(files)
             watch.coverage.start()
-            code = run_tests(existing, watch)
+            code = run_tests(tests, watch)
             watch.coverage.stop()
             Path(answer.name).write_text(json.dumps(asdict(watch.seen())), encoding="utf-8")
             os._exit(code)
@@ -315,7 +315,7 @@ class Mutated(MetaPathFinder, Loader):
 
 
 class Limit:
-    """A pytest plugin that ends the process where a test takes much longer than it did undisturbed."""
+    """A pytest plugin that ends the process where a test fails, or takes much longer than undisturbed."""
 
     def __init__(self, seconds: dict[str, float]) -> None:
         self.seconds = seconds
@@ -330,16 +330,26 @@ class Limit:
         """A test begins."""
         self.wait(3 + 5 * self.seconds[nodeid])
 
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        """A test, or what prepares or follows it, has ended."""
+        if report.failed:
+            os._exit(1)
+
+
+def confined() -> None:
+    """In a child: less memory, and nobody hears it."""
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    for stream in (0, 1, 2):
+        os.dup2(nowhere, stream)
+
 
 def trial(mutant: Mutant, tests: Sequence[str], seconds: dict[str, float]) -> int:
     """Fork a child that runs the tests on the mutant; its process id."""
     child = os.fork()
     if child:
         return child
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    nowhere = os.open(os.devnull, os.O_RDWR)
-    for stream in (0, 1, 2):
-        os.dup2(nowhere, stream)
+    confined()
     sys.meta_path.insert(0, Mutated(mutant))
     code = 1
     try:
@@ -348,23 +358,134 @@ def trial(mutant: Mutant, tests: Sequence[str], seconds: dict[str, float]) -> in
         os._exit(code)
 
 
-def trials(found: Sequence[Mutant], reach: Reach, jobs: int) -> Iterator[tuple[Mutant, str]]:
+def swapped(old: CodeType, new: CodeType, live: Live) -> bool:
+    """Give the functions whose code differs the new one; False where that is not all of the difference."""
+    inner = [[c for c in code.co_consts if isinstance(c, CodeType)] for code in (old, new)]
+    if len(inner[0]) != len(inner[1]):
+        return False
+    if old.co_flags & inspect.CO_OPTIMIZED:  # a function's
+        if old == new:
+            return True
+        here = live.get((old.co_qualname, old.co_firstlineno), [])
+        functions = [f for f in here if surface(f.__code__) == surface(old)]  # not two lambdas of a line
+        if old.co_freevars != new.co_freevars or not (functions or "<locals>" in old.co_qualname):
+            return False
+        for function in functions:
+            function.__code__ = new
+    elif surface(old) != surface(new):  # what runs on import: a module's or a class's own
+        return False
+    return all(swapped(*pair, live) for pair in zip(*inner, strict=True))
+
+
+def surface(code: CodeType) -> tuple[object, ...]:
+    """What a code object does itself, whatever the functions in it do."""
+    constants = [repr(c) for c in code.co_consts if not isinstance(c, CodeType)]
+    return code.co_code, code.co_names, code.co_varnames, constants
+
+
+class Swaps:
+    """A pytest plugin that tries mutants instead of running the tests, each in a child of this process.
+
+    The tests are collected and the project imported already: a child changes the code of functions in
+    place.  What else a mutant changes (constants, defaults, what runs on import) is not tried here, and
+    what survives may have done so by what was made before: both are tried again in a `trial`.
+    """
+
+    def __init__(self, found: Sequence[Mutant], reach: Reach, jobs: int, answers: IO[str]) -> None:
+        self.found, self.reach, self.jobs, self.answers = found, reach, jobs, answers
+
+    def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        """Try each mutant; a line of its number and the child's exit code for each."""
+        items = {item.nodeid: item for item in session.items}
+        live: dict[str, Live] = {}
+        for thing in gc.get_objects():
+            if isinstance(thing, FunctionType):
+                code = thing.__code__
+                place = live.setdefault(code.co_filename, {})
+                place.setdefault((code.co_qualname, code.co_firstlineno), []).append(thing)
+        gc.collect()
+        gc.freeze()
+        running: dict[int, int] = {}
+        waiting = list(range(len(self.found)))[::-1]
+        while waiting or running:
+            while waiting and len(running) < self.jobs:
+                number = waiting.pop()
+                tests = [items[test] for test in self.reach.tests(self.found[number])]
+                child = os.fork()
+                if not child:
+                    self.trial(self.found[number], tests, live)
+                running[child] = number
+            child, status = os.wait()
+            print(running.pop(child), os.waitstatus_to_exitcode(status), file=self.answers, flush=True)
+        return True
+
+    def trial(self, mutant: Mutant, tests: Sequence[pytest.Item], live: dict[str, Live]) -> NoReturn:
+        """In the child: the tests on the mutant."""
+        confined()
+        path = str(Path(mutant.file).resolve())
+        old, new = (compile(code, path, "exec") for code in (Path(path).read_text("utf-8"), mutant.code))
+        try:
+            if swapped(old, new, live.get(path, {})):
+                for test, following in itertools.zip_longest(tests, tests[1:]):
+                    test.config.hook.pytest_runtest_protocol(item=test, nextitem=following)
+        finally:
+            os._exit(0)
+
+
+def swaps(
+    found: Sequence[Mutant], tests: Sequence[str], reach: Reach, jobs: int
+) -> Iterator[tuple[int, int]]:
+    """Numbers of mutants and exit codes, 0 for those that are still to be tried otherwise."""
+    reader, writer = os.pipe()
+    child = os.fork()
+    if not child:
+        os.close(reader)
+        code = 1
+        try:
+            with os.fdopen(writer, "w") as answers:
+                plugins = Swaps(found, reach, jobs, answers), Limit(reach.seconds)
+                code = run_tests([*tests, "--capture=no"], *plugins)
+        finally:
+            os._exit(code)
+    os.close(writer)
+    with os.fdopen(reader) as answers:
+        for line in answers:
+            number, code = map(int, line.split())
+            yield number, code
+    if os.waitpid(child, 0)[1]:
+        raise SystemExit("the tests cannot be collected: nothing can be said")
+
+
+def trials(
+    found: Sequence[Mutant], tests: Sequence[str], reach: Reach, jobs: int
+) -> Iterator[tuple[Mutant, str]]:
     """Each mutant with what became of it: noticed, endless, survived or unreached."""
+    reached = [mutant for mutant in found if reach.tests(mutant)]
+    yield from ((mutant, "unreached") for mutant in found if not reach.tests(mutant))
+    waiting = []
+    for number, ended in swaps(reached, tests, reach, jobs):
+        if ended:
+            yield reached[number], fate(ended)
+        else:
+            waiting.append(reached[number])
+    yield from whole(waiting[::-1], reach, jobs)
+
+
+def whole(waiting: list[Mutant], reach: Reach, jobs: int) -> Iterator[tuple[Mutant, str]]:
+    """The same, each from the import on."""
     running: dict[int, Mutant] = {}
-    waiting = list(reversed(found))
     while waiting or running:
         while waiting and len(running) < jobs:
             mutant = waiting.pop()
-            tests = reach.tests(mutant)
-            if tests:
-                running[trial(mutant, tests, reach.seconds)] = mutant
-            else:
-                yield mutant, "unreached"
-        if running:
-            child, status = os.wait()
-            ended = os.waitstatus_to_exitcode(status)
-            endless = ended in (-signal.SIGPROF, -signal.SIGALRM)
-            yield running.pop(child), "survived" if ended == 0 else "endless" if endless else "noticed"
+            running[trial(mutant, reach.tests(mutant), reach.seconds)] = mutant
+        child, status = os.wait()
+        yield running.pop(child), fate(os.waitstatus_to_exitcode(status))
+
+
+def fate(ended: int) -> str:
+    """What a child's exit code says of its mutant."""
+    endless = ended in (-signal.SIGPROF, -signal.SIGALRM)
+    return "survived" if ended == 0 else "endless" if endless else "noticed"
 
 
 # --- the command --------------------------------------------------------------------------------
@@ -381,7 +502,8 @@ def inside(target: str, options: argparse.Namespace) -> int:
         left = {(m["file"], m["was"], m["now"]) for m in last if m["became"] in ("survived", "unreached")}
         found = [mutant for mutant in found if mutant.key in left]
     start = time.monotonic()
-    reach = reach_of(tests, files)
+    existing = sorted({str(path) for pattern in tests for path in Path().glob(pattern)})
+    reach = reach_of(existing, files)
     print(f"{len(reach.seconds)} tests in {time.monotonic() - start:.0f} s", flush=True)
     for name in reach.libraries:
         try:
@@ -392,10 +514,12 @@ def inside(target: str, options: argparse.Namespace) -> int:
     gc.freeze()  # else every child would go through all of it, and copy it
     sound = {mutant.file: Path(mutant.file).read_text(encoding="utf-8") for mutant in found}
     controls = [Mutant(file, 0, (0, 10**6), "", "", code) for file, code in sound.items()]
-    if any(what not in ("survived", "unreached") for _, what in trials(controls, reach, options.jobs)):
+    if any(
+        what not in ("survived", "unreached") for _, what in trials(controls, existing, reach, options.jobs)
+    ):
         raise SystemExit("the tests do not pass in a child without any mutant: nothing can be said")
     became = []
-    for mutant, what in trials(found, reach, options.jobs):
+    for mutant, what in trials(found, existing, reach, options.jobs):
         became.append((mutant, what))
         if what in ("survived", "unreached"):
             print(f"{what}: {mutant.file}:{mutant.line}\n  - {mutant.was}\n  + {mutant.now}", flush=True)
