@@ -53,14 +53,15 @@ def lift(model: Model, p: Array, omega: Array, u: Array, udot: Array) -> State:
     """The exact state that follows from minimal coordinates: r and v from the pivot outwards."""
     a = rotation(p)  # (N, 3, 3)
     r, v = np.empty((model.n, 3)), np.empty((model.n, 3))
+    near, far = np.cross(omega, model.proximal), np.cross(omega, model.distal)
     tip, tip_v = np.zeros(3), np.zeros(3)
     for k in range(model.n):
         hang = tip + model.length[k] * u[k]
         hang_v = tip_v + model.length[k] * udot[k]
         r[k] = hang - a[k] @ model.proximal[k]
-        v[k] = hang_v - a[k] @ np.cross(omega[k], model.proximal[k])
+        v[k] = hang_v - a[k] @ near[k]
         tip = r[k] + a[k] @ model.distal[k]
-        tip_v = v[k] + a[k] @ np.cross(omega[k], model.distal[k])
+        tip_v = v[k] + a[k] @ far[k]
     return State(p=p, omega=omega, u=u, udot=udot, r=r, v=v)
 
 

@@ -21,6 +21,7 @@ from ruamel.yaml.error import YAMLError
 
 from plumbline.records import Row
 
+Kind = tuple[str, str, str, str, str]  # of a row: engine, its version, level, integrator, quantity
 FILE = Path(__file__).with_name("known.yaml")
 
 
@@ -57,21 +58,19 @@ class Entry(BaseModel):
             raise ValueError("`sometimes` is for random scenarios (random-*): others show it or do not")
         return self
 
-    def covers(self, row: Row) -> bool:
-        """Whether the entry speaks of that row's cell, whatever its verdict; of an engine in any version."""
-        names = ("scenario", "level", "integrator", "quantity")
-        engine = row.engine.partition("@")[0]
-        here = fnmatchcase(engine, self.engine)
-        return (
-            here and all(fnmatchcase(getattr(row, n), getattr(self, n)) for n in names) and self.in_range(row)
-        )
+    def covers(self, kind: Kind) -> bool:
+        """Whether the entry speaks of that kind of row in its scenarios; of an engine in any version."""
+        engine, version, *others = kind
+        here = fnmatchcase(engine.partition("@")[0], self.engine)
+        patterns = self.level, self.integrator, self.quantity
+        return here and all(map(fnmatchcase, others, patterns)) and self.in_range(version)
 
-    def in_range(self, row: Row) -> bool:
-        """Whether the engine's version is in the entry's range; pre-releases count."""
+    def in_range(self, version: str) -> bool:
+        """Whether an engine's version is in the entry's range; pre-releases count."""
         if not self.versions:
             return True
         try:
-            return SpecifierSet(self.versions).contains(Version(row.engine_version), prereleases=True)
+            return SpecifierSet(self.versions).contains(Version(version), prereleases=True)
         except InvalidVersion:
             return False
 
@@ -107,19 +106,27 @@ class Excuses:
         """``finer``: the rows come from finer ladders than `run`'s."""
         self.entries = [e for e in entries if finer or not e.finer]
         self.finer = finer
+        self._of_kind: dict[Kind, list[Entry]] = {}  # there are many rows, of few kinds
         self.used: set[str] = set()
         self.covered: set[str] = set()
+
+    def about(self, row: Row) -> list[Entry]:
+        """The entries that speak of that row's cell, whatever its verdict."""
+        kind = row.engine, row.engine_version, row.level, row.integrator, row.quantity
+        if kind not in self._of_kind:
+            self._of_kind[kind] = [e for e in self.entries if e.covers(kind)]
+        return [e for e in self._of_kind[kind] if fnmatchcase(row.scenario, e.scenario)]
 
     def mark(self, rows: Iterable[Row]) -> list[Row]:
         """The rows, with the entry that expects their verdict where there is one."""
         marked = []
         for row in rows:
-            about = [e for e in self.entries if e.covers(row)]
-            self.covered |= {e.id for e in about}
+            about = self.about(row)
+            self.covered.update(e.id for e in about)
             match = next((e for e in about if e.verdict == row.verdict), None)
             if match:
                 self.used.add(match.id)
-            marked.append(replace(row, known=match.id if match else None))
+            marked.append(replace(row, known=match.id) if match else row)
         return marked
 
     def stale(self, *, whole: bool) -> list[Entry]:

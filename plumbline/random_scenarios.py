@@ -6,14 +6,13 @@ the others.  Each is a document like any scenario file's and passes the same che
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from typing import Any, overload
 
 import numpy as np
 
 from plumbline.sampling import seed_of
-from plumbline.scenario import Scenario, loads
+from plumbline.scenario import Scenario, made
 
 FAMILY = "random"
 MOST_BODIES = 10
@@ -48,7 +47,7 @@ class RandomScenarios(Sequence[Scenario]):
 def random_scenario(seed: int, k: int) -> Scenario:
     """Scenario k of a seed."""
     content = document(seed, k)
-    return loads(json.dumps(content), f"{content['name']}.yaml")
+    return made(content, f"{content['name']}.yaml")
 
 
 def document(seed: int, k: int) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -37,6 +38,7 @@ __all__ = [
     "load",
     "load_many",
     "loads",
+    "made",
     "schema",
     "slug",
 ]
@@ -85,6 +87,11 @@ def load(path: str | Path) -> Scenario:
 def loads(content: str, name: str = "scenario") -> Scenario:
     """The scenario of YAML text; ``name`` stands for the file."""
     return _build(parse(Source(name), content), Path(name))
+
+
+def made(content: dict[str, Any], name: str) -> Scenario:
+    """The scenario of plain data that a program made, checked as a file's is."""
+    return _build(Source(name, content, values=defaultdict(lambda: (1, 1))), Path(name))
 
 
 def load_many(names: Iterable[str | Path]) -> list[Scenario]:

@@ -46,23 +46,23 @@ def judge_states(who: Subject, truth: StateTruth, said: Evaluation) -> Findings:
 
 def compare(quantity: str, truth: StateTruth, said: Evaluation) -> Columns:
     """Per state (S,): the error, bound and scale of the body that comes nearest to its bound."""
-    records = []
-    answers = zip(said.quantities, truth.quantities, truth.bounds, strict=True)
-    for index, (answer, true, bound) in enumerate(answers):
-        error = sizes(quantity, np.asarray(getattr(answer, quantity)) - getattr(true, quantity))
-        tolerance = np.broadcast_to(bound.tolerance(quantity), error.shape)
-        scale = np.broadcast_to(bound.scale[quantity], error.shape)
-        body = int(np.argmax(error / np.maximum(tolerance, TINY)))
-        records.append((index, body, error[body], tolerance[body], scale[body]))
-    names = ("state", "body", "error", "bound", "scale")
-    return {name: np.array(column) for name, column in zip(names, zip(*records, strict=True), strict=True)}
+    answers = zip(said.quantities, truth.quantities, strict=True)
+    differences = [getattr(answer, quantity) - getattr(true, quantity) for answer, true in answers]
+    error = sizes(quantity, np.array(differences))
+    bound = np.array([bound.tolerance(quantity) for bound in truth.bounds]).reshape(error.shape)
+    scale = np.array([bound.scale[quantity] for bound in truth.bounds]).reshape(error.shape)
+    state, body = np.arange(len(error)), np.argmax(error / np.maximum(bound, TINY), axis=1)
+    at = state, body
+    return {"state": state, "body": body, "error": error[at], "bound": bound[at], "scale": scale[at]}
 
 
 def sizes(quantity: str, difference: Array) -> Array:
-    """(N,) Euclidean lengths per body; one number for scalars, momentum, the matrix's worst entry."""
+    """(S, N) Euclidean lengths per state and body; (S, 1) of scalars, momentum, the matrix's worst entry."""
+    count = len(difference)
     if quantity == "mass_matrix":
-        return np.array([np.max(np.abs(difference))])
-    return np.atleast_1d(np.linalg.norm(np.atleast_1d(difference), axis=-1))
+        return np.asarray(np.max(np.abs(difference.reshape(count, -1)), axis=1, keepdims=True))
+    components = 1 if difference.ndim == 1 else 3
+    return np.asarray(np.linalg.norm(difference.reshape(count, -1, components), axis=-1))
 
 
 def row(who: Subject, quantity: str, unit: str, found: Columns, method: str, cost: float) -> Row:

@@ -12,7 +12,6 @@ import json
 import os
 import tempfile
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -85,7 +84,7 @@ def plain(value: Any) -> Any:
 
 def row_record(row: Row) -> dict[str, Any]:
     """A row as results.json holds it."""
-    return {"key": row.key, **plain(asdict(row))}
+    return {"key": row.key, **plain(vars(row))}
 
 
 class Tables:
@@ -117,11 +116,11 @@ class Tables:
 
     def add_rows(self, rows: Iterable[Row]) -> None:
         """Take in rows for the summary."""
-        records = [row_record(row) for row in rows]
-        if records:
+        kept = list(rows)
+        if kept:
             names = TABLES["summary"].names
-            columns: Columns = {name: [r.get(name) for r in records] for name in names}
-            columns["extra"] = [json.dumps(r["extra"]) for r in records]
+            columns: Columns = {name: [plain(getattr(row, name)) for row in kept] for name in names}
+            columns["extra"] = [json.dumps(extra) for extra in columns["extra"]]
             self.add("summary", columns)
 
     def _encode(self, name: str) -> None:

@@ -394,6 +394,27 @@ def test_a_run_turns_its_rods_rates_too():
     close(s.state.udot, [[0.8, 1.5, 0.6], [-1.5, 0.8, 0.6], [-0.8, -1.5, 0.6]])
 
 
+def test_made_content_passes_the_checks_of_a_file():
+    body = {
+        "mass": 1.0,
+        "inertia": {"principal": [0.1, 0.1, 0.1]},
+        "proximal": [0.0, 0.0, 0.3],
+        "attitude": {"quaternion": [1.0, 0.0, 0.0, 0.0]},
+        "joint": {"kind": "ball"},
+    }
+    chain = [{**body, "distal": [0.0, 0.0, -0.3]}, body]
+    made, written = (
+        scenarios.made(document(chain), "x.yaml"),
+        scenarios.loads(as_yaml(document(chain)), "x.yaml"),
+    )
+    assert (made.digest, made.name) == (written.digest, written.name)
+    with pytest.raises(scenarios.ScenarioError) as refused:
+        scenarios.made(document([{**body, "mass": -1.0}, body]), "x.yaml")
+    assert [(p.file, p.field) for p in refused.value.problems] == [
+        ("x.yaml", "bodies[0].distal"), ("x.yaml", "bodies[0].mass"),
+    ]  # fmt: skip
+
+
 def test_the_digest_is_of_the_content():
     text = (scenarios.CATALOGUE / "single" / "tumbling-rod.yaml").read_text(encoding="utf-8")
     base = scenarios.loads(text).digest
