@@ -6,8 +6,8 @@
 
 The mistakes are mutmut's.  Each is made in the memory of a forked child, so no file is ever changed and a
 mutant costs the tests it meets and little more.  The tests run in a copy of the checkout, first once in full
-to learn which test reaches which line; a mutant meets those that reach its line, quickest first, until one
-fails or `PATIENCE` ends.  docs/mutation.md says what is left out, and why.
+to learn which test reaches which line; a mutant meets those that reach its line, the likeliest to notice
+first, until one fails or `PATIENCE` ends.  docs/mutation.md says what is left out, and why.
 
 Ends with 1 where fewer than 95 % are noticed, where one survives that `survivors.yaml` does not list with a
 reason, or where one is noticed that it lists.
@@ -315,10 +315,13 @@ class Mutated(MetaPathFinder, Loader):
 
 
 class Limit:
-    """A pytest plugin that ends the process where a test fails, or takes much longer than undisturbed."""
+    """A pytest plugin that ends the process where a test fails, or takes much longer than undisturbed.
+
+    The exit code is the number of the test that fails, 255 for all beyond.
+    """
 
     def __init__(self, seconds: dict[str, float]) -> None:
-        self.seconds = seconds
+        self.seconds, self.begun = seconds, 0
         self.wait(20.0)  # for imports
 
     def wait(self, seconds: float) -> None:
@@ -329,11 +332,12 @@ class Limit:
     def pytest_runtest_logstart(self, nodeid: str) -> None:
         """A test begins."""
         self.wait(3 + 5 * self.seconds[nodeid])
+        self.begun += 1
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """A test, or what prepares or follows it, has ended."""
         if report.failed:
-            os._exit(1)
+            os._exit(min(self.begun, 255))
 
 
 def confined() -> None:
@@ -383,6 +387,31 @@ def surface(code: CodeType) -> tuple[object, ...]:
     return code.co_code, code.co_names, code.co_varnames, constants
 
 
+class Experience:
+    """How often each test noticed a mistake in a file, for the next mutant to meet the likeliest first."""
+
+    def __init__(self, reach: Reach) -> None:
+        self.reach = reach
+        self.tried: Counter[tuple[str, str]] = Counter()
+        self.noticed: Counter[tuple[str, str]] = Counter()
+
+    def order(self, mutant: Mutant) -> list[str]:
+        """The tests of a mutant, by the time they take for each mistake noticed."""
+
+        def price(test: str) -> float:
+            at = mutant.file, test
+            return self.reach.seconds[test] * (self.tried[at] + 2) / (self.noticed[at] + 1)
+
+        return sorted(self.reach.tests(mutant), key=price)
+
+    def learn(self, mutant: Mutant, tests: Sequence[str], ended: int) -> None:
+        """What a child's exit code says of the tests it was to run."""
+        if ended >= 0:
+            last = ended or len(tests)
+            self.tried.update((mutant.file, test) for test in tests[:last])
+            self.noticed.update((mutant.file, test) for test in tests[last - 1 : last] if ended)
+
+
 class Swaps:
     """A pytest plugin that tries mutants instead of running the tests, each in a child of this process.
 
@@ -405,18 +434,22 @@ class Swaps:
                 place.setdefault((code.co_qualname, code.co_firstlineno), []).append(thing)
         gc.collect()
         gc.freeze()
-        running: dict[int, int] = {}
+        experience = Experience(self.reach)
+        running: dict[int, tuple[int, list[str]]] = {}
         waiting = list(range(len(self.found)))[::-1]
         while waiting or running:
             while waiting and len(running) < self.jobs:
                 number = waiting.pop()
-                tests = [items[test] for test in self.reach.tests(self.found[number])]
+                tests = experience.order(self.found[number])
                 child = os.fork()
                 if not child:
-                    self.trial(self.found[number], tests, live)
-                running[child] = number
+                    self.trial(self.found[number], [items[test] for test in tests], live)
+                running[child] = number, tests
             child, status = os.wait()
-            print(running.pop(child), os.waitstatus_to_exitcode(status), file=self.answers, flush=True)
+            number, tests = running.pop(child)
+            ended = os.waitstatus_to_exitcode(status)
+            experience.learn(self.found[number], tests, ended)
+            print(number, ended, file=self.answers, flush=True)
         return True
 
     def trial(self, mutant: Mutant, tests: Sequence[pytest.Item], live: dict[str, Live]) -> NoReturn:

@@ -19,8 +19,11 @@ from packaging.version import Version
 from plumbline import known, scenario, versions, work
 from plumbline.findings import Subject
 from plumbline.registry import ENGINES
+from plumbline.remote import call
 from plumbline.run import Plan, execute
+from plumbline.truth.certified import certify
 from plumbline.workers import Limits, Task, Workers
+from tests.exudyn_start import initial_accelerations
 
 HERE = sys.executable  # the installed environment stands for another one: the way there and back is the same
 
@@ -138,8 +141,31 @@ def test_the_supported_versions_work_beside_the_installed_ones(tmp_path):
         assert Version(result.engines[name].version) == Version(name.partition("@")[2])
     wrong = {r.key: r for r in result.rows if r.verdict in ("disagrees", "failed")}
     old = {f"{s.name}/{name}/trajectory/RK4/order" for s in chosen for name in OLD if "mujoco" in name}
-    assert wrong.keys() == old, "MuJoCo's RK4 is of order 2 before 4.0, and nothing else differs"
+    sparse = {
+        f"{s.name}/{name}/relations/{integrator}/by {solver}"
+        for s in chosen
+        for name in ("exudyn@1.9.0", "exudyn@1.10.0")
+        for integrator in ("trapezoidal", "generalized-alpha")
+        for solver in ("EXUdense", "EigenDense")
+    }
+    assert wrong.keys() == old | sparse, "MuJoCo's RK4 before 4.0, Exudyn's sparse start before 1.11"
     assert all(1.9 < wrong[key].order < 2.1 for key in old)
+
+
+@pytest.mark.full
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(("version", "sound"), [("1.9.0", False), ("1.10.0", False), ("1.11.0", True)])
+def test_exudyn_started_from_wrong_accelerations_with_its_sparse_solver(version, sound):
+    """The relation says that two solvers of one engine differ; this says which is wrong, and where."""
+    chosen = scenario.load_many(["double-tumbling-balls"])[0]
+    true = certify(chosen.model, chosen.state).quantities.acceleration
+    python = versions.interpreter(f"exudyn@{version}")
+    off = {
+        solver: np.max(np.abs(call(python, initial_accelerations, chosen.model, chosen.state, solver) - true))
+        for solver in ("EigenSparse", "EXUdense", "EigenDense")
+    }
+    assert max(off["EXUdense"], off["EigenDense"]) < 1e-4, "m/s²; by finite differences"
+    assert off["EigenSparse"] < 1e-4 if sound else off["EigenSparse"] > 0.1
 
 
 @pytest.mark.full

@@ -1,0 +1,21 @@
+"""What Exudyn takes for the accelerations at the start of an implicit run (for `test_versions`)."""
+
+from __future__ import annotations
+
+import exudyn
+
+from adapters.exudyn_common import linear, quiet, settings
+from adapters.exudyn_engine import Chain
+
+
+def initial_accelerations(model, state, solver):
+    """(N, 3) r̈ in m/s², as the implicit solver with that linear solver finds them at t = 0."""
+    with quiet():
+        chain, chosen = Chain(model, state), settings()
+        linear(chosen, solver)
+        chosen.timeIntegration.generalizedAlpha.computeInitialAccelerations = True
+        stepper = exudyn.MainSolverImplicitSecondOrder()
+        assert stepper.InitializeSolver(chain.mbs, chosen)
+        found = chain.mbs.systemData.GetODE2Coordinates_tt().copy()
+        stepper.FinalizeSolver(chain.mbs, chosen)
+    return found.reshape(model.n, 7)[:, :3]
