@@ -434,6 +434,8 @@ class Swaps:
                 place.setdefault((code.co_qualname, code.co_firstlineno), []).append(thing)
         gc.collect()
         gc.freeze()
+        for timer in (signal.ITIMER_PROF, signal.ITIMER_REAL):  # a child has timers of its own
+            signal.setitimer(timer, 0)
         experience = Experience(self.reach)
         running: dict[int, tuple[int, list[str]]] = {}
         waiting = list(range(len(self.found)))[::-1]
