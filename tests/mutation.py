@@ -51,6 +51,7 @@ from ruamel.yaml import YAML
 LEAST = 0.95  # of the mutants have to be noticed
 PATIENCE = 8.0  # s of processor time, undisturbed, of the tests that one mutant meets at most
 MEMORY = 8 * 2**30  # bytes of address space of a child
+MANY, UNTRIED = 253, 254  # exit codes of a child, see `Limit` and `Swaps`
 PLUGINS = ("no:cacheprovider", "pytest_timeout", "_hypothesis_pytestplugin")  # others only take time
 SURVIVORS = "tests/survivors.yaml"
 NOTES = ("notes_*", "forest", "collocation", "stabilised", "short_rods", "reference_engine")
@@ -222,13 +223,17 @@ class Reach:
     lines: dict[str, dict[int, list[str]]]  # file → line → tests, "" for the import
     libraries: list[str]  # imported modules that are not the project's
 
+    def near(self, mutant: Mutant) -> set[str]:
+        """The tests that run a line of its statement; "" among them where it runs on import."""
+        first, last = mutant.reach
+        lines = self.lines.get(mutant.file, {})
+        return {test for line, some in lines.items() if first <= line <= last for test in some}
+
     def tests(self, mutant: Mutant) -> list[str]:
         """Those that may notice it, quickest first: all of the file's where its line runs on import."""
-        lines = self.lines.get(mutant.file, {})
-        first, last = mutant.reach
-        near = {test for line, some in lines.items() if first <= line <= last for test in some}
+        near = self.near(mutant)
         if "" in near:
-            near = {test for tests in lines.values() for test in tests}
+            near = {test for tests in self.lines[mutant.file].values() for test in tests}
         quickest = sorted(near & self.seconds.keys(), key=lambda test: self.seconds[test])
         spent = itertools.accumulate(self.seconds[test] for test in quickest)
         return [test for test, seconds in zip(quickest, spent, strict=True) if seconds <= PATIENCE]
@@ -317,7 +322,7 @@ class Mutated(MetaPathFinder, Loader):
 class Limit:
     """A pytest plugin that ends the process where a test fails, or takes much longer than undisturbed.
 
-    The exit code is the number of the test that fails, 255 for all beyond.
+    The exit code is the number of the test that fails, `MANY` for all beyond.
     """
 
     def __init__(self, seconds: dict[str, float]) -> None:
@@ -337,7 +342,7 @@ class Limit:
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """A test, or what prepares or follows it, has ended."""
         if report.failed:
-            os._exit(min(self.begun, 255))
+            os._exit(min(self.begun, MANY))
 
 
 def confined() -> None:
@@ -378,7 +383,7 @@ def swapped(old: CodeType, new: CodeType, live: Live) -> bool:
             function.__code__ = new
     elif surface(old) != surface(new):  # what runs on import: a module's or a class's own
         return False
-    return all(swapped(*pair, live) for pair in zip(*inner, strict=True))
+    return all(swapped(one, other, live) for one, other in zip(*inner, strict=True))
 
 
 def surface(code: CodeType) -> tuple[object, ...]:
@@ -406,7 +411,7 @@ class Experience:
 
     def learn(self, mutant: Mutant, tests: Sequence[str], ended: int) -> None:
         """What a child's exit code says of the tests it was to run."""
-        if ended >= 0:
+        if ended >= 0 and ended != UNTRIED:
             last = ended or len(tests)
             self.tried.update((mutant.file, test) for test in tests[:last])
             self.noticed.update((mutant.file, test) for test in tests[last - 1 : last] if ended)
@@ -416,8 +421,7 @@ class Swaps:
     """A pytest plugin that tries mutants instead of running the tests, each in a child of this process.
 
     The tests are collected and the project imported already: a child changes the code of functions in
-    place.  What else a mutant changes (constants, defaults, what runs on import) is not tried here, and
-    what survives may have done so by what was made before: both are tried again in a `trial`.
+    place.  What else a mutant changes (constants, defaults, a class) is not tried here: `UNTRIED`.
     """
 
     def __init__(self, found: Sequence[Mutant], reach: Reach, jobs: int, answers: IO[str]) -> None:
@@ -459,18 +463,21 @@ class Swaps:
         confined()
         path = str(Path(mutant.file).resolve())
         old, new = (compile(code, path, "exec") for code in (Path(path).read_text("utf-8"), mutant.code))
+        code = 1
         try:
-            if swapped(old, new, live.get(path, {})):
-                for test, following in itertools.zip_longest(tests, tests[1:]):
-                    test.config.hook.pytest_runtest_protocol(item=test, nextitem=following)
+            if not swapped(old, new, live.get(path, {})):
+                os._exit(UNTRIED)
+            for test, following in itertools.zip_longest(tests, tests[1:]):
+                test.config.hook.pytest_runtest_protocol(item=test, nextitem=following)
+            code = 0
         finally:
-            os._exit(0)
+            os._exit(code)
 
 
 def swaps(
     found: Sequence[Mutant], tests: Sequence[str], reach: Reach, jobs: int
 ) -> Iterator[tuple[int, int]]:
-    """Numbers of mutants and exit codes, 0 for those that are still to be tried otherwise."""
+    """Numbers of mutants and exit codes, `UNTRIED` for those that are still to be tried otherwise."""
     reader, writer = os.pipe()
     child = os.fork()
     if not child:
@@ -499,10 +506,12 @@ def trials(
     yield from ((mutant, "unreached") for mutant in found if not reach.tests(mutant))
     waiting = []
     for number, ended in swaps(reached, tests, reach, jobs):
-        if ended:
-            yield reached[number], fate(ended)
+        mutant = reached[number]
+        # what has run on import or collection made things before the mutant was there
+        if ended == UNTRIED or (ended == 0 and "" in reach.near(mutant)):
+            waiting.append(mutant)
         else:
-            waiting.append(reached[number])
+            yield mutant, fate(ended)
     yield from whole(waiting[::-1], reach, jobs)
 
 
