@@ -115,9 +115,7 @@ def windows(seconds: float) -> list[float]:
 def endure(engine: str, integrator: str, model: Model, state: State, sample: float, plan: Course) -> Endured:
     """Run at every resolution of the plan; a run that fails is made again a decade shorter."""
     chosen = adapter(engine)
-    method = chosen.integrator(integrator)
-    if method.kind == "tolerance" and not (model.has_drag or np.any(model.moment)):
-        sample *= max(1, round(CONTROLLED / sample))  # where work is by quadrature, it needs all samples
+    sample = spacing(chosen.integrator(integrator), model, sample)
     runs: list[LongRun] = []
     for resolution in plan.resolutions:
         begin, failure, trajectory = time.process_time(), None, None
@@ -134,6 +132,13 @@ def endure(engine: str, integrator: str, model: Model, state: State, sample: flo
                 failure = failure or words(error)
         runs.append(reduced(model, trajectory, resolution, failure, begin))
     return Endured(runs, plan)
+
+
+def spacing(integrator: Integrator, model: Model, sample: float) -> float:
+    """Time in s from one sample to the next, where the scenario's is ``sample``."""
+    if integrator.kind == "tolerance" and not (model.has_drag or np.any(model.moment)):
+        sample *= max(1, round(CONTROLLED / sample))  # where work is by quadrature, it needs all samples
+    return sample
 
 
 def reduced(
@@ -182,7 +187,8 @@ def judge_endurance(
     cost = sum(run.cost for run in endured.runs)
 
     def whole(verdict: Verdict, reason: str) -> Findings:
-        row = who.row("invariants", integrator.name, "all_long", verdict, reason, wall_time=cost)
+        extra = {"asked": endured.plan.asked}
+        row = who.row("invariants", integrator.name, "all_long", verdict, reason, wall_time=cost, extra=extra)
         return Findings(rows=[row])
 
     if endured.unsupported is not None:
@@ -246,6 +252,14 @@ class Judge:
         by_quadrature = self.finest.work_uncertainty[end] if self.quantity == "energy_drift" else 0.0
         return float(passed * self.scale(end)) + by_quadrature
 
+    def passed(self, end: float) -> float:
+        """What may drift before an order is asked for: rounding, and what step control lets pass."""
+        floor = self.rounding(end)
+        if self.integrator.kind == "tolerance":
+            steps = self.finest.steps * end / self.finest.reached
+            floor += steps * self.finest.resolution * self.scale(end)
+        return floor
+
     def row(self) -> Row:
         """The longest window that can tell; a disagreement in it is never overruled by a shorter one."""
         ends = [t for t in sorted(self.finest.windows[self.quantity], reverse=True) if t >= SHORTEST]
@@ -260,12 +274,10 @@ class Judge:
 
     def judged(self, end: float) -> Row:
         """The verdict in one window."""
-        drift, floor = self.finest.windows[self.quantity][end].largest, self.rounding(end)
+        drift, floor = self.finest.windows[self.quantity][end].largest, self.passed(end)
         what, passed = f"{self.name} {drift:.2g} {self.unit} within {end:g} s", "rounding"
         if self.integrator.kind == "tolerance":
-            rtol = self.finest.resolution
-            floor += self.finest.steps * end / self.finest.reached * rtol * self.scale(end)
-            passed = f"what the tolerance {rtol:g} lets pass in every step"
+            passed = f"what the tolerance {self.finest.resolution:g} lets pass in every step"
         scale = self.scale(end)
         why = f"{self.finest.steps} steps in {self.finest.reached:g} s, a scale of {scale:.3g} {self.unit}"
         if drift > floor:
@@ -276,11 +288,7 @@ class Judge:
 
     def by_order(self, end: float, what: str) -> Row:
         """Does the drift fall with the step (or the tolerance) as the method's order says?"""
-        usable = [
-            run
-            for run in self.endured.runs
-            if end in run.windows.get(self.quantity, {}) and self.in_range(run, end)
-        ]
+        usable = self.usable(end)
         if len(usable) < 2 or usable[-1] is not self.finest:
             reason = (
                 f"{what}; of {len(self.endured.runs)} runs {len(usable)} reached it with every drift below "
@@ -308,6 +316,14 @@ class Judge:
             return self.verdict("disagrees", reason, end, tolerance, why, whole.order)
         return self.verdict("unresolved", f"{what}: {falls} cannot tell", end, tolerance, why, whole.order)
 
+    def usable(self, end: float) -> list[LongRun]:
+        """The runs that reached the window's end, in range."""
+        return [
+            run
+            for run in self.endured.runs
+            if end in run.windows.get(self.quantity, {}) and self.in_range(run, end)
+        ]
+
     def in_range(self, run: LongRun, end: float) -> bool:
         """Whether a run still is of the same motion: nothing that is conserved has gone far."""
         sizes = self.finest.scales[end]
@@ -329,11 +345,11 @@ class Judge:
         window, floor = self.finest.windows[self.quantity][end], self.rounding(end)
         grown = float(np.log2(window.largest / window.half)) if window.half > 0 else 0.0
         name = f"{self.quantity}_long_growth"
-        common = {"value": grown, "tolerance": SYMMETRIC_GROWTH, "horizon": end}
+        extra = {"asked": self.endured.plan.asked}
+        common = {"value": grown, "tolerance": SYMMETRIC_GROWTH, "horizon": end, "extra": extra}
         if window.largest <= floor:
-            return self.new(
-                name, "agrees", f"{self.name} is rounding: its growth says nothing", "1", horizon=end
-            )
+            reason = f"{self.name} is rounding: its growth says nothing"
+            return self.new(name, "agrees", reason, "1", horizon=end, extra=extra)
         kept = self.finest.windows[self.quantity]
         for a, b in itertools.pairwise(t for t in sorted(kept) if t >= SHORTEST):
             if kept[b].largest > UNSTABLE * b / a * kept[a].largest:

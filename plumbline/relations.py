@@ -48,6 +48,8 @@ from plumbline.records import (
 from plumbline.registry import adapter
 from plumbline.yardstick import ROUNDING, reach
 
+AS, BY = "as ", "by "  # how names of relations begin: another formulation, another way of the engine
+WELDED, REVERSED = "two welded halves", "reversed in time"
 FORMULATIONS = {
     "pinocchio": "pinocchio-maximal",
     "pinocchio-maximal": "pinocchio",
@@ -86,6 +88,8 @@ class Held:
     verdict: Verdict = "unsupported"  # of a refusal
     integrator: str = "-"  # where it is a relation of runs
     steps: int = 0  # of a run, there and back
+    resolution: float = 0.0  # of a run: its step in s, or its relative tolerance
+    end: float = 0.0  # s, of a run one way
 
 
 def values(said: StateQuantities, **factors: float) -> dict[str, Array]:
@@ -197,16 +201,16 @@ def check(engine: str, model: Model, states: Sequence[State]) -> list[Held]:
         for relation in RELATIONS
         if not (relation.name == "time reversed" and model.has_drag)
     ]
-    ways = {f"by {option}": chosen.by(option) for option in chosen.options}
+    ways = {BY + option: chosen.by(option) for option in chosen.options}
     if engine in FORMULATIONS:
-        ways[f"as {FORMULATIONS[engine]}"] = adapter(FORMULATIONS[engine])
+        ways[AS + FORMULATIONS[engine]] = adapter(FORMULATIONS[engine])
     asked += [(Relation(name, lambda m, s: (m, s), same), other.evaluate) for name, other in ways.items()]
     found = [held(relation, said, evaluate, model, states, bounds, bounds) for relation, evaluate in asked]
 
     def welding(model: Model, states: list[State]) -> list[StateQuantities]:
         return chosen.welding().evaluate(model, states)
 
-    welded = Relation("two welded halves", lambda m, s: (m, s), same)
+    welded = Relation(WELDED, lambda m, s: (m, s), same)
     of_halves = [state_bound(model, state, halves(model)) for state in states]
     found.append(held(welded, said, welding, model, states, bounds, of_halves))
     return [*found, *runs(chosen, model, states[0])]
@@ -283,13 +287,14 @@ def quickest(model: Model, state: State) -> float:
 def retraced(engine: Adapter, integrator: Integrator, model: Model, state: State, step: float) -> Held:
     """There and back by a symmetric integrator: the first row with opposite rates."""
     resolution = step if integrator.kind == "step" else integrator.tightest
-    name, end = "reversed in time", STEPS * step
+    end = STEPS * step
     try:
         run = engine.retrace(model, state, end, integrator.name, resolution)
     except (Unsupported, EngineFailure) as refusal:
-        return refused(name, integrator, refusal)
+        return refused(REVERSED, integrator, refusal)
     off = apart(model, row(run, 0), row(run, 2, -1.0))
-    return worst_of(name, integrator, off, allowed(integrator, model, state, end, run.steps), run.steps)
+    limit = allowed(integrator, model, state, end, run.steps)
+    return worst_of(REVERSED, integrator, off, limit, run.steps, resolution, end)
 
 
 def resolved(
@@ -309,12 +314,12 @@ def resolved(
     for solver in engine.solvers:
         other = last(engine.by(solver))
         if not isinstance(usual, Trajectory):
-            yield refused(f"by {solver}", integrator, usual)
+            yield refused(BY + solver, integrator, usual)
         elif not isinstance(other, Trajectory):
-            yield refused(f"by {solver}", integrator, other)
+            yield refused(BY + solver, integrator, other)
         else:
             off = apart(model, row(usual, -1), row(other, -1))
-            yield worst_of(f"by {solver}", integrator, off, limit, STEPS)
+            yield worst_of(BY + solver, integrator, off, limit, STEPS, step, times[-1])
 
 
 def refused(name: str, integrator: Integrator, refusal: Unsupported | EngineFailure) -> Held:
@@ -366,10 +371,19 @@ def apart(model: Model, one: State, other: State) -> dict[str, float]:
     }
 
 
-def worst_of(name: str, integrator: Integrator, off: dict[str, float], limit: float, steps: int) -> Held:
-    """A relation of runs, from the differences and what each may be."""
+def worst_of(
+    name: str,
+    integrator: Integrator,
+    off: dict[str, float],
+    limit: float,
+    steps: int,
+    resolution: float,
+    end: float,
+) -> Held:
+    """A relation of runs to ``end``, from the differences and what each may be."""
     quantity = max(off, key=lambda q: off[q])
-    return Held(name, off[quantity] / limit, quantity, 0, 1, integrator=integrator.name, steps=steps)
+    ratio = off[quantity] / limit
+    return Held(name, ratio, quantity, 0, 1, "", "unsupported", integrator.name, steps, resolution, end)
 
 
 def judge_relations(who: Subject, found: Sequence[Held]) -> Findings:
@@ -400,11 +414,12 @@ def judge_relations(who: Subject, found: Sequence[Held]) -> Findings:
             else f"{one.relation}: {who.title}'s {name} at {where} differs by {one.ratio:.3g} times {bounds}"
             + ("" if one.steps else " of both")
         )
+        of_run = {"resolution": one.resolution, "end": one.end} if one.steps else {}
         rows.append(
             who.row(
                 "relations", one.integrator, one.relation, "agrees" if agrees else "disagrees", reason,
                 value=one.ratio, tolerance=1.0, derivation=derivation,
-                extra={"states": float(one.states), "state": float(one.state)},
+                extra={"states": float(one.states), "state": float(one.state), **of_run},
             )
         )  # fmt: skip
     return Findings(rows)

@@ -18,11 +18,14 @@ import numpy as np
 
 from plumbline import store, versions
 from plumbline.converge import LADDER, RTOLS
+from plumbline.endurance import SHORTEST
+from plumbline.engine import Engine
 from plumbline.kinematics import lift
 from plumbline.records import Model, State
 from plumbline.sampling import random_states, seed_of
 from plumbline.script_text import script, unscripted
-from plumbline.shown import Engine, Question, measure_of, shrunk
+from plumbline.shown import Question, measure_of, shrunk, whole
+from plumbline.shown_long import GROWTH, LONG
 from plumbline.shrink import Case, OutOfTime
 from plumbline.workers import Limits, Task, Workers
 
@@ -71,6 +74,8 @@ def write(
             told |= {row["key"]: why for row in its}
             continue
         cost = its[0].get("wall_time", 0.0) if cell[2] in ("trajectory", "invariants") else 0.0
+        if long(its[0]):  # the first tries are as short as that
+            cost *= min(SHORTEST / its[0]["horizon"], 1.0)
         if keys is None and cost > UNASKED / TRIES:
             why = f"one try takes {cost:.1f} s of computing, too long at the end of a run; {ASK}"
             told |= {row["key"]: why for row in its}
@@ -111,7 +116,7 @@ def shown_by_script(question: Question, row: dict[str, Any]) -> tuple[str, str]:
     The same state is rounded otherwise by a script than by an adapter, which can matter next to a bound.
     """
     try:
-        for find in (shrunk, lambda q: measure_of(q)(q.case)):
+        for find in (shrunk, lambda q: measure_of(q)(whole(q))):
             if (found := find(question)) is not None:
                 text = script(row, found)
                 if disagreement(question.engine.say(text)) > 1:
@@ -128,21 +133,21 @@ def disagreement(said: str) -> float:
 
 def cell_of(row: dict[str, Any]) -> tuple[str, ...]:
     """What rows share a script: scenario, engine, level and integrator, or relation."""
-    apart = (row["quantity"],) if row["level"] == "relations" else ("long",) if long(row) else ()
+    apart = (row["quantity"],) if row["level"] == "relations" else ()
+    if long(row):
+        apart = ("long growth" if row["quantity"].endswith(GROWTH) else "long",)
     return row["scenario"], row["engine"], row["level"], row["integrator"], *apart
 
 
 def long(row: dict[str, Any]) -> bool:
     """Whether a row is about the nightly's long runs (`endurance`)."""
-    return "_long" in row["quantity"]
+    return str(row["quantity"]).endswith((LONG, GROWTH))
 
 
 def asked(document: dict[str, Any], rows: list[dict[str, Any]], seconds: float) -> Question:
     """What to shrink for the rows of one cell; NotReproducible where there is nothing to ask again."""
     row = rows[0]
     base, version = versions.split(row["engine"])
-    if long(row):
-        raise NotReproducible("a long run has no short case: the nightly of this scenario and engine runs it")
     if why := unscripted(base, row):
         raise NotReproducible(why)
     try:
@@ -153,15 +158,23 @@ def asked(document: dict[str, Any], rows: list[dict[str, Any]], seconds: float) 
     if about is None:
         raise NotReproducible(f"the results do not hold the scenario {row['scenario']!r}")
     model = Model(**{name: np.array(value, float) for name, value in about["model"].items()})
-    if row["level"] in ("trajectory", "invariants"):
+    if long(row):
+        case = Case(model, start(model, about), max(rows, key=ratio)["horizon"])
+    elif row["level"] in ("trajectory", "invariants"):
         case = runs_of(document, rows, model, start(model, about))
+    elif row["integrator"] != "-":
+        if "resolution" not in row["extra"]:
+            raise NotReproducible("the step of this run is not in the results")
+        case = Case(model, start(model, about), row["extra"]["end"], (row["extra"]["resolution"],))
     else:
         index = int(row["extra"]["state"])
         states = random_states(model, index, seed_of("states", about["digest"])) if index else []
         case = Case(model, states[-1] if states else start(model, about))
     most = max(ratio(row) for row in rows)
     wanted = tuple(row["quantity"] for row in rows)
-    return Question(engine, row["level"], wanted, row["integrator"], case, most, seconds)
+    return Question(
+        engine, row["level"], wanted, row["integrator"], case, most, seconds, about.get("sample", 0.0)
+    )
 
 
 def start(model: Model, about: dict[str, Any]) -> State:
@@ -172,7 +185,7 @@ def start(model: Model, about: dict[str, Any]) -> State:
 def runs_of(document: dict[str, Any], rows: list[dict[str, Any]], model: Model, state: State) -> Case:
     """The runs behind rows: up to the time of the longest of them, at the resolutions of the ladder."""
     cell = {k: rows[0][k] for k in ("scenario", "engine", "integrator")}
-    every = [row for row in document["rows"] if all(row[k] == cell[k] for k in cell)]
+    every = [row for row in document["rows"] if all(row[k] == cell[k] for k in cell) and of_ladder(row)]
     finest = min((row["extra"]["resolution"] for row in every if "resolution" in row["extra"]), default=None)
     declared = next((row["declared_order"] for row in every if row["declared_order"]), None)
     until = max(row["horizon"] for row in rows)
@@ -185,6 +198,11 @@ def runs_of(document: dict[str, Any], rows: list[dict[str, Any]], model: Model, 
     # the longest run of a number of coarsest steps that halves well, within the row's time
     span = coarsest * 2.0 ** np.floor(np.log2(max(until / coarsest, 1.0)))
     return Case(model, state, float(span), tuple(steps))
+
+
+def of_ladder(row: dict[str, Any]) -> bool:
+    """Whether a row is about the runs of a ladder of steps."""
+    return row["level"] in ("trajectory", "invariants") and not long(row)
 
 
 def ratio(row: dict[str, Any]) -> float:

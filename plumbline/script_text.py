@@ -13,10 +13,13 @@ import numpy as np
 from packaging.version import InvalidVersion, Version
 
 from plumbline.converge import ORDER_MARGIN
+from plumbline.endurance import BLOCKS, SIGMAS, SYMMETRIC_GROWTH
 from plumbline.parts import halves, whole
 from plumbline.records import Array
-from plumbline.relations import RELATIONS
-from plumbline.shown import AS, BY, WELDED, Shown, ShownRelation, ShownRun, ShownState
+from plumbline.relations import AS, BY, RELATIONS, REVERSED, WELDED
+from plumbline.shown import Shown, ShownRelation, ShownRun, ShownState
+from plumbline.shown_long import ShownLong
+from plumbline.shown_twice import ShownTwice
 from plumbline.shrink import Case
 from plumbline.versions import split
 
@@ -43,6 +46,9 @@ ENGINE_LINES = {
 }
 WELDERS = ("mujoco", "pinocchio", "pinocchio-aba", "pinocchio-maximal")  # that can be of two halves
 SWITCHED = ("reference", "mujoco", "pinocchio", "pinocchio-aba")  # that know the engine's options
+TURNED = ("reference", "exudyn")  # whose runs go there and back
+SOLVERS = {"exudyn": "EigenSparse", "exudyn-tree": "EXUdense"}  # linear, usual; the other ones are named
+Moving = ShownRun | ShownTwice | ShownLong
 SHORT = 80  # characters of a literal that stays on a line
 MODEL_WORDS = {
     "mass": "kg",
@@ -55,6 +61,13 @@ MODEL_WORDS = {
     "moment": "N m, body frame",
     "drag_force": "N s/m",
     "drag_moment": "N m s",
+}
+ENDS: dict[type, str] = {
+    ShownState: "end-state",
+    ShownRelation: "end-relations",
+    ShownTwice: "end-twice",
+    ShownRun: "end-motion",
+    ShownLong: "end-long",
 }
 STATE_WORDS = {
     "p": "attitudes",
@@ -88,8 +101,8 @@ def script(row: dict[str, Any], shown: Shown) -> str:
             if name not in ENGINE_LINES[engine][0]:
                 again = part(name, flags_of(shown, second, version))
                 text += "\n\n" + re.sub(r"\b(built|evaluate)\(", r"other_\1(", again)
-    end = {ShownState: "end-state", ShownRelation: "end-relations", ShownRun: "end-motion"}[type(shown)]
-    return text + "\n\n" + part(end, flags)
+    ends = ["invariants"] if isinstance(shown, ShownRun | ShownLong) and shown.drifts else []
+    return text + "".join("\n\n" + part(name, flags) for name in [*ends, ENDS[type(shown)]])
 
 
 def unscripted(engine: str, row: dict[str, Any]) -> str:
@@ -99,14 +112,16 @@ def unscripted(engine: str, row: dict[str, Any]) -> str:
         return f"no script template for {engine}; there are: {', '.join(ENGINE_LINES)}"
     if row["level"] != "relations":
         return ""
+    unknown = f"the script of {engine} does not know the relation {relation!r}"
     if row["integrator"] != "-":
-        return f"the relation {relation!r} is one of runs, and scripts of relations are of one state"
+        knows = engine in TURNED if relation == REVERSED else relation.startswith(BY) and engine in SOLVERS
+        return "" if knows else f"{unknown} of runs"
     if relation.startswith(AS) or relation in (r.name for r in RELATIONS):
         return ""
     if not (relation == WELDED or relation.startswith(BY)):
         return f"the relation {relation!r} is not of one state described or asked about in two ways"
     able = WELDERS if relation == WELDED else SWITCHED
-    return "" if engine in able else f"the script of {engine} does not know the relation {relation!r}"
+    return "" if engine in able else unknown
 
 
 def jointed(engine: str) -> bool:
@@ -136,13 +151,9 @@ def flags_of(shown: Shown, engine: str, version: str) -> set[str]:
         flags.add("loads")
     if model.has_drag or np.any(model.moment):
         flags.add("powered")
-    if isinstance(shown, ShownRun):
+    if isinstance(shown, Moving):
         kind = "fixed" if shown.integrator.kind == "step" else "adaptive"
-        flags |= {"motion", kind, shown.integrator.name, *shown.drifts}
-        flags |= {"ordered"} if shown.ordered else set()
-        flags |= {"limited"} if shown.limited else set()
-        flags |= {"invariants"} if shown.drifts else set()
-        flags |= {"extrapolated"} if shown.limited or shown.drifts else set()
+        flags |= {"motion", kind, shown.integrator.name, *flags_of_moving(shown)}
         if flags & {"joint_gap", "gap_rate"}:
             flags.add("gaps")
     else:
@@ -160,6 +171,19 @@ def flags_of(shown: Shown, engine: str, version: str) -> set[str]:
     return flags | {"before-1.12" if old else "since-1.12"}
 
 
+def flags_of_moving(shown: Moving) -> set[str]:
+    """What holds of runs."""
+    if isinstance(shown, ShownTwice):
+        return {"resolved" if shown.solver else "retraced"}
+    if isinstance(shown, ShownLong):
+        return {"long", "growth" if shown.growth else "falling", *shown.drifts}
+    flags = {"closing", *shown.drifts}
+    flags |= {"ordered"} if shown.ordered else set()
+    flags |= {"limited"} if shown.limited else set()
+    flags |= {"invariants"} if shown.drifts else set()
+    return flags | ({"extrapolated"} if shown.limited or shown.drifts else set())
+
+
 CONVENTIONS = [
     "",
     "An open chain of rigid bodies hung from the world origin. SI units, world z up; quaternions",
@@ -171,7 +195,14 @@ CONVENTIONS = [
 def head(row: dict[str, Any], shown: Shown) -> list[str]:
     """What the script shows, of whom."""
     who, about = f"{row['engine']!a} {row['engine_version']!a}", f"scenario {row['scenario']!a}"
-    if isinstance(shown, ShownRun):
+    if isinstance(shown, ShownTwice):
+        return [
+            f"{who}, integrator {row['integrator']!a}, disagrees with itself:",
+            f"two ends that should be the same ({shown.name!a}) are {shown.ratio:.3g} times what",
+            "rounding and the step's solver explain apart. No truth is needed.",
+            f"Shrunk from {about}: a run of {shown.case.until} s.",
+        ]
+    if isinstance(shown, ShownRun | ShownLong):
         return [
             f"{who}, integrator {row['integrator']!a}:",
             f"{row['quantity']!a} off by {shown.ratio:.3g} times the tolerance.",
@@ -198,7 +229,7 @@ def needs(engine: str, shown: Shown) -> list[str]:
     """What has to be there besides the engine and numpy."""
     if engine == "reference":
         return ["", "The engine is the package reference_impl: run it with the checkout in PYTHONPATH."]
-    if isinstance(shown, ShownRun) and shown.integrator.name == "dop853":
+    if isinstance(shown, Moving) and shown.integrator.name == "dop853":
         return ["", "Pinocchio has no integrator: SciPy's DOP853 takes the steps, on its accelerations."]
     return []
 
@@ -207,12 +238,14 @@ def settings(engine: str, shown: Shown) -> list[str]:
     """Choices that are one word."""
     lines = []
     if engine.startswith("pinocchio"):
-        stepped = isinstance(shown, ShownRun) and shown.integrator.kind == "step"
+        stepped = isinstance(shown, Moving) and shown.integrator.kind == "step"
         lines.append(f"ALGORITHM = {'aba' if engine == 'pinocchio-aba' or stepped else 'crba'!r}")
     elif isinstance(shown, ShownRelation) and shown.way.startswith(BY):
         lines.append('ALGORITHM = "usual"')
-    if isinstance(shown, ShownRun):
+    if isinstance(shown, Moving):
         lines.append(f"INTEGRATOR = {shown.integrator.name!r}")
+        if engine in SOLVERS:
+            lines.append(f"SOLVER = {SOLVERS[engine]!r}  # of the linear equations")
     return [*lines, ""] if lines else []
 
 
@@ -229,6 +262,10 @@ def evidence(shown: Shown) -> list[str]:
     """What is true, or the second description, and what is allowed."""
     if isinstance(shown, ShownRun):
         return run_evidence(shown)
+    if isinstance(shown, ShownTwice):
+        return twice_evidence(shown)
+    if isinstance(shown, ShownLong):
+        return long_evidence(shown)
     explained = "# largest Euclidean norm of the difference (per body) that rounding in double explains"
     if isinstance(shown, ShownState):
         exact = "enclosed in ball arithmetic, rounded to double once" if shown.certified else "not certified"
@@ -256,6 +293,43 @@ def pieces(case: Case) -> list[str]:
             lines.append(f"    [{', '.join(each)}],")
         lines.append("]")
     return lines
+
+
+def twice_evidence(shown: ShownTwice) -> list[str]:
+    """The run, and how far apart its two ends may be."""
+    unit = "s" if shown.integrator.kind == "step" else "relative tolerance"
+    return [
+        "",
+        f"times = np.array([0.0, {shown.case.until!r}])  # s",
+        f"step = {shown.case.steps[0]!r}  # {unit}",
+        *([f"OTHER_SOLVER = {shown.solver!r}"] if shown.solver else []),
+        "# largest difference of a body (m, rad, m/s, rad/s): by rounding and the step's solver, grown",
+        f"allowed = {shown.allowed!r}",
+    ]
+
+
+def long_evidence(shown: ShownLong) -> list[str]:
+    """Times and steps, and what is due."""
+    fixed = shown.integrator.kind == "step"
+    words = ("step", "steps") if fixed else ("tolerance", "relative tolerances")
+    lines = [
+        "",
+        f"times = np.linspace(0.0, {float(shown.times[-1])!r}, {len(shown.times)})  # s",
+        f"steps = {list(shown.case.steps)!r}  # {'s' if fixed else words[1]}",
+        f"drifts = {shown.drifts!r}",
+    ]
+    if shown.growth:
+        return [*lines, f"limit = {SYMMETRIC_GROWTH!r}  # of log2 of the growth: 0 is bounded, 1 secular"]
+    passed = "rounding" if fixed else "rounding and every step's tolerance"
+    return [
+        *lines,
+        f"step_word, blocks, sigmas = {words[0]!r}, {BLOCKS!r}, {SIGMAS!r}",
+        f"due = {shown.due!r}  # order in the {words[0]}, at least",
+        "# of rounding and the step's solver, in one block of time",
+        f"rounding = {shown.rounding!r}",
+        f"# of {passed}, in the whole run",
+        f"passed = {shown.passed!r}",
+    ]
 
 
 def run_evidence(shown: ShownRun) -> list[str]:

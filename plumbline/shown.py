@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from io import StringIO
 from typing import Any, cast
 
 import numpy as np
@@ -19,13 +17,15 @@ import numpy as np
 from plumbline import work
 from plumbline.bound import state_bound
 from plumbline.converge import ORDER_MARGIN
+from plumbline.engine import Engine
 from plumbline.findings import Subject
 from plumbline.motion_verdicts import Ladder
 from plumbline.parts import halves
-from plumbline.records import Array, Integrator, Model, Row, State, StateQuantities
+from plumbline.records import Array, Integrator, Model, Row, StateQuantities
 from plumbline.registry import adapter
-from plumbline.relations import RELATIONS, Relation, same, values
-from plumbline.remote import call
+from plumbline.relations import AS, RELATIONS, WELDED, Relation, same, values
+from plumbline.shown_long import GROWTH, LONG, OverLong, ShownLong
+from plumbline.shown_twice import ShownTwice, Twice
 from plumbline.shrink import Case, smallest
 from plumbline.truth import TruthUnavailable
 from plumbline.truth.certified import certify
@@ -33,48 +33,7 @@ from plumbline.work import Rung
 from plumbline.yardstick import MotionTruth, motion_truth
 
 LIMITS = ("position_limit", "position", "attitude_limit", "attitude")
-AS, BY, WELDED = "as ", "by ", "two welded halves"  # names of relations, or how they begin
 FINE = 64  # samples of a run whose loads' work is integrated
-
-
-@dataclass(frozen=True)
-class Engine:
-    """Whom to ask: a registered name and, for another version, the interpreter of its environment."""
-
-    name: str
-    python: str = ""
-
-    def ask(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """``function(name, *arguments)``, here or there."""
-        if self.python:
-            return call(self.python, function, self.name, *arguments)
-        return function(self.name, *arguments)
-
-    def evaluate(self, model: Model, state: State, way: str = "") -> StateQuantities:
-        """What it says of a state, by another of its ways where one is named."""
-        found: StateQuantities = self.ask(answer, way, model, state)
-        return found
-
-    def say(self, script: str) -> str:
-        """What a script prints."""
-        said: str = self.ask(printed, script)
-        return said
-
-
-def printed(_: str, script: str) -> str:
-    """The output of a script, run in this process; empty where it fails."""
-    with redirect_stdout(StringIO()) as output, suppress(Exception):
-        exec(compile(script, "script", "exec"), {"__name__": "__main__"})  # it is ours, written from numbers
-    return output.getvalue()
-
-
-def answer(engine: str, way: str, model: Model, state: State) -> StateQuantities:
-    """What an engine says of a state: as usual, by one of its options, or of welded halves."""
-    chosen = adapter(engine)
-    if way:
-        chosen = chosen.welding() if way == WELDED else chosen.by(way.removeprefix(BY))
-    (said,) = chosen.evaluate(model, [state])
-    return said
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +79,7 @@ class ShownRun:
     uncertain: dict[str, float]  # m, rad or the invariant's unit, per quantity
 
 
-Shown = ShownState | ShownRelation | ShownRun
+Shown = ShownState | ShownRelation | ShownTwice | ShownRun | ShownLong
 
 
 @dataclass(frozen=True)
@@ -134,6 +93,7 @@ class Question:
     case: Case
     most: float  # by how much it disagreed, in tolerances
     seconds: float  # of computing, for shrinking
+    sample: float = 0.0  # s, from one sample of a long run to the next
 
 
 def measure_of(question: Question) -> Callable[[Case], Shown | None]:
@@ -142,8 +102,18 @@ def measure_of(question: Question) -> Callable[[Case], Shown | None]:
     if q.level == "state":
         return AtState(q.engine, q.wanted)
     if q.level == "relations":
+        if q.integrator != "-":
+            return Twice(q.engine, q.integrator, q.wanted[0])
         return Related(q.engine, q.wanted[0])
+    if q.wanted[0].endswith((LONG, GROWTH)):
+        return OverLong(q.engine, q.integrator, q.wanted, q.sample)
     return AlongRuns(q.engine, q.integrator, q.level, q.wanted)
+
+
+def whole(question: Question) -> Case:
+    """The case in question with its steps; those of a long run are its integrator's."""
+    measure = measure_of(question)
+    return measure.whole(question.case) if isinstance(measure, OverLong) else question.case
 
 
 def shrunk(question: Question) -> Shown | None:
@@ -151,18 +121,15 @@ def shrunk(question: Question) -> Shown | None:
 
     Raises OutOfTime where none was found in time.
     """
-    measure, most = measure_of(question), question.most
-    if not question.case.steps:
-        most = getattr(measure(question.case), "ratio", 0.0)
+    measure, case, most = measure_of(question), whole(question), question.most
+    if not case.steps:
+        most = getattr(measure(case), "ratio", 0.0)
     # what another environment computes is not on this process's clock
     clock = time.monotonic if question.engine.python else time.process_time
-    found = smallest(question.case, measure, most, question.seconds, not adaptive(measure), clock)
+    steps_given = getattr(getattr(measure, "integrator", None), "kind", "step") == "step"
+    as_it_is = isinstance(measure, OverLong) and measure.growth  # another motion need not be a regular one
+    found = smallest(case, measure, most, question.seconds, steps_given, clock, not as_it_is)
     return cast("Shown | None", found)
-
-
-def adaptive(measure: object) -> bool:
-    """Whether it is one of runs whose steps the integrator chooses."""
-    return isinstance(measure, AlongRuns) and measure.integrator.kind == "tolerance"
 
 
 def length_of(difference: Array, quantity: str) -> Array:
@@ -281,9 +248,7 @@ class AlongRuns:
     @cached_property
     def integrator(self) -> Integrator:
         """As the engine declares it."""
-        every = self.engine.ask(work.describe).integrators
-        found: Integrator = next(i for i in every if i.name == self.method)
-        return found
+        return self.engine.integrator(self.method)
 
     def times(self, case: Case) -> Array | None:
         """Start and end; more where the work of moments or drag is to be integrated, if steps allow it."""

@@ -104,23 +104,26 @@ def smallest(
     seconds: float,
     coarsest: bool = True,
     clock: Callable[[], float] = time.process_time,
+    plainer: bool = True,
 ) -> M | None:
     """The smallest case found within ``seconds`` that shows what ``case`` shows; None where none does.
 
     ``most`` is by how much it showed.  ``coarsest``: a run is at least one of its coarsest steps long.
+    ``plainer``: with fewer bodies and simpler numbers; else only runs are shortened.
     The clock is that of computing by default: a busy machine finds no other cases.  OutOfTime where none
     was found before all were tried.
     """
     search: Search[M] = Search(measure, clock, clock() + seconds)
     for goal in (100 * PLAIN, PLAIN):  # in two rounds: each simplification may cost some of what is shown
         search.enough = max(min(most / 2, goal), 1.0)
-        if search.best is None and not search.first(growing(case)):
+        if search.best is None and not search.first(growing(case, plainer)):
             continue
-        fewest_bodies(search)
+        if plainer:
+            fewest_bodies(search)
         for _ in range(2 if search.case.steps else 0):
             shortest_run(search, coarsest)
             fewest_steps(search)
-        for change in simpler(search.case.model):
+        for change in simpler(search.case.model) if plainer else ():
             search.take(change(search.case))
     if search.best is None:
         search.enough = 1.0
@@ -130,11 +133,12 @@ def smallest(
     return search.best
 
 
-def growing(case: Case) -> Iterator[Case]:
+def growing(case: Case, plainer: bool = True) -> Iterator[Case]:
     """Cases of a run from cheap to dear, the whole one last; a single state as it is."""
     n = case.model.n
-    counts = [2**k for k in range(n.bit_length()) if 2**k < n] + [n]
-    spans = [case.until / 4**k for k in range(3)] if case.steps else [case.until]
+    counts = [2**k for k in range(n.bit_length()) if plainer and 2**k < n] + [n]
+    quarters = max(3, 1 + int(np.log2(max(case.until, 1.0)) / 2))  # down to some seconds, of long runs
+    spans = [case.until / 4**k for k in range(quarters)] if case.steps else [case.until]
     for span, count in sorted(((s, c) for s in spans for c in counts), key=lambda x: x[0] * x[1]):
         if case.steps and span < case.steps[0]:
             continue

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from adapters.mujoco_engine import Mujoco
-from plumbline import endurance, reproduce, scenario, store
+from plumbline import endurance, scenario
 from plumbline.endurance import BLOCKS, BODY_STEPS, Course, Fall, course, endure, judge_endurance
 from plumbline.findings import Subject
 from plumbline.records import Integrator, Trajectory
@@ -181,12 +181,3 @@ def test_a_run_has_long_cells_beside_the_others():
     assert len({row.key for row in result.rows}) == len(result.rows)
     assert {row.verdict for row in rows} == {"agrees"}
     assert {row.integrator for row in rows if row.alias_of} == {"implicitfast"}
-
-
-def test_a_long_disagreement_is_told_to_have_no_script(tmp_path):
-    who = Subject("rest", "single", "mujoco", "MuJoCo", "4")
-    row = who.row("invariants", "RK4", "energy_drift_long", "disagrees", "leaks")
-    tables = store.Tables()
-    tables.add_rows([row])
-    store.write(tmp_path, {}, {}, {}, [row], tables)
-    assert "the nightly of this scenario" in reproduce.write(tmp_path)[row.key]

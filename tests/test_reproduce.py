@@ -24,11 +24,15 @@ from click.testing import CliRunner
 from plumbline import relations, reproduce, shown, store, versions
 from plumbline.cli import main
 from plumbline.converge import ladder
+from plumbline.endurance import Course, course, endure, judge_endurance
+from plumbline.engine import Engine
 from plumbline.registry import ENGINES, adapter
 from plumbline.reproduce import NotReproducible, disagreement, file_name, shown_by_script
 from plumbline.script_text import ENGINE_LINES, PARTS, part, script, unscripted
-from plumbline.shown import AlongRuns, AtState, Engine, Question, Related, shrunk
-from plumbline.shrink import Case
+from plumbline.shown import AlongRuns, AtState, Question, Related, shrunk
+from plumbline.shown_long import OverLong
+from plumbline.shown_twice import Twice, both_ends
+from plumbline.shrink import Case, growing
 from plumbline.workers import Outcome
 from tests import pendulums
 from tests.pendulums import JOINTS
@@ -76,9 +80,10 @@ def defective(lines: str):
     import mujoco
     import pinocchio
 
+    from reference_impl import collocation
     from reference_impl.system import System
 
-    places = (exudyn.itemInterface, mujoco, pinocchio, System)
+    places = (exudyn, exudyn.itemInterface, mujoco, pinocchio, collocation, System)
     before = [dict(vars(place)) for place in places]
     try:
         exec(lines, {})
@@ -163,6 +168,57 @@ def test_a_script_measures_drifts_as_the_harness_does(engine, loads, count):
         assert float(printed) == pytest.approx(harness, rel=0.01, abs=1e-13 + 2 * by_quadrature), quantity
 
 
+@pytest.mark.parametrize(
+    ("engine", "integrator", "loads", "count"),
+    [
+        ("exudyn", "trapezoidal", False, 5),
+        ("pinocchio", "rkmk4", True, 4),
+        pytest.param("reference", "dop853", True, 4, marks=pytest.mark.full),
+    ],
+)
+def test_a_script_of_long_runs_measures_as_the_nightly_does(engine, integrator, loads, count):
+    """Every sample of every invariant; the work of moments and drag is integrated without SciPy."""
+    model = pendulums.model(JOINTS["rod-ball"], loads=loads, drag=loads)
+    case = Case(model, pendulums.state(model, seed=3, rate=1.0), 1.0)
+    measure = OverLong(Engine(engine), integrator, tuple(f"{name}_long" for name in DRIFTS), 2.0**-7)
+    found = measure(measure.whole(case))
+    said, names = executed(script(row(engine), found))
+    assert len(found.drifts) == len(ratios(said)) == count and max(ratios(said)) < 1
+    assert len(names["times"]) == 129
+    plan = Course(1.0, found.case.steps, 1.0)
+    nightly = endure(engine, integrator, model, case.state, 2.0**-7, plan).runs[-1]
+    for quantity in found.drifts:
+        window = nightly.windows[quantity][1.0]
+        allowed = 1e-13 + 2 * nightly.work_uncertainty[1.0] * (quantity == "energy_drift")
+        last = rf"{quantity} within(?:.*\n)+?  \w+ {found.case.steps[-1]}: (\S+), (\S+)"
+        largest, mean = map(float, re.search(last, said).groups())
+        assert largest == pytest.approx(window.largest, rel=0.01, abs=allowed), quantity
+        assert mean == pytest.approx(np.mean(window.blocks), rel=0.01, abs=allowed), quantity
+
+
+@pytest.mark.parametrize(
+    ("engine", "integrator", "relation"),
+    [("exudyn", "trapezoidal", "reversed in time"), ("reference", "collocation", "reversed in time")]
+    + [("exudyn", "generalized-alpha", f"by {way}") for way in adapter("exudyn").solvers]
+    + [("exudyn-tree", "RK44", f"by {way}") for way in adapter("exudyn-tree").solvers],
+)
+def test_a_script_runs_twice_as_the_harness_does(engine, integrator, relation):
+    model = pendulums.model(JOINTS["rod-ball"], loads=True, drag=relation.startswith("by"))
+    measure = Twice(Engine(engine), integrator, relation)
+    step = 2.0**-8 if measure.integrator.kind == "step" else measure.integrator.tightest
+    found = measure(Case(model, pendulums.state(model, seed=3, rate=1.0), 2.0**-5, (step,)))
+    text = script(row(engine, level="relations"), found)
+    said, names = executed(text)
+    assert len(ratios(said)) == 4 and max(ratios(said)) < 0.1 and found.ratio < 0.1
+    assert names.get("OTHER_SOLVER", "") == found.solver
+    one, _, _ = both_ends(engine, relation, integrator, model, found.case.state, 2.0**-5, step)
+    for mine, theirs in zip(names["one"], (one.r, one.p, one.v, one.omega), strict=True):
+        assert np.max(np.abs(mine - theirs)) < 1e-11
+    other = re.search(r"^(one, )?other = .*", text, re.M)[0]
+    spoilt = text.replace(other, f"{other}\nother[0][-1] += 1e-3")
+    assert max(ratios(executed(spoilt)[0])) > 1, "blind"
+
+
 @pytest.mark.parametrize("engine", ["pinocchio", "exudyn"])
 @pytest.mark.parametrize("relation", [r.name for r in relations.RELATIONS])
 def test_a_script_of_a_relation_finds_what_the_harness_finds(engine, relation):
@@ -240,6 +296,45 @@ for name in ("constraintDynamics", "forwardDynamics"):
         return real(m, d, q, 1.0001 * v, tau, *more)
     setattr(pinocchio, name, fast)
 """
+SOLVER = """import exudyn
+class Spoilt:
+    def __init__(self):
+        self.real = made()
+    def __getattr__(self, name):
+        return getattr(self.real, name)
+    def SolveSystem(self, mbs, chosen):
+        spoil(chosen, chosen.timeIntegration.generalizedAlpha)
+        return self.real.SolveSystem(mbs, chosen)
+"""
+LOSSY = f"""{SOLVER}made, exudyn.MainSolverImplicitSecondOrder = exudyn.MainSolverImplicitSecondOrder, Spoilt
+def spoil(chosen, method):
+    method.useNewmark = method.useIndex2Constraints = False
+    method.spectralRadius = 0.9
+"""
+DENSE = f"""{SOLVER}made, exudyn.MainSolverImplicitSecondOrder = exudyn.MainSolverImplicitSecondOrder, Spoilt
+def spoil(chosen, method):
+    if chosen.linearSolver.solverType == exudyn.LinearSolverType.EXUdense:
+        method.useNewmark = method.useIndex2Constraints = False
+        method.spectralRadius = 0.5
+"""
+SPARSE = f"""{SOLVER}made, exudyn.MainSolverExplicit = exudyn.MainSolverExplicit, Spoilt
+def spoil(chosen, method):
+    if chosen.linearSolver.solverType == exudyn.LinearSolverType.EigenSparse:
+        chosen.timeIntegration.solverType = exudyn.DynamicSolverType.ExplicitMidpoint
+"""
+FASTER = """from reference_impl import collocation
+real = collocation.integrate
+def faster(chains, r, p, v, pdot, *more, **named):
+    return real(chains, r, p, v * (1 + 1e-9), pdot * (1 + 1e-9), *more, **named)
+collocation.integrate = faster
+"""
+DAMPED = """import mujoco
+real = mujoco.mj_setConst
+def damped(m, d):
+    m.dof_damping[:] = 1e-5
+    real(m, d)
+mujoco.mj_setConst = damped
+"""
 FULL = pytest.mark.full
 DEFECTS = [  # engine, level, integrator, what must disagree, the defect
     ("mujoco", "state", "-", "joint_reaction", HEAVY),
@@ -248,6 +343,10 @@ DEFECTS = [  # engine, level, integrator, what must disagree, the defect
     ("exudyn", "trajectory", "trapezoidal", "attitude_limit", STRONG),
     ("pinocchio", "invariants", "semi-implicit-euler", "energy_drift", SYRUP),
     ("pinocchio-aba", "relations", "-", "by crba", SYRUP),
+    ("exudyn", "relations", "trapezoidal", "reversed in time", LOSSY),
+    ("exudyn-tree", "relations", "RK44", "by EigenSparse", SPARSE),
+    ("mujoco", "invariants", "RK4", "energy_drift_long", DAMPED),
+    ("pinocchio", "invariants", "rkmk4", "energy_drift_long", SYRUP),
     pytest.param("pinocchio", "state", "-", "mass_matrix", BIASED, marks=FULL),
     pytest.param("pinocchio-maximal", "state", "-", "acceleration", FLYER, marks=FULL),
     pytest.param("exudyn", "state", "-", "acceleration", STRONG, marks=FULL),
@@ -259,6 +358,11 @@ DEFECTS = [  # engine, level, integrator, what must disagree, the defect
     pytest.param("mujoco", "invariants", "RK4", "energy_drift", HEAVY, marks=FULL),
     pytest.param("exudyn", "invariants", "generalized-alpha", "energy_drift", STRONG, marks=FULL),
     pytest.param("pinocchio", "relations", "-", "as pinocchio-maximal", FLYER, marks=FULL),
+    pytest.param("exudyn", "relations", "trapezoidal", "by EXUdense", DENSE, marks=FULL),
+    pytest.param("exudyn", "relations", "generalized-alpha", "by EXUdense", DENSE, marks=FULL),
+    pytest.param("reference", "relations", "collocation", "reversed in time", FASTER, marks=FULL),
+    pytest.param("exudyn", "invariants", "trapezoidal", "energy_drift_long", STRONG, marks=FULL),
+    pytest.param("pinocchio", "invariants", "dop853", "energy_drift_long", BIASED, marks=FULL),
 ]
 
 
@@ -270,11 +374,16 @@ DEFECTS = [  # engine, level, integrator, what must disagree, the defect
 def test_a_defect_in_an_engine_is_shown_by_its_script(engine, level, integrator, wanted, lines, tmp_path):
     """The script is run in a process of its own; without the defect the same script finds nothing."""
     model = pendulums.model(JOINTS["balls"])
-    case = Case(model, pendulums.state(model, seed=3, rate=1.0))
+    case, most = Case(model, pendulums.state(model, seed=3, rate=1.0)), 50.0
     if integrator != "-":
         method = adapter(engine).integrator(integrator)
         case = replace(case, until=0.25, steps=tuple(ladder(method, 2, 1.0))[:6])
-    question = Question(Engine(engine), level, (wanted,), integrator, case, 50.0, 1.5)
+        if level == "relations":
+            step = 2.0**-7 if method.kind == "step" else method.tightest
+            case = replace(case, until=0.125, steps=(step,))
+        elif wanted.endswith("_long"):
+            case, most = replace(case, until=12.5, steps=()), 4.0  # not falling, it is over by little
+    question = Question(Engine(engine), level, (wanted,), integrator, case, most, 1.5, 2.0**-5)
     with defective(lines):
         text, why = shown_by_script(question, row(engine, level=level))
     assert text, why
@@ -285,6 +394,24 @@ def test_a_defect_in_an_engine_is_shown_by_its_script(engine, level, integrator,
     assert max(ratios(right)) < 1, "without the defect all is right"
     differences = [re.findall(r"^  difference.*", text, re.M) for text in (said, right)]
     assert differences[0] != differences[1]
+
+
+def test_a_drift_that_grows_is_shown_in_a_shorter_time_of_the_same_motion(tmp_path):
+    """A symmetric method's energy: with fewer bodies or simpler numbers the motion may not be regular."""
+    from plumbline.scenario import find, load
+
+    scenario, lossy = load(find("lagrange-top")), LOSSY.replace("0.9", "0.0")
+    case, wanted = Case(scenario.model, scenario.state, 50.0), ("energy_drift_long_growth",)
+    question = Question(
+        Engine("exudyn"), "invariants", wanted, "trapezoidal", case, 1.9, 20.0, scenario.sample
+    )
+    with defective(lossy):
+        text, why = shown_by_script(question, row("exudyn", level="invariants"))
+    assert text, why
+    assert "np.linspace(0.0, 12.5, 401)" in text, "not shorter: a drift that swings may be on its way out"
+    assert "steps = [0.001953125]" in text and f"mass=np.array({scenario.model.mass.tolist()})" in text
+    assert max(ratios(run(text, tmp_path, before=lossy))) > 1.5
+    assert max(ratios(executed(text)[0])) < 0.2, "the trapezoidal rule keeps it bounded"
 
 
 # --- shrinking ------------------------------------------------------------------------------------------
@@ -315,7 +442,7 @@ def test_a_defect_in_one_number_shrinks_to_one_body():
     engine = plant(type(adapter(defect.engine)), defect)
     model = pendulums.model(JOINTS["mixed"], loads=True, drag=True)
     case = Case(model, pendulums.state(model, seed=3))
-    with patch("plumbline.shown.adapter", lambda _: engine):
+    with patch("plumbline.engine.adapter", lambda _: engine):
         small = shrunk(Question(Engine(defect.engine), "state", ("acceleration",), "-", case, 0.0, 60.0))
     assert small.case.model.n == 1 and not small.case.model.has_loads and not small.case.model.has_drag
     assert small.case.model.mass.tolist() == [1.0]
@@ -327,13 +454,22 @@ def test_a_busy_search_gives_what_it_has():
     model = pendulums.model(JOINTS["balls"])
     case = Case(model, pendulums.state(model, seed=3))
     question = Question(Engine(defect.engine), "state", ("acceleration",), "-", case, 0.0, 0.0)
-    with patch("plumbline.shown.adapter", lambda _: plant(type(adapter(defect.engine)), defect)):
+    with patch("plumbline.engine.adapter", lambda _: plant(type(adapter(defect.engine)), defect)):
         small = shrunk(question)
     assert small is not None and small.case.model.n == 2
     runs = replace(case, until=1.0, steps=tuple(ladder(adapter("mujoco").integrator("RK4"), 2, 1.0)))
     late = replace(question, engine=Engine("mujoco"), level="trajectory", integrator="RK4", case=runs)
     text, why = shown_by_script(late, row("mujoco"))
     assert not text and "within 0 s" in why, "a whole ladder of runs is not begun out of time"
+
+
+def test_long_runs_are_tried_from_a_few_seconds_up():
+    model = pendulums.model(JOINTS["balls"])
+    case = Case(model, pendulums.state(model), 100.0, (2.0**-7,))
+    tried = [(c.until, c.model.n) for c in growing(case)]
+    assert tried[0] == (1.5625, 1) and tried[-1] == (100.0, 2)
+    assert [c.until for c in growing(case, plainer=False)] == [1.5625, 6.25, 25.0, 100.0]
+    assert min(c.until for c in growing(replace(case, until=1.0))) == 0.0625
 
 
 def test_where_the_engine_agrees_there_is_nothing_to_show():
@@ -352,6 +488,14 @@ def test_another_environment_is_asked_and_runs_the_script(tmp_path):
     assert there.ratio == AtState(Engine("mujoco"), QUANTITIES)(case).ratio
     said = Engine("mujoco", sys.executable).say(script(row("mujoco@4"), there))
     assert said == executed(script(row("mujoco@4"), there))[0] and len(ratios(said)) == len(QUANTITIES)
+    twice, long_ = replace(case, until=0.125, steps=(2.0**-7,)), replace(case, until=0.5)
+    for name, ask, what in (
+        ("exudyn", lambda engine: Twice(engine, "trapezoidal", "reversed in time"), twice),
+        ("mujoco", lambda engine: OverLong(engine, "RK4", ("joint_gap_long",), 2.0**-5), long_),
+    ):
+        found = [ask(Engine(name, python)) for python in ("", sys.executable)]
+        found = [measure(getattr(measure, "whole", lambda x: x)(what)) for measure in found]
+        assert script(row(name), found[0]) == script(row(name), found[1])
 
 
 @pytest.mark.full
@@ -401,7 +545,9 @@ def test_conditions_in_the_parts_are_closed(name):
 def test_every_engine_has_a_script_and_what_has_none_says_why():
     assert set(ENGINE_LINES) == set(ENGINES)
     for level, quantity, integrator, words in (
-        ("relations", "reversed in time", "trapezoidal", "is one of runs"),
+        ("relations", "reversed in time", "trapezoidal", ""),
+        ("relations", "by EigenDense", "generalized-alpha", ""),
+        ("relations", "something new", "trapezoidal", "does not know the relation 'something new' of runs"),
         ("relations", "two welded halves", "-", "does not know the relation"),
         ("relations", "something new", "-", "not of one state"),
         ("state", "acceleration", "-", ""),
@@ -409,6 +555,14 @@ def test_every_engine_has_a_script_and_what_has_none_says_why():
     ):
         said = unscripted("exudyn", {"level": level, "quantity": quantity, "integrator": integrator})
         assert words in said and bool(words) == bool(said)
+    for name in ENGINES:  # no relation of runs that the harness tries is left without a script
+        chosen = adapter(name)
+        for integrator in chosen.integrators:
+            tried = ["reversed in time"] * integrator.symmetric
+            tried += [f"by {solver}" for solver in chosen.solvers if integrator.kind == "step"]
+            for relation in tried:
+                cell = {"level": "relations", "quantity": relation, "integrator": integrator.name}
+                assert unscripted(name, cell) == ""
     assert "no script template" in unscripted("other", {"level": "state", "quantity": "", "integrator": "-"})
 
 
@@ -465,13 +619,70 @@ def test_the_runs_behind_a_row_are_those_of_its_ladder(results):
              "verdict": "disagrees", "declared_order": 4, "horizon": 1.7, "value": 2.0, "tolerance": 0.1,
              "quantity": "order", "extra": {}}  # fmt: skip
     finest = found | {"quantity": "position", "verdict": "agrees", "extra": {"resolution": 2.0**-8}}
-    document["rows"] = [found, finest]
+    others = ({"level": "relations"}, {"level": "invariants", "quantity": "energy_drift_long"})
+    apart = [finest | other | {"extra": {"resolution": 2.0**-12}} for other in others]
+    document["rows"] = [found, finest, *apart]
     question = reproduce.asked(document, [found], 1.0)
     assert question.case.steps == (2.0**-5, 2.0**-6, 2.0**-7, 2.0**-8)
     assert question.case.until == 1.0 and question.most == 20 and question.wanted == ("order",)
     document["rows"] = [found]
     with pytest.raises(NotReproducible, match="ladder"):
         reproduce.asked(document, [found], 1.0)
+
+
+def document_of(name: str, rows: list) -> dict:
+    """Results as a run stores them: one scenario, and these rows."""
+    from plumbline.scenario import find, load
+
+    scenario = load(find(name))
+    about = {
+        "digest": scenario.digest, "sample": scenario.sample,
+        "model": {k: np.asarray(v).tolist() for k, v in vars(scenario.model).items()},
+        "state": {k: getattr(scenario.state, k).tolist() for k in ("p", "omega", "u", "udot")},
+    }  # fmt: skip
+    return {"scenarios": {name: about}, "rows": [store.row_record(row) for row in rows]}
+
+
+@pytest.mark.parametrize(
+    ("engine", "relation", "lines"),
+    [("exudyn", "reversed in time", LOSSY), ("exudyn-tree", "by EigenSparse", SPARSE)],
+)
+def test_the_run_behind_a_relation_of_runs_is_asked_for_again(engine, relation, lines):
+    from plumbline.scenario import find, load
+
+    scenario = load(find("double-tumbling-balls"))
+    with defective(lines):
+        found = list(relations.runs(adapter(engine), scenario.model, scenario.state))
+        rows = relations.judge_relations(shown.Subject(scenario.name, "", engine, engine, "1"), found).rows
+        row = next(row for row in rows if row.quantity == relation)
+        document = document_of(scenario.name, rows)
+        question = reproduce.asked(document, [store.row_record(row)], 1.0)
+        assert question.case.until == 16 * question.case.steps[0] == row.extra["end"]
+        again = shown.measure_of(question)(question.case)
+    assert row.verdict == "disagrees" and again.ratio == pytest.approx(row.value) == question.most
+    without = store.row_record(row) | {"extra": {"state": 0.0}}
+    with pytest.raises(NotReproducible, match="step of this run"):
+        reproduce.asked(document, [without], 1.0)
+
+
+def test_the_long_runs_behind_a_row_are_asked_for_again():
+    from plumbline.scenario import find, load
+
+    scenario, method = load(find("tumbling-ball")), adapter("mujoco").integrator("RK4")
+    with defective(DAMPED):
+        plan = course(method, 1, 6.25)
+        runs = endure("mujoco", "RK4", scenario.model, scenario.state, scenario.sample, plan)
+        who = shown.Subject(scenario.name, "", "mujoco", "MuJoCo", "1")
+        rows = judge_endurance(who, scenario.model, method, runs, False).rows
+        document = document_of(scenario.name, rows)
+        off = reproduce.disputed(document)
+        question = reproduce.asked(document, off, 1.0)
+        again = shown.measure_of(question)(shown.whole(question))
+    assert {row["quantity"] for row in off} >= {"energy_drift_long"} and question.case.until == 6.25
+    assert again.ratio == pytest.approx(question.most) and again.case.steps == plan.resolutions
+    cells = {reproduce.cell_of(row | {"quantity": q}) for row in off for q in
+             ("energy_drift", "energy_drift_long", "energy_drift_long_growth")}  # fmt: skip
+    assert len(cells) == 3, "a script shows one kind of them"
 
 
 def test_a_lost_engine_is_told_and_leaves_no_script(results):
