@@ -28,6 +28,7 @@ CURVES = (
     "norm_drift",
 )
 CLI_LEVEL = {"state": "state", "trajectory": "trajectory", "invariants": "trajectory"}
+ENDURANCE = 100.0  # s: how long a nightly's long runs are unless it is told otherwise
 CATALOGUE = Path(__file__).parent.parent / "scenarios"
 MOTION_BYTES = 90_000  # of one scenario's motion, before compression
 _DETAIL = (
@@ -52,14 +53,24 @@ Tables = dict[str, dict[str, Columns]]  # by table, then scenario
 
 
 def command(row: Record, scenario: Record) -> str:
-    """The command line that repeats just this cell, quoted for a POSIX shell."""
+    """The command line that repeats just this cell, quoted for a POSIX shell; long runs are a nightly's."""
     file = str(scenario.get("file") or "")
     ours = not file or any(CATALOGUE.glob(f"*/{glob.escape(Path(file).name)}"))
     what = row["scenario"] if ours else file
-    level = CLI_LEVEL.get(row["level"], "all")
-    words = ["python", "-m", "plumbline", "run", "--engine", row["engine"], "--level", level]
+    words = ["python", "-m", "plumbline", "run", "--engine", row["engine"]]
+    if long(row):
+        words[3:] = ["nightly", "--engine", row["engine"], "--random", "0", "--no-instrument"]
+        asked = (row.get("extra") or {}).get("asked", ENDURANCE)
+        words += [] if asked == ENDURANCE else ["--endurance", f"{asked:g}"]
+    else:
+        words += ["--level", CLI_LEVEL.get(row["level"], "all")]
     words[4:4] = [] if what.startswith("-") else [what]
     return shlex.join(words + (["--", what] if what.startswith("-") else []))
+
+
+def long(row: Record) -> bool:
+    """Whether a row is about a nightly's long runs."""
+    return str(row["quantity"]).endswith(("_long", "_long_growth"))
 
 
 def finite(value: Any, digits: int = 6) -> Any:
@@ -123,7 +134,7 @@ def scenario_chunk(name: str, results: Results, tables: Tables, points: int) -> 
         if row["key"] in results.scripts:
             detail["script"] = results.scripts[row["key"]]
         details[str(place)] = detail
-        commands[f"{row['engine']}/{row['level']}"] = command(row, scenario)
+        commands[f"{row['engine']}/{'long' if long(row) else row['level']}"] = command(row, scenario)
     header = {
         "scenario": {
             k: finite(v) if isinstance(v, float) else v for k, v in scenario.items() if k != "model"

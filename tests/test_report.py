@@ -251,7 +251,7 @@ def test_the_first_crossing_is_of_the_undecimated_curve(out: Path, text: str) ->
 
 
 def test_commands_are_quoted_for_a_shell() -> None:
-    row = {"scenario": "x'; rm -rf ~ #", "engine": "mujoco", "level": "invariants"}
+    row = {"scenario": "x'; rm -rf ~ #", "engine": "mujoco", "level": "invariants", "quantity": "order"}
     assert shlex.split(payload.command(row, {"file": ""}))[4:] == [
         "x'; rm -rf ~ #",
         "--engine",
@@ -262,6 +262,11 @@ def test_commands_are_quoted_for_a_shell() -> None:
     row["scenario"] = "--out"
     assert shlex.split(payload.command(row, {"file": ""}))[-2:] == ["--", "--out"]
     assert "'my own.yaml'" in payload.command(row, {"file": "my own.yaml"})
+    row |= {"scenario": "rest", "quantity": "energy_drift_long", "extra": {"asked": 100.0}}
+    nightly = "python -m plumbline nightly rest --engine mujoco --random 0 --no-instrument"
+    assert payload.command(row, {"file": ""}) == nightly
+    row["extra"] = {"asked": 12.5}
+    assert payload.command(row, {"file": ""}) == f"{nightly} --endurance 12.5"
 
 
 def test_numbers_read_as_people_write_them() -> None:

@@ -74,7 +74,7 @@ export async function showCell(root, index, fields, back) {
   if (spread) plots.append(spread);
   if (plots.childElementCount) root.append(h("h2", { class: "sub" }, "Convergence and states"), plots);
   root.append(h("h2", { class: "sub" }, "Repeat this cell"));
-  for (const level of new Set(ours.map((i) => index.levels[index.rows.level[i]]))) {
+  for (const level of [...new Set(ours.map((i) => index.levels[index.rows.level[i]])), "long"]) {
     const line = data.commands[`${fields.engine}/${level}`];
     if (line && ![...root.querySelectorAll("pre")].some((pre) => pre.textContent === line)) root.append(copyable(line, `command for ${level}`));
   }
