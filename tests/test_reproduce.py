@@ -515,6 +515,26 @@ def test_the_order_of_an_older_mujoco_is_shown_in_its_environment(tmp_path):
     assert ratios(run(text, tmp_path))[0] < 1, "the installed one is of order 4"
 
 
+@pytest.mark.full
+def test_the_start_of_an_older_exudyn_is_shown_in_its_environment(tmp_path):
+    """The real one: before 1.11 the first accelerations are wrong with the sparse solver."""
+    try:
+        python = versions.interpreter("exudyn@1.10.0")
+    except versions.NoSuchEnvironment as error:
+        pytest.skip(str(error))
+    model = pendulums.model(JOINTS["balls"])
+    case = Case(model, pendulums.state(model, seed=3), 2.0**-4, (2.0**-8,))
+    question = Question(
+        Engine("exudyn", python), "relations", ("by EXUdense",), "trapezoidal", case, 1e4, 20.0
+    )
+    told = row("exudyn@1.10.0", engine_version="1.10.0", level="relations")
+    text, why = shown_by_script(question, told)
+    assert text, why
+    assert "times = np.array([0.0, 0.00390625])" in text and "mass=np.array([1.0])" in text
+    assert max(ratios(run(text, tmp_path, python=python))) > 1e3
+    assert max(ratios(run(text, tmp_path))) < 1, "the installed one starts right"
+
+
 # --- texts ------------------------------------------------------------------------------------------------
 
 
