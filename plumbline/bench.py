@@ -14,6 +14,7 @@ from plumbline.endurance import course, endure, judge_endurance
 from plumbline.exact import solution
 from plumbline.findings import Findings, Subject
 from plumbline.motion_verdicts import judge_motion
+from plumbline.packed import Packed
 from plumbline.records import Integrator, StateQuantities, Verdict
 from plumbline.sampling import random_states, seed_of
 from plumbline.scenario import Scenario
@@ -54,10 +55,8 @@ class Bench:
         self.again = False  # whether the motion's truth was asked for a second time
         self.early: list[Outcome] = []  # engines' answers that came before the truth
         count = min(plan.states, PROBE_STATES) if probe else plan.states
-        self.states = [
-            scenario.state,
-            *random_states(scenario.model, count, seed_of("states", scenario.digest)),
-        ]
+        drawn = random_states(scenario.model, count, seed_of("states", scenario.digest))
+        self.states = Packed.of([scenario.state, *drawn])  # many tasks have them
 
     def tasks(self) -> Iterator[Task]:
         """Truth first (unless it is there already), then every engine's cells."""

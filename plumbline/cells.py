@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 
+from plumbline.packed import Packed
 from plumbline.store import write_atomically
 from plumbline.workers import Memory, Outcome, Task
 
@@ -37,6 +38,7 @@ class Cells(Memory):
 
     def __init__(self, folder: Path, tell: Callable[[str], None] = lambda _: None) -> None:
         self.folder, self.tell = folder, tell
+        self._asked: dict[Any, Path] = {}  # of tasks that are on their way, by their keys
 
     def path(self, task: Task) -> Path:
         """Where the answer to ``task`` is or will be."""
@@ -44,7 +46,7 @@ class Cells(Memory):
 
     def get(self, task: Task) -> Outcome | None:
         """The stored answer, or None where there is none that can be trusted."""
-        path = self.path(task)
+        path = self._asked[task.key] = self.path(task)
         try:
             data = path.read_bytes()
         except FileNotFoundError:
@@ -55,15 +57,17 @@ class Cells(Memory):
         if hashlib.sha256(data[32:]).digest() != data[:32]:
             self.tell(f"{path}: damaged; the cell runs again")
             return None
-        value, cost = pickle.loads(data[32:])
-        return Outcome(task.key, value, cost=cost)
+        del self._asked[task.key]
+        answer, cost = pickle.loads(data[32:])
+        return Outcome(task.key, Packed(answer), cost=cost)
 
     def put(self, task: Task, outcome: Outcome) -> None:
         """Keep an answer.  A lost cell is not kept: what killed it may have been the machine."""
+        path = self._asked.pop(task.key, None) or self.path(task)
         if outcome.lost is None:
             self.folder.mkdir(parents=True, exist_ok=True)
-            body = pickle.dumps((outcome.value, outcome.cost), protocol=5)
-            write_atomically(self.path(task), hashlib.sha256(body).digest() + body)
+            body = pickle.dumps((outcome.packed.data, outcome.cost), protocol=5)
+            write_atomically(path, hashlib.sha256(body).digest() + body)
 
     def clear(self) -> None:
         """Forget all: the run is complete, the next one begins anew."""
@@ -111,6 +115,8 @@ def feed(digest: Any, value: Any) -> None:
             head, body = "str", value.encode()
         case bytes():
             head, body = "bytes", value
+        case Packed():
+            head, body = "packed", value.data
         case np.ndarray():
             head, body = f"array {value.dtype.str} {value.shape}", np.ascontiguousarray(value).tobytes()
         case list() | tuple():

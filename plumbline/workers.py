@@ -21,6 +21,7 @@ from typing import Any
 from pebble import ProcessExpired, ProcessPool
 
 from plumbline.fate import die_with_parent
+from plumbline.packed import Packed
 from plumbline.remote import Crashed, Elsewhere, call, exit_words, timed
 from plumbline.scratch import Scratch
 
@@ -42,7 +43,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Task:
-    """A call to make in a worker: a picklable function and its arguments."""
+    """A call to make in a worker: a picklable function and its arguments, packed ones opened there."""
 
     key: Any
     call: Callable[..., Any]
@@ -57,9 +58,19 @@ class Outcome:
     """What became of a task: its value, or the sentence that says how it was lost."""
 
     key: Any
-    value: Any = None
+    answer: Any = None  # the value, or that value packed as its worker sent it
     lost: str | None = None
     cost: float = 0.0  # CPU s of the call
+
+    @property
+    def value(self) -> Any:
+        """The answer, opened at every look."""
+        return self.answer.open() if isinstance(self.answer, Packed) else self.answer
+
+    @property
+    def packed(self) -> Packed:
+        """The answer as it goes to others."""
+        return self.answer if isinstance(self.answer, Packed) else Packed.of(self.answer)
 
 
 class NoCrew(Exception):
@@ -138,12 +149,14 @@ class Workers:
                 yield found
 
 
-def perform(task: Task) -> tuple[Any, float]:
-    """Make a task's call, here or in the environment that it names: its value and its CPU time in s."""
+def perform(task: Task) -> Outcome:
+    """Make a task's call, here or in the environment that it names."""
+    arguments = [one.open() if isinstance(one, Packed) else one for one in task.arguments]
     if task.python:
-        value, cost = call(task.python, timed, task.call, *task.arguments)
-        return value, cost
-    return timed(task.call, *task.arguments)
+        value, cost = call(task.python, timed, task.call, *arguments)
+    else:
+        value, cost = timed(task.call, *arguments)
+    return Outcome(task.key, Packed.of(value), cost=cost)
 
 
 def stop_late(waiting: dict[Future[Any], Task], began: dict[Future[Any], float]) -> None:
@@ -157,11 +170,10 @@ def stop_late(waiting: dict[Future[Any], Task], began: dict[Future[Any], float])
             future.cancel()
 
 
-def outcome(task: Task, future: Future[Any]) -> Outcome:
-    """The value of a finished future, or how its worker was lost."""
+def outcome(task: Task, future: Future[Outcome]) -> Outcome:
+    """The outcome of a finished future, or how its worker was lost."""
     try:
-        value, cost = future.result()
-        return Outcome(task.key, value, cost=cost)
+        return future.result()
     except CancelledError:  # by `stop_late`, and by nobody else
         return Outcome(task.key, lost=f"hung: no answer within {task.limits.seconds:g} s, worker killed")
     except ProcessExpired as expired:

@@ -39,7 +39,7 @@ def test_a_memory_is_the_same_and_measured():
     class Slow(Memory):
         def get(self, task):
             burn(0.05)
-            return Outcome(("a",), value=3)
+            return Outcome(("a",), 3)
 
     split = Split()
     assert split.storing(Slow()).get(None).value == 3

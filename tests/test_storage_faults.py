@@ -15,7 +15,7 @@ import pytest
 from plumbline import nightly, run, scenario, workers
 from plumbline.history import History
 from plumbline.run import Plan
-from plumbline.workers import Limits, Memory, Outcome
+from plumbline.workers import Limits, Memory
 
 ROOT = Path(__file__).parent.parent
 ERRORS = [errno.ENOSPC, errno.EIO, errno.EROFS, errno.EDQUOT]
@@ -38,8 +38,7 @@ class Here:
         for task in tasks:
             found = memory.get(task)
             if found is None:
-                value, cost = workers.perform(task)
-                found = Outcome(task.key, value, cost=cost)
+                found = workers.perform(task)
                 memory.put(task, found)
             yield found
 
