@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from plumbline.packed import Packed
 from plumbline.records import Integrator, StateQuantities, Verdict
 from plumbline.sampling import random_states, seed_of
 from plumbline.scenario import Scenario
-from plumbline.state_verdicts import judge_states
+from plumbline.state_verdicts import judge_packed, judge_states
 from plumbline.work import EngineInfo
 from plumbline.workers import Outcome, Task
 from plumbline.yardstick import ROUNDING, MotionTruth, StateTruth
@@ -54,15 +55,17 @@ class Bench:
         self.truths: dict[str, StateTruth | MotionTruth | Lost] = {}
         self.again = False  # whether the motion's truth was asked for a second time
         self.early: list[Outcome] = []  # engines' answers that came before the truth
+        self.state_truth: Packed | None = None  # for those who judge and explain elsewhere
         count = min(plan.states, PROBE_STATES) if probe else plan.states
         drawn = random_states(scenario.model, count, seed_of("states", scenario.digest))
         self.states = Packed.of([scenario.state, *drawn])  # many tasks have them
 
     def tasks(self) -> Iterator[Task]:
-        """Truth first (unless it is there already), then every engine's cells."""
+        """Truths that are not there yet, then all cells but those of states, which follow their truth."""
         for key in self.keys:
             if key[1] != "truth":
-                yield self.cell(key)
+                if key[2] != "state":
+                    yield self.cell(key)
             elif key[2] not in self.truths:
                 yield self.truth(key)
 
@@ -93,7 +96,10 @@ class Bench:
             length = course(integrator, s.model.n, self.plan.endurance)
             arguments = (integrator.name, s.model, s.state, s.sample, length)
         base, _ = versions.split(name)
-        return Task(key, call, (base, *arguments), self.plan.limits, info.version, info.python)
+        judge = None
+        if level == "state" and self.state_truth is not None:
+            judge = partial(judge_packed, self.who(name), self.state_truth)
+        return Task(key, call, (base, *arguments), self.plan.limits, info.version, info.python, judge)
 
     @property
     def done(self) -> bool:
@@ -124,20 +130,21 @@ class Bench:
         return next(i for i in self.engines[engine].integrators if i.name == name)
 
     def take(self, outcome: Outcome) -> list[Task]:
-        """Keep a truth and judge what waited for it, judge an answer or let it wait; new questions."""
+        """Keep a truth, judge an answer or let it wait for its truth; the tasks that follow."""
         if outcome.lost and outcome.key[1:] == ("truth", "trajectory") and not self.again:
             self.again = True  # compiled code brought the worker down: a truth is to be had without
             return [self.truth(outcome.key, 0)]
         self.open.discard(outcome.key)
+        questions = []
         if outcome.key[1] == "why":
             self.explain(outcome)
         elif outcome.key[1] != "truth":
             self.early.append(outcome)
-        elif outcome.lost is None:
-            self.truths[outcome.key[2]] = outcome.value
         else:
-            self.truths[outcome.key[2]] = Lost(outcome.lost)
-        questions = []
+            self.truths[outcome.key[2]] = Lost(outcome.lost) if outcome.lost else outcome.value
+            if outcome.key[2] == "state":
+                self.state_truth = None if outcome.lost else outcome.packed
+                questions = [self.cell(key) for key in self.keys if key[1] != "truth" and key[2] == "state"]
         waiting, self.early = self.early, []
         for answer in waiting:
             if answer.key[2] not in self.truths and answer.key[2] not in TRUTHLESS:
@@ -159,7 +166,9 @@ class Bench:
             if level == "endurance":
                 return Findings(rows=[who.row("invariants", name, "all_long", "failed", lost)])
             return Findings(rows=[who.row(level, name, "all", "failed", lost)])
-        if level == "endurance":
+        if outcome.judged is not None:
+            found: Findings = outcome.judged
+        elif level == "endurance":
             integrator = self.integrator(engine, name)
             regular = self.scenario.exact is not None
             found = judge_endurance(who, self.scenario.model, integrator, outcome.value, regular)
@@ -178,7 +187,7 @@ class Bench:
     def question(self, engine: str, said: list[StateQuantities]) -> Task:
         """Which term is it, in a cell that disagrees at state level?"""
         (base, _), info = versions.split(engine), self.engines[engine]
-        arguments = (base, self.scenario.model, said, self.truths["state"])
+        arguments = (base, self.scenario.model, said, self.state_truth)
         key = (self.scenario.name, "why", engine)
         return Task(key, work.explain, arguments, self.plan.limits, info.version, info.python)
 

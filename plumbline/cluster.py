@@ -48,7 +48,7 @@ class Cluster:
         """Leave the cluster as it is; what is still on its way is dropped."""
         self._client.close()
 
-    def run(self, tasks: Iterable[Task], memory: Memory | None = None) -> Iterator[Outcome]:
+    def run(self, tasks: Iterable[Task | None], memory: Memory | None = None) -> Iterator[Outcome]:
         """Outcomes in the order of completion; as `Workers.run`."""
         memory = memory or Memory()
         waiting: dict[str, tuple[Task, int]] = {}  # with the number of times it was handed over
@@ -63,9 +63,12 @@ class Cluster:
 
         while waiting or not exhausted:
             while not exhausted and len(waiting) < self._room():
-                task = next(source, None)
-                if task is None:
+                try:
+                    task = next(source)
+                except StopIteration:
                     exhausted = True
+                    break
+                if task is None:
                     break
                 before = memory.get(task)
                 if before is not None:

@@ -8,7 +8,7 @@ import platform
 import subprocess
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -103,7 +103,7 @@ def execute(plan: Plan, progress: Progress) -> Result:
     open_: dict[str, Bench] = {}  # in the order of their making, which is that of the tables
     questions: deque[Task] = deque()
 
-    def tasks() -> Iterator[Task]:
+    def tasks() -> Iterator[Task | None]:
         # the longest first, so that no long task is left alone at the end
         order = sorted(plan.scenarios, key=lambda s: -s.model.n)
         for number, scenario in enumerate(itertools.chain(order, plan.probes)):
@@ -112,6 +112,8 @@ def execute(plan: Plan, progress: Progress) -> Result:
                 while questions:
                     yield questions.popleft()
                 yield task
+        while open_:
+            yield questions.popleft() if questions else None
 
     def retire(bench: Bench) -> None:
         found = bench.findings()
@@ -132,21 +134,15 @@ def execute(plan: Plan, progress: Progress) -> Result:
         total = sum(sum(1 for _ in keys("", engines, plan.level, plan.endurance > 0)) for _ in plan.scenarios)
         total += len(plan.probes) * sum(1 for _ in keys("", engines, "state"))
         done = 0
-        source: Iterable[Task] = tasks()
-        while True:
-            for outcome in workers.run(source, split.storing(plan.memory)):
-                split.count(outcome)
-                with split.measure("judging"):
-                    asked = open_[outcome.key[0]].take(outcome)
-                    while open_ and (first := next(iter(open_.values()))).done:
-                        retire(open_.pop(first.scenario.name))
-                questions.extend(asked)
-                done, total = done + 1, total + len(asked)
-                progress(done, total, " ".join(outcome.key))
-            if not questions:
-                break
-            source = list(questions)  # what came up when all tasks had been handed over
-            questions.clear()
+        for outcome in workers.run(tasks(), split.storing(plan.memory)):
+            split.count(outcome)
+            with split.measure("judging"):
+                asked = open_[outcome.key[0]].take(outcome)
+                while open_ and (first := next(iter(open_.values()))).done:
+                    retire(open_.pop(first.scenario.name))
+            questions.extend(asked)
+            done, total = done + 1, total + sum(task.key[1] == "why" for task in asked)
+            progress(done, total, " ".join(outcome.key))
     result = Result(
         [row for name in rows for row in rows[name]],
         excuses.stale(whole=plan.whole),

@@ -19,10 +19,11 @@ class Split:
         self.seconds = dict.fromkeys(KINDS, 0.0)
 
     def count(self, outcome: Outcome) -> None:
-        """Take in what a task's call took in its worker."""
+        """Take in what a task's call and its judge took in its worker."""
         subject = outcome.key[1]
         kind = {"truth": "truth", "why": "diagnosis", "reference": "reference"}.get(subject, "engines")
         self.seconds[kind] += outcome.cost
+        self.seconds["judging"] += outcome.judging
 
     @contextmanager
     def measure(self, kind: str) -> Iterator[None]:

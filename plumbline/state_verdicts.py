@@ -6,6 +6,7 @@ import numpy as np
 
 from plumbline.bound import BLUNT
 from plumbline.findings import Columns, Findings, Subject
+from plumbline.packed import Packed
 from plumbline.records import Array, Row
 from plumbline.work import Evaluation
 from plumbline.yardstick import StateTruth
@@ -42,6 +43,11 @@ def judge_states(who: Subject, truth: StateTruth, said: Evaluation) -> Findings:
         )
         found.rows.append(row(who, quantity, unit, worst, truth.method, said.cost))
     return found
+
+
+def judge_packed(who: Subject, truth: Packed, said: Evaluation) -> Findings:
+    """The same in the worker that has the answer: the process that has all answers is spared it."""
+    return judge_states(who, truth.open(), said)
 
 
 def compare(quantity: str, truth: StateTruth, said: Evaluation) -> Columns:

@@ -118,9 +118,13 @@ class Tables:
         """Take in rows for the summary."""
         kept = list(rows)
         if kept:
-            names = TABLES["summary"].names
-            columns: Columns = {name: [plain(getattr(row, name)) for row in kept] for name in names}
-            columns["extra"] = [json.dumps(extra) for extra in columns["extra"]]
+            columns: Columns = {
+                name: [getattr(row, name) for row in kept] for name in TABLES["summary"].names
+            }
+            for field in TABLES["summary"]:
+                if field.type == REAL:
+                    columns[field.name] = plain(columns[field.name])
+            columns["extra"] = [json.dumps(plain(extra)) for extra in columns["extra"]]
             self.add("summary", columns)
 
     def _encode(self, name: str) -> None:

@@ -51,6 +51,9 @@ class Task:
     limits: Limits = field(default_factory=Limits)
     version: str = ""  # of the engine that answers; a part of the answer's content key
     python: str = ""  # the interpreter of another environment to make the call in; empty: this one's
+    judge: Callable[[Any], Any] | None = (
+        None  # picklable: what the worker says of the value, in this environment
+    )
 
 
 @dataclass(frozen=True)
@@ -61,6 +64,8 @@ class Outcome:
     answer: Any = None  # the value, or that value packed as its worker sent it
     lost: str | None = None
     cost: float = 0.0  # CPU s of the call
+    judged: Any = None  # what the task's judge said; of an answer from before: None
+    judging: float = 0.0  # CPU s of the judge
 
     @property
     def value(self) -> Any:
@@ -115,10 +120,11 @@ class Workers:
         self._pool.join()
         self._scratch.remove()
 
-    def run(self, tasks: Iterable[Task], memory: Memory | None = None) -> Iterator[Outcome]:
+    def run(self, tasks: Iterable[Task | None], memory: Memory | None = None) -> Iterator[Outcome]:
         """Outcomes in the order of completion; only a few tasks are handed over at a time.
 
-        What ``memory`` has is not run again; it is told of every other outcome before the caller.
+        ``tasks`` may yield None: no task until another outcome has come.  What ``memory`` has is not run
+        again; it is told of every other outcome before the caller.
         """
         memory = memory or Memory()
         waiting: dict[Future[Any], Task] = {}
@@ -127,9 +133,12 @@ class Workers:
         exhausted = False
         while waiting or not exhausted:
             while not exhausted and len(waiting) < 2 * self.jobs:
-                task = next(source, None)
-                if task is None:
+                try:
+                    task = next(source)
+                except StopIteration:
                     exhausted = True
+                    break
+                if task is None:
                     break
                 before = memory.get(task)
                 if before is not None:
@@ -156,7 +165,8 @@ def perform(task: Task) -> Outcome:
         value, cost = call(task.python, timed, task.call, *arguments)
     else:
         value, cost = timed(task.call, *arguments)
-    return Outcome(task.key, Packed.of(value), cost=cost)
+    judged, judging = timed(task.judge, value) if task.judge else (None, 0.0)
+    return Outcome(task.key, Packed.of(value), None, cost, judged, judging)
 
 
 def stop_late(waiting: dict[Future[Any], Task], began: dict[Future[Any], float]) -> None:

@@ -31,14 +31,41 @@ def answered(task, **lost):
 def test_answers_wait_for_the_truth_whatever_comes_first(engines):
     rows = []
     for turned in (False, True):
-        bench = made(engines, "state")
+        bench = made(engines, "trajectory")
         tasks = list(bench.tasks())
         for task in reversed(tasks) if turned else tasks:
             assert not bench.done
-            bench.take(answered(task))
+            assert bench.take(answered(task)) == []
         assert bench.done
         rows.append([(r.key, r.value, r.verdict) for r in bench.findings().rows])
-    assert rows[0] == rows[1] and len(rows[0]) == 14
+    assert rows[0] == rows[1] and len(rows[0]) > 14
+
+
+def test_states_are_asked_for_with_their_truth_and_judged_alike_here_and_by_the_worker(engines):
+    benches = [made(engines, "state"), made(engines, "state")]
+    for bench, elsewhere in zip(benches, (True, False), strict=True):
+        (truth,) = bench.tasks()
+        cells = bench.take(answered(truth))
+        assert [task.key[1:] for task in cells] == [("reference", "state"), ("mujoco", "state")]
+        for task in cells:
+            assert not bench.done
+            found = answered(task)
+            assert len(found.judged.rows) == 7
+            bench.take(found if elsewhere else replace(found, judged=None))  # as the memory has it
+        assert bench.done
+    by_worker, here = ([replace(r, wall_time=0.0) for r in bench.findings().rows] for bench in benches)
+    assert by_worker == here and len(here) == 14
+
+
+def test_a_lost_truth_of_states_fails_every_cell_and_says_so(engines):
+    bench = made(engines, "state")
+    (truth,) = bench.tasks()
+    for task in bench.take(Outcome(truth.key, lost="crashed")):
+        bench.take(answered(task))
+    assert bench.done
+    assert [(r.verdict, r.reason) for r in bench.findings().rows] == [
+        ("failed", "no truth to judge by: crashed")
+    ] * 2
 
 
 def test_a_motion_truth_whose_worker_died_is_asked_for_once_more_without_a_compiler(engines):
