@@ -18,6 +18,7 @@ import pytest
 
 from plumbline import scenario, work
 from plumbline.cells import Cells, key_of
+from plumbline.packed import Packed
 from plumbline.run import Plan, execute
 from plumbline.workers import Outcome, Task
 
@@ -183,6 +184,7 @@ def test_a_lost_cell_is_tried_again(tmp_path):
 
 def test_the_key_is_the_content():
     s = scenario.load_many(["double-tumbling-balls"])[0]
+    turned = replace(s.state, omega=-s.state.omega)
     other = replace(s.model, mass=np.nextafter(s.model.mass, 9.0))
     base = Task("a", work.climb, ("mujoco", "RK4", s.model, s.state, s.times, [0.5, 0.25]), version="4.0.0")
     key = key_of(base)
@@ -197,7 +199,7 @@ def test_the_key_is_the_content():
                     "pinocchio",
                     "Euler",
                     other,
-                    replace(s.state, omega=-s.state.omega),
+                    turned,
                     s.times[:-1],
                     [0.5, 0.125],
                 ]
@@ -206,3 +208,5 @@ def test_the_key_is_the_content():
     ]
     assert len({key, *map(key_of, changed)}) == 1 + len(changed)
     assert key_of(replace(base, arguments=(["ab", "c"],))) != key_of(replace(base, arguments=(["a", "bc"],)))
+    packed = [key_of(replace(base, arguments=(Packed.of([state]),))) for state in (s.state, s.state, turned)]
+    assert packed[0] == packed[1] != packed[2]

@@ -81,6 +81,24 @@ def test_each_loss_costs_one_task_and_says_so():
         assert words in (outcomes["lost", k].lost or ""), loss.__name__
 
 
+def test_what_an_outcome_brings_up_runs_while_others_do():
+    """Where tasks say that there is none now, they are asked again after the next outcome."""
+    came = []
+
+    def tasks():
+        yield Task("long", nap, (4.0,))
+        yield Task("short", nap, (0.0,))
+        while "short" not in came:
+            yield None
+        yield Task("follows", nap, (0.0,))
+
+    with Workers(2) as workers:
+        for outcome in workers.run(tasks()):
+            assert outcome.lost is None
+            came.append(outcome.key)
+    assert came == ["short", "follows", "long"]
+
+
 def test_files_and_output_of_an_engine_go_nowhere(capfd, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with Workers(1) as workers:
