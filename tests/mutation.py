@@ -46,14 +46,14 @@ import libcst as cst
 import pytest
 from libcst.metadata import CodeRange, MetadataWrapper, ParentNodeProvider, PositionProvider
 from mutmut.mutation.mutators import mutation_operators
-from ruamel.yaml import YAML
+
+from tests.survivors import FILE, Key, listed
 
 LEAST = 0.95  # of the mutants have to be noticed
 PATIENCE = 8.0  # s of processor time, undisturbed, of the tests that one mutant meets at most
 MEMORY = 8 * 2**30  # bytes of address space of a child
 MANY, UNTRIED = 253, 254  # exit codes of a child, see `Limit` and `Swaps`
 PLUGINS = ("no:cacheprovider", "pytest_timeout", "_hypothesis_pytestplugin")  # others only take time
-SURVIVORS = "tests/survivors.yaml"
 NOTES = ("notes_*", "forest", "collocation", "stabilised", "short_rods", "reference_engine")
 JUDGES = (
     "bound", "converge", "diagnosis", "horizon", "known", "measures", "motion_verdicts", "relations",
@@ -85,8 +85,8 @@ class Mutant:
     code: str
 
     @property
-    def key(self) -> tuple[str, str, str]:
-        """What names it in `SURVIVORS`, whatever its line."""
+    def key(self) -> Key:
+        """What names it in `survivors.yaml`, whatever its line."""
         return self.file, self.was, self.now
 
 
@@ -579,13 +579,13 @@ def judge(became: Sequence[tuple[Mutant, str]], files: Sequence[str], least: flo
     """Print the figures; 1 where something is amiss."""
     kinds = Counter(what for _, what in became)
     rate = (kinds["noticed"] + kinds["endless"]) / max(len(became), 1)
-    listed = {(e["file"], e["was"], e["now"]): e["why"] for e in YAML(typ="safe").load(Path(SURVIVORS)) or ()}
+    known = listed()
     left = [mutant for mutant, what in became if what in ("survived", "unreached")]
-    new = [mutant for mutant in left if mutant.key not in listed]
-    stale = [mutant for mutant, what in became if mutant.key in listed and mutant not in left]
+    new = [mutant for mutant in left if mutant.key not in known]
+    stale = [mutant for mutant, what in became if mutant.key in known and mutant not in left]
     print(
         f"{len(became)} mutants of {', '.join(files)}: {100 * rate:.1f} % noticed, {kinds['endless']} of "
-        f"them by never ending; {len(left)} survive, {len(left) - len(new)} of them listed in {SURVIVORS}"
+        f"them by never ending; {len(left)} survive, {len(left) - len(new)} of them listed in {FILE.name}"
     )
     for mutant in new:
         print(f"not listed: {mutant.file}:{mutant.line}\n  - {mutant.was}\n  + {mutant.now}")
