@@ -199,6 +199,15 @@ def test_states_without_motion_or_gravity_have_finite_bounds():
             assert np.all(np.isfinite(state_bound(centred, state).acceleration))
 
 
+def test_a_scale_of_zero_says_nothing_of_bluntness():
+    bound = state_bound(*random_chain(np.random.default_rng(0), [0, 1, 0]))
+    scale = {"acceleration": np.array([0.0, 4.0, 1.0])}
+    bound = replace(bound, acceleration=np.array([1.0, 4e-12, 3e-12]), scale=scale)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert bound.bluntness("acceleration") == pytest.approx(3e-12)
+
+
 def test_fifty_bodies_take_milliseconds():
     model, state = random_chain(np.random.default_rng(0), [1] * 50)
     spent = []

@@ -52,6 +52,8 @@ def test_order_two_under_an_order_four_name_is_seen_as_two():
         ((3.6, 3.7, 3.78), None),
         ((float("nan"), 4.3, 4.15), None),
         ((4.3, 4.15), None),
+        ((5.0, 4.5, 4.25), None),  # halving what is left, but not there yet
+        ((4.5, 4.6, 4.5), None),  # away by less than three times the way it has gone, there and back
         ((4.22, 4.2, 4.18), None),  # near 4 and hardly moving: neither on its way there nor far enough
     ],
 )
@@ -86,7 +88,10 @@ def test_rounding_is_not_an_order():
 def test_a_run_that_blew_up_is_a_point_of_the_study():
     limit, ys = rungs(4, (4, 5, 6))
     ys[0] = np.full_like(limit, np.nan)
-    assert observed_order(ys, 1e-16, 4).value == pytest.approx(4, abs=0.1)
+    seen = observed_order(ys, 1e-16, 4)
+    assert seen.value == pytest.approx(4, abs=0.1)
+    assert np.isnan(seen.orders).tolist() == [True, False, False, False]
+    assert seen.differences[0] == np.inf
     assert np.max(np.abs(romberg(ys, (4, 5, 6)).y - limit)) < 1e-12
 
 
@@ -110,7 +115,9 @@ def test_ladders_halve_and_keep_four_rungs(bodies, order, duration):
         (2, 2, 10.0, 0, 8, 12),
         (1, 8, 2.0, 0, 9, 15),  # 2^15 steps a second for 2 s of 8 bodies are just affordable
         (1, 9, 2.0, 0, 9, 14),
-        (1, 8, 0.1, 0, 9, 15),  # less than a second counts as one
+        (1, 16, 1.0, 0, 9, 15),
+        (1, 16, 0.1, 0, 9, 15),  # less than a second counts as one
+        (1, 17, 0.1, 0, 9, 14),
         (2, 60, 100.0, 0, 8, 11),  # four steps, whatever they cost
         (4, 1, 2.0, 1, 5, 13),
         (2, 60, 100.0, 2, 8, 13),
@@ -128,7 +135,7 @@ def test_an_adaptive_method_climbs_by_tolerances():
 
 def test_the_largest_length_is_over_everything_but_the_last_axis():
     y = np.zeros((2, 3, 2))
-    y[1, 2] = [3, -4]
+    y[0, 1], y[1, 2] = [4, -2], [3, -4]
     assert largest(y) == 5.0
     assert largest(np.zeros((0, 3, 2))) == 0.0
     y[0, 0, 0] = np.nan
@@ -154,6 +161,7 @@ def test_a_difference_counts_above_32_floors(floor, used):
     seen = observed_order(geometric(64.0, 16.0, 4.0, 0.5), floor, 5)
     assert np.isfinite(seen.orders).tolist() == [k < used for k in range(3)]
     assert seen.value == ([2.0, 2.0, 3.0][used - 1] if used else None)
+    assert seen.differences == (64.0, 16.0, 4.0, 0.5)
     assert not seen.asymptotic and not seen.at_floor
 
 
@@ -179,6 +187,18 @@ def test_two_consecutive_orders_near_the_declared_one_show_it(orders, declared, 
     assert shown is None or seen.value == pytest.approx(shown, abs=1e-9)
 
 
+@pytest.mark.parametrize("more", [(), (1.0,)])
+def test_the_three_finest_orders_above_rounding_lead_somewhere(more):
+    """4.55, 4.3, 4.15 are on their way to 4; what is finer than rounding says nothing."""
+    sizes = 1e3 * 2.0 ** -np.cumsum([0.0, 4.55, 4.3, 4.15, *more])
+    seen = observed_order(geometric(*sizes), sizes[3] / 32 * 0.99, 4)
+    assert seen.asymptotic and seen.value == pytest.approx(4.0, abs=1e-9)
+
+
+def test_runs_that_agree_have_no_order():
+    assert np.isnan(observed_order(geometric(0.0, 4.0, 1.0), 1e-9, 2).orders).tolist() == [True, False]
+
+
 def test_romberg_is_richardson_by_hand():
     """Errors h + h²: one column leaves h² alone, two leave nothing; the uncertainty is the column's gaps."""
     limit, hs = 5.0, (1.0, 0.5, 0.25, 0.125)
@@ -191,6 +211,8 @@ def test_romberg_is_richardson_by_hand():
     assert first.uncertainty == pytest.approx([0.125 + 1 / 64 + 0.25 * 0.125], abs=1e-14)
     bare = romberg(ys[:2], (1,))  # nothing to eliminate with: twice the last difference
     assert bare.column == 0 and bare.y == ys[1] and bare.uncertainty == pytest.approx([2 * 1.25])
+    bare = romberg(ys, ())
+    assert bare.column == 0 and bare.y == ys[3] and bare.uncertainty == pytest.approx([2 * (0.125 + 3 / 64)])
 
 
 def test_an_uncertainty_never_shrinks_with_time():

@@ -11,8 +11,10 @@ import pytest
 from plumbline.diagnosis import (
     QUANTITIES,
     Difference,
+    Fit,
     derivatives,
     diagnose,
+    explains,
     explanations,
     fitted,
     misread,
@@ -65,6 +67,8 @@ def test_a_difference_is_measured_per_quantity_and_as_one_vector():
     wide = {"acceleration": np.array([[4.0]]), "kinetic_energy": np.array([6.0])}
     assert seen.off(still, wide) == {"acceleration": 0.5, "kinetic_energy": 1.0}
     assert seen.weighted(said).tolist() == [4.0, 0, 0, 2.0]
+    energy, allowed = {"kinetic_energy": np.array([6.0, 8.0])}, {"kinetic_energy": np.array([3.0, 2.0])}
+    assert Difference(known()[0], energy, energy, allowed, {}).weighted(energy).tolist() == [2.0, 4.0]
 
 
 @pytest.mark.parametrize(("at", "first"), [(0, 0), (3, 0), (5, 1), (9, 2)])
@@ -149,6 +153,26 @@ def test_what_is_in_no_pattern_is_not_misread():
     assert explanations(seen) == []
     text = diagnose(model, said, truth)
     assert text == "no single change of a parameter, term or convention explains the acceleration"
+
+
+def test_of_two_differences_one_may_have_a_name():
+    rng = np.random.default_rng(2)
+    model, said, truth = changed(
+        "joint_reaction", lambda i, x, b: x * (1 + 1e-6 * rng.normal(size=x.shape)), count=4
+    )
+    said = [replace(a, acceleration=1.25 * a.acceleration) for a in said]
+    assert diagnose(model, said, truth) == (
+        "behaves as if acceleration were 1.25 times as large; "
+        "no single change of a parameter, term or convention explains the joint reaction"
+    )
+
+
+def test_a_pendulum_that_cannot_be_explains_nothing():
+    """Bodies without any inertia have no angular acceleration to predict."""
+    model, said, truth = changed("acceleration", lambda i, x, b: 2 * x)
+    seen = observe(model, said, truth)
+    (cause,) = (c for c in causes(seen.case) if c.words(2.0, 0.0) == "all inertias were doubled")
+    assert not explains(seen, answer(seen.case), Fit(cause, 0.0, 0.0))
 
 
 def test_a_difference_within_the_bound_is_in_the_mass_matrix():
