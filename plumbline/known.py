@@ -102,7 +102,7 @@ def spread(item: object) -> list[object]:
 class Excuses:
     """Entries as they are used: rows come by and by, and at the end an entry may have excused nothing."""
 
-    def __init__(self, entries: Sequence[Entry], finer: bool = False) -> None:
+    def __init__(self, entries: Sequence[Entry], finer: bool) -> None:
         """``finer``: the rows come from finer ladders than `run`'s."""
         self.entries = [e for e in entries if finer or not e.finer]
         self.finer = finer

@@ -25,9 +25,7 @@ def attitude_error(p: Array, q: Array) -> Array:
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     sign = np.where(np.sum(p * q, axis=-1, keepdims=True) < 0, -1.0, 1.0)
     # 4 asin(|p - q| / 2), exact for all angles and, unlike acos(p·q), accurate for small ones
-    return np.asarray(
-        np.max(4 * np.arcsin(np.minimum(np.linalg.norm(p - sign * q, axis=-1) / 2, 1.0)), axis=-1)
-    )
+    return np.asarray(np.max(4 * np.arcsin(np.linalg.norm(p - sign * q, axis=-1) / 2), axis=-1))
 
 
 def kinetic_energy(model: Model, v: Array, omega: Array) -> Array:
@@ -141,7 +139,7 @@ def scales(model: Model, run: Trajectory, length: float) -> dict[str, float]:
     fall = float(np.sqrt(np.linalg.norm(model.gravity) * length))
     speed = max(fall, float(np.max(np.linalg.norm(run.v, axis=-1))))
     spin = max(fall / length, float(np.max(np.linalg.norm(omega, axis=-1))))
-    arm = float(np.max(np.linalg.norm(run.r, axis=-1), initial=0.0))
+    arm = float(np.max(np.linalg.norm(run.r, axis=-1)))
     inertia = float(np.sum(np.linalg.norm(model.inertia, axis=(1, 2))))
     return {
         "energy_drift": max(kinetic, potential, swing),

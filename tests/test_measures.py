@@ -50,6 +50,7 @@ def test_attitude_error_is_the_largest_rotation_angle(angle: float) -> None:
     q[1::2] *= -1  # the same attitude
     assert attitude_error(p, q) == pytest.approx(np.full(4, angle), rel=1e-6)
     assert attitude_error(p * 1.1, q * 0.7) == pytest.approx(np.full(4, angle), rel=1e-6)
+    assert attitude_error(p[1], q[1]) == pytest.approx(angle, rel=1e-6)
     assert np.array_equal(attitude_error(p, -p), np.zeros(4))
 
 
@@ -167,6 +168,14 @@ def test_a_gap_is_the_vector_of_a_ball_and_the_stretch_of_a_rod() -> None:
     assert np.max(np.abs(stretched.joint_gap[:, 1, 0])) > 1e-5
 
 
+def test_the_ends_of_a_rod_in_one_place_are_its_length_off() -> None:
+    model, _ = random_chain(np.random.default_rng(78), [True])
+    model = replace(model, proximal=np.zeros((1, 3)))
+    found = invariants(model, run_with(model, TIMES, TIMES))
+    np.testing.assert_array_equal(found.joint_gap[:, 0, 0], -model.length[0])
+    assert not np.any(found.gap_rate), "a stretch has no direction there"
+
+
 def lift_of_joint(model: Model, run: Trajectory) -> Array:
     """ℓ u (T, 3) of the second joint, from where it hangs to the second body's proximal point."""
     found = []
@@ -194,6 +203,8 @@ def test_what_is_not_conserved_is_not_judged() -> None:
     """Momentum about gravity: not with loads, drag or without gravity; energy by a shift, norm as it is."""
     model, run = motion([False])
     assert invariants(replace(model, gravity=np.zeros(3)), run).momentum_drift is None
+    light, usual = (invariants(replace(model, gravity=x * model.gravity), run) for x in (1e-2, 1))
+    np.testing.assert_allclose(light.momentum_drift, usual.momentum_drift, rtol=0, atol=1e-15)
     assert invariants(replace(model, force=np.ones((1, 3))), run).momentum_drift is None
     assert invariants(replace(model, drag_moment=np.ones(1)), run).momentum_drift is None
     long = invariants(model, replace(run, p=1.01 * run.p))

@@ -263,6 +263,12 @@ def test_scales_are_sizes_of_what_the_invariants_are_made_of():
     assert scales["momentum_drift"] == pytest.approx(sum(model.mass) * arm * speed + inertia * spin)
     assert scales["joint_gap"] == max(0.4, arm) and scales["norm_drift"] == 1.0
     assert scales["gap_rate"] == pytest.approx(max(speed, spin * 0.4), rel=1e-12)
+    still = replace(held, truth=truth(trajectory=replace(true, v=0 * true.v, pdot=0 * true.pdot))).scales()
+    assert still["energy_drift"] == pytest.approx(max(potential, swing), rel=1e-12)
+    over = np.linspace(1, -1, 17)[:, None, None] * TRUE.r[0]  # from one side of the pivot to the other
+    turned = replace(TRUE, r=over, v=0 * TRUE.v, pdot=0 * TRUE.pdot)
+    lifted = 2 * abs(MODEL.mass[0] * TRUE.r[0, 0] @ MODEL.gravity)
+    assert ladder(trajectory=turned).scales()["energy_drift"] == pytest.approx(lifted, rel=1e-12)
     long = replace(held, truth=truth(trajectory=true, length=50.0)).scales()  # a fall is faster than this
     assert long["joint_gap"] == 50.0
     assert long["gap_rate"] == pytest.approx(
