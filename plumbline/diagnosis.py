@@ -95,7 +95,7 @@ def diagnose(
         if unnamed:
             none = f"no single change of a parameter, term or convention explains the {' and '.join(unnamed)}"
             text = f"{text}; {none}" if text else none
-    where = localised(model, seen, truth, evaluate) if evaluate else ""
+    where = localised(model, seen, evaluate) if evaluate else ""
     return text + (f" ({where})" if where else "")
 
 
@@ -255,7 +255,7 @@ def misread(seen: Difference, quantity: str) -> str | None:
 # --- where --------------------------------------------------------------------------------------
 
 
-def localised(model: Model, seen: Difference, truth: StateTruth, evaluate: Evaluate) -> str:
+def localised(model: Model, seen: Difference, evaluate: Evaluate) -> str:
     """Where the difference persists: asked again at rest, without gravity, without loads and drag."""
     states = [seen.case.pendulum(i)[1] for i in range(min(len(seen.case.p), 4))]
     still = [lift(model, s.p, 0 * s.omega, s.u, 0 * s.udot) for s in states]

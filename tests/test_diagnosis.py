@@ -24,11 +24,12 @@ from plumbline.diagnosis import (
 from plumbline.hypotheses import causes
 from plumbline.kinematics import lift
 from plumbline.sampling import random_states
-from plumbline.suspect import answer
+from plumbline.suspect import answer, case
 from plumbline.yardstick import state_truth
 from tests import pendulums
 
 VECTORS = QUANTITIES[:3]
+ALONG = np.array([2.0, -1.0, 2.0]) / 3
 
 
 @cache
@@ -167,12 +168,38 @@ def test_of_two_differences_one_may_have_a_name():
     )
 
 
+def the_cause(seen, words):
+    """The one with these words for an amount of 2."""
+    (found,) = (cause for cause in causes(seen.case) if cause.words(2.0, 0.0) == words)
+    return found
+
+
 def test_a_pendulum_that_cannot_be_explains_nothing():
     """Bodies without any inertia have no angular acceleration to predict."""
     model, said, truth = changed("acceleration", lambda i, x, b: 2 * x)
     seen = observe(model, said, truth)
-    (cause,) = (c for c in causes(seen.case) if c.words(2.0, 0.0) == "all inertias were doubled")
+    cause = the_cause(seen, "all inertias were doubled")
     assert not explains(seen, answer(seen.case), Fit(cause, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(("off", "explained"), [(0.9, True), (1.9, True), (2.1, False)])
+def test_a_prediction_may_be_off_by_the_bounds_of_both_pendulums(off, explained):
+    model, said, truth = changed("acceleration", lambda i, x, b: x + off * b[:, None] * ALONG)
+    seen = observe(model, said, truth)
+    cause = the_cause(seen, "all inertias were doubled")  # once as large: the right pendulum
+    assert explains(seen, answer(seen.case), Fit(cause, 1.0, 0.0)) is explained
+
+
+@pytest.mark.parametrize(
+    "words", ["world rate were taken for the body rate", "products of inertia were missing"]
+)
+def test_a_convention_is_named(words):
+    model, truth = known(count=4)
+    wrong = answer(
+        the_cause(observe(model, truth.quantities, truth), words).alter(case(model, truth.states), 0)
+    )
+    said = [replace(a, **{q: wrong[q][i] for q in QUANTITIES}) for i, a in enumerate(truth.quantities)]
+    assert explanations(observe(model, said, truth)) == [words]
 
 
 def test_a_difference_within_the_bound_is_in_the_mass_matrix():
