@@ -170,7 +170,7 @@ class Ladder:
             reason,
             value=off,
             tolerance=ORDER_MARGIN,
-            order=None if order.at_floor else order.value,
+            order=order.value,
             declared_order=declared,
             horizon=self.shown_until,
             derivation=f"log2 of ratios of consecutive differences of (r, ṙ) over {steps}: {listed}; "
@@ -231,7 +231,6 @@ class Ladder:
         ratio = float(off[at] / tolerance[at])  # what the verdict hangs on, in both rows
         step = self.rungs[-1].resolution
         what = "step" if self.integrator.kind == "step" else "tolerance"
-        follows: Verdict = "agrees" if own <= estimate else "disagrees"
         return [
             who.row(
                 "trajectory",
@@ -257,7 +256,7 @@ class Ladder:
                 "trajectory",
                 method,
                 name,
-                follows if found.verdict == "agrees" else found.verdict,
+                found.verdict,  # own ≤ estimate where the limit agrees: the triangle inequality
                 f"{name} at {what} {step:g} is {own:.2g} {unit} from the truth, "
                 f"the ladder says {estimate:.2g}",
                 unit,

@@ -88,7 +88,7 @@ def test_a_sound_ladder_agrees_in_everything_and_says_what_it_measured():
     assert own.value == pytest.approx(0.02 * STEPS[-1] ** 2, rel=1e-6)
     assert own.tolerance == pytest.approx(own.value + limit.tolerance, rel=1e-6)
     assert own.extra == {"ratio": limit.extra["ratio"], "resolution": STEPS[-1]}
-    assert "at step 0.000976562" in own.reason
+    assert limit.reason.startswith("position limit within") and "at step 0.000976562" in own.reason
     turned = found["attitude"]
     assert turned.value == pytest.approx(0.02 * STEPS[-1] ** 2, rel=1e-4) and turned.unit == "rad"
     assert found["attitude_limit"].tolerance == pytest.approx(2e-12 + 2 * ROUNDING * 3.0, rel=0.1)
@@ -102,6 +102,9 @@ def test_windows_halve_down_to_an_eighth_with_three_samples_at_least(until, numb
     assert ladder().windows(until) == numbers
     assert ladder().windows(0.3) == [3]
     assert ladder().windows(0.1) == [3]
+    dense = ladder()
+    dense.truth = truth(trajectory=replace(TRUE, t=np.linspace(0, 2, 65)))
+    assert dense.windows(2.0) == [65, 33, 17, 9]
 
 
 def test_an_order_that_stays_away_disagrees_and_one_on_its_way_decides_nothing():
@@ -109,9 +112,20 @@ def test_an_order_that_stays_away_disagrees_and_one_on_its_way_decides_nothing()
     assert (one.verdict, one.order, one.value) == ("disagrees", pytest.approx(1), pytest.approx(1))
     lost = rows(climbed([0.01, 0.003, 0.002, 0.0003, 0.0002, 0.00001]))["order"]
     assert lost.verdict == "unresolved" and lost.reason.startswith("not in the asymptotic range: orders ")
+    assert lost.horizon == 2.0, "the longest window, where none shows an order"
     floor = rows(climbed([1e-16, 0, 1e-16, 0, 1e-16, 0]))["order"]
     assert (floor.verdict, floor.order, floor.value) == ("agrees", None, None)
     assert "not observable" in floor.reason and floor.horizon == 2.0
+
+
+@pytest.mark.parametrize(("factor", "until"), [(0.98, 2.0), (1.02, 1.0)])
+def test_differences_within_four_times_the_rounding_have_no_order(factor, until):
+    """32 floors of an eighth of what rounding has grown to; over half the time they are smaller still."""
+    held = ladder()
+    per_error = 2.0 * np.hypot(1 / held.truth.length, 1 / held.scales()["gap_rate"])
+    error = factor * 4 * ROUNDING * 3.0 / per_error
+    found = ladder(climbed([error * x for x in (1, 0, 0.6, 0.1, 0.9, 0)]))
+    assert found.shown.at_floor and found.shown_until == until
 
 
 def test_order_is_of_positions_and_velocities_over_their_scales():
@@ -122,6 +136,11 @@ def test_order_is_of_positions_and_velocities_over_their_scales():
     sizes = held.truth.length, held.scales()["gap_rate"]
     expected = np.concatenate([TRUE.r / sizes[0], made[0].trajectory.v / sizes[1]], -1)
     np.testing.assert_allclose(held.phases[0], expected, rtol=1e-13)
+
+
+def test_rounding_of_a_quaternion_is_twice_that_of_the_angle():
+    grown = rows(growth=np.full(17, 1e4))["attitude_limit"]
+    assert grown.tolerance == pytest.approx(2 * ROUNDING * 1e4, rel=1e-2)
 
 
 def test_a_limit_elsewhere_disagrees_only_where_the_ladder_shows_its_order():
@@ -146,6 +165,7 @@ def test_a_shorter_window_may_tell_where_the_long_one_cannot():
     assert (limit.verdict, limit.horizon) == ("agrees", 1.0)
     assert limit.extra["growth"] == 2.0 and "up to t = 1 s" in limit.reason
     assert found["position"].value == pytest.approx(0.01 * STEPS[-1] ** 2, rel=1e-6)
+    assert found["position"].tolerance == pytest.approx(0.01 * STEPS[-1] ** 2 + limit.tolerance, rel=1e-6)
     assert found["attitude_limit"].horizon == 2.0
     both = rows(visible_position=np.full(17, 1e-14))
     blind = both["position_limit"]
@@ -200,6 +220,7 @@ def test_a_method_with_a_tolerance_has_no_order_and_its_tightest_run_is_the_limi
     assert limit.verdict == "agrees" and "tightest of 6 tolerances" in limit.derivation
     assert limit.value == pytest.approx(2e-12, rel=1e-2)
     assert limit.uncertainty == pytest.approx(1e-12 + 2e-12, rel=1e-2)
+    assert found["attitude_limit"].uncertainty == pytest.approx(2e-12 + 2e-12, rel=1e-2)
     assert found["position"].reason.startswith("position at tolerance 0.000976562 is 2e-12 m")
     wild = (1e-7, 5e-8, 4.9e-8, 1e-9, 9e-10, 0)  # no order of any kind
     off = rows(climbed([1e-6 + e for e in wild]), method)["position_limit"]
@@ -235,6 +256,20 @@ def test_attitudes_have_two_signs():
         assert np.array_equal(mine, theirs)
     assert np.array_equal(right.positions[1], climbed().rungs[1].trajectory.r)
     assert rows(some)["attitude_limit"].verdict == "agrees"
+
+
+def test_the_sign_of_an_attitude_is_that_of_its_body_and_time():
+    """Of two bodies, with signs at random; a component about zero decides nothing."""
+    model = pendulums.model("br")
+    p = pendulums.motion(model, pendulums.state(model, seed=3), TIMES).p
+    p[..., 3] = 1e-12
+    other = p * [1, 1, 1, -1e6]
+    signs = np.random.default_rng(1).choice([-1.0, 1.0], size=(17, 2, 1))
+    still = np.zeros((17, 2, 3))
+    runs = [Trajectory(TIMES, still, x, still, 0 * x, 1) for x in (signs * other, p)]
+    made = [Rung(h, run, None, 0.0) for h, run in zip(STEPS, runs, strict=False)]
+    held = Ladder(WHO, model, truth(trajectory=runs[1]), METHOD, made, 2.0)
+    assert np.array_equal(held.attitudes[0], other) and np.array_equal(held.attitudes[1], p)
 
 
 # --- invariants ---------------------------------------------------------------------------------
