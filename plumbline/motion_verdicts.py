@@ -386,12 +386,11 @@ class Ladder:
         records = []
         for i, rung in enumerate(self.rungs):
             steps = rung.trajectory.steps if rung.trajectory else 0
-            order = orders[i] if i < len(orders) else np.nan
             for name, error in (
                 ("position", position_error(self.positions[i][:end], true.r[:end])),
                 ("attitude", attitude_error(self.attitudes[i][:end], true.p[:end])),
             ):
-                records.append((rung.resolution, name, np.max(error), rung.cost, steps, order))
+                records.append((rung.resolution, name, np.max(error), rung.cost, steps, orders[i]))
         names = ("resolution", "quantity", "error", "cost", "steps", "order")
         return dict(zip(names, map(list, zip(*records, strict=True)), strict=True))
 

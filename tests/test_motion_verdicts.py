@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from plumbline.converge import romberg
 from plumbline.findings import Subject
 from plumbline.kinematics import angular_velocity, multiply
 from plumbline.measures import invariants
@@ -202,7 +203,8 @@ def test_runs_that_did_not_stay_finite_are_points_of_the_study():
         assert (said[name].level, said[name].integrator) == ("trajectory", "Heun")
         assert said[name].unit == ("m" if name == "position_limit" else "rad")
     assert "position" not in said
-    assert np.all(np.isnan(dict(alone.tables)["curves"]["limit_error"]))
+    curves = dict(alone.tables)["curves"]
+    assert np.all(np.isnan([curves["limit_error"], curves["tolerance"]]))
     some.rungs[-1] = replace(some.rungs[-1], trajectory=None, failure="NaN at 1 s")
     (lost,) = judge_motion(WHO, MODEL, truth(), METHOD, some, 2.0).rows
     assert (lost.quantity, lost.verdict, lost.integrator) == ("all", "failed", "Heun")
@@ -320,7 +322,8 @@ def test_a_drift_that_falls_with_the_step_agrees_and_one_that_does_not_disagrees
     assert found.tolerance == pytest.approx(found.value + floor, rel=1e-3)
     assert found.extra["limit"] < 1e-14 and "at the finest step" in found.reason
     stays = rows(climbed([1e-6 + 0.01 * h**2 for h in STEPS]))["joint_gap"]
-    assert stays.verdict == "disagrees" and "does not vanish with the step" in stays.reason
+    assert stays.verdict == "disagrees" and "joint gap does not vanish with the step" in stays.reason
+    assert "from the finest step to step zero" in stays.derivation
     assert stays.extra["limit"] == pytest.approx(2e-6, rel=0.1)
     assert stays.extra["ratio"] == pytest.approx(stays.extra["limit"] / stays.tolerance, rel=1e-9)
     wild = rows(climbed([0.1, 0.03, 0.02, 0.003, 0.002, 0.001]))["joint_gap"]
@@ -330,7 +333,19 @@ def test_a_drift_that_falls_with_the_step_agrees_and_one_that_does_not_disagrees
     alone = climbed()
     for rung in range(5):
         alone.rungs[rung] = replace(alone.rungs[rung], trajectory=None)
-    assert rows(alone)["joint_gap"].verdict == "unresolved"
+    lost = rows(alone)["joint_gap"]
+    assert lost.verdict == "unresolved" and "fewer than two" in lost.reason
+    assert lost.tolerance == pytest.approx(floor) and lost.derivation.startswith("100 steps, ")
+
+
+def test_an_unresolved_drift_is_allowed_what_the_ladder_leaves_open():
+    errors = [1e-3 + e for e in (0.0, 1e-5, -1e-5, 2e-5, 1e-5, 0)]
+    found = rows(climbed(errors, attitude=0.0, speed=0.0))["joint_gap"]
+    limit = romberg([np.full((1, 1, 1), 2 * e) for e in errors], METHOD.powers)  # at 2 s
+    own = abs(2e-3 - limit.y[0, 0, 0])
+    assert found.verdict == "unresolved" and found.value == pytest.approx(2e-3)
+    assert found.tolerance == pytest.approx(own + limit.uncertainty[0], rel=1e-6)
+    assert f"{own:.2g} from the finest step to step zero" in found.derivation
 
 
 @pytest.mark.parametrize(("steps", "counted"), [(10, 64), (64, 64), (1000, 1000)])
@@ -340,6 +355,7 @@ def test_a_drift_of_rounding_agrees_at_once(steps, counted):
     assert base.verdict == "agrees" and base.reason.endswith("rounding")
     assert base.tolerance == pytest.approx(PER_STEP * counted, rel=1e-12)
     assert base.extra["ratio"] == pytest.approx(base.value / base.tolerance)
+    assert base.derivation.startswith(f"{steps} steps, ") and base.horizon == 2.0
     held = climbed([0.0] * 6, steps=steps)
     for factor, said in ((0.9, True), (1.1, False)):
         grown = TRUE.p * (1 + factor * base.tolerance * TIMES / 2)[:, None, None]
