@@ -83,8 +83,8 @@ def test_a_sound_ladder_agrees_in_everything_and_says_what_it_measured():
     rounding = ROUNDING * 3.0 * 0.4
     limit, own = found["position_limit"], found["position"]
     assert limit.value < 1e-15 and limit.horizon == 2.0 and limit.unit == own.unit == "m"
-    assert limit.uncertainty == pytest.approx(1e-12, rel=1e-2)
-    assert limit.tolerance == pytest.approx(1e-12 + rounding, rel=1e-2)
+    assert limit.uncertainty == pytest.approx(1e-12, rel=1e-2, abs=0)
+    assert limit.tolerance == pytest.approx(1e-12 + rounding, rel=1e-2, abs=0)
     assert limit.extra == {"ratio": limit.value / limit.tolerance, "visible": 1e-6, "growth": 3.0}
     assert own.value == pytest.approx(0.02 * STEPS[-1] ** 2, rel=1e-6)
     assert own.tolerance == pytest.approx(own.value + limit.tolerance, rel=1e-6)
@@ -92,7 +92,7 @@ def test_a_sound_ladder_agrees_in_everything_and_says_what_it_measured():
     assert limit.reason.startswith("position limit within") and "at step 0.000976562" in own.reason
     turned = found["attitude"]
     assert turned.value == pytest.approx(0.02 * STEPS[-1] ** 2, rel=1e-4) and turned.unit == "rad"
-    assert found["attitude_limit"].tolerance == pytest.approx(2e-12 + 2 * ROUNDING * 3.0, rel=0.1)
+    assert found["attitude_limit"].tolerance == pytest.approx(2e-12 + 2 * ROUNDING * 3.0, rel=0.1, abs=0)
     assert found["attitude_limit"].extra["visible"] == 2e-6
     assert "powers of h from (2, 3, 4) eliminated over 6 steps" in limit.derivation
     assert "a mistake of 0.0001 in a parameter makes 1e-06" in limit.derivation
@@ -220,9 +220,9 @@ def test_a_method_with_a_tolerance_has_no_order_and_its_tightest_run_is_the_limi
     assert "order" not in found
     limit = found["position_limit"]
     assert limit.verdict == "agrees" and "tightest of 6 tolerances" in limit.derivation
-    assert limit.value == pytest.approx(2e-12, rel=1e-2)
-    assert limit.uncertainty == pytest.approx(1e-12 + 2e-12, rel=1e-2)
-    assert found["attitude_limit"].uncertainty == pytest.approx(2e-12 + 2e-12, rel=1e-2)
+    assert limit.value == pytest.approx(2e-12, rel=1e-2, abs=0)
+    assert limit.uncertainty == pytest.approx(1e-12 + 2e-12, rel=1e-2, abs=0)
+    assert found["attitude_limit"].uncertainty == pytest.approx(2e-12 + 2e-12, rel=1e-2, abs=0)
     assert found["position"].reason.startswith("position at tolerance 0.000976562 is 2e-12 m")
     wild = (1e-7, 5e-8, 4.9e-8, 1e-9, 9e-10, 0)  # no order of any kind
     off = rows(climbed([1e-6 + e for e in wild]), method)["position_limit"]
@@ -335,7 +335,7 @@ def test_a_drift_that_falls_with_the_step_agrees_and_one_that_does_not_disagrees
         alone.rungs[rung] = replace(alone.rungs[rung], trajectory=None)
     lost = rows(alone)["joint_gap"]
     assert lost.verdict == "unresolved" and "fewer than two" in lost.reason
-    assert lost.tolerance == pytest.approx(floor) and lost.derivation.startswith("100 steps, ")
+    assert lost.tolerance == pytest.approx(floor, abs=0) and lost.derivation.startswith("100 steps, ")
 
 
 def test_an_unresolved_drift_is_allowed_what_the_ladder_leaves_open():
@@ -353,7 +353,7 @@ def test_a_drift_of_rounding_agrees_at_once(steps, counted):
     """So much in every step, of at least 64 steps."""
     base = rows(climbed([0.0] * 6, steps=steps))["norm_drift"]
     assert base.verdict == "agrees" and base.reason.endswith("rounding")
-    assert base.tolerance == pytest.approx(PER_STEP * counted, rel=1e-12)
+    assert base.tolerance == pytest.approx(PER_STEP * counted, rel=1e-12, abs=0)
     assert base.extra["ratio"] == pytest.approx(base.value / base.tolerance)
     assert base.derivation.startswith(f"{steps} steps, ") and base.horizon == 2.0
     held = climbed([0.0] * 6, steps=steps)

@@ -126,9 +126,20 @@ def test_runs_are_measured_by_length_turn_and_speed() -> None:
         },
         rel=1e-9,
     )
-    found = worst_of("reversed in time", METHOD, {"position": 1.0, "velocity": 3.0, "attitude": 2.0}, 0.5, 64)
+    found = worst_of(
+        "reversed in time", METHOD, {"position": 1.0, "velocity": 3.0, "attitude": 2.0}, 0.5, 64, 0.25, 8.0
+    )
     assert found == Held(
-        "reversed in time", 6.0, "velocity", 0, 1, integrator="trapezoidal", steps=64, refused=""
+        "reversed in time",
+        6.0,
+        "velocity",
+        0,
+        1,
+        integrator="trapezoidal",
+        steps=64,
+        refused="",
+        resolution=0.25,
+        end=8.0,
     )
 
 
@@ -192,9 +203,11 @@ def test_a_run_may_be_off_by_its_rounding_its_solver_and_its_accelerations_grown
     grown = max(growth(MODEL, at, np.array([0, end / 2, end])))
     assert grown > 1.1 and ratio > 1.1
     limit = allowed(method, MODEL, at, end, steps)
-    assert limit == pytest.approx((ROUNDING + solved + pushed) * grown, rel=1e-12)
+    assert limit == pytest.approx((ROUNDING + solved + pushed) * grown, rel=1e-12, abs=0)
     bare = replace(method, solver=0.0, tightest=0.0)
-    assert allowed(bare, MODEL, at, end, steps) == pytest.approx((ROUNDING + pushed) * grown, rel=1e-12)
+    assert allowed(bare, MODEL, at, end, steps) == pytest.approx(
+        (ROUNDING + pushed) * grown, rel=1e-12, abs=0
+    )
 
 
 @pytest.mark.parametrize("drag", [False, True])

@@ -9,9 +9,10 @@ from plumbline.bench import horizon_of
 from plumbline.bound import state_bound
 from plumbline.findings import Subject
 from plumbline.motion_verdicts import judge_motion
+from plumbline.packed import Packed
 from plumbline.registry import adapter
 from plumbline.sampling import random_states
-from plumbline.state_verdicts import UNITS, judge_states
+from plumbline.state_verdicts import UNITS, judge_packed, judge_states
 from plumbline.work import Evaluation, climb
 from plumbline.yardstick import StateTruth, motion_truth
 from tests import pendulums
@@ -41,6 +42,21 @@ def verdict(scale_of_bound, shift=0.0):
 )
 def test_a_bound_decides_only_where_it_is_sharp(scale, shift, expected):
     assert verdict(scale, shift) == expected
+
+
+def test_a_blunt_row_says_what_was_measured():
+    bounds = [replace(b, acceleration=1e6 * b.acceleration) for b in map(state_bound, [MODEL] * 3, STATES)]
+    row = judged((1, 1, 0.5), bounds=bounds).rows[0]
+    assert (row.level, row.integrator, row.quantity, row.unit) == ("state", "-", "acceleration", "m/s²")
+    assert row.verdict == "unresolved" and row.reason.startswith("blunt: the rounding bound is ")
+    assert row.tolerance == bounds[1].acceleration[1] and row.extra["ratio"] == pytest.approx(0.5)
+
+
+def test_a_packed_truth_is_judged_as_it_is_open():
+    right = adapter("reference").evaluate(MODEL, STATES)
+    truth = StateTruth(STATES, right, [state_bound(MODEL, s) for s in STATES], "itself")
+    said = Evaluation(right[::-1], None, None, 0.0)
+    assert judge_packed(WHO, Packed.of(truth), said).rows == judge_states(WHO, truth, said).rows
 
 
 @pytest.mark.parametrize("drag", [False, True])
@@ -76,25 +92,32 @@ def test_the_row_is_of_the_body_that_is_worst_by_its_own_bound():
     # The larger error in m/s² is elsewhere: body 1 of state 0 gets a bound a thousand times as wide.
     wide = bounds[0].acceleration * [1e3, 1.0]
     bounds[0] = replace(bounds[0], acceleration=wide)
-    found = judged((0, 0, 0.5), (2, 1, 3.0), bounds=bounds)
+    small = [b.scale | {"acceleration": 1e-2 * b.scale["acceleration"]} for b in bounds]
+    bounds = [replace(b, scale=scale) for b, scale in zip(bounds, small, strict=True)]
+    found = judged((0, 0, 0.5), (1, 0, 1.5), (2, 1, 3.0), bounds=bounds)
     row = found.rows[0]
     sharp = bounds[2].acceleration[1]
     assert (row.quantity, row.verdict, row.unit, row.level) == ("acceleration", "disagrees", "m/s²", "state")
-    assert row.value == pytest.approx(3 * sharp, rel=1e-2) and row.tolerance == sharp
+    assert row.value == pytest.approx(3 * sharp, rel=1e-2, abs=0) and row.tolerance == sharp
     assert (row.extra["state"], row.extra["body"], row.extra["states"]) == (2.0, 2.0, 3.0)
     assert row.extra["ratio"] == pytest.approx(3, rel=1e-2)
     assert row.wall_time == 0.25
-    assert "state 2, body 2" in row.reason and "1 of 3 states disagree" in row.reason
+    assert "state 2, body 2" in row.reason and "2 of 3 states disagree" in row.reason
+    assert row.derivation.endswith("truth: itself")
     (name, table), *_ = found.tables
     assert name == "states" and (table["scenario"], table["engine"]) == ("s", "reference")
     assert table["quantity"] == "acceleration"
     assert table["state"].tolist() == [0, 1, 2] and table["body"].tolist() == [0, 0, 1]
-    assert table["error"] == pytest.approx([0.5 * wide[0], 0, 3 * sharp], rel=1e-2)
+    assert table["error"] == pytest.approx(
+        [0.5 * wide[0], 1.5 * bounds[1].acceleration[0], 3 * sharp], rel=1e-2, abs=0
+    )
     assert table["bound"][[0, 2]].tolist() == [wide[0], sharp]
     scales = [bounds[i].scale["acceleration"][body] for i, body in ((0, 0), (1, 0), (2, 1))]
     assert table["scale"].tolist() == scales
-    assert row.extra["relative"] == pytest.approx(max(table["error"] / scales), rel=1e-12)
-    assert row.extra["bound_relative"] == pytest.approx(np.median(table["bound"] / scales), rel=1e-12)
+    assert row.extra["relative"] == pytest.approx(max(table["error"] / scales), rel=1e-12, abs=0)
+    assert row.extra["bound_relative"] == pytest.approx(np.median(table["bound"] / scales), rel=1e-12, abs=0)
+    (_, table), *_ = judged((0, 0, 0.5), (0, 1, 0.9), bounds=bounds).tables
+    assert table["body"][0] == 1, "nearer to its bound, though less far off"
 
 
 @pytest.mark.parametrize(("by", "expected"), [(0.98, "agrees"), (1.02, "disagrees")])
@@ -107,6 +130,7 @@ def test_one_bound_is_the_border(by, expected):
     assert [row.quantity for row in rows] == list(UNITS)
     assert [row.unit for row in rows] == ["m/s²", "rad/s²", "N", "J", "J", "kg m²/s", "kg m²"]
     assert {(row.level, row.integrator, row.engine) for row in rows} == {("state", "-", "reference")}
+    assert rows[1].reason == "angular acceleration within 0 of the rounding bound at 3 states"
     assert rows[0].extra["bound_relative"] < 1e-9 and rows[1].extra["ratio"] == 0.0
 
 
