@@ -188,13 +188,14 @@ class _Stepper:
     def sizes(self, r: Array, p: Array, v: Array, pdot: Array) -> None:
         """Natural sizes (7, M) of q and v, chain by chain, and the first step from their ratio."""
         q_size, v_size = np.empty_like(self.q), np.empty_like(self.v)
+        pushed = np.abs(self.forest.acceleration(self.q, self.v))
         for chain, at in zip(self.forest.chains, self.forest.start, strict=False):
             body = slice(at, at + chain.n)
             y = natural_sizes(chain, r[body], p[body], v[body], pdot[body])
             first, second = y[0], y[3 * chain.n]
             q_size[:3, body], q_size[3:, body] = first, second
             v_size[:3, body], v_size[3:, body] = y[7 * chain.n], y[10 * chain.n]
-        pushed = np.max(np.abs(self.forest.acceleration(self.q, self.v)), axis=1, keepdims=True)
+            pushed[:, body] = np.max(pushed[:, body], axis=1, keepdims=True)
         v_size = np.maximum(v_size, np.sqrt(pushed * q_size))  # loads may move what neither falls nor turns
         self.q_size, self.v_size = q_size, np.where(v_size > 0, v_size, 1.0)  # nothing moves: any size
         self.h = 0.3 * float(np.min(q_size / self.v_size))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from reference_impl import collocation
 from reference_impl import integrate as raw
 from reference_impl.chain import Array
 from reference_impl.collocation import BatchRun, gauss, integrate
-from reference_impl.forest import Forest
+from reference_impl.forest import Forest, lay
 from tests.random_chains import random_chain, rescaled
 
 TIMES = np.linspace(0.0, 1.0, 11)
@@ -134,20 +135,26 @@ def test_a_long_chain_runs() -> None:
     assert np.max(np.abs(gap)) < 1e-6
 
 
+@pytest.mark.parametrize("nodes", [4, collocation.NODES])
 @pytest.mark.parametrize("dense", [True, False])
 @pytest.mark.parametrize("rods", [[False, False], [True, False]], ids=str)
-def test_other_units_take_the_same_steps(rods: list[bool], dense: bool) -> None:
-    """Lengths and times by powers of two, masses by powers of four (roots): every digit is the same."""
+def test_other_units_take_the_same_steps(rods: list[bool], dense: bool, nodes: int) -> None:
+    """Lengths and times by powers of two, masses by powers of four (roots): every digit is the same.
+
+    Of 4 nodes the tail sets the steps, of 16 the sweeps.
+    """
     model, state = random_chain(np.random.default_rng(39), rods, loads=True, drag=True)
     times = TIMES[:4]
-    here = run(model, state, 1e-9, times, dense=dense)
+    here = run(model, state, 1e-6, times, dense=dense, nodes=nodes)
     for length, mass, second in (
         (2.0**6, 1.0, 1.0),
         (1.0, 2.0**-8, 1.0),
         (1.0, 1.0, 2.0**5),
         (0.25, 4.0, 0.5),
     ):
-        there = run(*rescaled(model, state, length, mass, second), 1e-9, times * second, dense=dense)
+        there = run(
+            *rescaled(model, state, length, mass, second), 1e-6, times * second, dense=dense, nodes=nodes
+        )
         assert (there.steps, there.evaluations) == (here.steps, here.evaluations)
         assert np.array_equal(there.r, here.r * length)
         assert np.array_equal(there.p, here.p)
@@ -220,3 +227,118 @@ def test_a_step_that_vanishes_is_an_error() -> None:
     with pytest.raises(ArithmeticError, match=r"stopped at t = 0\.0 s: the step vanishes"):
         run(model, state, 1e-6, np.array([0.0, 1e3]))
     assert run(model, state, 1e-6, np.array([0.0, 1e-12])).steps > 2
+
+
+@pytest.mark.parametrize("ratio", [0.3, 1.0, 1.6])
+def test_the_last_steps_polynomial_goes_on_in_the_next(ratio: float) -> None:
+    """Any polynomial of degree < S, at the nodes of a step ``ratio`` times as long."""
+    table = gauss(8)
+    for k in range(8):
+        found = table.ahead(ratio) @ table.modes @ table.c**k
+        np.testing.assert_allclose(found, (1 + ratio * table.c) ** k, rtol=1e-8)
+
+
+def test_a_batch_has_every_chains_own_sizes() -> None:
+    """A pendulum of a millimetre beside one of a metre keeps its own scales, and sets the first step."""
+    drawn = [random_chain(np.random.default_rng(43), [False] * n) for n in (2, 3, 1)]
+    drawn[1] = rescaled(*drawn[1], 1e-3, 1e-6, 1e-2)
+
+    def sized(models: list[tuple[Model, State]]) -> collocation._Stepper:
+        r, p, v, pdot = (np.concatenate(parts) for parts in zip(*(start(s) for _, s in models), strict=True))
+        forest = Forest([chain(model) for model, _ in models])
+        stepper = collocation._Stepper(
+            forest, lay(r, p), lay(v, pdot), 1e-6, 1e-7, gauss(4), True, baumgarte=0.0
+        )
+        stepper.sizes(r, p, v, pdot)
+        return stepper
+
+    together, alone = sized(drawn), [sized([one]) for one in drawn]
+    for name in ("q_size", "v_size"):
+        np.testing.assert_allclose(
+            getattr(together, name), np.hstack([getattr(one, name) for one in alone]), rtol=1e-9
+        )
+    assert together.h == pytest.approx(min(one.h for one in alone), rel=1e-9)
+
+
+def test_close_times_are_no_vanishing_steps() -> None:
+    model, state = random_chain(np.random.default_rng(44), [False])
+    times = np.array([0.0, 0.1, 0.1 + 5e-15])
+    done = run(model, state, 1e-6, times, dense=False)
+    assert np.max(np.abs(done.r[2] - done.r[1])) < 1e-13
+
+
+def test_sweeps_end_at_what_rounding_leaves() -> None:
+    """No sweep tolerance at all: the sweeps still end, and the motion is as good as double precision."""
+    model, state = random_chain(np.random.default_rng(45), [False, True], loads=True, drag=True)
+    usual, quiet = run(model, state, 1e-12), run(model, state, 1e-12, sweep_tolerance=0.0)
+    assert quiet.rejected <= 1
+    assert np.max(np.abs(quiet.r - usual.r)) < 1e-10
+
+
+def test_a_step_is_made_where_its_error_is_within_the_tolerance(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Longer and longer first steps: good ones, then too long for the tolerance, then for the sweeps."""
+    model, state = random_chain(np.random.default_rng(46), [False])
+    tails, tail = [], collocation._Stepper._tail
+
+    def noted(stepper: collocation._Stepper, a: Array, h: float) -> float:
+        tails.append(tail(stepper, a, h))
+        return tails[-1]
+
+    monkeypatch.setattr(collocation._Stepper, "_tail", noted)
+    r, p, v, pdot = start(state)
+    forest, found = Forest([chain(model)]), []
+    for h in np.geomspace(0.01, 1.0, 60):
+        stepper = collocation._Stepper(
+            forest, lay(r, p), lay(v, pdot), 1e-6, 1e-7, gauss(8), True, baumgarte=0.0
+        )
+        stepper.sizes(r, p, v, pdot)
+        tails.clear()
+        made, slow = stepper.step(h)
+        assert made == (bool(tails) and tails[0] <= 1)
+        assert made or slow == (not tails)
+        assert made or 0.3 * h <= stepper.h < h
+        found.append((made, slow))
+    assert {(True, False), (False, False), (False, True)} <= set(found)
+
+
+def test_the_tolerance_sets_the_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of few nodes the next step's error is foreseen; of many, what takes the usual sweeps is kept."""
+    model, state = random_chain(np.random.default_rng(47), [False, False])
+    done = run(model, state, 1e-6, np.array([0.0, 1.0]), nodes=4)
+    assert done.rejected < 0.1 * done.steps and done.hindered == 0
+    watched = Watched(monkeypatch)
+    run(model, state, 1e-12, np.array([0.0, 2.0]))
+    for (h, sweeps, made, _), (after, *_) in zip(watched.tried[:-2], watched.tried[1:-1], strict=True):
+        assert not made or sweeps > collocation.USUAL or after > 0.95 * h
+
+
+def test_no_crumb_before_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps that end on the times asked for share the way to each."""
+    model, state = random_chain(np.random.default_rng(48), [False])
+    watched, times = Watched(monkeypatch), np.linspace(0, 1.5, 8)
+    run(model, state, 1e-9, times, dense=False)
+    h = np.array([h for h, _, made, _ in watched.tried if made])
+    ends = np.searchsorted(np.cumsum(h), times[1:] - 1e-9)  # the last step of each interval
+    assert np.all(h[ends[1:]] > 0.4 * h[ends[1:] - 1])
+
+
+def test_a_thousand_steps_add_up_to_the_last_digit() -> None:
+    """Constant parts: the compensated sums are the exact ones but for one rounding."""
+    model, state = random_chain(np.random.default_rng(49), [False])
+    r, p, v, pdot = start(state)
+    forest, table = Forest([chain(model)]), gauss(4)
+    for push in (0.0, 0.3):
+        stepper = collocation._Stepper(
+            forest, lay(r, p), lay(v, pdot), 1e-6, 1e-7, table, True, baumgarte=0.0
+        )
+        first, a, h = (stepper.q, stepper.v), np.full((7, 4, 1), push), 0.1
+        stepper.new_modes = table.modes @ a
+        stepper._advance(a, h)
+        part = h * first[1] if push == 0 else h * np.einsum("j,ijm->im", table.b, a)
+        for _ in range(999):
+            stepper._advance(a, h)
+        begun, ended = (first[0], stepper.q) if push == 0 else (first[1], stepper.v)
+        exact = [
+            float(Fraction(x) + 1000 * Fraction(dx)) for x, dx in zip(begun.flat, part.flat, strict=True)
+        ]
+        np.testing.assert_allclose(ended.ravel(), exact, rtol=4e-16, atol=1e-17)
