@@ -94,6 +94,20 @@ def test_growth_is_how_far_the_worst_twin_has_gone(rods):
     assert growth(model, state, times) == pytest.approx(expected, rel=0.01)
 
 
+def test_positions_count_by_the_distance_from_the_pivot():
+    """A point on a rod that stands: positions part exponentially, attitudes as time does."""
+    model = replace(pendulums.model("r"), gravity=np.array([3.0, -6, 6]), proximal=np.zeros((1, 3)))
+    still = np.zeros((1, 3))
+    state = lift(model, np.array([[1.0, 0, 0, 0]]), still, -model.gravity[None] / 9, still)
+    times = np.linspace(0, 1, 9)
+    base, *others = (pendulums.motion(model, s, times) for s in (state, *twins(model, state)))
+    parted = [position_error(x.r, base.r) / model.length[0] / TWIN for x in others]
+    turned = [attitude_error(x.p, base.p) / TWIN for x in others]
+    assert np.max(parted) > 5 * np.max(turned)
+    expected = np.maximum(np.max([parted, turned], axis=(0, 1)), 1.0)
+    assert growth(model, state, times) == pytest.approx(expected, rel=0.01)
+
+
 @pytest.mark.parametrize(("rate_", "unit"), [(0.0, 1.0), (30.0, 30.0)])
 def test_twins_are_turned_by_their_size_and_rates_by_it_of_the_motion(rate_, unit):
     model, state = random_chain(np.random.default_rng(6), [0, 1, 0], rate=rate_)

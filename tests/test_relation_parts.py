@@ -169,7 +169,17 @@ def test_the_quickest_is_a_body_a_rod_or_the_shortest_link() -> None:
 def test_rows_say_what_held_what_did_not_and_what_was_refused() -> None:
     one = Held("masses doubled", 0.25, "joint_reaction", 2, 4)
     off = replace(one, ratio=1.5)
-    run = Held("reversed in time", 0.5, "velocity", 0, 1, integrator="trapezoidal", steps=64)
+    run = Held(
+        "reversed in time",
+        0.5,
+        "velocity",
+        0,
+        1,
+        integrator="trapezoidal",
+        steps=64,
+        resolution=0.25,
+        end=8.0,
+    )
     lost = refused("by sparse", METHOD, EngineFailure("it stopped"))
     never = refused("by sparse", METHOD, Unsupported("no such solver"))
     rows = judge_relations(
@@ -183,6 +193,9 @@ def test_rows_say_what_held_what_did_not_and_what_was_refused() -> None:
     assert [r.value for r in rows] == [0.25, 1.5, 1.0, 0.5, 7.0, None, None]
     assert [r.tolerance for r in rows] == [1.0] * 5 + [None] * 2
     assert rows[0].extra == {"states": 4.0, "state": 2.0}
+    assert rows[3].extra == {"states": 1.0, "state": 0.0, "resolution": 0.25, "end": 8.0}
+    assert "sum of both sides' state-level rounding bounds" in rows[0].derivation
+    assert "growth of a small perturbation" in rows[3].derivation
     assert "to 0.25 of the rounding bounds, 4 states" in rows[0].reason
     assert "E's joint reaction at state 2 differs by 1.5 times the rounding bounds of both" in rows[1].reason
     assert "to 0.5 of what rounding and the step's solver explain, 64 steps" in rows[3].reason

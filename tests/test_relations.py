@@ -15,7 +15,7 @@ from plumbline.findings import Subject
 from plumbline.parts import halved, halves
 from plumbline.records import EngineFailure, Unsupported
 from plumbline.registry import ENGINES, adapter
-from plumbline.relations import QUANTITIES, RELATIONS, check, judge_relations, runs
+from plumbline.relations import QUANTITIES, RELATIONS, check, judge_relations, quickest, runs
 from plumbline.suspect import answer, case
 from tests import pendulums
 from tests.pendulums import JOINTS
@@ -243,6 +243,26 @@ def ran(engine, relation, joints="balls", integrator="trapezoidal"):
         if (held.relation, held.integrator) == (relation, integrator)
     )
     return found
+
+
+def test_runs_take_sixteen_steps_of_at_most_a_thirtieth_of_a_radian_each_way():
+    model = pendulums.model(JOINTS["balls"])
+    at = pendulums.state(model, 1)
+    found = list(runs(exudyn()(), model, at))
+    solvers = ["by EXUdense", "by EigenDense"]
+    assert [(held.integrator, held.relation) for held in found] == [
+        ("trapezoidal", "reversed in time"),
+        *(("trapezoidal", name) for name in solvers),
+        *(("generalized-alpha", name) for name in solvers),
+    ]
+    for held in found:
+        assert held.steps == (32 if held.relation == "reversed in time" else 16)
+        assert held.end == 16 * held.resolution and np.log2(held.resolution) % 1 == 0
+        assert 0.5 < 32 * quickest(model, at) * held.resolution <= 1
+    reference = adapter("reference")
+    (back,) = runs(reference, model, at)
+    (method,) = (method for method in reference.integrators if method.symmetric)
+    assert (back.end, back.resolution) == (found[0].end, method.tightest)
 
 
 @pytest.mark.parametrize("joints", ["balls", "rods", "mixed"])
