@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from reference_impl.drift import BINS, drift, growth
+from reference_impl.drift import BINS, drift, gaps, growth
 from reference_impl.integrate import integrate
 from reference_impl.joints import rows
 from tests.notes_cases import on_manifold, random_chain
@@ -33,16 +33,29 @@ def test_an_injected_defect_has_exponents_1_and_2():
     rng = np.random.default_rng(7)
     chain = random_chain(rng, [True])
     length = chain.length[0]
-    measured = drift(
-        chain, *on_manifold(chain, rng), 1e-11, np.array([0.1, 1, 10]), gamma_defect=DEFECT, samples=10
-    )
-    assert (measured.rtol, measured.decades.tolist()) == (1e-11, [0.1, 1, 10]) and measured.steps > 10
+    decades = np.array([0.02, 0.2, 2.0])
+    measured = drift(chain, *on_manifold(chain, rng), 1e-11, decades, gamma_defect=DEFECT, samples=10)
+    assert measured.rtol == 1e-11 and measured.decades is decades and measured.steps > 10
     assert abs(measured.joint_gap.exponent - 2) < 0.02
     assert abs(measured.gap_rate.exponent - 1) < 0.02
     np.testing.assert_allclose(
-        measured.joint_gap.maxima * 2 * length, DEFECT * np.array([1, 100]) / 2, rtol=0.01
+        measured.joint_gap.maxima * 2 * length, DEFECT * decades[1:] ** 2 / 2, rtol=0.01
     )
-    np.testing.assert_allclose(measured.gap_rate.maxima * 2 * length, DEFECT * np.array([1, 10]), rtol=0.01)
+    np.testing.assert_allclose(measured.gap_rate.maxima * 2 * length, DEFECT * decades[1:], rtol=0.01)
+
+
+def test_gaps_are_metres_and_metres_a_second_of_the_worst_joint():
+    """A ball opened by 5 cm and 0.5 m/s; a rod stretched by 1e-6 m along itself, and at 1e-3 m/s."""
+    rng = np.random.default_rng(8)
+    chain = random_chain(rng, [False])
+    r, p, v, pdot = on_manifold(chain, rng)
+    found = gaps(chain, r + np.array([0.03, 0.04, 0]), p, v + np.array([0, 0.3, 0.4]), pdot)
+    np.testing.assert_allclose(found, (0.05, 0.5), rtol=1e-12)
+    chain = random_chain(rng, [True])
+    r, p, v, pdot = on_manifold(chain, rng)
+    u = rows(chain, r, p, v, pdot).d / chain.length[0]
+    np.testing.assert_allclose(gaps(chain, r + 1e-6 * u, p, v, pdot)[0], 1e-6, rtol=1e-5)
+    np.testing.assert_allclose(gaps(chain, r, p, v + 1e-3 * u, pdot)[1], 1e-3, rtol=1e-9)
 
 
 def falls_with_the_tolerance(rods, decades, tolerances):
