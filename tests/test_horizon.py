@@ -46,6 +46,19 @@ def test_growth_is_exponential_as_far_as_it_goes():
     assert slope == pytest.approx(np.full(100, own), rel=0.02)
 
 
+def test_growth_may_end():
+    """A body that falls over and comes to rest: its twins part ten thousandfold, and then no further."""
+    model, state, own = upright()
+    model = replace(model, drag_moment=np.array([0.2 * model.mass[0] * 9.81 * 0.3 / own]))
+    state = twins(model, state, size=3e-5, count=1)[0]
+    times = np.linspace(0, 60 / own, 61)
+    found = growth(model, state, times)
+    base, *others = (pendulums.motion(model, s, times[[0, -1]]) for s in (state, *twins(model, state)))
+    apart = max(attitude_error(x.p[-1], base.p[-1]) for x in others) / TWIN
+    assert found[-1] > FAR
+    assert found[-1] == pytest.approx(apart, rel=0.1)
+
+
 def test_a_stable_swing_grows_no_faster_than_time():
     scenario = load(find("planar-small"))
     found = growth(scenario.model, scenario.state, np.arange(81) * 0.05)
