@@ -174,8 +174,9 @@ def explains(seen: Difference, model_right: dict[str, Array], fit: Fit) -> bool:
 def derivatives(seen: Difference, at: Sequence[tuple[Cause, float]]) -> Array:
     """(causes, K) central derivatives of the answers by each cause's amount, in bounds per unit."""
     size, columns = len(seen.case.p), []
-    for start in range(0, len(at), max(1, 4096 // (size * seen.case.n**2))):
-        some = at[start : start + max(1, 4096 // (size * seen.case.n**2))]
+    many = max(1, 4096 // (size * seen.case.n**2))
+    for start in range(0, len(at), many):
+        some = at[start : start + many]
         steps = [ROUGH * (c.scale or 1.0) for c, _ in some]
         sides = [
             c.alter(seen.case, x + s * h) for (c, x), h in zip(some, steps, strict=True) for s in (1, -1)
