@@ -76,7 +76,7 @@ def drift_table(
 
     Energy is judged only without loads and drag, NaN with them.
     """
-    grid = np.unique(np.concatenate([[0.0], *(np.linspace(0, end, samples + 1) for end in times)]))
+    grid = np.unique(np.concatenate([np.linspace(0, end, samples + 1) for end in times]))
     table = []
     for variant in variants:
         for rtol in rtols:

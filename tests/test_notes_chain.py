@@ -84,3 +84,12 @@ def test_consistent_states_satisfy_every_row():
     np.testing.assert_allclose(joints.C, 0, atol=1e-15)
     np.testing.assert_allclose(joints.rate(v, pdot), 0, atol=1e-14)
     np.testing.assert_allclose(np.linalg.norm(joints.d, axis=1), chain.length, atol=1e-15)
+
+
+def test_a_balls_rows_keep_their_order_in_a_long_chain():
+    rng = np.random.default_rng(2)
+    chain = random_chain(rng, [True, False, False] * 15)
+    joints = rows(chain, *on_manifold(chain, rng))
+    assert np.all(np.diff(joints.joint) >= 0)
+    balls = joints.r_near[~chain.rods[joints.joint]].reshape(-1, 3, 3)
+    np.testing.assert_array_equal(balls, np.broadcast_to(np.eye(3), (30, 3, 3)))

@@ -11,7 +11,8 @@ from reference_impl import printed
 from reference_impl.euler_parameters import A, L, angular_velocity
 from reference_impl.euler_parameters import rate as pdot_of
 from reference_impl.integrate import integrate, natural_sizes, pack, rate, unpack
-from reference_impl.system import System, solve_dense
+from reference_impl.joints import rows
+from reference_impl.system import System, power_of_two, singular, solve_dense
 from tests.notes_cases import Symbols, off_manifold, on_manifold, random_chain
 
 MIXES = [[True], [False], [True, True], [False, False], [True, False, False, True, False], [False, True] * 5]
@@ -66,11 +67,13 @@ def test_the_band_and_the_dense_form_give_the_same_solution(rods, states):
     assert np.max(residual) < 16 * np.finfo(float).eps
 
 
+@pytest.mark.parametrize("without", [(), ("drag_force",), ("drag_moment",)], ids=str)
 @pytest.mark.parametrize("rods", MIXES, ids=str)
-def test_the_solution_obeys_newton_and_euler(rods):
+def test_the_solution_obeys_newton_and_euler(rods, without):
     """m r̈ = F + reactions and J ω̇′ + ω′ × J ω′ = moments of the reactions about the centre of mass + n′."""
     rng = np.random.default_rng(11 + len(rods))
     chain = random_chain(rng, rods)
+    chain = dataclasses.replace(chain, **{name: np.zeros(chain.n) for name in without})
     r, p, v, pdot = on_manifold(chain, rng)
     x = System(chain).solve(r, p, v, pdot)
     omega, turn = angular_velocity(p, pdot), A(p)
@@ -91,13 +94,13 @@ def test_the_solution_obeys_newton_and_euler(rods):
 
 
 def test_units_do_not_decide_the_digits():
-    """The same motion with masses × 2^±20: without equilibration the pivots would follow the units."""
+    """The same motion with masses × 2^±30: without equilibration the pivots would follow the units."""
     rng = np.random.default_rng(5)
     chain = random_chain(rng, [True, False, True])
     state = on_manifold(chain, rng)
     x = System(chain).solve(*state)
     loads = ("mass", "inertia", "force", "moment", "drag_force", "drag_moment")
-    for scale in (2.0**-20, 2.0**20):
+    for scale in (2.0**-30, 2.0**30):
         scaled = dataclasses.replace(chain, **{name: scale * getattr(chain, name) for name in loads})
         y = System(scaled).solve(*state)
         np.testing.assert_allclose(y.acceleration, x.acceleration, rtol=0, atol=1e-13)
@@ -119,10 +122,48 @@ def test_refinement_solves_every_row_to_its_own_rounding():
         state = on_manifold(chain, rng)
         system = System(chain)
         S, b = system.assemble(*state)
-        x = vector(system.solve(*state)).astype(np.longdouble)
-        residual = np.abs(S.astype(np.longdouble) @ x - b) / (np.abs(S) @ np.abs(x) + np.abs(b))
         fullest = np.max(np.count_nonzero(S, axis=1))
-        assert np.max(residual) <= (fullest + 1) * np.finfo(float).eps
+        for x in (vector(system.solve(*state)), solve_dense(S, b)):
+            x = x.astype(np.longdouble)
+            residual = np.abs(S.astype(np.longdouble) @ x - b) / (np.abs(S) @ np.abs(x) + np.abs(b))
+            assert np.max(residual) <= (fullest + 1) * np.finfo(float).eps
+
+
+def test_a_planted_defect_is_added_to_every_gamma():
+    """C_r r̈ + C_p p̈ = γ + δ, a δ for each row."""
+    rng = np.random.default_rng(14)
+    chain = random_chain(rng, [True, False, True])
+    state = on_manifold(chain, rng)
+    joints, delta = rows(chain, *state), np.arange(1.0, 6.0)
+    x = System(chain).solve(*state, gamma_defect=delta)
+    np.testing.assert_allclose(joints.rate(x.acceleration, x.pddot) - joints.gamma, delta, atol=1e-11)
+    still = 2 * np.sum(state[1] * x.pddot, axis=1) + 2 * np.sum(state[3] ** 2, axis=1)
+    np.testing.assert_allclose(still, 0, atol=1e-12)
+
+
+def test_units_do_not_decide_the_steps_of_N6():
+    """A thousandth of the size: the absolute tolerance is in the sizes of the motion."""
+    rng = np.random.default_rng(15)
+    chain = random_chain(rng, [False], loads=False)
+    r, p, v, pdot = on_manifold(chain, rng)
+    times, unit = np.array([0.0, 0.5]), 2.0**-10
+    here = integrate(chain, r, p, v, pdot, times, 1e-6)
+    small = dataclasses.replace(
+        chain,
+        inertia=unit**2 * chain.inertia,
+        **{name: unit * getattr(chain, name) for name in ("proximal", "distal", "gravity")},
+    )
+    there = integrate(small, unit * r, p, unit * v, pdot, times, 1e-6)
+    assert there.steps == here.steps
+    np.testing.assert_allclose(there.r, unit * here.r, rtol=1e-9)
+
+
+def test_a_vanishing_step_of_N6_is_an_error():
+    rng = np.random.default_rng(16)
+    chain = random_chain(rng, [False])
+    stiff = dataclasses.replace(chain, drag_force=np.array([1e17]))
+    with pytest.raises(ArithmeticError, match="DOP853 stopped at t = "):
+        integrate(stiff, *on_manifold(chain, rng), np.array([1.0, 2.0]), 1e-6)
 
 
 def test_energy_changes_by_the_power_of_the_loads():
@@ -289,3 +330,17 @@ def test_pdot_of_is_on_the_sphere():
     np.testing.assert_allclose(pdot_of(p, angular_velocity(p, pdot)), pdot, atol=1e-15)
     x = System(chain).solve(r, p, v, pdot)
     np.testing.assert_allclose(np.sum(p * x.pddot, -1), -np.sum(pdot * pdot, -1), atol=1e-13)
+
+
+def test_equilibration_is_by_the_powers_of_two_that_bring_entries_near_1():
+    largest = np.array([3e-9, 0.3, 0.5, 1.0, 2.0, 7.0, 4e11])
+    scale = power_of_two(largest)
+    np.testing.assert_array_equal(np.frexp(scale)[0], 0.5)
+    assert np.all((scale**2 * largest >= 0.5) & (scale**2 * largest < 2))
+    assert power_of_two(np.zeros(1)).tolist() == [1.0], "an empty row stays as it is"
+
+
+@pytest.mark.parametrize("unit", [1e-5, 1.0, 1e5])
+def test_what_is_singular_to_rounding_is_so_in_any_unit(unit):
+    assert singular(unit * np.array([1.0, -1e-17]))
+    assert not singular(unit * np.array([1.0, -1e-14]))

@@ -9,6 +9,7 @@ import pytest
 
 from adapters.reference_engine import chain
 from plumbline.kinematics import rate
+from reference_impl.collocation import integrate
 from reference_impl.euler_parameters import angular_velocity
 from reference_impl.forest import Forest, lay
 from reference_impl.joints import rows
@@ -167,3 +168,21 @@ def test_projection_from_afar_ends_on_unit_quaternions() -> None:
     assert np.max(np.abs(np.sum(near[0][3:] * near[1][3:], axis=0))) < 1e-15
     left, before = (np.max(np.abs(forest.constraints(x, v)[0])) for x in (near[0], far))
     assert left < 0.02 * before
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_variant_is_collocation_with_its_own_option_and_no_other(variant: str) -> None:
+    model, state = random_chain(np.random.default_rng(70), [False, True])
+    state = replace(state, r=state.r + 1e-3)  # off the manifold, where the options differ
+    start, times = (state.r, state.p, state.v, rate(state.p, state.omega)), np.linspace(0, 0.2, 3)
+    ours = run(variant, chain(model), *start, times, 1e-6, rate=7.0, nodes=5)
+    same = integrate(
+        [chain(model)],
+        *start,
+        times,
+        1e-6,
+        nodes=5,
+        baumgarte=7.0 * (variant == "baumgarte"),
+        projected=variant == "projected",
+    )
+    assert np.array_equal(ours.r, same.r) and np.array_equal(ours.pdot, same.pdot)
