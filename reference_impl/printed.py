@@ -18,7 +18,7 @@ from reference_impl.system import check, solve_dense
 # --- single pendulum: r, p, ṙ, ṗ of the body, s₁ its attachment, ℓ the rod -------------------------------
 
 
-def single_C(r: Field, p: Field, s1: Field, length: float = 0) -> Field:
+def single_C(r: Field, p: Field, s1: Field, length: float) -> Field:
     """(S1) C = rᵀr + 2 rᵀA s₁ + s₁ᵀs₁ − ℓ², m²; s₁ᵀAᵀA s₁ replaced by s₁ᵀs₁ (E2)."""
     return np.asarray(r @ r + 2 * (r @ A(p) @ s1) + s1 @ s1 - length * length)
 
