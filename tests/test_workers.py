@@ -76,7 +76,7 @@ def test_each_loss_costs_one_task_and_says_so():
         for k, (loss, _) in enumerate(LOSSES):
             tasks.insert(2 * k, Task(("lost", k), loss, (), quick))
         outcomes = {o.key: o for o in workers.run(tasks)}
-    assert [outcomes["fine", i].value for i in range(6)] == [2 * i for i in range(6)]
+    assert [outcomes["fine", i].value for i in range(6)] == [2 * i for i in range(6)], outcomes
     for k, (loss, words) in enumerate(LOSSES):
         assert words in (outcomes["lost", k].lost or ""), loss.__name__
 
