@@ -188,9 +188,9 @@ class Forest:
 
     # -- kinematics ---------------------------------------------------------------------------------
 
-    def _hung(self, x: Array, out: Array | None = None) -> Array:
+    def _hung(self, x: Array) -> Array:
         """(..., M): the value at the body that body k hangs on, 0 for the pivot."""
-        moved = np.empty_like(x) if out is None else out
+        moved = np.empty_like(x)
         moved[..., 0] = 0
         np.multiply(x[..., :-1], self.link[1:], out=moved[..., 1:])
         return moved

@@ -134,7 +134,7 @@ def test_singular_configurations_are_reported(mix: str) -> None:
     with pytest.raises(SingularSystem, match=r"body 2"):
         forest.solve(nan, state.p, state.v, pdot)
     for change, words in (
-        ({"mass": model.mass * [1, 0, 1, 1]}, "mass of body 2"),
+        ({"mass": model.mass * [1, 0, 1, 1]}, r"mass of body 2 is 0\.0 kg"),
         ({"inertia": model.inertia * np.array([1, 1, 1, 0])[:, None, None]}, "inertia of body 4"),
     ):
         with pytest.raises(SingularSystem, match=words):
@@ -259,3 +259,34 @@ def test_the_copies_of_a_tiled_forest_have_names_too() -> None:
     with pytest.raises(SingularSystem, match="p of body 2"):
         forest.acceleration(q, v)
     assert forest.start.tolist() == [0, 3, 6]
+
+
+def test_a_body_without_thickness_is_named_beside_a_tiny_one() -> None:
+    """A needle has no inertia about its axis; a body of 1e-20 kg m² has, however small."""
+    model, _ = random_chain(np.random.default_rng(30), [False, False])
+    needle = replace(model, inertia=np.stack([1e-20 * np.eye(3), np.diag([1.0, 1.0, 0.0])]))
+    with pytest.raises(SingularSystem, match="inertia of body 2 is singular"):
+        Forest([chain(needle)])
+
+
+@KINDS
+@pytest.mark.parametrize("alone", ["drag_force", "drag_moment"])
+def test_one_kind_of_drag_alone_counts(mix: str, alone: str) -> None:
+    rng = np.random.default_rng(31)
+    model, state = random_chain(rng, MIXES[mix](rng, 3), drag=True)
+    other = {"drag_force": "drag_moment", "drag_moment": "drag_force"}[alone]
+    one, pdot = chain(replace(model, **{other: np.zeros(3)})), rate(state.p, state.omega)
+    ours, direct = (form.solve(state.r, state.p, state.v, pdot) for form in (Forest([one]), System(one)))
+    np.testing.assert_allclose(ours.acceleration, direct.acceleration, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(ours.pddot, direct.pddot, rtol=0, atol=1e-10)
+
+
+@KINDS
+def test_the_rate_of_a_gap_is_its_derivative_off_the_manifold_too(mix: str) -> None:
+    """Where pᵀṗ is not 0 the matrix A of the notes stretches, and d with it."""
+    rng, h = np.random.default_rng(32), 1e-6
+    model, state = random_chain(rng, MIXES[mix](rng, 4))
+    forest = Forest([chain(model)])
+    q, v = lay(state.r, 1.1 * state.p), rng.normal(size=(7, 4))
+    ends = [forest.gaps(q + s * h * v, v)[0] for s in (1, -1)]
+    np.testing.assert_allclose(forest.gaps(q, v)[1], (ends[0] - ends[1]) / (2 * h), rtol=0, atol=1e-8)
