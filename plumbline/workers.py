@@ -8,6 +8,7 @@ its parent.
 from __future__ import annotations
 
 import contextlib
+import gc
 import multiprocessing
 import os
 import tempfile
@@ -160,6 +161,16 @@ class Workers:
 
 def perform(task: Task) -> Outcome:
     """Make a task's call, here or in the environment that it names."""
+    try:
+        return performed(task)
+    except MemoryError:
+        pass  # what it filled hangs on the error's traceback, which the pool would keep during the next task
+    gc.collect()
+    raise MemoryError
+
+
+def performed(task: Task) -> Outcome:
+    """The same; a MemoryError holds what filled the memory."""
     arguments = [one.open() if isinstance(one, Packed) else one for one in task.arguments]
     if task.python:
         value, cost = call(task.python, timed, task.call, *arguments)
