@@ -77,7 +77,5 @@ class Split:
 
 def spent() -> float:
     """CPU s of this process and of its children that have ended."""
-    times = (
-        os.times()
-    )  # in ticks of 10 ms, which is too coarse for a process's own time, taken in small parts
+    times = os.times()  # in ticks of 10 ms: too coarse for this process's own time, taken in small parts
     return time.process_time() + times.children_user + times.children_system

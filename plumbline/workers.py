@@ -53,7 +53,7 @@ class Task:
     version: str = ""  # of the engine that answers; a part of the answer's content key
     python: str = ""  # the interpreter of another environment to make the call in; empty: this one's
     judge: Callable[[Any], Any] | None = (
-        None  # picklable: what the worker says of the value, in this environment
+        None  # picklable; the worker asks it of the value, in this environment
     )
 
 

@@ -277,6 +277,7 @@ def test_one_kind_of_drag_alone_counts(mix: str, alone: str) -> None:
     other = {"drag_force": "drag_moment", "drag_moment": "drag_force"}[alone]
     one, pdot = chain(replace(model, **{other: np.zeros(3)})), rate(state.p, state.omega)
     ours, direct = (form.solve(state.r, state.p, state.v, pdot) for form in (Forest([one]), System(one)))
+    # rounding of three bodies' accelerations; drag that is dropped shows in the first digits
     np.testing.assert_allclose(ours.acceleration, direct.acceleration, rtol=0, atol=1e-10)
     np.testing.assert_allclose(ours.pddot, direct.pddot, rtol=0, atol=1e-10)
 
@@ -289,4 +290,5 @@ def test_the_rate_of_a_gap_is_its_derivative_off_the_manifold_too(mix: str) -> N
     forest = Forest([chain(model)])
     q, v = lay(state.r, 1.1 * state.p), rng.normal(size=(7, 4))
     ends = [forest.gaps(q + s * h * v, v)[0] for s in (1, -1)]
+    # gaps of some metres, rounded, over 2 h: 1e-9 (the quadratic p(t) leaves h² some 1e-12)
     np.testing.assert_allclose(forest.gaps(q, v)[1], (ends[0] - ends[1]) / (2 * h), rtol=0, atol=1e-8)

@@ -498,13 +498,18 @@ def test_another_environment_is_asked_and_runs_the_script(tmp_path):
         assert script(row(name), found[0]) == script(row(name), found[1])
 
 
+def interpreter_of(engine):
+    """That of an engine's other version; skips with the reason where it cannot be had."""
+    try:
+        return versions.interpreter(engine)
+    except versions.NoSuchEnvironment as error:
+        pytest.skip(str(error))
+
+
 @pytest.mark.full
 def test_the_order_of_an_older_mujoco_is_shown_in_its_environment(tmp_path):
     """The real one: RK4 of 3.12 is of order 2."""
-    try:
-        python = versions.interpreter("mujoco@3.12.0")
-    except versions.NoSuchEnvironment as error:
-        pytest.skip(str(error))
+    python = interpreter_of("mujoco@3.12.0")
     model = pendulums.model(JOINTS["balls"])
     steps = tuple(ladder(adapter("mujoco").integrator("RK4"), 2, 1.0))
     case = Case(model, pendulums.state(model, seed=3, rate=1.0), 1.0, steps)
@@ -518,10 +523,7 @@ def test_the_order_of_an_older_mujoco_is_shown_in_its_environment(tmp_path):
 @pytest.mark.full
 def test_the_start_of_an_older_exudyn_is_shown_in_its_environment(tmp_path):
     """The real one: before 1.11 the first accelerations are wrong with the sparse solver."""
-    try:
-        python = versions.interpreter("exudyn@1.10.0")
-    except versions.NoSuchEnvironment as error:
-        pytest.skip(str(error))
+    python = interpreter_of("exudyn@1.10.0")
     model = pendulums.model(JOINTS["balls"])
     case = Case(model, pendulums.state(model, seed=3), 2.0**-4, (2.0**-8,))
     question = Question(
