@@ -51,18 +51,25 @@ def angular_velocity(p: Array, pdot: Array) -> Array:
 
 def lift(model: Model, p: Array, omega: Array, u: Array, udot: Array) -> State:
     """The exact state that follows from minimal coordinates: r and v from the pivot outwards."""
-    a = rotation(p)  # (N, 3, 3)
-    r, v = np.empty((model.n, 3)), np.empty((model.n, 3))
-    near, far = np.cross(omega, model.proximal), np.cross(omega, model.distal)
-    tip, tip_v = np.zeros(3), np.zeros(3)
-    for k in range(model.n):
-        hang = tip + model.length[k] * u[k]
-        hang_v = tip_v + model.length[k] * udot[k]
-        r[k] = hang - a[k] @ model.proximal[k]
-        v[k] = hang_v - a[k] @ near[k]
-        tip = r[k] + a[k] @ model.distal[k]
-        tip_v = v[k] + a[k] @ far[k]
+    r, v = hung(model, p, omega, u, udot)
     return State(p=p, omega=omega, u=u, udot=udot, r=r, v=v)
+
+
+def hung(model: Model, p: Array, omega: Array, u: Array, udot: Array) -> tuple[Array, Array]:
+    """The places and velocities r, v (..., N, 3) of one or of many states at once, as `lift` has them."""
+    a = rotation(p)  # (..., N, 3, 3)
+    r, v = np.empty_like(omega), np.empty_like(omega)
+    near, far = np.cross(omega, model.proximal), np.cross(omega, model.distal)
+    tip = tip_v = np.zeros(3)
+    for k in range(model.n):
+        turn = a[..., k, :, :]
+        hang = tip + model.length[k] * u[..., k, :]
+        hang_v = tip_v + model.length[k] * udot[..., k, :]
+        r[..., k, :] = hang - turn @ model.proximal[k]
+        v[..., k, :] = hang_v - (turn @ near[..., k, :, None])[..., 0]
+        tip = r[..., k, :] + turn @ model.distal[k]
+        tip_v = v[..., k, :] + (turn @ far[..., k, :, None])[..., 0]
+    return r, v
 
 
 def joint_vectors(model: Model, r: Array, p: Array) -> Array:

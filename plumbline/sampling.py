@@ -6,7 +6,7 @@ import hashlib
 
 import numpy as np
 
-from plumbline.kinematics import lift
+from plumbline.kinematics import hung
 from plumbline.records import Model, State
 
 
@@ -25,15 +25,15 @@ def random_states(model: Model, count: int, seed: int) -> list[State]:
     rng = np.random.default_rng(seed)
     reach = np.linalg.norm(model.proximal, axis=1) + model.length
     own_rate = np.sqrt(max(float(np.linalg.norm(model.gravity)), 1e-3) / max(float(np.mean(reach)), 1e-3))
-    states = []
-    for _ in range(count):
-        p = rng.normal(size=(model.n, 4))
-        p /= np.linalg.norm(p, axis=1, keepdims=True)
+    p, omega, u, udot = (np.zeros((count, model.n, size)) for size in (4, 3, 3, 3))
+    for k in range(count):
+        p[k] = rng.normal(size=(model.n, 4))
         spread = own_rate * 10 ** rng.uniform(-1.0, np.log10(4.0))
-        omega = spread * rng.normal(size=(model.n, 3))
-        u = rng.normal(size=(model.n, 3))
-        u /= np.linalg.norm(u, axis=1, keepdims=True)
-        udot = np.cross(spread * rng.normal(size=(model.n, 3)), u)
-        rod = model.rods[:, None]
-        states.append(lift(model, p, omega, np.where(rod, u, 0.0), np.where(rod, udot, 0.0)))
-    return states
+        omega[k] = spread * rng.normal(size=(model.n, 3))
+        u[k] = rng.normal(size=(model.n, 3))
+        udot[k] = spread * rng.normal(size=(model.n, 3))
+    p /= np.linalg.norm(p, axis=-1, keepdims=True)
+    u /= np.linalg.norm(u, axis=-1, keepdims=True)
+    u, udot = (np.where(model.rods[:, None], x, 0.0) for x in (u, np.cross(udot, u)))
+    r, v = hung(model, p, omega, u, udot)
+    return [State(*parts) for parts in zip(p, omega, u, udot, r, v, strict=True)]

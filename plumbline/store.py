@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import tempfile
 from collections.abc import Iterable, Sequence
@@ -123,7 +124,8 @@ class Tables:
             }
             for field in TABLES["summary"]:
                 if field.type == REAL:
-                    columns[field.name] = plain(columns[field.name])
+                    column = columns[field.name]
+                    columns[field.name] = [x if x is not None and math.isfinite(x) else None for x in column]
             columns["extra"] = [json.dumps(plain(extra)) for extra in columns["extra"]]
             self.add("summary", columns)
 
