@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
+from functools import cached_property
 from io import StringIO
 from typing import Any
 
@@ -43,6 +44,19 @@ class Engine:
         """What a script prints."""
         said: str = self.ask(printed, script)
         return said
+
+
+@dataclass
+class OfRuns:
+    """What is measured of runs by one of an engine's integrators."""
+
+    engine: Engine
+    method: str
+
+    @cached_property
+    def integrator(self) -> Integrator:
+        """As the engine declares it."""
+        return self.engine.integrator(self.method)
 
 
 def printed(_: str, script: str) -> str:

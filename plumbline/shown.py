@@ -7,9 +7,8 @@ are always this one's.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
@@ -17,7 +16,7 @@ import numpy as np
 from plumbline import work
 from plumbline.bound import state_bound
 from plumbline.converge import ORDER_MARGIN
-from plumbline.engine import Engine
+from plumbline.engine import Engine, OfRuns
 from plumbline.findings import Subject
 from plumbline.motion_verdicts import Ladder
 from plumbline.parts import halves
@@ -96,7 +95,7 @@ class Question:
     sample: float = 0.0  # s, from one sample of a long run to the next
 
 
-def measure_of(question: Question) -> Callable[[Case], Shown | None]:
+def measure_of(question: Question) -> AtState | Related | AlongRuns | Twice | OverLong:
     """What says by how much a case shows what is in question."""
     q = question
     if q.level == "state":
@@ -123,13 +122,14 @@ def shrunk(question: Question) -> Shown | None:
     """
     measure, case, most = measure_of(question), whole(question), question.most
     if not case.steps:
-        most = getattr(measure(case), "ratio", 0.0)
+        found = measure(case)
+        most = found.ratio if found else 0.0
     # what another environment computes is not on this process's clock
     clock = time.monotonic if question.engine.python else time.process_time
-    steps_given = getattr(getattr(measure, "integrator", None), "kind", "step") == "step"
+    steps_given = not isinstance(measure, OfRuns) or measure.integrator.kind == "step"
     as_it_is = isinstance(measure, OverLong) and measure.growth  # another motion need not be a regular one
-    found = smallest(case, measure, most, question.seconds, steps_given, clock, not as_it_is)
-    return cast("Shown | None", found)
+    smaller = smallest(case, measure, most, question.seconds, steps_given, clock, not as_it_is)
+    return cast("Shown | None", smaller)
 
 
 def length_of(difference: Array, quantity: str) -> Array:
@@ -236,19 +236,12 @@ def ways(relation: Relation, model: Model, said: StateQuantities) -> dict[str, A
 
 
 @dataclass
-class AlongRuns:
+class AlongRuns(OfRuns):
     """By how much a ladder of runs is off, judged as a run of the matrix judges it."""
 
-    engine: Engine
-    method: str
     level: str
     wanted: tuple[str, ...]
     known: dict[tuple[object, ...], tuple[MotionTruth, dict[float, Rung]]] = field(default_factory=dict)
-
-    @cached_property
-    def integrator(self) -> Integrator:
-        """As the engine declares it."""
-        return self.engine.integrator(self.method)
 
     def times(self, case: Case) -> Array | None:
         """Start and end; more where the work of moments or drag is to be integrated, if steps allow it."""

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
 from plumbline.endurance import BLOCKS, Course, Endured, Judge, course, endure, spacing
-from plumbline.engine import Engine
+from plumbline.engine import OfRuns
 from plumbline.findings import Subject
 from plumbline.measures import UNITS
 from plumbline.records import Array, Integrator, Row
@@ -34,18 +33,11 @@ class ShownLong:
 
 
 @dataclass
-class OverLong:
+class OverLong(OfRuns):
     """By how much invariants of long runs are off, judged as the nightly judges them in the whole window."""
 
-    engine: Engine
-    method: str
     wanted: tuple[str, ...]
     sample: float  # s, the scenario's
-
-    @cached_property
-    def integrator(self) -> Integrator:
-        """As the engine declares it."""
-        return self.engine.integrator(self.method)
 
     @property
     def growth(self) -> bool:

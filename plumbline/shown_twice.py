@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
-from plumbline.engine import Engine
+from plumbline.engine import OfRuns
 from plumbline.records import Integrator, Model, State
 from plumbline.registry import adapter
 from plumbline.relations import BY, REVERSED, allowed, apart, row, sizes
@@ -41,17 +40,10 @@ def both_ends(
 
 
 @dataclass
-class Twice:
+class Twice(OfRuns):
     """By how much the two ends of a run differ, over what rounding and its steps' solver explain."""
 
-    engine: Engine
-    method: str
     relation: str
-
-    @cached_property
-    def integrator(self) -> Integrator:
-        """As the engine declares it."""
-        return self.engine.integrator(self.method)
 
     def __call__(self, case: Case) -> ShownTwice | None:
         """None for what the engine refuses, and for drag, which knows the direction of time."""
