@@ -99,4 +99,17 @@ def test_the_fit_recovers_a_power_law_and_says_how_sure_it_is():
         noisy = growth(np.exp(0.3 * rng.normal(size=len(ends))) * ends**1.7, ends)
         covered += abs(noisy.exponent - 1.7) < noisy.interval
     assert covered >= 180, "a 95 % interval holds the exponent in about 190 of 200 draws"
-    assert growth(np.zeros(2 * BINS), ends).interval == np.inf
+    x, y = np.log(ends), np.log(ends**1.7) + np.array([0.3, -0.1, 0.2, -0.4, 0.1, 0.0, -0.2, 0.1])
+    slope, offset = np.polyfit(x, y, 1)
+    error = np.sqrt(np.sum((y - slope * x - offset) ** 2) / 6 / np.sum((x - x.mean()) ** 2))
+    found = growth(np.exp(y), ends)
+    assert found.exponent == pytest.approx(slope, rel=1e-12)
+    assert found.interval == pytest.approx(2.446912 * error, rel=1e-6), "Student's t of 8 - 2 freedoms"
+
+
+def test_zeros_take_no_part_in_the_fit_and_three_points_make_one():
+    ends = 10 ** (np.arange(1, 2 * BINS + 1) / BINS)
+    few = np.where(np.arange(2 * BINS) < 5, 0.0, ends**2)
+    assert growth(few, ends).exponent == pytest.approx(2, rel=1e-12)
+    two = growth(np.where(np.arange(2 * BINS) < 6, 0.0, ends), ends)
+    assert (*two.maxima, two.exponent, two.interval) == (0.0, 100.0, 0.0, np.inf)
