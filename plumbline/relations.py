@@ -31,7 +31,7 @@ from plumbline.adapter import Adapter
 from plumbline.bound import Bound, state_bound
 from plumbline.findings import Findings, Subject
 from plumbline.horizon import growth
-from plumbline.kinematics import angular_velocity, lift, multiply, rotation
+from plumbline.kinematics import angular_velocity, conjugate, lift, multiply, rotation
 from plumbline.measures import attitude_error, position_error
 from plumbline.parts import halves
 from plumbline.records import (
@@ -72,7 +72,7 @@ class Relation:
 
     name: str
     there: Callable[[Model, State], tuple[Model, State]]
-    back: Callable[[Model, StateQuantities], dict[str, Array]]
+    back: Callable[[StateQuantities], dict[str, Array]]
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def rotated_world(model: Model, state: State) -> tuple[Model, State]:
     return turned, lift(turned, p, state.omega, state.u @ turn.T, state.udot @ turn.T)
 
 
-def unrotated(_: Model, said: StateQuantities) -> dict[str, Array]:
+def unrotated(said: StateQuantities) -> dict[str, Array]:
     """World vectors turned back."""
     world = ("acceleration", "joint_reaction", "angular_momentum")
     return {q: x @ rotation(Q) if q in world else x for q, x in values(said).items()}
@@ -132,12 +132,12 @@ def body_frame(model: Model, state: State) -> tuple[Model, State]:
         distal=model.distal @ turn.T,
         moment=model.moment @ turn.T,
     )
-    p = multiply(state.p, Q * [1.0, -1.0, -1.0, -1.0])
+    p = multiply(state.p, conjugate(Q))
     p /= np.linalg.norm(p, axis=-1, keepdims=True)
     return turned, lift(turned, p, state.omega @ turn.T, state.u, state.udot)
 
 
-def unframed(_: Model, said: StateQuantities) -> dict[str, Array]:
+def unframed(said: StateQuantities) -> dict[str, Array]:
     """Body vectors turned back."""
     return {q: x @ rotation(Q) if q == "angular_acceleration" else x for q, x in values(said).items()}
 
@@ -148,7 +148,7 @@ def doubled(model: Model, state: State) -> tuple[Model, State]:
     return scaled(model, **dict.fromkeys(fields, 2.0)), state
 
 
-def halved(_: Model, said: StateQuantities) -> dict[str, Array]:
+def halved(said: StateQuantities) -> dict[str, Array]:
     """Forces, energies and momentum / 2."""
     return values(said, **dict.fromkeys(QUANTITIES[2:], 0.5))
 
@@ -161,7 +161,7 @@ def longer(model: Model, state: State) -> tuple[Model, State]:
     return big, lift(big, state.p, state.omega / 2, state.u, state.udot / 2)
 
 
-def shorter(_: Model, said: StateQuantities) -> dict[str, Array]:
+def shorter(said: StateQuantities) -> dict[str, Array]:
     """Angular accelerations × 4, energies / 4, momentum / 8."""
     return values(
         said, angular_acceleration=4.0, kinetic_energy=0.25, potential_energy=0.25, angular_momentum=0.125
@@ -173,9 +173,9 @@ def reversed_time(model: Model, state: State) -> tuple[Model, State]:
     return model, lift(model, state.p, -state.omega, state.u, -state.udot)
 
 
-def same(_: Model, said: StateQuantities) -> dict[str, Array]:
+def same(model: Model, state: State) -> tuple[Model, State]:
     """As they are."""
-    return values(said)
+    return model, state
 
 
 RELATIONS = (
@@ -183,7 +183,7 @@ RELATIONS = (
     Relation("re-chosen body frame", body_frame, unframed),
     Relation("masses doubled", doubled, halved),
     Relation("lengths × 4", longer, shorter),
-    Relation("time reversed", reversed_time, lambda _, said: values(said, angular_momentum=-1.0)),
+    Relation("time reversed", reversed_time, lambda said: values(said, angular_momentum=-1.0)),
 )
 
 
@@ -204,13 +204,13 @@ def check(engine: str, model: Model, states: Sequence[State]) -> list[Held]:
     ways = {BY + option: chosen.by(option) for option in chosen.options}
     if engine in FORMULATIONS:
         ways[AS + FORMULATIONS[engine]] = adapter(FORMULATIONS[engine])
-    asked += [(Relation(name, lambda m, s: (m, s), same), other.evaluate) for name, other in ways.items()]
+    asked += [(Relation(name, same, values), other.evaluate) for name, other in ways.items()]
     found = [held(relation, said, evaluate, model, states, bounds, bounds) for relation, evaluate in asked]
 
     def welding(model: Model, states: list[State]) -> list[StateQuantities]:
         return chosen.welding().evaluate(model, states)
 
-    welded = Relation(WELDED, lambda m, s: (m, s), same)
+    welded = Relation(WELDED, same, values)
     of_halves = [state_bound(model, state, halves(model)) for state in states]
     found.append(held(welded, said, welding, model, states, bounds, of_halves))
     return [*found, *runs(chosen, model, states[0])]
@@ -235,7 +235,7 @@ def held(
     other_bounds: Sequence[Bound],
 ) -> Held:
     """One relation at every state that the engine takes on both sides."""
-    worst, count, refused = (0.0, "acceleration", 0), 0, ""
+    worst, count, refused = (0.0, "", 0), 0, ""
     for index, state in enumerate(states):
         other_model, other_state = relation.there(model, state)
         here, other = said[index], said_of(there, other_model, other_state)
@@ -243,10 +243,9 @@ def held(
             refused = str(here if isinstance(here, Unsupported) else other)
             continue
         count += 1
-        mine, theirs = values(here), relation.back(other_model, other)
+        mine, theirs = values(here), relation.back(other)
         for q in mine.keys() & theirs.keys():
-            off = np.atleast_1d(mine[q] - theirs[q])
-            size = np.linalg.norm(off, axis=-1) if np.ndim(mine[q]) else np.abs(off)
+            size = np.linalg.norm(np.atleast_1d(mine[q] - theirs[q]), axis=-1)
             both = np.asarray(bounds[index].tolerance(q)) + other_bounds[index].tolerance(q)
             allowed = np.maximum(both, np.finfo(float).tiny)
             worst = max(worst, (float(np.max(size / allowed)), q, index))
@@ -301,16 +300,16 @@ def resolved(
     engine: Adapter, integrator: Integrator, model: Model, state: State, step: float
 ) -> Iterator[Held]:
     """The same run with each of the engine's linear solvers."""
-    times = np.array([0.0, STEPS * step])
+    end = STEPS * step
 
     def last(way: Adapter) -> Trajectory | Unsupported | EngineFailure:
         try:
-            return way.simulate(model, state, times, integrator.name, step)
+            return way.simulate(model, state, np.array([0.0, end]), integrator.name, step)
         except (Unsupported, EngineFailure) as refusal:
             return refusal
 
     usual = last(engine)
-    limit = 2 * allowed(integrator, model, state, times[-1], STEPS)
+    limit = 2 * allowed(integrator, model, state, end, STEPS)
     for solver in engine.solvers:
         other = last(engine.by(solver))
         if not isinstance(usual, Trajectory):
@@ -319,7 +318,7 @@ def resolved(
             yield refused(BY + solver, integrator, other)
         else:
             off = apart(model, row(usual, -1), row(other, -1))
-            yield worst_of(BY + solver, integrator, off, limit, STEPS, step, times[-1])
+            yield worst_of(BY + solver, integrator, off, limit, STEPS, step, end)
 
 
 def refused(name: str, integrator: Integrator, refusal: Unsupported | EngineFailure) -> Held:

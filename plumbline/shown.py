@@ -20,7 +20,7 @@ from plumbline.engine import Engine, OfRuns
 from plumbline.findings import Subject
 from plumbline.motion_verdicts import Ladder
 from plumbline.parts import halves
-from plumbline.records import Array, Integrator, Model, Row, StateQuantities
+from plumbline.records import Array, Integrator, Row, StateQuantities
 from plumbline.registry import adapter
 from plumbline.relations import AS, RELATIONS, WELDED, Relation, same, values
 from plumbline.shown_long import GROWTH, LONG, OverLong, ShownLong
@@ -181,7 +181,7 @@ class Related:
         model, state, engine = case.model, case.state, self.engine
         relation = next((r for r in RELATIONS if r.name == self.name), None)
         way = "" if relation or self.name.startswith(AS) else self.name
-        relation = relation or Relation(self.name, lambda m, s: (m, s), same)
+        relation = relation or Relation(self.name, same, values)
         if self.name.startswith(AS):
             engine = replace(engine, name=self.name.removeprefix(AS))
         if model.has_drag and self.name == "time reversed":
@@ -196,9 +196,9 @@ class Related:
             bounds.append(state_bound(model, state, halves(model)) if way == WELDED else bounds[0])
         except Exception:
             return None
-        mine, theirs = values(here), relation.back(other.model, said)
+        mine, theirs = values(here), relation.back(said)
         if not self.back:
-            self.back.update(ways(relation, other.model, said))
+            self.back.update(ways(relation, said))
         both = [q for q in mine if q in theirs]
         bound = {q: np.sum([np.asarray(b.tolerance(q), float) for b in bounds], axis=0) for q in both}
         off = [np.max(length_of(mine[q] - theirs[q], q) / np.maximum(bound[q], 1e-300)) for q in both]
@@ -207,17 +207,17 @@ class Related:
         )
 
 
-def ways(relation: Relation, model: Model, said: StateQuantities) -> dict[str, Array]:
+def ways(relation: Relation, said: StateQuantities) -> dict[str, Array]:
     """The way back of each quantity: a factor, or a matrix (3, 3) on its last axis, found by asking.
 
     NotImplementedError where it is neither: a script could not say it in numbers.
     """
     found: dict[str, Array] = {}
-    for q, value in relation.back(model, said).items():
+    for q, value in relation.back(said).items():
         given = np.asarray(getattr(said, q), float)
 
         def back(y: Any, q: str = q) -> Array:
-            return np.asarray(relation.back(model, replace(said, **{q: y}))[q], float)
+            return np.asarray(relation.back(replace(said, **{q: y}))[q], float)
 
         if given.ndim == 0:
             way = back(1.0)

@@ -14,6 +14,7 @@ from plumbline.kinematics import angular_velocity, multiply, rate
 from plumbline.records import EngineFailure, Integrator, StateQuantities, Trajectory, Unsupported
 from plumbline.registry import adapter
 from plumbline.relations import (
+    FORMULATIONS,
     QUANTITIES,
     Held,
     Relation,
@@ -70,7 +71,7 @@ def compared(*shifts, relation=None, refuse=(), refuse_here=()):
         return [other[index]]
 
     said = [Unsupported(f"nor state {k}") if k in refuse_here else x for k, x in enumerate(said)]
-    relation = relation or Relation("as itself", lambda m, s: (m, s), same)
+    relation = relation or Relation("as itself", same, values)
     return held(relation, said, there, MODEL, STATES, bounds, bounds)
 
 
@@ -91,7 +92,8 @@ def test_equal_answers_and_refused_ones() -> None:
     mine = compared((2, "acceleration", 5.0), (1, "acceleration", 3.0), refuse_here=(2,))
     assert (mine.states, mine.state, mine.refused) == (2, 1, "nor state 2")
     none = compared(refuse=(0, 1, 2))
-    assert (none.ratio, none.states, none.verdict) == (None, 0, "unsupported")
+    assert (none.ratio, none.quantity, none.state, none.states) == (None, "", 0, 0)
+    assert none.verdict == "unsupported"
 
     def refusing(_model, _states):
         raise Unsupported("never")
@@ -233,9 +235,22 @@ def test_every_relation_is_asked_but_time_reversed_with_drag(drag: bool) -> None
     assert "as pinocchio-maximal" in names and "two welded halves" in names
 
 
+@pytest.mark.parametrize(("engine", "other"), FORMULATIONS.items())
+def test_both_columns_of_an_engine_are_compared(engine: str, other: str) -> None:
+    pytest.importorskip(engine.split("-")[0])
+    assert FORMULATIONS[other] == engine
+    model = pendulums.model("b")
+    assert f"as {other}" in [found.relation for found in check(engine, model, [pendulums.state(model)])]
+    assert set(FORMULATIONS) == {"pinocchio", "pinocchio-maximal", "exudyn", "exudyn-tree"}
+
+
+def test_a_relation_of_states_has_no_run() -> None:
+    assert Held("x", 1.0, "q", 2, 3) == Held("x", 1.0, "q", 2, 3, "", "unsupported", "-", 0, 0.0, 0.0)
+
+
 def test_long_chains_are_asked_at_half_as_many_states() -> None:
-    pytest.importorskip("pinocchio")
+    pytest.importorskip("mujoco")
     for bodies, states in ((12, 4), (13, 2)):
         model = pendulums.model("b" * bodies)
-        found = check("pinocchio", model, [pendulums.state(model, seed=k, rate=0.5) for k in range(6)])
+        found = check("mujoco", model, [pendulums.state(model, seed=k, rate=0.5) for k in range(6)])
         assert {one.states for one in found if not one.steps and one.ratio is not None} == {states}

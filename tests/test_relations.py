@@ -10,12 +10,25 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
+from plumbline import relations
 from plumbline.bound import state_bound
 from plumbline.findings import Subject
 from plumbline.parts import halved, halves
 from plumbline.records import EngineFailure, Unsupported
 from plumbline.registry import ENGINES, adapter
-from plumbline.relations import QUANTITIES, RELATIONS, check, judge_relations, quickest, runs
+from plumbline.relations import (
+    QUANTITIES,
+    RELATIONS,
+    WELDED,
+    allowed,
+    apart,
+    check,
+    judge_relations,
+    of_integrator,
+    quickest,
+    row,
+    runs,
+)  # fmt: skip
 from plumbline.suspect import answer, case
 from tests import pendulums
 from tests.pendulums import JOINTS
@@ -40,7 +53,7 @@ def test_the_ways_back_are_those_of_the_equations(joints):
             right = answer(case(here, [state]))
             other_model, other_state = relation.there(here, state)
             said = {q: x[0] for q, x in answer(case(other_model, [other_state])).items()}
-            back = relation.back(other_model, _quantities(said))
+            back = relation.back(_quantities(said))
             for q, x in back.items():
                 np.testing.assert_allclose(x, right[q][0], rtol=1e-11, atol=1e-11 * np.max(np.abs(right[q])))
 
@@ -200,6 +213,10 @@ def test_halves_have_roundings_of_their_own():
     assert 0 <= abs(two.potential_energy - whole.potential_energy) <= welded.potential_energy
     for q in QUANTITIES:
         assert np.all(np.asarray(welded.tolerance(q)) >= plain.tolerance(q))
+    with patch("plumbline.relations.held", wraps=relations.held) as asked:
+        check("mujoco", model, [at])
+    (_, *_, (one,), (other,)) = next(c.args for c in asked.call_args_list if c.args[0].name == WELDED)
+    assert one.potential_energy == 0 and other.potential_energy == welded.potential_energy
 
 
 @pytest.mark.parametrize("joints", ["mixed", "balls-10"])
@@ -230,9 +247,16 @@ def test_an_option_that_there_is_not_is_refused():
 # -- short runs ------------------------------------------------------------------------------------
 
 
+SOLVED = "by EXUdense", "by EigenDense"  # besides the usual one
+
+
 @cache
 def exudyn():
     return pytest.importorskip("adapters.exudyn_engine").Exudyn
+
+
+def trapezoidal():
+    return exudyn()().integrator("trapezoidal")
 
 
 def ran(engine, relation, joints="balls", integrator="trapezoidal"):
@@ -249,11 +273,10 @@ def test_runs_take_sixteen_steps_of_at_most_a_thirtieth_of_a_radian_each_way():
     model = pendulums.model(JOINTS["balls"])
     at = pendulums.state(model, 1)
     found = list(runs(exudyn()(), model, at))
-    solvers = ["by EXUdense", "by EigenDense"]
     assert [(held.integrator, held.relation) for held in found] == [
         ("trapezoidal", "reversed in time"),
-        *(("trapezoidal", name) for name in solvers),
-        *(("generalized-alpha", name) for name in solvers),
+        *(("trapezoidal", name) for name in SOLVED),
+        *(("generalized-alpha", name) for name in SOLVED),
     ]
     for held in found:
         assert held.steps == (32 if held.relation == "reversed in time" else 16)
@@ -325,7 +348,55 @@ def test_drag_is_not_reversed_and_a_failing_run_is_told():
     found = list(runs(Failing(), model, pendulums.state(model)))
     rows = judge_relations(Subject("s", "f", "e", "E", "0"), found).rows
     assert {(row.verdict, row.reason) for row in rows} == {("failed", "it stopped")}
-    assert {row.integrator for row in rows} == {"trapezoidal", "generalized-alpha"}
+    solved = [(name, way) for name in ("trapezoidal", "generalized-alpha") for way in SOLVED]
+    assert [(row.integrator, row.quantity) for row in rows] == [("trapezoidal", "reversed in time"), *solved]
+
+
+def test_a_solver_with_which_a_run_fails_is_told():
+    class Half(exudyn()):
+        def by(self, option):
+            found = super().by(option)
+            found._simulate = failing
+            return found
+
+    def failing(*_):
+        raise EngineFailure("it stopped")
+
+    model = pendulums.model(JOINTS["ball"])
+    back, *others = of_integrator(Half(), trapezoidal(), model, pendulums.state(model), 1 / 512)
+    assert back.ratio < 0.3
+    assert [(h.relation, h.integrator, h.refused, h.verdict) for h in others] == [
+        (way, "trapezoidal", "it stopped", "failed") for way in SOLVED
+    ]
+
+
+def test_two_solvers_may_both_be_off():
+    found = ran(exudyn()(), "by EigenDense", "mixed")
+    model = pendulums.model(JOINTS["mixed"])
+    at = pendulums.state(model, 1)
+    ends = [
+        row(way.simulate(model, at, np.array([0.0, found.end]), "trapezoidal", found.resolution), -1)
+        for way in (exudyn()(), exudyn()().by("EigenDense"))
+    ]
+    limit = 2 * allowed(trapezoidal(), model, at, found.end, 16)
+    assert (
+        found.ratio == pytest.approx(max(apart(model, *ends).values()) / limit, rel=1e-9) and found.ratio > 0
+    )
+
+
+def test_runs_by_tolerance_have_no_solvers_and_are_not_tried_finer():
+    tried = []
+
+    class Failing(type(adapter("reference"))):
+        solvers = ("never",)
+
+        def _retrace(self, *_):
+            tried.append(1)
+            raise EngineFailure("it stopped")
+
+    model = pendulums.model(JOINTS["ball"])
+    (held,) = runs(Failing(), model, pendulums.state(model))
+    assert (held.relation, held.verdict, len(tried)) == ("reversed in time", "failed", 1)
 
 
 def test_a_step_too_coarse_to_be_solved_is_taken_finer():
