@@ -179,6 +179,7 @@ def test_bounds_stay_sharp_and_say_how_they_came_about():
         how = "terms of the Newton-Euler equations" if quantity in VECTORS else "sum of the magnitudes"
         assert how in bound.explain(quantity)
         assert str(ROUNDINGS if quantity in VECTORS else SUMMANDS) in bound.explain(quantity)
+    assert (np.finfo(float).eps / 2, 64, 256) == (EPS, ROUNDINGS, SUMMANDS), "calibrated, see below"
     assert f"{np.max(bound.acceleration):.1e}" in bound.explain("acceleration")
 
 

@@ -103,6 +103,7 @@ def test_nothing_finite_is_said():
 @given(st.integers(1, 60), st.sampled_from([1, 2, 4]), st.floats(0.25, 100))
 def test_ladders_halve_and_keep_four_rungs(bodies, order, duration):
     steps = ladder(Integrator("x", "step", order, (order,)), bodies, duration)
+    assert steps == ladder(Integrator("x", "step", order, (order,)), bodies, duration, finer=0)
     assert len(steps) >= 4
     assert all(a == 2 * b for a, b in itertools.pairwise(steps))
 

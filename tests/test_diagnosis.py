@@ -16,6 +16,7 @@ from plumbline.diagnosis import (
     diagnose,
     explains,
     explanations,
+    fits,
     fitted,
     misread,
     observe,
@@ -261,8 +262,9 @@ def test_a_pendulum_at_rest_is_asked_at_rest_too():
     assert text.endswith("(the difference persists at rest, vanishes without gravity)")
 
 
-def test_what_lives_in_the_loads_vanishes_without_them():
-    model = pendulums.model("b", loads=True, drag=True)
+@pytest.mark.parametrize(("loads", "drag"), [(True, True), (True, False), (False, True)])
+def test_what_lives_in_the_loads_vanishes_without_them(loads, drag):
+    model = pendulums.model("b", loads=loads, drag=drag)
     truth = state_truth(model, random_states(model, 4, seed=6))
     none = {name: 0 * getattr(model, name) for name in ("force", "moment", "drag_force", "drag_moment")}
 
@@ -270,4 +272,90 @@ def test_what_lives_in_the_loads_vanishes_without_them():
         return state_truth(replace(asked, **none), states).quantities
 
     text = diagnose(model, evaluate(model, truth.states), truth, evaluate)
-    assert text.endswith("persists at rest, persists without gravity, vanishes without loads and drag)")
+    at_rest = "persists" if loads else "vanishes"  # drag does, too
+    assert text.endswith(f"{at_rest} at rest, persists without gravity, vanishes without loads and drag)")
+
+
+def test_what_lives_in_the_rates_vanishes_at_rest():
+    model = pendulums.model("rb")
+    truth = state_truth(model, random_states(model, 4, seed=3))
+
+    def evaluate(asked, states):
+        still = [lift(asked, s.p, 0 * s.omega, s.u, 0 * s.udot) for s in states]
+        return state_truth(asked, still).quantities
+
+    text = diagnose(model, evaluate(model, truth.states), truth, evaluate)
+    assert text.endswith("(the difference vanishes at rest, persists without gravity)")
+
+
+def test_the_first_that_fails_is_told_in_eighty_letters_and_the_next_one_asked():
+    model, said, truth = changed("acceleration", lambda i, x, b: 1.5 * x)
+
+    def evaluate(asked, states):
+        if not any(np.any(s.omega) for s in states):
+            raise RuntimeError("x" * 100)
+        return [replace(t, acceleration=1.5 * t.acceleration) for t in state_truth(asked, states).quantities]
+
+    text = diagnose(model, said, truth, evaluate)
+    assert text.endswith(f"(the difference fails at rest: {'x' * 80}, persists without gravity)")
+
+
+def with_a_mass(factor, noise=0.0, count=4):
+    """What an engine would say whose first mass is ``factor`` times as large, off by ``noise`` bounds."""
+    model, truth = known(count=count)
+    rng = np.random.default_rng(5)
+    wrong = answer(case(replace(model, mass=model.mass * [factor, 1.0]), truth.states))
+    said = [replace(a, **{q: wrong[q][i] for q in QUANTITIES}) for i, a in enumerate(truth.quantities)]
+    off = [
+        replace(a, acceleration=a.acceleration + noise * b.acceleration[:, None] * rng.normal(size=(2, 3)))
+        for a, b in zip(said, truth.bounds, strict=True)
+    ]
+    return observe(model, off, truth)
+
+
+@pytest.mark.parametrize("factor", [0.99, 1.01])
+def test_an_amount_is_found_whether_it_is_more_or_less(factor):
+    seen = with_a_mass(factor)
+    right, found = answer(seen.case), [c for c in causes(seen.case) if c.scale is not None]
+    data = seen.weighted({q: seen.said[q] - seen.right[q] for q in seen.said})
+    named = [fit for fit in fits(seen, right, data, found) if explains(seen, right, fit)]
+    mass = seen.case.mass[0, 0]
+    (fit,) = (fit for fit in named if fit.cause.usual == mass)
+    assert abs(fit.amount - factor * mass) < 3 * fit.resolution < 1e-9 * mass
+    (slope,) = derivatives(seen, [(fit.cause, fit.amount)])
+    assert fit.resolution == pytest.approx(1 / np.linalg.norm(slope), rel=1e-3, abs=0)
+
+
+def test_an_amount_is_fitted_to_what_it_does_not_explain_too():
+    seen = with_a_mass(1.001, noise=1e6)
+    (cause,) = (c for c in causes(seen.case) if c.scale is not None and c.usual == seen.case.mass[0, 0])
+    (slope,) = derivatives(seen, [(cause, cause.usual)])
+    fit = fitted(seen, answer(seen.case), cause, slope)
+    assert fit is not None and abs(fit.amount - 1.001 * cause.usual) < 1e7 * fit.resolution
+    assert not explains(seen, answer(seen.case), fit)
+
+
+@pytest.mark.parametrize(("off", "words"), [(1.5, "acceleration were 1.25 times as large"), (2.5, None)])
+def test_a_misread_quantity_may_be_off_by_both_bounds(off, words):
+    model, said, truth = changed(
+        "acceleration", lambda i, x, b: 1.25 * x + (i == 3) * off * b[:, None] * ALONG
+    )
+    assert misread(observe(model, said, truth), "acceleration") == words
+
+
+def test_three_states_show_a_stale_field_and_a_constant():
+    model, truth = known(count=3)
+    before = [truth.quantities[0], *truth.quantities[:-1]]
+    said = [replace(a, acceleration=b.acceleration) for a, b in zip(truth.quantities, before, strict=True)]
+    assert "stale" in str(misread(observe(model, said, truth), "acceleration"))
+    said[1] = truth.quantities[1]
+    assert misread(observe(model, said, truth), "acceleration") is None, "one state was not of the one before"
+    model, said, truth = changed("acceleration", lambda i, x, b: x + 0.5, count=3)
+    assert "a constant were added" in str(misread(observe(model, said, truth), "acceleration"))
+
+
+@pytest.mark.parametrize(("factor", "words"), [(-0.5, "-0.5"), (1.000123456, "1.000123"), (2.0, "2")])
+def test_a_factor_is_told_with_the_digits_that_it_needs(factor, words):
+    model, said, truth = changed("acceleration", lambda i, x, b: factor * x)
+    text = f"acceleration were {words} times as large"
+    assert misread(observe(model, said, truth), "acceleration") == text

@@ -9,13 +9,13 @@ import pytest
 
 from adapters.reference_engine import chain
 from plumbline.bound import state_bound
-from plumbline.kinematics import rate
+from plumbline.kinematics import lift, rate
 from reference_impl.chain import Chain
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import L
 from reference_impl.forest import Forest, lay
 from reference_impl.joints import rows
-from reference_impl.system import Solution, System
+from reference_impl.system import EPS, Solution, System
 from tests.random_chains import random_chain, rescaled
 
 MIXES = {
@@ -197,6 +197,8 @@ def test_baumgarte_adds_2a_and_a_squared_to_every_constraint(mix: str, a: float)
     q[:3] += 0.1 * rng.normal(size=(3, 4))
     v[:3] += 0.1 * rng.normal(size=(3, 4))
     acceleration = forest.acceleration(q, v, a)
+    np.testing.assert_array_equal(forest.acceleration(q, v), forest.acceleration(q, v, 0.0))
+    assert np.any(forest.acceleration(q, v) != acceleration)
     C, C_rate = forest.constraints(q, v)
     ends = [forest.constraints(q + s * h * v, v + s * h * acceleration)[1] for s in (1, -1)]
     second = (ends[0] - ends[1]) / (2 * h)
@@ -214,7 +216,7 @@ def test_a_pendulum_of_any_size_is_solved_alike(mix: str) -> None:
     rng = np.random.default_rng(28)
     model, state = random_chain(rng, MIXES[mix](rng, 3), loads=True, drag=True)
     here = Forest([chain(model)]).solve(state.r, state.p, state.v, rate(state.p, state.omega))
-    for length, mass, second in ((1e-6, 1e-9, 1e-3), (1e3, 1e6, 1e2)):
+    for length, mass, second in ((1e-6, 1e-9, 1e-3), (1e3, 1e6, 1e2), (1.0, 1e15, 1.0)):
         small, at = rescaled(model, state, length, mass, second)
         there = Forest([chain(small)]).solve(at.r, at.p, at.v, rate(at.p, at.omega))
         for name, unit in (
@@ -234,6 +236,25 @@ def test_a_collapsed_rod_is_one_of_its_own_rounding(scale: float) -> None:
     r[2] -= state.u[2] * model.length[2]
     with pytest.raises(SingularSystem, match="rod above body 3 has length 0"):
         Forest([chain(model)]).solve(r, state.p, state.v, rate(state.p, state.omega))
+
+
+def test_a_rod_short_beside_another_chain_s_is_no_collapsed_one() -> None:
+    rng = np.random.default_rng(24)
+    small, large = (rescaled(*random_chain(rng, [True]), scale, 1.0, 1.0) for scale in (1e-6, 1e12))
+    models, states = zip(small, large, strict=True)
+    r, p, v, omega = (np.concatenate([getattr(s, k) for s in states]) for k in ("r", "p", "v", "omega"))
+    both = Forest([chain(model) for model in models]).solve(r, p, v, rate(p, omega))
+    model, at = small
+    alone = Forest([chain(model)]).solve(at.r, at.p, at.v, rate(at.p, at.omega))
+    np.testing.assert_allclose(both.acceleration[:1], alone.acceleration, rtol=64 * EPS, atol=0)
+
+
+def test_a_collapsed_rod_on_a_body_that_is_not_turned_is_named_too() -> None:
+    model, state = random_chain(np.random.default_rng(24), [True])
+    at = lift(model, np.array([[1.0, 0, 0, 0]]), state.omega, state.u, state.udot)
+    with pytest.raises(SingularSystem, match="rod above body 1 has length 0"):
+        r = at.r - at.u * model.length
+        Forest([chain(model)]).solve(r, at.p, at.v, rate(at.p, at.omega))
 
 
 def test_what_is_lost_to_rounding_or_overflow_is_told() -> None:
