@@ -8,7 +8,18 @@ import numpy as np
 import pytest
 
 from plumbline.flow import flow
-from plumbline.horizon import FAR, TWIN, TWINS, _between, _minimal, growth, growth_beside, horizon, twins
+from plumbline.horizon import (
+    FAR,
+    TWIN,
+    TWINS,
+    _between,
+    _minimal,
+    _state,
+    growth,
+    growth_beside,
+    horizon,
+    twins,
+)
 from plumbline.kinematics import lift, rate
 from plumbline.measures import attitude_error, position_error
 from plumbline.scenario import find, load
@@ -57,6 +68,14 @@ def test_growth_may_end():
     apart = max(attitude_error(x.p[-1], base.p[-1]) for x in others) / TWIN
     assert found[-1] > FAR
     assert found[-1] == pytest.approx(apart, rel=0.1)
+
+
+def test_what_hangs_damped_grows_to_nothing():
+    """All that stays is the turn about the vertical."""
+    model, state, _ = upright()
+    model = replace(model, proximal=-model.proximal, drag_moment=2 * model.mass)
+    found = growth(model, lift(model, state.p, *np.zeros((3, 1, 3))), np.linspace(0, 10, 6))
+    assert np.all(found >= 1) and found[-1] < 2
 
 
 def test_a_stable_swing_grows_no_faster_than_time():
@@ -119,6 +138,41 @@ def test_positions_count_by_the_distance_from_the_pivot():
     assert np.max(parted) > 5 * np.max(turned)
     expected = np.maximum(np.max([parted, turned], axis=(0, 1)), 1.0)
     assert growth(model, state, times) == pytest.approx(expected, rel=0.01)
+
+
+def test_between_two_far_neighbours_lie_themselves_and_the_middle():
+    model, state = random_chain(np.random.default_rng(3), [0, 1, 1])
+    twin = twins(model, state, size=0.3, count=1)[0]
+    other = replace(twin, p=-twin.p)
+    for far in (twin, other):
+        there = _between(model, state, far, 1.0)
+        for name in ("p", "omega", "u", "udot", "r", "v"):
+            assert getattr(there, name) == pytest.approx(getattr(twin, name), abs=1e-13), name
+        half = _between(model, state, far, 0.5)
+        assert half.p == pytest.approx(_between(model, state, twin, 0.5).p, abs=1e-15)
+
+
+def test_a_state_is_of_unit_quaternions_whatever_it_was_made_of():
+    model, state = random_chain(np.random.default_rng(3), [0, 1])
+    found = _state(model, 2 * state.p, state.omega, 3 * state.u, state.udot)
+    raw = _minimal(model, state.r, 2 * state.p, state.v, 0.5 * rate(state.p, state.omega))
+    for name in ("p", "u", "r"):
+        assert getattr(found, name) == pytest.approx(getattr(state, name), abs=1e-14), name
+        assert getattr(raw, name) == pytest.approx(getattr(state, name), abs=1e-14), name
+    assert raw.omega == pytest.approx(state.omega / 2, rel=1e-12)
+
+
+@pytest.mark.parametrize("faster", ["omega", "udot"])
+def test_rates_are_turned_by_those_of_the_fastest(faster):
+    model, state = random_chain(np.random.default_rng(6), [0, 1, 0])
+    across = np.cross(state.u, [1.0, 0, 0])
+    rates = {"omega": 40 * (faster == "omega") + 0 * state.omega, "udot": 40 * (faster == "udot") * across}
+    state = lift(model, state.p, rates["omega"], state.u, rates["udot"])
+    fastest = np.max(np.abs(getattr(state, faster)))
+    found = twins(model, state, 1e-6, 40)
+    spread = np.array([x.omega - state.omega for x in found])
+    assert np.sqrt(np.mean(np.square(spread))) == pytest.approx(fastest * 1e-6, rel=0.2)
+    assert np.all(np.std(spread, axis=2) > 0), "each component its own"
 
 
 @pytest.mark.parametrize(("rate_", "unit"), [(0.0, 1.0), (30.0, 30.0)])

@@ -109,8 +109,9 @@ def test_runs_are_measured_by_length_turn_and_speed() -> None:
     assert sizes(MODEL, at) == pytest.approx((length, spin, speed), rel=1e-14)
     still = replace(at, omega=0 * at.omega, v=0 * at.v)
     assert sizes(MODEL, still) == pytest.approx((length, np.sqrt(g / length), np.sqrt(g * length)), rel=1e-14)
-    thrown = replace(still, v=np.array([[0, 0, 0], [0, 50.0, 0]]))
+    thrown = replace(still, v=np.array([[0, 0, 40.0], [0, 50.0, 0]]))
     assert sizes(MODEL, thrown)[2] == 50.0
+    assert sizes(replace(MODEL, gravity=np.zeros(3)), still)[1] == np.finfo(float).tiny
     turn = np.array([np.cos(5e-4), np.sin(5e-4), 0, 0])
     other = replace(
         at,
@@ -184,6 +185,8 @@ def test_rows_say_what_held_what_did_not_and_what_was_refused() -> None:
     )
     lost = refused("by sparse", METHOD, EngineFailure("it stopped"))
     never = refused("by sparse", METHOD, Unsupported("no such solver"))
+    assert lost == Held("by sparse", None, "", 0, 0, "it stopped", "failed", "trapezoidal", 0, 0.0, 0.0)
+    assert (one.refused, one.integrator, one.steps) == ("", "-", 0)
     rows = judge_relations(
         WHO, [one, off, replace(one, ratio=1.0), run, replace(run, ratio=7.0), lost, never]
     ).rows
@@ -242,10 +245,6 @@ def test_both_columns_of_an_engine_are_compared(engine: str, other: str) -> None
     model = pendulums.model("b")
     assert f"as {other}" in [found.relation for found in check(engine, model, [pendulums.state(model)])]
     assert set(FORMULATIONS) == {"pinocchio", "pinocchio-maximal", "exudyn", "exudyn-tree"}
-
-
-def test_a_relation_of_states_has_no_run() -> None:
-    assert Held("x", 1.0, "q", 2, 3) == Held("x", 1.0, "q", 2, 3, "", "unsupported", "-", 0, 0.0, 0.0)
 
 
 def test_long_chains_are_asked_at_half_as_many_states() -> None:
