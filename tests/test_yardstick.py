@@ -44,6 +44,7 @@ def test_the_least_effect_is_of_those_that_show_at_all() -> None:
     assert least_visible(effects, 1e-10).tolist() == [0, 1e-9, 2e-9, 2e-9]
     assert least_visible(effects, 5.0).tolist() == [0, 5, 5, 9]
     assert least_visible(effects, 9.0).tolist() == [np.inf] * 4
+    assert least_visible(effects[:1], 9.0).tolist() == [np.inf] * 4
 
 
 @pytest.mark.parametrize("joints", ["b", "rb"])
