@@ -58,7 +58,7 @@ def lift(model: Model, p: Array, omega: Array, u: Array, udot: Array) -> State:
 def hung(model: Model, p: Array, omega: Array, u: Array, udot: Array) -> tuple[Array, Array]:
     """The places and velocities r, v (..., N, 3) of one or of many states at once, as `lift` has them."""
     a = rotation(p)  # (..., N, 3, 3)
-    r, v = np.empty_like(omega), np.empty_like(omega)
+    r, v = np.empty(omega.shape), np.empty(omega.shape)
     near, far = np.cross(omega, model.proximal), np.cross(omega, model.distal)
     tip = tip_v = np.zeros(3)
     for k in range(model.n):
