@@ -8,6 +8,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from numpy.polynomial.legendre import legval
 
 from adapters.reference_engine import chain
 from plumbline.kinematics import rate
@@ -181,6 +182,32 @@ class Watched:
 
         monkeypatch.setattr(collocation._Stepper, "step", noted)
         monkeypatch.setattr(Forest, "acceleration", counted)
+
+
+def test_a_step_begins_with_the_last_one_s_polynomial_up_to_its_smallest_term(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model, state = random_chain(np.random.default_rng(40), [False, True], rate=4.0)
+    guess, cuts = collocation._Stepper._guess, []
+
+    def checked(stepper: collocation._Stepper, ratio: float) -> Array:
+        ahead = 1 + 2 * ratio * stepper.table.c  # −1 … 1 is the last step
+        modes = stepper.modes
+        grown = [np.max(np.abs(modes[:, k]) / stepper.v_size) * legval(ahead[-1], np.eye(k + 1)[k])
+                 for k in range(modes.shape[1])]  # fmt: skip
+        last = min(range(1, len(grown)), key=lambda k: grown[k])
+        cuts.append(len(grown) - 1 - last)
+        found = guess(stepper, ratio)
+        by_hand = sum(
+            np.multiply.outer(legval(ahead, np.eye(k + 1)[k]), modes[:, k]) for k in range(last + 1)
+        )
+        limit = 1e-12 * np.max(np.abs(found))
+        np.testing.assert_allclose(found, np.moveaxis(by_hand, 0, 1), rtol=0, atol=limit)
+        return found
+
+    monkeypatch.setattr(collocation._Stepper, "_guess", checked)
+    run(model, state, 1e-10, np.array([0.0, 2.0]))
+    assert len(cuts) > 10 and min(cuts) == 0 < max(cuts)
 
 
 @pytest.mark.parametrize("rods, rtol", [([False, False], 1e-3), ([False, False], 1e-12), ([True], 1e-8)])
