@@ -230,13 +230,17 @@ class Reach:
         return {test for line, some in lines.items() if first <= line <= last for test in some}
 
     def tests(self, mutant: Mutant) -> list[str]:
-        """Those that may notice it, quickest first: all of the file's where its line runs on import."""
+        """Those that may notice it: all of the file's where its line runs on import.
+
+        Those of the file's own name come first, and the quickest of them.
+        """
         near = self.near(mutant)
         if "" in near:
             near = {test for tests in self.lines[mutant.file].values() for test in tests}
-        quickest = sorted(near & self.seconds.keys(), key=lambda test: self.seconds[test])
-        spent = itertools.accumulate(self.seconds[test] for test in quickest)
-        return [test for test, seconds in zip(quickest, spent, strict=True) if seconds <= PATIENCE]
+        own = f"test_{Path(mutant.file).stem}.py::"
+        ready = sorted(near & self.seconds.keys(), key=lambda test: (own not in test, self.seconds[test]))
+        spent = itertools.accumulate(self.seconds[test] for test in ready)
+        return [test for test, seconds in zip(ready, spent, strict=True) if seconds <= PATIENCE]
 
 
 class Watch:
