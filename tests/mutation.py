@@ -586,7 +586,8 @@ def judge(became: Sequence[tuple[Mutant, str]], files: Sequence[str], least: flo
     known = listed()
     left = [mutant for mutant, what in became if what in ("survived", "unreached")]
     new = [mutant for mutant in left if mutant.key not in known]
-    stale = [mutant for mutant, what in became if mutant.key in known and mutant not in left]
+    alive = {mutant.key for mutant in left}  # the same line may stand in several places
+    stale = [mutant for mutant, _ in became if mutant.key in known and mutant.key not in alive]
     print(
         f"{len(became)} mutants of {', '.join(files)}: {100 * rate:.1f} % noticed, {kinds['endless']} of "
         f"them by never ending; {len(left)} survive, {len(left) - len(new)} of them listed in {FILE.name}"
