@@ -16,7 +16,7 @@ from reference_impl.euler_parameters import L
 from reference_impl.forest import Forest, lay
 from reference_impl.joints import rows
 from reference_impl.system import EPS, Solution, System
-from tests.random_chains import random_chain, rescaled
+from tests.random_chains import norms, random_chain, rescaled
 
 MIXES = {
     "balls": lambda rng, n: [False] * n,
@@ -216,16 +216,16 @@ def test_a_pendulum_of_any_size_is_solved_alike(mix: str) -> None:
     rng = np.random.default_rng(28)
     model, state = random_chain(rng, MIXES[mix](rng, 3), loads=True, drag=True)
     here = Forest([chain(model)]).solve(state.r, state.p, state.v, rate(state.p, state.omega))
+    allowed = state_bound(model, state)
     for length, mass, second in ((1e-6, 1e-9, 1e-3), (1e3, 1e6, 1e2), (1.0, 1e15, 1.0)):
         small, at = rescaled(model, state, length, mass, second)
         there = Forest([chain(small)]).solve(at.r, at.p, at.v, rate(at.p, at.omega))
-        for name, unit in (
-            ("acceleration", length / second**2),
-            ("pddot", 1 / second**2),
-            ("joint_reaction", mass * length / second**2),
+        for name, unit, bound in (
+            ("acceleration", length / second**2, allowed.acceleration),
+            ("pddot", 1 / second**2, allowed.angular_acceleration / 2),
+            ("joint_reaction", mass * length / second**2, allowed.joint_reaction),
         ):
-            mine, theirs = getattr(here, name), getattr(there, name) / unit
-            np.testing.assert_allclose(theirs, mine, rtol=0, atol=1e-10 * np.max(np.abs(mine)))
+            assert np.all(norms(getattr(there, name) / unit - getattr(here, name)) <= 2 * bound), name
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e6, 1e-6])
@@ -296,11 +296,11 @@ def test_one_kind_of_drag_alone_counts(mix: str, alone: str) -> None:
     rng = np.random.default_rng(31)
     model, state = random_chain(rng, MIXES[mix](rng, 3), drag=True)
     other = {"drag_force": "drag_moment", "drag_moment": "drag_force"}[alone]
-    one, pdot = chain(replace(model, **{other: np.zeros(3)})), rate(state.p, state.omega)
+    model = replace(model, **{other: np.zeros(3)})
+    one, pdot, allowed = chain(model), rate(state.p, state.omega), state_bound(model, state)
     ours, direct = (form.solve(state.r, state.p, state.v, pdot) for form in (Forest([one]), System(one)))
-    # rounding of three bodies' accelerations; drag that is dropped shows in the first digits
-    np.testing.assert_allclose(ours.acceleration, direct.acceleration, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(ours.pddot, direct.pddot, rtol=0, atol=1e-10)
+    assert np.all(norms(ours.acceleration - direct.acceleration) <= allowed.acceleration)
+    assert np.all(norms(ours.pddot - direct.pddot) <= allowed.angular_acceleration / 2)
 
 
 @KINDS
@@ -311,5 +311,5 @@ def test_the_rate_of_a_gap_is_its_derivative_off_the_manifold_too(mix: str) -> N
     forest = Forest([chain(model)])
     q, v = lay(state.r, 1.1 * state.p), rng.normal(size=(7, 4))
     ends = [forest.gaps(q + s * h * v, v)[0] for s in (1, -1)]
-    # gaps of some metres, rounded, over 2 h: 1e-9 (the quadratic p(t) leaves h² some 1e-12)
+    # gaps of some metres, each a dozen roundings of 1e-16, over 2 h (the quadratic p(t) leaves h² some 1e-12)
     np.testing.assert_allclose(forest.gaps(q, v)[1], (ends[0] - ends[1]) / (2 * h), rtol=0, atol=1e-8)

@@ -22,12 +22,14 @@ from plumbline.horizon import (
 )
 from plumbline.kinematics import lift, rate
 from plumbline.measures import attitude_error, position_error
-from plumbline.scenario import find, load
+from plumbline.scenario import catalogue, find, load
 from tests import pendulums
 from tests.random_chains import random_chain
 
 EPS = 2.0**-53
-CHAOTIC = [
+# All of the catalogue whose small perturbations grow ten thousandfold in 15 s: the chaotic ones, and of the
+# regular ones the conical motion and the swing of 170°, which are unstable.
+UNSTABLE = [
     "double-planar-large",
     "double-tumbling-balls",
     "double-tumbling-rods",
@@ -36,6 +38,14 @@ CHAOTIC = [
     "chain-3-balls",
     "chain-3-rods",
     "chain-5-mixed",
+    "chain-10-balls",
+    "chain-10-rods",
+    "chain-30-balls",
+    "chain-50-balls",
+    "conical",
+    "driven-rod",
+    "planar-170",
+    "tumbling-rod",
 ]
 
 
@@ -87,6 +97,8 @@ def test_a_stable_swing_grows_no_faster_than_time():
 @pytest.mark.parametrize("rods", [[0], [1], [0, 1, 1]], ids=str)
 def test_twins_are_on_the_manifold_and_close(rods):
     model, state = random_chain(np.random.default_rng(3), rods)
+    # Numbers of size 1 … 5, each some dozen roundings of 1e-16; a middle on the sphere is off the chord's
+    # by the square of the distance, (3e-7)², times them.
     for twin in twins(model, state):
         assert 1e-9 < np.max(np.abs(twin.r - state.r)) < 1e-5
         assert np.sum(twin.u * twin.udot, axis=1) == pytest.approx(np.zeros(len(rods)), abs=1e-14)
@@ -96,7 +108,7 @@ def test_twins_are_on_the_manifold_and_close(rods):
         half = _between(model, state, twin, 0.5)
         for name in ("p", "omega", "u", "udot", "r", "v"):
             middle = (getattr(twin, name) + getattr(state, name)) / 2
-            assert getattr(half, name) == pytest.approx(middle, abs=1e-11), name
+            assert getattr(half, name) == pytest.approx(middle, abs=1e-12), name
 
 
 def test_others_run_beside_it_as_they_do_alone():
@@ -143,7 +155,7 @@ def test_positions_count_by_the_distance_from_the_pivot():
 def test_between_two_far_neighbours_lie_themselves_and_the_middle():
     model, state = random_chain(np.random.default_rng(3), [0, 1, 1])
     twin = twins(model, state, size=0.3, count=1)[0]
-    other = replace(twin, p=-twin.p)
+    other = replace(twin, p=-twin.p)  # the same attitude
     for far in (twin, other):
         there = _between(model, state, far, 1.0)
         for name in ("p", "omega", "u", "udot", "r", "v"):
@@ -153,6 +165,7 @@ def test_between_two_far_neighbours_lie_themselves_and_the_middle():
 
 
 def test_a_state_is_of_unit_quaternions_whatever_it_was_made_of():
+    """To a few roundings; of ω′, which comes from a rate of p, a few more."""
     model, state = random_chain(np.random.default_rng(3), [0, 1])
     found = _state(model, 2 * state.p, state.omega, 3 * state.u, state.udot)
     raw = _minimal(model, state.r, 2 * state.p, state.v, 0.5 * rate(state.p, state.omega))
@@ -171,6 +184,7 @@ def test_rates_are_turned_by_those_of_the_fastest(faster):
     fastest = np.max(np.abs(getattr(state, faster)))
     found = twins(model, state, 1e-6, 40)
     spread = np.array([x.omega - state.omega for x in found])
+    # 360 numbers: their scatter is known within 4 %
     assert np.sqrt(np.mean(np.square(spread))) == pytest.approx(fastest * 1e-6, rel=0.2)
     assert np.all(np.std(spread, axis=2) > 0), "each component its own"
 
@@ -182,6 +196,7 @@ def test_twins_are_turned_by_their_size_and_rates_by_it_of_the_motion(rate_, uni
     assert len(found) == 40 and len(twins(model, state)) == TWINS
     angles = [attitude_error(x.p[:, None], state.p[:, None]) for x in found]
     # Of a normal vector with variance 1 in each of three directions; rates are as large as the fastest.
+    # 360 numbers tell a scatter within 4 %, the rod's 80 within 8 %: five and four of these.
     assert np.sqrt(np.mean(np.square(angles))) == pytest.approx(np.sqrt(3) * 1e-6, rel=0.2)
     fastest = max(np.max(np.abs(state.omega)), np.max(np.abs(state.udot)), 1.0)
     assert fastest >= unit * 0.5
@@ -207,26 +222,35 @@ def test_horizon_is_the_last_tolerable_time():
     assert horizon(times, found, np.full(5, 1e-3), 0.07) == 2.0, "what was lost does not come back"
 
 
-@pytest.mark.parametrize("name", CHAOTIC[:2])
+@pytest.mark.full
+@pytest.mark.parametrize("name", catalogue())
+def test_no_unstable_scenario_is_left_out(name):
+    scenario = load(find(name))
+    found = growth(scenario.model, scenario.state, np.arange(301) * 0.05)
+    assert (np.max(found) > FAR) == (name in UNSTABLE)
+
+
+@pytest.mark.parametrize("name", UNSTABLE[:2])
 def test_observed_divergence(name):
     check_divergence(name, "extended")
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", CHAOTIC[2:])
-def test_observed_divergence_on_every_chaotic_scenario(name):
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize("name", UNSTABLE[2:])
+def test_observed_divergence_on_every_unstable_scenario(name):
     check_divergence(name, "extended")
 
 
 @pytest.mark.full
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("name", [name for name in CHAOTIC if name.startswith("double")])
+@pytest.mark.parametrize("name", [name for name in UNSTABLE if not name.startswith("chain")])
 def test_observed_divergence_from_quad(name):
     """A minute each; longer chains take many, and extended precision, 2000 times finer, must do there."""
     check_divergence(name, "quad")
 
 
-def check_divergence(name, yardstick, duration=15.0):
+def check_divergence(name, yardstick):
     """Double parts from a higher precision no earlier than T_h and at most at twice T_h.
 
     The double run is Taylor's method in minimal coordinates, whose own error is rounding: δ₀ = 10 ε of the
@@ -237,7 +261,8 @@ def check_divergence(name, yardstick, duration=15.0):
     from plumbline.truth.taylor import taylor
 
     scenario = load(find(name))
-    times = np.arange(round(duration / 0.05) + 1) * 0.05
+    duration = 30 if scenario.model.n == 1 else 15  # s: one body is in no hurry
+    times = np.arange(20 * duration + 1) * 0.05
     double, fine = (taylor(scenario.model, scenario.state, times, kind) for kind in ("double", yardstick))
     observed = position_error(double.r, np.asarray(fine.r, dtype=float))
     reach = np.max(np.linalg.norm(double.r, axis=-1))

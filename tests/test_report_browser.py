@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
 
+import numpy as np
 import pytest
 
 from reports import page as report
@@ -87,25 +88,36 @@ def visible_lines(page: Any) -> list[str]:
 
 
 def test_opening_times(chromium: Any, tmp_path: Path, record_property: Any) -> None:
-    """The whole default catalogue opens in a second, a cell in 0.3 s: the best of five, others only add."""
+    """The whole default catalogue opens in a second, a cell in 0.3 s: the median of five.
+
+    The figures are those of a machine with nothing else to do; five that other work has disturbed are timed
+    again, twice at most.
+    """
     folder = fixture.build(tmp_path / "big", hostile=False, scenarios=30, samples=200)
     path = report.write(Results.load(folder))
-    opened, cells = [], []
-    for _ in range(5):
-        page = chromium.new_page()
-        began = time.perf_counter()
-        page.goto(path.as_uri())
-        page.wait_for_selector("html[data-shown=matrix]")
-        opened.append(time.perf_counter() - began)
-        cells.append(page.evaluate(CLICK))
-        assert page.locator(".uplot").count() >= 4
-        page.close()
     size = path.stat().st_size
-    record_property("opening", min(opened))
-    record_property("cell", min(cells))
-    print(f"{size:,} bytes; opens in {min(opened):.3f} s, a cell in {min(cells):.3f} s")
-    assert min(opened) <= OPENING
-    assert min(cells) <= CELL
+    for _ in range(3):
+        opening, cell = np.median([timed(chromium, path) for _ in range(5)], axis=0)
+        print(f"{size:,} bytes; opens in {opening:.3f} s, a cell in {cell:.3f} s")
+        if opening <= OPENING and cell <= CELL:
+            break
+    record_property("opening", opening)
+    record_property("cell", cell)
+    assert opening <= OPENING
+    assert cell <= CELL
+
+
+def timed(chromium: Any, path: Path) -> tuple[float, float]:
+    """How long the report takes to open, and then a cell of it: s."""
+    page = chromium.new_page()
+    began = time.perf_counter()
+    page.goto(path.as_uri())
+    page.wait_for_selector("html[data-shown=matrix]")
+    opened = time.perf_counter() - began
+    cell = page.evaluate(CLICK)
+    assert page.locator(".uplot").count() >= 4
+    page.close()
+    return opened, cell
 
 
 def test_without_javascript_the_matrix_and_findings_are_there(open_page: Open, out: Path) -> None:
