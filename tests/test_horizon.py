@@ -251,30 +251,35 @@ def test_observed_divergence_from_quad(name):
 
 
 def check_divergence(name, yardstick):
-    """Double parts from a higher precision no earlier than T_h and at most at twice T_h.
-
-    The double run is Taylor's method in minimal coordinates, whose own error is rounding: δ₀ = 10 ε of the
-    reach (over all scenarios of the catalogue it was 0.002 … 10 ε G of the reach, 220 at a mass ratio of
-    1000, where the equations' conditioning enters).
-    """
+    """Double parts from a higher precision when the horizon says, as is seen within 15 s or else 30 s."""
     pytest.importorskip("heyoka")
+    seen = divergences(name, yardstick, 15) or divergences(name, yardstick, 30)
+    assert seen, "no divergence was seen: nothing was validated"
+
+
+def divergences(name, yardstick, duration):
+    """How many of five tolerances are passed within ``duration`` s, each in T_h … 2.1 T_h.
+
+    The double run is Taylor's method in minimal coordinates, whose own error is rounding: over all scenarios
+    of the catalogue it was 0.002 … 10 ε G of the reach (220 at a mass ratio of 1000, where the equations'
+    conditioning enters).  T_h is of the upper end; that of the lower end is a limit from above as well.
+    """
     from plumbline.truth.taylor import taylor
 
     scenario = load(find(name))
-    duration = 30 if scenario.model.n == 1 else 15  # s: one body is in no hurry
     times = np.arange(20 * duration + 1) * 0.05
     double, fine = (taylor(scenario.model, scenario.state, times, kind) for kind in ("double", yardstick))
     observed = position_error(double.r, np.asarray(fine.r, dtype=float))
-    reach = np.max(np.linalg.norm(double.r, axis=-1))
+    rounding = EPS * np.max(np.linalg.norm(double.r, axis=-1))
     found = growth(scenario.model, scenario.state, times)
     seen = 0
     for tolerance in (1e-10, 1e-9, 1e-8, 1e-7, 1e-6):
         passed = np.flatnonzero(observed > tolerance)
-        until = horizon(times, found, 10 * EPS * reach, tolerance)
+        until, latest = (horizon(times, found, delta * rounding, tolerance) for delta in (10, 0.002))
         if not len(passed):
             assert until > 0.4 * duration, "the horizon ends early in a run that stays together"
             continue
         seen += 1
         print(f"{name}: {tolerance:g} m is passed at {times[passed[0]]:.2f} s, T_h = {until:.2f} s")
-        assert until <= times[passed[0]] <= 2 * until
-    assert seen, "no divergence was seen: nothing was validated"
+        assert until <= times[passed[0]] <= min(2.1 * until, latest)
+    return seen
