@@ -6,10 +6,10 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from statistics import median
 from typing import Any
 from urllib.parse import urlencode
 
-import numpy as np
 import pytest
 
 from reports import page as report
@@ -97,7 +97,7 @@ def test_opening_times(chromium: Any, tmp_path: Path, record_property: Any) -> N
     path = report.write(Results.load(folder))
     size = path.stat().st_size
     for _ in range(3):
-        opening, cell = np.median([timed(chromium, path) for _ in range(5)], axis=0)
+        opening, cell = map(median, zip(*(timed(chromium, path) for _ in range(5)), strict=True))
         print(f"{size:,} bytes; opens in {opening:.3f} s, a cell in {cell:.3f} s")
         if opening <= OPENING and cell <= CELL:
             break
