@@ -290,6 +290,27 @@ def test_a_batch_has_every_chains_own_sizes() -> None:
     assert together.h == pytest.approx(min(one.h for one in alone), rel=1e-9)
 
 
+@pytest.mark.parametrize("rods", [[False, False], [True, False]], ids=str)
+def test_joints_that_are_open_close_as_they_are_told(rods: list[bool]) -> None:
+    """C̈ + 2 a Ċ + a² C = 0 has (C + (Ċ + a C) t) e^{−a t}; a projection leaves nothing at all."""
+    model, state = random_chain(np.random.default_rng(44), rods)
+    opened = replace(state, r=state.r + np.array([[0.01, 0, -0.02], [0.03, 0.01, 0]]))
+    forest, times, a = Forest([chain(model)]), np.array([0.0, 0.3, 2.0]), 3.0
+
+    def left(found: BatchRun) -> Array:
+        samples = zip(found.r, found.p, found.v, found.pdot, strict=True)
+        return np.array([forest.constraints(lay(r, p), lay(v, pdot)) for r, p, v, pdot in samples])
+
+    C = left(run(model, opened, 1e-9, times, baumgarte=a))
+    (C_0, rate_0), t = C[0], times[:, None, None]
+    told = (C_0 + (rate_0 + a * C_0) * t) * np.exp(-a * t)
+    assert np.max(np.abs(C_0)) > 0.01
+    growth = 1e3  # of local errors of 1e-9, as above
+    np.testing.assert_allclose(C[:, 0], told, rtol=0, atol=growth * 1e-9)
+    # Numbers of size 1, some roundings each.
+    assert np.max(np.abs(left(run(model, opened, 1e-9, times, projected=True))[1:, 0])) < 1e-14
+
+
 def test_close_times_are_no_vanishing_steps() -> None:
     model, state = random_chain(np.random.default_rng(44), [False])
     times = np.array([0.0, 0.1, 0.1 + 5e-15])
