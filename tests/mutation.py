@@ -50,7 +50,7 @@ from mutmut.mutation.mutators import mutation_operators
 from tests.survivors import FILE, Key, listed
 
 LEAST = 0.95  # of the mutants have to be noticed
-PATIENCE = 8.0  # s of processor time, undisturbed, of the tests that one mutant meets at most
+PATIENCE = 8.0  # s of processor time, undisturbed, of a file's own tests that a mutant meets, and of others
 MEMORY = 8 * 2**30  # bytes of address space of a child
 MANY, UNTRIED = 253, 254  # exit codes of a child, see `Limit` and `Swaps`
 PLUGINS = ("no:cacheprovider", "pytest_timeout", "_hypothesis_pytestplugin")  # others only take time
@@ -232,15 +232,19 @@ class Reach:
     def tests(self, mutant: Mutant) -> list[str]:
         """Those that may notice it: all of the file's where its line runs on import.
 
-        Those of the file's own name come first, and the quickest of them.
+        Those of the file's own name come first, the quickest of them, and they take no others' time.
         """
         near = self.near(mutant)
         if "" in near:
             near = {test for tests in self.lines[mutant.file].values() for test in tests}
         own = f"test_{Path(mutant.file).stem}.py::"
         ready = sorted(near & self.seconds.keys(), key=lambda test: (own not in test, self.seconds[test]))
-        spent = itertools.accumulate(self.seconds[test] for test in ready)
-        return [test for test, seconds in zip(ready, spent, strict=True) if seconds <= PATIENCE]
+        met, spent = [], {True: 0.0, False: 0.0}
+        for test in ready:
+            spent[own in test] += self.seconds[test]
+            if spent[own in test] <= PATIENCE:
+                met.append(test)
+        return met
 
 
 class Watch:
