@@ -543,12 +543,22 @@ def fate(ended: int) -> str:
 # --- the command --------------------------------------------------------------------------------
 
 
+def files_of(target: str) -> list[str]:
+    """The files of a target, or of a path; none where nothing has the name."""
+    return sorted(str(path) for pattern in TARGETS.get(target, [target]) for path in Path().glob(pattern))
+
+
+def outcome_of(target: str, options: argparse.Namespace) -> Path:
+    """The JSON file of a target's mutants and of what became of them."""
+    return Path(options.out) / f"{target.replace('/', '-')}.json"
+
+
 def inside(target: str, options: argparse.Namespace) -> int:
     """In the copy: find the mutants of a target, try them, judge."""
-    files = sorted(str(path) for pattern in TARGETS.get(target, [target]) for path in Path().glob(pattern))
+    files = files_of(target)
     tests = TESTS.get(target.split("/")[0], TESTS["plumbline"])
     found = mutants(files, options.sample, options.seed)
-    table = Path(options.out) / f"{target.replace('/', '-')}.json"
+    table = outcome_of(target, options)
     if options.again:
         last = json.loads(table.read_text(encoding="utf-8"))
         left = {(m["file"], m["was"], m["now"]) for m in last if m["became"] in ("survived", "unreached")}
@@ -632,6 +642,11 @@ def main() -> int:
     options = parser.parse_args()
     if options.inside:
         return max([inside(target, options) for target in options.target])
+    for target in options.target:
+        if not files_of(target):
+            parser.error(f"{target}: no such file; valid are {', '.join(TARGETS)} and paths of Python files")
+        if options.again and not outcome_of(target, options).exists():
+            parser.error(f"{target}: not tried before, there is no {outcome_of(target, options)}")
     with tempfile.TemporaryDirectory(prefix="plumbline-mutation-") as folder:
         copied(Path(folder))
         command = [sys.executable, "-m", "tests.mutation", *sys.argv[1:], "--inside"]
