@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import exudyn
 import numpy as np
 
-from plumbline.records import Array, EngineFailure, Model
+from plumbline.model.datatypes import Array, EngineFailure, Model
 
 items: Any = exudyn.itemInterface  # its constructors are untyped
 

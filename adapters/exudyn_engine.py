@@ -32,10 +32,18 @@ from adapters.exudyn_common import (
     system,
     version,
 )
-from plumbline.adapter import Adapter
-from plumbline.kinematics import angular_velocity, rate, rotation
-from plumbline.parts import Parts, whole
-from plumbline.records import Array, EngineFailure, Integrator, Model, State, StateQuantities, Trajectory
+from plumbline.engines.adapter import Adapter
+from plumbline.model.datatypes import (
+    Array,
+    EngineFailure,
+    Integrator,
+    Model,
+    State,
+    StateQuantities,
+    Trajectory,
+)
+from plumbline.model.kinematics import angular_velocity, rate, rotation
+from plumbline.model.welding import Parts, whole
 
 Output = exudyn.OutputVariableType
 

@@ -35,9 +35,8 @@ from adapters.exudyn_common import (
     system,
     version,
 )
-from plumbline.adapter import Adapter
-from plumbline.kinematics import conjugate, multiply, rate, rotation
-from plumbline.records import (
+from plumbline.engines.adapter import Adapter
+from plumbline.model.datatypes import (
     Array,
     EngineFailure,
     Integrator,
@@ -47,6 +46,7 @@ from plumbline.records import (
     Trajectory,
     Unsupported,
 )
+from plumbline.model.kinematics import conjugate, multiply, rate, rotation
 
 Output = exudyn.OutputVariableType
 # cosine of a middle angle, 84.3°: the other two angles' rates grow as its inverse

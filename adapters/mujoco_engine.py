@@ -33,10 +33,18 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from plumbline import kinematics
-from plumbline.adapter import Adapter
-from plumbline.parts import Part, Parts, whole
-from plumbline.records import Array, EngineFailure, Integrator, Model, State, StateQuantities, Trajectory
+from plumbline.engines.adapter import Adapter
+from plumbline.model import kinematics
+from plumbline.model.datatypes import (
+    Array,
+    EngineFailure,
+    Integrator,
+    Model,
+    State,
+    StateQuantities,
+    Trajectory,
+)
+from plumbline.model.welding import Part, Parts, whole
 
 ALL = (1, 2, 3, 4, 5, 6)
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])

@@ -33,10 +33,8 @@ import pinocchio as pin
 from scipy.integrate import DOP853
 from scipy.linalg import lapack
 
-from plumbline.adapter import Adapter
-from plumbline.kinematics import conjugate, multiply, rate, rotation
-from plumbline.parts import Parts, whole
-from plumbline.records import (
+from plumbline.engines.adapter import Adapter
+from plumbline.model.datatypes import (
     Array,
     EngineFailure,
     Integrator,
@@ -45,6 +43,8 @@ from plumbline.records import (
     StateQuantities,
     Trajectory,
 )
+from plumbline.model.kinematics import conjugate, multiply, rate, rotation
+from plumbline.model.welding import Parts, whole
 
 WORLD = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 WHOLE = 10  # joints up to which their 3 × 3 blocks are solved faster as one matrix

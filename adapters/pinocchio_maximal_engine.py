@@ -24,10 +24,10 @@ from typing import ClassVar
 import numpy as np
 import pinocchio as pin
 
-from plumbline.adapter import Adapter
-from plumbline.kinematics import rotation, velocity_map
-from plumbline.parts import Parts
-from plumbline.records import Array, Integrator, Model, State, StateQuantities, Unsupported
+from plumbline.engines.adapter import Adapter
+from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, Unsupported
+from plumbline.model.kinematics import rotation, velocity_map
+from plumbline.model.welding import Parts
 
 WORLD = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 LARGEST = 30  # bodies; the engine's workspace grows with N³: 0.4 GB here, 1.5 GB at 50

@@ -13,16 +13,24 @@ from typing import ClassVar
 
 import numpy as np
 
-from plumbline.adapter import Adapter
-from plumbline.kinematics import velocity_map
-from plumbline.records import Array, EngineFailure, Integrator, Model, State, StateQuantities, Trajectory
+from plumbline.engines.adapter import Adapter
+from plumbline.model.datatypes import (
+    Array,
+    EngineFailure,
+    Integrator,
+    Model,
+    State,
+    StateQuantities,
+    Trajectory,
+)
+from plumbline.model.kinematics import velocity_map
 from reference_impl import collocation
 from reference_impl.chain import Chain
+from reference_impl.direct import Solution, System
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import A, L, rate
-from reference_impl.forest import Forest
 from reference_impl.integrate import Run, integrate
-from reference_impl.system import Solution, System
+from reference_impl.structured import Forest
 
 
 class Reference(Adapter):

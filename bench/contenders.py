@@ -14,10 +14,10 @@ from scipy.sparse.linalg import splu
 from adapters import exudyn_engine, mujoco_engine, pinocchio_engine
 from adapters.exudyn_common import settings
 from adapters.reference_engine import chain
-from plumbline.kinematics import rate
-from plumbline.records import Array, Model, State
-from reference_impl.forest import Forest, lay
-from reference_impl.system import System, solve_dense
+from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.kinematics import rate
+from reference_impl.direct import System, solve_dense
+from reference_impl.structured import Forest, lay
 from tests.random_chains import random_chain
 
 Call = Callable[[], object]

@@ -10,9 +10,9 @@ from time import process_time
 import numpy as np
 
 from adapters.reference_engine import chain
-from plumbline.adapter import Adapter
-from plumbline.kinematics import rate
-from plumbline.records import Array, Model, State
+from plumbline.engines.adapter import Adapter
+from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.kinematics import rate
 from reference_impl import integrate as raw
 from reference_impl.collocation import integrate
 

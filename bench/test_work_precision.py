@@ -13,9 +13,9 @@ from adapters.mujoco_engine import Mujoco
 from adapters.pinocchio_engine import Pinocchio
 from bench import precision
 from bench.test_right_hand_side import store
-from plumbline.kinematics import lift
-from plumbline.records import Model, State
-from plumbline.scenario import find, load
+from plumbline.model.datatypes import Model, State
+from plumbline.model.kinematics import lift
+from plumbline.scenario.loader import find, load
 
 ERRORS = (1e-4, 1e-6, 1e-8, 1e-9, 1e-10, 1e-11, 1e-12)
 OWN = (

@@ -1,6 +1,6 @@
 """`python -m plumbline`."""
 
-from plumbline.cli import main
+from plumbline.cli.main import main
 
 if __name__ == "__main__":  # worker processes import this module again
     main(prog_name="python -m plumbline")

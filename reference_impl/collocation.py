@@ -21,8 +21,8 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
 
 from reference_impl.chain import Array, Chain
-from reference_impl.forest import Forest, lay
 from reference_impl.integrate import Run, natural_sizes
+from reference_impl.structured import Forest, lay
 
 NODES = 16  # a sweep of a small chain costs NumPy's calls and not its nodes: 8 … 20 were tried
 SWEEPS = 14  # at most in a step; more are better spent on a shorter step

@@ -8,9 +8,9 @@ import numpy as np
 from scipy.integrate import DOP853
 
 from reference_impl.chain import Array, Chain
+from reference_impl.direct import System
 from reference_impl.euler_parameters import angular_velocity
-from reference_impl.forest import Forest, lay
-from reference_impl.system import System
+from reference_impl.structured import Forest, lay
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,7 @@ import numpy as np
 from reference_impl.chain import Array, Chain
 from reference_impl.collocation import NODES, BatchRun, integrate
 from reference_impl.euler_parameters import angular_velocity
-from reference_impl.forest import Forest, lay
+from reference_impl.structured import Forest, lay
 
 BAUMGARTE = 10.0  # 1/s
 VARIANTS = ("raw", "baumgarte", "projected")

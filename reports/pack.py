@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.records import Array
+from plumbline.model.datatypes import Array
 
 STEPS_PER_DECADE = 500  # log-scale curves are rounded to 10^(1/500), 0.46 %
 FLOOR = -40.0  # decade of code 2; code 0 is "no number", code 1 an exact zero

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.kinematics import conjugate, multiply
-from plumbline.records import Array
+from plumbline.model.datatypes import Array
+from plumbline.model.kinematics import conjugate, multiply
 from reports.history import History
 from reports.pack import Packer, decimate, decimate_times, log_codes
 from reports.results import Columns, Record, Results, groups

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from adapters.mujoco_engine import Mujoco
-from plumbline import registry, workers
-from plumbline.records import Array, Integrator, Model, State, Trajectory
+from plumbline.engines import registry
+from plumbline.model.datatypes import Array, Integrator, Model, State, Trajectory
+from plumbline.processes import workers
 
 Run = Callable[[], Trajectory]
 

@@ -2,7 +2,7 @@
 
     python -m tests.mutation reference_impl judging           every mutant of both
     python -m tests.mutation judging --sample 300 --seed 1    300 of them, drawn at random
-    python -m tests.mutation plumbline/known.py --again       of one file, those that survived last time
+    python -m tests.mutation plumbline/judging/outlier.py --again   of one file, those that survived last time
 
 The mistakes are mutmut's.  Each is made in the memory of a forked child, so no file is ever changed and a
 mutant costs the tests it meets and little more.  The tests run in a copy of the checkout, first once in full

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from plumbline import kinematics
-from plumbline.records import Array, Model, State
+from plumbline.model import kinematics
+from plumbline.model.datatypes import Array, Model, State
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ import numpy as np
 from sympy import QQ
 from sympy.polys.rings import ring
 
-from plumbline.kinematics import lift
+from plumbline.model.kinematics import lift
 from reference_impl.chain import Chain
 from reference_impl.euler_parameters import rate
 

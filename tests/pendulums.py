@@ -7,8 +7,8 @@ from functools import cache
 
 import numpy as np
 
-from plumbline import kinematics
-from plumbline.records import Array, Model, State, Trajectory
+from plumbline.model import kinematics
+from plumbline.model.datatypes import Array, Model, State, Trajectory
 from reference_impl.chain import Chain
 from reference_impl.collocation import integrate
 

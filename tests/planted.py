@@ -13,11 +13,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from plumbline.adapter import Adapter
-from plumbline.kinematics import conjugate, lift, rotation
-from plumbline.records import Array, Integrator, Model, State, StateQuantities, Trajectory
+from plumbline.engines.adapter import Adapter
+from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, Trajectory
+from plumbline.model.kinematics import conjugate, lift, rotation
+from reference_impl.direct import Solution, System
 from reference_impl.euler_parameters import angular_velocity
-from reference_impl.system import Solution, System
 
 Inputs = Callable[[Model, State], tuple[Model, State]]
 Answers = Callable[[Model, list[State], list[StateQuantities]], list[StateQuantities]]

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from plumbline.kinematics import lift
-from plumbline.records import Array, Model, State
+from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.kinematics import lift
 
 
 def random_chain(

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from pebble import ProcessExpired
 
-from plumbline import kinematics
-from plumbline.records import BadInput, EngineFailure, Integrator, Model, State, Unsupported
-from plumbline.registry import ENGINES
+from plumbline.engines.registry import ENGINES
+from plumbline.model import kinematics
+from plumbline.model.datatypes import BadInput, EngineFailure, Integrator, Model, State, Unsupported
 from tests import newton_euler, pendulums, worker
 from tests.pendulums import JOINTS
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from plumbline.problems import Problem, ScenarioError, nearest
-from plumbline.scenario import find, load, load_many, loads
+from plumbline.scenario.errors import Problem, ScenarioError, nearest
+from plumbline.scenario.loader import find, load, load_many, loads
 
 GOOD = """\
 schema_version: 1

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import pytest
 
-from plumbline import scenario
-from plumbline.bench import Bench
-from plumbline.run import Plan, describe_all, execute
-from plumbline.workers import Limits, Outcome, Workers, perform
+from plumbline.execution.runner import Plan, describe_all, execute
+from plumbline.execution.scenario_run import Bench
+from plumbline.processes.workers import Limits, Outcome, Workers, perform
+from plumbline.scenario import loader
 
 pytest.importorskip("mujoco")
 
@@ -20,7 +20,7 @@ def engines():
 
 
 def made(engines, level):
-    chosen = scenario.load(scenario.find("rest"))
+    chosen = loader.load(loader.find("rest"))
     return Bench(Plan([chosen], list(engines), level, states=2), chosen, engines)
 
 
@@ -105,7 +105,7 @@ def test_in_a_run_the_second_truth_is_handed_over(monkeypatch):
         return asked[-1] if uncompiled else replace(asked[-1], call=crash)
 
     monkeypatch.setattr(Bench, "truth", first_crashes)
-    chosen = scenario.load(scenario.find("rest"))
+    chosen = loader.load(loader.find("rest"))
     result = execute(Plan([chosen], ["mujoco"], "trajectory", limits=Limits(120)), lambda *_: None)
     assert len(asked) == 2
     assert result.run["exit_code"] == 0, result.run["sentence"]

@@ -10,13 +10,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.bound import BLUNT, EPS, ROUNDINGS, SUMMANDS, Bound, state_bound
-from plumbline.kinematics import lift, rotation
-from plumbline.parts import halves, whole
-from plumbline.records import Unsupported
-from plumbline.registry import ENGINES, adapter
-from plumbline.sampling import random_states
-from plumbline.scenario import find, load
+from plumbline.engines.registry import ENGINES, adapter
+from plumbline.model.datatypes import Unsupported
+from plumbline.model.kinematics import lift, rotation
+from plumbline.model.sampling import random_states
+from plumbline.model.welding import halves, whole
+from plumbline.scenario.loader import find, load
+from plumbline.truth.rounding_bound import BLUNT, EPS, ROUNDINGS, SUMMANDS, Bound, state_bound
 from tests.random_chains import norms, random_chain, rescaled
 
 VECTORS = ("acceleration", "angular_acceleration", "joint_reaction")

@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.kinematics import lift, rotation
+from plumbline.model.kinematics import lift, rotation
 from plumbline.truth import TruthUnavailable, tool
 from plumbline.truth.certified import RADIUS, NotCertified, certify, enclose, rod_multiplier
-from plumbline.truth.kane import kane_solution
-from plumbline.truth.notes_system import notes_solution
+from tests.helpers.kane import kane_solution
+from tests.helpers.notes_system_multiprecision import notes_solution
 from tests.random_chains import random_chain
 
 flint = pytest.importorskip("flint")

@@ -14,9 +14,9 @@ import pytest
 
 pytest.importorskip("distributed")
 
-from plumbline import scenario
-from plumbline.run import Plan, execute
-from plumbline.workers import Limits, Task
+from plumbline.execution.runner import Plan, execute
+from plumbline.processes.workers import Limits, Task
+from plumbline.scenario import loader
 
 ROOT = Path(__file__).parent.parent
 DASK = Path(sys.executable).with_name("dask")
@@ -82,7 +82,7 @@ def said(plan, progress=lambda *_: None):
 
 
 def plan(**more):
-    chosen = scenario.load_many(["rest", "conical", "double-tumbling-balls"])
+    chosen = loader.load_many(["rest", "conical", "double-tumbling-balls"])
     return Plan(chosen, ["mujoco", "pinocchio"], "state", states=5, **more)
 
 
@@ -109,7 +109,7 @@ def losses_cost_one_task(address):
     import ctypes
     import operator
 
-    from plumbline.cluster import Cluster
+    from plumbline.processes.dask_cluster import Cluster
 
     limits = Limits(5, 4)
     with Cluster(address, limits) as crew:

@@ -11,13 +11,13 @@ import pytest
 from numpy.polynomial.legendre import legval
 
 from adapters.reference_engine import chain
-from plumbline.kinematics import rate
-from plumbline.records import Model, State
+from plumbline.model.datatypes import Model, State
+from plumbline.model.kinematics import rate
 from reference_impl import collocation
 from reference_impl import integrate as raw
 from reference_impl.chain import Array
 from reference_impl.collocation import BatchRun, gauss, integrate
-from reference_impl.forest import Forest, lay
+from reference_impl.structured import Forest, lay
 from tests.random_chains import random_chain, rescaled
 
 TIMES = np.linspace(0.0, 1.0, 11)

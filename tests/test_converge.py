@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plumbline.converge import approached, ladder, largest, observed_order, romberg, tightest
-from plumbline.records import Integrator
+from plumbline.judging.convergence import approached, ladder, largest, observed_order, romberg, tightest
+from plumbline.model.datatypes import Integrator
 
 TIMES = np.linspace(0, 2, 17)
 

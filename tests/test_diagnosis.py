@@ -8,7 +8,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from plumbline.diagnosis import (
+from plumbline.diagnosis.defect_model import answer, case
+from plumbline.diagnosis.diagnose import (
     QUANTITIES,
     Difference,
     Fit,
@@ -22,11 +23,10 @@ from plumbline.diagnosis import (
     observe,
     worst,
 )
-from plumbline.hypotheses import causes
-from plumbline.kinematics import lift
-from plumbline.sampling import random_states
-from plumbline.suspect import answer, case
-from plumbline.yardstick import state_truth
+from plumbline.diagnosis.hypotheses import causes
+from plumbline.model.kinematics import lift
+from plumbline.model.sampling import random_states
+from plumbline.truth.ground_truth import state_truth
 from tests import pendulums
 
 VECTORS = QUANTITIES[:3]

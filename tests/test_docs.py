@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from plumbline.scenario_reference import field_reference
+from plumbline.scenario.field_docs import field_reference
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = ["add-a-scenario.md", "add-an-engine.md"]
@@ -97,7 +97,7 @@ def test_the_player_sees_a_page_that_lies(tmp_path):
 def test_the_field_reference_is_up_to_date():
     written = (ROOT / "docs" / "scenario-files.md").read_text(encoding="utf-8")
     assert written == field_reference(), (
-        "run: python -m plumbline.scenario_reference > docs/scenario-files.md"
+        "run: python -m plumbline.scenario.field_docs > docs/scenario-files.md"
     )
 
 

@@ -13,9 +13,9 @@ import pyarrow.parquet as pq
 import pytest
 from click.testing import CliRunner
 
-from plumbline import drift
-from plumbline import scenario as scenarios
-from plumbline.cli import main
+from plumbline.cli.main import main
+from plumbline.scenario import loader as scenarios
+from plumbline.studies import drift
 from reference_impl.stabilised import VARIANTS
 
 

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 
 from adapters.mujoco_engine import Mujoco
-from plumbline import endurance, scenario
-from plumbline.endurance import BLOCKS, BODY_STEPS, Course, Fall, course, endure, judge_endurance
-from plumbline.findings import Subject
-from plumbline.records import Integrator, Trajectory
-from plumbline.registry import adapter
-from plumbline.run import Plan, execute
-from plumbline.workers import Limits
+from plumbline.engines.registry import adapter
+from plumbline.execution.runner import Plan, execute
+from plumbline.judging import long_runs
+from plumbline.judging.long_runs import BLOCKS, BODY_STEPS, Course, Fall, course, endure, judge_endurance
+from plumbline.judging.rows import Subject
+from plumbline.model.datatypes import Integrator, Trajectory
+from plumbline.processes.workers import Limits
+from plumbline.scenario import loader
 from tests import worker
 from tests.planted import MOTION_DEFECTS, Defect, model_change, plant
 
@@ -20,7 +21,7 @@ DEFECTS = {d.name: d for d in MOTION_DEFECTS}
 
 
 def load(name):
-    return scenario.load_many([name])[0]
+    return loader.load_many([name])[0]
 
 
 def long(name, engine, integrator, seconds=100.0):
@@ -41,7 +42,7 @@ def planted(monkeypatch):
 
     def put(defect):
         engine = plant(Mujoco, defect)
-        monkeypatch.setattr(endurance, "adapter", lambda _: engine)
+        monkeypatch.setattr(long_runs, "adapter", lambda _: engine)
         return engine
 
     return put
@@ -127,11 +128,11 @@ def leaking():
         Exudyn,
         Defect("", "", inputs=model_change(lambda m, _: {"drag_moment": m.drag_moment + 3e-6})),
     )
-    before, endurance.adapter = endurance.adapter, lambda _: engine
+    before, long_runs.adapter = long_runs.adapter, lambda _: engine
     try:
         return long("spherical", engine, "trapezoidal", 50.0)["energy_drift_long_growth"]
     finally:
-        endurance.adapter = before
+        long_runs.adapter = before
 
 
 @pytest.mark.full

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy.special import ellipj, ellipkinc
 
-from plumbline.elliptic import first, jacobi, third
-from plumbline.equilibria import relative_equilibrium
-from plumbline.exact import SOLUTIONS, NotThatMotion, solution
-from plumbline.kinematics import lift, multiply, rotation
-from plumbline.measures import attitude_error, position_error
-from plumbline.records import Array, Model, State
-from plumbline.registry import adapter
-from plumbline.scenario import catalogue, load
+from plumbline.engines.registry import adapter
+from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.invariants import attitude_error, position_error
+from plumbline.model.kinematics import lift, multiply, rotation
+from plumbline.scenario.loader import catalogue, load
+from plumbline.truth.closed_form import SOLUTIONS, NotThatMotion, solution
+from plumbline.truth.elliptic import first, jacobi, third
+from tests.helpers.relative_equilibria import relative_equilibrium
 
 TIMES = np.arange(41) * 0.05
 NAMED = {name: load(path) for name, path in catalogue().items()}

@@ -12,9 +12,9 @@ import pytest
 from adapters.exudyn_common import quiet, settings
 from adapters.exudyn_engine import Chain, Exudyn
 from adapters.exudyn_tree_engine import ExudynTree
-from plumbline.adapter import Adapter
-from plumbline.kinematics import joint_vectors, lift
-from plumbline.records import EngineFailure, Model, State, Unsupported
+from plumbline.engines.adapter import Adapter
+from plumbline.model.datatypes import EngineFailure, Model, State, Unsupported
+from plumbline.model.kinematics import joint_vectors, lift
 from tests import newton_euler, pendulums
 
 TIMES = np.linspace(0.0, 2.0, 9)

@@ -10,7 +10,7 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from plumbline import sweep
+from plumbline.studies import sweep
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGE = (ROOT / "docs" / "fast-reference.md").read_text(encoding="utf-8")

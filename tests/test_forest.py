@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from adapters.reference_engine import chain
-from plumbline.bound import state_bound
-from plumbline.kinematics import lift, rate
+from plumbline.model.kinematics import lift, rate
+from plumbline.truth.rounding_bound import state_bound
 from reference_impl.chain import Chain
+from reference_impl.direct import EPS, Solution, System
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import L
-from reference_impl.forest import Forest, lay
 from reference_impl.joints import rows
-from reference_impl.system import EPS, Solution, System
+from reference_impl.structured import Forest, lay
 from tests.random_chains import norms, random_chain, rescaled
 
 MIXES = {

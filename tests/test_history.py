@@ -5,10 +5,10 @@ import json
 import pytest
 from click.testing import CliRunner
 
-from plumbline import store
-from plumbline.cli import main
-from plumbline.findings import Subject
-from plumbline.history import History
+from plumbline.cli.main import main
+from plumbline.judging.rows import Subject
+from plumbline.storage import results_store
+from plumbline.storage.history import History
 
 KEY = "s/mujoco/state/-/acceleration"
 
@@ -28,9 +28,9 @@ def night(folder, day, verdicts, version="4.0", known=None, family="single"):
         "sentence": "",
         "versions": {"mujoco": version},
     }
-    tables = store.Tables()
+    tables = results_store.Tables()
     tables.add_rows(rows)
-    store.write(folder / run["id"], run, {}, {}, rows, tables)
+    results_store.write(folder / run["id"], run, {}, {}, rows, tables)
 
 
 def test_first_bad_night_and_last_green(tmp_path):

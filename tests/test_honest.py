@@ -7,15 +7,17 @@ import time
 
 import pytest
 
-from plumbline.random_scenarios import RandomScenarios
-from plumbline.registry import ENGINES
-from plumbline.run import Plan, execute
-from plumbline.workers import Limits
+from plumbline.engines.registry import ENGINES
+from plumbline.execution.runner import Plan, execute
+from plumbline.processes.workers import Limits
+from plumbline.scenario.generator import RandomScenarios
 
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(engine)
 
-DEFECTIVE = {"pinocchio-aba"}  # loses digits: plumbline/known.yaml has the evidence, and crba + solve agrees
+DEFECTIVE = {
+    "pinocchio-aba"
+}  # loses digits: plumbline/judging/known_issues.yaml has the evidence, and crba + solve agrees
 
 
 def peak():

@@ -7,8 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.flow import flow
-from plumbline.horizon import (
+from plumbline.model.invariants import attitude_error, position_error
+from plumbline.model.kinematics import lift, rate
+from plumbline.scenario.loader import catalogue, find, load
+from plumbline.truth.notes_motion import flow
+from plumbline.truth.sensitivity import (
     FAR,
     TWIN,
     TWINS,
@@ -20,9 +23,6 @@ from plumbline.horizon import (
     horizon,
     twins,
 )
-from plumbline.kinematics import lift, rate
-from plumbline.measures import attitude_error, position_error
-from plumbline.scenario import catalogue, find, load
 from tests import pendulums
 from tests.random_chains import random_chain
 

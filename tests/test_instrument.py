@@ -4,9 +4,11 @@ import json
 
 import pytest
 
-from plumbline import instrument, nightly, scenario
-from plumbline.instrument import Answer
-from plumbline.workers import Limits
+from plumbline.cli.main import nightly
+from plumbline.execution import selftest
+from plumbline.execution.selftest import Answer
+from plumbline.processes.workers import Limits
+from plumbline.scenario import loader
 
 GOOD = """
 def test_rates(record_property):
@@ -38,7 +40,7 @@ pytest.importorskip("no_such_module_at_all")
 )
 def test_the_answer_is_that_of_the_tests(tmp_path, text, figures, trouble):
     (tmp_path / "test_it.py").write_text(text)
-    answer = instrument.check(tmp_path / "said.xml", str(tmp_path / "test_it.py"))
+    answer = selftest.check(tmp_path / "said.xml", str(tmp_path / "test_it.py"))
     assert answer.figures == figures
     assert trouble in answer.trouble and bool(trouble) == bool(answer.trouble)
     assert ("failed" in answer.sentence) == bool(trouble)
@@ -46,7 +48,7 @@ def test_the_answer_is_that_of_the_tests(tmp_path, text, figures, trouble):
 
 def test_one_that_hangs_is_ended(tmp_path):
     (tmp_path / "test_it.py").write_text("import time\ndef test_a(): time.sleep(60)\n")
-    answer = instrument.check(tmp_path / "said.xml", str(tmp_path / "test_it.py"), patience=3)
+    answer = selftest.check(tmp_path / "said.xml", str(tmp_path / "test_it.py"), patience=3)
     assert answer.trouble == "no answer within 3 s"
 
 
@@ -59,7 +61,7 @@ def test_a_night_with_a_dull_instrument_is_not_green(tmp_path, trouble):
         return Answer({"planted": 67, "reported": 67}, trouble)
 
     _, place = nightly.nightly(
-        tmp_path, scenario.load_many(["rest"]), ["mujoco"], random=0, seed=1, jobs=1, limits=Limits(),
+        tmp_path, loader.load_many(["rest"]), ["mujoco"], random=0, seed=1, jobs=1, limits=Limits(),
         whole=False, command="-", level="state", instrument=said, progress=lambda *_: None,
         tell=lambda _: None,
     )  # fmt: skip
@@ -74,7 +76,7 @@ def test_a_night_killed_as_it_was_done_is_not_had_twice(tmp_path, monkeypatch):
 
     def night():
         return nightly.nightly(
-            tmp_path, scenario.load_many(["rest"]), ["mujoco"], random=0, seed=None, jobs=1, limits=Limits(),
+            tmp_path, loader.load_many(["rest"]), ["mujoco"], random=0, seed=None, jobs=1, limits=Limits(),
             whole=False, command="-", level="state", progress=lambda *_: None, tell=lambda _: None,
         )  # fmt: skip
 

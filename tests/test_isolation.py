@@ -7,16 +7,19 @@ from pathlib import Path
 
 import psutil
 
-from plumbline import nightly, registry, scenario, workers
-from plumbline.history import History
-from plumbline.workers import Limits
+from plumbline.cli.main import nightly
+from plumbline.engines import registry
+from plumbline.processes import workers
+from plumbline.processes.workers import Limits
+from plumbline.scenario import loader
+from plumbline.storage.history import History
 from tests import faulty
 
 LIMITS = Limits(seconds=10, gigabytes=4)
 
 
 def night(out, engines):
-    (s,) = scenario.load_many(["planar-small"])
+    (s,) = loader.load_many(["planar-small"])
     return nightly.nightly(
         out, [replace(s, duration=0.5)], engines, random=0, seed=1, jobs=2, limits=LIMITS, whole=False,
         command="-", finer=0, level="trajectory", progress=lambda *_: None, tell=lambda _: None,

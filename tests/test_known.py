@@ -4,8 +4,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from plumbline import known
-from plumbline.findings import Subject
+from plumbline.judging import known_issues
+from plumbline.judging.rows import Subject
 
 WHO = Subject("tumbling-ball", "single", "mujoco", "MuJoCo", "4.0.0")
 ENTRY = {
@@ -15,7 +15,7 @@ ENTRY = {
 
 
 def entry(**changes):
-    return known.Entry(**{**ENTRY, **changes})
+    return known_issues.Entry(**{**ENTRY, **changes})
 
 
 def row(verdict="disagrees", quantity="acceleration", who=WHO):
@@ -24,13 +24,13 @@ def row(verdict="disagrees", quantity="acceleration", who=WHO):
 
 def judged_by(rows, entries, whole, finer=False):
     """Rows with their excuses, and what is stale then."""
-    excuses = known.Excuses(entries, finer)
+    excuses = known_issues.Excuses(entries, finer)
     return SimpleNamespace(rows=excuses.mark(rows), stale=excuses.stale(whole=whole))
 
 
 def covers(an_entry, of):
     """Whether an entry speaks of the cell of a row."""
-    return known.Excuses([an_entry], finer=False).about(of) == [an_entry]
+    return known_issues.Excuses([an_entry], finer=False).about(of) == [an_entry]
 
 
 def test_an_entry_marks_its_row_and_no_other():
@@ -84,14 +84,14 @@ def test_a_bad_file_is_refused_by_name(tmp_path, text, words):
     path = tmp_path / "known.yaml"
     path.write_text(text)
     with pytest.raises(ValueError, match=words) as caught:
-        known.load(path)
+        known_issues.load(path)
     assert str(path) in str(caught.value)
 
 
 def test_a_list_of_scenarios_is_an_entry_for_each(tmp_path):
     path = tmp_path / "known.yaml"
     path.write_text("- {id: a, scenario: [x, y], engine: z, verdict: failed, evidence: e, reason: r}\n")
-    assert [(e.id, e.scenario) for e in known.load(path)] == [("a: x", "x"), ("a: y", "y")]
+    assert [(e.id, e.scenario) for e in known_issues.load(path)] == [("a: x", "x"), ("a: y", "y")]
 
 
 def test_only_random_scenarios_may_show_it_sometimes():
@@ -115,11 +115,11 @@ def test_an_id_twice_is_refused(tmp_path):
     other = line.replace("a,", "b,", 1)
     path.write_text(line * 2 + other * 2)
     with pytest.raises(ValueError, match=r"twice: a, b$"):
-        known.load(path)
+        known_issues.load(path)
 
 
 def test_the_projects_own_file_is_valid_and_gives_evidence():
-    for e in known.load():
+    for e in known_issues.load():
         assert len(e.evidence) > 20
         assert len(e.reason) > 20
 
@@ -178,18 +178,18 @@ def test_lists_of_several_fields_are_an_entry_for_each_pair(tmp_path):
     path = tmp_path / "known.yaml"
     lists = "scenario: x, integrator: [RK4, Euler], quantity: [order, position]"
     path.write_text(f"- {{id: a, {lists}, engine: z, verdict: failed, evidence: e, reason: r}}\n")
-    found = known.load(path)
+    found = known_issues.load(path)
     assert [(e.integrator, e.quantity) for e in found] == [
         ("RK4", "order"), ("RK4", "position"), ("Euler", "order"), ("Euler", "position"),
     ]  # fmt: skip
     assert [e.id for e in found][:2] == ["a: RK4: order", "a: RK4: position"]
     path.write_text("")
-    assert known.load(path) == []
+    assert known_issues.load(path) == []
 
 
 def test_what_an_entry_does_not_say_is_anything():
     bare = {name: ENTRY[name] for name in ("id", "scenario", "engine", "verdict", "evidence", "reason")}
-    about = known.Entry(**bare)
+    about = known_issues.Entry(**bare)
     for level, integrator, quantity in (("state", "-", "energy"), ("trajectory", "RK4", "position_limit")):
         assert covers(about, WHO.row(level, integrator, quantity, "disagrees", "why"))
     assert not about.sometimes and about.versions == ""

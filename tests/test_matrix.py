@@ -8,19 +8,20 @@ import os
 
 import pytest
 
-from plumbline import known, scenario
-from plumbline.bench import Bench
-from plumbline.registry import ENGINES
-from plumbline.run import Plan, describe_all
-from plumbline.workers import Limits, Workers
+from plumbline.engines.registry import ENGINES
+from plumbline.execution.runner import Plan, describe_all
+from plumbline.execution.scenario_run import Bench
+from plumbline.judging import known_issues
+from plumbline.processes.workers import Limits, Workers
+from plumbline.scenario import loader
 
 LONG = 5  # bodies: longer chains climb their ladders in the full form only
 LEVELS = ("state", "trajectory")
 
 
 def cells():
-    for name, path in scenario.catalogue().items():
-        bodies = scenario.load(path).model.n
+    for name, path in loader.catalogue().items():
+        bodies = loader.load(path).model.n
         for engine in ENGINES:
             for level in LEVELS:
                 marks = [pytest.mark.xdist_group(name)]  # one process per scenario: its truth is found once
@@ -50,7 +51,7 @@ def truths():
 @pytest.mark.parametrize(("name", "engine", "level"), list(cells()))
 @pytest.mark.timeout(900)
 def test_cell(name, engine, level, workers, engines, truths):
-    found = scenario.load(scenario.find(name))
+    found = loader.load(loader.find(name))
     info = engines[engine]
     if info.missing:
         pytest.skip(info.missing)
@@ -69,7 +70,7 @@ def test_cell(name, engine, level, workers, engines, truths):
         tasks = [task for task in follow if task.key[1] != "why"]
     rows = bench.findings().rows
     assert rows, "no answer at all"
-    excuses = known.Excuses(known.load(), finer=False)
+    excuses = known_issues.Excuses(known_issues.load(), finer=False)
     wrong = [
         f"{r.key} {r.verdict}: {r.reason}"
         for r in excuses.mark(rows)

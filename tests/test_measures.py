@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.kinematics import joint_vectors, lift, multiply, rate
-from plumbline.measures import (
+from plumbline.model.datatypes import Array, Model, Trajectory
+from plumbline.model.invariants import (
     UNITS,
     angular_momentum,
     attitude_error,
@@ -19,7 +19,7 @@ from plumbline.measures import (
     potential_energy,
     work,
 )
-from plumbline.records import Array, Model, Trajectory
+from plumbline.model.kinematics import joint_vectors, lift, multiply, rate
 from tests import newton_euler, pendulums
 from tests.random_chains import random_chain
 

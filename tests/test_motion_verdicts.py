@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.converge import romberg
-from plumbline.findings import Subject
-from plumbline.kinematics import angular_velocity, multiply
-from plumbline.measures import invariants
-from plumbline.motion_verdicts import PER_STEP, Ladder, judge_motion
-from plumbline.records import Integrator, Trajectory
-from plumbline.work import Climb, Rung
-from plumbline.yardstick import ROUNDING, MotionTruth
+from plumbline.engines.calls import Climb, Rung
+from plumbline.judging.convergence import romberg
+from plumbline.judging.rows import Subject
+from plumbline.judging.trajectory import PER_STEP, Ladder, judge_motion
+from plumbline.model.datatypes import Integrator, Trajectory
+from plumbline.model.invariants import invariants
+from plumbline.model.kinematics import angular_velocity, multiply
+from plumbline.truth.ground_truth import ROUNDING, MotionTruth
 from tests import pendulums
 
 TIMES = np.linspace(0, 2, 17)
@@ -413,7 +413,7 @@ def test_the_tables_hold_every_rung_every_sample_and_every_pose():
 
 
 def test_poses_are_in_order_of_time_then_body():
-    from plumbline.motion_verdicts import poses
+    from plumbline.judging.trajectory import poses
 
     r, p = np.arange(12.0).reshape(2, 2, 3), 100 + np.arange(16.0).reshape(2, 2, 4)
     table = poses(Trajectory(np.array([0.0, 1.0]), r, p, r, p, 1))

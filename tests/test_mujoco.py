@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plumbline import kinematics
-from plumbline.records import EngineFailure
+from plumbline.model import kinematics
+from plumbline.model.datatypes import EngineFailure
 from tests import newton_euler, pendulums, worker
 
 pytest.importorskip("mujoco")

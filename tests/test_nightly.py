@@ -6,16 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline import nightly, scenario
-from plumbline.findings import Subject
-from plumbline.history import History
-from plumbline.nightly import Night
-from plumbline.probes import Probes
-from plumbline.random_scenarios import FAMILY, MOST_BODIES, RandomScenarios, document, random_scenario
-from plumbline.run import Result
-from plumbline.split import Split
-from plumbline.store import Tables, read_table
-from plumbline.workers import Limits
+from plumbline.cli.main import nightly
+from plumbline.cli.nightly import Night
+from plumbline.execution.random_batch import Probes
+from plumbline.execution.runner import Result
+from plumbline.judging.rows import Subject
+from plumbline.processes.cpu_time import Split
+from plumbline.processes.workers import Limits
+from plumbline.scenario import loader
+from plumbline.scenario.generator import FAMILY, MOST_BODIES, RandomScenarios, document, random_scenario
+from plumbline.storage.history import History
+from plumbline.storage.results_store import Tables, read_table
 
 
 def quiet(*_):
@@ -44,11 +45,11 @@ def test_random_scenarios_cover_what_they_promise():
 def test_a_random_scenario_is_a_file_like_any_other(tmp_path):
     path = tmp_path / "some.yaml"
     path.write_text(json.dumps(document(3, 4)))
-    assert scenario.load(path).digest == random_scenario(3, 4).digest
+    assert loader.load(path).digest == random_scenario(3, 4).digest
 
 
 def run(out, **more):
-    chosen = scenario.load_many(["rest"])
+    chosen = loader.load_many(["rest"])
     options = {"random": 3, "seed": 11, "jobs": 1, "limits": Limits(), "whole": False, "finer": 0} | more
     progress = options.pop("progress", quiet)
     return nightly.nightly(
@@ -130,4 +131,4 @@ def test_what_someone_should_see_is_kept_whole_with_its_file(tmp_path):
     assert probes.take([excused]) == [], "a recorded gap of every probe is only counted"
     nightly.write_files_of_random(Result(kept, [], {}, {}, probes, Tables(), Split(), {}), drawn, tmp_path)
     found = sorted(tmp_path.iterdir())
-    assert [scenario.load(path).digest for path in found] == [drawn[1].digest, drawn[2].digest]
+    assert [loader.load(path).digest for path in found] == [drawn[1].digest, drawn[2].digest]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from reference_impl import printed
+from reference_impl import notes
 from reference_impl.chain import Chain
 from reference_impl.euler_parameters import dot
 from reference_impl.joints import rows
@@ -38,12 +38,12 @@ def test_rods_are_the_printed_forms_identically(n):
     C_r, C_p = jacobians(joints, n)
     if n == 1:
         r, p, v, pdot, s1 = x.r[0], x.p[0], x.v[0], x.pdot[0], x.s[0]
-        C, gamma = printed.single_C(r, p, s1, 2), printed.single_gamma(r, p, v, pdot, s1)
-        printed_C_r, printed_C_p = printed.single_C_r(r, p, s1), printed.single_C_p(r, p, s1)
+        C, gamma = notes.single_C(r, p, s1, 2), notes.single_gamma(r, p, v, pdot, s1)
+        printed_C_r, printed_C_p = notes.single_C_r(r, p, s1), notes.single_C_p(r, p, s1)
     else:
         s = np.array([x.s[0], x.s[2], x.s[1]])
-        C, gamma = printed.double_C(x.r, x.p, s, chain.length), printed.double_gamma(x.r, x.p, x.v, x.pdot, s)
-        printed_C_r, printed_C_p = printed.double_C_r(x.r, x.p, s), printed.double_C_p(x.r, x.p, s)
+        C, gamma = notes.double_C(x.r, x.p, s, chain.length), notes.double_gamma(x.r, x.p, x.v, x.pdot, s)
+        printed_C_r, printed_C_p = notes.double_C_r(x.r, x.p, s), notes.double_C_p(x.r, x.p, s)
     for general, as_printed in ((joints.C, C), (C_r, printed_C_r), (C_p, printed_C_p), (joints.gamma, gamma)):
         assert x.zero(general - as_printed)
 

@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from reference_impl import printed
+from reference_impl import notes
 from reference_impl.chain import Chain
+from reference_impl.direct import System, check, solve_dense
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import I3, A, A_rate, L, dAs_dp, dot, rate
 from reference_impl.integrate import integrate
 from reference_impl.joints import rows
-from reference_impl.system import System, check, solve_dense
 from tests.notes_cases import Symbols, off_manifold, on_manifold, random_chain
 
 
@@ -46,14 +46,14 @@ def test_E1_printed_with_length_0_is_singular_and_names_the_body(n):
     The printed form reads every joint as a rod.
     """
     chain, state = hanging([False] * n)
-    S, b = printed.system(chain, *state)
+    S, b = notes.system(chain, *state)
     rows_C, rows_E = S[7 * n : 8 * n], S[8 * n :]
     np.testing.assert_allclose(rows_C[:, : 3 * n], 0, atol=1e-15)
     assert np.linalg.matrix_rank(np.concatenate([rows_C, rows_E])) == n
     with pytest.raises(SingularSystem, match="singular"):
         solve_dense(S, b)
     with pytest.raises(SingularSystem, match=r"rod above body 1 has length 0.*E1.*ball"):
-        printed.solve(chain, *state)
+        notes.solve(chain, *state)
 
 
 def test_E1_a_rod_whose_ends_meet_is_singular_in_the_general_form_too():
@@ -299,8 +299,8 @@ def test_the_pendulum_of_the_notes_is_regular():
         chain = random_chain(rng, [True] * n)
         chain = dataclasses.replace(chain, proximal=np.array([[-0.4, 0, 0]] * n))
         state = on_manifold(chain, rng)
-        S, _ = printed.system(chain, *state)
+        S, _ = notes.system(chain, *state)
         assert S.shape == (9 * n, 9 * n) and np.linalg.matrix_rank(S) == 9 * n
         x = System(chain).solve(*state)
-        np.testing.assert_allclose(printed.solve(chain, *state)[: 3 * n], x.acceleration.ravel(), atol=1e-12)
+        np.testing.assert_allclose(notes.solve(chain, *state)[: 3 * n], x.acceleration.ravel(), atol=1e-12)
         assert np.all(rate(state[1], np.zeros((n, 3))) == 0)

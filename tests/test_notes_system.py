@@ -7,12 +7,12 @@ import pytest
 from scipy.special import ellipk
 
 from reference_impl import integrate as integrator
-from reference_impl import printed
+from reference_impl import notes
+from reference_impl.direct import System, power_of_two, singular, solve_dense
 from reference_impl.euler_parameters import A, L, angular_velocity
 from reference_impl.euler_parameters import rate as pdot_of
 from reference_impl.integrate import integrate, natural_sizes, pack, rate, unpack
 from reference_impl.joints import rows
-from reference_impl.system import System, power_of_two, singular, solve_dense
 from tests.notes_cases import Symbols, off_manifold, on_manifold, random_chain
 
 MIXES = [[True], [False], [True, True], [False, False], [True, False, False, True, False], [False, True] * 5]
@@ -43,7 +43,7 @@ def test_N5_is_assembled_as_printed(n, states):
     chain = random_chain(rng, [True] * n)
     state = states(chain, rng)
     S, b = System(chain).assemble(*state)
-    S_printed, b_printed = printed.system(chain, *state)
+    S_printed, b_printed = notes.system(chain, *state)
     np.testing.assert_allclose(S, S_printed, rtol=1e-14, atol=1e-15)
     np.testing.assert_allclose(b, b_printed, rtol=1e-14, atol=1e-14)
 
@@ -291,8 +291,8 @@ def test_the_printed_system_is_exact_on_complex_numbers():
     chain = random_chain(rng, [True, True])
     r, p, v, pdot = on_manifold(chain, rng)
     along, h = rng.normal(size=p.shape), 1e-6
-    S, b = printed.system(chain, r, p + 1e-30j * along, v, pdot)
-    ends = [printed.system(chain, r, p + s * h * along, v, pdot) for s in (1, -1)]
+    S, b = notes.system(chain, r, p + 1e-30j * along, v, pdot)
+    ends = [notes.system(chain, r, p + s * h * along, v, pdot) for s in (1, -1)]
     for x, (up, down) in zip((S, b), zip(*ends, strict=True), strict=True):
         np.testing.assert_allclose(x.imag / 1e-30, (up - down) / (2 * h), rtol=0, atol=1e-8)
 
@@ -320,7 +320,7 @@ def test_one_and_two_bodies_are_what_the_notes_print():
     rng = np.random.default_rng(3)
     chain = random_chain(rng, [True] * 3)
     with pytest.raises(ValueError, match="one and two bodies"):
-        printed.system(chain, *on_manifold(chain, rng))
+        notes.system(chain, *on_manifold(chain, rng))
 
 
 def test_pdot_of_is_on_the_sphere():

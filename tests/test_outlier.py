@@ -7,13 +7,13 @@ from functools import cache
 
 import pytest
 
-from plumbline.findings import Subject
-from plumbline.outlier import outlier, told
-from plumbline.registry import adapter
-from plumbline.sampling import random_states
-from plumbline.state_verdicts import judge_states
-from plumbline.work import Evaluation
-from plumbline.yardstick import state_truth
+from plumbline.engines.calls import Evaluation
+from plumbline.engines.registry import adapter
+from plumbline.judging.outlier import outlier, told
+from plumbline.judging.rows import Subject
+from plumbline.judging.state import judge_states
+from plumbline.model.sampling import random_states
+from plumbline.truth.ground_truth import state_truth
 from tests import pendulums
 from tests.planted import STATE_DEFECTS, plant
 

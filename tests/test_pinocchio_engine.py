@@ -10,9 +10,9 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from plumbline import kinematics
-from plumbline.records import Unsupported
-from plumbline.scenario import find, load
+from plumbline.model import kinematics
+from plumbline.model.datatypes import Unsupported
+from plumbline.scenario.loader import find, load
 from tests import newton_euler, pendulums, worker
 from tests.pendulums import JOINTS
 

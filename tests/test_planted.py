@@ -15,16 +15,16 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from plumbline.bench import horizon_of
-from plumbline.converge import ladder
-from plumbline.diagnosis import diagnose
-from plumbline.findings import Subject
-from plumbline.motion_verdicts import judge_motion
-from plumbline.registry import adapter
-from plumbline.sampling import random_states
-from plumbline.state_verdicts import judge_states
-from plumbline.work import Evaluation, climb
-from plumbline.yardstick import motion_truth, state_truth
+from plumbline.diagnosis.diagnose import diagnose
+from plumbline.engines.calls import Evaluation, climb
+from plumbline.engines.registry import adapter
+from plumbline.execution.scenario_run import horizon_of
+from plumbline.judging.convergence import ladder
+from plumbline.judging.rows import Subject
+from plumbline.judging.state import judge_states
+from plumbline.judging.trajectory import judge_motion
+from plumbline.model.sampling import random_states
+from plumbline.truth.ground_truth import motion_truth, state_truth
 from tests import pendulums
 from tests.pendulums import JOINTS
 from tests.planted import (
@@ -92,7 +92,7 @@ def motion_report(defect: Defect) -> list[str]:
     engine = plant(type(adapter(defect.engine)), defect)
     integrator = engine.integrator(defect.integrator)
     steps = ladder(integrator, model.n, float(TIMES[-1]))
-    with patch("plumbline.work.adapter", lambda _: engine):
+    with patch("plumbline.engines.calls.adapter", lambda _: engine):
         runs = climb(defect.engine, integrator.name, model, state, TIMES, steps)
     who = Subject("planted", "planted", defect.name, defect.name, "0")
     rows = judge_motion(who, model, truth, integrator, runs, horizon_of(truth)).rows

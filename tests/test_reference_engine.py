@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from adapters.reference_engine import Reference
-from plumbline.kinematics import angular_velocity, lift, mass_matrix, rotation, velocity_map
-from plumbline.records import EngineFailure, Model
+from plumbline.model.datatypes import EngineFailure, Model
+from plumbline.model.kinematics import angular_velocity, lift, mass_matrix, rotation, velocity_map
 from tests.notes_cases import random_chain
 
 

@@ -14,8 +14,8 @@ import pyarrow as pa
 import pytest
 from click.testing import CliRunner
 
-from plumbline import drift, sweep
-from plumbline.cli import main
+from plumbline.cli.main import main
+from plumbline.studies import drift, sweep
 from reports import fast_reference, page, picture, sweep_page
 from reports.results import Results, clean
 from tests import report_fixture as fixture

@@ -7,13 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.bound import state_bound
-from plumbline.findings import Subject
-from plumbline.horizon import growth
-from plumbline.kinematics import angular_velocity, multiply, rate
-from plumbline.records import EngineFailure, Integrator, StateQuantities, Trajectory, Unsupported
-from plumbline.registry import adapter
-from plumbline.relations import (
+from plumbline.engines.registry import adapter
+from plumbline.judging.metamorphic import (
     FORMULATIONS,
     QUANTITIES,
     Held,
@@ -33,7 +28,12 @@ from plumbline.relations import (
     values,
     worst_of,
 )
-from plumbline.yardstick import ROUNDING, reach
+from plumbline.judging.rows import Subject
+from plumbline.model.datatypes import EngineFailure, Integrator, StateQuantities, Trajectory, Unsupported
+from plumbline.model.kinematics import angular_velocity, multiply, rate
+from plumbline.truth.ground_truth import ROUNDING, reach
+from plumbline.truth.rounding_bound import state_bound
+from plumbline.truth.sensitivity import growth
 from tests import pendulums
 
 MODEL = pendulums.model("br")

@@ -10,13 +10,10 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from plumbline import relations
-from plumbline.bound import state_bound
-from plumbline.findings import Subject
-from plumbline.parts import halved, halves
-from plumbline.records import EngineFailure, Unsupported
-from plumbline.registry import ENGINES, adapter
-from plumbline.relations import (
+from plumbline.diagnosis.defect_model import answer, case
+from plumbline.engines.registry import ENGINES, adapter
+from plumbline.judging import metamorphic
+from plumbline.judging.metamorphic import (
     QUANTITIES,
     RELATIONS,
     WELDED,
@@ -29,7 +26,10 @@ from plumbline.relations import (
     row,
     runs,
 )  # fmt: skip
-from plumbline.suspect import answer, case
+from plumbline.judging.rows import Subject
+from plumbline.model.datatypes import EngineFailure, Unsupported
+from plumbline.model.welding import halved, halves
+from plumbline.truth.rounding_bound import state_bound
 from tests import pendulums
 from tests.pendulums import JOINTS
 from tests.planted import STATE_DEFECTS, Defect, field, model_change, parameter, plant
@@ -59,7 +59,7 @@ def test_the_ways_back_are_those_of_the_equations(joints):
 
 
 def _quantities(said):
-    from plumbline.records import StateQuantities
+    from plumbline.model.datatypes import StateQuantities
 
     return StateQuantities(**{q: x if np.ndim(x) else float(x) for q, x in said.items()})
 
@@ -108,7 +108,8 @@ def test_a_defect_of_its_kind_breaks_it(relation):
     for defect in BROKEN[relation]:
         engine = plant(type(adapter(defect.engine)), defect)
         with patch(
-            "plumbline.relations.adapter", lambda n, e=engine, d=defect: e if n == d.engine else adapter(n)
+            "plumbline.judging.metamorphic.adapter",
+            lambda n, e=engine, d=defect: e if n == d.engine else adapter(n),
         ):
             broken |= {defect.name: any(h.relation == relation and h.ratio > 1
                                         for h in check(defect.engine, model, states(model)))}  # fmt: skip
@@ -123,7 +124,7 @@ def test_a_refused_state_is_left_out_and_a_refusing_engine_is_told():
             raise Unsupported("not on a Monday")
 
     model = pendulums.model(JOINTS["ball"])
-    with patch("plumbline.relations.adapter", lambda _: Refusing()):
+    with patch("plumbline.judging.metamorphic.adapter", lambda _: Refusing()):
         rows = judge_relations(Subject("s", "f", "e", "E", "0"), check("mujoco", model, states(model))).rows
     assert {(row.verdict, row.reason) for row in rows} == {("unsupported", "not on a Monday")}
 
@@ -135,7 +136,7 @@ def test_noise_breaks_what_is_not_bitwise():
         "acceleration", lambda _, __, a: a * (1 + 1e-9 * rng.normal(size=a.shape))))  # fmt: skip
     engine = plant(type(adapter("mujoco")), noisy)
     model = pendulums.model(JOINTS["balls"])
-    with patch("plumbline.relations.adapter", lambda _: engine):
+    with patch("plumbline.judging.metamorphic.adapter", lambda _: engine):
         assert all(h.ratio > 1 for h in check("mujoco", model, states(model)))
 
 
@@ -160,7 +161,7 @@ WELDERS = [(engine, "two welded halves") for engine in ENGINES if not type(adapt
 def test_a_defect_in_one_way_of_the_engine_breaks_it(engine, relation, defect):
     model = pendulums.model(JOINTS["balls"])
     bent = one_sided(replace(of(defect), engine=engine))
-    with patch("plumbline.relations.adapter", lambda n: bent if n == engine else adapter(n)):
+    with patch("plumbline.judging.metamorphic.adapter", lambda n: bent if n == engine else adapter(n)):
         (found,) = (h for h in check(engine, model, states(model)) if h.relation == relation)
     assert found.ratio > 1, found
 
@@ -176,7 +177,7 @@ def test_a_half_that_is_welded_wrongly_breaks_it(engine, change):
         return parts
 
     model = pendulums.model(JOINTS["balls"])
-    with patch("plumbline.adapter.halves", wrong):
+    with patch("plumbline.engines.adapter.halves", wrong):
         (found,) = (h for h in check(engine, model, states(model)) if h.relation == "two welded halves")
     assert found.ratio > 1, found
 
@@ -213,7 +214,7 @@ def test_halves_have_roundings_of_their_own():
     assert 0 <= abs(two.potential_energy - whole.potential_energy) <= welded.potential_energy
     for q in QUANTITIES:
         assert np.all(np.asarray(welded.tolerance(q)) >= plain.tolerance(q))
-    with patch("plumbline.relations.held", wraps=relations.held) as asked:
+    with patch("plumbline.judging.metamorphic.held", wraps=metamorphic.held) as asked:
         check("mujoco", model, [at])
     (_, *_, (one,), (other,)) = next(c.args for c in asked.call_args_list if c.args[0].name == WELDED)
     assert one.potential_energy == 0 and other.potential_energy == welded.potential_energy

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plumbline.kinematics import multiply
+from plumbline.model.kinematics import multiply
 from reports import junit, pack, page, payload, step_summary
 from reports.history import History
 from reports.results import Results, clean

@@ -21,19 +21,28 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from plumbline import relations, reproduce, shown, store, versions
-from plumbline.cli import main
-from plumbline.converge import ladder
-from plumbline.endurance import Course, course, endure, judge_endurance
-from plumbline.engine import Engine
-from plumbline.registry import ENGINES, adapter
-from plumbline.reproduce import NotReproducible, disagreement, file_name, shown_by_script
-from plumbline.script_text import ENGINE_LINES, PARTS, part, script, unscripted
-from plumbline.shown import AlongRuns, AtState, Question, Related, shrunk
-from plumbline.shown_long import OverLong
-from plumbline.shown_twice import Twice, both_ends
-from plumbline.shrink import Case, growing
-from plumbline.workers import Outcome
+from plumbline.cli.main import main
+from plumbline.engines import environments
+from plumbline.engines.registry import ENGINES, adapter
+from plumbline.judging import metamorphic
+from plumbline.judging.convergence import ladder
+from plumbline.judging.long_runs import Course, course, endure, judge_endurance
+from plumbline.processes.workers import Outcome
+from plumbline.reproduce.engine_client import Engine
+from plumbline.reproduce.measure import AlongRuns, AtState, Question, Related, shrunk
+from plumbline.reproduce.measure_long_run import OverLong
+from plumbline.reproduce.measure_round_trip import Twice, both_ends
+from plumbline.reproduce.render import ENGINE_LINES, PARTS, part, script, unscripted
+from plumbline.reproduce.shrink import Case, growing
+from plumbline.reproduce.write import (
+    NotReproducible,
+    disagreement,
+    file_name,
+    measure,
+    shown_by_script,
+    write,
+)
+from plumbline.storage import results_store
 from tests import pendulums
 from tests.pendulums import JOINTS
 from tests.planted import STATE_DEFECTS, plant
@@ -43,7 +52,7 @@ for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
 
 ROOT = Path(__file__).resolve().parent.parent
 HOSTILE = '<img src=x onerror="alert(1)">\n"""\nimport os; os.abort()  # \\ \'\'\' \r ; # ünï'
-QUANTITIES = (*relations.QUANTITIES, "mass_matrix")
+QUANTITIES = (*metamorphic.QUANTITIES, "mass_matrix")
 DRIFTS = ("energy_drift", "momentum_drift", "joint_gap", "gap_rate", "norm_drift")
 ROW = {"scenario": HOSTILE, "quantity": HOSTILE, "engine_version": "4", "integrator": HOSTILE,
        "extra": {"state": 3.0}}  # fmt: skip
@@ -81,7 +90,7 @@ def defective(lines: str):
     import pinocchio
 
     from reference_impl import collocation
-    from reference_impl.system import System
+    from reference_impl.direct import System
 
     places = (exudyn, exudyn.itemInterface, mujoco, pinocchio, collocation, System)
     before = [dict(vars(place)) for place in places]
@@ -103,7 +112,7 @@ def row(engine: str, **more):
     return ROW | {"engine": engine} | more
 
 
-def at_state(engine: str, joints: str) -> shown.ShownState:
+def at_state(engine: str, joints: str) -> measure.ShownState:
     model = pendulums.model(JOINTS[joints], loads=True, drag=True)
     found = AtState(Engine(engine), QUANTITIES)(Case(model, pendulums.state(model, seed=3)))
     assert found is not None
@@ -159,8 +168,8 @@ def test_a_script_measures_drifts_as_the_harness_does(engine, loads, count):
     said, _ = executed(script(row(engine), found))
     assert len(ratios(said)) == count and max(ratios(said)) < 1
     truth, rungs = measure.runs(case, measure.times(case))
-    who = shown.Subject("", "", "", "", "")
-    ladder_ = shown.Ladder(who, case.model, truth, measure.integrator, rungs, 1.0)
+    who = measure.Subject("", "", "", "", "")
+    ladder_ = measure.Ladder(who, case.model, truth, measure.integrator, rungs, 1.0)
     for quantity in found.drifts:
         printed = re.search(rf"{quantity} by(?:.*\n)+?  step {case.steps[-1]}: (\S+)", said)[1]
         harness = np.max(np.linalg.norm(getattr(ladder_.drift[-1], quantity)[-1], axis=-1))
@@ -220,7 +229,7 @@ def test_a_script_runs_twice_as_the_harness_does(engine, integrator, relation):
 
 
 @pytest.mark.parametrize("engine", ["pinocchio", "exudyn"])
-@pytest.mark.parametrize("relation", [r.name for r in relations.RELATIONS])
+@pytest.mark.parametrize("relation", [r.name for r in metamorphic.RELATIONS])
 def test_a_script_of_a_relation_finds_what_the_harness_finds(engine, relation):
     model = pendulums.model(JOINTS["rod-ball"], loads=True, drag=relation != "time reversed")
     found = Related(Engine(engine), relation)(Case(model, pendulums.state(model, seed=3)))
@@ -233,7 +242,7 @@ def test_a_script_of_a_relation_finds_what_the_harness_finds(engine, relation):
 
 @pytest.mark.parametrize(
     ("engine", "relation"),
-    [(name, f"as {other}") for name, other in relations.FORMULATIONS.items()]
+    [(name, f"as {other}") for name, other in metamorphic.FORMULATIONS.items()]
     + [("pinocchio", f"by {way}") for way in adapter("pinocchio").options]
     + [(name, f"by {way}") for name in ("mujoco", "reference") for way in adapter(name).options]
     + [("pinocchio-aba", "by crba")]
@@ -286,7 +295,7 @@ def strong(**given):
     return real(**{**given, "gravity": [1.001 * x for x in given["gravity"]]})
 items.ObjectKinematicTree = strong
 """
-NOTES = """from reference_impl.system import System
+NOTES = """from reference_impl.direct import System
 real = System.solve
 System.solve = lambda self, *given: real(self, *given, 1e-6)
 """
@@ -398,7 +407,7 @@ def test_a_defect_in_an_engine_is_shown_by_its_script(engine, level, integrator,
 
 def test_a_drift_that_grows_is_shown_in_a_shorter_time_of_the_same_motion(tmp_path):
     """A symmetric method's energy: with fewer bodies or simpler numbers the motion may not be regular."""
-    from plumbline.scenario import find, load
+    from plumbline.scenario.loader import find, load
 
     scenario, lossy = load(find("lagrange-top")), LOSSY.replace("0.9", "0.0")
     case, wanted = Case(scenario.model, scenario.state, 50.0), ("energy_drift_long_growth",)
@@ -419,7 +428,7 @@ def test_a_drift_that_grows_is_shown_in_a_shorter_time_of_the_same_motion(tmp_pa
 
 def test_the_smallest_chain_on_which_aba_loses_its_digits(tmp_path):
     """The real one: Pinocchio's aba on thirty balls, with simpler numbers, and still disagreeing alone."""
-    from plumbline.scenario import find, load
+    from plumbline.scenario.loader import find, load
 
     scenario = load(find("chain-30-balls"))
     case = Case(scenario.model, scenario.state)
@@ -442,7 +451,7 @@ def test_a_defect_in_one_number_shrinks_to_one_body():
     engine = plant(type(adapter(defect.engine)), defect)
     model = pendulums.model(JOINTS["mixed"], loads=True, drag=True)
     case = Case(model, pendulums.state(model, seed=3))
-    with patch("plumbline.engine.adapter", lambda _: engine):
+    with patch("plumbline.reproduce.engine_client.adapter", lambda _: engine):
         small = shrunk(Question(Engine(defect.engine), "state", ("acceleration",), "-", case, 0.0, 60.0))
     assert small.case.model.n == 1 and not small.case.model.has_loads and not small.case.model.has_drag
     assert small.case.model.mass.tolist() == [1.0]
@@ -454,7 +463,9 @@ def test_a_busy_search_gives_what_it_has():
     model = pendulums.model(JOINTS["balls"])
     case = Case(model, pendulums.state(model, seed=3))
     question = Question(Engine(defect.engine), "state", ("acceleration",), "-", case, 0.0, 0.0)
-    with patch("plumbline.engine.adapter", lambda _: plant(type(adapter(defect.engine)), defect)):
+    with patch(
+        "plumbline.reproduce.engine_client.adapter", lambda _: plant(type(adapter(defect.engine)), defect)
+    ):
         small = shrunk(question)
     assert small is not None and small.case.model.n == 2
     runs = replace(case, until=1.0, steps=tuple(ladder(adapter("mujoco").integrator("RK4"), 2, 1.0)))
@@ -501,8 +512,8 @@ def test_another_environment_is_asked_and_runs_the_script(tmp_path):
 def interpreter_of(engine):
     """That of an engine's other version; skips with the reason where it cannot be had."""
     try:
-        return versions.interpreter(engine)
-    except versions.NoSuchEnvironment as error:
+        return environments.interpreter(engine)
+    except environments.NoSuchEnvironment as error:
         pytest.skip(str(error))
 
 
@@ -594,7 +605,7 @@ def test_every_engine_has_a_script_and_what_has_none_says_why():
 @pytest.fixture
 def results(tmp_path):
     """A results folder with disagreements that the harness recorded of aba, and one without a script."""
-    from plumbline.scenario import find, load
+    from plumbline.scenario.loader import find, load
 
     scenario = load(find("chain-30-balls"))
     about = {
@@ -612,7 +623,7 @@ def results(tmp_path):
             ("c", "state", "-", "joint_reaction", "agrees"),
             ("d", "relations", "-", "re-chosen body frame", "disagrees"))
     ]  # fmt: skip
-    document = {"schema_version": store.SCHEMA_VERSION, "scenarios": {"chain": about}, "rows": rows}
+    document = {"schema_version": results_store.SCHEMA_VERSION, "scenarios": {"chain": about}, "rows": rows}
     (tmp_path / "results.json").write_text(json.dumps(document))
     return tmp_path
 
@@ -621,7 +632,7 @@ def test_the_command_lists_and_writes(results):
     command = CliRunner()
     listed = command.invoke(main, ["reproduce", str(results)])
     assert listed.exit_code == 0 and "a: off" in listed.output and "c:" not in listed.output
-    with patch("plumbline.reproduce.ASKED", 0.0):
+    with patch("plumbline.reproduce.write.ASKED", 0.0):
         done = command.invoke(main, ["reproduce", str(results / "results.json"), "a", "d"])
     assert done.exit_code == 0, done.output
     index = json.loads((results / "scripts" / "index.json").read_text())
@@ -636,7 +647,7 @@ def test_the_command_lists_and_writes(results):
 
 
 def test_the_runs_behind_a_row_are_those_of_its_ladder(results):
-    document = store.read(results)
+    document = results_store.read(results)
     found = {"scenario": "chain", "engine": "mujoco", "integrator": "RK4", "level": "trajectory",
              "verdict": "disagrees", "declared_order": 4, "horizon": 1.7, "value": 2.0, "tolerance": 0.1,
              "quantity": "order", "extra": {}}  # fmt: skip
@@ -644,17 +655,17 @@ def test_the_runs_behind_a_row_are_those_of_its_ladder(results):
     others = ({"level": "relations"}, {"level": "invariants", "quantity": "energy_drift_long"})
     apart = [finest | other | {"extra": {"resolution": 2.0**-12}} for other in others]
     document["rows"] = [found, finest, *apart]
-    question = reproduce.asked(document, [found], 1.0)
+    question = write.asked(document, [found], 1.0)
     assert question.case.steps == (2.0**-5, 2.0**-6, 2.0**-7, 2.0**-8)
     assert question.case.until == 1.0 and question.most == 20 and question.wanted == ("order",)
     document["rows"] = [found]
     with pytest.raises(NotReproducible, match="ladder"):
-        reproduce.asked(document, [found], 1.0)
+        write.asked(document, [found], 1.0)
 
 
 def document_of(name: str, rows: list) -> dict:
     """Results as a run stores them: one scenario, and these rows."""
-    from plumbline.scenario import find, load
+    from plumbline.scenario.loader import find, load
 
     scenario = load(find(name))
     about = {
@@ -662,7 +673,7 @@ def document_of(name: str, rows: list) -> dict:
         "model": {k: np.asarray(v).tolist() for k, v in vars(scenario.model).items()},
         "state": {k: getattr(scenario.state, k).tolist() for k in ("p", "omega", "u", "udot")},
     }  # fmt: skip
-    return {"scenarios": {name: about}, "rows": [store.row_record(row) for row in rows]}
+    return {"scenarios": {name: about}, "rows": [results_store.row_record(row) for row in rows]}
 
 
 @pytest.mark.parametrize(
@@ -670,55 +681,57 @@ def document_of(name: str, rows: list) -> dict:
     [("exudyn", "reversed in time", LOSSY), ("exudyn-tree", "by EigenSparse", SPARSE)],
 )
 def test_the_run_behind_a_relation_of_runs_is_asked_for_again(engine, relation, lines):
-    from plumbline.scenario import find, load
+    from plumbline.scenario.loader import find, load
 
     scenario = load(find("double-tumbling-balls"))
     with defective(lines):
-        found = list(relations.runs(adapter(engine), scenario.model, scenario.state))
-        rows = relations.judge_relations(shown.Subject(scenario.name, "", engine, engine, "1"), found).rows
+        found = list(metamorphic.runs(adapter(engine), scenario.model, scenario.state))
+        rows = metamorphic.judge_relations(
+            measure.Subject(scenario.name, "", engine, engine, "1"), found
+        ).rows
         row = next(row for row in rows if row.quantity == relation)
         document = document_of(scenario.name, rows)
-        question = reproduce.asked(document, [store.row_record(row)], 1.0)
+        question = write.asked(document, [results_store.row_record(row)], 1.0)
         assert question.case.until == 16 * question.case.steps[0] == row.extra["end"]
-        again = shown.measure_of(question)(question.case)
+        again = measure.measure_of(question)(question.case)
     assert row.verdict == "disagrees" and again.ratio == pytest.approx(row.value) == question.most
-    without = store.row_record(row) | {"extra": {"state": 0.0}}
+    without = results_store.row_record(row) | {"extra": {"state": 0.0}}
     with pytest.raises(NotReproducible, match="step of this run"):
-        reproduce.asked(document, [without], 1.0)
+        write.asked(document, [without], 1.0)
 
 
 def test_the_long_runs_behind_a_row_are_asked_for_again():
-    from plumbline.scenario import find, load
+    from plumbline.scenario.loader import find, load
 
     scenario, method = load(find("tumbling-ball")), adapter("mujoco").integrator("RK4")
     with defective(DAMPED):
         plan = course(method, 1, 6.25)
         runs = endure("mujoco", "RK4", scenario.model, scenario.state, scenario.sample, plan)
-        who = shown.Subject(scenario.name, "", "mujoco", "MuJoCo", "1")
+        who = measure.Subject(scenario.name, "", "mujoco", "MuJoCo", "1")
         rows = judge_endurance(who, scenario.model, method, runs, False).rows
         document = document_of(scenario.name, rows)
-        off = reproduce.disputed(document)
-        question = reproduce.asked(document, off, 1.0)
-        again = shown.measure_of(question)(shown.whole(question))
+        off = write.disputed(document)
+        question = write.asked(document, off, 1.0)
+        again = measure.measure_of(question)(measure.whole(question))
     assert {row["quantity"] for row in off} >= {"energy_drift_long"} and question.case.until == 6.25
     assert again.ratio == pytest.approx(question.most) and again.case.steps == plan.resolutions
-    cells = {reproduce.cell_of(row | {"quantity": q}) for row in off for q in
+    cells = {write.cell_of(row | {"quantity": q}) for row in off for q in
              ("energy_drift", "energy_drift_long", "energy_drift_long_growth")}  # fmt: skip
     assert len(cells) == 3, "a script shows one kind of them"
 
 
 def test_a_lost_engine_is_told_and_leaves_no_script(results):
     with patch(
-        "plumbline.reproduce.Workers.run", lambda _, tasks: [Outcome(t.key, lost="hung") for t in tasks]
+        "plumbline.reproduce.write.Workers.run", lambda _, tasks: [Outcome(t.key, lost="hung") for t in tasks]
     ):
-        told = reproduce.write(results)
-        assert reproduce.write(results, ["d"]) == {"d": "hung"}
+        told = write.write(results)
+        assert write.write(results, ["d"]) == {"d": "hung"}
     assert told["a"] == "hung" and "of runs" in told["b"] and "the state-level script" in told["d"]
     assert not list((results / "scripts").glob("*.py"))
 
 
 def test_at_the_end_of_a_run_nothing_long_is_begun(results):
-    document = store.read(results)
+    document = results_store.read(results)
     slow = {
         "key": "s",
         "level": "trajectory",
@@ -728,15 +741,15 @@ def test_at_the_end_of_a_run_nothing_long_is_begun(results):
     }
     document["rows"] = [document["rows"][0] | slow]
     (results / "results.json").write_text(json.dumps(document))
-    with patch("plumbline.reproduce.Workers", side_effect=AssertionError("began")):
-        told = reproduce.write(results)
+    with patch("plumbline.reproduce.write.Workers", side_effect=AssertionError("began")):
+        told = write.write(results)
     assert told == {
         "s": "one try takes 2.0 s of computing, too long at the end of a run; ask for this row by its key"
     }
-    with patch("plumbline.reproduce.asked", side_effect=NotReproducible("began")):
-        assert reproduce.write(results, ["s"]) == {"s": "began"}
+    with patch("plumbline.reproduce.write.asked", side_effect=NotReproducible("began")):
+        assert write.write(results, ["s"]) == {"s": "began"}
 
 
 def test_a_row_that_is_not_there_is_refused(results):
     with pytest.raises(NotReproducible, match="no row 'x'"):
-        reproduce.write(results, ["x"])
+        write.write(results, ["x"])

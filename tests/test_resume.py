@@ -16,11 +16,12 @@ import psutil
 import pyarrow.parquet as pq
 import pytest
 
-from plumbline import scenario, work
-from plumbline.cells import Cells, key_of
-from plumbline.packed import Packed
-from plumbline.run import Plan, execute
-from plumbline.workers import Outcome, Task
+from plumbline.engines import calls
+from plumbline.execution.result_cache import Cells, key_of
+from plumbline.execution.runner import Plan, execute
+from plumbline.processes.packed import Packed
+from plumbline.processes.workers import Outcome, Task
+from plumbline.scenario import loader
 
 ROOT = Path(__file__).parent.parent
 TIMES = {"wall_time", "cost"}  # what may differ between two runs
@@ -146,7 +147,7 @@ def run(cells, stop_after=None):
         if done == stop_after:
             raise Interrupted
 
-    chosen = scenario.load_many(["rest", "conical"])
+    chosen = loader.load_many(["rest", "conical"])
     try:
         result = execute(Plan(chosen, ["mujoco"], "state", memory=cells, states=3), progress)
     except Interrupted:
@@ -183,15 +184,15 @@ def test_a_lost_cell_is_tried_again(tmp_path):
 
 
 def test_the_key_is_the_content():
-    s = scenario.load_many(["double-tumbling-balls"])[0]
+    s = loader.load_many(["double-tumbling-balls"])[0]
     turned = replace(s.state, omega=-s.state.omega)
     other = replace(s.model, mass=np.nextafter(s.model.mass, 9.0))
-    base = Task("a", work.climb, ("mujoco", "RK4", s.model, s.state, s.times, [0.5, 0.25]), version="4.0.0")
+    base = Task("a", calls.climb, ("mujoco", "RK4", s.model, s.state, s.times, [0.5, 0.25]), version="4.0.0")
     key = key_of(base)
     assert key == key_of(replace(base, key="b")), "the key is not the label's"
     changed = [
         replace(base, version="3.3.0"),
-        replace(base, call=work.evaluate),
+        replace(base, call=calls.evaluate),
         *(
             replace(base, arguments=(*base.arguments[:i], value, *base.arguments[i + 1 :]))
             for i, value in enumerate(

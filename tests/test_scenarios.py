@@ -13,12 +13,12 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
-from plumbline import scenario as scenarios
-from plumbline.adapter import check_state, check_times
-from plumbline.equilibria import relative_equilibrium
-from plumbline.kinematics import joint_vectors, multiply, rotation
-from plumbline.records import State
-from plumbline.scenario_schema import Attitude, Document, Inertia, attitude_quaternion, inertia_matrix
+from plumbline.engines.adapter import check_state, check_times
+from plumbline.model.datatypes import State
+from plumbline.model.kinematics import joint_vectors, multiply, rotation
+from plumbline.scenario import loader as scenarios
+from plumbline.scenario.schema import Attitude, Document, Inertia, attitude_quaternion, inertia_matrix
+from tests.helpers.relative_equilibria import relative_equilibrium
 
 EPS = np.finfo(float).eps
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from adapters.reference_engine import chain
-from plumbline.kinematics import rate
+from plumbline.model.kinematics import rate
 from reference_impl.collocation import integrate
-from reference_impl.short_rods import converge, directions, hang
-from reference_impl.system import System
+from reference_impl.direct import System
+from tests.helpers.short_rods import converge, directions, hang
 from tests.random_chains import random_chain, rescaled
 
 LENGTHS = [0.4, 1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6]

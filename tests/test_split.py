@@ -4,10 +4,10 @@ import time
 
 import pytest
 
-from plumbline import scenario
-from plumbline.run import Plan, execute
-from plumbline.split import KINDS, Split, spent
-from plumbline.workers import Memory, Outcome
+from plumbline.execution.runner import Plan, execute
+from plumbline.processes.cpu_time import KINDS, Split, spent
+from plumbline.processes.workers import Memory, Outcome
+from plumbline.scenario import loader
 
 
 def burn(seconds):
@@ -49,7 +49,7 @@ def test_a_memory_is_the_same_and_measured():
 def test_a_run_accounts_for_its_time():
     pytest.importorskip("mujoco")
     begin = spent()
-    chosen = scenario.load_many(["rest"])
+    chosen = loader.load_many(["rest"])
     split = execute(Plan(chosen, ["reference", "mujoco"], states=3), lambda *_: None).split
     seconds = {kind: split.seconds[kind] for kind in KINDS}
     assert all(seconds[k] > 0 for k in ("engines", "reference", "truth", "process", "judging")), seconds

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from adapters.reference_engine import chain
-from plumbline.kinematics import rate
+from plumbline.model.kinematics import rate
 from reference_impl.collocation import integrate
 from reference_impl.euler_parameters import angular_velocity
-from reference_impl.forest import Forest, lay
 from reference_impl.joints import rows
 from reference_impl.stabilised import VARIANTS, constraint_errors, drift_table, energy_error, run
+from reference_impl.structured import Forest, lay
 from tests.random_chains import random_chain
 
 

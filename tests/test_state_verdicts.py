@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.bench import horizon_of
-from plumbline.bound import state_bound
-from plumbline.findings import Subject
-from plumbline.motion_verdicts import judge_motion
-from plumbline.packed import Packed
-from plumbline.registry import adapter
-from plumbline.sampling import random_states
-from plumbline.state_verdicts import UNITS, judge_packed, judge_states
-from plumbline.work import Evaluation, climb
-from plumbline.yardstick import StateTruth, motion_truth
+from plumbline.engines.calls import Evaluation, climb
+from plumbline.engines.registry import adapter
+from plumbline.execution.scenario_run import horizon_of
+from plumbline.judging.rows import Subject
+from plumbline.judging.state import UNITS, judge_packed, judge_states
+from plumbline.judging.trajectory import judge_motion
+from plumbline.model.sampling import random_states
+from plumbline.processes.packed import Packed
+from plumbline.truth.ground_truth import StateTruth, motion_truth
+from plumbline.truth.rounding_bound import state_bound
 from tests import pendulums
 
 MODEL = pendulums.model("bb")

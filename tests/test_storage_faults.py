@@ -12,10 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from plumbline import nightly, run, scenario, workers
-from plumbline.history import History
-from plumbline.run import Plan
-from plumbline.workers import Limits, Memory
+from plumbline.cli.main import nightly
+from plumbline.execution import runner
+from plumbline.execution.runner import Plan
+from plumbline.processes import workers
+from plumbline.processes.workers import Limits, Memory
+from plumbline.scenario import loader
+from plumbline.storage.history import History
 
 ROOT = Path(__file__).parent.parent
 ERRORS = [errno.ENOSPC, errno.EIO, errno.EROFS, errno.EDQUOT]
@@ -112,13 +115,13 @@ class Disk:
 
 @pytest.fixture
 def disk(monkeypatch):
-    monkeypatch.setattr(run, "Workers", Here)
+    monkeypatch.setattr(runner, "Workers", Here)
     monkeypatch.setattr(nightly, "Plan", lambda *a, **k: Plan(*a, **k, states=1))
     return Disk(monkeypatch)
 
 
 def night(out):
-    chosen = scenario.load_many(["rest"])
+    chosen = loader.load_many(["rest"])
     result, place = nightly.nightly(
         out, chosen, ["mujoco"], random=0, seed=1, jobs=1, limits=Limits(), whole=False, command="-", finer=0,
         level="state", progress=lambda *_: None, tell=lambda _: None,
@@ -200,7 +203,7 @@ def test_a_clock_set_back_overwrites_no_night(tmp_path):
 
 def test_nights_are_told_in_the_order_in_which_they_were_made(tmp_path, monkeypatch):
     """The clock is set back, forward within the second night, and then shows the first one again."""
-    monkeypatch.setattr(run, "Workers", Here)
+    monkeypatch.setattr(runner, "Workers", Here)
     monkeypatch.setattr(nightly, "Plan", lambda *a, **k: Plan(*a, **k, states=1))
     days = iter([10, 10, 5, 8, 10, 10])  # when a night begins, and when its run does
 
@@ -210,7 +213,7 @@ def test_nights_are_told_in_the_order_in_which_they_were_made(tmp_path, monkeypa
             return datetime(2026, 1, next(days), tzinfo=tz)
 
     monkeypatch.setattr(nightly, "datetime", Clock)
-    monkeypatch.setattr(run, "datetime", Clock)
+    monkeypatch.setattr(runner, "datetime", Clock)
     made = [night(tmp_path)[1].name for _ in range(3)]
     assert made == ["20260110T000000Z", "20260108T000000Z", "20260110T000000Z-2"]
     history = History(tmp_path)

@@ -9,9 +9,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from plumbline import store
-from plumbline.findings import Subject
-from plumbline.records import Row
+from plumbline.judging.rows import Subject
+from plumbline.model.datatypes import Row
+from plumbline.storage import results_store
 
 ROW = Subject("s", "single", "mujoco", "MuJoCo", "4.0").row(
     "state",
@@ -40,7 +40,7 @@ STATES = [
 
 
 def write(folder):
-    tables = store.Tables()
+    tables = results_store.Tables()
     names = {"scenario": "s", "engine": "mujoco", "quantity": "q"}
     for part in ([0], [1, 2]):
         tables.add(
@@ -55,30 +55,32 @@ def write(folder):
             },
         )
     tables.add_rows([ROW])
-    store.write(folder, {"id": "x"}, {"s": {"title": "<b>"}}, {}, [ROW], tables)
+    results_store.write(folder, {"id": "x"}, {"s": {"title": "<b>"}}, {}, [ROW], tables)
 
 
 def test_what_is_written_is_read_back(tmp_path):
     write(tmp_path / "new")
-    document = store.read(tmp_path / "new")
+    document = results_store.read(tmp_path / "new")
     (row,) = document["rows"]
     assert row["key"] == "s/mujoco/state/-/acceleration"
     assert row["value"] == 1e-15
     assert row["tolerance"] is None, "JSON has no infinity"
     assert row["extra"] == {"ratio": None}
-    assert store.read_table(tmp_path / "new", "states") == STATES
-    (summary,) = store.read_table(tmp_path / "new", "summary")
+    assert results_store.read_table(tmp_path / "new", "states") == STATES
+    (summary,) = results_store.read_table(tmp_path / "new", "summary")
     assert summary["key"] == row["key"]
 
 
 def test_nothing_temporary_is_left(tmp_path):
     write(tmp_path)
-    assert {p.name for p in tmp_path.iterdir()} == {"results.json"} | {f"{n}.parquet" for n in store.TABLES}
+    assert {p.name for p in tmp_path.iterdir()} == {"results.json"} | {
+        f"{n}.parquet" for n in results_store.TABLES
+    }
 
 
 def test_many_records_take_several_row_groups_and_none_is_lost(tmp_path, monkeypatch):
-    monkeypatch.setattr(store, "GROUP", 7)
-    tables = store.Tables()
+    monkeypatch.setattr(results_store, "GROUP", 7)
+    tables = results_store.Tables()
     for k in range(20):
         column = np.arange(3.0) + 3 * k
         tables.add(
@@ -95,21 +97,21 @@ def test_many_records_take_several_row_groups_and_none_is_lost(tmp_path, monkeyp
             },
         )
     tables.write(tmp_path)
-    assert [r["error"] for r in store.read_table(tmp_path, "states")] == list(range(60))
+    assert [r["error"] for r in results_store.read_table(tmp_path, "states")] == list(range(60))
     assert pq.ParquetFile(tmp_path / "states.parquet").num_row_groups > 2
-    assert store.read_table(tmp_path, "curves") == []
+    assert results_store.read_table(tmp_path, "curves") == []
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "results.json"
-    store.write_atomically(path, b"old")
+    results_store.write_atomically(path, b"old")
 
     def full(_: int) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space"):
-        store.write_atomically(path, b"new")
+        results_store.write_atomically(path, b"new")
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 
@@ -118,18 +120,18 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
 def test_foreign_or_broken_results_are_refused_by_name(tmp_path, text):
     (tmp_path / "results.json").write_text(text, encoding="latin-1")
     with pytest.raises(ValueError, match=r"results\.json"):
-        store.read(tmp_path)
+        results_store.read(tmp_path)
 
 
 def test_no_results_says_how_to_make_them(tmp_path):
     with pytest.raises(ValueError, match="plumbline run"):
-        store.read(tmp_path)
+        results_store.read(tmp_path)
 
 
 def test_the_field_reference_names_every_field_and_column():
     text = (Path(__file__).parents[1] / "docs" / "results.md").read_text()
     for field in dataclasses.fields(Row):
         assert f"`{field.name}`" in text, field.name
-    for name, schema in store.TABLES.items():
+    for name, schema in results_store.TABLES.items():
         if name != "summary":
             assert f"- `{name}`: {', '.join(schema.names)}" in text, name

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from plumbline.bound import state_bound
-from plumbline.sampling import random_states
-from plumbline.suspect import DENSE, answer, case
+from plumbline.diagnosis.defect_model import DENSE, answer, case
+from plumbline.model.sampling import random_states
 from plumbline.truth.certified import certify
+from plumbline.truth.rounding_bound import state_bound
 from tests import pendulums
 
 pytest.importorskip("flint")

@@ -9,9 +9,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from plumbline import sweep
-from plumbline.problems import ScenarioError
-from plumbline.work import Climb, climb
+from plumbline.engines.calls import Climb, climb
+from plumbline.scenario.errors import ScenarioError
+from plumbline.studies import sweep
 
 FILE = """\
 schema_version: 1

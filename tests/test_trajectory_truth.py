@@ -10,17 +10,16 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 
-from plumbline import yardstick
-from plumbline.exact import solution
-from plumbline.flow import flow
-from plumbline.measures import attitude_error, position_error
-from plumbline.records import EngineFailure
-from plumbline.scenario import catalogue, find, load
-from plumbline.truth import trajectory
+from plumbline.model.datatypes import EngineFailure
+from plumbline.model.invariants import attitude_error, position_error
+from plumbline.processes.workers import Limits, Task, Workers
+from plumbline.scenario.loader import catalogue, find, load
+from plumbline.truth import ground_truth, trajectory
 from plumbline.truth.certified import certify
+from plumbline.truth.closed_form import solution
+from plumbline.truth.notes_motion import flow
 from plumbline.truth.taylor import heyoka, taylor
 from plumbline.truth.trajectory import EXTENDED, RTOL, trajectory_truth
-from plumbline.workers import Limits, Task, Workers
 from tests.random_chains import random_chain
 
 TIMES = np.arange(41) * 0.05
@@ -132,23 +131,25 @@ def test_its_accelerations_are_the_certified_ones():
 @pytest.mark.parametrize("side", ["taylor", "flow"])
 def test_a_billionth_too_much_mass_in_one_of_the_two_is_seen(monkeypatch, side):
     scenario = load(find("double-tumbling-balls"))
-    usual = yardstick.motion_truth(scenario.model, scenario.state, TIMES, None)
+    usual = ground_truth.motion_truth(scenario.model, scenario.state, TIMES, None)
     right = getattr(trajectory, side)
 
     def wrong(model, *rest):
         return right(replace(model, mass=model.mass * [1, 1 + 1e-9]), *rest)
 
     monkeypatch.setattr(trajectory, side, wrong)
-    planted = yardstick.motion_truth(scenario.model, scenario.state, TIMES, None)
+    planted = ground_truth.motion_truth(scenario.model, scenario.state, TIMES, None)
     assert planted.position_uncertainty[-1] > 1e4 * usual.position_uncertainty[-1]
-    assert planted.method == usual.method + yardstick.PARTED
+    assert planted.method == usual.method + ground_truth.PARTED
 
 
 def test_a_closed_form_that_is_off_is_seen():
     scenario = load(find("lagrange-top"))
     r, p = solution(scenario)(TIMES)
-    truth = yardstick.motion_truth(scenario.model, scenario.state, TIMES, (r * (1 + 1e-9), p, "a misprint"))
-    assert truth.method.endswith(yardstick.PARTED)
+    truth = ground_truth.motion_truth(
+        scenario.model, scenario.state, TIMES, (r * (1 + 1e-9), p, "a misprint")
+    )
+    assert truth.method.endswith(ground_truth.PARTED)
 
 
 # where Taylor's method cannot be had
@@ -156,7 +157,7 @@ def test_a_closed_form_that_is_off_is_seen():
 
 def check_fall_back(why, **arguments):
     scenario = load(find("double-tumbling-balls"))
-    truth = yardstick.motion_truth(scenario.model, scenario.state, TIMES[:11], None, **arguments)
+    truth = ground_truth.motion_truth(scenario.model, scenario.state, TIMES[:11], None, **arguments)
     assert truth.method == (
         "the notes' form by collocation; uncertainty: its difference from the same by DOP853, "
         f"no Taylor series: {why}"

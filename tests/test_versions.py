@@ -16,13 +16,15 @@ import psutil
 import pytest
 from packaging.version import Version
 
-from plumbline import known, scenario, versions, work
-from plumbline.findings import Subject
-from plumbline.registry import ENGINES
-from plumbline.remote import call
-from plumbline.run import Plan, execute
+from plumbline.engines import calls, environments
+from plumbline.engines.registry import ENGINES
+from plumbline.execution.runner import Plan, execute
+from plumbline.judging import known_issues
+from plumbline.judging.rows import Subject
+from plumbline.processes.remote_python import call
+from plumbline.processes.workers import Limits, Task, Workers
+from plumbline.scenario import loader
 from plumbline.truth.certified import certify
-from plumbline.workers import Limits, Task, Workers
 from tests.exudyn_start import initial_accelerations
 
 HERE = sys.executable  # the installed environment stands for another one: the way there and back is the same
@@ -49,35 +51,35 @@ def quiet(*_):
     ],
 )
 def test_the_version_part_of_a_name(name, words):
-    found = versions.problem_of(name)
+    found = environments.problem_of(name)
     assert found is None if words is None else words in found
 
 
 @pytest.mark.parametrize("engine", [e for e in ENGINES if e != "reference"])
 def test_what_an_adapter_declares_is_read_without_importing_it(engine):
-    from plumbline.registry import adapter
+    from plumbline.engines.registry import adapter
 
     found = adapter(engine)
-    assert versions.declared(engine, "package") == found.package
-    assert tuple(versions.declared(engine, "needs") or ()) == found.needs
-    assert work.describe(engine).missing is None, "the installed version is in the declared range"
+    assert environments.declared(engine, "package") == found.package
+    assert tuple(environments.declared(engine, "needs") or ()) == found.needs
+    assert calls.describe(engine).missing is None, "the installed version is in the declared range"
 
 
 def test_a_version_out_of_range_says_so(monkeypatch):
     from adapters.mujoco_engine import Mujoco
 
     monkeypatch.setattr(Mujoco, "supported", "<1")
-    assert "supports versions <1 of mujoco, this is" in work.describe("mujoco").missing
+    assert "supports versions <1 of mujoco, this is" in calls.describe("mujoco").missing
 
 
 def test_known_entries_hold_for_an_engine_in_any_version_of_their_range():
-    entry = known.Entry(
+    entry = known_issues.Entry(
         id="a", scenario="*", engine="mujoco", versions="<4", verdict="disagrees", evidence="e", reason="r"
     )
     row = Subject("s", "f", "mujoco@3.12.0", "MuJoCo", "3.12.0").row(
         "trajectory", "RK4", "order", "disagrees", ""
     )
-    about = known.Excuses([entry], finer=False).about
+    about = known_issues.Excuses([entry], finer=False).about
     assert about(row) and not about(replace(row, engine_version="4.0.0"))
     assert not about(replace(row, engine="mujocox"))
 
@@ -111,12 +113,12 @@ def test_losses_over_there_are_told_like_those_here():
 
 
 def test_an_engine_says_the_same_in_both_places():
-    s = scenario.load_many(["double-tumbling-balls"])[0]
+    s = loader.load_many(["double-tumbling-balls"])[0]
     with Workers(1) as workers:
         here, away = (
             o.value.quantities[0]
             for python in ("", HERE)
-            for o in workers.run([Task("k", work.evaluate, ("mujoco", s.model, [s.state]), python=python)])
+            for o in workers.run([Task("k", calls.evaluate, ("mujoco", s.model, [s.state]), python=python)])
         )
     assert np.array_equal(here.acceleration, away.acceleration)
     assert np.array_equal(here.mass_matrix, away.mass_matrix)
@@ -134,7 +136,7 @@ OLD = [
 @pytest.mark.full
 @pytest.mark.timeout(1800)
 def test_the_supported_versions_work_beside_the_installed_ones(tmp_path):
-    chosen = scenario.load_many(["tumbling-ball", "tumbling-rod"])
+    chosen = loader.load_many(["tumbling-ball", "tumbling-rod"])
     result = execute(Plan(chosen, ["mujoco", *OLD], limits=Limits(600)), quiet)
     for name in OLD:
         assert result.engines[name].missing is None
@@ -157,9 +159,9 @@ def test_the_supported_versions_work_beside_the_installed_ones(tmp_path):
 @pytest.mark.parametrize(("version", "sound"), [("1.9.0", False), ("1.10.0", False), ("1.11.0", True)])
 def test_exudyn_started_from_wrong_accelerations_with_its_sparse_solver(version, sound):
     """The relation says that two solvers of one engine differ; this says which is wrong, and where."""
-    chosen = scenario.load_many(["double-tumbling-balls"])[0]
+    chosen = loader.load_many(["double-tumbling-balls"])[0]
     true = certify(chosen.model, chosen.state).quantities.acceleration
-    python = versions.interpreter(f"exudyn@{version}")
+    python = environments.interpreter(f"exudyn@{version}")
     off = {
         solver: np.max(np.abs(call(python, initial_accelerations, chosen.model, chosen.state, solver) - true))
         for solver in ("EigenSparse", "EXUdense", "EigenDense")
@@ -171,7 +173,7 @@ def test_exudyn_started_from_wrong_accelerations_with_its_sparse_solver(version,
 @pytest.mark.full
 @pytest.mark.timeout(900)
 def test_a_version_that_cannot_be_had_is_a_verdict():
-    chosen = scenario.load_many(["rest"])
+    chosen = loader.load_many(["rest"])
     result = execute(Plan(chosen, ["mujoco@99.0.0", "mujoco@3.1.6"], "state"), quiet)
     absent, refused = result.rows
     assert absent.verdict == "not installed" and "99.0.0" in absent.reason
@@ -182,7 +184,7 @@ def test_a_version_that_cannot_be_had_is_a_verdict():
 
 
 def uv_there():
-    return shutil.which("uv") or (versions.ROOT / ".uv" / "bin" / "uv").exists()
+    return shutil.which("uv") or (environments.ROOT / ".uv" / "bin" / "uv").exists()
 
 
 needs_uv = pytest.mark.skipif(not uv_there(), reason="uv is not installed here")
@@ -192,8 +194,8 @@ needs_uv = pytest.mark.skipif(not uv_there(), reason="uv is not installed here")
 def index():
     """Skips with the reason where no package index answers."""
     try:
-        versions.newest("packaging", pre=False)
-    except versions.NoSuchEnvironment as error:
+        environments.newest("packaging", pre=False)
+    except environments.NoSuchEnvironment as error:
         pytest.skip(f"no package index can be reached: {error}")
 
 
@@ -212,10 +214,10 @@ def wheel(folder, package="mujoco"):
 def test_a_file_that_is_no_wheel_is_bad_usage(tmp_path):
     path = tmp_path / "mujoco-4.0.0-py3-none-any.whl"
     path.write_text("no zip")
-    assert "is not a wheel: it is no zip file" in versions.problem_of(f"mujoco@{path}")
+    assert "is not a wheel: it is no zip file" in environments.problem_of(f"mujoco@{path}")
     done = subprocess.run(
         [HERE, "-m", "plumbline", "run", "rest", "--engine", f"exudyn@{path}"],
-        cwd=versions.ROOT, capture_output=True, text=True,
+        cwd=environments.ROOT, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 2 and "is a wheel of mujoco, not of exudyn" in " ".join(done.stderr.split())
 
@@ -229,7 +231,7 @@ def test_an_index_that_does_not_answer_is_told(tmp_path, monkeypatch, version):
     monkeypatch.setenv("UV_HTTP_RETRIES", "0")
     monkeypatch.setenv("UV_CACHE_DIR", str(tmp_path / "uv"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    result = execute(Plan(scenario.load_many(["rest"]), [f"mujoco@{version}"], "state"), quiet)
+    result = execute(Plan(loader.load_many(["rest"]), [f"mujoco@{version}"], "state"), quiet)
     (row,) = result.rows
     assert row.verdict == "not installed"
     assert "uv cannot make an environment" in row.reason and "http://127.0.0.1:9/simple/mujoco" in row.reason
@@ -241,7 +243,7 @@ def test_an_index_that_does_not_answer_is_told(tmp_path, monkeypatch, version):
 @pytest.mark.timeout(1800)
 def test_latest_pre_and_a_wheel_run_beside_the_installed_one(tmp_path, index):
     names = ["mujoco", "mujoco@latest", "mujoco@pre", f"mujoco@{wheel(tmp_path)}"]
-    result = execute(Plan(scenario.load_many(["tumbling-ball"]), names, "state", limits=Limits(600)), quiet)
+    result = execute(Plan(loader.load_many(["tumbling-ball"]), names, "state", limits=Limits(600)), quiet)
     found = {name: result.engines[name] for name in names}
     assert [info.missing for info in found.values()] == [None] * 4
     latest, newest = (Version(found[f"mujoco@{which}"].version) for which in ("latest", "pre"))
@@ -259,7 +261,7 @@ def test_a_wheel_without_a_content_is_told(tmp_path, index):
     path = tmp_path / "mujoco-4.0.0-py3-none-any.whl"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("mujoco/__init__.py", "")
-    result = execute(Plan(scenario.load_many(["rest"]), [f"mujoco@{path}"], "state"), quiet)
+    result = execute(Plan(loader.load_many(["rest"]), [f"mujoco@{path}"], "state"), quiet)
     (row,) = result.rows
     assert row.verdict == "not installed" and "uv cannot make an environment" in row.reason
 
@@ -267,6 +269,6 @@ def test_a_wheel_without_a_content_is_told(tmp_path, index):
 def test_a_bad_version_is_bad_usage():
     done = subprocess.run(
         [HERE, "-m", "plumbline", "run", "rest", "--engine", "mujoco@three"],
-        cwd=versions.ROOT, capture_output=True, text=True,
+        cwd=environments.ROOT, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 2 and "'three' is not a version" in done.stderr

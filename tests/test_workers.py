@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from plumbline.scratch import sweep
-from plumbline.workers import Limits, Task, Workers
+from plumbline.processes.isolation import sweep
+from plumbline.processes.workers import Limits, Task, Workers
 
 ROOT = Path(__file__).parents[1]
 
@@ -139,7 +139,7 @@ def test_what_a_killed_run_leaves_is_removed_by_the_next(tmp_path, monkeypatch):
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", None)
     script = (
-        "import time; from plumbline.scratch import Scratch\n"
+        "import time; from plumbline.processes.isolation import Scratch\n"
         "mine = Scratch(); print(mine.path, flush=True); time.sleep(600)"
     )
     owners = [
@@ -170,7 +170,7 @@ def test_no_orphan_is_left_when_the_parent_is_killed(tmp_path):
         "import sys\n"
         f"sys.path[:0] = {[str(Path(__file__).parents[1]), str(Path(__file__).parent)]!r}\n"
         "from test_workers import hang, pid\n"
-        "from plumbline.workers import Task, Workers\n"
+        "from plumbline.processes.workers import Task, Workers\n"
         "if __name__ == '__main__':\n"
         "    with Workers(1) as workers:\n"
         "        for outcome in workers.run([Task(0, pid), Task(1, hang)]):\n"

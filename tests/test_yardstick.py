@@ -9,16 +9,15 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from plumbline import yardstick
-from plumbline.bound import state_bound
-from plumbline.horizon import growth
-from plumbline.kinematics import lift, multiply
-from plumbline.records import StateQuantities
-from plumbline.registry import adapter
-from plumbline.sampling import random_states
-from plumbline.truth import TruthUnavailable
+from plumbline.engines.registry import adapter
+from plumbline.model.datatypes import StateQuantities
+from plumbline.model.kinematics import lift, multiply
+from plumbline.model.sampling import random_states
+from plumbline.truth import TruthUnavailable, ground_truth
+from plumbline.truth.ground_truth import PART, PARTED, least_visible, mistaken, motion_truth, reach, visible
+from plumbline.truth.rounding_bound import state_bound
+from plumbline.truth.sensitivity import growth
 from plumbline.truth.trajectory import TrajectoryTruth, trajectory_truth
-from plumbline.yardstick import PART, PARTED, least_visible, mistaken, motion_truth, reach, visible
 from tests import pendulums
 
 TIMES = np.linspace(0, 1, 9)
@@ -95,10 +94,10 @@ def test_the_truth_of_states_is_certified_or_says_that_it_is_not() -> None:
     pytest.importorskip("flint")
     model = pendulums.model("rb", loads=True, drag=True)
     states = random_states(model, 3, seed=2)
-    found = yardstick.state_truth(model, states)
+    found = ground_truth.state_truth(model, states)
     assert re.fullmatch(r"certified: enclosed in ball arithmetic of \d+ bits", found.method)
-    with patch("plumbline.yardstick.certify", side_effect=TruthUnavailable("gone")):
-        other = yardstick.state_truth(model, states)
+    with patch("plumbline.truth.ground_truth.certify", side_effect=TruthUnavailable("gone")):
+        other = ground_truth.state_truth(model, states)
     assert "truth tools are not installed" in other.method
     said = adapter("reference").evaluate(model, states)
     for truth in (found, other):
@@ -147,7 +146,7 @@ def test_two_methods_that_part_by_more_than_rounding_are_told(
         2 * attitude * limit * off,
         "made",
     )
-    with patch("plumbline.yardstick.trajectory_truth", lambda *_: made):
+    with patch("plumbline.truth.ground_truth.trajectory_truth", lambda *_: made):
         assert motion_truth(model, at, TIMES, None).method == "made" + PARTED * parted
 
 

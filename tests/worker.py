@@ -13,8 +13,8 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before any child loads a BLAS
 
 from pebble import ProcessPool
 
-from plumbline.adapter import Adapter
-from plumbline.registry import adapter
+from plumbline.engines.adapter import Adapter
+from plumbline.engines.registry import adapter
 
 TIMEOUT = 60.0  # s
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.records import Array, Model, State, StateQuantities
+from plumbline.model.datatypes import Array, Model, State, StateQuantities
 from plumbline.truth import tool
 
 RADIUS = 1e-25  # relative to the largest magnitude of the quantity's own terms

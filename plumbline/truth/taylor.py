@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from plumbline.records import Array, EngineFailure, Model, State
+from plumbline.model.datatypes import Array, EngineFailure, Model, State
 from plumbline.truth import tool
 
 Precision = Literal["double", "extended", "quad"]

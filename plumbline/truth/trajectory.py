@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from plumbline.flow import flow
-from plumbline.kinematics import rate
-from plumbline.measures import attitude_error, position_error
-from plumbline.records import Array, Model, State, Trajectory
+from plumbline.model.datatypes import Array, Model, State, Trajectory
+from plumbline.model.invariants import attitude_error, position_error
+from plumbline.model.kinematics import rate
 from plumbline.truth import TruthUnavailable
+from plumbline.truth.notes_motion import flow
 from plumbline.truth.taylor import Precision, taylor
 
 RTOL = 1e-13  # of the notes' form: at 1e-14 it is no closer to extended precision, the rest is rounding

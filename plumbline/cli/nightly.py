@@ -1,0 +1,169 @@
+"""The nightly: everything, unattended; one folder per night, and what is unfinished beside them.
+
+    OUT/unfinished/plan.json   seed and number of the random scenarios, when it was begun
+    OUT/unfinished/cells/      finished cells (`plumbline.execution.result_cache`)
+    OUT/unfinished/night/      results as they are written, and what the instrument's own test said
+    OUT/history/ID/            a complete night, moved there by one rename
+
+Killed at any moment, the same command reads the plan and goes on; a folder in history is never half.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import reports
+from plumbline.execution.result_cache import Cells
+from plumbline.execution.runner import Levels, Plan, Progress, Result, execute, save
+from plumbline.execution.selftest import Answer
+from plumbline.processes.workers import Limits
+from plumbline.scenario import loader as scenarios
+from plumbline.scenario.generator import FAMILY, RandomScenarios
+from plumbline.storage.results_store import read, write_atomically
+
+FINER = 1  # halvings beyond the quick ladders
+
+
+@dataclass(frozen=True)
+class Night:
+    """What one night adds to the catalogue, and when it was begun."""
+
+    seed: int
+    random: int
+    started: str  # ISO 8601, UTC
+
+    @classmethod
+    def begun(cls, folder: Path, seed: int | None, random: int) -> Night:
+        """The unfinished night of ``folder`` if it is the same one, else a new one, written down."""
+        path = folder / "plan.json"
+        try:
+            night = cls(**json.loads(path.read_text(encoding="utf-8")))
+            if night.random == random and seed in (None, night.seed):
+                return night
+        except (OSError, ValueError, TypeError):
+            pass  # none, or damaged: a new one
+        night = cls(secrets.randbits(32) if seed is None else seed, random, now())
+        folder.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, json.dumps(asdict(night)).encode())
+        return night
+
+
+def now() -> str:
+    """The time, UTC, to the second."""
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def nightly(
+    out: Path,
+    chosen: Sequence[scenarios.Scenario],
+    engines: Sequence[str],
+    *,
+    random: int,
+    seed: int | None,
+    jobs: int,
+    limits: Limits,
+    whole: bool,
+    command: str,
+    finer: int = FINER,
+    endurance: float = 0.0,
+    level: Levels = "all",
+    scheduler: str | None = None,
+    instrument: Callable[[Path], Answer] | None = None,
+    progress: Progress,
+    tell: Callable[[str], None],
+) -> tuple[Result, Path]:
+    """Run a night, or what is left of it; returns its result and its folder in OUT/history.
+
+    ``instrument`` is the instrument's own test, given the place of its JUnit file.
+    """
+    unfinished = out / "unfinished"
+    night = Night.begun(unfinished, seed, random)
+    if remembered(night, out / "history"):  # killed as it was done: only this was left of it
+        shutil.rmtree(unfinished)
+        night = Night.begun(unfinished, seed, random)
+    kept = sum(1 for _ in unfinished.glob("cells/*.cell"))
+    tell(f"random scenarios: {night.random}, seed {night.seed}")
+    if kept:
+        tell(f"going on with the night begun {night.started}: {kept} cells are done")
+    drawn = RandomScenarios(night.seed, night.random)
+    plan = Plan(
+        chosen,
+        engines,
+        level,
+        jobs=jobs,
+        limits=limits,
+        finer=finer,
+        endurance=endurance,
+        whole=whole,
+        scheduler=scheduler,
+        probes=drawn,
+        memory=Cells(unfinished / "cells", tell),
+    )
+    result = execute(plan, progress)
+    place = free(out / "history" / result.run["id"])
+    result.run |= {"id": place.name, "night": number(place.parent)}
+    result.run |= {"started": night.started, "random": night.random, "seed": night.seed}
+    folder = unfinished / "night"
+    shutil.rmtree(folder, ignore_errors=True)
+    if instrument is not None:
+        folder.mkdir()
+        answer = instrument(folder / "instrument.xml")
+        result.run |= {
+            "instrument": answer.figures,
+            "sentence": f"{result.run['sentence']}; {answer.sentence}",
+        }
+        if answer.trouble:
+            result.run["exit_code"] = result.run["exit_code"] or 1
+    save(result, folder, command)
+    write_files_of_random(result, drawn, folder / "scenarios")
+    with result.split.measure("report"):
+        reports.write(folder, out / "history")
+    place.parent.mkdir(exist_ok=True)
+    os.replace(folder, place)
+    shutil.rmtree(unfinished)
+    return result, place
+
+
+def remembered(night: Night, history: Path) -> bool:
+    """Whether that very night is complete already."""
+    if not (history.parent / "unfinished" / "cells").is_dir():
+        return False
+    for path in history.glob("*/results.json"):
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # damaged: `history` names it
+            run = read(path.parent)["run"]
+            if (run["started"], run["seed"], run["random"]) == (night.started, night.seed, night.random):
+                return True
+    return False
+
+
+def number(history: Path) -> int:
+    """The number of a new night: they are told in this order, whatever the clock says."""
+    highest = 0
+    for path in history.glob("*/results.json"):
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # damaged: `history` names it
+            highest = max(highest, int(read(path.parent)["run"]["night"]))
+    return highest + 1
+
+
+def free(place: Path) -> Path:
+    """``place``, or with a number after it where a clock that was set back gave another night its name."""
+    names = itertools.chain([place], (place.with_name(f"{place.name}-{k}") for k in itertools.count(2)))
+    return next(name for name in names if not name.exists())
+
+
+def write_files_of_random(result: Result, drawn: Sequence[scenarios.Scenario], folder: Path) -> None:
+    """The scenario file of every random scenario that someone should see: `run FILE` repeats it."""
+    wanted = {row.scenario for row in result.rows if row.family == FAMILY}
+    for s in (drawn[int(name.rpartition("-")[2])] for name in sorted(wanted)):
+        folder.mkdir(exist_ok=True)
+        text = json.dumps(s.document, indent=1)  # JSON is YAML
+        write_atomically(folder / f"{s.name}.yaml", text.encode())

@@ -1,0 +1,1 @@
+"""Diagnosis: which term is wrong."""

@@ -1,0 +1,158 @@
+"""Other versions of an engine: `mujoco@3.12.0`, `@latest`, `@pre`, `mujoco@path/to.whl`.
+
+Each version lives in an environment of its own, made once by uv in the user's cache and then used as it
+is.  An environment appears by one rename, so that one that is there is whole.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+from typing import Any
+
+from packaging.specifiers import SpecifierSet
+from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel_filename
+from packaging.version import InvalidVersion, Version
+
+from plumbline.engines.registry import ENGINES
+from plumbline.processes.isolation import Scratch
+
+ROOT = Path(__file__).resolve().parents[2]
+BESIDE = ("numpy", "scipy", "packaging")  # what adapters and the worker's side of the core import
+PATIENCE = 900  # s for uv to fetch and install
+
+
+class NoSuchEnvironment(Exception):
+    """The version cannot be had here; the message says why."""
+
+
+def split(name: str) -> tuple[str, str]:
+    """``mujoco@3.12.0`` → ("mujoco", "3.12.0"); the version is empty where none is named."""
+    base, _, version = name.partition("@")
+    return base, version
+
+
+def problem_of(name: str) -> str | None:
+    """What is wrong with the version part of a name, in a sentence, before anything is fetched."""
+    base, version = split(name)
+    if "@" not in name or version in ("latest", "pre"):
+        return None
+    if version.endswith(".whl"):
+        return problem_of_wheel(Path(version), declared(base, "package"))
+    try:
+        Version(version)
+    except InvalidVersion:
+        return f"{version!r} is not a version; write one as 3.12.0, or latest, pre, or the path of a wheel"
+    return None
+
+
+def problem_of_wheel(path: Path, package: str) -> str | None:
+    """What is wrong with a wheel of ``package``, as far as its name and its outside show it."""
+    try:
+        found, *_ = parse_wheel_filename(path.name)
+    except InvalidWheelFilename as error:
+        return str(error)
+    if found != canonicalize_name(package):
+        return f"{path} is a wheel of {found}, not of {package}"
+    if not path.is_file():
+        return f"there is no file {path}"
+    return None if zipfile.is_zipfile(path) else f"{path} is not a wheel: it is no zip file"
+
+
+def declared(engine: str, attribute: str) -> Any:
+    """A literal class attribute of an adapter, its bases' in the same file included, without importing it.
+
+    The distribution's name is needed where the engine is not installed.
+    """
+    module, _, name = ENGINES[engine].partition(":")
+    tree = ast.parse((ROOT / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8"))
+    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
+    while name in classes:
+        for node in classes[name].body:
+            targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+            if any(isinstance(t, ast.Name) and t.id == attribute for t in targets):
+                return ast.literal_eval(node.value)  # type: ignore[attr-defined]
+        bases = [base.id for base in classes[name].bases if isinstance(base, ast.Name)]
+        name = next((base for base in bases if base in classes), "")
+    return None
+
+
+def interpreter(name: str) -> str:
+    """The Python of the environment of this version, made if need be; else NoSuchEnvironment."""
+    base, version = split(name)
+    package = declared(base, "package")
+    if version.endswith(".whl"):
+        wheel = Path(version).resolve()
+        requirement, label = str(wheel), hashlib.sha256(wheel.read_bytes()).hexdigest()[:16]
+    elif version in ("latest", "pre"):
+        requirement = newest(package, pre=version == "pre")
+        label = requirement.partition("==")[2]
+    else:
+        requirement, label = f"{package}=={version}", version
+    number = str(parse_wheel_filename(Path(version).name)[1]) if version.endswith(".whl") else label
+    more = (need for when, need in declared(base, "needs") or () if SpecifierSet(when).contains(number))
+    wanted = [requirement, *BESIDE, *more]
+    tag = hashlib.sha256("\n".join([*wanted, sys.version]).encode()).hexdigest()[:8]
+    place = cache() / f"{package}-{label}-{tag}"
+    if not python_of(place).exists():
+        place.parent.mkdir(parents=True, exist_ok=True)
+        with Scratch(".making-", place.parent) as scratch:
+            made = scratch / "environment"
+            uv("venv", "--relocatable", "--python", sys.executable, str(made))
+            uv("pip", "install", "--python", str(python_of(made)), *wanted)
+            try:
+                os.rename(made, place)
+            except OSError:  # somebody else made it meanwhile
+                if not python_of(place).exists():
+                    raise
+    return str(python_of(place))
+
+
+def python_of(environment: Path) -> Path:
+    """The interpreter of an environment."""
+    return environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
+
+
+def cache() -> Path:
+    """The folder of all environments."""
+    if os.name == "nt":
+        home = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
+    else:
+        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return home / "plumbline" / "engines"
+
+
+def newest(package: str, *, pre: bool) -> str:
+    """``package==version``: the newest release, or the newest of all."""
+    with tempfile.TemporaryDirectory() as scratch:
+        source = Path(scratch) / "wanted.in"
+        source.write_text(package)
+        kind = ["--prerelease", "allow"] if pre else []
+        found = uv(
+            "pip", "compile", "--no-deps", "--no-header", "--no-annotate", "--python", sys.executable, *kind,
+            str(source),
+        )  # fmt: skip
+    return found.split()[0]
+
+
+def uv(*arguments: str) -> str:
+    """What uv says; NoSuchEnvironment with its own words where it fails."""
+    program = shutil.which("uv") or str(ROOT / ".uv" / "bin" / "uv")
+    environment = {"UV_PYTHON_DOWNLOADS": "never", "UV_SYSTEM_CERTS": "true", **os.environ}
+    try:
+        done = subprocess.run(
+            [program, "--quiet", "--no-config", *arguments],
+            capture_output=True, text=True, timeout=PATIENCE, env=environment,
+        )  # fmt: skip
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise NoSuchEnvironment(f"uv cannot make an environment for it: {error}") from None
+    if done.returncode:
+        raise NoSuchEnvironment(f"uv cannot make an environment for it: {' '.join(done.stderr.split())}")
+    return done.stdout

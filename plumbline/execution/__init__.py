@@ -1,0 +1,1 @@
+"""Execution: scenarios × engines → judged rows."""

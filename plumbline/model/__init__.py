@@ -1,0 +1,1 @@
+"""The model and its kinematics: data, no physics of an engine."""

@@ -1,0 +1,175 @@
+"""What crosses from one stage to the next: small frozen records of NumPy arrays.
+
+A leaf module: it imports nothing of the project.  Frames and units, everywhere:
+SI; world z up, pivot at the world origin; ``r`` is a centre of mass in the world
+frame; quaternions are scalar first and turn body vectors into world vectors;
+``omega`` is the angular velocity in the body frame (the notes' ω′ = 2 L(p) ṗ).
+N is the number of bodies, T the number of samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+Level = Literal["state", "invariants", "trajectory", "relations"]
+Verdict = Literal["agrees", "disagrees", "unresolved", "unsupported", "not installed", "failed"]
+
+
+class Unsupported(Exception):
+    """The engine cannot do this; the message is the sentence that stands in the results."""
+
+
+class EngineFailure(Exception):
+    """The engine was asked for something it offers and did not deliver it; the message says what it did."""
+
+
+class BadInput(ValueError):
+    """A state or model was refused before any engine saw it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """An open chain of N rigid bodies hung from the world origin by rods and ball joints.
+
+    Joint k connects body k to body k-1 (joint 0: to the pivot, the world origin).
+    ``length[k] == 0`` is a ball joint; ``length[k] > 0`` a massless rigid rod of that
+    length with a ball joint at both ends (E1 of the notes).
+    """
+
+    mass: Array  # (N,) kg
+    inertia: Array  # (N, 3, 3) kg m², about the centre of mass, body frame
+    proximal: Array  # (N, 3) m, body frame: where body k hangs (the notes' s_1, s_3)
+    distal: Array  # (N, 3) m, body frame: where body k+1 hangs on body k (s_2); unused for the last
+    length: Array  # (N,) m, rod length of joint k, 0 for a ball joint
+    gravity: Array  # (3,) m/s², world frame
+    force: Array  # (N, 3) N, constant applied force at the centre of mass, world frame
+    moment: Array  # (N, 3) N m, constant applied moment n′, body frame
+    drag_force: Array  # (N,) N s/m, c_t: F = -c_t ṙ at the centre of mass
+    drag_moment: Array  # (N,) N m s, c_r: n′ = -c_r ω′
+
+    @property
+    def n(self) -> int:
+        """Number of bodies."""
+        return len(self.mass)
+
+    @property
+    def rods(self) -> NDArray[np.bool_]:
+        """(N,) True where joint k is a rod."""
+        return np.asarray(self.length > 0)
+
+    @property
+    def has_drag(self) -> bool:
+        """Whether any body feels drag."""
+        return bool(np.any(self.drag_force) or np.any(self.drag_moment))
+
+    @property
+    def has_loads(self) -> bool:
+        """Whether any constant force or moment is applied."""
+        return bool(np.any(self.force) or np.any(self.moment))
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """One exact state on the constraint manifold: the minimal coordinates and what follows from them.
+
+    ``u``, ``udot`` are the unit direction of rod k, from the point where the rod hangs to
+    body k's proximal point, and its rate (u·udot = 0); zero for ball joints.  The rod's
+    angular velocity without axial spin is u × udot.  ``r``, ``v`` follow from the others
+    (`plumbline.model.kinematics.lift`).
+    """
+
+    p: Array  # (N, 4) –
+    omega: Array  # (N, 3) rad/s, body frame
+    u: Array  # (N, 3) –, world frame
+    udot: Array  # (N, 3) 1/s, world frame
+    r: Array  # (N, 3) m, world frame
+    v: Array  # (N, 3) m/s, world frame: ṙ
+
+
+@dataclass(frozen=True, eq=False)
+class StateQuantities:
+    """What an engine says of one state. Optional ones are None where the engine has none."""
+
+    acceleration: Array  # (N, 3) m/s², r̈ of the centres of mass, world frame
+    angular_acceleration: Array  # (N, 3) rad/s², ω̇′, body frame
+    joint_reaction: Array | None = None  # (N, 3) N, force on body k at its proximal point, world frame
+    kinetic_energy: float | None = None  # J
+    potential_energy: float | None = None  # J, zero at the pivot: -Σ m g·r
+    angular_momentum: Array | None = None  # (3,) kg m²/s about the pivot, world frame
+    # (nu, nu), kinetic energy = ½ νᵀ M ν with ν = (udot of the rods in order, then omega of all bodies),
+    # i.e. nu = 3·(number of rods) + 3 N; a rod's 3×3 part acts on udot through u × udot.
+    mass_matrix: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Samples of one run at the asked times; row 0 is the initial state.
+
+    ``p`` and ``pdot`` are what the engine holds: not normalised, not projected.
+    """
+
+    t: Array  # (T,) s
+    r: Array  # (T, N, 3) m
+    p: Array  # (T, N, 4) –
+    v: Array  # (T, N, 3) m/s, ṙ
+    pdot: Array  # (T, N, 4) 1/s; ½ L(p)ᵀ ω′ where the engine holds ω′
+    steps: int  # steps the integrator took
+
+
+@dataclass(frozen=True)
+class Integrator:
+    """One way of an engine to step in time.
+
+    ``resolution`` handed to `Adapter.simulate` is the step in seconds for ``kind`` "step"
+    and the relative tolerance for ``kind`` "tolerance".
+    """
+
+    name: str
+    kind: Literal["step", "tolerance"]
+    order: int  # declared order; of the underlying method for kind "tolerance"
+    powers: tuple[int, ...] = ()  # exponents of h in the error expansion, ascending
+    symmetric: bool = False  # time-symmetric: reversing the velocities retraces the path
+    solver: float = 0.0  # relative tolerance to which an implicit step's equations are solved
+    tightest: float = 1e-12  # for kind "tolerance": below, rounding on long chains stalls the step
+    alias_of: str | None = None  # equals that integrator without drag: not independent evidence
+    note: str = ""  # a sentence on what it is
+
+
+@dataclass(frozen=True)
+class Row:
+    """One judged quantity: the unit of results.json, the pytest ids and the report."""
+
+    scenario: str
+    family: str
+    engine: str
+    engine_version: str
+    level: Level
+    integrator: str  # "-" where none took part
+    quantity: str
+    unit: str
+    value: float | None  # the error or drift that was measured, worst over bodies, states and samples
+    tolerance: float | None  # what it was compared with, same unit
+    verdict: Verdict
+    reason: str  # one sentence
+    derivation: str = ""  # how the tolerance came about, in words and numbers
+    uncertainty: float | None = None  # of the truth and of the limit together, same unit
+    horizon: float | None = None  # s, up to which positions were compared
+    order: float | None = None  # observed order
+    declared_order: int | None = None
+    alias_of: str | None = None
+    known: str | None = None  # id of the entry of known.yaml that expects this verdict
+    diagnosis: str | None = None  # the guilty term, in a sentence
+    accept: float | None = None  # the user's own tolerance, shown beside the verdict
+    wall_time: float = 0.0  # s, of the work behind this row
+    extra: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def key(self) -> str:
+        """The row's identity across runs."""
+        return "/".join((self.scenario, self.engine, self.level, self.integrator, self.quantity))

@@ -1,0 +1,150 @@
+"""From trajectories to numbers: errors between two, and the invariants of one.
+
+Leading axes are free everywhere: (T, N, …) for a run.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.interpolate import make_interp_spline
+
+from plumbline.model.datatypes import Array, Model, Trajectory
+from plumbline.model.kinematics import angular_velocity, joint_vectors, rotation
+
+
+def position_error(a: Array, b: Array) -> Array:
+    """(T,) m: the largest distance between the same body's centre of mass in two runs."""
+    return np.asarray(np.max(np.linalg.norm(a - b, axis=-1), axis=-1))
+
+
+def attitude_error(p: Array, q: Array) -> Array:
+    """(T,) rad: the largest rotation angle between the same body's two attitudes; q and -q are the same."""
+    p = p / np.linalg.norm(p, axis=-1, keepdims=True)
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    sign = np.where(np.sum(p * q, axis=-1, keepdims=True) < 0, -1.0, 1.0)
+    # 4 asin(|p - q| / 2), exact for all angles and, unlike acos(p·q), accurate for small ones
+    return np.asarray(np.max(4 * np.arcsin(np.linalg.norm(p - sign * q, axis=-1) / 2), axis=-1))
+
+
+def kinetic_energy(model: Model, v: Array, omega: Array) -> Array:
+    """(…,) J: Σ ½ m ṙ² + ½ ω′ᵀ J ω′."""
+    spin = np.einsum("...ki,kij,...kj->...", omega, model.inertia, omega)
+    return np.asarray(0.5 * np.einsum("k,...ki,...ki->...", model.mass, v, v) + 0.5 * spin)
+
+
+def potential_energy(model: Model, r: Array) -> Array:
+    """(…,) J: -Σ m g·r, zero at the pivot's height."""
+    return np.asarray(-np.einsum("k,i,...ki->...", model.mass, model.gravity, r))
+
+
+def angular_momentum(model: Model, r: Array, p: Array, v: Array, omega: Array) -> Array:
+    """(…, 3) kg m²/s about the pivot, world frame: Σ m r × ṙ + A J ω′."""
+    spin = np.einsum("...kij,kjl,...kl->...i", rotation(p), model.inertia, omega)
+    return np.asarray(np.einsum("k,...ki->...i", model.mass, np.cross(r, v)) + spin)
+
+
+@dataclass(frozen=True, eq=False)
+class Invariants:
+    """Signed series (T, M, width) of one run; each is zero in an exact motion."""
+
+    energy_drift: Array  # (T, 1, 1) J: E - E(0) - W, W the work of loads and drag
+    momentum_drift: (
+        Array | None
+    )  # (T, 1, 1) kg m²/s: change of L about the pivot along gravity; None if not conserved
+    joint_gap: Array  # (T, N, 3) m: d of a ball joint; (|d| - ℓ, 0, 0) of a rod
+    gap_rate: Array  # (T, N, 3) m/s: its rate
+    norm_drift: Array  # (T, N, 1) –: |p| - 1
+    work_uncertainty: float  # J: of W by quadrature over the samples
+
+
+UNITS = {
+    "energy_drift": "J",
+    "momentum_drift": "kg m²/s",
+    "joint_gap": "m",
+    "gap_rate": "m/s",
+    "norm_drift": "1",
+}
+
+
+def work(model: Model, run: Trajectory, omega: Array) -> tuple[Array, float]:
+    """Work (T,) of loads and drag since t = 0 in J, and its quadrature uncertainty.
+
+    Constant world forces do F·Δr exactly.  Moments and drag are integrated over the samples by
+    a quintic spline of their power; its distance to the cubic one, or to the quintic through every
+    other sample, is the uncertainty, whichever is larger.
+    """
+    exact = np.einsum("ki,tki->t", model.force, run.r - run.r[0])
+    power = (
+        np.einsum("ki,tki->t", model.moment, omega)
+        - np.einsum("k,tki,tki->t", model.drag_force, run.v, run.v)
+        - np.einsum("k,tki,tki->t", model.drag_moment, omega, omega)
+    )
+    if not np.any(power) or len(run.t) < 13:
+        return exact, 0.0
+    quintic, cubic = (make_interp_spline(run.t, power, k=k).antiderivative()(run.t) for k in (5, 3))
+    half = slice(None, None, 2)
+    coarse = make_interp_spline(run.t[half], power[half], k=5).antiderivative()(run.t[half])
+    away = max(np.max(np.abs(quintic - cubic)), np.max(np.abs(quintic[half] - coarse)))
+    return exact + quintic, float(away)
+
+
+def invariants(model: Model, run: Trajectory) -> Invariants:
+    """The invariants of one run, from what the engine holds: p is not normalised before |p| is read."""
+    omega = angular_velocity(run.p, run.pdot)
+    energy = kinetic_energy(model, run.v, omega) + potential_energy(model, run.r)
+    done, uncertainty = work(model, run, omega)
+    gravity = np.linalg.norm(model.gravity)
+    momentum = None
+    if gravity > 0 and not (model.has_loads or model.has_drag):
+        about = angular_momentum(model, run.r, run.p, run.v, omega) @ (model.gravity / gravity)
+        momentum = (about - about[0])[:, None, None]
+    d = joint_vectors(model, run.r, run.p)
+    ddot = joint_rates(model, run, omega)
+    distance = np.linalg.norm(d, axis=-1)
+    stretch = np.zeros_like(d)
+    stretch[..., 0] = distance - model.length
+    stretching = np.zeros_like(d)
+    stretching[..., 0] = np.sum(d * ddot, axis=-1) / np.where(distance > 0, distance, 1.0)
+    rods = model.rods[:, None]
+    return Invariants(
+        energy_drift=(energy - energy[0] - done)[:, None, None],
+        momentum_drift=momentum,
+        joint_gap=np.where(rods, stretch, d),
+        gap_rate=np.where(rods, stretching, ddot),
+        norm_drift=np.linalg.norm(run.p, axis=-1, keepdims=True) - 1,
+        work_uncertainty=uncertainty,
+    )
+
+
+def joint_rates(model: Model, run: Trajectory, omega: Array) -> Array:
+    """ḋ (T, N, 3) m/s, world frame, of the joint vectors of `kinematics.joint_vectors`."""
+    a = rotation(run.p)
+    near = run.v + np.einsum("tkij,tkj->tki", a, np.cross(omega, model.proximal))
+    far = run.v + np.einsum("tkij,tkj->tki", a, np.cross(omega, model.distal))
+    return np.asarray(near - np.concatenate([np.zeros_like(far[:, :1]), far[:, :-1]], axis=1))
+
+
+def scales(model: Model, run: Trajectory, length: float) -> dict[str, float]:
+    """Sizes of what the invariants of a run are made of: energies, momenta, lengths, speeds; as `UNITS`.
+
+    ``length`` (m) is that of the stretched chain.  A pendulum at rest rounds too: speeds are at least
+    that of a fall through it.
+    """
+    omega = angular_velocity(run.p, run.pdot)
+    kinetic = float(np.max(kinetic_energy(model, run.v, omega)))
+    potential = float(np.max(np.sum(model.mass * np.abs(run.r @ model.gravity), axis=-1)))
+    swing = float(np.ptp(potential_energy(model, run.r)))
+    fall = float(np.sqrt(np.linalg.norm(model.gravity) * length))
+    speed = max(fall, float(np.max(np.linalg.norm(run.v, axis=-1))))
+    spin = max(fall / length, float(np.max(np.linalg.norm(omega, axis=-1))))
+    arm = float(np.max(np.linalg.norm(run.r, axis=-1)))
+    inertia = float(np.sum(np.linalg.norm(model.inertia, axis=(1, 2))))
+    return {
+        "energy_drift": max(kinetic, potential, swing),
+        "momentum_drift": float(np.sum(model.mass)) * arm * speed + inertia * spin,
+        "joint_gap": max(length, arm),
+        "gap_rate": max(speed, spin * length),
+        "norm_drift": 1.0,
+    }

@@ -1,0 +1,39 @@
+"""Random states on the constraint manifold of a scenario, and the seeds they come from."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+
+from plumbline.model.datatypes import Model, State
+from plumbline.model.kinematics import hung
+
+
+def seed_of(*parts: str) -> int:
+    """A seed that depends on the words given and on nothing else (not on hash randomisation)."""
+    return int.from_bytes(hashlib.sha256("\0".join(parts).encode()).digest()[:8], "big")
+
+
+def random_states(model: Model, count: int, seed: int) -> list[State]:
+    """``count`` states of the model's geometry: attitudes and rod directions uniform, rates slow to fast.
+
+    Rates are Gaussian with a standard deviation drawn per state, log-uniform from a tenth to
+    four times the pendulum's own rate √(g/ℓ), so that gravity dominates in some states and the
+    velocity terms in others.  u and u̇ are zero where the joint is a ball joint.
+    """
+    rng = np.random.default_rng(seed)
+    reach = np.linalg.norm(model.proximal, axis=1) + model.length
+    own_rate = np.sqrt(max(float(np.linalg.norm(model.gravity)), 1e-3) / max(float(np.mean(reach)), 1e-3))
+    p, omega, u, udot = (np.zeros((count, model.n, size)) for size in (4, 3, 3, 3))
+    for k in range(count):
+        p[k] = rng.normal(size=(model.n, 4))
+        spread = own_rate * 10 ** rng.uniform(-1.0, np.log10(4.0))
+        omega[k] = spread * rng.normal(size=(model.n, 3))
+        u[k] = rng.normal(size=(model.n, 3))
+        udot[k] = spread * rng.normal(size=(model.n, 3))
+    p /= np.linalg.norm(p, axis=-1, keepdims=True)
+    u /= np.linalg.norm(u, axis=-1, keepdims=True)
+    u, udot = (np.where(model.rods[:, None], x, 0.0) for x in (u, np.cross(udot, u)))
+    r, v = hung(model, p, omega, u, udot)
+    return [State(*parts) for parts in zip(p, omega, u, udot, r, v, strict=True)]

@@ -1,0 +1,58 @@
+"""What a body is made of: itself, or two halves to be welded.
+
+With Σ = ½ tr(J) I − J, the second moments of the body's mass about its centre, the halves have m/2 each
+at ± c and share what their distance leaves of the inertia, ¼ and ¾, so that no two are alike:
+
+    c = √(1/2m) Σ^½ w,    J₁ + J₂ + m (c·c I − c cᵀ) = J,    w no principal axis.
+
+Half of what the body has along c is then still the halves' own: Σ − m c cᵀ ≥ ½ Σ, so that they are
+physical, and as well conditioned as the body to within a factor of 8.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from plumbline.model.datatypes import Array, Model
+
+SHARES = 0.25, 0.75  # of the inertia that is left
+W = np.ones(3) / np.sqrt(3.0)  # in principal axes
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One rigid piece of a body."""
+
+    mass: float  # kg
+    centre: Array  # (3,) m, from the body's centre of mass, body frame
+    inertia: Array  # (3, 3) kg m², about the piece's own centre, body axes
+
+
+Parts = list[tuple[Part, ...]]  # of every body
+
+
+def whole(model: Model) -> Parts:
+    """Every body in one piece."""
+    each = zip(model.mass, model.inertia, strict=True)
+    return [(Part(float(mass), np.zeros(3), inertia),) for mass, inertia in each]
+
+
+def halves(model: Model) -> Parts:
+    """Every body in two pieces."""
+    return [halved(float(mass), inertia) for mass, inertia in zip(model.mass, model.inertia, strict=True)]
+
+
+def halved(mass: float, inertia: Array) -> tuple[Part, Part]:
+    """The two halves of one body."""
+    principal, axes = np.linalg.eigh(inertia)
+    moments = np.maximum(np.sum(principal) / 2 - principal, 0.0)  # of a flat body one is a rounding of zero
+    centre = axes @ (np.sqrt(moments / (2 * mass)) * W)
+    left = inertia - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
+    return Part(mass / 2, centre, SHARES[0] * left), Part(mass / 2, -centre, SHARES[1] * left)
+
+
+def arms(parts: Parts) -> Array:
+    """(N,) m: how far a piece's centre is from its body's, at most."""
+    return np.array([max(float(np.linalg.norm(part.centre)) for part in pieces) for pieces in parts])

@@ -1,0 +1,81 @@
+"""Where a run's CPU time went: what the engines took, and what the harness took to ask and judge them."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from plumbline.processes.workers import Memory, Outcome, Task
+
+KINDS = ("engines", "reference", "truth", "diagnosis", "process", "judging", "storage", "report")
+
+
+class Split:
+    """CPU seconds by kind; "process" is what starting workers and moving questions and answers took."""
+
+    def __init__(self) -> None:
+        self.seconds = dict.fromkeys(KINDS, 0.0)
+
+    def count(self, outcome: Outcome) -> None:
+        """Take in what a task's call and its judge took in its worker."""
+        subject = outcome.key[1]
+        kind = {"truth": "truth", "why": "diagnosis", "reference": "reference"}.get(subject, "engines")
+        self.seconds[kind] += outcome.cost
+        self.seconds["judging"] += outcome.judging
+
+    @contextmanager
+    def measure(self, kind: str) -> Iterator[None]:
+        """Count what this process, and its children that end meanwhile, take inside."""
+        begin = spent()
+        try:
+            yield
+        finally:
+            self.seconds[kind] += spent() - begin
+
+    @contextmanager
+    def work(self) -> Iterator[None]:
+        """What is taken inside and counted by nobody else was process."""
+        begin, before = spent(), sum(self.seconds.values())
+        yield
+        counted = sum(self.seconds.values()) - before
+        self.seconds["process"] += max(0.0, spent() - begin - counted)  # answers from before took nothing now
+
+    def storing(self, memory: Memory) -> Memory:
+        """The same memory, what it takes counted as storage."""
+        split = self
+
+        class Measured(Memory):
+            def get(self, task: Task) -> Outcome | None:
+                with split.measure("storage"):
+                    return memory.get(task)
+
+            def put(self, task: Task, outcome: Outcome) -> None:
+                with split.measure("storage"):
+                    memory.put(task, outcome)
+
+        return Measured()
+
+    @property
+    def asked(self) -> float:
+        """CPU s of the calls in workers."""
+        return sum(self.seconds[kind] for kind in ("engines", "reference", "truth", "diagnosis"))
+
+    def sentence(self) -> str:
+        """The split in words; what is neither an engine's answer nor what it is held to is the harness."""
+        total, engines = sum(self.seconds.values()), self.seconds["engines"]
+        parts = ", ".join(f"{kind} {s:.1f}" for kind, s in self.seconds.items())
+        if not engines:
+            return f"CPU {total:.1f} s: {parts}"
+        return (
+            f"CPU {total:.1f} s: {parts}; over the engines' own time: harness "
+            f"{100 * (total - self.asked) / engines:.0f} %, truth and reference "
+            f"{100 * (self.asked - engines) / engines:.0f} %"
+        )
+
+
+def spent() -> float:
+    """CPU s of this process and of its children that have ended."""
+    times = os.times()  # in ticks of 10 ms: too coarse for this process's own time, taken in small parts
+    return time.process_time() + times.children_user + times.children_system

@@ -1,0 +1,96 @@
+"""A long run, as short as still shows it: an invariant that does not fall with the step, or that grows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from plumbline.judging.long_runs import BLOCKS, Course, Endured, Judge, course, endure, spacing
+from plumbline.judging.rows import Subject
+from plumbline.model.datatypes import Array, Integrator, Row
+from plumbline.model.invariants import UNITS
+from plumbline.reproduce.engine_client import OfRuns
+from plumbline.reproduce.shrink import Case
+
+LONG, GROWTH = "_long", "_long_growth"  # how the names of such rows' quantities end
+GROWN = 10.0  # s: in less, a bounded drift that swings may still be on its way out
+
+
+@dataclass(frozen=True, eq=False)
+class ShownLong:
+    """Runs in which what is conserved drifts more than the method's order explains, or ever farther."""
+
+    case: Case
+    ratio: float
+    times: Array  # (T,) s
+    integrator: Integrator
+    drifts: tuple[str, ...]  # invariants
+    growth: bool  # whether it is the drift's growth with time that is in dispute
+    due: float  # order in the step or tolerance, at least
+    rounding: dict[str, float]  # of a block of time, per invariant, in its unit
+    passed: dict[str, float]  # what the whole run may drift by before any order is asked for
+
+
+@dataclass
+class OverLong(OfRuns):
+    """By how much invariants of long runs are off, judged as the nightly judges them in the whole window."""
+
+    wanted: tuple[str, ...]
+    sample: float  # s, the scenario's
+
+    @property
+    def growth(self) -> bool:
+        """Whether growth with time is in dispute; it is bounded in a regular motion only."""
+        return self.wanted[0].endswith(GROWTH)
+
+    def whole(self, case: Case) -> Case:
+        """A case at the resolutions of the nightly; of growth the finest is judged, alone."""
+        every = course(self.integrator, case.model.n, case.until).resolutions
+        return replace(case, steps=every[-1:] if self.growth else every)
+
+    def __call__(self, case: Case) -> ShownLong | None:
+        """None for what the engine refuses, and for a run too short to be judged."""
+        sample = spacing(self.integrator, case.model, self.sample)
+        count = round(case.until / sample)
+        if (
+            abs(count * sample - case.until) > 1e-9 * case.until
+            or count < BLOCKS
+            or (self.growth and case.until < GROWN)
+        ):
+            return None
+        plan = Course(case.until, case.steps, case.until)
+        try:
+            endured: Endured = self.engine.ask(endure, self.method, case.model, case.state, sample, plan)
+        except Exception:
+            return None
+        if endured.unsupported is not None or endured.runs[-1].failure is not None:
+            return None
+        who = Subject("", "", self.engine.name, self.engine.name, "")
+        kept, end = endured.runs[-1].windows, endured.runs[-1].reached
+        wanted = (q.removesuffix(GROWTH).removesuffix(LONG) for q in self.wanted)
+        judges = {q: Judge(who, self.integrator, endured, q, UNITS[q]) for q in wanted if q in kept}
+        if not judges:
+            return None
+        off = {
+            q: excess(judge.growth_row() if self.growth else judge.judged(end)) for q, judge in judges.items()
+        }
+        judges = {q: judge for q, judge in judges.items() if off[q]} or judges
+        judge = next(iter(judges.values()))
+        runs = endured.runs if self.growth else judge.usable(end)
+        return ShownLong(
+            replace(case, steps=tuple(run.resolution for run in runs)),
+            max(off.values()),
+            np.arange(count + 1, dtype=np.float64) * sample,
+            self.integrator,
+            tuple(judges),
+            self.growth,
+            judge.due,
+            {q: float(judge.rounding(end, BLOCKS)) for q, judge in judges.items()},
+            {q: float(judge.passed(end)) for q, judge in judges.items()},
+        )
+
+
+def excess(row: Row) -> float:
+    """Drift, or its growth, over what is allowed, of a row that disagrees; else 0."""
+    return (row.value or 0.0) / (row.tolerance or 1.0) if row.verdict == "disagrees" else 0.0

@@ -1,0 +1,66 @@
+"""A run that an engine makes in two ways, and ends otherwise: there and back, or by another linear solver."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from plumbline.engines.registry import adapter
+from plumbline.judging.metamorphic import BY, REVERSED, allowed, apart, row, sizes
+from plumbline.model.datatypes import Integrator, Model, State
+from plumbline.reproduce.engine_client import OfRuns
+from plumbline.reproduce.shrink import Case
+
+
+@dataclass(frozen=True, eq=False)
+class ShownTwice:
+    """A run whose two ends should be the same."""
+
+    case: Case
+    ratio: float
+    name: str  # of the relation
+    integrator: Integrator
+    solver: str  # the other one; empty where the run is there and back
+    allowed: dict[str, float]  # m, rad, m/s, rad/s: the largest difference of a body
+
+
+def both_ends(
+    engine: str, relation: str, integrator: str, model: Model, state: State, end: float, resolution: float
+) -> tuple[State, State, int]:
+    """The two samples that should be the same, and the steps between (to be called in a worker)."""
+    chosen = adapter(engine)
+    if relation == REVERSED:
+        run = chosen.retrace(model, state, end, integrator, resolution)
+        return row(run, 0), row(run, 2, -1.0), run.steps
+    times = np.array([0.0, end])
+    ways = chosen, chosen.by(relation.removeprefix(BY))
+    one, other = (way.simulate(model, state, times, integrator, resolution) for way in ways)
+    return row(one, -1), row(other, -1), one.steps
+
+
+@dataclass
+class Twice(OfRuns):
+    """By how much the two ends of a run differ, over what rounding and its steps' solver explain."""
+
+    relation: str
+
+    def __call__(self, case: Case) -> ShownTwice | None:
+        """None for what the engine refuses, and for drag, which knows the direction of time."""
+        model, state, until, (resolution,) = case.model, case.state, case.until, case.steps
+        if model.has_drag and self.relation == REVERSED:
+            return None
+        try:
+            one, other, steps = self.engine.ask(
+                both_ends, self.relation, self.method, model, state, until, resolution
+            )
+            limit = allowed(self.integrator, model, state, until, steps)
+        except Exception:
+            return None
+        solver = "" if self.relation == REVERSED else self.relation.removeprefix(BY)
+        limit *= 2 if solver else 1  # both runs are off
+        length, spin, speed = sizes(model, one)
+        scales = {"position": length, "attitude": 1.0, "velocity": speed, "angular velocity": spin}
+        most = {name: float(limit * scale) for name, scale in scales.items()}
+        ratio = max(apart(model, one, other).values()) / limit
+        return ShownTwice(case, ratio, self.relation, self.integrator, solver, most)

@@ -1,0 +1,93 @@
+"""The field reference of scenario files, written from the schema: python -m plumbline.scenario.field_docs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from plumbline.scenario.loader import schema
+from plumbline.scenario.schema import SCHEMA_VERSION
+
+HEADINGS = {  # in the page's order
+    "Document": "The file",
+    "Body": "`bodies[]`: a body",
+    "Run": "`bodies[]`: a run of bodies",
+    "Ball": "`joint`, kind ball",
+    "Rod": "`joint`, kind rod",
+    "Attitude": "`attitude`",
+    "AxisAngle": "`axis_angle`, `turn`",
+    "Euler": "`euler`",
+    "Inertia": "`inertia`",
+    "Load": "`load`",
+    "Drag": "`drag`",
+}
+BOUNDS = {"exclusiveMinimum": "> {}", "minimum": "≥ {}", "maximum": "≤ {}", "maxLength": "≤ {} characters"}
+INTRODUCTION = f"""\
+# Scenario files
+
+This page is written by `python -m plumbline.scenario.field_docs` from the schema that reads the files;
+a test keeps it so. [Add a scenario](add-a-scenario.md) is the worked example.
+
+A scenario file is YAML 1.2 (UTF-8, no tabs for indentation) of schema version {SCHEMA_VERSION}.
+It describes one open chain of rigid bodies that hangs from the world's origin, its state at t = 0
+and its loads. Everything is in SI units; angles are in rad unless the field is called `degrees`;
+the world's z points up; a body's frame has its origin at the centre of mass. Numbers are written
+alone, without a unit. Unknown fields are refused.
+
+`python -m plumbline check FILE…` names every mistake of every file with line and column;
+`python -m plumbline schema` prints the JSON Schema for editors.
+
+Initial states are given in minimal terms, from which positions and velocities follow: no state can
+be off the joints. Quaternions and directions are normalised; a rod's rate is freed of what rounding
+left along the rod.
+"""
+
+
+def field_reference() -> str:
+    """The whole page, Markdown."""
+    whole = schema()
+    parts = {"Document": whole, **whole["$defs"]}
+    return "\n".join([INTRODUCTION, *(section(parts[name], heading) for name, heading in HEADINGS.items())])
+
+
+def section(part: dict[str, Any], heading: str) -> str:
+    """One part of the file: what it is, and its fields."""
+    lines = [f"## {heading}", "", part["description"], ""]
+    lines += ["| field | type | unit | default | meaning |", "|---|---|---|---|---|"]
+    for name, field in part["properties"].items():
+        default = "required" if name in part.get("required", ()) else written(field.get("default"))
+        meaning = field["description"] + "".join(f" Example: `{e}`." for e in field.get("examples", ()))
+        cells = (f"`{name}`", kind(field), field.get("unit", ""), default, meaning)
+        lines.append(("| " + " | ".join(cells) + " |").replace("|  |", "| |"))
+    return "\n".join([*lines, ""])
+
+
+def written(default: Any) -> str:
+    """A default as it would be typed; a dash where absence has a meaning of its own."""
+    return "–" if default is None else f"`{default}`"
+
+
+def kind(field: dict[str, Any]) -> str:
+    """The type of a field, with its bounds, in a reader's words."""
+    bounds = [text.format(field[name]) for name, text in BOUNDS.items() if name in field]
+    return ", ".join([kind_name(field), *bounds])
+
+
+def kind_name(field: dict[str, Any]) -> str:
+    """The type of a field without its bounds."""
+    if alternatives := field.get("anyOf") or field.get("oneOf"):
+        return " or ".join(kind(option) for option in alternatives if option.get("type") != "null")
+    if "$ref" in field:
+        name = str(field["$ref"]).rpartition("/")[2]
+        return "axis_angle" if name == "AxisAngle" else name.lower()
+    if options := field.get("enum") or ([field["const"]] if "const" in field else []):
+        return ", ".join(f"`{option}`" for option in options)
+    if field["type"] == "array":
+        if field.get("minItems", 0) == field.get("maxItems"):
+            inner = kind(field["items"])
+            return f"{field['minItems']} " + (f"× {inner}" if inner[0].isdigit() else f"{inner}s")
+        return f"list of {kind(field['items'])}"
+    return {"integer": "whole number", "string": "text"}.get(field["type"], str(field["type"]))
+
+
+if __name__ == "__main__":
+    print(field_reference(), end="")

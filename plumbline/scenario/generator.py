@@ -1,0 +1,105 @@
+"""Random scenarios: any mix of joints, full inertias, masses over decades, slow to fast, loads and drag.
+
+Scenario k of a seed depends on the seed and k alone, so that one of ten thousand is made again without
+the others.  Each is a document like any scenario file's and passes the same checks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, overload
+
+import numpy as np
+
+from plumbline.model.sampling import seed_of
+from plumbline.scenario.loader import Scenario, made
+
+FAMILY = "random"
+MOST_BODIES = 10
+DECADES = 3.0  # masses in a wild scenario reach from 1e-3 to 1e3 kg; in a tame one 0.1 to 10 kg
+PURPOSE = (
+    "Nobody chose it, so nobody's blind spot shaped it: generic geometry, full inertia, rates and loads "
+    "shows any mistake that a symmetric or planar case hides."
+)
+
+
+class RandomScenarios(Sequence[Scenario]):
+    """The first ``count`` scenarios of a seed, each made when it is asked for."""
+
+    def __init__(self, seed: int, count: int) -> None:
+        self.seed, self.numbers = seed, range(count)
+
+    def __len__(self) -> int:
+        """How many."""
+        return len(self.numbers)
+
+    @overload
+    def __getitem__(self, k: int) -> Scenario: ...
+    @overload
+    def __getitem__(self, k: slice) -> list[Scenario]: ...
+    def __getitem__(self, k: int | slice) -> Scenario | list[Scenario]:
+        """Scenario k."""
+        if isinstance(k, slice):
+            return [random_scenario(self.seed, number) for number in self.numbers[k]]
+        return random_scenario(self.seed, self.numbers[k])
+
+
+def random_scenario(seed: int, k: int) -> Scenario:
+    """Scenario k of a seed."""
+    content = document(seed, k)
+    return made(content, f"{content['name']}.yaml")
+
+
+def document(seed: int, k: int) -> dict[str, Any]:
+    """The content of its file: every number finite and written with all its digits."""
+    rng = np.random.default_rng(seed_of("random scenario", str(seed), str(k)))
+    n = int(np.clip(rng.geometric(0.3), 1, MOST_BODIES))  # short chains most often
+    wild = bool(rng.random() < 0.25)
+    decades = DECADES if wild else 1.0
+    rate = 10 ** rng.uniform(-1.0, 1.0)  # rad/s
+    loaded, dragged = rng.random(2) < 0.3
+    return {
+        "schema_version": 1,
+        "name": f"random-{seed}-{k}",
+        "family": FAMILY,
+        "title": f"Random {k} of seed {seed}: {n} {'body' if n == 1 else 'bodies'}{', wild masses' * wild}",
+        "purpose": PURPOSE,
+        "duration": 1.0,
+        "bodies": [body(rng, decades, rate, bool(loaded), bool(dragged), i == n - 1) for i in range(n)],
+    }
+
+
+def body(
+    rng: np.random.Generator, decades: float, rate: float, loaded: bool, dragged: bool, last: bool
+) -> dict[str, Any]:
+    """One body of a chain, its inertia an ellipsoid's of some attitude: physical whatever is drawn."""
+    mass = 10 ** rng.uniform(-decades, decades)
+    squares = rng.uniform(0.05, 0.5, 3) ** 2  # m², semi-axes
+    found: dict[str, Any] = {
+        "mass": mass,
+        "inertia": {
+            "principal": (mass / 5 * (squares.sum() - squares)).tolist(),
+            "axes": {"quaternion": rng.normal(size=4).tolist()},
+        },
+        "proximal": (0.3 * rng.normal(size=3)).tolist(),
+        "attitude": {"quaternion": rng.normal(size=4).tolist()},
+        "angular_velocity": (rate * rng.normal(size=3)).tolist(),
+        "joint": {"kind": "ball"},
+    }
+    if rng.random() < 0.4:
+        found["joint"] = {
+            "kind": "rod",
+            "length": 10 ** rng.uniform(-1.0, 0.3),
+            "direction": rng.normal(size=3).tolist(),
+            "angular_velocity": (rate * rng.normal(size=3)).tolist(),
+        }
+    if not last:
+        found["distal"] = (0.3 * rng.normal(size=3)).tolist()
+    if loaded:
+        found["load"] = {
+            "force": (mass * rng.normal(size=3)).tolist(),
+            "moment": (mass * rng.normal(size=3)).tolist(),
+        }
+    if dragged:
+        found["drag"] = {"force": mass * rng.uniform(0.0, 1.0), "moment": mass * rng.uniform(0.0, 0.1)}
+    return found

@@ -1,0 +1,267 @@
+"""A scenario: what is to be true. Its file, checked, becomes a model and an exact initial state."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.kinematics import lift, multiply, rotation
+from plumbline.scenario.errors import Problem, ScenarioError, closest, nearest
+from plumbline.scenario.schema import (
+    MAX_BODIES,
+    Body,
+    Document,
+    Rod,
+    attitude_quaternion,
+    inertia_matrix,
+    unit_vector,
+)
+from plumbline.scenario.validation_messages import translate
+from plumbline.scenario.yaml_source import Key, Source, dotted, parse, read
+
+__all__ = [
+    "Problem",
+    "Scenario",
+    "ScenarioError",
+    "catalogue",
+    "find",
+    "load",
+    "load_many",
+    "loads",
+    "made",
+    "schema",
+    "slug",
+]
+
+CATALOGUE = Path(__file__).resolve().parents[2] / "scenarios"
+HUGE = 1e30  # beyond it squares and products leave the range where engines can compute
+FAMILIES = ("single", "double", "chain")
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """One pendulum, its loads and its exact initial state.
+
+    ``state`` holds the minimal coordinates (p, omega, u, udot) that truth in high precision
+    starts from: p and u are unit to rounding, udot is perpendicular to u to rounding.
+    ``name``, ``title`` and the other texts are the file's own and may hold any printable
+    character: escape them where they go into HTML, XML, shells or file names (`slug`).
+    """
+
+    name: str
+    family: str
+    title: str
+    purpose: str  # the sentence on what it is there to catch
+    schema_version: int
+    model: Model
+    state: State
+    duration: float  # s
+    sample: float  # s, between compared samples
+    exact: str | None  # id of its closed-form solution
+    bodies: tuple[str, ...]  # N names, for the reader
+    path: Path
+    digest: str  # sha256 of the checked content: layout and comments do not count
+    document: dict[str, Any] = field(repr=False, default_factory=dict)  # the checked content as plain data
+
+    @property
+    def times(self) -> Array:
+        """(T,) s, the sample times from 0 to the duration."""
+        return np.arange(round(self.duration / self.sample) + 1, dtype=np.float64) * self.sample
+
+
+def load(path: str | Path) -> Scenario:
+    """The scenario of a YAML file; raises ScenarioError with every problem of the file."""
+    return _build(read(Path(path)), Path(path))
+
+
+def loads(content: str, name: str = "scenario") -> Scenario:
+    """The scenario of YAML text; ``name`` stands for the file."""
+    return _build(parse(Source(name), content), Path(name))
+
+
+def made(content: dict[str, Any], name: str) -> Scenario:
+    """The scenario of plain data that a program made, checked as a file's is."""
+    return _build(Source(name, content, values=defaultdict(lambda: (1, 1))), Path(name))
+
+
+def load_many(names: Iterable[str | Path]) -> list[Scenario]:
+    """Scenarios by catalogue name or path, each once; problems of all files at once in one ScenarioError."""
+    found: dict[str, Scenario] = {}
+    problems: list[Problem] = []
+    for name in names:
+        try:
+            scenario = load(find(name))
+        except ScenarioError as error:
+            problems += error.problems
+            continue
+        other = found.setdefault(scenario.name, scenario)
+        if other.digest != scenario.digest:
+            message = f"is named {scenario.name!r} like {other.path}"
+            problems.append(Problem(str(scenario.path), 0, 0, "name", message, "a name of its own"))
+    if problems:
+        raise ScenarioError(dict.fromkeys(problems))
+    return list(found.values())
+
+
+def catalogue() -> dict[str, Path]:
+    """Name → file of every scenario that comes with the project, family by family."""
+    files = (path for family in FAMILIES for path in sorted((CATALOGUE / family).glob("*.yaml")))
+    return {path.stem: path for path in files}
+
+
+def find(name: str | Path) -> Path:
+    """The file of a catalogue name, or the path itself; ScenarioError suggests the nearest name."""
+    known = catalogue()
+    if str(name) in known:
+        return known[str(name)]
+    path = Path(name)
+    if path.suffix in (".yaml", ".yml") or len(path.parts) > 1 or path.is_file():
+        return path
+    valid = f"a path of a YAML file, or one of: {', '.join(known)}"
+    message = f"unknown scenario. {nearest(str(name), list(known))}".rstrip(" .")
+    raise ScenarioError([Problem(str(name), 0, 0, "", message, valid)])
+
+
+def slug(name: str) -> str:
+    """A file name for a scenario's name, safe and distinct also where capitals do not count."""
+    plain = re.sub(r"[^a-z0-9-]+", "-", name.lower()).strip("-")[:60]
+    reserved = re.fullmatch("con|prn|aux|nul|(com|lpt)[0-9]", plain)  # devices on Windows
+    if plain == name and not reserved:
+        return plain
+    return f"{plain or 'scenario'}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
+
+
+def schema() -> dict[str, Any]:
+    """JSON Schema of scenario files, for editors."""
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **Document.model_json_schema()}
+
+
+def _build(source: Source, path: Path) -> Scenario:
+    problems = list(source.problems)
+    document = None
+    try:
+        document = Document.model_validate(source.data)
+    except ValidationError as error:
+        version = [
+            e for e in error.errors() if e["loc"] == ("schema_version",) and e["type"] == "literal_error"
+        ]
+        if version:  # the fields of another version are not this one's to judge
+            raise ScenarioError(translate(source, version)) from None
+        problems += translate(source, error.errors())
+    problems += _distal_problems(source)
+    if problems or document is None:
+        raise ScenarioError(problems)
+    bodies = list(_expand(document))
+    if len(bodies) > MAX_BODIES:
+        raise source.stop(f"has {len(bodies)} bodies", f"at most {MAX_BODIES}", source.values[("bodies",)])
+    with np.errstate(all="ignore"):
+        model = _model(document, [body for body, _ in bodies])
+        state = lift(model, *_minimal(bodies))
+    for name, array in {**vars(model), **vars(state)}.items():
+        if not np.all(np.abs(array) <= HUGE):
+            raise source.stop(
+                f"has numbers that make {name} larger than {HUGE:g}", "SI numbers of a pendulum", (1, 1)
+            )
+    content = document.model_dump(mode="json")
+    content["name"] = document.name or path.stem
+    canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return Scenario(
+        name=content["name"],
+        family=document.family,
+        title=document.title,
+        purpose=" ".join(document.purpose.split()),
+        schema_version=document.schema_version,
+        model=model,
+        state=state,
+        duration=document.duration,
+        sample=document.sample,
+        exact=document.exact,
+        bodies=tuple(body.name or f"body {k + 1}" for k, (body, _) in enumerate(bodies)),
+        path=path,
+        digest=hashlib.sha256(canonical.encode()).hexdigest(),
+        document=content,
+    )
+
+
+def _distal_problems(source: Source) -> Iterator[Problem]:
+    """Bodies that carry another one without saying where; found in the raw data, so beside other problems."""
+    valid = "the point, in the frame of this body, from which the next one hangs, as [0, 0, -0.2] (m)"
+    items = source.data.get("bodies") if isinstance(source.data, dict) else None
+    items = items if isinstance(items, list) else []
+    for index, item in enumerate(items):
+        written: list[tuple[tuple[Key, ...], Any]] = [(("bodies", index), item)]
+        count = 1
+        if isinstance(item, dict) and isinstance(item.get("cycle"), list):
+            written = [(("bodies", index, "cycle", k), body) for k, body in enumerate(item["cycle"])]
+            count = item.get("repeat", 0)
+        for place, (path, body) in enumerate(written):
+            ends = index == len(items) - 1 and count == place + 1  # the chain's last body, copied once
+            if ends or not isinstance(body, dict) or body.get("distal") is not None:
+                continue
+            if any(closest(key, ["distal"]) for key in body if key not in Body.model_fields):
+                continue  # misspelt, and named as such
+            yield Problem(
+                source.file,
+                *source.values[path],
+                dotted((*path, "distal")),
+                "is missing: a body follows",
+                valid,
+            )
+
+
+def _expand(document: Document) -> Iterator[tuple[Body, Array]]:
+    """Every body of the chain with the quaternion (4,) it is turned by, runs written out."""
+    for item in document.bodies:
+        if isinstance(item, Body):
+            yield item, np.array([1.0, 0.0, 0.0, 0.0])
+            continue
+        for j in range(item.repeat):
+            turn = item.turn.quaternion(j) if item.turn and j else np.array([1.0, 0.0, 0.0, 0.0])
+            yield item.cycle[j % len(item.cycle)], turn
+
+
+def _model(document: Document, bodies: list[Body]) -> Model:
+    zero = [0.0, 0.0, 0.0]
+    distal = [body.distal or zero for body in bodies]
+    distal[-1] = zero
+    return Model(
+        mass=np.array([body.mass for body in bodies], dtype=float),
+        inertia=np.array([inertia_matrix(body.inertia) for body in bodies]),
+        proximal=np.array([body.proximal for body in bodies], dtype=float),
+        distal=np.array(distal, dtype=float),
+        length=np.array([body.joint.length if isinstance(body.joint, Rod) else 0.0 for body in bodies]),
+        gravity=np.array(document.gravity, dtype=float),
+        force=np.array([body.load.force for body in bodies], dtype=float),
+        moment=np.array([body.load.moment for body in bodies], dtype=float),
+        drag_force=np.array([body.drag.force for body in bodies], dtype=float),
+        drag_moment=np.array([body.drag.moment for body in bodies], dtype=float),
+    )
+
+
+def _minimal(bodies: list[tuple[Body, Array]]) -> tuple[Array, Array, Array, Array]:
+    """p, omega, u, udot of the chain: unit and perpendicular to rounding."""
+    n = len(bodies)
+    p, u, udot = np.empty((n, 4)), np.zeros((n, 3)), np.zeros((n, 3))
+    for k, (body, turn) in enumerate(bodies):
+        p[k] = unit_vector(multiply(turn, attitude_quaternion(body.attitude)).tolist())
+        if isinstance(body.joint, Rod):
+            world = rotation(turn)
+            u[k] = unit_vector((world @ unit_vector(body.joint.direction)).tolist())
+            if body.joint.angular_velocity is not None:
+                rate = np.cross(world @ np.array(body.joint.angular_velocity), u[k])
+            else:
+                rate = world @ np.array(body.joint.rate or [0.0, 0.0, 0.0])
+            for _ in range(2):  # the second pass removes what rounding left of the first
+                rate = rate - (rate @ u[k]) * u[k]
+            udot[k] = rate
+    return p, np.array([body.angular_velocity for body, _ in bodies], dtype=float), u, udot

@@ -1,0 +1,1 @@
+"""Storage: results as Parquet and JSON; history over nights."""

@@ -1,0 +1,199 @@
+"""The output folder: results.json and Parquet tables, each written whole or not at all.
+
+Layout (`SCHEMA_VERSION` changes whenever a reader must): results.json, summary.parquet,
+states.parquet, convergence.parquet, curves.parquet, trajectories.parquet; see
+docs/results.md.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import tempfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from plumbline.judging.rows import Columns
+from plumbline.model.datatypes import Row
+
+SCHEMA_VERSION = 1
+TEXT = pa.string()
+REAL = pa.float64()
+WHOLE = pa.int32()
+GROUP = 8_192  # records encoded together: what waits is small
+PARTS = 32  # tables of a few records that wait apart: each is tens of kilobytes besides its records
+
+
+def _schema(**columns: pa.DataType) -> pa.Schema:
+    return pa.schema(list(columns.items()))
+
+
+_CELL = {"scenario": TEXT, "engine": TEXT}
+_RUN = {**_CELL, "integrator": TEXT, "resolution": REAL}
+TABLES: dict[str, pa.Schema] = {
+    "summary": _schema(
+        key=TEXT, scenario=TEXT, family=TEXT, engine=TEXT, engine_version=TEXT, level=TEXT, integrator=TEXT,
+        quantity=TEXT, unit=TEXT, value=REAL, tolerance=REAL, verdict=TEXT, reason=TEXT, derivation=TEXT,
+        uncertainty=REAL, horizon=REAL, order=REAL, declared_order=WHOLE, alias_of=TEXT, known=TEXT,
+        diagnosis=TEXT, accept=REAL, wall_time=REAL, extra=TEXT,
+    ),
+    "states": _schema(**_CELL, quantity=TEXT, state=WHOLE, body=WHOLE, error=REAL, bound=REAL, scale=REAL),
+    "convergence": _schema(**_RUN, quantity=TEXT, error=REAL, cost=REAL, steps=WHOLE, order=REAL),
+    "curves": _schema(
+        **_RUN, t=REAL, position_error=REAL, attitude_error=REAL, limit_error=REAL, tolerance=REAL,
+        energy_drift=REAL, momentum_drift=REAL, joint_gap=REAL, gap_rate=REAL, norm_drift=REAL,
+    ),
+    "trajectories": _schema(
+        **_RUN, t=REAL, body=WHOLE, rx=REAL, ry=REAL, rz=REAL, p0=REAL, p1=REAL, p2=REAL, p3=REAL
+    ),
+}  # fmt: skip
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write to a temporary name beside ``path``, flush to the disk, rename; the old file stays on failure."""
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):  # what stopped the writing may stop this too, and is what to tell
+            os.unlink(temporary)
+        raise
+
+
+def plain(value: Any) -> Any:
+    """JSON has no NaN or infinity: they become null, everywhere below ``value``."""
+    if isinstance(value, float) and not (-float("inf") < value < float("inf")):
+        return None
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return value
+
+
+def row_record(row: Row) -> dict[str, Any]:
+    """A row as results.json holds it."""
+    return {"key": row.key, **plain(vars(row))}
+
+
+class Tables:
+    """The tables of a run, encoded as they come: ten thousand cells take a few megabytes.
+
+    Parquet in zstd, floats split by byte, in row groups of `GROUP` records.
+    """
+
+    def __init__(self) -> None:
+        self._waiting: dict[str, list[pa.Table]] = {}
+        self._files: dict[str, tuple[pa.BufferOutputStream, pq.ParquetWriter]] = {}
+
+    def add(self, name: str, columns: Columns) -> None:
+        """Take in records of the table ``name``."""
+        schema = TABLES[name]
+        count = next((len(c) for c in columns.values() if isinstance(c, list | np.ndarray)), 1)
+        arrays = [
+            pa.array(columns[field.name], field.type)
+            if isinstance(columns[field.name], list | np.ndarray)
+            else pa.repeat(pa.scalar(columns[field.name], field.type), count)
+            for field in schema
+        ]
+        waiting = self._waiting.setdefault(name, [])
+        waiting.append(pa.Table.from_arrays(arrays, schema=schema))
+        if sum(map(len, waiting)) >= GROUP:
+            self._encode(name)
+        elif len(waiting) >= PARTS:
+            waiting[:] = [pa.concat_tables(waiting).combine_chunks()]
+
+    def add_rows(self, rows: Iterable[Row]) -> None:
+        """Take in rows for the summary."""
+        kept = list(rows)
+        if kept:
+            columns: Columns = {
+                name: [getattr(row, name) for row in kept] for name in TABLES["summary"].names
+            }
+            for field in TABLES["summary"]:
+                if field.type == REAL:
+                    column = columns[field.name]
+                    columns[field.name] = [x if x is not None and math.isfinite(x) else None for x in column]
+            columns["extra"] = [json.dumps(plain(extra)) for extra in columns["extra"]]
+            self.add("summary", columns)
+
+    def _encode(self, name: str) -> None:
+        if name not in self._files:
+            schema, sink = TABLES[name], pa.BufferOutputStream()
+            writer = pq.ParquetWriter(
+                sink,
+                schema,
+                compression="zstd",
+                use_dictionary=[f.name for f in schema if f.type == TEXT],
+                column_encoding={f.name: "BYTE_STREAM_SPLIT" for f in schema if f.type == REAL},
+            )
+            self._files[name] = sink, writer
+        self._files[name][1].write_table(pa.concat_tables(self._waiting.pop(name, [])), GROUP)
+
+    def write(self, folder: Path) -> None:
+        """Write each as FOLDER/NAME.parquet; nothing can be added any more."""
+        for name in TABLES:
+            if name in self._waiting or name not in self._files:
+                self._waiting.setdefault(name, []).append(TABLES[name].empty_table())
+                self._encode(name)
+            sink, writer = self._files[name]
+            writer.close()
+            write_atomically(folder / f"{name}.parquet", sink.getvalue().to_pybytes())
+
+
+def read_table(folder: Path, name: str) -> list[dict[str, Any]]:
+    """The records of one table."""
+    records: list[dict[str, Any]] = pq.read_table(folder / f"{name}.parquet").to_pylist()
+    return records
+
+
+def write(
+    folder: Path,
+    run: dict[str, Any],
+    scenarios: dict[str, Any],
+    engines: dict[str, Any],
+    rows: Sequence[Row],
+    tables: Tables,
+) -> None:
+    """Write one run's results; the summary in ``tables`` holds ``rows`` and may hold more (of probes)."""
+    folder.mkdir(parents=True, exist_ok=True)
+    tables.write(folder)
+    document = {
+        "schema_version": SCHEMA_VERSION,
+        "run": run,
+        "scenarios": scenarios,
+        "engines": engines,
+        "rows": [row_record(row) for row in rows],
+    }
+    # results.json last: its presence says that the folder is complete
+    text = json.dumps(plain(document), ensure_ascii=False, indent=1)
+    write_atomically(folder / "results.json", text.encode())
+
+
+def read(folder: Path) -> dict[str, Any]:
+    """The document of results.json; ValueError where it is not one of this schema."""
+    path = folder / "results.json"
+    try:
+        document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        found = document["schema_version"]
+    except FileNotFoundError:
+        raise ValueError(
+            f"{path}: no results here; `python -m plumbline run --out {folder}` makes them"
+        ) from None
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: not a results file of plumbline ({error})") from None
+    if found != SCHEMA_VERSION:
+        raise ValueError(f"{path}: schema_version {found}, this version reads {SCHEMA_VERSION}")
+    return document

@@ -1,0 +1,1 @@
+"""Studies: one scenario over ranges of parameters or long times."""

@@ -1,0 +1,56 @@
+"""Jacobi's elliptic functions and Legendre's integrals from the complementary parameter m₁ = 1 − m.
+
+scipy takes m alone, which loses the digits of 1 − m near a separatrix (a pendulum close to upright, a
+brick spun about its middle axis), so the functions are built here from the arithmetic-geometric mean.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import elliprf, elliprj
+
+from plumbline.model.datatypes import Array
+
+
+def jacobi(u: Array, m1: float) -> tuple[Array, Array, Array, Array]:
+    """(sn, cn, dn, am) (T,) of u (T,), 0 ≤ m1 ≤ 1.  Abramowitz & Stegun 16.4 (descending Landen)."""
+    u = np.asarray(u, dtype=float)
+    if m1 == 0:
+        sech = 1 / np.cosh(u)
+        return np.tanh(u), sech, sech, 2 * np.arctan(np.tanh(u / 2))
+    a, b, c = [1.0], np.sqrt(m1), [np.sqrt(1 - m1)]
+    while c[-1] > 1e-9 * a[-1]:  # the next c is c²/4a
+        a, b, c = [*a, (a[-1] + b) / 2], np.sqrt(a[-1] * b), [*c, (a[-1] - b) / 2]
+    phi = 2.0 ** (len(a) - 1) * a[-1] * u
+    for ratio in reversed([cn / an for cn, an in zip(c[1:], a[1:], strict=True)]):
+        phi = (phi + np.arcsin(np.clip(ratio * np.sin(phi), -1, 1))) / 2
+    sn, cn = np.sin(phi), np.cos(phi)
+    return sn, cn, np.sqrt(cn * cn + m1 * sn * sn), phi
+
+
+def first(phi: Array | float, m1: float) -> Array:
+    """F(φ | m), Legendre's integral of the first kind, every φ.  DLMF 19.25.5, Carlson's R_F."""
+    turns, s, c = _folded(phi)
+    part = s * elliprf(c * c, c * c + m1 * s * s, 1.0)
+    return np.asarray(part + 2 * turns * elliprf(0.0, m1, 1.0) if np.any(turns) else part)
+
+
+def third(n: float, phi: Array | float, m1: float) -> Array:
+    """Π(n; φ | m) = ∫ dφ / ((1 − n sin²φ) √(1 − m sin²φ)), n < 1, every φ.  DLMF 19.25.14."""
+    turns, s, c = _folded(phi)
+    part = _third(n, s, c, m1)
+    whole = _third(n, np.ones(1), np.zeros(1), m1)[0] if np.any(turns) else 0.0
+    return np.asarray(part + 2 * turns * whole)
+
+
+def _third(n: float, s: Array, c: Array, m1: float) -> Array:
+    d, q = c * c + m1 * s * s, c * c + (1 - n) * s * s
+    return np.asarray(s * elliprf(c * c, d, 1.0) + n / 3 * s**3 * elliprj(c * c, d, 1.0, q))
+
+
+def _folded(phi: Array | float) -> tuple[Array, Array, Array]:
+    """Half turns, and sine and cosine of the rest, which lies in [−π/2, π/2]."""
+    phi = np.asarray(phi, dtype=float)
+    turns = np.round(phi / np.pi)
+    sign = np.where(turns % 2 == 0, 1.0, -1.0)
+    return turns, sign * np.sin(phi), np.abs(np.cos(phi))

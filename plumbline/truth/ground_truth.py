@@ -1,0 +1,145 @@
+"""What engines are measured with: the truth of a scenario, how sure it is, and how sharp it must be.
+
+Runs inside a worker.  State level: rigorous enclosures in ball arithmetic.  Along trajectories: the closed
+form where the scenario has one, else Taylor's method in minimal coordinates; uncertain by the difference
+from a method of another kind (`plumbline.truth.trajectory`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from plumbline.engines.registry import adapter
+from plumbline.model.datatypes import Array, Model, State, StateQuantities, Trajectory
+from plumbline.model.invariants import attitude_error, position_error
+from plumbline.model.kinematics import lift
+from plumbline.model.sampling import seed_of
+from plumbline.truth import TruthUnavailable
+from plumbline.truth.certified import certify
+from plumbline.truth.rounding_bound import Bound, state_bound
+from plumbline.truth.sensitivity import growth_beside
+from plumbline.truth.trajectory import COMPILED, Exact, trajectory_truth
+
+ROUNDING = 1e3 * 2.0**-52  # of a whole run, before growth: trials saw at most 115 ε G (verification.md)
+PARTED = "; they part by more than rounding explains: one of the two is wrong, or at its limits"
+PART = 1e-4  # a mistake of this relative size in a parameter must be visible, or the verdict is unresolved
+
+
+@dataclass(frozen=True, eq=False)
+class StateTruth:
+    """True quantities at a list of states, and the tolerance of each."""
+
+    states: list[State]
+    quantities: list[StateQuantities]
+    bounds: list[Bound]
+    method: str
+
+
+@dataclass(frozen=True, eq=False)
+class MotionTruth:
+    """The true motion at the sample times, and what may be concluded from it."""
+
+    trajectory: Trajectory
+    position_uncertainty: Array  # (T,) m, running maximum
+    attitude_uncertainty: Array  # (T,) rad, running maximum
+    growth: Array  # (T,) –: of a small perturbation, running maximum
+    visible_position: Array  # (T,) m: the least that a mistake of one part in 10⁴ does, up to t
+    visible_attitude: Array  # (T,) rad
+    length: float  # m: the stretched chain, the scale of rounding in positions
+    method: str
+
+
+def state_truth(model: Model, states: Sequence[State]) -> StateTruth:
+    """True state quantities and their rounding bounds; certified where the truth tools are installed."""
+    bounds = [state_bound(model, state) for state in states]
+    try:
+        certified = [certify(model, state, mass_matrix=True) for state in states]
+    except TruthUnavailable:
+        said = adapter("reference").evaluate(model, states)
+        method = "the notes' direct system in double precision (truth tools are not installed)"
+        return StateTruth(list(states), said, bounds, method)
+    bits = max(answer.bits for answer in certified)
+    method = f"certified: enclosed in ball arithmetic of {bits} bits"
+    return StateTruth(list(states), [answer.quantities for answer in certified], bounds, method)
+
+
+def motion_truth(
+    model: Model, state: State, times: Array, exact: Exact | None, compiled: int = COMPILED
+) -> MotionTruth:
+    """True motion from ``state`` at ``times``; ``exact`` is a closed form's (r, p, source), if any.
+
+    Taylor's method is asked of up to ``compiled`` bodies: of none by 0, for where it brought a worker down.
+    """
+    found = trajectory_truth(model, state, times, exact, compiled)
+    grown, r, p = growth_beside(model, state, times, mistaken(model, state))
+    grown, length = np.maximum.accumulate(grown), float(np.sum(reach(model)))
+    apart = (found.position_uncertainty > length * ROUNDING * grown) | (
+        found.attitude_uncertainty > 2 * ROUNDING * grown
+    )
+    return MotionTruth(
+        found.trajectory,
+        found.position_uncertainty,
+        found.attitude_uncertainty,
+        grown,
+        *visible(model, r, p),
+        length=length,
+        method=found.method + (PARTED if apart.any() else ""),
+    )
+
+
+def reach(model: Model) -> Array:
+    """(N,) m: from where body k hangs to where the next one does, stretched; at least to its centre.
+
+    And at least the body's radius of gyration: a body that hangs at its centre of mass has a size too.
+    """
+    span = np.linalg.norm(model.proximal - model.distal, axis=1)
+    span[-1] = 0.0
+    gyration = np.sqrt(np.trace(model.inertia, axis1=1, axis2=2) / (2 * model.mass))
+    sizes = [span, np.linalg.norm(model.proximal, axis=1), gyration]
+    return np.asarray(model.length + np.max(sizes, axis=0))
+
+
+def mistaken(model: Model, state: State) -> list[tuple[Model, State]]:
+    """The model with mistakes of one part in 10⁴, and the same minimal state lifted onto each of them.
+
+    Gravity, the masses, the inertias, the attachments are wrong in turn, each entry by ±1e-4 of itself with
+    random signs.
+    """
+    rng = np.random.default_rng(seed_of("visible"))
+
+    def off(x: Array) -> Array:
+        return np.asarray(x * (1 + PART * rng.choice([-1.0, 1.0], size=x.shape)))
+
+    entries = off(np.ones((model.n, 3, 3)))
+    lopsided = model.inertia * (entries + entries.mT) / 2  # scaled as a whole a free body would not show it
+    models = [
+        replace(model, gravity=model.gravity * (1 + PART)),
+        replace(model, mass=off(model.mass)),
+        replace(model, inertia=lopsided),
+        replace(model, proximal=off(model.proximal), distal=off(model.distal)),
+    ]
+    return [(m, lift(m, state.p, state.omega, state.u, state.udot)) for m in models]
+
+
+def visible(model: Model, r: Array, p: Array) -> tuple[Array, Array]:
+    """Least effects (T,) m and rad, up to each time, of mistakes: r and p of the right motion, then theirs.
+
+    Mistakes that no motion of this scenario shows (mass of a single body, anything of a body at rest) do not
+    count.
+    """
+    scale = PART * float(np.sum(reach(model)))
+    return (
+        least_visible([position_error(r[0], wrong) for wrong in r[1:]], 1e-3 * scale),
+        least_visible([attitude_error(p[0], wrong) for wrong in p[1:]], 1e-3 * PART),
+    )
+
+
+def least_visible(effects: Sequence[Array], threshold: float) -> Array:
+    """(T,) running maximum of the smallest effect that passes the threshold at all; inf if none does."""
+    seen = [np.maximum.accumulate(e) for e in effects if np.max(e) > threshold]
+    if not seen:
+        return np.full(len(effects[0]), np.inf)
+    return np.asarray(np.min(seen, axis=0))
