@@ -15,15 +15,15 @@ from plumbline.model.datatypes import Array, EngineFailure, Model
 
 items: Any = exudyn.itemInterface  # its constructors are untyped
 
-Row = TypeVar("Row")
-SUPPORTED = ">=1.9,<2"
-Raised: type[Exception] = getattr(exudyn, "ExudynError", RuntimeError)  # its own errors, since 1.12
+Sample = TypeVar("Sample")
+SUPPORTED_VERSIONS = ">=1.9,<2"
+ENGINE_ERROR: type[Exception] = getattr(exudyn, "ExudynError", RuntimeError)  # its own errors, since 1.12
 
-NEWTON = 1e-12  # relative and absolute; at the engine's defaults extrapolation stops at 2e-9
+NEWTON_TOLERANCE = 1e-12  # relative and absolute; at the engine's defaults extrapolation stops at 2e-9
 
 
 @contextlib.contextmanager
-def quiet() -> Iterator[None]:
+def silence_engine() -> Iterator[None]:
     """A scratch working directory and no console output: Exudyn writes to both."""
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch, contextlib.chdir(scratch):
         if not hasattr(exudyn, "config"):  # before 1.10; it has no way to ask what was set before
@@ -39,13 +39,13 @@ def quiet() -> Iterator[None]:
             exudyn.config.printToConsole, exudyn.config.suppressWarnings = before
 
 
-def system() -> tuple[Any, Any]:
+def make_system() -> tuple[Any, Any]:
     """An empty system and the container that keeps it alive."""
     container = exudyn.SystemContainer()
     return container.AddSystem(), container
 
 
-def settings() -> Any:
+def make_settings() -> Any:
     """Fixed steps, Newton to `NEWTON`, nothing written."""
     chosen: Any = exudyn.SimulationSettings()
     if hasattr(chosen, "solution"):
@@ -58,12 +58,12 @@ def settings() -> Any:
     time.verboseMode = 0
     time.adaptiveStep = False
     time.automaticStepSize = False
-    time.newton.absoluteTolerance = time.newton.relativeTolerance = NEWTON
+    time.newton.absoluteTolerance = time.newton.relativeTolerance = NEWTON_TOLERANCE
     time.newton.maxIterations = 100  # its Jacobian leaves out C_qᵀλ's, so that taut rods converge linearly
     return chosen
 
 
-def rigid_body(node: Any, mass: float, J: Array) -> Any:
+def make_rigid_body(node: Any, mass: float, J: Array) -> Any:
     """A body of that mass and inertia (about its centre of mass, its own axes) on a node."""
     sizes = {"mass": mass, "inertia": [J[0, 0], J[1, 1], J[2, 2], J[1, 2], J[0, 2], J[0, 1]]}
     if "mass" not in signature(items.ObjectRigidBody).parameters:  # before 1.12
@@ -71,18 +71,18 @@ def rigid_body(node: Any, mass: float, J: Array) -> Any:
     return items.ObjectRigidBody(nodeNumber=node, **sizes)
 
 
-def linear(chosen: Any, name: str) -> None:
+def set_linear_solver(settings: Any, name: str) -> None:
     """The linear solver of that name."""
     kind = getattr(exudyn.LinearSolverType, name)
-    if hasattr(chosen, "linearSolver"):
-        chosen.linearSolver.solverType = kind
+    if hasattr(settings, "linearSolver"):
+        settings.linearSolver.solverType = kind
     else:  # before 1.12
-        chosen.linearSolverType = kind
+        settings.linearSolverType = kind
 
 
-def runge_kutta(chosen: Any) -> None:
+def set_rk44(settings: Any) -> None:
     """RK44, without the accelerations at the end of a step, which nothing here reads."""
-    time, kind = chosen.timeIntegration, exudyn.DynamicSolverType.RK44
+    time, kind = settings.timeIntegration, exudyn.DynamicSolverType.RK44
     if hasattr(time, "solverType"):
         time.solverType = kind
         time.explicit.computeEndOfStepAccelerations = False
@@ -116,15 +116,15 @@ def add_loads(mbs: Any, model: Model, k: int, marker: Any, ground: Any, moment: 
         )
 
 
-def run(
+def run_solver(
     solver: Any,
     mbs: Any,
-    chosen: Any,
+    settings: Any,
     times: Array,
     step: float,
-    read: Callable[[], Row],
-    watch: Callable[[float], None] | None = None,
-) -> list[Row]:
+    read_sample: Callable[[], Sample],
+    check_step: Callable[[float], None] | None = None,
+) -> list[Sample]:
     """What ``read`` finds at each of ``times``; ``watch(t)`` is called after every step and may raise.
 
     Raises EngineFailure with the engine's own words where a step fails, and where the number of
@@ -132,7 +132,7 @@ def run(
     """
     steps = round(float(times[-1] / step))
     wanted = set(np.rint(times / step).astype(int).tolist())
-    rows = [read()]
+    rows = [read_sample()]
     if steps == 0:
         return rows
     taken = 0
@@ -144,20 +144,20 @@ def run(
             return True
         taken += 1
         try:
-            if watch is not None:
-                watch(t)
+            if check_step is not None:
+                check_step(t)
             if taken in wanted:
-                rows.append(read())
+                rows.append(read_sample())
         except Exception as error:  # carried around the engine, which would wrap it in one of its own
             stopped = error
         return stopped is None
 
     mbs.SetPostStepUserFunction(after_step)
-    chosen.timeIntegration.numberOfSteps = steps
-    chosen.timeIntegration.endTime = float(times[-1])
+    settings.timeIntegration.numberOfSteps = steps
+    settings.timeIntegration.endTime = float(times[-1])
     try:
-        finished = solver.SolveSystem(mbs, chosen)
-    except (RuntimeError, ValueError, Raised) as error:
+        finished = solver.SolveSystem(mbs, settings)
+    except (RuntimeError, ValueError, ENGINE_ERROR) as error:
         raise EngineFailure(f"Exudyn stopped after {taken} of {steps} steps: {error}") from error
     if stopped is not None:
         raise stopped

@@ -20,16 +20,16 @@ import numpy as np
 import scipy.linalg
 
 from adapters.exudyn_common import (
-    NEWTON,
-    SUPPORTED,
+    NEWTON_TOLERANCE,
+    SUPPORTED_VERSIONS,
     add_loads,
     items,
-    linear,
-    quiet,
-    rigid_body,
-    run,
-    settings,
-    system,
+    make_rigid_body,
+    make_settings,
+    make_system,
+    run_solver,
+    set_linear_solver,
+    silence_engine,
     version,
 )
 from plumbline.engines.adapter import Adapter
@@ -42,69 +42,79 @@ from plumbline.model.datatypes import (
     StateQuantities,
     Trajectory,
 )
-from plumbline.model.kinematics import angular_velocity, rate, rotation
-from plumbline.model.welding import Parts, whole
+from plumbline.model.kinematics import angular_velocity, quaternion_rate, rotation_matrix
+from plumbline.model.welding import BodyParts, undivided_bodies
 
 Output = exudyn.OutputVariableType
 
 
-class Chain:
+class ExudynChain:
     """The assembled system at one state; the pieces of all bodies in a row.
 
     ``first[k]``, ``last[k]``: the pieces that body k hangs by and that the next one hangs on;
     ``of[i]``, ``centre[i]``: the body of piece i and where in it the piece's own centre of mass is.
     """
 
-    def __init__(self, model: Model, state: State, parts: Parts | None = None) -> None:
-        self.mbs, self.container = system()
-        mbs, parts = self.mbs, parts or whole(model)
+    def __init__(self, model: Model, state: State, parts: BodyParts | None = None) -> None:
+        self.mbs, self.container = make_system()
+        mbs, parts = self.mbs, parts or undivided_bodies(model)
         ground = mbs.AddObject(items.ObjectGround())
         pivot = hang = mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=ground))
         self.nodes, self.joints, self.welds = [], [], []
-        self.bodies: list[Any] = []
-        self.first, self.last, self.of = [], [], []
-        self.centre = [part.centre for pieces in parts for part in pieces]
-        self.qdot = np.empty((len(self.centre), 7))
-        turn, pdot, gravity = rotation(state.p), rate(state.p, state.omega), model.gravity.tolist()
+        self.piece_bodies: list[Any] = []
+        self.first_piece, self.last_piece, self.body_of_piece = [], [], []
+        self.piece_centre = [part.centre for pieces in parts for part in pieces]
+        self.qdot = np.empty((len(self.piece_centre), 7))
+        turn, pdot, gravity = (
+            rotation_matrix(state.p),
+            quaternion_rate(state.p, state.omega),
+            model.gravity.tolist(),
+        )
         for k in range(model.n):
-            self.first.append(len(self.bodies))
+            self.first_piece.append(len(self.piece_bodies))
             for part in parts[k]:
                 arm = turn[k] @ part.centre, turn[k] @ np.cross(state.omega[k], part.centre)
-                qdot = self.qdot[len(self.bodies)] = *(state.v[k] + arm[1]), *pdot[k]
+                qdot = self.qdot[len(self.piece_bodies)] = *(state.v[k] + arm[1]), *pdot[k]
                 node = mbs.AddNode(
                     items.NodeRigidBodyEP(
                         referenceCoordinates=[*(state.r[k] + arm[0]), *state.p[k]], initialVelocities=[*qdot]
                     )
                 )
-                body = mbs.AddObject(rigid_body(node, part.mass, part.inertia))
+                body = mbs.AddObject(make_rigid_body(node, part.mass, part.inertia))
                 weight = mbs.AddMarker(items.MarkerBodyMass(bodyNumber=body))
                 mbs.AddLoad(items.LoadMassProportional(markerNumber=weight, loadVector=gravity))
                 self.nodes.append(node)
-                self.bodies.append(body)
-                self.of.append(k)
-            self.last.append(len(self.bodies) - 1)
-            ends = [hang, self.marker(self.first[k], model.proximal[k])]
+                self.piece_bodies.append(body)
+                self.body_of_piece.append(k)
+            self.last_piece.append(len(self.piece_bodies) - 1)
+            ends = [hang, self.add_marker(self.first_piece[k], model.proximal[k])]
             if model.length[k] > 0:
                 joint = items.ObjectConnectorDistance(markerNumbers=ends, distance=model.length[k])
             else:
                 joint = items.ObjectJointSpherical(markerNumbers=ends)
             self.joints.append(mbs.AddObject(joint))
-            if self.last[k] > self.first[k]:
-                middle = [self.marker(piece, np.zeros(3)) for piece in (self.first[k], self.last[k])]
+            if self.last_piece[k] > self.first_piece[k]:
+                middle = [
+                    self.add_marker(piece, np.zeros(3)) for piece in (self.first_piece[k], self.last_piece[k])
+                ]
                 self.welds.append(mbs.AddObject(items.ObjectJointGeneric(markerNumbers=middle)))
-            add_loads(mbs, model, k, self.marker(self.first[k], np.zeros(3)), pivot, model.moment[k])
-            hang = self.marker(self.last[k], model.distal[k])
+            add_loads(
+                mbs, model, k, self.add_marker(self.first_piece[k], np.zeros(3)), pivot, model.moment[k]
+            )
+            hang = self.add_marker(self.last_piece[k], model.distal[k])
         mbs.Assemble()
 
-    def marker(self, piece: int, point: Array) -> Any:
+    def add_marker(self, piece: int, point: Array) -> Any:
         """A marker on a piece, at a point of its body."""
-        local = (point - self.centre[piece]).tolist()
-        return self.mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=self.bodies[piece], localPosition=local))
+        local = (point - self.piece_centre[piece]).tolist()
+        return self.mbs.AddMarker(
+            items.MarkerBodyRigid(bodyNumber=self.piece_bodies[piece], localPosition=local)
+        )
 
-    def at(self, piece: int, what: Any, point: Array) -> Array:
+    def output_at(self, piece: int, output_type: Any, point: Array) -> Array:
         """(3,) an output of a piece at a point of its body."""
-        local = (point - self.centre[piece]).tolist()
-        return np.array(self.mbs.GetObjectOutputBody(self.bodies[piece], what, local))
+        local = (point - self.piece_centre[piece]).tolist()
+        return np.array(self.mbs.GetObjectOutputBody(self.piece_bodies[piece], output_type, local))
 
 
 class Exudyn(Adapter):
@@ -113,15 +123,15 @@ class Exudyn(Adapter):
     name = "exudyn"
     title = "Exudyn"
     package = "exudyn"
-    supported = SUPPORTED
+    supported = SUPPORTED_VERSIONS
     integrators: ClassVar[tuple[Integrator, ...]] = (
         Integrator(
             "trapezoidal",
             "step",
             2,
             (2, 4, 6, 8, 10, 12),
-            symmetric=True,
-            solver=NEWTON,
+            is_symmetric=True,
+            solver_rtol=NEWTON_TOLERANCE,
             note="TrapezoidalIndex2: implicit trapezoidal rule, constraints on velocities",
         ),
         Integrator(
@@ -129,7 +139,7 @@ class Exudyn(Adapter):
             "step",
             2,
             (2, 3, 4, 5, 6),
-            solver=NEWTON,
+            solver_rtol=NEWTON_TOLERANCE,
             note="generalized-α with spectral radius 0.9, constraints on positions (index 3)",
         ),
     )
@@ -142,51 +152,58 @@ class Exudyn(Adapter):
         return version()
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-        with quiet():
-            return [evaluate(model, state, self.parts(model)) for state in states]
+        with silence_engine():
+            return [evaluate_state(model, state, self.body_pieces(model)) for state in states]
 
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
-        with quiet():
-            chain = Chain(model, state)
-            rows = self._rows(chain, times, integrator, resolution)
-        return trajectory(model, state, times, rows, resolution)
+        with silence_engine():
+            chain = ExudynChain(model, state)
+            rows = self._run_samples(chain, times, integrator, resolution)
+        return trajectory_from_samples(model, state, times, rows, resolution)
 
     def _retrace(
         self, model: Model, state: State, end: float, integrator: Integrator, resolution: float
     ) -> Trajectory:
         initial, leg = exudyn.ConfigurationType.Initial, np.array([0.0, end])
-        with quiet():
-            chain = Chain(model, state)
+        with silence_engine():
+            chain = ExudynChain(model, state)
             data = chain.mbs.systemData
-            there = self._rows(chain, leg, integrator, resolution)
+            there = self._run_samples(chain, leg, integrator, resolution)
             q, qdot, qddot = there[-1]
             data.SetODE2Coordinates(q, initial)
             data.SetODE2Coordinates_t(-qdot, initial)
             data.SetODE2Coordinates_tt(qddot, initial)  # carried from step to step: a part of its state
             data.SetTime(0.0, initial)
-            back = self._rows(chain, leg, integrator, resolution, afresh=False)
-        return trajectory(model, state, np.array([0.0, end, 2 * end]), [*there, back[-1]], resolution)
+            back = self._run_samples(chain, leg, integrator, resolution, compute_initial_accelerations=False)
+        return trajectory_from_samples(
+            model, state, np.array([0.0, end, 2 * end]), [*there, back[-1]], resolution
+        )
 
-    def _rows(
-        self, chain: Chain, times: Array, integrator: Integrator, step: float, afresh: bool = True
+    def _run_samples(
+        self,
+        chain: ExudynChain,
+        times: Array,
+        integrator: Integrator,
+        step: float,
+        compute_initial_accelerations: bool = True,
     ) -> list[tuple[Array, Array, Array]]:
         """Displacements, rates, accelerations (7N,) at ``times``; ``afresh``: the first accelerations too."""
-        chosen, data = settings(), chain.mbs.systemData
-        linear(chosen, self.option or "EigenSparse")
+        chosen, data = make_settings(), chain.mbs.systemData
+        set_linear_solver(chosen, self.option or "EigenSparse")
         alpha = chosen.timeIntegration.generalizedAlpha
-        alpha.computeInitialAccelerations = afresh
+        alpha.computeInitialAccelerations = compute_initial_accelerations
         if integrator.name == "trapezoidal":
             alpha.useNewmark = alpha.useIndex2Constraints = True
         else:
             alpha.spectralRadius = 0.9
         parts = data.GetODE2Coordinates, data.GetODE2Coordinates_t, data.GetODE2Coordinates_tt
         solver = exudyn.MainSolverImplicitSecondOrder()
-        return run(solver, chain.mbs, chosen, times, step, lambda: tuple(part() for part in parts))
+        return run_solver(solver, chain.mbs, chosen, times, step, lambda: tuple(part() for part in parts))
 
 
-def trajectory(
+def trajectory_from_samples(
     model: Model, state: State, times: Array, rows: list[tuple[Array, Array, Array]], step: float
 ) -> Trajectory:
     """What was read of a run from ``state``."""
@@ -198,7 +215,7 @@ def trajectory(
     )
 
 
-def evaluate(model: Model, state: State, parts: Parts) -> StateQuantities:
+def evaluate_state(model: Model, state: State, parts: BodyParts) -> StateQuantities:
     """Everything from Exudyn's own mass matrix M, right-hand side f, constraint Jacobian C and outputs.
 
     Its own initial accelerations are finite differences, wrong by some 1e-6, and are not used:
@@ -208,9 +225,9 @@ def evaluate(model: Model, state: State, parts: Parts) -> StateQuantities:
 
     Pieces of one body turn alike, so that γ of a weld's rotations is 0.
     """
-    chain = Chain(model, state, parts)
-    mbs, data, n = chain.mbs, chain.mbs.systemData, len(chain.bodies)
-    chosen = settings()
+    chain = ExudynChain(model, state, parts)
+    mbs, data, n = chain.mbs, chain.mbs.systemData, len(chain.piece_bodies)
+    chosen = make_settings()
     chosen.timeIntegration.generalizedAlpha.computeInitialAccelerations = False
     solver: Any = exudyn.MainSolverImplicitSecondOrder()
     if not solver.InitializeSolver(mbs, chosen):
@@ -233,14 +250,16 @@ def evaluate(model: Model, state: State, parts: Parts) -> StateQuantities:
     for i, node in enumerate(chain.nodes):
         gamma[data.GetNodeLTGAE(node)] = -2 * chain.qdot[i, 3:] @ chain.qdot[i, 3:]
     for k, joint in enumerate(chain.joints):
-        bend = _relative(model, chain, k, Output.Acceleration)
+        bend = _relative_joint_output(model, chain, k, Output.Acceleration)
         if model.length[k] > 0:  # (‖d‖)¨ = (dᵀd̈ + ḋᵀḋ - (‖d‖˙)²) / ‖d‖, and ‖d‖˙ = 0 on the manifold
-            d, ddot = (_relative(model, chain, k, what) for what in (Output.Position, Output.Velocity))
+            d, ddot = (
+                _relative_joint_output(model, chain, k, what) for what in (Output.Position, Output.Velocity)
+            )
             bend = (d @ bend + ddot @ ddot) / np.linalg.norm(d)
         gamma[data.GetObjectLTGAE(joint)] = -bend
-    for weld, one, other in zip(chain.welds, chain.first, chain.last, strict=False):
+    for weld, one, other in zip(chain.welds, chain.first_piece, chain.last_piece, strict=False):
         rows = data.GetObjectLTGAE(weld)[:3]
-        there, here = (chain.at(piece, Output.Acceleration, np.zeros(3)) for piece in (other, one))
+        there, here = (chain.output_at(piece, Output.Acceleration, np.zeros(3)) for piece in (other, one))
         bend = there - here
         gamma[rows] = -C[rows, 7 * other : 7 * other + 3] @ bend
 
@@ -250,43 +269,46 @@ def evaluate(model: Model, state: State, parts: Parts) -> StateQuantities:
     reaction = np.array(
         [
             -C[data.GetObjectLTGAE(joint), 7 * i : 7 * i + 3].T @ multiplier[data.GetObjectLTGAE(joint)]
-            for i, joint in zip(chain.first, chain.joints, strict=True)
+            for i, joint in zip(chain.first_piece, chain.joints, strict=True)
         ]
     )
 
-    def output(what: Any) -> Array:
-        return np.array([chain.at(i, what, np.zeros(3)) for i in chain.first])
+    def output(output_type: Any) -> Array:
+        return np.array([chain.output_at(i, output_type, np.zeros(3)) for i in chain.first_piece])
 
     momentum = (M @ chain.qdot.ravel()).reshape(n, 7)  # 4LᵀJLṗ = 2LᵀJω′, and L Lᵀ = I gives Jω′ = ½ L (…)
-    p = state.p[chain.of]
+    p = state.p[chain.body_of_piece]
     spin = angular_velocity(p, momentum[:, 3:]) / 4  # angular_velocity is 2 L(p) (…)
-    r = np.array([mbs.GetObjectOutputBody(body, Output.Position) for body in chain.bodies])
+    r = np.array([mbs.GetObjectOutputBody(body, Output.Position) for body in chain.piece_bodies])
     weight = (M @ np.tile([*model.gravity, 0, 0, 0, 0], n)).reshape(n, 7)[:, :3]
     kinetic = 0.5 * np.sum(chain.qdot * momentum)
     if hasattr(Output, "KineticEnergy"):  # an output of bodies since 1.12
-        kinetic = np.sum([mbs.GetObjectOutputBody(body, Output.KineticEnergy) for body in chain.bodies])
-    basis = None if chain.welds else _rates(model, state)  # of pieces the engine has no mass matrix on ν
+        kinetic = np.sum([mbs.GetObjectOutputBody(body, Output.KineticEnergy) for body in chain.piece_bodies])
+    basis = (
+        None if chain.welds else _coordinate_rate_map(model, state)
+    )  # of pieces the engine has no mass matrix on ν
     return StateQuantities(
         acceleration=output(Output.Acceleration),
         angular_acceleration=output(Output.AngularAccelerationLocal),
         joint_reaction=reaction,
         kinetic_energy=float(kinetic),
         potential_energy=float(-np.sum(weight * r)),  # its own PotentialEnergy is always 0
-        angular_momentum=np.sum(np.cross(r, momentum[:, :3]), 0) + np.einsum("kij,kj->i", rotation(p), spin),
+        angular_momentum=np.sum(np.cross(r, momentum[:, :3]), 0)
+        + np.einsum("kij,kj->i", rotation_matrix(p), spin),
         mass_matrix=None if basis is None else basis.T @ M @ basis,
     )
 
 
-def _relative(model: Model, chain: Chain, k: int, what: Any) -> Array:
+def _relative_joint_output(model: Model, chain: ExudynChain, k: int, output_type: Any) -> Array:
     """(3,) an output of joint k: at body k's proximal point less that at the point where the joint hangs."""
-    here = chain.at(chain.first[k], what, model.proximal[k])
-    return here - chain.at(chain.last[k - 1], what, model.distal[k - 1]) if k else here
+    here = chain.output_at(chain.first_piece[k], output_type, model.proximal[k])
+    return here - chain.output_at(chain.last_piece[k - 1], output_type, model.distal[k - 1]) if k else here
 
 
-def _rates(model: Model, state: State) -> Array:
+def _coordinate_rate_map(model: Model, state: State) -> Array:
     """(7N, nu) matrix that takes ν = (u̇ of the rods, ω′ of all bodies) to Exudyn's (ṙ, ṗ) of all bodies."""
     n, rods = model.n, np.flatnonzero(model.rods)
-    A = rotation(state.p)
+    A = rotation_matrix(state.p)
     out = np.zeros((n, 7, 3 * len(rods) + 3 * n))
     tip = np.zeros((3, out.shape[2]))  # rate of the point where the next joint hangs
     for k in range(n):
@@ -295,14 +317,14 @@ def _rates(model: Model, state: State) -> Array:
             rod = slice(3 * int(np.searchsorted(rods, k)), 3 * int(np.searchsorted(rods, k)) + 3)
             tip[:, rod] += model.length[k] * (np.eye(3) - np.outer(state.u[k], state.u[k]))
         out[k, :3] = tip
-        out[k, :3, turn] -= _moved(A[k], model.proximal[k])
-        out[k, 3:, turn] = rate(np.tile(state.p[k], (3, 1)), np.eye(3)).T
+        out[k, :3, turn] -= _point_velocity_map(A[k], model.proximal[k])
+        out[k, 3:, turn] = quaternion_rate(np.tile(state.p[k], (3, 1)), np.eye(3)).T
         tip = out[k, :3].copy()
-        tip[:, turn] += _moved(A[k], model.distal[k])
+        tip[:, turn] += _point_velocity_map(A[k], model.distal[k])
     return out.reshape(7 * n, -1)
 
 
-def _moved(A: Array, s: Array) -> Array:
+def _point_velocity_map(A: Array, s: Array) -> Array:
     """(3, 3) with d(A s)/dt = (…) ω′ for the body-fixed point s."""
     return np.stack([A @ np.cross(axis, s) for axis in np.eye(3)], axis=1)
 

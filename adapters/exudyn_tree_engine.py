@@ -24,15 +24,15 @@ import exudyn
 import numpy as np
 
 from adapters.exudyn_common import (
-    SUPPORTED,
+    SUPPORTED_VERSIONS,
     add_loads,
     items,
-    linear,
-    quiet,
-    run,
-    runge_kutta,
-    settings,
-    system,
+    make_settings,
+    make_system,
+    run_solver,
+    set_linear_solver,
+    set_rk44,
+    silence_engine,
     version,
 )
 from plumbline.engines.adapter import Adapter
@@ -46,33 +46,38 @@ from plumbline.model.datatypes import (
     Trajectory,
     Unsupported,
 )
-from plumbline.model.kinematics import conjugate, multiply, rate, rotation
+from plumbline.model.kinematics import (
+    quaternion_conjugate,
+    quaternion_product,
+    quaternion_rate,
+    rotation_matrix,
+)
 
 Output = exudyn.OutputVariableType
 # cosine of a middle angle, 84.3°: the other two angles' rates grow as its inverse
-NEAR = 0.1
+MIN_COS_MIDDLE_ANGLE = 0.1
 
 
 @dataclass(frozen=True, eq=False)
-class Turn:
+class RevoluteGroup:
     """Two or three revolutes in a row (Z, Y and, for a ball, X) whose angles start at 0."""
 
-    first: int  # index of the first angle
-    count: int  # 2 for a rod, 3 for a ball
+    first_angle: int  # index of the first angle
+    angle_count: int  # 2 for a rod, 3 for a ball
     axes: Array  # (3, 3) world axes of the link at the start, columns x, y, z
-    frame: Array  # (3, 3) the same in the frame of the body that it turns (of the one before, for a rod)
+    body_axes: Array  # (3, 3) the same in the frame of the body that it turns (of the one before, for a rod)
     body: int  # the body it hangs, for messages
 
 
-class Tree:
+class KinematicTree:
     """The assembled tree at one state, and the maps between its angles and bodies."""
 
     def __init__(self, model: Model, state: State) -> None:
         self.model, self.state = model, state
         n, rods = model.n, int(np.sum(model.rods))
-        A = rotation(state.p)
+        A = rotation_matrix(state.p)
         nu = np.concatenate([state.udot[model.rods].ravel(), state.omega.ravel()])
-        self.turns: list[Turn] = []
+        self.revolute_groups: list[RevoluteGroup] = []
         self.W = np.zeros((0, 3 * rods + 3 * n))  # q̇ = W ν
         links: list[tuple[Any, int, Array, Array, Array, Array, float]] = []
         before, hang = (
@@ -80,12 +85,12 @@ class Tree:
             np.zeros(3),
         )  # axes of the link before (world), where the next one hangs on it
         spin = np.zeros((3, len(nu)))  # its angular velocity in the world, as a matrix on ν
-        self.last: list[int] = []  # link of each body
+        self.link_of_body: list[int] = []  # link of each body
 
         def add(count: int, axes: Array, at: Array, offset: Array, relative: Array, body: int) -> None:
             """Massless revolutes that turn ``axes`` against the link before at the rate ``relative`` ν."""
             nonlocal spin
-            self.turns.append(Turn(len(links), count, axes, at, body))
+            self.revolute_groups.append(RevoluteGroup(len(links), count, axes, at, body))
             for i, joint in enumerate(("RevoluteZ", "RevoluteY", "RevoluteX")[:count]):
                 twist = before.T @ axes if i == 0 else np.eye(3)
                 where = offset if i == 0 else np.zeros(3)
@@ -97,13 +102,15 @@ class Tree:
 
         rod = 0
         for k in range(n):
-            fallback = _fallback(A[k] @ model.proximal[k], model.gravity)
+            fallback = _fallback_axis(A[k] @ model.proximal[k], model.gravity)
             if model.length[k] > 0:
                 wanted = np.zeros_like(spin)  # the rod's u × u̇
                 wanted[:, 3 * rod : 3 * rod + 3] = np.cross(state.u[k], np.eye(3)).T
                 relative = wanted - spin
                 fast = relative @ nu
-                z = _axis(fast - state.u[k] * (state.u[k] @ fast), _fallback(state.u[k], model.gravity))
+                z = _unit_vector(
+                    fast - state.u[k] * (state.u[k] @ fast), _fallback_axis(state.u[k], model.gravity)
+                )
                 axes = np.stack([state.u[k], np.cross(z, state.u[k]), z], axis=1)
                 add(2, axes, A[k - 1].T @ axes if k else axes, hang, relative, k)
                 before, hang = axes, np.array([model.length[k], 0.0, 0.0])
@@ -111,20 +118,20 @@ class Tree:
             wanted = np.zeros_like(spin)
             wanted[:, 3 * (rods + k) : 3 * (rods + k) + 3] = A[k]
             relative = wanted - spin
-            z = _axis(relative @ nu, fallback)
-            x = _perpendicular(z)
+            z = _unit_vector(relative @ nu, fallback)
+            x = _perpendicular_unit(z)
             axes = np.stack([x, np.cross(z, x), z], axis=1)
             B = A[k].T @ axes
             add(3, axes, B, hang, relative, k)
             kind, parent, twist, where, *_ = links[-1]
             inertia = B.T @ model.inertia[k] @ B
             links[-1] = (kind, parent, twist, where, -B.T @ model.proximal[k], inertia, float(model.mass[k]))
-            self.last.append(len(links) - 1)
+            self.link_of_body.append(len(links) - 1)
             before, hang = axes, B.T @ (model.distal[k] - model.proximal[k])
 
-        self.rates = self.W @ nu
+        self.initial_angle_rates = self.W @ nu
         kinds, parents, twists, offsets, coms, inertias, masses = map(list, zip(*links, strict=True))
-        self.mbs, self.container = system()
+        self.mbs, self.container = make_system()
         mbs, zeros = self.mbs, [0.0] * len(links)
         matrices: Any = exudyn.Matrix3DList
         vectors: Any = exudyn.Vector3DList
@@ -132,7 +139,7 @@ class Tree:
             items.NodeGenericODE2(
                 referenceCoordinates=zeros,
                 initialCoordinates=zeros,
-                initialCoordinates_t=self.rates.tolist(),
+                initialCoordinates_t=self.initial_angle_rates.tolist(),
                 numberOfODE2Coordinates=len(links),
             )
         )
@@ -160,66 +167,70 @@ class Tree:
                 Output.AngularAccelerationLocal,
             )
         }
-        self.frames = np.array([turn.frame for turn in self.turns if turn.count == 3])  # (N, 3, 3) B
-        for k, link in enumerate(self.last):
+        self.body_axes_of_links = np.array(
+            [turn.body_axes for turn in self.revolute_groups if turn.angle_count == 3]
+        )  # (N, 3, 3) B
+        for k, link in enumerate(self.link_of_body):
             place = {"objectNumber": self.tree, "linkNumber": link, "localPosition": coms[link].tolist()}
             marker = mbs.AddMarker(items.MarkerKinematicTreeRigid(**place))
-            add_loads(mbs, model, k, marker, ground, self.frames[k].T @ model.moment[k])
+            add_loads(mbs, model, k, marker, ground, self.body_axes_of_links[k].T @ model.moment[k])
             for what, found in self.sensors.items():
                 sensor = items.SensorKinematicTree(**place, outputVariableType=what, writeToFile=False)
                 found.append(mbs.AddSensor(sensor))
         mbs.Assemble()
 
-    def sense(self, what: Any) -> Array:
+    def read_sensors(self, output_type: Any) -> Array:
         """(N, 3) an output at every centre of mass; those of the link turned into the body's frame."""
-        values = np.array([self.mbs.GetSensorValues(sensor) for sensor in self.sensors[what]])
-        local = what in (Output.AngularVelocityLocal, Output.AngularAccelerationLocal)
-        return np.einsum("kij,kj->ki", self.frames, values) if local else values
+        values = np.array([self.mbs.GetSensorValues(sensor) for sensor in self.sensors[output_type]])
+        local = output_type in (Output.AngularVelocityLocal, Output.AngularAccelerationLocal)
+        return np.einsum("kij,kj->ki", self.body_axes_of_links, values) if local else values
 
-    def attitudes(self, angles: Array) -> Array:
+    def quaternions_at(self, angles: Array) -> Array:
         """(N, 4) quaternions at the angles: continuous, and the state's own at 0."""
         now = then = np.array([1.0, 0.0, 0.0, 0.0])  # of the frame before, which a rod turns along
         out = np.empty((self.model.n, 4))
-        for turn in self.turns:
-            half = 0.5 * angles[turn.first : turn.first + turn.count]
+        for turn in self.revolute_groups:
+            half = 0.5 * angles[turn.first_angle : turn.first_angle + turn.angle_count]
             spun = np.array([1.0, 0.0, 0.0, 0.0])
             for i, h in enumerate(half):
-                spun = multiply(spun, np.array([np.cos(h), *(np.sin(h) * np.eye(3)[2 - i])]))
-            spun[1:] = turn.frame @ spun[1:]
-            if turn.count == 2:
-                now = multiply(now, spun)
+                spun = quaternion_product(spun, np.array([np.cos(h), *(np.sin(h) * np.eye(3)[2 - i])]))
+            spun[1:] = turn.body_axes @ spun[1:]
+            if turn.angle_count == 2:
+                now = quaternion_product(now, spun)
             else:
                 start = self.state.p[turn.body]
-                now = multiply(multiply(now, multiply(conjugate(then), start)), spun)
+                now = quaternion_product(
+                    quaternion_product(now, quaternion_product(quaternion_conjugate(then), start)), spun
+                )
                 then = start
                 out[turn.body] = now
         return out
 
-    def watch(self, t: float) -> None:
+    def check_singularity(self, t: float) -> None:
         """Unsupported once a middle angle is near ±90°."""
         angles = self.mbs.systemData.GetODE2Coordinates()
-        for turn in self.turns:
-            middle = float(angles[turn.first + 1])
-            if np.cos(middle) < NEAR:
-                what = "rod" if turn.count == 2 else "ball joint"
+        for turn in self.revolute_groups:
+            middle = float(angles[turn.first_angle + 1])
+            if np.cos(middle) < MIN_COS_MIDDLE_ANGLE:
+                what = "rod" if turn.angle_count == 2 else "ball joint"
                 raise Unsupported(
                     f"the angles of the {what} of body {turn.body + 1} come near their singularity at "
                     f"t = {t:.6g} s (middle angle {np.degrees(remainder(middle, tau)):.1f}°)"
                 )
 
 
-def _axis(wanted: Array, fallback: Array) -> Array:
+def _unit_vector(wanted: Array, fallback: Array) -> Array:
     """(3,) the unit vector along ``wanted``, or the fallback where that is zero."""
     size = np.linalg.norm(wanted)
     return np.asarray(wanted / size if size > 0 else fallback)
 
 
-def _fallback(arm: Array, gravity: Array) -> Array:
+def _fallback_axis(arm: Array, gravity: Array) -> Array:
     """(3,) the unit axis about which gravity will turn an arm at rest; any across it where there is none."""
-    return _axis(np.cross(gravity, arm), _perpendicular(_axis(arm, np.eye(3)[0])))
+    return _unit_vector(np.cross(gravity, arm), _perpendicular_unit(_unit_vector(arm, np.eye(3)[0])))
 
 
-def _perpendicular(unit: Array) -> Array:
+def _perpendicular_unit(unit: Array) -> Array:
     """(3,) a unit vector across a unit vector."""
     across = np.cross(unit, np.eye(3)[np.argmin(np.abs(unit))])
     return np.asarray(across / np.linalg.norm(across))
@@ -231,7 +242,7 @@ class ExudynTree(Adapter):
     name = "exudyn-tree"
     title = "Exudyn (kinematic tree)"
     package = "exudyn"
-    supported = SUPPORTED
+    supported = SUPPORTED_VERSIONS
     integrators: ClassVar[tuple[Integrator, ...]] = (
         Integrator("RK44", "step", 4, (4, 5, 6, 7, 8), note="classical Runge-Kutta on joint angles"),
     )
@@ -243,36 +254,41 @@ class ExudynTree(Adapter):
         return version()
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-        with quiet():
-            return [evaluate(model, state) for state in states]
+        with silence_engine():
+            return [evaluate_state(model, state) for state in states]
 
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
-        with quiet():
-            tree = Tree(model, state)
+        with silence_engine():
+            tree = KinematicTree(model, state)
             solver = exudyn.MainSolverExplicit()
 
             def read() -> tuple[Array, Array, Array, Array]:
-                p = tree.attitudes(tree.mbs.systemData.GetODE2Coordinates())
-                omega = tree.sense(Output.AngularVelocityLocal)
-                return tree.sense(Output.Position), p, tree.sense(Output.Velocity), rate(p, omega)
+                p = tree.quaternions_at(tree.mbs.systemData.GetODE2Coordinates())
+                omega = tree.read_sensors(Output.AngularVelocityLocal)
+                return (
+                    tree.read_sensors(Output.Position),
+                    p,
+                    tree.read_sensors(Output.Velocity),
+                    quaternion_rate(p, omega),
+                )
 
-            chosen = explicit()
-            linear(chosen, self.option or "EXUdense")
-            rows = run(solver, tree.mbs, chosen, times, resolution, read, tree.watch)
+            chosen = rk44_settings()
+            set_linear_solver(chosen, self.option or "EXUdense")
+            rows = run_solver(solver, tree.mbs, chosen, times, resolution, read, tree.check_singularity)
         r, p, v, pdot = (np.array(column) for column in zip(*rows, strict=True))
         return Trajectory(times.copy(), r, p, v, pdot, round(float(times[-1] / resolution)))
 
 
-def explicit() -> Any:
+def rk44_settings() -> Any:
     """Settings of RK44."""
-    chosen = settings()
-    runge_kutta(chosen)
+    chosen = make_settings()
+    set_rk44(chosen)
     return chosen
 
 
-def evaluate(model: Model, state: State) -> StateQuantities:
+def evaluate_state(model: Model, state: State) -> StateQuantities:
     """All but joint forces, which minimal coordinates do not have, from the tree's own M, f and outputs.
 
         M q̈ = f,   T = ½ q̇ᵀ M q̇,   V = -Σ m g·r of its links,   μ = M q̇
@@ -281,8 +297,8 @@ def evaluate(model: Model, state: State) -> StateQuantities:
     the pivot has three axes there; a rod has two, and along u the angular momentum about the pivot is that
     about the rod's end, where the ball's axes are.
     """
-    tree = Tree(model, state)
-    chosen = explicit()
+    tree = KinematicTree(model, state)
+    chosen = rk44_settings()
     solver: Any = exudyn.MainSolverExplicit()
     if not solver.InitializeSolver(tree.mbs, chosen):
         raise EngineFailure(f"Exudyn could not initialise its solver: {solver.GetErrorString()}")
@@ -294,19 +310,19 @@ def evaluate(model: Model, state: State) -> StateQuantities:
     finally:
         solver.FinalizeSolver(tree.mbs, chosen)
     tree.mbs.systemData.SetODE2Coordinates_tt(np.linalg.solve(M, f))
-    momentum = M @ tree.rates
-    first, *rest = tree.turns
-    L = first.axes[:, ::-1][:, : first.count] @ momentum[: first.count]
-    if first.count == 2:
+    momentum = M @ tree.initial_angle_rates
+    first, *rest = tree.revolute_groups
+    L = first.axes[:, ::-1][:, : first.angle_count] @ momentum[: first.angle_count]
+    if first.angle_count == 2:
         beyond = rest[0].axes[:, ::-1] @ momentum[2:5]
         L = L + first.axes[:, 0] * (first.axes[:, 0] @ beyond)
-    masses = np.array(tree.mbs.GetObjectParameter(tree.tree, "linkMasses"))[tree.last]
+    masses = np.array(tree.mbs.GetObjectParameter(tree.tree, "linkMasses"))[tree.link_of_body]
     gravity = np.array(tree.mbs.GetObjectParameter(tree.tree, "gravity"))
     return StateQuantities(
-        acceleration=tree.sense(Output.Acceleration),
-        angular_acceleration=tree.sense(Output.AngularAccelerationLocal),
-        kinetic_energy=float(0.5 * tree.rates @ momentum),
-        potential_energy=float(-masses @ (tree.sense(Output.Position) @ gravity)),
+        acceleration=tree.read_sensors(Output.Acceleration),
+        angular_acceleration=tree.read_sensors(Output.AngularAccelerationLocal),
+        kinetic_energy=float(0.5 * tree.initial_angle_rates @ momentum),
+        potential_energy=float(-masses @ (tree.read_sensors(Output.Position) @ gravity)),
         angular_momentum=L,
         mass_matrix=tree.W.T @ M @ tree.W,
     )

@@ -44,10 +44,10 @@ from plumbline.model.datatypes import (
     StateQuantities,
     Trajectory,
 )
-from plumbline.model.welding import Part, Parts, whole
+from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 
-ALL = (1, 2, 3, 4, 5, 6)
-UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+FIRST_ORDER_POWERS = (1, 2, 3, 4, 5, 6)
+IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 class Mujoco(Adapter):
@@ -58,13 +58,15 @@ class Mujoco(Adapter):
     package = "mujoco"
     supported = ">=3.2,<5"
     integrators = (
-        Integrator("Euler", "step", 1, ALL, note="semi-implicit Euler"),
-        Integrator("implicit", "step", 1, ALL, note="Euler, implicit in velocity with Coriolis terms"),
+        Integrator("Euler", "step", 1, FIRST_ORDER_POWERS, note="semi-implicit Euler"),
+        Integrator(
+            "implicit", "step", 1, FIRST_ORDER_POWERS, note="Euler, implicit in velocity with Coriolis terms"
+        ),
         Integrator(
             "implicitfast",
             "step",
             1,
-            ALL,
+            FIRST_ORDER_POWERS,
             alias_of="Euler",
             note="implicit in velocity without Coriolis terms: equals Euler bit for bit unless there is drag",
         ),
@@ -78,20 +80,20 @@ class Mujoco(Adapter):
         return str(mujoco.mj_versionString())
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-        chain = _Chain(model, self.parts(model), dense=bool(self.option))
-        with _watched(chain.d):
+        chain = _MujocoChain(model, self.body_pieces(model), dense=bool(self.option))
+        with _raise_on_warnings(chain.d):
             return [chain.quantities(state) for state in states]
 
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
-        chain = _Chain(model)
+        chain = _MujocoChain(model)
         chain.m.opt.timestep = resolution
         chain.m.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.name.upper()}")
-        chain.set(state)
+        chain.set_state(state)
         counts = np.round(times / resolution).astype(int)
         t, rows = [0.0], [chain.sample()]
-        with _watched(chain.d):
+        with _raise_on_warnings(chain.d):
             for done in np.diff(counts):
                 mujoco.mj_step(chain.m, chain.d, nstep=int(done))
                 t.append(chain.d.time)  # the engine's own clock: a rewound one is seen by the contract
@@ -100,31 +102,31 @@ class Mujoco(Adapter):
         return Trajectory(t=np.array(t), r=r, p=p, v=v, pdot=pdot, steps=int(counts[-1]))
 
 
-class _Chain:
+class _MujocoChain:
     """A compiled chain and its data.  Engine body ids: ``link[k]`` of link k, ``turning`` all on joints."""
 
-    def __init__(self, model: Model, parts: Parts | None = None, dense: bool = False) -> None:
+    def __init__(self, model: Model, parts: BodyParts | None = None, dense: bool = False) -> None:
         spec = mujoco.MjSpec()
         getattr(spec, "compiler", spec).autolimits = False  # on the spec itself in 3.2.0 to 3.2.4
-        self.model, self.dense = model, dense
-        self.link: list[int] = []
-        self.turning: list[int] = []
+        self.model, self.use_dense_solve = model, dense
+        self.link_ids: list[int] = []
+        self.jointed_body_ids: list[int] = []
         self.mass: list[float] = [0.0]
         self.inertia: list[Array] = [np.zeros(3)]
         parent, hang = spec.worldbody, np.zeros(3)
         for k in range(model.n):
             if model.length[k] > 0:
-                axial = np.array([0, 0, 0.01 * _principal(model.inertia[k])[0].mean()])
-                parent = self._body(parent, hang, 0.0, axial, joint=np.zeros(3))
+                axial = np.array([0, 0, 0.01 * _principal_inertia(model.inertia[k])[0].mean()])
+                parent = self._add_body(parent, hang, 0.0, axial, joint=np.zeros(3))
                 hang = np.array([0, 0, -model.length[k]])
-            at, pieces = model.proximal[k], (parts or whole(model))[k]
-            one = pieces[0] if len(pieces) == 1 else Part(0.0, np.zeros(3), np.zeros((3, 3)))
-            parent = self._body(parent, hang - at, one.mass, *_principal(one.inertia), joint=at)
-            self.link.append(len(self.mass) - 1)
+            at, pieces = model.proximal[k], (parts or undivided_bodies(model))[k]
+            one = pieces[0] if len(pieces) == 1 else RigidPart(0.0, np.zeros(3), np.zeros((3, 3)))
+            parent = self._add_body(parent, hang - at, one.mass, *_principal_inertia(one.inertia), joint=at)
+            self.link_ids.append(len(self.mass) - 1)
             for piece in pieces if len(pieces) > 1 else ():  # before the next link: ids go depth first
-                self._body(parent, piece.centre, piece.mass, *_principal(piece.inertia))
+                self._add_body(parent, piece.centre, piece.mass, *_principal_inertia(piece.inertia))
             hang = model.distal[k]
-            _actuate(spec, parent, k, model)
+            _add_load_actuators(spec, parent, k, model)
         m = self.m = spec.compile()
         m.opt.gravity = model.gravity
         flags = mujoco.mjtDisableBit
@@ -135,63 +137,65 @@ class _Chain:
         m.body_inertia[:] = self.inertia
         d = self.d = mujoco.MjData(m)
         mujoco.mj_setConst(m, d)
-        self.applied = np.zeros((m.nbody, 6))
-        self.applied[self.link, :3] = model.force
-        self.probe = mujoco.MjData(m)
+        self.applied_wrenches = np.zeros((m.nbody, 6))
+        self.applied_wrenches[self.link_ids, :3] = model.force
+        self.readout_data = mujoco.MjData(m)
 
-    def _body(
+    def _add_body(
         self,
         parent: Any,
         pos: Array,
         mass: float,
         inertia: Array,
-        axes: Array = UPRIGHT,
+        axes: Array = IDENTITY_QUATERNION,
         joint: Array | None = None,
     ) -> Any:
         """A body on a ball joint, or welded; of unit mass until ``mass`` and ``inertia`` are set."""
-        body = _made(
+        body = _set_attributes(
             parent.add_body(),
             pos=pos, mass=1.0, inertia=np.ones(3), ipos=np.zeros(3), iquat=axes, explicitinertial=True,
         )  # fmt: skip
         if joint is not None:
-            _made(body.add_joint(), type=mujoco.mjtJoint.mjJNT_BALL, pos=joint)
-            self.turning.append(len(self.mass))
+            _set_attributes(body.add_joint(), type=mujoco.mjtJoint.mjJNT_BALL, pos=joint)
+            self.jointed_body_ids.append(len(self.mass))
         self.mass.append(mass)
         self.inertia.append(inertia)
         return body
 
-    def frames(self, state: State) -> tuple[Array, Array]:
+    def body_frames(self, state: State) -> tuple[Array, Array]:
         """Quaternions (nbody, 4) of the engine's bodies; E (nbody, 3, nu): their ω = E ν, in own frames."""
         rods = np.flatnonzero(self.model.rods)
         q = np.zeros((self.m.nbody, 4))
         q[0, 0] = 1
         E = np.zeros((self.m.nbody, 3, 3 * (len(rods) + self.model.n)))
-        for k, b in enumerate(self.link):
+        for k, b in enumerate(self.link_ids):
             q[b] = state.p[k]
             E[b, :, 3 * (len(rods) + k) :][:, :3] = np.eye(3)
-        for j, (b, u) in enumerate(zip(np.array(self.link)[rods] - 1, state.u[rods], strict=True)):
-            q[b] = _hanging(u)
-            E[b, :, 3 * j : 3 * j + 3] = kinematics.rotation(q[b]).T @ np.cross(u, np.eye(3)).T
+        for j, (b, u) in enumerate(zip(np.array(self.link_ids)[rods] - 1, state.u[rods], strict=True)):
+            q[b] = _rod_quaternion(u)
+            E[b, :, 3 * j : 3 * j + 3] = kinematics.rotation_matrix(q[b]).T @ np.cross(u, np.eye(3)).T
         return q, E
 
-    def set(self, state: State) -> Array:
+    def set_state(self, state: State) -> Array:
         """Write a state; returns T (nv, nu)."""
         m, d = self.m, self.d
-        q, E = self.frames(state)
-        own, up = self.turning, m.body_parentid[self.turning]
-        turn = kinematics.rotation(kinematics.multiply(kinematics.conjugate(q[own]), q[up]))  # R_bᵀ R_a
+        q, E = self.body_frames(state)
+        own, up = self.jointed_body_ids, m.body_parentid[self.jointed_body_ids]
+        turn = kinematics.rotation_matrix(
+            kinematics.quaternion_product(kinematics.quaternion_conjugate(q[own]), q[up])
+        )  # R_bᵀ R_a
         T = (E[own] - turn @ E[up]).reshape(m.nv, -1)
         nu = np.concatenate([state.udot[self.model.rods].ravel(), state.omega.ravel()])
         mujoco.mj_resetData(m, d)
-        d.qpos = kinematics.multiply(kinematics.conjugate(q[up]), q[own]).ravel()
+        d.qpos = kinematics.quaternion_product(kinematics.quaternion_conjugate(q[up]), q[own]).ravel()
         d.qvel = T @ nu
-        d.xfrc_applied = self.applied
+        d.xfrc_applied = self.applied_wrenches
         return np.asarray(T)
 
     def quantities(self, state: State) -> StateQuantities:
         """Everything the engine says of a state."""
-        m, d, link = self.m, self.d, self.link
-        T = self.set(state)
+        m, d, link = self.m, self.d, self.link_ids
+        T = self.set_state(state)
         m.opt.enableflags = mujoco.mjtEnableBit.mjENBL_ENERGY
         mujoco.mj_forward(m, d)
         mujoco.mj_subtreeVel(m, d)
@@ -200,16 +204,16 @@ class _Chain:
             mujoco.mj_fullM(m, d, M)
         except TypeError:  # older ones, 3.4 among them
             mujoco.mj_fullM(m, M, d.qM)
-        if self.dense:
+        if self.use_dense_solve:
             d.qacc = np.linalg.solve(M, d.qfrc_smooth)
-        velocity = self._object(mujoco.mj_objectVelocity, d)
+        velocity = self._spatial_motion(mujoco.mj_objectVelocity, d)
         d.xfrc_applied[link, :3] -= self.model.drag_force[:, None] * velocity[:, 3:]
         mujoco.mj_rnePostConstraint(m, d)
-        acceleration = self._object(mujoco.mj_objectAcceleration, d)
+        acceleration = self._spatial_motion(mujoco.mj_objectAcceleration, d)
         com, momentum = d.subtree_com[0], m.body_subtreemass[0] * d.subtree_linvel[0]
         return StateQuantities(
             acceleration=acceleration[:, 3:] + self.model.gravity,
-            angular_acceleration=_to_body(d.xmat[link], acceleration[:, :3]),
+            angular_acceleration=_to_body_frame(d.xmat[link], acceleration[:, :3]),
             joint_reaction=d.cfrc_int[link, 3:].copy(),
             kinetic_energy=float(d.energy[1]),
             potential_energy=float(d.energy[0]),
@@ -219,39 +223,39 @@ class _Chain:
 
     def sample(self) -> tuple[Array, Array, Array, Array]:
         """r, p, v, ṗ of the links; read in a second data, so that reading leaves no mark on the run."""
-        m, probe = self.m, self.probe
+        m, probe = self.m, self.readout_data
         probe.qpos, probe.qvel = self.d.qpos, self.d.qvel
         mujoco.mj_kinematics(m, probe)
         mujoco.mj_comPos(m, probe)
         mujoco.mj_comVel(m, probe)
-        velocity = self._object(mujoco.mj_objectVelocity, probe)
-        p = probe.xquat[self.link]
-        omega = _to_body(probe.xmat[self.link], velocity[:, :3])
-        return probe.xpos[self.link], p, velocity[:, 3:], kinematics.rate(p, omega)
+        velocity = self._spatial_motion(mujoco.mj_objectVelocity, probe)
+        p = probe.xquat[self.link_ids]
+        omega = _to_body_frame(probe.xmat[self.link_ids], velocity[:, :3])
+        return probe.xpos[self.link_ids], p, velocity[:, 3:], kinematics.quaternion_rate(p, omega)
 
-    def _object(self, of: Callable[..., None], data: Any) -> Array:
+    def _spatial_motion(self, mujoco_function: Callable[..., None], data: Any) -> Array:
         """``of`` (mj_objectVelocity, mj_objectAcceleration) of the links (N, 6), rotation first, world"""
         out = np.empty((self.model.n, 6))
-        for k, b in enumerate(self.link):
-            of(self.m, data, mujoco.mjtObj.mjOBJ_BODY, b, out[k], 0)
+        for k, b in enumerate(self.link_ids):
+            mujoco_function(self.m, data, mujoco.mjtObj.mjOBJ_BODY, b, out[k], 0)
         return out
 
 
-def _made(element: Any, **attributes: Any) -> Any:
+def _set_attributes(element: Any, **attributes: Any) -> Any:
     """An element of a spec with these attributes; only later versions take them as arguments."""
     for name, value in attributes.items():
         setattr(element, name, value)
     return element
 
 
-def _actuate(spec: Any, body: Any, k: int, model: Model) -> None:
+def _add_load_actuators(spec: Any, body: Any, k: int, model: Model) -> None:
     """n′ − c_r ω′ and −c_t ṙ of body k where they act: force = bias + rate · velocity along each axis."""
-    _made(body.add_site(), name=f"com{k}")
+    _set_attributes(body.add_site(), name=f"com{k}")
     biases = np.concatenate([np.zeros(3), model.moment[k]])
     rates = -np.repeat([model.drag_force[k], model.drag_moment[k]], 3)
     for gear, bias, rate in zip(np.eye(6), biases, rates, strict=True):
         if bias or rate:
-            _made(
+            _set_attributes(
                 spec.add_actuator(),
                 trntype=mujoco.mjtTrn.mjTRN_SITE,
                 target=f"com{k}",
@@ -262,13 +266,13 @@ def _actuate(spec: Any, body: Any, k: int, model: Model) -> None:
             )
 
 
-def _principal(J: Array) -> tuple[Array, Array]:
+def _principal_inertia(J: Array) -> tuple[Array, Array]:
     """Principal inertias (3,) and the quaternion of their axes; a diagonal J stays as it is, unrounded.
 
     MuJoCo's own diagonalisation of a full inertia is less accurate.
     """
     if not np.any(J - np.diag(np.diag(J))):
-        return np.diag(J), UPRIGHT
+        return np.diag(J), IDENTITY_QUATERNION
     values, axes = np.linalg.eigh(J)
     axes[:, 2] *= np.sign(np.linalg.det(axes))
     q = np.empty(4)
@@ -276,7 +280,7 @@ def _principal(J: Array) -> tuple[Array, Array]:
     return values, q
 
 
-def _hanging(u: Array) -> Array:
+def _rod_quaternion(u: Array) -> Array:
     """A unit quaternion that turns −z into u; which one, nothing feels: the rod may turn about its axis.
 
     The shortest turn; for u above the horizontal after a half turn about y, away from its singularity.
@@ -286,13 +290,13 @@ def _hanging(u: Array) -> Array:
     return np.asarray(q / np.linalg.norm(q))
 
 
-def _to_body(xmat: Array, vector: Array) -> Array:
+def _to_body_frame(xmat: Array, vector: Array) -> Array:
     """Rᵀ v of each body: xmat (N, 9), vector (N, 3)."""
     return np.asarray(np.einsum("kji,kj->ki", xmat.reshape(-1, 3, 3), vector))
 
 
 @contextmanager
-def _watched(d: Any) -> Iterator[None]:
+def _raise_on_warnings(d: Any) -> Iterator[None]:
     """Any warning MuJoCo counts is a failure; its text goes into the error and not into a log file."""
     texts: list[str] = []
     before = mujoco.get_mju_user_warning()

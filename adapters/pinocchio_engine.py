@@ -43,93 +43,102 @@ from plumbline.model.datatypes import (
     StateQuantities,
     Trajectory,
 )
-from plumbline.model.kinematics import conjugate, multiply, rate, rotation
-from plumbline.model.welding import Parts, whole
+from plumbline.model.kinematics import (
+    quaternion_conjugate,
+    quaternion_product,
+    quaternion_rate,
+    rotation_matrix,
+)
+from plumbline.model.welding import BodyParts, undivided_bodies
 
-WORLD = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-WHOLE = 10  # joints up to which their 3 × 3 blocks are solved faster as one matrix
+WORLD_ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+MAX_DENSE_JOINTS = 10  # joints up to which their 3 × 3 blocks are solved faster as one matrix
 Algorithm = Literal["aba", "aba-world", "crba", "cholesky", "forwardDynamics"]
 
 
-class Chain:
+class PinocchioChain:
     """A `Model` as Pinocchio's model and data, and the map between their coordinates.
 
     nj joints: one per body and one more per rod, each spherical, the parent of j being j - 1.
     q is (4 nj,), v is (3 nj,) in Pinocchio's conventions.
     """
 
-    def __init__(self, model: Model, algorithm: Algorithm, parts: Parts | None = None):
-        self.source, self.algorithm = model, algorithm
-        parts = parts or whole(model)
-        self.pin = pin.Model()
-        self.pin.gravity = pin.Motion(model.gravity, np.zeros(3))
-        self.bodies: list[int] = []  # joint of body k
-        self.frames: list[int] = []  # frame at body k's centre of mass
+    def __init__(self, model: Model, algorithm: Algorithm, parts: BodyParts | None = None):
+        self.source_model, self.algorithm = model, algorithm
+        parts = parts or undivided_bodies(model)
+        self.pin_model = pin.Model()
+        self.pin_model.gravity = pin.Motion(model.gravity, np.zeros(3))
+        self.body_joints: list[int] = []  # joint of body k
+        self.com_frames: list[int] = []  # frame at body k's centre of mass
         joint, hang = 0, np.zeros(3)
         for k in range(model.n):
             if model.length[k] > 0:
-                joint = self._add(joint, hang, f"rod {k}")
+                joint = self._add_spherical_joint(joint, hang, f"rod {k}")
                 # Any axial inertia does; this one keeps its place among the others when units change.
                 axial = np.diag([0.0, 0.0, np.trace(model.inertia[k]) / 3])
-                self.pin.appendBodyToJoint(joint, pin.Inertia(0.0, np.zeros(3), axial), pin.SE3.Identity())
+                self.pin_model.appendBodyToJoint(
+                    joint, pin.Inertia(0.0, np.zeros(3), axial), pin.SE3.Identity()
+                )
                 hang = np.array([0.0, 0.0, model.length[k]])
-            joint = self._add(joint, hang, f"body {k}")
+            joint = self._add_spherical_joint(joint, hang, f"body {k}")
             centre = pin.SE3(np.eye(3), -model.proximal[k])
             for part in parts[k]:  # the engine welds what is appended to one joint
                 inertia = pin.Inertia(part.mass, np.zeros(3), part.inertia)
                 place = pin.SE3(np.eye(3), part.centre - model.proximal[k])
-                self.pin.appendBodyToJoint(joint, inertia, place)
+                self.pin_model.appendBodyToJoint(joint, inertia, place)
             frame = pin.Frame(f"com {k}", joint, centre, pin.FrameType.OP_FRAME)
-            self.frames.append(self.pin.addFrame(frame))
-            self.bodies.append(joint)
+            self.com_frames.append(self.pin_model.addFrame(frame))
+            self.body_joints.append(joint)
             hang = model.distal[k] - model.proximal[k]
-        self.data = self.pin.createData()
-        self.nj = self.pin.njoints - 1
-        self.rows = np.array(self.bodies) - 1  # rows of the bodies among the joints
-        self.rods = np.setdiff1d(np.arange(self.nj), self.rows)
-        self.centres = [pin.SE3(np.eye(3), -s) for s in model.proximal]
-        self.no_torque = np.zeros(self.pin.nv)
+        self.data = self.pin_model.createData()
+        self.joint_count = self.pin_model.njoints - 1
+        self.body_rows = np.array(self.body_joints) - 1  # rows of the bodies among the joints
+        self.rod_rows = np.setdiff1d(np.arange(self.joint_count), self.body_rows)
+        self.com_placements = [pin.SE3(np.eye(3), -s) for s in model.proximal]
+        self.zero_torque = np.zeros(self.pin_model.nv)
         self.fext = pin.StdVec_Force()
-        for _ in range(self.pin.njoints):
+        for _ in range(self.pin_model.njoints):
             self.fext.append(pin.Force.Zero())
-        for k, j in enumerate(self.bodies):
+        for k, j in enumerate(self.body_joints):
             self.fext[j] = pin.Force(np.zeros(3), model.moment[k])
         # A constant moment is constant in the joint's frame; the others change from stage to stage.
         changing = np.any(model.force != 0, axis=1) | (model.drag_force != 0) | (model.drag_moment != 0)
-        self.changing = [int(k) for k in np.flatnonzero(changing)]
+        self.bodies_with_varying_loads = [int(k) for k in np.flatnonzero(changing)]
 
-    def _add(self, parent: int, offset: Array, name: str) -> int:
-        return int(self.pin.addJoint(parent, pin.JointModelSpherical(), pin.SE3(np.eye(3), offset), name))
+    def _add_spherical_joint(self, parent: int, offset: Array, name: str) -> int:
+        return int(
+            self.pin_model.addJoint(parent, pin.JointModelSpherical(), pin.SE3(np.eye(3), offset), name)
+        )
 
     def coordinates(self, state: State) -> tuple[Array, Array]:
         """(q, v) of a state."""
-        attitude, spin = np.empty((self.nj, 4)), np.empty((self.nj, 3))
-        attitude[self.rows], spin[self.rows] = state.p, state.omega
-        for j, k in zip(self.rods, np.flatnonzero(self.source.rods), strict=True):
-            attitude[j] = pointing(state.u[k])
-            spin[j] = rotation(attitude[j]).T @ np.cross(state.u[k], state.udot[k])
+        attitude, spin = np.empty((self.joint_count, 4)), np.empty((self.joint_count, 3))
+        attitude[self.body_rows], spin[self.body_rows] = state.p, state.omega
+        for j, k in zip(self.rod_rows, np.flatnonzero(self.source_model.rods), strict=True):
+            attitude[j] = rod_quaternion(state.u[k])
+            spin[j] = rotation_matrix(attitude[j]).T @ np.cross(state.u[k], state.udot[k])
             spin[j, 2] = 0.0  # the rod does not spin about itself; here it is a rounding of zero
         relative = attitude.copy()
-        relative[1:] = multiply(conjugate(attitude[:-1]), attitude[1:])
+        relative[1:] = quaternion_product(quaternion_conjugate(attitude[:-1]), attitude[1:])
         v = spin.copy()
-        v[1:] -= np.matvec(rotation(relative[1:]).mT, spin[:-1])
+        v[1:] -= np.matvec(rotation_matrix(relative[1:]).mT, spin[:-1])
         return np.roll(relative, -1, axis=1).ravel(), v.ravel()
 
-    def attitudes(self, q: Array) -> Array:
+    def absolute_attitudes(self, q: Array) -> Array:
         """Attitudes (T, nj, 4) of the joints, scalar first, of configurations q (T, 4 nj)."""
-        p = np.roll(q.reshape(len(q), self.nj, 4), 1, axis=2)
-        for j in range(1, self.nj):
-            p[:, j] = multiply(p[:, j - 1], p[:, j])
+        p = np.roll(q.reshape(len(q), self.joint_count, 4), 1, axis=2)
+        for j in range(1, self.joint_count):
+            p[:, j] = quaternion_product(p[:, j - 1], p[:, j])
         return p
 
-    def load(self, q: Array, v: Array) -> None:
+    def update_loads(self, q: Array, v: Array) -> None:
         """Set `fext` to the loads at (q, v)."""
-        if not self.changing:
+        if not self.bodies_with_varying_loads:
             return
-        pin.forwardKinematics(self.pin, self.data, q, v)
-        model = self.source
-        for k in self.changing:
-            j, centre = self.bodies[k], self.centres[k]
+        pin.forwardKinematics(self.pin_model, self.data, q, v)
+        model = self.source_model
+        for k in self.bodies_with_varying_loads:
+            j, centre = self.body_joints[k], self.com_placements[k]
             motion = centre.actInv(self.data.v[j])  # of the centre of mass, body axes
             force = self.data.oMi[j].rotation.T @ model.force[k] - model.drag_force[k] * motion.linear
             moment = model.moment[k] - model.drag_moment[k] * motion.angular
@@ -137,10 +146,10 @@ class Chain:
 
     def acceleration(self, q: Array, v: Array) -> Array:
         """v̇ (3 nj,) under gravity and loads, by the chosen algorithm."""
-        self.load(q, v)
+        self.update_loads(q, v)
         if self.algorithm in ("crba", "cholesky", "forwardDynamics"):
-            engine, data = self.pin, self.data
-            bias = pin.rnea(engine, data, q, v, self.no_torque, self.fext)
+            engine, data = self.pin_model, self.data
+            bias = pin.rnea(engine, data, q, v, self.zero_torque, self.fext)
             if self.algorithm == "forwardDynamics":  # it counts the velocity terms and gravity itself
                 force, no_rows = pin.nonLinearEffects(engine, data, q, v) - bias, np.zeros((0, engine.nv))
                 return np.asarray(pin.forwardDynamics(engine, data, q, v, force, no_rows, np.zeros(0), 0.0))
@@ -150,29 +159,31 @@ class Chain:
             pin.cholesky.decompose(engine, data)  # along the tree's branches: sparse
             return np.ravel(pin.cholesky.solve(engine, data, -bias))
         convention = pin.Convention.WORLD if self.algorithm == "aba-world" else pin.Convention.LOCAL
-        return np.asarray(pin.aba(self.pin, self.data, q, v, self.no_torque, self.fext, convention))
+        return np.asarray(pin.aba(self.pin_model, self.data, q, v, self.zero_torque, self.fext, convention))
 
-    def flow(self, q: Array, theta: Array, v: Array) -> Array:
+    def exponential_coordinate_rate(self, q: Array, theta: Array, v: Array) -> Array:
         """θ̇ (3 nj,) with d/dt integrate(q, θ) = v: dexp⁻¹ of θ applied to v, joint by joint."""
-        dexp = pin.dIntegrate(self.pin, q, theta, pin.ArgumentPosition.ARG1)
-        if self.nj <= WHOLE:
+        dexp = pin.dIntegrate(self.pin_model, q, theta, pin.ArgumentPosition.ARG1)
+        if self.joint_count <= MAX_DENSE_JOINTS:
             return np.asarray(lapack.dgesv(dexp, v)[2])
-        each = np.arange(self.nj)
-        blocks = dexp.reshape(self.nj, 3, self.nj, 3)[each, :, each, :]  # the rest is zero
+        each = np.arange(self.joint_count)
+        blocks = dexp.reshape(self.joint_count, 3, self.joint_count, 3)[each, :, each, :]  # the rest is zero
         return np.linalg.solve(blocks, v.reshape(-1, 3, 1)).ravel()
 
     def quantities(self, state: State) -> StateQuantities:
         """All state quantities at one state."""
-        engine, data = self.pin, self.data
+        engine, data = self.pin_model, self.data
         q, v = self.coordinates(state)
         a = self.acceleration(q, v)
         pin.forwardKinematics(engine, data, q, v, a)
         pin.updateFramePlacements(engine, data)
-        acceleration = [pin.getFrameClassicalAcceleration(engine, data, f, WORLD).linear for f in self.frames]
-        angular = [data.a[j].angular.copy() for j in self.bodies]
-        turn = [data.oMi[j].rotation.copy() for j in self.bodies]
+        acceleration = [
+            pin.getFrameClassicalAcceleration(engine, data, f, WORLD_ALIGNED).linear for f in self.com_frames
+        ]
+        angular = [data.a[j].angular.copy() for j in self.body_joints]
+        turn = [data.oMi[j].rotation.copy() for j in self.body_joints]
         pin.rnea(engine, data, q, v, a, self.fext)
-        reaction = [r @ data.f[j].linear for r, j in zip(turn, self.bodies, strict=True)]
+        reaction = [r @ data.f[j].linear for r, j in zip(turn, self.body_joints, strict=True)]
         kinetic = pin.computeKineticEnergy(engine, data, q, v)
         potential = pin.computePotentialEnergy(engine, data, q)
         momentum = pin.computeCentroidalMomentum(engine, data, q, v)
@@ -191,34 +202,36 @@ class Chain:
 
         v = T W takes absolute rates W to joint rates, W = S ν takes ν to absolute rates.
         """
-        relative = rotation(np.roll(q.reshape(-1, 4), 1, axis=1))
-        t = np.eye(3 * self.nj)
-        for j in range(1, self.nj):
+        relative = rotation_matrix(np.roll(q.reshape(-1, 4), 1, axis=1))
+        t = np.eye(3 * self.joint_count)
+        for j in range(1, self.joint_count):
             t[3 * j : 3 * j + 3, 3 * j - 3 : 3 * j] = -relative[j].T
-        s = np.zeros((3 * self.nj, 3 * self.nj))
-        for i, (j, k) in enumerate(zip(self.rods, np.flatnonzero(self.source.rods), strict=True)):
-            s[3 * j : 3 * j + 3, 3 * i : 3 * i + 3] = rotation(pointing(state.u[k])).T @ pin.skew(state.u[k])
-        for i, j in enumerate(self.rows, start=len(self.rods)):
+        s = np.zeros((3 * self.joint_count, 3 * self.joint_count))
+        for i, (j, k) in enumerate(zip(self.rod_rows, np.flatnonzero(self.source_model.rods), strict=True)):
+            s[3 * j : 3 * j + 3, 3 * i : 3 * i + 3] = rotation_matrix(
+                rod_quaternion(state.u[k])
+            ).T @ pin.skew(state.u[k])
+        for i, j in enumerate(self.body_rows, start=len(self.rod_rows)):
             s[3 * j : 3 * j + 3, 3 * i : 3 * i + 3] = np.eye(3)
-        m, ts = pin.crba(self.pin, self.data, q), t @ s
+        m, ts = pin.crba(self.pin_model, self.data, q), t @ s
         return np.asarray(ts.T @ m @ ts)
 
     def trajectory(self, times: Array, q: Array, v: Array, steps: int) -> Trajectory:
         """Samples of the bodies at configurations q (T, 4 nj) with rates v (T, 3 nj)."""
-        shape = (len(times), self.source.n, 3)
+        shape = (len(times), self.source_model.n, 3)
         r, rdot, omega = np.empty(shape), np.empty(shape), np.empty(shape)
         for i in range(len(times)):
-            pin.forwardKinematics(self.pin, self.data, q[i], v[i])
-            for k, (j, centre) in enumerate(zip(self.bodies, self.centres, strict=True)):
+            pin.forwardKinematics(self.pin_model, self.data, q[i], v[i])
+            for k, (j, centre) in enumerate(zip(self.body_joints, self.com_placements, strict=True)):
                 pose, motion = self.data.oMi[j], centre.actInv(self.data.v[j])
                 r[i, k] = pose.act(centre.translation)
                 rdot[i, k] = pose.rotation @ motion.linear
                 omega[i, k] = motion.angular
-        p = self.attitudes(q)[:, self.rows]
-        return Trajectory(t=times, r=r, p=p, v=rdot, pdot=rate(p, omega), steps=steps)
+        p = self.absolute_attitudes(q)[:, self.body_rows]
+        return Trajectory(t=times, r=r, p=p, v=rdot, pdot=quaternion_rate(p, omega), steps=steps)
 
 
-def pointing(u: Array) -> Array:
+def rod_quaternion(u: Array) -> Array:
     """A unit quaternion whose rotation takes e_z to the unit vector u: half a turn about e_z + u.
 
     Where u points down the shortest turn is from -e_z, after half a turn about x, to stay away from 0/0.
@@ -226,42 +239,44 @@ def pointing(u: Array) -> Array:
     if u[2] >= 0:
         p = np.array([1 + u[2], -u[1], u[0], 0.0])
     else:
-        p = multiply(np.array([1 - u[2], u[1], -u[0], 0.0]), np.array([0.0, 1.0, 0.0, 0.0]))
+        p = quaternion_product(np.array([1 - u[2], u[1], -u[0], 0.0]), np.array([0.0, 1.0, 0.0, 0.0]))
     return np.asarray(p / np.linalg.norm(p))
 
 
-def semi_implicit_euler(chain: Chain, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+def semi_implicit_euler(chain: PinocchioChain, q: Array, v: Array, h: float) -> tuple[Array, Array]:
     """v₁ = v + h a(q, v), q₁ = q ⊕ h v₁."""
     v = v + h * chain.acceleration(q, v)
-    return pin.integrate(chain.pin, q, h * v), v
+    return pin.integrate(chain.pin_model, q, h * v), v
 
 
-def rkmk4(chain: Chain, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+def rkmk4(chain: PinocchioChain, q: Array, v: Array, h: float) -> tuple[Array, Array]:
     """The classical Runge–Kutta step for θ̇ = dexp⁻¹(θ) v, v̇ = a(q ⊕ θ, v) from θ = 0.
 
     Munthe-Kaas, Appl. Numer. Math. 29 (1999) 115–127.  With θ̇ = v instead the order would be 2.
     """
 
     def slope(theta: Array, w: Array) -> tuple[Array, Array]:
-        return chain.flow(q, theta, w), chain.acceleration(pin.integrate(chain.pin, q, theta), w)
+        return chain.exponential_coordinate_rate(q, theta, w), chain.acceleration(
+            pin.integrate(chain.pin_model, q, theta), w
+        )
 
     a1, b1 = v, chain.acceleration(q, v)
     a2, b2 = slope(h / 2 * a1, v + h / 2 * b1)
     a3, b3 = slope(h / 2 * a2, v + h / 2 * b2)
     a4, b4 = slope(h * a3, v + h * b3)
     theta = h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
-    return pin.integrate(chain.pin, q, theta), v + h / 6 * (b1 + 2 * b2 + 2 * b3 + b4)
+    return pin.integrate(chain.pin_model, q, theta), v + h / 6 * (b1 + 2 * b2 + 2 * b3 + b4)
 
 
-def tangent(model: pin.Model, q: Array, v: Array) -> Array:
+def configuration_rate(model: pin.Model, q: Array, v: Array) -> Array:
     """q̇ (nq,) of a velocity v (nv,)."""
     if hasattr(pin, "tangentMapProduct"):
         return np.asarray(pin.tangentMapProduct(model, q, v[:, None])).ravel()
     p = np.roll(q.reshape(-1, 4), 1, axis=1)  # before 4.0: of spherical joints, ½ q v
-    return np.roll(rate(p, v.reshape(-1, 3)), -1, axis=1).ravel()
+    return np.roll(quaternion_rate(p, v.reshape(-1, 3)), -1, axis=1).ravel()
 
 
-def dop853(chain: Chain, q: Array, v: Array, times: Array, rtol: float) -> tuple[Array, Array, int]:
+def dop853(chain: PinocchioChain, q: Array, v: Array, times: Array, rtol: float) -> tuple[Array, Array, int]:
     """Rows (T, 4 nj) and (T, 3 nj) and the number of steps of q̇ = tangentMap(q) v, v̇ = a(q, v).
 
     Steps end at every sample time.  The quaternions integrated are not normalised; the
@@ -271,8 +286,8 @@ def dop853(chain: Chain, q: Array, v: Array, times: Array, rtol: float) -> tuple
 
     def field(_: float, y: Array) -> Array:
         q, v = y[:nq], y[nq:]
-        a = chain.acceleration(pin.normalize(chain.pin, q), v)
-        return np.concatenate([tangent(chain.pin, q, v), a])
+        a = chain.acceleration(pin.normalize(chain.pin_model, q), v)
+        return np.concatenate([configuration_rate(chain.pin_model, q, v), a])
 
     y, steps = np.concatenate([q, v]), 0
     rows = [y]
@@ -307,14 +322,14 @@ class Pinocchio(Adapter):
             "semi-implicit-euler",
             "step",
             1,
-            powers=(1, 2, 3, 4, 5),
+            error_exponents=(1, 2, 3, 4, 5),
             note="v += h a(q, v) by aba, then q = integrate(q, h v)",
         ),
         Integrator(
             "rkmk4",
             "step",
             4,
-            powers=(4, 5, 6, 7, 8),
+            error_exponents=(4, 5, 6, 7, 8),
             note="Munthe-Kaas form of the classical Runge–Kutta method, on aba, integrate and dIntegrate",
         ),
         Integrator("dop853", "tolerance", 8, note="SciPy's DOP853 on (q, v) with crba and the tangent map"),
@@ -328,7 +343,7 @@ class Pinocchio(Adapter):
 
     def by(self, option: str) -> Self:
         """The same engine by another of its algorithms."""
-        other = super().by(option)
+        other = super().with_option(option)
         other.algorithm = cast(Algorithm, option)
         return other
 
@@ -337,13 +352,13 @@ class Pinocchio(Adapter):
         return str(pin.__version__)
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-        chain = Chain(model, self.algorithm, self.parts(model))
+        chain = PinocchioChain(model, self.algorithm, self.body_pieces(model))
         return [chain.quantities(state) for state in states]
 
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
-        chain = Chain(model, "crba" if integrator.kind == "tolerance" else "aba")
+        chain = PinocchioChain(model, "crba" if integrator.kind == "tolerance" else "aba")
         q, v = chain.coordinates(state)
         if integrator.kind == "tolerance":
             return chain.trajectory(times, *dop853(chain, q, v, times, resolution))

@@ -26,61 +26,63 @@ import pinocchio as pin
 
 from plumbline.engines.adapter import Adapter
 from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, Unsupported
-from plumbline.model.kinematics import rotation, velocity_map
-from plumbline.model.welding import Parts
+from plumbline.model.kinematics import rotation_matrix, velocity_jacobian
+from plumbline.model.welding import BodyParts
 
-WORLD = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-LARGEST = 30  # bodies; the engine's workspace grows with N³: 0.4 GB here, 1.5 GB at 50
+WORLD_ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+MAX_BODIES = 30  # bodies; the engine's workspace grows with N³: 0.4 GB here, 1.5 GB at 50
 
 
-class Flyers:
+class FreeFlyerSystem:
     """A `Model` as free bodies and constraints. Pinocchio's q is (7 N,), its v (6 N,)."""
 
-    def __init__(self, model: Model, parts: Parts, inverse: bool = False):
-        self.source, self.inverse = model, inverse
-        self.pin = pin.Model()
-        self.pin.gravity = pin.Motion(model.gravity, np.zeros(3))
+    def __init__(self, model: Model, parts: BodyParts, inverse: bool = False):
+        self.source_model, self.use_kkt_inverse = model, inverse
+        self.pin_model = pin.Model()
+        self.pin_model.gravity = pin.Motion(model.gravity, np.zeros(3))
         for k in range(model.n):
-            joint = self.pin.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"body {k}")
+            joint = self.pin_model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"body {k}")
             for part in parts[k]:  # the engine welds what is appended to one joint
                 inertia = pin.Inertia(part.mass, np.zeros(3), part.inertia)
-                self.pin.appendBodyToJoint(joint, inertia, _at(part.centre))
+                self.pin_model.appendBodyToJoint(joint, inertia, _translation(part.centre))
         # Attachment points of joint k: (joint, placement) on body k, and on body k-1 or the world.
-        near = [(k + 1, _at(model.proximal[k])) for k in range(model.n)]
-        far = [(k, _at(model.distal[k - 1] if k else np.zeros(3))) for k in range(model.n)]
-        self.near, self.far = ([self._frame(*point) for point in points] for points in (near, far))
+        near = [(k + 1, _translation(model.proximal[k])) for k in range(model.n)]
+        far = [(k, _translation(model.distal[k - 1] if k else np.zeros(3))) for k in range(model.n)]
+        self.near_frames, self.far_frames = (
+            [self._add_frame(*point) for point in points] for points in (near, far)
+        )
         self.contacts, self.contact_data = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
         for here, there in zip(near, far, strict=True):
             kind, frame = pin.ContactType.CONTACT_3D, pin.ReferenceFrame.LOCAL
-            self.contacts.append(pin.RigidConstraintModel(kind, self.pin, *here, *there, frame))
+            self.contacts.append(pin.RigidConstraintModel(kind, self.pin_model, *here, *there, frame))
             self.contact_data.append(self.contacts[-1].createData())
-        self.data = self.pin.createData()
+        self.data = self.pin_model.createData()
         try:
-            pin.initConstraintDynamics(self.pin, self.data, self.contacts, self.contact_data)
+            pin.initConstraintDynamics(self.pin_model, self.data, self.contacts, self.contact_data)
         except TypeError:  # before 4.0
-            pin.initConstraintDynamics(self.pin, self.data, self.contacts)
+            pin.initConstraintDynamics(self.pin_model, self.data, self.contacts)
 
-    def _frame(self, joint: int, placement: pin.SE3) -> int:
-        name = f"point {self.pin.nframes}"
-        return int(self.pin.addFrame(pin.Frame(name, joint, placement, pin.FrameType.OP_FRAME)))
+    def _add_frame(self, joint: int, placement: pin.SE3) -> int:
+        name = f"point {self.pin_model.nframes}"
+        return int(self.pin_model.addFrame(pin.Frame(name, joint, placement, pin.FrameType.OP_FRAME)))
 
     def quantities(self, state: State) -> StateQuantities:
         """All state quantities at one state."""
-        engine, data, model = self.pin, self.data, self.source
-        turn = rotation(state.p)
+        engine, data, model = self.pin_model, self.data, self.source_model
+        turn = rotation_matrix(state.p)
         local = np.matvec(turn.mT, state.v)
         q = np.hstack([state.r, np.roll(state.p, -1, axis=1)]).ravel()
         v = np.hstack([local, state.omega]).ravel()
         force = np.matvec(turn.mT, model.force) - model.drag_force[:, None] * local
         moment = model.moment - model.drag_moment[:, None] * state.omega
         tau = np.hstack([force, moment]).ravel()
-        if self.inverse or np.any(model.rods):
-            reaction = self._rows(state, q, v, tau)
+        if self.use_kkt_inverse or np.any(model.rods):
+            reaction = self._solve_constraint_rows(state, q, v, tau)
         else:
             pin.constraintDynamics(engine, data, q, v, tau, self.contacts, self.contact_data)
             reaction = np.matvec(turn, [contact.contact_force.linear for contact in self.contact_data])
         a = data.ddq.reshape(-1, 6)
-        w = velocity_map(model, state)
+        w = velocity_jacobian(model, state)
         w.reshape(model.n, 6, -1)[:, :3] = turn.mT @ w.reshape(model.n, 6, -1)[:, :3]
         inertia = pin.crba(engine, data, q)
         momentum = pin.computeCentroidalMomentum(engine, data, q, v)
@@ -94,23 +96,25 @@ class Flyers:
             mass_matrix=w.T @ inertia @ w,
         )
 
-    def _rows(self, state: State, q: Array, v: Array, tau: Array) -> Array:
+    def _solve_constraint_rows(self, state: State, q: Array, v: Array, tau: Array) -> Array:
         """Solve with own constraint rows into ``data.ddq``; the joint reactions (N, 3), world."""
-        engine, data, model = self.pin, self.data, self.source
+        engine, data, model = self.pin_model, self.data, self.source_model
         pin.forwardKinematics(engine, data, q, v, np.zeros(engine.nv))
         pin.computeJointJacobians(engine, data, q)
         pin.updateFramePlacements(engine, data)
         jacobian, drift, directions = [], [], []
         for k in range(model.n):
-            both = self.near[k], self.far[k]
-            j_near, j_far = (pin.getFrameJacobian(engine, data, f, WORLD)[:3] for f in both)
-            g_near, g_far = (pin.getFrameClassicalAcceleration(engine, data, f, WORLD).linear for f in both)
+            both = self.near_frames[k], self.far_frames[k]
+            j_near, j_far = (pin.getFrameJacobian(engine, data, f, WORLD_ALIGNED)[:3] for f in both)
+            g_near, g_far = (
+                pin.getFrameClassicalAcceleration(engine, data, f, WORLD_ALIGNED).linear for f in both
+            )
             along = state.u[k : k + 1] if model.length[k] > 0 else np.eye(3)
             jacobian.append(along @ (j_near - j_far))
             drift.append(along @ (g_near - g_far) + model.length[k] * state.udot[k] @ state.udot[k])
             directions.append(along)
         rows, bend = np.vstack(jacobian), np.concatenate(drift)
-        if self.inverse:
+        if self.use_kkt_inverse:
             force = tau - pin.nonLinearEffects(engine, data, q, v)
             inverse = pin.computeKKTContactDynamicMatrixInverse(engine, data, q, rows, 0.0)
             x = inverse @ np.concatenate([force, -bend])
@@ -123,7 +127,7 @@ class Flyers:
         return np.array([along.T @ m for along, m in zip(directions, multipliers, strict=True)])
 
 
-def _at(point: Array) -> pin.SE3:
+def _translation(point: Array) -> pin.SE3:
     return pin.SE3(np.eye(3), point)
 
 
@@ -144,12 +148,12 @@ class PinocchioMaximal(Adapter):
         return str(pin.__version__)
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-        if model.n > LARGEST:
+        if model.n > MAX_BODIES:
             raise Unsupported(
                 f"the engine's workspace for {model.n} free bodies, growing with their cube, is too large; "
-                f"in maximal coordinates Pinocchio is asked about {LARGEST} at most"
+                f"in maximal coordinates Pinocchio is asked about {MAX_BODIES} at most"
             )
-        flyers = Flyers(model, self.parts(model), inverse=bool(self.option))
+        flyers = FreeFlyerSystem(model, self.body_pieces(model), inverse=bool(self.option))
         return [flyers.quantities(state) for state in states]
 
     def _simulate(self, *_: object) -> None:  # type: ignore[override]

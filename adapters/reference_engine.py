@@ -23,14 +23,14 @@ from plumbline.model.datatypes import (
     StateQuantities,
     Trajectory,
 )
-from plumbline.model.kinematics import velocity_map
+from plumbline.model.kinematics import velocity_jacobian
 from reference_impl import collocation
 from reference_impl.chain import Chain
-from reference_impl.direct import Solution, System
+from reference_impl.direct import DirectSystem, Solution
 from reference_impl.errors import SingularSystem
-from reference_impl.euler_parameters import A, L, rate
-from reference_impl.integrate import Run, integrate
-from reference_impl.structured import Forest
+from reference_impl.euler_parameters import A, L, euler_parameter_rate
+from reference_impl.integrate import IntegrationResult, integrate_dop853
+from reference_impl.structured import StructuredSystem
 
 
 class Reference(Adapter):
@@ -44,7 +44,7 @@ class Reference(Adapter):
             "dop853",
             "tolerance",
             8,
-            tightest=1e-13,
+            min_rtol=1e-13,
             note="scipy's DOP853 on y = (r, p, ṙ, ṗ), no stabilisation; resolution is rtol, atol is rtol "
             "times the natural size of each part of y",
         ),
@@ -52,8 +52,8 @@ class Reference(Adapter):
             "collocation",
             "tolerance",
             32,
-            symmetric=True,
-            tightest=1e-14,
+            is_symmetric=True,
+            min_rtol=1e-14,
             note="16-point Gauss–Legendre collocation by Picard sweeps on the structured form of the same "
             "equations, no stabilisation; resolution is rtol of the dense output",
         ),
@@ -68,23 +68,25 @@ class Reference(Adapter):
         return str(project["project"]["version"])
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-        system = System(chain(model))
+        system = DirectSystem(notes_chain(model))
         solve: Callable[..., Solution] = system.solve
         if self.option:
             dense = self.option == "dense factors"
-            solve = system.solve_densely if dense else Forest([chain(model)]).solve
-        return [quantities(system, model, state, solve) for state in states]
+            solve = system.solve_with_dense_factors if dense else StructuredSystem([notes_chain(model)]).solve
+        return [state_quantities(system, model, state, solve) for state in states]
 
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
-        pdot = rate(state.p, state.omega)
+        pdot = euler_parameter_rate(state.p, state.omega)
         try:
             if integrator.name == "collocation":
                 start = state.r, state.p, state.v, pdot
-                run: Run = collocation.integrate([chain(model)], *start, times, resolution)
+                run: IntegrationResult = collocation.integrate_collocation(
+                    [notes_chain(model)], *start, times, resolution
+                )
             else:
-                run = integrate(chain(model), state.r, state.p, state.v, pdot, times, resolution)
+                run = integrate_dop853(notes_chain(model), state.r, state.p, state.v, pdot, times, resolution)
         except ArithmeticError as error:
             raise EngineFailure(f"{self.title}: {error}") from error
         return Trajectory(t=run.t, r=run.r, p=run.p, v=run.v, pdot=run.pdot, steps=run.steps)
@@ -92,11 +94,13 @@ class Reference(Adapter):
     def _retrace(
         self, model: Model, state: State, end: float, integrator: Integrator, resolution: float
     ) -> Trajectory:
-        def legs(r: Array, p: Array, v: Array, pdot: Array) -> Run:
-            return collocation.integrate([chain(model)], r, p, v, pdot, np.array([0.0, end]), resolution)
+        def legs(r: Array, p: Array, v: Array, pdot: Array) -> IntegrationResult:
+            return collocation.integrate_collocation(
+                [notes_chain(model)], r, p, v, pdot, np.array([0.0, end]), resolution
+            )
 
         try:
-            there = legs(state.r, state.p, state.v, rate(state.p, state.omega))
+            there = legs(state.r, state.p, state.v, euler_parameter_rate(state.p, state.omega))
             back = legs(there.r[-1], there.p[-1], -there.v[-1], -there.pdot[-1])
         except ArithmeticError as error:
             raise EngineFailure(f"{self.title}: {error}") from error
@@ -105,15 +109,17 @@ class Reference(Adapter):
         return Trajectory(t=times, **rows, steps=there.steps + back.steps)
 
 
-def chain(model: Model) -> Chain:
+def notes_chain(model: Model) -> Chain:
     """The same chain in the notes' own type."""
     return Chain(**{field.name: getattr(model, field.name) for field in fields(Chain)})
 
 
-def quantities(system: System, model: Model, state: State, solve: Callable[..., Solution]) -> StateQuantities:
+def state_quantities(
+    system: DirectSystem, model: Model, state: State, solve: Callable[..., Solution]
+) -> StateQuantities:
     """All that the notes say of one state, S x = b solved by ``solve``."""
     try:
-        x = solve(state.r, state.p, state.v, rate(state.p, state.omega))
+        x = solve(state.r, state.p, state.v, euler_parameter_rate(state.p, state.omega))
     except SingularSystem as error:
         raise EngineFailure(f"{Reference.title}: {error}") from error
     momentum = model.mass[:, None] * state.v
@@ -130,11 +136,11 @@ def quantities(system: System, model: Model, state: State, solve: Callable[..., 
     )
 
 
-def notes_mass_matrix(system: System, model: Model, state: State) -> Array:
+def notes_mass_matrix(system: DirectSystem, model: Model, state: State) -> Array:
     """diag(M, 4 LᵀJL) of (N5) in the contract's rates: Zᵀ S_top Z with (ṙ, ṗ) = Z ν and ṗ = ½ Lᵀ ω′."""
     n = model.n
-    S, _ = system.assemble(state.r, state.p, state.v, rate(state.p, state.omega))
-    bodies = velocity_map(model, state).reshape(n, 6, -1)
+    S, _ = system.assemble(state.r, state.p, state.v, euler_parameter_rate(state.p, state.omega))
+    bodies = velocity_jacobian(model, state).reshape(n, 6, -1)
     pdot = L(state.p).swapaxes(-1, -2) @ bodies[:, 3:] / 2
     z = np.concatenate([bodies[:, :3].reshape(3 * n, -1), pdot.reshape(4 * n, -1)])
     return np.asarray(z.T @ S[: 7 * n, : 7 * n] @ z)

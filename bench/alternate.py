@@ -20,16 +20,16 @@ class Timing:
         """The fastest round: what the code costs when least disturbed."""
         return min(self.rounds)
 
-    def over(self, other: Timing) -> float:
+    def ratio_to(self, other: Timing) -> float:
         """Median over the rounds of this one's time over the other's of the same round."""
         return float(np.median(np.array(self.rounds) / other.rounds))
 
 
-def alternate(
-    contenders: Mapping[str, Callable[[], object]], rounds: int = 9, least: float = 0.02
+def time_interleaved(
+    contenders: Mapping[str, Callable[[], object]], rounds: int = 9, min_seconds: float = 0.02
 ) -> dict[str, Timing]:
     """Time every contender once per round, for at least ``least`` s of CPU each, in alternating order."""
-    calls = {name: _calls(call, least) for name, call in contenders.items()}
+    calls = {name: _calls_to_fill(call, min_seconds) for name, call in contenders.items()}
     times: dict[str, list[float]] = {name: [] for name in contenders}
     for turn in range(rounds):
         names = list(contenders)
@@ -42,7 +42,7 @@ def alternate(
     return {name: Timing(tuple(spent)) for name, spent in times.items()}
 
 
-def _calls(call: Callable[[], object], least: float) -> int:
+def _calls_to_fill(call: Callable[[], object], min_seconds: float) -> int:
     """How many calls fill ``least`` seconds."""
     count = 1
     while True:
@@ -50,6 +50,6 @@ def _calls(call: Callable[[], object], least: float) -> int:
         for _ in range(count):
             call()
         spent = process_time() - start
-        if spent >= least / 2:
-            return max(1, round(count * least / spent))
+        if spent >= min_seconds / 2:
+            return max(1, round(count * min_seconds / spent))
         count *= 4

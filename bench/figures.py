@@ -20,11 +20,11 @@ import numpy as np
 COLOURS = ("#0b6e99", "#7a4fa3", "#b85c00", "#2e7d32", "#b3261e", "#5d6b7a", "#8a6d00", "#c2185b", "#00796b")
 
 
-def goals(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def measured_goals(measurements: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """The goals whose measurement is among ``found``: what, goal, measured (a ratio or exponent)."""
 
     def pick(kind: str, **where: Any) -> dict[str, Any] | None:
-        fits = (r for r in found if r["kind"] == kind and all(r.get(k) == v for k, v in where.items()))
+        fits = (r for r in measurements if r["kind"] == kind and all(r.get(k) == v for k, v in where.items()))
         return next(fits, None)
 
     table: list[tuple[str, float, dict[str, Any] | None, tuple[str, str]]] = [
@@ -55,7 +55,7 @@ def goals(found: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return rows
 
 
-def picture(curves: dict[str, list[dict[str, float]]], title: str) -> str:
+def work_precision_svg(curves: dict[str, list[dict[str, float]]], title: str) -> str:
     """Work–precision curves as SVG: error (m) falls to the right, CPU time (s) rises; both logarithmic."""
     points = [p for curve in curves.values() for p in curve if 0 < p["error"] < 1 and p["seconds"] > 0]
     errors, seconds = ([np.log10(p[k]) for p in points] for k in ("error", "seconds"))
@@ -104,7 +104,7 @@ def picture(curves: dict[str, list[dict[str, float]]], title: str) -> str:
     return "\n".join([*out, "</svg>"]) + "\n"
 
 
-def measured(folder: Path) -> Path:
+def run_benchmarks(folder: Path) -> Path:
     """Run all benchmarks with one BLAS thread; the path of what pytest-benchmark stored."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "benchmarks.json"
@@ -116,10 +116,10 @@ def measured(folder: Path) -> Path:
 
 def main(arguments: list[str]) -> None:
     """Write and print the figures of a stored run, or of one made now."""
-    stored = Path(arguments[0]) if arguments else measured(Path("reports") / "out")
+    stored = Path(arguments[0]) if arguments else run_benchmarks(Path("reports") / "out")
     folder = Path(arguments[1]) if len(arguments) > 1 else stored.parent
     found = [b["extra_info"] for b in json.loads(stored.read_text())["benchmarks"] if b["extra_info"]]
-    rows = goals(found)
+    rows = measured_goals(found)
     for row in rows:
         met = "met" if row["measured"] <= row["goal"] else "not met"
         print(f"{row['what']}: {row['measured']:.3g} (goal {row['goal']:g}, {met})")
@@ -130,7 +130,7 @@ def main(arguments: list[str]) -> None:
             name = "work-precision.svg" if batch == 1 else f"work-precision-{batch}.svg"
             many = f"a batch of {batch}" if batch > 1 else "one pendulum"
             title = f"Two bodies on ball joints, {many}: CPU time to an error"
-            (folder / name).write_text(picture(record["curves"], title))
+            (folder / name).write_text(work_precision_svg(record["curves"], title))
 
 
 if __name__ == "__main__":

@@ -9,19 +9,19 @@ from time import process_time
 
 import numpy as np
 
-from adapters.reference_engine import chain
+from adapters.reference_engine import notes_chain
 from plumbline.engines.adapter import Adapter
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import rate
+from plumbline.model.kinematics import quaternion_rate
 from reference_impl import integrate as raw
-from reference_impl.collocation import integrate
+from reference_impl.collocation import integrate_collocation
 
-END = np.array([0.0, 2.0])
+SAMPLE_TIMES = np.array([0.0, 2.0])
 TOLERANCES = (1e-3, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-12)
 
 
 @dataclass(frozen=True)
-class Point:
+class WorkPrecisionPoint:
     """One run: the resolution it was asked for, its error (m) at the end and its CPU time (s)."""
 
     resolution: float
@@ -29,58 +29,74 @@ class Point:
     seconds: float
 
 
-def stacked(states: Sequence[State]) -> tuple[Array, Array, Array, Array]:
+def stack_states(states: Sequence[State]) -> tuple[Array, Array, Array, Array]:
     """r, p, ṙ, ṗ of a batch, body first."""
     r, p, v = (np.concatenate([getattr(state, name) for state in states]) for name in ("r", "p", "v"))
-    return r, p, v, np.concatenate([rate(state.p, state.omega) for state in states])
+    return r, p, v, np.concatenate([quaternion_rate(state.p, state.omega) for state in states])
 
 
-def truth(model: Model, states: Sequence[State]) -> Array:
+def reference_positions(model: Model, states: Sequence[State]) -> Array:
     """(bodies of all states, 3) m at the end, by collocation at the tightest tolerance, one by one."""
-    runs = [integrate([chain(model)], *stacked([state]), END, 1e-14) for state in states]
+    runs = [
+        integrate_collocation([notes_chain(model)], *stack_states([state]), SAMPLE_TIMES, 1e-14)
+        for state in states
+    ]
     return np.concatenate([run.r[-1] for run in runs])
 
 
-def measure(run: Callable[[], Array], expected: Array, resolution: float, again: int = 3) -> Point:
+def measure_run(
+    run: Callable[[], Array], expected: Array, resolution: float, repeats: int = 3
+) -> WorkPrecisionPoint:
     """The best of ``again`` runs."""
     seconds = []
-    for _ in range(again):
+    for _ in range(repeats):
         start = process_time()
         found = run()
         seconds.append(process_time() - start)
-    return Point(resolution, float(np.max(np.linalg.norm(found - expected, axis=-1))), min(seconds))
+    return WorkPrecisionPoint(
+        resolution, float(np.max(np.linalg.norm(found - expected, axis=-1))), min(seconds)
+    )
 
 
-def collocation(model: Model, states: Sequence[State], expected: Array) -> list[Point]:
+def collocation_curve(model: Model, states: Sequence[State], expected: Array) -> list[WorkPrecisionPoint]:
     """The reference's collocation on all states in one batch; the time of a run of one step is taken off."""
-    chains, start, points = [chain(model)] * len(states), stacked(states), []
+    chains, start, points = [notes_chain(model)] * len(states), stack_states(states), []
     for rtol in TOLERANCES:
 
         def run(until: Array, rtol: float = rtol) -> Array:
-            return integrate(chains, *start, until, rtol, dense=False).r[-1]
+            return integrate_collocation(chains, *start, until, rtol, dense=False).r[-1]
 
-        setup = measure(lambda run=run: run(END * 5e-4), expected, rtol).seconds
-        point = measure(lambda run=run: run(END), expected, rtol)
-        points.append(Point(rtol, point.error, point.seconds - setup))
+        setup = measure_run(lambda run=run: run(SAMPLE_TIMES * 5e-4), expected, rtol).seconds
+        point = measure_run(lambda run=run: run(SAMPLE_TIMES), expected, rtol)
+        points.append(WorkPrecisionPoint(rtol, point.error, point.seconds - setup))
     return points
 
 
-def dop853(model: Model, states: Sequence[State], expected: Array, structured: bool) -> list[Point]:
+def dop853_curve(
+    model: Model, states: Sequence[State], expected: Array, structured: bool
+) -> list[WorkPrecisionPoint]:
     """The reference's DOP853 on either form, state by state."""
 
     def run(rtol: float) -> Array:
         ends = [
-            raw.integrate(chain(model), *stacked([state]), END, rtol, structured=structured).r[-1]
+            raw.integrate_dop853(
+                notes_chain(model), *stack_states([state]), SAMPLE_TIMES, rtol, structured=structured
+            ).r[-1]
             for state in states
         ]
         return np.concatenate(ends)
 
-    return [measure(lambda rtol=rtol: run(rtol), expected, rtol, 1) for rtol in TOLERANCES[1::2]]
+    return [measure_run(lambda rtol=rtol: run(rtol), expected, rtol, 1) for rtol in TOLERANCES[1::2]]
 
 
-def fixed_step(
-    engine: Adapter, integrator: str, model: Model, states: Sequence[State], expected: Array, longest: float
-) -> list[Point]:
+def fixed_step_curve(
+    engine: Adapter,
+    integrator: str,
+    model: Model,
+    states: Sequence[State],
+    expected: Array,
+    max_seconds: float,
+) -> list[WorkPrecisionPoint]:
     """An engine's own integrator; the time of building its model (a run of one step) is taken off."""
     points = []
     for step in (1.6e-2, 8e-3, 4e-3, 2e-3, 1e-3, 5e-4, 2.5e-4, 1.25e-4, 6.25e-5):
@@ -89,16 +105,16 @@ def fixed_step(
             runs = [engine.simulate(model, state, until, integrator, step) for state in states]
             return np.concatenate([run.r[-1] for run in runs])
 
-        setup = measure(lambda step=step: run(np.array([0.0, step])), expected, step, 2).seconds
-        point = measure(lambda: run(END), expected, step, 2)
+        setup = measure_run(lambda step=step: run(np.array([0.0, step])), expected, step, 2).seconds
+        point = measure_run(lambda: run(SAMPLE_TIMES), expected, step, 2)
         if point.seconds > setup:  # else too quick to be told from the building of the model
-            points.append(Point(step, point.error, point.seconds - setup))
-        if point.seconds > longest:
+            points.append(WorkPrecisionPoint(step, point.error, point.seconds - setup))
+        if point.seconds > max_seconds:
             break
     return points
 
 
-def cost(points: Sequence[Point], error: float) -> float:
+def cost_at_error(points: Sequence[WorkPrecisionPoint], error: float) -> float:
     """CPU seconds at which the curve first reaches ``error``, log–log between its points; NaN if never."""
     for worse, better in pairwise(points):
         if better.error <= error < worse.error:

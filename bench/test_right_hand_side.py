@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from bench import contenders
-from bench.alternate import alternate
+from bench.alternate import time_interleaved
 
 BODIES = (1, 2, 10, 100, 1000, 10_000)
 
 
-def store(benchmark: Any, table: dict[str, Any]) -> None:
+def record_table(benchmark: Any, table: dict[str, Any]) -> None:
     """Put a table beside pytest-benchmark's own figures, and say it."""
     benchmark.extra_info.update(table)
     print(table)
@@ -23,21 +23,24 @@ def store(benchmark: Any, table: dict[str, Any]) -> None:
 @pytest.mark.parametrize("bodies", BODIES)
 def test_single(benchmark: Any, bodies: int, rods: bool) -> None:
     """Chains of balls or rods, one state."""
-    model, state = contenders.pendulum(bodies, rods)
-    calls = {"reference": contenders.structured(model, state)}
+    model, state = contenders.random_pendulum(bodies, rods)
+    calls = {"reference": contenders.structured_call(model, state)}
     per_call = dict.fromkeys(("reference", "direct", "superlu", "dense", "mujoco", "pinocchio"), 1)
     if bodies <= 1000:
-        S, b, direct = contenders.notes(model, state)
-        calls |= {"direct": direct, "superlu": contenders.superlu(S, b)}
+        S, b, direct = contenders.direct_call(model, state)
+        calls |= {"direct": direct, "superlu": contenders.superlu_call(S, b)}
         if bodies <= 100:  # Pinocchio's data takes 7 GB at 200 bodies
-            calls |= {"dense": contenders.dense(S, b), "pinocchio": contenders.pinocchio_aba(model, state)}
+            calls |= {
+                "dense": contenders.dense_call(S, b),
+                "pinocchio": contenders.pinocchio_aba_call(model, state),
+            }
     if bodies <= 300:
-        calls["mujoco"] = contenders.mujoco_forward(model, state)
+        calls["mujoco"] = contenders.mujoco_forward_call(model, state)
     if bodies <= 100:
-        calls["exudyn step"], per_call["exudyn step"] = contenders.exudyn_step(model, state)
-    timing = benchmark.pedantic(alternate, args=(calls,), rounds=1, iterations=1)
+        calls["exudyn step"], per_call["exudyn step"] = contenders.exudyn_steps_call(model, state)
+    timing = benchmark.pedantic(time_interleaved, args=(calls,), rounds=1, iterations=1)
     ours = timing["reference"]
-    store(
+    record_table(
         benchmark,
         {
             "kind": "single",
@@ -53,15 +56,15 @@ def test_single(benchmark: Any, bodies: int, rods: bool) -> None:
 @pytest.mark.parametrize("bodies", [1, 2])
 def test_batch(benchmark: Any, bodies: int, batch: int) -> None:
     """Many states of one pendulum in a call, per state."""
-    model, state = contenders.pendulum(bodies)
+    model, state = contenders.random_pendulum(bodies)
     calls = {
-        "reference": contenders.structured(model, state, batch),
-        "mujoco": contenders.mujoco_forward(model, state),
-        "pinocchio": contenders.pinocchio_aba(model, state),
+        "reference": contenders.structured_call(model, state, batch),
+        "mujoco": contenders.mujoco_forward_call(model, state),
+        "pinocchio": contenders.pinocchio_aba_call(model, state),
     }
-    timing = benchmark.pedantic(alternate, args=(calls,), rounds=1, iterations=1)
+    timing = benchmark.pedantic(time_interleaved, args=(calls,), rounds=1, iterations=1)
     ours = timing["reference"]
-    store(
+    record_table(
         benchmark,
         {
             "kind": "batch",
@@ -77,11 +80,11 @@ def test_batch(benchmark: Any, bodies: int, batch: int) -> None:
 def test_growth(benchmark: Any, rods: bool) -> None:
     """The cost exponent between 100 and 10,000 bodies, from alternating rounds of both."""
     sizes = (100, 1000, 10_000)
-    calls = {str(n): contenders.structured(*contenders.pendulum(n, rods)) for n in sizes}
-    timing = benchmark.pedantic(alternate, args=(calls,), rounds=1, iterations=1)
+    calls = {str(n): contenders.structured_call(*contenders.random_pendulum(n, rods)) for n in sizes}
+    timing = benchmark.pedantic(time_interleaved, args=(calls,), rounds=1, iterations=1)
     slope = np.log(timing["10000"].over(timing["100"])) / np.log(100)
     last = np.log10(timing["10000"].over(timing["1000"]))
-    store(
+    record_table(
         benchmark,
         {
             "kind": "growth",

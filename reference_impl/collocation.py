@@ -21,42 +21,44 @@ import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
 
 from reference_impl.chain import Array, Chain
-from reference_impl.integrate import Run, natural_sizes
-from reference_impl.structured import Forest, lay
+from reference_impl.integrate import IntegrationResult, state_scales
+from reference_impl.structured import StructuredSystem, component_first
 
-NODES = 16  # a sweep of a small chain costs NumPy's calls and not its nodes: 8 … 20 were tried
-SWEEPS = 14  # at most in a step; more are better spent on a shorter step
-USUAL = 6  # sweeps: a step that needs more is made shorter, one that needs fewer may grow
+DEFAULT_NODES = 16  # a sweep of a small chain costs NumPy's calls and not its nodes: 8 … 20 were tried
+MAX_SWEEPS = 14  # at most in a step; more are better spent on a shorter step
+USUAL_SWEEPS = 6  # sweeps: a step that needs more is made shorter, one that needs fewer may grow
 
 
 @dataclass(frozen=True, eq=False)
-class BatchRun(Run):
+class BatchIntegrationResult(IntegrationResult):
     """A run of all chains together: N counts the bodies of all, ``evaluations`` the sweeps."""
 
-    rejected: int  # steps that were repeated shorter
-    hindered: int  # steps whose size the sweeps' convergence decided and not the tolerance: stiffness
+    rejected_steps: int  # steps that were repeated shorter
+    stiff_steps: int  # steps whose size the sweeps' convergence decided and not the tolerance: stiffness
     note: str  # a sentence where the problem is stiff for the sweeps
 
 
 @dataclass(frozen=True, eq=False)
-class Gauss:
+class GaussTables:
     """Tables of the S-point Gauss–Legendre collocation on [0, 1]."""
 
     c: Array  # (S,) nodes
     b: Array  # (S,) weights
     A: Array  # (S, S): ∫₀^cᵢ of the polynomial through the nodes
-    modes: Array  # (S, S): node values → Legendre coefficients
-    known: dict[float, Array] = field(default_factory=dict)
+    node_to_mode: Array  # (S, S): node values → Legendre coefficients
+    _extrapolation_cache: dict[float, Array] = field(default_factory=dict)
 
-    def ahead(self, ratio: float) -> Array:
+    def extrapolation_matrix(self, ratio: float) -> Array:
         """(S, S) Legendre modes → values at the nodes of the next step, ``ratio`` times as long."""
-        if ratio not in self.known:
-            if len(self.known) > 64:
-                self.known.clear()
-            self.known[ratio] = np.asarray(legvander(1 + 2 * ratio * self.c, len(self.c) - 1), dtype=float)
-        return self.known[ratio]
+        if ratio not in self._extrapolation_cache:
+            if len(self._extrapolation_cache) > 64:
+                self._extrapolation_cache.clear()
+            self._extrapolation_cache[ratio] = np.asarray(
+                legvander(1 + 2 * ratio * self.c, len(self.c) - 1), dtype=float
+            )
+        return self._extrapolation_cache[ratio]
 
-    def integrals(self, tau: Array) -> tuple[Array, Array]:
+    def mode_integrals(self, tau: Array) -> tuple[Array, Array]:
         """(T, S) each: the first and second integral from 0 to ``tau`` (T,) per Legendre mode."""
         S, x = len(self.c), 2 * tau - 1
         P = np.concatenate([-np.ones((len(x), 1)), legvander(x, S + 1)], axis=1)  # P₋₁ = −1, P₀, …
@@ -69,17 +71,17 @@ class Gauss:
 
 
 @cache
-def gauss(S: int) -> Gauss:
+def gauss_tables(S: int) -> GaussTables:
     """The tables for S nodes."""
     x, w = leggauss(S)
     modes = (legvander(x, S - 1) * w[:, None]).T * (np.arange(S)[:, None] + 0.5)
-    table = Gauss(c=(1 + x) / 2, b=w / 2, A=np.empty((S, S)), modes=modes)
-    np.matmul(table.integrals(table.c)[0], modes, out=table.A)
+    table = GaussTables(c=(1 + x) / 2, b=w / 2, A=np.empty((S, S)), node_to_mode=modes)
+    np.matmul(table.mode_integrals(table.c)[0], modes, out=table.A)
     return table
 
 
-def integrate(
-    chains: Sequence[Chain] | Forest,
+def integrate_collocation(
+    chains: Sequence[Chain] | StructuredSystem,
     r: Array,
     p: Array,
     v: Array,
@@ -87,12 +89,12 @@ def integrate(
     times: Array,
     rtol: float,
     *,
-    nodes: int = NODES,
+    nodes: int = DEFAULT_NODES,
     sweep_tolerance: float | None = None,
     dense: bool = True,
     baumgarte: float = 0.0,
-    projected: bool = False,
-) -> BatchRun:
+    project: bool = False,
+) -> BatchIntegrationResult:
     """Motion of all chains with common steps, sampled at ``times`` (T,); times[0] is the initial time.
 
     Initial r, ṙ (M, 3) m, m/s and p, ṗ (M, 4) –, 1/s, the bodies of all chains in order.
@@ -111,13 +113,22 @@ def integrate(
 
     Raises SingularSystem where S is singular on the way, ArithmeticError where the step vanishes.
     """
-    forest = chains if isinstance(chains, Forest) else Forest(chains)
+    forest = chains if isinstance(chains, StructuredSystem) else StructuredSystem(chains)
     quiet = 0.1 * rtol if sweep_tolerance is None else sweep_tolerance
-    stepper = _Stepper(forest, lay(r, p), lay(v, pdot), rtol, quiet, gauss(nodes), dense, baumgarte)
-    stepper.sizes(r, p, v, pdot)
+    stepper = _Stepper(
+        forest,
+        component_first(r, p),
+        component_first(v, pdot),
+        rtol,
+        quiet,
+        gauss_tables(nodes),
+        dense,
+        baumgarte,
+    )
+    stepper.initialise_scales(r, p, v, pdot)
     span = float(times[-1] - times[0])
     t, steps, rejected, hindered, done = float(times[0]), 0, 0, 0, 1
-    samples = np.empty((2, len(times), 7, forest.size))
+    samples = np.empty((2, len(times), 7, forest.body_count))
     samples[:, 0] = stepper.q, stepper.v
     while done < len(times):
         goal = float(times[-1] if dense else times[done])
@@ -126,7 +137,7 @@ def integrate(
             h = (goal - t) / max(1.0, np.ceil((goal - t) / stepper.h - 0.15))
         if h < 1e-13 * max(span, abs(t)) and goal - t > h:
             raise ArithmeticError(f"collocation stopped at t = {t} s: the step vanishes")
-        ok, slow = stepper.step(h)
+        ok, slow = stepper.try_step(h)
         if not ok:
             rejected += 1
             continue
@@ -135,18 +146,18 @@ def integrate(
         reached_t = goal if ends else t + h
         reached = int(np.searchsorted(times, reached_t, side="right"))
         if reached > done:
-            within = stepper.inside((times[done:reached] - t) / h)
-            if projected:
+            within = stepper.dense_output((times[done:reached] - t) / h)
+            if project:
                 within = np.stack([forest.project(q, v) for q, v in within.swapaxes(0, 1)], axis=1)
             samples[:, done:reached] = within
-        if projected:
+        if project:
             stepper.project()
         if reached > done and times[reached - 1] == reached_t:
             samples[:, reached - 1] = stepper.q, stepper.v
         t, done = reached_t, reached
     values = samples.swapaxes(-1, -2)
     note = f"stiff: the sweeps and not the tolerance set {hindered} of {steps} steps"
-    return BatchRun(
+    return BatchIntegrationResult(
         t=times,
         r=values[0, ..., :3],
         p=values[0, ..., 3:],
@@ -154,8 +165,8 @@ def integrate(
         pdot=values[1, ..., 3:],
         steps=steps,
         evaluations=stepper.sweeps,
-        rejected=rejected,
-        hindered=hindered,
+        rejected_steps=rejected,
+        stiff_steps=hindered,
         note=note if 2 * hindered > steps > 2 else "",
     )
 
@@ -164,34 +175,37 @@ class _Stepper:
     """The state of all chains, and one step of it."""
 
     h: float  # s, of the next step
-    last_h: float
+    last_step: float
     new_modes: Array
 
     def __init__(
         self,
-        forest: Forest,
+        forest: StructuredSystem,
         q: Array,
         v: Array,
         rtol: float,
         quiet: float,
-        table: Gauss,
+        table: GaussTables,
         dense: bool,
         baumgarte: float,
     ) -> None:
-        self.forest, self.tiled, self.table = forest, forest.tile(len(table.c)), table
-        self.q, self.v, self.rtol, self.quiet = q, v, rtol, quiet
+        self.forest, self.tiled, self.table = forest, forest.repeated(len(table.c)), table
+        self.q, self.v, self.rtol, self.sweep_tolerance = q, v, rtol, quiet
         self.dense, self.baumgarte = dense, baumgarte
-        self.q_lost, self.v_lost = np.zeros_like(q), np.zeros_like(v)  # what rounding took from the sums
+        self.q_compensation, self.v_compensation = (
+            np.zeros_like(q),
+            np.zeros_like(v),
+        )  # what rounding took from the sums
         self.modes: Array = np.empty(0)  # (7, S, M) Legendre modes of the last step's accelerations
         self.sweeps = 0
 
-    def sizes(self, r: Array, p: Array, v: Array, pdot: Array) -> None:
+    def initialise_scales(self, r: Array, p: Array, v: Array, pdot: Array) -> None:
         """Natural sizes (7, M) of q and v, chain by chain, and the first step from their ratio."""
         q_size, v_size = np.empty_like(self.q), np.empty_like(self.v)
         pushed = np.abs(self.forest.acceleration(self.q, self.v))
-        for chain, at in zip(self.forest.chains, self.forest.start, strict=False):
+        for chain, at in zip(self.forest.chains, self.forest.first_body, strict=False):
             body = slice(at, at + chain.n)
-            y = natural_sizes(chain, r[body], p[body], v[body], pdot[body])
+            y = state_scales(chain, r[body], p[body], v[body], pdot[body])
             first, second = y[0], y[3 * chain.n]
             q_size[:3, body], q_size[3:, body] = first, second
             v_size[:3, body], v_size[3:, body] = y[7 * chain.n], y[10 * chain.n]
@@ -200,18 +214,18 @@ class _Stepper:
         self.q_size, self.v_size = q_size, np.where(v_size > 0, v_size, 1.0)  # nothing moves: any size
         self.h = 0.3 * float(np.min(q_size / self.v_size))
 
-    def step(self, h: float) -> tuple[bool, bool]:
+    def try_step(self, h: float) -> tuple[bool, bool]:
         """Try a step: (whether it was made, whether the sweeps were what limited it). Sets the next ``h``."""
-        table, S, M = self.table, len(self.table.c), self.forest.size
+        table, S, M = self.table, len(self.table.c), self.forest.body_count
         if self.modes.size:
-            a = self._guess(h / self.last_h)
+            a = self._extrapolated_acceleration(h / self.last_step)
         else:
             here = self.forest.acceleration(self.q, self.v, self.baumgarte)
             a = np.repeat(here[:, None], S, axis=1)
         q0, v0, weight = self.q[:, None], self.v[:, None], 1 / self.v_size[:, None]
         before, rate, converged, count = np.inf, 0.0, False, 0
         hA = h * table.A
-        while count < SWEEPS and not converged:
+        while count < MAX_SWEEPS and not converged:
             V = hA @ a
             V += v0
             Q = hA @ V
@@ -226,7 +240,7 @@ class _Stepper:
             rate = change / before if count > 1 else 1.0
             # Quiet at the floor that rounding in a sets: no sweep improves on it.
             floor = 1e-12 * h * float(np.max(np.abs(a) * weight)) if count > 1 and rate > 0.3 else 0.0
-            converged = change * min(rate, 1.0) <= self.quiet or change <= floor
+            converged = change * min(rate, 1.0) <= self.sweep_tolerance or change <= floor
             if count > 3 and rate > 0.8 and not converged:
                 break
             before = change
@@ -234,9 +248,9 @@ class _Stepper:
         if not converged:
             self.h = 0.6 * h
             return False, True
-        tail = self._tail(a, h)
+        tail = self._error_over_tolerance(a, h)
         grow = 0.9 * (1 / max(tail, 1e-30)) ** (1 / S)
-        patience = (USUAL / count) ** 0.5
+        patience = (USUAL_SWEEPS / count) ** 0.5
         slow = grow > 1.6 and patience < 1.1
         if tail > 1:
             self.h = h * max(0.3, grow)
@@ -247,21 +261,21 @@ class _Stepper:
         self._advance(a, h)
         return True, slow
 
-    def _guess(self, ratio: float) -> Array:
+    def _extrapolated_acceleration(self, ratio: float) -> Array:
         """The last step's polynomial at the nodes of the next one, cut where its terms there are smallest.
 
         A Legendre mode k grows (1 + 2 ratio + …)ᵏ-fold outside its step, and the last ones are rounding and
         aliasing: beyond the smallest term each one adds more error than it takes away.
         """
-        ahead = self.table.ahead(ratio)
+        ahead = self.table.extrapolation_matrix(ratio)
         terms = np.max(np.abs(self.modes) / self.v_size[:, None], axis=(0, 2)) * ahead[-1]
         keep = 2 + int(np.argmin(terms[1:]))
         return np.asarray(ahead[:, :keep] @ self.modes[:, :keep])
 
-    def _tail(self, a: Array, h: float) -> float:
+    def _error_over_tolerance(self, a: Array, h: float) -> float:
         """The error of the step over the tolerance, from the last two Legendre modes of a."""
         S = len(self.table.c)
-        self.new_modes = self.table.modes @ a  # (7, S, M)
+        self.new_modes = self.table.node_to_mode @ a  # (7, S, M)
         last = np.max(np.abs(self.new_modes[:, -2:]), axis=1)
         if not self.dense:
             size = np.max(np.abs(a), axis=1)
@@ -273,16 +287,16 @@ class _Stepper:
     def _advance(self, a: Array, h: float) -> None:
         """To the end of the step, with compensated sums (Kahan)."""
         table = self.table
-        self.modes, self.last_h, self.q0, self.v0 = self.new_modes, h, self.q, self.v
+        self.modes, self.last_step, self.q0, self.v0 = self.new_modes, h, self.q, self.v
         dv = h * np.einsum("j,ijm->im", table.b, a)
         dq = h * (self.v + h * np.einsum("j,ijm->im", table.b * (1 - table.c), a))
-        self.q, self.q_lost = _add(self.q, dq + self.q_lost)
-        self.v, self.v_lost = _add(self.v, dv + self.v_lost)
+        self.q, self.q_compensation = _compensated_sum(self.q, dq + self.q_compensation)
+        self.v, self.v_compensation = _compensated_sum(self.v, dv + self.v_compensation)
 
-    def inside(self, tau: Array) -> Array:
+    def dense_output(self, tau: Array) -> Array:
         """(2, T, 7, M) q and v at fractions ``tau`` of the last step."""
-        once, twice = self.table.integrals(tau)
-        modes, h = self.modes, self.last_h
+        once, twice = self.table.mode_integrals(tau)
+        modes, h = self.modes, self.last_step
         v = self.v0 + h * np.einsum("tk,ikm->tim", once, modes)
         q = self.q0 + h * (tau[:, None, None] * self.v0 + h * np.einsum("tk,ikm->tim", twice, modes))
         return np.stack([q, v])
@@ -290,10 +304,10 @@ class _Stepper:
     def project(self) -> None:
         """Onto the manifold."""
         self.q, self.v = self.forest.project(self.q, self.v)
-        self.q_lost, self.v_lost = np.zeros_like(self.q), np.zeros_like(self.v)
+        self.q_compensation, self.v_compensation = np.zeros_like(self.q), np.zeros_like(self.v)
 
 
-def _add(total: Array, part: Array) -> tuple[Array, Array]:
+def _compensated_sum(total: Array, part: Array) -> tuple[Array, Array]:
     """Sum, and what its rounding lost (Kahan)."""
     out = total + part
     return out, part - (out - total)

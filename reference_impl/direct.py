@@ -11,7 +11,7 @@ from scipy.linalg import lapack
 from reference_impl.chain import Array, Chain
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import L, angular_velocity, dot
-from reference_impl.joints import Rows, after_pivot, row_joints, rows
+from reference_impl.joints import ConstraintRows, constraint_rows, far_body_values, joint_of_rows
 
 EPS = float(np.finfo(float).eps)
 
@@ -29,7 +29,7 @@ class Solution:
     joint_reaction: Array  # (N, 3) N, force on body k at its proximal point, world frame: −C_rᵀ λ
 
 
-class System:
+class DirectSystem:
     """S x = b of one chain; the sparsity of S is found once, S and b are assembled for every state.
 
     `assemble` is the specification: S and b dense, blocks and signs as printed in (N5), unknowns in
@@ -39,7 +39,7 @@ class System:
 
     def __init__(self, chain: Chain) -> None:
         self.chain = chain
-        n, joint = chain.n, row_joints(chain)
+        n, joint = chain.n, joint_of_rows(chain)
         c = len(joint)
         r, p = np.arange(3 * n).reshape(n, 3), 3 * n + np.arange(4 * n).reshape(n, 4)
         row, norm = 7 * n + np.arange(c), 7 * n + c + np.arange(n)
@@ -78,18 +78,18 @@ class System:
 
     def assemble(self, r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, Array]:
         """(N5) S (m, m) and b (m,), m = 8 N + c, at r, ṙ (N, 3), p, ṗ (N, 4), on or off the manifold."""
-        values, b, _ = self._blocks(r, p, v, pdot)
+        values, b, _ = self._entries(r, p, v, pdot)
         S = np.zeros((self.size, self.size))
         S[self._i, self._j] = values
         return S, b
 
     def solve(self, r: Array, p: Array, v: Array, pdot: Array, gamma_defect: float | Array = 0.0) -> Solution:
         """r̈, p̈, λ, λ_E of (N5) at r, ṙ (N, 3) and p, ṗ (N, 4), and what they mean; as `unknowns`."""
-        return self._read(*self.unknowns(r, p, v, pdot, gamma_defect))
+        return self._solution_from_unknowns(*self.solve_unknowns(r, p, v, pdot, gamma_defect))
 
-    def unknowns(
+    def solve_unknowns(
         self, r: Array, p: Array, v: Array, pdot: Array, gamma_defect: float | Array = 0.0
-    ) -> tuple[Array, Rows]:
+    ) -> tuple[Array, ConstraintRows]:
         """The unknowns of (N5), x (m,) in the printed order, and the joints' rows.
 
         S is equilibrated symmetrically by powers of two (its blocks have the units kg, kg m² and m,
@@ -101,13 +101,13 @@ class System:
         Raises SingularSystem, which names the body and the cause (E1, E7).
         """
         with np.errstate(all="ignore"):  # what overflows is named below
-            values, b, joints = self._blocks(r, p, v, pdot)
+            values, b, joints = self._entries(r, p, v, pdot)
             n, c = self.chain.n, len(self.joint)
             b[7 * n : 7 * n + c] += gamma_defect
-            check(self.chain, r, p, joints.d, self._rods, (values, b, v))
+            check_state_solvable(self.chain, r, p, joints.d, self._rods, (values, b, v))
 
         entries = values[self._by_row]
-        scale = power_of_two(np.maximum.reduceat(np.abs(entries), self._row_start))
+        scale = power_of_two_scale(np.maximum.reduceat(np.abs(entries), self._row_start))
         entries *= scale[self._row] * scale[self._column]
         band = np.zeros((3 * self._width + 1, self.size))
         band[self._band] = entries[self._unsort]
@@ -121,15 +121,15 @@ class System:
         solution[self._order] = x * scale
         return solution, joints
 
-    def solve_densely(self, r: Array, p: Array, v: Array, pdot: Array) -> Solution:
+    def solve_with_dense_factors(self, r: Array, p: Array, v: Array, pdot: Array) -> Solution:
         """As `solve`, by dense factors of the assembled S: another way to the same x."""
         S, b = self.assemble(r, p, v, pdot)
-        return self._read(solve_dense(S, b), rows(self.chain, r, p, v, pdot))
+        return self._solution_from_unknowns(solve_dense(S, b), constraint_rows(self.chain, r, p, v, pdot))
 
-    def _blocks(self, r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, Array, Rows]:
+    def _entries(self, r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, Array, ConstraintRows]:
         """The entries of S in the order of `_i`, `_j`, then b, and the joints they come from."""
         chain = self.chain
-        joints = rows(chain, r, p, v, pdot)
+        joints = constraint_rows(chain, r, p, v, pdot)
         L_, L_rate = L(p), L(pdot)
         JL = chain.inertia @ L_
         blocks = (
@@ -151,7 +151,7 @@ class System:
         b = np.concatenate([force.ravel(), p_force.ravel(), joints.gamma, -2 * dot(pdot, pdot)])
         return np.concatenate([values, values[self._lower :]]), b, joints
 
-    def _read(self, x: Array, joints: Rows) -> Solution:
+    def _solution_from_unknowns(self, x: Array, joints: ConstraintRows) -> Solution:
         """The parts of x, and λ as forces."""
         n, c = self.chain.n, len(self.joint)
         multiplier = x[7 * n : 7 * n + c]
@@ -171,28 +171,28 @@ class System:
 
 def solve_dense(S: Array, b: Array) -> Array:
     """X of S x = b, dense, equilibrated and refined as `System.solve`; SingularSystem if S is singular."""
-    scale = power_of_two(np.max(np.abs(S), axis=1))
+    scale = power_of_two_scale(np.max(np.abs(S), axis=1))
     S = S * scale[:, None] * scale
     lu, pivots, _ = lapack.dgetrf(S)
-    if singular(np.diagonal(lu)):
+    if is_singular(np.diagonal(lu)):
         raise SingularSystem("S is singular to rounding")
     x, _ = lapack.dgetrs(lu, pivots, b * scale)
     x += lapack.dgetrs(lu, pivots, b * scale - S @ x)[0]
     return np.asarray(x * scale)
 
 
-def power_of_two(largest: Array) -> Array:
+def power_of_two_scale(largest: Array) -> Array:
     """The power of two nearest below 1/√largest, 1 where that is 0: scaling by it rounds nothing."""
     return np.where(largest > 0, np.ldexp(1.0, -(np.frexp(largest)[1] // 2)), 1.0)
 
 
-def singular(pivots: Array) -> bool:
+def is_singular(pivots: Array) -> bool:
     """Whether the pivots of an equilibrated matrix say that it is singular to rounding."""
     size = np.abs(pivots)
     return not bool(np.min(size) > len(size) * EPS * np.max(size))
 
 
-def check(
+def check_state_solvable(
     chain: Chain, r: Array, p: Array, d: Array, rods: NDArray[np.bool_], entries: tuple[Array, ...]
 ) -> None:
     """Raise SingularSystem where the state alone says that S is singular, and of which body (E1, E7).
@@ -210,7 +210,7 @@ def check(
         raise SingularSystem(f"p of body {body} is 0: 4 LᵀJL and the normalisation row vanish with it (E7)")
     if not rods.any():
         return
-    spans = [r, after_pivot(r), chain.proximal, after_pivot(chain.distal)]
+    spans = [r, far_body_values(r), chain.proximal, far_body_values(chain.distal)]
     rounding = 16 * EPS * np.max(np.abs(spans), axis=(0, 2))
     collapsed = rods & (np.sqrt(dot(d, d)) <= rounding)
     if collapsed.any():
@@ -223,7 +223,7 @@ def check(
 
 def check_pivots(chain: Chain, pivots: Array) -> None:
     """Raise SingularSystem with the likeliest cause where the factored S is singular to rounding."""
-    if not singular(pivots):
+    if not is_singular(pivots):
         return
     if np.any(chain.mass <= 0):
         raise SingularSystem(f"the mass of body {int(np.argmin(chain.mass)) + 1} is {np.min(chain.mass)} kg")

@@ -23,78 +23,78 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reference_impl.chain import Chain
-from reference_impl.euler_parameters import I3, A, B, Field, G, L, dot, outer
+from reference_impl.euler_parameters import I3, A, AnyArray, B, G, L, dot, outer
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class ConstraintRows:
     """The joints' rows in the order of the joints; c rows in all, c = Σ (1 per rod, 3 per ball)."""
 
     joint: NDArray[np.intp]  # (c,) the joint of the row; its near body
-    C: Field  # (c,) m² of a rod, m of a ball
-    r_near: Field  # (c, 3) ∂C/∂r of the near body; of the far body it is −r_near
-    p_near: Field  # (c, 4) ∂C/∂p of the near body
-    p_far: Field  # (c, 4) ∂C/∂p of the far body; 0 for the pivot
-    gamma: Field  # (c,) C̈ = C_r r̈ + C_p p̈ − γ
-    d: Field  # (N, 3) m, world frame, from where joint k hangs to the near body's proximal point
+    C: AnyArray  # (c,) m² of a rod, m of a ball
+    r_near: AnyArray  # (c, 3) ∂C/∂r of the near body; of the far body it is −r_near
+    p_near: AnyArray  # (c, 4) ∂C/∂p of the near body
+    p_far: AnyArray  # (c, 4) ∂C/∂p of the far body; 0 for the pivot
+    gamma: AnyArray  # (c,) C̈ = C_r r̈ + C_p p̈ − γ
+    d: AnyArray  # (N, 3) m, world frame, from where joint k hangs to the near body's proximal point
 
-    def rate(self, v: Field, pdot: Field) -> Field:
+    def constraint_rate(self, v: AnyArray, pdot: AnyArray) -> AnyArray:
         """Ċ = C_r ṙ + C_p ṗ, (c,); ṙ (N, 3), ṗ (N, 4)."""
-        far_v, far_pdot = after_pivot(v), after_pivot(pdot)
+        far_v, far_pdot = far_body_values(v), far_body_values(pdot)
         k = self.joint
         moved = dot(self.r_near, v[k] - far_v[k])
         return np.asarray(moved + dot(self.p_near, pdot[k]) + dot(self.p_far, far_pdot[k]))
 
 
-def after_pivot(x: Field) -> Field:
+def far_body_values(x: AnyArray) -> AnyArray:
     """The far body's value for every joint: zeros for the pivot, then x of bodies 0 … N−2."""
     return np.concatenate([np.zeros_like(x[:1]), x[:-1]])
 
 
-def row_joints(chain: Chain) -> NDArray[np.intp]:
+def joint_of_rows(chain: Chain) -> NDArray[np.intp]:
     """(c,) the joint of each row."""
     return np.repeat(np.arange(chain.n), np.where(chain.rods, 1, 3))
 
 
 @dataclass(frozen=True, eq=False)
-class Layout:
+class RowLayout:
     """What the rows of a chain have in common at every state."""
 
     bodies: NDArray[np.intp]  # (2, N) near and far body of each joint; the pivot's is body 0, see `s`
-    s: Field  # (2, N, 3) m, their points; 0 for the pivot, which takes body 0 out: H(p, 0) = 0
-    B: Field  # (2, N, 4, 4) B(s)
-    squares: Field  # (N,) m²: sᵀs of both points less ℓ²
-    rod: NDArray[np.intp] | slice  # joints that are rods; all of them as a slice, which copies nothing
-    ball: NDArray[np.intp] | slice
-    rods: int  # how many
-    balls: int
+    s: AnyArray  # (2, N, 3) m, their points; 0 for the pivot, which takes body 0 out: H(p, 0) = 0
+    B: AnyArray  # (2, N, 4, 4) B(s)
+    point_squares: AnyArray  # (N,) m²: sᵀs of both points less ℓ²
+    rod_joints: NDArray[np.intp] | slice  # joints that are rods; all of them as a slice, which copies nothing
+    ball_joints: NDArray[np.intp] | slice
+    rod_count: int  # how many
+    ball_count: int
     joint: NDArray[np.intp]  # (c,) the joint of each row
     order: NDArray[np.intp]  # (c,) rows of the rods, then of the balls, in the order of the joints
 
 
 @lru_cache(maxsize=64)  # chains are never changed, and a run asks for the same one ten thousand times
-def layout(chain: Chain) -> Layout:
+def row_layout(chain: Chain) -> RowLayout:
     """The layout of one chain's rows."""
     k = np.arange(chain.n)
-    s = np.stack([chain.proximal, after_pivot(chain.distal)])
+    s = np.stack([chain.proximal, far_body_values(chain.distal)])
     rod, ball = np.flatnonzero(chain.rods), np.flatnonzero(~chain.rods)
-    return Layout(
+    return RowLayout(
         bodies=np.stack([k, np.maximum(k - 1, 0)]),
         s=s,
         B=B(s),
-        squares=dot(s, s).sum(0) - chain.length**2,
-        rod=rod if len(ball) else slice(None),
-        ball=ball if len(rod) else slice(None),
-        rods=len(rod),
-        balls=len(ball),
-        joint=row_joints(chain),
+        point_squares=dot(s, s).sum(0) - chain.length**2,
+        rod_joints=rod if len(ball) else slice(None),
+        ball_joints=ball if len(rod) else slice(None),
+        rod_count=len(rod),
+        ball_count=len(ball),
+        joint=joint_of_rows(chain),
         order=np.argsort(np.concatenate([rod, np.repeat(ball, 3)]), kind="stable"),
     )
 
 
-def rows(chain: Chain, r: Field, p: Field, v: Field, pdot: Field) -> Rows:
+def constraint_rows(chain: Chain, r: AnyArray, p: AnyArray, v: AnyArray, pdot: AnyArray) -> ConstraintRows:
     """C, C_r, C_p and γ of every joint at r, ṙ (N, 3), p, ṗ (N, 4), on or off the manifold."""
-    fixed = layout(chain)
+    fixed = row_layout(chain)
     s = fixed.s
     q, qdot = p[fixed.bodies], pdot[fixed.bodies]  # (2, N, 4): near and far body of each joint
     x, xdot = r.copy(), v.copy()  # from the far body to the near one
@@ -103,39 +103,43 @@ def rows(chain: Chain, r: Field, p: Field, v: Field, pdot: Field) -> Rows:
     both = np.stack([q, qdot])
     turn = G(both)
     (H_near, H_far), (H_near_rate, H_far_rate) = turn @ fixed.B + outer(s, both)  # H, Ḣ (D4)
-    b, a = _times(A(q), s)
+    b, a = _matrix_vector(A(q), s)
     d = x + b - a
 
-    parts: list[tuple[Field, ...]] = []
-    if fixed.rods:
-        k = fixed.rod
-        bdot, adot = 2 * _times(turn[0][:, k], _left(s[:, k], L(qdot[:, k])))  # Ȧ s, Ȧ = 2 G L̇ᵀ (N10)
+    parts: list[tuple[AnyArray, ...]] = []
+    if fixed.rod_count:
+        k = fixed.rod_joints
+        bdot, adot = 2 * _matrix_vector(
+            turn[0][:, k], _vector_matrix(s[:, k], L(qdot[:, k]))
+        )  # Ȧ s, Ȧ = 2 G L̇ᵀ (N10)
         y, ydot, z, zdot = x[k] - a[k], xdot[k] - adot, x[k] + b[k], xdot[k] + bdot
-        C = dot(x[k], x[k]) + 2 * dot(x[k], b[k] - a[k]) - 2 * dot(a[k], b[k]) + fixed.squares[k]
-        near_rate = _left(ydot, H_near[k]) + _left(y, H_near_rate[k])
-        far_rate = _left(zdot, H_far[k]) + _left(z, H_far_rate[k])
+        C = dot(x[k], x[k]) + 2 * dot(x[k], b[k] - a[k]) - 2 * dot(a[k], b[k]) + fixed.point_squares[k]
+        near_rate = _vector_matrix(ydot, H_near[k]) + _vector_matrix(y, H_near_rate[k])
+        far_rate = _vector_matrix(zdot, H_far[k]) + _vector_matrix(z, H_far_rate[k])
         gamma = (
             -2 * dot(zdot - adot, xdot[k]) - 4 * dot(near_rate, qdot[0, k]) + 4 * dot(far_rate, qdot[1, k])
         )
-        parts.append((C, 2 * d[k], 4 * _left(y, H_near[k]), -4 * _left(z, H_far[k]), gamma))
-    if fixed.balls:
-        k = fixed.ball
-        gamma = 2 * (_times(H_far_rate[k], qdot[1, k]) - _times(H_near_rate[k], qdot[0, k]))
-        identity = np.broadcast_to(I3, (fixed.balls, 3, 3))
+        parts.append((C, 2 * d[k], 4 * _vector_matrix(y, H_near[k]), -4 * _vector_matrix(z, H_far[k]), gamma))
+    if fixed.ball_count:
+        k = fixed.ball_joints
+        gamma = 2 * (_matrix_vector(H_far_rate[k], qdot[1, k]) - _matrix_vector(H_near_rate[k], qdot[0, k]))
+        identity = np.broadcast_to(I3, (fixed.ball_count, 3, 3))
         blocks = (d[k], identity, 2 * H_near[k], -2 * H_far[k], gamma)
-        parts.append(tuple(np.reshape(block, (3 * fixed.balls, *np.shape(block)[2:])) for block in blocks))
+        parts.append(
+            tuple(np.reshape(block, (3 * fixed.ball_count, *np.shape(block)[2:])) for block in blocks)
+        )
     columns = parts[0]
     if len(parts) == 2:
         columns = tuple(np.concatenate(column)[fixed.order] for column in zip(*parts, strict=True))
     C, r_near, p_near, p_far, gamma = columns
-    return Rows(joint=fixed.joint, C=C, r_near=r_near, p_near=p_near, p_far=p_far, gamma=gamma, d=d)
+    return ConstraintRows(joint=fixed.joint, C=C, r_near=r_near, p_near=p_near, p_far=p_far, gamma=gamma, d=d)
 
 
-def _times(matrix: Field, vector: Field) -> Field:
+def _matrix_vector(matrix: AnyArray, vector: AnyArray) -> AnyArray:
     """Matrix times vector, batched."""
     return np.asarray((matrix @ vector[..., None])[..., 0])
 
 
-def _left(vector: Field, matrix: Field) -> Field:
+def _vector_matrix(vector: AnyArray, matrix: AnyArray) -> AnyArray:
     """Row vector times matrix, batched."""
     return np.asarray((vector[..., None, :] @ matrix)[..., 0, :])

@@ -11,45 +11,45 @@ from __future__ import annotations
 import numpy as np
 
 from reference_impl.chain import Array, Chain
-from reference_impl.direct import check, solve_dense
-from reference_impl.euler_parameters import A, A_rate, B, Field, G, H, L, outer
-from reference_impl.joints import rows
+from reference_impl.direct import check_state_solvable, solve_dense
+from reference_impl.euler_parameters import A, A_rate, AnyArray, B, G, H, L, outer
+from reference_impl.joints import constraint_rows
 
 # --- single pendulum: r, p, ṙ, ṗ of the body, s₁ its attachment, ℓ the rod -------------------------------
 
 
-def single_C(r: Field, p: Field, s1: Field, length: float) -> Field:
+def single_C(r: AnyArray, p: AnyArray, s1: AnyArray, length: float) -> AnyArray:
     """(S1) C = rᵀr + 2 rᵀA s₁ + s₁ᵀs₁ − ℓ², m²; s₁ᵀAᵀA s₁ replaced by s₁ᵀs₁ (E2)."""
     return np.asarray(r @ r + 2 * (r @ A(p) @ s1) + s1 @ s1 - length * length)
 
 
-def single_C_r(r: Field, p: Field, s1: Field) -> Field:
+def single_C_r(r: AnyArray, p: AnyArray, s1: AnyArray) -> AnyArray:
     """(S2) C_r = 2 rᵀ + 2 s₁ᵀAᵀ, (3,)."""
     return np.asarray(2 * r + 2 * (s1 @ A(p).T))
 
 
-def single_C_p(r: Field, p: Field, s1: Field) -> Field:
+def single_C_p(r: AnyArray, p: AnyArray, s1: AnyArray) -> AnyArray:
     """(S3) C_p = 4 rᵀ (G B(s₁) + s₁ pᵀ), (4,)."""
     return np.asarray(4 * (r @ (G(p) @ B(s1) + outer(s1, p))))
 
 
-def single_gamma(r: Field, p: Field, v: Field, pdot: Field, s1: Field) -> Field:
+def single_gamma(r: AnyArray, p: AnyArray, v: AnyArray, pdot: AnyArray, s1: AnyArray) -> AnyArray:
     """(S4) γ = −2 ṙᵀṙ − 4 s₁ᵀL̇Gᵀṙ − 4 [(ṙᵀG + rᵀĠ) B(s₁) + ṙᵀs₁ pᵀ + rᵀs₁ ṗᵀ] ṗ."""
     bracket = (v @ G(p) + r @ G(pdot)) @ B(s1) + v @ outer(s1, p) + r @ outer(s1, pdot)
     return np.asarray(-2 * (v @ v) - 4 * (s1 @ L(pdot) @ G(p).T @ v) - 4 * (bracket @ pdot))
 
 
-def norm_C(p: Field) -> Field:
+def norm_C(p: AnyArray) -> AnyArray:
     """(S5) C_E = pᵀp − 1."""
     return np.asarray(p @ p - 1)
 
 
-def norm_C_p(p: Field) -> Field:
+def norm_C_p(p: AnyArray) -> AnyArray:
     """(S5) C_{E,p} = 2 pᵀ, (4,)."""
     return np.asarray(2 * p)
 
 
-def norm_gamma(pdot: Field) -> Field:
+def norm_gamma(pdot: AnyArray) -> AnyArray:
     """(S5) γ_E = −2 ṗᵀṗ."""
     return np.asarray(-2 * (pdot @ pdot))
 
@@ -57,7 +57,7 @@ def norm_gamma(pdot: Field) -> Field:
 # --- double pendulum: r, p, ṙ, ṗ have a row per body, s = (s₁, s₂, s₃), ℓ = (ℓ₁, ℓ₂) ------------------------
 
 
-def double_C(r: Field, p: Field, s: Field, length: Field) -> Field:
+def double_C(r: AnyArray, p: AnyArray, s: AnyArray, length: AnyArray) -> AnyArray:
     """(D2) C₁ as (S1); C₂ expanded, s₂ᵀA₁ᵀA₁s₂ and s₃ᵀA₂ᵀA₂s₃ replaced by s₂ᵀs₂ and s₃ᵀs₃, (2,)."""
     (r1, r2), (p1, p2), (s1, s2, s3) = r, p, s
     C2 = r1 @ r1 - 2 * (r1 @ r2) + r2 @ r2 + 2 * ((r1 - r2) @ (A(p1) @ s2 - A(p2) @ s3))
@@ -65,14 +65,14 @@ def double_C(r: Field, p: Field, s: Field, length: Field) -> Field:
     return np.array([single_C(r1, p1, s1, length[0])[()], C2])
 
 
-def double_C_r(r: Field, p: Field, s: Field) -> Field:
+def double_C_r(r: AnyArray, p: AnyArray, s: AnyArray) -> AnyArray:
     """(S2, D3) C_r, (2, 6)."""
     (r1, r2), (p1, p2), (s1, s2, s3) = r, p, s
     row = 2 * (r1 - r2) + 2 * (A(p1) @ s2 - A(p2) @ s3)
     return np.stack([np.concatenate([single_C_r(r1, p1, s1), 0 * r2]), np.concatenate([row, -row])])
 
 
-def double_C_p(r: Field, p: Field, s: Field) -> Field:
+def double_C_p(r: AnyArray, p: AnyArray, s: AnyArray) -> AnyArray:
     """(S3, D4) C_p, (2, 8)."""
     (r1, r2), (p1, p2), (s1, s2, s3) = r, p, s
     p1_row = 4 * ((r1 - r2) @ H(p1, s2)) - 4 * (s3 @ A(p2).T @ H(p1, s2))
@@ -80,14 +80,14 @@ def double_C_p(r: Field, p: Field, s: Field) -> Field:
     return np.stack([np.concatenate([single_C_p(r1, p1, s1), 0 * p2]), np.concatenate([p1_row, p2_row])])
 
 
-def double_C_r_rate(p: Field, v: Field, pdot: Field, s: Field) -> Field:
+def double_C_r_rate(p: AnyArray, v: AnyArray, pdot: AnyArray, s: AnyArray) -> AnyArray:
     """(D5) d_t(∂C₂/∂r), (6,)."""
     (p1, p2), (v1, v2), (pd1, pd2), (_, s2, s3) = p, v, pdot, s
     row = 2 * (v1 - v2) + 4 * (s2 @ L(pd1) @ G(p1).T - s3 @ L(pd2) @ G(p2).T)
     return np.concatenate([row, -row])
 
 
-def double_C_p_rate(r: Field, p: Field, v: Field, pdot: Field, s: Field) -> Field:
+def double_C_p_rate(r: AnyArray, p: AnyArray, v: AnyArray, pdot: AnyArray, s: AnyArray) -> AnyArray:
     """(D6) d_t(∂C₂/∂p), (8,)."""
     (r1, r2), (p1, p2), (v1, v2), (pd1, pd2), (_, s2, s3) = r, p, v, pdot, s
     H1, H1_rate, H2, H2_rate = H(p1, s2), H(pd1, s2), H(p2, s3), H(pd2, s3)
@@ -98,7 +98,7 @@ def double_C_p_rate(r: Field, p: Field, v: Field, pdot: Field, s: Field) -> Fiel
     return np.concatenate([p1_row, p2_row])
 
 
-def double_gamma(r: Field, p: Field, v: Field, pdot: Field, s: Field) -> Field:
+def double_gamma(r: AnyArray, p: AnyArray, v: AnyArray, pdot: AnyArray, s: AnyArray) -> AnyArray:
     """(N3 with S4, D5, D6) γ = −d_t(C_r) ṙ − d_t(C_p) ṗ, (2,)."""
     gamma_2 = -double_C_r_rate(p, v, pdot, s) @ v.ravel() - double_C_p_rate(r, p, v, pdot, s) @ pdot.ravel()
     return np.array([single_gamma(r[0], p[0], v[0], pdot[0], s[0])[()], gamma_2])
@@ -107,7 +107,7 @@ def double_gamma(r: Field, p: Field, v: Field, pdot: Field, s: Field) -> Field:
 # --- N5 for both ---------------------------------------------------------------------------------------
 
 
-def blocks(matrices: Field) -> Field:
+def block_diagonal(matrices: AnyArray) -> AnyArray:
     """diag(X₁, …, X_N) of X (N, i, j): (N i, N j)."""
     n, i, j = matrices.shape
     out = np.zeros((n, i, n, j), matrices.dtype)
@@ -115,7 +115,9 @@ def blocks(matrices: Field) -> Field:
     return out.reshape(n * i, n * j)
 
 
-def system(chain: Chain, r: Field, p: Field, v: Field, pdot: Field) -> tuple[Field, Field]:
+def assemble_system(
+    chain: Chain, r: AnyArray, p: AnyArray, v: AnyArray, pdot: AnyArray
+) -> tuple[AnyArray, AnyArray]:
     """(N5 with S1–S5 or D1–D6) S and b of a chain of one or two bodies, every joint read as a rod.
 
     Unknowns (r̈, p̈, λ, λ_E): S is (9, 9) for one body and (18, 18) for two.
@@ -128,13 +130,13 @@ def system(chain: Chain, r: Field, p: Field, v: Field, pdot: Field) -> tuple[Fie
         C_r, C_p, gamma = double_C_r(r, p, s), double_C_p(r, p, s), double_gamma(r, p, v, pdot, s)
     else:
         raise ValueError(f"the notes print one and two bodies, not {chain.n}")
-    L_, L_rate, J = blocks(L(p)), blocks(L(pdot)), blocks(chain.inertia)
+    L_, L_rate, J = block_diagonal(L(p)), block_diagonal(L(pdot)), block_diagonal(chain.inertia)
     M = np.diag(np.repeat(chain.mass, 3))
-    C_Ep = blocks(norm_C_p(p)[:, None, :])
+    C_Ep = block_diagonal(norm_C_p(p)[:, None, :])
     force = chain.mass[:, None] * chain.gravity + chain.force - chain.drag_force[:, None] * v
     moment = chain.moment - chain.drag_moment[:, None] * (2 * (L_ @ pdot.ravel())).reshape(-1, 3)
 
-    def zero(rows: int, columns: int) -> Field:
+    def zero(rows: int, columns: int) -> AnyArray:
         return np.zeros((rows, columns), M.dtype)
 
     n = chain.n
@@ -151,9 +153,9 @@ def system(chain: Chain, r: Field, p: Field, v: Field, pdot: Field) -> tuple[Fie
     return S, np.concatenate(b)
 
 
-def solve(chain: Chain, r: Array, p: Array, v: Array, pdot: Array) -> Array:
+def solve_printed(chain: Chain, r: Array, p: Array, v: Array, pdot: Array) -> Array:
     """(N5) (r̈, p̈, λ, λ_E), (9 N,), of `system`; SingularSystem names the cause and the body (E1, E7)."""
-    d = rows(chain, r, p, v, pdot).d
-    S, b = system(chain, r, p, v, pdot)
-    check(chain, r, p, d, np.full(chain.n, True), (S, b))
+    d = constraint_rows(chain, r, p, v, pdot).d
+    S, b = assemble_system(chain, r, p, v, pdot)
+    check_state_solvable(chain, r, p, d, np.full(chain.n, True), (S, b))
     return solve_dense(S, b)

@@ -13,16 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from reference_impl.chain import Array, Chain
-from reference_impl.collocation import NODES, BatchRun, integrate
+from reference_impl.collocation import DEFAULT_NODES, BatchIntegrationResult, integrate_collocation
 from reference_impl.euler_parameters import angular_velocity
-from reference_impl.structured import Forest, lay
+from reference_impl.structured import StructuredSystem, component_first
 
-BAUMGARTE = 10.0  # 1/s
+BAUMGARTE_RATE = 10.0  # 1/s
 VARIANTS = ("raw", "baumgarte", "projected")
 
 
 @dataclass(frozen=True)
-class Drift:
+class DriftRow:
     """The largest constraint and energy errors of one variant over [0, time]."""
 
     variant: str
@@ -35,7 +35,7 @@ class Drift:
     steps: int
 
 
-def run(
+def integrate_variant(
     variant: str,
     chain: Chain,
     r: Array,
@@ -44,20 +44,20 @@ def run(
     pdot: Array,
     times: Array,
     rtol: float,
-    rate: float = BAUMGARTE,
-    nodes: int = NODES,
-) -> BatchRun:
+    rate: float = BAUMGARTE_RATE,
+    nodes: int = DEFAULT_NODES,
+) -> BatchIntegrationResult:
     """Collocation of one of `VARIANTS`; arguments as `collocation.integrate`, ``rate`` a in 1/s."""
     if variant not in VARIANTS:
         raise ValueError(f"no variant {variant!r}; there are {VARIANTS}")
-    return integrate(
+    return integrate_collocation(
         [chain],
         *(r, p, v, pdot),
         times,
         rtol,
         nodes=nodes,
         baumgarte=rate if variant == "baumgarte" else 0.0,
-        projected=variant == "projected",
+        project=variant == "projected",
     )
 
 
@@ -71,7 +71,7 @@ def drift_table(
     times: Sequence[float] = (10.0, 100.0, 1000.0),
     samples: int = 40,
     variants: Sequence[str] = VARIANTS,
-) -> list[Drift]:
+) -> list[DriftRow]:
     """One `Drift` for every variant, tolerance and time; ``samples`` of each decade go into the maxima.
 
     Energy is judged only without loads and drag, NaN with them.
@@ -80,20 +80,20 @@ def drift_table(
     table = []
     for variant in variants:
         for rtol in rtols:
-            motion = run(variant, chain, r, p, v, pdot, grid, rtol)
+            motion = integrate_variant(variant, chain, r, p, v, pdot, grid, rtol)
             errors = np.stack([*constraint_errors(chain, motion), energy_error(chain, motion)])
             for end in times:
                 gap, gap_rate, norm, energy = np.max(errors[:, grid <= end], axis=1).tolist()
                 steps = round(motion.steps * end / times[-1])
-                table.append(Drift(variant, rtol, end, gap, gap_rate, norm, energy, steps))
+                table.append(DriftRow(variant, rtol, end, gap, gap_rate, norm, energy, steps))
     return table
 
 
-def constraint_errors(chain: Chain, motion: BatchRun) -> tuple[Array, Array, Array]:
+def constraint_errors(chain: Chain, motion: BatchIntegrationResult) -> tuple[Array, Array, Array]:
     """Largest gap (m), gap rate (m/s) and |‖p‖ − 1| at each sample, (T,) each."""
-    forest, found = Forest([chain]), []
+    forest, found = StructuredSystem([chain]), []
     for state in zip(motion.r, motion.p, motion.v, motion.pdot, strict=True):
-        d, rate = forest.gaps(lay(*state[:2]), lay(*state[2:]))
+        d, rate = forest.joint_gaps(component_first(*state[:2]), component_first(*state[2:]))
         distance = np.sqrt(np.sum(d * d, axis=0))
         along = np.sum(d * rate, axis=0) / np.where(chain.rods, distance, 1.0)
         gap = np.where(chain.rods, np.abs(distance - chain.length), distance)
@@ -103,7 +103,7 @@ def constraint_errors(chain: Chain, motion: BatchRun) -> tuple[Array, Array, Arr
     return gap, gap_rate, norm
 
 
-def energy_error(chain: Chain, motion: BatchRun) -> Array:
+def energy_error(chain: Chain, motion: BatchIntegrationResult) -> Array:
     """|E − E(0)| (T,) over Σ m g (reach of the stretched chain); NaN with loads or drag."""
     if any(np.any(x) for x in (chain.force, chain.moment, chain.drag_force, chain.drag_moment)):
         return np.full(len(motion.t), np.nan)

@@ -25,9 +25,9 @@ import numpy as np
 from scipy.linalg import lapack
 
 from reference_impl.chain import Array, Chain
-from reference_impl.direct import EPS, Solution, check
+from reference_impl.direct import EPS, Solution, check_state_solvable
 from reference_impl.errors import SingularSystem
-from reference_impl.joints import row_joints
+from reference_impl.joints import joint_of_rows
 
 
 def _bilinear(rows: list[str]) -> Array:
@@ -47,10 +47,12 @@ _PRODUCT = _bilinear(  # quaternion product a b, by components
         "+03 +12 -21 +30",
     ]
 )
-_FIRST, _SECOND = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]  # the six products ωᵢ ωⱼ
-_OMEGA = 2 * _bilinear(["+01 -10 -23 +32", "+02 +13 -20 -31", "+03 -12 +21 -30"])  # 2 L(p) ṗ
-_RATES = np.concatenate([_bilinear(["+00 +11 +22 +33"]), _OMEGA[_FIRST], _OMEGA[_SECOND]])  # pᵀṗ and these
-_ROTATION = _bilinear(  # π, then π R row by row
+_FIRST_FACTORS, _SECOND_FACTORS = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]  # the six products ωᵢ ωⱼ
+_TO_OMEGA = 2 * _bilinear(["+01 -10 -23 +32", "+02 +13 -20 -31", "+03 -12 +21 -30"])  # 2 L(p) ṗ
+_TO_RATE_PRODUCTS = np.concatenate(
+    [_bilinear(["+00 +11 +22 +33"]), _TO_OMEGA[_FIRST_FACTORS], _TO_OMEGA[_SECOND_FACTORS]]
+)  # pᵀṗ and these
+_TO_ROTATION = _bilinear(  # π, then π R row by row
     [
         "+00 +11 +22 +33",
         *("+00 +11 -22 -33", "+12 +21 -03 -30", "+13 +31 +02 +20"),
@@ -62,28 +64,28 @@ _HALF_LT = 0.5 * _PRODUCT.reshape(4, 4, 4)[:, :, 1:].reshape(
     4, 12
 )  # ½ L(p)ᵀ α, from the outer product of p and α
 # The lower band of D: column 3k+j holds rows j, j+1 … of its own block and then the next block's, 6 in all.
-_BAND = np.array(
+_BAND_INDICES = np.array(
     [
         *(0, 3, 6, 9, 12, 15),  # cells 3 i + j of the own block, 9 + 3 i + j of the next
         *(4, 7, 10, 13, 16, 18),  # 18: zeros
         *(8, 11, 14, 17, 18, 18),
     ]
 )
-_CROSS = np.zeros((9, 3))  # ω → ω̃, row by row
-_CROSS[[7, 2, 3], [0, 1, 2]], _CROSS[[5, 6, 1], [0, 1, 2]] = 1.0, -1.0
+_TO_TILDE = np.zeros((9, 3))  # ω → ω̃, row by row
+_TO_TILDE[[7, 2, 3], [0, 1, 2]], _TO_TILDE[[5, 6, 1], [0, 1, 2]] = 1.0, -1.0
 
 
 def skew(s: Array) -> Array:
     """s̃ (..., 3, 3) of s (..., 3)."""
-    return np.asarray((s @ _CROSS.T).reshape(*s.shape, 3))
+    return np.asarray((s @ _TO_TILDE.T).reshape(*s.shape, 3))
 
 
 def _tilde(omega: Array) -> Array:
     """ω̃ (3, 3, M) of ω (3, M)."""
-    return np.asarray((_CROSS @ omega).reshape(3, 3, -1))
+    return np.asarray((_TO_TILDE @ omega).reshape(3, 3, -1))
 
 
-def _turn(matrix: Array, vector: Array) -> Array:
+def _matrix_vector(matrix: Array, vector: Array) -> Array:
     """Matrix (i, j, M) times vector (j, M), or (c, j, M) of several points."""
     return np.asarray(np.einsum("ijm,...jm->...im", matrix, vector))
 
@@ -93,7 +95,7 @@ def _dot(a: Array, b: Array) -> Array:
     return np.asarray(np.einsum("i...,i...->...", a, b))
 
 
-class Joints(NamedTuple):
+class FactoredJoints(NamedTuple):
     """The joints' rows at one configuration and the factor of D, for any right-hand side.
 
     For balls only, c = 3 and U is the identity (``U`` None); for rods only, c = 1; mixed, c = 3 with a
@@ -102,13 +104,15 @@ class Joints(NamedTuple):
 
     d: Array | None  # (3, M) m, world frame, joint k's gap or rod; None for balls only
     U: Array | None  # (3, c, M) force on body k per μ_k
-    rows: Array  # (2, c, 3, M) U_nearᵀ X of body k's proximal, U_farᵀ X of body k−1's distal point (pivot: 0)
+    lever_rows: (
+        Array  # (2, c, 3, M) U_nearᵀ X of body k's proximal, U_farᵀ X of body k−1's distal point (pivot: 0)
+    )
     U_near: Array | None  # (3, c, M) as U, with the notes' own lever off pᵀp = 1 (E2)
     U_far: Array | None
     factor: tuple[Array, ...]
 
 
-class Forest:
+class StructuredSystem:
     """Chains laid end to end; M bodies in all.
 
     Raises SingularSystem for a mass or inertia that is not positive.  Public methods take and
@@ -127,8 +131,8 @@ class Forest:
             for name in ("moment", "drag_force", "drag_moment")
         )
         weight = np.concatenate([c.mass[:, None] * c.gravity + c.force for c in chains])
-        self.size = len(mass)
-        self.start = np.cumsum([0, *(chain.n for chain in chains)])
+        self.body_count = len(mass)
+        self.first_body = np.cumsum([0, *(chain.n for chain in chains)])
         if np.any(mass <= 0):
             raise SingularSystem(f"the mass of body {int(np.argmin(mass)) + 1} is {np.min(mass)} kg")
         principal = np.linalg.eigvalsh(inertia)
@@ -144,43 +148,52 @@ class Forest:
         def last(x: Array) -> Array:
             return np.ascontiguousarray(np.moveaxis(x, 0, -1))
 
-        self.per_mass = 1 / mass  # (M,) 1/kg
+        self.inverse_mass = 1 / mass  # (M,) 1/kg
         self.J, self.K = last(inertia), last(K)  # (3, 3, M)
         self.s = last(points)  # (2, 3, M) m, proximal and distal point, body frame
-        self.free = last(weight / mass[:, None])  # (3, M) m/s²
-        self.drag = drag_force / mass  # (M,) 1/s
-        self.dragged = bool(np.any(drag_force) or np.any(drag_moment))
+        self.free_acceleration = last(weight / mass[:, None])  # (3, M) m/s²
+        self.drag_rate = drag_force / mass  # (M,) 1/s
+        self.has_drag = bool(np.any(drag_force) or np.any(drag_moment))
         # β = K⁻¹ J⁻¹ (n′ − ω×Jω/π) and, in the body frame, the points about the centre, B β + ω×(ω×s)/π:
         # (9, M) constant, and (9, 6, M) of the ωᵢ ωⱼ/π; with drag (9, 9, M), the last three of ω.
-        cross, one = _CROSS.reshape(3, 3, 3), np.eye(3)
+        cross, one = _TO_TILDE.reshape(3, 3, 3), np.eye(3)
         gyro = -np.einsum("mki,kja,mjd->miad", K, cross, inertia)
         pull = np.einsum("ia,mcd->mciad", one, points) - np.einsum("ad,mci->mciad", one, points)
         B = -skew(points) @ K[:, None]  # (M, 2, 3, 3)
         self.B = last(B)
         spin = np.concatenate([gyro, (np.einsum("mcik,mkad->mciad", B, gyro) + pull).reshape(-1, 6, 3, 3)], 1)
-        spin = spin[..., _FIRST, _SECOND] + spin[..., _SECOND, _FIRST] * (np.arange(6) > 2)
+        spin = spin[..., _FIRST_FACTORS, _SECOND_FACTORS] + spin[..., _SECOND_FACTORS, _FIRST_FACTORS] * (
+            np.arange(6) > 2
+        )
         turned = np.concatenate([K.mT, (B @ K.mT[:, None]).reshape(-1, 6, 3)], 1)  # from a moment
-        if self.dragged:
+        if self.has_drag:
             spin = np.concatenate([spin, -turned * drag_moment[:, None, None]], -1)
-        self.spin, self.push = last(spin), last(np.matvec(turned, moment))
+        self.spin_terms, self.moment_terms = last(spin), last(np.matvec(turned, moment))
         self.length = length
-        self.link = np.ones(self.size)  # 0 where a body hangs on the pivot
-        self.link[self.start[:-1]] = 0
+        self.is_linked = np.ones(self.body_count)  # 0 where a body hangs on the pivot
+        self.is_linked[self.first_body[:-1]] = 0
         self.rods = length > 0
-        self.pair_mass = self.per_mass + self._hung(self.per_mass)  # (M,) 1/kg
-        self.next_mass = self.per_mass * self._next(np.ones(self.size))  # 0 where nothing hangs on a body
-        self.width = 1 if np.all(self.rods) else 3  # c
-        self.balls_only = not np.any(self.rods)
-        self.cells = np.zeros((2 * self.width**2 + 1, self.size))  # D's blocks, see _joints
-        if self.balls_only:  # I/m, the part that never changes
-            self.cells[0:9:4], self.cells[9:18:4] = self.pair_mass, -self.next_mass
+        self.pair_inverse_mass = self.inverse_mass + self._at_parent(self.inverse_mass)  # (M,) 1/kg
+        self.child_inverse_mass = self.inverse_mass * self._at_child(
+            np.ones(self.body_count)
+        )  # 0 where nothing hangs on a body
+        self.rows_per_joint = 1 if np.all(self.rods) else 3  # c
+        self.has_only_balls = not np.any(self.rods)
+        self.constant_blocks = np.zeros(
+            (2 * self.rows_per_joint**2 + 1, self.body_count)
+        )  # D's blocks, see _joints
+        if self.has_only_balls:  # I/m, the part that never changes
+            self.constant_blocks[0:9:4], self.constant_blocks[9:18:4] = (
+                self.pair_inverse_mass,
+                -self.child_inverse_mass,
+            )
 
-    def tile(self, count: int) -> Forest:
+    def repeated(self, count: int) -> StructuredSystem:
         """The same chains ``count`` times over: all of them, then all again."""
-        tiled = object.__new__(Forest)
+        tiled = object.__new__(StructuredSystem)
         tiled.__dict__.update(self.__dict__)
-        tiled.chains, tiled.size = self.chains * count, self.size * count
-        tiled.start = np.cumsum([0, *(chain.n for chain in tiled.chains)])
+        tiled.chains, tiled.body_count = self.chains * count, self.body_count * count
+        tiled.first_body = np.cumsum([0, *(chain.n for chain in tiled.chains)])
         for name, value in vars(self).items():
             if isinstance(value, np.ndarray) and name != "start":  # the last axis counts bodies
                 setattr(tiled, name, np.tile(value, count))
@@ -188,101 +201,101 @@ class Forest:
 
     # -- kinematics ---------------------------------------------------------------------------------
 
-    def _hung(self, x: Array) -> Array:
+    def _at_parent(self, x: Array) -> Array:
         """(..., M): the value at the body that body k hangs on, 0 for the pivot."""
         moved = np.empty_like(x)
         moved[..., 0] = 0
-        np.multiply(x[..., :-1], self.link[1:], out=moved[..., 1:])
+        np.multiply(x[..., :-1], self.is_linked[1:], out=moved[..., 1:])
         return moved
 
-    def _next(self, x: Array) -> Array:
+    def _at_child(self, x: Array) -> Array:
         """(..., M): the value at the body that hangs on body k, 0 for the last of a chain."""
         moved = np.empty_like(x)
         moved[..., -1] = 0
-        np.multiply(x[..., 1:], self.link[1:], out=moved[..., :-1])
+        np.multiply(x[..., 1:], self.is_linked[1:], out=moved[..., :-1])
         return moved
 
-    def _turned(self, q: Array) -> tuple[Array, Array]:
+    def _norm_and_rotation(self, q: Array) -> tuple[Array, Array]:
         """Return π (M,) and R (3, 3, M)."""
-        squares = _ROTATION @ (q[3:, None] * q[3:]).reshape(16, -1)
+        squares = _TO_ROTATION @ (q[3:, None] * q[3:]).reshape(16, -1)
         with np.errstate(all="ignore"):  # p = 0 and what is not finite is named where D is factored
             return squares[0], (squares[1:] / squares[0]).reshape(3, 3, -1)
 
-    def _points(self, norm: Array, R: Array) -> tuple[Array, Array]:
+    def _attachment_points(self, norm: Array, R: Array) -> tuple[Array, Array]:
         """Return R s (2, 3, M) and A s (2, 3, M) = π R s + (π − 1) s."""
-        Rs = _turn(R, self.s)
+        Rs = _matrix_vector(R, self.s)
         return Rs, norm * Rs + (norm - 1) * self.s
 
-    def gaps(self, q: Array, v: Array) -> tuple[Array, Array]:
+    def joint_gaps(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Return d and ḋ (3, M) of every joint, from where it hangs to body k's proximal point."""
-        norm, R = self._turned(q)
-        Rs, As = self._points(norm, R)
-        rates = self._rates(q, v)
+        norm, R = self._norm_and_rotation(q)
+        Rs, As = self._attachment_points(norm, R)
+        rates = self._rate_products(q, v)
         sigma, omega = rates[0], rates[1:4]
-        velocity = _turn(R, _turn(_tilde(omega), self.s))
+        velocity = _matrix_vector(R, _matrix_vector(_tilde(omega), self.s))
         velocity += 2 * sigma * (Rs + self.s)
-        d = q[:3] + As[0] - self._hung(q[:3] + As[1])
-        return d, v[:3] + velocity[0] - self._hung(v[:3] + velocity[1])
+        d = q[:3] + As[0] - self._at_parent(q[:3] + As[1])
+        return d, v[:3] + velocity[0] - self._at_parent(v[:3] + velocity[1])
 
     def constraints(self, q: Array, v: Array) -> tuple[Array, Array]:
         """C and Ċ, padded (c, M): d of a ball, dᵀd − ℓ² of a rod."""
-        d, rate = self.gaps(q, v)
+        d, rate = self.joint_gaps(q, v)
         rod = np.stack([_dot(d, d) - self.length**2, 2 * _dot(d, rate)])
-        if self.width == 1:
+        if self.rows_per_joint == 1:
             return rod[0][None], rod[1][None]
         first = np.array([[1.0], [0], [0]])
         return np.where(self.rods, rod[0] * first, d), np.where(self.rods, rod[1] * first, rate)
 
-    def _rates(self, q: Array, v: Array) -> Array:
+    def _rate_products(self, q: Array, v: Array) -> Array:
         """(13, M): σ = pᵀṗ; ω = 2 L ṗ and then the rest of the first, then the second factors of ωᵢ ωⱼ."""
-        return np.asarray(_RATES @ (q[3:, None] * v[3:]).reshape(16, -1))
+        return np.asarray(_TO_RATE_PRODUCTS @ (q[3:, None] * v[3:]).reshape(16, -1))
 
     # -- the joint system ---------------------------------------------------------------------------
 
-    def _joints(self, q: Array, norm: Array, R: Array, As: Array | None) -> Joints:
+    def _factor_joints(self, q: Array, norm: Array, R: Array, As: Array | None) -> FactoredJoints:
         """The joints' rows and D factored; A s where there are rods. SingularSystem with the cause."""
         X = np.einsum("ijm,cjkm->cikm", R, self.B)
-        c = self.width
+        c = self.rows_per_joint
         d = U = U_near = U_far = None
         # D's blocks: (c, c, M) on the diagonal, (c, c, M) of joint k + 1 with joint k, and zeros to fill up.
-        cells = self.cells.copy()
+        cells = self.constant_blocks.copy()
         own, after = cells[:-1].reshape(2, c, c, -1)
         if As is None:
             rows = X
-            rows[1] = self._hung(X[1])
+            rows[1] = self._at_parent(X[1])
         else:
-            d = q[:3] + As[0] - self._hung(q[:3] + As[1])
+            d = q[:3] + As[0] - self._at_parent(q[:3] + As[1])
             self._check_rods(q, d)
             off = norm - 1
-            U = self._padded(2 * d)
-            U_near = self._padded(2 * (d - off * self.s[0]))
-            U_far = self._padded(2 * (d + self._hung(off * self.s[1])))
-            rows = np.empty((2, c, 3, self.size))
+            U = self._padded_rows(2 * d)
+            U_near = self._padded_rows(2 * (d - off * self.s[0]))
+            U_far = self._padded_rows(2 * (d + self._at_parent(off * self.s[1])))
+            rows = np.empty((2, c, 3, self.body_count))
             np.einsum("icm,ijm->cjm", U_near, X[0], out=rows[0])
-            np.einsum("icm,ijm->cjm", U_far, self._hung(X[1]), out=rows[1])
-            np.multiply(np.einsum("icm,iem->cem", U, U), self.pair_mass, out=own)
-            np.multiply(np.einsum("icm,iem->cem", self._next(U), U), -self.next_mass, out=after)
+            np.einsum("icm,ijm->cjm", U_far, self._at_parent(X[1]), out=rows[1])
+            np.multiply(np.einsum("icm,iem->cem", U, U), self.pair_inverse_mass, out=own)
+            np.multiply(np.einsum("icm,iem->cem", self._at_child(U), U), -self.child_inverse_mass, out=after)
             if c == 3:
                 own[[1, 2], [1, 2]] += self.rods  # the empty rows
         own += np.einsum("kcim,keim->cem", rows, rows)
         after[..., :-1] -= np.einsum("cim,eim->cem", rows[1, ..., 1:], rows[0, ..., :-1])
         if c == 1:
-            beside = after[0, 0, :-1] if self.size > 1 else np.zeros(1)  # LAPACK's wrapper wants one
+            beside = after[0, 0, :-1] if self.body_count > 1 else np.zeros(1)  # LAPACK's wrapper wants one
             pivots, coupling, info = lapack.dpttrf(own[0, 0], beside)
             factor: tuple[Array, ...] = (pivots, coupling)
             largest = own[0, 0]
         else:
-            band = np.ascontiguousarray(cells.take(_BAND, axis=0).T).reshape(-1, 6)
+            band = np.ascontiguousarray(cells.take(_BAND_INDICES, axis=0).T).reshape(-1, 6)
             cholesky, info = lapack.dpbtrf(band.T, lower=1)
             factor = (cholesky,)
             pivots, largest = cholesky[0] ** 2, band[:, 0]
         if info != 0 or not (pivots > 8 * EPS * largest).all():
-            self._diagnose(q, d)
-        return Joints(d=d, U=U, rows=rows, U_near=U_near, U_far=U_far, factor=factor)
+            self._raise_singular(q, d)
+        return FactoredJoints(d=d, U=U, lever_rows=rows, U_near=U_near, U_far=U_far, factor=factor)
 
-    def _padded(self, w: Array) -> Array:
+    def _padded_rows(self, w: Array) -> Array:
         """U (3, c, M): w of rods, the identity of balls."""
-        if self.width == 1:
+        if self.rows_per_joint == 1:
             return w[:, None]
         U = np.where(self.rods, 0.0, np.eye(3)[:, :, None])
         U[:, 0] = np.where(self.rods, w, U[:, 0])
@@ -293,34 +306,36 @@ class Forest:
         shortest = float(np.min(_dot(d, d)[self.rods]))
         span = max(float(np.max(np.abs(q[:3]))), float(np.max(np.abs(self.s))))
         if not shortest > (16 * EPS * span) ** 2:
-            self._diagnose(q, d, certain=False)
+            self._raise_singular(q, d, certain=False)
 
-    def _diagnose(self, q: Array, d: Array | None, certain: bool = True) -> None:
+    def _raise_singular(self, q: Array, d: Array | None, certain: bool = True) -> None:
         """Raise SingularSystem that names the chain's body and the cause (E1, E7)."""
         d = (
-            np.ones((3, self.size)) if d is None else np.where(np.isfinite(d), d, 1.0)
+            np.ones((3, self.body_count)) if d is None else np.where(np.isfinite(d), d, 1.0)
         )  # R is not, where p = 0
-        for chain, at in zip(self.chains, self.start, strict=False):
+        for chain, at in zip(self.chains, self.first_body, strict=False):
             part = slice(at, at + chain.n)
-            check(chain, q[:3, part].T, q[3:7, part].T, d[:, part].T, chain.rods, (q[:, part],))
+            check_state_solvable(
+                chain, q[:3, part].T, q[3:7, part].T, d[:, part].T, chain.rods, (q[:, part],)
+            )
         if certain:
             raise SingularSystem(
                 "the joint rows are not independent at this state: S is singular to rounding"
             )
 
-    def _multiply_back(self, joints: Joints, h: Array) -> tuple[Array, Array, Array]:
+    def _back_substitute(self, joints: FactoredJoints, h: Array) -> tuple[Array, Array, Array]:
         """μ = −D⁻¹ h (c, M); what it adds to r̈, (3, M), and to β = K⁻¹ α, (3, M)."""
-        if self.width == 1:
+        if self.rows_per_joint == 1:
             mu = lapack.dpttrs(*joints.factor, -h[0])[0][None]
         else:
             mu = lapack.dpbtrs(*joints.factor, -h.T.reshape(-1, 1), lower=1)[0].reshape(-1, 3).T
-        f = self._force(joints, mu)
-        linear = (f - self._next(f)) * self.per_mass
-        near, far = np.einsum("kcjm,cm->kjm", joints.rows, mu)
-        return mu, linear, near - self._next(far)
+        f = self._joint_force(joints, mu)
+        linear = (f - self._at_child(f)) * self.inverse_mass
+        near, far = np.einsum("kcjm,cm->kjm", joints.lever_rows, mu)
+        return mu, linear, near - self._at_child(far)
 
     @staticmethod
-    def _force(joints: Joints, mu: Array) -> Array:
+    def _joint_force(joints: FactoredJoints, mu: Array) -> Array:
         """U μ (3, M) N, world frame: the force on body k at its proximal point."""
         return mu if joints.U is None else np.asarray(np.einsum("icm,cm->im", joints.U, mu))
 
@@ -332,34 +347,41 @@ class Forest:
         ``baumgarte`` a (1/s) adds −2 a Ċ − a² C to γ and likewise to γ_E; 0 is the notes' raw form.
         Raises SingularSystem.
         """
-        return self._motion(q, v, baumgarte)[0]
+        return self._solve_motion(q, v, baumgarte)[0]
 
-    def _motion(self, q: Array, v: Array, a: float) -> tuple[Array, Array, Joints, Array]:
+    def _solve_motion(self, q: Array, v: Array, a: float) -> tuple[Array, Array, FactoredJoints, Array]:
         """(r̈; p̈), μ, the joints and ω."""
-        norm, R = self._turned(q)
-        Rs, As = (None, None) if self.balls_only else self._points(norm, R)
-        joints = self._joints(q, norm, R, As)
-        rates = self._rates(q, v)
+        norm, R = self._norm_and_rotation(q)
+        Rs, As = (None, None) if self.has_only_balls else self._attachment_points(norm, R)
+        joints = self._factor_joints(q, norm, R, As)
+        rates = self._rate_products(q, v)
         sigma, omega = rates[0], rates[1:4]
         terms = rates[1:7] * rates[7:] / norm
-        linear = self.free
-        if self.dragged:
+        linear = self.free_acceleration
+        if self.has_drag:
             terms = np.concatenate([terms, omega])
-            linear = linear - self.drag * v[:3]
-        moved = self.push + _turn(self.spin, terms)
-        beta, point = moved[:3], _turn(R, moved[3:].reshape(2, 3, -1))
+            linear = linear - self.drag_rate * v[:3]
+        moved = self.moment_terms + _matrix_vector(self.spin_terms, terms)
+        beta, point = moved[:3], _matrix_vector(R, moved[3:].reshape(2, 3, -1))
         point += linear
-        h = point[0] - self._hung(point[1])
+        h = point[0] - self._at_parent(point[1])
         if Rs is not None:
             h = self._rod_rows(
-                joints, linear, point - linear, h, v, sigma, Rs, _turn(R, _turn(_tilde(omega), self.s))
+                joints,
+                linear,
+                point - linear,
+                h,
+                v,
+                sigma,
+                Rs,
+                _matrix_vector(R, _matrix_vector(_tilde(omega), self.s)),
             )
         if a:
             C, rate = self.constraints(q, v)
             h = h + 2 * a * rate + a * a * C
-        mu, pulled, turned = self._multiply_back(joints, h)
+        mu, pulled, turned = self._back_substitute(joints, h)
 
-        alpha = _turn(self.K, beta + turned) - 2 * (sigma / norm) * omega
+        alpha = _matrix_vector(self.K, beta + turned) - 2 * (sigma / norm) * omega
         p, pdot = q[3:], v[3:]
         stretch = _dot(pdot, pdot)  # −pᵀp̈, from (N4)
         if a:
@@ -369,12 +391,12 @@ class Forest:
         np.subtract(_HALF_LT @ (p[:, None] * alpha).reshape(12, -1), p * stretch, out=out[3:])
         out[3:] /= norm
         if not np.isfinite(out.sum()):  # an overflow, or a rate or load that is not a number
-            self._diagnose(np.concatenate([q, v]), joints.d)
+            self._raise_singular(np.concatenate([q, v]), joints.d)
         return out, mu, joints, omega
 
     def _rod_rows(
         self,
-        joints: Joints,
+        joints: FactoredJoints,
         linear: Array,
         point: Array,
         relative: Array,
@@ -391,13 +413,13 @@ class Forest:
         assert joints.U is not None and joints.U_near is not None and joints.U_far is not None
         velocity = swing + 2 * sigma * (Rs + self.s)  # d_t(A s)
         excess = 2 * sigma * self.s  # d_t(A s) − 2 G L̇ᵀ s (E3)
-        ddot = v[:3] + velocity[0] - self._hung(v[:3] + velocity[1])
-        own = _dot(excess[0], velocity[0]) + self._hung(_dot(excess[1], velocity[1]))
-        quadratic = 2 * (_dot(ddot, ddot - excess[0] + self._hung(excess[1])) - own)
-        shared = linear - self._hung(linear)
+        ddot = v[:3] + velocity[0] - self._at_parent(v[:3] + velocity[1])
+        own = _dot(excess[0], velocity[0]) + self._at_parent(_dot(excess[1], velocity[1]))
+        quadratic = 2 * (_dot(ddot, ddot - excess[0] + self._at_parent(excess[1])) - own)
+        shared = linear - self._at_parent(linear)
         row = _dot(joints.U[:, 0], shared) + _dot(joints.U_near[:, 0], point[0])
-        row += quadratic - _dot(joints.U_far[:, 0], self._hung(point[1]))
-        if self.width == 1:
+        row += quadratic - _dot(joints.U_far[:, 0], self._at_parent(point[1]))
+        if self.rows_per_joint == 1:
             return np.asarray(row[None])
         rods_only = np.where(self.rods, 0.0, relative)
         rods_only[0] = np.where(self.rods, row, relative[0])
@@ -408,25 +430,25 @@ class Forest:
 
         Raises SingularSystem, which names the body of its chain and the cause (E1, E7).
         """
-        q, qdot = lay(r, p), lay(v, pdot)
+        q, qdot = component_first(r, p), component_first(v, pdot)
         if not np.isfinite(q).all():
-            self._diagnose(q, None)
-        motion, mu, joints, omega = self._motion(q, qdot, 0.0)
-        Rs, As = self._points(*self._turned(q))
-        reaction = self._force(joints, mu)
-        turn_near, turn_far = reaction, self._next(reaction)  # C_pᵀμ = Wᵀ of these
+            self._raise_singular(q, None)
+        motion, mu, joints, omega = self._solve_motion(q, qdot, 0.0)
+        Rs, As = self._attachment_points(*self._norm_and_rotation(q))
+        reaction = self._joint_force(joints, mu)
+        turn_near, turn_far = reaction, self._at_child(reaction)  # C_pᵀμ = Wᵀ of these
         if joints.d is not None:
             rods, d = self.rods, joints.d
             turn_near = np.where(rods, 2 * mu[0] * (d - As[0]), turn_near)
             hung = np.append(rods[1:], False)
-            turn_far = np.where(hung, 2 * self._next(mu[0]) * (self._next(d) + As[1]), turn_far)
-        spin = _dot(omega, _turn(self.J, omega)) / _dot(q[3:], q[3:])
+            turn_far = np.where(hung, 2 * self._at_child(mu[0]) * (self._at_child(d) + As[1]), turn_far)
+        spin = _dot(omega, _matrix_vector(self.J, omega)) / _dot(q[3:], q[3:])
         row = np.concatenate(
-            [row_joints(chain) + at for chain, at in zip(self.chains, self.start, strict=False)]
+            [joint_of_rows(chain) + at for chain, at in zip(self.chains, self.first_body, strict=False)]
         )
-        kept = np.ones((self.size, self.width), dtype=bool)
+        kept = np.ones((self.body_count, self.rows_per_joint), dtype=bool)
         kept[self.rods, 1:] = False
-        tension = np.full(self.size, np.nan)
+        tension = np.full(self.body_count, np.nan)
         tension[self.rods] = -2 * (self.length * mu[0])[self.rods]
         return Solution(
             acceleration=motion[:3].T,
@@ -449,21 +471,23 @@ class Forest:
         q, v = q.copy(), v.copy()
         for _ in range(2):
             q[3:] /= np.sqrt(_dot(q[3:], q[3:]))
-            q += self._correction(q, self.constraints(q, v)[0])
+            q += self._projection_step(q, self.constraints(q, v)[0])
         q[3:] /= np.sqrt(_dot(q[3:], q[3:]))
         v[3:] -= q[3:] * _dot(q[3:], v[3:])
-        v += self._correction(q, self.constraints(q, v)[1])
+        v += self._projection_step(q, self.constraints(q, v)[1])
         return q, v
 
-    def _correction(self, q: Array, h: Array) -> Array:
+    def _projection_step(self, q: Array, h: Array) -> Array:
         """(7, M) −M⁻¹ Cᵀ D⁻¹ h, tangent to pᵀp = const."""
-        norm, R = self._turned(q)
-        joints = self._joints(q, norm, R, None if self.balls_only else self._points(norm, R)[1])
-        _, linear, turned = self._multiply_back(joints, h)
-        turn = _HALF_LT @ (q[3:, None] * _turn(self.K, turned)).reshape(12, -1) / norm
+        norm, R = self._norm_and_rotation(q)
+        joints = self._factor_joints(
+            q, norm, R, None if self.has_only_balls else self._attachment_points(norm, R)[1]
+        )
+        _, linear, turned = self._back_substitute(joints, h)
+        turn = _HALF_LT @ (q[3:, None] * _matrix_vector(self.K, turned)).reshape(12, -1) / norm
         return np.concatenate([linear, turn])
 
 
-def lay(a: Array, b: Array) -> Array:
+def component_first(a: Array, b: Array) -> Array:
     """(7, M), component first, of r or ṙ (M, 3) and p or ṗ (M, 4)."""
     return np.ascontiguousarray(np.concatenate([a.T, b.T]))

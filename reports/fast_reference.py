@@ -9,27 +9,27 @@ import base64
 import json
 from pathlib import Path
 
-from reports.results import Record, Results, clean
+from reports.results import Record, Results, replace_unprintable
 
-STORED = Path(__file__).parent.parent / "bench" / "results"
-DRIFTS = {  # column: title, unit
+STORED_RESULTS = Path(__file__).parent.parent / "bench" / "results"
+DRIFT_COLUMNS = {  # column: title, unit
     "gap": ("Joint gap", "m"),
     "gap_rate": ("Gap rate", "m/s"),
     "norm": ("|‖p‖ − 1|", ""),
     "energy": ("Energy error", "of m g reach"),
 }
-PICTURES = {
+PICTURE_TITLES = {
     "work-precision.svg": "CPU time against the error at 2 s, one pendulum: the reference and the engines",
     "work-precision-64.svg": "CPU time against the error at 2 s, 64 in a batch: reference and engines",
 }
 
 
-def drifts(folder: Path, stored: Path = STORED) -> Record | None:
+def drift_table(folder: Path, stored: Path = STORED_RESULTS) -> Record | None:
     """The drift table as the template takes it: times, and per scenario and rtol a line per variant.
 
     None where there is no drift.parquet.
     """
-    place = _place("drift.parquet", folder, stored)
+    place = _first_folder_with("drift.parquet", folder, stored)
     if place is None:
         return None
     table = Results(place, {}, {}, {}, []).table("drift")
@@ -47,25 +47,27 @@ def drifts(folder: Path, stored: Path = STORED) -> Record | None:
         else:
             line["at"][record["time"]] = record
             line["cost"] = record["cpu_seconds"]
-    return {"times": times, "columns": DRIFTS, "blocks": blocks, "stored": place != folder}
+    return {"times": times, "columns": DRIFT_COLUMNS, "blocks": blocks, "stored": place != folder}
 
 
-def benchmarks(folder: Path, stored: Path = STORED) -> Record | None:
+def benchmark_table(folder: Path, stored: Path = STORED_RESULTS) -> Record | None:
     """The goals with what was measured, a note on how, and the work–precision pictures as data URIs.
 
     A picture becomes an image, so that nothing in it can run or load. None where there is no figures.json.
     """
-    place = _place("figures.json", folder, stored)
+    place = _first_folder_with("figures.json", folder, stored)
     if place is None:
         return None
-    goals = clean(json.loads((place / "figures.json").read_text(encoding="utf-8"))["goals"])
+    goals = replace_unprintable(json.loads((place / "figures.json").read_text(encoding="utf-8"))["goals"])
     readme = place / "README.md"
-    note = clean(readme.read_text(encoding="utf-8")).split("\n\n")[0] if readme.is_file() else ""
+    note = (
+        replace_unprintable(readme.read_text(encoding="utf-8")).split("\n\n")[0] if readme.is_file() else ""
+    )
     return {
         "goals": [goal | {"met": goal["measured"] <= goal["goal"]} for goal in goals],
         "pictures": [
             {"title": title, "uri": _data_uri(place / name)}
-            for name, title in PICTURES.items()
+            for name, title in PICTURE_TITLES.items()
             if (place / name).is_file()
         ],
         "note": note.replace("`", "") if place != folder else "",
@@ -73,7 +75,7 @@ def benchmarks(folder: Path, stored: Path = STORED) -> Record | None:
     }
 
 
-def _place(name: str, *folders: Path) -> Path | None:
+def _first_folder_with(name: str, *folders: Path) -> Path | None:
     return next((folder for folder in folders if (folder / name).is_file()), None)
 
 

@@ -7,7 +7,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 from reports.results import Record, Results
-from reports.verdicts import needs_attention, number
+from reports.verdicts import format_number, needs_attention
 
 
 def write(results: Results) -> Path:
@@ -20,12 +20,12 @@ def write(results: Results) -> Path:
     suites = ET.Element("testsuites", name="plumbline", time=f"{float(results.run['duration']):.3f}")
     totals = {"tests": 0, "failures": 0, "errors": 0, "skipped": 0}
     for name, scenario in results.scenarios.items():
-        rows = [results.rows[place] for place in results.places[name]]
+        rows = [results.rows[place] for place in results.row_indices[name]]
         suite = ET.SubElement(suites, "testsuite", name=name, timestamp=str(results.run["started"])[:19])
         ET.SubElement(ET.SubElement(suite, "properties"), "property", name="family", value=scenario["family"])
         counted = dict.fromkeys(totals, 0)
         for row in rows:
-            outcome = _case(suite, row)
+            outcome = _add_test_case(suite, row)
             counted["tests"] += 1
             if outcome:
                 counted[outcome] += 1
@@ -43,7 +43,7 @@ def write(results: Results) -> Path:
     return path
 
 
-def _case(suite: ET.Element, row: Record) -> str | None:
+def _add_test_case(suite: ET.Element, row: Record) -> str | None:
     """Add the row's test case; which total it counts in besides "tests"."""
     what = row["quantity"] if row["integrator"] == "-" else f"{row['quantity']}[{row['integrator']}]"
     case = ET.SubElement(
@@ -56,7 +56,7 @@ def _case(suite: ET.Element, row: Record) -> str | None:
     message = f"{row['verdict']}: {row['reason']}"
     if needs_attention(row):
         kind = "error" if row["verdict"] == "failed" else "failure"
-        ET.SubElement(case, kind, message=message, type=row["verdict"]).text = _detail(row)
+        ET.SubElement(case, kind, message=message, type=row["verdict"]).text = _failure_text(row)
         return "errors" if kind == "error" else "failures"
     if row["verdict"] != "agrees":
         recorded = f"recorded as {row['known']}; " if row.get("known") else ""
@@ -65,9 +65,9 @@ def _case(suite: ET.Element, row: Record) -> str | None:
     return None
 
 
-def _detail(row: Record) -> str:
+def _failure_text(row: Record) -> str:
     lines = [
-        f"error {number(row['value'], 4)}, tolerance {number(row['tolerance'], 4)} [{row['unit']}]",
+        f"error {format_number(row['value'], 4)}, tolerance {format_number(row['tolerance'], 4)} [{row['unit']}]",
         row["derivation"],
         row["diagnosis"] or "",
         f"engine version {row['engine_version']}, key {row['key']}",

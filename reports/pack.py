@@ -17,10 +17,10 @@ import numpy as np
 from plumbline.model.datatypes import Array
 
 STEPS_PER_DECADE = 500  # log-scale curves are rounded to 10^(1/500), 0.46 %
-FLOOR = -40.0  # decade of code 2; code 0 is "no number", code 1 an exact zero
+LOWEST_DECADE = -40.0  # decade of code 2; code 0 is "no number", code 1 an exact zero
 
 
-def buckets(count: int, points: int) -> np.ndarray:
+def bucket_edges(count: int, points: int) -> np.ndarray:
     """Edges of at most ``points // 2`` buckets of consecutive samples; one per sample where they fit."""
     if count <= points:
         return np.arange(count + 1)
@@ -29,7 +29,7 @@ def buckets(count: int, points: int) -> np.ndarray:
 
 def decimate_times(t: Array, points: int) -> Array:
     """The times that go with `decimate`: first and last of each bucket."""
-    edges = buckets(len(t), points)
+    edges = bucket_edges(len(t), points)
     return t if len(edges) == len(t) + 1 else np.stack([t[edges[:-1]], t[edges[1:] - 1]], 1).ravel()
 
 
@@ -38,7 +38,7 @@ def decimate(y: Array, points: int) -> Array:
 
     A value that is not finite stays: a bucket that holds one ends in NaN.
     """
-    edges = buckets(len(y), points)
+    edges = bucket_edges(len(y), points)
     if len(edges) == len(y) + 1:
         return y
     out = np.empty((len(edges) - 1, 2))
@@ -53,16 +53,16 @@ def decimate(y: Array, points: int) -> Array:
     return out.ravel()
 
 
-def log_codes(y: Array) -> np.ndarray:
+def log_scale_codes(y: Array) -> np.ndarray:
     """|y| as uint16: 0 not finite, 1 exact zero, else 2 + 500 (log10 |y| + 40)."""
     size = np.abs(np.asarray(y, dtype=float))
     with np.errstate(divide="ignore", invalid="ignore"):
-        codes = np.clip(np.round((np.log10(size) - FLOOR) * STEPS_PER_DECADE), 0, 65000) + 2
+        codes = np.clip(np.round((np.log10(size) - LOWEST_DECADE) * STEPS_PER_DECADE), 0, 65000) + 2
     codes = np.where(size == 0, 1, np.where(np.isfinite(size), codes, 0))
     return codes.astype(np.uint16)
 
 
-class Packer:
+class ChunkBuilder:
     """Collects the arrays of one chunk."""
 
     def __init__(self) -> None:
@@ -81,7 +81,7 @@ class Packer:
         self._size += len(data) + len(padding)
         return reference
 
-    def chunk(self, header: Any) -> str:
+    def encode(self, header: Any) -> str:
         """The finished chunk, base64."""
         text = json.dumps(header, ensure_ascii=False, separators=(",", ":"), allow_nan=False).encode()
         text += b" " * (-len(text) % 4)
@@ -89,7 +89,7 @@ class Packer:
         return base64.b64encode(gzip.compress(body, 9, mtime=0)).decode()
 
 
-def unpack(chunk: str) -> Any:
+def decode_chunk(chunk: str) -> Any:
     """Header of a chunk with its arrays in place, as the page's own ``chunks.js`` does it."""
     body = gzip.decompress(base64.b64decode(chunk))
     length = int.from_bytes(body[:4], "little")

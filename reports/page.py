@@ -19,15 +19,41 @@ from markupsafe import Markup
 from reports import fast_reference, payload
 from reports.history import History
 from reports.results import Record, Results
-from reports.verdicts import MARKS, needs_attention, number, ratio, severity, tally, worst
+from reports.verdicts import (
+    VERDICT_STYLES,
+    count_all_verdicts,
+    error_ratio,
+    format_number,
+    needs_attention,
+    severity,
+    worst_row,
+)
 
-HERE = Path(__file__).parent
-MODULES = ("chunks", "text", "route", "plot", "matrix", "curves", "motion", "detail", "cost", "trend", "main")
-BUDGET = 2_000_000  # bytes, for the default catalogue
-NIGHTLY_BUDGET = 8_000_000  # bytes, with a history or more than 60 scenarios
-POINTS = (360, 240, 160, 100, 60)  # samples per curve, tried in turn until the page is within its budget
-LINES = 500  # scenarios in the page at most
-LISTED = 60  # findings written out in the static page
+REPORTS_FOLDER = Path(__file__).parent
+SCRIPT_MODULES = (
+    "chunks",
+    "text",
+    "route",
+    "plot",
+    "matrix",
+    "curves",
+    "motion",
+    "detail",
+    "cost",
+    "trend",
+    "main",
+)
+MAX_PAGE_BYTES = 2_000_000  # bytes, for the default catalogue
+MAX_NIGHTLY_PAGE_BYTES = 8_000_000  # bytes, with a history or more than 60 scenarios
+CURVE_POINTS = (
+    360,
+    240,
+    160,
+    100,
+    60,
+)  # samples per curve, tried in turn until the page is within its budget
+MAX_SCENARIOS = 500  # scenarios in the page at most
+MAX_FINDINGS = 60  # findings written out in the static page
 
 
 def write(results: Results, history: Path | None = None) -> Path:
@@ -35,10 +61,10 @@ def write(results: Results, history: Path | None = None) -> Path:
 
     Raises OSError where the page cannot be written.
     """
-    return put(results.folder / "report.html", render(results, History.load(history, results)))
+    return write_page(results.folder / "report.html", render(results, History.load(history, results)))
 
 
-def put(path: Path, html: str) -> Path:
+def write_page(path: Path, html: str) -> Path:
     """Write a page under a temporary name, then rename it."""
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.html")
     try:
@@ -51,63 +77,65 @@ def put(path: Path, html: str) -> Path:
 
 def render(results: Results, history: History) -> str:
     """The page as text, with as many points per curve as its budget allows."""
-    budget = NIGHTLY_BUDGET if history.nights or len(results.scenarios) > 60 else BUDGET
-    shown = results.only(_shown(results))
-    tables = {k: shown.by_scenario(k) for k in ("states", "curves", "trajectories")}
+    budget = MAX_NIGHTLY_PAGE_BYTES if history.nights or len(results.scenarios) > 60 else MAX_PAGE_BYTES
+    shown = results.restricted_to(_scenarios_to_show(results))
+    tables = {k: shown.table_by_scenario(k) for k in ("states", "curves", "trajectories")}
     chunks = {
         "index": payload.index_chunk(shown, history),
         "convergence": payload.convergence_chunk(shown),
     }
     if history.nights:
         chunks["history"] = payload.history_chunk(shown, history)
-    for points in (*POINTS, 0):
+    for points in (*CURVE_POINTS, 0):
         for k, name in enumerate(shown.scenarios):
             chunks[f"scenario-{k}"] = payload.scenario_chunk(name, shown, tables, points)
-        html = _fill(results, shown, history, chunks, points)
+        html = _render_template(results, shown, history, chunks, points)
         if len(html.encode()) <= budget:
             break
     return html
 
 
-def _shown(results: Results) -> set[str]:
+def _scenarios_to_show(results: Results) -> set[str]:
     """The scenarios that the page has room for: those with anything unexpected first, then as they come."""
     worrying = dict.fromkeys(row["scenario"] for row in results.rows if needs_attention(row))
-    return set([*worrying, *(name for name in results.scenarios if name not in worrying)][:LINES])
+    return set([*worrying, *(name for name in results.scenarios if name not in worrying)][:MAX_SCENARIOS])
 
 
-def _fill(results: Results, shown: Results, history: History, chunks: dict[str, str], points: int) -> str:
-    script, style = bundle(), stylesheet()
-    attention = _attention(results.rows)
+def _render_template(
+    results: Results, shown: Results, history: History, chunks: dict[str, str], points: int
+) -> str:
+    script, style = bundle_script(), stylesheet()
+    attention = _unexpected_findings(results.rows)
     unshown = results.scenarios.keys() - shown.scenarios.keys()
     return (
-        environment()
+        template_environment()
         .get_template("report.html")
         .render(
             run=results.run,
-            policy=policy(style, script),
+            policy=content_security_policy(style, script),
             script=Markup(script),
             style=Markup(style),
             chunks=chunks,
-            marks=MARKS,
-            counts=tally(results),
-            total=tally(results).total(),
-            probes=_probes(results),
+            marks=VERDICT_STYLES,
+            counts=count_all_verdicts(results),
+            total=count_all_verdicts(results).total(),
+            probes=_random_scenario_summary(results),
             engines=results.engines,
-            families=_families(shown),
+            families=_matrix_by_family(shown),
             unshown=len(unshown),
             unshown_fine=not any(entry["row"]["scenario"] in unshown for entry in attention),
-            attention=attention[:LISTED],
-            unlisted=len(attention) - LISTED,
-            expected=_expected(results.rows),
-            ratio=ratio,
+            attention=attention[:MAX_FINDINGS],
+            unlisted=len(attention) - MAX_FINDINGS,
+            expected=_known_findings(results.rows),
+            ratio=error_ratio,
             link=lambda row: cell_link(row["scenario"], row["engine"], row),
-            comparison=_comparison(results, history),
-            damaged=history.damaged,
+            comparison=_changes_since_last_passed(results, history),
+            damaged=history.unreadable,
             nights=len(history.nights),
-            drifts=fast_reference.drifts(results.folder),
-            benchmarks=fast_reference.benchmarks(results.folder),
+            drifts=fast_reference.drift_table(results.folder),
+            benchmarks=fast_reference.benchmark_table(results.folder),
             decimated=points,
-            notice=(HERE / "assets" / "vendor" / "uPlot.LICENSE").read_text(encoding="utf-8"),
+            notice=(REPORTS_FOLDER / "assets" / "vendor" / "uPlot.LICENSE").read_text(encoding="utf-8"),
             rendered=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
         )
     )
@@ -121,7 +149,7 @@ def cell_link(scenario: str, engine: str, row: Record | None = None) -> str:
     return "#" + urlencode(fields)
 
 
-def _families(results: Results) -> dict[str, Any]:
+def _matrix_by_family(results: Results) -> dict[str, Any]:
     """Matrix by family: per scenario and engine the row that speaks for the cell, and how many there are."""
     cells: dict[tuple[str, str], list[Record]] = {}
     for row in results.rows:
@@ -132,15 +160,15 @@ def _families(results: Results) -> dict[str, Any]:
         for engine in results.engines:
             rows = cells.get((name, engine))
             if rows:
-                speaker = worst(rows)
+                speaker = worst_row(rows)
                 line[engine] = {
                     "row": speaker,
-                    "mark": MARKS[speaker["verdict"]],
-                    "ratio": ratio(speaker),
+                    "mark": VERDICT_STYLES[speaker["verdict"]],
+                    "ratio": error_ratio(speaker),
                     "count": len(rows),
                     "known": sum(r.get("known") is not None for r in rows),
                     "link": cell_link(name, engine),
-                    "track": track(ratio(speaker)),
+                    "track": ratio_position(error_ratio(speaker)),
                 }
         family = families.setdefault(scenario["family"], {"lines": [], "summary": {}})
         family["lines"].append({"name": name, "scenario": scenario, "cells": line, "place": place})
@@ -152,20 +180,20 @@ def _families(results: Results) -> dict[str, Any]:
     return families
 
 
-def track(quotient: float | None) -> float | None:
+def ratio_position(quotient: float | None) -> float | None:
     """Where error over tolerance stands on a cell's log scale, 0 (≤ 1e-4) … 96 (≥ 1e4), 48 the tolerance."""
     if quotient is None:
         return None
     return round(min(max((math.log10(max(quotient, 1e-30)) + 4) * 12, 0), 96), 1)
 
 
-def _attention(rows: list[Record]) -> list[Record]:
+def _unexpected_findings(rows: list[Record]) -> list[Record]:
     """What nobody expected, worst first: an entry per cell and verdict, gaps of one reason together.
 
     Each has its worst row, how many more rows there are and the other scenarios they are in.
     """
     found: dict[tuple[str, ...], Record] = {}
-    for row in sorted(filter(needs_attention, rows), key=lambda r: (-severity(r), -(ratio(r) or 0.0))):
+    for row in sorted(filter(needs_attention, rows), key=lambda r: (-severity(r), -(error_ratio(r) or 0.0))):
         gap = row["verdict"] == "unsupported"
         key = (row["engine"], row["verdict"], row["reason"] if gap else row["scenario"])
         entry = found.setdefault(key, {"row": row, "more": -1, "scenarios": {}})
@@ -177,7 +205,7 @@ def _attention(rows: list[Record]) -> list[Record]:
     return list(found.values())
 
 
-def _expected(rows: list[Record]) -> list[Record]:
+def _known_findings(rows: list[Record]) -> list[Record]:
     """Recorded discrepancies and gaps by entry of known.yaml: how many rows, and one of them as example."""
     found: dict[str, Record] = {}
     for row in rows:
@@ -190,7 +218,7 @@ def _expected(rows: list[Record]) -> list[Record]:
                     "count": 0,
                     "engines": {},
                     "scenarios": {},
-                    "mark": MARKS[row["verdict"]],
+                    "mark": VERDICT_STYLES[row["verdict"]],
                 },
             )
             entry["count"] += 1
@@ -198,9 +226,9 @@ def _expected(rows: list[Record]) -> list[Record]:
     return sorted(found.values(), key=lambda e: (-severity(e["row"]), -e["count"]))
 
 
-def _comparison(results: Results, history: History) -> Record | None:
+def _changes_since_last_passed(results: Results, history: History) -> Record | None:
     """What changed since the last green run; None without a history."""
-    green = history.last_green
+    green = history.last_passed
     if not history.nights:
         return None
     if green is None:
@@ -220,7 +248,7 @@ def _comparison(results: Results, history: History) -> Record | None:
     }
 
 
-def _probes(results: Results) -> Record | None:
+def _random_scenario_summary(results: Results) -> Record | None:
     """What the random scenarios came to: how many, and the worst error over bound by quantity and engine."""
     said = results.run["probes"]
     if not said:
@@ -231,12 +259,12 @@ def _probes(results: Results) -> Record | None:
     return {"scenarios": said["scenarios"], "worst": worst}
 
 
-def bundle() -> str:
+def bundle_script() -> str:
     """The page's own modules and uPlot as one classic script: import lines dropped, ``export`` taken off."""
-    parts = [(HERE / "assets" / "vendor" / "uPlot.iife.min.js").read_text(encoding="utf-8")]
+    parts = [(REPORTS_FOLDER / "assets" / "vendor" / "uPlot.iife.min.js").read_text(encoding="utf-8")]
     names: list[str] = []  # they share one scope, so each must be there once
-    for name in MODULES:
-        text = (HERE / "assets" / f"{name}.js").read_text(encoding="utf-8")
+    for name in SCRIPT_MODULES:
+        text = (REPORTS_FOLDER / "assets" / f"{name}.js").read_text(encoding="utf-8")
         text = re.sub(r"^import\b[^;]*;\n", "", text, flags=re.MULTILINE)
         text = re.sub(r"^export (?=async|function|const|class|let)", "", text, flags=re.MULTILINE)
         names += re.findall(r"^(?:async function|function|const|class|let) (\w+)", text, flags=re.MULTILINE)
@@ -249,41 +277,41 @@ def bundle() -> str:
     return script
 
 
-def environment() -> Environment:
+def template_environment() -> Environment:
     """The templates, with everything escaped and nothing undefined let through."""
     made = Environment(
-        loader=FileSystemLoader(HERE / "templates"),
+        loader=FileSystemLoader(REPORTS_FOLDER / "templates"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters |= {"number": number, "when": _when, "seconds": _seconds}
+    made.filters |= {"number": format_number, "when": _format_time, "seconds": _format_duration}
     return made
 
 
-def policy(style: str, script: str | None = None) -> str:
+def content_security_policy(style: str, script: str | None = None) -> str:
     """The Content-Security-Policy of a page with this style and at most this script: no request, no other."""
-    sources = ["default-src 'none'", f"style-src {_hash(style)}", "img-src data:"]
+    sources = ["default-src 'none'", f"style-src {_csp_hash(style)}", "img-src data:"]
     if script is not None:
-        sources.insert(1, f"script-src {_hash(script)}")
+        sources.insert(1, f"script-src {_csp_hash(script)}")
     return "; ".join([*sources, "base-uri 'none'", "form-action 'none'"])
 
 
 def stylesheet() -> str:
     """The style of uPlot and the pages' own."""
-    vendor = (HERE / "assets" / "vendor" / "uPlot.min.css").read_text(encoding="utf-8")
-    return vendor + (HERE / "assets" / "style.css").read_text(encoding="utf-8")
+    vendor = (REPORTS_FOLDER / "assets" / "vendor" / "uPlot.min.css").read_text(encoding="utf-8")
+    return vendor + (REPORTS_FOLDER / "assets" / "style.css").read_text(encoding="utf-8")
 
 
-def _hash(text: str) -> str:
+def _csp_hash(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
-def _when(iso: str) -> str:
+def _format_time(iso: str) -> str:
     return str(iso)[:16].replace("T", " ")
 
 
-def _seconds(duration: Any) -> str:
+def _format_duration(duration: Any) -> str:
     total = float(duration)
     return f"{total:.1f} s" if total < 60 else f"{int(total // 60)} min {int(total % 60)} s"

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from plumbline.model.datatypes import Array
-from plumbline.model.kinematics import conjugate, multiply
+from plumbline.model.kinematics import quaternion_conjugate, quaternion_product
 from reports.history import History
-from reports.pack import Packer, decimate, decimate_times, log_codes
-from reports.results import Columns, Record, Results, groups
-from reports.verdicts import MARKS, ratio, severity
+from reports.pack import ChunkBuilder, decimate, decimate_times, log_scale_codes
+from reports.results import Columns, Record, Results, group_rows
+from reports.verdicts import VERDICT_STYLES, error_ratio, severity
 
-CURVES = (
+CURVE_COLUMNS = (
     "position_error",
     "limit_error",
     "attitude_error",
@@ -28,10 +28,10 @@ CURVES = (
     "norm_drift",
 )
 CLI_LEVEL = {"state": "state", "trajectory": "trajectory", "invariants": "trajectory"}
-ENDURANCE = 100.0  # s: how long a nightly's long runs are unless it is told otherwise
-CATALOGUE = Path(__file__).parent.parent / "scenarios"
-MOTION_BYTES = 90_000  # of one scenario's motion, before compression
-_DETAIL = (
+DEFAULT_LONG_RUN_SECONDS = 100.0  # s: how long a nightly's long runs are unless it is told otherwise
+CATALOGUE_FOLDER = Path(__file__).parent.parent / "scenarios"
+MAX_MOTION_BYTES = 90_000  # of one scenario's motion, before compression
+_DETAIL_FIELDS = (
     "unit",
     "value",
     "tolerance",
@@ -49,31 +49,31 @@ _DETAIL = (
     "engine_version",
 )
 
-Tables = dict[str, dict[str, Columns]]  # by table, then scenario
+ScenarioTables = dict[str, dict[str, Columns]]  # by table, then scenario
 
 
-def command(row: Record, scenario: Record) -> str:
+def rerun_command(row: Record, scenario: Record) -> str:
     """The command line that repeats just this cell, quoted for a POSIX shell; long runs are a nightly's."""
     file = str(scenario.get("file") or "")
-    ours = not file or any(CATALOGUE.glob(f"*/{glob.escape(Path(file).name)}"))
+    ours = not file or any(CATALOGUE_FOLDER.glob(f"*/{glob.escape(Path(file).name)}"))
     what = row["scenario"] if ours else file
     words = ["python", "-m", "plumbline", "run", "--engine", row["engine"]]
-    if long(row):
+    if is_long_run(row):
         words[3:] = ["nightly", "--engine", row["engine"], "--random", "0", "--no-instrument"]
-        asked = (row.get("extra") or {}).get("asked", ENDURANCE)
-        words += [] if asked == ENDURANCE else ["--endurance", f"{asked:g}"]
+        asked = (row.get("extra") or {}).get("asked", DEFAULT_LONG_RUN_SECONDS)
+        words += [] if asked == DEFAULT_LONG_RUN_SECONDS else ["--endurance", f"{asked:g}"]
     else:
         words += ["--level", CLI_LEVEL.get(row["level"], "all")]
     words[4:4] = [] if what.startswith("-") else [what]
     return shlex.join(words + (["--", what] if what.startswith("-") else []))
 
 
-def long(row: Record) -> bool:
+def is_long_run(row: Record) -> bool:
     """Whether a row is about a nightly's long runs."""
     return str(row["quantity"]).endswith(("_long", "_long_growth"))
 
 
-def finite(value: Any, digits: int = 6) -> Any:
+def json_number(value: Any, digits: int = 6) -> Any:
     """A JSON number of a few digits; None for what JSON cannot say."""
     if value is None or isinstance(value, str):
         return value
@@ -82,19 +82,19 @@ def finite(value: Any, digits: int = 6) -> Any:
 
 def index_chunk(results: Results, history: History) -> str:
     """Every row, one small number per field, and the dictionaries the numbers point into."""
-    packer = Packer()
+    packer = ChunkBuilder()
     header: dict[str, Any] = {
         "scenarios": list(results.scenarios),
         "families": [s["family"] for s in results.scenarios.values()],
         "titles": [s["title"] for s in results.scenarios.values()],
         "engines": list(results.engines),
         "engine_titles": [e["title"] for e in results.engines.values()],
-        "verdicts": list(MARKS),
-        "glyphs": [m.glyph for m in MARKS.values()],
-        "slugs": [m.slug for m in MARKS.values()],
+        "verdicts": list(VERDICT_STYLES),
+        "glyphs": [m.glyph for m in VERDICT_STYLES.values()],
+        "slugs": [m.css_class for m in VERDICT_STYLES.values()],
         "reasons": [row["reason"] for row in results.rows],
         "commit": results.run.get("commit"),
-        "green": history.last_green.run["started"] if history.last_green else None,
+        "green": history.last_passed.run["started"] if history.last_passed else None,
     }
     for name in ("level", "integrator", "quantity"):
         header[name + "s"] = list(dict.fromkeys(row[name] for row in results.rows))
@@ -111,47 +111,49 @@ def index_chunk(results: Results, history: History) -> str:
         rows[name] = packer.add(np.array([place[row[name]] for row in results.rows], dtype=kind))
     rows["severity"] = packer.add(np.array([severity(row) for row in results.rows], dtype=np.uint8))
     rows["fresh"] = packer.add(np.array([history.is_new(row) for row in results.rows], dtype=np.uint8))
-    quotients = [ratio(row) for row in results.rows]
-    rows["ratio"] = packer.add(log_codes(np.array([np.nan if q is None else q for q in quotients])))
+    quotients = [error_ratio(row) for row in results.rows]
+    rows["ratio"] = packer.add(log_scale_codes(np.array([np.nan if q is None else q for q in quotients])))
     header["rows"] = rows
-    return packer.chunk(header)
+    return packer.encode(header)
 
 
-def scenario_chunk(name: str, results: Results, tables: Tables, points: int) -> str:
+def scenario_chunk(name: str, results: Results, tables: ScenarioTables, points: int) -> str:
     """Everything the cells of one scenario show; ``points`` samples per curve at most, 0 for no curves."""
-    packer = Packer()
+    packer = ChunkBuilder()
     scenario = results.scenarios[name]
     details: dict[str, Record] = {}
     commands: dict[str, str] = {}
-    for place in results.places[name]:
+    for place in results.row_indices[name]:
         row = results.rows[place]
-        detail: Record = {k: row.get(k) for k in _DETAIL if row.get(k) not in (None, "", {})}
+        detail: Record = {k: row.get(k) for k in _DETAIL_FIELDS if row.get(k) not in (None, "", {})}
         for field in ("value", "tolerance", "uncertainty", "horizon", "order", "accept", "wall_time"):
             if field in detail:
-                detail[field] = finite(detail[field])
+                detail[field] = json_number(detail[field])
         if "extra" in detail:
-            detail["extra"] = {k: finite(v) for k, v in detail["extra"].items()}
+            detail["extra"] = {k: json_number(v) for k, v in detail["extra"].items()}
         if row["key"] in results.scripts:
             detail["script"] = results.scripts[row["key"]]
         details[str(place)] = detail
-        commands[f"{row['engine']}/{'long' if long(row) else row['level']}"] = command(row, scenario)
+        commands[f"{row['engine']}/{'long' if is_long_run(row) else row['level']}"] = rerun_command(
+            row, scenario
+        )
     header = {
         "scenario": {
-            k: finite(v) if isinstance(v, float) else v for k, v in scenario.items() if k != "model"
+            k: json_number(v) if isinstance(v, float) else v for k, v in scenario.items() if k != "model"
         },
         "rows": details,
         "commands": commands,
-        "states": _states(name, tables, packer),
-        "curves": _curves(name, tables, packer, points) if points else None,
-        "motion": _motion(name, scenario, tables, packer, points) if points else None,
+        "states": _state_errors(name, tables, packer),
+        "curves": _error_curves(name, tables, packer, points) if points else None,
+        "motion": _motion_frames(name, scenario, tables, packer, points) if points else None,
     }
-    return packer.chunk(header)
+    return packer.encode(header)
 
 
-def _states(name: str, tables: Tables, packer: Packer) -> list[Record]:
+def _state_errors(name: str, tables: ScenarioTables, packer: ChunkBuilder) -> list[Record]:
     states = tables["states"].get(name, {})
     found = []
-    for (engine, quantity), rows in groups(states, "engine", "quantity"):
+    for (engine, quantity), rows in group_rows(states, "engine", "quantity"):
         error, bound = states["error"][rows].astype(float), states["bound"][rows].astype(float)
         with np.errstate(divide="ignore", invalid="ignore"):
             quotient = error / bound
@@ -161,23 +163,23 @@ def _states(name: str, tables: Tables, packer: Packer) -> list[Record]:
             {
                 "engine": engine,
                 "quantity": quantity,
-                "ratio": packer.add(log_codes(quotient[order])),
+                "ratio": packer.add(log_scale_codes(quotient[order])),
                 "worst": [int(states["state"][rows][top]), int(states["body"][rows][top]) + 1],
-                "bound": finite(np.median(bound), 3),
-                "error": finite(error[top], 3),
+                "bound": json_number(np.median(bound), 3),
+                "error": json_number(error[top], 3),
             }
         )
     return found
 
 
-def _curves(name: str, tables: Tables, packer: Packer, points: int) -> list[Record]:
+def _error_curves(name: str, tables: ScenarioTables, packer: ChunkBuilder, points: int) -> list[Record]:
     curves = tables["curves"].get(name, {})
     found: list[Record] = []
     times: dict[bytes, Any] = {}
-    for (engine, integrator), rows in groups(curves, "engine", "integrator"):
+    for (engine, integrator), rows in group_rows(curves, "engine", "integrator"):
         t = curves["t"][rows].astype(float)
         tolerance = curves["tolerance"][rows].astype(float)
-        judged = _judged(curves, rows)
+        judged = _judged_curve(curves, rows)
         above = ~(curves[judged][rows] <= tolerance) & np.isfinite(tolerance)
         shared = t.tobytes()
         if shared not in times:
@@ -185,42 +187,44 @@ def _curves(name: str, tables: Tables, packer: Packer, points: int) -> list[Reco
         one: Record = {
             "engine": engine,
             "integrator": integrator,
-            "resolution": finite(curves["resolution"][rows][0]),
+            "resolution": json_number(curves["resolution"][rows][0]),
             "t": times[shared],
-            "crossing": finite(t[int(np.argmax(above))]) if above.any() else None,
+            "crossing": json_number(t[int(np.argmax(above))]) if above.any() else None,
         }
         if np.isfinite(tolerance).any():
             one["judged"] = judged
-            one["tolerance"] = packer.add(log_codes(decimate(tolerance, points)))
-        for curve in CURVES:
+            one["tolerance"] = packer.add(log_scale_codes(decimate(tolerance, points)))
+        for curve in CURVE_COLUMNS:
             if curve in curves and np.any(np.isfinite(curves[curve][rows]) & (curves[curve][rows] != 0)):
-                one[curve] = packer.add(log_codes(decimate(curves[curve][rows].astype(float), points)))
+                one[curve] = packer.add(log_scale_codes(decimate(curves[curve][rows].astype(float), points)))
         found.append(one)
     return found
 
 
-def _judged(curves: Columns, rows: np.ndarray) -> str:
+def _judged_curve(curves: Columns, rows: np.ndarray) -> str:
     """The curve that the tolerance is for: the limit of the steps' error where there is one."""
     limited = "limit_error" in curves and np.isfinite(curves["limit_error"][rows]).any()
     return "limit_error" if limited else "position_error"
 
 
-def _final_errors(name: str, tables: Tables) -> dict[tuple[str, ...], float]:
+def _final_errors(name: str, tables: ScenarioTables) -> dict[tuple[str, ...], float]:
     curves = tables["curves"].get(name, {})
     errors = {}
-    for key, rows in groups(curves, "engine", "integrator"):
+    for key, rows in group_rows(curves, "engine", "integrator"):
         worst = float(np.max(curves["position_error"][rows]))
         errors[key] = worst if np.isfinite(worst) else np.inf
     return errors
 
 
-def _motion(name: str, scenario: Record, tables: Tables, packer: Packer, points: int) -> Record | None:
+def _motion_frames(
+    name: str, scenario: Record, tables: ScenarioTables, packer: ChunkBuilder, points: int
+) -> Record | None:
     """Poses of the reference, and how far every other run is from them, one scale per frame.
 
     A run's pose is r = r_ref + scale·d/127, attitude = exp(scale·w/127) attitude_ref: so 1e-9 survives.
     """
     poses = tables["trajectories"].get(name, {})
-    runs = dict(groups(poses, "engine", "integrator"))
+    runs = dict(group_rows(poses, "engine", "integrator"))
     if not runs:
         return None
     n = int(scenario["bodies"])
@@ -229,8 +233,8 @@ def _motion(name: str, scenario: Record, tables: Tables, packer: Packer, points:
     best = [min((k for k in runs if k[0] == e), key=lambda k: errors.get(k, np.inf)) for e in engines]
     shown = list(runs) if n <= 3 else best
     base = next((k for k in best if k[0] == "reference"), best[0])
-    r0, p0, t = _poses(poses, runs[base], n)
-    frames = int(np.clip(MOTION_BYTES * points / 300 / (n * (14 + 6 * len(shown))), 24, points))
+    r0, p0, t = _run_poses(poses, runs[base], n)
+    frames = int(np.clip(MAX_MOTION_BYTES * points / 300 / (n * (14 + 6 * len(shown))), 24, points))
     pick = np.unique(np.linspace(0, len(t) - 1, min(frames, len(t))).round().astype(int))
     span = float(np.max(np.abs(r0))) or 1.0
     header: Record = {
@@ -240,11 +244,11 @@ def _motion(name: str, scenario: Record, tables: Tables, packer: Packer, points:
         "span": span,
         "r": packer.add(np.round(r0[pick] / span * 32767).astype(np.int16)),
         "p": packer.add(np.round(p0[pick] * 32767).astype(np.int16)),
-        "shape": _shapes(scenario),
+        "shape": _body_shapes(scenario),
         "runs": [],
     }
     for key in shown:
-        r, p, times = _poses(poses, runs[key], n)
+        r, p, times = _run_poses(poses, runs[key], n)
         if len(times) != len(t) or np.any(np.abs(times - t) > 1e-9 * max(1.0, t[-1])):
             continue
         difference = np.concatenate([r - r0, rotation_vector(p, p0)], -1)[pick]
@@ -263,7 +267,7 @@ def _motion(name: str, scenario: Record, tables: Tables, packer: Packer, points:
     return header
 
 
-def _poses(poses: Columns, rows: np.ndarray, n: int) -> tuple[Array, Array, Array]:
+def _run_poses(poses: Columns, rows: np.ndarray, n: int) -> tuple[Array, Array, Array]:
     """R (T, n, 3), unit p (T, n, 4) and t (T,) of one run, whatever the order of its rows."""
     order = rows[np.lexsort((poses["body"][rows], poses["t"][rows]))]
     r = np.stack([poses[k][order] for k in ("rx", "ry", "rz")], -1).reshape(-1, n, 3).astype(float)
@@ -274,7 +278,7 @@ def _poses(poses: Columns, rows: np.ndarray, n: int) -> tuple[Array, Array, Arra
 
 def rotation_vector(p: Array, p0: Array) -> Array:
     """World-frame rotation vector (..., 3) from attitude p0 to attitude p, rad; exact for tiny angles."""
-    q = multiply(p, conjugate(p0))
+    q = quaternion_product(p, quaternion_conjugate(p0))
     q = np.where(q[..., :1] < 0, -q, q)
     size = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -282,7 +286,7 @@ def rotation_vector(p: Array, p0: Array) -> Array:
     return np.asarray(factor * q[..., 1:])
 
 
-def _shapes(scenario: Record) -> list[Record]:
+def _body_shapes(scenario: Record) -> list[Record]:
     """Per body: attachment points, rod, and the box with its principal moments (axes, half sides)."""
     model = scenario["model"]
     mass = np.asarray(model["mass"], dtype=float)
@@ -292,11 +296,11 @@ def _shapes(scenario: Record) -> list[Record]:
         half = np.sqrt(np.clip(1.5 / mass[k] * (moments.sum() - 2 * moments), 0, None))
         shapes.append(
             {
-                "proximal": [finite(x) for x in model["proximal"][k]],
-                "distal": [finite(x) for x in model["distal"][k]],
-                "length": finite(model["length"][k]),
-                "axes": [[finite(x, 4) for x in axis] for axis in axes.T],
-                "half": [finite(x, 4) for x in half],
+                "proximal": [json_number(x) for x in model["proximal"][k]],
+                "distal": [json_number(x) for x in model["distal"][k]],
+                "length": json_number(model["length"][k]),
+                "axes": [[json_number(x, 4) for x in axis] for axis in axes.T],
+                "half": [json_number(x, 4) for x in half],
             }
         )
     return shapes
@@ -307,7 +311,7 @@ def convergence_chunk(results: Results) -> str:
     columns = results.table("convergence")
     kinds = {(e, i["name"]): i for e, engine in results.engines.items() for i in engine["integrators"]}
     studies = []
-    for (scenario, engine, integrator, quantity), rows in groups(
+    for (scenario, engine, integrator, quantity), rows in group_rows(
         columns, "scenario", "engine", "integrator", "quantity"
     ):
         if scenario not in results.scenarios:
@@ -324,18 +328,18 @@ def convergence_chunk(results: Results) -> str:
                 "declared": method.get("order"),
                 "alias": method.get("alias_of"),
                 **{
-                    k: [finite(v, 4) for v in columns[k][order]]
+                    k: [json_number(v, 4) for v in columns[k][order]]
                     for k in ("resolution", "error", "cost", "order")
                 },
             }
         )
-    return Packer().chunk(studies)
+    return ChunkBuilder().encode(studies)
 
 
 def history_chunk(results: Results, history: History) -> str:
     """Value, error over tolerance and verdict of each of this run's keys over the nights, this run last."""
-    packer = Packer()
-    verdicts = {verdict: k + 1 for k, verdict in enumerate(MARKS)}
+    packer = ChunkBuilder()
+    verdicts = {verdict: k + 1 for k, verdict in enumerate(VERDICT_STYLES)}
     nights: Sequence[dict[str, Record]] = [
         *(night.rows for night in history.nights),
         {row["key"]: row for row in results.rows},
@@ -352,9 +356,9 @@ def history_chunk(results: Results, history: History) -> str:
             {k: run.get(k) for k in ("id", "started", "commit", "versions", "exit_code", "sentence")}
             for run in (*(night.run for night in history.nights), results.run)
         ],
-        "damaged": history.damaged,
-        "value": packer.add(log_codes(table(lambda r: r.get("value")))),
-        "ratio": packer.add(log_codes(table(ratio))),
+        "damaged": history.unreadable,
+        "value": packer.add(log_scale_codes(table(lambda r: r.get("value")))),
+        "ratio": packer.add(log_scale_codes(table(error_ratio))),
         "verdict": packer.add(np.nan_to_num(table(lambda r: verdicts.get(r["verdict"], 0))).astype(np.uint8)),
     }
-    return packer.chunk(header)
+    return packer.encode(header)

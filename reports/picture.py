@@ -6,34 +6,36 @@ import shutil
 import sys
 from pathlib import Path
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
+BROWSER_NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
 
 
-def chromium() -> str | None:
+def find_chromium() -> str | None:
     """The system's own Chromium, or None."""
-    return next((found for name in NAMES if (found := shutil.which(name))), None)
+    return next((found for name in BROWSER_NAMES if (found := shutil.which(name))), None)
 
 
-def take(report: Path, picture: Path, view: str = "", width: int = 1400, height: int = 1000) -> Path:
+def take_screenshot(
+    report: Path, image_path: Path, view: str = "", width: int = 1400, height: int = 1000
+) -> Path:
     """Open the report at a view ("" the matrix, or "#scenario=…&engine=…") and save what is seen as PNG.
 
     Raises RuntimeError where there is no Chromium.
     """
     from playwright.sync_api import sync_playwright
 
-    found = chromium()
+    found = find_chromium()
     if not found:
-        raise RuntimeError(f"no Chromium here: none of {', '.join(NAMES)} is on the path")
+        raise RuntimeError(f"no Chromium here: none of {', '.join(BROWSER_NAMES)} is on the path")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
         page = browser.new_page(viewport={"width": width, "height": height}, color_scheme="light")
         page.goto(report.resolve().as_uri() + view)
         page.wait_for_selector("html[data-shown]")
         page.wait_for_timeout(300)  # the plots take their size in the next frames
-        page.screenshot(path=picture)
+        page.screenshot(path=image_path)
         browser.close()
-    return picture
+    return image_path
 
 
 if __name__ == "__main__":
-    take(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3] if len(sys.argv) > 3 else "")
+    take_screenshot(Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3] if len(sys.argv) > 3 else "")

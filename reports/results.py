@@ -23,7 +23,7 @@ _UNPRINTABLE = re.compile(
 )
 
 # What a run of one level only, or of another program, may leave out.
-_NOT_SAID: Record = {
+_RUN_DEFAULTS: Record = {
     "probes": {},
     "truth": "",
     "machine": {},
@@ -32,7 +32,7 @@ _NOT_SAID: Record = {
     "platform": "",
     "versions": {},
 }
-_UNKNOWN: Record = {
+_SCENARIO_DEFAULTS: Record = {
     "horizon": None,
     "truth_uncertainty": None,
     "exact": None,
@@ -42,15 +42,15 @@ _UNKNOWN: Record = {
 }
 
 
-def clean(value: Any) -> Any:
+def replace_unprintable(value: Any) -> Any:
     """The same value with every unprintable character of every text in it replaced by U+FFFD."""
     if isinstance(value, str):
         plain = value.isascii() and value.isprintable()  # most are, and this is quicker told
         return value if plain else _UNPRINTABLE.sub("\N{REPLACEMENT CHARACTER}", value)
     if isinstance(value, dict):
-        return {clean(k): clean(v) for k, v in value.items()}
+        return {replace_unprintable(k): replace_unprintable(v) for k, v in value.items()}
     if isinstance(value, list):
-        return [clean(v) for v in value]
+        return [replace_unprintable(v) for v in value]
     return value
 
 
@@ -67,9 +67,9 @@ class Results:
     @classmethod
     def load(cls, folder: Path) -> Results:
         """Read OUT/results.json; raises OSError or ValueError where it is missing or not JSON."""
-        stored = clean(json.loads((folder / "results.json").read_text(encoding="utf-8")))
-        scenarios = {name: _UNKNOWN | about for name, about in stored["scenarios"].items()}
-        return cls(folder, _NOT_SAID | stored["run"], scenarios, stored["engines"], stored["rows"])
+        stored = replace_unprintable(json.loads((folder / "results.json").read_text(encoding="utf-8")))
+        scenarios = {name: _SCENARIO_DEFAULTS | about for name, about in stored["scenarios"].items()}
+        return cls(folder, _RUN_DEFAULTS | stored["run"], scenarios, stored["engines"], stored["rows"])
 
     def table(self, name: str) -> Columns:
         """Columns of OUT/<name>.parquet as NumPy arrays, texts cleaned; {} where the file is absent."""
@@ -84,22 +84,22 @@ class Results:
         return columns
 
     @cached_property
-    def places(self) -> dict[str, list[int]]:
+    def row_indices(self) -> dict[str, list[int]]:
         """Indices of each scenario's rows."""
         found: dict[str, list[int]] = {name: [] for name in self.scenarios}
         for place, row in enumerate(self.rows):
             found[row["scenario"]].append(place)
         return found
 
-    def by_scenario(self, name: str) -> dict[str, Columns]:
+    def table_by_scenario(self, name: str) -> dict[str, Columns]:
         """The named table, split by scenario."""
         columns = self.table(name)
         return {
             scenario: {k: values[rows] for k, values in columns.items()}
-            for (scenario,), rows in groups(columns, "scenario")
+            for (scenario,), rows in group_rows(columns, "scenario")
         }
 
-    def only(self, names: Collection[str]) -> Results:
+    def restricted_to(self, names: Collection[str]) -> Results:
         """The same run with these scenarios alone."""
         kept = {name: about for name, about in self.scenarios.items() if name in names}
         return replace(self, scenarios=kept, rows=[row for row in self.rows if row["scenario"] in kept])
@@ -113,7 +113,7 @@ class Results:
         files = json.loads(index.read_text(encoding="utf-8"))
         inside = {k: (index.parent / Path(name).name) for k, name in files.items()}
         return {
-            clean(k): clean(path.read_text(encoding="utf-8", errors="replace"))
+            replace_unprintable(k): replace_unprintable(path.read_text(encoding="utf-8", errors="replace"))
             for k, path in inside.items()
             if path.is_file()
         }
@@ -121,10 +121,10 @@ class Results:
 
 def _clean_texts(values: np.ndarray) -> np.ndarray:
     known: dict[Any, Any] = {}
-    return np.array([known.setdefault(v, clean(v)) for v in values.tolist()], dtype=object)
+    return np.array([known.setdefault(v, replace_unprintable(v)) for v in values.tolist()], dtype=object)
 
 
-def groups(columns: Columns, *by: str) -> Iterator[tuple[tuple[str, ...], np.ndarray]]:
+def group_rows(columns: Columns, *by: str) -> Iterator[tuple[tuple[str, ...], np.ndarray]]:
     """Row indices of each distinct combination of the named columns, in order of first appearance."""
     if not columns:
         return

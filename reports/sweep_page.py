@@ -16,14 +16,14 @@ import pyarrow.parquet as pq
 from markupsafe import Markup
 
 from reports import page
-from reports.results import Record, clean
-from reports.verdicts import MARKS, counts, severity
+from reports.results import Record, replace_unprintable
+from reports.verdicts import VERDICT_STYLES, count_verdicts, severity
 
-STEPS = 24  # values of an axis that are shown one by one; more are gathered into intervals
-INTERVALS = 16
-LISTED = 60  # rows that do not agree, written out
-SHADES = 8
-MAPS = {  # per implementation: column, title
+MAX_AXIS_VALUES = 24  # values of an axis that are shown one by one; more are gathered into intervals
+AXIS_INTERVALS = 16
+MAX_LISTED_ROWS = 60  # rows that do not agree, written out
+SHADE_COUNT = 8
+MAP_COLUMNS = {  # per implementation: column, title
     True: (("uncertainty", "uncertainty, m"), ("reach", "reach of the last body, m")),  # the reference
     False: (("position_error", "largest distance from the reference, m"),),
 }
@@ -37,7 +37,7 @@ class Axis(NamedTuple):
     values: list[float]
     edges: list[float] | None
 
-    def place(self, value: float) -> int:
+    def index_of(self, value: float) -> int:
         """Which value or interval it belongs to."""
         if self.edges is None:
             return self.values.index(value)
@@ -50,17 +50,17 @@ def write(folder: Path) -> Path:
     Raises OSError or pyarrow's ArrowInvalid where the table cannot be read.
     """
     table = pq.read_table(folder / "sweep.parquet")
-    names = clean(table.column_names)
-    rows = clean(table.rename_columns(names).to_pylist())
-    about = clean(json.loads((table.schema.metadata or {}).get(b"sweep", b"{}")))
-    return page.put(folder / "sweep.html", render(names[: names.index("cell")], rows, about))
+    names = replace_unprintable(table.column_names)
+    rows = replace_unprintable(table.rename_columns(names).to_pylist())
+    about = replace_unprintable(json.loads((table.schema.metadata or {}).get(b"sweep", b"{}")))
+    return page.write_page(folder / "sweep.html", render(names[: names.index("cell")], rows, about))
 
 
-def render(parameters: Sequence[str], rows: Sequence[Record], about: Record) -> str:
+def render(parameters: Sequence[str], rows: Sequence[Record], sweep_info: Record) -> str:
     """The page as text; ``parameters`` are the varied columns, ``about`` the sweep's file."""
     varied = [name for name in parameters if len({row[name] for row in rows}) > 1] or list(parameters)
-    across = axis(varied[0], rows)
-    down = axis(varied[1], rows) if len(varied) > 1 else None
+    across = make_axis(varied[0], rows)
+    down = make_axis(varied[1], rows) if len(varied) > 1 else None
     implementations: dict[str, list[Record]] = {}
     for row in rows:
         implementations.setdefault(row["implementation"], []).append(row)
@@ -69,57 +69,57 @@ def render(parameters: Sequence[str], rows: Sequence[Record], about: Record) -> 
             "name": name,
             "integrator": next((r["integrator"] for r in theirs if r["integrator"]), ""),
             "title": title,
-            "counts": counts(theirs),
-            **chart(theirs, column, across, down),
+            "counts": count_verdicts(theirs),
+            **map_cells(theirs, column, across, down),
         }
         for name, theirs in implementations.items()
-        for column, title in MAPS[name == "reference"]
+        for column, title in MAP_COLUMNS[name == "reference"]
     ]
     poor = [row for row in rows if row["verdict"] not in ("agrees", "not installed")]
     cells = len({row["cell"] for row in rows})
     told = Counter((row["implementation"], row["verdict"]) for row in rows)
     style = page.stylesheet()
     return (
-        page.environment()
+        page.template_environment()
         .get_template("sweep.html")
         .render(
-            policy=page.policy(style),
+            policy=page.content_security_policy(style),
             style=Markup(style),
             sentence=f"{cells} cells: "
             + "; ".join(f"{name} {verdict} {k}" for (name, verdict), k in told.items()),
-            scenario=about.get("scenario", ""),
-            about=about,
+            scenario=sweep_info.get("scenario", ""),
+            about=sweep_info,
             across=across,
             down=down,
             folded=varied[2:],
             maps=maps,
-            marks=MARKS,
-            poor=poor[:LISTED],
-            unlisted=len(poor) - LISTED,
+            marks=VERDICT_STYLES,
+            poor=poor[:MAX_LISTED_ROWS],
+            unlisted=len(poor) - MAX_LISTED_ROWS,
             parameters=parameters,
-            shades=SHADES,
+            shades=SHADE_COUNT,
         )
     )
 
 
-def axis(name: str, rows: Sequence[Record]) -> Axis:
+def make_axis(name: str, rows: Sequence[Record]) -> Axis:
     """The parameter's values, or intervals of them where there are too many to show one by one."""
     values = sorted({float(row[name]) for row in rows})
-    if len(values) <= STEPS:
+    if len(values) <= MAX_AXIS_VALUES:
         return Axis(name, [f"{value:.4g}" for value in values], values, None)
     ratios = values[0] > 0 and values[-1] > 100 * values[0]
-    edges = (np.geomspace if ratios else np.linspace)(values[0], values[-1], INTERVALS + 1).tolist()
+    edges = (np.geomspace if ratios else np.linspace)(values[0], values[-1], AXIS_INTERVALS + 1).tolist()
     return Axis(name, [f"{a:.3g} … {b:.3g}" for a, b in pairwise(edges)], edges, edges)
 
 
-def chart(rows: Sequence[Record], column: str, across: Axis, down: Axis | None) -> Record:
+def map_cells(rows: Sequence[Record], column: str, across: Axis, down: Axis | None) -> Record:
     """Per place of the map its worst row, largest value, count and shade; the shades' range.
 
     Shades are steps of the value's logarithm between the smallest and the largest on this map.
     """
     held: dict[tuple[int, int], list[Record]] = {}
     for row in rows:
-        place = down.place(row[down.name]) if down else 0, across.place(row[across.name])
+        place = down.index_of(row[down.name]) if down else 0, across.index_of(row[across.name])
         held.setdefault(place, []).append(row)
 
     def size(row: Record) -> float:
@@ -135,9 +135,9 @@ def chart(rows: Sequence[Record], column: str, across: Axis, down: Axis | None) 
         part = (logs[place] - low) / (high - low) if place in logs and high > low else 0.0
         cells[place] = {
             "row": speaker,
-            "mark": MARKS[speaker["verdict"]],
+            "mark": VERDICT_STYLES[speaker["verdict"]],
             "value": value if value > -math.inf else None,
             "count": len(theirs),
-            "shade": round(part * (SHADES - 1)),
+            "shade": round(part * (SHADE_COUNT - 1)),
         }
     return {"cells": cells, "low": 10**low if logs else None, "high": 10**high if logs else None}

@@ -10,27 +10,29 @@ from typing import Any, NamedTuple
 from reports.results import Record, Results
 
 
-class Mark(NamedTuple):
+class VerdictStyle(NamedTuple):
     """Glyph, CSS class, the verb of "3 …" and what it means."""
 
     glyph: str
-    slug: str
+    css_class: str
     plural: str
     meaning: str
 
 
-MARKS = {
-    "disagrees": Mark("≠", "disagrees", "disagree", "the error is above its derived tolerance"),
-    "failed": Mark("✕", "failed", "failed", "raised, crashed, hung, ran out of memory or was not finite"),
-    "unresolved": Mark("?", "unresolved", "unresolved", "the data cannot tell"),
-    "unsupported": Mark("–", "unsupported", "unsupported", "the engine cannot do this"),
-    "not installed": Mark("○", "absent", "not installed", "the engine is not on this machine"),
-    "agrees": Mark("✓", "agrees", "agree", "the error is within its derived tolerance"),
+VERDICT_STYLES = {
+    "disagrees": VerdictStyle("≠", "disagrees", "disagree", "the error is above its derived tolerance"),
+    "failed": VerdictStyle(
+        "✕", "failed", "failed", "raised, crashed, hung, ran out of memory or was not finite"
+    ),
+    "unresolved": VerdictStyle("?", "unresolved", "unresolved", "the data cannot tell"),
+    "unsupported": VerdictStyle("–", "unsupported", "unsupported", "the engine cannot do this"),
+    "not installed": VerdictStyle("○", "absent", "not installed", "the engine is not on this machine"),
+    "agrees": VerdictStyle("✓", "agrees", "agree", "the error is within its derived tolerance"),
 }
 
 # Whose voice a cell speaks with: what nobody expected first, then recorded disagreements, then
 # agreement, then expected gaps.
-_UNEXPECTED = {
+_UNEXPECTED_SEVERITY = {
     "failed": 9,
     "disagrees": 8,
     "unresolved": 7,
@@ -38,12 +40,19 @@ _UNEXPECTED = {
     "agrees": 4,
     "not installed": 1,
 }
-_EXPECTED = {"failed": 5, "disagrees": 5, "unresolved": 3, "unsupported": 2, "agrees": 4, "not installed": 1}
+_KNOWN_SEVERITY = {
+    "failed": 5,
+    "disagrees": 5,
+    "unresolved": 3,
+    "unsupported": 2,
+    "agrees": 4,
+    "not installed": 1,
+}
 
 
 def severity(row: Record) -> int:
     """9 (failed) … 1 (not installed); from 6 on it was not expected and needs attention."""
-    return (_EXPECTED if row.get("known") else _UNEXPECTED)[row["verdict"]]
+    return (_KNOWN_SEVERITY if row.get("known") else _UNEXPECTED_SEVERITY)[row["verdict"]]
 
 
 def needs_attention(row: Record) -> bool:
@@ -51,7 +60,7 @@ def needs_attention(row: Record) -> bool:
     return severity(row) >= 6
 
 
-def ratio(row: Record) -> float | None:
+def error_ratio(row: Record) -> float | None:
     """Error over tolerance; None where either is missing or the quotient says nothing.
 
     Where the worst of many comparisons, each with a tolerance of its own, is not the largest error,
@@ -66,25 +75,27 @@ def ratio(row: Record) -> float | None:
     return float(value) / float(tolerance)
 
 
-def worst(rows: Iterable[Record]) -> Record:
+def worst_row(rows: Iterable[Record]) -> Record:
     """The row that speaks for a cell: the most severe, among those the largest error over tolerance."""
-    return max(rows, key=lambda row: (severity(row), ratio(row) if ratio(row) is not None else -1.0))
+    return max(
+        rows, key=lambda row: (severity(row), error_ratio(row) if error_ratio(row) is not None else -1.0)
+    )
 
 
-def counts(rows: Iterable[Record]) -> Counter[str]:
+def count_verdicts(rows: Iterable[Record]) -> Counter[str]:
     """Number of rows by verdict."""
     return Counter(row["verdict"] for row in rows)
 
 
-def tally(results: Results) -> Counter[str]:
+def count_all_verdicts(results: Results) -> Counter[str]:
     """Number of a run's rows by verdict, those of random scenarios that are only counted among them."""
-    return counts(results.rows) + Counter(results.run["probes"].get("folded", {}))
+    return count_verdicts(results.rows) + Counter(results.run["probes"].get("folded", {}))
 
 
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
-def number(x: Any, digits: int = 2) -> str:
+def format_number(x: Any, digits: int = 2) -> str:
     """A number as people write it: 0.031, 4.2×10⁻⁶; "–" for none."""
     if x is None:
         return "–"

@@ -127,5 +127,5 @@ def register() -> None:
 
 def prepare(*arguments: Any) -> None:
     """`workers.prepare`, and the engines."""
-    workers.prepare(*arguments)
+    workers.initialize_worker(*arguments)
     register()

@@ -77,14 +77,14 @@ def integrate(model: Model, state: State, times: Array, rtol: float = 3e-14) -> 
 
     def unpack(y: Array) -> State:
         p, omega, u, udot = (part.reshape(s) for part, s in zip(np.split(y, cuts), shapes, strict=True))
-        return kinematics.lift(model, p, omega, u, udot)
+        return kinematics.state_from_minimal(model, p, omega, u, udot)
 
     def rhs(_t: float, y: Array) -> Array:
         at = unpack(y)
         truth = solve(model, at, float)  # rounding, like that of the integrator
         d_ddot = _attachment_acceleration(model, at, truth)
         uddot = np.where(model.rods[:, None], d_ddot / np.where(model.rods, model.length, 1)[:, None], 0)
-        parts = kinematics.rate(at.p, at.omega), truth.angular_acceleration, at.udot, uddot
+        parts = kinematics.quaternion_rate(at.p, at.omega), truth.angular_acceleration, at.udot, uddot
         return np.concatenate([np.ravel(part) for part in parts])
 
     start = np.concatenate([np.ravel(x) for x in (state.p, state.omega, state.u, state.udot)])
@@ -105,7 +105,7 @@ def potential(model: Model, state: State) -> float:
 
 def angular_momentum(model: Model, state: State) -> Array:
     """Σ r × m v + A J ω′ (3,), about the world origin."""
-    spin = np.einsum("kij,kjl,kl->i", kinematics.rotation(state.p), model.inertia, state.omega)
+    spin = np.einsum("kij,kjl,kl->i", kinematics.rotation_matrix(state.p), model.inertia, state.omega)
     return np.asarray(np.sum(model.mass[:, None] * np.cross(state.r, state.v), 0) + spin)
 
 
@@ -117,7 +117,9 @@ def mass_matrix(model: Model, state: State) -> Array:
         udot, omega = np.zeros((model.n, 3)), unit[3 * len(rods) :].reshape(model.n, 3)
         udot[rods] = unit[: 3 * len(rods)].reshape(-1, 3)
         udot -= state.u * np.sum(state.u * udot, -1, keepdims=True)  # a rod turns with u × u̇
-        columns.append(np.hstack([kinematics.lift(model, state.p, omega, state.u, udot).v, omega]))
+        columns.append(
+            np.hstack([kinematics.state_from_minimal(model, state.p, omega, state.u, udot).v, omega])
+        )
     B = np.array(columns)  # (nu, N, 6)
     linear = np.einsum("akj,k,bkj->ab", B[..., :3], model.mass, B[..., :3])
     return np.asarray(linear + np.einsum("aki,kij,bkj->ab", B[..., 3:], model.inertia, B[..., 3:]))
@@ -141,7 +143,7 @@ def _velocities(R: Array, omega: Array, rod_rate: Array, near: Array, far: Array
 
 def _attachment_acceleration(model: Model, state: State, truth: Truth) -> Array:
     """d̈ (N, 3): of body k's proximal point relative to the point where joint k hangs."""
-    a = kinematics.rotation(state.p)
+    a = kinematics.rotation_matrix(state.p)
 
     def point(s: Array) -> Array:
         turn = _cross(truth.angular_acceleration, s) + _cross(state.omega, _cross(state.omega, s))

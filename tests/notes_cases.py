@@ -8,9 +8,9 @@ import numpy as np
 from sympy import QQ
 from sympy.polys.rings import ring
 
-from plumbline.model.kinematics import lift
+from plumbline.model.kinematics import state_from_minimal
 from reference_impl.chain import Chain
-from reference_impl.euler_parameters import rate
+from reference_impl.euler_parameters import euler_parameter_rate
 
 
 def random_chain(rng, rods, loads=True):
@@ -40,8 +40,8 @@ def on_manifold(chain, rng):
     p /= np.linalg.norm(p, axis=1, keepdims=True)
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     omega, udot = rng.normal(size=(n, 3)), np.cross(u, rng.normal(size=(n, 3)))
-    state = lift(chain, p, omega, u, udot)
-    return state.r, p, state.v, rate(p, omega)
+    state = state_from_minimal(chain, p, omega, u, udot)
+    return state.r, p, state.v, euler_parameter_rate(p, omega)
 
 
 def off_manifold(chain, rng):

@@ -10,7 +10,7 @@ import numpy as np
 from plumbline.model import kinematics
 from plumbline.model.datatypes import Array, Model, State, Trajectory
 from reference_impl.chain import Chain
-from reference_impl.collocation import integrate
+from reference_impl.collocation import integrate_collocation
 
 JOINTS = {  # b: hung by a ball joint, r: by a rod
     "ball": "b",
@@ -59,13 +59,13 @@ def state(subject: Model, seed: int = 0, rate: float = 3.0) -> State:
     udot = np.cross(rate * rng.normal(size=(n, 3)), u)
     omega = rate * rng.normal(size=(n, 3))
     p /= np.linalg.norm(p, axis=1, keepdims=True)
-    return kinematics.lift(subject, p, omega, np.where(rod, u, 0.0), np.where(rod, udot, 0.0))
+    return kinematics.state_from_minimal(subject, p, omega, np.where(rod, u, 0.0), np.where(rod, udot, 0.0))
 
 
 def motion(subject: Model, at: State, times: Array) -> Trajectory:
     """The motion by the reference's collocation, held on its manifold."""
-    start = at.r, at.p, at.v, kinematics.rate(at.p, at.omega)
-    run = integrate([Chain(**vars(subject))], *start, times, 1e-13, projected=True)
+    start = at.r, at.p, at.v, kinematics.quaternion_rate(at.p, at.omega)
+    run = integrate_collocation([Chain(**vars(subject))], *start, times, 1e-13, project=True)
     return Trajectory(times, run.r, run.p, run.v, run.pdot, run.steps)
 
 

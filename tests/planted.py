@@ -15,8 +15,8 @@ import numpy as np
 
 from plumbline.engines.adapter import Adapter
 from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, Trajectory
-from plumbline.model.kinematics import conjugate, lift, rotation
-from reference_impl.direct import Solution, System
+from plumbline.model.kinematics import quaternion_conjugate, rotation_matrix, state_from_minimal
+from reference_impl.direct import DirectSystem, Solution
 from reference_impl.euler_parameters import angular_velocity
 
 Inputs = Callable[[Model, State], tuple[Model, State]]
@@ -64,7 +64,7 @@ def plant(real: type[Adapter], defect: Defect) -> Adapter:
     return Planted()
 
 
-class Bent(System):
+class Bent(DirectSystem):
     """The notes' system with something added to γ: patched into the reference's adapter."""
 
     model: Model
@@ -81,7 +81,7 @@ class Bent(System):
 
 def joint_directions(model: Model, r: Array, p: Array, omega: Array | None = None) -> Array:
     """(N, 3) joint vectors d, or their rates where r is a velocity and ω′ is given."""
-    a = rotation(p)
+    a = rotation_matrix(p)
 
     def point(s: Array) -> Array:
         arm = s if omega is None else np.cross(omega, s)
@@ -96,7 +96,7 @@ def joint_directions(model: Model, r: Array, p: Array, omega: Array | None = Non
 def relifted(model: Model, state: State, **minimal: Array) -> State:
     """The state of a model from its minimal coordinates, some of them replaced."""
     parts = {k: minimal.get(k, getattr(state, k)) for k in ("p", "omega", "u", "udot")}
-    return lift(model, **parts)
+    return state_from_minimal(model, **parts)
 
 
 def parameter(field: str, *index: int, by: float = 0.0, times: float = 1.0) -> Inputs:
@@ -129,12 +129,12 @@ def state_change(change: Callable[[Model, State], dict[str, Array]]) -> Inputs:
 
 def world(state: State, vectors: Array) -> Array:
     """A x of each body."""
-    return np.asarray((rotation(state.p) @ vectors[..., None])[..., 0])
+    return np.asarray((rotation_matrix(state.p) @ vectors[..., None])[..., 0])
 
 
 def body(state: State, vectors: Array) -> Array:
     """Aᵀ x of each body."""
-    return np.asarray((rotation(state.p).mT @ vectors[..., None])[..., 0])
+    return np.asarray((rotation_matrix(state.p).mT @ vectors[..., None])[..., 0])
 
 
 def gyroscopic(model: Model, state: State) -> Array:
@@ -334,7 +334,7 @@ STATE_DEFECTS = (
            inputs=model_change(about_proximal)),
     Defect("inertia-in-world-axes", "A J Aᵀ in place of J", ("inertia in world axes",), M,
            inputs=model_change(lambda m, s: {"inertia": (lambda x: (x + x.mT) / 2)(
-               rotation(s.p).mT @ m.inertia @ rotation(s.p))})),
+               rotation_matrix(s.p).mT @ m.inertia @ rotation_matrix(s.p))})),
     Defect("centre-0.1mm", "centre of mass of body 1 by 0.1 mm in x", ("centre of mass of body 1",), M,
            inputs=centre_moved(0, 1e-4 * X)),
     Defect("proximal-1e-5", "proximal y of body 1 by 1e-5 m", ("proximal y of body 1",), P,
@@ -374,7 +374,7 @@ STATE_DEFECTS = (
            loaded=True, inputs=model_change(lambda m, s: {"moment": body(s, m.moment)})),
     # numbers of the state
     Defect("rotation-transposed", "A → Aᵀ", ("rotation transposed",), M,
-           inputs=state_change(lambda _, s: {"p": conjugate(s.p)})),
+           inputs=state_change(lambda _, s: {"p": quaternion_conjugate(s.p)})),
     Defect("quaternion-order", "(x, y, z, w) read as (w, x, y, z)", ("quaternion order",), P,
            inputs=state_change(lambda _, s: {"p": np.roll(s.p, -1, axis=1)})),
     Defect("world-rate-for-body-rate", "A ω′ in place of ω′", ("world rate",), E,

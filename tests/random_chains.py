@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import lift
+from plumbline.model.kinematics import state_from_minimal
 
 
 def random_chain(
@@ -42,7 +42,9 @@ def random_chain(
     u = rng.normal(size=(n, 3))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     udot = np.cross(rate * rng.normal(size=(n, 3)), u)
-    state = lift(model, p, rate * rng.normal(size=(n, 3)), np.where(held, u, 0.0), np.where(held, udot, 0.0))
+    state = state_from_minimal(
+        model, p, rate * rng.normal(size=(n, 3)), np.where(held, u, 0.0), np.where(held, udot, 0.0)
+    )
     return model, state
 
 
@@ -62,7 +64,7 @@ def rescaled(model: Model, state: State, length: float, mass: float, time: float
         drag_force=model.drag_force * mass / time,
         drag_moment=model.drag_moment * mass * length**2 / time,
     )
-    return scaled, lift(scaled, state.p, state.omega / time, state.u, state.udot / time)
+    return scaled, state_from_minimal(scaled, state.p, state.omega / time, state.u, state.udot / time)
 
 
 def norms(difference: Array) -> Array:

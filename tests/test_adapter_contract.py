@@ -57,7 +57,9 @@ def test_says_what_it_is(engine):
         assert method.alias_of is None or method.alias_of in names
         assert method.note, f"{method.name} has no sentence that says what it is"
         if method.kind == "step":
-            assert method.powers[0] == method.order and list(method.powers) == sorted(set(method.powers))
+            assert method.error_exponents[0] == method.order and list(method.error_exponents) == sorted(
+                set(method.error_exponents)
+            )
     with pytest.raises(KeyError, match=names[0] if names else engine):
         worker.call(engine, "simulate", *still(), TIMES, "no such method", STEP)
 
@@ -137,7 +139,9 @@ def still(p=(1.0, 0.0, 0.0, 0.0), omega=(0.0, 0.0, 0.0), pivot=(0.0, 0.0, 0.2), 
         gravity=np.array([0.0, 0.0, -10.0]),
     )
     u = np.array([u], float) * (joint > 0)
-    at = kinematics.lift(subject, np.array([p], float), np.array([omega], float), u, np.zeros((1, 3)))
+    at = kinematics.state_from_minimal(
+        subject, np.array([p], float), np.array([omega], float), u, np.zeros((1, 3))
+    )
     return subject, at
 
 
@@ -170,7 +174,11 @@ def test_frames_and_quaternion_order(engine):
     agrees(engine, got, "angular_momentum", [0, 0, 2 * (0.04 + 0.08)], 1, 1e-13)
     for method in worker.attribute(engine, "integrators"):
         run = worker.call(engine, "simulate", subject, at, TIMES[:2], method.name, resolution(method))
-        for name, expected in (("r", at.r), ("v", at.v), ("pdot", kinematics.rate(at.p, at.omega))):
+        for name, expected in (
+            ("r", at.r),
+            ("v", at.v),
+            ("pdot", kinematics.quaternion_rate(at.p, at.omega)),
+        ):
             close(getattr(run, name)[0], expected, 1, f"{method.name}: first {name}", 1e-14)
         close(run.p[0], at.p, 1, f"{method.name}: first p", 1e-14)
 
@@ -191,7 +199,13 @@ def test_p_and_minus_p_are_the_same_attitude(engine, joints):
             for start in (at, pendulums.flipped(at))
         ]
         close(runs[1].r, runs[0].r, 1, f"{method.name}: r", 1e-10)
-        close(kinematics.rotation(runs[1].p), kinematics.rotation(runs[0].p), 1, f"{method.name}: A", 1e-10)
+        close(
+            kinematics.rotation_matrix(runs[1].p),
+            kinematics.rotation_matrix(runs[0].p),
+            1,
+            f"{method.name}: A",
+            1e-10,
+        )
 
 
 # -- trajectories ------------------------------------------------------------------------------
@@ -286,7 +300,7 @@ def stack(run, true):
 
 
 def stack_truth(true):
-    pdot = [kinematics.rate(s.p, s.omega) for s in true]
+    pdot = [kinematics.quaternion_rate(s.p, s.omega) for s in true]
     columns = [s.r for s in true], [s.p for s in true], [s.v for s in true], pdot
     return np.concatenate([np.ravel(column) for column in columns])
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from plumbline.scenario.errors import Problem, ScenarioError, nearest
-from plumbline.scenario.loader import find, load, load_many, loads
+from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean
+from plumbline.scenario.loader import find_scenario_file, load_scenario, load_scenario_text, load_scenarios
 
 GOOD = """\
 schema_version: 1
@@ -324,12 +324,12 @@ BARE = BODY.replace("distal: [0, 0, 0], ", "")
 
 def problems_of(text: str) -> list[str]:
     with pytest.raises(ScenarioError) as caught:
-        loads(text, "x.yaml")
+        load_scenario_text(text, "x.yaml")
     return [str(problem).removeprefix("x.yaml:") for problem in caught.value.problems]
 
 
 def test_the_unspoilt_file_is_valid():
-    loads(GOOD)
+    load_scenario_text(GOOD)
 
 
 @pytest.mark.timeout(20)
@@ -362,20 +362,20 @@ def test_all_mistakes_of_all_files_come_at_once(tmp_path):
     for name in ("a", "b"):
         (tmp_path / f"{name}.yaml").write_text(GOOD.replace("1.5", "-1"))
     with pytest.raises(ScenarioError) as caught:
-        load_many([tmp_path / "a.yaml", tmp_path / "b.yaml", "no-such-scenario"])
+        load_scenarios([tmp_path / "a.yaml", tmp_path / "b.yaml", "no-such-scenario"])
     assert [Path(p.file).name for p in caught.value.problems] == ["a.yaml", "b.yaml", "no-such-scenario"]
     assert f"{tmp_path / 'a.yaml'}:5:11: bodies[0].mass: is -1" in str(caught.value)
 
 
 def test_a_body_in_a_run_is_placed_too():
     head = GOOD[: GOOD.index("  - mass")]
-    loads(head + f"  - repeat: 2\n    cycle:\n      - {BODY}\n")
+    load_scenario_text(head + f"  - repeat: 2\n    cycle:\n      - {BODY}\n")
     bare = BARE.replace("mass: 1", "mass: -1")
     assert [p[:40] for p in problems_of(head + f"  - repeat: 2\n    cycle:\n      - {bare}\n")] == [
         "7:9: bodies[0].cycle[0].distal: is missi",
         "7:16: bodies[0].cycle[0].mass: is -1; va",
     ]
-    loads(head + f"  - repeat: 1\n    cycle:\n      - {BARE}\n")
+    load_scenario_text(head + f"  - repeat: 1\n    cycle:\n      - {BARE}\n")
 
 
 @pytest.mark.timeout(20)
@@ -400,7 +400,7 @@ def test_an_alias_of_itself_ends(loop):
 
 def test_many_problems_are_counted_rather_than_listed():
     with pytest.raises(ScenarioError) as caught:
-        loads(GOOD + "".join(f"x{i}: 1\n" for i in range(300)))
+        load_scenario_text(GOOD + "".join(f"x{i}: 1\n" for i in range(300)))
     assert len(caught.value.problems) == 300
     assert str(caught.value).endswith("… and 200 more problems")
 
@@ -419,7 +419,7 @@ def test_bytes_that_are_no_text(tmp_path, raw, expected):
     path = tmp_path / "bytes.yaml"
     path.write_bytes(raw)
     with pytest.raises(ScenarioError) as caught:
-        load(path)
+        load_scenario(path)
     assert str(caught.value).startswith(f"{path}{expected}")
 
 
@@ -433,7 +433,7 @@ def test_files_that_cannot_be_read(tmp_path):
         if path.name == "zero" and not path.exists():
             continue  # not on this system
         with pytest.raises(ScenarioError) as caught:
-            load(path)
+            load_scenario(path)
         assert expected in str(caught.value)
 
 
@@ -443,7 +443,7 @@ def test_a_file_without_permission(tmp_path):
     path.write_text(GOOD)
     path.chmod(0)
     with pytest.raises(ScenarioError, match="cannot be read: Permission denied"):
-        load(path)
+        load_scenario(path)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names here")
@@ -451,28 +451,28 @@ def test_a_file_without_permission(tmp_path):
 def test_a_pipe_does_not_hang(tmp_path):
     os.mkfifo(tmp_path / "pipe.yaml")
     with pytest.raises(ScenarioError, match="is not a regular file"):
-        load(tmp_path / "pipe.yaml")
+        load_scenario(tmp_path / "pipe.yaml")
 
 
 def test_byte_order_mark_and_carriage_returns_are_fine(tmp_path):
     path = tmp_path / "windows.yaml"
     path.write_bytes(b"\xef\xbb\xbf" + GOOD.replace("\n", "\r\n").encode())
-    assert load(path).digest == loads(GOOD, "windows.yaml").digest
+    assert load_scenario(path).digest == load_scenario_text(GOOD, "windows.yaml").digest
     path.write_bytes(b"\xef\xbb\xbf" + GOOD.replace("\n", "\r\n").replace("1.5", "-1").encode())
     with pytest.raises(ScenarioError, match=r":5:11: bodies\[0\].mass: is -1"):
-        load(path)
+        load_scenario(path)
 
 
 def test_an_unknown_name_suggests_the_nearest():
     with pytest.raises(
         ScenarioError, match=r"tumbling-bal: unknown scenario\. did you mean 'tumbling-ball'\?"
     ):
-        find("tumbling-bal")
+        find_scenario_file("tumbling-bal")
     with pytest.raises(
         ScenarioError, match="unknown scenario; valid would be a path of a YAML file, or one of"
     ):
-        find("qqqqqq")
-    assert nearest("Distl", ["mass", "distal"]) == "did you mean 'distal'?"
+        find_scenario_file("qqqqqq")
+    assert did_you_mean("Distl", ["mass", "distal"]) == "did you mean 'distal'?"
 
 
 def test_two_scenarios_of_one_name_are_refused(tmp_path):
@@ -481,8 +481,8 @@ def test_two_scenarios_of_one_name_are_refused(tmp_path):
             "name: same\n" + GOOD.replace("1.5", "1" if name == "a" else "2")
         )
     with pytest.raises(ScenarioError, match="name: is named 'same' like"):
-        load_many([tmp_path / "a.yaml", tmp_path / "b.yaml"])
-    assert len(load_many([tmp_path / "a.yaml", tmp_path / "a.yaml"])) == 1
+        load_scenarios([tmp_path / "a.yaml", tmp_path / "b.yaml"])
+    assert len(load_scenarios([tmp_path / "a.yaml", tmp_path / "a.yaml"])) == 1
 
 
 def test_errors_cross_processes():

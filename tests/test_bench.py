@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from plumbline.execution.runner import Plan, describe_all, execute
-from plumbline.execution.scenario_run import Bench
-from plumbline.processes.workers import Limits, Outcome, Workers, perform
+from plumbline.execution.runner import Plan, describe_engines, run_plan
+from plumbline.execution.scenario_run import ScenarioRun
+from plumbline.processes.workers import Limits, Outcome, WorkerPool, run_task
 from plumbline.scenario import loader
 
 pytest.importorskip("mujoco")
@@ -15,17 +15,17 @@ pytest.importorskip("mujoco")
 
 @pytest.fixture(scope="module")
 def engines():
-    with Workers(1) as workers:
-        return describe_all(workers, ["reference", "mujoco"])
+    with WorkerPool(1) as workers:
+        return describe_engines(workers, ["reference", "mujoco"])
 
 
 def made(engines, level):
-    chosen = loader.load(loader.find("rest"))
-    return Bench(Plan([chosen], list(engines), level, states=2), chosen, engines)
+    chosen = loader.load_scenario(loader.find_scenario_file("rest"))
+    return ScenarioRun(Plan([chosen], list(engines), level, random_state_count=2), chosen, engines)
 
 
 def answered(task, **lost):
-    return Outcome(task.key, **lost) if lost else perform(task)
+    return Outcome(task.key, **lost) if lost else run_task(task)
 
 
 def test_answers_wait_for_the_truth_whatever_comes_first(engines):
@@ -34,9 +34,9 @@ def test_answers_wait_for_the_truth_whatever_comes_first(engines):
         bench = made(engines, "trajectory")
         tasks = list(bench.tasks())
         for task in reversed(tasks) if turned else tasks:
-            assert not bench.done
-            assert bench.take(answered(task)) == []
-        assert bench.done
+            assert not bench.is_done
+            assert bench.on_outcome(answered(task)) == []
+        assert bench.is_done
         rows.append([(r.key, r.value, r.verdict) for r in bench.findings().rows])
     assert rows[0] == rows[1] and len(rows[0]) > 14
 
@@ -45,14 +45,14 @@ def test_states_are_asked_for_with_their_truth_and_judged_alike_here_and_by_the_
     benches = [made(engines, "state"), made(engines, "state")]
     for bench, elsewhere in zip(benches, (True, False), strict=True):
         (truth,) = bench.tasks()
-        cells = bench.take(answered(truth))
+        cells = bench.on_outcome(answered(truth))
         assert [task.key[1:] for task in cells] == [("reference", "state"), ("mujoco", "state")]
         for task in cells:
-            assert not bench.done
+            assert not bench.is_done
             found = answered(task)
-            assert len(found.judged.rows) == 7
-            bench.take(found if elsewhere else replace(found, judged=None))  # as the memory has it
-        assert bench.done
+            assert len(found.judge_result.rows) == 7
+            bench.on_outcome(found if elsewhere else replace(found, judged=None))  # as the memory has it
+        assert bench.is_done
     by_worker, here = ([replace(r, wall_time=0.0) for r in bench.findings().rows] for bench in benches)
     assert by_worker == here and len(here) == 14
 
@@ -60,9 +60,9 @@ def test_states_are_asked_for_with_their_truth_and_judged_alike_here_and_by_the_
 def test_a_lost_truth_of_states_fails_every_cell_and_says_so(engines):
     bench = made(engines, "state")
     (truth,) = bench.tasks()
-    for task in bench.take(Outcome(truth.key, lost="crashed")):
-        bench.take(answered(task))
-    assert bench.done
+    for task in bench.on_outcome(Outcome(truth.key, failure="crashed")):
+        bench.on_outcome(answered(task))
+    assert bench.is_done
     assert [(r.verdict, r.reason) for r in bench.findings().rows] == [
         ("failed", "no truth to judge by: crashed")
     ] * 2
@@ -72,10 +72,10 @@ def test_a_motion_truth_whose_worker_died_is_asked_for_once_more_without_a_compi
     bench = made(engines, "trajectory")
     truth, *cells = bench.tasks()
     for task in cells:
-        bench.take(answered(task))
-    (second,) = bench.take(Outcome(truth.key, lost="crashed: the worker died of SIGSEGV"))
-    assert second.key == truth.key and second.arguments[-1] == 0 and not bench.done
-    assert bench.take(answered(second)) == [] and bench.done
+        bench.on_outcome(answered(task))
+    (second,) = bench.on_outcome(Outcome(truth.key, failure="crashed: the worker died of SIGSEGV"))
+    assert second.key == truth.key and second.arguments[-1] == 0 and not bench.is_done
+    assert bench.on_outcome(answered(second)) == [] and bench.is_done
     assert all(row.verdict == "agrees" for row in bench.findings().rows)
     assert "Taylor" not in bench.truths["trajectory"].method.split("closed form")[0]
 
@@ -84,9 +84,9 @@ def test_a_truth_that_is_lost_twice_fails_every_cell_and_says_so(engines):
     bench = made(engines, "trajectory")
     truth, *cells = bench.tasks()
     for task in cells:
-        bench.take(answered(task))
-    bench.take(Outcome(truth.key, lost="crashed"))
-    assert bench.take(Outcome(truth.key, lost="crashed twice")) == [] and bench.done
+        bench.on_outcome(answered(task))
+    bench.on_outcome(Outcome(truth.key, failure="crashed"))
+    assert bench.on_outcome(Outcome(truth.key, failure="crashed twice")) == [] and bench.is_done
     rows = bench.findings().rows
     assert len(rows) == len(cells)
     assert all(r.verdict == "failed" and r.reason == "no truth to judge by: crashed twice" for r in rows)
@@ -98,14 +98,14 @@ def crash(*_):
 
 
 def test_in_a_run_the_second_truth_is_handed_over(monkeypatch):
-    truth, asked = Bench.truth, []
+    truth, asked = ScenarioRun.truth_task, []
 
     def first_crashes(self, key, *uncompiled):
         asked.append(truth(self, key, *uncompiled))
         return asked[-1] if uncompiled else replace(asked[-1], call=crash)
 
-    monkeypatch.setattr(Bench, "truth", first_crashes)
-    chosen = loader.load(loader.find("rest"))
-    result = execute(Plan([chosen], ["mujoco"], "trajectory", limits=Limits(120)), lambda *_: None)
+    monkeypatch.setattr(ScenarioRun, "truth_task", first_crashes)
+    chosen = loader.load_scenario(loader.find_scenario_file("rest"))
+    result = run_plan(Plan([chosen], ["mujoco"], "trajectory", limits=Limits(120)), lambda *_: None)
     assert len(asked) == 2
-    assert result.run["exit_code"] == 0, result.run["sentence"]
+    assert result.metadata["exit_code"] == 0, result.metadata["sentence"]

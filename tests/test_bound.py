@@ -10,13 +10,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.engines.registry import ENGINES, adapter
+from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.model.datatypes import Unsupported
-from plumbline.model.kinematics import lift, rotation
+from plumbline.model.kinematics import rotation_matrix, state_from_minimal
 from plumbline.model.sampling import random_states
-from plumbline.model.welding import halves, whole
-from plumbline.scenario.loader import find, load
-from plumbline.truth.rounding_bound import BLUNT, EPS, ROUNDINGS, SUMMANDS, Bound, state_bound
+from plumbline.model.welding import split_bodies, undivided_bodies
+from plumbline.scenario.loader import find_scenario_file, load_scenario
+from plumbline.truth.rounding_bound import (
+    EPS,
+    MAX_RELATIVE_BOUND,
+    ROUNDING_FACTOR,
+    SUM_ROUNDING_FACTOR,
+    RoundingBound,
+    state_rounding_bound,
+)
 from tests.random_chains import norms, random_chain, rescaled
 
 VECTORS = ("acceleration", "angular_acceleration", "joint_reaction")
@@ -51,13 +58,18 @@ def test_other_units_change_nothing(rods, units):
         "angular_momentum": mass * length**2 / second,
         "mass_matrix": mass * length**2,
     }
-    here, there = state_bound(model, state), state_bound(*rescaled(model, state, length, mass, second))
+    here, there = (
+        state_rounding_bound(model, state),
+        state_rounding_bound(*rescaled(model, state, length, mass, second)),
+    )
     # a bound is itself rounded, through an inverse; a unit forgotten would be off by a power of ten
     for quantity, factor in unit.items():
         assert there.tolerance(quantity) / factor == pytest.approx(
             here.tolerance(quantity), rel=1e-7, abs=0
         ), quantity
-        assert there.bluntness(quantity) == pytest.approx(here.bluntness(quantity), rel=1e-7, abs=0), quantity
+        assert there.relative_bound(quantity) == pytest.approx(
+            here.relative_bound(quantity), rel=1e-7, abs=0
+        ), quantity
 
 
 LOSES_DIGITS = "pinocchio-aba"  # on long chains and wide mass ratios, really: see the test after these
@@ -78,10 +90,10 @@ def test_no_honest_engine_is_blamed_in_two_thousand_chains(name):
 def honest(name, count):
     """An engine's worst error over the tolerance stays below a half: there is room for worse luck."""
     pytest.importorskip("flint")
-    from plumbline.truth.certified import certify
+    from plumbline.truth.certified import certify_state
 
     try:
-        engine = adapter(name)
+        engine = load_adapter(name)
     except ImportError as error:
         pytest.skip(f"{name} is not installed: {error}")
     rng = np.random.default_rng(17)
@@ -94,8 +106,8 @@ def honest(name, count):
             said = engine.evaluate(model, [state])[0]
         except Unsupported:
             continue
-        true = certify(model, state, mass_matrix=n <= 3).quantities
-        for quantity, ratio in over_bound(said, true, state_bound(model, state)).items():
+        true = certify_state(model, state, mass_matrix=n <= 3).quantities
+        for quantity, ratio in over_bound(said, true, state_rounding_bound(model, state)).items():
             checks += 1
             worst[quantity] = max(worst.get(quantity, 0.0), ratio)
     print(name, checks, {quantity: f"{ratio:.3f}" for quantity, ratio in worst.items()})
@@ -107,13 +119,13 @@ def test_a_real_loss_of_digits_is_blamed():
     """The articulated-body recursion on a chain of 50 balls is off by far more than roundings explain."""
     pytest.importorskip("flint")
     pytest.importorskip("pinocchio")
-    from plumbline.truth.certified import certify
+    from plumbline.truth.certified import certify_state
 
-    scenario = load(find("chain-50-balls"))
+    scenario = load_scenario(find_scenario_file("chain-50-balls"))
     (state,) = random_states(scenario.model, 1, seed=3)
-    true, bound = certify(scenario.model, state).quantities, state_bound(scenario.model, state)
+    true, bound = certify_state(scenario.model, state).quantities, state_rounding_bound(scenario.model, state)
     recursion, matrix = (
-        adapter(name).evaluate(scenario.model, [state])[0] for name in (LOSES_DIGITS, "pinocchio")
+        load_adapter(name).evaluate(scenario.model, [state])[0] for name in (LOSES_DIGITS, "pinocchio")
     )
     assert max(over_bound(recursion, true, bound).values()) > 10
     assert max(over_bound(matrix, true, bound).values()) < 0.5
@@ -122,8 +134,11 @@ def test_a_real_loss_of_digits_is_blamed():
 def test_scales_do_not_vanish_with_the_answer():
     """In steady conical motion and at rest ω̇′ is zero, and a tolerance relative to it would mean nothing."""
     for name in ("double-conical", "planar-rotating", "rest", "chain-10-small"):
-        scenario = load(find(name))
-        assert state_bound(scenario.model, scenario.state).bluntness("angular_acceleration") < BLUNT, name
+        scenario = load_scenario(find_scenario_file(name))
+        assert (
+            state_rounding_bound(scenario.model, scenario.state).relative_bound("angular_acceleration")
+            < MAX_RELATIVE_BOUND
+        ), name
 
 
 PLANTED = {
@@ -151,19 +166,19 @@ def test_a_small_mistake_is_seen(what, rods, sharp):
 
 
 def smallest_seen(what, rods):
-    from plumbline.truth.certified import certify
+    from plumbline.truth.certified import certify_state
 
     rng, worst = np.random.default_rng(5), 0.0
     for _ in range(10):
         model, _ = random_chain(rng, rods)
         states = random_states(model, 10, seed=int(rng.integers(2**31)))
-        bounds = [state_bound(model, state) for state in states]
-        true = [certify(model, state).quantities for state in states]
+        bounds = [state_rounding_bound(model, state) for state in states]
+        true = [certify_state(model, state).quantities for state in states]
 
         def seen(e, model=model, states=states, bounds=bounds, true=true):
             wrong = PLANTED[what](model, e)
-            relifted = [lift(wrong, s.p, s.omega, s.u, s.udot) for s in states]
-            said = [certify(wrong, state).quantities for state in relifted]
+            relifted = [state_from_minimal(wrong, s.p, s.omega, s.u, s.udot) for s in states]
+            said = [certify_state(wrong, state).quantities for state in relifted]
             return any(max(over_bound(*each).values()) > 1 for each in zip(said, true, bounds, strict=True))
 
         grid = 10 ** np.arange(-14, -5, 0.25)
@@ -173,20 +188,24 @@ def smallest_seen(what, rods):
 
 def test_bounds_stay_sharp_and_say_how_they_came_about():
     model, state = random_chain(np.random.default_rng(0), [0, 1, 0])
-    bound = state_bound(model, state)
+    bound = state_rounding_bound(model, state)
     for quantity in bound.scale:
-        assert 8 * EPS < bound.bluntness(quantity) < BLUNT, quantity
+        assert 8 * EPS < bound.relative_bound(quantity) < MAX_RELATIVE_BOUND, quantity
         how = "terms of the Newton-Euler equations" if quantity in VECTORS else "sum of the magnitudes"
-        assert how in bound.explain(quantity)
-        assert str(ROUNDINGS if quantity in VECTORS else SUMMANDS) in bound.explain(quantity)
-    assert (np.finfo(float).eps / 2, 64, 256) == (EPS, ROUNDINGS, SUMMANDS), "calibrated, see below"
-    assert f"{np.max(bound.acceleration):.1e}" in bound.explain("acceleration")
+        assert how in bound.describe(quantity)
+        assert str(ROUNDING_FACTOR if quantity in VECTORS else SUM_ROUNDING_FACTOR) in bound.describe(
+            quantity
+        )
+    assert (np.finfo(float).eps / 2, 64, 256) == (EPS, ROUNDING_FACTOR, SUM_ROUNDING_FACTOR), (
+        "calibrated, see below"
+    )
+    assert f"{np.max(bound.acceleration):.1e}" in bound.describe("acceleration")
 
 
 def test_a_wild_scenario_is_called_blunt():
     model, state = random_chain(np.random.default_rng(1), [0] * 10)
     model = replace(model, mass=np.geomspace(1e-6, 1e6, 10), inertia=model.inertia * 1e-4)
-    assert state_bound(model, state).bluntness("angular_acceleration") > BLUNT
+    assert state_rounding_bound(model, state).relative_bound("angular_acceleration") > MAX_RELATIVE_BOUND
 
 
 def test_states_without_motion_or_gravity_have_finite_bounds():
@@ -195,19 +214,19 @@ def test_states_without_motion_or_gravity_have_finite_bounds():
         for rods in ([0], [1], [0, 1]):
             model, state = random_chain(np.random.default_rng(3), rods, rate=0.0)
             still = replace(model, gravity=np.zeros(3))
-            for bound in (state_bound(model, state), state_bound(still, state)):
+            for bound in (state_rounding_bound(model, state), state_rounding_bound(still, state)):
                 assert all(np.all(np.isfinite(bound.tolerance(q))) for q in bound.scale)
             centred = replace(model, proximal=np.zeros_like(model.proximal))
-            assert np.all(np.isfinite(state_bound(centred, state).acceleration))
+            assert np.all(np.isfinite(state_rounding_bound(centred, state).acceleration))
 
 
 def test_a_scale_of_zero_says_nothing_of_bluntness():
-    bound = state_bound(*random_chain(np.random.default_rng(0), [0, 1, 0]))
+    bound = state_rounding_bound(*random_chain(np.random.default_rng(0), [0, 1, 0]))
     scale = {"acceleration": np.array([0.0, 4.0, 1.0])}
     bound = replace(bound, acceleration=np.array([1.0, 4e-12, 3e-12]), scale=scale)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert bound.bluntness("acceleration") == 3e-12
+        assert bound.relative_bound("acceleration") == 3e-12
 
 
 def test_fifty_bodies_take_milliseconds():
@@ -215,7 +234,7 @@ def test_fifty_bodies_take_milliseconds():
     spent = []
     for _ in range(5):
         start = time.thread_time()
-        state_bound(model, state)
+        state_rounding_bound(model, state)
         spent.append(time.thread_time() - start)
     assert min(spent) < 0.2
 
@@ -225,7 +244,7 @@ class ByDefinition:
 
     def __init__(self, model, state, parts):
         self.model, self.state, n = model, state, model.n
-        A = rotation(state.p)
+        A = rotation_matrix(state.p)
         self.J = [A[k] @ model.inertia[k] @ A[k].T for k in range(n)]
         self.sp = [A[k] @ model.proximal[k] for k in range(n)]
         self.sd = [A[k] @ model.distal[k] if k + 1 < n else np.zeros(3) for k in range(n)]
@@ -233,7 +252,7 @@ class ByDefinition:
         self.load = [model.force[k] - model.drag_force[k] * state.v[k] for k in range(n)]
         self.torque = [A[k] @ model.moment[k] - model.drag_moment[k] * self.omega[k] for k in range(n)]
         self.gravity = float(np.linalg.norm(model.gravity))
-        pieces = whole(model) if parts is None else parts
+        pieces = undivided_bodies(model) if parts is None else parts
         self.arm = [max(np.linalg.norm(part.centre) for part in body) for body in pieces]
         self.light = [min(part.mass for part in body) for body in pieces]
         self.J_min = [min(np.linalg.eigvalsh(part.inertia)[0] for part in body) for body in pieces]
@@ -380,7 +399,7 @@ class ByDefinition:
         swing, turned = (sum(x[i] * acc[i] for i in D) for x in (D, below))
         carried = m * (a + swing + g)
         total += np.stack([swing + a, turned, [np.sum(carried[k:]) for k in range(n)]], 1)
-        tolerance = ROUNDINGS * EPS * total
+        tolerance = ROUNDING_FACTOR * EPS * total
 
         speed, spin = (sum(x[i] * spd[i] for i in D) for x in (D, below))
         lever = np.cumsum(np.add(sp, model.length)) + [sum(sd[:k]) for k in range(n)]
@@ -396,7 +415,9 @@ class ByDefinition:
             "joint_reaction": np.maximum(F, m * g),
         }
         vectors = dict(zip(VECTORS, tolerance.T, strict=True))
-        return Bound(**vectors, **{q: SUMMANDS * EPS * x for q, x in scalars.items()}, scale=scale | scalars)
+        return RoundingBound(
+            **vectors, **{q: SUM_ROUNDING_FACTOR * EPS * x for q, x in scalars.items()}, scale=scale | scalars
+        )
 
 
 def skew(s):
@@ -420,10 +441,12 @@ def test_the_bound_is_its_definition(rods, welded):
             moment=loads * model.moment,
             inertia=shrink * model.inertia,
         )
-        parts = halves(model) if welded else None
-        ours, theirs = ByDefinition(model, state, parts).bound(), state_bound(model, state, parts)
+        parts = split_bodies(model) if welded else None
+        ours, theirs = ByDefinition(model, state, parts).bound(), state_rounding_bound(model, state, parts)
         for quantity in ours.scale:
             here, there = theirs.tolerance(quantity), ours.tolerance(quantity)
             np.testing.assert_allclose(here, there, rtol=1e-7, err_msg=quantity)
             np.testing.assert_allclose(theirs.scale[quantity], ours.scale[quantity], rtol=1e-7)
-            assert theirs.bluntness(quantity) == pytest.approx(ours.bluntness(quantity), rel=1e-7, abs=0)
+            assert theirs.relative_bound(quantity) == pytest.approx(
+                ours.relative_bound(quantity), rel=1e-7, abs=0
+            )

@@ -14,7 +14,7 @@ import pytest
 
 pytest.importorskip("distributed")
 
-from plumbline.execution.runner import Plan, execute
+from plumbline.execution.runner import Plan, run_plan
 from plumbline.processes.workers import Limits, Task
 from plumbline.scenario import loader
 
@@ -78,12 +78,12 @@ def cluster(folder, workers):
 
 
 def said(plan, progress=lambda *_: None):
-    return [replace(row, wall_time=0.0) for row in execute(plan, progress).rows]
+    return [replace(row, wall_time=0.0) for row in run_plan(plan, progress).rows]
 
 
 def plan(**more):
-    chosen = loader.load_many(["rest", "conical", "double-tumbling-balls"])
-    return Plan(chosen, ["mujoco", "pinocchio"], "state", states=5, **more)
+    chosen = loader.load_scenarios(["rest", "conical", "double-tumbling-balls"])
+    return Plan(chosen, ["mujoco", "pinocchio"], "state", random_state_count=5, **more)
 
 
 @pytest.mark.timeout(300)
@@ -109,17 +109,17 @@ def losses_cost_one_task(address):
     import ctypes
     import operator
 
-    from plumbline.processes.dask_cluster import Cluster
+    from plumbline.processes.dask_cluster import DaskCluster
 
     limits = Limits(5, 4)
-    with Cluster(address, limits) as crew:
+    with DaskCluster(address, limits) as crew:
         calls = {"a": (operator.mul, 2, 3), "crash": (ctypes.string_at, 0), "hang": (time.sleep, 600),
                  "b": (operator.mul, 3, 3)}  # fmt: skip
         tasks = [Task(key, call, tuple(arguments), limits) for key, (call, *arguments) in calls.items()]
         found = {o.key: o for o in crew.run(tasks)}
     assert (found["a"].value, found["b"].value) == (6, 9)
-    assert found["crash"].lost == "crashed: the worker died of SIGSEGV"
-    assert "hung" in found["hang"].lost
+    assert found["crash"].failure == "crashed: the worker died of SIGSEGV"
+    assert "hung" in found["hang"].failure
 
 
 def test_no_scheduler_is_told():

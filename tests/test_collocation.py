@@ -10,38 +10,42 @@ import numpy as np
 import pytest
 from numpy.polynomial.legendre import legval
 
-from adapters.reference_engine import chain
+from adapters.reference_engine import notes_chain
 from plumbline.model.datatypes import Model, State
-from plumbline.model.kinematics import rate
+from plumbline.model.kinematics import quaternion_rate
 from reference_impl import collocation
 from reference_impl import integrate as raw
 from reference_impl.chain import Array
-from reference_impl.collocation import BatchRun, gauss, integrate
-from reference_impl.structured import Forest, lay
+from reference_impl.collocation import BatchIntegrationResult, gauss_tables, integrate_collocation
+from reference_impl.structured import StructuredSystem, component_first
 from tests.random_chains import random_chain, rescaled
 
 TIMES = np.linspace(0.0, 1.0, 11)
 
 
 def start(state: State) -> tuple[Array, Array, Array, Array]:
-    return state.r, state.p, state.v, rate(state.p, state.omega)
+    return state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
 
 
-def run(model: Model, state: State, rtol: float, times: Array = TIMES, **options: object) -> BatchRun:
-    return integrate([chain(model)], *start(state), times, rtol, **options)  # type: ignore[arg-type]
+def run(
+    model: Model, state: State, rtol: float, times: Array = TIMES, **options: object
+) -> BatchIntegrationResult:
+    return integrate_collocation([notes_chain(model)], *start(state), times, rtol, **options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("S", [4, 12, 20])
 def test_tables_integrate_polynomials_exactly(S: int) -> None:
     """∫₀^c of x^k for k < S by A, ∫₀¹ for k < 2 S by b, and both integrals of the dense output."""
-    table = gauss(S)
+    table = gauss_tables(S)
     for k in range(S):
         values = table.c**k
         assert np.max(np.abs(table.A @ values - table.c ** (k + 1) / (k + 1))) < 4e-15
         tau = np.linspace(0, 1, 7)
-        once, twice = table.integrals(tau)
-        assert np.max(np.abs(once @ table.modes @ values - tau ** (k + 1) / (k + 1))) < 4e-15
-        assert np.max(np.abs(twice @ table.modes @ values - tau ** (k + 2) / (k + 1) / (k + 2))) < 4e-15
+        once, twice = table.mode_integrals(tau)
+        assert np.max(np.abs(once @ table.node_to_mode @ values - tau ** (k + 1) / (k + 1))) < 4e-15
+        assert (
+            np.max(np.abs(twice @ table.node_to_mode @ values - tau ** (k + 2) / (k + 1) / (k + 2))) < 4e-15
+        )
     for k in range(2 * S):
         assert abs(table.b @ table.c**k - 1 / (k + 1)) < 4e-15
 
@@ -50,7 +54,7 @@ def test_tables_integrate_polynomials_exactly(S: int) -> None:
 def test_two_methods_share_their_digits(rods: list[bool]) -> None:
     """Direct form with DOP853, structured form with collocation: nothing in common but the notes."""
     model, state = random_chain(np.random.default_rng(31), rods, loads=True, drag=True)
-    dop = raw.integrate(chain(model), *start(state), TIMES, 1e-13)
+    dop = raw.integrate_dop853(notes_chain(model), *start(state), TIMES, 1e-13)
     ours = run(model, state, 1e-13)
     assert np.max(np.abs(ours.r - dop.r)) < (2e-11 if any(rods) else 1e-12)
     assert np.max(np.abs(ours.p - dop.p)) < (2e-11 if any(rods) else 1e-12)
@@ -98,7 +102,7 @@ def test_a_batch_is_every_chain_alone() -> None:
     rng = np.random.default_rng(35)
     drawn = [random_chain(rng, rods) for rods in ([False], [True, False], [False, False, False], [True])]
     packed = [np.concatenate(parts) for parts in zip(*(start(state) for _, state in drawn), strict=True)]
-    batch = integrate([chain(model) for model, _ in drawn], *packed, TIMES, 1e-12)
+    batch = integrate_collocation([notes_chain(model) for model, _ in drawn], *packed, TIMES, 1e-12)
     at = 0
     for model, state in drawn:
         alone = run(model, state, 1e-12)
@@ -130,13 +134,13 @@ def test_a_long_chain_runs() -> None:
     """300 bodies; the work per body does not grow."""
     model, state = random_chain(np.random.default_rng(38), [False] * 300, rate=0.1)
     moved = run(model, state, 1e-6, np.array([0.0, 0.02]))
-    gap = Forest([chain(model)]).gaps(
+    gap = StructuredSystem([notes_chain(model)]).joint_gaps(
         np.vstack([moved.r[-1].T, moved.p[-1].T]), np.vstack([moved.v[-1].T, moved.pdot[-1].T])
     )[0]
     assert np.max(np.abs(gap)) < 1e-6
 
 
-@pytest.mark.parametrize("nodes", [4, collocation.NODES])
+@pytest.mark.parametrize("nodes", [4, collocation.DEFAULT_NODES])
 @pytest.mark.parametrize("dense", [True, False])
 @pytest.mark.parametrize("rods", [[False, False], [True, False]], ids=str)
 def test_other_units_take_the_same_steps(rods: list[bool], dense: bool, nodes: int) -> None:
@@ -168,7 +172,7 @@ class Watched:
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.tried: list[tuple[float, int, bool, bool]] = []  # h, sweeps, made, limited by the sweeps
         self.asked = 0
-        step, acceleration = collocation._Stepper.step, Forest.acceleration
+        step, acceleration = collocation._Stepper.try_step, StructuredSystem.acceleration
 
         def noted(stepper: collocation._Stepper, h: float) -> tuple[bool, bool]:
             before = stepper.sweeps
@@ -176,19 +180,19 @@ class Watched:
             self.tried.append((h, stepper.sweeps - before, *made))
             return made
 
-        def counted(forest: Forest, *args: object) -> Array:
+        def counted(forest: StructuredSystem, *args: object) -> Array:
             self.asked += 1
             return acceleration(forest, *args)  # type: ignore[arg-type]
 
         monkeypatch.setattr(collocation._Stepper, "step", noted)
-        monkeypatch.setattr(Forest, "acceleration", counted)
+        monkeypatch.setattr(StructuredSystem, "acceleration", counted)
 
 
 def test_a_step_begins_with_the_last_one_s_polynomial_up_to_its_smallest_term(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     model, state = random_chain(np.random.default_rng(40), [False, True], rate=4.0)
-    guess, cuts = collocation._Stepper._guess, []
+    guess, cuts = collocation._Stepper._extrapolated_acceleration, []
 
     def checked(stepper: collocation._Stepper, ratio: float) -> Array:
         ahead = 1 + 2 * ratio * stepper.table.c  # −1 … 1 is the last step
@@ -217,8 +221,8 @@ def test_a_run_says_what_it_did(rods: list[bool], rtol: float, monkeypatch: pyte
     watched = Watched(monkeypatch)
     done = run(model, state, rtol, np.array([0.0, 0.7, 2.1]))
     made = np.array([h for h, _, ok, _ in watched.tried if ok])
-    assert (done.steps, done.rejected) == (len(made), len(watched.tried) - len(made))
-    assert done.hindered == sum(ok and slow for _, _, ok, slow in watched.tried)
+    assert (done.steps, done.rejected_steps) == (len(made), len(watched.tried) - len(made))
+    assert done.stiff_steps == sum(ok and slow for _, _, ok, slow in watched.tried)
     assert done.evaluations == sum(sweeps for _, sweeps, _, _ in watched.tried)
     assert watched.asked == done.evaluations + 2  # for the sizes, and the first guess
     assert abs(np.sum(made) - 2.1) < 1e-13
@@ -233,8 +237,8 @@ def test_steps_that_take_many_sweeps_are_followed_by_shorter_ones(monkeypatch: p
     done = run(replace(model, drag_force=model.mass * 3e3), state, 1e-6, TIMES[:2])
     for (h, sweeps, made, _), (after, *_) in zip(watched.tried[:-2], watched.tried[1:-1], strict=True):
         assert not made or sweeps <= 8 or after < 0.95 * h, (h, sweeps, after)
-    assert done.rejected < 0.1 * done.steps
-    assert max(sweeps for _, sweeps, made, _ in watched.tried if made) <= collocation.SWEEPS
+    assert done.rejected_steps < 0.1 * done.steps
+    assert max(sweeps for _, sweeps, made, _ in watched.tried if made) <= collocation.MAX_SWEEPS
 
 
 @pytest.mark.parametrize("dense", [True, False])
@@ -260,9 +264,9 @@ def test_a_step_that_vanishes_is_an_error() -> None:
 @pytest.mark.parametrize("ratio", [0.3, 1.0, 1.6])
 def test_the_last_steps_polynomial_goes_on_in_the_next(ratio: float) -> None:
     """Any polynomial of degree < S, at the nodes of a step ``ratio`` times as long."""
-    table = gauss(8)
+    table = gauss_tables(8)
     for k in range(8):
-        found = table.ahead(ratio) @ table.modes @ table.c**k
+        found = table.extrapolation_matrix(ratio) @ table.node_to_mode @ table.c**k
         # at 1 + 2 · 1.6, outside of its interval, Legendre's polynomial of degree 7 is 6e5: eight terms of ε
         np.testing.assert_allclose(found, (1 + ratio * table.c) ** k, rtol=8 * 6e5 * 2.0**-52)
 
@@ -274,11 +278,18 @@ def test_a_batch_has_every_chains_own_sizes() -> None:
 
     def sized(models: list[tuple[Model, State]]) -> collocation._Stepper:
         r, p, v, pdot = (np.concatenate(parts) for parts in zip(*(start(s) for _, s in models), strict=True))
-        forest = Forest([chain(model) for model, _ in models])
+        forest = StructuredSystem([notes_chain(model) for model, _ in models])
         stepper = collocation._Stepper(
-            forest, lay(r, p), lay(v, pdot), 1e-6, 1e-7, gauss(4), True, baumgarte=0.0
+            forest,
+            component_first(r, p),
+            component_first(v, pdot),
+            1e-6,
+            1e-7,
+            gauss_tables(4),
+            True,
+            baumgarte=0.0,
         )
-        stepper.sizes(r, p, v, pdot)
+        stepper.initialise_scales(r, p, v, pdot)
         return stepper
 
     together, alone = sized(drawn), [sized([one]) for one in drawn]
@@ -295,11 +306,13 @@ def test_joints_that_are_open_close_as_they_are_told(rods: list[bool]) -> None:
     """C̈ + 2 a Ċ + a² C = 0 has (C + (Ċ + a C) t) e^{−a t}; a projection leaves nothing at all."""
     model, state = random_chain(np.random.default_rng(44), rods)
     opened = replace(state, r=state.r + np.array([[0.01, 0, -0.02], [0.03, 0.01, 0]]))
-    forest, times, a = Forest([chain(model)]), np.array([0.0, 0.3, 2.0]), 3.0
+    forest, times, a = StructuredSystem([notes_chain(model)]), np.array([0.0, 0.3, 2.0]), 3.0
 
-    def left(found: BatchRun) -> Array:
+    def left(found: BatchIntegrationResult) -> Array:
         samples = zip(found.r, found.p, found.v, found.pdot, strict=True)
-        return np.array([forest.constraints(lay(r, p), lay(v, pdot)) for r, p, v, pdot in samples])
+        return np.array(
+            [forest.constraints(component_first(r, p), component_first(v, pdot)) for r, p, v, pdot in samples]
+        )
 
     C = left(run(model, opened, 1e-9, times, baumgarte=a))
     (C_0, rate_0), t = C[0], times[:, None, None]
@@ -322,14 +335,14 @@ def test_sweeps_end_at_what_rounding_leaves() -> None:
     """No sweep tolerance at all: the sweeps still end, and the motion is as good as double precision."""
     model, state = random_chain(np.random.default_rng(45), [False, True], loads=True, drag=True)
     usual, quiet = run(model, state, 1e-12), run(model, state, 1e-12, sweep_tolerance=0.0)
-    assert quiet.rejected <= 1
+    assert quiet.rejected_steps <= 1
     assert np.max(np.abs(quiet.r - usual.r)) < 1e-10
 
 
 def test_a_step_is_made_where_its_error_is_within_the_tolerance(monkeypatch: pytest.MonkeyPatch) -> None:
     """Longer and longer first steps: good ones, then too long for the tolerance, then for the sweeps."""
     model, state = random_chain(np.random.default_rng(46), [False])
-    tails, tail = [], collocation._Stepper._tail
+    tails, tail = [], collocation._Stepper._error_over_tolerance
 
     def noted(stepper: collocation._Stepper, a: Array, h: float) -> float:
         tails.append(tail(stepper, a, h))
@@ -337,14 +350,21 @@ def test_a_step_is_made_where_its_error_is_within_the_tolerance(monkeypatch: pyt
 
     monkeypatch.setattr(collocation._Stepper, "_tail", noted)
     r, p, v, pdot = start(state)
-    forest, found = Forest([chain(model)]), []
+    forest, found = StructuredSystem([notes_chain(model)]), []
     for h in np.geomspace(0.01, 1.0, 60):
         stepper = collocation._Stepper(
-            forest, lay(r, p), lay(v, pdot), 1e-6, 1e-7, gauss(8), True, baumgarte=0.0
+            forest,
+            component_first(r, p),
+            component_first(v, pdot),
+            1e-6,
+            1e-7,
+            gauss_tables(8),
+            True,
+            baumgarte=0.0,
         )
-        stepper.sizes(r, p, v, pdot)
+        stepper.initialise_scales(r, p, v, pdot)
         tails.clear()
-        made, slow = stepper.step(h)
+        made, slow = stepper.try_step(h)
         assert made == (bool(tails) and tails[0] <= 1)
         assert made or slow == (not tails)
         assert made or 0.3 * h <= stepper.h < h
@@ -356,11 +376,11 @@ def test_the_tolerance_sets_the_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of few nodes the next step's error is foreseen; of many, what takes the usual sweeps is kept."""
     model, state = random_chain(np.random.default_rng(47), [False, False])
     done = run(model, state, 1e-6, np.array([0.0, 1.0]), nodes=4)
-    assert done.rejected < 0.1 * done.steps and done.hindered == 0
+    assert done.rejected_steps < 0.1 * done.steps and done.stiff_steps == 0
     watched = Watched(monkeypatch)
     run(model, state, 1e-12, np.array([0.0, 2.0]))
     for (h, sweeps, made, _), (after, *_) in zip(watched.tried[:-2], watched.tried[1:-1], strict=True):
-        assert not made or sweeps > collocation.USUAL or after > 0.95 * h
+        assert not made or sweeps > collocation.USUAL_SWEEPS or after > 0.95 * h
 
 
 def test_no_crumb_before_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -377,13 +397,13 @@ def test_a_thousand_steps_add_up_to_the_last_digit() -> None:
     """Constant parts: the compensated sums are the exact ones but for one rounding."""
     model, state = random_chain(np.random.default_rng(49), [False])
     r, p, v, pdot = start(state)
-    forest, table = Forest([chain(model)]), gauss(4)
+    forest, table = StructuredSystem([notes_chain(model)]), gauss_tables(4)
     for push in (0.0, 0.3):
         stepper = collocation._Stepper(
-            forest, lay(r, p), lay(v, pdot), 1e-6, 1e-7, table, True, baumgarte=0.0
+            forest, component_first(r, p), component_first(v, pdot), 1e-6, 1e-7, table, True, baumgarte=0.0
         )
         first, a, h = (stepper.q, stepper.v), np.full((7, 4, 1), push), 0.1
-        stepper.new_modes = table.modes @ a
+        stepper.new_modes = table.node_to_mode @ a
         stepper._advance(a, h)
         part = h * first[1] if push == 0 else h * np.einsum("j,ijm->im", table.b, a)
         for _ in range(999):

@@ -7,7 +7,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plumbline.judging.convergence import approached, ladder, largest, observed_order, romberg, tightest
+from plumbline.judging.convergence import (
+    extrapolated_order,
+    max_norm,
+    observed_order,
+    refinement_resolutions,
+    romberg,
+    tightest_tolerance_limit,
+)
 from plumbline.model.datatypes import Integrator
 
 TIMES = np.linspace(0, 2, 17)
@@ -28,7 +35,7 @@ def rungs(order: int, powers: tuple[int, ...], count: int = 6, size: float = 1.0
 def test_the_order_is_seen_and_the_limit_is_reached(order, powers):
     limit, ys = rungs(order, powers)
     seen = observed_order(ys, 1e-16, order)
-    assert seen.asymptotic
+    assert seen.is_asymptotic
     assert seen.value == pytest.approx(order, abs=0.1)
     found = romberg(ys, powers)
     error = np.max(np.linalg.norm(found.y - limit, axis=-1))
@@ -39,7 +46,7 @@ def test_the_order_is_seen_and_the_limit_is_reached(order, powers):
 def test_order_two_under_an_order_four_name_is_seen_as_two():
     _, ys = rungs(2, (2, 3, 4))
     seen = observed_order(ys, 1e-16, 4)
-    assert seen.asymptotic
+    assert seen.is_asymptotic
     assert seen.value == pytest.approx(2, abs=0.1)
 
 
@@ -58,7 +65,7 @@ def test_order_two_under_an_order_four_name_is_seen_as_two():
     ],
 )
 def test_what_three_orders_lead_to(last, shown):
-    found = approached(last, 4)
+    found = extrapolated_order(last, 4)
     assert found == (None if shown is None else pytest.approx(shown))
 
 
@@ -68,7 +75,7 @@ def test_an_order_on_its_way_shows_nothing():
     creeping = [
         limit + (y - limit) / h * h ** (1.5 + 0.3 * k) for k, (y, h) in enumerate(zip(ys, hs, strict=True))
     ]
-    assert not observed_order(creeping, 1e-16, 4).asymptotic
+    assert not observed_order(creeping, 1e-16, 4).is_asymptotic
 
 
 def test_wrong_powers_are_paid_for_in_uncertainty():
@@ -81,7 +88,7 @@ def test_rounding_is_not_an_order():
     limit, _ = rungs(4, (4,))
     noise = np.random.default_rng(1).normal(size=(6, *limit.shape)) * 1e-16
     seen = observed_order([limit + n for n in noise], 1e-15, 4)
-    assert seen.at_floor
+    assert seen.is_at_rounding_floor
     assert seen.value is None
 
 
@@ -102,8 +109,10 @@ def test_nothing_finite_is_said():
 
 @given(st.integers(1, 60), st.sampled_from([1, 2, 4]), st.floats(0.25, 100))
 def test_ladders_halve_and_keep_four_rungs(bodies, order, duration):
-    steps = ladder(Integrator("x", "step", order, (order,)), bodies, duration)
-    assert steps == ladder(Integrator("x", "step", order, (order,)), bodies, duration, finer=0)
+    steps = refinement_resolutions(Integrator("x", "step", order, (order,)), bodies, duration)
+    assert steps == refinement_resolutions(
+        Integrator("x", "step", order, (order,)), bodies, duration, extra_refinements=0
+    )
     assert len(steps) >= 4
     assert all(a == 2 * b for a, b in itertools.pairwise(steps))
 
@@ -125,22 +134,24 @@ def test_ladders_halve_and_keep_four_rungs(bodies, order, duration):
     ],
 )
 def test_a_ladder_is_as_long_as_is_affordable(order, bodies, duration, finer, coarse, fine):
-    steps = ladder(Integrator("x", "step", order, (order,)), bodies, duration, finer)
+    steps = refinement_resolutions(Integrator("x", "step", order, (order,)), bodies, duration, finer)
     assert steps == [2.0**-k for k in range(coarse, fine + 1)]
 
 
 def test_an_adaptive_method_climbs_by_tolerances():
-    method = Integrator("x", "tolerance", 8, tightest=1e-13)
-    assert ladder(method, 50, 100.0) == pytest.approx([1e-7, 1e-9, 1e-11, 1e-13], rel=1e-12, abs=0)
+    method = Integrator("x", "tolerance", 8, min_rtol=1e-13)
+    assert refinement_resolutions(method, 50, 100.0) == pytest.approx(
+        [1e-7, 1e-9, 1e-11, 1e-13], rel=1e-12, abs=0
+    )
 
 
 def test_the_largest_length_is_over_everything_but_the_last_axis():
     y = np.zeros((2, 3, 2))
     y[0, 1], y[1, 2] = [4, -2], [3, -4]
-    assert largest(y) == 5.0
-    assert largest(np.zeros((0, 3, 2))) == 0.0
+    assert max_norm(y) == 5.0
+    assert max_norm(np.zeros((0, 3, 2))) == 0.0
     y[0, 0, 0] = np.nan
-    assert largest(y) == np.inf
+    assert max_norm(y) == np.inf
 
 
 def geometric(*differences):
@@ -152,7 +163,7 @@ def test_orders_are_logarithms_of_ratios_of_differences():
     seen = observed_order(geometric(64.0, 16.0, 4.0, 0.5), 1e-9, 2)
     assert seen.orders == (2.0, 2.0, 3.0)
     assert seen.differences == (64.0, 16.0, 4.0, 0.5)
-    assert (seen.value, seen.asymptotic, seen.at_floor) == (2.0, True, False)
+    assert (seen.value, seen.is_asymptotic, seen.is_at_rounding_floor) == (2.0, True, False)
 
 
 @pytest.mark.parametrize(
@@ -163,12 +174,12 @@ def test_a_difference_counts_above_32_floors(floor, used):
     assert np.isfinite(seen.orders).tolist() == [k < used for k in range(3)]
     assert seen.value == ([2.0, 2.0, 3.0][used - 1] if used else None)
     assert seen.differences == (64.0, 16.0, 4.0, 0.5)
-    assert not seen.asymptotic and not seen.at_floor
+    assert not seen.is_asymptotic and not seen.is_at_rounding_floor
 
 
 @pytest.mark.parametrize(("floor", "at_floor"), [(2.0, True), (1.99, False)])
 def test_all_differences_within_32_floors_are_rounding(floor, at_floor):
-    assert observed_order(geometric(64.0, 16.0, 4.0), floor, 2).at_floor is at_floor
+    assert observed_order(geometric(64.0, 16.0, 4.0), floor, 2).is_at_rounding_floor is at_floor
 
 
 @pytest.mark.parametrize(
@@ -184,7 +195,7 @@ def test_all_differences_within_32_floors_are_rounding(floor, at_floor):
 def test_two_consecutive_orders_near_the_declared_one_show_it(orders, declared, shown):
     sizes = 1e3 * 2.0 ** -np.cumsum([0.0, *orders])
     seen = observed_order(geometric(*sizes), 1e-12, declared)
-    assert seen.asymptotic is (shown is not None)
+    assert seen.is_asymptotic is (shown is not None)
     assert shown is None or seen.value == pytest.approx(shown, abs=1e-9)
 
 
@@ -193,7 +204,7 @@ def test_the_three_finest_orders_above_rounding_lead_somewhere(more):
     """4.55, 4.3, 4.15 are on their way to 4; what is finer than rounding says nothing."""
     sizes = 1e3 * 2.0 ** -np.cumsum([0.0, 4.55, 4.3, 4.15, *more])
     seen = observed_order(geometric(*sizes), sizes[3] / 32 * 0.99, 4)
-    assert seen.asymptotic and seen.value == pytest.approx(4.0, abs=1e-9)
+    assert seen.is_asymptotic and seen.value == pytest.approx(4.0, abs=1e-9)
 
 
 def test_runs_that_agree_have_no_order():
@@ -205,21 +216,25 @@ def test_romberg_is_richardson_by_hand():
     limit, hs = 5.0, (1.0, 0.5, 0.25, 0.125)
     ys = [np.full((1, 1, 1), limit + h + h**2) for h in hs]
     found = romberg(ys, (1, 2))
-    assert found.column == 2 and found.y == pytest.approx(limit, abs=1e-14)
+    assert found.eliminated_powers == 2 and found.y == pytest.approx(limit, abs=1e-14)
     first = romberg(ys, (1,))
-    assert first.column == 1 and first.y == pytest.approx(limit - 0.25 * 0.125, abs=1e-14)
+    assert first.eliminated_powers == 1 and first.y == pytest.approx(limit - 0.25 * 0.125, abs=1e-14)
     # The row before: 5 − 0.5 · 0.25; the column before: 5 + 1/8 + 1/64.
     assert first.uncertainty == pytest.approx([0.125 + 1 / 64 + 0.25 * 0.125], abs=1e-14)
     bare = romberg(ys[:2], (1,))  # nothing to eliminate with: twice the last difference
-    assert bare.column == 0 and bare.y == ys[1] and bare.uncertainty == pytest.approx([2 * 1.25])
+    assert bare.eliminated_powers == 0 and bare.y == ys[1] and bare.uncertainty == pytest.approx([2 * 1.25])
     bare = romberg(ys, ())
-    assert bare.column == 0 and bare.y == ys[3] and bare.uncertainty == pytest.approx([2 * (0.125 + 3 / 64)])
+    assert (
+        bare.eliminated_powers == 0
+        and bare.y == ys[3]
+        and bare.uncertainty == pytest.approx([2 * (0.125 + 3 / 64)])
+    )
 
 
 def test_an_uncertainty_never_shrinks_with_time():
     ys = [np.array([0.0, 4.0, 1.0])[:, None, None] * h for h in (1.0, 0.5)]
-    assert tightest(ys).uncertainty.tolist() == [0.0, 2.0, 2.0]
-    assert tightest(ys).y is ys[-1] and tightest(ys).column == 0
+    assert tightest_tolerance_limit(ys).uncertainty.tolist() == [0.0, 2.0, 2.0]
+    assert tightest_tolerance_limit(ys).y is ys[-1] and tightest_tolerance_limit(ys).eliminated_powers == 0
 
 
 def test_a_run_that_is_not_finite_in_between_leaves_the_finer_ones_alone():

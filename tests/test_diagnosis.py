@@ -8,23 +8,23 @@ from functools import cache
 import numpy as np
 import pytest
 
-from plumbline.diagnosis.defect_model import answer, case
+from plumbline.diagnosis.defect_model import evaluate_case, make_defect_case
 from plumbline.diagnosis.diagnose import (
     QUANTITIES,
-    Difference,
-    Fit,
-    derivatives,
+    FittedCause,
+    ObservedDifference,
+    derivatives_by_amount,
     diagnose,
-    explains,
-    explanations,
-    fits,
-    fitted,
-    misread,
-    observe,
-    worst,
+    diagnose_quantity,
+    find_explanations,
+    fit_cause,
+    fit_causes,
+    is_explanation,
+    max_error_ratio,
+    observe_difference,
 )
-from plumbline.diagnosis.hypotheses import causes
-from plumbline.model.kinematics import lift
+from plumbline.diagnosis.hypotheses import all_causes
+from plumbline.model.kinematics import state_from_minimal
 from plumbline.model.sampling import random_states
 from plumbline.truth.ground_truth import state_truth
 from tests import pendulums
@@ -51,44 +51,47 @@ def changed(quantity, to, joints="bb", count=10):
 
 def test_distances_are_in_bounds():
     vectors = np.array([[[3.0, 4, 0], [0, 0, 1]], [[0, 0, 0], [6, 0, 8]]])
-    assert worst(vectors, np.array([[1.0, 1.0], [1.0, 4.0]])) == 5.0
-    assert worst(vectors[1:], np.array([[1.0, 4.0]])) == 2.5
-    assert worst(np.array([-3.0, 2.0]), np.array([1.0, 1.0])) == 3.0
-    assert worst(np.array([0.0]), np.array([0.0])) == 0.0
-    assert worst(np.array([1.0]), np.array([0.0])) > 1e300
+    assert max_error_ratio(vectors, np.array([[1.0, 1.0], [1.0, 4.0]])) == 5.0
+    assert max_error_ratio(vectors[1:], np.array([[1.0, 4.0]])) == 2.5
+    assert max_error_ratio(np.array([-3.0, 2.0]), np.array([1.0, 1.0])) == 3.0
+    assert max_error_ratio(np.array([0.0]), np.array([0.0])) == 0.0
+    assert max_error_ratio(np.array([1.0]), np.array([0.0])) > 1e300
 
 
 def test_a_difference_is_measured_per_quantity_and_as_one_vector():
     one, two = np.array([[[2.0, 0, 0]]]), np.array([6.0])
     said = {"acceleration": one, "kinetic_energy": two}
-    seen = Difference(
+    seen = ObservedDifference(
         known()[0], said, said, {"acceleration": np.array([[0.5]]), "kinetic_energy": np.array([3.0])}, {}
     )
     still = {q: 0 * x for q, x in said.items()}
-    assert seen.off(still) == {"acceleration": 4.0, "kinetic_energy": 2.0}
+    assert seen.error_ratios(still) == {"acceleration": 4.0, "kinetic_energy": 2.0}
     wide = {"acceleration": np.array([[4.0]]), "kinetic_energy": np.array([6.0])}
-    assert seen.off(still, wide) == {"acceleration": 0.5, "kinetic_energy": 1.0}
-    assert seen.weighted(said).tolist() == [4.0, 0, 0, 2.0]
+    assert seen.error_ratios(still, wide) == {"acceleration": 0.5, "kinetic_energy": 1.0}
+    assert seen.weighted_vector(said).tolist() == [4.0, 0, 0, 2.0]
     energy, allowed = {"kinetic_energy": np.array([6.0, 8.0])}, {"kinetic_energy": np.array([3.0, 2.0])}
-    assert Difference(known()[0], energy, energy, allowed, {}).weighted(energy).tolist() == [2.0, 4.0]
+    assert ObservedDifference(known()[0], energy, energy, allowed, {}).weighted_vector(energy).tolist() == [
+        2.0,
+        4.0,
+    ]
 
 
 @pytest.mark.parametrize(("at", "first"), [(0, 0), (3, 0), (5, 1), (9, 2)])
 def test_eight_states_around_the_worst_one_are_looked_at(at, first):
     model, said, truth = changed("acceleration", lambda i, a, b: a + 100 * b[:, None] * (i == at))
-    seen = observe(model, said, truth)
+    seen = observe_difference(model, said, truth)
     assert len(seen.case.p) == 8
     for k in range(8):
         assert np.array_equal(seen.case.p[k], truth.states[first + k].p)
-        assert np.array_equal(seen.said["acceleration"][k], said[first + k].acceleration)
-        assert np.array_equal(seen.right["acceleration"][k], truth.quantities[first + k].acceleration)
+        assert np.array_equal(seen.reported["acceleration"][k], said[first + k].acceleration)
+        assert np.array_equal(seen.expected["acceleration"][k], truth.quantities[first + k].acceleration)
         assert np.array_equal(seen.bounds["joint_reaction"][k], truth.bounds[first + k].joint_reaction)
         if first + k:
             before = truth.quantities[first + k - 1]
-            assert np.array_equal(seen.before["acceleration"][k], before.acceleration)
-    assert set(seen.said) == set(QUANTITIES)
+            assert np.array_equal(seen.previous_expected["acceleration"][k], before.acceleration)
+    assert set(seen.reported) == set(QUANTITIES)
     less = [replace(said[0], joint_reaction=None), *said[1:]]
-    assert "joint_reaction" not in observe(model, less, truth).said
+    assert "joint_reaction" not in observe_difference(model, less, truth).reported
 
 
 @pytest.mark.parametrize(("bodies", "states"), [(6, 8), (7, 4), (12, 4), (13, 2)])
@@ -96,8 +99,8 @@ def test_fewer_states_of_long_chains(bodies, states):
     model = pendulums.model("b" * bodies)
     at = random_states(model, 9, seed=1)
     truth = state_truth(model, at)
-    assert len(observe(model, truth.quantities, truth).case.p) == states
-    assert len(observe(model, truth.quantities[:1], truth_of(truth, 1)).case.p) == 1
+    assert len(observe_difference(model, truth.quantities, truth).case.p) == states
+    assert len(observe_difference(model, truth.quantities[:1], truth_of(truth, 1)).case.p) == 1
 
 
 def truth_of(truth, count):
@@ -112,11 +115,15 @@ def test_slopes_are_those_of_the_answers(size):
     model = pendulums.model("bb")
     model = replace(model, mass=size * model.mass, inertia=size * model.inertia)
     truth = state_truth(model, random_states(model, 4, seed=4))
-    seen = observe(model, truth.quantities, truth)
-    for cause in [c for c in causes(seen.case) if c.scale is not None][::5]:
-        (slope,) = derivatives(seen, [(cause, cause.usual)])
-        ends = [answer(cause.alter(seen.case, cause.usual + s * 1e-4 * cause.scale)) for s in (1, -1)]
-        by_hand = seen.weighted({q: (ends[0][q] - ends[1][q]) / (2e-4 * cause.scale) for q in seen.said})
+    seen = observe_difference(model, truth.quantities, truth)
+    for cause in [c for c in all_causes(seen.case) if c.scale is not None][::5]:
+        (slope,) = derivatives_by_amount(seen, [(cause, cause.nominal)])
+        ends = [
+            evaluate_case(cause.alter(seen.case, cause.nominal + s * 1e-4 * cause.scale)) for s in (1, -1)
+        ]
+        by_hand = seen.weighted_vector(
+            {q: (ends[0][q] - ends[1][q]) / (2e-4 * cause.scale) for q in seen.reported}
+        )
         np.testing.assert_allclose(slope, by_hand, rtol=1e-5, atol=1e-5 * np.max(np.abs(by_hand)))
 
 
@@ -133,29 +140,31 @@ def test_slopes_are_those_of_the_answers(size):
 )
 def test_a_misread_quantity_is_named(quantity, to, words):
     model, said, truth = changed(quantity, to)
-    assert misread(observe(model, said, truth), quantity) == words.format(quantity.replace("_", " "))
+    assert diagnose_quantity(observe_difference(model, said, truth), quantity) == words.format(
+        quantity.replace("_", " ")
+    )
 
 
 def test_a_stale_field_and_an_origin_elsewhere_are_named():
     model, truth = known()
     stale = [truth.quantities[0], *truth.quantities[:-1]]  # the first has none before it
     said = [replace(a, joint_reaction=b.joint_reaction) for a, b in zip(truth.quantities, stale, strict=True)]
-    text = misread(observe(model, said, truth), "joint_reaction")
+    text = diagnose_quantity(observe_difference(model, said, truth), "joint_reaction")
     assert text == "joint reaction of the state before were given (a stale field)"
     model, said, truth = changed("potential_energy", lambda i, x, b: x + 0.75)
-    seen = observe(model, said, truth)
-    assert misread(seen, "potential_energy") == (
+    seen = observe_difference(model, said, truth)
+    assert diagnose_quantity(seen, "potential_energy") == (
         "origin of the potential energy were elsewhere: 0.75 J more at every state"
     )
-    assert misread(seen, "kinetic_energy") != misread(seen, "potential_energy")
+    assert diagnose_quantity(seen, "kinetic_energy") != diagnose_quantity(seen, "potential_energy")
 
 
 def test_what_is_in_no_pattern_is_not_misread():
     rng = np.random.default_rng(1)
     model, said, truth = changed("acceleration", lambda i, x, b: x * (1 + 1e-6 * rng.normal(size=x.shape)))
-    seen = observe(model, said, truth)
-    assert misread(seen, "acceleration") is None
-    assert explanations(seen) == []
+    seen = observe_difference(model, said, truth)
+    assert diagnose_quantity(seen, "acceleration") is None
+    assert find_explanations(seen) == []
     text = diagnose(model, said, truth)
     assert text == "no single change of a parameter, term or convention explains the acceleration"
 
@@ -174,24 +183,24 @@ def test_of_two_differences_one_may_have_a_name():
 
 def the_cause(seen, words):
     """The one with these words for an amount of 2."""
-    (found,) = (cause for cause in causes(seen.case) if cause.words(2.0, 0.0) == words)
+    (found,) = (cause for cause in all_causes(seen.case) if cause.describe(2.0, 0.0) == words)
     return found
 
 
 def test_a_pendulum_that_cannot_be_explains_nothing():
     """Bodies without any inertia have no angular acceleration to predict."""
     model, said, truth = changed("acceleration", lambda i, x, b: 2 * x)
-    seen = observe(model, said, truth)
+    seen = observe_difference(model, said, truth)
     cause = the_cause(seen, "all inertias were doubled")
-    assert not explains(seen, answer(seen.case), Fit(cause, 0.0, 0.0))
+    assert not is_explanation(seen, evaluate_case(seen.case), FittedCause(cause, 0.0, 0.0))
 
 
 @pytest.mark.parametrize(("off", "explained"), [(0.9, True), (1.9, True), (2.1, False)])
 def test_a_prediction_may_be_off_by_the_bounds_of_both_pendulums(off, explained):
     model, said, truth = changed("acceleration", lambda i, x, b: x + off * b[:, None] * ALONG)
-    seen = observe(model, said, truth)
+    seen = observe_difference(model, said, truth)
     cause = the_cause(seen, "all inertias were doubled")  # once as large: the right pendulum
-    assert explains(seen, answer(seen.case), Fit(cause, 1.0, 0.0)) is explained
+    assert is_explanation(seen, evaluate_case(seen.case), FittedCause(cause, 1.0, 0.0)) is explained
 
 
 @pytest.mark.parametrize(
@@ -199,11 +208,13 @@ def test_a_prediction_may_be_off_by_the_bounds_of_both_pendulums(off, explained)
 )
 def test_a_convention_is_named(words):
     model, truth = known(count=4)
-    wrong = answer(
-        the_cause(observe(model, truth.quantities, truth), words).alter(case(model, truth.states), 0)
+    wrong = evaluate_case(
+        the_cause(observe_difference(model, truth.quantities, truth), words).alter(
+            make_defect_case(model, truth.states), 0
+        )
     )
     said = [replace(a, **{q: wrong[q][i] for q in QUANTITIES}) for i, a in enumerate(truth.quantities)]
-    assert explanations(observe(model, said, truth)) == [words]
+    assert find_explanations(observe_difference(model, said, truth)) == [words]
 
 
 def test_a_difference_within_the_bound_is_in_the_mass_matrix():
@@ -228,14 +239,14 @@ def test_an_engine_that_fails_when_asked_again_is_told():
 
 def test_where_nothing_is_different_no_amount_is_seen():
     model, truth = known()
-    seen = observe(model, truth.quantities, truth)
-    right = answer(seen.case)
-    amounts = [cause for cause in causes(seen.case) if cause.scale is not None]
-    assert {cause.usual for cause in amounts} >= {0.0, 1.0}
+    seen = observe_difference(model, truth.quantities, truth)
+    right = evaluate_case(seen.case)
+    amounts = [cause for cause in all_causes(seen.case) if cause.scale is not None]
+    assert {cause.nominal for cause in amounts} >= {0.0, 1.0}
     for cause in amounts:
-        (slope,) = derivatives(seen, [(cause, cause.usual)])
+        (slope,) = derivatives_by_amount(seen, [(cause, cause.nominal)])
         if np.any(slope):
-            assert fitted(seen, right, cause, slope) is None
+            assert fit_cause(seen, right, cause, slope) is None
 
 
 @pytest.mark.parametrize(
@@ -244,14 +255,18 @@ def test_where_nothing_is_different_no_amount_is_seen():
 def test_two_states_show_neither_a_constant_nor_a_stale_field(to):
     """Of thirteen bodies two states are looked at, too few to see a pattern over states."""
     model, said, truth = changed("acceleration", to, "b" * 13, 9)
-    assert misread(observe(model, said, truth), "acceleration") is None
+    assert diagnose_quantity(observe_difference(model, said, truth), "acceleration") is None
     model, said, truth = changed("acceleration", lambda i, x, b: x + 0.5, "b" * 7, 9)
-    assert "a constant were added" in str(misread(observe(model, said, truth), "acceleration"))
+    assert "a constant were added" in str(
+        diagnose_quantity(observe_difference(model, said, truth), "acceleration")
+    )
 
 
 def test_a_pendulum_at_rest_is_asked_at_rest_too():
     model = replace(pendulums.model("rb"), gravity=np.array([0, 0, -9.81]))
-    still = [lift(model, s.p, 0 * s.omega, s.u, 0 * s.udot) for s in random_states(model, 4, seed=3)]
+    still = [
+        state_from_minimal(model, s.p, 0 * s.omega, s.u, 0 * s.udot) for s in random_states(model, 4, seed=3)
+    ]
     truth = state_truth(model, still)
 
     def evaluate(asked, states):
@@ -281,7 +296,7 @@ def test_what_lives_in_the_rates_vanishes_at_rest():
     truth = state_truth(model, random_states(model, 4, seed=3))
 
     def evaluate(asked, states):
-        still = [lift(asked, s.p, 0 * s.omega, s.u, 0 * s.udot) for s in states]
+        still = [state_from_minimal(asked, s.p, 0 * s.omega, s.u, 0 * s.udot) for s in states]
         return state_truth(asked, still).quantities
 
     text = diagnose(model, evaluate(model, truth.states), truth, evaluate)
@@ -304,35 +319,37 @@ def with_a_mass(factor, noise=0.0, count=4):
     """What an engine would say whose first mass is ``factor`` times as large, off by ``noise`` bounds."""
     model, truth = known(count=count)
     rng = np.random.default_rng(5)
-    wrong = answer(case(replace(model, mass=model.mass * [factor, 1.0]), truth.states))
+    wrong = evaluate_case(make_defect_case(replace(model, mass=model.mass * [factor, 1.0]), truth.states))
     said = [replace(a, **{q: wrong[q][i] for q in QUANTITIES}) for i, a in enumerate(truth.quantities)]
     off = [
         replace(a, acceleration=a.acceleration + noise * b.acceleration[:, None] * rng.normal(size=(2, 3)))
         for a, b in zip(said, truth.bounds, strict=True)
     ]
-    return observe(model, off, truth)
+    return observe_difference(model, off, truth)
 
 
 @pytest.mark.parametrize("factor", [0.99, 1.01])
 def test_an_amount_is_found_whether_it_is_more_or_less(factor):
     seen = with_a_mass(factor)
-    right, found = answer(seen.case), [c for c in causes(seen.case) if c.scale is not None]
-    data = seen.weighted({q: seen.said[q] - seen.right[q] for q in seen.said})
-    named = [fit for fit in fits(seen, right, data, found) if explains(seen, right, fit)]
+    right, found = evaluate_case(seen.case), [c for c in all_causes(seen.case) if c.scale is not None]
+    data = seen.weighted_vector({q: seen.reported[q] - seen.expected[q] for q in seen.reported})
+    named = [fit for fit in fit_causes(seen, right, data, found) if is_explanation(seen, right, fit)]
     mass = seen.case.mass[0, 0]
-    (fit,) = (fit for fit in named if fit.cause.usual == mass)
-    assert abs(fit.amount - factor * mass) < 3 * fit.resolution < 1e-9 * mass
-    (slope,) = derivatives(seen, [(fit.cause, fit.amount)])  # by differences, true to 1e-5 (above)
+    (fit,) = (fit for fit in named if fit.cause.nominal == mass)
+    assert abs(fit.fitted_amount - factor * mass) < 3 * fit.resolution < 1e-9 * mass
+    (slope,) = derivatives_by_amount(
+        seen, [(fit.cause, fit.fitted_amount)]
+    )  # by differences, true to 1e-5 (above)
     assert fit.resolution == pytest.approx(1 / np.linalg.norm(slope), rel=1e-5, abs=0)
 
 
 def test_an_amount_is_fitted_to_what_it_does_not_explain_too():
     seen = with_a_mass(1.001, noise=1e6)
-    (cause,) = (c for c in causes(seen.case) if c.scale is not None and c.usual == seen.case.mass[0, 0])
-    (slope,) = derivatives(seen, [(cause, cause.usual)])
-    fit = fitted(seen, answer(seen.case), cause, slope)
-    assert fit is not None and abs(fit.amount - 1.001 * cause.usual) < 1e7 * fit.resolution
-    assert not explains(seen, answer(seen.case), fit)
+    (cause,) = (c for c in all_causes(seen.case) if c.scale is not None and c.nominal == seen.case.mass[0, 0])
+    (slope,) = derivatives_by_amount(seen, [(cause, cause.nominal)])
+    fit = fit_cause(seen, evaluate_case(seen.case), cause, slope)
+    assert fit is not None and abs(fit.fitted_amount - 1.001 * cause.nominal) < 1e7 * fit.resolution
+    assert not is_explanation(seen, evaluate_case(seen.case), fit)
 
 
 @pytest.mark.parametrize(("off", "words"), [(1.5, "acceleration were 1.25 times as large"), (2.5, None)])
@@ -340,22 +357,26 @@ def test_a_misread_quantity_may_be_off_by_both_bounds(off, words):
     model, said, truth = changed(
         "acceleration", lambda i, x, b: 1.25 * x + (i == 3) * off * b[:, None] * ALONG
     )
-    assert misread(observe(model, said, truth), "acceleration") == words
+    assert diagnose_quantity(observe_difference(model, said, truth), "acceleration") == words
 
 
 def test_three_states_show_a_stale_field_and_a_constant():
     model, truth = known(count=3)
     before = [truth.quantities[0], *truth.quantities[:-1]]
     said = [replace(a, acceleration=b.acceleration) for a, b in zip(truth.quantities, before, strict=True)]
-    assert "stale" in str(misread(observe(model, said, truth), "acceleration"))
+    assert "stale" in str(diagnose_quantity(observe_difference(model, said, truth), "acceleration"))
     said[1] = truth.quantities[1]
-    assert misread(observe(model, said, truth), "acceleration") is None, "one state was not of the one before"
+    assert diagnose_quantity(observe_difference(model, said, truth), "acceleration") is None, (
+        "one state was not of the one before"
+    )
     model, said, truth = changed("acceleration", lambda i, x, b: x + 0.5, count=3)
-    assert "a constant were added" in str(misread(observe(model, said, truth), "acceleration"))
+    assert "a constant were added" in str(
+        diagnose_quantity(observe_difference(model, said, truth), "acceleration")
+    )
 
 
 @pytest.mark.parametrize(("factor", "words"), [(-0.5, "-0.5"), (1.000123456, "1.000123"), (2.0, "2")])
 def test_a_factor_is_told_with_the_digits_that_it_needs(factor, words):
     model, said, truth = changed("acceleration", lambda i, x, b: factor * x)
     text = f"acceleration were {words} times as large"
-    assert misread(observe(model, said, truth), "acceleration") == text
+    assert diagnose_quantity(observe_difference(model, said, truth), "acceleration") == text

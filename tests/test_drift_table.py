@@ -20,8 +20,8 @@ from reference_impl.stabilised import VARIANTS
 
 
 def measured(names: Sequence[str], longest: float, **options: Any) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = drift.table(
-        scenarios.load_many(names), longest, rtols=(1e-6,), **options
+    found: list[dict[str, Any]] = drift.measure_drift(
+        scenarios.load_scenarios(names), longest, rtols=(1e-6,), **options
     ).to_pylist()
     return found
 
@@ -48,16 +48,16 @@ def test_a_time_that_costs_too_much_is_left_out_and_says_so() -> None:
 
 
 def test_a_run_that_fails_is_a_row_with_its_reason() -> None:
-    (s,) = scenarios.load_many(["tumbling-ball"])
+    (s,) = scenarios.load_scenarios(["tumbling-ball"])
     massless = replace(s, model=replace(s.model, mass=np.zeros(1)))
-    rows = drift.table([massless], 60, times=(1.0, 10.0), rtols=(1e-6,)).to_pylist()
+    rows = drift.measure_drift([massless], 60, times=(1.0, 10.0), rtols=(1e-6,)).to_pylist()
     assert len(rows) == 2 * len(VARIANTS)
     assert all(row["gap"] is None and "failed: the mass of body 1" in row["reason"] for row in rows)
 
 
 def test_the_command_writes_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    quick = functools.partial(drift.table, times=(0.5, 1.0))
-    monkeypatch.setattr(drift, "table", quick)
+    quick = functools.partial(drift.measure_drift, times=(0.5, 1.0))
+    monkeypatch.setattr(drift, "measure_drift", quick)
     ran = CliRunner().invoke(main, ["drift", "tumbling-rod", "--rtol", "1e-6", "--out", str(tmp_path)])
     assert ran.exit_code == 0, ran.output
     kept = pq.read_table(tmp_path / "drift.parquet")

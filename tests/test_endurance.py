@@ -6,11 +6,19 @@ import numpy as np
 import pytest
 
 from adapters.mujoco_engine import Mujoco
-from plumbline.engines.registry import adapter
-from plumbline.execution.runner import Plan, execute
+from plumbline.engines.registry import load_adapter
+from plumbline.execution.runner import Plan, run_plan
 from plumbline.judging import long_runs
-from plumbline.judging.long_runs import BLOCKS, BODY_STEPS, Course, Fall, course, endure, judge_endurance
-from plumbline.judging.rows import Subject
+from plumbline.judging.long_runs import (
+    BLOCK_COUNT,
+    MAX_BODY_STEPS,
+    DriftOrder,
+    LongRunPlan,
+    judge_long_runs,
+    plan_long_run,
+    run_long_run_study,
+)
+from plumbline.judging.rows import RowContext
 from plumbline.model.datatypes import Integrator, Trajectory
 from plumbline.processes.workers import Limits
 from plumbline.scenario import loader
@@ -21,18 +29,19 @@ DEFECTS = {d.name: d for d in MOTION_DEFECTS}
 
 
 def load(name):
-    return loader.load_many([name])[0]
+    return loader.load_scenarios([name])[0]
 
 
 def long(name, engine, integrator, seconds=100.0):
     """Rows by quantity of one integrator's long runs of a scenario."""
-    s, chosen = load(name), adapter(engine) if isinstance(engine, str) else engine
+    s, chosen = load(name), load_adapter(engine) if isinstance(engine, str) else engine
     method = chosen.integrator(integrator)
-    plan = course(method, s.model.n, seconds)
-    endured = endure(chosen.name, integrator, s.model, s.state, s.sample, plan)
-    who = Subject(name, s.family, chosen.name, chosen.title, "1")
+    plan = plan_long_run(method, s.model.n, seconds)
+    endured = run_long_run_study(chosen.name, integrator, s.model, s.state, s.sample_interval, plan)
+    who = RowContext(name, s.family, chosen.name, chosen.title, "1")
     return {
-        row.quantity: row for row in judge_endurance(who, s.model, method, endured, s.exact is not None).rows
+        row.quantity: row
+        for row in judge_long_runs(who, s.model, method, endured, s.closed_form is not None).rows
     }
 
 
@@ -42,7 +51,7 @@ def planted(monkeypatch):
 
     def put(defect):
         engine = plant(Mujoco, defect)
-        monkeypatch.setattr(long_runs, "adapter", lambda _: engine)
+        monkeypatch.setattr(long_runs, "load_adapter", lambda _: engine)
         return engine
 
     return put
@@ -52,7 +61,7 @@ def test_a_chaotic_motion_keeps_what_is_conserved_for_100_s():
     rows = long("double-tumbling-balls", "mujoco", "RK4")
     assert {row.verdict for row in rows.values()} == {"agrees"} and len(rows) == 5
     energy = rows["energy_drift_long"]
-    assert energy.level == "invariants" and energy.horizon == 100.0 and energy.declared_order == 4
+    assert energy.level == "invariants" and energy.compared_until == 100.0 and energy.declared_order == 4
     assert 3.5 < energy.order < 5.5
     by = [energy.extra[f"by {t:g} s"] for t in (0.1, 1, 10, 100)]
     assert by == sorted(by) and by[-1] == energy.value < 1e-5
@@ -61,7 +70,7 @@ def test_a_chaotic_motion_keeps_what_is_conserved_for_100_s():
 def test_a_step_too_coarse_for_100_s_is_judged_where_it_is_not():
     rows = long("tumbling-ball", "mujoco", "Euler")
     energy = rows["energy_drift_long"]
-    assert energy.verdict == "agrees" and energy.horizon == 10.0 and abs(energy.order - 1) < 0.2
+    assert energy.verdict == "agrees" and energy.compared_until == 10.0 and abs(energy.order - 1) < 0.2
     assert "within 100 s, which cannot tell" in energy.reason
     assert energy.extra["by 100 s"] > 3.0 > energy.extra["scale"] / 2
 
@@ -128,11 +137,11 @@ def leaking():
         Exudyn,
         Defect("", "", inputs=model_change(lambda m, _: {"drag_moment": m.drag_moment + 3e-6})),
     )
-    before, long_runs.adapter = long_runs.adapter, lambda _: engine
+    before, long_runs.load_adapter = long_runs.load_adapter, lambda _: engine
     try:
         return long("spherical", engine, "trapezoidal", 50.0)["energy_drift_long_growth"]
     finally:
-        long_runs.adapter = before
+        long_runs.load_adapter = before
 
 
 @pytest.mark.full
@@ -147,35 +156,35 @@ def test_step_control_keeps_each_invariant_within_its_tolerance():
 
 def test_the_affordable_length_is_told():
     rk4 = Integrator("RK4", "step", 4)
-    assert course(rk4, 1, 100.0) == Course(100.0, (2.0**-7, 2.0**-8, 2.0**-9), 100.0)
+    assert plan_long_run(rk4, 1, 100.0) == LongRunPlan(100.0, (2.0**-7, 2.0**-8, 2.0**-9), 100.0)
     for n in range(1, 60):
-        plan = course(rk4, n, 100.0)
-        assert n * plan.seconds / plan.resolutions[-1] <= BODY_STEPS[4]
-        assert plan.words == (
+        plan = plan_long_run(rk4, n, 100.0)
+        assert n * plan.seconds / plan.resolutions[-1] <= MAX_BODY_STEPS[4]
+        assert plan.shortening_note == (
             "" if n < 3 else f"; the limit of steps × bodies allows {plan.seconds:g} s of 100 s"
         )
-    assert course(Integrator("d", "tolerance", 8), 10, 100.0).seconds == 6.25
+    assert plan_long_run(Integrator("d", "tolerance", 8), 10, 100.0).seconds == 6.25
 
 
 def test_the_jackknife_knows_a_common_motion_from_two():
     rng = np.random.default_rng(7)
-    blocks = rng.exponential(size=BLOCKS)
-    same = Fall.of(blocks, blocks / 16, 2)
-    assert abs(same.order - 2) < 1e-12 and same.sigma < 1e-12
+    blocks = rng.exponential(size=BLOCK_COUNT)
+    same = DriftOrder.from_blocks(blocks, blocks / 16, 2)
+    assert abs(same.order - 2) < 1e-12 and same.order_error < 1e-12
     # two motions with the same law: as many orders off by more than 3 σ as so few blocks explain
-    falls = [Fall.of(*rng.exponential(size=(2, BLOCKS)), 2) for _ in range(2000)]
+    falls = [DriftOrder.from_blocks(*rng.exponential(size=(2, BLOCK_COUNT)), 2) for _ in range(2000)]
     wrong = np.mean([abs(f.order) > 3 * f.sigma for f in falls])
     assert wrong < 0.02
     # one block that alone moves shows nothing
-    lone = np.zeros(BLOCKS)
+    lone = np.zeros(BLOCK_COUNT)
     lone[3] = 1.0
-    assert not np.isfinite(Fall.of(lone, lone / 4, 2).sigma)
+    assert not np.isfinite(DriftOrder.from_blocks(lone, lone / 4, 2).order_error)
 
 
 def test_a_run_has_long_cells_beside_the_others():
-    plan = Plan([load("conical")], ["mujoco"], "trajectory", limits=Limits(120), endurance=6.25)
+    plan = Plan([load("conical")], ["mujoco"], "trajectory", limits=Limits(120), long_run_seconds=6.25)
     seen = []
-    result = execute(plan, lambda done, total, what: seen.append((done, total)))
+    result = run_plan(plan, lambda done, total, what: seen.append((done, total)))
     assert seen[-1] == (9, 9)  # the truth, four ladders, four long runs
     rows = [row for row in result.rows if row.quantity.endswith("_long")]
     assert len(rows) == 4 * 5 and {row.level for row in rows} == {"invariants"}

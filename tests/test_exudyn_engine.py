@@ -9,12 +9,12 @@ import exudyn
 import numpy as np
 import pytest
 
-from adapters.exudyn_common import quiet, settings
-from adapters.exudyn_engine import Chain, Exudyn
+from adapters.exudyn_common import make_settings, silence_engine
+from adapters.exudyn_engine import Exudyn, ExudynChain
 from adapters.exudyn_tree_engine import ExudynTree
 from plumbline.engines.adapter import Adapter
 from plumbline.model.datatypes import EngineFailure, Model, State, Unsupported
-from plumbline.model.kinematics import joint_vectors, lift
+from plumbline.model.kinematics import joint_vectors, state_from_minimal
 from tests import newton_euler, pendulums
 
 TIMES = np.linspace(0.0, 2.0, 9)
@@ -34,7 +34,7 @@ def gentle(joints: str) -> tuple[Model, State]:
     p /= np.linalg.norm(p, axis=1, keepdims=True)
     u = np.where(subject.rods[:, None], [0.0, -0.6, -0.8], 0.0)
     udot = np.where(subject.rods[:, None], [0.7, 0.4, -0.3], 0.0)
-    return subject, lift(subject, p, 0.5 * rng.normal(size=(n, 3)), u, udot)
+    return subject, state_from_minimal(subject, p, 0.5 * rng.normal(size=(n, 3)), u, udot)
 
 
 @cache
@@ -101,9 +101,9 @@ def test_builtin_initial_accelerations_are_finite_differences():
     start = pendulums.state(subject)
     truth = newton_euler.solve(subject, start)
     scale = np.abs(truth.acceleration).max()
-    with quiet():
-        chain = Chain(subject, start)
-        solver, chosen = exudyn.MainSolverImplicitSecondOrder(), settings()
+    with silence_engine():
+        chain = ExudynChain(subject, start)
+        solver, chosen = exudyn.MainSolverImplicitSecondOrder(), make_settings()
         assert chosen.timeIntegration.generalizedAlpha.computeInitialAccelerations
         assert solver.InitializeSolver(chain.mbs, chosen)
         own = np.reshape(chain.mbs.systemData.GetODE2Coordinates_tt(), (-1, 7))[:, :3]
@@ -128,7 +128,9 @@ def swing_over(rate: float) -> tuple[Model, State]:
     subject = replace(pendulums.model("b"), gravity=np.zeros(3), moment=np.array([[0.0, 4.0, 0.0]]))
     subject = replace(subject, inertia=0.1 * np.eye(3)[None], proximal=np.zeros((1, 3)))
     zero = np.zeros((1, 3))
-    return subject, lift(subject, np.array([[1.0, 0, 0, 0]]), np.array([[rate, 0.0, 0.0]]), zero, zero)
+    return subject, state_from_minimal(
+        subject, np.array([[1.0, 0, 0, 0]]), np.array([[rate, 0.0, 0.0]]), zero, zero
+    )
 
 
 def test_tree_says_when_its_angles_become_singular():

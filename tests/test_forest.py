@@ -7,15 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adapters.reference_engine import chain
-from plumbline.model.kinematics import lift, rate
-from plumbline.truth.rounding_bound import state_bound
+from adapters.reference_engine import notes_chain
+from plumbline.model.kinematics import quaternion_rate, state_from_minimal
+from plumbline.truth.rounding_bound import state_rounding_bound
 from reference_impl.chain import Chain
-from reference_impl.direct import EPS, Solution, System
+from reference_impl.direct import EPS, DirectSystem, Solution
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import L
-from reference_impl.joints import rows
-from reference_impl.structured import Forest, lay
+from reference_impl.joints import constraint_rows
+from reference_impl.structured import StructuredSystem, component_first
 from tests.random_chains import norms, random_chain, rescaled
 
 MIXES = {
@@ -26,19 +26,19 @@ MIXES = {
 KINDS = pytest.mark.parametrize("mix", MIXES)
 
 
-def parts(solution: Solution, forest: Forest) -> list[Solution]:
+def parts(solution: Solution, forest: StructuredSystem) -> list[Solution]:
     """The forest's answer chain by chain."""
     out = []
     for index, one in enumerate(forest.chains):
-        mine = (solution.joint >= forest.start[index]) & (solution.joint < forest.start[index + 1])
-        body = slice(forest.start[index], forest.start[index + 1])
+        mine = (solution.joint >= forest.first_body[index]) & (solution.joint < forest.first_body[index + 1])
+        body = slice(forest.first_body[index], forest.first_body[index + 1])
         out.append(
             Solution(
                 acceleration=solution.acceleration[body],
                 pddot=solution.pddot[body],
                 multiplier=solution.multiplier[mine],
                 norm_multiplier=solution.norm_multiplier[body],
-                joint=solution.joint[mine] - forest.start[index],
+                joint=solution.joint[mine] - forest.first_body[index],
                 tension=solution.tension[body],
                 joint_reaction=solution.joint_reaction[body],
             )
@@ -55,13 +55,15 @@ def test_equals_the_direct_form_within_the_derived_bound(mix: str) -> None:
             random_chain(rng, MIXES[mix](rng, n), decades=1.0, loads=True, drag=True)
             for n in rng.integers(1, 11, size=4)
         ]
-        forest = Forest([chain(model) for model, _ in drawn])
+        forest = StructuredSystem([notes_chain(model) for model, _ in drawn])
         held = [np.concatenate([getattr(state, name) for _, state in drawn]) for name in ("r", "p", "v")]
-        pdot = np.concatenate([rate(state.p, state.omega) for _, state in drawn])
+        pdot = np.concatenate([quaternion_rate(state.p, state.omega) for _, state in drawn])
         together = parts(forest.solve(*held, pdot), forest)
         for (model, state), ours in zip(drawn, together, strict=True):
-            direct = System(chain(model)).solve(state.r, state.p, state.v, rate(state.p, state.omega))
-            bound = state_bound(model, state)
+            direct = DirectSystem(notes_chain(model)).solve(
+                state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+            )
+            bound = state_rounding_bound(model, state)
             turned = [2 * (L(state.p) @ x.pddot[..., None])[..., 0] for x in (ours, direct)]
             for ours_, direct_, allowed in (
                 (ours.acceleration, direct.acceleration, bound.acceleration),
@@ -83,13 +85,13 @@ def test_all_unknowns_equal_the_direct_forms_on_and_off_the_manifold(mix: str, o
     rng = np.random.default_rng(21)
     for _ in range(12):
         drawn = [random_chain(rng, MIXES[mix](rng, n), 0.5, loads=True, drag=True) for n in (1, 2, 2, 5, 8)]
-        forest = Forest([chain(model) for model, _ in drawn])
+        forest = StructuredSystem([notes_chain(model) for model, _ in drawn])
         r, p, v = (np.concatenate([getattr(s, name) for _, s in drawn]) for name in ("r", "p", "v"))
-        pdot = np.concatenate([rate(s.p, s.omega) for _, s in drawn])
+        pdot = np.concatenate([quaternion_rate(s.p, s.omega) for _, s in drawn])
         r, p, v, pdot = (x + off * rng.normal(size=x.shape) for x in (r, p, v, pdot))
         for index, ours in enumerate(parts(forest.solve(r, p, v, pdot), forest)):
-            body = slice(forest.start[index], forest.start[index + 1])
-            direct = System(forest.chains[index]).solve(r[body], p[body], v[body], pdot[body])
+            body = slice(forest.first_body[index], forest.first_body[index + 1])
+            direct = DirectSystem(forest.chains[index]).solve(r[body], p[body], v[body], pdot[body])
             for name in (
                 "acceleration",
                 "pddot",
@@ -109,12 +111,17 @@ def test_a_batch_is_more_chains() -> None:
     rng = np.random.default_rng(22)
     model, state = random_chain(rng, [True, False, True])
     other, elsewhere = random_chain(rng, [False, False])
-    alone = Forest([chain(model)])
-    q, v = lay(state.r, state.p), lay(state.v, rate(state.p, state.omega))
-    q2, v2 = lay(elsewhere.r, elsewhere.p), lay(elsewhere.v, rate(elsewhere.p, elsewhere.omega))
+    alone = StructuredSystem([notes_chain(model)])
+    q, v = component_first(state.r, state.p), component_first(state.v, quaternion_rate(state.p, state.omega))
+    q2, v2 = (
+        component_first(elsewhere.r, elsewhere.p),
+        component_first(elsewhere.v, quaternion_rate(elsewhere.p, elsewhere.omega)),
+    )
     answer = alone.acceleration(q, v)
-    both = Forest([chain(other), chain(model)]).acceleration(np.hstack([q2, q]), np.hstack([v2, v]))
-    tiled = alone.tile(3).acceleration(np.tile(q, 3), np.tile(v, 3))
+    both = StructuredSystem([notes_chain(other), notes_chain(model)]).acceleration(
+        np.hstack([q2, q]), np.hstack([v2, v])
+    )
+    tiled = alone.repeated(3).acceleration(np.tile(q, 3), np.tile(v, 3))
     scale = np.max(np.abs(answer))
     assert np.max(np.abs(both[:, 2:] - answer)) <= 1e-13 * scale
     assert np.max(np.abs(tiled - np.tile(answer, 3))) <= 1e-13 * scale
@@ -124,7 +131,7 @@ def test_a_batch_is_more_chains() -> None:
 def test_singular_configurations_are_reported(mix: str) -> None:
     rng = np.random.default_rng(23)
     model, state = random_chain(rng, MIXES[mix](rng, 4))
-    forest, pdot = Forest([chain(model)]), rate(state.p, state.omega)
+    forest, pdot = StructuredSystem([notes_chain(model)]), quaternion_rate(state.p, state.omega)
     zero = state.p.copy()
     zero[2] = 0
     with pytest.raises(SingularSystem, match=r"p of body 3"):
@@ -138,19 +145,19 @@ def test_singular_configurations_are_reported(mix: str) -> None:
         ({"inertia": model.inertia * np.array([1, 1, 1, 0])[:, None, None]}, "inertia of body 4"),
     ):
         with pytest.raises(SingularSystem, match=words):
-            Forest([chain(replace(model, **change))])
+            StructuredSystem([notes_chain(replace(model, **change))])
 
 
 def test_a_rod_of_length_zero_is_singular() -> None:
     """Read literally, C = dᵀd on a ball joint has no gradient (E1)."""
     rng = np.random.default_rng(24)
     model, state = random_chain(rng, [False, False, True])
-    literal: Chain = chain(replace(model, length=np.array([0.0, 0.0, 0.4])))
+    literal: Chain = notes_chain(replace(model, length=np.array([0.0, 0.0, 0.4])))
     gap = state.u[2] * model.length[2]
     r = state.r.copy()
     r[2] -= gap
     with pytest.raises(SingularSystem, match="rod above body 3 has length 0"):
-        Forest([literal]).solve(r, state.p, state.v, rate(state.p, state.omega))
+        StructuredSystem([literal]).solve(r, state.p, state.v, quaternion_rate(state.p, state.omega))
 
 
 @KINDS
@@ -160,10 +167,10 @@ def test_constraints_are_gaps_of_balls_and_squares_of_rods(mix: str) -> None:
     rods = {"balls": [False] * 5, "rods": [True] * 5, "mixed": [True, False, True, True, False]}[mix]
     model, state = random_chain(rng, rods)
     r, v = state.r + 0.1 * rng.normal(size=(5, 3)), state.v + 0.1 * rng.normal(size=(5, 3))
-    pdot, one = rate(state.p, state.omega), chain(model)
-    forest, direct = Forest([one]), rows(one, r, state.p, v, pdot)
-    found = forest.constraints(lay(r, state.p), lay(v, pdot))
-    for ours, theirs in zip(found, (direct.C, direct.rate(v, pdot)), strict=True):
+    pdot, one = quaternion_rate(state.p, state.omega), notes_chain(model)
+    forest, direct = StructuredSystem([one]), constraint_rows(one, r, state.p, v, pdot)
+    found = forest.constraints(component_first(r, state.p), component_first(v, pdot))
+    for ours, theirs in zip(found, (direct.C, direct.constraint_rate(v, pdot)), strict=True):
         assert ours.shape == (1 if mix == "rods" else 3, 5)
         kept = np.array([[row == 0 or not rod for row in range(len(ours))] for rod in one.rods])
         np.testing.assert_allclose(ours.T[kept], theirs, rtol=0, atol=1e-13)
@@ -176,8 +183,8 @@ def test_a_cause_is_named_by_the_body_of_its_own_chain(at: int, words: str) -> N
     rng = np.random.default_rng(26)
     drawn = [random_chain(rng, [False] * n) for n in (2, 3, 2)]
     r, p, v = (np.concatenate([getattr(s, name) for _, s in drawn]) for name in ("r", "p", "v"))
-    pdot = np.concatenate([rate(s.p, s.omega) for _, s in drawn])
-    forest = Forest([chain(model) for model, _ in drawn])
+    pdot = np.concatenate([quaternion_rate(s.p, s.omega) for _, s in drawn])
+    forest = StructuredSystem([notes_chain(model) for model, _ in drawn])
     for broken, what in ((p, 0.0), (r, np.nan)):
         kept = broken[at].copy()
         broken[at] = what
@@ -192,8 +199,8 @@ def test_baumgarte_adds_2a_and_a_squared_to_every_constraint(mix: str, a: float)
     """C̈ + 2 a Ċ + a² C = 0 of joints that are open, and of pᵀp − 1."""
     rng = np.random.default_rng(27)
     model, state = random_chain(rng, MIXES[mix](rng, 4), loads=True, drag=True)
-    forest, pdot, h = Forest([chain(model)]), rate(state.p, state.omega), 1e-6
-    q, v = lay(state.r, state.p), lay(state.v, pdot)
+    forest, pdot, h = StructuredSystem([notes_chain(model)]), quaternion_rate(state.p, state.omega), 1e-6
+    q, v = component_first(state.r, state.p), component_first(state.v, pdot)
     q[:3] += 0.1 * rng.normal(size=(3, 4))
     v[:3] += 0.1 * rng.normal(size=(3, 4))
     acceleration = forest.acceleration(q, v, a)
@@ -215,11 +222,15 @@ def test_a_pendulum_of_any_size_is_solved_alike(mix: str) -> None:
     """Micrometres and milligrams, kilometres and kilotons: no threshold has a unit."""
     rng = np.random.default_rng(28)
     model, state = random_chain(rng, MIXES[mix](rng, 3), loads=True, drag=True)
-    here = Forest([chain(model)]).solve(state.r, state.p, state.v, rate(state.p, state.omega))
-    allowed = state_bound(model, state)
+    here = StructuredSystem([notes_chain(model)]).solve(
+        state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+    )
+    allowed = state_rounding_bound(model, state)
     for length, mass, second in ((1e-6, 1e-9, 1e-3), (1e3, 1e6, 1e2), (1.0, 1e15, 1.0)):
         small, at = rescaled(model, state, length, mass, second)
-        there = Forest([chain(small)]).solve(at.r, at.p, at.v, rate(at.p, at.omega))
+        there = StructuredSystem([notes_chain(small)]).solve(
+            at.r, at.p, at.v, quaternion_rate(at.p, at.omega)
+        )
         for name, unit, bound in (
             ("acceleration", length / second**2, allowed.acceleration),
             ("pddot", 1 / second**2, allowed.angular_acceleration / 2),
@@ -235,7 +246,9 @@ def test_a_collapsed_rod_is_one_of_its_own_rounding(scale: float) -> None:
     r = state.r.copy()
     r[2] -= state.u[2] * model.length[2]
     with pytest.raises(SingularSystem, match="rod above body 3 has length 0"):
-        Forest([chain(model)]).solve(r, state.p, state.v, rate(state.p, state.omega))
+        StructuredSystem([notes_chain(model)]).solve(
+            r, state.p, state.v, quaternion_rate(state.p, state.omega)
+        )
 
 
 def test_a_rod_short_beside_another_chain_s_is_no_collapsed_one() -> None:
@@ -243,18 +256,20 @@ def test_a_rod_short_beside_another_chain_s_is_no_collapsed_one() -> None:
     small, large = (rescaled(*random_chain(rng, [True]), scale, 1.0, 1.0) for scale in (1e-6, 1e12))
     models, states = zip(small, large, strict=True)
     r, p, v, omega = (np.concatenate([getattr(s, k) for s in states]) for k in ("r", "p", "v", "omega"))
-    both = Forest([chain(model) for model in models]).solve(r, p, v, rate(p, omega))
+    both = StructuredSystem([notes_chain(model) for model in models]).solve(
+        r, p, v, quaternion_rate(p, omega)
+    )
     model, at = small
-    alone = Forest([chain(model)]).solve(at.r, at.p, at.v, rate(at.p, at.omega))
+    alone = StructuredSystem([notes_chain(model)]).solve(at.r, at.p, at.v, quaternion_rate(at.p, at.omega))
     np.testing.assert_allclose(both.acceleration[:1], alone.acceleration, rtol=64 * EPS, atol=0)
 
 
 def test_a_collapsed_rod_on_a_body_that_is_not_turned_is_named_too() -> None:
     model, state = random_chain(np.random.default_rng(24), [True])
-    at = lift(model, np.array([[1.0, 0, 0, 0]]), state.omega, state.u, state.udot)
+    at = state_from_minimal(model, np.array([[1.0, 0, 0, 0]]), state.omega, state.u, state.udot)
     with pytest.raises(SingularSystem, match="rod above body 1 has length 0"):
         r = at.r - at.u * model.length
-        Forest([chain(model)]).solve(r, at.p, at.v, rate(at.p, at.omega))
+        StructuredSystem([notes_chain(model)]).solve(r, at.p, at.v, quaternion_rate(at.p, at.omega))
 
 
 def test_what_is_lost_to_rounding_or_overflow_is_told() -> None:
@@ -262,24 +277,24 @@ def test_what_is_lost_to_rounding_or_overflow_is_told() -> None:
     model, state = random_chain(np.random.default_rng(24), [False] * 3)
     heavy = np.array([1.0, 1e20, 1.0])
     uneven = replace(model, mass=heavy * model.mass, inertia=heavy[:, None, None] * model.inertia)
-    pdot = rate(state.p, state.omega)
+    pdot = quaternion_rate(state.p, state.omega)
     with pytest.raises(SingularSystem, match="joint rows are not independent"):
-        Forest([chain(uneven)]).solve(state.r, state.p, state.v, pdot)
-    forest, fast = Forest([chain(model)]), pdot.copy()
+        StructuredSystem([notes_chain(uneven)]).solve(state.r, state.p, state.v, pdot)
+    forest, fast = StructuredSystem([notes_chain(model)]), pdot.copy()
     fast[1, 2] = np.inf
     with pytest.raises(SingularSystem, match="a rate or a load is not finite"), np.errstate(all="ignore"):
-        forest.acceleration(lay(state.r, state.p), lay(state.v, fast))
+        forest.acceleration(component_first(state.r, state.p), component_first(state.v, fast))
 
 
 def test_the_copies_of_a_tiled_forest_have_names_too() -> None:
     model, state = random_chain(np.random.default_rng(29), [False, False, False])
-    forest = Forest([chain(model)]).tile(2)
-    q, v = lay(state.r, state.p), lay(state.v, rate(state.p, state.omega))
+    forest = StructuredSystem([notes_chain(model)]).repeated(2)
+    q, v = component_first(state.r, state.p), component_first(state.v, quaternion_rate(state.p, state.omega))
     q, v = np.tile(q, 2), np.tile(v, 2)
     q[3:, 4] = 0.0
     with pytest.raises(SingularSystem, match="p of body 2"):
         forest.acceleration(q, v)
-    assert forest.start.tolist() == [0, 3, 6]
+    assert forest.first_body.tolist() == [0, 3, 6]
 
 
 def test_a_body_without_thickness_is_named_beside_a_tiny_one() -> None:
@@ -287,7 +302,7 @@ def test_a_body_without_thickness_is_named_beside_a_tiny_one() -> None:
     model, _ = random_chain(np.random.default_rng(30), [False, False])
     needle = replace(model, inertia=np.stack([1e-20 * np.eye(3), np.diag([1.0, 1.0, 0.0])]))
     with pytest.raises(SingularSystem, match="inertia of body 2 is singular"):
-        Forest([chain(needle)])
+        StructuredSystem([notes_chain(needle)])
 
 
 @KINDS
@@ -297,8 +312,14 @@ def test_one_kind_of_drag_alone_counts(mix: str, alone: str) -> None:
     model, state = random_chain(rng, MIXES[mix](rng, 3), drag=True)
     other = {"drag_force": "drag_moment", "drag_moment": "drag_force"}[alone]
     model = replace(model, **{other: np.zeros(3)})
-    one, pdot, allowed = chain(model), rate(state.p, state.omega), state_bound(model, state)
-    ours, direct = (form.solve(state.r, state.p, state.v, pdot) for form in (Forest([one]), System(one)))
+    one, pdot, allowed = (
+        notes_chain(model),
+        quaternion_rate(state.p, state.omega),
+        state_rounding_bound(model, state),
+    )
+    ours, direct = (
+        form.solve(state.r, state.p, state.v, pdot) for form in (StructuredSystem([one]), DirectSystem(one))
+    )
     assert np.all(norms(ours.acceleration - direct.acceleration) <= allowed.acceleration)
     assert np.all(norms(ours.pddot - direct.pddot) <= allowed.angular_acceleration / 2)
 
@@ -308,8 +329,8 @@ def test_the_rate_of_a_gap_is_its_derivative_off_the_manifold_too(mix: str) -> N
     """Where pᵀṗ is not 0 the matrix A of the notes stretches, and d with it."""
     rng, h = np.random.default_rng(32), 1e-6
     model, state = random_chain(rng, MIXES[mix](rng, 4))
-    forest = Forest([chain(model)])
-    q, v = lay(state.r, 1.1 * state.p), rng.normal(size=(7, 4))
-    ends = [forest.gaps(q + s * h * v, v)[0] for s in (1, -1)]
+    forest = StructuredSystem([notes_chain(model)])
+    q, v = component_first(state.r, 1.1 * state.p), rng.normal(size=(7, 4))
+    ends = [forest.joint_gaps(q + s * h * v, v)[0] for s in (1, -1)]
     # gaps of some metres, each a dozen roundings of 1e-16, over 2 h (the quadratic p(t) leaves h² some 1e-12)
-    np.testing.assert_allclose(forest.gaps(q, v)[1], (ends[0] - ends[1]) / (2 * h), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(forest.joint_gaps(q, v)[1], (ends[0] - ends[1]) / (2 * h), rtol=0, atol=1e-8)

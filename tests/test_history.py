@@ -6,7 +6,7 @@ import pytest
 from click.testing import CliRunner
 
 from plumbline.cli.main import main
-from plumbline.judging.rows import Subject
+from plumbline.judging.rows import RowContext
 from plumbline.storage import results_store
 from plumbline.storage.history import History
 
@@ -17,9 +17,9 @@ def night(folder, day, verdicts, version="4.0", known=None, family="single"):
     """A stored run of one scenario per verdict; scenario "s" first, then "s1", …"""
     rows = []
     for k, verdict in enumerate(verdicts):
-        who = Subject(f"s{k or ''}", family, "mujoco", "MuJoCo", version)
+        who = RowContext(f"s{k or ''}", family, "mujoco", "MuJoCo", version)
         more = {"value": 10.0**-day, "tolerance": 1.0, "known": known}
-        rows.append(who.row("state", "-", "acceleration", verdict, f"it {verdict}", "m/s²", **more))
+        rows.append(who.make_row("state", "-", "acceleration", verdict, f"it {verdict}", "m/s²", **more))
     bad = any(v != "agrees" for v in verdicts) and known is None
     run = {
         "id": f"2026010{day}T000000Z",
@@ -28,9 +28,9 @@ def night(folder, day, verdicts, version="4.0", known=None, family="single"):
         "sentence": "",
         "versions": {"mujoco": version},
     }
-    tables = results_store.Tables()
+    tables = results_store.ResultTables()
     tables.add_rows(rows)
-    results_store.write(folder / run["id"], run, {}, {}, rows, tables)
+    results_store.write_results(folder / run["id"], run, {}, {}, rows, tables)
 
 
 def test_first_bad_night_and_last_green(tmp_path):
@@ -46,7 +46,7 @@ def test_first_bad_night_and_last_green(tmp_path):
         "20260104T000000Z",
         "20260103T000000Z",
     )
-    green, changes = history.since_green()
+    green, changes = history.changes_since_green()
     assert green == "20260103T000000Z"
     assert [(c["key"], c["was"], c["is"]) for c in changes] == [
         (KEY, "agrees", "failed"),
@@ -62,14 +62,14 @@ def test_a_key_that_was_never_good(tmp_path):
     night(tmp_path, 2, ["disagrees"])
     history = History(tmp_path)
     assert [(f["first_bad"], f["last_good"]) for f in history.first_bad()] == [("20260101T000000Z", None)]
-    assert history.since_green() == (None, [])
+    assert history.changes_since_green() == (None, [])
 
 
 def test_random_scenarios_are_counted_only(tmp_path):
     night(tmp_path, 1, ["agrees", "agrees"], family="random")
     night(tmp_path, 2, ["disagrees"], family="random")
     history = History(tmp_path)
-    assert history.first_bad() == [] and history.since_green()[1] == []
+    assert history.first_bad() == [] and history.changes_since_green()[1] == []
     assert [n["random"] for n in history.overview()] == [2, 1]
 
 
@@ -107,7 +107,7 @@ def test_a_damaged_night_is_named_and_left_out(tmp_path, spoil):
 
 
 def test_an_empty_folder_has_no_nights(tmp_path):
-    document = History(tmp_path).document("*")
+    document = History(tmp_path).to_document("*")
     assert document.pop("last_green") is None
     assert set(document) == {"nights", "damaged", "versions", "first_bad", "since_green", "trend"}
     assert all(part == [] for part in document.values())

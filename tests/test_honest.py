@@ -8,7 +8,7 @@ import time
 import pytest
 
 from plumbline.engines.registry import ENGINES
-from plumbline.execution.runner import Plan, execute
+from plumbline.execution.runner import Plan, run_plan
 from plumbline.processes.workers import Limits
 from plumbline.scenario.generator import RandomScenarios
 
@@ -36,9 +36,14 @@ def probed(seed, count, states):
 
     jobs = 1 if "PYTEST_XDIST_WORKER" in os.environ else os.cpu_count() or 1
     plan = Plan(
-        [], list(ENGINES), jobs=jobs, limits=Limits(600), states=states, probes=RandomScenarios(seed, count)
+        [],
+        list(ENGINES),
+        jobs=jobs,
+        limits=Limits(600),
+        random_state_count=states,
+        random_scenarios=RandomScenarios(seed, count),
     )
-    return execute(plan, progress), peaks
+    return run_plan(plan, progress), peaks
 
 
 def accused(result):
@@ -62,8 +67,8 @@ def told(result):
 
 def test_honest_engines_are_not_accused():
     result, _ = probed(seed=2026, count=200, states=1)
-    assert not accused(result) and result.run["exit_code"] == 0, accused(result)
-    assert result.probes.scenarios == 200
+    assert not accused(result) and result.metadata["exit_code"] == 0, accused(result)
+    assert result.random_batch.scenario_count == 200
     counted = told(result)
     assert counted["agrees"] > 200 * len(ENGINES) * 6
     assert counted["unresolved"] < 0.01 * counted.total(), "too blunt to see anything"
@@ -90,7 +95,7 @@ def test_fourteen_thousand_cells_in_the_memory_of_a_few(record_testsuite_propert
         record_testsuite_property(name, figure)
     with capsys.disabled():
         print(f"\nrandom scenarios: {figures}")
-    assert not accused(result) and result.run["exit_code"] == 0, accused(result)
+    assert not accused(result) and result.metadata["exit_code"] == 0, accused(result)
     # What someone should see is kept and may grow; a cell whose bench stays takes 83 kB, forty times this
     # limit (measured before benches were retired).
     grown = peaks[-1] - peaks[1]

@@ -6,7 +6,7 @@ import pytest
 
 from plumbline.cli.main import nightly
 from plumbline.execution import selftest
-from plumbline.execution.selftest import Answer
+from plumbline.execution.selftest import SelfTestResult
 from plumbline.processes.workers import Limits
 from plumbline.scenario import loader
 
@@ -40,16 +40,16 @@ pytest.importorskip("no_such_module_at_all")
 )
 def test_the_answer_is_that_of_the_tests(tmp_path, text, figures, trouble):
     (tmp_path / "test_it.py").write_text(text)
-    answer = selftest.check(tmp_path / "said.xml", str(tmp_path / "test_it.py"))
-    assert answer.figures == figures
-    assert trouble in answer.trouble and bool(trouble) == bool(answer.trouble)
-    assert ("failed" in answer.sentence) == bool(trouble)
+    answer = selftest.run_self_test(tmp_path / "said.xml", str(tmp_path / "test_it.py"))
+    assert answer.counts == figures
+    assert trouble in answer.failure and bool(trouble) == bool(answer.failure)
+    assert ("failed" in answer.summary) == bool(trouble)
 
 
 def test_one_that_hangs_is_ended(tmp_path):
     (tmp_path / "test_it.py").write_text("import time\ndef test_a(): time.sleep(60)\n")
-    answer = selftest.check(tmp_path / "said.xml", str(tmp_path / "test_it.py"), patience=3)
-    assert answer.trouble == "no answer within 3 s"
+    answer = selftest.run_self_test(tmp_path / "said.xml", str(tmp_path / "test_it.py"), timeout=3)
+    assert answer.failure == "no answer within 3 s"
 
 
 @pytest.mark.parametrize("trouble", ["", "half of them"])
@@ -58,10 +58,10 @@ def test_a_night_with_a_dull_instrument_is_not_green(tmp_path, trouble):
 
     def said(report):
         report.write_text("<testsuite/>")
-        return Answer({"planted": 67, "reported": 67}, trouble)
+        return SelfTestResult({"planted": 67, "reported": 67}, trouble)
 
     _, place = nightly.nightly(
-        tmp_path, loader.load_many(["rest"]), ["mujoco"], random=0, seed=1, jobs=1, limits=Limits(),
+        tmp_path, loader.load_scenarios(["rest"]), ["mujoco"], random=0, seed=1, jobs=1, limits=Limits(),
         whole=False, command="-", level="state", instrument=said, progress=lambda *_: None,
         tell=lambda _: None,
     )  # fmt: skip
@@ -76,7 +76,7 @@ def test_a_night_killed_as_it_was_done_is_not_had_twice(tmp_path, monkeypatch):
 
     def night():
         return nightly.nightly(
-            tmp_path, loader.load_many(["rest"]), ["mujoco"], random=0, seed=None, jobs=1, limits=Limits(),
+            tmp_path, loader.load_scenarios(["rest"]), ["mujoco"], random=0, seed=None, jobs=1, limits=Limits(),
             whole=False, command="-", level="state", progress=lambda *_: None, tell=lambda _: None,
         )  # fmt: skip
 

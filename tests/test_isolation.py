@@ -19,7 +19,7 @@ LIMITS = Limits(seconds=10, gigabytes=4)
 
 
 def night(out, engines):
-    (s,) = loader.load_many(["planar-small"])
+    (s,) = loader.load_scenarios(["planar-small"])
     return nightly.nightly(
         out, [replace(s, duration=0.5)], engines, random=0, seed=1, jobs=2, limits=LIMITS, whole=False,
         command="-", finer=0, level="trajectory", progress=lambda *_: None, tell=lambda _: None,
@@ -37,7 +37,7 @@ def said(rows, engine):
 
 def test_every_fault_at_once_loses_exactly_its_own_cell(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(registry, "ENGINES", dict(registry.ENGINES))
-    monkeypatch.setattr(workers, "prepare", faulty.prepare)
+    monkeypatch.setattr(workers, "initialize_worker", faulty.prepare)
     monkeypatch.chdir(tmp_path)
     faulty.register()
     names = [fault.__name__ for fault in faulty.FAULTS]

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import pytest
 
 from plumbline.judging import known_issues
-from plumbline.judging.rows import Subject
+from plumbline.judging.rows import RowContext
 
-WHO = Subject("tumbling-ball", "single", "mujoco", "MuJoCo", "4.0.0")
+WHO = RowContext("tumbling-ball", "single", "mujoco", "MuJoCo", "4.0.0")
 ENTRY = {
     "id": "a", "scenario": "tumbling-ball", "engine": "mujoco", "quantity": "acceleration",
     "verdict": "disagrees", "evidence": "seen", "reason": "because",
@@ -15,22 +15,22 @@ ENTRY = {
 
 
 def entry(**changes):
-    return known_issues.Entry(**{**ENTRY, **changes})
+    return known_issues.KnownIssue(**{**ENTRY, **changes})
 
 
 def row(verdict="disagrees", quantity="acceleration", who=WHO):
-    return who.row("state", "-", quantity, verdict, "why")
+    return who.make_row("state", "-", quantity, verdict, "why")
 
 
 def judged_by(rows, entries, whole, finer=False):
     """Rows with their excuses, and what is stale then."""
-    excuses = known_issues.Excuses(entries, finer)
-    return SimpleNamespace(rows=excuses.mark(rows), stale=excuses.stale(whole=whole))
+    excuses = known_issues.KnownIssues(entries, finer)
+    return SimpleNamespace(rows=excuses.mark_known(rows), stale=excuses.stale_issues(is_full_matrix=whole))
 
 
 def covers(an_entry, of):
     """Whether an entry speaks of the cell of a row."""
-    return known_issues.Excuses([an_entry], finer=False).about(of) == [an_entry]
+    return known_issues.KnownIssues([an_entry], has_extra_refinements=False).issues_for(of) == [an_entry]
 
 
 def test_an_entry_marks_its_row_and_no_other():
@@ -84,19 +84,22 @@ def test_a_bad_file_is_refused_by_name(tmp_path, text, words):
     path = tmp_path / "known.yaml"
     path.write_text(text)
     with pytest.raises(ValueError, match=words) as caught:
-        known_issues.load(path)
+        known_issues.load_known_issues(path)
     assert str(path) in str(caught.value)
 
 
 def test_a_list_of_scenarios_is_an_entry_for_each(tmp_path):
     path = tmp_path / "known.yaml"
     path.write_text("- {id: a, scenario: [x, y], engine: z, verdict: failed, evidence: e, reason: r}\n")
-    assert [(e.id, e.scenario) for e in known_issues.load(path)] == [("a: x", "x"), ("a: y", "y")]
+    assert [(e.id, e.scenario) for e in known_issues.load_known_issues(path)] == [
+        ("a: x", "x"),
+        ("a: y", "y"),
+    ]
 
 
 def test_only_random_scenarios_may_show_it_sometimes():
     chance = entry(scenario="random-*", sometimes=True)
-    who = Subject("random-1-2", "random", "mujoco", "MuJoCo", "4.0.0")
+    who = RowContext("random-1-2", "random", "mujoco", "MuJoCo", "4.0.0")
     assert judged_by([row("agrees", who=who)], [chance], whole=True).stale == []
     assert judged_by([row(who=who)], [chance], whole=True).rows[0].known == "a"
     with pytest.raises(ValueError, match="random"):
@@ -115,11 +118,11 @@ def test_an_id_twice_is_refused(tmp_path):
     other = line.replace("a,", "b,", 1)
     path.write_text(line * 2 + other * 2)
     with pytest.raises(ValueError, match=r"twice: a, b$"):
-        known_issues.load(path)
+        known_issues.load_known_issues(path)
 
 
 def test_the_projects_own_file_is_valid_and_gives_evidence():
-    for e in known_issues.load():
+    for e in known_issues.load_known_issues():
         assert len(e.evidence) > 20
         assert len(e.reason) > 20
 
@@ -142,7 +145,7 @@ def test_the_projects_own_file_is_valid_and_gives_evidence():
 )
 @pytest.mark.parametrize("engine", ["mujoco", "mujoco@3.12.0"])
 def test_an_entry_covers_what_all_its_patterns_match(changes, spoken_of, engine):
-    who = Subject("tumbling-ball", "single", engine, "MuJoCo", "4.0.0")
+    who = RowContext("tumbling-ball", "single", engine, "MuJoCo", "4.0.0")
     assert covers(entry(**changes), row(who=who)) is spoken_of
 
 
@@ -156,7 +159,7 @@ def test_an_entry_covers_what_all_its_patterns_match(changes, spoken_of, engine)
     ],
 )
 def test_versions_that_are_none_and_those_before_a_release(version, versions, inside):
-    who = Subject("tumbling-ball", "single", "mujoco", "MuJoCo", version)
+    who = RowContext("tumbling-ball", "single", "mujoco", "MuJoCo", version)
     assert covers(entry(versions=versions), row(who=who)) is inside
 
 
@@ -178,21 +181,21 @@ def test_lists_of_several_fields_are_an_entry_for_each_pair(tmp_path):
     path = tmp_path / "known.yaml"
     lists = "scenario: x, integrator: [RK4, Euler], quantity: [order, position]"
     path.write_text(f"- {{id: a, {lists}, engine: z, verdict: failed, evidence: e, reason: r}}\n")
-    found = known_issues.load(path)
+    found = known_issues.load_known_issues(path)
     assert [(e.integrator, e.quantity) for e in found] == [
         ("RK4", "order"), ("RK4", "position"), ("Euler", "order"), ("Euler", "position"),
     ]  # fmt: skip
     assert [e.id for e in found][:2] == ["a: RK4: order", "a: RK4: position"]
     path.write_text("")
-    assert known_issues.load(path) == []
+    assert known_issues.load_known_issues(path) == []
 
 
 def test_what_an_entry_does_not_say_is_anything():
     bare = {name: ENTRY[name] for name in ("id", "scenario", "engine", "verdict", "evidence", "reason")}
-    about = known_issues.Entry(**bare)
+    about = known_issues.KnownIssue(**bare)
     for level, integrator, quantity in (("state", "-", "energy"), ("trajectory", "RK4", "position_limit")):
-        assert covers(about, WHO.row(level, integrator, quantity, "disagrees", "why"))
-    assert not about.sometimes and about.versions == ""
+        assert covers(about, WHO.make_row(level, integrator, quantity, "disagrees", "why"))
+    assert not about.intermittent and about.versions == ""
     with pytest.raises(ValueError, match="frozen"):
         about.quantity = "energy"
 

@@ -9,10 +9,10 @@ import os
 import pytest
 
 from plumbline.engines.registry import ENGINES
-from plumbline.execution.runner import Plan, describe_all
-from plumbline.execution.scenario_run import Bench
+from plumbline.execution.runner import Plan, describe_engines
+from plumbline.execution.scenario_run import ScenarioRun
 from plumbline.judging import known_issues
-from plumbline.processes.workers import Limits, Workers
+from plumbline.processes.workers import Limits, WorkerPool
 from plumbline.scenario import loader
 
 LONG = 5  # bodies: longer chains climb their ladders in the full form only
@@ -21,7 +21,7 @@ LEVELS = ("state", "trajectory")
 
 def cells():
     for name, path in loader.catalogue().items():
-        bodies = loader.load(path).model.n
+        bodies = loader.load_scenario(path).model.n
         for engine in ENGINES:
             for level in LEVELS:
                 marks = [pytest.mark.xdist_group(name)]  # one process per scenario: its truth is found once
@@ -34,13 +34,13 @@ def cells():
 
 @pytest.fixture(scope="session")
 def workers():
-    with Workers(1 if "PYTEST_XDIST_WORKER" in os.environ else os.cpu_count() or 1) as pool:
+    with WorkerPool(1 if "PYTEST_XDIST_WORKER" in os.environ else os.cpu_count() or 1) as pool:
         yield pool
 
 
 @pytest.fixture(scope="session")
 def engines(workers):
-    return describe_all(workers, list(ENGINES))
+    return describe_engines(workers, list(ENGINES))
 
 
 @pytest.fixture(scope="session")
@@ -51,30 +51,30 @@ def truths():
 @pytest.mark.parametrize(("name", "engine", "level"), list(cells()))
 @pytest.mark.timeout(900)
 def test_cell(name, engine, level, workers, engines, truths):
-    found = loader.load(loader.find(name))
+    found = loader.load_scenario(loader.find_scenario_file(name))
     info = engines[engine]
     if info.missing:
         pytest.skip(info.missing)
     if level == "trajectory" and not info.integrators:
         pytest.skip(f"{info.title} answers at state level only: its integrators are another column's")
     plan = Plan([found], [engine], level, limits=Limits(600))
-    bench = Bench(plan, found, {engine: info})
+    bench = ScenarioRun(plan, found, {engine: info})
     known_truth = truths.get((name, level))
-    tasks = [*(bench.take(known_truth) if known_truth else []), *bench.tasks()]
+    tasks = [*(bench.on_outcome(known_truth) if known_truth else []), *bench.tasks()]
     while tasks:
         follow = []
         for outcome in workers.run(tasks):
             if outcome.key[1] == "truth":
                 truths[name, level] = outcome
-            follow += bench.take(outcome)
+            follow += bench.on_outcome(outcome)
         tasks = [task for task in follow if task.key[1] != "why"]
     rows = bench.findings().rows
     assert rows, "no answer at all"
-    excuses = known_issues.Excuses(known_issues.load(), finer=False)
+    excuses = known_issues.KnownIssues(known_issues.load_known_issues(), has_extra_refinements=False)
     wrong = [
         f"{r.key} {r.verdict}: {r.reason}"
-        for r in excuses.mark(rows)
-        if r.verdict != "agrees" and r.known is None
+        for r in excuses.mark_known(rows)
+        if r.verdict != "agrees" and r.known_issue is None
     ]
-    stale = [f"known entry {e.id} no longer occurs" for e in excuses.stale(whole=False)]
+    stale = [f"known entry {e.id} no longer occurs" for e in excuses.stale_issues(is_full_matrix=False)]
     assert not wrong + stale, "\n".join(wrong + stale)

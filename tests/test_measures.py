@@ -9,17 +9,17 @@ import pytest
 
 from plumbline.model.datatypes import Array, Model, Trajectory
 from plumbline.model.invariants import (
-    UNITS,
+    INVARIANT_UNITS,
     angular_momentum,
     attitude_error,
-    invariants,
-    joint_rates,
+    compute_invariants,
+    joint_vector_rates,
     kinetic_energy,
     position_error,
     potential_energy,
-    work,
+    work_of_loads,
 )
-from plumbline.model.kinematics import joint_vectors, lift, multiply, rate
+from plumbline.model.kinematics import joint_vectors, quaternion_product, quaternion_rate, state_from_minimal
 from tests import newton_euler, pendulums
 from tests.random_chains import random_chain
 
@@ -46,7 +46,13 @@ def test_attitude_error_is_the_largest_rotation_angle(angle: float) -> None:
     p /= np.linalg.norm(p, axis=-1, keepdims=True)
     axis = np.array([2.0, -1.0, 2.0]) / 3
     turn, less = (np.array([np.cos(x / 2), *(np.sin(x / 2) * axis)]) for x in (angle, angle / 2))
-    q = np.stack([multiply(p[:, 0], np.tile(less, (4, 1))), multiply(p[:, 1], np.tile(turn, (4, 1)))], 1)
+    q = np.stack(
+        [
+            quaternion_product(p[:, 0], np.tile(less, (4, 1))),
+            quaternion_product(p[:, 1], np.tile(turn, (4, 1))),
+        ],
+        1,
+    )
     q[1::2] *= -1  # the same attitude
     assert attitude_error(p, q) == pytest.approx(np.full(4, angle), rel=1e-6)
     assert attitude_error(p * 1.1, q * 0.7) == pytest.approx(np.full(4, angle), rel=1e-6)
@@ -72,7 +78,7 @@ def run_with(model: Model, power: Array, times: Array) -> Trajectory:
     omega = still.copy()
     omega[:, 0, 0] = power
     p = np.tile([1.0, 0, 0, 0], (len(times), model.n, 1))
-    return Trajectory(times, still, p, still, rate(p, omega), 1)
+    return Trajectory(times, still, p, still, quaternion_rate(p, omega), 1)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 4, 5])
@@ -84,11 +90,13 @@ def test_work_of_a_moment_is_the_integral_of_its_power(degree: int) -> None:
     times = np.linspace(0, 2, 25)
     run = run_with(model, times**degree, times)
     omega = 2 * run.pdot[..., 1:]
-    done, uncertainty = work(replace(model, moment=moment), run, omega)
+    done, uncertainty = work_of_loads(replace(model, moment=moment), run, omega)
     np.testing.assert_allclose(done, times ** (degree + 1) / (degree + 1), rtol=0, atol=1e-12)
     assert (uncertainty < 1e-12) == (degree <= 3)
     drag = replace(model, drag_moment=np.array([0.5, 0.0]))
-    lost, _ = work(drag, run_with(model, times**2, times), 2 * run_with(model, times**2, times).pdot[..., 1:])
+    lost, _ = work_of_loads(
+        drag, run_with(model, times**2, times), 2 * run_with(model, times**2, times).pdot[..., 1:]
+    )
     np.testing.assert_allclose(lost, -0.5 * times**5 / 5, rtol=0, atol=1e-12)
 
 
@@ -101,10 +109,10 @@ def test_work_of_a_force_needs_no_quadrature_and_drag_takes() -> None:
     v[:, 1, 2] = times**2
     p = np.tile([1.0, 0, 0, 0], (25, 2, 1))
     run, still = Trajectory(times, r, p, v, 0 * p, 1), np.zeros((25, 2, 3))
-    done, uncertainty = work(replace(model, force=force), run, still)
+    done, uncertainty = work_of_loads(replace(model, force=force), run, still)
     np.testing.assert_allclose(done, np.sum(force * (r - r[0]), axis=(1, 2)), rtol=0, atol=1e-14)
     assert uncertainty == 0.0
-    lost, _ = work(replace(model, drag_force=np.array([7.0, 3.0])), run, still)
+    lost, _ = work_of_loads(replace(model, drag_force=np.array([7.0, 3.0])), run, still)
     np.testing.assert_allclose(lost, -3 * times**5 / 5, rtol=0, atol=1e-12)
 
 
@@ -114,7 +122,9 @@ def test_the_quadrature_knows_its_error(count: int, sharp: float) -> None:
     model, _ = random_chain(np.random.default_rng(75), [False])
     times = np.linspace(0, 2, count)
     run = run_with(model, np.cos(9 * times), times)
-    done, uncertainty = work(replace(model, moment=np.array([[1.0, 0, 0]])), run, 2 * run.pdot[..., 1:])
+    done, uncertainty = work_of_loads(
+        replace(model, moment=np.array([[1.0, 0, 0]])), run, 2 * run.pdot[..., 1:]
+    )
     error = float(np.max(np.abs(done - np.sin(9 * times) / 9)))
     assert 0 < error <= uncertainty < sharp
 
@@ -123,7 +133,9 @@ def test_too_few_samples_do_no_quadrature() -> None:
     model, _ = random_chain(np.random.default_rng(76), [False])
     times = np.linspace(0, 1, 12)
     run = run_with(model, 1 + times, times)
-    done, uncertainty = work(replace(model, moment=np.array([[1.0, 0, 0]])), run, 2 * run.pdot[..., 1:])
+    done, uncertainty = work_of_loads(
+        replace(model, moment=np.array([[1.0, 0, 0]])), run, 2 * run.pdot[..., 1:]
+    )
     assert not np.any(done) and uncertainty == 0.0
 
 
@@ -131,7 +143,7 @@ def test_too_few_samples_do_no_quadrature() -> None:
 @pytest.mark.parametrize("rods", [[False, False], [True, False], [True]], ids=str)
 def test_true_motion_has_no_drift(rods: list[bool], options: dict[str, bool]) -> None:
     model, run = motion(rods, np.linspace(0, 1, 161), **options)
-    found = invariants(model, run)
+    found = compute_invariants(model, run)
     size = float(np.max(kinetic_energy(model, run.v, 2 * run.pdot[..., 1:]))) + 9.81
     assert np.max(np.abs(found.energy_drift)) <= found.work_uncertainty + 1e-11 * size
     assert found.energy_drift[0, 0, 0] == 0.0
@@ -143,13 +155,13 @@ def test_true_motion_has_no_drift(rods: list[bool], options: dict[str, bool]) ->
         series = getattr(found, name)
         assert series.shape == (161, len(rods), width)
         assert np.max(np.abs(series)) < 1e-13, name
-    assert set(UNITS) <= set(vars(found))
+    assert set(INVARIANT_UNITS) <= set(vars(found))
 
 
 def test_a_gap_is_the_vector_of_a_ball_and_the_stretch_of_a_rod() -> None:
     model, run = motion([False, True])
     away, faster = np.array([1e-3, -2e-3, 3e-3]), np.array([4e-3, 1e-3, -2e-3])
-    moved = invariants(model, replace(run, r=run.r + away, v=run.v + faster))
+    moved = compute_invariants(model, replace(run, r=run.r + away, v=run.v + faster))
     np.testing.assert_allclose(moved.joint_gap[:, 0], np.tile(away, (41, 1)), atol=1e-14)
     np.testing.assert_allclose(moved.gap_rate[:, 0], np.tile(faster, (41, 1)), atol=1e-13)
     assert np.max(np.abs(moved.joint_gap[:, 1])) < 1e-13, "the second body moved with the first"
@@ -157,12 +169,14 @@ def test_a_gap_is_the_vector_of_a_ball_and_the_stretch_of_a_rod() -> None:
     r[:, 1, 0] += 1e-3
     v[:, 1, 1] += 1e-3
     down = replace(run, r=r, v=v)
-    stretched = invariants(model, down)
+    stretched = compute_invariants(model, down)
     d = lift_of_joint(model, run)
     d[:, 0] += 1e-3
     long = np.linalg.norm(d, axis=-1)
     np.testing.assert_allclose(stretched.joint_gap[:, 1, 0], long - model.length[1], atol=1e-14)
-    rates = joint_rates(model, down, 2 * multiply(run.p * [1, -1, -1, -1], run.pdot)[..., 1:])[:, 1]
+    rates = joint_vector_rates(
+        model, down, 2 * quaternion_product(run.p * [1, -1, -1, -1], run.pdot)[..., 1:]
+    )[:, 1]
     np.testing.assert_allclose(stretched.gap_rate[:, 1, 0], np.sum(d * rates, -1) / long, atol=1e-13)
     assert not np.any(stretched.joint_gap[:, 1, 1:]) and not np.any(stretched.gap_rate[:, 1, 1:])
     assert np.max(np.abs(stretched.joint_gap[:, 1, 0])) > 1e-5
@@ -171,7 +185,7 @@ def test_a_gap_is_the_vector_of_a_ball_and_the_stretch_of_a_rod() -> None:
 def test_the_ends_of_a_rod_in_one_place_are_its_length_off() -> None:
     model, _ = random_chain(np.random.default_rng(78), [True])
     model = replace(model, proximal=np.zeros((1, 3)))
-    found = invariants(model, run_with(model, TIMES, TIMES))
+    found = compute_invariants(model, run_with(model, TIMES, TIMES))
     np.testing.assert_array_equal(found.joint_gap[:, 0, 0], -model.length[0])
     assert not np.any(found.gap_rate), "a stretch has no direction there"
 
@@ -181,7 +195,7 @@ def lift_of_joint(model: Model, run: Trajectory) -> Array:
     found = []
     for r, p in zip(run.r, run.p, strict=True):
         still = np.zeros((2, 3))
-        hung = lift(replace(model, length=np.zeros(2)), p, still, still, still).r
+        hung = state_from_minimal(replace(model, length=np.zeros(2)), p, still, still, still).r
         found.append(r[1] - hung[1] - (r[0] - hung[0]))
     return np.array(found)
 
@@ -192,8 +206,8 @@ def test_joint_rates_are_the_slopes_of_the_joint_vectors(rods: list[bool]) -> No
     model, run = motion(rods)
     rng, h = np.random.default_rng(77), 1e-6
     drift = rng.normal(size=(len(rods), 3))
-    omega = 2 * multiply(run.p * [1, -1, -1, -1], run.pdot)[..., 1:]
-    rates = joint_rates(model, replace(run, v=run.v + drift), omega)
+    omega = 2 * quaternion_product(run.p * [1, -1, -1, -1], run.pdot)[..., 1:]
+    rates = joint_vector_rates(model, replace(run, v=run.v + drift), omega)
     ends = [joint_vectors(model, run.r + s * h * (run.v + drift), run.p + s * h * run.pdot) for s in (1, -1)]
     np.testing.assert_allclose(rates, (ends[0] - ends[1]) / (2 * h), rtol=0, atol=1e-8)
     assert np.max(np.abs(rates)) > 0.1
@@ -202,15 +216,15 @@ def test_joint_rates_are_the_slopes_of_the_joint_vectors(rods: list[bool]) -> No
 def test_what_is_not_conserved_is_not_judged() -> None:
     """Momentum about gravity: not with loads, drag or without gravity; energy by a shift, norm as it is."""
     model, run = motion([False])
-    assert invariants(replace(model, gravity=np.zeros(3)), run).momentum_drift is None
-    light, usual = (invariants(replace(model, gravity=x * model.gravity), run) for x in (1e-2, 1))
+    assert compute_invariants(replace(model, gravity=np.zeros(3)), run).momentum_drift is None
+    light, usual = (compute_invariants(replace(model, gravity=x * model.gravity), run) for x in (1e-2, 1))
     np.testing.assert_allclose(light.momentum_drift, usual.momentum_drift, rtol=0, atol=1e-15)
-    assert invariants(replace(model, force=np.ones((1, 3))), run).momentum_drift is None
-    assert invariants(replace(model, drag_moment=np.ones(1)), run).momentum_drift is None
-    long = invariants(model, replace(run, p=1.01 * run.p))
+    assert compute_invariants(replace(model, force=np.ones((1, 3))), run).momentum_drift is None
+    assert compute_invariants(replace(model, drag_moment=np.ones(1)), run).momentum_drift is None
+    long = compute_invariants(model, replace(run, p=1.01 * run.p))
     np.testing.assert_allclose(long.norm_drift, 0.01, atol=1e-13)
     faster = replace(run, v=np.concatenate([run.v[:1], 2 * run.v[1:]]))
-    shifted = invariants(model, faster)
+    shifted = compute_invariants(model, faster)
     extra = 1.5 * model.mass[0] * np.sum(run.v[1:, 0] ** 2, -1)
     np.testing.assert_allclose(shifted.energy_drift[1:, 0, 0], extra, atol=1e-11)
     about = model.mass[0] * np.cross(run.r[1:, 0], run.v[1:, 0]) @ [0, 0, -1.0]

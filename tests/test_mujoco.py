@@ -31,12 +31,12 @@ def swinging(joints, loaded=False):
     p /= np.linalg.norm(p, axis=1, keepdims=True)  # turns s_prox upwards
     rng = np.random.default_rng(len(joints))
     turn = np.hstack([np.ones((subject.n, 1)), 0.4 * rng.normal(size=(subject.n, 3))])
-    p = kinematics.multiply(turn / np.linalg.norm(turn, axis=1, keepdims=True), p)
+    p = kinematics.quaternion_product(turn / np.linalg.norm(turn, axis=1, keepdims=True), p)
     u = np.where(subject.rods[:, None], [0, 0, -1.0] + 0.4 * rng.normal(size=(subject.n, 3)), 0.0)
     u /= np.where(subject.rods, np.linalg.norm(u, axis=1), 1)[:, None]
     udot = np.cross(rng.normal(size=(subject.n, 3)), u)
     p /= np.linalg.norm(p, axis=1, keepdims=True)
-    return subject, kinematics.lift(subject, p, rng.normal(size=(subject.n, 3)), u, udot)
+    return subject, kinematics.state_from_minimal(subject, p, rng.normal(size=(subject.n, 3)), u, udot)
 
 
 def study(joints, integrator, coarsest, levels, powers, loaded=False):
@@ -116,7 +116,7 @@ def test_flat_bodies_and_points_on_the_joint():
     subject = replace(
         subject, inertia=J, mass=np.array([1.0, 1e-9]), proximal=np.array([[0, 0, 0.0], [0.1, 0, 0]])
     )
-    at = kinematics.lift(subject, at.p, at.omega, at.u, at.udot)
+    at = kinematics.state_from_minimal(subject, at.p, at.omega, at.u, at.udot)
     (got,) = worker.call("mujoco", "evaluate", subject, [at])
     true = newton_euler.solve(subject, at)
     np.testing.assert_allclose(got.acceleration, true.acceleration, rtol=1e-10, atol=1e-10)

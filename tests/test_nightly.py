@@ -7,16 +7,22 @@ import numpy as np
 import pytest
 
 from plumbline.cli.main import nightly
-from plumbline.cli.nightly import Night
-from plumbline.execution.random_batch import Probes
-from plumbline.execution.runner import Result
-from plumbline.judging.rows import Subject
-from plumbline.processes.cpu_time import Split
+from plumbline.cli.nightly import NightPlan
+from plumbline.execution.random_batch import RandomBatch
+from plumbline.execution.runner import RunResult
+from plumbline.judging.rows import RowContext
+from plumbline.processes.cpu_time import CpuTimes
 from plumbline.processes.workers import Limits
 from plumbline.scenario import loader
-from plumbline.scenario.generator import FAMILY, MOST_BODIES, RandomScenarios, document, random_scenario
+from plumbline.scenario.generator import (
+    MAX_RANDOM_BODIES,
+    RANDOM_FAMILY,
+    RandomScenarios,
+    random_document,
+    random_scenario,
+)
 from plumbline.storage.history import History
-from plumbline.storage.results_store import Tables, read_table
+from plumbline.storage.results_store import ResultTables, read_table
 
 
 def quiet(*_):
@@ -33,7 +39,7 @@ def test_a_random_scenario_depends_on_its_seed_and_number_alone():
 def test_random_scenarios_cover_what_they_promise():
     drawn = list(RandomScenarios(1, 300))
     mass = np.concatenate([s.model.mass for s in drawn])
-    assert {s.model.n for s in drawn} == set(range(1, MOST_BODIES + 1))
+    assert {s.model.n for s in drawn} == set(range(1, MAX_RANDOM_BODIES + 1))
     assert mass.min() < 1e-2 and mass.max() > 1e2
     assert any(s.model.has_loads for s in drawn) and any(s.model.has_drag for s in drawn)
     rods = np.concatenate([s.model.rods for s in drawn])
@@ -44,12 +50,12 @@ def test_random_scenarios_cover_what_they_promise():
 
 def test_a_random_scenario_is_a_file_like_any_other(tmp_path):
     path = tmp_path / "some.yaml"
-    path.write_text(json.dumps(document(3, 4)))
-    assert loader.load(path).digest == random_scenario(3, 4).digest
+    path.write_text(json.dumps(random_document(3, 4)))
+    assert loader.load_scenario(path).digest == random_scenario(3, 4).digest
 
 
 def run(out, **more):
-    chosen = loader.load_many(["rest"])
+    chosen = loader.load_scenarios(["rest"])
     options = {"random": 3, "seed": 11, "jobs": 1, "limits": Limits(), "whole": False, "finer": 0} | more
     progress = options.pop("progress", quiet)
     return nightly.nightly(
@@ -66,8 +72,11 @@ def test_a_night_is_whole_and_remembered(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["history"]
     stored = json.loads((place / "results.json").read_text())["run"]
     assert (stored["seed"], stored["random"]) == (11, 3)
-    assert not [r for r in result.rows if r.family == FAMILY], "what agrees is folded"
-    folded, random = result.probes.folded, [r for r in read_table(place, "summary") if r["family"] == FAMILY]
+    assert not [r for r in result.rows if r.family == RANDOM_FAMILY], "what agrees is folded"
+    folded, random = (
+        result.probes.folded,
+        [r for r in read_table(place, "summary") if r["family"] == RANDOM_FAMILY],
+    )
     assert {r["scenario"] for r in random} == {f"random-11-{k}" for k in range(3)}
     assert all(r["level"] == "state" for r in random) and folded.total() == len(random)
     assert stored["probes"]["scenarios"] == 3 and len(stored["probes"]["worst"]) == 7
@@ -111,24 +120,29 @@ def test_an_unfinished_night_goes_on_with_its_seed(tmp_path):
 @pytest.mark.parametrize("spoilt", ["", "{", '{"seed": 1}', "[]"])
 def test_a_damaged_plan_begins_a_new_night(tmp_path, spoilt):
     (tmp_path / "plan.json").write_text(spoilt)
-    night = Night.begun(tmp_path, None, 7)
-    assert Night.begun(tmp_path, None, 7) == night
-    assert Night.begun(tmp_path, night.seed + 1, 7) != night
+    night = NightPlan.resume_or_start(tmp_path, None, 7)
+    assert NightPlan.resume_or_start(tmp_path, None, 7) == night
+    assert NightPlan.resume_or_start(tmp_path, night.seed + 1, 7) != night
 
 
 def test_what_someone_should_see_is_kept_whole_with_its_file(tmp_path):
     drawn = RandomScenarios(2, 3)
-    probes, kept = Probes(), []
+    probes, kept = RandomBatch(), []
     for s, verdict in zip(drawn, ("agrees", "disagrees", "unsupported"), strict=True):
-        who = Subject(s.name, FAMILY, "mujoco", "MuJoCo", "4")
-        fine = who.row("state", "-", "joint_reaction", "agrees", "why", extra={"ratio": 0.5})
+        who = RowContext(s.name, RANDOM_FAMILY, "mujoco", "MuJoCo", "4")
+        fine = who.make_row("state", "-", "joint_reaction", "agrees", "why", extra={"ratio": 0.5})
         other = replace(fine, engine="exudyn")
-        kept += probes.take([other, fine, who.row("state", "-", "acceleration", verdict, "why")])
+        kept += probes.add_scenario([other, fine, who.make_row("state", "-", "acceleration", verdict, "why")])
     assert [r.verdict for r in kept] == ["agrees", "disagrees", "agrees", "unsupported"]
     assert {r.engine for r in kept} == {"mujoco"}, "what another engine says calmly of it is folded"
-    assert probes.folded == {"agrees": 5} and probes.worst["mujoco", "joint_reaction"] == (0.5, drawn[0].name)
+    assert probes.counts_by_verdict == {"agrees": 5} and probes.worst_ratios["mujoco", "joint_reaction"] == (
+        0.5,
+        drawn[0].name,
+    )
     excused = replace(kept[-1], known="k")
-    assert probes.take([excused]) == [], "a recorded gap of every probe is only counted"
-    nightly.write_files_of_random(Result(kept, [], {}, {}, probes, Tables(), Split(), {}), drawn, tmp_path)
+    assert probes.add_scenario([excused]) == [], "a recorded gap of every probe is only counted"
+    nightly.write_files_of_random(
+        RunResult(kept, [], {}, {}, probes, ResultTables(), CpuTimes(), {}), drawn, tmp_path
+    )
     found = sorted(tmp_path.iterdir())
-    assert [loader.load(path).digest for path in found] == [drawn[1].digest, drawn[2].digest]
+    assert [loader.load_scenario(path).digest for path in found] == [drawn[1].digest, drawn[2].digest]

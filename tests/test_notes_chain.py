@@ -6,7 +6,7 @@ import pytest
 from reference_impl import notes
 from reference_impl.chain import Chain
 from reference_impl.euler_parameters import dot
-from reference_impl.joints import rows
+from reference_impl.joints import constraint_rows
 from tests.notes_cases import Symbols, off_manifold, on_manifold, random_chain
 
 
@@ -17,7 +17,7 @@ def symbolic(rods):
     none = np.zeros(n)
     length = np.where(rods, np.arange(2, 2 + n), 0)
     chain = Chain(none, none, x.s[:n], x.s[n:], length, none, none, none, none, none)
-    return x, chain, rows(chain, x.r, x.p, x.v, x.pdot)
+    return x, chain, constraint_rows(chain, x.r, x.p, x.v, x.pdot)
 
 
 def jacobians(joints, n):
@@ -55,7 +55,7 @@ def test_every_mix_of_two_differentiates(rods):
     C_r, C_p = jacobians(joints, len(rods))
     assert x.zero(C_r - x.gradient(joints.C, x.r.ravel()))
     assert x.zero(C_p - x.gradient(joints.C, x.p.ravel()))
-    assert x.zero(joints.rate(x.v, x.pdot) - x.rate(joints.C))
+    assert x.zero(joints.constraint_rate(x.v, x.pdot) - x.rate(joints.C))
     true = -x.rate(C_r) @ x.v.ravel() - x.rate(C_p) @ x.pdot.ravel()
     ball = ~np.array(rods)[joints.joint]
     assert x.zero((true - joints.gamma)[ball])
@@ -69,27 +69,27 @@ def test_a_long_mixed_chain_differentiates_by_complex_step(states):
     chain = random_chain(rng, [True, False, True, True, False, False, True])
     r, p, v, pdot = states(chain, rng)
     pdot = pdot - p * (dot(p, pdot) / dot(p, p))[:, None]
-    joints, h = rows(chain, r, p, v, pdot), 1e-30
-    moved = rows(chain, r + 1j * h * v, p + 1j * h * pdot, v.astype(complex), pdot.astype(complex))
-    np.testing.assert_allclose(joints.rate(v, pdot), moved.C.imag / h, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(-joints.gamma, moved.rate(v, pdot).imag / h, rtol=0, atol=1e-13)
+    joints, h = constraint_rows(chain, r, p, v, pdot), 1e-30
+    moved = constraint_rows(chain, r + 1j * h * v, p + 1j * h * pdot, v.astype(complex), pdot.astype(complex))
+    np.testing.assert_allclose(joints.constraint_rate(v, pdot), moved.C.imag / h, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(-joints.gamma, moved.constraint_rate(v, pdot).imag / h, rtol=0, atol=1e-13)
 
 
 def test_consistent_states_satisfy_every_row():
     rng = np.random.default_rng(1)
     chain = random_chain(rng, [True, False, False, True, True])
     r, p, v, pdot = on_manifold(chain, rng)
-    joints = rows(chain, r, p, v, pdot)
+    joints = constraint_rows(chain, r, p, v, pdot)
     assert len(joints.C) == 9
     np.testing.assert_allclose(joints.C, 0, atol=1e-15)
-    np.testing.assert_allclose(joints.rate(v, pdot), 0, atol=1e-14)
+    np.testing.assert_allclose(joints.constraint_rate(v, pdot), 0, atol=1e-14)
     np.testing.assert_allclose(np.linalg.norm(joints.d, axis=1), chain.length, atol=1e-15)
 
 
 def test_a_balls_rows_keep_their_order_in_a_long_chain():
     rng = np.random.default_rng(2)
     chain = random_chain(rng, [True, False, False] * 15)
-    joints = rows(chain, *on_manifold(chain, rng))
+    joints = constraint_rows(chain, *on_manifold(chain, rng))
     assert np.all(np.diff(joints.joint) >= 0)
     balls = joints.r_near[~chain.rods[joints.joint]].reshape(-1, 3, 3)
     np.testing.assert_array_equal(balls, np.broadcast_to(np.eye(3), (30, 3, 3)))

@@ -14,7 +14,7 @@ from reference_impl.euler_parameters import (
     angular_velocity,
     dAs_dp,
     dot,
-    rate,
+    euler_parameter_rate,
     tilde,
 )
 from tests.notes_cases import Symbols
@@ -70,7 +70,7 @@ def test_angular_velocity_is_the_rotation_rate():
     q = rng.normal(size=(20, 4))
     q /= np.linalg.norm(q, axis=1, keepdims=True)
     omega = rng.normal(size=(20, 3))
-    qdot = rate(q, omega)
+    qdot = euler_parameter_rate(q, omega)
     np.testing.assert_allclose(angular_velocity(q, qdot), omega, atol=2e-15)
     np.testing.assert_allclose(dot(q, qdot), 0, atol=1e-15)
     np.testing.assert_allclose(A_rate(q, qdot), A(q) @ tilde(omega), atol=5e-15)

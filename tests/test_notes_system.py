@@ -8,11 +8,11 @@ from scipy.special import ellipk
 
 from reference_impl import integrate as integrator
 from reference_impl import notes
-from reference_impl.direct import System, power_of_two, singular, solve_dense
+from reference_impl.direct import DirectSystem, is_singular, power_of_two_scale, solve_dense
 from reference_impl.euler_parameters import A, L, angular_velocity
-from reference_impl.euler_parameters import rate as pdot_of
-from reference_impl.integrate import integrate, natural_sizes, pack, rate, unpack
-from reference_impl.joints import rows
+from reference_impl.euler_parameters import euler_parameter_rate as pdot_of
+from reference_impl.integrate import integrate_dop853, pack_state, state_rate, state_scales, unpack_state
+from reference_impl.joints import constraint_rows
 from tests.notes_cases import Symbols, off_manifold, on_manifold, random_chain
 
 MIXES = [[True], [False], [True, True], [False, False], [True, False, False, True, False], [False, True] * 5]
@@ -42,8 +42,8 @@ def test_N5_is_assembled_as_printed(n, states):
     rng = np.random.default_rng(n)
     chain = random_chain(rng, [True] * n)
     state = states(chain, rng)
-    S, b = System(chain).assemble(*state)
-    S_printed, b_printed = notes.system(chain, *state)
+    S, b = DirectSystem(chain).assemble(*state)
+    S_printed, b_printed = notes.assemble_system(chain, *state)
     np.testing.assert_allclose(S, S_printed, rtol=1e-14, atol=1e-15)
     np.testing.assert_allclose(b, b_printed, rtol=1e-14, atol=1e-14)
 
@@ -55,11 +55,11 @@ def test_the_band_and_the_dense_form_give_the_same_solution(rods, states):
     rng = np.random.default_rng(len(rods))
     chain = random_chain(rng, rods)
     state = states(chain, rng)
-    system = System(chain)
+    system = DirectSystem(chain)
     S, b = system.assemble(*state)
     x, dense = vector(system.solve(*state)), solve_dense(S, b)
     np.testing.assert_allclose(x, dense, rtol=0, atol=1e-14 * np.max(np.abs(dense)))
-    read, densely = system.solve(*state), system.solve_densely(*state)
+    read, densely = system.solve(*state), system.solve_with_dense_factors(*state)
     np.testing.assert_array_equal(vector(densely), dense)
     reaction = 1e-13 * np.max(np.abs(read.joint_reaction))
     np.testing.assert_allclose(densely.joint_reaction, read.joint_reaction, rtol=0, atol=reaction)
@@ -75,7 +75,7 @@ def test_the_solution_obeys_newton_and_euler(rods, without):
     chain = random_chain(rng, rods)
     chain = dataclasses.replace(chain, **{name: np.zeros(chain.n) for name in without})
     r, p, v, pdot = on_manifold(chain, rng)
-    x = System(chain).solve(r, p, v, pdot)
+    x = DirectSystem(chain).solve(r, p, v, pdot)
     omega, turn = angular_velocity(p, pdot), A(p)
     near, far = x.joint_reaction, -np.concatenate([x.joint_reaction[1:], np.zeros((1, 3))])
     load = chain.mass[:, None] * chain.gravity + chain.force - chain.drag_force[:, None] * v
@@ -98,11 +98,11 @@ def test_units_do_not_decide_the_digits():
     rng = np.random.default_rng(5)
     chain = random_chain(rng, [True, False, True])
     state = on_manifold(chain, rng)
-    x = System(chain).solve(*state)
+    x = DirectSystem(chain).solve(*state)
     loads = ("mass", "inertia", "force", "moment", "drag_force", "drag_moment")
     for scale in (2.0**-30, 2.0**30):
         scaled = dataclasses.replace(chain, **{name: scale * getattr(chain, name) for name in loads})
-        y = System(scaled).solve(*state)
+        y = DirectSystem(scaled).solve(*state)
         np.testing.assert_allclose(y.acceleration, x.acceleration, rtol=0, atol=1e-13)
         np.testing.assert_allclose(y.joint_reaction / scale, x.joint_reaction, rtol=0, atol=1e-13)
 
@@ -120,7 +120,7 @@ def test_refinement_solves_every_row_to_its_own_rounding():
             chain, mass=chain.mass * scale, inertia=chain.inertia * scale[:, None, None]
         )
         state = on_manifold(chain, rng)
-        system = System(chain)
+        system = DirectSystem(chain)
         S, b = system.assemble(*state)
         fullest = np.max(np.count_nonzero(S, axis=1))
         for x in (vector(system.solve(*state)), solve_dense(S, b)):
@@ -134,9 +134,11 @@ def test_a_planted_defect_is_added_to_every_gamma():
     rng = np.random.default_rng(14)
     chain = random_chain(rng, [True, False, True])
     state = on_manifold(chain, rng)
-    joints, delta = rows(chain, *state), np.arange(1.0, 6.0)
-    x = System(chain).solve(*state, gamma_defect=delta)
-    np.testing.assert_allclose(joints.rate(x.acceleration, x.pddot) - joints.gamma, delta, atol=1e-11)
+    joints, delta = constraint_rows(chain, *state), np.arange(1.0, 6.0)
+    x = DirectSystem(chain).solve(*state, gamma_defect=delta)
+    np.testing.assert_allclose(
+        joints.constraint_rate(x.acceleration, x.pddot) - joints.gamma, delta, atol=1e-11
+    )
     still = 2 * np.sum(state[1] * x.pddot, axis=1) + 2 * np.sum(state[3] ** 2, axis=1)
     np.testing.assert_allclose(still, 0, atol=1e-12)
 
@@ -147,13 +149,13 @@ def test_units_do_not_decide_the_steps_of_N6():
     chain = random_chain(rng, [False], loads=False)
     r, p, v, pdot = on_manifold(chain, rng)
     times, unit = np.array([0.0, 0.5]), 2.0**-10
-    here = integrate(chain, r, p, v, pdot, times, 1e-6)
+    here = integrate_dop853(chain, r, p, v, pdot, times, 1e-6)
     small = dataclasses.replace(
         chain,
         inertia=unit**2 * chain.inertia,
         **{name: unit * getattr(chain, name) for name in ("proximal", "distal", "gravity")},
     )
-    there = integrate(small, unit * r, p, unit * v, pdot, times, 1e-6)
+    there = integrate_dop853(small, unit * r, p, unit * v, pdot, times, 1e-6)
     # the very same steps: what differs is rounding (4 ε a step and coordinate), far below a step's 1e-6
     assert there.steps == here.steps
     np.testing.assert_allclose(there.r, unit * here.r, rtol=1e-9)
@@ -164,7 +166,7 @@ def test_a_vanishing_step_of_N6_is_an_error():
     chain = random_chain(rng, [False])
     stiff = dataclasses.replace(chain, drag_force=np.array([1e17]))
     with pytest.raises(ArithmeticError, match="DOP853 stopped at t = "):
-        integrate(stiff, *on_manifold(chain, rng), np.array([1.0, 2.0]), 1e-6)
+        integrate_dop853(stiff, *on_manifold(chain, rng), np.array([1.0, 2.0]), 1e-6)
 
 
 def test_energy_changes_by_the_power_of_the_loads():
@@ -172,7 +174,7 @@ def test_energy_changes_by_the_power_of_the_loads():
     rng = np.random.default_rng(6)
     chain = random_chain(rng, [True, False, True, False])
     r, p, v, pdot = on_manifold(chain, rng)
-    x = System(chain).solve(r, p, v, pdot)
+    x = DirectSystem(chain).solve(r, p, v, pdot)
     omega, omega_dot = angular_velocity(p, pdot), 2 * (L(p) @ x.pddot[..., None])[..., 0]
     inertial = np.einsum("nij,nj->ni", chain.inertia, omega)
     energy_rate = np.sum(chain.mass[:, None] * v * (x.acceleration - chain.gravity)) + np.sum(
@@ -187,12 +189,12 @@ def test_N6_orders_y_as_r_p_v_pdot():
     rng = np.random.default_rng(8)
     chain = random_chain(rng, [True, False])
     state = on_manifold(chain, rng)
-    y = pack(*state)
-    for part, back in zip(state, unpack(y, 2), strict=True):
+    y = pack_state(*state)
+    for part, back in zip(state, unpack_state(y, 2), strict=True):
         np.testing.assert_array_equal(part, back)
-    system = System(chain)
+    system = DirectSystem(chain)
     x = system.solve(*state)
-    ydot = unpack(rate(system, y), 2)
+    ydot = unpack_state(state_rate(system, y), 2)
     for part, expected in zip(ydot, (state[2], state[3], x.acceleration, x.pddot), strict=True):
         np.testing.assert_array_equal(part, expected)
 
@@ -218,7 +220,7 @@ def test_N6_swings_with_the_exact_period():
     chain, state, period = planar(np.radians(170))
     errors = []
     for rtol in (1e-6, 1e-9, 1e-12):
-        run = integrate(chain, *state, np.array([0, period / 2, period]), rtol)
+        run = integrate_dop853(chain, *state, np.array([0, period / 2, period]), rtol)
         errors.append(np.max(np.abs(run.r[-1] - state[0])))
         np.testing.assert_allclose(run.r[1, 0, 0], -state[0][0, 0], atol=1e3 * rtol)
     assert errors[2] < 1e-9, errors
@@ -230,11 +232,11 @@ def test_samples_do_not_change_the_steps():
     rng = np.random.default_rng(9)
     chain = random_chain(rng, [True, False])
     state = on_manifold(chain, rng)
-    few = integrate(chain, *state, np.array([0.0, 1.0]), 1e-10)
-    many = integrate(chain, *state, np.linspace(0, 1, 101), 1e-10)
+    few = integrate_dop853(chain, *state, np.array([0.0, 1.0]), 1e-10)
+    many = integrate_dop853(chain, *state, np.linspace(0, 1, 101), 1e-10)
     assert (few.steps, few.t.size, many.t.size) == (many.steps, 2, 101)
     np.testing.assert_array_equal(few.r[-1], many.r[-1])
-    gap = np.abs(integrate(chain, *state, np.array([0.0, 0.37]), 1e-10).r[-1] - many.r[37])
+    gap = np.abs(integrate_dop853(chain, *state, np.array([0.0, 0.37]), 1e-10).r[-1] - many.r[37])
     assert np.max(gap) < 1e-9
 
 
@@ -247,7 +249,7 @@ def test_natural_sizes_are_of_the_stretched_chain_its_fall_and_its_motion():
     r, p, v, _ = on_manifold(chain, rng)
 
     def sizes(r, v, omega, chain=chain):
-        y = natural_sizes(chain, r, p, v, pdot_of(p, omega))
+        y = state_scales(chain, r, p, v, pdot_of(p, omega))
         parts = np.split(y, np.cumsum([9, 12, 9]))
         assert [len(part) for part in parts] == [9, 12, 9, 12] and all(np.ptp(part) == 0 for part in parts)
         return [part[0] for part in parts]
@@ -275,14 +277,14 @@ def test_the_structured_form_integrates_the_same_and_steps_are_counted(monkeypat
             return super().step()
 
     monkeypatch.setattr(integrator, "DOP853", Counted)
-    direct = integrate(chain, *state, times, 1e-10)
+    direct = integrate_dop853(chain, *state, times, 1e-10)
     assert direct.steps == len(counted) and direct.evaluations > 10 * direct.steps
-    structured = integrate(chain, *state, times, 1e-10, structured=True)
+    structured = integrate_dop853(chain, *state, times, 1e-10, structured=True)
     assert structured.steps == direct.steps and structured.evaluations == direct.evaluations
     for name in ("r", "p", "v", "pdot"):
         np.testing.assert_allclose(getattr(structured, name), getattr(direct, name), rtol=0, atol=1e-10)
     with pytest.raises(ValueError, match="direct form only"):
-        integrate(chain, *state, times, 1e-10, gamma_defect=1e-9, structured=True)
+        integrate_dop853(chain, *state, times, 1e-10, gamma_defect=1e-9, structured=True)
 
 
 def test_the_printed_system_is_exact_on_complex_numbers():
@@ -291,15 +293,15 @@ def test_the_printed_system_is_exact_on_complex_numbers():
     chain = random_chain(rng, [True, True])
     r, p, v, pdot = on_manifold(chain, rng)
     along, h = rng.normal(size=p.shape), 1e-6
-    S, b = notes.system(chain, r, p + 1e-30j * along, v, pdot)
-    ends = [notes.system(chain, r, p + s * h * along, v, pdot) for s in (1, -1)]
+    S, b = notes.assemble_system(chain, r, p + 1e-30j * along, v, pdot)
+    ends = [notes.assemble_system(chain, r, p + s * h * along, v, pdot) for s in (1, -1)]
     for x, (up, down) in zip((S, b), zip(*ends, strict=True), strict=True):
         np.testing.assert_allclose(x.imag / 1e-30, (up - down) / (2 * h), rtol=0, atol=1e-8)
 
 
 def test_at_rest_stays_at_rest():
     chain, state, _ = planar(0.0)
-    run = integrate(chain, *state, np.linspace(0, 5, 6), 1e-10)
+    run = integrate_dop853(chain, *state, np.linspace(0, 5, 6), 1e-10)
     np.testing.assert_allclose(run.r, np.broadcast_to(state[0], run.r.shape), rtol=0, atol=1e-14)
 
 
@@ -308,7 +310,7 @@ def test_fifty_bodies():
     rng = np.random.default_rng(50)
     chain = random_chain(rng, [False] * 50)
     state = on_manifold(chain, rng)
-    system = System(chain)
+    system = DirectSystem(chain)
     dense = solve_dense(*system.assemble(*state))
     np.testing.assert_allclose(
         vector(system.solve(*state)), dense, rtol=0, atol=1e-13 * np.max(np.abs(dense))
@@ -320,7 +322,7 @@ def test_one_and_two_bodies_are_what_the_notes_print():
     rng = np.random.default_rng(3)
     chain = random_chain(rng, [True] * 3)
     with pytest.raises(ValueError, match="one and two bodies"):
-        notes.system(chain, *on_manifold(chain, rng))
+        notes.assemble_system(chain, *on_manifold(chain, rng))
 
 
 def test_pdot_of_is_on_the_sphere():
@@ -329,19 +331,19 @@ def test_pdot_of_is_on_the_sphere():
     chain = random_chain(rng, [False, True])
     r, p, v, pdot = on_manifold(chain, rng)
     np.testing.assert_allclose(pdot_of(p, angular_velocity(p, pdot)), pdot, atol=1e-15)
-    x = System(chain).solve(r, p, v, pdot)
+    x = DirectSystem(chain).solve(r, p, v, pdot)
     np.testing.assert_allclose(np.sum(p * x.pddot, -1), -np.sum(pdot * pdot, -1), atol=1e-13)
 
 
 def test_equilibration_is_by_the_powers_of_two_that_bring_entries_near_1():
     largest = np.array([3e-9, 0.3, 0.5, 1.0, 2.0, 7.0, 4e11])
-    scale = power_of_two(largest)
+    scale = power_of_two_scale(largest)
     np.testing.assert_array_equal(np.frexp(scale)[0], 0.5)
     assert np.all((scale**2 * largest >= 0.5) & (scale**2 * largest < 2))
-    assert power_of_two(np.zeros(1)).tolist() == [1.0], "an empty row stays as it is"
+    assert power_of_two_scale(np.zeros(1)).tolist() == [1.0], "an empty row stays as it is"
 
 
 @pytest.mark.parametrize("unit", [1e-5, 1.0, 1e5])
 def test_what_is_singular_to_rounding_is_so_in_any_unit(unit):
-    assert singular(unit * np.array([1.0, -1e-17]))
-    assert not singular(unit * np.array([1.0, -1e-14]))
+    assert is_singular(unit * np.array([1.0, -1e-17]))
+    assert not is_singular(unit * np.array([1.0, -1e-14]))

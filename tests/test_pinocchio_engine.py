@@ -12,7 +12,7 @@ import pytest
 
 from plumbline.model import kinematics
 from plumbline.model.datatypes import Unsupported
-from plumbline.scenario.loader import find, load
+from plumbline.scenario.loader import find_scenario_file, load_scenario
 from tests import newton_euler, pendulums, worker
 from tests.pendulums import JOINTS
 
@@ -69,7 +69,7 @@ def test_aba_loses_the_symmetry_of_articulated_inertias():
     """A finding about pin: if this fails, its aba got better; then crba can leave the adapter's docstring."""
     error, asymmetry = {}, {}
     for bodies in (10, 30, 50):
-        scenario = load(find(f"chain-{bodies}-balls"))
+        scenario = load_scenario(find_scenario_file(f"chain-{bodies}-balls"))
         truth = newton_euler.solve(scenario.model, scenario.state).acceleration
         for algorithm in ("aba", "crba"):
             (got,) = Pinocchio(algorithm).evaluate(scenario.model, [scenario.state])
@@ -164,7 +164,7 @@ def test_a_balanced_load_shows_in_the_reaction():
     state = pendulums.state(model, rate=0.0)
     pull = model.mass[0] * model.gravity + model.force[0]
     arm = state.r[0]
-    moment = -kinematics.rotation(state.p[0]).T @ np.cross(arm, pull)
+    moment = -kinematics.rotation_matrix(state.p[0]).T @ np.cross(arm, pull)
     model = replace(model, moment=moment[None])
     for engine in (Pinocchio("aba"), Pinocchio("crba"), PinocchioMaximal()):
         (got,) = engine.evaluate(model, [state])
@@ -179,7 +179,7 @@ def test_rods_point_everywhere_and_spin_about_themselves_by_integration_error_on
     ups = np.vstack([np.eye(3), -np.eye(3), near_down, np.random.default_rng(0).normal(size=(50, 3))])
     for u in ups:
         u = u / np.linalg.norm(u)
-        toward = kinematics.rotation(pinocchio_engine.pointing(u))[:, 2]
+        toward = kinematics.rotation_matrix(pinocchio_engine.pointing(u))[:, 2]
         assert np.max(np.abs(toward - u)) < 1e-15, f"{toward} for {u}"
     model = pendulums.model("rbr", loads=True)
     state = pendulums.state(model)
@@ -200,7 +200,7 @@ def _rod_spins(model, state, h):
 
 @in_the_engines_process
 def test_maximal_coordinates_know_their_limits():
-    scenario = load(find("chain-50-balls"))
+    scenario = load_scenario(find_scenario_file("chain-50-balls"))
     with pytest.raises(Unsupported, match="workspace for 50 free bodies"):
         PinocchioMaximal().evaluate(scenario.model, [scenario.state])
     with pytest.raises(KeyError, match="no integrator"):

@@ -16,13 +16,13 @@ import numpy as np
 import pytest
 
 from plumbline.diagnosis.diagnose import diagnose
-from plumbline.engines.calls import Evaluation, climb
-from plumbline.engines.registry import adapter
-from plumbline.execution.scenario_run import horizon_of
-from plumbline.judging.convergence import ladder
-from plumbline.judging.rows import Subject
+from plumbline.engines.calls import Evaluation, run_refinement
+from plumbline.engines.registry import load_adapter
+from plumbline.execution.scenario_run import predictability_horizon
+from plumbline.judging.convergence import refinement_resolutions
+from plumbline.judging.rows import RowContext
 from plumbline.judging.state import judge_states
-from plumbline.judging.trajectory import judge_motion
+from plumbline.judging.trajectory import judge_trajectory
 from plumbline.model.sampling import random_states
 from plumbline.truth.ground_truth import motion_truth, state_truth
 from tests import pendulums
@@ -64,7 +64,7 @@ def motion():
 @contextmanager
 def planted(defect: Defect, model):
     """The real engine with the defect in it."""
-    engine = plant(type(adapter(defect.engine)), defect)
+    engine = plant(type(load_adapter(defect.engine)), defect)
     if defect.gamma is None:
         yield engine
         return
@@ -79,7 +79,7 @@ def state_report(defect: Defect) -> tuple[list[str], str]:
     model, truth = subject(defect.joints, defect.loaded)
     with planted(defect, model) as engine:
         said = engine.evaluate(model, truth.states)
-        who = Subject("planted", "planted", defect.name, defect.name, "0")
+        who = RowContext("planted", "planted", defect.name, defect.name, "0")
         rows = judge_states(who, truth, Evaluation(said, None, None, 0.0)).rows
         wrong = [row.quantity for row in rows if row.verdict == "disagrees"]
         return wrong, diagnose(model, said, truth, engine.evaluate) if wrong else ""
@@ -89,13 +89,13 @@ def state_report(defect: Defect) -> tuple[list[str], str]:
 def motion_report(defect: Defect) -> list[str]:
     """Rows about motion that do not agree; an unresolved cell that no file excuses fails a run, too."""
     model, state, truth = motion()
-    engine = plant(type(adapter(defect.engine)), defect)
+    engine = plant(type(load_adapter(defect.engine)), defect)
     integrator = engine.integrator(defect.integrator)
-    steps = ladder(integrator, model.n, float(TIMES[-1]))
-    with patch("plumbline.engines.calls.adapter", lambda _: engine):
-        runs = climb(defect.engine, integrator.name, model, state, TIMES, steps)
-    who = Subject("planted", "planted", defect.name, defect.name, "0")
-    rows = judge_motion(who, model, truth, integrator, runs, horizon_of(truth)).rows
+    steps = refinement_resolutions(integrator, model.n, float(TIMES[-1]))
+    with patch("plumbline.engines.calls.load_adapter", lambda _: engine):
+        runs = run_refinement(defect.engine, integrator.name, model, state, TIMES, steps)
+    who = RowContext("planted", "planted", defect.name, defect.name, "0")
+    rows = judge_trajectory(who, model, truth, integrator, runs, predictability_horizon(truth)).rows
     return [f"{row.verdict}: {row.quantity}: {row.reason}" for row in rows if row.verdict != "agrees"]
 
 

@@ -9,7 +9,13 @@ import pytest
 
 from adapters.reference_engine import Reference
 from plumbline.model.datatypes import EngineFailure, Model
-from plumbline.model.kinematics import angular_velocity, lift, mass_matrix, rotation, velocity_map
+from plumbline.model.kinematics import (
+    angular_velocity,
+    mass_matrix,
+    rotation_matrix,
+    state_from_minimal,
+    velocity_jacobian,
+)
 from tests.notes_cases import random_chain
 
 
@@ -23,7 +29,7 @@ def case(rods, seed=0, loads=True):
     p /= np.linalg.norm(p, axis=1, keepdims=True)
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     u, udot = u * model.rods[:, None], np.cross(u, rng.normal(size=(n, 3))) * model.rods[:, None]
-    return model, lift(model, p, rng.normal(size=(n, 3)), u, udot)
+    return model, state_from_minimal(model, p, rng.normal(size=(n, 3)), u, udot)
 
 
 def rates(model, state):
@@ -34,7 +40,7 @@ def rates(model, state):
 @pytest.mark.parametrize("rods", [[True], [False], [True, False, True], [False, True, False, False]], ids=str)
 def test_velocity_map_gives_the_bodies_rates(rods):
     model, state = case(rods)
-    bodies = (velocity_map(model, state) @ rates(model, state)).reshape(model.n, 6)
+    bodies = (velocity_jacobian(model, state) @ rates(model, state)).reshape(model.n, 6)
     np.testing.assert_allclose(bodies, np.hstack([state.v, state.omega]), atol=1e-14)
 
 
@@ -45,7 +51,7 @@ def test_energy_momentum_and_mass_matrix_belong_together(rods):
     nu = rates(model, state)
     np.testing.assert_allclose(said.kinetic_energy, nu @ said.mass_matrix @ nu / 2, rtol=1e-14)
     np.testing.assert_allclose(said.mass_matrix, mass_matrix(model, state), atol=1e-14)
-    spin = np.einsum("nij,njk,nk->ni", rotation(state.p), model.inertia, state.omega)
+    spin = np.einsum("nij,njk,nk->ni", rotation_matrix(state.p), model.inertia, state.omega)
     momentum = np.cross(state.r, model.mass[:, None] * state.v) + spin
     np.testing.assert_allclose(said.angular_momentum, momentum.sum(0), atol=1e-14)
     weight = -model.mass[:, None] * model.gravity
@@ -79,7 +85,7 @@ def test_a_singular_model_fails_with_its_cause():
     model, state = case([False])
     inertia = np.diag([0.1, 0.1, 0.0])[None]
     pencil = replace(model, inertia=inertia, proximal=np.array([[0, 0, 0.3]]))
-    state = lift(pencil, state.p, state.omega, state.u, state.udot)
+    state = state_from_minimal(pencil, state.p, state.omega, state.u, state.udot)
     with pytest.raises(EngineFailure, match="inertia of body 1 is singular"):
         Reference().evaluate(pencil, [state])
     with pytest.raises(EngineFailure, match="inertia of body 1 is singular"):

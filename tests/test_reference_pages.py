@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from plumbline.cli.main import main
 from plumbline.studies import drift, sweep
 from reports import fast_reference, page, picture, sweep_page
-from reports.results import Results, clean
+from reports.results import Results, replace_unprintable
 from tests import report_fixture as fixture
 from tests.report_fixture import HOSTILE, NASTY
 
@@ -65,7 +65,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
         {"what": NASTY, "goal": 4, "measured": 5.5},
     ]
     (folder / "figures.json").write_text(json.dumps({"goals": goals, "records": []}))
-    svg = (fast_reference.STORED / "work-precision.svg").read_text(encoding="utf-8")
+    svg = (fast_reference.STORED_RESULTS / "work-precision.svg").read_text(encoding="utf-8")
     trap = '<script>alert(3)</script><image href="https://example.org/x.png"/></svg>'
     (folder / "work-precision.svg").write_text(svg.replace("</svg>", trap))
     page.write(Results.load(folder))
@@ -95,7 +95,7 @@ def test_the_report_has_the_drift_of_every_variant(out: Path) -> None:
     found = section((out / "report.html").read_text(encoding="utf-8"), "drift")
     lines = [words(line) for line in re.findall(r"<tr>.*?</tr>", found, re.DOTALL)]
     raw = next(line for line in lines if line.startswith("raw"))
-    assert clean(" ".join(NASTY.split()))[:12] in raw
+    assert replace_unprintable(" ".join(NASTY.split()))[:12] in raw
     assert "3.2×10⁻⁶ 3.2×10⁻⁵ – 4.5×10⁻⁹ 4.5×10⁻⁹ – 6.7×10⁻¹⁰ 6.7×10⁻¹⁰ – – – – 2.5" in raw
     assert sum(line.startswith("projected") for line in lines) == 2
     assert "10 s 100 s 1000 s" in words(found)
@@ -116,13 +116,13 @@ def test_the_report_has_the_goals_and_the_pictures_as_inert_images(out: Path) ->
 
 
 def test_stored_measurements_stand_in_and_say_so(tmp_path: Path) -> None:
-    kept = fast_reference.benchmarks(tmp_path)
+    kept = fast_reference.benchmark_table(tmp_path)
     assert kept is not None
     assert kept["stored"]
     assert len(kept["pictures"]) == 2
     assert "shared two-core machine" in kept["note"]
-    assert fast_reference.benchmarks(tmp_path, tmp_path) is None
-    assert fast_reference.drifts(tmp_path, tmp_path) is None
+    assert fast_reference.benchmark_table(tmp_path, tmp_path) is None
+    assert fast_reference.drift_table(tmp_path, tmp_path) is None
 
 
 def test_the_map_has_every_place_and_the_worst_speaks(out: Path) -> None:
@@ -131,7 +131,7 @@ def test_the_map_has_every_place_and_the_worst_speaks(out: Path) -> None:
     assert len(tables) == 3  # two of the reference, one of the engine
     for table in tables:
         lines = re.findall(r"<tr>.*?</tr>", table, re.DOTALL)[1:]
-        assert len(lines) == sweep_page.INTERVALS
+        assert len(lines) == sweep_page.AXIS_INTERVALS
         assert all(len(re.findall(r"<td", line)) == 3 for line in lines)
     rows = [row for row in sweep_rows() if row["implementation"] == "mujoco"]
     places = re.findall(r'<td class="([^"]*)".*?</td>', tables[2], re.DOTALL)
@@ -150,23 +150,23 @@ def test_the_map_has_every_place_and_the_worst_speaks(out: Path) -> None:
 
 def test_intervals_cover_every_value_and_follow_ratios() -> None:
     name = list(sweep_rows()[0])[1]
-    axis = sweep_page.axis(name, sweep_rows())
+    axis = sweep_page.make_axis(name, sweep_rows())
     assert axis.edges is not None
     assert axis.edges[1] / axis.edges[0] == pytest.approx(axis.edges[-1] / axis.edges[-2])
     for row in sweep_rows():
-        k = axis.place(row[name])
+        k = axis.index_of(row[name])
         assert axis.edges[k] * (1 - 1e-12) <= row[name] <= axis.edges[k + 1] * (1 + 1e-12)
-    few = sweep_page.axis("bodies[0].mass", sweep_rows())
+    few = sweep_page.make_axis("bodies[0].mass", sweep_rows())
     assert few.edges is None
-    assert [few.place(v) for v in (0.5, 1.5, 2.5)] == [0, 1, 2]
+    assert [few.index_of(v) for v in (0.5, 1.5, 2.5)] == [0, 1, 2]
 
 
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    found = picture.chromium()
+    found = picture.find_chromium()
     if not found:
-        pytest.skip(f"no Chromium here: none of {', '.join(picture.NAMES)} is on the path")
+        pytest.skip(f"no Chromium here: none of {', '.join(picture.BROWSER_NAMES)} is on the path")
     with sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
         yield browser

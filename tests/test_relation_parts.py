@@ -7,55 +7,55 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.engines.registry import adapter
+from plumbline.engines.registry import load_adapter
 from plumbline.judging.metamorphic import (
-    FORMULATIONS,
+    OTHER_FORMULATIONS,
     QUANTITIES,
-    Held,
     Relation,
-    allowed,
-    apart,
-    check,
-    held,
+    RelationResult,
+    characteristic_scales,
+    check_relations,
+    check_state_relation,
+    evaluate_or_refusal,
+    fastest_rate,
     judge_relations,
-    quickest,
-    refused,
-    row,
-    said_of,
-    same,
-    scaled,
-    sizes,
-    values,
-    worst_of,
+    quantity_values,
+    refused_result,
+    relative_differences,
+    run_tolerance,
+    scale_fields,
+    state_at_sample,
+    unchanged,
+    worst_difference_result,
 )
-from plumbline.judging.rows import Subject
+from plumbline.judging.rows import RowContext
 from plumbline.model.datatypes import EngineFailure, Integrator, StateQuantities, Trajectory, Unsupported
-from plumbline.model.kinematics import angular_velocity, multiply, rate
-from plumbline.truth.ground_truth import ROUNDING, reach
-from plumbline.truth.rounding_bound import state_bound
-from plumbline.truth.sensitivity import growth
+from plumbline.model.kinematics import angular_velocity, quaternion_product, quaternion_rate
+from plumbline.truth.ground_truth import RUN_ROUNDING, stretched_length
+from plumbline.truth.rounding_bound import state_rounding_bound
+from plumbline.truth.sensitivity import perturbation_growth
 from tests import pendulums
 
 MODEL = pendulums.model("br")
 STATES = [pendulums.state(MODEL, seed=k) for k in range(3)]
-WHO = Subject("s", "f", "e", "E", "0")
-METHOD = Integrator("trapezoidal", "step", 2, symmetric=True)
+WHO = RowContext("s", "f", "e", "E", "0")
+METHOD = Integrator("trapezoidal", "step", 2, is_symmetric=True)
 
 
 def test_values_are_what_is_offered_times_its_factor() -> None:
     said = StateQuantities(np.ones((2, 3)), 2 * np.ones((2, 3)), kinetic_energy=3.0)
-    found = values(said, kinetic_energy=0.5, joint_reaction=9.0)
+    found = quantity_values(said, kinetic_energy=0.5, joint_reaction=9.0)
     assert set(found) == {"acceleration", "angular_acceleration", "kinetic_energy"}
     assert found["kinetic_energy"] == 1.5 and np.array_equal(found["acceleration"], said.acceleration)
-    twice = scaled(MODEL, mass=2.0, length=3.0)
+    twice = scale_fields(MODEL, mass=2.0, length=3.0)
     assert np.array_equal(twice.mass, 2 * MODEL.mass) and np.array_equal(twice.length, 3 * MODEL.length)
     assert np.array_equal(twice.inertia, MODEL.inertia)
 
 
 def compared(*shifts, relation=None, refuse=(), refuse_here=()):
     """The relation of an engine with itself, answers shifted: (state, quantity, so many bounds of both)."""
-    bounds = [state_bound(MODEL, s) for s in STATES]
-    said = list(adapter("reference").evaluate(MODEL, STATES))
+    bounds = [state_rounding_bound(MODEL, s) for s in STATES]
+    said = list(load_adapter("reference").evaluate(MODEL, STATES))
     other = list(said)
     for index, quantity, by in shifts:
         x = np.asarray(getattr(said[index], quantity))
@@ -71,8 +71,8 @@ def compared(*shifts, relation=None, refuse=(), refuse_here=()):
         return [other[index]]
 
     said = [Unsupported(f"nor state {k}") if k in refuse_here else x for k, x in enumerate(said)]
-    relation = relation or Relation("as itself", same, values)
-    return held(relation, said, there, MODEL, STATES, bounds, bounds)
+    relation = relation or Relation("as itself", unchanged, quantity_values)
+    return check_state_relation(relation, said, there, MODEL, STATES, bounds, bounds)
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
@@ -80,47 +80,49 @@ def compared(*shifts, relation=None, refuse=(), refuse_here=()):
 def test_a_relation_is_as_far_off_as_its_worst_quantity_over_both_bounds(quantity: str, by: float) -> None:
     found = compared((0, "kinetic_energy", 0.5), (2, quantity, by))
     assert found.ratio == pytest.approx(by, rel=0.05)
-    assert (found.quantity, found.state, found.states) == (quantity, 2, 3)
-    assert (found.relation, found.integrator, found.steps, found.refused) == ("as itself", "-", 0, "")
+    assert (found.quantity, found.worst_state, found.state_count) == (quantity, 2, 3)
+    assert (found.relation, found.integrator, found.steps, found.refusal_reason) == ("as itself", "-", 0, "")
 
 
 def test_equal_answers_and_refused_ones() -> None:
     assert compared().ratio == 0.0
     some = compared((0, "acceleration", 5.0), (1, "acceleration", 3.0), refuse=(0,))
-    assert (some.states, some.state) == (2, 1) and some.refused == "not state 0"
+    assert (some.state_count, some.worst_state) == (2, 1) and some.refusal_reason == "not state 0"
     assert some.ratio == pytest.approx(3, rel=0.01)
     mine = compared((2, "acceleration", 5.0), (1, "acceleration", 3.0), refuse_here=(2,))
-    assert (mine.states, mine.state, mine.refused) == (2, 1, "nor state 2")
+    assert (mine.state_count, mine.worst_state, mine.refusal_reason) == (2, 1, "nor state 2")
     none = compared(refuse=(0, 1, 2))
-    assert (none.ratio, none.quantity, none.state, none.states) == (None, "", 0, 0)
+    assert (none.ratio, none.quantity, none.worst_state, none.state_count) == (None, "", 0, 0)
     assert none.verdict == "unsupported"
 
     def refusing(_model, _states):
         raise Unsupported("never")
 
-    assert str(said_of(refusing, MODEL, STATES[0])) == "never"
+    assert str(evaluate_or_refusal(refusing, MODEL, STATES[0])) == "never"
 
 
 def test_runs_are_measured_by_length_turn_and_speed() -> None:
     at = STATES[0]
-    length, g = float(np.sum(reach(MODEL))), np.linalg.norm(MODEL.gravity)
+    length, g = float(np.sum(stretched_length(MODEL))), np.linalg.norm(MODEL.gravity)
     spin = max(np.sqrt(g * length) / length, *np.linalg.norm(at.omega, axis=1))
     speed = max(spin * length, *np.linalg.norm(at.v, axis=1))
-    assert sizes(MODEL, at) == pytest.approx((length, spin, speed), rel=1e-14)
+    assert characteristic_scales(MODEL, at) == pytest.approx((length, spin, speed), rel=1e-14)
     still = replace(at, omega=0 * at.omega, v=0 * at.v)
-    assert sizes(MODEL, still) == pytest.approx((length, np.sqrt(g / length), np.sqrt(g * length)), rel=1e-14)
+    assert characteristic_scales(MODEL, still) == pytest.approx(
+        (length, np.sqrt(g / length), np.sqrt(g * length)), rel=1e-14
+    )
     thrown = replace(still, v=np.array([[0, 0, 40.0], [0, 50.0, 0]]))
-    assert sizes(MODEL, thrown)[2] == 50.0
-    assert sizes(replace(MODEL, gravity=np.zeros(3)), still)[1] == np.finfo(float).tiny
+    assert characteristic_scales(MODEL, thrown)[2] == 50.0
+    assert characteristic_scales(replace(MODEL, gravity=np.zeros(3)), still)[1] == np.finfo(float).tiny
     turn = np.array([np.cos(5e-4), np.sin(5e-4), 0, 0])
     other = replace(
         at,
         r=at.r + np.array([[0, 0, 0], [3e-3, 0, 4e-3]]),
-        p=multiply(at.p, np.tile(turn, (2, 1))),
+        p=quaternion_product(at.p, np.tile(turn, (2, 1))),
         v=at.v + np.array([[0, 2e-3, 0], [0, 0, 0]]),
         omega=at.omega + np.array([[0, 0, 0], [0, 0, 7e-3]]),
     )
-    assert apart(MODEL, at, other) == pytest.approx(
+    assert relative_differences(MODEL, at, other) == pytest.approx(
         {
             "position": 5e-3 / length,
             "attitude": 1e-3,
@@ -129,10 +131,10 @@ def test_runs_are_measured_by_length_turn_and_speed() -> None:
         },
         rel=1e-9,  # distances of 1e-3 and more between numbers of size 1 … 50
     )
-    found = worst_of(
+    found = worst_difference_result(
         "reversed in time", METHOD, {"position": 1.0, "velocity": 3.0, "attitude": 2.0}, 0.5, 64, 0.25, 8.0
     )
-    assert found == Held(
+    assert found == RelationResult(
         "reversed in time",
         6.0,
         "velocity",
@@ -140,39 +142,41 @@ def test_runs_are_measured_by_length_turn_and_speed() -> None:
         1,
         integrator="trapezoidal",
         steps=64,
-        refused="",
+        refusal_reason="",
         resolution=0.25,
-        end=8.0,
+        end_time=8.0,
     )
 
 
 def test_a_sample_is_taken_as_it_is_and_back_with_opposite_rates() -> None:
     at = STATES[1]
     r, p, v = (np.stack([0 * x, x]) for x in (at.r, at.p, at.v))
-    run = Trajectory(np.array([0.0, 1.0]), r, p, v, np.stack([0 * at.p, rate(at.p, at.omega)]), 1)
+    run = Trajectory(np.array([0.0, 1.0]), r, p, v, np.stack([0 * at.p, quaternion_rate(at.p, at.omega)]), 1)
     for sign in (1.0, -1.0):
-        found = row(run, -1, sign)
+        found = state_at_sample(run, -1, sign)
         assert np.array_equal(found.r, at.r) and np.array_equal(found.p, at.p)
         assert np.array_equal(found.v, sign * at.v)
         assert found.omega == pytest.approx(sign * angular_velocity(at.p, run.pdot[1]), abs=1e-14)
         for nothing in (found.u, found.udot):
             assert nothing.shape == (2, 3) and not np.any(nothing)
-    assert not np.any(row(run, 0).r)
+    assert not np.any(state_at_sample(run, 0).r)
 
 
 def test_the_quickest_is_a_body_a_rod_or_the_shortest_link() -> None:
     at, g = STATES[0], np.linalg.norm(MODEL.gravity)
     still = replace(at, omega=0 * at.omega, udot=0 * at.udot)
-    assert quickest(MODEL, still) == pytest.approx(np.sqrt(g / np.min(reach(MODEL))), rel=1e-14)
-    assert quickest(MODEL, replace(still, omega=np.array([[0, 3.0, 4.0], [90.0, 0, 0]]))) == 90.0
-    assert quickest(MODEL, replace(still, udot=np.array([[0, 0, 0], [30.0, 0, 40.0]]))) == 50.0
-    assert quickest(replace(MODEL, gravity=np.zeros(3)), still) == 1.0
+    assert fastest_rate(MODEL, still) == pytest.approx(
+        np.sqrt(g / np.min(stretched_length(MODEL))), rel=1e-14
+    )
+    assert fastest_rate(MODEL, replace(still, omega=np.array([[0, 3.0, 4.0], [90.0, 0, 0]]))) == 90.0
+    assert fastest_rate(MODEL, replace(still, udot=np.array([[0, 0, 0], [30.0, 0, 40.0]]))) == 50.0
+    assert fastest_rate(replace(MODEL, gravity=np.zeros(3)), still) == 1.0
 
 
 def test_rows_say_what_held_what_did_not_and_what_was_refused() -> None:
-    one = Held("masses doubled", 0.25, "joint_reaction", 2, 4)
+    one = RelationResult("masses doubled", 0.25, "joint_reaction", 2, 4)
     off = replace(one, ratio=1.5)
-    run = Held(
+    run = RelationResult(
         "reversed in time",
         0.5,
         "velocity",
@@ -181,12 +185,14 @@ def test_rows_say_what_held_what_did_not_and_what_was_refused() -> None:
         integrator="trapezoidal",
         steps=64,
         resolution=0.25,
-        end=8.0,
+        end_time=8.0,
     )
-    lost = refused("by sparse", METHOD, EngineFailure("it stopped"))
-    never = refused("by sparse", METHOD, Unsupported("no such solver"))
-    assert lost == Held("by sparse", None, "", 0, 0, "it stopped", "failed", "trapezoidal", 0, 0.0, 0.0)
-    assert (one.refused, one.integrator, one.steps) == ("", "-", 0)
+    lost = refused_result("by sparse", METHOD, EngineFailure("it stopped"))
+    never = refused_result("by sparse", METHOD, Unsupported("no such solver"))
+    assert lost == RelationResult(
+        "by sparse", None, "", 0, 0, "it stopped", "failed", "trapezoidal", 0, 0.0, 0.0
+    )
+    assert (one.refusal_reason, one.integrator, one.steps) == ("", "-", 0)
     rows = judge_relations(
         WHO, [one, off, replace(one, ratio=1.0), run, replace(run, ratio=7.0), lost, never]
     ).rows
@@ -213,43 +219,45 @@ def test_rows_say_what_held_what_did_not_and_what_was_refused() -> None:
 @pytest.mark.parametrize("kind", ["step", "tolerance"])
 def test_a_run_may_be_off_by_its_rounding_its_solver_and_its_accelerations_grown(kind: str) -> None:
     at, end, steps = STATES[2], 0.5, 81
-    method = Integrator("x", kind, 2, solver=1e-9, tightest=3e-9)  # type: ignore[arg-type]
-    bound, (_, spin, speed) = state_bound(MODEL, at), sizes(MODEL, at)
+    method = Integrator("x", kind, 2, solver_rtol=1e-9, min_rtol=3e-9)  # type: ignore[arg-type]
+    bound, (_, spin, speed) = state_rounding_bound(MODEL, at), characteristic_scales(MODEL, at)
     ratio = max(MODEL.mass) / min(MODEL.mass)
     solved = (1e-9 * ratio if kind == "step" else 3e-9) * 9
     pushed = end * max(max(bound.acceleration) / speed, max(bound.angular_acceleration) / spin)
-    grown = max(growth(MODEL, at, np.array([0, end / 2, end])))
+    grown = max(perturbation_growth(MODEL, at, np.array([0, end / 2, end])))
     assert grown > 1.1 and ratio > 1.1
-    limit = allowed(method, MODEL, at, end, steps)
-    assert limit == pytest.approx((ROUNDING + solved + pushed) * grown, rel=1e-12, abs=0)
+    limit = run_tolerance(method, MODEL, at, end, steps)
+    assert limit == pytest.approx((RUN_ROUNDING + solved + pushed) * grown, rel=1e-12, abs=0)
     bare = replace(method, solver=0.0, tightest=0.0)
-    assert allowed(bare, MODEL, at, end, steps) == pytest.approx(
-        (ROUNDING + pushed) * grown, rel=1e-12, abs=0
+    assert run_tolerance(bare, MODEL, at, end, steps) == pytest.approx(
+        (RUN_ROUNDING + pushed) * grown, rel=1e-12, abs=0
     )
 
 
 @pytest.mark.parametrize("drag", [False, True])
 def test_every_relation_is_asked_but_time_reversed_with_drag(drag: bool) -> None:
     model = pendulums.model("b", drag=drag)
-    names = [found.relation for found in check("pinocchio", model, [pendulums.state(model)])]
+    names = [found.relation for found in check_relations("pinocchio", model, [pendulums.state(model)])]
     told = ["rotated world", "re-chosen body frame", "masses doubled", "lengths × 4"]
     told += [] if drag else ["time reversed"]
     assert names[: len(told)] == told and ("time reversed" in names) is not drag
     assert "as pinocchio-maximal" in names and "two welded halves" in names
 
 
-@pytest.mark.parametrize(("engine", "other"), FORMULATIONS.items())
+@pytest.mark.parametrize(("engine", "other"), OTHER_FORMULATIONS.items())
 def test_both_columns_of_an_engine_are_compared(engine: str, other: str) -> None:
     pytest.importorskip(engine.split("-")[0])
-    assert FORMULATIONS[other] == engine
+    assert OTHER_FORMULATIONS[other] == engine
     model = pendulums.model("b")
-    assert f"as {other}" in [found.relation for found in check(engine, model, [pendulums.state(model)])]
-    assert set(FORMULATIONS) == {"pinocchio", "pinocchio-maximal", "exudyn", "exudyn-tree"}
+    assert f"as {other}" in [
+        found.relation for found in check_relations(engine, model, [pendulums.state(model)])
+    ]
+    assert set(OTHER_FORMULATIONS) == {"pinocchio", "pinocchio-maximal", "exudyn", "exudyn-tree"}
 
 
 def test_long_chains_are_asked_at_half_as_many_states() -> None:
     pytest.importorskip("mujoco")
     for bodies, states in ((12, 4), (13, 2)):
         model = pendulums.model("b" * bodies)
-        found = check("mujoco", model, [pendulums.state(model, seed=k, rate=0.5) for k in range(6)])
-        assert {one.states for one in found if not one.steps and one.ratio is not None} == {states}
+        found = check_relations("mujoco", model, [pendulums.state(model, seed=k, rate=0.5) for k in range(6)])
+        assert {one.state_count for one in found if not one.steps and one.ratio is not None} == {states}

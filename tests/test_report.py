@@ -19,11 +19,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from plumbline.model.kinematics import multiply
+from plumbline.model.kinematics import quaternion_product
 from reports import junit, pack, page, payload, step_summary
 from reports.history import History
-from reports.results import Results, clean
-from reports.verdicts import MARKS, needs_attention, number, ratio, severity, worst
+from reports.results import Results, replace_unprintable
+from reports.verdicts import VERDICT_STYLES, error_ratio, format_number, needs_attention, severity, worst_row
 from tests import report_fixture as fixture
 
 REPORTS = Path(page.__file__).parent
@@ -62,7 +62,7 @@ class Parsed(HTMLParser):
 
 def chunks(text: str) -> dict[str, object]:
     found = re.findall(r'<script type="application/octet-stream" id="chunk-([\w-]+)">([^<]*)</script>', text)
-    return {name: pack.unpack(body) for name, body in found}
+    return {name: pack.decode_chunk(body) for name, body in found}
 
 
 def test_the_sentence_counts_and_versions_come_first(out: Path, text: str) -> None:
@@ -70,7 +70,7 @@ def test_the_sentence_counts_and_versions_come_first(out: Path, text: str) -> No
     parsed = Parsed(text)
     before_matrix = parsed.words[: parsed.words.index("Worst error over its tolerance")]
     assert results.run["sentence"] in before_matrix
-    for verdict, mark in MARKS.items():
+    for verdict, mark in VERDICT_STYLES.items():
         count = sum(row["verdict"] == verdict for row in results.rows)
         assert re.search(rf"{count}\s*{mark.plural}", before_matrix), verdict
     assert "6d61634" in before_matrix
@@ -88,12 +88,12 @@ def test_every_cell_is_in_the_static_matrix_with_glyph_text_and_class(out: Path,
         assert len(cells) == len(results.engines)
         for cell, engine in zip(cells, results.engines, strict=True):
             rows = [r for r in results.rows if r["scenario"] == name and r["engine"] == engine]
-            speaker = max(rows, key=lambda r: (severity(r), ratio(r) or -1))
-            mark = MARKS[speaker["verdict"]]
-            assert f'class="cell {mark.slug}' in cell
+            speaker = max(rows, key=lambda r: (severity(r), error_ratio(r) or -1))
+            mark = VERDICT_STYLES[speaker["verdict"]]
+            assert f'class="cell {mark.css_class}' in cell
             assert mark.glyph in cell
-            quotient = ratio(speaker)
-            assert (number(quotient) if quotient is not None else speaker["verdict"]) in cell
+            quotient = error_ratio(speaker)
+            assert (format_number(quotient) if quotient is not None else speaker["verdict"]) in cell
 
 
 def test_a_cell_speaks_with_its_worst_row() -> None:
@@ -102,13 +102,13 @@ def test_a_cell_speaks_with_its_worst_row() -> None:
 
     agree, disagree = row("agrees", 0.9), row("disagrees", 2.0)
     gap, known_gap = row("unsupported", None), row("unsupported", None, "gap")
-    assert worst([agree, row("agrees", 0.1), known_gap]) is agree
-    assert worst([agree, gap]) is gap
-    assert worst([agree, disagree, gap]) is disagree
-    assert worst([row("disagrees", 50.0, "old"), disagree]) is disagree
-    assert worst([row("failed", None), disagree])["verdict"] == "failed"
+    assert worst_row([agree, row("agrees", 0.1), known_gap]) is agree
+    assert worst_row([agree, gap]) is gap
+    assert worst_row([agree, disagree, gap]) is disagree
+    assert worst_row([row("disagrees", 50.0, "old"), disagree]) is disagree
+    assert worst_row([row("failed", None), disagree])["verdict"] == "failed"
     assert needs_attention(gap) and not needs_attention(known_gap)
-    assert ratio({"verdict": "agrees", "value": 3.0, "tolerance": 4.0, "extra": {"ratio": 0.2}}) == 0.2
+    assert error_ratio({"verdict": "agrees", "value": 3.0, "tolerance": 4.0, "extra": {"ratio": 0.2}}) == 0.2
 
 
 def test_no_hostile_text_becomes_markup(text: str) -> None:
@@ -137,7 +137,7 @@ def test_hostile_names_survive_in_the_data_and_in_links(out: Path, text: str) ->
 
 def test_unprintable_characters_become_visible_ones_everywhere() -> None:
     bad = "a\x00b\x1bc\u202ed\ud800e\ufffff\x85g\rh\ni"
-    assert clean({bad: [bad]}) == {"a�b�c�d�e�f�g�h\ni": ["a�b�c�d�e�f�g�h\ni"]}
+    assert replace_unprintable({bad: [bad]}) == {"a�b�c�d�e�f�g�h\ni": ["a�b�c�d�e�f�g�h\ni"]}
 
 
 def test_the_page_allows_only_its_own_script_and_style(text: str) -> None:
@@ -163,7 +163,7 @@ def test_decimation_keeps_every_peak_and_every_gap() -> None:
     small, times = pack.decimate(y, 300), pack.decimate_times(t, 300)
     assert len(small) == len(times) <= 300
     assert np.nanmax(small) == np.nanmax(y) and np.nanmin(small) == np.nanmin(y)
-    edges = pack.buckets(len(y), 300)
+    edges = pack.bucket_edges(len(y), 300)
     for k, (a, b) in enumerate(pairwise(edges)):
         part = y[a:b]
         assert np.nanmax(small[2 * k : 2 * k + 2]) == np.nanmax(part)
@@ -174,14 +174,14 @@ def test_decimation_keeps_every_peak_and_every_gap() -> None:
 
 def test_log_codes_keep_half_a_percent_and_tell_zero_from_nothing() -> None:
     y = np.array([0.0, np.nan, np.inf, 1e-300, 1e-17, 3.3e-9, -2.5, 1e80])
-    codes = pack.log_codes(y).astype(float)
+    codes = pack.log_scale_codes(y).astype(float)
     assert codes[:4].tolist() == [1, 0, 0, 2]
-    back = 10 ** ((codes[4:] - 2) / pack.STEPS_PER_DECADE + pack.FLOOR)
+    back = 10 ** ((codes[4:] - 2) / pack.STEPS_PER_DECADE + pack.LOWEST_DECADE)
     assert np.allclose(back, np.abs(y[4:]), rtol=0.0024)
 
 
 def test_chunks_come_back_as_they_went_in() -> None:
-    packer = pack.Packer()
+    packer = pack.ChunkBuilder()
     arrays = [
         np.arange(7, dtype=np.uint8),
         np.linspace(-1, 1, 5, dtype=np.float32),
@@ -190,9 +190,9 @@ def test_chunks_come_back_as_they_went_in() -> None:
         np.array([-128, 127], dtype=np.int8),
     ]
     header = {"a": [packer.add(a) for a in arrays], "text": "</script>ä", "none": None}
-    chunk = packer.chunk(header)
+    chunk = packer.encode(header)
     assert re.fullmatch(r"[A-Za-z0-9+/=]+", chunk)
-    back = pack.unpack(chunk)
+    back = pack.decode_chunk(chunk)
     assert back["text"] == "</script>ä" and back["none"] is None
     for found, array in zip(back["a"], arrays, strict=True):
         assert np.array_equal(found, array)
@@ -220,7 +220,7 @@ def test_rotation_vectors_are_exact_for_tiny_and_large_angles() -> None:
     axis = np.array([2, -3, 6]) / 7
     base = np.array([0.5, 0.5, -0.5, 0.5])
     for angle in (1e-14, 1e-9, 0.3, 3.0):
-        turned = multiply(np.array([np.cos(angle / 2), *(np.sin(angle / 2) * axis)]), base)
+        turned = quaternion_product(np.array([np.cos(angle / 2), *(np.sin(angle / 2) * axis)]), base)
         for sign in (1, -1):
             assert np.allclose(
                 payload.rotation_vector(sign * turned, base), angle * axis, rtol=1e-6, atol=2e-16
@@ -252,7 +252,7 @@ def test_the_first_crossing_is_of_the_undecimated_curve(out: Path, text: str) ->
 
 def test_commands_are_quoted_for_a_shell() -> None:
     row = {"scenario": "x'; rm -rf ~ #", "engine": "mujoco", "level": "invariants", "quantity": "order"}
-    assert shlex.split(payload.command(row, {"file": ""}))[4:] == [
+    assert shlex.split(payload.rerun_command(row, {"file": ""}))[4:] == [
         "x'; rm -rf ~ #",
         "--engine",
         "mujoco",
@@ -260,17 +260,17 @@ def test_commands_are_quoted_for_a_shell() -> None:
         "trajectory",
     ]
     row["scenario"] = "--out"
-    assert shlex.split(payload.command(row, {"file": ""}))[-2:] == ["--", "--out"]
-    assert "'my own.yaml'" in payload.command(row, {"file": "my own.yaml"})
+    assert shlex.split(payload.rerun_command(row, {"file": ""}))[-2:] == ["--", "--out"]
+    assert "'my own.yaml'" in payload.rerun_command(row, {"file": "my own.yaml"})
     row |= {"scenario": "rest", "quantity": "energy_drift_long", "extra": {"asked": 100.0}}
     nightly = "python -m plumbline nightly rest --engine mujoco --random 0 --no-instrument"
-    assert payload.command(row, {"file": ""}) == nightly
+    assert payload.rerun_command(row, {"file": ""}) == nightly
     row["extra"] = {"asked": 12.5}
-    assert payload.command(row, {"file": ""}) == f"{nightly} --endurance 12.5"
+    assert payload.rerun_command(row, {"file": ""}) == f"{nightly} --endurance 12.5"
 
 
 def test_numbers_read_as_people_write_them() -> None:
-    shown = [number(x) for x in (0.0, 1.0, 0.0314, 4.2e-6, -1.5e7, 123.4, 9.99, float("nan"), None)]
+    shown = [format_number(x) for x in (0.0, 1.0, 0.0314, 4.2e-6, -1.5e7, 123.4, 9.99, float("nan"), None)]
     assert shown == ["0", "1.0", "0.031", "4.2×10⁻⁶", "−1.5×10⁷", "120", "10", "not finite", "–"]
 
 
@@ -284,7 +284,7 @@ def test_the_default_catalogue_stays_under_2_megabytes(
     record_property("bytes", size)  # type: ignore[operator]
     record_property("seconds", took)  # type: ignore[operator]
     print(f"30 scenarios: {size:,} bytes in {took:.2f} s")
-    assert size <= page.BUDGET
+    assert size <= page.MAX_PAGE_BYTES
 
 
 def test_a_night_of_thousands_of_scenarios_stays_under_8_megabytes(out: Path, tmp_path: Path) -> None:
@@ -303,7 +303,7 @@ def test_a_night_of_thousands_of_scenarios_stays_under_8_megabytes(out: Path, tm
     began = time.perf_counter()
     text = page.write(Results.load(tmp_path)).read_text()
     print(f"{len(stored['rows']):,} rows: {len(text):,} bytes in {time.perf_counter() - began:.1f} s")
-    assert len(text.encode()) <= page.NIGHTLY_BUDGET
+    assert len(text.encode()) <= page.MAX_NIGHTLY_PAGE_BYTES
     assert "random-2499" in text and "the needle" in text
     assert "2000 more scenarios are not in this page" in text
     assert "those with anything unexpected are all here" in text
@@ -315,7 +315,7 @@ def test_a_page_above_its_budget_has_fewer_points(out: Path, monkeypatch: pytest
     whole = page.render(results, History())
     monkeypatch.setattr(page, "BUDGET", len(whole.encode()) - 30_000)
     smaller = page.render(results, History())
-    assert len(smaller.encode()) <= page.BUDGET
+    assert len(smaller.encode()) <= page.MAX_PAGE_BYTES
     few = chunks(smaller)["scenario-0"]["curves"]  # type: ignore[index,call-overload]
     assert few is None or len(few[0]["t"]) < len(chunks(whole)["scenario-0"]["curves"][0]["t"])  # type: ignore[index,call-overload]
 
@@ -324,16 +324,16 @@ def test_a_history_says_what_is_new_and_skips_a_damaged_night(out: Path, tmp_pat
     past = fixture.nights(out, tmp_path / "history", count=4)
     results = Results.load(out)
     history = History.load(past, results)
-    assert len(history.nights) == 4 and history.damaged == ["2026-11-02"]
-    assert history.last_green is history.nights[-2]
+    assert len(history.nights) == 4 and history.unreadable == ["2026-11-02"]
+    assert history.last_passed is history.nights[-2]
     fresh = {row["key"] for row in results.rows if history.is_new(row)}
     assert fresh == {row["key"] for row in results.rows if row["verdict"] in ("disagrees", "failed")}
     data = chunks(page.render(results, history))
     table = data["history"]["verdict"].reshape(len(results.rows), 5)  # type: ignore[index,call-overload]
     for line, row in zip(table, results.rows, strict=True):
-        assert list(MARKS)[line[-1] - 1] == row["verdict"]
+        assert list(VERDICT_STYLES)[line[-1] - 1] == row["verdict"]
         if row["key"] in fresh:
-            assert list(MARKS)[line[0] - 1] == "agrees"
+            assert list(VERDICT_STYLES)[line[0] - 1] == "agrees"
     words = Parsed(page.render(results, history)).words
     assert re.search(rf"{len(fresh)}\s+newly failing", words) and "Skipped as damaged: 2026-11-02" in words
 
@@ -358,7 +358,7 @@ def test_gaps_of_one_reason_are_one_finding(out: Path) -> None:
     rows = [{**gap, "known": None, "scenario": f"s{k}"} for k in range(9)]
     rows += [{**gap, "known": None, "scenario": "s0", "quantity": "energy"}]
     rows += [{**gap, "known": None, "scenario": "s1", "reason": "another"}]
-    first, second = page._attention(rows)
+    first, second = page._unexpected_findings(rows)
     assert (len(first["scenarios"]), first["more"]) == (8, 1) and first["row"]["scenario"] not in first[
         "scenarios"
     ]
@@ -398,8 +398,8 @@ def test_junit_counts_what_it_holds_and_survives_every_text(out: Path) -> None:
 def test_the_step_summary_shows_text_as_text_and_keeps_its_limit(out: Path) -> None:
     text = step_summary.write(Results.load(out)).read_text(encoding="utf-8")
     assert "<" not in text and "`" not in text
-    assert html.unescape(step_summary.escape(fixture.HOSTILE)) == fixture.HOSTILE
-    assert not re.search(r"(?<!&)[|*_#\[\]`<>@]", step_summary.escape("|*_#[]`<>@me"))
+    assert html.unescape(step_summary.escape_markdown(fixture.HOSTILE)) == fixture.HOSTILE
+    assert not re.search(r"(?<!&)[|*_#\[\]`<>@]", step_summary.escape_markdown("|*_#[]`<>@me"))
     results = Results.load(out)
     bad = next(row for row in results.rows if row["verdict"] == "disagrees")
     results.rows.extend({**bad, "scenario": f"s{k}", "reason": "long " * 60} for k in range(5000))
@@ -435,5 +435,5 @@ def test_the_pages_own_script_is_linted() -> None:
 
 
 def test_vendored_uplot_comes_with_its_licence(text: str) -> None:
-    assert "uPlot" in page.bundle() and "Copyright (c) 2022 Leon Sorokin" in Parsed(text).words
-    assert not re.search(r"\bfetch\(|XMLHttpRequest|WebSocket|EventSource|sendBeacon", page.bundle())
+    assert "uPlot" in page.bundle_script() and "Copyright (c) 2022 Leon Sorokin" in Parsed(text).words
+    assert not re.search(r"\bfetch\(|XMLHttpRequest|WebSocket|EventSource|sendBeacon", page.bundle_script())

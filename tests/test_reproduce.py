@@ -23,10 +23,10 @@ from click.testing import CliRunner
 
 from plumbline.cli.main import main
 from plumbline.engines import environments
-from plumbline.engines.registry import ENGINES, adapter
+from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.judging import metamorphic
-from plumbline.judging.convergence import ladder
-from plumbline.judging.long_runs import Course, course, endure, judge_endurance
+from plumbline.judging.convergence import refinement_resolutions
+from plumbline.judging.long_runs import LongRunPlan, judge_long_runs, plan_long_run, run_long_run_study
 from plumbline.processes.workers import Outcome
 from plumbline.reproduce.engine_client import Engine
 from plumbline.reproduce.measure import AlongRuns, AtState, Question, Related, shrunk
@@ -56,7 +56,7 @@ QUANTITIES = (*metamorphic.QUANTITIES, "mass_matrix")
 DRIFTS = ("energy_drift", "momentum_drift", "joint_gap", "gap_rate", "norm_drift")
 ROW = {"scenario": HOSTILE, "quantity": HOSTILE, "engine_version": "4", "integrator": HOSTILE,
        "extra": {"state": 3.0}}  # fmt: skip
-INTEGRATORS = [(name, i.name) for name in ENGINES for i in adapter(name).integrators]
+INTEGRATORS = [(name, i.name) for name in ENGINES for i in load_adapter(name).integrators]
 
 
 def run(text: str, tmp_path, before: str = "", python: str = sys.executable) -> str:
@@ -90,9 +90,9 @@ def defective(lines: str):
     import pinocchio
 
     from reference_impl import collocation
-    from reference_impl.direct import System
+    from reference_impl.direct import DirectSystem
 
-    places = (exudyn, exudyn.itemInterface, mujoco, pinocchio, collocation, System)
+    places = (exudyn, exudyn.itemInterface, mujoco, pinocchio, collocation, DirectSystem)
     before = [dict(vars(place)) for place in places]
     try:
         exec(lines, {})
@@ -121,9 +121,9 @@ def at_state(engine: str, joints: str) -> measure.ShownState:
 
 def runs(engine: str, integrator: str, joints: str, level: str, loads: bool, until: float = 0.25):
     """A measure of runs of a slow tumble, and the case."""
-    method = adapter(engine).integrator(integrator)
+    method = load_adapter(engine).integrator(integrator)
     model = pendulums.model(JOINTS[joints], loads=loads, drag=loads)
-    steps = tuple(2.0**-k for k in (6, 7, 8)) if method.kind == "step" else (1e-8, 1e-10, method.tightest)
+    steps = tuple(2.0**-k for k in (6, 7, 8)) if method.kind == "step" else (1e-8, 1e-10, method.min_rtol)
     case = Case(model, pendulums.state(model, seed=3, rate=1.0), until, steps)
     wanted = DRIFTS if level == "invariants" else ("order", "position_limit", "attitude_limit")
     return AlongRuns(Engine(engine), integrator, level, wanted), case
@@ -194,27 +194,27 @@ def test_a_script_of_long_runs_measures_as_the_nightly_does(engine, integrator, 
     said, names = executed(script(row(engine), found))
     assert len(found.drifts) == len(ratios(said)) == count and max(ratios(said)) < 1
     assert len(names["times"]) == 129
-    plan = Course(1.0, found.case.steps, 1.0)
-    nightly = endure(engine, integrator, model, case.state, 2.0**-7, plan).runs[-1]
+    plan = LongRunPlan(1.0, found.case.steps, 1.0)
+    nightly = run_long_run_study(engine, integrator, model, case.state, 2.0**-7, plan).runs[-1]
     for quantity in found.drifts:
         window = nightly.windows[quantity][1.0]
         allowed = 1e-13 + 2 * nightly.work_uncertainty[1.0] * (quantity == "energy_drift")
         last = rf"{quantity} within(?:.*\n)+?  \w+ {found.case.steps[-1]}: (\S+), (\S+)"
         largest, mean = map(float, re.search(last, said).groups())
-        assert largest == pytest.approx(window.largest, rel=0.01, abs=allowed), quantity
-        assert mean == pytest.approx(np.mean(window.blocks), rel=0.01, abs=allowed), quantity
+        assert largest == pytest.approx(window.max_drift, rel=0.01, abs=allowed), quantity
+        assert mean == pytest.approx(np.mean(window.block_drifts), rel=0.01, abs=allowed), quantity
 
 
 @pytest.mark.parametrize(
     ("engine", "integrator", "relation"),
     [("exudyn", "trapezoidal", "reversed in time"), ("reference", "collocation", "reversed in time")]
-    + [("exudyn", "generalized-alpha", f"by {way}") for way in adapter("exudyn").solvers]
-    + [("exudyn-tree", "RK44", f"by {way}") for way in adapter("exudyn-tree").solvers],
+    + [("exudyn", "generalized-alpha", f"by {way}") for way in load_adapter("exudyn").linear_solvers]
+    + [("exudyn-tree", "RK44", f"by {way}") for way in load_adapter("exudyn-tree").linear_solvers],
 )
 def test_a_script_runs_twice_as_the_harness_does(engine, integrator, relation):
     model = pendulums.model(JOINTS["rod-ball"], loads=True, drag=relation.startswith("by"))
     measure = Twice(Engine(engine), integrator, relation)
-    step = 2.0**-8 if measure.integrator.kind == "step" else measure.integrator.tightest
+    step = 2.0**-8 if measure.integrator.kind == "step" else measure.integrator.min_rtol
     found = measure(Case(model, pendulums.state(model, seed=3, rate=1.0), 2.0**-5, (step,)))
     text = script(row(engine, level="relations"), found)
     said, names = executed(text)
@@ -229,7 +229,7 @@ def test_a_script_runs_twice_as_the_harness_does(engine, integrator, relation):
 
 
 @pytest.mark.parametrize("engine", ["pinocchio", "exudyn"])
-@pytest.mark.parametrize("relation", [r.name for r in metamorphic.RELATIONS])
+@pytest.mark.parametrize("relation", [r.name for r in metamorphic.STATE_RELATIONS])
 def test_a_script_of_a_relation_finds_what_the_harness_finds(engine, relation):
     model = pendulums.model(JOINTS["rod-ball"], loads=True, drag=relation != "time reversed")
     found = Related(Engine(engine), relation)(Case(model, pendulums.state(model, seed=3)))
@@ -242,9 +242,9 @@ def test_a_script_of_a_relation_finds_what_the_harness_finds(engine, relation):
 
 @pytest.mark.parametrize(
     ("engine", "relation"),
-    [(name, f"as {other}") for name, other in metamorphic.FORMULATIONS.items()]
-    + [("pinocchio", f"by {way}") for way in adapter("pinocchio").options]
-    + [(name, f"by {way}") for name in ("mujoco", "reference") for way in adapter(name).options]
+    [(name, f"as {other}") for name, other in metamorphic.OTHER_FORMULATIONS.items()]
+    + [("pinocchio", f"by {way}") for way in load_adapter("pinocchio").options]
+    + [(name, f"by {way}") for name in ("mujoco", "reference") for way in load_adapter(name).options]
     + [("pinocchio-aba", "by crba")]
     + [(name, "two welded halves") for name in ("mujoco", "pinocchio", "pinocchio-maximal")],
 )
@@ -385,10 +385,10 @@ def test_a_defect_in_an_engine_is_shown_by_its_script(engine, level, integrator,
     model = pendulums.model(JOINTS["balls"])
     case, most = Case(model, pendulums.state(model, seed=3, rate=1.0)), 50.0
     if integrator != "-":
-        method = adapter(engine).integrator(integrator)
-        case = replace(case, until=0.25, steps=tuple(ladder(method, 2, 1.0))[:6])
+        method = load_adapter(engine).integrator(integrator)
+        case = replace(case, until=0.25, steps=tuple(refinement_resolutions(method, 2, 1.0))[:6])
         if level == "relations":
-            step = 2.0**-7 if method.kind == "step" else method.tightest
+            step = 2.0**-7 if method.kind == "step" else method.min_rtol
             case = replace(case, until=0.125, steps=(step,))
         elif wanted.endswith("_long"):
             case, most = replace(case, until=12.5, steps=()), 4.0  # not falling, it is over by little
@@ -407,12 +407,12 @@ def test_a_defect_in_an_engine_is_shown_by_its_script(engine, level, integrator,
 
 def test_a_drift_that_grows_is_shown_in_a_shorter_time_of_the_same_motion(tmp_path):
     """A symmetric method's energy: with fewer bodies or simpler numbers the motion may not be regular."""
-    from plumbline.scenario.loader import find, load
+    from plumbline.scenario.loader import find_scenario_file, load_scenario
 
-    scenario, lossy = load(find("lagrange-top")), LOSSY.replace("0.9", "0.0")
+    scenario, lossy = load_scenario(find_scenario_file("lagrange-top")), LOSSY.replace("0.9", "0.0")
     case, wanted = Case(scenario.model, scenario.state, 50.0), ("energy_drift_long_growth",)
     question = Question(
-        Engine("exudyn"), "invariants", wanted, "trapezoidal", case, 1.9, 20.0, scenario.sample
+        Engine("exudyn"), "invariants", wanted, "trapezoidal", case, 1.9, 20.0, scenario.sample_interval
     )
     with defective(lossy):
         text, why = shown_by_script(question, row("exudyn", level="invariants"))
@@ -428,9 +428,9 @@ def test_a_drift_that_grows_is_shown_in_a_shorter_time_of_the_same_motion(tmp_pa
 
 def test_the_smallest_chain_on_which_aba_loses_its_digits(tmp_path):
     """The real one: Pinocchio's aba on thirty balls, with simpler numbers, and still disagreeing alone."""
-    from plumbline.scenario.loader import find, load
+    from plumbline.scenario.loader import find_scenario_file, load_scenario
 
-    scenario = load(find("chain-30-balls"))
+    scenario = load_scenario(find_scenario_file("chain-30-balls"))
     case = Case(scenario.model, scenario.state)
     wanted = ("acceleration", "angular_acceleration", "joint_reaction")
     question = Question(Engine("pinocchio-aba"), "state", wanted, "-", case, 0.0, 60.0)
@@ -448,10 +448,10 @@ def test_the_smallest_chain_on_which_aba_loses_its_digits(tmp_path):
 
 def test_a_defect_in_one_number_shrinks_to_one_body():
     defect = next(d for d in STATE_DEFECTS if d.name == "inertia-xx-1e-6")
-    engine = plant(type(adapter(defect.engine)), defect)
+    engine = plant(type(load_adapter(defect.engine)), defect)
     model = pendulums.model(JOINTS["mixed"], loads=True, drag=True)
     case = Case(model, pendulums.state(model, seed=3))
-    with patch("plumbline.reproduce.engine_client.adapter", lambda _: engine):
+    with patch("plumbline.reproduce.engine_client.load_adapter", lambda _: engine):
         small = shrunk(Question(Engine(defect.engine), "state", ("acceleration",), "-", case, 0.0, 60.0))
     assert small.case.model.n == 1 and not small.case.model.has_loads and not small.case.model.has_drag
     assert small.case.model.mass.tolist() == [1.0]
@@ -464,11 +464,14 @@ def test_a_busy_search_gives_what_it_has():
     case = Case(model, pendulums.state(model, seed=3))
     question = Question(Engine(defect.engine), "state", ("acceleration",), "-", case, 0.0, 0.0)
     with patch(
-        "plumbline.reproduce.engine_client.adapter", lambda _: plant(type(adapter(defect.engine)), defect)
+        "plumbline.reproduce.engine_client.load_adapter",
+        lambda _: plant(type(load_adapter(defect.engine)), defect),
     ):
         small = shrunk(question)
     assert small is not None and small.case.model.n == 2
-    runs = replace(case, until=1.0, steps=tuple(ladder(adapter("mujoco").integrator("RK4"), 2, 1.0)))
+    runs = replace(
+        case, until=1.0, steps=tuple(refinement_resolutions(load_adapter("mujoco").integrator("RK4"), 2, 1.0))
+    )
     late = replace(question, engine=Engine("mujoco"), level="trajectory", integrator="RK4", case=runs)
     text, why = shown_by_script(late, row("mujoco"))
     assert not text and "within 0 s" in why, "a whole ladder of runs is not begun out of time"
@@ -512,8 +515,8 @@ def test_another_environment_is_asked_and_runs_the_script(tmp_path):
 def interpreter_of(engine):
     """That of an engine's other version; skips with the reason where it cannot be had."""
     try:
-        return environments.interpreter(engine)
-    except environments.NoSuchEnvironment as error:
+        return environments.ensure_interpreter(engine)
+    except environments.EnvironmentUnavailable as error:
         pytest.skip(str(error))
 
 
@@ -522,7 +525,7 @@ def test_the_order_of_an_older_mujoco_is_shown_in_its_environment(tmp_path):
     """The real one: RK4 of 3.12 is of order 2."""
     python = interpreter_of("mujoco@3.12.0")
     model = pendulums.model(JOINTS["balls"])
-    steps = tuple(ladder(adapter("mujoco").integrator("RK4"), 2, 1.0))
+    steps = tuple(refinement_resolutions(load_adapter("mujoco").integrator("RK4"), 2, 1.0))
     case = Case(model, pendulums.state(model, seed=3, rate=1.0), 1.0, steps)
     question = Question(Engine("mujoco", python), "trajectory", ("order",), "RK4", case, 20.0, 20.0)
     text, _ = shown_by_script(question, row("mujoco@3.12.0", engine_version="3.12.0"))
@@ -589,10 +592,10 @@ def test_every_engine_has_a_script_and_what_has_none_says_why():
         said = unscripted("exudyn", {"level": level, "quantity": quantity, "integrator": integrator})
         assert words in said and bool(words) == bool(said)
     for name in ENGINES:  # no relation of runs that the harness tries is left without a script
-        chosen = adapter(name)
+        chosen = load_adapter(name)
         for integrator in chosen.integrators:
-            tried = ["reversed in time"] * integrator.symmetric
-            tried += [f"by {solver}" for solver in chosen.solvers if integrator.kind == "step"]
+            tried = ["reversed in time"] * integrator.is_symmetric
+            tried += [f"by {solver}" for solver in chosen.linear_solvers if integrator.kind == "step"]
             for relation in tried:
                 cell = {"level": "relations", "quantity": relation, "integrator": integrator.name}
                 assert unscripted(name, cell) == ""
@@ -605,9 +608,9 @@ def test_every_engine_has_a_script_and_what_has_none_says_why():
 @pytest.fixture
 def results(tmp_path):
     """A results folder with disagreements that the harness recorded of aba, and one without a script."""
-    from plumbline.scenario.loader import find, load
+    from plumbline.scenario.loader import find_scenario_file, load_scenario
 
-    scenario = load(find("chain-30-balls"))
+    scenario = load_scenario(find_scenario_file("chain-30-balls"))
     about = {
         "digest": scenario.digest,
         "model": {k: np.asarray(v).tolist() for k, v in vars(scenario.model).items()},
@@ -647,7 +650,7 @@ def test_the_command_lists_and_writes(results):
 
 
 def test_the_runs_behind_a_row_are_those_of_its_ladder(results):
-    document = results_store.read(results)
+    document = results_store.read_results(results)
     found = {"scenario": "chain", "engine": "mujoco", "integrator": "RK4", "level": "trajectory",
              "verdict": "disagrees", "declared_order": 4, "horizon": 1.7, "value": 2.0, "tolerance": 0.1,
              "quantity": "order", "extra": {}}  # fmt: skip
@@ -665,11 +668,11 @@ def test_the_runs_behind_a_row_are_those_of_its_ladder(results):
 
 def document_of(name: str, rows: list) -> dict:
     """Results as a run stores them: one scenario, and these rows."""
-    from plumbline.scenario.loader import find, load
+    from plumbline.scenario.loader import find_scenario_file, load_scenario
 
-    scenario = load(find(name))
+    scenario = load_scenario(find_scenario_file(name))
     about = {
-        "digest": scenario.digest, "sample": scenario.sample,
+        "digest": scenario.digest, "sample": scenario.sample_interval,
         "model": {k: np.asarray(v).tolist() for k, v in vars(scenario.model).items()},
         "state": {k: getattr(scenario.state, k).tolist() for k in ("p", "omega", "u", "udot")},
     }  # fmt: skip
@@ -681,11 +684,11 @@ def document_of(name: str, rows: list) -> dict:
     [("exudyn", "reversed in time", LOSSY), ("exudyn-tree", "by EigenSparse", SPARSE)],
 )
 def test_the_run_behind_a_relation_of_runs_is_asked_for_again(engine, relation, lines):
-    from plumbline.scenario.loader import find, load
+    from plumbline.scenario.loader import find_scenario_file, load_scenario
 
-    scenario = load(find("double-tumbling-balls"))
+    scenario = load_scenario(find_scenario_file("double-tumbling-balls"))
     with defective(lines):
-        found = list(metamorphic.runs(adapter(engine), scenario.model, scenario.state))
+        found = list(metamorphic.check_run_relations(load_adapter(engine), scenario.model, scenario.state))
         rows = metamorphic.judge_relations(
             measure.Subject(scenario.name, "", engine, engine, "1"), found
         ).rows
@@ -701,14 +704,19 @@ def test_the_run_behind_a_relation_of_runs_is_asked_for_again(engine, relation, 
 
 
 def test_the_long_runs_behind_a_row_are_asked_for_again():
-    from plumbline.scenario.loader import find, load
+    from plumbline.scenario.loader import find_scenario_file, load_scenario
 
-    scenario, method = load(find("tumbling-ball")), adapter("mujoco").integrator("RK4")
+    scenario, method = (
+        load_scenario(find_scenario_file("tumbling-ball")),
+        load_adapter("mujoco").integrator("RK4"),
+    )
     with defective(DAMPED):
-        plan = course(method, 1, 6.25)
-        runs = endure("mujoco", "RK4", scenario.model, scenario.state, scenario.sample, plan)
+        plan = plan_long_run(method, 1, 6.25)
+        runs = run_long_run_study(
+            "mujoco", "RK4", scenario.model, scenario.state, scenario.sample_interval, plan
+        )
         who = measure.Subject(scenario.name, "", "mujoco", "MuJoCo", "1")
-        rows = judge_endurance(who, scenario.model, method, runs, False).rows
+        rows = judge_long_runs(who, scenario.model, method, runs, False).rows
         document = document_of(scenario.name, rows)
         off = write.disputed(document)
         question = write.asked(document, off, 1.0)
@@ -722,7 +730,8 @@ def test_the_long_runs_behind_a_row_are_asked_for_again():
 
 def test_a_lost_engine_is_told_and_leaves_no_script(results):
     with patch(
-        "plumbline.reproduce.write.Workers.run", lambda _, tasks: [Outcome(t.key, lost="hung") for t in tasks]
+        "plumbline.reproduce.write.WorkerPool.run",
+        lambda _, tasks: [Outcome(t.key, failure="hung") for t in tasks],
     ):
         told = write.write(results)
         assert write.write(results, ["d"]) == {"d": "hung"}
@@ -731,7 +740,7 @@ def test_a_lost_engine_is_told_and_leaves_no_script(results):
 
 
 def test_at_the_end_of_a_run_nothing_long_is_begun(results):
-    document = results_store.read(results)
+    document = results_store.read_results(results)
     slow = {
         "key": "s",
         "level": "trajectory",
@@ -741,7 +750,7 @@ def test_at_the_end_of_a_run_nothing_long_is_begun(results):
     }
     document["rows"] = [document["rows"][0] | slow]
     (results / "results.json").write_text(json.dumps(document))
-    with patch("plumbline.reproduce.write.Workers", side_effect=AssertionError("began")):
+    with patch("plumbline.reproduce.write.WorkerPool", side_effect=AssertionError("began")):
         told = write.write(results)
     assert told == {
         "s": "one try takes 2.0 s of computing, too long at the end of a run; ask for this row by its key"

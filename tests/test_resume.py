@@ -17,9 +17,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from plumbline.engines import calls
-from plumbline.execution.result_cache import Cells, key_of
-from plumbline.execution.runner import Plan, execute
-from plumbline.processes.packed import Packed
+from plumbline.execution.result_cache import DiskResultCache, task_hash
+from plumbline.execution.runner import Plan, run_plan
+from plumbline.processes.packed import Pickled
 from plumbline.processes.workers import Outcome, Task
 from plumbline.scenario import loader
 
@@ -147,24 +147,26 @@ def run(cells, stop_after=None):
         if done == stop_after:
             raise Interrupted
 
-    chosen = loader.load_many(["rest", "conical"])
+    chosen = loader.load_scenarios(["rest", "conical"])
     try:
-        result = execute(Plan(chosen, ["mujoco"], "state", memory=cells, states=3), progress)
+        result = run_plan(
+            Plan(chosen, ["mujoco"], "state", result_cache=cells, random_state_count=3), progress
+        )
     except Interrupted:
         return None, ran
-    return [replace(row, wall_time=0.0) for row in result.rows], ran
+    return [replace(row, cpu_time=0.0) for row in result.rows], ran
 
 
 def test_only_what_was_not_finished_runs_again(tmp_path):
-    expected, everything = run(Cells(tmp_path / "calm"))
-    _, first = run(Cells(tmp_path / "rough"), stop_after=2)
-    rows, rest = run(Cells(tmp_path / "rough"))
+    expected, everything = run(DiskResultCache(tmp_path / "calm"))
+    _, first = run(DiskResultCache(tmp_path / "rough"), stop_after=2)
+    rows, rest = run(DiskResultCache(tmp_path / "rough"))
     assert (everything, first, rest) == (4, 2, 2)
     assert rows == expected
 
 
 def test_a_damaged_cell_is_named_and_runs_again(tmp_path):
-    expected, _ = run(Cells(tmp_path))
+    expected, _ = run(DiskResultCache(tmp_path))
     paths = sorted(tmp_path.glob("*.cell"))
     data = bytearray(paths[0].read_bytes())
     data[len(data) // 2] ^= 1
@@ -172,27 +174,29 @@ def test_a_damaged_cell_is_named_and_runs_again(tmp_path):
     paths[1].write_bytes(paths[1].read_bytes()[:-1])
     paths[2].write_bytes(b"")
     told = []
-    rows, ran = run(Cells(tmp_path, told.append))
+    rows, ran = run(DiskResultCache(tmp_path, told.append))
     assert ran == 3 and rows == expected
     assert len(told) == 3 and all("damaged" in sentence for sentence in told)
 
 
 def test_a_lost_cell_is_tried_again(tmp_path):
     task = Task(("s", "mujoco", "state"), quiet)
-    Cells(tmp_path).put(task, Outcome(task.key, lost="crashed"))
-    assert Cells(tmp_path).get(task) is None
+    DiskResultCache(tmp_path).put(task, Outcome(task.key, failure="crashed"))
+    assert DiskResultCache(tmp_path).get(task) is None
 
 
 def test_the_key_is_the_content():
-    s = loader.load_many(["double-tumbling-balls"])[0]
+    s = loader.load_scenarios(["double-tumbling-balls"])[0]
     turned = replace(s.state, omega=-s.state.omega)
     other = replace(s.model, mass=np.nextafter(s.model.mass, 9.0))
-    base = Task("a", calls.climb, ("mujoco", "RK4", s.model, s.state, s.times, [0.5, 0.25]), version="4.0.0")
-    key = key_of(base)
-    assert key == key_of(replace(base, key="b")), "the key is not the label's"
+    base = Task(
+        "a", calls.run_refinement, ("mujoco", "RK4", s.model, s.state, s.times, [0.5, 0.25]), version="4.0.0"
+    )
+    key = task_hash(base)
+    assert key == task_hash(replace(base, key="b")), "the key is not the label's"
     changed = [
         replace(base, version="3.3.0"),
-        replace(base, call=calls.evaluate),
+        replace(base, call=calls.evaluate_states),
         *(
             replace(base, arguments=(*base.arguments[:i], value, *base.arguments[i + 1 :]))
             for i, value in enumerate(
@@ -207,7 +211,11 @@ def test_the_key_is_the_content():
             )
         ),
     ]
-    assert len({key, *map(key_of, changed)}) == 1 + len(changed)
-    assert key_of(replace(base, arguments=(["ab", "c"],))) != key_of(replace(base, arguments=(["a", "bc"],)))
-    packed = [key_of(replace(base, arguments=(Packed.of([state]),))) for state in (s.state, s.state, turned)]
+    assert len({key, *map(task_hash, changed)}) == 1 + len(changed)
+    assert task_hash(replace(base, arguments=(["ab", "c"],))) != task_hash(
+        replace(base, arguments=(["a", "bc"],))
+    )
+    packed = [
+        task_hash(replace(base, arguments=(Pickled.of([state]),))) for state in (s.state, s.state, turned)
+    ]
     assert packed[0] == packed[1] != packed[2]

@@ -4,9 +4,9 @@ import time
 
 import pytest
 
-from plumbline.execution.runner import Plan, execute
-from plumbline.processes.cpu_time import KINDS, Split, spent
-from plumbline.processes.workers import Memory, Outcome
+from plumbline.execution.runner import Plan, run_plan
+from plumbline.processes.cpu_time import CPU_TIME_KINDS, CpuTimes, cpu_time_spent
+from plumbline.processes.workers import Outcome, ResultCache
 from plumbline.scenario import loader
 
 
@@ -17,8 +17,8 @@ def burn(seconds):
 
 
 def test_what_is_measured_inside_is_not_process_too():
-    split = Split()
-    with split.work():
+    split = CpuTimes()
+    with split.measure_overhead():
         burn(0.05)
         with split.measure("judging"):
             burn(0.1)
@@ -27,30 +27,32 @@ def test_what_is_measured_inside_is_not_process_too():
 
 
 def test_calls_are_counted_by_whom_they_asked():
-    split = Split()
+    split = CpuTimes()
     for key, cost in ((("s", "truth", "state"), 1.0), (("s", "reference", "state"), 2.0),
                       (("s", "mujoco", "state"), 4.0), (("s", "why", "mujoco"), 8.0)):  # fmt: skip
-        split.count(Outcome(key, cost=cost))
+        split.add_outcome(Outcome(key, cpu_time=cost))
     assert [split.seconds[k] for k in ("truth", "reference", "engines", "diagnosis")] == [1.0, 2.0, 4.0, 8.0]
-    assert "harness 0 %, truth and reference 275 %" in split.sentence()
+    assert "harness 0 %, truth and reference 275 %" in split.summary()
 
 
 def test_a_memory_is_the_same_and_measured():
-    class Slow(Memory):
+    class Slow(ResultCache):
         def get(self, task):
             burn(0.05)
             return Outcome(("a",), 3)
 
-    split = Split()
-    assert split.storing(Slow()).get(None).value == 3
+    split = CpuTimes()
+    assert split.timed_cache(Slow()).get(None).value == 3
     assert split.seconds["storage"] > 0.04
 
 
 def test_a_run_accounts_for_its_time():
     pytest.importorskip("mujoco")
-    begin = spent()
-    chosen = loader.load_many(["rest"])
-    split = execute(Plan(chosen, ["reference", "mujoco"], states=3), lambda *_: None).split
-    seconds = {kind: split.seconds[kind] for kind in KINDS}
+    begin = cpu_time_spent()
+    chosen = loader.load_scenarios(["rest"])
+    split = run_plan(Plan(chosen, ["reference", "mujoco"], random_state_count=3), lambda *_: None).cpu_times
+    seconds = {kind: split.seconds[kind] for kind in CPU_TIME_KINDS}
     assert all(seconds[k] > 0 for k in ("engines", "reference", "truth", "process", "judging")), seconds
-    assert 0.7 * (spent() - begin) < sum(seconds.values()) < 1.1 * (spent() - begin), seconds
+    assert 0.7 * (cpu_time_spent() - begin) < sum(seconds.values()) < 1.1 * (cpu_time_spent() - begin), (
+        seconds
+    )

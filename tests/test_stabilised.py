@@ -7,22 +7,28 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adapters.reference_engine import chain
-from plumbline.model.kinematics import rate
-from reference_impl.collocation import integrate
+from adapters.reference_engine import notes_chain
+from plumbline.model.kinematics import quaternion_rate
+from reference_impl.collocation import integrate_collocation
 from reference_impl.euler_parameters import angular_velocity
-from reference_impl.joints import rows
-from reference_impl.stabilised import VARIANTS, constraint_errors, drift_table, energy_error, run
-from reference_impl.structured import Forest, lay
+from reference_impl.joints import constraint_rows
+from reference_impl.stabilised import (
+    VARIANTS,
+    constraint_errors,
+    drift_table,
+    energy_error,
+    integrate_variant,
+)
+from reference_impl.structured import StructuredSystem, component_first
 from tests.random_chains import random_chain
 
 
 @pytest.mark.parametrize("rods", [[False], [True], [False, True, False]])
 def test_every_variant_converges_to_the_same_motion(rods: list[bool]) -> None:
     model, state = random_chain(np.random.default_rng(60), rods, loads=True, drag=True)
-    start = chain(model), state.r, state.p, state.v, rate(state.p, state.omega)
+    start = notes_chain(model), state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
     times = np.linspace(0, 0.5, 6)
-    runs = [run(variant, *start, times, 1e-13) for variant in VARIANTS]
+    runs = [integrate_variant(variant, *start, times, 1e-13) for variant in VARIANTS]
     for other in runs[1:]:
         assert np.max(np.abs(other.r - runs[0].r)) < 1e-10
         assert np.max(np.abs(other.pdot - runs[0].pdot)) < 1e-9
@@ -33,8 +39,8 @@ def test_projection_is_newton_on_every_constraint(rods: list[bool]) -> None:
     """From 1e-5 off the manifold to rounding; a state on it stays."""
     rng = np.random.default_rng(61)
     model, state = random_chain(rng, rods)
-    forest, pdot = Forest([chain(model)]), rate(state.p, state.omega)
-    q, v = lay(state.r, state.p), lay(state.v, pdot)
+    forest, pdot = StructuredSystem([notes_chain(model)]), quaternion_rate(state.p, state.omega)
+    q, v = component_first(state.r, state.p), component_first(state.v, pdot)
     near = forest.project(q + 1e-5 * rng.normal(size=q.shape), v + 1e-5 * rng.normal(size=q.shape))
     for error in forest.constraints(*near):
         assert np.max(np.abs(error)) < 1e-14
@@ -48,7 +54,13 @@ def test_projection_is_newton_on_every_constraint(rods: list[bool]) -> None:
 def test_raw_drifts_and_the_others_do_not() -> None:
     model, state = random_chain(np.random.default_rng(62), [False])
     table = drift_table(
-        chain(model), state.r, state.p, state.v, rate(state.p, state.omega), rtols=(1e-6,), times=(3.0, 30.0)
+        notes_chain(model),
+        state.r,
+        state.p,
+        state.v,
+        quaternion_rate(state.p, state.omega),
+        rtols=(1e-6,),
+        times=(3.0, 30.0),
     )
     held = {(row.variant, row.time): row for row in table}
     assert held["raw", 30.0].gap > 3 * held["raw", 3.0].gap
@@ -62,17 +74,25 @@ def test_baumgarte_pulls_back_at_its_rate() -> None:
     """A gap of 1e-6 with a = 10/s is critically damped: (1 + a t) e^{−a t} of it is left."""
     model, state = random_chain(np.random.default_rng(63), [False])
     r, times = state.r + np.array([1e-6, 0, 0]), np.linspace(0, 1, 5)
-    held = run(
-        "baumgarte", chain(model), r, state.p, state.v, rate(state.p, state.omega), times, 1e-12, rate=10.0
+    held = integrate_variant(
+        "baumgarte",
+        notes_chain(model),
+        r,
+        state.p,
+        state.v,
+        quaternion_rate(state.p, state.omega),
+        times,
+        1e-12,
+        rate=10.0,
     )
-    left = constraint_errors(chain(model), held)[0] / 1e-6
+    left = constraint_errors(notes_chain(model), held)[0] / 1e-6
     assert np.max(np.abs(left - (1 + 10 * times) * np.exp(-10 * times))) < 1e-3
 
 
 @pytest.mark.full
 def test_energy_over_a_thousand_seconds() -> None:
     model, state = random_chain(np.random.default_rng(64), [False])
-    start = chain(model), state.r, state.p, state.v, rate(state.p, state.omega)
+    start = notes_chain(model), state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
     row = drift_table(*start, rtols=(1e-13,), times=(1000.0,), variants=("projected",))[0]
     assert row.energy <= 1e-12
     assert row.gap < 1e-14
@@ -83,8 +103,8 @@ def test_constraint_errors_are_metres_and_metres_a_second(rods: list[bool]) -> N
     """A rod's stretch and its rate, a ball's distance and speed, each the worst of its state, from `rows`."""
     rng = np.random.default_rng(65)
     model, state = random_chain(rng, rods)
-    one, pdot = chain(model), rate(state.p, state.omega)
-    motion = run("raw", one, state.r, state.p, state.v, pdot, np.linspace(0, 0.1, 3), 1e-6)
+    one, pdot = notes_chain(model), quaternion_rate(state.p, state.omega)
+    motion = integrate_variant("raw", one, state.r, state.p, state.v, pdot, np.linspace(0, 0.1, 3), 1e-6)
     n = model.n
     moved = replace(
         motion,
@@ -93,8 +113,8 @@ def test_constraint_errors_are_metres_and_metres_a_second(rods: list[bool]) -> N
     )
     found = constraint_errors(one, moved)
     for t in range(3):
-        joints = rows(one, moved.r[t], moved.p[t], moved.v[t], moved.pdot[t])
-        rates = joints.rate(moved.v[t], moved.pdot[t])
+        joints = constraint_rows(one, moved.r[t], moved.p[t], moved.v[t], moved.pdot[t])
+        rates = joints.constraint_rate(moved.v[t], moved.pdot[t])
         gaps, speeds = [], []
         for k in range(n):
             distance = np.linalg.norm(joints.d[k])
@@ -110,8 +130,10 @@ def test_constraint_errors_are_metres_and_metres_a_second(rods: list[bool]) -> N
 
 def test_energy_is_over_the_weight_and_reach_of_the_stretched_chain() -> None:
     model, state = random_chain(np.random.default_rng(66), [True, False, True])
-    one, pdot = chain(model), rate(state.p, state.omega)
-    motion = run("projected", one, state.r, state.p, state.v, pdot, np.linspace(0, 0.1, 3), 1e-12)
+    one, pdot = notes_chain(model), quaternion_rate(state.p, state.omega)
+    motion = integrate_variant(
+        "projected", one, state.r, state.p, state.v, pdot, np.linspace(0, 0.1, 3), 1e-12
+    )
     near, far = np.linalg.norm(model.proximal, axis=1), np.linalg.norm(model.distal, axis=1)
     hang = [model.length[0] + near[0], 0.0, 0.0]
     hang[1] = hang[0] + far[0] + near[1]
@@ -135,13 +157,13 @@ def test_energy_is_over_the_weight_and_reach_of_the_stretched_chain() -> None:
 def test_a_table_has_a_row_for_each_variant_tolerance_and_time() -> None:
     """The maxima up to a time, and the share of the steps that falls to it."""
     model, state = random_chain(np.random.default_rng(67), [False])
-    start = chain(model), state.r, state.p, state.v, rate(state.p, state.omega)
+    start = notes_chain(model), state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
     rtols, times = (1e-4, 1e-6), (0.5, 2.0, 4.0)
     table = drift_table(*start, rtols=rtols, times=times, samples=8, variants=("raw", "projected"))
     expected = [(v, rtol, end) for v in ("raw", "projected") for rtol in rtols for end in times]
     assert [(row.variant, row.rtol, row.time) for row in table] == expected
     grid = np.unique(np.concatenate([np.linspace(0, end, 9) for end in times]))
-    motion = run("raw", *start, grid, 1e-4)
+    motion = integrate_variant("raw", *start, grid, 1e-4)
     errors = [*constraint_errors(start[0], motion), energy_error(start[0], motion)]
     for row in table[:3]:
         upto = [float(np.max(error[grid <= row.time])) for error in errors]
@@ -151,17 +173,17 @@ def test_a_table_has_a_row_for_each_variant_tolerance_and_time() -> None:
 
 def test_there_are_three_variants_and_no_other() -> None:
     model, state = random_chain(np.random.default_rng(68), [False])
-    start = chain(model), state.r, state.p, state.v, rate(state.p, state.omega)
+    start = notes_chain(model), state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
     with pytest.raises(ValueError, match="no variant 'damped'"):
-        run("damped", *start, np.array([0.0, 0.1]), 1e-6)
+        integrate_variant("damped", *start, np.array([0.0, 0.1]), 1e-6)
 
 
 def test_projection_from_afar_ends_on_unit_quaternions() -> None:
     """From 5 % off what is left of the gaps is of higher order, but p is normalised to rounding."""
     rng = np.random.default_rng(69)
     model, state = random_chain(rng, [True, False, False])
-    forest = Forest([chain(model)])
-    q, v = lay(state.r, state.p), lay(state.v, rate(state.p, state.omega))
+    forest = StructuredSystem([notes_chain(model)])
+    q, v = component_first(state.r, state.p), component_first(state.v, quaternion_rate(state.p, state.omega))
     far = q + 0.05 * rng.normal(size=q.shape)
     near = forest.project(far, v + 0.05 * rng.normal(size=q.shape))
     assert np.max(np.abs(np.sum(near[0][3:] ** 2, axis=0) - 1)) < 1e-15
@@ -174,15 +196,15 @@ def test_projection_from_afar_ends_on_unit_quaternions() -> None:
 def test_a_variant_is_collocation_with_its_own_option_and_no_other(variant: str) -> None:
     model, state = random_chain(np.random.default_rng(70), [False, True])
     state = replace(state, r=state.r + 1e-3)  # off the manifold, where the options differ
-    start, times = (state.r, state.p, state.v, rate(state.p, state.omega)), np.linspace(0, 0.2, 3)
-    ours = run(variant, chain(model), *start, times, 1e-6, rate=7.0, nodes=5)
-    same = integrate(
-        [chain(model)],
+    start, times = (state.r, state.p, state.v, quaternion_rate(state.p, state.omega)), np.linspace(0, 0.2, 3)
+    ours = integrate_variant(variant, notes_chain(model), *start, times, 1e-6, rate=7.0, nodes=5)
+    same = integrate_collocation(
+        [notes_chain(model)],
         *start,
         times,
         1e-6,
         nodes=5,
         baumgarte=7.0 * (variant == "baumgarte"),
-        projected=variant == "projected",
+        project=variant == "projected",
     )
     assert np.array_equal(ours.r, same.r) and np.array_equal(ours.pdot, same.pdot)

@@ -5,27 +5,27 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.engines.calls import Evaluation, climb
-from plumbline.engines.registry import adapter
-from plumbline.execution.scenario_run import horizon_of
-from plumbline.judging.rows import Subject
-from plumbline.judging.state import UNITS, judge_packed, judge_states
-from plumbline.judging.trajectory import judge_motion
+from plumbline.engines.calls import Evaluation, run_refinement
+from plumbline.engines.registry import load_adapter
+from plumbline.execution.scenario_run import predictability_horizon
+from plumbline.judging.rows import RowContext
+from plumbline.judging.state import STATE_UNITS, judge_states, judge_states_pickled
+from plumbline.judging.trajectory import judge_trajectory
 from plumbline.model.sampling import random_states
-from plumbline.processes.packed import Packed
+from plumbline.processes.packed import Pickled
 from plumbline.truth.ground_truth import StateTruth, motion_truth
-from plumbline.truth.rounding_bound import state_bound
+from plumbline.truth.rounding_bound import state_rounding_bound
 from tests import pendulums
 
 MODEL = pendulums.model("bb")
 STATES = random_states(MODEL, 3, 1)
-WHO = Subject("s", "f", "reference", "Reference", "0")
+WHO = RowContext("s", "f", "reference", "Reference", "0")
 
 
 def verdict(scale_of_bound, shift=0.0):
     """The verdict on acceleration of the reference against itself, its bound and answer changed."""
-    said = adapter("reference").evaluate(MODEL, STATES)
-    bounds = [state_bound(MODEL, s) for s in STATES]
+    said = load_adapter("reference").evaluate(MODEL, STATES)
+    bounds = [state_rounding_bound(MODEL, s) for s in STATES]
     bounds = [replace(b, acceleration=b.acceleration * scale_of_bound) for b in bounds]
     truth = StateTruth(STATES, said, bounds, "itself")
     off = [
@@ -45,7 +45,9 @@ def test_a_bound_decides_only_where_it_is_sharp(scale, shift, expected):
 
 
 def test_a_blunt_row_says_what_was_measured():
-    bounds = [replace(b, acceleration=1e6 * b.acceleration) for b in map(state_bound, [MODEL] * 3, STATES)]
+    bounds = [
+        replace(b, acceleration=1e6 * b.acceleration) for b in map(state_rounding_bound, [MODEL] * 3, STATES)
+    ]
     row = judged((1, 1, 0.5), bounds=bounds).rows[0]
     assert (row.level, row.integrator, row.quantity, row.unit) == ("state", "-", "acceleration", "m/s²")
     assert row.verdict == "unresolved" and row.reason.startswith("blunt: the rounding bound is ")
@@ -53,10 +55,10 @@ def test_a_blunt_row_says_what_was_measured():
 
 
 def test_a_packed_truth_is_judged_as_it_is_open():
-    right = adapter("reference").evaluate(MODEL, STATES)
-    truth = StateTruth(STATES, right, [state_bound(MODEL, s) for s in STATES], "itself")
+    right = load_adapter("reference").evaluate(MODEL, STATES)
+    truth = StateTruth(STATES, right, [state_rounding_bound(MODEL, s) for s in STATES], "itself")
     said = Evaluation(right[::-1], None, None, 0.0)
-    assert judge_packed(WHO, Packed.of(truth), said).rows == judge_states(WHO, truth, said).rows
+    assert judge_states_pickled(WHO, Pickled.of(truth), said).rows == judge_states(WHO, truth, said).rows
 
 
 @pytest.mark.parametrize("drag", [False, True])
@@ -64,20 +66,22 @@ def test_implicitfast_is_an_alias_of_euler_only_without_drag(drag):
     """And where it is called one, it is Euler to the last bit."""
     model, times = pendulums.model("b", drag=drag), np.linspace(0, 0.5, 9)
     state = pendulums.state(model, seed=2, rate=0.5)
-    truth, mujoco = motion_truth(model, state, times, None), adapter("mujoco")
+    truth, mujoco = motion_truth(model, state, times, None), load_adapter("mujoco")
     steps = [2.0**-k for k in range(9, 13)]
-    runs = {name: climb("mujoco", name, model, state, times, steps) for name in ("Euler", "implicitfast")}
-    same = np.array_equal(*(c.rungs[-1].trajectory.r for c in runs.values()))
+    runs = {
+        name: run_refinement("mujoco", name, model, state, times, steps) for name in ("Euler", "implicitfast")
+    }
+    same = np.array_equal(*(c.runs[-1].trajectory.r for c in runs.values()))
     fast = mujoco.integrator("implicitfast")
-    rows = judge_motion(WHO, model, truth, fast, runs["implicitfast"], horizon_of(truth)).rows
+    rows = judge_trajectory(WHO, model, truth, fast, runs["implicitfast"], predictability_horizon(truth)).rows
     assert {row.alias_of for row in rows} == ({None} if drag else {"Euler"})
     assert same is not drag
 
 
 def judged(*off, bounds=None, **evaluation):
     """Findings on answers that are ``off`` by so many bounds of acceleration: (state, body, bounds)."""
-    right = adapter("reference").evaluate(MODEL, STATES)
-    bounds = bounds or [state_bound(MODEL, s) for s in STATES]
+    right = load_adapter("reference").evaluate(MODEL, STATES)
+    bounds = bounds or [state_rounding_bound(MODEL, s) for s in STATES]
     said = list(right)
     for state, body, by in off:
         shift = np.zeros((2, 3))
@@ -88,7 +92,7 @@ def judged(*off, bounds=None, **evaluation):
 
 
 def test_the_row_is_of_the_body_that_is_worst_by_its_own_bound():
-    bounds = [state_bound(MODEL, s) for s in STATES]
+    bounds = [state_rounding_bound(MODEL, s) for s in STATES]
     # The larger error in m/s² is elsewhere: body 1 of state 0 gets a bound a thousand times as wide.
     wide = bounds[0].acceleration * [1e3, 1.0]
     bounds[0] = replace(bounds[0], acceleration=wide)
@@ -101,7 +105,7 @@ def test_the_row_is_of_the_body_that_is_worst_by_its_own_bound():
     assert row.value == pytest.approx(3 * sharp, rel=1e-2, abs=0) and row.tolerance == sharp
     assert (row.extra["state"], row.extra["body"], row.extra["states"]) == (2.0, 2.0, 3.0)
     assert row.extra["ratio"] == pytest.approx(3, rel=1e-2)
-    assert row.wall_time == 0.25
+    assert row.cpu_time == 0.25
     assert "state 2, body 2" in row.reason and "2 of 3 states disagree" in row.reason
     assert row.derivation.endswith("truth: itself")
     (name, table), *_ = found.tables
@@ -127,7 +131,7 @@ def test_one_bound_is_the_border(by, expected):
     assert all(
         row.verdict == "agrees" and row.value == 0 for row in rows[1:] if row.quantity != "mass_matrix"
     )
-    assert [row.quantity for row in rows] == list(UNITS)
+    assert [row.quantity for row in rows] == list(STATE_UNITS)
     assert [row.unit for row in rows] == ["m/s²", "rad/s²", "N", "J", "J", "kg m²/s", "kg m²"]
     assert {(row.level, row.integrator, row.engine) for row in rows} == {("state", "-", "reference")}
     assert rows[1].reason == "angular acceleration within 0 of the rounding bound at 3 states"
@@ -135,13 +139,13 @@ def test_one_bound_is_the_border(by, expected):
 
 
 def test_what_an_engine_does_not_offer_or_deliver_is_told():
-    right = adapter("reference").evaluate(MODEL, STATES)
+    right = load_adapter("reference").evaluate(MODEL, STATES)
     less = [*right[:2], replace(right[2], joint_reaction=None)]
     rows = judged(quantities=less).rows
     (gone,) = (row for row in rows if row.quantity == "joint_reaction")
     assert (gone.verdict, gone.unit, gone.level, gone.integrator) == ("unsupported", "N", "state", "-")
     assert gone.reason == "Reference offers no joint reaction of its own"
-    assert len(rows) == len(UNITS)
+    assert len(rows) == len(STATE_UNITS)
     for field, verdict in (("unsupported", "unsupported"), ("failure", "failed")):
         (row,) = judged(**{field: "because"}).rows
         assert (row.quantity, row.verdict, row.reason) == ("all", verdict, "because")
@@ -149,7 +153,7 @@ def test_what_an_engine_does_not_offer_or_deliver_is_told():
 
 
 def test_vectors_count_by_their_length_and_matrices_by_their_worst_entry():
-    right = adapter("reference").evaluate(MODEL, STATES)
+    right = load_adapter("reference").evaluate(MODEL, STATES)
     matrix = right[0].mass_matrix.copy()
     matrix[0, 1] -= 1.0
     matrix[3, 4] += 0.5
@@ -166,8 +170,8 @@ def test_vectors_count_by_their_length_and_matrices_by_their_worst_entry():
 def test_a_scale_of_zero_is_no_reason_to_be_blunt():
     """At rest there is no kinetic energy, no tolerance for it, and 0 = 0."""
     still = [replace(s, omega=0 * s.omega, v=0 * s.v) for s in STATES]
-    right = adapter("reference").evaluate(MODEL, still)
-    bounds = [state_bound(MODEL, s) for s in still]
+    right = load_adapter("reference").evaluate(MODEL, still)
+    bounds = [state_rounding_bound(MODEL, s) for s in still]
     found = judge_states(WHO, StateTruth(still, right, bounds, "itself"), Evaluation(right, None, None, 0.0))
     row = next(row for row in found.rows if row.quantity == "kinetic_energy")
     assert (row.verdict, row.value, row.tolerance) == ("agrees", 0.0, 0.0)

@@ -16,7 +16,7 @@ from plumbline.cli.main import nightly
 from plumbline.execution import runner
 from plumbline.execution.runner import Plan
 from plumbline.processes import workers
-from plumbline.processes.workers import Limits, Memory
+from plumbline.processes.workers import Limits, ResultCache
 from plumbline.scenario import loader
 from plumbline.storage.history import History
 
@@ -37,11 +37,11 @@ class Here:
         pass
 
     def run(self, tasks, memory=None):
-        memory = memory or Memory()
+        memory = memory or ResultCache()
         for task in tasks:
             found = memory.get(task)
             if found is None:
-                found = workers.perform(task)
+                found = workers.run_task(task)
                 memory.put(task, found)
             yield found
 
@@ -115,13 +115,13 @@ class Disk:
 
 @pytest.fixture
 def disk(monkeypatch):
-    monkeypatch.setattr(runner, "Workers", Here)
-    monkeypatch.setattr(nightly, "Plan", lambda *a, **k: Plan(*a, **k, states=1))
+    monkeypatch.setattr(runner, "WorkerPool", Here)
+    monkeypatch.setattr(nightly, "Plan", lambda *a, **k: Plan(*a, **k, random_state_count=1))
     return Disk(monkeypatch)
 
 
 def night(out):
-    chosen = loader.load_many(["rest"])
+    chosen = loader.load_scenarios(["rest"])
     result, place = nightly.nightly(
         out, chosen, ["mujoco"], random=0, seed=1, jobs=1, limits=Limits(), whole=False, command="-", finer=0,
         level="state", progress=lambda *_: None, tell=lambda _: None,
@@ -203,8 +203,8 @@ def test_a_clock_set_back_overwrites_no_night(tmp_path):
 
 def test_nights_are_told_in_the_order_in_which_they_were_made(tmp_path, monkeypatch):
     """The clock is set back, forward within the second night, and then shows the first one again."""
-    monkeypatch.setattr(runner, "Workers", Here)
-    monkeypatch.setattr(nightly, "Plan", lambda *a, **k: Plan(*a, **k, states=1))
+    monkeypatch.setattr(runner, "WorkerPool", Here)
+    monkeypatch.setattr(nightly, "Plan", lambda *a, **k: Plan(*a, **k, random_state_count=1))
     days = iter([10, 10, 5, 8, 10, 10])  # when a night begins, and when its run does
 
     class Clock(datetime):

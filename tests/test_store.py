@@ -9,11 +9,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from plumbline.judging.rows import Subject
+from plumbline.judging.rows import RowContext
 from plumbline.model.datatypes import Row
 from plumbline.storage import results_store
 
-ROW = Subject("s", "single", "mujoco", "MuJoCo", "4.0").row(
+ROW = RowContext("s", "single", "mujoco", "MuJoCo", "4.0").make_row(
     "state",
     "-",
     "acceleration",
@@ -40,7 +40,7 @@ STATES = [
 
 
 def write(folder):
-    tables = results_store.Tables()
+    tables = results_store.ResultTables()
     names = {"scenario": "s", "engine": "mujoco", "quantity": "q"}
     for part in ([0], [1, 2]):
         tables.add(
@@ -55,12 +55,12 @@ def write(folder):
             },
         )
     tables.add_rows([ROW])
-    results_store.write(folder, {"id": "x"}, {"s": {"title": "<b>"}}, {}, [ROW], tables)
+    results_store.write_results(folder, {"id": "x"}, {"s": {"title": "<b>"}}, {}, [ROW], tables)
 
 
 def test_what_is_written_is_read_back(tmp_path):
     write(tmp_path / "new")
-    document = results_store.read(tmp_path / "new")
+    document = results_store.read_results(tmp_path / "new")
     (row,) = document["rows"]
     assert row["key"] == "s/mujoco/state/-/acceleration"
     assert row["value"] == 1e-15
@@ -79,8 +79,8 @@ def test_nothing_temporary_is_left(tmp_path):
 
 
 def test_many_records_take_several_row_groups_and_none_is_lost(tmp_path, monkeypatch):
-    monkeypatch.setattr(results_store, "GROUP", 7)
-    tables = results_store.Tables()
+    monkeypatch.setattr(results_store, "ROW_GROUP_SIZE", 7)
+    tables = results_store.ResultTables()
     for k in range(20):
         column = np.arange(3.0) + 3 * k
         tables.add(
@@ -96,7 +96,7 @@ def test_many_records_take_several_row_groups_and_none_is_lost(tmp_path, monkeyp
                 "scale": 2.0,
             },
         )
-    tables.write(tmp_path)
+    tables.write_parquet(tmp_path)
     assert [r["error"] for r in results_store.read_table(tmp_path, "states")] == list(range(60))
     assert pq.ParquetFile(tmp_path / "states.parquet").num_row_groups > 2
     assert results_store.read_table(tmp_path, "curves") == []
@@ -120,12 +120,12 @@ def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
 def test_foreign_or_broken_results_are_refused_by_name(tmp_path, text):
     (tmp_path / "results.json").write_text(text, encoding="latin-1")
     with pytest.raises(ValueError, match=r"results\.json"):
-        results_store.read(tmp_path)
+        results_store.read_results(tmp_path)
 
 
 def test_no_results_says_how_to_make_them(tmp_path):
     with pytest.raises(ValueError, match="plumbline run"):
-        results_store.read(tmp_path)
+        results_store.read_results(tmp_path)
 
 
 def test_the_field_reference_names_every_field_and_column():

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from plumbline.diagnosis.defect_model import DENSE, answer, case
+from plumbline.diagnosis.defect_model import MAX_DENSE_UNKNOWNS, evaluate_case, make_defect_case
 from plumbline.model.sampling import random_states
-from plumbline.truth.certified import certify
-from plumbline.truth.rounding_bound import state_bound
+from plumbline.truth.certified import certify_state
+from plumbline.truth.rounding_bound import state_rounding_bound
 from tests import pendulums
 
 pytest.importorskip("flint")
@@ -15,11 +15,11 @@ pytest.importorskip("flint")
 @pytest.mark.parametrize("joints", ["rb", "brbbrbrrbbrb"])
 def test_it_is_the_certified_answer(joints):
     model = pendulums.model(joints, loads=True, drag=True)
-    assert (9 * model.n > DENSE) == (len(joints) > 6)
+    assert (9 * model.n > MAX_DENSE_UNKNOWNS) == (len(joints) > 6)
     states = random_states(model, 3, 5)
-    said = answer(case(model, states))
+    said = evaluate_case(make_defect_case(model, states))
     for k, state in enumerate(states):
-        truth, bound = certify(model, state).quantities, state_bound(model, state)
+        truth, bound = certify_state(model, state).quantities, state_rounding_bound(model, state)
         for quantity, x in said.items():
             off = np.atleast_1d(x[k] - getattr(truth, quantity))
             size = np.linalg.norm(off, axis=-1) if x.ndim > 1 else np.abs(off)
@@ -28,8 +28,8 @@ def test_it_is_the_certified_answer(joints):
 
 def test_a_singular_chain_is_told():
     model = pendulums.model("b" * 8)
-    broken = case(model, random_states(model, 1, 1))
+    broken = make_defect_case(model, random_states(model, 1, 1))
     broken.mass[:] = 0.0
     broken.inertia[:] = 0.0
     with pytest.raises(np.linalg.LinAlgError), np.errstate(all="ignore"):
-        answer(broken)
+        evaluate_case(broken)

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from plumbline.engines.calls import Climb, climb
+from plumbline.engines.calls import RefinementStudy, run_refinement
 from plumbline.scenario.errors import ScenarioError
 from plumbline.studies import sweep
 
@@ -87,24 +87,33 @@ def test_a_mistake_of_the_engine_disagrees(tmp_path: Path, mistake: float) -> No
     spec, cells = sweep.load(write(tmp_path, FILE))
     cell = cells[0]
     assert cell.scenario is not None
-    truth: dict[int, sweep.Reference] = {}
-    sweep._batch([(cell, cell.scenario)], truth)
+    truth: dict[int, sweep.ReferenceMotion] = {}
+    sweep._run_reference_batch([(cell, cell.scenario)], truth)
     scenario = cell.scenario
     wrong = replace(scenario, model=replace(scenario.model, mass=scenario.model.mass * [1, 1 + mistake]))
-    found = sweep._climb("mujoco", "RK4", wrong, spec.step)
-    assert isinstance(found, Climb)
-    row = sweep._judge(cell, "mujoco", "RK4", found, None, truth[cell.index])
+    found = sweep._run_engine_refinement("mujoco", "RK4", wrong, spec.step)
+    assert isinstance(found, RefinementStudy)
+    row = sweep._judge_cell(cell, "mujoco", "RK4", found, None, truth[cell.index])
     assert row["verdict"] == ("disagrees" if mistake else "agrees"), row["reason"]
 
 
 def test_an_engine_too_coarse_to_tell_is_unresolved(tmp_path: Path) -> None:
     cell = sweep.load(write(tmp_path, FILE))[1][0]
     assert cell.scenario is not None
-    truth: dict[int, sweep.Reference] = {}
-    sweep._batch([(cell, cell.scenario)], truth)
+    truth: dict[int, sweep.ReferenceMotion] = {}
+    sweep._run_reference_batch([(cell, cell.scenario)], truth)
     s = cell.scenario
-    coarse = climb("mujoco", "Euler", s.model, s.state, s.times, [s.sample, s.sample / 2, s.sample / 4])
-    assert sweep._judge(cell, "mujoco", "Euler", coarse, None, truth[cell.index])["verdict"] == "unresolved"
+    coarse = run_refinement(
+        "mujoco",
+        "Euler",
+        s.model,
+        s.state,
+        s.times,
+        [s.sample_interval, s.sample_interval / 2, s.sample_interval / 4],
+    )
+    assert (
+        sweep._judge_cell(cell, "mujoco", "Euler", coarse, None, truth[cell.index])["verdict"] == "unresolved"
+    )
 
 
 @pytest.mark.parametrize(

@@ -12,20 +12,20 @@ import pytest
 
 from plumbline.model.datatypes import EngineFailure
 from plumbline.model.invariants import attitude_error, position_error
-from plumbline.processes.workers import Limits, Task, Workers
-from plumbline.scenario.loader import catalogue, find, load
+from plumbline.processes.workers import Limits, Task, WorkerPool
+from plumbline.scenario.loader import catalogue, find_scenario_file, load_scenario
 from plumbline.truth import ground_truth, trajectory
-from plumbline.truth.certified import certify
-from plumbline.truth.closed_form import solution
-from plumbline.truth.notes_motion import flow
-from plumbline.truth.taylor import heyoka, taylor
-from plumbline.truth.trajectory import EXTENDED, RTOL, trajectory_truth
+from plumbline.truth.certified import certify_state
+from plumbline.truth.closed_form import closed_form_motion
+from plumbline.truth.notes_motion import simulate_notes_form
+from plumbline.truth.taylor import load_heyoka, simulate_taylor
+from plumbline.truth.trajectory import MAX_EXTENDED_PRECISION_BODIES, NOTES_RTOL, trajectory_truth
 from tests.random_chains import random_chain
 
 TIMES = np.arange(41) * 0.05
-CATALOGUE = [load(path) for path in catalogue().values()]
+CATALOGUE = [load_scenario(path) for path in catalogue().values()]
 BALLS = [s for s in CATALOGUE if not s.model.rods.any()]
-CLOSED = [s for s in CATALOGUE if (closed := solution(s)) and closed.amplitude == 0]
+CLOSED = [s for s in CATALOGUE if (closed := closed_form_motion(s)) and closed.amplitude == 0]
 
 
 pytestmark = pytest.mark.skipif(
@@ -50,12 +50,14 @@ def test_extended_precision_is_as_good_as_quad_says_on_longer_chains(rods):
 def check_precisions(rods):
     """Each precision from quad, and the notes' form on its manifold, which shares no equation with them."""
     model, state = random_chain(np.random.default_rng(1), rods, loads=True, drag=True)
-    quad, extended, double = (taylor(model, state, TIMES, kind) for kind in ("quad", "extended", "double"))
+    quad, extended, double = (
+        simulate_taylor(model, state, TIMES, kind) for kind in ("quad", "extended", "double")
+    )
     fine, middle, coarse = (np.asarray(run.r, dtype=float) for run in (quad, extended, double))
     assert np.max(np.abs(middle - fine)) < 1e-15
     assert np.max(np.abs(coarse - fine)) < 1e-12
     assert np.max(np.abs(coarse - fine)) > 0, "double and quad gave the same bits: is quad really quad?"
-    assert np.max(np.abs(flow(model, state, TIMES, RTOL).r - fine)) < 1e-12
+    assert np.max(np.abs(simulate_notes_form(model, state, TIMES, NOTES_RTOL).r - fine)) < 1e-12
 
 
 @pytest.mark.full
@@ -66,9 +68,9 @@ def test_the_uncertainty_covers_what_a_higher_precision_says_of_the_truth(scenar
     Beyond the difference a bit per link: in double both methods add up a chain's links alike.
     """
     precision = "quad" if scenario.model.n <= 2 else "extended"
-    fine = taylor(scenario.model, scenario.state, TIMES, precision)
+    fine = simulate_taylor(scenario.model, scenario.state, TIMES, precision)
     closed = scenario in CLOSED
-    exact = (*solution(scenario)(TIMES), "") if closed else None
+    exact = (*closed_form_motion(scenario)(TIMES), "") if closed else None
     truth = trajectory_truth(scenario.model, scenario.state, TIMES, exact)
     r, p = (np.asarray(y, dtype=float) for y in (fine.r, fine.p))
     size = scenario.model.n * 2.0**-52 * max(1.0, float(np.max(np.abs(r))))
@@ -84,7 +86,7 @@ def test_the_uncertainty_covers_what_a_higher_precision_says_of_the_truth(scenar
 
 def check_balls(scenario):
     truth = trajectory_truth(scenario.model, scenario.state, TIMES)
-    precision = "extended" if scenario.model.n <= EXTENDED else "double"
+    precision = "extended" if scenario.model.n <= MAX_EXTENDED_PRECISION_BODIES else "double"
     print(
         f"{scenario.name}: {truth.position_uncertainty[-1]:.1e} m, {truth.attitude_uncertainty[-1]:.1e} rad"
     )
@@ -106,7 +108,7 @@ def test_the_uncertainty_is_below_a_picometre_on_long_chains_of_balls(scenario):
 
 @pytest.mark.parametrize("scenario", CLOSED, ids=lambda s: s.name)
 def test_it_agrees_with_the_closed_forms(scenario):
-    r, p = solution(scenario)(TIMES)
+    r, p = closed_form_motion(scenario)(TIMES)
     truth = trajectory_truth(scenario.model, scenario.state, TIMES, (r, p, "a book"))
     assert truth.method.startswith("closed form: a book; uncertainty: its difference from Taylor's method")
     assert np.array_equal(truth.trajectory.r, r)
@@ -118,8 +120,8 @@ def test_its_accelerations_are_the_certified_ones():
     """ω′ and v of a mixed chain, differenced over a microsecond, against ball arithmetic at one state."""
     model, state = random_chain(np.random.default_rng(4), [1, 0], loads=True, drag=True)
     h = 1e-4
-    run = taylor(model, state, np.array([0.0, h, 2 * h]), "extended")
-    said = certify(model, state).quantities
+    run = simulate_taylor(model, state, np.array([0.0, h, 2 * h]), "extended")
+    said = certify_state(model, state).quantities
     for values, expected in ((run.omega, said.angular_acceleration), (run.v, said.acceleration)):
         slope = np.asarray((-3 * values[0] + 4 * values[1] - values[2]) / (2 * h), dtype=float)
         assert slope == pytest.approx(expected, abs=3e-6 * np.max(np.abs(expected)))
@@ -130,7 +132,7 @@ def test_its_accelerations_are_the_certified_ones():
 
 @pytest.mark.parametrize("side", ["taylor", "flow"])
 def test_a_billionth_too_much_mass_in_one_of_the_two_is_seen(monkeypatch, side):
-    scenario = load(find("double-tumbling-balls"))
+    scenario = load_scenario(find_scenario_file("double-tumbling-balls"))
     usual = ground_truth.motion_truth(scenario.model, scenario.state, TIMES, None)
     right = getattr(trajectory, side)
 
@@ -140,23 +142,23 @@ def test_a_billionth_too_much_mass_in_one_of_the_two_is_seen(monkeypatch, side):
     monkeypatch.setattr(trajectory, side, wrong)
     planted = ground_truth.motion_truth(scenario.model, scenario.state, TIMES, None)
     assert planted.position_uncertainty[-1] > 1e4 * usual.position_uncertainty[-1]
-    assert planted.method == usual.method + ground_truth.PARTED
+    assert planted.method == usual.method + ground_truth.TRUTHS_DIFFER
 
 
 def test_a_closed_form_that_is_off_is_seen():
-    scenario = load(find("lagrange-top"))
-    r, p = solution(scenario)(TIMES)
+    scenario = load_scenario(find_scenario_file("lagrange-top"))
+    r, p = closed_form_motion(scenario)(TIMES)
     truth = ground_truth.motion_truth(
         scenario.model, scenario.state, TIMES, (r * (1 + 1e-9), p, "a misprint")
     )
-    assert truth.method.endswith(ground_truth.PARTED)
+    assert truth.method.endswith(ground_truth.TRUTHS_DIFFER)
 
 
 # where Taylor's method cannot be had
 
 
 def check_fall_back(why, **arguments):
-    scenario = load(find("double-tumbling-balls"))
+    scenario = load_scenario(find_scenario_file("double-tumbling-balls"))
     truth = ground_truth.motion_truth(scenario.model, scenario.state, TIMES[:11], None, **arguments)
     assert truth.method == (
         "the notes' form by collocation; uncertainty: its difference from the same by DOP853, "
@@ -170,7 +172,7 @@ def test_long_chains_say_that_the_equations_are_the_same():
 
 
 def test_without_heyoka_dop853_stands_in(monkeypatch):
-    heyoka.cache_clear()
+    load_heyoka.cache_clear()
     monkeypatch.setitem(sys.modules, "heyoka", None)
     try:
         check_fall_back(
@@ -178,13 +180,13 @@ def test_without_heyoka_dop853_stands_in(monkeypatch):
             "`uv pip install -r locks/truth.lock` installs them"
         )
     finally:
-        heyoka.cache_clear()
+        load_heyoka.cache_clear()
 
 
 def test_the_closed_form_is_compared_without_heyoka_too():
-    scenario = load(find("lagrange-top"))
-    r, p = solution(scenario)(TIMES)
-    truth = trajectory_truth(scenario.model, scenario.state, TIMES, (r, p, "a book"), compiled=0)
+    scenario = load_scenario(find_scenario_file("lagrange-top"))
+    r, p = closed_form_motion(scenario)(TIMES)
+    truth = trajectory_truth(scenario.model, scenario.state, TIMES, (r, p, "a book"), max_compiled_bodies=0)
     assert (
         truth.method == "closed form: a book; uncertainty: its difference from the notes' form by collocation"
     )
@@ -195,17 +197,17 @@ def test_a_failure_of_heyoka_does_not_lose_the_truth(monkeypatch):
     def fails(*arguments):
         raise EngineFailure("heyoka stopped: err_nf_state")
 
-    monkeypatch.setattr(trajectory, "taylor", fails)
+    monkeypatch.setattr(trajectory, "simulate_taylor", fails)
     check_fall_back("EngineFailure: heyoka stopped: err_nf_state")
 
 
 def test_a_worker_has_room_for_it():
     """Ten bodies compile and run within a quarter of a worker's address space."""
-    scenario = load(find("chain-10-rods"))
+    scenario = load_scenario(find_scenario_file("chain-10-rods"))
     arguments = (scenario.model, scenario.state, TIMES)
-    with Workers(1, Limits(gigabytes=2.0)) as workers:
+    with WorkerPool(1, Limits(gigabytes=2.0)) as workers:
         (outcome,) = workers.run([Task("truth", trajectory_truth, arguments)])
-    assert outcome.lost is None
+    assert outcome.failure is None
     assert "Taylor" in outcome.value.method
 
 

@@ -18,13 +18,13 @@ from packaging.version import Version
 
 from plumbline.engines import calls, environments
 from plumbline.engines.registry import ENGINES
-from plumbline.execution.runner import Plan, execute
+from plumbline.execution.runner import Plan, run_plan
 from plumbline.judging import known_issues
-from plumbline.judging.rows import Subject
-from plumbline.processes.remote_python import call
-from plumbline.processes.workers import Limits, Task, Workers
+from plumbline.judging.rows import RowContext
+from plumbline.processes.remote_python import call_remote
+from plumbline.processes.workers import Limits, Task, WorkerPool
 from plumbline.scenario import loader
-from plumbline.truth.certified import certify
+from plumbline.truth.certified import certify_state
 from tests.exudyn_start import initial_accelerations
 
 HERE = sys.executable  # the installed environment stands for another one: the way there and back is the same
@@ -51,35 +51,35 @@ def quiet(*_):
     ],
 )
 def test_the_version_part_of_a_name(name, words):
-    found = environments.problem_of(name)
+    found = environments.version_problem(name)
     assert found is None if words is None else words in found
 
 
 @pytest.mark.parametrize("engine", [e for e in ENGINES if e != "reference"])
 def test_what_an_adapter_declares_is_read_without_importing_it(engine):
-    from plumbline.engines.registry import adapter
+    from plumbline.engines.registry import load_adapter
 
-    found = adapter(engine)
-    assert environments.declared(engine, "package") == found.package
-    assert tuple(environments.declared(engine, "needs") or ()) == found.needs
-    assert calls.describe(engine).missing is None, "the installed version is in the declared range"
+    found = load_adapter(engine)
+    assert environments.declared_attribute(engine, "package") == found.package
+    assert tuple(environments.declared_attribute(engine, "extra_requirements") or ()) == found.extra_requirements
+    assert calls.describe_engine(engine).missing is None, "the installed version is in the declared range"
 
 
 def test_a_version_out_of_range_says_so(monkeypatch):
     from adapters.mujoco_engine import Mujoco
 
-    monkeypatch.setattr(Mujoco, "supported", "<1")
-    assert "supports versions <1 of mujoco, this is" in calls.describe("mujoco").missing
+    monkeypatch.setattr(Mujoco, "supported_versions", "<1")
+    assert "supports versions <1 of mujoco, this is" in calls.describe_engine("mujoco").missing
 
 
 def test_known_entries_hold_for_an_engine_in_any_version_of_their_range():
-    entry = known_issues.Entry(
+    entry = known_issues.KnownIssue(
         id="a", scenario="*", engine="mujoco", versions="<4", verdict="disagrees", evidence="e", reason="r"
     )
-    row = Subject("s", "f", "mujoco@3.12.0", "MuJoCo", "3.12.0").row(
+    row = RowContext("s", "f", "mujoco@3.12.0", "MuJoCo", "3.12.0").make_row(
         "trajectory", "RK4", "order", "disagrees", ""
     )
-    about = known_issues.Excuses([entry], finer=False).about
+    about = known_issues.KnownIssues([entry], has_extra_refinements=False).issues_for
     assert about(row) and not about(replace(row, engine_version="4.0.0"))
     assert not about(replace(row, engine="mujocox"))
 
@@ -99,9 +99,9 @@ def test_losses_over_there_are_told_like_those_here():
         there("complain", operator.getitem, {}, "no"), there("hang", time.sleep, 600, limits=Limits(3, 4)),
         there("c", operator.mul, 3, 2), there("pid2", os.getpid),
     ]  # fmt: skip
-    with Workers(1, Limits(30, 4)) as workers:
+    with WorkerPool(1, Limits(30, 4)) as workers:
         found = {o.key: o for o in workers.run(tasks)}
-    lost = {key: o.lost for key, o in found.items() if o.lost}
+    lost = {key: o.failure for key, o in found.items() if o.failure}
     assert lost.pop("segfault") == "crashed: the worker died of SIGSEGV"
     assert lost.pop("complain") == "KeyError: 'no'"
     assert "out of memory" in lost.pop("devour")
@@ -113,12 +113,14 @@ def test_losses_over_there_are_told_like_those_here():
 
 
 def test_an_engine_says_the_same_in_both_places():
-    s = loader.load_many(["double-tumbling-balls"])[0]
-    with Workers(1) as workers:
+    s = loader.load_scenarios(["double-tumbling-balls"])[0]
+    with WorkerPool(1) as workers:
         here, away = (
             o.value.quantities[0]
             for python in ("", HERE)
-            for o in workers.run([Task("k", calls.evaluate, ("mujoco", s.model, [s.state]), python=python)])
+            for o in workers.run(
+                [Task("k", calls.evaluate_states, ("mujoco", s.model, [s.state]), python=python)]
+            )
         )
     assert np.array_equal(here.acceleration, away.acceleration)
     assert np.array_equal(here.mass_matrix, away.mass_matrix)
@@ -136,8 +138,8 @@ OLD = [
 @pytest.mark.full
 @pytest.mark.timeout(1800)
 def test_the_supported_versions_work_beside_the_installed_ones(tmp_path):
-    chosen = loader.load_many(["tumbling-ball", "tumbling-rod"])
-    result = execute(Plan(chosen, ["mujoco", *OLD], limits=Limits(600)), quiet)
+    chosen = loader.load_scenarios(["tumbling-ball", "tumbling-rod"])
+    result = run_plan(Plan(chosen, ["mujoco", *OLD], limits=Limits(600)), quiet)
     for name in OLD:
         assert result.engines[name].missing is None
         assert Version(result.engines[name].version) == Version(name.partition("@")[2])
@@ -159,11 +161,13 @@ def test_the_supported_versions_work_beside_the_installed_ones(tmp_path):
 @pytest.mark.parametrize(("version", "sound"), [("1.9.0", False), ("1.10.0", False), ("1.11.0", True)])
 def test_exudyn_started_from_wrong_accelerations_with_its_sparse_solver(version, sound):
     """The relation says that two solvers of one engine differ; this says which is wrong, and where."""
-    chosen = loader.load_many(["double-tumbling-balls"])[0]
-    true = certify(chosen.model, chosen.state).quantities.acceleration
-    python = environments.interpreter(f"exudyn@{version}")
+    chosen = loader.load_scenarios(["double-tumbling-balls"])[0]
+    true = certify_state(chosen.model, chosen.state).quantities.acceleration
+    python = environments.ensure_interpreter(f"exudyn@{version}")
     off = {
-        solver: np.max(np.abs(call(python, initial_accelerations, chosen.model, chosen.state, solver) - true))
+        solver: np.max(
+            np.abs(call_remote(python, initial_accelerations, chosen.model, chosen.state, solver) - true)
+        )
         for solver in ("EigenSparse", "EXUdense", "EigenDense")
     }
     assert max(off["EXUdense"], off["EigenDense"]) < 1e-4, "m/s²; by finite differences"
@@ -173,8 +177,8 @@ def test_exudyn_started_from_wrong_accelerations_with_its_sparse_solver(version,
 @pytest.mark.full
 @pytest.mark.timeout(900)
 def test_a_version_that_cannot_be_had_is_a_verdict():
-    chosen = loader.load_many(["rest"])
-    result = execute(Plan(chosen, ["mujoco@99.0.0", "mujoco@3.1.6"], "state"), quiet)
+    chosen = loader.load_scenarios(["rest"])
+    result = run_plan(Plan(chosen, ["mujoco@99.0.0", "mujoco@3.1.6"], "state"), quiet)
     absent, refused = result.rows
     assert absent.verdict == "not installed" and "99.0.0" in absent.reason
     assert refused.verdict == "unsupported" and "supports versions >=3.2" in refused.reason
@@ -194,8 +198,8 @@ needs_uv = pytest.mark.skipif(not uv_there(), reason="uv is not installed here")
 def index():
     """Skips with the reason where no package index answers."""
     try:
-        environments.newest("packaging", pre=False)
-    except environments.NoSuchEnvironment as error:
+        environments.newest_requirement("packaging", pre=False)
+    except environments.EnvironmentUnavailable as error:
         pytest.skip(f"no package index can be reached: {error}")
 
 
@@ -214,7 +218,7 @@ def wheel(folder, package="mujoco"):
 def test_a_file_that_is_no_wheel_is_bad_usage(tmp_path):
     path = tmp_path / "mujoco-4.0.0-py3-none-any.whl"
     path.write_text("no zip")
-    assert "is not a wheel: it is no zip file" in environments.problem_of(f"mujoco@{path}")
+    assert "is not a wheel: it is no zip file" in environments.version_problem(f"mujoco@{path}")
     done = subprocess.run(
         [HERE, "-m", "plumbline", "run", "rest", "--engine", f"exudyn@{path}"],
         cwd=environments.ROOT, capture_output=True, text=True,
@@ -231,7 +235,7 @@ def test_an_index_that_does_not_answer_is_told(tmp_path, monkeypatch, version):
     monkeypatch.setenv("UV_HTTP_RETRIES", "0")
     monkeypatch.setenv("UV_CACHE_DIR", str(tmp_path / "uv"))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    result = execute(Plan(loader.load_many(["rest"]), [f"mujoco@{version}"], "state"), quiet)
+    result = run_plan(Plan(loader.load_scenarios(["rest"]), [f"mujoco@{version}"], "state"), quiet)
     (row,) = result.rows
     assert row.verdict == "not installed"
     assert "uv cannot make an environment" in row.reason and "http://127.0.0.1:9/simple/mujoco" in row.reason
@@ -243,7 +247,9 @@ def test_an_index_that_does_not_answer_is_told(tmp_path, monkeypatch, version):
 @pytest.mark.timeout(1800)
 def test_latest_pre_and_a_wheel_run_beside_the_installed_one(tmp_path, index):
     names = ["mujoco", "mujoco@latest", "mujoco@pre", f"mujoco@{wheel(tmp_path)}"]
-    result = execute(Plan(loader.load_many(["tumbling-ball"]), names, "state", limits=Limits(600)), quiet)
+    result = run_plan(
+        Plan(loader.load_scenarios(["tumbling-ball"]), names, "state", limits=Limits(600)), quiet
+    )
     found = {name: result.engines[name] for name in names}
     assert [info.missing for info in found.values()] == [None] * 4
     latest, newest = (Version(found[f"mujoco@{which}"].version) for which in ("latest", "pre"))
@@ -261,7 +267,7 @@ def test_a_wheel_without_a_content_is_told(tmp_path, index):
     path = tmp_path / "mujoco-4.0.0-py3-none-any.whl"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("mujoco/__init__.py", "")
-    result = execute(Plan(loader.load_many(["rest"]), [f"mujoco@{path}"], "state"), quiet)
+    result = run_plan(Plan(loader.load_scenarios(["rest"]), [f"mujoco@{path}"], "state"), quiet)
     (row,) = result.rows
     assert row.verdict == "not installed" and "uv cannot make an environment" in row.reason
 

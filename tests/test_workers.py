@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from plumbline.processes.isolation import sweep
-from plumbline.processes.workers import Limits, Task, Workers
+from plumbline.processes.isolation import remove_orphaned_folders
+from plumbline.processes.workers import Limits, Task, WorkerPool
 
 ROOT = Path(__file__).parents[1]
 
@@ -71,14 +71,14 @@ LOSSES = [
 def test_each_loss_costs_one_task_and_says_so():
     limits = Limits(seconds=5, gigabytes=4)
     quick = Limits(seconds=2, gigabytes=4)
-    with Workers(2, limits) as workers:
+    with WorkerPool(2, limits) as workers:
         tasks = [Task(("fine", i), double, (i,), limits) for i in range(6)]
         for k, (loss, _) in enumerate(LOSSES):
             tasks.insert(2 * k, Task(("lost", k), loss, (), quick))
         outcomes = {o.key: o for o in workers.run(tasks)}
     assert [outcomes["fine", i].value for i in range(6)] == [2 * i for i in range(6)], outcomes
     for k, (loss, words) in enumerate(LOSSES):
-        assert words in (outcomes["lost", k].lost or ""), loss.__name__
+        assert words in (outcomes["lost", k].failure or ""), loss.__name__
 
 
 def test_what_an_outcome_brings_up_runs_while_others_do():
@@ -92,16 +92,16 @@ def test_what_an_outcome_brings_up_runs_while_others_do():
             yield None
         yield Task("follows", nap, (0.0,))
 
-    with Workers(2) as workers:
+    with WorkerPool(2) as workers:
         for outcome in workers.run(tasks()):
-            assert outcome.lost is None
+            assert outcome.failure is None
             came.append(outcome.key)
     assert came == ["short", "follows", "long"]
 
 
 def test_files_and_output_of_an_engine_go_nowhere(capfd, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         (outcome,) = workers.run([Task("x", misbehave)])
     assert outcome.value != str(tmp_path)
     assert not Path(outcome.value).exists(), "the scratch folder is removed"
@@ -118,7 +118,7 @@ def test_a_clock_that_is_set_neither_kills_nor_spares(monkeypatch):
     """By the clock of the wall the nap would be over its limit, and the hang within it for an hour."""
     real, off = time.time, [0.0]
     monkeypatch.setattr(time, "time", lambda: real() + off[0])
-    with Workers(3) as workers:
+    with WorkerPool(3) as workers:
         list(workers.run([Task(k, nap, (1.0,)) for k in range(6)]))  # now all three are there
         for step in (3600.0, -3600.0):
             tasks = [
@@ -153,14 +153,14 @@ def test_what_a_killed_run_leaves_is_removed_by_the_next(tmp_path, monkeypatch):
     owners[0].kill()
     owners[0].wait()
     assert dead.is_dir() and alive.is_dir(), "nobody has come by yet"
-    with Workers(1) as workers:
+    with WorkerPool(1) as workers:
         mine = workers._scratch.path
         assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith("plumbline-")) == sorted(
             [alive.name, mine.name, "plumbline-of-somebody"]
         )
     owners[1].kill()
     owners[1].wait()
-    assert not mine.exists() and sweep("plumbline-") == [alive]
+    assert not mine.exists() and remove_orphaned_folders("plumbline-") == [alive]
 
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the parent-death signal is Linux's")

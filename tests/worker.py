@@ -14,7 +14,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # before any child loads a BLAS
 from pebble import ProcessPool
 
 from plumbline.engines.adapter import Adapter
-from plumbline.engines.registry import adapter
+from plumbline.engines.registry import load_adapter
 
 TIMEOUT = 60.0  # s
 
@@ -59,7 +59,7 @@ def _close(pool: ProcessPool) -> None:
 
 @cache
 def _adapter(engine: str) -> Adapter:
-    return adapter(engine)
+    return load_adapter(engine)
 
 
 def _invoke(engine: str, method: str, args: tuple[Any, ...], tamper: dict[str, Callable[..., Any]]) -> Any:

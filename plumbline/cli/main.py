@@ -15,21 +15,21 @@ import click
 from rich.table import Table
 
 import reports
-from plumbline.cli.console import console, progress_to, tell
+from plumbline.cli.console import ProgressDisplay, make_console, print_result
 from plumbline.cli.options import (
     choose_engines,
     choose_scenarios,
-    machine_faults_told,
+    ensure_writable,
+    exit_on_io_error,
     read_scenarios,
-    writable,
 )
 from plumbline.engines.registry import ENGINES
-from plumbline.execution.result_cache import Cells
-from plumbline.execution.runner import Plan, describe_all, execute, save
-from plumbline.processes.workers import Limits, Workers
+from plumbline.execution.result_cache import DiskResultCache
+from plumbline.execution.runner import Plan, describe_engines, run_plan, save
+from plumbline.processes.workers import Limits, WorkerPool
 from plumbline.scenario import loader as scenarios
 from plumbline.scenario.errors import ScenarioError
-from plumbline.storage.results_store import plain, read, row_record
+from plumbline.storage.results_store import read_results, row_record, to_json_value
 
 DEFAULT_OUT = Path("reports") / "out"
 EXIT_CODES = """
@@ -44,7 +44,7 @@ An engine that is not installed is a verdict and changes no exit code.
 """
 
 
-class Group(click.Group):
+class SuggestingGroup(click.Group):
     """Bad usage suggests the nearest command."""
 
     def resolve_command(
@@ -58,7 +58,7 @@ class Group(click.Group):
         return super().resolve_command(ctx, args)
 
 
-@click.group(cls=Group, epilog=EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]})
+@click.group(cls=SuggestingGroup, epilog=EXIT_CODES, context_settings={"help_option_names": ["-h", "--help"]})
 def main() -> None:
     """Run identical pendulums through the notes' equations and multibody engines, and say who is wrong.
 
@@ -91,12 +91,12 @@ def list_(what: str, as_json: bool) -> None:
                 if k not in ("purpose", "file")
             )
         )
-    console(sys.stdout).print(table)
+    make_console(sys.stdout).print(table)
 
 
 def list_scenarios() -> list[dict[str, Any]]:
     """One record per scenario of the catalogue."""
-    found = scenarios.load_many(scenarios.catalogue())
+    found = scenarios.load_scenarios(scenarios.catalogue())
     return [
         {
             "name": s.name,
@@ -112,8 +112,8 @@ def list_scenarios() -> list[dict[str, Any]]:
 
 def list_engines() -> list[dict[str, Any]]:
     """One record per engine of the registry, asked in worker processes."""
-    with Workers(1) as workers:
-        found = describe_all(workers, list(ENGINES))
+    with WorkerPool(1) as workers:
+        found = describe_engines(workers, list(ENGINES))
     return [
         {
             "name": name,
@@ -179,39 +179,39 @@ def run(
     """
     chosen = choose_scenarios(names, families)
     chosen_engines = choose_engines(engines)
-    folder = writable(out)
+    folder = ensure_writable(out)
     whole = not names and not families and not engines and level == "all"
-    cells = Cells(folder / "cells", lambda sentence: click.echo(sentence, err=True))
+    cells = DiskResultCache(folder / "cells", lambda sentence: click.echo(sentence, err=True))
     plan = Plan(
         chosen,
         chosen_engines,
         level,
         jobs or os.cpu_count() or 1,
         Limits(timeout, memory),
-        accept=accept,
-        whole=whole,
-        memory=cells,
+        user_rtol=accept,
+        is_full_catalogue=whole,
+        result_cache=cells,
         scheduler=scheduler,
     )
-    with machine_faults_told():
-        with progress_to(sys.stderr) as progress:
-            result = execute(plan, progress)
+    with exit_on_io_error():
+        with ProgressDisplay(sys.stderr) as progress:
+            result = run_plan(plan, progress)
         save(result, folder, shlex.join(["python", "-m", "plumbline", *sys.argv[1:]]))
-        with result.split.measure("report"):
+        with result.cpu_times.measure("report"):
             written = reports.write(folder)
         cells.clear()
     if as_json:
         document = {
-            "run": result.run,
-            "sentence": result.run["sentence"],
+            "run": result.metadata,
+            "sentence": result.metadata["sentence"],
             "rows": [row_record(r) for r in result.rows],
         }
-        click.echo(json.dumps(plain(document), ensure_ascii=False, indent=1))
+        click.echo(json.dumps(to_json_value(document), ensure_ascii=False, indent=1))
     else:
-        tell(result)
+        print_result(result)
     click.echo(f"report: {written}", err=as_json)
-    click.echo(result.split.sentence(), err=True)
-    sys.exit(result.run["exit_code"])
+    click.echo(result.cpu_times.summary(), err=True)
+    sys.exit(result.metadata["exit_code"])
 
 
 @main.command(epilog=EXIT_CODES)
@@ -264,7 +264,7 @@ def run(
 )
 def nightly(
     names: tuple[str, ...], engines: tuple[str, ...], count: int, seed: int | None, finer: int,
-    endurance: float, instrument: bool, jobs: int | None, scheduler: str | None, out: Path, timeout: float,
+    endurance: float, self_test: bool, jobs: int | None, scheduler: str | None, out: Path, timeout: float,
     memory: float,
 ) -> None:  # fmt: skip
     """Run everything, unattended: catalogue, finer steps, long runs, random scenarios, the instrument's own
@@ -278,22 +278,26 @@ def nightly(
       python -m plumbline nightly --random 1000 --seed 7 --out nights
       python -m plumbline history nightly
     """
-    from plumbline.cli.nightly import nightly as run_night
-    from plumbline.execution.selftest import check
+    from plumbline.cli.nightly import run_nightly as run_night
+    from plumbline.execution.selftest import run_self_test
 
-    chosen, chosen_engines, folder = choose_scenarios(names, ()), choose_engines(engines), writable(out)
-    with machine_faults_told(), progress_to(sys.stderr) as progress:
+    chosen, chosen_engines, folder = (
+        choose_scenarios(names, ()),
+        choose_engines(engines),
+        ensure_writable(out),
+    )
+    with exit_on_io_error(), ProgressDisplay(sys.stderr) as progress:
         result, place = run_night(
             folder, chosen, chosen_engines, random=count, seed=seed, jobs=jobs or os.cpu_count() or 1,
             limits=Limits(timeout, memory), whole=not names and not engines, finer=finer, progress=progress,
-            endurance=endurance, scheduler=scheduler, instrument=check if instrument else None,
+            endurance=endurance, scheduler=scheduler, self_test=run_self_test if self_test else None,
             command=shlex.join(["python", "-m", "plumbline", *sys.argv[1:]]),
-            tell=lambda sentence: click.echo(sentence, err=True),
+            log=lambda sentence: click.echo(sentence, err=True),
         )  # fmt: skip
-    tell(result)
+    print_result(result)
     click.echo(f"report: {place / 'report.html'}")
-    click.echo(result.split.sentence(), err=True)
-    sys.exit(result.run["exit_code"])
+    click.echo(result.cpu_times.summary(), err=True)
+    sys.exit(result.metadata["exit_code"])
 
 
 @main.command()
@@ -315,8 +319,8 @@ def sweep(file: Path, jobs: int | None, out: Path) -> None:
     except ScenarioError as error:
         click.echo(str(error), err=True)
         sys.exit(2)
-    folder = writable(out)
-    with machine_faults_told():
+    folder = ensure_writable(out)
+    with exit_on_io_error():
         table = sweeps.run(spec, cells, jobs or os.cpu_count() or 1)
         path = sweeps.write(table, folder)
         drawn = sweep_page.write(folder)
@@ -357,7 +361,7 @@ def sweep(file: Path, jobs: int | None, out: Path) -> None:
 @click.option(
     "--out", type=click.Path(path_type=Path), default=DEFAULT_OUT, show_default=True, help="Output folder."
 )
-def drift(names: tuple[str, ...], rtols: tuple[float, ...], longest: float, out: Path) -> None:
+def drift(names: tuple[str, ...], rtols: tuple[float, ...], max_cpu_seconds: float, out: Path) -> None:
     """Measure the drift of raw, Baumgarte and projected runs in 10, 100, 1000 s (default: two bodies).
 
     Writes drift.parquet, and report.html again where OUT holds results: the report shows the table.
@@ -370,15 +374,15 @@ def drift(names: tuple[str, ...], rtols: tuple[float, ...], longest: float, out:
     from plumbline.studies import drift as drifts
 
     chosen = read_scenarios(names or ("tumbling-ball", "tumbling-rod"))
-    folder = writable(out)
-    with machine_faults_told():
-        with progress_to(sys.stderr) as progress:
-            found = drifts.table(
+    folder = ensure_writable(out)
+    with exit_on_io_error():
+        with ProgressDisplay(sys.stderr) as progress:
+            found = drifts.measure_drift(
                 chosen,
-                longest,
+                max_cpu_seconds,
                 rtols=rtols,
                 progress=progress,
-                tell=lambda words: click.echo(words, err=True),
+                log=lambda words: click.echo(words, err=True),
             )
         path = drifts.write(found, folder)
         shown = Table(box=None, pad_edge=False, header_style="bold")
@@ -388,7 +392,7 @@ def drift(names: tuple[str, ...], rtols: tuple[float, ...], longest: float, out:
             shown.add_row(
                 *(f"{v:.2g}" if isinstance(v, float) else "" if v is None else str(v) for v in row.values())
             )
-        console(sys.stdout).print(shown)
+        make_console(sys.stdout).print(shown)
         click.echo(f"results: {path}")
         if (folder / "results.json").is_file():
             click.echo(f"report: {reports.write(folder)}")
@@ -409,11 +413,11 @@ def history(folder: Path, pattern: str | None, as_json: bool) -> None:
     """
     from plumbline.storage.history import History
 
-    told = History(folder).document(pattern)
+    told = History(folder).to_document(pattern)
     if as_json:
         click.echo(json.dumps(told, ensure_ascii=False, indent=1))
         return
-    out = console(sys.stdout)
+    out = make_console(sys.stdout)
     for name, records in (("nights", told["nights"]), ("trend", told.get("trend", []))):
         table = Table(
             *(records[0] if records else ()), box=None, pad_edge=False, header_style="bold", title=name
@@ -449,13 +453,13 @@ def history(folder: Path, pattern: str | None, as_json: bool) -> None:
     default=None,
     help="Folder of earlier nights: adds trends and the comparison with the last green one.",
 )
-def report(folder: Path, nights: Path | None) -> None:
+def report(folder: Path, history_folder: Path | None) -> None:
     """Write report.html, junit.xml and summary.md again, from the results stored in FOLDER."""
     try:
-        read(folder)
+        read_results(folder)
     except ValueError as error:
         raise click.UsageError(str(error)) from None
-    click.echo(f"report: {reports.write(writable(folder), nights)}")
+    click.echo(f"report: {reports.write(ensure_writable(folder), history_folder)}")
 
 
 @main.command()
@@ -473,7 +477,7 @@ def check(files: tuple[Path, ...]) -> None:
 @main.command()
 def schema() -> None:
     """Print the JSON Schema of scenario files, for editors and other programs."""
-    click.echo(json.dumps(scenarios.schema(), ensure_ascii=False, indent=1))
+    click.echo(json.dumps(scenarios.json_schema(), ensure_ascii=False, indent=1))
 
 
 @main.command()
@@ -494,7 +498,7 @@ def reproduce(result: Path, keys: tuple[str, ...]) -> None:
     folder = result if result.is_dir() else result.parent
     try:
         if not keys:
-            rows = scripts.disputed(read(folder))
+            rows = scripts.disputed(read_results(folder))
             for row in rows:
                 click.echo(f"{row['key']}: {row['diagnosis'] or row['reason']}")
             click.echo(f"{len(rows)} disagreements" if rows else "nothing disagrees", err=True)

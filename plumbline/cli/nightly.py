@@ -22,49 +22,49 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import reports
-from plumbline.execution.result_cache import Cells
-from plumbline.execution.runner import Levels, Plan, Progress, Result, execute, save
-from plumbline.execution.selftest import Answer
+from plumbline.execution.result_cache import DiskResultCache
+from plumbline.execution.runner import LevelSelection, Plan, ProgressCallback, RunResult, run_plan, save
+from plumbline.execution.selftest import SelfTestResult
 from plumbline.processes.workers import Limits
 from plumbline.scenario import loader as scenarios
-from plumbline.scenario.generator import FAMILY, RandomScenarios
-from plumbline.storage.results_store import read, write_atomically
+from plumbline.scenario.generator import RANDOM_FAMILY, RandomScenarios
+from plumbline.storage.results_store import read_results, write_atomically
 
-FINER = 1  # halvings beyond the quick ladders
+EXTRA_REFINEMENTS = 1  # halvings beyond the quick ladders
 
 
 @dataclass(frozen=True)
-class Night:
+class NightPlan:
     """What one night adds to the catalogue, and when it was begun."""
 
     seed: int
-    random: int
+    random_count: int
     started: str  # ISO 8601, UTC
 
     @classmethod
-    def begun(cls, folder: Path, seed: int | None, random: int) -> Night:
+    def resume_or_start(cls, folder: Path, seed: int | None, random: int) -> NightPlan:
         """The unfinished night of ``folder`` if it is the same one, else a new one, written down."""
         path = folder / "plan.json"
         try:
             night = cls(**json.loads(path.read_text(encoding="utf-8")))
-            if night.random == random and seed in (None, night.seed):
+            if night.random_count == random and seed in (None, night.seed):
                 return night
         except (OSError, ValueError, TypeError):
             pass  # none, or damaged: a new one
-        night = cls(secrets.randbits(32) if seed is None else seed, random, now())
+        night = cls(secrets.randbits(32) if seed is None else seed, random, utc_now())
         folder.mkdir(parents=True, exist_ok=True)
         write_atomically(path, json.dumps(asdict(night)).encode())
         return night
 
 
-def now() -> str:
+def utc_now() -> str:
     """The time, UTC, to the second."""
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 
-def nightly(
+def run_nightly(
     out: Path,
-    chosen: Sequence[scenarios.Scenario],
+    selected_scenarios: Sequence[scenarios.Scenario],
     engines: Sequence[str],
     *,
     random: int,
@@ -73,59 +73,59 @@ def nightly(
     limits: Limits,
     whole: bool,
     command: str,
-    finer: int = FINER,
+    finer: int = EXTRA_REFINEMENTS,
     endurance: float = 0.0,
-    level: Levels = "all",
+    level: LevelSelection = "all",
     scheduler: str | None = None,
-    instrument: Callable[[Path], Answer] | None = None,
-    progress: Progress,
-    tell: Callable[[str], None],
-) -> tuple[Result, Path]:
+    self_test: Callable[[Path], SelfTestResult] | None = None,
+    progress: ProgressCallback,
+    log: Callable[[str], None],
+) -> tuple[RunResult, Path]:
     """Run a night, or what is left of it; returns its result and its folder in OUT/history.
 
     ``instrument`` is the instrument's own test, given the place of its JUnit file.
     """
     unfinished = out / "unfinished"
-    night = Night.begun(unfinished, seed, random)
-    if remembered(night, out / "history"):  # killed as it was done: only this was left of it
+    night = NightPlan.resume_or_start(unfinished, seed, random)
+    if is_already_recorded(night, out / "history"):  # killed as it was done: only this was left of it
         shutil.rmtree(unfinished)
-        night = Night.begun(unfinished, seed, random)
+        night = NightPlan.resume_or_start(unfinished, seed, random)
     kept = sum(1 for _ in unfinished.glob("cells/*.cell"))
-    tell(f"random scenarios: {night.random}, seed {night.seed}")
+    log(f"random scenarios: {night.random_count}, seed {night.seed}")
     if kept:
-        tell(f"going on with the night begun {night.started}: {kept} cells are done")
-    drawn = RandomScenarios(night.seed, night.random)
+        log(f"going on with the night begun {night.started}: {kept} cells are done")
+    drawn = RandomScenarios(night.seed, night.random_count)
     plan = Plan(
-        chosen,
+        selected_scenarios,
         engines,
         level,
         jobs=jobs,
         limits=limits,
-        finer=finer,
-        endurance=endurance,
-        whole=whole,
+        extra_refinements=finer,
+        long_run_seconds=endurance,
+        is_full_catalogue=whole,
         scheduler=scheduler,
-        probes=drawn,
-        memory=Cells(unfinished / "cells", tell),
+        random_scenarios=drawn,
+        result_cache=DiskResultCache(unfinished / "cells", log),
     )
-    result = execute(plan, progress)
-    place = free(out / "history" / result.run["id"])
-    result.run |= {"id": place.name, "night": number(place.parent)}
-    result.run |= {"started": night.started, "random": night.random, "seed": night.seed}
+    result = run_plan(plan, progress)
+    place = unused_path(out / "history" / result.metadata["id"])
+    result.metadata |= {"id": place.name, "night": next_night_number(place.parent)}
+    result.metadata |= {"started": night.started, "random": night.random_count, "seed": night.seed}
     folder = unfinished / "night"
     shutil.rmtree(folder, ignore_errors=True)
-    if instrument is not None:
+    if self_test is not None:
         folder.mkdir()
-        answer = instrument(folder / "instrument.xml")
-        result.run |= {
-            "instrument": answer.figures,
-            "sentence": f"{result.run['sentence']}; {answer.sentence}",
+        answer = self_test(folder / "instrument.xml")
+        result.metadata |= {
+            "instrument": answer.counts,
+            "sentence": f"{result.metadata['sentence']}; {answer.summary}",
         }
-        if answer.trouble:
-            result.run["exit_code"] = result.run["exit_code"] or 1
+        if answer.failure:
+            result.metadata["exit_code"] = result.metadata["exit_code"] or 1
     save(result, folder, command)
-    write_files_of_random(result, drawn, folder / "scenarios")
-    with result.split.measure("report"):
+    write_random_scenario_files(result, drawn, folder / "scenarios")
+    with result.cpu_times.measure("report"):
         reports.write(folder, out / "history")
     place.parent.mkdir(exist_ok=True)
     os.replace(folder, place)
@@ -133,36 +133,40 @@ def nightly(
     return result, place
 
 
-def remembered(night: Night, history: Path) -> bool:
+def is_already_recorded(night: NightPlan, history: Path) -> bool:
     """Whether that very night is complete already."""
     if not (history.parent / "unfinished" / "cells").is_dir():
         return False
     for path in history.glob("*/results.json"):
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # damaged: `history` names it
-            run = read(path.parent)["run"]
-            if (run["started"], run["seed"], run["random"]) == (night.started, night.seed, night.random):
+            run = read_results(path.parent)["run"]
+            if (run["started"], run["seed"], run["random"]) == (
+                night.started,
+                night.seed,
+                night.random_count,
+            ):
                 return True
     return False
 
 
-def number(history: Path) -> int:
+def next_night_number(history: Path) -> int:
     """The number of a new night: they are told in this order, whatever the clock says."""
     highest = 0
     for path in history.glob("*/results.json"):
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # damaged: `history` names it
-            highest = max(highest, int(read(path.parent)["run"]["night"]))
+            highest = max(highest, int(read_results(path.parent)["run"]["night"]))
     return highest + 1
 
 
-def free(place: Path) -> Path:
+def unused_path(place: Path) -> Path:
     """``place``, or with a number after it where a clock that was set back gave another night its name."""
     names = itertools.chain([place], (place.with_name(f"{place.name}-{k}") for k in itertools.count(2)))
     return next(name for name in names if not name.exists())
 
 
-def write_files_of_random(result: Result, drawn: Sequence[scenarios.Scenario], folder: Path) -> None:
+def write_random_scenario_files(result: RunResult, drawn: Sequence[scenarios.Scenario], folder: Path) -> None:
     """The scenario file of every random scenario that someone should see: `run FILE` repeats it."""
-    wanted = {row.scenario for row in result.rows if row.family == FAMILY}
+    wanted = {row.scenario for row in result.rows if row.family == RANDOM_FAMILY}
     for s in (drawn[int(name.rpartition("-")[2])] for name in sorted(wanted)):
         folder.mkdir(exist_ok=True)
         text = json.dumps(s.document, indent=1)  # JSON is YAML

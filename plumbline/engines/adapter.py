@@ -26,9 +26,9 @@ from plumbline.model.datatypes import (
     Trajectory,
     Unsupported,
 )
-from plumbline.model.welding import Parts, halves, whole
+from plumbline.model.welding import BodyParts, split_bodies, undivided_bodies
 
-UNIT = 8 * np.finfo(float).eps  # a quaternion normalised in double is this close to |p| = 1
+UNIT_NORM_TOLERANCE = 8 * np.finfo(float).eps  # a quaternion normalised in double is this close to |p| = 1
 
 
 class Adapter(ABC):
@@ -38,15 +38,15 @@ class Adapter(ABC):
     title: ClassVar[str]  # as shown in the report
     package: ClassVar[str]  # distribution whose version is reported
     integrators: ClassVar[tuple[Integrator, ...]]
-    supported: ClassVar[str] = ""  # PEP 440 range of versions that the adapter works with
+    supported_versions: ClassVar[str] = ""  # PEP 440 range of versions that the adapter works with
     # Requirements of environments with another version: (range of versions, what they need besides).
-    needs: ClassVar[tuple[tuple[str, str], ...]] = ()
+    extra_requirements: ClassVar[tuple[tuple[str, str], ...]] = ()
     # Ways of the engine to the same answers other than its usual one: for evaluating states, for simulating.
     options: ClassVar[tuple[str, ...]] = ()
-    solvers: ClassVar[tuple[str, ...]] = ()
-    unwelded: ClassVar[str] = "the adapter welds nothing"  # why not; empty where it does
+    linear_solvers: ClassVar[tuple[str, ...]] = ()
+    welding_unsupported_reason: ClassVar[str] = "the adapter welds nothing"  # why not; empty where it does
     option: str = ""  # the one of `options` or `solvers` in use
-    halved: bool = False  # whether bodies are two welded halves
+    has_welded_halves: bool = False  # whether bodies are two welded halves
 
     @abstractmethod
     def version(self) -> str:
@@ -69,27 +69,27 @@ class Adapter(ABC):
                 return candidate
         raise KeyError(f"{self.name} has no integrator {name!r}; it has {[i.name for i in self.integrators]}")
 
-    def by(self, option: str) -> Self:
+    def with_option(self, option: str) -> Self:
         """The same engine by another of its ways; KeyError names the ones there are."""
-        if option not in (ways := (*self.options, *self.solvers)):
+        if option not in (ways := (*self.options, *self.linear_solvers)):
             raise KeyError(f"{self.name} has no option {option!r}; it has {list(ways)}")
         other = copy(self)
         other.option = option
         return other
 
-    def welding(self) -> Self:
+    def with_welded_halves(self) -> Self:
         """The same engine, evaluating every body as two welded halves; Unsupported where it cannot weld."""
-        if self.unwelded:
-            raise Unsupported(self.unwelded)
+        if self.welding_unsupported_reason:
+            raise Unsupported(self.welding_unsupported_reason)
         other = copy(self)
-        other.halved = True
+        other.has_welded_halves = True
         return other
 
-    def parts(self, model: Model) -> Parts:
+    def body_pieces(self, model: Model) -> BodyParts:
         """What the engine is to build every body of."""
-        return halves(model) if self.halved else whole(model)
+        return split_bodies(model) if self.has_welded_halves else undivided_bodies(model)
 
-    def _retrace(
+    def _simulate_round_trip(
         self, model: Model, state: State, end: float, integrator: Integrator, resolution: float
     ) -> Trajectory:
         """To ``end``, all that the integrator carries reversed in time, and as long back: three rows."""
@@ -122,7 +122,7 @@ class Adapter(ABC):
         check_trajectory(model, state, times, trajectory, f"{self.name} {integrator}")
         return trajectory
 
-    def retrace(
+    def simulate_round_trip(
         self, model: Model, state: State, end: float, integrator: str, resolution: float
     ) -> Trajectory:
         """There and back by a symmetric integrator: rows at 0, ``end`` and 2 ``end``; errors as `simulate`.
@@ -131,7 +131,7 @@ class Adapter(ABC):
         """
         check_state(model, state)
         times = np.array([0.0, end, 2 * end])
-        run = self._retrace(model, state, end, self.integrator(integrator), resolution)
+        run = self._simulate_round_trip(model, state, end, self.integrator(integrator), resolution)
         check_samples(model, times, run, f"{self.name} {integrator}")
         return run
 
@@ -147,14 +147,14 @@ def check_state(model: Model, state: State) -> None:
         if not np.all(np.isfinite(array)):
             raise BadInput(f"state.{name} is not finite")
     norms = np.linalg.norm(state.p, axis=-1)
-    if np.any(np.abs(norms - 1) > UNIT):
+    if np.any(np.abs(norms - 1) > UNIT_NORM_TOLERANCE):
         raise BadInput(f"state.p is not normalised: |p| = {norms.tolist()}")
     for array_name in vars(model):
         if not np.all(np.isfinite(getattr(model, array_name))):
             raise BadInput(f"model.{array_name} is not finite")
 
 
-def check_quantities(model: Model, answer: StateQuantities, what: str) -> None:
+def check_quantities(model: Model, answer: StateQuantities, label: str) -> None:
     """Shapes and finiteness of what an engine says of a state."""
     shapes = {
         "acceleration": (model.n, 3),
@@ -170,9 +170,9 @@ def check_quantities(model: Model, answer: StateQuantities, what: str) -> None:
         if value is None:
             continue
         if np.shape(value) != shape:
-            raise EngineFailure(f"{what}: {name} has shape {np.shape(value)}, expected {shape}")
+            raise EngineFailure(f"{label}: {name} has shape {np.shape(value)}, expected {shape}")
         if not np.all(np.isfinite(value)):
-            raise EngineFailure(f"{what}: {name} is not finite")
+            raise EngineFailure(f"{label}: {name} is not finite")
 
 
 def check_times(times: Array, step: float) -> None:
@@ -186,33 +186,33 @@ def check_times(times: Array, step: float) -> None:
         raise BadInput(f"sample times are not multiples of the step {step}")
 
 
-def check_samples(model: Model, times: Array, run: Trajectory, what: str) -> None:
+def check_samples(model: Model, times: Array, run: Trajectory, label: str) -> None:
     """An early stop and rows that are not finite are failures, never data."""
     if np.shape(run.t) != np.shape(times) or np.max(np.abs(run.t - times)) > 1e-9 * max(1.0, times[-1]):
         last = run.t[-1] if len(run.t) else float("nan")
-        raise EngineFailure(f"{what}: sampled {len(run.t)} of {len(times)} times, last at t = {last} s")
+        raise EngineFailure(f"{label}: sampled {len(run.t)} of {len(times)} times, last at t = {last} s")
     shape = (len(times), model.n)
     for name, width in (("r", 3), ("p", 4), ("v", 3), ("pdot", 4)):
         array = getattr(run, name)
         if np.shape(array) != (*shape, width):
-            raise EngineFailure(f"{what}: {name} has shape {np.shape(array)}, expected {(*shape, width)}")
+            raise EngineFailure(f"{label}: {name} has shape {np.shape(array)}, expected {(*shape, width)}")
         finite = np.all(np.isfinite(array), axis=(1, 2))
         if not np.all(finite):
-            raise EngineFailure(f"{what}: {name} is not finite from t = {times[np.argmin(finite)]} s")
+            raise EngineFailure(f"{label}: {name} is not finite from t = {times[np.argmin(finite)]} s")
 
 
-def check_trajectory(model: Model, state: State, times: Array, run: Trajectory, what: str) -> None:
+def check_trajectory(model: Model, state: State, times: Array, run: Trajectory, label: str) -> None:
     """As `check_samples`; so are a silent reset and repeated rows."""
-    check_samples(model, times, run, what)
+    check_samples(model, times, run, label)
     rows = np.concatenate([getattr(run, k).reshape(len(times), -1) for k in ("r", "p", "v", "pdot")], axis=1)
     moving = np.any(run.v != 0, axis=(1, 2)) | np.any(run.pdot != 0, axis=(1, 2))
     repeated = np.all(rows[1:] == rows[:-1], axis=1) & moving[1:]
     if np.any(repeated):
         at = times[1 + int(np.argmax(repeated))]
-        raise EngineFailure(f"{what}: the row at t = {at} s repeats the one before while moving")
+        raise EngineFailure(f"{label}: the row at t = {at} s repeats the one before while moving")
     # A return to the exact initial row (which may be at rest) of a pendulum that moved is a reset, not a
     # period: no integrator closes an orbit to the last bit of every coordinate and rate.
     reset = np.all(rows[1:] == rows[0], axis=1) & np.logical_or.accumulate(moving)[1:]
     if np.any(reset):
         at = times[1 + int(np.argmax(reset))]
-        raise EngineFailure(f"{what}: the row at t = {at} s is the initial state again (a silent reset)")
+        raise EngineFailure(f"{label}: the row at t = {at} s is the initial state again (a silent reset)")

@@ -22,30 +22,30 @@ from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel
 from packaging.version import InvalidVersion, Version
 
 from plumbline.engines.registry import ENGINES
-from plumbline.processes.isolation import Scratch
+from plumbline.processes.isolation import ScratchFolder
 
 ROOT = Path(__file__).resolve().parents[2]
-BESIDE = ("numpy", "scipy", "packaging")  # what adapters and the worker's side of the core import
-PATIENCE = 900  # s for uv to fetch and install
+BASE_REQUIREMENTS = ("numpy", "scipy", "packaging")  # what adapters and the worker's side of the core import
+INSTALL_TIMEOUT = 900  # s for uv to fetch and install
 
 
-class NoSuchEnvironment(Exception):
+class EnvironmentUnavailable(Exception):
     """The version cannot be had here; the message says why."""
 
 
-def split(name: str) -> tuple[str, str]:
+def split_version(name: str) -> tuple[str, str]:
     """``mujoco@3.12.0`` → ("mujoco", "3.12.0"); the version is empty where none is named."""
     base, _, version = name.partition("@")
     return base, version
 
 
-def problem_of(name: str) -> str | None:
+def version_problem(name: str) -> str | None:
     """What is wrong with the version part of a name, in a sentence, before anything is fetched."""
-    base, version = split(name)
+    base, version = split_version(name)
     if "@" not in name or version in ("latest", "pre"):
         return None
     if version.endswith(".whl"):
-        return problem_of_wheel(Path(version), declared(base, "package"))
+        return wheel_problem(Path(version), declared_attribute(base, "package"))
     try:
         Version(version)
     except InvalidVersion:
@@ -53,7 +53,7 @@ def problem_of(name: str) -> str | None:
     return None
 
 
-def problem_of_wheel(path: Path, package: str) -> str | None:
+def wheel_problem(path: Path, package: str) -> str | None:
     """What is wrong with a wheel of ``package``, as far as its name and its outside show it."""
     try:
         found, *_ = parse_wheel_filename(path.name)
@@ -66,7 +66,7 @@ def problem_of_wheel(path: Path, package: str) -> str | None:
     return None if zipfile.is_zipfile(path) else f"{path} is not a wheel: it is no zip file"
 
 
-def declared(engine: str, attribute: str) -> Any:
+def declared_attribute(engine: str, attribute: str) -> Any:
     """A literal class attribute of an adapter, its bases' in the same file included, without importing it.
 
     The distribution's name is needed where the engine is not installed.
@@ -84,43 +84,45 @@ def declared(engine: str, attribute: str) -> Any:
     return None
 
 
-def interpreter(name: str) -> str:
+def ensure_interpreter(name: str) -> str:
     """The Python of the environment of this version, made if need be; else NoSuchEnvironment."""
-    base, version = split(name)
-    package = declared(base, "package")
+    base, version = split_version(name)
+    package = declared_attribute(base, "package")
     if version.endswith(".whl"):
         wheel = Path(version).resolve()
         requirement, label = str(wheel), hashlib.sha256(wheel.read_bytes()).hexdigest()[:16]
     elif version in ("latest", "pre"):
-        requirement = newest(package, pre=version == "pre")
+        requirement = newest_requirement(package, pre=version == "pre")
         label = requirement.partition("==")[2]
     else:
         requirement, label = f"{package}=={version}", version
     number = str(parse_wheel_filename(Path(version).name)[1]) if version.endswith(".whl") else label
-    more = (need for when, need in declared(base, "needs") or () if SpecifierSet(when).contains(number))
-    wanted = [requirement, *BESIDE, *more]
+    more = (
+        need for when, need in declared_attribute(base, "extra_requirements") or () if SpecifierSet(when).contains(number)
+    )
+    wanted = [requirement, *BASE_REQUIREMENTS, *more]
     tag = hashlib.sha256("\n".join([*wanted, sys.version]).encode()).hexdigest()[:8]
-    place = cache() / f"{package}-{label}-{tag}"
-    if not python_of(place).exists():
+    place = environments_folder() / f"{package}-{label}-{tag}"
+    if not interpreter_path(place).exists():
         place.parent.mkdir(parents=True, exist_ok=True)
-        with Scratch(".making-", place.parent) as scratch:
+        with ScratchFolder(".making-", place.parent) as scratch:
             made = scratch / "environment"
-            uv("venv", "--relocatable", "--python", sys.executable, str(made))
-            uv("pip", "install", "--python", str(python_of(made)), *wanted)
+            run_uv("venv", "--relocatable", "--python", sys.executable, str(made))
+            run_uv("pip", "install", "--python", str(interpreter_path(made)), *wanted)
             try:
                 os.rename(made, place)
             except OSError:  # somebody else made it meanwhile
-                if not python_of(place).exists():
+                if not interpreter_path(place).exists():
                     raise
-    return str(python_of(place))
+    return str(interpreter_path(place))
 
 
-def python_of(environment: Path) -> Path:
+def interpreter_path(environment: Path) -> Path:
     """The interpreter of an environment."""
     return environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 
 
-def cache() -> Path:
+def environments_folder() -> Path:
     """The folder of all environments."""
     if os.name == "nt":
         home = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
@@ -129,30 +131,30 @@ def cache() -> Path:
     return home / "plumbline" / "engines"
 
 
-def newest(package: str, *, pre: bool) -> str:
+def newest_requirement(package: str, *, pre: bool) -> str:
     """``package==version``: the newest release, or the newest of all."""
     with tempfile.TemporaryDirectory() as scratch:
         source = Path(scratch) / "wanted.in"
         source.write_text(package)
         kind = ["--prerelease", "allow"] if pre else []
-        found = uv(
+        found = run_uv(
             "pip", "compile", "--no-deps", "--no-header", "--no-annotate", "--python", sys.executable, *kind,
             str(source),
         )  # fmt: skip
     return found.split()[0]
 
 
-def uv(*arguments: str) -> str:
+def run_uv(*arguments: str) -> str:
     """What uv says; NoSuchEnvironment with its own words where it fails."""
     program = shutil.which("uv") or str(ROOT / ".uv" / "bin" / "uv")
     environment = {"UV_PYTHON_DOWNLOADS": "never", "UV_SYSTEM_CERTS": "true", **os.environ}
     try:
         done = subprocess.run(
             [program, "--quiet", "--no-config", *arguments],
-            capture_output=True, text=True, timeout=PATIENCE, env=environment,
+            capture_output=True, text=True, timeout=INSTALL_TIMEOUT, env=environment,
         )  # fmt: skip
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise NoSuchEnvironment(f"uv cannot make an environment for it: {error}") from None
+        raise EnvironmentUnavailable(f"uv cannot make an environment for it: {error}") from None
     if done.returncode:
-        raise NoSuchEnvironment(f"uv cannot make an environment for it: {' '.join(done.stderr.split())}")
+        raise EnvironmentUnavailable(f"uv cannot make an environment for it: {' '.join(done.stderr.split())}")
     return done.stdout

@@ -17,7 +17,7 @@ ENGINES = {
 }
 
 
-def adapter(name: str) -> Adapter:
+def load_adapter(name: str) -> Adapter:
     """The adapter of that name; imports its engine, so ImportError means "not installed"."""
     module, _, class_name = ENGINES[name].partition(":")
     found: type[Adapter] = getattr(import_module(module), class_name)

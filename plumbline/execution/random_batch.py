@@ -10,43 +10,45 @@ from typing import Any
 from plumbline.model.datatypes import Row, Verdict
 
 # What a probe may say without being looked at: it agrees, or cannot and that is recorded.
-CALM: tuple[Verdict, ...] = ("agrees", "unsupported", "not installed")
+UNREMARKABLE_VERDICTS: tuple[Verdict, ...] = ("agrees", "unsupported", "not installed")
 
 
 @dataclass
-class Probes:
+class RandomBatch:
     """What the probes of a run came to, in a size that does not depend on their number."""
 
-    scenarios: int = 0
-    folded: Counter[Verdict] = field(default_factory=Counter)  # rows that are not kept, by verdict
-    worst: dict[tuple[str, str], tuple[float, str]] = field(default_factory=dict)  # by engine and quantity
+    scenario_count: int = 0
+    counts_by_verdict: Counter[Verdict] = field(default_factory=Counter)  # rows that are not kept, by verdict
+    worst_ratios: dict[tuple[str, str], tuple[float, str]] = field(
+        default_factory=dict
+    )  # by engine and quantity
 
-    def take(self, rows: Sequence[Row]) -> list[Row]:
+    def add_scenario(self, rows: Sequence[Row]) -> list[Row]:
         """Count a probe's rows, known ones marked; those of engines of which one should be seen are kept."""
-        self.scenarios += 1
-        seen = {row.engine for row in rows if remarkable(row)}
+        self.scenario_count += 1
+        seen = {row.engine for row in rows if is_remarkable(row)}
         for row in rows:
             if row.engine in seen:
                 continue
-            self.folded[row.verdict] += 1
+            self.counts_by_verdict[row.verdict] += 1
             if "ratio" in row.extra:
                 cell = row.engine, row.quantity
                 found = row.extra["ratio"], row.scenario
-                self.worst[cell] = max(found, self.worst.get(cell, (-1.0, "")))
+                self.worst_ratios[cell] = max(found, self.worst_ratios.get(cell, (-1.0, "")))
         return [row for row in rows if row.engine in seen]
 
     def summary(self) -> dict[str, Any]:
         """As results.json holds it."""
         return {
-            "scenarios": self.scenarios,
-            "folded": dict(self.folded),
+            "scenarios": self.scenario_count,
+            "folded": dict(self.counts_by_verdict),
             "worst": [
                 {"engine": engine, "quantity": quantity, "ratio": ratio, "scenario": scenario}
-                for (engine, quantity), (ratio, scenario) in self.worst.items()
+                for (engine, quantity), (ratio, scenario) in self.worst_ratios.items()
             ],
         }
 
 
-def remarkable(row: Row) -> bool:
+def is_remarkable(row: Row) -> bool:
     """Whether someone should see what is said of a probe, recorded or not."""
-    return row.verdict not in CALM or (row.verdict == "unsupported" and not row.known)
+    return row.verdict not in UNREMARKABLE_VERDICTS or (row.verdict == "unsupported" and not row.known_issue)

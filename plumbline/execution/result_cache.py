@@ -24,29 +24,33 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.processes.packed import Packed
-from plumbline.processes.workers import Memory, Outcome, Task
+from plumbline.processes.packed import Pickled
+from plumbline.processes.workers import Outcome, ResultCache, Task
 from plumbline.storage.results_store import write_atomically
 
 ROOT = Path(__file__).resolve().parents[2]
-CODE = ("plumbline", "adapters", "reference_impl")
-LIBRARIES = ("numpy", "scipy", "python-flint")  # of the truth and the notes; engines name their own version
+HASHED_PACKAGES = ("plumbline", "adapters", "reference_impl")
+HASHED_LIBRARIES = (
+    "numpy",
+    "scipy",
+    "python-flint",
+)  # of the truth and the notes; engines name their own version
 
 
-class Cells(Memory):
+class DiskResultCache(ResultCache):
     """The cells of one output folder; ``tell`` gets a sentence about each damaged file."""
 
-    def __init__(self, folder: Path, tell: Callable[[str], None] = lambda _: None) -> None:
-        self.folder, self.tell = folder, tell
-        self._asked: dict[Any, Path] = {}  # of tasks that are on their way, by their keys
+    def __init__(self, folder: Path, log: Callable[[str], None] = lambda _: None) -> None:
+        self.folder, self.tell = folder, log
+        self._pending_paths: dict[Any, Path] = {}  # of tasks that are on their way, by their keys
 
-    def path(self, task: Task) -> Path:
+    def cell_path(self, task: Task) -> Path:
         """Where the answer to ``task`` is or will be."""
-        return self.folder / f"{key_of(task)}.cell"
+        return self.folder / f"{task_hash(task)}.cell"
 
     def get(self, task: Task) -> Outcome | None:
         """The stored answer, or None where there is none that can be trusted."""
-        path = self._asked[task.key] = self.path(task)
+        path = self._pending_paths[task.key] = self.cell_path(task)
         try:
             data = path.read_bytes()
         except FileNotFoundError:
@@ -57,16 +61,16 @@ class Cells(Memory):
         if hashlib.sha256(data[32:]).digest() != data[:32]:
             self.tell(f"{path}: damaged; the cell runs again")
             return None
-        del self._asked[task.key]
+        del self._pending_paths[task.key]
         answer, cost = pickle.loads(data[32:])
-        return Outcome(task.key, Packed(answer), cost=cost)
+        return Outcome(task.key, Pickled(answer), cpu_time=cost)
 
     def put(self, task: Task, outcome: Outcome) -> None:
         """Keep an answer.  A lost cell is not kept: what killed it may have been the machine."""
-        path = self._asked.pop(task.key, None) or self.path(task)
-        if outcome.lost is None:
+        path = self._pending_paths.pop(task.key, None) or self.cell_path(task)
+        if outcome.failure is None:
             self.folder.mkdir(parents=True, exist_ok=True)
-            body = pickle.dumps((outcome.packed.data, outcome.cost), protocol=5)
+            body = pickle.dumps((outcome.pickled.data, outcome.cpu_time), protocol=5)
             write_atomically(path, hashlib.sha256(body).digest() + body)
 
     def clear(self) -> None:
@@ -74,27 +78,27 @@ class Cells(Memory):
         shutil.rmtree(self.folder, ignore_errors=True)
 
 
-def key_of(task: Task) -> str:
+def task_hash(task: Task) -> str:
     """The content hash of a task."""
     digest = hashlib.sha256()
-    name = f"{task.call.__module__}.{task.call.__qualname__}"
-    for part in (surroundings(), name, task.version, task.arguments):
-        feed(digest, part)
+    name = f"{task.function.__module__}.{task.function.__qualname__}"
+    for part in (environment_fingerprint(), name, task.version, task.arguments):
+        update_hash(digest, part)
     return digest.hexdigest()
 
 
 @cache
-def surroundings() -> str:
+def environment_fingerprint() -> str:
     """Hash of the project's code, the interpreter, the libraries and the kind of machine."""
     digest = hashlib.sha256()
-    for folder in CODE:
+    for folder in HASHED_PACKAGES:
         for path in sorted((ROOT / folder).rglob("*.py")):
-            feed(digest, (path.relative_to(ROOT).as_posix(), path.read_bytes()))
-    feed(digest, (sys.version, platform.machine(), *map(installed, LIBRARIES)))
+            update_hash(digest, (path.relative_to(ROOT).as_posix(), path.read_bytes()))
+    update_hash(digest, (sys.version, platform.machine(), *map(installed_version, HASHED_LIBRARIES)))
     return digest.hexdigest()
 
 
-def installed(package: str) -> str:
+def installed_version(package: str) -> str:
     """A distribution's version, empty where it is not installed."""
     try:
         return version(package)
@@ -102,7 +106,7 @@ def installed(package: str) -> str:
         return ""
 
 
-def feed(digest: Any, value: Any) -> None:
+def update_hash(digest: Any, value: Any) -> None:
     """Feed a value to a hash, unambiguously: every part is preceded by its kind and size."""
     match value:
         case None:
@@ -115,24 +119,24 @@ def feed(digest: Any, value: Any) -> None:
             head, body = "str", value.encode()
         case bytes():
             head, body = "bytes", value
-        case Packed():
+        case Pickled():
             head, body = "packed", value.data
         case np.ndarray():
             head, body = f"array {value.dtype.str} {value.shape}", np.ascontiguousarray(value).tobytes()
         case list() | tuple():
             digest.update(f"list {len(value)}\n".encode())
             for item in value:
-                feed(digest, item)
+                update_hash(digest, item)
             return
         case dict():
             digest.update(f"dict {len(value)}\n".encode())
             for item in value.items():
-                feed(digest, item)
+                update_hash(digest, item)
             return
         case _ if is_dataclass(value) and not isinstance(value, type):
             digest.update(f"{type(value).__name__} {len(fields(value))}\n".encode())
             for field in fields(value):
-                feed(digest, (field.name, getattr(value, field.name)))
+                update_hash(digest, (field.name, getattr(value, field.name)))
             return
         case _:
             raise TypeError(f"no content hash of a {type(value).__name__}")

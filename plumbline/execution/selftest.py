@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-TESTS = "tests/test_planted.py"
-PATIENCE = 1800.0  # s
-_CHILD = (
+TEST_FILE = "tests/test_planted.py"
+TIMEOUT = 1800.0  # s
+_CHILD_SCRIPT = (
     "import sys; from plumbline.processes.parent_death import die_with_parent; "
     "die_with_parent(int(sys.argv[1])); "
     "import pytest; sys.exit(pytest.main(sys.argv[2:]))"
@@ -23,39 +23,39 @@ _CHILD = (
 
 
 @dataclass(frozen=True)
-class Answer:
+class SelfTestResult:
     """What became of the planted mistakes; ``trouble`` is empty where all was as it must be."""
 
-    figures: dict[str, int] = field(default_factory=dict)  # planted, reported, named, false namings, …
-    trouble: str = ""
+    counts: dict[str, int] = field(default_factory=dict)  # planted, reported, named, false namings, …
+    failure: str = ""
 
     @property
-    def sentence(self) -> str:
+    def summary(self) -> str:
         """The answer in words."""
-        if self.trouble:
-            return f"the instrument's own test failed: {self.trouble}"
-        return "the instrument's own test: " + ", ".join(f"{n} {what}" for what, n in self.figures.items())
+        if self.failure:
+            return f"the instrument's own test failed: {self.failure}"
+        return "the instrument's own test: " + ", ".join(f"{n} {what}" for what, n in self.counts.items())
 
 
-def check(report: Path, tests: str = TESTS, patience: float = PATIENCE) -> Answer:
+def run_self_test(report: Path, tests: str = TEST_FILE, timeout: float = TIMEOUT) -> SelfTestResult:
     """Run the tests, their JUnit file written to ``report``."""
     arguments = ["-q", "-p", "no:cacheprovider", f"--rootdir={ROOT}", f"--junitxml={report}", tests]
-    command = [sys.executable, "-c", _CHILD, str(os.getpid()), *arguments]
+    command = [sys.executable, "-c", _CHILD_SCRIPT, str(os.getpid()), *arguments]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     try:
         done = subprocess.run(
-            command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=patience
+            command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=timeout
         )
     except subprocess.TimeoutExpired:
-        return Answer(trouble=f"no answer within {patience:g} s")
+        return SelfTestResult(failure=f"no answer within {timeout:g} s")
     try:
-        return read(report)
+        return read_junit_report(report)
     except (OSError, ET.ParseError):
         last = (done.stdout + done.stderr).strip().splitlines()[-1:] or ["no word"]
-        return Answer(trouble=f"pytest ended with {done.returncode}: {last[0]}")
+        return SelfTestResult(failure=f"pytest ended with {done.returncode}: {last[0]}")
 
 
-def read(report: Path) -> Answer:
+def read_junit_report(report: Path) -> SelfTestResult:
     """The answer that a JUnit file gives."""
     cases = list(ET.parse(report).iter("testcase"))
     figures = {
@@ -70,10 +70,10 @@ def read(report: Path) -> Answer:
     ]
     if bad:
         more = f" and {len(bad) - 3} more" if len(bad) > 3 else ""
-        return Answer(figures, f"{', '.join(bad[:3])}{more}")
+        return SelfTestResult(figures, f"{', '.join(bad[:3])}{more}")
     skipped = next((c.find("skipped") for c in cases if c.find("skipped") is not None), None)
     if skipped is not None or not cases:
-        return Answer(
+        return SelfTestResult(
             figures, "it was skipped: " + (skipped.get("message", "") if skipped is not None else "empty")
         )
-    return Answer(figures)
+    return SelfTestResult(figures)

@@ -16,45 +16,49 @@ import numpy as np
 from plumbline.model.datatypes import Array, Integrator
 
 ORDER_MARGIN = 0.1  # two consecutive orders this near to the declared one show it (verification.md)
-DRIFTS = 3.0  # three consecutive orders show another one if it is this many of their own changes away
-ABOVE_FLOOR = 32.0  # a difference this far above rounding shows its order to 0.05: log2(1 + 1/32)
-LADDER = {1: (9, 15), 2: (8, 12), 4: (5, 12)}  # order: coarsest and finest step, as -log2 of seconds
-BODY_STEPS = 2**19  # most steps × bodies of the finest run of the quick form
-RTOLS = (1e6, 1e4, 1e2, 1.0)  # relative tolerances of an adaptive method, over its tightest
+ORDER_CHANGE_FACTOR = (
+    3.0  # three consecutive orders show another one if it is this many of their own changes away
+)
+ROUNDING_FLOOR_FACTOR = 32.0  # a difference this far above rounding shows its order to 0.05: log2(1 + 1/32)
+STEP_EXPONENTS = {1: (9, 15), 2: (8, 12), 4: (5, 12)}  # order: coarsest and finest step, as -log2 of seconds
+MAX_BODY_STEPS = 2**19  # most steps × bodies of the finest run of the quick form
+RTOL_FACTORS = (1e6, 1e4, 1e2, 1.0)  # relative tolerances of an adaptive method, over its tightest
 
 
-def ladder(integrator: Integrator, bodies: int, duration: float, finer: int = 0) -> list[float]:
+def refinement_resolutions(
+    integrator: Integrator, bodies: int, duration: float, extra_refinements: int = 0
+) -> list[float]:
     """Resolutions from coarse to fine: steps in s, powers of two; or relative tolerances.
 
     The finest step halves ``finer`` times more (the nightly's form); long chains stop where
     the work of the finest run would pass `BODY_STEPS`, always leaving four steps.
     """
     if integrator.kind == "tolerance":
-        return [integrator.tightest * factor for factor in RTOLS]
-    coarse, fine = LADDER[integrator.order]
-    affordable = int(np.floor(np.log2(BODY_STEPS / (bodies * max(duration, 1.0)))))
-    fine = max(min(fine, affordable), coarse + 3) + finer
+        return [integrator.min_rtol * factor for factor in RTOL_FACTORS]
+    coarse, fine = STEP_EXPONENTS[integrator.order]
+    affordable = int(np.floor(np.log2(MAX_BODY_STEPS / (bodies * max(duration, 1.0)))))
+    fine = max(min(fine, affordable), coarse + 3) + extra_refinements
     return [2.0**-k for k in range(coarse, fine + 1)]
 
 
-def largest(y: Array) -> float:
+def max_norm(y: Array) -> float:
     """Largest Euclidean length over all leading axes; inf where anything is not finite."""
     size = float(np.max(np.linalg.norm(y, axis=-1), initial=0.0))
     return size if np.isfinite(size) else np.inf
 
 
 @dataclass(frozen=True)
-class Order:
+class ObservedOrder:
     """The order that a ladder shows over one window of time."""
 
     value: float | None  # the last trusted order; None where nothing could be observed
-    asymptotic: bool  # two consecutive orders near the declared one, or three that stay away from it
-    at_floor: bool  # differences are rounding at every step: there is nothing to observe
+    is_asymptotic: bool  # two consecutive orders near the declared one, or three that stay away from it
+    is_at_rounding_floor: bool  # differences are rounding at every step: there is nothing to observe
     orders: tuple[float, ...]  # all consecutive ones, coarse to fine
     differences: tuple[float, ...]  # between consecutive steps
 
 
-def observed_order(ys: Sequence[Array], floor: float, declared: int) -> Order:
+def observed_order(ys: Sequence[Array], floor: float, declared: int) -> ObservedOrder:
     """Order from consecutive differences D_k = max |y_k - y_{k+1}|, log2(D_k / D_{k+1}).
 
     ``ys`` are (T, N, width) samples, coarse to fine; ``floor`` is the size of rounding: a difference
@@ -62,12 +66,12 @@ def observed_order(ys: Sequence[Array], floor: float, declared: int) -> Order:
     margin.  The finest pair of consecutive orders both within `ORDER_MARGIN` of ``declared`` shows that
     order; else the finest three may (`approached`).
     """
-    differences = [largest(a - b) for a, b in itertools.pairwise(ys)]
+    differences = [max_norm(a - b) for a, b in itertools.pairwise(ys)]
     orders = []
     for coarse, fine in itertools.pairwise(differences):
-        usable = 0 < coarse < np.inf and fine > ABOVE_FLOOR * floor
+        usable = 0 < coarse < np.inf and fine > ROUNDING_FLOOR_FACTOR * floor
         orders.append(float(np.log2(coarse / fine)) if usable else np.nan)
-    at_floor = all(d <= ABOVE_FLOOR * floor for d in differences)
+    at_floor = all(d <= ROUNDING_FLOOR_FACTOR * floor for d in differences)
     near = [
         b
         for a, b in itertools.pairwise(orders)
@@ -75,14 +79,14 @@ def observed_order(ys: Sequence[Array], floor: float, declared: int) -> Order:
     ]  # NaN compares false
     trusted = [k for k, order in enumerate(orders) if np.isfinite(order)]
     last = orders[trusted[-1] - 2 : trusted[-1] + 1] if trusted and trusted[-1] >= 2 else []
-    shown = near[-1] if near else approached(last, declared)
+    shown = near[-1] if near else extrapolated_order(last, declared)
     if shown is not None:
-        return Order(shown, True, False, tuple(orders), tuple(differences))
+        return ObservedOrder(shown, True, False, tuple(orders), tuple(differences))
     finite = [order for order in orders if np.isfinite(order)]
-    return Order(finite[-1] if finite else None, False, at_floor, tuple(orders), tuple(differences))
+    return ObservedOrder(finite[-1] if finite else None, False, at_floor, tuple(orders), tuple(differences))
 
 
-def approached(last: Sequence[float], declared: int) -> float | None:
+def extrapolated_order(last: Sequence[float], declared: int) -> float | None:
     """The order that the three finest orders lead to, or None while they lead nowhere.
 
     Observed orders are off by c h + …: where two halvings of the step have each about halved what is
@@ -96,19 +100,19 @@ def approached(last: Sequence[float], declared: int) -> float | None:
     if halved and abs(left[2]) <= 2 * ORDER_MARGIN:
         return float(2 * last[2] - last[1])
     changes = abs(last[1] - last[0]) + abs(last[2] - last[1])
-    return float(last[2]) if abs(left[2]) > ORDER_MARGIN + DRIFTS * changes else None
+    return float(last[2]) if abs(left[2]) > ORDER_MARGIN + ORDER_CHANGE_FACTOR * changes else None
 
 
 @dataclass(frozen=True, eq=False)
-class Limit:
+class ExtrapolatedLimit:
     """The motion at step zero, as far as the ladder can tell."""
 
     y: Array  # (T, N, width)
     uncertainty: Array  # (T,) running maximum over time, same unit
-    column: int  # how many powers were eliminated
+    eliminated_powers: int  # how many powers were eliminated
 
 
-def romberg(ys: Sequence[Array], powers: Sequence[int]) -> Limit:
+def romberg(ys: Sequence[Array], powers: Sequence[int]) -> ExtrapolatedLimit:
     """Extrapolate samples ``ys`` (coarse to fine, steps halving) with errors in h**powers.
 
     Column m has the first m powers eliminated.  Its uncertainty is the larger of the distance to its row
@@ -122,22 +126,22 @@ def romberg(ys: Sequence[Array], powers: Sequence[int]) -> Limit:
     if len(usable) < 2:
         raise ValueError("fewer than two finite runs: nothing to extrapolate")
     column = usable
-    best = _limit(column, 0, 2 * column[-2] - column[-1])
+    best = _column_limit(column, 0, 2 * column[-2] - column[-1])
     for m, power in enumerate(powers[: len(usable) - 2], start=1):
         factor, before = 2.0**power - 1.0, column[-1]
         column = [fine + (fine - coarse) / factor for coarse, fine in itertools.pairwise(column)]
-        candidate = _limit(column, m, before)
+        candidate = _column_limit(column, m, before)
         if candidate.uncertainty[-1] < best.uncertainty[-1]:
             best = candidate
     return best
 
 
-def _limit(column: Sequence[Array], m: int, before: Array) -> Limit:
+def _column_limit(column: Sequence[Array], m: int, before: Array) -> ExtrapolatedLimit:
     """The last of a column, uncertain by its row before the last or by ``before``, whichever is farther."""
     gaps = [np.max(np.linalg.norm(column[-1] - other, axis=-1), axis=1) for other in (column[-2], before)]
-    return Limit(column[-1], np.maximum.accumulate(np.maximum(*gaps)), m)
+    return ExtrapolatedLimit(column[-1], np.maximum.accumulate(np.maximum(*gaps)), m)
 
 
-def tightest(ys: Sequence[Array]) -> Limit:
+def tightest_tolerance_limit(ys: Sequence[Array]) -> ExtrapolatedLimit:
     """The limit of an adaptive method's ladder: its tightest run, uncertain by the step before it."""
-    return _limit(ys, 0, ys[-2])
+    return _column_limit(ys, 0, ys[-2])

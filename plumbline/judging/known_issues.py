@@ -21,11 +21,11 @@ from ruamel.yaml.error import YAMLError
 
 from plumbline.model.datatypes import Row
 
-Kind = tuple[str, str, str, str, str]  # of a row: engine, its version, level, integrator, quantity
-FILE = Path(__file__).with_name("known_issues.yaml")
+RowKind = tuple[str, str, str, str, str]  # of a row: engine, its version, level, integrator, quantity
+KNOWN_ISSUES_FILE = Path(__file__).with_name("known_issues.yaml")
 
 
-class Entry(BaseModel):
+class KnownIssue(BaseModel):
     """One expected verdict that is not "agrees"."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -38,14 +38,14 @@ class Entry(BaseModel):
     integrator: str = "*"
     quantity: str = "*"
     verdict: Literal["disagrees", "unresolved", "unsupported", "failed"]
-    sometimes: bool = False  # of random scenarios, which may or may not show it
-    finer: bool = False  # of the nightly's finer ladders alone
+    intermittent: bool = False  # of random scenarios, which may or may not show it
+    extra_refinements_only: bool = False  # of the nightly's finer ladders alone
     evidence: str  # what shows it: a measurement, a script, a document
     reason: str  # why it is so
 
     @field_validator("versions")
     @classmethod
-    def _is_a_range(cls, text: str) -> str:
+    def _check_version_range(cls, text: str) -> str:
         try:
             SpecifierSet(text)
         except InvalidSpecifier as error:
@@ -53,19 +53,19 @@ class Entry(BaseModel):
         return text
 
     @model_validator(mode="after")
-    def _only_chance_is_excused(self) -> Entry:
-        if self.sometimes and not self.scenario.startswith("random-"):
+    def _check_intermittent(self) -> KnownIssue:
+        if self.intermittent and not self.scenario.startswith("random-"):
             raise ValueError("`sometimes` is for random scenarios (random-*): others show it or do not")
         return self
 
-    def covers(self, kind: Kind) -> bool:
+    def matches_kind(self, kind: RowKind) -> bool:
         """Whether the entry speaks of that kind of row in its scenarios; of an engine in any version."""
         engine, version, *others = kind
         here = fnmatchcase(engine.partition("@")[0], self.engine)
         patterns = self.level, self.integrator, self.quantity
-        return here and all(map(fnmatchcase, others, patterns)) and self.in_range(version)
+        return here and all(map(fnmatchcase, others, patterns)) and self.matches_version(version)
 
-    def in_range(self, version: str) -> bool:
+    def matches_version(self, version: str) -> bool:
         """Whether an engine's version is in the entry's range; pre-releases count."""
         if not self.versions:
             return True
@@ -75,12 +75,12 @@ class Entry(BaseModel):
             return False
 
 
-def load(path: Path = FILE) -> list[Entry]:
+def load_known_issues(path: Path = KNOWN_ISSUES_FILE) -> list[KnownIssue]:
     """The entries of a file; ValueError naming file and entry where it is not valid."""
     try:
         raw = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
-        entries = TypeAdapter(list[Entry]).validate_python(
-            [one for item in raw or [] for one in spread(item)]
+        entries = TypeAdapter(list[KnownIssue]).validate_python(
+            [one for item in raw or [] for one in expand_lists(item)]
         )
     except (OSError, YAMLError, ValidationError) as error:
         raise ValueError(f"{path}: {error}") from None
@@ -90,46 +90,46 @@ def load(path: Path = FILE) -> list[Entry]:
     return entries
 
 
-def spread(item: object) -> list[object]:
+def expand_lists(item: object) -> list[object]:
     """One entry for each scenario, integrator or quantity of a list, each with an id: each must occur."""
     for field in ("scenario", "integrator", "quantity"):
         if isinstance(item, dict) and isinstance(item.get(field), list):
             each = [{**item, field: name, "id": f"{item.get('id')}: {name}"} for name in item[field]]
-            return [one for entry in each for one in spread(entry)]
+            return [one for entry in each for one in expand_lists(entry)]
     return [item]
 
 
-class Excuses:
+class KnownIssues:
     """Entries as they are used: rows come by and by, and at the end an entry may have excused nothing."""
 
-    def __init__(self, entries: Sequence[Entry], finer: bool) -> None:
+    def __init__(self, entries: Sequence[KnownIssue], has_extra_refinements: bool) -> None:
         """``finer``: the rows come from finer ladders than `run`'s."""
-        self.entries = [e for e in entries if finer or not e.finer]
-        self.finer = finer
-        self._of_kind: dict[Kind, list[Entry]] = {}  # there are many rows, of few kinds
-        self.used: set[str] = set()
-        self.covered: set[str] = set()
+        self.issues = [e for e in entries if has_extra_refinements or not e.extra_refinements_only]
+        self.finer = has_extra_refinements
+        self._by_kind: dict[RowKind, list[KnownIssue]] = {}  # there are many rows, of few kinds
+        self.used_ids: set[str] = set()
+        self.matched_ids: set[str] = set()
 
-    def about(self, row: Row) -> list[Entry]:
+    def issues_for(self, row: Row) -> list[KnownIssue]:
         """The entries that speak of that row's cell, whatever its verdict."""
         kind = row.engine, row.engine_version, row.level, row.integrator, row.quantity
-        if kind not in self._of_kind:
-            self._of_kind[kind] = [e for e in self.entries if e.covers(kind)]
-        return [e for e in self._of_kind[kind] if fnmatchcase(row.scenario, e.scenario)]
+        if kind not in self._by_kind:
+            self._by_kind[kind] = [e for e in self.issues if e.matches_kind(kind)]
+        return [e for e in self._by_kind[kind] if fnmatchcase(row.scenario, e.scenario)]
 
-    def mark(self, rows: Iterable[Row]) -> list[Row]:
+    def mark_known(self, rows: Iterable[Row]) -> list[Row]:
         """The rows, with the entry that expects their verdict where there is one."""
         marked = []
         for row in rows:
-            about = self.about(row)
-            self.covered.update(e.id for e in about)
+            about = self.issues_for(row)
+            self.matched_ids.update(e.id for e in about)
             match = next((e for e in about if e.verdict == row.verdict), None)
             if match:
-                self.used.add(match.id)
-            marked.append(replace(row, known=match.id) if match else row)
+                self.used_ids.add(match.id)
+            marked.append(replace(row, known_issue=match.id) if match else row)
         return marked
 
-    def stale(self, *, whole: bool) -> list[Entry]:
+    def stale_issues(self, *, is_full_matrix: bool) -> list[KnownIssue]:
         """Entries that have had their day; with ``whole`` (a run of the full matrix) all that excused none.
 
         Where only a part of the matrix ran, an entry is stale if it covers rows that ran and excuses none
@@ -138,10 +138,10 @@ class Excuses:
         """
         return [
             e
-            for e in self.entries
-            if e.id not in self.used
-            and not e.sometimes
-            and e.id in self.covered
+            for e in self.issues
+            if e.id not in self.used_ids
+            and not e.intermittent
+            and e.id in self.matched_ids
             and not (self.finer and e.verdict == "unresolved")
-            and (whole or not set("*?[") & set(e.scenario))
+            and (is_full_matrix or not set("*?[") & set(e.scenario))
         ]

@@ -28,8 +28,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from plumbline.engines.adapter import Adapter
-from plumbline.engines.registry import adapter
-from plumbline.judging.rows import Findings, Subject
+from plumbline.engines.registry import load_adapter
+from plumbline.judging.rows import JudgingResult, RowContext
 from plumbline.model.datatypes import (
     Array,
     EngineFailure,
@@ -42,23 +42,35 @@ from plumbline.model.datatypes import (
     Verdict,
 )
 from plumbline.model.invariants import attitude_error, position_error
-from plumbline.model.kinematics import angular_velocity, conjugate, lift, multiply, rotation
-from plumbline.model.welding import halves
-from plumbline.truth.ground_truth import ROUNDING, reach
-from plumbline.truth.rounding_bound import Bound, state_bound
-from plumbline.truth.sensitivity import growth
+from plumbline.model.kinematics import (
+    angular_velocity,
+    quaternion_conjugate,
+    quaternion_product,
+    rotation_matrix,
+    state_from_minimal,
+)
+from plumbline.model.welding import split_bodies
+from plumbline.truth.ground_truth import RUN_ROUNDING, stretched_length
+from plumbline.truth.rounding_bound import RoundingBound, state_rounding_bound
+from plumbline.truth.sensitivity import perturbation_growth
 
-AS, BY = "as ", "by "  # how names of relations begin: another formulation, another way of the engine
-WELDED, REVERSED = "two welded halves", "reversed in time"
-FORMULATIONS = {
+OTHER_FORMULATION_PREFIX, OPTION_PREFIX = (
+    "as ",
+    "by ",
+)  # how names of relations begin: another formulation, another way of the engine
+WELDED_HALVES, REVERSED_IN_TIME = "two welded halves", "reversed in time"
+OTHER_FORMULATIONS = {
     "pinocchio": "pinocchio-maximal",
     "pinocchio-maximal": "pinocchio",
     "exudyn": "exudyn-tree",
     "exudyn-tree": "exudyn",
 }
-STATES, LONG = 4, 12  # states per relation; half of them for chains above so many bodies
-FINER = 1, 4, 16  # steps that an implicit method is given, one after the other, where it fails
-STEPS, COARSE = 16, 32  # of a run, one way; to a radian of the fastest rate, for implicit steps to be solved
+MAX_STATES, LONG_CHAIN_BODIES = 4, 12  # states per relation; half of them for chains above so many bodies
+STEP_DIVISORS = 1, 4, 16  # steps that an implicit method is given, one after the other, where it fails
+RUN_STEPS, STEPS_PER_RADIAN = (
+    16,
+    32,
+)  # of a run, one way; to a radian of the fastest rate, for implicit steps to be solved
 Q = np.array([1.0, 2.0, 3.0, 4.0]) / np.sqrt(30.0)  # turns no axis into an axis
 QUANTITIES = (
     "acceleration", "angular_acceleration", "joint_reaction", "kinetic_energy", "potential_energy",
@@ -71,59 +83,59 @@ class Relation:
     """Another description of the same pendulum, and the way back of what is said of it."""
 
     name: str
-    there: Callable[[Model, State], tuple[Model, State]]
-    back: Callable[[StateQuantities], dict[str, Array]]
+    transform: Callable[[Model, State], tuple[Model, State]]
+    transform_back: Callable[[StateQuantities], dict[str, Array]]
 
 
 @dataclass(frozen=True)
-class Held:
+class RelationResult:
     """How well one relation held: the worst difference over what is allowed, and where."""
 
     relation: str
     ratio: float | None  # None where the engine refused every state
     quantity: str
-    state: int
-    states: int  # that were compared
-    refused: str = ""
+    worst_state: int
+    state_count: int  # that were compared
+    refusal_reason: str = ""
     verdict: Verdict = "unsupported"  # of a refusal
     integrator: str = "-"  # where it is a relation of runs
     steps: int = 0  # of a run, there and back
     resolution: float = 0.0  # of a run: its step in s, or its relative tolerance
-    end: float = 0.0  # s, of a run one way
+    end_time: float = 0.0  # s, of a run one way
 
 
-def values(said: StateQuantities, **factors: float) -> dict[str, Array]:
+def quantity_values(answers: StateQuantities, **factors: float) -> dict[str, Array]:
     """The quantities an engine offers, some multiplied."""
     return {
-        q: np.asarray(getattr(said, q), float) * factors.get(q, 1.0)
+        q: np.asarray(getattr(answers, q), float) * factors.get(q, 1.0)
         for q in QUANTITIES
-        if getattr(said, q) is not None
+        if getattr(answers, q) is not None
     }
 
 
-def scaled(model: Model, **factors: float) -> Model:
+def scale_fields(model: Model, **factors: float) -> Model:
     """Fields of a model multiplied."""
     return replace(model, **{name: getattr(model, name) * factor for name, factor in factors.items()})
 
 
-def rotated_world(model: Model, state: State) -> tuple[Model, State]:
+def rotate_world(model: Model, state: State) -> tuple[Model, State]:
     """World vectors and attitudes turned by Q."""
-    turn = rotation(Q)
+    turn = rotation_matrix(Q)
     turned = replace(model, gravity=turn @ model.gravity, force=model.force @ turn.T)
-    p = multiply(Q, state.p)
+    p = quaternion_product(Q, state.p)
     p /= np.linalg.norm(p, axis=-1, keepdims=True)
-    return turned, lift(turned, p, state.omega, state.u @ turn.T, state.udot @ turn.T)
+    return turned, state_from_minimal(turned, p, state.omega, state.u @ turn.T, state.udot @ turn.T)
 
 
-def unrotated(said: StateQuantities) -> dict[str, Array]:
+def unrotate_world(answers: StateQuantities) -> dict[str, Array]:
     """World vectors turned back."""
     world = ("acceleration", "joint_reaction", "angular_momentum")
-    return {q: x @ rotation(Q) if q in world else x for q, x in values(said).items()}
+    return {q: x @ rotation_matrix(Q) if q in world else x for q, x in quantity_values(answers).items()}
 
 
-def body_frame(model: Model, state: State) -> tuple[Model, State]:
+def rotate_body_frames(model: Model, state: State) -> tuple[Model, State]:
     """Body axes turned by Q: a body vector x becomes Q x."""
-    turn = rotation(Q)
+    turn = rotation_matrix(Q)
     inertia = turn @ model.inertia @ turn.T
     turned = replace(
         model,
@@ -132,91 +144,97 @@ def body_frame(model: Model, state: State) -> tuple[Model, State]:
         distal=model.distal @ turn.T,
         moment=model.moment @ turn.T,
     )
-    p = multiply(state.p, conjugate(Q))
+    p = quaternion_product(state.p, quaternion_conjugate(Q))
     p /= np.linalg.norm(p, axis=-1, keepdims=True)
-    return turned, lift(turned, p, state.omega @ turn.T, state.u, state.udot)
+    return turned, state_from_minimal(turned, p, state.omega @ turn.T, state.u, state.udot)
 
 
-def unframed(said: StateQuantities) -> dict[str, Array]:
+def unrotate_body_frames(answers: StateQuantities) -> dict[str, Array]:
     """Body vectors turned back."""
-    return {q: x @ rotation(Q) if q == "angular_acceleration" else x for q, x in values(said).items()}
+    return {
+        q: x @ rotation_matrix(Q) if q == "angular_acceleration" else x
+        for q, x in quantity_values(answers).items()
+    }
 
 
-def doubled(model: Model, state: State) -> tuple[Model, State]:
+def double_masses(model: Model, state: State) -> tuple[Model, State]:
     """All masses, inertias, loads and drags × 2."""
     fields = ("mass", "inertia", "force", "moment", "drag_force", "drag_moment")
-    return scaled(model, **dict.fromkeys(fields, 2.0)), state
+    return scale_fields(model, **dict.fromkeys(fields, 2.0)), state
 
 
-def halved(said: StateQuantities) -> dict[str, Array]:
+def halve_forces(answers: StateQuantities) -> dict[str, Array]:
     """Forces, energies and momentum / 2."""
-    return values(said, **dict.fromkeys(QUANTITIES[2:], 0.5))
+    return quantity_values(answers, **dict.fromkeys(QUANTITIES[2:], 0.5))
 
 
-def longer(model: Model, state: State) -> tuple[Model, State]:
+def scale_lengths(model: Model, state: State) -> tuple[Model, State]:
     """Lengths × 4 and times × 2."""
-    big = scaled(
+    big = scale_fields(
         model, proximal=4.0, distal=4.0, length=4.0, inertia=16.0, moment=4.0, drag_force=0.5, drag_moment=8.0
     )
-    return big, lift(big, state.p, state.omega / 2, state.u, state.udot / 2)
+    return big, state_from_minimal(big, state.p, state.omega / 2, state.u, state.udot / 2)
 
 
-def shorter(said: StateQuantities) -> dict[str, Array]:
+def unscale_lengths(answers: StateQuantities) -> dict[str, Array]:
     """Angular accelerations × 4, energies / 4, momentum / 8."""
-    return values(
-        said, angular_acceleration=4.0, kinetic_energy=0.25, potential_energy=0.25, angular_momentum=0.125
+    return quantity_values(
+        answers, angular_acceleration=4.0, kinetic_energy=0.25, potential_energy=0.25, angular_momentum=0.125
     )
 
 
-def reversed_time(model: Model, state: State) -> tuple[Model, State]:
+def reverse_time(model: Model, state: State) -> tuple[Model, State]:
     """The same place, the opposite rates; drag, which knows the direction of time, left out."""
-    return model, lift(model, state.p, -state.omega, state.u, -state.udot)
+    return model, state_from_minimal(model, state.p, -state.omega, state.u, -state.udot)
 
 
-def same(model: Model, state: State) -> tuple[Model, State]:
+def unchanged(model: Model, state: State) -> tuple[Model, State]:
     """As they are."""
     return model, state
 
 
-RELATIONS = (
-    Relation("rotated world", rotated_world, unrotated),
-    Relation("re-chosen body frame", body_frame, unframed),
-    Relation("masses doubled", doubled, halved),
-    Relation("lengths × 4", longer, shorter),
-    Relation("time reversed", reversed_time, lambda said: values(said, angular_momentum=-1.0)),
+STATE_RELATIONS = (
+    Relation("rotated world", rotate_world, unrotate_world),
+    Relation("re-chosen body frame", rotate_body_frames, unrotate_body_frames),
+    Relation("masses doubled", double_masses, halve_forces),
+    Relation("lengths × 4", scale_lengths, unscale_lengths),
+    Relation("time reversed", reverse_time, lambda answers: quantity_values(answers, angular_momentum=-1.0)),
 )
 
 
 Evaluate = Callable[[Model, list[State]], list[StateQuantities]]
 
 
-def check(engine: str, model: Model, states: Sequence[State]) -> list[Held]:
+def check_relations(engine: str, model: Model, states: Sequence[State]) -> list[RelationResult]:
     """Every relation on one engine, at each state (to be called in a worker)."""
-    chosen = adapter(engine)
-    states = states[: STATES if model.n <= LONG else STATES // 2]
-    said = [said_of(chosen.evaluate, model, state) for state in states]
-    bounds = [state_bound(model, state) for state in states]
+    chosen = load_adapter(engine)
+    states = states[: MAX_STATES if model.n <= LONG_CHAIN_BODIES else MAX_STATES // 2]
+    said = [evaluate_or_refusal(chosen.evaluate, model, state) for state in states]
+    bounds = [state_rounding_bound(model, state) for state in states]
     asked: list[tuple[Relation, Evaluate]] = [
         (relation, chosen.evaluate)
-        for relation in RELATIONS
+        for relation in STATE_RELATIONS
         if not (relation.name == "time reversed" and model.has_drag)
     ]
-    ways = {BY + option: chosen.by(option) for option in chosen.options}
-    if engine in FORMULATIONS:
-        ways[AS + FORMULATIONS[engine]] = adapter(FORMULATIONS[engine])
-    asked += [(Relation(name, same, values), other.evaluate) for name, other in ways.items()]
-    found = [held(relation, said, evaluate, model, states, bounds, bounds) for relation, evaluate in asked]
+    ways = {OPTION_PREFIX + option: chosen.with_option(option) for option in chosen.options}
+    if engine in OTHER_FORMULATIONS:
+        ways[OTHER_FORMULATION_PREFIX + OTHER_FORMULATIONS[engine]] = load_adapter(OTHER_FORMULATIONS[engine])
+    asked += [(Relation(name, unchanged, quantity_values), other.evaluate) for name, other in ways.items()]
+    found = [
+        check_state_relation(relation, said, evaluate, model, states, bounds, bounds)
+        for relation, evaluate in asked
+    ]
 
     def welding(model: Model, states: list[State]) -> list[StateQuantities]:
-        return chosen.welding().evaluate(model, states)
+        return chosen.with_welded_halves().evaluate(model, states)
 
-    welded = Relation(WELDED, same, values)
-    of_halves = [state_bound(model, state, halves(model)) for state in states]
-    found.append(held(welded, said, welding, model, states, bounds, of_halves))
-    return [*found, *runs(chosen, model, states[0])]
+    welded = Relation(WELDED_HALVES, unchanged, quantity_values)
+    of_halves = [state_rounding_bound(model, state, split_bodies(model)) for state in states]
+    found.append(check_state_relation(welded, said, welding, model, states, bounds, of_halves))
+    return [*found, *check_run_relations(chosen, model, states[0])]
 
 
-def said_of(evaluate: Evaluate, model: Model, state: State) -> StateQuantities | Unsupported:
+def evaluate_or_refusal(evaluate: Evaluate, model: Model, state: State) -> StateQuantities | Unsupported:
     """What is said of one state, or the refusal."""
     try:
         (said,) = evaluate(model, [state])
@@ -225,82 +243,84 @@ def said_of(evaluate: Evaluate, model: Model, state: State) -> StateQuantities |
     return said
 
 
-def held(
+def check_state_relation(
     relation: Relation,
-    said: Sequence[StateQuantities | Unsupported],
-    there: Evaluate,
+    answers: Sequence[StateQuantities | Unsupported],
+    evaluate_other: Evaluate,
     model: Model,
     states: Sequence[State],
-    bounds: Sequence[Bound],
-    other_bounds: Sequence[Bound],
-) -> Held:
+    bounds: Sequence[RoundingBound],
+    other_bounds: Sequence[RoundingBound],
+) -> RelationResult:
     """One relation at every state that the engine takes on both sides."""
     worst, count, refused = (0.0, "", 0), 0, ""
     for index, state in enumerate(states):
-        other_model, other_state = relation.there(model, state)
-        here, other = said[index], said_of(there, other_model, other_state)
+        other_model, other_state = relation.transform(model, state)
+        here, other = answers[index], evaluate_or_refusal(evaluate_other, other_model, other_state)
         if isinstance(here, Unsupported) or isinstance(other, Unsupported):
             refused = str(here if isinstance(here, Unsupported) else other)
             continue
         count += 1
-        mine, theirs = values(here), relation.back(other)
+        mine, theirs = quantity_values(here), relation.transform_back(other)
         for q in mine.keys() & theirs.keys():
             size = np.linalg.norm(np.atleast_1d(mine[q] - theirs[q]), axis=-1)
             both = np.asarray(bounds[index].tolerance(q)) + other_bounds[index].tolerance(q)
             allowed = np.maximum(both, np.finfo(float).tiny)
             worst = max(worst, (float(np.max(size / allowed)), q, index))
-    return Held(relation.name, worst[0] if count else None, worst[1], worst[2], count, refused)
+    return RelationResult(relation.name, worst[0] if count else None, worst[1], worst[2], count, refused)
 
 
-def runs(engine: Adapter, model: Model, state: State) -> Iterator[Held]:
+def check_run_relations(engine: Adapter, model: Model, state: State) -> Iterator[RelationResult]:
     """The relations of short runs from one state, of every integrator that has one.
 
     A step too coarse for an implicit one to be solved says nothing: the run is shorter then, and its step.
     """
-    step = 2.0 ** float(np.floor(-np.log2(COARSE * quickest(model, state))))
+    step = 2.0 ** float(np.floor(-np.log2(STEPS_PER_RADIAN * fastest_rate(model, state))))
     for integrator in engine.integrators:
-        for finer in FINER:
-            found = list(of_integrator(engine, integrator, model, state, step / finer))
+        for finer in STEP_DIVISORS:
+            found = list(check_integrator_relations(engine, integrator, model, state, step / finer))
             if integrator.kind == "tolerance" or all(held.verdict != "failed" for held in found):
                 break
         yield from found
 
 
-def of_integrator(
+def check_integrator_relations(
     engine: Adapter, integrator: Integrator, model: Model, state: State, step: float
-) -> Iterator[Held]:
+) -> Iterator[RelationResult]:
     """The relations of one integrator's runs in steps of ``step``."""
-    if integrator.symmetric and not model.has_drag:
-        yield retraced(engine, integrator, model, state, step)
-    if integrator.kind == "step" and engine.solvers:
-        yield from resolved(engine, integrator, model, state, step)
+    if integrator.is_symmetric and not model.has_drag:
+        yield check_time_reversal(engine, integrator, model, state, step)
+    if integrator.kind == "step" and engine.linear_solvers:
+        yield from check_linear_solvers(engine, integrator, model, state, step)
 
 
-def quickest(model: Model, state: State) -> float:
+def fastest_rate(model: Model, state: State) -> float:
     """The fastest rate in 1/s: of a body, of a rod, of the shortest link as a pendulum."""
-    swing = np.sqrt(np.linalg.norm(model.gravity) / np.min(reach(model)))
+    swing = np.sqrt(np.linalg.norm(model.gravity) / np.min(stretched_length(model)))
     rates = [np.max(np.linalg.norm(rate, axis=1)) for rate in (state.omega, state.udot)]
     return float(max(swing, *rates)) or 1.0
 
 
-def retraced(engine: Adapter, integrator: Integrator, model: Model, state: State, step: float) -> Held:
-    """There and back by a symmetric integrator: the first row with opposite rates."""
-    resolution = step if integrator.kind == "step" else integrator.tightest
-    end = STEPS * step
-    try:
-        run = engine.retrace(model, state, end, integrator.name, resolution)
-    except (Unsupported, EngineFailure) as refusal:
-        return refused(REVERSED, integrator, refusal)
-    off = apart(model, row(run, 0), row(run, 2, -1.0))
-    limit = allowed(integrator, model, state, end, run.steps)
-    return worst_of(REVERSED, integrator, off, limit, run.steps, resolution, end)
-
-
-def resolved(
+def check_time_reversal(
     engine: Adapter, integrator: Integrator, model: Model, state: State, step: float
-) -> Iterator[Held]:
+) -> RelationResult:
+    """There and back by a symmetric integrator: the first row with opposite rates."""
+    resolution = step if integrator.kind == "step" else integrator.min_rtol
+    end = RUN_STEPS * step
+    try:
+        run = engine.simulate_round_trip(model, state, end, integrator.name, resolution)
+    except (Unsupported, EngineFailure) as refusal:
+        return refused_result(REVERSED_IN_TIME, integrator, refusal)
+    off = relative_differences(model, state_at_sample(run, 0), state_at_sample(run, 2, -1.0))
+    limit = run_tolerance(integrator, model, state, end, run.steps)
+    return worst_difference_result(REVERSED_IN_TIME, integrator, off, limit, run.steps, resolution, end)
+
+
+def check_linear_solvers(
+    engine: Adapter, integrator: Integrator, model: Model, state: State, step: float
+) -> Iterator[RelationResult]:
     """The same run with each of the engine's linear solvers."""
-    end = STEPS * step
+    end = RUN_STEPS * step
 
     def last(way: Adapter) -> Trajectory | Unsupported | EngineFailure:
         try:
@@ -309,25 +329,27 @@ def resolved(
             return refusal
 
     usual = last(engine)
-    limit = 2 * allowed(integrator, model, state, end, STEPS)
-    for solver in engine.solvers:
-        other = last(engine.by(solver))
+    limit = 2 * run_tolerance(integrator, model, state, end, RUN_STEPS)
+    for solver in engine.linear_solvers:
+        other = last(engine.with_option(solver))
         if not isinstance(usual, Trajectory):
-            yield refused(BY + solver, integrator, usual)
+            yield refused_result(OPTION_PREFIX + solver, integrator, usual)
         elif not isinstance(other, Trajectory):
-            yield refused(BY + solver, integrator, other)
+            yield refused_result(OPTION_PREFIX + solver, integrator, other)
         else:
-            off = apart(model, row(usual, -1), row(other, -1))
-            yield worst_of(BY + solver, integrator, off, limit, STEPS, step, end)
+            off = relative_differences(model, state_at_sample(usual, -1), state_at_sample(other, -1))
+            yield worst_difference_result(
+                OPTION_PREFIX + solver, integrator, off, limit, RUN_STEPS, step, end
+            )
 
 
-def refused(name: str, integrator: Integrator, refusal: Unsupported | EngineFailure) -> Held:
+def refused_result(name: str, integrator: Integrator, refusal: Unsupported | EngineFailure) -> RelationResult:
     """A relation of runs that the engine cannot do, or failed to."""
     verdict: Verdict = "unsupported" if isinstance(refusal, Unsupported) else "failed"
-    return Held(name, None, "", 0, 0, str(refusal), verdict, integrator.name)
+    return RelationResult(name, None, "", 0, 0, str(refusal), verdict, integrator.name)
 
 
-def allowed(integrator: Integrator, model: Model, state: State, end: float, steps: int) -> float:
+def run_tolerance(integrator: Integrator, model: Model, state: State, end: float, steps: int) -> float:
     """What a run from ``state`` may be off by, of a scale of 1: its rounding and its steps' solver, grown.
 
     On long chains accelerations, rounded, are off by more than the other roundings of a run: by the
@@ -335,33 +357,33 @@ def allowed(integrator: Integrator, model: Model, state: State, end: float, step
     there: without drag the flow is Hamiltonian (but for body-fixed moments, which change little in so short
     a run), and its singular values come in pairs σ, 1/σ.
     """
-    of_step = integrator.tightest
+    of_step = integrator.min_rtol
     if integrator.kind == "step":  # the residual is small beside the heaviest body's: F = m a of a light one
-        of_step = integrator.solver * float(np.max(model.mass) / np.min(model.mass))
-    bound, (_, spin, speed) = state_bound(model, state), sizes(model, state)
+        of_step = integrator.solver_rtol * float(np.max(model.mass) / np.min(model.mass))
+    bound, (_, spin, speed) = state_rounding_bound(model, state), characteristic_scales(model, state)
     pushed = end * max(np.max(bound.acceleration) / speed, np.max(bound.angular_acceleration) / spin)
-    grown = growth(model, state, np.array([0.0, end / 2, end]))
-    return float((ROUNDING + of_step * np.sqrt(steps) + pushed) * np.max(grown))
+    grown = perturbation_growth(model, state, np.array([0.0, end / 2, end]))
+    return float((RUN_ROUNDING + of_step * np.sqrt(steps) + pushed) * np.max(grown))
 
 
-def sizes(model: Model, state: State) -> tuple[float, float, float]:
+def characteristic_scales(model: Model, state: State) -> tuple[float, float, float]:
     """What differences are measured by: the pendulum's length (m), its turn (rad/s), its speed (m/s)."""
-    length = float(np.sum(reach(model)))
+    length = float(np.sum(stretched_length(model)))
     fall = float(np.sqrt(np.linalg.norm(model.gravity) * length))
     spin = max(fall / length, float(np.max(np.linalg.norm(state.omega, axis=1))), np.finfo(float).tiny)
     return length, spin, max(spin * length, float(np.max(np.linalg.norm(state.v, axis=1))))
 
 
-def row(run: Trajectory, at: int, sign: float = 1.0) -> State:
+def state_at_sample(run: Trajectory, at: int, sign: float = 1.0) -> State:
     """One sample as it is, on the manifold or off; its rates times ``sign``."""
     p, pdot = run.p[at], sign * run.pdot[at]
     nothing = np.zeros_like(run.r[at])
     return State(p, angular_velocity(p, pdot), nothing, nothing, run.r[at], sign * run.v[at])
 
 
-def apart(model: Model, one: State, other: State) -> dict[str, float]:
+def relative_differences(model: Model, one: State, other: State) -> dict[str, float]:
     """Differences of two samples, each of its size."""
-    length, spin, speed = sizes(model, one)
+    length, spin, speed = characteristic_scales(model, one)
     return {
         "position": float(position_error(one.r, other.r)) / length,
         "attitude": float(attitude_error(one.p, other.p)),
@@ -370,27 +392,31 @@ def apart(model: Model, one: State, other: State) -> dict[str, float]:
     }
 
 
-def worst_of(
+def worst_difference_result(
     name: str,
     integrator: Integrator,
-    off: dict[str, float],
+    differences: dict[str, float],
     limit: float,
     steps: int,
     resolution: float,
     end: float,
-) -> Held:
+) -> RelationResult:
     """A relation of runs to ``end``, from the differences and what each may be."""
-    quantity = max(off, key=lambda q: off[q])
-    ratio = off[quantity] / limit
-    return Held(name, ratio, quantity, 0, 1, "", "unsupported", integrator.name, steps, resolution, end)
+    quantity = max(differences, key=lambda q: differences[q])
+    ratio = differences[quantity] / limit
+    return RelationResult(
+        name, ratio, quantity, 0, 1, "", "unsupported", integrator.name, steps, resolution, end
+    )
 
 
-def judge_relations(who: Subject, found: Sequence[Held]) -> Findings:
+def judge_relations(context: RowContext, found: Sequence[RelationResult]) -> JudgingResult:
     """One row per relation: the worst difference over what rounding on both sides explains."""
     rows = []
     for one in found:
         if one.ratio is None:
-            rows.append(who.row("relations", one.integrator, one.relation, one.verdict, one.refused))
+            rows.append(
+                context.make_row("relations", one.integrator, one.relation, one.verdict, one.refusal_reason)
+            )
             continue
         name, agrees = one.quantity.replace("_", " "), one.ratio <= 1
         if one.steps:
@@ -405,20 +431,24 @@ def judge_relations(who: Subject, found: Sequence[Held]) -> Findings:
                 "the growth of a small perturbation"
             )
         else:
-            bounds, over, where = "the rounding bounds", f"{one.states} states", f"state {one.state}"
+            bounds, over, where = (
+                "the rounding bounds",
+                f"{one.state_count} states",
+                f"state {one.worst_state}",
+            )
             derivation = "worst difference over the sum of both sides' state-level rounding bounds"
         reason = (
-            f"{one.relation}: {who.title} says the same of both to {one.ratio:.2g} of {bounds}, {over}"
+            f"{one.relation}: {context.title} says the same of both to {one.ratio:.2g} of {bounds}, {over}"
             if agrees
-            else f"{one.relation}: {who.title}'s {name} at {where} differs by {one.ratio:.3g} times {bounds}"
+            else f"{one.relation}: {context.title}'s {name} at {where} differs by {one.ratio:.3g} times {bounds}"
             + ("" if one.steps else " of both")
         )
-        of_run = {"resolution": one.resolution, "end": one.end} if one.steps else {}
+        of_run = {"resolution": one.resolution, "end": one.end_time} if one.steps else {}
         rows.append(
-            who.row(
+            context.make_row(
                 "relations", one.integrator, one.relation, "agrees" if agrees else "disagrees", reason,
                 value=one.ratio, tolerance=1.0, derivation=derivation,
-                extra={"states": float(one.states), "state": float(one.state), **of_run},
+                extra={"states": float(one.state_count), "state": float(one.worst_state), **of_run},
             )
         )  # fmt: skip
-    return Findings(rows)
+    return JudgingResult(rows)

@@ -11,7 +11,7 @@ Columns = dict[str, Any]  # column name → its values (n,), or the one value of
 
 
 @dataclass(frozen=True)
-class Subject:
+class RowContext:
     """Who is judged, on what."""
 
     scenario: str
@@ -20,7 +20,7 @@ class Subject:
     title: str
     version: str
 
-    def row(
+    def make_row(
         self,
         level: Level,
         integrator: str,
@@ -39,7 +39,7 @@ class Subject:
 
 
 @dataclass
-class Findings:
+class JudgingResult:
     """Rows, and parts of the tables behind them by their name in the store."""
 
     rows: list[Row] = field(default_factory=list)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from plumbline.engines.calls import Evaluation
-from plumbline.judging.rows import Columns, Findings, Subject
+from plumbline.judging.rows import Columns, JudgingResult, RowContext
 from plumbline.model.datatypes import Array, Row
-from plumbline.processes.packed import Packed
+from plumbline.processes.packed import Pickled
 from plumbline.truth.ground_truth import StateTruth
-from plumbline.truth.rounding_bound import BLUNT
+from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND
 
-UNITS = {
+STATE_UNITS = {
     "acceleration": "m/s²",
     "angular_acceleration": "rad/s²",
     "joint_reaction": "N",
@@ -23,38 +23,41 @@ UNITS = {
 TINY = float(np.finfo(float).tiny)  # an exact zero against a tolerance of zero is no error
 
 
-def judge_states(who: Subject, truth: StateTruth, said: Evaluation) -> Findings:
+def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation) -> JudgingResult:
     """Verdicts on every state quantity, worst over bodies and states."""
-    found = Findings()
-    if said.unsupported is not None:
-        found.rows.append(who.row("state", "-", "all", "unsupported", said.unsupported))
+    found = JudgingResult()
+    if evaluation.unsupported is not None:
+        found.rows.append(context.make_row("state", "-", "all", "unsupported", evaluation.unsupported))
         return found
-    if said.failure is not None:
-        found.rows.append(who.row("state", "-", "all", "failed", said.failure))
+    if evaluation.failure is not None:
+        found.rows.append(context.make_row("state", "-", "all", "failed", evaluation.failure))
         return found
-    for quantity, unit in UNITS.items():
-        if any(getattr(answer, quantity) is None for answer in said.quantities):
-            reason = f"{who.title} offers no {quantity.replace('_', ' ')} of its own"
-            found.rows.append(who.row("state", "-", quantity, "unsupported", reason, unit))
+    for quantity, unit in STATE_UNITS.items():
+        if any(getattr(answer, quantity) is None for answer in evaluation.quantities):
+            reason = f"{context.title} offers no {quantity.replace('_', ' ')} of its own"
+            found.rows.append(context.make_row("state", "-", quantity, "unsupported", reason, unit))
             continue
-        worst = compare(quantity, truth, said)
+        worst = worst_error_per_state(quantity, truth, evaluation)
         found.tables.append(
-            ("states", {"scenario": who.scenario, "engine": who.engine, "quantity": quantity, **worst})
+            (
+                "states",
+                {"scenario": context.scenario, "engine": context.engine, "quantity": quantity, **worst},
+            )
         )
-        found.rows.append(row(who, quantity, unit, worst, truth.method, said.cost))
+        found.rows.append(state_row(context, quantity, unit, worst, truth.method, evaluation.cpu_time))
     return found
 
 
-def judge_packed(who: Subject, truth: Packed, said: Evaluation) -> Findings:
+def judge_states_pickled(context: RowContext, truth: Pickled, evaluation: Evaluation) -> JudgingResult:
     """The same in the worker that has the answer: the process that has all answers is spared it."""
-    return judge_states(who, truth.open(), said)
+    return judge_states(context, truth.load(), evaluation)
 
 
-def compare(quantity: str, truth: StateTruth, said: Evaluation) -> Columns:
+def worst_error_per_state(quantity: str, truth: StateTruth, evaluation: Evaluation) -> Columns:
     """Per state (S,): the error, bound and scale of the body that comes nearest to its bound."""
-    answers = zip(said.quantities, truth.quantities, strict=True)
+    answers = zip(evaluation.quantities, truth.quantities, strict=True)
     differences = [getattr(answer, quantity) - getattr(true, quantity) for answer, true in answers]
-    error = sizes(quantity, np.array(differences))
+    error = error_norms(quantity, np.array(differences))
     bound = np.array([bound.tolerance(quantity) for bound in truth.bounds]).reshape(error.shape)
     scale = np.array([bound.scale[quantity] for bound in truth.bounds]).reshape(error.shape)
     state, body = np.arange(len(error)), np.argmax(error / np.maximum(bound, TINY), axis=1)
@@ -62,7 +65,7 @@ def compare(quantity: str, truth: StateTruth, said: Evaluation) -> Columns:
     return {"state": state, "body": body, "error": error[at], "bound": bound[at], "scale": scale[at]}
 
 
-def sizes(quantity: str, difference: Array) -> Array:
+def error_norms(quantity: str, difference: Array) -> Array:
     """(S, N) Euclidean lengths per state and body; (S, 1) of scalars, momentum, the matrix's worst entry."""
     count = len(difference)
     if quantity == "mass_matrix":
@@ -71,7 +74,7 @@ def sizes(quantity: str, difference: Array) -> Array:
     return np.asarray(np.linalg.norm(difference.reshape(count, -1, components), axis=-1))
 
 
-def row(who: Subject, quantity: str, unit: str, found: Columns, method: str, cost: float) -> Row:
+def state_row(context: RowContext, quantity: str, unit: str, found: Columns, method: str, cost: float) -> Row:
     """The verdict on one quantity: its worst error over bound decides, a blunt bound decides nothing."""
     error, bound, scale = found["error"], found["bound"], found["scale"]
     ratios, there = error / np.maximum(bound, TINY), scale > 0
@@ -101,12 +104,14 @@ def row(who: Subject, quantity: str, unit: str, found: Columns, method: str, cos
     }
     if ratio > 1:
         reason = (
-            f"{who.title}'s {name} is off by {worst:.3g} {unit} at {where}, {ratio:.3g} times the "
+            f"{context.title}'s {name} is off by {worst:.3g} {unit} at {where}, {ratio:.3g} times the "
             f"rounding bound; {int(np.sum(ratios > 1))} of {count} states disagree"
         )
-        return who.row("state", "-", quantity, "disagrees", reason, unit, **common)
-    if not (ratio <= 1 and bluntness <= BLUNT):  # a bound that is not a number decides nothing either
-        reason = f"blunt: the rounding bound is {bluntness:.1g} of the scale, above {BLUNT:g} or no number"
-        return who.row("state", "-", quantity, "unresolved", reason, unit, **common)
+        return context.make_row("state", "-", quantity, "disagrees", reason, unit, **common)
+    if not (
+        ratio <= 1 and bluntness <= MAX_RELATIVE_BOUND
+    ):  # a bound that is not a number decides nothing either
+        reason = f"blunt: the rounding bound is {bluntness:.1g} of the scale, above {MAX_RELATIVE_BOUND:g} or no number"
+        return context.make_row("state", "-", quantity, "unresolved", reason, unit, **common)
     reason = f"{name} within {ratio:.2g} of the rounding bound at {count} states"
-    return who.row("state", "-", quantity, "agrees", reason, unit, **common)
+    return context.make_row("state", "-", quantity, "agrees", reason, unit, **common)

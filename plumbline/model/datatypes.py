@@ -133,10 +133,10 @@ class Integrator:
     name: str
     kind: Literal["step", "tolerance"]
     order: int  # declared order; of the underlying method for kind "tolerance"
-    powers: tuple[int, ...] = ()  # exponents of h in the error expansion, ascending
-    symmetric: bool = False  # time-symmetric: reversing the velocities retraces the path
-    solver: float = 0.0  # relative tolerance to which an implicit step's equations are solved
-    tightest: float = 1e-12  # for kind "tolerance": below, rounding on long chains stalls the step
+    error_exponents: tuple[int, ...] = ()  # exponents of h in the error expansion, ascending
+    is_symmetric: bool = False  # time-symmetric: reversing the velocities retraces the path
+    solver_rtol: float = 0.0  # relative tolerance to which an implicit step's equations are solved
+    min_rtol: float = 1e-12  # for kind "tolerance": below, rounding on long chains stalls the step
     alias_of: str | None = None  # equals that integrator without drag: not independent evidence
     note: str = ""  # a sentence on what it is
 
@@ -159,14 +159,14 @@ class Row:
     reason: str  # one sentence
     derivation: str = ""  # how the tolerance came about, in words and numbers
     uncertainty: float | None = None  # of the truth and of the limit together, same unit
-    horizon: float | None = None  # s, up to which positions were compared
+    compared_until: float | None = None  # s, up to which positions were compared
     order: float | None = None  # observed order
     declared_order: int | None = None
     alias_of: str | None = None
-    known: str | None = None  # id of the entry of known.yaml that expects this verdict
+    known_issue: str | None = None  # id of the entry of known.yaml that expects this verdict
     diagnosis: str | None = None  # the guilty term, in a sentence
-    accept: float | None = None  # the user's own tolerance, shown beside the verdict
-    wall_time: float = 0.0  # s, of the work behind this row
+    user_rtol: float | None = None  # the user's own tolerance, shown beside the verdict
+    cpu_time: float = 0.0  # s, of the work behind this row
     extra: dict[str, float] = field(default_factory=dict)
 
     @property

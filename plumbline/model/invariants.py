@@ -11,7 +11,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 
 from plumbline.model.datatypes import Array, Model, Trajectory
-from plumbline.model.kinematics import angular_velocity, joint_vectors, rotation
+from plumbline.model.kinematics import angular_velocity, joint_vectors, rotation_matrix
 
 
 def position_error(a: Array, b: Array) -> Array:
@@ -41,7 +41,7 @@ def potential_energy(model: Model, r: Array) -> Array:
 
 def angular_momentum(model: Model, r: Array, p: Array, v: Array, omega: Array) -> Array:
     """(…, 3) kg m²/s about the pivot, world frame: Σ m r × ṙ + A J ω′."""
-    spin = np.einsum("...kij,kjl,...kl->...i", rotation(p), model.inertia, omega)
+    spin = np.einsum("...kij,kjl,...kl->...i", rotation_matrix(p), model.inertia, omega)
     return np.asarray(np.einsum("k,...ki->...i", model.mass, np.cross(r, v)) + spin)
 
 
@@ -59,7 +59,7 @@ class Invariants:
     work_uncertainty: float  # J: of W by quadrature over the samples
 
 
-UNITS = {
+INVARIANT_UNITS = {
     "energy_drift": "J",
     "momentum_drift": "kg m²/s",
     "joint_gap": "m",
@@ -68,7 +68,7 @@ UNITS = {
 }
 
 
-def work(model: Model, run: Trajectory, omega: Array) -> tuple[Array, float]:
+def work_of_loads(model: Model, run: Trajectory, omega: Array) -> tuple[Array, float]:
     """Work (T,) of loads and drag since t = 0 in J, and its quadrature uncertainty.
 
     Constant world forces do F·Δr exactly.  Moments and drag are integrated over the samples by
@@ -90,18 +90,18 @@ def work(model: Model, run: Trajectory, omega: Array) -> tuple[Array, float]:
     return exact + quintic, float(away)
 
 
-def invariants(model: Model, run: Trajectory) -> Invariants:
+def compute_invariants(model: Model, run: Trajectory) -> Invariants:
     """The invariants of one run, from what the engine holds: p is not normalised before |p| is read."""
     omega = angular_velocity(run.p, run.pdot)
     energy = kinetic_energy(model, run.v, omega) + potential_energy(model, run.r)
-    done, uncertainty = work(model, run, omega)
+    done, uncertainty = work_of_loads(model, run, omega)
     gravity = np.linalg.norm(model.gravity)
     momentum = None
     if gravity > 0 and not (model.has_loads or model.has_drag):
         about = angular_momentum(model, run.r, run.p, run.v, omega) @ (model.gravity / gravity)
         momentum = (about - about[0])[:, None, None]
     d = joint_vectors(model, run.r, run.p)
-    ddot = joint_rates(model, run, omega)
+    ddot = joint_vector_rates(model, run, omega)
     distance = np.linalg.norm(d, axis=-1)
     stretch = np.zeros_like(d)
     stretch[..., 0] = distance - model.length
@@ -118,15 +118,15 @@ def invariants(model: Model, run: Trajectory) -> Invariants:
     )
 
 
-def joint_rates(model: Model, run: Trajectory, omega: Array) -> Array:
+def joint_vector_rates(model: Model, run: Trajectory, omega: Array) -> Array:
     """ḋ (T, N, 3) m/s, world frame, of the joint vectors of `kinematics.joint_vectors`."""
-    a = rotation(run.p)
+    a = rotation_matrix(run.p)
     near = run.v + np.einsum("tkij,tkj->tki", a, np.cross(omega, model.proximal))
     far = run.v + np.einsum("tkij,tkj->tki", a, np.cross(omega, model.distal))
     return np.asarray(near - np.concatenate([np.zeros_like(far[:, :1]), far[:, :-1]], axis=1))
 
 
-def scales(model: Model, run: Trajectory, length: float) -> dict[str, float]:
+def invariant_scales(model: Model, run: Trajectory, length: float) -> dict[str, float]:
     """Sizes of what the invariants of a run are made of: energies, momenta, lengths, speeds; as `UNITS`.
 
     ``length`` (m) is that of the stretched chain.  A pendulum at rest rounds too: speeds are at least

@@ -11,7 +11,7 @@ import numpy as np
 from plumbline.model.datatypes import Array, Model, State
 
 
-def rotation(p: Array) -> Array:
+def rotation_matrix(p: Array) -> Array:
     """Rotation matrix (..., 3, 3), body → world, of quaternions p (..., 4), scalar first.
 
     The homogeneous-quadratic form divided by pᵀp: a rotation for every p ≠ 0.
@@ -27,37 +27,37 @@ def rotation(p: Array) -> Array:
     return np.asarray(np.stack([np.stack(row, -1) for row in rows], -2) / s[..., None, None])
 
 
-def multiply(a: Array, b: Array) -> Array:
+def quaternion_product(a: Array, b: Array) -> Array:
     """Quaternion product a b, (..., 4) each, scalar first: rotation(a b) = rotation(a) rotation(b)."""
     aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
     scalar = aw * bw - np.sum(av * bv, -1, keepdims=True)
     return np.concatenate([scalar, aw * bv + bw * av + np.cross(av, bv)], -1)
 
 
-def conjugate(p: Array) -> Array:
+def quaternion_conjugate(p: Array) -> Array:
     """Conjugate quaternion (..., 4): the inverse rotation of a unit one."""
     return np.asarray(p * np.array([1.0, -1.0, -1.0, -1.0]))
 
 
-def rate(p: Array, omega: Array) -> Array:
+def quaternion_rate(p: Array, omega: Array) -> Array:
     """ṗ = ½ L(p)ᵀ ω′ (..., 4) of unit quaternions p and body-frame ω′ (..., 3)."""
-    return 0.5 * multiply(p, np.concatenate([np.zeros_like(omega[..., :1]), omega], -1))
+    return 0.5 * quaternion_product(p, np.concatenate([np.zeros_like(omega[..., :1]), omega], -1))
 
 
 def angular_velocity(p: Array, pdot: Array) -> Array:
     """ω′ = 2 L(p) ṗ (..., 3), body frame, as the notes define it (also off pᵀp = 1)."""
-    return 2.0 * multiply(conjugate(p), pdot)[..., 1:]
+    return 2.0 * quaternion_product(quaternion_conjugate(p), pdot)[..., 1:]
 
 
-def lift(model: Model, p: Array, omega: Array, u: Array, udot: Array) -> State:
+def state_from_minimal(model: Model, p: Array, omega: Array, u: Array, udot: Array) -> State:
     """The exact state that follows from minimal coordinates: r and v from the pivot outwards."""
-    r, v = hung(model, p, omega, u, udot)
+    r, v = forward_kinematics(model, p, omega, u, udot)
     return State(p=p, omega=omega, u=u, udot=udot, r=r, v=v)
 
 
-def hung(model: Model, p: Array, omega: Array, u: Array, udot: Array) -> tuple[Array, Array]:
+def forward_kinematics(model: Model, p: Array, omega: Array, u: Array, udot: Array) -> tuple[Array, Array]:
     """The places and velocities r, v (..., N, 3) of one or of many states at once, as `lift` has them."""
-    a = rotation(p)  # (..., N, 3, 3)
+    a = rotation_matrix(p)  # (..., N, 3, 3)
     r, v = np.empty(omega.shape), np.empty(omega.shape)
     near, far = np.cross(omega, model.proximal), np.cross(omega, model.distal)
     tip = tip_v = np.zeros(3)
@@ -77,14 +77,14 @@ def joint_vectors(model: Model, r: Array, p: Array) -> Array:
 
     Zero for an exact ball joint, of length ℓ_k for an exact rod.  p is normalised first.
     """
-    a = rotation(p)
+    a = rotation_matrix(p)
     near = r + np.einsum("...kij,kj->...ki", a, model.proximal)
     far = r + np.einsum("...kij,kj->...ki", a, model.distal)
     hang = np.concatenate([np.zeros_like(far[..., :1, :]), far[..., :-1, :]], -2)
     return np.asarray(near - hang)
 
 
-def velocity_map(model: Model, state: State) -> Array:
+def velocity_jacobian(model: Model, state: State) -> Array:
     """Map W (6N, nu) of the minimal rates to the bodies': (v_0, ω′_0, v_1, ω′_1, …) = W ν.
 
     ν = (udot of the rods in order, then omega of all bodies), as `StateQuantities.mass_matrix`
@@ -93,7 +93,7 @@ def velocity_map(model: Model, state: State) -> Array:
     energy of the bodies is ½ νᵀ Wᵀ diag(m_k I, J_k) W ν: `mass_matrix`.
     """
     n, rods = model.n, np.flatnonzero(model.rods)
-    a = rotation(state.p)
+    a = rotation_matrix(state.p)
 
     def lever(s: Array) -> Array:
         """−A s̃ (N, 3, 3): the velocity of point s of each body per ω′ of the body."""
@@ -117,7 +117,7 @@ def velocity_map(model: Model, state: State) -> Array:
 
 def mass_matrix(model: Model, state: State) -> Array:
     """M (nu, nu) of `StateQuantities.mass_matrix` from the map W: Wᵀ diag(m_k I, J_k) W."""
-    w = velocity_map(model, state).reshape(model.n, 6, -1)
+    w = velocity_jacobian(model, state).reshape(model.n, 6, -1)
     linear, angular = w[:, :3], w[:, 3:]
     out = np.einsum("k,kia,kib->ab", model.mass, linear, linear)
     return np.asarray(out + np.einsum("kia,kij,kjb->ab", angular, model.inertia, angular, optimize=True))

@@ -7,10 +7,10 @@ import hashlib
 import numpy as np
 
 from plumbline.model.datatypes import Model, State
-from plumbline.model.kinematics import hung
+from plumbline.model.kinematics import forward_kinematics
 
 
-def seed_of(*parts: str) -> int:
+def derive_seed(*parts: str) -> int:
     """A seed that depends on the words given and on nothing else (not on hash randomisation)."""
     return int.from_bytes(hashlib.sha256("\0".join(parts).encode()).digest()[:8], "big")
 
@@ -35,5 +35,5 @@ def random_states(model: Model, count: int, seed: int) -> list[State]:
     p /= np.linalg.norm(p, axis=-1, keepdims=True)
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
     u, udot = (np.where(model.rods[:, None], x, 0.0) for x in (u, np.cross(udot, u)))
-    r, v = hung(model, p, omega, u, udot)
+    r, v = forward_kinematics(model, p, omega, u, udot)
     return [State(*parts) for parts in zip(p, omega, u, udot, r, v, strict=True)]

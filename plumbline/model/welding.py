@@ -17,12 +17,12 @@ import numpy as np
 
 from plumbline.model.datatypes import Array, Model
 
-SHARES = 0.25, 0.75  # of the inertia that is left
-W = np.ones(3) / np.sqrt(3.0)  # in principal axes
+INERTIA_SHARES = 0.25, 0.75  # of the inertia that is left
+SPLIT_DIRECTION = np.ones(3) / np.sqrt(3.0)  # in principal axes
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class RigidPart:
     """One rigid piece of a body."""
 
     mass: float  # kg
@@ -30,29 +30,31 @@ class Part:
     inertia: Array  # (3, 3) kg m², about the piece's own centre, body axes
 
 
-Parts = list[tuple[Part, ...]]  # of every body
+BodyParts = list[tuple[RigidPart, ...]]  # of every body
 
 
-def whole(model: Model) -> Parts:
+def undivided_bodies(model: Model) -> BodyParts:
     """Every body in one piece."""
     each = zip(model.mass, model.inertia, strict=True)
-    return [(Part(float(mass), np.zeros(3), inertia),) for mass, inertia in each]
+    return [(RigidPart(float(mass), np.zeros(3), inertia),) for mass, inertia in each]
 
 
-def halves(model: Model) -> Parts:
+def split_bodies(model: Model) -> BodyParts:
     """Every body in two pieces."""
-    return [halved(float(mass), inertia) for mass, inertia in zip(model.mass, model.inertia, strict=True)]
+    return [split_body(float(mass), inertia) for mass, inertia in zip(model.mass, model.inertia, strict=True)]
 
 
-def halved(mass: float, inertia: Array) -> tuple[Part, Part]:
+def split_body(mass: float, inertia: Array) -> tuple[RigidPart, RigidPart]:
     """The two halves of one body."""
     principal, axes = np.linalg.eigh(inertia)
     moments = np.maximum(np.sum(principal) / 2 - principal, 0.0)  # of a flat body one is a rounding of zero
-    centre = axes @ (np.sqrt(moments / (2 * mass)) * W)
+    centre = axes @ (np.sqrt(moments / (2 * mass)) * SPLIT_DIRECTION)
     left = inertia - mass * (centre @ centre * np.eye(3) - np.outer(centre, centre))
-    return Part(mass / 2, centre, SHARES[0] * left), Part(mass / 2, -centre, SHARES[1] * left)
+    return RigidPart(mass / 2, centre, INERTIA_SHARES[0] * left), RigidPart(
+        mass / 2, -centre, INERTIA_SHARES[1] * left
+    )
 
 
-def arms(parts: Parts) -> Array:
+def part_offsets(parts: BodyParts) -> Array:
     """(N,) m: how far a piece's centre is from its body's, at most."""
     return np.array([max(float(np.linalg.norm(part.centre)) for part in pieces) for pieces in parts])

@@ -18,21 +18,21 @@ try:
 except ImportError:  # Windows: nothing is swept there
     fcntl = None  # type: ignore[assignment]
 
-LOCK = "owner.lock"
+LOCK_FILE = "owner.lock"
 
 
-class Scratch:
+class ScratchFolder:
     """A new folder ``path`` in ``parent`` (default: the temporary folder); those of dead owners go first."""
 
     def __init__(self, prefix: str = "plumbline-", parent: Path | None = None) -> None:
-        sweep(prefix, parent)
+        remove_orphaned_folders(prefix, parent)
         self.path = Path(tempfile.mkdtemp(prefix=prefix, dir=parent))
         self._lock: IO[bytes] | None = None
         if fcntl is not None:
-            made = self.path / f"{LOCK}.new"  # it gets its name when it is locked, not before
+            made = self.path / f"{LOCK_FILE}.new"  # it gets its name when it is locked, not before
             self._lock = made.open("wb")
             fcntl.flock(self._lock, fcntl.LOCK_EX)
-            os.rename(made, self.path / LOCK)
+            os.rename(made, self.path / LOCK_FILE)
 
     def __enter__(self) -> Path:
         """The folder."""
@@ -49,10 +49,12 @@ class Scratch:
             self._lock.close()
 
 
-def sweep(prefix: str, parent: Path | None = None) -> list[Path]:
+def remove_orphaned_folders(prefix: str, parent: Path | None = None) -> list[Path]:
     """Remove the folders whose owner is no more, and return them."""
     removed = []
-    for lock in Path(parent or tempfile.gettempdir()).glob(f"{prefix}*/{LOCK}") if fcntl is not None else ():
+    for lock in (
+        Path(parent or tempfile.gettempdir()).glob(f"{prefix}*/{LOCK_FILE}") if fcntl is not None else ()
+    ):
         with contextlib.suppress(OSError), lock.open("r+b") as file:  # another user's, or just removed
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # OSError: its owner lives
             shutil.rmtree(lock.parent, ignore_errors=True)

@@ -8,16 +8,16 @@ from typing import Any
 
 
 @dataclass(frozen=True)
-class Packed:
+class Pickled:
     """A pickled value.  Pickles are code to whoever opens them."""
 
     data: bytes
 
     @classmethod
-    def of(cls, value: Any) -> Packed:
+    def of(cls, value: Any) -> Pickled:
         """The value, packed."""
         return cls(pickle.dumps(value, protocol=5))
 
-    def open(self) -> Any:
+    def load(self) -> Any:
         """The value, made anew."""
         return pickle.loads(self.data)

@@ -23,31 +23,31 @@ from pathlib import Path
 from typing import IO, Any
 
 ROOT = Path(__file__).resolve().parents[2]
-LENGTH = struct.Struct("<Q")
+FRAME_LENGTH = struct.Struct("<Q")
 
 
-class Crashed(Exception):
+class RemoteCrash(Exception):
     """The child ended before it answered; the message says how."""
 
 
-class Elsewhere(Exception):
+class RemoteError(Exception):
     """What was raised in the child: class and words, its own class may not exist here."""
 
 
-def send(stream: IO[bytes], value: Any) -> None:
+def send_frame(stream: IO[bytes], value: Any) -> None:
     """One frame."""
     body = pickle.dumps(value, protocol=5)
-    stream.write(LENGTH.pack(len(body)))
+    stream.write(FRAME_LENGTH.pack(len(body)))
     stream.write(body)
     stream.flush()
 
 
-def receive(stream: IO[bytes]) -> Any:
+def receive_frame(stream: IO[bytes]) -> Any:
     """One frame; EOFError where the other side has gone."""
-    head = stream.read(LENGTH.size)
-    if len(head) < LENGTH.size:
+    head = stream.read(FRAME_LENGTH.size)
+    if len(head) < FRAME_LENGTH.size:
         raise EOFError
-    (size,) = LENGTH.unpack(head)
+    (size,) = FRAME_LENGTH.unpack(head)
     body = stream.read(size)
     if len(body) < size:
         raise EOFError
@@ -55,7 +55,7 @@ def receive(stream: IO[bytes]) -> Any:
 
 
 @cache
-def child(python: str) -> subprocess.Popen[bytes]:
+def child_process(python: str) -> subprocess.Popen[bytes]:
     """The child of this process for an environment's interpreter, started at first use."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
     process = subprocess.Popen(
@@ -67,30 +67,30 @@ def child(python: str) -> subprocess.Popen[bytes]:
     return process
 
 
-def call(python: str, function: Callable[..., Any], *arguments: Any) -> Any:
+def call_remote(python: str, function: Callable[..., Any], *arguments: Any) -> Any:
     """``function(*arguments)`` in the child; raises Elsewhere or Crashed."""
-    process = child(python)
+    process = child_process(python)
     assert process.stdin is not None and process.stdout is not None
     try:
-        send(process.stdin, (function.__module__, function.__qualname__, arguments))
-        raised, value = receive(process.stdout)
+        send_frame(process.stdin, (function.__module__, function.__qualname__, arguments))
+        raised, value = receive_frame(process.stdout)
     except (EOFError, BrokenPipeError):
-        child.cache_clear()
-        raise Crashed(exit_words(process.wait())) from None
+        child_process.cache_clear()
+        raise RemoteCrash(describe_exit(process.wait())) from None
     if raised:
         if value[0] == "MemoryError":
             raise MemoryError
-        raise Elsewhere(": ".join(value))
+        raise RemoteError(": ".join(value))
     return value
 
 
-def timed(function: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
+def call_timed(function: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
     """``function(*arguments)``, and the CPU time in s that this process spent on it."""
     begin = time.process_time()
     return function(*arguments), time.process_time() - begin
 
 
-def exit_words(code: int) -> str:
+def describe_exit(code: int) -> str:
     """An exit code in words: the signal's name where one ended the process."""
     if code < 0:
         try:
@@ -100,7 +100,7 @@ def exit_words(code: int) -> str:
     return f"exited with code {code}"
 
 
-def serve(parent: int) -> None:
+def serve_calls(parent: int) -> None:
     """The child's loop.  Engines print: the pipe moves away from descriptor 1 before any is loaded."""
     from plumbline.processes.parent_death import die_with_parent
 
@@ -112,15 +112,15 @@ def serve(parent: int) -> None:
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     while True:
         try:
-            module, name, arguments = receive(questions)
+            module, name, arguments = receive_frame(questions)
         except EOFError:
             return
         try:
             answer = False, getattr(import_module(module), name)(*arguments)
         except Exception as error:
             answer = True, (type(error).__name__, str(error))
-        send(answers, answer)
+        send_frame(answers, answer)
 
 
 if __name__ == "__main__":
-    serve(int(sys.argv[1]))
+    serve_calls(int(sys.argv[1]))

@@ -21,17 +21,17 @@ from typing import Any
 
 from pebble import ProcessExpired, ProcessPool
 
-from plumbline.processes.isolation import Scratch
-from plumbline.processes.packed import Packed
+from plumbline.processes.isolation import ScratchFolder
+from plumbline.processes.packed import Pickled
 from plumbline.processes.parent_death import die_with_parent
-from plumbline.processes.remote_python import Crashed, Elsewhere, call, exit_words, timed
+from plumbline.processes.remote_python import RemoteCrash, RemoteError, call_remote, call_timed, describe_exit
 
-ONE_THREAD = dict.fromkeys(
+SINGLE_THREAD_ENV = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
 
 
-TICK = 0.2  # s between looks at what runs too long
+POLL_INTERVAL = 0.2  # s between looks at what runs too long
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Task:
     """A call to make in a worker: a picklable function and its arguments, packed ones opened there."""
 
     key: Any
-    call: Callable[..., Any]
+    function: Callable[..., Any]
     arguments: tuple[Any, ...] = ()
     limits: Limits = field(default_factory=Limits)
     version: str = ""  # of the engine that answers; a part of the answer's content key
@@ -62,28 +62,28 @@ class Outcome:
     """What became of a task: its value, or the sentence that says how it was lost."""
 
     key: Any
-    answer: Any = None  # the value, or that value packed as its worker sent it
-    lost: str | None = None
-    cost: float = 0.0  # CPU s of the call
-    judged: Any = None  # what the task's judge said; of an answer from before: None
-    judging: float = 0.0  # CPU s of the judge
+    raw_value: Any = None  # the value, or that value packed as its worker sent it
+    failure: str | None = None
+    cpu_time: float = 0.0  # CPU s of the call
+    judge_result: Any = None  # what the task's judge said; of an answer from before: None
+    judge_cpu_time: float = 0.0  # CPU s of the judge
 
     @property
     def value(self) -> Any:
         """The answer, opened at every look."""
-        return self.answer.open() if isinstance(self.answer, Packed) else self.answer
+        return self.raw_value.load() if isinstance(self.raw_value, Pickled) else self.raw_value
 
     @property
-    def packed(self) -> Packed:
+    def pickled(self) -> Pickled:
         """The answer as it goes to others."""
-        return self.answer if isinstance(self.answer, Packed) else Packed.of(self.answer)
+        return self.raw_value if isinstance(self.raw_value, Pickled) else Pickled.of(self.raw_value)
 
 
-class NoCrew(Exception):
+class ExecutorUnavailable(Exception):
     """Those who should do the work cannot be had; the message says why."""
 
 
-class Memory:
+class ResultCache:
     """What is known of tasks from before; this one knows nothing."""
 
     def get(self, task: Task) -> Outcome | None:
@@ -94,22 +94,24 @@ class Memory:
         """Take note of a task's outcome."""
 
 
-class Workers:
+class WorkerPool:
     """A pool of ``jobs`` workers; `run` yields outcomes as they come, a lost worker costs one of them."""
 
     def __init__(self, jobs: int, limits: Limits | None = None) -> None:
         self.jobs = jobs
         self.limits = limits or Limits()
-        self._scratch = Scratch()
-        os.environ.update(ONE_THREAD)  # inherited by the spawned interpreters, before NumPy loads there
+        self._scratch = ScratchFolder()
+        os.environ.update(
+            SINGLE_THREAD_ENV
+        )  # inherited by the spawned interpreters, before NumPy loads there
         self._pool = ProcessPool(
             max_workers=jobs,
             context=multiprocessing.get_context("spawn"),
-            initializer=prepare,
+            initializer=initialize_worker,
             initargs=(str(self._scratch.path), self.limits.gigabytes, os.getpid()),
         )
 
-    def __enter__(self) -> Workers:
+    def __enter__(self) -> WorkerPool:
         """The pool itself."""
         return self
 
@@ -121,13 +123,13 @@ class Workers:
         self._pool.join()
         self._scratch.remove()
 
-    def run(self, tasks: Iterable[Task | None], memory: Memory | None = None) -> Iterator[Outcome]:
+    def run(self, tasks: Iterable[Task | None], result_cache: ResultCache | None = None) -> Iterator[Outcome]:
         """Outcomes in the order of completion; only a few tasks are handed over at a time.
 
         ``tasks`` may yield None: no task until another outcome has come.  What ``memory`` has is not run
         again; it is told of every other outcome before the caller.
         """
-        memory = memory or Memory()
+        result_cache = result_cache or ResultCache()
         waiting: dict[Future[Any], Task] = {}
         began: dict[Future[Any], float] = {}
         source = iter(tasks)
@@ -141,46 +143,46 @@ class Workers:
                     break
                 if task is None:
                     break
-                before = memory.get(task)
+                before = result_cache.get(task)
                 if before is not None:
                     yield before
                     continue
-                future: Future[Any] = self._pool.schedule(perform, args=(task,))
+                future: Future[Any] = self._pool.schedule(run_task, args=(task,))
                 waiting[future] = task
             if not waiting:
                 return
-            done, _ = wait(waiting, timeout=TICK, return_when=FIRST_COMPLETED)
-            stop_late(waiting, began)
+            done, _ = wait(waiting, timeout=POLL_INTERVAL, return_when=FIRST_COMPLETED)
+            cancel_overdue(waiting, began)
             for future in done:
                 task = waiting.pop(future)
                 began.pop(future, None)
-                found = outcome(task, future)
-                memory.put(task, found)
+                found = outcome_from_future(task, future)
+                result_cache.put(task, found)
                 yield found
 
 
-def perform(task: Task) -> Outcome:
+def run_task(task: Task) -> Outcome:
     """Make a task's call, here or in the environment that it names."""
     try:
-        return performed(task)
+        return _call_and_judge(task)
     except MemoryError:
         pass  # what it filled hangs on the error's traceback, which the pool would keep during the next task
     gc.collect()
     raise MemoryError
 
 
-def performed(task: Task) -> Outcome:
+def _call_and_judge(task: Task) -> Outcome:
     """The same; a MemoryError holds what filled the memory."""
-    arguments = [one.open() if isinstance(one, Packed) else one for one in task.arguments]
+    arguments = [one.load() if isinstance(one, Pickled) else one for one in task.arguments]
     if task.python:
-        value, cost = call(task.python, timed, task.call, *arguments)
+        value, cost = call_remote(task.python, call_timed, task.function, *arguments)
     else:
-        value, cost = timed(task.call, *arguments)
-    judged, judging = timed(task.judge, value) if task.judge else (None, 0.0)
-    return Outcome(task.key, Packed.of(value), None, cost, judged, judging)
+        value, cost = call_timed(task.function, *arguments)
+    judged, judging = call_timed(task.judge, value) if task.judge else (None, 0.0)
+    return Outcome(task.key, Pickled.of(value), None, cost, judged, judging)
 
 
-def stop_late(waiting: dict[Future[Any], Task], began: dict[Future[Any], float]) -> None:
+def cancel_overdue(waiting: dict[Future[Any], Task], began: dict[Future[Any], float]) -> None:
     """Cancel what runs longer than its limit, which kills its worker.
 
     The pool would do it by the clock of the wall: set forward it kills what is in time, set back it waits.
@@ -191,27 +193,27 @@ def stop_late(waiting: dict[Future[Any], Task], began: dict[Future[Any], float])
             future.cancel()
 
 
-def outcome(task: Task, future: Future[Outcome]) -> Outcome:
+def outcome_from_future(task: Task, future: Future[Outcome]) -> Outcome:
     """The outcome of a finished future, or how its worker was lost."""
     try:
         return future.result()
     except CancelledError:  # by `stop_late`, and by nobody else
-        return Outcome(task.key, lost=f"hung: no answer within {task.limits.seconds:g} s, worker killed")
+        return Outcome(task.key, failure=f"hung: no answer within {task.limits.seconds:g} s, worker killed")
     except ProcessExpired as expired:
-        return Outcome(task.key, lost=f"crashed: the worker {exit_words(expired.exitcode)}")
-    except Crashed as crashed:
-        return Outcome(task.key, lost=f"crashed: the worker {crashed}")
-    except Elsewhere as error:
-        return Outcome(task.key, lost=str(error))
+        return Outcome(task.key, failure=f"crashed: the worker {describe_exit(expired.exitcode)}")
+    except RemoteCrash as crashed:
+        return Outcome(task.key, failure=f"crashed: the worker {crashed}")
+    except RemoteError as error:
+        return Outcome(task.key, failure=str(error))
     except MemoryError:
-        return Outcome(task.key, lost=f"out of memory: over {task.limits.gigabytes:g} GB of address space")
+        return Outcome(task.key, failure=f"out of memory: over {task.limits.gigabytes:g} GB of address space")
     except Exception as error:  # ImportError among them: the caller tells "not installed" by its name
-        return Outcome(task.key, lost=f"{type(error).__name__}: {error}")
+        return Outcome(task.key, failure=f"{type(error).__name__}: {error}")
 
 
-def prepare(scratch: str, gigabytes: float, parent: int) -> None:
+def initialize_worker(scratch: str, gigabytes: float, parent: int) -> None:
     """Initialise a worker process: called by the pool, in the worker, before any task."""
-    os.environ.update(ONE_THREAD)
+    os.environ.update(SINGLE_THREAD_ENV)
     os.chdir(tempfile.mkdtemp(dir=scratch))
     sink = os.open(os.devnull, os.O_WRONLY)
     os.dup2(sink, 1)

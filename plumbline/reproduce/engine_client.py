@@ -10,10 +10,10 @@ from io import StringIO
 from typing import Any
 
 from plumbline.engines import calls
-from plumbline.engines.registry import adapter
-from plumbline.judging.metamorphic import BY, WELDED
+from plumbline.engines.registry import load_adapter
+from plumbline.judging.metamorphic import OPTION_PREFIX, WELDED_HALVES
 from plumbline.model.datatypes import Integrator, Model, State, StateQuantities
-from plumbline.processes.remote_python import call
+from plumbline.processes.remote_python import call_remote
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Engine:
     def ask(self, function: Callable[..., Any], *arguments: Any) -> Any:
         """``function(name, *arguments)``, here or there."""
         if self.python:
-            return call(self.python, function, self.name, *arguments)
+            return call_remote(self.python, function, self.name, *arguments)
         return function(self.name, *arguments)
 
     def evaluate(self, model: Model, state: State, way: str = "") -> StateQuantities:
@@ -36,7 +36,7 @@ class Engine:
 
     def integrator(self, name: str) -> Integrator:
         """One of its integrators, as it declares it."""
-        every = self.ask(calls.describe).integrators
+        every = self.ask(calls.describe_engine).integrators
         found: Integrator = next(i for i in every if i.name == name)
         return found
 
@@ -68,8 +68,12 @@ def printed(_: str, script: str) -> str:
 
 def answer(engine: str, way: str, model: Model, state: State) -> StateQuantities:
     """What an engine says of a state: as usual, by one of its options, or of welded halves."""
-    chosen = adapter(engine)
+    chosen = load_adapter(engine)
     if way:
-        chosen = chosen.welding() if way == WELDED else chosen.by(way.removeprefix(BY))
+        chosen = (
+            chosen.with_welded_halves()
+            if way == WELDED_HALVES
+            else chosen.with_option(way.removeprefix(OPTION_PREFIX))
+        )
     (said,) = chosen.evaluate(model, [state])
     return said

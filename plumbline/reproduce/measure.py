@@ -14,22 +14,29 @@ from typing import Any, cast
 import numpy as np
 
 from plumbline.engines import calls
-from plumbline.engines.calls import Rung
-from plumbline.engines.registry import adapter
+from plumbline.engines.calls import RefinementRun
+from plumbline.engines.registry import load_adapter
 from plumbline.judging.convergence import ORDER_MARGIN
-from plumbline.judging.metamorphic import AS, RELATIONS, WELDED, Relation, same, values
-from plumbline.judging.rows import Subject
-from plumbline.judging.trajectory import Ladder
+from plumbline.judging.metamorphic import (
+    OTHER_FORMULATION_PREFIX,
+    STATE_RELATIONS,
+    WELDED_HALVES,
+    Relation,
+    quantity_values,
+    unchanged,
+)
+from plumbline.judging.rows import RowContext
+from plumbline.judging.trajectory import RefinementAnalysis
 from plumbline.model.datatypes import Array, Integrator, Row, StateQuantities
-from plumbline.model.welding import halves
+from plumbline.model.welding import split_bodies
 from plumbline.reproduce.engine_client import Engine, OfRuns
 from plumbline.reproduce.measure_long_run import GROWTH, LONG, OverLong, ShownLong
 from plumbline.reproduce.measure_round_trip import ShownTwice, Twice
 from plumbline.reproduce.shrink import Case, smallest
 from plumbline.truth import TruthUnavailable
-from plumbline.truth.certified import certify
+from plumbline.truth.certified import certify_state
 from plumbline.truth.ground_truth import MotionTruth, motion_truth
-from plumbline.truth.rounding_bound import state_bound
+from plumbline.truth.rounding_bound import state_rounding_bound
 
 LIMITS = ("position_limit", "position", "attitude_limit", "attitude")
 FINE = 64  # samples of a run whose loads' work is integrated
@@ -150,13 +157,13 @@ class AtState:
         """None for what the engine, the truth or the bound refuses: it shows nothing."""
         try:
             said = self.engine.evaluate(case.model, case.state)
-            allowed, certified = state_bound(case.model, case.state), True
+            allowed, certified = state_rounding_bound(case.model, case.state), True
             try:
-                truth = certify(
+                truth = certify_state(
                     case.model, case.state, mass_matrix="mass_matrix" in self.quantities
                 ).quantities
             except TruthUnavailable:
-                (truth,), certified = adapter("reference").evaluate(case.model, [case.state]), False
+                (truth,), certified = load_adapter("reference").evaluate(case.model, [case.state]), False
         except Exception:
             return None
         offered = [q for q in self.quantities if getattr(said, q) is not None]
@@ -179,24 +186,26 @@ class Related:
     def __call__(self, case: Case) -> ShownRelation | None:
         """None for what cannot be compared."""
         model, state, engine = case.model, case.state, self.engine
-        relation = next((r for r in RELATIONS if r.name == self.name), None)
-        way = "" if relation or self.name.startswith(AS) else self.name
-        relation = relation or Relation(self.name, same, values)
-        if self.name.startswith(AS):
-            engine = replace(engine, name=self.name.removeprefix(AS))
+        relation = next((r for r in STATE_RELATIONS if r.name == self.name), None)
+        way = "" if relation or self.name.startswith(OTHER_FORMULATION_PREFIX) else self.name
+        relation = relation or Relation(self.name, unchanged, quantity_values)
+        if self.name.startswith(OTHER_FORMULATION_PREFIX):
+            engine = replace(engine, name=self.name.removeprefix(OTHER_FORMULATION_PREFIX))
         if model.has_drag and self.name == "time reversed":
             return None
         try:
-            other = Case(*relation.there(model, state))
+            other = Case(*relation.transform(model, state))
             here, said = (
                 self.engine.evaluate(model, state),
                 engine.evaluate(other.model, other.state, way),
             )
-            bounds = [state_bound(model, state)]
-            bounds.append(state_bound(model, state, halves(model)) if way == WELDED else bounds[0])
+            bounds = [state_rounding_bound(model, state)]
+            bounds.append(
+                state_rounding_bound(model, state, split_bodies(model)) if way == WELDED_HALVES else bounds[0]
+            )
         except Exception:
             return None
-        mine, theirs = values(here), relation.back(said)
+        mine, theirs = quantity_values(here), relation.transform_back(said)
         if not self.back:
             self.back.update(ways(relation, said))
         both = [q for q in mine if q in theirs]
@@ -213,11 +222,11 @@ def ways(relation: Relation, said: StateQuantities) -> dict[str, Array]:
     NotImplementedError where it is neither: a script could not say it in numbers.
     """
     found: dict[str, Array] = {}
-    for q, value in relation.back(said).items():
+    for q, value in relation.transform_back(said).items():
         given = np.asarray(getattr(said, q), float)
 
         def back(y: Any, q: str = q) -> Array:
-            return np.asarray(relation.back(replace(said, **{q: y}))[q], float)
+            return np.asarray(relation.transform_back(replace(said, **{q: y}))[q], float)
 
         if given.ndim == 0:
             way = back(1.0)
@@ -241,7 +250,9 @@ class AlongRuns(OfRuns):
 
     level: str
     wanted: tuple[str, ...]
-    known: dict[tuple[object, ...], tuple[MotionTruth, dict[float, Rung]]] = field(default_factory=dict)
+    known: dict[tuple[object, ...], tuple[MotionTruth, dict[float, RefinementRun]]] = field(
+        default_factory=dict
+    )
 
     def times(self, case: Case) -> Array | None:
         """Start and end; more where the work of moments or drag is to be integrated, if steps allow it."""
@@ -255,7 +266,7 @@ class AlongRuns(OfRuns):
                 return None
         return np.linspace(0.0, case.until, count + 1)
 
-    def runs(self, case: Case, times: Array) -> tuple[MotionTruth, list[Rung]]:
+    def runs(self, case: Case, times: Array) -> tuple[MotionTruth, list[RefinementRun]]:
         """Truth and rungs; those of the case before are not run again where only steps differ."""
         at = (*replace(case, steps=()).content, len(times))
         if at not in self.known:
@@ -264,7 +275,7 @@ class AlongRuns(OfRuns):
         truth, rungs = self.known[at]
         missing = [h for h in case.steps if h not in rungs]
         if missing:
-            climb = self.engine.ask(calls.climb, self.method, case.model, case.state, times, missing)
+            climb = self.engine.ask(calls.run_refinement, self.method, case.model, case.state, times, missing)
             rungs.update({rung.resolution: rung for rung in climb.rungs})
         return truth, [rungs[h] for h in case.steps]
 
@@ -279,9 +290,12 @@ class AlongRuns(OfRuns):
             return None
         if any(rung.trajectory is None for rung in rungs):
             return None
-        who = Subject("", "", self.engine.name, self.engine.name, "")
-        ladder = Ladder(who, case.model, truth, self.integrator, rungs, case.until)
-        rows = {row.quantity: row for row in (ladder.drifts() if self.drifting else ladder.motion())}
+        who = RowContext("", "", self.engine.name, self.engine.name, "")
+        ladder = RefinementAnalysis(who, case.model, truth, self.integrator, rungs, case.until)
+        rows = {
+            row.quantity: row
+            for row in (ladder.invariant_rows() if self.drifting else ladder.trajectory_rows())
+        }
         groups = [set(self.wanted)] if self.drifting else [{"order"}, set(LIMITS)]
         off = [
             max((excess(rows[q]) for q in group if q in rows), default=0.0)
@@ -293,13 +307,13 @@ class AlongRuns(OfRuns):
         if self.drifting:
             there = [q for q in self.wanted if q in rows]
             shown = [q for q in there if rows[q].verdict == "disagrees"] or there
-            series = {q: [getattr(d, q) for d in ladder.drift] for q in shown}
+            series = {q: [getattr(d, q) for d in ladder.invariant_drifts] for q in shown}
             uncertain = {q: rows[q] for q in shown}
         return ShownRun(
             case, min(off, default=0.0), times, self.integrator, "order" in self.wanted and "order" in rows,
             bool(set(LIMITS) & set(self.wanted)), tuple(series) if self.drifting else (),
-            truth.trajectory.r[-1], truth.trajectory.p[-1], (truth.length, ladder.scales()["gap_rate"]),
-            {q: ladder.limit(ys).column for q, ys in series.items()},
+            truth.trajectory.r[-1], truth.trajectory.p[-1], (truth.length, ladder.invariant_scales()["gap_rate"]),
+            {q: ladder.extrapolated_limit(ys).eliminated_powers for q, ys in series.items()},
             {q: float(row.tolerance) for q, row in uncertain.items() if row and row.tolerance},
         )  # fmt: skip
 

@@ -6,10 +6,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from plumbline.judging.long_runs import BLOCKS, Course, Endured, Judge, course, endure, spacing
-from plumbline.judging.rows import Subject
+from plumbline.judging.long_runs import (
+    BLOCK_COUNT,
+    DriftJudge,
+    LongRunPlan,
+    LongRunStudy,
+    plan_long_run,
+    run_long_run_study,
+    sample_spacing,
+)
+from plumbline.judging.rows import RowContext
 from plumbline.model.datatypes import Array, Integrator, Row
-from plumbline.model.invariants import UNITS
+from plumbline.model.invariants import INVARIANT_UNITS
 from plumbline.reproduce.engine_client import OfRuns
 from plumbline.reproduce.shrink import Case
 
@@ -46,38 +54,43 @@ class OverLong(OfRuns):
 
     def whole(self, case: Case) -> Case:
         """A case at the resolutions of the nightly; of growth the finest is judged, alone."""
-        every = course(self.integrator, case.model.n, case.until).resolutions
+        every = plan_long_run(self.integrator, case.model.n, case.until).resolutions
         return replace(case, steps=every[-1:] if self.growth else every)
 
     def __call__(self, case: Case) -> ShownLong | None:
         """None for what the engine refuses, and for a run too short to be judged."""
-        sample = spacing(self.integrator, case.model, self.sample)
+        sample = sample_spacing(self.integrator, case.model, self.sample)
         count = round(case.until / sample)
         if (
             abs(count * sample - case.until) > 1e-9 * case.until
-            or count < BLOCKS
+            or count < BLOCK_COUNT
             or (self.growth and case.until < GROWN)
         ):
             return None
-        plan = Course(case.until, case.steps, case.until)
+        plan = LongRunPlan(case.until, case.steps, case.until)
         try:
-            endured: Endured = self.engine.ask(endure, self.method, case.model, case.state, sample, plan)
+            endured: LongRunStudy = self.engine.ask(
+                run_long_run_study, self.method, case.model, case.state, sample, plan
+            )
         except Exception:
             return None
         if endured.unsupported is not None or endured.runs[-1].failure is not None:
             return None
-        who = Subject("", "", self.engine.name, self.engine.name, "")
-        kept, end = endured.runs[-1].windows, endured.runs[-1].reached
+        who = RowContext("", "", self.engine.name, self.engine.name, "")
+        kept, end = endured.runs[-1].windows, endured.runs[-1].reached_time
         wanted = (q.removesuffix(GROWTH).removesuffix(LONG) for q in self.wanted)
-        judges = {q: Judge(who, self.integrator, endured, q, UNITS[q]) for q in wanted if q in kept}
+        judges = {
+            q: DriftJudge(who, self.integrator, endured, q, INVARIANT_UNITS[q]) for q in wanted if q in kept
+        }
         if not judges:
             return None
         off = {
-            q: excess(judge.growth_row() if self.growth else judge.judged(end)) for q, judge in judges.items()
+            q: excess(judge.growth_row() if self.growth else judge.judge_window(end))
+            for q, judge in judges.items()
         }
         judges = {q: judge for q, judge in judges.items() if off[q]} or judges
         judge = next(iter(judges.values()))
-        runs = endured.runs if self.growth else judge.usable(end)
+        runs = endured.runs if self.growth else judge.usable_runs(end)
         return ShownLong(
             replace(case, steps=tuple(run.resolution for run in runs)),
             max(off.values()),
@@ -85,9 +98,9 @@ class OverLong(OfRuns):
             self.integrator,
             tuple(judges),
             self.growth,
-            judge.due,
-            {q: float(judge.rounding(end, BLOCKS)) for q, judge in judges.items()},
-            {q: float(judge.passed(end)) for q, judge in judges.items()},
+            judge.required_order,
+            {q: float(judge.rounding_floor(end, BLOCK_COUNT)) for q, judge in judges.items()},
+            {q: float(judge.allowed_drift(end)) for q, judge in judges.items()},
         )
 
 

@@ -6,8 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plumbline.engines.registry import adapter
-from plumbline.judging.metamorphic import BY, REVERSED, allowed, apart, row, sizes
+from plumbline.engines.registry import load_adapter
+from plumbline.judging.metamorphic import (
+    OPTION_PREFIX,
+    REVERSED_IN_TIME,
+    characteristic_scales,
+    relative_differences,
+    run_tolerance,
+    state_at_sample,
+)
 from plumbline.model.datatypes import Integrator, Model, State
 from plumbline.reproduce.engine_client import OfRuns
 from plumbline.reproduce.shrink import Case
@@ -29,14 +36,14 @@ def both_ends(
     engine: str, relation: str, integrator: str, model: Model, state: State, end: float, resolution: float
 ) -> tuple[State, State, int]:
     """The two samples that should be the same, and the steps between (to be called in a worker)."""
-    chosen = adapter(engine)
-    if relation == REVERSED:
-        run = chosen.retrace(model, state, end, integrator, resolution)
-        return row(run, 0), row(run, 2, -1.0), run.steps
+    chosen = load_adapter(engine)
+    if relation == REVERSED_IN_TIME:
+        run = chosen.simulate_round_trip(model, state, end, integrator, resolution)
+        return state_at_sample(run, 0), state_at_sample(run, 2, -1.0), run.steps
     times = np.array([0.0, end])
-    ways = chosen, chosen.by(relation.removeprefix(BY))
+    ways = chosen, chosen.with_option(relation.removeprefix(OPTION_PREFIX))
     one, other = (way.simulate(model, state, times, integrator, resolution) for way in ways)
-    return row(one, -1), row(other, -1), one.steps
+    return state_at_sample(one, -1), state_at_sample(other, -1), one.steps
 
 
 @dataclass
@@ -48,19 +55,19 @@ class Twice(OfRuns):
     def __call__(self, case: Case) -> ShownTwice | None:
         """None for what the engine refuses, and for drag, which knows the direction of time."""
         model, state, until, (resolution,) = case.model, case.state, case.until, case.steps
-        if model.has_drag and self.relation == REVERSED:
+        if model.has_drag and self.relation == REVERSED_IN_TIME:
             return None
         try:
             one, other, steps = self.engine.ask(
                 both_ends, self.relation, self.method, model, state, until, resolution
             )
-            limit = allowed(self.integrator, model, state, until, steps)
+            limit = run_tolerance(self.integrator, model, state, until, steps)
         except Exception:
             return None
-        solver = "" if self.relation == REVERSED else self.relation.removeprefix(BY)
+        solver = "" if self.relation == REVERSED_IN_TIME else self.relation.removeprefix(OPTION_PREFIX)
         limit *= 2 if solver else 1  # both runs are off
-        length, spin, speed = sizes(model, one)
+        length, spin, speed = characteristic_scales(model, one)
         scales = {"position": length, "attitude": 1.0, "velocity": speed, "angular velocity": spin}
         most = {name: float(limit * scale) for name, scale in scales.items()}
-        ratio = max(apart(model, one, other).values()) / limit
+        ratio = max(relative_differences(model, one, other).values()) / limit
         return ShownTwice(case, ratio, self.relation, self.integrator, solver, most)

@@ -12,12 +12,18 @@ from typing import Any
 import numpy as np
 from packaging.version import InvalidVersion, Version
 
-from plumbline.engines.environments import split
+from plumbline.engines.environments import split_version
 from plumbline.judging.convergence import ORDER_MARGIN
-from plumbline.judging.long_runs import BLOCKS, SIGMAS, SYMMETRIC_GROWTH
-from plumbline.judging.metamorphic import AS, BY, RELATIONS, REVERSED, WELDED
+from plumbline.judging.long_runs import BLOCK_COUNT, MAX_SYMMETRIC_GROWTH, SIGMA_FACTOR
+from plumbline.judging.metamorphic import (
+    OPTION_PREFIX,
+    OTHER_FORMULATION_PREFIX,
+    REVERSED_IN_TIME,
+    STATE_RELATIONS,
+    WELDED_HALVES,
+)
 from plumbline.model.datatypes import Array
-from plumbline.model.welding import halves, whole
+from plumbline.model.welding import split_bodies, undivided_bodies
 from plumbline.reproduce.measure import Shown, ShownRelation, ShownRun, ShownState
 from plumbline.reproduce.measure_long_run import ShownLong
 from plumbline.reproduce.measure_round_trip import ShownTwice
@@ -79,7 +85,7 @@ STATE_WORDS = {
 
 def script(row: dict[str, Any], shown: Shown) -> str:
     """The stand-alone script; texts of the row stay text, whatever characters they hold."""
-    engine, version = split(row["engine"])[0], str(row["engine_version"])
+    engine, version = split_version(row["engine"])[0], str(row["engine_version"])
     second = shown.second if isinstance(shown, ShownRelation) and shown.second != engine else ""
     flags = flags_of(shown, engine, version)
     lines = [f"# {line}".rstrip() for line in [*head(row, shown), *CONVENTIONS, *needs(engine, shown)]]
@@ -114,13 +120,17 @@ def unscripted(engine: str, row: dict[str, Any]) -> str:
         return ""
     unknown = f"the script of {engine} does not know the relation {relation!r}"
     if row["integrator"] != "-":
-        knows = engine in TURNED if relation == REVERSED else relation.startswith(BY) and engine in SOLVERS
+        knows = (
+            engine in TURNED
+            if relation == REVERSED_IN_TIME
+            else relation.startswith(OPTION_PREFIX) and engine in SOLVERS
+        )
         return "" if knows else f"{unknown} of runs"
-    if relation.startswith(AS) or relation in (r.name for r in RELATIONS):
+    if relation.startswith(OTHER_FORMULATION_PREFIX) or relation in (r.name for r in STATE_RELATIONS):
         return ""
-    if not (relation == WELDED or relation.startswith(BY)):
+    if not (relation == WELDED_HALVES or relation.startswith(OPTION_PREFIX)):
         return f"the relation {relation!r} is not of one state described or asked about in two ways"
-    able = WELDERS if relation == WELDED else SWITCHED
+    able = WELDERS if relation == WELDED_HALVES else SWITCHED
     return "" if engine in able else unknown
 
 
@@ -159,7 +169,7 @@ def flags_of(shown: Shown, engine: str, version: str) -> set[str]:
     else:
         flags.add("state")
         if isinstance(shown, ShownRelation):
-            kinds = {WELDED: "welded", "": "described" if shown.second == engine else "two"}
+            kinds = {WELDED_HALVES: "welded", "": "described" if shown.second == engine else "two"}
             flags.add(kinds.get(shown.way, "switched"))
         if "mass_matrix" in (shown.bound if isinstance(shown, ShownState) else ()):
             flags.add("mass_matrix")
@@ -211,7 +221,7 @@ def head(row: dict[str, Any], shown: Shown) -> list[str]:
     state = int(row["extra"]["state"])
     if isinstance(shown, ShownRelation):
         other = "described otherwise"
-        if shown.way or shown.second != split(row["engine"])[0]:
+        if shown.way or shown.second != split_version(row["engine"])[0]:
             other = "asked otherwise"
         return [
             f"{who} disagrees with itself: the same state, {other} ({shown.name!a}),",
@@ -240,7 +250,7 @@ def settings(engine: str, shown: Shown) -> list[str]:
     if engine.startswith("pinocchio"):
         stepped = isinstance(shown, Moving) and shown.integrator.kind == "step"
         lines.append(f"ALGORITHM = {'aba' if engine == 'pinocchio-aba' or stepped else 'crba'!r}")
-    elif isinstance(shown, ShownRelation) and shown.way.startswith(BY):
+    elif isinstance(shown, ShownRelation) and shown.way.startswith(OPTION_PREFIX):
         lines.append('ALGORITHM = "usual"')
     if isinstance(shown, Moving):
         lines.append(f"INTEGRATOR = {shown.integrator.name!r}")
@@ -272,10 +282,10 @@ def evidence(shown: Shown) -> list[str]:
         return ["", f"# true: {exact}", *table("certified", shown.truth), explained,
                 *table("bound", shown.bound)]  # fmt: skip
     lines = [""]
-    if shown.way == WELDED:
+    if shown.way == WELDED_HALVES:
         lines += pieces(shown.case)
     elif shown.way:
-        lines += [f"OTHER_ALGORITHM = {shown.way.removeprefix(BY)!r}", ""]
+        lines += [f"OTHER_ALGORITHM = {shown.way.removeprefix(OPTION_PREFIX)!r}", ""]
     elif shown.case.content != shown.other.content:
         lines += [f"# the other description: {shown.name!a}", *described("other", shown.other)]
     lines += ["# the way back of each answer: a factor, or a matrix"]
@@ -286,7 +296,7 @@ def evidence(shown: Shown) -> list[str]:
 def pieces(case: Case) -> list[str]:
     """Every body in one piece, and in two."""
     lines = []
-    for name, parts in (("whole", whole(case.model)), ("halves", halves(case.model))):
+    for name, parts in (("whole", undivided_bodies(case.model)), ("halves", split_bodies(case.model))):
         lines += [f"{name} = [  # of each body: mass, centre from the body's, inertia about its own"]
         for body in parts:
             each = (f"({p.mass!r}, {p.centre.tolist()!r}, {p.inertia.tolist()!r})" for p in body)
@@ -319,11 +329,11 @@ def long_evidence(shown: ShownLong) -> list[str]:
         f"drifts = {shown.drifts!r}",
     ]
     if shown.growth:
-        return [*lines, f"limit = {SYMMETRIC_GROWTH!r}  # of log2 of the growth: 0 is bounded, 1 secular"]
+        return [*lines, f"limit = {MAX_SYMMETRIC_GROWTH!r}  # of log2 of the growth: 0 is bounded, 1 secular"]
     passed = "rounding" if fixed else "rounding and every step's tolerance"
     return [
         *lines,
-        f"step_word, blocks, sigmas = {words[0]!r}, {BLOCKS!r}, {SIGMAS!r}",
+        f"step_word, blocks, sigmas = {words[0]!r}, {BLOCK_COUNT!r}, {SIGMA_FACTOR!r}",
         f"due = {shown.due!r}  # order in the {words[0]}, at least",
         "# of rounding and the step's solver, in one block of time",
         f"rounding = {shown.rounding!r}",
@@ -351,7 +361,7 @@ def run_evidence(shown: ShownRun) -> list[str]:
     if shown.limited or shown.drifts:
         lines += [
             f"step_word, limit_words = {words!r}",
-            f"powers = {list(shown.integrator.powers)!r}  # of the step, in the error",
+            f"powers = {list(shown.integrator.error_exponents)!r}  # of the step, in the error",
             f"eliminated = {shown.eliminated!r}  # so many of them",
             "# of the limit, of the truth and of rounding together",
             f"uncertain = {shown.uncertain!r}",

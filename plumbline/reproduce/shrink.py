@@ -14,7 +14,7 @@ from typing import Generic, Protocol, TypeVar
 import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import lift
+from plumbline.model.kinematics import state_from_minimal
 
 PLAIN = 10.0  # times the tolerance: a shrunk case shows at least this, or half of what it showed
 FEWEST = 3  # runs of a ladder: what an extrapolation and its uncertainty need
@@ -152,7 +152,7 @@ def parts(case: Case, count: int, ends: Iterable[bool] = (False, True)) -> Itera
     for last in ends if count < n else (False,):
         part = slice(n - count, n) if last else slice(0, count)
         few = replace(model, **{k: v[part] for k, v in vars(model).items() if k != "gravity"})
-        at = lift(few, state.p[part], state.omega[part], state.u[part], state.udot[part])
+        at = state_from_minimal(few, state.p[part], state.omega[part], state.u[part], state.udot[part])
         yield replace(case, model=few, state=at)
 
 
@@ -202,14 +202,16 @@ def simpler(model: Model) -> Iterator[Change]:
             m, s = case.model, case.state
             new = replace(m, **{name: of(getattr(m, name)) for name, of in make.items()})
             rod = new.rods[:, None]
-            return replace(case, model=new, state=lift(new, s.p, s.omega, s.u * rod, s.udot * rod))
+            return replace(
+                case, model=new, state=state_from_minimal(new, s.p, s.omega, s.u * rod, s.udot * rod)
+            )
 
         return change
 
     def rates(make: Callable[[Array], Array]) -> Change:
         def change(case: Case) -> Case:
             s = case.state
-            return replace(case, state=lift(case.model, s.p, make(s.omega), s.u, make(s.udot)))
+            return replace(case, state=state_from_minimal(case.model, s.p, make(s.omega), s.u, make(s.udot)))
 
         return change
 
@@ -217,7 +219,7 @@ def simpler(model: Model) -> Iterator[Change]:
         def change(case: Case) -> Case:
             m, s = case.model, case.state
             p = np.array([make(k) for k in range(m.n)])
-            return replace(case, state=lift(m, p, s.omega, s.u, s.udot))
+            return replace(case, state=state_from_minimal(m, p, s.omega, s.u, s.udot))
 
         return change
 
@@ -226,7 +228,7 @@ def simpler(model: Model) -> Iterator[Change]:
             m, s = case.model, case.state
             along = np.where(m.rods[:, None], u, 0.0)
             across = s.udot - np.sum(s.udot * along, axis=1, keepdims=True) * along
-            return replace(case, state=lift(m, s.p, s.omega, along, across))
+            return replace(case, state=state_from_minimal(m, s.p, s.omega, along, across))
 
         return change
 

@@ -17,12 +17,12 @@ from typing import Any
 import numpy as np
 
 from plumbline.engines import environments
-from plumbline.judging.convergence import LADDER, RTOLS
-from plumbline.judging.long_runs import SHORTEST
+from plumbline.judging.convergence import RTOL_FACTORS, STEP_EXPONENTS
+from plumbline.judging.long_runs import MIN_WINDOW_SECONDS
 from plumbline.model.datatypes import Model, State
-from plumbline.model.kinematics import lift
-from plumbline.model.sampling import random_states, seed_of
-from plumbline.processes.workers import Limits, Task, Workers
+from plumbline.model.kinematics import state_from_minimal
+from plumbline.model.sampling import derive_seed, random_states
+from plumbline.processes.workers import Limits, Task, WorkerPool
 from plumbline.reproduce.engine_client import Engine
 from plumbline.reproduce.measure import Question, measure_of, shrunk, whole
 from plumbline.reproduce.measure_long_run import GROWTH, LONG
@@ -52,7 +52,7 @@ def write(
     One script serves all rows of a cell and level (of one relation).  index.json there lists the files by
     row key.  ``jobs`` workers shrink at once, as many as the run had by default.
     """
-    document = results_store.read(folder)
+    document = results_store.read_results(folder)
     rows = [row for row in disputed(document) if keys is None or row["key"] in keys]
     for key in set(keys or ()) - {row["key"] for row in rows}:
         near = get_close_matches(key, [row["key"] for row in disputed(document)], 1)
@@ -76,7 +76,7 @@ def write(
             continue
         cost = its[0].get("wall_time", 0.0) if cell[2] in ("trajectory", "invariants") else 0.0
         if long(its[0]):  # the first tries are as short as that
-            cost *= min(SHORTEST / its[0]["horizon"], 1.0)
+            cost *= min(MIN_WINDOW_SECONDS / its[0]["horizon"], 1.0)
         if keys is None and cost > UNASKED / TRIES:
             why = f"one try takes {cost:.1f} s of computing, too long at the end of a run; {ASK}"
             told |= {row["key"]: why for row in its}
@@ -93,10 +93,10 @@ def write(
         return told
     scripts.mkdir(exist_ok=True)
     jobs = jobs or int(document.get("run", {}).get("machine", {}).get("jobs", 1))
-    with Workers(min(jobs, len(tasks)), limits) as workers:
+    with WorkerPool(min(jobs, len(tasks)), limits) as workers:
         for outcome in workers.run(tasks):
             its = cells[outcome.key]
-            text, nothing = outcome.value or ("", outcome.lost)
+            text, nothing = outcome.value or ("", outcome.failure)
             if nothing:
                 told |= {row["key"]: nothing for row in its}
                 continue
@@ -148,12 +148,12 @@ def long(row: dict[str, Any]) -> bool:
 def asked(document: dict[str, Any], rows: list[dict[str, Any]], seconds: float) -> Question:
     """What to shrink for the rows of one cell; NotReproducible where there is nothing to ask again."""
     row = rows[0]
-    base, version = environments.split(row["engine"])
+    base, version = environments.split_version(row["engine"])
     if why := unscripted(base, row):
         raise NotReproducible(why)
     try:
-        engine = Engine(base, environments.interpreter(row["engine"]) if version else "")
-    except environments.NoSuchEnvironment as error:
+        engine = Engine(base, environments.ensure_interpreter(row["engine"]) if version else "")
+    except environments.EnvironmentUnavailable as error:
         raise NotReproducible(str(error)) from None
     about = document["scenarios"].get(row["scenario"])
     if about is None:
@@ -169,7 +169,7 @@ def asked(document: dict[str, Any], rows: list[dict[str, Any]], seconds: float) 
         case = Case(model, start(model, about), row["extra"]["end"], (row["extra"]["resolution"],))
     else:
         index = int(row["extra"]["state"])
-        states = random_states(model, index, seed_of("states", about["digest"])) if index else []
+        states = random_states(model, index, derive_seed("states", about["digest"])) if index else []
         case = Case(model, states[-1] if states else start(model, about))
     most = max(ratio(row) for row in rows)
     wanted = tuple(row["quantity"] for row in rows)
@@ -180,7 +180,9 @@ def asked(document: dict[str, Any], rows: list[dict[str, Any]], seconds: float) 
 
 def start(model: Model, about: dict[str, Any]) -> State:
     """The initial state of a scenario."""
-    return lift(model, **{name: np.array(value, float) for name, value in about["state"].items()})
+    return state_from_minimal(
+        model, **{name: np.array(value, float) for name, value in about["state"].items()}
+    )
 
 
 def runs_of(document: dict[str, Any], rows: list[dict[str, Any]], model: Model, state: State) -> Case:
@@ -193,8 +195,8 @@ def runs_of(document: dict[str, Any], rows: list[dict[str, Any]], model: Model, 
     if finest is None:
         raise NotReproducible("the ladder of steps behind this row is not in the results")
     if declared is None:  # an adaptive integrator: tolerances from a million times the tightest
-        return Case(model, state, until, tuple(finest * factor for factor in RTOLS))
-    coarsest = 2.0 ** -LADDER[declared][0]
+        return Case(model, state, until, tuple(finest * factor for factor in RTOL_FACTORS))
+    coarsest = 2.0 ** -STEP_EXPONENTS[declared][0]
     steps = [coarsest / 2**k for k in range(round(np.log2(coarsest / finest)) + 1)]
     # the longest run of a number of coarsest steps that halves well, within the row's time
     span = coarsest * 2.0 ** np.floor(np.log2(max(until / coarsest, 1.0)))

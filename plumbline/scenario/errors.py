@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 
-SHOWN = 100  # problems that the text of an error lists; `problems` holds them all
+MAX_LISTED_PROBLEMS = 100  # problems that the text of an error lists; `problems` holds them all
 
 
 @dataclass(frozen=True)
@@ -31,22 +31,22 @@ class ScenarioError(ValueError):
 
     def __init__(self, problems: Iterable[Problem]):
         self.problems = tuple(sorted(problems, key=lambda p: (p.file, p.line, p.column, p.field)))
-        lines = [str(problem) for problem in self.problems[:SHOWN]]
-        if len(self.problems) > SHOWN:
-            lines.append(f"… and {len(self.problems) - SHOWN} more problems")
+        lines = [str(problem) for problem in self.problems[:MAX_LISTED_PROBLEMS]]
+        if len(self.problems) > MAX_LISTED_PROBLEMS:
+            lines.append(f"… and {len(self.problems) - MAX_LISTED_PROBLEMS} more problems")
         super().__init__("\n".join(lines))
 
     def __reduce__(self) -> tuple[type[ScenarioError], tuple[tuple[Problem, ...]]]:
         return type(self), (self.problems,)
 
 
-def closest(word: str, known: Sequence[str]) -> str:
+def closest_match(word: str, known: Sequence[str]) -> str:
     """The closest known word, or an empty string where none is close."""
     close = get_close_matches(word.lower(), [k.lower() for k in known], n=1, cutoff=0.5)
     return next((k for k in known if close and k.lower() == close[0]), "")
 
 
-def nearest(word: str, known: Sequence[str]) -> str:
+def did_you_mean(word: str, known: Sequence[str]) -> str:
     """``did you mean …?`` for the closest known word, or an empty string."""
-    close = closest(word, known)
+    close = closest_match(word, known)
     return f"did you mean {close!r}?" if close else ""

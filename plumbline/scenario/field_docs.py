@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from plumbline.scenario.loader import schema
+from plumbline.scenario.loader import json_schema
 from plumbline.scenario.schema import SCHEMA_VERSION
 
-HEADINGS = {  # in the page's order
+SECTION_HEADINGS = {  # in the page's order
     "Document": "The file",
     "Body": "`bodies[]`: a body",
     "Run": "`bodies[]`: a run of bodies",
@@ -20,7 +20,12 @@ HEADINGS = {  # in the page's order
     "Load": "`load`",
     "Drag": "`drag`",
 }
-BOUNDS = {"exclusiveMinimum": "> {}", "minimum": "≥ {}", "maximum": "≤ {}", "maxLength": "≤ {} characters"}
+BOUND_FORMATS = {
+    "exclusiveMinimum": "> {}",
+    "minimum": "≥ {}",
+    "maximum": "≤ {}",
+    "maxLength": "≤ {} characters",
+}
 INTRODUCTION = f"""\
 # Scenario files
 
@@ -44,38 +49,40 @@ left along the rod.
 
 def field_reference() -> str:
     """The whole page, Markdown."""
-    whole = schema()
+    whole = json_schema()
     parts = {"Document": whole, **whole["$defs"]}
-    return "\n".join([INTRODUCTION, *(section(parts[name], heading) for name, heading in HEADINGS.items())])
+    return "\n".join(
+        [INTRODUCTION, *(render_section(parts[name], heading) for name, heading in SECTION_HEADINGS.items())]
+    )
 
 
-def section(part: dict[str, Any], heading: str) -> str:
+def render_section(part: dict[str, Any], heading: str) -> str:
     """One part of the file: what it is, and its fields."""
     lines = [f"## {heading}", "", part["description"], ""]
     lines += ["| field | type | unit | default | meaning |", "|---|---|---|---|---|"]
     for name, field in part["properties"].items():
-        default = "required" if name in part.get("required", ()) else written(field.get("default"))
+        default = "required" if name in part.get("required", ()) else format_default(field.get("default"))
         meaning = field["description"] + "".join(f" Example: `{e}`." for e in field.get("examples", ()))
-        cells = (f"`{name}`", kind(field), field.get("unit", ""), default, meaning)
+        cells = (f"`{name}`", field_type(field), field.get("unit", ""), default, meaning)
         lines.append(("| " + " | ".join(cells) + " |").replace("|  |", "| |"))
     return "\n".join([*lines, ""])
 
 
-def written(default: Any) -> str:
+def format_default(default: Any) -> str:
     """A default as it would be typed; a dash where absence has a meaning of its own."""
     return "–" if default is None else f"`{default}`"
 
 
-def kind(field: dict[str, Any]) -> str:
+def field_type(field: dict[str, Any]) -> str:
     """The type of a field, with its bounds, in a reader's words."""
-    bounds = [text.format(field[name]) for name, text in BOUNDS.items() if name in field]
-    return ", ".join([kind_name(field), *bounds])
+    bounds = [text.format(field[name]) for name, text in BOUND_FORMATS.items() if name in field]
+    return ", ".join([base_type(field), *bounds])
 
 
-def kind_name(field: dict[str, Any]) -> str:
+def base_type(field: dict[str, Any]) -> str:
     """The type of a field without its bounds."""
     if alternatives := field.get("anyOf") or field.get("oneOf"):
-        return " or ".join(kind(option) for option in alternatives if option.get("type") != "null")
+        return " or ".join(field_type(option) for option in alternatives if option.get("type") != "null")
     if "$ref" in field:
         name = str(field["$ref"]).rpartition("/")[2]
         return "axis_angle" if name == "AxisAngle" else name.lower()
@@ -83,9 +90,9 @@ def kind_name(field: dict[str, Any]) -> str:
         return ", ".join(f"`{option}`" for option in options)
     if field["type"] == "array":
         if field.get("minItems", 0) == field.get("maxItems"):
-            inner = kind(field["items"])
+            inner = field_type(field["items"])
             return f"{field['minItems']} " + (f"× {inner}" if inner[0].isdigit() else f"{inner}s")
-        return f"list of {kind(field['items'])}"
+        return f"list of {field_type(field['items'])}"
     return {"integer": "whole number", "string": "text"}.get(field["type"], str(field["type"]))
 
 

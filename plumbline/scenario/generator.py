@@ -11,13 +11,13 @@ from typing import Any, overload
 
 import numpy as np
 
-from plumbline.model.sampling import seed_of
-from plumbline.scenario.loader import Scenario, made
+from plumbline.model.sampling import derive_seed
+from plumbline.scenario.loader import Scenario, scenario_from_dict
 
-FAMILY = "random"
-MOST_BODIES = 10
-DECADES = 3.0  # masses in a wild scenario reach from 1e-3 to 1e3 kg; in a tame one 0.1 to 10 kg
-PURPOSE = (
+RANDOM_FAMILY = "random"
+MAX_RANDOM_BODIES = 10
+MASS_DECADES = 3.0  # masses in a wild scenario reach from 1e-3 to 1e3 kg; in a tame one 0.1 to 10 kg
+RANDOM_PURPOSE = (
     "Nobody chose it, so nobody's blind spot shaped it: generic geometry, full inertia, rates and loads "
     "shows any mistake that a symmetric or planar case hides."
 )
@@ -27,50 +27,52 @@ class RandomScenarios(Sequence[Scenario]):
     """The first ``count`` scenarios of a seed, each made when it is asked for."""
 
     def __init__(self, seed: int, count: int) -> None:
-        self.seed, self.numbers = seed, range(count)
+        self.seed, self.indices = seed, range(count)
 
     def __len__(self) -> int:
         """How many."""
-        return len(self.numbers)
+        return len(self.indices)
 
     @overload
-    def __getitem__(self, k: int) -> Scenario: ...
+    def __getitem__(self, index: int) -> Scenario: ...
     @overload
-    def __getitem__(self, k: slice) -> list[Scenario]: ...
-    def __getitem__(self, k: int | slice) -> Scenario | list[Scenario]:
+    def __getitem__(self, index: slice) -> list[Scenario]: ...
+    def __getitem__(self, index: int | slice) -> Scenario | list[Scenario]:
         """Scenario k."""
-        if isinstance(k, slice):
-            return [random_scenario(self.seed, number) for number in self.numbers[k]]
-        return random_scenario(self.seed, self.numbers[k])
+        if isinstance(index, slice):
+            return [random_scenario(self.seed, number) for number in self.indices[index]]
+        return random_scenario(self.seed, self.indices[index])
 
 
-def random_scenario(seed: int, k: int) -> Scenario:
+def random_scenario(seed: int, index: int) -> Scenario:
     """Scenario k of a seed."""
-    content = document(seed, k)
-    return made(content, f"{content['name']}.yaml")
+    content = random_document(seed, index)
+    return scenario_from_dict(content, f"{content['name']}.yaml")
 
 
-def document(seed: int, k: int) -> dict[str, Any]:
+def random_document(seed: int, index: int) -> dict[str, Any]:
     """The content of its file: every number finite and written with all its digits."""
-    rng = np.random.default_rng(seed_of("random scenario", str(seed), str(k)))
-    n = int(np.clip(rng.geometric(0.3), 1, MOST_BODIES))  # short chains most often
+    rng = np.random.default_rng(derive_seed("random scenario", str(seed), str(index)))
+    n = int(np.clip(rng.geometric(0.3), 1, MAX_RANDOM_BODIES))  # short chains most often
     wild = bool(rng.random() < 0.25)
-    decades = DECADES if wild else 1.0
+    decades = MASS_DECADES if wild else 1.0
     rate = 10 ** rng.uniform(-1.0, 1.0)  # rad/s
     loaded, dragged = rng.random(2) < 0.3
     return {
         "schema_version": 1,
-        "name": f"random-{seed}-{k}",
-        "family": FAMILY,
-        "title": f"Random {k} of seed {seed}: {n} {'body' if n == 1 else 'bodies'}{', wild masses' * wild}",
-        "purpose": PURPOSE,
+        "name": f"random-{seed}-{index}",
+        "family": RANDOM_FAMILY,
+        "title": f"Random {index} of seed {seed}: {n} {'body' if n == 1 else 'bodies'}{', wild masses' * wild}",
+        "purpose": RANDOM_PURPOSE,
         "duration": 1.0,
-        "bodies": [body(rng, decades, rate, bool(loaded), bool(dragged), i == n - 1) for i in range(n)],
+        "bodies": [
+            random_body(rng, decades, rate, bool(loaded), bool(dragged), i == n - 1) for i in range(n)
+        ],
     }
 
 
-def body(
-    rng: np.random.Generator, decades: float, rate: float, loaded: bool, dragged: bool, last: bool
+def random_body(
+    rng: np.random.Generator, decades: float, rate: float, has_load: bool, has_drag: bool, is_last: bool
 ) -> dict[str, Any]:
     """One body of a chain, its inertia an ellipsoid's of some attitude: physical whatever is drawn."""
     mass = 10 ** rng.uniform(-decades, decades)
@@ -93,13 +95,13 @@ def body(
             "direction": rng.normal(size=3).tolist(),
             "angular_velocity": (rate * rng.normal(size=3)).tolist(),
         }
-    if not last:
+    if not is_last:
         found["distal"] = (0.3 * rng.normal(size=3)).tolist()
-    if loaded:
+    if has_load:
         found["load"] = {
             "force": (mass * rng.normal(size=3)).tolist(),
             "moment": (mass * rng.normal(size=3)).tolist(),
         }
-    if dragged:
+    if has_drag:
         found["drag"] = {"force": mass * rng.uniform(0.0, 1.0), "moment": mass * rng.uniform(0.0, 0.1)}
     return found

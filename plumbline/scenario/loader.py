@@ -15,8 +15,8 @@ import numpy as np
 from pydantic import ValidationError
 
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import lift, multiply, rotation
-from plumbline.scenario.errors import Problem, ScenarioError, closest, nearest
+from plumbline.model.kinematics import quaternion_product, rotation_matrix, state_from_minimal
+from plumbline.scenario.errors import Problem, ScenarioError, closest_match, did_you_mean
 from plumbline.scenario.schema import (
     MAX_BODIES,
     Body,
@@ -26,25 +26,25 @@ from plumbline.scenario.schema import (
     inertia_matrix,
     unit_vector,
 )
-from plumbline.scenario.validation_messages import translate
-from plumbline.scenario.yaml_source import Key, Source, dotted, parse, read
+from plumbline.scenario.validation_messages import problems_from_validation
+from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path, parse_yaml, read_yaml
 
 __all__ = [
     "Problem",
     "Scenario",
     "ScenarioError",
     "catalogue",
-    "find",
-    "load",
-    "load_many",
-    "loads",
-    "made",
-    "schema",
+    "find_scenario_file",
+    "json_schema",
+    "load_scenario",
+    "load_scenario_text",
+    "load_scenarios",
+    "scenario_from_dict",
     "slug",
 ]
 
-CATALOGUE = Path(__file__).resolve().parents[2] / "scenarios"
-HUGE = 1e30  # beyond it squares and products leave the range where engines can compute
+CATALOGUE_FOLDER = Path(__file__).resolve().parents[2] / "scenarios"
+MAX_MAGNITUDE = 1e30  # beyond it squares and products leave the range where engines can compute
 FAMILIES = ("single", "double", "chain")
 
 
@@ -66,9 +66,9 @@ class Scenario:
     model: Model
     state: State
     duration: float  # s
-    sample: float  # s, between compared samples
-    exact: str | None  # id of its closed-form solution
-    bodies: tuple[str, ...]  # N names, for the reader
+    sample_interval: float  # s, between compared samples
+    closed_form: str | None  # id of its closed-form solution
+    body_names: tuple[str, ...]  # N names, for the reader
     path: Path
     digest: str  # sha256 of the checked content: layout and comments do not count
     document: dict[str, Any] = field(repr=False, default_factory=dict)  # the checked content as plain data
@@ -76,31 +76,34 @@ class Scenario:
     @property
     def times(self) -> Array:
         """(T,) s, the sample times from 0 to the duration."""
-        return np.arange(round(self.duration / self.sample) + 1, dtype=np.float64) * self.sample
+        return (
+            np.arange(round(self.duration / self.sample_interval) + 1, dtype=np.float64)
+            * self.sample_interval
+        )
 
 
-def load(path: str | Path) -> Scenario:
+def load_scenario(path: str | Path) -> Scenario:
     """The scenario of a YAML file; raises ScenarioError with every problem of the file."""
-    return _build(read(Path(path)), Path(path))
+    return build_scenario(read_yaml(Path(path)), Path(path))
 
 
-def loads(content: str, name: str = "scenario") -> Scenario:
+def load_scenario_text(content: str, name: str = "scenario") -> Scenario:
     """The scenario of YAML text; ``name`` stands for the file."""
-    return _build(parse(Source(name), content), Path(name))
+    return build_scenario(parse_yaml(YamlSource(name), content), Path(name))
 
 
-def made(content: dict[str, Any], name: str) -> Scenario:
+def scenario_from_dict(content: dict[str, Any], name: str) -> Scenario:
     """The scenario of plain data that a program made, checked as a file's is."""
-    return _build(Source(name, content, values=defaultdict(lambda: (1, 1))), Path(name))
+    return build_scenario(YamlSource(name, content, value_positions=defaultdict(lambda: (1, 1))), Path(name))
 
 
-def load_many(names: Iterable[str | Path]) -> list[Scenario]:
+def load_scenarios(names: Iterable[str | Path]) -> list[Scenario]:
     """Scenarios by catalogue name or path, each once; problems of all files at once in one ScenarioError."""
     found: dict[str, Scenario] = {}
     problems: list[Problem] = []
     for name in names:
         try:
-            scenario = load(find(name))
+            scenario = load_scenario(find_scenario_file(name))
         except ScenarioError as error:
             problems += error.problems
             continue
@@ -115,11 +118,11 @@ def load_many(names: Iterable[str | Path]) -> list[Scenario]:
 
 def catalogue() -> dict[str, Path]:
     """Name → file of every scenario that comes with the project, family by family."""
-    files = (path for family in FAMILIES for path in sorted((CATALOGUE / family).glob("*.yaml")))
+    files = (path for family in FAMILIES for path in sorted((CATALOGUE_FOLDER / family).glob("*.yaml")))
     return {path.stem: path for path in files}
 
 
-def find(name: str | Path) -> Path:
+def find_scenario_file(name: str | Path) -> Path:
     """The file of a catalogue name, or the path itself; ScenarioError suggests the nearest name."""
     known = catalogue()
     if str(name) in known:
@@ -128,7 +131,7 @@ def find(name: str | Path) -> Path:
     if path.suffix in (".yaml", ".yml") or len(path.parts) > 1 or path.is_file():
         return path
     valid = f"a path of a YAML file, or one of: {', '.join(known)}"
-    message = f"unknown scenario. {nearest(str(name), list(known))}".rstrip(" .")
+    message = f"unknown scenario. {did_you_mean(str(name), list(known))}".rstrip(" .")
     raise ScenarioError([Problem(str(name), 0, 0, "", message, valid)])
 
 
@@ -141,12 +144,12 @@ def slug(name: str) -> str:
     return f"{plain or 'scenario'}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
-def schema() -> dict[str, Any]:
+def json_schema() -> dict[str, Any]:
     """JSON Schema of scenario files, for editors."""
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **Document.model_json_schema()}
 
 
-def _build(source: Source, path: Path) -> Scenario:
+def build_scenario(source: YamlSource, path: Path) -> Scenario:
     problems = list(source.problems)
     document = None
     try:
@@ -156,21 +159,25 @@ def _build(source: Source, path: Path) -> Scenario:
             e for e in error.errors() if e["loc"] == ("schema_version",) and e["type"] == "literal_error"
         ]
         if version:  # the fields of another version are not this one's to judge
-            raise ScenarioError(translate(source, version)) from None
-        problems += translate(source, error.errors())
-    problems += _distal_problems(source)
+            raise ScenarioError(problems_from_validation(source, version)) from None
+        problems += problems_from_validation(source, error.errors())
+    problems += _missing_distal_problems(source)
     if problems or document is None:
         raise ScenarioError(problems)
-    bodies = list(_expand(document))
+    bodies = list(_expand_repeats(document))
     if len(bodies) > MAX_BODIES:
-        raise source.stop(f"has {len(bodies)} bodies", f"at most {MAX_BODIES}", source.values[("bodies",)])
+        raise source.fatal_error(
+            f"has {len(bodies)} bodies", f"at most {MAX_BODIES}", source.value_positions[("bodies",)]
+        )
     with np.errstate(all="ignore"):
-        model = _model(document, [body for body, _ in bodies])
-        state = lift(model, *_minimal(bodies))
+        model = _build_model(document, [body for body, _ in bodies])
+        state = state_from_minimal(model, *_minimal_coordinates(bodies))
     for name, array in {**vars(model), **vars(state)}.items():
-        if not np.all(np.abs(array) <= HUGE):
-            raise source.stop(
-                f"has numbers that make {name} larger than {HUGE:g}", "SI numbers of a pendulum", (1, 1)
+        if not np.all(np.abs(array) <= MAX_MAGNITUDE):
+            raise source.fatal_error(
+                f"has numbers that make {name} larger than {MAX_MAGNITUDE:g}",
+                "SI numbers of a pendulum",
+                (1, 1),
             )
     content = document.model_dump(mode="json")
     content["name"] = document.name or path.stem
@@ -184,22 +191,22 @@ def _build(source: Source, path: Path) -> Scenario:
         model=model,
         state=state,
         duration=document.duration,
-        sample=document.sample,
-        exact=document.exact,
-        bodies=tuple(body.name or f"body {k + 1}" for k, (body, _) in enumerate(bodies)),
+        sample_interval=document.sample,
+        closed_form=document.exact,
+        body_names=tuple(body.name or f"body {k + 1}" for k, (body, _) in enumerate(bodies)),
         path=path,
         digest=hashlib.sha256(canonical.encode()).hexdigest(),
         document=content,
     )
 
 
-def _distal_problems(source: Source) -> Iterator[Problem]:
+def _missing_distal_problems(source: YamlSource) -> Iterator[Problem]:
     """Bodies that carry another one without saying where; found in the raw data, so beside other problems."""
     valid = "the point, in the frame of this body, from which the next one hangs, as [0, 0, -0.2] (m)"
     items = source.data.get("bodies") if isinstance(source.data, dict) else None
     items = items if isinstance(items, list) else []
     for index, item in enumerate(items):
-        written: list[tuple[tuple[Key, ...], Any]] = [(("bodies", index), item)]
+        written: list[tuple[tuple[PathKey, ...], Any]] = [(("bodies", index), item)]
         count = 1
         if isinstance(item, dict) and isinstance(item.get("cycle"), list):
             written = [(("bodies", index, "cycle", k), body) for k, body in enumerate(item["cycle"])]
@@ -208,18 +215,18 @@ def _distal_problems(source: Source) -> Iterator[Problem]:
             ends = index == len(items) - 1 and count == place + 1  # the chain's last body, copied once
             if ends or not isinstance(body, dict) or body.get("distal") is not None:
                 continue
-            if any(closest(key, ["distal"]) for key in body if key not in Body.model_fields):
+            if any(closest_match(key, ["distal"]) for key in body if key not in Body.model_fields):
                 continue  # misspelt, and named as such
             yield Problem(
                 source.file,
-                *source.values[path],
-                dotted((*path, "distal")),
+                *source.value_positions[path],
+                dotted_path((*path, "distal")),
                 "is missing: a body follows",
                 valid,
             )
 
 
-def _expand(document: Document) -> Iterator[tuple[Body, Array]]:
+def _expand_repeats(document: Document) -> Iterator[tuple[Body, Array]]:
     """Every body of the chain with the quaternion (4,) it is turned by, runs written out."""
     for item in document.bodies:
         if isinstance(item, Body):
@@ -230,7 +237,7 @@ def _expand(document: Document) -> Iterator[tuple[Body, Array]]:
             yield item.cycle[j % len(item.cycle)], turn
 
 
-def _model(document: Document, bodies: list[Body]) -> Model:
+def _build_model(document: Document, bodies: list[Body]) -> Model:
     zero = [0.0, 0.0, 0.0]
     distal = [body.distal or zero for body in bodies]
     distal[-1] = zero
@@ -248,14 +255,14 @@ def _model(document: Document, bodies: list[Body]) -> Model:
     )
 
 
-def _minimal(bodies: list[tuple[Body, Array]]) -> tuple[Array, Array, Array, Array]:
+def _minimal_coordinates(bodies: list[tuple[Body, Array]]) -> tuple[Array, Array, Array, Array]:
     """p, omega, u, udot of the chain: unit and perpendicular to rounding."""
     n = len(bodies)
     p, u, udot = np.empty((n, 4)), np.zeros((n, 3)), np.zeros((n, 3))
     for k, (body, turn) in enumerate(bodies):
-        p[k] = unit_vector(multiply(turn, attitude_quaternion(body.attitude)).tolist())
+        p[k] = unit_vector(quaternion_product(turn, attitude_quaternion(body.attitude)).tolist())
         if isinstance(body.joint, Rod):
-            world = rotation(turn)
+            world = rotation_matrix(turn)
             u[k] = unit_vector((world @ unit_vector(body.joint.direction)).tolist())
             if body.joint.angular_velocity is not None:
                 rate = np.cross(world @ np.array(body.joint.angular_velocity), u[k])

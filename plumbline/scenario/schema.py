@@ -25,13 +25,15 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from plumbline.model.datatypes import Array
-from plumbline.model.kinematics import multiply, rotation
+from plumbline.model.kinematics import quaternion_product, rotation_matrix
 
 SCHEMA_VERSION = 1
 MAX_BODIES = 20_000
 MAX_SAMPLES = 1_000_000
-ROUNDING = 1e-12  # relative: what sixteen typed digits and a few operations leave; anything above is meant
-EXACT = Literal[
+INPUT_ROUNDING = (
+    1e-12  # relative: what sixteen typed digits and a few operations leave; anything above is meant
+)
+ClosedForm = Literal[
     "rest",
     "planar-pendulum",
     "spherical-pendulum",
@@ -44,16 +46,16 @@ EXACT = Literal[
 ]
 
 
-def invalid(message: str, valid: str) -> PydanticCustomError:
+def invalid_value_error(message: str, valid: str) -> PydanticCustomError:
     """A validation error in the project's words: what is wrong, and what would be valid."""
     return PydanticCustomError("plumbline", "{message}", {"message": message, "valid": valid})
 
 
-def text(value: str) -> str:
+def require_printable(value: str) -> str:
     """Text without control characters or code points that XML cannot hold; line breaks and tabs may stay."""
     for char in value:
         if unicodedata.category(char) in ("Cc", "Cs", "Cn") and char not in "\n\t":
-            raise invalid(f"has the character U+{ord(char):04X}", "printable text")
+            raise invalid_value_error(f"has the character U+{ord(char):04X}", "printable text")
     return value
 
 
@@ -64,30 +66,30 @@ def unit_vector(values: list[float]) -> Array:
     return np.asarray(vector / np.linalg.norm(vector))
 
 
-def nonzero(values: list[float]) -> list[float]:
+def require_nonzero(values: list[float]) -> list[float]:
     """Refuse the zero vector, which has no direction."""
     if not any(values):
-        raise invalid("is all zeros, which has no direction", "at least one number other than 0")
+        raise invalid_value_error("is all zeros, which has no direction", "at least one number other than 0")
     return values
 
 
-class Part(BaseModel):
+class SchemaModel(BaseModel):
     """What all parts of a scenario file share: strict types, no unknown fields."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
-    def exactly_one(self, *names: str) -> None:
+    def require_exactly_one(self, *names: str) -> None:
         """Refuse none or several of the alternatives."""
         given = [name for name in names if getattr(self, name) is not None]
         if len(given) != 1:
             what = "gives none of " + ", ".join(names) if not given else "gives " + " and ".join(given)
-            raise invalid(what, "exactly one of " + ", ".join(names))
+            raise invalid_value_error(what, "exactly one of " + ", ".join(names))
 
 
 Vector = Annotated[list[float], Len(3, 3)]
 
 
-class AxisAngle(Part):
+class AxisAngle(SchemaModel):
     """A rotation about an axis fixed in the world, right-handed."""
 
     axis: Vector = Field(description="The axis, world frame; any length but 0.", examples=[[0, 1, 0]])
@@ -98,11 +100,11 @@ class AxisAngle(Part):
         None, description="The angle; or give `angle`.", json_schema_extra={"unit": "°"}
     )
 
-    _axis = field_validator("axis")(nonzero)
+    _axis = field_validator("axis")(require_nonzero)
 
     @model_validator(mode="after")
-    def _one(self) -> AxisAngle:
-        self.exactly_one("angle", "degrees")
+    def _check_alternatives(self) -> AxisAngle:
+        self.require_exactly_one("angle", "degrees")
         return self
 
     @property
@@ -110,13 +112,13 @@ class AxisAngle(Part):
         """The angle in rad."""
         return self.angle if self.angle is not None else math.radians(self.degrees or 0.0)
 
-    def quaternion(self, times: float = 1.0) -> Array:
+    def quaternion(self, multiple: float = 1.0) -> Array:
         """(4,) the unit quaternion of the rotation by ``times`` the angle."""
-        half = 0.5 * times * self.radians
+        half = 0.5 * multiple * self.radians
         return np.concatenate([[math.cos(half)], math.sin(half) * unit_vector(self.axis)])
 
 
-class Euler(Part):
+class Euler(SchemaModel):
     """Three rotations about coordinate axes."""
 
     convention: str = Field(
@@ -137,12 +139,12 @@ class Euler(Part):
     )
 
     @model_validator(mode="after")
-    def _one(self) -> Euler:
-        self.exactly_one("angles", "degrees")
+    def _check_alternatives(self) -> Euler:
+        self.require_exactly_one("angles", "degrees")
         return self
 
 
-class Attitude(Part):
+class Attitude(SchemaModel):
     """How a body stands: exactly one of the three."""
 
     quaternion: Annotated[list[float], Len(4, 4)] | None = Field(
@@ -157,15 +159,15 @@ class Attitude(Part):
     @field_validator("quaternion")
     @classmethod
     def _quaternion(cls, value: list[float] | None) -> list[float] | None:
-        return nonzero(value) if value else value
+        return require_nonzero(value) if value else value
 
     @model_validator(mode="after")
-    def _one(self) -> Attitude:
-        self.exactly_one("quaternion", "axis_angle", "euler")
+    def _check_alternatives(self) -> Attitude:
+        self.require_exactly_one("quaternion", "axis_angle", "euler")
         return self
 
 
-class Inertia(Part):
+class Inertia(SchemaModel):
     """Inertia about the centre of mass, in the body's frame: exactly one of principal, six, matrix."""
 
     principal: Vector | None = Field(
@@ -190,14 +192,14 @@ class Inertia(Part):
     @classmethod
     def _principal(cls, value: list[float] | None) -> list[float] | None:
         if value:
-            physical(np.diag(value))
+            require_physical_inertia(np.diag(value))
         return value
 
     @field_validator("six")
     @classmethod
     def _six(cls, value: list[float] | None) -> list[float] | None:
         if value:
-            physical(symmetric(value))
+            require_physical_inertia(symmetric_matrix(value))
         return value
 
     @field_validator("matrix")
@@ -205,48 +207,50 @@ class Inertia(Part):
     def _matrix(cls, value: list[list[float]] | None) -> list[list[float]] | None:
         if value:
             matrix = np.array(value)
-            if np.any(np.abs(matrix - matrix.T) > ROUNDING * np.max(np.abs(matrix))):
-                raise invalid("is not symmetric", "a matrix that equals its transpose")
-            physical((matrix + matrix.T) / 2)
+            if np.any(np.abs(matrix - matrix.T) > INPUT_ROUNDING * np.max(np.abs(matrix))):
+                raise invalid_value_error("is not symmetric", "a matrix that equals its transpose")
+            require_physical_inertia((matrix + matrix.T) / 2)
         return value
 
     @model_validator(mode="after")
-    def _one(self) -> Inertia:
-        self.exactly_one("principal", "six", "matrix")
+    def _check_alternatives(self) -> Inertia:
+        self.require_exactly_one("principal", "six", "matrix")
         if self.axes is not None and self.principal is None:
-            raise invalid("gives axes without principal", "axes beside principal only")
+            raise invalid_value_error("gives axes without principal", "axes beside principal only")
         return self
 
 
-def symmetric(six: list[float]) -> Array:
+def symmetric_matrix(six: list[float]) -> Array:
     """The matrix of xx, yy, zz, xy, xz, yz."""
     xx, yy, zz, xy, xz, yz = six
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
-def physical(matrix: Array) -> None:
+def require_physical_inertia(matrix: Array) -> None:
     """Refuse what no body has: values that are not positive, or one above the sum of the two others.
 
     The three sums J1 + J2 - J3 are twice the second moments of the mass, so none is negative.
     """
     values = np.linalg.eigvalsh(matrix)
     shown = ", ".join(f"{value:.6g}" for value in values)
-    if values[0] <= ROUNDING * values[2]:
-        raise invalid(f"has principal values {shown}, not all positive", "three positive principal values")
-    if values[0] + values[1] < values[2] * (1 - ROUNDING):
-        raise invalid(
+    if values[0] <= INPUT_ROUNDING * values[2]:
+        raise invalid_value_error(
+            f"has principal values {shown}, not all positive", "three positive principal values"
+        )
+    if values[0] + values[1] < values[2] * (1 - INPUT_ROUNDING):
+        raise invalid_value_error(
             f"is of no body: of its principal values {shown} the largest exceeds the sum of the others",
             "principal values that obey the triangle inequality",
         )
 
 
-class Ball(Part):
+class Ball(SchemaModel):
     """A ball joint: the body's proximal point stays where it hangs."""
 
     kind: Literal["ball"] = Field(description="`ball`.")
 
 
-class Rod(Part):
+class Rod(SchemaModel):
     """A massless rigid rod with a ball joint at both ends (the notes' own joint)."""
 
     kind: Literal["rod"] = Field(description="`rod`.")
@@ -275,33 +279,35 @@ class Rod(Part):
     @classmethod
     def _length(cls, value: float) -> float:
         if value == 0:
-            raise invalid("is 0: a rod of no length is a ball joint", "{kind: ball}, or a length above 0")
+            raise invalid_value_error(
+                "is 0: a rod of no length is a ball joint", "{kind: ball}, or a length above 0"
+            )
         if value < 0:
-            raise invalid(f"is {value!r}, below 0", "a length above 0")
+            raise invalid_value_error(f"is {value!r}, below 0", "a length above 0")
         return value
 
-    _direction = field_validator("direction")(nonzero)
+    _direction = field_validator("direction")(require_nonzero)
 
     @field_validator("rate")
     @classmethod
     def _rate(cls, value: list[float] | None, info: ValidationInfo) -> list[float] | None:
         if value and any(value) and "direction" in info.data:
             along = float(unit_vector(value) @ unit_vector(info.data["direction"]))
-            if abs(along) > ROUNDING:
-                raise invalid(
+            if abs(along) > INPUT_ROUNDING:
+                raise invalid_value_error(
                     f"has a part along the direction, {along:.3g} of its length",
                     "a rate perpendicular to the direction; angular_velocity needs no such care",
                 )
         return value
 
     @model_validator(mode="after")
-    def _one(self) -> Rod:
+    def _check_alternatives(self) -> Rod:
         if self.rate is not None and self.angular_velocity is not None:
-            raise invalid("gives rate and angular_velocity", "one of them")
+            raise invalid_value_error("gives rate and angular_velocity", "one of them")
         return self
 
 
-class Load(Part):
+class Load(SchemaModel):
     """Constant loads on a body."""
 
     force: Vector = Field(
@@ -316,7 +322,7 @@ class Load(Part):
     )
 
 
-class Drag(Part):
+class Drag(SchemaModel):
     """Linear drag on a body."""
 
     force: float = Field(
@@ -330,7 +336,7 @@ class Drag(Part):
     )
 
 
-class Body(Part):
+class Body(SchemaModel):
     """One rigid body, hung from the one before; the first from the pivot, the world's origin."""
 
     name: str | None = Field(
@@ -358,10 +364,10 @@ class Body(Part):
     load: Load = Field(default_factory=Load, description="Constant force and moment on this body.")
     drag: Drag = Field(default_factory=Drag, description="Linear drag on this body.")
 
-    _name = field_validator("name")(lambda value: text(value) if value else value)
+    _name = field_validator("name")(lambda value: require_printable(value) if value else value)
 
 
-class Run(Part):
+class BodySequence(SchemaModel):
     """A run of bodies that repeat: body j = 0, 1, 2 … of it copies the bodies of `cycle` in turn.
 
     With `turn`, body j and its rod (direction and rate) are turned together by j times that
@@ -373,15 +379,19 @@ class Run(Part):
     turn: AxisAngle | None = Field(None, description="What body j is turned by, j times. Absent: not turned.")
 
 
-def _kind_of_item(value: Any) -> str:
-    is_run = "repeat" in value or "cycle" in value if isinstance(value, dict) else isinstance(value, Run)
+def _item_tag(value: Any) -> str:
+    is_run = (
+        "repeat" in value or "cycle" in value if isinstance(value, dict) else isinstance(value, BodySequence)
+    )
     return "run" if is_run else "body"
 
 
-Item = Annotated[Annotated[Body, Tag("body")] | Annotated[Run, Tag("run")], Discriminator(_kind_of_item)]
+ChainItem = Annotated[
+    Annotated[Body, Tag("body")] | Annotated[BodySequence, Tag("run")], Discriminator(_item_tag)
+]
 
 
-class Document(Part):
+class Document(SchemaModel):
     """A scenario file: one open chain of rigid bodies, its initial state, its loads."""
 
     schema_version: Literal[1] = Field(description="Version of this format: 1.")
@@ -402,7 +412,7 @@ class Document(Part):
     purpose: str = Field(
         min_length=1, max_length=1000, description="The sentence on what it is there to catch."
     )
-    exact: EXACT | None = Field(
+    exact: ClosedForm | None = Field(
         None,
         description="The closed-form solution that this scenario has, if any. `small-double` and "
         "`small-chain` are asymptotic: their error shrinks with the square of the amplitude.",
@@ -425,21 +435,21 @@ class Document(Part):
         description="Acceleration of gravity, world frame.",
         json_schema_extra={"unit": "m/s²"},
     )
-    bodies: list[Item] = Field(
+    bodies: list[ChainItem] = Field(
         min_length=1,
         max_length=MAX_BODIES,
         description="The chain, from the pivot outwards: bodies and runs.",
     )
 
     _text = field_validator("name", "family", "title", "purpose")(
-        lambda value: text(value) if value else value
+        lambda value: require_printable(value) if value else value
     )
 
     @field_validator("name", "family", "title")
     @classmethod
     def _one_line(cls, value: str | None) -> str | None:
         if value and (value != value.strip() or "\n" in value or "\t" in value):
-            raise invalid("has line breaks, tabs or blanks around it", "one line of text")
+            raise invalid_value_error("has line breaks, tabs or blanks around it", "one line of text")
         return value
 
     @field_validator("sample")
@@ -447,9 +457,11 @@ class Document(Part):
     def _sample(cls, value: float, info: ValidationInfo) -> float:
         count = info.data.get("duration", value) / value
         if abs(count - round(count)) > 1e-9 * count or round(count) < 1:
-            raise invalid(f"goes {count:.9g} times into the duration", "a time that divides the duration")
+            raise invalid_value_error(
+                f"goes {count:.9g} times into the duration", "a time that divides the duration"
+            )
         if count > MAX_SAMPLES:
-            raise invalid(f"makes {count:.3g} samples", f"at most {MAX_SAMPLES} samples")
+            raise invalid_value_error(f"makes {count:.3g} samples", f"at most {MAX_SAMPLES} samples")
         return value
 
 
@@ -473,19 +485,19 @@ def euler_quaternion(euler: Euler) -> Array:
     ]
     if order == "extrinsic":
         factors.reverse()
-    return unit_vector(multiply(multiply(factors[0], factors[1]), factors[2]).tolist())
+    return unit_vector(quaternion_product(quaternion_product(factors[0], factors[1]), factors[2]).tolist())
 
 
 def inertia_matrix(inertia: Inertia) -> Array:
     """(3, 3) kg m², symmetric to the bit."""
     if inertia.six is not None:
-        return symmetric(inertia.six)
+        return symmetric_matrix(inertia.six)
     if inertia.matrix is not None:
         matrix = np.array(inertia.matrix)
         return np.asarray((matrix + matrix.T) / 2)
     assert inertia.principal is not None  # the model has exactly one
     if inertia.axes is None:
         return np.diag(inertia.principal)
-    axes = rotation(attitude_quaternion(inertia.axes))
+    axes = rotation_matrix(attitude_quaternion(inertia.axes))
     matrix = axes @ np.diag(inertia.principal) @ axes.T
     return np.asarray((matrix + matrix.T) / 2)

@@ -10,60 +10,66 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from plumbline.scenario.errors import Problem, closest, nearest
-from plumbline.scenario.schema import SCHEMA_VERSION, Ball, Body, Document, Rod, Run
-from plumbline.scenario.yaml_source import Key, Source, dotted
+from plumbline.scenario.errors import Problem, closest_match, did_you_mean
+from plumbline.scenario.schema import SCHEMA_VERSION, Ball, Body, BodySequence, Document, Rod
+from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path
 
-TAGS: dict[str, type[BaseModel]] = {"ball": Ball, "rod": Rod, "body": Body, "run": Run}
+UNION_TAGS: dict[str, type[BaseModel]] = {"ball": Ball, "rod": Rod, "body": Body, "run": BodySequence}
 
 
-def translate(source: Source, errors: Iterable[ErrorDetails]) -> list[Problem]:
+def problems_from_validation(source: YamlSource, errors: Iterable[ErrorDetails]) -> list[Problem]:
     """One Problem for each of pydantic's errors; a field that is only misspelt is not missing besides."""
-    resolved = [(error, *_resolve(source, error["loc"])[:2]) for error in errors]
+    resolved = [(error, *_locate_field(source, error["loc"])[:2]) for error in errors]
     meant = {
-        (*path[:-1], closest(str(path[-1]), list(model.model_fields)))
+        (*path[:-1], closest_match(str(path[-1]), list(model.model_fields)))
         for error, path, model in resolved
         if error["type"] == "extra_forbidden"
     }
-    return [_problem(source, e) for e, path, _ in resolved if e["type"] != "missing" or path not in meant]
+    return [
+        _problem_from_error(source, e)
+        for e, path, _ in resolved
+        if e["type"] != "missing" or path not in meant
+    ]
 
 
-def _problem(source: Source, error: ErrorDetails) -> Problem:
-    path, model, info = _resolve(source, error["loc"])
+def _problem_from_error(source: YamlSource, error: ErrorDetails) -> Problem:
+    path, model, info = _locate_field(source, error["loc"])
     extra = error["type"] == "extra_forbidden"
-    place = source.keys.get(path) if extra else source.values.get(path)
-    place = place or source.values.get(path[:-1]) or (1, 1)
-    message, valid = _words(error, model, info)
-    return Problem(source.file, *place, dotted(path), message, valid)
+    place = source.key_positions.get(path) if extra else source.value_positions.get(path)
+    place = place or source.value_positions.get(path[:-1]) or (1, 1)
+    message, valid = _message_and_valid(error, model, info)
+    return Problem(source.file, *place, dotted_path(path), message, valid)
 
 
-def _resolve(
-    source: Source, loc: tuple[Key, ...]
-) -> tuple[tuple[Key, ...], type[BaseModel], FieldInfo | None]:
+def _locate_field(
+    source: YamlSource, loc: tuple[PathKey, ...]
+) -> tuple[tuple[PathKey, ...], type[BaseModel], FieldInfo | None]:
     """The path in the file, the model it lies in and the field; union tags are no part of it."""
-    path: tuple[Key, ...] = ()
+    path: tuple[PathKey, ...] = ()
     model: type[BaseModel] = Document
     info: FieldInfo | None = None
     for key in loc:
-        if isinstance(key, str) and key in TAGS and (*path, key) not in source.values:
-            model = TAGS[key]
+        if isinstance(key, str) and key in UNION_TAGS and (*path, key) not in source.value_positions:
+            model = UNION_TAGS[key]
             continue
         path = (*path, key)
         if isinstance(key, str):
             info = model.model_fields.get(key)
-            for inner in _models(info.annotation if info else None):
-                if inner not in TAGS.values() or inner is Body:
+            for inner in _models_in_annotation(info.annotation if info else None):
+                if inner not in UNION_TAGS.values() or inner is Body:
                     model = inner
     return path, model, info
 
 
-def _models(annotation: Any) -> list[type[BaseModel]]:
+def _models_in_annotation(annotation: Any) -> list[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
-    return [model for inner in get_args(annotation) for model in _models(inner)]
+    return [model for inner in get_args(annotation) for model in _models_in_annotation(inner)]
 
 
-def _words(error: ErrorDetails, model: type[BaseModel], info: FieldInfo | None) -> tuple[str, str]:
+def _message_and_valid(
+    error: ErrorDetails, model: type[BaseModel], info: FieldInfo | None
+) -> tuple[str, str]:
     """What is wrong and what would be valid."""
     kind, given, context = error["type"], error.get("input"), error.get("ctx", {})
     name = str(error["loc"][-1]) if error["loc"] else ""
@@ -71,10 +77,10 @@ def _words(error: ErrorDetails, model: type[BaseModel], info: FieldInfo | None) 
         case "plumbline":
             return str(context["message"]), str(context["valid"])
         case "missing":
-            return "is missing", _described(info)
+            return "is missing", _field_description(info)
         case "extra_forbidden":
             fields = list(model.model_fields)
-            return f"unknown field. {nearest(name, fields)}".strip(" ."), "one of " + ", ".join(fields)
+            return f"unknown field. {did_you_mean(name, fields)}".strip(" ."), "one of " + ", ".join(fields)
         case "literal_error" if name == "schema_version":
             return f"is {given!r}; this version of Plumbline reads {SCHEMA_VERSION}", str(SCHEMA_VERSION)
         case "literal_error":
@@ -82,19 +88,21 @@ def _words(error: ErrorDetails, model: type[BaseModel], info: FieldInfo | None) 
                 [o for arg in get_args(info.annotation) for o in (get_args(arg) or (arg,))] if info else []
             )
             words = [str(o) for o in options if isinstance(o, str)]
-            return f"is {given!r}. {nearest(str(given), words)}".strip(" ."), str(context.get("expected"))
+            return f"is {given!r}. {did_you_mean(str(given), words)}".strip(" ."), str(
+                context.get("expected")
+            )
         case "union_tag_not_found":
-            close = [k for k in given if nearest(k, ["kind"])] if isinstance(given, dict) else []
+            close = [k for k in given if did_you_mean(k, ["kind"])] if isinstance(given, dict) else []
             hint = f" ({close[0]!r} is not a field of it)" if close else ""
             return f"has no kind{hint}", "kind: ball or kind: rod"
         case "union_tag_invalid":
             return f"has the kind {context.get('tag')!r}", "kind: ball or kind: rod"
         case "int_type" | "int_from_float":
-            return f"is {_what(given)}, not a whole number", "a whole number"
+            return f"is {_describe_value(given)}, not a whole number", "a whole number"
         case "float_type":
-            return _not_a_number(given), _number(info)
+            return _describe_non_number(given), _number_phrase(info)
         case "finite_number":
-            return f"is {given!r}, not a finite number", _number(info)
+            return f"is {given!r}, not a finite number", _number_phrase(info)
         case "greater_than" | "greater_than_equal" | "less_than_equal":
             sign = {"greater_than": "above", "greater_than_equal": "at least", "less_than_equal": "at most"}[
                 kind
@@ -102,9 +110,9 @@ def _words(error: ErrorDetails, model: type[BaseModel], info: FieldInfo | None) 
             bound = context.get("gt", context.get("ge", context.get("le")))
             return f"is {given!r}", f"a number {sign} {bound:g}"
         case "model_type" | "model_attributes_type" | "dict_type" if not error["loc"]:
-            return f"is {_what(given)}", "a mapping that starts with schema_version: 1"
+            return f"is {_describe_value(given)}", "a mapping that starts with schema_version: 1"
         case "list_type" | "model_type" | "model_attributes_type" | "dict_type" | "string_type":
-            return f"is {_what(given)}", _described(info, kind)
+            return f"is {_describe_value(given)}", _field_description(info, kind)
         case "too_short" | "too_long":
             bound = context.get("min_length", context.get("max_length"))
             fixed = isinstance(given, list) and bound in (3, 4, 6)  # vectors, quaternions, six, matrix
@@ -119,18 +127,18 @@ def _words(error: ErrorDetails, model: type[BaseModel], info: FieldInfo | None) 
         case "string_pattern_mismatch":
             return f"is {given!r}", "intrinsic or extrinsic and three axes, as 'intrinsic zxz'"
         case _:
-            return error["msg"], _described(info)
+            return error["msg"], _field_description(info)
 
 
-def _not_a_number(given: Any) -> str:
+def _describe_non_number(given: Any) -> str:
     if isinstance(given, str) and re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", given):
         return f"is the text {given!r}, not a number: leave out the quotes"
     if isinstance(given, str) and (match := re.fullmatch(r"\s*([-+.\deE]*\d)\s*([^\d\s].*)", given)):
         return f"is the text {given!r}: write the number alone, {match[1]}, without {match[2]!r}"
-    return f"is {_what(given)}, not a number"
+    return f"is {_describe_value(given)}, not a number"
 
 
-def _what(given: Any) -> str:
+def _describe_value(given: Any) -> str:
     match given:
         case None:
             return "empty"
@@ -146,16 +154,16 @@ def _what(given: Any) -> str:
             return f"the number {given!r}"
 
 
-def _unit(info: FieldInfo | None) -> str:
+def _unit_suffix(info: FieldInfo | None) -> str:
     extra = info.json_schema_extra if info and isinstance(info.json_schema_extra, dict) else {}
     return f" in {extra['unit']}" if "unit" in extra else ""
 
 
-def _number(info: FieldInfo | None) -> str:
-    return f"a number{_unit(info)}"
+def _number_phrase(info: FieldInfo | None) -> str:
+    return f"a number{_unit_suffix(info)}"
 
 
-def _described(info: FieldInfo | None, kind: str = "") -> str:
+def _field_description(info: FieldInfo | None, kind: str = "") -> str:
     """The first sentence of the field's description, with its unit."""
     if info is None:
         return ""
@@ -163,4 +171,4 @@ def _described(info: FieldInfo | None, kind: str = "") -> str:
     shape = {"list_type": "a list: ", "string_type": "text: "}.get(
         kind, "a mapping: " if "model" in kind else ""
     )
-    return shape + sentence[:1].lower() + sentence[1:] + _unit(info)
+    return shape + sentence[:1].lower() + sentence[1:] + _unit_suffix(info)

@@ -27,146 +27,148 @@ MAX_DEPTH = 20
 TOO_DEEP = "is nested too deeply", f"at most {MAX_DEPTH} levels"
 TOO_MANY = f"has more than {MAX_NODES} values (aliases followed)", "fewer values; `repeat` makes long chains"
 
-Key = str | int
+PathKey = str | int
 Position = tuple[int, int]
 
 
 @dataclass
-class Source:
+class YamlSource:
     """Plain data of a YAML file and where each part of it stands (line and column from 1)."""
 
     file: str
     data: Any = None
-    values: dict[tuple[Key, ...], Position] = field(default_factory=dict)
-    keys: dict[tuple[Key, ...], Position] = field(default_factory=dict)
+    value_positions: dict[tuple[PathKey, ...], Position] = field(default_factory=dict)
+    key_positions: dict[tuple[PathKey, ...], Position] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
 
-    def stop(self, message: str, valid: str = "", at: Position = (0, 0)) -> ScenarioError:
+    def fatal_error(self, message: str, valid: str = "", at: Position = (0, 0)) -> ScenarioError:
         """The error of a file that cannot be read on."""
         return ScenarioError([Problem(self.file, *at, "", message, valid)])
 
 
-class _Stop(Exception):
+class _ParsingStopped(Exception):
     """(message, what is valid, mark) of a file that is not read on."""
 
 
-class _Composer(Composer):  # type: ignore[misc,unused-ignore]
+class _BoundedComposer(Composer):  # type: ignore[misc,unused-ignore]
     """Stops at once where a file is too deep or too large to be a scenario."""
 
-    nodes = depth = 0
+    node_count = depth = 0
 
     def compose_node(self, parent: Any, index: Any) -> Any:
-        self.nodes += 1
-        if self.nodes > MAX_NODES or self.depth > MAX_DEPTH:
+        self.node_count += 1
+        if self.node_count > MAX_NODES or self.depth > MAX_DEPTH:
             much, valid = TOO_DEEP if self.depth > MAX_DEPTH else TOO_MANY
-            raise _Stop(much, valid, self.parser.peek_event().start_mark)
+            raise _ParsingStopped(much, valid, self.parser.peek_event().start_mark)
         self.depth += 1
         node = super().compose_node(parent, index)
         self.depth -= 1
         return node
 
 
-def dotted(path: tuple[Key, ...]) -> str:
+def dotted_path(path: tuple[PathKey, ...]) -> str:
     """``bodies[0].mass`` of ("bodies", 0, "mass")."""
     return "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path).lstrip(".")
 
 
-def read(path: Path) -> Source:
+def read_yaml(path: Path) -> YamlSource:
     """Plain data of the file; raises ScenarioError where it is not readable YAML text."""
-    source = Source(str(path))
+    source = YamlSource(str(path))
     try:
         if not stat.S_ISREG(path.stat().st_mode):  # a pipe would wait, a device never end
-            raise source.stop("is not a regular file", "a YAML file")
+            raise source.fatal_error("is not a regular file", "a YAML file")
         with path.open("rb") as handle:
             raw = handle.read(MAX_BYTES + 1)
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         if isinstance(error, ScenarioError):
             raise
-        raise source.stop(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
+        raise source.fatal_error(f"cannot be read: {getattr(error, 'strerror', None) or error}") from None
     if len(raw) > MAX_BYTES:
-        raise source.stop(f"is larger than {MAX_BYTES} bytes", "a smaller file; `repeat` makes long chains")
+        raise source.fatal_error(
+            f"is larger than {MAX_BYTES} bytes", "a smaller file; `repeat` makes long chains"
+        )
     try:
         content = raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         before = raw[: error.start]
         at = before.count(b"\n") + 1, len(before.rpartition(b"\n")[2].decode("utf-8-sig", "replace")) + 1
-        raise source.stop(f"byte 0x{raw[error.start]:02x} is not UTF-8", "UTF-8 text", at) from None
-    return parse(source, content)
+        raise source.fatal_error(f"byte 0x{raw[error.start]:02x} is not UTF-8", "UTF-8 text", at) from None
+    return parse_yaml(source, content)
 
 
-def parse(source: Source, content: str) -> Source:
+def parse_yaml(source: YamlSource, content: str) -> YamlSource:
     """Fill in data, positions and problems from YAML text."""
     yaml = YAML(typ="safe", pure=True)
-    yaml.Composer = _Composer
+    yaml.Composer = _BoundedComposer
     try:
         root = yaml.compose(content)
-    except _Stop as stop:
+    except _ParsingStopped as stop:
         message, valid, mark = stop.args
-        raise source.stop(message, valid, (mark.line + 1, mark.column + 1)) from None
+        raise source.fatal_error(message, valid, (mark.line + 1, mark.column + 1)) from None
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         at = (mark.line + 1, mark.column + 1) if mark else (1, 1)
         said = error.problem or error.context or "not YAML"
         hint = "blanks: YAML has no tabs for indentation" if "'\\t'" in said else "YAML 1.2"
-        raise source.stop(said, hint, at) from None
+        raise source.fatal_error(said, hint, at) from None
     except ReaderError as error:
         before = content[: error.position]
         at = before.count("\n") + 1, len(before.rpartition("\n")[2]) + 1
         char = ord(error.character) if isinstance(error.character, str) else error.character
-        raise source.stop(
+        raise source.fatal_error(
             f"the character U+{char:04X} is not allowed in YAML", "printable text", at
         ) from None
     except (YAMLError, ValueError) as error:
-        raise source.stop(f"is not YAML: {error}", "YAML 1.2", (1, 1)) from None
+        raise source.fatal_error(f"is not YAML: {error}", "YAML 1.2", (1, 1)) from None
     if root is None or (isinstance(root, ScalarNode) and str(root.tag).endswith(":null")):
-        raise source.stop("is empty", "a mapping that starts with schema_version: 1", (1, 1))
+        raise source.fatal_error("is empty", "a mapping that starts with schema_version: 1", (1, 1))
     budget = [MAX_NODES]
-    source.data = _plain(source, root, (), budget)
+    source.data = _plain_data(source, root, (), budget)
     return source
 
 
-def _plain(source: Source, node: Node, path: tuple[Key, ...], budget: list[int]) -> Any:
+def _plain_data(source: YamlSource, node: Node, path: tuple[PathKey, ...], budget: list[int]) -> Any:
     at = node.start_mark.line + 1, node.start_mark.column + 1
     budget[0] -= 1
     if budget[0] < 0:
-        raise source.stop(*TOO_MANY, at)
+        raise source.fatal_error(*TOO_MANY, at)
     if len(path) > MAX_DEPTH:
-        raise source.stop(*TOO_DEEP, at)
-    source.values[path] = at
+        raise source.fatal_error(*TOO_DEEP, at)
+    source.value_positions[path] = at
     if isinstance(node, MappingNode):
         mapping: dict[str, Any] = {}
         for key_node, value_node in node.value:
             key = str(key_node.value) if isinstance(key_node, ScalarNode) else "?"
             key_at = key_node.start_mark.line + 1, key_node.start_mark.column + 1
             if key in mapping:
-                first = source.keys[(*path, key)][0]
+                first = source.key_positions[(*path, key)][0]
                 source.problems.append(
                     Problem(
                         source.file,
                         *key_at,
-                        dotted((*path, key)),
+                        dotted_path((*path, key)),
                         f"is given twice, first on line {first}",
                         "each field once",
                     )
                 )
                 continue
-            source.keys[(*path, key)] = key_at
-            mapping[key] = _plain(source, value_node, (*path, key), budget)
+            source.key_positions[(*path, key)] = key_at
+            mapping[key] = _plain_data(source, value_node, (*path, key), budget)
             if value_node.start_mark.index == value_node.end_mark.index:  # nothing stands there: show the key
-                source.values[(*path, key)] = key_at
+                source.value_positions[(*path, key)] = key_at
         return mapping
     if isinstance(node, SequenceNode):
-        return [_plain(source, item, (*path, index), budget) for index, item in enumerate(node.value)]
-    return _scalar(source, node, path, at)
+        return [_plain_data(source, item, (*path, index), budget) for index, item in enumerate(node.value)]
+    return _scalar_value(source, node, path, at)
 
 
-def _scalar(source: Source, node: Node, path: tuple[Key, ...], at: Position) -> Any:
+def _scalar_value(source: YamlSource, node: Node, path: tuple[PathKey, ...], at: Position) -> Any:
     written, kind = str(node.value), str(node.tag).rpartition(":")[2]
     if not str(node.tag).startswith("tag:yaml.org,2002:"):
         kind = "tag"
     if kind in ("int", "float"):
         try:
-            return _number(written)
+            return _parse_number(written)
         except ValueError:  # the tag says a number, the text does not
             return written
     if kind == "bool":
@@ -175,12 +177,14 @@ def _scalar(source: Source, node: Node, path: tuple[Key, ...], at: Position) -> 
         return None
     if kind not in ("str", "timestamp", "value", "merge"):
         source.problems.append(
-            Problem(source.file, *at, dotted(path), f"has the tag {node.tag}", "a plain value without a tag")
+            Problem(
+                source.file, *at, dotted_path(path), f"has the tag {node.tag}", "a plain value without a tag"
+            )
         )
     return written
 
 
-def _number(written: str) -> int | float:
+def _parse_number(written: str) -> int | float:
     """A YAML 1.2 number; whole ones beyond 2^53 become floats, since no field holds them otherwise."""
     digits = written.replace("_", "").lower()
     if match := re.fullmatch(r"([-+]?)(0x[0-9a-f]+|0o[0-7]+)", digits):

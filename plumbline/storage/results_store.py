@@ -24,34 +24,43 @@ from plumbline.judging.rows import Columns
 from plumbline.model.datatypes import Row
 
 SCHEMA_VERSION = 1
+# Fields of Row by their names in stored results.
+STORED_NAMES = {
+    "compared_until": "horizon",
+    "known_issue": "known",
+    "user_rtol": "accept",
+    "cpu_time": "wall_time",
+}
 TEXT = pa.string()
 REAL = pa.float64()
-WHOLE = pa.int32()
-GROUP = 8_192  # records encoded together: what waits is small
-PARTS = 32  # tables of a few records that wait apart: each is tens of kilobytes besides its records
+INTEGER = pa.int32()
+ROW_GROUP_SIZE = 8_192  # records encoded together: what waits is small
+MAX_WAITING_TABLES = (
+    32  # tables of a few records that wait apart: each is tens of kilobytes besides its records
+)
 
 
 def _schema(**columns: pa.DataType) -> pa.Schema:
     return pa.schema(list(columns.items()))
 
 
-_CELL = {"scenario": TEXT, "engine": TEXT}
-_RUN = {**_CELL, "integrator": TEXT, "resolution": REAL}
+_CELL_COLUMNS = {"scenario": TEXT, "engine": TEXT}
+_RUN_COLUMNS = {**_CELL_COLUMNS, "integrator": TEXT, "resolution": REAL}
 TABLES: dict[str, pa.Schema] = {
     "summary": _schema(
         key=TEXT, scenario=TEXT, family=TEXT, engine=TEXT, engine_version=TEXT, level=TEXT, integrator=TEXT,
         quantity=TEXT, unit=TEXT, value=REAL, tolerance=REAL, verdict=TEXT, reason=TEXT, derivation=TEXT,
-        uncertainty=REAL, horizon=REAL, order=REAL, declared_order=WHOLE, alias_of=TEXT, known=TEXT,
+        uncertainty=REAL, horizon=REAL, order=REAL, declared_order=INTEGER, alias_of=TEXT, known=TEXT,
         diagnosis=TEXT, accept=REAL, wall_time=REAL, extra=TEXT,
     ),
-    "states": _schema(**_CELL, quantity=TEXT, state=WHOLE, body=WHOLE, error=REAL, bound=REAL, scale=REAL),
-    "convergence": _schema(**_RUN, quantity=TEXT, error=REAL, cost=REAL, steps=WHOLE, order=REAL),
+    "states": _schema(**_CELL_COLUMNS, quantity=TEXT, state=INTEGER, body=INTEGER, error=REAL, bound=REAL, scale=REAL),
+    "convergence": _schema(**_RUN_COLUMNS, quantity=TEXT, error=REAL, cost=REAL, steps=INTEGER, order=REAL),
     "curves": _schema(
-        **_RUN, t=REAL, position_error=REAL, attitude_error=REAL, limit_error=REAL, tolerance=REAL,
+        **_RUN_COLUMNS, t=REAL, position_error=REAL, attitude_error=REAL, limit_error=REAL, tolerance=REAL,
         energy_drift=REAL, momentum_drift=REAL, joint_gap=REAL, gap_rate=REAL, norm_drift=REAL,
     ),
     "trajectories": _schema(
-        **_RUN, t=REAL, body=WHOLE, rx=REAL, ry=REAL, rz=REAL, p0=REAL, p1=REAL, p2=REAL, p3=REAL
+        **_RUN_COLUMNS, t=REAL, body=INTEGER, rx=REAL, ry=REAL, rz=REAL, p0=REAL, p1=REAL, p2=REAL, p3=REAL
     ),
 }  # fmt: skip
 
@@ -72,23 +81,23 @@ def write_atomically(path: Path, data: bytes) -> None:
         raise
 
 
-def plain(value: Any) -> Any:
+def to_json_value(value: Any) -> Any:
     """JSON has no NaN or infinity: they become null, everywhere below ``value``."""
     if isinstance(value, float) and not (-float("inf") < value < float("inf")):
         return None
     if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_json_value(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [to_json_value(item) for item in value]
     return value
 
 
 def row_record(row: Row) -> dict[str, Any]:
     """A row as results.json holds it."""
-    return {"key": row.key, **plain(vars(row))}
+    return {"key": row.key, **to_json_value({STORED_NAMES.get(k, k): v for k, v in vars(row).items()})}
 
 
-class Tables:
+class ResultTables:
     """The tables of a run, encoded as they come: ten thousand cells take a few megabytes.
 
     Parquet in zstd, floats split by byte, in row groups of `GROUP` records.
@@ -110,9 +119,9 @@ class Tables:
         ]
         waiting = self._waiting.setdefault(name, [])
         waiting.append(pa.Table.from_arrays(arrays, schema=schema))
-        if sum(map(len, waiting)) >= GROUP:
+        if sum(map(len, waiting)) >= ROW_GROUP_SIZE:
             self._encode(name)
-        elif len(waiting) >= PARTS:
+        elif len(waiting) >= MAX_WAITING_TABLES:
             waiting[:] = [pa.concat_tables(waiting).combine_chunks()]
 
     def add_rows(self, rows: Iterable[Row]) -> None:
@@ -120,13 +129,14 @@ class Tables:
         kept = list(rows)
         if kept:
             columns: Columns = {
-                name: [getattr(row, name) for row in kept] for name in TABLES["summary"].names
+                STORED_NAMES.get(name, name): [getattr(row, name) for row in kept]
+                for name in ("key", *vars(kept[0]))
             }
             for field in TABLES["summary"]:
                 if field.type == REAL:
                     column = columns[field.name]
                     columns[field.name] = [x if x is not None and math.isfinite(x) else None for x in column]
-            columns["extra"] = [json.dumps(plain(extra)) for extra in columns["extra"]]
+            columns["extra"] = [json.dumps(to_json_value(extra)) for extra in columns["extra"]]
             self.add("summary", columns)
 
     def _encode(self, name: str) -> None:
@@ -140,9 +150,9 @@ class Tables:
                 column_encoding={f.name: "BYTE_STREAM_SPLIT" for f in schema if f.type == REAL},
             )
             self._files[name] = sink, writer
-        self._files[name][1].write_table(pa.concat_tables(self._waiting.pop(name, [])), GROUP)
+        self._files[name][1].write_table(pa.concat_tables(self._waiting.pop(name, [])), ROW_GROUP_SIZE)
 
-    def write(self, folder: Path) -> None:
+    def write_parquet(self, folder: Path) -> None:
         """Write each as FOLDER/NAME.parquet; nothing can be added any more."""
         for name in TABLES:
             if name in self._waiting or name not in self._files:
@@ -159,17 +169,17 @@ def read_table(folder: Path, name: str) -> list[dict[str, Any]]:
     return records
 
 
-def write(
+def write_results(
     folder: Path,
     run: dict[str, Any],
     scenarios: dict[str, Any],
     engines: dict[str, Any],
     rows: Sequence[Row],
-    tables: Tables,
+    tables: ResultTables,
 ) -> None:
     """Write one run's results; the summary in ``tables`` holds ``rows`` and may hold more (of probes)."""
     folder.mkdir(parents=True, exist_ok=True)
-    tables.write(folder)
+    tables.write_parquet(folder)
     document = {
         "schema_version": SCHEMA_VERSION,
         "run": run,
@@ -178,11 +188,11 @@ def write(
         "rows": [row_record(row) for row in rows],
     }
     # results.json last: its presence says that the folder is complete
-    text = json.dumps(plain(document), ensure_ascii=False, indent=1)
+    text = json.dumps(to_json_value(document), ensure_ascii=False, indent=1)
     write_atomically(folder / "results.json", text.encode())
 
 
-def read(folder: Path) -> dict[str, Any]:
+def read_results(folder: Path) -> dict[str, Any]:
     """The document of results.json; ValueError where it is not one of this schema."""
     path = folder / "results.json"
     try:

@@ -14,9 +14,9 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from plumbline.model.kinematics import rate
+from plumbline.model.kinematics import quaternion_rate
 from plumbline.scenario.loader import Scenario
-from plumbline.storage.results_store import plain, write_atomically
+from plumbline.storage.results_store import to_json_value, write_atomically
 from reference_impl.chain import Chain
 from reference_impl.stabilised import VARIANTS, drift_table
 
@@ -38,25 +38,25 @@ SCHEMA = pa.schema(
 )
 
 
-def table(
-    chosen: Sequence[Scenario],
-    longest: float,
+def measure_drift(
+    selected_scenarios: Sequence[Scenario],
+    max_cpu_seconds: float,
     rtols: Sequence[float],
     times: Sequence[float] = TIMES,
     progress: Callable[[int, int, str], None] = lambda done, total, what: None,
-    tell: Callable[[str], None] = lambda sentence: None,
+    log: Callable[[str], None] = lambda sentence: None,
 ) -> pa.Table:
     """One row per scenario, variant, rtol and time (columns as `SCHEMA`).
 
     ``longest`` CPU seconds may be spent on one run; ``tell`` hears what each will cost.
     """
-    asked = [(s, variant, rtol) for s in chosen for rtol in rtols for variant in VARIANTS]
+    asked = [(s, variant, rtol) for s in selected_scenarios for rtol in rtols for variant in VARIANTS]
     records: list[dict[str, Any]] = []
     for done, (s, variant, rtol) in enumerate(asked):
         progress(done, len(asked), f"{s.name}, {variant}, rtol {rtol:g}")
-        records += _run(s, variant, rtol, longest, times, tell)
+        records += _measure_variant(s, variant, rtol, max_cpu_seconds, times, log)
     progress(len(asked), len(asked), "done")
-    return pa.Table.from_pylist([plain(record) for record in records], schema=SCHEMA)
+    return pa.Table.from_pylist([to_json_value(record) for record in records], schema=SCHEMA)
 
 
 def write(found: pa.Table, folder: Path) -> Path:
@@ -68,17 +68,17 @@ def write(found: pa.Table, folder: Path) -> Path:
     return path
 
 
-def _run(
+def _measure_variant(
     s: Scenario,
     variant: str,
     rtol: float,
-    longest: float,
+    max_cpu_seconds: float,
     times: Sequence[float],
-    tell: Callable[[str], None],
+    log: Callable[[str], None],
 ) -> Iterator[dict[str, Any]]:
     """The rows of one variant at one tolerance: first to the first time, then to the last affordable one."""
     key = {"scenario": s.name, "variant": variant, "rtol": rtol}
-    start = _chain(s), s.state.r, s.state.p, s.state.v, rate(s.state.p, s.state.omega)
+    start = _notes_chain(s), s.state.r, s.state.p, s.state.v, quaternion_rate(s.state.p, s.state.omega)
     within: Sequence[float] = times[:1]
     reasons = dict.fromkeys(times, "")
     try:
@@ -86,14 +86,14 @@ def _run(
         found = drift_table(*start, rtols=(rtol,), times=within, variants=(variant,))
         spent = process_time() - began
         foreseen = {time: spent * time / times[0] for time in times}
-        affordable = [time for time in times if foreseen[time] <= longest] or times[:1]
+        affordable = [time for time in times if foreseen[time] <= max_cpu_seconds] or times[:1]
         for time in times[len(affordable) :]:
             reasons[time] = (
-                f"left out: would cost {foreseen[time]:.0f} s, more than the {longest:g} s allowed"
+                f"left out: would cost {foreseen[time]:.0f} s, more than the {max_cpu_seconds:g} s allowed"
             )
         if len(affordable) > 1:
             what = f"{s.name}, {variant}, rtol {rtol:g}"
-            tell(f"{what}: to {affordable[-1]:g} s, about {foreseen[affordable[-1]]:.0f} s of CPU time")
+            log(f"{what}: to {affordable[-1]:g} s, about {foreseen[affordable[-1]]:.0f} s of CPU time")
             began, within = process_time(), affordable
             found = drift_table(*start, rtols=(rtol,), times=within, variants=(variant,))
             spent = process_time() - began
@@ -114,7 +114,7 @@ def _run(
         yield key | {"time": time, "reason": reasons[time]}
 
 
-def _chain(s: Scenario) -> Chain:
-    from adapters.reference_engine import chain
+def _notes_chain(s: Scenario) -> Chain:
+    from adapters.reference_engine import notes_chain
 
-    return chain(s.model)
+    return notes_chain(s.model)

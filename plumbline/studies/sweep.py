@@ -34,31 +34,31 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from pydantic import Field, ValidationError
 
-from plumbline.engines.calls import Climb, climb
-from plumbline.engines.registry import ENGINES, adapter
+from plumbline.engines.calls import RefinementStudy, run_refinement
+from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.judging.convergence import romberg
 from plumbline.model.datatypes import Array, Trajectory
-from plumbline.model.invariants import attitude_error, invariants, position_error
-from plumbline.model.kinematics import rate
-from plumbline.model.sampling import seed_of
-from plumbline.processes.workers import Limits, Task, Workers
+from plumbline.model.invariants import attitude_error, compute_invariants, position_error
+from plumbline.model.kinematics import quaternion_rate
+from plumbline.model.sampling import derive_seed
+from plumbline.processes.workers import Limits, Task, WorkerPool
 from plumbline.scenario import loader as scenarios
 from plumbline.scenario.errors import Problem, ScenarioError
 from plumbline.scenario.loader import Scenario
-from plumbline.scenario.schema import Part
-from plumbline.scenario.yaml_source import Key, Source, read
-from plumbline.storage.results_store import plain, write_atomically
+from plumbline.scenario.schema import SchemaModel
+from plumbline.scenario.yaml_source import PathKey, YamlSource, read_yaml
+from plumbline.storage.results_store import to_json_value, write_atomically
 from reference_impl import collocation
 from reference_impl.chain import Chain
 
-RTOLS = (1e-9, 1e-11)  # of the reference: the run and the yardstick of its uncertainty
-HALVINGS = 4
-MOST_CELLS = 100_000
+REFERENCE_RTOLS = (1e-9, 1e-11)  # of the reference: the run and the yardstick of its uncertainty
+REFINEMENT_LEVELS = 4
+MAX_CELLS = 100_000
 
-Reference = tuple[Trajectory, Array]  # a cell's motion, and its uncertainty (T,) in m
+ReferenceMotion = tuple[Trajectory, Array]  # a cell's motion, and its uncertainty (T,) in m
 
 
-class Axis(Part):
+class Axis(SchemaModel):
     """How one field varies: exactly one of `from`/`to`/`points`, `values` (grid), or a distribution."""
 
     start: float | None = Field(None, alias="from")
@@ -70,7 +70,7 @@ class Axis(Part):
     normal: tuple[float, float] | None = None
     log_uniform: tuple[float, float] | None = None
 
-    def grid(self) -> list[float] | None:
+    def grid_values(self) -> list[float] | None:
         """The grid's values, or None for a distribution."""
         if self.values is not None:
             return self.values
@@ -79,7 +79,7 @@ class Axis(Part):
         spaced = np.geomspace if self.log else np.linspace
         return [float(x) for x in spaced(self.start, self.to, self.points)]
 
-    def draw(self, rng: np.random.Generator) -> float:
+    def sample(self, rng: np.random.Generator) -> float:
         """One value of the distribution."""
         if self.normal is not None:
             return float(rng.normal(*self.normal))
@@ -88,7 +88,7 @@ class Axis(Part):
         assert self.log_uniform is not None
         return float(np.exp(rng.uniform(*np.log(self.log_uniform))))
 
-    def problem(self) -> str:
+    def validation_error(self) -> str:
         """What is wrong with it, or an empty string."""
         ranged = [self.start, self.to, self.points]
         ways = [self.values, self.uniform, self.normal, self.log_uniform]
@@ -108,13 +108,13 @@ class Axis(Part):
         return ""
 
 
-class Sweep(Part):
+class Sweep(SchemaModel):
     """A sweep file."""
 
     schema_version: int
     scenario: str
     vary: dict[str, Axis] = Field(min_length=1)
-    count: int = Field(1, ge=1, le=MOST_CELLS)
+    count: int = Field(1, ge=1, le=MAX_CELLS)
     seed: int = Field(0, ge=0)
     duration: float | None = Field(None, gt=0, le=1000)
     engines: dict[str, str] = Field(default_factory=dict)
@@ -122,89 +122,99 @@ class Sweep(Part):
 
 
 @dataclass(frozen=True, eq=False)
-class Cell:
+class SweepCell:
     """One pendulum of the sweep; ``scenario`` None where its values make none, and ``refused`` why."""
 
     index: int
     values: dict[str, float]
     scenario: Scenario | None
-    refused: str = ""
+    invalid_reason: str = ""
 
 
-def load(path: Path) -> tuple[Sweep, list[Cell]]:
+def load(path: Path) -> tuple[Sweep, list[SweepCell]]:
     """The sweep of a file and all its cells; ScenarioError with every problem of the file."""
-    source = read(path)
+    source = read_yaml(path)
     problems = list(source.problems)
     try:
-        sweep = Sweep.model_validate(_lax(source.data))
+        sweep = Sweep.model_validate(_coerce_types(source.data))
     except ValidationError as error:
         for e in error.errors():
-            at = _position(source, e["loc"])
+            at = _source_position(source, e["loc"])
             field = ".".join(str(key) for key in e["loc"])
             problems.append(Problem(source.file, *at, field, e["msg"].lower()))
         raise ScenarioError(problems) from None
     if sweep.schema_version != 1:
         problems.append(
-            Problem(source.file, *_position(source, ("schema_version",)), "schema_version", "is not 1")
+            Problem(source.file, *_source_position(source, ("schema_version",)), "schema_version", "is not 1")
         )
     for name, axis in sweep.vary.items():
-        if axis.problem():
-            problems.append(Problem(source.file, *_position(source, ("vary", name)), name, axis.problem()))
+        if axis.validation_error():
+            problems.append(
+                Problem(source.file, *_source_position(source, ("vary", name)), name, axis.validation_error())
+            )
     problems += _engine_problems(source, sweep)
     beside = path.parent / sweep.scenario
     try:
-        base = scenarios.load(beside if beside.is_file() else scenarios.find(sweep.scenario))
+        base = scenarios.load_scenario(
+            beside if beside.is_file() else scenarios.find_scenario_file(sweep.scenario)
+        )
     except ScenarioError as error:
         raise ScenarioError([*problems, *error.problems]) from None
     for name in sweep.vary:
         try:
-            if not isinstance(_get(base.document, _keys(name)), int | float):
+            if not isinstance(_get_field(base.document, _parse_field_path(name)), int | float):
                 raise LookupError
         except LookupError:
-            at = _position(source, ("vary", name))
+            at = _source_position(source, ("vary", name))
             message, valid = (
                 f"is no number of {base.name}",
                 "a field as `bodies[0].mass`, written in the scenario",
             )
             problems.append(Problem(source.file, *at, name, message, valid))
-    size = sweep.count if any(a.grid() is None for a in sweep.vary.values() if not a.problem()) else 1
+    size = (
+        sweep.count
+        if any(a.grid_values() is None for a in sweep.vary.values() if not a.validation_error())
+        else 1
+    )
     for axis in sweep.vary.values():
-        size *= 1 if axis.problem() else len(axis.grid() or [0])
-    if size > MOST_CELLS:
-        problems.append(Problem(source.file, 1, 1, "", f"has {size} cells", f"at most {MOST_CELLS}"))
+        size *= 1 if axis.validation_error() else len(axis.grid_values() or [0])
+    if size > MAX_CELLS:
+        problems.append(Problem(source.file, 1, 1, "", f"has {size} cells", f"at most {MAX_CELLS}"))
     if problems:
         raise ScenarioError(problems)
-    return sweep, list(_cells(sweep, base))
+    return sweep, list(_make_cells(sweep, base))
 
 
-def _cells(sweep: Sweep, base: Scenario) -> Iterator[Cell]:
-    grids = {name: grid for name, axis in sweep.vary.items() if (grid := axis.grid()) is not None}
+def _make_cells(sweep: Sweep, base: Scenario) -> Iterator[SweepCell]:
+    grids = {name: grid for name, axis in sweep.vary.items() if (grid := axis.grid_values()) is not None}
     drawn = {name: axis for name, axis in sweep.vary.items() if name not in grids}
     index = 0
     for point in itertools.product(*grids.values()):
         for _ in range(sweep.count if drawn else 1):
-            rng = np.random.default_rng(seed_of("sweep", str(sweep.seed), str(index)))
-            values = dict(zip(grids, point, strict=True)) | {n: a.draw(rng) for n, a in drawn.items()}
+            rng = np.random.default_rng(derive_seed("sweep", str(sweep.seed), str(index)))
+            values = dict(zip(grids, point, strict=True)) | {n: a.sample(rng) for n, a in drawn.items()}
             document = copy.deepcopy(base.document)
             for name, value in values.items():
-                *keys, last = _keys(name)
-                _get(document, tuple(keys))[last] = value
+                *keys, last = _parse_field_path(name)
+                _get_field(document, tuple(keys))[last] = value
             document["name"] = f"{base.name[:60]}-{index}"
             if sweep.duration is not None:
                 document["duration"] = sweep.duration
             try:
-                yield Cell(index, values, scenarios._build(Source(base.path.name, document), base.path))
+                yield SweepCell(
+                    index, values, scenarios.build_scenario(YamlSource(base.path.name, document), base.path)
+                )
             except ScenarioError as error:
                 sentence = "; ".join(f"{p.field} {p.message}" for p in error.problems)
-                yield Cell(index, values, None, sentence)
+                yield SweepCell(index, values, None, sentence)
             index += 1
 
 
 def run(
     sweep: Sweep,
-    cells: Sequence[Cell],
+    cells: Sequence[SweepCell],
     jobs: int = 1,
-    tell: Callable[[int, int], None] = lambda done, all_: None,
+    progress: Callable[[int, int], None] = lambda done, all_: None,
 ) -> pa.Table:
     """All cells on the reference and, cell by cell in worker processes, on the sweep's engines.
 
@@ -212,28 +222,35 @@ def run(
     and its uncertainty, drifts, and a verdict with its sentence.
     """
     records: list[dict[str, Any]] = []
-    references: dict[int, Reference] = {}
-    for group in _alike(cells):
-        records += _batch(group, references)
+    references: dict[int, ReferenceMotion] = {}
+    for group in _group_by_sampling(cells):
+        records += _run_reference_batch(group, references)
     records += [
-        {"cell": c.index, "implementation": "reference", "verdict": "unsupported", "reason": c.refused}
+        {"cell": c.index, "implementation": "reference", "verdict": "unsupported", "reason": c.invalid_reason}
         for c in cells
         if c.scenario is None
     ]
     tasks = [
-        Task((cell.index, engine, name), _climb, (engine, name, cell.scenario, sweep.step), Limits())
+        Task(
+            (cell.index, engine, name),
+            _run_engine_refinement,
+            (engine, name, cell.scenario, sweep.step),
+            Limits(),
+        )
         for cell in cells
         if cell.scenario is not None and cell.index in references
         for engine, name in sweep.engines.items()
     ]
     by_index = {cell.index: cell for cell in cells}
     if tasks:
-        with Workers(jobs) as workers:
+        with WorkerPool(jobs) as workers:
             for done, outcome in enumerate(workers.run(tasks), start=1):
                 index, engine, name = outcome.key
                 cell = by_index[index]
-                records.append(_judge(cell, engine, name, outcome.value, outcome.lost, references[index]))
-                tell(done, len(tasks))
+                records.append(
+                    _judge_cell(cell, engine, name, outcome.value, outcome.failure, references[index])
+                )
+                progress(done, len(tasks))
     for record in records:
         record |= by_index[record["cell"]].values
     records.sort(key=lambda record: (record["cell"], record["implementation"] != "reference"))
@@ -242,7 +259,7 @@ def run(
         [(name, COLUMNS.get(name, pa.float64())) for name in names],
         metadata={"sweep": sweep.model_dump_json(by_alias=True)},
     )
-    return pa.Table.from_pylist([plain(record) for record in records], schema=schema)
+    return pa.Table.from_pylist([to_json_value(record) for record in records], schema=schema)
 
 
 COLUMNS: dict[str, pa.DataType] = {
@@ -275,26 +292,30 @@ def write(table: pa.Table, folder: Path) -> Path:
     return path
 
 
-def _alike(cells: Sequence[Cell]) -> Iterator[list[tuple[Cell, Scenario]]]:
+def _group_by_sampling(cells: Sequence[SweepCell]) -> Iterator[list[tuple[SweepCell, Scenario]]]:
     """Cells of one sampling, which run as one batch; a varied duration or sample makes several."""
-    groups: dict[tuple[float, float], list[tuple[Cell, Scenario]]] = defaultdict(list)
+    groups: dict[tuple[float, float], list[tuple[SweepCell, Scenario]]] = defaultdict(list)
     for cell in cells:
         if cell.scenario is not None:
-            groups[cell.scenario.duration, cell.scenario.sample].append((cell, cell.scenario))
+            groups[cell.scenario.duration, cell.scenario.sample_interval].append((cell, cell.scenario))
     yield from groups.values()
 
 
-def _batch(group: Sequence[tuple[Cell, Scenario]], references: dict[int, Reference]) -> list[dict[str, Any]]:
+def _run_reference_batch(
+    group: Sequence[tuple[SweepCell, Scenario]], references: dict[int, ReferenceMotion]
+) -> list[dict[str, Any]]:
     """The reference's rows; a batch that stops is run again cell by cell, so that one cell is lost."""
-    chains = [_chain(s) for _, s in group]
+    chains = [_notes_chain(s) for _, s in group]
     r, p, v = (np.concatenate([getattr(s.state, name) for _, s in group]) for name in ("r", "p", "v"))
-    pdot = np.concatenate([rate(s.state.p, s.state.omega) for _, s in group])
+    pdot = np.concatenate([quaternion_rate(s.state.p, s.state.omega) for _, s in group])
     times = group[0][1].times
     try:
-        coarse, fine = (collocation.integrate(chains, r, p, v, pdot, times, rtol) for rtol in RTOLS)
+        coarse, fine = (
+            collocation.integrate_collocation(chains, r, p, v, pdot, times, rtol) for rtol in REFERENCE_RTOLS
+        )
     except ArithmeticError as error:
         if len(group) > 1:
-            return [record for one in group for record in _batch([one], references)]
+            return [record for one in group for record in _run_reference_batch([one], references)]
         cell = group[0][0]
         return [
             {"cell": cell.index, "implementation": "reference", "verdict": "failed", "reason": str(error)}
@@ -317,14 +338,14 @@ def _batch(group: Sequence[tuple[Cell, Scenario]], references: dict[int, Referen
                 "verdict": "agrees",
                 "reason": "the reference; its uncertainty is the change to the tighter tolerance",
                 "uncertainty": float(uncertainty[-1]),
-                **_measures(scenario, held[1]),
+                **_measure_motion(scenario, held[1]),
             }
         )
     return records
 
 
-def _measures(scenario: Scenario, motion: Trajectory) -> dict[str, Any]:
-    kept = invariants(scenario.model, motion)
+def _measure_motion(scenario: Scenario, motion: Trajectory) -> dict[str, Any]:
+    kept = compute_invariants(scenario.model, motion)
     x, y, z = (float(c) for c in motion.r[-1, -1])
     return {
         "energy_drift": float(np.max(np.abs(kept.energy_drift))),
@@ -337,27 +358,29 @@ def _measures(scenario: Scenario, motion: Trajectory) -> dict[str, Any]:
     }
 
 
-def _climb(engine: str, integrator: str, scenario: Scenario, step: float) -> Climb | str:
+def _run_engine_refinement(
+    engine: str, integrator: str, scenario: Scenario, step: float
+) -> RefinementStudy | str:
     """In a worker: the engine at four halvings of the largest step up to ``step`` that hits every sample.
 
     A sentence where the engine is not installed.
     """
-    coarse = scenario.sample / np.ceil(scenario.sample / step * (1 - 1e-12))
+    coarse = scenario.sample_interval / np.ceil(scenario.sample_interval / step * (1 - 1e-12))
     try:
-        kind = adapter(engine).integrator(integrator).kind
+        kind = load_adapter(engine).integrator(integrator).kind
     except ImportError as error:
         return f"{engine} is not installed here: {error}"
-    ladder = [coarse / 2**k for k in range(HALVINGS)] if kind == "step" else [1e-7, 1e-9, 1e-11]
-    return climb(engine, integrator, scenario.model, scenario.state, scenario.times, ladder)
+    ladder = [coarse / 2**k for k in range(REFINEMENT_LEVELS)] if kind == "step" else [1e-7, 1e-9, 1e-11]
+    return run_refinement(engine, integrator, scenario.model, scenario.state, scenario.times, ladder)
 
 
-def _judge(
-    cell: Cell,
+def _judge_cell(
+    cell: SweepCell,
     engine: str,
     name: str,
-    found: Climb | str | None,
+    found: RefinementStudy | str | None,
     lost: str | None,
-    truth: Reference,
+    truth: ReferenceMotion,
 ) -> dict[str, Any]:
     """The engine's row: its limit against the reference, within both uncertainties."""
     assert cell.scenario is not None
@@ -367,13 +390,13 @@ def _judge(
     if found is None or found.unsupported:
         verdict = "unsupported" if found else "failed"
         return record | {"verdict": verdict, "reason": found.unsupported if found else lost}
-    runs = [rung.trajectory for rung in found.rungs if rung.trajectory is not None]
-    if len(runs) < 3 or found.rungs[-1].trajectory is None:
-        words = next((rung.failure for rung in found.rungs if rung.failure), "fewer than three finite runs")
+    runs = [rung.trajectory for rung in found.runs if rung.trajectory is not None]
+    if len(runs) < 3 or found.runs[-1].trajectory is None:
+        words = next((rung.failure for rung in found.runs if rung.failure), "fewer than three finite runs")
         return record | {"verdict": "failed", "reason": words}
     reference, own = truth
-    method = adapter(engine).integrator(name)
-    limit = romberg([motion.r for motion in runs], method.powers)
+    method = load_adapter(engine).integrator(name)
+    limit = romberg([motion.r for motion in runs], method.error_exponents)
     error = position_error(limit.y, reference.r)
     allowed = limit.uncertainty + own
     # A mistake of one part in 10⁴ moves the pendulum by about that part of its own way.
@@ -393,24 +416,24 @@ def _judge(
         "attitude_error": float(np.max(attitude_error(runs[-1].p, reference.p))),
         "uncertainty": float(allowed[-1]),
         "finest_error": float(np.max(position_error(runs[-1].r, reference.r))),
-        **_measures(cell.scenario, runs[-1]),
+        **_measure_motion(cell.scenario, runs[-1]),
     }
 
 
-def _chain(scenario: Scenario) -> Chain:
-    from adapters.reference_engine import chain
+def _notes_chain(scenario: Scenario) -> Chain:
+    from adapters.reference_engine import notes_chain
 
-    return chain(scenario.model)
+    return notes_chain(scenario.model)
 
 
-def _keys(name: str) -> tuple[Key, ...]:
+def _parse_field_path(name: str) -> tuple[PathKey, ...]:
     """("bodies", 0, "mass") of ``bodies[0].mass``; LookupError where it is not written so."""
     if not re.fullmatch(r"\w+(\[\d+\]|\.\w+)*", name):
         raise LookupError(name)
     return tuple(int(part) if part.isdigit() else part for part in re.findall(r"\w+", name))
 
 
-def _get(document: Any, keys: tuple[Key, ...]) -> Any:
+def _get_field(document: Any, keys: tuple[PathKey, ...]) -> Any:
     for key in keys:
         if isinstance(document, dict) or (isinstance(document, list) and isinstance(key, int)):
             document = document[key]  # type: ignore[index]
@@ -419,14 +442,14 @@ def _get(document: Any, keys: tuple[Key, ...]) -> Any:
     return document
 
 
-def _engine_problems(source: Source, sweep: Sweep) -> Iterator[Problem]:
+def _engine_problems(source: YamlSource, sweep: Sweep) -> Iterator[Problem]:
     for engine, name in sweep.engines.items():
-        at = _position(source, ("engines", engine))
+        at = _source_position(source, ("engines", engine))
         if engine not in ENGINES:
             yield Problem(source.file, *at, f"engines.{engine}", "is no engine", ", ".join(ENGINES))
             continue
         try:
-            known = [i.name for i in adapter(engine).integrators]
+            known = [i.name for i in load_adapter(engine).integrators]
         except ImportError:
             continue  # a verdict, not an error
         if name not in known:
@@ -435,14 +458,14 @@ def _engine_problems(source: Source, sweep: Sweep) -> Iterator[Problem]:
             )
 
 
-def _position(source: Source, loc: Sequence[Any]) -> tuple[int, int]:
+def _source_position(source: YamlSource, loc: Sequence[Any]) -> tuple[int, int]:
     path = tuple(loc)
-    while path and path not in source.values:
+    while path and path not in source.value_positions:
         path = path[:-1]
-    return source.values.get(path, (1, 1))
+    return source.value_positions.get(path, (1, 1))
 
 
-def _lax(data: Any) -> Any:
+def _coerce_types(data: Any) -> Any:
     """Whole numbers as floats where a float is meant, lists as the pairs of a distribution."""
     if not isinstance(data, dict):
         return data

@@ -14,7 +14,7 @@ class TruthUnavailable(ImportError):
     """The truth tools are not installed; the message says which and how to get them."""
 
 
-def tool(module: str) -> Any:
+def import_truth_tool(module: str) -> Any:
     """The optional module of that name; raises TruthUnavailable with a sentence where it is missing."""
     try:
         return import_module(module)

@@ -19,18 +19,18 @@ from typing import Any
 import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State, StateQuantities
-from plumbline.truth import tool
+from plumbline.truth import import_truth_tool
 
-RADIUS = 1e-25  # relative to the largest magnitude of the quantity's own terms
+MAX_RELATIVE_RADIUS = 1e-25  # relative to the largest magnitude of the quantity's own terms
 MAX_BITS = 20_000
 
 
-class NotCertified(ArithmeticError):
+class CertificationFailure(ArithmeticError):
     """No finite enclosure was found: the system is singular at this state, or nearly so."""
 
 
 @dataclass(frozen=True, eq=False)
-class Certified:
+class CertifiedQuantities:
     """State quantities whose error is known.
 
     ``quantities`` are the enclosures' midpoints rounded to double; ``radius`` holds per quantity the largest
@@ -45,29 +45,31 @@ class Certified:
     bits: int
 
 
-def rod_multiplier(model: Model, certified: Certified) -> Array:
+def rod_multiplier(model: Model, certified: CertifiedQuantities) -> Array:
     """λ (N,) N/m of the notes' C = dᵀd per rod (E5: tension = 2 ℓ λ), 0 for ball joints."""
     return np.where(model.rods, certified.tension / (2 * np.where(model.rods, model.length, 1.0)), 0.0)
 
 
-def certify(model: Model, state: State, mass_matrix: bool = False, bits: int = 200) -> Certified:
+def certify_state(
+    model: Model, state: State, mass_matrix: bool = False, bits: int = 200
+) -> CertifiedQuantities:
     """Rigorous state quantities, SI units, frames as in `StateQuantities`.
 
     Precision is raised from ``bits`` until every radius is below 1e-25 of its quantity's terms.
     Raises TruthUnavailable without python-flint, NotCertified where the system is singular.
     """
     while bits <= MAX_BITS:
-        balls = enclose(model, state, bits, mass_matrix)
-        if balls is not None and all(_sharp(name, balls) for name in balls if name != "scale"):
+        balls = enclose_quantities(model, state, bits, mass_matrix)
+        if balls is not None and all(_is_sharp(name, balls) for name in balls if name != "scale"):
             break
         bits = bits * 3 // 2
     else:
-        raise NotCertified(
-            f"no enclosure below {RADIUS:g} relative at {MAX_BITS} bits: singular or nearly so"
+        raise CertificationFailure(
+            f"no enclosure below {MAX_RELATIVE_RADIUS:g} relative at {MAX_BITS} bits: singular or nearly so"
         )
     quantities = {name: ball for name, ball in balls.items() if name != "scale"}
-    middle = {name: _doubles(ball) for name, ball in quantities.items()}
-    radius = {name: max(float(x.rad()) for x in _flat(ball)) for name, ball in quantities.items()}
+    middle = {name: _midpoints(ball) for name, ball in quantities.items()}
+    radius = {name: max(float(x.rad()) for x in _flatten(ball)) for name, ball in quantities.items()}
     answer = StateQuantities(
         acceleration=middle["acceleration"],
         angular_acceleration=middle["angular_acceleration"],
@@ -78,24 +80,26 @@ def certify(model: Model, state: State, mass_matrix: bool = False, bits: int = 2
     )
     if mass_matrix:
         answer = replace(answer, mass_matrix=middle["mass_matrix"])
-    return Certified(answer, middle["tension"], radius, bits)
+    return CertifiedQuantities(answer, middle["tension"], radius, bits)
 
 
-def enclose(model: Model, state: State, bits: int, mass_matrix: bool = False) -> dict[str, Any] | None:
+def enclose_quantities(
+    model: Model, state: State, bits: int, mass_matrix: bool = False
+) -> dict[str, Any] | None:
     """Enclosures (python-flint ``arb``) of every quantity at ``bits``, None where an inverse had none.
 
     Vectors per body are lists of N lists of 3, scalars lists of one; "scale" holds the sizes, as floats,
     that radii are compared with.
     """
-    flint = tool("flint")
+    flint = import_truth_tool("flint")
     with flint.ctx.workprec(bits):
         try:
-            return _solve(_Chain(flint, model, state), mass_matrix)
+            return _solve_and_enclose(_BallChain(flint, model, state), mass_matrix)
         except ZeroDivisionError:
             return None
 
 
-class _Chain:
+class _BallChain:
     """The model and state in balls, world axes: every vector a 3×1 ``arb_mat``."""
 
     def __init__(self, flint: Any, model: Model, state: State) -> None:
@@ -123,7 +127,7 @@ class _Chain:
                 udot = udot - u * self.dot(u, udot)
             self.u.append(u)
             self.udot.append(udot)
-        self.r, self.v = self.lifted()
+        self.r, self.v = self.positions_and_velocities()
 
     def vector(self, v: Iterable[float]) -> Any:
         return self.mat(3, 1, [self.arb(float(x)) for x in v])
@@ -131,7 +135,7 @@ class _Chain:
     def matrix(self, m: Array) -> Any:
         return self.mat(3, 3, [self.arb(float(x)) for x in np.ravel(m)])
 
-    def cross(self, a: Any) -> Any:
+    def cross_matrix(self, a: Any) -> Any:
         """ã: ã b = a × b."""
         x, y, z = a[0, 0], a[1, 0], a[2, 0]
         return self.mat(3, 3, [0, -z, y, z, 0, -x, -y, x, 0])
@@ -151,25 +155,25 @@ class _Chain:
         ]
         return self.mat(entries) * (1 / (ww + xx + yy + zz))
 
-    def lifted(self) -> tuple[list[Any], list[Any]]:
+    def positions_and_velocities(self) -> tuple[list[Any], list[Any]]:
         """Centres of mass and their velocities, from the pivot outwards."""
         tip, tip_v, r, v = self.zero, self.zero, [], []
         for k in range(self.n):
-            w = self.cross(self.w[k])
+            w = self.cross_matrix(self.w[k])
             r.append(tip + self.u[k] * self.ell[k] - self.sp[k])
             v.append(tip_v + self.udot[k] * self.ell[k] - w * self.sp[k])
             tip, tip_v = r[k] + self.sd[k], v[k] + w * self.sd[k]
         return r, v
 
 
-def _solve(c: _Chain, mass_matrix: bool) -> dict[str, Any]:
+def _solve_and_enclose(c: _BallChain, mass_matrix: bool) -> dict[str, Any]:
     """Block elimination along the chain, then accelerations, energies and momentum."""
     model, n = c.model, c.n
     free, turn, near, far, Ypp, Ypd, Ydd = [], [], [], [], [], [], []
     for k in range(n):
         force = c.vector(model.force[k]) - c.v[k] * c.arb(float(model.drag_force[k])) + c.g * c.m[k]
         moment = c.A[k] * c.vector(model.moment[k]) - c.w[k] * c.arb(float(model.drag_moment[k]))
-        w, sp, sd = c.cross(c.w[k]), c.cross(c.sp[k]), c.cross(c.sd[k])
+        w, sp, sd = c.cross_matrix(c.w[k]), c.cross_matrix(c.sp[k]), c.cross_matrix(c.sd[k])
         free.append(force * (1 / c.m[k]))
         turn.append(c.I_inverse[k] * (moment - w * (c.I[k] * c.w[k])))
         near.append(free[k] - sp * turn[k] + w * (w * c.sp[k]))
@@ -208,29 +212,29 @@ def _solve(c: _Chain, mass_matrix: bool) -> dict[str, Any]:
     for k in range(n):
         below = F[k + 1] if k + 1 < n else c.zero
         acceleration.append(free[k] + (F[k] - below) * (1 / c.m[k]))
-        alpha = turn[k] + c.I_inverse[k] * (c.cross(c.sp[k]) * F[k] - c.cross(c.sd[k]) * below)
+        alpha = turn[k] + c.I_inverse[k] * (c.cross_matrix(c.sp[k]) * F[k] - c.cross_matrix(c.sd[k]) * below)
         angular.append(c.A[k].transpose() * alpha)
         spin = c.I[k] * c.w[k]
         kinetic += (c.m[k] * c.dot(c.v[k], c.v[k]) + c.dot(c.w[k], spin)) / 2
         potential -= c.m[k] * c.dot(c.g, c.r[k])
-        momentum += c.cross(c.r[k]) * c.v[k] * c.m[k] + spin
+        momentum += c.cross_matrix(c.r[k]) * c.v[k] * c.m[k] + spin
     balls: dict[str, Any] = {
-        "acceleration": [_list(a) for a in acceleration],
-        "angular_acceleration": [_list(a) for a in angular],
-        "joint_reaction": [_list(f) for f in F],
+        "acceleration": [_entries(a) for a in acceleration],
+        "angular_acceleration": [_entries(a) for a in angular],
+        "joint_reaction": [_entries(f) for f in F],
         "kinetic_energy": [kinetic],
         "potential_energy": [potential],
-        "angular_momentum": _list(momentum),
+        "angular_momentum": _entries(momentum),
         "tension": [-c.dot(c.u[k], F[k]) for k in range(n)],
-        "r": [_list(r) for r in c.r],
-        "v": [_list(v) for v in c.v],
+        "r": [_entries(r) for r in c.r],
+        "v": [_entries(v) for v in c.v],
     }
     if mass_matrix:
         balls["mass_matrix"] = _mass_matrix(c)
-    return balls | {"scale": _scale(c, balls)}
+    return balls | {"scale": _term_scales(c, balls)}
 
 
-def _mass_matrix(c: _Chain) -> list[list[Any]]:
+def _mass_matrix(c: _BallChain) -> list[list[Any]]:
     """M (nu, nu) of `StateQuantities.mass_matrix`: the velocity of centre b is Σ T_bi ν_i.
 
     T_bi is the same, c_i, for every body below i, so with μ_j the mass below j and i < j,
@@ -239,11 +243,12 @@ def _mass_matrix(c: _Chain) -> list[list[Any]]:
     rods = [k for k in range(c.n) if c.model.rods[k]]
     below = [sum(c.m[k + 1 :], c.arb(0)) for k in range(c.n)]
     turn = [c.A[k] for k in range(c.n)]
-    bent = [c.cross(c.u[k]) for k in range(c.n)]
+    bent = [c.cross_matrix(c.u[k]) for k in range(c.n)]
     # per column: its body, what it gives to the centres below, and to the body's own
     slides = [(k, bent[k] * bent[k] * -c.ell[k]) for k in rods]
     columns = [(k, slide, slide) for k, slide in slides] + [
-        (k, (c.cross(c.sp[k]) - c.cross(c.sd[k])) * turn[k], c.cross(c.sp[k]) * turn[k]) for k in range(c.n)
+        (k, (c.cross_matrix(c.sp[k]) - c.cross_matrix(c.sd[k])) * turn[k], c.cross_matrix(c.sp[k]) * turn[k])
+        for k in range(c.n)
     ]
     size = 3 * len(columns)
     M = [[c.arb(0)] * size for _ in range(size)]
@@ -262,15 +267,15 @@ def _mass_matrix(c: _Chain) -> list[list[Any]]:
     return M
 
 
-def _scale(c: _Chain, balls: dict[str, Any]) -> dict[str, float]:
+def _term_scales(c: _BallChain, balls: dict[str, Any]) -> dict[str, float]:
     """Sizes of each quantity's own terms: radii are compared with them, so an exact zero may come out."""
     model = c.model
     norm = np.linalg.norm
     lever = float(np.sum(norm(model.proximal, axis=1) + norm(model.distal, axis=1) + model.length))
-    spins = c.w + [c.cross(c.u[k]) * c.udot[k] for k in range(c.n)]
-    rate = float(np.max(norm(_doubles([_list(w) for w in spins]), axis=1)))
+    spins = c.w + [c.cross_matrix(c.u[k]) * c.udot[k] for k in range(c.n)]
+    rate = float(np.max(norm(_midpoints([_entries(w) for w in spins]), axis=1)))
     g = float(norm(model.gravity))
-    size = {name: float(np.max(np.abs(_doubles(ball)))) for name, ball in balls.items()}
+    size = {name: float(np.max(np.abs(_midpoints(ball)))) for name, ball in balls.items()}
     a = max(size["acceleration"], g, rate**2 * lever)
     mass, inertia = float(np.sum(model.mass)), float(np.sum(norm(model.inertia, axis=(1, 2))))
     force = max(size["joint_reaction"], mass * a)
@@ -288,22 +293,22 @@ def _scale(c: _Chain, balls: dict[str, Any]) -> dict[str, float]:
     }
 
 
-def _sharp(name: str, balls: dict[str, Any]) -> bool:
+def _is_sharp(name: str, balls: dict[str, Any]) -> bool:
     """Whether every radius of the quantity is small enough (an infinite or NaN one is not)."""
-    return all(float(x.rad()) <= RADIUS * balls["scale"][name] for x in _flat(balls[name]))
+    return all(float(x.rad()) <= MAX_RELATIVE_RADIUS * balls["scale"][name] for x in _flatten(balls[name]))
 
 
-def _list(v: Any) -> list[Any]:
+def _entries(v: Any) -> list[Any]:
     """The three balls of a 3×1 matrix."""
     return list(v.entries())
 
 
-def _flat(ball: list[Any]) -> list[Any]:
+def _flatten(ball: list[Any]) -> list[Any]:
     """All balls of a list or of a list of lists."""
     return [x for row in ball for x in row] if isinstance(ball[0], list) else ball
 
 
-def _doubles(ball: list[Any]) -> Array:
+def _midpoints(ball: list[Any]) -> Array:
     """Midpoints rounded to double, in the ball list's shape."""
     return np.array(
         [[float(x.mid()) for x in row] if isinstance(row, list) else float(row.mid()) for row in ball]

@@ -16,21 +16,21 @@ import numpy as np
 from scipy.linalg import eigh
 
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import multiply, rotation
-from plumbline.truth.elliptic import first, jacobi, third
+from plumbline.model.kinematics import quaternion_product, rotation_matrix
+from plumbline.truth.elliptic import elliptic_f, elliptic_pi, jacobi
 
-ROUNDING = 1e-12  # relative: what a rounded input may miss a condition by
+CONDITION_RTOL = 1e-12  # relative: what a rounded input may miss a condition by
 
 
-class NotThatMotion(ValueError):
+class ClosedFormMismatch(ValueError):
     """The scenario does not satisfy what its closed form presupposes; the message says which condition."""
 
 
-class Described(Protocol):
+class ClosedFormScenario(Protocol):
     """What of a scenario is needed here."""
 
     @property
-    def exact(self) -> str | None:
+    def closed_form(self) -> str | None:
         """A key of `SOLUTIONS`, or None."""
 
     @property
@@ -43,48 +43,51 @@ class Described(Protocol):
 
 
 @dataclass(frozen=True)
-class Motion:
+class ClosedFormMotion:
     """A closed-form motion: ``motion(times)`` gives r (T, N, 3) m and p (T, N, 4).
 
     ``amplitude`` is 0 for an exact solution; for one of small oscillations it is the largest angle (rad),
     and the relative error is of the size of its square, growing with time as its frequencies drift.
     """
 
-    path: Callable[[Array], tuple[Array, Array]]
+    evaluate: Callable[[Array], tuple[Array, Array]]
     source: str
     amplitude: float = 0.0
 
     def __call__(self, times: Array) -> tuple[Array, Array]:
         """Positions r and attitudes p at ``times`` (T,) s from the initial state."""
-        return self.path(np.atleast_1d(np.asarray(times, dtype=float)))
+        return self.evaluate(np.atleast_1d(np.asarray(times, dtype=float)))
 
 
-def solution(scenario: Described) -> Motion | None:
+def closed_form_motion(scenario: ClosedFormScenario) -> ClosedFormMotion | None:
     """The closed form that the scenario names, None where it names none; raises NotThatMotion."""
-    if scenario.exact is None:
+    if scenario.closed_form is None:
         return None
-    return SOLUTIONS[scenario.exact](scenario.model, scenario.state)
+    return CLOSED_FORMS[scenario.closed_form](scenario.model, scenario.state)
 
 
-def planar_pendulum(model: Model, state: State) -> Motion:
+def planar_pendulum(model: Model, state: State) -> ClosedFormMotion:
     """One body on a ball joint, swinging or turning in a vertical plane.
 
     θ from hanging, Ω² = m g d / I: sin ½θ = k sn(Ωt + u₀), θ̇ = 2kΩ cn for k < 1; ½θ = am(kΩt + u₀ | 1/k²)
     for k > 1; k² = sin² ½θ₀ + θ̇₀²/4Ω².  Whittaker, Analytical Dynamics, § 44.
     """
-    A, up, g = _single(model, state, rod=False)
+    A, up, g = _require_single_body(model, state, rod=False)
     m, s, d = model.mass[0], model.proximal[0], np.linalg.norm(model.proximal[0])
-    _need(g > 0 and d > 0, "gravity and a lever between pivot and centre of mass")
+    _require(g > 0 and d > 0, "gravity and a lever between pivot and centre of mass")
     rate = float(np.linalg.norm(state.omega[0]))
     axis = A @ (state.omega[0] / rate) if rate > 0 else np.cross(A @ s, -up)
-    _need(np.linalg.norm(axis) > 0, "a rate or a torque that shows the plane")
+    _require(np.linalg.norm(axis) > 0, "a rate or a torque that shows the plane")
     axis = axis / np.linalg.norm(axis)
-    inertia = _about_pivot(model)
+    inertia = _inertia_about_pivot(model)
     body_axis = A.T @ axis
-    _need(abs(axis @ up) < ROUNDING, "a horizontal axis of rotation")
-    _need(abs(body_axis @ s) < ROUNDING * d, "a centre of mass in the plane of motion")
+    _require(abs(axis @ up) < CONDITION_RTOL, "a horizontal axis of rotation")
+    _require(abs(body_axis @ s) < CONDITION_RTOL * d, "a centre of mass in the plane of motion")
     I = float(body_axis @ inertia @ body_axis)  # noqa: E741
-    _need(np.linalg.norm(inertia @ body_axis - I * body_axis) < ROUNDING * I, "a principal axis of rotation")
+    _require(
+        np.linalg.norm(inertia @ body_axis - I * body_axis) < CONDITION_RTOL * I,
+        "a principal axis of rotation",
+    )
     across, down, out = np.cross(up, axis), -up, -(A @ s) / d
     theta0 = np.arctan2(out @ across, out @ down)
     own = np.sqrt(m * g * d / I)
@@ -95,39 +98,39 @@ def planar_pendulum(model: Model, state: State) -> Motion:
 
     def path(t: Array) -> tuple[Array, Array]:
         if complement >= 0:
-            start = first(np.arctan2(s0, w), complement)
+            start = elliptic_f(np.arctan2(s0, w), complement)
             sn, _, dn, _ = jacobi(own * t + start, complement)
             half_sin, half_cos = k * sn, dn
         else:
             m1 = -complement / k**2
-            half_sin, half_cos, _, _ = jacobi(k * own * t + first(way * theta0 / 2, m1), m1)
+            half_sin, half_cos, _, _ = jacobi(k * own * t + elliptic_f(way * theta0 / 2, m1), m1)
             half_sin = way * half_sin
         # r along θ, and the turn by θ − θ₀ about the axis from its half angle
         sin, cos = 2 * half_sin * half_cos, 1 - 2 * half_sin**2
         r = d * (cos[:, None] * down + sin[:, None] * across)
         turn_cos, turn_sin = half_cos * c0 + half_sin * s0, half_sin * c0 - half_cos * s0
         turn = np.concatenate([turn_cos[:, None], turn_sin[:, None] * axis], 1)
-        return r[:, None], multiply(turn, state.p[0][None])[:, None]
+        return r[:, None], quaternion_product(turn, state.p[0][None])[:, None]
 
-    return Motion(path, "elliptic functions, Whittaker § 44")
+    return ClosedFormMotion(path, "elliptic functions, Whittaker § 44")
 
 
-def lagrange_top(model: Model, state: State) -> Motion:
+def lagrange_top(model: Model, state: State) -> ClosedFormMotion:
     """A heavy symmetric body on a ball joint, pivot on its axis.  See `_axis_motion`."""
-    A, up, g = _single(model, state, rod=False)
+    A, up, g = _require_single_body(model, state, rod=False)
     d = float(np.linalg.norm(model.proximal[0]))
-    _need(g > 0 and d > 0, "gravity and a lever between pivot and centre of mass")
+    _require(g > 0 and d > 0, "gravity and a lever between pivot and centre of mass")
     c = -model.proximal[0] / d
-    inertia = _about_pivot(model)
+    inertia = _inertia_about_pivot(model)
     axial = float(c @ inertia @ c)
     transverse = float((np.trace(inertia) - axial) / 2)
     symmetric = transverse * np.eye(3) + (axial - transverse) * np.outer(c, c)
-    _need(
-        np.max(np.abs(inertia - symmetric)) < ROUNDING * transverse,
+    _require(
+        np.max(np.abs(inertia - symmetric)) < CONDITION_RTOL * transverse,
         "inertia symmetric about the axis to the pivot",
     )
     omega = A @ state.omega[0]
-    turn = _axis_motion(
+    turn = _symmetric_top_motion(
         up, A @ c, omega, axial / transverse, 2 * model.mass[0] * g * d / transverse, state.p[0], c
     )
 
@@ -135,10 +138,10 @@ def lagrange_top(model: Model, state: State) -> Motion:
         p, axis = turn(t)
         return d * axis[:, None], p[:, None]
 
-    return Motion(path, "elliptic functions and integrals of the third kind, Whittaker § 71")
+    return ClosedFormMotion(path, "elliptic functions and integrals of the third kind, Whittaker § 71")
 
 
-def spherical_pendulum(model: Model, state: State) -> Motion:
+def spherical_pendulum(model: Model, state: State) -> ClosedFormMotion:
     """A symmetric body on a ball joint without spin about its axis, or a body hung at its centre of mass.
 
     The second is a point on a sphere of the rod's length, and a free top about that point.
@@ -146,109 +149,117 @@ def spherical_pendulum(model: Model, state: State) -> Motion:
     if not model.rods[0]:
         axis = model.proximal[0]
         spin = abs(float(axis @ state.omega[0]))
-        _need(
-            spin <= ROUNDING * np.linalg.norm(axis) * np.linalg.norm(state.omega[0]),
+        _require(
+            spin <= CONDITION_RTOL * np.linalg.norm(axis) * np.linalg.norm(state.omega[0]),
             "no spin about the axis to the pivot (else it is a lagrange-top)",
         )
         return lagrange_top(model, state)
-    _, up, g = _single(model, state, rod=True)
-    _need(g > 0 and not np.any(model.proximal[0]), "gravity, and a rod attached at the centre of mass")
+    _, up, g = _require_single_body(model, state, rod=True)
+    _require(g > 0 and not np.any(model.proximal[0]), "gravity, and a rod attached at the centre of mass")
     ell, u = float(model.length[0]), state.u[0]
-    point = _axis_motion(up, u, np.cross(u, state.udot[0]), 0.0, 2 * g / ell, np.array([1.0, 0, 0, 0]), u)
-    body = _free(model.inertia[0], state.p[0], state.omega[0])
+    point = _symmetric_top_motion(
+        up, u, np.cross(u, state.udot[0]), 0.0, 2 * g / ell, np.array([1.0, 0, 0, 0]), u
+    )
+    body = _torque_free_attitude(model.inertia[0], state.p[0], state.omega[0])
 
     def path(t: Array) -> tuple[Array, Array]:
         return ell * point(t)[1][:, None], body(t)[:, None]
 
-    return Motion(path, "elliptic functions and integrals of the third kind, Whittaker § 55")
+    return ClosedFormMotion(path, "elliptic functions and integrals of the third kind, Whittaker § 55")
 
 
-def free_top(model: Model, state: State) -> Motion:
+def free_top(model: Model, state: State) -> ClosedFormMotion:
     """Euler's top: one body held at its centre of mass by a ball joint.  See `_free`."""
-    _single(model, state, rod=False)
-    _need(not np.any(model.proximal[0]), "a pivot at the centre of mass")
-    body = _free(model.inertia[0], state.p[0], state.omega[0])
+    _require_single_body(model, state, rod=False)
+    _require(not np.any(model.proximal[0]), "a pivot at the centre of mass")
+    body = _torque_free_attitude(model.inertia[0], state.p[0], state.omega[0])
 
     def path(t: Array) -> tuple[Array, Array]:
         return np.zeros((len(t), 1, 3)), body(t)[:, None]
 
-    return Motion(
+    return ClosedFormMotion(
         path, "elliptic functions and integrals of the third kind, Landau & Lifshitz, Mechanics, § 37"
     )
 
 
-def conical(model: Model, state: State) -> Motion:
+def steady_rotation(model: Model, state: State) -> ClosedFormMotion:
     """Relative equilibrium: every body and rod turns about the vertical at one rate, as if rigid."""
-    _plain(model)
-    _need(np.any(model.gravity), "gravity")
+    _require_no_loads(model)
+    _require(np.any(model.gravity), "gravity")
     up = -model.gravity / np.linalg.norm(model.gravity)
-    A = rotation(state.p)
+    A = rotation_matrix(state.p)
     omega = (A @ state.omega[..., None])[..., 0]
     rate = float(omega[0] @ up)
     size = abs(rate) or 1.0
-    _need(
-        np.max(np.abs(omega - rate * up)) < ROUNDING * size,
+    _require(
+        np.max(np.abs(omega - rate * up)) < CONDITION_RTOL * size,
         "the same vertical angular velocity in all bodies",
     )
     carried = np.where(model.rods[:, None], rate * np.cross(up, state.u), 0.0)
-    _need(np.max(np.abs(state.udot - carried)) < ROUNDING * size, "rods that turn with the bodies")
-    _need(
-        _unbalanced(model, state, rate * up) < ROUNDING,
+    _require(np.max(np.abs(state.udot - carried)) < CONDITION_RTOL * size, "rods that turn with the bodies")
+    _require(
+        _relative_imbalance(model, state, rate * up) < CONDITION_RTOL,
         "forces and moments that balance in the turning frame",
     )
 
     def path(t: Array) -> tuple[Array, Array]:
         half = rate * t / 2
         turn = np.concatenate([np.cos(half)[:, None], np.sin(half)[:, None] * up], 1)
-        return np.einsum("tij,nj->tni", rotation(turn), state.r), multiply(turn[:, None], state.p[None])
+        return np.einsum("tij,nj->tni", rotation_matrix(turn), state.r), quaternion_product(
+            turn[:, None], state.p[None]
+        )
 
-    return Motion(path, "relative equilibrium: a rigid turn about the vertical")
+    return ClosedFormMotion(path, "relative equilibrium: a rigid turn about the vertical")
 
 
-def rest(model: Model, state: State) -> Motion:
+def equilibrium(model: Model, state: State) -> ClosedFormMotion:
     """Everything hangs still."""
-    _need(not (np.any(state.omega) or np.any(state.udot)), "no velocity")
-    _plain(model)
-    _need(_unbalanced(model, state, np.zeros(3)) < ROUNDING, "forces and moments that balance")
+    _require(not (np.any(state.omega) or np.any(state.udot)), "no velocity")
+    _require_no_loads(model)
+    _require(
+        _relative_imbalance(model, state, np.zeros(3)) < CONDITION_RTOL, "forces and moments that balance"
+    )
 
     def path(t: Array) -> tuple[Array, Array]:
         return np.repeat(state.r[None], len(t), 0), np.repeat(state.p[None], len(t), 0)
 
-    return Motion(path, "equilibrium")
+    return ClosedFormMotion(path, "equilibrium")
 
 
-def small_oscillation(model: Model, state: State) -> Motion:
+def small_oscillation(model: Model, state: State) -> ClosedFormMotion:
     """Planar small oscillations about hanging, of any chain whose joints lie on the bodies' axes.
 
     M θ̈ + K θ = 0 in the angles of bodies and rods, solved by its normal modes (Rayleigh, Theory of
     Sound, § 62 for the chain).  Asymptotic: exact in the limit of zero amplitude.
     """
-    _plain(model)
+    _require_no_loads(model)
     n, g = model.n, float(np.linalg.norm(model.gravity))
-    _need(g > 0, "gravity")
-    up, A = -model.gravity / g, rotation(state.p)
+    _require(g > 0, "gravity")
+    up, A = -model.gravity / g, rotation_matrix(state.p)
     near, far = np.linalg.norm(model.proximal, axis=1), np.linalg.norm(model.distal, axis=1)
     far[-1] = 0.0
-    _need(np.all(near > 0), "a lever between each joint and the centre of mass")
+    _require(np.all(near > 0), "a lever between each joint and the centre of mass")
     c = model.proximal / near[:, None]  # up the body when it hangs
     aligned = np.max(np.abs(model.distal[:-1] + far[:-1, None] * c[:-1]), initial=0.0)
-    _need(aligned < ROUNDING * np.max(near), "joints on one axis through the centre of mass of each body")
+    _require(
+        aligned < CONDITION_RTOL * np.max(near), "joints on one axis through the centre of mass of each body"
+    )
     out = (A @ c[..., None])[..., 0]
     omega = (A @ state.omega[..., None])[..., 0]
     tilts = np.concatenate([np.cross(up, out), omega, np.cross(state.u, up), np.cross(state.u, state.udot)])
     axis = tilts[np.argmax(np.linalg.norm(tilts, axis=1))]
-    _need(np.any(axis), "some motion")
+    _require(np.any(axis), "some motion")
     axis = axis / np.linalg.norm(axis)
-    _need(np.max(np.abs(tilts - np.outer(tilts @ axis, axis))) < ROUNDING, "one plane of motion")
-    _need(abs(axis @ up) < ROUNDING, "a vertical plane of motion")
+    _require(np.max(np.abs(tilts - np.outer(tilts @ axis, axis))) < CONDITION_RTOL, "one plane of motion")
+    _require(abs(axis @ up) < CONDITION_RTOL, "a vertical plane of motion")
     body_axis = A.mT @ axis
     J = np.einsum("ki,kij,kj->k", body_axis, model.inertia, body_axis)
     off = (model.inertia @ body_axis[..., None])[..., 0] - J[:, None] * body_axis
-    _need(np.max(np.abs(off)) < ROUNDING * np.max(J), "a principal axis of rotation in every body")
+    _require(np.max(np.abs(off)) < CONDITION_RTOL * np.max(J), "a principal axis of rotation in every body")
 
     across = np.cross(axis, up)
     rods = np.flatnonzero(model.rods)
-    angle = np.concatenate([_angle(-state.u[rods], up, across), _angle(out, up, across)])
+    angle = np.concatenate([_angles_from_up(-state.u[rods], up, across), _angles_from_up(out, up, across)])
     rate = np.concatenate([np.cross(state.u, state.udot)[rods] @ axis, omega @ axis])
     # displacement of centre b to first order: minus Σ lever_bi θ_i
     lever = np.zeros((n, len(rods) + n))
@@ -274,26 +285,26 @@ def small_oscillation(model: Model, state: State) -> Motion:
             tip = r[:, k] - far[k] * up_of[:, len(rods) + k]
         half = (theta - angle)[:, len(rods) :] / 2
         turn = np.concatenate([np.cos(half)[..., None], np.sin(half)[..., None] * axis], -1)
-        return r, multiply(turn, np.broadcast_to(state.p, (len(t), n, 4)))
+        return r, quaternion_product(turn, np.broadcast_to(state.p, (len(t), n, 4)))
 
     amplitude = float(np.max(np.abs(modes) @ np.hypot(at, speed)))
-    return Motion(path, "normal modes of small oscillations", amplitude)
+    return ClosedFormMotion(path, "normal modes of small oscillations", amplitude)
 
 
-SOLUTIONS: dict[str, Callable[[Model, State], Motion]] = {
+CLOSED_FORMS: dict[str, Callable[[Model, State], ClosedFormMotion]] = {
     "planar-pendulum": planar_pendulum,
     "spherical-pendulum": spherical_pendulum,
     "lagrange-top": lagrange_top,
     "free-top": free_top,
-    "conical": conical,
-    "double-conical": conical,
+    "conical": steady_rotation,
+    "double-conical": steady_rotation,
     "small-double": small_oscillation,
     "small-chain": small_oscillation,
-    "rest": rest,
+    "rest": equilibrium,
 }
 
 
-def _axis_motion(
+def _symmetric_top_motion(
     up: Array, c: Array, omega: Array, ratio: float, beta: float, p: Array, body_c: Array
 ) -> Callable[[Array], tuple[Array, Array]]:
     """Motion of a heavy symmetric top: times (T,) → p (T, 4), axis (T, 3) in the world.
@@ -317,7 +328,7 @@ def _axis_motion(
     for _ in range(3):  # polish the simple root
         slope = (3 * beta * x3 + 2 * c2) * x3 + c1
         x3 -= (((beta * x3 + c2) * x3 + c1) * x3 + c0) / slope if slope else 0.0
-    _need(x3 > 1e-6, "an axis that stays away from straight up")
+    _require(x3 > 1e-6, "an axis that stays away from straight up")
     product = -c0 / (beta * x3)  # x1 x2 ≤ 0
     total = (product - c1 / beta) / x3  # −(x1 + x2)
     root = np.sqrt(total**2 - 4 * product)
@@ -325,11 +336,11 @@ def _axis_motion(
     smaller = product / larger if larger else 0.0
     x1, x2 = min(larger, smaller), max(larger, smaller)
     u1, u2 = u0 + x1, u0 + x2
-    _need(1 + u1 > 1e-6 and 1 - u2 > 1e-6, "an axis that never points straight up or down")
+    _require(1 + u1 > 1e-6 and 1 - u2 > 1e-6, "an axis that never points straight up or down")
     m1 = (x3 - x2) / (x3 - x1)
     speed = np.sqrt(beta * (x3 - x1)) / 2
     start = np.arctan2(np.sqrt(max(-x1, 0.0)), np.copysign(np.sqrt(max(x2, 0.0)), udot))
-    tau0 = float(first(start, m1))
+    tau0 = float(elliptic_f(start, m1))
     minus, plus = q0 + a * u0 - a, q0 + a * u0 + a  # b − a, b + a
     n_minus, n_plus = (x2 - x1) / (1 - u1), -(x2 - x1) / (1 + u1)
     node = np.cross(up, c)
@@ -339,18 +350,24 @@ def _axis_motion(
     def path(t: Array) -> tuple[Array, Array]:
         sn, _, _, am = jacobi(speed * t + tau0, m1)
         u = u1 + (x2 - x1) * sn**2
-        towards = minus / (1 - u1) * (third(n_minus, am, m1) - third(n_minus, start, m1)) / (2 * speed)
-        away = plus / (1 + u1) * (third(n_plus, am, m1) - third(n_plus, start, m1)) / (2 * speed)
+        towards = (
+            minus / (1 - u1) * (elliptic_pi(n_minus, am, m1) - elliptic_pi(n_minus, start, m1)) / (2 * speed)
+        )
+        away = plus / (1 + u1) * (elliptic_pi(n_plus, am, m1) - elliptic_pi(n_plus, start, m1)) / (2 * speed)
         phi, psi = towards + away, (spin - a) * t - (towards - away)
         theta = np.arctan2(np.sqrt((1 - u) * (1 + u)), u)
-        turn = multiply(_turn(up, phi), _turn(node, theta - theta0))
-        axis = (rotation(turn) @ c[:, None])[..., 0]
-        return multiply(multiply(turn, np.broadcast_to(p, (len(t), 4))), _turn(body_c, psi)), axis
+        turn = quaternion_product(
+            _axis_angle_quaternions(up, phi), _axis_angle_quaternions(node, theta - theta0)
+        )
+        axis = (rotation_matrix(turn) @ c[:, None])[..., 0]
+        return quaternion_product(
+            quaternion_product(turn, np.broadcast_to(p, (len(t), 4))), _axis_angle_quaternions(body_c, psi)
+        ), axis
 
     return path
 
 
-def _free(inertia: Array, p: Array, omega: Array) -> Callable[[Array], Array]:
+def _torque_free_attitude(inertia: Array, p: Array, omega: Array) -> Callable[[Array], Array]:
     """Attitude p (T, 4) of a body free of moments.  Landau & Lifshitz, Mechanics, § 37.
 
     Principal moments ordered so that ω circles the third axis: ω₁ = a₁ cn, ω₂ = ±a₂ sn, ω₃ = a₃ dn; the body
@@ -374,61 +391,74 @@ def _free(inertia: Array, p: Array, omega: Array) -> Callable[[Array], Array]:
     if D == 0 or B == 0 or np.count_nonzero(w) < 2:  # about one principal axis, or a sphere
         rate = np.linalg.norm(omega)
         axis = omega / rate if rate else np.array([0.0, 0.0, 1.0])
-        return lambda t: multiply(np.broadcast_to(p, (len(t), 4)), _turn(axis, rate * t))
-    _need(gap > 0, "a motion that is not exactly on the separatrix")
+        return lambda t: quaternion_product(
+            np.broadcast_to(p, (len(t), 4)), _axis_angle_quaternions(axis, rate * t)
+        )
+    _require(gap > 0, "a motion that is not exactly on the separatrix")
     sign = np.copysign(1.0, w[2]) * np.sign(I3 - I1)
     a1, a2 = np.sqrt(D / (I1 * (I3 - I1))), np.sqrt(D / (I2 * (I3 - I2)))
     a3 = np.copysign(np.sqrt(B / (I3 * (I3 - I1))), w[2])
     speed = np.sqrt((I3 - I2) * B / (I1 * I2 * I3))
     m1 = min(1.0, abs(I3 - I1) * gap / ((I3 - I2) * B))
     start = np.arctan2(sign * w[1] / a2, w[0] / a1)
-    tau0, n = float(first(start, m1)), I3 * (I1 - I2) / (I1 * (I3 - I2))
+    tau0, n = float(elliptic_f(start, m1)), I3 * (I1 - I2) / (I1 * (I3 - I2))
 
     def towards(w1: Array, w2: Array, w3: Array) -> Array:
         """Rx(θ) Rz(ψ), which turns the body-frame direction of L into z."""
         theta = np.arctan2(np.hypot(I1 * w1, I2 * w2), I3 * w3)
-        return multiply(_turn(np.eye(3)[0], theta), _turn(np.eye(3)[2], np.arctan2(I1 * w1, I2 * w2)))
+        return quaternion_product(
+            _axis_angle_quaternions(np.eye(3)[0], theta),
+            _axis_angle_quaternions(np.eye(3)[2], np.arctan2(I1 * w1, I2 * w2)),
+        )
 
-    principal = _quaternion(axes)
+    principal = _quaternion_from_matrix(axes)
     inverse = np.array([1.0, -1.0, -1.0, -1.0])
-    base = multiply(multiply(p, principal), towards(*(np.atleast_1d(x) for x in w))[0] * inverse)
+    base = quaternion_product(
+        quaternion_product(p, principal), towards(*(np.atleast_1d(x) for x in w))[0] * inverse
+    )
 
     def path(t: Array) -> Array:
         sn, cn, dn, am = jacobi(speed * t + tau0, m1)
-        chi = L * t / I3 + L * (I3 - I1) / (I1 * I3 * speed) * (third(n, am, m1) - third(n, start, m1))
-        turned = multiply(_turn(np.eye(3)[2], chi), towards(a1 * cn, sign * a2 * sn, a3 * dn))
-        return multiply(multiply(np.broadcast_to(base, (len(t), 4)), turned), principal * inverse)
+        chi = L * t / I3 + L * (I3 - I1) / (I1 * I3 * speed) * (
+            elliptic_pi(n, am, m1) - elliptic_pi(n, start, m1)
+        )
+        turned = quaternion_product(
+            _axis_angle_quaternions(np.eye(3)[2], chi), towards(a1 * cn, sign * a2 * sn, a3 * dn)
+        )
+        return quaternion_product(
+            quaternion_product(np.broadcast_to(base, (len(t), 4)), turned), principal * inverse
+        )
 
     return path
 
 
-def _need(holds: bool | np.bool_, condition: str) -> None:
+def _require(holds: bool | np.bool_, condition: str) -> None:
     if not holds:
-        raise NotThatMotion(f"this closed form needs {condition}")
+        raise ClosedFormMismatch(f"this closed form needs {condition}")
 
 
-def _plain(model: Model) -> None:
-    _need(not model.has_loads and not model.has_drag, "no loads and no drag")
+def _require_no_loads(model: Model) -> None:
+    _require(not model.has_loads and not model.has_drag, "no loads and no drag")
 
 
-def _single(model: Model, state: State, rod: bool) -> tuple[Array, Array, float]:
+def _require_single_body(model: Model, state: State, rod: bool) -> tuple[Array, Array, float]:
     """A (3, 3), the unit vector up and |g| of a scenario with one body, no loads and the right joint."""
-    _plain(model)
-    _need(model.n == 1, "one body")
-    _need(bool(model.rods[0]) == rod, "a rod" if rod else "a ball joint")
+    _require_no_loads(model)
+    _require(model.n == 1, "one body")
+    _require(bool(model.rods[0]) == rod, "a rod" if rod else "a ball joint")
     g = float(np.linalg.norm(model.gravity))
-    return rotation(state.p[0]), -model.gravity / g if g else np.array([0.0, 0.0, 1.0]), g
+    return rotation_matrix(state.p[0]), -model.gravity / g if g else np.array([0.0, 0.0, 1.0]), g
 
 
-def _about_pivot(model: Model) -> Array:
+def _inertia_about_pivot(model: Model) -> Array:
     """Inertia (3, 3) about the pivot, body frame."""
     s = model.proximal[0]
     return np.asarray(model.inertia[0] + model.mass[0] * (s @ s * np.eye(3) - np.outer(s, s)))
 
 
-def _unbalanced(model: Model, state: State, spin: Array) -> float:
+def _relative_imbalance(model: Model, state: State, spin: Array) -> float:
     """Force and moment, relative to their terms, that a rigid turn of everything at ``spin`` leaves over."""
-    A = rotation(state.p)
+    A = rotation_matrix(state.p)
     near, far = ((A @ s[..., None])[..., 0] for s in (model.proximal, model.distal))
     inertia = A @ model.inertia @ A.mT
     worst, below = 0.0, np.zeros(3)
@@ -448,18 +478,18 @@ def _unbalanced(model: Model, state: State, spin: Array) -> float:
     return worst
 
 
-def _angle(v: Array, up: Array, across: Array) -> Array:
+def _angles_from_up(v: Array, up: Array, across: Array) -> Array:
     """Angle (K,) of unit vectors v (K, 3) from up towards across."""
     return np.asarray(np.arctan2(v @ across, v @ up))
 
 
-def _turn(axis: Array, angle: Array) -> Array:
+def _axis_angle_quaternions(axis: Array, angle: Array) -> Array:
     """Quaternions (T, 4) of rotations by angle (T,) about a unit axis (3,)."""
     half = np.asarray(angle)[:, None] / 2
     return np.concatenate([np.cos(half), np.sin(half) * axis], 1)
 
 
-def _quaternion(A: Array) -> Array:
+def _quaternion_from_matrix(A: Array) -> Array:
     """Unit quaternion (4,) of a rotation matrix: the largest column of 4 p pᵀ."""
     xx, yy, zz = np.diag(A)
     a, b, c = A[2, 1] - A[1, 2], A[0, 2] - A[2, 0], A[1, 0] - A[0, 1]

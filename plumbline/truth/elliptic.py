@@ -28,27 +28,27 @@ def jacobi(u: Array, m1: float) -> tuple[Array, Array, Array, Array]:
     return sn, cn, np.sqrt(cn * cn + m1 * sn * sn), phi
 
 
-def first(phi: Array | float, m1: float) -> Array:
+def elliptic_f(phi: Array | float, m1: float) -> Array:
     """F(φ | m), Legendre's integral of the first kind, every φ.  DLMF 19.25.5, Carlson's R_F."""
-    turns, s, c = _folded(phi)
+    turns, s, c = _reduce_angle(phi)
     part = s * elliprf(c * c, c * c + m1 * s * s, 1.0)
     return np.asarray(part + 2 * turns * elliprf(0.0, m1, 1.0) if np.any(turns) else part)
 
 
-def third(n: float, phi: Array | float, m1: float) -> Array:
+def elliptic_pi(n: float, phi: Array | float, m1: float) -> Array:
     """Π(n; φ | m) = ∫ dφ / ((1 − n sin²φ) √(1 − m sin²φ)), n < 1, every φ.  DLMF 19.25.14."""
-    turns, s, c = _folded(phi)
-    part = _third(n, s, c, m1)
-    whole = _third(n, np.ones(1), np.zeros(1), m1)[0] if np.any(turns) else 0.0
+    turns, s, c = _reduce_angle(phi)
+    part = _elliptic_pi_reduced(n, s, c, m1)
+    whole = _elliptic_pi_reduced(n, np.ones(1), np.zeros(1), m1)[0] if np.any(turns) else 0.0
     return np.asarray(part + 2 * turns * whole)
 
 
-def _third(n: float, s: Array, c: Array, m1: float) -> Array:
+def _elliptic_pi_reduced(n: float, s: Array, c: Array, m1: float) -> Array:
     d, q = c * c + m1 * s * s, c * c + (1 - n) * s * s
     return np.asarray(s * elliprf(c * c, d, 1.0) + n / 3 * s**3 * elliprj(c * c, d, 1.0, q))
 
 
-def _folded(phi: Array | float) -> tuple[Array, Array, Array]:
+def _reduce_angle(phi: Array | float) -> tuple[Array, Array, Array]:
     """Half turns, and sine and cosine of the rest, which lies in [−π/2, π/2]."""
     phi = np.asarray(phi, dtype=float)
     turns = np.round(phi / np.pi)

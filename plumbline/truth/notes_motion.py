@@ -8,35 +8,39 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from plumbline.model.datatypes import Array, EngineFailure, Model, State, Trajectory
-from plumbline.model.kinematics import rate
+from plumbline.model.kinematics import quaternion_rate
 from reference_impl import collocation
 from reference_impl.chain import Chain
-from reference_impl.structured import Forest
+from reference_impl.structured import StructuredSystem
 
-Method = Literal["collocation", "dop853"]
+NotesIntegrator = Literal["collocation", "dop853"]
 
 
-def flow(model: Model, state: State, times: Array, rtol: float, method: Method = "collocation") -> Trajectory:
+def simulate_notes_form(
+    model: Model, state: State, times: Array, rtol: float, method: NotesIntegrator = "collocation"
+) -> Trajectory:
     """The motion at ``times`` from ``state``: on the manifold by collocation, or the raw form (N6) by DOP853.
 
     Held on the manifold it is 2e-14 m from the truth after 2 s on thirty balls and 5e-14 m on fifty, where
     the raw form drifts by 7e-13 m and 2e-12 m at any tolerance.
     Raises EngineFailure where the integrator stops early.
     """
-    forest = Forest([Chain(**vars(model))])
-    start = state.r, state.p, state.v, rate(state.p, state.omega)
+    forest = StructuredSystem([Chain(**vars(model))])
+    start = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
     try:
         if method == "collocation":
-            run = collocation.integrate(forest, *start, times, rtol, projected=True)
+            run = collocation.integrate_collocation(forest, *start, times, rtol, project=True)
             return Trajectory(times, run.r, run.p, run.v, run.pdot, run.steps)
-        return dop853(forest, start, times, rtol)
+        return simulate_dop853(forest, start, times, rtol)
     except ArithmeticError as error:
         raise EngineFailure(str(error)) from None
 
 
-def dop853(forest: Forest, start: tuple[Array, Array, Array, Array], times: Array, rtol: float) -> Trajectory:
+def simulate_dop853(
+    forest: StructuredSystem, start: tuple[Array, Array, Array, Array], times: Array, rtol: float
+) -> Trajectory:
     """The same motion by DOP853; absolute tolerances are ``rtol`` of 1 m, 1, 1 m/s and 1 1/s."""
-    size = forest.size
+    size = forest.body_count
 
     def slope(_: float, y: Array) -> Array:
         half = y.reshape(14, size)

@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 
 from plumbline.model.datatypes import Model, State
-from plumbline.truth import tool
+from plumbline.truth import import_truth_tool
 
 
 def kane_solution(model: Model, state: State, digits: int = 50) -> dict[str, Any]:
     """r̈ and ω̇′ per body, N lists of 3 ``mpf``, at ``digits``; errors as `notes_solution`."""
-    mp = tool("mpmath")
-    function = _equations(tuple(bool(rod) for rod in model.rods))
+    mp = import_truth_tool("mpmath")
+    function = _kane_function(tuple(bool(rod) for rod in model.rods))
     with mp.workdps(digits):
-        values = [mp.mpf(float(x)) for x in _parameters(model)]
+        values = [mp.mpf(float(x)) for x in _parameter_values(model)]
         for k in range(model.n):
             if model.rods[k]:
-                values += _rod_values(mp, state.u[k], state.udot[k])
+                values += _rod_coordinates(mp, state.u[k], state.udot[k])
             q = mp.matrix([float(x) for x in state.p[k]])
             values += [*(q / mp.norm(q)), *(mp.mpf(float(x)) for x in state.omega[k])]
         mass, forcing, acceleration_rows, acceleration_rest = function(*values)
@@ -39,7 +39,7 @@ def kane_solution(model: Model, state: State, digits: int = 50) -> dict[str, Any
         }
 
 
-def _parameters(model: Model) -> list[float]:
+def _parameter_values(model: Model) -> list[float]:
     """Everything numeric in the model, in the order `_equations` names it."""
     values: list[float] = list(model.gravity)
     for k in range(model.n):
@@ -54,7 +54,7 @@ def _parameters(model: Model) -> list[float]:
     return values
 
 
-def _rod_values(mp: Any, u: Any, udot: Any) -> list[Any]:
+def _rod_coordinates(mp: Any, u: Any, udot: Any) -> list[Any]:
     """Quaternion of a frame whose z axis is u, and the rates about its x and y axes, in high precision."""
     u = mp.matrix([float(x) for x in u])
     u /= mp.norm(u)
@@ -71,9 +71,9 @@ def _rod_values(mp: Any, u: Any, udot: Any) -> list[Any]:
 
 
 @cache
-def _equations(rods: tuple[bool, ...]) -> Callable[..., Any]:
+def _kane_function(rods: tuple[bool, ...]) -> Callable[..., Any]:
     """Kane's equations of a chain of that pattern, as one mpmath function of parameters and state."""
-    sp, me = tool("sympy"), tool("sympy.physics.mechanics")
+    sp, me = import_truth_tool("sympy"), import_truth_tool("sympy.physics.mechanics")
     world = me.ReferenceFrame("N")
     pivot = me.Point("O")
     pivot.set_vel(world, 0)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 from plumbline.model.datatypes import Model, State
-from plumbline.truth import tool
+from plumbline.truth import import_truth_tool
 
 
 def notes_solution(model: Model, state: State, digits: int = 50) -> dict[str, Any]:
@@ -17,20 +17,20 @@ def notes_solution(model: Model, state: State, digits: int = 50) -> dict[str, An
 
     Raises TruthUnavailable without mpmath, ZeroDivisionError where S is singular.
     """
-    mp = tool("mpmath")
+    mp = import_truth_tool("mpmath")
     with mp.workdps(digits):
-        return _solve(mp, model, state)
+        return _solve_notes_system(mp, model, state)
 
 
-def _solve(mp: Any, model: Model, state: State) -> dict[str, Any]:
-    n, at = model.n, _Layout(model)
+def _solve_notes_system(mp: Any, model: Model, state: State) -> dict[str, Any]:
+    n, at = model.n, _UnknownLayout(model)
     S, b = mp.zeros(at.size), mp.zeros(at.size, 1)
     p, rods, far, tip_v = [], {}, None, mp.zeros(3, 1)
     for k in range(n):
-        q = _column(mp, state.p[k])
+        q = _column_vector(mp, state.p[k])
         q /= mp.norm(q)
-        q_dot = _L(mp, q).T * _column(mp, state.omega[k]) / 2
-        u, u_dot = _column(mp, state.u[k]), _column(mp, state.udot[k])
+        q_dot = _L(mp, q).T * _column_vector(mp, state.omega[k]) / 2
+        u, u_dot = _column_vector(mp, state.u[k]), _column_vector(mp, state.udot[k])
         if model.rods[k]:
             u /= mp.norm(u)
             u_dot -= u * (u.T * u_dot)[0]
@@ -42,16 +42,20 @@ def _solve(mp: Any, model: Model, state: State) -> dict[str, Any]:
 
         # (N1), (N2), (N4)
         L, L_dot, J = _L(mp, q), _L(mp, q_dot), mp.matrix(model.inertia[k].tolist())
-        m, omega = mp.mpf(float(model.mass[k])), _column(mp, state.omega[k])
-        moment = _column(mp, model.moment[k]) - omega * float(model.drag_moment[k])
-        force = _column(mp, model.force[k]) - v * float(model.drag_force[k]) + m * _column(mp, model.gravity)
-        _put(S, at.r(k), at.r(k), m * mp.eye(3))
-        _put(S, at.p(k), at.p(k), 4 * L.T * J * L)
-        _put(S, at.p(k), at.norm(k), 2 * q)
-        _put(S, at.norm(k), at.p(k), 2 * q.T)
-        _put(b, at.r(k), 0, force)
-        _put(b, at.p(k), 0, 8 * L_dot.T * J * L_dot * q + 2 * L.T * moment)
-        _put(b, at.norm(k), 0, -2 * q_dot.T * q_dot)
+        m, omega = mp.mpf(float(model.mass[k])), _column_vector(mp, state.omega[k])
+        moment = _column_vector(mp, model.moment[k]) - omega * float(model.drag_moment[k])
+        force = (
+            _column_vector(mp, model.force[k])
+            - v * float(model.drag_force[k])
+            + m * _column_vector(mp, model.gravity)
+        )
+        _set_block(S, at.r(k), at.r(k), m * mp.eye(3))
+        _set_block(S, at.p(k), at.p(k), 4 * L.T * J * L)
+        _set_block(S, at.p(k), at.norm(k), 2 * q)
+        _set_block(S, at.norm(k), at.p(k), 2 * q.T)
+        _set_block(b, at.r(k), 0, force)
+        _set_block(b, at.p(k), 0, 8 * L_dot.T * J * L_dot * q + 2 * L.T * moment)
+        _set_block(b, at.norm(k), 0, -2 * q_dot.T * q_dot)
 
         # (N3): a ball is d = 0, a rod dᵀd = ℓ²
         blocks = [(at.r(k), mp.eye(3)), (at.p(k), proximal)]
@@ -64,9 +68,9 @@ def _solve(mp: Any, model: Model, state: State) -> dict[str, Any]:
             gamma = 2 * d.T * gamma - 2 * d_dot.T * d_dot
             rods[k] = d
         for column, block in blocks:
-            _put(S, at.joint(k), column, block)
-            _put(S, column, at.joint(k), block.T)
-        _put(b, at.joint(k), 0, gamma)
+            _set_block(S, at.joint(k), column, block)
+            _set_block(S, column, at.joint(k), block.T)
+        _set_block(b, at.joint(k), 0, gamma)
         far = (distal, quad_d)
         p.append(q)
 
@@ -81,7 +85,7 @@ def _solve(mp: Any, model: Model, state: State) -> dict[str, Any]:
     return {"acceleration": acceleration, "angular_acceleration": angular, "joint_reaction": reaction}
 
 
-class _Layout:
+class _UnknownLayout:
     """Where each unknown of (N5) stands: r̈, p̈, λ, λ_E."""
 
     def __init__(self, model: Model) -> None:
@@ -104,17 +108,17 @@ class _Layout:
         return self.normal + k
 
 
-def _put(target: Any, row: int, column: int, block: Any) -> None:
+def _set_block(target: Any, row: int, column: int, block: Any) -> None:
     for i in range(block.rows):
         for j in range(block.cols):
             target[row + i, column + j] = block[i, j]
 
 
-def _column(mp: Any, v: Any) -> Any:
+def _column_vector(mp: Any, v: Any) -> Any:
     return mp.matrix([float(x) for x in v])
 
 
-def _tilde(mp: Any, e: Any) -> Any:
+def _cross_matrix(mp: Any, e: Any) -> Any:
     return mp.matrix([[0, -e[2], e[1]], [e[2], 0, -e[0]], [-e[1], e[0], 0]])
 
 
@@ -122,8 +126,8 @@ def _LG(mp: Any, p: Any, sign: int) -> Any:
     """[−e, p0 I ∓ ẽ]."""
     e = p[1:4]
     out = mp.zeros(3, 4)
-    _put(out, 0, 0, -e)
-    _put(out, 0, 1, p[0] * mp.eye(3) + sign * _tilde(mp, e))
+    _set_block(out, 0, 0, -e)
+    _set_block(out, 0, 1, p[0] * mp.eye(3) + sign * _cross_matrix(mp, e))
     return out
 
 
@@ -137,9 +141,9 @@ def _G(mp: Any, p: Any) -> Any:
 
 def _W(mp: Any, p: Any, s: Any) -> Any:
     """∂(A s)/∂p = 2 G(p) B(s) + 2 s pᵀ (N8)."""
-    s = _column(mp, s)
+    s = _column_vector(mp, s)
     B = mp.zeros(4)
-    _put(B, 0, 1, -s.T)
-    _put(B, 1, 0, s)
-    _put(B, 1, 1, -_tilde(mp, s))
+    _set_block(B, 0, 1, -s.T)
+    _set_block(B, 1, 0, s)
+    _set_block(B, 1, 1, -_cross_matrix(mp, s))
     return 2 * _G(mp, p) * B + 2 * s * p.T

@@ -33,28 +33,28 @@ def relative_equilibrium(model: Model, rate: float, p: Array, u: Array) -> tuple
             break
         best, last = size, (p, u)
         columns = [
-            _residual(model, rate, *_moved(p, u, +1e-6 * e))
-            - _residual(model, rate, *_moved(p, u, -1e-6 * e))
+            _residual(model, rate, *_apply_step(p, u, +1e-6 * e))
+            - _residual(model, rate, *_apply_step(p, u, -1e-6 * e))
             for e in np.eye(6 * model.n)
         ]
         jacobian = np.array(columns, dtype=float).T / 2e-6
         step = np.linalg.lstsq(jacobian, -residual.astype(float), rcond=1e-7)[0]
-        p, u = _moved(p, u, step * min(1.0, 0.3 / max(float(np.max(np.abs(step))), 1e-300)))
+        p, u = _apply_step(p, u, step * min(1.0, 0.3 / max(float(np.max(np.abs(step))), 1e-300)))
     else:
         raise ValueError(f"no relative equilibrium found near the guess: residual {best:.3g}")
     p, u = last
-    omega = _turn(p * np.array([1, -1, -1, -1]), np.array([0, 0, rate], dtype=np.longdouble))
+    omega = _rotate_vectors(p * np.array([1, -1, -1, -1]), np.array([0, 0, rate], dtype=np.longdouble))
     return p.astype(float), omega.astype(float), np.where(model.rods[:, None], u, 0).astype(float)
 
 
-def _turn(p: Any, s: Any) -> Any:
+def _rotate_vectors(p: Any, s: Any) -> Any:
     """A(p) s (N, 3) of unit quaternions, in the precision of its arguments."""
     e = p[..., 1:]
     t = 2 * np.cross(e, s)
     return s + p[..., :1] * t + np.cross(e, t)
 
 
-def _moved(p: Any, u: Any, step: Any) -> tuple[Any, Any]:
+def _apply_step(p: Any, u: Any, step: Any) -> tuple[Any, Any]:
     """(p, u) after a small step (6 N): turns of the bodies, shifts of the rods' directions."""
     turn, shift = step.reshape(2, -1, 3)
     w, e = p[:, :1], p[:, 1:]
@@ -66,7 +66,10 @@ def _moved(p: Any, u: Any, step: Any) -> tuple[Any, Any]:
 
 def _residual(model: Model, rate: float, p: Any, u: Any) -> Any:
     """(6 N,) moments about the centres of mass that steady rotation leaves unbalanced, and rods askew."""
-    near, far = _turn(p, model.proximal.astype(p.dtype)), _turn(p, model.distal.astype(p.dtype))
+    near, far = (
+        _rotate_vectors(p, model.proximal.astype(p.dtype)),
+        _rotate_vectors(p, model.distal.astype(p.dtype)),
+    )
     lever = model.length[:, None] * u - near  # from where joint k hangs to the centre of mass
     hang = np.concatenate([np.zeros_like(u[:1]), np.cumsum(lever + far, 0)[:-1]])
     r = hang + lever
@@ -75,8 +78,8 @@ def _residual(model: Model, rate: float, p: Any, u: Any) -> Any:
     pull = model.mass[:, None] * (a - model.gravity)
     force = np.cumsum(pull[::-1], 0)[::-1]  # on body k at its proximal point
     below = np.concatenate([force[1:], np.zeros_like(u[:1])])
-    omega = _turn(p * np.array([1, -1, -1, -1]), spin)
-    gyro = _turn(p, np.cross(omega, np.einsum("kij,kj->ki", model.inertia.astype(p.dtype), omega)))
+    omega = _rotate_vectors(p * np.array([1, -1, -1, -1]), spin)
+    gyro = _rotate_vectors(p, np.cross(omega, np.einsum("kij,kj->ki", model.inertia.astype(p.dtype), omega)))
     moment = np.cross(near, force) - np.cross(far, below) - gyro
     size = np.sqrt(np.sum(force * force, 1, keepdims=True))
     askew = np.where(model.rods[:, None], u + force / size, u)  # a massless rod points along its force

@@ -13,44 +13,48 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from reference_impl.chain import Array, Chain
-from reference_impl.collocation import BatchRun, integrate
-from reference_impl.structured import Forest
+from reference_impl.collocation import BatchIntegrationResult, integrate_collocation
+from reference_impl.structured import StructuredSystem
 
 
 @dataclass(frozen=True, eq=False)
-class Family:
+class RodLengthStudy:
     """Rods of several lengths beside their limit."""
 
     length: Array  # (K,) m
     acceleration: Array  # (K,) m/s², largest ‖r̈ − r̈_ball‖ at the start
     reaction: Array  # (K,) N, largest ‖F − F_ball‖ at the start
     position: Array  # (K,) m, largest distance from the ball's motion over the asked times
-    rate: Array  # (3, K − 1) observed order in ℓ of each, from neighbours: 1 where the ball is the limit
-    runs: tuple[BatchRun, ...]
+    observed_order: (
+        Array  # (3, K − 1) observed order in ℓ of each, from neighbours: 1 where the ball is the limit
+    )
+    runs: tuple[BatchIntegrationResult, ...]
 
 
-def hang(ball: Chain, r: Array, p: Array, v: Array, pdot: Array, length: float) -> tuple[Chain, Array, Array]:
+def replace_balls_by_rods(
+    ball: Chain, r: Array, p: Array, v: Array, pdot: Array, length: float
+) -> tuple[Chain, Array, Array]:
     """The chain with every ball joint made a rod of ``length`` m, and its r, ṙ (N, 3) on the slow manifold.
 
     r, ṙ (N, 3), p, ṗ (N, 4) are of the ball-jointed chain; p and ṗ stay.  Raises ValueError where
     a joint carries no force, so that no direction is the slow one.
     """
-    u, udot = directions(ball, r, p, v, pdot)
+    u, udot = slow_manifold_directions(ball, r, p, v, pdot)
     rods = replace(ball, length=np.full(ball.n, length))
     return rods, r + np.cumsum(length * u, axis=0), v + np.cumsum(length * udot, axis=0)
 
 
-def directions(ball: Chain, r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, Array]:
+def slow_manifold_directions(ball: Chain, r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, Array]:
     """U = −F/‖F‖ (N, 3) of the ball joints' forces, and u̇ (1/s) along the ball's motion.
 
     u̇ is the slope of the polynomial of degree 8 through u at nine times of the next instant.
     """
-    forest = Forest([ball])
+    forest = StructuredSystem([ball])
     omega = 2 * np.linalg.norm(pdot, axis=1).max()
     reach = np.abs(np.concatenate([ball.proximal, ball.distal])).max()
     instant = 0.1 / max(omega, float(np.sqrt(np.linalg.norm(ball.gravity) / reach)))
     times = instant * (1 - np.cos(np.pi * np.arange(9) / 8)) / 2
-    run = integrate(forest, r, p, v, pdot, times, 1e-13)
+    run = integrate_collocation(forest, r, p, v, pdot, times, 1e-13)
     force = np.stack(
         [forest.solve(*state).joint_reaction for state in zip(run.r, run.p, run.v, run.pdot, strict=True)]
     )
@@ -66,7 +70,7 @@ def directions(ball: Chain, r: Array, p: Array, v: Array, pdot: Array) -> tuple[
     return u[0], udot - u[0] * np.sum(u[0] * udot, axis=1, keepdims=True)
 
 
-def converge(
+def study_rod_limit(
     ball: Chain,
     r: Array,
     p: Array,
@@ -75,28 +79,28 @@ def converge(
     lengths: Sequence[float],
     times: Array,
     rtol: float,
-) -> Family:
+) -> RodLengthStudy:
     """The family of ``lengths`` (m) beside the ball-jointed chain: state, motion over ``times``, rates."""
-    limit = Forest([ball]).solve(r, p, v, pdot)
-    motion = integrate([ball], r, p, v, pdot, times, rtol)
+    limit = StructuredSystem([ball]).solve(r, p, v, pdot)
+    motion = integrate_collocation([ball], r, p, v, pdot, times, rtol)
     found, runs = [], []
     for length in lengths:
-        rods, r0, v0 = hang(ball, r, p, v, pdot, length)
-        x = Forest([rods]).solve(r0, p, v0, pdot)
-        run = integrate([rods], r0, p, v0, pdot, times, rtol)
+        rods, r0, v0 = replace_balls_by_rods(ball, r, p, v, pdot, length)
+        x = StructuredSystem([rods]).solve(r0, p, v0, pdot)
+        run = integrate_collocation([rods], r0, p, v0, pdot, times, rtol)
         runs.append(run)
         found.append(
             [
-                _largest(x.acceleration - limit.acceleration),
-                _largest(x.joint_reaction - limit.joint_reaction),
-                _largest(run.r - motion.r),
+                _largest_norm(x.acceleration - limit.acceleration),
+                _largest_norm(x.joint_reaction - limit.joint_reaction),
+                _largest_norm(run.r - motion.r),
             ]
         )
     error = np.array(found).T
     rate = np.diff(np.log(error)) / np.diff(np.log(lengths))
-    return Family(np.array(lengths), error[0], error[1], error[2], rate, tuple(runs))
+    return RodLengthStudy(np.array(lengths), error[0], error[1], error[2], rate, tuple(runs))
 
 
-def _largest(difference: Array) -> float:
+def _largest_norm(difference: Array) -> float:
     """The largest norm of 3-vectors (..., 3)."""
     return float(np.max(np.linalg.norm(difference, axis=-1)))

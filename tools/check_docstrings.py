@@ -1,0 +1,159 @@
+"""Check that public functions document their arguments, return values and exceptions.
+
+    python -m tools.check_docstrings [PATH ...]      default: all packages
+
+Public means: a module-level function or class, or a method of such a class, whose name has no leading
+underscore.  Google style: ``Args`` names every parameter, ``Returns`` (or ``Yields``) is there where the
+annotation is not None, ``Raises`` names every exception that the body raises.  A description that only
+repeats words of the name does not count.  Exempt: properties and overrides need no ``Args``, commands of the
+command line have their help text as docstring, and nested functions are private.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("plumbline", "adapters", "reference_impl", "reports")
+SECTIONS = ("Args", "Returns", "Yields", "Raises")
+FILLER = {"the", "a", "an", "of", "to", "in", "for", "and", "this", "that", "its", "return", "returns", "is"}
+FunctionNode = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def problems_in_file(path: Path) -> Iterator[str]:
+    """Find undocumented parts of the public functions and classes of one file.
+
+    Args:
+        path: the Python file.
+
+    Yields:
+        One message per problem, as ``file:line: name: what is missing``.
+
+    """
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for node in tree.body:
+        if isinstance(node, FunctionNode) and not node.name.startswith("_"):
+            yield from _located(path, node, node.name, _function_problems(node))
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            if not ast.get_docstring(node):
+                yield from _located(path, node, node.name, ["no docstring"])
+            for method in node.body:
+                if isinstance(method, FunctionNode) and not method.name.startswith("_"):
+                    yield from _located(
+                        path, method, f"{node.name}.{method.name}", _function_problems(method)
+                    )
+
+
+def _located(path: Path, node: ast.AST, name: str, problems: list[str]) -> Iterator[str]:
+    line = getattr(node, "lineno", 1)
+    yield from (f"{path.relative_to(ROOT)}:{line}: {name}: {problem}" for problem in problems)
+
+
+def _function_problems(node: FunctionNode) -> list[str]:
+    decorators = {_decorator_name(decorator) for decorator in node.decorator_list}
+    docstring = ast.get_docstring(node)
+    if decorators & {"overload", "override"}:
+        return []
+    if not docstring:
+        return ["no docstring"]
+    if decorators & {"command", "group"}:
+        return []
+    summary, sections = _split_sections(docstring)
+    problems = []
+    if not _informative(summary, node.name):
+        problems.append("the first line repeats the name")
+    if decorators & {"property", "cached_property", "setter"}:
+        return problems
+    parameters = [a.arg for a in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)]
+    parameters += [a.arg for a in (node.args.vararg, node.args.kwarg) if a is not None]
+    described = _entries(sections.get("Args", ""))
+    for name in parameters:
+        if name in ("self", "cls") or name.startswith("_"):
+            continue
+        if name not in described:
+            problems.append(f"Args lacks {name!r}")
+        elif not _informative(described[name], name):
+            problems.append(f"Args repeats the name {name!r}")
+    if _returns_value(node) and not sections.keys() & {"Returns", "Yields"}:
+        problems.append("no Returns")
+    raised = _entries(sections.get("Raises", ""))
+    problems += [f"Raises lacks {name}" for name in sorted(_raised(node)) if name not in raised]
+    return problems
+
+
+def _decorator_name(node: ast.expr) -> str:
+    while isinstance(node, ast.Call):
+        node = node.func
+    return node.attr if isinstance(node, ast.Attribute) else node.id if isinstance(node, ast.Name) else ""
+
+
+def _split_sections(docstring: str) -> tuple[str, dict[str, str]]:
+    parts = re.split(rf"^({'|'.join(SECTIONS)}):\s*$", docstring, flags=re.M)
+    return parts[0].strip().split("\n")[0], dict(zip(parts[1::2], parts[2::2], strict=True))
+
+
+def _entries(section: str) -> dict[str, str]:
+    entries: dict[str, str] = {}
+    for names, text in re.findall(
+        r"^ {4}(\*{0,2}\w[\w., *]*?)(?: \([^)]*\))?: (.*(?:\n {5,}.*)*)", section, re.M
+    ):
+        entries |= dict.fromkeys((name.strip("* ").rpartition(".")[2] for name in names.split(",")), text)
+    return entries
+
+
+def _informative(text: str, name: str) -> bool:
+    words = set(re.findall(r"[^\W_]+", text.lower())) - FILLER
+    return bool(words - set(name.lower().split("_")))
+
+
+def _returns_value(node: FunctionNode) -> bool:
+    returns = node.returns
+    if returns is None or (isinstance(returns, ast.Constant) and returns.value is None):
+        return False
+    return not (isinstance(returns, ast.Name) and returns.id in ("NoReturn", "Never"))
+
+
+def _raised(node: FunctionNode) -> set[str]:
+    found: set[str] = set()
+    stack: list[ast.AST] = list(node.body)
+    while stack:
+        here = stack.pop()
+        if isinstance(here, FunctionNode | ast.Lambda | ast.ClassDef):
+            continue
+        if isinstance(here, ast.Raise) and isinstance(here.exc, ast.Call):
+            callee = here.exc.func
+            name = callee.attr if isinstance(callee, ast.Attribute) else getattr(callee, "id", "")
+            if name[:1].isupper():
+                found.add(name)
+        stack.extend(ast.iter_child_nodes(here))
+    return found - {"AssertionError", "NotImplementedError"}
+
+
+def main(arguments: list[str]) -> int:
+    """Print every problem of the named files and folders.
+
+    Args:
+        arguments: paths of files or folders; all packages where empty.
+
+    Returns:
+        The exit code: 1 if there is a problem, else 0.
+
+    """
+    roots = [Path(argument).resolve() for argument in arguments] or [ROOT / package for package in PACKAGES]
+    files = [
+        file
+        for root in roots
+        for file in (sorted(root.rglob("*.py")) if root.is_dir() else [root])
+        if "node_modules" not in file.parts and "out" not in file.parts
+    ]
+    problems = [problem for file in files for problem in problems_in_file(file)]
+    print("\n".join(problems) or "every public function is documented")
+    return 1 if problems else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
