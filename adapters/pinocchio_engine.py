@@ -6,7 +6,7 @@ Pinocchio has no time integrator; the three here are built on its `integrate`, `
 ones `aba` (4.1.0) loses digits that the problem does not ask for, because the articulated inertias
 it passes to the parent lose their symmetry, about threefold a body: 5e-14 m/s² off on the
 catalogue's ten balls, 2e-8 on thirty, 8e-3 on fifty, where crba is below 2e-11 throughout
-(tests/test_pinocchio_engine.py).  An error-controlled integrator stalls on noise of that size.
+(tests/adapters/test_pinocchio_engine.py).  An error-controlled integrator stalls on noise of that size.
 
 The map.  Joint frame k sits at body k's proximal point with the body's axes, so in it the
 centre of mass is at c = -proximal_k and the next joint at distal_k - proximal_k.  A rod is a

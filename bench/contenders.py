@@ -18,7 +18,7 @@ from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import quaternion_rate
 from reference_impl.direct import DirectSystem, solve_dense
 from reference_impl.structured import StructuredSystem, component_first
-from tests.random_chains import random_chain
+from tests.helpers.random_chains import random_chain
 
 Call = Callable[[], object]
 

@@ -98,7 +98,9 @@ def ensure_interpreter(name: str) -> str:
         requirement, label = f"{package}=={version}", version
     number = str(parse_wheel_filename(Path(version).name)[1]) if version.endswith(".whl") else label
     more = (
-        need for when, need in declared_attribute(base, "extra_requirements") or () if SpecifierSet(when).contains(number)
+        need
+        for when, need in declared_attribute(base, "extra_requirements") or ()
+        if SpecifierSet(when).contains(number)
     )
     wanted = [requirement, *BASE_REQUIREMENTS, *more]
     tag = hashlib.sha256("\n".join([*wanted, sys.version]).encode()).hexdigest()[:8]

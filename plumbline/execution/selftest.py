@@ -1,6 +1,6 @@
 """The instrument's own test: mistakes planted in the engines must be reported, and named by their own term.
 
-The tests of the checkout (`tests/test_planted.py`) run in a process of their own, which dies with this one.
+The tests of the checkout (`tests/execution/test_planted_defects.py`) run in a process of their own, which dies with this one.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-TEST_FILE = "tests/test_planted.py"
+TEST_FILE = "tests/execution/test_planted_defects.py"
 TIMEOUT = 1800.0  # s
 _CHILD_SCRIPT = (
     "import sys; from plumbline.processes.parent_death import die_with_parent; "

@@ -30,7 +30,7 @@ from plumbline.model.kinematics import rotation_matrix
 from plumbline.model.welding import BodyParts, part_offsets
 
 EPS = 2.0**-53
-ROUNDING_FACTOR = 64  # state quantities: worst honest error seen is about a sixth of it (tests/test_bound.py)
+ROUNDING_FACTOR = 64  # state quantities: worst honest error seen is about a sixth of it (tests/truth/test_rounding_bound.py)
 SUM_ROUNDING_FACTOR = 256  # energies and momenta
 MAX_RELATIVE_BOUND = 1e-8  # a tolerance above this fraction of its scale could hide a mistake
 

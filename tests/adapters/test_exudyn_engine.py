@@ -1,0 +1,185 @@
+"""What holds of Exudyn alone: orders and limits, the singularity of its tree, what is not used and why."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import exudyn
+import numpy as np
+import pytest
+
+from adapters.exudyn_common import make_settings, silence_engine
+from adapters.exudyn_engine import Exudyn, ExudynChain
+from adapters.exudyn_tree_engine import ExudynTree
+from plumbline.engines.adapter import Adapter
+from plumbline.model.datatypes import EngineFailure, Model, State, Unsupported
+from plumbline.model.kinematics import joint_vectors, state_from_minimal
+from tests.helpers import newton_euler, pendulums
+
+TIMES = np.linspace(0.0, 2.0, 9)
+
+
+def gentle(joints: str) -> tuple[Model, State]:
+    """A generic pendulum (offsets, full inertia) that swings in three dimensions below the pivot."""
+    rng = np.random.default_rng(len(joints))
+    subject = pendulums.model(joints, seed=3)
+    n = subject.n
+    subject = replace(
+        subject,
+        proximal=0.05 * rng.normal(size=(n, 3)) + [0, 0, 0.25],
+        distal=0.05 * rng.normal(size=(n, 3)) - [0, 0, 0.25],
+    )
+    p = np.hstack([np.ones((n, 1)), 0.15 * rng.normal(size=(n, 3))])
+    p /= np.linalg.norm(p, axis=1, keepdims=True)
+    u = np.where(subject.rods[:, None], [0.0, -0.6, -0.8], 0.0)
+    udot = np.where(subject.rods[:, None], [0.7, 0.4, -0.3], 0.0)
+    return subject, state_from_minimal(subject, p, 0.5 * rng.normal(size=(n, 3)), u, udot)
+
+
+@cache
+def truth(joints: str) -> np.ndarray:
+    """(T, N, 3) positions of the gentle pendulum by an independent solution."""
+    return np.array([at.r for at in newton_euler.integrate(*gentle(joints), TIMES)])
+
+
+def ladder(engine: Adapter, joints: str, method: str, levels: range) -> tuple[np.ndarray, np.ndarray]:
+    """Positions at each step size (levels, T, N, 3), and the independent solution's (T, N, 3)."""
+    subject, start = gentle(joints)
+    runs = [engine.simulate(subject, start, TIMES, method, 2.0**-k).r for k in levels]
+    return np.array(runs), truth(joints)
+
+
+def limit(runs: np.ndarray, powers: tuple[int, ...]) -> np.ndarray:
+    """Romberg's last column of runs at halved steps, for an error in these powers of the step."""
+    for power in powers[: len(runs) - 1]:
+        runs = (2.0**power * runs[1:] - runs[:-1]) / (2.0**power - 1)
+    return runs[-1]
+
+
+@pytest.mark.parametrize("joints", ["b", "bb", "r"])
+@pytest.mark.parametrize(
+    ("engine", "method", "levels", "order"),
+    [
+        (Exudyn(), "trapezoidal", range(8, 13), 2),
+        (Exudyn(), "generalized-alpha", range(8, 13), 2),
+        (ExudynTree(), "RK44", range(7, 12), 4),
+    ],
+    ids=["trapezoidal", "generalized-alpha", "RK44"],
+)
+def test_order_and_limit(engine, method, levels, order, joints):
+    runs, true = ladder(engine, joints, method, levels)
+    steps = np.abs(np.diff(runs, axis=0)).max(axis=(1, 2, 3))
+    shown = np.log2(steps[:-1] / steps[1:])
+    assert abs(shown[1] - order) < 0.1, f"{method} on {joints} shows orders {shown}, declared {order}"
+    error = np.abs(limit(runs, engine.integrator(method).powers) - true).max()
+    assert error < 1e-11, f"the limit of {method} on {joints} is off by {error:.1e} m"
+
+
+def test_even_powers_are_what_the_trapezoidal_rule_has():
+    """Two steps of the even powers reach what two of the consecutive ones do not: the h³ term is absent."""
+    runs, true = ladder(Exudyn(), "b", "trapezoidal", range(7, 10))
+    even, each = (np.abs(limit(runs, powers) - true).max() for powers in ((2, 4), (2, 3)))
+    assert even < each / 30
+
+
+def test_the_trapezoidal_rule_lets_joints_drift_and_index_3_does_not():
+    subject, start = gentle("br")
+    gaps = {}
+    for method in ("trapezoidal", "generalized-alpha"):
+        for step in (2.0**-8, 2.0**-9):
+            run = Exudyn().simulate(subject, start, TIMES, method, step)
+            gap = np.linalg.norm(joint_vectors(subject, run.r, run.p), axis=-1) - subject.length
+            gaps[method, step] = np.abs(gap).max()
+    assert gaps["generalized-alpha", 2.0**-8] < 1e-10
+    assert 3 < gaps["trapezoidal", 2.0**-8] / gaps["trapezoidal", 2.0**-9] < 5  # order 2
+
+
+def test_builtin_initial_accelerations_are_finite_differences():
+    """The reason why `evaluate` solves M, C, f and γ itself: Exudyn's own are off by some 1e-6."""
+    subject = pendulums.model("bb", seed=1)
+    start = pendulums.state(subject)
+    truth = newton_euler.solve(subject, start)
+    scale = np.abs(truth.acceleration).max()
+    with silence_engine():
+        chain = ExudynChain(subject, start)
+        solver, chosen = exudyn.MainSolverImplicitSecondOrder(), make_settings()
+        assert chosen.timeIntegration.generalizedAlpha.computeInitialAccelerations
+        assert solver.InitializeSolver(chain.mbs, chosen)
+        own = np.reshape(chain.mbs.systemData.GetODE2Coordinates_tt(), (-1, 7))[:, :3]
+        solver.FinalizeSolver(chain.mbs, chosen)
+    solved = Exudyn().evaluate(subject, [start])[0].acceleration
+    assert 1e-9 < np.abs(own - truth.acceleration).max() / scale < 1e-3
+    assert np.abs(solved - truth.acceleration).max() / scale < 1e-13
+
+
+def test_long_chains_at_state_level():
+    """50 bodies: maximal coordinates keep rounding; the tree's mass matrix costs digits."""
+    subject = pendulums.model("b" * 25 + "r" * 25)
+    start = pendulums.state(subject, rate=1.0)
+    truth = newton_euler.solve(subject, start).acceleration
+    for engine, bound in ((Exudyn(), 1e-13), (ExudynTree(), 1e-9)):
+        error = np.abs(engine.evaluate(subject, [start])[0].acceleration - truth).max() / np.abs(truth).max()
+        assert error < bound, f"{engine.name}: {error:.1e}"
+
+
+def swing_over(rate: float) -> tuple[Model, State]:
+    """A body on a ball that starts about x and is driven about y, off its first axis."""
+    subject = replace(pendulums.model("b"), gravity=np.zeros(3), moment=np.array([[0.0, 4.0, 0.0]]))
+    subject = replace(subject, inertia=0.1 * np.eye(3)[None], proximal=np.zeros((1, 3)))
+    zero = np.zeros((1, 3))
+    return subject, state_from_minimal(
+        subject, np.array([[1.0, 0, 0, 0]]), np.array([[rate, 0.0, 0.0]]), zero, zero
+    )
+
+
+def test_tree_says_when_its_angles_become_singular():
+    """A constant body moment turns the first axis into the third; before that the motion is right."""
+    subject, start = swing_over(1e-3)
+    with pytest.raises(Unsupported, match=r"body 1 come near their singularity at t = 0\.2\d* s") as said:
+        ExudynTree().simulate(subject, start, np.array([0.0, 2.0]), "RK44", 2.0**-9)
+    stated = float(str(said.value).split("t = ")[1].split(" s")[0])
+    # from rest, ½ (4 / 0.1) t² about the second or third axis of the chart: 84.26° at 0.2712 s
+    assert stated == pytest.approx(np.sqrt(2 * np.arccos(0.1) / 40), abs=2.0**-9)
+    before = np.array([0.0, 0.25])
+    run = ExudynTree().simulate(subject, start, before, "RK44", 2.0**-11)
+    true = newton_euler.integrate(subject, start, before)[-1]
+    assert np.abs(np.abs(run.p[-1] @ true.p.T) - 1).max() < 1e-10
+
+
+def test_tree_turns_for_ever_about_its_first_axis():
+    """Ten turns about the initial axis: angles grow, nothing is singular."""
+    subject, start = swing_over(10 * np.pi)
+    subject = replace(subject, moment=np.zeros((1, 3)))
+    run = ExudynTree().simulate(subject, start, np.linspace(0, 2, 5), "RK44", 2.0**-8)
+    assert np.abs(run.v).max() < 1e-13
+    assert np.abs(np.abs(run.p[-1, 0]) - np.abs(start.p[0])).max() < 1e-9
+
+
+def test_a_failed_newton_iteration_is_named_with_time_and_words():
+    """A step of a quarter of a second through a tumbling pendulum: Newton diverges, and that is said."""
+    subject = pendulums.model("rr")
+    start = pendulums.state(subject, rate=20.0)
+    with pytest.raises(EngineFailure, match=r"stopped at t = .* s after \d+ steps, asked for 8 .*: .+"):
+        Exudyn().simulate(subject, start, TIMES, "generalized-alpha", 0.25)
+
+
+@pytest.mark.parametrize("step", [2.0**-8, 1e-3, 1 / 300])
+def test_steps_are_counted(step):
+    subject, start = gentle("b")
+    times = np.arange(0, 4) * (300 * step if step > 1e-3 else 1.0)
+    run = Exudyn().simulate(subject, start, times, "trapezoidal", step)
+    assert run.steps == round(times[-1] / step)
+
+
+def test_nothing_is_printed_or_written(capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    subject, start = gentle("br")
+    for engine in (Exudyn(), ExudynTree()):
+        engine.evaluate(subject, [start])
+        engine.simulate(subject, start, TIMES[:2], engine.integrators[0].name, 2.0**-8)
+    hard = pendulums.model("rr")
+    with pytest.raises(EngineFailure):
+        Exudyn().simulate(hard, pendulums.state(hard, rate=20.0), TIMES, "generalized-alpha", 0.25)
+    assert capfd.readouterr() == ("", "")
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,146 @@
+"""The command line as a user types it: real engines, real exit codes."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def plumbline(*words, cwd=ROOT, **environment):
+    return subprocess.run(
+        [sys.executable, "-m", "plumbline", *map(str, words)],
+        cwd=cwd, capture_output=True, text=True, timeout=240,
+        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+    )  # fmt: skip
+
+
+def test_help_teaches_and_documents_exit_codes():
+    said = plumbline("--help")
+    assert said.returncode == 0
+    for words in (
+        "Exit codes",
+        "0  everything agrees",
+        "1  a disagreement",
+        "2  bad usage",
+        "3  an engine failed",
+    ):
+        assert words in said.stdout
+    assert "\n    python -m plumbline run --family chain --level state\n" in plumbline("run", "--help").stdout
+    assert "\\b" not in said.stdout
+
+
+def test_list_scenarios_and_engines_as_text_and_json():
+    names = [s["name"] for s in json.loads(plumbline("list", "scenarios", "--json").stdout)]
+    assert len(names) >= 27
+    text = plumbline("list", "scenarios").stdout
+    assert all(name in text for name in names)
+    engines = {e["name"]: e for e in json.loads(plumbline("list", "engines", "--json").stdout)}
+    assert {"reference", "mujoco", "pinocchio", "exudyn"} <= set(engines)
+    assert "RK4" in engines["mujoco"]["integrators"]
+
+
+def test_a_run_writes_everything_and_exits_by_its_verdict(tmp_path):
+    said = plumbline("run", "rest", "--engine", "mujoco", "--engine", "reference", "--out", tmp_path / "o o")
+    assert said.returncode == 0, said.stdout + said.stderr
+    assert "agree" in said.stdout
+    assert "report.html" in said.stdout
+    files = {p.name for p in (tmp_path / "o o").iterdir()}
+    assert {"results.json", "summary.parquet", "states.parquet", "report.html", "junit.xml"} <= files
+    document = json.loads((tmp_path / "o o" / "results.json").read_text())
+    assert document["schema_version"] == 1
+    assert {row["verdict"] for row in document["rows"] if row["known"] is None} == {"agrees"}
+    (tmp_path / "o o" / "report.html").unlink()
+    again = plumbline("report", tmp_path / "o o")
+    assert again.returncode == 0, again.stderr
+    assert (tmp_path / "o o" / "report.html").exists()
+
+
+def test_json_is_alone_on_stdout_and_accept_is_shown_beside(tmp_path):
+    said = plumbline(
+        "run",
+        "rest",
+        "--engine",
+        "mujoco",
+        "--level",
+        "state",
+        "--json",
+        "--accept",
+        "1e-6",
+        "--out",
+        tmp_path,
+    )
+    document = json.loads(said.stdout)
+    assert {row["accept"] for row in document["rows"]} == {1e-6}
+    assert document["run"]["exit_code"] == said.returncode == 0
+
+
+def test_a_scenario_of_ones_own_by_path_and_a_family(tmp_path):
+    mine = tmp_path / "my pendulum.yaml"
+    mine.write_text((ROOT / "scenarios" / "single" / "rest.yaml").read_text())
+    said = plumbline("run", mine, "--engine", "pinocchio", "--level", "state", "--out", tmp_path / "out")
+    assert said.returncode == 0, said.stdout + said.stderr
+    assert "my pendulum" in said.stdout
+    said = plumbline("check", mine)
+    assert said.returncode == 0
+    assert "ok" in said.stdout
+
+
+def test_a_name_stays_text_on_the_terminal_in_html_and_in_junit(tmp_path):
+    name = "[/red] <img src=x onerror=alert(1)> & 'quoted' $(reboot)"
+    mine = tmp_path / "hostile.yaml"
+    rest = (ROOT / "scenarios" / "single" / "rest.yaml").read_text()
+    mine.write_text(rest.replace("schema_version: 1", f"schema_version: 1\nname: {json.dumps(name)}"))
+    said = plumbline("run", mine, "--engine", "mujoco", "--level", "state", "--out", tmp_path / "out")
+    assert said.returncode == 0, said.stdout + said.stderr
+    assert name[:30] in said.stdout
+    assert "<img" not in (tmp_path / "out" / "report.html").read_text()
+    cases = ElementTree.parse(tmp_path / "out" / "junit.xml").iter("testcase")
+    assert any(name in (case.get("name") or "") + (case.get("classname") or "") for case in cases)
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["run", "tumbling-bal"], "tumbling-ball"),
+        (["run", "--engine", "mujocco"], "did you mean 'mujoco'"),
+        (["run", "--family", "singel"], "did you mean 'single'"),
+        (["run", "--level", "all of them"], "level"),
+        (["run", "--jobs", "0"], "jobs"),
+        (["run", "--accept", "-1"], "accept"),
+        (["rnu"], "Did you mean 'run'"),
+        (["check"], "FILE"),
+        (["report", "nowhere"], "no results here"),
+        (["check", "nowhere.yaml"], "nowhere.yaml"),
+    ],
+)
+def test_bad_usage_ends_with_2_and_a_suggestion(words, expected):
+    said = plumbline(*words)
+    assert said.returncode == 2, said.stdout + said.stderr
+    assert expected in said.stderr
+
+
+def test_an_output_folder_that_cannot_be_written_is_said_before_any_work(tmp_path):
+    (tmp_path / "file").write_text("x")
+    said = plumbline("run", "rest", "--out", tmp_path / "file" / "out")
+    assert said.returncode == 2
+    assert "cannot write to" in said.stderr
+
+
+def test_an_engine_that_is_not_installed_is_a_verdict(tmp_path):
+    (tmp_path / "mujoco.py").write_text("raise ImportError('no mujoco here')\n")
+    said = plumbline(
+        "run", "rest", "--engine", "mujoco", "--level", "state", "--out", tmp_path / "out",
+        PYTHONPATH=f"{tmp_path}{os.pathsep}{ROOT}",
+    )  # fmt: skip
+    assert said.returncode == 0, said.stderr
+    assert "not installed" in said.stdout
+
+
+def test_schema_is_json():
+    assert json.loads(plumbline("schema").stdout)["properties"]

@@ -1,0 +1,382 @@
+"""The steps of a diagnosis, each on answers made for it; whole diagnoses are in `test_planted`."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from plumbline.diagnosis.defect_model import evaluate_case, make_defect_case
+from plumbline.diagnosis.diagnose import (
+    QUANTITIES,
+    FittedCause,
+    ObservedDifference,
+    derivatives_by_amount,
+    diagnose,
+    diagnose_quantity,
+    find_explanations,
+    fit_cause,
+    fit_causes,
+    is_explanation,
+    max_error_ratio,
+    observe_difference,
+)
+from plumbline.diagnosis.hypotheses import all_causes
+from plumbline.model.kinematics import state_from_minimal
+from plumbline.model.sampling import random_states
+from plumbline.truth.ground_truth import state_truth
+from tests.helpers import pendulums
+
+VECTORS = QUANTITIES[:3]
+ALONG = np.array([2.0, -1.0, 2.0]) / 3
+
+
+@cache
+def known(joints="bb", count=10):
+    model = pendulums.model(joints)
+    return model, state_truth(model, random_states(model, count, seed=4))
+
+
+def changed(quantity, to, joints="bb", count=10):
+    """True answers with one quantity put through ``to`` (index, value, bound)."""
+    model, truth = known(joints, count)
+    said = [
+        replace(a, **{quantity: to(i, getattr(a, quantity), np.asarray(b.tolerance(quantity)))})
+        for i, (a, b) in enumerate(zip(truth.quantities, truth.bounds, strict=True))
+    ]
+    return model, said, truth
+
+
+def test_distances_are_in_bounds():
+    vectors = np.array([[[3.0, 4, 0], [0, 0, 1]], [[0, 0, 0], [6, 0, 8]]])
+    assert max_error_ratio(vectors, np.array([[1.0, 1.0], [1.0, 4.0]])) == 5.0
+    assert max_error_ratio(vectors[1:], np.array([[1.0, 4.0]])) == 2.5
+    assert max_error_ratio(np.array([-3.0, 2.0]), np.array([1.0, 1.0])) == 3.0
+    assert max_error_ratio(np.array([0.0]), np.array([0.0])) == 0.0
+    assert max_error_ratio(np.array([1.0]), np.array([0.0])) > 1e300
+
+
+def test_a_difference_is_measured_per_quantity_and_as_one_vector():
+    one, two = np.array([[[2.0, 0, 0]]]), np.array([6.0])
+    said = {"acceleration": one, "kinetic_energy": two}
+    seen = ObservedDifference(
+        known()[0], said, said, {"acceleration": np.array([[0.5]]), "kinetic_energy": np.array([3.0])}, {}
+    )
+    still = {q: 0 * x for q, x in said.items()}
+    assert seen.error_ratios(still) == {"acceleration": 4.0, "kinetic_energy": 2.0}
+    wide = {"acceleration": np.array([[4.0]]), "kinetic_energy": np.array([6.0])}
+    assert seen.error_ratios(still, wide) == {"acceleration": 0.5, "kinetic_energy": 1.0}
+    assert seen.weighted_vector(said).tolist() == [4.0, 0, 0, 2.0]
+    energy, allowed = {"kinetic_energy": np.array([6.0, 8.0])}, {"kinetic_energy": np.array([3.0, 2.0])}
+    assert ObservedDifference(known()[0], energy, energy, allowed, {}).weighted_vector(energy).tolist() == [
+        2.0,
+        4.0,
+    ]
+
+
+@pytest.mark.parametrize(("at", "first"), [(0, 0), (3, 0), (5, 1), (9, 2)])
+def test_eight_states_around_the_worst_one_are_looked_at(at, first):
+    model, said, truth = changed("acceleration", lambda i, a, b: a + 100 * b[:, None] * (i == at))
+    seen = observe_difference(model, said, truth)
+    assert len(seen.case.p) == 8
+    for k in range(8):
+        assert np.array_equal(seen.case.p[k], truth.states[first + k].p)
+        assert np.array_equal(seen.reported["acceleration"][k], said[first + k].acceleration)
+        assert np.array_equal(seen.expected["acceleration"][k], truth.quantities[first + k].acceleration)
+        assert np.array_equal(seen.bounds["joint_reaction"][k], truth.bounds[first + k].joint_reaction)
+        if first + k:
+            before = truth.quantities[first + k - 1]
+            assert np.array_equal(seen.previous_expected["acceleration"][k], before.acceleration)
+    assert set(seen.reported) == set(QUANTITIES)
+    less = [replace(said[0], joint_reaction=None), *said[1:]]
+    assert "joint_reaction" not in observe_difference(model, less, truth).reported
+
+
+@pytest.mark.parametrize(("bodies", "states"), [(6, 8), (7, 4), (12, 4), (13, 2)])
+def test_fewer_states_of_long_chains(bodies, states):
+    model = pendulums.model("b" * bodies)
+    at = random_states(model, 9, seed=1)
+    truth = state_truth(model, at)
+    assert len(observe_difference(model, truth.quantities, truth).case.p) == states
+    assert len(observe_difference(model, truth.quantities[:1], truth_of(truth, 1)).case.p) == 1
+
+
+def truth_of(truth, count):
+    return replace(
+        truth, states=truth.states[:count], quantities=truth.quantities[:count], bounds=truth.bounds[:count]
+    )
+
+
+@pytest.mark.parametrize("size", [1.0, 1e-6])
+def test_slopes_are_those_of_the_answers(size):
+    """By every fifth cause, against differences a hundred times as far; of bodies of milligrams too."""
+    model = pendulums.model("bb")
+    model = replace(model, mass=size * model.mass, inertia=size * model.inertia)
+    truth = state_truth(model, random_states(model, 4, seed=4))
+    seen = observe_difference(model, truth.quantities, truth)
+    for cause in [c for c in all_causes(seen.case) if c.scale is not None][::5]:
+        (slope,) = derivatives_by_amount(seen, [(cause, cause.nominal)])
+        ends = [
+            evaluate_case(cause.alter(seen.case, cause.nominal + s * 1e-4 * cause.scale)) for s in (1, -1)
+        ]
+        by_hand = seen.weighted_vector(
+            {q: (ends[0][q] - ends[1][q]) / (2e-4 * cause.scale) for q in seen.reported}
+        )
+        np.testing.assert_allclose(slope, by_hand, rtol=1e-5, atol=1e-5 * np.max(np.abs(by_hand)))
+
+
+@pytest.mark.parametrize("quantity", VECTORS)
+@pytest.mark.parametrize(
+    ("to", "words"),
+    [
+        (lambda i, x, b: -x, "{} with the opposite sign were given"),
+        (lambda i, x, b: 1.25 * x, "{} were 1.25 times as large"),
+        (lambda i, x, b: x + np.array([1e-3, 0, 2e-3]), "a constant were added to the {} at every state"),
+        (lambda i, x, b: np.asarray(np.float32(x), float), "{} were rounded to single precision"),
+    ],
+    ids=["sign", "factor", "constant", "single"],
+)
+def test_a_misread_quantity_is_named(quantity, to, words):
+    model, said, truth = changed(quantity, to)
+    assert diagnose_quantity(observe_difference(model, said, truth), quantity) == words.format(
+        quantity.replace("_", " ")
+    )
+
+
+def test_a_stale_field_and_an_origin_elsewhere_are_named():
+    model, truth = known()
+    stale = [truth.quantities[0], *truth.quantities[:-1]]  # the first has none before it
+    said = [replace(a, joint_reaction=b.joint_reaction) for a, b in zip(truth.quantities, stale, strict=True)]
+    text = diagnose_quantity(observe_difference(model, said, truth), "joint_reaction")
+    assert text == "joint reaction of the state before were given (a stale field)"
+    model, said, truth = changed("potential_energy", lambda i, x, b: x + 0.75)
+    seen = observe_difference(model, said, truth)
+    assert diagnose_quantity(seen, "potential_energy") == (
+        "origin of the potential energy were elsewhere: 0.75 J more at every state"
+    )
+    assert diagnose_quantity(seen, "kinetic_energy") != diagnose_quantity(seen, "potential_energy")
+
+
+def test_what_is_in_no_pattern_is_not_misread():
+    rng = np.random.default_rng(1)
+    model, said, truth = changed("acceleration", lambda i, x, b: x * (1 + 1e-6 * rng.normal(size=x.shape)))
+    seen = observe_difference(model, said, truth)
+    assert diagnose_quantity(seen, "acceleration") is None
+    assert find_explanations(seen) == []
+    text = diagnose(model, said, truth)
+    assert text == "no single change of a parameter, term or convention explains the acceleration"
+
+
+def test_of_two_differences_one_may_have_a_name():
+    rng = np.random.default_rng(2)
+    model, said, truth = changed(
+        "joint_reaction", lambda i, x, b: x * (1 + 1e-6 * rng.normal(size=x.shape)), count=4
+    )
+    said = [replace(a, acceleration=1.25 * a.acceleration) for a in said]
+    assert diagnose(model, said, truth) == (
+        "behaves as if acceleration were 1.25 times as large; "
+        "no single change of a parameter, term or convention explains the joint reaction"
+    )
+
+
+def the_cause(seen, words):
+    """The one with these words for an amount of 2."""
+    (found,) = (cause for cause in all_causes(seen.case) if cause.describe(2.0, 0.0) == words)
+    return found
+
+
+def test_a_pendulum_that_cannot_be_explains_nothing():
+    """Bodies without any inertia have no angular acceleration to predict."""
+    model, said, truth = changed("acceleration", lambda i, x, b: 2 * x)
+    seen = observe_difference(model, said, truth)
+    cause = the_cause(seen, "all inertias were doubled")
+    assert not is_explanation(seen, evaluate_case(seen.case), FittedCause(cause, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(("off", "explained"), [(0.9, True), (1.9, True), (2.1, False)])
+def test_a_prediction_may_be_off_by_the_bounds_of_both_pendulums(off, explained):
+    model, said, truth = changed("acceleration", lambda i, x, b: x + off * b[:, None] * ALONG)
+    seen = observe_difference(model, said, truth)
+    cause = the_cause(seen, "all inertias were doubled")  # once as large: the right pendulum
+    assert is_explanation(seen, evaluate_case(seen.case), FittedCause(cause, 1.0, 0.0)) is explained
+
+
+@pytest.mark.parametrize(
+    "words", ["world rate were taken for the body rate", "products of inertia were missing"]
+)
+def test_a_convention_is_named(words):
+    model, truth = known(count=4)
+    wrong = evaluate_case(
+        the_cause(observe_difference(model, truth.quantities, truth), words).alter(
+            make_defect_case(model, truth.states), 0
+        )
+    )
+    said = [replace(a, **{q: wrong[q][i] for q in QUANTITIES}) for i, a in enumerate(truth.quantities)]
+    assert find_explanations(observe_difference(model, said, truth)) == [words]
+
+
+def test_a_difference_within_the_bound_is_in_the_mass_matrix():
+    model, said, truth = changed("acceleration", lambda i, x, b: x + 0.4 * b[:, None])
+    assert diagnose(model, said, truth).endswith("it is in the mass matrix alone")
+    model, said, truth = changed("acceleration", lambda i, x, b: x + 4.0 * b[:, None])
+    assert diagnose(model, said, truth) == "too near the rounding bound for any one term to be named"
+
+
+def test_an_engine_that_fails_when_asked_again_is_told():
+    model, said, truth = changed("acceleration", lambda i, x, b: 1.5 * x)
+
+    def evaluate(asked, states):
+        if not np.any(asked.gravity):
+            raise RuntimeError("no\n  weight")
+        return [replace(t, acceleration=1.5 * t.acceleration) for t in state_truth(asked, states).quantities]
+
+    text = diagnose(model, said, truth, evaluate)
+    assert text.startswith("behaves as if acceleration were 1.5 times as large (the difference ")
+    assert text.endswith("persists at rest, fails without gravity: no weight)")
+
+
+def test_where_nothing_is_different_no_amount_is_seen():
+    model, truth = known()
+    seen = observe_difference(model, truth.quantities, truth)
+    right = evaluate_case(seen.case)
+    amounts = [cause for cause in all_causes(seen.case) if cause.scale is not None]
+    assert {cause.nominal for cause in amounts} >= {0.0, 1.0}
+    for cause in amounts:
+        (slope,) = derivatives_by_amount(seen, [(cause, cause.nominal)])
+        if np.any(slope):
+            assert fit_cause(seen, right, cause, slope) is None
+
+
+@pytest.mark.parametrize(
+    "to", [lambda i, x, b: x + 0.5, lambda i, x, b: known("b" * 13, 9)[1].quantities[i - 1].acceleration]
+)
+def test_two_states_show_neither_a_constant_nor_a_stale_field(to):
+    """Of thirteen bodies two states are looked at, too few to see a pattern over states."""
+    model, said, truth = changed("acceleration", to, "b" * 13, 9)
+    assert diagnose_quantity(observe_difference(model, said, truth), "acceleration") is None
+    model, said, truth = changed("acceleration", lambda i, x, b: x + 0.5, "b" * 7, 9)
+    assert "a constant were added" in str(
+        diagnose_quantity(observe_difference(model, said, truth), "acceleration")
+    )
+
+
+def test_a_pendulum_at_rest_is_asked_at_rest_too():
+    model = replace(pendulums.model("rb"), gravity=np.array([0, 0, -9.81]))
+    still = [
+        state_from_minimal(model, s.p, 0 * s.omega, s.u, 0 * s.udot) for s in random_states(model, 4, seed=3)
+    ]
+    truth = state_truth(model, still)
+
+    def evaluate(asked, states):
+        right = state_truth(asked, states).quantities
+        return [replace(t, acceleration=1.5 * t.acceleration) for t in right]
+
+    text = diagnose(model, evaluate(model, still), truth, evaluate)
+    assert text.endswith("(the difference persists at rest, vanishes without gravity)")
+
+
+@pytest.mark.parametrize(("loads", "drag"), [(True, True), (True, False), (False, True)])
+def test_what_lives_in_the_loads_vanishes_without_them(loads, drag):
+    model = pendulums.model("b", loads=loads, drag=drag)
+    truth = state_truth(model, random_states(model, 4, seed=6))
+    none = {name: 0 * getattr(model, name) for name in ("force", "moment", "drag_force", "drag_moment")}
+
+    def evaluate(asked, states):
+        return state_truth(replace(asked, **none), states).quantities
+
+    text = diagnose(model, evaluate(model, truth.states), truth, evaluate)
+    at_rest = "persists" if loads else "vanishes"  # drag does, too
+    assert text.endswith(f"{at_rest} at rest, persists without gravity, vanishes without loads and drag)")
+
+
+def test_what_lives_in_the_rates_vanishes_at_rest():
+    model = pendulums.model("rb")
+    truth = state_truth(model, random_states(model, 4, seed=3))
+
+    def evaluate(asked, states):
+        still = [state_from_minimal(asked, s.p, 0 * s.omega, s.u, 0 * s.udot) for s in states]
+        return state_truth(asked, still).quantities
+
+    text = diagnose(model, evaluate(model, truth.states), truth, evaluate)
+    assert text.endswith("(the difference vanishes at rest, persists without gravity)")
+
+
+def test_the_first_that_fails_is_told_in_eighty_letters_and_the_next_one_asked():
+    model, said, truth = changed("acceleration", lambda i, x, b: 1.5 * x)
+
+    def evaluate(asked, states):
+        if not any(np.any(s.omega) for s in states):
+            raise RuntimeError("x" * 100)
+        return [replace(t, acceleration=1.5 * t.acceleration) for t in state_truth(asked, states).quantities]
+
+    text = diagnose(model, said, truth, evaluate)
+    assert text.endswith(f"(the difference fails at rest: {'x' * 80}, persists without gravity)")
+
+
+def with_a_mass(factor, noise=0.0, count=4):
+    """What an engine would say whose first mass is ``factor`` times as large, off by ``noise`` bounds."""
+    model, truth = known(count=count)
+    rng = np.random.default_rng(5)
+    wrong = evaluate_case(make_defect_case(replace(model, mass=model.mass * [factor, 1.0]), truth.states))
+    said = [replace(a, **{q: wrong[q][i] for q in QUANTITIES}) for i, a in enumerate(truth.quantities)]
+    off = [
+        replace(a, acceleration=a.acceleration + noise * b.acceleration[:, None] * rng.normal(size=(2, 3)))
+        for a, b in zip(said, truth.bounds, strict=True)
+    ]
+    return observe_difference(model, off, truth)
+
+
+@pytest.mark.parametrize("factor", [0.99, 1.01])
+def test_an_amount_is_found_whether_it_is_more_or_less(factor):
+    seen = with_a_mass(factor)
+    right, found = evaluate_case(seen.case), [c for c in all_causes(seen.case) if c.scale is not None]
+    data = seen.weighted_vector({q: seen.reported[q] - seen.expected[q] for q in seen.reported})
+    named = [fit for fit in fit_causes(seen, right, data, found) if is_explanation(seen, right, fit)]
+    mass = seen.case.mass[0, 0]
+    (fit,) = (fit for fit in named if fit.cause.nominal == mass)
+    assert abs(fit.fitted_amount - factor * mass) < 3 * fit.resolution < 1e-9 * mass
+    (slope,) = derivatives_by_amount(
+        seen, [(fit.cause, fit.fitted_amount)]
+    )  # by differences, true to 1e-5 (above)
+    assert fit.resolution == pytest.approx(1 / np.linalg.norm(slope), rel=1e-5, abs=0)
+
+
+def test_an_amount_is_fitted_to_what_it_does_not_explain_too():
+    seen = with_a_mass(1.001, noise=1e6)
+    (cause,) = (c for c in all_causes(seen.case) if c.scale is not None and c.nominal == seen.case.mass[0, 0])
+    (slope,) = derivatives_by_amount(seen, [(cause, cause.nominal)])
+    fit = fit_cause(seen, evaluate_case(seen.case), cause, slope)
+    assert fit is not None and abs(fit.fitted_amount - 1.001 * cause.nominal) < 1e7 * fit.resolution
+    assert not is_explanation(seen, evaluate_case(seen.case), fit)
+
+
+@pytest.mark.parametrize(("off", "words"), [(1.5, "acceleration were 1.25 times as large"), (2.5, None)])
+def test_a_misread_quantity_may_be_off_by_both_bounds(off, words):
+    model, said, truth = changed(
+        "acceleration", lambda i, x, b: 1.25 * x + (i == 3) * off * b[:, None] * ALONG
+    )
+    assert diagnose_quantity(observe_difference(model, said, truth), "acceleration") == words
+
+
+def test_three_states_show_a_stale_field_and_a_constant():
+    model, truth = known(count=3)
+    before = [truth.quantities[0], *truth.quantities[:-1]]
+    said = [replace(a, acceleration=b.acceleration) for a, b in zip(truth.quantities, before, strict=True)]
+    assert "stale" in str(diagnose_quantity(observe_difference(model, said, truth), "acceleration"))
+    said[1] = truth.quantities[1]
+    assert diagnose_quantity(observe_difference(model, said, truth), "acceleration") is None, (
+        "one state was not of the one before"
+    )
+    model, said, truth = changed("acceleration", lambda i, x, b: x + 0.5, count=3)
+    assert "a constant were added" in str(
+        diagnose_quantity(observe_difference(model, said, truth), "acceleration")
+    )
+
+
+@pytest.mark.parametrize(("factor", "words"), [(-0.5, "-0.5"), (1.000123456, "1.000123"), (2.0, "2")])
+def test_a_factor_is_told_with_the_digits_that_it_needs(factor, words):
+    model, said, truth = changed("acceleration", lambda i, x, b: factor * x)
+    text = f"acceleration were {words} times as large"
+    assert diagnose_quantity(observe_difference(model, said, truth), "acceleration") == text

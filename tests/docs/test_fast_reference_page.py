@@ -1,0 +1,87 @@
+"""docs/fast-reference.md cites stored runs: every figure of its tables is the one in bench/results."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+
+from plumbline.studies import sweep
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = (ROOT / "docs" / "fast-reference.md").read_text(encoding="utf-8")
+FIGURES = json.loads((ROOT / "bench" / "results" / "figures.json").read_text(encoding="utf-8"))
+COLUMNS = {
+    "structured": "reference",
+    "direct": "direct",
+    "SuperLU": "superlu",
+    "MuJoCo forward": "mujoco",
+    "Pinocchio aba": "pinocchio",
+    "Exudyn step": "exudyn step",
+}
+
+
+def table(first: str) -> list[dict[str, str]]:
+    """The rows of the page's table whose header starts so."""
+    lines = PAGE[PAGE.index(f"| {first} |") :].split("\n\n")[0].splitlines()
+    head, _, *rows = ([cell.strip() for cell in line.strip("| ").split(" | ")] for line in lines)
+    return [dict(zip(head, row, strict=True)) for row in rows]
+
+
+def record(**where: Any) -> dict[str, Any]:
+    (found,) = (r for r in FIGURES["records"] if where.items() <= r.items())
+    return dict(found["microseconds"])
+
+
+def close(told: str, stored: float) -> bool:
+    return float(told.replace(",", "")) == pytest.approx(stored, rel=0.05 if "e" in told else 5.1e-3)
+
+
+def test_the_goals() -> None:
+    rows = table("what")
+    assert [row["what"] for row in rows] == [goal["what"] for goal in FIGURES["goals"]]
+    for row, goal in zip(rows, FIGURES["goals"], strict=True):
+        assert close(row["measured"], goal["measured"]), row
+        assert float(row["goal, at most"]) == goal["goal"]
+
+
+@pytest.mark.parametrize("kind", ["single", "batch"])
+def test_the_times(kind: str) -> None:
+    second = "joints" if kind == "single" else "batch"
+    for row in table(f"bodies, {second}"):
+        bodies, other = row.pop(f"bodies, {second}").split(", ")
+        stored = record(kind=kind, bodies=int(bodies), **{second: other if kind == "single" else int(other)})
+        for column, told in row.items():
+            name = COLUMNS[column]
+            assert (told == "–") == (name not in stored), (bodies, other, column)
+            assert told == "–" or close(told, stored[name]), (bodies, other, column)
+
+
+def test_the_drifts() -> None:
+    stored = pq.read_table(ROOT / "bench" / "results" / "drift.parquet").to_pylist()
+    late = [row for row in stored if row["time"] == 1000]
+    rows = table("scenario")
+    assert len(rows) == len(late) == 21
+    for told, row in zip(rows, late, strict=True):
+        assert (told["scenario"], told["variant"]) == (row["scenario"], row["variant"])
+        assert float(told["rtol"]) == row["rtol"]
+        for column, name in (
+            ("joint gap, m", "gap"),
+            ("gap rate, m/s", "gap_rate"),
+            ("energy error", "energy"),
+        ):
+            assert told[column] == f"{row[name]:.1e}"
+
+
+def test_the_shown_sweep_is_one(tmp_path: Path) -> None:
+    shown = re.search(r"```text\n(.*?)```", PAGE, re.DOTALL)
+    assert shown
+    (tmp_path / "sweep.yaml").write_text(shown[1], encoding="utf-8")
+    spec, cells = sweep.load(tmp_path / "sweep.yaml")
+    assert len(cells) == 12
+    assert all(cell.scenario is not None for cell in cells)
+    assert set(spec.engines) == {"mujoco", "exudyn"}

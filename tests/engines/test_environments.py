@@ -1,0 +1,282 @@
+"""Other versions of an engine: names, the other environment's process, and what is supported."""
+
+import ctypes
+import operator
+import os
+import shutil
+import subprocess
+import sys
+import time
+import zipfile
+from dataclasses import replace
+from importlib import metadata
+
+import numpy as np
+import psutil
+import pytest
+from packaging.version import Version
+
+from plumbline.engines import calls, environments
+from plumbline.engines.registry import ENGINES
+from plumbline.execution.runner import Plan, run_plan
+from plumbline.judging import known_issues
+from plumbline.judging.rows import RowContext
+from plumbline.processes.remote_python import call_remote
+from plumbline.processes.workers import Limits, Task, WorkerPool
+from plumbline.scenario import loader
+from plumbline.truth.certified import certify_state
+from tests.helpers.exudyn_initial_accelerations import initial_accelerations
+
+HERE = sys.executable  # the installed environment stands for another one: the way there and back is the same
+
+
+def quiet(*_):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("mujoco", None),
+        ("mujoco@3.12.0", None),
+        ("mujoco@4.0.0rc1", None),
+        ("pinocchio-aba@latest", None),
+        ("exudyn@pre", None),
+        ("mujoco@", "is not a version"),
+        ("mujoco@newest", "is not a version"),
+        ("mujoco@mujoco-9.9-py3-none-any.whl", "there is no file"),
+        ("mujoco@elsewhere/absent-1.0-py3-none-any.whl", "is a wheel of absent, not of mujoco"),
+        ("pinocchio-aba@pinocchio-4.0-py3-none-any.whl", "is a wheel of pinocchio, not of pin"),
+        ("mujoco@some.whl", "Invalid wheel filename"),
+    ],
+)
+def test_the_version_part_of_a_name(name, words):
+    found = environments.version_problem(name)
+    assert found is None if words is None else words in found
+
+
+@pytest.mark.parametrize("engine", [e for e in ENGINES if e != "reference"])
+def test_what_an_adapter_declares_is_read_without_importing_it(engine):
+    from plumbline.engines.registry import load_adapter
+
+    found = load_adapter(engine)
+    assert environments.declared_attribute(engine, "package") == found.package
+    assert (
+        tuple(environments.declared_attribute(engine, "extra_requirements") or ()) == found.extra_requirements
+    )
+    assert calls.describe_engine(engine).missing is None, "the installed version is in the declared range"
+
+
+def test_a_version_out_of_range_says_so(monkeypatch):
+    from adapters.mujoco_engine import Mujoco
+
+    monkeypatch.setattr(Mujoco, "supported_versions", "<1")
+    assert "supports versions <1 of mujoco, this is" in calls.describe_engine("mujoco").missing
+
+
+def test_known_entries_hold_for_an_engine_in_any_version_of_their_range():
+    entry = known_issues.KnownIssue(
+        id="a", scenario="*", engine="mujoco", versions="<4", verdict="disagrees", evidence="e", reason="r"
+    )
+    row = RowContext("s", "f", "mujoco@3.12.0", "MuJoCo", "3.12.0").make_row(
+        "trajectory", "RK4", "order", "disagrees", ""
+    )
+    about = known_issues.KnownIssues([entry], has_extra_refinements=False).issues_for
+    assert about(row) and not about(replace(row, engine_version="4.0.0"))
+    assert not about(replace(row, engine="mujocox"))
+
+
+# --- the other environment's process -----------------------------------------------------------
+
+
+def there(key, call, *arguments, limits=None):
+    return Task(key, call, arguments, limits or Limits(30, 4), python=HERE)
+
+
+def test_losses_over_there_are_told_like_those_here():
+    tasks = [
+        there("a", operator.mul, 1, 2), there("pid", os.getpid), there("noise", print, "x" * 100_000),
+        there("segfault", ctypes.string_at, 0), there("b", operator.mul, 2, 2),
+        there("devour", bytearray, 64 * 2**30),
+        there("complain", operator.getitem, {}, "no"), there("hang", time.sleep, 600, limits=Limits(3, 4)),
+        there("c", operator.mul, 3, 2), there("pid2", os.getpid),
+    ]  # fmt: skip
+    with WorkerPool(1, Limits(30, 4)) as workers:
+        found = {o.key: o for o in workers.run(tasks)}
+    lost = {key: o.failure for key, o in found.items() if o.failure}
+    assert lost.pop("segfault") == "crashed: the worker died of SIGSEGV"
+    assert lost.pop("complain") == "KeyError: 'no'"
+    assert "out of memory" in lost.pop("devour")
+    assert "hung" in lost.pop("hang")
+    assert not lost
+    assert [found[key].value for key in "abc"] == [2, 4, 6]
+    alive = [psutil.Process(p) for p in (found["pid"].value, found["pid2"].value) if psutil.pid_exists(p)]
+    assert not psutil.wait_procs(alive, timeout=10)[1], "a child outlived its worker"
+
+
+def test_an_engine_says_the_same_in_both_places():
+    s = loader.load_scenarios(["double-tumbling-balls"])[0]
+    with WorkerPool(1) as workers:
+        here, away = (
+            o.value.quantities[0]
+            for python in ("", HERE)
+            for o in workers.run(
+                [Task("k", calls.evaluate_states, ("mujoco", s.model, [s.state]), python=python)]
+            )
+        )
+    assert np.array_equal(here.acceleration, away.acceleration)
+    assert np.array_equal(here.mass_matrix, away.mass_matrix)
+
+
+# --- real versions: fetched once, then from the cache ------------------------------------------
+
+OLD = [
+    "mujoco@3.2.0", "mujoco@3.3.0", "mujoco@3.12.0", "pinocchio@3.3.1", "pinocchio@3.9.0", "pinocchio@4.0.0",
+    "pinocchio-aba@3.3.1", "pinocchio-maximal@3.9.0", "exudyn@1.9.0", "exudyn@1.10.0", "exudyn@1.11.0",
+    "exudyn-tree@1.9.0",
+]  # fmt: skip
+
+
+@pytest.mark.full
+@pytest.mark.timeout(1800)
+def test_the_supported_versions_work_beside_the_installed_ones(tmp_path):
+    chosen = loader.load_scenarios(["tumbling-ball", "tumbling-rod"])
+    result = run_plan(Plan(chosen, ["mujoco", *OLD], limits=Limits(600)), quiet)
+    for name in OLD:
+        assert result.engines[name].missing is None
+        assert Version(result.engines[name].version) == Version(name.partition("@")[2])
+    wrong = {r.key: r for r in result.rows if r.verdict in ("disagrees", "failed")}
+    old = {f"{s.name}/{name}/trajectory/RK4/order" for s in chosen for name in OLD if "mujoco" in name}
+    sparse = {
+        f"{s.name}/{name}/relations/{integrator}/by {solver}"
+        for s in chosen
+        for name in ("exudyn@1.9.0", "exudyn@1.10.0")
+        for integrator in ("trapezoidal", "generalized-alpha")
+        for solver in ("EXUdense", "EigenDense")
+    }
+    assert wrong.keys() == old | sparse, "MuJoCo's RK4 before 4.0, Exudyn's sparse start before 1.11"
+    assert all(1.9 < wrong[key].order < 2.1 for key in old)
+
+
+@pytest.mark.full
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(("version", "sound"), [("1.9.0", False), ("1.10.0", False), ("1.11.0", True)])
+def test_exudyn_started_from_wrong_accelerations_with_its_sparse_solver(version, sound):
+    """The relation says that two solvers of one engine differ; this says which is wrong, and where."""
+    chosen = loader.load_scenarios(["double-tumbling-balls"])[0]
+    true = certify_state(chosen.model, chosen.state).quantities.acceleration
+    python = environments.ensure_interpreter(f"exudyn@{version}")
+    off = {
+        solver: np.max(
+            np.abs(call_remote(python, initial_accelerations, chosen.model, chosen.state, solver) - true)
+        )
+        for solver in ("EigenSparse", "EXUdense", "EigenDense")
+    }
+    assert max(off["EXUdense"], off["EigenDense"]) < 1e-4, "m/s²; by finite differences"
+    assert off["EigenSparse"] < 1e-4 if sound else off["EigenSparse"] > 0.1
+
+
+@pytest.mark.full
+@pytest.mark.timeout(900)
+def test_a_version_that_cannot_be_had_is_a_verdict():
+    chosen = loader.load_scenarios(["rest"])
+    result = run_plan(Plan(chosen, ["mujoco@99.0.0", "mujoco@3.1.6"], "state"), quiet)
+    absent, refused = result.rows
+    assert absent.verdict == "not installed" and "99.0.0" in absent.reason
+    assert refused.verdict == "unsupported" and "supports versions >=3.2" in refused.reason
+
+
+# --- what is no version, no wheel, or cannot be fetched ------------------------------------------
+
+
+def uv_there():
+    return shutil.which("uv") or (environments.ROOT / ".uv" / "bin" / "uv").exists()
+
+
+needs_uv = pytest.mark.skipif(not uv_there(), reason="uv is not installed here")
+
+
+@pytest.fixture
+def index():
+    """Skips with the reason where no package index answers."""
+    try:
+        environments.newest_requirement("packaging", pre=False)
+    except environments.EnvironmentUnavailable as error:
+        pytest.skip(f"no package index can be reached: {error}")
+
+
+def wheel(folder, package="mujoco"):
+    """The installed distribution packed again as the wheel that it came from."""
+    found = metadata.distribution(package)
+    (tag,) = [line[5:] for line in found.read_text("WHEEL").splitlines() if line.startswith("Tag: ")][:1]
+    path = folder / f"{package}-{found.version}-{tag}.whl"
+    with zipfile.ZipFile(path, "w") as archive:
+        for file in found.files or ():
+            if ".." not in file.parts and "__pycache__" not in file.parts:
+                archive.write(found.locate_file(file), file.as_posix())
+    return path
+
+
+def test_a_file_that_is_no_wheel_is_bad_usage(tmp_path):
+    path = tmp_path / "mujoco-4.0.0-py3-none-any.whl"
+    path.write_text("no zip")
+    assert "is not a wheel: it is no zip file" in environments.version_problem(f"mujoco@{path}")
+    done = subprocess.run(
+        [HERE, "-m", "plumbline", "run", "rest", "--engine", f"exudyn@{path}"],
+        cwd=environments.ROOT, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 2 and "is a wheel of mujoco, not of exudyn" in " ".join(done.stderr.split())
+
+
+@needs_uv
+@pytest.mark.parametrize("version", ["9.9.9", "latest"])
+def test_an_index_that_does_not_answer_is_told(tmp_path, monkeypatch, version):
+    for name in ("UV_INDEX_URL", "UV_EXTRA_INDEX_URL", "UV_INDEX", "UV_FIND_LINKS"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("UV_DEFAULT_INDEX", "http://127.0.0.1:9/simple")  # the port of discard: refused
+    monkeypatch.setenv("UV_HTTP_RETRIES", "0")
+    monkeypatch.setenv("UV_CACHE_DIR", str(tmp_path / "uv"))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    result = run_plan(Plan(loader.load_scenarios(["rest"]), [f"mujoco@{version}"], "state"), quiet)
+    (row,) = result.rows
+    assert row.verdict == "not installed"
+    assert "uv cannot make an environment" in row.reason and "http://127.0.0.1:9/simple/mujoco" in row.reason
+    assert not list((tmp_path / "plumbline").rglob("*.py")), "half an environment is left"
+
+
+@pytest.mark.full
+@needs_uv
+@pytest.mark.timeout(1800)
+def test_latest_pre_and_a_wheel_run_beside_the_installed_one(tmp_path, index):
+    names = ["mujoco", "mujoco@latest", "mujoco@pre", f"mujoco@{wheel(tmp_path)}"]
+    result = run_plan(
+        Plan(loader.load_scenarios(["tumbling-ball"]), names, "state", limits=Limits(600)), quiet
+    )
+    found = {name: result.engines[name] for name in names}
+    assert [info.missing for info in found.values()] == [None] * 4
+    latest, newest = (Version(found[f"mujoco@{which}"].version) for which in ("latest", "pre"))
+    assert not latest.is_prerelease and newest >= latest >= Version("4.0.0")
+    assert found[names[3]].version == found["mujoco"].version
+    values = {name: [row.value for row in result.rows if row.engine == name] for name in ("mujoco", names[3])}
+    assert values["mujoco"] == values[names[3]], "the same wheel says the same"
+    assert {row.verdict for row in result.rows} == {"agrees"}
+
+
+@pytest.mark.full
+@needs_uv
+@pytest.mark.timeout(900)
+def test_a_wheel_without_a_content_is_told(tmp_path, index):
+    path = tmp_path / "mujoco-4.0.0-py3-none-any.whl"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("mujoco/__init__.py", "")
+    result = run_plan(Plan(loader.load_scenarios(["rest"]), [f"mujoco@{path}"], "state"), quiet)
+    (row,) = result.rows
+    assert row.verdict == "not installed" and "uv cannot make an environment" in row.reason
+
+
+def test_a_bad_version_is_bad_usage():
+    done = subprocess.run(
+        [HERE, "-m", "plumbline", "run", "rest", "--engine", "mujoco@three"],
+        cwd=environments.ROOT, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 2 and "'three' is not a version" in done.stderr

@@ -1,0 +1,228 @@
+"""The harness as a measuring instrument: every planted defect is reported, and named by its own term.
+
+The list, its sizes and the words a diagnosis must use are in `planted`, committed before any diagnosis
+was written; the defects here that must *not* be named came after it.
+"""
+
+from __future__ import annotations
+
+import zlib
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+from plumbline.diagnosis.diagnose import diagnose
+from plumbline.engines.calls import Evaluation, run_refinement
+from plumbline.engines.registry import load_adapter
+from plumbline.execution.scenario_run import predictability_horizon
+from plumbline.judging.convergence import refinement_resolutions
+from plumbline.judging.rows import RowContext
+from plumbline.judging.state import judge_states
+from plumbline.judging.trajectory import judge_trajectory
+from plumbline.model.sampling import random_states
+from plumbline.truth.ground_truth import motion_truth, state_truth
+from tests.helpers import pendulums
+from tests.helpers.pendulums import JOINTS
+from tests.helpers.planted_defects import (
+    DEFECTS,
+    MOTION_DEFECTS,
+    PAIRS,
+    STATE_DEFECTS,
+    Bent,
+    Defect,
+    field,
+    model_change,
+    plant,
+)
+
+for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
+    pytest.importorskip(engine)
+
+STATES = 10
+TIMES = np.linspace(0, 2, 17)
+
+
+@cache
+def subject(joints: str, loaded: bool):
+    """A generic pendulum, random states of it and their certified truth."""
+    model = pendulums.model(JOINTS[joints], loads=loaded, drag=loaded)
+    return model, state_truth(model, random_states(model, STATES, seed=1))
+
+
+@cache
+def motion():
+    """A slow tumble whose every mistake shows within two seconds."""
+    model = pendulums.model(JOINTS["balls"])
+    state = pendulums.state(model, seed=2, rate=0.5)
+    return model, state, motion_truth(model, state, TIMES, None)
+
+
+@contextmanager
+def planted(defect: Defect, model):
+    """The real engine with the defect in it."""
+    engine = plant(type(load_adapter(defect.engine)), defect)
+    if defect.gamma is None:
+        yield engine
+        return
+    bent = type("BentHere", (Bent,), {"model": model, "defect": staticmethod(defect.gamma)})
+    with patch("adapters.reference_engine.System", bent):
+        yield engine
+
+
+@cache
+def state_report(defect: Defect) -> tuple[list[str], str]:
+    """Quantities that disagree at state level, and the diagnosis."""
+    model, truth = subject(defect.joints, defect.loaded)
+    with planted(defect, model) as engine:
+        said = engine.evaluate(model, truth.states)
+        who = RowContext("planted", "planted", defect.name, defect.name, "0")
+        rows = judge_states(who, truth, Evaluation(said, None, None, 0.0)).rows
+        wrong = [row.quantity for row in rows if row.verdict == "disagrees"]
+        return wrong, diagnose(model, said, truth, engine.evaluate) if wrong else ""
+
+
+@cache
+def motion_report(defect: Defect) -> list[str]:
+    """Rows about motion that do not agree; an unresolved cell that no file excuses fails a run, too."""
+    model, state, truth = motion()
+    engine = plant(type(load_adapter(defect.engine)), defect)
+    integrator = engine.integrator(defect.integrator)
+    steps = refinement_resolutions(integrator, model.n, float(TIMES[-1]))
+    with patch("plumbline.engines.calls.load_adapter", lambda _: engine):
+        runs = run_refinement(defect.engine, integrator.name, model, state, TIMES, steps)
+    who = RowContext("planted", "planted", defect.name, defect.name, "0")
+    rows = judge_trajectory(who, model, truth, integrator, runs, predictability_horizon(truth)).rows
+    return [f"{row.verdict}: {row.quantity}: {row.reason}" for row in rows if row.verdict != "agrees"]
+
+
+def ids(defects):
+    return {"argvalues": defects, "ids": [d.name for d in defects]}
+
+
+def test_the_list_is_long_enough_and_each_defect_has_its_own_name():
+    assert len(DEFECTS) >= 40 and len({d.name for d in DEFECTS}) == len(DEFECTS)
+    assert sum(bool(d.named) for d in DEFECTS) >= 30
+
+
+@pytest.mark.parametrize("defect", **ids(STATE_DEFECTS))
+def test_every_state_defect_is_reported_and_named(defect):
+    wrong, text = state_report(defect)
+    assert wrong, f"nothing reports {defect.size}"
+    if defect.named:
+        assert any(words in text for words in defect.named), f"{defect.size}: said {text!r}"
+
+
+@pytest.mark.parametrize("defect", **ids(MOTION_DEFECTS))
+def test_every_motion_defect_is_reported(defect):
+    assert motion_report(defect), f"nothing reports {defect.size}"
+
+
+def test_the_same_engine_without_defect_is_not_reported():
+    clean = Defect("clean", "nothing")
+    assert not motion_report(clean), motion_report(clean)
+    for joints, loaded in {(d.joints, d.loaded) for d in STATE_DEFECTS}:
+        for engine in ("mujoco", "pinocchio", "exudyn", "reference"):
+            wrong, text = state_report(replace(clean, joints=joints, loaded=loaded, engine=engine))
+            assert not wrong, f"{engine} on {joints}: {wrong}, {text}"
+
+
+@pytest.mark.parametrize(("defect", "both"), PAIRS, ids=[d.name for d, _ in PAIRS])
+def test_what_no_data_can_tell_apart_is_named_as_such(defect, both):
+    wrong, text = state_report(defect)
+    assert bool(wrong) == bool(both)
+    assert all(words in text for words in both) and ("cannot tell apart" in text) == bool(both), text
+
+
+def test_scaled_mass_and_inertia_are_invisible_to_accelerations_alone():
+    blind = next(d for d in STATE_DEFECTS if d.name == "mass-and-inertia-together")
+    wrong, _ = state_report(blind)
+    assert "joint_reaction" in wrong and not {"acceleration", "angular_acceleration"} & set(wrong)
+
+
+def noisy(_, state, a):
+    rng = np.random.default_rng(zlib.crc32(state.p.tobytes()))
+    return a * (1 + 1e-9 * rng.normal(size=a.shape))
+
+
+UNNAMEABLE = (
+    Defect("noise", "r̈ × (1 + 1e-9 noise)", answers=field("acceleration", noisy)),
+    Defect("cubed", "ω̇′ + 1e-6 ω̇′³", engine="pinocchio",
+           answers=field("angular_acceleration", lambda _, __, a: a + 1e-6 * a**3)),
+    Defect("two-at-once", "mass of body 1 and inertia xx of body 2 × (1 + 1e-4)",
+           inputs=model_change(lambda m, _: {
+               "mass": m.mass * [1 + 1e-4, 1], "inertia": m.inertia * [[[1]], [[1 + 1e-4]]]})),
+    Defect("friction", "Coulomb friction of 1e-3 N m on every body", engine="exudyn",
+           inputs=model_change(lambda m, s: {"moment": m.moment - 1e-3 * np.sign(s.omega)})),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("defect", **ids(UNNAMEABLE))
+def test_what_has_no_single_cause_is_not_named(defect):
+    wrong, text = state_report(defect)
+    assert wrong and text.startswith("no single change"), text
+
+
+def test_a_difference_next_to_the_bound_is_not_named():
+    model, truth = subject("balls", False)
+    said = list(truth.quantities)
+    shift = 1.8 * truth.bounds[3].acceleration[:, None] * np.array([[0.6, -0.48, 0.64]])
+    said[3] = replace(said[3], acceleration=said[3].acceleration + shift)
+    assert diagnose(model, said, truth).startswith("too near the rounding bound")
+
+
+def test_where_the_difference_lives_is_said():
+    at = {d.name: state_report(d)[1] for d in STATE_DEFECTS}
+    assert "vanishes at rest, persists without gravity" in at["gyroscopic-dropped"]
+    assert "persists at rest, vanishes without gravity" in at["gravity-1e-5"]
+    assert "vanishes without loads and drag" in at["loads-ignored"]
+
+
+def test_rates(record_property, capsys):
+    """Kill rate, naming rate and false namings, as the nightly report gives them."""
+    killed = [d for d in DEFECTS if (motion_report(d) if d.level == "motion" else state_report(d)[0])]
+    nameable = [d for d in DEFECTS if d.named]
+    named = [d for d in nameable if any(words in state_report(d)[1] for words in d.named)]
+    said = [d for d in (*STATE_DEFECTS, *UNNAMEABLE) if "behaves as if" in state_report(d)[1]]
+    false = [d.name for d in said if (d.named and d not in named) or d in UNNAMEABLE]
+    figures = {
+        "planted": len(DEFECTS),
+        "reported": len(killed),
+        "of them as unresolved": sum(
+            all(words.startswith("unresolved") for words in motion_report(d)) for d in MOTION_DEFECTS
+        ),
+        "nameable": len(nameable),
+        "named": len(named),
+        "false namings": len(false),
+    }
+    for name, number in figures.items():
+        record_property(name, number)
+    with capsys.disabled():
+        print(f"\nplanted defects: {figures}")
+    assert len(killed) == len(DEFECTS) and len(named) >= 30 and not false, figures
+
+
+def applicable(defect: Defect, joints: str) -> bool:
+    """Whether the pendulum has what the defect alters: a second joint that is a rod, a rod at all."""
+    if defect.name == "rod-length-1e-5":
+        return joints[1] == "r"
+    return "r" in joints or not defect.name.startswith("rod")
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("engine", ["mujoco", "pinocchio", "exudyn", "reference"])
+@pytest.mark.parametrize("joints", ["balls", "rods", "rod-ball", "mixed"])
+def test_defects_are_named_on_every_engine_and_joint(engine, joints):
+    """The long form: every defect of numbers, conventions and answers, wherever it makes a difference."""
+    missed = {}
+    for defect in STATE_DEFECTS:
+        if defect.gamma or not defect.named or not applicable(defect, JOINTS[joints]):
+            continue
+        moved = replace(defect, engine=engine, joints=joints)
+        wrong, text = state_report(moved)
+        if not wrong or not any(words in text for words in defect.named):
+            missed[defect.name] = text
+    assert not missed

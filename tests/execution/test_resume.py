@@ -1,0 +1,221 @@
+"""A run that is killed goes on where it stopped, and ends as if it had not been."""
+
+import contextlib
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pyarrow.parquet as pq
+import pytest
+
+from plumbline.engines import calls
+from plumbline.execution.result_cache import DiskResultCache, task_hash
+from plumbline.execution.runner import Plan, run_plan
+from plumbline.processes.packed import Pickled
+from plumbline.processes.workers import Outcome, Task
+from plumbline.scenario import loader
+
+ROOT = Path(__file__).resolve().parents[2]
+TIMES = {"wall_time", "cost"}  # what may differ between two runs
+QUICK = ["rest", "tumbling-ball"]
+
+
+def quiet(*_):
+    pass
+
+
+def command(out, *more):
+    return [sys.executable, "-m", "plumbline", "run", *QUICK, "--engine", "mujoco", "--engine", "pinocchio",
+            "--jobs", "2", "--out", str(out), *more]  # fmt: skip
+
+
+def results(out):
+    """Everything that a run says, without its times."""
+    document = json.loads((out / "results.json").read_text())
+    run = {k: document["run"][k] for k in ("sentence", "exit_code", "versions", "truth", "stale")}
+    rows = [{k: v for k, v in row.items() if k not in TIMES} for row in document["rows"]]
+    tables = {}
+    for path in sorted(out.glob("*.parquet")):
+        table = pq.read_table(path)
+        table = table.drop_columns([c for c in table.column_names if c in TIMES])
+        tables[path.name] = repr(table.to_pylist())  # to the last bit, and NaN equals NaN
+    return run, rows, document["scenarios"], tables
+
+
+def killed(out, after, from_new_cell, *more):
+    """Run, kill -9 ``after`` seconds (from the first new cell, if asked); whether it was still running.
+
+    No process of it may remain.
+    """
+    before = cells(out)
+    process = subprocess.Popen(
+        command(out, *more), cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    while from_new_cell and process.poll() is None and cells(out).keys() <= before.keys():
+        time.sleep(0.01)
+    try:
+        process.wait(timeout=after)
+        return False
+    except subprocess.TimeoutExpired:
+        children = psutil.Process(process.pid).children(recursive=True)
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        _, alive = psutil.wait_procs(children, timeout=20)
+        assert not alive, f"orphans: {alive}"
+        return True
+
+
+def cells(out):
+    """Path and time of every stored cell; a run that ends meanwhile clears them away."""
+    found = {}
+    for path in out.glob("cells/*.cell"):
+        with contextlib.suppress(FileNotFoundError):
+            found[path] = path.stat().st_mtime_ns
+    return found
+
+
+def survive(tmp_path, kills, level):
+    """Kill ``kills`` times at random moments; runs that finish between them are checked."""
+    rng = random.Random(20)
+    calm = tmp_path / "calm"
+    begin = time.monotonic()
+    subprocess.run(command(calm, "--level", level), cwd=ROOT, capture_output=True, check=True)
+    longest = time.monotonic() - begin
+    expected = results(calm)
+    done, finished = 0, 0
+    while done < kills:
+        out = tmp_path / f"rough{finished}"
+        before = cells(out)
+        from_new_cell = bool(done % 2)
+        after = rng.uniform(0.0, 0.2 * longest if from_new_cell else longest)
+        if killed(out, after, from_new_cell, "--level", level):
+            done += 1
+            kept = cells(out)
+            assert before.items() <= kept.items() or (out / "results.json").exists(), (
+                "a finished cell ran again"
+            )
+        else:
+            assert results(out) == expected
+            finished += 1
+    out = tmp_path / f"rough{finished}"
+    subprocess.run(command(out, "--level", level), cwd=ROOT, capture_output=True, check=True)
+    assert results(out) == expected
+    return done, finished
+
+
+@pytest.mark.timeout(240)
+def test_five_kills_change_nothing(tmp_path):
+    survive(tmp_path, 5, "state")
+
+
+@pytest.mark.full
+@pytest.mark.timeout(3600)
+def test_a_hundred_kills_change_nothing(tmp_path, record_testsuite_property):
+    kills, finished = survive(tmp_path, 100, "all")
+    record_testsuite_property("kills", kills)
+    record_testsuite_property("runs finished between them", finished)
+
+
+# --- the same in one process: which cells run, and which do not --------------------------------
+
+
+class Interrupted(Exception):
+    pass
+
+
+def run(cells, stop_after=None):
+    """(rows, number of cells that ran); raises Interrupted after ``stop_after`` outcomes."""
+    ran = 0
+    put = cells.put
+
+    def counting(task, outcome):
+        nonlocal ran
+        ran += 1
+        put(task, outcome)
+
+    cells.put = counting
+
+    def progress(done, *_):
+        if done == stop_after:
+            raise Interrupted
+
+    chosen = loader.load_scenarios(["rest", "conical"])
+    try:
+        result = run_plan(
+            Plan(chosen, ["mujoco"], "state", result_cache=cells, random_state_count=3), progress
+        )
+    except Interrupted:
+        return None, ran
+    return [replace(row, cpu_time=0.0) for row in result.rows], ran
+
+
+def test_only_what_was_not_finished_runs_again(tmp_path):
+    expected, everything = run(DiskResultCache(tmp_path / "calm"))
+    _, first = run(DiskResultCache(tmp_path / "rough"), stop_after=2)
+    rows, rest = run(DiskResultCache(tmp_path / "rough"))
+    assert (everything, first, rest) == (4, 2, 2)
+    assert rows == expected
+
+
+def test_a_damaged_cell_is_named_and_runs_again(tmp_path):
+    expected, _ = run(DiskResultCache(tmp_path))
+    paths = sorted(tmp_path.glob("*.cell"))
+    data = bytearray(paths[0].read_bytes())
+    data[len(data) // 2] ^= 1
+    paths[0].write_bytes(data)
+    paths[1].write_bytes(paths[1].read_bytes()[:-1])
+    paths[2].write_bytes(b"")
+    told = []
+    rows, ran = run(DiskResultCache(tmp_path, told.append))
+    assert ran == 3 and rows == expected
+    assert len(told) == 3 and all("damaged" in sentence for sentence in told)
+
+
+def test_a_lost_cell_is_tried_again(tmp_path):
+    task = Task(("s", "mujoco", "state"), quiet)
+    DiskResultCache(tmp_path).put(task, Outcome(task.key, failure="crashed"))
+    assert DiskResultCache(tmp_path).get(task) is None
+
+
+def test_the_key_is_the_content():
+    s = loader.load_scenarios(["double-tumbling-balls"])[0]
+    turned = replace(s.state, omega=-s.state.omega)
+    other = replace(s.model, mass=np.nextafter(s.model.mass, 9.0))
+    base = Task(
+        "a", calls.run_refinement, ("mujoco", "RK4", s.model, s.state, s.times, [0.5, 0.25]), version="4.0.0"
+    )
+    key = task_hash(base)
+    assert key == task_hash(replace(base, key="b")), "the key is not the label's"
+    changed = [
+        replace(base, version="3.3.0"),
+        replace(base, call=calls.evaluate_states),
+        *(
+            replace(base, arguments=(*base.arguments[:i], value, *base.arguments[i + 1 :]))
+            for i, value in enumerate(
+                [
+                    "pinocchio",
+                    "Euler",
+                    other,
+                    turned,
+                    s.times[:-1],
+                    [0.5, 0.125],
+                ]
+            )
+        ),
+    ]
+    assert len({key, *map(task_hash, changed)}) == 1 + len(changed)
+    assert task_hash(replace(base, arguments=(["ab", "c"],))) != task_hash(
+        replace(base, arguments=(["a", "bc"],))
+    )
+    packed = [
+        task_hash(replace(base, arguments=(Pickled.of([state]),))) for state in (s.state, s.state, turned)
+    ]
+    assert packed[0] == packed[1] != packed[2]

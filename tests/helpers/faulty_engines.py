@@ -1,0 +1,131 @@
+"""Real engines with a fault planted: MuJoCo that crashes, hangs, devours memory … in one cell of its own.
+
+The parent names `prepare` as the initialiser of its workers, so that each knows these engines too.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from adapters.mujoco_engine import Mujoco
+from plumbline.engines import registry
+from plumbline.model.datatypes import Array, Integrator, Model, State, Trajectory
+from plumbline.processes import workers
+
+Run = Callable[[], Trajectory]
+
+
+def segfault(run: Run) -> Trajectory:
+    ctypes.string_at(0)
+    return run()
+
+
+def abort(run: Run) -> Trajectory:
+    os.abort()
+
+
+def leave(run: Run) -> Trajectory:
+    os._exit(7)
+
+
+def hang(run: Run) -> Trajectory:
+    time.sleep(600)
+    return run()
+
+
+def hang_with_the_lock(run: Run) -> Trajectory:
+    ctypes.PyDLL(None).sleep(600)
+    return run()
+
+
+def endless_memory(run: Run) -> Trajectory:
+    kept = []
+    while True:
+        kept.append(np.empty(2**25))  # 256 MB of address space, never touched
+
+
+def not_a_number(run: Run) -> Trajectory:
+    done = run()
+    r = done.r.copy()
+    r[-1] = np.nan
+    return replace(done, r=r)
+
+
+def silent_reset(run: Run) -> Trajectory:
+    done = run()
+    rows = [*range(len(done.t) - 3), 0, 1, 2]
+    return Trajectory(done.t, *(getattr(done, k)[rows] for k in ("r", "p", "v", "pdot")), done.steps)
+
+
+def early_stop(run: Run) -> Trajectory:
+    done = run()
+    return Trajectory(*(getattr(done, k)[:-3] for k in ("t", "r", "p", "v", "pdot")), done.steps)
+
+
+def raises(run: Run) -> Trajectory:
+    raise RuntimeError("the engine's own words\nover two lines")
+
+
+def litter(run: Run) -> Trajectory:
+    Path("MUJOCO_LOG.TXT").write_text("dropped")
+    for _ in range(100):
+        os.write(1, b"noise " * 10_000)
+        os.write(2, b"noise " * 10_000)
+    return run()
+
+
+# The fault and the words of which its row's reason must have; none where the cell is not lost.
+FAULTS: dict[Callable[[Run], Trajectory], str] = {
+    segfault: "crashed: the worker died of SIGSEGV",
+    abort: "crashed: the worker died of SIGABRT",
+    leave: "crashed: the worker exited with code 7",
+    hang: "hung: no answer within",
+    hang_with_the_lock: "hung: no answer within",
+    endless_memory: "out of memory: over",
+    not_a_number: "r is not finite from t =",
+    silent_reset: "is the initial state again (a silent reset)",
+    early_stop: "sampled 14 of 17 times",
+    raises: "RuntimeError: the engine's own words over two lines",
+    litter: "",
+}
+CELL = "implicit"  # the integrator whose cell has the fault; Euler's beside it is sound
+
+
+def engine(fault: Callable[[Run], Trajectory]) -> type[Mujoco]:
+    """MuJoCo with two integrators, the fault in one."""
+
+    class Faulty(Mujoco):
+        name = fault.__name__
+        title = f"MuJoCo ({fault.__name__})"
+        integrators = tuple(i for i in Mujoco.integrators if i.name in ("Euler", CELL))
+
+        def _simulate(
+            self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
+        ) -> Trajectory:
+            def run() -> Trajectory:
+                return super(Faulty, self)._simulate(model, state, times, integrator, resolution)
+
+            return fault(run) if integrator.name == CELL else run()
+
+    return Faulty
+
+
+def register() -> None:
+    """Into the registry of this process."""
+    for fault in FAULTS:
+        globals()[f"Faulty_{fault.__name__}"] = engine(fault)
+        registry.ENGINES[fault.__name__] = f"tests.helpers.faulty_engines:Faulty_{fault.__name__}"
+
+
+def prepare(*arguments: Any) -> None:
+    """`workers.prepare`, and the engines."""
+    workers.initialize_worker(*arguments)
+    register()

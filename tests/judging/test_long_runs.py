@@ -1,0 +1,193 @@
+"""Long runs: what is conserved is judged by its fall from step to step, and planted leaks are seen."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from adapters.mujoco_engine import Mujoco
+from plumbline.engines.registry import load_adapter
+from plumbline.execution.runner import Plan, run_plan
+from plumbline.judging import long_runs
+from plumbline.judging.long_runs import (
+    BLOCK_COUNT,
+    MAX_BODY_STEPS,
+    DriftOrder,
+    LongRunPlan,
+    judge_long_runs,
+    plan_long_run,
+    run_long_run_study,
+)
+from plumbline.judging.rows import RowContext
+from plumbline.model.datatypes import Integrator, Trajectory
+from plumbline.processes.workers import Limits
+from plumbline.scenario import loader
+from tests.helpers import engine_process as worker
+from tests.helpers.planted_defects import MOTION_DEFECTS, Defect, model_change, plant
+
+DEFECTS = {d.name: d for d in MOTION_DEFECTS}
+
+
+def load(name):
+    return loader.load_scenarios([name])[0]
+
+
+def long(name, engine, integrator, seconds=100.0):
+    """Rows by quantity of one integrator's long runs of a scenario."""
+    s, chosen = load(name), load_adapter(engine) if isinstance(engine, str) else engine
+    method = chosen.integrator(integrator)
+    plan = plan_long_run(method, s.model.n, seconds)
+    endured = run_long_run_study(chosen.name, integrator, s.model, s.state, s.sample_interval, plan)
+    who = RowContext(name, s.family, chosen.name, chosen.title, "1")
+    return {
+        row.quantity: row
+        for row in judge_long_runs(who, s.model, method, endured, s.closed_form is not None).rows
+    }
+
+
+@pytest.fixture
+def planted(monkeypatch):
+    """``planted(defect)``: MuJoCo with it, as the engine that `endure` gets."""
+
+    def put(defect):
+        engine = plant(Mujoco, defect)
+        monkeypatch.setattr(long_runs, "load_adapter", lambda _: engine)
+        return engine
+
+    return put
+
+
+def test_a_chaotic_motion_keeps_what_is_conserved_for_100_s():
+    rows = long("double-tumbling-balls", "mujoco", "RK4")
+    assert {row.verdict for row in rows.values()} == {"agrees"} and len(rows) == 5
+    energy = rows["energy_drift_long"]
+    assert energy.level == "invariants" and energy.compared_until == 100.0 and energy.declared_order == 4
+    assert 3.5 < energy.order < 5.5
+    by = [energy.extra[f"by {t:g} s"] for t in (0.1, 1, 10, 100)]
+    assert by == sorted(by) and by[-1] == energy.value < 1e-5
+
+
+def test_a_step_too_coarse_for_100_s_is_judged_where_it_is_not():
+    rows = long("tumbling-ball", "mujoco", "Euler")
+    energy = rows["energy_drift_long"]
+    assert energy.verdict == "agrees" and energy.compared_until == 10.0 and abs(energy.order - 1) < 0.2
+    assert "within 100 s, which cannot tell" in energy.reason
+    assert energy.extra["by 100 s"] > 3.0 > energy.extra["scale"] / 2
+
+
+LEAK = Defect(
+    "damping-1e-7", "drag of 1e-7 N m s on every body",
+    inputs=model_change(lambda m, _: {"drag_moment": m.drag_moment + 1e-7}),
+)  # fmt: skip
+
+
+def half_way(run):
+    """Rows whose second half begins again."""
+    half = len(run.t) // 2
+    return [*range(half), *range(len(run.t) - half)]
+
+
+def reset(simulate, *arguments):
+    run = simulate(*arguments)
+    return Trajectory(run.t, *(getattr(run, k)[half_way(run)] for k in ("r", "p", "v", "pdot")), run.steps)
+
+
+def creep(simulate, *arguments):
+    """Every joint opens by 1e-9 m/s, unseen by the velocities."""
+    run = simulate(*arguments)
+    return replace(run, r=run.r + 1e-9 * run.t[:, None, None])
+
+
+@pytest.mark.parametrize(
+    ("defect", "verdict", "quantities"),
+    [
+        (LEAK, "disagrees", {"energy_drift_long"}),
+        (Defect("creep", "", run=creep), "disagrees", {"joint_gap_long"}),
+        (Defect("reset", "", run=reset), "failed", {"all_long"}),
+        (DEFECTS["norm-1e-9"], "disagrees", {"norm_drift_long"}),
+    ],
+    ids=lambda x: x.name if isinstance(x, Defect) else None,
+)
+def test_planted_leaks_are_seen(planted, defect, verdict, quantities):
+    rows = long("tumbling-ball", planted(defect), "RK4", 25.0)
+    assert {q for q, row in rows.items() if row.verdict == verdict} >= quantities
+
+
+def test_another_order_than_its_name_is_seen(planted):
+    rows = long("tumbling-ball", planted(DEFECTS["order-2-named-RK4"]), "RK4", 12.5)
+    row = rows["energy_drift_long"]
+    assert row.verdict == "disagrees" and row.order < 3.5 and "due 3.9" in row.reason
+
+
+@pytest.mark.full
+def test_a_symmetric_method_is_bounded_and_a_leak_is_not():
+    rows = worker.run("exudyn", long, "spherical", "exudyn", "trapezoidal", 50.0)
+    growth = rows["energy_drift_long_growth"]
+    assert growth.verdict == "agrees" and growth.value < 0.1 and "bounded" in growth.reason
+    assert rows["energy_drift_long"].verdict == "agrees"
+    leak = worker.run("exudyn", leaking)
+    assert leak.verdict == "disagrees" and leak.value > 0.9 and "grows with time" in leak.reason
+
+
+def leaking():
+    """The row on the growth of Exudyn's energy with a drag that takes as much as the steps' error."""
+    from adapters.exudyn_engine import Exudyn
+
+    engine = plant(
+        Exudyn,
+        Defect("", "", inputs=model_change(lambda m, _: {"drag_moment": m.drag_moment + 3e-6})),
+    )
+    before, long_runs.load_adapter = long_runs.load_adapter, lambda _: engine
+    try:
+        return long("spherical", engine, "trapezoidal", 50.0)["energy_drift_long_growth"]
+    finally:
+        long_runs.load_adapter = before
+
+
+@pytest.mark.full
+def test_step_control_keeps_each_invariant_within_its_tolerance():
+    rows = worker.run("pinocchio", long, "tumbling-ball", "pinocchio", "dop853", 50.0)
+    assert {row.verdict for row in rows.values()} == {"agrees"}
+    assert "what the tolerance 1e-08 lets pass in every step" in rows["energy_drift_long"].reason
+
+
+# --- lengths, and the statistic -----------------------------------------------------------------
+
+
+def test_the_affordable_length_is_told():
+    rk4 = Integrator("RK4", "step", 4)
+    assert plan_long_run(rk4, 1, 100.0) == LongRunPlan(100.0, (2.0**-7, 2.0**-8, 2.0**-9), 100.0)
+    for n in range(1, 60):
+        plan = plan_long_run(rk4, n, 100.0)
+        assert n * plan.seconds / plan.resolutions[-1] <= MAX_BODY_STEPS[4]
+        assert plan.shortening_note == (
+            "" if n < 3 else f"; the limit of steps × bodies allows {plan.seconds:g} s of 100 s"
+        )
+    assert plan_long_run(Integrator("d", "tolerance", 8), 10, 100.0).seconds == 6.25
+
+
+def test_the_jackknife_knows_a_common_motion_from_two():
+    rng = np.random.default_rng(7)
+    blocks = rng.exponential(size=BLOCK_COUNT)
+    same = DriftOrder.from_blocks(blocks, blocks / 16, 2)
+    assert abs(same.order - 2) < 1e-12 and same.order_error < 1e-12
+    # two motions with the same law: as many orders off by more than 3 σ as so few blocks explain
+    falls = [DriftOrder.from_blocks(*rng.exponential(size=(2, BLOCK_COUNT)), 2) for _ in range(2000)]
+    wrong = np.mean([abs(f.order) > 3 * f.sigma for f in falls])
+    assert wrong < 0.02
+    # one block that alone moves shows nothing
+    lone = np.zeros(BLOCK_COUNT)
+    lone[3] = 1.0
+    assert not np.isfinite(DriftOrder.from_blocks(lone, lone / 4, 2).order_error)
+
+
+def test_a_run_has_long_cells_beside_the_others():
+    plan = Plan([load("conical")], ["mujoco"], "trajectory", limits=Limits(120), long_run_seconds=6.25)
+    seen = []
+    result = run_plan(plan, lambda done, total, what: seen.append((done, total)))
+    assert seen[-1] == (9, 9)  # the truth, four ladders, four long runs
+    rows = [row for row in result.rows if row.quantity.endswith("_long")]
+    assert len(rows) == 4 * 5 and {row.level for row in rows} == {"invariants"}
+    assert len({row.key for row in result.rows}) == len(result.rows)
+    assert {row.verdict for row in rows} == {"agrees"}
+    assert {row.integrator for row in rows if row.alias_of} == {"implicitfast"}

@@ -1,0 +1,445 @@
+"""Relations that need no truth: they hold on every engine, and each breaks under a defect of its kind."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache, partialmethod
+from itertools import product
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+from plumbline.diagnosis.defect_model import evaluate_case, make_defect_case
+from plumbline.engines.registry import ENGINES, load_adapter
+from plumbline.judging import metamorphic
+from plumbline.judging.metamorphic import (
+    QUANTITIES,
+    STATE_RELATIONS,
+    WELDED_HALVES,
+    check_integrator_relations,
+    check_relations,
+    check_run_relations,
+    fastest_rate,
+    judge_relations,
+    relative_differences,
+    run_tolerance,
+    state_at_sample,
+)  # fmt: skip
+from plumbline.judging.rows import RowContext
+from plumbline.model.datatypes import EngineFailure, Unsupported
+from plumbline.model.welding import split_bodies, split_body
+from plumbline.truth.rounding_bound import state_rounding_bound
+from tests.helpers import pendulums
+from tests.helpers.pendulums import JOINTS
+from tests.helpers.planted_defects import STATE_DEFECTS, Defect, field, model_change, parameter, plant
+from tests.helpers.random_chains import random_chain
+
+for engine in ("mujoco", "pinocchio", "exudyn"):
+    pytest.importorskip(engine)
+
+
+def states(model):
+    return [pendulums.state(model, seed) for seed in range(3)]
+
+
+@pytest.mark.parametrize("joints", ["ball", "rods", "mixed"])
+def test_the_ways_back_are_those_of_the_equations(joints):
+    """Each relation on an independent solution, loads and drag included: the algebra of there and back."""
+    model = pendulums.model(JOINTS[joints], loads=True, drag=True)
+    for relation in STATE_RELATIONS:
+        here = model if relation.name != "time reversed" else pendulums.model(JOINTS[joints], loads=True)
+        for state in states(here):
+            right = evaluate_case(make_defect_case(here, [state]))
+            other_model, other_state = relation.transform(here, state)
+            said = {q: x[0] for q, x in evaluate_case(make_defect_case(other_model, [other_state])).items()}
+            back = relation.transform_back(_quantities(said))
+            for q, x in back.items():
+                np.testing.assert_allclose(x, right[q][0], rtol=1e-11, atol=1e-11 * np.max(np.abs(right[q])))
+
+
+def _quantities(said):
+    from plumbline.model.datatypes import StateQuantities
+
+    return StateQuantities(**{q: x if np.ndim(x) else float(x) for q, x in said.items()})
+
+
+@pytest.mark.parametrize("joints", ["balls", "rod-ball"])
+@pytest.mark.parametrize("engine", [e for e in ENGINES if "@" not in e])
+def test_every_engine_keeps_every_relation(engine, joints):
+    model = pendulums.model(JOINTS[joints], loads=True)
+    found = check_relations(engine, model, states(model))
+    rows = judge_relations(RowContext("s", "f", engine, engine, "0"), found).rows
+    refused = [row.quantity for row in rows if row.verdict == "unsupported"]
+    assert refused == (["two welded halves"] if engine in ("reference", "exudyn-tree") else [])
+    assert len(rows) >= 7 and len({(row.integrator, row.quantity) for row in rows}) == len(rows)
+    assert all(row.verdict == "agrees" for row in rows if row.quantity not in refused), [
+        row.reason for row in rows
+    ]
+
+
+def of(name: str) -> Defect:
+    return next(d for d in STATE_DEFECTS if d.name == name)
+
+
+BROKEN = {
+    "rotated world": (of("gravity-z"), of("gravity-axes"), of("bodies-exchanged")),
+    "re-chosen body frame": (of("inertia-products-dropped"), of("inertia-xx-1e-6"), of("centre-0.1mm")),
+    "masses doubled": (
+        of("damping-1e-6"),
+        Defect("gram", "mass of body 1 by 1e-3 kg", inputs=parameter("mass", 0, by=1e-3)),
+    ),
+    "lengths × 4": (of("distal-1e-5"), of("centre-0.1mm"), of("potential-origin")),
+    "time reversed": (
+        of("damping-1e-6"),
+        of("spatial-acceleration"),
+        Defect(
+            "helical", "n′ + 1e-6 ω′", inputs=model_change(lambda m, s: {"moment": m.moment + 1e-6 * s.omega})
+        ),
+    ),
+    "as exudyn-tree": (replace(of("mass-1-1e-5"), engine="exudyn"),),
+}
+
+
+@pytest.mark.parametrize("relation", BROKEN)
+def test_a_defect_of_its_kind_breaks_it(relation):
+    model = pendulums.model(JOINTS["balls"])
+    broken = {}
+    for defect in BROKEN[relation]:
+        engine = plant(type(load_adapter(defect.engine)), defect)
+        with patch(
+            "plumbline.judging.metamorphic.load_adapter",
+            lambda n, e=engine, d=defect: e if n == d.engine else load_adapter(n),
+        ):
+            broken |= {defect.name: any(h.relation == relation and h.ratio > 1
+                                        for h in check_relations(defect.engine, model, states(model)))}  # fmt: skip
+    assert any(broken.values()) and broken[BROKEN[relation][0].name], broken
+
+
+def test_a_refused_state_is_left_out_and_a_refusing_engine_is_told():
+    class Refusing(type(load_adapter("mujoco"))):
+        name = "refusing"
+
+        def _evaluate(self, model, asked):
+            raise Unsupported("not on a Monday")
+
+    model = pendulums.model(JOINTS["ball"])
+    with patch("plumbline.judging.metamorphic.load_adapter", lambda _: Refusing()):
+        rows = judge_relations(
+            RowContext("s", "f", "e", "E", "0"), check_relations("mujoco", model, states(model))
+        ).rows
+    assert {(row.verdict, row.reason) for row in rows} == {("unsupported", "not on a Monday")}
+
+
+def test_noise_breaks_what_is_not_bitwise():
+    """An engine that loses digits is seen without any truth: as aba on thirty balls is."""
+    rng = np.random.default_rng(5)
+    noisy = Defect("noise", "1e-9", answers=field(
+        "acceleration", lambda _, __, a: a * (1 + 1e-9 * rng.normal(size=a.shape))))  # fmt: skip
+    engine = plant(type(load_adapter("mujoco")), noisy)
+    model = pendulums.model(JOINTS["balls"])
+    with patch("plumbline.judging.metamorphic.load_adapter", lambda _: engine):
+        assert all(h.ratio > 1 for h in check_relations("mujoco", model, states(model)))
+
+
+# -- the engine's other ways, and welded halves -----------------------------------------------------
+
+
+def one_sided(defect: Defect):
+    """The real engine with a defect in its usual way alone: its other ways and welded bodies are sound."""
+    real = type(load_adapter(defect.engine))
+    engine = plant(real, defect)
+    engine.with_option = lambda option: real().with_option(option)
+    engine.with_welded_halves = lambda: real().with_welded_halves()
+    return engine
+
+
+WAYS = [(engine, f"by {option}") for engine in ENGINES for option in type(load_adapter(engine)).options]
+WELDERS = [
+    (engine, "two welded halves")
+    for engine in ENGINES
+    if not type(load_adapter(engine)).welding_unsupported_reason
+]
+
+
+@pytest.mark.parametrize("defect", ["inertia-xx-1e-6", "distal-1e-5"])
+@pytest.mark.parametrize(("engine", "relation"), WAYS + WELDERS)
+def test_a_defect_in_one_way_of_the_engine_breaks_it(engine, relation, defect):
+    model = pendulums.model(JOINTS["balls"])
+    bent = one_sided(replace(of(defect), engine=engine))
+    with patch(
+        "plumbline.judging.metamorphic.load_adapter", lambda n: bent if n == engine else load_adapter(n)
+    ):
+        (found,) = (h for h in check_relations(engine, model, states(model)) if h.relation == relation)
+    assert found.ratio > 1, found
+
+
+@pytest.mark.parametrize("change", ["inertia", "centre", "mass"])
+@pytest.mark.parametrize("engine", [engine for engine, _ in WELDERS])
+def test_a_half_that_is_welded_wrongly_breaks_it(engine, change):
+    """One number of one half off by 1e-6 of it: what the engine welds is not the body then."""
+
+    def wrong(model):
+        one, other = (parts := split_bodies(model))[-1]
+        parts[-1] = one, replace(other, **{change: getattr(other, change) * (1 + 1e-6)})
+        return parts
+
+    model = pendulums.model(JOINTS["balls"])
+    with patch("plumbline.engines.adapter.split_bodies", wrong):
+        (found,) = (
+            h for h in check_relations(engine, model, states(model)) if h.relation == "two welded halves"
+        )
+    assert found.ratio > 1, found
+
+
+@pytest.mark.parametrize("shape", [[2.0, 3.0, 4.0], [1.0, 1.0, 2.0], [1.0, 1.0, 1e-6], [1.0, 1.0, 1.0]])
+def test_two_halves_are_physical_and_make_the_body(shape):
+    turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    inertia = turn @ np.diag(shape) @ turn.T
+    inertia = (inertia + inertia.T) / 2
+    pair = split_body(3.0, inertia)
+    size, eye = np.linalg.norm(inertia), np.eye(3)
+    assert sum(part.mass for part in pair) == 3.0
+    assert np.all(pair[0].mass * pair[0].centre + pair[1].mass * pair[1].centre == 0)
+    assert np.linalg.norm(pair[0].centre) > 0.3 * np.sqrt(size / 3.0) / 2
+    together = sum(
+        part.inertia + part.mass * (part.centre @ part.centre * eye - np.outer(part.centre, part.centre))
+        for part in pair
+    )
+    np.testing.assert_allclose(together, inertia, rtol=0, atol=1e-15 * size)
+    for part in pair:
+        a, b, c = np.linalg.eigvalsh(part.inertia)
+        assert a > 0 and a + b >= c - 1e-15 * size
+        assert a >= shape[0 if shape[0] < shape[2] else 2] / 8 * (1 - 1e-9)
+
+
+def test_halves_have_roundings_of_their_own():
+    """Hung at its centre a body has no potential energy to round; its halves' must cancel."""
+    model = pendulums.model(JOINTS["ball"])
+    model = replace(model, proximal=0 * model.proximal)
+    at = pendulums.state(model, 1)
+    plain, welded = state_rounding_bound(model, at), state_rounding_bound(model, at, split_bodies(model))
+    assert plain.potential_energy == 0 < welded.potential_energy
+    (whole,), (two,) = (
+        e.evaluate(model, [at]) for e in (load_adapter("mujoco"), load_adapter("mujoco").with_welded_halves())
+    )
+    assert 0 <= abs(two.potential_energy - whole.potential_energy) <= welded.potential_energy
+    for q in QUANTITIES:
+        assert np.all(np.asarray(welded.tolerance(q)) >= plain.tolerance(q))
+    with patch(
+        "plumbline.judging.metamorphic.check_state_relation", wraps=metamorphic.check_state_relation
+    ) as asked:
+        check_relations("mujoco", model, [at])
+    (_, *_, (one,), (other,)) = next(c.args for c in asked.call_args_list if c.args[0].name == WELDED_HALVES)
+    assert one.potential_energy == 0 and other.potential_energy == welded.potential_energy
+
+
+@pytest.mark.parametrize("joints", ["mixed", "balls-10"])
+def test_mujoco_s_solvers_have_nothing_to_do(joints):
+    """Solver and Jacobian are of active constraints: without any, the answers are the same bit for bit."""
+    mujoco = pytest.importorskip("mujoco")
+    engine = pytest.importorskip("adapters.mujoco_engine")
+    model = pendulums.model(JOINTS[joints], loads=True, drag=True)
+    usual = load_adapter("mujoco").evaluate(model, states(model))
+    kinds, jacobians = ("PGS", "CG", "NEWTON"), ("DENSE", "SPARSE")
+    for kind, jacobian in product(kinds, jacobians):
+        chain = engine._Chain(model)
+        chain.m.opt.solver = getattr(mujoco.mjtSolver, f"mjSOL_{kind}")
+        chain.m.opt.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{jacobian}")
+        for at, right in zip(states(model), usual, strict=True):
+            said = chain.quantities(at)
+            assert chain.d.nefc == 0
+            assert all(np.array_equal(getattr(said, q), getattr(right, q)) for q in vars(right))
+
+
+def test_an_option_that_there_is_not_is_refused():
+    with pytest.raises(KeyError, match="dense mass matrix"):
+        load_adapter("mujoco").with_option("sparse")
+    with pytest.raises(Unsupported, match="rigidly"):
+        load_adapter("reference").with_welded_halves()
+
+
+# -- short runs ------------------------------------------------------------------------------------
+
+
+SOLVED = "by EXUdense", "by EigenDense"  # besides the usual one
+
+
+@cache
+def exudyn():
+    return pytest.importorskip("adapters.exudyn_engine").Exudyn
+
+
+def trapezoidal():
+    return exudyn()().integrator("trapezoidal")
+
+
+def ran(engine, relation, joints="balls", integrator="trapezoidal"):
+    model = pendulums.model(JOINTS[joints])
+    (found,) = (
+        held
+        for held in check_run_relations(engine, model, pendulums.state(model, 1))
+        if (held.relation, held.integrator) == (relation, integrator)
+    )
+    return found
+
+
+def test_runs_take_sixteen_steps_of_at_most_a_thirtieth_of_a_radian_each_way():
+    model = pendulums.model(JOINTS["balls"])
+    at = pendulums.state(model, 1)
+    found = list(check_run_relations(exudyn()(), model, at))
+    assert [(held.integrator, held.relation) for held in found] == [
+        ("trapezoidal", "reversed in time"),
+        *(("trapezoidal", name) for name in SOLVED),
+        *(("generalized-alpha", name) for name in SOLVED),
+    ]
+    for held in found:
+        assert held.steps == (32 if held.relation == "reversed in time" else 16)
+        assert held.end_time == 16 * held.resolution and np.log2(held.resolution) % 1 == 0
+        assert 0.5 < 32 * fastest_rate(model, at) * held.resolution <= 1
+    reference = load_adapter("reference")
+    (back,) = check_run_relations(reference, model, at)
+    (method,) = (method for method in reference.integrators if method.is_symmetric)
+    assert (back.end_time, back.resolution) == (found[0].end_time, method.min_rtol)
+
+
+@pytest.mark.parametrize("joints", ["balls", "rods", "mixed"])
+def test_a_symmetric_integrator_comes_back(joints):
+    assert ran(exudyn()(), "reversed in time", joints).ratio < 0.3
+    assert ran(load_adapter("reference"), "reversed in time", joints, "collocation").ratio < 0.3
+
+
+def damped(real):
+    """A millionth of a newton metre second on every body: it knows the direction of time."""
+
+    class Damped(real):
+        def _retrace(self, model, *more):
+            return super()._retrace(replace(model, drag_moment=np.full(model.n, 1e-6)), *more)
+
+    return Damped
+
+
+@pytest.mark.parametrize("engine", ["exudyn", "reference"])
+def test_damping_is_not_reversed(engine):
+    real = damped(type(load_adapter(engine)))
+    integrator = next(i.name for i in real.integrators if i.symmetric)
+    assert ran(real(), "reversed in time", integrator=integrator).ratio > 1
+
+
+def test_a_scheme_that_is_not_symmetric_does_not_come_back():
+    class Alpha(exudyn()):
+        integrators = tuple(replace(i, symmetric=True) for i in exudyn().integrators)
+
+    assert ran(Alpha(), "reversed in time").ratio < 0.3
+    assert ran(Alpha(), "reversed in time", integrator="generalized-alpha").ratio > 1e3
+
+
+def test_accelerations_that_are_not_carried_break_the_way_back():
+    class Forgetful(exudyn()):
+        _rows = partialmethod(lambda self, *more, afresh=True: exudyn()._rows(self, *more, afresh=True))
+
+    assert ran(Forgetful(), "reversed in time").ratio > 1
+
+
+@pytest.mark.parametrize("engine", ["exudyn", "exudyn-tree"])
+def test_a_linear_solver_that_solves_something_else_is_seen(engine):
+    sound = load_adapter(engine)
+    bent = plant(type(sound), replace(of("distal-1e-5"), engine=engine))
+    sound.with_option = bent.with_option
+    for held in check_run_relations(
+        sound, model := pendulums.model(JOINTS["balls"]), pendulums.state(model, 1)
+    ):
+        assert (held.ratio > 1) == held.relation.startswith("by "), held
+
+
+def test_drag_is_not_reversed_and_a_failing_run_is_told():
+    model = pendulums.model(JOINTS["ball"], drag=True)
+    found = list(check_run_relations(exudyn()(), model, pendulums.state(model)))
+    assert found and not any(held.relation == "reversed in time" for held in found)
+
+    class Failing(exudyn()):
+        def _rows(self, *_, **__):
+            raise EngineFailure("it stopped")
+
+    model = pendulums.model(JOINTS["ball"])
+    found = list(check_run_relations(Failing(), model, pendulums.state(model)))
+    rows = judge_relations(RowContext("s", "f", "e", "E", "0"), found).rows
+    assert {(row.verdict, row.reason) for row in rows} == {("failed", "it stopped")}
+    solved = [(name, way) for name in ("trapezoidal", "generalized-alpha") for way in SOLVED]
+    assert [(row.integrator, row.quantity) for row in rows] == [("trapezoidal", "reversed in time"), *solved]
+
+
+def test_a_solver_with_which_a_run_fails_is_told():
+    class Half(exudyn()):
+        def by(self, option):
+            found = super().by(option)
+            found._simulate = failing
+            return found
+
+    def failing(*_):
+        raise EngineFailure("it stopped")
+
+    model = pendulums.model(JOINTS["ball"])
+    back, *others = check_integrator_relations(Half(), trapezoidal(), model, pendulums.state(model), 1 / 512)
+    assert back.ratio < 0.3
+    assert [(h.relation, h.integrator, h.refusal_reason, h.verdict) for h in others] == [
+        (way, "trapezoidal", "it stopped", "failed") for way in SOLVED
+    ]
+
+
+def test_two_solvers_may_both_be_off():
+    found = ran(exudyn()(), "by EigenDense", "mixed")
+    model = pendulums.model(JOINTS["mixed"])
+    at = pendulums.state(model, 1)
+    ends = [
+        state_at_sample(
+            way.simulate(model, at, np.array([0.0, found.end_time]), "trapezoidal", found.resolution), -1
+        )
+        for way in (exudyn()(), exudyn()().by("EigenDense"))
+    ]
+    limit = 2 * run_tolerance(trapezoidal(), model, at, found.end_time, 16)
+    assert found.ratio > 0
+    assert found.ratio == pytest.approx(max(relative_differences(model, *ends).values()) / limit, rel=1e-9), (
+        "the same runs"
+    )
+
+
+def test_runs_by_tolerance_have_no_solvers_and_are_not_tried_finer():
+    tried = []
+
+    class Failing(type(load_adapter("reference"))):
+        solvers = ("never",)
+
+        def _retrace(self, *_):
+            tried.append(1)
+            raise EngineFailure("it stopped")
+
+    model = pendulums.model(JOINTS["ball"])
+    (held,) = check_run_relations(Failing(), model, pendulums.state(model))
+    assert (held.relation, held.verdict, len(tried)) == ("reversed in time", "failed", 1)
+
+
+def test_a_step_too_coarse_to_be_solved_is_taken_finer():
+    tried = []
+
+    class Stiff(exudyn()):
+        def _rows(self, chain, times, integrator, step, afresh=True):
+            tried.append(step)
+            if step > max(tried) / 4:
+                raise EngineFailure("no convergence")
+            return super()._rows(chain, times, integrator, step, afresh)
+
+    found = ran(Stiff(), "reversed in time")
+    assert found.ratio < 0.3 and min(tried) == max(tried) / 4
+
+
+def test_a_light_body_among_heavy_ones_is_solved_less_sharply():
+    """The step's residual is small beside the heaviest body's: 2.6 times over without the ratio of masses."""
+    rng = np.random.default_rng([7, 174])
+    n, _ = int(rng.integers(1, 9)), rng.choice(3)
+    rods, rate = list(rng.random(n) < 0.4), float(rng.choice([0.5, 2, 10]))
+    loads, _ = rng.random() < 0.5, rng.random()
+    model, state = random_chain(rng, rods, decades=3, rate=rate, loads=bool(loads))
+    assert np.max(model.mass) > 1e2 * np.min(model.mass)
+    (held,) = (h for h in check_run_relations(exudyn()(), model, state) if h.relation == "reversed in time")
+    assert held.ratio < 0.3

@@ -1,0 +1,263 @@
+"""The arithmetic behind the relations: what is compared, over what, and what the rows say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from plumbline.engines.registry import load_adapter
+from plumbline.judging.metamorphic import (
+    OTHER_FORMULATIONS,
+    QUANTITIES,
+    Relation,
+    RelationResult,
+    characteristic_scales,
+    check_relations,
+    check_state_relation,
+    evaluate_or_refusal,
+    fastest_rate,
+    judge_relations,
+    quantity_values,
+    refused_result,
+    relative_differences,
+    run_tolerance,
+    scale_fields,
+    state_at_sample,
+    unchanged,
+    worst_difference_result,
+)
+from plumbline.judging.rows import RowContext
+from plumbline.model.datatypes import EngineFailure, Integrator, StateQuantities, Trajectory, Unsupported
+from plumbline.model.kinematics import angular_velocity, quaternion_product, quaternion_rate
+from plumbline.truth.ground_truth import RUN_ROUNDING, stretched_length
+from plumbline.truth.rounding_bound import state_rounding_bound
+from plumbline.truth.sensitivity import perturbation_growth
+from tests.helpers import pendulums
+
+MODEL = pendulums.model("br")
+STATES = [pendulums.state(MODEL, seed=k) for k in range(3)]
+WHO = RowContext("s", "f", "e", "E", "0")
+METHOD = Integrator("trapezoidal", "step", 2, is_symmetric=True)
+
+
+def test_values_are_what_is_offered_times_its_factor() -> None:
+    said = StateQuantities(np.ones((2, 3)), 2 * np.ones((2, 3)), kinetic_energy=3.0)
+    found = quantity_values(said, kinetic_energy=0.5, joint_reaction=9.0)
+    assert set(found) == {"acceleration", "angular_acceleration", "kinetic_energy"}
+    assert found["kinetic_energy"] == 1.5 and np.array_equal(found["acceleration"], said.acceleration)
+    twice = scale_fields(MODEL, mass=2.0, length=3.0)
+    assert np.array_equal(twice.mass, 2 * MODEL.mass) and np.array_equal(twice.length, 3 * MODEL.length)
+    assert np.array_equal(twice.inertia, MODEL.inertia)
+
+
+def compared(*shifts, relation=None, refuse=(), refuse_here=()):
+    """The relation of an engine with itself, answers shifted: (state, quantity, so many bounds of both)."""
+    bounds = [state_rounding_bound(MODEL, s) for s in STATES]
+    said = list(load_adapter("reference").evaluate(MODEL, STATES))
+    other = list(said)
+    for index, quantity, by in shifts:
+        x = np.asarray(getattr(said[index], quantity))
+        off = by * 2 * np.asarray(bounds[index].tolerance(quantity))
+        off = off[:, None] * [0.6, 0, -0.8] if x.ndim == 2 else off * np.eye(3)[0] if x.ndim else -off
+        other[index] = replace(other[index], **{quantity: x + off})
+    asked = iter(range(3))
+
+    def there(_model, _states):
+        index = next(asked)
+        if index in refuse:
+            raise Unsupported(f"not state {index}")
+        return [other[index]]
+
+    said = [Unsupported(f"nor state {k}") if k in refuse_here else x for k, x in enumerate(said)]
+    relation = relation or Relation("as itself", unchanged, quantity_values)
+    return check_state_relation(relation, said, there, MODEL, STATES, bounds, bounds)
+
+
+@pytest.mark.parametrize("quantity", QUANTITIES)
+@pytest.mark.parametrize("by", [0.9, 1.1, 40.0])
+def test_a_relation_is_as_far_off_as_its_worst_quantity_over_both_bounds(quantity: str, by: float) -> None:
+    found = compared((0, "kinetic_energy", 0.5), (2, quantity, by))
+    assert found.ratio == pytest.approx(by, rel=0.05)
+    assert (found.quantity, found.worst_state, found.state_count) == (quantity, 2, 3)
+    assert (found.relation, found.integrator, found.steps, found.refusal_reason) == ("as itself", "-", 0, "")
+
+
+def test_equal_answers_and_refused_ones() -> None:
+    assert compared().ratio == 0.0
+    some = compared((0, "acceleration", 5.0), (1, "acceleration", 3.0), refuse=(0,))
+    assert (some.state_count, some.worst_state) == (2, 1) and some.refusal_reason == "not state 0"
+    assert some.ratio == pytest.approx(3, rel=0.01)
+    mine = compared((2, "acceleration", 5.0), (1, "acceleration", 3.0), refuse_here=(2,))
+    assert (mine.state_count, mine.worst_state, mine.refusal_reason) == (2, 1, "nor state 2")
+    none = compared(refuse=(0, 1, 2))
+    assert (none.ratio, none.quantity, none.worst_state, none.state_count) == (None, "", 0, 0)
+    assert none.verdict == "unsupported"
+
+    def refusing(_model, _states):
+        raise Unsupported("never")
+
+    assert str(evaluate_or_refusal(refusing, MODEL, STATES[0])) == "never"
+
+
+def test_runs_are_measured_by_length_turn_and_speed() -> None:
+    at = STATES[0]
+    length, g = float(np.sum(stretched_length(MODEL))), np.linalg.norm(MODEL.gravity)
+    spin = max(np.sqrt(g * length) / length, *np.linalg.norm(at.omega, axis=1))
+    speed = max(spin * length, *np.linalg.norm(at.v, axis=1))
+    assert characteristic_scales(MODEL, at) == pytest.approx((length, spin, speed), rel=1e-14)
+    still = replace(at, omega=0 * at.omega, v=0 * at.v)
+    assert characteristic_scales(MODEL, still) == pytest.approx(
+        (length, np.sqrt(g / length), np.sqrt(g * length)), rel=1e-14
+    )
+    thrown = replace(still, v=np.array([[0, 0, 40.0], [0, 50.0, 0]]))
+    assert characteristic_scales(MODEL, thrown)[2] == 50.0
+    assert characteristic_scales(replace(MODEL, gravity=np.zeros(3)), still)[1] == np.finfo(float).tiny
+    turn = np.array([np.cos(5e-4), np.sin(5e-4), 0, 0])
+    other = replace(
+        at,
+        r=at.r + np.array([[0, 0, 0], [3e-3, 0, 4e-3]]),
+        p=quaternion_product(at.p, np.tile(turn, (2, 1))),
+        v=at.v + np.array([[0, 2e-3, 0], [0, 0, 0]]),
+        omega=at.omega + np.array([[0, 0, 0], [0, 0, 7e-3]]),
+    )
+    assert relative_differences(MODEL, at, other) == pytest.approx(
+        {
+            "position": 5e-3 / length,
+            "attitude": 1e-3,
+            "velocity": 2e-3 / speed,
+            "angular velocity": 7e-3 / spin,
+        },
+        rel=1e-9,  # distances of 1e-3 and more between numbers of size 1 … 50
+    )
+    found = worst_difference_result(
+        "reversed in time", METHOD, {"position": 1.0, "velocity": 3.0, "attitude": 2.0}, 0.5, 64, 0.25, 8.0
+    )
+    assert found == RelationResult(
+        "reversed in time",
+        6.0,
+        "velocity",
+        0,
+        1,
+        integrator="trapezoidal",
+        steps=64,
+        refusal_reason="",
+        resolution=0.25,
+        end_time=8.0,
+    )
+
+
+def test_a_sample_is_taken_as_it_is_and_back_with_opposite_rates() -> None:
+    at = STATES[1]
+    r, p, v = (np.stack([0 * x, x]) for x in (at.r, at.p, at.v))
+    run = Trajectory(np.array([0.0, 1.0]), r, p, v, np.stack([0 * at.p, quaternion_rate(at.p, at.omega)]), 1)
+    for sign in (1.0, -1.0):
+        found = state_at_sample(run, -1, sign)
+        assert np.array_equal(found.r, at.r) and np.array_equal(found.p, at.p)
+        assert np.array_equal(found.v, sign * at.v)
+        assert found.omega == pytest.approx(sign * angular_velocity(at.p, run.pdot[1]), abs=1e-14)
+        for nothing in (found.u, found.udot):
+            assert nothing.shape == (2, 3) and not np.any(nothing)
+    assert not np.any(state_at_sample(run, 0).r)
+
+
+def test_the_quickest_is_a_body_a_rod_or_the_shortest_link() -> None:
+    at, g = STATES[0], np.linalg.norm(MODEL.gravity)
+    still = replace(at, omega=0 * at.omega, udot=0 * at.udot)
+    assert fastest_rate(MODEL, still) == pytest.approx(
+        np.sqrt(g / np.min(stretched_length(MODEL))), rel=1e-14
+    )
+    assert fastest_rate(MODEL, replace(still, omega=np.array([[0, 3.0, 4.0], [90.0, 0, 0]]))) == 90.0
+    assert fastest_rate(MODEL, replace(still, udot=np.array([[0, 0, 0], [30.0, 0, 40.0]]))) == 50.0
+    assert fastest_rate(replace(MODEL, gravity=np.zeros(3)), still) == 1.0
+
+
+def test_rows_say_what_held_what_did_not_and_what_was_refused() -> None:
+    one = RelationResult("masses doubled", 0.25, "joint_reaction", 2, 4)
+    off = replace(one, ratio=1.5)
+    run = RelationResult(
+        "reversed in time",
+        0.5,
+        "velocity",
+        0,
+        1,
+        integrator="trapezoidal",
+        steps=64,
+        resolution=0.25,
+        end_time=8.0,
+    )
+    lost = refused_result("by sparse", METHOD, EngineFailure("it stopped"))
+    never = refused_result("by sparse", METHOD, Unsupported("no such solver"))
+    assert lost == RelationResult(
+        "by sparse", None, "", 0, 0, "it stopped", "failed", "trapezoidal", 0, 0.0, 0.0
+    )
+    assert (one.refusal_reason, one.integrator, one.steps) == ("", "-", 0)
+    rows = judge_relations(
+        WHO, [one, off, replace(one, ratio=1.0), run, replace(run, ratio=7.0), lost, never]
+    ).rows
+    assert [r.verdict for r in rows] == [
+        "agrees", "disagrees", "agrees", "agrees", "disagrees", "failed", "unsupported",
+    ]  # fmt: skip
+    assert {r.level for r in rows} == {"relations"}
+    assert [r.integrator for r in rows] == ["-"] * 3 + ["trapezoidal"] * 4
+    assert [r.value for r in rows] == [0.25, 1.5, 1.0, 0.5, 7.0, None, None]
+    assert [r.tolerance for r in rows] == [1.0] * 5 + [None] * 2
+    assert rows[0].extra == {"states": 4.0, "state": 2.0}
+    assert rows[3].extra == {"states": 1.0, "state": 0.0, "resolution": 0.25, "end": 8.0}
+    assert "sum of both sides' state-level rounding bounds" in rows[0].derivation
+    assert "growth of a small perturbation" in rows[3].derivation
+    assert "to 0.25 of the rounding bounds, 4 states" in rows[0].reason
+    assert "E's joint reaction at state 2 differs by 1.5 times the rounding bounds of both" in rows[1].reason
+    assert "to 0.5 of what rounding and the step's solver explain, 64 steps" in rows[3].reason
+    assert "velocity at the end differs by 7 times" in rows[4].reason
+    assert rows[4].reason.endswith("what rounding and the step's solver explain")
+    assert [r.reason for r in rows[5:]] == ["it stopped", "no such solver"]
+    assert [r.quantity for r in rows][:2] == ["masses doubled"] * 2
+
+
+@pytest.mark.parametrize("kind", ["step", "tolerance"])
+def test_a_run_may_be_off_by_its_rounding_its_solver_and_its_accelerations_grown(kind: str) -> None:
+    at, end, steps = STATES[2], 0.5, 81
+    method = Integrator("x", kind, 2, solver_rtol=1e-9, min_rtol=3e-9)  # type: ignore[arg-type]
+    bound, (_, spin, speed) = state_rounding_bound(MODEL, at), characteristic_scales(MODEL, at)
+    ratio = max(MODEL.mass) / min(MODEL.mass)
+    solved = (1e-9 * ratio if kind == "step" else 3e-9) * 9
+    pushed = end * max(max(bound.acceleration) / speed, max(bound.angular_acceleration) / spin)
+    grown = max(perturbation_growth(MODEL, at, np.array([0, end / 2, end])))
+    assert grown > 1.1 and ratio > 1.1
+    limit = run_tolerance(method, MODEL, at, end, steps)
+    assert limit == pytest.approx((RUN_ROUNDING + solved + pushed) * grown, rel=1e-12, abs=0)
+    bare = replace(method, solver=0.0, tightest=0.0)
+    assert run_tolerance(bare, MODEL, at, end, steps) == pytest.approx(
+        (RUN_ROUNDING + pushed) * grown, rel=1e-12, abs=0
+    )
+
+
+@pytest.mark.parametrize("drag", [False, True])
+def test_every_relation_is_asked_but_time_reversed_with_drag(drag: bool) -> None:
+    model = pendulums.model("b", drag=drag)
+    names = [found.relation for found in check_relations("pinocchio", model, [pendulums.state(model)])]
+    told = ["rotated world", "re-chosen body frame", "masses doubled", "lengths × 4"]
+    told += [] if drag else ["time reversed"]
+    assert names[: len(told)] == told and ("time reversed" in names) is not drag
+    assert "as pinocchio-maximal" in names and "two welded halves" in names
+
+
+@pytest.mark.parametrize(("engine", "other"), OTHER_FORMULATIONS.items())
+def test_both_columns_of_an_engine_are_compared(engine: str, other: str) -> None:
+    pytest.importorskip(engine.split("-")[0])
+    assert OTHER_FORMULATIONS[other] == engine
+    model = pendulums.model("b")
+    assert f"as {other}" in [
+        found.relation for found in check_relations(engine, model, [pendulums.state(model)])
+    ]
+    assert set(OTHER_FORMULATIONS) == {"pinocchio", "pinocchio-maximal", "exudyn", "exudyn-tree"}
+
+
+def test_long_chains_are_asked_at_half_as_many_states() -> None:
+    pytest.importorskip("mujoco")
+    for bodies, states in ((12, 4), (13, 2)):
+        model = pendulums.model("b" * bodies)
+        found = check_relations("mujoco", model, [pendulums.state(model, seed=k, rate=0.5) for k in range(6)])
+        assert {one.state_count for one in found if not one.steps and one.ratio is not None} == {states}

@@ -1,0 +1,439 @@
+"""What decides the rows about motion, on ladders whose errors are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from plumbline.engines.calls import RefinementRun, RefinementStudy
+from plumbline.judging.convergence import romberg
+from plumbline.judging.rows import RowContext
+from plumbline.judging.trajectory import ROUNDING_PER_STEP, RefinementAnalysis, judge_trajectory
+from plumbline.model.datatypes import Integrator, Trajectory
+from plumbline.model.invariants import compute_invariants
+from plumbline.model.kinematics import angular_velocity, quaternion_product
+from plumbline.truth.ground_truth import RUN_ROUNDING, MotionTruth
+from tests.helpers import pendulums
+
+TIMES = np.linspace(0, 2, 17)
+MODEL = pendulums.model("b")
+TRUE = pendulums.motion(MODEL, pendulums.state(MODEL, seed=2, rate=0.5), TIMES)
+WHO = RowContext("s", "f", "mujoco", "MuJoCo", "4")
+METHOD = Integrator("Heun", "step", 2, (2, 3, 4))
+STEPS = tuple(2.0**-k for k in range(5, 11))
+ALONG = np.array([2.0, -1.0, 2.0]) / 3
+
+
+def truth(**changes):
+    one = np.ones(17)
+    held = MotionTruth(
+        TRUE, 1e-12 * one, 2e-12 * one, 1 + TIMES, 1e-6 * one, 2e-6 * one, length=0.4, method="made"
+    )
+    return replace(held, **changes)
+
+
+def run(error, attitude=None, speed=None, steps=100):
+    """The truth, off by ``error`` t m along one direction, ``attitude`` t rad and ``speed`` t m/s."""
+    attitude, speed = (error if x is None else x for x in (attitude, speed))
+    off = TIMES[:, None, None] * ALONG
+    half = attitude * TIMES / 2
+    turn = np.stack([np.cos(half), *(np.sin(half) * ALONG[:, None])], -1)[:, None]
+    p = quaternion_product(TRUE.p, turn)
+    return Trajectory(TIMES, TRUE.r + error * off, p, TRUE.v + speed * off, TRUE.pdot, steps)
+
+
+def climbed(errors=None, **more):
+    """A ladder with error c h² and cost 1, 2, 3, … s; or with these errors."""
+    errors = [0.01 * h**2 for h in STEPS] if errors is None else errors
+    rungs = [
+        RefinementRun(h, run(e, **more), None, i + 1.0)
+        for i, (h, e) in enumerate(zip(STEPS, errors, strict=True))
+    ]
+    return RefinementStudy(rungs, None)
+
+
+def rows(climb=None, method=METHOD, horizon=2.0, model=MODEL, **changes):
+    found = judge_trajectory(WHO, model, truth(**changes), method, climb or climbed(), horizon)
+    return {row.quantity: row for row in found.rows}
+
+
+def ladder(climb=None, method=METHOD, horizon=2.0, model=MODEL, **changes):
+    return RefinementAnalysis(WHO, model, truth(**changes), method, (climb or climbed()).runs, horizon)
+
+
+def test_a_sound_ladder_agrees_in_everything_and_says_what_it_measured():
+    found = rows()
+    assert list(found) == [
+        "order", "position_limit", "position", "attitude_limit", "attitude",
+        "energy_drift", "momentum_drift", "joint_gap", "gap_rate", "norm_drift",
+    ]  # fmt: skip
+    assert {row.verdict for row in found.values()} == {"agrees"}
+    assert {row.integrator for row in found.values()} == {"Heun"}
+    units = ["1", "m", "m", "rad", "rad", "J", "kg m²/s", "m", "m/s", "1"]
+    assert [row.unit for row in found.values()] == units
+    assert [row.level for row in found.values()] == ["trajectory"] * 5 + ["invariants"] * 5
+    assert {row.cpu_time for row in found.values()} == {21.0}
+    order = found["order"]
+    assert (order.value, order.order) == (pytest.approx(0, abs=1e-6), pytest.approx(2, abs=1e-6))
+    assert (order.tolerance, order.declared_order, order.compared_until) == (0.1, 2, 2.0)
+    assert (order.level, order.unit) == ("trajectory", "1")
+    assert "steps 0.03125 … 0.000976562 s, t ≤ 2 s" in order.reason and "shows order 2.00" in order.reason
+    assert "2.00, 2.00, 2.00, 2.00" in order.derivation
+    rounding = RUN_ROUNDING * 3.0 * 0.4
+    limit, own = found["position_limit"], found["position"]
+    assert limit.value < 1e-15 and limit.compared_until == 2.0 and limit.unit == own.unit == "m"
+    assert limit.uncertainty == pytest.approx(1e-12, rel=1e-2, abs=0)
+    assert limit.tolerance == pytest.approx(1e-12 + rounding, rel=1e-2, abs=0)
+    assert limit.extra == {"ratio": limit.value / limit.tolerance, "visible": 1e-6, "growth": 3.0}
+    assert own.value == pytest.approx(0.02 * STEPS[-1] ** 2, rel=1e-6)
+    assert own.tolerance == pytest.approx(own.value + limit.tolerance, rel=1e-6)
+    assert own.extra == {"ratio": limit.extra["ratio"], "resolution": STEPS[-1]}
+    assert limit.reason.startswith("position limit within") and "at step 0.000976562" in own.reason
+    turned = found["attitude"]
+    assert turned.value == pytest.approx(0.02 * STEPS[-1] ** 2, rel=1e-4) and turned.unit == "rad"
+    assert found["attitude_limit"].tolerance == pytest.approx(2e-12 + 2 * RUN_ROUNDING * 3.0, rel=0.1, abs=0)
+    assert found["attitude_limit"].extra["visible"] == 2e-6
+    assert "powers of h from (2, 3, 4) eliminated over 6 steps" in limit.derivation
+    assert "a mistake of 0.0001 in a parameter makes 1e-06" in limit.derivation
+
+
+@pytest.mark.parametrize(("until", "numbers"), [(2.0, [17, 9, 5, 3]), (9.0, [17, 9, 5, 3]), (1.0, [9, 5, 3])])
+def test_windows_halve_down_to_an_eighth_with_three_samples_at_least(until, numbers):
+    assert ladder().window_lengths(until) == numbers
+    assert ladder().window_lengths(0.3) == [3]
+    assert ladder().window_lengths(0.1) == [3]
+    dense = ladder()
+    dense.truth = truth(trajectory=replace(TRUE, t=np.linspace(0, 2, 65)))
+    assert dense.window_lengths(2.0) == [65, 33, 17, 9]
+
+
+def test_an_order_that_stays_away_disagrees_and_one_on_its_way_decides_nothing():
+    one = rows(climbed([0.01 * h for h in STEPS]), replace(METHOD, powers=(1, 2, 3)))["order"]
+    assert (one.verdict, one.order, one.value) == ("disagrees", pytest.approx(1), pytest.approx(1))
+    lost = rows(climbed([0.01, 0.003, 0.002, 0.0003, 0.0002, 0.00001]))["order"]
+    assert lost.verdict == "unresolved" and lost.reason.startswith("not in the asymptotic range: orders ")
+    assert lost.compared_until == 2.0, "the longest window, where none shows an order"
+    floor = rows(climbed([1e-16, 0, 1e-16, 0, 1e-16, 0]))["order"]
+    assert (floor.verdict, floor.order, floor.value) == ("agrees", None, None)
+    assert "not observable" in floor.reason and floor.compared_until == 2.0
+
+
+@pytest.mark.parametrize(("factor", "until"), [(0.98, 2.0), (1.02, 1.0)])
+def test_differences_within_four_times_the_rounding_have_no_order(factor, until):
+    """32 floors of an eighth of what rounding has grown to; over half the time they are smaller still."""
+    held = ladder()
+    per_error = 2.0 * np.hypot(1 / held.truth.length, 1 / held.invariant_scales()["gap_rate"])
+    error = factor * 4 * RUN_ROUNDING * 3.0 / per_error
+    found = ladder(climbed([error * x for x in (1, 0, 0.6, 0.1, 0.9, 0)]))
+    assert found.observed.is_at_rounding_floor and found.observed_until == until
+
+
+def test_order_is_of_positions_and_velocities_over_their_scales():
+    """Positions without error and velocities of order 1: an order 1, not a rounding floor."""
+    made = [RefinementRun(h, run(0.0, 0.0, 0.01 * h), None, 0.0) for h in STEPS]
+    held = ladder(RefinementStudy(made, None))
+    assert held.observed.value == pytest.approx(1)
+    sizes = held.truth.length, held.invariant_scales()["gap_rate"]
+    expected = np.concatenate([TRUE.r / sizes[0], made[0].trajectory.v / sizes[1]], -1)
+    np.testing.assert_allclose(held.scaled_states[0], expected, rtol=1e-13)
+
+
+def test_rounding_of_a_quaternion_is_twice_that_of_the_angle():
+    grown = rows(growth=np.full(17, 1e4))["attitude_limit"]
+    assert grown.tolerance == pytest.approx(2 * RUN_ROUNDING * 1e4, rel=1e-2)
+
+
+def test_a_limit_elsewhere_disagrees_only_where_the_ladder_shows_its_order():
+    shifted = [1e-9 + 0.01 * h**2 for h in STEPS]
+    found = rows(climbed(shifted))
+    limit = found["position_limit"]
+    assert limit.verdict == found["position"].verdict == found["attitude_limit"].verdict == "disagrees"
+    assert limit.value == pytest.approx(2e-9, rel=1e-3) and limit.compared_until == 2.0
+    assert f"{limit.value / limit.tolerance:.3g} times the uncertainties" in limit.reason
+    assert limit.extra["ratio"] == pytest.approx(limit.value / limit.tolerance)
+    wild = [1e-9 + e for e in (0.01, 0.003, 0.002, 0.0003, 0.0002, 0.0002)]
+    lost = rows(climbed(wild))["position_limit"]
+    assert lost.verdict == "unresolved"
+    tight = rows(climbed([1e-9] * 6))["position_limit"]  # at the floor at every step: trusted
+    assert tight.verdict == "disagrees"
+
+
+def test_a_shorter_window_may_tell_where_the_long_one_cannot():
+    late = np.where(TIMES > 1, 1e-3, 1e-12)
+    found = rows(position_uncertainty=late)
+    limit = found["position_limit"]
+    assert (limit.verdict, limit.compared_until) == ("agrees", 1.0)
+    assert limit.extra["growth"] == 2.0 and "up to t = 1 s" in limit.reason
+    assert found["position"].value == pytest.approx(0.01 * STEPS[-1] ** 2, rel=1e-6)
+    assert found["position"].tolerance == pytest.approx(0.01 * STEPS[-1] ** 2 + limit.tolerance, rel=1e-6)
+    assert found["attitude_limit"].compared_until == 2.0
+    both = rows(visible_position=np.full(17, 1e-14))
+    blind = both["position_limit"]
+    assert both["position"].verdict == "unresolved", "the finest run is no better than its limit"
+    assert (blind.verdict, blind.compared_until) == ("unresolved", 2.0)
+    assert "is above the 1e-14 m that a mistake of 0.0001 would make" in blind.reason
+    endless = rows(visible_position=np.full(17, np.inf))["position_limit"]
+    assert endless.verdict == "agrees" and endless.extra["visible"] == 1e308
+    short = rows(horizon=0.5)["position_limit"]
+    assert short.compared_until == 0.5
+
+
+def test_the_border_is_the_tolerance_and_the_tolerance_what_is_visible():
+    tolerance = rows()["position_limit"].tolerance
+    for shift, verdict in ((0.95 * tolerance / 2, "agrees"), (1.05 * tolerance / 2, "disagrees")):
+        assert rows(climbed([shift + 0.01 * h**2 for h in STEPS]))["position_limit"].verdict == verdict
+    for visible, horizon in ((1.01 * tolerance, 2.0), (0.99 * tolerance, 1.0)):  # rounding grows with time
+        assert rows(visible_position=np.full(17, visible))["position_limit"].compared_until == horizon
+
+
+def test_runs_that_did_not_stay_finite_are_points_of_the_study():
+    some = climbed()
+    some.runs[0] = replace(some.runs[0], trajectory=None, failure="blew up")
+    found = judge_trajectory(WHO, MODEL, truth(), METHOD, some, 2.0)
+    assert {row.verdict for row in found.rows} == {"agrees"}
+    table = dict(found.tables)["convergence"]
+    assert table["steps"][:3] == [0, 0, 100] and np.isnan(table["error"][0])
+    for rung in range(5):
+        some.runs[rung] = replace(some.runs[rung], trajectory=None)
+    alone = judge_trajectory(WHO, MODEL, truth(), METHOD, some, 2.0)
+    said = {row.quantity: row for row in alone.rows}
+    for name in ("position_limit", "attitude_limit"):
+        assert said[name].verdict == "unresolved" and "fewer than two" in said[name].reason
+        assert (said[name].level, said[name].integrator) == ("trajectory", "Heun")
+        assert said[name].unit == ("m" if name == "position_limit" else "rad")
+    assert "position" not in said
+    curves = dict(alone.tables)["curves"]
+    assert np.all(np.isnan([curves["limit_error"], curves["tolerance"]]))
+    some.runs[-1] = replace(some.runs[-1], trajectory=None, failure="NaN at 1 s")
+    (lost,) = judge_trajectory(WHO, MODEL, truth(), METHOD, some, 2.0).rows
+    assert (lost.quantity, lost.verdict, lost.integrator) == ("all", "failed", "Heun")
+    assert lost.reason == "at the finest resolution 0.000976562: NaN at 1 s"
+    (never,) = judge_trajectory(WHO, MODEL, truth(), METHOD, RefinementStudy([], "no drag here"), 2.0).rows
+    assert (never.quantity, never.verdict, never.reason) == ("all", "unsupported", "no drag here")
+    assert (lost.level, never.level, never.integrator) == ("trajectory", "trajectory", "Heun")
+
+
+def test_a_method_with_a_tolerance_has_no_order_and_its_tightest_run_is_the_limit():
+    method = Integrator("DOP853", "tolerance", 8)
+    found = rows(climbed([1e-6, 1e-8, 1e-10, 1e-11, 2e-12, 1e-12]), method)
+    assert "order" not in found
+    limit = found["position_limit"]
+    assert limit.verdict == "agrees" and "tightest of 6 tolerances" in limit.derivation
+    assert limit.value == pytest.approx(2e-12, rel=1e-2, abs=0)
+    assert limit.uncertainty == pytest.approx(1e-12 + 2e-12, rel=1e-2, abs=0)
+    assert found["attitude_limit"].uncertainty == pytest.approx(2e-12 + 2e-12, rel=1e-2, abs=0)
+    assert found["position"].reason.startswith("position at tolerance 0.000976562 is 2e-12 m")
+    wild = (1e-7, 5e-8, 4.9e-8, 1e-9, 9e-10, 0)  # no order of any kind
+    off = rows(climbed([1e-6 + e for e in wild]), method)["position_limit"]
+    assert off.verdict == "disagrees", "trusted without any order"
+    floor = found["energy_drift"]
+    each = ROUNDING_PER_STEP + STEPS[-1]
+    assert floor.tolerance == pytest.approx(each * 100 * floor.extra["scale"], rel=1e-12)
+    stays = rows(climbed([0.5 + e for e in (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 0)]), method)["joint_gap"]
+    assert stays.verdict == "disagrees", "trusted without any order"
+
+
+def test_an_implicit_solver_walks_at_random():
+    method = replace(METHOD, solver=1e-11)
+    held = ladder(method=method)
+    np.testing.assert_allclose(held.rounding, (RUN_ROUNDING + 1e-10) * (1 + TIMES), rtol=1e-12)
+    assert held.rounding_description() == "(10³ ε + 1e-11 of the step's solver × √100) G(t)"
+    assert ladder().rounding_description() == "10³ ε G(t)"
+
+
+def test_an_alias_is_told_and_drag_parts_it():
+    method = replace(METHOD, alias_of="Euler")
+    assert {row.alias_of for row in rows(method=method).values()} == {"Euler"}
+    dragged = replace(MODEL, drag_moment=np.array([0.1]))
+    assert {row.alias_of for row in rows(method=method, model=dragged).values()} == {None}
+
+
+def test_attitudes_have_two_signs():
+    some, right = climbed(), ladder()
+    for rung in (2, 4):
+        run = some.runs[rung].trajectory
+        some.runs[rung] = replace(some.runs[rung], trajectory=replace(run, p=-run.p))
+    for mine, theirs in zip(ladder(some).attitudes, right.attitudes, strict=True):
+        assert np.array_equal(mine, theirs)
+    assert np.array_equal(right.positions[1], climbed().runs[1].trajectory.r)
+    assert rows(some)["attitude_limit"].verdict == "agrees"
+
+
+def test_the_sign_of_an_attitude_is_that_of_its_body_and_time():
+    """Of two bodies, with signs at random; a component about zero decides nothing."""
+    model = pendulums.model("br")
+    p = pendulums.motion(model, pendulums.state(model, seed=3), TIMES).p
+    p[..., 3] = 1e-12
+    other = p * [1, 1, 1, -1e6]
+    signs = np.random.default_rng(1).choice([-1.0, 1.0], size=(17, 2, 1))
+    still = np.zeros((17, 2, 3))
+    runs = [Trajectory(TIMES, still, x, still, 0 * x, 1) for x in (signs * other, p)]
+    made = [RefinementRun(h, run, None, 0.0) for h, run in zip(STEPS, runs, strict=False)]
+    held = RefinementAnalysis(WHO, model, truth(trajectory=runs[1]), METHOD, made, 2.0)
+    assert np.array_equal(held.attitudes[0], other) and np.array_equal(held.attitudes[1], p)
+
+
+# --- invariants ---------------------------------------------------------------------------------
+
+
+def test_scales_are_sizes_of_what_the_invariants_are_made_of():
+    model = pendulums.model("br")
+    state = pendulums.state(model, seed=3, rate=4.0)
+    true = pendulums.motion(model, state, TIMES)
+    held = RefinementAnalysis(
+        WHO, model, truth(trajectory=true), METHOD, [RefinementRun(0.1, true, None, 0.0)], 2.0
+    )
+    scales, omega = held.invariant_scales(), angular_velocity(true.p, true.pdot)
+    g = np.linalg.norm(model.gravity)
+    kinetic = [
+        sum(model.mass[k] * v[k] @ v[k] / 2 + w[k] @ model.inertia[k] @ w[k] / 2 for k in range(2))
+        for v, w in zip(true.v, omega, strict=True)
+    ]
+    height = [model.mass * (r @ model.gravity) for r in true.r]
+    potential = np.max([np.sum(np.abs(x)) for x in height])
+    swing = np.ptp([np.sum(x) for x in height])
+    assert scales["energy_drift"] == pytest.approx(max(*kinetic, potential, swing), rel=1e-12)
+    fall = np.sqrt(g * 0.4)
+    speed = max(fall, *np.linalg.norm(true.v, axis=-1).ravel())
+    spin = max(fall / 0.4, *np.linalg.norm(omega, axis=-1).ravel())
+    arm = np.max(np.linalg.norm(true.r, axis=-1))
+    inertia = sum(np.linalg.norm(J) for J in model.inertia)
+    assert scales["momentum_drift"] == pytest.approx(sum(model.mass) * arm * speed + inertia * spin)
+    assert scales["joint_gap"] == max(0.4, arm) and scales["norm_drift"] == 1.0
+    assert scales["gap_rate"] == pytest.approx(max(speed, spin * 0.4), rel=1e-12)
+    still = replace(
+        held, truth=truth(trajectory=replace(true, v=0 * true.v, pdot=0 * true.pdot))
+    ).invariant_scales()
+    assert still["energy_drift"] == pytest.approx(max(potential, swing), rel=1e-12)
+    over = np.linspace(1, -1, 17)[:, None, None] * TRUE.r[0]  # from one side of the pivot to the other
+    turned = replace(TRUE, r=over, v=0 * TRUE.v, pdot=0 * TRUE.pdot)
+    lifted = 2 * abs(MODEL.mass[0] * TRUE.r[0, 0] @ MODEL.gravity)
+    assert ladder(trajectory=turned).invariant_scales()["energy_drift"] == pytest.approx(lifted, rel=1e-12)
+    long = replace(
+        held, truth=truth(trajectory=true, length=50.0)
+    ).invariant_scales()  # a fall is faster than this
+    assert long["joint_gap"] == 50.0
+    assert long["gap_rate"] == pytest.approx(
+        max(np.sqrt(g * 50), np.max(np.linalg.norm(omega, axis=-1)) * 50)
+    )
+
+
+def test_a_drift_that_falls_with_the_step_agrees_and_one_that_does_not_disagrees():
+    found = rows()["joint_gap"]
+    whole = 0.02 * STEPS[-1] ** 2
+    assert (found.verdict, found.level, found.unit, found.compared_until) == (
+        "agrees",
+        "invariants",
+        "m",
+        2.0,
+    )
+    assert found.value == pytest.approx(whole, rel=0.1) and found.extra["whole"] == found.value
+    floor = ROUNDING_PER_STEP * 100 * found.extra["scale"]
+    assert found.tolerance == pytest.approx(found.value + floor, rel=1e-3)
+    assert found.extra["limit"] < 1e-14 and "at the finest step" in found.reason
+    stays = rows(climbed([1e-6 + 0.01 * h**2 for h in STEPS]))["joint_gap"]
+    assert stays.verdict == "disagrees" and "joint gap does not vanish with the step" in stays.reason
+    assert "from the finest step to step zero" in stays.derivation
+    assert stays.extra["limit"] == pytest.approx(2e-6, rel=0.1)
+    assert stays.extra["ratio"] == pytest.approx(stays.extra["limit"] / stays.tolerance, rel=1e-9)
+    wild = rows(climbed([0.1, 0.03, 0.02, 0.003, 0.002, 0.001]))["joint_gap"]
+    assert wild.verdict == "unresolved" and wild.reason.endswith("cannot tell")
+    untold = rows(climbed([1e-3 + e for e in (0.0, 1e-5, -1e-5, 2e-5, 1e-5, 0)]))["joint_gap"]
+    assert untold.extra["ratio"] > 1 and untold.verdict == "unresolved", "no order, no trust"
+    alone = climbed()
+    for rung in range(5):
+        alone.runs[rung] = replace(alone.runs[rung], trajectory=None)
+    lost = rows(alone)["joint_gap"]
+    assert lost.verdict == "unresolved" and "fewer than two" in lost.reason
+    assert lost.tolerance == pytest.approx(floor, abs=0) and lost.derivation.startswith("100 steps, ")
+
+
+def test_an_unresolved_drift_is_allowed_what_the_ladder_leaves_open():
+    errors = [1e-3 + e for e in (0.0, 1e-5, -1e-5, 2e-5, 1e-5, 0)]
+    found = rows(climbed(errors, attitude=0.0, speed=0.0))["joint_gap"]
+    limit = romberg([np.full((1, 1, 1), 2 * e) for e in errors], METHOD.error_exponents)  # at 2 s
+    own = abs(2e-3 - limit.y[0, 0, 0])
+    assert found.verdict == "unresolved" and found.value == pytest.approx(2e-3)
+    assert found.tolerance == pytest.approx(own + limit.uncertainty[0], rel=1e-6)
+    assert f"{own:.2g} from the finest step to step zero" in found.derivation
+
+
+@pytest.mark.parametrize(("steps", "counted"), [(10, 64), (64, 64), (1000, 1000)])
+def test_a_drift_of_rounding_agrees_at_once(steps, counted):
+    """So much in every step, of at least 64 steps."""
+    base = rows(climbed([0.0] * 6, steps=steps))["norm_drift"]
+    assert base.verdict == "agrees" and base.reason.endswith("rounding")
+    assert base.tolerance == pytest.approx(ROUNDING_PER_STEP * counted, rel=1e-12, abs=0)
+    assert base.extra["ratio"] == pytest.approx(base.value / base.tolerance)
+    assert base.derivation.startswith(f"{steps} steps, ") and base.compared_until == 2.0
+    held = climbed([0.0] * 6, steps=steps)
+    for factor, said in ((0.9, True), (1.1, False)):
+        grown = TRUE.p * (1 + factor * base.tolerance * TIMES / 2)[:, None, None]
+        held.runs[-1] = replace(held.runs[-1], trajectory=replace(held.runs[-1].trajectory, p=grown))
+        assert rows(held)["norm_drift"].reason.endswith("rounding") is said
+
+
+def test_what_the_quadrature_of_the_work_leaves_open_is_allowed():
+    """Drag: energy by the samples' spline; its uncertainty is part of the tolerance, and only there."""
+    model = replace(MODEL, drag_moment=np.array([1e-5]))
+    true = pendulums.motion(model, pendulums.state(model, seed=2, rate=0.5), TIMES)
+    rungs = [
+        RefinementRun(h, replace(true, v=true.v * (1 + h**2 * TIMES[:, None, None])), None, 0.0)
+        for h in STEPS
+    ]
+    found = rows(RefinementStudy(rungs, None), model=model, trajectory=true)
+    uncertain = compute_invariants(model, rungs[-1].trajectory).work_uncertainty
+    assert uncertain > 1e-8
+    row = found["energy_drift"]
+    assert f"the work by quadrature ± {uncertain:.2g}" in row.derivation
+    assert "quadrature ± 0" in found["gap_rate"].derivation
+    assert row.extra["limit"] < uncertain and row.verdict == "agrees"
+    assert "momentum_drift" not in found
+
+
+# --- tables -------------------------------------------------------------------------------------
+
+
+def test_the_tables_hold_every_rung_every_sample_and_every_pose():
+    found = dict(judge_trajectory(WHO, MODEL, truth(), METHOD, climbed(), 1.0).tables)
+    table = found["convergence"]
+    assert (table["scenario"], table["engine"], table["integrator"]) == ("s", "mujoco", "Heun")
+    assert table["quantity"] == ["position", "attitude"] * 6
+    assert table["resolution"] == [h for h in STEPS for _ in range(2)]
+    assert table["cost"] == [float(i) for i in range(1, 7) for _ in range(2)] and set(table["steps"]) == {100}
+    np.testing.assert_allclose(table["error"][::2], [0.01 * h**2 for h in STEPS], rtol=1e-6)
+    np.testing.assert_allclose(table["error"][1::2], [0.01 * h**2 for h in STEPS], rtol=1e-4)
+    np.testing.assert_allclose(table["order"][::2], [np.nan, np.nan, 2, 2, 2, 2], rtol=1e-6)
+    curves = found["curves"]
+    assert curves["resolution"] == STEPS[-1] and curves["t"] is TIMES
+    np.testing.assert_allclose(curves["position_error"], 0.01 * STEPS[-1] ** 2 * TIMES, atol=1e-15)
+    np.testing.assert_allclose(curves["attitude_error"], 0.01 * STEPS[-1] ** 2 * TIMES, atol=1e-14)
+    assert np.max(curves["limit_error"]) < 1e-14
+    np.testing.assert_allclose(curves["tolerance"], 1e-12 + 0.4 * RUN_ROUNDING * (1 + TIMES), rtol=0.05)
+    finest = climbed().runs[-1].trajectory
+    held = compute_invariants(MODEL, finest)
+    np.testing.assert_allclose(curves["joint_gap"], np.linalg.norm(held.joint_gap[:, 0], axis=-1))
+    np.testing.assert_allclose(curves["norm_drift"], np.abs(held.norm_drift[:, 0, 0]))
+    bare = dict(
+        judge_trajectory(
+            WHO, replace(MODEL, gravity=0 * MODEL.gravity), truth(), METHOD, climbed(), 1.0
+        ).tables
+    )
+    assert np.all(np.isnan(bare["curves"]["momentum_drift"]))
+    poses = found["trajectories"]
+    assert poses["t"].tolist() == TIMES.tolist() and set(poses["body"]) == {0}
+    np.testing.assert_array_equal(poses["rz"], finest.r[:, 0, 2])
+    np.testing.assert_array_equal(poses["p3"], finest.p[:, 0, 3])
+    assert poses["resolution"] == STEPS[-1]
+
+
+def test_poses_are_in_order_of_time_then_body():
+    from plumbline.judging.trajectory import pose_columns
+
+    r, p = np.arange(12.0).reshape(2, 2, 3), 100 + np.arange(16.0).reshape(2, 2, 4)
+    table = pose_columns(Trajectory(np.array([0.0, 1.0]), r, p, r, p, 1))
+    assert table["t"].tolist() == [0, 0, 1, 1] and table["body"].tolist() == [0, 1, 0, 1]
+    assert table["rx"].tolist() == [0, 3, 6, 9] and table["p0"].tolist() == [100, 104, 108, 112]
+    assert list(table)[2:] == ["rx", "ry", "rz", "p0", "p1", "p2", "p3"]

@@ -1,0 +1,232 @@
+"""Errors between two motions and the invariants of one, each against what it is by definition."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from plumbline.model.datatypes import Array, Model, Trajectory
+from plumbline.model.invariants import (
+    INVARIANT_UNITS,
+    angular_momentum,
+    attitude_error,
+    compute_invariants,
+    joint_vector_rates,
+    kinetic_energy,
+    position_error,
+    potential_energy,
+    work_of_loads,
+)
+from plumbline.model.kinematics import joint_vectors, quaternion_product, quaternion_rate, state_from_minimal
+from tests.helpers import newton_euler, pendulums
+from tests.helpers.random_chains import random_chain
+
+TIMES = np.linspace(0.0, 1.0, 41)
+
+
+def motion(rods: list[bool], times: Array = TIMES, **options: bool) -> tuple[Model, Trajectory]:
+    model, state = random_chain(np.random.default_rng(70), rods, **options)
+    return model, pendulums.motion(model, state, times)
+
+
+def test_position_error_is_the_largest_distance_of_a_body() -> None:
+    a = np.zeros((2, 3, 3))
+    b = a.copy()
+    b[0, 1], b[0, 2], b[1, 0] = [3, 0, 4], [1, 1, 1], [0, 0, -2]
+    assert position_error(a, b).tolist() == [5.0, 2.0]
+    assert position_error(b[0], a[0]) == 5.0
+
+
+@pytest.mark.parametrize("angle", [1e-9, 1e-3, 1.0, 3.0, np.pi])
+def test_attitude_error_is_the_largest_rotation_angle(angle: float) -> None:
+    rng = np.random.default_rng(71)
+    p = rng.normal(size=(4, 2, 4))
+    p /= np.linalg.norm(p, axis=-1, keepdims=True)
+    axis = np.array([2.0, -1.0, 2.0]) / 3
+    turn, less = (np.array([np.cos(x / 2), *(np.sin(x / 2) * axis)]) for x in (angle, angle / 2))
+    q = np.stack(
+        [
+            quaternion_product(p[:, 0], np.tile(less, (4, 1))),
+            quaternion_product(p[:, 1], np.tile(turn, (4, 1))),
+        ],
+        1,
+    )
+    q[1::2] *= -1  # the same attitude
+    assert attitude_error(p, q) == pytest.approx(np.full(4, angle), rel=1e-6)
+    assert attitude_error(p * 1.1, q * 0.7) == pytest.approx(np.full(4, angle), rel=1e-6)
+    assert attitude_error(p[1], q[1]) == pytest.approx(angle, rel=1e-6)
+    assert np.array_equal(attitude_error(p, -p), np.zeros(4))
+
+
+@pytest.mark.parametrize("rods", [[False], [True, False, True]], ids=str)
+def test_energies_and_momentum_are_sums_over_bodies(rods: list[bool]) -> None:
+    model, state = random_chain(np.random.default_rng(72), rods)
+    kinetic = kinetic_energy(model, state.v, state.omega)
+    assert kinetic == pytest.approx(newton_euler.kinetic(model, state), rel=1e-14)
+    assert potential_energy(model, state.r) == pytest.approx(newton_euler.potential(model, state), rel=1e-13)
+    momentum = angular_momentum(model, state.r, state.p, state.v, state.omega)
+    np.testing.assert_allclose(momentum, newton_euler.angular_momentum(model, state), rtol=0, atol=1e-14)
+    two = [np.stack([x, 2 * x]) for x in (state.v, state.omega)]
+    assert kinetic_energy(model, *two)[1] == pytest.approx(4 * kinetic, rel=1e-14)
+
+
+def run_with(model: Model, power: Array, times: Array) -> Trajectory:
+    """A run in which body 1 turns about x, so that a moment of 1 N m about it does this power."""
+    still = np.zeros((len(times), model.n, 3))
+    omega = still.copy()
+    omega[:, 0, 0] = power
+    p = np.tile([1.0, 0, 0, 0], (len(times), model.n, 1))
+    return Trajectory(times, still, p, still, quaternion_rate(p, omega), 1)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 4, 5])
+def test_work_of_a_moment_is_the_integral_of_its_power(degree: int) -> None:
+    """Exact to degree 5; up to 3 both splines are, and say so."""
+    model, _ = random_chain(np.random.default_rng(73), [False, False])
+    moment = np.zeros((2, 3))
+    moment[0, 0] = 1.0
+    times = np.linspace(0, 2, 25)
+    run = run_with(model, times**degree, times)
+    omega = 2 * run.pdot[..., 1:]
+    done, uncertainty = work_of_loads(replace(model, moment=moment), run, omega)
+    np.testing.assert_allclose(done, times ** (degree + 1) / (degree + 1), rtol=0, atol=1e-12)
+    assert (uncertainty < 1e-12) == (degree <= 3)
+    drag = replace(model, drag_moment=np.array([0.5, 0.0]))
+    lost, _ = work_of_loads(
+        drag, run_with(model, times**2, times), 2 * run_with(model, times**2, times).pdot[..., 1:]
+    )
+    np.testing.assert_allclose(lost, -0.5 * times**5 / 5, rtol=0, atol=1e-12)
+
+
+def test_work_of_a_force_needs_no_quadrature_and_drag_takes() -> None:
+    model, _ = random_chain(np.random.default_rng(74), [False, False])
+    rng = np.random.default_rng(74)
+    r = rng.normal(size=(25, 2, 3))
+    times, force = np.linspace(0, 2, 25), rng.normal(size=(2, 3))
+    v = np.zeros((25, 2, 3))
+    v[:, 1, 2] = times**2
+    p = np.tile([1.0, 0, 0, 0], (25, 2, 1))
+    run, still = Trajectory(times, r, p, v, 0 * p, 1), np.zeros((25, 2, 3))
+    done, uncertainty = work_of_loads(replace(model, force=force), run, still)
+    np.testing.assert_allclose(done, np.sum(force * (r - r[0]), axis=(1, 2)), rtol=0, atol=1e-14)
+    assert uncertainty == 0.0
+    lost, _ = work_of_loads(replace(model, drag_force=np.array([7.0, 3.0])), run, still)
+    np.testing.assert_allclose(lost, -3 * times**5 / 5, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("count, sharp", [(13, 1.0), (25, 0.2), (49, 1e-4)])
+def test_the_quadrature_knows_its_error(count: int, sharp: float) -> None:
+    """Of a power that few samples hardly resolve the work is uncertain by at least its error."""
+    model, _ = random_chain(np.random.default_rng(75), [False])
+    times = np.linspace(0, 2, count)
+    run = run_with(model, np.cos(9 * times), times)
+    done, uncertainty = work_of_loads(
+        replace(model, moment=np.array([[1.0, 0, 0]])), run, 2 * run.pdot[..., 1:]
+    )
+    error = float(np.max(np.abs(done - np.sin(9 * times) / 9)))
+    assert 0 < error <= uncertainty < sharp
+
+
+def test_too_few_samples_do_no_quadrature() -> None:
+    model, _ = random_chain(np.random.default_rng(76), [False])
+    times = np.linspace(0, 1, 12)
+    run = run_with(model, 1 + times, times)
+    done, uncertainty = work_of_loads(
+        replace(model, moment=np.array([[1.0, 0, 0]])), run, 2 * run.pdot[..., 1:]
+    )
+    assert not np.any(done) and uncertainty == 0.0
+
+
+@pytest.mark.parametrize("options", [{}, {"loads": True}, {"drag": True}], ids=str)
+@pytest.mark.parametrize("rods", [[False, False], [True, False], [True]], ids=str)
+def test_true_motion_has_no_drift(rods: list[bool], options: dict[str, bool]) -> None:
+    model, run = motion(rods, np.linspace(0, 1, 161), **options)
+    found = compute_invariants(model, run)
+    size = float(np.max(kinetic_energy(model, run.v, 2 * run.pdot[..., 1:]))) + 9.81
+    assert np.max(np.abs(found.energy_drift)) <= found.work_uncertainty + 1e-11 * size
+    assert found.energy_drift[0, 0, 0] == 0.0
+    assert (found.momentum_drift is None) == bool(options)
+    if found.momentum_drift is not None:
+        assert np.max(np.abs(found.momentum_drift)) < 1e-11 * size
+        assert found.momentum_drift.shape == (161, 1, 1)
+    for name, width in (("joint_gap", 3), ("gap_rate", 3), ("norm_drift", 1)):
+        series = getattr(found, name)
+        assert series.shape == (161, len(rods), width)
+        assert np.max(np.abs(series)) < 1e-13, name
+    assert set(INVARIANT_UNITS) <= set(vars(found))
+
+
+def test_a_gap_is_the_vector_of_a_ball_and_the_stretch_of_a_rod() -> None:
+    model, run = motion([False, True])
+    away, faster = np.array([1e-3, -2e-3, 3e-3]), np.array([4e-3, 1e-3, -2e-3])
+    moved = compute_invariants(model, replace(run, r=run.r + away, v=run.v + faster))
+    np.testing.assert_allclose(moved.joint_gap[:, 0], np.tile(away, (41, 1)), atol=1e-14)
+    np.testing.assert_allclose(moved.gap_rate[:, 0], np.tile(faster, (41, 1)), atol=1e-13)
+    assert np.max(np.abs(moved.joint_gap[:, 1])) < 1e-13, "the second body moved with the first"
+    r, v = run.r.copy(), run.v.copy()
+    r[:, 1, 0] += 1e-3
+    v[:, 1, 1] += 1e-3
+    down = replace(run, r=r, v=v)
+    stretched = compute_invariants(model, down)
+    d = lift_of_joint(model, run)
+    d[:, 0] += 1e-3
+    long = np.linalg.norm(d, axis=-1)
+    np.testing.assert_allclose(stretched.joint_gap[:, 1, 0], long - model.length[1], atol=1e-14)
+    rates = joint_vector_rates(
+        model, down, 2 * quaternion_product(run.p * [1, -1, -1, -1], run.pdot)[..., 1:]
+    )[:, 1]
+    np.testing.assert_allclose(stretched.gap_rate[:, 1, 0], np.sum(d * rates, -1) / long, atol=1e-13)
+    assert not np.any(stretched.joint_gap[:, 1, 1:]) and not np.any(stretched.gap_rate[:, 1, 1:])
+    assert np.max(np.abs(stretched.joint_gap[:, 1, 0])) > 1e-5
+
+
+def test_the_ends_of_a_rod_in_one_place_are_its_length_off() -> None:
+    model, _ = random_chain(np.random.default_rng(78), [True])
+    model = replace(model, proximal=np.zeros((1, 3)))
+    found = compute_invariants(model, run_with(model, TIMES, TIMES))
+    np.testing.assert_array_equal(found.joint_gap[:, 0, 0], -model.length[0])
+    assert not np.any(found.gap_rate), "a stretch has no direction there"
+
+
+def lift_of_joint(model: Model, run: Trajectory) -> Array:
+    """ℓ u (T, 3) of the second joint, from where it hangs to the second body's proximal point."""
+    found = []
+    for r, p in zip(run.r, run.p, strict=True):
+        still = np.zeros((2, 3))
+        hung = state_from_minimal(replace(model, length=np.zeros(2)), p, still, still, still).r
+        found.append(r[1] - hung[1] - (r[0] - hung[0]))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("rods", [[False], [True, False, True]], ids=str)
+def test_joint_rates_are_the_slopes_of_the_joint_vectors(rods: list[bool]) -> None:
+    """Off the manifold, where they are not zero: ṙ shifted by a constant moves r by it times t."""
+    model, run = motion(rods)
+    rng, h = np.random.default_rng(77), 1e-6
+    drift = rng.normal(size=(len(rods), 3))
+    omega = 2 * quaternion_product(run.p * [1, -1, -1, -1], run.pdot)[..., 1:]
+    rates = joint_vector_rates(model, replace(run, v=run.v + drift), omega)
+    ends = [joint_vectors(model, run.r + s * h * (run.v + drift), run.p + s * h * run.pdot) for s in (1, -1)]
+    np.testing.assert_allclose(rates, (ends[0] - ends[1]) / (2 * h), rtol=0, atol=1e-8)
+    assert np.max(np.abs(rates)) > 0.1
+
+
+def test_what_is_not_conserved_is_not_judged() -> None:
+    """Momentum about gravity: not with loads, drag or without gravity; energy by a shift, norm as it is."""
+    model, run = motion([False])
+    assert compute_invariants(replace(model, gravity=np.zeros(3)), run).momentum_drift is None
+    light, usual = (compute_invariants(replace(model, gravity=x * model.gravity), run) for x in (1e-2, 1))
+    np.testing.assert_allclose(light.momentum_drift, usual.momentum_drift, rtol=0, atol=1e-15)
+    assert compute_invariants(replace(model, force=np.ones((1, 3))), run).momentum_drift is None
+    assert compute_invariants(replace(model, drag_moment=np.ones(1)), run).momentum_drift is None
+    long = compute_invariants(model, replace(run, p=1.01 * run.p))
+    np.testing.assert_allclose(long.norm_drift, 0.01, atol=1e-13)
+    faster = replace(run, v=np.concatenate([run.v[:1], 2 * run.v[1:]]))
+    shifted = compute_invariants(model, faster)
+    extra = 1.5 * model.mass[0] * np.sum(run.v[1:, 0] ** 2, -1)
+    np.testing.assert_allclose(shifted.energy_drift[1:, 0, 0], extra, atol=1e-11)
+    about = model.mass[0] * np.cross(run.r[1:, 0], run.v[1:, 0]) @ [0, 0, -1.0]
+    assert shifted.momentum_drift is not None
+    np.testing.assert_allclose(shifted.momentum_drift[1:, 0, 0], about, atol=1e-11)

@@ -1,0 +1,130 @@
+"""Cells on a cluster started by dask's own command line: the same results, also when a machine is lost."""
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import psutil
+import pytest
+
+pytest.importorskip("distributed")
+
+from plumbline.execution.runner import Plan, run_plan
+from plumbline.processes.workers import Limits, Task
+from plumbline.scenario import loader
+
+ROOT = Path(__file__).resolve().parents[2]
+DASK = Path(sys.executable).with_name("dask")
+LOCAL = ("--host", "127.0.0.1")
+
+
+@contextlib.contextmanager
+def cluster(folder, workers):
+    """(address, processes of the workers) of a scheduler and workers here, their files in ``folder``."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    where = ["--scheduler-file", str(folder / "scheduler.json")]
+    started = []
+
+    def start(*command):
+        process = subprocess.Popen(
+            [str(DASK), *command],
+            cwd=folder,
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        started.append(process)
+        return process
+
+    try:
+        start(
+            "scheduler", *LOCAL, "--port", "0", "--no-dashboard", "--dashboard-address", "127.0.0.1:0", *where
+        )
+        machines = [
+            start(
+                "worker",
+                *LOCAL,
+                "--nthreads",
+                "1",
+                "--no-dashboard",
+                "--local-directory",
+                str(folder),
+                *where,
+            )
+            for _ in range(workers)
+        ]
+        from distributed import Client
+
+        deadline = time.monotonic() + 60
+        while not (folder / "scheduler.json").exists() and time.monotonic() < deadline:
+            time.sleep(0.1)
+        with Client(scheduler_file=str(folder / "scheduler.json"), timeout=60) as client:
+            client.wait_for_workers(workers, timeout=60)
+            yield client.scheduler.address, machines
+    finally:
+        family = [
+            c for p in started if p.poll() is None for c in psutil.Process(p.pid).children(recursive=True)
+        ]
+        for process in [*started, *family]:
+            with contextlib.suppress(psutil.NoSuchProcess, ProcessLookupError):
+                process.kill()
+        for process in started:
+            process.wait()
+
+
+def said(plan, progress=lambda *_: None):
+    return [replace(row, wall_time=0.0) for row in run_plan(plan, progress).rows]
+
+
+def plan(**more):
+    chosen = loader.load_scenarios(["rest", "conical", "double-tumbling-balls"])
+    return Plan(chosen, ["mujoco", "pinocchio"], "state", random_state_count=5, **more)
+
+
+@pytest.mark.timeout(300)
+def test_a_cluster_says_the_same_and_outlives_a_machine(tmp_path):
+    expected = said(plan())
+    with cluster(tmp_path, 2) as (address, machines):
+        assert said(plan(scheduler=address)) == expected
+
+        def lose_one(done, *_):
+            if done == 2:
+                victim = machines[0]
+                for process in [*psutil.Process(victim.pid).children(recursive=True), victim]:
+                    with contextlib.suppress(psutil.NoSuchProcess):
+                        os.kill(process.pid, signal.SIGKILL)
+
+        assert said(plan(scheduler=address), lose_one) == expected
+        assert machines[0].poll() is not None, "no machine was lost: the test tests nothing"
+        losses_cost_one_task(address)
+
+
+def losses_cost_one_task(address):
+    """A crash and a hang inside a dask worker lose their own task, and no dask worker."""
+    import ctypes
+    import operator
+
+    from plumbline.processes.dask_cluster import DaskCluster
+
+    limits = Limits(5, 4)
+    with DaskCluster(address, limits) as crew:
+        calls = {"a": (operator.mul, 2, 3), "crash": (ctypes.string_at, 0), "hang": (time.sleep, 600),
+                 "b": (operator.mul, 3, 3)}  # fmt: skip
+        tasks = [Task(key, call, tuple(arguments), limits) for key, (call, *arguments) in calls.items()]
+        found = {o.key: o for o in crew.run(tasks)}
+    assert (found["a"].value, found["b"].value) == (6, 9)
+    assert found["crash"].failure == "crashed: the worker died of SIGSEGV"
+    assert "hung" in found["hang"].failure
+
+
+def test_no_scheduler_is_told():
+    done = subprocess.run(
+        [sys.executable, "-m", "plumbline", "run", "rest", "--scheduler", "nonsense"],
+        cwd=ROOT, capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 2 and "nonsense" in done.stderr

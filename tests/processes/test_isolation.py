@@ -1,0 +1,69 @@
+"""A night over engines with every fault at once: each loses its own cell, named with its reason, no other."""
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import psutil
+
+from plumbline.cli.main import nightly
+from plumbline.engines import registry
+from plumbline.processes import workers
+from plumbline.processes.workers import Limits
+from plumbline.scenario import loader
+from plumbline.storage.history import History
+from tests.helpers import faulty_engines as faulty
+
+LIMITS = Limits(seconds=10, gigabytes=4)
+
+
+def night(out, engines):
+    (s,) = loader.load_scenarios(["planar-small"])
+    return nightly.nightly(
+        out, [replace(s, duration=0.5)], engines, random=0, seed=1, jobs=2, limits=LIMITS, whole=False,
+        command="-", finer=0, level="trajectory", progress=lambda *_: None, tell=lambda _: None,
+    )  # fmt: skip
+
+
+def said(rows, engine):
+    """What the rows of an engine say, without who says it and what it cost."""
+    return [
+        replace(row, engine="", wall_time=0.0)
+        for row in rows
+        if row.engine == engine and row.integrator != faulty.CELL
+    ]
+
+
+def test_every_fault_at_once_loses_exactly_its_own_cell(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(registry, "ENGINES", dict(registry.ENGINES))
+    monkeypatch.setattr(workers, "initialize_worker", faulty.prepare)
+    monkeypatch.chdir(tmp_path)
+    faulty.register()
+    names = [fault.__name__ for fault in faulty.FAULTS]
+    result, place = night(tmp_path / "out", ["mujoco", *names])
+    lost = {(row.engine, row.integrator): row.reason for row in result.rows if row.verdict == "failed"}
+    expected = {(f.__name__, faulty.CELL): words for f, words in faulty.FAULTS.items() if words}
+    assert lost.keys() == expected.keys(), {k: lost[k] for k in lost.keys() - expected.keys()}
+    for cell, words in expected.items():
+        assert words in lost[cell], cell
+    sound = said(result.rows, "mujoco")
+    euler = [row for row in sound if row.integrator == "Euler"]
+    for name in names:
+        assert said(result.rows, name) == euler, "a fault changed a cell beside it"
+    assert said(result.rows, "litter") and not [r for r in result.rows if r.verdict == "disagrees"]
+    # the night is whole, tells of it, and nothing of it is left elsewhere
+    stored = json.loads((place / "results.json").read_text())
+    assert stored["run"]["exit_code"] == 3 and len(stored["rows"]) == len(result.rows)
+    assert [n["id"] for n in History(tmp_path / "out").overview()] == [place.name]
+    assert [p.name for p in tmp_path.iterdir()] == ["out"], "an engine's file is in the working folder"
+    assert "noise" not in "".join(capfd.readouterr())
+    assert not [p for p in psutil.Process(os.getpid()).children(recursive=True) if works_here(p)]
+
+
+def works_here(process):
+    """Whether a process is a worker in a scratch folder."""
+    try:
+        return Path(process.cwd()).parent.name.startswith("plumbline-")
+    except psutil.Error:
+        return False

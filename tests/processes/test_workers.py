@@ -1,0 +1,187 @@
+"""Worker processes: every way to lose one costs one task, and says how."""
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import pytest
+
+from plumbline.processes.isolation import remove_orphaned_folders
+from plumbline.processes.workers import Limits, Task, WorkerPool
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def double(x: int) -> int:
+    return 2 * x
+
+
+def segfault() -> None:
+    ctypes.string_at(0)
+
+
+def abort() -> None:
+    os.abort()
+
+
+def hang() -> None:
+    time.sleep(600)
+
+
+def hang_with_the_lock() -> None:
+    """Native code that never returns and never lets go of the interpreter lock."""
+    ctypes.PyDLL(None).sleep(600)
+
+
+def devour() -> int:
+    return len(bytearray(64 * 2**30))
+
+
+def leave() -> None:
+    os._exit(7)
+
+
+def misbehave() -> str:
+    """Write a file into the working folder and flood both outputs, as engines do."""
+    Path("dropped.txt").write_text("x")
+    os.write(1, b"noise\n" * 10_000)
+    os.write(2, b"noise\n" * 10_000)
+    return os.getcwd()
+
+
+def pid() -> int:
+    return os.getpid()
+
+
+LOSSES = [
+    (segfault, "crashed: the worker died of SIGSEGV"),
+    (abort, "crashed: the worker died of SIGABRT"),
+    (leave, "crashed: the worker exited with code 7"),
+    (devour, "out of memory"),
+    (hang, "hung: no answer within"),
+    (hang_with_the_lock, "hung: no answer within"),
+]
+
+
+def test_each_loss_costs_one_task_and_says_so():
+    limits = Limits(seconds=5, gigabytes=4)
+    quick = Limits(seconds=2, gigabytes=4)
+    with WorkerPool(2, limits) as workers:
+        tasks = [Task(("fine", i), double, (i,), limits) for i in range(6)]
+        for k, (loss, _) in enumerate(LOSSES):
+            tasks.insert(2 * k, Task(("lost", k), loss, (), quick))
+        outcomes = {o.key: o for o in workers.run(tasks)}
+    assert [outcomes["fine", i].value for i in range(6)] == [2 * i for i in range(6)], outcomes
+    for k, (loss, words) in enumerate(LOSSES):
+        assert words in (outcomes["lost", k].failure or ""), loss.__name__
+
+
+def test_what_an_outcome_brings_up_runs_while_others_do():
+    """Where tasks say that there is none now, they are asked again after the next outcome."""
+    came = []
+
+    def tasks():
+        yield Task("long", nap, (4.0,))
+        yield Task("short", nap, (0.0,))
+        while "short" not in came:
+            yield None
+        yield Task("follows", nap, (0.0,))
+
+    with WorkerPool(2) as workers:
+        for outcome in workers.run(tasks()):
+            assert outcome.failure is None
+            came.append(outcome.key)
+    assert came == ["short", "follows", "long"]
+
+
+def test_files_and_output_of_an_engine_go_nowhere(capfd, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with WorkerPool(1) as workers:
+        (outcome,) = workers.run([Task("x", misbehave)])
+    assert outcome.value != str(tmp_path)
+    assert not Path(outcome.value).exists(), "the scratch folder is removed"
+    assert list(tmp_path.iterdir()) == []
+    assert "noise" not in "".join(capfd.readouterr())
+
+
+def nap(seconds: float) -> float:
+    time.sleep(seconds)
+    return seconds
+
+
+def test_a_clock_that_is_set_neither_kills_nor_spares(monkeypatch):
+    """By the clock of the wall the nap would be over its limit, and the hang within it for an hour."""
+    real, off = time.time, [0.0]
+    monkeypatch.setattr(time, "time", lambda: real() + off[0])
+    with WorkerPool(3) as workers:
+        list(workers.run([Task(k, nap, (1.0,)) for k in range(6)]))  # now all three are there
+        for step in (3600.0, -3600.0):
+            tasks = [
+                Task("nap", nap, (3.0,), Limits(seconds=60)),
+                Task("hang", hang, (), Limits(seconds=4)),
+                Task("go", nap, (1.0,)),
+            ]
+            found = {}
+            for outcome in workers.run(tasks):
+                if outcome.key == "go":
+                    off[0] += step  # while the others run
+                found[outcome.key] = outcome
+            assert found["nap"].value == 3.0
+            assert "hung" in (found["hang"].lost or "")
+
+
+def test_what_a_killed_run_leaves_is_removed_by_the_next(tmp_path, monkeypatch):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(tempfile, "tempdir", None)
+    script = (
+        "import time; from plumbline.processes.isolation import Scratch\n"
+        "mine = Scratch(); print(mine.path, flush=True); time.sleep(600)"
+    )
+    owners = [
+        subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, cwd=ROOT)
+        for _ in range(2)
+    ]
+    dead, alive = (Path(p.stdout.readline().strip()) for p in owners)
+    (dead / "deep").mkdir()
+    (dead / "deep" / "file").write_text("x")
+    (tmp_path / "plumbline-of-somebody").mkdir()  # none of ours: nobody locks it
+    owners[0].kill()
+    owners[0].wait()
+    assert dead.is_dir() and alive.is_dir(), "nobody has come by yet"
+    with WorkerPool(1) as workers:
+        mine = workers._scratch.path
+        assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith("plumbline-")) == sorted(
+            [alive.name, mine.name, "plumbline-of-somebody"]
+        )
+    owners[1].kill()
+    owners[1].wait()
+    assert not mine.exists() and remove_orphaned_folders("plumbline-") == [alive]
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the parent-death signal is Linux's")
+def test_no_orphan_is_left_when_the_parent_is_killed(tmp_path):
+    script = tmp_path / "parent.py"
+    script.write_text(
+        "import sys\n"
+        f"sys.path[:0] = {[str(Path(__file__).resolve().parents[2]), str(Path(__file__).parent)]!r}\n"
+        "from test_workers import hang, pid\n"
+        "from plumbline.processes.workers import Task, Workers\n"
+        "if __name__ == '__main__':\n"
+        "    with Workers(1) as workers:\n"
+        "        for outcome in workers.run([Task(0, pid), Task(1, hang)]):\n"
+        "            print(outcome.value, flush=True)\n"
+    )
+    parent = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    worker = int(parent.stdout.readline())
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    deadline = time.monotonic() + 20
+    while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not Path(f"/proc/{worker}").exists()

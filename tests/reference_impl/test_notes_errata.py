@@ -1,0 +1,308 @@
+"""What a reader of the notes must know, E1–E7 (E4, the drift, has a file of its own)."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from reference_impl import notes
+from reference_impl.chain import Chain
+from reference_impl.direct import DirectSystem, check_state_solvable, solve_dense
+from reference_impl.errors import SingularSystem
+from reference_impl.euler_parameters import I3, A, A_rate, L, dAs_dp, dot, euler_parameter_rate
+from reference_impl.integrate import integrate_dop853
+from reference_impl.joints import constraint_rows
+from tests.helpers.notes_test_data import Symbols, off_manifold, on_manifold, random_chain
+
+
+def hanging(rods, length=0.5, arm=0.3):
+    """Bodies at rest straight below each other, attachments on the body's z axis."""
+    n = len(rods)
+    zeros = np.zeros((n, 3))
+    chain = Chain(
+        mass=np.arange(1.0, n + 1),
+        inertia=np.broadcast_to(0.02 * np.diag([1.0, 1.2, 0.9]), (n, 3, 3)),
+        proximal=zeros + np.array([0, 0, arm]),
+        distal=zeros - np.array([0, 0, arm]),
+        length=np.where(rods, length, 0.0),
+        gravity=np.array([0, 0, -9.81]),
+        force=zeros,
+        moment=zeros,
+        drag_force=zeros[:, 0],
+        drag_moment=zeros[:, 0],
+    )
+    r = zeros.copy()
+    r[:, 2] = -np.cumsum(chain.length + 2 * arm) + arm
+    return chain, (r, np.tile([1.0, 0, 0, 0], (n, 1)), zeros, np.zeros((n, 4)))
+
+
+# --- E1 -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_E1_printed_with_length_0_is_singular_and_names_the_body(n):
+    """Read literally, d = 0: C_r = 0, and C_p, 0 for dᵀd, is by E2 a multiple of pᵀ: the normalisation row.
+
+    The printed form reads every joint as a rod.
+    """
+    chain, state = hanging([False] * n)
+    S, b = notes.assemble_system(chain, *state)
+    rows_C, rows_E = S[7 * n : 8 * n], S[8 * n :]
+    np.testing.assert_allclose(rows_C[:, : 3 * n], 0, atol=1e-15)
+    assert np.linalg.matrix_rank(np.concatenate([rows_C, rows_E])) == n
+    with pytest.raises(SingularSystem, match="singular"):
+        solve_dense(S, b)
+    with pytest.raises(SingularSystem, match=r"rod above body 1 has length 0.*E1.*ball"):
+        notes.solve_printed(chain, *state)
+
+
+def test_E1_a_rod_whose_ends_meet_is_singular_in_the_general_form_too():
+    """Also where rounding leaves 1e-17 of d, which would otherwise be solved as a direction."""
+    rng = np.random.default_rng(0)
+    chain = random_chain(rng, [False, False, False])
+    r, p, v, pdot = on_manifold(chain, rng)
+    rod = dataclasses.replace(chain, length=np.array([0, 0, 0.4]))
+    d = constraint_rows(rod, r, p, v, pdot).d[2]
+    assert np.linalg.norm(d) < 1e-15
+    with pytest.raises(SingularSystem, match="rod above body 3 has length 0"):
+        DirectSystem(rod).solve(r, p, v, pdot)
+
+
+def test_E1_the_length_changes_neither_jacobians_nor_gamma():
+    rng = np.random.default_rng(1)
+    chain = random_chain(rng, [True, True])
+    state = on_manifold(chain, rng)
+    longer = dataclasses.replace(chain, length=chain.length + 1)
+    one, other = (DirectSystem(c).assemble(*state) for c in (chain, longer))
+    np.testing.assert_array_equal(one[0], other[0])
+    np.testing.assert_array_equal(one[1], other[1])
+
+
+def test_E1_the_ball_is_the_limit_of_the_rod():
+    """A rod that starts along the ball's reaction swings about it ever less: positions differ by O(ℓ)."""
+    rng = np.random.default_rng(2)
+    ball = random_chain(rng, [False], loads=False)
+    r, p, v, pdot = on_manifold(ball, rng)
+    times = np.linspace(0, 0.5, 6)
+    truth = integrate_dop853(ball, r, p, v, pdot, times, 1e-10)
+    pull = DirectSystem(ball).solve(r, p, v, pdot).joint_reaction
+    direction = -pull / np.linalg.norm(pull)
+    errors = []
+    for length in (1e-2, 1e-3, 1e-4):
+        rod = dataclasses.replace(ball, length=np.array([length]))
+        run = integrate_dop853(rod, r + length * direction, p, v, pdot, times, 1e-10)
+        errors.append(np.max(np.abs(run.r - truth.r)))
+    assert errors[0] < 0.1 and errors[1] < 0.2 * errors[0] and errors[2] < 0.2 * errors[1], errors
+
+
+# --- E2, E3 ---------------------------------------------------------------------------------------------
+
+
+def test_E2_changes_only_the_norm_multiplier():
+    """With dᵀd's own derivatives C_p differs by a multiple of pᵀ: r̈, p̈, λ are the same, λ_E is not."""
+    rng = np.random.default_rng(3)
+    chain = random_chain(rng, [True])
+    r, p, v, pdot = on_manifold(chain, rng)
+    s, h = chain.proximal[0], 1e-30
+
+    def jacobian(r, p):
+        d = r + A(p) @ s
+        return np.concatenate([2 * d, 2 * d @ dAs_dp(p, s)])
+
+    S, b = DirectSystem(chain).assemble(r, p, v, pdot)
+    x = solve_dense(S, b)
+    row = jacobian(r[0], p[0])
+    difference = row[3:] - S[7, 3:7]
+    along = dot(difference, p[0])
+    assert abs(along) > 0.01
+    np.testing.assert_allclose(difference, along * p[0], atol=1e-15)
+    S[7, :7] = S[:7, 7] = row
+    b[7] = -(jacobian(r[0] + 1j * h * v[0], p[0] + 1j * h * pdot[0]).imag / h) @ np.concatenate(
+        [v[0], pdot[0]]
+    )
+    y = solve_dense(S, b)
+    np.testing.assert_allclose(y[:8], x[:8], rtol=0, atol=1e-13)
+    assert abs(y[8] - x[8]) > 1e-3
+
+
+def test_E2_off_the_sphere_is_another_constraint():
+    """The notes' C minus dᵀd − ℓ² is s₁ᵀs₁ − s₁ᵀAᵀA s₁: 0 where pᵀp = 1 only."""
+    rng = np.random.default_rng(4)
+    chain = random_chain(rng, [True])
+    for states, off in ((on_manifold, False), (off_manifold, True)):
+        r, p, v, pdot = states(chain, rng)
+        joints = constraint_rows(chain, r, p, v, pdot)
+        turned = A(p[0]) @ chain.proximal[0]
+        difference = joints.C[0] - (dot(joints.d, joints.d)[0] - chain.length[0] ** 2)
+        np.testing.assert_allclose(
+            difference, dot(chain.proximal, chain.proximal)[0] - turned @ turned, atol=1e-15
+        )
+        assert (abs(difference) > 1e-3) == off
+
+
+def test_E3_is_exact_for_a_chain():
+    """γ_true − γ = −d_t(C) rows with 2 (pᵀṗ) I added to every Ȧ, the single one −4 (s₁ᵀṙ)(pᵀṗ)."""
+    rng = np.random.default_rng(5)
+    chain = random_chain(rng, [True, True, True])
+    r, p, v, pdot = off_manifold(chain, rng)
+    h = 1e-30
+    joints = constraint_rows(chain, r, p, v, pdot)
+    moved = constraint_rows(chain, r + 1j * h * v, p + 1j * h * pdot, v.astype(complex), pdot.astype(complex))
+    missing = -moved.constraint_rate(v, pdot).imag / h - joints.gamma
+    np.testing.assert_allclose(missing[0], -4 * (chain.proximal[0] @ v[0]) * (p[0] @ pdot[0]), atol=1e-13)
+    for k in (1, 2):
+        near, far = dot(p[k], pdot[k]) * chain.proximal[k], dot(p[k - 1], pdot[k - 1]) * chain.distal[k - 1]
+        near_rate, far_rate = (
+            dAs_dp(p[k], chain.proximal[k]) @ pdot[k],
+            dAs_dp(p[k - 1], chain.distal[k - 1]) @ pdot[k - 1],
+        )
+        expected = -4 * (v[k] - v[k - 1]) @ (near - far) + 4 * (far @ near_rate + near @ far_rate)
+        np.testing.assert_allclose(missing[k], expected, atol=1e-13)
+    assert np.all(np.abs(missing) > 1e-3)
+    x = Symbols(bodies=1, attachments=1)
+    assert x.zero(x.rate(A(x.p[0])) - A_rate(x.p[0], x.pdot[0]) - I3 * (2 * (x.p[0] @ x.pdot[0])))
+
+
+# --- E5 -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rods", [[True], [False], [True, True], [True, False, True]], ids=str)
+def test_E5_multipliers_at_rest_carry_the_weight(rods):
+    """Tension 2 ℓ λ and the reaction are the weight hanging below; λ of a ball is minus the reaction."""
+    chain, state = hanging(rods)
+    x = DirectSystem(chain).solve(*state)
+    weight = np.cumsum(chain.mass[::-1])[::-1] * 9.81
+    np.testing.assert_allclose(x.acceleration, 0, atol=1e-13)
+    np.testing.assert_allclose(x.joint_reaction, weight[:, None] * [0, 0, 1], atol=1e-12)
+    for k, rod in enumerate(rods):
+        multiplier = x.multiplier[x.joint == k]
+        if rod:
+            np.testing.assert_allclose(x.tension[k], weight[k], rtol=1e-13)
+            np.testing.assert_allclose(multiplier, weight[k] / (2 * chain.length[k]), rtol=1e-13)
+        else:
+            assert np.isnan(x.tension[k])
+            np.testing.assert_allclose(multiplier, -x.joint_reaction[k], atol=0)
+
+
+def test_E5_the_reaction_of_a_rod_is_minus_2_lambda_d():
+    rng = np.random.default_rng(6)
+    chain = random_chain(rng, [True, True])
+    state = on_manifold(chain, rng)
+    x, d = DirectSystem(chain).solve(*state), constraint_rows(chain, *state).d
+    np.testing.assert_allclose(x.joint_reaction, -2 * x.multiplier[:, None] * d, atol=1e-14)
+    np.testing.assert_allclose(np.abs(x.tension), np.linalg.norm(x.joint_reaction, axis=1), rtol=1e-14)
+
+
+# --- E7 -------------------------------------------------------------------------------------------------
+
+
+def test_E7_rank_three_without_the_normalisation_row():
+    rng = np.random.default_rng(7)
+    chain = random_chain(rng, [True])
+    r, p, v, pdot = on_manifold(chain, rng)
+    block = 4 * L(p[0]).T @ chain.inertia[0] @ L(p[0])
+    assert np.linalg.matrix_rank(block) == 3
+    np.testing.assert_allclose(block @ p[0], 0, atol=1e-15)
+    S, b = DirectSystem(chain).assemble(r, p, v, pdot)
+    assert np.linalg.matrix_rank(S) == 9
+    # Hung at its centre of mass C_p = 0, so nothing but the normalisation row holds the kernel along p.
+    loose = dataclasses.replace(chain, proximal=np.zeros((1, 3)))
+    S, b = DirectSystem(loose).assemble(r, p, v, pdot)
+    assert np.linalg.matrix_rank(S[:8, :8]) == 7
+    with pytest.raises(SingularSystem):
+        solve_dense(S[:8, :8], b[:8])
+
+
+@pytest.mark.parametrize("rods", [[True, True], [False, False], [True, False]], ids=str)
+def test_E7_p_zero_names_the_body(rods):
+    rng = np.random.default_rng(8)
+    chain = random_chain(rng, rods)
+    r, p, v, pdot = on_manifold(chain, rng)
+    p[1] = 0
+    with pytest.raises(SingularSystem, match=r"p of body 2 is 0.*E7"):
+        DirectSystem(chain).solve(r, p, v, pdot)
+
+
+def test_E7_singular_inertia_names_the_body():
+    """No inertia about the axis through the attachments: a spin about it meets no resistance."""
+    chain, state = hanging([False, True])
+    inertia = chain.inertia.copy()
+    inertia[1, 2, 2] = 0
+    with pytest.raises(SingularSystem, match=r"inertia of body 2 is singular.*E7"):
+        DirectSystem(dataclasses.replace(chain, inertia=inertia)).solve(*state)
+    with pytest.raises(SingularSystem, match=r"inertia of body 2 is singular.*E7"):
+        integrate_dop853(dataclasses.replace(chain, inertia=inertia), *state, np.array([0.0, 1.0]), 1e-6)
+
+
+def test_E1_a_rod_is_as_short_as_its_own_surroundings_allow():
+    """A rod of 1e-9 m is a direction beside bodies of decimetres, and rounding 1e7 m from the pivot."""
+    rng = np.random.default_rng(16)
+    chain = random_chain(rng, [True, True])
+    r, p, *_ = on_manifold(chain, rng)
+    far = np.array([[0, 0, 0], [1e7, 0, 0]])
+    d, entries = 1e-9 * np.eye(3)[:2], (np.ones(1),)
+    check_state_solvable(chain, r, p, d, chain.rods, entries)
+    with pytest.raises(SingularSystem, match="rod above body 2 has length 0"):
+        check_state_solvable(chain, r + far, p, d, chain.rods, entries)
+    with pytest.raises(SingularSystem, match="rod above body 1 has length 0"):
+        check_state_solvable(chain, r + far[::-1], p, d, chain.rods, entries)
+
+
+@pytest.mark.parametrize("heavy", [1.0, 1e6, 1e-6])
+def test_E7_an_inertia_is_flat_beside_its_own_size(heavy):
+    """A stick along a slanting axis has a least principal value of rounding, in any unit."""
+    chain, state = hanging([False, True])
+    turn = np.linalg.qr(np.random.default_rng(15).normal(size=(3, 3)))[0]
+    inertia, proximal = heavy * chain.inertia, chain.proximal.copy()
+    stick = turn @ np.diag([0.02, 0.02, 0]) @ turn.T
+    inertia[1], proximal[1] = heavy * (stick + stick.T) / 2, 0.3 * turn[:, 2]
+    flat = dataclasses.replace(chain, mass=heavy * chain.mass, inertia=inertia, proximal=proximal)
+    with pytest.raises(SingularSystem, match=r"inertia of body 2 is singular.*E7"):
+        DirectSystem(flat).solve(*state)
+
+
+def test_a_singular_inertia_that_the_joint_makes_good_is_solved():
+    """J of a thin stick hung off its axis: S is regular, and its solution is the limit of thicker sticks."""
+    rng = np.random.default_rng(9)
+    chain = random_chain(rng, [False], loads=False)
+    state = on_manifold(chain, rng)
+    answers = []
+    for thin in (1e-6, 0.0):
+        stick = dataclasses.replace(chain, inertia=0.05 * np.diag([1.0, 1.0, thin])[None])
+        answers.append(DirectSystem(stick).solve(*state).acceleration)
+    np.testing.assert_allclose(answers[0], answers[1], atol=1e-3)
+
+
+def test_no_mass_names_the_body():
+    chain, state = hanging([True, True])
+    massless = dataclasses.replace(chain, mass=np.array([1.0, 0.0]), inertia=0 * chain.inertia)
+    with pytest.raises(SingularSystem, match="mass of body 2 is 0"):
+        DirectSystem(massless).solve(*state)
+
+
+@pytest.mark.parametrize(
+    ("part", "value", "message"),
+    [(0, np.nan, "body 2"), (1, np.inf, "body 2"), (2, np.nan, "rate"), (3, np.inf, "rate")],
+)
+def test_what_is_not_finite_is_named(part, value, message):
+    chain, state = hanging([True, False])
+    state = [x.copy() for x in state]
+    state[part][1, 1] = value
+    with pytest.raises(SingularSystem, match=rf"{message}.*not finite"):
+        DirectSystem(chain).solve(*state)
+
+
+def test_the_pendulum_of_the_notes_is_regular():
+    """S has its 9 and 18 rows and full rank on rods of ℓ > 0 (E7), s₁ on a body axis included."""
+    rng = np.random.default_rng(10)
+    for n in (1, 2):
+        chain = random_chain(rng, [True] * n)
+        chain = dataclasses.replace(chain, proximal=np.array([[-0.4, 0, 0]] * n))
+        state = on_manifold(chain, rng)
+        S, _ = notes.assemble_system(chain, *state)
+        assert S.shape == (9 * n, 9 * n) and np.linalg.matrix_rank(S) == 9 * n
+        x = DirectSystem(chain).solve(*state)
+        np.testing.assert_allclose(
+            notes.solve_printed(chain, *state)[: 3 * n], x.acceleration.ravel(), atol=1e-12
+        )
+        assert np.all(euler_parameter_rate(state[1], np.zeros((n, 3))) == 0)

@@ -1,0 +1,336 @@
+"""The structured form against the direct form it stands in for, on and off the manifold."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from adapters.reference_engine import notes_chain
+from plumbline.model.kinematics import quaternion_rate, state_from_minimal
+from plumbline.truth.rounding_bound import state_rounding_bound
+from reference_impl.chain import Chain
+from reference_impl.direct import EPS, DirectSystem, Solution
+from reference_impl.errors import SingularSystem
+from reference_impl.euler_parameters import L
+from reference_impl.joints import constraint_rows
+from reference_impl.structured import StructuredSystem, component_first
+from tests.helpers.random_chains import norms, random_chain, rescaled
+
+MIXES = {
+    "balls": lambda rng, n: [False] * n,
+    "rods": lambda rng, n: [True] * n,
+    "mixed": lambda rng, n: list(rng.random(n) < 0.5),
+}
+KINDS = pytest.mark.parametrize("mix", MIXES)
+
+
+def parts(solution: Solution, forest: StructuredSystem) -> list[Solution]:
+    """The forest's answer chain by chain."""
+    out = []
+    for index, one in enumerate(forest.chains):
+        mine = (solution.joint >= forest.first_body[index]) & (solution.joint < forest.first_body[index + 1])
+        body = slice(forest.first_body[index], forest.first_body[index + 1])
+        out.append(
+            Solution(
+                acceleration=solution.acceleration[body],
+                pddot=solution.pddot[body],
+                multiplier=solution.multiplier[mine],
+                norm_multiplier=solution.norm_multiplier[body],
+                joint=solution.joint[mine] - forest.first_body[index],
+                tension=solution.tension[body],
+                joint_reaction=solution.joint_reaction[body],
+            )
+        )
+        assert len(out[-1].pddot) == one.n
+    return out
+
+
+@KINDS
+def test_equals_the_direct_form_within_the_derived_bound(mix: str) -> None:
+    rng = np.random.default_rng(20)
+    for _ in range(12):
+        drawn = [
+            random_chain(rng, MIXES[mix](rng, n), decades=1.0, loads=True, drag=True)
+            for n in rng.integers(1, 11, size=4)
+        ]
+        forest = StructuredSystem([notes_chain(model) for model, _ in drawn])
+        held = [np.concatenate([getattr(state, name) for _, state in drawn]) for name in ("r", "p", "v")]
+        pdot = np.concatenate([quaternion_rate(state.p, state.omega) for _, state in drawn])
+        together = parts(forest.solve(*held, pdot), forest)
+        for (model, state), ours in zip(drawn, together, strict=True):
+            direct = DirectSystem(notes_chain(model)).solve(
+                state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+            )
+            bound = state_rounding_bound(model, state)
+            turned = [2 * (L(state.p) @ x.pddot[..., None])[..., 0] for x in (ours, direct)]
+            for ours_, direct_, allowed in (
+                (ours.acceleration, direct.acceleration, bound.acceleration),
+                (turned[0], turned[1], bound.angular_acceleration),
+                (ours.joint_reaction, direct.joint_reaction, bound.joint_reaction),
+            ):
+                assert np.all(np.linalg.norm(ours_ - direct_, axis=-1) <= allowed)
+
+
+@KINDS
+@pytest.mark.parametrize("off", [0.0, 0.05, 1.0])
+def test_all_unknowns_equal_the_direct_forms_on_and_off_the_manifold(mix: str, off: float) -> None:
+    """r, p and the rates anywhere: the printed rows' own behaviour (E2, E3) is part of what is equal.
+
+    Off the manifold there is no derived bound.  Masses within a factor 10 and rods of 0.2 m and more keep
+    the equilibrated S at condition 1e4 … 1e5 for these chains, so 1e-11 of the largest entry is rounding;
+    a term of E2 or E3 left out shows at ``off``, nine orders above.
+    """
+    rng = np.random.default_rng(21)
+    for _ in range(12):
+        drawn = [random_chain(rng, MIXES[mix](rng, n), 0.5, loads=True, drag=True) for n in (1, 2, 2, 5, 8)]
+        forest = StructuredSystem([notes_chain(model) for model, _ in drawn])
+        r, p, v = (np.concatenate([getattr(s, name) for _, s in drawn]) for name in ("r", "p", "v"))
+        pdot = np.concatenate([quaternion_rate(s.p, s.omega) for _, s in drawn])
+        r, p, v, pdot = (x + off * rng.normal(size=x.shape) for x in (r, p, v, pdot))
+        for index, ours in enumerate(parts(forest.solve(r, p, v, pdot), forest)):
+            body = slice(forest.first_body[index], forest.first_body[index + 1])
+            direct = DirectSystem(forest.chains[index]).solve(r[body], p[body], v[body], pdot[body])
+            for name in (
+                "acceleration",
+                "pddot",
+                "multiplier",
+                "norm_multiplier",
+                "joint_reaction",
+                "tension",
+            ):
+                a, b = getattr(ours, name), getattr(direct, name)
+                assert np.array_equal(np.isnan(a), np.isnan(b))
+                scale = np.max(np.abs(b), initial=1.0, where=~np.isnan(b))
+                assert np.nanmax(np.abs(a - b), initial=0.0) <= 1e-11 * scale, name
+
+
+def test_a_batch_is_more_chains() -> None:
+    """A chain's answer does not depend on its neighbours in the forest, to the last bit of a sum."""
+    rng = np.random.default_rng(22)
+    model, state = random_chain(rng, [True, False, True])
+    other, elsewhere = random_chain(rng, [False, False])
+    alone = StructuredSystem([notes_chain(model)])
+    q, v = component_first(state.r, state.p), component_first(state.v, quaternion_rate(state.p, state.omega))
+    q2, v2 = (
+        component_first(elsewhere.r, elsewhere.p),
+        component_first(elsewhere.v, quaternion_rate(elsewhere.p, elsewhere.omega)),
+    )
+    answer = alone.acceleration(q, v)
+    both = StructuredSystem([notes_chain(other), notes_chain(model)]).acceleration(
+        np.hstack([q2, q]), np.hstack([v2, v])
+    )
+    tiled = alone.repeated(3).acceleration(np.tile(q, 3), np.tile(v, 3))
+    scale = np.max(np.abs(answer))
+    assert np.max(np.abs(both[:, 2:] - answer)) <= 1e-13 * scale
+    assert np.max(np.abs(tiled - np.tile(answer, 3))) <= 1e-13 * scale
+
+
+@KINDS
+def test_singular_configurations_are_reported(mix: str) -> None:
+    rng = np.random.default_rng(23)
+    model, state = random_chain(rng, MIXES[mix](rng, 4))
+    forest, pdot = StructuredSystem([notes_chain(model)]), quaternion_rate(state.p, state.omega)
+    zero = state.p.copy()
+    zero[2] = 0
+    with pytest.raises(SingularSystem, match=r"p of body 3"):
+        forest.solve(state.r, zero, state.v, pdot)
+    nan = state.r.copy()
+    nan[1] = np.nan
+    with pytest.raises(SingularSystem, match=r"body 2"):
+        forest.solve(nan, state.p, state.v, pdot)
+    for change, words in (
+        ({"mass": model.mass * [1, 0, 1, 1]}, r"mass of body 2 is 0\.0 kg"),
+        ({"inertia": model.inertia * np.array([1, 1, 1, 0])[:, None, None]}, "inertia of body 4"),
+    ):
+        with pytest.raises(SingularSystem, match=words):
+            StructuredSystem([notes_chain(replace(model, **change))])
+
+
+def test_a_rod_of_length_zero_is_singular() -> None:
+    """Read literally, C = dᵀd on a ball joint has no gradient (E1)."""
+    rng = np.random.default_rng(24)
+    model, state = random_chain(rng, [False, False, True])
+    literal: Chain = notes_chain(replace(model, length=np.array([0.0, 0.0, 0.4])))
+    gap = state.u[2] * model.length[2]
+    r = state.r.copy()
+    r[2] -= gap
+    with pytest.raises(SingularSystem, match="rod above body 3 has length 0"):
+        StructuredSystem([literal]).solve(r, state.p, state.v, quaternion_rate(state.p, state.omega))
+
+
+@KINDS
+def test_constraints_are_gaps_of_balls_and_squares_of_rods(mix: str) -> None:
+    """C and its rate along (ṙ, ṗ), where joints are open and p is a unit quaternion; a rod has one row."""
+    rng = np.random.default_rng(25)
+    rods = {"balls": [False] * 5, "rods": [True] * 5, "mixed": [True, False, True, True, False]}[mix]
+    model, state = random_chain(rng, rods)
+    r, v = state.r + 0.1 * rng.normal(size=(5, 3)), state.v + 0.1 * rng.normal(size=(5, 3))
+    pdot, one = quaternion_rate(state.p, state.omega), notes_chain(model)
+    forest, direct = StructuredSystem([one]), constraint_rows(one, r, state.p, v, pdot)
+    found = forest.constraints(component_first(r, state.p), component_first(v, pdot))
+    for ours, theirs in zip(found, (direct.C, direct.constraint_rate(v, pdot)), strict=True):
+        assert ours.shape == (1 if mix == "rods" else 3, 5)
+        kept = np.array([[row == 0 or not rod for row in range(len(ours))] for rod in one.rods])
+        np.testing.assert_allclose(ours.T[kept], theirs, rtol=0, atol=1e-13)
+        assert not np.any(ours.T[~kept])
+
+
+@pytest.mark.parametrize("at, words", [(0, "body 1"), (3, "body 2"), (6, "body 2")])
+def test_a_cause_is_named_by_the_body_of_its_own_chain(at: int, words: str) -> None:
+    """Chains of 2, 3 and 2 bodies; the bodies of all are counted from 0."""
+    rng = np.random.default_rng(26)
+    drawn = [random_chain(rng, [False] * n) for n in (2, 3, 2)]
+    r, p, v = (np.concatenate([getattr(s, name) for _, s in drawn]) for name in ("r", "p", "v"))
+    pdot = np.concatenate([quaternion_rate(s.p, s.omega) for _, s in drawn])
+    forest = StructuredSystem([notes_chain(model) for model, _ in drawn])
+    for broken, what in ((p, 0.0), (r, np.nan)):
+        kept = broken[at].copy()
+        broken[at] = what
+        with pytest.raises(SingularSystem, match=words):
+            forest.solve(r, p, v, pdot)
+        broken[at] = kept
+
+
+@KINDS
+@pytest.mark.parametrize("a", [0.5, 8.0])
+def test_baumgarte_adds_2a_and_a_squared_to_every_constraint(mix: str, a: float) -> None:
+    """C̈ + 2 a Ċ + a² C = 0 of joints that are open, and of pᵀp − 1."""
+    rng = np.random.default_rng(27)
+    model, state = random_chain(rng, MIXES[mix](rng, 4), loads=True, drag=True)
+    forest, pdot, h = StructuredSystem([notes_chain(model)]), quaternion_rate(state.p, state.omega), 1e-6
+    q, v = component_first(state.r, state.p), component_first(state.v, pdot)
+    q[:3] += 0.1 * rng.normal(size=(3, 4))
+    v[:3] += 0.1 * rng.normal(size=(3, 4))
+    acceleration = forest.acceleration(q, v, a)
+    np.testing.assert_array_equal(forest.acceleration(q, v), forest.acceleration(q, v, 0.0))
+    assert np.any(forest.acceleration(q, v) != acceleration)
+    C, C_rate = forest.constraints(q, v)
+    ends = [forest.constraints(q + s * h * v, v + s * h * acceleration)[1] for s in (1, -1)]
+    second = (ends[0] - ends[1]) / (2 * h)
+    np.testing.assert_allclose(second, -2 * a * C_rate - a * a * C, rtol=0, atol=1e-6 * (1 + a * a))
+    q[3:], v[3:] = 1.1 * q[3:], v[3:] + 0.1 * q[3:]
+    p, p_rate, p_second = q[3:], v[3:], forest.acceleration(q, v, a)[3:]
+    E, E_rate = np.sum(p * p, 0) - 1, 2 * np.sum(p * p_rate, 0)
+    E_second = 2 * np.sum(p_rate * p_rate + p * p_second, 0)
+    np.testing.assert_allclose(E_second, -2 * a * E_rate - a * a * E, rtol=0, atol=1e-11 * (1 + a * a))
+
+
+@KINDS
+def test_a_pendulum_of_any_size_is_solved_alike(mix: str) -> None:
+    """Micrometres and milligrams, kilometres and kilotons: no threshold has a unit."""
+    rng = np.random.default_rng(28)
+    model, state = random_chain(rng, MIXES[mix](rng, 3), loads=True, drag=True)
+    here = StructuredSystem([notes_chain(model)]).solve(
+        state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+    )
+    allowed = state_rounding_bound(model, state)
+    for length, mass, second in ((1e-6, 1e-9, 1e-3), (1e3, 1e6, 1e2), (1.0, 1e15, 1.0)):
+        small, at = rescaled(model, state, length, mass, second)
+        there = StructuredSystem([notes_chain(small)]).solve(
+            at.r, at.p, at.v, quaternion_rate(at.p, at.omega)
+        )
+        for name, unit, bound in (
+            ("acceleration", length / second**2, allowed.acceleration),
+            ("pddot", 1 / second**2, allowed.angular_acceleration / 2),
+            ("joint_reaction", mass * length / second**2, allowed.joint_reaction),
+        ):
+            assert np.all(norms(getattr(there, name) / unit - getattr(here, name)) <= 2 * bound), name
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e6, 1e-6])
+def test_a_collapsed_rod_is_one_of_its_own_rounding(scale: float) -> None:
+    model, state = random_chain(np.random.default_rng(24), [False, False, True])
+    model, state = rescaled(model, state, scale, 1.0, 1.0)
+    r = state.r.copy()
+    r[2] -= state.u[2] * model.length[2]
+    with pytest.raises(SingularSystem, match="rod above body 3 has length 0"):
+        StructuredSystem([notes_chain(model)]).solve(
+            r, state.p, state.v, quaternion_rate(state.p, state.omega)
+        )
+
+
+def test_a_rod_short_beside_another_chain_s_is_no_collapsed_one() -> None:
+    rng = np.random.default_rng(24)
+    small, large = (rescaled(*random_chain(rng, [True]), scale, 1.0, 1.0) for scale in (1e-6, 1e12))
+    models, states = zip(small, large, strict=True)
+    r, p, v, omega = (np.concatenate([getattr(s, k) for s in states]) for k in ("r", "p", "v", "omega"))
+    both = StructuredSystem([notes_chain(model) for model in models]).solve(
+        r, p, v, quaternion_rate(p, omega)
+    )
+    model, at = small
+    alone = StructuredSystem([notes_chain(model)]).solve(at.r, at.p, at.v, quaternion_rate(at.p, at.omega))
+    np.testing.assert_allclose(both.acceleration[:1], alone.acceleration, rtol=64 * EPS, atol=0)
+
+
+def test_a_collapsed_rod_on_a_body_that_is_not_turned_is_named_too() -> None:
+    model, state = random_chain(np.random.default_rng(24), [True])
+    at = state_from_minimal(model, np.array([[1.0, 0, 0, 0]]), state.omega, state.u, state.udot)
+    with pytest.raises(SingularSystem, match="rod above body 1 has length 0"):
+        r = at.r - at.u * model.length
+        StructuredSystem([notes_chain(model)]).solve(r, at.p, at.v, quaternion_rate(at.p, at.omega))
+
+
+def test_what_is_lost_to_rounding_or_overflow_is_told() -> None:
+    """Bodies of 1 and 1e20 kg hold each other by rows that double precision cannot tell apart."""
+    model, state = random_chain(np.random.default_rng(24), [False] * 3)
+    heavy = np.array([1.0, 1e20, 1.0])
+    uneven = replace(model, mass=heavy * model.mass, inertia=heavy[:, None, None] * model.inertia)
+    pdot = quaternion_rate(state.p, state.omega)
+    with pytest.raises(SingularSystem, match="joint rows are not independent"):
+        StructuredSystem([notes_chain(uneven)]).solve(state.r, state.p, state.v, pdot)
+    forest, fast = StructuredSystem([notes_chain(model)]), pdot.copy()
+    fast[1, 2] = np.inf
+    with pytest.raises(SingularSystem, match="a rate or a load is not finite"), np.errstate(all="ignore"):
+        forest.acceleration(component_first(state.r, state.p), component_first(state.v, fast))
+
+
+def test_the_copies_of_a_tiled_forest_have_names_too() -> None:
+    model, state = random_chain(np.random.default_rng(29), [False, False, False])
+    forest = StructuredSystem([notes_chain(model)]).repeated(2)
+    q, v = component_first(state.r, state.p), component_first(state.v, quaternion_rate(state.p, state.omega))
+    q, v = np.tile(q, 2), np.tile(v, 2)
+    q[3:, 4] = 0.0
+    with pytest.raises(SingularSystem, match="p of body 2"):
+        forest.acceleration(q, v)
+    assert forest.first_body.tolist() == [0, 3, 6]
+
+
+def test_a_body_without_thickness_is_named_beside_a_tiny_one() -> None:
+    """A needle has no inertia about its axis; a body of 1e-20 kg m² has, however small."""
+    model, _ = random_chain(np.random.default_rng(30), [False, False])
+    needle = replace(model, inertia=np.stack([1e-20 * np.eye(3), np.diag([1.0, 1.0, 0.0])]))
+    with pytest.raises(SingularSystem, match="inertia of body 2 is singular"):
+        StructuredSystem([notes_chain(needle)])
+
+
+@KINDS
+@pytest.mark.parametrize("alone", ["drag_force", "drag_moment"])
+def test_one_kind_of_drag_alone_counts(mix: str, alone: str) -> None:
+    rng = np.random.default_rng(31)
+    model, state = random_chain(rng, MIXES[mix](rng, 3), drag=True)
+    other = {"drag_force": "drag_moment", "drag_moment": "drag_force"}[alone]
+    model = replace(model, **{other: np.zeros(3)})
+    one, pdot, allowed = (
+        notes_chain(model),
+        quaternion_rate(state.p, state.omega),
+        state_rounding_bound(model, state),
+    )
+    ours, direct = (
+        form.solve(state.r, state.p, state.v, pdot) for form in (StructuredSystem([one]), DirectSystem(one))
+    )
+    assert np.all(norms(ours.acceleration - direct.acceleration) <= allowed.acceleration)
+    assert np.all(norms(ours.pddot - direct.pddot) <= allowed.angular_acceleration / 2)
+
+
+@KINDS
+def test_the_rate_of_a_gap_is_its_derivative_off_the_manifold_too(mix: str) -> None:
+    """Where pᵀṗ is not 0 the matrix A of the notes stretches, and d with it."""
+    rng, h = np.random.default_rng(32), 1e-6
+    model, state = random_chain(rng, MIXES[mix](rng, 4))
+    forest = StructuredSystem([notes_chain(model)])
+    q, v = component_first(state.r, 1.1 * state.p), rng.normal(size=(7, 4))
+    ends = [forest.joint_gaps(q + s * h * v, v)[0] for s in (1, -1)]
+    # gaps of some metres, each a dozen roundings of 1e-16, over 2 h (the quadratic p(t) leaves h² some 1e-12)
+    np.testing.assert_allclose(forest.joint_gaps(q, v)[1], (ends[0] - ends[1]) / (2 * h), rtol=0, atol=1e-8)

@@ -1,0 +1,234 @@
+"""The report's sections on the reference (drift, cost) and the sweep's map: static, escaped, accessible."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pytest
+from click.testing import CliRunner
+
+from plumbline.cli.main import main
+from plumbline.studies import drift, sweep
+from reports import fast_reference, page, picture, sweep_page
+from reports.results import Results, replace_unprintable
+from tests.helpers import example_results as fixture
+from tests.helpers.example_results import HOSTILE, NASTY
+
+AXE = Path(page.__file__).parent / "node_modules" / "axe-core" / "axe.min.js"
+MEASURED: dict[str, Any] = {
+    "rtol": 1e-9,
+    "gap_rate": 4.5e-9,
+    "norm": 6.7e-10,
+    "energy": None,
+    "steps": 100,
+    "cpu_seconds": 2.5,
+}
+DRIFT = [
+    MEASURED | {"scenario": name, "variant": variant, "time": time, "gap": 3.21e-7 * time, "reason": ""}
+    for name in ("tumbling-ball", HOSTILE)
+    for variant in ("raw", "projected")
+    for time in (10.0, 100.0)
+]
+LEFT_OUT = {"scenario": "tumbling-ball", "variant": "raw", "rtol": 1e-9, "time": 1000.0, "reason": NASTY}
+
+
+def sweep_rows() -> list[dict[str, Any]]:
+    """Two parameters, one of them with more values than are shown one by one; every verdict."""
+    rows, verdicts = [], ["agrees", "disagrees", "failed", "unresolved", "unsupported", "not installed"]
+    for cell in range(90):
+        values = {"bodies[0].mass": 0.5 + cell % 3, f"initial{HOSTILE}": 10.0 ** (cell // 3 / 9)}
+        shared = {"cell": cell, "reason": NASTY, "reach": 1.0 + cell, "uncertainty": 1e-12 * (cell + 1)}
+        rows.append(values | shared | {"implementation": "reference", "verdict": "agrees"})
+        if cell:
+            error = 0.0 if cell == 1 else 1e-9 * cell
+            verdict = verdicts[cell % 6] if cell < 12 else "agrees"
+            rows.append(
+                values | shared | {"implementation": "mujoco", "verdict": verdict, "integrator": "RK4"}
+                | {"position_error": error if verdict in verdicts[:2] else None}
+            )  # fmt: skip
+    return rows
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = fixture.build(tmp_path_factory.mktemp("pages") / "a run & more")
+    drift.write(pa.Table.from_pylist([*DRIFT, LEFT_OUT], schema=drift.SCHEMA), folder)
+    goals = [
+        {"what": HOSTILE, "goal": 0.3, "measured": 0.12},
+        {"what": NASTY, "goal": 4, "measured": 5.5},
+    ]
+    (folder / "figures.json").write_text(json.dumps({"goals": goals, "records": []}))
+    svg = (fast_reference.STORED_RESULTS / "work-precision.svg").read_text(encoding="utf-8")
+    trap = '<script>alert(3)</script><image href="https://example.org/x.png"/></svg>'
+    (folder / "work-precision.svg").write_text(svg.replace("</svg>", trap))
+    page.write(Results.load(folder))
+    names = [*list(sweep_rows()[0])[:2], *sweep.COLUMNS]
+    schema = pa.schema(
+        [(name, sweep.COLUMNS.get(name, pa.float64())) for name in names],
+        metadata={
+            "sweep": json.dumps({"scenario": HOSTILE, "count": 1, "seed": 0, "duration": None, "step": 0.1})
+        },
+    )
+    sweep.write(pa.Table.from_pylist(sweep_rows(), schema=schema), folder)
+    sweep_page.write(folder)
+    return folder
+
+
+def section(text: str, name: str) -> str:
+    found = re.search(rf'<section class="fast" id="{name}".*?</section>', text, re.DOTALL)
+    assert found, name
+    return found[0]
+
+
+def words(markup: str) -> str:
+    return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", markup)).split())
+
+
+def test_the_report_has_the_drift_of_every_variant(out: Path) -> None:
+    found = section((out / "report.html").read_text(encoding="utf-8"), "drift")
+    lines = [words(line) for line in re.findall(r"<tr>.*?</tr>", found, re.DOTALL)]
+    raw = next(line for line in lines if line.startswith("raw"))
+    assert replace_unprintable(" ".join(NASTY.split()))[:12] in raw
+    assert "3.2×10⁻⁶ 3.2×10⁻⁵ – 4.5×10⁻⁹ 4.5×10⁻⁹ – 6.7×10⁻¹⁰ 6.7×10⁻¹⁰ – – – – 2.5" in raw
+    assert sum(line.startswith("projected") for line in lines) == 2
+    assert "10 s 100 s 1000 s" in words(found)
+    assert "not made in this run" not in found
+    assert HOSTILE in words(found)
+    assert HOSTILE not in found
+
+
+def test_the_report_has_the_goals_and_the_pictures_as_inert_images(out: Path) -> None:
+    found = section((out / "report.html").read_text(encoding="utf-8"), "benchmarks")
+    assert f"{HOSTILE} 0.3 0.120 ✓ yes" in words(found)
+    assert re.search(r"4 5\.50 ≠ no", words(found))
+    (uri,) = re.findall(r'<image href="data:image/svg\+xml;base64,([^"]*)"', found)
+    assert base64.b64decode(uri) == (out / "work-precision.svg").read_bytes()
+    assert "example.org" not in found
+    assert "<script" not in found
+    assert HOSTILE not in found
+
+
+def test_stored_measurements_stand_in_and_say_so(tmp_path: Path) -> None:
+    kept = fast_reference.benchmark_table(tmp_path)
+    assert kept is not None
+    assert kept["stored"]
+    assert len(kept["pictures"]) == 2
+    assert "shared two-core machine" in kept["note"]
+    assert fast_reference.benchmark_table(tmp_path, tmp_path) is None
+    assert fast_reference.drift_table(tmp_path, tmp_path) is None
+
+
+def test_the_map_has_every_place_and_the_worst_speaks(out: Path) -> None:
+    text = (out / "sweep.html").read_text(encoding="utf-8")
+    tables = re.findall(r'<table class="map">.*?</table>', text, re.DOTALL)
+    assert len(tables) == 3  # two of the reference, one of the engine
+    for table in tables:
+        lines = re.findall(r"<tr>.*?</tr>", table, re.DOTALL)[1:]
+        assert len(lines) == sweep_page.AXIS_INTERVALS
+        assert all(len(re.findall(r"<td", line)) == 3 for line in lines)
+    rows = [row for row in sweep_rows() if row["implementation"] == "mujoco"]
+    places = re.findall(r'<td class="([^"]*)".*?</td>', tables[2], re.DOTALL)
+    assert sum(place.startswith("none") for place in places) == 0
+    poor = [row for row in rows if row["verdict"] not in ("agrees", "not installed")]
+    first = re.search(r"<tbody>.*?</tr>", tables[2], re.DOTALL)
+    assert first
+    cells = [words(cell) for cell in re.findall(r"<td.*?</td>", first[0], re.DOTALL)]
+    assert cells == ["? unresolved", "≠ disagrees, 0 of 2", "✕ failed of 2"]
+    listed = re.findall(r'<tr class="(?:disagrees|failed|unresolved|unsupported)"', text)
+    assert len(listed) == len(poor) == 8
+    assert HOSTILE not in text
+    assert HOSTILE in words(text)
+    assert "<script" not in text
+
+
+def test_intervals_cover_every_value_and_follow_ratios() -> None:
+    name = list(sweep_rows()[0])[1]
+    axis = sweep_page.make_axis(name, sweep_rows())
+    assert axis.edges is not None
+    assert axis.edges[1] / axis.edges[0] == pytest.approx(axis.edges[-1] / axis.edges[-2])
+    for row in sweep_rows():
+        k = axis.index_of(row[name])
+        assert axis.edges[k] * (1 - 1e-12) <= row[name] <= axis.edges[k + 1] * (1 + 1e-12)
+    few = sweep_page.make_axis("bodies[0].mass", sweep_rows())
+    assert few.edges is None
+    assert [few.index_of(v) for v in (0.5, 1.5, 2.5)] == [0, 1, 2]
+
+
+@pytest.fixture(scope="module")
+def chromium() -> Iterator[Any]:
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    found = picture.find_chromium()
+    if not found:
+        pytest.skip(f"no Chromium here: none of {', '.join(picture.BROWSER_NAMES)} is on the path")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("name", ["report.html", "sweep.html"])
+def test_no_request_no_violation_no_script_needed(chromium: Any, out: Path, name: str) -> None:
+    trouble: list[str] = []
+    page_ = chromium.new_page(java_script_enabled=False, offline=True)
+    page_.on("console", lambda message: trouble.append(message.text))
+    page_.on("dialog", lambda dialog: (trouble.append(dialog.message), dialog.dismiss()))
+    requests: list[str] = []
+    page_.on("request", lambda request: requests.append(request.url))
+    page_.goto((out / name).as_uri())
+    for part in ("#drift", "#benchmarks svg.wp") if name == "report.html" else (".map >> nth=2", "#poor"):
+        assert page_.locator(part).is_visible(), part
+    page_.wait_for_timeout(200)
+    page_.close()
+    assert trouble == []
+    own = ("data:", (out / name).as_uri())
+    assert [url for url in requests if not url.startswith(own)] == []
+
+
+@pytest.mark.browser
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("name", ["report.html", "sweep.html"])
+def test_axe_finds_no_violation_here_either(chromium: Any, out: Path, name: str, scheme: str) -> None:
+    if not AXE.exists():
+        pytest.skip("axe-core is not installed: run `npm ci` in reports/ first")
+    context = chromium.new_context(color_scheme=scheme, bypass_csp=True, offline=True)
+    page_ = context.new_page()
+    page_.goto((out / name).as_uri())
+    page_.add_script_tag(path=str(AXE))
+    found = page_.evaluate("axe.run(document, {resultTypes: ['violations']})")
+    context.close()
+    assert [
+        f"{v['id']}: {n['target']} {n['failureSummary']}" for v in found["violations"] for n in v["nodes"]
+    ] == []
+    assert len(found["passes"]) > 15
+
+
+def test_a_sweep_of_one_parameter_is_one_line(tmp_path: Path) -> None:
+    rows = [row for row in sweep_rows() if row["bodies[0].mass"] == 0.5 and row["cell"] < 30]
+    text = sweep_page.render(["bodies[0].mass", list(rows[0])[1]], _whole(rows), {})
+    assert [
+        len(re.findall("<tr>", t)) for t in re.findall(r'<table class="map">.*?</table>', text, re.DOTALL)
+    ] == [2] * 3
+
+
+def test_the_command_writes_the_map(tmp_path: Path) -> None:
+    vary = ("bodies[0].mass: {values: [0.5, 1]}", "bodies[0].angular_velocity[0]: {values: [0, 1]}")
+    head = "schema_version: 1\nscenario: tumbling-ball\nduration: 0.25\nvary:\n  "
+    (tmp_path / "sweep.yaml").write_text(head + "\n  ".join(vary))
+    ran = CliRunner().invoke(main, ["sweep", str(tmp_path / "sweep.yaml"), "--out", str(tmp_path / "out")])
+    assert ran.exit_code == 0, ran.output
+    told = words((tmp_path / "out" / "sweep.html").read_text(encoding="utf-8"))
+    assert "4 cells: reference agrees 4" in told
+    assert "bodies[0].angular_velocity[0] ↓" in told
+    assert "Scenario tumbling-ball Count 1 Seed 0 Duration 0.25" in told
+
+
+def _whole(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    return [dict.fromkeys(sweep.COLUMNS) | row for row in rows]

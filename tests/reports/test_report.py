@@ -1,0 +1,439 @@
+"""The report from stored results, without a browser."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import json
+import re
+import shlex
+import shutil
+import subprocess
+import time
+import xml.etree.ElementTree as ET
+from html.parser import HTMLParser
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plumbline.model.kinematics import quaternion_product
+from reports import junit, pack, page, payload, step_summary
+from reports.history import History
+from reports.results import Results, replace_unprintable
+from reports.verdicts import VERDICT_STYLES, error_ratio, format_number, needs_attention, severity, worst_row
+from tests.helpers import example_results as fixture
+
+REPORTS = Path(page.__file__).parent
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return fixture.build(tmp_path_factory.mktemp("report") / "a run with spaces")
+
+
+@pytest.fixture(scope="module")
+def text(out: Path) -> str:
+    return page.write(Results.load(out)).read_text(encoding="utf-8")
+
+
+class Parsed(HTMLParser):
+    """Tags with attributes, and all text outside scripts and styles."""
+
+    def __init__(self, source: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.words = ""
+        self.raw = False
+        self.feed(source)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        self.raw = tag in ("script", "style")
+
+    def handle_endtag(self, tag: str) -> None:
+        self.raw = False
+
+    def handle_data(self, data: str) -> None:
+        self.words += "" if self.raw else data
+
+
+def chunks(text: str) -> dict[str, object]:
+    found = re.findall(r'<script type="application/octet-stream" id="chunk-([\w-]+)">([^<]*)</script>', text)
+    return {name: pack.decode_chunk(body) for name, body in found}
+
+
+def test_the_sentence_counts_and_versions_come_first(out: Path, text: str) -> None:
+    results = Results.load(out)
+    parsed = Parsed(text)
+    before_matrix = parsed.words[: parsed.words.index("Worst error over its tolerance")]
+    assert results.run["sentence"] in before_matrix
+    for verdict, mark in VERDICT_STYLES.items():
+        count = sum(row["verdict"] == verdict for row in results.rows)
+        assert re.search(rf"{count}\s*{mark.plural}", before_matrix), verdict
+    assert "6d61634" in before_matrix
+    for engine in results.engines.values():
+        assert engine["version"] in parsed.words
+
+
+def test_every_cell_is_in_the_static_matrix_with_glyph_text_and_class(out: Path, text: str) -> None:
+    results = Results.load(out)
+    table = text[text.index('<table class="matrix"') : text.index("</table>")]
+    lines = table.split('<tr class="line"')[1:]
+    assert len(lines) == len(results.scenarios)
+    for line, name in zip(lines, results.scenarios, strict=True):
+        cells = re.findall(r'<td class="cell[^>]*>.*?</td>', line, re.DOTALL)
+        assert len(cells) == len(results.engines)
+        for cell, engine in zip(cells, results.engines, strict=True):
+            rows = [r for r in results.rows if r["scenario"] == name and r["engine"] == engine]
+            speaker = max(rows, key=lambda r: (severity(r), error_ratio(r) or -1))
+            mark = VERDICT_STYLES[speaker["verdict"]]
+            assert f'class="cell {mark.css_class}' in cell
+            assert mark.glyph in cell
+            quotient = error_ratio(speaker)
+            assert (format_number(quotient) if quotient is not None else speaker["verdict"]) in cell
+
+
+def test_a_cell_speaks_with_its_worst_row() -> None:
+    def row(verdict: str, value: float | None, known: str | None = None) -> dict[str, object]:
+        return {"verdict": verdict, "value": value, "tolerance": 1.0, "known": known, "extra": {}}
+
+    agree, disagree = row("agrees", 0.9), row("disagrees", 2.0)
+    gap, known_gap = row("unsupported", None), row("unsupported", None, "gap")
+    assert worst_row([agree, row("agrees", 0.1), known_gap]) is agree
+    assert worst_row([agree, gap]) is gap
+    assert worst_row([agree, disagree, gap]) is disagree
+    assert worst_row([row("disagrees", 50.0, "old"), disagree]) is disagree
+    assert worst_row([row("failed", None), disagree])["verdict"] == "failed"
+    assert needs_attention(gap) and not needs_attention(known_gap)
+    assert error_ratio({"verdict": "agrees", "value": 3.0, "tolerance": 4.0, "extra": {"ratio": 0.2}}) == 0.2
+
+
+def test_no_hostile_text_becomes_markup(text: str) -> None:
+    parsed = Parsed(text)
+    kinds = {tag for tag, _ in parsed.tags}
+    assert "img" not in kinds
+    assert not [k for _, attributes in parsed.tags for k in attributes if k.startswith("on") or k == "style"]
+    assert fixture.HOSTILE in parsed.words
+    assert "a'\"`${1}&amp;</script><script>alert(2)</script>]]>" in parsed.words
+    scripts = [attributes for tag, attributes in parsed.tags if tag == "script"]
+    assert [a.get("type") for a in scripts] == ["application/octet-stream"] * (len(scripts) - 1) + [None]
+    assert not re.search("[\x00-\x08\x0b-\x1f\x7f\u202e]", text)
+
+
+def test_hostile_names_survive_in_the_data_and_in_links(out: Path, text: str) -> None:
+    data = chunks(text)
+    assert fixture.HOSTILE in data["index"]["scenarios"]  # type: ignore[index]
+    links = [
+        a["href"] for tag, a in Parsed(text).tags if tag == "a" and (a.get("href") or "").startswith("#")
+    ]
+    assert any("scenario=%3Cimg+src%3Dx+onerror%3Dalert%281%29%3E" in (link or "") for link in links)
+    rows = [c["rows"] for name, c in data.items() if name.startswith("scenario-")]  # type: ignore[index,call-overload]
+    scripts = [row["script"] for group in rows for row in group.values() if "script" in row]
+    assert any(fixture.HOSTILE in script for script in scripts)
+
+
+def test_unprintable_characters_become_visible_ones_everywhere() -> None:
+    bad = "a\x00b\x1bc\u202ed\ud800e\ufffff\x85g\rh\ni"
+    assert replace_unprintable({bad: [bad]}) == {"a�b�c�d�e�f�g�h\ni": ["a�b�c�d�e�f�g�h\ni"]}
+
+
+def test_the_page_allows_only_its_own_script_and_style(text: str) -> None:
+    policy = html.unescape(re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1])  # type: ignore[index]
+    assert policy.startswith("default-src 'none'")
+    assert "unsafe" not in policy and "http" not in policy
+    for tag in ("script", "style"):
+        body = re.search(rf"<{tag}>(.*?)</{tag}>", text, re.DOTALL)[1]  # type: ignore[index]
+        digest = base64.b64encode(hashlib.sha256(body.encode()).digest()).decode()
+        assert f"{tag}-src 'sha256-{digest}'" in policy
+    loading = [a for _, a in Parsed(text).tags if "src" in a or (a.get("href") or "#")[0] not in "#d"]
+    assert loading == []
+
+
+def test_decimation_keeps_every_peak_and_every_gap() -> None:
+    rng = np.random.default_rng(1)
+    y = rng.random(10_001)
+    spikes = rng.choice(len(y), 20, replace=False)
+    y[spikes[:10]] = 1e3 * (1 + rng.random(10))
+    y[spikes[10:]] = 1e-9 * (1 + rng.random(10))
+    y[7777] = np.nan
+    t = np.linspace(0, 10, len(y))
+    small, times = pack.decimate(y, 300), pack.decimate_times(t, 300)
+    assert len(small) == len(times) <= 300
+    assert np.nanmax(small) == np.nanmax(y) and np.nanmin(small) == np.nanmin(y)
+    edges = pack.bucket_edges(len(y), 300)
+    for k, (a, b) in enumerate(pairwise(edges)):
+        part = y[a:b]
+        assert np.nanmax(small[2 * k : 2 * k + 2]) == np.nanmax(part)
+        assert np.isnan(part).any() == np.isnan(small[2 * k : 2 * k + 2]).any()
+        assert times[2 * k] == t[a] and times[2 * k + 1] == t[b - 1]
+    assert pack.decimate(y[:300], 300) is not None and len(pack.decimate(y[:300], 300)) == 300
+
+
+def test_log_codes_keep_half_a_percent_and_tell_zero_from_nothing() -> None:
+    y = np.array([0.0, np.nan, np.inf, 1e-300, 1e-17, 3.3e-9, -2.5, 1e80])
+    codes = pack.log_scale_codes(y).astype(float)
+    assert codes[:4].tolist() == [1, 0, 0, 2]
+    back = 10 ** ((codes[4:] - 2) / pack.STEPS_PER_DECADE + pack.LOWEST_DECADE)
+    assert np.allclose(back, np.abs(y[4:]), rtol=0.0024)
+
+
+def test_chunks_come_back_as_they_went_in() -> None:
+    packer = pack.ChunkBuilder()
+    arrays = [
+        np.arange(7, dtype=np.uint8),
+        np.linspace(-1, 1, 5, dtype=np.float32),
+        np.array([-300, 299], dtype=np.int16),
+        np.array([65535, 1], dtype=np.uint16),
+        np.array([-128, 127], dtype=np.int8),
+    ]
+    header = {"a": [packer.add(a) for a in arrays], "text": "</script>ä", "none": None}
+    chunk = packer.encode(header)
+    assert re.fullmatch(r"[A-Za-z0-9+/=]+", chunk)
+    back = pack.decode_chunk(chunk)
+    assert back["text"] == "</script>ä" and back["none"] is None
+    for found, array in zip(back["a"], arrays, strict=True):
+        assert np.array_equal(found, array)
+
+
+def test_a_difference_of_1e_9_survives_in_the_motion(out: Path, text: str) -> None:
+    results = Results.load(out)
+    poses, name = results.table("trajectories"), "double-tumbling"
+    motion = chunks(text)[f"scenario-{list(results.scenarios).index(name)}"]["motion"]  # type: ignore[index,call-overload]
+    frames = len(motion["t"])
+
+    def r(engine: str, integrator: str) -> np.ndarray:
+        mine = (poses["scenario"] == name) & (poses["engine"] == engine) & (poses["integrator"] == integrator)
+        order = np.lexsort((poses["body"][mine], poses["t"][mine]))
+        return np.stack([poses[k][mine][order] for k in ("rx", "ry", "rz")], -1).reshape(-1, 2, 3)
+
+    run = next(x for x in motion["runs"] if x["engine"] == "exudyn-tree")
+    exact = r("exudyn-tree", run["integrator"]) - r("reference", "RK4")
+    pick = np.unique(np.linspace(0, len(exact) - 1, frames).round().astype(int))
+    drawn = (run["scale"][:, None, None] * run["d"].reshape(frames, 2, 6) / 127)[..., :3]
+    assert np.all(np.abs(drawn - exact[pick]) <= run["scale"][:, None, None] / 254 * 1.001 + 1e-30)
+
+
+def test_rotation_vectors_are_exact_for_tiny_and_large_angles() -> None:
+    axis = np.array([2, -3, 6]) / 7
+    base = np.array([0.5, 0.5, -0.5, 0.5])
+    for angle in (1e-14, 1e-9, 0.3, 3.0):
+        turned = quaternion_product(np.array([np.cos(angle / 2), *(np.sin(angle / 2) * axis)]), base)
+        for sign in (1, -1):
+            assert np.allclose(
+                payload.rotation_vector(sign * turned, base), angle * axis, rtol=1e-6, atol=2e-16
+            )
+
+
+def test_the_first_crossing_is_of_the_undecimated_curve(out: Path, text: str) -> None:
+    results = Results.load(out)
+    curves = results.table("curves")
+    seen = 0
+    for k, name in enumerate(results.scenarios):
+        for one in chunks(text)[f"scenario-{k}"]["curves"]:  # type: ignore[index,call-overload]
+            mine = (
+                (curves["scenario"] == name)
+                & (curves["engine"] == one["engine"])
+                & (curves["integrator"] == one["integrator"])
+            )
+            above = [
+                t
+                for t, e, tol in zip(
+                    *(curves[c][mine] for c in ("t", "position_error", "tolerance")), strict=True
+                )
+                if not e <= tol
+            ]
+            assert one["crossing"] == (pytest.approx(above[0], rel=1e-5, abs=1e-9) if above else None)
+            seen += bool(above)
+    assert seen > 3
+
+
+def test_commands_are_quoted_for_a_shell() -> None:
+    row = {"scenario": "x'; rm -rf ~ #", "engine": "mujoco", "level": "invariants", "quantity": "order"}
+    assert shlex.split(payload.rerun_command(row, {"file": ""}))[4:] == [
+        "x'; rm -rf ~ #",
+        "--engine",
+        "mujoco",
+        "--level",
+        "trajectory",
+    ]
+    row["scenario"] = "--out"
+    assert shlex.split(payload.rerun_command(row, {"file": ""}))[-2:] == ["--", "--out"]
+    assert "'my own.yaml'" in payload.rerun_command(row, {"file": "my own.yaml"})
+    row |= {"scenario": "rest", "quantity": "energy_drift_long", "extra": {"asked": 100.0}}
+    nightly = "python -m plumbline nightly rest --engine mujoco --random 0 --no-instrument"
+    assert payload.rerun_command(row, {"file": ""}) == nightly
+    row["extra"] = {"asked": 12.5}
+    assert payload.rerun_command(row, {"file": ""}) == f"{nightly} --endurance 12.5"
+
+
+def test_numbers_read_as_people_write_them() -> None:
+    shown = [format_number(x) for x in (0.0, 1.0, 0.0314, 4.2e-6, -1.5e7, 123.4, 9.99, float("nan"), None)]
+    assert shown == ["0", "1.0", "0.031", "4.2×10⁻⁶", "−1.5×10⁷", "120", "10", "not finite", "–"]
+
+
+def test_the_default_catalogue_stays_under_2_megabytes(
+    tmp_path: Path, record_property: pytest.FixtureRequest
+) -> None:
+    out = fixture.build(tmp_path / "big", hostile=False, scenarios=30, samples=200)
+    began = time.perf_counter()
+    size = page.write(Results.load(out)).stat().st_size
+    took = time.perf_counter() - began
+    record_property("bytes", size)  # type: ignore[operator]
+    record_property("seconds", took)  # type: ignore[operator]
+    print(f"30 scenarios: {size:,} bytes in {took:.2f} s")
+    assert size <= page.MAX_PAGE_BYTES
+
+
+def test_a_night_of_thousands_of_scenarios_stays_under_8_megabytes(out: Path, tmp_path: Path) -> None:
+    stored = json.loads((out / "results.json").read_text())
+    name = "double-tumbling"
+    rows, about = [r for r in stored["rows"] if r["scenario"] == name], stored["scenarios"][name]
+    stored["scenarios"] = {f"random-{k}": about for k in range(2500)}
+    stored["rows"] = [
+        {**row, "scenario": f"random-{k}", "key": row["key"].replace(name, f"random-{k}")}
+        for k in range(2500)
+        for row in rows
+    ]
+    late = stored["rows"][-1]
+    late |= {"verdict": "disagrees", "known": None, "reason": "the needle"}
+    (tmp_path / "results.json").write_text(json.dumps(stored))
+    began = time.perf_counter()
+    text = page.write(Results.load(tmp_path)).read_text()
+    print(f"{len(stored['rows']):,} rows: {len(text):,} bytes in {time.perf_counter() - began:.1f} s")
+    assert len(text.encode()) <= page.MAX_NIGHTLY_PAGE_BYTES
+    assert "random-2499" in text and "the needle" in text
+    assert "2000 more scenarios are not in this page" in text
+    assert "those with anything unexpected are all here" in text
+    assert f"<b>{sum(row['verdict'] == 'agrees' for row in stored['rows'])}</b><span>agree" in text
+
+
+def test_a_page_above_its_budget_has_fewer_points(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    results = Results.load(out)
+    whole = page.render(results, History())
+    monkeypatch.setattr(page, "BUDGET", len(whole.encode()) - 30_000)
+    smaller = page.render(results, History())
+    assert len(smaller.encode()) <= page.MAX_PAGE_BYTES
+    few = chunks(smaller)["scenario-0"]["curves"]  # type: ignore[index,call-overload]
+    assert few is None or len(few[0]["t"]) < len(chunks(whole)["scenario-0"]["curves"][0]["t"])  # type: ignore[index,call-overload]
+
+
+def test_a_history_says_what_is_new_and_skips_a_damaged_night(out: Path, tmp_path: Path) -> None:
+    past = fixture.nights(out, tmp_path / "history", count=4)
+    results = Results.load(out)
+    history = History.load(past, results)
+    assert len(history.nights) == 4 and history.unreadable == ["2026-11-02"]
+    assert history.last_passed is history.nights[-2]
+    fresh = {row["key"] for row in results.rows if history.is_new(row)}
+    assert fresh == {row["key"] for row in results.rows if row["verdict"] in ("disagrees", "failed")}
+    data = chunks(page.render(results, history))
+    table = data["history"]["verdict"].reshape(len(results.rows), 5)  # type: ignore[index,call-overload]
+    for line, row in zip(table, results.rows, strict=True):
+        assert list(VERDICT_STYLES)[line[-1] - 1] == row["verdict"]
+        if row["key"] in fresh:
+            assert list(VERDICT_STYLES)[line[0] - 1] == "agrees"
+    words = Parsed(page.render(results, history)).words
+    assert re.search(rf"{len(fresh)}\s+newly failing", words) and "Skipped as damaged: 2026-11-02" in words
+
+
+def test_a_run_of_the_state_level_alone_has_a_page(out: Path, tmp_path: Path) -> None:
+    few = tmp_path / "few"
+    few.mkdir()
+    stored = json.loads((out / "results.json").read_text())
+    stored["rows"] = [row for row in stored["rows"] if row["level"] == "state"]
+    for about in stored["scenarios"].values():
+        del about["horizon"], about["truth_uncertainty"]
+    del stored["run"]["truth"]
+    (few / "results.json").write_text(json.dumps(stored))
+    shutil.copy(out / "states.parquet", few)
+    data = chunks(page.write(Results.load(few)).read_text())
+    assert data["scenario-0"]["curves"] == [] and data["scenario-0"]["motion"] is None  # type: ignore[index,call-overload]
+
+
+def test_gaps_of_one_reason_are_one_finding(out: Path) -> None:
+    results = Results.load(out)
+    gap = next(row for row in results.rows if row["verdict"] == "unsupported")
+    rows = [{**gap, "known": None, "scenario": f"s{k}"} for k in range(9)]
+    rows += [{**gap, "known": None, "scenario": "s0", "quantity": "energy"}]
+    rows += [{**gap, "known": None, "scenario": "s1", "reason": "another"}]
+    first, second = page._unexpected_findings(rows)
+    assert (len(first["scenarios"]), first["more"]) == (8, 1) and first["row"]["scenario"] not in first[
+        "scenarios"
+    ]
+    assert (len(second["scenarios"]), second["more"]) == (0, 0)
+
+
+def test_a_report_that_cannot_be_written_leaves_the_old_one(
+    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copy = shutil.copytree(out, tmp_path / "copy")
+    old = page.write(Results.load(copy)).read_bytes()
+
+    def full(self: Path, data: str, encoding: str) -> int:
+        self.write_bytes(data.encode(encoding)[:1000])
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(OSError, match="No space"):
+        page.write(Results.load(copy))
+    assert (copy / "report.html").read_bytes() == old
+    assert [p.name for p in copy.iterdir() if p.name.startswith(".")] == []
+
+
+def test_junit_counts_what_it_holds_and_survives_every_text(out: Path) -> None:
+    results = Results.load(out)
+    root = ET.parse(junit.write(Results.load(out))).getroot()
+    cases = root.findall("./testsuite/testcase")
+    assert len(cases) == len(results.rows) == int(root.get("tests", ""))
+    for tag, total in (("failure", "failures"), ("error", "errors"), ("skipped", "skipped")):
+        assert len(root.findall(f".//{tag}")) == int(root.get(total, "")) > 0
+    expected = {row["key"] for row in results.rows if needs_attention(row)}
+    assert len(root.findall(".//failure")) + len(root.findall(".//error")) == len(expected)
+    assert {s.get("name") for s in root.findall("testsuite")} == set(results.scenarios)
+    assert any("behaves as if gravity" in (failure.text or "") for failure in root.findall(".//failure"))
+
+
+def test_the_step_summary_shows_text_as_text_and_keeps_its_limit(out: Path) -> None:
+    text = step_summary.write(Results.load(out)).read_text(encoding="utf-8")
+    assert "<" not in text and "`" not in text
+    assert html.unescape(step_summary.escape_markdown(fixture.HOSTILE)) == fixture.HOSTILE
+    assert not re.search(r"(?<!&)[|*_#\[\]`<>@]", step_summary.escape_markdown("|*_#[]`<>@me"))
+    results = Results.load(out)
+    bad = next(row for row in results.rows if row["verdict"] == "disagrees")
+    results.rows.extend({**bad, "scenario": f"s{k}", "reason": "long " * 60} for k in range(5000))
+    crowded = step_summary.render(results)
+    assert len(crowded.encode()) <= 1024 * 1024
+    assert re.search(r"… and \d{3,} more", crowded)
+    assert "report.html has every cell" in crowded
+
+
+def tool(name: str) -> str:
+    found = REPORTS / "node_modules" / ".bin" / name
+    if not found.exists():
+        pytest.skip(f"{name} is not installed: run `npm ci` in reports/ first")
+    return str(found)
+
+
+def test_the_pages_own_script_is_type_checked() -> None:
+    done = subprocess.run(
+        [tool("tsc"), "--noEmit", "-p", "."], cwd=REPORTS, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_the_pages_own_script_is_linted() -> None:
+    done = subprocess.run(
+        [tool("eslint"), "--max-warnings", "0", "assets"],
+        cwd=REPORTS,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_vendored_uplot_comes_with_its_licence(text: str) -> None:
+    assert "uPlot" in page.bundle_script() and "Copyright (c) 2022 Leon Sorokin" in Parsed(text).words
+    assert not re.search(r"\bfetch\(|XMLHttpRequest|WebSocket|EventSource|sendBeacon", page.bundle_script())

@@ -1,0 +1,222 @@
+"""Faults of the disk: every write fails in turn; nothing half is ever read as good, and the night goes on."""
+
+import errno
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+
+import pytest
+
+from plumbline.cli.main import nightly
+from plumbline.execution import runner
+from plumbline.execution.runner import Plan
+from plumbline.processes import workers
+from plumbline.processes.workers import Limits, ResultCache
+from plumbline.scenario import loader
+from plumbline.storage.history import History
+
+ROOT = Path(__file__).resolve().parents[2]
+ERRORS = [errno.ENOSPC, errno.EIO, errno.EROFS, errno.EDQUOT]
+
+
+class Here:
+    """Stands for the pool of workers: the same calls in this process, so that hundreds of runs are quick."""
+
+    def __init__(self, jobs, limits=None):
+        self.limits = limits or Limits()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def run(self, tasks, memory=None):
+        memory = memory or ResultCache()
+        for task in tasks:
+            found = memory.get(task)
+            if found is None:
+                found = workers.run_task(task)
+                memory.put(task, found)
+            yield found
+
+
+class Disk:
+    """Counts every step of every write; fails the ``at``-th, once or from then on."""
+
+    def __init__(self, monkeypatch):
+        self.steps, self.at, self.for_good, self.error = 0, 0, False, errno.ENOSPC
+        replace_, fsync, fdopen, mkstemp, text, mkdir = (
+            os.replace, os.fsync, os.fdopen, tempfile.mkstemp, Path.write_text, Path.mkdir,
+        )  # fmt: skip
+        disk = self
+
+        class File:
+            """A file that takes a half of the data before it fails."""
+
+            def __init__(self, file):
+                self.file = file
+
+            def __enter__(self):
+                return self
+
+            def __exit__(self, *_):
+                self.file.close()
+
+            def write(self, data):
+                try:
+                    disk.step()
+                except OSError:
+                    self.file.write(data[: len(data) // 2])
+                    raise
+                self.file.write(data)
+
+            def __getattr__(self, name):
+                return getattr(self.file, name)
+
+        def half_text(path, data, *args, **options):
+            try:
+                disk.step()
+            except OSError:
+                text(path, data[: len(data) // 2], *args, **options)
+                raise
+            return text(path, data, *args, **options)
+
+        def stepping(call):
+            def stepped(*args, **options):
+                disk.step()
+                return call(*args, **options)
+
+            return stepped
+
+        monkeypatch.setattr(os, "replace", stepping(replace_))
+        monkeypatch.setattr(os, "fsync", stepping(fsync))
+        monkeypatch.setattr(tempfile, "mkstemp", stepping(mkstemp))
+        monkeypatch.setattr(Path, "mkdir", stepping(mkdir))
+        monkeypatch.setattr(Path, "write_text", half_text)
+        monkeypatch.setattr(os, "fdopen", lambda handle, mode: File(fdopen(handle, mode)))
+
+    def step(self):
+        self.steps += 1
+        if self.at and (self.steps == self.at or (self.for_good and self.steps > self.at)):
+            raise OSError(self.error, os.strerror(self.error))
+
+    def fault(self, at, error=errno.ENOSPC, for_good=False):
+        self.steps, self.at, self.error, self.for_good = 0, at, error, for_good
+
+    def mend(self):
+        self.fault(0)
+
+
+@pytest.fixture
+def disk(monkeypatch):
+    monkeypatch.setattr(runner, "WorkerPool", Here)
+    monkeypatch.setattr(nightly, "Plan", lambda *a, **k: Plan(*a, **k, random_state_count=1))
+    return Disk(monkeypatch)
+
+
+def night(out):
+    chosen = loader.load_scenarios(["rest"])
+    result, place = nightly.nightly(
+        out, chosen, ["mujoco"], random=0, seed=1, jobs=1, limits=Limits(), whole=False, command="-", finer=0,
+        level="state", progress=lambda *_: None, tell=lambda _: None,
+    )  # fmt: skip
+    return [replace(row, wall_time=0.0) for row in result.rows], place
+
+
+def fail_and_go_on(disk, out, expected, at, error, for_good):
+    disk.fault(at, error, for_good)
+    with pytest.raises(OSError, match=os.strerror(error)):
+        night(out)
+    disk.mend()
+    found = History(out) if out.exists() else None
+    if found:
+        assert not found.damaged and len(found.nights) <= 1  # 1: whole, a later step failed
+    rows, place = night(out)
+    assert rows == expected
+    assert json.loads((place / "results.json").read_text())["run"]["exit_code"] == 0
+    assert sorted(p.name for p in out.iterdir()) == ["history"]
+    assert not list(out.rglob(".*")), "temporary files are left"
+
+
+def every_step(disk, tmp_path, errors, manners):
+    expected, _ = night(tmp_path / "calm")
+    disk.mend()
+    assert night(tmp_path / "count")[0] == expected
+    steps = disk.steps
+    faults = 0
+    for at in range(1, steps + 1):
+        for error in errors:
+            for for_good in manners:
+                out = tmp_path / f"{at}-{error}-{for_good}"
+                fail_and_go_on(disk, out, expected, at, error, for_good)
+                faults += 1
+    return steps, faults
+
+
+@pytest.mark.timeout(300)
+def test_a_full_disk_at_every_step_of_every_write(disk, tmp_path):
+    steps, _ = every_step(disk, tmp_path, [errno.ENOSPC], [False])
+    assert steps > 30, "the faults no longer reach the writes"
+
+
+@pytest.mark.full
+@pytest.mark.timeout(3600)
+def test_every_error_at_every_step_once_and_for_good(disk, tmp_path, record_testsuite_property):
+    steps, faults = every_step(disk, tmp_path, ERRORS, [False, True])
+    record_testsuite_property("steps of writing", steps)
+    record_testsuite_property("faults injected", faults)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limits of file size")
+def test_the_command_says_so_and_goes_on(tmp_path):
+    """The kernel refuses files above 120 kB: the cells fit, the report does not."""
+    import resource
+
+    command = [sys.executable, "-m", "plumbline", "run", "rest", "--engine", "mujoco", "--level", "state",
+               "--jobs", "1", "--out", str(tmp_path)]  # fmt: skip
+    limited = subprocess.run(
+        command, cwd=ROOT, capture_output=True, text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (120_000, 120_000)),
+    )  # fmt: skip
+    assert limited.returncode == 4, limited.stderr
+    assert "stopped by the machine" in limited.stderr and "the same command goes on" in limited.stderr
+    assert not (tmp_path / "report.html").exists()
+    kept = len(list(tmp_path.glob("cells/*.cell")))
+    assert kept == 2
+    again = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert again.returncode == 0, again.stderr
+    assert (tmp_path / "report.html").exists() and not (tmp_path / "cells").exists()
+
+
+def test_a_clock_set_back_overwrites_no_night(tmp_path):
+    place = tmp_path / "20260101T000000Z"
+    assert nightly.free(place) == place
+    place.mkdir()
+    assert nightly.free(place).name == "20260101T000000Z-2"
+
+
+def test_nights_are_told_in_the_order_in_which_they_were_made(tmp_path, monkeypatch):
+    """The clock is set back, forward within the second night, and then shows the first one again."""
+    monkeypatch.setattr(runner, "WorkerPool", Here)
+    monkeypatch.setattr(nightly, "Plan", lambda *a, **k: Plan(*a, **k, random_state_count=1))
+    days = iter([10, 10, 5, 8, 10, 10])  # when a night begins, and when its run does
+
+    class Clock(datetime):
+        @classmethod
+        def now(cls, tz=None):
+            return datetime(2026, 1, next(days), tzinfo=tz)
+
+    monkeypatch.setattr(nightly, "datetime", Clock)
+    monkeypatch.setattr(runner, "datetime", Clock)
+    made = [night(tmp_path)[1].name for _ in range(3)]
+    assert made == ["20260110T000000Z", "20260108T000000Z", "20260110T000000Z-2"]
+    history = History(tmp_path)
+    assert [n.folder.name for n in history.nights] == made
+    assert [n["id"] for n in history.overview()] == made
+    assert [t["id"] for t in history.trend("rest/mujoco/state/-/acceleration")] == made

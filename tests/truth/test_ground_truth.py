@@ -1,0 +1,188 @@
+"""What engines are measured with: sizes, mistakes that must be visible, and where the truth comes from."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields, replace
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+from plumbline.engines.registry import load_adapter
+from plumbline.model.datatypes import StateQuantities
+from plumbline.model.kinematics import quaternion_product, state_from_minimal
+from plumbline.model.sampling import random_states
+from plumbline.truth import TruthUnavailable, ground_truth
+from plumbline.truth.ground_truth import (
+    DETECTABLE_PARAMETER_ERROR,
+    TRUTHS_DIFFER,
+    detectable_effect,
+    least_detectable_effect,
+    motion_truth,
+    perturbed_models,
+    stretched_length,
+)
+from plumbline.truth.rounding_bound import state_rounding_bound
+from plumbline.truth.sensitivity import perturbation_growth
+from plumbline.truth.trajectory import TrajectoryTruth, trajectory_truth
+from tests.helpers import pendulums
+
+TIMES = np.linspace(0, 1, 9)
+
+
+def test_reach_is_from_where_a_body_hangs_to_where_the_next_one_does() -> None:
+    """At least to its centre, at least its radius of gyration; nothing hangs on the last."""
+    model = replace(
+        pendulums.model("rbb"),
+        mass=np.array([1.0, 2.0, 4.0]),
+        inertia=np.array([1e-4, 1e-4, 8.0 * 2 / 3])[:, None, None] * np.eye(3),
+        proximal=np.array([[0, 0, 0.3], [0.6, 0, 0], [0, 0, 0.5]]),
+        distal=np.array([[0, 0.4, 0], [0.5, 0, 0], [9.0, 9, 9]]),
+        length=np.array([0.25, 0, 0]),
+    )
+    assert stretched_length(model) == pytest.approx([0.25 + 0.5, 0.6, np.sqrt(2.0)], rel=1e-14)
+    assert stretched_length(replace(model, inertia=1e-3 * model.inertia)) == pytest.approx(
+        [0.75, 0.6, 0.5], rel=1e-14
+    )
+
+
+def test_the_least_effect_is_of_those_that_show_at_all() -> None:
+    effects = [np.array([0, 1.0, 3, 2]), np.array([0, 5.0, 1, 9]), np.array([0, 1e-9, 2e-9, 0])]
+    assert least_detectable_effect(effects, 1e-6).tolist() == [0, 1, 3, 3]
+    assert least_detectable_effect(effects, 1e-10).tolist() == [0, 1e-9, 2e-9, 2e-9]
+    assert least_detectable_effect(effects, 5.0).tolist() == [0, 5, 5, 9]
+    assert least_detectable_effect(effects, 9.0).tolist() == [np.inf] * 4
+    assert least_detectable_effect(effects[:1], 9.0).tolist() == [np.inf] * 4
+
+
+@pytest.mark.parametrize("joints", ["b", "rb"])
+def test_mistakes_are_of_one_part_in_ten_thousand_each_of_its_kind(joints: str) -> None:
+    model = pendulums.model(joints)
+    at = pendulums.state(model, seed=5)
+    altered = [{"gravity"}, {"mass"}, {"inertia"}, {"proximal", "distal"}]
+    found = perturbed_models(model, at)
+    assert len(found) == len(altered)
+    for (wrong, state), names in zip(found, altered, strict=True):
+        for field in fields(model):
+            was, now = getattr(model, field.name), getattr(wrong, field.name)
+            if field.name not in names:
+                assert np.array_equal(was, now), field.name
+                continue
+            part = np.abs(now / was - 1)
+            if field.name == "inertia":  # two entries of ± 1e-4 make one of a symmetric tensor
+                assert (
+                    np.all(part < 1.001 * DETECTABLE_PARAMETER_ERROR)
+                    and np.ptp(now / was) > 0.9 * DETECTABLE_PARAMETER_ERROR
+                )
+                assert np.array_equal(now, now.mT)
+            else:
+                assert part == pytest.approx(np.full(part.shape, DETECTABLE_PARAMETER_ERROR), rel=1e-9)
+        lifted = state_from_minimal(wrong, at.p, at.omega, at.u, at.udot)
+        for name in ("p", "omega", "u", "udot", "r", "v"):
+            assert np.array_equal(getattr(state, name), getattr(lifted, name))
+    offsets = found[3][0].proximal / model.proximal
+    assert np.any(offsets > 1) and np.any(offsets < 1), "signs are drawn"
+
+
+def test_what_is_visible_is_the_least_effect_on_positions_and_attitudes() -> None:
+    model = pendulums.model("b")
+    length = float(np.sum(stretched_length(model)))
+    r, p = np.zeros((4, 9, 1, 3)), np.tile([1.0, 0, 0, 0], (4, 9, 1, 1))
+    for k, size in enumerate((2e-5, 5e-5, 0.9e-3 * DETECTABLE_PARAMETER_ERROR * length), start=1):
+        r[k, :, 0, 1] = size * TIMES
+    for k, angle in enumerate((1e-5, 3e-5, 0.9e-3 * DETECTABLE_PARAMETER_ERROR), start=1):
+        turn = np.stack(
+            [np.cos(angle * TIMES / 2), *(np.sin(angle * TIMES / 2) * np.eye(3)[k - 1][:, None])], -1
+        )
+        p[k] = quaternion_product(p[k], turn[:, None])
+    position, attitude = detectable_effect(model, r, p)
+    assert position == pytest.approx(2e-5 * TIMES, abs=1e-18)  # the third is no effect
+    assert attitude == pytest.approx(1e-5 * TIMES, rel=1e-6, abs=0)
+    r[3] *= 1.2 / 0.9
+    assert detectable_effect(model, r, p)[0] == pytest.approx(
+        1.2e-3 * DETECTABLE_PARAMETER_ERROR * length * TIMES, rel=1e-9, abs=0
+    )
+
+
+def test_the_truth_of_states_is_certified_or_says_that_it_is_not() -> None:
+    pytest.importorskip("flint")
+    model = pendulums.model("rb", loads=True, drag=True)
+    states = random_states(model, 3, seed=2)
+    found = ground_truth.state_truth(model, states)
+    assert re.fullmatch(r"certified: enclosed in ball arithmetic of \d+ bits", found.method)
+    with patch("plumbline.truth.ground_truth.certify_state", side_effect=TruthUnavailable("gone")):
+        other = ground_truth.state_truth(model, states)
+    assert "truth tools are not installed" in other.method
+    said = load_adapter("reference").evaluate(model, states)
+    for truth in (found, other):
+        assert truth.states == states
+        for mine, theirs, bound, state in zip(truth.quantities, said, truth.bounds, states, strict=True):
+            assert np.array_equal(bound.acceleration, state_rounding_bound(model, state).acceleration)
+            for q in bound.scale:
+                off = np.max(np.abs(np.asarray(getattr(mine, q)) - getattr(theirs, q)))
+                assert off <= np.max(bound.tolerance(q)), q
+    assert all(isinstance(q, StateQuantities) and q.mass_matrix is not None for q in found.quantities)
+
+
+def test_the_truth_of_a_motion_knows_its_growth_its_length_and_what_it_must_show() -> None:
+    model = pendulums.model("bb")
+    at = pendulums.state(model, seed=2, rate=0.5)
+    found, run = motion_truth(model, at, TIMES, None), trajectory_truth(model, at, TIMES)
+    for name in ("r", "p", "v", "pdot"):
+        assert np.array_equal(getattr(found.trajectory, name), getattr(run.trajectory, name))
+    assert np.array_equal(found.position_uncertainty, run.position_uncertainty)
+    assert np.array_equal(found.attitude_uncertainty, run.attitude_uncertainty)
+    assert found.method == run.method and found.length == pytest.approx(
+        float(np.sum(stretched_length(model)))
+    )
+    assert np.all(np.diff(found.growth) >= 0) and found.growth[0] >= 1
+    assert found.growth == pytest.approx(
+        np.maximum.accumulate(perturbation_growth(model, at, TIMES)), rel=0.05
+    )
+    wrong = [pendulums.motion(m, s, TIMES) for m, s in perturbed_models(model, at)]
+    right = pendulums.motion(model, at, TIMES)
+    shown = detectable_effect(
+        model, np.array([x.r for x in (right, *wrong)]), np.array([x.p for x in (right, *wrong)])
+    )
+    for mine, theirs in zip((found.detectable_position, found.detectable_attitude), shown, strict=True):
+        assert mine[1:] == pytest.approx(theirs[1:], rel=1e-3) and mine[-1] > 1e-7
+
+
+@pytest.mark.parametrize(
+    ("position", "attitude", "parted"), [(0.9, 0.9, False), (1.1, 0.9, True), (0.9, 1.1, True)]
+)
+def test_two_methods_that_part_by_more_than_rounding_are_told(
+    position: float, attitude: float, parted: bool
+) -> None:
+    model = pendulums.model("b")
+    at = pendulums.state(model, seed=2, rate=0.5)
+    sound = motion_truth(model, at, TIMES, None)
+    limit = 1e3 * np.finfo(float).eps * sound.growth  # 10³ ε G(t), as the rows say
+    off = np.zeros(9)
+    off[-1] = 1.0
+    made = TrajectoryTruth(
+        sound.trajectory,
+        position * sound.length * limit * off,
+        2 * attitude * limit * off,
+        "made",
+    )
+    with patch("plumbline.truth.ground_truth.trajectory_truth", lambda *_: made):
+        assert motion_truth(model, at, TIMES, None).method == "made" + TRUTHS_DIFFER * parted
+
+
+def test_taylors_method_is_asked_of_so_many_bodies_only() -> None:
+    model = pendulums.model("b")
+    found = motion_truth(
+        model, pendulums.state(model, seed=2, rate=0.5), TIMES[:3], None, max_compiled_bodies=0
+    )
+    assert "not asked of more than 0 bodies" in found.method
+
+
+def test_a_closed_form_is_taken_for_the_motion() -> None:
+    model = pendulums.model("b")
+    at = pendulums.state(model, seed=2, rate=0.5)
+    run = pendulums.motion(model, at, TIMES)
+    found = motion_truth(model, at, TIMES, (run.r + 1e-9, run.p, "a book"))
+    assert np.array_equal(found.trajectory.r, run.r + 1e-9) and "closed form: a book" in found.method
+    assert found.position_uncertainty[-1] == pytest.approx(1e-9 * np.sqrt(3), rel=1e-3, abs=0)

@@ -1,0 +1,218 @@
+"""Truth along trajectories: two methods of different kind and coordinates, and quad precision above them."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+
+from plumbline.model.datatypes import EngineFailure
+from plumbline.model.invariants import attitude_error, position_error
+from plumbline.processes.workers import Limits, Task, WorkerPool
+from plumbline.scenario.loader import catalogue, find_scenario_file, load_scenario
+from plumbline.truth import ground_truth, trajectory
+from plumbline.truth.certified import certify_state
+from plumbline.truth.closed_form import closed_form_motion
+from plumbline.truth.notes_motion import simulate_notes_form
+from plumbline.truth.taylor import load_heyoka, simulate_taylor
+from plumbline.truth.trajectory import MAX_EXTENDED_PRECISION_BODIES, NOTES_RTOL, trajectory_truth
+from tests.helpers.random_chains import random_chain
+
+TIMES = np.arange(41) * 0.05
+CATALOGUE = [load_scenario(path) for path in catalogue().values()]
+BALLS = [s for s in CATALOGUE if not s.model.rods.any()]
+CLOSED = [s for s in CATALOGUE if (closed := closed_form_motion(s)) and closed.amplitude == 0]
+
+
+pytestmark = pytest.mark.skipif(
+    not (find_spec("heyoka") and find_spec("mpmath")), reason="the truth tools are not installed"
+)
+
+
+# the yardstick
+
+
+@pytest.mark.parametrize("rods", [[0], [1], [0, 0]], ids=str)
+def test_extended_precision_is_as_good_as_quad_says(rods):
+    check_precisions(rods)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("rods", [[1, 1], [0, 1, 0], [1, 0, 1], [0] * 5], ids=str)
+def test_extended_precision_is_as_good_as_quad_says_on_longer_chains(rods):
+    check_precisions(rods)
+
+
+def check_precisions(rods):
+    """Each precision from quad, and the notes' form on its manifold, which shares no equation with them."""
+    model, state = random_chain(np.random.default_rng(1), rods, loads=True, drag=True)
+    quad, extended, double = (
+        simulate_taylor(model, state, TIMES, kind) for kind in ("quad", "extended", "double")
+    )
+    fine, middle, coarse = (np.asarray(run.r, dtype=float) for run in (quad, extended, double))
+    assert np.max(np.abs(middle - fine)) < 1e-15
+    assert np.max(np.abs(coarse - fine)) < 1e-12
+    assert np.max(np.abs(coarse - fine)) > 0, "double and quad gave the same bits: is quad really quad?"
+    assert np.max(np.abs(simulate_notes_form(model, state, TIMES, NOTES_RTOL).r - fine)) < 1e-12
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("scenario", CATALOGUE, ids=lambda s: s.name)
+def test_the_uncertainty_covers_what_a_higher_precision_says_of_the_truth(scenario):
+    """Quad for a body or two, extended precision above.
+
+    Beyond the difference a bit per link: in double both methods add up a chain's links alike.
+    """
+    precision = "quad" if scenario.model.n <= 2 else "extended"
+    fine = simulate_taylor(scenario.model, scenario.state, TIMES, precision)
+    closed = scenario in CLOSED
+    exact = (*closed_form_motion(scenario)(TIMES), "") if closed else None
+    truth = trajectory_truth(scenario.model, scenario.state, TIMES, exact)
+    r, p = (np.asarray(y, dtype=float) for y in (fine.r, fine.p))
+    size = scenario.model.n * 2.0**-52 * max(1.0, float(np.max(np.abs(r))))
+    off = position_error(truth.trajectory.r, r)
+    print(f"{scenario.name}: {np.max(off):.1e} m off, uncertain by {truth.position_uncertainty[-1]:.1e} m")
+    assert np.all(off <= 2 * truth.position_uncertainty + size)
+    turned = attitude_error(truth.trajectory.p, p)
+    assert np.all(turned <= 2 * truth.attitude_uncertainty + 4 * 2.0**-52)
+
+
+# what the truth is, and how sure
+
+
+def check_balls(scenario):
+    truth = trajectory_truth(scenario.model, scenario.state, TIMES)
+    precision = "extended" if scenario.model.n <= MAX_EXTENDED_PRECISION_BODIES else "double"
+    print(
+        f"{scenario.name}: {truth.position_uncertainty[-1]:.1e} m, {truth.attitude_uncertainty[-1]:.1e} rad"
+    )
+    assert f"Taylor's method in minimal coordinates and {precision} precision" in truth.method
+    assert np.max(truth.position_uncertainty) < 1e-12
+    assert np.all(np.diff(truth.position_uncertainty) >= 0)
+
+
+@pytest.mark.parametrize("scenario", [s for s in BALLS if s.model.n < 10], ids=lambda s: s.name)
+def test_the_uncertainty_is_below_a_picometre_on_balls(scenario):
+    check_balls(scenario)
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("scenario", [s for s in BALLS if s.model.n >= 10], ids=lambda s: s.name)
+def test_the_uncertainty_is_below_a_picometre_on_long_chains_of_balls(scenario):
+    check_balls(scenario)
+
+
+@pytest.mark.parametrize("scenario", CLOSED, ids=lambda s: s.name)
+def test_it_agrees_with_the_closed_forms(scenario):
+    r, p = closed_form_motion(scenario)(TIMES)
+    truth = trajectory_truth(scenario.model, scenario.state, TIMES, (r, p, "a book"))
+    assert truth.method.startswith("closed form: a book; uncertainty: its difference from Taylor's method")
+    assert np.array_equal(truth.trajectory.r, r)
+    assert np.max(truth.position_uncertainty) < 1e-14
+    assert np.max(truth.attitude_uncertainty) < 3e-14
+
+
+def test_its_accelerations_are_the_certified_ones():
+    """ω′ and v of a mixed chain, differenced over a microsecond, against ball arithmetic at one state."""
+    model, state = random_chain(np.random.default_rng(4), [1, 0], loads=True, drag=True)
+    h = 1e-4
+    run = simulate_taylor(model, state, np.array([0.0, h, 2 * h]), "extended")
+    said = certify_state(model, state).quantities
+    for values, expected in ((run.omega, said.angular_acceleration), (run.v, said.acceleration)):
+        slope = np.asarray((-3 * values[0] + 4 * values[1] - values[2]) / (2 * h), dtype=float)
+        assert slope == pytest.approx(expected, abs=3e-6 * np.max(np.abs(expected)))
+
+
+# a wrong truth is seen
+
+
+@pytest.mark.parametrize("side", ["taylor", "flow"])
+def test_a_billionth_too_much_mass_in_one_of_the_two_is_seen(monkeypatch, side):
+    scenario = load_scenario(find_scenario_file("double-tumbling-balls"))
+    usual = ground_truth.motion_truth(scenario.model, scenario.state, TIMES, None)
+    right = getattr(trajectory, side)
+
+    def wrong(model, *rest):
+        return right(replace(model, mass=model.mass * [1, 1 + 1e-9]), *rest)
+
+    monkeypatch.setattr(trajectory, side, wrong)
+    planted = ground_truth.motion_truth(scenario.model, scenario.state, TIMES, None)
+    assert planted.position_uncertainty[-1] > 1e4 * usual.position_uncertainty[-1]
+    assert planted.method == usual.method + ground_truth.TRUTHS_DIFFER
+
+
+def test_a_closed_form_that_is_off_is_seen():
+    scenario = load_scenario(find_scenario_file("lagrange-top"))
+    r, p = closed_form_motion(scenario)(TIMES)
+    truth = ground_truth.motion_truth(
+        scenario.model, scenario.state, TIMES, (r * (1 + 1e-9), p, "a misprint")
+    )
+    assert truth.method.endswith(ground_truth.TRUTHS_DIFFER)
+
+
+# where Taylor's method cannot be had
+
+
+def check_fall_back(why, **arguments):
+    scenario = load_scenario(find_scenario_file("double-tumbling-balls"))
+    truth = ground_truth.motion_truth(scenario.model, scenario.state, TIMES[:11], None, **arguments)
+    assert truth.method == (
+        "the notes' form by collocation; uncertainty: its difference from the same by DOP853, "
+        f"no Taylor series: {why}"
+    )
+    assert 0 < truth.position_uncertainty[-1] < 1e-12
+
+
+def test_long_chains_say_that_the_equations_are_the_same():
+    check_fall_back("not asked of more than 1 bodies", compiled=1)
+
+
+def test_without_heyoka_dop853_stands_in(monkeypatch):
+    load_heyoka.cache_clear()
+    monkeypatch.setitem(sys.modules, "heyoka", None)
+    try:
+        check_fall_back(
+            "truth tools not installed (heyoka is missing: import of heyoka halted; None in sys.modules); "
+            "`uv pip install -r locks/truth.lock` installs them"
+        )
+    finally:
+        load_heyoka.cache_clear()
+
+
+def test_the_closed_form_is_compared_without_heyoka_too():
+    scenario = load_scenario(find_scenario_file("lagrange-top"))
+    r, p = closed_form_motion(scenario)(TIMES)
+    truth = trajectory_truth(scenario.model, scenario.state, TIMES, (r, p, "a book"), max_compiled_bodies=0)
+    assert (
+        truth.method == "closed form: a book; uncertainty: its difference from the notes' form by collocation"
+    )
+    assert 0 < truth.position_uncertainty[-1] < 1e-13
+
+
+def test_a_failure_of_heyoka_does_not_lose_the_truth(monkeypatch):
+    def fails(*arguments):
+        raise EngineFailure("heyoka stopped: err_nf_state")
+
+    monkeypatch.setattr(trajectory, "simulate_taylor", fails)
+    check_fall_back("EngineFailure: heyoka stopped: err_nf_state")
+
+
+def test_a_worker_has_room_for_it():
+    """Ten bodies compile and run within a quarter of a worker's address space."""
+    scenario = load_scenario(find_scenario_file("chain-10-rods"))
+    arguments = (scenario.model, scenario.state, TIMES)
+    with WorkerPool(1, Limits(gigabytes=2.0)) as workers:
+        (outcome,) = workers.run([Task("truth", trajectory_truth, arguments)])
+    assert outcome.failure is None
+    assert "Taylor" in outcome.value.method
+
+
+def test_sympy_is_hidden_only_while_heyoka_is_imported():
+    """It would take two seconds; later it must be there for Kane's equations."""
+    seen = "import sys; from plumbline.truth.taylor import heyoka; heyoka(); print('sympy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", seen], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"

@@ -1,0 +1,1 @@
+"""Mutation testing: do the tests notice small mistakes in the code?"""
