@@ -22,6 +22,7 @@ from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel
 from packaging.version import InvalidVersion, Version
 
 from plumbline.engines.registry import ENGINES
+from plumbline.processes.errors import PlumblineError
 from plumbline.processes.isolation import ScratchFolder
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -29,7 +30,7 @@ BASE_REQUIREMENTS = ("numpy", "scipy", "packaging")  # what adapters and the wor
 INSTALL_TIMEOUT = 900  # s for uv to fetch and install
 
 
-class EnvironmentUnavailable(Exception):
+class EnvironmentUnavailable(PlumblineError):
     """The version cannot be had here; the message says why."""
 
 

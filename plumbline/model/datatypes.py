@@ -1,6 +1,6 @@
 """What crosses from one stage to the next: small frozen records of NumPy arrays.
 
-A leaf module: it imports nothing of the project.  Frames and units, everywhere:
+Frames and units, everywhere:
 SI; world z up, pivot at the world origin; ``r`` is a centre of mass in the world
 frame; quaternions are scalar first and turn body vectors into world vectors;
 ``omega`` is the angular velocity in the body frame (the notes' ω′ = 2 L(p) ṗ).
@@ -15,21 +15,23 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from plumbline.processes.errors import PlumblineError
+
 Array = NDArray[np.float64]
 
 Level = Literal["state", "invariants", "trajectory", "relations"]
 Verdict = Literal["agrees", "disagrees", "unresolved", "unsupported", "not installed", "failed"]
 
 
-class Unsupported(Exception):
+class Unsupported(PlumblineError):
     """The engine cannot do this; the message is the sentence that stands in the results."""
 
 
-class EngineFailure(Exception):
+class EngineFailure(PlumblineError):
     """The engine was asked for something it offers and did not deliver it; the message says what it did."""
 
 
-class BadInput(ValueError):
+class BadInput(PlumblineError, ValueError):
     """A state or model was refused before any engine saw it."""
 
 

@@ -22,15 +22,17 @@ from importlib import import_module
 from pathlib import Path
 from typing import IO, Any
 
+from plumbline.processes.errors import PlumblineError
+
 ROOT = Path(__file__).resolve().parents[2]
 FRAME_LENGTH = struct.Struct("<Q")
 
 
-class RemoteCrash(Exception):
+class RemoteCrash(PlumblineError):
     """The child ended before it answered; the message says how."""
 
 
-class RemoteError(Exception):
+class RemoteError(PlumblineError):
     """What was raised in the child: class and words, its own class may not exist here."""
 
 

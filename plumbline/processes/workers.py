@@ -21,6 +21,7 @@ from typing import Any
 
 from pebble import ProcessExpired, ProcessPool
 
+from plumbline.processes.errors import PlumblineError
 from plumbline.processes.isolation import ScratchFolder
 from plumbline.processes.packed import Pickled
 from plumbline.processes.parent_death import die_with_parent
@@ -79,7 +80,7 @@ class Outcome:
         return self.raw_value if isinstance(self.raw_value, Pickled) else Pickled.of(self.raw_value)
 
 
-class ExecutorUnavailable(Exception):
+class ExecutorUnavailable(PlumblineError):
     """Those who should do the work cannot be had; the message says why."""
 
 

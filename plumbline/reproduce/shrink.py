@@ -15,6 +15,7 @@ import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import state_from_minimal
+from plumbline.processes.errors import PlumblineError
 
 PLAIN = 10.0  # times the tolerance: a shrunk case shows at least this, or half of what it showed
 FEWEST = 3  # runs of a ladder: what an extrapolation and its uncertainty need
@@ -53,7 +54,7 @@ class Measured(Protocol):
         """Error over tolerance: above 1 it disagrees."""
 
 
-class OutOfTime(Exception):
+class OutOfTime(PlumblineError):
     """No case was found in the time that was given."""
 
 

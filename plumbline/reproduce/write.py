@@ -22,6 +22,7 @@ from plumbline.judging.long_runs import MIN_WINDOW_SECONDS
 from plumbline.model.datatypes import Model, State
 from plumbline.model.kinematics import state_from_minimal
 from plumbline.model.sampling import derive_seed, random_states
+from plumbline.processes.errors import PlumblineError
 from plumbline.processes.workers import Limits, Task, WorkerPool
 from plumbline.reproduce.engine_client import Engine
 from plumbline.reproduce.measure import Question, measure_of, shrunk, whole
@@ -35,7 +36,7 @@ TRIES = 6  # at least so many make a case smaller: where they take longer than `
 ASK = "ask for this row by its key"
 
 
-class NotReproducible(ValueError):
+class NotReproducible(PlumblineError, ValueError):
     """No script can be made of that row; the message says why."""
 
 

@@ -6,6 +6,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 
+from plumbline.processes.errors import PlumblineError
+
 MAX_LISTED_PROBLEMS = 100  # problems that the text of an error lists; `problems` holds them all
 
 
@@ -26,7 +28,7 @@ class Problem:
         return ": ".join(parts) + (f"; valid would be {self.valid}" if self.valid else "")
 
 
-class ScenarioError(ValueError):
+class ScenarioError(PlumblineError, ValueError):
     """A scenario that cannot be used; carries every problem that was found, one per line as text."""
 
     def __init__(self, problems: Iterable[Problem]):

@@ -9,8 +9,10 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
+from plumbline.processes.errors import PlumblineError
 
-class TruthUnavailable(ImportError):
+
+class TruthUnavailable(PlumblineError, ImportError):
     """The truth tools are not installed; the message says which and how to get them."""
 
 

@@ -19,13 +19,14 @@ from typing import Any
 import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State, StateQuantities
+from plumbline.processes.errors import PlumblineError
 from plumbline.truth import import_truth_tool
 
 MAX_RELATIVE_RADIUS = 1e-25  # relative to the largest magnitude of the quantity's own terms
 MAX_BITS = 20_000
 
 
-class CertificationFailure(ArithmeticError):
+class CertificationFailure(PlumblineError, ArithmeticError):
     """No finite enclosure was found: the system is singular at this state, or nearly so."""
 
 

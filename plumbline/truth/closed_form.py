@@ -17,12 +17,13 @@ from scipy.linalg import eigh
 
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
+from plumbline.processes.errors import PlumblineError
 from plumbline.truth.elliptic import elliptic_f, elliptic_pi, jacobi
 
 CONDITION_RTOL = 1e-12  # relative: what a rounded input may miss a condition by
 
 
-class ClosedFormMismatch(ValueError):
+class ClosedFormMismatch(PlumblineError, ValueError):
     """The scenario does not satisfy what its closed form presupposes; the message says which condition."""
 
 
