@@ -123,7 +123,7 @@ class Exudyn(Adapter):
     name = "exudyn"
     title = "Exudyn"
     package = "exudyn"
-    supported = SUPPORTED_VERSIONS
+    supported_versions = SUPPORTED_VERSIONS
     integrators: ClassVar[tuple[Integrator, ...]] = (
         Integrator(
             "trapezoidal",
@@ -144,8 +144,8 @@ class Exudyn(Adapter):
         ),
     )
 
-    solvers = ("EXUdense", "EigenDense")
-    unwelded = ""
+    linear_solvers = ("EXUdense", "EigenDense")
+    welding_unsupported_reason = ""
 
     def version(self) -> str:
         """Version of the Exudyn that runs."""
@@ -163,7 +163,7 @@ class Exudyn(Adapter):
             rows = self._run_samples(chain, times, integrator, resolution)
         return trajectory_from_samples(model, state, times, rows, resolution)
 
-    def _retrace(
+    def _simulate_round_trip(
         self, model: Model, state: State, end: float, integrator: Integrator, resolution: float
     ) -> Trajectory:
         initial, leg = exudyn.ConfigurationType.Initial, np.array([0.0, end])

@@ -242,12 +242,12 @@ class ExudynTree(Adapter):
     name = "exudyn-tree"
     title = "Exudyn (kinematic tree)"
     package = "exudyn"
-    supported = SUPPORTED_VERSIONS
+    supported_versions = SUPPORTED_VERSIONS
     integrators: ClassVar[tuple[Integrator, ...]] = (
         Integrator("RK44", "step", 4, (4, 5, 6, 7, 8), note="classical Runge-Kutta on joint angles"),
     )
-    solvers = ("EigenSparse",)
-    unwelded = "a kinematic tree has revolute and prismatic joints, none that holds two links rigidly"
+    linear_solvers = ("EigenSparse",)
+    welding_unsupported_reason = "a kinematic tree has revolute and prismatic joints, none that holds two links rigidly"
 
     def version(self) -> str:
         """Version of the Exudyn that runs."""

@@ -56,7 +56,7 @@ class Mujoco(Adapter):
     name = "mujoco"
     title = "MuJoCo"
     package = "mujoco"
-    supported = ">=3.2,<5"
+    supported_versions = ">=3.2,<5"
     integrators = (
         Integrator("Euler", "step", 1, FIRST_ORDER_POWERS, note="semi-implicit Euler"),
         Integrator(
@@ -73,7 +73,7 @@ class Mujoco(Adapter):
         Integrator("RK4", "step", 4, (4, 5, 6, 7, 8), note="classical Runge–Kutta on the rotation group"),
     )
     options = ("dense mass matrix",)
-    unwelded = ""
+    welding_unsupported_reason = ""
 
     def version(self) -> str:
         """Version of the loaded library."""

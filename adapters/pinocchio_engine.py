@@ -315,8 +315,8 @@ class Pinocchio(Adapter):
     name: ClassVar[str] = "pinocchio"
     title: ClassVar[str] = "Pinocchio"
     package: ClassVar[str] = "pin"
-    supported = ">=3.3.1,<5"
-    needs = (("<4", "cmeel-urdfdom<5"), ("<4", "cmeel-tinyxml2<11"))  # what those wheels were linked with
+    supported_versions = ">=3.3.1,<5"
+    extra_requirements = (("<4", "cmeel-urdfdom<5"), ("<4", "cmeel-tinyxml2<11"))  # what those wheels were linked with
     integrators: ClassVar[tuple[Integrator, ...]] = (
         Integrator(
             "semi-implicit-euler",
@@ -336,12 +336,12 @@ class Pinocchio(Adapter):
     )
 
     options: ClassVar[tuple[Algorithm, ...]] = ("cholesky", "forwardDynamics")
-    unwelded = ""
+    welding_unsupported_reason = ""
 
     def __init__(self, algorithm: Algorithm = "crba"):
         self.algorithm: Algorithm = algorithm
 
-    def by(self, option: str) -> Self:
+    def with_option(self, option: str) -> Self:
         """The same engine by another of its algorithms."""
         other = super().with_option(option)
         other.algorithm = cast(Algorithm, option)

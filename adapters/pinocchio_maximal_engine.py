@@ -137,11 +137,11 @@ class PinocchioMaximal(Adapter):
     name: ClassVar[str] = "pinocchio-maximal"
     title: ClassVar[str] = "Pinocchio, maximal coordinates"
     package: ClassVar[str] = "pin"
-    supported = ">=3.3.1,<5"
-    needs = (("<4", "cmeel-urdfdom<5"), ("<4", "cmeel-tinyxml2<11"))  # what those wheels were linked with
+    supported_versions = ">=3.3.1,<5"
+    extra_requirements = (("<4", "cmeel-urdfdom<5"), ("<4", "cmeel-tinyxml2<11"))  # what those wheels were linked with
     integrators: ClassVar[tuple[Integrator, ...]] = ()
     options = ("inverse of the KKT matrix",)
-    unwelded = ""
+    welding_unsupported_reason = ""
 
     def version(self) -> str:
         """Version of the pin wheel."""

@@ -60,7 +60,7 @@ class Reference(Adapter):
     )
 
     options = ("dense factors", "O(N) form")
-    unwelded = "the notes know ball joints and rods, no joint that holds two bodies rigidly"
+    welding_unsupported_reason = "the notes know ball joints and rods, no joint that holds two bodies rigidly"
 
     def version(self) -> str:
         """Version of this checkout."""
@@ -91,7 +91,7 @@ class Reference(Adapter):
             raise EngineFailure(f"{self.title}: {error}") from error
         return Trajectory(t=run.t, r=run.r, p=run.p, v=run.v, pdot=run.pdot, steps=run.steps)
 
-    def _retrace(
+    def _simulate_round_trip(
         self, model: Model, state: State, end: float, integrator: Integrator, resolution: float
     ) -> Trajectory:
         def legs(r: Array, p: Array, v: Array, pdot: Array) -> IntegrationResult:

@@ -278,7 +278,7 @@ def test_converges_to_the_truth_with_its_declared_order(engine, case):
         orders = np.log2(np.array(change[:-1]) / change[1:])[-2:]
         assert np.all(np.abs(orders - method.order) < 0.1), f"{method.name}: orders {orders}"
         previous, limit = None, rows
-        for power in method.powers[: len(rows) - 1]:
+        for power in method.error_exponents[: len(rows) - 1]:
             previous, limit = limit[-1], [b + (b - a) / (2**power - 1) for a, b in pairwise(limit)]
         uncertainty = 10 * np.max(np.abs(limit[-1] - previous)) + 1e-11
         assert uncertainty < 1e-5, f"{method.name}: extrapolation is uncertain by {uncertainty}"

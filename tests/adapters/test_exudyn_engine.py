@@ -72,7 +72,7 @@ def test_order_and_limit(engine, method, levels, order, joints):
     steps = np.abs(np.diff(runs, axis=0)).max(axis=(1, 2, 3))
     shown = np.log2(steps[:-1] / steps[1:])
     assert abs(shown[1] - order) < 0.1, f"{method} on {joints} shows orders {shown}, declared {order}"
-    error = np.abs(limit(runs, engine.integrator(method).powers) - true).max()
+    error = np.abs(limit(runs, engine.integrator(method).error_exponents) - true).max()
     assert error < 1e-11, f"the limit of {method} on {joints} is off by {error:.1e} m"
 
 

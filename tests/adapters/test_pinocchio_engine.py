@@ -20,7 +20,7 @@ from tests.helpers.pendulums import JOINTS
 pin = pytest.importorskip("pinocchio")
 pinocchio_engine = pytest.importorskip("adapters.pinocchio_engine")
 maximal = pytest.importorskip("adapters.pinocchio_maximal_engine")
-Chain, Pinocchio = pinocchio_engine.Chain, pinocchio_engine.Pinocchio
+Chain, Pinocchio = pinocchio_engine.PinocchioChain, pinocchio_engine.Pinocchio
 PinocchioMaximal = maximal.PinocchioMaximal
 
 TIMES = np.linspace(0, 2, 5)
@@ -131,7 +131,7 @@ def test_without_the_inverse_differential_the_order_is_two():
     """Why Munthe-Kaas: Runge–Kutta stages through `integrate` alone look the same and are order 2."""
     model = pendulums.model("bb")
     state = pendulums.state(model, rate=0.5)
-    with patch.object(Chain, "flow", lambda self, q, theta, v: v):
+    with patch.object(Chain, "exponential_coordinate_rate", lambda self, q, theta, v: v):
         seen = orders(refined(model, state, "rkmk4", 2.0**-9, 4))
     assert np.all(np.abs(seen - 2) < 0.1), f"orders {seen}"
 
@@ -145,8 +145,8 @@ def test_loads_are_taken_at_every_stage():
     assert np.all(np.abs(seen - 4) < 0.1), f"orders {seen}"
 
     def frozen(chain, q, v, h):
-        chain.load(q, v)
-        with patch.object(Chain, "load", lambda self, q, v: None):
+        chain.update_loads(q, v)
+        with patch.object(Chain, "update_loads", lambda self, q, v: None):
             return step(chain, q, v, h)
 
     step = pinocchio_engine.rkmk4
@@ -180,7 +180,7 @@ def test_rods_point_everywhere_and_spin_about_themselves_by_integration_error_on
     ups = np.vstack([np.eye(3), -np.eye(3), near_down, np.random.default_rng(0).normal(size=(50, 3))])
     for u in ups:
         u = u / np.linalg.norm(u)
-        toward = kinematics.rotation_matrix(pinocchio_engine.pointing(u))[:, 2]
+        toward = kinematics.rotation_matrix(pinocchio_engine.rod_quaternion(u))[:, 2]
         assert np.max(np.abs(toward - u)) < 1e-15, f"{toward} for {u}"
     model = pendulums.model("rbr", loads=True)
     state = pendulums.state(model)
@@ -195,8 +195,8 @@ def _rod_spins(model, state, h):
     q, v = chain.coordinates(state)
     for _ in range(round(1 / h)):
         q, v = pinocchio_engine.rkmk4(chain, q, v, h)
-    pin.forwardKinematics(chain.pin, chain.data, q, v)
-    return [chain.data.v[int(j) + 1].angular[2] for j in chain.rods]
+    pin.forwardKinematics(chain.pin_model, chain.data, q, v)
+    return [chain.data.v[int(j) + 1].angular[2] for j in chain.rod_rows]
 
 
 @in_the_engines_process

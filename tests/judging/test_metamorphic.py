@@ -313,8 +313,8 @@ def damped(real):
     """A millionth of a newton metre second on every body: it knows the direction of time."""
 
     class Damped(real):
-        def _retrace(self, model, *more):
-            return super()._retrace(replace(model, drag_moment=np.full(model.n, 1e-6)), *more)
+        def _simulate_round_trip(self, model, *more):
+            return super()._simulate_round_trip(replace(model, drag_moment=np.full(model.n, 1e-6)), *more)
 
     return Damped
 
@@ -408,9 +408,9 @@ def test_runs_by_tolerance_have_no_solvers_and_are_not_tried_finer():
     tried = []
 
     class Failing(type(load_adapter("reference"))):
-        solvers = ("never",)
+        linear_solvers = ("never",)
 
-        def _retrace(self, *_):
+        def _simulate_round_trip(self, *_):
             tried.append(1)
             raise EngineFailure("it stopped")
 
