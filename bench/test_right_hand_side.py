@@ -47,7 +47,7 @@ def test_single(benchmark: Any, bodies: int, rods: bool) -> None:
             "bodies": bodies,
             "joints": "rods" if rods else "balls",
             "microseconds": {name: 1e6 * t.best / per_call[name] for name, t in timing.items()},
-            "ratio": {name: ours.over(t) * per_call[name] for name, t in timing.items() if t is not ours},
+            "ratio": {name: ours.ratio_to(t) * per_call[name] for name, t in timing.items() if t is not ours},
         },
     )
 
@@ -71,7 +71,7 @@ def test_batch(benchmark: Any, bodies: int, batch: int) -> None:
             "bodies": bodies,
             "batch": batch,
             "microseconds": {n: 1e6 * t.best / (batch if t is ours else 1) for n, t in timing.items()},
-            "ratio": {n: ours.over(t) / batch for n, t in timing.items() if t is not ours},
+            "ratio": {n: ours.ratio_to(t) / batch for n, t in timing.items() if t is not ours},
         },
     )
 
@@ -82,8 +82,8 @@ def test_growth(benchmark: Any, rods: bool) -> None:
     sizes = (100, 1000, 10_000)
     calls = {str(n): contenders.structured_call(*contenders.random_pendulum(n, rods)) for n in sizes}
     timing = benchmark.pedantic(time_interleaved, args=(calls,), rounds=1, iterations=1)
-    slope = np.log(timing["10000"].over(timing["100"])) / np.log(100)
-    last = np.log10(timing["10000"].over(timing["1000"]))
+    slope = np.log(timing["10000"].ratio_to(timing["100"])) / np.log(100)
+    last = np.log10(timing["10000"].ratio_to(timing["1000"]))
     record_table(
         benchmark,
         {

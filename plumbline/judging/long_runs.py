@@ -386,10 +386,10 @@ class DriftJudge:
         )
         name = f"{self.quantity}_long_growth"
         extra = {"asked": self.study.plan.requested_seconds}
-        common = {"value": grown, "tolerance": MAX_SYMMETRIC_GROWTH, "horizon": end, "extra": extra}
+        common = {"value": grown, "tolerance": MAX_SYMMETRIC_GROWTH, "compared_until": end, "extra": extra}
         if window.max_drift <= floor:
             reason = f"{self.name} is rounding: its growth says nothing"
-            return self.make_row(name, "agrees", reason, "1", horizon=end, extra=extra)
+            return self.make_row(name, "agrees", reason, "1", compared_until=end, extra=extra)
         kept = self.finest.windows[self.quantity]
         for a, b in itertools.pairwise(t for t in sorted(kept) if t >= MIN_WINDOW_SECONDS):
             if kept[b].max_drift > UNSTABLE_GROWTH_FACTOR * b / a * kept[a].max_drift:
@@ -434,7 +434,7 @@ class DriftJudge:
             value=kept[end].max_drift,
             tolerance=tolerance,
             derivation=why + self.study.plan.shortening_note,
-            horizon=end,
+            compared_until=end,
             order=order if self.integrator.kind == "step" else None,
             declared_order=self.integrator.order if order and self.integrator.kind == "step" else None,
             extra={"scale": self.scale(end), "asked": self.study.plan.requested_seconds, **extra},

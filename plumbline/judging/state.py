@@ -92,7 +92,7 @@ def state_row(context: RowContext, quantity: str, unit: str, found: Columns, met
             f"first-order rounding bound per body and state, {allowed:.2g} {unit} at {where}, "
             f"{bluntness:.1g} of the scale in the median of {count} states; truth: {method}"
         ),
-        "wall_time": cost,
+        "cpu_time": cost,
         "extra": {
             "ratio": ratio,
             "relative": relative,

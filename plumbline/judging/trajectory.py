@@ -125,7 +125,7 @@ class RefinementAnalysis:
     def common_fields(self) -> dict[str, Any]:
         """What every row of this ladder says besides its quantity."""
         alias = None if self.model.has_drag else self.integrator.alias_of  # drag is where they part
-        return {"alias_of": alias, "wall_time": sum(rung.cpu_time for rung in self.runs)}
+        return {"alias_of": alias, "cpu_time": sum(rung.cpu_time for rung in self.runs)}
 
     def samples(self, run: RefinementRun, name: str) -> Array:
         """(T, N, width), NaN where the rung did not stay finite; quaternions signed like the finest run's."""
@@ -194,7 +194,7 @@ class RefinementAnalysis:
             tolerance=ORDER_MARGIN,
             order=order.value,
             declared_order=declared,
-            horizon=self.observed_until,
+            compared_until=self.observed_until,
             derivation=f"log2 of ratios of consecutive differences of (r, ṙ) over {steps}: {listed}; "
             f"two consecutive ones within {ORDER_MARGIN} of {declared} show it"
             f", three that stay away from it by {ORDER_CHANGE_FACTOR:g} times their changes another",
@@ -250,7 +250,7 @@ class RefinementAnalysis:
         common = {
             **self.common_fields,
             "uncertainty": float(ladder[at] + truth_uncertainty[at]),
-            "horizon": end,
+            "compared_until": end,
         }
         own = np.maximum.accumulate(distance(samples[-1], true))[at]
         estimate = float(np.max(distance(samples[-1], limit.y)[: at + 1]) + tolerance[at])
@@ -364,7 +364,7 @@ class RefinementAnalysis:
                 value=float(drift[at]),
                 tolerance=tolerance,
                 derivation=why,
-                horizon=float(self.times[at]),
+                compared_until=float(self.times[at]),
                 extra={"scale": scale, "whole": float(drift[-1]), **extra},
                 **self.common_fields,
             )

@@ -59,7 +59,7 @@ def run(out, **more):
     options = {"random": 3, "seed": 11, "jobs": 1, "limits": Limits(), "whole": False, "finer": 0} | more
     progress = options.pop("progress", quiet)
     return nightly.nightly(
-        out, chosen, ["mujoco"], command="-", progress=progress, tell=quiet, **options
+        out, chosen, ["mujoco"], command="-", progress=progress, log=quiet, **options
     )  # fmt: skip
 
 
@@ -74,7 +74,7 @@ def test_a_night_is_whole_and_remembered(tmp_path):
     assert (stored["seed"], stored["random"]) == (11, 3)
     assert not [r for r in result.rows if r.family == RANDOM_FAMILY], "what agrees is folded"
     folded, random = (
-        result.probes.folded,
+        result.random_batch.counts_by_verdict,
         [r for r in read_table(place, "summary") if r["family"] == RANDOM_FAMILY],
     )
     assert {r["scenario"] for r in random} == {f"random-11-{k}" for k in range(3)}
@@ -110,7 +110,7 @@ def test_an_unfinished_night_goes_on_with_its_seed(tmp_path):
     for path in kept:  # what is kept is used: no cell of it is written again
         path.chmod(0o400)
     result, _ = run(tmp_path, seed=None)
-    assert result.run["seed"] == begun["seed"] and result.run["started"] == begun["started"]
+    assert result.metadata["seed"] == begun["seed"] and result.metadata["started"] == begun["started"]
     calm, _ = run(tmp_path / "calm", seed=begun["seed"])
     assert [(r.key, r.value, r.verdict) for r in result.rows] == [
         (r.key, r.value, r.verdict) for r in calm.rows
@@ -139,7 +139,7 @@ def test_what_someone_should_see_is_kept_whole_with_its_file(tmp_path):
         0.5,
         drawn[0].name,
     )
-    excused = replace(kept[-1], known="k")
+    excused = replace(kept[-1], known_issue="k")
     assert probes.add_scenario([excused]) == [], "a recorded gap of every probe is only counted"
     nightly.write_files_of_random(
         RunResult(kept, [], {}, {}, probes, ResultTables(), CpuTimes(), {}), drawn, tmp_path

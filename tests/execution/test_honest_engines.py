@@ -53,14 +53,14 @@ def accused(result):
 
 def worst(result):
     """The largest error over its bound, per engine, of rows only counted and of rows kept."""
-    counted = [(cell["engine"], cell["ratio"]) for cell in result.run["probes"]["worst"]]
+    counted = [(cell["engine"], cell["ratio"]) for cell in result.metadata["probes"]["worst"]]
     kept = [(row.engine, row.extra["ratio"]) for row in result.rows if "ratio" in row.extra]
     return {engine: max(ratio for who, ratio in counted + kept if who == engine) for engine in ENGINES}
 
 
 def told(result):
     """Rows by verdict."""
-    counted = result.probes.folded.copy()
+    counted = result.random_batch.counts_by_verdict.copy()
     counted.update(row.verdict for row in result.rows)
     return counted
 

@@ -196,7 +196,7 @@ def test_the_key_is_the_content():
     assert key == task_hash(replace(base, key="b")), "the key is not the label's"
     changed = [
         replace(base, version="3.3.0"),
-        replace(base, call=calls.evaluate_states),
+        replace(base, function=calls.evaluate_states),
         *(
             replace(base, arguments=(*base.arguments[:i], value, *base.arguments[i + 1 :]))
             for i, value in enumerate(

@@ -51,9 +51,11 @@ def test_states_are_asked_for_with_their_truth_and_judged_alike_here_and_by_the_
             assert not bench.is_done
             found = answered(task)
             assert len(found.judge_result.rows) == 7
-            bench.on_outcome(found if elsewhere else replace(found, judged=None))  # as the memory has it
+            bench.on_outcome(
+                found if elsewhere else replace(found, judge_result=None)
+            )  # as the memory has it
         assert bench.is_done
-    by_worker, here = ([replace(r, wall_time=0.0) for r in bench.findings().rows] for bench in benches)
+    by_worker, here = ([replace(r, cpu_time=0.0) for r in bench.findings().rows] for bench in benches)
     assert by_worker == here and len(here) == 14
 
 
@@ -102,7 +104,7 @@ def test_in_a_run_the_second_truth_is_handed_over(monkeypatch):
 
     def first_crashes(self, key, *uncompiled):
         asked.append(truth(self, key, *uncompiled))
-        return asked[-1] if uncompiled else replace(asked[-1], call=crash)
+        return asked[-1] if uncompiled else replace(asked[-1], function=crash)
 
     monkeypatch.setattr(ScenarioRun, "truth_task", first_crashes)
     chosen = loader.load_scenario(loader.find_scenario_file("rest"))

@@ -61,9 +61,9 @@ def test_a_night_with_a_dull_instrument_is_not_green(tmp_path, trouble):
         return SelfTestResult({"planted": 67, "reported": 67}, trouble)
 
     _, place = nightly.nightly(
-        tmp_path, loader.load_scenarios(["rest"]), ["mujoco"], random=0, seed=1, jobs=1, limits=Limits(),
-        whole=False, command="-", level="state", instrument=said, progress=lambda *_: None,
-        tell=lambda _: None,
+        tmp_path, loader.load_scenarios(["rest"]), ["mujoco"], random_count=0, seed=1, jobs=1, limits=Limits(),
+        is_full_catalogue=False, command="-", level="state", self_test=said, progress=lambda *_: None,
+        log=lambda _: None,
     )  # fmt: skip
     run = json.loads((place / "results.json").read_text())["run"]
     assert run["exit_code"] == bool(trouble) and run["instrument"]["planted"] == 67
@@ -76,8 +76,8 @@ def test_a_night_killed_as_it_was_done_is_not_had_twice(tmp_path, monkeypatch):
 
     def night():
         return nightly.nightly(
-            tmp_path, loader.load_scenarios(["rest"]), ["mujoco"], random=0, seed=None, jobs=1, limits=Limits(),
-            whole=False, command="-", level="state", progress=lambda *_: None, tell=lambda _: None,
+            tmp_path, loader.load_scenarios(["rest"]), ["mujoco"], random_count=0, seed=None, jobs=1, limits=Limits(),
+            is_full_catalogue=False, command="-", level="state", progress=lambda *_: None, log=lambda _: None,
         )  # fmt: skip
 
     def killed(_):
@@ -90,5 +90,5 @@ def test_a_night_killed_as_it_was_done_is_not_had_twice(tmp_path, monkeypatch):
     assert (tmp_path / "unfinished" / "plan.json").exists()
     result, place = night()
     seeds = [json.loads((p / "results.json").read_text())["run"]["seed"] for p in (first, place)]
-    assert place != first and seeds[0] != seeds[1] == result.run["seed"]
+    assert place != first and seeds[0] != seeds[1] == result.metadata["seed"]
     assert not (tmp_path / "unfinished").exists()

@@ -36,7 +36,7 @@ def covers(an_entry, of):
 def test_an_entry_marks_its_row_and_no_other():
     rows = [row(), row(quantity="joint_reaction"), row("unresolved")]
     judged = judged_by(rows, [entry()], whole=True)
-    assert [r.known for r in judged.rows] == ["a", None, None]
+    assert [r.known_issue for r in judged.rows] == ["a", None, None]
     assert judged.stale == []
 
 
@@ -60,7 +60,7 @@ def test_a_pattern_is_stale_only_when_the_whole_matrix_ran():
 )
 def test_version_ranges(versions, excused):
     judged = judged_by([row()], [entry(versions=versions)], whole=False)
-    assert (judged.rows[0].known == "a") is excused
+    assert (judged.rows[0].known_issue == "a") is excused
     assert judged.stale == [], "an entry about another version is not about this run"
 
 
@@ -98,12 +98,12 @@ def test_a_list_of_scenarios_is_an_entry_for_each(tmp_path):
 
 
 def test_only_random_scenarios_may_show_it_sometimes():
-    chance = entry(scenario="random-*", sometimes=True)
+    chance = entry(scenario="random-*", intermittent=True)
     who = RowContext("random-1-2", "random", "mujoco", "MuJoCo", "4.0.0")
     assert judged_by([row("agrees", who=who)], [chance], whole=True).stale == []
-    assert judged_by([row(who=who)], [chance], whole=True).rows[0].known == "a"
+    assert judged_by([row(who=who)], [chance], whole=True).rows[0].known_issue == "a"
     with pytest.raises(ValueError, match="random"):
-        entry(sometimes=True)
+        entry(intermittent=True)
 
 
 def test_finer_ladders_may_resolve_what_was_not():
@@ -166,7 +166,7 @@ def test_versions_that_are_none_and_those_before_a_release(version, versions, in
 def test_the_entry_with_the_rows_verdict_excuses_it_and_the_other_is_stale():
     both = [entry(id="open", verdict="unresolved"), entry(id="off")]
     judged = judged_by([row()], both, whole=True)
-    assert judged.rows[0].known == "off"
+    assert judged.rows[0].known_issue == "off"
     assert [e.id for e in judged.stale] == ["open"]
 
 
@@ -201,8 +201,8 @@ def test_what_an_entry_does_not_say_is_anything():
 
 
 def test_what_finer_ladders_alone_show_is_expected_of_them_alone():
-    nightly = entry(finer=True)
+    nightly = entry(extra_refinements_only=True)
     usual, finer = (judged_by([row()], [nightly], whole=True, finer=f) for f in (False, True))
-    assert usual.rows[0].known is None and usual.stale == []
-    assert finer.rows[0].known == "a" and finer.stale == []
+    assert usual.rows[0].known_issue is None and usual.stale == []
+    assert finer.rows[0].known_issue == "a" and finer.stale == []
     assert judged_by([row("agrees")], [nightly], whole=True, finer=True).stale == [nightly]

@@ -322,13 +322,13 @@ def damped(real):
 @pytest.mark.parametrize("engine", ["exudyn", "reference"])
 def test_damping_is_not_reversed(engine):
     real = damped(type(load_adapter(engine)))
-    integrator = next(i.name for i in real.integrators if i.symmetric)
+    integrator = next(i.name for i in real.integrators if i.is_symmetric)
     assert ran(real(), "reversed in time", integrator=integrator).ratio > 1
 
 
 def test_a_scheme_that_is_not_symmetric_does_not_come_back():
     class Alpha(exudyn()):
-        integrators = tuple(replace(i, symmetric=True) for i in exudyn().integrators)
+        integrators = tuple(replace(i, is_symmetric=True) for i in exudyn().integrators)
 
     assert ran(Alpha(), "reversed in time").ratio < 0.3
     assert ran(Alpha(), "reversed in time", integrator="generalized-alpha").ratio > 1e3
@@ -336,7 +336,11 @@ def test_a_scheme_that_is_not_symmetric_does_not_come_back():
 
 def test_accelerations_that_are_not_carried_break_the_way_back():
     class Forgetful(exudyn()):
-        _rows = partialmethod(lambda self, *more, afresh=True: exudyn()._rows(self, *more, afresh=True))
+        _run_samples = partialmethod(
+            lambda self, *more, compute_initial_accelerations=True: exudyn()._run_samples(
+                self, *more, compute_initial_accelerations=True
+            )
+        )
 
     assert ran(Forgetful(), "reversed in time").ratio > 1
 
@@ -358,7 +362,7 @@ def test_drag_is_not_reversed_and_a_failing_run_is_told():
     assert found and not any(held.relation == "reversed in time" for held in found)
 
     class Failing(exudyn()):
-        def _rows(self, *_, **__):
+        def _run_samples(self, *_, **__):
             raise EngineFailure("it stopped")
 
     model = pendulums.model(JOINTS["ball"])
@@ -371,8 +375,8 @@ def test_drag_is_not_reversed_and_a_failing_run_is_told():
 
 def test_a_solver_with_which_a_run_fails_is_told():
     class Half(exudyn()):
-        def by(self, option):
-            found = super().by(option)
+        def with_option(self, option):
+            found = super().with_option(option)
             found._simulate = failing
             return found
 
@@ -395,7 +399,7 @@ def test_two_solvers_may_both_be_off():
         state_at_sample(
             way.simulate(model, at, np.array([0.0, found.end_time]), "trapezoidal", found.resolution), -1
         )
-        for way in (exudyn()(), exudyn()().by("EigenDense"))
+        for way in (exudyn()(), exudyn()().with_option("EigenDense"))
     ]
     limit = 2 * run_tolerance(trapezoidal(), model, at, found.end_time, 16)
     assert found.ratio > 0
@@ -423,11 +427,11 @@ def test_a_step_too_coarse_to_be_solved_is_taken_finer():
     tried = []
 
     class Stiff(exudyn()):
-        def _rows(self, chain, times, integrator, step, afresh=True):
+        def _run_samples(self, chain, times, integrator, step, compute_initial_accelerations=True):
             tried.append(step)
             if step > max(tried) / 4:
                 raise EngineFailure("no convergence")
-            return super()._rows(chain, times, integrator, step, afresh)
+            return super()._run_samples(chain, times, integrator, step, compute_initial_accelerations)
 
     found = ran(Stiff(), "reversed in time")
     assert found.ratio < 0.3 and min(tried) == max(tried) / 4

@@ -228,7 +228,7 @@ def test_a_run_may_be_off_by_its_rounding_its_solver_and_its_accelerations_grown
     assert grown > 1.1 and ratio > 1.1
     limit = run_tolerance(method, MODEL, at, end, steps)
     assert limit == pytest.approx((RUN_ROUNDING + solved + pushed) * grown, rel=1e-12, abs=0)
-    bare = replace(method, solver=0.0, tightest=0.0)
+    bare = replace(method, solver_rtol=0.0, min_rtol=0.0)
     assert run_tolerance(bare, MODEL, at, end, steps) == pytest.approx(
         (RUN_ROUNDING + pushed) * grown, rel=1e-12, abs=0
     )

@@ -110,7 +110,7 @@ def test_windows_halve_down_to_an_eighth_with_three_samples_at_least(until, numb
 
 
 def test_an_order_that_stays_away_disagrees_and_one_on_its_way_decides_nothing():
-    one = rows(climbed([0.01 * h for h in STEPS]), replace(METHOD, powers=(1, 2, 3)))["order"]
+    one = rows(climbed([0.01 * h for h in STEPS]), replace(METHOD, error_exponents=(1, 2, 3)))["order"]
     assert (one.verdict, one.order, one.value) == ("disagrees", pytest.approx(1), pytest.approx(1))
     lost = rows(climbed([0.01, 0.003, 0.002, 0.0003, 0.0002, 0.00001]))["order"]
     assert lost.verdict == "unresolved" and lost.reason.startswith("not in the asymptotic range: orders ")
@@ -169,12 +169,12 @@ def test_a_shorter_window_may_tell_where_the_long_one_cannot():
     assert found["position"].value == pytest.approx(0.01 * STEPS[-1] ** 2, rel=1e-6)
     assert found["position"].tolerance == pytest.approx(0.01 * STEPS[-1] ** 2 + limit.tolerance, rel=1e-6)
     assert found["attitude_limit"].compared_until == 2.0
-    both = rows(visible_position=np.full(17, 1e-14))
+    both = rows(detectable_position=np.full(17, 1e-14))
     blind = both["position_limit"]
     assert both["position"].verdict == "unresolved", "the finest run is no better than its limit"
     assert (blind.verdict, blind.compared_until) == ("unresolved", 2.0)
     assert "is above the 1e-14 m that a mistake of 0.0001 would make" in blind.reason
-    endless = rows(visible_position=np.full(17, np.inf))["position_limit"]
+    endless = rows(detectable_position=np.full(17, np.inf))["position_limit"]
     assert endless.verdict == "agrees" and endless.extra["visible"] == 1e308
     short = rows(horizon=0.5)["position_limit"]
     assert short.compared_until == 0.5
@@ -185,7 +185,7 @@ def test_the_border_is_the_tolerance_and_the_tolerance_what_is_visible():
     for shift, verdict in ((0.95 * tolerance / 2, "agrees"), (1.05 * tolerance / 2, "disagrees")):
         assert rows(climbed([shift + 0.01 * h**2 for h in STEPS]))["position_limit"].verdict == verdict
     for visible, horizon in ((1.01 * tolerance, 2.0), (0.99 * tolerance, 1.0)):  # rounding grows with time
-        assert rows(visible_position=np.full(17, visible))["position_limit"].compared_until == horizon
+        assert rows(detectable_position=np.full(17, visible))["position_limit"].compared_until == horizon
 
 
 def test_runs_that_did_not_stay_finite_are_points_of_the_study():
@@ -236,7 +236,7 @@ def test_a_method_with_a_tolerance_has_no_order_and_its_tightest_run_is_the_limi
 
 
 def test_an_implicit_solver_walks_at_random():
-    method = replace(METHOD, solver=1e-11)
+    method = replace(METHOD, solver_rtol=1e-11)
     held = ladder(method=method)
     np.testing.assert_allclose(held.rounding, (RUN_ROUNDING + 1e-10) * (1 + TIMES), rtol=1e-12)
     assert held.rounding_description() == "(10³ ε + 1e-11 of the step's solver × √100) G(t)"

@@ -78,7 +78,7 @@ def cluster(folder, workers):
 
 
 def said(plan, progress=lambda *_: None):
-    return [replace(row, wall_time=0.0) for row in run_plan(plan, progress).rows]
+    return [replace(row, cpu_time=0.0) for row in run_plan(plan, progress).rows]
 
 
 def plan(**more):

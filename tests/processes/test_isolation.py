@@ -21,15 +21,15 @@ LIMITS = Limits(seconds=10, gigabytes=4)
 def night(out, engines):
     (s,) = loader.load_scenarios(["planar-small"])
     return nightly.nightly(
-        out, [replace(s, duration=0.5)], engines, random=0, seed=1, jobs=2, limits=LIMITS, whole=False,
-        command="-", finer=0, level="trajectory", progress=lambda *_: None, tell=lambda _: None,
+        out, [replace(s, duration=0.5)], engines, random_count=0, seed=1, jobs=2, limits=LIMITS, is_full_catalogue=False,
+        command="-", extra_refinements=0, level="trajectory", progress=lambda *_: None, log=lambda _: None,
     )  # fmt: skip
 
 
 def said(rows, engine):
     """What the rows of an engine say, without who says it and what it cost."""
     return [
-        replace(row, engine="", wall_time=0.0)
+        replace(row, engine="", cpu_time=0.0)
         for row in rows
         if row.engine == engine and row.integrator != faulty.CELL
     ]

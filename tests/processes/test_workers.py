@@ -132,7 +132,7 @@ def test_a_clock_that_is_set_neither_kills_nor_spares(monkeypatch):
                     off[0] += step  # while the others run
                 found[outcome.key] = outcome
             assert found["nap"].value == 3.0
-            assert "hung" in (found["hang"].lost or "")
+            assert "hung" in (found["hang"].failure or "")
 
 
 def test_what_a_killed_run_leaves_is_removed_by_the_next(tmp_path, monkeypatch):

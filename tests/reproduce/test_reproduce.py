@@ -172,8 +172,8 @@ def test_a_script_measures_drifts_as_the_harness_does(engine, loads, count):
     ladder_ = measure.Ladder(who, case.model, truth, measure.integrator, rungs, 1.0)
     for quantity in found.drifts:
         printed = re.search(rf"{quantity} by(?:.*\n)+?  step {case.steps[-1]}: (\S+)", said)[1]
-        harness = np.max(np.linalg.norm(getattr(ladder_.drift[-1], quantity)[-1], axis=-1))
-        by_quadrature = ladder_.drift[-1].work_uncertainty * (quantity == "energy_drift")
+        harness = np.max(np.linalg.norm(getattr(ladder_.invariant_drifts[-1], quantity)[-1], axis=-1))
+        by_quadrature = ladder_.invariant_drifts[-1].work_uncertainty * (quantity == "energy_drift")
         assert float(printed) == pytest.approx(harness, rel=0.01, abs=1e-13 + 2 * by_quadrature), quantity
 
 

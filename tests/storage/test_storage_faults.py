@@ -36,13 +36,13 @@ class Here:
     def __exit__(self, *_):
         pass
 
-    def run(self, tasks, memory=None):
-        memory = memory or ResultCache()
+    def run(self, tasks, result_cache=None):
+        result_cache = result_cache or ResultCache()
         for task in tasks:
-            found = memory.get(task)
+            found = result_cache.get(task)
             if found is None:
                 found = workers.run_task(task)
-                memory.put(task, found)
+                result_cache.put(task, found)
             yield found
 
 
@@ -123,10 +123,10 @@ def disk(monkeypatch):
 def night(out):
     chosen = loader.load_scenarios(["rest"])
     result, place = nightly.nightly(
-        out, chosen, ["mujoco"], random=0, seed=1, jobs=1, limits=Limits(), whole=False, command="-", finer=0,
-        level="state", progress=lambda *_: None, tell=lambda _: None,
+        out, chosen, ["mujoco"], random_count=0, seed=1, jobs=1, limits=Limits(), is_full_catalogue=False, command="-", extra_refinements=0,
+        level="state", progress=lambda *_: None, log=lambda _: None,
     )  # fmt: skip
-    return [replace(row, wall_time=0.0) for row in result.rows], place
+    return [replace(row, cpu_time=0.0) for row in result.rows], place
 
 
 def fail_and_go_on(disk, out, expected, at, error, for_good):

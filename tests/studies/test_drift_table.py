@@ -28,7 +28,7 @@ def measured(names: Sequence[str], longest: float, **options: Any) -> list[dict[
 
 def test_every_variant_and_time_has_a_row_and_the_drift_is_the_raw_one(tmp_path: Path) -> None:
     told: list[str] = []
-    rows = measured(["tumbling-ball"], 60, times=(1.0, 10.0), tell=told.append)
+    rows = measured(["tumbling-ball"], 60, times=(1.0, 10.0), log=told.append)
     assert [(row["variant"], row["time"]) for row in rows] == [(v, t) for v in VARIANTS for t in (1.0, 10.0)]
     late = {row["variant"]: row for row in rows if row["time"] == 10.0}
     assert late["raw"]["gap"] > 10 * late["baumgarte"]["gap"] > 1e-11

@@ -125,7 +125,7 @@ def test_a_top_without_motion_is_a_planar_pendulum():
     case = Case("lagrange-top", model, start(model, turned([1, 0, 0], 1.0), [0, 0, 0]))
     with pytest.raises(ClosedFormMismatch, match="straight up or down"):
         closed_form_motion(case)
-    position, attitude = errors(replace(case, exact="planar-pendulum"))
+    position, attitude = errors(replace(case, closed_form="planar-pendulum"))
     assert max(position, attitude) < 1e-12
 
 
@@ -233,7 +233,7 @@ def scaled(case, part):
         back = turned(list(axis if sine else [1.0, 0, 0]), (1 - part) * angle)
         p[k] = quaternion_product(back[0], case.state.p[k])
     state = state_from_minimal(case.model, p, part * case.state.omega, case.state.u, case.state.udot)
-    return Case(case.exact, case.model, state)
+    return Case(case.closed_form, case.model, state)
 
 
 def test_small_oscillations_of_a_chain_with_rods():
