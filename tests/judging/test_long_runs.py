@@ -173,7 +173,7 @@ def test_the_jackknife_knows_a_common_motion_from_two():
     assert abs(same.order - 2) < 1e-12 and same.order_error < 1e-12
     # two motions with the same law: as many orders off by more than 3 σ as so few blocks explain
     falls = [DriftOrder.from_blocks(*rng.exponential(size=(2, BLOCK_COUNT)), 2) for _ in range(2000)]
-    wrong = np.mean([abs(f.order) > 3 * f.sigma for f in falls])
+    wrong = np.mean([abs(f.order) > 3 * f.order_error for f in falls])
     assert wrong < 0.02
     # one block that alone moves shows nothing
     lone = np.zeros(BLOCK_COUNT)

@@ -87,7 +87,7 @@ def judged(*off, bounds=None, **evaluation):
         shift = np.zeros((2, 3))
         shift[body] = by * bounds[state].acceleration[body] * np.array([2.0, -1.0, 2.0]) / 3
         said[state] = replace(said[state], acceleration=said[state].acceleration + shift)
-    answer = {"quantities": said, "unsupported": None, "failure": None, "cost": 0.25} | evaluation
+    answer = {"quantities": said, "unsupported": None, "failure": None, "cpu_time": 0.25} | evaluation
     return judge_states(WHO, StateTruth(STATES, right, bounds, "itself"), Evaluation(**answer))
 
 
