@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Callable, Sequence
-from dataclasses import fields
 from pathlib import Path
 from typing import ClassVar
 
@@ -25,7 +24,6 @@ from plumbline.model.datatypes import (
 )
 from plumbline.model.kinematics import velocity_jacobian
 from reference_impl import collocation
-from reference_impl.chain import Chain
 from reference_impl.direct import DirectSystem, Solution
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import A, L, euler_parameter_rate
@@ -68,11 +66,11 @@ class Reference(Adapter):
         return str(project["project"]["version"])
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-        system = DirectSystem(notes_chain(model))
+        system = DirectSystem(model)
         solve: Callable[..., Solution] = system.solve
         if self.option:
             dense = self.option == "dense factors"
-            solve = system.solve_with_dense_factors if dense else StructuredSystem([notes_chain(model)]).solve
+            solve = system.solve_with_dense_factors if dense else StructuredSystem([model]).solve
         return [state_quantities(system, model, state, solve) for state in states]
 
     def _simulate(
@@ -82,11 +80,9 @@ class Reference(Adapter):
         try:
             if integrator.name == "collocation":
                 start = state.r, state.p, state.v, pdot
-                run: IntegrationResult = collocation.integrate_collocation(
-                    [notes_chain(model)], *start, times, resolution
-                )
+                run: IntegrationResult = collocation.integrate_collocation([model], *start, times, resolution)
             else:
-                run = integrate_dop853(notes_chain(model), state.r, state.p, state.v, pdot, times, resolution)
+                run = integrate_dop853(model, state.r, state.p, state.v, pdot, times, resolution)
         except ArithmeticError as error:
             raise EngineFailure(f"{self.title}: {error}") from error
         return Trajectory(t=run.t, r=run.r, p=run.p, v=run.v, pdot=run.pdot, steps=run.steps)
@@ -95,9 +91,7 @@ class Reference(Adapter):
         self, model: Model, state: State, end: float, integrator: Integrator, resolution: float
     ) -> Trajectory:
         def legs(r: Array, p: Array, v: Array, pdot: Array) -> IntegrationResult:
-            return collocation.integrate_collocation(
-                [notes_chain(model)], r, p, v, pdot, np.array([0.0, end]), resolution
-            )
+            return collocation.integrate_collocation([model], r, p, v, pdot, np.array([0.0, end]), resolution)
 
         try:
             there = legs(state.r, state.p, state.v, euler_parameter_rate(state.p, state.omega))
@@ -107,11 +101,6 @@ class Reference(Adapter):
         names, times = ("r", "p", "v", "pdot"), np.array([0.0, end, 2 * end])
         rows = {name: np.vstack([getattr(there, name), getattr(back, name)[1:]]) for name in names}
         return Trajectory(t=times, **rows, steps=there.steps + back.steps)
-
-
-def notes_chain(model: Model) -> Chain:
-    """The same chain in the notes' own type."""
-    return Chain(**{field.name: getattr(model, field.name) for field in fields(Chain)})
 
 
 def state_quantities(

@@ -13,7 +13,6 @@ from scipy.sparse.linalg import splu
 
 from adapters import exudyn_engine, mujoco_engine, pinocchio_engine
 from adapters.exudyn_common import make_settings
-from adapters.reference_engine import notes_chain
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import quaternion_rate
 from reference_impl.direct import DirectSystem, solve_dense
@@ -30,7 +29,7 @@ def random_pendulum(bodies: int, rods: bool = False, seed: int = 1) -> tuple[Mod
 
 def structured_call(model: Model, state: State, batch: int = 1) -> Call:
     """The reference's structured form; ``batch`` chains in one call, each at a state of its own."""
-    forest = StructuredSystem([notes_chain(model)]).repeated(batch)
+    forest = StructuredSystem([model]).repeated(batch)
     q, v = (
         np.tile(x, batch)
         for x in (
@@ -44,7 +43,7 @@ def structured_call(model: Model, state: State, batch: int = 1) -> Call:
 
 def direct_call(model: Model, state: State) -> tuple[sparse.csc_matrix, Array, Call]:
     """The direct form: S (sparse) and b assembled, and the banded solve of a state from scratch."""
-    system, pdot = DirectSystem(notes_chain(model)), quaternion_rate(state.p, state.omega)
+    system, pdot = DirectSystem(model), quaternion_rate(state.p, state.omega)
     values, b, _ = system._entries(state.r, state.p, state.v, pdot)
     S = sparse.csc_matrix((values, (system._i, system._j)), shape=(system.size, system.size))
     return S, b, lambda: system.solve(state.r, state.p, state.v, pdot)

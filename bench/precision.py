@@ -9,7 +9,6 @@ from time import process_time
 
 import numpy as np
 
-from adapters.reference_engine import notes_chain
 from plumbline.engines.adapter import Adapter
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import quaternion_rate
@@ -37,10 +36,7 @@ def stack_states(states: Sequence[State]) -> tuple[Array, Array, Array, Array]:
 
 def reference_positions(model: Model, states: Sequence[State]) -> Array:
     """(bodies of all states, 3) m at the end, by collocation at the tightest tolerance, one by one."""
-    runs = [
-        integrate_collocation([notes_chain(model)], *stack_states([state]), SAMPLE_TIMES, 1e-14)
-        for state in states
-    ]
+    runs = [integrate_collocation([model], *stack_states([state]), SAMPLE_TIMES, 1e-14) for state in states]
     return np.concatenate([run.r[-1] for run in runs])
 
 
@@ -60,7 +56,7 @@ def measure_run(
 
 def collocation_curve(model: Model, states: Sequence[State], expected: Array) -> list[WorkPrecisionPoint]:
     """The reference's collocation on all states in one batch; the time of a run of one step is taken off."""
-    chains, start, points = [notes_chain(model)] * len(states), stack_states(states), []
+    chains, start, points = [model] * len(states), stack_states(states), []
     for rtol in TOLERANCES:
 
         def run(until: Array, rtol: float = rtol) -> Array:
@@ -79,9 +75,9 @@ def dop853_curve(
 
     def run(rtol: float) -> Array:
         ends = [
-            raw.integrate_dop853(
-                notes_chain(model), *stack_states([state]), SAMPLE_TIMES, rtol, structured=structured
-            ).r[-1]
+            raw.integrate_dop853(model, *stack_states([state]), SAMPLE_TIMES, rtol, structured=structured).r[
+                -1
+            ]
             for state in states
         ]
         return np.concatenate(ends)

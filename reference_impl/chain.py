@@ -1,4 +1,4 @@
-"""The chain of bodies that the notes' equations are written for, usable without the rest of the project."""
+"""The mechanism that the equations are written for: an open chain of rigid bodies on rods and ball joints."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ Array = NDArray[np.float64]
 class Chain:
     """An open chain of N rigid bodies, each hung from the one before and the first from the world origin.
 
-    ``length[k] > 0`` makes joint k the notes' massless rigid rod with a ball joint at both ends,
-    ``length[k] == 0`` the ball joint, its limit ℓ → 0 (E1).  N = 1 and
-    N = 2 on rods are the notes' own pendulums.
+    Joint k connects body k to body k−1, joint 0 to the pivot.  ``length[k] > 0`` makes it the notes'
+    massless rigid rod with a ball joint at both ends, ``length[k] == 0`` a ball joint, the limit ℓ → 0 (E1).
+    N = 1 and N = 2 on rods are the notes' own pendulums.
     """
 
     mass: Array  # (N,) kg
     inertia: Array  # (N, 3, 3) kg m², J about the centre of mass, body frame
-    proximal: Array  # (N, 3) m, body frame: s_1 of body 1, s_3 of body 2, where the body hangs
-    distal: Array  # (N, 3) m, body frame: s_2 of body 1, where the next one hangs; unused for the last
-    length: Array  # (N,) m, ℓ of joint k
+    proximal: Array  # (N, 3) m, body frame, where body k hangs: s_1 of body 1, s_3 of body 2
+    distal: Array  # (N, 3) m, body frame, where body k+1 hangs on body k: s_2; unused for the last body
+    length: Array  # (N,) m, ℓ of joint k, 0 for a ball joint
     gravity: Array  # (3,) m/s², world frame
     force: Array  # (N, 3) N, constant applied force at the centre of mass, world frame
     moment: Array  # (N, 3) N m, constant applied moment n′, body frame
@@ -39,3 +39,13 @@ class Chain:
     def rods(self) -> NDArray[np.bool_]:
         """(N,) True where joint k is a rod."""
         return np.asarray(self.length > 0)
+
+    @property
+    def has_drag(self) -> bool:
+        """Whether any body feels drag."""
+        return bool(np.any(self.drag_force) or np.any(self.drag_moment))
+
+    @property
+    def has_loads(self) -> bool:
+        """Whether any constant force or moment is applied."""
+        return bool(np.any(self.force) or np.any(self.moment))

@@ -195,7 +195,7 @@ class StructuredSystem:
         tiled.chains, tiled.body_count = self.chains * count, self.body_count * count
         tiled.first_body = np.cumsum([0, *(chain.n for chain in tiled.chains)])
         for name, value in vars(self).items():
-            if isinstance(value, np.ndarray) and name != "start":  # the last axis counts bodies
+            if isinstance(value, np.ndarray) and name != "first_body":  # the last axis counts bodies
                 setattr(tiled, name, np.tile(value, count))
         return tiled
 

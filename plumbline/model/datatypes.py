@@ -1,7 +1,8 @@
 """What crosses from one stage to the next: small frozen records of NumPy arrays.
 
-Frames and units, everywhere:
-SI; world z up, pivot at the world origin; ``r`` is a centre of mass in the world
+`Model`, the mechanism, is the reference's `Chain` under the name that scenarios and engines use.
+
+Frames and units, everywhere: SI; world z up, pivot at the world origin; ``r`` is a centre of mass in the world
 frame; quaternions are scalar first and turn body vectors into world vectors;
 ``omega`` is the angular velocity in the body frame (the notes' ω′ = 2 L(p) ṗ).
 N is the number of bodies, T the number of samples.
@@ -12,12 +13,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from plumbline.processes.errors import PlumblineError
+from reference_impl.chain import Array as Array
+from reference_impl.chain import Chain
 
-Array = NDArray[np.float64]
+Model = Chain
 
 Level = Literal["state", "invariants", "trajectory", "relations"]
 Verdict = Literal["agrees", "disagrees", "unresolved", "unsupported", "not installed", "failed"]
@@ -33,47 +33,6 @@ class EngineFailure(PlumblineError):
 
 class BadInput(PlumblineError, ValueError):
     """A state or model was refused before any engine saw it."""
-
-
-@dataclass(frozen=True, eq=False)
-class Model:
-    """An open chain of N rigid bodies hung from the world origin by rods and ball joints.
-
-    Joint k connects body k to body k-1 (joint 0: to the pivot, the world origin).
-    ``length[k] == 0`` is a ball joint; ``length[k] > 0`` a massless rigid rod of that
-    length with a ball joint at both ends (E1 of the notes).
-    """
-
-    mass: Array  # (N,) kg
-    inertia: Array  # (N, 3, 3) kg m², about the centre of mass, body frame
-    proximal: Array  # (N, 3) m, body frame: where body k hangs (the notes' s_1, s_3)
-    distal: Array  # (N, 3) m, body frame: where body k+1 hangs on body k (s_2); unused for the last
-    length: Array  # (N,) m, rod length of joint k, 0 for a ball joint
-    gravity: Array  # (3,) m/s², world frame
-    force: Array  # (N, 3) N, constant applied force at the centre of mass, world frame
-    moment: Array  # (N, 3) N m, constant applied moment n′, body frame
-    drag_force: Array  # (N,) N s/m, c_t: F = -c_t ṙ at the centre of mass
-    drag_moment: Array  # (N,) N m s, c_r: n′ = -c_r ω′
-
-    @property
-    def n(self) -> int:
-        """Number of bodies."""
-        return len(self.mass)
-
-    @property
-    def rods(self) -> NDArray[np.bool_]:
-        """(N,) True where joint k is a rod."""
-        return np.asarray(self.length > 0)
-
-    @property
-    def has_drag(self) -> bool:
-        """Whether any body feels drag."""
-        return bool(np.any(self.drag_force) or np.any(self.drag_moment))
-
-    @property
-    def has_loads(self) -> bool:
-        """Whether any constant force or moment is applied."""
-        return bool(np.any(self.force) or np.any(self.moment))
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,6 @@ import pyarrow.parquet as pq
 from plumbline.model.kinematics import quaternion_rate
 from plumbline.scenario.loader import Scenario
 from plumbline.storage.results_store import to_json_value, write_atomically
-from reference_impl.chain import Chain
 from reference_impl.stabilised import VARIANTS, drift_table
 
 TIMES = (10.0, 100.0, 1000.0)  # s
@@ -78,7 +77,7 @@ def _measure_variant(
 ) -> Iterator[dict[str, Any]]:
     """The rows of one variant at one tolerance: first to the first time, then to the last affordable one."""
     key = {"scenario": s.name, "variant": variant, "rtol": rtol}
-    start = _notes_chain(s), s.state.r, s.state.p, s.state.v, quaternion_rate(s.state.p, s.state.omega)
+    start = s.model, s.state.r, s.state.p, s.state.v, quaternion_rate(s.state.p, s.state.omega)
     within: Sequence[float] = times[:1]
     reasons = dict.fromkeys(times, "")
     try:
@@ -112,9 +111,3 @@ def _measure_variant(
         }
     for time in times[len(found) :]:
         yield key | {"time": time, "reason": reasons[time]}
-
-
-def _notes_chain(s: Scenario) -> Chain:
-    from adapters.reference_engine import notes_chain
-
-    return notes_chain(s.model)

@@ -49,7 +49,6 @@ from plumbline.scenario.schema import SchemaModel
 from plumbline.scenario.yaml_source import PathKey, YamlSource, read_yaml
 from plumbline.storage.results_store import to_json_value, write_atomically
 from reference_impl import collocation
-from reference_impl.chain import Chain
 
 REFERENCE_RTOLS = (1e-9, 1e-11)  # of the reference: the run and the yardstick of its uncertainty
 REFINEMENT_LEVELS = 4
@@ -305,7 +304,7 @@ def _run_reference_batch(
     group: Sequence[tuple[SweepCell, Scenario]], references: dict[int, ReferenceMotion]
 ) -> list[dict[str, Any]]:
     """The reference's rows; a batch that stops is run again cell by cell, so that one cell is lost."""
-    chains = [_notes_chain(s) for _, s in group]
+    chains = [s.model for _, s in group]
     r, p, v = (np.concatenate([getattr(s.state, name) for _, s in group]) for name in ("r", "p", "v"))
     pdot = np.concatenate([quaternion_rate(s.state.p, s.state.omega) for _, s in group])
     times = group[0][1].times
@@ -418,12 +417,6 @@ def _judge_cell(
         "finest_error": float(np.max(position_error(runs[-1].r, reference.r))),
         **_measure_motion(cell.scenario, runs[-1]),
     }
-
-
-def _notes_chain(scenario: Scenario) -> Chain:
-    from adapters.reference_engine import notes_chain
-
-    return notes_chain(scenario.model)
 
 
 def _parse_field_path(name: str) -> tuple[PathKey, ...]:

@@ -10,7 +10,6 @@ from scipy.integrate import solve_ivp
 from plumbline.model.datatypes import Array, EngineFailure, Model, State, Trajectory
 from plumbline.model.kinematics import quaternion_rate
 from reference_impl import collocation
-from reference_impl.chain import Chain
 from reference_impl.structured import StructuredSystem
 
 NotesIntegrator = Literal["collocation", "dop853"]
@@ -25,7 +24,7 @@ def simulate_notes_form(
     the raw form drifts by 7e-13 m and 2e-12 m at any tolerance.
     Raises EngineFailure where the integrator stops early.
     """
-    forest = StructuredSystem([Chain(**vars(model))])
+    forest = StructuredSystem([model])
     start = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
     try:
         if method == "collocation":

@@ -23,7 +23,6 @@ from plumbline.model.kinematics import (
     state_from_minimal,
 )
 from plumbline.model.sampling import derive_seed
-from reference_impl.chain import Chain
 from reference_impl.collocation import integrate_collocation
 from reference_impl.structured import StructuredSystem
 
@@ -59,9 +58,7 @@ def perturbation_growth_and_runs(
     model: Model, state: State, times: Array, other_models: Sequence[tuple[Model, State]]
 ) -> tuple[Array, Array, Array]:
     """G (T,), and r, p (1 + others, T, N, ·) of the model and ``others``, as many bodies, in common steps."""
-    forest = StructuredSystem(
-        [Chain(**vars(m)) for m in ([model] * (PERTURBATION_COUNT + 1) + [m for m, _ in other_models])]
-    )
+    forest = StructuredSystem([model] * (PERTURBATION_COUNT + 1) + [m for m, _ in other_models])
     states = [state, *perturbed_states(model, state), *(s for _, s in other_models)]
     size, grown = np.full(PERTURBATION_COUNT, PERTURBATION_SIZE), np.empty((PERTURBATION_COUNT, len(times)))
     scale, done, arm = np.ones(PERTURBATION_COUNT), 0, 1e-3
@@ -94,7 +91,7 @@ def perturbation_growth_and_runs(
         done += stop
         if other_models:
             forest, other_models = (
-                StructuredSystem([Chain(**vars(model))]).repeated(PERTURBATION_COUNT + 1),
+                StructuredSystem([model]).repeated(PERTURBATION_COUNT + 1),
                 [],
             )
         r, p, v, pdot = _integrate_batch(forest, [base, *near], times[done : done + 2 * stop + 1])

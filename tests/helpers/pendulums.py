@@ -9,7 +9,6 @@ import numpy as np
 
 from plumbline.model import kinematics
 from plumbline.model.datatypes import Array, Model, State, Trajectory
-from reference_impl.chain import Chain
 from reference_impl.collocation import integrate_collocation
 
 JOINTS = {  # b: hung by a ball joint, r: by a rod
@@ -65,7 +64,7 @@ def state(subject: Model, seed: int = 0, rate: float = 3.0) -> State:
 def motion(subject: Model, at: State, times: Array) -> Trajectory:
     """The motion by the reference's collocation, held on its manifold."""
     start = at.r, at.p, at.v, kinematics.quaternion_rate(at.p, at.omega)
-    run = integrate_collocation([Chain(**vars(subject))], *start, times, 1e-13, project=True)
+    run = integrate_collocation([subject], *start, times, 1e-13, project=True)
     return Trajectory(times, run.r, run.p, run.v, run.pdot, run.steps)
 
 

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from numpy.polynomial.legendre import legval
 
-from adapters.reference_engine import notes_chain
 from plumbline.model.datatypes import Model, State
 from plumbline.model.kinematics import quaternion_rate
 from reference_impl import collocation
@@ -30,7 +29,7 @@ def start(state: State) -> tuple[Array, Array, Array, Array]:
 def run(
     model: Model, state: State, rtol: float, times: Array = TIMES, **options: object
 ) -> BatchIntegrationResult:
-    return integrate_collocation([notes_chain(model)], *start(state), times, rtol, **options)  # type: ignore[arg-type]
+    return integrate_collocation([model], *start(state), times, rtol, **options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("S", [4, 12, 20])
@@ -54,7 +53,7 @@ def test_tables_integrate_polynomials_exactly(S: int) -> None:
 def test_two_methods_share_their_digits(rods: list[bool]) -> None:
     """Direct form with DOP853, structured form with collocation: nothing in common but the notes."""
     model, state = random_chain(np.random.default_rng(31), rods, loads=True, drag=True)
-    dop = raw.integrate_dop853(notes_chain(model), *start(state), TIMES, 1e-13)
+    dop = raw.integrate_dop853(model, *start(state), TIMES, 1e-13)
     ours = run(model, state, 1e-13)
     assert np.max(np.abs(ours.r - dop.r)) < (2e-11 if any(rods) else 1e-12)
     assert np.max(np.abs(ours.p - dop.p)) < (2e-11 if any(rods) else 1e-12)
@@ -84,7 +83,7 @@ def test_dense_output_inside_the_steps() -> None:
 
 def test_order_is_twice_the_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
     """S = 2 nodes with fixed steps: order 4 at the ends of steps."""
-    monkeypatch.setattr(collocation, "USUAL", 1e6)  # no step is cut for its sweeps
+    monkeypatch.setattr(collocation, "USUAL_SWEEPS", 1e6)  # no step is cut for its sweeps
     model, state = random_chain(np.random.default_rng(34), [False], rate=2.0)
     truth = run(model, state, 1e-14, TIMES[[0, -1]])
     error = []
@@ -102,7 +101,7 @@ def test_a_batch_is_every_chain_alone() -> None:
     rng = np.random.default_rng(35)
     drawn = [random_chain(rng, rods) for rods in ([False], [True, False], [False, False, False], [True])]
     packed = [np.concatenate(parts) for parts in zip(*(start(state) for _, state in drawn), strict=True)]
-    batch = integrate_collocation([notes_chain(model) for model, _ in drawn], *packed, TIMES, 1e-12)
+    batch = integrate_collocation([model for model, _ in drawn], *packed, TIMES, 1e-12)
     at = 0
     for model, state in drawn:
         alone = run(model, state, 1e-12)
@@ -134,7 +133,7 @@ def test_a_long_chain_runs() -> None:
     """300 bodies; the work per body does not grow."""
     model, state = random_chain(np.random.default_rng(38), [False] * 300, rate=0.1)
     moved = run(model, state, 1e-6, np.array([0.0, 0.02]))
-    gap = StructuredSystem([notes_chain(model)]).joint_gaps(
+    gap = StructuredSystem([model]).joint_gaps(
         np.vstack([moved.r[-1].T, moved.p[-1].T]), np.vstack([moved.v[-1].T, moved.pdot[-1].T])
     )[0]
     assert np.max(np.abs(gap)) < 1e-6
@@ -184,7 +183,7 @@ class Watched:
             self.asked += 1
             return acceleration(forest, *args)  # type: ignore[arg-type]
 
-        monkeypatch.setattr(collocation._Stepper, "step", noted)
+        monkeypatch.setattr(collocation._Stepper, "try_step", noted)
         monkeypatch.setattr(StructuredSystem, "acceleration", counted)
 
 
@@ -210,7 +209,7 @@ def test_a_step_begins_with_the_last_one_s_polynomial_up_to_its_smallest_term(
         np.testing.assert_allclose(found, np.moveaxis(by_hand, 0, 1), rtol=0, atol=limit)
         return found
 
-    monkeypatch.setattr(collocation._Stepper, "_guess", checked)
+    monkeypatch.setattr(collocation._Stepper, "_extrapolated_acceleration", checked)
     run(model, state, 1e-10, np.array([0.0, 2.0]))
     assert len(cuts) > 10 and min(cuts) == 0 < max(cuts)
 
@@ -278,7 +277,7 @@ def test_a_batch_has_every_chains_own_sizes() -> None:
 
     def sized(models: list[tuple[Model, State]]) -> collocation._Stepper:
         r, p, v, pdot = (np.concatenate(parts) for parts in zip(*(start(s) for _, s in models), strict=True))
-        forest = StructuredSystem([notes_chain(model) for model, _ in models])
+        forest = StructuredSystem([model for model, _ in models])
         stepper = collocation._Stepper(
             forest,
             component_first(r, p),
@@ -306,7 +305,7 @@ def test_joints_that_are_open_close_as_they_are_told(rods: list[bool]) -> None:
     """C̈ + 2 a Ċ + a² C = 0 has (C + (Ċ + a C) t) e^{−a t}; a projection leaves nothing at all."""
     model, state = random_chain(np.random.default_rng(44), rods)
     opened = replace(state, r=state.r + np.array([[0.01, 0, -0.02], [0.03, 0.01, 0]]))
-    forest, times, a = StructuredSystem([notes_chain(model)]), np.array([0.0, 0.3, 2.0]), 3.0
+    forest, times, a = StructuredSystem([model]), np.array([0.0, 0.3, 2.0]), 3.0
 
     def left(found: BatchIntegrationResult) -> Array:
         samples = zip(found.r, found.p, found.v, found.pdot, strict=True)
@@ -321,7 +320,7 @@ def test_joints_that_are_open_close_as_they_are_told(rods: list[bool]) -> None:
     growth = 1e3  # of local errors of 1e-9, as above
     np.testing.assert_allclose(C[:, 0], told, rtol=0, atol=growth * 1e-9)
     # Numbers of size 1, some roundings each.
-    assert np.max(np.abs(left(run(model, opened, 1e-9, times, projected=True))[1:, 0])) < 1e-14
+    assert np.max(np.abs(left(run(model, opened, 1e-9, times, project=True))[1:, 0])) < 1e-14
 
 
 def test_close_times_are_no_vanishing_steps() -> None:
@@ -348,9 +347,9 @@ def test_a_step_is_made_where_its_error_is_within_the_tolerance(monkeypatch: pyt
         tails.append(tail(stepper, a, h))
         return tails[-1]
 
-    monkeypatch.setattr(collocation._Stepper, "_tail", noted)
+    monkeypatch.setattr(collocation._Stepper, "_error_over_tolerance", noted)
     r, p, v, pdot = start(state)
-    forest, found = StructuredSystem([notes_chain(model)]), []
+    forest, found = StructuredSystem([model]), []
     for h in np.geomspace(0.01, 1.0, 60):
         stepper = collocation._Stepper(
             forest,
@@ -397,7 +396,7 @@ def test_a_thousand_steps_add_up_to_the_last_digit() -> None:
     """Constant parts: the compensated sums are the exact ones but for one rounding."""
     model, state = random_chain(np.random.default_rng(49), [False])
     r, p, v, pdot = start(state)
-    forest, table = StructuredSystem([notes_chain(model)]), gauss_tables(4)
+    forest, table = StructuredSystem([model]), gauss_tables(4)
     for push in (0.0, 0.3):
         stepper = collocation._Stepper(
             forest, component_first(r, p), component_first(v, pdot), 1e-6, 1e-7, table, True, baumgarte=0.0

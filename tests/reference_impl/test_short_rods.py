@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adapters.reference_engine import notes_chain
 from plumbline.model.kinematics import quaternion_rate
 from reference_impl.collocation import integrate_collocation
 from reference_impl.direct import DirectSystem
@@ -21,7 +20,7 @@ LENGTHS = [0.4, 1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6]
 def test_short_rods_converge_to_the_ball_joint_at_first_order(bodies: int) -> None:
     model, state = random_chain(np.random.default_rng(40 + bodies), [False] * bodies, loads=True)
     start = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
-    family = study_rod_limit(notes_chain(model), *start, LENGTHS, np.linspace(0, 0.05, 6), 1e-10)
+    family = study_rod_limit(model, *start, LENGTHS, np.linspace(0, 0.05, 6), 1e-10)
     assert np.all(np.abs(family.observed_order[:2, 1:] - 1) < 0.01), family.observed_order
     assert np.all(np.abs(family.observed_order[2, 2:] - 1) < 0.1), family.observed_order
     assert family.position[-1] < 1e-4
@@ -31,7 +30,7 @@ def test_off_the_slow_manifold_the_rod_swings_fast() -> None:
     """A rod that does not point where the ball joint pulls leaves the ball's accelerations altogether."""
     model, state = random_chain(np.random.default_rng(44), [False])
     pdot = quaternion_rate(state.p, state.omega)
-    rods, r, v = replace_balls_by_rods(notes_chain(model), state.r, state.p, state.v, pdot, 1e-4)
+    rods, r, v = replace_balls_by_rods(model, state.r, state.p, state.v, pdot, 1e-4)
     slow = integrate_collocation([rods], r, state.p, v, pdot, np.linspace(0, 0.02, 21), 1e-8)
     u = (r - state.r)[0] / 1e-4
     aside = np.cross(u, [1.0, 0, 0]) / np.linalg.norm(np.cross(u, [1.0, 0, 0]))
@@ -45,7 +44,7 @@ def test_off_the_slow_manifold_the_rod_swings_fast() -> None:
 def test_a_family_is_what_its_fields_say() -> None:
     """Largest differences from the ball, of r̈ and F by the direct form and of the motion; their orders."""
     model, state = random_chain(np.random.default_rng(45), [False, False], loads=True)
-    ball, pdot, times = notes_chain(model), quaternion_rate(state.p, state.omega), np.linspace(0, 0.05, 6)
+    ball, pdot, times = model, quaternion_rate(state.p, state.omega), np.linspace(0, 0.05, 6)
     start = state.r, state.p, state.v, pdot
     lengths = [0.1, 0.02]
     family = study_rod_limit(ball, *start, lengths, times, 1e-10)
@@ -69,7 +68,7 @@ def test_a_family_is_what_its_fields_say() -> None:
 def test_a_rod_starts_along_the_balls_force_and_turns_with_it() -> None:
     """u = −F/‖F‖ and its rate along the ball's motion, by differences; a joint without force has none."""
     model, state = random_chain(np.random.default_rng(46), [False, False])
-    ball, pdot, h = notes_chain(model), quaternion_rate(state.p, state.omega), 1e-3
+    ball, pdot, h = model, quaternion_rate(state.p, state.omega), 1e-3
     u, udot = slow_manifold_directions(ball, state.r, state.p, state.v, pdot)
     motion = integrate_collocation([ball], state.r, state.p, state.v, pdot, h * np.arange(5), 1e-13)
     force = [
@@ -94,7 +93,7 @@ def test_a_small_pendulum_has_the_same_directions() -> None:
     """In units of a millimetre, moving slowly: the instant that u̇ is fitted in is of its own swing."""
     model, state = random_chain(np.random.default_rng(47), [False, False], rate=0.01)
     found = [
-        slow_manifold_directions(notes_chain(one), at.r, at.p, at.v, quaternion_rate(at.p, at.omega))
+        slow_manifold_directions(one, at.r, at.p, at.v, quaternion_rate(at.p, at.omega))
         for one, at in ((model, state), rescaled(model, state, 2.0**-10, 1.0, 1.0))
     ]
     for here, there in zip(*found, strict=True):
@@ -104,7 +103,7 @@ def test_a_small_pendulum_has_the_same_directions() -> None:
 def test_the_joint_without_force_is_named() -> None:
     """A body that hangs still, and below it one that its load holds."""
     model, state = random_chain(np.random.default_rng(48), [False, False])
-    one = notes_chain(model)
+    one = model
     still = replace(
         one,
         proximal=np.array([[0, 0, 0.5], [0.1, 0.2, 0.3]]),

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adapters.reference_engine import notes_chain
 from plumbline.model.kinematics import quaternion_rate
 from reference_impl.collocation import integrate_collocation
 from reference_impl.euler_parameters import angular_velocity
@@ -26,7 +25,7 @@ from tests.helpers.random_chains import random_chain
 @pytest.mark.parametrize("rods", [[False], [True], [False, True, False]])
 def test_every_variant_converges_to_the_same_motion(rods: list[bool]) -> None:
     model, state = random_chain(np.random.default_rng(60), rods, loads=True, drag=True)
-    start = notes_chain(model), state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+    start = model, state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
     times = np.linspace(0, 0.5, 6)
     runs = [integrate_variant(variant, *start, times, 1e-13) for variant in VARIANTS]
     for other in runs[1:]:
@@ -39,7 +38,7 @@ def test_projection_is_newton_on_every_constraint(rods: list[bool]) -> None:
     """From 1e-5 off the manifold to rounding; a state on it stays."""
     rng = np.random.default_rng(61)
     model, state = random_chain(rng, rods)
-    forest, pdot = StructuredSystem([notes_chain(model)]), quaternion_rate(state.p, state.omega)
+    forest, pdot = StructuredSystem([model]), quaternion_rate(state.p, state.omega)
     q, v = component_first(state.r, state.p), component_first(state.v, pdot)
     near = forest.project(q + 1e-5 * rng.normal(size=q.shape), v + 1e-5 * rng.normal(size=q.shape))
     for error in forest.constraints(*near):
@@ -54,7 +53,7 @@ def test_projection_is_newton_on_every_constraint(rods: list[bool]) -> None:
 def test_raw_drifts_and_the_others_do_not() -> None:
     model, state = random_chain(np.random.default_rng(62), [False])
     table = drift_table(
-        notes_chain(model),
+        model,
         state.r,
         state.p,
         state.v,
@@ -76,7 +75,7 @@ def test_baumgarte_pulls_back_at_its_rate() -> None:
     r, times = state.r + np.array([1e-6, 0, 0]), np.linspace(0, 1, 5)
     held = integrate_variant(
         "baumgarte",
-        notes_chain(model),
+        model,
         r,
         state.p,
         state.v,
@@ -85,14 +84,14 @@ def test_baumgarte_pulls_back_at_its_rate() -> None:
         1e-12,
         rate=10.0,
     )
-    left = constraint_errors(notes_chain(model), held)[0] / 1e-6
+    left = constraint_errors(model, held)[0] / 1e-6
     assert np.max(np.abs(left - (1 + 10 * times) * np.exp(-10 * times))) < 1e-3
 
 
 @pytest.mark.full
 def test_energy_over_a_thousand_seconds() -> None:
     model, state = random_chain(np.random.default_rng(64), [False])
-    start = notes_chain(model), state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+    start = model, state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
     row = drift_table(*start, rtols=(1e-13,), times=(1000.0,), variants=("projected",))[0]
     assert row.energy <= 1e-12
     assert row.gap < 1e-14
@@ -103,7 +102,7 @@ def test_constraint_errors_are_metres_and_metres_a_second(rods: list[bool]) -> N
     """A rod's stretch and its rate, a ball's distance and speed, each the worst of its state, from `rows`."""
     rng = np.random.default_rng(65)
     model, state = random_chain(rng, rods)
-    one, pdot = notes_chain(model), quaternion_rate(state.p, state.omega)
+    one, pdot = model, quaternion_rate(state.p, state.omega)
     motion = integrate_variant("raw", one, state.r, state.p, state.v, pdot, np.linspace(0, 0.1, 3), 1e-6)
     n = model.n
     moved = replace(
@@ -130,7 +129,7 @@ def test_constraint_errors_are_metres_and_metres_a_second(rods: list[bool]) -> N
 
 def test_energy_is_over_the_weight_and_reach_of_the_stretched_chain() -> None:
     model, state = random_chain(np.random.default_rng(66), [True, False, True])
-    one, pdot = notes_chain(model), quaternion_rate(state.p, state.omega)
+    one, pdot = model, quaternion_rate(state.p, state.omega)
     motion = integrate_variant(
         "projected", one, state.r, state.p, state.v, pdot, np.linspace(0, 0.1, 3), 1e-12
     )
@@ -157,7 +156,7 @@ def test_energy_is_over_the_weight_and_reach_of_the_stretched_chain() -> None:
 def test_a_table_has_a_row_for_each_variant_tolerance_and_time() -> None:
     """The maxima up to a time, and the share of the steps that falls to it."""
     model, state = random_chain(np.random.default_rng(67), [False])
-    start = notes_chain(model), state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+    start = model, state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
     rtols, times = (1e-4, 1e-6), (0.5, 2.0, 4.0)
     table = drift_table(*start, rtols=rtols, times=times, samples=8, variants=("raw", "projected"))
     expected = [(v, rtol, end) for v in ("raw", "projected") for rtol in rtols for end in times]
@@ -173,7 +172,7 @@ def test_a_table_has_a_row_for_each_variant_tolerance_and_time() -> None:
 
 def test_there_are_three_variants_and_no_other() -> None:
     model, state = random_chain(np.random.default_rng(68), [False])
-    start = notes_chain(model), state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+    start = model, state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
     with pytest.raises(ValueError, match="no variant 'damped'"):
         integrate_variant("damped", *start, np.array([0.0, 0.1]), 1e-6)
 
@@ -182,7 +181,7 @@ def test_projection_from_afar_ends_on_unit_quaternions() -> None:
     """From 5 % off what is left of the gaps is of higher order, but p is normalised to rounding."""
     rng = np.random.default_rng(69)
     model, state = random_chain(rng, [True, False, False])
-    forest = StructuredSystem([notes_chain(model)])
+    forest = StructuredSystem([model])
     q, v = component_first(state.r, state.p), component_first(state.v, quaternion_rate(state.p, state.omega))
     far = q + 0.05 * rng.normal(size=q.shape)
     near = forest.project(far, v + 0.05 * rng.normal(size=q.shape))
@@ -197,9 +196,9 @@ def test_a_variant_is_collocation_with_its_own_option_and_no_other(variant: str)
     model, state = random_chain(np.random.default_rng(70), [False, True])
     state = replace(state, r=state.r + 1e-3)  # off the manifold, where the options differ
     start, times = (state.r, state.p, state.v, quaternion_rate(state.p, state.omega)), np.linspace(0, 0.2, 3)
-    ours = integrate_variant(variant, notes_chain(model), *start, times, 1e-6, rate=7.0, nodes=5)
+    ours = integrate_variant(variant, model, *start, times, 1e-6, rate=7.0, nodes=5)
     same = integrate_collocation(
-        [notes_chain(model)],
+        [model],
         *start,
         times,
         1e-6,

@@ -7,10 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from adapters.reference_engine import notes_chain
 from plumbline.model.kinematics import quaternion_rate, state_from_minimal
 from plumbline.truth.rounding_bound import state_rounding_bound
-from reference_impl.chain import Chain
 from reference_impl.direct import EPS, DirectSystem, Solution
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import L
@@ -55,12 +53,12 @@ def test_equals_the_direct_form_within_the_derived_bound(mix: str) -> None:
             random_chain(rng, MIXES[mix](rng, n), decades=1.0, loads=True, drag=True)
             for n in rng.integers(1, 11, size=4)
         ]
-        forest = StructuredSystem([notes_chain(model) for model, _ in drawn])
+        forest = StructuredSystem([model for model, _ in drawn])
         held = [np.concatenate([getattr(state, name) for _, state in drawn]) for name in ("r", "p", "v")]
         pdot = np.concatenate([quaternion_rate(state.p, state.omega) for _, state in drawn])
         together = parts(forest.solve(*held, pdot), forest)
         for (model, state), ours in zip(drawn, together, strict=True):
-            direct = DirectSystem(notes_chain(model)).solve(
+            direct = DirectSystem(model).solve(
                 state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
             )
             bound = state_rounding_bound(model, state)
@@ -85,7 +83,7 @@ def test_all_unknowns_equal_the_direct_forms_on_and_off_the_manifold(mix: str, o
     rng = np.random.default_rng(21)
     for _ in range(12):
         drawn = [random_chain(rng, MIXES[mix](rng, n), 0.5, loads=True, drag=True) for n in (1, 2, 2, 5, 8)]
-        forest = StructuredSystem([notes_chain(model) for model, _ in drawn])
+        forest = StructuredSystem([model for model, _ in drawn])
         r, p, v = (np.concatenate([getattr(s, name) for _, s in drawn]) for name in ("r", "p", "v"))
         pdot = np.concatenate([quaternion_rate(s.p, s.omega) for _, s in drawn])
         r, p, v, pdot = (x + off * rng.normal(size=x.shape) for x in (r, p, v, pdot))
@@ -111,16 +109,14 @@ def test_a_batch_is_more_chains() -> None:
     rng = np.random.default_rng(22)
     model, state = random_chain(rng, [True, False, True])
     other, elsewhere = random_chain(rng, [False, False])
-    alone = StructuredSystem([notes_chain(model)])
+    alone = StructuredSystem([model])
     q, v = component_first(state.r, state.p), component_first(state.v, quaternion_rate(state.p, state.omega))
     q2, v2 = (
         component_first(elsewhere.r, elsewhere.p),
         component_first(elsewhere.v, quaternion_rate(elsewhere.p, elsewhere.omega)),
     )
     answer = alone.acceleration(q, v)
-    both = StructuredSystem([notes_chain(other), notes_chain(model)]).acceleration(
-        np.hstack([q2, q]), np.hstack([v2, v])
-    )
+    both = StructuredSystem([other, model]).acceleration(np.hstack([q2, q]), np.hstack([v2, v]))
     tiled = alone.repeated(3).acceleration(np.tile(q, 3), np.tile(v, 3))
     scale = np.max(np.abs(answer))
     assert np.max(np.abs(both[:, 2:] - answer)) <= 1e-13 * scale
@@ -131,7 +127,7 @@ def test_a_batch_is_more_chains() -> None:
 def test_singular_configurations_are_reported(mix: str) -> None:
     rng = np.random.default_rng(23)
     model, state = random_chain(rng, MIXES[mix](rng, 4))
-    forest, pdot = StructuredSystem([notes_chain(model)]), quaternion_rate(state.p, state.omega)
+    forest, pdot = StructuredSystem([model]), quaternion_rate(state.p, state.omega)
     zero = state.p.copy()
     zero[2] = 0
     with pytest.raises(SingularSystem, match=r"p of body 3"):
@@ -145,14 +141,14 @@ def test_singular_configurations_are_reported(mix: str) -> None:
         ({"inertia": model.inertia * np.array([1, 1, 1, 0])[:, None, None]}, "inertia of body 4"),
     ):
         with pytest.raises(SingularSystem, match=words):
-            StructuredSystem([notes_chain(replace(model, **change))])
+            StructuredSystem([replace(model, **change)])
 
 
 def test_a_rod_of_length_zero_is_singular() -> None:
     """Read literally, C = dᵀd on a ball joint has no gradient (E1)."""
     rng = np.random.default_rng(24)
     model, state = random_chain(rng, [False, False, True])
-    literal: Chain = notes_chain(replace(model, length=np.array([0.0, 0.0, 0.4])))
+    literal = replace(model, length=np.array([0.0, 0.0, 0.4]))
     gap = state.u[2] * model.length[2]
     r = state.r.copy()
     r[2] -= gap
@@ -167,7 +163,7 @@ def test_constraints_are_gaps_of_balls_and_squares_of_rods(mix: str) -> None:
     rods = {"balls": [False] * 5, "rods": [True] * 5, "mixed": [True, False, True, True, False]}[mix]
     model, state = random_chain(rng, rods)
     r, v = state.r + 0.1 * rng.normal(size=(5, 3)), state.v + 0.1 * rng.normal(size=(5, 3))
-    pdot, one = quaternion_rate(state.p, state.omega), notes_chain(model)
+    pdot, one = quaternion_rate(state.p, state.omega), model
     forest, direct = StructuredSystem([one]), constraint_rows(one, r, state.p, v, pdot)
     found = forest.constraints(component_first(r, state.p), component_first(v, pdot))
     for ours, theirs in zip(found, (direct.C, direct.constraint_rate(v, pdot)), strict=True):
@@ -184,7 +180,7 @@ def test_a_cause_is_named_by_the_body_of_its_own_chain(at: int, words: str) -> N
     drawn = [random_chain(rng, [False] * n) for n in (2, 3, 2)]
     r, p, v = (np.concatenate([getattr(s, name) for _, s in drawn]) for name in ("r", "p", "v"))
     pdot = np.concatenate([quaternion_rate(s.p, s.omega) for _, s in drawn])
-    forest = StructuredSystem([notes_chain(model) for model, _ in drawn])
+    forest = StructuredSystem([model for model, _ in drawn])
     for broken, what in ((p, 0.0), (r, np.nan)):
         kept = broken[at].copy()
         broken[at] = what
@@ -199,7 +195,7 @@ def test_baumgarte_adds_2a_and_a_squared_to_every_constraint(mix: str, a: float)
     """C̈ + 2 a Ċ + a² C = 0 of joints that are open, and of pᵀp − 1."""
     rng = np.random.default_rng(27)
     model, state = random_chain(rng, MIXES[mix](rng, 4), loads=True, drag=True)
-    forest, pdot, h = StructuredSystem([notes_chain(model)]), quaternion_rate(state.p, state.omega), 1e-6
+    forest, pdot, h = StructuredSystem([model]), quaternion_rate(state.p, state.omega), 1e-6
     q, v = component_first(state.r, state.p), component_first(state.v, pdot)
     q[:3] += 0.1 * rng.normal(size=(3, 4))
     v[:3] += 0.1 * rng.normal(size=(3, 4))
@@ -222,15 +218,11 @@ def test_a_pendulum_of_any_size_is_solved_alike(mix: str) -> None:
     """Micrometres and milligrams, kilometres and kilotons: no threshold has a unit."""
     rng = np.random.default_rng(28)
     model, state = random_chain(rng, MIXES[mix](rng, 3), loads=True, drag=True)
-    here = StructuredSystem([notes_chain(model)]).solve(
-        state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
-    )
+    here = StructuredSystem([model]).solve(state.r, state.p, state.v, quaternion_rate(state.p, state.omega))
     allowed = state_rounding_bound(model, state)
     for length, mass, second in ((1e-6, 1e-9, 1e-3), (1e3, 1e6, 1e2), (1.0, 1e15, 1.0)):
         small, at = rescaled(model, state, length, mass, second)
-        there = StructuredSystem([notes_chain(small)]).solve(
-            at.r, at.p, at.v, quaternion_rate(at.p, at.omega)
-        )
+        there = StructuredSystem([small]).solve(at.r, at.p, at.v, quaternion_rate(at.p, at.omega))
         for name, unit, bound in (
             ("acceleration", length / second**2, allowed.acceleration),
             ("pddot", 1 / second**2, allowed.angular_acceleration / 2),
@@ -246,9 +238,7 @@ def test_a_collapsed_rod_is_one_of_its_own_rounding(scale: float) -> None:
     r = state.r.copy()
     r[2] -= state.u[2] * model.length[2]
     with pytest.raises(SingularSystem, match="rod above body 3 has length 0"):
-        StructuredSystem([notes_chain(model)]).solve(
-            r, state.p, state.v, quaternion_rate(state.p, state.omega)
-        )
+        StructuredSystem([model]).solve(r, state.p, state.v, quaternion_rate(state.p, state.omega))
 
 
 def test_a_rod_short_beside_another_chain_s_is_no_collapsed_one() -> None:
@@ -256,11 +246,9 @@ def test_a_rod_short_beside_another_chain_s_is_no_collapsed_one() -> None:
     small, large = (rescaled(*random_chain(rng, [True]), scale, 1.0, 1.0) for scale in (1e-6, 1e12))
     models, states = zip(small, large, strict=True)
     r, p, v, omega = (np.concatenate([getattr(s, k) for s in states]) for k in ("r", "p", "v", "omega"))
-    both = StructuredSystem([notes_chain(model) for model in models]).solve(
-        r, p, v, quaternion_rate(p, omega)
-    )
+    both = StructuredSystem(models).solve(r, p, v, quaternion_rate(p, omega))
     model, at = small
-    alone = StructuredSystem([notes_chain(model)]).solve(at.r, at.p, at.v, quaternion_rate(at.p, at.omega))
+    alone = StructuredSystem([model]).solve(at.r, at.p, at.v, quaternion_rate(at.p, at.omega))
     np.testing.assert_allclose(both.acceleration[:1], alone.acceleration, rtol=64 * EPS, atol=0)
 
 
@@ -269,7 +257,7 @@ def test_a_collapsed_rod_on_a_body_that_is_not_turned_is_named_too() -> None:
     at = state_from_minimal(model, np.array([[1.0, 0, 0, 0]]), state.omega, state.u, state.udot)
     with pytest.raises(SingularSystem, match="rod above body 1 has length 0"):
         r = at.r - at.u * model.length
-        StructuredSystem([notes_chain(model)]).solve(r, at.p, at.v, quaternion_rate(at.p, at.omega))
+        StructuredSystem([model]).solve(r, at.p, at.v, quaternion_rate(at.p, at.omega))
 
 
 def test_what_is_lost_to_rounding_or_overflow_is_told() -> None:
@@ -279,8 +267,8 @@ def test_what_is_lost_to_rounding_or_overflow_is_told() -> None:
     uneven = replace(model, mass=heavy * model.mass, inertia=heavy[:, None, None] * model.inertia)
     pdot = quaternion_rate(state.p, state.omega)
     with pytest.raises(SingularSystem, match="joint rows are not independent"):
-        StructuredSystem([notes_chain(uneven)]).solve(state.r, state.p, state.v, pdot)
-    forest, fast = StructuredSystem([notes_chain(model)]), pdot.copy()
+        StructuredSystem([uneven]).solve(state.r, state.p, state.v, pdot)
+    forest, fast = StructuredSystem([model]), pdot.copy()
     fast[1, 2] = np.inf
     with pytest.raises(SingularSystem, match="a rate or a load is not finite"), np.errstate(all="ignore"):
         forest.acceleration(component_first(state.r, state.p), component_first(state.v, fast))
@@ -288,7 +276,7 @@ def test_what_is_lost_to_rounding_or_overflow_is_told() -> None:
 
 def test_the_copies_of_a_tiled_forest_have_names_too() -> None:
     model, state = random_chain(np.random.default_rng(29), [False, False, False])
-    forest = StructuredSystem([notes_chain(model)]).repeated(2)
+    forest = StructuredSystem([model]).repeated(2)
     q, v = component_first(state.r, state.p), component_first(state.v, quaternion_rate(state.p, state.omega))
     q, v = np.tile(q, 2), np.tile(v, 2)
     q[3:, 4] = 0.0
@@ -302,7 +290,7 @@ def test_a_body_without_thickness_is_named_beside_a_tiny_one() -> None:
     model, _ = random_chain(np.random.default_rng(30), [False, False])
     needle = replace(model, inertia=np.stack([1e-20 * np.eye(3), np.diag([1.0, 1.0, 0.0])]))
     with pytest.raises(SingularSystem, match="inertia of body 2 is singular"):
-        StructuredSystem([notes_chain(needle)])
+        StructuredSystem([needle])
 
 
 @KINDS
@@ -313,7 +301,7 @@ def test_one_kind_of_drag_alone_counts(mix: str, alone: str) -> None:
     other = {"drag_force": "drag_moment", "drag_moment": "drag_force"}[alone]
     model = replace(model, **{other: np.zeros(3)})
     one, pdot, allowed = (
-        notes_chain(model),
+        model,
         quaternion_rate(state.p, state.omega),
         state_rounding_bound(model, state),
     )
@@ -329,7 +317,7 @@ def test_the_rate_of_a_gap_is_its_derivative_off_the_manifold_too(mix: str) -> N
     """Where pᵀṗ is not 0 the matrix A of the notes stretches, and d with it."""
     rng, h = np.random.default_rng(32), 1e-6
     model, state = random_chain(rng, MIXES[mix](rng, 4))
-    forest = StructuredSystem([notes_chain(model)])
+    forest = StructuredSystem([model])
     q, v = component_first(state.r, 1.1 * state.p), rng.normal(size=(7, 4))
     ends = [forest.joint_gaps(q + s * h * v, v)[0] for s in (1, -1)]
     # gaps of some metres, each a dozen roundings of 1e-16, over 2 h (the quadratic p(t) leaves h² some 1e-12)
