@@ -7,6 +7,8 @@ from collections import Counter
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
+from plumbline.judging import rows
+from plumbline.judging.rows import Verdict
 from reports.results import Record, Results
 
 
@@ -20,71 +22,45 @@ class VerdictStyle(NamedTuple):
 
 
 VERDICT_STYLES = {
-    "disagrees": VerdictStyle("≠", "disagrees", "disagree", "the error is above its derived tolerance"),
-    "failed": VerdictStyle(
-        "✕", "failed", "failed", "raised, crashed, hung, ran out of memory or was not finite"
-    ),
-    "unresolved": VerdictStyle("?", "unresolved", "unresolved", "the data cannot tell"),
-    "unsupported": VerdictStyle("–", "unsupported", "unsupported", "the engine cannot do this"),
-    "not installed": VerdictStyle("○", "absent", "not installed", "the engine is not on this machine"),
-    "agrees": VerdictStyle("✓", "agrees", "agree", "the error is within its derived tolerance"),
-}
-
-# Whose voice a cell speaks with: what nobody expected first, then recorded disagreements, then
-# agreement, then expected gaps.
-_UNEXPECTED_SEVERITY = {
-    "failed": 9,
-    "disagrees": 8,
-    "unresolved": 7,
-    "unsupported": 6,
-    "agrees": 4,
-    "not installed": 1,
-}
-_KNOWN_SEVERITY = {
-    "failed": 5,
-    "disagrees": 5,
-    "unresolved": 3,
-    "unsupported": 2,
-    "agrees": 4,
-    "not installed": 1,
+    str(verdict): VerdictStyle(
+        style.glyph,
+        "absent" if verdict == Verdict.NOT_INSTALLED else str(verdict),
+        style.plural,
+        style.meaning,
+    )
+    for verdict, style in rows.VERDICT_STYLES.items()
 }
 
 
 def severity(row: Record) -> int:
     """9 (failed) … 1 (not installed); from 6 on it was not expected and needs attention."""
-    return (_KNOWN_SEVERITY if row.get("known") else _UNEXPECTED_SEVERITY)[row["verdict"]]
+    return rows.severity(row["verdict"], row.get("known"))
 
 
 def needs_attention(row: Record) -> bool:
     """A disagreement, failure or gap that no entry of known.yaml expects."""
-    return severity(row) >= 6
+    return severity(row) >= rows.ATTENTION_SEVERITY
 
 
 def error_ratio(row: Record) -> float | None:
-    """Error over tolerance; None where either is missing or the quotient says nothing.
-
-    Where the worst of many comparisons, each with a tolerance of its own, is not the largest error,
-    the row says so in ``extra["ratio"]``.
-    """
-    told = (row.get("extra") or {}).get("ratio")
-    if told is not None and math.isfinite(told):
-        return float(told)
-    value, tolerance = row.get("value"), row.get("tolerance")
-    if value is None or tolerance is None or not math.isfinite(value) or not tolerance > 0:
-        return None
-    return float(value) / float(tolerance)
+    """Error over tolerance, as judged; None where the row has none."""
+    if "ratio" in row:
+        ratio = row["ratio"]
+    else:  # stored before rows had a ratio of their own
+        ratio = (row.get("extra") or {}).get("ratio")
+        if ratio is None:
+            ratio = rows.error_ratio(row.get("value"), row.get("tolerance"))
+    return None if ratio is None or not math.isfinite(ratio) else float(ratio)
 
 
-def worst_row(rows: Iterable[Record]) -> Record:
+def worst_row(candidates: Iterable[Record]) -> Record:
     """The row that speaks for a cell: the most severe, among those the largest error over tolerance."""
-    return max(
-        rows, key=lambda row: (severity(row), error_ratio(row) if error_ratio(row) is not None else -1.0)
-    )
+    return max(candidates, key=lambda row: rows.cell_rank(row["verdict"], row.get("known"), error_ratio(row)))
 
 
-def count_verdicts(rows: Iterable[Record]) -> Counter[str]:
+def count_verdicts(records: Iterable[Record]) -> Counter[str]:
     """Number of rows by verdict."""
-    return Counter(row["verdict"] for row in rows)
+    return Counter(row["verdict"] for row in records)
 
 
 def count_all_verdicts(results: Results) -> Counter[str]:

@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from plumbline.execution.runner import RunResult
-from plumbline.model.datatypes import Row
+from plumbline.judging.rows import Row, Verdict
 
 
 def make_console(file: Any) -> Console:
@@ -49,12 +49,11 @@ class ProgressDisplay:
             print(f"{done} of {total} tasks done", file=self.file, flush=True)
 
 
-VERDICT_GLYPHS = {
-    "agrees": "[green]✓[/]", "disagrees": "[red bold]✗[/]", "unresolved": "[yellow]?[/]",
-    "unsupported": "[dim]–[/]", "not installed": "[dim]∅[/]", "failed": "[red bold]![/]",
+VERDICT_COLOURS = {
+    Verdict.AGREES: "green", Verdict.DISAGREES: "red bold", Verdict.UNRESOLVED: "yellow",
+    Verdict.UNSUPPORTED: "dim", Verdict.NOT_INSTALLED: "dim", Verdict.FAILED: "red bold",
 }  # fmt: skip
 MAX_COMPLETE_TABLE = 60  # scenarios; of more, those where everything agrees are left out of the table
-VERDICTS_WORST_FIRST = ("failed", "disagrees", "unresolved", "unsupported", "not installed", "agrees")
 
 
 def print_result(result: RunResult) -> None:
@@ -70,28 +69,50 @@ def print_result(result: RunResult) -> None:
     for scenario in result.scenarios:
         of = [[r for r in rows_of[scenario] if r.engine == engine] for engine in result.engines]
         if len(result.scenarios) <= MAX_COMPLETE_TABLE or any(
-            r.verdict != "agrees" for rows in of for r in rows
+            r.verdict != Verdict.AGREES for rows in of for r in rows
         ):
             table.add_row(escape(scenario), *map(format_cell, of))
     out.print(table)
     out.print(
-        "[dim]each cell: agreeing rows / all rows, then the worst error over its tolerance; "
-        "✓ agrees  ✗ disagrees  ? unresolved  – unsupported  ∅ not installed  ! failed[/]"
+        "[dim]each cell: worst verdict, agreeing rows / all rows, error over tolerance of the worst row; "
+        + "  ".join(f"{verdict.style.glyph} {verdict}" for verdict in Verdict)
+        + "[/]"
     )
     for row in result.rows:
-        if row.verdict != "agrees" and row.known_issue is None:
-            out.print(f"{VERDICT_GLYPHS[row.verdict]} {escape(row.key)}: {escape(row.reason)}")
+        if row.verdict != Verdict.AGREES and row.known_issue is None:
+            out.print(f"{coloured_glyph(row)} {escape(row.key)}: {escape(row.reason)}")
     for entry in result.stale_entries:
         out.print(f"[red]![/] known entry {entry.id} no longer occurs: remove it from known_issues.yaml")
     out.print(f"[bold]{escape(result.metadata['sentence'])}[/]")
 
 
+def coloured_glyph(row: Row) -> str:
+    """Return the verdict's glyph as rich markup, dimmed where a known issue expects the verdict.
+
+    Args:
+        row: any judged row.
+
+    Returns:
+        Markup for `rich`.
+
+    """
+    colour = "dim" if row.known_issue else VERDICT_COLOURS[row.verdict]
+    return f"[{colour}]{row.verdict.style.glyph}[/]"
+
+
 def format_cell(rows: Sequence[Row]) -> str:
-    """One cell of the matrix: worst verdict that nothing explains, counts, worst error over tolerance."""
+    """Return one cell of the matrix: the worst row's glyph, the counts and the worst row's ratio.
+
+    Args:
+        rows: all rows of one scenario and engine.
+
+    Returns:
+        Markup for `rich`; empty for no rows.
+
+    """
     if not rows:
         return ""
-    open_rows = [r for r in rows if r.known_issue is None] or rows
-    worst = min((r.verdict for r in open_rows), key=VERDICTS_WORST_FIRST.index)
-    agreeing = sum(r.verdict == "agrees" for r in rows)
-    ratios = [r.extra["ratio"] for r in rows if r.verdict == "agrees" and "ratio" in r.extra]
-    return f"{VERDICT_GLYPHS[worst]} {agreeing}/{len(rows)}" + (f" {max(ratios):.1g}" if ratios else "")
+    worst = max(rows, key=lambda row: row.rank)
+    agreeing = sum(row.verdict == Verdict.AGREES for row in rows)
+    ratio = "" if worst.ratio is None else f" {worst.ratio:.1g}"
+    return f"{coloured_glyph(worst)} {agreeing}/{len(rows)}{ratio}"

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from plumbline.model.datatypes import Row, Verdict
+from plumbline.judging.rows import Row, Verdict
 
 # What a probe may say without being looked at: it agrees, or cannot and that is recorded.
-UNREMARKABLE_VERDICTS: tuple[Verdict, ...] = ("agrees", "unsupported", "not installed")
+UNREMARKABLE_VERDICTS: tuple[Verdict, ...] = (Verdict.AGREES, Verdict.UNSUPPORTED, Verdict.NOT_INSTALLED)
 
 
 @dataclass
@@ -31,9 +31,9 @@ class RandomBatch:
             if row.engine in seen:
                 continue
             self.counts_by_verdict[row.verdict] += 1
-            if "ratio" in row.extra:
+            if row.ratio is not None:
                 cell = row.engine, row.quantity
-                found = row.extra["ratio"], row.scenario
+                found = row.ratio, row.scenario
                 self.worst_ratios[cell] = max(found, self.worst_ratios.get(cell, (-1.0, "")))
         return [row for row in rows if row.engine in seen]
 
@@ -51,4 +51,6 @@ class RandomBatch:
 
 def is_remarkable(row: Row) -> bool:
     """Whether someone should see what is said of a probe, recorded or not."""
-    return row.verdict not in UNREMARKABLE_VERDICTS or (row.verdict == "unsupported" and not row.known_issue)
+    return row.verdict not in UNREMARKABLE_VERDICTS or (
+        row.verdict == Verdict.UNSUPPORTED and not row.known_issue
+    )

@@ -12,14 +12,14 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal
 
 from plumbline.engines import calls, environments
 from plumbline.engines.calls import EngineInfo
 from plumbline.execution.random_batch import RandomBatch
 from plumbline.execution.scenario_run import ScenarioRun, TruthFailure, task_keys
 from plumbline.judging import known_issues
-from plumbline.model.datatypes import Row, Verdict
+from plumbline.judging.rows import Row, Verdict
 from plumbline.processes.cpu_time import CpuTimes
 from plumbline.processes.workers import ExecutorUnavailable, Limits, ResultCache, Task, WorkerPool
 from plumbline.reproduce import write
@@ -216,9 +216,9 @@ def describe_truth_methods(bench: ScenarioRun) -> list[str]:
 
 def summarize_verdicts(result: RunResult) -> str:
     """The verdict in one sentence: counts, the disagreements by name, what is expected."""
-    verb = {"agrees": "agree", "disagrees": "disagree"}
+    verb = {Verdict.AGREES: "agree", Verdict.DISAGREES: "disagree"}
     parts = []
-    for verdict in get_args(Verdict):
+    for verdict in Verdict:
         here = [row for row in result.rows if row.verdict == verdict]
         number = len(here) + result.random_batch.counts_by_verdict[verdict]
         if not number:
@@ -226,11 +226,11 @@ def summarize_verdicts(result: RunResult) -> str:
         part = f"{number} {verb.get(verdict, verdict)}"
         new = [row for row in here if row.known_issue is None]
         # of probes only what is recorded or agrees, and engines that are not installed, are not in the rows
-        old = 0 if verdict in ("agrees", "not installed") else number - len(new)
+        old = 0 if verdict in (Verdict.AGREES, Verdict.NOT_INSTALLED) else number - len(new)
         aliases = sum(row.alias_of is not None for row in here)
-        if verdict == "agrees" and aliases:
+        if verdict == Verdict.AGREES and aliases:
             part += f" ({aliases} by an alias of another integrator)"
-        if verdict in ("disagrees", "failed") and new:
+        if verdict in (Verdict.DISAGREES, Verdict.FAILED) and new:
             named = list(dict.fromkeys(f"{row.engine}, {row.scenario}: {row.quantity}" for row in new))
             more = f" and {len(named) - 3} more" if len(named) > 3 else ""
             part += f" ({'; '.join(named[:3])}{more})"
@@ -246,9 +246,11 @@ def summarize_verdicts(result: RunResult) -> str:
 def exit_code(result: RunResult) -> int:
     """0 all agree or differ as recorded; 1 a disagreement or an unexpected gap; 3 an engine failed."""
     new = {row.verdict for row in result.rows if row.known_issue is None}
-    if "failed" in new:
+    if Verdict.FAILED in new:
         return 3
-    return 1 if new & {"disagrees", "unresolved", "unsupported"} or result.stale_entries else 0
+    return (
+        1 if new & {Verdict.DISAGREES, Verdict.UNRESOLVED, Verdict.UNSUPPORTED} or result.stale_entries else 0
+    )
 
 
 def git_commit() -> str | None:

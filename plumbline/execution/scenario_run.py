@@ -14,10 +14,10 @@ from plumbline.engines.calls import EngineInfo
 from plumbline.judging import metamorphic, outlier
 from plumbline.judging.convergence import refinement_resolutions
 from plumbline.judging.long_runs import judge_long_runs, plan_long_run, run_long_run_study
-from plumbline.judging.rows import JudgingResult, RowContext
+from plumbline.judging.rows import JudgingResult, RowContext, Verdict
 from plumbline.judging.state import judge_states, judge_states_pickled
 from plumbline.judging.trajectory import judge_trajectory
-from plumbline.model.datatypes import Integrator, StateQuantities, Verdict
+from plumbline.model.datatypes import Integrator, StateQuantities
 from plumbline.model.sampling import derive_seed, random_states
 from plumbline.processes.packed import Pickled
 from plumbline.processes.workers import Outcome, Task
@@ -116,7 +116,7 @@ class ScenarioRun:
         found = JudgingResult()
         for name, info in self.engines.items():
             if info.missing is not None:
-                verdict: Verdict = "unsupported" if info.version else "not installed"
+                verdict: Verdict = Verdict.UNSUPPORTED if info.version else Verdict.NOT_INSTALLED
                 found.rows.append(self.subject(name).make_row("state", "-", "all", verdict, info.missing))
             for key in self.keys:
                 if key[1] == name and key in self.findings_by_key:
@@ -160,7 +160,7 @@ class ScenarioRun:
                 self.waiting_for_truth.append(answer)
                 continue
             found = self.findings_by_key[answer.key] = self.judge(answer)
-            if answer.key[2] == "state" and any(row.verdict == "disagrees" for row in found.rows):
+            if answer.key[2] == "state" and any(row.verdict == Verdict.DISAGREES for row in found.rows):
                 questions.append(self.diagnosis_task(answer.key[1], answer.value.quantities))
         self.pending_keys |= {task.key for task in questions}
         return questions
@@ -173,8 +173,10 @@ class ScenarioRun:
         if outcome.failure or isinstance(truth, TruthFailure):
             lost = outcome.failure or f"no truth to judge by: {getattr(truth, 'reason', '')}"
             if level == "endurance":
-                return JudgingResult(rows=[who.make_row("invariants", name, "all_long", "failed", lost)])
-            return JudgingResult(rows=[who.make_row(level, name, "all", "failed", lost)])
+                return JudgingResult(
+                    rows=[who.make_row("invariants", name, "all_long", Verdict.FAILED, lost)]
+                )
+            return JudgingResult(rows=[who.make_row(level, name, "all", Verdict.FAILED, lost)])
         if outcome.judge_result is not None:
             found: JudgingResult = outcome.judge_result
         elif level == "endurance":
@@ -204,7 +206,7 @@ class ScenarioRun:
         """Take the answer to a question into the rows that disagree."""
         text = outcome.value or f"no diagnosis: {outcome.failure}"
         cell = self.findings_by_key[self.scenario.name, outcome.key[2], "state"]
-        cell.rows = [replace(r, diagnosis=text) if r.verdict == "disagrees" else r for r in cell.rows]
+        cell.rows = [replace(r, diagnosis=text) if r.verdict == Verdict.DISAGREES else r for r in cell.rows]
 
     def summary(self) -> dict[str, Any]:
         """What the store keeps of the scenario."""

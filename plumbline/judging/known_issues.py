@@ -19,7 +19,7 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, field_
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from plumbline.model.datatypes import Row
+from plumbline.judging.rows import Row
 
 RowKind = tuple[str, str, str, str, str]  # of a row: engine, its version, level, integrator, quantity
 KNOWN_ISSUES_FILE = Path(__file__).with_name("known_issues.yaml")

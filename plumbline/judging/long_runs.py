@@ -22,8 +22,8 @@ import numpy as np
 from plumbline.engines.calls import format_exception
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.convergence import ORDER_MARGIN
-from plumbline.judging.rows import JudgingResult, RowContext
-from plumbline.model.datatypes import Array, Integrator, Model, Row, State, Trajectory, Unsupported, Verdict
+from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict
+from plumbline.model.datatypes import Array, Integrator, Model, State, Trajectory, Unsupported
 from plumbline.model.invariants import INVARIANT_UNITS, compute_invariants, invariant_scales
 from plumbline.truth.ground_truth import DETECTABLE_PARAMETER_ERROR, stretched_length
 
@@ -210,13 +210,13 @@ def judge_long_runs(
         return JudgingResult(rows=[row])
 
     if endured.unsupported is not None:
-        return whole("unsupported", endured.unsupported)
+        return whole(Verdict.UNSUPPORTED, endured.unsupported)
     finest = endured.runs[-1]
     if not finest.windows:
-        return whole("failed", f"at the finest resolution {finest.resolution:g}: {finest.failure}")
+        return whole(Verdict.FAILED, f"at the finest resolution {finest.resolution:g}: {finest.failure}")
     if finest.failure is not None and not has_blown_up(endured):
         return whole(
-            "failed", f"within {endured.plan.seconds:g} s at {finest.resolution:g}: {finest.failure}"
+            Verdict.FAILED, f"within {endured.plan.seconds:g} s at {finest.resolution:g}: {finest.failure}"
         )
     for quantity, unit in INVARIANT_UNITS.items():
         if quantity in finest.windows:
@@ -292,7 +292,7 @@ class DriftJudge:
         unresolved: Row | None = None
         for end in ends or [self.finest.reached_time]:
             row = self.judge_window(end)
-            if row.verdict != "unresolved":
+            if row.verdict != Verdict.UNRESOLVED:
                 return row
             unresolved = unresolved or row
         assert unresolved is not None
@@ -311,9 +311,9 @@ class DriftJudge:
         if drift > floor:
             return self.judge_order(end, what)
         if floor <= DETECTABLE_PARAMETER_ERROR * self.scale(end):
-            return self.verdict_row("agrees", f"{what}: {passed}", end, floor, why)
+            return self.verdict_row(Verdict.AGREES, f"{what}: {passed}", end, floor, why)
         return self.verdict_row(
-            "unresolved", f"{what}: {floor:.2g} {self.unit} may be {passed}", end, floor, why
+            Verdict.UNRESOLVED, f"{what}: {floor:.2g} {self.unit} may be {passed}", end, floor, why
         )
 
     def judge_order(self, end: float, what: str) -> Row:
@@ -324,7 +324,7 @@ class DriftJudge:
                 f"{what}; of {len(self.study.runs)} runs {len(usable)} reached it with every drift below "
                 f"{MAX_RELATIVE_DRIFT:g} of its scale: too coarse a step"
             )
-            return self.verdict_row("unresolved", reason, end, MAX_RELATIVE_DRIFT * self.scale(end), "")
+            return self.verdict_row(Verdict.UNRESOLVED, reason, end, MAX_RELATIVE_DRIFT * self.scale(end), "")
         floor = self.rounding_floor(end, BLOCK_COUNT)
         whole = DriftOrder.from_runs(usable[0], self.finest, self.quantity, end)
         allowed = whole.max_fine_mean(self.required_order, floor)
@@ -339,13 +339,15 @@ class DriftJudge:
             f"the coarsest: {falls} ({SIGMA_FACTOR:g} σ of the blocks), due {self.required_order:.3g}, rounding {floor:.2g}"
         )
         if whole.fine_mean <= allowed and whole.order > SIGMA_FACTOR * whole.order_error:
-            return self.verdict_row("agrees", f"{what}, vanishing: {falls}", end, tolerance, why, whole.order)
+            return self.verdict_row(
+                Verdict.AGREES, f"{what}, vanishing: {falls}", end, tolerance, why, whole.order
+            )
         pairs = [DriftOrder.from_runs(a, b, self.quantity, end) for a, b in itertools.pairwise(usable)]
         if all(pair.fine_mean > pair.max_fine_mean(self.required_order, floor) for pair in [whole, *pairs]):
             reason = f"{what} does not vanish: {falls}, due {self.required_order:.3g}"
-            return self.verdict_row("disagrees", reason, end, tolerance, why, whole.order)
+            return self.verdict_row(Verdict.DISAGREES, reason, end, tolerance, why, whole.order)
         return self.verdict_row(
-            "unresolved", f"{what}: {falls} cannot tell", end, tolerance, why, whole.order
+            Verdict.UNRESOLVED, f"{what}: {falls} cannot tell", end, tolerance, why, whole.order
         )
 
     def usable_runs(self, end: float) -> list[LongRun]:
@@ -389,7 +391,7 @@ class DriftJudge:
         common = {"value": grown, "tolerance": MAX_SYMMETRIC_GROWTH, "compared_until": end, "extra": extra}
         if window.max_drift <= floor:
             reason = f"{self.name} is rounding: its growth says nothing"
-            return self.make_row(name, "agrees", reason, "1", compared_until=end, extra=extra)
+            return self.make_row(name, Verdict.AGREES, reason, "1", compared_until=end, extra=extra)
         kept = self.finest.windows[self.quantity]
         for a, b in itertools.pairwise(t for t in sorted(kept) if t >= MIN_WINDOW_SECONDS):
             if kept[b].max_drift > UNSTABLE_GROWTH_FACTOR * b / a * kept[a].max_drift:
@@ -397,8 +399,8 @@ class DriftJudge:
                     f"an unstable motion: {self.name} {kept[a].max_drift:.2g} {self.unit} by {a:g} s, "
                     f"{kept[b].max_drift:.2g} by {b:g} s, which neither a bounded drift nor a leak does"
                 )
-                return self.make_row(name, "unresolved", reason, "1", **common)
-        verdict: Verdict = "agrees" if grown < MAX_SYMMETRIC_GROWTH else "disagrees"
+                return self.make_row(name, Verdict.UNRESOLVED, reason, "1", **common)
+        verdict: Verdict = Verdict.AGREES if grown < MAX_SYMMETRIC_GROWTH else Verdict.DISAGREES
         reason = (
             f"{self.name} {window.max_drift_first_half:.2g} {self.unit} by {end / 2:g} s, {window.max_drift:.2g} by {end:g} s: "
             f"{'bounded' if verdict == 'agrees' else 'it grows with time, of a symmetric method'}"

@@ -29,7 +29,7 @@ import numpy as np
 
 from plumbline.engines.adapter import Adapter
 from plumbline.engines.registry import load_adapter
-from plumbline.judging.rows import JudgingResult, RowContext
+from plumbline.judging.rows import JudgingResult, RowContext, Verdict
 from plumbline.model.datatypes import (
     Array,
     EngineFailure,
@@ -39,7 +39,6 @@ from plumbline.model.datatypes import (
     StateQuantities,
     Trajectory,
     Unsupported,
-    Verdict,
 )
 from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import (
@@ -97,7 +96,7 @@ class RelationResult:
     worst_state: int
     state_count: int  # that were compared
     refusal_reason: str = ""
-    verdict: Verdict = "unsupported"  # of a refusal
+    verdict: Verdict = Verdict.UNSUPPORTED  # of a refusal
     integrator: str = "-"  # where it is a relation of runs
     steps: int = 0  # of a run, there and back
     resolution: float = 0.0  # of a run: its step in s, or its relative tolerance
@@ -279,7 +278,7 @@ def check_run_relations(engine: Adapter, model: Model, state: State) -> Iterator
     for integrator in engine.integrators:
         for finer in STEP_DIVISORS:
             found = list(check_integrator_relations(engine, integrator, model, state, step / finer))
-            if integrator.kind == "tolerance" or all(held.verdict != "failed" for held in found):
+            if integrator.kind == "tolerance" or all(held.verdict != Verdict.FAILED for held in found):
                 break
         yield from found
 
@@ -345,7 +344,7 @@ def check_linear_solvers(
 
 def refused_result(name: str, integrator: Integrator, refusal: Unsupported | EngineFailure) -> RelationResult:
     """A relation of runs that the engine cannot do, or failed to."""
-    verdict: Verdict = "unsupported" if isinstance(refusal, Unsupported) else "failed"
+    verdict: Verdict = Verdict.UNSUPPORTED if isinstance(refusal, Unsupported) else Verdict.FAILED
     return RelationResult(name, None, "", 0, 0, str(refusal), verdict, integrator.name)
 
 
@@ -405,7 +404,7 @@ def worst_difference_result(
     quantity = max(differences, key=lambda q: differences[q])
     ratio = differences[quantity] / limit
     return RelationResult(
-        name, ratio, quantity, 0, 1, "", "unsupported", integrator.name, steps, resolution, end
+        name, ratio, quantity, 0, 1, "", Verdict.UNSUPPORTED, integrator.name, steps, resolution, end
     )
 
 
@@ -446,7 +445,7 @@ def judge_relations(context: RowContext, found: Sequence[RelationResult]) -> Jud
         of_run = {"resolution": one.resolution, "end": one.end_time} if one.steps else {}
         rows.append(
             context.make_row(
-                "relations", one.integrator, one.relation, "agrees" if agrees else "disagrees", reason,
+                "relations", one.integrator, one.relation, Verdict.AGREES if agrees else Verdict.DISAGREES, reason,
                 value=one.ratio, tolerance=1.0, derivation=derivation,
                 extra={"states": float(one.state_count), "state": float(one.worst_state), **of_run},
             )

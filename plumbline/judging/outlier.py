@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from plumbline.model.datatypes import Row
+from plumbline.judging.rows import Row, Verdict
 
 
 def annotate_outliers(rows: Sequence[Row]) -> list[Row]:
@@ -31,7 +31,7 @@ def describe_outliers(rows: Sequence[Row]) -> str:
     if not wrong:
         return ""
     disputed = {row.quantity for row in rows if is_state_disagreement(row)}
-    right = [row for row in rows if row.level == "state" and row.verdict == "agrees"]
+    right = [row for row in rows if row.level == "state" and row.verdict == Verdict.AGREES]
     agree = list(dict.fromkeys(r.engine for r in right if r.quantity in disputed and r.engine not in wrong))
     certified = any("truth: certified" in row.derivation for row in rows)
     truth = "the certified truth" if certified else "the reference, which is the truth here"
@@ -46,7 +46,7 @@ def describe_outliers(rows: Sequence[Row]) -> str:
 
 def is_state_disagreement(row: Row) -> bool:
     """Whether a row disagrees at state level."""
-    return row.level == "state" and row.verdict == "disagrees"
+    return row.level == "state" and row.verdict == Verdict.DISAGREES
 
 
 def join_words(words: Sequence[str]) -> str:

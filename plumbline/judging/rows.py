@@ -1,18 +1,146 @@
-"""What judging yields: rows about a subject, and the tables behind them."""
+"""Verdicts, rows and the tables behind them: what judging returns."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
-from typing import Any
+from enum import StrEnum
+from typing import Any, Literal, NamedTuple
 
-from plumbline.model.datatypes import Level, Row, Verdict
-
+Level = Literal["state", "invariants", "trajectory", "relations"]
 Columns = dict[str, Any]  # column name → its values (n,), or the one value of all n records
+
+
+class Verdict(StrEnum):
+    """What became of one judged quantity; the values are the words that users read."""
+
+    AGREES = "agrees"
+    DISAGREES = "disagrees"
+    UNRESOLVED = "unresolved"
+    UNSUPPORTED = "unsupported"
+    NOT_INSTALLED = "not installed"
+    FAILED = "failed"
+
+    @property
+    def style(self) -> VerdictStyle:
+        """How terminal and report show this verdict."""
+        return VERDICT_STYLES[self]
+
+
+class VerdictStyle(NamedTuple):
+    """How a verdict is shown and ranked."""
+
+    glyph: str
+    plural: str  # the word after a count: "3 disagree"
+    meaning: str  # short, for legends
+    severity: int  # 9 (worst) … 1, where no known issue expects the verdict; from 6 on it needs attention
+    known_severity: int  # the same where a known issue expects the verdict
+
+
+VERDICT_STYLES = {
+    Verdict.DISAGREES: VerdictStyle("✗", "disagree", "the error is above its derived tolerance", 8, 5),
+    Verdict.FAILED: VerdictStyle(
+        "!", "failed", "raised, crashed, timed out, ran out of memory or was not finite", 9, 5
+    ),
+    Verdict.UNRESOLVED: VerdictStyle("?", "unresolved", "the data cannot decide", 7, 3),
+    Verdict.UNSUPPORTED: VerdictStyle("–", "unsupported", "the engine cannot do this", 6, 2),
+    Verdict.NOT_INSTALLED: VerdictStyle("∅", "not installed", "the engine is not on this machine", 1, 1),
+    Verdict.AGREES: VerdictStyle("✓", "agree", "the error is within its derived tolerance", 4, 4),
+}
+ATTENTION_SEVERITY = 6  # from here on a verdict needs attention
+
+
+def severity(verdict: str, known_issue: str | None) -> int:
+    """Rank a verdict for the summary of several rows in one cell.
+
+    Unexpected failures come first, then recorded disagreements, then agreement, then expected gaps.
+
+    Args:
+        verdict: a value of `Verdict`.
+        known_issue: id of the entry of known_issues.yaml that expects the verdict, or None.
+
+    Returns:
+        9 (failed, unexpected) … 1 (not installed); from `ATTENTION_SEVERITY` on nothing expects it.
+
+    """
+    style = VERDICT_STYLES[Verdict(verdict)]
+    return style.known_severity if known_issue else style.severity
+
+
+def cell_rank(verdict: str, known_issue: str | None, ratio: float | None) -> tuple[int, float]:
+    """Return the sort key whose maximum over a cell's rows is the row that stands for the cell.
+
+    Args:
+        verdict: a value of `Verdict`.
+        known_issue: id of the entry of known_issues.yaml that expects the verdict, or None.
+        ratio: error over tolerance; None where the row has none.
+
+    Returns:
+        The severity, then the ratio.
+
+    """
+    return severity(verdict, known_issue), -1.0 if ratio is None else ratio
+
+
+def error_ratio(value: float | None, tolerance: float | None) -> float | None:
+    """Divide an error by its tolerance.
+
+    Args:
+        value: the error, in the row's unit.
+        tolerance: the tolerance, in the same unit.
+
+    Returns:
+        The quotient; None where either is missing or not finite, or the tolerance is not positive.
+
+    """
+    if value is None or tolerance is None or not (math.isfinite(value) and tolerance > 0):
+        return None
+    return value / tolerance
+
+
+@dataclass(frozen=True)
+class Row:
+    """One judged quantity: the unit of results.json, the pytest ids and the report."""
+
+    scenario: str
+    family: str
+    engine: str
+    engine_version: str
+    level: Level
+    integrator: str  # "-" for levels without an integrator
+    quantity: str
+    unit: str
+    value: float | None  # the measured error or drift, worst over bodies, states and samples
+    tolerance: float | None  # the limit of ``value``, same unit
+    verdict: Verdict
+    reason: str  # one sentence
+    ratio: float | None = None  # error over tolerance, worst over all comparisons of the row
+    derivation: str = ""  # of the tolerance, in words and numbers
+    uncertainty: float | None = None  # of the truth and of the limit together, same unit
+    compared_until: float | None = None  # s, up to which positions were compared
+    order: float | None = None  # observed order
+    declared_order: int | None = None
+    alias_of: str | None = None
+    known_issue: str | None = None  # id of the entry of known_issues.yaml that expects this verdict
+    diagnosis: str | None = None  # the wrong term, in a sentence
+    user_rtol: float | None = None  # the user's own tolerance, shown beside the verdict
+    cpu_time: float = 0.0  # s, of the work behind this row
+    extra: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def key(self) -> str:
+        """The row's identity across runs."""
+        return "/".join((self.scenario, self.engine, self.level, self.integrator, self.quantity))
+
+    @property
+    def rank(self) -> tuple[int, float]:
+        """The row's `cell_rank`."""
+        return cell_rank(self.verdict, self.known_issue, self.ratio)
 
 
 @dataclass(frozen=True)
 class RowContext:
-    """Who is judged, on what."""
+    """Scenario and engine of the rows of one cell."""
 
     scenario: str
     family: str
@@ -30,8 +158,24 @@ class RowContext:
         unit: str = "1",
         **more: Any,
     ) -> Row:
-        """A row about this subject."""
+        """Make a row about this scenario and engine.
+
+        Args:
+            level: level of comparison.
+            integrator: name of the integrator, "-" for none.
+            quantity: name of the judged quantity.
+            verdict: the verdict.
+            reason: the verdict's reason, one sentence.
+            unit: unit of ``value`` and ``tolerance``.
+            **more: other fields of `Row`. ``ratio`` is the quotient of ``value`` and ``tolerance`` unless
+                given: of many comparisons the worst ratio need not belong to the largest error.
+
+        Returns:
+            The row.
+
+        """
         more = {"value": None, "tolerance": None} | more
+        more.setdefault("ratio", error_ratio(more["value"], more["tolerance"]))
         return Row(
             self.scenario, self.family, self.engine, self.version, level, integrator, quantity, unit,
             verdict=verdict, reason=reason, **more,
@@ -40,7 +184,7 @@ class RowContext:
 
 @dataclass
 class JudgingResult:
-    """Rows, and parts of the tables behind them by their name in the store."""
+    """Rows, and parts of the stored tables behind them."""
 
     rows: list[Row] = field(default_factory=list)
-    tables: list[tuple[str, Columns]] = field(default_factory=list)
+    tables: list[tuple[str, Columns]] = field(default_factory=list)  # name of the stored table, its columns

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from plumbline.engines.calls import Evaluation
-from plumbline.judging.rows import Columns, JudgingResult, RowContext
-from plumbline.model.datatypes import Array, Row
+from plumbline.judging.rows import Columns, JudgingResult, Row, RowContext, Verdict
+from plumbline.model.datatypes import Array
 from plumbline.processes.packed import Pickled
 from plumbline.truth.ground_truth import StateTruth
 from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND
@@ -27,15 +27,15 @@ def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation)
     """Verdicts on every state quantity, worst over bodies and states."""
     found = JudgingResult()
     if evaluation.unsupported is not None:
-        found.rows.append(context.make_row("state", "-", "all", "unsupported", evaluation.unsupported))
+        found.rows.append(context.make_row("state", "-", "all", Verdict.UNSUPPORTED, evaluation.unsupported))
         return found
     if evaluation.failure is not None:
-        found.rows.append(context.make_row("state", "-", "all", "failed", evaluation.failure))
+        found.rows.append(context.make_row("state", "-", "all", Verdict.FAILED, evaluation.failure))
         return found
     for quantity, unit in STATE_UNITS.items():
         if any(getattr(answer, quantity) is None for answer in evaluation.quantities):
             reason = f"{context.title} offers no {quantity.replace('_', ' ')} of its own"
-            found.rows.append(context.make_row("state", "-", quantity, "unsupported", reason, unit))
+            found.rows.append(context.make_row("state", "-", quantity, Verdict.UNSUPPORTED, reason, unit))
             continue
         worst = worst_error_per_state(quantity, truth, evaluation)
         found.tables.append(
@@ -93,8 +93,8 @@ def state_row(context: RowContext, quantity: str, unit: str, found: Columns, met
             f"{bluntness:.1g} of the scale in the median of {count} states; truth: {method}"
         ),
         "cpu_time": cost,
+        "ratio": ratio,
         "extra": {
-            "ratio": ratio,
             "relative": relative,
             "states": float(count),
             "bound_relative": bluntness,
@@ -107,11 +107,11 @@ def state_row(context: RowContext, quantity: str, unit: str, found: Columns, met
             f"{context.title}'s {name} is off by {worst:.3g} {unit} at {where}, {ratio:.3g} times the "
             f"rounding bound; {int(np.sum(ratios > 1))} of {count} states disagree"
         )
-        return context.make_row("state", "-", quantity, "disagrees", reason, unit, **common)
+        return context.make_row("state", "-", quantity, Verdict.DISAGREES, reason, unit, **common)
     if not (
         ratio <= 1 and bluntness <= MAX_RELATIVE_BOUND
     ):  # a bound that is not a number decides nothing either
         reason = f"blunt: the rounding bound is {bluntness:.1g} of the scale, above {MAX_RELATIVE_BOUND:g} or no number"
-        return context.make_row("state", "-", quantity, "unresolved", reason, unit, **common)
+        return context.make_row("state", "-", quantity, Verdict.UNRESOLVED, reason, unit, **common)
     reason = f"{name} within {ratio:.2g} of the rounding bound at {count} states"
-    return context.make_row("state", "-", quantity, "agrees", reason, unit, **common)
+    return context.make_row("state", "-", quantity, Verdict.AGREES, reason, unit, **common)

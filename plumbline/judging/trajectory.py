@@ -24,8 +24,8 @@ from plumbline.judging.convergence import (
     romberg,
     tightest_tolerance_limit,
 )
-from plumbline.judging.rows import Columns, JudgingResult, RowContext
-from plumbline.model.datatypes import Array, Integrator, Model, Row, Trajectory, Verdict
+from plumbline.judging.rows import Columns, JudgingResult, Row, RowContext, Verdict
+from plumbline.model.datatypes import Array, Integrator, Model, Trajectory
 from plumbline.model.invariants import (
     INVARIANT_UNITS,
     Invariants,
@@ -61,13 +61,13 @@ def judge_trajectory(
     found = JudgingResult()
     if study.unsupported is not None:
         found.rows.append(
-            who.make_row("trajectory", integrator.name, "all", "unsupported", study.unsupported)
+            who.make_row("trajectory", integrator.name, "all", Verdict.UNSUPPORTED, study.unsupported)
         )
         return found
     finest = study.runs[-1]
     if finest.trajectory is None:
         reason = f"at the finest resolution {finest.resolution:g}: {finest.failure}"
-        found.rows.append(who.make_row("trajectory", integrator.name, "all", "failed", reason))
+        found.rows.append(who.make_row("trajectory", integrator.name, "all", Verdict.FAILED, reason))
         return found
     ladder = RefinementAnalysis(who, model, truth, integrator, study.runs, horizon)
     found.rows += [*ladder.trajectory_rows(), *ladder.invariant_rows()]
@@ -176,13 +176,13 @@ class RefinementAnalysis:
         steps = f"steps {coarse:g} … {fine:g} s, t ≤ {self.observed_until:g} s"
         listed = ", ".join(f"{o:.2f}" for o in order.orders)
         off = None if order.value is None else abs(order.value - declared)
-        verdict: Verdict = "agrees"
+        verdict: Verdict = Verdict.AGREES
         if order.is_at_rounding_floor:
             off, reason = None, f"order not observable: differences are rounding at every step ({steps})"
         elif not order.is_asymptotic or off is None:
-            verdict, reason = "unresolved", f"not in the asymptotic range: orders {listed} over {steps}"
+            verdict, reason = Verdict.UNRESOLVED, f"not in the asymptotic range: orders {listed} over {steps}"
         else:
-            verdict = "agrees" if off <= ORDER_MARGIN else "disagrees"
+            verdict = Verdict.AGREES if off <= ORDER_MARGIN else Verdict.DISAGREES
             reason = f"shows order {order.value:.2f}, declared {declared} ({steps})"
         return self.context.make_row(
             "trajectory",
@@ -236,7 +236,7 @@ class RefinementAnalysis:
         try:
             limit = self.extrapolated_limit(samples)
         except ValueError as error:
-            return [who.make_row("trajectory", method, f"{name}_limit", "unresolved", str(error), unit)]
+            return [who.make_row("trajectory", method, f"{name}_limit", Verdict.UNRESOLVED, str(error), unit)]
         off = np.maximum.accumulate(distance(limit.y, true))
         ladder, rounding = uncertainty_factor * limit.uncertainty, scale * self.rounding
         tolerance = ladder + truth_uncertainty + rounding
@@ -271,8 +271,8 @@ class RefinementAnalysis:
                 f"truth ({self.truth.method}) ± {truth_uncertainty[at]:.2g}, "
                 f"rounding {self.rounding_description()} × {scale:.3g} {unit} = {rounding[at]:.2g}; "
                 f"a mistake of {DETECTABLE_PARAMETER_ERROR:g} in a parameter makes {detectable[at]:.2g}",
+                ratio=ratio,
                 extra={
-                    "ratio": ratio,
                     "visible": float(min(detectable[at], 1e308)),
                     "growth": float(self.truth.growth[at]),
                 },
@@ -289,7 +289,8 @@ class RefinementAnalysis:
                 value=float(own),
                 tolerance=estimate,
                 derivation=f"from the finest run to the limit, plus the limit's tolerance, t ≤ {end:g} s",
-                extra={"ratio": ratio, "resolution": step},
+                ratio=ratio,
+                extra={"resolution": step},
                 **common,
             ),
         ]
@@ -306,14 +307,14 @@ class RefinementAnalysis:
             until = f"up to t = {self.times[at]:g} s"
             if deviation[at] <= tolerance[at] <= detectable[at]:
                 return WindowVerdict(
-                    "agrees", f"{name} limit within {deviation[at]:.2g} {unit} of the truth {until}", at
+                    Verdict.AGREES, f"{name} limit within {deviation[at]:.2g} {unit} of the truth {until}", at
                 )
             if deviation[at] > tolerance[at] and trusted:
                 reason = (
                     f"the {name} at step zero is {deviation[at]:.3g} {unit} from the truth {until}, "
                     f"{deviation[at] / tolerance[at]:.3g} times the uncertainties"
                 )
-                return WindowVerdict("disagrees", reason, at)
+                return WindowVerdict(Verdict.DISAGREES, reason, at)
             if deviation[at] > tolerance[at]:
                 reason = f"{name} limit {deviation[at]:.2g} {unit} off {until}, but the ladder shows no order"
             else:
@@ -321,7 +322,7 @@ class RefinementAnalysis:
                     f"uncertainty {tolerance[at]:.2g} {unit} {until} is above the {detectable[at]:.2g} {unit} "
                     f"that a mistake of {DETECTABLE_PARAMETER_ERROR:g} would make"
                 )
-            unresolved = unresolved or WindowVerdict("unresolved", reason, at)
+            unresolved = unresolved or WindowVerdict(Verdict.UNRESOLVED, reason, at)
         assert unresolved is not None
         return unresolved
 
@@ -353,7 +354,9 @@ class RefinementAnalysis:
         drift = np.maximum.accumulate(np.max(np.linalg.norm(samples[-1], axis=-1), axis=1))
         base = f"{self.finest.steps} steps, {each:.1g} × {scale:.3g} {unit} each: {floor:.2g}"
 
-        def row(verdict: Verdict, reason: str, at: int, tolerance: float, why: str, **extra: float) -> Row:
+        def row(
+            verdict: Verdict, reason: str, at: int, tolerance: float, why: str, ratio: float, **extra: float
+        ) -> Row:
             return self.context.make_row(
                 "invariants",
                 self.integrator.name,
@@ -363,6 +366,7 @@ class RefinementAnalysis:
                 unit,
                 value=float(drift[at]),
                 tolerance=tolerance,
+                ratio=ratio,
                 derivation=why,
                 compared_until=float(self.times[at]),
                 extra={"scale": scale, "whole": float(drift[-1]), **extra},
@@ -372,11 +376,11 @@ class RefinementAnalysis:
         end = len(self.times) - 1
         if drift[end] <= floor:
             reason = f"{name} {drift[end]:.2g} {unit}: rounding"
-            return row("agrees", reason, end, floor, base, ratio=float(drift[end] / floor))
+            return row(Verdict.AGREES, reason, end, floor, base, float(drift[end] / floor))
         try:
             limit = self.extrapolated_limit(samples)
         except ValueError as error:
-            return row("unresolved", str(error), end, floor, base)
+            return row(Verdict.UNRESOLVED, str(error), end, floor, base, float(drift[end] / floor))
         left = np.maximum.accumulate(np.max(np.linalg.norm(limit.y, axis=-1), axis=1))
         tolerance = limit.uncertainty + floor + by_quadrature
         trusted = (
@@ -389,19 +393,22 @@ class RefinementAnalysis:
             own = float(np.max(np.linalg.norm((samples[-1] - limit.y)[:number], axis=-1)))
             allowed = own + float(tolerance[at])
             zero = f"{left[at]:.2g} ± {tolerance[at]:.2g} {unit} at step zero, t ≤ {self.times[at]:g} s"
-            about = {"limit": float(left[at]), "ratio": float(left[at] / tolerance[at])}
+            ratio = float(left[at] / tolerance[at])
+            remainder = float(left[at])
             why = (
                 f"{own:.2g} from the finest step to step zero, itself ± {limit.uncertainty[at]:.2g}; "
                 f"{base}; the work by quadrature ± {by_quadrature:.2g}"
             )
             if left[at] <= tolerance[at] <= DETECTABLE_PARAMETER_ERROR * scale:
                 reason = f"{name} {drift[at]:.2g} {unit} at the finest step, {zero}"
-                return row("agrees", reason, at, allowed, why, **about)
+                return row(Verdict.AGREES, reason, at, allowed, why, ratio, limit=remainder)
             if left[at] > tolerance[at] and trusted:
                 reason = f"{name} does not vanish with the step: {zero}"
-                return row("disagrees", reason, at, float(tolerance[at]), why, **about)
+                return row(Verdict.DISAGREES, reason, at, float(tolerance[at]), why, ratio, limit=remainder)
             reason = f"{name} {drift[at]:.2g} {unit}: {zero} cannot tell"
-            unresolved = unresolved or row("unresolved", reason, at, allowed, why, **about)
+            unresolved = unresolved or row(
+                Verdict.UNRESOLVED, reason, at, allowed, why, ratio, limit=remainder
+            )
         assert unresolved is not None
         return unresolved
 

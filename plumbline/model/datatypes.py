@@ -10,7 +10,7 @@ N is the number of bodies, T the number of samples.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Literal
 
 from plumbline.processes.errors import PlumblineError
@@ -18,9 +18,6 @@ from reference_impl.chain import Array as Array
 from reference_impl.chain import Chain
 
 Model = Chain
-
-Level = Literal["state", "invariants", "trajectory", "relations"]
-Verdict = Literal["agrees", "disagrees", "unresolved", "unsupported", "not installed", "failed"]
 
 
 class Unsupported(PlumblineError):
@@ -100,37 +97,3 @@ class Integrator:
     min_rtol: float = 1e-12  # for kind "tolerance": below, rounding on long chains stalls the step
     alias_of: str | None = None  # equals that integrator without drag: not independent evidence
     note: str = ""  # a sentence on what it is
-
-
-@dataclass(frozen=True)
-class Row:
-    """One judged quantity: the unit of results.json, the pytest ids and the report."""
-
-    scenario: str
-    family: str
-    engine: str
-    engine_version: str
-    level: Level
-    integrator: str  # "-" where none took part
-    quantity: str
-    unit: str
-    value: float | None  # the error or drift that was measured, worst over bodies, states and samples
-    tolerance: float | None  # what it was compared with, same unit
-    verdict: Verdict
-    reason: str  # one sentence
-    derivation: str = ""  # how the tolerance came about, in words and numbers
-    uncertainty: float | None = None  # of the truth and of the limit together, same unit
-    compared_until: float | None = None  # s, up to which positions were compared
-    order: float | None = None  # observed order
-    declared_order: int | None = None
-    alias_of: str | None = None
-    known_issue: str | None = None  # id of the entry of known.yaml that expects this verdict
-    diagnosis: str | None = None  # the guilty term, in a sentence
-    user_rtol: float | None = None  # the user's own tolerance, shown beside the verdict
-    cpu_time: float = 0.0  # s, of the work behind this row
-    extra: dict[str, float] = field(default_factory=dict)
-
-    @property
-    def key(self) -> str:
-        """The row's identity across runs."""
-        return "/".join((self.scenario, self.engine, self.level, self.integrator, self.quantity))

@@ -25,9 +25,9 @@ from plumbline.judging.metamorphic import (
     quantity_values,
     unchanged,
 )
-from plumbline.judging.rows import RowContext
+from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.judging.trajectory import RefinementAnalysis
-from plumbline.model.datatypes import Array, Integrator, Row, StateQuantities
+from plumbline.model.datatypes import Array, Integrator, StateQuantities
 from plumbline.model.welding import split_bodies
 from plumbline.reproduce.engine_client import Engine, OfRuns
 from plumbline.reproduce.measure_long_run import GROWTH, LONG, OverLong, ShownLong
@@ -306,7 +306,7 @@ class AlongRuns(OfRuns):
         uncertain = {name: rows.get(f"{name}_limit") for name in series}
         if self.drifting:
             there = [q for q in self.wanted if q in rows]
-            shown = [q for q in there if rows[q].verdict == "disagrees"] or there
+            shown = [q for q in there if rows[q].verdict == Verdict.DISAGREES] or there
             series = {q: [getattr(d, q) for d in ladder.invariant_drifts] for q in shown}
             uncertain = {q: rows[q] for q in shown}
         return ShownRun(
@@ -325,8 +325,9 @@ class AlongRuns(OfRuns):
 
 def excess(row: Row) -> float:
     """Error over tolerance of a row that disagrees, else 0."""
-    if row.verdict != "disagrees":
+    if row.verdict != Verdict.DISAGREES:
         return 0.0
     if row.quantity == "order":
         return float(row.value or 0.0) / ORDER_MARGIN
-    return row.extra["ratio"]
+    assert row.ratio is not None
+    return row.ratio

@@ -15,8 +15,8 @@ from plumbline.judging.long_runs import (
     run_long_run_study,
     sample_spacing,
 )
-from plumbline.judging.rows import RowContext
-from plumbline.model.datatypes import Array, Integrator, Row
+from plumbline.judging.rows import Row, RowContext, Verdict
+from plumbline.model.datatypes import Array, Integrator
 from plumbline.model.invariants import INVARIANT_UNITS
 from plumbline.reproduce.engine_client import OfRuns
 from plumbline.reproduce.shrink import Case
@@ -106,4 +106,4 @@ class OverLong(OfRuns):
 
 def excess(row: Row) -> float:
     """Drift, or its growth, over what is allowed, of a row that disagrees; else 0."""
-    return (row.value or 0.0) / (row.tolerance or 1.0) if row.verdict == "disagrees" else 0.0
+    return (row.value or 0.0) / (row.tolerance or 1.0) if row.verdict == Verdict.DISAGREES else 0.0

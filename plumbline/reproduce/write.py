@@ -211,7 +211,7 @@ def of_ladder(row: dict[str, Any]) -> bool:
 
 def ratio(row: dict[str, Any]) -> float:
     """By how much a row disagrees, in tolerances."""
-    found = row["extra"].get("ratio") or (row["value"] or 0.0) / (row["tolerance"] or 1.0)
+    found = row.get("ratio") or row["extra"].get("ratio") or (row["value"] or 0.0) / (row["tolerance"] or 1.0)
     return float(found)
 
 

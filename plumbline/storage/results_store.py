@@ -20,8 +20,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from plumbline.judging.rows import Columns
-from plumbline.model.datatypes import Row
+from plumbline.judging.rows import Columns, Row
 
 SCHEMA_VERSION = 1
 # Fields of Row by their names in stored results.
@@ -49,7 +48,7 @@ _RUN_COLUMNS = {**_CELL_COLUMNS, "integrator": TEXT, "resolution": REAL}
 TABLES: dict[str, pa.Schema] = {
     "summary": _schema(
         key=TEXT, scenario=TEXT, family=TEXT, engine=TEXT, engine_version=TEXT, level=TEXT, integrator=TEXT,
-        quantity=TEXT, unit=TEXT, value=REAL, tolerance=REAL, verdict=TEXT, reason=TEXT, derivation=TEXT,
+        quantity=TEXT, unit=TEXT, value=REAL, tolerance=REAL, verdict=TEXT, reason=TEXT, ratio=REAL, derivation=TEXT,
         uncertainty=REAL, horizon=REAL, order=REAL, declared_order=INTEGER, alias_of=TEXT, known=TEXT,
         diagnosis=TEXT, accept=REAL, wall_time=REAL, extra=TEXT,
     ),

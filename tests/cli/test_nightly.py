@@ -81,7 +81,7 @@ def test_a_night_is_whole_and_remembered(tmp_path):
     assert all(r["level"] == "state" for r in random) and folded.total() == len(random)
     assert stored["probes"]["scenarios"] == 3 and len(stored["probes"]["worst"]) == 7
     assert max(cell["ratio"] for cell in stored["probes"]["worst"]) == max(
-        json.loads(r["extra"])["ratio"] for r in random if r["verdict"] == "agrees"
+        r["ratio"] for r in random if r["verdict"] == "agrees"
     )
     assert f"{len(result.rows) + folded.total()} agree" in stored["sentence"]
     assert "3 random scenarios" in (place / "report.html").read_text()
@@ -130,7 +130,7 @@ def test_what_someone_should_see_is_kept_whole_with_its_file(tmp_path):
     probes, kept = RandomBatch(), []
     for s, verdict in zip(drawn, ("agrees", "disagrees", "unsupported"), strict=True):
         who = RowContext(s.name, RANDOM_FAMILY, "mujoco", "MuJoCo", "4")
-        fine = who.make_row("state", "-", "joint_reaction", "agrees", "why", extra={"ratio": 0.5})
+        fine = who.make_row("state", "-", "joint_reaction", "agrees", "why", ratio=0.5)
         other = replace(fine, engine="exudyn")
         kept += probes.add_scenario([other, fine, who.make_row("state", "-", "acceleration", verdict, "why")])
     assert [r.verdict for r in kept] == ["agrees", "disagrees", "agrees", "unsupported"]

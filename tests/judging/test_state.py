@@ -51,7 +51,7 @@ def test_a_blunt_row_says_what_was_measured():
     row = judged((1, 1, 0.5), bounds=bounds).rows[0]
     assert (row.level, row.integrator, row.quantity, row.unit) == ("state", "-", "acceleration", "m/s²")
     assert row.verdict == "unresolved" and row.reason.startswith("blunt: the rounding bound is ")
-    assert row.tolerance == bounds[1].acceleration[1] and row.extra["ratio"] == pytest.approx(0.5)
+    assert row.tolerance == bounds[1].acceleration[1] and row.ratio == pytest.approx(0.5)
 
 
 def test_a_packed_truth_is_judged_as_it_is_open():
@@ -104,7 +104,7 @@ def test_the_row_is_of_the_body_that_is_worst_by_its_own_bound():
     assert (row.quantity, row.verdict, row.unit, row.level) == ("acceleration", "disagrees", "m/s²", "state")
     assert row.value == pytest.approx(3 * sharp, rel=1e-2, abs=0) and row.tolerance == sharp
     assert (row.extra["state"], row.extra["body"], row.extra["states"]) == (2.0, 2.0, 3.0)
-    assert row.extra["ratio"] == pytest.approx(3, rel=1e-2)
+    assert row.ratio == pytest.approx(3, rel=1e-2)
     assert row.cpu_time == 0.25
     assert "state 2, body 2" in row.reason and "2 of 3 states disagree" in row.reason
     assert row.derivation.endswith("truth: itself")
@@ -135,7 +135,7 @@ def test_one_bound_is_the_border(by, expected):
     assert [row.unit for row in rows] == ["m/s²", "rad/s²", "N", "J", "J", "kg m²/s", "kg m²"]
     assert {(row.level, row.integrator, row.engine) for row in rows} == {("state", "-", "reference")}
     assert rows[1].reason == "angular acceleration within 0 of the rounding bound at 3 states"
-    assert rows[0].extra["bound_relative"] < 1e-9 and rows[1].extra["ratio"] == 0.0
+    assert rows[0].extra["bound_relative"] < 1e-9 and rows[1].ratio == 0.0
 
 
 def test_what_an_engine_does_not_offer_or_deliver_is_told():

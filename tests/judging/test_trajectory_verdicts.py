@@ -86,10 +86,10 @@ def test_a_sound_ladder_agrees_in_everything_and_says_what_it_measured():
     assert limit.value < 1e-15 and limit.compared_until == 2.0 and limit.unit == own.unit == "m"
     assert limit.uncertainty == pytest.approx(1e-12, rel=1e-2, abs=0)
     assert limit.tolerance == pytest.approx(1e-12 + rounding, rel=1e-2, abs=0)
-    assert limit.extra == {"ratio": limit.value / limit.tolerance, "visible": 1e-6, "growth": 3.0}
+    assert limit.ratio == limit.value / limit.tolerance and limit.extra == {"visible": 1e-6, "growth": 3.0}
     assert own.value == pytest.approx(0.02 * STEPS[-1] ** 2, rel=1e-6)
     assert own.tolerance == pytest.approx(own.value + limit.tolerance, rel=1e-6)
-    assert own.extra == {"ratio": limit.extra["ratio"], "resolution": STEPS[-1]}
+    assert own.ratio == limit.ratio and own.extra == {"resolution": STEPS[-1]}
     assert limit.reason.startswith("position limit within") and "at step 0.000976562" in own.reason
     turned = found["attitude"]
     assert turned.value == pytest.approx(0.02 * STEPS[-1] ** 2, rel=1e-4) and turned.unit == "rad"
@@ -152,7 +152,7 @@ def test_a_limit_elsewhere_disagrees_only_where_the_ladder_shows_its_order():
     assert limit.verdict == found["position"].verdict == found["attitude_limit"].verdict == "disagrees"
     assert limit.value == pytest.approx(2e-9, rel=1e-3) and limit.compared_until == 2.0
     assert f"{limit.value / limit.tolerance:.3g} times the uncertainties" in limit.reason
-    assert limit.extra["ratio"] == pytest.approx(limit.value / limit.tolerance)
+    assert limit.ratio == pytest.approx(limit.value / limit.tolerance)
     wild = [1e-9 + e for e in (0.01, 0.003, 0.002, 0.0003, 0.0002, 0.0002)]
     lost = rows(climbed(wild))["position_limit"]
     assert lost.verdict == "unresolved"
@@ -337,11 +337,11 @@ def test_a_drift_that_falls_with_the_step_agrees_and_one_that_does_not_disagrees
     assert stays.verdict == "disagrees" and "joint gap does not vanish with the step" in stays.reason
     assert "from the finest step to step zero" in stays.derivation
     assert stays.extra["limit"] == pytest.approx(2e-6, rel=0.1)
-    assert stays.extra["ratio"] == pytest.approx(stays.extra["limit"] / stays.tolerance, rel=1e-9)
+    assert stays.ratio == pytest.approx(stays.extra["limit"] / stays.tolerance, rel=1e-9)
     wild = rows(climbed([0.1, 0.03, 0.02, 0.003, 0.002, 0.001]))["joint_gap"]
     assert wild.verdict == "unresolved" and wild.reason.endswith("cannot tell")
     untold = rows(climbed([1e-3 + e for e in (0.0, 1e-5, -1e-5, 2e-5, 1e-5, 0)]))["joint_gap"]
-    assert untold.extra["ratio"] > 1 and untold.verdict == "unresolved", "no order, no trust"
+    assert untold.ratio > 1 and untold.verdict == "unresolved", "no order, no trust"
     alone = climbed()
     for rung in range(5):
         alone.runs[rung] = replace(alone.runs[rung], trajectory=None)
@@ -366,7 +366,7 @@ def test_a_drift_of_rounding_agrees_at_once(steps, counted):
     base = rows(climbed([0.0] * 6, steps=steps))["norm_drift"]
     assert base.verdict == "agrees" and base.reason.endswith("rounding")
     assert base.tolerance == pytest.approx(ROUNDING_PER_STEP * counted, rel=1e-12, abs=0)
-    assert base.extra["ratio"] == pytest.approx(base.value / base.tolerance)
+    assert base.ratio == pytest.approx(base.value / base.tolerance)
     assert base.derivation.startswith(f"{steps} steps, ") and base.compared_until == 2.0
     held = climbed([0.0] * 6, steps=steps)
     for factor, said in ((0.9, True), (1.1, False)):

@@ -9,8 +9,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from plumbline.judging.rows import RowContext
-from plumbline.model.datatypes import Row
+from plumbline.judging.rows import Row, RowContext
 from plumbline.storage import results_store
 
 ROW = RowContext("s", "single", "mujoco", "MuJoCo", "4.0").make_row(
@@ -22,7 +21,8 @@ ROW = RowContext("s", "single", "mujoco", "MuJoCo", "4.0").make_row(
     "m/s²",
     value=1e-15,
     tolerance=float("inf"),
-    extra={"ratio": float("nan")},
+    ratio=float("nan"),
+    extra={"scale": float("nan")},
 )
 STATES = [
     {
@@ -65,7 +65,7 @@ def test_what_is_written_is_read_back(tmp_path):
     assert row["key"] == "s/mujoco/state/-/acceleration"
     assert row["value"] == 1e-15
     assert row["tolerance"] is None, "JSON has no infinity"
-    assert row["extra"] == {"ratio": None}
+    assert row["ratio"] is None and row["extra"] == {"scale": None}
     assert results_store.read_table(tmp_path / "new", "states") == STATES
     (summary,) = results_store.read_table(tmp_path / "new", "summary")
     assert summary["key"] == row["key"]
