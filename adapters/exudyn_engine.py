@@ -32,7 +32,7 @@ from adapters.exudyn_common import (
     silence_engine,
     version,
 )
-from plumbline.engines.adapter import Adapter
+from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.model.datatypes import (
     Array,
     EngineFailure,
@@ -117,12 +117,14 @@ class ExudynChain:
         return np.array(self.mbs.GetObjectOutputBody(self.piece_bodies[piece], output_type, local))
 
 
-class Exudyn(Adapter):
+class Exudyn(MetamorphicHooks):
     """Maximal coordinates with Euler parameters: the closest peer of the notes' own form."""
 
     name = "exudyn"
     title = "Exudyn"
     package = "exudyn"
+    reproduction_template = "exudyn"
+    other_formulation = "exudyn-tree"
     supported_versions = SUPPORTED_VERSIONS
     integrators: ClassVar[tuple[Integrator, ...]] = (
         Integrator(
@@ -144,6 +146,7 @@ class Exudyn(Adapter):
         ),
     )
 
+    usual_linear_solver = "EigenSparse"
     linear_solvers = ("EXUdense", "EigenDense")
     welding_unsupported_reason = ""
 
@@ -191,7 +194,7 @@ class Exudyn(Adapter):
     ) -> list[tuple[Array, Array, Array]]:
         """Displacements, rates, accelerations (7N,) at ``times``; ``afresh``: the first accelerations too."""
         chosen, data = make_settings(), chain.mbs.systemData
-        set_linear_solver(chosen, self.option or "EigenSparse")
+        set_linear_solver(chosen, self.option or self.usual_linear_solver)
         alpha = chosen.timeIntegration.generalizedAlpha
         alpha.computeInitialAccelerations = compute_initial_accelerations
         if integrator.name == "trapezoidal":

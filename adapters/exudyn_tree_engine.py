@@ -35,7 +35,7 @@ from adapters.exudyn_common import (
     silence_engine,
     version,
 )
-from plumbline.engines.adapter import Adapter
+from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.model.datatypes import (
     Array,
     EngineFailure,
@@ -236,18 +236,23 @@ def _perpendicular_unit(unit: Array) -> Array:
     return np.asarray(across / np.linalg.norm(across))
 
 
-class ExudynTree(Adapter):
+class ExudynTree(MetamorphicHooks):
     """Minimal coordinates: nothing to drift, and angles that can become singular."""
 
     name = "exudyn-tree"
     title = "Exudyn (kinematic tree)"
     package = "exudyn"
+    reproduction_template = "exudyn-tree"
+    other_formulation = "exudyn"
     supported_versions = SUPPORTED_VERSIONS
     integrators: ClassVar[tuple[Integrator, ...]] = (
         Integrator("RK44", "step", 4, (4, 5, 6, 7, 8), note="classical Runge-Kutta on joint angles"),
     )
+    usual_linear_solver = "EXUdense"
     linear_solvers = ("EigenSparse",)
-    welding_unsupported_reason = "a kinematic tree has revolute and prismatic joints, none that holds two links rigidly"
+    welding_unsupported_reason = (
+        "a kinematic tree has revolute and prismatic joints, none that holds two links rigidly"
+    )
 
     def version(self) -> str:
         """Version of the Exudyn that runs."""
@@ -275,7 +280,7 @@ class ExudynTree(Adapter):
                 )
 
             chosen = rk44_settings()
-            set_linear_solver(chosen, self.option or "EXUdense")
+            set_linear_solver(chosen, self.option or self.usual_linear_solver)
             rows = run_solver(solver, tree.mbs, chosen, times, resolution, read, tree.check_singularity)
         r, p, v, pdot = (np.array(column) for column in zip(*rows, strict=True))
         return Trajectory(times.copy(), r, p, v, pdot, round(float(times[-1] / resolution)))

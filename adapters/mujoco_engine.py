@@ -33,7 +33,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from plumbline.engines.adapter import Adapter
+from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.model import kinematics
 from plumbline.model.datatypes import (
     Array,
@@ -50,12 +50,13 @@ FIRST_ORDER_POWERS = (1, 2, 3, 4, 5, 6)
 IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-class Mujoco(Adapter):
+class Mujoco(MetamorphicHooks):
     """MuJoCo's forward dynamics and its fixed-step integrators."""
 
     name = "mujoco"
     title = "MuJoCo"
     package = "mujoco"
+    reproduction_template = "mujoco"
     supported_versions = ">=3.2,<5"
     integrators = (
         Integrator("Euler", "step", 1, FIRST_ORDER_POWERS, note="semi-implicit Euler"),

@@ -33,7 +33,7 @@ import pinocchio as pin
 from scipy.integrate import DOP853
 from scipy.linalg import lapack
 
-from plumbline.engines.adapter import Adapter
+from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.model.datatypes import (
     Array,
     EngineFailure,
@@ -303,7 +303,7 @@ def dop853(chain: PinocchioChain, q: Array, v: Array, times: Array, rtol: float)
     return np.array(rows)[:, :nq], np.array(rows)[:, nq:], steps
 
 
-class Pinocchio(Adapter):
+class Pinocchio(MetamorphicHooks):
     """Pinocchio on a chain of spherical joints.
 
     ``algorithm`` chooses how state evaluation finds accelerations: "crba" solves with the engine's
@@ -315,8 +315,13 @@ class Pinocchio(Adapter):
     name: ClassVar[str] = "pinocchio"
     title: ClassVar[str] = "Pinocchio"
     package: ClassVar[str] = "pin"
+    reproduction_template = "pinocchio"
+    other_formulation = "pinocchio-maximal"
     supported_versions = ">=3.3.1,<5"
-    extra_requirements = (("<4", "cmeel-urdfdom<5"), ("<4", "cmeel-tinyxml2<11"))  # what those wheels were linked with
+    extra_requirements = (
+        ("<4", "cmeel-urdfdom<5"),
+        ("<4", "cmeel-tinyxml2<11"),
+    )  # what those wheels were linked with
     integrators: ClassVar[tuple[Integrator, ...]] = (
         Integrator(
             "semi-implicit-euler",
@@ -378,6 +383,7 @@ class PinocchioAba(Pinocchio):
 
     name = "pinocchio-aba"
     title = "Pinocchio (aba)"
+    other_formulation = ""
     integrators: ClassVar[tuple[Integrator, ...]] = ()
     options = ("crba",)
 

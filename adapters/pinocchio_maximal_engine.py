@@ -24,7 +24,7 @@ from typing import ClassVar
 import numpy as np
 import pinocchio as pin
 
-from plumbline.engines.adapter import Adapter
+from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, Unsupported
 from plumbline.model.kinematics import rotation_matrix, velocity_jacobian
 from plumbline.model.welding import BodyParts
@@ -131,14 +131,19 @@ def _translation(point: Array) -> pin.SE3:
     return pin.SE3(np.eye(3), point)
 
 
-class PinocchioMaximal(Adapter):
+class PinocchioMaximal(MetamorphicHooks):
     """Pinocchio's constrained dynamics of free bodies; evaluates states, does not integrate."""
 
     name: ClassVar[str] = "pinocchio-maximal"
     title: ClassVar[str] = "Pinocchio, maximal coordinates"
     package: ClassVar[str] = "pin"
+    reproduction_template = "pinocchio-maximal"
+    other_formulation = "pinocchio"
     supported_versions = ">=3.3.1,<5"
-    extra_requirements = (("<4", "cmeel-urdfdom<5"), ("<4", "cmeel-tinyxml2<11"))  # what those wheels were linked with
+    extra_requirements = (
+        ("<4", "cmeel-urdfdom<5"),
+        ("<4", "cmeel-tinyxml2<11"),
+    )  # what those wheels were linked with
     integrators: ClassVar[tuple[Integrator, ...]] = ()
     options = ("inverse of the KKT matrix",)
     welding_unsupported_reason = ""

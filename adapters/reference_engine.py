@@ -12,7 +12,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from plumbline.engines.adapter import Adapter
+from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.model.datatypes import (
     Array,
     EngineFailure,
@@ -31,12 +31,13 @@ from reference_impl.integrate import IntegrationResult, integrate_dop853
 from reference_impl.structured import StructuredSystem
 
 
-class Reference(Adapter):
+class Reference(MetamorphicHooks):
     """The notes' own system S x = b (N5) and first-order form (N6), raw."""
 
     name: ClassVar[str] = "reference"
     title: ClassVar[str] = "Reference (the notes)"
     package: ClassVar[str] = "plumbline"
+    reproduction_template = "reference"
     integrators: ClassVar[tuple[Integrator, ...]] = (
         Integrator(
             "dop853",

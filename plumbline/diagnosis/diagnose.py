@@ -15,6 +15,7 @@ import numpy as np
 
 from plumbline.diagnosis.defect_model import DefectCase, concatenate_cases, evaluate_case, make_defect_case
 from plumbline.diagnosis.hypotheses import Cause, all_causes, format_significant, output_defects
+from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import Array, Model, State, StateQuantities
 from plumbline.model.kinematics import state_from_minimal
 from plumbline.truth.ground_truth import StateTruth
@@ -69,6 +70,24 @@ def max_error_ratio(difference: Array, bound: Array) -> float:
     size = np.abs(difference) if difference.ndim == 1 else np.linalg.norm(difference, axis=-1)
     with np.errstate(over="ignore", invalid="ignore"):
         return float(np.max(size / np.maximum(bound, TINY)))
+
+
+def explain_disagreement(
+    engine: str, model: Model, engine_quantities: list[StateQuantities], truth: StateTruth
+) -> str:
+    """Load the engine and diagnose answers of it that disagree with the truth (to be called in a worker).
+
+    Args:
+        engine: its name in the registry.
+        model: the pendulum.
+        engine_quantities: the engine's answer at each of the truth's states.
+        truth: the right answers and their rounding bounds.
+
+    Returns:
+        A sentence that names the wrong term.
+
+    """
+    return diagnose(model, engine_quantities, truth, load_adapter(engine).evaluate)
 
 
 def diagnose(

@@ -1,19 +1,20 @@
-"""The contract between the core and an engine: four duties, checked on the way in and out.
+"""The adapter contract: describe an engine, evaluate states, simulate; every call is checked on both sides.
 
-An adapter file subclasses `Adapter` and fills in the engine's calls; the checks here run
-around every call of every adapter, so that no engine sees a NaN or an unnormalised
-quaternion (most accept both silently) and no early stop, silent reset, repeated or
-non-finite row leaves unnoticed.
+An adapter file subclasses `Adapter` and translates between the project's model and the engine's calls.
+The checks in this module run around every call of every adapter: no engine receives a NaN or a quaternion
+that is not of unit length (most engines accept both silently), and an early stop, a silent reset, a
+repeated row or a number that is not finite is reported as a failure.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
-from copy import copy
-from typing import ClassVar, Self
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
+from packaging.specifiers import SpecifierSet
 
 from plumbline.model.datatypes import (
     Array,
@@ -24,82 +25,116 @@ from plumbline.model.datatypes import (
     State,
     StateQuantities,
     Trajectory,
-    Unsupported,
 )
-from plumbline.model.welding import BodyParts, split_bodies, undivided_bodies
 
 UNIT_NORM_TOLERANCE = 8 * np.finfo(float).eps  # a quaternion normalised in double is this close to |p| = 1
 
+# What an adapter may declare as unsupported, and what each entry covers.
+UNSUPPORTED_KINDS = {
+    "joint_reaction": "the engine does not return the forces at the joints",
+    "kinetic_energy": "the engine does not return the kinetic energy",
+    "potential_energy": "the engine does not return the potential energy",
+    "angular_momentum": "the engine does not return the angular momentum about the pivot",
+    "mass_matrix": "the engine does not return a joint-space mass matrix",
+    "rods": "the engine refuses models in which a body hangs by a massless rod, or some of them",
+    "chains": "the engine refuses models of more than one body, or some of them",
+    "loads": "the engine refuses models with applied forces, moments and drag, or some of them",
+    "integrators": "the engine evaluates states and does not simulate",
+}
+
+
+@dataclass(frozen=True)
+class EngineInfo:
+    """An engine as it is installed here (or in the environment of ``python``), or why it does not run."""
+
+    name: str
+    title: str
+    version: str
+    integrators: tuple[Integrator, ...]
+    missing: str | None = None
+    python: str = ""
+
 
 class Adapter(ABC):
-    """One engine (and one formulation of it), translated to the project's model and back."""
+    """One formulation of one engine, translated to the project's model and back.
+
+    Everything that another package needs to know of an engine is a class attribute here.
+    """
 
     name: ClassVar[str]  # as typed on the command line
     title: ClassVar[str]  # as shown in the report
     package: ClassVar[str]  # distribution whose version is reported
     integrators: ClassVar[tuple[Integrator, ...]]
+    # What the engine does not do (a key of `UNSUPPORTED_KINDS`), and why, in a sentence.
+    unsupported: ClassVar[Mapping[str, str]] = {}
     supported_versions: ClassVar[str] = ""  # PEP 440 range of versions that the adapter works with
-    # Requirements of environments with another version: (range of versions, what they need besides).
+    # Requirements of environments with another version: (range of versions, additional requirement).
     extra_requirements: ClassVar[tuple[tuple[str, str], ...]] = ()
-    # Ways of the engine to the same answers other than its usual one: for evaluating states, for simulating.
-    options: ClassVar[tuple[str, ...]] = ()
-    linear_solvers: ClassVar[tuple[str, ...]] = ()
-    welding_unsupported_reason: ClassVar[str] = "the adapter welds nothing"  # why not; empty where it does
-    option: str = ""  # the one of `options` or `solvers` in use
-    has_welded_halves: bool = False  # whether bodies are two welded halves
+    other_formulation: ClassVar[str] = ""  # the same engine's column in other coordinates
+    reproduction_template: ClassVar[str] = ""  # template of stand-alone scripts; without one there are none
 
     @abstractmethod
     def version(self) -> str:
-        """Version of the engine that runs."""
+        """Return the version of the engine that is loaded."""
 
     @abstractmethod
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-        """State quantities at the given states; raise Unsupported with a sentence where it cannot."""
+        """Return the state quantities at each state; raise Unsupported with a sentence to refuse."""
 
     @abstractmethod
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
-        """Run from ``state`` and sample at ``times`` (times[0] = 0), every one hit by a step exactly."""
+        """Run from ``state`` and sample at ``times`` (times[0] = 0), each of which ends a step exactly."""
+
+    def describe(self) -> EngineInfo:
+        """Describe the engine as it is loaded.
+
+        Returns:
+            Its names, version and integrators; ``missing`` is a sentence where the adapter does not support
+            the loaded version.
+
+        """
+        version, missing = self.version(), None
+        supported = self.supported_versions
+        if supported and not SpecifierSet(supported).contains(version, prereleases=True):
+            missing = f"the adapter supports versions {supported} of {self.package}, this is {version}"
+        return EngineInfo(self.name, self.title, version, self.integrators, missing)
 
     def integrator(self, name: str) -> Integrator:
-        """The integrator of that name; KeyError names the ones there are."""
+        """Look up one of the engine's integrators.
+
+        Args:
+            name: its name, as in `integrators`.
+
+        Returns:
+            The integrator's description.
+
+        Raises:
+            KeyError: the engine has none of that name; the message lists those it has.
+
+        """
         for candidate in self.integrators:
             if candidate.name == name:
                 return candidate
         raise KeyError(f"{self.name} has no integrator {name!r}; it has {[i.name for i in self.integrators]}")
 
-    def with_option(self, option: str) -> Self:
-        """The same engine by another of its ways; KeyError names the ones there are."""
-        if option not in (ways := (*self.options, *self.linear_solvers)):
-            raise KeyError(f"{self.name} has no option {option!r}; it has {list(ways)}")
-        other = copy(self)
-        other.option = option
-        return other
-
-    def with_welded_halves(self) -> Self:
-        """The same engine, evaluating every body as two welded halves; Unsupported where it cannot weld."""
-        if self.welding_unsupported_reason:
-            raise Unsupported(self.welding_unsupported_reason)
-        other = copy(self)
-        other.has_welded_halves = True
-        return other
-
-    def body_pieces(self, model: Model) -> BodyParts:
-        """What the engine is to build every body of."""
-        return split_bodies(model) if self.has_welded_halves else undivided_bodies(model)
-
-    def _simulate_round_trip(
-        self, model: Model, state: State, end: float, integrator: Integrator, resolution: float
-    ) -> Trajectory:
-        """To ``end``, all that the integrator carries reversed in time, and as long back: three rows."""
-        raise Unsupported(f"the adapter does not turn a run of {integrator.name} round")
-
     def evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-        """State quantities at each state.
+        """Evaluate the state quantities at each state.
 
-        Raises BadInput for states no engine should see, Unsupported with the engine's
-        reason, EngineFailure where what comes back is not finite or not of the right shape.
+        Args:
+            model: the pendulum.
+            states: states of it on the constraint manifold, double precision, unit quaternions.
+
+        Returns:
+            One record per state; quantities that the engine does not offer are None.
+
+        Raises:
+            EngineFailure: the answers have the wrong number or shape, or are not finite.
+
+        `BadInput` (the input was refused before the engine received it) and `Unsupported` (the engine
+        cannot do this; the message is the reason) pass through.
+
         """
         for state in states:
             check_state(model, state)
@@ -107,37 +142,45 @@ class Adapter(ABC):
         if len(answers) != len(states):
             raise EngineFailure(f"{self.name} answered {len(answers)} of {len(states)} states")
         for index, answer in enumerate(answers):
-            check_quantities(model, answer, f"{self.name}, state {index}")
+            _check_quantities(model, answer, f"{self.name}, state {index}")
         return answers
 
     def simulate(
         self, model: Model, state: State, times: Array, integrator: str, resolution: float
     ) -> Trajectory:
-        """Trajectory at ``times`` with the named integrator; errors as `evaluate`."""
+        """Simulate from a state and sample at given times; errors are those of `evaluate`.
+
+        Args:
+            model: the pendulum.
+            state: the initial state.
+            times: sample times (T,) [s], ascending from 0; multiples of the step for fixed-step methods.
+            integrator: name of one of `integrators`.
+            resolution: step [s], or relative tolerance, by the integrator's ``kind``.
+
+        Returns:
+            The trajectory at ``times``, not normalised and not projected.
+
+        """
         check_state(model, state)
         method = self.integrator(integrator)
         if method.kind == "step":
             check_times(times, resolution)
         trajectory = self._simulate(model, state, times, method, resolution)
-        check_trajectory(model, state, times, trajectory, f"{self.name} {integrator}")
+        _check_trajectory(model, times, trajectory, f"{self.name} {integrator}")
         return trajectory
-
-    def simulate_round_trip(
-        self, model: Model, state: State, end: float, integrator: str, resolution: float
-    ) -> Trajectory:
-        """There and back by a symmetric integrator: rows at 0, ``end`` and 2 ``end``; errors as `simulate`.
-
-        The last row is the first one with opposite rates, but for rounding and the step's solver.
-        """
-        check_state(model, state)
-        times = np.array([0.0, end, 2 * end])
-        run = self._simulate_round_trip(model, state, end, self.integrator(integrator), resolution)
-        check_samples(model, times, run, f"{self.name} {integrator}")
-        return run
 
 
 def check_state(model: Model, state: State) -> None:
-    """Refuse what engines accept silently: NaN, infinity, wrong shapes, quaternions not of unit length."""
+    """Refuse input that engines accept silently.
+
+    Args:
+        model: the pendulum; every array must be finite.
+        state: arrays must have the model's shapes, be float64 and finite, and ``p`` of unit length.
+
+    Raises:
+        BadInput: one of these does not hold; the message names the array.
+
+    """
     for name, shape in (("p", (model.n, 4)), *((k, (model.n, 3)) for k in ("omega", "u", "udot", "r", "v"))):
         array = getattr(state, name)
         if np.shape(array) != shape:
@@ -154,8 +197,58 @@ def check_state(model: Model, state: State) -> None:
             raise BadInput(f"model.{array_name} is not finite")
 
 
-def check_quantities(model: Model, answer: StateQuantities, label: str) -> None:
-    """Shapes and finiteness of what an engine says of a state."""
+def check_times(times: Array, step: float) -> None:
+    """Check that every sample time is a whole number of steps, to rounding.
+
+    Args:
+        times: sample times (T,) [s].
+        step: step [s].
+
+    Raises:
+        BadInput: the step is not a positive number, the times do not ascend from 0, or one is no multiple.
+
+    """
+    if not np.isfinite(step) or step <= 0:
+        raise BadInput(f"step {step} is not a positive number")
+    if times[0] != 0 or np.any(np.diff(times) <= 0):
+        raise BadInput("sample times must start at 0 and increase")
+    count = times / step
+    if np.any(np.abs(count - np.round(count)) > 1e-9 * np.maximum(count, 1)):
+        raise BadInput(f"sample times are not multiples of the step {step}")
+
+
+def check_samples(model: Model, times: Array, run: Trajectory, label: str) -> None:
+    """Check that a run was sampled at the given times, with finite rows of the right shapes.
+
+    Args:
+        model: the pendulum.
+        times: sample times (T,) [s] that the engine was given.
+        run: the trajectory that the engine returned.
+        label: engine and integrator, for the message.
+
+    Raises:
+        EngineFailure: the run stopped early, or a row has another shape or is not finite.
+
+    """
+    if np.shape(run.t) != np.shape(times) or np.max(np.abs(run.t - times)) > 1e-9 * max(1.0, times[-1]):
+        last = run.t[-1] if len(run.t) else float("nan")
+        raise EngineFailure(f"{label}: sampled {len(run.t)} of {len(times)} times, last at t = {last} s")
+    shape = (len(times), model.n)
+    for name, width in (("r", 3), ("p", 4), ("v", 3), ("pdot", 4)):
+        array = getattr(run, name)
+        _check_shape(array, (*shape, width), f"{label}: {name}")
+        finite = np.all(np.isfinite(array), axis=(1, 2))
+        if not np.all(finite):
+            raise EngineFailure(f"{label}: {name} is not finite from t = {times[np.argmin(finite)]} s")
+
+
+def _check_shape(array: Array | float, shape: tuple[int, ...], label: str) -> None:
+    if np.shape(array) != shape:
+        raise EngineFailure(f"{label} has shape {np.shape(array)}, expected {shape}")
+
+
+def _check_quantities(model: Model, answer: StateQuantities, label: str) -> None:
+    """Check the shapes and the finiteness of an engine's answer at one state."""
     shapes = {
         "acceleration": (model.n, 3),
         "angular_acceleration": (model.n, 3),
@@ -169,40 +262,13 @@ def check_quantities(model: Model, answer: StateQuantities, label: str) -> None:
         value = getattr(answer, name)
         if value is None:
             continue
-        if np.shape(value) != shape:
-            raise EngineFailure(f"{label}: {name} has shape {np.shape(value)}, expected {shape}")
+        _check_shape(value, shape, f"{label}: {name}")
         if not np.all(np.isfinite(value)):
             raise EngineFailure(f"{label}: {name} is not finite")
 
 
-def check_times(times: Array, step: float) -> None:
-    """Every sample time must be a whole number of steps, to rounding."""
-    if not np.isfinite(step) or step <= 0:
-        raise BadInput(f"step {step} is not a positive number")
-    if times[0] != 0 or np.any(np.diff(times) <= 0):
-        raise BadInput("sample times must start at 0 and increase")
-    count = times / step
-    if np.any(np.abs(count - np.round(count)) > 1e-9 * np.maximum(count, 1)):
-        raise BadInput(f"sample times are not multiples of the step {step}")
-
-
-def check_samples(model: Model, times: Array, run: Trajectory, label: str) -> None:
-    """An early stop and rows that are not finite are failures, never data."""
-    if np.shape(run.t) != np.shape(times) or np.max(np.abs(run.t - times)) > 1e-9 * max(1.0, times[-1]):
-        last = run.t[-1] if len(run.t) else float("nan")
-        raise EngineFailure(f"{label}: sampled {len(run.t)} of {len(times)} times, last at t = {last} s")
-    shape = (len(times), model.n)
-    for name, width in (("r", 3), ("p", 4), ("v", 3), ("pdot", 4)):
-        array = getattr(run, name)
-        if np.shape(array) != (*shape, width):
-            raise EngineFailure(f"{label}: {name} has shape {np.shape(array)}, expected {(*shape, width)}")
-        finite = np.all(np.isfinite(array), axis=(1, 2))
-        if not np.all(finite):
-            raise EngineFailure(f"{label}: {name} is not finite from t = {times[np.argmin(finite)]} s")
-
-
-def check_trajectory(model: Model, state: State, times: Array, run: Trajectory, label: str) -> None:
-    """As `check_samples`; so are a silent reset and repeated rows."""
+def _check_trajectory(model: Model, times: Array, run: Trajectory, label: str) -> None:
+    """Check the samples of a run, and that no row repeats the one before or the initial state."""
     check_samples(model, times, run, label)
     rows = np.concatenate([getattr(run, k).reshape(len(times), -1) for k in ("r", "p", "v", "pdot")], axis=1)
     moving = np.any(run.v != 0, axis=(1, 2)) | np.any(run.pdot != 0, axis=(1, 2))

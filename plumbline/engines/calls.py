@@ -1,7 +1,7 @@
-"""What runs inside a worker process: one engine, one task, raw numbers back.
+"""Calls made in worker processes: one engine, one task, numbers or a reason back.
 
-Nothing here judges.  Every function takes and returns small picklable records, so that the same
-task runs in a local process or on another machine.
+Nothing here judges.  Every function takes and returns small picklable records, so that the same task runs
+in a local process, in another environment or on another machine.
 """
 
 from __future__ import annotations
@@ -10,17 +10,14 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import metadata
-from typing import TYPE_CHECKING
 
-from packaging.specifiers import SpecifierSet
-
+from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.environments import declared_attribute
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import (
     Array,
     BadInput,
     EngineFailure,
-    Integrator,
     Model,
     State,
     StateQuantities,
@@ -28,35 +25,20 @@ from plumbline.model.datatypes import (
     Unsupported,
 )
 
-if TYPE_CHECKING:
-    from plumbline.truth.ground_truth import StateTruth
-
-
-@dataclass(frozen=True)
-class EngineInfo:
-    """An engine as it is installed here (or in the environment of ``python``), or why it does not run."""
-
-    name: str
-    title: str
-    version: str
-    integrators: tuple[Integrator, ...]
-    missing: str | None = None
-    python: str = ""
-
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """An engine's answers at a list of states, or the sentence that stands in their place."""
+    """State quantities of an engine at a list of states, or the reason why there are none."""
 
     quantities: list[StateQuantities]
-    unsupported: str | None
-    failure: str | None
+    unsupported: str | None  # the engine's reason for refusing
+    failure: str | None  # what the engine did instead
     cpu_time: float  # CPU s inside the engine's calls
 
 
 @dataclass(frozen=True, eq=False)
 class RefinementRun:
-    """One run of a ladder: a trajectory, or what the engine did instead."""
+    """One run of a refinement study: a trajectory, or what the engine did instead."""
 
     resolution: float  # step in s, or relative tolerance
     trajectory: Trajectory | None
@@ -66,33 +48,47 @@ class RefinementRun:
 
 @dataclass(frozen=True, eq=False)
 class RefinementStudy:
-    """A whole ladder of one integrator, coarse to fine."""
+    """The runs of one integrator at all resolutions, coarse to fine."""
 
     runs: list[RefinementRun]
-    unsupported: str | None
+    unsupported: str | None  # the engine's reason for refusing
 
 
 def describe_engine(engine: str) -> EngineInfo:
-    """Import an engine and say what it is; an ImportError means it is not installed."""
+    """Load an engine and describe it.
+
+    Args:
+        engine: its name in the registry.
+
+    Returns:
+        Its description; ``missing`` holds a sentence where the engine is not installed here, or in a
+        version that the adapter cannot use.
+
+    """
     try:
-        found = load_adapter(engine)
+        return load_adapter(engine).describe()
     except ImportError as error:
         return EngineInfo(engine, engine, "", (), f"{engine} is not installed here: {error}")
     except AttributeError as error:  # an interface that this version does not have
         version = metadata.version(declared_attribute(engine, "package"))
         return EngineInfo(engine, engine, version, (), f"the adapter cannot use version {version}: {error}")
-    version, missing = found.version(), None
-    if found.supported_versions and not SpecifierSet(found.supported_versions).contains(
-        version, prereleases=True
-    ):
-        missing = (
-            f"the adapter supports versions {found.supported_versions} of {found.package}, this is {version}"
-        )
-    return EngineInfo(engine, found.title, version, found.integrators, missing)
 
 
 def evaluate_states(engine: str, model: Model, states: Sequence[State]) -> Evaluation:
-    """State quantities of one engine at each state."""
+    """Evaluate the state quantities of one engine; what the engine raises becomes a reason.
+
+    Args:
+        engine: its name in the registry.
+        model: the pendulum.
+        states: states of it.
+
+    Returns:
+        The quantities at each state, or the reason why there are none.
+
+    Raises:
+        MemoryError: the worker reached its memory limit, which the pool reports.
+
+    """
     begin = time.process_time()
     quantities: list[StateQuantities] = []
     unsupported = failure = None
@@ -101,8 +97,8 @@ def evaluate_states(engine: str, model: Model, states: Sequence[State]) -> Evalu
     except Unsupported as refusal:
         unsupported = str(refusal)
     except MemoryError:
-        raise  # the worker's limit, told as such
-    except Exception as error:  # an engine may raise anything: its words belong in the results
+        raise
+    except Exception as error:  # an engine may raise anything: its message belongs in the results
         failure = format_exception(error)
     return Evaluation(quantities, unsupported, failure, time.process_time() - begin)
 
@@ -110,34 +106,49 @@ def evaluate_states(engine: str, model: Model, states: Sequence[State]) -> Evalu
 def run_refinement(
     engine: str, integrator: str, model: Model, state: State, times: Array, resolutions: Sequence[float]
 ) -> RefinementStudy:
-    """The same motion at each resolution; a rung that does not stay finite is kept as such."""
-    chosen = load_adapter(engine)
-    rungs: list[RefinementRun] = []
+    """Simulate the same motion at each resolution; a run that fails is kept with its reason.
+
+    Args:
+        engine: its name in the registry.
+        integrator: name of one of the engine's integrators.
+        model: the pendulum.
+        state: the initial state.
+        times: sample times (T,) [s].
+        resolutions: steps [s] or relative tolerances, coarse to fine.
+
+    Returns:
+        The runs; up to the first refusal where the engine does not support the motion.
+
+    Raises:
+        MemoryError: the worker reached its memory limit, which the pool reports.
+
+    """
+    adapter = load_adapter(engine)
+    runs: list[RefinementRun] = []
     for resolution in resolutions:
         begin = time.process_time()
         trajectory, failure = None, None
         try:
-            trajectory = chosen.simulate(model, state, times, integrator, resolution)
+            trajectory = adapter.simulate(model, state, times, integrator, resolution)
         except Unsupported as refusal:
-            return RefinementStudy(rungs, str(refusal))
+            return RefinementStudy(runs, str(refusal))
         except MemoryError:
             raise
         except Exception as error:  # as above
             failure = format_exception(error)
-        rungs.append(RefinementRun(resolution, trajectory, failure, time.process_time() - begin))
-    return RefinementStudy(rungs, None)
-
-
-def explain_disagreement(
-    engine: str, model: Model, engine_quantities: list[StateQuantities], truth: StateTruth
-) -> str:
-    """Which term is wrong in answers that disagree with the truth: a sentence."""
-    from plumbline.diagnosis.diagnose import diagnose  # only a dispute needs it
-
-    return diagnose(model, engine_quantities, truth, load_adapter(engine).evaluate)
+        runs.append(RefinementRun(resolution, trajectory, failure, time.process_time() - begin))
+    return RefinementStudy(runs, None)
 
 
 def format_exception(error: Exception) -> str:
-    """An exception as one sentence; the project's own need no class name before them."""
+    """Write an exception as one sentence.
+
+    Args:
+        error: what was raised.
+
+    Returns:
+        Its message on one line; after the class name unless the error is one of the project's own.
+
+    """
     text = " ".join(str(error).split()) or "no message"
     return text if isinstance(error, EngineFailure | BadInput) else f"{type(error).__name__}: {text}"

@@ -68,21 +68,44 @@ def wheel_problem(path: Path, package: str) -> str | None:
 
 
 def declared_attribute(engine: str, attribute: str) -> Any:
-    """A literal class attribute of an adapter, its bases' in the same file included, without importing it.
+    """Read a literal class attribute of an adapter without importing it.
 
-    The distribution's name is needed where the engine is not installed.
+    The name of the distribution, for one, is needed where the engine is not installed.
+
+    Args:
+        engine: name in the registry.
+        attribute: name of a class attribute of the adapter or of one of its bases, written as a literal.
+
+    Returns:
+        Its value; None where no class declares it.
+
     """
-    module, _, name = ENGINES[engine].partition(":")
-    tree = ast.parse((ROOT / f"{module.replace('.', '/')}.py").read_text(encoding="utf-8"))
-    classes = {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
-    while name in classes:
-        for node in classes[name].body:
+    module, _, class_name = ENGINES[engine].partition(":")
+    return _read_attribute(module, class_name, attribute)
+
+
+def _read_attribute(module: str, class_name: str, attribute: str) -> Any:
+    """Read an attribute in the source of a class, or of the first of its bases that has it."""
+    source = ROOT / f"{module.replace('.', '/')}.py"
+    if not source.is_file():
+        return None
+    body = ast.parse(source.read_text(encoding="utf-8")).body
+    bases: list[str] = []
+    for definition in (node for node in body if isinstance(node, ast.ClassDef) and node.name == class_name):
+        bases = [base.id for base in definition.bases if isinstance(base, ast.Name)]
+        for node in definition.body:
             targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
             if any(isinstance(t, ast.Name) and t.id == attribute for t in targets):
-                return ast.literal_eval(node.value)  # type: ignore[attr-defined]
-        bases = [base.id for base in classes[name].bases if isinstance(base, ast.Name)]
-        name = next((base for base in bases if base in classes), "")
-    return None
+                value = getattr(node, "value", None)
+                return None if value is None else ast.literal_eval(value)
+    imported_from = {
+        name.name: node.module or ""
+        for node in body
+        if isinstance(node, ast.ImportFrom)
+        for name in node.names
+    }
+    found = (_read_attribute(imported_from.get(base, module), base, attribute) for base in bases)
+    return next((value for value in found if value is not None), None)
 
 
 def ensure_interpreter(name: str) -> str:
@@ -100,7 +123,7 @@ def ensure_interpreter(name: str) -> str:
     number = str(parse_wheel_filename(Path(version).name)[1]) if version.endswith(".whl") else label
     more = (
         need
-        for when, need in declared_attribute(base, "extra_requirements") or ()
+        for when, need in declared_attribute(base, "extra_requirements")
         if SpecifierSet(when).contains(number)
     )
     wanted = [requirement, *BASE_REQUIREMENTS, *more]

@@ -1,4 +1,4 @@
-"""The one place that knows every engine: adding an engine is adding one file and one line here."""
+"""The list of engines: adding one is adding a file in `adapters` and a line here."""
 
 from __future__ import annotations
 
@@ -18,7 +18,15 @@ ENGINES = {
 
 
 def load_adapter(name: str) -> Adapter:
-    """The adapter of that name; imports its engine, so ImportError means "not installed"."""
+    """Import an adapter, and with it its engine; ImportError means that the engine is not installed.
+
+    Args:
+        name: a key of `ENGINES`.
+
+    Returns:
+        A new instance of the adapter.
+
+    """
     module, _, class_name = ENGINES[name].partition(":")
     found: type[Adapter] = getattr(import_module(module), class_name)
     return found()

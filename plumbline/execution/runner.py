@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from plumbline.engines import calls, environments
-from plumbline.engines.calls import EngineInfo
+from plumbline.engines.adapter import EngineInfo
 from plumbline.execution.random_batch import RandomBatch
 from plumbline.execution.scenario_run import ScenarioRun, TruthFailure, task_keys
 from plumbline.judging import known_issues

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from plumbline.diagnosis.diagnose import explain_disagreement
 from plumbline.engines import calls, environments
-from plumbline.engines.calls import EngineInfo
+from plumbline.engines.adapter import EngineInfo
 from plumbline.judging import metamorphic, outlier
 from plumbline.judging.convergence import refinement_resolutions
 from plumbline.judging.long_runs import judge_long_runs, plan_long_run, run_long_run_study
@@ -200,7 +201,7 @@ class ScenarioRun:
         (base, _), info = environments.split_version(engine), self.engines[engine]
         arguments = (base, self.scenario.model, engine_quantities, self.state_truth)
         key = (self.scenario.name, "why", engine)
-        return Task(key, calls.explain_disagreement, arguments, self.plan.limits, info.version, info.python)
+        return Task(key, explain_disagreement, arguments, self.plan.limits, info.version, info.python)
 
     def add_diagnosis(self, outcome: Outcome) -> None:
         """Take the answer to a question into the rows that disagree."""

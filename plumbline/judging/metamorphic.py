@@ -28,6 +28,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from plumbline.engines.adapter import Adapter
+from plumbline.engines.metamorphic_hooks import MetamorphicHooks, metamorphic_hooks
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import JudgingResult, RowContext, Verdict
 from plumbline.model.datatypes import (
@@ -58,12 +59,6 @@ OTHER_FORMULATION_PREFIX, OPTION_PREFIX = (
     "by ",
 )  # how names of relations begin: another formulation, another way of the engine
 WELDED_HALVES, REVERSED_IN_TIME = "two welded halves", "reversed in time"
-OTHER_FORMULATIONS = {
-    "pinocchio": "pinocchio-maximal",
-    "pinocchio-maximal": "pinocchio",
-    "exudyn": "exudyn-tree",
-    "exudyn-tree": "exudyn",
-}
 MAX_STATES, LONG_CHAIN_BODIES = 4, 12  # states per relation; half of them for chains above so many bodies
 STEP_DIVISORS = 1, 4, 16  # steps that an implicit method is given, one after the other, where it fails
 RUN_STEPS, STEPS_PER_RADIAN = (
@@ -206,7 +201,7 @@ Evaluate = Callable[[Model, list[State]], list[StateQuantities]]
 
 def check_relations(engine: str, model: Model, states: Sequence[State]) -> list[RelationResult]:
     """Every relation on one engine, at each state (to be called in a worker)."""
-    chosen = load_adapter(engine)
+    chosen = metamorphic_hooks(load_adapter(engine))
     states = states[: MAX_STATES if model.n <= LONG_CHAIN_BODIES else MAX_STATES // 2]
     said = [evaluate_or_refusal(chosen.evaluate, model, state) for state in states]
     bounds = [state_rounding_bound(model, state) for state in states]
@@ -215,10 +210,12 @@ def check_relations(engine: str, model: Model, states: Sequence[State]) -> list[
         for relation in STATE_RELATIONS
         if not (relation.name == "time reversed" and model.has_drag)
     ]
-    ways = {OPTION_PREFIX + option: chosen.with_option(option) for option in chosen.options}
-    if engine in OTHER_FORMULATIONS:
-        ways[OTHER_FORMULATION_PREFIX + OTHER_FORMULATIONS[engine]] = load_adapter(OTHER_FORMULATIONS[engine])
-    asked += [(Relation(name, unchanged, quantity_values), other.evaluate) for name, other in ways.items()]
+    ways: dict[str, Adapter] = {
+        OPTION_PREFIX + option: chosen.with_option(option) for option in chosen.options
+    }
+    if other := chosen.other_formulation:
+        ways[OTHER_FORMULATION_PREFIX + other] = load_adapter(other)
+    asked += [(Relation(name, unchanged, quantity_values), way.evaluate) for name, way in ways.items()]
     found = [
         check_state_relation(relation, said, evaluate, model, states, bounds, bounds)
         for relation, evaluate in asked
@@ -269,7 +266,7 @@ def check_state_relation(
     return RelationResult(relation.name, worst[0] if count else None, worst[1], worst[2], count, refused)
 
 
-def check_run_relations(engine: Adapter, model: Model, state: State) -> Iterator[RelationResult]:
+def check_run_relations(engine: MetamorphicHooks, model: Model, state: State) -> Iterator[RelationResult]:
     """The relations of short runs from one state, of every integrator that has one.
 
     A step too coarse for an implicit one to be solved says nothing: the run is shorter then, and its step.
@@ -284,7 +281,7 @@ def check_run_relations(engine: Adapter, model: Model, state: State) -> Iterator
 
 
 def check_integrator_relations(
-    engine: Adapter, integrator: Integrator, model: Model, state: State, step: float
+    engine: MetamorphicHooks, integrator: Integrator, model: Model, state: State, step: float
 ) -> Iterator[RelationResult]:
     """The relations of one integrator's runs in steps of ``step``."""
     if integrator.is_symmetric and not model.has_drag:
@@ -301,7 +298,7 @@ def fastest_rate(model: Model, state: State) -> float:
 
 
 def check_time_reversal(
-    engine: Adapter, integrator: Integrator, model: Model, state: State, step: float
+    engine: MetamorphicHooks, integrator: Integrator, model: Model, state: State, step: float
 ) -> RelationResult:
     """There and back by a symmetric integrator: the first row with opposite rates."""
     resolution = step if integrator.kind == "step" else integrator.min_rtol
@@ -316,7 +313,7 @@ def check_time_reversal(
 
 
 def check_linear_solvers(
-    engine: Adapter, integrator: Integrator, model: Model, state: State, step: float
+    engine: MetamorphicHooks, integrator: Integrator, model: Model, state: State, step: float
 ) -> Iterator[RelationResult]:
     """The same run with each of the engine's linear solvers."""
     end = RUN_STEPS * step

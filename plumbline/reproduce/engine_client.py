@@ -10,6 +10,7 @@ from io import StringIO
 from typing import Any
 
 from plumbline.engines import calls
+from plumbline.engines.metamorphic_hooks import metamorphic_hooks
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.metamorphic import OPTION_PREFIX, WELDED_HALVES
 from plumbline.model.datatypes import Integrator, Model, State, StateQuantities
@@ -68,7 +69,7 @@ def printed(_: str, script: str) -> str:
 
 def answer(engine: str, way: str, model: Model, state: State) -> StateQuantities:
     """What an engine says of a state: as usual, by one of its options, or of welded halves."""
-    chosen = load_adapter(engine)
+    chosen = metamorphic_hooks(load_adapter(engine))
     if way:
         chosen = (
             chosen.with_welded_halves()

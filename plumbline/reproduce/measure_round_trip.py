@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from plumbline.engines.metamorphic_hooks import metamorphic_hooks
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.metamorphic import (
     OPTION_PREFIX,
@@ -36,7 +37,7 @@ def both_ends(
     engine: str, relation: str, integrator: str, model: Model, state: State, end: float, resolution: float
 ) -> tuple[State, State, int]:
     """The two samples that should be the same, and the steps between (to be called in a worker)."""
-    chosen = load_adapter(engine)
+    chosen = metamorphic_hooks(load_adapter(engine))
     if relation == REVERSED_IN_TIME:
         run = chosen.simulate_round_trip(model, state, end, integrator, resolution)
         return state_at_sample(run, 0), state_at_sample(run, 2, -1.0), run.steps

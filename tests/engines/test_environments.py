@@ -61,9 +61,8 @@ def test_what_an_adapter_declares_is_read_without_importing_it(engine):
 
     found = load_adapter(engine)
     assert environments.declared_attribute(engine, "package") == found.package
-    assert (
-        tuple(environments.declared_attribute(engine, "extra_requirements") or ()) == found.extra_requirements
-    )
+    for name in ("extra_requirements", "other_formulation", "reproduction_template"):
+        assert environments.declared_attribute(engine, name) == getattr(found, name)
     assert calls.describe_engine(engine).missing is None, "the installed version is in the declared range"
 
 

@@ -185,7 +185,7 @@ def test_a_half_that_is_welded_wrongly_breaks_it(engine, change):
         return parts
 
     model = pendulums.model(JOINTS["balls"])
-    with patch("plumbline.engines.adapter.split_bodies", wrong):
+    with patch("plumbline.engines.metamorphic_hooks.split_bodies", wrong):
         (found,) = (
             h for h in check_relations(engine, model, states(model)) if h.relation == "two welded halves"
         )

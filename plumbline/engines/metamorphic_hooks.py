@@ -1,0 +1,151 @@
+"""Hooks for metamorphic tests: other ways of one engine to the same answers.
+
+An adapter that subclasses `MetamorphicHooks` instead of `Adapter` may offer other algorithms for the
+accelerations, other linear solvers, bodies built of two welded halves, and runs that turn round.
+All are optional; an adapter without them is still tested with rotated, rescaled and reversed models.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from copy import copy
+from typing import ClassVar, Self
+
+import numpy as np
+
+from plumbline.engines.adapter import Adapter, check_samples, check_state
+from plumbline.model.datatypes import (
+    Array,
+    Integrator,
+    Model,
+    State,
+    StateQuantities,
+    Trajectory,
+    Unsupported,
+)
+from plumbline.model.welding import BodyParts, split_bodies, undivided_bodies
+
+
+class MetamorphicHooks(Adapter):
+    """An adapter whose engine has several ways to the same answers.
+
+    ``_evaluate`` and ``_simulate`` use the way named by ``option`` (empty: the usual one), and
+    ``_evaluate`` builds each body of the parts that `body_pieces` returns.
+    """
+
+    options: ClassVar[tuple[str, ...]] = ()  # other algorithms for the accelerations
+    usual_linear_solver: ClassVar[str] = ""  # of implicit steps, or of the equations of motion
+    linear_solvers: ClassVar[tuple[str, ...]] = ()  # the others
+    welding_unsupported_reason: ClassVar[str] = "the adapter welds nothing"  # empty where it does
+    option: str = ""  # the one of `options` or `linear_solvers` in use
+    has_welded_halves: bool = False  # whether `body_pieces` divides every body
+
+    def with_option(self, option: str) -> Self:
+        """Copy the adapter, set to another algorithm or linear solver.
+
+        Args:
+            option: one of `options` or `linear_solvers`.
+
+        Returns:
+            The copy.
+
+        Raises:
+            KeyError: the engine has no such option; the message lists those it has.
+
+        """
+        if option not in (ways := (*self.options, *self.linear_solvers)):
+            raise KeyError(f"{self.name} has no option {option!r}; it has {list(ways)}")
+        other = copy(self)
+        other.option = option
+        return other
+
+    def with_welded_halves(self) -> Self:
+        """Copy the adapter, set to build every body of two welded halves.
+
+        Returns:
+            The copy.
+
+        Raises:
+            Unsupported: the engine cannot weld; the message is `welding_unsupported_reason`.
+
+        """
+        if self.welding_unsupported_reason:
+            raise Unsupported(self.welding_unsupported_reason)
+        other = copy(self)
+        other.has_welded_halves = True
+        return other
+
+    def body_pieces(self, model: Model) -> BodyParts:
+        """Divide the bodies of a model into the parts that the engine is to weld.
+
+        Args:
+            model: the pendulum.
+
+        Returns:
+            Per body one part, or two where the adapter is set to welded halves.
+
+        """
+        return split_bodies(model) if self.has_welded_halves else undivided_bodies(model)
+
+    def simulate_round_trip(
+        self, model: Model, state: State, end: float, integrator: str, resolution: float
+    ) -> Trajectory:
+        """Simulate to ``end``, reverse all that the integrator carries, and simulate back.
+
+        The last row of a symmetric integrator is the first one with opposite rates, but for rounding
+        and the tolerance of the step's solver.  Errors are those of `Adapter.evaluate`.
+
+        Args:
+            model: the pendulum, without drag.
+            state: the initial state.
+            end: duration one way [s].
+            integrator: name of a symmetric integrator.
+            resolution: step [s], or relative tolerance, by the integrator's ``kind``.
+
+        Returns:
+            Rows at 0, ``end`` and 2 ``end``.
+
+        """
+        check_state(model, state)
+        run = self._simulate_round_trip(model, state, end, self.integrator(integrator), resolution)
+        check_samples(model, np.array([0.0, end, 2 * end]), run, f"{self.name} {integrator}")
+        return run
+
+    def _simulate_round_trip(
+        self, model: Model, state: State, end: float, integrator: Integrator, resolution: float
+    ) -> Trajectory:
+        """Simulate there and back; rows at 0, ``end`` and 2 ``end``."""
+        raise Unsupported(f"the adapter does not turn a run of {integrator.name} round")
+
+
+class _WithoutHooks(MetamorphicHooks):
+    """Any adapter as one that offers no other way."""
+
+    def __init__(self, adapter: Adapter) -> None:
+        self._adapter = adapter
+        self.name, self.title, self.package = adapter.name, adapter.title, adapter.package  # type: ignore[misc]
+        self.integrators, self.other_formulation = adapter.integrators, adapter.other_formulation  # type: ignore[misc]
+
+    def version(self) -> str:
+        return self._adapter.version()
+
+    def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
+        return self._adapter._evaluate(model, states)
+
+    def _simulate(
+        self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
+    ) -> Trajectory:
+        return self._adapter._simulate(model, state, times, integrator, resolution)
+
+
+def metamorphic_hooks(adapter: Adapter) -> MetamorphicHooks:
+    """Return an adapter with the hooks, whether or not its engine has other ways.
+
+    Args:
+        adapter: any adapter.
+
+    Returns:
+        The adapter itself where it has the hooks; else the same engine with every hook at its default.
+
+    """
+    return adapter if isinstance(adapter, MetamorphicHooks) else _WithoutHooks(adapter)
