@@ -25,14 +25,13 @@ from plumbline.processes.workers import Outcome, Task
 from plumbline.scenario.loader import Scenario
 from plumbline.truth import ground_truth
 from plumbline.truth.closed_form import closed_form_motion
-from plumbline.truth.ground_truth import RUN_ROUNDING, MotionTruth, StateTruth
+from plumbline.truth.ground_truth import MotionTruth, StateTruth
 
 if TYPE_CHECKING:
     from plumbline.execution.runner import Plan
 
 STATES_PER_RANDOM_SCENARIO = 9  # random states of a probe: there are many probes
 LEVELS_WITHOUT_TRUTH = ("relations", "endurance")  # levels judged without a truth
-HORIZON_TOLERANCE = 1e-9  # m: positions are compared while rounding, grown, stays below this
 
 TaskKey = tuple[str, ...]  # scenario, engine or "truth" or "why", level, …
 
@@ -190,8 +189,7 @@ class ScenarioRun:
             found = judge_states(who, truth, outcome.value)
         else:
             integrator = self.integrator(engine, name)
-            horizon = predictability_horizon(truth)
-            found = judge_trajectory(who, self.scenario.model, truth, integrator, outcome.value, horizon)
+            found = judge_trajectory(who, self.scenario.model, truth, integrator, outcome.value)
         if self.plan.user_rtol is not None:
             found.rows = [replace(row, user_rtol=self.plan.user_rtol) for row in found.rows]
         return found
@@ -228,7 +226,7 @@ class ScenarioRun:
         }
         if isinstance(truth, MotionTruth):
             about |= {
-                "horizon": predictability_horizon(truth),
+                "horizon": truth.horizon,
                 "growth": float(truth.growth[-1]),
                 "truth": truth.method,
                 "truth_uncertainty": float(truth.position_uncertainty[-1]),
@@ -253,10 +251,3 @@ def task_keys(
             yield from ((scenario, name, "trajectory", i.name) for i in info.integrators)
             if long_runs:
                 yield from ((scenario, name, "endurance", i.name) for i in info.integrators)
-
-
-def predictability_horizon(truth: MotionTruth) -> float:
-    """T_h in s: the last sample at which rounding and the truth's error, grown, are below the tolerance."""
-    reached = truth.length * RUN_ROUNDING * truth.growth + truth.position_uncertainty
-    good = np.maximum.accumulate(reached) <= HORIZON_TOLERANCE
-    return float(truth.trajectory.t[np.flatnonzero(good)[-1]]) if good.any() else 0.0

@@ -55,7 +55,6 @@ def judge_trajectory(
     truth: MotionTruth,
     integrator: Integrator,
     study: RefinementStudy,
-    horizon: float,
 ) -> JudgingResult:
     """Verdicts on order, limits and invariants of one integrator's ladder, up to the horizon."""
     found = JudgingResult()
@@ -69,7 +68,7 @@ def judge_trajectory(
         reason = f"at the finest resolution {finest.resolution:g}: {finest.failure}"
         found.rows.append(who.make_row("trajectory", integrator.name, "all", Verdict.FAILED, reason))
         return found
-    ladder = RefinementAnalysis(who, model, truth, integrator, study.runs, horizon)
+    ladder = RefinementAnalysis(who, model, truth, integrator, study.runs, truth.horizon)
     found.rows += [*ladder.trajectory_rows(), *ladder.invariant_rows()]
     names: Columns = {"scenario": who.scenario, "engine": who.engine, "integrator": integrator.name}
     found.tables.append(("convergence", names | ladder.convergence_columns()))

@@ -20,7 +20,7 @@ from plumbline.model.sampling import derive_seed
 from plumbline.truth import TruthUnavailable
 from plumbline.truth.certified import certify_state
 from plumbline.truth.rounding_bound import RoundingBound, state_rounding_bound
-from plumbline.truth.sensitivity import perturbation_growth_and_runs
+from plumbline.truth.sensitivity import perturbation_growth_and_runs, predictability_horizon
 from plumbline.truth.trajectory import MAX_COMPILED_BODIES, ClosedFormSamples, trajectory_truth
 
 RUN_ROUNDING = 1e3 * 2.0**-52  # of a whole run, before growth: trials saw at most 115 ε G (verification.md)
@@ -52,6 +52,12 @@ class MotionTruth:
     detectable_attitude: Array  # (T,) rad
     length: float  # m: the stretched chain, the scale of rounding in positions
     method: str
+
+    @property
+    def horizon(self) -> float:
+        """T_h [s], up to which positions are compared: rounding of a run, grown, and the truth's uncertainty."""
+        rounding = self.length * RUN_ROUNDING
+        return predictability_horizon(self.trajectory.t, self.growth, rounding, self.position_uncertainty)
 
 
 def state_truth(model: Model, states: Sequence[State]) -> StateTruth:

@@ -34,14 +34,33 @@ RENORMALISATION_GROWTH = 1e4  # growth after which a twin is brought back, well 
 RTOL = 1e-10  # common steps: the error of the base and of the twins is nearly the same
 
 
-def predictability_horizon(times: Array, growth: Array, delta: float | Array, tolerance: float) -> float:
-    """T_h in s: the last of ``times`` (T,) up to which an initial error ``delta``, grown, is tolerable.
+HORIZON_TOLERANCE = 1e-9  # m: positions are compared while the error to be expected stays below this
 
-    ``growth`` is G (T,); ``delta`` in the unit of ``tolerance`` (a (T,) array: an error that itself grows);
-    0 where not even the first sample is within the tolerance.
+
+def predictability_horizon(
+    times: Array,
+    growth: Array,
+    initial_error: float | Array,
+    uncertainty: float | Array = 0.0,
+    tolerance: float = HORIZON_TOLERANCE,
+) -> float:
+    """Return T_h, the last sample time up to which positions of a motion can be compared [s].
+
+    The error to be expected at a time is an initial error, grown as small perturbations of this motion grow,
+    plus the uncertainty of what is compared with; its running maximum must not exceed the tolerance.
+
+    Args:
+        times: (T,) sample times [s].
+        growth: (T,) growth G of a small perturbation, from `perturbation_growth` [–].
+        initial_error: rounding of a run before growth, one number or (T,) [m].
+        uncertainty: of the true positions, one number or (T,) [m].
+        tolerance: the largest tolerable error [m].
+
+    Returns:
+        T_h; 0 where not even the first sample is within the tolerance.
     """
-    reached = np.maximum.accumulate(delta * growth)
-    good = np.flatnonzero(reached <= tolerance)
+    expected = np.maximum.accumulate(initial_error * growth + uncertainty)
+    good = np.flatnonzero(expected <= tolerance)
     return float(times[good[-1]]) if len(good) else 0.0
 
 

@@ -18,7 +18,6 @@ import pytest
 from plumbline.diagnosis.diagnose import diagnose
 from plumbline.engines.calls import Evaluation, run_refinement
 from plumbline.engines.registry import load_adapter
-from plumbline.execution.scenario_run import predictability_horizon
 from plumbline.judging.convergence import refinement_resolutions
 from plumbline.judging.rows import RowContext
 from plumbline.judging.state import judge_states
@@ -95,7 +94,7 @@ def motion_report(defect: Defect) -> list[str]:
     with patch("plumbline.engines.calls.load_adapter", lambda _: engine):
         runs = run_refinement(defect.engine, integrator.name, model, state, TIMES, steps)
     who = RowContext("planted", "planted", defect.name, defect.name, "0")
-    rows = judge_trajectory(who, model, truth, integrator, runs, predictability_horizon(truth)).rows
+    rows = judge_trajectory(who, model, truth, integrator, runs).rows
     return [f"{row.verdict}: {row.quantity}: {row.reason}" for row in rows if row.verdict != "agrees"]
 
 

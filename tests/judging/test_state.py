@@ -7,7 +7,6 @@ import pytest
 
 from plumbline.engines.calls import Evaluation, run_refinement
 from plumbline.engines.registry import load_adapter
-from plumbline.execution.scenario_run import predictability_horizon
 from plumbline.judging.rows import RowContext
 from plumbline.judging.state import STATE_UNITS, judge_states, judge_states_pickled
 from plumbline.judging.trajectory import judge_trajectory
@@ -73,7 +72,7 @@ def test_implicitfast_is_an_alias_of_euler_only_without_drag(drag):
     }
     same = np.array_equal(*(c.runs[-1].trajectory.r for c in runs.values()))
     fast = mujoco.integrator("implicitfast")
-    rows = judge_trajectory(WHO, model, truth, fast, runs["implicitfast"], predictability_horizon(truth)).rows
+    rows = judge_trajectory(WHO, model, truth, fast, runs["implicitfast"]).rows
     assert {row.alias_of for row in rows} == ({None} if drag else {"Euler"})
     assert same is not drag
 

@@ -26,11 +26,11 @@ STEPS = tuple(2.0**-k for k in range(5, 11))
 ALONG = np.array([2.0, -1.0, 2.0]) / 3
 
 
-def truth(**changes):
+def truth(horizon=2.0, **changes):
+    """A truth that is compared with up to ``horizon``, whatever its uncertainty and growth."""
     one = np.ones(17)
-    held = MotionTruth(
-        TRUE, 1e-12 * one, 2e-12 * one, 1 + TIMES, 1e-6 * one, 2e-6 * one, length=0.4, method="made"
-    )
+    made = type("MadeTruth", (MotionTruth,), {"horizon": horizon})
+    held = made(TRUE, 1e-12 * one, 2e-12 * one, 1 + TIMES, 1e-6 * one, 2e-6 * one, length=0.4, method="made")
     return replace(held, **changes)
 
 
@@ -54,13 +54,13 @@ def climbed(errors=None, **more):
     return RefinementStudy(rungs, None)
 
 
-def rows(climb=None, method=METHOD, horizon=2.0, model=MODEL, **changes):
-    found = judge_trajectory(WHO, model, truth(**changes), method, climb or climbed(), horizon)
+def rows(climb=None, method=METHOD, model=MODEL, **changes):
+    found = judge_trajectory(WHO, model, truth(**changes), method, climb or climbed())
     return {row.quantity: row for row in found.rows}
 
 
-def ladder(climb=None, method=METHOD, horizon=2.0, model=MODEL, **changes):
-    return RefinementAnalysis(WHO, model, truth(**changes), method, (climb or climbed()).runs, horizon)
+def ladder(climb=None, method=METHOD, model=MODEL, **changes):
+    return RefinementAnalysis(WHO, model, truth(**changes), method, (climb or climbed()).runs, 2.0)
 
 
 def test_a_sound_ladder_agrees_in_everything_and_says_what_it_measured():
@@ -191,13 +191,13 @@ def test_the_border_is_the_tolerance_and_the_tolerance_what_is_visible():
 def test_runs_that_did_not_stay_finite_are_points_of_the_study():
     some = climbed()
     some.runs[0] = replace(some.runs[0], trajectory=None, failure="blew up")
-    found = judge_trajectory(WHO, MODEL, truth(), METHOD, some, 2.0)
+    found = judge_trajectory(WHO, MODEL, truth(), METHOD, some)
     assert {row.verdict for row in found.rows} == {"agrees"}
     table = dict(found.tables)["convergence"]
     assert table["steps"][:3] == [0, 0, 100] and np.isnan(table["error"][0])
     for rung in range(5):
         some.runs[rung] = replace(some.runs[rung], trajectory=None)
-    alone = judge_trajectory(WHO, MODEL, truth(), METHOD, some, 2.0)
+    alone = judge_trajectory(WHO, MODEL, truth(), METHOD, some)
     said = {row.quantity: row for row in alone.rows}
     for name in ("position_limit", "attitude_limit"):
         assert said[name].verdict == "unresolved" and "fewer than two" in said[name].reason
@@ -207,10 +207,10 @@ def test_runs_that_did_not_stay_finite_are_points_of_the_study():
     curves = dict(alone.tables)["curves"]
     assert np.all(np.isnan([curves["limit_error"], curves["tolerance"]]))
     some.runs[-1] = replace(some.runs[-1], trajectory=None, failure="NaN at 1 s")
-    (lost,) = judge_trajectory(WHO, MODEL, truth(), METHOD, some, 2.0).rows
+    (lost,) = judge_trajectory(WHO, MODEL, truth(), METHOD, some).rows
     assert (lost.quantity, lost.verdict, lost.integrator) == ("all", "failed", "Heun")
     assert lost.reason == "at the finest resolution 0.000976562: NaN at 1 s"
-    (never,) = judge_trajectory(WHO, MODEL, truth(), METHOD, RefinementStudy([], "no drag here"), 2.0).rows
+    (never,) = judge_trajectory(WHO, MODEL, truth(), METHOD, RefinementStudy([], "no drag here")).rows
     assert (never.quantity, never.verdict, never.reason) == ("all", "unsupported", "no drag here")
     assert (lost.level, never.level, never.integrator) == ("trajectory", "trajectory", "Heun")
 
@@ -397,7 +397,7 @@ def test_what_the_quadrature_of_the_work_leaves_open_is_allowed():
 
 
 def test_the_tables_hold_every_rung_every_sample_and_every_pose():
-    found = dict(judge_trajectory(WHO, MODEL, truth(), METHOD, climbed(), 1.0).tables)
+    found = dict(judge_trajectory(WHO, MODEL, truth(horizon=1.0), METHOD, climbed()).tables)
     table = found["convergence"]
     assert (table["scenario"], table["engine"], table["integrator"]) == ("s", "mujoco", "Heun")
     assert table["quantity"] == ["position", "attitude"] * 6
@@ -418,7 +418,7 @@ def test_the_tables_hold_every_rung_every_sample_and_every_pose():
     np.testing.assert_allclose(curves["norm_drift"], np.abs(held.norm_drift[:, 0, 0]))
     bare = dict(
         judge_trajectory(
-            WHO, replace(MODEL, gravity=0 * MODEL.gravity), truth(), METHOD, climbed(), 1.0
+            WHO, replace(MODEL, gravity=0 * MODEL.gravity), truth(horizon=1.0), METHOD, climbed()
         ).tables
     )
     assert np.all(np.isnan(bare["curves"]["momentum_drift"]))
