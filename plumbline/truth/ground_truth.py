@@ -55,7 +55,7 @@ class MotionTruth:
 
     @property
     def horizon(self) -> float:
-        """T_h [s], up to which positions are compared: rounding of a run, grown, and the truth's uncertainty."""
+        """Predictability horizon T_h [s], from the rounding of a run and the truth's uncertainty."""
         rounding = self.length * RUN_ROUNDING
         return predictability_horizon(self.trajectory.t, self.growth, rounding, self.position_uncertainty)
 

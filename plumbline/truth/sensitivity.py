@@ -58,6 +58,7 @@ def predictability_horizon(
 
     Returns:
         T_h; 0 where not even the first sample is within the tolerance.
+
     """
     expected = np.maximum.accumulate(initial_error * growth + uncertainty)
     good = np.flatnonzero(expected <= tolerance)
