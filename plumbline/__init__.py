@@ -1,1 +1,3 @@
-"""The core: scenarios in, verdicts out."""
+"""The core: scenario files enter, verdicts leave."""
+
+__version__ = "0.1.0"

@@ -59,9 +59,9 @@ def rerun_command(row: Record, scenario: Record) -> str:
     what = row["scenario"] if ours else file
     words = ["python", "-m", "plumbline", "run", "--engine", row["engine"]]
     if is_long_run(row):
-        words[3:] = ["nightly", "--engine", row["engine"], "--random", "0", "--no-instrument"]
+        words[3:] = ["nightly", "--engine", row["engine"], "--random", "0", "--no-self-test"]
         asked = (row.get("extra") or {}).get("asked", DEFAULT_LONG_RUN_SECONDS)
-        words += [] if asked == DEFAULT_LONG_RUN_SECONDS else ["--endurance", f"{asked:g}"]
+        words += [] if asked == DEFAULT_LONG_RUN_SECONDS else ["--long-run-seconds", f"{asked:g}"]
     else:
         words += ["--level", CLI_LEVEL.get(row["level"], "all")]
     words[4:4] = [] if what.startswith("-") else [what]

@@ -1,9 +1,9 @@
-"""What a run tells on the terminal: progress, the matrix, the sentences of what does not agree."""
+"""What a run prints on the terminal: progress, the matrix of verdicts, the reasons of what does not agree."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 from rich.console import Console
@@ -11,17 +11,65 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from plumbline.engines.environments import split_version
 from plumbline.execution.runner import RunResult
 from plumbline.judging.rows import Row, Verdict
 
 
 def make_console(file: Any) -> Console:
-    """A console that wraps to the terminal, or never where the output is piped."""
+    """Make a console that wraps to the terminal, or at 200 columns where the output is piped.
+
+    Args:
+        file: an open text file, as sys.stdout.
+
+    Returns:
+        The console.
+
+    """
     return Console(file=file, width=None if file.isatty() else 200, highlight=False)
 
 
+def count_noun(count: int, singular: str, plural: str = "") -> str:
+    """Write a number with its noun, as "1 body" or "2 bodies".
+
+    Args:
+        count: how many.
+        singular: the noun for one.
+        plural: the noun for several; absent: ``singular`` with an s.
+
+    Returns:
+        The words.
+
+    """
+    return f"{count} {singular if count == 1 else plural or singular + 's'}"
+
+
+def print_table(records: Iterable[Mapping[str, Any]], title: str | None = None) -> None:
+    """Print records as a table on stdout; nothing where there are none.
+
+    Args:
+        records: rows that have the same keys, which become the header.
+        title: a line above the table.
+
+    """
+    table = Table(box=None, pad_edge=False, header_style="bold", title=title)
+    for record in records:
+        if not table.columns:
+            for name in record:
+                table.add_column(name, overflow="fold")
+        table.add_row(*(escape(_format_value(value)) for value in record.values()))
+    if table.columns:
+        make_console(sys.stdout).print(table)
+
+
+def _format_value(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.3g}"
+    return "" if value is None else ", ".join(value) if isinstance(value, list) else str(value)
+
+
 class ProgressDisplay:
-    """A progress bar on a terminal, plain lines (each tenth) otherwise."""
+    """A progress bar on a terminal; elsewhere a line after each tenth of the tasks."""
 
     def __init__(self, file: Any) -> None:
         self.bar = Progress(
@@ -32,7 +80,7 @@ class ProgressDisplay:
         self.last_tenth = 0
 
     def __enter__(self) -> Callable[[int, int, str], None]:
-        """The function to call after each task."""
+        """Start the bar; the value is the function to call after each task."""
         self.bar.start()
         self.task = self.bar.add_task("running", total=None)
         return self.update
@@ -42,7 +90,14 @@ class ProgressDisplay:
         self.bar.stop()
 
     def update(self, done: int, total: int, task_name: str) -> None:
-        """Show how far the run is."""
+        """Show how far the run is.
+
+        Args:
+            done: finished tasks.
+            total: tasks that are known so far.
+            task_name: the task that finished last.
+
+        """
         self.bar.update(self.task, completed=done, total=total, description=escape(task_name[:48].ljust(48)))
         if not self.file.isatty() and done * 10 // total > self.last_tenth:
             self.last_tenth = done * 10 // total
@@ -57,12 +112,17 @@ MAX_COMPLETE_TABLE = 60  # scenarios; of more, those where everything agrees are
 
 
 def print_result(result: RunResult) -> None:
-    """The matrix of scenario × engine, the sentences of what does not agree, the verdict."""
+    """Print the matrix of scenarios × engines, the reason of every row that does not agree, and the summary.
+
+    Args:
+        result: a judged run.
+
+    """
     out = make_console(sys.stdout)
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("scenario")
     for name, info in result.engines.items():
-        table.add_column(f"{name} {info.version}".strip())
+        table.add_column(escape(engine_heading(name, info.version)))
     rows_of: dict[str, list[Row]] = {scenario: [] for scenario in result.scenarios}
     for row in result.rows:
         rows_of[row.scenario].append(row)
@@ -71,7 +131,7 @@ def print_result(result: RunResult) -> None:
         if len(result.scenarios) <= MAX_COMPLETE_TABLE or any(
             r.verdict != Verdict.AGREES for rows in of for r in rows
         ):
-            table.add_row(escape(scenario), *map(format_cell, of))
+            table.add_row(escape(scenario), *map(_format_cell, of))
     out.print(table)
     out.print(
         "[dim]each cell: worst verdict, agreeing rows / all rows, error over tolerance of the worst row; "
@@ -80,39 +140,40 @@ def print_result(result: RunResult) -> None:
     )
     for row in result.rows:
         if row.verdict != Verdict.AGREES and row.known_issue is None:
-            out.print(f"{coloured_glyph(row)} {escape(row.key)}: {escape(row.reason)}")
+            out.print(f"{_coloured_glyph(row)} {escape(row.key)}: {escape(row.reason)}")
     for entry in result.stale_entries:
-        out.print(f"[red]![/] known entry {entry.id} no longer occurs: remove it from known_issues.yaml")
+        out.print(
+            f"[red]![/] known entry {escape(entry.id)} no longer occurs: remove it from known_issues.yaml"
+        )
     out.print(f"[bold]{escape(result.metadata['sentence'])}[/]")
 
 
-def coloured_glyph(row: Row) -> str:
-    """Return the verdict's glyph as rich markup, dimmed where a known issue expects the verdict.
-
-    Args:
-        row: any judged row.
-
-    Returns:
-        Markup for `rich`.
-
-    """
+def _coloured_glyph(row: Row) -> str:
+    """Return the verdict's glyph as rich markup, dimmed where a known issue expects the verdict."""
     colour = "dim" if row.known_issue else VERDICT_COLOURS[row.verdict]
     return f"[{colour}]{row.verdict.style.glyph}[/]"
 
 
-def format_cell(rows: Sequence[Row]) -> str:
-    """Return one cell of the matrix: the worst row's glyph, the counts and the worst row's ratio.
+def engine_heading(name: str, version: str) -> str:
+    """Write an engine with its version once: ``mujoco@3.12.0`` becomes "mujoco 3.12.0".
 
     Args:
-        rows: all rows of one scenario and engine.
+        name: the engine as it was named on the command line.
+        version: the installed version; empty where the engine is not installed.
 
     Returns:
-        Markup for `rich`; empty for no rows.
+        The heading of the engine's column.
 
     """
+    base, requested = split_version(name)
+    return f"{base if requested == version else name} {version}".strip()
+
+
+def _format_cell(rows: Sequence[Row]) -> str:
+    """Return one cell of the matrix: the worst row's glyph, the counts and the worst row's ratio."""
     if not rows:
         return ""
     worst = max(rows, key=lambda row: row.rank)
     agreeing = sum(row.verdict == Verdict.AGREES for row in rows)
     ratio = "" if worst.ratio is None else f" {worst.ratio:.1g}"
-    return f"{coloured_glyph(worst)} {agreeing}/{len(rows)}{ratio}"
+    return f"{_coloured_glyph(worst)} {agreeing}/{len(rows)}{ratio}"

@@ -1,77 +1,228 @@
-"""What a command line asks for, checked before any work is done; a mistake ends with exit code 2."""
+"""Options that several commands share, and checks of what was typed; a mistake ends with exit code 2."""
 
 from __future__ import annotations
 
+import functools
+import os
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from difflib import get_close_matches
 from pathlib import Path
+from typing import Any, ParamSpec
 
 import click
 
 from plumbline.engines import environments
 from plumbline.engines.registry import ENGINES
-from plumbline.processes.workers import ExecutorUnavailable
+from plumbline.processes.workers import ExecutorUnavailable, Limits
 from plumbline.scenario import loader as scenarios
-from plumbline.scenario.errors import Problem, ScenarioError
+from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean
+from plumbline.scenario.yaml_source import read_yaml
 from plumbline.truth.closed_form import ClosedFormMismatch, closed_form_motion
+
+DEFAULT_OUT = Path("reports") / "out"
+MIN_TIMEOUT = 1e-300
+MIN_MEMORY = 1e-300
+MIN_USER_RTOL = 1e-300
+EXIT_CODES = """
+\b
+Exit codes:
+  0  everything agrees, or differs as recorded in plumbline/judging/known_issues.yaml
+  1  a disagreement, or a cell unresolved or unsupported that is not recorded
+  2  bad usage or a bad scenario file
+  3  an engine failed: raised, crashed, hung, ran out of memory, was not finite
+  4  the machine failed: disk full, input/output error; the same command resumes
+An engine that is not installed is a verdict and changes no exit code.
+"""
+
+_Parameters = ParamSpec("_Parameters")
+_Command = Callable[..., Any]
+_Decorator = Callable[[_Command], _Command]
+
+
+class FiniteNumber(click.FloatRange):
+    """A number in a range."""
+
+
+class FolderPath(click.Path):
+    """A folder that may not exist yet; the empty text, which would mean the current folder, is refused."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+
+def examples(*lines: str) -> str:
+    """Format example commands for the end of a help text.
+
+    Args:
+        *lines: what follows ``python -m plumbline``, remarks included.
+
+    Returns:
+        A paragraph whose line breaks click keeps.
+
+    """
+    return "\n".join(["\b", "Examples:", *(f"  python -m plumbline {line}" for line in lines), "", ""])
+
+
+def out_option(default: Path, note: str = "") -> _Decorator:
+    """Make the option ``--out``.
+
+    Args:
+        default: the folder where the option is not given.
+        note: what else the help says of the folder.
+
+    Returns:
+        The decorator of a command; it passes ``out``.
+
+    """
+    return click.option(
+        "--out", type=FolderPath(), default=default, show_default=True, help=f"Output folder{note}."
+    )
+
+
+def limits_options(timeout: float) -> _Decorator:
+    """Make the options ``--timeout`` and ``--memory``.
+
+    Args:
+        timeout: the default time limit of a task [s].
+
+    Returns:
+        The decorator of a command; it passes both as ``limits``.
+
+    """
+
+    def decorate(command: Callable[_Parameters, None]) -> _Command:
+        @click.option(
+            "--timeout",
+            type=FiniteNumber(MIN_TIMEOUT),
+            default=timeout,
+            show_default=True,
+            help="Seconds per task.",
+        )
+        @click.option(
+            "--memory", type=FiniteNumber(MIN_MEMORY), default=8.0, show_default=True, help="GB per worker."
+        )
+        @functools.wraps(command)
+        def with_limits(*args: Any, timeout: float, memory: float, **options: Any) -> None:
+            command(*args, **options, limits=Limits(timeout, memory))  # type: ignore[arg-type]
+
+        return with_limits  # fmt: skip
+
+    return decorate
+
+
+def _choose_engines(_: click.Context, __: click.Parameter, names: Sequence[str]) -> list[str]:
+    """Check engine names; return them in the registry's order, or all engines where none is named."""
+    for name in names:
+        base, _version = environments.split_version(name)
+        if base not in ENGINES:
+            raise click.BadParameter(f"no engine {base!r}; {_nearest_or_all(base, ENGINES)}")
+        if problem := environments.version_problem(name):
+            raise click.BadParameter(f"{name}: {problem}")
+    order = list(ENGINES)
+    chosen = sorted(dict.fromkeys(names), key=lambda e: order.index(environments.split_version(e)[0]))
+    return chosen or order
+
+
+engines_option = click.option(
+    "--engine",
+    "engines",
+    multiple=True,
+    callback=_choose_engines,
+    help="Only this engine (may be repeated); mujoco@3.12.0, @latest, @pre or @path/to.whl for another "
+    "version than the installed one. Default: all.",
+)
+jobs_option = click.option(
+    "--jobs",
+    type=click.IntRange(1),
+    default=lambda: os.cpu_count() or 1,
+    show_default="one per core",
+    help="Worker processes.",
+)
+scheduler_option = click.option(
+    "--scheduler", metavar="ADDRESS", help="A dask cluster to run on instead, as tcp://HOST:8786."
+)
+json_option = click.option(
+    "--json", "as_json", is_flag=True, help="Print JSON on stdout, for other programs."
+)
+names_argument = click.argument("names", nargs=-1, metavar="[SCENARIO]...")
 
 
 def read_scenarios(names: Iterable[str | Path]) -> list[scenarios.Scenario]:
-    """Scenarios by name or path; every problem goes to stderr and ends with exit code 2."""
+    """Load scenarios; print every problem of every file to stderr and exit with 2 if there is one.
+
+    Args:
+        names: names of the catalogue, or paths of YAML files.
+
+    Returns:
+        The scenarios, each once, in the order of ``names``.
+
+    """
     try:
         found = scenarios.load_scenarios(names)
-        for s in found:
-            try:
-                closed_form_motion(s)
-            except ClosedFormMismatch as error:
-                raise ScenarioError(
-                    [Problem(str(s.path), 0, 0, "exact", str(error), "no exact, or another")]
-                ) from None
+        if problems := [problem for s in found if (problem := _closed_form_problem(s))]:
+            raise ScenarioError(problems)
     except ScenarioError as error:
         click.echo(str(error), err=True)
         sys.exit(2)
     return found
 
 
-def choose_scenarios(names: tuple[str, ...], families: tuple[str, ...]) -> list[scenarios.Scenario]:
-    """The asked scenarios, or the catalogue; narrowed to the asked families."""
+def _closed_form_problem(scenario: scenarios.Scenario) -> Problem | None:
+    """Find out whether the scenario lacks what the closed form named in its file needs."""
+    try:
+        closed_form_motion(scenario)
+    except ClosedFormMismatch as error:
+        line, column = read_yaml(scenario.path).value_positions.get(("exact",), (1, 1))
+        valid = "no `exact` at all, or the name of the closed form that fits"
+        return Problem(str(scenario.path), line, column, "exact", str(error), valid)
+    return None
+
+
+def choose_scenarios(names: Sequence[str], families: Sequence[str]) -> list[scenarios.Scenario]:
+    """Load the named scenarios, or the catalogue, narrowed to families.
+
+    Args:
+        names: names of the catalogue or paths; empty for the whole catalogue.
+        families: names of families; empty for all.
+
+    Returns:
+        The scenarios.
+
+    Raises:
+        BadParameter: no scenario is of one of the families.
+
+    """
     found = read_scenarios(names or tuple(scenarios.catalogue()))
-    known_families = {s.family for s in found}
+    known = {s.family for s in found}
     for family in families:
-        if family not in known_families:
+        if family not in known:
             raise click.BadParameter(
-                f"no family {family!r}{suggestion(family, known_families)}", param_hint="--family"
+                f"no family {family!r}; {_nearest_or_all(family, known)}", param_hint="--family"
             )
     return [s for s in found if not families or s.family in families]
 
 
-def choose_engines(engines: tuple[str, ...]) -> list[str]:
-    """The asked engines in the registry's order, then as they were asked; or all of them."""
-    for engine in engines:
-        base, _ = environments.split_version(engine)
-        if base not in ENGINES:
-            raise click.BadParameter(f"no engine {base!r}{suggestion(base, ENGINES)}", param_hint="--engine")
-        problem = environments.version_problem(engine)
-        if problem:
-            raise click.BadParameter(f"{engine}: {problem}", param_hint="--engine")
-    order = list(ENGINES)
-    return (
-        sorted(dict.fromkeys(engines), key=lambda e: order.index(environments.split_version(e)[0])) or order
-    )
-
-
-def suggestion(name: str, names: Iterable[str]) -> str:
-    """A suggestion: the nearest name, or the list of them."""
-    names = list(names)
-    near = get_close_matches(name, names, 1)
-    return f"; did you mean {near[0]!r}?" if near else f"; there are: {', '.join(sorted(names))}"
+def _nearest_or_all(name: str, known: Iterable[str]) -> str:
+    """Suggest the nearest known name, or list all of them."""
+    names = sorted(known)
+    return did_you_mean(name, names) or f"there are: {', '.join(names)}"
 
 
 def ensure_writable(folder: Path) -> Path:
-    """The output folder, made and tried before any work is done; exit code 2 where it cannot be written."""
+    """Make the output folder and try to write to it, before any work is done.
+
+    Args:
+        folder: the folder; parents are made too.
+
+    Returns:
+        The folder.
+
+    Raises:
+        BadParameter: the folder cannot be made or written to (exit code 2).
+
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -83,12 +234,21 @@ def ensure_writable(folder: Path) -> Path:
 
 @contextmanager
 def exit_on_io_error() -> Iterator[None]:
-    """A write that fails ends the run with exit code 4 and says how to go on; finished cells are kept."""
+    """Exit with 4 when a write fails; finished cells are kept.
+
+    Yields:
+        Nothing.
+
+    Raises:
+        BadParameter: the dask cluster cannot be reached (exit code 2).
+
+    """
     try:
         yield
     except ExecutorUnavailable as error:
         raise click.BadParameter(str(error), param_hint="--scheduler") from None
     except OSError as error:
-        click.echo(f"stopped by the machine: {error}", err=True)
-        click.echo("What is finished is kept: the same command goes on from there.", err=True)
+        click.echo(
+            f"I/O error: {error}. Finished cells were saved; run the same command to resume.", err=True
+        )
         sys.exit(4)

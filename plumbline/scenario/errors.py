@@ -42,13 +42,46 @@ class ScenarioError(PlumblineError, ValueError):
         return type(self), (self.problems,)
 
 
-def closest_match(word: str, known: Sequence[str]) -> str:
-    """The closest known word, or an empty string where none is close."""
-    close = get_close_matches(word.lower(), [k.lower() for k in known], n=1, cutoff=0.5)
+def closest_match(word: str, known: Sequence[str], cutoff: float = 0.5) -> str:
+    """Find the known word that is most similar to a misspelt one; capitals do not count.
+
+    Args:
+        word: what was written.
+        known: what may be written.
+        cutoff: the least similarity, from 0 to 1 (difflib's ratio).
+
+    Returns:
+        The known word, or an empty string where none is similar.
+
+    """
+    close = get_close_matches(word[:100].lower(), [k.lower() for k in known], n=1, cutoff=cutoff)
     return next((k for k in known if close and k.lower() == close[0]), "")
 
 
 def did_you_mean(word: str, known: Sequence[str]) -> str:
-    """``did you mean …?`` for the closest known word, or an empty string."""
+    """Write the hint ``did you mean …?`` for a misspelt word.
+
+    Args:
+        word: what was written.
+        known: what may be written.
+
+    Returns:
+        The hint, or an empty string where no known word is similar.
+
+    """
     close = closest_match(word, known)
     return f"did you mean {close!r}?" if close else ""
+
+
+def shorten(text: str, limit: int = 60) -> str:
+    """Cut a text that a file gives, so that a message stays readable.
+
+    Args:
+        text: any text.
+        limit: the largest length of what is returned, in characters.
+
+    Returns:
+        The text, or its beginning with an ellipsis.
+
+    """
+    return text if len(text) <= limit else text[: limit - 1] + "…"

@@ -58,11 +58,12 @@ def random_document(seed: int, index: int) -> dict[str, Any]:
     decades = MASS_DECADES if wild else 1.0
     rate = 10 ** rng.uniform(-1.0, 1.0)  # rad/s
     loaded, dragged = rng.random(2) < 0.3
+    size = "1 body" if n == 1 else f"{n} bodies"
     return {
         "schema_version": 1,
         "name": f"random-{seed}-{index}",
         "family": RANDOM_FAMILY,
-        "title": f"Random {index} of seed {seed}: {n} {'body' if n == 1 else 'bodies'}{', wild masses' * wild}",
+        "title": f"Random {index} of seed {seed}: {size}{', wild masses' * wild}",
         "purpose": RANDOM_PURPOSE,
         "duration": 1.0,
         "bodies": [

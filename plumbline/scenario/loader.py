@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import quaternion_product, rotation_matrix, state_from_minimal
-from plumbline.scenario.errors import Problem, ScenarioError, closest_match, did_you_mean
+from plumbline.scenario.errors import Problem, ScenarioError, closest_match
 from plumbline.scenario.schema import (
     MAX_BODIES,
     Body,
@@ -131,7 +131,9 @@ def find_scenario_file(name: str | Path) -> Path:
     if path.suffix in (".yaml", ".yml") or len(path.parts) > 1 or path.is_file():
         return path
     valid = f"a path of a YAML file, or one of: {', '.join(known)}"
-    message = f"unknown scenario. {did_you_mean(str(name), list(known))}".rstrip(" .")
+    near = closest_match(str(name), [*known, *FAMILIES], cutoff=0.6)
+    hint = f". did you mean {f'`--family {near}`' if near in FAMILIES else repr(near)}?" if near else ""
+    message = f"unknown scenario{hint}"
     raise ScenarioError([Problem(str(name), 0, 0, "", message, valid)])
 
 

@@ -2,12 +2,19 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from click.testing import CliRunner
+
+import plumbline as package
+from plumbline.cli.console import count_noun, engine_heading
+from plumbline.cli.main import main
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -33,6 +40,52 @@ def test_help_teaches_and_documents_exit_codes():
         assert words in said.stdout
     assert "\n    python -m plumbline run --family chain --level state\n" in plumbline("run", "--help").stdout
     assert "\\b" not in said.stdout
+
+
+def test_no_arguments_print_the_help():
+    result = CliRunner().invoke(main, [])
+    assert result.exit_code == 0
+    assert result.stdout == CliRunner().invoke(main, ["--help"]).stdout
+
+
+def test_every_command_has_a_short_help_that_the_list_shows_whole():
+    listed = CliRunner().invoke(main, []).stdout
+    for name, command in main.commands.items():
+        assert command.short_help and re.search(rf"^  {name} +{re.escape(command.short_help)}$", listed, re.M)
+
+
+def test_the_version_is_that_of_the_project():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert package.__version__ == project["version"]
+    assert CliRunner().invoke(main, ["--version"]).stdout == f"plumbline {project['version']}\n"
+
+
+def test_the_launcher_runs_this_checkout_from_another_folder(tmp_path):
+    launcher, elsewhere = tmp_path / "plumbline", tmp_path / "elsewhere"
+    subprocess.run(
+        ["make", "--silent", "--old-file=.venv/pyvenv.cfg", f"LAUNCHER={launcher}", launcher],
+        cwd=ROOT,
+        check=True,
+    )
+    (elsewhere / "plumbline").mkdir(parents=True)  # a package of that name there must not be taken
+    (elsewhere / "plumbline" / "__init__.py").write_text("raise SystemExit('the wrong package')")
+    scenario = elsewhere / "a b.yaml"
+    scenario.write_text((ROOT / "scenarios" / "single" / "rest.yaml").read_text())
+    result = subprocess.run([launcher, "check", "a b.yaml"], cwd=elsewhere, capture_output=True, text=True)
+    assert (result.returncode, result.stdout) == (0, "a b.yaml: ok: a b, 1 body (ball)\n"), result.stderr
+
+
+def test_numbers_agree_with_their_nouns():
+    assert count_noun(1, "disagreement") == "1 disagreement"
+    assert count_noun(0, "disagreement") == "0 disagreements"
+    assert count_noun(2, "body", "bodies") == "2 bodies"
+
+
+def test_a_column_names_an_engines_version_once():
+    assert engine_heading("mujoco@3.12.0", "3.12.0") == "mujoco 3.12.0"
+    assert engine_heading("mujoco@latest", "3.12.0") == "mujoco@latest 3.12.0"
+    assert engine_heading("mujoco", "3.8.0") == "mujoco 3.8.0"
+    assert engine_heading("mujoco", "") == "mujoco"
 
 
 def test_list_scenarios_and_engines_as_text_and_json():
@@ -61,7 +114,7 @@ def test_a_run_writes_everything_and_exits_by_its_verdict(tmp_path):
     assert (tmp_path / "o o" / "report.html").exists()
 
 
-def test_json_is_alone_on_stdout_and_accept_is_shown_beside(tmp_path):
+def test_stdout_holds_json_alone_with_the_users_tolerance(tmp_path):
     said = plumbline(
         "run",
         "rest",
@@ -70,7 +123,7 @@ def test_json_is_alone_on_stdout_and_accept_is_shown_beside(tmp_path):
         "--level",
         "state",
         "--json",
-        "--accept",
+        "--user-rtol",
         "1e-6",
         "--out",
         tmp_path,
@@ -112,17 +165,21 @@ def test_a_name_stays_text_on_the_terminal_in_html_and_in_junit(tmp_path):
         (["run", "--family", "singel"], "did you mean 'single'"),
         (["run", "--level", "all of them"], "level"),
         (["run", "--jobs", "0"], "jobs"),
-        (["run", "--accept", "-1"], "accept"),
-        (["rnu"], "Did you mean 'run'"),
+        (["run", "--user-rtol", "-1"], "user-rtol"),
+        (["rnu"], "did you mean 'run'"),
         (["check"], "FILE"),
         (["report", "nowhere"], "no results here"),
         (["check", "nowhere.yaml"], "nowhere.yaml"),
+        (["nightly", "--extra-refinement", "1"], "Did you mean '--extra-refinements'"),
+        (["history", "nowhere"], "`python -m plumbline nightly` makes one"),
+        (["run", "--family", "dubble"], "did you mean 'double'?"),
+        (["run", "dubble"], "did you mean `--family double`?"),
     ],
 )
 def test_bad_usage_ends_with_2_and_a_suggestion(words, expected):
-    said = plumbline(*words)
-    assert said.returncode == 2, said.stdout + said.stderr
-    assert expected in said.stderr
+    result = CliRunner().invoke(main, words)
+    assert result.exit_code == 2, result.output
+    assert expected in " ".join(result.stderr.split())
 
 
 def test_an_output_folder_that_cannot_be_written_is_said_before_any_work(tmp_path):

@@ -263,10 +263,10 @@ def test_commands_are_quoted_for_a_shell() -> None:
     assert shlex.split(payload.rerun_command(row, {"file": ""}))[-2:] == ["--", "--out"]
     assert "'my own.yaml'" in payload.rerun_command(row, {"file": "my own.yaml"})
     row |= {"scenario": "rest", "quantity": "energy_drift_long", "extra": {"asked": 100.0}}
-    nightly = "python -m plumbline nightly rest --engine mujoco --random 0 --no-instrument"
+    nightly = "python -m plumbline nightly rest --engine mujoco --random 0 --no-self-test"
     assert payload.rerun_command(row, {"file": ""}) == nightly
     row["extra"] = {"asked": 12.5}
-    assert payload.rerun_command(row, {"file": ""}) == f"{nightly} --endurance 12.5"
+    assert payload.rerun_command(row, {"file": ""}) == f"{nightly} --long-run-seconds 12.5"
 
 
 def test_numbers_read_as_people_write_them() -> None:

@@ -185,7 +185,7 @@ def test_the_command_says_so_and_goes_on(tmp_path):
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (120_000, 120_000)),
     )  # fmt: skip
     assert limited.returncode == 4, limited.stderr
-    assert "stopped by the machine" in limited.stderr and "the same command goes on" in limited.stderr
+    assert "I/O error" in limited.stderr and "run the same command to resume" in limited.stderr
     assert not (tmp_path / "report.html").exists()
     kept = len(list(tmp_path.glob("cells/*.cell")))
     assert kept == 2

@@ -1,0 +1,108 @@
+"""Commands about stored results: history, report, reproduce."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+import reports
+from plumbline.cli.console import count_noun, make_console, print_table
+from plumbline.cli.options import DEFAULT_OUT, FolderPath, ensure_writable, examples, json_option
+from plumbline.storage.results_store import read_results
+
+
+@click.command(
+    short_help="Compare stored nights.",
+    epilog=examples("history nightly", 'history nightly --key "double-*/mujoco/state/*"'),
+)
+@click.argument("folder", default="nightly", type=FolderPath())
+@click.option("--key", "pattern", default=None, help="Trend of the rows whose key matches (* and ?).")
+@json_option
+def history(folder: Path, pattern: str | None, as_json: bool) -> None:
+    """Print verdict counts, first bad nights and changes since the last green one of the nights in FOLDER."""
+    from plumbline.storage.history import History
+
+    if not folder.is_dir():
+        raise click.UsageError(f"no folder {folder}: no nights yet; `python -m plumbline nightly` makes one")
+    document = History(folder).to_document(pattern)
+    if as_json:
+        click.echo(json.dumps(document, ensure_ascii=False, indent=1))
+        return
+    trend = document.get("trend", [])
+    print_table(document["nights"], "nights")
+    print_table(trend, "trend")
+    lines = list(_history_lines(document))
+    if not document["nights"]:
+        lines.append(f"no nights in {folder}; `python -m plumbline nightly` makes one")
+    elif pattern is not None and not trend:
+        lines.append(f"no row matches {pattern!r}")
+    out = make_console(sys.stdout)
+    for line in lines or ["nothing is bad, nothing changed"]:
+        out.print(line, markup=False)
+
+
+def _history_lines(document: dict[str, Any]) -> list[str]:
+    lines = [f"damaged, left out: {sentence}" for sentence in document["damaged"]]
+    lines += [f"version: {sentence}" for sentence in document["versions"]]
+    for bad in document["first_bad"]:
+        good = f"last good {bad['last_good']}" if bad["last_good"] else "never good"
+        lines.append(f"{bad['key']} {bad['verdict']} since {bad['first_bad']} ({good}): {bad['reason']}")
+    since = f"since the last green {document['last_green']}"
+    return lines + [f"{since}: {c['key']} {c['was']} → {c['is']}" for c in document["since_green"]]
+
+
+@click.command(short_help="Write the report of stored results again.")
+@click.argument("folder", default=DEFAULT_OUT, type=FolderPath())
+@click.option(
+    "--history",
+    "history_folder",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    default=None,
+    help="Folder of earlier nights: adds trends and the comparison with the last green one.",
+)
+def report(folder: Path, history_folder: Path | None) -> None:
+    """Write report.html, junit.xml and summary.md again, from the results stored in FOLDER."""
+    try:
+        read_results(folder)
+    except ValueError as error:
+        raise click.UsageError(str(error)) from None
+    click.echo(f"report: {reports.write(ensure_writable(folder), history_folder)}")
+
+
+@click.command(
+    short_help="Write a stand-alone script of a disagreement.",
+    epilog=examples(
+        "reproduce reports/out",
+        "reproduce reports/out chain-50-balls/pinocchio-aba/state/-/acceleration",
+    ),
+)
+@click.argument("result", type=click.Path(path_type=Path, exists=True))
+@click.argument("keys", nargs=-1, metavar="[KEY]...")
+def reproduce(result: Path, keys: tuple[str, ...]) -> None:
+    """Write a stand-alone script that shows a disagreement, for the engine's maintainers.
+
+    RESULT is a results folder or its results.json; KEY is a row's key. Without KEY, the disagreements are
+    listed.
+    """
+    from plumbline.reproduce import write as scripts
+
+    folder = result if result.is_dir() else result.parent
+    try:
+        if not keys:
+            rows = scripts.disputed(read_results(folder))
+            for row in rows:
+                click.echo(f"{row['key']}: {row['diagnosis'] or row['reason']}")
+            click.echo(count_noun(len(rows), "disagreement") if rows else "nothing disagrees", err=True)
+            return
+        names = scripts.write(folder, keys)
+    except ValueError as error:
+        raise click.UsageError(str(error)) from None
+    for key, name in names.items():
+        path = folder / "scripts" / name
+        if not path.is_file():
+            raise click.ClickException(f"{key}: {name}")
+        click.echo(str(path))

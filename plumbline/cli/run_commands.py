@@ -1,0 +1,195 @@
+"""Commands that run scenarios on engines and judge the results: run, nightly."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+
+import reports
+from plumbline.cli.console import ProgressDisplay, print_result
+from plumbline.cli.options import (
+    DEFAULT_OUT,
+    EXIT_CODES,
+    MIN_USER_RTOL,
+    FiniteNumber,
+    choose_scenarios,
+    engines_option,
+    ensure_writable,
+    examples,
+    exit_on_io_error,
+    jobs_option,
+    json_option,
+    limits_options,
+    names_argument,
+    out_option,
+    scheduler_option,
+)
+from plumbline.engines.registry import ENGINES
+from plumbline.execution.result_cache import DiskResultCache
+from plumbline.execution.runner import Plan, RunResult, run_plan, save
+from plumbline.processes.workers import Limits
+from plumbline.storage.results_store import row_record, to_json_value
+
+
+@click.command(
+    short_help="Compare scenarios on engines.",
+    epilog=examples(
+        "run                                    (everything)",
+        "run double-tumbling-balls --engine mujoco",
+        "run --family chain --level state",
+        "run my-pendulum.yaml --out results --json | jq .sentence",
+    )
+    + EXIT_CODES,
+)
+@names_argument
+@click.option("--family", "families", multiple=True, help="Only scenarios of this family (may be repeated).")
+@engines_option
+@click.option(
+    "--level",
+    type=click.Choice(["state", "trajectory", "all"]),
+    default="all",
+    show_default=True,
+    help="state: accelerations, reactions and energies at 51 states. trajectory: observed orders, limits and "
+    "invariants. all: both, and the metamorphic relations.",
+)
+@jobs_option
+@scheduler_option
+@out_option(DEFAULT_OUT)
+@json_option
+@click.option(
+    "--user-rtol",
+    type=FiniteNumber(MIN_USER_RTOL, 1.0),
+    default=None,
+    help="A relative tolerance of your own; results and report show it beside each derived verdict, which it "
+    "does not change.",
+)
+@limits_options(300.0)
+def run(
+    names: tuple[str, ...], families: tuple[str, ...], engines: list[str], level: Any, jobs: int,
+    scheduler: str | None, out: Path, as_json: bool, user_rtol: float | None, limits: Limits,
+) -> None:  # fmt: skip
+    """Compare scenarios (names of the catalogue, or paths of YAML files; default: all) on all engines."""
+    chosen = choose_scenarios(names, families)
+    folder = ensure_writable(out)
+    cache = DiskResultCache(folder / "cells", _log)
+    plan = Plan(
+        chosen,
+        engines,
+        level,
+        jobs,
+        limits,
+        user_rtol=user_rtol,
+        is_full_catalogue=not names and not families and engines == list(ENGINES) and level == "all",
+        result_cache=cache,
+        scheduler=scheduler,
+    )
+    with exit_on_io_error():
+        with ProgressDisplay(sys.stderr) as progress:
+            result = run_plan(plan, progress)
+        save(result, folder, _command_line())
+        with result.cpu_times.measure("report"):
+            report = reports.write(folder)
+        cache.clear()
+    if as_json:
+        document = {
+            "run": result.metadata,
+            "sentence": result.metadata["sentence"],
+            "rows": [row_record(r) for r in result.rows],
+        }
+        click.echo(json.dumps(to_json_value(document), ensure_ascii=False, indent=1))
+    _finish(result, report, as_json)
+
+
+@click.command(
+    short_help="Run everything unattended and keep the history.",
+    epilog=examples(
+        "nightly                               (everything)",
+        "nightly --random 1000 --seed 7 --out nights",
+        "history nightly",
+    )
+    + EXIT_CODES,
+)
+@names_argument
+@engines_option
+@click.option(
+    "--random",
+    "random_count",
+    type=click.IntRange(0),
+    default=200,
+    show_default=True,
+    help="Number of random scenarios.",
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(0),
+    default=None,
+    help="Seed of the random scenarios. Default: random; printed and stored in results.json.",
+)
+@click.option(
+    "--extra-refinements",
+    type=click.IntRange(0, 4),
+    default=1,
+    show_default=True,
+    help="Halvings of the step beyond those of `run`.",
+)
+@click.option(
+    "--long-run-seconds",
+    type=FiniteNumber(0),
+    default=100.0,
+    show_default=True,
+    help="Simulated seconds of the long runs whose invariants are judged; 0: no long runs.",
+)
+@click.option(
+    "--self-test/--no-self-test",
+    default=True,
+    show_default=True,
+    help="Plant mistakes in an engine and require that the run reports and names them.",
+)
+@jobs_option
+@scheduler_option
+@out_option(Path("nightly"), "; complete nights are in its folder `history`")
+@limits_options(1800.0)
+def nightly(
+    names: tuple[str, ...], engines: list[str], random_count: int, seed: int | None, extra_refinements: int,
+    long_run_seconds: float, self_test: bool, jobs: int, scheduler: str | None, out: Path, limits: Limits,
+) -> None:  # fmt: skip
+    """Run the catalogue with finer steps, long runs, random scenarios and the self-test.
+
+    Runs unattended, keeps the history of earlier nights, and resumes after interruption: give the same
+    command again.
+    """
+    from plumbline.cli.nightly import run_nightly
+    from plumbline.execution.selftest import run_self_test
+
+    chosen = choose_scenarios(names, ())
+    folder = ensure_writable(out)
+    with exit_on_io_error(), ProgressDisplay(sys.stderr) as progress:
+        result, place = run_nightly(
+            folder, chosen, engines, random=random_count, seed=seed, jobs=jobs, limits=limits,
+            whole=not names and engines == list(ENGINES), finer=extra_refinements, progress=progress,
+            endurance=long_run_seconds, scheduler=scheduler, self_test=run_self_test if self_test else None,
+            command=_command_line(), log=_log,
+        )  # fmt: skip
+    _finish(result, place / "report.html", as_json=False)
+
+
+def _command_line() -> str:
+    return shlex.join(["python", "-m", "plumbline", *sys.argv[1:]])
+
+
+def _log(sentence: str) -> None:
+    click.echo(sentence, err=True)
+
+
+def _finish(result: RunResult, report: Path, as_json: bool) -> None:
+    """Print the result for people, unless stdout holds JSON, and exit with the run's code."""
+    if not as_json:
+        print_result(result)
+    click.echo(f"report: {report}", err=as_json)
+    _log(result.cpu_times.summary())
+    sys.exit(result.metadata["exit_code"])

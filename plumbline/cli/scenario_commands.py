@@ -1,0 +1,74 @@
+"""Commands about scenarios and engines: list, check, schema."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from plumbline.cli.console import count_noun, print_table
+from plumbline.cli.options import json_option, read_scenarios
+from plumbline.engines.registry import ENGINES
+from plumbline.execution.runner import describe_engines
+from plumbline.processes.workers import WorkerPool
+from plumbline.scenario import loader as scenarios
+
+JSON_ONLY = ("purpose", "file")  # columns too long for a terminal
+
+
+@click.command("list", short_help="List scenarios or engines.")
+@click.argument("what", type=click.Choice(["scenarios", "engines"]))
+@json_option
+def list_(what: str, as_json: bool) -> None:
+    """List the scenarios of the catalogue, or the engines with their versions and integrators."""
+    records = _scenario_records() if what == "scenarios" else _engine_records()
+    if as_json:
+        click.echo(json.dumps(records, ensure_ascii=False, indent=1))
+    else:
+        print_table({k: v for k, v in record.items() if k not in JSON_ONLY} for record in records)
+
+
+def _scenario_records() -> list[dict[str, Any]]:
+    return [
+        {
+            "name": s.name,
+            "family": s.family,
+            "bodies": s.model.n,
+            "title": s.title,
+            "purpose": s.purpose,
+            "file": str(s.path),
+        }
+        for s in scenarios.load_scenarios(scenarios.catalogue())
+    ]
+
+
+def _engine_records() -> list[dict[str, Any]]:
+    with WorkerPool(1) as workers:
+        found = describe_engines(workers, list(ENGINES))
+    return [
+        {
+            "name": name,
+            "title": info.title,
+            "version": info.version or "not installed",
+            "integrators": [i.name for i in info.integrators],
+        }
+        for name, info in found.items()
+    ]
+
+
+@click.command(short_help="Check scenario files.")
+@click.argument("files", nargs=-1, required=True, metavar="FILE...", type=click.Path(path_type=Path))
+def check(files: tuple[Path, ...]) -> None:
+    """Check scenario files and print every problem of every file, as file:line:column."""
+    for s in read_scenarios(files):
+        joints = ", ".join("rod" if rod else "ball" for rod in s.model.rods[:6])
+        more = " …" if s.model.n > 6 else ""
+        click.echo(f"{s.path}: ok: {s.name}, {count_noun(s.model.n, 'body', 'bodies')} ({joints}{more})")
+
+
+@click.command(short_help="Print the JSON Schema of scenario files.")
+def schema() -> None:
+    """Print the JSON Schema of scenario files, for editors and other programs."""
+    click.echo(json.dumps(scenarios.json_schema(), ensure_ascii=False, indent=1))

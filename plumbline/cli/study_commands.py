@@ -1,0 +1,116 @@
+"""Commands that study one scenario over ranges of parameters or long times: sweep, drift."""
+
+from __future__ import annotations
+
+import collections
+import sys
+from pathlib import Path
+
+import click
+import pyarrow as pa
+
+import reports
+from plumbline.cli.console import ProgressDisplay, count_noun, print_table
+from plumbline.cli.options import (
+    DEFAULT_OUT,
+    EXIT_CODES,
+    FiniteNumber,
+    ensure_writable,
+    examples,
+    exit_on_io_error,
+    jobs_option,
+    names_argument,
+    out_option,
+    read_scenarios,
+)
+from plumbline.scenario.errors import ScenarioError
+
+MAX_LISTED_CELLS = 10
+
+
+@click.command(short_help="Vary a scenario's parameters.", epilog=EXIT_CODES)
+@click.argument("file", metavar="FILE", type=click.Path(path_type=Path))
+@jobs_option
+@out_option(Path("sweep"))
+def sweep(file: Path, jobs: int, out: Path) -> None:
+    """Vary a scenario's parameters over a grid or distributions, as a sweep file says (docs/sweeps.md).
+
+    Writes sweep.parquet, one row per cell and implementation, and its map, sweep.html.
+    """
+    from plumbline.studies import sweep as sweeps
+    from reports import sweep_page
+
+    try:
+        spec, cells = sweeps.load(file)
+    except ScenarioError as error:
+        click.echo(str(error), err=True)
+        sys.exit(2)
+    folder = ensure_writable(out)
+    with exit_on_io_error():
+        table = sweeps.run(spec, cells, jobs)
+        path = sweeps.write(table, folder)
+        page = sweep_page.write(folder)
+    _print_sweep(table, len(cells))
+    click.echo(f"results: {path}")
+    click.echo(f"map: {page}")
+    verdicts = set(table["verdict"].to_pylist()) - {"agrees", "not installed"}
+    sys.exit(3 if "failed" in verdicts else 1 if verdicts else 0)
+
+
+def _print_sweep(table: pa.Table, cell_count: int) -> None:
+    """Print how often each implementation got each verdict, and the first cells that do not agree."""
+    rows = table.to_pylist()
+    counts = collections.Counter((row["implementation"], row["verdict"]) for row in rows)
+    shown = "; ".join(f"{name} {verdict} {count}" for (name, verdict), count in sorted(counts.items()))
+    click.echo(f"{count_noun(cell_count, 'cell')}: {shown}")
+    disagreeing = [row for row in rows if row["verdict"] not in ("agrees", "not installed")]
+    for row in disagreeing[:MAX_LISTED_CELLS]:
+        click.echo(f"cell {row['cell']}, {row['implementation']}: {row['verdict']}: {row['reason']}")
+
+
+@click.command(
+    short_help="Measure constraint and energy drift over long times.",
+    epilog=examples("drift", "drift double-tumbling-rods --max-cpu-seconds 30 --out results"),
+)
+@names_argument
+@click.option(
+    "--rtol",
+    "rtols",
+    type=FiniteNumber(1e-14, 1e-2),
+    multiple=True,
+    default=(1e-6, 1e-9, 1e-12),
+    show_default=True,
+    help="Relative tolerance of the integration (may be repeated).",
+)
+@click.option(
+    "--max-cpu-seconds",
+    type=FiniteNumber(0, min_open=True),
+    default=120.0,
+    show_default=True,
+    help="CPU seconds that one run may take; later times are left out where they would cost more.",
+)
+@out_option(DEFAULT_OUT)
+def drift(names: tuple[str, ...], rtols: tuple[float, ...], max_cpu_seconds: float, out: Path) -> None:
+    """Measure the drift of raw, Baumgarte and projected runs in 10, 100, 1000 s (default: two scenarios).
+
+    Writes drift.parquet, and report.html again where OUT holds results: the report shows the table.
+    """
+    from plumbline.studies import drift as drifts
+
+    chosen = read_scenarios(names or ("tumbling-ball", "tumbling-rod"))
+    folder = ensure_writable(out)
+    with exit_on_io_error():
+        with ProgressDisplay(sys.stderr) as progress:
+            table = drifts.measure_drift(
+                chosen,
+                max_cpu_seconds,
+                rtols=rtols,
+                progress=progress,
+                log=lambda sentence: click.echo(sentence, err=True),
+            )
+        path = drifts.write(table, folder)
+        print_table(table.to_pylist())
+        click.echo(f"results: {path}")
+        if (folder / "results.json").is_file():
+            click.echo(f"report: {reports.write(folder)}")
+    sys.exit(3 if any(reason.startswith("failed") for reason in table["reason"].to_pylist()) else 0)
