@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import os
 import sys
 import tempfile
@@ -22,9 +23,9 @@ from plumbline.scenario.yaml_source import read_yaml
 from plumbline.truth.closed_form import ClosedFormMismatch, closed_form_motion
 
 DEFAULT_OUT = Path("reports") / "out"
-MIN_TIMEOUT = 1e-300
-MIN_MEMORY = 1e-300
-MIN_USER_RTOL = 1e-300
+MIN_TIMEOUT = 1.0  # s; starting an engine takes longer than less
+MIN_MEMORY = 1.0  # GB of address space; a worker with NumPy, SciPy and one engine does not start with less
+MIN_USER_RTOL = 1e-16  # below the rounding of a double no two results agree
 EXIT_CODES = """
 \b
 Exit codes:
@@ -42,7 +43,24 @@ _Decorator = Callable[[_Command], _Command]
 
 
 class FiniteNumber(click.FloatRange):
-    """A number in a range."""
+    """A number in a range; unlike click's own type, NaN and infinity are refused."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Parse a number and check that it is finite and in the range.
+
+        Args:
+            value: the text of the command line, or a default.
+            param: the option, for the message.
+            ctx: the command's context, for the message.
+
+        Returns:
+            The number.
+
+        """
+        number = float(super().convert(value, param, ctx))
+        if not math.isfinite(number):
+            self.fail(f"{value} is not a finite number.", param, ctx)
+        return number
 
 
 class FolderPath(click.Path):
