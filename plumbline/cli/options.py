@@ -69,6 +69,22 @@ class FolderPath(click.Path):
     def __init__(self) -> None:
         super().__init__(path_type=Path)
 
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Parse the path of a folder.
+
+        Args:
+            value: the text of the command line, or a default.
+            param: the option or argument, for the message.
+            ctx: the command's context, for the message.
+
+        Returns:
+            The path.
+
+        """
+        if not os.fspath(value):
+            self.fail("the path is empty; the current folder is written as a dot.", param, ctx)
+        return super().convert(value, param, ctx)
+
 
 def examples(*lines: str) -> str:
     """Format example commands for the end of a help text.

@@ -179,6 +179,8 @@ def test_a_name_stays_text_on_the_terminal_in_html_and_in_junit(tmp_path):
         (["run", "--user-rtol", "1e-300"], "1e-300 is not in the range"),
         (["nightly", "--long-run-seconds", "inf"], "inf is not a finite number"),
         (["nightly", "--extra-refinement", "1"], "Did you mean '--extra-refinements'"),
+        (["run", "--out", ""], "the path is empty"),
+        (["report", ""], "the path is empty"),
         (["history", "nowhere"], "`python -m plumbline nightly` makes one"),
         (["run", "--family", "dubble"], "did you mean 'double'?"),
         (["run", "dubble"], "did you mean `--family double`?"),
