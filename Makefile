@@ -4,6 +4,7 @@
 UV_VERSION := 0.13.9
 UV := $(shell command -v uv 2>/dev/null || echo .uv/bin/uv)
 PYTHON := .venv/bin/python
+LAUNCHER := .venv/bin/plumbline
 # The locks name exact versions and hashes and no address, so any index or mirror serves them.
 INSTALL = $(UV) pip install --quiet --require-hashes --python $(PYTHON)
 export UV_PYTHON_DOWNLOADS := never
@@ -44,7 +45,13 @@ mutants: .venv/mutation.done  ## do the tests notice mistakes? a sample; MUTANTS
 .venv/pyvenv.cfg: | $(filter .uv/bin/uv,$(UV))
 	$(UV) venv --quiet --allow-existing .venv
 
-.venv/main.done: locks/main.lock | .venv/pyvenv.cfg
+# `plumbline` runs this checkout's package from any folder; -P keeps the current folder off the module path.
+$(LAUNCHER): Makefile | .venv/pyvenv.cfg
+	@printf '%s\n' '#!/bin/sh' 'PYTHONPATH="$(CURDIR)$${PYTHONPATH:+:$$PYTHONPATH}" \' \
+		'exec "$(CURDIR)/$(PYTHON)" -P -m plumbline "$$@"' > $@
+	@chmod +x $@
+
+.venv/main.done: locks/main.lock | .venv/pyvenv.cfg $(LAUNCHER)
 	$(INSTALL) -r locks/main.lock
 	@touch $@
 
@@ -53,7 +60,7 @@ mutants: .venv/mutation.done  ## do the tests notice mistakes? a sample; MUTANTS
 	-$(INSTALL) -r locks/truth.lock
 	@touch $@
 
-.venv/test.done: locks/test.lock | .venv/pyvenv.cfg
+.venv/test.done: locks/test.lock | .venv/pyvenv.cfg $(LAUNCHER)
 	$(INSTALL) -r locks/test.lock
 	@touch $@ .venv/main.done .venv/truth.tried
 
