@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from plumbline.cli.main import nightly
+from plumbline.cli import nightly
 from plumbline.cli.nightly import NightPlan
 from plumbline.execution.random_batch import RandomBatch
 from plumbline.execution.runner import RunResult
@@ -58,7 +58,7 @@ def run(out, **more):
     chosen = loader.load_scenarios(["rest"])
     options = {"random": 3, "seed": 11, "jobs": 1, "limits": Limits(), "whole": False, "finer": 0} | more
     progress = options.pop("progress", quiet)
-    return nightly.nightly(
+    return nightly.run_nightly(
         out, chosen, ["mujoco"], command="-", progress=progress, log=quiet, **options
     )  # fmt: skip
 
@@ -141,7 +141,7 @@ def test_what_someone_should_see_is_kept_whole_with_its_file(tmp_path):
     )
     excused = replace(kept[-1], known_issue="k")
     assert probes.add_scenario([excused]) == [], "a recorded gap of every probe is only counted"
-    nightly.write_files_of_random(
+    nightly.write_random_scenario_files(
         RunResult(kept, [], {}, {}, probes, ResultTables(), CpuTimes(), {}), drawn, tmp_path
     )
     found = sorted(tmp_path.iterdir())

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from plumbline.cli.main import nightly
+from plumbline.cli import nightly
 from plumbline.execution import selftest
 from plumbline.execution.selftest import SelfTestResult
 from plumbline.processes.workers import Limits
@@ -60,7 +60,7 @@ def test_a_night_with_a_dull_instrument_is_not_green(tmp_path, trouble):
         report.write_text("<testsuite/>")
         return SelfTestResult({"planted": 67, "reported": 67}, trouble)
 
-    _, place = nightly.nightly(
+    _, place = nightly.run_nightly(
         tmp_path, loader.load_scenarios(["rest"]), ["mujoco"], random_count=0, seed=1, jobs=1, limits=Limits(),
         is_full_catalogue=False, command="-", level="state", self_test=said, progress=lambda *_: None,
         log=lambda _: None,
@@ -75,7 +75,7 @@ def test_a_night_killed_as_it_was_done_is_not_had_twice(tmp_path, monkeypatch):
     pytest.importorskip("mujoco")
 
     def night():
-        return nightly.nightly(
+        return nightly.run_nightly(
             tmp_path, loader.load_scenarios(["rest"]), ["mujoco"], random_count=0, seed=None, jobs=1, limits=Limits(),
             is_full_catalogue=False, command="-", level="state", progress=lambda *_: None, log=lambda _: None,
         )  # fmt: skip

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import psutil
 
-from plumbline.cli.main import nightly
+from plumbline.cli import nightly
 from plumbline.engines import registry
 from plumbline.processes import workers
 from plumbline.processes.workers import Limits
@@ -20,7 +20,7 @@ LIMITS = Limits(seconds=10, gigabytes=4)
 
 def night(out, engines):
     (s,) = loader.load_scenarios(["planar-small"])
-    return nightly.nightly(
+    return nightly.run_nightly(
         out, [replace(s, duration=0.5)], engines, random_count=0, seed=1, jobs=2, limits=LIMITS, is_full_catalogue=False,
         command="-", extra_refinements=0, level="trajectory", progress=lambda *_: None, log=lambda _: None,
     )  # fmt: skip

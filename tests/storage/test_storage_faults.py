@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from plumbline.cli.main import nightly
+from plumbline.cli import nightly
 from plumbline.execution import runner
 from plumbline.execution.runner import Plan
 from plumbline.processes import workers
@@ -122,7 +122,7 @@ def disk(monkeypatch):
 
 def night(out):
     chosen = loader.load_scenarios(["rest"])
-    result, place = nightly.nightly(
+    result, place = nightly.run_nightly(
         out, chosen, ["mujoco"], random_count=0, seed=1, jobs=1, limits=Limits(), is_full_catalogue=False, command="-", extra_refinements=0,
         level="state", progress=lambda *_: None, log=lambda _: None,
     )  # fmt: skip
