@@ -1,11 +1,12 @@
-"""Earlier runs: every folder of HISTORY with a results.json; a damaged one is named and skipped."""
+"""Earlier runs for the report: the nights of the stored history that were completed before this run."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from reports.results import Record, Results
+from plumbline.storage import history
+from reports.results import Record, Results, replace_unprintable
 from reports.verdicts import needs_attention
 
 MAX_NIGHTS = 90  # nights that the trend page shows
@@ -13,41 +14,40 @@ MAX_NIGHTS = 90  # nights that the trend page shows
 
 @dataclass(frozen=True)
 class EarlierRun:
-    """One earlier run: its ``run`` record and its rows by key."""
+    """One earlier run."""
 
-    run: Record
-    rows: dict[str, Record]
-
-    @property
-    def has_passed(self) -> bool:
-        """Nothing disagreed, failed or was missing without being expected."""
-        return self.run.get("exit_code") == 0
+    run: Record  # its entry ``run`` of results.json
+    rows: dict[str, Record]  # value, tolerance, ratio, verdict and known issue by row key
+    has_passed: bool
 
 
 @dataclass(frozen=True)
 class History:
-    """Earlier runs in the order they started, and what could not be read."""
+    """Earlier runs, oldest first."""
 
     nights: list[EarlierRun] = field(default_factory=list)
-    unreadable: list[str] = field(default_factory=list)
+    unreadable: list[str] = field(default_factory=list)  # names of folders that could not be read
 
     @classmethod
     def load(cls, folder: Path | None, current: Results) -> History:
-        """Read HISTORY/*/results.json except the current run's own; none for a folder of None."""
-        nights, damaged = [], []
-        for path in sorted(folder.glob("*/results.json")) if folder else []:
-            try:
-                stored = Results.load(path.parent)
-                night = EarlierRun(stored.run, {row["key"]: row for row in stored.rows})
-                if not isinstance(stored.run["started"], str):
-                    raise ValueError("started is not a text")
-            except (OSError, ValueError, KeyError, TypeError, AttributeError):
-                damaged.append(path.parent.name)
-                continue
-            if stored.run["id"] != current.run["id"] and stored.run["started"] <= current.run["started"]:
-                nights.append(night)
-        nights.sort(key=lambda night: night.run["started"])
-        return cls(nights[-MAX_NIGHTS:], damaged)
+        """Read the last nights before a run.
+
+        Args:
+            folder: folder of the nights; None for no history.
+            current: the run that is reported.
+
+        Returns:
+            The nights completed before ``current``, which all are where ``current`` is not among them.
+        """
+        if folder is None:
+            return cls()
+        stored = history.History(folder)
+        keys = [row["key"] for row in current.rows]
+        nights = [
+            EarlierRun(replace_unprintable(run.metadata), stored.rows_by_key(index, keys), run.has_passed)
+            for index, run in stored.before(current.run["id"])[-MAX_NIGHTS:]
+        ]
+        return cls(nights, list(stored.damaged))
 
     @property
     def last_passed(self) -> EarlierRun | None:
@@ -55,7 +55,14 @@ class History:
         return next((night for night in reversed(self.nights) if night.has_passed), None)
 
     def is_new(self, row: Record) -> bool:
-        """Does not agree, and did not say so in the last green run (or is new and unexpected)."""
+        """Whether a row's disagreement was not in the last run that passed.
+
+        Args:
+            row: a row of the current run.
+
+        Returns:
+            True where the verdict differs from that run's, or is unexpected and the key is new.
+        """
         green = self.last_passed
         if green is None or row["verdict"] == "agrees":
             return False

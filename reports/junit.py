@@ -30,7 +30,7 @@ def write(results: Results) -> Path:
             if outcome:
                 counted[outcome] += 1
         suite.attrib |= {k: str(v) for k, v in counted.items()}
-        suite.set("time", f"{sum(row['wall_time'] for row in rows):.3f}")
+        suite.set("time", f"{sum(row['cpu_time'] for row in rows):.3f}")
         totals = {k: v + counted[k] for k, v in totals.items()}
     suites.attrib |= {k: str(v) for k, v in totals.items()}
     path = results.folder / "junit.xml"
@@ -51,7 +51,7 @@ def _add_test_case(suite: ET.Element, row: Record) -> str | None:
         "testcase",
         classname=f"{row['scenario']}.{row['engine']}.{row['level']}",
         name=what,
-        time=f"{row['wall_time']:.3f}",
+        time=f"{row['cpu_time']:.3f}",
     )
     message = f"{row['verdict']}: {row['reason']}"
     if needs_attention(row):
@@ -59,7 +59,7 @@ def _add_test_case(suite: ET.Element, row: Record) -> str | None:
         ET.SubElement(case, kind, message=message, type=row["verdict"]).text = _failure_text(row)
         return "errors" if kind == "error" else "failures"
     if row["verdict"] != "agrees":
-        recorded = f"recorded as {row['known']}; " if row.get("known") else ""
+        recorded = f"recorded as {row['known_issue']}; " if row.get("known_issue") else ""
         ET.SubElement(case, "skipped", message=recorded + message)
         return "skipped"
     return None

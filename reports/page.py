@@ -166,7 +166,7 @@ def _matrix_by_family(results: Results) -> dict[str, Any]:
                     "mark": VERDICT_STYLES[speaker["verdict"]],
                     "ratio": error_ratio(speaker),
                     "count": len(rows),
-                    "known": sum(r.get("known") is not None for r in rows),
+                    "known": sum(r.get("known_issue") is not None for r in rows),
                     "link": cell_link(name, engine),
                     "track": ratio_position(error_ratio(speaker)),
                 }
@@ -209,11 +209,11 @@ def _known_findings(rows: list[Record]) -> list[Record]:
     """Recorded discrepancies and gaps by entry of known.yaml: how many rows, and one of them as example."""
     found: dict[str, Record] = {}
     for row in rows:
-        if row.get("known"):
+        if row.get("known_issue"):
             entry = found.setdefault(
-                row["known"],
+                row["known_issue"],
                 {
-                    "id": row["known"],
+                    "id": row["known_issue"],
                     "row": row,
                     "count": 0,
                     "engines": {},
@@ -250,11 +250,11 @@ def _changes_since_last_passed(results: Results, history: History) -> Record | N
 
 def _random_scenario_summary(results: Results) -> Record | None:
     """What the random scenarios came to: how many, and the worst error over bound by quantity and engine."""
-    said = results.run["probes"]
+    said = results.run["random_batch"]
     if not said:
         return None
     worst: dict[str, dict[str, Record]] = {}
-    for cell in said["worst"]:
+    for cell in said["worst_ratios"]:
         worst.setdefault(cell["quantity"], {})[cell["engine"]] = cell
     return {"scenarios": said["scenarios"], "worst": worst}
 

@@ -36,14 +36,14 @@ _DETAIL_FIELDS = (
     "value",
     "tolerance",
     "uncertainty",
-    "horizon",
+    "compared_until",
     "order",
     "declared_order",
     "alias_of",
-    "known",
+    "known_issue",
     "diagnosis",
-    "accept",
-    "wall_time",
+    "user_rtol",
+    "cpu_time",
     "derivation",
     "extra",
     "engine_version",
@@ -126,7 +126,15 @@ def scenario_chunk(name: str, results: Results, tables: ScenarioTables, points: 
     for place in results.row_indices[name]:
         row = results.rows[place]
         detail: Record = {k: row.get(k) for k in _DETAIL_FIELDS if row.get(k) not in (None, "", {})}
-        for field in ("value", "tolerance", "uncertainty", "horizon", "order", "accept", "wall_time"):
+        for field in (
+            "value",
+            "tolerance",
+            "uncertainty",
+            "compared_until",
+            "order",
+            "user_rtol",
+            "cpu_time",
+        ):
             if field in detail:
                 detail[field] = json_number(detail[field])
         if "extra" in detail:

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 
+from plumbline.storage.results_store import read_results
+
 Record = dict[str, Any]
 Columns = dict[str, np.ndarray]
 
@@ -24,7 +26,7 @@ _UNPRINTABLE = re.compile(
 
 # What a run of one level only, or of another program, may leave out.
 _RUN_DEFAULTS: Record = {
-    "probes": {},
+    "random_batch": {},
     "truth": "",
     "machine": {},
     "commit": None,
@@ -66,8 +68,8 @@ class Results:
 
     @classmethod
     def load(cls, folder: Path) -> Results:
-        """Read OUT/results.json; raises OSError or ValueError where it is missing or not JSON."""
-        stored = replace_unprintable(json.loads((folder / "results.json").read_text(encoding="utf-8")))
+        """Read OUT/results.json, of any schema version; raises ValueError where it is missing or damaged."""
+        stored = replace_unprintable(read_results(folder))
         scenarios = {name: _SCENARIO_DEFAULTS | about for name, about in stored["scenarios"].items()}
         return cls(folder, _RUN_DEFAULTS | stored["run"], scenarios, stored["engines"], stored["rows"])
 

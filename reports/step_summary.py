@@ -107,10 +107,10 @@ def _verdict_table(results: Results) -> list[str]:
 
 def _random_scenario_summary(results: Results) -> list[str]:
     """A line on the random scenarios: how many, and the worst error over its bound of those that agree."""
-    said = results.run["probes"]
+    said = results.run["random_batch"]
     if not said:
         return []
-    worst = max(said["worst"], key=lambda cell: cell["ratio"], default=None)
+    worst = max(said["worst_ratios"], key=lambda cell: cell["ratio"], default=None)
     text = f"{said['scenarios']} random scenarios at state level"
     if worst:
         text += (

@@ -34,7 +34,7 @@ VERDICT_STYLES = {
 
 def severity(row: Record) -> int:
     """9 (failed) … 1 (not installed); from 6 on it was not expected and needs attention."""
-    return rows.severity(row["verdict"], row.get("known"))
+    return rows.severity(row["verdict"], row.get("known_issue"))
 
 
 def needs_attention(row: Record) -> bool:
@@ -44,18 +44,15 @@ def needs_attention(row: Record) -> bool:
 
 def error_ratio(row: Record) -> float | None:
     """Error over tolerance, as judged; None where the row has none."""
-    if "ratio" in row:
-        ratio = row["ratio"]
-    else:  # stored before rows had a ratio of their own
-        ratio = (row.get("extra") or {}).get("ratio")
-        if ratio is None:
-            ratio = rows.error_ratio(row.get("value"), row.get("tolerance"))
+    ratio = row["ratio"]
     return None if ratio is None or not math.isfinite(ratio) else float(ratio)
 
 
 def worst_row(candidates: Iterable[Record]) -> Record:
     """The row that speaks for a cell: the most severe, among those the largest error over tolerance."""
-    return max(candidates, key=lambda row: rows.cell_rank(row["verdict"], row.get("known"), error_ratio(row)))
+    return max(
+        candidates, key=lambda row: rows.cell_rank(row["verdict"], row.get("known_issue"), error_ratio(row))
+    )
 
 
 def count_verdicts(records: Iterable[Record]) -> Counter[str]:
@@ -65,7 +62,7 @@ def count_verdicts(records: Iterable[Record]) -> Counter[str]:
 
 def count_all_verdicts(results: Results) -> Counter[str]:
     """Number of a run's rows by verdict, those of random scenarios that are only counted among them."""
-    return count_verdicts(results.rows) + Counter(results.run["probes"].get("folded", {}))
+    return count_verdicts(results.rows) + Counter(results.run["random_batch"].get("counts_by_verdict", {}))
 
 
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

@@ -10,7 +10,6 @@ Killed at any moment, the same command reads the plan and goes on; a folder in h
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import json
 import os
@@ -28,7 +27,8 @@ from plumbline.execution.selftest import SelfTestResult
 from plumbline.processes.workers import Limits
 from plumbline.scenario import loader as scenarios
 from plumbline.scenario.generator import RANDOM_FAMILY, RandomScenarios
-from plumbline.storage.results_store import read_results, write_atomically
+from plumbline.storage.history import next_night_number, stored_runs
+from plumbline.storage.results_store import write_atomically
 
 EXTRA_REFINEMENTS = 1  # halvings beyond the quick ladders
 
@@ -116,9 +116,9 @@ def run_nightly(
     shutil.rmtree(folder, ignore_errors=True)
     if self_test is not None:
         folder.mkdir()
-        answer = self_test(folder / "instrument.xml")
+        answer = self_test(folder / "self_test.xml")
         result.metadata |= {
-            "instrument": answer.counts,
+            "self_test": answer.counts,
             "sentence": f"{result.metadata['sentence']}; {answer.summary}",
         }
         if answer.failure:
@@ -137,25 +137,11 @@ def is_already_recorded(night: NightPlan, history: Path) -> bool:
     """Whether that very night is complete already."""
     if not (history.parent / "unfinished" / "cells").is_dir():
         return False
-    for path in history.glob("*/results.json"):
-        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # damaged: `history` names it
-            run = read_results(path.parent)["run"]
-            if (run["started"], run["seed"], run["random"]) == (
-                night.started,
-                night.seed,
-                night.random_count,
-            ):
-                return True
-    return False
-
-
-def next_night_number(history: Path) -> int:
-    """The number of a new night: they are told in this order, whatever the clock says."""
-    highest = 0
-    for path in history.glob("*/results.json"):
-        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # damaged: `history` names it
-            highest = max(highest, int(read_results(path.parent)["run"]["night"]))
-    return highest + 1
+    wanted = night.started, night.seed, night.random_count
+    return any(
+        tuple(run.metadata.get(name) for name in ("started", "seed", "random")) == wanted
+        for run in stored_runs(history)
+    )
 
 
 def unused_path(place: Path) -> Path:

@@ -41,8 +41,8 @@ class RandomBatch:
         """As results.json holds it."""
         return {
             "scenarios": self.scenario_count,
-            "folded": dict(self.counts_by_verdict),
-            "worst": [
+            "counts_by_verdict": dict(self.counts_by_verdict),
+            "worst_ratios": [
                 {"engine": engine, "quantity": quantity, "ratio": ratio, "scenario": scenario}
                 for (engine, quantity), (ratio, scenario) in self.worst_ratios.items()
             ],

@@ -174,10 +174,10 @@ def run_plan(plan: Plan, progress: ProgressCallback) -> RunResult:
         "states": plan.random_state_count + 1,
         "sentence": summarize_verdicts(result),
         "exit_code": exit_code(result),
-        "stale": [entry.id for entry in result.stale_entries],
+        "stale_issues": [entry.id for entry in result.stale_entries],
     }
     if len(plan.random_scenarios):
-        result.metadata["probes"] = probes.summary()
+        result.metadata["random_batch"] = probes.summary()
     return result
 
 

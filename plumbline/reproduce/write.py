@@ -75,9 +75,9 @@ def write(
             why = f"the state-level script of this engine and scenario shows it; {ASK}"
             told |= {row["key"]: why for row in its}
             continue
-        cost = its[0].get("wall_time", 0.0) if cell[2] in ("trajectory", "invariants") else 0.0
+        cost = its[0].get("cpu_time", 0.0) if cell[2] in ("trajectory", "invariants") else 0.0
         if long(its[0]):  # the first tries are as short as that
-            cost *= min(MIN_WINDOW_SECONDS / its[0]["horizon"], 1.0)
+            cost *= min(MIN_WINDOW_SECONDS / its[0]["compared_until"], 1.0)
         if keys is None and cost > UNASKED / TRIES:
             why = f"one try takes {cost:.1f} s of computing, too long at the end of a run; {ASK}"
             told |= {row["key"]: why for row in its}
@@ -161,7 +161,7 @@ def asked(document: dict[str, Any], rows: list[dict[str, Any]], seconds: float) 
         raise NotReproducible(f"the results do not hold the scenario {row['scenario']!r}")
     model = Model(**{name: np.array(value, float) for name, value in about["model"].items()})
     if long(row):
-        case = Case(model, start(model, about), max(rows, key=ratio)["horizon"])
+        case = Case(model, start(model, about), max(rows, key=ratio)["compared_until"])
     elif row["level"] in ("trajectory", "invariants"):
         case = runs_of(document, rows, model, start(model, about))
     elif row["integrator"] != "-":
@@ -192,7 +192,7 @@ def runs_of(document: dict[str, Any], rows: list[dict[str, Any]], model: Model, 
     every = [row for row in document["rows"] if all(row[k] == cell[k] for k in cell) and of_ladder(row)]
     finest = min((row["extra"]["resolution"] for row in every if "resolution" in row["extra"]), default=None)
     declared = next((row["declared_order"] for row in every if row["declared_order"]), None)
-    until = max(row["horizon"] for row in rows)
+    until = max(row["compared_until"] for row in rows)
     if finest is None:
         raise NotReproducible("the ladder of steps behind this row is not in the results")
     if declared is None:  # an adaptive integrator: tolerances from a million times the tightest
@@ -211,8 +211,7 @@ def of_ladder(row: dict[str, Any]) -> bool:
 
 def ratio(row: dict[str, Any]) -> float:
     """By how much a row disagrees, in tolerances."""
-    found = row.get("ratio") or row["extra"].get("ratio") or (row["value"] or 0.0) / (row["tolerance"] or 1.0)
-    return float(found)
+    return float(row["ratio"] or 0.0)
 
 
 def file_name(key: str) -> str:

@@ -1,13 +1,16 @@
-"""What the nights say together: DuckDB over the summary tables of a folder of complete runs.
+"""The history of runs: DuckDB over the summary tables of a folder of complete runs.
 
-A night is a folder with results.json and summary.parquet (`plumbline.cli.nightly` makes them; so does every
-`run`).  A row is bad where it does not agree and no known entry expects that.  Random scenarios are new
-every night, so only their counts are compared.
+A night is a folder with results.json and summary.parquet, which `plumbline nightly` and every `plumbline run`
+write.  A row is bad where it does not agree and no known issue expects that.  Random scenarios are new every
+night, so only their counts are compared.  The command `history` and the report both read this history.
 """
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import json
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,116 +18,173 @@ from typing import Any
 import duckdb
 
 from plumbline.scenario.generator import RANDOM_FAMILY
-from plumbline.storage.results_store import read_results
+from plumbline.storage.results_store import Record, read_results, read_table
 
-UNEXPECTED_VERDICT_SQL = "verdict <> 'agrees' AND known IS NULL"
-Record = dict[str, Any]
+UNEXPECTED_VERDICT_SQL = "verdict <> 'agrees' AND known_issue IS NULL"
+_ROW_COLUMNS = {
+    "key": "VARCHAR", "scenario": "VARCHAR", "family": "VARCHAR", "engine": "VARCHAR", "level": "VARCHAR",
+    "quantity": "VARCHAR", "unit": "VARCHAR", "value": "DOUBLE", "tolerance": "DOUBLE", "ratio": "DOUBLE",
+    "verdict": "VARCHAR", "known_issue": "VARCHAR", "reason": "VARCHAR",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class StoredRun:
-    """One complete run."""
+    """One complete run of a history."""
 
-    id: str
-    started: str  # ISO 8601
-    exit_code: int
-    sentence: str
-    versions: dict[str, str]
     folder: Path
-    number: int = 0  # a night's, in the order in which they were made; 0 of other runs
+    metadata: Record  # the entry ``run`` of results.json
+
+    @property
+    def id(self) -> str:
+        """Identifier of the run."""
+        return str(self.metadata["id"])
+
+    @property
+    def has_passed(self) -> bool:
+        """Whether the run ended with exit code 0."""
+        return bool(self.metadata["exit_code"] == 0)
+
+    @property
+    def order(self) -> tuple[int, str]:
+        """Sort key: the night's number, which the clock does not change; only runs without one go by time."""
+        return int(self.metadata.get("night", 0)), str(self.metadata["started"])
 
 
 class History:
-    """The nights of a folder, oldest first, and questions about them."""
+    """The nights of a folder, oldest first, and queries over them.
+
+    Attributes:
+        nights: the readable runs, in the order in which they were completed.
+        damaged: reason by folder name of each run that was left out.
+    """
 
     def __init__(self, folder: Path) -> None:
-        """Read HISTORY/*/; of OUT, its folder ``history``. ``damaged`` says of each night left out why."""
+        """Read a history.
+
+        Args:
+            folder: folder of runs, or a nightly's output folder, whose runs are in ``history``.
+        """
         inside = folder / "history"
         self.nights: list[StoredRun] = []
-        self.damaged: list[str] = []
-        self.database = duckdb.connect()
+        self.damaged: dict[str, str] = {}
+        self._database = duckdb.connect()
         for path in sorted((inside if inside.is_dir() else folder).glob("*/results.json")):
             try:
-                self.nights.append(self._read_run(path.parent))
-            except (OSError, ValueError, KeyError, TypeError, duckdb.Error) as error:
-                self.damaged.append(f"{path.parent.name}: {' '.join(str(error).split())}")
-        self.nights.sort(key=lambda night: (night.number, night.started))
+                self.nights.append(_read_complete_run(path.parent))
+            except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+                self.damaged[path.parent.name] = " ".join(str(error).split())
+        self.nights.sort(key=lambda night: night.order)
         self._load_tables()
 
-    def _read_run(self, folder: Path) -> StoredRun:
-        document = read_results(folder)
-        run = document["run"]
-        night = StoredRun(
-            str(run["id"]), str(run["started"]), int(run["exit_code"]), str(run["sentence"]),
-            {str(k): str(v) for k, v in run["versions"].items()}, folder, int(run.get("night", 0)),
-        )  # fmt: skip
-        table = str(folder / "summary.parquet")
-        (stored,) = self._query_one("SELECT count(key) + 0 * count(verdict) FROM read_parquet(?)", [table])
-        told = len(document["rows"]) + sum(run.get("probes", {}).get("folded", {}).values())
-        if stored != told:
-            raise ValueError(f"summary.parquet has {stored} rows, results.json tells of {told}")
-        return night
+    def before(self, run_id: str) -> list[tuple[int, StoredRun]]:
+        """List the nights before a run; all of them where the run is not in this history.
+
+        Args:
+            run_id: identifier of the run.
+
+        Returns:
+            Index in ``nights`` and run, oldest first.
+        """
+        ids = [night.id for night in self.nights]
+        end = ids.index(run_id) if run_id in ids else len(ids)
+        return list(enumerate(self.nights[:end]))
+
+    def rows_by_key(self, night: int, keys: Sequence[str]) -> dict[str, Record]:
+        """Look rows of one night up.
+
+        Args:
+            night: index in ``nights``.
+            keys: keys of the wanted rows.
+
+        Returns:
+            Value, tolerance, ratio, verdict and known issue by key, of the keys that the night has.
+        """
+        found = self.query(
+            "SELECT key, value, tolerance, ratio, verdict, known_issue FROM rows"
+            " WHERE night = ? AND key IN (SELECT unnest(?::VARCHAR[]))",
+            [night, list(keys)],
+        )
+        return {row["key"]: row for row in found}
 
     def _load_tables(self) -> None:
-        self.database.execute(
+        self._database.execute(
             "CREATE TABLE nights (night INTEGER, id VARCHAR, started VARCHAR, exit_code INTEGER)"
         )
-        columns = (
-            "key, scenario, family, engine, level, quantity, unit, value, tolerance, verdict, known, reason"
-        )
-        self.database.execute(
-            "CREATE TABLE rows (night INTEGER, key VARCHAR, scenario VARCHAR, family VARCHAR, engine VARCHAR,"
-            " level VARCHAR, quantity VARCHAR, unit VARCHAR, value DOUBLE, tolerance DOUBLE, verdict VARCHAR,"
-            " known VARCHAR, reason VARCHAR)"
-        )
+        columns = ", ".join(f"{name} {kind}" for name, kind in _ROW_COLUMNS.items())
+        self._database.execute(f"CREATE TABLE rows (night INTEGER, {columns})")
         for index, night in enumerate(self.nights):
-            self.database.execute(
-                "INSERT INTO nights VALUES (?, ?, ?, ?)", [index, night.id, night.started, night.exit_code]
+            about = night.metadata
+            self._database.execute(
+                "INSERT INTO nights VALUES (?, ?, ?, ?)",
+                [index, night.id, about["started"], about["exit_code"]],
             )
-            table = str(night.folder / "summary.parquet")
-            self.database.execute(
-                f"INSERT INTO rows SELECT ?, {columns} FROM read_parquet(?)", [index, table]
-            )
-
-    def _query_one(self, query: str, parameters: list[Any]) -> tuple[Any, ...]:
-        found = self.database.execute(query, parameters).fetchone()
-        assert found is not None
-        return tuple(found)
+            self._database.register("summary", read_table(night.folder, "summary"))
+            self._database.execute(f"INSERT INTO rows SELECT {index}, {', '.join(_ROW_COLUMNS)} FROM summary")
+            self._database.unregister("summary")
 
     def query(self, query: str, parameters: list[Any] | None = None) -> list[Record]:
-        """Rows of a query over the tables ``nights`` and ``rows``, as records."""
-        answer = self.database.execute(query, parameters or [])
+        """Run a query over the tables ``nights`` and ``rows``.
+
+        Args:
+            query: SQL of DuckDB.
+            parameters: values of the question marks in the query.
+
+        Returns:
+            One record per row of the answer.
+        """
+        answer = self._database.execute(query, parameters or [])
         names = [column[0] for column in answer.description or ()]
         return [dict(zip(names, row, strict=True)) for row in answer.fetchall()]
 
     def overview(self) -> list[Record]:
-        """One record per night: counts of verdicts, of what nothing expects, and how it ended."""
+        """Count the rows of every night.
+
+        Returns:
+            One record per night: its id, start and exit code, the number of rows, of those that agree
+            (``agree``), are unexpectedly bad (``bad``), or are as a known issue expects (``as_recorded``), and
+            the number of random scenarios.
+        """
         return self.query(
             f"""
             SELECT id, started, exit_code, count(key) AS rows,
                    count(*) FILTER (verdict = 'agrees') AS agree,
                    count(*) FILTER ({UNEXPECTED_VERDICT_SQL}) AS bad,
-                   count(*) FILTER (known IS NOT NULL) AS as_recorded,
+                   count(*) FILTER (known_issue IS NOT NULL) AS as_recorded,
                    count(DISTINCT scenario) FILTER (family = '{RANDOM_FAMILY}') AS random
             FROM nights LEFT JOIN rows USING (night) GROUP BY night, id, started, exit_code ORDER BY night
             """
         )
 
     def trend(self, pattern: str) -> list[Record]:
-        """Value, tolerance and verdict of every row whose key matches ``pattern`` (* and ?), by night."""
+        """Follow rows over the nights.
+
+        Args:
+            pattern: pattern of row keys, with * and ?.
+
+        Returns:
+            One record per key and night: value, tolerance, unit, ratio and verdict.
+        """
         return self.query(
             """
-            SELECT key, id, started, value, tolerance, unit, value / nullif(tolerance, 0) AS ratio, verdict
+            SELECT key, id, started, value, tolerance, unit, ratio, verdict
             FROM rows JOIN nights USING (night) WHERE key GLOB ? ORDER BY key, night
             """,
             [pattern],
         )
 
     def first_bad(self) -> list[Record]:
-        """Every key that was bad in the last night: its first bad night since it was last good."""
+        """Find since when the rows that are bad in the last night are bad.
+
+        Returns:
+            One record per key: verdict, reason, the id of the first bad night since the last good one
+            (``first_bad``) and of that good one (``last_good``, None where there is none).
+        """
         return self.query(
             f"""
-            WITH known_keys AS (SELECT *, ({UNEXPECTED_VERDICT_SQL}) AS bad FROM rows WHERE family <> '{RANDOM_FAMILY}'),
+            WITH known_keys AS (
+                     SELECT *, ({UNEXPECTED_VERDICT_SQL}) AS bad FROM rows WHERE family <> '{RANDOM_FAMILY}'
+                 ),
                  good AS (SELECT key, max(night) AS last_good FROM known_keys WHERE NOT bad GROUP BY key),
                  streak AS (
                      SELECT key, min(night) AS first, any_value(last_good) AS last_good
@@ -139,7 +199,12 @@ class History:
         )
 
     def changes_since_green(self) -> tuple[str | None, list[Record]]:
-        """The id of the last green night before the last one, and every key whose verdict is another now."""
+        """Compare the last night with the last night before it that passed.
+
+        Returns:
+            The id of the night that passed (None where there is none), and one record per key whose verdict
+            differs: both verdicts (``was``, ``is``), both values, and the reason now.
+        """
         green = self.query(
             "SELECT night, id FROM nights WHERE exit_code = 0 AND night < (SELECT max(night) FROM nights)"
             " ORDER BY night DESC LIMIT 1"
@@ -163,21 +228,32 @@ class History:
         return green[0]["id"], changes
 
     def version_changes(self) -> list[str]:
-        """A sentence for every change of an engine's version from one night to the next."""
+        """List the changes of the engines' versions from one night to the next.
+
+        Returns:
+            One sentence per change.
+        """
         found = []
-        for before, now in zip(self.nights, self.nights[1:], strict=False):
-            for engine, version in now.versions.items():
-                old = before.versions.get(engine)
+        for before, now in itertools.pairwise(self.nights):
+            for engine, version in now.metadata["versions"].items():
+                old = before.metadata["versions"].get(engine)
                 if old not in (None, version):
                     found.append(f"{now.id}: {engine} {old} → {version}")
         return found
 
     def to_document(self, pattern: str | None = None) -> Record:
-        """Everything as plain data."""
+        """Collect everything that the command `history` reports.
+
+        Args:
+            pattern: pattern of row keys to follow over the nights; None for no trend.
+
+        Returns:
+            Plain data that JSON can hold.
+        """
         green, changes = self.changes_since_green()
         document: Record = {
             "nights": self.overview(),
-            "damaged": self.damaged,
+            "damaged": [f"{name}: {reason}" for name, reason in self.damaged.items()],
             "versions": self.version_changes(),
             "first_bad": self.first_bad(),
             "last_green": green,
@@ -186,3 +262,44 @@ class History:
         if pattern is not None:
             document["trend"] = self.trend(pattern)
         return json.loads(json.dumps(document, default=str))  # type: ignore[no-any-return]
+
+
+def stored_runs(folder: Path) -> Iterator[StoredRun]:
+    """Read the runs of a folder whose results.json is readable.
+
+    Args:
+        folder: the folder of runs.
+
+    Yields:
+        One run at a time, in the order of the folders' names.
+    """
+    for path in sorted(folder.glob("*/results.json")):
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+            yield StoredRun(path.parent, read_results(path.parent)["run"])
+
+
+def next_night_number(folder: Path) -> int:
+    """Return the number of a new night: nights are ordered by it, whatever the clock shows.
+
+    Args:
+        folder: the folder of complete nights.
+
+    Returns:
+        One more than the highest number there.
+    """
+    return 1 + max((int(run.metadata.get("night", 0)) for run in stored_runs(folder)), default=0)
+
+
+def _read_complete_run(folder: Path) -> StoredRun:
+    """Read a run's metadata; raises ValueError or OSError where results.json or the summary is damaged."""
+    document = read_results(folder)
+    run = StoredRun(folder, document["run"])
+    if not isinstance(run.metadata["started"], str) or not isinstance(run.metadata["exit_code"], int):
+        raise ValueError("the start or the exit code of the run is not in results.json")
+    run.metadata["versions"].items()
+    table = read_table(folder, "summary")
+    expected = len(document["rows"])
+    expected += sum(run.metadata.get("random_batch", {}).get("counts_by_verdict", {}).values())
+    if len(table) != expected:
+        raise ValueError(f"summary.parquet has {len(table)} rows, results.json expects {expected}")
+    return run

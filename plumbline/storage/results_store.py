@@ -21,15 +21,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from plumbline.judging.rows import Columns, Row
+from plumbline.storage.upgrade import upgrade_document, upgrade_summary
 
-SCHEMA_VERSION = 1
-# Fields of Row by their names in stored results.
-STORED_NAMES = {
-    "compared_until": "horizon",
-    "known_issue": "known",
-    "user_rtol": "accept",
-    "cpu_time": "wall_time",
-}
+Record = dict[str, Any]
+SCHEMA_VERSION = 2
+READABLE_VERSIONS = (1, 2)
 TEXT = pa.string()
 REAL = pa.float64()
 INTEGER = pa.int32()
@@ -49,8 +45,8 @@ TABLES: dict[str, pa.Schema] = {
     "summary": _schema(
         key=TEXT, scenario=TEXT, family=TEXT, engine=TEXT, engine_version=TEXT, level=TEXT, integrator=TEXT,
         quantity=TEXT, unit=TEXT, value=REAL, tolerance=REAL, verdict=TEXT, reason=TEXT, ratio=REAL, derivation=TEXT,
-        uncertainty=REAL, horizon=REAL, order=REAL, declared_order=INTEGER, alias_of=TEXT, known=TEXT,
-        diagnosis=TEXT, accept=REAL, wall_time=REAL, extra=TEXT,
+        uncertainty=REAL, compared_until=REAL, order=REAL, declared_order=INTEGER, alias_of=TEXT,
+        known_issue=TEXT, diagnosis=TEXT, user_rtol=REAL, cpu_time=REAL, extra=TEXT,
     ),
     "states": _schema(**_CELL_COLUMNS, quantity=TEXT, state=INTEGER, body=INTEGER, error=REAL, bound=REAL, scale=REAL),
     "convergence": _schema(**_RUN_COLUMNS, quantity=TEXT, error=REAL, cost=REAL, steps=INTEGER, order=REAL),
@@ -93,7 +89,7 @@ def to_json_value(value: Any) -> Any:
 
 def row_record(row: Row) -> dict[str, Any]:
     """A row as results.json holds it."""
-    return {"key": row.key, **to_json_value({STORED_NAMES.get(k, k): v for k, v in vars(row).items()})}
+    return {"key": row.key, **to_json_value(vars(row))}
 
 
 class ResultTables:
@@ -128,8 +124,7 @@ class ResultTables:
         kept = list(rows)
         if kept:
             columns: Columns = {
-                STORED_NAMES.get(name, name): [getattr(row, name) for row in kept]
-                for name in ("key", *vars(kept[0]))
+                name: [getattr(row, name) for row in kept] for name in ("key", *vars(kept[0]))
             }
             for field in TABLES["summary"]:
                 if field.type == REAL:
@@ -162,10 +157,22 @@ class ResultTables:
             write_atomically(folder / f"{name}.parquet", sink.getvalue().to_pybytes())
 
 
-def read_table(folder: Path, name: str) -> list[dict[str, Any]]:
-    """The records of one table."""
-    records: list[dict[str, Any]] = pq.read_table(folder / f"{name}.parquet").to_pylist()
-    return records
+def read_table(folder: Path, name: str) -> pa.Table:
+    """Read one table of a run.
+
+    Args:
+        folder: output folder of the run.
+        name: a key of `TABLES`.
+
+    Returns:
+        The table; a summary with the names of the present schema version.
+
+    Raises:
+        OSError: the file is missing.
+        ValueError: the file is damaged (`pyarrow.ArrowInvalid`).
+    """
+    table = pq.read_table(folder / f"{name}.parquet")
+    return upgrade_summary(table) if name == "summary" else table
 
 
 def write_results(
@@ -203,6 +210,6 @@ def read_results(folder: Path) -> dict[str, Any]:
         ) from None
     except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
         raise ValueError(f"{path}: not a results file of plumbline ({error})") from None
-    if found != SCHEMA_VERSION:
+    if found not in READABLE_VERSIONS:
         raise ValueError(f"{path}: schema_version {found}, this version reads {SCHEMA_VERSION}")
-    return document
+    return upgrade_document(document)

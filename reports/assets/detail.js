@@ -146,7 +146,7 @@ function compared(index, data, ours, fields) {
           const button = h("button", { type: "button", class: "row", "aria-pressed": "false", title: index.reasons[i], click: () => choose(i, true) },
             h("span", { class: `g ${slug}`, "aria-hidden": "true" }, index.glyphs[rows.verdict[i]]), h("span", { class: "vh" }, index.verdicts[rows.verdict[i]] + ", "),
             h("span", { class: "q" }, row.value === undefined || row.value === null ? index.verdicts[rows.verdict[i]] : number(row.value)),
-            row.known ? h("sup", {}, "†") : null,
+            row.known_issue ? h("sup", {}, "†") : null,
             row.tolerance === undefined || row.tolerance === null ? null : h("span", { class: "why" }, `of ${number(row.tolerance)}`),
             Number.isNaN(ratio) ? null : track(ratio));
           buttons.set(i, button);
@@ -189,13 +189,13 @@ function derivation(row) {
   say("Tolerance", row.tolerance === undefined ? null : `${number(row.tolerance, 4)} ${unitOf(row.unit)}${row.derivation ? ": " + row.derivation : ""}`);
   say("Measured", row.value === undefined ? null : `${number(row.value, 4)} ${unitOf(row.unit)}`);
   say("Uncertainty", row.uncertainty === undefined ? null : `${number(row.uncertainty, 3)} ${unitOf(row.unit)}, of the truth and of the limit together`);
-  say("Horizon", row.horizon === undefined ? null : `${number(row.horizon, 3)} s, up to which positions were compared`);
+  say("Horizon", row.compared_until === undefined ? null : `${number(row.compared_until, 3)} s, up to which positions were compared`);
   say("Order", row.order === undefined ? null : `observed ${number(row.order, 4)}${row.declared_order ? `, declared ${row.declared_order}` : ""}`);
   say("Alias", row.alias_of ? `equals ${row.alias_of} here, so it is not independent evidence` : null);
-  say("Recorded as", row.known);
-  say("Asked for", row.accept === undefined ? null : `${number(row.accept)} ${unitOf(row.unit)}: the error is ${(row.value ?? Infinity) <= row.accept ? "within" : "above"} the tolerance given on the command line; the verdict does not depend on it`);
+  say("Recorded as", row.known_issue);
+  say("Asked for", row.user_rtol === undefined ? null : `${number(row.user_rtol)} ${unitOf(row.unit)}: the error is ${(row.value ?? Infinity) <= row.user_rtol ? "within" : "above"} the tolerance given on the command line; the verdict does not depend on it`);
   for (const [name, value] of Object.entries(row.extra ?? {})) say(name.replaceAll("_", " "), number(value, 4));
-  say("Work", row.wall_time === undefined ? null : `${number(row.wall_time)} s`);
+  say("Work", row.cpu_time === undefined ? null : `${number(row.cpu_time)} s`);
   return list;
 }
 

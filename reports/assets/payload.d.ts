@@ -12,9 +12,9 @@ export interface Index {
 }
 
 export interface RowDetail {
-  unit?: string; value?: number | null; tolerance?: number | null; uncertainty?: number | null; horizon?: number | null;
-  order?: number | null; declared_order?: number; alias_of?: string; known?: string; diagnosis?: string; accept?: number;
-  wall_time?: number; derivation?: string; extra?: Record<string, number | null>; script?: string; engine_version?: string;
+  unit?: string; value?: number | null; tolerance?: number | null; uncertainty?: number | null; compared_until?: number | null;
+  order?: number | null; declared_order?: number; alias_of?: string; known_issue?: string; diagnosis?: string; user_rtol?: number;
+  cpu_time?: number; derivation?: string; extra?: Record<string, number | null>; script?: string; engine_version?: string;
 }
 
 export interface CurveSet {

@@ -107,7 +107,7 @@ def test_a_run_writes_everything_and_exits_by_its_verdict(tmp_path):
     assert {"results.json", "summary.parquet", "states.parquet", "report.html", "junit.xml"} <= files
     document = json.loads((tmp_path / "o o" / "results.json").read_text())
     assert document["schema_version"] == 1
-    assert {row["verdict"] for row in document["rows"] if row["known"] is None} == {"agrees"}
+    assert {row["verdict"] for row in document["rows"] if row["known_issue"] is None} == {"agrees"}
     (tmp_path / "o o" / "report.html").unlink()
     again = plumbline("report", tmp_path / "o o")
     assert again.returncode == 0, again.stderr
@@ -129,7 +129,7 @@ def test_stdout_holds_json_alone_with_the_users_tolerance(tmp_path):
         tmp_path,
     )
     document = json.loads(said.stdout)
-    assert {row["accept"] for row in document["rows"]} == {1e-6}
+    assert {row["user_rtol"] for row in document["rows"]} == {1e-6}
     assert document["run"]["exit_code"] == said.returncode == 0
 
 

@@ -75,12 +75,12 @@ def test_a_night_is_whole_and_remembered(tmp_path):
     assert not [r for r in result.rows if r.family == RANDOM_FAMILY], "what agrees is folded"
     folded, random = (
         result.random_batch.counts_by_verdict,
-        [r for r in read_table(place, "summary") if r["family"] == RANDOM_FAMILY],
+        [r for r in read_table(place, "summary").to_pylist() if r["family"] == RANDOM_FAMILY],
     )
     assert {r["scenario"] for r in random} == {f"random-11-{k}" for k in range(3)}
     assert all(r["level"] == "state" for r in random) and folded.total() == len(random)
-    assert stored["probes"]["scenarios"] == 3 and len(stored["probes"]["worst"]) == 7
-    assert max(cell["ratio"] for cell in stored["probes"]["worst"]) == max(
+    assert stored["random_batch"]["scenarios"] == 3 and len(stored["random_batch"]["worst_ratios"]) == 7
+    assert max(cell["ratio"] for cell in stored["random_batch"]["worst_ratios"]) == max(
         r["ratio"] for r in random if r["verdict"] == "agrees"
     )
     assert f"{len(result.rows) + folded.total()} agree" in stored["sentence"]

@@ -53,7 +53,7 @@ def accused(result):
 
 def worst(result):
     """The largest error over its bound, per engine, of rows only counted and of rows kept."""
-    counted = [(cell["engine"], cell["ratio"]) for cell in result.metadata["probes"]["worst"]]
+    counted = [(cell["engine"], cell["ratio"]) for cell in result.metadata["random_batch"]["worst_ratios"]]
     kept = [(row.engine, row.ratio) for row in result.rows if row.ratio is not None]
     return {engine: max(ratio for who, ratio in counted + kept if who == engine) for engine in ENGINES}
 

@@ -24,7 +24,7 @@ from plumbline.processes.workers import Outcome, Task
 from plumbline.scenario import loader
 
 ROOT = Path(__file__).resolve().parents[2]
-TIMES = {"wall_time", "cost"}  # what may differ between two runs
+TIMES = {"cpu_time", "cost"}  # what may differ between two runs
 QUICK = ["rest", "tumbling-ball"]
 
 
@@ -40,7 +40,7 @@ def command(out, *more):
 def results(out):
     """Everything that a run says, without its times."""
     document = json.loads((out / "results.json").read_text())
-    run = {k: document["run"][k] for k in ("sentence", "exit_code", "versions", "truth", "stale")}
+    run = {k: document["run"][k] for k in ("sentence", "exit_code", "versions", "truth", "stale_issues")}
     rows = [{k: v for k, v in row.items() if k not in TIMES} for row in document["rows"]]
     tables = {}
     for path in sorted(out.glob("*.parquet")):

@@ -66,9 +66,9 @@ def test_a_night_with_a_dull_instrument_is_not_green(tmp_path, trouble):
         log=lambda _: None,
     )  # fmt: skip
     run = json.loads((place / "results.json").read_text())["run"]
-    assert run["exit_code"] == bool(trouble) and run["instrument"]["planted"] == 67
+    assert run["exit_code"] == bool(trouble) and run["self_test"]["planted"] == 67
     assert ("67 planted" in run["sentence"]) == (not trouble) and trouble in run["sentence"]
-    assert (place / "instrument.xml").is_file()
+    assert (place / "self_test.xml").is_file()
 
 
 def test_a_night_killed_as_it_was_done_is_not_had_twice(tmp_path, monkeypatch):

@@ -17,6 +17,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from plumbline.judging.rows import error_ratio
+
 G = 9.81
 HOSTILE = "<img src=x onerror=alert(1)>"
 NASTY = "a'\"`${1}&amp;</script><script>alert(2)</script>]]>|*_#-- \x00\x1b\u202e end"
@@ -180,14 +182,15 @@ def build(
                 "reason": "",
                 "derivation": "",
                 "uncertainty": None,
-                "horizon": None,
+                "ratio": None,
+                "compared_until": None,
                 "order": None,
                 "declared_order": None,
                 "alias_of": None,
-                "known": None,
+                "known_issue": None,
                 "diagnosis": None,
-                "accept": None,
-                "wall_time": float(rng.uniform(0.01, 2)),
+                "user_rtol": None,
+                "cpu_time": float(rng.uniform(0.01, 2)),
                 "extra": {},
             }
 
@@ -243,7 +246,7 @@ def build(
             row(
                 quantity="mass_matrix",
                 verdict="unsupported",
-                known="no-mass-matrix",
+                known_issue="no-mass-matrix",
                 reason="this formulation has no joint-space mass matrix",
             )
             if engine == "exudyn" and name == "chain-10":
@@ -326,7 +329,7 @@ def build(
                     "integrator": method,
                     "order": float(np.log2(points[-2] / points[-1])),
                     "declared_order": order,
-                    "horizon": catalogue[name]["horizon"],
+                    "compared_until": catalogue[name]["horizon"],
                     "uncertainty": 4e-13,
                 }
                 limit = min(points) * 1e-3
@@ -347,7 +350,7 @@ def build(
                     value=abs(common["order"] - order),
                     tolerance=0.1,
                     verdict="agrees" if abs(common["order"] - order) < 0.1 else "unresolved",
-                    known=None if abs(common["order"] - order) < 0.1 else "coarse-steps",
+                    known_issue=None if abs(common["order"] - order) < 0.1 else "coarse-steps",
                     reason=f"shows order {common['order']:.2f}, declared {order}",
                     alias_of="Euler" if method == "midpoint" else None,
                 )
@@ -359,17 +362,18 @@ def build(
                     value=float(drift.max()),
                     tolerance=float(drift.max() * 8 + 1e-13),
                     reason="falls with the step as order says",
-                    accept=1e-6,
+                    user_rtol=1e-6,
                 )
     for row_ in rows:
         for field in ("value", "tolerance", "order"):  # as the store writes what JSON cannot say
             if row_[field] is not None and not np.isfinite(row_[field]):
                 row_[field] = None
+        row_["ratio"] = error_ratio(row_["value"], row_["tolerance"])
         row_["key"] = "/".join(row_[k] for k in ("scenario", "engine", "level", "integrator", "quantity"))
     bad = [r for r in rows if r["verdict"] == "disagrees"]
     counts = {v: sum(r["verdict"] == v for r in rows) for v in dict.fromkeys(r["verdict"] for r in rows)}
     results = {
-        "schema_version": 1,
+        "schema_version": 2,
         "run": {
             "id": "20261121-020000-6d61634",
             "started": "2026-11-21T02:00:00+00:00",
@@ -454,6 +458,7 @@ def nights(out: Path, history: Path, count: int = 12) -> Path:
                 row["verdict"] = "agrees"
                 if row["value"] is not None:
                     row["value"] = row["tolerance"] * 0.01
+            row["ratio"] = error_ratio(row["value"], row["tolerance"])
         folder = history / f"2026-11-{20 - count + k + 1:02d}"
         folder.mkdir(parents=True, exist_ok=True)
         (folder / "results.json").write_text(json.dumps(night))

@@ -98,7 +98,7 @@ def test_every_cell_is_in_the_static_matrix_with_glyph_text_and_class(out: Path,
 
 def test_a_cell_speaks_with_its_worst_row() -> None:
     def row(verdict: str, value: float | None, known: str | None = None) -> dict[str, object]:
-        return {"verdict": verdict, "value": value, "tolerance": 1.0, "known": known, "extra": {}}
+        return {"verdict": verdict, "ratio": value, "known_issue": known}
 
     agree, disagree = row("agrees", 0.9), row("disagrees", 2.0)
     gap, known_gap = row("unsupported", None), row("unsupported", None, "gap")
@@ -108,7 +108,7 @@ def test_a_cell_speaks_with_its_worst_row() -> None:
     assert worst_row([row("disagrees", 50.0, "old"), disagree]) is disagree
     assert worst_row([row("failed", None), disagree])["verdict"] == "failed"
     assert needs_attention(gap) and not needs_attention(known_gap)
-    assert error_ratio({"verdict": "agrees", "value": 3.0, "tolerance": 4.0, "extra": {"ratio": 0.2}}) == 0.2
+    assert error_ratio({"verdict": "agrees", "value": 3.0, "tolerance": 4.0, "ratio": 0.2}) == 0.2
 
 
 def test_no_hostile_text_becomes_markup(text: str) -> None:
@@ -298,7 +298,7 @@ def test_a_night_of_thousands_of_scenarios_stays_under_8_megabytes(out: Path, tm
         for row in rows
     ]
     late = stored["rows"][-1]
-    late |= {"verdict": "disagrees", "known": None, "reason": "the needle"}
+    late |= {"verdict": "disagrees", "known_issue": None, "reason": "the needle"}
     (tmp_path / "results.json").write_text(json.dumps(stored))
     began = time.perf_counter()
     text = page.write(Results.load(tmp_path)).read_text()
@@ -355,9 +355,9 @@ def test_a_run_of_the_state_level_alone_has_a_page(out: Path, tmp_path: Path) ->
 def test_gaps_of_one_reason_are_one_finding(out: Path) -> None:
     results = Results.load(out)
     gap = next(row for row in results.rows if row["verdict"] == "unsupported")
-    rows = [{**gap, "known": None, "scenario": f"s{k}"} for k in range(9)]
-    rows += [{**gap, "known": None, "scenario": "s0", "quantity": "energy"}]
-    rows += [{**gap, "known": None, "scenario": "s1", "reason": "another"}]
+    rows = [{**gap, "known_issue": None, "scenario": f"s{k}"} for k in range(9)]
+    rows += [{**gap, "known_issue": None, "scenario": "s0", "quantity": "energy"}]
+    rows += [{**gap, "known_issue": None, "scenario": "s1", "reason": "another"}]
     first, second = page._unexpected_findings(rows)
     assert (len(first["scenarios"]), first["more"]) == (8, 1) and first["row"]["scenario"] not in first[
         "scenarios"

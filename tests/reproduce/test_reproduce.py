@@ -652,7 +652,7 @@ def test_the_command_lists_and_writes(results):
 def test_the_runs_behind_a_row_are_those_of_its_ladder(results):
     document = results_store.read_results(results)
     found = {"scenario": "chain", "engine": "mujoco", "integrator": "RK4", "level": "trajectory",
-             "verdict": "disagrees", "declared_order": 4, "horizon": 1.7, "value": 2.0, "tolerance": 0.1,
+             "verdict": "disagrees", "declared_order": 4, "compared_until": 1.7, "value": 2.0, "tolerance": 0.1, "ratio": 20.0,
              "quantity": "order", "extra": {}}  # fmt: skip
     finest = found | {"quantity": "position", "verdict": "agrees", "extra": {"resolution": 2.0**-8}}
     others = ({"level": "relations"}, {"level": "invariants", "quantity": "energy_drift_long"})
@@ -746,7 +746,7 @@ def test_at_the_end_of_a_run_nothing_long_is_begun(results):
         "level": "trajectory",
         "integrator": "rkmk4",
         "quantity": "attitude",
-        "wall_time": 2.0,
+        "cpu_time": 2.0,
     }
     document["rows"] = [document["rows"][0] | slow]
     (results / "results.json").write_text(json.dumps(document))

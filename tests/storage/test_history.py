@@ -8,17 +8,19 @@ from click.testing import CliRunner
 from plumbline.cli.main import main
 from plumbline.judging.rows import RowContext
 from plumbline.storage import results_store
-from plumbline.storage.history import History
+from plumbline.storage.history import History, next_night_number
+from reports.history import History as ReportHistory
+from reports.results import Results
 
 KEY = "s/mujoco/state/-/acceleration"
 
 
-def night(folder, day, verdicts, version="4.0", known=None, family="single"):
-    """A stored run of one scenario per verdict; scenario "s" first, then "s1", …"""
+def night(folder, day, verdicts, version="4.0", known=None, family="single", number=0):
+    """Store a run of one scenario per verdict: "s", then "s1", …; as a nightly's where it has a number."""
     rows = []
     for k, verdict in enumerate(verdicts):
         who = RowContext(f"s{k or ''}", family, "mujoco", "MuJoCo", version)
-        more = {"value": 10.0**-day, "tolerance": 1.0, "known": known}
+        more = {"value": 10.0**-day, "tolerance": 1.0, "known_issue": known}
         rows.append(who.make_row("state", "-", "acceleration", verdict, f"it {verdict}", "m/s²", **more))
     bad = any(v != "agrees" for v in verdicts) and known is None
     run = {
@@ -28,6 +30,8 @@ def night(folder, day, verdicts, version="4.0", known=None, family="single"):
         "sentence": "",
         "versions": {"mujoco": version},
     }
+    if number:
+        run["night"] = number
     tables = results_store.ResultTables()
     tables.add_rows(rows)
     results_store.write_results(folder / run["id"], run, {}, {}, rows, tables)
@@ -73,6 +77,24 @@ def test_random_scenarios_are_counted_only(tmp_path):
     assert [n["random"] for n in history.overview()] == [2, 1]
 
 
+def test_nights_keep_their_order_when_the_clock_is_set_back(tmp_path):
+    for number, (day, verdict) in enumerate([(5, "agrees"), (6, "agrees"), (1, "disagrees")], 1):
+        night(tmp_path, day, [verdict], number=number)
+    ids = [f"2026010{day}T000000Z" for day in (5, 6, 1)]
+    history = History(tmp_path)
+    assert [n.id for n in history.nights] == ids
+    assert [n["id"] for n in history.overview()] == [t["id"] for t in history.trend(KEY)] == ids
+    assert [(f["first_bad"], f["last_good"]) for f in history.first_bad()] == [(ids[2], ids[1])]
+    assert next_night_number(tmp_path) == 4
+    last = Results.load(tmp_path / ids[2])
+    report = ReportHistory.load(tmp_path, last)
+    assert [n.run["id"] for n in report.nights] == ids[:2], "the report has the same nights before this one"
+    assert report.last_passed.run["id"] == ids[1] and report.is_new(last.rows[0])
+    night(tmp_path / "unfinished", 2, ["disagrees"])  # the next night, before it is moved to the history
+    next_one = Results.load(tmp_path / "unfinished" / "20260102T000000Z")
+    assert [n.run["id"] for n in ReportHistory.load(tmp_path, next_one).nights] == ids
+
+
 def spoil_json(folder):
     (folder / "results.json").write_text("{")
 
@@ -103,7 +125,7 @@ def test_a_damaged_night_is_named_and_left_out(tmp_path, spoil):
     spoil(tmp_path / "20260102T000000Z")
     history = History(tmp_path)
     assert [n.id for n in history.nights] == ["20260101T000000Z", "20260103T000000Z"]
-    assert len(history.damaged) == 1 and history.damaged[0].startswith("20260102T000000Z: ")
+    assert list(history.damaged) == ["20260102T000000Z"] and all(history.damaged.values())
 
 
 def test_an_empty_folder_has_no_nights(tmp_path):

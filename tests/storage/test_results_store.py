@@ -66,8 +66,8 @@ def test_what_is_written_is_read_back(tmp_path):
     assert row["value"] == 1e-15
     assert row["tolerance"] is None, "JSON has no infinity"
     assert row["ratio"] is None and row["extra"] == {"scale": None}
-    assert results_store.read_table(tmp_path / "new", "states") == STATES
-    (summary,) = results_store.read_table(tmp_path / "new", "summary")
+    assert results_store.read_table(tmp_path / "new", "states").to_pylist() == STATES
+    (summary,) = results_store.read_table(tmp_path / "new", "summary").to_pylist()
     assert summary["key"] == row["key"]
 
 
@@ -97,9 +97,9 @@ def test_many_records_take_several_row_groups_and_none_is_lost(tmp_path, monkeyp
             },
         )
     tables.write_parquet(tmp_path)
-    assert [r["error"] for r in results_store.read_table(tmp_path, "states")] == list(range(60))
+    assert [r["error"] for r in results_store.read_table(tmp_path, "states").to_pylist()] == list(range(60))
     assert pq.ParquetFile(tmp_path / "states.parquet").num_row_groups > 2
-    assert results_store.read_table(tmp_path, "curves") == []
+    assert results_store.read_table(tmp_path, "curves").to_pylist() == []
 
 
 def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):

@@ -1,0 +1,86 @@
+"""Results of earlier schema versions, renamed to the present names when they are read."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pyarrow as pa
+
+from plumbline.judging.rows import error_ratio
+
+Record = dict[str, Any]
+
+# Names of schema version 1 and their present names.
+_ROW_NAMES = {
+    "horizon": "compared_until",
+    "known": "known_issue",
+    "accept": "user_rtol",
+    "wall_time": "cpu_time",
+}
+_INTEGRATOR_NAMES = {
+    "powers": "error_exponents",
+    "symmetric": "is_symmetric",
+    "solver": "solver_rtol",
+    "tightest": "min_rtol",
+}
+_RUN_NAMES = {"probes": "random_batch", "instrument": "self_test", "stale": "stale_issues"}
+_RANDOM_BATCH_NAMES = {"folded": "counts_by_verdict", "worst": "worst_ratios"}
+
+
+def upgrade_document(document: Record) -> Record:
+    """Bring the document of a results.json of version 1 or 2 to version 2.
+
+    Args:
+        document: the document as stored.
+
+    Returns:
+        The document with the names of version 2. In version 1 the ratio of a row was in its ``extra``, or
+        followed from its value and tolerance.
+    """
+    if document["schema_version"] != 1:
+        return document
+    run = _rename(document["run"], _RUN_NAMES)
+    if "random_batch" in run:
+        run["random_batch"] = _rename(run["random_batch"], _RANDOM_BATCH_NAMES)
+    engines = {
+        name: engine
+        | {"integrators": [_rename(one, _INTEGRATOR_NAMES) for one in engine.get("integrators", [])]}
+        for name, engine in document["engines"].items()
+    }
+    rows = []
+    for stored in document["rows"]:
+        row = _rename(stored, _ROW_NAMES)
+        row["extra"], row["ratio"] = _split_ratio(row)
+        rows.append(row)
+    return document | {"schema_version": 2, "run": run, "engines": engines, "rows": rows}
+
+
+def upgrade_summary(table: pa.Table) -> pa.Table:
+    """Bring a summary table of version 1 or 2 to version 2.
+
+    Args:
+        table: the content of summary.parquet, all columns.
+
+    Returns:
+        The table with the names of version 2 and the column ``ratio``.
+    """
+    if "ratio" in table.column_names:
+        return table
+    table = table.rename_columns([_ROW_NAMES.get(name, name) for name in table.column_names])
+    records = table.select(["value", "tolerance", "extra"]).to_pylist()
+    split = [_split_ratio(record | {"extra": json.loads(record["extra"])}) for record in records]
+    extra = pa.array([json.dumps(extra) for extra, _ in split], pa.string())
+    table = table.set_column(table.column_names.index("extra"), "extra", extra)
+    return table.append_column("ratio", pa.array([ratio for _, ratio in split], pa.float64()))
+
+
+def _split_ratio(row: Record) -> tuple[Record, float | None]:
+    """The ``extra`` of a row of version 1 without its ratio, and the ratio."""
+    extra = dict(row["extra"])
+    ratio = extra.pop("ratio", None)
+    return extra, error_ratio(row["value"], row["tolerance"]) if ratio is None else ratio
+
+
+def _rename(record: Record, names: dict[str, str]) -> Record:
+    return {names.get(key, key): value for key, value in record.items()}
