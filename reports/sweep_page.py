@@ -25,7 +25,7 @@ MAX_LISTED_ROWS = 60  # rows that do not agree, written out
 SHADE_COUNT = 8
 MAP_COLUMNS = {  # per implementation: column, title
     True: (("uncertainty", "uncertainty, m"), ("reach", "reach of the last body, m")),  # the reference
-    False: (("position_error", "largest distance from the reference, m"),),
+    False: (("position_error", "largest distance from the truth, m"),),
 }
 
 

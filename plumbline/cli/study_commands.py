@@ -38,10 +38,11 @@ def sweep(file: Path, jobs: int, out: Path) -> None:
     Writes sweep.parquet, one row per cell and implementation, and its map, sweep.html.
     """
     from plumbline.studies import sweep as sweeps
+    from plumbline.studies import sweep_file
     from reports import sweep_page
 
     try:
-        spec, cells = sweeps.load(file)
+        spec, cells = sweep_file.load(file)
     except ScenarioError as error:
         click.echo(str(error), err=True)
         sys.exit(2)

@@ -10,7 +10,7 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 
-from plumbline.studies import sweep
+from plumbline.studies import sweep_file
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "fast-reference.md").read_text(encoding="utf-8")
@@ -81,7 +81,7 @@ def test_the_shown_sweep_is_one(tmp_path: Path) -> None:
     shown = re.search(r"```text\n(.*?)```", PAGE, re.DOTALL)
     assert shown
     (tmp_path / "sweep.yaml").write_text(shown[1], encoding="utf-8")
-    spec, cells = sweep.load(tmp_path / "sweep.yaml")
+    spec, cells = sweep_file.load(tmp_path / "sweep.yaml")
     assert len(cells) == 12
     assert all(cell.scenario is not None for cell in cells)
     assert set(spec.engines) == {"mujoco", "exudyn"}

@@ -2,16 +2,28 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.calls import RefinementStudy, run_refinement
+from plumbline.engines.registry import load_adapter
+from plumbline.judging.convergence import refinement_resolutions
+from plumbline.judging.rows import RowContext
+from plumbline.judging.trajectory import judge_trajectory
+from plumbline.scenario import loader as scenarios
 from plumbline.scenario.errors import ScenarioError
-from plumbline.studies import sweep
+from plumbline.studies import sweep, sweep_file
+from plumbline.truth.ground_truth import MotionTruth, motion_truth
+from tests.helpers import pendulums
+from tests.helpers.planted_defects import MOTION_DEFECTS, Defect, plant
 
 FILE = """\
 schema_version: 1
@@ -34,7 +46,7 @@ def write(folder: Path, text: str) -> Path:
 
 
 def test_the_grid_and_the_draws(tmp_path: Path) -> None:
-    spec, cells = sweep.load(write(tmp_path, FILE))
+    spec, cells = sweep_file.load(write(tmp_path, FILE))
     assert len(cells) == 3 * 2 * spec.count
     assert sorted({cell.values["bodies[0].mass"] for cell in cells}) == pytest.approx([0.5, 1.0, 2.0])
     drawn = [cell.values["bodies[1].proximal[0]"] for cell in cells]
@@ -46,15 +58,15 @@ def test_the_grid_and_the_draws(tmp_path: Path) -> None:
         assert cell.scenario.model.proximal[1, 0] == cell.values["bodies[1].proximal[0]"]
         assert cell.scenario.state.omega[1, 2] == cell.values["bodies[1].angular_velocity[2]"]
         assert cell.scenario.duration == 0.25
-    again = sweep.load(write(tmp_path, FILE))[1]
+    again = sweep_file.load(write(tmp_path, FILE))[1]
     assert [cell.values for cell in again] == [cell.values for cell in cells]
-    assert [c.values for c in sweep.load(write(tmp_path, FILE.replace("7", "8")))[1]] != [
+    assert [c.values for c in sweep_file.load(write(tmp_path, FILE.replace("7", "8")))[1]] != [
         c.values for c in cells
     ]
 
 
 def test_a_sweep_runs_and_is_kept(tmp_path: Path) -> None:
-    spec, cells = sweep.load(
+    spec, cells = sweep_file.load(
         write(tmp_path, FILE.replace("points: 3", "points: 2").replace("[-1, 1]", "[1]"))
     )
     table = sweep.run(spec, cells, jobs=1)
@@ -74,46 +86,85 @@ def test_a_sweep_runs_and_is_kept(tmp_path: Path) -> None:
 def test_values_that_make_no_pendulum_are_a_cell_with_a_reason(tmp_path: Path) -> None:
     vary = "vary: {'bodies[0].mass': {values: [-1, 1]}}"
     text = f"schema_version: 1\nscenario: tumbling-rod\n{vary}\nduration: 0.25\n"
-    spec, cells = sweep.load(write(tmp_path, text))
+    spec, cells = sweep_file.load(write(tmp_path, text))
     assert cells[0].scenario is None
     rows = sweep.run(spec, cells).to_pylist()
     assert [row["verdict"] for row in rows] == ["unsupported", "agrees"]
     assert "bodies[0].mass" in rows[0]["reason"]
 
 
-@pytest.mark.parametrize("mistake", [1e-3, 0.0])
-def test_a_mistake_of_the_engine_disagrees(tmp_path: Path, mistake: float) -> None:
-    """An engine whose second mass is off by a thousandth; and one that is right."""
-    spec, cells = sweep.load(write(tmp_path, FILE))
-    cell = cells[0]
-    assert cell.scenario is not None
-    truth: dict[int, sweep.ReferenceMotion] = {}
-    sweep._run_reference_batch([(cell, cell.scenario)], truth)
-    scenario = cell.scenario
-    wrong = replace(scenario, model=replace(scenario.model, mass=scenario.model.mass * [1, 1 + mistake]))
-    found = sweep._run_engine_refinement("mujoco", "RK4", wrong, spec.step)
-    assert isinstance(found, RefinementStudy)
-    row = sweep._judge_cell(cell, "mujoco", "RK4", found, None, truth[cell.index])
-    assert row["verdict"] == ("disagrees" if mistake else "agrees"), row["reason"]
+@cache
+def cell() -> tuple[scenarios.Scenario, MotionTruth]:
+    """A slow tumble whose every mistake shows within two seconds."""
+    (s,) = scenarios.load_scenarios(["double-tumbling-balls"])
+    model = pendulums.model("bb")
+    state = pendulums.state(model, seed=2, rate=0.5)
+    s = replace(s, model=model, state=state, duration=2.0, sample_interval=0.125)
+    return s, motion_truth(model, state, s.times, None)
 
 
-def test_an_engine_too_coarse_to_tell_is_unresolved(tmp_path: Path) -> None:
-    cell = sweep.load(write(tmp_path, FILE))[1][0]
-    assert cell.scenario is not None
-    truth: dict[int, sweep.ReferenceMotion] = {}
-    sweep._run_reference_batch([(cell, cell.scenario)], truth)
-    s = cell.scenario
-    coarse = run_refinement(
-        "mujoco",
-        "Euler",
-        s.model,
-        s.state,
-        s.times,
-        [s.sample_interval, s.sample_interval / 2, s.sample_interval / 4],
-    )
-    assert (
-        sweep._judge_cell(cell, "mujoco", "Euler", coarse, None, truth[cell.index])["verdict"] == "unresolved"
-    )
+def judged_by_run_and_sweep(defect: Defect) -> tuple[set[str], str]:
+    """The verdicts of a run and that of a sweep on one cell, by an engine with a planted defect."""
+    (s, truth), engine = cell(), plant(type(load_adapter(defect.engine)), defect)
+    method = engine.integrator(defect.integrator)
+    info = EngineInfo("mujoco", "MuJoCo", "0", engine.integrators)
+
+    def study(steps: Sequence[float]) -> RefinementStudy:
+        with patch("plumbline.engines.calls.load_adapter", lambda _: engine):
+            return run_refinement("mujoco", method.name, s.model, s.state, s.times, steps)
+
+    run_steps = refinement_resolutions(method, s.model.n, s.duration)
+    who = RowContext(s.name, s.family, "mujoco", "MuJoCo", "0")
+    rows = judge_trajectory(who, s.model, truth, method, study(run_steps)).rows
+    own = sweep._judge_cell(info, method, s, study(sweep._resolutions(method, s, None)), truth)
+    return {row.verdict for row in rows}, own["verdict"]
+
+
+@pytest.mark.parametrize("defect", MOTION_DEFECTS, ids=lambda defect: defect.name)
+def test_a_defect_that_a_run_reports_is_reported_by_a_sweep(defect: Defect) -> None:
+    by_run, by_sweep = judged_by_run_and_sweep(defect)
+    assert by_run != {"agrees"} and by_sweep in by_run - {"agrees"}
+    assert (by_sweep == "disagrees") == ("disagrees" in by_run and "failed" not in by_run)
+
+
+def test_an_engine_without_defect_agrees_in_both() -> None:
+    assert judged_by_run_and_sweep(Defect("clean", "nothing")) == ({"agrees"}, "agrees")
+
+
+def test_an_engine_too_coarse_to_resolve_a_mistake_is_unresolved(tmp_path: Path) -> None:
+    text = FILE.replace("points: 3", "points: 1").replace("[-1, 1]", "[1]").replace("count: 2", "count: 1")
+    text = text.replace("mujoco: RK4", "mujoco: Euler") + "step: 0.03125\n"
+    spec, cells = sweep_file.load(write(tmp_path, text))
+    _, row = sweep.run(spec, cells).to_pylist()
+    assert (row["implementation"], row["integrator"], row["verdict"]) == ("mujoco", "Euler", "unresolved")
+    assert row["position_error"] > 0 and row["finest_error"] > 0 and row["attitude_error"] > 0
+
+
+@pytest.mark.parametrize("interval", [0.03125, 0.05])
+def test_every_step_hits_every_sample(interval: float) -> None:
+    """The steps of a run where the samples allow them; shorter ones where not, or where the file says so."""
+    s = replace(scenarios.load_scenarios(["tumbling-rod"])[0], sample_interval=interval)
+    method = load_adapter("mujoco").integrator("RK4")
+    usual = refinement_resolutions(method, s.model.n, s.duration)
+    steps = sweep._resolutions(method, s, None)
+    assert len(steps) == len(usual) and (steps == usual) == (interval == 0.03125)
+    for found, largest in ((steps, usual[0]), (sweep._resolutions(method, s, 0.002), 0.002)):
+        assert found[0] <= largest < 2 * found[0]
+        assert found == [found[0] / 2**k for k in range(len(found))]
+        assert interval / found[0] == pytest.approx(round(interval / found[0]), rel=1e-12)
+    assert len(sweep._resolutions(method, s, 0.002)) == 4
+
+
+def test_a_missing_engine_and_a_truth_that_fails_are_rows(tmp_path: Path) -> None:
+    text = FILE.replace("points: 3", "points: 1").replace("[-1, 1]", "[1]").replace("count: 2", "count: 1")
+    spec, cells = sweep_file.load(write(tmp_path, text))
+    missing = EngineInfo("mujoco", "MuJoCo", "", (), "mujoco is not installed here: No module")
+    with patch("plumbline.studies.sweep.describe_engine", return_value=missing):
+        _, row = sweep.run(spec, cells).to_pylist()
+    assert (row["verdict"], row["reason"]) == ("not installed", missing.missing)
+    with patch("plumbline.studies.sweep._compute_truths", return_value={0: "crashed"}):
+        _, row = sweep.run(spec, cells).to_pylist()
+    assert (row["verdict"], row["reason"]) == ("failed", "no truth to judge by: crashed")
 
 
 @pytest.mark.parametrize(
@@ -139,4 +190,4 @@ def test_mistakes_in_the_file_are_named_with_their_place(
     tmp_path: Path, change: tuple[str, str], words: str
 ) -> None:
     with pytest.raises(ScenarioError, match=words):
-        sweep.load(write(tmp_path, FILE.replace(*change)))
+        sweep_file.load(write(tmp_path, FILE.replace(*change)))
