@@ -36,7 +36,7 @@ bench: .venv/test.done  ## right-hand sides and work-precision beside the engine
 	$(PYTHON) -m bench.figures
 
 mutants: .venv/mutation.done  ## do the tests notice mistakes? a sample; MUTANTS="--jobs 2" tries all
-	$(PYTHON) -m tools.mutation.mutation reference_impl judging $(MUTANTS)
+	$(PYTHON) -m tools.mutation reference_impl judging $(MUTANTS)
 
 .uv/bin/uv:
 	python3 -m venv .uv

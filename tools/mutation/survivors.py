@@ -1,4 +1,4 @@
-"""The mutants that no test notices, as `survivors.yaml` lists them by file and reason."""
+"""Mutants that no test notices, as `survivors.yaml` lists them by file, function, change and reason."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ from pathlib import Path
 
 from ruamel.yaml import YAML
 
-FILE = Path(__file__).with_suffix(".yaml")
-Key = tuple[str, str, str]  # file, what stands there, what the mutant has
+SURVIVORS_FILE = Path(__file__).with_suffix(".yaml")
+MutantKey = tuple[str, str, str, int]  # file, function, change, occurrence of that change in the function
 
 
-def listed() -> dict[Key, str]:
-    """Each with its reason; ValueError where one is listed twice."""
-    found: dict[Key, str] = {}
-    for entry in YAML(typ="safe").load(FILE) or ():
+def load_survivors() -> dict[MutantKey, str]:
+    """Return the reason for every listed survivor; raise ValueError if one is listed twice."""
+    found: dict[MutantKey, str] = {}
+    for entry in YAML(typ="safe").load(SURVIVORS_FILE) or ():
         for mutant in entry["mutants"]:
-            for now in [mutant["now"]] if isinstance(mutant["now"], str) else mutant["now"]:
-                key = entry["file"], mutant["was"], now
+            for occurrence in mutant["occurrences"]:
+                key = entry["file"], mutant["function"], mutant["change"], occurrence
                 if key in found:
-                    raise ValueError(f"{FILE.name} lists twice: {key}")
-                found[key] = entry["why"]
+                    raise ValueError(f"{SURVIVORS_FILE.name} lists twice: {key}")
+                found[key] = entry["reason"]
     return found
