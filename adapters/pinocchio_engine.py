@@ -1,48 +1,48 @@
 """Pinocchio in minimal coordinates: a chain of spherical joints.
 
-Pinocchio has no time integrator; the three here are built on its `integrate`, `dIntegrate` and
-`tangentMapProduct`.  Accelerations come from `aba` in the two fixed-step integrators and from
-`crba` with a dense solve in state evaluation and in dop853.  The two agree on short chains; on long
-ones `aba` (4.1.0) loses digits that the problem does not ask for, because the articulated inertias
-it passes to the parent lose their symmetry, about threefold a body: 5e-14 m/s² off on the
-catalogue's ten balls, 2e-8 on thirty, 8e-3 on fifty, where crba is below 2e-11 throughout
-(tests/adapters/test_pinocchio_engine.py).  An error-controlled integrator stalls on noise of that size.
+Frames, quaternion order and offsets.  Joint frame k is at body k's proximal point with the body's axes, so
+in it the centre of mass is at c = -proximal_k and the next joint at distal_k - proximal_k.  A rod is a
+spherical joint too: its frame is where the rod hangs, its z axis along u, the child's joint at
+(0, 0, length).  Its body has no mass, and inertia about its own axis only, which is exact while the rod does
+not spin about that axis: it starts without, and gains none but the integrator's error.
 
-The map.  Joint frame k sits at body k's proximal point with the body's axes, so in it the
-centre of mass is at c = -proximal_k and the next joint at distal_k - proximal_k.  A rod is a
-spherical joint too, its frame where the rod hangs, its z axis along u, the child's joint at
-(0, 0, length).  Its body has no mass and inertia about its own axis only, which is exact while
-the rod does not spin about that axis: it starts without, and gains none but the integrator's error.
-With a, b the absolute attitudes of a joint's parent and of itself (quaternions) and W their angular
-velocities, each in its own frame,
+With a, b the absolute attitudes of a joint's parent and of itself (quaternions, scalar first) and W their
+angular velocities, each in its own frame, Pinocchio's coordinates of joint j are
 
     q_j = (a⁻¹ b) as (x, y, z, w),        v_j = W_b - R(a⁻¹ b)ᵀ W_a,        W_rod = R(b)ᵀ (u × udot).
 
-Applied loads enter as `fext`: force and moment on the joint's body, in and about its frame,
+Applied loads enter as `fext`, force and moment on the joint's body, in and about its frame:
 
     f = Rᵀ (F - c_t ṙ),        n = n′ - c_r ω′ + c × f.
+
+Accelerations come from `crba` with a dense solve in state evaluation and in dop853, from `aba` in the two
+fixed-step integrators (which are `plumbline.engines.integrators`: Pinocchio has none).  The two agree on
+short chains.  On long ones `aba` (4.1.0) loses digits that the problem does not cost, because the
+articulated inertias that it passes to the parent lose their symmetry, about threefold a body: 5e-14 m/s²
+off on the catalogue's ten balls, 2e-8 on thirty, 8e-3 on fifty, where `crba` is below 2e-11 throughout
+(tests/adapters/test_pinocchio_engine.py).  An error-controlled integrator stalls on noise of that size.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar, Literal, Self, cast
+from typing import ClassVar
 
 import numpy as np
 import pinocchio as pin
-from scipy.integrate import DOP853
 from scipy.linalg import lapack
 
-from plumbline.engines.metamorphic_hooks import MetamorphicHooks
-from plumbline.model.datatypes import (
-    Array,
-    EngineFailure,
-    Integrator,
-    Model,
-    State,
-    StateQuantities,
-    Trajectory,
+from adapters.pinocchio_common import (
+    PinocchioAdapter,
+    add_frame,
+    append_parts,
+    configuration_rate,
+    energies_and_momentum,
+    point_acceleration,
+    translation,
 )
+from plumbline.engines.integrators import dop853, rkmk4, sample_steps, semi_implicit_euler
+from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, Trajectory
 from plumbline.model.kinematics import (
     quaternion_conjugate,
     quaternion_product,
@@ -51,19 +51,21 @@ from plumbline.model.kinematics import (
 )
 from plumbline.model.welding import BodyParts, undivided_bodies
 
-WORLD_ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 MAX_DENSE_JOINTS = 10  # joints up to which their 3 × 3 blocks are solved faster as one matrix
-Algorithm = Literal["aba", "aba-world", "crba", "cholesky", "forwardDynamics"]
+FIXED_STEPS = {"semi-implicit-euler": semi_implicit_euler, "rkmk4": rkmk4}
 
 
 class PinocchioChain:
     """A `Model` as Pinocchio's model and data, and the map between their coordinates.
 
     nj joints: one per body and one more per rod, each spherical, the parent of j being j - 1.
-    q is (4 nj,), v is (3 nj,) in Pinocchio's conventions.
+    q is (4 nj,), v is (3 nj,) in Pinocchio's conventions.  ``algorithm`` finds the accelerations: "crba"
+    solves with the engine's mass matrix densely, "cholesky" with its own sparse factors, "forwardDynamics"
+    in its solver for constraints, of which there are none, "aba" and "aba-world" are its articulated-body
+    algorithm in local and in world coordinates.
     """
 
-    def __init__(self, model: Model, algorithm: Algorithm, parts: BodyParts | None = None):
+    def __init__(self, model: Model, algorithm: str, parts: BodyParts | None = None):
         self.source_model, self.algorithm = model, algorithm
         parts = parts or undivided_bodies(model)
         self.pin_model = pin.Model()
@@ -76,42 +78,46 @@ class PinocchioChain:
                 joint = self._add_spherical_joint(joint, hang, f"rod {k}")
                 # Any axial inertia does; this one keeps its place among the others when units change.
                 axial = np.diag([0.0, 0.0, np.trace(model.inertia[k]) / 3])
-                self.pin_model.appendBodyToJoint(
-                    joint, pin.Inertia(0.0, np.zeros(3), axial), pin.SE3.Identity()
-                )
+                massless = pin.Inertia(0.0, np.zeros(3), axial)
+                self.pin_model.appendBodyToJoint(joint, massless, pin.SE3.Identity())
                 hang = np.array([0.0, 0.0, model.length[k]])
             joint = self._add_spherical_joint(joint, hang, f"body {k}")
-            centre = pin.SE3(np.eye(3), -model.proximal[k])
-            for part in parts[k]:  # the engine welds what is appended to one joint
-                inertia = pin.Inertia(part.mass, np.zeros(3), part.inertia)
-                place = pin.SE3(np.eye(3), part.centre - model.proximal[k])
-                self.pin_model.appendBodyToJoint(joint, inertia, place)
-            frame = pin.Frame(f"com {k}", joint, centre, pin.FrameType.OP_FRAME)
-            self.com_frames.append(self.pin_model.addFrame(frame))
+            append_parts(self.pin_model, joint, parts[k], -model.proximal[k])
+            self.com_frames.append(add_frame(self.pin_model, f"com {k}", joint, -model.proximal[k]))
             self.body_joints.append(joint)
             hang = model.distal[k] - model.proximal[k]
         self.data = self.pin_model.createData()
         self.joint_count = self.pin_model.njoints - 1
         self.body_rows = np.array(self.body_joints) - 1  # rows of the bodies among the joints
         self.rod_rows = np.setdiff1d(np.arange(self.joint_count), self.body_rows)
-        self.com_placements = [pin.SE3(np.eye(3), -s) for s in model.proximal]
+        self.com_placements = [translation(-s) for s in model.proximal]
         self.zero_torque = np.zeros(self.pin_model.nv)
+        self._init_loads()
+
+    def _add_spherical_joint(self, parent: int, offset: Array, name: str) -> int:
+        return int(self.pin_model.addJoint(parent, pin.JointModelSpherical(), translation(offset), name))
+
+    def _init_loads(self) -> None:
+        """Set `fext` to the constant loads; a moment is constant in the joint's frame, the others vary."""
+        model = self.source_model
         self.fext = pin.StdVec_Force()
         for _ in range(self.pin_model.njoints):
             self.fext.append(pin.Force.Zero())
         for k, j in enumerate(self.body_joints):
             self.fext[j] = pin.Force(np.zeros(3), model.moment[k])
-        # A constant moment is constant in the joint's frame; the others change from stage to stage.
-        changing = np.any(model.force != 0, axis=1) | (model.drag_force != 0) | (model.drag_moment != 0)
-        self.bodies_with_varying_loads = [int(k) for k in np.flatnonzero(changing)]
-
-    def _add_spherical_joint(self, parent: int, offset: Array, name: str) -> int:
-        return int(
-            self.pin_model.addJoint(parent, pin.JointModelSpherical(), pin.SE3(np.eye(3), offset), name)
-        )
+        varying = np.any(model.force != 0, axis=1) | (model.drag_force != 0) | (model.drag_moment != 0)
+        self.bodies_with_varying_loads = [int(k) for k in np.flatnonzero(varying)]
 
     def coordinates(self, state: State) -> tuple[Array, Array]:
-        """(q, v) of a state."""
+        """Map a state to Pinocchio's coordinates.
+
+        Args:
+            state: a state of the model.
+
+        Returns:
+            q (4 nj,) and v (3 nj,).
+
+        """
         attitude, spin = np.empty((self.joint_count, 4)), np.empty((self.joint_count, 3))
         attitude[self.body_rows], spin[self.body_rows] = state.p, state.omega
         for j, k in zip(self.rod_rows, np.flatnonzero(self.source_model.rods), strict=True):
@@ -124,15 +130,21 @@ class PinocchioChain:
         v[1:] -= np.matvec(rotation_matrix(relative[1:]).mT, spin[:-1])
         return np.roll(relative, -1, axis=1).ravel(), v.ravel()
 
-    def absolute_attitudes(self, q: Array) -> Array:
-        """Attitudes (T, nj, 4) of the joints, scalar first, of configurations q (T, 4 nj)."""
+    def _absolute_attitudes(self, q: Array) -> Array:
+        """Return the attitudes (T, nj, 4) of the joints, scalar first, at configurations q (T, 4 nj)."""
         p = np.roll(q.reshape(len(q), self.joint_count, 4), 1, axis=2)
         for j in range(1, self.joint_count):
             p[:, j] = quaternion_product(p[:, j - 1], p[:, j])
         return p
 
     def update_loads(self, q: Array, v: Array) -> None:
-        """Set `fext` to the loads at (q, v)."""
+        """Set `fext` to the loads at a state.
+
+        Args:
+            q: configuration (4 nj,).
+            v: velocity (3 nj,).
+
+        """
         if not self.bodies_with_varying_loads:
             return
         pin.forwardKinematics(self.pin_model, self.data, q, v)
@@ -145,7 +157,16 @@ class PinocchioChain:
             self.fext[j] = centre.act(pin.Force(force, moment))
 
     def acceleration(self, q: Array, v: Array) -> Array:
-        """v̇ (3 nj,) under gravity and loads, by the chosen algorithm."""
+        """Evaluate the accelerations under gravity and loads, by the chosen algorithm.
+
+        Args:
+            q: configuration (4 nj,).
+            v: velocity (3 nj,).
+
+        Returns:
+            v̇ (3 nj,).
+
+        """
         self.update_loads(q, v)
         if self.algorithm in ("crba", "cholesky", "forwardDynamics"):
             engine, data = self.pin_model, self.data
@@ -162,7 +183,17 @@ class PinocchioChain:
         return np.asarray(pin.aba(self.pin_model, self.data, q, v, self.zero_torque, self.fext, convention))
 
     def exponential_coordinate_rate(self, q: Array, theta: Array, v: Array) -> Array:
-        """θ̇ (3 nj,) with d/dt integrate(q, θ) = v: dexp⁻¹ of θ applied to v, joint by joint."""
+        """Apply dexp⁻¹ of θ to a velocity, joint by joint.
+
+        Args:
+            q: configuration (4 nj,).
+            theta: exponential coordinates θ (3 nj,) of a configuration near q.
+            v: velocity (3 nj,) there.
+
+        Returns:
+            θ̇ (3 nj,) with d/dt integrate(q, θ) = v.
+
+        """
         dexp = pin.dIntegrate(self.pin_model, q, theta, pin.ArgumentPosition.ARG1)
         if self.joint_count <= MAX_DENSE_JOINTS:
             return np.asarray(lapack.dgesv(dexp, v)[2])
@@ -170,35 +201,74 @@ class PinocchioChain:
         blocks = dexp.reshape(self.joint_count, 3, self.joint_count, 3)[each, :, each, :]  # the rest is zero
         return np.linalg.solve(blocks, v.reshape(-1, 3, 1)).ravel()
 
+    def integrate(self, q: Array, displacement: Array) -> Array:
+        """Move a configuration along a tangent vector, by the engine's `integrate`.
+
+        Args:
+            q: configuration (4 nj,).
+            displacement: tangent vector (3 nj,) [rad].
+
+        Returns:
+            The configuration reached (4 nj,).
+
+        """
+        return np.asarray(pin.integrate(self.pin_model, q, displacement))
+
+    def configuration_rate(self, q: Array, v: Array) -> Array:
+        """Map a velocity to the rate of the configuration.
+
+        Args:
+            q: configuration (4 nj,).
+            v: velocity (3 nj,).
+
+        Returns:
+            q̇ (4 nj,).
+
+        """
+        return configuration_rate(self.pin_model, q, v)
+
+    def normalize(self, q: Array) -> Array:
+        """Normalise the quaternions of a configuration; `aba` takes any quaternion for a unit one.
+
+        Args:
+            q: configuration (4 nj,).
+
+        Returns:
+            The same with quaternions of unit length.
+
+        """
+        return np.asarray(pin.normalize(self.pin_model, q))
+
     def quantities(self, state: State) -> StateQuantities:
-        """All state quantities at one state."""
+        """Evaluate all state quantities.
+
+        Args:
+            state: a state of the model.
+
+        Returns:
+            The quantities, in the project's frames.
+
+        """
         engine, data = self.pin_model, self.data
         q, v = self.coordinates(state)
         a = self.acceleration(q, v)
         pin.forwardKinematics(engine, data, q, v, a)
         pin.updateFramePlacements(engine, data)
-        acceleration = [
-            pin.getFrameClassicalAcceleration(engine, data, f, WORLD_ALIGNED).linear for f in self.com_frames
-        ]
+        acceleration = [point_acceleration(engine, data, f) for f in self.com_frames]
         angular = [data.a[j].angular.copy() for j in self.body_joints]
         turn = [data.oMi[j].rotation.copy() for j in self.body_joints]
         pin.rnea(engine, data, q, v, a, self.fext)
         reaction = [r @ data.f[j].linear for r, j in zip(turn, self.body_joints, strict=True)]
-        kinetic = pin.computeKineticEnergy(engine, data, q, v)
-        potential = pin.computePotentialEnergy(engine, data, q)
-        momentum = pin.computeCentroidalMomentum(engine, data, q, v)
         return StateQuantities(
             acceleration=np.array(acceleration),
             angular_acceleration=np.array(angular),
             joint_reaction=np.array(reaction),
-            kinetic_energy=float(kinetic),
-            potential_energy=float(potential),
-            angular_momentum=momentum.angular + np.cross(data.com[0], momentum.linear),
-            mass_matrix=self.mass_matrix(state, q),
+            **energies_and_momentum(engine, data, q, v),
+            mass_matrix=self._mass_matrix(state, q),
         )
 
-    def mass_matrix(self, state: State, q: Array) -> Array:
-        """(nu, nu) mass matrix of ν = (udot of rods, ω′ of bodies): (T S)ᵀ M (T S).
+    def _mass_matrix(self, state: State, q: Array) -> Array:
+        """Return the mass matrix (nu, nu) of ν = (udot of rods, ω′ of bodies): (T S)ᵀ M (T S).
 
         v = T W takes absolute rates W to joint rates, W = S ν takes ν to absolute rates.
         """
@@ -217,7 +287,18 @@ class PinocchioChain:
         return np.asarray(ts.T @ m @ ts)
 
     def trajectory(self, times: Array, q: Array, v: Array, steps: int) -> Trajectory:
-        """Samples of the bodies at configurations q (T, 4 nj) with rates v (T, 3 nj)."""
+        """Map samples to the bodies' positions, attitudes and rates.
+
+        Args:
+            times: sample times (T,) [s].
+            q: configurations (T, 4 nj).
+            v: velocities (T, 3 nj).
+            steps: number of steps taken.
+
+        Returns:
+            The trajectory in the project's frames.
+
+        """
         shape = (len(times), self.source_model.n, 3)
         r, rdot, omega = np.empty(shape), np.empty(shape), np.empty(shape)
         for i in range(len(times)):
@@ -227,14 +308,21 @@ class PinocchioChain:
                 r[i, k] = pose.act(centre.translation)
                 rdot[i, k] = pose.rotation @ motion.linear
                 omega[i, k] = motion.angular
-        p = self.absolute_attitudes(q)[:, self.body_rows]
+        p = self._absolute_attitudes(q)[:, self.body_rows]
         return Trajectory(t=times, r=r, p=p, v=rdot, pdot=quaternion_rate(p, omega), steps=steps)
 
 
 def rod_quaternion(u: Array) -> Array:
-    """A unit quaternion whose rotation takes e_z to the unit vector u: half a turn about e_z + u.
+    """Choose an attitude for a rod: half a turn about e_z + u, which takes e_z to u.
 
-    Where u points down the shortest turn is from -e_z, after half a turn about x, to stay away from 0/0.
+    Where u points down it is the shortest turn from -e_z after half a turn about x, to stay away from 0/0.
+
+    Args:
+        u: unit vector (3,), world frame.
+
+    Returns:
+        A unit quaternion (4,), scalar first, that turns e_z into u.
+
     """
     if u[2] >= 0:
         p = np.array([1 + u[2], -u[1], u[0], 0.0])
@@ -243,85 +331,13 @@ def rod_quaternion(u: Array) -> Array:
     return np.asarray(p / np.linalg.norm(p))
 
 
-def semi_implicit_euler(chain: PinocchioChain, q: Array, v: Array, h: float) -> tuple[Array, Array]:
-    """v₁ = v + h a(q, v), q₁ = q ⊕ h v₁."""
-    v = v + h * chain.acceleration(q, v)
-    return pin.integrate(chain.pin_model, q, h * v), v
+class Pinocchio(PinocchioAdapter):
+    """Pinocchio on a chain of spherical joints; each integrator uses the algorithm that its note names."""
 
-
-def rkmk4(chain: PinocchioChain, q: Array, v: Array, h: float) -> tuple[Array, Array]:
-    """The classical Runge–Kutta step for θ̇ = dexp⁻¹(θ) v, v̇ = a(q ⊕ θ, v) from θ = 0.
-
-    Munthe-Kaas, Appl. Numer. Math. 29 (1999) 115–127.  With θ̇ = v instead the order would be 2.
-    """
-
-    def slope(theta: Array, w: Array) -> tuple[Array, Array]:
-        return chain.exponential_coordinate_rate(q, theta, w), chain.acceleration(
-            pin.integrate(chain.pin_model, q, theta), w
-        )
-
-    a1, b1 = v, chain.acceleration(q, v)
-    a2, b2 = slope(h / 2 * a1, v + h / 2 * b1)
-    a3, b3 = slope(h / 2 * a2, v + h / 2 * b2)
-    a4, b4 = slope(h * a3, v + h * b3)
-    theta = h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
-    return pin.integrate(chain.pin_model, q, theta), v + h / 6 * (b1 + 2 * b2 + 2 * b3 + b4)
-
-
-def configuration_rate(model: pin.Model, q: Array, v: Array) -> Array:
-    """q̇ (nq,) of a velocity v (nv,)."""
-    if hasattr(pin, "tangentMapProduct"):
-        return np.asarray(pin.tangentMapProduct(model, q, v[:, None])).ravel()
-    p = np.roll(q.reshape(-1, 4), 1, axis=1)  # before 4.0: of spherical joints, ½ q v
-    return np.roll(quaternion_rate(p, v.reshape(-1, 3)), -1, axis=1).ravel()
-
-
-def dop853(chain: PinocchioChain, q: Array, v: Array, times: Array, rtol: float) -> tuple[Array, Array, int]:
-    """Rows (T, 4 nj) and (T, 3 nj) and the number of steps of q̇ = tangentMap(q) v, v̇ = a(q, v).
-
-    Steps end at every sample time.  The quaternions integrated are not normalised; the
-    accelerations are taken at q/|q|, for `aba` takes any quaternion for a unit one.
-    """
-    nq = len(q)
-
-    def field(_: float, y: Array) -> Array:
-        q, v = y[:nq], y[nq:]
-        a = chain.acceleration(pin.normalize(chain.pin_model, q), v)
-        return np.concatenate([configuration_rate(chain.pin_model, q, v), a])
-
-    y, steps = np.concatenate([q, v]), 0
-    rows = [y]
-    solver = DOP853(field, 0.0, y, times[-1], rtol=rtol, atol=rtol)
-    for time in times[1:]:
-        solver.t_bound, solver.status = time, "running"
-        while solver.status == "running":
-            message = solver.step()
-            steps += 1
-        if solver.status == "failed":
-            raise EngineFailure(f"dop853 stopped at t = {solver.t} s: {message}")
-        rows.append(solver.y.copy())
-    return np.array(rows)[:, :nq], np.array(rows)[:, nq:], steps
-
-
-class Pinocchio(MetamorphicHooks):
-    """Pinocchio on a chain of spherical joints.
-
-    ``algorithm`` chooses how state evaluation finds accelerations: "crba" solves with the engine's
-    mass matrix densely, "cholesky" with its own sparse factors, "forwardDynamics" in its solver for
-    constraints without any, "aba" and "aba-world" are its articulated-body algorithm in local and in world
-    coordinates.  The integrators keep to the algorithm their note names.
-    """
-
-    name: ClassVar[str] = "pinocchio"
-    title: ClassVar[str] = "Pinocchio"
-    package: ClassVar[str] = "pin"
+    name = "pinocchio"
+    title = "Pinocchio"
     reproduction_template = "pinocchio"
     other_formulation = "pinocchio-maximal"
-    supported_versions = ">=3.3.1,<5"
-    extra_requirements = (
-        ("<4", "cmeel-urdfdom<5"),
-        ("<4", "cmeel-tinyxml2<11"),
-    )  # what those wheels were linked with
     integrators: ClassVar[tuple[Integrator, ...]] = (
         Integrator(
             "semi-implicit-euler",
@@ -339,43 +355,24 @@ class Pinocchio(MetamorphicHooks):
         ),
         Integrator("dop853", "tolerance", 8, note="SciPy's DOP853 on (q, v) with crba and the tangent map"),
     )
-
-    options: ClassVar[tuple[Algorithm, ...]] = ("cholesky", "forwardDynamics")
-    welding_unsupported_reason = ""
-
-    def __init__(self, algorithm: Algorithm = "crba"):
-        self.algorithm: Algorithm = algorithm
-
-    def with_option(self, option: str) -> Self:
-        """The same engine by another of its algorithms."""
-        other = super().with_option(option)
-        other.algorithm = cast(Algorithm, option)
-        return other
-
-    def version(self) -> str:
-        """Version of the pin wheel."""
-        return str(pin.__version__)
+    options: ClassVar[tuple[str, ...]] = ("cholesky", "forwardDynamics")
+    usual_algorithm: ClassVar[str] = "crba"  # for the accelerations of state evaluation
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-        chain = PinocchioChain(model, self.algorithm, self.body_pieces(model))
+        chain = PinocchioChain(model, self.option or self.usual_algorithm, self.body_pieces(model))
         return [chain.quantities(state) for state in states]
 
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
         chain = PinocchioChain(model, "crba" if integrator.kind == "tolerance" else "aba")
-        q, v = chain.coordinates(state)
+        start = chain.coordinates(state)
         if integrator.kind == "tolerance":
-            return chain.trajectory(times, *dop853(chain, q, v, times, resolution))
-        step = semi_implicit_euler if integrator.name == "semi-implicit-euler" else rkmk4
-        at = np.rint(times / resolution).astype(int)
-        rows = [(q, v)]
-        for count in np.diff(at):
-            for _ in range(count):
-                q, v = step(chain, q, v, resolution)
-            rows.append((q, v))
-        qs, vs = (np.array(column) for column in zip(*rows, strict=True))
-        return chain.trajectory(times, qs, vs, int(at[-1]))
+            return chain.trajectory(times, *dop853(chain, *start, times, resolution))
+        step = FIXED_STEPS[integrator.name]
+        samples = sample_steps(lambda qv: step(chain, *qv, resolution), start, times, resolution)
+        q, v = (np.array(column) for column in zip(*samples, strict=True))
+        return chain.trajectory(times, q, v, round(float(times[-1] / resolution)))
 
 
 class PinocchioAba(Pinocchio):
@@ -384,8 +381,7 @@ class PinocchioAba(Pinocchio):
     name = "pinocchio-aba"
     title = "Pinocchio (aba)"
     other_formulation = ""
-    integrators: ClassVar[tuple[Integrator, ...]] = ()
+    integrators = ()
+    unsupported = (("integrators", "another algorithm of Pinocchio is compared at state level only"),)
     options = ("crba",)
-
-    def __init__(self) -> None:
-        super().__init__("aba")
+    usual_algorithm = "aba"

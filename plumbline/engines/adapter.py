@@ -9,7 +9,7 @@ repeated row or a number that is not finite is reported as a failure.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -25,6 +25,7 @@ from plumbline.model.datatypes import (
     State,
     StateQuantities,
     Trajectory,
+    Unsupported,
 )
 
 UNIT_NORM_TOLERANCE = 8 * np.finfo(float).eps  # a quaternion normalised in double is this close to |p| = 1
@@ -65,8 +66,8 @@ class Adapter(ABC):
     title: ClassVar[str]  # as shown in the report
     package: ClassVar[str]  # distribution whose version is reported
     integrators: ClassVar[tuple[Integrator, ...]]
-    # What the engine does not do (a key of `UNSUPPORTED_KINDS`), and why, in a sentence.
-    unsupported: ClassVar[Mapping[str, str]] = {}
+    # What the engine does not do: (a key of `UNSUPPORTED_KINDS`, the reason in a sentence).
+    unsupported: ClassVar[tuple[tuple[str, str], ...]] = ()
     supported_versions: ClassVar[str] = ""  # PEP 440 range of versions that the adapter works with
     # Requirements of environments with another version: (range of versions, additional requirement).
     extra_requirements: ClassVar[tuple[tuple[str, str], ...]] = ()
@@ -81,11 +82,11 @@ class Adapter(ABC):
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         """Return the state quantities at each state; raise Unsupported with a sentence to refuse."""
 
-    @abstractmethod
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
         """Run from ``state`` and sample at ``times`` (times[0] = 0), each of which ends a step exactly."""
+        raise Unsupported(f"the adapter does not simulate with {integrator.name}")
 
     def describe(self) -> EngineInfo:
         """Describe the engine as it is loaded.

@@ -38,6 +38,12 @@ def in_the_engines_process(test):
     return guarded
 
 
+def by(algorithm):
+    engine = Pinocchio()
+    engine.option = algorithm
+    return engine
+
+
 def relative(got, expected, floor):
     return np.max(np.abs(got - expected)) / max(floor, np.max(np.abs(expected)))
 
@@ -50,8 +56,8 @@ def test_algorithms_and_formulations_agree(joints, loaded):
     model = pendulums.model(JOINTS[joints], loads=loaded, drag=loaded)
     states = [pendulums.state(model, seed) for seed in range(10)]
     # The world convention is 1e-11 off by five bodies already, as the docstring of the adapter says of aba.
-    others = [Pinocchio("aba"), PinocchioMaximal(), *([Pinocchio("aba-world")] if model.n <= 2 else [])]
-    first = Pinocchio("crba")
+    others = [by("aba"), PinocchioMaximal(), *([by("aba-world")] if model.n <= 2 else [])]
+    first = by("crba")
     for other in others:
         for a, b in zip(first.evaluate(model, states), other.evaluate(model, states), strict=True):
             for name, floor in (
@@ -73,7 +79,7 @@ def test_aba_loses_the_symmetry_of_articulated_inertias():
         scenario = load_scenario(find_scenario_file(f"chain-{bodies}-balls"))
         truth = newton_euler.solve(scenario.model, scenario.state).acceleration
         for algorithm in ("aba", "crba"):
-            (got,) = Pinocchio(algorithm).evaluate(scenario.model, [scenario.state])
+            (got,) = by(algorithm).evaluate(scenario.model, [scenario.state])
             error[algorithm, bodies] = np.max(np.abs(got.acceleration - truth))
         chain = Chain(scenario.model, "aba")
         chain.acceleration(*chain.coordinates(scenario.state))
@@ -150,7 +156,7 @@ def test_loads_are_taken_at_every_stage():
             return step(chain, q, v, h)
 
     step = pinocchio_engine.rkmk4
-    with patch.object(pinocchio_engine, "rkmk4", frozen):
+    with patch.dict(pinocchio_engine.FIXED_STEPS, rkmk4=frozen):
         seen = orders(refined(model, state, "rkmk4", 2.0**-9, 3))
     assert np.all(np.abs(seen - 1) < 0.1), f"orders {seen}"
 
@@ -167,7 +173,7 @@ def test_a_balanced_load_shows_in_the_reaction():
     arm = state.r[0]
     moment = -kinematics.rotation_matrix(state.p[0]).T @ np.cross(arm, pull)
     model = replace(model, moment=moment[None])
-    for engine in (Pinocchio("aba"), Pinocchio("crba"), PinocchioMaximal()):
+    for engine in (by("aba"), by("crba"), PinocchioMaximal()):
         (got,) = engine.evaluate(model, [state])
         assert np.max(np.abs(got.angular_acceleration)) < 1e-12
         # The joint then carries weight and force together.

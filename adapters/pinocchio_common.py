@@ -1,0 +1,150 @@
+"""Parts shared by both Pinocchio formulations: read-outs, welded parts, calls of older versions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+
+from plumbline.engines.metamorphic_hooks import MetamorphicHooks
+from plumbline.model.datatypes import Array
+from plumbline.model.kinematics import quaternion_rate
+from plumbline.model.welding import RigidPart
+
+WORLD_ALIGNED = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+
+
+class PinocchioAdapter(MetamorphicHooks):
+    """Declarations common to all columns of Pinocchio."""
+
+    package = "pin"
+    supported_versions = ">=3.3.1,<5"
+    # What the wheels of version 3 were linked with.
+    extra_requirements = (("<4", "cmeel-urdfdom<5"), ("<4", "cmeel-tinyxml2<11"))
+    welding_unsupported_reason = ""
+
+    def version(self) -> str:
+        """Return the version of the pin wheel."""
+        return str(pin.__version__)
+
+
+def translation(point: Array) -> pin.SE3:
+    """Return the placement of a frame without rotation.
+
+    Args:
+        point: its origin (3,) [m] in the parent frame.
+
+    Returns:
+        The placement.
+
+    """
+    return pin.SE3(np.eye(3), point)
+
+
+def append_parts(pin_model: pin.Model, joint: int, parts: tuple[RigidPart, ...], centre: Array) -> None:
+    """Append the parts of a body to a joint; Pinocchio welds everything appended to one joint.
+
+    Args:
+        pin_model: the model under construction.
+        joint: index of the joint that carries the body.
+        parts: the body's parts.
+        centre: the body's centre of mass (3,) [m] in the joint's frame.
+
+    """
+    for part in parts:
+        inertia = pin.Inertia(part.mass, np.zeros(3), part.inertia)
+        pin_model.appendBodyToJoint(joint, inertia, translation(part.centre + centre))
+
+
+def add_frame(pin_model: pin.Model, name: str, joint: int, point: Array) -> int:
+    """Add an operational frame with the axes of a joint.
+
+    Args:
+        pin_model: the model under construction.
+        name: a name that no other frame has.
+        joint: index of the joint that carries the frame.
+        point: its origin (3,) [m] in the joint's frame.
+
+    Returns:
+        The frame's index.
+
+    """
+    frame = pin.Frame(name, joint, translation(point), pin.FrameType.OP_FRAME)
+    return int(pin_model.addFrame(frame))
+
+
+def point_acceleration(pin_model: pin.Model, data: pin.Data, frame: int) -> Array:
+    """Read the acceleration of a frame's origin from the last forward kinematics.
+
+    Args:
+        pin_model: the model.
+        data: its data, with frame placements up to date.
+        frame: index of the frame.
+
+    Returns:
+        Second time derivative (3,) [m/s²] of the origin's position, world frame.
+
+    """
+    return np.asarray(pin.getFrameClassicalAcceleration(pin_model, data, frame, WORLD_ALIGNED).linear)
+
+
+def energies_and_momentum(pin_model: pin.Model, data: pin.Data, q: Array, v: Array) -> dict[str, Any]:
+    """Evaluate the quantities of the whole mechanism.
+
+    Args:
+        pin_model: the model.
+        data: its data.
+        q: configuration, in Pinocchio's convention.
+        v: velocity, in Pinocchio's convention.
+
+    Returns:
+        ``kinetic_energy`` and ``potential_energy`` [J] and ``angular_momentum`` (3,) [kg m²/s] about the
+        world origin.
+
+    """
+    kinetic = pin.computeKineticEnergy(pin_model, data, q, v)
+    potential = pin.computePotentialEnergy(pin_model, data, q)
+    momentum = pin.computeCentroidalMomentum(pin_model, data, q, v)
+    return {
+        "kinetic_energy": float(kinetic),
+        "potential_energy": float(potential),
+        "angular_momentum": momentum.angular + np.cross(data.com[0], momentum.linear),
+    }
+
+
+# -- calls that differ before version 4.0 ------------------------------------------------------------
+
+
+def init_constraint_dynamics(pin_model: pin.Model, data: pin.Data, contacts: Any, contact_data: Any) -> None:
+    """Allocate what `constraintDynamics` needs.
+
+    Args:
+        pin_model: the model.
+        data: its data.
+        contacts: the constraint models.
+        contact_data: their data, which version 3 does not take.
+
+    """
+    try:
+        pin.initConstraintDynamics(pin_model, data, contacts, contact_data)
+    except TypeError:
+        pin.initConstraintDynamics(pin_model, data, contacts)
+
+
+def configuration_rate(pin_model: pin.Model, q: Array, v: Array) -> Array:
+    """Map a velocity to the rate of the configuration of spherical joints.
+
+    Args:
+        pin_model: a model of spherical joints.
+        q: configuration (4 nj,).
+        v: velocity (3 nj,).
+
+    Returns:
+        q̇ (4 nj,); version 3 has no tangent map, and q̇ = ½ q v is evaluated here.
+
+    """
+    if hasattr(pin, "tangentMapProduct"):
+        return np.asarray(pin.tangentMapProduct(pin_model, q, v[:, None])).ravel()
+    p = np.roll(q.reshape(-1, 4), 1, axis=1)
+    return np.roll(quaternion_rate(p, v.reshape(-1, 3)), -1, axis=1).ravel()

@@ -1,0 +1,163 @@
+"""Time integrators for engines that have none: one-step methods and an error-controlled one.
+
+The configuration q of a system is a point of a Lie group, its velocity v a vector of the Lie algebra.
+The methods need the system's accelerations and the group's operations, see `LieGroupSystem`; with ⊕ for
+`LieGroupSystem.integrate` they solve q̇ = (d/dε) q ⊕ ε v, v̇ = a(q, v).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol, TypeVar
+
+import numpy as np
+from scipy.integrate import DOP853
+
+from plumbline.model.datatypes import Array, EngineFailure
+
+Sample = TypeVar("Sample")
+
+
+class LieGroupSystem(Protocol):
+    """A mechanical system with configurations q (nq,) and velocities v (nv,)."""
+
+    def acceleration(self, q: Array, v: Array) -> Array:
+        """Return v̇ (nv,)."""
+
+    def integrate(self, q: Array, displacement: Array) -> Array:
+        """Return q ⊕ displacement (nq,)."""
+
+    def exponential_coordinate_rate(self, q: Array, theta: Array, v: Array) -> Array:
+        """Return θ̇ (nv,) with (d/dt) q ⊕ θ = v, which is dexp⁻¹ of θ applied to v."""
+
+    def configuration_rate(self, q: Array, v: Array) -> Array:
+        """Return q̇ (nq,)."""
+
+    def normalize(self, q: Array) -> Array:
+        """Return the point (nq,) of the group nearest to q."""
+
+
+def semi_implicit_euler(system: LieGroupSystem, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+    """Take one step of v₁ = v + h a(q, v), q₁ = q ⊕ h v₁.
+
+    Args:
+        system: accelerations and group operations.
+        q: configuration (nq,).
+        v: velocity (nv,).
+        h: step [s].
+
+    Returns:
+        q₁ and v₁.
+
+    """
+    v = v + h * system.acceleration(q, v)
+    return system.integrate(q, h * v), v
+
+
+def rkmk4(system: LieGroupSystem, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+    """Take one step of the classical Runge–Kutta method in exponential coordinates.
+
+    It solves θ̇ = dexp⁻¹(θ) v, v̇ = a(q ⊕ θ, v) from θ = 0 (Munthe-Kaas, Appl. Numer. Math. 29 (1999)
+    115–127).  With θ̇ = v instead the order would be 2.
+
+    Args:
+        system: accelerations and group operations.
+        q: configuration (nq,).
+        v: velocity (nv,).
+        h: step [s].
+
+    Returns:
+        Configuration and velocity after the step.
+
+    """
+
+    def slope(y: Array) -> Array:
+        theta, w = y
+        if not theta.any():  # dexp is the identity
+            return np.array([w, system.acceleration(q, w)])
+        rate = system.exponential_coordinate_rate(q, theta, w)
+        return np.array([rate, system.acceleration(system.integrate(q, theta), w)])
+
+    theta, v = runge_kutta_4(slope, np.array([np.zeros_like(v), v]), h)
+    return system.integrate(q, theta), v
+
+
+def runge_kutta_4(slope: Callable[[Array], Array], y: Array, h: float) -> Array:
+    """Take one step of the classical Runge–Kutta method for ẏ = slope(y).
+
+    Args:
+        slope: the right-hand side.
+        y: array of any shape.
+        h: step [s].
+
+    Returns:
+        y after the step.
+
+    """
+    k1 = slope(y)
+    k2 = slope(y + h / 2 * k1)
+    k3 = slope(y + h / 2 * k2)
+    k4 = slope(y + h * k3)
+    return np.asarray(y + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
+
+
+def sample_steps(step: Callable[[Sample], Sample], start: Sample, times: Array, h: float) -> list[Sample]:
+    """Take steps of fixed size and keep the samples.
+
+    Args:
+        step: advances a sample (for example q and v) by one step.
+        start: the sample at time 0.
+        times: sample times (T,) [s], multiples of ``h`` from 0.
+        h: step [s].
+
+    Returns:
+        The samples at ``times``.
+
+    """
+    samples = [start]
+    for count in np.diff(np.rint(times / h).astype(int)):
+        sample = samples[-1]
+        for _ in range(count):
+            sample = step(sample)
+        samples.append(sample)
+    return samples
+
+
+def dop853(system: LieGroupSystem, q: Array, v: Array, times: Array, rtol: float) -> tuple[Array, Array, int]:
+    """Integrate q̇, v̇ in ambient coordinates by SciPy's DOP853, with a step that ends at every sample time.
+
+    The integrated q is not normalised; accelerations are evaluated at the normalised q.
+
+    Args:
+        system: accelerations and group operations.
+        q: initial configuration (nq,).
+        v: initial velocity (nv,).
+        times: sample times (T,) [s], ascending from 0.
+        rtol: relative tolerance, and the absolute one.
+
+    Returns:
+        Configurations (T, nq), velocities (T, nv) and the number of steps.
+
+    Raises:
+        EngineFailure: the step size became too small; the message is SciPy's.
+
+    """
+    nq = len(q)
+
+    def slope(_: float, y: Array) -> Array:
+        q, v = y[:nq], y[nq:]
+        a = system.acceleration(system.normalize(q), v)
+        return np.concatenate([system.configuration_rate(q, v), a])
+
+    y, steps = np.concatenate([q, v]), 0
+    rows = [y]
+    solver = DOP853(slope, 0.0, y, times[-1], rtol=rtol, atol=rtol)
+    for time in times[1:]:
+        solver.t_bound, solver.status = time, "running"
+        while solver.status == "running":
+            message = solver.step()
+            steps += 1
+        if solver.status == "failed":
+            raise EngineFailure(f"dop853 stopped at t = {solver.t} s: {message}")
+        rows.append(solver.y.copy())
+    return np.array(rows)[:, :nq], np.array(rows)[:, nq:], steps
