@@ -1,6 +1,7 @@
 """MuJoCo: a joint-space engine; every link and every massless rod is a body on a ball joint.
 
-Maps (R_b: rotation of engine body b, body → world; a(b): its parent; z_b: a rod's own axis):
+Frames, quaternion order and offsets (R_b: rotation of engine body b, body → world; a(b): its parent; z: a
+rod's own axis):
 
     link k    body frame: the project's, at the centre of mass;  joint at s_prox(k)
               pos = s_dist(k−1) − s_prox(k), or (0, 0, −ℓ_k) − s_prox(k) where it hangs on a rod
@@ -16,12 +17,13 @@ Maps (R_b: rotation of engine body b, body → world; a(b): its parent; z_b: a r
 
 Loads act inside every integrator stage: the world force is `xfrc_applied`; n′ − c_r ω′ and −c_t ṙ
 are actuators on a site at the centre of mass, a constant and a velocity bias along each axis.
-`cfrc_int` counts actuator forces as if the joint carried them, so before asking for it the drag
-force that acted is named as an applied one too.
+`cfrc_int` counts actuator forces as if the joint carried them, so before it is read the drag
+force that acted is declared as an applied one too.
 
-Welded halves are bodies without a joint on a massless one in their body's place.  The other way to the
-accelerations is a dense solve with `mj_fullM`.  The engine's choices of solver (PGS, CG, Newton) and
-Jacobian (dense, sparse) are of active constraints: there are none here, and the answers the same bit for bit.
+Welded halves are bodies without a joint on a massless one in their body's place.  The option "dense mass
+matrix" finds the accelerations by a dense solve with `mj_fullM`.  MuJoCo's solvers (PGS, CG, Newton) and
+Jacobians (dense, sparse) concern active constraints: here there are none, and the answers are the same bit
+for bit.
 """
 
 from __future__ import annotations
@@ -77,7 +79,7 @@ class Mujoco(MetamorphicHooks):
     welding_unsupported_reason = ""
 
     def version(self) -> str:
-        """Version of the loaded library."""
+        """Return the version of the loaded library."""
         return str(mujoco.mj_versionString())
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
@@ -97,18 +99,21 @@ class Mujoco(MetamorphicHooks):
         with _raise_on_warnings(chain.d):
             for done in np.diff(counts):
                 mujoco.mj_step(chain.m, chain.d, nstep=int(done))
-                t.append(chain.d.time)  # the engine's own clock: a rewound one is seen by the contract
+                t.append(chain.d.time)  # the engine's own clock: the contract's checks notice a reset
                 rows.append(chain.sample())
         r, p, v, pdot = (np.array(column) for column in zip(*rows, strict=True))
         return Trajectory(t=np.array(t), r=r, p=p, v=v, pdot=pdot, steps=int(counts[-1]))
 
 
 class _MujocoChain:
-    """A compiled chain and its data.  Engine body ids: ``link[k]`` of link k, ``turning`` all on joints."""
+    """A compiled chain and its data.
+
+    Engine body ids: ``link_ids[k]`` of link k, ``jointed_body_ids`` of all bodies on joints.
+    """
 
     def __init__(self, model: Model, parts: BodyParts | None = None, dense: bool = False) -> None:
         spec = mujoco.MjSpec()
-        getattr(spec, "compiler", spec).autolimits = False  # on the spec itself in 3.2.0 to 3.2.4
+        _compiler_options(spec).autolimits = False
         self.model, self.use_dense_solve = model, dense
         self.link_ids: list[int] = []
         self.jointed_body_ids: list[int] = []
@@ -120,19 +125,13 @@ class _MujocoChain:
                 axial = np.array([0, 0, 0.01 * _principal_inertia(model.inertia[k])[0].mean()])
                 parent = self._add_body(parent, hang, 0.0, axial, joint=np.zeros(3))
                 hang = np.array([0, 0, -model.length[k]])
-            at, pieces = model.proximal[k], (parts or undivided_bodies(model))[k]
-            one = pieces[0] if len(pieces) == 1 else RigidPart(0.0, np.zeros(3), np.zeros((3, 3)))
-            parent = self._add_body(parent, hang - at, one.mass, *_principal_inertia(one.inertia), joint=at)
-            self.link_ids.append(len(self.mass) - 1)
-            for piece in pieces if len(pieces) > 1 else ():  # before the next link: ids go depth first
-                self._add_body(parent, piece.centre, piece.mass, *_principal_inertia(piece.inertia))
+            pieces = (parts or undivided_bodies(model))[k]
+            parent = self._add_link(parent, hang - model.proximal[k], model.proximal[k], pieces)
             hang = model.distal[k]
             _add_load_actuators(spec, parent, k, model)
         m = self.m = spec.compile()
         m.opt.gravity = model.gravity
-        flags = mujoco.mjtDisableBit
-        # 3.2.0 always resets; its clock then tells, as every reset is told by the contract
-        m.opt.disableflags = flags.mjDSBL_CONTACT | getattr(flags, "mjDSBL_AUTORESET", 0)
+        m.opt.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT | _autoreset_flag()
         # After compiling: the compiler refuses massless bodies, and cannot adjust what it does not see.
         m.body_mass[:] = self.mass
         m.body_inertia[:] = self.inertia
@@ -141,6 +140,15 @@ class _MujocoChain:
         self.applied_wrenches = np.zeros((m.nbody, 6))
         self.applied_wrenches[self.link_ids, :3] = model.force
         self.readout_data = mujoco.MjData(m)
+
+    def _add_link(self, parent: Any, pos: Array, joint: Array, pieces: tuple[RigidPart, ...]) -> Any:
+        """Add a body of one part, or a massless one with its parts welded to it."""
+        one = pieces[0] if len(pieces) == 1 else RigidPart(0.0, np.zeros(3), np.zeros((3, 3)))
+        link = self._add_body(parent, pos, one.mass, *_principal_inertia(one.inertia), joint=joint)
+        self.link_ids.append(len(self.mass) - 1)
+        for piece in pieces if len(pieces) > 1 else ():  # before the next link: ids go depth first
+            self._add_body(link, piece.centre, piece.mass, *_principal_inertia(piece.inertia))
+        return link
 
     def _add_body(
         self,
@@ -151,7 +159,7 @@ class _MujocoChain:
         axes: Array = IDENTITY_QUATERNION,
         joint: Array | None = None,
     ) -> Any:
-        """A body on a ball joint, or welded; of unit mass until ``mass`` and ``inertia`` are set."""
+        """Add a body on a ball joint, or welded; of unit mass until ``mass`` and ``inertia`` are set."""
         body = _set_attributes(
             parent.add_body(),
             pos=pos, mass=1.0, inertia=np.ones(3), ipos=np.zeros(3), iquat=axes, explicitinertial=True,
@@ -164,7 +172,7 @@ class _MujocoChain:
         return body
 
     def body_frames(self, state: State) -> tuple[Array, Array]:
-        """Quaternions (nbody, 4) of the engine's bodies; E (nbody, 3, nu): their ω = E ν, in own frames."""
+        """Return the quaternions (nbody, 4) of all bodies and E (nbody, 3, nu): their ω = E ν, own frames."""
         rods = np.flatnonzero(self.model.rods)
         q = np.zeros((self.m.nbody, 4))
         q[0, 0] = 1
@@ -178,7 +186,7 @@ class _MujocoChain:
         return q, E
 
     def set_state(self, state: State) -> Array:
-        """Write a state; returns T (nv, nu)."""
+        """Write a state into the engine's data; returns T (nv, nu)."""
         m, d = self.m, self.d
         q, E = self.body_frames(state)
         own, up = self.jointed_body_ids, m.body_parentid[self.jointed_body_ids]
@@ -194,17 +202,13 @@ class _MujocoChain:
         return np.asarray(T)
 
     def quantities(self, state: State) -> StateQuantities:
-        """Everything the engine says of a state."""
+        """Evaluate all state quantities at one state."""
         m, d, link = self.m, self.d, self.link_ids
         T = self.set_state(state)
         m.opt.enableflags = mujoco.mjtEnableBit.mjENBL_ENERGY
         mujoco.mj_forward(m, d)
         mujoco.mj_subtreeVel(m, d)
-        M = np.zeros((m.nv, m.nv))
-        try:
-            mujoco.mj_fullM(m, d, M)
-        except TypeError:  # older ones, 3.4 among them
-            mujoco.mj_fullM(m, M, d.qM)
+        M = _full_mass_matrix(m, d)
         if self.use_dense_solve:
             d.qacc = np.linalg.solve(M, d.qfrc_smooth)
         velocity = self._spatial_motion(mujoco.mj_objectVelocity, d)
@@ -223,7 +227,7 @@ class _MujocoChain:
         )
 
     def sample(self) -> tuple[Array, Array, Array, Array]:
-        """r, p, v, ṗ of the links; read in a second data, so that reading leaves no mark on the run."""
+        """Return r, p, v, ṗ of the links, read with a second data so that the run is not disturbed."""
         m, probe = self.m, self.readout_data
         probe.qpos, probe.qvel = self.d.qpos, self.d.qvel
         mujoco.mj_kinematics(m, probe)
@@ -235,22 +239,15 @@ class _MujocoChain:
         return probe.xpos[self.link_ids], p, velocity[:, 3:], kinematics.quaternion_rate(p, omega)
 
     def _spatial_motion(self, mujoco_function: Callable[..., None], data: Any) -> Array:
-        """``of`` (mj_objectVelocity, mj_objectAcceleration) of the links (N, 6), rotation first, world"""
+        """Return mj_objectVelocity or mj_objectAcceleration of the links (N, 6), rotation first, world."""
         out = np.empty((self.model.n, 6))
         for k, b in enumerate(self.link_ids):
             mujoco_function(self.m, data, mujoco.mjtObj.mjOBJ_BODY, b, out[k], 0)
         return out
 
 
-def _set_attributes(element: Any, **attributes: Any) -> Any:
-    """An element of a spec with these attributes; only later versions take them as arguments."""
-    for name, value in attributes.items():
-        setattr(element, name, value)
-    return element
-
-
 def _add_load_actuators(spec: Any, body: Any, k: int, model: Model) -> None:
-    """n′ − c_r ω′ and −c_t ṙ of body k where they act: force = bias + rate · velocity along each axis."""
+    """Add n′ − c_r ω′ and −c_t ṙ of body k where they act: force = bias + rate · velocity along each axis."""
     _set_attributes(body.add_site(), name=f"com{k}")
     biases = np.concatenate([np.zeros(3), model.moment[k]])
     rates = -np.repeat([model.drag_force[k], model.drag_moment[k]], 3)
@@ -268,7 +265,7 @@ def _add_load_actuators(spec: Any, body: Any, k: int, model: Model) -> None:
 
 
 def _principal_inertia(J: Array) -> tuple[Array, Array]:
-    """Principal inertias (3,) and the quaternion of their axes; a diagonal J stays as it is, unrounded.
+    """Return principal inertias (3,) and the quaternion of their axes; a diagonal J is not rounded.
 
     MuJoCo's own diagonalisation of a full inertia is less accurate.
     """
@@ -282,9 +279,9 @@ def _principal_inertia(J: Array) -> tuple[Array, Array]:
 
 
 def _rod_quaternion(u: Array) -> Array:
-    """A unit quaternion that turns −z into u; which one, nothing feels: the rod may turn about its axis.
+    """Return a unit quaternion that turns −z into u; the rod's turn about its own axis has no effect.
 
-    The shortest turn; for u above the horizontal after a half turn about y, away from its singularity.
+    It is the shortest turn; for u above the horizontal after half a turn about y, away from its singularity.
     """
     x, y, z = u
     q = np.array([1 - z, y, -x, 0] if z <= 0 else [-x, 0, 1 + z, -y])
@@ -292,13 +289,13 @@ def _rod_quaternion(u: Array) -> Array:
 
 
 def _to_body_frame(xmat: Array, vector: Array) -> Array:
-    """Rᵀ v of each body: xmat (N, 9), vector (N, 3)."""
+    """Return Rᵀ v of each body: xmat (N, 9), vector (N, 3)."""
     return np.asarray(np.einsum("kji,kj->ki", xmat.reshape(-1, 3, 3), vector))
 
 
 @contextmanager
 def _raise_on_warnings(d: Any) -> Iterator[None]:
-    """Any warning MuJoCo counts is a failure; its text goes into the error and not into a log file."""
+    """Raise EngineFailure for any warning that MuJoCo counts, with its text, which no log file gets."""
     texts: list[str] = []
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(texts.append)
@@ -308,3 +305,33 @@ def _raise_on_warnings(d: Any) -> Iterator[None]:
         mujoco.set_mju_user_warning(before)
     if texts or any(warning.number for warning in d.warning):
         raise EngineFailure(f"MuJoCo warned by t = {d.time:g} s: {texts[0] if texts else 'no text'}")
+
+
+# -- older versions ----------------------------------------------------------------------------------
+
+
+def _compiler_options(spec: Any) -> Any:
+    """Return the compiler's options; in 3.2.0 to 3.2.4 they are attributes of the spec itself."""
+    return getattr(spec, "compiler", spec)
+
+
+def _autoreset_flag() -> int:
+    """Return the flag that disables resets; 3.2.0 always resets, which the contract's checks report."""
+    return int(getattr(mujoco.mjtDisableBit, "mjDSBL_AUTORESET", 0))
+
+
+def _full_mass_matrix(m: Any, d: Any) -> Array:
+    """Return the dense mass matrix (nv, nv); `mj_fullM` of older versions (3.4 among them) takes others."""
+    M = np.zeros((m.nv, m.nv))
+    try:
+        mujoco.mj_fullM(m, d, M)
+    except TypeError:
+        mujoco.mj_fullM(m, M, d.qM)
+    return M
+
+
+def _set_attributes(element: Any, **attributes: Any) -> Any:
+    """Set attributes of an element of a spec; only later versions take them as arguments."""
+    for name, value in attributes.items():
+        setattr(element, name, value)
+    return element
