@@ -1,4 +1,4 @@
-"""What both Exudyn formulations share: settings, loads at a centre of mass, and a watched run."""
+"""Parts shared by both Exudyn formulations: settings, loads at a centre of mass, a run with its checks."""
 
 from __future__ import annotations
 
@@ -6,102 +6,75 @@ import contextlib
 import tempfile
 from collections.abc import Callable, Iterator
 from inspect import signature
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import exudyn
 import numpy as np
 
+from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.model.datatypes import Array, EngineFailure, Model
 
-items: Any = exudyn.itemInterface  # its constructors are untyped
-
 Sample = TypeVar("Sample")
-SUPPORTED_VERSIONS = ">=1.9,<2"
-ENGINE_ERROR: type[Exception] = getattr(exudyn, "ExudynError", RuntimeError)  # its own errors, since 1.12
+items: Any = exudyn.itemInterface  # its constructors are untyped
+Output: Any = exudyn.OutputVariableType
 
 NEWTON_TOLERANCE = 1e-12  # relative and absolute; at the engine's defaults extrapolation stops at 2e-9
 
 
-@contextlib.contextmanager
-def silence_engine() -> Iterator[None]:
-    """A scratch working directory and no console output: Exudyn writes to both."""
-    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch, contextlib.chdir(scratch):
-        if not hasattr(exudyn, "config"):  # before 1.10; it has no way to ask what was set before
-            exudyn.SetWriteToConsole(False)
-            exudyn.SuppressWarnings(True)
-            yield
-            return
-        before = exudyn.config.printToConsole, exudyn.config.suppressWarnings
-        exudyn.config.printToConsole, exudyn.config.suppressWarnings = False, True
-        try:
-            yield
-        finally:
-            exudyn.config.printToConsole, exudyn.config.suppressWarnings = before
+class ExudynAdapter(MetamorphicHooks):
+    """Declarations common to all columns of Exudyn."""
+
+    package = "exudyn"
+    supported_versions = ">=1.9,<2"
+
+    def version(self) -> str:
+        """Return the version of the Exudyn that is loaded."""
+        return _version()
 
 
 def make_system() -> tuple[Any, Any]:
-    """An empty system and the container that keeps it alive."""
+    """Make an empty system.
+
+    Returns:
+        The system, and the container that keeps it alive.
+
+    """
     container = exudyn.SystemContainer()
     return container.AddSystem(), container
 
 
 def make_settings() -> Any:
-    """Fixed steps, Newton to `NEWTON`, nothing written."""
-    chosen: Any = exudyn.SimulationSettings()
-    if hasattr(chosen, "solution"):
-        chosen.solution.file.write = False
-        chosen.solution.sensors.active = False
-    else:  # before 1.12
-        chosen.solutionSettings.writeSolutionToFile = False
-        chosen.solutionSettings.sensorsStoreAndWriteFiles = False
-    time = chosen.timeIntegration
+    """Make settings with fixed steps, Newton iterations to `NEWTON_TOLERANCE` and no files.
+
+    Returns:
+        The settings.
+
+    """
+    settings: Any = exudyn.SimulationSettings()
+    _write_no_files(settings)
+    time = settings.timeIntegration
     time.verboseMode = 0
     time.adaptiveStep = False
     time.automaticStepSize = False
     time.newton.absoluteTolerance = time.newton.relativeTolerance = NEWTON_TOLERANCE
     time.newton.maxIterations = 100  # its Jacobian leaves out C_qᵀλ's, so that taut rods converge linearly
-    return chosen
-
-
-def make_rigid_body(node: Any, mass: float, J: Array) -> Any:
-    """A body of that mass and inertia (about its centre of mass, its own axes) on a node."""
-    sizes = {"mass": mass, "inertia": [J[0, 0], J[1, 1], J[2, 2], J[1, 2], J[0, 2], J[0, 1]]}
-    if "mass" not in signature(items.ObjectRigidBody).parameters:  # before 1.12
-        sizes = {f"physics{name.capitalize()}": value for name, value in sizes.items()}
-    return items.ObjectRigidBody(nodeNumber=node, **sizes)
-
-
-def set_linear_solver(settings: Any, name: str) -> None:
-    """The linear solver of that name."""
-    kind = getattr(exudyn.LinearSolverType, name)
-    if hasattr(settings, "linearSolver"):
-        settings.linearSolver.solverType = kind
-    else:  # before 1.12
-        settings.linearSolverType = kind
-
-
-def set_rk44(settings: Any) -> None:
-    """RK44, without the accelerations at the end of a step, which nothing here reads."""
-    time, kind = settings.timeIntegration, exudyn.DynamicSolverType.RK44
-    if hasattr(time, "solverType"):
-        time.solverType = kind
-        time.explicit.computeEndOfStepAccelerations = False
-    else:  # before 1.12
-        time.explicitIntegration.dynamicSolverType = kind
-        time.explicitIntegration.computeEndOfStepAccelerations = False
-
-
-def version() -> str:
-    """Version of the Exudyn that runs."""
-    config = getattr(exudyn, "config", None)  # since 1.10
-    return str(exudyn.GetVersionString() if config is None else config.Version())
+    return settings
 
 
 def add_loads(mbs: Any, model: Model, k: int, marker: Any, ground: Any, moment: Array) -> None:
-    """Applied force (world), moment (marker's frame, turning with it) and drag at a centre-of-mass marker.
+    """Apply the loads of a body at its centre of mass, evaluated wherever the integrator evaluates forces.
 
-    All are evaluated wherever the integrator evaluates forces.  Drag is a damper to the ground with
-    isotropic damping: F = -c_t ṙ, and -c_r ω in the world is -c_r ω′ in the body.
+    Drag is a damper to the ground with isotropic damping: F = -c_t ṙ, and -c_r ω in the world is -c_r ω′ in
+    the body.
+
+    Args:
+        mbs: the system under construction.
+        model: the pendulum.
+        k: the body.
+        marker: a marker at its centre of mass.
+        ground: a marker on the ground.
+        moment: the applied moment (3,) [N m] in the marker's frame, with which it turns.
+
     """
     if np.any(model.force[k]):
         mbs.AddLoad(items.LoadForceVector(markerNumber=marker, loadVector=model.force[k].tolist()))
@@ -116,6 +89,71 @@ def add_loads(mbs: Any, model: Model, k: int, marker: Any, ground: Any, moment: 
         )
 
 
+@contextlib.contextmanager
+def initialized_solver(solver: Any, mbs: Any, settings: Any) -> Iterator[None]:
+    """Initialise a solver for a single evaluation, and finalise it at the end.
+
+    Args:
+        solver: the solver.
+        mbs: the assembled system.
+        settings: its settings.
+
+    Yields:
+        Nothing.
+
+    Raises:
+        EngineFailure: the solver could not be initialised.
+
+    """
+    if not solver.InitializeSolver(mbs, settings):
+        raise EngineFailure(f"Exudyn could not initialise its solver: {solver.GetErrorString()}")
+    try:
+        yield
+    finally:
+        solver.FinalizeSolver(mbs, settings)
+
+
+def mass_matrix_and_force(solver: Any, mbs: Any) -> tuple[Array, Array]:
+    """Evaluate M and f of M q̈ = f, without constraints.
+
+    Args:
+        solver: an initialised solver.
+        mbs: its system.
+
+    Returns:
+        M (nq, nq) and f (nq,).
+
+    """
+    solver.ComputeMassMatrix(mbs)
+    M = np.array(solver.GetSystemMassMatrix())
+    solver.ComputeODE2RHS(mbs)
+    return M, np.array(solver.GetSystemResidual())[: len(M)]
+
+
+class _StepRecorder(Generic[Sample]):
+    """The function that Exudyn calls after every step: checks, samples, and carries exceptions out."""
+
+    def __init__(
+        self, sampled_steps: set[int], read_sample: Callable[[], Sample], check_step: Callable[[float], None]
+    ) -> None:
+        self.sampled_steps, self.read_sample, self.check_step = sampled_steps, read_sample, check_step
+        self.samples = [read_sample()]
+        self.taken = 0
+        self.error: Exception | None = None
+
+    def after_step(self, _: Any, t: float) -> bool:
+        if t == 0:  # Exudyn calls once before the first step
+            return True
+        self.taken += 1
+        try:
+            self.check_step(t)
+            if self.taken in self.sampled_steps:
+                self.samples.append(self.read_sample())
+        except Exception as error:  # Exudyn would wrap it in one of its own
+            self.error = error
+        return self.error is None
+
+
 def run_solver(
     solver: Any,
     mbs: Any,
@@ -123,48 +161,153 @@ def run_solver(
     times: Array,
     step: float,
     read_sample: Callable[[], Sample],
-    check_step: Callable[[float], None] | None = None,
+    check_step: Callable[[float], None] = lambda _: None,
 ) -> list[Sample]:
-    """What ``read`` finds at each of ``times``; ``watch(t)`` is called after every step and may raise.
+    """Run a solver in fixed steps.
 
-    Raises EngineFailure with the engine's own words where a step fails, and where the number of
-    steps or the final time is not the one asked for: Exudyn reports an early stop as a success.
+    Args:
+        solver: a solver with ``SolveSystem``.
+        mbs: the assembled system.
+        settings: its settings; the number of steps and the end time are set here.
+        times: sample times (T,) [s], multiples of the step from 0.
+        step: step [s].
+        read_sample: reads a sample from the system.
+        check_step: called with the time after every step; may raise.
+
+    Returns:
+        The samples at ``times``.
+
+    Raises:
+        EngineFailure: a step failed, or the number of steps or the final time is not what was requested
+            (Exudyn reports an early stop as a success); the message ends with Exudyn's own.
+
     """
     steps = round(float(times[-1] / step))
-    wanted = set(np.rint(times / step).astype(int).tolist())
-    rows = [read_sample()]
+    recorder = _StepRecorder(set(np.rint(times / step).astype(int).tolist()), read_sample, check_step)
     if steps == 0:
-        return rows
-    taken = 0
-    stopped: Exception | None = None
-
-    def after_step(mbs: Any, t: float) -> bool:
-        nonlocal taken, stopped
-        if t == 0:  # it is called once before the first step
-            return True
-        taken += 1
-        try:
-            if check_step is not None:
-                check_step(t)
-            if taken in wanted:
-                rows.append(read_sample())
-        except Exception as error:  # carried around the engine, which would wrap it in one of its own
-            stopped = error
-        return stopped is None
-
-    mbs.SetPostStepUserFunction(after_step)
+        return recorder.samples
+    mbs.SetPostStepUserFunction(recorder.after_step)
     settings.timeIntegration.numberOfSteps = steps
     settings.timeIntegration.endTime = float(times[-1])
     try:
         finished = solver.SolveSystem(mbs, settings)
     except (RuntimeError, ValueError, ENGINE_ERROR) as error:
-        raise EngineFailure(f"Exudyn stopped after {taken} of {steps} steps: {error}") from error
-    if stopped is not None:
-        raise stopped
+        raise EngineFailure(f"Exudyn stopped after {recorder.taken} of {steps} steps: {error}") from error
+    if recorder.error is not None:
+        raise recorder.error
     end = mbs.systemData.GetTime()
-    if not finished or taken != steps or abs(end - times[-1]) > 1e-9 * times[-1]:
-        words = " ".join(str(solver.GetErrorString()).split()) or "no reason given"
+    if not finished or recorder.taken != steps or abs(end - times[-1]) > 1e-9 * times[-1]:
+        message = " ".join(str(solver.GetErrorString()).split()) or "no reason given"
         raise EngineFailure(
-            f"Exudyn stopped at t = {end} s after {taken} steps, asked for {steps} to {times[-1]} s: {words}"
+            f"Exudyn stopped at t = {end} s after {recorder.taken} steps, "
+            f"asked for {steps} to {times[-1]} s: {message}"
         )
-    return rows
+    return recorder.samples
+
+
+# -- calls that differ between versions --------------------------------------------------------------
+
+ENGINE_ERROR: type[Exception] = getattr(exudyn, "ExudynError", RuntimeError)  # its own errors, since 1.12
+
+
+def _version() -> str:
+    config = getattr(exudyn, "config", None)  # since 1.10
+    return str(exudyn.GetVersionString() if config is None else config.Version())
+
+
+@contextlib.contextmanager
+def silence_engine() -> Iterator[None]:
+    """Run in a scratch working directory without console output: Exudyn writes to both.
+
+    Yields:
+        Nothing.
+
+    """
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as scratch, contextlib.chdir(scratch):
+        if not hasattr(exudyn, "config"):  # before 1.10; the earlier setting cannot be read
+            exudyn.SetWriteToConsole(False)
+            exudyn.SuppressWarnings(True)
+            yield
+            return
+        before = exudyn.config.printToConsole, exudyn.config.suppressWarnings
+        exudyn.config.printToConsole, exudyn.config.suppressWarnings = False, True
+        try:
+            yield
+        finally:
+            exudyn.config.printToConsole, exudyn.config.suppressWarnings = before
+
+
+def _write_no_files(settings: Any) -> None:
+    if hasattr(settings, "solution"):
+        settings.solution.file.write = False
+        settings.solution.sensors.active = False
+    else:  # before 1.12
+        settings.solutionSettings.writeSolutionToFile = False
+        settings.solutionSettings.sensorsStoreAndWriteFiles = False
+
+
+def make_rigid_body(node: Any, mass: float, J: Array) -> Any:
+    """Make a rigid body.
+
+    Args:
+        node: the node that holds its coordinates.
+        mass: mass [kg].
+        J: inertia (3, 3) [kg m²] about its centre of mass, in its own axes.
+
+    Returns:
+        The item, to be added to a system.
+
+    """
+    sizes = {"mass": mass, "inertia": [J[0, 0], J[1, 1], J[2, 2], J[1, 2], J[0, 2], J[0, 1]]}
+    if "mass" not in signature(items.ObjectRigidBody).parameters:  # before 1.12
+        sizes = {f"physics{name.capitalize()}": value for name, value in sizes.items()}
+    return items.ObjectRigidBody(nodeNumber=node, **sizes)
+
+
+def kinetic_energy(mbs: Any, bodies: list[Any], quadratic_form: float) -> float:
+    """Read the kinetic energy of bodies.
+
+    Args:
+        mbs: the assembled system.
+        bodies: the bodies.
+        quadratic_form: ½ q̇ᵀ M q̇ [J] with the engine's mass matrix, for versions before 1.12, in which
+            bodies have no such output.
+
+    Returns:
+        The energy [J].
+
+    """
+    if not hasattr(Output, "KineticEnergy"):
+        return quadratic_form
+    return float(np.sum([mbs.GetObjectOutputBody(body, Output.KineticEnergy) for body in bodies]))
+
+
+def set_linear_solver(settings: Any, name: str) -> None:
+    """Choose the linear solver.
+
+    Args:
+        settings: the settings to change.
+        name: a member of ``exudyn.LinearSolverType``.
+
+    """
+    kind = getattr(exudyn.LinearSolverType, name)
+    if hasattr(settings, "linearSolver"):
+        settings.linearSolver.solverType = kind
+    else:  # before 1.12
+        settings.linearSolverType = kind
+
+
+def set_rk44(settings: Any) -> None:
+    """Choose RK44, without the accelerations at the end of a step, which nothing here reads.
+
+    Args:
+        settings: the settings to change.
+
+    """
+    time, kind = settings.timeIntegration, exudyn.DynamicSolverType.RK44
+    if hasattr(time, "solverType"):
+        time.solverType = kind
+        time.explicit.computeEndOfStepAccelerations = False
+    else:  # before 1.12
+        time.explicitIntegration.dynamicSolverType = kind
+        time.explicitIntegration.computeEndOfStepAccelerations = False
