@@ -333,23 +333,23 @@ def round_to_single_precision(c: DefectCase) -> dict[str, Array]:
 
 def velocity_term_causes(case: DefectCase) -> Iterator[Cause]:
     """Velocity terms, each with a factor that should be 1."""
-    yield Cause(multiply_fields("gyroscopic"), factor_description("the gyroscopic term (8 L̇ᵀJL̇p)"), 1.0, 1.0)
-    yield Cause(multiply_fields("near", "far", "bend"), factor_description("γ (J̇v)"), 1.0, 1.0)
+    yield Cause(multiply_fields("gyroscopic_factor"), factor_description("the gyroscopic term (8 L̇ᵀJL̇p)"), 1.0, 1.0)
+    yield Cause(multiply_fields("proximal_factor", "distal_factor", "rod_factor"), factor_description("γ (J̇v)"), 1.0, 1.0)
     if case.n > 1:
         yield Cause(
-            multiply_fields("near"),
+            multiply_fields("proximal_factor"),
             factor_description("the near term of γ (ω × ω × s of the body that hangs)"),
             1.0,
             1.0,
         )
         yield Cause(
-            multiply_fields("far"),
+            multiply_fields("distal_factor"),
             factor_description("the far term of γ (ω × ω × s of the body above)"),
             1.0,
             1.0,
         )
     if np.any(case.length):
-        yield Cause(multiply_fields("bend"), factor_description("the rod term of γ (ḋᵀḋ)"), 1.0, 1.0)
+        yield Cause(multiply_fields("rod_factor"), factor_description("the rod term of γ (ḋᵀḋ)"), 1.0, 1.0)
 
 
 BODY_PERMUTATIONS: dict[str, Callable[[Array], Array]] = {

@@ -26,7 +26,7 @@ NAMED = {name: scenario for name, scenario in NAMED.items() if scenario.closed_f
 class Case:
     """What `solution` needs of a scenario."""
 
-    exact: str | None
+    closed_form: str | None
     model: Model
     state: State
 

@@ -130,7 +130,7 @@ def test_its_accelerations_are_the_certified_ones():
 # a wrong truth is seen
 
 
-@pytest.mark.parametrize("side", ["taylor", "flow"])
+@pytest.mark.parametrize("side", ["simulate_taylor", "simulate_notes_form"])
 def test_a_billionth_too_much_mass_in_one_of_the_two_is_seen(monkeypatch, side):
     scenario = load_scenario(find_scenario_file("double-tumbling-balls"))
     usual = ground_truth.motion_truth(scenario.model, scenario.state, TIMES, None)
@@ -213,6 +213,6 @@ def test_a_worker_has_room_for_it():
 
 def test_sympy_is_hidden_only_while_heyoka_is_imported():
     """It would take two seconds; later it must be there for Kane's equations."""
-    seen = "import sys; from plumbline.truth.taylor import heyoka; heyoka(); print('sympy' in sys.modules)"
+    seen = "import sys; from plumbline.truth.taylor import load_heyoka; load_heyoka(); print('sympy' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", seen], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
