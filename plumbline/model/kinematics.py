@@ -27,6 +27,35 @@ def rotation_matrix(p: Array) -> Array:
     return np.asarray(np.stack([np.stack(row, -1) for row in rows], -2) / s[..., None, None])
 
 
+def rotate_vectors(A: Array, v: Array) -> Array:
+    """Multiply matrices and vectors pairwise: A v.
+
+    Args:
+        A: (..., 3, 3) matrices, for example rotations body → world; inertias and their like do as well.
+        v: (..., 3) vectors.
+
+    Returns:
+        (..., 3) products.
+
+    """
+    return np.asarray((A @ v[..., None])[..., 0])
+
+
+def cross_matrix(s: Array) -> Array:
+    """Return the skew-symmetric matrix s̃ with s̃ v = s × v.
+
+    Args:
+        s: (..., 3) vectors.
+
+    Returns:
+        (..., 3, 3) matrices.
+
+    """
+    half = np.zeros((*s.shape, 3))
+    half[..., 0, 1], half[..., 0, 2], half[..., 1, 2] = -s[..., 2], s[..., 1], -s[..., 0]
+    return half - half.swapaxes(-1, -2)
+
+
 def quaternion_product(a: Array, b: Array) -> Array:
     """Quaternion product a b, (..., 4) each, scalar first: rotation(a b) = rotation(a) rotation(b)."""
     aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]

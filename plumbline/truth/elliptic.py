@@ -1,7 +1,8 @@
 """Jacobi's elliptic functions and Legendre's integrals from the complementary parameter m₁ = 1 − m.
 
-scipy takes m alone, which loses the digits of 1 − m near a separatrix (a pendulum close to upright, a
-brick spun about its middle axis), so the functions are built here from the arithmetic-geometric mean.
+SciPy takes m alone, which loses the digits of 1 − m near a separatrix (a pendulum close to upright, a brick
+spun about its middle axis), so the functions are computed here from the arithmetic-geometric mean and from
+Carlson's symmetric integrals.
 """
 
 from __future__ import annotations
@@ -13,7 +14,18 @@ from plumbline.model.datatypes import Array
 
 
 def jacobi(u: Array, m1: float) -> tuple[Array, Array, Array, Array]:
-    """(sn, cn, dn, am) (T,) of u (T,), 0 ≤ m1 ≤ 1.  Abramowitz & Stegun 16.4 (descending Landen)."""
+    """Evaluate Jacobi's functions by descending Landen transformations.
+
+    DLMF § 22.20(ii), Abramowitz & Stegun 16.4; for m₁ = 0 the hyperbolic limits of DLMF Table 22.5.4.
+
+    Args:
+        u: (T,) arguments.
+        m1: complementary parameter 1 − m, 0 ≤ m1 ≤ 1.
+
+    Returns:
+        sn, cn, dn and the amplitude am, each (T,).
+
+    """
     u = np.asarray(u, dtype=float)
     if m1 == 0:
         sech = 1 / np.cosh(u)
@@ -29,28 +41,48 @@ def jacobi(u: Array, m1: float) -> tuple[Array, Array, Array, Array]:
 
 
 def elliptic_f(phi: Array | float, m1: float) -> Array:
-    """F(φ | m), Legendre's integral of the first kind, every φ.  DLMF 19.25.5, Carlson's R_F."""
-    turns, s, c = _reduce_angle(phi)
+    """Evaluate F(φ | m), Legendre's integral of the first kind, by DLMF 19.25.5 and Carlson's R_F.
+
+    Args:
+        phi: amplitudes of any shape [rad], of any size.
+        m1: complementary parameter 1 − m, 0 ≤ m1 ≤ 1.
+
+    Returns:
+        The integral, with the shape of ``phi``.
+
+    """
+    half_turns, s, c = _reduce_angle(phi)
     part = s * elliprf(c * c, c * c + m1 * s * s, 1.0)
-    return np.asarray(part + 2 * turns * elliprf(0.0, m1, 1.0) if np.any(turns) else part)
+    return np.asarray(part + 2 * half_turns * elliprf(0.0, m1, 1.0) if np.any(half_turns) else part)
 
 
 def elliptic_pi(n: float, phi: Array | float, m1: float) -> Array:
-    """Π(n; φ | m) = ∫ dφ / ((1 − n sin²φ) √(1 − m sin²φ)), n < 1, every φ.  DLMF 19.25.14."""
-    turns, s, c = _reduce_angle(phi)
+    """Evaluate Π(n; φ | m) = ∫ dφ / ((1 − n sin²φ) √(1 − m sin²φ)) by DLMF 19.25.14.
+
+    Args:
+        n: characteristic, n < 1.
+        phi: amplitudes of any shape [rad], of any size.
+        m1: complementary parameter 1 − m, 0 ≤ m1 ≤ 1.
+
+    Returns:
+        The integral, with the shape of ``phi``.
+
+    """
+    half_turns, s, c = _reduce_angle(phi)
     part = _elliptic_pi_reduced(n, s, c, m1)
-    whole = _elliptic_pi_reduced(n, np.ones(1), np.zeros(1), m1)[0] if np.any(turns) else 0.0
-    return np.asarray(part + 2 * turns * whole)
+    complete = _elliptic_pi_reduced(n, np.ones(1), np.zeros(1), m1)[0] if np.any(half_turns) else 0.0
+    return np.asarray(part + 2 * half_turns * complete)
 
 
 def _elliptic_pi_reduced(n: float, s: Array, c: Array, m1: float) -> Array:
+    """Π from the sine and cosine of an amplitude in [−π/2, π/2]."""
     d, q = c * c + m1 * s * s, c * c + (1 - n) * s * s
     return np.asarray(s * elliprf(c * c, d, 1.0) + n / 3 * s**3 * elliprj(c * c, d, 1.0, q))
 
 
 def _reduce_angle(phi: Array | float) -> tuple[Array, Array, Array]:
-    """Half turns, and sine and cosine of the rest, which lies in [−π/2, π/2]."""
+    """Number of half turns, and sine and cosine of the remainder in [−π/2, π/2]."""
     phi = np.asarray(phi, dtype=float)
-    turns = np.round(phi / np.pi)
-    sign = np.where(turns % 2 == 0, 1.0, -1.0)
-    return turns, sign * np.sin(phi), np.abs(np.cos(phi))
+    half_turns = np.round(phi / np.pi)
+    sign = np.where(half_turns % 2 == 0, 1.0, -1.0)
+    return half_turns, sign * np.sin(phi), np.abs(np.cos(phi))

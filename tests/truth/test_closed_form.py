@@ -24,7 +24,7 @@ NAMED = {name: scenario for name, scenario in NAMED.items() if scenario.closed_f
 
 @dataclass(frozen=True)
 class Case:
-    """What `solution` needs of a scenario."""
+    """The part of a scenario that `closed_form_motion` reads."""
 
     closed_form: str | None
     model: Model

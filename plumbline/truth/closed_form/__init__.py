@@ -1,0 +1,71 @@
+"""Closed-form motions, independent of every engine and of the notes' equations.
+
+`closed_form_motion` takes a scenario that names its closed form, checks that the scenario fulfils the
+conditions of that motion, and returns the motion as a function of time.  One module per family: planar
+pendulum, heavy symmetric top (and spherical pendulum), free top, steady motions (equilibria and conical
+motions), small oscillations.  After 2 s the results are accurate to 3e-15 m and 2e-14 rad for the scenarios
+of the catalogue; an axis that passes the vertical at an angle δ loses a factor 1/δ² in its azimuth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+from plumbline.model.datatypes import Model, State
+from plumbline.truth.closed_form.free_top import free_top
+from plumbline.truth.closed_form.heavy_top import lagrange_top, spherical_pendulum
+from plumbline.truth.closed_form.motion import ClosedFormMismatch, ClosedFormMotion
+from plumbline.truth.closed_form.planar_pendulum import planar_pendulum
+from plumbline.truth.closed_form.small_oscillation import small_oscillation
+from plumbline.truth.closed_form.steady_motion import equilibrium, steady_rotation
+
+__all__ = [
+    "CLOSED_FORMS", "ClosedFormMismatch", "ClosedFormMotion", "ClosedFormScenario", "closed_form_motion",
+]  # fmt: skip
+
+CLOSED_FORMS: dict[str, Callable[[Model, State], ClosedFormMotion]] = {
+    "planar-pendulum": planar_pendulum,
+    "spherical-pendulum": spherical_pendulum,
+    "lagrange-top": lagrange_top,
+    "free-top": free_top,
+    "conical": steady_rotation,
+    "double-conical": steady_rotation,
+    "small-double": small_oscillation,
+    "small-chain": small_oscillation,
+    "rest": equilibrium,
+}
+
+
+class ClosedFormScenario(Protocol):
+    """The part of a scenario that `closed_form_motion` reads."""
+
+    @property
+    def closed_form(self) -> str | None:
+        """Key of `CLOSED_FORMS`, or None where the scenario has no closed form."""
+
+    @property
+    def model(self) -> Model:
+        """Mechanism of the scenario."""
+
+    @property
+    def state(self) -> State:
+        """Initial state."""
+
+
+def closed_form_motion(scenario: ClosedFormScenario) -> ClosedFormMotion | None:
+    """Return the closed-form motion that a scenario names.
+
+    Args:
+        scenario: its model and initial state must be the motion that ``closed_form`` names.
+
+    Returns:
+        The motion; None where the scenario names no closed form.
+
+    Raises:
+        ClosedFormMismatch: the scenario violates a condition of its closed form.
+
+    """
+    if scenario.closed_form is None:
+        return None
+    return CLOSED_FORMS[scenario.closed_form](scenario.model, scenario.state)
