@@ -1,20 +1,20 @@
-"""The state-level tolerance: a first-order rounding bound per body and quantity.
+"""The tolerance of the state level: a first-order rounding bound per body and quantity.
 
-An engine that evaluates the Newton–Euler equations of the chain in double precision commits
-roundings of a few kinds; each kind is pushed through the inverse of the system and summed:
+An engine that evaluates the Newton–Euler equations of the chain in double precision commits a few kinds of
+roundings.  Each kind is propagated through the inverse of the system, and the results are added:
 
-    tolerance = 64 ε (tB + tS + tJ + d)        ε = 2⁻⁵³
+    tolerance = 64 ε (tB + tS + tJ + d),    ε = 2⁻⁵³
 
-    tB  the terms of each row, rounded once, and the answer itself
+    tB  every term of each equation, rounded once, and the result itself
     tS  elimination onto the joints: the terms of C M⁻¹ f
     tJ  joint-space engines: the terms of M q̈ + h, as torque pairs at the joints
     d   accumulation of accelerations and forces along the chain
 
-A part for rods held as differences of positions changed no worst ratio in 1,500 random chains (masses over
-1e±3, rods of 1e-5 … 1e-2 m, needles, tiny inertias, long levers), so there is none: tJ is above it.  Without
-tJ joint-space engines are 1e7 above the rest, without tS maximal coordinates 1e4 (needles).
+A fifth part tX, for rods held as differences of positions, changed no worst ratio in 1,500 random chains
+(masses over 1e±3, rods of 1e-5 … 1e-2 m, needles, tiny inertias, long levers) and is left out: tJ is above
+it.  Without tJ joint-space engines exceed the bound by 1e7, without tS maximal coordinates by 1e4 (needles).
 
-Every part is homogeneous in each unit, so the bound over its quantity's scale does not change when
+Every part is homogeneous in each unit, so the ratio of the bound to its quantity's scale does not change when
 lengths, masses or times are measured in other units.  World frame throughout: A ω̇′ has the norm of ω̇′.
 """
 
@@ -26,21 +26,21 @@ from typing import cast
 import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import rotation_matrix
+from plumbline.model.kinematics import cross_matrix, rotate_vectors, rotation_matrix
 from plumbline.model.welding import BodyParts, part_offsets
 
 EPS = 2.0**-53
-ROUNDING_FACTOR = 64  # state quantities: worst honest error seen is about a sixth of it (tests/truth/test_rounding_bound.py)
-SUM_ROUNDING_FACTOR = 256  # energies and momenta
+ROUNDING_FACTOR = 64  # state quantities; the worst error of a sound engine is about a sixth of it (tests)
+SUM_ROUNDING_FACTOR = 256  # energies, momenta, entries of the mass matrix
 MAX_RELATIVE_BOUND = 1e-8  # a tolerance above this fraction of its scale could hide a mistake
 
 
 @dataclass(frozen=True, eq=False)
 class RoundingBound:
-    """Tolerances for one state; differences of 3-vectors are compared by their Euclidean norm.
+    """Tolerances at one state; differences of 3-vectors are compared by their Euclidean norm.
 
-    ``scale`` holds, per field, what the tolerance is relative to: max(‖r̈‖, g), the largest moment of the
-    body's Euler equation over |J|, max(‖F‖, m g), and the sums of magnitudes behind the scalars.
+    ``scale`` holds per field what the tolerance is relative to: max(‖r̈‖, g), the largest moment in the body's
+    Euler equation over |J|, max(‖F‖, m g), and the sums of magnitudes behind the scalars.
     """
 
     acceleration: Array  # (N,) m/s²
@@ -48,126 +48,188 @@ class RoundingBound:
     joint_reaction: Array  # (N,) N
     kinetic_energy: float  # J
     potential_energy: float  # J
-    angular_momentum: float  # kg m²/s, of the norm of the difference
+    angular_momentum: float  # kg m²/s
     mass_matrix: float  # kg m², of each entry
     scale: dict[str, Array | float]
 
     def tolerance(self, quantity: str) -> Array | float:
-        """The tolerance of that name: (N,) or a number."""
+        """Look up a tolerance by the name of its quantity.
+
+        Args:
+            quantity: a field of `StateQuantities`.
+
+        Returns:
+            (N,) per body for vectors per body, else one number, in the unit of the quantity.
+
+        """
         return cast("Array | float", getattr(self, quantity))
 
     def relative_bound(self, quantity: str) -> float:
-        """Largest tolerance over its scale; above `BLUNT` a comparison proves little."""
+        """Return the largest ratio of a tolerance to its scale.
+
+        Args:
+            quantity: a field of `StateQuantities`.
+
+        Returns:
+            The ratio; above `MAX_RELATIVE_BOUND` agreement would prove little.
+
+        """
         tolerance, scale = np.asarray(self.tolerance(quantity)), np.asarray(self.scale[quantity])
         return float(np.max(tolerance / np.where(scale > 0, scale, 1.0), initial=0.0, where=scale > 0))
 
     def describe(self, quantity: str) -> str:
-        """One sentence: how the tolerance of that quantity came about."""
-        worst = float(np.max(self.tolerance(quantity)))
+        """Explain in one sentence how a tolerance was derived.
+
+        Args:
+            quantity: a field of `StateQuantities`.
+
+        Returns:
+            The sentence, with the largest tolerance and its ratio to the scale.
+
+        """
         if quantity in ("acceleration", "angular_acceleration", "joint_reaction"):
             how = (
-                f"{ROUNDING_FACTOR} roundings (2^-53) of the largest terms of the Newton-Euler equations, of their "
-                "elimination onto the joints and of the joint-space form, each carried through the inverse"
+                f"{ROUNDING_FACTOR} roundings (2^-53) of the largest terms of the Newton-Euler equations, of "
+                "their elimination onto the joints and of the joint-space form, each propagated through the "
+                "inverse"
             )
         else:
             how = f"{SUM_ROUNDING_FACTOR} roundings (2^-53) of the sum of the magnitudes of its terms"
-        return f"{how}: at most {worst:.1e}, {self.relative_bound(quantity):.1e} of its scale"
+        largest = float(np.max(self.tolerance(quantity)))
+        return f"{how}: at most {largest:.1e}, {self.relative_bound(quantity):.1e} of its scale"
 
 
 def state_rounding_bound(model: Model, state: State, parts: BodyParts | None = None) -> RoundingBound:
-    """Rounding tolerances of every state quantity of ``model`` at ``state`` (SI units, norms).
+    """Compute the rounding tolerances of every state quantity.
 
-    ``parts``: of what an engine welds the bodies.  Its terms are those of a piece then: the levers and
-    accelerations of one whose centre is c off, longer by ‖c‖ and ‖c‖(‖ω̇‖ + ‖ω‖W), on the mass and least
-    inertia of the lightest; and the weld carries the weight and inertia of a piece, with the lever c.
+    Args:
+        model: the mechanism; masses > 0, inertias positive definite.
+        state: the state at which quantities are compared.
+        parts: the rigid parts that an engine welds each body from, where it does.  The terms are those of a
+            part then: for a part whose centre is c away, levers are longer by ‖c‖ and accelerations by
+            ‖c‖(‖ω̇‖ + ‖ω‖W), mass and least inertia are those of the lightest part, and the weld carries the
+            weight and inertia of a part with the lever c.
 
-    Needs m > 0 and a positive definite inertia; raises numpy's LinAlgError on a singular system.
+    Returns:
+        The tolerances, in SI units, and their scales.
+
+    Raises:
+        LinAlgError: the system is singular.
+
     """
     system = _NewtonEulerSystem(model, state)
-    body, norm, rods, m = np.arange(model.n), np.linalg.norm, model.rods, model.mass
-    sp, sd, omega, a, alpha = system.sp, system.sd, system.omega, system.acceleration, system.alpha
-    u, g = state.u, float(norm(model.gravity))
-    J, J_min = norm(model.inertia, axis=(1, 2)), np.linalg.eigvalsh(model.inertia)[:, 0]
-    load, torque = norm(system.load, axis=1), norm(system.torque, axis=1)
-
-    # ---- sizes of the terms
-    nA, nAlpha, nOmega, nF = (norm(x, axis=1) for x in (a, alpha, omega, system.F))
-    sp_n, sd_n, rod_rate = norm(sp, axis=1), norm(sd, axis=1), np.where(rods, norm(state.udot, axis=1), 0.0)
-    W = np.maximum.accumulate(np.maximum(nOmega, rod_rate))
-    arm, light, weld = np.zeros(model.n), m, np.zeros(model.n)
-    if parts is not None:
-        arm, light = part_offsets(parts), np.array([min(part.mass for part in pieces) for pieces in parts])
-        inertias = np.array([[part.inertia for part in pieces] for pieces in parts])
-        J_min = np.min(np.linalg.eigvalsh(inertias), axis=(1, 2))
-        nA, sp_n, sd_n = nA + arm * (nAlpha + nOmega * W), sp_n + arm, sd_n + arm
-        weld = m * (nA + g)
-    nF_next, spin = _shift_up(nF), J * nOmega * W
-    reach = np.maximum(sp_n * nAlpha, sp_n * nOmega * W)
-    hang = np.maximum(nA, np.maximum(sd_n * nAlpha, sd_n * nOmega * W))
-    force = np.max([m * nA, m * g, nF, nF_next, load], 0)
-    moment = np.max([J * nAlpha, spin, sp_n * nF, sd_n * nF_next, torque, arm * weld], 0)
-    joint = np.max([nA, reach, _shift_down(hang), np.where(rods, model.length * rod_rate * W, 0.0)], 0)
-    answer = np.stack([np.maximum(nA, g), nAlpha, nF], 1)
-
-    B = system.block_norms()
-    tB = _propagate_errors(B, force, moment, joint) + answer
-
-    free = (nF + nF_next + m * g + weld) / light
-    turn = (sp_n * nF + sd_n * nF_next + spin + torque) / J_min
-    tS = _propagate_errors(B, 0 * m, 0 * m, free + sp_n * turn + _shift_down(free + sd_n * turn))
-
-    # ---- joint space: one joint per ball, two per rod (where it hangs, and its tip)
-    of_body = np.concatenate([body[rods], body])  # the body below each joint
-    tip = state.r + sp
-    at = np.concatenate([(tip - model.length[:, None] * u)[rods], tip])
-    below = of_body[:, None] <= body  # (joints, N)
-    D = np.where(below, norm(at[:, None] - state.r, axis=2) + arm, 0.0)
-
-    def relative(own: Array, rod: Array) -> Array:
-        """Norms (joints,) of what each joint turns by: rods against the body above, bodies against either."""
-        above = _shift_down(own)
-        turns = np.concatenate([(rod - above)[rods], own - np.where(rods[:, None], rod, above)])
-        return np.asarray(norm(turns, axis=1))
-
-    joint_rate, joint_acc = (
-        relative(omega, np.cross(u, state.udot)),
-        relative(alpha, system.rod_angular_acceleration()),
+    terms = _TermSizes(model, state, system, parts)
+    joints = _JointSpaceTerms(model, state, system, terms)
+    m, J, g = terms.m, terms.J, terms.g
+    moment = np.max(
+        [
+            J * terms.alpha,
+            terms.spin,
+            terms.sp * terms.F,
+            terms.sd * terms.F_next,
+            terms.torque,
+            terms.arm * terms.weld,
+        ],
+        0,
     )
-    mass_scale = (D * m) @ D.T + (below * J) @ below.T
-    drive = below @ (J * W**2 + torque) + D @ (m * (g + nA) + load)
-    tau = mass_scale @ joint_acc + drive
-    tJ = np.einsum("jnq,j->nq", system.torque_pair_responses(), tau)
+    result = np.stack([np.maximum(terms.a, g), terms.alpha, terms.F], 1)
+    tB = system.propagate(terms.force(), moment, terms.joint()) + result
+    tS = system.propagate(0 * m, 0 * m, terms.elimination())
+    tJ = np.einsum("jnq,j->nq", system.torque_pair_responses(), joints.torque)
+    swing = joints.D.T @ joints.acceleration
+    turning = joints.is_below.T @ joints.acceleration
+    carried = np.cumsum((m * (terms.a + swing + g))[::-1])[::-1]
+    d = np.stack([swing + terms.a, turning, carried], 1)
+    total = ROUNDING_FACTOR * EPS * (tB + tS + tJ + d)
 
-    swing = D.T @ joint_acc
-    carried = m * (nA + swing + g)
-    along = np.stack([swing + nA, below.T @ joint_acc, np.cumsum(carried[::-1])[::-1]], 1)
+    rate, speed = joints.is_below.T @ joints.rate, joints.D.T @ joints.rate
+    lever = np.cumsum(terms.sp + model.length) + _from_previous(np.cumsum(terms.sd))
+    sums = {
+        "kinetic_energy": float(0.5 * np.sum(m * speed**2 + J * rate**2)),
+        "potential_energy": float(g * np.sum(m * lever)),
+        "angular_momentum": float(np.sum(m * lever * speed + J * rate)),
+        "mass_matrix": float(np.max(joints.mass_matrix)),
+    }
+    scale = {
+        "acceleration": result[:, 0],
+        "angular_acceleration": np.max([terms.alpha, moment / J, turning], 0),
+        "joint_reaction": np.maximum(terms.F, m * g),
+    }
+    bounds = {name: SUM_ROUNDING_FACTOR * EPS * size for name, size in sums.items()}
+    return RoundingBound(*total.T, **bounds, scale=scale | sums)
 
-    total = ROUNDING_FACTOR * EPS * (tB + tS + tJ + along)
-    rate, speed = below.T @ joint_rate, D.T @ joint_rate
-    lever = np.cumsum(sp_n + np.where(rods, model.length, 0.0)) + _shift_down(np.cumsum(sd_n))
-    kinetic = float(0.5 * np.sum(m * speed**2 + J * rate**2))
-    potential = float(g * np.sum(m * lever))
-    momentum = float(np.sum(m * lever * speed + J * rate))
-    mass_entry = float(np.max(mass_scale))
-    summed = SUM_ROUNDING_FACTOR * EPS
-    return RoundingBound(
-        acceleration=total[:, 0],
-        angular_acceleration=total[:, 1],
-        joint_reaction=total[:, 2],
-        kinetic_energy=summed * kinetic,
-        potential_energy=summed * potential,
-        angular_momentum=summed * momentum,
-        mass_matrix=summed * mass_entry,
-        scale={
-            "acceleration": answer[:, 0],
-            "angular_acceleration": np.max([nAlpha, moment / J, below.T @ joint_acc], 0),
-            "joint_reaction": np.maximum(nF, m * g),
-            "kinetic_energy": kinetic,
-            "potential_energy": potential,
-            "angular_momentum": momentum,
-            "mass_matrix": mass_entry,
-        },
-    )
+
+class _TermSizes:
+    """Magnitudes (N,) of the terms in the equations of each body, with norms named as their vectors."""
+
+    def __init__(
+        self, model: Model, state: State, system: _NewtonEulerSystem, parts: BodyParts | None
+    ) -> None:
+        norm, n = np.linalg.norm, model.n
+        self.m, self.g, self.J = model.mass, float(norm(model.gravity)), norm(model.inertia, axis=(1, 2))
+        vectors = system.acceleration, system.alpha, system.omega, system.F, system.sp, system.sd
+        self.a, self.alpha, self.omega, self.F, self.sp, self.sd = (norm(x, axis=1) for x in vectors)
+        self.load, self.torque = norm(system.load, axis=1), norm(system.torque, axis=1)
+        self.lightest, self.least_inertia = self.m, np.linalg.eigvalsh(model.inertia)[:, 0]
+        self.arm = self.weld = np.zeros(n)  # lever and force of the weld
+        rod_rate = np.where(model.rods, norm(state.udot, axis=1), 0.0)
+        self.W = np.maximum.accumulate(
+            np.maximum(self.omega, rod_rate)
+        )  # largest rate from the pivot to here
+        self.centripetal_rod = model.length * rod_rate * self.W
+        if parts is not None:
+            self.arm = part_offsets(parts)
+            self.lightest = np.array([min(part.mass for part in pieces) for pieces in parts])
+            inertias = np.array([[part.inertia for part in pieces] for pieces in parts])
+            self.least_inertia = np.min(np.linalg.eigvalsh(inertias), axis=(1, 2))
+            self.a = self.a + self.arm * (self.alpha + self.omega * self.W)
+            self.sp, self.sd = self.sp + self.arm, self.sd + self.arm
+            self.weld = self.m * (self.a + self.g)
+        self.F_next = np.append(self.F[1:], 0.0)
+        self.spin = self.J * self.omega * self.W
+
+    def force(self) -> Array:
+        """Largest term of each Newton equation [N]."""
+        return np.asarray(np.max([self.m * self.a, self.m * self.g, self.F, self.F_next, self.load], 0))
+
+    def joint(self) -> Array:
+        """Largest term of each joint's acceleration equation [m/s²]."""
+        near, far = (np.max([self.a, s * self.alpha, s * self.omega * self.W], 0) for s in (self.sp, self.sd))
+        return np.asarray(np.max([near, _from_previous(far), self.centripetal_rod], 0))
+
+    def elimination(self) -> Array:
+        """Terms of C M⁻¹ f in each joint's equation [m/s²]."""
+        free = (self.F + self.F_next + self.m * self.g + self.weld) / self.lightest
+        turn = (self.sp * self.F + self.sd * self.F_next + self.spin + self.torque) / self.least_inertia
+        return np.asarray(free + self.sp * turn + _from_previous(free + self.sd * turn))
+
+
+class _JointSpaceTerms:
+    """Terms of M q̈ + h with one joint per ball and two per rod (its upper end, and its tip).
+
+    Joints are ordered as in `_NewtonEulerSystem.torque_pair_responses`.
+    """
+
+    def __init__(self, model: Model, state: State, system: _NewtonEulerSystem, terms: _TermSizes) -> None:
+        norm, rods, body = np.linalg.norm, model.rods, np.arange(model.n)
+        tip = state.r + system.sp
+        position = np.concatenate([(tip - model.length[:, None] * state.u)[rods], tip])
+        self.is_below = np.concatenate([body[rods], body])[:, None] <= body  # (joints, N)
+        distance = norm(position[:, None] - state.r, axis=2) + terms.arm
+        self.D = np.where(self.is_below, distance, 0.0)  # (joints, N) m, joint to centre
+
+        def relative(of_body: Array, of_rod: Array) -> Array:
+            """Norms (joints,): rods against the body above, bodies against their rod or the body above."""
+            above = _from_previous(of_body)
+            turns = [(of_rod - above)[rods], of_body - np.where(rods[:, None], of_rod, above)]
+            return np.asarray(norm(np.concatenate(turns), axis=1))
+
+        self.rate = relative(system.omega, np.cross(state.u, state.udot))
+        self.acceleration = relative(system.alpha, system.rod_angular_acceleration())
+        m, J = terms.m, terms.J
+        self.mass_matrix = (self.D * m) @ self.D.T + (self.is_below * J) @ self.is_below.T
+        h = self.is_below @ (J * terms.W**2 + terms.torque) + self.D @ (m * (terms.g + terms.a) + terms.load)
+        self.torque = self.mass_matrix @ self.acceleration + h
 
 
 class _NewtonEulerSystem:
@@ -177,7 +239,7 @@ class _NewtonEulerSystem:
 
         M x − Cᵀ λ = f,    C x = γ,    K = C M⁻¹ Cᵀ
 
-    ``columns`` (N, 3, 3, 9N): r̈, α, F of each body per unit of each row (6N of f, then 3N of γ).
+    ``inverse_columns`` (N, 3, 3, 9N): r̈, α, F of each body per unit of each row (6N of f, then 3N of γ).
     """
 
     def __init__(self, model: Model, state: State) -> None:
@@ -185,25 +247,25 @@ class _NewtonEulerSystem:
         A = rotation_matrix(state.p)
         inertia = A @ model.inertia @ A.mT
         self.n, self.rods, self.u, self.length = n, rods, state.u, model.length
-        self.sp, self.sd = _rotate_vectors(A, model.proximal), _rotate_vectors(A, model.distal)
-        self.sd[-1] = 0.0  # nothing hangs there
-        self.omega = omega = _rotate_vectors(A, state.omega)
+        self.sp, self.sd = rotate_vectors(A, model.proximal), rotate_vectors(A, model.distal)
+        self.sd[-1] = 0.0  # nothing is attached there
+        self.omega = omega = rotate_vectors(A, state.omega)
         self.load = model.force - model.drag_force[:, None] * state.v
-        self.torque = _rotate_vectors(A, model.moment) - model.drag_moment[:, None] * omega
+        self.torque = rotate_vectors(A, model.moment) - model.drag_moment[:, None] * omega
 
         E = np.where(rods[:, None, None], state.u[:, :, None] * np.array([1.0, 0.0, 0.0]), np.eye(3))
         C = np.zeros((n, 3, n, 6))
-        C[body, :, body, :3], C[body, :, body, 3:] = E.mT, -E.mT @ _cross_matrices(self.sp)
+        C[body, :, body, :3], C[body, :, body, 3:] = E.mT, -E.mT @ cross_matrix(self.sp)
         up, down = body[1:], body[:-1]
-        C[up, :, down, :3], C[up, :, down, 3:] = -E[1:].mT, E[1:].mT @ _cross_matrices(self.sd[:-1])
+        C[up, :, down, :3], C[up, :, down, 3:] = -E[1:].mT, E[1:].mT @ cross_matrix(self.sd[:-1])
         M_inverse = np.zeros((n, 6, n, 6))
         M_inverse[body, :3, body, :3] = np.eye(3) / model.mass[:, None, None]
         M_inverse[body, 3:, body, 3:] = np.linalg.inv(inertia)
         C_flat, M_flat = C.reshape(3 * n, 6 * n), M_inverse.reshape(6 * n, 6 * n)
         CM = C_flat @ M_flat
-        held = np.repeat(~rods, 3).reshape(n, 3) | (np.arange(3) == 0)  # a rod fills one of its three rows
+        held = np.repeat(~rods, 3).reshape(n, 3) | (np.arange(3) == 0)  # a rod uses one of its three rows
         K = CM @ C_flat.T + np.diag(~held.ravel())
-        d = 1 / np.sqrt(np.diag(K))  # equilibrated: units must not decide what a pivot is
+        d = 1 / np.sqrt(np.diag(K))  # equilibrated: pivots must not depend on the units
         K_inverse = np.linalg.inv(K * d * d[:, None]) * d * d[:, None] * np.outer(held, held)
         X = CM.T @ K_inverse
         x_rows = np.concatenate([M_flat - X @ CM, X], 1).reshape(n, 2, 3, 9 * n)
@@ -213,29 +275,33 @@ class _NewtonEulerSystem:
         self.centripetal_p, self.centripetal_d = (
             np.cross(omega, np.cross(omega, s)) for s in (self.sp, self.sd)
         )
-        gamma = (E.mT @ (_shift_down(self.centripetal_d) - self.centripetal_p)[..., None])[..., 0]
+        gamma = (E.mT @ (_from_previous(self.centripetal_d) - self.centripetal_p)[..., None])[..., 0]
         gamma[:, 0] -= np.where(rods, model.length * np.sum(state.udot**2, -1), 0.0)
         force = model.mass[:, None] * model.gravity + self.load
-        moment = self.torque - np.cross(omega, _rotate_vectors(inertia, omega))
+        moment = self.torque - np.cross(omega, rotate_vectors(inertia, omega))
         rows = np.concatenate([np.concatenate([force, moment], -1).ravel(), gamma.ravel()])
         self.acceleration, self.alpha, self.F = np.moveaxis(self.inverse_columns @ rows, 1, 0)  # (N, 3) each
 
-    def block_norms(self) -> Array:
-        """B (N, 3, N, 3): Frobenius norms of the blocks of the inverse, rows (r̈, α, F), columns (f, n, γ)."""
+    def propagate(self, force: Array, moment: Array, joint: Array) -> Array:
+        """First-order change (N, 3) of r̈, α and F for errors of these sizes (N,) in the three rows per body.
+
+        The Frobenius norms of the 3×3 blocks of the inverse, times the errors.
+        """
         n, norm = self.n, np.linalg.norm
-        of_x = norm(self.inverse_columns[..., : 6 * n].reshape(n, 3, 3, n, 2, 3), axis=(2, 5))
+        of_body = norm(self.inverse_columns[..., : 6 * n].reshape(n, 3, 3, n, 2, 3), axis=(2, 5))
         of_joint = norm(self.inverse_columns[..., 6 * n :].reshape(n, 3, 3, n, 1, 3), axis=(2, 5))
-        return np.concatenate([of_x, of_joint], -1)
+        B = np.concatenate([of_body, of_joint], -1)
+        return np.asarray(np.einsum("nqkc,kc->nq", B, np.stack([force, moment, joint], 1)))
 
     def rod_angular_acceleration(self) -> Array:
         """Angular acceleration (N, 3) of each rod without axial spin, u × d̈/ℓ; 0 for a ball."""
         near = self.acceleration + np.cross(self.alpha, self.sp) + self.centripetal_p
         far = self.acceleration + np.cross(self.alpha, self.sd) + self.centripetal_d
         ell = np.where(self.rods, self.length, np.inf)[:, None]
-        return np.cross(self.u, near - _shift_down(far)) / ell
+        return np.cross(self.u, near - _from_previous(far)) / ell
 
     def torque_pair_responses(self) -> Array:
-        """(joints, N, 3): norms of the answers to a unit torque pair at each joint, rods' upper joints first.
+        """Norms (joints, N, 3) of the response to a unit torque pair at each joint, rods' upper joints first.
 
         A torque τ on a massless rod is balanced by forces ∓(τ × u)/ℓ at its ends.
         """
@@ -243,8 +309,8 @@ class _NewtonEulerSystem:
         force, moment = np.moveaxis(wrench[..., 0, :], 3, 0), np.moveaxis(wrench[..., 1, :], 3, 0)
 
         def push(k: int, s: Array) -> Array:
-            """Answer (N, 3, 3, 3) to a force at a point of body k."""
-            return np.asarray(force[k] + moment[k] @ _cross_matrices(s[None])[0])
+            """Response (N, 3, 3, 3) to a force at a point of body k."""
+            return np.asarray(force[k] + moment[k] @ cross_matrix(s))
 
         upper, lower = [], []
         for k in range(self.n):
@@ -253,34 +319,12 @@ class _NewtonEulerSystem:
                 lower.append(moment[k] - above)
                 continue
             ends = push(k, self.sp[k]) - (push(k - 1, self.sd[k - 1]) if k else 0.0)
-            through = -ends @ _cross_matrices(self.u[k][None])[0] / self.length[k]  # (τ × u)/ℓ = −ũ τ/ℓ
+            through = -ends @ cross_matrix(self.u[k]) / self.length[k]  # (τ × u)/ℓ = −ũ τ/ℓ
             upper.append(through - above)
             lower.append(moment[k] - through)
         return np.asarray(np.linalg.norm(np.array(upper + lower), axis=(3, 4)))
 
 
-def _rotate_vectors(A: Array, s: Array) -> Array:
-    """A s per body, (N, 3, 3) and (N, 3)."""
-    return (A @ s[..., None])[..., 0]
-
-
-def _cross_matrices(s: Array) -> Array:
-    """s̃ (N, 3, 3): s̃ v = s × v."""
-    out = np.zeros((*s.shape, 3))
-    out[:, 0, 1], out[:, 0, 2], out[:, 1, 2] = -s[:, 2], s[:, 1], -s[:, 0]
-    return out - out.mT
-
-
-def _shift_up(v: Array) -> Array:
-    """The value of the joint below each body, 0 for the last."""
-    return np.concatenate([v[1:], [0.0]])
-
-
-def _shift_down(v: Array) -> Array:
-    """The value, (N,) or (N, 3), of the body above each body, 0 at the pivot."""
+def _from_previous(v: Array) -> Array:
+    """Value (N,) or (N, 3) at the body above each body, 0 at the pivot."""
     return np.concatenate([np.zeros_like(v[:1]), v[:-1]])
-
-
-def _propagate_errors(B: Array, force: Array, moment: Array, joint: Array) -> Array:
-    """B ρ (N, 3): first-order answer, per body and quantity, to errors of these sizes in the rows."""
-    return np.asarray(np.einsum("nqkc,kc->nq", B, np.stack([force, moment, joint], 1)))
