@@ -1,9 +1,8 @@
-"""What an engine with a given defect would say of a state: Newton–Euler in double precision, many at once.
+"""State quantities of mechanisms with a given defect: Newton–Euler equations in double precision, in batches.
 
-A `Case` is B pendulums of N bodies at one state each; besides the model's numbers it has a factor on
-each velocity term, 1 in an engine without defect.  Written apart from `reference_impl`, and fast rather
-than certified: its own rounding stays below the bound that answers are compared with (one refinement
-of an equilibrated solve).
+A `DefectCase` is B mechanisms of N bodies at one state each; besides the numbers of the model it has a factor
+on each velocity term, 1 in an engine without defect.  Independent of `reference_impl`, and fast rather than
+certified: an equilibrated solve with one refinement keeps its rounding below the bounds of the comparison.
 """
 
 from __future__ import annotations
@@ -15,20 +14,20 @@ import numpy as np
 from scipy.linalg import lapack
 
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import rotation_matrix
+from plumbline.model.kinematics import cross_matrix, rotate_vectors, rotation_matrix
 
 MODEL_FIELDS = (
     "mass", "inertia", "proximal", "distal", "length", "gravity", "force", "moment", "drag_force",
     "drag_moment",
 )  # fmt: skip
 STATE_FIELDS = ("p", "omega", "u", "udot")
-HALF_BANDWIDTH = 17  # a body's nine equations have unknowns of its own and of both neighbours
-MAX_DENSE_UNKNOWNS = 60  # unknowns up to which a batch is solved faster whole
+HALF_BANDWIDTH = 17  # the nine equations of a body contain its own unknowns and those of both neighbours
+MAX_DENSE_UNKNOWNS = 60  # up to here a dense solve of the batch is faster
 
 
 @dataclass(frozen=True, eq=False)
 class DefectCase:
-    """B pendulums, one state each; fields as in `Model` and `State` with a leading axis B."""
+    """B mechanisms, one state each; fields as in `Model` and `State`, with a leading axis B."""
 
     mass: Array
     inertia: Array
@@ -45,8 +44,8 @@ class DefectCase:
     u: Array
     udot: Array
     gyroscopic_factor: Array  # (B,) factor of ω′ × J ω′ (the notes' 8 L̇ᵀJL̇p)
-    proximal_factor: Array  # (B,) factor of ω × (ω × s) of the near body in γ
-    distal_factor: Array  # (B,) … of the far body
+    proximal_factor: Array  # (B,) factor of ω × (ω × s) of the lower body in γ
+    distal_factor: Array  # (B,) … of the upper body
     rod_factor: Array  # (B,) factor of ℓ u̇² in a rod's γ
 
     @property
@@ -55,14 +54,31 @@ class DefectCase:
         return int(self.mass.shape[1])
 
     def model_and_state(self, b: int) -> tuple[Model, State]:
-        """Pendulum b as model and lifted state; the factors of the terms stay behind."""
+        """Extract one mechanism; the factors on velocity terms are dropped.
+
+        Args:
+            b: index of the mechanism, 0 … B − 1.
+
+        Returns:
+            Its model, and its state with r and v computed from the minimal coordinates.
+
+        """
         model = Model(**{name: getattr(self, name)[b] for name in MODEL_FIELDS})
         r, v = centre_positions_and_velocities(self)
         return model, State(**{name: getattr(self, name)[b] for name in STATE_FIELDS}, r=r[b], v=v[b])
 
 
 def make_defect_case(model: Model, states: Sequence[State]) -> DefectCase:
-    """One model at several states, without defect."""
+    """Put one model at several states into a batch.
+
+    Args:
+        model: the mechanism, used for every state.
+        states: B states, of which the minimal coordinates are used.
+
+    Returns:
+        The batch without defect.
+
+    """
     size = len(states)
     ones = np.ones(size)
     return DefectCase(
@@ -73,43 +89,55 @@ def make_defect_case(model: Model, states: Sequence[State]) -> DefectCase:
 
 
 def concatenate_cases(cases: Sequence[DefectCase]) -> DefectCase:
-    """All pendulums of several cases of the same size, in order."""
+    """Join batches of mechanisms that have the same number of bodies.
+
+    Args:
+        cases: the batches.
+
+    Returns:
+        One batch, in the order of ``cases``.
+
+    """
     names = [f.name for f in fields(DefectCase)]
     return replace(cases[0], **{n: np.concatenate([getattr(c, n) for c in cases]) for n in names})
 
 
-def rotate_vectors(a: Array, s: Array) -> Array:
-    """A s per body, (…, 3, 3) and (…, 3)."""
-    return np.asarray((a @ s[..., None])[..., 0])
-
-
-def skew(s: Array) -> Array:
-    """s̃ (…, 3, 3)."""
-    out = np.zeros((*s.shape, 3))
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -s[..., 2], s[..., 1], -s[..., 0]
-    return out - out.swapaxes(-1, -2)
-
-
 def centre_positions_and_velocities(c: DefectCase) -> tuple[Array, Array]:
-    """Centres of mass and their velocities (B, N, 3), from the pivot outwards."""
+    """Compute the centres of mass and their velocities from the minimal coordinates.
+
+    Args:
+        c: mechanisms and states.
+
+    Returns:
+        r [m] and ṙ [m/s], (B, N, 3) each, world frame.
+
+    """
     a = rotation_matrix(c.p)
     near, far = rotate_vectors(a, c.proximal), rotate_vectors(a, c.distal)
     near_v, far_v = (rotate_vectors(a, np.cross(c.omega, s)) for s in (c.proximal, c.distal))
     rod, rod_v = c.length[..., None] * c.u, c.length[..., None] * c.udot
-
-    def chain(first: Array, own: Array, carried: Array) -> Array:
-        before = np.cumsum(first - own + carried, axis=1) - (first - own + carried)
-        return np.asarray(before + first - own)
-
-    return chain(rod, near, far), chain(rod_v, near_v, far_v)
+    r = np.cumsum(rod - near + far, axis=1) - far
+    return r, np.cumsum(rod_v - near_v + far_v, axis=1) - far_v
 
 
 def evaluate_case(c: DefectCase) -> dict[str, Array]:
-    """Accelerations and joint reactions (B, N, 3), energies (B,), angular momentum (B, 3)."""
+    """Evaluate the state quantities of every mechanism, with its defects.
+
+    Args:
+        c: mechanisms and states.
+
+    Returns:
+        The fields of `StateQuantities` by name, units and frames as there: accelerations and joint reactions
+        (B, N, 3), energies (B,), angular momentum (B, 3).
+
+    Raises:
+        LinAlgError: a mechanism is singular.
+
+    """
     r, v = centre_positions_and_velocities(c)
     a = rotation_matrix(c.p)
     spin = rotate_vectors(c.inertia, c.omega)
-    acceleration, angular, reaction = solve_newton_euler(c, a, v, spin)
+    acceleration, angular, reaction = _solve_newton_euler(c, a, v, spin)
     momentum = np.sum(np.cross(r, c.mass[..., None] * v) + rotate_vectors(a, spin), axis=1)
     return {
         "acceleration": acceleration,
@@ -121,20 +149,23 @@ def evaluate_case(c: DefectCase) -> dict[str, Array]:
     }
 
 
-def solve_newton_euler(c: DefectCase, a: Array, v: Array, spin: Array) -> tuple[Array, Array, Array]:
-    """r̈ (world), ω̇′ (body), F (world), each (B, N, 3), of force, moment and joint equations."""
+def _solve_newton_euler(c: DefectCase, a: Array, v: Array, spin: Array) -> tuple[Array, Array, Array]:
+    """r̈ (world), ω̇′ (body), F (world), each (B, N, 3), from the force, moment and joint equations.
+
+    ``a`` (B, N, 3, 3) are rotation matrices, ``v`` velocities of the centres, ``spin`` = J ω′ (B, N, 3).
+    """
     size, n = c.mass.shape
     S, b = np.zeros((size, n, 9, n, 9)), np.zeros((size, n, 9))
-    eye, near, far, at = np.eye(3), skew(c.proximal), skew(c.distal), a.swapaxes(-1, -2)
+    eye, near, far, at = np.eye(3), cross_matrix(c.proximal), cross_matrix(c.distal), a.mT
     load = c.force - c.drag_force[..., None] * v
     b[..., :3] = c.mass[..., None] * c.gravity[:, None] + load
     b[..., 3:6] = (
         c.moment - c.drag_moment[..., None] * c.omega
         - c.gyroscopic_factor[:, None, None] * np.cross(c.omega, spin)
     )  # fmt: skip
-    bent = [rotate_vectors(a, np.cross(c.omega, np.cross(c.omega, s))) for s in (c.proximal, c.distal)]
-    gamma = -c.proximal_factor[:, None, None] * bent[0]
-    gamma[:, 1:] += c.distal_factor[:, None, None] * bent[1][:, :-1]
+    centripetal = [rotate_vectors(a, np.cross(c.omega, np.cross(c.omega, s))) for s in (c.proximal, c.distal)]
+    b[..., 6:] = -c.proximal_factor[:, None, None] * centripetal[0]
+    b[:, 1:, 6:] += c.distal_factor[:, None, None] * centripetal[1][:, :-1]
     rod = c.length > 0
     for i in range(n):
         S[:, i, :3, i, :3] = c.mass[:, i, None, None] * eye
@@ -147,30 +178,29 @@ def solve_newton_euler(c: DefectCase, a: Array, v: Array, spin: Array) -> tuple[
         S[:, i, 6:, i, :3], S[:, i, 6:, i, 3:6] = eye, -a[:, i] @ near[:, i]
         if i:
             S[:, i, 6:, i - 1, :3], S[:, i, 6:, i - 1, 3:6] = -eye, a[:, i - 1] @ far[:, i - 1]
-    b[..., 6:] = gamma
     for i in map(int, np.flatnonzero(rod.any(0))):
         held = rod[:, i]
         u, udot = c.u[held, i], c.udot[held, i]
-        bend = c.rod_factor[held] * c.length[held, i] * np.sum(udot * udot, -1)
+        centripetal_rod = c.rod_factor[held] * c.length[held, i] * np.sum(udot * udot, -1)
         rows = np.einsum("bi,bijk->bjk", u, S[held, i, 6:].reshape(-1, 3, n, 9))
         first = np.cross(u, np.eye(3)[np.argmin(np.abs(u), axis=-1)])
         first /= np.linalg.norm(first, axis=-1, keepdims=True)
         S[held, i, 6:] = 0.0
         S[held, i, 6] = rows
         S[held, i, 7, i, 6:], S[held, i, 8, i, 6:] = first, np.cross(u, first)
-        b[held, i, 6] = np.sum(u * b[held, i, 6:], -1) - bend
+        b[held, i, 6] = np.sum(u * b[held, i, 6:], -1) - centripetal_rod
         b[held, i, 7:] = 0.0
-    x = solve_with_refinement(S.reshape(size, 9 * n, 9 * n), b.reshape(size, 9 * n)).reshape(size, n, 9)
+    x = _solve_with_refinement(S.reshape(size, 9 * n, 9 * n), b.reshape(size, 9 * n)).reshape(size, n, 9)
     return x[..., :3], x[..., 3:6], x[..., 6:]
 
 
-def solve_with_refinement(S: Array, b: Array) -> Array:
-    """S x = b, (B, m, m) and (B, m), rows and columns scaled by powers of two, refined once."""
+def _solve_with_refinement(S: Array, b: Array) -> Array:
+    """Solution x (B, m) of S x = b, rows and columns scaled by powers of two, refined once."""
     row = np.exp2(-np.round(np.log2(np.max(np.abs(S), axis=2))))
     column = np.exp2(-np.round(np.log2(np.max(np.abs(S) * row[..., None], axis=1))))
     scaled, right = S * row[..., None] * column[:, None], b * row
     solve = (
-        banded_solver(scaled)
+        _banded_solver(scaled)
         if S.shape[1] > MAX_DENSE_UNKNOWNS
         else lambda y: np.linalg.solve(scaled, y[..., None])[..., 0]
     )
@@ -179,8 +209,8 @@ def solve_with_refinement(S: Array, b: Array) -> Array:
     return np.asarray(column * x)
 
 
-def banded_solver(S: Array) -> Callable[[Array], Array]:
-    """The solution (B, m) of S x = y for any y, from factors of S (B, m, m) within its band."""
+def _banded_solver(S: Array) -> Callable[[Array], Array]:
+    """Return the map from y to the solution x of S x = y, from LU factors of S (B, m, m) within its band."""
     m = S.shape[1]
     i, j = np.indices((m, m)).reshape(2, -1)
     inside = np.abs(i - j) <= HALF_BANDWIDTH
@@ -194,10 +224,10 @@ def banded_solver(S: Array) -> Callable[[Array], Array]:
             raise np.linalg.LinAlgError("Singular matrix")
         factors.append((lu, pivots))
 
-    def solve_newton_euler(y: Array) -> Array:
+    def solve(y: Array) -> Array:
         parts = zip(factors, y, strict=True)
         return np.array(
             [lapack.dgbtrs(lu, HALF_BANDWIDTH, HALF_BANDWIDTH, one, pivots)[0] for (lu, pivots), one in parts]
         )
 
-    return solve_newton_euler
+    return solve

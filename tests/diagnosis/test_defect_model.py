@@ -1,4 +1,4 @@
-"""The fast model behind diagnoses is right: few bodies solved whole, many by their band."""
+"""The fast model of a diagnosis against certified truth: dense for few bodies, banded for many."""
 
 import numpy as np
 import pytest
@@ -13,20 +13,20 @@ pytest.importorskip("flint")
 
 
 @pytest.mark.parametrize("joints", ["rb", "brbbrbrrbbrb"])
-def test_it_is_the_certified_answer(joints):
+def test_the_model_agrees_with_certified_truth(joints):
     model = pendulums.model(joints, loads=True, drag=True)
     assert (9 * model.n > MAX_DENSE_UNKNOWNS) == (len(joints) > 6)
     states = random_states(model, 3, 5)
-    said = evaluate_case(make_defect_case(model, states))
+    answers = evaluate_case(make_defect_case(model, states))
     for k, state in enumerate(states):
         truth, bound = certify_state(model, state).quantities, state_rounding_bound(model, state)
-        for quantity, x in said.items():
+        for quantity, x in answers.items():
             off = np.atleast_1d(x[k] - getattr(truth, quantity))
             size = np.linalg.norm(off, axis=-1) if x.ndim > 1 else np.abs(off)
             assert np.all(size <= bound.tolerance(quantity)), quantity
 
 
-def test_a_singular_chain_is_told():
+def test_a_singular_chain_raises():
     model = pendulums.model("b" * 8)
     broken = make_defect_case(model, random_states(model, 1, 1))
     broken.mass[:] = 0.0
