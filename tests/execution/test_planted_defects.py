@@ -68,7 +68,7 @@ def planted(defect: Defect, model):
         yield engine
         return
     bent = type("BentHere", (Bent,), {"model": model, "defect": staticmethod(defect.gamma)})
-    with patch("adapters.reference_engine.System", bent):
+    with patch("adapters.reference_engine.DirectSystem", bent):
         yield engine
 
 
