@@ -100,8 +100,8 @@ FACTORS = (
     Factor(("proximal", "distal", "length"), "all lengths"),
     Factor(("inertia",), "all inertias"),
     Factor(("mass",), "all masses"),
-    Factor(("gravity",), "gravity's size", "there were no gravity",
-           lambda case: np.count_nonzero(case.gravity[0]) > 1),  # along one axis, that component is the cause
+    Factor(("gravity",), "gravity's size", "there were no gravity",  # along one axis, its component is the cause
+           lambda case: int(np.count_nonzero(case.gravity[0])) > 1),
     Factor(("omega",), "angular rates ω′"),
     Factor(("udot",), "rod rates u̇"),
     Factor(("omega", "udot"), "all rates", None, _has_rods),

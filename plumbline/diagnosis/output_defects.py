@@ -57,6 +57,12 @@ BODY_PERMUTATIONS: dict[str, Callable[[Array], Array]] = {
     "the one counted from the other end": lambda x: x[:, ::-1],
 }
 
+
+def _of_another_body(name: str, which: str) -> OutputDefect:
+    description = f"it returned the {name.replace('_', ' ')} of another body, {which}"
+    return OutputDefect(name, description, lambda _, q: BODY_PERMUTATIONS[which](q[name]))
+
+
 OUTPUT_DEFECTS = (
     OutputDefect("acceleration",
                  "it returned the spatial acceleration (r̈ − ω × ṙ) instead of the classical one",
@@ -74,10 +80,8 @@ OUTPUT_DEFECTS = (
                  lambda c, q: to_body(c, q["joint_reaction"])),
     OutputDefect("angular_acceleration", "it returned the angular acceleration in the world frame",
                  lambda c, q: to_world(c, q["angular_acceleration"])),
-    *(OutputDefect(name, f"it returned the {name.replace('_', ' ')} of another body, {which}",
-                   lambda _, q, name=name, permute=permute: permute(q[name]))
-      for name in ("acceleration", "angular_acceleration", "joint_reaction")
-      for which, permute in BODY_PERMUTATIONS.items()),
+    *(_of_another_body(name, which)
+      for name in ("acceleration", "angular_acceleration", "joint_reaction") for which in BODY_PERMUTATIONS),
     OutputDefect("kinetic_energy", "it returned the kinetic energy without rotation",
                  lambda c, q: q["kinetic_energy"] - _rotational_energy(c)),
     OutputDefect("kinetic_energy", "it returned the kinetic energy of rotation alone",

@@ -144,19 +144,28 @@ def state_rounding_bound(model: Model, state: State, parts: BodyParts | None = N
 
     rate, speed = joints.is_below.T @ joints.rate, joints.D.T @ joints.rate
     lever = np.cumsum(terms.sp + model.length) + _from_previous(np.cumsum(terms.sd))
-    sums = {
-        "kinetic_energy": float(0.5 * np.sum(m * speed**2 + J * rate**2)),
-        "potential_energy": float(g * np.sum(m * lever)),
-        "angular_momentum": float(np.sum(m * lever * speed + J * rate)),
-        "mass_matrix": float(np.max(joints.mass_matrix)),
-    }
-    scale = {
-        "acceleration": result[:, 0],
-        "angular_acceleration": np.max([terms.alpha, moment / J, turning], 0),
-        "joint_reaction": np.maximum(terms.F, m * g),
-    }
-    bounds = {name: SUM_ROUNDING_FACTOR * EPS * size for name, size in sums.items()}
-    return RoundingBound(*total.T, **bounds, scale=scale | sums)
+    kinetic = float(0.5 * np.sum(m * speed**2 + J * rate**2))
+    potential = float(g * np.sum(m * lever))
+    momentum = float(np.sum(m * lever * speed + J * rate))
+    mass_entry = float(np.max(joints.mass_matrix))
+    return RoundingBound(
+        acceleration=total[:, 0],
+        angular_acceleration=total[:, 1],
+        joint_reaction=total[:, 2],
+        kinetic_energy=SUM_ROUNDING_FACTOR * EPS * kinetic,
+        potential_energy=SUM_ROUNDING_FACTOR * EPS * potential,
+        angular_momentum=SUM_ROUNDING_FACTOR * EPS * momentum,
+        mass_matrix=SUM_ROUNDING_FACTOR * EPS * mass_entry,
+        scale={
+            "acceleration": result[:, 0],
+            "angular_acceleration": np.max([terms.alpha, moment / J, turning], 0),
+            "joint_reaction": np.maximum(terms.F, m * g),
+            "kinetic_energy": kinetic,
+            "potential_energy": potential,
+            "angular_momentum": momentum,
+            "mass_matrix": mass_entry,
+        },
+    )
 
 
 class _TermSizes:
@@ -173,9 +182,8 @@ class _TermSizes:
         self.lightest, self.least_inertia = self.m, np.linalg.eigvalsh(model.inertia)[:, 0]
         self.arm = self.weld = np.zeros(n)  # lever and force of the weld
         rod_rate = np.where(model.rods, norm(state.udot, axis=1), 0.0)
-        self.W = np.maximum.accumulate(
-            np.maximum(self.omega, rod_rate)
-        )  # largest rate from the pivot to here
+        # largest rate of any body or rod between the pivot and here
+        self.W = np.maximum.accumulate(np.maximum(self.omega, rod_rate))
         self.centripetal_rod = model.length * rod_rate * self.W
         if parts is not None:
             self.arm = part_offsets(parts)

@@ -211,7 +211,8 @@ def test_a_prediction_may_be_off_by_the_bounds_of_both_pendulums(off, explained)
 
 
 @pytest.mark.parametrize(
-    "words", ["the world-frame angular velocity were used as the body-frame one", "products of inertia were missing"]
+    "words",
+    ["the world-frame angular velocity were used as the body-frame one", "products of inertia were missing"],
 )
 def test_a_convention_is_named(words):
     model, truth = known(count=4)
@@ -365,7 +366,9 @@ def test_an_amount_is_fitted_to_what_it_does_not_explain_too():
     assert remaining_ratio(seen, evaluate_case(seen.case), fit) > MAX_EXPLAINED_RATIO
 
 
-@pytest.mark.parametrize(("off", "words"), [(1.5, "it returned the acceleration multiplied by 1.25"), (2.5, None)])
+@pytest.mark.parametrize(
+    ("off", "words"), [(1.5, "it returned the acceleration multiplied by 1.25"), (2.5, None)]
+)
 def test_a_misread_quantity_may_be_off_by_both_bounds(off, words):
     model, said, truth = changed(
         "acceleration", lambda i, x, b: 1.25 * x + (i == 3) * off * b[:, None] * ALONG

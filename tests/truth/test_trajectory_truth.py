@@ -213,6 +213,8 @@ def test_a_worker_has_room_for_it():
 
 def test_sympy_is_hidden_only_while_heyoka_is_imported():
     """It would take two seconds; later it must be there for Kane's equations."""
-    seen = "import sys; from plumbline.truth.taylor import load_heyoka; load_heyoka(); print('sympy' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", seen], capture_output=True, text=True, check=True)
+    program = (
+        "from plumbline.truth import taylor; taylor.load_heyoka(); import sys; print('sympy' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"

@@ -90,12 +90,12 @@ def _axis_of_motion(model: Model, A: Array, up: Array, rotations: Array) -> Arra
     """Unit normal (3,) of the vertical plane in which all ``rotations`` (K, 3), tilts and rates, lie."""
     axis = rotations[np.argmax(np.linalg.norm(rotations, axis=1))]
     require(np.any(axis), "some motion")
-    axis = np.asarray(axis / np.linalg.norm(axis))
-    off_axis = np.max(np.abs(rotations - np.outer(rotations @ axis, axis)))
-    require(off_axis < CONDITION_RTOL, "one plane of motion")
+    axis = axis / np.linalg.norm(axis)
+    out_of_plane = np.max(np.abs(rotations - np.outer(rotations @ axis, axis)))
+    require(out_of_plane < CONDITION_RTOL, "one plane of motion")
     require(abs(axis @ up) < CONDITION_RTOL, "a vertical plane of motion")
     body_axis = A.mT @ axis
     J = np.einsum("ki,kij,kj->k", body_axis, model.inertia, body_axis)
     off_axis = np.max(np.abs(rotate_vectors(model.inertia, body_axis) - J[:, None] * body_axis))
     require(off_axis < CONDITION_RTOL * np.max(J), "a principal axis of rotation in every body")
-    return axis
+    return np.asarray(axis)
