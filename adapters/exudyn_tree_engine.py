@@ -19,7 +19,7 @@ Attitudes are quaternions, scalar first, multiplied up along the chain from the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import remainder, tau
 from typing import Any, ClassVar
@@ -283,7 +283,9 @@ class ExudynTree(ExudynAdapter):
     integrators: ClassVar[tuple[Integrator, ...]] = (
         Integrator("RK44", "step", 4, (4, 5, 6, 7, 8), note="classical Runge-Kutta on joint angles"),
     )
-    unsupported = (("joint_reaction", "minimal coordinates have no forces at the joints"),)
+    unsupported: ClassVar[Mapping[str, str]] = {
+        "joint_reaction": "minimal coordinates have no forces at the joints"
+    }
     usual_linear_solver = "EXUdense"
     linear_solvers = ("EigenSparse",)
     welding_unsupported_reason = (

@@ -25,7 +25,7 @@ off on the catalogue's ten balls, 2e-8 on thirty, 8e-3 on fifty, where `crba` is
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -382,6 +382,8 @@ class PinocchioAba(Pinocchio):
     title = "Pinocchio (aba)"
     other_formulation = ""
     integrators = ()
-    unsupported = (("integrators", "another algorithm of Pinocchio is compared at state level only"),)
+    unsupported: ClassVar[Mapping[str, str]] = {
+        "integrators": "another algorithm of Pinocchio is compared at state level only"
+    }
     options = ("crba",)
     usual_algorithm = "aba"

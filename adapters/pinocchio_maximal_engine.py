@@ -19,7 +19,8 @@ The option "inverse of the KKT matrix" solves the same rows with the engine's in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 import pinocchio as pin
@@ -131,7 +132,9 @@ class PinocchioMaximal(PinocchioAdapter):
     reproduction_template = "pinocchio-maximal"
     other_formulation = "pinocchio"
     integrators = ()
-    unsupported = (("integrators", "Pinocchio in maximal coordinates is compared at state level only"),)
+    unsupported: ClassVar[Mapping[str, str]] = {
+        "integrators": "Pinocchio in maximal coordinates is compared at state level only"
+    }
     options = ("inverse of the KKT matrix",)
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:

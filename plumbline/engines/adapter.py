@@ -9,7 +9,7 @@ repeated row or a number that is not finite is reported as a failure.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -38,6 +38,7 @@ UNSUPPORTED_KINDS = {
     "angular_momentum": "the engine does not return the angular momentum about the pivot",
     "mass_matrix": "the engine does not return a joint-space mass matrix",
     "rods": "the engine refuses models in which a body hangs by a massless rod, or some of them",
+    "balls": "the engine refuses models in which a body hangs by a ball joint, or some of them",
     "chains": "the engine refuses models of more than one body, or some of them",
     "loads": "the engine refuses models with applied forces, moments and drag, or some of them",
     "integrators": "the engine evaluates states and does not simulate",
@@ -66,8 +67,8 @@ class Adapter(ABC):
     title: ClassVar[str]  # as shown in the report
     package: ClassVar[str]  # distribution whose version is reported
     integrators: ClassVar[tuple[Integrator, ...]]
-    # What the engine does not do: (a key of `UNSUPPORTED_KINDS`, the reason in a sentence).
-    unsupported: ClassVar[tuple[tuple[str, str], ...]] = ()
+    # What the engine does not do (a key of `UNSUPPORTED_KINDS`), and why, in a sentence.
+    unsupported: ClassVar[Mapping[str, str]] = {}
     supported_versions: ClassVar[str] = ""  # PEP 440 range of versions that the adapter works with
     # Requirements of environments with another version: (range of versions, additional requirement).
     extra_requirements: ClassVar[tuple[tuple[str, str], ...]] = ()
