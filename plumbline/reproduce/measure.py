@@ -17,15 +17,15 @@ from plumbline.engines import calls
 from plumbline.engines.calls import RefinementRun
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.convergence import ORDER_MARGIN
-from plumbline.judging.metamorphic import (
-    OTHER_FORMULATION_PREFIX,
+from plumbline.judging.relation_result import OTHER_FORMULATION_PREFIX
+from plumbline.judging.rows import Row, RowContext, Verdict
+from plumbline.judging.state_relations import (
     STATE_RELATIONS,
     WELDED_HALVES,
     Relation,
     quantity_values,
     unchanged,
 )
-from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.judging.trajectory import RefinementAnalysis
 from plumbline.model.datatypes import Array, Integrator, StateQuantities
 from plumbline.model.welding import split_bodies

@@ -8,8 +8,8 @@ import numpy as np
 
 from plumbline.engines.metamorphic_hooks import metamorphic_hooks
 from plumbline.engines.registry import load_adapter
-from plumbline.judging.metamorphic import (
-    OPTION_PREFIX,
+from plumbline.judging.relation_result import OPTION_PREFIX
+from plumbline.judging.run_relations import (
     REVERSED_IN_TIME,
     characteristic_scales,
     relative_differences,

@@ -15,13 +15,9 @@ from packaging.version import InvalidVersion, Version
 from plumbline.engines.environments import split_version
 from plumbline.judging.convergence import ORDER_MARGIN
 from plumbline.judging.long_runs import BLOCK_COUNT, MAX_SYMMETRIC_GROWTH, SIGMA_FACTOR
-from plumbline.judging.metamorphic import (
-    OPTION_PREFIX,
-    OTHER_FORMULATION_PREFIX,
-    REVERSED_IN_TIME,
-    STATE_RELATIONS,
-    WELDED_HALVES,
-)
+from plumbline.judging.relation_result import OPTION_PREFIX, OTHER_FORMULATION_PREFIX
+from plumbline.judging.run_relations import REVERSED_IN_TIME
+from plumbline.judging.state_relations import STATE_RELATIONS, WELDED_HALVES
 from plumbline.model.datatypes import Array
 from plumbline.model.welding import split_bodies, undivided_bodies
 from plumbline.reproduce.measure import Shown, ShownRelation, ShownRun, ShownState

@@ -12,21 +12,17 @@ import pytest
 
 from plumbline.diagnosis.defect_model import evaluate_case, make_defect_case
 from plumbline.engines.registry import ENGINES, load_adapter
-from plumbline.judging import metamorphic
-from plumbline.judging.metamorphic import (
-    QUANTITIES,
-    STATE_RELATIONS,
-    WELDED_HALVES,
+from plumbline.judging.metamorphic import check_relations, judge_relations
+from plumbline.judging.rows import RowContext
+from plumbline.judging.run_relations import (
     check_integrator_relations,
-    check_relations,
     check_run_relations,
     fastest_rate,
-    judge_relations,
     relative_differences,
     run_tolerance,
     state_at_sample,
-)  # fmt: skip
-from plumbline.judging.rows import RowContext
+)
+from plumbline.judging.state_relations import QUANTITIES, STATE_RELATIONS, WELDED_HALVES, check_state_relation
 from plumbline.model.datatypes import EngineFailure, Unsupported
 from plumbline.model.welding import split_bodies, split_body
 from plumbline.truth.rounding_bound import state_rounding_bound
@@ -226,9 +222,7 @@ def test_halves_have_roundings_of_their_own():
     assert 0 <= abs(two.potential_energy - whole.potential_energy) <= welded.potential_energy
     for q in QUANTITIES:
         assert np.all(np.asarray(welded.tolerance(q)) >= plain.tolerance(q))
-    with patch(
-        "plumbline.judging.metamorphic.check_state_relation", wraps=metamorphic.check_state_relation
-    ) as asked:
+    with patch("plumbline.judging.state_relations.check_state_relation", wraps=check_state_relation) as asked:
         check_relations("mujoco", model, [at])
     (_, *_, (one,), (other,)) = next(c.args for c in asked.call_args_list if c.args[0].name == WELDED_HALVES)
     assert one.potential_energy == 0 and other.potential_energy == welded.potential_energy

@@ -8,26 +8,27 @@ import numpy as np
 import pytest
 
 from plumbline.engines.registry import load_adapter
-from plumbline.judging.metamorphic import (
-    QUANTITIES,
-    Relation,
-    RelationResult,
+from plumbline.judging.metamorphic import check_relations, judge_relations
+from plumbline.judging.relation_result import RelationResult
+from plumbline.judging.rows import RowContext
+from plumbline.judging.run_relations import (
     characteristic_scales,
-    check_relations,
-    check_state_relation,
-    evaluate_or_refusal,
     fastest_rate,
-    judge_relations,
-    quantity_values,
     refused_result,
     relative_differences,
     run_tolerance,
-    scale_fields,
     state_at_sample,
-    unchanged,
     worst_difference_result,
 )
-from plumbline.judging.rows import RowContext
+from plumbline.judging.state_relations import (
+    QUANTITIES,
+    Relation,
+    check_state_relation,
+    evaluate_or_refusal,
+    quantity_values,
+    scale_fields,
+    unchanged,
+)
 from plumbline.model.datatypes import EngineFailure, Integrator, StateQuantities, Trajectory, Unsupported
 from plumbline.model.kinematics import angular_velocity, quaternion_product, quaternion_rate
 from plumbline.truth.ground_truth import RUN_ROUNDING, stretched_length
@@ -204,13 +205,19 @@ def test_rows_say_what_held_what_did_not_and_what_was_refused() -> None:
     assert [r.tolerance for r in rows] == [1.0] * 5 + [None] * 2
     assert rows[0].extra == {"states": 4.0, "state": 2.0}
     assert rows[3].extra == {"states": 1.0, "state": 0.0, "resolution": 0.25, "end": 8.0}
-    assert "sum of both sides' state-level rounding bounds" in rows[0].derivation
+    assert "sum of the state-level rounding bounds of both sides" in rows[0].derivation
     assert "growth of a small perturbation" in rows[3].derivation
-    assert "to 0.25 of the rounding bounds, 4 states" in rows[0].reason
-    assert "E's joint reaction at state 2 differs by 1.5 times the rounding bounds of both" in rows[1].reason
-    assert "to 0.5 of what rounding and the step's solver explain, 64 steps" in rows[3].reason
-    assert "velocity at the end differs by 7 times" in rows[4].reason
-    assert rows[4].reason.endswith("what rounding and the step's solver explain")
+    assert "agree within 0.25 of the sum of both rounding bounds, over 4 states" in rows[0].reason
+    assert (
+        "the joint reaction of E at state 2 differs by 1.5 times the sum of both rounding bounds"
+        in rows[1].reason
+    )
+    assert (
+        "within 0.5 of what rounding and the tolerance of the step's solver explain, over 64 steps"
+        in rows[3].reason
+    )
+    assert "velocity of E at the end differs by 7 times" in rows[4].reason
+    assert rows[4].reason.endswith("what rounding and the tolerance of the step's solver explain")
     assert [r.reason for r in rows[5:]] == ["it stopped", "no such solver"]
     assert [r.quantity for r in rows][:2] == ["masses doubled"] * 2
 

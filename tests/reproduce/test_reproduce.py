@@ -24,7 +24,7 @@ from click.testing import CliRunner
 from plumbline.cli.main import main
 from plumbline.engines import environments
 from plumbline.engines.registry import ENGINES, load_adapter
-from plumbline.judging import metamorphic
+from plumbline.judging import metamorphic, run_relations, state_relations
 from plumbline.judging.convergence import refinement_resolutions
 from plumbline.judging.long_runs import LongRunPlan, judge_long_runs, plan_long_run, run_long_run_study
 from plumbline.processes.workers import Outcome
@@ -52,7 +52,7 @@ for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
 
 ROOT = Path(__file__).resolve().parents[2]
 HOSTILE = '<img src=x onerror="alert(1)">\n"""\nimport os; os.abort()  # \\ \'\'\' \r ; # ünï'
-QUANTITIES = (*metamorphic.QUANTITIES, "mass_matrix")
+QUANTITIES = (*state_relations.QUANTITIES, "mass_matrix")
 DRIFTS = ("energy_drift", "momentum_drift", "joint_gap", "gap_rate", "norm_drift")
 ROW = {"scenario": HOSTILE, "quantity": HOSTILE, "engine_version": "4", "integrator": HOSTILE,
        "extra": {"state": 3.0}}  # fmt: skip
@@ -229,7 +229,7 @@ def test_a_script_runs_twice_as_the_harness_does(engine, integrator, relation):
 
 
 @pytest.mark.parametrize("engine", ["pinocchio", "exudyn"])
-@pytest.mark.parametrize("relation", [r.name for r in metamorphic.STATE_RELATIONS])
+@pytest.mark.parametrize("relation", [r.name for r in state_relations.STATE_RELATIONS])
 def test_a_script_of_a_relation_finds_what_the_harness_finds(engine, relation):
     model = pendulums.model(JOINTS["rod-ball"], loads=True, drag=relation != "time reversed")
     found = Related(Engine(engine), relation)(Case(model, pendulums.state(model, seed=3)))
@@ -688,7 +688,7 @@ def test_the_run_behind_a_relation_of_runs_is_asked_for_again(engine, relation, 
 
     scenario = load_scenario(find_scenario_file("double-tumbling-balls"))
     with defective(lines):
-        found = list(metamorphic.check_run_relations(load_adapter(engine), scenario.model, scenario.state))
+        found = list(run_relations.check_run_relations(load_adapter(engine), scenario.model, scenario.state))
         rows = metamorphic.judge_relations(
             measure.Subject(scenario.name, "", engine, engine, "1"), found
         ).rows

@@ -1,0 +1,27 @@
+"""The result of one metamorphic relation, before it is judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from plumbline.judging.rows import Verdict
+
+OTHER_FORMULATION_PREFIX = "as "  # names of relations: "as NAME" is the engine's other formulation NAME
+OPTION_PREFIX = "by "  # "by NAME" is another algorithm or linear solver of the same engine
+
+
+@dataclass(frozen=True)
+class RelationResult:
+    """The worst difference between two sides of a relation, over what rounding explains."""
+
+    relation: str
+    ratio: float | None  # difference over tolerance; None where the engine refused or failed
+    quantity: str  # of the worst difference
+    worst_state: int  # index of its state
+    state_count: int  # number of states that were compared
+    refusal_reason: str = ""
+    verdict: Verdict = Verdict.UNSUPPORTED  # of a refusal
+    integrator: str = "-"  # of a relation of runs
+    steps: int = 0  # of a run, there and back
+    resolution: float = 0.0  # of a run: its step [s], or its relative tolerance
+    end_time: float = 0.0  # [s] of a run, one way

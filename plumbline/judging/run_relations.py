@@ -1,0 +1,268 @@
+"""Metamorphic relations of short runs: reversed in time, and with another linear solver.
+
+    reversed in time     a symmetric integrator whose rates are reversed returns to its initial state, at any step
+    by …                 the same run with another linear solver of the engine
+
+The ends of the two runs may differ by rounding and by the tolerance of the step's solver, both grown as small
+perturbations of the motion grow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from plumbline.engines.adapter import Adapter
+from plumbline.engines.metamorphic_hooks import MetamorphicHooks
+from plumbline.judging.relation_result import OPTION_PREFIX, RelationResult
+from plumbline.judging.rows import Verdict
+from plumbline.model.datatypes import EngineFailure, Integrator, Model, State, Trajectory, Unsupported
+from plumbline.model.invariants import attitude_error, position_error
+from plumbline.model.kinematics import angular_velocity
+from plumbline.truth.ground_truth import RUN_ROUNDING, stretched_length
+from plumbline.truth.rounding_bound import state_rounding_bound
+from plumbline.truth.sensitivity import perturbation_growth
+
+REVERSED_IN_TIME = "reversed in time"
+STEP_DIVISORS = 1, 4, 16  # of the step, tried one after the other where an implicit integrator fails
+RUN_STEPS = 16  # of a run, one way
+STEPS_PER_RADIAN = 32  # at the fastest rate, so that implicit steps can be solved
+
+
+def check_run_relations(engine: MetamorphicHooks, model: Model, state: State) -> Iterator[RelationResult]:
+    """Check the relations of short runs, for every integrator that has one.
+
+    A step at which an implicit integrator cannot be solved decides nothing: the run is repeated with a shorter
+    step, and is shorter itself.
+
+    Args:
+        engine: the adapter.
+        model: the pendulum.
+        state: the initial state.
+
+    Yields:
+        One result per integrator and relation.
+
+    """
+    step = 2.0 ** float(np.floor(-np.log2(STEPS_PER_RADIAN * fastest_rate(model, state))))
+    for integrator in engine.integrators:
+        results: list[RelationResult] = []
+        for divisor in STEP_DIVISORS:
+            results = list(check_integrator_relations(engine, integrator, model, state, step / divisor))
+            if integrator.kind == "tolerance" or all(r.verdict != Verdict.FAILED for r in results):
+                break
+        yield from results
+
+
+def check_integrator_relations(
+    engine: MetamorphicHooks, integrator: Integrator, model: Model, state: State, step: float
+) -> Iterator[RelationResult]:
+    """Check the relations of one integrator's runs.
+
+    Args:
+        engine: the adapter.
+        integrator: one of its integrators.
+        model: the pendulum.
+        state: the initial state.
+        step: step of the runs [s]; with step control it sets only their duration.
+
+    Yields:
+        One result per relation.
+
+    """
+    if integrator.is_symmetric and not model.has_drag:
+        yield _check_time_reversal(engine, integrator, model, state, step)
+    if integrator.kind == "step" and engine.linear_solvers:
+        yield from _check_linear_solvers(engine, integrator, model, state, step)
+
+
+def fastest_rate(model: Model, state: State) -> float:
+    """Return the fastest rate of a motion: of a body, of a rod, or of the shortest link as a pendulum.
+
+    Args:
+        model: the pendulum.
+        state: a state of it.
+
+    Returns:
+        The rate [1/s]; 1 where everything rests without gravity.
+
+    """
+    swing = np.sqrt(np.linalg.norm(model.gravity) / np.min(stretched_length(model)))
+    rates = [np.max(np.linalg.norm(rate, axis=1)) for rate in (state.omega, state.udot)]
+    return float(max(swing, *rates)) or 1.0
+
+
+def _check_time_reversal(
+    engine: MetamorphicHooks, integrator: Integrator, model: Model, state: State, step: float
+) -> RelationResult:
+    """Run there and back: the last row must be the first one with opposite rates."""
+    resolution = step if integrator.kind == "step" else integrator.min_rtol
+    end = RUN_STEPS * step
+    try:
+        run = engine.simulate_round_trip(model, state, end, integrator.name, resolution)
+    except (Unsupported, EngineFailure) as refusal:
+        return refused_result(REVERSED_IN_TIME, integrator, refusal)
+    differences = relative_differences(model, state_at_sample(run, 0), state_at_sample(run, 2, -1.0))
+    limit = run_tolerance(integrator, model, state, end, run.steps)
+    return worst_difference_result(
+        REVERSED_IN_TIME, integrator, differences, limit, run.steps, resolution, end
+    )
+
+
+def _check_linear_solvers(
+    engine: MetamorphicHooks, integrator: Integrator, model: Model, state: State, step: float
+) -> Iterator[RelationResult]:
+    """Compare the same run with each of the engine's linear solvers."""
+    end = RUN_STEPS * step
+
+    def simulate(adapter: Adapter) -> Trajectory | Unsupported | EngineFailure:
+        try:
+            return adapter.simulate(model, state, np.array([0.0, end]), integrator.name, step)
+        except (Unsupported, EngineFailure) as refusal:
+            return refusal
+
+    usual = simulate(engine)
+    limit = 2 * run_tolerance(integrator, model, state, end, RUN_STEPS)
+    for solver in engine.linear_solvers:
+        name, other = OPTION_PREFIX + solver, simulate(engine.with_option(solver))
+        if not isinstance(usual, Trajectory):
+            yield refused_result(name, integrator, usual)
+        elif not isinstance(other, Trajectory):
+            yield refused_result(name, integrator, other)
+        else:
+            differences = relative_differences(model, state_at_sample(usual, -1), state_at_sample(other, -1))
+            yield worst_difference_result(name, integrator, differences, limit, RUN_STEPS, step, end)
+
+
+def refused_result(name: str, integrator: Integrator, refusal: Unsupported | EngineFailure) -> RelationResult:
+    """Make the result of a run that the engine refused or failed.
+
+    Args:
+        name: name of the relation.
+        integrator: the run's integrator.
+        refusal: the engine's exception.
+
+    Returns:
+        The result, without a ratio.
+
+    """
+    verdict = Verdict.UNSUPPORTED if isinstance(refusal, Unsupported) else Verdict.FAILED
+    return RelationResult(name, None, "", 0, 0, str(refusal), verdict, integrator.name)
+
+
+def run_tolerance(integrator: Integrator, model: Model, state: State, end: float, steps: int) -> float:
+    """Return by how much the end of a run may be off: rounding and the tolerance of its steps, grown.
+
+    On long chains the rounding of accelerations is more than the other rounding of a run: they are off by the
+    state-level bound, all the time.  A way back is as long as the way there, and grows perturbations as much:
+    without drag the flow is Hamiltonian (except for body-fixed moments, which change little in so short a
+    run), and its singular values are pairs σ, 1/σ.
+
+    Args:
+        integrator: the run's integrator.
+        model: the pendulum.
+        state: the initial state.
+        end: duration of the run, one way [s].
+        steps: number of its steps, there and back.
+
+    Returns:
+        The tolerance, relative to `characteristic_scales` [–].
+
+    """
+    of_step = integrator.min_rtol
+    if (
+        integrator.kind == "step"
+    ):  # a residual is small compared with the heaviest body's, F = m a of a light one
+        of_step = integrator.solver_rtol * float(np.max(model.mass) / np.min(model.mass))
+    bound, (_, spin, speed) = state_rounding_bound(model, state), characteristic_scales(model, state)
+    pushed = end * max(np.max(bound.acceleration) / speed, np.max(bound.angular_acceleration) / spin)
+    growth = perturbation_growth(model, state, np.array([0.0, end / 2, end]))
+    return float((RUN_ROUNDING + of_step * np.sqrt(steps) + pushed) * np.max(growth))
+
+
+def characteristic_scales(model: Model, state: State) -> tuple[float, float, float]:
+    """Return the scales that differences of runs are relative to.
+
+    Args:
+        model: the pendulum.
+        state: a state of it.
+
+    Returns:
+        The stretched pendulum's length [m], its rate of rotation [rad/s] and its speed [m/s].
+
+    """
+    length = float(np.sum(stretched_length(model)))
+    fall = float(np.sqrt(np.linalg.norm(model.gravity) * length))
+    spin = max(fall / length, float(np.max(np.linalg.norm(state.omega, axis=1))), np.finfo(float).tiny)
+    return length, spin, max(spin * length, float(np.max(np.linalg.norm(state.v, axis=1))))
+
+
+def state_at_sample(run: Trajectory, at: int, sign: float = 1.0) -> State:
+    """Return one sample of a run as the engine returned it, on the constraint manifold or off it.
+
+    Args:
+        run: samples of poses and rates.
+        at: index of the sample.
+        sign: number to multiply the rates by, ±1.
+
+    Returns:
+        The state; the directions of its rods are zero.
+
+    """
+    p, pdot = run.p[at], sign * run.pdot[at]
+    zeros = np.zeros_like(run.r[at])
+    return State(p, angular_velocity(p, pdot), zeros, zeros, run.r[at], sign * run.v[at])
+
+
+def relative_differences(model: Model, one: State, other: State) -> dict[str, float]:
+    """Compare two samples.
+
+    Args:
+        model: the pendulum.
+        one: a sample, whose rates set the scales.
+        other: the other sample.
+
+    Returns:
+        By quantity the largest difference of any body, relative to `characteristic_scales` [–]; of attitudes
+        the angle [rad].
+
+    """
+    length, spin, speed = characteristic_scales(model, one)
+    return {
+        "position": float(position_error(one.r, other.r)) / length,
+        "attitude": float(attitude_error(one.p, other.p)),
+        "velocity": float(position_error(one.v, other.v)) / speed,
+        "angular velocity": float(position_error(one.omega, other.omega)) / spin,
+    }
+
+
+def worst_difference_result(
+    name: str,
+    integrator: Integrator,
+    differences: dict[str, float],
+    limit: float,
+    steps: int,
+    resolution: float,
+    end: float,
+) -> RelationResult:
+    """Make the result of a relation of runs.
+
+    Args:
+        name: name of the relation.
+        integrator: the runs' integrator.
+        differences: by quantity, from `relative_differences`.
+        limit: tolerance of each difference, from `run_tolerance`.
+        steps: number of steps.
+        resolution: step [s], or relative tolerance.
+        end: duration, one way [s].
+
+    Returns:
+        The result, of the quantity with the largest difference.
+
+    """
+    quantity = max(differences, key=lambda q: differences[q])
+    return RelationResult(
+        name, differences[quantity] / limit, quantity, 0, 1, integrator=integrator.name, steps=steps,
+        resolution=resolution, end_time=end,
+    )  # fmt: skip

@@ -1,0 +1,274 @@
+"""Metamorphic relations at a state: the same pendulum described in another way, for the same engine.
+
+Each relation changes model and state so that the effect on every answer is known exactly, and maps the
+answers back; or it asks for another algorithm of the same engine.  The two answers may differ by the sum of
+the first-order rounding bounds of both sides.  The bounds are the same on both sides (they are homogeneous in
+every unit and independent of axes), except for welded halves, whose equations have other terms.
+
+    rotated world        everything in world axes rotated by Q
+    re-chosen body frame body axes rotated by Q: p Q*, s → Q s, J → Q J Qᵀ, ω′ → Q ω′ (an inertia becomes full)
+    masses doubled       m, J, loads and drag × 2: the same motion, forces and energies × 2
+    lengths × 4          s, ℓ × 4, J × 16, ω and u̇ / 2, moments × 4, c_t / 2, c_r × 8: r̈ and F the same
+    time reversed        ω, u̇ → −ω, −u̇ without drag: r̈, ω̇′, F, energies the same, L → −L
+    as …                 the engine's other formulation (maximal or minimal coordinates)
+    by …                 the engine's other algorithm for the accelerations (dense, sparse, …)
+    two welded halves    every body built of two bodies that are rigidly joined
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from plumbline.engines.metamorphic_hooks import MetamorphicHooks
+from plumbline.engines.registry import load_adapter
+from plumbline.judging.relation_result import OPTION_PREFIX, OTHER_FORMULATION_PREFIX, RelationResult
+from plumbline.model.datatypes import Array, Model, State, StateQuantities, Unsupported
+from plumbline.model.kinematics import (
+    quaternion_conjugate,
+    quaternion_product,
+    rotation_matrix,
+    state_from_minimal,
+)
+from plumbline.model.welding import split_bodies
+from plumbline.truth.rounding_bound import RoundingBound, state_rounding_bound
+
+WELDED_HALVES = "two welded halves"
+MAX_STATES, LONG_CHAIN_BODIES = 4, 12  # states per relation; half of them for chains of more bodies
+Q = np.array([1.0, 2.0, 3.0, 4.0]) / np.sqrt(30.0)  # unit quaternion that rotates no axis into an axis
+QUANTITIES = (
+    "acceleration", "angular_acceleration", "joint_reaction", "kinetic_energy", "potential_energy",
+    "angular_momentum",
+)  # fmt: skip
+Evaluate = Callable[[Model, list[State]], list[StateQuantities]]
+
+
+def quantity_values(answers: StateQuantities, **factors: float) -> dict[str, Array]:
+    """Return the state quantities that an engine offers.
+
+    Args:
+        answers: the engine's answers at one state.
+        **factors: by name of a quantity, the number to multiply it by.
+
+    Returns:
+        By name those of `QUANTITIES` that are not None.
+
+    """
+    return {
+        q: np.asarray(getattr(answers, q), float) * factors.get(q, 1.0)
+        for q in QUANTITIES
+        if getattr(answers, q) is not None
+    }
+
+
+def unchanged(model: Model, state: State) -> tuple[Model, State]:
+    """Return model and state as they are: the transformation of relations between two algorithms.
+
+    Args:
+        model: the pendulum.
+        state: minimal coordinates and what follows from them.
+
+    Returns:
+        Both.
+
+    """
+    return model, state
+
+
+@dataclass(frozen=True)
+class Relation:
+    """Another description of the same pendulum, or another algorithm for it."""
+
+    name: str
+    transform: Callable[[Model, State], tuple[Model, State]] = unchanged
+    transform_back: Callable[[StateQuantities], dict[str, Array]] = quantity_values  # of the other answers
+
+
+def scale_fields(model: Model, **factors: float) -> Model:
+    """Multiply fields of a model.
+
+    Args:
+        model: the pendulum.
+        **factors: by name of a field, the number to multiply it by.
+
+    Returns:
+        The other pendulum.
+
+    """
+    return replace(model, **{name: getattr(model, name) * factor for name, factor in factors.items()})
+
+
+def _rotate_world(model: Model, state: State) -> tuple[Model, State]:
+    turn = rotation_matrix(Q)
+    rotated = replace(model, gravity=turn @ model.gravity, force=model.force @ turn.T)
+    p = quaternion_product(Q, state.p)
+    p /= np.linalg.norm(p, axis=-1, keepdims=True)
+    return rotated, state_from_minimal(rotated, p, state.omega, state.u @ turn.T, state.udot @ turn.T)
+
+
+def _unrotate_world(answers: StateQuantities) -> dict[str, Array]:
+    world = ("acceleration", "joint_reaction", "angular_momentum")
+    return {q: x @ rotation_matrix(Q) if q in world else x for q, x in quantity_values(answers).items()}
+
+
+def _rotate_body_frames(model: Model, state: State) -> tuple[Model, State]:
+    """A body vector x becomes Q x."""
+    turn = rotation_matrix(Q)
+    inertia = turn @ model.inertia @ turn.T
+    rotated = replace(
+        model,
+        inertia=(inertia + inertia.mT) / 2,
+        proximal=model.proximal @ turn.T,
+        distal=model.distal @ turn.T,
+        moment=model.moment @ turn.T,
+    )
+    p = quaternion_product(state.p, quaternion_conjugate(Q))
+    p /= np.linalg.norm(p, axis=-1, keepdims=True)
+    return rotated, state_from_minimal(rotated, p, state.omega @ turn.T, state.u, state.udot)
+
+
+def _unrotate_body_frames(answers: StateQuantities) -> dict[str, Array]:
+    return {
+        q: x @ rotation_matrix(Q) if q == "angular_acceleration" else x
+        for q, x in quantity_values(answers).items()
+    }
+
+
+def _double_masses(model: Model, state: State) -> tuple[Model, State]:
+    fields = ("mass", "inertia", "force", "moment", "drag_force", "drag_moment")
+    return scale_fields(model, **dict.fromkeys(fields, 2.0)), state
+
+
+def _halve_forces(answers: StateQuantities) -> dict[str, Array]:
+    return quantity_values(answers, **dict.fromkeys(QUANTITIES[2:], 0.5))
+
+
+def _scale_lengths(model: Model, state: State) -> tuple[Model, State]:
+    """Lengths × 4 and times × 2."""
+    large = scale_fields(
+        model, proximal=4.0, distal=4.0, length=4.0, inertia=16.0, moment=4.0, drag_force=0.5, drag_moment=8.0
+    )
+    return large, state_from_minimal(large, state.p, state.omega / 2, state.u, state.udot / 2)
+
+
+def _unscale_lengths(answers: StateQuantities) -> dict[str, Array]:
+    return quantity_values(
+        answers, angular_acceleration=4.0, kinetic_energy=0.25, potential_energy=0.25, angular_momentum=0.125
+    )
+
+
+def _reverse_time(model: Model, state: State) -> tuple[Model, State]:
+    return model, state_from_minimal(model, state.p, -state.omega, state.u, -state.udot)
+
+
+TIME_REVERSED = Relation(
+    "time reversed", _reverse_time, lambda answers: quantity_values(answers, angular_momentum=-1.0)
+)
+STATE_RELATIONS = (
+    Relation("rotated world", _rotate_world, _unrotate_world),
+    Relation("re-chosen body frame", _rotate_body_frames, _unrotate_body_frames),
+    Relation("masses doubled", _double_masses, _halve_forces),
+    Relation("lengths × 4", _scale_lengths, _unscale_lengths),
+    TIME_REVERSED,
+)
+
+
+def check_state_relations(
+    engine: MetamorphicHooks, model: Model, states: Sequence[State]
+) -> Iterator[RelationResult]:
+    """Check every relation on one engine, at each state.
+
+    Args:
+        engine: the adapter.
+        model: the pendulum.
+        states: states of it; the first few are used.
+
+    Yields:
+        One result per relation.
+
+    """
+    states = states[: MAX_STATES if model.n <= LONG_CHAIN_BODIES else MAX_STATES // 2]
+    answers = [evaluate_or_refusal(engine.evaluate, model, state) for state in states]
+    bounds = [state_rounding_bound(model, state) for state in states]
+    others: list[tuple[Relation, Evaluate]] = [
+        (relation, engine.evaluate)
+        for relation in STATE_RELATIONS
+        if not (relation is TIME_REVERSED and model.has_drag)
+    ]
+    others += [
+        (Relation(OPTION_PREFIX + option), engine.with_option(option).evaluate) for option in engine.options
+    ]
+    if formulation := engine.other_formulation:
+        others.append((Relation(OTHER_FORMULATION_PREFIX + formulation), load_adapter(formulation).evaluate))
+    for relation, evaluate in others:
+        yield check_state_relation(relation, answers, evaluate, model, states, bounds, bounds)
+
+    def evaluate_welded(model: Model, states: list[State]) -> list[StateQuantities]:
+        return engine.with_welded_halves().evaluate(model, states)
+
+    welded_bounds = [state_rounding_bound(model, state, split_bodies(model)) for state in states]
+    yield check_state_relation(
+        Relation(WELDED_HALVES), answers, evaluate_welded, model, states, bounds, welded_bounds
+    )
+
+
+def evaluate_or_refusal(evaluate: Evaluate, model: Model, state: State) -> StateQuantities | Unsupported:
+    """Evaluate one state.
+
+    Args:
+        evaluate: the engine's function for a list of states.
+        model: the pendulum.
+        state: a state of it.
+
+    Returns:
+        The engine's answers, or the exception with which it refused.
+
+    """
+    try:
+        (answers,) = evaluate(model, [state])
+    except Unsupported as refusal:
+        return refusal
+    return answers
+
+
+def check_state_relation(
+    relation: Relation,
+    answers: Sequence[StateQuantities | Unsupported],
+    evaluate_other: Evaluate,
+    model: Model,
+    states: Sequence[State],
+    bounds: Sequence[RoundingBound],
+    other_bounds: Sequence[RoundingBound],
+) -> RelationResult:
+    """Check one relation at every state that the engine evaluates on both sides.
+
+    Args:
+        relation: maps the state there and the answers back.
+        answers: the engine's usual answer at each state.
+        evaluate_other: evaluates the transformed states.
+        model: the pendulum.
+        states: states of it on the constraint manifold.
+        bounds: rounding bound of the usual answer at each state.
+        other_bounds: rounding bound of the other answer at each state, mapped back.
+
+    Returns:
+        The worst difference over the sum of both bounds, of all states, bodies and quantities.
+
+    """
+    worst, count, refusal = (0.0, "", 0), 0, ""
+    for index, state in enumerate(states):
+        here = answers[index]
+        other = evaluate_or_refusal(evaluate_other, *relation.transform(model, state))
+        if isinstance(here, Unsupported) or isinstance(other, Unsupported):
+            refusal = str(here if isinstance(here, Unsupported) else other)
+            continue
+        count += 1
+        mine, theirs = quantity_values(here), relation.transform_back(other)
+        for q in mine.keys() & theirs.keys():
+            difference = np.linalg.norm(np.atleast_1d(mine[q] - theirs[q]), axis=-1)
+            both = np.asarray(bounds[index].tolerance(q)) + other_bounds[index].tolerance(q)
+            allowed = np.maximum(both, np.finfo(float).tiny)
+            worst = max(worst, (float(np.max(difference / allowed)), q, index))
+    return RelationResult(relation.name, worst[0] if count else None, worst[1], worst[2], count, refusal)
