@@ -1,0 +1,1 @@
+"""Tests of the import graph and of the documentation of the code."""

@@ -1,0 +1,116 @@
+"""The import graph follows the layout: packages import only those below them, and there is no cycle."""
+
+import ast
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+LAYERS = (  # from the top; a package imports only what stands after it
+    "cli", "execution", "studies", "reproduce", "storage", "judging", "diagnosis", "truth", "engines", "importers",
+    "scenario", "model", "processes",
+)  # fmt: skip
+OUTSIDE = {  # packages beside the core, and what of the project each may import
+    "reference_impl": ("reference_impl",),
+    "adapters": (
+        "adapters", "reference_impl", "plumbline.model", "plumbline.engines", "plumbline.processes",
+    ),
+    "reports": ("reports", "plumbline.storage", "plumbline.judging.rows", "plumbline.model", "plumbline.processes"),
+    "bench": ("bench", "plumbline", "reference_impl", "adapters", "tests.helpers"),
+}  # fmt: skip
+PROJECT = ("plumbline", "reference_impl", "adapters", "reports", "bench", "tests", "tools")
+
+
+def module_name(path):
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def modules():
+    folders = ("plumbline", *OUTSIDE)
+    files = [
+        path
+        for folder in folders
+        for path in (ROOT / folder).rglob("*.py")
+        if "node_modules" not in path.parts
+    ]
+    return {module_name(path): path for path in files}
+
+
+MODULES = modules()
+
+
+def imports(name, *, at_import):
+    """Modules of the project that a module imports; with at_import only those that loading it imports."""
+    tree = ast.parse(MODULES[name].read_text(encoding="utf-8"))
+    found = set()
+
+    def visit(node):
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test) and at_import:
+            return
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda) and at_import:
+            return
+        if isinstance(node, ast.Import):
+            found.update(alias.name for alias in node.names)
+        if isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{name} imports relatively"
+            members = {f"{node.module}.{alias.name}" for alias in node.names}
+            found.update(members & MODULES.keys() or {node.module})
+        for child in ast.iter_child_nodes(node):
+            visit(child)
+
+    visit(tree)
+    return {module for module in found if module.split(".")[0] in PROJECT}
+
+
+def layer(module):
+    parts = module.split(".")
+    return (
+        LAYERS.index(parts[1]) if parts[0] == "plumbline" and len(parts) > 1 and parts[1] in LAYERS else None
+    )
+
+
+def test_every_module_of_the_core_is_in_a_layer():
+    loose = [
+        m for m in MODULES if m.startswith("plumbline.") and layer(m) is None and m != "plumbline.__main__"
+    ]
+    assert not loose
+
+
+@pytest.mark.parametrize("name", sorted(m for m in MODULES if layer(m) is not None))
+def test_a_package_imports_only_packages_below_it(name):
+    own = layer(name)
+    for imported in imports(name, at_import=False):
+        if (other := layer(imported)) is not None:
+            assert other >= own, f"{name} imports {imported}, which is above it"
+        else:
+            allowed = {"reference_impl", "plumbline"} | ({"reports"} if own == 0 else set())
+            assert imported.split(".")[0] in allowed, f"{name} imports {imported}"
+
+
+@pytest.mark.parametrize("name", sorted(m for m in MODULES if m.split(".")[0] in OUTSIDE))
+def test_a_package_beside_the_core_imports_only_what_it_may(name):
+    allowed = OUTSIDE[name.split(".")[0]]
+    for imported in imports(name, at_import=False):
+        assert any(imported == a or imported.startswith(f"{a}.") for a in allowed), (
+            f"{name} imports {imported}"
+        )
+
+
+def test_no_adapter_imports_another():
+    engines = {
+        m: imports(m, at_import=False) for m in MODULES if m.startswith("adapters.") and m.endswith("_engine")
+    }
+    for name, imported in engines.items():
+        family = name.removeprefix("adapters.").split("_")[0]
+        others = {m for m in imported & engines.keys() if m.removeprefix("adapters.").split("_")[0] != family}
+        assert not others, f"{name} imports {others}"
+
+
+def test_no_module_imports_itself_in_a_circle():
+    graph = {name: imports(name, at_import=True) & MODULES.keys() - {name} for name in MODULES}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(" → ".join(error.args[1]))
