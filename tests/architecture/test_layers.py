@@ -7,16 +7,18 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-LAYERS = (  # from the top; a package imports only what stands after it
-    "cli", "execution", "studies", "reproduce", "storage", "judging", "diagnosis", "truth", "engines", "importers",
-    "scenario", "model", "processes",
+LAYERS = (  # from the top; a package imports only what follows it
+    "cli", "execution", "studies", "reproduce", "storage", "judging", "diagnosis", "truth", "engines",
+    "importers", "scenario", "model", "processes",
 )  # fmt: skip
 OUTSIDE = {  # packages beside the core, and what of the project each may import
     "reference_impl": ("reference_impl",),
     "adapters": (
         "adapters", "reference_impl", "plumbline.model", "plumbline.engines", "plumbline.processes",
     ),
-    "reports": ("reports", "plumbline.storage", "plumbline.judging.rows", "plumbline.model", "plumbline.processes"),
+    "reports": (
+        "reports", "plumbline.storage", "plumbline.judging.rows", "plumbline.model", "plumbline.processes",
+    ),
     "bench": ("bench", "plumbline", "reference_impl", "adapters", "tests.helpers"),
 }  # fmt: skip
 PROJECT = ("plumbline", "reference_impl", "adapters", "reports", "bench", "tests", "tools")
