@@ -1,13 +1,16 @@
-"""Euler parameters: A, L, G, B of a body and what follows from them (N7–N10 of the notes).
+"""Euler parameters of a body: A, L, G, B and what follows from them (N7–N10 of formulation.md).
 
-Everything takes leading batch dimensions and is exact algebra of +, − and ×, so it runs on
-floats, on complex numbers (complex-step differentiation) and on exact rationals or symbols
-in object arrays: the tests check these very functions, not a copy.  L, G, B and H are linear
-in their arguments, so L̇ = L(ṗ), Ġ = G(ṗ) and Ḣ = H(ṗ, s).
+Every function takes leading batch dimensions and uses only +, − and ×, so it runs on floats, on complex
+numbers (complex-step differentiation) and on exact rationals or symbols in object arrays: the tests check
+these very functions.  ṽ, L, G and B are linear in their vector v.  They are written for one vector, as the
+notes write them, and `_linear` applies them to batches as Σ vᵢ X(eᵢ), which rounds nothing.  By linearity,
+too, L̇ = L(ṗ), Ġ = G(ṗ) and Ḣ = H(ṗ, s) (N9).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -18,85 +21,194 @@ AnyArray = NDArray[Any]  # float, complex or exact entries
 I3 = np.eye(3, dtype=int)  # integers: exact in every field
 
 
-def _signed_index_pattern(*rows: str) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Places and signs of a matrix whose every entry is 0 or ± a component of the vector it is made of.
+def _linear(size: int) -> Callable[[Callable[[AnyArray], AnyArray]], Callable[[AnyArray], AnyArray]]:
+    """Apply a matrix that is linear in one vector (size,) to vectors (..., size)."""
 
-    Taken at once: the matrices below are most of what a right-hand side costs in calls.
-    """
-    entries = np.array([row.split() for row in rows])
-    place = np.array([[int(entry[-1]) for entry in row] for row in entries])
-    sign = np.array([[{"-": -1, "+": 1, "0": 0}[entry[0]] for entry in row] for row in entries])
-    return place, sign
+    def batched(matrix: Callable[[AnyArray], AnyArray]) -> Callable[[AnyArray], AnyArray]:
+        of_units = np.array([matrix(unit) for unit in np.eye(size, dtype=int)])
+        table, shape = of_units.reshape(size, -1), of_units.shape[1:]
 
+        @wraps(matrix)
+        def of_batch(v: AnyArray) -> AnyArray:
+            return np.asarray(v @ table).reshape(*v.shape[:-1], *shape)
 
-_TILDE_PATTERN = _signed_index_pattern("00 -2 +1", "+2 00 -0", "-1 +0 00")
-_L_PATTERN = _signed_index_pattern("-1 +0 +3 -2", "-2 -3 +0 +1", "-3 +2 -1 +0")
-_G_PATTERN = _signed_index_pattern("-1 +0 -3 +2", "-2 +3 +0 -1", "-3 -2 +1 +0")
-_B_PATTERN = _signed_index_pattern("00 -0 -1 -2", "+0 00 +2 -1", "+1 -2 00 +0", "+2 +1 -0 00")
+        return of_batch
 
-
-def _apply_pattern(x: AnyArray, linear: tuple[NDArray[Any], NDArray[Any]]) -> AnyArray:
-    """The matrix (..., i, j) of x (..., k)."""
-    place, sign = linear
-    return np.asarray(x.take(place, axis=-1) * sign)
+    return batched
 
 
+@_linear(3)
 def tilde(v: AnyArray) -> AnyArray:
-    """Cross-product matrix ṽ (..., 3, 3) of v (..., 3): ṽ w = v × w."""
-    return _apply_pattern(v, _TILDE_PATTERN)
+    """Return the cross-product matrix ṽ, ṽ w = v × w.
+
+    Args:
+        v: vectors (..., 3).
+
+    Returns:
+        ṽ (..., 3, 3).
+
+    """
+    x, y, z = v
+    return np.array(
+        [
+            [0, -z, y],
+            [z, 0, -x],
+            [-y, x, 0],
+        ]
+    )
 
 
 def outer(a: AnyArray, b: AnyArray) -> AnyArray:
-    """Outer product a bᵀ (..., i, j) of a (..., i) and b (..., j)."""
+    """Return the outer product a bᵀ.
+
+    Args:
+        a: vectors (..., i).
+        b: vectors (..., j).
+
+    Returns:
+        (..., i, j).
+
+    """
     return a[..., :, None] * b[..., None, :]
 
 
 def dot(a: AnyArray, b: AnyArray) -> AnyArray:
-    """Inner product aᵀb (...) of a, b (..., i); never conjugates, as a complex step needs it."""
+    """Return the inner product aᵀb without complex conjugation, as complex steps need it.
+
+    Args:
+        a: vectors (..., i).
+        b: vectors (..., i).
+
+    Returns:
+        (...).
+
+    """
     return np.asarray((a * b).sum(-1))
 
 
 def A(p: AnyArray) -> AnyArray:
-    """(N7) A = (2 p0² − 1) I + 2 (e eᵀ + p0 ẽ), (..., 3, 3): a rotation, body → world, where pᵀp = 1."""
+    """Return A = (2 p0² − 1) I + 2 (e eᵀ + p0 ẽ) (N7).
+
+    Args:
+        p: Euler parameters (..., 4).
+
+    Returns:
+        A (..., 3, 3): a rotation, body → world, where pᵀp = 1.
+
+    """
     p0, e = p[..., 0, None, None], p[..., 1:]
-    return np.asarray((2 * p0 * p0 - 1) * I3 + 2 * (outer(e, e) + p0 * tilde(e)))
+    return np.asarray((2 * p0**2 - 1) * I3 + 2 * (outer(e, e) + p0 * tilde(e)))
 
 
+@_linear(4)
 def L(p: AnyArray) -> AnyArray:
-    """The notes' matrix [−e, p0 I − ẽ], (..., 3, 4): ω′ = 2 Lṗ, body frame."""
-    return _apply_pattern(p, _L_PATTERN)
+    """Return L = [−e, p0 I − ẽ], with which ω′ = 2 L ṗ.
+
+    Args:
+        p: Euler parameters or their rates (..., 4).
+
+    Returns:
+        L (..., 3, 4).
+
+    """
+    p0, e = p[0], p[1:]
+    return np.column_stack([-e, p0 * I3 - tilde(e)])
 
 
+@_linear(4)
 def G(p: AnyArray) -> AnyArray:
-    """The notes' matrix [−e, p0 I + ẽ], (..., 3, 4): A = G Lᵀ + (pᵀp − 1) I."""
-    return _apply_pattern(p, _G_PATTERN)
+    """Return G = [−e, p0 I + ẽ], with which A = G Lᵀ + (pᵀp − 1) I (N10).
+
+    Args:
+        p: Euler parameters or their rates (..., 4).
+
+    Returns:
+        G (..., 3, 4).
+
+    """
+    p0, e = p[0], p[1:]
+    return np.column_stack([-e, p0 * I3 + tilde(e)])
 
 
+@_linear(3)
 def B(s: AnyArray) -> AnyArray:
-    """(N8) B = [[0, −sᵀ], [s, −s̃]], (..., 4, 4)."""
-    return _apply_pattern(s, _B_PATTERN)
+    """Return B = [[0, −sᵀ], [s, −s̃]] (N8).
+
+    Args:
+        s: points of the body (..., 3) [m], body frame.
+
+    Returns:
+        B (..., 4, 4) [m].
+
+    """
+    return np.block([[np.zeros((1, 1), int), -s[None, :]], [s[:, None], -tilde(s)]])
 
 
 def H(p: AnyArray, s: AnyArray) -> AnyArray:
-    """(D4) H = G(p) B(s) + s pᵀ, (..., 3, 4): half of ∂(A s)/∂p."""
+    """Return H = G(p) B(s) + s pᵀ, half of ∂(A s)/∂p (D4).
+
+    Args:
+        p: Euler parameters or their rates (..., 4).
+        s: points of the body (..., 3) [m], body frame.
+
+    Returns:
+        H (..., 3, 4) [m].
+
+    """
     return G(p) @ B(s) + outer(s, p)
 
 
 def dAs_dp(p: AnyArray, s: AnyArray) -> AnyArray:
-    """(N8) ∂(A s)/∂p = 2 G(p) B(s) + 2 s pᵀ, (..., 3, 4), for every p."""
-    return 2 * H(p, s)
+    """Return ∂(A s)/∂p = 2 G(p) B(s) + 2 s pᵀ, for every p (N8).
+
+    Args:
+        p: Euler parameters (..., 4).
+        s: points of the body (..., 3) [m], body frame.
+
+    Returns:
+        (..., 3, 4) [m].
+
+    """
+    return np.asarray(2 * G(p) @ B(s) + 2 * outer(s, p))
 
 
 def A_rate(p: AnyArray, pdot: AnyArray) -> AnyArray:
-    """(N10) Ȧ = 2 G L̇ᵀ, (..., 3, 3), as the notes use it: Ȧ of (N7) is 2 (pᵀṗ) I more where pᵀṗ ≠ 0 (E3)."""
+    """Return Ȧ = 2 G L̇ᵀ as the notes use it (N10); off pᵀṗ = 0 the rate of (N7) is 2 (pᵀṗ) I more (E3).
+
+    Args:
+        p: Euler parameters (..., 4).
+        pdot: their rates ṗ (..., 4) [1/s].
+
+    Returns:
+        Ȧ (..., 3, 3) [1/s].
+
+    """
     return 2 * G(p) @ L(pdot).swapaxes(-1, -2)
 
 
 def angular_velocity(p: AnyArray, pdot: AnyArray) -> AnyArray:
-    """ω′ = 2 L(p) ṗ, (..., 3) rad/s, body frame."""
+    """Return ω′ = 2 L(p) ṗ.
+
+    Args:
+        p: Euler parameters (..., 4).
+        pdot: their rates ṗ (..., 4) [1/s].
+
+    Returns:
+        ω′ (..., 3) [rad/s], body frame.
+
+    """
     return np.asarray(2 * (L(p) @ pdot[..., None])[..., 0])
 
 
 def euler_parameter_rate(p: AnyArray, omega: AnyArray) -> AnyArray:
-    """ṗ = ½ L(p)ᵀ ω′, (..., 4) 1/s, for pᵀp = 1; then pᵀṗ = 0."""
+    """Return ṗ = ½ L(p)ᵀ ω′, the inverse of ω′ = 2 L ṗ where pᵀp = 1; then pᵀṗ = 0.
+
+    Args:
+        p: Euler parameters (..., 4).
+        omega: angular velocities ω′ (..., 3) [rad/s], body frame.
+
+    Returns:
+        ṗ (..., 4) [1/s].
+
+    """
     return np.asarray((L(p).swapaxes(-1, -2) @ omega[..., None])[..., 0] / 2)

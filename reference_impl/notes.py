@@ -1,161 +1,213 @@
-"""The single and the double pendulum exactly as the notes print them: S1–S5 and D1–D6.
+"""The notes' single and double pendulum as formulation.md prints them: S1–S5, D1–D6 and S x = b (N5).
 
-One function per equation, on one state, in the order of the notes; the equations share nothing with
-the general chain of `joints`, so that each can be held against the other.  Both joints are rods
-(E1); a length of 0 is accepted here and makes S singular, which is what E1 says of the notes read
-literally.  Exact on any number field, as `euler_parameters`.
+Open this file beside formulation.md: one property per equation, in the same order, with the errata applied.
+Both joints are rods (E1).  The equations share nothing with the chain of N bodies in `joints` and `direct`,
+so that each can be compared with the other.  They use only +, − and ×, so they run on floats, complex
+numbers, exact rationals and symbols, as `euler_parameters` does.
 """
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
+from scipy.linalg import block_diag
 
 from reference_impl.chain import Array, Chain
 from reference_impl.direct import check_state_solvable, solve_dense
 from reference_impl.euler_parameters import A, A_rate, AnyArray, B, G, H, L, outer
-from reference_impl.joints import constraint_rows
 
-# --- single pendulum: r, p, ṙ, ṗ of the body, s₁ its attachment, ℓ the rod -------------------------------
-
-
-def single_C(r: AnyArray, p: AnyArray, s1: AnyArray, length: float) -> AnyArray:
-    """(S1) C = rᵀr + 2 rᵀA s₁ + s₁ᵀs₁ − ℓ², m²; s₁ᵀAᵀA s₁ replaced by s₁ᵀs₁ (E2)."""
-    return np.asarray(r @ r + 2 * (r @ A(p) @ s1) + s1 @ s1 - length * length)
+Number = Any  # float, complex or exact
 
 
-def single_C_r(r: AnyArray, p: AnyArray, s1: AnyArray) -> AnyArray:
-    """(S2) C_r = 2 rᵀ + 2 s₁ᵀAᵀ, (3,)."""
-    return np.asarray(2 * r + 2 * (s1 @ A(p).T))
+class SinglePendulum(NamedTuple):
+    """One state of the single pendulum, on or off the constraints, and its equations (S1–S5)."""
+
+    r: AnyArray  # (3,) m, centre of mass, world frame
+    p: AnyArray  # (4,) Euler parameters
+    rdot: AnyArray  # (3,) m/s
+    pdot: AnyArray  # (4,) 1/s
+    s1: AnyArray  # (3,) m, attachment of the rod, body frame
+    ell: Number  # m, length of the rod; 0 makes S singular (E1)
+
+    @property
+    def C(self) -> Number:
+        """(S1) C = rᵀr + 2 rᵀA s₁ + s₁ᵀs₁ − ℓ² [m²]: dᵀd − ℓ² with s₁ᵀs₁ for s₁ᵀAᵀA s₁ (E2)."""
+        r, p, _, _, s1, ell = self
+        return r @ r + 2 * (r @ A(p) @ s1) + s1 @ s1 - ell * ell
+
+    @property
+    def C_r(self) -> AnyArray:
+        """(S2) C_r = 2 rᵀ + 2 s₁ᵀAᵀ, (3,) [m]."""
+        r, p, _, _, s1, _ = self
+        return np.asarray(2 * r + 2 * (s1 @ A(p).T))
+
+    @property
+    def C_p(self) -> AnyArray:
+        """(S3) C_p = 4 rᵀ (G B(s₁) + s₁ pᵀ), (4,) [m²]."""
+        r, p, _, _, s1, _ = self
+        return np.asarray(4 * (r @ (G(p) @ B(s1) + outer(s1, p))))
+
+    @property
+    def gamma(self) -> Number:
+        """(S4) γ = −2 ṙᵀṙ − 4 s₁ᵀL̇Gᵀṙ − 4 [(ṙᵀG + rᵀĠ) B(s₁) + ṙᵀs₁ pᵀ + rᵀs₁ ṗᵀ] ṗ [m²/s²]."""
+        r, p, rdot, pdot, s1, _ = self
+        Ldot, Gdot = L(pdot), G(pdot)
+        bracket = (rdot @ G(p) + r @ Gdot) @ B(s1) + rdot @ outer(s1, p) + r @ outer(s1, pdot)
+        return -2 * (rdot @ rdot) - 4 * (s1 @ Ldot @ G(p).T @ rdot) - 4 * (bracket @ pdot)
+
+    @property
+    def C_E(self) -> Number:
+        """(S5) C_E = pᵀp − 1."""
+        return self.p @ self.p - 1
+
+    @property
+    def C_Ep(self) -> AnyArray:
+        """(S5) C_{E,p} = 2 pᵀ, (4,)."""
+        return np.asarray(2 * self.p)
+
+    @property
+    def gamma_E(self) -> Number:
+        """(S5) γ_E = −2 ṗᵀṗ [1/s²]."""
+        return -2 * (self.pdot @ self.pdot)
 
 
-def single_C_p(r: AnyArray, p: AnyArray, s1: AnyArray) -> AnyArray:
-    """(S3) C_p = 4 rᵀ (G B(s₁) + s₁ pᵀ), (4,)."""
-    return np.asarray(4 * (r @ (G(p) @ B(s1) + outer(s1, p))))
+class DoublePendulum(NamedTuple):
+    """One state of the double pendulum, on or off the constraints, and its equations (D2–D6)."""
+
+    r: AnyArray  # (2, 3) m, centres of mass, world frame
+    p: AnyArray  # (2, 4) Euler parameters
+    rdot: AnyArray  # (2, 3) m/s
+    pdot: AnyArray  # (2, 4) 1/s
+    s: AnyArray  # (3, 3) m, s₁, s₂, s₃, body frames
+    ell: AnyArray  # (2,) m, lengths of the rods
+
+    @property
+    def bodies(self) -> list[SinglePendulum]:
+        """Body 1 on its rod, which is the single pendulum; of body 2 only the normalisation (S5) applies."""
+        attachments = (self.s[0], self.s[2])
+        return [SinglePendulum(*of_body) for of_body in zip(*self[:4], attachments, self.ell, strict=True)]
+
+    @property
+    def C(self) -> AnyArray:
+        """(S1, D2) C, (2,) [m²]: C₂ = dᵀd − ℓ₂² expanded, with s₂ᵀs₂ and s₃ᵀs₃ (E2)."""
+        (r1, r2), (p1, p2), _, _, (_, s2, s3), (_, ell2) = self
+        A1, A2 = A(p1), A(p2)
+        C2 = r1 @ r1 - 2 * (r1 @ r2) + r2 @ r2 + 2 * ((r1 - r2) @ (A1 @ s2 - A2 @ s3))
+        C2 = C2 + s2 @ s2 - 2 * (s2 @ A1.T @ A2 @ s3) + s3 @ s3 - ell2 * ell2
+        return np.array([self.bodies[0].C, C2])
+
+    @property
+    def C_r(self) -> AnyArray:
+        """(S2, D3) C_r, (2, 6) [m]: ∂C₂/∂r₁ = 2 (r₁ − r₂)ᵀ + 2 (A₁s₂ − A₂s₃)ᵀ = −∂C₂/∂r₂."""
+        (r1, r2), (p1, p2), _, _, (_, s2, s3), _ = self
+        C2_r1 = 2 * (r1 - r2) + 2 * (A(p1) @ s2 - A(p2) @ s3)
+        return np.block([[self.bodies[0].C_r, 0 * r2], [C2_r1, -C2_r1]])
+
+    @property
+    def C_p(self) -> AnyArray:
+        """(S3, D4) C_p, (2, 8) [m²], with H(p, s) = G(p) B(s) + s pᵀ."""
+        (r1, r2), (p1, p2), _, _, (_, s2, s3), _ = self
+        C2_p1 = +4 * ((r1 - r2) @ H(p1, s2)) - 4 * (s3 @ A(p2).T @ H(p1, s2))
+        C2_p2 = -4 * ((r1 - r2) @ H(p2, s3)) - 4 * (s2 @ A(p1).T @ H(p2, s3))
+        return np.block([[self.bodies[0].C_p, 0 * p2], [C2_p1, C2_p2]])
+
+    @property
+    def C2_r_rate(self) -> AnyArray:
+        """(D5) d_t(∂C₂/∂r), (6,) [m/s]: 2 (ṙ₁ − ṙ₂)ᵀ + 4 (s₂ᵀL̇₁G₁ᵀ − s₃ᵀL̇₂G₂ᵀ) = −d_t(∂C₂/∂r₂)."""
+        _, (p1, p2), (rdot1, rdot2), (pdot1, pdot2), (_, s2, s3), _ = self
+        C2_r1_rate = 2 * (rdot1 - rdot2) + 4 * (s2 @ L(pdot1) @ G(p1).T - s3 @ L(pdot2) @ G(p2).T)
+        return np.concatenate([C2_r1_rate, -C2_r1_rate])
+
+    @property
+    def C2_p_rate(self) -> AnyArray:
+        """(D6) d_t(∂C₂/∂p), (8,) [m²/s], with Ḣ(p, s) = H(ṗ, s) and Ȧᵀ = 2 L̇ Gᵀ (E3)."""
+        (r1, r2), (p1, p2), (rdot1, rdot2), (pdot1, pdot2), (_, s2, s3), _ = self
+        A1, A2, A1dot, A2dot = A(p1), A(p2), A_rate(p1, pdot1), A_rate(p2, pdot2)
+        H1, H2, H1dot, H2dot = H(p1, s2), H(p2, s3), H(pdot1, s2), H(pdot2, s3)
+        C2_p1_rate = 4 * ((rdot1 - rdot2) @ H1) + 4 * ((r1 - r2) @ H1dot)
+        C2_p1_rate = C2_p1_rate - 4 * (s3 @ A2dot.T @ H1) - 4 * (s3 @ A2.T @ H1dot)
+        C2_p2_rate = -4 * ((rdot1 - rdot2) @ H2) - 4 * ((r1 - r2) @ H2dot)
+        C2_p2_rate = C2_p2_rate - 4 * (s2 @ A1dot.T @ H2) - 4 * (s2 @ A1.T @ H2dot)
+        return np.concatenate([C2_p1_rate, C2_p2_rate])
+
+    @property
+    def gamma(self) -> AnyArray:
+        """(N3) γ = −d_t(C_r) ṙ − d_t(C_p) ṗ, (2,) [m²/s²]: γ₁ by (S4), γ₂ by (D5, D6)."""
+        gamma_2 = -self.C2_r_rate @ self.rdot.ravel() - self.C2_p_rate @ self.pdot.ravel()
+        return np.array([self.bodies[0].gamma, gamma_2])
 
 
-def single_gamma(r: AnyArray, p: AnyArray, v: AnyArray, pdot: AnyArray, s1: AnyArray) -> AnyArray:
-    """(S4) γ = −2 ṙᵀṙ − 4 s₁ᵀL̇Gᵀṙ − 4 [(ṙᵀG + rᵀĠ) B(s₁) + ṙᵀs₁ pᵀ + rᵀs₁ ṗᵀ] ṗ."""
-    bracket = (v @ G(p) + r @ G(pdot)) @ B(s1) + v @ outer(s1, p) + r @ outer(s1, pdot)
-    return np.asarray(-2 * (v @ v) - 4 * (s1 @ L(pdot) @ G(p).T @ v) - 4 * (bracket @ pdot))
+def assemble_system(chain: Chain, r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, Array]:
+    """Assemble S and b of (N5) for one body (S1–S5) or two (D1–D6); every joint is read as a rod.
 
+    Args:
+        chain: the pendulum, N = 1 or 2.
+        r: positions (N, 3) [m], world frame.
+        p: Euler parameters (N, 4).
+        v: velocities ṙ (N, 3) [m/s], world frame.
+        pdot: rates ṗ (N, 4) [1/s].
 
-def norm_C(p: AnyArray) -> AnyArray:
-    """(S5) C_E = pᵀp − 1."""
-    return np.asarray(p @ p - 1)
+    Returns:
+        S (9 N, 9 N) and b (9 N,), for x = (r̈, p̈, λ, λ_E).
 
+    Raises:
+        ValueError: the chain has more than two bodies.
 
-def norm_C_p(p: AnyArray) -> AnyArray:
-    """(S5) C_{E,p} = 2 pᵀ, (4,)."""
-    return np.asarray(2 * p)
-
-
-def norm_gamma(pdot: AnyArray) -> AnyArray:
-    """(S5) γ_E = −2 ṗᵀṗ."""
-    return np.asarray(-2 * (pdot @ pdot))
-
-
-# --- double pendulum: r, p, ṙ, ṗ have a row per body, s = (s₁, s₂, s₃), ℓ = (ℓ₁, ℓ₂) ------------------------
-
-
-def double_C(r: AnyArray, p: AnyArray, s: AnyArray, length: AnyArray) -> AnyArray:
-    """(D2) C₁ as (S1); C₂ expanded, s₂ᵀA₁ᵀA₁s₂ and s₃ᵀA₂ᵀA₂s₃ replaced by s₂ᵀs₂ and s₃ᵀs₃, (2,)."""
-    (r1, r2), (p1, p2), (s1, s2, s3) = r, p, s
-    C2 = r1 @ r1 - 2 * (r1 @ r2) + r2 @ r2 + 2 * ((r1 - r2) @ (A(p1) @ s2 - A(p2) @ s3))
-    C2 = C2 + s2 @ s2 - 2 * (s2 @ A(p1).T @ A(p2) @ s3) + s3 @ s3 - length[1] * length[1]
-    return np.array([single_C(r1, p1, s1, length[0])[()], C2])
-
-
-def double_C_r(r: AnyArray, p: AnyArray, s: AnyArray) -> AnyArray:
-    """(S2, D3) C_r, (2, 6)."""
-    (r1, r2), (p1, p2), (s1, s2, s3) = r, p, s
-    row = 2 * (r1 - r2) + 2 * (A(p1) @ s2 - A(p2) @ s3)
-    return np.stack([np.concatenate([single_C_r(r1, p1, s1), 0 * r2]), np.concatenate([row, -row])])
-
-
-def double_C_p(r: AnyArray, p: AnyArray, s: AnyArray) -> AnyArray:
-    """(S3, D4) C_p, (2, 8)."""
-    (r1, r2), (p1, p2), (s1, s2, s3) = r, p, s
-    p1_row = 4 * ((r1 - r2) @ H(p1, s2)) - 4 * (s3 @ A(p2).T @ H(p1, s2))
-    p2_row = -4 * ((r1 - r2) @ H(p2, s3)) - 4 * (s2 @ A(p1).T @ H(p2, s3))
-    return np.stack([np.concatenate([single_C_p(r1, p1, s1), 0 * p2]), np.concatenate([p1_row, p2_row])])
-
-
-def double_C_r_rate(p: AnyArray, v: AnyArray, pdot: AnyArray, s: AnyArray) -> AnyArray:
-    """(D5) d_t(∂C₂/∂r), (6,)."""
-    (p1, p2), (v1, v2), (pd1, pd2), (_, s2, s3) = p, v, pdot, s
-    row = 2 * (v1 - v2) + 4 * (s2 @ L(pd1) @ G(p1).T - s3 @ L(pd2) @ G(p2).T)
-    return np.concatenate([row, -row])
-
-
-def double_C_p_rate(r: AnyArray, p: AnyArray, v: AnyArray, pdot: AnyArray, s: AnyArray) -> AnyArray:
-    """(D6) d_t(∂C₂/∂p), (8,)."""
-    (r1, r2), (p1, p2), (v1, v2), (pd1, pd2), (_, s2, s3) = r, p, v, pdot, s
-    H1, H1_rate, H2, H2_rate = H(p1, s2), H(pd1, s2), H(p2, s3), H(pd2, s3)
-    p1_row = 4 * ((v1 - v2) @ H1) + 4 * ((r1 - r2) @ H1_rate)
-    p1_row = p1_row - 4 * (s3 @ A_rate(p2, pd2).T @ H1) - 4 * (s3 @ A(p2).T @ H1_rate)
-    p2_row = -4 * ((v1 - v2) @ H2) - 4 * ((r1 - r2) @ H2_rate)
-    p2_row = p2_row - 4 * (s2 @ A_rate(p1, pd1).T @ H2) - 4 * (s2 @ A(p1).T @ H2_rate)
-    return np.concatenate([p1_row, p2_row])
-
-
-def double_gamma(r: AnyArray, p: AnyArray, v: AnyArray, pdot: AnyArray, s: AnyArray) -> AnyArray:
-    """(N3 with S4, D5, D6) γ = −d_t(C_r) ṙ − d_t(C_p) ṗ, (2,)."""
-    gamma_2 = -double_C_r_rate(p, v, pdot, s) @ v.ravel() - double_C_p_rate(r, p, v, pdot, s) @ pdot.ravel()
-    return np.array([single_gamma(r[0], p[0], v[0], pdot[0], s[0])[()], gamma_2])
-
-
-# --- N5 for both ---------------------------------------------------------------------------------------
-
-
-def block_diagonal(matrices: AnyArray) -> AnyArray:
-    """diag(X₁, …, X_N) of X (N, i, j): (N i, N j)."""
-    n, i, j = matrices.shape
-    out = np.zeros((n, i, n, j), matrices.dtype)
-    out[np.arange(n), :, np.arange(n), :] = matrices
-    return out.reshape(n * i, n * j)
-
-
-def assemble_system(
-    chain: Chain, r: AnyArray, p: AnyArray, v: AnyArray, pdot: AnyArray
-) -> tuple[AnyArray, AnyArray]:
-    """(N5 with S1–S5 or D1–D6) S and b of a chain of one or two bodies, every joint read as a rod.
-
-    Unknowns (r̈, p̈, λ, λ_E): S is (9, 9) for one body and (18, 18) for two.
     """
-    s = np.stack([chain.proximal[0], chain.distal[0], chain.proximal[-1]])
-    if chain.n == 1:
-        C_r, C_p = single_C_r(r[0], p[0], s[0])[None], single_C_p(r[0], p[0], s[0])[None]
-        gamma = single_gamma(r[0], p[0], v[0], pdot[0], s[0])[None]
-    elif chain.n == 2:
-        C_r, C_p, gamma = double_C_r(r, p, s), double_C_p(r, p, s), double_gamma(r, p, v, pdot, s)
-    else:
-        raise ValueError(f"the notes print one and two bodies, not {chain.n}")
-    L_, L_rate, J = block_diagonal(L(p)), block_diagonal(L(pdot)), block_diagonal(chain.inertia)
-    M = np.diag(np.repeat(chain.mass, 3))
-    C_Ep = block_diagonal(norm_C_p(p)[:, None, :])
-    force = chain.mass[:, None] * chain.gravity + chain.force - chain.drag_force[:, None] * v
-    moment = chain.moment - chain.drag_moment[:, None] * (2 * (L_ @ pdot.ravel())).reshape(-1, 3)
-
-    def zero(rows: int, columns: int) -> AnyArray:
-        return np.zeros((rows, columns), M.dtype)
-
     n = chain.n
+    if n == 1:
+        one = SinglePendulum(r[0], p[0], v[0], pdot[0], chain.proximal[0], chain.length[0])
+        bodies, C_r, C_p, gamma = [one], one.C_r[None], one.C_p[None], np.array([one.gamma])
+    elif n == 2:
+        s = np.stack([chain.proximal[0], chain.distal[0], chain.proximal[1]])
+        two = DoublePendulum(r, p, v, pdot, s, chain.length)
+        bodies, C_r, C_p, gamma = two.bodies, two.C_r, two.C_p, two.gamma
+    else:
+        raise ValueError(f"the notes print one and two bodies, not {n}")
+    C_Ep = block_diag(*(body.C_Ep for body in bodies))
+    gamma_E = np.array([body.gamma_E for body in bodies])
+    M = block_diag(*(m * np.eye(3) for m in chain.mass))  # (D1), and the next two lines
+    J = block_diag(*chain.inertia)
+    L_, Ldot = block_diag(*L(p)), block_diag(*L(pdot))
+    p_, omega = p.ravel(), 2 * (L(p) @ pdot[..., None])[..., 0]
+    F = chain.mass[:, None] * chain.gravity + chain.force - chain.drag_force[:, None] * v
+    moment = chain.moment - chain.drag_moment[:, None] * omega  # n′
+
+    def zero(rows: int, columns: int) -> Array:
+        return np.zeros((rows, columns))
+
     S = np.block(
         [
-            [M, zero(3 * n, 4 * n), C_r.T, zero(3 * n, n)],
-            [zero(4 * n, 3 * n), 4 * L_.T @ J @ L_, C_p.T, C_Ep.T],
-            [C_r, C_p, zero(n, n), zero(n, n)],
-            [zero(n, 3 * n), C_Ep, zero(n, n), zero(n, n)],
+            [M, zero(3 * n, 4 * n), C_r.T, zero(3 * n, n)],  # (N1)
+            [zero(4 * n, 3 * n), 4 * L_.T @ J @ L_, C_p.T, C_Ep.T],  # (N2)
+            [C_r, C_p, zero(n, n), zero(n, n)],  # (N3)
+            [zero(n, 3 * n), C_Ep, zero(n, n), zero(n, n)],  # (N4)
         ]
     )
-    quadratic = 8 * L_rate.T @ (J @ (L_rate @ p.ravel()))
-    b = [force.ravel(), quadratic + 2 * L_.T @ moment.ravel(), gamma, [norm_gamma(x)[()] for x in pdot]]
+    b = [F.ravel(), 8 * Ldot.T @ J @ Ldot @ p_ + 2 * L_.T @ moment.ravel(), gamma, gamma_E]
     return S, np.concatenate(b)
 
 
-def solve_printed(chain: Chain, r: Array, p: Array, v: Array, pdot: Array) -> Array:
-    """(N5) (r̈, p̈, λ, λ_E), (9 N,), of `system`; SingularSystem names the cause and the body (E1, E7)."""
-    d = constraint_rows(chain, r, p, v, pdot).d
+def solve_system(chain: Chain, r: Array, p: Array, v: Array, pdot: Array) -> Array:
+    """Solve (N5) for x = (r̈, p̈, λ, λ_E).
+
+    Args:
+        chain: the pendulum, N = 1 or 2.
+        r: positions (N, 3) [m], world frame.
+        p: Euler parameters (N, 4).
+        v: velocities ṙ (N, 3) [m/s], world frame.
+        pdot: rates ṗ (N, 4) [1/s].
+
+    Returns:
+        (9 N,) r̈ [m/s²], p̈ [1/s²], λ [N/m] and λ_E.
+
+    Raises:
+        SingularSystem: S is singular; the message names the body and the cause (E1, E7).
+
+    """
+    n = chain.n
     S, b = assemble_system(chain, r, p, v, pdot)
-    check_state_solvable(chain, r, p, d, np.full(chain.n, True), (S, b))
+    d = np.array([S[7 * n + k, 3 * k : 3 * k + 3] / 2 for k in range(n)])  # by (S2, D3), up to its sign
+    check_state_solvable(chain, r, p, d, np.full(n, True), (S, b))
     return solve_dense(S, b)

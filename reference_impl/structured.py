@@ -27,42 +27,19 @@ from scipy.linalg import lapack
 from reference_impl.chain import Array, Chain
 from reference_impl.direct import EPS, Solution, check_state_solvable
 from reference_impl.errors import SingularSystem
+from reference_impl.euler_parameters import G, L, tilde
 from reference_impl.joints import joint_of_rows
 
-
-def _bilinear(rows: list[str]) -> Array:
-    """(k, 16) matrix from the flattened outer product of two 4-vectors to k sums of terms ±ij: ± a_i b_j."""
-    matrix = np.zeros((len(rows), 4, 4))
-    for row, terms in zip(matrix, rows, strict=True):
-        for term in terms.split():
-            row[int(term[1]), int(term[2])] += float(term[0] + "1")
-    return matrix.reshape(len(rows), 16)
-
-
-_PRODUCT = _bilinear(  # quaternion product a b, by components
-    [
-        "+00 -11 -22 -33",
-        "+01 +10 +23 -32",
-        "+02 -13 +20 +31",
-        "+03 +12 -21 +30",
-    ]
-)
+# Constants that turn flattened outer products of p with another vector into what is needed of them.
+_L, _G = L(np.eye(4)), G(np.eye(4))  # (4, 3, 4) each: L(p) = Σ pᵢ Lᵢ
+_TO_OMEGA = 2 * _L.transpose(1, 0, 2).reshape(3, 16)  # p ṗᵀ → ω′ = 2 L(p) ṗ
+_HALF_LT = _L.transpose(2, 0, 1).reshape(4, 12) / 2  # p αᵀ → ½ L(p)ᵀ α
+_TO_NORM = np.eye(4).reshape(1, 16)  # p bᵀ → pᵀb
+_GLT = np.einsum("iak,jbk->abij", _G, _L).reshape(9, 4, 4)  # p pᵀ → π R = G Lᵀ (N10), row by row
+_TO_ROTATION = np.concatenate([_TO_NORM, (_GLT + _GLT.mT).reshape(9, 16) / 2])  # p pᵀ → π, then π R
+_TO_TILDE = tilde(np.eye(3)).reshape(3, 9).T  # ω → ω̃, row by row
 _FIRST_FACTORS, _SECOND_FACTORS = [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]  # the six products ωᵢ ωⱼ
-_TO_OMEGA = 2 * _bilinear(["+01 -10 -23 +32", "+02 +13 -20 -31", "+03 -12 +21 -30"])  # 2 L(p) ṗ
-_TO_RATE_PRODUCTS = np.concatenate(
-    [_bilinear(["+00 +11 +22 +33"]), _TO_OMEGA[_FIRST_FACTORS], _TO_OMEGA[_SECOND_FACTORS]]
-)  # pᵀṗ and these
-_TO_ROTATION = _bilinear(  # π, then π R row by row
-    [
-        "+00 +11 +22 +33",
-        *("+00 +11 -22 -33", "+12 +21 -03 -30", "+13 +31 +02 +20"),
-        *("+12 +21 +03 +30", "+00 -11 +22 -33", "+23 +32 -01 -10"),
-        *("+13 +31 -02 -20", "+23 +32 +01 +10", "+00 -11 -22 +33"),
-    ]
-)
-_HALF_LT = 0.5 * _PRODUCT.reshape(4, 4, 4)[:, :, 1:].reshape(
-    4, 12
-)  # ½ L(p)ᵀ α, from the outer product of p and α
+_TO_RATE_PRODUCTS = np.concatenate([_TO_NORM, _TO_OMEGA[_FIRST_FACTORS], _TO_OMEGA[_SECOND_FACTORS]])
 # The lower band of D: column 3k+j holds rows j, j+1 … of its own block and then the next block's, 6 in all.
 _BAND_INDICES = np.array(
     [
@@ -71,13 +48,6 @@ _BAND_INDICES = np.array(
         *(8, 11, 14, 17, 18, 18),
     ]
 )
-_TO_TILDE = np.zeros((9, 3))  # ω → ω̃, row by row
-_TO_TILDE[[7, 2, 3], [0, 1, 2]], _TO_TILDE[[5, 6, 1], [0, 1, 2]] = 1.0, -1.0
-
-
-def skew(s: Array) -> Array:
-    """s̃ (..., 3, 3) of s (..., 3)."""
-    return np.asarray((s @ _TO_TILDE.T).reshape(*s.shape, 3))
 
 
 def _tilde(omega: Array) -> Array:
@@ -159,7 +129,7 @@ class StructuredSystem:
         cross, one = _TO_TILDE.reshape(3, 3, 3), np.eye(3)
         gyro = -np.einsum("mki,kja,mjd->miad", K, cross, inertia)
         pull = np.einsum("ia,mcd->mciad", one, points) - np.einsum("ad,mci->mciad", one, points)
-        B = -skew(points) @ K[:, None]  # (M, 2, 3, 3)
+        B = -tilde(points) @ K[:, None]  # (M, 2, 3, 3)
         self.B = last(B)
         spin = np.concatenate([gyro, (np.einsum("mcik,mkad->mciad", B, gyro) + pull).reshape(-1, 6, 3, 3)], 1)
         spin = spin[..., _FIRST_FACTORS, _SECOND_FACTORS] + spin[..., _SECOND_FACTORS, _FIRST_FACTORS] * (

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from reference_impl import notes
 from reference_impl.chain import Chain
 from reference_impl.euler_parameters import dot
 from reference_impl.joints import constraint_rows
+from reference_impl.notes import DoublePendulum, SinglePendulum
 from tests.helpers.notes_test_data import Symbols, off_manifold, on_manifold, random_chain
 
 
@@ -37,14 +37,15 @@ def test_rods_are_the_printed_forms_identically(n):
     x, chain, joints = symbolic([True] * n)
     C_r, C_p = jacobians(joints, n)
     if n == 1:
-        r, p, v, pdot, s1 = x.r[0], x.p[0], x.v[0], x.pdot[0], x.s[0]
-        C, gamma = notes.single_C(r, p, s1, 2), notes.single_gamma(r, p, v, pdot, s1)
-        printed_C_r, printed_C_p = notes.single_C_r(r, p, s1), notes.single_C_p(r, p, s1)
+        printed = SinglePendulum(x.r[0], x.p[0], x.v[0], x.pdot[0], x.s[0], 2)
     else:
-        s = np.array([x.s[0], x.s[2], x.s[1]])
-        C, gamma = notes.double_C(x.r, x.p, s, chain.length), notes.double_gamma(x.r, x.p, x.v, x.pdot, s)
-        printed_C_r, printed_C_p = notes.double_C_r(x.r, x.p, s), notes.double_C_p(x.r, x.p, s)
-    for general, as_printed in ((joints.C, C), (C_r, printed_C_r), (C_p, printed_C_p), (joints.gamma, gamma)):
+        printed = DoublePendulum(x.r, x.p, x.v, x.pdot, x.s[[0, 2, 1]], chain.length)
+    for general, as_printed in (
+        (joints.C, printed.C),
+        (C_r, printed.C_r),
+        (C_p, printed.C_p),
+        (joints.gamma, printed.gamma),
+    ):
         assert x.zero(general - as_printed)
 
 

@@ -2,15 +2,16 @@
 
 import numpy as np
 
-from reference_impl import notes
-from reference_impl.euler_parameters import A, H
+from reference_impl.euler_parameters import A, G, H, L
+from reference_impl.notes import DoublePendulum, SinglePendulum
 from tests.helpers.notes_test_data import Symbols
 
 x = Symbols(bodies=2, attachments=3)
 r, p, v, pdot, s = x.r, x.p, x.v, x.pdot, x.s
 (s1, s2, s3), (p1, p2), (pd1, pd2) = s, p, pdot
-C = notes.double_C(r, p, s, x.length)
-C_r, C_p = notes.double_C_r(r, p, s), notes.double_C_p(r, p, s)
+pendulum = DoublePendulum(r, p, v, pdot, s, x.length)
+first = SinglePendulum(r[0], p1, v[0], pd1, s1, x.length[0])
+C, C_r, C_p = pendulum.C, pendulum.C_r, pendulum.C_p
 c1, c2 = p1 @ pd1, p2 @ pd2  # what N10 neglects (E3)
 
 
@@ -18,7 +19,7 @@ def test_D2_is_dTd_with_E2s_replacement():
     a, b = A(p1) @ s2, A(p2) @ s3
     d = r[0] + a - r[1] - b
     assert x.zero(C[1] - (d @ d - x.length[1] ** 2) + a @ a - s2 @ s2 + b @ b - s3 @ s3)
-    assert x.zero(C[0] - notes.single_C(r[0], p1, s1, x.length[0]))
+    assert x.zero(C[0] - first.C)
 
 
 def test_D3_D4_are_the_derivatives_of_D2():
@@ -28,26 +29,25 @@ def test_D3_D4_are_the_derivatives_of_D2():
 
 def test_D5_is_the_rate_of_D3_up_to_E3():
     missing = 4 * (s2 * c1 - s3 * c2)
-    difference = x.rate(C_r[1]) - notes.double_C_r_rate(p, v, pdot, s)
+    difference = x.rate(C_r[1]) - pendulum.C2_r_rate
     assert x.zero(difference - np.concatenate([missing, -missing]))
 
 
 def test_D6_is_the_rate_of_D4_up_to_E3():
-    difference = x.rate(C_p[1]) - notes.double_C_p_rate(r, p, v, pdot, s)
+    difference = x.rate(C_p[1]) - pendulum.C2_p_rate
     missing = np.concatenate([-8 * (s3 @ H(p1, s2)) * c2, -8 * (s2 @ H(p2, s3)) * c1])
     assert x.zero(difference - missing)
 
 
 def test_gamma_is_minus_the_rates_times_the_velocities():
-    gamma = notes.double_gamma(r, p, v, pdot, s)
-    rates = notes.double_C_r_rate(p, v, pdot, s) @ v.ravel()
-    rates = rates + notes.double_C_p_rate(r, p, v, pdot, s) @ pdot.ravel()
-    assert x.zero(gamma[1] + rates)
-    assert x.zero(gamma[0] - notes.single_gamma(r[0], p1, v[0], pd1, s1))
+    rates = pendulum.C2_r_rate @ v.ravel()
+    rates = rates + pendulum.C2_p_rate @ pdot.ravel()
+    assert x.zero(pendulum.gamma[1] + rates)
+    assert x.zero(pendulum.gamma[0] - first.gamma)
 
 
 def test_E6_the_recognised_text_without_transposes_is_not_the_derivative():
     lost = 4 * ((r[0] - r[1]) @ H(p1, s2)) - 4 * (s3 @ A(p2) @ H(p1, s2))
     assert not x.zero(lost - x.gradient(C[1], p1))
-    unequal = 2 * (v[0] - v[1]) + 4 * (s2 @ notes.L(pd1) @ notes.G(p1).T)
-    assert not x.zero(unequal - notes.double_C_r_rate(p, v, pdot, s)[:3])
+    unequal = 2 * (v[0] - v[1]) + 4 * (s2 @ L(pd1) @ G(p1).T)
+    assert not x.zero(unequal - pendulum.C2_r_rate[:3])

@@ -53,7 +53,7 @@ def test_E1_printed_with_length_0_is_singular_and_names_the_body(n):
     with pytest.raises(SingularSystem, match="singular"):
         solve_dense(S, b)
     with pytest.raises(SingularSystem, match=r"rod above body 1 has length 0.*E1.*ball"):
-        notes.solve_printed(chain, *state)
+        notes.solve_system(chain, *state)
 
 
 def test_E1_a_rod_whose_ends_meet_is_singular_in_the_general_form_too():
@@ -303,6 +303,6 @@ def test_the_pendulum_of_the_notes_is_regular():
         assert S.shape == (9 * n, 9 * n) and np.linalg.matrix_rank(S) == 9 * n
         x = DirectSystem(chain).solve(*state)
         np.testing.assert_allclose(
-            notes.solve_printed(chain, *state)[: 3 * n], x.acceleration.ravel(), atol=1e-12
+            notes.solve_system(chain, *state)[: 3 * n], x.acceleration.ravel(), atol=1e-12
         )
         assert np.all(euler_parameter_rate(state[1], np.zeros((n, 3))) == 0)

@@ -2,15 +2,14 @@
 
 import numpy as np
 
-from reference_impl import notes
 from reference_impl.euler_parameters import A, dot
+from reference_impl.notes import SinglePendulum
 from tests.helpers.notes_test_data import Symbols
 
 x = Symbols(bodies=1, attachments=1)
 r, p, v, pdot, s1, length = x.r[0], x.p[0], x.v[0], x.pdot[0], x.s[0], x.length[0]
-C = notes.single_C(r, p, s1, length)
-C_r, C_p = notes.single_C_r(r, p, s1), notes.single_C_p(r, p, s1)
-gamma = notes.single_gamma(r, p, v, pdot, s1)
+pendulum = SinglePendulum(r, p, v, pdot, s1, length)
+C, C_r, C_p, gamma = pendulum.C, pendulum.C_r, pendulum.C_p, pendulum.gamma
 
 
 def test_S1_is_dTd_with_E2s_replacement():
@@ -30,10 +29,9 @@ def test_S4_is_minus_the_rate_of_the_jacobians_up_to_E3():
 
 
 def test_S5_is_the_normalisation_and_its_derivatives():
-    norm = notes.norm_C(p)
-    assert x.zero(norm - (p @ p - 1))
-    assert x.zero(notes.norm_C_p(p) - x.gradient(norm, p))
-    assert x.zero(notes.norm_gamma(pdot) + x.rate(notes.norm_C_p(p)) @ pdot)
+    assert x.zero(pendulum.C_E - (p @ p - 1))
+    assert x.zero(pendulum.C_Ep - x.gradient(pendulum.C_E, p))
+    assert x.zero(pendulum.gamma_E + x.rate(pendulum.C_Ep) @ pdot)
 
 
 def test_the_notes_own_s1_on_a_body_axis():
@@ -42,8 +40,8 @@ def test_the_notes_own_s1_on_a_body_axis():
     half = np.pi / 4  # x axis turned down: the attachment −R x is above the centre of mass
     q = np.array([np.cos(half), 0, np.sin(half), 0])
     centre = np.array([0, 0, -rod - R])
-    s = np.array([-R, 0, 0])
-    assert abs(notes.single_C(centre, q, s, rod)) < 1e-15
-    np.testing.assert_allclose(notes.single_C_r(centre, q, s), [0, 0, -2 * rod], atol=1e-15)
-    row = notes.single_C_p(centre, q, s)
+    hanging = SinglePendulum(centre, q, np.zeros(3), np.zeros(4), np.array([-R, 0, 0]), rod)
+    assert abs(hanging.C) < 1e-15
+    np.testing.assert_allclose(hanging.C_r, [0, 0, -2 * rod], atol=1e-15)
+    row = hanging.C_p
     np.testing.assert_allclose(row, dot(row, q) * q, atol=1e-15)
