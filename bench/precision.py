@@ -12,8 +12,8 @@ import numpy as np
 from plumbline.engines.adapter import Adapter
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import quaternion_rate
-from reference_impl import integrate as raw
 from reference_impl.collocation import integrate_collocation
+from reference_impl.integrate import integrate_dop853, structured_acceleration
 
 SAMPLE_TIMES = np.array([0.0, 2.0])
 TOLERANCES = (1e-3, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-12)
@@ -75,9 +75,13 @@ def dop853_curve(
 
     def run(rtol: float) -> Array:
         ends = [
-            raw.integrate_dop853(model, *stack_states([state]), SAMPLE_TIMES, rtol, structured=structured).r[
-                -1
-            ]
+            integrate_dop853(
+                model,
+                *stack_states([state]),
+                SAMPLE_TIMES,
+                rtol,
+                acceleration=structured_acceleration(model) if structured else None,
+            ).r[-1]
             for state in states
         ]
         return np.concatenate(ends)

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.integrate import DOP853
 
+from reference_impl import notes
 from reference_impl.chain import Array, Chain
 from reference_impl.direct import DirectSystem
 from reference_impl.euler_parameters import angular_velocity
 from reference_impl.structured import StructuredSystem, component_first
 
+Acceleration = Callable[[Array, Array, Array, Array], Array]  # r̈ and p̈, (7 N,), at r, p, ṙ, ṗ (N, ·)
+
 
 @dataclass(frozen=True, eq=False)
 class IntegrationResult:
-    """Samples at the asked times, as integrated: p is neither normalised nor projected."""
+    """Samples of a motion as integrated: p is neither normalised nor projected."""
 
     t: Array  # (T,) s
     r: Array  # (T, N, 3) m
@@ -27,46 +31,109 @@ class IntegrationResult:
 
 
 def pack_state(r: Array, p: Array, v: Array, pdot: Array) -> Array:
-    """(N6) y = (r, p, ṙ, ṗ), (14 N,)."""
+    """Concatenate y = (r, p, ṙ, ṗ) (N6).
+
+    Args:
+        r: positions (N, 3) [m].
+        p: Euler parameters (N, 4).
+        v: velocities ṙ (N, 3) [m/s].
+        pdot: rates ṗ (N, 4) [1/s].
+
+    Returns:
+        y (14 N,).
+
+    """
     return np.concatenate([x.ravel() for x in (r, p, v, pdot)])
 
 
 def unpack_state(y: Array, n: int) -> tuple[Array, Array, Array, Array]:
-    """Parts r (..., N, 3), p (..., N, 4), ṙ, ṗ of y (..., 14 N)."""
-    lead = y.shape[:-1]
-    r, p = y[..., : 3 * n].reshape(*lead, n, 3), y[..., 3 * n : 7 * n].reshape(*lead, n, 4)
-    v, pdot = y[..., 7 * n : 10 * n].reshape(*lead, n, 3), y[..., 10 * n :].reshape(*lead, n, 4)
+    """Split y = (r, p, ṙ, ṗ) (N6) into its parts.
+
+    Args:
+        y: states (..., 14 N).
+        n: number of bodies N.
+
+    Returns:
+        r (..., N, 3), p (..., N, 4), ṙ (..., N, 3) and ṗ (..., N, 4).
+
+    """
+    parts = np.split(y, np.cumsum([3 * n, 4 * n, 3 * n]), axis=-1)
+    r, p, v, pdot = (part.reshape(*y.shape[:-1], n, -1) for part in parts)
     return r, p, v, pdot
 
 
-def state_rate(system: DirectSystem, y: Array, gamma_defect: float | Array = 0.0) -> Array:
-    """(N6) ẏ = (ṙ, ṗ, r̈, p̈), (14 N,); ``gamma_defect`` as `System.solve`."""
-    r, p, v, pdot = unpack_state(y, system.chain.n)
-    x, _ = system.solve_unknowns(r, p, v, pdot, gamma_defect)
-    return np.concatenate([v.ravel(), pdot.ravel(), x[: 7 * system.chain.n]])  # r̈, p̈ come first
+def direct_acceleration(chain: Chain, gamma_defect: float | Array = 0.0) -> Acceleration:
+    """Return the right-hand side of the direct form.
+
+    Args:
+        chain: the mechanism.
+        gamma_defect: added to γ, one number or one per row (c,): a planted fault of known growth (E4).
+
+    Returns:
+        r̈ and p̈ (7 N,) as a function of r, p, ṙ, ṗ.
+
+    """
+    system = DirectSystem(chain)
+    return lambda r, p, v, pdot: system.solve_unknowns(r, p, v, pdot, gamma_defect)[0][: 7 * chain.n]
 
 
-def structured_state_rate(forest: StructuredSystem, y: Array) -> Array:
-    """(N6) ẏ (14 N,) from the structured form: equal to `rate` to rounding, in less time."""
-    r, p, v, pdot = unpack_state(y, forest.body_count)
-    a = forest.acceleration(component_first(r, p), component_first(v, pdot))
-    return pack_state(v, pdot, a[:3].T, a[3:].T)
+def structured_acceleration(chain: Chain) -> Acceleration:
+    """Return the right-hand side of the structured form, which takes less time on long chains.
+
+    Args:
+        chain: the mechanism.
+
+    Returns:
+        r̈ and p̈ (7 N,) as a function of r, p, ṙ, ṗ.
+
+    """
+    system = StructuredSystem([chain])
+
+    def acceleration(r: Array, p: Array, v: Array, pdot: Array) -> Array:
+        a = system.acceleration(component_first(r, p), component_first(v, pdot))
+        return np.concatenate([a[:3].T.ravel(), a[3:].T.ravel()])
+
+    return acceleration
+
+
+def notes_acceleration(chain: Chain) -> Acceleration:
+    """Return the right-hand side by the equations exactly as the notes print them.
+
+    Args:
+        chain: one or two bodies on rods.
+
+    Returns:
+        r̈ and p̈ (7 N,) as a function of r, p, ṙ, ṗ.
+
+    """
+    return lambda *state: notes.solve_system(chain, *state)[: 7 * chain.n]
 
 
 def state_scales(chain: Chain, r: Array, p: Array, v: Array, pdot: Array) -> Array:
-    """(14 N,) the size that each part of y has in this motion: what an absolute tolerance is relative to.
+    """Return the size that each part of y has in this motion, for absolute tolerances.
 
     A coordinate that passes through zero needs no more digits there than the motion as a whole: the
-    stretched chain for r, 1 for p, and for the rates what is there at the start or what falling through the
-    chain's own length reaches, whichever is larger.
+    stretched chain for r, 1 for p, and for the rates the larger of the initial ones and of those that
+    falling through the chain's own length reaches.
+
+    Args:
+        chain: the mechanism.
+        r: initial positions (N, 3) [m].
+        p: initial Euler parameters (N, 4).
+        v: initial velocities ṙ (N, 3) [m/s].
+        pdot: initial rates ṗ (N, 4) [1/s].
+
+    Returns:
+        (14 N,) in the units of y.
+
     """
-    reach = float(np.sum(chain.length + np.linalg.norm(chain.proximal, axis=1)))
-    reach += float(np.sum(np.linalg.norm(chain.distal[:-1], axis=1)))
-    reach = max(reach, float(np.max(np.abs(r)))) or 1.0
-    fall = float(np.sqrt(np.linalg.norm(chain.gravity) * reach))
+    span = float(np.sum(chain.length + np.linalg.norm(chain.proximal, axis=1)))
+    span += float(np.sum(np.linalg.norm(chain.distal[:-1], axis=1)))
+    span = max(span, float(np.max(np.abs(r)))) or 1.0
+    fall = float(np.sqrt(np.linalg.norm(chain.gravity) * span))
     omega = float(np.max(np.abs(angular_velocity(p, pdot))))
-    speed = max(fall, float(np.max(np.abs(v))), omega * reach)
-    sizes = (reach, 1.0, speed, max(speed / reach, omega) / 2)
+    speed = max(fall, float(np.max(np.abs(v))), omega * span)
+    sizes = (span, 1.0, speed, max(speed / span, omega) / 2)
     return np.repeat(sizes, np.array([3, 4, 3, 4]) * chain.n)
 
 
@@ -78,30 +145,39 @@ def integrate_dop853(
     pdot: Array,
     times: Array,
     rtol: float,
-    gamma_defect: float | Array = 0.0,
-    structured: bool = False,
+    acceleration: Acceleration | None = None,
 ) -> IntegrationResult:
-    """(N6) by DOP853, sampled at ``times`` (T,) from its dense output; times[0] is the initial time.
+    """Integrate (N6) by scipy's DOP853.
 
-    Initial r, ṙ (N, 3) m, m/s and p, ṗ (N, 4) –, 1/s.  The absolute tolerance is ``rtol`` times
-    `natural_sizes`.  scipy holds rtol at 2.2e-14 at least.  ``structured`` takes the right-hand side from
-    `forest` in place of the direct form, for long chains; γ has no defect there.
+    Args:
+        chain: the mechanism.
+        r: initial positions (N, 3) [m].
+        p: initial Euler parameters (N, 4).
+        v: initial velocities ṙ (N, 3) [m/s].
+        pdot: initial rates ṗ (N, 4) [1/s].
+        times: sample times (T,) [s], ascending from the initial time; samples are dense output.
+        rtol: relative tolerance, 2.2e-14 at least; the absolute one is ``rtol`` times `state_scales`.
+        acceleration: the right-hand side; the direct form by default.
 
-    Raises SingularSystem where S is singular on the way, ArithmeticError where the step size vanishes.
+    Returns:
+        The motion at ``times``.
+
+    Raises:
+        SingularSystem: S is singular on the way.
+        ArithmeticError: the step size vanishes.
+
     """
-    system, n = DirectSystem(chain), chain.n
+    n, accelerate = chain.n, acceleration or direct_acceleration(chain)
     start = pack_state(r, p, v, pdot)
-    atol = rtol * state_scales(chain, r, p, v, pdot)
     samples = np.empty((len(times), 14 * n))
     samples[0], done, steps = start, 1, 0
-    if structured and np.any(gamma_defect):
-        raise ValueError("a defect of γ is planted in the direct form only")
-    forest = StructuredSystem([chain]) if structured else None
 
-    def right(_: float, y: Array) -> Array:
-        return state_rate(system, y, gamma_defect) if forest is None else structured_state_rate(forest, y)
+    def rate(_: float, y: Array) -> Array:
+        """(N6) ẏ = (ṙ, ṗ, r̈, p̈)."""
+        return np.concatenate([y[7 * n :], accelerate(*unpack_state(y, n))])
 
-    solver = DOP853(right, times[0], start, times[-1], rtol=rtol, atol=atol)
+    atol = rtol * state_scales(chain, r, p, v, pdot)
+    solver = DOP853(rate, times[0], start, times[-1], rtol=rtol, atol=atol)
     while done < len(times):
         message = solver.step()
         if solver.status == "failed":
@@ -113,5 +189,4 @@ def integrate_dop853(
             if times[reached - 1] == solver.t:
                 samples[reached - 1] = solver.y
             done = reached
-    r_, p_, v_, pdot_ = unpack_state(samples, n)
-    return IntegrationResult(t=times, r=r_, p=p_, v=v_, pdot=pdot_, steps=steps, evaluations=solver.nfev)
+    return IntegrationResult(times, *unpack_state(samples, n), steps, solver.nfev)
