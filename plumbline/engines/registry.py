@@ -8,6 +8,7 @@ from plumbline.engines.adapter import Adapter
 
 ENGINES = {
     "reference": "adapters.reference_engine:Reference",
+    "reference-printed": "adapters.reference_printed:ReferencePrinted",
     "mujoco": "adapters.mujoco_engine:Mujoco",
     "pinocchio": "adapters.pinocchio_engine:Pinocchio",
     "pinocchio-aba": "adapters.pinocchio_engine:PinocchioAba",

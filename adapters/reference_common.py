@@ -1,0 +1,100 @@
+"""What the reference columns share: from the solution of S x = b to the contract's quantities.
+
+State: ṗ = ½ L(p)ᵀ ω′ on the way in; ω̇′ = 2 L(p) p̈ on the way out (L̇ ṗ = 0, N9).  With y = (ṙ, ṗ) and
+T = diag(M, 4 LᵀJL), the upper left block of S, the kinetic energy is ½ yᵀ T y (N1, N2).
+"""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import numpy as np
+
+from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, Trajectory
+from plumbline.model.kinematics import velocity_jacobian
+from reference_impl.euler_parameters import A, L, euler_parameter_rate
+from reference_impl.integrate import IntegrationResult
+
+NO_WELD = "the notes know ball joints and rods, no joint that holds two bodies rigidly"
+DOP853 = Integrator(
+    "dop853",
+    "tolerance",
+    8,
+    min_rtol=1e-13,
+    note="scipy's DOP853 on y = (r, p, ṙ, ṗ), no stabilisation; resolution is rtol, atol is rtol "
+    "times the natural size of each part of y",
+)
+
+
+def checkout_version() -> str:
+    """Read the version of this checkout.
+
+    Returns:
+        The project's version in pyproject.toml.
+
+    """
+    project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
+    return str(project["project"]["version"])
+
+
+def notes_state(state: State) -> tuple[Array, Array, Array, Array]:
+    """Convert a state to the notes' variables.
+
+    Args:
+        state: of N bodies.
+
+    Returns:
+        r (N, 3) [m], p (N, 4), ṙ (N, 3) [m/s] and ṗ (N, 4) [1/s].
+
+    """
+    return state.r, state.p, state.v, euler_parameter_rate(state.p, state.omega)
+
+
+def state_quantities(
+    model: Model, state: State, acceleration: Array, pddot: Array, reaction: Array, S: Array
+) -> StateQuantities:
+    """Compute the contract's quantities of one state from the solution of S x = b.
+
+    Args:
+        model: the pendulum.
+        state: the state.
+        acceleration: r̈ (N, 3) [m/s²], world frame.
+        pddot: p̈ (N, 4) [1/s²].
+        reaction: forces on the bodies at their proximal points (N, 3) [N], world frame (E5).
+        S: the matrix of (N5), of which rows and columns of r̈ and p̈ are used.
+
+    Returns:
+        Every quantity of the contract.
+
+    """
+    n = model.n
+    r, p, v, pdot = notes_state(state)
+    T, y = S[: 7 * n, : 7 * n], np.concatenate([v.ravel(), pdot.ravel()])
+    # The contract's mass matrix is Zᵀ T Z with y = Z ν.
+    bodies = velocity_jacobian(model, state).reshape(n, 6, -1)
+    pdot_rows = L(p).swapaxes(-1, -2) @ bodies[:, 3:] / 2
+    Z = np.concatenate([bodies[:, :3].reshape(3 * n, -1), pdot_rows.reshape(4 * n, -1)])
+    spin = A(p) @ model.inertia @ state.omega[..., None]
+    return StateQuantities(
+        acceleration=acceleration,
+        angular_acceleration=2 * (L(p) @ pddot[..., None])[..., 0],
+        joint_reaction=reaction,
+        kinetic_energy=float(y @ T @ y) / 2,
+        potential_energy=-float(np.sum(model.mass * (r @ model.gravity))),
+        angular_momentum=np.sum(np.cross(r, model.mass[:, None] * v) + spin[..., 0], axis=0),
+        mass_matrix=Z.T @ T @ Z,
+    )
+
+
+def trajectory(run: IntegrationResult) -> Trajectory:
+    """Convert a run of the reference's integrators.
+
+    Args:
+        run: samples at the requested times.
+
+    Returns:
+        The same samples.
+
+    """
+    return Trajectory(t=run.t, r=run.r, p=run.p, v=run.v, pdot=run.pdot, steps=run.steps)
