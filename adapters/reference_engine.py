@@ -56,7 +56,7 @@ class Reference(MetamorphicHooks):
     welding_unsupported_reason = NO_WELD
 
     def version(self) -> str:
-        """Version of this checkout."""
+        """Return the version of this checkout."""
         return checkout_version()
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
