@@ -6,7 +6,7 @@ hangs to the body's attachment (E5).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -43,10 +43,10 @@ class ReferencePrinted(MetamorphicHooks):
     title: ClassVar[str] = "Reference (the notes as printed)"
     package: ClassVar[str] = "plumbline"
     integrators: ClassVar[tuple[Integrator, ...]] = (DOP853,)
-    unsupported = (
-        ("balls", "the notes print a rod at every joint; a ball joint is their limit of length 0 (E1)"),
-        ("chains", "the notes print the equations of one and of two bodies"),
-    )
+    unsupported: ClassVar[Mapping[str, str]] = {
+        "balls": "the notes print a rod at every joint; a ball joint is their limit of length 0 (E1)",
+        "chains": "the notes print the equations of one and of two bodies",
+    }
     welding_unsupported_reason = NO_WELD
 
     def version(self) -> str:
@@ -79,8 +79,7 @@ class ReferencePrinted(MetamorphicHooks):
         return trajectory(run)
 
     def _check_printed(self, model: Model) -> None:
-        reasons = dict(self.unsupported)
         if not np.all(model.rods):
-            raise Unsupported(reasons["balls"])
+            raise Unsupported(self.unsupported["balls"])
         if model.n > 2:
-            raise Unsupported(f"{reasons['chains']}, not of {model.n}")
+            raise Unsupported(f"{self.unsupported['chains']}, not of {model.n}")
