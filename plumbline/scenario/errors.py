@@ -1,4 +1,4 @@
-"""What is wrong with a file, and where: the errors a user can mend."""
+"""Problems of input files: where they are, what is wrong, what would be valid."""
 
 from __future__ import annotations
 
@@ -13,23 +13,25 @@ MAX_LISTED_PROBLEMS = 100  # problems that the text of an error lists; `problems
 
 @dataclass(frozen=True)
 class Problem:
-    """One mistake in a file: where it is, what is wrong, what would be valid."""
+    """One mistake in a file."""
 
     file: str
     line: int  # from 1; 0 where there is no position
     column: int  # from 1
-    field: str  # path of the field, as `bodies[0].mass`; empty where it is the whole file
-    message: str
-    valid: str = ""
+    field: str  # path of the field, as `bodies[0].mass`; empty for the whole file
+    message: str  # what is wrong
+    valid: str = ""  # what would be valid, a noun phrase
+    hint: str = ""  # how to correct it, an imperative or a likely cause
 
     def __str__(self) -> str:
         where = f"{self.file}:{self.line}:{self.column}" if self.line else self.file
         parts = [where, self.field, self.message] if self.field else [where, self.message]
-        return ": ".join(parts) + (f"; valid would be {self.valid}" if self.valid else "")
+        valid = f"; valid would be {self.valid}" if self.valid else ""
+        return ": ".join(parts) + valid + (f"; {self.hint}" if self.hint else "")
 
 
 class ScenarioError(PlumblineError, ValueError):
-    """A scenario that cannot be used; carries every problem that was found, one per line as text."""
+    """A file that cannot be used; ``problems`` has every mistake of it, the text one per line."""
 
     def __init__(self, problems: Iterable[Problem]):
         self.problems = tuple(sorted(problems, key=lambda p: (p.file, p.line, p.column, p.field)))

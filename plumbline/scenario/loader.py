@@ -155,7 +155,8 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
     problems = list(source.problems)
     document = None
     try:
-        document = Document.model_validate(source.data)
+        with np.errstate(all="ignore"):  # numbers that overflow are refused below
+            document = Document.model_validate(source.data)
     except ValidationError as error:
         version = [
             e for e in error.errors() if e["loc"] == ("schema_version",) and e["type"] == "literal_error"

@@ -235,12 +235,12 @@ def require_physical_inertia(matrix: Array) -> None:
     shown = ", ".join(f"{value:.6g}" for value in values)
     if values[0] <= INPUT_ROUNDING * values[2]:
         raise invalid_value_error(
-            f"has principal values {shown}, not all positive", "three positive principal values"
+            f"has the principal moments {shown}, not all positive", "three positive principal moments"
         )
     if values[0] + values[1] < values[2] * (1 - INPUT_ROUNDING):
         raise invalid_value_error(
-            f"is of no body: of its principal values {shown} the largest exceeds the sum of the others",
-            "principal values that obey the triangle inequality",
+            f"is not a physical inertia: its principal moments {shown} violate the triangle inequality",
+            "principal moments of which none exceeds the sum of the other two",
         )
 
 
@@ -380,14 +380,14 @@ class BodySequence(SchemaModel):
 
 
 def _item_tag(value: Any) -> str:
-    is_run = (
+    is_sequence = (
         "repeat" in value or "cycle" in value if isinstance(value, dict) else isinstance(value, BodySequence)
     )
-    return "run" if is_run else "body"
+    return "sequence" if is_sequence else "body"
 
 
 ChainItem = Annotated[
-    Annotated[Body, Tag("body")] | Annotated[BodySequence, Tag("run")], Discriminator(_item_tag)
+    Annotated[Body, Tag("body")] | Annotated[BodySequence, Tag("sequence")], Discriminator(_item_tag)
 ]
 
 
@@ -449,7 +449,7 @@ class Document(SchemaModel):
     @classmethod
     def _one_line(cls, value: str | None) -> str | None:
         if value and (value != value.strip() or "\n" in value or "\t" in value):
-            raise invalid_value_error("has line breaks, tabs or blanks around it", "one line of text")
+            raise invalid_value_error("has line breaks, tabs, or blanks at its ends", "one line of text")
         return value
 
     @field_validator("sample")

@@ -1,4 +1,4 @@
-"""Validation errors in the project's words: the user's field, its position, and what would be valid."""
+"""Turn pydantic's validation errors into problems with the field, its position and what would be valid."""
 
 from __future__ import annotations
 
@@ -10,30 +10,49 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
-from plumbline.scenario.errors import Problem, closest_match, did_you_mean
+from plumbline.scenario.errors import Problem, closest_match, did_you_mean, shorten
 from plumbline.scenario.schema import SCHEMA_VERSION, Ball, Body, BodySequence, Document, Rod
 from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path
 
-UNION_TAGS: dict[str, type[BaseModel]] = {"ball": Ball, "rod": Rod, "body": Body, "run": BodySequence}
+UNION_TAGS: dict[str, type[BaseModel]] = {"ball": Ball, "rod": Rod, "body": Body, "sequence": BodySequence}
+KINDS = "kind: ball or kind: rod"
+MAX_NUMBER_LENGTH = 100  # characters; a longer text is not taken for a mistyped number
 
 
 def problems_from_validation(source: YamlSource, errors: Iterable[ErrorDetails]) -> list[Problem]:
-    """One Problem for each of pydantic's errors; a field that is only misspelt is not missing besides."""
-    resolved = [(error, *_locate_field(source, error["loc"])[:2]) for error in errors]
-    meant = {
+    """Make one problem of each validation error; a misspelt field is not reported as missing too.
+
+    Args:
+        source: the file's positions.
+        errors: pydantic's errors of `plumbline.scenario.schema.Document`.
+
+    Returns:
+        The problems, in the order of the errors.
+
+    """
+    located = [(error, *_locate_field(source, error["loc"])) for error in errors]
+    misspelt = {
         (*path[:-1], closest_match(str(path[-1]), list(model.model_fields)))
-        for error, path, model in resolved
+        for error, path, model, _ in located
         if error["type"] == "extra_forbidden"
     }
     return [
-        _problem_from_error(source, e)
-        for e, path, _ in resolved
-        if e["type"] != "missing" or path not in meant
+        _problem_from_error(source, error, path, model, info)
+        for error, path, model, info in located
+        if error["type"] != "missing" or path not in misspelt
     ]
 
 
-def _problem_from_error(source: YamlSource, error: ErrorDetails) -> Problem:
-    path, model, info = _locate_field(source, error["loc"])
+def _problem_from_error(
+    source: YamlSource,
+    error: ErrorDetails,
+    path: tuple[PathKey, ...],
+    model: type[BaseModel],
+    info: FieldInfo | None,
+) -> Problem:
+    conflicting = error.get("ctx", {}).get("default_conflicts_with")
+    if conflicting and path not in source.value_positions:
+        path = (*path[:-1], conflicting)
     extra = error["type"] == "extra_forbidden"
     place = source.key_positions.get(path) if extra else source.value_positions.get(path)
     place = place or source.value_positions.get(path[:-1]) or (1, 1)
@@ -44,7 +63,7 @@ def _problem_from_error(source: YamlSource, error: ErrorDetails) -> Problem:
 def _locate_field(
     source: YamlSource, loc: tuple[PathKey, ...]
 ) -> tuple[tuple[PathKey, ...], type[BaseModel], FieldInfo | None]:
-    """The path in the file, the model it lies in and the field; union tags are no part of it."""
+    """Find the path in the file, which has no union tags, the model that the field is in, and the field."""
     path: tuple[PathKey, ...] = ()
     model: type[BaseModel] = Document
     info: FieldInfo | None = None
@@ -70,7 +89,6 @@ def _models_in_annotation(annotation: Any) -> list[type[BaseModel]]:
 def _message_and_valid(
     error: ErrorDetails, model: type[BaseModel], info: FieldInfo | None
 ) -> tuple[str, str]:
-    """What is wrong and what would be valid."""
     kind, given, context = error["type"], error.get("input"), error.get("ctx", {})
     name = str(error["loc"][-1]) if error["loc"] else ""
     match kind:
@@ -82,33 +100,34 @@ def _message_and_valid(
             fields = list(model.model_fields)
             return f"unknown field. {did_you_mean(name, fields)}".strip(" ."), "one of " + ", ".join(fields)
         case "literal_error" if name == "schema_version":
-            return f"is {given!r}; this version of Plumbline reads {SCHEMA_VERSION}", str(SCHEMA_VERSION)
+            return f"is {_quote(given)}; this version of Plumbline reads {SCHEMA_VERSION}", str(
+                SCHEMA_VERSION
+            )
         case "literal_error":
             options = (
                 [o for arg in get_args(info.annotation) for o in (get_args(arg) or (arg,))] if info else []
             )
             words = [str(o) for o in options if isinstance(o, str)]
-            return f"is {given!r}. {did_you_mean(str(given), words)}".strip(" ."), str(
-                context.get("expected")
-            )
+            hint = did_you_mean(str(given), words)
+            return f"is {_quote(given)}. {hint}".strip(" ."), str(context.get("expected"))
         case "union_tag_not_found":
             close = [k for k in given if did_you_mean(k, ["kind"])] if isinstance(given, dict) else []
-            hint = f" ({close[0]!r} is not a field of it)" if close else ""
-            return f"has no kind{hint}", "kind: ball or kind: rod"
+            hint = f" ({_quote(close[0])} is not a field of it)" if close else ""
+            return f"has no kind{hint}", KINDS
         case "union_tag_invalid":
-            return f"has the kind {context.get('tag')!r}", "kind: ball or kind: rod"
+            return f"has the kind {_quote(context.get('tag'))}", KINDS
         case "int_type" | "int_from_float":
             return f"is {_describe_value(given)}, not a whole number", "a whole number"
         case "float_type":
             return _describe_non_number(given), _number_phrase(info)
         case "finite_number":
-            return f"is {given!r}, not a finite number", _number_phrase(info)
+            return f"is {_quote(given)}, not a finite number", _number_phrase(info)
         case "greater_than" | "greater_than_equal" | "less_than_equal":
             sign = {"greater_than": "above", "greater_than_equal": "at least", "less_than_equal": "at most"}[
                 kind
             ]
             bound = context.get("gt", context.get("ge", context.get("le")))
-            return f"is {given!r}", f"a number {sign} {bound:g}"
+            return f"is {_quote(given)}", f"a number {sign} {bound:g}"
         case "model_type" | "model_attributes_type" | "dict_type" if not error["loc"]:
             return f"is {_describe_value(given)}", "a mapping that starts with schema_version: 1"
         case "list_type" | "model_type" | "model_attributes_type" | "dict_type" | "string_type":
@@ -120,21 +139,25 @@ def _message_and_valid(
             return f"has {context.get('actual_length')} entries", f"{few} {bound}"
         case "string_too_short" | "string_too_long":
             length = context.get("min_length", context.get("max_length"))
-            return (
-                f"has {len(str(given))} characters",
-                f"{'at least' if 'min_length' in context else 'at most'} {length}",
-            )
+            few = "at least" if "min_length" in context else "at most"
+            return f"has {len(str(given))} characters", f"{few} {length}"
         case "string_pattern_mismatch":
-            return f"is {given!r}", "intrinsic or extrinsic and three axes, as 'intrinsic zxz'"
+            return f"is {_quote(given)}", "intrinsic or extrinsic and three axes, as 'intrinsic zxz'"
         case _:
             return error["msg"], _field_description(info)
 
 
+def _quote(given: Any) -> str:
+    return shorten(repr(given))
+
+
 def _describe_non_number(given: Any) -> str:
-    if isinstance(given, str) and re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", given):
-        return f"is the text {given!r}, not a number: leave out the quotes"
-    if isinstance(given, str) and (match := re.fullmatch(r"\s*([-+.\deE]*\d)\s*([^\d\s].*)", given)):
-        return f"is the text {given!r}: write the number alone, {match[1]}, without {match[2]!r}"
+    if not isinstance(given, str) or len(given) > MAX_NUMBER_LENGTH:
+        return f"is {_describe_value(given)}, not a number"
+    if re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", given):
+        return f"is the text {_quote(given)}, not a number: leave out the quotes"
+    if match := re.fullmatch(r"\s*([-+.\deE]*\d)\s*([^\d\s].*)", given):
+        return f"is the text {_quote(given)}: write the number alone, {match[1]}, without {match[2]!r}"
     return f"is {_describe_value(given)}, not a number"
 
 
@@ -149,9 +172,9 @@ def _describe_value(given: Any) -> str:
         case list():
             return "a list"
         case str():
-            return f"the text {given[:40]!r}"
+            return f"the text {_quote(given)}"
         case _:
-            return f"the number {given!r}"
+            return f"the number {_quote(given)}"
 
 
 def _unit_suffix(info: FieldInfo | None) -> str:
@@ -164,7 +187,7 @@ def _number_phrase(info: FieldInfo | None) -> str:
 
 
 def _field_description(info: FieldInfo | None, kind: str = "") -> str:
-    """The first sentence of the field's description, with its unit."""
+    """Return the first sentence of the field's description, with its unit."""
     if info is None:
         return ""
     sentence = (info.description or "").partition(". ")[0].rstrip(".")

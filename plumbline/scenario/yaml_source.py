@@ -1,7 +1,7 @@
-"""YAML 1.2 text → plain data with the position of every key and value, and all problems on the way.
+"""YAML 1.2 text → plain data with the position of every key and value, and every problem on the way.
 
-The node graph is walked here rather than by a constructor: positions and every duplicate key
-are wanted, no tag may build an object, and aliases may not multiply without bound.
+The node graph is walked here rather than by a constructor of ruamel.yaml: positions and all duplicate keys
+are kept, tags build no objects, and the number of values that aliases make is limited.
 """
 
 from __future__ import annotations
@@ -17,12 +17,32 @@ from ruamel.yaml.composer import Composer
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
 from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
+from ruamel.yaml.scanner import Scanner
 
-from plumbline.scenario.errors import Problem, ScenarioError
+from plumbline.scenario.errors import Problem, ScenarioError, shorten
 
 MAX_BYTES = 1_000_000
 MAX_NODES = 50_000  # about 1,000 bodies in full, 6 s of reading; longer chains repeat
 MAX_DEPTH = 20
+MAX_TAG_LENGTH = 1000  # characters; ruamel.yaml needs time that grows with the square of it
+NO_TAG = "a plain value without a tag"
+
+_LIKELY_CAUSES = (  # part of the parser's message or context, and what most often causes it
+    ("'\\t'", "indent with blanks: YAML allows no tabs there"),
+    ("cannot start any token", "a text that starts with this character needs quotes"),
+    ("mapping values are not allowed", "a colon inside a text needs quotes around the text"),
+    ("flow sequence", "a bracket [ is not closed, or a comma is missing"),
+    ("flow mapping", "a brace { is not closed, or a comma is missing"),
+    ("quoted scalar", "a quote is not closed, or a backslash inside double quotes is not doubled"),
+    (
+        "could not find expected ':'",
+        "a colon is missing, or the line belongs to a text that starts further up",
+    ),
+    ("<block end>", "the line is not indented like the lines of its block"),
+    ("another document", "write one scenario per file: remove the line ---"),
+    ("alias", "a text that starts with * needs quotes"),
+    ("anchor", "a text that starts with & needs quotes"),
+)
 
 TOO_DEEP = "is nested too deeply", f"at most {MAX_DEPTH} levels"
 TOO_MANY = f"has more than {MAX_NODES} values (aliases followed)", "fewer values; `repeat` makes long chains"
@@ -33,27 +53,54 @@ Position = tuple[int, int]
 
 @dataclass
 class YamlSource:
-    """Plain data of a YAML file and where each part of it stands (line and column from 1)."""
+    """Plain data of a YAML file and the position of each part (line and column, both from 1)."""
 
-    file: str
-    data: Any = None
+    file: str  # the name that problems show
+    data: Any = None  # dicts, lists, texts, numbers, booleans, None
     value_positions: dict[tuple[PathKey, ...], Position] = field(default_factory=dict)
     key_positions: dict[tuple[PathKey, ...], Position] = field(default_factory=dict)
-    problems: list[Problem] = field(default_factory=list)
+    problems: list[Problem] = field(default_factory=list)  # duplicate keys and tags
 
-    def fatal_error(self, message: str, valid: str = "", at: Position = (0, 0)) -> ScenarioError:
-        """The error of a file that cannot be read on."""
-        return ScenarioError([Problem(self.file, *at, "", message, valid)])
+    def fatal_error(
+        self, message: str, valid: str = "", at: Position = (0, 0), hint: str = ""
+    ) -> ScenarioError:
+        """Make the error of a file that cannot be read any further.
+
+        Args:
+            message: what is wrong.
+            valid: what would be valid, a noun phrase.
+            at: line and column of the mistake; (0, 0) for the whole file.
+            hint: how to correct it.
+
+        Returns:
+            The error, to be raised by the caller.
+
+        """
+        return ScenarioError([Problem(self.file, *at, "", message, valid, hint)])
 
 
 class _ParsingStopped(Exception):
-    """(message, what is valid, mark) of a file that is not read on."""
+    """Ends the parsing of a file; holds the message, what would be valid, and the mark."""
+
+
+class _BoundedScanner(Scanner):  # type: ignore[misc,unused-ignore]
+    """Stops at a tag that is too long to be decoded in reasonable time."""
+
+    def scan_tag(self) -> Any:
+        token = super().scan_tag()
+        if len(token.value[1]) > MAX_TAG_LENGTH:
+            raise _ParsingStopped(f"has a tag of {len(token.value[1])} characters", NO_TAG, token.start_mark)
+        return token
 
 
 class _BoundedComposer(Composer):  # type: ignore[misc,unused-ignore]
-    """Stops at once where a file is too deep or too large to be a scenario."""
+    """Stops the parser where a file is nested too deeply or has too many values for a scenario."""
 
     node_count = depth = 0
+
+    def __init__(self, loader: Any = None) -> None:
+        super().__init__(loader=loader)
+        self.warn_double_anchors = False  # YAML 1.2 allows them; the last one counts
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         self.node_count += 1
@@ -67,12 +114,31 @@ class _BoundedComposer(Composer):  # type: ignore[misc,unused-ignore]
 
 
 def dotted_path(path: tuple[PathKey, ...]) -> str:
-    """``bodies[0].mass`` of ("bodies", 0, "mass")."""
-    return "".join(f"[{key}]" if isinstance(key, int) else f".{key}" for key in path).lstrip(".")
+    """Write the path of a field as ``bodies[0].mass``.
+
+    Args:
+        path: the keys and indices from the file's top to the field, as ("bodies", 0, "mass").
+
+    Returns:
+        The path; keys that are longer than any field's are shortened.
+
+    """
+    return "".join(f"[{key}]" if isinstance(key, int) else f".{shorten(key)}" for key in path).lstrip(".")
 
 
 def read_yaml(path: Path) -> YamlSource:
-    """Plain data of the file; raises ScenarioError where it is not readable YAML text."""
+    """Read a YAML file.
+
+    Args:
+        path: a regular file of at most MAX_BYTES, UTF-8 with or without a byte order mark.
+
+    Returns:
+        Its data, positions and problems.
+
+    Raises:
+        ScenarioError: the file cannot be read or is not YAML text.
+
+    """
     source = YamlSource(str(path))
     try:
         if not stat.S_ISREG(path.stat().st_mode):  # a pipe would wait, a device never end
@@ -97,9 +163,21 @@ def read_yaml(path: Path) -> YamlSource:
 
 
 def parse_yaml(source: YamlSource, content: str) -> YamlSource:
-    """Fill in data, positions and problems from YAML text."""
+    """Parse YAML text.
+
+    Args:
+        source: receives data, positions and problems.
+        content: the text.
+
+    Returns:
+        ``source``.
+
+    Raises:
+        ScenarioError: the text is empty, is not YAML, or is too large or too deep for a scenario.
+
+    """
     yaml = YAML(typ="safe", pure=True)
-    yaml.Composer = _BoundedComposer
+    yaml.Scanner, yaml.Composer = _BoundedScanner, _BoundedComposer
     try:
         root = yaml.compose(content)
     except _ParsingStopped as stop:
@@ -108,9 +186,12 @@ def parse_yaml(source: YamlSource, content: str) -> YamlSource:
     except MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         at = (mark.line + 1, mark.column + 1) if mark else (1, 1)
-        said = error.problem or error.context or "not YAML"
-        hint = "blanks: YAML has no tabs for indentation" if "'\\t'" in said else "YAML 1.2"
-        raise source.fatal_error(said, hint, at) from None
+        message = f"{error.problem or ''} {error.context or ''}"
+        hint = next(
+            (cause for part, cause in _LIKELY_CAUSES if part in message), "check quotes and indentation"
+        )
+        text = shorten(error.problem or error.context or "is not YAML", 100)
+        raise source.fatal_error(text, at=at, hint=hint) from None
     except ReaderError as error:
         before = content[: error.position]
         at = before.count("\n") + 1, len(before.rpartition("\n")[2]) + 1
@@ -119,7 +200,7 @@ def parse_yaml(source: YamlSource, content: str) -> YamlSource:
             f"the character U+{char:04X} is not allowed in YAML", "printable text", at
         ) from None
     except (YAMLError, ValueError) as error:
-        raise source.fatal_error(f"is not YAML: {error}", "YAML 1.2", (1, 1)) from None
+        raise source.fatal_error(f"is not YAML: {shorten(str(error), 100)}", at=(1, 1)) from None
     if root is None or (isinstance(root, ScalarNode) and str(root.tag).endswith(":null")):
         raise source.fatal_error("is empty", "a mapping that starts with schema_version: 1", (1, 1))
     budget = [MAX_NODES]
@@ -177,15 +258,13 @@ def _scalar_value(source: YamlSource, node: Node, path: tuple[PathKey, ...], at:
         return None
     if kind not in ("str", "timestamp", "value", "merge"):
         source.problems.append(
-            Problem(
-                source.file, *at, dotted_path(path), f"has the tag {node.tag}", "a plain value without a tag"
-            )
+            Problem(source.file, *at, dotted_path(path), f"has the tag {shorten(str(node.tag))}", NO_TAG)
         )
     return written
 
 
 def _parse_number(written: str) -> int | float:
-    """A YAML 1.2 number; whole ones beyond 2^53 become floats, since no field holds them otherwise."""
+    """Parse a YAML 1.2 number; a whole one beyond 2^53 becomes a float, as in every field."""
     digits = written.replace("_", "").lower()
     if match := re.fullmatch(r"([-+]?)(0x[0-9a-f]+|0o[0-7]+)", digits):
         return int(match[1] + str(int(match[2], 0)))
