@@ -46,9 +46,20 @@ ClosedForm = Literal[
 ]
 
 
-def invalid_value_error(message: str, valid: str) -> PydanticCustomError:
-    """A validation error in the project's words: what is wrong, and what would be valid."""
-    return PydanticCustomError("plumbline", "{message}", {"message": message, "valid": valid})
+def invalid_value_error(message: str, valid: str, default_conflicts_with: str = "") -> PydanticCustomError:
+    """Make the validation error of a value.
+
+    Args:
+        message: what is wrong.
+        valid: what would be valid, a noun phrase.
+        default_conflicts_with: the field to name instead where the value is a default, so not in the file.
+
+    Returns:
+        The error, to be raised by a validator; `plumbline.scenario.validation_messages` reads it.
+
+    """
+    context = {"message": message, "valid": valid, "default_conflicts_with": default_conflicts_with}
+    return PydanticCustomError("plumbline", "{message}", context)
 
 
 def require_printable(value: str) -> str:
@@ -426,6 +437,7 @@ class Document(SchemaModel):
     sample: float = Field(
         0.03125,
         gt=0,
+        validate_default=True,
         description="Time between compared samples. A binary fraction (1/32 = 0.03125) lets every step "
         "1/2^k hit the samples exactly.",
         json_schema_extra={"unit": "s"},
@@ -455,13 +467,14 @@ class Document(SchemaModel):
     @field_validator("sample")
     @classmethod
     def _sample(cls, value: float, info: ValidationInfo) -> float:
-        count = info.data.get("duration", value) / value
-        if abs(count - round(count)) > 1e-9 * count or round(count) < 1:
-            raise invalid_value_error(
-                f"goes {count:.9g} times into the duration", "a time that divides the duration"
-            )
+        duration = info.data.get("duration", value)
+        count = duration / value
+        message = f"{duration:g} s are {count:.9g} samples of {value:g} s"
         if count > MAX_SAMPLES:
-            raise invalid_value_error(f"makes {count:.3g} samples", f"at most {MAX_SAMPLES} samples")
+            raise invalid_value_error(message, f"at most {MAX_SAMPLES} samples", "duration")
+        if abs(count - round(count)) > 1e-9 * count or round(count) < 1:
+            valid = "a duration that is a whole number of samples"
+            raise invalid_value_error(message, valid, "duration")
         return value
 
 

@@ -269,12 +269,27 @@ CASES = {
     "sample does not divide": (
         "bodies:",
         "duration: 1\nsample: 0.3\nbodies:",
-        "5:9: sample: goes 3.33333333 times into the duration",
+        "5:9: sample: 1 s are 3.33333333 samples of 0.3 s; valid would be a duration that is a whole number",
+    ),
+    "duration is no multiple of the default sample": (
+        "bodies:",
+        "duration: 2.01\nbodies:",
+        "4:11: duration: 2.01 s are 64.32 samples of 0.03125 s; valid would be a duration that is",
+    ),
+    "duration below the default sample": (
+        "bodies:",
+        "duration: 1e-300\nbodies:",
+        "4:11: duration: 1e-300 s are 3.2e-299 samples of 0.03125 s; valid",
+    ),
+    "duration of too many default samples": (
+        "bodies:",
+        "duration: 1e9\nbodies:",
+        "4:11: duration: 1e+09 s are 3.2e+10 samples of 0.03125 s; valid would be at most 1000000 samples",
     ),
     "sample too fine": (
         "bodies:",
         "duration: 4\nsample: 0.000001\nbodies:",
-        "5:9: sample: makes 4e+06 samples; valid would be at most 1000000",
+        "5:9: sample: 4 s are 4000000 samples of 1e-06 s; valid would be at most 1000000",
     ),
     "control character": (
         "A pendulum",
@@ -428,21 +443,6 @@ def test_a_file_that_is_too_much_ends_soon(bomb):
     assert "has more than 50000 values (aliases followed)" in problems_of(bomb)[0]
 
 
-@pytest.mark.parametrize("loop", ["a: &a [*a]", "a: &a {b: *a}"])
-def test_an_alias_of_itself_ends(loop):
-    assert problems_of(loop)[0].startswith("1:4: is nested too deeply")
-
-
-def test_many_problems_are_counted_rather_than_listed():
-    with pytest.raises(ScenarioError) as caught:
-        load_scenario_text(GOOD + "".join(f"x{i}: 1\n" for i in range(300)))
-    assert len(caught.value.problems) == 300
-    assert str(caught.value).endswith("… and 200 more problems")
-
-
-@pytest.mark.parametrize(
-    ("raw", "expected"),
-    [
 @pytest.mark.parametrize(
     "text",
     [
@@ -474,6 +474,21 @@ def test_reading_prints_no_warnings(recwarn):
     assert not recwarn.list
 
 
+@pytest.mark.parametrize("loop", ["a: &a [*a]", "a: &a {b: *a}"])
+def test_an_alias_of_itself_ends(loop):
+    assert problems_of(loop)[0].startswith("1:4: is nested too deeply")
+
+
+def test_many_problems_are_counted_rather_than_listed():
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario_text(GOOD + "".join(f"x{i}: 1\n" for i in range(300)))
+    assert len(caught.value.problems) == 300
+    assert str(caught.value).endswith("… and 200 more problems")
+
+
+@pytest.mark.parametrize(
+    ("raw", "expected"),
+    [
         (b"title: \xff\xfe", ":1:8: byte 0xff is not UTF-8; valid would be UTF-8 text"),
         (b"title: a\npurpose: na\xefve", ":2:12: byte 0xef is not UTF-8"),
         ("title: überé\n".encode() + b"purpose: \xe9", ":2:10: byte 0xe9 is not UTF-8"),
