@@ -209,8 +209,8 @@ def _closed_form_problem(scenario: scenarios.Scenario) -> Problem | None:
         closed_form_motion(scenario)
     except ClosedFormMismatch as error:
         line, column = read_yaml(scenario.path).value_positions.get(("exact",), (1, 1))
-        valid = "no `exact` at all, or the name of the closed form that fits"
-        return Problem(str(scenario.path), line, column, "exact", str(error), valid)
+        hint = "remove `exact`, or name the closed form that fits"
+        return Problem(str(scenario.path), line, column, "exact", str(error), hint=hint)
     return None
 
 

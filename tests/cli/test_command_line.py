@@ -192,6 +192,18 @@ def test_bad_usage_ends_with_2_and_a_suggestion(words, expected):
     assert expected in " ".join(result.stderr.split())
 
 
+def test_a_closed_form_that_does_not_fit_is_reported_with_line_and_column(tmp_path):
+    for name, scenario in (("a", "tumbling-ball"), ("b", "tumbling-rod")):
+        text = (ROOT / "scenarios" / "single" / f"{scenario}.yaml").read_text()
+        (tmp_path / f"{name}.yaml").write_text(f"exact: free-top\n{text}")
+    result = CliRunner().invoke(main, ["check", str(tmp_path / "a.yaml"), str(tmp_path / "b.yaml")])
+    assert result.exit_code == 2
+    lines = result.stderr.splitlines()
+    for name, line in zip("ab", lines, strict=True):
+        assert line.startswith(f"{tmp_path / name}.yaml:1:8: exact: this closed form needs ")
+        assert line.endswith("; remove `exact`, or name the closed form that fits")
+
+
 def test_an_output_folder_that_cannot_be_written_is_said_before_any_work(tmp_path):
     (tmp_path / "file").write_text("x")
     said = plumbline("run", "rest", "--out", tmp_path / "file" / "out")
