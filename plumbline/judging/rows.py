@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import StrEnum
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 Level = Literal["state", "invariants", "trajectory", "relations"]
 Columns = dict[str, Any]  # column name → its values (n,), or the one value of all n records
@@ -164,7 +165,7 @@ class RowContext:
             level: level of comparison.
             integrator: name of the integrator, "-" for none.
             quantity: name of the judged quantity.
-            verdict: the verdict.
+            verdict: one of `Verdict`.
             reason: the verdict's reason, one sentence.
             unit: unit of ``value`` and ``tolerance``.
             **more: other fields of `Row`. ``ratio`` is the quotient of ``value`` and ``tolerance`` unless
@@ -175,11 +176,39 @@ class RowContext:
 
         """
         more = {"value": None, "tolerance": None} | more
-        more.setdefault("ratio", error_ratio(more["value"], more["tolerance"]))
+        if more.get("ratio") is None:
+            more["ratio"] = error_ratio(more["value"], more["tolerance"])
         return Row(
             self.scenario, self.family, self.engine, self.version, level, integrator, quantity, unit,
             verdict=verdict, reason=reason, **more,
         )  # fmt: skip
+
+
+class _Decidable(Protocol):
+    @property
+    def verdict(self) -> Verdict: ...
+
+
+_DecidableT = TypeVar("_DecidableT", bound=_Decidable)
+
+
+def first_decided(candidates: Iterable[_DecidableT]) -> _DecidableT:
+    """Return the first of several verdicts on one quantity that is not unresolved.
+
+    Args:
+        candidates: at least one; the preferred one, such as that of the longest window of time, comes first.
+
+    Returns:
+        The first that is decided; the first of all where none is.
+
+    """
+    first: _DecidableT | None = None
+    for candidate in candidates:
+        if candidate.verdict != Verdict.UNRESOLVED:
+            return candidate
+        first = first or candidate
+    assert first is not None
+    return first
 
 
 @dataclass

@@ -6,7 +6,7 @@ the first-order rounding bounds of both sides.  The bounds are the same on both 
 every unit and independent of axes), except for welded halves, whose equations have other terms.
 
     rotated world        everything in world axes rotated by Q
-    re-chosen body frame body axes rotated by Q: p Q*, s → Q s, J → Q J Qᵀ, ω′ → Q ω′ (an inertia becomes full)
+    re-chosen body frame body axes rotated by Q: p Q*, s → Q s, J → Q J Qᵀ, ω′ → Q ω′ (inertias become full)
     masses doubled       m, J, loads and drag × 2: the same motion, forces and energies × 2
     lengths × 4          s, ℓ × 4, J × 16, ω and u̇ / 2, moments × 4, c_t / 2, c_r × 8: r̈ and F the same
     time reversed        ω, u̇ → −ω, −u̇ without drag: r̈, ω̇′, F, energies the same, L → −L

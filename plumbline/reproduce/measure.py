@@ -17,6 +17,7 @@ from plumbline.engines import calls
 from plumbline.engines.calls import RefinementRun
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.convergence import ORDER_MARGIN
+from plumbline.judging.refinement_analysis import RefinementAnalysis
 from plumbline.judging.relation_result import OTHER_FORMULATION_PREFIX
 from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.judging.state_relations import (
@@ -26,7 +27,6 @@ from plumbline.judging.state_relations import (
     quantity_values,
     unchanged,
 )
-from plumbline.judging.trajectory import RefinementAnalysis
 from plumbline.model.datatypes import Array, Integrator, StateQuantities
 from plumbline.model.welding import split_bodies
 from plumbline.reproduce.engine_client import Engine, OfRuns
@@ -294,7 +294,7 @@ class AlongRuns(OfRuns):
         ladder = RefinementAnalysis(who, case.model, truth, self.integrator, rungs, case.until)
         rows = {
             row.quantity: row
-            for row in (ladder.invariant_rows() if self.drifting else ladder.trajectory_rows())
+            for row in (invariant_rows(ladder) if self.drifting else trajectory_rows(ladder))
         }
         groups = [set(self.wanted)] if self.drifting else [{"order"}, set(LIMITS)]
         off = [
@@ -312,7 +312,7 @@ class AlongRuns(OfRuns):
         return ShownRun(
             case, min(off, default=0.0), times, self.integrator, "order" in self.wanted and "order" in rows,
             bool(set(LIMITS) & set(self.wanted)), tuple(series) if self.drifting else (),
-            truth.trajectory.r[-1], truth.trajectory.p[-1], (truth.length, ladder.invariant_scales()["gap_rate"]),
+            truth.trajectory.r[-1], truth.trajectory.p[-1], (truth.length, ladder.invariant_scales["gap_rate"]),
             {q: ladder.extrapolated_limit(ys).eliminated_powers for q, ys in series.items()},
             {q: float(row.tolerance) for q, row in uncertain.items() if row and row.tolerance},
         )  # fmt: skip

@@ -1,0 +1,98 @@
+"""Invariants along a refinement study: every drift must vanish with the step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from plumbline.judging.convergence import observed_order
+from plumbline.judging.refinement_analysis import RefinementAnalysis
+from plumbline.judging.rows import Row, Verdict, first_decided
+from plumbline.model.datatypes import Array
+from plumbline.model.invariants import INVARIANT_UNITS
+from plumbline.truth.ground_truth import DETECTABLE_PARAMETER_ERROR
+
+ROUNDING_PER_STEP = 8 * 2.0**-52  # of an invariant, relative to its scale: a handful of operations
+
+
+def invariant_rows(study: RefinementAnalysis) -> list[Row]:
+    """Judge every invariant that is conserved in this motion.
+
+    Args:
+        study: the refinement study.
+
+    Returns:
+        One row per invariant: its drift in the finest run, and the verdict on its limit at step zero.
+
+    """
+    rows = []
+    for quantity, unit in INVARIANT_UNITS.items():
+        series = [None if d is None else getattr(d, quantity) for d in study.invariant_drifts]
+        if series[-1] is not None:
+            ys = [np.full_like(series[-1], np.nan) if s is None else s for s in series]
+            rows.append(_invariant_row(study, quantity, unit, ys))
+    return rows
+
+
+def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples: Sequence[Array]) -> Row:
+    """The limit of a drift is zero, within its uncertainty and the rounding of all steps."""
+    name, scale, times = quantity.replace("_", " "), study.invariant_scales[quantity], study.times
+    last, steps = study.invariant_drifts[-1], study.finest.steps
+    assert last is not None
+    per_step = ROUNDING_PER_STEP
+    if not study.has_steps:
+        per_step += study.runs[-1].resolution  # error that step control accepts in every step
+    floor = per_step * max(steps, 64) * scale
+    work_uncertainty = last.work_uncertainty if quantity == "energy_drift" else 0.0
+    drift = np.maximum.accumulate(np.max(np.linalg.norm(samples[-1], axis=-1), axis=1))
+    rounding = f"{steps} steps, {per_step:.1g} × {scale:.3g} {unit} each: {floor:.2g}"
+
+    def row(
+        verdict: Verdict,
+        reason: str,
+        at: int,
+        tolerance: float,
+        derivation: str = rounding,
+        ratio: float | None = None,
+        **extra: float,
+    ) -> Row:
+        return study.context.make_row(
+            "invariants", study.integrator.name, quantity, verdict, reason, unit,
+            value=float(drift[at]), tolerance=tolerance, ratio=ratio, derivation=derivation,
+            compared_until=float(times[at]), extra={"scale": scale, "whole": float(drift[-1]), **extra},
+            **study.common_fields,
+        )  # fmt: skip
+
+    end = len(times) - 1
+    if drift[end] <= floor:
+        reason = f"{name} {drift[end]:.2g} {unit}: rounding"
+        return row(Verdict.AGREES, reason, end, floor, ratio=float(drift[end] / floor))
+    try:
+        limit = study.extrapolated_limit(samples)
+    except ValueError as error:
+        return row(Verdict.UNRESOLVED, str(error), end, floor)
+    limit_drift = np.maximum.accumulate(np.max(np.linalg.norm(limit.y, axis=-1), axis=1))
+    tolerance = limit.uncertainty + floor + work_uncertainty
+    is_trusted = not study.has_steps or observed_order(samples, floor, study.integrator.order).is_asymptotic
+
+    def judge_window(number: int) -> Row:
+        at = number - 1
+        to_limit = float(np.max(np.linalg.norm((samples[-1] - limit.y)[:number], axis=-1)))
+        allowed = to_limit + float(tolerance[at])
+        at_zero = f"{limit_drift[at]:.2g} ± {tolerance[at]:.2g} {unit} at step zero, t ≤ {times[at]:g} s"
+        derivation = (
+            f"{to_limit:.2g} from the finest step to step zero, itself ± {limit.uncertainty[at]:.2g}; "
+            f"{rounding}; the work by quadrature ± {work_uncertainty:.2g}"
+        )
+        ratio, extra = float(limit_drift[at] / tolerance[at]), {"limit": float(limit_drift[at])}
+        if limit_drift[at] <= tolerance[at] <= DETECTABLE_PARAMETER_ERROR * scale:
+            reason = f"{name} {drift[at]:.2g} {unit} at the finest step, {at_zero}"
+            return row(Verdict.AGREES, reason, at, allowed, derivation, ratio, **extra)
+        if limit_drift[at] > tolerance[at] and is_trusted:
+            reason = f"{name} does not vanish with the step: {at_zero}"
+            return row(Verdict.DISAGREES, reason, at, float(tolerance[at]), derivation, ratio, **extra)
+        reason = f"{name} {drift[at]:.2g} {unit}: {at_zero} does not decide"
+        return row(Verdict.UNRESOLVED, reason, at, allowed, derivation, ratio, **extra)
+
+    return first_decided(judge_window(number) for number in study.window_lengths(float(times[-1])))

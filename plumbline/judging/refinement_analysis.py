@@ -1,0 +1,143 @@
+"""One integrator's refinement study on one scenario: samples, order, limit and windows of time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from plumbline.engines.calls import RefinementRun
+from plumbline.judging.convergence import (
+    ExtrapolatedLimit,
+    ObservedOrder,
+    observed_order,
+    romberg,
+    tightest_tolerance_limit,
+)
+from plumbline.judging.rows import RowContext
+from plumbline.model.datatypes import Array, Integrator, Model, Trajectory
+from plumbline.model.invariants import Invariants, compute_invariants, invariant_scales
+from plumbline.truth.ground_truth import RUN_ROUNDING, MotionTruth
+
+
+@dataclass
+class RefinementAnalysis:
+    """The runs of a refinement study, coarse to fine, and what follows from all of them together."""
+
+    context: RowContext
+    model: Model
+    truth: MotionTruth
+    integrator: Integrator
+    runs: Sequence[RefinementRun]
+    horizon: float  # s, up to which positions may be compared
+    finest: Trajectory = field(init=False)
+    positions: list[Array] = field(init=False)  # per run (T, N, 3) m; NaN where the run failed
+    attitudes: list[Array] = field(init=False)  # per run (T, N, 4)
+    scaled_states: list[Array] = field(init=False)  # per run (T, N, 6): r and ṙ over their scales
+    invariant_drifts: list[Invariants | None] = field(init=False)
+    invariant_scales: dict[str, float] = field(init=False)  # of the true motion, units as `INVARIANT_UNITS`
+    rounding: Array = field(init=False)  # (T,) of a run and its steps' solver, grown, for a scale of 1
+    observed: ObservedOrder = field(init=False)
+    observed_until: float = field(init=False)  # s, end of the window in which the order was observed
+
+    def __post_init__(self) -> None:
+        last = self.runs[-1].trajectory
+        assert last is not None
+        self.finest = last
+        self.positions = [self._samples(run, "r") for run in self.runs]
+        self.attitudes = [self._samples(run, "p") for run in self.runs]
+        self.invariant_scales = invariant_scales(self.model, self.truth.trajectory, self.truth.length)
+        # Positions alone may converge faster than the method: symplectic Euler from a state without
+        # torque is a leapfrog in r, and shows its order 1 in ṙ only.
+        sizes = self.truth.length, self.invariant_scales["gap_rate"]
+        self.scaled_states = [
+            np.concatenate([r / sizes[0], self._samples(run, "v") / sizes[1]], axis=-1)
+            for r, run in zip(self.positions, self.runs, strict=True)
+        ]
+        trajectories = [run.trajectory for run in self.runs]
+        self.invariant_drifts = [
+            None if t is None else compute_invariants(self.model, t) for t in trajectories
+        ]
+        # The equations of an implicit step are solved to a tolerance: independent errors of so many steps add
+        # up like a random walk.
+        solved = self.integrator.solver_rtol * np.sqrt(self.finest.steps)
+        self.rounding = (RUN_ROUNDING + solved) * self.truth.growth
+        self.observed, self.observed_until = self._observe_order()
+
+    @property
+    def times(self) -> Array:
+        """(T,) sample times [s]."""
+        return self.truth.trajectory.t
+
+    @property
+    def has_steps(self) -> bool:
+        """Whether the integrator has fixed steps; else a tolerance controls them."""
+        return self.integrator.kind == "step"
+
+    @property
+    def common_fields(self) -> dict[str, Any]:
+        """Fields that all rows of this study share."""
+        alias = None if self.model.has_drag else self.integrator.alias_of  # with drag the two methods differ
+        return {"alias_of": alias, "cpu_time": sum(run.cpu_time for run in self.runs)}
+
+    @property
+    def rounding_description(self) -> str:
+        """The formula of `rounding`, for derivations."""
+        if not self.integrator.solver_rtol:
+            return "10³ ε G(t)"
+        return f"(10³ ε + {self.integrator.solver_rtol:g} of the step's solver × √{self.finest.steps}) G(t)"
+
+    def extrapolated_limit(self, samples: Sequence[Array]) -> ExtrapolatedLimit:
+        """Return the limit at step zero, or the run with the tightest tolerance.
+
+        Args:
+            samples: per run (T, N, width) of one quantity.
+
+        Returns:
+            The limit and its uncertainty.
+
+        Raises:
+            ValueError: fewer than two runs are finite.
+
+        """
+        if self.has_steps:
+            return romberg(samples, self.integrator.error_exponents)
+        return tightest_tolerance_limit(samples)
+
+    def window_lengths(self, until: float) -> list[int]:
+        """Return the windows of time to try, longest first.
+
+        Args:
+            until: end of the longest window [s].
+
+        Returns:
+            Numbers of samples up to ``until``, and to a half, a quarter and an eighth of it.
+
+        """
+        end = min(until, float(self.times[-1]))
+        ends = [end / 2**k * (1 + 1e-12) for k in range(4)]
+        numbers = [int(np.searchsorted(self.times, e, side="right")) for e in ends]
+        return [number for number in dict.fromkeys(numbers) if number >= 3] or [min(3, len(self.times))]
+
+    def _samples(self, run: RefinementRun, name: str) -> Array:
+        """(T, N, width) of one field, NaN where the run failed; quaternions have the finest run's signs."""
+        fine: Array = getattr(self.finest, name)
+        if run.trajectory is None:
+            return np.full_like(fine, np.nan)
+        y: Array = getattr(run.trajectory, name)
+        if name == "p":
+            y = y * np.where(np.sum(y * fine, axis=-1, keepdims=True) < 0, -1.0, 1.0)
+        return y
+
+    def _observe_order(self) -> tuple[ObservedOrder, float]:
+        """The order in the longest window that shows one, and that window's end [s]."""
+        tried = []
+        for number in self.window_lengths(self.horizon):
+            floor = float(self.rounding[number - 1] / 8)  # trials found 115 ε G at most, an eighth of it
+            order = observed_order([y[:number] for y in self.scaled_states], floor, self.integrator.order)
+            tried.append((order, float(self.times[number - 1])))
+            if order.is_asymptotic or order.is_at_rounding_floor:
+                return tried[-1]
+        return tried[0]
