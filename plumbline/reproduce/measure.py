@@ -17,6 +17,7 @@ from plumbline.engines import calls
 from plumbline.engines.calls import RefinementRun
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.convergence import ORDER_MARGIN
+from plumbline.judging.invariant_drift import invariant_rows
 from plumbline.judging.refinement_analysis import RefinementAnalysis
 from plumbline.judging.relation_result import OTHER_FORMULATION_PREFIX
 from plumbline.judging.rows import Row, RowContext, Verdict
@@ -27,6 +28,7 @@ from plumbline.judging.state_relations import (
     quantity_values,
     unchanged,
 )
+from plumbline.judging.trajectory import trajectory_rows
 from plumbline.model.datatypes import Array, Integrator, StateQuantities
 from plumbline.model.welding import split_bodies
 from plumbline.reproduce.engine_client import Engine, OfRuns
