@@ -100,7 +100,7 @@ FACTORS = (
     Factor(("proximal", "distal", "length"), "all lengths"),
     Factor(("inertia",), "all inertias"),
     Factor(("mass",), "all masses"),
-    Factor(("gravity",), "gravity's size", "there were no gravity",  # along one axis, its component is the cause
+    Factor(("gravity",), "gravity's size", "there were no gravity",  # along one axis: see `gravity z`
            lambda case: int(np.count_nonzero(case.gravity[0])) > 1),
     Factor(("omega",), "angular rates ω′"),
     Factor(("udot",), "rod rates u̇"),

@@ -1,15 +1,16 @@
 """Motion by heyoka's adaptive Taylor method in minimal coordinates, in double, extended or quad precision.
 
-Coordinates per body: quaternion p, ω′, and for a rod u, u̇ (world).  The joint forces come from the
-elimination of `certified`, as formulas in the coordinates; no constraint is integrated, so nothing drifts.
-One compiled integrator serves every model with the same pattern of joints: numbers enter as parameters,
-which also keeps double-precision constants out of the quad model.
+Coordinates per body: the quaternion p, ω′, and for a rod u, u̇ (world frame).  The joint forces come from the
+block elimination described in `certified`, written as expressions in the coordinates; no constraint is
+integrated, so nothing drifts.  One compiled integrator serves every model with the same sequence of joints:
+the numbers of the model enter as parameters, which also keeps double-precision constants out of the quad
+model.  Vectors (3,) and matrices (3, 3) of expressions are NumPy arrays of objects.
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal
@@ -24,54 +25,69 @@ Precision = Literal["double", "extended", "quad"]
 
 @dataclass(frozen=True, eq=False)
 class MinimalCoordinateRun:
-    """A motion in minimal coordinates at ``t`` (T,), of the precision's own number type.
+    """A motion in minimal coordinates; arrays hold numbers of the precision's own type."""
 
-    p (T, N, 4), omega (T, N, 3) body frame, u, udot (T, N, 3) world frame, and r, v (T, N, 3) lifted from
-    them in the same precision.
-    """
-
-    t: Array
-    p: Any
-    omega: Any
-    u: Any
-    udot: Any
-    r: Any
-    v: Any
+    t: Array  # (T,) s
+    p: Any  # (T, N, 4)
+    omega: Any  # (T, N, 3) rad/s, body frame
+    u: Any  # (T, N, 3), world frame; 0 for ball joints
+    udot: Any  # (T, N, 3) 1/s, world frame
+    r: Any  # (T, N, 3) m, world frame, computed from the coordinates in the same precision
+    v: Any  # (T, N, 3) m/s, world frame
     steps: int
 
 
 def simulate_taylor(
     model: Model, state: State, times: Array, precision: Precision = "extended"
 ) -> MinimalCoordinateRun:
-    """The motion from ``state`` (its minimal coordinates, normalised in that precision) at ``times``.
+    """Integrate the motion from a state.
 
-    Raises TruthUnavailable without heyoka (Linux only) and mpmath, EngineFailure where a step fails.
+    Args:
+        model: the mechanism.
+        state: initial state, of which the minimal coordinates are used, normalised in that precision.
+        times: (T,) [s] of the samples, times[0] = 0.
+        precision: number type of the integration.
+
+    Returns:
+        The motion at ``times``.
+
+    Raises:
+        TruthUnavailable: heyoka (Linux only) or mpmath is not installed.
+        EngineFailure: a step fails, or heyoka was built without quad precision.
+
     """
     hy, mp = load_heyoka(), import_truth_tool("mpmath")
-    kind = _number_type(hy, precision)
+    number_type = _number_type(hy, precision)
     integrator = _compiled_integrator(tuple(bool(rod) for rod in model.rods), model.has_drag, precision)
     with mp.workdps(60):
 
         def number(x: Any) -> Any:
-            return float(x) if kind is float else kind(mp.nstr(mp.mpf(x), 40))
+            return float(x) if number_type is float else number_type(mp.nstr(mp.mpf(x), 40))
 
-        used = len(integrator.pars)  # it ends at the last parameter that the equations name
+        used = len(integrator.pars)  # up to the last parameter that appears in the equations
         integrator.pars[:] = [number(x) for x in _parameter_values(mp, model)[:used]]
         integrator.state[:] = [number(x) for x in _initial_values(mp, model, state)]
-        exact = [[number(mp.mpf(float(x))) for x in row] for row in (*model.proximal, *model.distal)]
-        ell = [number(mp.mpf(float(x))) for x in model.length]
-    integrator.time = kind(0.0)
-    outcome, _, _, steps, _, samples = integrator.propagate_grid([kind(float(t)) for t in times])
+        proximal, distal = ([_vector(map(number, s)) for s in x] for x in (model.proximal, model.distal))
+        length = [number(x) for x in model.length]
+    integrator.time = number_type(0.0)
+    outcome, _, _, steps, _, samples = integrator.propagate_grid([number_type(float(t)) for t in times])
     if "time_limit" not in str(outcome):
         raise EngineFailure(f"heyoka stopped: {outcome}")
-    return _lift_run(model, times, np.asarray(samples), exact, ell, int(steps))
+    return _forward_kinematics(model, times, np.asarray(samples), proximal, distal, length, int(steps))
 
 
 @cache
 def load_heyoka() -> Any:
-    """The module, without SymPy, which it imports where it can (2 s) for translations not wanted here.
+    """Import heyoka without SymPy, which it would load for conversions that are not used here (2 s).
 
-    One thread, as everything in a worker; no cache on disk, which unoptimised code does not need.
+    One thread, as in every worker; no cache on disk, which unoptimised code does not need.
+
+    Returns:
+        The module.
+
+    Raises:
+        TruthUnavailable: heyoka is not installed.
+
     """
     hidden = sys.modules.setdefault("sympy", None) is None  # type: ignore[arg-type]
     try:
@@ -91,288 +107,236 @@ def _number_type(hy: Any, precision: Precision) -> Any:
 
 
 def _initial_values(mp: Any, model: Model, state: State) -> list[Any]:
-    """Coordinates in the order of `_compiled`, normalised at 60 digits."""
+    """Coordinates in the order of `_equations_of_motion`, normalised in mpmath's precision."""
     values: list[Any] = []
     for k in range(model.n):
+        p, omega, u, udot = (mp.matrix(x[k].tolist()) for x in (state.p, state.omega, state.u, state.udot))
         if model.rods[k]:
-            u, udot = _column_vector(mp, state.u[k]), _column_vector(mp, state.udot[k])
             u /= mp.norm(u)
             udot -= u * (u.T * udot)[0]
             values += [*u, *udot]
-        p = _column_vector(mp, state.p[k])
-        values += [*(p / mp.norm(p)), *_column_vector(mp, state.omega[k])]
+        values += [*(p / mp.norm(p)), *omega]
     return values
 
 
 def _parameter_values(mp: Any, model: Model) -> list[Any]:
     """Numbers of the model in the order of `_Body`: gravity, then per body."""
-    values = [*_column_vector(mp, model.gravity)]
+    values: list[Any] = model.gravity.tolist()
     for k in range(model.n):
         m, J = mp.mpf(float(model.mass[k])), mp.matrix(model.inertia[k].tolist())
         J_inverse = J**-1
-        cross = [_cross_matrix(mp, s) for s in (model.proximal[k], model.distal[k])]
-        Y = [
-            mp.eye(3) / m - a * J_inverse * b
-            for a, b in ((0, 0), (0, 1), (1, 1))
-            for a, b in ((cross[a], cross[b]),)
-        ]
-        values += [*J, *J_inverse, *Y[0], *Y[1], *Y[2]]
-        values += [*_column_vector(mp, model.proximal[k]), *_column_vector(mp, model.distal[k]), 1 / m]
-        values += [*(_column_vector(mp, model.force[k]) / m), *_column_vector(mp, model.moment[k])]
-        values += [
-            mp.mpf(float(model.length[k])),
-            float(model.drag_force[k]) / m,
-            float(model.drag_moment[k]),
-        ]
+        sp, sd = (_cross_matrix(mp, s[k]) for s in (model.proximal, model.distal))
+        values += [*J, *J_inverse]
+        for a, b in ((sp, sp), (sp, sd), (sd, sd)):
+            values += [*(mp.eye(3) / m - a * J_inverse * b)]
+        values += [*model.proximal[k].tolist(), *model.distal[k].tolist(), 1 / m]
+        values += [*(mp.matrix(model.force[k].tolist()) / m), *model.moment[k].tolist()]
+        values += [float(model.length[k]), float(model.drag_force[k]) / m, float(model.drag_moment[k])]
     return values
 
 
-def _column_vector(mp: Any, v: Any) -> Any:
-    return mp.matrix([float(x) for x in v])
-
-
-def _cross_matrix(mp: Any, s: Any) -> Any:
+def _cross_matrix(mp: Any, s: Array) -> Any:
     x, y, z = (mp.mpf(float(c)) for c in s)
     return mp.matrix([[0, -z, y], [z, 0, -x], [-y, x, 0]])
 
 
 @cache
 def _compiled_integrator(rods: tuple[bool, ...], drag: bool, precision: Precision) -> Any:
-    """The Taylor integrator of a chain of that pattern."""
+    """The Taylor integrator of a chain with that sequence of joints."""
     hy = load_heyoka()
     system = _equations_of_motion(hy, rods, drag)
-    kind = _number_type(hy, precision)
-    # Unoptimised code runs two to three times as long and is there in a tenth of the time: of ten bodies in
-    # 0.4 s, where optimising takes 3 s … 6 s and saves 0.4 s in a run of 2 s in double, 1 s in extended.
-    return hy.taylor_adaptive(system, [kind(0.0)] * len(system), fp_type=kind, compact_mode=True, opt_level=0)
+    zero = _number_type(hy, precision)(0.0)
+    # Unoptimised code takes two to three times as long to run and a tenth of the time to compile: for ten
+    # bodies 0.4 s, where optimising takes 3 … 6 s and saves 0.4 s of a run of 2 s in double, 1 s in extended.
+    return hy.taylor_adaptive(
+        system, [zero] * len(system), fp_type=type(zero), compact_mode=True, opt_level=0
+    )
 
 
-Expression = Any
-Vector = list[Expression]
-Matrix = list[list[Expression]]
+# --- equations of motion as expressions -----------------------------------------------------------
 
 
-class _BodyParameters:
-    """Parameters of one body as heyoka expressions, in the order of `_parameters`."""
+class _Body:
+    """Parameters (in the order of `_parameter_values`) and coordinates of one body as expressions."""
 
-    def __init__(self, hy: Any, first: int) -> None:
-        self.at, self.hy = first, hy
-        self.J, self.J_inverse, self.Ypp, self.Ypd, self.Ydd = (self.take_matrix() for _ in range(5))
-        self.sp, self.sd, (self.inverse_mass,) = (
-            self.take_parameters(3),
-            self.take_parameters(3),
-            self.take_parameters(1),
+    def __init__(self, hy: Any, k: int, first_parameter: int) -> None:
+        self.next_parameter, self.hy = first_parameter, hy
+        self.J, self.J_inverse, self.Ypp, self.Ypd, self.Ydd = (self.take(9).reshape(3, 3) for _ in range(5))
+        self.sp, self.sd, (self.inverse_mass,) = self.take(3), self.take(3), self.take(1)
+        self.force_per_mass, self.moment = self.take(3), self.take(3)
+        self.length, self.drag_force_per_mass, self.drag_moment = self.take(3)
+        self.p, self.w, self.u, self.udot = (
+            _vector(hy.make_vars(*(f"{name}{i}_{k}" for i in range(size))))
+            for name, size in (("p", 4), ("w", 3), ("u", 3), ("d", 3))
         )
-        self.f, self.n = self.take_parameters(3), self.take_parameters(3)
-        self.ell, self.ct, self.cr = self.take_parameters(3)
+        self.A = _rotation_matrix(self.p)
 
-    def take_parameters(self, count: int) -> Vector:
-        self.at += count
-        return [self.hy.par[i] for i in range(self.at - count, self.at)]
+    def take(self, count: int) -> Any:
+        self.next_parameter += count
+        return _vector(self.hy.par[i] for i in range(self.next_parameter - count, self.next_parameter))
 
-    def take_matrix(self) -> Matrix:
-        flat = self.take_parameters(9)
-        return [flat[0:3], flat[3:6], flat[6:9]]
+    def centripetal(self, s: Any) -> Any:
+        """ω′ × (ω′ × s) (3,), body frame."""
+        return np.cross(self.w, np.cross(self.w, s))
+
+    def point_acceleration(self, at_force: Any, at_below: Any, free: Any, force: Any, below: Any) -> Any:
+        """Acceleration of a point (3,): free motion, the proximal force, minus the force passed on below.
+
+        ``at_force`` and ``at_below`` are the mobilities of the point for the two forces, body frame.
+        """
+        pulled = at_force @ (self.A.T @ force)
+        if below is not None:
+            pulled = pulled - at_below @ (self.A.T @ below)
+        return free + self.A @ pulled
 
 
 def _equations_of_motion(hy: Any, rods: tuple[bool, ...], drag: bool) -> list[tuple[Any, Any]]:
-    """(coordinate, its rate) of the chain."""
-    n, g = len(rods), [hy.par[i] for i in range(3)]
-    bodies: list[_BodyParameters] = []
-    for _ in rods:
-        bodies.append(_BodyParameters(hy, bodies[-1].at if bodies else 3))
-    names = [
-        [hy.make_vars(*(f"{c}{i}_{k}" for i in range(w))) for c, w in (("p", 4), ("w", 3))] for k in range(n)
-    ]
-    links = [[hy.make_vars(*(f"{c}{i}_{k}" for i in range(3))) for c in ("u", "d")] for k in range(n)]
-    A = [_rotation_matrix(p) for p, _ in names]
-    turn: list[Vector] = []
-    far_a: list[Vector] = []
-    near_a: list[Vector] = []
-    v: Vector = [hy.expression(0.0)] * 3
-    for k, body in enumerate(bodies):
-        w = list(names[k][1])
-        moment = _subtract(body.n, _cross(w, _matrix_times_vector(body.J, w)))
-        free = _add(g, body.f)
-        if drag:
-            moment = _subtract(moment, [body.cr * x for x in w])
-            if rods[k]:
-                v = _add(v, [body.ell * x for x in links[k][1]])
-            v = _subtract(v, _matrix_times_vector(A[k], _cross(w, body.sp)))
-            free = _subtract(free, [body.ct * x for x in v])
-            v = _add(v, _matrix_times_vector(A[k], _cross(w, body.sd)))
-        turn.append(_matrix_times_vector(body.J_inverse, moment))
-        for point, into in ((body.sp, near_a), (body.sd, far_a)):
-            inside = _add(_cross(turn[k], point), _cross(w, _cross(w, point)))
-            into.append(_add(free, _matrix_times_vector(A[k], inside)))
-
-    solves: list[Any] = []
-    rhs: list[Vector] = []
-    off: list[Matrix] = []
-    for k, body in enumerate(bodies):
-        D, e = _congruence(A[k], body.Ypp), [-x for x in near_a[k]]
-        if k:
-            D = [_add(a, b) for a, b in zip(D, _congruence(A[k - 1], bodies[k - 1].Ydd), strict=True)]
-            e = _add(e, far_a[k - 1])
-        E = _transposed([list(links[k][0])]) if rods[k] else None  # 3 × 1
-        D, e = _project_block(E, D, E), _project_vector(E, e)
-        if rods[k]:
-            e = [e[0] - body.ell * _dot(links[k][1], links[k][1])]
-        if k:
-            E_above = _transposed([list(links[k - 1][0])]) if rods[k - 1] else None
-            couple = _project_block(E_above, _congruence(A[k - 1], bodies[k - 1].Ypd), E)
-            off.append([[-x for x in row] for row in couple])  # (above, here)
-            columns = _transposed(off[-1])
-            gain = [solves[-1](column) for column in columns]  # D⁻¹ of the column, one per row here
-            D = [[D[i][j] - _dot(gain[i], columns[j]) for j in range(len(D))] for i in range(len(D))]
-            e = [e[i] - _dot(gain[i], rhs[-1]) for i in range(len(e))]
-        solves.append(_symmetric_solve(D))
-        rhs.append(e)
-    F: list[Vector] = [[]] * n
-    multiplier: Vector = []
-    for k in reversed(range(n)):
-        e = rhs[k] if k == n - 1 else _subtract(rhs[k], _matrix_times_vector(off[k], multiplier))
-        multiplier = solves[k](e)
-        F[k] = [multiplier[0] * x for x in links[k][0]] if rods[k] else multiplier
-
+    """Pairs (coordinate, its rate) of the chain."""
+    bodies: list[_Body] = []
+    for k in range(len(rods)):
+        bodies.append(_Body(hy, k, bodies[-1].next_parameter if bodies else 3))
+    turn, near_a, far_a = _free_accelerations(hy, rods, drag, bodies)
+    F = [*_joint_forces(rods, bodies, near_a, far_a), None]
     system: list[tuple[Any, Any]] = []
-    far: Vector | None = None
+    hanging_point: Any = None  # acceleration of the distal point above
     for k, body in enumerate(bodies):
-        (p, w), (u, udot) = names[k], links[k]
-        pull = _matrix_times_vector(_transposed(A[k]), F[k])
-        couple_k = _cross(body.sp, pull)
-        below = F[k + 1] if k + 1 < n else None
-        if below is not None:
-            couple_k = _subtract(couple_k, _cross(body.sd, _matrix_times_vector(_transposed(A[k]), below)))
-        alpha = _add(turn[k], _matrix_times_vector(body.J_inverse, couple_k))
-        if rods[k]:  # ℓ ü is the acceleration of the rod's tip relative to where it hangs
-            near = _point_acceleration(A[k], body.Ypp, body.Ypd, near_a[k], F[k], below)
-            relative = near if far is None else _subtract(near, far)
-            # the part along u is −u̇² u, by definition of a unit vector: taken so, ‖u‖ does not wander
-            across = [x / body.ell for x in relative]
-            along = _dot(across, u) + _dot(udot, udot)
-            system += [*zip(u, udot, strict=True)]
-            system += [(d, a - along * x) for d, a, x in zip(udot, across, u, strict=True)]
-        if k + 1 < n and rods[k + 1]:
-            far = _point_acceleration(A[k], _transposed(body.Ypd), body.Ydd, far_a[k], F[k], below)
-        p0, p1, p2, p3 = p
-        wx, wy, wz = (0.5 * x for x in w)
-        rates = [-p1 * wx - p2 * wy - p3 * wz, p0 * wx - p3 * wy + p2 * wz]
-        rates += [p3 * wx + p0 * wy - p1 * wz, -p2 * wx + p1 * wy + p0 * wz]
-        system += [*zip(p, rates, strict=True), *zip(w, alpha, strict=True)]
+        couple = np.cross(body.sp, body.A.T @ F[k])
+        if F[k + 1] is not None:
+            couple = couple - np.cross(body.sd, body.A.T @ F[k + 1])
+        if rods[k]:  # ℓ ü is the acceleration of the rod's tip relative to its upper end
+            near = body.point_acceleration(body.Ypp, body.Ypd, near_a[k], F[k], F[k + 1])
+            relative = (near if hanging_point is None else near - hanging_point) / body.length
+            # the part along u is −u̇² u for a unit vector; written so, ‖u‖ does not drift
+            along = relative @ body.u + body.udot @ body.udot
+            system += [*zip(body.u, body.udot, strict=True)]
+            system += zip(body.udot, relative - along * body.u, strict=True)
+        if k + 1 < len(rods) and rods[k + 1]:
+            hanging_point = body.point_acceleration(body.Ypd.T, body.Ydd, far_a[k], F[k], F[k + 1])
+        p0, p1, p2, p3 = body.p
+        wx, wy, wz = 0.5 * body.w
+        p_rate = [-p1 * wx - p2 * wy - p3 * wz, p0 * wx - p3 * wy + p2 * wz]
+        p_rate += [p3 * wx + p0 * wy - p1 * wz, -p2 * wx + p1 * wy + p0 * wz]
+        w_rate = turn[k] + body.J_inverse @ couple
+        system += [*zip(body.p, p_rate, strict=True), *zip(body.w, w_rate, strict=True)]
     return system
 
 
-def _point_acceleration(
-    A: Matrix, Yf: Matrix, Yb: Matrix, free: Vector, F: Vector, below: Vector | None
-) -> Vector:
-    """Acceleration of a point: free motion, the force at the proximal point, the one passed on below."""
-    pulled = _matrix_times_vector(Yf, _matrix_times_vector(_transposed(A), F))
-    if below is not None:
-        pulled = _subtract(pulled, _matrix_times_vector(Yb, _matrix_times_vector(_transposed(A), below)))
-    return _add(free, _matrix_times_vector(A, pulled))
+def _free_accelerations(
+    hy: Any, rods: tuple[bool, ...], drag: bool, bodies: list[_Body]
+) -> tuple[list[Any], list[Any], list[Any]]:
+    """Without joint forces: ω̇′ (body frame), accelerations of proximal and distal points (world frame)."""
+    gravity = _vector(hy.par[i] for i in range(3))
+    turn, near_a, far_a = [], [], []
+    v = _vector([hy.expression(0.0)] * 3)
+    for body, rod in zip(bodies, rods, strict=True):
+        moment = body.moment - np.cross(body.w, body.J @ body.w)
+        free = gravity + body.force_per_mass
+        if drag:
+            moment = moment - body.drag_moment * body.w
+            if rod:
+                v = v + body.length * body.udot
+            v = v - body.A @ np.cross(body.w, body.sp)
+            free = free - body.drag_force_per_mass * v
+            v = v + body.A @ np.cross(body.w, body.sd)
+        turn.append(body.J_inverse @ moment)
+        for point, accelerations in ((body.sp, near_a), (body.sd, far_a)):
+            inside = np.cross(turn[-1], point) + body.centripetal(point)
+            accelerations.append(free + body.A @ inside)
+    return turn, near_a, far_a
 
 
-def _rotation_matrix(p: Sequence[Expression]) -> Matrix:
+def _joint_forces(
+    rods: tuple[bool, ...], bodies: list[_Body], near_a: list[Any], far_a: list[Any]
+) -> list[Any]:
+    """Force (3,) on each body at its proximal point, world frame, by block elimination along the chain."""
+    solves: list[Callable[[Any], Any]] = []
+    rhs: list[Any] = []
+    off: list[Any] = []  # (above, here)
+    directions = [body.u[:, None] if rod else None for body, rod in zip(bodies, rods, strict=True)]
+    for k, body in enumerate(bodies):
+        D, e, E = body.A @ body.Ypp @ body.A.T, -near_a[k], directions[k]
+        if k:
+            above = bodies[k - 1]
+            D, e = D + above.A @ above.Ydd @ above.A.T, e + far_a[k - 1]
+            coupling = -_project(directions[k - 1], above.A @ above.Ypd @ above.A.T, E)
+        D = _project(E, D, E)
+        if rods[k]:
+            e = _vector([body.u @ e - body.length * (body.udot @ body.udot)])
+        if k:
+            off.append(coupling)
+            gain = np.stack([solves[-1](column) for column in coupling.T])
+            D, e = D - gain @ coupling, e - gain @ rhs[-1]
+        solves.append(_symmetric_solve(D))
+        rhs.append(e)
+    F: list[Any] = [None] * len(bodies)
+    multiplier: Any = None
+    for k in reversed(range(len(bodies))):
+        multiplier = solves[k](rhs[k] if multiplier is None else rhs[k] - off[k] @ multiplier)
+        F[k] = multiplier[0] * bodies[k].u if rods[k] else multiplier
+    return F
+
+
+def _vector(entries: Iterable[Any]) -> Any:
+    """One-dimensional array of objects, which may be arrays themselves."""
+    return np.fromiter(entries, dtype=object)
+
+
+def _rotation_matrix(p: Any) -> Any:
     w, x, y, z = p
     ww, xx, yy, zz = w * w, x * x, y * y, z * z
     x2, y2, w2 = x + x, y + y, w + w  # no constant: quad arrays do not mix with Python's numbers
-    return [
-        [ww + xx - yy - zz, x2 * y - w2 * z, x2 * z + w2 * y],
-        [x2 * y + w2 * z, ww - xx + yy - zz, y2 * z - w2 * x],
-        [x2 * z - w2 * y, y2 * z + w2 * x, ww - xx - yy + zz],
-    ]
+    return _vector(
+        [
+            *(ww + xx - yy - zz, x2 * y - w2 * z, x2 * z + w2 * y),
+            *(x2 * y + w2 * z, ww - xx + yy - zz, y2 * z - w2 * x),
+            *(x2 * z - w2 * y, y2 * z + w2 * x, ww - xx - yy + zz),
+        ]
+    ).reshape(3, 3)
 
 
-def _dot(a: Sequence[Any], b: Sequence[Any]) -> Any:
-    return sum((x * y for x, y in zip(a[1:], b[1:], strict=True)), a[0] * b[0])
-
-
-def _add(a: Sequence[Any], b: Sequence[Any]) -> Vector:
-    return [x + y for x, y in zip(a, b, strict=True)]
-
-
-def _subtract(a: Sequence[Any], b: Sequence[Any]) -> Vector:
-    return [x - y for x, y in zip(a, b, strict=True)]
-
-
-def _cross(a: Sequence[Any], b: Sequence[Any]) -> Vector:
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-
-
-def _matrix_times_vector(M: Matrix, v: Sequence[Any]) -> Vector:
-    return [_dot(row, v) for row in M]
-
-
-def _transposed(M: Matrix) -> Matrix:
-    return [list(column) for column in zip(*M, strict=True)]
-
-
-def _matrix_product(a: Matrix, b: Matrix) -> Matrix:
-    columns = _transposed(b)
-    return [[_dot(row, column) for column in columns] for row in a]
-
-
-def _congruence(A: Matrix, Y: Matrix) -> Matrix:
-    """A Y Aᵀ."""
-    return _matrix_product(_matrix_product(A, Y), _transposed(A))
-
-
-def _project_block(E: Matrix | None, Y: Matrix, E2: Matrix | None) -> Matrix:
-    """Eᵀ Y E2 where None stands for the identity."""
+def _project(E: Any, Y: Any, E2: Any) -> Any:
+    """Eᵀ Y E2, where None stands for the identity."""
     if E is not None:
-        Y = _matrix_product(_transposed(E), Y)
-    return Y if E2 is None else _matrix_product(Y, E2)
+        Y = E.T @ Y
+    return Y if E2 is None else Y @ E2
 
 
-def _project_vector(E: Matrix | None, e: Vector) -> Vector:
-    return e if E is None else [_dot([row[0] for row in E], e)]
-
-
-def _symmetric_solve(D: Matrix) -> Any:
+def _symmetric_solve(D: Any) -> Callable[[Any], Any]:
     """The map b → D⁻¹ b of a 1×1 or 3×3 symmetric positive definite D, by LDLᵀ."""
     if len(D) == 1:
-        return lambda b: [b[0] / D[0][0]]
-    d0 = D[0][0]
-    l10, l20 = D[1][0] / d0, D[2][0] / d0
-    d1 = D[1][1] - l10 * D[1][0]
-    c21 = D[2][1] - l20 * D[1][0]
+        return lambda b: b / D[0, 0]
+    d0 = D[0, 0]
+    l10, l20 = D[1, 0] / d0, D[2, 0] / d0
+    d1 = D[1, 1] - l10 * D[1, 0]
+    c21 = D[2, 1] - l20 * D[1, 0]
     l21 = c21 / d1
-    d2 = D[2][2] - l20 * D[2][0] - l21 * c21
+    d2 = D[2, 2] - l20 * D[2, 0] - l21 * c21
 
-    def solve(b: Sequence[Any]) -> Vector:
+    def solve(b: Any) -> Any:
         y1 = b[1] - l10 * b[0]
         y2 = b[2] - l20 * b[0] - l21 * y1
         x2 = y2 / d2
         x1 = y1 / d1 - l21 * x2
-        return [b[0] / d0 - l10 * x1 - l20 * x2, x1, x2]
+        return _vector([b[0] / d0 - l10 * x1 - l20 * x2, x1, x2])
 
     return solve
 
 
-def _lift_run(
-    model: Model, times: Array, y: Any, points: list[Any], ell: list[Any], steps: int
+def _forward_kinematics(
+    model: Model, times: Array, y: Any, proximal: list[Any], distal: list[Any], length: list[Any], steps: int
 ) -> MinimalCoordinateRun:
     """Coordinates by name, and r, v from the pivot outwards, in the precision of y (T, coordinates)."""
-    n, zero = model.n, y[:, :3] - y[:, :3]
+    columns = iter(y.T)
+    zero = y[:, 0] - y[:, 0]
     parts: dict[str, list[Any]] = {name: [] for name in ("p", "omega", "u", "udot", "r", "v")}
-    tip, tip_v, at = zero, zero, 0
-    for k in range(n):
-        u_k, d_k = zero, zero
-        if model.rods[k]:
-            u_k, d_k, at = y[:, at : at + 3], y[:, at + 3 : at + 6], at + 6
-        p_k, w_k, at = y[:, at : at + 4], y[:, at + 4 : at + 7], at + 7
-        A = _rotation_matrix([p_k[:, i] for i in range(4)])
-
-        def arm(s: Any, A: Matrix = A, w: Any = w_k) -> tuple[Any, Any]:
-            """A s and A (ω′ × s)."""
-            swing = _cross([w[:, i] for i in range(3)], s)
-            return np.stack(_matrix_times_vector(A, s), 1), np.stack(_matrix_times_vector(A, swing), 1)
-
-        near, near_v = arm(points[k])
-        far, far_v = arm(points[n + k])
-        r_k, v_k = tip + u_k * ell[k] - near, tip_v + d_k * ell[k] - near_v
-        tip, tip_v = r_k + far, v_k + far_v
-        for into, value in zip(parts.values(), (p_k, w_k, u_k, d_k, r_k, v_k), strict=True):
-            into.append(value)
+    tip = tip_v = _vector([zero] * 3)
+    for k in range(model.n):
+        u, udot = (_vector([next(columns) if model.rods[k] else zero for _ in range(3)]) for _ in range(2))
+        p, w = _vector(next(columns) for _ in range(4)), _vector(next(columns) for _ in range(3))
+        A = _rotation_matrix(p)
+        r = tip + u * length[k] - A @ proximal[k]
+        v = tip_v + udot * length[k] - A @ np.cross(w, proximal[k])
+        tip, tip_v = r + A @ distal[k], v + A @ np.cross(w, distal[k])
+        for part, value in zip(parts.values(), (p, w, u, udot, r, v), strict=True):
+            part.append(np.stack(list(value), 1))
     return MinimalCoordinateRun(t=times, steps=steps, **{name: np.stack(x, 1) for name, x in parts.items()})
