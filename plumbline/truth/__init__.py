@@ -1,7 +1,9 @@
-"""Truth in high precision: certified state quantities and trajectories with an earned uncertainty.
+"""Truth: what engines are judged by, with its uncertainty.
 
-Needs the optional group `truth` (python-flint, mpmath, sympy, heyoka), imported inside the functions:
-where it is missing `TruthUnavailable` says so and the main job goes on without.
+A model and states enter; true state quantities with rounding bounds (`ground_truth.state_truth`) and true
+motions with uncertainties and the growth of perturbations (`ground_truth.motion_truth`) leave.  High
+precision needs the optional group `truth` (python-flint, mpmath, SymPy, heyoka), imported inside functions:
+where it is missing, `TruthUnavailable` is raised and `ground_truth` falls back to double precision.
 """
 
 from __future__ import annotations
@@ -13,11 +15,22 @@ from plumbline.processes.errors import PlumblineError
 
 
 class TruthUnavailable(PlumblineError, ImportError):
-    """The truth tools are not installed; the message says which and how to get them."""
+    """A package of the group `truth` is not installed; the message names it and the command to install it."""
 
 
 def import_truth_tool(module: str) -> Any:
-    """The optional module of that name; raises TruthUnavailable with a sentence where it is missing."""
+    """Import an optional module.
+
+    Args:
+        module: its full name.
+
+    Returns:
+        The module.
+
+    Raises:
+        TruthUnavailable: it is not installed.
+
+    """
     try:
         return import_module(module)
     except ImportError as error:

@@ -1,13 +1,15 @@
-"""Certified truth at one state: the notes' system enclosed in ball arithmetic (python-flint).
+"""Certified truth at one state: rigorous enclosures in ball arithmetic (python-flint).
 
-Starts from the minimal state (p, ω′, u, u̇ as doubles), normalises and lifts it exactly and solves for the
-joint forces: eliminated onto the joints the system is symmetric, positive definite and block-tridiagonal,
-so a chain costs O(N).  With s̃ the cross-product matrix and s, I in world axes, a body's point mobility is
+The minimal coordinates (p, ω′, u, u̇ as doubles) are normalised, positions and velocities follow from them,
+and the Newton–Euler equations are solved for the joint forces: eliminated onto the joints, the system is
+symmetric, positive definite and block-tridiagonal, so that a chain costs O(N).  With s̃ the cross-product
+matrix, and s and I in world axes, the mobility between two points of a body is
 
     Y(s, t) = 1/m − s̃ I⁻¹ t̃        (force at t → acceleration at s)
 
-and joint k, E = I for a ball and u for a rod, gives  E_kᵀ d̈_k = −ℓ u̇² (rod) or 0 (ball), F_k = E_k λ_k.
-All quantities come back with a radius that encloses every rounding made on the way.
+and joint k, with E = 1 for a ball and u for a rod, requires E_kᵀ d̈_k = −ℓ u̇² (rod) or 0 (ball), with the
+force F_k = E_k λ_k.
+Every quantity has a radius that encloses all roundings of its computation.
 """
 
 from __future__ import annotations
@@ -27,37 +29,39 @@ MAX_BITS = 20_000
 
 
 class CertificationFailure(PlumblineError, ArithmeticError):
-    """No finite enclosure was found: the system is singular at this state, or nearly so."""
+    """No sharp enclosure was found: the system is singular at this state, or nearly so."""
 
 
 @dataclass(frozen=True, eq=False)
 class CertifiedQuantities:
-    """State quantities whose error is known.
+    """State quantities with a bound of their error."""
 
-    ``quantities`` are the enclosures' midpoints rounded to double; ``radius`` holds per quantity the largest
-    distance from the truth, that last rounding excluded (it adds half a unit in the last place);
-    ``tension`` (N,) N is each rod's, 2 ℓ λ of the notes (E5), positive when it pulls, 0 for a ball joint;
-    ``bits`` the precision that was needed.
-    """
-
-    quantities: StateQuantities
-    tension: Array
-    radius: dict[str, float]
-    bits: int
-
-
-def rod_multiplier(model: Model, certified: CertifiedQuantities) -> Array:
-    """λ (N,) N/m of the notes' C = dᵀd per rod (E5: tension = 2 ℓ λ), 0 for ball joints."""
-    return np.where(model.rods, certified.tension / (2 * np.where(model.rods, model.length, 1.0)), 0.0)
+    quantities: StateQuantities  # midpoints of the enclosures, rounded to double
+    tension: Array  # (N,) N, of each rod: 2 ℓ λ of the notes (E5), positive when it pulls; 0 for a ball joint
+    radius: dict[str, float]  # per quantity: largest error of the midpoints, before rounding to double
+    bits: int  # precision that was needed
 
 
 def certify_state(
     model: Model, state: State, mass_matrix: bool = False, bits: int = 200
 ) -> CertifiedQuantities:
-    """Rigorous state quantities, SI units, frames as in `StateQuantities`.
+    """Compute state quantities with a rigorous bound of their error.
 
-    Precision is raised from ``bits`` until every radius is below 1e-25 of its quantity's terms.
-    Raises TruthUnavailable without python-flint, NotCertified where the system is singular.
+    The precision rises until every radius is below `MAX_RELATIVE_RADIUS` of the quantity's terms.
+
+    Args:
+        model: the mechanism.
+        state: the state, of which the minimal coordinates are used.
+        mass_matrix: whether to compute the mass matrix too.
+        bits: precision to start with.
+
+    Returns:
+        The quantities, in SI units and the frames of `StateQuantities`.
+
+    Raises:
+        CertificationFailure: the system is singular at this state, or nearly so.
+        TruthUnavailable: python-flint is not installed.
+
     """
     while bits <= MAX_BITS:
         balls = enclose_quantities(model, state, bits, mass_matrix)
@@ -71,7 +75,7 @@ def certify_state(
     quantities = {name: ball for name, ball in balls.items() if name != "scale"}
     middle = {name: _midpoints(ball) for name, ball in quantities.items()}
     radius = {name: max(float(x.rad()) for x in _flatten(ball)) for name, ball in quantities.items()}
-    answer = StateQuantities(
+    found = StateQuantities(
         acceleration=middle["acceleration"],
         angular_acceleration=middle["angular_acceleration"],
         joint_reaction=middle["joint_reaction"],
@@ -80,17 +84,28 @@ def certify_state(
         angular_momentum=middle["angular_momentum"],
     )
     if mass_matrix:
-        answer = replace(answer, mass_matrix=middle["mass_matrix"])
-    return CertifiedQuantities(answer, middle["tension"], radius, bits)
+        found = replace(found, mass_matrix=middle["mass_matrix"])
+    return CertifiedQuantities(found, middle["tension"], radius, bits)
 
 
 def enclose_quantities(
     model: Model, state: State, bits: int, mass_matrix: bool = False
 ) -> dict[str, Any] | None:
-    """Enclosures (python-flint ``arb``) of every quantity at ``bits``, None where an inverse had none.
+    """Enclose every quantity at one precision.
 
-    Vectors per body are lists of N lists of 3, scalars lists of one; "scale" holds the sizes, as floats,
-    that radii are compared with.
+    Args:
+        model: the mechanism.
+        state: the state, of which the minimal coordinates are used.
+        bits: precision of the balls.
+        mass_matrix: whether to compute the mass matrix too.
+
+    Returns:
+        Balls (python-flint ``arb``) by quantity: N lists of 3 for vectors per body, lists of one for scalars;
+        "scale" holds, as floats, the sizes that radii are compared with.  None where a block has no inverse.
+
+    Raises:
+        TruthUnavailable: python-flint is not installed.
+
     """
     flint = import_truth_tool("flint")
     with flint.ctx.workprec(bits):
@@ -101,7 +116,7 @@ def enclose_quantities(
 
 
 class _BallChain:
-    """The model and state in balls, world axes: every vector a 3×1 ``arb_mat``."""
+    """Model and state in balls: every vector is a 3×1 ``arb_mat`` in world axes; ``J`` is in body axes."""
 
     def __init__(self, flint: Any, model: Model, state: State) -> None:
         self.flint, self.model, self.n = flint, model, model.n
@@ -110,8 +125,7 @@ class _BallChain:
         self.m = [self.arb(float(m)) for m in model.mass]
         self.ell = [self.arb(float(length)) for length in model.length]
         self.J = [self.matrix(J) for J in model.inertia]
-        self.w_body = [self.vector(w) for w in state.omega]
-        self.w = [a * w for a, w in zip(self.A, self.w_body, strict=True)]
+        self.w = [a * self.vector(w) for a, w in zip(self.A, state.omega, strict=True)]
         self.sp = [a * self.vector(s) for a, s in zip(self.A, model.proximal, strict=True)]
         self.sd = [a * self.vector(s) for a, s in zip(self.A, model.distal, strict=True)]
         self.I = [a * J * a.transpose() for a, J in zip(self.A, self.J, strict=True)]
@@ -168,7 +182,36 @@ class _BallChain:
 
 
 def _solve_and_enclose(c: _BallChain, mass_matrix: bool) -> dict[str, Any]:
-    """Block elimination along the chain, then accelerations, energies and momentum."""
+    """All quantities of `enclose_quantities`."""
+    free, turn, F = _solve_joint_forces(c)
+    acceleration, angular, kinetic, potential, momentum = [], [], c.arb(0), c.arb(0), c.zero
+    for k in range(c.n):
+        below = F[k + 1] if k + 1 < c.n else c.zero
+        acceleration.append(free[k] + (F[k] - below) * (1 / c.m[k]))
+        couple = c.cross_matrix(c.sp[k]) * F[k] - c.cross_matrix(c.sd[k]) * below
+        angular.append(c.A[k].transpose() * (turn[k] + c.I_inverse[k] * couple))
+        spin = c.I[k] * c.w[k]
+        kinetic += (c.m[k] * c.dot(c.v[k], c.v[k]) + c.dot(c.w[k], spin)) / 2
+        potential -= c.m[k] * c.dot(c.g, c.r[k])
+        momentum += c.cross_matrix(c.r[k]) * c.v[k] * c.m[k] + spin
+    balls: dict[str, Any] = {
+        "acceleration": [_entries(a) for a in acceleration],
+        "angular_acceleration": [_entries(a) for a in angular],
+        "joint_reaction": [_entries(f) for f in F],
+        "kinetic_energy": [kinetic],
+        "potential_energy": [potential],
+        "angular_momentum": _entries(momentum),
+        "tension": [-c.dot(c.u[k], F[k]) for k in range(c.n)],
+        "r": [_entries(r) for r in c.r],
+        "v": [_entries(v) for v in c.v],
+    }
+    if mass_matrix:
+        balls["mass_matrix"] = _mass_matrix(c)
+    return balls | {"scale": _term_scales(c, balls)}
+
+
+def _solve_joint_forces(c: _BallChain) -> tuple[list[Any], list[Any], list[Any]]:
+    """Accelerations r̈ and A ω̇′ without joint forces, and joint forces F, by block elimination."""
     model, n = c.model, c.n
     free, turn, near, far, Ypp, Ypd, Ydd = [], [], [], [], [], [], []
     for k in range(n):
@@ -179,10 +222,10 @@ def _solve_and_enclose(c: _BallChain, mass_matrix: bool) -> dict[str, Any]:
         turn.append(c.I_inverse[k] * (moment - w * (c.I[k] * c.w[k])))
         near.append(free[k] - sp * turn[k] + w * (w * c.sp[k]))
         far.append(free[k] - sd * turn[k] + w * (w * c.sd[k]))
-        by_m = c.eye * (1 / c.m[k])
-        Ypp.append(by_m - sp * c.I_inverse[k] * sp)
-        Ypd.append(by_m - sp * c.I_inverse[k] * sd)
-        Ydd.append(by_m - sd * c.I_inverse[k] * sd)
+        inverse_mass = c.eye * (1 / c.m[k])
+        Ypp.append(inverse_mass - sp * c.I_inverse[k] * sp)
+        Ypd.append(inverse_mass - sp * c.I_inverse[k] * sd)
+        Ydd.append(inverse_mass - sd * c.I_inverse[k] * sd)
 
     # K λ = e: forward elimination, back-substitution
     E = [c.u[k] if model.rods[k] else c.eye for k in range(n)]
@@ -208,57 +251,34 @@ def _solve_and_enclose(c: _BallChain, mass_matrix: bool) -> dict[str, Any]:
         e = rhs[k] if multiplier is None else rhs[k] - off[k] * multiplier
         multiplier = pivot[k] * e
         F[k] = E[k] * multiplier
-
-    acceleration, angular, kinetic, potential, momentum = [], [], c.arb(0), c.arb(0), c.zero
-    for k in range(n):
-        below = F[k + 1] if k + 1 < n else c.zero
-        acceleration.append(free[k] + (F[k] - below) * (1 / c.m[k]))
-        alpha = turn[k] + c.I_inverse[k] * (c.cross_matrix(c.sp[k]) * F[k] - c.cross_matrix(c.sd[k]) * below)
-        angular.append(c.A[k].transpose() * alpha)
-        spin = c.I[k] * c.w[k]
-        kinetic += (c.m[k] * c.dot(c.v[k], c.v[k]) + c.dot(c.w[k], spin)) / 2
-        potential -= c.m[k] * c.dot(c.g, c.r[k])
-        momentum += c.cross_matrix(c.r[k]) * c.v[k] * c.m[k] + spin
-    balls: dict[str, Any] = {
-        "acceleration": [_entries(a) for a in acceleration],
-        "angular_acceleration": [_entries(a) for a in angular],
-        "joint_reaction": [_entries(f) for f in F],
-        "kinetic_energy": [kinetic],
-        "potential_energy": [potential],
-        "angular_momentum": _entries(momentum),
-        "tension": [-c.dot(c.u[k], F[k]) for k in range(n)],
-        "r": [_entries(r) for r in c.r],
-        "v": [_entries(v) for v in c.v],
-    }
-    if mass_matrix:
-        balls["mass_matrix"] = _mass_matrix(c)
-    return balls | {"scale": _term_scales(c, balls)}
+    return free, turn, F
 
 
 def _mass_matrix(c: _BallChain) -> list[list[Any]]:
-    """M (nu, nu) of `StateQuantities.mass_matrix`: the velocity of centre b is Σ T_bi ν_i.
+    """M (nu, nu) of `StateQuantities.mass_matrix`, from the velocities Σ T_bi ν_i of the centres b.
 
-    T_bi is the same, c_i, for every body below i, so with μ_j the mass below j and i < j,
-    M_ij = c_iᵀ (m_j T_jj + μ_j c_j).
+    T_bi = c_i is the same for every body below i, so that with μ_j the mass below j, M_ij = c_iᵀ (m_j T_jj +
+    μ_j c_j) for i < j.
     """
     rods = [k for k in range(c.n) if c.model.rods[k]]
-    below = [sum(c.m[k + 1 :], c.arb(0)) for k in range(c.n)]
-    turn = [c.A[k] for k in range(c.n)]
-    bent = [c.cross_matrix(c.u[k]) for k in range(c.n)]
-    # per column: its body, what it gives to the centres below, and to the body's own
-    slides = [(k, bent[k] * bent[k] * -c.ell[k]) for k in rods]
-    columns = [(k, slide, slide) for k, slide in slides] + [
-        (k, (c.cross_matrix(c.sp[k]) - c.cross_matrix(c.sd[k])) * turn[k], c.cross_matrix(c.sp[k]) * turn[k])
-        for k in range(c.n)
-    ]
+    mass_below = [sum(c.m[k + 1 :], c.arb(0)) for k in range(c.n)]
+    # per column: its body, and the velocities of the centres below it and of its own centre
+    columns = []
+    for k in rods:
+        u_cross = c.cross_matrix(c.u[k])
+        swing = u_cross * u_cross * -c.ell[k]
+        columns.append((k, swing, swing))
+    for k in range(c.n):
+        sp, sd = c.cross_matrix(c.sp[k]), c.cross_matrix(c.sd[k])
+        columns.append((k, (sp - sd) * c.A[k], sp * c.A[k]))
     size = 3 * len(columns)
     M = [[c.arb(0)] * size for _ in range(size)]
-    for i, (bi, carried_i, own_i) in enumerate(columns):
-        for j, (bj, carried_j, own_j) in enumerate(columns):
+    for i, (bi, below_i, own_i) in enumerate(columns):
+        for j, (bj, below_j, own_j) in enumerate(columns):
             if bj < bi:
                 continue
-            at_j = own_i if bi == bj else carried_i
-            block = at_j.transpose() * own_j * c.m[bj] + carried_i.transpose() * carried_j * below[bj]
+            at_j = own_i if bi == bj else below_i
+            block = at_j.transpose() * own_j * c.m[bj] + below_i.transpose() * below_j * mass_below[bj]
             if i == j and i >= len(rods):
                 block = block + c.J[bi]
             for row in range(3):
@@ -269,7 +289,7 @@ def _mass_matrix(c: _BallChain) -> list[list[Any]]:
 
 
 def _term_scales(c: _BallChain, balls: dict[str, Any]) -> dict[str, float]:
-    """Sizes of each quantity's own terms: radii are compared with them, so an exact zero may come out."""
+    """Sizes of the terms of each quantity; radii are compared with them because a quantity may be zero."""
     model = c.model
     norm = np.linalg.norm
     lever = float(np.sum(norm(model.proximal, axis=1) + norm(model.distal, axis=1) + model.length))

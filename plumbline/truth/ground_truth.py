@@ -1,8 +1,8 @@
-"""What engines are measured with: the truth of a scenario, how sure it is, and how sharp it must be.
+"""The truth of a scenario, its uncertainty, and the smallest error that must be detectable.
 
-Runs inside a worker.  State level: rigorous enclosures in ball arithmetic.  Along trajectories: the closed
-form where the scenario has one, else Taylor's method in minimal coordinates; uncertain by the difference
-from a method of another kind (`plumbline.truth.trajectory`).
+Runs inside a worker.  State level: rigorous enclosures in ball arithmetic (`certified`).  Trajectories: the
+closed form where the scenario has one, else Taylor's method in minimal coordinates; the uncertainty is the
+difference from a method of another kind (`trajectory`).
 """
 
 from __future__ import annotations
@@ -23,16 +23,17 @@ from plumbline.truth.rounding_bound import RoundingBound, state_rounding_bound
 from plumbline.truth.sensitivity import perturbation_growth_and_runs, predictability_horizon
 from plumbline.truth.trajectory import MAX_COMPILED_BODIES, ClosedFormSamples, trajectory_truth
 
-RUN_ROUNDING = 1e3 * 2.0**-52  # of a whole run, before growth: trials saw at most 115 ε G (verification.md)
-TRUTHS_DIFFER = "; they part by more than rounding explains: one of the two is wrong, or at its limits"
-DETECTABLE_PARAMETER_ERROR = (
-    1e-4  # a mistake of this relative size in a parameter must be visible, or the verdict is unresolved
+RUN_ROUNDING = 1e3 * 2.0**-52  # error of a whole run over its growth G; the largest measured is 115 ε
+TRUTHS_DIFFER = (
+    "; the two methods differ by more than rounding explains: one of them is wrong, or at its limits"
 )
+# an error of this relative size in a parameter must be detectable, or the verdict is "unresolved"
+DETECTABLE_PARAMETER_ERROR = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class StateTruth:
-    """True quantities at a list of states, and the tolerance of each."""
+    """True quantities at S states, and the tolerances at each."""
 
     states: list[State]
     quantities: list[StateQuantities]
@@ -42,15 +43,15 @@ class StateTruth:
 
 @dataclass(frozen=True, eq=False)
 class MotionTruth:
-    """The true motion at the sample times, and what may be concluded from it."""
+    """The true motion at T sample times, and what a comparison with it can resolve."""
 
     trajectory: Trajectory
     position_uncertainty: Array  # (T,) m, running maximum
     attitude_uncertainty: Array  # (T,) rad, running maximum
-    growth: Array  # (T,) –: of a small perturbation, running maximum
-    detectable_position: Array  # (T,) m: the least that a mistake of one part in 10⁴ does, up to t
-    detectable_attitude: Array  # (T,) rad
-    length: float  # m: the stretched chain, the scale of rounding in positions
+    growth: Array  # (T,) of a small perturbation, running maximum
+    detectable_position: Array  # (T,) m, smallest effect up to t of a parameter that is wrong by 1e-4
+    detectable_attitude: Array  # (T,) rad, the same
+    length: float  # m, of the stretched chain: the scale of rounding in positions
     method: str
 
     @property
@@ -61,14 +62,27 @@ class MotionTruth:
 
 
 def state_truth(model: Model, states: Sequence[State]) -> StateTruth:
-    """True state quantities and their rounding bounds; certified where the truth tools are installed."""
+    """Compute true state quantities and their rounding bounds.
+
+    Args:
+        model: the mechanism.
+        states: S states on the constraint manifold.
+
+    Returns:
+        The quantities: certified where the truth tools are installed, else those of the reference in double
+        precision; ``method`` states which.
+
+    Raises:
+        CertificationFailure: the system is singular at a state, or nearly so.
+
+    """
     bounds = [state_rounding_bound(model, state) for state in states]
     try:
         certified = [certify_state(model, state, mass_matrix=True) for state in states]
     except TruthUnavailable:
-        said = load_adapter("reference").evaluate(model, states)
+        quantities = load_adapter("reference").evaluate(model, states)
         method = "the notes' direct system in double precision (truth tools are not installed)"
-        return StateTruth(list(states), said, bounds, method)
+        return StateTruth(list(states), quantities, bounds, method)
     bits = max(answer.bits for answer in certified)
     method = f"certified: enclosed in ball arithmetic of {bits} bits"
     return StateTruth(list(states), [answer.quantities for answer in certified], bounds, method)
@@ -81,31 +95,49 @@ def motion_truth(
     closed_form: ClosedFormSamples | None,
     max_compiled_bodies: int = MAX_COMPILED_BODIES,
 ) -> MotionTruth:
-    """True motion from ``state`` at ``times``; ``exact`` is a closed form's (r, p, source), if any.
+    """Compute the true motion, the growth of perturbations and the effects of small parameter errors.
 
-    Taylor's method is asked of up to ``compiled`` bodies: of none by 0, for where it brought a worker down.
+    Args:
+        model: the mechanism.
+        state: initial state.
+        times: (T,) [s] of the samples, times[0] = 0.
+        closed_form: samples of a closed form at ``times``, if the scenario has one.
+        max_compiled_bodies: longest chain for Taylor's method; 0 after it has crashed a worker.
+
+    Returns:
+        The motion with all that `MotionTruth` holds.
+
+    Raises:
+        EngineFailure: the integrator of the notes' form stops early.
+
     """
-    found = trajectory_truth(model, state, times, closed_form, max_compiled_bodies)
-    grown, r, p = perturbation_growth_and_runs(model, state, times, perturbed_models(model, state))
-    grown, length = np.maximum.accumulate(grown), float(np.sum(stretched_length(model)))
-    apart = (found.position_uncertainty > length * RUN_ROUNDING * grown) | (
-        found.attitude_uncertainty > 2 * RUN_ROUNDING * grown
+    truth = trajectory_truth(model, state, times, closed_form, max_compiled_bodies)
+    growth, r, p = perturbation_growth_and_runs(model, state, times, perturbed_models(model, state))
+    growth, length = np.maximum.accumulate(growth), float(np.sum(stretched_length(model)))
+    differ = (truth.position_uncertainty > length * RUN_ROUNDING * growth) | (
+        truth.attitude_uncertainty > 2 * RUN_ROUNDING * growth
     )
     return MotionTruth(
-        found.trajectory,
-        found.position_uncertainty,
-        found.attitude_uncertainty,
-        grown,
+        truth.trajectory,
+        truth.position_uncertainty,
+        truth.attitude_uncertainty,
+        growth,
         *detectable_effect(model, r, p),
         length=length,
-        method=found.method + (TRUTHS_DIFFER if apart.any() else ""),
+        method=truth.method + (TRUTHS_DIFFER if differ.any() else ""),
     )
 
 
 def stretched_length(model: Model) -> Array:
-    """(N,) m: from where body k hangs to where the next one does, stretched; at least to its centre.
+    """Measure how far each body and its rod extend the stretched chain.
 
-    And at least the body's radius of gyration: a body that hangs at its centre of mass has a size too.
+    Args:
+        model: the mechanism.
+
+    Returns:
+        (N,) [m] rod length plus the largest of: distance from the proximal to the distal point, distance from
+        the proximal point to the centre of mass, radius of gyration.
+
     """
     span = np.linalg.norm(model.proximal - model.distal, axis=1)
     span[-1] = 0.0
@@ -115,32 +147,50 @@ def stretched_length(model: Model) -> Array:
 
 
 def perturbed_models(model: Model, state: State) -> list[tuple[Model, State]]:
-    """The model with mistakes of one part in 10⁴, and the same minimal state lifted onto each of them.
+    """Create models with parameter errors of one part in 10⁴.
 
-    Gravity, the masses, the inertias, the attachments are wrong in turn, each entry by ±1e-4 of itself with
-    random signs.
+    Gravity, the masses, the inertias and the attachment points are changed in turn, each entry by ±1e-4 of
+    itself with random signs (gravity as a whole).
+
+    Args:
+        model: the mechanism.
+        state: its initial state.
+
+    Returns:
+        Four models, each with the state of the same minimal coordinates.
+
     """
     rng = np.random.default_rng(derive_seed("visible"))
 
-    def off(x: Array) -> Array:
+    def perturbed(x: Array) -> Array:
         return np.asarray(x * (1 + DETECTABLE_PARAMETER_ERROR * rng.choice([-1.0, 1.0], size=x.shape)))
 
-    entries = off(np.ones((model.n, 3, 3)))
-    lopsided = model.inertia * (entries + entries.mT) / 2  # scaled as a whole a free body would not show it
+    factors = perturbed(
+        np.ones((model.n, 3, 3))
+    )  # entry by entry: a common factor does not affect a free body
     models = [
         replace(model, gravity=model.gravity * (1 + DETECTABLE_PARAMETER_ERROR)),
-        replace(model, mass=off(model.mass)),
-        replace(model, inertia=lopsided),
-        replace(model, proximal=off(model.proximal), distal=off(model.distal)),
+        replace(model, mass=perturbed(model.mass)),
+        replace(model, inertia=model.inertia * (factors + factors.mT) / 2),
+        replace(model, proximal=perturbed(model.proximal), distal=perturbed(model.distal)),
     ]
     return [(m, state_from_minimal(m, state.p, state.omega, state.u, state.udot)) for m in models]
 
 
 def detectable_effect(model: Model, r: Array, p: Array) -> tuple[Array, Array]:
-    """Least effects (T,) m and rad, up to each time, of mistakes: r and p of the right motion, then theirs.
+    """Measure the smallest effect of the parameter errors on positions and attitudes.
 
-    Mistakes that no motion of this scenario shows (mass of a single body, anything of a body at rest) do not
-    count.
+    Errors without effect in this scenario (the mass of a single body, any parameter of a body at rest) are
+    ignored.
+
+    Args:
+        model: the mechanism.
+        r: (1 + K, T, N, 3) [m] positions of the true motion, then of K perturbed models.
+        p: (1 + K, T, N, 4) attitudes of the same motions.
+
+    Returns:
+        Effects (T,) [m] and (T,) [rad], running maxima.
+
     """
     scale = DETECTABLE_PARAMETER_ERROR * float(np.sum(stretched_length(model)))
     return (
@@ -152,8 +202,15 @@ def detectable_effect(model: Model, r: Array, p: Array) -> tuple[Array, Array]:
 
 
 def least_detectable_effect(effects: Sequence[Array], threshold: float) -> Array:
-    """(T,) running maximum of the smallest effect that passes the threshold at all; inf if none does."""
-    seen = [np.maximum.accumulate(e) for e in effects if np.max(e) > threshold]
-    if not seen:
-        return np.full(len(effects[0]), np.inf)
-    return np.asarray(np.min(seen, axis=0))
+    """Take the smallest of several effects, without those that stay below a threshold.
+
+    Args:
+        effects: arrays (T,) in one unit.
+        threshold: effects that never exceed it are ignored.
+
+    Returns:
+        (T,) smallest running maximum; infinite where all effects are ignored.
+
+    """
+    visible = [np.maximum.accumulate(e) for e in effects if np.max(e) > threshold]
+    return np.asarray(np.min(visible, axis=0)) if visible else np.full(len(effects[0]), np.inf)

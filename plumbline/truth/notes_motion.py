@@ -1,4 +1,4 @@
-"""A motion by the reference's structured form: the notes' side of the truth."""
+"""Motions by the notes' equations in the reference's structured form, for comparison with other methods."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 
 from plumbline.model.datatypes import Array, EngineFailure, Model, State, Trajectory
 from plumbline.model.kinematics import quaternion_rate
-from reference_impl import collocation
+from reference_impl.collocation import integrate_collocation
 from reference_impl.structured import StructuredSystem
 
 NotesIntegrator = Literal["collocation", "dop853"]
@@ -18,36 +18,52 @@ NotesIntegrator = Literal["collocation", "dop853"]
 def simulate_notes_form(
     model: Model, state: State, times: Array, rtol: float, method: NotesIntegrator = "collocation"
 ) -> Trajectory:
-    """The motion at ``times`` from ``state``: on the manifold by collocation, or the raw form (N6) by DOP853.
+    """Integrate the notes' equations, by collocation on the manifold or in the raw form (N6) by DOP853.
 
-    Held on the manifold it is 2e-14 m from the truth after 2 s on thirty balls and 5e-14 m on fifty, where
-    the raw form drifts by 7e-13 m and 2e-12 m at any tolerance.
-    Raises EngineFailure where the integrator stops early.
+    After 2 s, the motion on the manifold differs from the truth by 2e-14 m on thirty ball joints and 5e-14 m
+    on fifty, the raw form by 7e-13 m and 2e-12 m at any tolerance, because it drifts.
+
+    Args:
+        model: the mechanism.
+        state: initial state.
+        times: (T,) [s] of the samples, times[0] = 0.
+        rtol: relative tolerance.
+        method: the integrator.
+
+    Returns:
+        The motion at ``times``.
+
+    Raises:
+        EngineFailure: the integrator stops early.
+
     """
-    forest = StructuredSystem([model])
+    system = StructuredSystem([model])
     start = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
     try:
-        if method == "collocation":
-            run = collocation.integrate_collocation(forest, *start, times, rtol, project=True)
-            return Trajectory(times, run.r, run.p, run.v, run.pdot, run.steps)
-        return simulate_dop853(forest, start, times, rtol)
+        if method == "dop853":
+            return _simulate_dop853(system, start, times, rtol)
+        run = integrate_collocation(system, *start, times, rtol, project=True)
+        return Trajectory(times, run.r, run.p, run.v, run.pdot, run.steps)
     except ArithmeticError as error:
         raise EngineFailure(str(error)) from None
 
 
-def simulate_dop853(
-    forest: StructuredSystem, start: tuple[Array, Array, Array, Array], times: Array, rtol: float
+def _simulate_dop853(
+    system: StructuredSystem, start: tuple[Array, Array, Array, Array], times: Array, rtol: float
 ) -> Trajectory:
-    """The same motion by DOP853; absolute tolerances are ``rtol`` of 1 m, 1, 1 m/s and 1 1/s."""
-    size = forest.body_count
+    """The raw form by DOP853, with absolute tolerances of ``rtol`` times 1 m, 1, 1 m/s and 1 1/s.
 
-    def slope(_: float, y: Array) -> Array:
-        half = y.reshape(14, size)
-        return np.concatenate([half[7:], forest.acceleration(half[:7], half[7:])]).ravel()
+    `reference_impl.integrate` scales them with the motion, which is too coarse for a truth.
+    """
+    n = system.body_count
+
+    def rate(_: float, y: Array) -> Array:
+        q, v = np.split(y.reshape(14, n), 2)
+        return np.concatenate([v, system.acceleration(q, v)]).ravel()
 
     first = np.concatenate(start, axis=1).T.ravel()
-    found = solve_ivp(slope, (0.0, times[-1]), first, "DOP853", times, rtol=rtol, atol=rtol)
-    if not found.success:
-        raise ArithmeticError(f"DOP853 stopped at t = {found.t[-1]} s: {found.message}")
-    y = np.moveaxis(found.y.reshape(14, size, len(times)), (0, 1, 2), (2, 1, 0))  # (T, M, 14)
-    return Trajectory(times, y[..., :3], y[..., 3:7], y[..., 7:10], y[..., 10:], int(found.nfev) // 12)
+    run = solve_ivp(rate, (0.0, times[-1]), first, "DOP853", times, rtol=rtol, atol=rtol)
+    if not run.success:
+        raise ArithmeticError(f"DOP853 stopped at t = {run.t[-1]} s: {run.message}")
+    y = np.moveaxis(run.y.reshape(14, n, len(times)), (0, 1, 2), (2, 1, 0))  # (T, N, 14)
+    return Trajectory(times, y[..., :3], y[..., 3:7], y[..., 7:10], y[..., 10:], int(run.nfev) // 12)

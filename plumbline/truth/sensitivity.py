@@ -1,8 +1,8 @@
 """How a small perturbation of a motion grows, and until when its positions can be compared.
 
-Twin runs in several random directions tangent to the manifold (of the minimal coordinates), all in one
-batch; a twin that has moved away ten thousandfold is brought back to the size it began with (Benettin), so
-that G stays the growth of a small perturbation however large it gets.
+The motion and several neighbours, perturbed in random directions of the minimal coordinates, are integrated
+in one batch.  A neighbour whose distance has grown ten thousandfold is moved back to its initial distance
+(Benettin's method), so that G remains the growth of a small perturbation however large it becomes.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from plumbline.model.kinematics import (
     quaternion_conjugate,
     quaternion_product,
     quaternion_rate,
+    rotate_vectors,
     rotation_matrix,
     state_from_minimal,
 )
@@ -26,13 +27,12 @@ from plumbline.model.sampling import derive_seed
 from reference_impl.collocation import integrate_collocation
 from reference_impl.structured import StructuredSystem
 
-PERTURBATION_SIZE = (
-    1e-7  # size of a perturbation: of each angle in rad, of each rate relative to the motion's own
+PERTURBATION_SIZE = 1e-7  # of each angle [rad], of each rate relative to the largest rate of the motion
+PERTURBATION_COUNT = 4  # random directions
+RENORMALISATION_GROWTH = (
+    1e4  # growth after which a neighbour is moved back, while its distance is still small
 )
-PERTURBATION_COUNT = 4  # directions tried
-RENORMALISATION_GROWTH = 1e4  # growth after which a twin is brought back, well before it stops being small
-RTOL = 1e-10  # common steps: the error of the base and of the twins is nearly the same
-
+RTOL = 1e-10  # the steps are common, so that motion and neighbours have nearly the same error
 
 HORIZON_TOLERANCE = 1e-9  # m: positions are compared while the error to be expected stays below this
 
@@ -66,10 +66,19 @@ def predictability_horizon(
 
 
 def perturbation_growth(model: Model, state: State, times: Array) -> Array:
-    """G (T,), at least 1: how much the worst of several twins has moved away, over the perturbation.
+    """Compute the growth G of small perturbations of a motion.
 
-    Distances are in units of the perturbation: of positions over size × the largest distance from the
-    pivot, of attitudes over the size itself, whichever is larger.
+    Distances are in units of the perturbation: of positions over size × the largest distance from the pivot,
+    of attitudes over the size itself, whichever is larger.
+
+    Args:
+        model: the mechanism.
+        state: initial state.
+        times: (T,) [s] of the samples.
+
+    Returns:
+        (T,) largest growth over all perturbations, at least 1.
+
     """
     return perturbation_growth_and_runs(model, state, times, [])[0]
 
@@ -77,60 +86,75 @@ def perturbation_growth(model: Model, state: State, times: Array) -> Array:
 def perturbation_growth_and_runs(
     model: Model, state: State, times: Array, other_models: Sequence[tuple[Model, State]]
 ) -> tuple[Array, Array, Array]:
-    """G (T,), and r, p (1 + others, T, N, ·) of the model and ``others``, as many bodies, in common steps."""
-    forest = StructuredSystem([model] * (PERTURBATION_COUNT + 1) + [m for m, _ in other_models])
+    """Compute the growth of small perturbations, and motions of other models in the same batch.
+
+    Args:
+        model: the mechanism.
+        state: initial state.
+        times: (T,) [s] of the samples.
+        other_models: K models of as many bodies, with their initial states.
+
+    Returns:
+        The growth (T,) of `perturbation_growth`, and of the unperturbed motion and the K others the positions
+        r (1 + K, T, N, 3) [m] and attitudes p (1 + K, T, N, 4).
+
+    """
+    neighbours = range(1, PERTURBATION_COUNT + 1)
+    system = StructuredSystem([model] * (PERTURBATION_COUNT + 1) + [m for m, _ in other_models])
     states = [state, *perturbed_states(model, state), *(s for _, s in other_models)]
-    size, grown = np.full(PERTURBATION_COUNT, PERTURBATION_SIZE), np.empty((PERTURBATION_COUNT, len(times)))
-    scale, done, arm = np.ones(PERTURBATION_COUNT), 0, 1e-3
-    r, p, v, pdot = _integrate_batch(forest, states, times)
-    shown = [0, *range(PERTURBATION_COUNT + 1, len(states))]
-    beside = r[shown], p[shown]
+    r, p, v, pdot = _integrate_batch(system, states, times)
+    unperturbed = [0, *range(PERTURBATION_COUNT + 1, len(states))]
+    runs = r[unperturbed], p[unperturbed]
+    if other_models:
+        system = StructuredSystem([model]).repeated(PERTURBATION_COUNT + 1)
+    size, growth = np.full(PERTURBATION_COUNT, PERTURBATION_SIZE), np.empty((PERTURBATION_COUNT, len(times)))
+    earlier_growth, done, arm = np.ones(PERTURBATION_COUNT), 0, 1e-3
     while True:
         arm = max(arm, float(np.max(np.linalg.norm(r[0], axis=-1))))
-        away = np.array(
-            [
-                np.maximum(position_error(r[k], r[0]) / arm, attitude_error(p[k], p[0]))
-                for k in range(1, PERTURBATION_COUNT + 1)
-            ]
+        distance = np.array(
+            [np.maximum(position_error(r[k], r[0]) / arm, attitude_error(p[k], p[0])) for k in neighbours]
         )
-        grown[:, done : done + away.shape[1]] = scale[:, None] * away / size[:, None]
-        far = np.flatnonzero(np.any(away > RENORMALISATION_GROWTH * PERTURBATION_SIZE, axis=0))
-        stop = max(int(far[0]), 1) if len(far) else away.shape[1] - 1
+        growth[:, done : done + distance.shape[1]] = earlier_growth[:, None] * distance / size[:, None]
+        far = np.flatnonzero(np.any(distance > RENORMALISATION_GROWTH * PERTURBATION_SIZE, axis=0))
+        stop = max(int(far[0]), 1) if len(far) else distance.shape[1] - 1
         if done + stop >= len(times) - 1:
-            break
-        base, *close = (
+            return np.asarray(np.maximum(np.max(growth, axis=0), 1.0)), *runs
+        base, *moved = (
             _project_to_manifold(model, r[k, stop], p[k, stop], v[k, stop], pdot[k, stop])
-            for k in range(PERTURBATION_COUNT + 1)
+            for k in (0, *neighbours)
         )
-        size = np.minimum(away[:, stop], PERTURBATION_SIZE)
-        scale = scale * away[:, stop] / size
-        near = [
-            _interpolate_states(model, base, twin, part)
-            for twin, part in zip(close, size / away[:, stop], strict=True)
-        ]
+        size = np.minimum(distance[:, stop], PERTURBATION_SIZE)
+        earlier_growth = earlier_growth * distance[:, stop] / size
+        parts = size / distance[:, stop]
+        near = [_interpolate_states(model, base, x, part) for x, part in zip(moved, parts, strict=True)]
         done += stop
-        if other_models:
-            forest, other_models = (
-                StructuredSystem([model]).repeated(PERTURBATION_COUNT + 1),
-                [],
-            )
-        r, p, v, pdot = _integrate_batch(forest, [base, *near], times[done : done + 2 * stop + 1])
-    return np.asarray(np.maximum(np.max(grown, axis=0), 1.0)), *beside
+        r, p, v, pdot = _integrate_batch(system, [base, *near], times[done : done + 2 * stop + 1])
 
 
 def perturbed_states(
     model: Model, state: State, perturbation_size: float = PERTURBATION_SIZE, count: int = PERTURBATION_COUNT
 ) -> list[State]:
-    """Neighbours of ``state`` on the manifold: attitudes, directions and rates turned by ``size`` rad."""
+    """Create neighbours of a state on the constraint manifold, with normally distributed perturbations.
+
+    Args:
+        model: the mechanism.
+        state: the state to perturb.
+        perturbation_size: standard deviation of each angle [rad], and of each rate relative to the largest
+            rate of the state (or 1 rad/s).
+        count: number of neighbours.
+
+    Returns:
+        The neighbours, always the same for the same arguments.
+
+    """
     rng = np.random.default_rng(derive_seed("twins"))
+    fastest = max(float(np.max(np.abs(state.omega))), float(np.max(np.abs(state.udot))), 1.0)
     found = []
     for _ in range(count):
         turn = perturbation_size * rng.normal(size=(model.n, 3)) / 2
         quaternion = np.concatenate([np.ones((model.n, 1)), turn], axis=1)
         p = quaternion_product(state.p, quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True))
-        spread = perturbation_size * max(
-            float(np.max(np.abs(state.omega))), float(np.max(np.abs(state.udot))), 1.0
-        )
+        spread = perturbation_size * fastest
         omega = state.omega + spread * rng.normal(size=(model.n, 3))
         u = state.u + np.cross(perturbation_size * rng.normal(size=(model.n, 3)), state.u)
         udot = state.udot + np.cross(spread * rng.normal(size=(model.n, 3)), state.u)
@@ -139,40 +163,40 @@ def perturbed_states(
 
 
 def _integrate_batch(
-    forest: StructuredSystem, states: list[State], times: Array
+    system: StructuredSystem, states: list[State], times: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """r, p, ṙ, ṗ (runs, T, N, ·) of a batch of states of one model, from times[0]."""
+    """r, p, ṙ, ṗ (runs, T, N, ·) of a batch of chains of as many bodies, from times[0]."""
     r, p, v = (np.concatenate([getattr(state, name) for state in states]) for name in ("r", "p", "v"))
     pdot = np.concatenate([quaternion_rate(state.p, state.omega) for state in states])
-    run = integrate_collocation(forest, r, p, v, pdot, times, RTOL)
+    run = integrate_collocation(system, r, p, v, pdot, times, RTOL)
     parts = (np.split(x, len(states), axis=1) for x in (run.r, run.p, run.v, run.pdot))
     r_, p_, v_, pdot_ = (np.array(part) for part in parts)
     return r_, p_, v_, pdot_
 
 
 def _project_to_manifold(model: Model, r: Array, p: Array, v: Array, pdot: Array) -> State:
-    """The state on the manifold that a raw one, (N, ·) each, stands for."""
+    """The state on the manifold with the minimal coordinates of an integrated one, (N, ·) each."""
     p = p / np.linalg.norm(p, axis=1, keepdims=True)
     omega = angular_velocity(p, pdot)
     A = rotation_matrix(p)
-    ends = [(A @ np.cross(omega, points)[..., None])[..., 0] + v for points in (model.proximal, model.distal)]
-    gap_rate = ends[0] - np.concatenate([np.zeros((1, 3)), ends[1][:-1]])
+    near, far = (v + rotate_vectors(A, np.cross(omega, s)) for s in (model.proximal, model.distal))
+    gap_rate = near - np.concatenate([np.zeros((1, 3)), far[:-1]])
     ell = np.where(model.rods, model.length, np.inf)[:, None]
     return _make_state(model, p, omega, joint_vectors(model, r, p) / ell, gap_rate / ell)
 
 
-def _interpolate_states(model: Model, base: State, twin: State, part: float) -> State:
-    """The state that lies ``part`` of the way from ``base`` to its neighbour ``twin``."""
-    turn = quaternion_product(quaternion_conjugate(base.p), twin.p)
+def _interpolate_states(model: Model, base: State, other: State, part: float) -> State:
+    """The state at the fraction ``part`` of the way from ``base`` to a close ``other``."""
+    turn = quaternion_product(quaternion_conjugate(base.p), other.p)
     turn = turn * np.where(turn[:, :1] < 0, -1.0, 1.0)
     turn[:, 1:] *= part
     turn[:, 0] = np.sqrt(1 - np.sum(turn[:, 1:] ** 2, 1))
-    mixed = (getattr(base, x) + part * (getattr(twin, x) - getattr(base, x)) for x in ("omega", "u", "udot"))
+    mixed = (getattr(base, x) + part * (getattr(other, x) - getattr(base, x)) for x in ("omega", "u", "udot"))
     return _make_state(model, quaternion_product(base.p, turn), *mixed)
 
 
 def _make_state(model: Model, p: Array, omega: Array, u: Array, udot: Array) -> State:
-    """The lifted state of coordinates that may be off their unit spheres; u and u̇ only where rods are."""
+    """The state of coordinates that may be off their unit spheres; u and u̇ are 0 for ball joints."""
     rods = model.rods[:, None]
     u = np.where(rods, u / np.maximum(np.linalg.norm(u, axis=1, keepdims=True), np.finfo(float).tiny), 0.0)
     udot = np.where(rods, udot - np.sum(udot * u, axis=1, keepdims=True) * u, 0.0)

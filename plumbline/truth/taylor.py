@@ -226,7 +226,9 @@ def _free_accelerations(
 ) -> tuple[list[Any], list[Any], list[Any]]:
     """Without joint forces: ω̇′ (body frame), accelerations of proximal and distal points (world frame)."""
     gravity = _vector(hy.par[i] for i in range(3))
-    turn, near_a, far_a = [], [], []
+    turn: list[Any] = []
+    near_a: list[Any] = []
+    far_a: list[Any] = []
     v = _vector([hy.expression(0.0)] * 3)
     for body, rod in zip(bodies, rods, strict=True):
         moment = body.moment - np.cross(body.w, body.J @ body.w)

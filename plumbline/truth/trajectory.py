@@ -1,9 +1,9 @@
-"""Truth along a trajectory, with an uncertainty that is earned by two methods that share nothing.
+"""Truth along a trajectory; its uncertainty is the difference of two methods that share no equation.
 
-Heyoka's Taylor method in minimal coordinates, and the notes' form on its manifold by the reference's
-collocation: other equations, other coordinates, another integrator.  What they differ by is the
-uncertainty.  It is the second's rounding: in extended precision the first is better by far, as quad precision
-says, which is its yardstick (tests).
+The first is heyoka's Taylor method in minimal coordinates (`taylor`), the second the notes' equations on the
+constraint manifold by collocation (`notes_motion`): other equations, other coordinates, another integrator.
+Their difference is the rounding of the second: in extended precision the first is far more accurate, as a
+comparison with quad precision shows (tests).
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from plumbline.truth.notes_motion import simulate_notes_form
 from plumbline.truth.taylor import Precision, simulate_taylor
 
 NOTES_RTOL = 1e-13  # of the notes' form: at 1e-14 it is no closer to extended precision, the rest is rounding
-MAX_EXTENDED_PRECISION_BODIES = (
-    5  # bodies: 2 s of ten take 2.0 s in extended precision, 0.6 s in double; fifty 14 s and 4 s
-)
-MAX_COMPILED_BODIES = 50  # bodies: 2 s to compile fifty
-ClosedFormSamples = tuple[Array, Array, str]  # a closed form's r (T, N, 3) m, p (T, N, 4), and its source
+# 2 s of ten bodies take 2.0 s in extended precision, 0.6 s in double; of fifty 14 s and 4 s
+MAX_EXTENDED_PRECISION_BODIES = 5
+MAX_COMPILED_BODIES = 50  # the equations of fifty bodies take 2 s to compile
+NOTES_METHOD = "the notes' form by collocation"
+ClosedFormSamples = tuple[Array, Array, str]  # r (T, N, 3) m and p (T, N, 4) of a closed form, and its source
 
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryTruth:
-    """The motion, and by how much it may be off: running maxima (T,) over bodies, m and rad."""
+    """The true motion and its uncertainty."""
 
     trajectory: Trajectory
-    position_uncertainty: Array
-    attitude_uncertainty: Array
-    method: str
+    position_uncertainty: Array  # (T,) m, largest of any body up to each time
+    attitude_uncertainty: Array  # (T,) rad, largest of any body up to each time
+    method: str  # the two methods, in words
 
 
 def trajectory_truth(
@@ -44,44 +44,54 @@ def trajectory_truth(
     closed_form: ClosedFormSamples | None = None,
     max_compiled_bodies: int = MAX_COMPILED_BODIES,
 ) -> TrajectoryTruth:
-    """The motion from ``state`` at ``times`` (T,) s, times[0] = 0; r and p are those of ``exact`` if given.
+    """Compute the motion by two methods.
 
-    Without heyoka, where it fails and for more than ``compiled`` bodies, DOP853 on the notes' form stands in:
-    another integrator but the same equations, and the method says so and why.
-    Raises EngineFailure where the notes' form stops early.
+    Where heyoka is missing, fails, or the chain has more than ``max_compiled_bodies``, DOP853 on the notes'
+    equations takes its place: another integrator but the same equations, and ``method`` states that.
+
+    Args:
+        model: the mechanism.
+        state: initial state.
+        times: (T,) [s] of the samples, times[0] = 0.
+        closed_form: samples of a closed form at ``times``; they replace r and p of the result.
+        max_compiled_bodies: longest chain that heyoka compiles; 0 to avoid heyoka.
+
+    Returns:
+        The motion and the differences between the two methods.
+
+    Raises:
+        EngineFailure: the integrator of the notes' form stops early.
+
     """
+    failure = ""
     try:
-        run, method = simulate_minimal_coordinates(model, state, times, max_compiled_bodies)
-    except Exception as error:  # whatever befell heyoka, the truth is not lost for it
-        run, method = simulate_notes_form(model, state, times, NOTES_RTOL), "the notes' form by collocation"
-        if closed_form is None:
-            other = simulate_notes_form(model, state, times, NOTES_RTOL, "dop853")
-            why = error if isinstance(error, TruthUnavailable) else f"{type(error).__name__}: {error}"
-            against = f"the same by DOP853, no Taylor series: {why}"
-    else:
-        if closed_form is None:
-            other, against = (
-                simulate_notes_form(model, state, times, NOTES_RTOL),
-                "the notes' form by collocation",
-            )
+        run, method = _simulate_minimal_coordinates(model, state, times, max_compiled_bodies)
+    except Exception as error:  # whatever fails in heyoka, the notes' form remains
+        run, method = simulate_notes_form(model, state, times, NOTES_RTOL), NOTES_METHOD
+        failure = str(error) if isinstance(error, TruthUnavailable) else f"{type(error).__name__}: {error}"
     if closed_form is not None:
         r, p, source = closed_form
-        other, against, method = run, method, f"closed form: {source}"
+        other, other_method, method = run, method, f"closed form: {source}"
         run = replace(run, r=r, p=p)
+    elif failure:
+        other = simulate_notes_form(model, state, times, NOTES_RTOL, "dop853")
+        other_method = f"the same by DOP853, no Taylor series: {failure}"
+    else:
+        other, other_method = simulate_notes_form(model, state, times, NOTES_RTOL), NOTES_METHOD
     return TrajectoryTruth(
         run,
         np.maximum.accumulate(position_error(run.r, other.r)),
         np.maximum.accumulate(attitude_error(run.p, other.p)),
-        f"{method}; uncertainty: its difference from {against}",
+        f"{method}; uncertainty: its difference from {other_method}",
     )
 
 
-def simulate_minimal_coordinates(
+def _simulate_minimal_coordinates(
     model: Model, state: State, times: Array, max_compiled_bodies: int
 ) -> tuple[Trajectory, str]:
-    """The motion by Taylor's method in minimal coordinates, and what to call that."""
+    """The motion by Taylor's method in minimal coordinates, and the name of the method."""
     if model.n > max_compiled_bodies:
-        raise TruthUnavailable(f"not asked of more than {max_compiled_bodies} bodies")
+        raise TruthUnavailable(f"not used for more than {max_compiled_bodies} bodies")
     precision: Precision = "extended" if model.n <= MAX_EXTENDED_PRECISION_BODIES else "double"
     found = simulate_taylor(model, state, times, precision)
     r, p, v, omega = (np.asarray(getattr(found, name), float) for name in ("r", "p", "v", "omega"))

@@ -176,7 +176,7 @@ def test_taylors_method_is_asked_of_so_many_bodies_only() -> None:
     found = motion_truth(
         model, pendulums.state(model, seed=2, rate=0.5), TIMES[:3], None, max_compiled_bodies=0
     )
-    assert "not asked of more than 0 bodies" in found.method
+    assert "not used for more than 0 bodies" in found.method
 
 
 def test_a_closed_form_is_taken_for_the_motion() -> None:

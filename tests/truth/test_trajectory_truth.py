@@ -168,7 +168,7 @@ def check_fall_back(why, **arguments):
 
 
 def test_long_chains_say_that_the_equations_are_the_same():
-    check_fall_back("not asked of more than 1 bodies", max_compiled_bodies=1)
+    check_fall_back("not used for more than 1 bodies", max_compiled_bodies=1)
 
 
 def test_without_heyoka_dop853_stands_in(monkeypatch):
