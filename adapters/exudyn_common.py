@@ -28,7 +28,12 @@ class ExudynAdapter(MetamorphicHooks):
     supported_versions = ">=1.9,<2"
 
     def version(self) -> str:
-        """Return the version of the Exudyn that is loaded."""
+        """Return the version of the Exudyn that is loaded.
+
+        Returns:
+            As Exudyn reports it.
+
+        """
         return _version()
 
 
@@ -94,9 +99,9 @@ def initialized_solver(solver: Any, mbs: Any, settings: Any) -> Iterator[None]:
     """Initialise a solver for a single evaluation, and finalise it at the end.
 
     Args:
-        solver: the solver.
+        solver: one of Exudyn's main solvers, not initialised.
         mbs: the assembled system.
-        settings: its settings.
+        settings: the simulation settings to initialise it with.
 
     Yields:
         Nothing.
@@ -247,7 +252,7 @@ def _write_no_files(settings: Any) -> None:
 
 
 def make_rigid_body(node: Any, mass: float, J: Array) -> Any:
-    """Make a rigid body.
+    """Describe a body with six degrees of freedom to Exudyn.
 
     Args:
         node: the node that holds its coordinates.
@@ -269,7 +274,7 @@ def kinetic_energy(mbs: Any, bodies: list[Any], quadratic_form: float) -> float:
 
     Args:
         mbs: the assembled system.
-        bodies: the bodies.
+        bodies: object numbers of rigid bodies in it.
         quadratic_form: ½ q̇ᵀ M q̇ [J] with the engine's mass matrix, for versions before 1.12, in which
             bodies have no such output.
 

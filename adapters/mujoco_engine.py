@@ -79,7 +79,12 @@ class Mujoco(MetamorphicHooks):
     welding_unsupported_reason = ""
 
     def version(self) -> str:
-        """Return the version of the loaded library."""
+        """Return the version of the loaded library.
+
+        Returns:
+            As MuJoCo reports it.
+
+        """
         return str(mujoco.mj_versionString())
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:

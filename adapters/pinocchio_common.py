@@ -25,7 +25,12 @@ class PinocchioAdapter(MetamorphicHooks):
     welding_unsupported_reason = ""
 
     def version(self) -> str:
-        """Return the version of the pin wheel."""
+        """Return the version of the pin wheel.
+
+        Returns:
+            As Pinocchio reports it.
+
+        """
         return str(pin.__version__)
 
 
@@ -78,8 +83,8 @@ def point_acceleration(pin_model: pin.Model, data: pin.Data, frame: int) -> Arra
     """Read the acceleration of a frame's origin from the last forward kinematics.
 
     Args:
-        pin_model: the model.
-        data: its data, with frame placements up to date.
+        pin_model: Pinocchio's description of the mechanism.
+        data: the workspace made for it, with frame placements up to date.
         frame: index of the frame.
 
     Returns:
@@ -93,8 +98,8 @@ def energies_and_momentum(pin_model: pin.Model, data: pin.Data, q: Array, v: Arr
     """Evaluate the quantities of the whole mechanism.
 
     Args:
-        pin_model: the model.
-        data: its data.
+        pin_model: Pinocchio's description of the mechanism.
+        data: the workspace made for it.
         q: configuration, in Pinocchio's convention.
         v: velocity, in Pinocchio's convention.
 
@@ -120,8 +125,8 @@ def init_constraint_dynamics(pin_model: pin.Model, data: pin.Data, contacts: Any
     """Allocate what `constraintDynamics` needs.
 
     Args:
-        pin_model: the model.
-        data: its data.
+        pin_model: Pinocchio's description of the mechanism.
+        data: the workspace made for it.
         contacts: the constraint models.
         contact_data: their data, which version 3 does not take.
 

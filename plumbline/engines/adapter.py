@@ -77,7 +77,12 @@ class Adapter(ABC):
 
     @abstractmethod
     def version(self) -> str:
-        """Return the version of the engine that is loaded."""
+        """Return the version of the engine that is loaded.
+
+        Returns:
+            A PEP 440 version, as the engine itself reports it.
+
+        """
 
     @abstractmethod
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:

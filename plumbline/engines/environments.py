@@ -1,7 +1,7 @@
 """Other versions of an engine: `mujoco@3.12.0`, `@latest`, `@pre`, `mujoco@path/to.whl`.
 
-Each version lives in an environment of its own, made once by uv in the user's cache and then used as it
-is.  An environment appears by one rename, so that one that is there is whole.
+Each version lives in its own environment, which uv makes once in the user's cache.  The environment is built
+in a temporary folder and renamed, so that an existing one is complete.
 """
 
 from __future__ import annotations
@@ -26,27 +26,43 @@ from plumbline.processes.errors import PlumblineError
 from plumbline.processes.isolation import ScratchFolder
 
 ROOT = Path(__file__).resolve().parents[2]
-BASE_REQUIREMENTS = ("numpy", "scipy", "packaging")  # what adapters and the worker's side of the core import
+BASE_REQUIREMENTS = ("numpy", "scipy", "packaging")  # imported by adapters and by the core in workers
 INSTALL_TIMEOUT = 900  # s for uv to fetch and install
 
 
 class EnvironmentUnavailable(PlumblineError):
-    """The version cannot be had here; the message says why."""
+    """The environment of a version cannot be made here; the message is the reason."""
 
 
 def split_version(name: str) -> tuple[str, str]:
-    """``mujoco@3.12.0`` → ("mujoco", "3.12.0"); the version is empty where none is named."""
+    """Split ``mujoco@3.12.0`` into ("mujoco", "3.12.0").
+
+    Args:
+        name: an engine as typed on the command line, with or without a version.
+
+    Returns:
+        The name in the registry, and the version; empty where none is given.
+
+    """
     base, _, version = name.partition("@")
     return base, version
 
 
 def version_problem(name: str) -> str | None:
-    """What is wrong with the version part of a name, in a sentence, before anything is fetched."""
+    """Check the version part of a name before anything is downloaded.
+
+    Args:
+        name: an engine as typed on the command line.
+
+    Returns:
+        A sentence about what is wrong, or None.
+
+    """
     base, version = split_version(name)
     if "@" not in name or version in ("latest", "pre"):
         return None
     if version.endswith(".whl"):
-        return wheel_problem(Path(version), declared_attribute(base, "package"))
+        return _wheel_problem(Path(version), declared_attribute(base, "package"))
     try:
         Version(version)
     except InvalidVersion:
@@ -54,8 +70,8 @@ def version_problem(name: str) -> str | None:
     return None
 
 
-def wheel_problem(path: Path, package: str) -> str | None:
-    """What is wrong with a wheel of ``package``, as far as its name and its outside show it."""
+def _wheel_problem(path: Path, package: str) -> str | None:
+    """Return what is wrong with a wheel of ``package``, judged by its file name and file type."""
     try:
         found, *_ = parse_wheel_filename(path.name)
     except InvalidWheelFilename as error:
@@ -109,47 +125,55 @@ def _read_attribute(module: str, class_name: str, attribute: str) -> Any:
 
 
 def ensure_interpreter(name: str) -> str:
-    """The Python of the environment of this version, made if need be; else NoSuchEnvironment."""
+    """Find the Python of a version's environment; make the environment where there is none.
+
+    Args:
+        name: an engine with a version, as typed on the command line.
+
+    Returns:
+        Path of the interpreter.
+
+    Raises:
+        OSError: the finished environment could not be moved into the cache.
+
+    `EnvironmentUnavailable` passes through where uv fails.
+
+    """
     base, version = split_version(name)
     package = declared_attribute(base, "package")
     if version.endswith(".whl"):
         wheel = Path(version).resolve()
         requirement, label = str(wheel), hashlib.sha256(wheel.read_bytes()).hexdigest()[:16]
-    elif version in ("latest", "pre"):
-        requirement = newest_requirement(package, pre=version == "pre")
-        label = requirement.partition("==")[2]
+        number = str(parse_wheel_filename(wheel.name)[1])
     else:
-        requirement, label = f"{package}=={version}", version
-    number = str(parse_wheel_filename(Path(version).name)[1]) if version.endswith(".whl") else label
-    more = (
-        need
-        for when, need in declared_attribute(base, "extra_requirements")
-        if SpecifierSet(when).contains(number)
-    )
-    wanted = [requirement, *BASE_REQUIREMENTS, *more]
+        requirement = f"{package}=={version}"
+        if version in ("latest", "pre"):
+            requirement = newest_requirement(package, pre=version == "pre")
+        number = label = requirement.partition("==")[2]
+    extra = declared_attribute(base, "extra_requirements")
+    wanted = [requirement, *BASE_REQUIREMENTS]
+    wanted += [need for versions, need in extra if SpecifierSet(versions).contains(number)]
     tag = hashlib.sha256("\n".join([*wanted, sys.version]).encode()).hexdigest()[:8]
-    place = environments_folder() / f"{package}-{label}-{tag}"
-    if not interpreter_path(place).exists():
+    place = _environments_folder() / f"{package}-{label}-{tag}"
+    if not _interpreter_path(place).exists():
         place.parent.mkdir(parents=True, exist_ok=True)
         with ScratchFolder(".making-", place.parent) as scratch:
             made = scratch / "environment"
-            run_uv("venv", "--relocatable", "--python", sys.executable, str(made))
-            run_uv("pip", "install", "--python", str(interpreter_path(made)), *wanted)
+            _run_uv("venv", "--relocatable", "--python", sys.executable, str(made))
+            _run_uv("pip", "install", "--python", str(_interpreter_path(made)), *wanted)
             try:
                 os.rename(made, place)
-            except OSError:  # somebody else made it meanwhile
-                if not interpreter_path(place).exists():
+            except OSError:  # another process made it meanwhile
+                if not _interpreter_path(place).exists():
                     raise
-    return str(interpreter_path(place))
+    return str(_interpreter_path(place))
 
 
-def interpreter_path(environment: Path) -> Path:
-    """The interpreter of an environment."""
+def _interpreter_path(environment: Path) -> Path:
     return environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 
 
-def environments_folder() -> Path:
-    """The folder of all environments."""
+def _environments_folder() -> Path:
     if os.name == "nt":
         home = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
     else:
@@ -158,20 +182,29 @@ def environments_folder() -> Path:
 
 
 def newest_requirement(package: str, *, pre: bool) -> str:
-    """``package==version``: the newest release, or the newest of all."""
+    """Look up the newest version of a distribution.
+
+    Args:
+        package: name of the distribution.
+        pre: whether pre-releases count.
+
+    Returns:
+        The requirement ``package==version``.
+
+    """
     with tempfile.TemporaryDirectory() as scratch:
         source = Path(scratch) / "wanted.in"
         source.write_text(package)
         kind = ["--prerelease", "allow"] if pre else []
-        found = run_uv(
+        found = _run_uv(
             "pip", "compile", "--no-deps", "--no-header", "--no-annotate", "--python", sys.executable, *kind,
             str(source),
         )  # fmt: skip
     return found.split()[0]
 
 
-def run_uv(*arguments: str) -> str:
-    """What uv says; NoSuchEnvironment with its own words where it fails."""
+def _run_uv(*arguments: str) -> str:
+    """Run uv and return its output; raise EnvironmentUnavailable with its error message."""
     program = shutil.which("uv") or str(ROOT / ".uv" / "bin" / "uv")
     environment = {"UV_PYTHON_DOWNLOADS": "never", "UV_SYSTEM_CERTS": "true", **os.environ}
     try:
@@ -179,6 +212,8 @@ def run_uv(*arguments: str) -> str:
             [program, "--quiet", "--no-config", *arguments],
             capture_output=True, text=True, timeout=INSTALL_TIMEOUT, env=environment,
         )  # fmt: skip
+    except FileNotFoundError:
+        raise EnvironmentUnavailable("uv is not on PATH; install it (pip install uv) for @versions") from None
     except (OSError, subprocess.TimeoutExpired) as error:
         raise EnvironmentUnavailable(f"uv cannot make an environment for it: {error}") from None
     if done.returncode:

@@ -22,19 +22,64 @@ class LieGroupSystem(Protocol):
     """A mechanical system with configurations q (nq,) and velocities v (nv,)."""
 
     def acceleration(self, q: Array, v: Array) -> Array:
-        """Return v̇ (nv,)."""
+        """Evaluate the accelerations.
+
+        Args:
+            q: configuration (nq,).
+            v: velocity (nv,).
+
+        Returns:
+            v̇ (nv,).
+
+        """
 
     def integrate(self, q: Array, displacement: Array) -> Array:
-        """Return q ⊕ displacement (nq,)."""
+        """Move a configuration along a tangent vector.
+
+        Args:
+            q: configuration (nq,).
+            displacement: tangent vector (nv,).
+
+        Returns:
+            q ⊕ displacement (nq,).
+
+        """
 
     def exponential_coordinate_rate(self, q: Array, theta: Array, v: Array) -> Array:
-        """Return θ̇ (nv,) with (d/dt) q ⊕ θ = v, which is dexp⁻¹ of θ applied to v."""
+        """Apply dexp⁻¹ of θ to a velocity.
+
+        Args:
+            q: configuration (nq,).
+            theta: exponential coordinates θ (nv,) of a configuration near q.
+            v: velocity (nv,) there.
+
+        Returns:
+            θ̇ (nv,), with which q ⊕ θ moves at the velocity v.
+
+        """
 
     def configuration_rate(self, q: Array, v: Array) -> Array:
-        """Return q̇ (nq,)."""
+        """Map a velocity to the rate of the ambient coordinates.
+
+        Args:
+            q: configuration (nq,).
+            v: velocity (nv,).
+
+        Returns:
+            q̇ (nq,).
+
+        """
 
     def normalize(self, q: Array) -> Array:
-        """Return the point (nq,) of the group nearest to q."""
+        """Project ambient coordinates onto the group.
+
+        Args:
+            q: coordinates (nq,) near the group.
+
+        Returns:
+            The point (nq,) of the group nearest to q.
+
+        """
 
 
 def semi_implicit_euler(system: LieGroupSystem, q: Array, v: Array, h: float) -> tuple[Array, Array]:

@@ -227,6 +227,14 @@ def test_a_file_that_is_no_wheel_is_bad_usage(tmp_path):
     assert done.returncode == 2 and "is a wheel of mujoco, not of exudyn" in " ".join(done.stderr.split())
 
 
+def test_without_uv_the_reason_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(environments, "ROOT", tmp_path)
+    with pytest.raises(environments.EnvironmentUnavailable, match="uv is not on PATH; install it"):
+        environments.newest_requirement("packaging", pre=False)
+
+
 @needs_uv
 @pytest.mark.parametrize("version", ["9.9.9", "latest"])
 def test_an_index_that_does_not_answer_is_told(tmp_path, monkeypatch, version):
