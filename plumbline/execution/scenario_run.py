@@ -14,7 +14,8 @@ from plumbline.engines import calls, environments
 from plumbline.engines.adapter import EngineInfo
 from plumbline.judging import metamorphic, outlier
 from plumbline.judging.convergence import refinement_resolutions
-from plumbline.judging.long_runs import judge_long_runs, plan_long_run, run_long_run_study
+from plumbline.judging.long_run_study import plan_long_run, run_long_run_study
+from plumbline.judging.long_runs import judge_long_runs
 from plumbline.judging.rows import JudgingResult, RowContext, Verdict
 from plumbline.judging.state import judge_states, judge_states_pickled
 from plumbline.judging.trajectory import judge_trajectory

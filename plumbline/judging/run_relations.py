@@ -1,6 +1,6 @@
 """Metamorphic relations of short runs: reversed in time, and with another linear solver.
 
-    reversed in time     a symmetric integrator returns to its initial state when rates are reversed, at any step
+    reversed in time     a symmetric integrator whose rates are reversed returns to its start, at any step
     by …                 the same run with another linear solver of the engine
 
 The ends of the two runs may differ by rounding and by the tolerance of the step's solver, both grown as small
@@ -33,7 +33,7 @@ STEPS_PER_RADIAN = 32  # at the fastest rate, so that implicit steps can be solv
 def check_run_relations(engine: MetamorphicHooks, model: Model, state: State) -> Iterator[RelationResult]:
     """Check the relations of short runs, for every integrator that has one.
 
-    Where an implicit integrator fails at a step, that decides nothing: a shorter run with a shorter step follows.
+    Where an implicit integrator fails, a shorter run with a shorter step follows.
 
     Args:
         engine: the adapter.

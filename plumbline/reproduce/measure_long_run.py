@@ -6,15 +6,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from plumbline.judging.long_runs import (
+from plumbline.judging.long_run_study import (
     BLOCK_COUNT,
-    DriftJudge,
     LongRunPlan,
     LongRunStudy,
     plan_long_run,
     run_long_run_study,
-    sample_spacing,
 )
+from plumbline.judging.long_run_study import (
+    _sample_spacing as sample_spacing,
+)
+from plumbline.judging.long_runs import _DriftJudge as DriftJudge
 from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.model.datatypes import Array, Integrator
 from plumbline.model.invariants import INVARIANT_UNITS
@@ -90,7 +92,7 @@ class OverLong(OfRuns):
         }
         judges = {q: judge for q, judge in judges.items() if off[q]} or judges
         judge = next(iter(judges.values()))
-        runs = endured.runs if self.growth else judge.usable_runs(end)
+        runs = endured.runs if self.growth else [run for run in judge.study.runs if judge.is_usable(run, end)]
         return ShownLong(
             replace(case, steps=tuple(run.resolution for run in runs)),
             max(off.values()),

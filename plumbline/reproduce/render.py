@@ -14,7 +14,8 @@ from packaging.version import InvalidVersion, Version
 
 from plumbline.engines.environments import split_version
 from plumbline.judging.convergence import ORDER_MARGIN
-from plumbline.judging.long_runs import BLOCK_COUNT, MAX_SYMMETRIC_GROWTH, SIGMA_FACTOR
+from plumbline.judging.long_run_study import BLOCK_COUNT
+from plumbline.judging.long_runs import MAX_SYMMETRIC_GROWTH, SIGMA_FACTOR
 from plumbline.judging.relation_result import OPTION_PREFIX, OTHER_FORMULATION_PREFIX
 from plumbline.judging.run_relations import REVERSED_IN_TIME
 from plumbline.judging.state_relations import STATE_RELATIONS, WELDED_HALVES

@@ -18,7 +18,7 @@ import numpy as np
 
 from plumbline.engines import environments
 from plumbline.judging.convergence import RTOL_FACTORS, STEP_EXPONENTS
-from plumbline.judging.long_runs import MIN_WINDOW_SECONDS
+from plumbline.judging.long_run_study import MIN_WINDOW_SECONDS
 from plumbline.model.datatypes import Model, State
 from plumbline.model.kinematics import state_from_minimal
 from plumbline.model.sampling import derive_seed, random_states

@@ -8,16 +8,15 @@ import pytest
 from adapters.mujoco_engine import Mujoco
 from plumbline.engines.registry import load_adapter
 from plumbline.execution.runner import Plan, run_plan
-from plumbline.judging import long_runs
-from plumbline.judging.long_runs import (
+from plumbline.judging import long_run_study
+from plumbline.judging.long_run_study import (
     BLOCK_COUNT,
     MAX_BODY_STEPS,
-    DriftOrder,
     LongRunPlan,
-    judge_long_runs,
     plan_long_run,
     run_long_run_study,
 )
+from plumbline.judging.long_runs import DriftOrder, judge_long_runs
 from plumbline.judging.rows import RowContext
 from plumbline.model.datatypes import Integrator, Trajectory
 from plumbline.processes.workers import Limits
@@ -51,7 +50,7 @@ def planted(monkeypatch):
 
     def put(defect):
         engine = plant(Mujoco, defect)
-        monkeypatch.setattr(long_runs, "load_adapter", lambda _: engine)
+        monkeypatch.setattr(long_run_study, "load_adapter", lambda _: engine)
         return engine
 
     return put
@@ -71,7 +70,7 @@ def test_a_step_too_coarse_for_100_s_is_judged_where_it_is_not():
     rows = long("tumbling-ball", "mujoco", "Euler")
     energy = rows["energy_drift_long"]
     assert energy.verdict == "agrees" and energy.compared_until == 10.0 and abs(energy.order - 1) < 0.2
-    assert "within 100 s, which cannot tell" in energy.reason
+    assert "within 100 s, which does not decide" in energy.reason
     assert energy.extra["by 100 s"] > 3.0 > energy.extra["scale"] / 2
 
 
@@ -116,7 +115,7 @@ def test_planted_leaks_are_seen(planted, defect, verdict, quantities):
 def test_another_order_than_its_name_is_seen(planted):
     rows = long("tumbling-ball", planted(DEFECTS["order-2-named-RK4"]), "RK4", 12.5)
     row = rows["energy_drift_long"]
-    assert row.verdict == "disagrees" and row.order < 3.5 and "due 3.9" in row.reason
+    assert row.verdict == "disagrees" and row.order < 3.5 and "required 3.9" in row.reason
 
 
 @pytest.mark.full
@@ -137,18 +136,18 @@ def leaking():
         Exudyn,
         Defect("", "", inputs=model_change(lambda m, _: {"drag_moment": m.drag_moment + 3e-6})),
     )
-    before, long_runs.load_adapter = long_runs.load_adapter, lambda _: engine
+    before, long_run_study.load_adapter = long_run_study.load_adapter, lambda _: engine
     try:
         return long("spherical", engine, "trapezoidal", 50.0)["energy_drift_long_growth"]
     finally:
-        long_runs.load_adapter = before
+        long_run_study.load_adapter = before
 
 
 @pytest.mark.full
 def test_step_control_keeps_each_invariant_within_its_tolerance():
     rows = worker.run("pinocchio", long, "tumbling-ball", "pinocchio", "dop853", 50.0)
     assert {row.verdict for row in rows.values()} == {"agrees"}
-    assert "what the tolerance 1e-08 lets pass in every step" in rows["energy_drift_long"].reason
+    assert "the error that the tolerance 1e-08 accepts in every step" in rows["energy_drift_long"].reason
 
 
 # --- lengths, and the statistic -----------------------------------------------------------------

@@ -26,7 +26,8 @@ from plumbline.engines import environments
 from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.judging import metamorphic, run_relations, state_relations
 from plumbline.judging.convergence import refinement_resolutions
-from plumbline.judging.long_runs import LongRunPlan, judge_long_runs, plan_long_run, run_long_run_study
+from plumbline.judging.long_run_study import LongRunPlan, plan_long_run, run_long_run_study
+from plumbline.judging.long_runs import judge_long_runs
 from plumbline.processes.workers import Outcome
 from plumbline.reproduce.engine_client import Engine
 from plumbline.reproduce.measure import AlongRuns, AtState, Question, Related, shrunk
