@@ -195,9 +195,10 @@ def read_scenarios(names: Iterable[str | Path]) -> list[scenarios.Scenario]:
     """
     try:
         found = scenarios.load_scenarios(names)
-        if problems := [problem for s in found if (problem := _closed_form_problem(s))]:
-            raise ScenarioError(problems)
-    except ScenarioError as error:
+        error = ScenarioError(problem for s in found if (problem := _closed_form_problem(s)))
+    except ScenarioError as load_error:
+        error = load_error
+    if error.problems:
         click.echo(str(error), err=True)
         sys.exit(2)
     return found

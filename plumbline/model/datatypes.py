@@ -1,11 +1,10 @@
-"""What crosses from one stage to the next: small frozen records of NumPy arrays.
+"""The data that packages exchange: small frozen dataclasses of NumPy arrays.
 
 `Model`, the mechanism, is the reference's `Chain` under the name that scenarios and engines use.
 
-Frames and units, everywhere: SI; world z up, pivot at the world origin; ``r`` is a centre of mass in the world
-frame; quaternions are scalar first and turn body vectors into world vectors;
-``omega`` is the angular velocity in the body frame (the notes' ω′ = 2 L(p) ṗ).
-N is the number of bodies, T the number of samples.
+Frames and units, everywhere: SI; world z up, pivot at the world origin; ``r`` is a centre of mass in the
+world frame; quaternions are scalar first and turn body vectors into world vectors; ``omega`` is the angular
+velocity in the body frame (the notes' ω′ = 2 L(p) ṗ). N is the number of bodies, T the number of samples.
 """
 
 from __future__ import annotations
@@ -21,11 +20,11 @@ Model = Chain
 
 
 class Unsupported(PlumblineError):
-    """The engine cannot do this; the message is the sentence that stands in the results."""
+    """The engine has no such feature; the message is the sentence that results and report show."""
 
 
 class EngineFailure(PlumblineError):
-    """The engine was asked for something it offers and did not deliver it; the message says what it did."""
+    """The engine failed at something that it offers; the message says how."""
 
 
 class BadInput(PlumblineError, ValueError):
@@ -34,12 +33,11 @@ class BadInput(PlumblineError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """One exact state on the constraint manifold: the minimal coordinates and what follows from them.
+    """One exact state on the constraint manifold: minimal coordinates p, omega, u, udot; r, v follow.
 
-    ``u``, ``udot`` are the unit direction of rod k, from the point where the rod hangs to
-    body k's proximal point, and its rate (u·udot = 0); zero for ball joints.  The rod's
-    angular velocity without axial spin is u × udot.  ``r``, ``v`` follow from the others
-    (`plumbline.model.kinematics.lift`).
+    ``u`` is the unit direction of rod k, from the point where the rod hangs to the proximal point of body k,
+    and ``udot`` its rate (u·udot = 0); both are zero for ball joints.  The rod's angular velocity without
+    axial spin is u × udot.  `plumbline.model.kinematics.state_from_minimal` makes states.
     """
 
     p: Array  # (N, 4) –
@@ -52,7 +50,7 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class StateQuantities:
-    """What an engine says of one state. Optional ones are None where the engine has none."""
+    """What an engine computes at one state; quantities that it does not offer are None."""
 
     acceleration: Array  # (N, 3) m/s², r̈ of the centres of mass, world frame
     angular_acceleration: Array  # (N, 3) rad/s², ω̇′, body frame
@@ -67,9 +65,9 @@ class StateQuantities:
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Samples of one run at the asked times; row 0 is the initial state.
+    """Samples of one run at the requested times; row 0 is the initial state.
 
-    ``p`` and ``pdot`` are what the engine holds: not normalised, not projected.
+    ``p`` and ``pdot`` are the engine's own values: not normalised, not projected.
     """
 
     t: Array  # (T,) s
@@ -82,10 +80,10 @@ class Trajectory:
 
 @dataclass(frozen=True)
 class Integrator:
-    """One way of an engine to step in time.
+    """One integration method of an engine.
 
-    ``resolution`` handed to `Adapter.simulate` is the step in seconds for ``kind`` "step"
-    and the relative tolerance for ``kind`` "tolerance".
+    The ``resolution`` that `Adapter.simulate` receives is the step [s] for ``kind`` "step", and the relative
+    tolerance for ``kind`` "tolerance".
     """
 
     name: str

@@ -1,7 +1,4 @@
-"""From trajectories to numbers: errors between two, and the invariants of one.
-
-Leading axes are free everywhere: (T, N, …) for a run.
-"""
+"""Errors between two runs and invariants of one: energy, momentum, joint gaps, quaternion norms."""
 
 from __future__ import annotations
 
@@ -15,12 +12,30 @@ from plumbline.model.kinematics import angular_velocity, joint_vectors, rotation
 
 
 def position_error(a: Array, b: Array) -> Array:
-    """(T,) m: the largest distance between the same body's centre of mass in two runs."""
+    """Return the largest distance between the same body's centre of mass in two runs.
+
+    Args:
+        a: (..., N, 3) positions [m].
+        b: (..., N, 3) positions [m].
+
+    Returns:
+        (...) distances, the largest over the bodies [m].
+
+    """
     return np.asarray(np.max(np.linalg.norm(a - b, axis=-1), axis=-1))
 
 
 def attitude_error(p: Array, q: Array) -> Array:
-    """(T,) rad: the largest rotation angle between the same body's two attitudes; q and -q are the same."""
+    """Return the largest rotation angle between the same body's attitudes in two runs; q equals −q.
+
+    Args:
+        p: (..., N, 4) quaternions of the first run, normalised here.
+        q: (..., N, 4) quaternions of the second run, normalised here.
+
+    Returns:
+        (...) angles, the largest over the bodies [rad].
+
+    """
     p = p / np.linalg.norm(p, axis=-1, keepdims=True)
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     sign = np.where(np.sum(p * q, axis=-1, keepdims=True) < 0, -1.0, 1.0)
@@ -29,30 +44,60 @@ def attitude_error(p: Array, q: Array) -> Array:
 
 
 def kinetic_energy(model: Model, v: Array, omega: Array) -> Array:
-    """(…,) J: Σ ½ m ṙ² + ½ ω′ᵀ J ω′."""
+    """Return Σ ½ m ṙ² + ½ ω′ᵀ J ω′.
+
+    Args:
+        model: the chain of N bodies.
+        v: (..., N, 3) velocities of the centres of mass, world frame [m/s].
+        omega: (..., N, 3) angular velocities, body frame [rad/s].
+
+    Returns:
+        (...) energies [J].
+
+    """
     spin = np.einsum("...ki,kij,...kj->...", omega, model.inertia, omega)
     return np.asarray(0.5 * np.einsum("k,...ki,...ki->...", model.mass, v, v) + 0.5 * spin)
 
 
 def potential_energy(model: Model, r: Array) -> Array:
-    """(…,) J: -Σ m g·r, zero at the pivot's height."""
+    """Return −Σ m g·r, which is zero at the pivot's height.
+
+    Args:
+        model: the chain of N bodies.
+        r: (..., N, 3) centres of mass, world frame [m].
+
+    Returns:
+        (...) energies [J].
+
+    """
     return np.asarray(-np.einsum("k,i,...ki->...", model.mass, model.gravity, r))
 
 
 def angular_momentum(model: Model, r: Array, p: Array, v: Array, omega: Array) -> Array:
-    """(…, 3) kg m²/s about the pivot, world frame: Σ m r × ṙ + A J ω′."""
+    """Return Σ m r × ṙ + A J ω′, the angular momentum about the pivot.
+
+    Args:
+        model: the chain of N bodies.
+        r: (..., N, 3) centres of mass, world frame [m].
+        p: (..., N, 4) quaternions, normalised here.
+        v: (..., N, 3) velocities of the centres of mass, world frame [m/s].
+        omega: (..., N, 3) angular velocities, body frame [rad/s].
+
+    Returns:
+        (..., 3) angular momenta, world frame [kg m²/s].
+
+    """
     spin = np.einsum("...kij,kjl,...kl->...i", rotation_matrix(p), model.inertia, omega)
     return np.asarray(np.einsum("k,...ki->...i", model.mass, np.cross(r, v)) + spin)
 
 
 @dataclass(frozen=True, eq=False)
 class Invariants:
-    """Signed series (T, M, width) of one run; each is zero in an exact motion."""
+    """Signed series (T, bodies or 1, components) of one run; each is zero in an exact motion."""
 
     energy_drift: Array  # (T, 1, 1) J: E - E(0) - W, W the work of loads and drag
-    momentum_drift: (
-        Array | None
-    )  # (T, 1, 1) kg m²/s: change of L about the pivot along gravity; None if not conserved
+    # (T, 1, 1) kg m²/s: change of the angular momentum about the pivot along gravity; None if not conserved
+    momentum_drift: Array | None
     joint_gap: Array  # (T, N, 3) m: d of a ball joint; (|d| - ℓ, 0, 0) of a rod
     gap_rate: Array  # (T, N, 3) m/s: its rate
     norm_drift: Array  # (T, N, 1) –: |p| - 1
@@ -69,11 +114,20 @@ INVARIANT_UNITS = {
 
 
 def work_of_loads(model: Model, run: Trajectory, omega: Array) -> tuple[Array, float]:
-    """Work (T,) of loads and drag since t = 0 in J, and its quadrature uncertainty.
+    """Return the work of loads and drag since t = 0, and how uncertain its quadrature is.
 
-    Constant world forces do F·Δr exactly.  Moments and drag are integrated over the samples by
-    a quintic spline of their power; its distance to the cubic one, or to the quintic through every
-    other sample, is the uncertainty, whichever is larger.
+    Constant world forces do the work F·Δr exactly.  The power of moments and drag is integrated over the
+    samples by a quintic spline; the uncertainty is its distance to the cubic one or to the quintic through
+    every other sample, whichever is larger.  Fewer than 13 samples are not integrated.
+
+    Args:
+        model: the chain of N bodies.
+        run: T samples of its motion.
+        omega: (T, N, 3) angular velocities of the run, body frame [rad/s].
+
+    Returns:
+        Work, (T,) [J], and its uncertainty [J].
+
     """
     exact = np.einsum("ki,tki->t", model.force, run.r - run.r[0])
     power = (
@@ -91,7 +145,16 @@ def work_of_loads(model: Model, run: Trajectory, omega: Array) -> tuple[Array, f
 
 
 def compute_invariants(model: Model, run: Trajectory) -> Invariants:
-    """The invariants of one run, from what the engine holds: p is not normalised before |p| is read."""
+    """Compute the invariants of one run; its quaternions are not normalised before |p| is read.
+
+    Args:
+        model: the chain of N bodies.
+        run: T samples of its motion.
+
+    Returns:
+        The series; ``momentum_drift`` is None with loads, drag or without gravity.
+
+    """
     omega = angular_velocity(run.p, run.pdot)
     energy = kinetic_energy(model, run.v, omega) + potential_energy(model, run.r)
     done, uncertainty = work_of_loads(model, run, omega)
@@ -119,7 +182,17 @@ def compute_invariants(model: Model, run: Trajectory) -> Invariants:
 
 
 def joint_vector_rates(model: Model, run: Trajectory, omega: Array) -> Array:
-    """ḋ (T, N, 3) m/s, world frame, of the joint vectors of `kinematics.joint_vectors`."""
+    """Return ḋ, the rates of the vectors of `plumbline.model.kinematics.joint_vectors`.
+
+    Args:
+        model: the chain of N bodies.
+        run: T samples of its motion.
+        omega: (T, N, 3) angular velocities of the run, body frame [rad/s].
+
+    Returns:
+        (T, N, 3) rates, world frame [m/s].
+
+    """
     a = rotation_matrix(run.p)
     near = run.v + np.einsum("tkij,tkj->tki", a, np.cross(omega, model.proximal))
     far = run.v + np.einsum("tkij,tkj->tki", a, np.cross(omega, model.distal))
@@ -127,10 +200,18 @@ def joint_vector_rates(model: Model, run: Trajectory, omega: Array) -> Array:
 
 
 def invariant_scales(model: Model, run: Trajectory, length: float) -> dict[str, float]:
-    """Sizes of what the invariants of a run are made of: energies, momenta, lengths, speeds; as `UNITS`.
+    """Return the size of the quantities that each invariant is a difference of.
 
-    ``length`` (m) is that of the stretched chain.  A pendulum at rest rounds too: speeds are at least
-    that of a fall through it.
+    A pendulum at rest rounds too: speeds count at least as that of a fall through ``length``.
+
+    Args:
+        model: the chain of N bodies.
+        run: T samples of its motion.
+        length: the length of the stretched chain [m].
+
+    Returns:
+        A scale for each name of INVARIANT_UNITS, in its unit.
+
     """
     omega = angular_velocity(run.p, run.pdot)
     kinetic = float(np.max(kinetic_energy(model, run.v, omega)))

@@ -1,6 +1,6 @@
-"""Rigid-body kinematics of unit quaternions, shared by scenario loading, adapters and measures.
+"""Rigid-body kinematics with unit quaternions, for scenario loading, adapters and invariants.
 
-Written apart from `reference_impl`, whose Euler-parameter algebra is under test.
+Independent of `reference_impl`, whose Euler-parameter algebra is under test.
 Imports nothing of the project but its types.
 """
 
@@ -12,9 +12,14 @@ from plumbline.model.datatypes import Array, Model, State
 
 
 def rotation_matrix(p: Array) -> Array:
-    """Rotation matrix (..., 3, 3), body → world, of quaternions p (..., 4), scalar first.
+    """Return the rotation matrices A of quaternions: the homogeneous quadratic form divided by pᵀp.
 
-    The homogeneous-quadratic form divided by pᵀp: a rotation for every p ≠ 0.
+    Args:
+        p: (..., 4) quaternions, scalar first, of any length but 0.
+
+    Returns:
+        (..., 3, 3) rotations, body → world.
+
     """
     p = np.asarray(p, dtype=float)
     w, x, y, z = np.moveaxis(p, -1, 0)
@@ -57,35 +62,94 @@ def cross_matrix(s: Array) -> Array:
 
 
 def quaternion_product(a: Array, b: Array) -> Array:
-    """Quaternion product a b, (..., 4) each, scalar first: rotation(a b) = rotation(a) rotation(b)."""
+    """Multiply quaternions: rotation_matrix(a b) = rotation_matrix(a) rotation_matrix(b).
+
+    Args:
+        a: (..., 4) left factors, scalar first.
+        b: (..., 4) right factors, scalar first.
+
+    Returns:
+        (..., 4) products a b.
+
+    """
     aw, av, bw, bv = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
     scalar = aw * bw - np.sum(av * bv, -1, keepdims=True)
     return np.concatenate([scalar, aw * bv + bw * av + np.cross(av, bv)], -1)
 
 
 def quaternion_conjugate(p: Array) -> Array:
-    """Conjugate quaternion (..., 4): the inverse rotation of a unit one."""
+    """Return the conjugate quaternions; of unit ones, the inverse rotations.
+
+    Args:
+        p: (..., 4) quaternions, scalar first.
+
+    Returns:
+        (..., 4) conjugates.
+
+    """
     return np.asarray(p * np.array([1.0, -1.0, -1.0, -1.0]))
 
 
 def quaternion_rate(p: Array, omega: Array) -> Array:
-    """ṗ = ½ L(p)ᵀ ω′ (..., 4) of unit quaternions p and body-frame ω′ (..., 3)."""
+    """Return ṗ = ½ L(p)ᵀ ω′, the inverse of `angular_velocity` for unit quaternions.
+
+    Args:
+        p: (..., 4) unit quaternions.
+        omega: (..., 3) angular velocities ω′, body frame [rad/s].
+
+    Returns:
+        (..., 4) rates ṗ [1/s].
+
+    """
     return 0.5 * quaternion_product(p, np.concatenate([np.zeros_like(omega[..., :1]), omega], -1))
 
 
 def angular_velocity(p: Array, pdot: Array) -> Array:
-    """ω′ = 2 L(p) ṗ (..., 3), body frame, as the notes define it (also off pᵀp = 1)."""
+    """Return ω′ = 2 L(p) ṗ as the notes define it, also where pᵀp ≠ 1.
+
+    Args:
+        p: (..., 4) quaternions, not normalised here.
+        pdot: (..., 4) their rates [1/s].
+
+    Returns:
+        (..., 3) angular velocities, body frame [rad/s].
+
+    """
     return 2.0 * quaternion_product(quaternion_conjugate(p), pdot)[..., 1:]
 
 
 def state_from_minimal(model: Model, p: Array, omega: Array, u: Array, udot: Array) -> State:
-    """The exact state that follows from minimal coordinates: r and v from the pivot outwards."""
+    """Complete minimal coordinates to a state: centres of mass and their velocities from the pivot outwards.
+
+    Args:
+        model: the chain of N bodies.
+        p: (N, 4) unit quaternions, body → world.
+        omega: (N, 3) angular velocities, body frame [rad/s].
+        u: (N, 3) unit directions of the rods, world frame; zero for ball joints.
+        udot: (N, 3) their rates, perpendicular to ``u`` [1/s].
+
+    Returns:
+        The state, on the constraint manifold to rounding.
+
+    """
     r, v = forward_kinematics(model, p, omega, u, udot)
     return State(p=p, omega=omega, u=u, udot=udot, r=r, v=v)
 
 
 def forward_kinematics(model: Model, p: Array, omega: Array, u: Array, udot: Array) -> tuple[Array, Array]:
-    """The places and velocities r, v (..., N, 3) of one or of many states at once, as `lift` has them."""
+    """Return the centres of mass and their velocities, of one state or of many.
+
+    Args:
+        model: the chain of N bodies.
+        p: (..., N, 4) unit quaternions, body → world.
+        omega: (..., N, 3) angular velocities, body frame [rad/s].
+        u: (..., N, 3) unit directions of the rods, world frame; zero for ball joints.
+        udot: (..., N, 3) their rates [1/s].
+
+    Returns:
+        Positions r [m] and velocities ṙ [m/s], (..., N, 3) each, world frame.
+
+    """
     a = rotation_matrix(p)  # (..., N, 3, 3)
     r, v = np.empty(omega.shape), np.empty(omega.shape)
     near, far = np.cross(omega, model.proximal), np.cross(omega, model.distal)
@@ -102,9 +166,18 @@ def forward_kinematics(model: Model, p: Array, omega: Array, u: Array, udot: Arr
 
 
 def joint_vectors(model: Model, r: Array, p: Array) -> Array:
-    """d_k (..., N, 3), world frame: from where joint k hangs to body k's proximal point.
+    """Return d_k, the vectors from the point where joint k hangs to the proximal point of body k.
 
-    Zero for an exact ball joint, of length ℓ_k for an exact rod.  p is normalised first.
+    Zero for a ball joint that is closed, of length ℓ_k for a rod.
+
+    Args:
+        model: the chain of N bodies.
+        r: (..., N, 3) centres of mass, world frame [m].
+        p: (..., N, 4) quaternions, normalised here.
+
+    Returns:
+        (..., N, 3) vectors, world frame [m].
+
     """
     a = rotation_matrix(p)
     near = r + np.einsum("...kij,kj->...ki", a, model.proximal)
@@ -114,12 +187,20 @@ def joint_vectors(model: Model, r: Array, p: Array) -> Array:
 
 
 def velocity_jacobian(model: Model, state: State) -> Array:
-    """Map W (6N, nu) of the minimal rates to the bodies': (v_0, ω′_0, v_1, ω′_1, …) = W ν.
+    """Return the map W from the minimal rates to the bodies' velocities: (v_0, ω′_0, v_1, ω′_1, …) = W ν.
 
-    ν = (udot of the rods in order, then omega of all bodies), as `StateQuantities.mass_matrix`
-    has it.  A rod moves its lower end by ℓ (u × udot) × u = ℓ (I − u uᵀ) udot, so the axial part of
-    udot moves nothing; a body's ω′ moves a point s of it by −A s̃ ω′ (world frame).  The kinetic
-    energy of the bodies is ½ νᵀ Wᵀ diag(m_k I, J_k) W ν: `mass_matrix`.
+    ν holds udot of the rods in order, then ω′ of all bodies, as in `StateQuantities.mass_matrix`.  A rod
+    moves its lower end by ℓ (u × udot) × u = ℓ (I − u uᵀ) udot, so the axial part of udot moves nothing; the
+    angular velocity ω′ of a body moves its point s by −A s̃ ω′ (world frame).
+
+    Args:
+        model: the chain of N bodies.
+        state: a state on the constraint manifold.
+
+    Returns:
+        (6N, nu) matrix, nu = 3·(number of rods) + 3N; linear velocities in the world frame, angular in the
+            body's.
+
     """
     n, rods = model.n, np.flatnonzero(model.rods)
     a = rotation_matrix(state.p)
@@ -145,7 +226,16 @@ def velocity_jacobian(model: Model, state: State) -> Array:
 
 
 def mass_matrix(model: Model, state: State) -> Array:
-    """M (nu, nu) of `StateQuantities.mass_matrix` from the map W: Wᵀ diag(m_k I, J_k) W."""
+    """Return M = Wᵀ diag(m_k I, J_k) W with W of `velocity_jacobian`: the kinetic energy is ½ νᵀ M ν.
+
+    Args:
+        model: the chain of N bodies.
+        state: a state on the constraint manifold.
+
+    Returns:
+        (nu, nu) symmetric matrix, as `StateQuantities.mass_matrix`.
+
+    """
     w = velocity_jacobian(model, state).reshape(model.n, 6, -1)
     linear, angular = w[:, :3], w[:, 3:]
     out = np.einsum("k,kia,kib->ab", model.mass, linear, linear)

@@ -11,20 +11,38 @@ from plumbline.model.kinematics import forward_kinematics
 
 
 def derive_seed(*parts: str) -> int:
-    """A seed that depends on the words given and on nothing else (not on hash randomisation)."""
+    """Derive a seed from words; the same on every machine and in every process.
+
+    Args:
+        *parts: the words, for example a purpose and a scenario's digest.
+
+    Returns:
+        A whole number below 2⁶⁴.
+
+    """
     return int.from_bytes(hashlib.sha256("\0".join(parts).encode()).digest()[:8], "big")
 
 
 def random_states(model: Model, count: int, seed: int) -> list[State]:
-    """``count`` states of the model's geometry: attitudes and rod directions uniform, rates slow to fast.
+    """Draw states of the model: attitudes and rod directions uniform, rates slow to fast.
 
-    Rates are Gaussian with a standard deviation drawn per state, log-uniform from a tenth to
-    four times the pendulum's own rate √(g/ℓ), so that gravity dominates in some states and the
-    velocity terms in others.  u and u̇ are zero where the joint is a ball joint.
+    Rates are Gaussian with a standard deviation drawn per state, log-uniform from a tenth to four times the
+    pendulum's own rate √(g/ℓ), so that gravity dominates in some states and the velocity terms in others.
+
+    Args:
+        model: the chain of N bodies; only its geometry and gravity count.
+        count: how many states.
+        seed: the same seed gives the same states.
+
+    Returns:
+        The states, on the constraint manifold; ``u`` and ``udot`` are zero where the joint is a ball joint.
+
     """
     rng = np.random.default_rng(seed)
-    reach = np.linalg.norm(model.proximal, axis=1) + model.length
-    own_rate = np.sqrt(max(float(np.linalg.norm(model.gravity)), 1e-3) / max(float(np.mean(reach)), 1e-3))
+    hanging_length = np.linalg.norm(model.proximal, axis=1) + model.length
+    own_rate = np.sqrt(
+        max(float(np.linalg.norm(model.gravity)), 1e-3) / max(float(np.mean(hanging_length)), 1e-3)
+    )
     p, omega, u, udot = (np.zeros((count, model.n, size)) for size in (4, 3, 3, 3))
     for k in range(count):
         p[k] = rng.normal(size=(model.n, 4))

@@ -1,4 +1,4 @@
-"""What a body is made of: itself, or two halves to be welded.
+"""Bodies as one rigid piece, or as two halves to be welded.
 
 With Σ = ½ tr(J) I − J, the second moments of the body's mass about its centre, the halves have m/2 each
 at ± c and share what their distance leaves of the inertia, ¼ and ¾, so that no two are alike:
@@ -23,7 +23,7 @@ SPLIT_DIRECTION = np.ones(3) / np.sqrt(3.0)  # in principal axes
 
 @dataclass(frozen=True, eq=False)
 class RigidPart:
-    """One rigid piece of a body."""
+    """One rigid piece of a body, welded to the others."""
 
     mass: float  # kg
     centre: Array  # (3,) m, from the body's centre of mass, body frame
@@ -34,18 +34,43 @@ BodyParts = list[tuple[RigidPart, ...]]  # of every body
 
 
 def undivided_bodies(model: Model) -> BodyParts:
-    """Every body in one piece."""
+    """Describe every body as one piece.
+
+    Args:
+        model: the chain of N bodies.
+
+    Returns:
+        For each body a tuple of one piece.
+
+    """
     each = zip(model.mass, model.inertia, strict=True)
     return [(RigidPart(float(mass), np.zeros(3), inertia),) for mass, inertia in each]
 
 
 def split_bodies(model: Model) -> BodyParts:
-    """Every body in two pieces."""
+    """Describe every body as two pieces that have its mass, centre of mass and inertia together.
+
+    Args:
+        model: the chain of N bodies.
+
+    Returns:
+        For each body a tuple of two pieces.
+
+    """
     return [split_body(float(mass), inertia) for mass, inertia in zip(model.mass, model.inertia, strict=True)]
 
 
 def split_body(mass: float, inertia: Array) -> tuple[RigidPart, RigidPart]:
-    """The two halves of one body."""
+    """Split a body into the two halves of the module's docstring.
+
+    Args:
+        mass: the body's mass [kg].
+        inertia: (3, 3) about its centre of mass, body frame [kg m²].
+
+    Returns:
+        The halves.
+
+    """
     principal, axes = np.linalg.eigh(inertia)
     moments = np.maximum(np.sum(principal) / 2 - principal, 0.0)  # of a flat body one is a rounding of zero
     centre = axes @ (np.sqrt(moments / (2 * mass)) * SPLIT_DIRECTION)
@@ -56,5 +81,13 @@ def split_body(mass: float, inertia: Array) -> tuple[RigidPart, RigidPart]:
 
 
 def part_offsets(parts: BodyParts) -> Array:
-    """(N,) m: how far a piece's centre is from its body's, at most."""
+    """Return how far the centres of the pieces are from their body's centre of mass.
+
+    Args:
+        parts: the pieces of each of N bodies.
+
+    Returns:
+        (N,) the largest distance in each body [m].
+
+    """
     return np.array([max(float(np.linalg.norm(part.centre)) for part in pieces) for pieces in parts])

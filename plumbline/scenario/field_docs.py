@@ -1,4 +1,4 @@
-"""The field reference of scenario files, written from the schema: python -m plumbline.scenario.field_docs."""
+"""Write docs/scenario-files.md from the schema: python -m plumbline.scenario.field_docs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from plumbline.scenario.schema import SCHEMA_VERSION
 SECTION_HEADINGS = {  # in the page's order
     "Document": "The file",
     "Body": "`bodies[]`: a body",
-    "Run": "`bodies[]`: a run of bodies",
+    "BodySequence": "`bodies[]`: repeated bodies",
     "Ball": "`joint`, kind ball",
     "Rod": "`joint`, kind rod",
     "Attitude": "`attitude`",
@@ -29,70 +29,75 @@ BOUND_FORMATS = {
 INTRODUCTION = f"""\
 # Scenario files
 
-This page is written by `python -m plumbline.scenario.field_docs` from the schema that reads the files;
-a test keeps it so. [Add a scenario](add-a-scenario.md) is the worked example.
+`python -m plumbline.scenario.field_docs` writes this page from the schema that reads the files.
+[Add a scenario](add-a-scenario.md) is a worked example.
 
 A scenario file is YAML 1.2 (UTF-8, no tabs for indentation) of schema version {SCHEMA_VERSION}.
 It describes one open chain of rigid bodies that hangs from the world's origin, its state at t = 0
 and its loads. Everything is in SI units; angles are in rad unless the field is called `degrees`;
-the world's z points up; a body's frame has its origin at the centre of mass. Numbers are written
-alone, without a unit. Unknown fields are refused.
+the world's z axis points up; a body's frame has its origin at the centre of mass. Write numbers without
+a unit. Unknown fields are errors.
 
-`python -m plumbline check FILE…` names every mistake of every file with line and column;
+`python -m plumbline check FILE…` reports every mistake of every file with line and column;
 `python -m plumbline schema` prints the JSON Schema for editors.
 
-Initial states are given in minimal terms, from which positions and velocities follow: no state can
-be off the joints. Quaternions and directions are normalised; a rod's rate is freed of what rounding
-left along the rod.
+The initial state is given by attitudes, rod directions and rates; positions and velocities follow, so
+every state satisfies the joints. Quaternions and directions are normalised; the part of a rod's rate along
+the rod that rounding left is removed.
 """
 
 
 def field_reference() -> str:
-    """The whole page, Markdown."""
+    """Write the page.
+
+    Returns:
+        The text of docs/scenario-files.md, Markdown.
+
+    """
     whole = json_schema()
     parts = {"Document": whole, **whole["$defs"]}
     return "\n".join(
-        [INTRODUCTION, *(render_section(parts[name], heading) for name, heading in SECTION_HEADINGS.items())]
+        [INTRODUCTION, *(_render_section(parts[name], heading) for name, heading in SECTION_HEADINGS.items())]
     )
 
 
-def render_section(part: dict[str, Any], heading: str) -> str:
-    """One part of the file: what it is, and its fields."""
+def _render_section(part: dict[str, Any], heading: str) -> str:
+    """Write one part of the file: what it is, and its fields."""
     lines = [f"## {heading}", "", part["description"], ""]
     lines += ["| field | type | unit | default | meaning |", "|---|---|---|---|---|"]
     for name, field in part["properties"].items():
-        default = "required" if name in part.get("required", ()) else format_default(field.get("default"))
+        default = "required" if name in part.get("required", ()) else _format_default(field.get("default"))
         meaning = field["description"] + "".join(f" Example: `{e}`." for e in field.get("examples", ()))
-        cells = (f"`{name}`", field_type(field), field.get("unit", ""), default, meaning)
+        cells = (f"`{name}`", _field_type(field), field.get("unit", ""), default, meaning)
         lines.append(("| " + " | ".join(cells) + " |").replace("|  |", "| |"))
     return "\n".join([*lines, ""])
 
 
-def format_default(default: Any) -> str:
-    """A default as it would be typed; a dash where absence has a meaning of its own."""
+def _format_default(default: Any) -> str:
+    """Write a default as a user would type it; a dash where the field may be absent."""
     return "–" if default is None else f"`{default}`"
 
 
-def field_type(field: dict[str, Any]) -> str:
-    """The type of a field, with its bounds, in a reader's words."""
+def _field_type(field: dict[str, Any]) -> str:
+    """Write the type of a field with its bounds."""
     bounds = [text.format(field[name]) for name, text in BOUND_FORMATS.items() if name in field]
-    return ", ".join([base_type(field), *bounds])
+    return ", ".join([_base_type(field), *bounds])
 
 
-def base_type(field: dict[str, Any]) -> str:
-    """The type of a field without its bounds."""
+def _base_type(field: dict[str, Any]) -> str:
+    """Write the type of a field without its bounds."""
     if alternatives := field.get("anyOf") or field.get("oneOf"):
-        return " or ".join(field_type(option) for option in alternatives if option.get("type") != "null")
+        return " or ".join(_field_type(option) for option in alternatives if option.get("type") != "null")
     if "$ref" in field:
         name = str(field["$ref"]).rpartition("/")[2]
-        return "axis_angle" if name == "AxisAngle" else name.lower()
+        return {"AxisAngle": "axis_angle", "BodySequence": "repeated bodies"}.get(name, name.lower())
     if options := field.get("enum") or ([field["const"]] if "const" in field else []):
         return ", ".join(f"`{option}`" for option in options)
     if field["type"] == "array":
         if field.get("minItems", 0) == field.get("maxItems"):
-            inner = field_type(field["items"])
+            inner = _field_type(field["items"])
             return f"{field['minItems']} " + (f"× {inner}" if inner[0].isdigit() else f"{inner}s")
-        return f"list of {field_type(field['items'])}"
+        return f"list of {_field_type(field['items'])}"
     return {"integer": "whole number", "string": "text"}.get(field["type"], str(field["type"]))
 
 

@@ -1,7 +1,7 @@
 """Random scenarios: any mix of joints, full inertias, masses over decades, slow to fast, loads and drag.
 
-Scenario k of a seed depends on the seed and k alone, so that one of ten thousand is made again without
-the others.  Each is a document like any scenario file's and passes the same checks.
+Scenario k of a seed depends on the seed and k alone, so one of ten thousand can be made without the others.
+Each is the content of a scenario file and passes the checks of one.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ RANDOM_PURPOSE = (
 
 
 class RandomScenarios(Sequence[Scenario]):
-    """The first ``count`` scenarios of a seed, each made when it is asked for."""
+    """The first ``count`` scenarios of a seed; each is made when it is accessed."""
 
     def __init__(self, seed: int, count: int) -> None:
         self.seed, self.indices = seed, range(count)
@@ -45,13 +45,31 @@ class RandomScenarios(Sequence[Scenario]):
 
 
 def random_scenario(seed: int, index: int) -> Scenario:
-    """Scenario k of a seed."""
+    """Make one scenario of a seed.
+
+    Args:
+        seed: the seed of the whole batch.
+        index: the scenario's place in the batch, from 0; other scenarios need not be made first.
+
+    Returns:
+        The scenario, named ``random-SEED-INDEX``.
+
+    """
     content = random_document(seed, index)
     return scenario_from_dict(content, f"{content['name']}.yaml")
 
 
 def random_document(seed: int, index: int) -> dict[str, Any]:
-    """The content of its file: every number finite and written with all its digits."""
+    """Make the content of the file of one random scenario.
+
+    Args:
+        seed: the seed of the whole batch.
+        index: the scenario's place in the batch, from 0.
+
+    Returns:
+        Plain data; every number is finite and survives a round trip through JSON.
+
+    """
     rng = np.random.default_rng(derive_seed("random scenario", str(seed), str(index)))
     n = int(np.clip(rng.geometric(0.3), 1, MAX_RANDOM_BODIES))  # short chains most often
     wild = bool(rng.random() < 0.25)
@@ -67,15 +85,15 @@ def random_document(seed: int, index: int) -> dict[str, Any]:
         "purpose": RANDOM_PURPOSE,
         "duration": 1.0,
         "bodies": [
-            random_body(rng, decades, rate, bool(loaded), bool(dragged), i == n - 1) for i in range(n)
+            _random_body(rng, decades, rate, bool(loaded), bool(dragged), i == n - 1) for i in range(n)
         ],
     }
 
 
-def random_body(
+def _random_body(
     rng: np.random.Generator, decades: float, rate: float, has_load: bool, has_drag: bool, is_last: bool
 ) -> dict[str, Any]:
-    """One body of a chain, its inertia an ellipsoid's of some attitude: physical whatever is drawn."""
+    """Make one body of a chain; its inertia is that of a turned ellipsoid, so always physical."""
     mass = 10 ** rng.uniform(-decades, decades)
     squares = rng.uniform(0.05, 0.5, 3) ** 2  # m², semi-axes
     found: dict[str, Any] = {

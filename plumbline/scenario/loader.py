@@ -1,10 +1,9 @@
-"""A scenario: what is to be true. Its file, checked, becomes a model and an exact initial state."""
+"""Scenario files → `Scenario`: a checked model, an exact initial state and sample times."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -40,7 +39,6 @@ __all__ = [
     "load_scenario_text",
     "load_scenarios",
     "scenario_from_dict",
-    "slug",
 ]
 
 CATALOGUE_FOLDER = Path(__file__).resolve().parents[2] / "scenarios"
@@ -52,16 +50,16 @@ FAMILIES = ("single", "double", "chain")
 class Scenario:
     """One pendulum, its loads and its exact initial state.
 
-    ``state`` holds the minimal coordinates (p, omega, u, udot) that truth in high precision
-    starts from: p and u are unit to rounding, udot is perpendicular to u to rounding.
-    ``name``, ``title`` and the other texts are the file's own and may hold any printable
-    character: escape them where they go into HTML, XML, shells or file names (`slug`).
+    ``state`` holds the minimal coordinates (p, omega, u, udot) that the truth in high precision starts from:
+    p and u are unit to rounding, udot is perpendicular to u to rounding.  ``name``, ``title`` and the other
+    texts are the file's own and may hold any printable character: escape them in HTML, XML, shells and file
+    names.
     """
 
     name: str
     family: str
     title: str
-    purpose: str  # the sentence on what it is there to catch
+    purpose: str  # which mistakes this scenario reveals
     schema_version: int
     model: Model
     state: State
@@ -83,22 +81,68 @@ class Scenario:
 
 
 def load_scenario(path: str | Path) -> Scenario:
-    """The scenario of a YAML file; raises ScenarioError with every problem of the file."""
+    """Read and check a scenario file.
+
+    Args:
+        path: a YAML file.
+
+    Returns:
+        The scenario, named after the file unless the file has a name.
+
+    Raises:
+        ScenarioError: the file has problems; the error holds all of them.
+
+    """
     return build_scenario(read_yaml(Path(path)), Path(path))
 
 
 def load_scenario_text(content: str, name: str = "scenario") -> Scenario:
-    """The scenario of YAML text; ``name`` stands for the file."""
+    """Check the text of a scenario file.
+
+    Args:
+        content: YAML text.
+        name: what problems show as the file's name.
+
+    Returns:
+        The scenario.
+
+    Raises:
+        ScenarioError: the text has problems; the error holds all of them.
+
+    """
     return build_scenario(parse_yaml(YamlSource(name), content), Path(name))
 
 
 def scenario_from_dict(content: dict[str, Any], name: str) -> Scenario:
-    """The scenario of plain data that a program made, checked as a file's is."""
+    """Check plain data that a program made, as the content of a file is checked.
+
+    Args:
+        content: the fields of a scenario file.
+        name: what problems show as the file's name.
+
+    Returns:
+        The scenario.
+
+    Raises:
+        ScenarioError: the data have problems; the error holds all of them.
+
+    """
     return build_scenario(YamlSource(name, content, value_positions=defaultdict(lambda: (1, 1))), Path(name))
 
 
 def load_scenarios(names: Iterable[str | Path]) -> list[Scenario]:
-    """Scenarios by catalogue name or path, each once; problems of all files at once in one ScenarioError."""
+    """Read and check several scenarios.
+
+    Args:
+        names: names of the catalogue, or paths of files.
+
+    Returns:
+        The scenarios in this order, each once.
+
+    Raises:
+        ScenarioError: files have problems, or two different scenarios have one name.
+
+    """
     found: dict[str, Scenario] = {}
     problems: list[Problem] = []
     for name in names:
@@ -117,13 +161,29 @@ def load_scenarios(names: Iterable[str | Path]) -> list[Scenario]:
 
 
 def catalogue() -> dict[str, Path]:
-    """Name → file of every scenario that comes with the project, family by family."""
+    """List the scenarios that come with the project.
+
+    Returns:
+        Name → file, family by family.
+
+    """
     files = (path for family in FAMILIES for path in sorted((CATALOGUE_FOLDER / family).glob("*.yaml")))
     return {path.stem: path for path in files}
 
 
 def find_scenario_file(name: str | Path) -> Path:
-    """The file of a catalogue name, or the path itself; ScenarioError suggests the nearest name."""
+    """Look a name up in the catalogue; a path is returned as it is.
+
+    Args:
+        name: a name of the catalogue, or a path.
+
+    Returns:
+        The file, which need not exist.
+
+    Raises:
+        ScenarioError: the name is neither; suggests the nearest name.
+
+    """
     known = catalogue()
     if str(name) in known:
         return known[str(name)]
@@ -137,21 +197,30 @@ def find_scenario_file(name: str | Path) -> Path:
     raise ScenarioError([Problem(str(name), 0, 0, "", message, valid)])
 
 
-def slug(name: str) -> str:
-    """A file name for a scenario's name, safe and distinct also where capitals do not count."""
-    plain = re.sub(r"[^a-z0-9-]+", "-", name.lower()).strip("-")[:60]
-    reserved = re.fullmatch("con|prn|aux|nul|(com|lpt)[0-9]", plain)  # devices on Windows
-    if plain == name and not reserved:
-        return plain
-    return f"{plain or 'scenario'}-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
-
-
 def json_schema() -> dict[str, Any]:
-    """JSON Schema of scenario files, for editors."""
+    """Return the JSON Schema of scenario files, for editors.
+
+    Returns:
+        A schema of draft 2020-12, as plain data.
+
+    """
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **Document.model_json_schema()}
 
 
 def build_scenario(source: YamlSource, path: Path) -> Scenario:
+    """Check parsed data and build the model and the initial state from them.
+
+    Args:
+        source: the data of a file with their positions.
+        path: the file; its stem is the scenario's name unless the data have a name.
+
+    Returns:
+        The scenario.
+
+    Raises:
+        ScenarioError: the data have problems; the error holds all of them.
+
+    """
     problems = list(source.problems)
     document = None
     try:

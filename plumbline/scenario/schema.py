@@ -1,6 +1,6 @@
-"""The scenario file as it is written: fields, units, what is valid. `plumbline.scenario.loader` reads it.
+"""The fields of scenario files, their units and limits.
 
-Descriptions here are the field reference (`docs/scenario-files.md`) and the JSON Schema.
+The descriptions here become the field reference (`docs/scenario-files.md`) and the JSON Schema.
 SI units; world z up; a body's frame has its origin at the centre of mass.
 """
 
@@ -30,9 +30,7 @@ from plumbline.model.kinematics import quaternion_product, rotation_matrix
 SCHEMA_VERSION = 1
 MAX_BODIES = 20_000
 MAX_SAMPLES = 1_000_000
-INPUT_ROUNDING = (
-    1e-12  # relative: what sixteen typed digits and a few operations leave; anything above is meant
-)
+INPUT_ROUNDING = 1e-12  # relative: rounding of sixteen typed digits; larger deviations are mistakes
 ClosedForm = Literal[
     "rest",
     "planar-pendulum",
@@ -62,8 +60,8 @@ def invalid_value_error(message: str, valid: str, default_conflicts_with: str = 
     return PydanticCustomError("plumbline", "{message}", context)
 
 
-def require_printable(value: str) -> str:
-    """Text without control characters or code points that XML cannot hold; line breaks and tabs may stay."""
+def _require_printable(value: str) -> str:
+    """Refuse control characters and code points that XML cannot hold; line breaks and tabs may stay."""
     for char in value:
         if unicodedata.category(char) in ("Cc", "Cs", "Cn") and char not in "\n\t":
             raise invalid_value_error(f"has the character U+{ord(char):04X}", "printable text")
@@ -71,25 +69,33 @@ def require_printable(value: str) -> str:
 
 
 def unit_vector(values: list[float]) -> Array:
-    """The vector at unit length; scaled first, so that it neither overflows nor underflows."""
+    """Scale a vector to unit length without overflow or underflow.
+
+    Args:
+        values: numbers, not all zero.
+
+    Returns:
+        The unit vector.
+
+    """
     vector = np.array(values, dtype=float)
     vector = vector / np.max(np.abs(vector))
     return np.asarray(vector / np.linalg.norm(vector))
 
 
-def require_nonzero(values: list[float]) -> list[float]:
-    """Refuse the zero vector, which has no direction."""
+def _require_nonzero(values: list[float]) -> list[float]:
+    """Refuse the zero vector: it has no direction."""
     if not any(values):
         raise invalid_value_error("is all zeros, which has no direction", "at least one number other than 0")
     return values
 
 
 class SchemaModel(BaseModel):
-    """What all parts of a scenario file share: strict types, no unknown fields."""
+    """Base of all parts of a scenario file: strict types, no unknown fields, no NaN or infinity."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
-    def require_exactly_one(self, *names: str) -> None:
+    def _require_exactly_one(self, *names: str) -> None:
         """Refuse none or several of the alternatives."""
         given = [name for name in names if getattr(self, name) is not None]
         if len(given) != 1:
@@ -111,11 +117,11 @@ class AxisAngle(SchemaModel):
         None, description="The angle; or give `angle`.", json_schema_extra={"unit": "°"}
     )
 
-    _axis = field_validator("axis")(require_nonzero)
+    _axis = field_validator("axis")(_require_nonzero)
 
     @model_validator(mode="after")
     def _check_alternatives(self) -> AxisAngle:
-        self.require_exactly_one("angle", "degrees")
+        self._require_exactly_one("angle", "degrees")
         return self
 
     @property
@@ -124,7 +130,15 @@ class AxisAngle(SchemaModel):
         return self.angle if self.angle is not None else math.radians(self.degrees or 0.0)
 
     def quaternion(self, multiple: float = 1.0) -> Array:
-        """(4,) the unit quaternion of the rotation by ``times`` the angle."""
+        """Return the unit quaternion of a multiple of the rotation.
+
+        Args:
+            multiple: factor of the angle.
+
+        Returns:
+            (4,) scalar first.
+
+        """
         half = 0.5 * multiple * self.radians
         return np.concatenate([[math.cos(half)], math.sin(half) * unit_vector(self.axis)])
 
@@ -151,12 +165,12 @@ class Euler(SchemaModel):
 
     @model_validator(mode="after")
     def _check_alternatives(self) -> Euler:
-        self.require_exactly_one("angles", "degrees")
+        self._require_exactly_one("angles", "degrees")
         return self
 
 
 class Attitude(SchemaModel):
-    """How a body stands: exactly one of the three."""
+    """An attitude: exactly one of the three."""
 
     quaternion: Annotated[list[float], Len(4, 4)] | None = Field(
         None,
@@ -170,19 +184,19 @@ class Attitude(SchemaModel):
     @field_validator("quaternion")
     @classmethod
     def _quaternion(cls, value: list[float] | None) -> list[float] | None:
-        return require_nonzero(value) if value else value
+        return _require_nonzero(value) if value else value
 
     @model_validator(mode="after")
     def _check_alternatives(self) -> Attitude:
-        self.require_exactly_one("quaternion", "axis_angle", "euler")
+        self._require_exactly_one("quaternion", "axis_angle", "euler")
         return self
 
 
 class Inertia(SchemaModel):
-    """Inertia about the centre of mass, in the body's frame: exactly one of principal, six, matrix."""
+    """Inertia about the centre of mass, body frame: exactly one of principal, six, matrix."""
 
     principal: Vector | None = Field(
-        None, description="The three principal values.", json_schema_extra={"unit": "kg m²"}
+        None, description="The three principal moments.", json_schema_extra={"unit": "kg m²"}
     )
     axes: Attitude | None = Field(
         None,
@@ -203,14 +217,14 @@ class Inertia(SchemaModel):
     @classmethod
     def _principal(cls, value: list[float] | None) -> list[float] | None:
         if value:
-            require_physical_inertia(np.diag(value))
+            _require_physical_inertia(np.diag(value))
         return value
 
     @field_validator("six")
     @classmethod
     def _six(cls, value: list[float] | None) -> list[float] | None:
         if value:
-            require_physical_inertia(symmetric_matrix(value))
+            _require_physical_inertia(_symmetric_matrix(value))
         return value
 
     @field_validator("matrix")
@@ -220,27 +234,27 @@ class Inertia(SchemaModel):
             matrix = np.array(value)
             if np.any(np.abs(matrix - matrix.T) > INPUT_ROUNDING * np.max(np.abs(matrix))):
                 raise invalid_value_error("is not symmetric", "a matrix that equals its transpose")
-            require_physical_inertia((matrix + matrix.T) / 2)
+            _require_physical_inertia((matrix + matrix.T) / 2)
         return value
 
     @model_validator(mode="after")
     def _check_alternatives(self) -> Inertia:
-        self.require_exactly_one("principal", "six", "matrix")
+        self._require_exactly_one("principal", "six", "matrix")
         if self.axes is not None and self.principal is None:
             raise invalid_value_error("gives axes without principal", "axes beside principal only")
         return self
 
 
-def symmetric_matrix(six: list[float]) -> Array:
-    """The matrix of xx, yy, zz, xy, xz, yz."""
+def _symmetric_matrix(six: list[float]) -> Array:
+    """Build the matrix of xx, yy, zz, xy, xz, yz."""
     xx, yy, zz, xy, xz, yz = six
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
-def require_physical_inertia(matrix: Array) -> None:
-    """Refuse what no body has: values that are not positive, or one above the sum of the two others.
+def _require_physical_inertia(matrix: Array) -> None:
+    """Refuse principal moments that are not positive or violate the triangle inequality.
 
-    The three sums J1 + J2 - J3 are twice the second moments of the mass, so none is negative.
+    The sums J1 + J2 − J3 are twice the second moments of the mass, so none is negative.
     """
     values = np.linalg.eigvalsh(matrix)
     shown = ", ".join(f"{value:.6g}" for value in values)
@@ -282,7 +296,7 @@ class Rod(SchemaModel):
     angular_velocity: Vector | None = Field(
         None,
         description="Angular velocity w of the rod at t = 0, world frame: the rate is w × direction, so the "
-        "part along the rod counts for nothing. Or give `rate`.",
+        "part along the rod has no effect. Or give `rate`.",
         json_schema_extra={"unit": "rad/s"},
     )
 
@@ -291,13 +305,13 @@ class Rod(SchemaModel):
     def _length(cls, value: float) -> float:
         if value == 0:
             raise invalid_value_error(
-                "is 0: a rod of no length is a ball joint", "{kind: ball}, or a length above 0"
+                "is 0: a rod without length is a ball joint", "{kind: ball}, or a length above 0"
             )
         if value < 0:
             raise invalid_value_error(f"is {value!r}, below 0", "a length above 0")
         return value
 
-    _direction = field_validator("direction")(require_nonzero)
+    _direction = field_validator("direction")(_require_nonzero)
 
     @field_validator("rate")
     @classmethod
@@ -307,7 +321,7 @@ class Rod(SchemaModel):
             if abs(along) > INPUT_ROUNDING:
                 raise invalid_value_error(
                     f"has a part along the direction, {along:.3g} of its length",
-                    "a rate perpendicular to the direction; angular_velocity needs no such care",
+                    "a rate perpendicular to the direction, or `angular_velocity` instead",
                 )
         return value
 
@@ -348,14 +362,17 @@ class Drag(SchemaModel):
 
 
 class Body(SchemaModel):
-    """One rigid body, hung from the one before; the first from the pivot, the world's origin."""
+    """One rigid body; it hangs from the body before it, the first from the pivot at the world's origin."""
 
     name: str | None = Field(
-        None, max_length=80, description="For the reader; absent: its place in the chain.", examples=["bob"]
+        None,
+        max_length=80,
+        description="A name for readers; absent: its place in the chain.",
+        examples=["bob"],
     )
     mass: float = Field(gt=0, description="Mass, greater than 0.", json_schema_extra={"unit": "kg"})
     inertia: Inertia = Field(description="Inertia about the centre of mass, body frame.")
-    joint: Annotated[Ball | Rod, Discriminator("kind")] = Field(description="What the body hangs by.")
+    joint: Annotated[Ball | Rod, Discriminator("kind")] = Field(description="How the body hangs.")
     proximal: Vector = Field(
         description="The point of this body by which it hangs, body frame (the notes' s_1, s_3).",
         json_schema_extra={"unit": "m"},
@@ -375,19 +392,21 @@ class Body(SchemaModel):
     load: Load = Field(default_factory=Load, description="Constant force and moment on this body.")
     drag: Drag = Field(default_factory=Drag, description="Linear drag on this body.")
 
-    _name = field_validator("name")(lambda value: require_printable(value) if value else value)
+    _name = field_validator("name")(lambda value: _require_printable(value) if value else value)
 
 
 class BodySequence(SchemaModel):
-    """A run of bodies that repeat: body j = 0, 1, 2 … of it copies the bodies of `cycle` in turn.
+    """Repeated bodies: body j = 0, 1, 2 … of them copies the bodies of `cycle` in turn.
 
     With `turn`, body j and its rod (direction and rate) are turned together by j times that
     rotation about its axis in the world; the angular velocity, being in the body's frame, goes along.
     """
 
-    repeat: int = Field(ge=1, le=MAX_BODIES, description="Number of bodies in the run.")
-    cycle: list[Body] = Field(min_length=1, description="The bodies that are copied in turn.")
-    turn: AxisAngle | None = Field(None, description="What body j is turned by, j times. Absent: not turned.")
+    repeat: int = Field(ge=1, le=MAX_BODIES, description="Number of bodies.")
+    cycle: list[Body] = Field(min_length=1, description="The bodies that are copied, one after the other.")
+    turn: AxisAngle | None = Field(
+        None, description="The rotation that body j is turned by, j times. Absent: none."
+    )
 
 
 def _item_tag(value: Any) -> str:
@@ -410,7 +429,7 @@ class Document(SchemaModel):
         None,
         min_length=1,
         max_length=80,
-        description="What it is called in results; absent: the file's name.",
+        description="The name in results; absent: the file's name.",
     )
     family: str = Field(
         "own",
@@ -419,9 +438,9 @@ class Document(SchemaModel):
         description="Group in reports and for `--family`.",
         examples=["double"],
     )
-    title: str = Field(min_length=1, max_length=200, description="One line that says what it is.")
+    title: str = Field(min_length=1, max_length=200, description="One line that describes the scenario.")
     purpose: str = Field(
-        min_length=1, max_length=1000, description="The sentence on what it is there to catch."
+        min_length=1, max_length=1000, description="Which mistakes this scenario reveals, in a sentence."
     )
     exact: ClosedForm | None = Field(
         None,
@@ -450,11 +469,11 @@ class Document(SchemaModel):
     bodies: list[ChainItem] = Field(
         min_length=1,
         max_length=MAX_BODIES,
-        description="The chain, from the pivot outwards: bodies and runs.",
+        description="The chain, from the pivot outwards: single and repeated bodies.",
     )
 
     _text = field_validator("name", "family", "title", "purpose")(
-        lambda value: require_printable(value) if value else value
+        lambda value: _require_printable(value) if value else value
     )
 
     @field_validator("name", "family", "title")
@@ -479,17 +498,25 @@ class Document(SchemaModel):
 
 
 def attitude_quaternion(attitude: Attitude) -> Array:
-    """(4,) the unit quaternion (to rounding) that the attitude means."""
+    """Return the unit quaternion of an attitude, in whichever form the file gives it.
+
+    Args:
+        attitude: a checked field.
+
+    Returns:
+        (4,) scalar first, body → world, unit to rounding.
+
+    """
     if attitude.quaternion is not None:
         return unit_vector(attitude.quaternion)
     if attitude.axis_angle is not None:
         return unit_vector(attitude.axis_angle.quaternion().tolist())
     assert attitude.euler is not None  # the model has exactly one
-    return euler_quaternion(attitude.euler)
+    return _euler_quaternion(attitude.euler)
 
 
-def euler_quaternion(euler: Euler) -> Array:
-    """(4,) intrinsic abc: q_a q_b q_c; extrinsic: the same factors in the other order."""
+def _euler_quaternion(euler: Euler) -> Array:
+    """Return the quaternion (4,); intrinsic abc: q_a q_b q_c, extrinsic: factors in reverse order."""
     order, axes = euler.convention.split()
     angles = euler.angles if euler.angles is not None else [math.radians(a) for a in euler.degrees or ()]
     factors = [
@@ -502,9 +529,17 @@ def euler_quaternion(euler: Euler) -> Array:
 
 
 def inertia_matrix(inertia: Inertia) -> Array:
-    """(3, 3) kg m², symmetric to the bit."""
+    """Return the inertia matrix, in whichever form the file gives it.
+
+    Args:
+        inertia: a checked field.
+
+    Returns:
+        (3, 3) about the centre of mass, body frame, exactly symmetric [kg m²].
+
+    """
     if inertia.six is not None:
-        return symmetric_matrix(inertia.six)
+        return _symmetric_matrix(inertia.six)
     if inertia.matrix is not None:
         matrix = np.array(inertia.matrix)
         return np.asarray((matrix + matrix.T) / 2)

@@ -127,7 +127,7 @@ CASES = {
     "rod of length 0": (
         LENGTH,
         "length: 0",
-        "7:32: bodies[0].joint.length: is 0: a rod of no length is a ball joint; valid would be {kind",
+        "7:32: bodies[0].joint.length: is 0: a rod without length is a ball joint; valid would be {kind",
     ),
     "rod of negative length": (LENGTH, "length: -0.4", "7:32: bodies[0].joint.length: is -0.4, below 0"),
     "rod without direction": (
