@@ -76,8 +76,7 @@ def report(folder: Path, history_folder: Path | None) -> None:
 @click.command(
     short_help="Write a stand-alone script of a disagreement.",
     epilog=examples(
-        "reproduce reports/out",
-        "reproduce reports/out chain-50-balls/pinocchio-aba/state/-/acceleration",
+        "reproduce reports/out", "reproduce reports/out chain-50-balls/pinocchio-aba/state/-/acceleration"
     ),
 )
 @click.argument("result", type=click.Path(path_type=Path, exists=True))

@@ -426,10 +426,7 @@ class Document(SchemaModel):
 
     schema_version: Literal[1] = Field(description="Version of this format: 1.")
     name: str | None = Field(
-        None,
-        min_length=1,
-        max_length=80,
-        description="The name in results; absent: the file's name.",
+        None, min_length=1, max_length=80, description="The name in results; absent: the file's name."
     )
     family: str = Field(
         "own",
