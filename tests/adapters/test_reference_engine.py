@@ -1,14 +1,14 @@
 """The reference as an engine: the map to the contract's quantities, its errors, its raw trajectories."""
 
 import tomllib
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from adapters.reference_engine import Reference
-from plumbline.model.datatypes import EngineFailure, Model
+from plumbline.model.datatypes import EngineFailure
 from plumbline.model.kinematics import (
     angular_velocity,
     mass_matrix,
@@ -16,20 +16,12 @@ from plumbline.model.kinematics import (
     state_from_minimal,
     velocity_jacobian,
 )
-from tests.helpers.notes_test_data import random_chain
+from tests.helpers.random_chains import random_chain
 
 
 def case(rods, seed=0, loads=True):
     """A generic model and a state of it."""
-    rng = np.random.default_rng(seed)
-    chain = random_chain(rng, rods, loads)
-    model = Model(*(getattr(chain, field.name) for field in fields(Model)))
-    n = model.n
-    p, u = rng.normal(size=(n, 4)), rng.normal(size=(n, 3))
-    p /= np.linalg.norm(p, axis=1, keepdims=True)
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    u, udot = u * model.rods[:, None], np.cross(u, rng.normal(size=(n, 3))) * model.rods[:, None]
-    return model, state_from_minimal(model, p, rng.normal(size=(n, 3)), u, udot)
+    return random_chain(np.random.default_rng(seed), rods, rate=1.0, loads=loads, drag=loads)
 
 
 def rates(model, state):

@@ -1,4 +1,4 @@
-"""What the tests of the notes share: random chains and states, on and off the manifold, and exact symbols.
+"""What the tests of the notes share: states on and off the manifold, and exact symbols.
 
 The functions of `reference_impl` are algebra of +, − and ×, so the tests run those very functions on
 polynomials over the rationals: an identity that holds there holds for all values.
@@ -8,40 +8,14 @@ import numpy as np
 from sympy import QQ
 from sympy.polys.rings import ring
 
-from plumbline.model.kinematics import state_from_minimal
-from reference_impl.chain import Chain
 from reference_impl.euler_parameters import euler_parameter_rate
-
-
-def random_chain(rng, rods, loads=True):
-    """A generic chain: full inertia tensors, off-axis attachments, every load; rods: one bool per joint."""
-    n = len(rods)
-    turn = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
-    a, b, c = rng.uniform(0.02, 0.1, (3, n))
-    principal = np.stack([b + c, a + c, a + b], -1)  # any a, b, c > 0 are a body's second moments
-    return Chain(
-        mass=rng.uniform(0.5, 2, n),
-        inertia=(turn * principal[:, None, :]) @ turn.swapaxes(-1, -2),
-        proximal=rng.uniform(-0.4, 0.4, (n, 3)),
-        distal=rng.uniform(-0.4, 0.4, (n, 3)),
-        length=np.where(rods, rng.uniform(0.3, 0.6, n), 0.0),
-        gravity=np.array([0.3, -0.2, -9.7]),
-        force=loads * rng.normal(size=(n, 3)),
-        moment=loads * rng.normal(size=(n, 3)),
-        drag_force=loads * rng.uniform(0.1, 0.3, n),
-        drag_moment=loads * rng.uniform(0.01, 0.1, n),
-    )
+from tests.helpers.random_chains import random_state
 
 
 def on_manifold(chain, rng):
     """r, p, ṙ, ṗ that satisfy every constraint and its rate to rounding."""
-    n = chain.n
-    p, u = rng.normal(size=(n, 4)), rng.normal(size=(n, 3))
-    p /= np.linalg.norm(p, axis=1, keepdims=True)
-    u /= np.linalg.norm(u, axis=1, keepdims=True)
-    omega, udot = rng.normal(size=(n, 3)), np.cross(u, rng.normal(size=(n, 3)))
-    state = state_from_minimal(chain, p, omega, u, udot)
-    return state.r, p, state.v, euler_parameter_rate(p, omega)
+    state = random_state(rng, chain, rate=1.0)
+    return state.r, state.p, state.v, euler_parameter_rate(state.p, state.omega)
 
 
 def off_manifold(chain, rng):

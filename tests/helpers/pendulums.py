@@ -10,6 +10,7 @@ import numpy as np
 from plumbline.model import kinematics
 from plumbline.model.datatypes import Array, Model, State, Trajectory
 from reference_impl.collocation import integrate_collocation
+from tests.helpers.random_chains import random_state
 
 JOINTS = {  # b: hung by a ball joint, r: by a rod
     "ball": "b",
@@ -51,14 +52,7 @@ def model(joints: str, loads: bool = False, drag: bool = False, seed: int = 0) -
 
 def state(subject: Model, seed: int = 0, rate: float = 3.0) -> State:
     """A random state on the manifold; ``rate`` (rad/s) is the standard deviation of every angular rate."""
-    rng = np.random.default_rng(seed)
-    n, rod = subject.n, subject.rods[:, None]
-    p = rng.normal(size=(n, 4))
-    u = _unit(rng, n)
-    udot = np.cross(rate * rng.normal(size=(n, 3)), u)
-    omega = rate * rng.normal(size=(n, 3))
-    p /= np.linalg.norm(p, axis=1, keepdims=True)
-    return kinematics.state_from_minimal(subject, p, omega, np.where(rod, u, 0.0), np.where(rod, udot, 0.0))
+    return random_state(np.random.default_rng(seed), subject, rate)
 
 
 def motion(subject: Model, at: State, times: Array) -> Trajectory:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,42 +11,52 @@ from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import state_from_minimal
 
 
-def random_chain(
+def random_model(
     rng: np.random.Generator,
-    rods: list[bool] | list[int],
+    rods: Sequence[bool | int],
     decades: float = 0.0,
-    rate: float = 2.0,
     loads: bool = False,
     drag: bool = False,
-) -> tuple[Model, State]:
-    """A chain with these joints; masses log-uniform over ± ``decades``, rates Gaussian of size ``rate``."""
-    n, held = len(rods), np.array(rods, dtype=bool)[:, None]
+) -> Model:
+    """A chain with a rod at each joint k with rods[k]; masses are log-uniform over ± ``decades``."""
+    n = len(rods)
     mass = 10 ** rng.uniform(-decades, decades, n)
     axes = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
     size = rng.uniform(0.1, 0.6, (n, 3)) ** 2
     principal = mass[:, None] / 5 * (size.sum(1, keepdims=True) - size)  # ellipsoids: always physical
     inertia = axes @ (principal[..., None] * axes.mT)
-    model = Model(
+    return Model(
         mass=mass,
         inertia=(inertia + inertia.mT) / 2,
         proximal=0.3 * rng.normal(size=(n, 3)),
         distal=0.3 * rng.normal(size=(n, 3)) * (np.arange(n) < n - 1)[:, None],
-        length=np.where(held[:, 0], rng.uniform(0.2, 1.0, n), 0.0),
+        length=np.where(np.array(rods, dtype=bool), rng.uniform(0.2, 1.0, n), 0.0),
         gravity=np.array([0.0, 0.0, -9.81]),
         force=loads * mass[:, None] * rng.normal(size=(n, 3)),
         moment=loads * mass[:, None] * rng.normal(size=(n, 3)),
         drag_force=drag * mass * rng.uniform(0, 1, n),
         drag_moment=drag * mass * rng.uniform(0, 0.1, n),
     )
+
+
+def random_state(rng: np.random.Generator, model: Model, rate: float = 2.0) -> State:
+    """A state on the manifold; ``rate`` (rad/s) is the standard deviation of every angular rate."""
+    n, rod = model.n, model.rods[:, None]
     p = rng.normal(size=(n, 4))
     p /= np.linalg.norm(p, axis=1, keepdims=True)
     u = rng.normal(size=(n, 3))
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     udot = np.cross(rate * rng.normal(size=(n, 3)), u)
-    state = state_from_minimal(
-        model, p, rate * rng.normal(size=(n, 3)), np.where(held, u, 0.0), np.where(held, udot, 0.0)
-    )
-    return model, state
+    omega = rate * rng.normal(size=(n, 3))
+    return state_from_minimal(model, p, omega, np.where(rod, u, 0.0), np.where(rod, udot, 0.0))
+
+
+def random_chain(
+    rng: np.random.Generator, rods: Sequence[bool | int], rate: float = 2.0, **options: float | bool
+) -> tuple[Model, State]:
+    """A random model, ``options`` as `random_model`, and a random state of it."""
+    model = random_model(rng, rods, **options)  # type: ignore[arg-type]
+    return model, random_state(rng, model, rate)
 
 
 def rescaled(model: Model, state: State, length: float, mass: float, time: float) -> tuple[Model, State]:

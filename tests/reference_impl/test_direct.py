@@ -20,7 +20,8 @@ from reference_impl.integrate import (
     unpack_state,
 )
 from reference_impl.joints import constraint_rows
-from tests.helpers.notes_test_data import Symbols, off_manifold, on_manifold, random_chain
+from tests.helpers.notes_test_data import Symbols, off_manifold, on_manifold
+from tests.helpers.random_chains import random_model
 
 MIXES = [[True], [False], [True, True], [False, False], [True, False, False, True, False], [False, True] * 5]
 
@@ -47,7 +48,7 @@ def test_N2_is_lagranges_equation():
 @pytest.mark.parametrize("n", [1, 2])
 def test_N5_is_assembled_as_printed(n, states):
     rng = np.random.default_rng(n)
-    chain = random_chain(rng, [True] * n)
+    chain = random_model(rng, [True] * n, loads=True, drag=True)
     state = states(chain, rng)
     S, b = DirectSystem(chain).assemble(*state)
     S_printed, b_printed = notes.assemble_system(chain, *state)
@@ -60,7 +61,7 @@ def test_N5_is_assembled_as_printed(n, states):
 def test_the_band_and_the_dense_form_give_the_same_solution(rods, states):
     """Both solve S x = b to a backward error of a few roundings, so they differ by that times κ at most."""
     rng = np.random.default_rng(len(rods))
-    chain = random_chain(rng, rods)
+    chain = random_model(rng, rods, loads=True, drag=True)
     state = states(chain, rng)
     system = DirectSystem(chain)
     S, b = system.assemble(*state)
@@ -79,7 +80,7 @@ def test_the_band_and_the_dense_form_give_the_same_solution(rods, states):
 def test_the_solution_obeys_newton_and_euler(rods, without):
     """m r̈ = F + reactions and J ω̇′ + ω′ × J ω′ = moments of the reactions about the centre of mass + n′."""
     rng = np.random.default_rng(11 + len(rods))
-    chain = random_chain(rng, rods)
+    chain = random_model(rng, rods, loads=True, drag=True)
     chain = dataclasses.replace(chain, **{name: np.zeros(chain.n) for name in without})
     r, p, v, pdot = on_manifold(chain, rng)
     x = DirectSystem(chain).solve(r, p, v, pdot)
@@ -103,7 +104,7 @@ def test_the_solution_obeys_newton_and_euler(rods, without):
 def test_units_do_not_decide_the_digits():
     """The same motion with masses × 2^±30: without equilibration the pivots would follow the units."""
     rng = np.random.default_rng(5)
-    chain = random_chain(rng, [True, False, True])
+    chain = random_model(rng, [True, False, True], loads=True, drag=True)
     state = on_manifold(chain, rng)
     x = DirectSystem(chain).solve(*state)
     loads = ("mass", "inertia", "force", "moment", "drag_force", "drag_moment")
@@ -121,7 +122,7 @@ def test_refinement_solves_every_row_to_its_own_rounding():
     """
     rng = np.random.default_rng(0)
     for _ in range(100):
-        chain = random_chain(rng, list(rng.random(4) < 0.5))
+        chain = random_model(rng, list(rng.random(4) < 0.5), loads=True, drag=True)
         scale = 10 ** rng.uniform(-3, 3, 4)
         chain = dataclasses.replace(
             chain, mass=chain.mass * scale, inertia=chain.inertia * scale[:, None, None]
@@ -139,7 +140,7 @@ def test_refinement_solves_every_row_to_its_own_rounding():
 def test_a_planted_defect_is_added_to_every_gamma():
     """C_r r̈ + C_p p̈ = γ + δ, a δ for each row."""
     rng = np.random.default_rng(14)
-    chain = random_chain(rng, [True, False, True])
+    chain = random_model(rng, [True, False, True], loads=True, drag=True)
     state = on_manifold(chain, rng)
     joints, delta = constraint_rows(chain, *state), np.arange(1.0, 6.0)
     x = DirectSystem(chain).solve(*state, gamma_defect=delta)
@@ -153,7 +154,7 @@ def test_a_planted_defect_is_added_to_every_gamma():
 def test_units_do_not_decide_the_steps_of_N6():
     """A thousandth of the size: the absolute tolerance is in the sizes of the motion."""
     rng = np.random.default_rng(15)
-    chain = random_chain(rng, [False], loads=False)
+    chain = random_model(rng, [False])
     r, p, v, pdot = on_manifold(chain, rng)
     times, unit = np.array([0.0, 0.5]), 2.0**-10
     here = integrate_dop853(chain, r, p, v, pdot, times, 1e-6)
@@ -170,7 +171,7 @@ def test_units_do_not_decide_the_steps_of_N6():
 
 def test_a_vanishing_step_of_N6_is_an_error():
     rng = np.random.default_rng(16)
-    chain = random_chain(rng, [False])
+    chain = random_model(rng, [False], loads=True, drag=True)
     stiff = dataclasses.replace(chain, drag_force=np.array([1e17]))
     with pytest.raises(ArithmeticError, match="DOP853 stopped at t = "):
         integrate_dop853(stiff, *on_manifold(chain, rng), np.array([1.0, 2.0]), 1e-6)
@@ -179,7 +180,7 @@ def test_a_vanishing_step_of_N6_is_an_error():
 def test_energy_changes_by_the_power_of_the_loads():
     """Ė = Σ F·ṙ + n′·ω′ (gravity in E): workless joints, rods and balls."""
     rng = np.random.default_rng(6)
-    chain = random_chain(rng, [True, False, True, False])
+    chain = random_model(rng, [True, False, True, False], loads=True, drag=True)
     r, p, v, pdot = on_manifold(chain, rng)
     x = DirectSystem(chain).solve(r, p, v, pdot)
     omega, omega_dot = angular_velocity(p, pdot), 2 * (L(p) @ x.pddot[..., None])[..., 0]
@@ -194,7 +195,7 @@ def test_energy_changes_by_the_power_of_the_loads():
 
 def test_N6_orders_y_as_r_p_v_pdot():
     rng = np.random.default_rng(8)
-    chain = random_chain(rng, [True, False])
+    chain = random_model(rng, [True, False], loads=True, drag=True)
     state = on_manifold(chain, rng)
     y = pack_state(*state)
     for part, back in zip(state, unpack_state(y, 2), strict=True):
@@ -208,7 +209,7 @@ def planar(amplitude, arm=0.4, mass=1.3, about_centre=0.05):
     """A body on a ball joint that swings about the y axis, at rest at ``amplitude``."""
     rng = np.random.default_rng(0)
     chain = dataclasses.replace(
-        random_chain(rng, [False], loads=False),
+        random_model(rng, [False]),
         mass=np.array([mass]),
         inertia=about_centre * np.eye(3)[None],
         proximal=np.array([[0, 0, arm]]),
@@ -235,7 +236,7 @@ def test_N6_swings_with_the_exact_period():
 def test_samples_do_not_change_the_steps():
     """Dense output: the same steps whatever times are asked, and the last sample is a step's own end."""
     rng = np.random.default_rng(9)
-    chain = random_chain(rng, [True, False])
+    chain = random_model(rng, [True, False], loads=True, drag=True)
     state = on_manifold(chain, rng)
     few = integrate_dop853(chain, *state, np.array([0.0, 1.0]), 1e-10)
     many = integrate_dop853(chain, *state, np.linspace(0, 1, 101), 1e-10)
@@ -247,7 +248,7 @@ def test_samples_do_not_change_the_steps():
 
 def test_natural_sizes_are_of_the_stretched_chain_its_fall_and_its_motion():
     rng = np.random.default_rng(12)
-    chain = random_chain(rng, [True, False, True])
+    chain = random_model(rng, [True, False, True], loads=True, drag=True)
     near, far = (np.linalg.norm(s, axis=1) for s in (chain.proximal, chain.distal))
     reach = np.sum(chain.length) + np.sum(near) + far[0] + far[1]
     fall = np.sqrt(np.linalg.norm(chain.gravity) * reach)
@@ -272,7 +273,7 @@ def test_natural_sizes_are_of_the_stretched_chain_its_fall_and_its_motion():
 
 def test_the_structured_form_integrates_the_same_and_steps_are_counted(monkeypatch):
     rng = np.random.default_rng(13)
-    chain = random_chain(rng, [True, False, True])
+    chain = random_model(rng, [True, False, True], loads=True, drag=True)
     state, times = on_manifold(chain, rng), np.linspace(0, 0.3, 4)
     counted = []
 
@@ -293,7 +294,7 @@ def test_the_structured_form_integrates_the_same_and_steps_are_counted(monkeypat
 def test_the_printed_system_is_exact_on_complex_numbers():
     """dS/dp along a direction by a complex step is that by differences: no part drops the imaginary one."""
     rng = np.random.default_rng(14)
-    chain = random_chain(rng, [True, True])
+    chain = random_model(rng, [True, True], loads=True, drag=True)
     r, p, v, pdot = on_manifold(chain, rng)
     along, h = rng.normal(size=p.shape), 1e-6
     S, b = notes.assemble_system(chain, r, p + 1e-30j * along, v, pdot)
@@ -311,7 +312,7 @@ def test_at_rest_stays_at_rest():
 def test_fifty_bodies():
     """A chain of 50 balls: solved in its band, to rounding of the dense form; width 10 whatever N."""
     rng = np.random.default_rng(50)
-    chain = random_chain(rng, [False] * 50)
+    chain = random_model(rng, [False] * 50, loads=True, drag=True)
     state = on_manifold(chain, rng)
     system = DirectSystem(chain)
     dense = solve_dense(*system.assemble(*state))
@@ -323,7 +324,7 @@ def test_fifty_bodies():
 
 def test_one_and_two_bodies_are_what_the_notes_print():
     rng = np.random.default_rng(3)
-    chain = random_chain(rng, [True] * 3)
+    chain = random_model(rng, [True] * 3, loads=True, drag=True)
     with pytest.raises(ValueError, match="one and two bodies"):
         notes.assemble_system(chain, *on_manifold(chain, rng))
 
@@ -331,7 +332,7 @@ def test_one_and_two_bodies_are_what_the_notes_print():
 def test_pdot_of_is_on_the_sphere():
     """ṗ = ½ Lᵀω′ and p̈ of the solution satisfy pᵀp̈ = −ṗᵀṗ (N4)."""
     rng = np.random.default_rng(4)
-    chain = random_chain(rng, [False, True])
+    chain = random_model(rng, [False, True], loads=True, drag=True)
     r, p, v, pdot = on_manifold(chain, rng)
     np.testing.assert_allclose(pdot_of(p, angular_velocity(p, pdot)), pdot, atol=1e-15)
     x = DirectSystem(chain).solve(r, p, v, pdot)

@@ -7,7 +7,8 @@ from reference_impl.chain import Chain
 from reference_impl.euler_parameters import dot
 from reference_impl.joints import constraint_rows
 from reference_impl.notes import DoublePendulum, SinglePendulum
-from tests.helpers.notes_test_data import Symbols, off_manifold, on_manifold, random_chain
+from tests.helpers.notes_test_data import Symbols, off_manifold, on_manifold
+from tests.helpers.random_chains import random_model
 
 
 def symbolic(rods):
@@ -67,7 +68,7 @@ def test_every_mix_of_two_differentiates(rods):
 def test_a_long_mixed_chain_differentiates_by_complex_step(states):
     """Ċ and γ at N = 7; off the manifold pᵀṗ is taken out first, since γ holds only without it (E3)."""
     rng = np.random.default_rng(0)
-    chain = random_chain(rng, [True, False, True, True, False, False, True])
+    chain = random_model(rng, [True, False, True, True, False, False, True], loads=True, drag=True)
     r, p, v, pdot = states(chain, rng)
     pdot = pdot - p * (dot(p, pdot) / dot(p, p))[:, None]
     joints, h = constraint_rows(chain, r, p, v, pdot), 1e-30
@@ -78,7 +79,7 @@ def test_a_long_mixed_chain_differentiates_by_complex_step(states):
 
 def test_consistent_states_satisfy_every_row():
     rng = np.random.default_rng(1)
-    chain = random_chain(rng, [True, False, False, True, True])
+    chain = random_model(rng, [True, False, False, True, True], loads=True, drag=True)
     r, p, v, pdot = on_manifold(chain, rng)
     joints = constraint_rows(chain, r, p, v, pdot)
     assert len(joints.C) == 9
@@ -89,7 +90,7 @@ def test_consistent_states_satisfy_every_row():
 
 def test_a_balls_rows_keep_their_order_in_a_long_chain():
     rng = np.random.default_rng(2)
-    chain = random_chain(rng, [True, False, False] * 15)
+    chain = random_model(rng, [True, False, False] * 15, loads=True, drag=True)
     joints = constraint_rows(chain, *on_manifold(chain, rng))
     assert np.all(np.diff(joints.joint) >= 0)
     balls = joints.r_near[~chain.rods[joints.joint]].reshape(-1, 3, 3)

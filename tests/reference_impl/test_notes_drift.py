@@ -8,7 +8,8 @@ import pytest
 from reference_impl.integrate import direct_acceleration, integrate_dop853
 from reference_impl.joints import constraint_rows
 from reference_impl.stabilised import constraint_errors
-from tests.helpers.notes_test_data import on_manifold, random_chain
+from tests.helpers.notes_test_data import on_manifold
+from tests.helpers.random_chains import random_model
 
 DEFECT = 1e-4
 
@@ -17,7 +18,7 @@ DEFECT = 1e-4
 def test_an_injected_defect_comes_out_as_delta_t_and_half_delta_t_squared(rods):
     """One δ per row, all different, signs mixed; truncation (rtol 1e-12) is far below 1 % of it."""
     rng = np.random.default_rng(len(rods))
-    chain = random_chain(rng, rods)
+    chain = random_model(rng, rods, loads=True, drag=True)
     state = on_manifold(chain, rng)
     count = int(np.sum(np.where(rods, 1, 3)))
     delta = DEFECT * (1 + np.arange(count)) * (-1.0) ** np.arange(count)
@@ -41,7 +42,7 @@ def measure_drift(chain, state, rtol, decades, gamma_defect=0.0, samples=400):
 
 def test_an_injected_defect_has_exponents_1_and_2():
     rng = np.random.default_rng(7)
-    chain = random_chain(rng, [True])
+    chain = random_model(rng, [True], loads=True, drag=True)
     decades = np.array([0.02, 0.2, 2.0])
     (gap, gap_rate, _), _ = measure_drift(chain, on_manifold(chain, rng), 1e-11, decades, DEFECT, samples=40)
     assert abs(np.log10(gap[1] / gap[0]) - 2) < 0.02
@@ -54,7 +55,7 @@ def test_an_injected_defect_has_exponents_1_and_2():
 def drift_falls_with_the_tolerance(rods, decades, tolerances):
     """Drift at each tolerance; every maximum falls by a decade at least for three decades of tolerance."""
     rng = np.random.default_rng(4)
-    chain = random_chain(rng, rods, loads=False)
+    chain = random_model(rng, rods)
     state = on_manifold(chain, rng)
     runs = [measure_drift(chain, state, rtol, decades) for rtol in tolerances]
     for (coarse, _), (fine, _) in pairwise(runs):

@@ -9,10 +9,11 @@ from reference_impl import notes
 from reference_impl.chain import Chain
 from reference_impl.direct import DirectSystem, check_state_solvable, solve_dense
 from reference_impl.errors import SingularSystem
-from reference_impl.euler_parameters import I3, A, A_rate, L, dAs_dp, dot, euler_parameter_rate
+from reference_impl.euler_parameters import I3, A, A_rate, L, dAs_dp, dot
 from reference_impl.integrate import integrate_dop853
 from reference_impl.joints import constraint_rows
-from tests.helpers.notes_test_data import Symbols, off_manifold, on_manifold, random_chain
+from tests.helpers.notes_test_data import Symbols, off_manifold, on_manifold
+from tests.helpers.random_chains import random_model
 
 
 def hanging(rods, length=0.5, arm=0.3):
@@ -59,7 +60,7 @@ def test_E1_printed_with_length_0_is_singular_and_names_the_body(n):
 def test_E1_a_rod_whose_ends_meet_is_singular_in_the_general_form_too():
     """Also where rounding leaves 1e-17 of d, which would otherwise be solved as a direction."""
     rng = np.random.default_rng(0)
-    chain = random_chain(rng, [False, False, False])
+    chain = random_model(rng, [False, False, False], loads=True, drag=True)
     r, p, v, pdot = on_manifold(chain, rng)
     rod = dataclasses.replace(chain, length=np.array([0, 0, 0.4]))
     d = constraint_rows(rod, r, p, v, pdot).d[2]
@@ -70,7 +71,7 @@ def test_E1_a_rod_whose_ends_meet_is_singular_in_the_general_form_too():
 
 def test_E1_the_length_changes_neither_jacobians_nor_gamma():
     rng = np.random.default_rng(1)
-    chain = random_chain(rng, [True, True])
+    chain = random_model(rng, [True, True], loads=True, drag=True)
     state = on_manifold(chain, rng)
     longer = dataclasses.replace(chain, length=chain.length + 1)
     one, other = (DirectSystem(c).assemble(*state) for c in (chain, longer))
@@ -81,7 +82,7 @@ def test_E1_the_length_changes_neither_jacobians_nor_gamma():
 def test_E1_the_ball_is_the_limit_of_the_rod():
     """A rod that starts along the ball's reaction swings about it ever less: positions differ by O(ℓ)."""
     rng = np.random.default_rng(2)
-    ball = random_chain(rng, [False], loads=False)
+    ball = random_model(rng, [False])
     r, p, v, pdot = on_manifold(ball, rng)
     times = np.linspace(0, 0.5, 6)
     truth = integrate_dop853(ball, r, p, v, pdot, times, 1e-10)
@@ -98,37 +99,42 @@ def test_E1_the_ball_is_the_limit_of_the_rod():
 # --- E2, E3 ---------------------------------------------------------------------------------------------
 
 
-def test_E2_changes_only_the_norm_multiplier():
-    """With dᵀd's own derivatives C_p differs by a multiple of pᵀ: r̈, p̈, λ are the same, λ_E is not."""
-    rng = np.random.default_rng(3)
-    chain = random_chain(rng, [True])
-    r, p, v, pdot = on_manifold(chain, rng)
-    s, h = chain.proximal[0], 1e-30
+@pytest.mark.parametrize("n", [1, 2])
+def test_E2_changes_only_the_norm_multiplier(n):
+    """With the derivatives of dᵀd itself C_p differs by multiples of pᵀ: r̈, p̈, λ are the same, λ_E is not."""
+    rng, h = np.random.default_rng(3), 1e-30
+    chain = random_model(rng, [True] * n, loads=True, drag=True)
 
     def jacobian(r, p):
-        d = r + A(p) @ s
-        return np.concatenate([2 * d, 2 * d @ dAs_dp(p, s)])
+        """Of every dᵀd, (N, 7 N)."""
+        near = r + np.einsum("kij,kj->ki", A(p), chain.proximal)
+        far = r + np.einsum("kij,kj->ki", A(p), chain.distal)
+        d = near - np.concatenate([0 * far[:1], far[:-1]])
+        of_r, of_p = np.zeros((n, n, 3), d.dtype), np.zeros((n, n, 4), d.dtype)
+        for k in range(n):
+            of_r[k, k], of_p[k, k] = 2 * d[k], 2 * d[k] @ dAs_dp(p[k], chain.proximal[k])
+            if k > 0:
+                of_r[k, k - 1], of_p[k, k - 1] = -2 * d[k], -2 * d[k] @ dAs_dp(p[k - 1], chain.distal[k - 1])
+        return np.concatenate([of_r.reshape(n, -1), of_p.reshape(n, -1)], axis=1)
 
-    S, b = DirectSystem(chain).assemble(r, p, v, pdot)
-    x = solve_dense(S, b)
-    row = jacobian(r[0], p[0])
-    difference = row[3:] - S[7, 3:7]
-    along = dot(difference, p[0])
-    assert abs(along) > 0.01
-    np.testing.assert_allclose(difference, along * p[0], atol=1e-15)
-    S[7, :7] = S[:7, 7] = row
-    b[7] = -(jacobian(r[0] + 1j * h * v[0], p[0] + 1j * h * pdot[0]).imag / h) @ np.concatenate(
-        [v[0], pdot[0]]
-    )
+    r, p, v, pdot = on_manifold(chain, rng)
+    S, b = notes.assemble_system(chain, r, p, v, pdot)
+    x, rows, rates = solve_dense(S, b), jacobian(r, p), np.concatenate([v.ravel(), pdot.ravel()])
+    difference = (rows - S[7 * n : 8 * n, : 7 * n])[:, 3 * n :].reshape(n, n, 4)  # of C_p, joint by body
+    along = np.einsum("jki,ki->jk", difference, p)
+    assert np.all(np.abs(along[np.tril_indices(n)]) > 0.01)
+    np.testing.assert_allclose(difference, along[..., None] * p, atol=2e-15)
+    S[7 * n : 8 * n, : 7 * n], S[: 7 * n, 7 * n : 8 * n] = rows, rows.T
+    b[7 * n : 8 * n] = -(jacobian(r + 1j * h * v, p + 1j * h * pdot).imag / h) @ rates
     y = solve_dense(S, b)
-    np.testing.assert_allclose(y[:8], x[:8], rtol=0, atol=1e-13)
-    assert abs(y[8] - x[8]) > 1e-3
+    np.testing.assert_allclose(y[: 8 * n], x[: 8 * n], rtol=0, atol=1e-13 * np.max(np.abs(x)))
+    assert np.all(np.abs(y[8 * n :] - x[8 * n :]) > 1e-3)
 
 
 def test_E2_off_the_sphere_is_another_constraint():
     """The notes' C minus dᵀd − ℓ² is s₁ᵀs₁ − s₁ᵀAᵀA s₁: 0 where pᵀp = 1 only."""
     rng = np.random.default_rng(4)
-    chain = random_chain(rng, [True])
+    chain = random_model(rng, [True], loads=True, drag=True)
     for states, off in ((on_manifold, False), (off_manifold, True)):
         r, p, v, pdot = states(chain, rng)
         joints = constraint_rows(chain, r, p, v, pdot)
@@ -143,7 +149,7 @@ def test_E2_off_the_sphere_is_another_constraint():
 def test_E3_is_exact_for_a_chain():
     """γ_true − γ = −d_t(C) rows with 2 (pᵀṗ) I added to every Ȧ, the single one −4 (s₁ᵀṙ)(pᵀṗ)."""
     rng = np.random.default_rng(5)
-    chain = random_chain(rng, [True, True, True])
+    chain = random_model(rng, [True, True, True], loads=True, drag=True)
     r, p, v, pdot = off_manifold(chain, rng)
     h = 1e-30
     joints = constraint_rows(chain, r, p, v, pdot)
@@ -186,7 +192,7 @@ def test_E5_multipliers_at_rest_carry_the_weight(rods):
 
 def test_E5_the_reaction_of_a_rod_is_minus_2_lambda_d():
     rng = np.random.default_rng(6)
-    chain = random_chain(rng, [True, True])
+    chain = random_model(rng, [True, True], loads=True, drag=True)
     state = on_manifold(chain, rng)
     x, d = DirectSystem(chain).solve(*state), constraint_rows(chain, *state).d
     np.testing.assert_allclose(x.joint_reaction, -2 * x.multiplier[:, None] * d, atol=1e-14)
@@ -198,7 +204,7 @@ def test_E5_the_reaction_of_a_rod_is_minus_2_lambda_d():
 
 def test_E7_rank_three_without_the_normalisation_row():
     rng = np.random.default_rng(7)
-    chain = random_chain(rng, [True])
+    chain = random_model(rng, [True], loads=True, drag=True)
     r, p, v, pdot = on_manifold(chain, rng)
     block = 4 * L(p[0]).T @ chain.inertia[0] @ L(p[0])
     assert np.linalg.matrix_rank(block) == 3
@@ -216,7 +222,7 @@ def test_E7_rank_three_without_the_normalisation_row():
 @pytest.mark.parametrize("rods", [[True, True], [False, False], [True, False]], ids=str)
 def test_E7_p_zero_names_the_body(rods):
     rng = np.random.default_rng(8)
-    chain = random_chain(rng, rods)
+    chain = random_model(rng, rods, loads=True, drag=True)
     r, p, v, pdot = on_manifold(chain, rng)
     p[1] = 0
     with pytest.raises(SingularSystem, match=r"p of body 2 is 0.*E7"):
@@ -237,7 +243,7 @@ def test_E7_singular_inertia_names_the_body():
 def test_E1_a_rod_is_as_short_as_its_own_surroundings_allow():
     """A rod of 1e-9 m is a direction beside bodies of decimetres, and rounding 1e7 m from the pivot."""
     rng = np.random.default_rng(16)
-    chain = random_chain(rng, [True, True])
+    chain = random_model(rng, [True, True], loads=True, drag=True)
     r, p, *_ = on_manifold(chain, rng)
     far = np.array([[0, 0, 0], [1e7, 0, 0]])
     d, entries = 1e-9 * np.eye(3)[:2], (np.ones(1),)
@@ -264,7 +270,7 @@ def test_E7_an_inertia_is_flat_beside_its_own_size(heavy):
 def test_a_singular_inertia_that_the_joint_makes_good_is_solved():
     """J of a thin stick hung off its axis: S is regular, and its solution is the limit of thicker sticks."""
     rng = np.random.default_rng(9)
-    chain = random_chain(rng, [False], loads=False)
+    chain = random_model(rng, [False])
     state = on_manifold(chain, rng)
     answers = []
     for thin in (1e-6, 0.0):
@@ -292,17 +298,21 @@ def test_what_is_not_finite_is_named(part, value, message):
         DirectSystem(chain).solve(*state)
 
 
-def test_the_pendulum_of_the_notes_is_regular():
-    """S has its 9 and 18 rows and full rank on rods of ℓ > 0 (E7), s₁ on a body axis included."""
+@pytest.mark.parametrize("n", [1, 2])
+def test_the_pendulum_of_the_notes_is_regular(n):
+    """On rods of ℓ > 0, s₁ on a body axis included, S has rank 9 N (E7), x satisfies every row of (N5)."""
     rng = np.random.default_rng(10)
-    for n in (1, 2):
-        chain = random_chain(rng, [True] * n)
-        chain = dataclasses.replace(chain, proximal=np.array([[-0.4, 0, 0]] * n))
-        state = on_manifold(chain, rng)
-        S, _ = notes.assemble_system(chain, *state)
-        assert S.shape == (9 * n, 9 * n) and np.linalg.matrix_rank(S) == 9 * n
-        x = DirectSystem(chain).solve(*state)
-        np.testing.assert_allclose(
-            notes.solve_system(chain, *state)[: 3 * n], x.acceleration.ravel(), atol=1e-12
-        )
-        assert np.all(euler_parameter_rate(state[1], np.zeros((n, 3))) == 0)
+    chain = random_model(rng, [True] * n, loads=True, drag=True)
+    chain = dataclasses.replace(chain, proximal=np.array([[-0.4, 0, 0]] * n))
+    state = on_manifold(chain, rng)
+    S, b = notes.assemble_system(chain, *state)
+    assert S.shape == (9 * n, 9 * n) and np.linalg.matrix_rank(S) == 9 * n
+    x = notes.solve_system(chain, *state)
+    np.testing.assert_allclose(S @ x, b, atol=1e-12 * np.max(np.abs(b)))
+    general = DirectSystem(chain).solve(*state)
+    np.testing.assert_allclose(x[: 3 * n], general.acceleration.ravel(), atol=1e-12)
+    np.testing.assert_allclose(x[7 * n : 8 * n], general.multiplier, atol=1e-12)
+    loose = dataclasses.replace(chain, proximal=np.zeros((n, 3)), distal=np.zeros((n, 3)))
+    S, _ = notes.assemble_system(loose, *on_manifold(loose, rng))
+    assert np.linalg.matrix_rank(S) == 9 * n
+    assert np.linalg.matrix_rank(S[: 8 * n, : 8 * n]) == 7 * n, "C_p = 0: only the norm holds p̈ along p (E7)"
