@@ -58,7 +58,7 @@ def state_quantities(
 
     Args:
         model: the pendulum.
-        state: the state.
+        state: one on the constraint manifold.
         acceleration: r̈ (N, 3) [m/s²], world frame.
         pddot: p̈ (N, 4) [1/s²].
         reaction: forces on the bodies at their proximal points (N, 3) [N], world frame (E5).

@@ -49,7 +49,15 @@ class GaussTables:
     _extrapolation_cache: dict[float, Array] = field(default_factory=dict)
 
     def extrapolation_matrix(self, ratio: float) -> Array:
-        """(S, S) Legendre modes → values at the nodes of the next step, ``ratio`` times as long."""
+        """Return the matrix from Legendre modes of a step to values at the nodes of the next one.
+
+        Args:
+            ratio: length of the next step over that of this one.
+
+        Returns:
+            (S, S).
+
+        """
         if ratio not in self._extrapolation_cache:
             if len(self._extrapolation_cache) > 64:
                 self._extrapolation_cache.clear()
@@ -59,7 +67,15 @@ class GaussTables:
         return self._extrapolation_cache[ratio]
 
     def mode_integrals(self, tau: Array) -> tuple[Array, Array]:
-        """(T, S) each: the first and second integral from 0 to ``tau`` (T,) per Legendre mode."""
+        """Integrate each Legendre mode once and twice from the start of the step.
+
+        Args:
+            tau: upper limits (T,), fractions of the step.
+
+        Returns:
+            (T, S) each: the first and the second integral.
+
+        """
         S, x = len(self.c), 2 * tau - 1
         P = np.concatenate([-np.ones((len(x), 1)), legvander(x, S + 1)], axis=1)  # P₋₁ = −1, P₀, …
         odd = 2 * np.arange(S + 1) + 1
@@ -72,7 +88,15 @@ class GaussTables:
 
 @cache
 def gauss_tables(S: int) -> GaussTables:
-    """The tables for S nodes."""
+    """Compute the tables of Gauss–Legendre collocation.
+
+    Args:
+        S: number of nodes.
+
+    Returns:
+        The tables, the same object at every call.
+
+    """
     x, w = leggauss(S)
     modes = (legvander(x, S - 1) * w[:, None]).T * (np.arange(S)[:, None] + 0.5)
     table = GaussTables(c=(1 + x) / 2, b=w / 2, A=np.empty((S, S)), node_to_mode=modes)
@@ -95,23 +119,35 @@ def integrate_collocation(
     baumgarte: float = 0.0,
     project: bool = False,
 ) -> BatchIntegrationResult:
-    """Motion of all chains with common steps, sampled at ``times`` (T,); times[0] is the initial time.
+    """Integrate all chains with common steps.
 
-    Initial r, ṙ (M, 3) m, m/s and p, ṗ (M, 4) –, 1/s, the bodies of all chains in order.
+    Where sweeps converge only for steps shorter than the tolerance allows (stiffness: short rods, strong
+    drag), the sweeps set the steps and ``note`` reports it.  DOP853 is no alternative there, being bound by
+    its stability: on a rod of 1e-5 m it took twice the time of the sweeps, and on one of 1e-6 m it had not
+    ended after 200 s where the sweeps took 0.3 s; only with drag of 1e4/s and more is it cheaper, 1.8 times.
 
-    ``dense``: ``rtol`` holds for the polynomial inside the step, measured by its last Legendre modes in
-    the `natural_sizes` of each chain.  Without it the steps end on ``times`` and ``rtol`` holds there
-    only: the ends of steps have order 2 S where the polynomial has S, so the square of the tail counts.
-    ``sweep_tolerance`` ends the sweeps, 0.1 ``rtol`` where it is not given.
-    ``baumgarte`` a (1/s) and ``projected`` (every step's end and every sample, onto the manifold) stabilise;
-    without them it is the notes' raw form.
+    Args:
+        chains: the mechanisms; M bodies in all.
+        r: initial positions (M, 3) [m], world frame, the bodies of all chains in order.
+        p: initial Euler parameters (M, 4).
+        v: initial velocities ṙ (M, 3) [m/s], world frame.
+        pdot: initial rates ṗ (M, 4) [1/s].
+        times: sample times (T,) [s], ascending from the initial time.
+        rtol: tolerance of the error, relative to the `state_scales` of each chain; see ``dense``.
+        nodes: S, of a step.
+        sweep_tolerance: ends the sweeps of a step, relative like ``rtol``; 0.1 ``rtol`` by default.
+        dense: hold ``rtol`` for the polynomial inside the step, measured by its last Legendre modes.
+            Otherwise steps end on ``times`` and ``rtol`` holds there only: the ends of steps have order 2 S
+            where the polynomial has S, so the square of the tail counts.
+        baumgarte: a [1/s] of Baumgarte's stabilisation; 0 is the notes' raw form.
+        project: move the end of every step, and every sample, onto the constraints.
 
-    Where sweeps converge only for steps shorter than the tolerance asks for (stiffness: short rods, strong
-    drag), the steps follow the sweeps and ``note`` says so.  DOP853 is no way out there, being bound by its
-    stability: a rod of 1e-5 m took it twice the time of the sweeps, one of 1e-6 m had not ended after 200 s
-    where the sweeps took 0.3 s; only drag of 1e4/s and more is cheaper by it, 1.8 times.
+    Returns:
+        The motion of all chains at ``times``.
 
-    Raises SingularSystem where S is singular on the way, ArithmeticError where the step vanishes.
+    Raises:
+        ArithmeticError: the step vanishes, or (`SingularSystem`) S is singular on the way.
+
     """
     forest = chains if isinstance(chains, StructuredSystem) else StructuredSystem(chains)
     quiet = 0.1 * rtol if sweep_tolerance is None else sweep_tolerance

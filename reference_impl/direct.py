@@ -1,4 +1,4 @@
-"""The system S x = b of the notes (N1–N5) for a chain: assembled as printed, solved, and read (E5)."""
+"""S x = b (N1–N5) for a chain of N bodies: assembled, solved, and the multipliers as forces (E5)."""
 
 from __future__ import annotations
 
@@ -77,30 +77,67 @@ class DirectSystem:
         self._unsort = np.argsort(by_row)
 
     def assemble(self, r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, Array]:
-        """(N5) S (m, m) and b (m,), m = 8 N + c, at r, ṙ (N, 3), p, ṗ (N, 4), on or off the manifold."""
+        """Assemble S and b of (N5), on or off the constraints.
+
+        Args:
+            r: positions (N, 3) [m], world frame.
+            p: Euler parameters (N, 4).
+            v: velocities ṙ (N, 3) [m/s], world frame.
+            pdot: rates ṗ (N, 4) [1/s].
+
+        Returns:
+            S (m, m) and b (m,), m = 8 N + c, for x = (r̈, p̈, λ, λ_E).
+
+        """
         values, b, _ = self._entries(r, p, v, pdot)
         S = np.zeros((self.size, self.size))
         S[self._i, self._j] = values
         return S, b
 
     def solve(self, r: Array, p: Array, v: Array, pdot: Array, gamma_defect: float | Array = 0.0) -> Solution:
-        """r̈, p̈, λ, λ_E of (N5) at r, ṙ (N, 3) and p, ṗ (N, 4), and what they mean; as `unknowns`."""
+        """Solve (N5).
+
+        Args:
+            r: positions (N, 3) [m], world frame.
+            p: Euler parameters (N, 4).
+            v: velocities ṙ (N, 3) [m/s], world frame.
+            pdot: rates ṗ (N, 4) [1/s].
+            gamma_defect: added to γ, one number or one per row (c,): a planted fault of known growth (E4).
+
+        Returns:
+            r̈, p̈, λ, λ_E and the forces at the joints.
+
+        Raises:
+            SingularSystem: S is singular; the message names the body and the cause (E1, E7).
+
+        """
         return self._solution_from_unknowns(*self.solve_unknowns(r, p, v, pdot, gamma_defect))
 
     def solve_unknowns(
         self, r: Array, p: Array, v: Array, pdot: Array, gamma_defect: float | Array = 0.0
     ) -> tuple[Array, ConstraintRows]:
-        """The unknowns of (N5), x (m,) in the printed order, and the joints' rows.
+        """Solve (N5) for its unknowns alone.
 
         S is equilibrated symmetrically by powers of two (its blocks have the units kg, kg m² and m,
         and would otherwise decide the pivots), factored with partial pivoting and refined once.  Measured
         on chains of four, masses over 1e±3: |S x − b| ≤ 1.0 ε (|S||x| + |b|) in every row, where it is up to
         830 ε without the refinement; more passes of equilibration change nothing.
-        ``gamma_defect`` (a number or (c,)) is added to γ: a planted fault whose growth is known (E4).
 
-        Raises SingularSystem, which names the body and the cause (E1, E7).
+        Args:
+            r: positions (N, 3) [m], world frame.
+            p: Euler parameters (N, 4).
+            v: velocities ṙ (N, 3) [m/s], world frame.
+            pdot: rates ṗ (N, 4) [1/s].
+            gamma_defect: added to γ, one number or one per row (c,): a planted fault of known growth (E4).
+
+        Returns:
+            x (m,) in the printed order, and the rows of the constraints.
+
+        Raises:
+            SingularSystem: S is singular; the message names the body and the cause (E1, E7).
+
         """
-        with np.errstate(all="ignore"):  # what overflows is named below
+        with np.errstate(all="ignore"):  # an overflow raises SingularSystem below
             values, b, joints = self._entries(r, p, v, pdot)
             n, c = self.chain.n, len(self.joint)
             b[7 * n : 7 * n + c] += gamma_defect
@@ -112,7 +149,7 @@ class DirectSystem:
         band = np.zeros((3 * self._width + 1, self.size))
         band[self._band] = entries[self._unsort]
         lu, pivots, _ = lapack.dgbtrf(band, self._width, self._width, overwrite_ab=True)
-        check_pivots(self.chain, lu[2 * self._width])
+        _check_pivots(self.chain, lu[2 * self._width])
         right = b[self._order] * scale
         x, _ = lapack.dgbtrs(lu, self._width, self._width, right, pivots)
         residual = right - np.add.reduceat(entries * x[self._column], self._row_start)
@@ -122,7 +159,18 @@ class DirectSystem:
         return solution, joints
 
     def solve_with_dense_factors(self, r: Array, p: Array, v: Array, pdot: Array) -> Solution:
-        """As `solve`, by dense factors of the assembled S: another way to the same x."""
+        """Solve (N5) by dense factors of the assembled S, an independent way to the x of `solve`.
+
+        Args:
+            r: positions (N, 3) [m], world frame.
+            p: Euler parameters (N, 4).
+            v: velocities ṙ (N, 3) [m/s], world frame.
+            pdot: rates ṗ (N, 4) [1/s].
+
+        Returns:
+            As `solve`.
+
+        """
         S, b = self.assemble(r, p, v, pdot)
         return self._solution_from_unknowns(solve_dense(S, b), constraint_rows(self.chain, r, p, v, pdot))
 
@@ -170,7 +218,19 @@ class DirectSystem:
 
 
 def solve_dense(S: Array, b: Array) -> Array:
-    """X of S x = b, dense, equilibrated and refined as `System.solve`; SingularSystem if S is singular."""
+    """Solve S x = b by dense factors, equilibrated and refined once like `DirectSystem.solve_unknowns`.
+
+    Args:
+        S: symmetric matrix (m, m).
+        b: right-hand side (m,).
+
+    Returns:
+        x (m,).
+
+    Raises:
+        SingularSystem: S is singular to rounding.
+
+    """
     scale = power_of_two_scale(np.max(np.abs(S), axis=1))
     S = S * scale[:, None] * scale
     lu, pivots, _ = lapack.dgetrf(S)
@@ -182,12 +242,28 @@ def solve_dense(S: Array, b: Array) -> Array:
 
 
 def power_of_two_scale(largest: Array) -> Array:
-    """The power of two nearest below 1/√largest, 1 where that is 0: scaling by it rounds nothing."""
+    """Return the powers of two nearest below 1/√largest; scaling by them rounds nothing.
+
+    Args:
+        largest: largest magnitude in each row (m,).
+
+    Returns:
+        (m,); 1 where ``largest`` is 0.
+
+    """
     return np.where(largest > 0, np.ldexp(1.0, -(np.frexp(largest)[1] // 2)), 1.0)
 
 
 def is_singular(pivots: Array) -> bool:
-    """Whether the pivots of an equilibrated matrix say that it is singular to rounding."""
+    """Return whether an equilibrated matrix is singular to rounding.
+
+    Args:
+        pivots: diagonal of its triangular factor (m,).
+
+    Returns:
+        True where the smallest is within m ε of the largest.
+
+    """
     size = np.abs(pivots)
     return not bool(np.min(size) > len(size) * EPS * np.max(size))
 
@@ -195,12 +271,22 @@ def is_singular(pivots: Array) -> bool:
 def check_state_solvable(
     chain: Chain, r: Array, p: Array, d: Array, rods: NDArray[np.bool_], entries: tuple[Array, ...]
 ) -> None:
-    """Raise SingularSystem where the state alone says that S is singular, and of which body (E1, E7).
+    """Check that the state alone does not make S singular (E1, E7).
 
-    ``d`` (N, 3) is where rod k points; below its own rounding (16 ε of the vectors it is the sum of)
-    it is zero, and a row made of it would be noise.  ``entries`` are those of S and b, and ṙ.
+    Args:
+        chain: the mechanism.
+        r: positions (N, 3) [m], world frame.
+        p: Euler parameters (N, 4).
+        d: vectors along the rods (N, 3) [m].  One below its own rounding (16 ε of the vectors that it is the
+            sum of) counts as zero, because a row made of it would be noise.
+        rods: (N,) True where joint k is a rod.
+        entries: arrays that must be finite: entries of S and b, and ṙ.
+
+    Raises:
+        SingularSystem: with the cause and the body.
+
     """
-    if not np.isfinite(sum(x.sum() for x in (*entries, d))):  # no sum of finite entries means as much
+    if not np.isfinite(sum(x.sum() for x in (*entries, d))):  # a sum is finite only where its terms are
         bad = ~(np.isfinite(r).all(-1) & np.isfinite(p).all(-1))
         where = f"the position of body {int(np.argmax(bad)) + 1}" if bad.any() else "a rate or a load"
         raise SingularSystem(f"{where} is not finite, so S x = b has no meaning")
@@ -221,7 +307,7 @@ def check_state_solvable(
         )
 
 
-def check_pivots(chain: Chain, pivots: Array) -> None:
+def _check_pivots(chain: Chain, pivots: Array) -> None:
     """Raise SingularSystem with the likeliest cause where the factored S is singular to rounding."""
     if not is_singular(pivots):
         return

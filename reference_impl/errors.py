@@ -1,4 +1,4 @@
-"""What the reference refuses to answer."""
+"""The exception of the reference."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The joints of an open chain of N bodies, any mix of rods and balls: C, C_r, C_p, γ.
+"""The constraints of an open chain of N bodies on any mix of rods and ball joints: C, C_r, C_p, γ.
 
 Joint k has one row (rod) or three (ball) and touches body k, its near body, and body k−1, its far
 body; the far body of joint 0 is the pivot.  With x = r_k − r_{k−1}, a = A_{k−1} s_{k−1,distal} and
@@ -10,8 +10,8 @@ b = A_k s_{k,proximal} (r, a and their rates are 0 at the pivot), d = x + b − 
     ball  C = d,  C_r = I, −I,  C_p = 2 H_near, −2 H_far                                   (E1, N8)
 
 and γ = −d_t(C_r) ṙ − d_t(C_p) ṗ with Ȧ = 2 G L̇ᵀ in the rods' rows, as the notes have it (E3).
-The ball's γ = −2 Ḣ_near ṗ_near + 2 Ḣ_far ṗ_far is exact for every p.  The rods' rows of one and two
-bodies are S1–S4 and D2–D6: `printed`.
+The ball's γ = −2 Ḣ_near ṗ_near + 2 Ḣ_far ṗ_far is exact for every p.  For one and two
+bodies on rods they are S1–S4 and D2–D6, which `notes` has as printed.
 """
 
 from __future__ import annotations
@@ -39,7 +39,16 @@ class ConstraintRows:
     d: AnyArray  # (N, 3) m, world frame, from where joint k hangs to the near body's proximal point
 
     def constraint_rate(self, v: AnyArray, pdot: AnyArray) -> AnyArray:
-        """Ċ = C_r ṙ + C_p ṗ, (c,); ṙ (N, 3), ṗ (N, 4)."""
+        """Return Ċ = C_r ṙ + C_p ṗ.
+
+        Args:
+            v: velocities ṙ (N, 3) [m/s], world frame.
+            pdot: rates ṗ (N, 4) [1/s].
+
+        Returns:
+            Ċ (c,): m²/s of a rod, m/s of a ball.
+
+        """
         far_v, far_pdot = far_body_values(v), far_body_values(pdot)
         k = self.joint
         moved = dot(self.r_near, v[k] - far_v[k])
@@ -47,17 +56,33 @@ class ConstraintRows:
 
 
 def far_body_values(x: AnyArray) -> AnyArray:
-    """The far body's value for every joint: zeros for the pivot, then x of bodies 0 … N−2."""
+    """Return the far body's value for every joint.
+
+    Args:
+        x: values of the bodies (N, ...).
+
+    Returns:
+        (N, ...): zeros for the pivot, then x of bodies 0 … N−2.
+
+    """
     return np.concatenate([np.zeros_like(x[:1]), x[:-1]])
 
 
 def joint_of_rows(chain: Chain) -> NDArray[np.intp]:
-    """(c,) the joint of each row."""
+    """Number the rows of C by their joints.
+
+    Args:
+        chain: the mechanism; a rod has one row, a ball joint three.
+
+    Returns:
+        (c,) the joint of each row, ascending.
+
+    """
     return np.repeat(np.arange(chain.n), np.where(chain.rods, 1, 3))
 
 
 @dataclass(frozen=True, eq=False)
-class RowLayout:
+class _RowLayout:
     """What the rows of a chain have in common at every state."""
 
     bodies: NDArray[np.intp]  # (2, N) near and far body of each joint; the pivot's is body 0, see `s`
@@ -72,13 +97,12 @@ class RowLayout:
     order: NDArray[np.intp]  # (c,) rows of the rods, then of the balls, in the order of the joints
 
 
-@lru_cache(maxsize=64)  # chains are never changed, and a run asks for the same one ten thousand times
-def row_layout(chain: Chain) -> RowLayout:
-    """The layout of one chain's rows."""
+@lru_cache(maxsize=64)  # chains are never changed, and a run uses the same one ten thousand times
+def _row_layout(chain: Chain) -> _RowLayout:
     k = np.arange(chain.n)
     s = np.stack([chain.proximal, far_body_values(chain.distal)])
     rod, ball = np.flatnonzero(chain.rods), np.flatnonzero(~chain.rods)
-    return RowLayout(
+    return _RowLayout(
         bodies=np.stack([k, np.maximum(k - 1, 0)]),
         s=s,
         B=B(s),
@@ -93,8 +117,20 @@ def row_layout(chain: Chain) -> RowLayout:
 
 
 def constraint_rows(chain: Chain, r: AnyArray, p: AnyArray, v: AnyArray, pdot: AnyArray) -> ConstraintRows:
-    """C, C_r, C_p and γ of every joint at r, ṙ (N, 3), p, ṗ (N, 4), on or off the manifold."""
-    fixed = row_layout(chain)
+    """Evaluate C, C_r, C_p and γ of every joint (S1–S4, D2–D6 for rods; E1, N8 for balls).
+
+    Args:
+        chain: the mechanism.
+        r: positions (N, 3) [m], world frame.
+        p: Euler parameters (N, 4).
+        v: velocities ṙ (N, 3) [m/s], world frame.
+        pdot: rates ṗ (N, 4) [1/s].
+
+    Returns:
+        The rows in the order of the joints, on or off the constraints.
+
+    """
+    fixed = _row_layout(chain)
     s = fixed.s
     q, qdot = p[fixed.bodies], pdot[fixed.bodies]  # (2, N, 4): near and far body of each joint
     x, xdot = r.copy(), v.copy()  # from the far body to the near one

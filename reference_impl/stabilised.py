@@ -15,6 +15,7 @@ import numpy as np
 from reference_impl.chain import Array, Chain
 from reference_impl.collocation import DEFAULT_NODES, BatchIntegrationResult, integrate_collocation
 from reference_impl.euler_parameters import angular_velocity
+from reference_impl.integrate import IntegrationResult
 from reference_impl.structured import StructuredSystem, component_first
 
 BAUMGARTE_RATE = 10.0  # 1/s
@@ -47,7 +48,27 @@ def integrate_variant(
     rate: float = BAUMGARTE_RATE,
     nodes: int = DEFAULT_NODES,
 ) -> BatchIntegrationResult:
-    """Collocation of one of `VARIANTS`; arguments as `collocation.integrate`, ``rate`` a in 1/s."""
+    """Integrate one of `VARIANTS` by collocation.
+
+    Args:
+        variant: "raw", "baumgarte" or "projected".
+        chain: the mechanism.
+        r: initial positions (N, 3) [m], world frame.
+        p: initial Euler parameters (N, 4).
+        v: initial velocities ṙ (N, 3) [m/s], world frame.
+        pdot: initial rates ṗ (N, 4) [1/s].
+        times: sample times (T,) [s], ascending from the initial time.
+        rtol: relative tolerance of the integration.
+        rate: Baumgarte's a [1/s].
+        nodes: of the collocation.
+
+    Returns:
+        The motion at ``times``.
+
+    Raises:
+        ValueError: there is no such variant.
+
+    """
     if variant not in VARIANTS:
         raise ValueError(f"no variant {variant!r}; there are {VARIANTS}")
     return integrate_collocation(
@@ -72,9 +93,22 @@ def drift_table(
     samples: int = 40,
     variants: Sequence[str] = VARIANTS,
 ) -> list[DriftRow]:
-    """One `Drift` for every variant, tolerance and time; ``samples`` of each decade go into the maxima.
+    """Measure how far each variant leaves the constraints and its energy.
 
-    Energy is judged only without loads and drag, NaN with them.
+    Args:
+        chain: the mechanism.
+        r: initial positions (N, 3) [m], world frame.
+        p: initial Euler parameters (N, 4).
+        v: initial velocities ṙ (N, 3) [m/s], world frame.
+        pdot: initial rates ṗ (N, 4) [1/s].
+        rtols: relative tolerances of the integration.
+        times: ends of the intervals [0, time] [s].
+        samples: number of samples in each interval, of which the maxima are taken.
+        variants: names from `VARIANTS`.
+
+    Returns:
+        A row for every variant, tolerance and time; its energy error is NaN with loads or drag.
+
     """
     grid = np.unique(np.concatenate([np.linspace(0, end, samples + 1) for end in times]))
     table = []
@@ -89,8 +123,17 @@ def drift_table(
     return table
 
 
-def constraint_errors(chain: Chain, motion: BatchIntegrationResult) -> tuple[Array, Array, Array]:
-    """Largest gap (m), gap rate (m/s) and |‖p‖ − 1| at each sample, (T,) each."""
+def constraint_errors(chain: Chain, motion: IntegrationResult) -> tuple[Array, Array, Array]:
+    """Measure the constraint errors of a motion, of the worst joint or body at each sample.
+
+    Args:
+        chain: the mechanism.
+        motion: T samples of it.
+
+    Returns:
+        Gap [m], gap rate [m/s] and |‖p‖ − 1|, (T,) each.
+
+    """
     forest, found = StructuredSystem([chain]), []
     for state in zip(motion.r, motion.p, motion.v, motion.pdot, strict=True):
         d, rate = forest.joint_gaps(component_first(*state[:2]), component_first(*state[2:]))
@@ -103,8 +146,17 @@ def constraint_errors(chain: Chain, motion: BatchIntegrationResult) -> tuple[Arr
     return gap, gap_rate, norm
 
 
-def energy_error(chain: Chain, motion: BatchIntegrationResult) -> Array:
-    """|E − E(0)| (T,) over Σ m g (reach of the stretched chain); NaN with loads or drag."""
+def energy_error(chain: Chain, motion: IntegrationResult) -> Array:
+    """Measure the change of the energy.
+
+    Args:
+        chain: the mechanism.
+        motion: T samples of it.
+
+    Returns:
+        |E − E(0)| (T,) over Σ m g (reach of the stretched chain); NaN with loads or drag.
+
+    """
     if any(np.any(x) for x in (chain.force, chain.moment, chain.drag_force, chain.drag_moment)):
         return np.full(len(motion.t), np.nan)
     omega = angular_velocity(motion.p, motion.pdot)

@@ -159,7 +159,15 @@ class StructuredSystem:
             )
 
     def repeated(self, count: int) -> StructuredSystem:
-        """The same chains ``count`` times over: all of them, then all again."""
+        """Repeat the chains: all of them, then all again.
+
+        Args:
+            count: how many times.
+
+        Returns:
+            A system of ``count`` times as many chains.
+
+        """
         tiled = object.__new__(StructuredSystem)
         tiled.__dict__.update(self.__dict__)
         tiled.chains, tiled.body_count = self.chains * count, self.body_count * count
@@ -197,7 +205,16 @@ class StructuredSystem:
         return Rs, norm * Rs + (norm - 1) * self.s
 
     def joint_gaps(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return d and ḋ (3, M) of every joint, from where it hangs to body k's proximal point."""
+        """Return the vectors d from where joint k hangs to body k's proximal point, and their rates.
+
+        Args:
+            q: (r; p) (7, M) [m, –].
+            v: (ṙ; ṗ) (7, M) [m/s, 1/s].
+
+        Returns:
+            d (3, M) [m] and ḋ (3, M) [m/s], world frame.
+
+        """
         norm, R = self._norm_and_rotation(q)
         Rs, As = self._attachment_points(norm, R)
         rates = self._rate_products(q, v)
@@ -208,7 +225,16 @@ class StructuredSystem:
         return d, v[:3] + velocity[0] - self._at_parent(v[:3] + velocity[1])
 
     def constraints(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """C and Ċ, padded (c, M): d of a ball, dᵀd − ℓ² of a rod."""
+        """Evaluate the constraints: d of a ball joint, dᵀd − ℓ² of a rod (E1).
+
+        Args:
+            q: (r; p) (7, M) [m, –].
+            v: (ṙ; ṗ) (7, M) [m/s, 1/s].
+
+        Returns:
+            C and Ċ (c, M); where c = 3, rows 2 and 3 of a rod are 0.
+
+        """
         d, rate = self.joint_gaps(q, v)
         rod = np.stack([_dot(d, d) - self.length**2, 2 * _dot(d, rate)])
         if self.rows_per_joint == 1:
@@ -312,10 +338,19 @@ class StructuredSystem:
     # -- accelerations ------------------------------------------------------------------------------
 
     def acceleration(self, q: Array, v: Array, baumgarte: float = 0.0) -> Array:
-        """(r̈; p̈) (7, M) at q = (r; p), v = (ṙ; ṗ), on or off the manifold.
+        """Return the accelerations, on or off the constraints.
 
-        ``baumgarte`` a (1/s) adds −2 a Ċ − a² C to γ and likewise to γ_E; 0 is the notes' raw form.
-        Raises SingularSystem.
+        Args:
+            q: (r; p) (7, M) [m, –].
+            v: (ṙ; ṗ) (7, M) [m/s, 1/s].
+            baumgarte: a [1/s]; adds −2 a Ċ − a² C to γ and likewise to γ_E.  0 is the notes' raw form.
+
+        Returns:
+            (r̈; p̈) (7, M) [m/s², 1/s²].
+
+        Raises:
+            SingularSystem: S is singular.
+
         """
         return self._solve_motion(q, v, baumgarte)[0]
 
@@ -396,9 +431,20 @@ class StructuredSystem:
         return rods_only
 
     def solve(self, r: Array, p: Array, v: Array, pdot: Array) -> Solution:
-        """r̈, p̈, λ, λ_E of (N5) for every chain at r, ṙ (M, 3), p, ṗ (M, 4); `joint` counts all bodies.
+        """Solve (N5) for every chain.
 
-        Raises SingularSystem, which names the body of its chain and the cause (E1, E7).
+        Args:
+            r: positions (M, 3) [m], world frame.
+            p: Euler parameters (M, 4).
+            v: velocities ṙ (M, 3) [m/s], world frame.
+            pdot: rates ṗ (M, 4) [1/s].
+
+        Returns:
+            r̈, p̈, λ, λ_E and the forces at the joints; its ``joint`` counts the bodies of all chains.
+
+        Raises:
+            SingularSystem: S is singular; the message names the body of its chain and the cause (E1, E7).
+
         """
         q, qdot = component_first(r, p), component_first(v, pdot)
         if not np.isfinite(q).all():
@@ -433,10 +479,21 @@ class StructuredSystem:
     # -- the manifold -------------------------------------------------------------------------------
 
     def project(self, q: Array, v: Array) -> tuple[Array, Array]:
-        """Return q, v moved onto C = 0, pᵀp = 1, Ċ = 0, pᵀṗ = 0 by Newton steps in the metric of M and 4LᵀJL.
+        """Project onto C = 0, pᵀp = 1, Ċ = 0, pᵀṗ = 0 by Newton steps in the metric of M and 4 LᵀJL.
 
         Two steps at position level: the first leaves the square of the gap, which for the drift of one
-        integration step is below rounding.  Raises SingularSystem.
+        integration step is below rounding.
+
+        Args:
+            q: (r; p) (7, M) [m, –].
+            v: (ṙ; ṗ) (7, M) [m/s, 1/s].
+
+        Returns:
+            q and v on the constraints.
+
+        Raises:
+            SingularSystem: S is singular.
+
         """
         q, v = q.copy(), v.copy()
         for _ in range(2):
@@ -459,5 +516,14 @@ class StructuredSystem:
 
 
 def component_first(a: Array, b: Array) -> Array:
-    """(7, M), component first, of r or ṙ (M, 3) and p or ṗ (M, 4)."""
+    """Stack body-first arrays into one component-first array.
+
+    Args:
+        a: r or ṙ (M, 3).
+        b: p or ṗ (M, 4).
+
+    Returns:
+        (7, M), contiguous.
+
+    """
     return np.ascontiguousarray(np.concatenate([a.T, b.T]))
