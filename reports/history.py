@@ -38,6 +38,7 @@ class History:
 
         Returns:
             The nights completed before ``current``, which all are where ``current`` is not among them.
+
         """
         if folder is None:
             return cls()
@@ -62,6 +63,7 @@ class History:
 
         Returns:
             True where the verdict differs from that run's, or is unexpected and the key is new.
+
         """
         green = self.last_passed
         if green is None or row["verdict"] == "agrees":

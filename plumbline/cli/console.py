@@ -141,7 +141,7 @@ def print_result(result: RunResult) -> None:
     for row in result.rows:
         if row.verdict != Verdict.AGREES and row.known_issue is None:
             out.print(f"{_coloured_glyph(row)} {escape(row.key)}: {escape(row.reason)}")
-    for entry in result.stale_entries:
+    for entry in result.stale_issues:
         out.print(
             f"[red]![/] known entry {escape(entry.id)} no longer occurs: remove it from known_issues.yaml"
         )

@@ -1,11 +1,9 @@
-"""The nightly: everything, unattended; one folder per night, and what is unfinished beside them.
+"""The nightly: runs everything unattended, resumes after interruption, keeps the history of earlier nights.
 
-    OUT/unfinished/plan.json   seed and number of the random scenarios, when it was begun
-    OUT/unfinished/cells/      finished cells (`plumbline.execution.result_cache`)
-    OUT/unfinished/night/      results as they are written, and what the instrument's own test said
-    OUT/history/ID/            a complete night, moved there by one rename
-
-Killed at any moment, the same command reads the plan and goes on; a folder in history is never half.
+OUT/unfinished/plan.json   seed and number of the random scenarios, start of the night
+OUT/unfinished/cells/      finished cells (`plumbline.execution.result_cache`)
+OUT/unfinished/night/      results while they are written, and the self-test's JUnit file
+OUT/history/ID/            a complete night, moved there by one rename
 """
 
 from __future__ import annotations
@@ -21,139 +19,189 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import reports
+from plumbline.execution.plan import LevelSelection, Plan, ProgressCallback
 from plumbline.execution.result_cache import DiskResultCache
-from plumbline.execution.runner import LevelSelection, Plan, ProgressCallback, RunResult, run_plan, save
+from plumbline.execution.runner import RunResult, run_plan, save
 from plumbline.execution.selftest import SelfTestResult
 from plumbline.processes.workers import Limits
-from plumbline.scenario import loader as scenarios
+from plumbline.reproduce import write
 from plumbline.scenario.generator import RANDOM_FAMILY, RandomScenarios
+from plumbline.scenario.loader import Scenario
 from plumbline.storage.history import next_night_number, stored_runs
 from plumbline.storage.results_store import write_atomically
 
-EXTRA_REFINEMENTS = 1  # halvings beyond the quick ladders
+EXTRA_REFINEMENTS = 1  # halvings of the finest step beyond a run's refinement study
 
 
 @dataclass(frozen=True)
 class NightPlan:
-    """What one night adds to the catalogue, and when it was begun."""
+    """The random scenarios of one night, and its start."""
 
     seed: int
     random_count: int
     started: str  # ISO 8601, UTC
 
     @classmethod
-    def resume_or_start(cls, folder: Path, seed: int | None, random: int) -> NightPlan:
-        """The unfinished night of ``folder`` if it is the same one, else a new one, written down."""
+    def resume_or_start(cls, folder: Path, seed: int | None, random_count: int) -> NightPlan:
+        """Read the plan of the unfinished night, or write a new one.
+
+        Args:
+            folder: folder of the unfinished night.
+            seed: seed of the random scenarios; None for the unfinished night's, or a new one.
+            random_count: number of random scenarios.
+
+        Returns:
+            The plan of the unfinished night if it has this seed and number, else a new one.
+
+        Raises:
+            OSError: the plan cannot be written.
+
+        """
         path = folder / "plan.json"
         try:
             night = cls(**json.loads(path.read_text(encoding="utf-8")))
-            if night.random_count == random and seed in (None, night.seed):
+            if night.random_count == random_count and seed in (None, night.seed):
                 return night
         except (OSError, ValueError, TypeError):
-            pass  # none, or damaged: a new one
-        night = cls(secrets.randbits(32) if seed is None else seed, random, utc_now())
+            pass  # missing or damaged: a new one
+        started = datetime.now(UTC).isoformat(timespec="seconds")
+        night = cls(secrets.randbits(32) if seed is None else seed, random_count, started)
         folder.mkdir(parents=True, exist_ok=True)
         write_atomically(path, json.dumps(asdict(night)).encode())
         return night
 
 
-def utc_now() -> str:
-    """The time, UTC, to the second."""
-    return datetime.now(UTC).isoformat(timespec="seconds")
-
-
 def run_nightly(
     out: Path,
-    selected_scenarios: Sequence[scenarios.Scenario],
+    scenarios: Sequence[Scenario],
     engines: Sequence[str],
     *,
-    random: int,
+    random_count: int,
     seed: int | None,
     jobs: int,
     limits: Limits,
-    whole: bool,
+    is_full_catalogue: bool,
     command: str,
-    finer: int = EXTRA_REFINEMENTS,
-    endurance: float = 0.0,
+    extra_refinements: int = EXTRA_REFINEMENTS,
+    long_run_seconds: float = 0.0,
     level: LevelSelection = "all",
     scheduler: str | None = None,
     self_test: Callable[[Path], SelfTestResult] | None = None,
     progress: ProgressCallback,
     log: Callable[[str], None],
 ) -> tuple[RunResult, Path]:
-    """Run a night, or what is left of it; returns its result and its folder in OUT/history.
+    """Run a night, or what is left of an interrupted one.
 
-    ``instrument`` is the instrument's own test, given the place of its JUnit file.
+    Args:
+        out: output folder of all nights.
+        scenarios: scenarios of the catalogue to run.
+        engines: names of the engines.
+        random_count: number of random scenarios.
+        seed: their seed; None for the interrupted night's, or a new one.
+        jobs: number of worker processes.
+        limits: limits of each task.
+        is_full_catalogue: whether every known issue must occur.
+        command: the command line, stored with the results.
+        extra_refinements: halvings of the finest step beyond a run's refinement study.
+        long_run_seconds: length of the long runs [s]; 0 for none.
+        level: levels to compare at.
+        scheduler: address of a dask cluster to run on.
+        self_test: runs the self-test and writes its JUnit file to the given path; None for no self-test.
+        progress: called after every task.
+        log: called with sentences for the user.
+
+    Returns:
+        The result and the night's folder in OUT/history.
+
+    Raises:
+        OSError: a file cannot be written; the same call goes on from there.
+        ExecutorUnavailable: the cluster cannot be had.
+
     """
-    unfinished = out / "unfinished"
-    night = NightPlan.resume_or_start(unfinished, seed, random)
-    if is_already_recorded(night, out / "history"):  # killed as it was done: only this was left of it
+    unfinished, history = out / "unfinished", out / "history"
+    night = NightPlan.resume_or_start(unfinished, seed, random_count)
+    if _is_recorded(night, unfinished, history):  # interrupted when only the clean-up was left
         shutil.rmtree(unfinished)
-        night = NightPlan.resume_or_start(unfinished, seed, random)
-    kept = sum(1 for _ in unfinished.glob("cells/*.cell"))
+        night = NightPlan.resume_or_start(unfinished, seed, random_count)
+    finished = sum(1 for _ in unfinished.glob("cells/*.cell"))
     log(f"random scenarios: {night.random_count}, seed {night.seed}")
-    if kept:
-        log(f"going on with the night begun {night.started}: {kept} cells are done")
-    drawn = RandomScenarios(night.seed, night.random_count)
+    if finished:
+        log(f"resuming the night begun {night.started}: {finished} cells are finished")
+    random_scenarios = RandomScenarios(night.seed, night.random_count)
     plan = Plan(
-        selected_scenarios,
+        scenarios,
         engines,
         level,
         jobs=jobs,
         limits=limits,
-        extra_refinements=finer,
-        long_run_seconds=endurance,
-        is_full_catalogue=whole,
+        extra_refinements=extra_refinements,
+        long_run_seconds=long_run_seconds,
+        is_full_catalogue=is_full_catalogue,
         scheduler=scheduler,
-        random_scenarios=drawn,
+        random_scenarios=random_scenarios,
         result_cache=DiskResultCache(unfinished / "cells", log),
     )
     result = run_plan(plan, progress)
-    place = unused_path(out / "history" / result.metadata["id"])
-    result.metadata |= {"id": place.name, "night": next_night_number(place.parent)}
+    place = unused_path(history / result.metadata["id"])
+    result.metadata |= {"id": place.name, "night": next_night_number(history)}
     result.metadata |= {"started": night.started, "random": night.random_count, "seed": night.seed}
     folder = unfinished / "night"
     shutil.rmtree(folder, ignore_errors=True)
     if self_test is not None:
         folder.mkdir()
         answer = self_test(folder / "self_test.xml")
-        result.metadata |= {
-            "self_test": answer.counts,
-            "sentence": f"{result.metadata['sentence']}; {answer.summary}",
-        }
+        result.metadata["self_test"] = answer.counts
+        result.metadata["sentence"] += f"; {answer.summary}"
         if answer.failure:
             result.metadata["exit_code"] = result.metadata["exit_code"] or 1
     save(result, folder, command)
-    write_random_scenario_files(result, drawn, folder / "scenarios")
+    write_random_scenario_files(result, random_scenarios, folder / "scenarios")
     with result.cpu_times.measure("report"):
-        reports.write(folder, out / "history")
-    place.parent.mkdir(exist_ok=True)
+        write.write(folder)
+        reports.write(folder, history)
+    history.mkdir(exist_ok=True)
     os.replace(folder, place)
     shutil.rmtree(unfinished)
     return result, place
 
 
-def is_already_recorded(night: NightPlan, history: Path) -> bool:
-    """Whether that very night is complete already."""
-    if not (history.parent / "unfinished" / "cells").is_dir():
-        return False
-    wanted = night.started, night.seed, night.random_count
-    return any(
-        tuple(run.metadata.get(name) for name in ("started", "seed", "random")) == wanted
-        for run in stored_runs(history)
-    )
-
-
 def unused_path(place: Path) -> Path:
-    """``place``, or with a number after it where a clock that was set back gave another night its name."""
+    """Return a path that does not exist: a clock that was set back can give two nights the same name.
+
+    Args:
+        place: the wanted path.
+
+    Returns:
+        ``place``, or with -2, -3, … after it.
+
+    """
     names = itertools.chain([place], (place.with_name(f"{place.name}-{k}") for k in itertools.count(2)))
     return next(name for name in names if not name.exists())
 
 
-def write_random_scenario_files(result: RunResult, drawn: Sequence[scenarios.Scenario], folder: Path) -> None:
-    """The scenario file of every random scenario that someone should see: `run FILE` repeats it."""
-    wanted = {row.scenario for row in result.rows if row.family == RANDOM_FAMILY}
-    for s in (drawn[int(name.rpartition("-")[2])] for name in sorted(wanted)):
+def write_random_scenario_files(result: RunResult, drawn: Sequence[Scenario], folder: Path) -> None:
+    """Write the files of the random scenarios that have rows in the result, so that `run FILE` repeats them.
+
+    Args:
+        result: the night's result.
+        drawn: the random scenarios, by their number.
+        folder: folder of the files.
+
+    Raises:
+        OSError: a file cannot be written.
+
+    """
+    names = {row.scenario for row in result.rows if row.family == RANDOM_FAMILY}
+    for s in (drawn[int(name.rpartition("-")[2])] for name in sorted(names)):
         folder.mkdir(exist_ok=True)
         text = json.dumps(s.document, indent=1)  # JSON is YAML
         write_atomically(folder / f"{s.name}.yaml", text.encode())
+
+
+def _is_recorded(night: NightPlan, unfinished: Path, history: Path) -> bool:
+    """Whether the unfinished night is complete in the history already."""
+    wanted = night.started, night.seed, night.random_count
+    return (unfinished / "cells").is_dir() and any(
+        tuple(run.metadata.get(name) for name in ("started", "seed", "random")) == wanted
+        for run in stored_runs(history)
+    )

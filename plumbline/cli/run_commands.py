@@ -30,9 +30,11 @@ from plumbline.cli.options import (
     scheduler_option,
 )
 from plumbline.engines.registry import ENGINES
+from plumbline.execution.plan import Plan
 from plumbline.execution.result_cache import DiskResultCache
-from plumbline.execution.runner import Plan, RunResult, run_plan, save
+from plumbline.execution.runner import RunResult, run_plan, save
 from plumbline.processes.workers import Limits
+from plumbline.reproduce import write
 from plumbline.storage.results_store import row_record, to_json_value
 
 
@@ -93,6 +95,7 @@ def run(
             result = run_plan(plan, progress)
         save(result, folder, _command_line())
         with result.cpu_times.measure("report"):
+            write.write(folder)
             report = reports.write(folder)
         cache.clear()
     if as_json:
@@ -170,9 +173,9 @@ def nightly(
     folder = ensure_writable(out)
     with exit_on_io_error(), ProgressDisplay(sys.stderr) as progress:
         result, place = run_nightly(
-            folder, chosen, engines, random=random_count, seed=seed, jobs=jobs, limits=limits,
-            whole=not names and engines == list(ENGINES), finer=extra_refinements, progress=progress,
-            endurance=long_run_seconds, scheduler=scheduler, self_test=run_self_test if self_test else None,
+            folder, chosen, engines, random_count=random_count, seed=seed, jobs=jobs, limits=limits,
+            is_full_catalogue=not names and engines == list(ENGINES), extra_refinements=extra_refinements, progress=progress,
+            long_run_seconds=long_run_seconds, scheduler=scheduler, self_test=run_self_test if self_test else None,
             command=_command_line(), log=_log,
         )  # fmt: skip
     _finish(result, place / "report.html", as_json=False)

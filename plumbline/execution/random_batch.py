@@ -1,4 +1,4 @@
-"""Probes: many scenarios at state level, of which only what someone should see is kept one by one."""
+"""Random scenarios at state level: rows that need no look are counted, the others are kept."""
 
 from __future__ import annotations
 
@@ -9,36 +9,41 @@ from typing import Any
 
 from plumbline.judging.rows import Row, Verdict
 
-# What a probe may say without being looked at: it agrees, or cannot and that is recorded.
-UNREMARKABLE_VERDICTS: tuple[Verdict, ...] = (Verdict.AGREES, Verdict.UNSUPPORTED, Verdict.NOT_INSTALLED)
-
 
 @dataclass
 class RandomBatch:
-    """What the probes of a run came to, in a size that does not depend on their number."""
+    """Counts over the random scenarios of a run, in a size that does not depend on their number."""
 
     scenario_count: int = 0
-    counts_by_verdict: Counter[Verdict] = field(default_factory=Counter)  # rows that are not kept, by verdict
-    worst_ratios: dict[tuple[str, str], tuple[float, str]] = field(
-        default_factory=dict
-    )  # by engine and quantity
+    counts_by_verdict: Counter[Verdict] = field(default_factory=Counter)  # of rows that are not kept
+    # by engine and quantity: the worst ratio of rows that are not kept, and its scenario
+    worst_ratios: dict[tuple[str, str], tuple[float, str]] = field(default_factory=dict)
 
     def add_scenario(self, rows: Sequence[Row]) -> list[Row]:
-        """Count a probe's rows, known ones marked; those of engines of which one should be seen are kept."""
+        """Count the rows of a scenario.
+
+        Args:
+            rows: all its rows, known issues marked.
+
+        Returns:
+            The rows to keep: all of the engines with a row that needs a look.
+
+        """
         self.scenario_count += 1
-        seen = {row.engine for row in rows if is_remarkable(row)}
+        kept = {row.engine for row in rows if _needs_a_look(row)}
         for row in rows:
-            if row.engine in seen:
+            if row.engine in kept:
                 continue
             self.counts_by_verdict[row.verdict] += 1
             if row.ratio is not None:
                 cell = row.engine, row.quantity
-                found = row.ratio, row.scenario
-                self.worst_ratios[cell] = max(found, self.worst_ratios.get(cell, (-1.0, "")))
-        return [row for row in rows if row.engine in seen]
+                self.worst_ratios[cell] = max(
+                    (row.ratio, row.scenario), self.worst_ratios.get(cell, (-1.0, ""))
+                )
+        return [row for row in rows if row.engine in kept]
 
     def summary(self) -> dict[str, Any]:
-        """As results.json holds it."""
+        """Return what results.json holds of the random scenarios."""
         return {
             "scenarios": self.scenario_count,
             "counts_by_verdict": dict(self.counts_by_verdict),
@@ -49,8 +54,8 @@ class RandomBatch:
         }
 
 
-def is_remarkable(row: Row) -> bool:
-    """Whether someone should see what is said of a probe, recorded or not."""
-    return row.verdict not in UNREMARKABLE_VERDICTS or (
-        row.verdict == Verdict.UNSUPPORTED and not row.known_issue
-    )
+def _needs_a_look(row: Row) -> bool:
+    """Whether a row is neither agreement nor a gap that is recorded; other recorded verdicts are shown too."""
+    if row.verdict == Verdict.UNSUPPORTED:
+        return not row.known_issue
+    return row.verdict not in (Verdict.AGREES, Verdict.NOT_INSTALLED)

@@ -24,8 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.processes.packed import Pickled
-from plumbline.processes.workers import Outcome, ResultCache, Task
+from plumbline.processes.workers import Outcome, Pickled, ResultCache, Task
 from plumbline.storage.results_store import write_atomically
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 TEST_FILE = "tests/execution/test_planted_defects.py"
 TIMEOUT = 1800.0  # s
 _CHILD_SCRIPT = (
-    "import sys; from plumbline.processes.parent_death import die_with_parent; "
+    "import sys; from plumbline.processes.isolation import die_with_parent; "
     "die_with_parent(int(sys.argv[1])); "
     "import pytest; sys.exit(pytest.main(sys.argv[2:]))"
 )

@@ -7,7 +7,6 @@ import numpy as np
 from plumbline.engines.calls import Evaluation
 from plumbline.judging.rows import Columns, JudgingResult, Row, RowContext, Verdict
 from plumbline.model.datatypes import Array
-from plumbline.processes.packed import Pickled
 from plumbline.truth.ground_truth import StateTruth
 from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND
 
@@ -46,11 +45,6 @@ def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation)
         )
         found.rows.append(state_row(context, quantity, unit, worst, truth.method, evaluation.cpu_time))
     return found
-
-
-def judge_states_pickled(context: RowContext, truth: Pickled, evaluation: Evaluation) -> JudgingResult:
-    """The same in the worker that has the answer: the process that has all answers is spared it."""
-    return judge_states(context, truth.load(), evaluation)
 
 
 def worst_error_per_state(quantity: str, truth: StateTruth, evaluation: Evaluation) -> Columns:

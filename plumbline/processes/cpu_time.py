@@ -1,4 +1,4 @@
-"""Where a run's CPU time went: what the engines took, and what the harness took to ask and judge them."""
+"""Where a run's CPU time went: the engines, the truth, and the harness around them."""
 
 from __future__ import annotations
 
@@ -13,21 +13,39 @@ CPU_TIME_KINDS = ("engines", "reference", "truth", "diagnosis", "process", "judg
 
 
 class CpuTimes:
-    """CPU seconds by kind; "process" is what starting workers and moving questions and answers took."""
+    """CPU time by kind.
+
+    Attributes:
+        seconds: CPU time [s] by kind of `CPU_TIME_KINDS`; "process" is starting workers and moving data.
+
+    """
 
     def __init__(self) -> None:
+        """Start with zero seconds of every kind."""
         self.seconds = dict.fromkeys(CPU_TIME_KINDS, 0.0)
 
-    def add_outcome(self, outcome: Outcome) -> None:
-        """Take in what a task's call and its judge took in its worker."""
-        subject = outcome.key[1]
-        kind = {"truth": "truth", "why": "diagnosis", "reference": "reference"}.get(subject, "engines")
+    def add_outcome(self, outcome: Outcome, kind: str) -> None:
+        """Count what a task's call and its judge took in a worker.
+
+        Args:
+            outcome: the task's outcome.
+            kind: the kind of the call, of `CPU_TIME_KINDS`.
+
+        """
         self.seconds[kind] += outcome.cpu_time
         self.seconds["judging"] += outcome.judge_cpu_time
 
     @contextmanager
     def measure(self, kind: str) -> Iterator[None]:
-        """Count what this process, and its children that end meanwhile, take inside."""
+        """Count what this process, and its children that end meanwhile, take inside the context.
+
+        Args:
+            kind: the kind to count it as.
+
+        Yields:
+            Nothing.
+
+        """
         begin = cpu_time_spent()
         try:
             yield
@@ -36,48 +54,55 @@ class CpuTimes:
 
     @contextmanager
     def measure_overhead(self) -> Iterator[None]:
-        """What is taken inside and counted by nobody else was process."""
+        """Count as "process" what is taken inside the context and is not counted as another kind.
+
+        Yields:
+            Nothing.
+
+        """
         begin, before = cpu_time_spent(), sum(self.seconds.values())
         yield
         counted = sum(self.seconds.values()) - before
-        self.seconds["process"] += max(
-            0.0, cpu_time_spent() - begin - counted
-        )  # answers from before took nothing now
+        rest = cpu_time_spent() - begin - counted  # negative where answers came from the result cache
+        self.seconds["process"] += max(0.0, rest)
 
     def timed_cache(self, result_cache: ResultCache) -> ResultCache:
-        """The same memory, what it takes counted as storage."""
-        split = self
+        """Wrap a result cache so that its work is counted as storage.
 
-        class Measured(ResultCache):
+        Args:
+            result_cache: the cache.
+
+        Returns:
+            A cache with the same content.
+
+        """
+        times = self
+
+        class TimedCache(ResultCache):
             def get(self, task: Task) -> Outcome | None:
-                with split.measure("storage"):
+                with times.measure("storage"):
                     return result_cache.get(task)
 
             def put(self, task: Task, outcome: Outcome) -> None:
-                with split.measure("storage"):
+                with times.measure("storage"):
                     result_cache.put(task, outcome)
 
-        return Measured()
-
-    @property
-    def worker_cpu_time(self) -> float:
-        """CPU s of the calls in workers."""
-        return sum(self.seconds[kind] for kind in ("engines", "reference", "truth", "diagnosis"))
+        return TimedCache()
 
     def summary(self) -> str:
-        """The split in words; what is neither an engine's answer nor what it is held to is the harness."""
+        """Return the CPU times in words, with the harness's share over the engines' own time."""
         total, engines = sum(self.seconds.values()), self.seconds["engines"]
         parts = ", ".join(f"{kind} {s:.1f}" for kind, s in self.seconds.items())
         if not engines:
             return f"CPU {total:.1f} s: {parts}"
+        calls = sum(self.seconds[kind] for kind in ("engines", "reference", "truth", "diagnosis"))
         return (
             f"CPU {total:.1f} s: {parts}; over the engines' own time: harness "
-            f"{100 * (total - self.worker_cpu_time) / engines:.0f} %, truth and reference "
-            f"{100 * (self.worker_cpu_time - engines) / engines:.0f} %"
+            f"{100 * (total - calls) / engines:.0f} %, truth and reference {100 * (calls - engines) / engines:.0f} %"
         )
 
 
 def cpu_time_spent() -> float:
-    """CPU s of this process and of its children that have ended."""
+    """Return the CPU time [s] of this process and of its children that have ended."""
     times = os.times()  # in ticks of 10 ms: too coarse for this process's own time, taken in small parts
     return time.process_time() + times.children_user + times.children_system

@@ -104,7 +104,7 @@ def describe_exit(code: int) -> str:
 
 def serve_calls(parent: int) -> None:
     """The child's loop.  Engines print: the pipe moves away from descriptor 1 before any is loaded."""
-    from plumbline.processes.parent_death import die_with_parent
+    from plumbline.processes.isolation import die_with_parent
 
     die_with_parent(parent)
     answers = os.fdopen(os.dup(1), "wb")

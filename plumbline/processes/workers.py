@@ -1,8 +1,8 @@
-"""Worker processes that can be killed: a crash, hang or memory blow-up loses one task and says so.
+"""Worker processes that can be killed, and the scheduler that hands tasks to them.
 
-Each worker runs in a scratch folder of its own, has its output thrown away at the level of file
-descriptors (engines print from C++), one BLAS thread, a limit of address space, and dies with
-its parent.
+Each worker runs in a scratch folder of its own, discards its output at the level of file descriptors (engines
+print from C++), uses one BLAS thread and a limited address space, and dies with its parent. A crash, a timeout
+or a lack of memory loses one task, whose outcome holds the reason.
 """
 
 from __future__ import annotations
@@ -11,28 +11,51 @@ import contextlib
 import gc
 import multiprocessing
 import os
+import pickle
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 from pebble import ProcessExpired, ProcessPool
 
 from plumbline.processes.errors import PlumblineError
-from plumbline.processes.isolation import ScratchFolder
-from plumbline.processes.packed import Pickled
-from plumbline.processes.parent_death import die_with_parent
+from plumbline.processes.isolation import ScratchFolder, die_with_parent
 from plumbline.processes.remote_python import RemoteCrash, RemoteError, call_remote, call_timed, describe_exit
 
-SINGLE_THREAD_ENV = dict.fromkeys(
+_SINGLE_THREAD_ENV = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
+_POLL_INTERVAL = 0.2  # s between checks for tasks that run too long
 
 
-POLL_INTERVAL = 0.2  # s between looks at what runs too long
+@dataclass(frozen=True)
+class Pickled:
+    """A pickled value: pickled once, and loaded only where it is used. Loading a pickle can run any code."""
+
+    data: bytes
+
+    @classmethod
+    def of(cls, value: Any) -> Pickled:
+        """Pickle a value.
+
+        Args:
+            value: any value that can be pickled.
+
+        Returns:
+            The pickle.
+
+        """
+        return cls(pickle.dumps(value, protocol=5))
+
+    def load(self) -> Any:
+        """Return a new copy of the value."""
+        return pickle.loads(self.data)
 
 
 @dataclass(frozen=True)
@@ -45,76 +68,197 @@ class Limits:
 
 @dataclass(frozen=True)
 class Task:
-    """A call to make in a worker: a picklable function and its arguments, packed ones opened there."""
+    """A call to make in a worker; pickled arguments are loaded there."""
 
-    key: Any
-    function: Callable[..., Any]
+    key: Any  # hashable
+    function: Callable[..., Any]  # can be pickled
     arguments: tuple[Any, ...] = ()
     limits: Limits = field(default_factory=Limits)
-    version: str = ""  # of the engine that answers; a part of the answer's content key
-    python: str = ""  # the interpreter of another environment to make the call in; empty: this one's
-    judge: Callable[[Any], Any] | None = (
-        None  # picklable; the worker asks it of the value, in this environment
-    )
+    version: str = ""  # of the engine, a part of the content hash of the answer
+    python: str = ""  # interpreter of another environment that makes the call; empty: the worker itself
+    judge: Callable[..., Any] | None = None  # called in the worker with judge_arguments and the answer
+    judge_arguments: tuple[Any, ...] = ()
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a task: its value, or the sentence that says how it was lost."""
+    """The answer to a task, or the reason why there is none."""
 
     key: Any
-    raw_value: Any = None  # the value, or that value packed as its worker sent it
+    raw_value: Any = None  # the answer, or its pickle as the worker sent it
     failure: str | None = None
-    cpu_time: float = 0.0  # CPU s of the call
-    judge_result: Any = None  # what the task's judge said; of an answer from before: None
-    judge_cpu_time: float = 0.0  # CPU s of the judge
+    cpu_time: float = 0.0  # s of the call
+    judge_result: Any = None  # what the task's judge returned; None for an answer from the result cache
+    judge_cpu_time: float = 0.0  # s of the judge
 
     @property
     def value(self) -> Any:
-        """The answer, opened at every look."""
+        """The answer, loaded anew at every access."""
         return self.raw_value.load() if isinstance(self.raw_value, Pickled) else self.raw_value
 
     @property
     def pickled(self) -> Pickled:
-        """The answer as it goes to others."""
+        """The answer as a pickle."""
         return self.raw_value if isinstance(self.raw_value, Pickled) else Pickled.of(self.raw_value)
 
 
 class ExecutorUnavailable(PlumblineError):
-    """Those who should do the work cannot be had; the message says why."""
+    """The workers or the cluster cannot be had; the message gives the reason."""
 
 
 class ResultCache:
-    """What is known of tasks from before; this one knows nothing."""
+    """Answers of earlier tasks. This base class holds none."""
 
     def get(self, task: Task) -> Outcome | None:
-        """The outcome of a task that need not run again."""
+        """Look a task's answer up.
+
+        Args:
+            task: the task.
+
+        Returns:
+            Its outcome, or None where the task has to run.
+
+        """
         return None
 
     def put(self, task: Task, outcome: Outcome) -> None:
-        """Take note of a task's outcome."""
+        """Take note of an outcome.
+
+        Args:
+            task: the task.
+            outcome: its outcome.
+
+        """
 
 
-class WorkerPool:
-    """A pool of ``jobs`` workers; `run` yields outcomes as they come, a lost worker costs one of them."""
+class Executor(ABC):
+    """Something that makes the calls of tasks: the workers of this machine or of a cluster."""
+
+    limits: Limits
+
+    def __enter__(self) -> Self:
+        """Return the executor."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Drop what still runs."""
+
+    @property
+    @abstractmethod
+    def capacity(self) -> int:
+        """How many tasks may be handed over at a time."""
+
+    @abstractmethod
+    def start(self, task: Task) -> None:
+        """Hand a task over.
+
+        Args:
+            task: a task that is not in the result cache.
+
+        """
+
+    @abstractmethod
+    def collect(self) -> Sequence[tuple[Task, Outcome]]:
+        """Wait a moment for tasks to finish.
+
+        Returns:
+            The tasks that finished, with their outcomes; empty where none has finished yet.
+
+        """
+
+    def run(self, tasks: Iterable[Task]) -> Iterator[Outcome]:
+        """Run tasks without a cache.
+
+        Args:
+            tasks: the tasks.
+
+        Yields:
+            Outcomes in the order of completion.
+
+        """
+        yield from Scheduler(self).run(tasks)
+
+
+class Scheduler:
+    """Hands tasks to an executor, a few at a time, and takes new ones while it runs."""
+
+    def __init__(self, executor: Executor, result_cache: ResultCache | None = None) -> None:
+        """Make a scheduler.
+
+        Args:
+            executor: makes the calls.
+            result_cache: its answers are not computed again, and it gets every other outcome before the caller.
+
+        """
+        self._executor = executor
+        self._cache = result_cache or ResultCache()
+        self._submitted: deque[Task] = deque()
+
+    def submit(self, task: Task) -> None:
+        """Add a task that arose from an outcome; it starts before those that `run` was given.
+
+        Args:
+            task: the task.
+
+        """
+        self._submitted.append(task)
+
+    def run(self, tasks: Iterable[Task]) -> Iterator[Outcome]:
+        """Run tasks until neither ``tasks`` nor the submitted ones are left.
+
+        Args:
+            tasks: the tasks, taken one by one as the executor has room.
+
+        Yields:
+            Outcomes in the order of completion.
+
+        """
+        source = iter(tasks)
+        pending = 0
+        while True:
+            while pending < self._executor.capacity:
+                task = self._submitted.popleft() if self._submitted else next(source, None)
+                if task is None:
+                    break
+                known = self._cache.get(task)
+                if known is not None:
+                    yield known
+                    continue
+                self._executor.start(task)
+                pending += 1
+            if not pending:
+                return
+            for task, outcome in self._executor.collect():
+                pending -= 1
+                self._cache.put(task, outcome)
+                yield outcome
+
+
+class WorkerPool(Executor):
+    """Worker processes on this machine."""
 
     def __init__(self, jobs: int, limits: Limits | None = None) -> None:
-        self.jobs = jobs
+        """Start the workers.
+
+        Args:
+            jobs: number of worker processes.
+            limits: their limits; the time limit is each task's own.
+
+        """
         self.limits = limits or Limits()
+        self._jobs = jobs
         self._scratch = ScratchFolder()
-        os.environ.update(
-            SINGLE_THREAD_ENV
-        )  # inherited by the spawned interpreters, before NumPy loads there
+        self._tasks: dict[Future[Any], Task] = {}
+        self._started: dict[Future[Any], float] = {}  # monotonic time at which a task was first seen running
+        os.environ.update(_SINGLE_THREAD_ENV)  # inherited by the workers, before NumPy loads there
         self._pool = ProcessPool(
             max_workers=jobs,
             context=multiprocessing.get_context("spawn"),
             initializer=initialize_worker,
             initargs=(str(self._scratch.path), self.limits.gigabytes, os.getpid()),
         )
-
-    def __enter__(self) -> WorkerPool:
-        """The pool itself."""
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -124,82 +268,92 @@ class WorkerPool:
         self._pool.join()
         self._scratch.remove()
 
-    def run(self, tasks: Iterable[Task | None], result_cache: ResultCache | None = None) -> Iterator[Outcome]:
-        """Outcomes in the order of completion; only a few tasks are handed over at a time.
+    @property
+    def capacity(self) -> int:
+        """Two tasks per worker: one runs, one waits."""
+        return 2 * self._jobs
 
-        ``tasks`` may yield None: no task until another outcome has come.  What ``memory`` has is not run
-        again; it is told of every other outcome before the caller.
+    def start(self, task: Task) -> None:
+        """Queue a task for the next idle worker.
+
+        Args:
+            task: the task.
+
         """
-        result_cache = result_cache or ResultCache()
-        waiting: dict[Future[Any], Task] = {}
-        began: dict[Future[Any], float] = {}
-        source = iter(tasks)
-        exhausted = False
-        while waiting or not exhausted:
-            while not exhausted and len(waiting) < 2 * self.jobs:
-                try:
-                    task = next(source)
-                except StopIteration:
-                    exhausted = True
-                    break
-                if task is None:
-                    break
-                before = result_cache.get(task)
-                if before is not None:
-                    yield before
-                    continue
-                future: Future[Any] = self._pool.schedule(run_task, args=(task,))
-                waiting[future] = task
-            if not waiting:
-                return
-            done, _ = wait(waiting, timeout=POLL_INTERVAL, return_when=FIRST_COMPLETED)
-            cancel_overdue(waiting, began)
-            for future in done:
-                task = waiting.pop(future)
-                began.pop(future, None)
-                found = outcome_from_future(task, future)
-                result_cache.put(task, found)
-                yield found
+        self._tasks[self._pool.schedule(run_task, args=(task,))] = task
+
+    def collect(self) -> list[tuple[Task, Outcome]]:
+        """Wait for the first task to finish, at most `_POLL_INTERVAL`, and cancel those over their time limit.
+
+        Returns:
+            The finished tasks and their outcomes.
+
+        """
+        done, _ = wait(self._tasks, timeout=_POLL_INTERVAL, return_when=FIRST_COMPLETED)
+        self._cancel_overdue()
+        found = []
+        for future in done:
+            task = self._tasks.pop(future)
+            self._started.pop(future, None)
+            found.append((task, _outcome_from_future(task, future)))
+        return found
+
+    def _cancel_overdue(self) -> None:
+        """Cancel tasks over their time limit, which kills their workers.
+
+        The pool's own timeout goes by the wall clock: set forward it would kill tasks that are in time.
+        """
+        now = time.monotonic()
+        for future, task in self._tasks.items():
+            if future.running() and now - self._started.setdefault(future, now) > task.limits.seconds:
+                future.cancel()
 
 
 def run_task(task: Task) -> Outcome:
-    """Make a task's call, here or in the environment that it names."""
+    """Make a task's call in this process, or in the environment that the task names.
+
+    Args:
+        task: the task.
+
+    Returns:
+        The outcome; exceptions of the call are raised.
+
+    Raises:
+        MemoryError: the call needs more memory than there is.
+
+    """
     try:
         return _call_and_judge(task)
     except MemoryError:
-        pass  # what it filled hangs on the error's traceback, which the pool would keep during the next task
+        pass  # what filled the memory hangs on the traceback, which the pool would keep during the next task
     gc.collect()
     raise MemoryError
 
 
 def _call_and_judge(task: Task) -> Outcome:
-    """The same; a MemoryError holds what filled the memory."""
-    arguments = [one.load() if isinstance(one, Pickled) else one for one in task.arguments]
+    arguments = _load(task.arguments)
     if task.python:
         value, cost = call_remote(task.python, call_timed, task.function, *arguments)
     else:
         value, cost = call_timed(task.function, *arguments)
-    judged, judging = call_timed(task.judge, value) if task.judge else (None, 0.0)
+    judged, judging = None, 0.0
+    if task.judge:
+        judged, judging = call_timed(task.judge, *_load(task.judge_arguments), value)
     return Outcome(task.key, Pickled.of(value), None, cost, judged, judging)
 
 
-def cancel_overdue(waiting: dict[Future[Any], Task], began: dict[Future[Any], float]) -> None:
-    """Cancel what runs longer than its limit, which kills its worker.
-
-    The pool would do it by the clock of the wall: set forward it kills what is in time, set back it waits.
-    """
-    now = time.monotonic()
-    for future, task in waiting.items():
-        if future.running() and now - began.setdefault(future, now) > task.limits.seconds:
-            future.cancel()
+def _load(arguments: Sequence[Any]) -> list[Any]:
+    return [one.load() if isinstance(one, Pickled) else one for one in arguments]
 
 
-def outcome_from_future(task: Task, future: Future[Outcome]) -> Outcome:
+def _outcome_from_future(task: Task, future: Future[Outcome]) -> Outcome:
     """The outcome of a finished future, or how its worker was lost."""
     try:
         return future.result()
-    except CancelledError:  # by `stop_late`, and by nobody else
-        return Outcome(task.key, failure=f"hung: no answer within {task.limits.seconds:g} s, worker killed")
+    except CancelledError:  # by `_cancel_overdue` only
+        return Outcome(
+            task.key, failure=f"timeout: no answer within {task.limits.seconds:g} s, worker killed"
+        )
     except ProcessExpired as expired:
         return Outcome(task.key, failure=f"crashed: the worker {describe_exit(expired.exitcode)}")
     except RemoteCrash as crashed:
@@ -208,13 +362,20 @@ def outcome_from_future(task: Task, future: Future[Outcome]) -> Outcome:
         return Outcome(task.key, failure=str(error))
     except MemoryError:
         return Outcome(task.key, failure=f"out of memory: over {task.limits.gigabytes:g} GB of address space")
-    except Exception as error:  # ImportError among them: the caller tells "not installed" by its name
+    except Exception as error:  # ImportError among them: the caller recognises "not installed" by its name
         return Outcome(task.key, failure=f"{type(error).__name__}: {error}")
 
 
 def initialize_worker(scratch: str, gigabytes: float, parent: int) -> None:
-    """Initialise a worker process: called by the pool, in the worker, before any task."""
-    os.environ.update(SINGLE_THREAD_ENV)
+    """Prepare a worker process before its first task.
+
+    Args:
+        scratch: folder in which the worker makes its working folder.
+        gigabytes: limit of its address space.
+        parent: process id of the pool's process.
+
+    """
+    os.environ.update(_SINGLE_THREAD_ENV)
     os.chdir(tempfile.mkdtemp(dir=scratch))
     sink = os.open(os.devnull, os.O_WRONLY)
     os.dup2(sink, 1)

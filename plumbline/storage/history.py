@@ -57,6 +57,7 @@ class History:
     Attributes:
         nights: the readable runs, in the order in which they were completed.
         damaged: reason by folder name of each run that was left out.
+
     """
 
     def __init__(self, folder: Path) -> None:
@@ -64,6 +65,7 @@ class History:
 
         Args:
             folder: folder of runs, or a nightly's output folder, whose runs are in ``history``.
+
         """
         inside = folder / "history"
         self.nights: list[StoredRun] = []
@@ -85,6 +87,7 @@ class History:
 
         Returns:
             Index in ``nights`` and run, oldest first.
+
         """
         ids = [night.id for night in self.nights]
         end = ids.index(run_id) if run_id in ids else len(ids)
@@ -99,6 +102,7 @@ class History:
 
         Returns:
             Value, tolerance, ratio, verdict and known issue by key, of the keys that the night has.
+
         """
         found = self.query(
             "SELECT key, value, tolerance, ratio, verdict, known_issue FROM rows"
@@ -132,6 +136,7 @@ class History:
 
         Returns:
             One record per row of the answer.
+
         """
         answer = self._database.execute(query, parameters or [])
         names = [column[0] for column in answer.description or ()]
@@ -144,6 +149,7 @@ class History:
             One record per night: its id, start and exit code, the number of rows, of those that agree
             (``agree``), are unexpectedly bad (``bad``), or are as a known issue expects (``as_recorded``), and
             the number of random scenarios.
+
         """
         return self.query(
             f"""
@@ -164,6 +170,7 @@ class History:
 
         Returns:
             One record per key and night: value, tolerance, unit, ratio and verdict.
+
         """
         return self.query(
             """
@@ -179,6 +186,7 @@ class History:
         Returns:
             One record per key: verdict, reason, the id of the first bad night since the last good one
             (``first_bad``) and of that good one (``last_good``, None where there is none).
+
         """
         return self.query(
             f"""
@@ -204,6 +212,7 @@ class History:
         Returns:
             The id of the night that passed (None where there is none), and one record per key whose verdict
             differs: both verdicts (``was``, ``is``), both values, and the reason now.
+
         """
         green = self.query(
             "SELECT night, id FROM nights WHERE exit_code = 0 AND night < (SELECT max(night) FROM nights)"
@@ -232,6 +241,7 @@ class History:
 
         Returns:
             One sentence per change.
+
         """
         found = []
         for before, now in itertools.pairwise(self.nights):
@@ -249,6 +259,7 @@ class History:
 
         Returns:
             Plain data that JSON can hold.
+
         """
         green, changes = self.changes_since_green()
         document: Record = {
@@ -272,6 +283,7 @@ def stored_runs(folder: Path) -> Iterator[StoredRun]:
 
     Yields:
         One run at a time, in the order of the folders' names.
+
     """
     for path in sorted(folder.glob("*/results.json")):
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
@@ -286,6 +298,7 @@ def next_night_number(folder: Path) -> int:
 
     Returns:
         One more than the highest number there.
+
     """
     return 1 + max((int(run.metadata.get("night", 0)) for run in stored_runs(folder)), default=0)
 

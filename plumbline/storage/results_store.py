@@ -44,11 +44,13 @@ _RUN_COLUMNS = {**_CELL_COLUMNS, "integrator": TEXT, "resolution": REAL}
 TABLES: dict[str, pa.Schema] = {
     "summary": _schema(
         key=TEXT, scenario=TEXT, family=TEXT, engine=TEXT, engine_version=TEXT, level=TEXT, integrator=TEXT,
-        quantity=TEXT, unit=TEXT, value=REAL, tolerance=REAL, verdict=TEXT, reason=TEXT, ratio=REAL, derivation=TEXT,
-        uncertainty=REAL, compared_until=REAL, order=REAL, declared_order=INTEGER, alias_of=TEXT,
+        quantity=TEXT, unit=TEXT, value=REAL, tolerance=REAL, verdict=TEXT, reason=TEXT, ratio=REAL,
+        derivation=TEXT, uncertainty=REAL, compared_until=REAL, order=REAL, declared_order=INTEGER, alias_of=TEXT,
         known_issue=TEXT, diagnosis=TEXT, user_rtol=REAL, cpu_time=REAL, extra=TEXT,
     ),
-    "states": _schema(**_CELL_COLUMNS, quantity=TEXT, state=INTEGER, body=INTEGER, error=REAL, bound=REAL, scale=REAL),
+    "states": _schema(
+        **_CELL_COLUMNS, quantity=TEXT, state=INTEGER, body=INTEGER, error=REAL, bound=REAL, scale=REAL,
+    ),
     "convergence": _schema(**_RUN_COLUMNS, quantity=TEXT, error=REAL, cost=REAL, steps=INTEGER, order=REAL),
     "curves": _schema(
         **_RUN_COLUMNS, t=REAL, position_error=REAL, attitude_error=REAL, limit_error=REAL, tolerance=REAL,
@@ -170,6 +172,7 @@ def read_table(folder: Path, name: str) -> pa.Table:
     Raises:
         OSError: the file is missing.
         ValueError: the file is damaged (`pyarrow.ArrowInvalid`).
+
     """
     table = pq.read_table(folder / f"{name}.parquet")
     return upgrade_summary(table) if name == "summary" else table

@@ -37,6 +37,7 @@ def upgrade_document(document: Record) -> Record:
     Returns:
         The document with the names of version 2. In version 1 the ratio of a row was in its ``extra``, or
         followed from its value and tolerance.
+
     """
     if document["schema_version"] != 1:
         return document
@@ -64,6 +65,7 @@ def upgrade_summary(table: pa.Table) -> pa.Table:
 
     Returns:
         The table with the names of version 2 and the column ``ratio``.
+
     """
     if "ratio" in table.column_names:
         return table

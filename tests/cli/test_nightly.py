@@ -56,7 +56,8 @@ def test_a_random_scenario_is_a_file_like_any_other(tmp_path):
 
 def run(out, **more):
     chosen = loader.load_scenarios(["rest"])
-    options = {"random": 3, "seed": 11, "jobs": 1, "limits": Limits(), "whole": False, "finer": 0} | more
+    options = {"random_count": 3, "seed": 11, "jobs": 1, "limits": Limits(), "is_full_catalogue": False,
+               "extra_refinements": 0} | more  # fmt: skip
     progress = options.pop("progress", quiet)
     return nightly.run_nightly(
         out, chosen, ["mujoco"], command="-", progress=progress, log=quiet, **options

@@ -18,7 +18,8 @@ from packaging.version import Version
 
 from plumbline.engines import calls, environments
 from plumbline.engines.registry import ENGINES
-from plumbline.execution.runner import Plan, run_plan
+from plumbline.execution.plan import Plan
+from plumbline.execution.runner import run_plan
 from plumbline.judging import known_issues
 from plumbline.judging.rows import RowContext
 from plumbline.processes.remote_python import call_remote
@@ -106,7 +107,7 @@ def test_losses_over_there_are_told_like_those_here():
     assert lost.pop("segfault") == "crashed: the worker died of SIGSEGV"
     assert lost.pop("complain") == "KeyError: 'no'"
     assert "out of memory" in lost.pop("devour")
-    assert "hung" in lost.pop("hang")
+    assert "timeout" in lost.pop("hang")
     assert not lost
     assert [found[key].value for key in "abc"] == [2, 4, 6]
     alive = [psutil.Process(p) for p in (found["pid"].value, found["pid2"].value) if psutil.pid_exists(p)]

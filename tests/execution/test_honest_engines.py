@@ -8,7 +8,8 @@ import time
 import pytest
 
 from plumbline.engines.registry import ENGINES
-from plumbline.execution.runner import Plan, run_plan
+from plumbline.execution.plan import Plan
+from plumbline.execution.runner import run_plan
 from plumbline.processes.workers import Limits
 from plumbline.scenario.generator import RandomScenarios
 

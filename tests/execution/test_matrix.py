@@ -9,7 +9,8 @@ import os
 import pytest
 
 from plumbline.engines.registry import ENGINES
-from plumbline.execution.runner import Plan, describe_engines
+from plumbline.execution.plan import Plan, TaskKind
+from plumbline.execution.runner import describe_engines
 from plumbline.execution.scenario_run import ScenarioRun
 from plumbline.judging import known_issues
 from plumbline.processes.workers import Limits, WorkerPool
@@ -64,10 +65,10 @@ def test_cell(name, engine, level, workers, engines, truths):
     while tasks:
         follow = []
         for outcome in workers.run(tasks):
-            if outcome.key[1] == "truth":
+            if outcome.key.is_truth:
                 truths[name, level] = outcome
             follow += bench.on_outcome(outcome)
-        tasks = [task for task in follow if task.key[1] != "why"]
+        tasks = [task for task in follow if task.key.kind != TaskKind.DIAGNOSIS]
     rows = bench.findings().rows
     assert rows, "no answer at all"
     excuses = known_issues.KnownIssues(known_issues.load_known_issues(), has_extra_refinements=False)

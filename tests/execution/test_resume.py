@@ -17,10 +17,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from plumbline.engines import calls
+from plumbline.execution.plan import Plan
 from plumbline.execution.result_cache import DiskResultCache, task_hash
-from plumbline.execution.runner import Plan, run_plan
-from plumbline.processes.packed import Pickled
-from plumbline.processes.workers import Outcome, Task
+from plumbline.execution.runner import run_plan
+from plumbline.processes.workers import Outcome, Pickled, Task
 from plumbline.scenario import loader
 
 ROOT = Path(__file__).resolve().parents[2]

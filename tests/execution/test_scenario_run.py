@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from plumbline.execution.runner import Plan, describe_engines, run_plan
+from plumbline.execution.plan import Plan, TaskKind
+from plumbline.execution.runner import describe_engines, run_plan
 from plumbline.execution.scenario_run import ScenarioRun
 from plumbline.processes.workers import Limits, Outcome, WorkerPool, run_task
 from plumbline.scenario import loader
@@ -46,7 +47,9 @@ def test_states_are_asked_for_with_their_truth_and_judged_alike_here_and_by_the_
     for bench, elsewhere in zip(benches, (True, False), strict=True):
         (truth,) = bench.tasks()
         cells = bench.on_outcome(answered(truth))
-        assert [task.key[1:] for task in cells] == [("reference", "state"), ("mujoco", "state")]
+        assert [(task.key.engine, task.key.kind) for task in cells] == [
+            (name, TaskKind.STATE) for name in ("reference", "mujoco")
+        ]
         for task in cells:
             assert not bench.is_done
             found = answered(task)
@@ -79,7 +82,7 @@ def test_a_motion_truth_whose_worker_died_is_asked_for_once_more_without_a_compi
     assert second.key == truth.key and second.arguments[-1] == 0 and not bench.is_done
     assert bench.on_outcome(answered(second)) == [] and bench.is_done
     assert all(row.verdict == "agrees" for row in bench.findings().rows)
-    assert "Taylor" not in bench.truths["trajectory"].method.split("closed form")[0]
+    assert "Taylor" not in bench.truths[TaskKind.MOTION_TRUTH].method.split("closed form")[0]
 
 
 def test_a_truth_that_is_lost_twice_fails_every_cell_and_says_so(engines):

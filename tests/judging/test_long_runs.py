@@ -7,7 +7,8 @@ import pytest
 
 from adapters.mujoco_engine import Mujoco
 from plumbline.engines.registry import load_adapter
-from plumbline.execution.runner import Plan, run_plan
+from plumbline.execution.plan import Plan
+from plumbline.execution.runner import run_plan
 from plumbline.judging import long_run_study
 from plumbline.judging.long_run_study import (
     BLOCK_COUNT,

@@ -8,10 +8,9 @@ import pytest
 from plumbline.engines.calls import Evaluation, run_refinement
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import RowContext
-from plumbline.judging.state import STATE_UNITS, judge_states, judge_states_pickled
+from plumbline.judging.state import STATE_UNITS, judge_states
 from plumbline.judging.trajectory import judge_trajectory
 from plumbline.model.sampling import random_states
-from plumbline.processes.packed import Pickled
 from plumbline.truth.ground_truth import StateTruth, motion_truth
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers import pendulums
@@ -51,13 +50,6 @@ def test_a_blunt_row_says_what_was_measured():
     assert (row.level, row.integrator, row.quantity, row.unit) == ("state", "-", "acceleration", "m/s²")
     assert row.verdict == "unresolved" and row.reason.startswith("blunt: the rounding bound is ")
     assert row.tolerance == bounds[1].acceleration[1] and row.ratio == pytest.approx(0.5)
-
-
-def test_a_packed_truth_is_judged_as_it_is_open():
-    right = load_adapter("reference").evaluate(MODEL, STATES)
-    truth = StateTruth(STATES, right, [state_rounding_bound(MODEL, s) for s in STATES], "itself")
-    said = Evaluation(right[::-1], None, None, 0.0)
-    assert judge_states_pickled(WHO, Pickled.of(truth), said).rows == judge_states(WHO, truth, said).rows
 
 
 @pytest.mark.parametrize("drag", [False, True])

@@ -4,7 +4,8 @@ import time
 
 import pytest
 
-from plumbline.execution.runner import Plan, run_plan
+from plumbline.execution.plan import Plan, TaskKey, TaskKind
+from plumbline.execution.runner import run_plan
 from plumbline.processes.cpu_time import CPU_TIME_KINDS, CpuTimes, cpu_time_spent
 from plumbline.processes.workers import Outcome, ResultCache
 from plumbline.scenario import loader
@@ -28,9 +29,14 @@ def test_what_is_measured_inside_is_not_process_too():
 
 def test_calls_are_counted_by_whom_they_asked():
     split = CpuTimes()
-    for key, cost in ((("s", "truth", "state"), 1.0), (("s", "reference", "state"), 2.0),
-                      (("s", "mujoco", "state"), 4.0), (("s", "why", "mujoco"), 8.0)):  # fmt: skip
-        split.add_outcome(Outcome(key, cpu_time=cost))
+    costs = {
+        TaskKey(TaskKind.MOTION_TRUTH, "s"): 1.0,
+        TaskKey(TaskKind.STATE, "s", "reference"): 2.0,
+        TaskKey(TaskKind.STATE, "s", "mujoco"): 4.0,
+        TaskKey(TaskKind.DIAGNOSIS, "s", "mujoco"): 8.0,
+    }
+    for key, cost in costs.items():
+        split.add_outcome(Outcome(key, cpu_time=cost), key.cpu_time_kind)
     assert [split.seconds[k] for k in ("truth", "reference", "engines", "diagnosis")] == [1.0, 2.0, 4.0, 8.0]
     assert "harness 0 %, truth and reference 275 %" in split.summary()
 

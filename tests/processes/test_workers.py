@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from plumbline.processes.isolation import remove_orphaned_folders
-from plumbline.processes.workers import Limits, Task, WorkerPool
+from plumbline.processes.workers import Executor, Limits, Outcome, ResultCache, Scheduler, Task, WorkerPool
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -63,8 +63,8 @@ LOSSES = [
     (abort, "crashed: the worker died of SIGABRT"),
     (leave, "crashed: the worker exited with code 7"),
     (devour, "out of memory"),
-    (hang, "hung: no answer within"),
-    (hang_with_the_lock, "hung: no answer within"),
+    (hang, "timeout: no answer within"),
+    (hang_with_the_lock, "timeout: no answer within"),
 ]
 
 
@@ -81,22 +81,63 @@ def test_each_loss_costs_one_task_and_says_so():
         assert words in (outcomes["lost", k].failure or ""), loss.__name__
 
 
-def test_what_an_outcome_brings_up_runs_while_others_do():
-    """Where tasks say that there is none now, they are asked again after the next outcome."""
+def test_a_task_that_an_outcome_submits_runs_while_others_do():
     came = []
-
-    def tasks():
-        yield Task("long", nap, (4.0,))
-        yield Task("short", nap, (0.0,))
-        while "short" not in came:
-            yield None
-        yield Task("follows", nap, (0.0,))
-
     with WorkerPool(2) as workers:
-        for outcome in workers.run(tasks()):
+        scheduler = Scheduler(workers)
+        for outcome in scheduler.run([Task("long", nap, (4.0,)), Task("short", nap, (0.0,))]):
             assert outcome.failure is None
             came.append(outcome.key)
+            if outcome.key == "short":
+                scheduler.submit(Task("follows", nap, (0.0,)))
     assert came == ["short", "follows", "long"]
+
+
+class Immediate(Executor):
+    """Runs each task at once; of two that were started the last one finishes first."""
+
+    capacity = 2
+
+    def __init__(self):
+        self.limits, self.started, self.pending = Limits(), [], []
+
+    def start(self, task):
+        self.started.append(task.key)
+        self.pending.append(task)
+        assert len(self.pending) <= self.capacity
+
+    def collect(self):
+        task = self.pending.pop()
+        return [(task, Outcome(task.key, task.function(*task.arguments)))]
+
+
+class Remembering(ResultCache):
+    """Knows the answer of "known"; keeps what it gets."""
+
+    def __init__(self):
+        self.kept = []
+
+    def get(self, task):
+        return Outcome("known", "from before") if task.key == "known" else None
+
+    def put(self, task, outcome):
+        self.kept.append(outcome.key)
+
+
+def test_the_scheduler_takes_submitted_tasks_first_and_cached_answers_at_once():
+    executor, cache, found = Immediate(), Remembering(), []
+    scheduler = Scheduler(executor, cache)
+    tasks = [Task(key, double, (1,)) for key in ("a", "known", "b", "c")]
+    for outcome in scheduler.run(iter(tasks)):
+        found.append((outcome.key, outcome.value))
+        if outcome.key == "known":
+            scheduler.submit(Task("of known", double, (2,)))
+        if outcome.key == "c":
+            scheduler.submit(Task("of c", double, (3,)))
+    assert executor.started == ["a", "of known", "b", "c", "of c"] and cache.kept == [k for k, _ in found[1:]]
+    assert found[0] == ("known", "from before") and dict(found[1:]) == {
+        "a": 2, "of known": 4, "b": 2, "c": 2, "of c": 6
+    }  # fmt: skip
 
 
 def test_files_and_output_of_an_engine_go_nowhere(capfd, tmp_path, monkeypatch):
@@ -132,15 +173,15 @@ def test_a_clock_that_is_set_neither_kills_nor_spares(monkeypatch):
                     off[0] += step  # while the others run
                 found[outcome.key] = outcome
             assert found["nap"].value == 3.0
-            assert "hung" in (found["hang"].failure or "")
+            assert "timeout" in (found["hang"].failure or "")
 
 
 def test_what_a_killed_run_leaves_is_removed_by_the_next(tmp_path, monkeypatch):
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr(tempfile, "tempdir", None)
     script = (
-        "import time; from plumbline.processes.isolation import Scratch\n"
-        "mine = Scratch(); print(mine.path, flush=True); time.sleep(600)"
+        "import time; from plumbline.processes.isolation import ScratchFolder\n"
+        "mine = ScratchFolder(); print(mine.path, flush=True); time.sleep(600)"
     )
     owners = [
         subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True, cwd=ROOT)
@@ -170,9 +211,9 @@ def test_no_orphan_is_left_when_the_parent_is_killed(tmp_path):
         "import sys\n"
         f"sys.path[:0] = {[str(Path(__file__).resolve().parents[2]), str(Path(__file__).parent)]!r}\n"
         "from test_workers import hang, pid\n"
-        "from plumbline.processes.workers import Task, Workers\n"
+        "from plumbline.processes.workers import Task, WorkerPool\n"
         "if __name__ == '__main__':\n"
-        "    with Workers(1) as workers:\n"
+        "    with WorkerPool(1) as workers:\n"
         "        for outcome in workers.run([Task(0, pid), Task(1, hang)]):\n"
         "            print(outcome.value, flush=True)\n"
     )

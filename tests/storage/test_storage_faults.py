@@ -14,9 +14,9 @@ import pytest
 
 from plumbline.cli import nightly
 from plumbline.execution import runner
-from plumbline.execution.runner import Plan
+from plumbline.execution.plan import Plan
 from plumbline.processes import workers
-from plumbline.processes.workers import Limits, ResultCache
+from plumbline.processes.workers import Executor, Limits
 from plumbline.scenario import loader
 from plumbline.storage.history import History
 
@@ -24,26 +24,19 @@ ROOT = Path(__file__).resolve().parents[2]
 ERRORS = [errno.ENOSPC, errno.EIO, errno.EROFS, errno.EDQUOT]
 
 
-class Here:
+class Here(Executor):
     """Stands for the pool of workers: the same calls in this process, so that hundreds of runs are quick."""
+
+    capacity = 1
 
     def __init__(self, jobs, limits=None):
         self.limits = limits or Limits()
 
-    def __enter__(self):
-        return self
+    def start(self, task):
+        self.task = task
 
-    def __exit__(self, *_):
-        pass
-
-    def run(self, tasks, result_cache=None):
-        result_cache = result_cache or ResultCache()
-        for task in tasks:
-            found = result_cache.get(task)
-            if found is None:
-                found = workers.run_task(task)
-                result_cache.put(task, found)
-            yield found
+    def collect(self):
+        return [(self.task, workers.run_task(self.task))]
 
 
 class Disk:
@@ -123,8 +116,8 @@ def disk(monkeypatch):
 def night(out):
     chosen = loader.load_scenarios(["rest"])
     result, place = nightly.run_nightly(
-        out, chosen, ["mujoco"], random_count=0, seed=1, jobs=1, limits=Limits(), is_full_catalogue=False, command="-", extra_refinements=0,
-        level="state", progress=lambda *_: None, log=lambda _: None,
+        out, chosen, ["mujoco"], random_count=0, seed=1, jobs=1, limits=Limits(),
+        is_full_catalogue=False, command="-", extra_refinements=0, level="state", progress=lambda *_: None, log=lambda _: None,
     )  # fmt: skip
     return [replace(row, cpu_time=0.0) for row in result.rows], place
 
@@ -196,9 +189,9 @@ def test_the_command_says_so_and_goes_on(tmp_path):
 
 def test_a_clock_set_back_overwrites_no_night(tmp_path):
     place = tmp_path / "20260101T000000Z"
-    assert nightly.free(place) == place
+    assert nightly.unused_path(place) == place
     place.mkdir()
-    assert nightly.free(place).name == "20260101T000000Z-2"
+    assert nightly.unused_path(place).name == "20260101T000000Z-2"
 
 
 def test_nights_are_told_in_the_order_in_which_they_were_made(tmp_path, monkeypatch):

@@ -72,7 +72,7 @@ def test_history_report_and_reproduce_read_them(results):
     assert answer.exit_code == 0, answer.output
     assert "**13** agree" in (results / "summary.md").read_text()
     answer = command.invoke(main, ["reproduce", str(results)])
-    assert answer.exit_code == 0 and "no row" in answer.output, answer.output
+    assert answer.exit_code == 0 and "nothing disagrees" in answer.output, answer.output
 
 
 def test_a_disagreement_of_version_1_can_be_asked_for(results):

@@ -1,0 +1,118 @@
+"""What a run does: scenarios, engines and limits (`Plan`), and the keys of its tasks (`TaskKey`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import Literal
+
+from plumbline.engines.adapter import EngineInfo
+from plumbline.processes.workers import Limits, ResultCache
+from plumbline.scenario.loader import Scenario
+
+RANDOM_STATES = 50  # random states per scenario, besides the initial one
+STATES_PER_RANDOM_SCENARIO = 9  # the same for a random scenario: there are many of them
+
+LevelSelection = Literal["state", "trajectory", "all"]
+ProgressCallback = Callable[[int, int, str], None]  # finished tasks, all tasks, name of the last one
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to run."""
+
+    scenarios: Sequence[Scenario]
+    engines: Sequence[str]
+    level: LevelSelection = "all"
+    jobs: int = 1
+    limits: Limits = field(default_factory=Limits)
+    random_state_count: int = RANDOM_STATES
+    extra_refinements: int = 0  # how many times the finest step is halved beyond the usual refinement study
+    long_run_seconds: float = 0.0  # s of the long runs whose invariants are judged; 0: none
+    user_rtol: float | None = None  # relative to each quantity's scale; shown beside the verdict only
+    is_full_catalogue: bool = False  # the full catalogue on all engines: every known issue must occur
+    scheduler: str | None = None  # address of a dask cluster to run on, instead of ``jobs`` workers here
+    random_scenarios: Sequence[Scenario] = ()  # compared at few states only; may be made one by one
+    result_cache: ResultCache = field(default_factory=ResultCache)
+
+
+class TaskKind(StrEnum):
+    """What a task computes."""
+
+    STATE_TRUTH = "state truth"
+    MOTION_TRUTH = "motion truth"
+    STATE = "state"
+    RELATIONS = "relations"
+    TRAJECTORY = "trajectory"
+    LONG_RUN = "long run"
+    DIAGNOSIS = "diagnosis"
+    DESCRIPTION = "description"
+
+
+_CPU_TIME_KINDS = {
+    TaskKind.STATE_TRUTH: "truth",
+    TaskKind.MOTION_TRUTH: "truth",
+    TaskKind.DIAGNOSIS: "diagnosis",
+}
+_TRUTHS = {TaskKind.STATE: TaskKind.STATE_TRUTH, TaskKind.TRAJECTORY: TaskKind.MOTION_TRUTH}
+
+
+@dataclass(frozen=True)
+class TaskKey:
+    """The identity of one task of a run."""
+
+    kind: TaskKind
+    scenario: str = ""  # empty for descriptions
+    engine: str = ""  # empty for truths
+    integrator: str = ""  # empty for kinds without an integrator
+
+    def __str__(self) -> str:
+        return " ".join(part for part in (self.scenario, self.engine, self.kind, self.integrator) if part)
+
+    @property
+    def is_truth(self) -> bool:
+        """Whether the task computes a truth."""
+        return self.kind in _TRUTHS.values()
+
+    @property
+    def needed_truth(self) -> TaskKind | None:
+        """The truth that the answer is judged by; None where it is judged without one."""
+        return _TRUTHS.get(self.kind)
+
+    @property
+    def cpu_time_kind(self) -> str:
+        """The kind of `plumbline.processes.cpu_time` that the call counts as."""
+        return _CPU_TIME_KINDS.get(self.kind, "reference" if self.engine == "reference" else "engines")
+
+
+def task_keys(
+    scenario: str, engines: Mapping[str, EngineInfo], level: LevelSelection, has_long_runs: bool = False
+) -> Iterator[TaskKey]:
+    """List the tasks of a scenario that are known beforehand.
+
+    Args:
+        scenario: name of the scenario.
+        engines: descriptions of the engines; those that are missing get no task.
+        level: which levels to compare at.
+        has_long_runs: whether invariants are judged over long runs.
+
+    Yields:
+        The truths, then the cells engine by engine.
+
+    """
+    has_states, has_runs = level in ("state", "all"), level in ("trajectory", "all")
+    if has_states:
+        yield TaskKey(TaskKind.STATE_TRUTH, scenario)
+    if has_runs:
+        yield TaskKey(TaskKind.MOTION_TRUTH, scenario)
+    for name, info in engines.items():
+        if info.missing is not None:
+            continue
+        if has_states:
+            yield TaskKey(TaskKind.STATE, scenario, name)
+        if level == "all":
+            yield TaskKey(TaskKind.RELATIONS, scenario, name)
+        if has_runs:
+            for kind in (TaskKind.TRAJECTORY, TaskKind.LONG_RUN)[: 1 + has_long_runs]:
+                yield from (TaskKey(kind, scenario, name, one.name) for one in info.integrators)
