@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -17,10 +18,11 @@ from pathlib import Path
 
 import pytest
 
+from plumbline.cli.main import main
 from plumbline.scenario.field_docs import field_reference
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGES = ["add-a-scenario.md", "add-an-engine.md"]
+PAGES = ["first-run.md", "add-a-scenario.md", "add-an-engine.md", "sweeps.md"]
 BLOCK = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 LEFT_OUT = shutil.ignore_patterns(".*", "__pycache__", "node_modules", "out")
 
@@ -76,8 +78,6 @@ def play(page: str, folder: Path) -> int:
 @pytest.mark.skipif(shutil.which("bash") is None, reason="the pages' commands are for bash")
 @pytest.mark.parametrize("name", PAGES)
 def test_a_worked_page_does_what_it_says(name, tmp_path):
-    if not (ROOT / "docs" / name).exists():
-        pytest.skip(f"docs/{name} is not written")
     checkout = tmp_path / "check out"  # a path with a space in it
     shutil.copytree(ROOT, checkout, ignore=LEFT_OUT)
     assert play((ROOT / "docs" / name).read_text(encoding="utf-8"), checkout) >= 3
@@ -101,7 +101,60 @@ def test_the_field_reference_is_up_to_date():
     )
 
 
-def test_links_between_the_pages_lead_somewhere():
-    for page in (ROOT / "docs").glob("*.md"):
-        for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
-            assert (page.parent / target).exists(), f"{page.name} links to {target}, which is not there"
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+
+
+@pytest.mark.parametrize("page", DOCUMENTS, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_to_files_that_exist(page):
+    for target in re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8")):
+        assert (page.parent / target).exists(), f"{page.name} links to {target}, which is not there"
+
+
+COMMAND = re.compile(
+    r"(?:^|[`(\s])(?:python -m plumbline|\.venv/bin/plumbline|plumbline) ((?:[a-z]+)\b[^`\n|&;>…]*)", re.M
+)
+
+
+def documented_commands():
+    """Every command of this program in the documentation, as (page, words)."""
+    for page in DOCUMENTS:
+        for text in COMMAND.findall(page.read_text(encoding="utf-8")):
+            words = shlex.split(
+                text.split("#")[0].split("   ")[0].replace("[", " ").replace("]", " "), posix=True
+            )
+            if words[0] in main.commands:
+                yield page, [word.strip(",") for word in words]
+
+
+def test_documented_commands_and_options_exist():
+    found = list(documented_commands())
+    assert len(found) >= 20
+    for page, (name, *words) in found:
+        options = {option for param in main.commands[name].params for option in param.opts} | {"--help"}
+        unknown = {word.split("=")[0] for word in words if word.startswith("--")} - options
+        assert not unknown, f"{page.name}: {name} has no option {unknown}"
+
+
+def test_documented_make_targets_exist():
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M))
+    for page in DOCUMENTS:
+        named = set(re.findall(r"(?:^|`)make ([a-z-]+)", page.read_text(encoding="utf-8"), re.M))
+        assert named <= targets, f"{page.name}: no target {named - targets}"
+
+
+def test_documented_files_of_the_project_exist():
+    for page in DOCUMENTS:
+        if page.name == "CHANGELOG.md":
+            continue
+        text = page.read_text(encoding="utf-8")
+        for name in re.findall(
+            r"`((?:plumbline|reference_impl|adapters|tests|tools|reports|bench|scenarios)/[\w/.-]+)`", text
+        ):
+            made = name.startswith(("reports/out", "adapters/newton_euler")) or "`file=" in text
+            assert made or (ROOT / name).exists(), f"{page.name} names {name}, which does not exist"
+
+
+def test_the_glossary_has_thirty_terms_in_order():
+    text = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
+    terms = re.findall(r"^\| ([^|]+?) \|", text, re.M)[2:]
+    assert len(terms) == 30 and terms == sorted(terms, key=str.lower)

@@ -1,4 +1,4 @@
-"""docs/fast-reference.md cites stored runs: every figure of its tables is the one in bench/results."""
+"""docs/notes/reference-performance.md cites stored runs: every figure of its tables is the one in bench/results."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from plumbline.studies import sweep_file
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = (ROOT / "docs" / "fast-reference.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "notes" / "reference-performance.md").read_text(encoding="utf-8")
 FIGURES = json.loads((ROOT / "bench" / "results" / "figures.json").read_text(encoding="utf-8"))
 COLUMNS = {
     "structured": "reference",

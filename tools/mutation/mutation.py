@@ -7,7 +7,7 @@
 The mistakes are mutmut's.  Each is made in the memory of a forked child, so no file is ever changed and a
 mutant costs the tests it meets and little more.  The tests run in a copy of the checkout, first once in full
 to learn which test reaches which line; a mutant meets those that reach its line, the likeliest to notice
-first, until one fails or `PATIENCE` ends.  docs/mutation.md says what is left out, and why.
+first, until one fails or `PATIENCE` ends.  docs/notes/mutation.md says what is left out, and why.
 
 Ends with 1 where fewer than 95 % are noticed, where one survives that `survivors.yaml` does not list with a
 reason, or where one is noticed that it lists.
