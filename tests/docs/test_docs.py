@@ -156,5 +156,5 @@ def test_documented_files_of_the_project_exist():
 
 def test_the_glossary_has_thirty_terms_in_order():
     text = (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")
-    terms = re.findall(r"^\| ([^|]+?) \|", text, re.M)[2:]
+    terms = re.findall(r"^\| ([^|]+?) \|", text, re.M)[1:]
     assert len(terms) == 30 and terms == sorted(terms, key=str.lower)

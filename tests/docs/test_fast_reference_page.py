@@ -1,4 +1,4 @@
-"""docs/notes/reference-performance.md cites stored runs: every figure of its tables is the one in bench/results."""
+"""docs/notes/reference-performance.md cites stored runs: every figure of its tables is in bench/results."""
 
 from __future__ import annotations
 
