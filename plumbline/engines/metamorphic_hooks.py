@@ -7,22 +7,13 @@ All are optional; an adapter without them is still tested with rotated, rescaled
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from copy import copy
 from typing import ClassVar, Self
 
 import numpy as np
 
 from plumbline.engines.adapter import Adapter, check_samples, check_state
-from plumbline.model.datatypes import (
-    Array,
-    Integrator,
-    Model,
-    State,
-    StateQuantities,
-    Trajectory,
-    Unsupported,
-)
+from plumbline.model.datatypes import Integrator, Model, State, Trajectory, Unsupported
 from plumbline.model.welding import BodyParts, split_bodies, undivided_bodies
 
 
@@ -118,26 +109,6 @@ class MetamorphicHooks(Adapter):
         raise Unsupported(f"the adapter does not turn a run of {integrator.name} round")
 
 
-class _WithoutHooks(MetamorphicHooks):
-    """Any adapter as one that offers no other way."""
-
-    def __init__(self, adapter: Adapter) -> None:
-        self._adapter = adapter
-        self.name, self.title, self.package = adapter.name, adapter.title, adapter.package  # type: ignore[misc]
-        self.integrators, self.other_formulation = adapter.integrators, adapter.other_formulation  # type: ignore[misc]
-
-    def version(self) -> str:
-        return self._adapter.version()
-
-    def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-        return self._adapter._evaluate(model, states)
-
-    def _simulate(
-        self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
-    ) -> Trajectory:
-        return self._adapter._simulate(model, state, times, integrator, resolution)
-
-
 def metamorphic_hooks(adapter: Adapter) -> MetamorphicHooks:
     """Return an adapter with the hooks, whether or not its engine has other ways.
 
@@ -148,4 +119,7 @@ def metamorphic_hooks(adapter: Adapter) -> MetamorphicHooks:
         The adapter itself where it has the hooks; else the same engine with every hook at its default.
 
     """
-    return adapter if isinstance(adapter, MetamorphicHooks) else _WithoutHooks(adapter)
+    if isinstance(adapter, MetamorphicHooks):
+        return adapter
+    with_hooks: type[MetamorphicHooks] = type("WithHooks", (type(adapter), MetamorphicHooks), {})
+    return with_hooks()

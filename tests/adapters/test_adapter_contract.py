@@ -10,7 +10,6 @@ import ctypes
 import time
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -23,6 +22,7 @@ from plumbline.model.datatypes import BadInput, EngineFailure, Integrator, Model
 from tests.helpers import engine_process as worker
 from tests.helpers import newton_euler, pendulums
 from tests.helpers.pendulums import JOINTS
+from tests.helpers.refinement import observed_orders, romberg_columns
 
 STATES = 6
 STEP = 2.0**-7  # s, for runs whose accuracy does not matter
@@ -343,13 +343,10 @@ def test_converges_to_the_truth_with_its_declared_order(engine, integrator, case
     if integrator.kind == "tolerance":
         close(rows[0], stack_truth(true), 1, "at 1e-12", 1e-9)
         return
-    change = [np.linalg.norm(b - a) for a, b in pairwise(rows)]
-    orders = np.log2(np.array(change[:-1]) / change[1:])[-2:]
+    orders = observed_orders(np.array(rows))[-2:]
     assert np.all(np.abs(orders - integrator.order) < 0.1), f"orders {orders}"
-    previous, limit = None, rows
-    for power in integrator.error_exponents[: len(rows) - 1]:
-        previous, limit = limit[-1], [b + (b - a) / (2**power - 1) for a, b in pairwise(limit)]
-    uncertainty = 10 * np.max(np.abs(limit[-1] - previous)) + 1e-11
+    *_, previous, limit = romberg_columns(np.array(rows), integrator.error_exponents)
+    uncertainty = 10 * np.max(np.abs(limit[-1] - previous[-1])) + 1e-11
     assert uncertainty < 1e-5, f"extrapolation is uncertain by {uncertainty}"
     close(limit[-1], stack_truth(true), 1, "extrapolated", uncertainty)
 

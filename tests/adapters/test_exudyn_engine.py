@@ -16,6 +16,7 @@ from plumbline.engines.adapter import Adapter
 from plumbline.model.datatypes import EngineFailure, Model, State, Unsupported
 from plumbline.model.kinematics import joint_vectors, state_from_minimal
 from tests.helpers import newton_euler, pendulums
+from tests.helpers.refinement import extrapolated, observed_orders
 
 TIMES = np.linspace(0.0, 2.0, 9)
 
@@ -50,13 +51,6 @@ def ladder(engine: Adapter, joints: str, method: str, levels: range) -> tuple[np
     return np.array(runs), truth(joints)
 
 
-def limit(runs: np.ndarray, powers: tuple[int, ...]) -> np.ndarray:
-    """Romberg's last column of runs at halved steps, for an error in these powers of the step."""
-    for power in powers[: len(runs) - 1]:
-        runs = (2.0**power * runs[1:] - runs[:-1]) / (2.0**power - 1)
-    return runs[-1]
-
-
 @pytest.mark.parametrize("joints", ["b", "bb", "r"])
 @pytest.mark.parametrize(
     ("engine", "method", "levels", "order"),
@@ -69,17 +63,16 @@ def limit(runs: np.ndarray, powers: tuple[int, ...]) -> np.ndarray:
 )
 def test_order_and_limit(engine, method, levels, order, joints):
     runs, true = ladder(engine, joints, method, levels)
-    steps = np.abs(np.diff(runs, axis=0)).max(axis=(1, 2, 3))
-    shown = np.log2(steps[:-1] / steps[1:])
+    shown = observed_orders(runs)
     assert abs(shown[1] - order) < 0.1, f"{method} on {joints} shows orders {shown}, declared {order}"
-    error = np.abs(limit(runs, engine.integrator(method).error_exponents) - true).max()
+    error = np.abs(extrapolated(runs, engine.integrator(method).error_exponents) - true).max()
     assert error < 1e-11, f"the limit of {method} on {joints} is off by {error:.1e} m"
 
 
 def test_even_powers_are_what_the_trapezoidal_rule_has():
     """Two steps of the even powers reach what two of the consecutive ones do not: the h³ term is absent."""
     runs, true = ladder(Exudyn(), "b", "trapezoidal", range(7, 10))
-    even, each = (np.abs(limit(runs, powers) - true).max() for powers in ((2, 4), (2, 3)))
+    even, each = (np.abs(extrapolated(runs, powers) - true).max() for powers in ((2, 4), (2, 3)))
     assert even < each / 30
 
 

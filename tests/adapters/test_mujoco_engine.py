@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from plumbline.model import kinematics
 from plumbline.model.datatypes import EngineFailure
 from tests.helpers import engine_process as worker
 from tests.helpers import newton_euler, pendulums
+from tests.helpers.refinement import extrapolated, observed_orders
 
 pytest.importorskip("mujoco")
 
@@ -43,11 +43,9 @@ def swinging(joints, loaded=False):
 def study(joints, integrator, coarsest, levels, powers, loaded=False):
     """Orders seen (levels − 2,), error of the extrapolated limit in r (m) at the sample times."""
     subject, at = swinging(joints, loaded)
-    runs = [simulate(subject, at, integrator, coarsest / 2**level).r for level in range(levels)]
-    change = [np.linalg.norm(b - a) for a, b in pairwise(runs)]
-    for power in powers[: levels - 1]:
-        runs = [b + (b - a) / (2**power - 1) for a, b in pairwise(runs)]
-    return np.log2(np.array(change[:-1]) / change[1:]), np.max(np.abs(runs[-1] - truth(joints, loaded)))
+    runs = np.array([simulate(subject, at, integrator, coarsest / 2**level).r for level in range(levels)])
+    error = np.max(np.abs(extrapolated(runs, powers) - truth(joints, loaded)))
+    return observed_orders(runs), error
 
 
 @cache

@@ -16,6 +16,7 @@ from plumbline.scenario.loader import find_scenario_file, load_scenario
 from tests.helpers import engine_process as worker
 from tests.helpers import newton_euler, pendulums
 from tests.helpers.pendulums import JOINTS
+from tests.helpers.refinement import extrapolated, observed_orders
 
 pin = pytest.importorskip("pinocchio")
 pinocchio_engine = pytest.importorskip("adapters.pinocchio_engine")
@@ -101,18 +102,6 @@ def refined(model, state, integrator, coarsest, levels):
     )
 
 
-def orders(runs):
-    change = np.linalg.norm(np.diff(runs, axis=0).reshape(len(runs) - 1, -1), axis=1)
-    return np.log2(change[:-1] / change[1:])
-
-
-def limit(runs, order):
-    while len(runs) > 1:
-        runs = runs[1:] + (runs[1:] - runs[:-1]) / (2**order - 1)
-        order += 1
-    return runs[0]
-
-
 @pytest.mark.parametrize("joints", ["ball", "balls", "rod"])
 @in_the_engines_process
 def test_orders_and_limits_at_two_seconds(joints):
@@ -124,9 +113,9 @@ def test_orders_and_limits_at_two_seconds(joints):
         ("semi-implicit-euler", 1, 2.0**-8, 7),
     ):
         runs = refined(model, state, integrator, coarsest, levels)
-        seen = orders(runs)
+        seen = observed_orders(runs)
         assert np.all(np.abs(seen[-2:] - order) < 0.1), f"{integrator}: orders {seen}"
-        error = np.max(np.abs(limit(runs, order) - truth))
+        error = np.max(np.abs(extrapolated(runs, range(order, order + levels)) - truth))
         assert error < 1e-11, f"{integrator}: limit off by {error:.1e} m"
     run = Pinocchio().simulate(model, state, TIMES, "dop853", 1e-13)
     assert np.max(np.abs(run.r - truth)) < 1e-11
@@ -138,7 +127,7 @@ def test_without_the_inverse_differential_the_order_is_two():
     model = pendulums.model("bb")
     state = pendulums.state(model, rate=0.5)
     with patch.object(Chain, "exponential_coordinate_rate", lambda self, q, theta, v: v):
-        seen = orders(refined(model, state, "rkmk4", 2.0**-9, 4))
+        seen = observed_orders(refined(model, state, "rkmk4", 2.0**-9, 4))
     assert np.all(np.abs(seen - 2) < 0.1), f"orders {seen}"
 
 
@@ -147,7 +136,7 @@ def test_loads_are_taken_at_every_stage():
     """World force and drag, frozen over a step, would leave order 1."""
     model = pendulums.model("br", loads=True, drag=True)
     state = pendulums.state(model, rate=0.5)
-    seen = orders(refined(model, state, "rkmk4", 2.0**-7, 4))
+    seen = observed_orders(refined(model, state, "rkmk4", 2.0**-7, 4))
     assert np.all(np.abs(seen - 4) < 0.1), f"orders {seen}"
 
     def frozen(chain, q, v, h):
@@ -157,7 +146,7 @@ def test_loads_are_taken_at_every_stage():
 
     step = pinocchio_engine.rkmk4
     with patch.dict(pinocchio_engine.FIXED_STEPS, rkmk4=frozen):
-        seen = orders(refined(model, state, "rkmk4", 2.0**-9, 3))
+        seen = observed_orders(refined(model, state, "rkmk4", 2.0**-9, 3))
     assert np.all(np.abs(seen - 1) < 0.1), f"orders {seen}"
 
 

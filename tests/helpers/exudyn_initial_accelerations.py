@@ -1,4 +1,4 @@
-"""What Exudyn takes for the accelerations at the start of an implicit run (for `test_versions`)."""
+"""Exudyn's own accelerations at the start of an implicit run (for `test_environments`)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Real engines with a fault planted: MuJoCo that crashes, hangs, devours memory … in one cell of its own.
+"""MuJoCo with a planted fault: it crashes, hangs, exhausts memory … in the cell of one of its integrators.
 
-The parent names `prepare` as the initialiser of its workers, so that each knows these engines too.
+The parent process passes `prepare` as the initialiser of its workers, so that they load these engines too.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def litter(run: Run) -> Trajectory:
     return run()
 
 
-# The fault and the words of which its row's reason must have; none where the cell is not lost.
+# Per fault, the words that the reason of its row must contain; none where the cell is not lost.
 FAULTS: dict[Callable[[Run], Trajectory], str] = {
     segfault: "crashed: the worker died of SIGSEGV",
     abort: "crashed: the worker died of SIGABRT",
@@ -96,11 +96,11 @@ FAULTS: dict[Callable[[Run], Trajectory], str] = {
     raises: "RuntimeError: the engine's own words over two lines",
     litter: "",
 }
-CELL = "implicit"  # the integrator whose cell has the fault; Euler's beside it is sound
+CELL = "implicit"  # the integrator whose cell has the fault; the cell of Euler has none
 
 
 def engine(fault: Callable[[Run], Trajectory]) -> type[Mujoco]:
-    """MuJoCo with two integrators, the fault in one."""
+    """MuJoCo with two integrators and the fault in one of them."""
 
     class Faulty(Mujoco):
         name = fault.__name__
@@ -119,13 +119,13 @@ def engine(fault: Callable[[Run], Trajectory]) -> type[Mujoco]:
 
 
 def register() -> None:
-    """Into the registry of this process."""
+    """Add the faulty engines to the registry of this process."""
     for fault in FAULTS:
         globals()[f"Faulty_{fault.__name__}"] = engine(fault)
         registry.ENGINES[fault.__name__] = f"tests.helpers.faulty_engines:Faulty_{fault.__name__}"
 
 
 def prepare(*arguments: Any) -> None:
-    """`workers.prepare`, and the engines."""
+    """Initialise a worker and register the faulty engines there."""
     workers.initialize_worker(*arguments)
     register()
