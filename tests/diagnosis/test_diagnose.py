@@ -50,7 +50,7 @@ def changed(quantity, to, joints="bb", count=10):
     return model, said, truth
 
 
-def test_distances_are_in_bounds():
+def test_error_ratios_are_in_units_of_the_bounds():
     vectors = np.array([[[3.0, 4, 0], [0, 0, 1]], [[0, 0, 0], [6, 0, 8]]])
     assert max_error_ratio(vectors, np.array([[1.0, 1.0], [1.0, 4.0]])) == 5.0
     assert max_error_ratio(vectors[1:], np.array([[1.0, 4.0]])) == 2.5
@@ -82,7 +82,7 @@ def test_a_difference_is_measured_per_quantity_and_as_one_vector():
 
 
 @pytest.mark.parametrize(("at", "first"), [(0, 0), (3, 0), (5, 1), (9, 2)])
-def test_eight_states_around_the_worst_one_are_looked_at(at, first):
+def test_eight_states_around_the_worst_one_are_examined(at, first):
     model, said, truth = changed("acceleration", lambda i, a, b: a + 100 * b[:, None] * (i == at))
     seen = observe_difference(model, said, truth)
     assert len(seen.case.p) == 8
@@ -100,7 +100,7 @@ def test_eight_states_around_the_worst_one_are_looked_at(at, first):
 
 
 @pytest.mark.parametrize(("bodies", "states"), [(6, 8), (7, 4), (12, 4), (13, 2)])
-def test_fewer_states_of_long_chains(bodies, states):
+def test_fewer_states_are_examined_of_long_chains(bodies, states):
     model = pendulums.model("b" * bodies)
     at = random_states(model, 9, seed=1)
     truth = state_truth(model, at)
@@ -115,7 +115,7 @@ def truth_of(truth, count):
 
 
 @pytest.mark.parametrize("size", [1.0, 1e-6])
-def test_slopes_are_those_of_the_answers(size):
+def test_derivatives_agree_with_coarse_differences(size):
     """By every fifth cause, against differences a hundred times as far; of bodies of milligrams too."""
     model = pendulums.model("bb")
     model = replace(model, mass=size * model.mass, inertia=size * model.inertia)
@@ -164,7 +164,7 @@ def test_a_stale_field_and_an_origin_elsewhere_are_named():
     assert diagnose_quantity(seen, "kinetic_energy") != diagnose_quantity(seen, "potential_energy")
 
 
-def test_what_is_in_no_pattern_is_not_misread():
+def test_noise_is_not_named():
     rng = np.random.default_rng(1)
     model, said, truth = changed("acceleration", lambda i, x, b: x * (1 + 1e-6 * rng.normal(size=x.shape)))
     seen = observe_difference(model, said, truth)
@@ -174,7 +174,7 @@ def test_what_is_in_no_pattern_is_not_misread():
     assert text == "no single change of a parameter, term or convention explains the acceleration"
 
 
-def test_of_two_differences_one_may_have_a_name():
+def test_of_two_differences_one_may_be_named():
     rng = np.random.default_rng(2)
     model, said, truth = changed(
         "joint_reaction", lambda i, x, b: x * (1 + 1e-6 * rng.normal(size=x.shape)), count=4
@@ -192,7 +192,7 @@ def the_cause(seen, words):
     return found
 
 
-def test_a_pendulum_that_cannot_be_explains_nothing():
+def test_an_impossible_mechanism_explains_nothing():
     """Bodies without any inertia have no angular acceleration to predict."""
     model, said, truth = changed("acceleration", lambda i, x, b: 2 * x)
     seen = observe_difference(model, said, truth)
@@ -238,7 +238,7 @@ def test_a_difference_within_the_bound_is_in_the_mass_matrix():
     )
 
 
-def test_an_engine_that_fails_when_asked_again_is_told():
+def test_a_failure_of_the_second_evaluation_is_reported():
     model, said, truth = changed("acceleration", lambda i, x, b: 1.5 * x)
 
     def evaluate(asked, states):
@@ -251,7 +251,7 @@ def test_an_engine_that_fails_when_asked_again_is_told():
     assert text.endswith("persists at rest, fails without gravity: no weight)")
 
 
-def test_where_nothing_is_different_no_amount_is_seen():
+def test_without_a_difference_no_amount_is_significant():
     model, truth = known()
     seen = observe_difference(model, truth.quantities, truth)
     right = evaluate_case(seen.case)
@@ -276,7 +276,7 @@ def test_two_states_show_neither_a_constant_nor_a_stale_field(to):
     )
 
 
-def test_a_pendulum_at_rest_is_asked_at_rest_too():
+def test_a_state_at_rest_is_evaluated_at_rest_again():
     model = replace(pendulums.model("rb"), gravity=np.array([0, 0, -9.81]))
     still = [
         state_from_minimal(model, s.p, 0 * s.omega, s.u, 0 * s.udot) for s in random_states(model, 4, seed=3)
@@ -292,7 +292,7 @@ def test_a_pendulum_at_rest_is_asked_at_rest_too():
 
 
 @pytest.mark.parametrize(("loads", "drag"), [(True, True), (True, False), (False, True)])
-def test_what_lives_in_the_loads_vanishes_without_them(loads, drag):
+def test_an_error_in_the_loads_vanishes_without_them(loads, drag):
     model = pendulums.model("b", loads=loads, drag=drag)
     truth = state_truth(model, random_states(model, 4, seed=6))
     none = {name: 0 * getattr(model, name) for name in ("force", "moment", "drag_force", "drag_moment")}
@@ -305,7 +305,7 @@ def test_what_lives_in_the_loads_vanishes_without_them(loads, drag):
     assert text.endswith(f"{at_rest} at rest, persists without gravity, vanishes without loads and drag)")
 
 
-def test_what_lives_in_the_rates_vanishes_at_rest():
+def test_an_error_in_velocity_terms_vanishes_at_rest():
     model = pendulums.model("rb")
     truth = state_truth(model, random_states(model, 4, seed=3))
 
@@ -317,7 +317,7 @@ def test_what_lives_in_the_rates_vanishes_at_rest():
     assert text.endswith("(the difference vanishes at rest, persists without gravity)")
 
 
-def test_the_first_that_fails_is_told_in_eighty_letters_and_the_next_one_asked():
+def test_a_failure_is_reported_in_eighty_characters_and_the_next_trial_runs():
     model, said, truth = changed("acceleration", lambda i, x, b: 1.5 * x)
 
     def evaluate(asked, states):
@@ -343,7 +343,7 @@ def with_a_mass(factor, noise=0.0, count=4):
 
 
 @pytest.mark.parametrize("factor", [0.99, 1.01])
-def test_an_amount_is_found_whether_it_is_more_or_less(factor):
+def test_amounts_above_and_below_the_nominal_are_found(factor):
     seen = with_a_mass(factor)
     right, found = evaluate_case(seen.case), [c for c in all_causes(seen.case) if c.scale is not None]
     fits = fit_causes(seen, right, found)
@@ -357,7 +357,7 @@ def test_an_amount_is_found_whether_it_is_more_or_less(factor):
     assert fit.resolution == pytest.approx(1 / np.linalg.norm(slope), rel=1e-5, abs=0)
 
 
-def test_an_amount_is_fitted_to_what_it_does_not_explain_too():
+def test_a_fit_to_noisy_data_is_no_explanation():
     seen = with_a_mass(1.001, noise=1e6)
     (cause,) = (c for c in all_causes(seen.case) if c.scale is not None and c.nominal == seen.case.mass[0, 0])
     (slope,) = derivatives_by_amount(seen, [(cause, cause.nominal)])
@@ -392,7 +392,7 @@ def test_three_states_show_a_stale_field_and_a_constant():
 
 
 @pytest.mark.parametrize(("factor", "words"), [(-0.5, "-0.5"), (1.000123456, "1.000123"), (2.0, "2")])
-def test_a_factor_is_told_with_the_digits_that_it_needs(factor, words):
+def test_a_factor_is_described_with_the_digits_that_it_needs(factor, words):
     model, said, truth = changed("acceleration", lambda i, x, b: factor * x)
     text = f"it returned the acceleration multiplied by {words}"
     assert diagnose_quantity(observe_difference(model, said, truth), "acceleration") == text

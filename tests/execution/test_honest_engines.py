@@ -1,4 +1,4 @@
-"""Random scenarios through the whole harness: honest engines are not accused, and memory stays as it is."""
+"""Random scenarios through the whole harness: sound engines never disagree, and memory does not grow."""
 
 import os
 import resource
@@ -16,24 +16,23 @@ from plumbline.scenario.generator import RandomScenarios
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(engine)
 
-DEFECTIVE = {
-    "pinocchio-aba"
-}  # loses digits: plumbline/judging/known_issues.yaml has the evidence, and crba + solve agrees
+# loses digits: plumbline/judging/known_issues.yaml has the evidence, and crba + solve agrees
+DEFECTIVE = {"pinocchio-aba"}
 
 
-def peak():
-    """Largest size of this process so far, MB."""
+def peak_megabytes():
+    """Largest memory of this process so far [MB]."""
     size = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return size / (2**20 if sys.platform == "darwin" else 2**10)
 
 
-def probed(seed, count, states):
-    """The result, and the process's peak at each tenth of the tasks."""
+def run_random_scenarios(seed, count, states):
+    """The result, and the peak memory of this process [MB] at each tenth of the tasks."""
     peaks = []
 
     def progress(done, total, _):
         if done * 10 // total > len(peaks):
-            peaks.append(peak())
+            peaks.append(peak_megabytes())
 
     jobs = 1 if "PYTEST_XDIST_WORKER" in os.environ else os.cpu_count() or 1
     plan = Plan(
@@ -47,57 +46,59 @@ def probed(seed, count, states):
     return run_plan(plan, progress), peaks
 
 
-def accused(result):
+def disagreements(result):
     return [f"{r.key}: {r.reason}" for r in result.rows if r.verdict in ("disagrees", "failed")
             and r.engine not in DEFECTIVE]  # fmt: skip
 
 
-def worst(result):
+def worst_ratios(result):
     """The largest error over its bound, per engine, of rows only counted and of rows kept."""
     counted = [(cell["engine"], cell["ratio"]) for cell in result.metadata["random_batch"]["worst_ratios"]]
     kept = [(row.engine, row.ratio) for row in result.rows if row.ratio is not None]
     return {engine: max(ratio for who, ratio in counted + kept if who == engine) for engine in ENGINES}
 
 
-def told(result):
-    """Rows by verdict."""
+def count_by_verdict(result):
+    """Number of rows by verdict."""
     counted = result.random_batch.counts_by_verdict.copy()
     counted.update(row.verdict for row in result.rows)
     return counted
 
 
-def test_honest_engines_are_not_accused():
-    result, _ = probed(seed=2026, count=200, states=1)
-    assert not accused(result) and result.metadata["exit_code"] == 0, accused(result)
+def test_sound_engines_have_no_disagreement():
+    result, _ = run_random_scenarios(seed=2026, count=200, states=1)
+    assert not disagreements(result) and result.metadata["exit_code"] == 0, disagreements(result)
     assert result.random_batch.scenario_count == 200
-    counted = told(result)
+    counted = count_by_verdict(result)
     assert counted["agrees"] > 200 * len(ENGINES) * 6
-    assert counted["unresolved"] < 0.01 * counted.total(), "too blunt to see anything"
-    assert max(ratio for engine, ratio in worst(result).items() if engine not in DEFECTIVE) < 0.5
+    assert counted["unresolved"] < 0.01 * counted.total(), "too many inconclusive bounds"
+    assert max(ratio for engine, ratio in worst_ratios(result).items() if engine not in DEFECTIVE) < 0.5
 
 
 @pytest.mark.full
 @pytest.mark.timeout(7200)
-def test_fourteen_thousand_cells_in_the_memory_of_a_few(record_testsuite_property, capsys):
+def test_memory_does_not_grow_over_two_thousand_scenarios(record_testsuite_property, capsys):
     begin = time.monotonic()
-    result, peaks = probed(seed=1, count=2000, states=9)
+    result, peaks = run_random_scenarios(seed=1, count=2000, states=9)
     cells = 2000 * len(ENGINES)
     figures = {
         "cells": cells,
         "cells per second": round(cells / (time.monotonic() - begin), 1),
-        "rows": told(result).total(),
+        "rows": count_by_verdict(result).total(),
         "rows kept one by one": len(result.rows),
-        "disagree": told(result)["disagrees"],
-        "unresolved": told(result)["unresolved"],
-        "worst error over bound": {engine: float(f"{ratio:.2g}") for engine, ratio in worst(result).items()},
+        "disagree": count_by_verdict(result)["disagrees"],
+        "unresolved": count_by_verdict(result)["unresolved"],
+        "worst error over bound": {
+            engine: float(f"{ratio:.2g}") for engine, ratio in worst_ratios(result).items()
+        },
         "MB at each tenth": [round(size) for size in peaks],
     }
     for name, figure in figures.items():
         record_testsuite_property(name, figure)
     with capsys.disabled():
         print(f"\nrandom scenarios: {figures}")
-    assert not accused(result) and result.metadata["exit_code"] == 0, accused(result)
-    # What someone should see is kept and may grow; a cell whose bench stays takes 83 kB, forty times this
-    # limit (measured before benches were retired).
+    assert not disagreements(result) and result.metadata["exit_code"] == 0, disagreements(result)
+    # Remarkable rows are kept and may grow.  A cell whose scenario run is not released takes 83 kB, forty times
+    # this limit.
     grown = peaks[-1] - peaks[1]
     assert grown / (0.8 * cells) < 2 / 1024, f"{grown:.0f} MB in {0.8 * cells:.0f} cells"  # 2 kB a cell

@@ -130,7 +130,7 @@ def test_the_same_engine_without_defect_is_not_reported():
 
 
 @pytest.mark.parametrize(("defect", "both"), PAIRS, ids=[d.name for d, _ in PAIRS])
-def test_what_no_data_can_tell_apart_is_named_as_such(defect, both):
+def test_causes_with_the_same_effect_are_named_together(defect, both):
     wrong, text = state_report(defect)
     assert bool(wrong) == bool(both)
     assert all(words in text for words in both) and ("cannot distinguish" in text) == bool(both), text
@@ -160,7 +160,7 @@ UNNAMEABLE = (
 
 
 @pytest.mark.parametrize("defect", **ids(UNNAMEABLE))
-def test_what_has_no_single_cause_is_not_named(defect):
+def test_a_difference_without_single_cause_is_not_named(defect):
     wrong, text = state_report(defect)
     assert wrong and text.startswith("no single change"), text
 
@@ -173,7 +173,7 @@ def test_a_difference_next_to_the_bound_is_not_named():
     assert diagnose(model, said, truth).startswith("the difference is too close to the rounding bound")
 
 
-def test_where_the_difference_lives_is_said():
+def test_the_diagnosis_states_where_the_difference_persists():
     at = {d.name: state_report(d)[1] for d in STATE_DEFECTS}
     assert "vanishes at rest, persists without gravity" in at["gyroscopic-dropped"]
     assert "persists at rest, vanishes without gravity" in at["gravity-1e-5"]

@@ -63,7 +63,7 @@ def check_kane(rods):
             assert difference(balls[quantity], value) < 1e-44 * balls["scale"][quantity], quantity
 
 
-def test_kane_takes_rods_of_every_direction():
+def test_kanes_equations_agree_for_rods_in_every_direction():
     pytest.importorskip("sympy")
     model, state = random_chain(np.random.default_rng(5), [1])
     for u in ([0, 0, 1.0], [0, 0, -1.0], [1.0, 0, 0], [0.6, 0, -0.8]):
@@ -75,7 +75,7 @@ def test_kane_takes_rods_of_every_direction():
         )
 
 
-def test_every_enclosure_holds_what_a_higher_precision_finds():
+def test_enclosures_contain_the_results_of_a_higher_precision():
     model, state = random_chain(np.random.default_rng(7), [0, 1, 0, 0, 1], decades=2)
     coarse, fine = enclose_quantities(model, state, 120, True), enclose_quantities(model, state, 500, True)
     for quantity in set(coarse) - {"scale"}:
@@ -151,7 +151,7 @@ def test_a_singular_system_is_not_certified():
         certify_state(replace(model, inertia=flat), state)
 
 
-def test_without_the_tools_the_answer_is_a_sentence(monkeypatch):
+def test_missing_truth_tools_raise_with_an_explanation(monkeypatch):
     monkeypatch.setitem(sys.modules, "flint", None)
     model, state = random_chain(np.random.default_rng(0), [0])
     with pytest.raises(TruthUnavailable, match="truth tools not installed"):

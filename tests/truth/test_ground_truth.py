@@ -31,7 +31,7 @@ from tests.helpers import pendulums
 TIMES = np.linspace(0, 1, 9)
 
 
-def test_reach_is_from_where_a_body_hangs_to_where_the_next_one_does() -> None:
+def test_stretched_length_is_the_largest_extent_of_each_body() -> None:
     """At least to its centre, at least its radius of gyration; nothing hangs on the last."""
     model = replace(
         pendulums.model("rbb"),
@@ -47,7 +47,7 @@ def test_reach_is_from_where_a_body_hangs_to_where_the_next_one_does() -> None:
     )
 
 
-def test_the_least_effect_is_of_those_that_show_at_all() -> None:
+def test_the_least_effect_ignores_invisible_ones() -> None:
     effects = [np.array([0, 1.0, 3, 2]), np.array([0, 5.0, 1, 9]), np.array([0, 1e-9, 2e-9, 0])]
     assert least_detectable_effect(effects, 1e-6).tolist() == [0, 1, 3, 3]
     assert least_detectable_effect(effects, 1e-10).tolist() == [0, 1e-9, 2e-9, 2e-9]
@@ -57,7 +57,7 @@ def test_the_least_effect_is_of_those_that_show_at_all() -> None:
 
 
 @pytest.mark.parametrize("joints", ["b", "rb"])
-def test_mistakes_are_of_one_part_in_ten_thousand_each_of_its_kind(joints: str) -> None:
+def test_each_perturbed_model_has_one_kind_of_error_of_one_part_in_ten_thousand(joints: str) -> None:
     model = pendulums.model(joints)
     at = pendulums.state(model, seed=5)
     altered = [{"gravity"}, {"mass"}, {"inertia"}, {"proximal", "distal"}]
@@ -85,7 +85,7 @@ def test_mistakes_are_of_one_part_in_ten_thousand_each_of_its_kind(joints: str) 
     assert np.any(offsets > 1) and np.any(offsets < 1), "signs are drawn"
 
 
-def test_what_is_visible_is_the_least_effect_on_positions_and_attitudes() -> None:
+def test_detectable_effects_are_the_least_on_positions_and_attitudes() -> None:
     model = pendulums.model("b")
     length = float(np.sum(stretched_length(model)))
     r, p = np.zeros((4, 9, 1, 3)), np.tile([1.0, 0, 0, 0], (4, 9, 1, 1))
@@ -105,7 +105,7 @@ def test_what_is_visible_is_the_least_effect_on_positions_and_attitudes() -> Non
     )
 
 
-def test_the_truth_of_states_is_certified_or_says_that_it_is_not() -> None:
+def test_state_truth_is_certified_or_states_that_it_is_not() -> None:
     pytest.importorskip("flint")
     model = pendulums.model("rb", loads=True, drag=True)
     states = random_states(model, 3, seed=2)
@@ -125,7 +125,7 @@ def test_the_truth_of_states_is_certified_or_says_that_it_is_not() -> None:
     assert all(isinstance(q, StateQuantities) and q.mass_matrix is not None for q in found.quantities)
 
 
-def test_the_truth_of_a_motion_knows_its_growth_its_length_and_what_it_must_show() -> None:
+def test_motion_truth_holds_growth_length_and_detectable_effects() -> None:
     model = pendulums.model("bb")
     at = pendulums.state(model, seed=2, rate=0.5)
     found, run = motion_truth(model, at, TIMES, None), trajectory_truth(model, at, TIMES)
@@ -152,7 +152,7 @@ def test_the_truth_of_a_motion_knows_its_growth_its_length_and_what_it_must_show
 @pytest.mark.parametrize(
     ("position", "attitude", "parted"), [(0.9, 0.9, False), (1.1, 0.9, True), (0.9, 1.1, True)]
 )
-def test_two_methods_that_part_by_more_than_rounding_are_told(
+def test_two_methods_that_differ_by_more_than_rounding_are_reported(
     position: float, attitude: float, parted: bool
 ) -> None:
     model = pendulums.model("b")
@@ -171,7 +171,7 @@ def test_two_methods_that_part_by_more_than_rounding_are_told(
         assert motion_truth(model, at, TIMES, None).method == "made" + TRUTHS_DIFFER * parted
 
 
-def test_taylors_method_is_asked_of_so_many_bodies_only() -> None:
+def test_taylors_method_is_limited_in_bodies() -> None:
     model = pendulums.model("b")
     found = motion_truth(
         model, pendulums.state(model, seed=2, rate=0.5), TIMES[:3], None, max_compiled_bodies=0
@@ -179,7 +179,7 @@ def test_taylors_method_is_asked_of_so_many_bodies_only() -> None:
     assert "not used for more than 0 bodies" in found.method
 
 
-def test_a_closed_form_is_taken_for_the_motion() -> None:
+def test_a_closed_form_replaces_the_motion() -> None:
     model = pendulums.model("b")
     at = pendulums.state(model, seed=2, rate=0.5)
     run = pendulums.motion(model, at, TIMES)

@@ -45,7 +45,7 @@ def over_bound(said, true, bound):
 
 @pytest.mark.parametrize("rods", [[0], [1], [0, 0, 0], [1, 1, 1], [0, 1, 1, 0]], ids=str)
 @pytest.mark.parametrize("units", [(0.3, 1, 1), (1, 7e3, 1), (1, 1, 60.1), (39.37, 2.2046, 1e-3)], ids=str)
-def test_other_units_change_nothing(rods, units):
+def test_relative_bounds_are_independent_of_units(rods, units):
     length, mass, second = units
     model, state = random_chain(np.random.default_rng(2), rods, decades=1, loads=True, drag=True)
     force = mass * length / second**2
@@ -77,13 +77,13 @@ HONEST = [name for name in ENGINES if name != LOSES_DIGITS]
 
 
 @pytest.mark.parametrize("name", HONEST)
-def test_no_honest_engine_is_blamed(name):
+def test_no_sound_engine_exceeds_the_bound(name):
     honest(name, 40)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", HONEST)
-def test_no_honest_engine_is_blamed_in_two_thousand_chains(name):
+def test_no_sound_engine_exceeds_the_bound_in_two_thousand_chains(name):
     honest(name, 2000)
 
 
@@ -115,7 +115,7 @@ def honest(name, count):
     assert max(worst.values()) < 0.5, worst
 
 
-def test_a_real_loss_of_digits_is_blamed():
+def test_a_real_loss_of_digits_exceeds_the_bound():
     """The articulated-body recursion on a chain of 50 balls is off by far more than roundings explain."""
     pytest.importorskip("flint")
     pytest.importorskip("pinocchio")
@@ -131,7 +131,7 @@ def test_a_real_loss_of_digits_is_blamed():
     assert max(over_bound(matrix, true, bound).values()) < 0.5
 
 
-def test_scales_do_not_vanish_with_the_answer():
+def test_scales_do_not_vanish_with_the_quantity():
     """In steady conical motion and at rest ω̇′ is zero, and a tolerance relative to it would mean nothing."""
     for name in ("double-conical", "planar-rotating", "rest", "chain-10-small"):
         scenario = load_scenario(find_scenario_file(name))
@@ -157,7 +157,7 @@ PLANTED = {
 
 @pytest.mark.parametrize("rods, sharp", [([0, 0], 3e-11), ([1, 1], 1e-9)], ids=["balls", "rods"])
 @pytest.mark.parametrize("what", PLANTED)
-def test_a_small_mistake_is_seen(what, rods, sharp):
+def test_a_small_parameter_error_exceeds_the_bound(what, rods, sharp):
     """The smallest relative error that ten random states show in every one of ten models."""
     pytest.importorskip("flint")
     smallest = smallest_seen(what, rods)
@@ -186,7 +186,7 @@ def smallest_seen(what, rods):
     return worst
 
 
-def test_bounds_stay_sharp_and_say_how_they_came_about():
+def test_bounds_are_sharp_and_describe_their_derivation():
     model, state = random_chain(np.random.default_rng(0), [0, 1, 0])
     bound = state_rounding_bound(model, state)
     for quantity in bound.scale:
@@ -202,7 +202,7 @@ def test_bounds_stay_sharp_and_say_how_they_came_about():
     assert f"{np.max(bound.acceleration):.1e}" in bound.describe("acceleration")
 
 
-def test_a_wild_scenario_is_called_blunt():
+def test_extreme_mass_ratios_give_an_inconclusive_bound():
     model, state = random_chain(np.random.default_rng(1), [0] * 10)
     model = replace(model, mass=np.geomspace(1e-6, 1e6, 10), inertia=model.inertia * 1e-4)
     assert state_rounding_bound(model, state).relative_bound("angular_acceleration") > MAX_RELATIVE_BOUND
@@ -220,7 +220,7 @@ def test_states_without_motion_or_gravity_have_finite_bounds():
             assert np.all(np.isfinite(state_rounding_bound(centred, state).acceleration))
 
 
-def test_a_scale_of_zero_says_nothing_of_bluntness():
+def test_a_scale_of_zero_does_not_count_in_the_relative_bound():
     bound = state_rounding_bound(*random_chain(np.random.default_rng(0), [0, 1, 0]))
     scale = {"acceleration": np.array([0.0, 4.0, 1.0])}
     bound = replace(bound, acceleration=np.array([1.0, 4e-12, 3e-12]), scale=scale)

@@ -85,7 +85,7 @@ def test_growth_may_end():
     assert found[-1] == pytest.approx(apart, rel=0.1)
 
 
-def test_what_hangs_damped_grows_to_nothing():
+def test_perturbations_of_a_damped_hanging_body_do_not_grow():
     """All that stays is the turn about the vertical."""
     model, state, _ = upright()
     model = replace(model, proximal=-model.proximal, drag_moment=2 * model.mass)
@@ -102,7 +102,7 @@ def test_a_stable_swing_grows_no_faster_than_time():
 
 
 @pytest.mark.parametrize("rods", [[0], [1], [0, 1, 1]], ids=str)
-def test_twins_are_on_the_manifold_and_close(rods):
+def test_neighbours_are_on_the_manifold_and_close(rods):
     model, state = random_chain(np.random.default_rng(3), rods)
     # Numbers of size 1 … 5, each some dozen roundings of 1e-16; a middle on the sphere is off the chord's
     # by the square of the distance, (3e-7)², times them.
@@ -118,7 +118,7 @@ def test_twins_are_on_the_manifold_and_close(rods):
             assert getattr(half, name) == pytest.approx(middle, abs=1e-12), name
 
 
-def test_others_run_beside_it_as_they_do_alone():
+def test_other_models_in_the_batch_move_as_they_do_alone():
     """Past the time at which twins have moved so far that they run on without the others."""
     model, state, own = upright()
     heavier = replace(model, mass=2 * model.mass, inertia=3 * model.inertia)
@@ -133,7 +133,7 @@ def test_others_run_beside_it_as_they_do_alone():
 
 
 @pytest.mark.parametrize("rods", [[0, 0], [1], [0, 1]], ids=str)
-def test_growth_is_how_far_the_worst_twin_has_gone(rods):
+def test_growth_is_the_largest_distance_of_a_neighbour(rods):
     """Over the size it was turned by; positions over the largest distance from the pivot."""
     model, state = random_chain(np.random.default_rng(5), rods)
     times = np.linspace(0, 0.6, 13)
@@ -148,7 +148,7 @@ def test_growth_is_how_far_the_worst_twin_has_gone(rods):
     assert perturbation_growth(model, state, times) == pytest.approx(expected, rel=0.01)
 
 
-def test_positions_count_by_the_distance_from_the_pivot():
+def test_position_distances_are_relative_to_the_distance_from_the_pivot():
     """A point on a rod that stands: positions part exponentially, attitudes as time does."""
     model = replace(pendulums.model("r"), gravity=np.array([3.0, -6, 6]), proximal=np.zeros((1, 3)))
     still = np.zeros((1, 3))
@@ -162,7 +162,7 @@ def test_positions_count_by_the_distance_from_the_pivot():
     assert perturbation_growth(model, state, times) == pytest.approx(expected, rel=0.01)
 
 
-def test_between_two_far_neighbours_lie_themselves_and_the_middle():
+def test_interpolation_between_distant_states():
     model, state = random_chain(np.random.default_rng(3), [0, 1, 1])
     twin = perturbed_states(model, state, perturbation_size=0.3, count=1)[0]
     other = replace(twin, p=-twin.p)  # the same attitude
@@ -174,7 +174,7 @@ def test_between_two_far_neighbours_lie_themselves_and_the_middle():
         assert half.p == pytest.approx(_interpolate_states(model, state, twin, 0.5).p, abs=1e-15)
 
 
-def test_a_state_is_of_unit_quaternions_whatever_it_was_made_of():
+def test_projection_normalises_quaternions():
     """To a few roundings; of ω′, which comes from a rate of p, a few more."""
     model, state = random_chain(np.random.default_rng(3), [0, 1])
     found = _make_state(model, 2 * state.p, state.omega, 3 * state.u, state.udot)
@@ -188,7 +188,7 @@ def test_a_state_is_of_unit_quaternions_whatever_it_was_made_of():
 
 
 @pytest.mark.parametrize("faster", ["omega", "udot"])
-def test_rates_are_turned_by_those_of_the_fastest(faster):
+def test_rates_are_perturbed_relative_to_the_fastest(faster):
     model, state = random_chain(np.random.default_rng(6), [0, 1, 0])
     across = np.cross(state.u, [1.0, 0, 0])
     rates = {"omega": 40 * (faster == "omega") + 0 * state.omega, "udot": 40 * (faster == "udot") * across}
@@ -202,7 +202,7 @@ def test_rates_are_turned_by_those_of_the_fastest(faster):
 
 
 @pytest.mark.parametrize(("rate_", "unit"), [(0.0, 1.0), (30.0, 30.0)])
-def test_twins_are_turned_by_their_size_and_rates_by_it_of_the_motion(rate_, unit):
+def test_perturbations_have_the_specified_size(rate_, unit):
     model, state = random_chain(np.random.default_rng(6), [0, 1, 0], rate=rate_)
     found = perturbed_states(model, state, 1e-6, 40)
     assert len(found) == 40 and len(perturbed_states(model, state)) == PERTURBATION_COUNT

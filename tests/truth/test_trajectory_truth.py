@@ -37,13 +37,13 @@ pytestmark = pytest.mark.skipif(
 
 
 @pytest.mark.parametrize("rods", [[0], [1], [0, 0]], ids=str)
-def test_extended_precision_is_as_good_as_quad_says(rods):
+def test_extended_precision_agrees_with_quad(rods):
     check_precisions(rods)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("rods", [[1, 1], [0, 1, 0], [1, 0, 1], [0] * 5], ids=str)
-def test_extended_precision_is_as_good_as_quad_says_on_longer_chains(rods):
+def test_extended_precision_agrees_with_quad_on_longer_chains(rods):
     check_precisions(rods)
 
 
@@ -62,7 +62,7 @@ def check_precisions(rods):
 
 @pytest.mark.full
 @pytest.mark.parametrize("scenario", CATALOGUE, ids=lambda s: s.name)
-def test_the_uncertainty_covers_what_a_higher_precision_says_of_the_truth(scenario):
+def test_the_uncertainty_covers_the_error_measured_in_higher_precision(scenario):
     """Quad for a body or two, extended precision above.
 
     Beyond the difference a bit per link: in double both methods add up a chain's links alike.
@@ -107,7 +107,7 @@ def test_the_uncertainty_is_below_a_picometre_on_long_chains_of_balls(scenario):
 
 
 @pytest.mark.parametrize("scenario", CLOSED, ids=lambda s: s.name)
-def test_it_agrees_with_the_closed_forms(scenario):
+def test_the_truth_agrees_with_the_closed_forms(scenario):
     r, p = closed_form_motion(scenario)(TIMES)
     truth = trajectory_truth(scenario.model, scenario.state, TIMES, (r, p, "a book"))
     assert truth.method.startswith("closed form: a book; uncertainty: its difference from Taylor's method")
@@ -116,7 +116,7 @@ def test_it_agrees_with_the_closed_forms(scenario):
     assert np.max(truth.attitude_uncertainty) < 3e-14
 
 
-def test_its_accelerations_are_the_certified_ones():
+def test_accelerations_along_a_run_agree_with_the_certified_ones():
     """ω′ and v of a mixed chain, differenced over a microsecond, against ball arithmetic at one state."""
     model, state = random_chain(np.random.default_rng(4), [1, 0], loads=True, drag=True)
     h = 1e-4
@@ -131,7 +131,7 @@ def test_its_accelerations_are_the_certified_ones():
 
 
 @pytest.mark.parametrize("side", ["simulate_taylor", "simulate_notes_form"])
-def test_a_billionth_too_much_mass_in_one_of_the_two_is_seen(monkeypatch, side):
+def test_a_mass_error_of_1e_9_in_one_method_is_detected(monkeypatch, side):
     scenario = load_scenario(find_scenario_file("double-tumbling-balls"))
     usual = ground_truth.motion_truth(scenario.model, scenario.state, TIMES, None)
     right = getattr(trajectory, side)
@@ -145,7 +145,7 @@ def test_a_billionth_too_much_mass_in_one_of_the_two_is_seen(monkeypatch, side):
     assert planted.method == usual.method + ground_truth.TRUTHS_DIFFER
 
 
-def test_a_closed_form_that_is_off_is_seen():
+def test_an_error_in_a_closed_form_is_detected():
     scenario = load_scenario(find_scenario_file("lagrange-top"))
     r, p = closed_form_motion(scenario)(TIMES)
     truth = ground_truth.motion_truth(
@@ -167,11 +167,11 @@ def check_fall_back(why, **arguments):
     assert 0 < truth.position_uncertainty[-1] < 1e-12
 
 
-def test_long_chains_say_that_the_equations_are_the_same():
+def test_long_chains_fall_back_to_the_notes_equations():
     check_fall_back("not used for more than 1 bodies", max_compiled_bodies=1)
 
 
-def test_without_heyoka_dop853_stands_in(monkeypatch):
+def test_without_heyoka_dop853_is_the_second_method(monkeypatch):
     load_heyoka.cache_clear()
     monkeypatch.setitem(sys.modules, "heyoka", None)
     try:
@@ -193,7 +193,7 @@ def test_the_closed_form_is_compared_without_heyoka_too():
     assert 0 < truth.position_uncertainty[-1] < 1e-13
 
 
-def test_a_failure_of_heyoka_does_not_lose_the_truth(monkeypatch):
+def test_the_truth_survives_a_failure_of_heyoka(monkeypatch):
     def fails(*arguments):
         raise EngineFailure("heyoka stopped: err_nf_state")
 
@@ -201,7 +201,7 @@ def test_a_failure_of_heyoka_does_not_lose_the_truth(monkeypatch):
     check_fall_back("EngineFailure: heyoka stopped: err_nf_state")
 
 
-def test_a_worker_has_room_for_it():
+def test_the_truth_of_ten_bodies_fits_into_a_worker():
     """Ten bodies compile and run within a quarter of a worker's address space."""
     scenario = load_scenario(find_scenario_file("chain-10-rods"))
     arguments = (scenario.model, scenario.state, TIMES)
