@@ -98,7 +98,7 @@ def test_memory_does_not_grow_over_two_thousand_scenarios(record_testsuite_prope
     with capsys.disabled():
         print(f"\nrandom scenarios: {figures}")
     assert not disagreements(result) and result.metadata["exit_code"] == 0, disagreements(result)
-    # Remarkable rows are kept and may grow.  A cell whose scenario run is not released takes 83 kB, forty times
-    # this limit.
+    # Remarkable rows are kept and may grow.  A cell whose scenario run is not released takes 83 kB, forty
+    # times this limit.
     grown = peaks[-1] - peaks[1]
     assert grown / (0.8 * cells) < 2 / 1024, f"{grown:.0f} MB in {0.8 * cells:.0f} cells"  # 2 kB a cell
