@@ -70,7 +70,8 @@ def test_sound_engines_have_no_disagreement():
     assert not disagreements(result) and result.metadata["exit_code"] == 0, disagreements(result)
     assert result.random_batch.scenario_count == 200
     counted = count_by_verdict(result)
-    assert counted["agrees"] > 200 * len(ENGINES) * 6
+    # The notes as printed support rods of one and two bodies only.
+    assert counted["agrees"] > 200 * (len(ENGINES) - 1) * 6
     assert counted["unresolved"] < 0.01 * counted.total(), "too many inconclusive bounds"
     assert max(ratio for engine, ratio in worst_ratios(result).items() if engine not in DEFECTIVE) < 0.5
 
