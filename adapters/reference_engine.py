@@ -38,7 +38,6 @@ class Reference(MetamorphicHooks):
     name: ClassVar[str] = "reference"
     title: ClassVar[str] = "Reference (the notes)"
     package: ClassVar[str] = "plumbline"
-    reproduction_template = "reference"
     integrators: ClassVar[tuple[Integrator, ...]] = (
         DOP853,
         Integrator(

@@ -14,6 +14,7 @@ import numpy as np
 import pyarrow.parquet as pq
 
 from plumbline.storage.results_store import read_results
+from plumbline.storage.script_index import read_script_index, scripts_folder
 
 Record = dict[str, Any]
 Columns = dict[str, np.ndarray]
@@ -109,15 +110,11 @@ class Results:
     @cached_property
     def scripts(self) -> dict[str, str]:
         """Stand-alone script of each row key that has one (OUT/scripts/index.json)."""
-        index = self.folder / "scripts" / "index.json"
-        if not index.exists():
-            return {}
-        files = json.loads(index.read_text(encoding="utf-8"))
-        inside = {k: (index.parent / Path(name).name) for k, name in files.items()}
+        folder = scripts_folder(self.folder)
         return {
-            replace_unprintable(k): replace_unprintable(path.read_text(encoding="utf-8", errors="replace"))
-            for k, path in inside.items()
-            if path.is_file()
+            replace_unprintable(key): replace_unprintable((folder / name).read_text("utf-8", "replace"))
+            for key, name in read_script_index(self.folder).items()
+            if (folder / name).is_file()
         }
 
 

@@ -13,6 +13,7 @@ import reports
 from plumbline.cli.console import count_noun, make_console, print_table
 from plumbline.cli.options import DEFAULT_OUT, FolderPath, ensure_writable, examples, json_option
 from plumbline.storage.results_store import read_results
+from plumbline.storage.script_index import read_script_index
 
 
 @click.command(
@@ -68,6 +69,7 @@ def report(folder: Path, history_folder: Path | None) -> None:
     """Write report.html, junit.xml and summary.md again, from the results stored in FOLDER."""
     try:
         read_results(folder)
+        read_script_index(folder)
     except ValueError as error:
         raise click.UsageError(str(error)) from None
     click.echo(f"report: {reports.write(ensure_writable(folder), history_folder)}")
@@ -87,21 +89,20 @@ def reproduce(result: Path, keys: tuple[str, ...]) -> None:
     RESULT is a results folder or its results.json; KEY is a row's key. Without KEY, the disagreements are
     listed.
     """
-    from plumbline.reproduce import write as scripts
+    from plumbline.reproduce.write import read_disagreements, write_scripts
 
     folder = result if result.is_dir() else result.parent
     try:
         if not keys:
-            rows = scripts.disputed(read_results(folder))
+            rows = read_disagreements(folder)
             for row in rows:
                 click.echo(f"{row['key']}: {row['diagnosis'] or row['reason']}")
             click.echo(count_noun(len(rows), "disagreement") if rows else "nothing disagrees", err=True)
             return
-        names = scripts.write(folder, keys)
+        written = write_scripts(folder, keys)
     except ValueError as error:
         raise click.UsageError(str(error)) from None
-    for key, name in names.items():
-        path = folder / "scripts" / name
-        if not path.is_file():
-            raise click.ClickException(f"{key}: {name}")
+    for path in dict.fromkeys(written.files.values()):
         click.echo(str(path))
+    for key, reason in written.reasons.items():
+        raise click.ClickException(f"{key}: {reason}")

@@ -1,11 +1,10 @@
-"""Whom a script is about: a registered engine, here or in the environment of another version."""
+"""An engine as the reproduction code calls it: in this process, or in the environment of another version."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass
-from functools import cached_property
 from io import StringIO
 from typing import Any
 
@@ -19,63 +18,84 @@ from plumbline.processes.remote_python import call_remote
 
 
 @dataclass(frozen=True)
-class Engine:
-    """Whom to ask: a registered name and, for another version, the interpreter of its environment."""
+class EngineClient:
+    """A registered engine and, for another version of it, the interpreter of that version's environment."""
 
     name: str
-    python: str = ""
+    python: str = ""  # empty: this process
 
-    def ask(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """``function(name, *arguments)``, here or there."""
+    def call(self, function: Callable[..., Any], *arguments: Any) -> Any:
+        """Call a function of the engine's name in the engine's environment.
+
+        Args:
+            function: a module-level function whose first parameter is the engine's name.
+            *arguments: its other arguments; picklable.
+
+        Returns:
+            The function's result.
+
+        """
         if self.python:
             return call_remote(self.python, function, self.name, *arguments)
         return function(self.name, *arguments)
 
-    def evaluate(self, model: Model, state: State, way: str = "") -> StateQuantities:
-        """What it says of a state, by another of its ways where one is named."""
-        found: StateQuantities = self.ask(answer, way, model, state)
+    def evaluate(self, model: Model, state: State, variant: str = "") -> StateQuantities:
+        """Evaluate one state.
+
+        Args:
+            model: the mechanism.
+            state: a state on its constraint manifold.
+            variant: name of the relation whose second answer is wanted ("by cholesky", "two welded
+                halves"); empty for the engine's usual answer.
+
+        Returns:
+            The engine's quantities at that state.
+
+        """
+        found: StateQuantities = self.call(_evaluate_variant, variant, model, state)
         return found
 
     def integrator(self, name: str) -> Integrator:
-        """One of its integrators, as it declares it."""
-        every = self.ask(calls.describe_engine).integrators
+        """Return the declaration of one of the engine's integrators.
+
+        Args:
+            name: the integrator's name.
+
+        Returns:
+            The integrator as this version's adapter declares it.
+
+        """
+        every = self.call(calls.describe_engine).integrators
         found: Integrator = next(i for i in every if i.name == name)
         return found
 
-    def say(self, script: str) -> str:
-        """What a script prints."""
-        said: str = self.ask(printed, script)
-        return said
+    def run_script(self, script: str) -> str:
+        """Run a reproduction script in the engine's environment.
+
+        Args:
+            script: the script's text.
+
+        Returns:
+            What it prints, up to its end or its failure.
+
+        """
+        printed: str = self.call(_capture_output, script)
+        return printed
 
 
-@dataclass
-class OfRuns:
-    """What is measured of runs by one of an engine's integrators."""
-
-    engine: Engine
-    method: str
-
-    @cached_property
-    def integrator(self) -> Integrator:
-        """As the engine declares it."""
-        return self.engine.integrator(self.method)
-
-
-def printed(_: str, script: str) -> str:
-    """The output of a script, run in this process; empty where it fails."""
-    with redirect_stdout(StringIO()) as output, suppress(Exception):
-        exec(compile(script, "script", "exec"), {"__name__": "__main__"})  # it is ours, written from numbers
+def _capture_output(_: str, script: str) -> str:
+    with redirect_stdout(StringIO()) as output, suppress(Exception, SystemExit):
+        exec(
+            compile(script, "script", "exec"), {"__name__": "__main__"}
+        )  # written by this project, from numbers
     return output.getvalue()
 
 
-def answer(engine: str, way: str, model: Model, state: State) -> StateQuantities:
-    """What an engine says of a state: as usual, by one of its options, or of welded halves."""
-    chosen = metamorphic_hooks(load_adapter(engine))
-    if way:
-        chosen = (
-            chosen.with_welded_halves()
-            if way == WELDED_HALVES
-            else chosen.with_option(way.removeprefix(OPTION_PREFIX))
-        )
-    (said,) = chosen.evaluate(model, [state])
-    return said
+def _evaluate_variant(engine: str, variant: str, model: Model, state: State) -> StateQuantities:
+    adapter = metamorphic_hooks(load_adapter(engine))
+    if variant == WELDED_HALVES:
+        adapter = adapter.with_welded_halves()
+    elif variant:
+        adapter = adapter.with_option(variant.removeprefix(OPTION_PREFIX))
+    (found,) = adapter.evaluate(model, [state])
+    return found

@@ -1,14 +1,15 @@
-"""What an engine makes of a case, measured: at a state, of a relation, along a run.
+"""Measure by how much an engine disagrees on a case: at a state, in a relation, in a refinement study.
 
-Runs in a worker.  Engines of another version are asked in the environment of theirs; truths and bounds
-are always this one's.
+Called in a worker. An engine of another version is called in that version's environment; truths and bounds
+are always those of this checkout.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, cast
 
 import numpy as np
@@ -16,7 +17,6 @@ import numpy as np
 from plumbline.engines import calls
 from plumbline.engines.calls import RefinementRun
 from plumbline.engines.registry import load_adapter
-from plumbline.judging.convergence import ORDER_MARGIN
 from plumbline.judging.invariant_drift import invariant_rows
 from plumbline.judging.refinement_analysis import RefinementAnalysis
 from plumbline.judging.relation_result import OTHER_FORMULATION_PREFIX
@@ -31,305 +31,343 @@ from plumbline.judging.state_relations import (
 from plumbline.judging.trajectory import trajectory_rows
 from plumbline.model.datatypes import Array, Integrator, StateQuantities
 from plumbline.model.welding import split_bodies
-from plumbline.reproduce.engine_client import Engine, OfRuns
-from plumbline.reproduce.measure_long_run import GROWTH, LONG, OverLong, ShownLong
-from plumbline.reproduce.measure_round_trip import ShownTwice, Twice
-from plumbline.reproduce.shrink import Case, smallest
+from plumbline.reproduce.engine_client import EngineClient
+from plumbline.reproduce.shrink import ReproductionCase, smallest_case
 from plumbline.truth import TruthUnavailable
 from plumbline.truth.certified import certify_state
 from plumbline.truth.ground_truth import MotionTruth, motion_truth
 from plumbline.truth.rounding_bound import state_rounding_bound
 
 LIMITS = ("position_limit", "position", "attitude_limit", "attitude")
-FINE = 64  # samples of a run whose loads' work is integrated
+WORK_SAMPLES = 64  # of a run where the work of moments and drag is integrated
+TINY = 1e-300
 
 
 @dataclass(frozen=True, eq=False)
-class ShownState:
-    """A state at which the engine is off, with what is true there."""
+class StateEvidence:
+    """A state at which the engine's answers differ from the expected ones."""
 
-    case: Case
-    ratio: float
-    truth: dict[str, Array]
-    bound: dict[str, Array]  # (N,) or a number: of the norm of the difference, per body; of each entry
-    certified: bool
-
-
-@dataclass(frozen=True, eq=False)
-class ShownRelation:
-    """A state that the engine answers otherwise when it is described otherwise."""
-
-    case: Case
-    ratio: float
-    name: str
-    way: str  # of the engine to the second answer, where it is another one
-    other: Case  # the other description
-    second: str  # the engine that is asked of it
-    back: dict[str, Array]  # (3, 3) or a number per quantity: the second answer in terms of the first
-    bound: dict[str, Array]  # of both sides
+    case: ReproductionCase
+    ratio: float  # largest error over its bound
+    truth: dict[str, Array]  # expected value of each quantity
+    bound: dict[str, Array]  # (N,) or a number: of the norm of the error, per body; of each entry of a matrix
+    certified: bool  # whether the truth is certified; else the notes' equations in double precision
 
 
 @dataclass(frozen=True, eq=False)
-class ShownRun:
-    """Runs whose order, limit or drift is off."""
+class RelationEvidence:
+    """A state for which the engine's two answers differ."""
 
-    case: Case
+    case: ReproductionCase
+    ratio: float  # largest difference over its bound
+    name: str  # of the relation
+    variant: str  # how the engine computes the second answer ("by …", "two welded halves"); empty as usual
+    other: ReproductionCase  # the second description of the state
+    other_engine: str  # the engine that evaluates it
+    back: dict[str, Array]  # (3, 3) or a number per quantity: takes the second answer back to the first
+    bound: dict[str, Array]  # of both answers
+
+
+@dataclass(frozen=True, eq=False)
+class MotionEvidence:
+    """A refinement study whose order, limit or drift is off."""
+
+    case: ReproductionCase
     ratio: float
     times: Array  # (T,) s
     integrator: Integrator
-    ordered: bool  # whether the order is in dispute
-    limited: bool  # whether positions or attitudes at step zero are
-    drifts: tuple[str, ...]  # invariants that drift
-    true_r: Array  # (N, 3) m at the end
-    true_p: Array  # (N, 4) at the end
-    sizes: tuple[float, float]  # m and m/s: what r and v are measured in where orders are observed
-    eliminated: dict[str, int]  # powers of the step, per quantity
-    uncertain: dict[str, float]  # m, rad or the invariant's unit, per quantity
+    ordered: bool  # whether the observed order is in dispute
+    drifts: tuple[str, ...]  # invariants that are in dispute
+    sizes: tuple[float, float]  # m and m/s: scales of r and v where orders are observed
+    expected: dict[str, Array]  # at the end, of each quantity whose limit is in dispute
+    uncertain: dict[str, float]  # what each of them may be off by, per body; attitudes as quaternions
+    eliminated: dict[str, int]  # how many powers of the step Romberg's scheme eliminates, per quantity
 
 
-Shown = ShownState | ShownRelation | ShownTwice | ShownRun | ShownLong
+Evidence = StateEvidence | RelationEvidence | MotionEvidence
 
 
 @dataclass(frozen=True)
-class Question:
-    """What to shrink: an engine, a level and the quantities that disagree there."""
+class Disagreement:
+    """The rows of one cell that disagree, as far as they can be measured again."""
 
-    engine: Engine
+    engine: EngineClient
     level: str
-    wanted: tuple[str, ...]
-    integrator: str
-    case: Case
-    most: float  # by how much it disagreed, in tolerances
-    seconds: float  # of computing, for shrinking
-    sample: float = 0.0  # s, from one sample of a long run to the next
+    quantities: tuple[str, ...]
+    integrator: str  # "-" at a state
+    case: ReproductionCase
+    ratio: float  # the largest ratio of the rows
+    seconds: float  # for shrinking [s]
+
+    def measure(self, case: ReproductionCase) -> Evidence | None:
+        """Measure by how much a case shows this disagreement.
+
+        Args:
+            case: the case to evaluate or to run.
+
+        Returns:
+            The evidence, or None where the engine or the truth refuses the case.
+
+        """
+        return self._measure(case)
+
+    @cached_property
+    def _measure(self) -> Callable[[ReproductionCase], Evidence | None]:
+        if self.level == "state":
+            return StateMeasure(self.engine, self.quantities)
+        if self.level == "relations":
+            return RelationMeasure(self.engine, self.quantities[0])
+        return ConvergenceMeasure(self.engine, self.integrator, self.level, self.quantities)
+
+    def shrink(self) -> Evidence | None:
+        """Find the smallest case that shows this disagreement.
+
+        Returns:
+            Its evidence, or None where the engine, called again, agrees.
+
+        Raises:
+            OutOfTime: no case was found in time.
+
+        """
+        ratio = self.ratio
+        if not self.case.steps:
+            evidence = self.measure(self.case)
+            ratio = evidence.ratio if evidence else 0.0
+        # the CPU time of another environment's process is not counted in this process
+        clock = time.monotonic if self.engine.python else time.process_time
+        found = smallest_case(self.case, self._measure, ratio, self.seconds, clock)
+        return cast("Evidence | None", found)
 
 
-def measure_of(question: Question) -> AtState | Related | AlongRuns | Twice | OverLong:
-    """What says by how much a case shows what is in question."""
-    q = question
-    if q.level == "state":
-        return AtState(q.engine, q.wanted)
-    if q.level == "relations":
-        if q.integrator != "-":
-            return Twice(q.engine, q.integrator, q.wanted[0])
-        return Related(q.engine, q.wanted[0])
-    if q.wanted[0].endswith((LONG, GROWTH)):
-        return OverLong(q.engine, q.integrator, q.wanted, q.sample)
-    return AlongRuns(q.engine, q.integrator, q.level, q.wanted)
+def _error_size(error: Array, quantity: str) -> Array:
+    """Size of an error as the verdicts measure it: per body, of a vector, of a number, of each entry."""
+    if quantity == "mass_matrix" or error.ndim == 0:
+        return np.asarray(np.max(np.abs(error)))
+    return np.asarray(np.linalg.norm(error, axis=-1))
 
 
-def whole(question: Question) -> Case:
-    """The case in question with its steps; those of a long run are its integrator's."""
-    measure = measure_of(question)
-    return measure.whole(question.case) if isinstance(measure, OverLong) else question.case
-
-
-def shrunk(question: Question) -> Shown | None:
-    """The smallest case found that shows the disagreement; None where the engine, asked again, agrees.
-
-    Raises OutOfTime where none was found in time.
-    """
-    measure, case, most = measure_of(question), whole(question), question.most
-    if not case.steps:
-        found = measure(case)
-        most = found.ratio if found else 0.0
-    # what another environment computes is not on this process's clock
-    clock = time.monotonic if question.engine.python else time.process_time
-    steps_given = not isinstance(measure, OfRuns) or measure.integrator.kind == "step"
-    as_it_is = isinstance(measure, OverLong) and measure.growth  # another motion need not be a regular one
-    smaller = smallest(case, measure, most, question.seconds, steps_given, clock, not as_it_is)
-    return cast("Shown | None", smaller)
-
-
-def length_of(difference: Array, quantity: str) -> Array:
-    """Size of an error as the verdicts take it: per body, of a vector, of a number, of each entry."""
-    if quantity == "mass_matrix" or difference.ndim == 0:
-        return np.asarray(np.max(np.abs(difference)))
-    return np.asarray(np.linalg.norm(difference, axis=-1))
+def _largest_ratio(found: dict[str, Array], right: dict[str, Array], bound: dict[str, Array]) -> float:
+    """Largest error over its bound, of the quantities that have a bound."""
+    off = [np.max(_error_size(found[q] - right[q], q) / np.maximum(bound[q], TINY)) for q in bound]
+    return float(max(off, default=0.0))
 
 
 @dataclass(frozen=True)
-class AtState:
-    """By how much an engine's answers at a state are off, in rounding bounds."""
+class StateMeasure:
+    """Error of an engine's answers at a state, over the bounds of rounding."""
 
-    engine: Engine
+    engine: EngineClient
     quantities: tuple[str, ...]
 
-    def __call__(self, case: Case) -> ShownState | None:
-        """None for what the engine, the truth or the bound refuses: it shows nothing."""
+    def __call__(self, case: ReproductionCase) -> StateEvidence | None:
+        """Measure a case; None where the engine, the truth or the bound refuses it."""
+        model, state, certified = case.model, case.state, True
         try:
-            said = self.engine.evaluate(case.model, case.state)
-            allowed, certified = state_rounding_bound(case.model, case.state), True
+            answers = self.engine.evaluate(model, state)
+            allowed = state_rounding_bound(model, state)
             try:
-                truth = certify_state(
-                    case.model, case.state, mass_matrix="mass_matrix" in self.quantities
-                ).quantities
+                truth = certify_state(model, state, mass_matrix="mass_matrix" in self.quantities).quantities
             except TruthUnavailable:
-                (truth,), certified = load_adapter("reference").evaluate(case.model, [case.state]), False
+                (truth,), certified = load_adapter("reference").evaluate(model, [state]), False
         except Exception:
             return None
-        offered = [q for q in self.quantities if getattr(said, q) is not None]
-        bounds = {q: np.asarray(allowed.tolerance(q), float) for q in offered}
-        right = {q: np.asarray(getattr(truth, q), float) for q in offered}
-        ratios = [
-            np.max(length_of(getattr(said, q) - right[q], q) / np.maximum(bounds[q], 1e-300)) for q in offered
-        ]
-        return ShownState(case, float(max(ratios, default=0.0)), right, bounds, certified)
+        offered = [q for q in self.quantities if getattr(answers, q) is not None]
+        found, right = ({q: np.asarray(getattr(x, q), float) for q in offered} for x in (answers, truth))
+        bound = {q: np.asarray(allowed.tolerance(q), float) for q in offered}
+        return StateEvidence(case, _largest_ratio(found, right, bound), right, bound, certified)
 
 
 @dataclass(frozen=True)
-class Related:
-    """By how much an engine disagrees with itself on a case described, or asked about, in two ways."""
+class RelationMeasure:
+    """Difference of an engine's two answers for one state, over the bounds of rounding of both."""
 
-    engine: Engine
-    name: str
-    back: dict[str, Array] = field(default_factory=dict)  # see `ways`: the same for every case
+    engine: EngineClient
+    name: str  # of the relation
+    back: dict[str, Array] = field(default_factory=dict)  # see `inverse_transforms`: the same for every case
 
-    def __call__(self, case: Case) -> ShownRelation | None:
-        """None for what cannot be compared."""
+    def __call__(self, case: ReproductionCase) -> RelationEvidence | None:
+        """Measure a case; None where the two answers cannot be compared."""
         model, state, engine = case.model, case.state, self.engine
         relation = next((r for r in STATE_RELATIONS if r.name == self.name), None)
-        way = "" if relation or self.name.startswith(OTHER_FORMULATION_PREFIX) else self.name
+        variant = "" if relation or self.name.startswith(OTHER_FORMULATION_PREFIX) else self.name
         relation = relation or Relation(self.name, unchanged, quantity_values)
         if self.name.startswith(OTHER_FORMULATION_PREFIX):
             engine = replace(engine, name=self.name.removeprefix(OTHER_FORMULATION_PREFIX))
         if model.has_drag and self.name == "time reversed":
             return None
         try:
-            other = Case(*relation.transform(model, state))
-            here, said = (
-                self.engine.evaluate(model, state),
-                engine.evaluate(other.model, other.state, way),
-            )
-            bounds = [state_rounding_bound(model, state)]
-            bounds.append(
-                state_rounding_bound(model, state, split_bodies(model)) if way == WELDED_HALVES else bounds[0]
-            )
+            other = ReproductionCase(*relation.transform(model, state))
+            first = quantity_values(self.engine.evaluate(model, state))
+            answers = engine.evaluate(other.model, other.state, variant)
+            bounds = [state_rounding_bound(model, state)] * 2
+            if variant == WELDED_HALVES:
+                bounds[1] = state_rounding_bound(model, state, split_bodies(model))
         except Exception:
             return None
-        mine, theirs = quantity_values(here), relation.transform_back(said)
+        second = relation.transform_back(answers)
         if not self.back:
-            self.back.update(ways(relation, said))
-        both = [q for q in mine if q in theirs]
+            self.back.update(inverse_transforms(relation, answers))
+        both = [q for q in first if q in second]
         bound = {q: np.sum([np.asarray(b.tolerance(q), float) for b in bounds], axis=0) for q in both}
-        off = [np.max(length_of(mine[q] - theirs[q], q) / np.maximum(bound[q], 1e-300)) for q in both]
-        return ShownRelation(
-            case, float(max(off)), self.name, way, other, engine.name, {q: self.back[q] for q in both}, bound
-        )
+        back = {q: self.back[q] for q in both}
+        ratio = _largest_ratio(first, second, bound)
+        return RelationEvidence(case, ratio, self.name, variant, other, engine.name, back, bound)
 
 
-def ways(relation: Relation, said: StateQuantities) -> dict[str, Array]:
-    """The way back of each quantity: a factor, or a matrix (3, 3) on its last axis, found by asking.
+def inverse_transforms(relation: Relation, answers: StateQuantities) -> dict[str, Array]:
+    """Find how a relation takes each quantity back, by applying it to unit vectors.
 
-    NotImplementedError where it is neither: a script could not say it in numbers.
+    Args:
+        relation: how the second description of a state is made and its answers are taken back.
+        answers: the engine's answers for the second description of a state.
+
+    Returns:
+        Per quantity a factor, or a matrix (3, 3) that acts on the last axis.
+
+    Raises:
+        NotImplementedError: the relation does something else, which a script could not express in numbers.
+
     """
     found: dict[str, Array] = {}
-    for q, value in relation.transform_back(said).items():
-        given = np.asarray(getattr(said, q), float)
+    for q, value in relation.transform_back(answers).items():
+        given = np.asarray(getattr(answers, q), float)
 
         def back(y: Any, q: str = q) -> Array:
-            return np.asarray(relation.transform_back(replace(said, **{q: y}))[q], float)
+            return np.asarray(relation.transform_back(replace(answers, **{q: y}))[q], float)
 
         if given.ndim == 0:
             way = back(1.0)
         else:
-            way = np.stack(
-                [back(np.broadcast_to(e, given.shape)).reshape(-1, 3)[0] for e in np.eye(3)], axis=1
-            )
+            units = [back(np.broadcast_to(e, given.shape)).reshape(-1, 3)[0] for e in np.eye(3)]
+            way = np.stack(units, axis=1)
             way = way[0, 0] if np.all(way == way[0, 0] * np.eye(3)) else way
         again = given @ way.T if np.ndim(way) else way * given
-        if np.shape(again) != np.shape(value) or not np.allclose(
-            again, value, rtol=0, atol=1e-9 * np.max(np.abs(value))
-        ):
-            raise NotImplementedError(f"the way back of {relation.name!r} is not a matrix for each body")
+        limit = 1e-9 * np.max(np.abs(value))
+        if np.shape(again) != np.shape(value) or not np.allclose(again, value, rtol=0, atol=limit):
+            raise NotImplementedError(f"relation {relation.name!r} does not act on each body by a matrix")
         found[q] = way
     return found
 
 
 @dataclass
-class AlongRuns(OfRuns):
-    """By how much a ladder of runs is off, judged as a run of the matrix judges it."""
+class ConvergenceMeasure:
+    """Order, limit and drifts of a refinement study, judged by the rules of a run."""
 
-    level: str
-    wanted: tuple[str, ...]
-    known: dict[tuple[object, ...], tuple[MotionTruth, dict[float, RefinementRun]]] = field(
+    engine: EngineClient
+    method: str
+    level: str  # "trajectory" or "invariants"
+    quantities: tuple[str, ...]
+    cache: dict[tuple[object, ...], tuple[MotionTruth, dict[float, RefinementRun]]] = field(
         default_factory=dict
-    )
+    )  # of the last motion: cases that differ in their steps share its runs
 
-    def times(self, case: Case) -> Array | None:
-        """Start and end; more where the work of moments or drag is to be integrated, if steps allow it."""
-        model = case.model
-        count = 1
+    @cached_property
+    def integrator(self) -> Integrator:
+        """The integrator as the engine's adapter declares it."""
+        return self.engine.integrator(self.method)
+
+    def sample_times(self, case: ReproductionCase) -> Array | None:
+        """Choose sample times: start and end, more where the work of moments or drag is integrated.
+
+        Args:
+            case: the refinement study.
+
+        Returns:
+            Times (T,) [s], or None where the steps are too coarse for the work.
+
+        """
+        model, count = case.model, 1
         if self.level == "invariants" and (model.has_drag or np.any(model.moment)):
-            count = FINE
-            if self.integrator.kind == "step":
-                count = min(count, round(case.until / case.steps[0]))
+            count = min(WORK_SAMPLES, round(case.until / case.steps[0]))
             if count < 16:
                 return None
         return np.linspace(0.0, case.until, count + 1)
 
-    def runs(self, case: Case, times: Array) -> tuple[MotionTruth, list[RefinementRun]]:
-        """Truth and rungs; those of the case before are not run again where only steps differ."""
-        at = (*replace(case, steps=()).content, len(times))
-        if at not in self.known:
-            self.known.clear()
-            self.known[at] = motion_truth(case.model, case.state, times, None), {}
-        truth, rungs = self.known[at]
-        missing = [h for h in case.steps if h not in rungs]
-        if missing:
-            climb = self.engine.ask(calls.run_refinement, self.method, case.model, case.state, times, missing)
-            rungs.update({rung.resolution: rung for rung in climb.rungs})
-        return truth, [rungs[h] for h in case.steps]
+    def run(self, case: ReproductionCase, times: Array) -> tuple[MotionTruth, list[RefinementRun]]:
+        """Run the refinement study, and compute its truth.
 
-    def __call__(self, case: Case) -> ShownRun | None:
-        """None for what the engine or the truth refuses."""
-        times = self.times(case)
+        Args:
+            case: the refinement study.
+            times: sample times (T,) [s].
+
+        Returns:
+            The truth, and the engine's runs from coarse to fine.
+
+        """
+        motion = (*replace(case, steps=()).content, len(times))
+        if motion not in self.cache:
+            self.cache.clear()
+            self.cache[motion] = motion_truth(case.model, case.state, times, None), {}
+        truth, runs = self.cache[motion]
+        missing = [h for h in case.steps if h not in runs]
+        if missing:
+            study = self.engine.call(
+                calls.run_refinement, self.method, case.model, case.state, times, missing
+            )
+            runs.update({run.resolution: run for run in study.runs})
+        return truth, [runs[h] for h in case.steps]
+
+    def __call__(self, case: ReproductionCase) -> MotionEvidence | None:
+        """Measure a case; None where the engine or the truth refuses it."""
+        times = self.sample_times(case)
         if times is None:
             return None
         try:
-            truth, rungs = self.runs(case, times)
+            truth, runs = self.run(case, times)
         except Exception:
             return None
-        if any(rung.trajectory is None for rung in rungs):
+        if any(run.trajectory is None for run in runs):
             return None
-        who = RowContext("", "", self.engine.name, self.engine.name, "")
-        ladder = RefinementAnalysis(who, case.model, truth, self.integrator, rungs, case.until)
-        rows = {
-            row.quantity: row
-            for row in (invariant_rows(ladder) if self.drifting else trajectory_rows(ladder))
+        context = RowContext("", "", self.engine.name, self.engine.name, "")
+        analysis = RefinementAnalysis(context, case.model, truth, self.integrator, runs, case.until)
+        of_invariants = self.level == "invariants"
+        found = invariant_rows(analysis) if of_invariants else trajectory_rows(analysis)
+        rows, wanted = {row.quantity: row for row in found}, set(self.quantities)
+        groups = [wanted] if of_invariants else [g for g in ({"order"}, set(LIMITS)) if g & wanted]
+        ratios = [max((_excess(rows[q]) for q in group if q in rows), default=0.0) for group in groups]
+        series, limits = self._disputed_series(analysis, rows)
+        end = truth.trajectory
+        expected = {"position": end.r[-1], "attitude": end.p[-1]}
+        uncertain = {
+            q: float(row.tolerance or 0.0) / (2 if q == "attitude" else 1) for q, row in limits.items()
         }
-        groups = [set(self.wanted)] if self.drifting else [{"order"}, set(LIMITS)]
-        off = [
-            max((excess(rows[q]) for q in group if q in rows), default=0.0)
-            for group in groups
-            if group & set(self.wanted)
-        ]
-        series: dict[str, Sequence[Array]] = {"position": ladder.positions, "attitude": ladder.attitudes}
-        uncertain = {name: rows.get(f"{name}_limit") for name in series}
-        if self.drifting:
-            there = [q for q in self.wanted if q in rows]
-            shown = [q for q in there if rows[q].verdict == Verdict.DISAGREES] or there
-            series = {q: [getattr(d, q) for d in ladder.invariant_drifts] for q in shown}
-            uncertain = {q: rows[q] for q in shown}
-        return ShownRun(
-            case, min(off, default=0.0), times, self.integrator, "order" in self.wanted and "order" in rows,
-            bool(set(LIMITS) & set(self.wanted)), tuple(series) if self.drifting else (),
-            truth.trajectory.r[-1], truth.trajectory.p[-1], (truth.length, ladder.invariant_scales["gap_rate"]),
-            {q: ladder.extrapolated_limit(ys).eliminated_powers for q, ys in series.items()},
-            {q: float(row.tolerance) for q, row in uncertain.items() if row and row.tolerance},
-        )  # fmt: skip
+        return MotionEvidence(
+            case,
+            min(ratios, default=0.0),
+            times,
+            self.integrator,
+            ordered="order" in wanted and "order" in rows,
+            drifts=tuple(series) if of_invariants else (),
+            sizes=(truth.length, analysis.invariant_scales["gap_rate"]),
+            expected={q: expected[q] if q in expected else _zeros(case, q) for q in series},
+            uncertain=uncertain,
+            eliminated={q: analysis.extrapolated_limit(ys).eliminated_powers for q, ys in series.items()},
+        )
 
-    @property
-    def drifting(self) -> bool:
-        """Whether invariants are in dispute."""
-        return self.level == "invariants"
+    def _disputed_series(
+        self, analysis: RefinementAnalysis, rows: dict[str, Row]
+    ) -> tuple[dict[str, Sequence[Array]], dict[str, Row]]:
+        """Samples of each quantity whose limit is in dispute, and the row that judges the limit."""
+        if self.level == "invariants":
+            judged = [q for q in self.quantities if q in rows]
+            off = [q for q in judged if rows[q].verdict == Verdict.DISAGREES] or judged
+            drifts: dict[str, Sequence[Array]] = {
+                q: [getattr(d, q) for d in analysis.invariant_drifts] for q in off
+            }
+            return drifts, {q: rows[q] for q in off}
+        if not set(LIMITS) & set(self.quantities):
+            return {}, {}
+        limits = {q: rows[f"{q}_limit"] for q in ("position", "attitude") if rows.get(f"{q}_limit")}
+        limits = {q: row for q, row in limits.items() if row.tolerance}
+        return {q: getattr(analysis, f"{q}s") for q in limits}, limits
 
 
-def excess(row: Row) -> float:
+def _zeros(case: ReproductionCase, invariant: str) -> Array:
+    """Expected drift of an invariant: one number, or one row for each body."""
+    width = {"joint_gap": 3, "gap_rate": 3, "norm_drift": 1}.get(invariant)
+    return np.zeros((case.model.n, width) if width else ())
+
+
+def _excess(row: Row) -> float:
     """Error over tolerance of a row that disagrees, else 0."""
-    if row.verdict != Verdict.DISAGREES:
-        return 0.0
-    if row.quantity == "order":
-        return float(row.value or 0.0) / ORDER_MARGIN
-    assert row.ratio is not None
-    return row.ratio
+    return float(row.ratio or 0.0) if row.verdict == Verdict.DISAGREES else 0.0

@@ -1,6 +1,7 @@
-"""The smallest case that still shows a disagreement: fewest bodies, shortest run, simplest numbers.
+"""Search for the smallest case that shows a disagreement: fewest bodies, shortest run, simplest numbers.
 
-Knows nothing of engines: a measure says by how much a case shows it, and every try is measured again.
+The search knows nothing of engines: a measure returns by how much a case shows the disagreement, and every
+candidate is measured again.
 """
 
 from __future__ import annotations
@@ -17,154 +18,166 @@ from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import state_from_minimal
 from plumbline.processes.errors import PlumblineError
 
-PLAIN = 10.0  # times the tolerance: a shrunk case shows at least this, or half of what it showed
-FEWEST = 3  # runs of a ladder: what an extrapolation and its uncertainty need
-SHORTEST = 2.0**-6  # s, of a run with an adaptive step
+CLEAR_RATIO = 10.0  # a shrunk case exceeds its tolerance this many times, or half as often as the original
+MIN_RUNS = 3  # of a refinement study: an extrapolation and its uncertainty need three
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
-    """What is asked of an engine: a state, or a run from it to ``until`` (s) at each of ``steps``.
-
-    ``steps``, coarse to fine, are in s or, for an adaptive integrator, relative tolerances.
-    """
+class ReproductionCase:
+    """One state of a mechanism, or a refinement study that starts there."""
 
     model: Model
     state: State
-    until: float = 0.0
-    steps: tuple[float, ...] = ()
+    until: float = 0.0  # s, end of the runs
+    steps: tuple[float, ...] = ()  # s, coarse to fine; empty where only the state is evaluated
 
     @property
     def content(self) -> tuple[object, ...]:
-        """What tells two cases apart."""
-        state = (getattr(self.state, k) for k in ("p", "omega", "u", "udot"))
+        """Every number of the case, hashable: equal for equal cases."""
+        state = (getattr(self.state, name) for name in ("p", "omega", "u", "udot"))
         numbers = tuple(np.asarray(x).tobytes() for x in (*vars(self.model).values(), *state))
         return (*numbers, self.until, self.steps)
 
 
-class Measured(Protocol):
-    """A case and by how much it shows the disagreement, in tolerances."""
+class Measurement(Protocol):
+    """A case, and by how much it shows the disagreement."""
 
     @property
-    def case(self) -> Case:
-        """What was asked."""
+    def case(self) -> ReproductionCase:
+        """The measured case."""
 
     @property
     def ratio(self) -> float:
-        """Error over tolerance: above 1 it disagrees."""
+        """Error over tolerance: above 1 the engine disagrees."""
 
 
 class OutOfTime(PlumblineError):
     """No case was found in the time that was given."""
 
 
-M = TypeVar("M", bound=Measured)
+M = TypeVar("M", bound=Measurement)
 
 
 @dataclass
-class Search(Generic[M]):
-    """The best case so far.  ``measure`` gives None for a case that cannot be measured."""
+class _Search(Generic[M]):
+    """The best case so far."""
 
-    measure: Callable[[Case], M | None]
+    measure: Callable[[ReproductionCase], M | None]
     clock: Callable[[], float]
     deadline: float
-    enough: float = 1.0
+    required_ratio: float = 1.0
     best: M | None = None
-    late: bool = False  # whether something was left untried for want of time; a first state is always tried
-    tried: dict[tuple[object, ...], M | None] = field(default_factory=dict)
+    is_late: bool = False  # whether a candidate was skipped for want of time; the first state never is
+    measured: dict[tuple[object, ...], M | None] = field(default_factory=dict)
 
-    def take(self, case: Case) -> bool:
-        """Whether a case shows enough; it is the best then."""
+    def accepts(self, case: ReproductionCase) -> bool:
+        """Measure a case; where it shows enough, it becomes the best."""
         content = case.content
-        if content not in self.tried:
+        if content not in self.measured:
             if self.clock() > self.deadline and (self.best is not None or case.steps):
-                self.late = True
+                self.is_late = True
                 return False
-            self.tried[content] = self.measure(case)
-        found = self.tried[content]
-        if found is None or found.ratio <= 1 or found.ratio < self.enough:
+            self.measured[content] = self.measure(case)
+        found = self.measured[content]
+        if found is None or found.ratio <= 1 or found.ratio < self.required_ratio:
             return False
         self.best = found
         return True
 
-    def first(self, cases: Iterable[Case]) -> bool:
+    def accepts_any(self, cases: Iterable[ReproductionCase]) -> bool:
         """Take the first case that shows enough."""
-        return any(self.take(case) for case in cases)
+        return any(self.accepts(case) for case in cases)
 
     @property
-    def case(self) -> Case:
-        """Of the best so far."""
+    def case(self) -> ReproductionCase:
+        """The best case so far."""
         assert self.best is not None
         return self.best.case
 
 
-def smallest(
-    case: Case,
-    measure: Callable[[Case], M | None],
-    most: float,
+def smallest_case(
+    case: ReproductionCase,
+    measure: Callable[[ReproductionCase], M | None],
+    ratio: float,
     seconds: float,
-    coarsest: bool = True,
     clock: Callable[[], float] = time.process_time,
-    plainer: bool = True,
 ) -> M | None:
-    """The smallest case found within ``seconds`` that shows what ``case`` shows; None where none does.
+    """Find the smallest case that shows what a given case shows.
 
-    ``most`` is by how much it showed.  ``coarsest``: a run is at least one of its coarsest steps long.
-    ``plainer``: with fewer bodies and simpler numbers; else only runs are shortened.
-    The clock is that of computing by default: a busy machine finds no other cases.  OutOfTime where none
-    was found before all were tried.
+    Args:
+        case: the case to shrink.
+        measure: returns a case's measurement, or None for a case that cannot be measured.
+        ratio: by how much the given case exceeds its tolerance.
+        seconds: time for the search [s], on the clock below.
+        clock: returns the time [s]; by default CPU time, so that a busy machine finds the same cases.
+
+    Returns:
+        The measurement of the smallest case found, or None where no case shows the disagreement.
+
+    Raises:
+        OutOfTime: nothing was found before the time was over, and not every candidate was measured.
+
     """
-    search: Search[M] = Search(measure, clock, clock() + seconds)
-    for goal in (100 * PLAIN, PLAIN):  # in two rounds: each simplification may cost some of what is shown
-        search.enough = max(min(most / 2, goal), 1.0)
-        if search.best is None and not search.first(growing(case, plainer)):
+    search: _Search[M] = _Search(measure, clock, clock() + seconds)
+    # in two rounds: each simplification may cost some of what is shown
+    for clear in (100 * CLEAR_RATIO, CLEAR_RATIO):
+        search.required_ratio = max(min(ratio / 2, clear), 1.0)
+        if search.best is None and not search.accepts_any(starting_cases(case)):
             continue
-        if plainer:
-            fewest_bodies(search)
+        _reduce_bodies(search)
         for _ in range(2 if search.case.steps else 0):
-            shortest_run(search, coarsest)
-            fewest_steps(search)
-        for change in simpler(search.case.model) if plainer else ():
-            search.take(change(search.case))
+            _shorten_run(search)
+            _reduce_steps(search)
+        for change in _simplifications(search.case.model):
+            search.accepts(change(search.case))
     if search.best is None:
-        search.enough = 1.0
-        search.first([case])
-    if search.best is None and search.late:
+        search.required_ratio = 1.0
+        search.accepts(case)
+    if search.best is None and search.is_late:
         raise OutOfTime
     return search.best
 
 
-def growing(case: Case, plainer: bool = True) -> Iterator[Case]:
-    """Cases of a run from cheap to dear, the whole one last; a single state as it is."""
+def starting_cases(case: ReproductionCase) -> Iterator[ReproductionCase]:
+    """List cases to begin with.
+
+    Args:
+        case: the case to shrink.
+
+    Yields:
+        Shorter runs of fewer bodies from cheap to expensive, the whole case last; a single state as it is.
+
+    """
     n = case.model.n
-    counts = [2**k for k in range(n.bit_length()) if plainer and 2**k < n] + [n]
-    quarters = max(3, 1 + int(np.log2(max(case.until, 1.0)) / 2))  # down to some seconds, of long runs
-    spans = [case.until / 4**k for k in range(quarters)] if case.steps else [case.until]
+    if not case.steps:
+        yield case
+        return
+    counts = [2**k for k in range(n.bit_length()) if 2**k < n] + [n]
+    spans = [case.until / 4**k for k in range(3) if case.until / 4**k >= case.steps[0]]
     for span, count in sorted(((s, c) for s in spans for c in counts), key=lambda x: x[0] * x[1]):
-        if case.steps and span < case.steps[0]:
-            continue
-        if case.steps or count == n:
-            yield from parts(replace(case, until=span), count)
+        yield from _parts(replace(case, until=span), count)
 
 
-def parts(case: Case, count: int, ends: Iterable[bool] = (False, True)) -> Iterator[Case]:
-    """The first bodies, and the last ones hung from the pivot."""
+def _parts(
+    case: ReproductionCase, count: int, ends: Iterable[bool] = (False, True)
+) -> Iterator[ReproductionCase]:
+    """Yield the first bodies, and the last ones hung from the pivot."""
     model, state, n = case.model, case.state, case.model.n
-    for last in ends if count < n else (False,):
-        part = slice(n - count, n) if last else slice(0, count)
+    for is_last in ends if count < n else (False,):
+        part = slice(n - count, n) if is_last else slice(0, count)
         few = replace(model, **{k: v[part] for k, v in vars(model).items() if k != "gravity"})
         at = state_from_minimal(few, state.p[part], state.omega[part], state.u[part], state.udot[part])
         yield replace(case, model=few, state=at)
 
 
-def fewest_bodies(search: Search[M]) -> None:
-    """Double the number of bodies until it shows, then halve the interval, at the end where it showed."""
+def _reduce_bodies(search: _Search[M]) -> None:
+    """Double the number of bodies until they show it, then bisect, at the end of the chain that showed it."""
     ends, low, count = [False, True], 0, 1
 
     def shows(count: int) -> bool:
-        for last in ends:
-            if search.first(parts(search.case, count, [last])):
-                ends[:] = [last]
+        for is_last in ends:
+            if search.accepts_any(_parts(search.case, count, [is_last])):
+                ends[:] = [is_last]
                 return True
         return False
 
@@ -176,98 +189,106 @@ def fewest_bodies(search: Search[M]) -> None:
             low = middle
 
 
-def shortest_run(search: Search[M], coarsest: bool) -> None:
-    """Halve the time while it shows."""
-    while search.case.until / 2 >= (search.case.steps[0] if coarsest else SHORTEST):
-        if not search.take(replace(search.case, until=search.case.until / 2)):
+def _shorten_run(search: _Search[M]) -> None:
+    """Halve the time, down to one of the coarsest steps."""
+    while search.case.until / 2 >= search.case.steps[0]:
+        if not search.accepts(replace(search.case, until=search.case.until / 2)):
             return
 
 
-def fewest_steps(search: Search[M]) -> None:
+def _reduce_steps(search: _Search[M]) -> None:
     """Leave out the finest steps, then the coarsest."""
     for part in (slice(None, -1), slice(1, None)):
-        while len(search.case.steps) > FEWEST and search.take(
+        while len(search.case.steps) > MIN_RUNS and search.accepts(
             replace(search.case, steps=search.case.steps[part])
         ):
             pass
 
 
-Change = Callable[[Case], Case]
+_Change = Callable[[ReproductionCase], ReproductionCase]
 
 
-def simpler(model: Model) -> Iterator[Change]:
-    """Simplifications to try one after the other, the boldest first."""
+def _with_fields(**make: Callable[[Array], Array]) -> _Change:
+    """Change fields of the model; the state stays on its constraint manifold."""
 
-    def fields(**make: Callable[[Array], Array]) -> Change:
-        def change(case: Case) -> Case:
-            m, s = case.model, case.state
-            new = replace(m, **{name: of(getattr(m, name)) for name, of in make.items()})
-            rod = new.rods[:, None]
-            return replace(
-                case, model=new, state=state_from_minimal(new, s.p, s.omega, s.u * rod, s.udot * rod)
-            )
+    def change(case: ReproductionCase) -> ReproductionCase:
+        m, s = case.model, case.state
+        new = replace(m, **{name: of(getattr(m, name)) for name, of in make.items()})
+        rod = new.rods[:, None]
+        return replace(case, model=new, state=state_from_minimal(new, s.p, s.omega, s.u * rod, s.udot * rod))
 
-        return change
+    return change
 
-    def rates(make: Callable[[Array], Array]) -> Change:
-        def change(case: Case) -> Case:
-            s = case.state
-            return replace(case, state=state_from_minimal(case.model, s.p, make(s.omega), s.u, make(s.udot)))
 
-        return change
+def _with_rates(make: Callable[[Array], Array]) -> _Change:
+    """Change the rates of bodies and rods."""
 
-    def attitudes(make: Callable[[int], list[float]]) -> Change:
-        def change(case: Case) -> Case:
-            m, s = case.model, case.state
-            p = np.array([make(k) for k in range(m.n)])
-            return replace(case, state=state_from_minimal(m, p, s.omega, s.u, s.udot))
+    def change(case: ReproductionCase) -> ReproductionCase:
+        s = case.state
+        return replace(case, state=state_from_minimal(case.model, s.p, make(s.omega), s.u, make(s.udot)))
 
-        return change
+    return change
 
-    def directions(u: list[float]) -> Change:
-        def change(case: Case) -> Case:
-            m, s = case.model, case.state
-            along = np.where(m.rods[:, None], u, 0.0)
-            across = s.udot - np.sum(s.udot * along, axis=1, keepdims=True) * along
-            return replace(case, state=state_from_minimal(m, s.p, s.omega, along, across))
 
-        return change
+def _with_attitudes(*quaternions: list[float]) -> _Change:
+    """Give the bodies these attitudes, in turn."""
 
+    def change(case: ReproductionCase) -> ReproductionCase:
+        m, s = case.model, case.state
+        p = np.array([quaternions[k % len(quaternions)] for k in range(m.n)])
+        return replace(case, state=state_from_minimal(m, p, s.omega, s.u, s.udot))
+
+    return change
+
+
+def _with_directions(u: list[float]) -> _Change:
+    """Point all rods in one direction (world frame)."""
+
+    def change(case: ReproductionCase) -> ReproductionCase:
+        m, s = case.model, case.state
+        along = np.where(m.rods[:, None], u, 0.0)
+        across = s.udot - np.sum(s.udot * along, axis=1, keepdims=True) * along
+        return replace(case, state=state_from_minimal(m, s.p, s.omega, along, across))
+
+    return change
+
+
+def _simplifications(model: Model) -> Iterator[_Change]:
+    """Yield simplifications to try one after the other, the boldest first."""
     zero, offsets = np.zeros_like, ("proximal", "distal")
     numbers = [
-        fields(force=zero, moment=zero),
-        fields(drag_force=zero, drag_moment=zero),
-        fields(gravity=lambda g: np.array([0.0, 0.0, -10.0])),
+        _with_fields(force=zero, moment=zero),
+        _with_fields(drag_force=zero, drag_moment=zero),
+        _with_fields(gravity=lambda g: np.array([0.0, 0.0, -10.0])),
         *(
-            fields(**{name: lambda x: np.repeat(x[:1], len(x), 0)})
+            _with_fields(**{name: lambda x: np.repeat(x[:1], len(x), 0)})
             for name in ("mass", "inertia", *offsets, "length")
         ),
-        fields(mass=np.ones_like),
-        fields(inertia=lambda x: np.repeat((0.1 * np.diag([1.0, 2.0, 2.0]))[None], len(x), 0)),
+        _with_fields(mass=np.ones_like),
+        _with_fields(inertia=lambda x: np.repeat((0.1 * np.diag([1.0, 2.0, 2.0]))[None], len(x), 0)),
         *(
-            fields(**{name: lambda x: x * (np.abs(x) == np.max(np.abs(x), axis=-1, keepdims=True))})
+            _with_fields(**{name: lambda x: x * (np.abs(x) == np.max(np.abs(x), axis=-1, keepdims=True))})
             for name in offsets
         ),
-        *(fields(**{name: partial(rounded, places=1)}) for name in (*offsets, "length")),
+        *(_with_fields(**{name: partial(_rounded, places=1)}) for name in (*offsets, "length")),
     ]
     yield lambda case: reduce(lambda so_far, change: change(so_far), numbers, case)  # all at once
-    yield fields(length=zero)
-    yield rates(zero)
-    yield attitudes(lambda k: [1.0, 0.0, 0.0, 0.0])
-    yield attitudes(lambda k: [0.6, 0.8, 0.0, 0.0])
-    yield attitudes(lambda k: [[0.6, 0.8, 0.0, 0.0], [0.6, 0.0, 0.8, 0.0]][k % 2])
+    yield _with_fields(length=zero)
+    yield _with_rates(zero)
+    tilted = [0.6, 0.8, 0.0, 0.0]
+    yield from (_with_attitudes([1.0, 0.0, 0.0, 0.0]), _with_attitudes(tilted))
+    yield _with_attitudes(tilted, [0.6, 0.0, 0.8, 0.0])
     if np.any(model.rods):
-        yield directions([0.0, 0.0, -1.0])
-        yield directions([0.6, 0.0, -0.8])
+        yield from (_with_directions([0.0, 0.0, -1.0]), _with_directions([0.6, 0.0, -0.8]))
     yield from numbers
-    yield fields(inertia=lambda x: x * np.eye(3))
+    yield _with_fields(inertia=lambda x: x * np.eye(3))
     for name in ("mass", "length", *offsets, "inertia", "gravity", "moment", "force"):
         for places in (1, 2, 3):
-            yield fields(**{name: partial(rounded, places=places)})
-    yield rates(lambda x: x if np.any(model.rods) else rounded(x, 1))
+            yield _with_fields(**{name: partial(_rounded, places=places)})
+    yield _with_rates(lambda x: x if np.any(model.rods) else _rounded(x, 1))
 
 
-def rounded(x: Array, places: int) -> Array:
-    """Every number to so many digits of the largest in its array."""
+def _rounded(x: Array, places: int) -> Array:
+    """Round every number to so many digits of the largest in its array."""
     largest = float(np.max(np.abs(x), initial=0.0))
     return x if largest == 0 else np.round(x, places - 1 - int(np.floor(np.log10(largest)))) + 0.0

@@ -1,15 +1,12 @@
-"""A disagreement as a short script that an engine's maintainer can run: the engine and numpy, nothing else.
-
-The case that disagrees is shrunk first (`shrink`), to the fewest bodies, the shortest run and the simplest
-numbers that still show it, each try asked of the engine again and measured with the truth (`shown`).
-"""
+"""Write stand-alone scripts of the disagreements in a results folder."""
 
 from __future__ import annotations
 
 import hashlib
-import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -17,204 +14,272 @@ from typing import Any
 import numpy as np
 
 from plumbline.engines import environments
-from plumbline.judging.convergence import RTOL_FACTORS, STEP_EXPONENTS
-from plumbline.judging.long_run_study import MIN_WINDOW_SECONDS
-from plumbline.model.datatypes import Model, State
+from plumbline.judging.convergence import STEP_EXPONENTS
+from plumbline.judging.rows import Verdict
+from plumbline.model.datatypes import BadInput, Model, State
 from plumbline.model.kinematics import state_from_minimal
 from plumbline.model.sampling import derive_seed, random_states
 from plumbline.processes.errors import PlumblineError
 from plumbline.processes.workers import Limits, Task, WorkerPool
-from plumbline.reproduce.engine_client import Engine
-from plumbline.reproduce.measure import Question, measure_of, shrunk, whole
-from plumbline.reproduce.measure_long_run import GROWTH, LONG
-from plumbline.reproduce.render import script, unscripted
-from plumbline.reproduce.shrink import Case, OutOfTime
-from plumbline.storage import results_store
+from plumbline.reproduce.engine_client import EngineClient
+from plumbline.reproduce.measure import Disagreement
+from plumbline.reproduce.render import LONG_RUN_SUFFIXES, no_script_reason, render_script
+from plumbline.reproduce.shrink import OutOfTime, ReproductionCase
+from plumbline.storage.results_store import read_results, write_atomically
+from plumbline.storage.script_index import read_script_index, scripts_folder, write_script_index
 
-ASKED, UNASKED = 60.0, 3.0  # s of computing for a script that was asked for, and at the end of a run
-TRIES = 6  # at least so many make a case smaller: where they take longer than `UNASKED`, none is begun
-ASK = "ask for this row by its key"
+REQUESTED_SECONDS, UNREQUESTED_SECONDS = (
+    60.0,
+    3.0,
+)  # of shrinking: a script by its key, and at the end of a run
+MIN_CANDIDATES = 6  # shrinking needs at least so many; where they would take too long, it is not begun
+HINT = "request this row by its key"
+
+StoredRow = dict[str, Any]
 
 
 class NotReproducible(PlumblineError, ValueError):
-    """No script can be made of that row; the message says why."""
+    """No script can be made of a row, or the request is wrong; the message says why."""
 
 
-def disputed(document: dict[str, Any]) -> list[dict[str, Any]]:
-    """The rows a script may be asked for: those that disagree."""
-    return [row for row in document["rows"] if row["verdict"] == "disagrees"]
+@dataclass
+class WrittenScripts:
+    """What became of the requested rows."""
+
+    files: dict[str, Path] = field(default_factory=dict)  # script of each row key that has one
+    reasons: dict[str, str] = field(default_factory=dict)  # why there is none, for the others
 
 
-def write(
-    folder: Path, keys: Sequence[str] | None = None, limits: Limits | None = None, jobs: int | None = None
-) -> dict[str, str]:
-    """Scripts of rows (all that disagree by default) in folder/scripts; key → file name or why there is none.
+def read_disagreements(folder: Path) -> list[StoredRow]:
+    """Read the rows that disagree.
 
-    One script serves all rows of a cell and level (of one relation).  index.json there lists the files by
-    row key.  ``jobs`` workers shrink at once, as many as the run had by default.
+    Args:
+        folder: a results folder.
+
+    Returns:
+        The stored rows whose verdict is "disagrees".
+
+    Raises:
+        ValueError: results.json is missing or damaged; the message names it.
+
     """
-    document = results_store.read_results(folder)
-    rows = [row for row in disputed(document) if keys is None or row["key"] in keys]
-    for key in set(keys or ()) - {row["key"] for row in rows}:
-        near = get_close_matches(key, [row["key"] for row in disputed(document)], 1)
-        raise NotReproducible(
-            f"no row {key!r} disagrees here{f'; did you mean {near[0]!r}?' if near else ''}"
-        )
-    scripts = folder / "scripts"
+    document = read_results(folder)
+    with _checked(folder):
+        return _disagreements(document)
+
+
+def write_scripts(
+    folder: Path, keys: Sequence[str] | None = None, limits: Limits | None = None, jobs: int | None = None
+) -> WrittenScripts:
+    """Write scripts of rows into the results folder, and list them in scripts/index.json.
+
+    All rows of a cell and level (of one relation) share a script. Engines run in worker processes.
+
+    Args:
+        folder: a results folder.
+        keys: the wanted rows; by default all that disagree: less time is spent on each, and scripts of an
+            earlier run are removed.
+        limits: of the workers' memory and time.
+        jobs: number of workers; by default as many as the run had.
+
+    Returns:
+        The files, and for rows without one the reason.
+
+    Raises:
+        NotReproducible: a key names no row that disagrees.
+        ValueError: results.json or scripts/index.json is missing or damaged; the message names it.
+
+    """
+    document = read_results(folder)
+    scripts, written, tasks = scripts_folder(folder), WrittenScripts(), []
+    with _checked(folder):
+        disagreeing = _disagreements(document)
+        for key in keys or ():
+            _check_key(key, [row["key"] for row in disagreeing])
+        cells: dict[tuple[str, ...], list[StoredRow]] = {}
+        for row in disagreeing:
+            cells.setdefault(_cell(row), []).append(row)
+        wanted = {cell: [r for r in rows if keys is None or r["key"] in keys] for cell, rows in cells.items()}
+        wanted = {cell: rows for cell, rows in wanted.items() if rows}
+        jobs = jobs or int(document.get("run", {}).get("machine", {}).get("jobs", 1))
+        for cell, rows in wanted.items():
+            try:
+                if keys is None:
+                    _check_worthwhile(cell, rows, cells)
+                seconds = UNREQUESTED_SECONDS if keys is None else REQUESTED_SECONDS
+                disagreement = find_disagreement(document, cells[cell], seconds)
+            except NotReproducible as error:
+                written.reasons |= {row["key"]: str(error) for row in rows}
+                continue
+            shown = rows[0] | {"quantity": ", ".join(row["quantity"] for row in rows)}
+            tasks.append(Task(cell, make_script, (disagreement, shown), limits or Limits()))
+    index = {} if keys is None else read_script_index(folder)
     if keys is None and scripts.is_dir():  # of an earlier run in the same folder
         for old in (*scripts.glob("*.py"), *scripts.glob("index.json")):
             old.unlink()
-    told: dict[str, str] = {}
-    tasks: list[Task] = []
-    cells: dict[tuple[str, ...], list[dict[str, Any]]] = {}
-    for row in rows:
-        cells.setdefault(cell_of(row), []).append(row)
-    at_state = {cell[:2] for cell in cells if cell[2] == "state"}
-    for cell, its in cells.items():
-        if keys is None and cell[2:4] == ("relations", "-") and cell[:2] in at_state:
-            why = f"the state-level script of this engine and scenario shows it; {ASK}"
-            told |= {row["key"]: why for row in its}
-            continue
-        cost = its[0].get("cpu_time", 0.0) if cell[2] in ("trajectory", "invariants") else 0.0
-        if long(its[0]):  # the first tries are as short as that
-            cost *= min(MIN_WINDOW_SECONDS / its[0]["compared_until"], 1.0)
-        if keys is None and cost > UNASKED / TRIES:
-            why = f"one try takes {cost:.1f} s of computing, too long at the end of a run; {ASK}"
-            told |= {row["key"]: why for row in its}
-            continue
-        every = [row for row in disputed(document) if cell_of(row) == cell]
-        try:
-            question = asked(document, every, UNASKED if keys is None else ASKED)
-        except NotReproducible as why:
-            told |= {row["key"]: str(why) for row in its}
-        else:
-            about = its[0] | {"quantity": ", ".join(row["quantity"] for row in its)}
-            tasks.append(Task(cell, shown_by_script, (question, about), limits or Limits()))
     if not tasks:
-        return told
+        return written
     scripts.mkdir(exist_ok=True)
-    jobs = jobs or int(document.get("run", {}).get("machine", {}).get("jobs", 1))
     with WorkerPool(min(jobs, len(tasks)), limits) as workers:
         for outcome in workers.run(tasks):
-            its = cells[outcome.key]
-            text, nothing = outcome.value or ("", outcome.failure)
-            if nothing:
-                told |= {row["key"]: nothing for row in its}
-                continue
-            name = file_name("/".join(outcome.key))
-            results_store.write_atomically(scripts / name, text.encode())
-            told |= {row["key"]: name for row in its}
-    index = {key: name for key, name in told.items() if (scripts / name).is_file()}
-    before = scripts / "index.json"
-    if before.exists():
-        index = json.loads(before.read_text(encoding="utf-8")) | index
-    results_store.write_atomically(before, json.dumps(index, indent=1).encode())
-    return told
+            text, reason = outcome.value or ("", outcome.failure)
+            if text:
+                path = scripts / _file_name("/".join(outcome.key))
+                write_atomically(path, text.encode())
+                written.files |= {row["key"]: path for row in wanted[outcome.key]}
+            else:
+                written.reasons |= {row["key"]: reason for row in wanted[outcome.key]}
+    write_script_index(folder, index | {key: path.name for key, path in written.files.items()})
+    return written
 
 
-def shown_by_script(question: Question, row: dict[str, Any]) -> tuple[str, str]:
-    """The script of the smallest case, which was seen to show the disagreement; or none, and why.
+def make_script(disagreement: Disagreement, row: StoredRow) -> tuple[str, str]:
+    """Shrink a disagreement, render its script and run it once (to be called in a worker).
 
-    The same state is rounded otherwise by a script than by an adapter, which can matter next to a bound.
+    Where the script of the smallest case does not show the disagreement, that of the whole case is tried: a
+    script rounds differently from an adapter, which can matter next to a bound.
+
+    Args:
+        disagreement: what to shrink.
+        row: the stored row that the script's head describes.
+
+    Returns:
+        The script's text and an empty string, or an empty text and the reason why there is none.
+
     """
     try:
-        for find in (shrunk, lambda q: measure_of(q)(whole(q))):
-            if (found := find(question)) is not None:
-                text = script(row, found)
-                if disagreement(question.engine.say(text)) > 1:
+        for find in (disagreement.shrink, lambda: disagreement.measure(disagreement.case)):
+            if (evidence := find()) is not None:
+                text = render_script(row, evidence)
+                if _largest_printed_ratio(disagreement.engine.run_script(text)) > 1:
                     return text, ""
     except OutOfTime:
-        return "", f"no small case within {question.seconds:g} s of computing; {ASK}"
-    return "", "asked again, the engine agrees: nothing to show"
+        return "", f"no small case within {disagreement.seconds:g} s of computing; {HINT}"
+    return "", "called again, the engine agrees: nothing to show"
 
 
-def disagreement(said: str) -> float:
-    """The largest excess over a tolerance in the output of a script."""
-    return max(map(float, re.findall(r"^  over (?:what|the) .*: (\S+)$", said, re.M)), default=0.0)
+def find_disagreement(document: dict[str, Any], rows: list[StoredRow], seconds: float) -> Disagreement:
+    """Find what to measure again for the rows of one cell.
 
+    Args:
+        document: the stored results.
+        rows: rows of one cell that disagree.
+        seconds: time for shrinking [s].
 
-def cell_of(row: dict[str, Any]) -> tuple[str, ...]:
-    """What rows share a script: scenario, engine, level and integrator, or relation."""
-    apart = (row["quantity"],) if row["level"] == "relations" else ()
-    if long(row):
-        apart = ("long growth" if row["quantity"].endswith(GROWTH) else "long",)
-    return row["scenario"], row["engine"], row["level"], row["integrator"], *apart
+    Returns:
+        The disagreement.
 
+    Raises:
+        NotReproducible: there is no script for such rows, or the results do not hold what is needed.
 
-def long(row: dict[str, Any]) -> bool:
-    """Whether a row is about the nightly's long runs (`endurance`)."""
-    return str(row["quantity"]).endswith((LONG, GROWTH))
-
-
-def asked(document: dict[str, Any], rows: list[dict[str, Any]], seconds: float) -> Question:
-    """What to shrink for the rows of one cell; NotReproducible where there is nothing to ask again."""
-    row = rows[0]
+    """
+    row, ratio = rows[0], max(_ratio(row) for row in rows)
     base, version = environments.split_version(row["engine"])
-    if why := unscripted(base, row):
-        raise NotReproducible(why)
+    if reason := no_script_reason(base, row):
+        raise NotReproducible(reason)
     try:
-        engine = Engine(base, environments.ensure_interpreter(row["engine"]) if version else "")
+        engine = EngineClient(base, environments.ensure_interpreter(row["engine"]) if version else "")
     except environments.EnvironmentUnavailable as error:
         raise NotReproducible(str(error)) from None
-    about = document["scenarios"].get(row["scenario"])
-    if about is None:
+    scenario = document["scenarios"].get(row["scenario"])
+    if scenario is None:
         raise NotReproducible(f"the results do not hold the scenario {row['scenario']!r}")
-    model = Model(**{name: np.array(value, float) for name, value in about["model"].items()})
-    if long(row):
-        case = Case(model, start(model, about), max(rows, key=ratio)["compared_until"])
-    elif row["level"] in ("trajectory", "invariants"):
-        case = runs_of(document, rows, model, start(model, about))
-    elif row["integrator"] != "-":
-        if "resolution" not in row["extra"]:
-            raise NotReproducible("the step of this run is not in the results")
-        case = Case(model, start(model, about), row["extra"]["end"], (row["extra"]["resolution"],))
+    model = Model(**{name: np.array(value, float) for name, value in scenario["model"].items()})
+    start = {name: np.array(value, float) for name, value in scenario["state"].items()}
+    state = state_from_minimal(model, **start)
+    if row["level"] in ("trajectory", "invariants"):
+        case = _refinement_study(document, rows, model, state)
     else:
         index = int(row["extra"]["state"])
-        states = random_states(model, index, derive_seed("states", about["digest"])) if index else []
-        case = Case(model, states[-1] if states else start(model, about))
-    most = max(ratio(row) for row in rows)
-    wanted = tuple(row["quantity"] for row in rows)
-    return Question(
-        engine, row["level"], wanted, row["integrator"], case, most, seconds, about.get("sample", 0.0)
-    )
+        states = random_states(model, index, derive_seed("states", scenario["digest"])) if index else [state]
+        case = ReproductionCase(model, states[-1])
+    quantities = tuple(row["quantity"] for row in rows)
+    return Disagreement(engine, row["level"], quantities, row["integrator"], case, ratio, seconds)
 
 
-def start(model: Model, about: dict[str, Any]) -> State:
-    """The initial state of a scenario."""
-    return state_from_minimal(
-        model, **{name: np.array(value, float) for name, value in about["state"].items()}
-    )
+def _disagreements(document: dict[str, Any]) -> list[StoredRow]:
+    return [row for row in document["rows"] if row["verdict"] == Verdict.DISAGREES]
 
 
-def runs_of(document: dict[str, Any], rows: list[dict[str, Any]], model: Model, state: State) -> Case:
-    """The runs behind rows: up to the time of the longest of them, at the resolutions of the ladder."""
-    cell = {k: rows[0][k] for k in ("scenario", "engine", "integrator")}
-    every = [row for row in document["rows"] if all(row[k] == cell[k] for k in cell) and of_ladder(row)]
+@contextmanager
+def _checked(folder: Path) -> Iterator[None]:
+    """Turn what damaged results raise into a sentence."""
+    try:
+        yield
+    except PlumblineError as error:
+        if isinstance(error, BadInput):
+            raise NotReproducible(f"{folder / 'results.json'}: {error}") from None
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        found = f"{type(error).__name__}: {error}"
+        raise NotReproducible(f"{folder / 'results.json'}: damaged results ({found})") from None
+
+
+def _check_key(key: str, known: list[str]) -> None:
+    if key not in known:
+        near = get_close_matches(key, known, 1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        raise NotReproducible(f"no row {key!r} disagrees here{hint}")
+
+
+def _check_worthwhile(
+    cell: tuple[str, ...], rows: list[StoredRow], cells: dict[tuple[str, ...], list[StoredRow]]
+) -> None:
+    """Raise NotReproducible for a cell whose script can wait until somebody requests it."""
+    scenario, engine, level, *_ = cell
+    if level == "relations" and (scenario, engine, "state", "-") in cells:
+        raise NotReproducible(f"the state-level script of this engine and scenario shows it; {HINT}")
+    seconds = rows[0].get("cpu_time", 0.0) if level in ("trajectory", "invariants") else 0.0
+    if seconds > UNREQUESTED_SECONDS / MIN_CANDIDATES:
+        raise NotReproducible(f"one candidate takes {seconds:.1f} s, too long at the end of a run; {HINT}")
+
+
+def _largest_printed_ratio(printed: str) -> float:
+    return max(map(float, re.findall(r"^  off by (\S+) times", printed, re.M)), default=0.0)
+
+
+def _cell(row: StoredRow) -> tuple[str, ...]:
+    """Return what rows share a script: scenario, engine, level and integrator, or relation."""
+    relation = (row["quantity"],) if row["level"] == "relations" else ()
+    if _is_long_run(row):
+        relation = ("long run",)
+    return row["scenario"], row["engine"], row["level"], row["integrator"], *relation
+
+
+def _is_long_run(row: StoredRow) -> bool:
+    return str(row["quantity"]).endswith(LONG_RUN_SUFFIXES)
+
+
+def _refinement_study(
+    document: dict[str, Any], rows: list[StoredRow], model: Model, state: State
+) -> ReproductionCase:
+    """The study behind rows: up to the latest time they compared, with the steps of the run."""
+    cell = _cell(rows[0])[:2], rows[0]["integrator"]
+    every = [
+        row
+        for row in document["rows"]
+        if (_cell(row)[:2], row["integrator"]) == cell
+        and row["level"] in ("trajectory", "invariants")
+        and not _is_long_run(row)
+    ]
     finest = min((row["extra"]["resolution"] for row in every if "resolution" in row["extra"]), default=None)
     declared = next((row["declared_order"] for row in every if row["declared_order"]), None)
-    until = max(row["compared_until"] for row in rows)
-    if finest is None:
-        raise NotReproducible("the ladder of steps behind this row is not in the results")
-    if declared is None:  # an adaptive integrator: tolerances from a million times the tightest
-        return Case(model, state, until, tuple(finest * factor for factor in RTOL_FACTORS))
+    if finest is None or declared is None:
+        raise NotReproducible("the steps of the refinement study behind this row are not in the results")
     coarsest = 2.0 ** -STEP_EXPONENTS[declared][0]
-    steps = [coarsest / 2**k for k in range(round(np.log2(coarsest / finest)) + 1)]
-    # the longest run of a number of coarsest steps that halves well, within the row's time
+    steps = tuple(coarsest / 2**k for k in range(round(np.log2(coarsest / finest)) + 1))
+    # the longest run, within the compared time, of a power of two of coarsest steps: it can be halved
+    until = max(row["compared_until"] for row in rows)
     span = coarsest * 2.0 ** np.floor(np.log2(max(until / coarsest, 1.0)))
-    return Case(model, state, float(span), tuple(steps))
+    return ReproductionCase(model, state, float(span), steps)
 
 
-def of_ladder(row: dict[str, Any]) -> bool:
-    """Whether a row is about the runs of a ladder of steps."""
-    return row["level"] in ("trajectory", "invariants") and not long(row)
-
-
-def ratio(row: dict[str, Any]) -> float:
-    """By how much a row disagrees, in tolerances."""
+def _ratio(row: StoredRow) -> float:
+    """Error over tolerance of a stored row."""
     return float(row["ratio"] or 0.0)
 
 
-def file_name(key: str) -> str:
-    """A file name of safe characters, unique to the key."""
+def _file_name(key: str) -> str:
+    """Return a file name of safe characters, unique to the key."""
     safe = re.sub(r"[^A-Za-z0-9._-]+", "-", key).strip("-.")[:80]
     return f"{safe}-{hashlib.sha256(key.encode()).hexdigest()[:8]}.py"

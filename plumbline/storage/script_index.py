@@ -1,0 +1,67 @@
+"""The index of a results folder's reproduction scripts: scripts/index.json, row key → file name."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from plumbline.processes.errors import PlumblineError
+from plumbline.storage.results_store import write_atomically
+
+
+class DamagedScriptIndex(PlumblineError, ValueError):
+    """scripts/index.json is not what `write_script_index` writes; the message names the file."""
+
+
+def scripts_folder(folder: Path) -> Path:
+    """Return the folder of the scripts.
+
+    Args:
+        folder: a results folder.
+
+    Returns:
+        Where its scripts and their index are, or would be.
+
+    """
+    return folder / "scripts"
+
+
+def read_script_index(folder: Path) -> dict[str, str]:
+    """Read the index.
+
+    Args:
+        folder: a results folder.
+
+    Returns:
+        File name of the script of each row key that has one; empty where there is no index.
+
+    Raises:
+        DamagedScriptIndex: the file is not a JSON object of plain file names.
+
+    """
+    path = scripts_folder(folder) / "index.json"
+    try:
+        index = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        return {}
+    except (OSError, ValueError, RecursionError) as error:
+        raise DamagedScriptIndex(f"{path}: not readable as JSON ({error}); remove it to go on") from None
+    if not isinstance(index, dict) or not all(_is_file_name(name) for name in index.values()):
+        raise DamagedScriptIndex(f"{path}: not an object of row keys and file names; remove it to go on")
+    return index
+
+
+def write_script_index(folder: Path, index: dict[str, str]) -> None:
+    """Write the index; the scripts' folder exists.
+
+    Args:
+        folder: a results folder.
+        index: file name of the script of each row key.
+
+    """
+    data = json.dumps(index, indent=1).encode()
+    write_atomically(scripts_folder(folder) / "index.json", data)
+
+
+def _is_file_name(name: object) -> bool:
+    return isinstance(name, str) and name == Path(name).name and "\0" not in name
