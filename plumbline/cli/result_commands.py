@@ -89,15 +89,15 @@ def reproduce(result: Path, keys: tuple[str, ...]) -> None:
     RESULT is a results folder or its results.json; KEY is a row's key. Without KEY, the disagreements are
     listed.
     """
-    from plumbline.reproduce.write import read_disagreements, write_scripts
+    from plumbline.reproduce.write import list_disagreements, write_scripts
 
     folder = result if result.is_dir() else result.parent
     try:
         if not keys:
-            rows = read_disagreements(folder)
-            for row in rows:
-                click.echo(f"{row['key']}: {row['diagnosis'] or row['reason']}")
-            click.echo(count_noun(len(rows), "disagreement") if rows else "nothing disagrees", err=True)
+            found = list_disagreements(folder)
+            for key, reason in found.items():
+                click.echo(f"{key}: {reason}")
+            click.echo(count_noun(len(found), "disagreement") if found else "nothing disagrees", err=True)
             return
         written = write_scripts(folder, keys)
     except ValueError as error:

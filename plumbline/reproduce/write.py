@@ -50,14 +50,14 @@ class WrittenScripts:
     reasons: dict[str, str] = field(default_factory=dict)  # why there is none, for the others
 
 
-def read_disagreements(folder: Path) -> list[StoredRow]:
-    """Read the rows that disagree.
+def list_disagreements(folder: Path) -> dict[str, str]:
+    """List the rows that disagree.
 
     Args:
         folder: a results folder.
 
     Returns:
-        The stored rows whose verdict is "disagrees".
+        Diagnosis, or else the verdict's reason, by the key of the row.
 
     Raises:
         ValueError: results.json is missing or damaged; the message names it.
@@ -65,7 +65,7 @@ def read_disagreements(folder: Path) -> list[StoredRow]:
     """
     document = read_results(folder)
     with _checked(folder):
-        return _disagreements(document)
+        return {row["key"]: row["diagnosis"] or row["reason"] for row in _disagreements(document)}
 
 
 def write_scripts(
@@ -226,8 +226,8 @@ def _check_worthwhile(
     cell: tuple[str, ...], rows: list[StoredRow], cells: dict[tuple[str, ...], list[StoredRow]]
 ) -> None:
     """Raise NotReproducible for a cell whose script can wait until somebody requests it."""
-    scenario, engine, level, *_ = cell
-    if level == "relations" and (scenario, engine, "state", "-") in cells:
+    scenario, engine, level, integrator, *_ = cell
+    if (level, integrator) == ("relations", "-") and (scenario, engine, "state", "-") in cells:
         raise NotReproducible(f"the state-level script of this engine and scenario shows it; {HINT}")
     seconds = rows[0].get("cpu_time", 0.0) if level in ("trajectory", "invariants") else 0.0
     if seconds > UNREQUESTED_SECONDS / MIN_CANDIDATES:

@@ -64,4 +64,4 @@ def write_script_index(folder: Path, index: dict[str, str]) -> None:
 
 
 def _is_file_name(name: object) -> bool:
-    return isinstance(name, str) and name == Path(name).name and "\0" not in name
+    return isinstance(name, str) and bool(name) and name == Path(name).name and "\0" not in name

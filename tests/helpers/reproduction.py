@@ -1,0 +1,132 @@
+"""Reproduction scripts in tests: cases to render, scripts to run, and engines with a planted defect."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from contextlib import contextmanager, redirect_stdout
+from io import StringIO
+from pathlib import Path
+
+from plumbline.engines.metamorphic_hooks import metamorphic_hooks
+from plumbline.engines.registry import load_adapter
+from plumbline.judging.relation_result import OPTION_PREFIX, OTHER_FORMULATION_PREFIX
+from plumbline.judging.state_relations import QUANTITIES, STATE_RELATIONS, WELDED_HALVES
+from plumbline.reproduce.engine_client import EngineClient
+from plumbline.reproduce.measure import ConvergenceMeasure, RelationMeasure, StateMeasure
+from plumbline.reproduce.shrink import ReproductionCase
+from tests.helpers import pendulums
+from tests.helpers.pendulums import JOINTS
+
+HOSTILE = '<img src=x onerror="alert(1)">\n"""\nimport os; os.abort()  # \\ \'\'\' \r ; # ünï'
+DRIFTS = ("energy_drift", "momentum_drift", "joint_gap", "gap_rate", "norm_drift")
+ALL_QUANTITIES = (*QUANTITIES, "mass_matrix")
+ENGINES = ("mujoco", "pinocchio", "pinocchio-aba", "pinocchio-maximal", "exudyn", "exudyn-tree")
+
+
+def stored_row(engine: str, **more):
+    """A stored row about an engine of this environment; its texts are hostile."""
+    row = {"scenario": HOSTILE, "quantity": HOSTILE, "integrator": HOSTILE, "extra": {"state": 3.0}}
+    return row | {"engine": engine, "engine_version": load_adapter(engine).version()} | more
+
+
+def state_case(joints: str, loads: bool = False, drag: bool = False, rate: float = 3.0) -> ReproductionCase:
+    model = pendulums.model(JOINTS[joints], loads=loads, drag=drag)
+    return ReproductionCase(model, pendulums.state(model, seed=3, rate=rate))
+
+
+def state_evidence(engine: str, case: ReproductionCase):
+    found = StateMeasure(EngineClient(engine), ALL_QUANTITIES)(case)
+    assert found is not None
+    return found
+
+
+def relation_evidence(engine: str, relation: str, case: ReproductionCase):
+    found = RelationMeasure(EngineClient(engine), relation)(case)
+    assert found is not None
+    return found
+
+
+def motion_measure(engine: str, integrator: str, level: str, joints: str, loaded: bool, until: float):
+    """A measure of a slow tumble at three steps, and its case."""
+    case = state_case(joints, loaded, loaded, rate=1.0)
+    case = ReproductionCase(case.model, case.state, until, tuple(2.0**-k for k in (6, 7, 8)))
+    wanted = DRIFTS if level == "invariants" else ("order", "position_limit", "attitude_limit")
+    return ConvergenceMeasure(EngineClient(engine), integrator, level, wanted), case
+
+
+def step_integrators(engine: str) -> list[str]:
+    return [i.name for i in load_adapter(engine).integrators if i.kind == "step"]
+
+
+def second_ways(engine: str) -> list[str]:
+    """Relations in which the engine itself is set to a second way."""
+    hooks = metamorphic_hooks(load_adapter(engine))
+    found = [OPTION_PREFIX + option for option in hooks.options if engine != "pinocchio-maximal"]
+    found += [OTHER_FORMULATION_PREFIX + hooks.other_formulation] if hooks.other_formulation else []
+    return found + ([] if hooks.welding_unsupported_reason else [WELDED_HALVES])
+
+
+def every_evidence(engine: str, joints: str, loaded: bool):
+    """Evidence of every kind of script of an engine."""
+    case = state_case(joints, loaded, loaded)
+    yield state_evidence(engine, case)
+    for relation in (STATE_RELATIONS[0].name, *second_ways(engine)):
+        yield relation_evidence(engine, relation, case)
+    for integrator in step_integrators(engine):
+        for level in ("trajectory", "invariants"):
+            measure, study = motion_measure(engine, integrator, level, joints, loaded, 0.25)
+            yield measure(study)
+
+
+def ratios(printed: str) -> list[float]:
+    return [float(x) for x in re.findall(r"^  off by (\S+) times", printed, re.M)]
+
+
+def execute(script: str) -> tuple[list[float], dict]:
+    """Run a script in this process; its ratios and its names."""
+    names = {"__name__": "__main__"}
+    with redirect_stdout(StringIO()) as printed:
+        try:
+            exec(compile(script, "script", "exec"), names)
+        except SystemExit as end:
+            assert end.code == (max(ratios(printed.getvalue())) > 1), "exit status"
+    return ratios(printed.getvalue()), names
+
+
+def run_alone(script: str, folder: Path, before: str = "", python: str = sys.executable) -> list[float]:
+    """Run a script in a process of its own, without this project; ``before`` is executed first."""
+    path = folder / "script.py"
+    path.write_text(script, encoding="utf-8")
+    code = f"{before}\nimport runpy\nrunpy.run_path({str(path)!r}, run_name='__main__')"
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    done = subprocess.run(
+        [python, "-P", "-c", code] if before else [python, "-P", path],
+        cwd=folder, capture_output=True, text=True, timeout=120, encoding="utf-8",
+        env={**environment, "PYTHONIOENCODING": "utf-8", "OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
+    found = ratios(done.stdout)
+    assert found and done.returncode == (max(found) > 1), done.stderr
+    return found
+
+
+@contextmanager
+def defective(lines: str):
+    """The engines' modules after these lines; as they were afterwards."""
+    import exudyn
+    import exudyn.itemInterface
+    import mujoco
+    import pinocchio
+
+    places = (exudyn, exudyn.itemInterface, mujoco, pinocchio)
+    before = [dict(vars(place)) for place in places]
+    try:
+        exec(lines, {})
+        yield
+    finally:
+        for place, names in zip(places, before, strict=True):
+            for name, value in names.items():
+                if vars(place).get(name) is not value:
+                    setattr(place, name, value)

@@ -1,0 +1,198 @@
+"""A defect in an engine is shown by a small script, which finds nothing without the defect.
+
+An engine with a defect is one whose own module was changed: the same few lines are executed before the
+harness calls it and before the script runs, so that both meet the same engine.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+from plumbline.engines import environments
+from plumbline.engines.registry import load_adapter
+from plumbline.judging.convergence import refinement_resolutions
+from plumbline.reproduce.engine_client import EngineClient
+from plumbline.reproduce.measure import Disagreement, StateMeasure
+from plumbline.reproduce.render import render_script
+from plumbline.reproduce.shrink import ReproductionCase, starting_cases
+from plumbline.reproduce.write import make_script
+from plumbline.scenario.loader import find_scenario_file, load_scenario
+from tests.helpers.planted_defects import STATE_DEFECTS, plant
+from tests.helpers.reproduction import defective, execute, run_alone, state_case, stored_row
+
+for name in ("mujoco", "pinocchio", "exudyn", "flint"):
+    pytest.importorskip(name)
+
+HEAVY = """import mujoco
+real = mujoco.mj_setConst
+def heavy(m, d):
+    m.body_mass[-1] *= 1.0001
+    real(m, d)
+mujoco.mj_setConst = heavy
+"""
+EULER = """import mujoco, types
+mujoco.mjtIntegrator = types.SimpleNamespace(mjINT_RK4=mujoco.mjtIntegrator.mjINT_EULER)
+"""
+NO_DEXP = """import pinocchio, numpy
+pinocchio.dIntegrate = lambda m, q, v, arg: numpy.eye(m.nv)
+"""
+SYRUP = """import pinocchio
+real = pinocchio.aba
+pinocchio.aba = lambda m, d, q, v, *more: real(m, d, q, v, *more) - 1e-3 * v
+"""
+BIASED = """import pinocchio
+real = pinocchio.crba
+pinocchio.crba = lambda *all: real(*all) * 1.0001
+"""
+STRONG = """import exudyn.itemInterface as items
+real = items.LoadMassProportional
+def strong(markerNumber, loadVector):
+    return real(markerNumber=markerNumber, loadVector=[1.0001 * x for x in loadVector])
+items.LoadMassProportional = strong
+"""
+TREE = """import exudyn.itemInterface as items
+real = items.ObjectKinematicTree
+def strong(**given):
+    return real(**{**given, "gravity": [1.001 * x for x in given["gravity"]]})
+items.ObjectKinematicTree = strong
+"""
+FLYER = """import pinocchio
+for name in ("constraintDynamics", "forwardDynamics"):
+    def fast(m, d, q, v, tau, *more, real=getattr(pinocchio, name)):
+        return real(m, d, q, 1.0001 * v, tau, *more)
+    setattr(pinocchio, name, fast)
+"""
+FULL = pytest.mark.full
+DEFECTS = [  # engine, level, integrator, what must disagree, the defect
+    ("mujoco", "state", "-", "joint_reaction", HEAVY),
+    ("exudyn-tree", "state", "-", "acceleration", TREE),
+    ("mujoco", "trajectory", "RK4", "order", EULER),
+    ("exudyn", "trajectory", "trapezoidal", "attitude_limit", STRONG),
+    ("pinocchio", "invariants", "semi-implicit-euler", "energy_drift", SYRUP),
+    ("pinocchio-aba", "relations", "-", "by crba", SYRUP),
+    pytest.param("pinocchio", "state", "-", "mass_matrix", BIASED, marks=FULL),
+    pytest.param("pinocchio-maximal", "state", "-", "acceleration", FLYER, marks=FULL),
+    pytest.param("exudyn", "state", "-", "acceleration", STRONG, marks=FULL),
+    pytest.param("mujoco", "trajectory", "RK4", "position_limit", HEAVY, marks=FULL),
+    pytest.param("pinocchio", "trajectory", "rkmk4", "order", NO_DEXP, marks=FULL),
+    pytest.param("exudyn-tree", "trajectory", "RK44", "position_limit", TREE, marks=FULL),
+    pytest.param("mujoco", "invariants", "RK4", "energy_drift", HEAVY, marks=FULL),
+    pytest.param("exudyn", "invariants", "generalized-alpha", "energy_drift", STRONG, marks=FULL),
+    pytest.param("pinocchio", "relations", "-", "as pinocchio-maximal", FLYER, marks=FULL),
+]
+
+
+def study(engine: str, integrator: str, case: ReproductionCase, until: float) -> ReproductionCase:
+    """The refinement study that a run makes of a case."""
+    steps = refinement_resolutions(load_adapter(engine).integrator(integrator), case.model.n, 1.0)
+    return replace(case, until=until, steps=tuple(steps[:6]))
+
+
+def disagreement(engine: str, quantities: tuple[str, ...], case: ReproductionCase, **more) -> Disagreement:
+    given = {"level": "state", "integrator": "-", "ratio": 50.0, "seconds": 60.0} | more
+    return Disagreement(EngineClient(engine), quantities=quantities, case=case, **given)
+
+
+@pytest.mark.parametrize(
+    ("engine", "level", "integrator", "wanted", "lines"),
+    DEFECTS,
+    ids=lambda value: "" if "\n" in value else value,
+)
+def test_a_defect_in_an_engine_is_shown_by_its_script(engine, level, integrator, wanted, lines, tmp_path):
+    """The script is run in a process of its own; without the defect the same script finds nothing."""
+    case = state_case("balls", rate=1.0)
+    case = case if integrator == "-" else study(engine, integrator, case, 0.25)
+    found = disagreement(engine, (wanted,), case, level=level, integrator=integrator, seconds=1.5)
+    with defective(lines):
+        script, reason = make_script(found, stored_row(engine, level=level))
+    assert script, reason
+    assert len(re.search(r"mass=np\.array\(\[(.*?)\]\)", script)[1].split(",")) == 1, "one body shows it"
+    shown = run_alone(script, tmp_path, before=lines)
+    stated = re.search(r"off by (\S+) times what is allowed", script.replace("\n# ", " "))[1]
+    assert max(shown) > 1 and max(shown) == pytest.approx(float(stated), rel=0.1)
+    assert max(execute(script)[0]) < 1, "without the defect all is right"
+
+
+# --- shrinking ------------------------------------------------------------------------------------------
+
+
+def test_the_smallest_chain_on_which_aba_loses_its_digits(tmp_path):
+    """A real one: Pinocchio's aba on thirty balls, with simpler numbers, and still disagreeing alone."""
+    scenario = load_scenario(find_scenario_file("chain-30-balls"))
+    case = ReproductionCase(scenario.model, scenario.state)
+    wanted = ("acceleration", "angular_acceleration", "joint_reaction")
+    small = disagreement("pinocchio-aba", wanted, case).shrink()
+    assert small.case.model.n < 30 and small.ratio >= 10
+    assert not small.case.model.has_loads and np.all(small.case.state.omega == 0)
+    assert np.all(small.case.model.mass == 1)
+    row, whole = stored_row("pinocchio-aba"), StateMeasure(EngineClient("pinocchio-aba"), wanted)(case)
+    script = render_script(row, small)
+    assert len(script) < len(render_script(row, whole))
+    assert max(run_alone(script, tmp_path)) >= 5, (
+        "rounding differs between script and adapter, next to a bound"
+    )
+    assert script.count('ALGORITHM = "aba"') == 1
+    right, _ = execute(script.replace('ALGORITHM = "aba"', 'ALGORITHM = "crba"'))
+    assert max(right) < 1, "the model is the same: crba is right where aba is not"
+
+
+PLANTED = next(d for d in STATE_DEFECTS if d.name == "inertia-xx-1e-6")
+
+
+def with_planted_defect():
+    engine = plant(type(load_adapter(PLANTED.engine)), PLANTED)
+    return patch("plumbline.reproduce.engine_client.load_adapter", lambda _: engine)
+
+
+def test_a_defect_in_one_number_shrinks_to_one_body():
+    found = disagreement(PLANTED.engine, ("acceleration",), state_case("mixed", loads=True, drag=True))
+    with with_planted_defect():
+        small = found.shrink()
+    assert small.case.model.n == 1 and not small.case.model.has_loads and not small.case.model.has_drag
+    assert small.case.model.mass.tolist() == [1.0]
+
+
+def test_a_search_without_time_returns_a_state_as_it_is_and_begins_no_study():
+    case = state_case("balls")
+    with with_planted_defect():
+        small = disagreement(PLANTED.engine, ("acceleration",), case, seconds=0.0).shrink()
+    assert small is not None and small.case.model.n == 2
+    late = {"level": "trajectory", "integrator": "RK4", "seconds": 0.0}
+    found = disagreement("mujoco", ("order",), study("mujoco", "RK4", case, 1.0), **late)
+    script, reason = make_script(found, stored_row("mujoco"))
+    assert not script and "within 0 s" in reason
+
+
+def test_studies_begin_with_short_runs_of_few_bodies():
+    case = replace(state_case("balls"), until=1.0, steps=(2.0**-7,))
+    tried = [(c.until, c.model.n) for c in starting_cases(case)]
+    assert tried[0] == (0.0625, 1) and tried[-1] == (1.0, 2)
+
+
+def test_where_the_engine_agrees_there_is_no_script():
+    script, reason = make_script(
+        disagreement("mujoco", ("acceleration",), state_case("ball")), stored_row("mujoco")
+    )
+    assert not script and "agrees" in reason
+
+
+@pytest.mark.full
+def test_the_order_of_an_older_mujoco_is_shown_in_its_environment(tmp_path):
+    """A real one: RK4 of 3.12 is of order 2."""
+    try:
+        python = environments.ensure_interpreter("mujoco@3.12.0")
+    except environments.EnvironmentUnavailable as error:
+        pytest.skip(str(error))
+    case = study("mujoco", "RK4", state_case("balls", rate=1.0), 1.0)
+    found = disagreement("mujoco", ("order",), case, level="trajectory", integrator="RK4", seconds=20.0)
+    found = replace(found, engine=EngineClient("mujoco", python))
+    row = stored_row("mujoco") | {"engine": "mujoco@3.12.0", "engine_version": "3.12.0"}
+    script, reason = make_script(found, row)
+    assert "'mujoco@3.12.0' '3.12.0'" in script, reason
+    assert max(run_alone(script, tmp_path, python=python)) == pytest.approx(20, rel=0.1)
+    assert run_alone(script, tmp_path)[0] < 1, "the installed version is of order 4"

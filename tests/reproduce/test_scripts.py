@@ -1,0 +1,196 @@
+"""Scripts call an engine as its adapter does, run with the engine and NumPy alone, and pass ruff."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plumbline.engines.registry import ENGINES as REGISTERED
+from plumbline.judging.refinement_analysis import RefinementAnalysis
+from plumbline.judging.rows import RowContext
+from plumbline.judging.state_relations import STATE_RELATIONS
+from plumbline.reproduce.engine_client import EngineClient
+from plumbline.reproduce.measure import StateMeasure
+from plumbline.reproduce.render import TEMPLATES, no_script_reason, render_script
+from tests.helpers.reproduction import (
+    ALL_QUANTITIES,
+    ENGINES,
+    HOSTILE,
+    every_evidence,
+    execute,
+    motion_measure,
+    relation_evidence,
+    run_alone,
+    second_ways,
+    state_case,
+    state_evidence,
+    step_integrators,
+    stored_row,
+)
+
+for name in ("mujoco", "pinocchio", "exudyn", "flint"):
+    pytest.importorskip(name)
+
+ROOT = Path(__file__).resolve().parents[2]
+INTEGRATORS = [(engine, name) for engine in ENGINES for name in step_integrators(engine)]
+WAYS = [(engine, name) for engine in ENGINES for name in second_ways(engine)]
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_every_template_renders_to_what_ruff_accepts(engine, tmp_path):
+    """Every kind of script, with rods, loads and drag and without; also for the engine's old versions."""
+    scripts = []
+    for joints, loaded in (("rod-ball", True), ("ball", False)):
+        for evidence in every_evidence(engine, joints, loaded):
+            for version in ("1.0", "99"):
+                row = stored_row(engine, engine_version=version)
+                scripts.append(render_script(row, evidence))
+    assert len(scripts) >= 8
+    for i, script in enumerate(scripts):
+        (tmp_path / f"{i}.py").write_text(script, encoding="utf-8")
+    ruff = [Path(sys.executable).parent / "ruff"]
+    for command in (
+        ["check", "--ignore", "D"],
+        ["format", "--diff"],
+    ):  # of docstrings the functions need none
+        config = ["--no-cache", "--config", ROOT / "pyproject.toml", tmp_path]
+        done = subprocess.run([*ruff, *command, *config], capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout
+    assert "plumbline" not in "".join(scripts)
+
+
+def test_every_template_is_used():
+    frame = {"script", "state", "relation", "motion", "invariants", "exudyn-common"}
+    assert {path.name.removesuffix(".py.j2") for path in TEMPLATES.iterdir()} - frame == {
+        name for name in REGISTERED if not no_script_reason(name, {"level": "state", "quantity": "energy"})
+    } - {"pinocchio-aba"}
+
+
+# --- a script calls the engine as the adapter does: it has no mistake of its own -----------------------
+
+
+@pytest.mark.parametrize(
+    ("engine", "joints"), [("pinocchio-maximal", "balls"), *((name, "rod-ball") for name in ENGINES)]
+)
+def test_a_script_of_a_state_calls_the_engine_as_the_adapter_does(engine, joints):
+    evidence = state_evidence(engine, state_case(joints, loads=True, drag=True))
+    found, _ = execute(render_script(stored_row(engine), evidence))
+    assert len(found) >= 6 and max(found) < 1, found
+
+
+@pytest.mark.parametrize(("engine", "integrator"), INTEGRATORS)
+def test_a_script_of_runs_steps_as_the_adapter_does(engine, integrator):
+    """To rounding, or to the tolerance of an implicit step's solver, on balls and rods with every load."""
+    measure, case = motion_measure(engine, integrator, "trajectory", "rod-ball", True, 0.0625)
+    found, names = execute(render_script(stored_row(engine), measure(case)))
+    assert len(found) == 3 and max(found[1:]) < 1
+    _, runs = measure.run(case, measure.sample_times(case))
+    for run, mine in zip(runs, names["runs"], strict=True):
+        for name, values in zip(("r", "p", "v"), mine, strict=False):
+            assert np.max(np.abs(values - getattr(run.trajectory, name))) < 1e-10, (name, run.resolution)
+
+
+@pytest.mark.parametrize(
+    ("engine", "integrator", "loaded", "count"),
+    [("exudyn", "trapezoidal", False, 5), ("pinocchio", "rkmk4", True, 4)],
+)
+def test_a_script_measures_drifts_as_the_harness_does(engine, integrator, loaded, count):
+    """Momentum is not conserved under loads; the work of moments and drag is integrated without SciPy."""
+    measure, case = motion_measure(engine, integrator, "invariants", "rod-ball", loaded, 1.0)
+    evidence = measure(case)
+    found, names = execute(render_script(stored_row(engine), evidence))
+    assert len(found) == count and max(found) < 1
+    truth, runs = measure.run(case, measure.sample_times(case))
+    analysis = RefinementAnalysis(
+        RowContext("", "", "", "", ""), case.model, truth, measure.integrator, runs, 1.0
+    )
+    last = analysis.invariant_drifts[-1]
+    for quantity in evidence.drifts:
+        script = np.max(np.linalg.norm(np.atleast_1d(names[quantity](*names["runs"][-1])), axis=-1))
+        harness = np.max(np.linalg.norm(getattr(last, quantity)[-1], axis=-1))
+        by_quadrature = last.work_uncertainty * (quantity == "energy_drift")
+        assert script == pytest.approx(harness, rel=0.01, abs=1e-13 + 2 * by_quadrature), quantity
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "exudyn"])
+@pytest.mark.parametrize("relation", [r.name for r in STATE_RELATIONS])
+def test_a_script_of_a_relation_finds_what_the_harness_finds(engine, relation):
+    case = state_case("rod-ball", loads=True, drag=relation != "time reversed")
+    evidence = relation_evidence(engine, relation, case)
+    found, _ = execute(render_script(stored_row(engine), evidence))
+    assert evidence.ratio < 1 and len(found) == 6 and max(found) < 1
+    wrong = replace(evidence, back={q: way * 1.001 for q, way in evidence.back.items()})
+    assert min(execute(render_script(stored_row(engine), wrong))[0]) > 1, (
+        "a wrong answer would not be noticed"
+    )
+
+
+@pytest.mark.parametrize(("engine", "relation"), WAYS)
+def test_a_script_calls_the_engine_in_its_second_way(engine, relation):
+    evidence = relation_evidence(engine, relation, state_case("rod-ball", loads=True, drag=True))
+    script = render_script(stored_row(engine), evidence)
+    assert max(execute(script)[0]) < 1
+    second = re.search(r"second = .*", script)[0]
+    heavier = script.replace(second, f"c.mass = c.mass * 1.001\n{second}\n")
+    halves = "c.pieces = [[(m * 1.001, s, J) for m, s, J in x] for x in halves]"
+    heavier = heavier.replace("c.pieces = halves", halves)
+    assert max(execute(heavier)[0]) > 1, "the second answer is not computed"
+
+
+def test_another_environment_is_called_and_runs_the_script():
+    """This interpreter stands for that of another version: the way there and back is the same."""
+    case = state_case("ball")
+    there = StateMeasure(EngineClient("mujoco", sys.executable), ALL_QUANTITIES)(case)
+    assert there.ratio == state_evidence("mujoco", case).ratio
+    script = render_script(stored_row("mujoco"), there)
+    printed = EngineClient("mujoco", sys.executable).run_script(script)
+    assert printed == EngineClient("mujoco").run_script(script)
+    assert printed.count("\n  off by ") == len(ALL_QUANTITIES) and printed.startswith("MuJoCo 4")
+
+
+# --- texts ------------------------------------------------------------------------------------------------
+
+
+def test_literals_are_exact_and_hostile_names_stay_text(tmp_path):
+    case = state_case("ball")
+    state = state_evidence("mujoco", case)
+    relation = replace(relation_evidence("mujoco", "masses doubled", case), name=HOSTILE)
+    measure, study = motion_measure("mujoco", "RK4", "trajectory", "ball", False, 0.25)
+    hostile = stored_row("mujoco", engine_version=HOSTILE)
+    for evidence in (state, relation, measure(study)):
+        script = render_script(hostile, evidence)
+        head = re.split(r"^from ", script, flags=re.M)[0]
+        assert all(line.startswith("#") or not line for line in head.splitlines())
+        assert "os.abort" in head
+        _, names = execute(script)
+        for field in ("mass", "inertia", "proximal", "gravity"):
+            np.testing.assert_array_equal(getattr(names["c"], field), getattr(evidence.case.model, field))
+    run_alone(render_script(hostile, state), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("engine", "level", "quantity", "integrator", "words"),
+    [
+        ("exudyn", "relations", "reversed in time", "trapezoidal", "relations of runs have no script"),
+        ("exudyn", "relations", "two welded halves", "-", "cannot show 'two welded halves'"),
+        ("exudyn", "relations", "something new", "-", "cannot show 'something new'"),
+        ("exudyn", "invariants", "energy_drift_long", "trapezoidal", "long runs have no script"),
+        ("pinocchio", "trajectory", "position_limit", "dop853", "adaptive integrators have no script"),
+        ("reference", "state", "acceleration", "-", "no template"),
+        ("exudyn", "state", "acceleration", "-", ""),
+        ("exudyn", "relations", "rotated world", "-", ""),
+        ("pinocchio", "relations", "by cholesky", "-", ""),
+        ("mujoco", "relations", "two welded halves", "-", ""),
+        ("exudyn", "relations", "as exudyn-tree", "-", ""),
+    ],
+)
+def test_what_has_no_script_is_explained_in_a_sentence(engine, level, quantity, integrator, words):
+    row = {"level": level, "quantity": quantity, "integrator": integrator, "declared_order": None}
+    said = no_script_reason(engine, row)
+    assert words in said and bool(words) == bool(said)

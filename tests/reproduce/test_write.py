@@ -1,0 +1,173 @@
+"""Scripts of a results folder: which rows get one, and what damaged or wrong input leads to."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from plumbline.cli.main import main
+from plumbline.processes.workers import Outcome
+from plumbline.reproduce import write
+from plumbline.reproduce.write import NotReproducible, write_scripts
+from plumbline.scenario.loader import find_scenario_file, load_scenario
+from plumbline.storage import results_store
+from plumbline.storage.script_index import DamagedScriptIndex, read_script_index
+from tests.helpers.reproduction import run_alone, stored_row
+
+for name in ("mujoco", "pinocchio", "exudyn", "flint"):
+    pytest.importorskip(name)
+
+SLOW = {"level": "trajectory", "integrator": "rkmk4", "quantity": "attitude", "cpu_time": 2.0}
+
+
+@pytest.fixture
+def results(tmp_path):
+    """A results folder with real disagreements of aba, one row that agrees and one without a script."""
+    scenario = load_scenario(find_scenario_file("chain-30-balls"))
+    about = {
+        "digest": scenario.digest,
+        "model": {k: np.asarray(v).tolist() for k, v in asdict(scenario.model).items()},
+        "state": {k: getattr(scenario.state, k).tolist() for k in ("p", "omega", "u", "udot")},
+    }
+    rows = [
+        stored_row("pinocchio-aba", key=key, scenario="chain", level=level, integrator=integrator,
+                   quantity=quantity, verdict=verdict, reason="off", diagnosis=None, ratio=400.0,
+                   declared_order=None, extra={"state": 0.0})
+        for key, level, integrator, quantity, verdict in (
+            ("a", "state", "-", "acceleration", "disagrees"),
+            ("b", "relations", "rkmk4", "reversed in time", "disagrees"),
+            ("c", "state", "-", "joint_reaction", "agrees"),
+            ("d", "relations", "-", "re-chosen body frame", "disagrees"))
+    ]  # fmt: skip
+    document = {"schema_version": results_store.SCHEMA_VERSION, "scenarios": {"chain": about}, "rows": rows}
+    store(tmp_path, document)
+    return tmp_path
+
+
+def store(folder, document) -> None:
+    (folder / "results.json").write_text(json.dumps(document))
+
+
+def command(*arguments):
+    """The command's exit code and its output; a traceback is a failure."""
+    done = CliRunner().invoke(main, [str(a) for a in arguments])
+    assert done.exception is None or isinstance(done.exception, SystemExit), done.exception
+    return done.exit_code, done.output
+
+
+def test_the_command_lists_and_writes(results):
+    code, listed = command("reproduce", results)
+    assert code == 0 and "a: off" in listed and "c:" not in listed
+    with patch("plumbline.reproduce.write.REQUESTED_SECONDS", 0.0):
+        code, printed = command("reproduce", results / "results.json", "a", "d")
+    assert code == 0, printed
+    index = read_script_index(results)
+    assert set(index) == {"a", "d"}
+    for name in index.values():
+        path = results / "scripts" / name
+        assert str(path) in printed
+        assert max(run_alone(path.read_text(encoding="utf-8"), results)) > 1
+    code, refused = command("reproduce", results, "nothing")
+    assert code == 2 and "no row 'nothing' disagrees here" in refused
+    assert "did you mean 'a'?" in command("reproduce", results, "aa")[1]
+    code, refused = command("reproduce", results, "b")
+    assert code == 1 and "relations of runs have no script" in refused
+
+
+def test_the_runs_behind_a_row_are_those_of_its_refinement_study(results):
+    document = results_store.read_results(results)
+    found = {"scenario": "chain", "engine": "mujoco", "integrator": "RK4", "level": "trajectory",
+             "verdict": "disagrees", "declared_order": 4, "compared_until": 1.7, "ratio": 20.0,
+             "quantity": "order", "extra": {}}  # fmt: skip
+    finest = found | {"quantity": "position", "verdict": "agrees", "extra": {"resolution": 2.0**-8}}
+    others = ({"level": "relations"}, {"level": "invariants", "quantity": "energy_drift_long"})
+    document["rows"] = [found, finest, *(finest | o | {"extra": {"resolution": 2.0**-12}} for o in others)]
+    disagreement = write.find_disagreement(document, [found], 1.0)
+    assert disagreement.case.steps == (2.0**-5, 2.0**-6, 2.0**-7, 2.0**-8)
+    assert disagreement.case.until == 1.0 and disagreement.ratio == 20
+    assert disagreement.quantities == ("order",)
+    document["rows"] = [found]
+    with pytest.raises(NotReproducible, match="refinement study"):
+        write.find_disagreement(document, [found], 1.0)
+
+
+def test_a_lost_worker_leaves_no_script(results):
+    def lost(_, tasks):
+        return [Outcome(t.key, failure="hung") for t in tasks]
+
+    with patch("plumbline.reproduce.write.WorkerPool.run", lost):
+        written = write_scripts(results)
+        assert write_scripts(results, ["d"]).reasons == {"d": "hung"}
+    assert written.reasons["a"] == "hung" and "relations of runs" in written.reasons["b"]
+    assert "the state-level script" in written.reasons["d"] and not written.files
+    assert not list((results / "scripts").glob("*.py"))
+
+
+def test_at_the_end_of_a_run_nothing_long_is_begun(results):
+    document = results_store.read_results(results)
+    document["rows"] = [document["rows"][0] | SLOW | {"key": "s"}]
+    store(results, document)
+    with patch("plumbline.reproduce.write.WorkerPool", side_effect=AssertionError("began")):
+        reasons = write_scripts(results).reasons
+    hint = "request this row by its key"
+    assert reasons == {"s": f"one candidate takes 2.0 s, too long at the end of a run; {hint}"}
+    with patch("plumbline.reproduce.write.find_disagreement", side_effect=NotReproducible("began")):
+        assert write_scripts(results, ["s"]).reasons == {"s": "began"}
+
+
+# --- damaged input ------------------------------------------------------------------------------------
+
+INDICES = (
+    "", "{", "[]", "null", "3", '"text"', '{"a": 1}', '{"a": null}', '{"a": ["b"]}', '{"a": ""}',
+    '{"a": "../../etc/passwd"}', '{"a": "/etc/passwd"}', '{"a": "b\\u0000c"}', "\udcff", "[" * 100_000,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("text", INDICES, ids=[repr(text)[:20] for text in INDICES])
+def test_a_damaged_index_is_named(results, text):
+    (results / "scripts").mkdir()
+    (results / "scripts" / "index.json").write_bytes(text.encode("utf-8", "surrogateescape"))
+    with pytest.raises(DamagedScriptIndex, match=r"index\.json"):
+        read_script_index(results)
+    for arguments in (("reproduce", results, "a"), ("report", results)):
+        code, output = command(*arguments)
+        assert code == 2 and "index.json" in output and "remove it" in output
+
+
+def damaged(document):
+    """Copies of a document, each with one value of a row or scenario removed or replaced."""
+    chain = document["scenarios"]["chain"]
+    for value in (None, 7, "text", [[1.0]]):
+        for name in ("rows", "scenarios", "run"):
+            yield document | {name: value}
+        for name in document["rows"][0]:
+            yield document | {"rows": [document["rows"][0] | {name: value}]}
+        for name in ("model", "state", "digest"):
+            yield document | {"scenarios": {"chain": chain | {name: value}}}
+    for name in document["rows"][0]:
+        kept = {k: v for k, v in document["rows"][0].items() if k != name}
+        yield document | {"rows": [kept]}
+    for part in ("model", "state"):
+        for name in chain[part]:
+            for value in (None, [], [float("nan")]):
+                yield document | {"scenarios": {"chain": chain | {part: chain[part] | {name: value}}}}
+
+
+def test_damaged_results_are_named_and_raise_nothing_else(results):
+    document = results_store.read_results(results)
+
+    def no_work(_, tasks):
+        return [Outcome(t.key, failure="not run") for t in tasks]
+
+    with patch("plumbline.reproduce.write.WorkerPool.run", no_work):
+        for copy in damaged(document):
+            store(results, copy)
+            for arguments in (("reproduce", results), ("reproduce", results, "a")):
+                code, output = command(*arguments)
+                assert code in (0, 1, 2), output
+                assert code != 2 or "results.json" in output or "no row 'a'" in output, output
