@@ -24,7 +24,7 @@ from plumbline.execution.result_cache import DiskResultCache
 from plumbline.execution.runner import RunResult, run_plan, save
 from plumbline.execution.selftest import SelfTestResult
 from plumbline.processes.workers import Limits
-from plumbline.reproduce import write
+from plumbline.reproduce.write import write_scripts
 from plumbline.scenario.generator import RANDOM_FAMILY, RandomScenarios
 from plumbline.scenario.loader import Scenario
 from plumbline.storage.history import next_night_number, stored_runs
@@ -157,7 +157,7 @@ def run_nightly(
     save(result, folder, command)
     write_random_scenario_files(result, random_scenarios, folder / "scenarios")
     with result.cpu_times.measure("report"):
-        write.write(folder)
+        write_scripts(folder)
         reports.write(folder, history)
     history.mkdir(exist_ok=True)
     os.replace(folder, place)

@@ -34,7 +34,7 @@ from plumbline.execution.plan import Plan
 from plumbline.execution.result_cache import DiskResultCache
 from plumbline.execution.runner import RunResult, run_plan, save
 from plumbline.processes.workers import Limits
-from plumbline.reproduce import write
+from plumbline.reproduce.write import write_scripts
 from plumbline.storage.results_store import row_record, to_json_value
 
 
@@ -95,7 +95,7 @@ def run(
             result = run_plan(plan, progress)
         save(result, folder, _command_line())
         with result.cpu_times.measure("report"):
-            write.write(folder)
+            write_scripts(folder)
             report = reports.write(folder)
         cache.clear()
     if as_json:
