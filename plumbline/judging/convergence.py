@@ -1,6 +1,6 @@
 """Step refinement: observed order, extrapolated limit and its uncertainty.
 
-A ladder is the same motion at steps h, h/2, h/4, …, sampled at times that every step hits.
+A refinement study is the same motion at steps h, h/2, h/4, …, sampled at times that every step hits.
 Source: Romberg's scheme for an error expansion with known powers of h; E. Hairer,
 S. P. Nørsett, G. Wanner, Solving Ordinary Differential Equations I, II.9.
 """
@@ -16,22 +16,27 @@ import numpy as np
 from plumbline.model.datatypes import Array, Integrator
 
 ORDER_MARGIN = 0.1  # two consecutive orders this near to the declared one show it (verification.md)
-ORDER_CHANGE_FACTOR = (
-    3.0  # three consecutive orders show another one if it is this many of their own changes away
-)
-ROUNDING_FLOOR_FACTOR = 32.0  # a difference this far above rounding shows its order to 0.05: log2(1 + 1/32)
-STEP_EXPONENTS = {1: (9, 15), 2: (8, 12), 4: (5, 12)}  # order: coarsest and finest step, as -log2 of seconds
-MAX_BODY_STEPS = 2**19  # most steps × bodies of the finest run of the quick form
+ORDER_CHANGE_FACTOR = 3.0  # three consecutive orders this many of their changes away show another order
+ROUNDING_FLOOR_FACTOR = 32.0  # a difference this many times rounding gives its order to 0.05: log2(1 + 1/32)
+STEP_EXPONENTS = {1: (9, 15), 2: (8, 12), 4: (5, 12)}  # by order: coarsest and finest step, -log2 of seconds
+MAX_BODY_STEPS = 2**19  # most steps × bodies of the finest run, without extra refinements
 RTOL_FACTORS = (1e6, 1e4, 1e2, 1.0)  # relative tolerances of an adaptive method, over its tightest
 
 
 def refinement_resolutions(
     integrator: Integrator, bodies: int, duration: float, extra_refinements: int = 0
 ) -> list[float]:
-    """Resolutions from coarse to fine: steps in s, powers of two; or relative tolerances.
+    """Choose the resolutions of a refinement study.
 
-    The finest step halves ``finer`` times more (the nightly's form); long chains stop where
-    the work of the finest run would pass `BODY_STEPS`, always leaving four steps.
+    Args:
+        integrator: has fixed steps of an order, or a tolerance.
+        bodies: number of bodies; long chains stop where the finest run would pass `MAX_BODY_STEPS`.
+        duration: length of the motion [s].
+        extra_refinements: how many times the finest step is halved beyond that (in the nightly).
+
+    Returns:
+        From coarse to fine at least four steps [s], powers of two; or relative tolerances.
+
     """
     if integrator.kind == "tolerance":
         return [integrator.min_rtol * factor for factor in RTOL_FACTORS]
@@ -42,29 +47,45 @@ def refinement_resolutions(
 
 
 def max_norm(y: Array) -> float:
-    """Largest Euclidean length over all leading axes; inf where anything is not finite."""
+    """Return the largest Euclidean norm over all leading axes.
+
+    Args:
+        y: (…, width) vectors.
+
+    Returns:
+        The norm; inf where any component is not finite.
+
+    """
     size = float(np.max(np.linalg.norm(y, axis=-1), initial=0.0))
     return size if np.isfinite(size) else np.inf
 
 
 @dataclass(frozen=True)
 class ObservedOrder:
-    """The order that a ladder shows over one window of time."""
+    """The order of a refinement study in one window of time."""
 
     value: float | None  # the last trusted order; None where nothing could be observed
     is_asymptotic: bool  # two consecutive orders near the declared one, or three that stay away from it
-    is_at_rounding_floor: bool  # differences are rounding at every step: there is nothing to observe
+    is_at_rounding_floor: bool  # differences are rounding at every step, so no order can be observed
     orders: tuple[float, ...]  # all consecutive ones, coarse to fine
     differences: tuple[float, ...]  # between consecutive steps
 
 
 def observed_order(ys: Sequence[Array], floor: float, declared: int) -> ObservedOrder:
-    """Order from consecutive differences D_k = max |y_k - y_{k+1}|, log2(D_k / D_{k+1}).
+    """Observe the order from consecutive differences D_k = max |y_k - y_{k+1}|, as log2(D_k / D_{k+1}).
 
-    ``ys`` are (T, N, width) samples, coarse to fine; ``floor`` is the size of rounding: a difference
-    counts only above `ABOVE_FLOOR` times it, where rounding changes an order by less than half the
-    margin.  The finest pair of consecutive orders both within `ORDER_MARGIN` of ``declared`` shows that
-    order; else the finest three may (`approached`).
+    The finest pair of consecutive orders that are both within `ORDER_MARGIN` of the declared one shows that
+    order; else the finest three may show one (`extrapolated_order`).
+
+    Args:
+        ys: (T, N, width) samples of each run, coarse to fine, steps halving.
+        floor: rounding, in the unit of the samples. Only differences above `ROUNDING_FLOOR_FACTOR` times it
+            count: rounding changes their order by less than half the margin.
+        declared: the method's theoretical order.
+
+    Returns:
+        The order, and whether it can be trusted.
+
     """
     differences = [max_norm(a - b) for a, b in itertools.pairwise(ys)]
     orders = []
@@ -87,11 +108,19 @@ def observed_order(ys: Sequence[Array], floor: float, declared: int) -> Observed
 
 
 def extrapolated_order(last: Sequence[float], declared: int) -> float | None:
-    """The order that the three finest orders lead to, or None while they lead nowhere.
+    """Extrapolate the three finest observed orders.
 
-    Observed orders are off by c h + …: where two halvings of the step have each about halved what is
-    left, another halving is foreseen; where three stay away by many times their own changes, it is
-    another order.
+    Observed orders are off by c h + …: where two halvings of the step have each about halved the distance to
+    the declared order, the next halving is extrapolated; where three orders stay away from it by many
+    times their own changes, the method has another order.
+
+    Args:
+        last: the three finest orders, coarse to fine; fewer where there are not as many.
+        declared: the method's theoretical order.
+
+    Returns:
+        The order; None where the three allow no conclusion.
+
     """
     if len(last) < 3 or not np.all(np.isfinite(last)):
         return None
@@ -105,7 +134,7 @@ def extrapolated_order(last: Sequence[float], declared: int) -> float | None:
 
 @dataclass(frozen=True, eq=False)
 class ExtrapolatedLimit:
-    """The motion at step zero, as far as the ladder can tell."""
+    """The motion at step zero, extrapolated from all runs."""
 
     y: Array  # (T, N, width)
     uncertainty: Array  # (T,) running maximum over time, same unit
@@ -113,13 +142,24 @@ class ExtrapolatedLimit:
 
 
 def romberg(ys: Sequence[Array], powers: Sequence[int]) -> ExtrapolatedLimit:
-    """Extrapolate samples ``ys`` (coarse to fine, steps halving) with errors in h**powers.
+    """Extrapolate to step zero (Romberg), for errors with known powers of h.
 
-    Column m has the first m powers eliminated.  Its uncertainty is the larger of the distance to its row
-    before the last and to the column before: the errors of those, so an overestimate where the ladder
-    converges and the size of the noise where it does not (column 0, which has no column before,
-    takes the distance twice).  The column with the smallest one is the limit.  Rows that are not finite
-    are left out.
+    Column m of the scheme has the first m powers eliminated.  Its uncertainty is the larger of its distances
+    to its row before the last and to the column before: the errors of those, so an overestimate where the
+    study converges, and the size of the noise where it does not (column 0, which has no column before,
+    takes twice the first distance).  The column with the smallest uncertainty is the limit.
+
+    Args:
+        ys: (T, N, width) samples of each run, coarse to fine, steps halving; runs before the last one that is
+            not finite are left out.
+        powers: exponents of h in the error expansion, ascending.
+
+    Returns:
+        The limit.
+
+    Raises:
+        ValueError: fewer than two runs are finite.
+
     """
     finite = [k for k, y in enumerate(ys) if np.all(np.isfinite(y))]
     usable = list(ys[finite[0] :]) if finite and all(k in finite for k in range(finite[0], len(ys))) else []
@@ -137,11 +177,19 @@ def romberg(ys: Sequence[Array], powers: Sequence[int]) -> ExtrapolatedLimit:
 
 
 def _column_limit(column: Sequence[Array], m: int, before: Array) -> ExtrapolatedLimit:
-    """The last of a column, uncertain by its row before the last or by ``before``, whichever is farther."""
+    """The last row of a column; its uncertainty is its distance to the row before or to ``before``."""
     gaps = [np.max(np.linalg.norm(column[-1] - other, axis=-1), axis=1) for other in (column[-2], before)]
     return ExtrapolatedLimit(column[-1], np.maximum.accumulate(np.maximum(*gaps)), m)
 
 
 def tightest_tolerance_limit(ys: Sequence[Array]) -> ExtrapolatedLimit:
-    """The limit of an adaptive method's ladder: its tightest run, uncertain by the step before it."""
+    """Return the run with the tightest tolerance as the limit of a method with step control.
+
+    Args:
+        ys: (T, N, width) samples of each run, loose to tight.
+
+    Returns:
+        The tightest run; its uncertainty is the distance to the run before it.
+
+    """
     return _column_limit(ys, 0, ys[-2])

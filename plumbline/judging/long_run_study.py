@@ -78,7 +78,7 @@ def plan_long_run(integrator: Integrator, bodies: int, seconds: float) -> LongRu
     """Choose the affordable length and the resolutions of long runs.
 
     Args:
-        integrator: the integrator.
+        integrator: has fixed steps of an order, or a tolerance.
         bodies: number of bodies.
         seconds: requested length [s].
 

@@ -1,4 +1,7 @@
-"""State level: each engine's answer against the truth, per body, within the rounding bound."""
+"""State level: each engine's quantities against the truth, per body, within the rounding bound.
+
+The tolerance is `plumbline.truth.rounding_bound`; `MAX_RELATIVE_BOUND` limits how loose it may be.
+"""
 
 from __future__ import annotations
 
@@ -19,39 +22,44 @@ STATE_UNITS = {
     "angular_momentum": "kg m²/s",
     "mass_matrix": "kg m²",
 }
-TINY = float(np.finfo(float).tiny)  # an exact zero against a tolerance of zero is no error
+TINY = float(np.finfo(float).tiny)  # replaces a bound of zero, so that an error of zero has the ratio 0
 
 
 def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation) -> JudgingResult:
-    """Verdicts on every state quantity, worst over bodies and states."""
-    found = JudgingResult()
+    """Judge every state quantity of one engine, by the worst of all bodies and states.
+
+    Args:
+        context: scenario and engine.
+        truth: true quantities and rounding bounds at S states.
+        evaluation: the engine's quantities at the same states, or why there are none.
+
+    Returns:
+        One row per quantity, and per state the worst body (table "states").
+
+    """
     if evaluation.unsupported is not None:
-        found.rows.append(context.make_row("state", "-", "all", Verdict.UNSUPPORTED, evaluation.unsupported))
-        return found
+        row = context.make_row("state", "-", "all", Verdict.UNSUPPORTED, evaluation.unsupported)
+        return JudgingResult([row])
     if evaluation.failure is not None:
-        found.rows.append(context.make_row("state", "-", "all", Verdict.FAILED, evaluation.failure))
-        return found
+        return JudgingResult([context.make_row("state", "-", "all", Verdict.FAILED, evaluation.failure)])
+    result = JudgingResult()
     for quantity, unit in STATE_UNITS.items():
         if any(getattr(answer, quantity) is None for answer in evaluation.quantities):
             reason = f"{context.title} offers no {quantity.replace('_', ' ')} of its own"
-            found.rows.append(context.make_row("state", "-", quantity, Verdict.UNSUPPORTED, reason, unit))
+            result.rows.append(context.make_row("state", "-", quantity, Verdict.UNSUPPORTED, reason, unit))
             continue
-        worst = worst_error_per_state(quantity, truth, evaluation)
-        found.tables.append(
-            (
-                "states",
-                {"scenario": context.scenario, "engine": context.engine, "quantity": quantity, **worst},
-            )
-        )
-        found.rows.append(state_row(context, quantity, unit, worst, truth.method, evaluation.cpu_time))
-    return found
+        worst = _worst_error_per_state(quantity, truth, evaluation)
+        names = {"scenario": context.scenario, "engine": context.engine, "quantity": quantity}
+        result.tables.append(("states", names | worst))
+        result.rows.append(_quantity_row(context, quantity, unit, worst, truth.method, evaluation.cpu_time))
+    return result
 
 
-def worst_error_per_state(quantity: str, truth: StateTruth, evaluation: Evaluation) -> Columns:
-    """Per state (S,): the error, bound and scale of the body that comes nearest to its bound."""
-    answers = zip(evaluation.quantities, truth.quantities, strict=True)
-    differences = [getattr(answer, quantity) - getattr(true, quantity) for answer, true in answers]
-    error = error_norms(quantity, np.array(differences))
+def _worst_error_per_state(quantity: str, truth: StateTruth, evaluation: Evaluation) -> Columns:
+    """Per state (S,): error, bound and scale of the body with the largest ratio of error and bound."""
+    pairs = zip(evaluation.quantities, truth.quantities, strict=True)
+    differences = [getattr(answer, quantity) - getattr(true, quantity) for answer, true in pairs]
+    error = _error_norms(quantity, np.array(differences))
     bound = np.array([bound.tolerance(quantity) for bound in truth.bounds]).reshape(error.shape)
     scale = np.array([bound.scale[quantity] for bound in truth.bounds]).reshape(error.shape)
     state, body = np.arange(len(error)), np.argmax(error / np.maximum(bound, TINY), axis=1)
@@ -59,8 +67,8 @@ def worst_error_per_state(quantity: str, truth: StateTruth, evaluation: Evaluati
     return {"state": state, "body": body, "error": error[at], "bound": bound[at], "scale": scale[at]}
 
 
-def error_norms(quantity: str, difference: Array) -> Array:
-    """(S, N) Euclidean lengths per state and body; (S, 1) of scalars, momentum, the matrix's worst entry."""
+def _error_norms(quantity: str, difference: Array) -> Array:
+    """(S, N) Euclidean norms per state and body; (S, 1) of scalars, momentum, the matrix's worst entry."""
     count = len(difference)
     if quantity == "mass_matrix":
         return np.asarray(np.max(np.abs(difference.reshape(count, -1)), axis=1, keepdims=True))
@@ -68,44 +76,50 @@ def error_norms(quantity: str, difference: Array) -> Array:
     return np.asarray(np.linalg.norm(difference.reshape(count, -1, components), axis=-1))
 
 
-def state_row(context: RowContext, quantity: str, unit: str, found: Columns, method: str, cost: float) -> Row:
-    """The verdict on one quantity: its worst error over bound decides, a blunt bound decides nothing."""
-    error, bound, scale = found["error"], found["bound"], found["scale"]
-    ratios, there = error / np.maximum(bound, TINY), scale > 0
-    at = int(np.argmax(ratios))
-    relative = float(np.max(error[there] / scale[there], initial=0.0))
-    bluntness = float(np.median(bound[there] / scale[there])) if there.any() else 0.0
-    worst, allowed = float(error[at]), float(bound[at])
-    state, body = int(found["state"][at]), int(found["body"][at]) + 1
-    name, ratio, count = quantity.replace("_", " "), float(np.max(ratios)), len(ratios)
-    where = f"state {state}, body {body}"
-    common = {
-        "value": worst,
-        "tolerance": allowed,
-        "derivation": (
-            f"first-order rounding bound per body and state, {allowed:.2g} {unit} at {where}, "
-            f"{bluntness:.1g} of the scale in the median of {count} states; truth: {method}"
-        ),
-        "cpu_time": cost,
-        "ratio": ratio,
-        "extra": {
+def _quantity_row(
+    context: RowContext, quantity: str, unit: str, worst: Columns, method: str, cpu_time: float
+) -> Row:
+    """The row of one quantity: its worst ratio decides, unless the bound is too loose to detect an error."""
+    error, bound, scale = worst["error"], worst["bound"], worst["scale"]
+    ratios, has_scale = error / np.maximum(bound, TINY), scale > 0
+    at, ratio, count = int(np.argmax(ratios)), float(np.max(ratios)), len(ratios)
+    relative = float(np.max(error[has_scale] / scale[has_scale], initial=0.0))
+    looseness = float(np.median(bound[has_scale] / scale[has_scale])) if has_scale.any() else 0.0
+    state, body = int(worst["state"][at]), int(worst["body"][at]) + 1
+    name, where = quantity.replace("_", " "), f"state {state}, body {body}"
+    if ratio > 1:
+        verdict = Verdict.DISAGREES
+        reason = (
+            f"the {name} of {context.title} is off by {error[at]:.3g} {unit} at {where}, {ratio:.3g} times "
+            f"the rounding bound; {int(np.sum(ratios > 1))} of {count} states disagree"
+        )
+    elif ratio <= 1 and looseness <= MAX_RELATIVE_BOUND:
+        verdict = Verdict.AGREES
+        reason = f"{name} within {ratio:.2g} of the rounding bound at {count} states"
+    else:  # also where a bound is not a number
+        verdict = Verdict.UNRESOLVED
+        reason = (
+            f"inconclusive: the rounding bound is {looseness:.1g} of the quantity's scale "
+            f"(limit {MAX_RELATIVE_BOUND:g}), too loose to detect an error"
+        )
+    return context.make_row(
+        "state",
+        "-",
+        quantity,
+        verdict,
+        reason,
+        unit,
+        value=float(error[at]),
+        tolerance=float(bound[at]),
+        ratio=ratio,
+        derivation=f"first-order rounding bound per body and state, {bound[at]:.2g} {unit} at {where}, "
+        f"{looseness:.1g} of the scale in the median of {count} states; truth: {method}",
+        cpu_time=cpu_time,
+        extra={
             "relative": relative,
             "states": float(count),
-            "bound_relative": bluntness,
+            "bound_relative": looseness,
             "state": float(state),
             "body": float(body),
         },
-    }
-    if ratio > 1:
-        reason = (
-            f"{context.title}'s {name} is off by {worst:.3g} {unit} at {where}, {ratio:.3g} times the "
-            f"rounding bound; {int(np.sum(ratios > 1))} of {count} states disagree"
-        )
-        return context.make_row("state", "-", quantity, Verdict.DISAGREES, reason, unit, **common)
-    if not (
-        ratio <= 1 and bluntness <= MAX_RELATIVE_BOUND
-    ):  # a bound that is not a number decides nothing either
-        reason = f"blunt: the rounding bound is {bluntness:.1g} of the scale, above {MAX_RELATIVE_BOUND:g} or no number"
-        return context.make_row("state", "-", quantity, Verdict.UNRESOLVED, reason, unit, **common)
-    reason = f"{name} within {ratio:.2g} of the rounding bound at {count} states"
-    return context.make_row("state", "-", quantity, Verdict.AGREES, reason, unit, **common)
+    )

@@ -1,7 +1,7 @@
-"""The drift table: how far raw, Baumgarte and projected runs leave constraints and energy in 10, 100, 1000 s.
+"""Drift of constraints and energy over 10, 100 and 1000 s, for raw, Baumgarte and projected runs.
 
-A run to 1000 s costs a hundred times one to 10 s, which every run begins with; where that is more than may
-be spent, the later times are left out and the row says what they would have cost.
+A run to 10 s predicts the cost of longer ones (1000 s cost a hundred times as much).  Times that would cost
+too much are left out, and their rows give the predicted cost.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SCHEMA = pa.schema(
         ("variant", pa.string()),
         ("rtol", pa.float64()),
         ("time", pa.float64()),  # s, the errors are the largest over [0, time]
-        ("gap", pa.float64()),  # m; null, with a reason, where the run was not made or failed
+        ("gap", pa.float64()),  # m; null, with a reason, where the run was left out or failed
         ("gap_rate", pa.float64()),  # m/s
         ("norm", pa.float64()),  # |‖p‖ − 1|
         ("energy", pa.float64()),  # |E − E(0)| over Σ m g reach; null with loads or drag
@@ -45,21 +45,40 @@ def measure_drift(
     progress: Callable[[int, int, str], None] = lambda done, total, what: None,
     log: Callable[[str], None] = lambda sentence: None,
 ) -> pa.Table:
-    """One row per scenario, variant, rtol and time (columns as `SCHEMA`).
+    """Measure the drift of the reference's variants.
 
-    ``longest`` CPU seconds may be spent on one run; ``tell`` hears what each will cost.
+    Args:
+        selected_scenarios: what to run; each with every variant and tolerance.
+        max_cpu_seconds: most CPU time of one run [s].
+        rtols: relative tolerances of the integrator.
+        times: ends of the intervals to measure, ascending [s].
+        progress: called with runs done, runs in all and the current run.
+        log: called with the predicted cost of each long run.
+
+    Returns:
+        One row per scenario, variant, tolerance and time, with the columns of `SCHEMA`.
+
     """
-    asked = [(s, variant, rtol) for s in selected_scenarios for rtol in rtols for variant in VARIANTS]
+    planned = [(s, variant, rtol) for s in selected_scenarios for rtol in rtols for variant in VARIANTS]
     records: list[dict[str, Any]] = []
-    for done, (s, variant, rtol) in enumerate(asked):
-        progress(done, len(asked), f"{s.name}, {variant}, rtol {rtol:g}")
+    for done, (s, variant, rtol) in enumerate(planned):
+        progress(done, len(planned), f"{s.name}, {variant}, rtol {rtol:g}")
         records += _measure_variant(s, variant, rtol, max_cpu_seconds, times, log)
-    progress(len(asked), len(asked), "done")
+    progress(len(planned), len(planned), "done")
     return pa.Table.from_pylist([to_json_value(record) for record in records], schema=SCHEMA)
 
 
 def write(found: pa.Table, folder: Path) -> Path:
-    """Write `drift.parquet`; its path."""
+    """Write a drift table as Parquet.
+
+    Args:
+        found: the table that `measure_drift` returns.
+        folder: existing folder to write to.
+
+    Returns:
+        Path of the file, ``drift.parquet``.
+
+    """
     sink = pa.BufferOutputStream()
     pq.write_table(found, sink, compression="zstd")
     path = folder / "drift.parquet"
@@ -75,7 +94,7 @@ def _measure_variant(
     times: Sequence[float],
     log: Callable[[str], None],
 ) -> Iterator[dict[str, Any]]:
-    """The rows of one variant at one tolerance: first to the first time, then to the last affordable one."""
+    """The rows of one variant at one tolerance: runs to the first and to the last affordable time."""
     key = {"scenario": s.name, "variant": variant, "rtol": rtol}
     start = s.model, s.state.r, s.state.p, s.state.v, quaternion_rate(s.state.p, s.state.omega)
     within: Sequence[float] = times[:1]
@@ -84,15 +103,15 @@ def _measure_variant(
         began = process_time()
         found = drift_table(*start, rtols=(rtol,), times=within, variants=(variant,))
         spent = process_time() - began
-        foreseen = {time: spent * time / times[0] for time in times}
-        affordable = [time for time in times if foreseen[time] <= max_cpu_seconds] or times[:1]
+        predicted = {time: spent * time / times[0] for time in times}
+        affordable = [time for time in times if predicted[time] <= max_cpu_seconds] or times[:1]
         for time in times[len(affordable) :]:
             reasons[time] = (
-                f"left out: would cost {foreseen[time]:.0f} s, more than the {max_cpu_seconds:g} s allowed"
+                f"left out: would cost {predicted[time]:.0f} s, more than the {max_cpu_seconds:g} s allowed"
             )
         if len(affordable) > 1:
             what = f"{s.name}, {variant}, rtol {rtol:g}"
-            log(f"{what}: to {affordable[-1]:g} s, about {foreseen[affordable[-1]]:.0f} s of CPU time")
+            log(f"{what}: to {affordable[-1]:g} s, about {predicted[affordable[-1]]:.0f} s of CPU time")
             began, within = process_time(), affordable
             found = drift_table(*start, rtols=(rtol,), times=within, variants=(variant,))
             spent = process_time() - began

@@ -55,7 +55,12 @@ class Axis(SchemaModel):
     log_uniform: tuple[float, float] | None = None
 
     def grid_values(self) -> list[float] | None:
-        """Return the values of a grid axis, None for a distribution."""
+        """List the values of a grid axis.
+
+        Returns:
+            The values, in the field's unit; None for a distribution.
+
+        """
         if self.values is not None:
             return self.values
         if self.start is None or self.to is None or self.points is None:
@@ -81,7 +86,12 @@ class Axis(SchemaModel):
         return float(np.exp(rng.uniform(*np.log(self.log_uniform))))
 
     def validation_error(self) -> str:
-        """Return what is wrong with the axis as the end of a sentence, "" where nothing is."""
+        """Check the axis beyond its types.
+
+        Returns:
+            What is wrong, as the end of a sentence; "" where nothing is.
+
+        """
         ranged = [self.start, self.to, self.points]
         ways = [self.values, self.uniform, self.normal, self.log_uniform]
         given = sum(way is not None for way in ways) + any(x is not None for x in ranged)

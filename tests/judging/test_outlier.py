@@ -51,7 +51,7 @@ def test_one_engine_against_the_others_is_the_outlier(name):
     assert who.startswith(f"outlier: {name} in acceleration, angular acceleration")
     assert others == (
         ", ".join(sound := [e for e in ENGINES if e != name])[: -len(sound[-1]) - 2]
-        + f" and {sound[-1]} agree with the certified truth and, within both their bounds, with each other"
+        + f" and {sound[-1]} agree with the certified truth and, within the sum of their bounds, with each other"
     )
 
 
@@ -60,7 +60,7 @@ def test_two_are_both_named_and_a_quantity_alone_is_told():
     assert text.startswith("outliers: mujoco in ") and "; exudyn in " in text
     assert text.endswith(
         "; reference, pinocchio and exudyn-tree agree with the certified truth "
-        "and, within both their bounds, with each other"
+        "and, within the sum of their bounds, with each other"
     )
     text = describe_outliers(rows("pinocchio", defect="reaction-sign"))
     assert text.startswith("outlier: pinocchio in joint reaction; reference, mujoco and exudyn agree"), text
@@ -79,7 +79,7 @@ def test_a_truth_of_the_notes_own_may_be_the_one_that_is_wrong():
         replace(row, derivation=row.derivation.replace("truth: certified", "truth: the notes' system"))
         for row in rows(*others)
     ]
-    assert describe_outliers(uncertified).endswith("so that it may be the one that is wrong")
+    assert describe_outliers(uncertified).endswith("the truth is not certified: it may itself be wrong")
     uncertified = [
         replace(row, derivation=row.derivation.replace("truth: certified", "truth: the notes' system"))
         for row in rows("mujoco")

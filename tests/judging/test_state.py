@@ -48,7 +48,7 @@ def test_a_blunt_row_says_what_was_measured():
     ]
     row = judged((1, 1, 0.5), bounds=bounds).rows[0]
     assert (row.level, row.integrator, row.quantity, row.unit) == ("state", "-", "acceleration", "m/s²")
-    assert row.verdict == "unresolved" and row.reason.startswith("blunt: the rounding bound is ")
+    assert row.verdict == "unresolved" and row.reason.startswith("inconclusive: the rounding bound is ")
     assert row.tolerance == bounds[1].acceleration[1] and row.ratio == pytest.approx(0.5)
 
 
