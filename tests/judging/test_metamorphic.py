@@ -114,8 +114,8 @@ def test_a_defect_of_its_kind_breaks_it(relation):
             "plumbline.judging.metamorphic.load_adapter",
             lambda n, e=engine, d=defect: e if n == d.engine else load_adapter(n),
         ):
-            broken |= {defect.name: any(h.relation == relation and h.ratio > 1
-                                        for h in check_relations(defect.engine, model, states(model)))}  # fmt: skip
+            results = check_relations(defect.engine, model, states(model))
+        broken[defect.name] = any(r.relation == relation and r.ratio > 1 for r in results)
     assert any(broken.values()) and broken[BROKEN[relation][0].name], broken
 
 

@@ -51,7 +51,8 @@ def test_one_engine_against_the_others_is_the_outlier(name):
     assert who.startswith(f"outlier: {name} in acceleration, angular acceleration")
     assert others == (
         ", ".join(sound := [e for e in ENGINES if e != name])[: -len(sound[-1]) - 2]
-        + f" and {sound[-1]} agree with the certified truth and, within the sum of their bounds, with each other"
+        + f" and {sound[-1]} agree with the certified truth and, within the sum of their bounds, "
+        "with each other"
     )
 
 
