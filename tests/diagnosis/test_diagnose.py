@@ -9,19 +9,16 @@ import numpy as np
 import pytest
 
 from plumbline.diagnosis.defect_model import evaluate_case, make_defect_case
-from plumbline.diagnosis.diagnose import (
+from plumbline.diagnosis.diagnose import QUANTITIES, diagnose, diagnose_quantity, observe_difference
+from plumbline.diagnosis.fit import (
     MAX_EXPLAINED_RATIO,
-    QUANTITIES,
     FittedCause,
     ObservedDifference,
     derivatives_by_amount,
-    diagnose,
-    diagnose_quantity,
     find_explanations,
     fit_cause,
     fit_causes,
     max_error_ratio,
-    observe_difference,
     remaining_ratio,
 )
 from plumbline.diagnosis.hypotheses import all_causes

@@ -73,22 +73,22 @@ def test_relative_bounds_are_independent_of_units(rods, units):
 
 
 LOSES_DIGITS = "pinocchio-aba"  # on long chains and wide mass ratios, really: see the test after these
-HONEST = [name for name in ENGINES if name != LOSES_DIGITS]
+SOUND_ENGINES = [name for name in ENGINES if name != LOSES_DIGITS]
 
 
-@pytest.mark.parametrize("name", HONEST)
+@pytest.mark.parametrize("name", SOUND_ENGINES)
 def test_no_sound_engine_exceeds_the_bound(name):
-    honest(name, 40)
+    check_errors_within_bound(name, 40)
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("name", HONEST)
+@pytest.mark.parametrize("name", SOUND_ENGINES)
 def test_no_sound_engine_exceeds_the_bound_in_two_thousand_chains(name):
-    honest(name, 2000)
+    check_errors_within_bound(name, 2000)
 
 
-def honest(name, count):
-    """An engine's worst error over the tolerance stays below a half: there is room for worse luck."""
+def check_errors_within_bound(name, count):
+    """Check that the worst error of an engine stays below half of the tolerance, which leaves a margin."""
     pytest.importorskip("flint")
     from plumbline.truth.certified import certify_state
 
@@ -101,6 +101,9 @@ def honest(name, count):
     for _ in range(count):
         n, kind = int(rng.integers(1, 11)), rng.integers(4)
         rods = [0] * n if kind == 0 else [1] * n if kind == 1 else list(rng.integers(0, 2, n))
+        if name == "reference-printed":  # the notes print one and two bodies on rods
+            n = 1 + n % 2
+            rods = [1] * n
         model, state = random_chain(rng, rods, decades=rng.uniform(0, 3), rate=10 ** rng.uniform(-1, 1.3))
         try:
             said = engine.evaluate(model, [state])[0]
