@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+from plumbline.storage.results_store import write_atomically
 from reports.results import Record, Results
 from reports.verdicts import format_number, needs_attention
 
@@ -34,12 +34,7 @@ def write(results: Results) -> Path:
         totals = {k: v + counted[k] for k, v in totals.items()}
     suites.attrib |= {k: str(v) for k, v in totals.items()}
     path = results.folder / "junit.xml"
-    temporary = path.with_name(f".junit.{os.getpid()}.xml")
-    try:
-        ET.ElementTree(suites).write(temporary, encoding="utf-8", xml_declaration=True)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_atomically(path, ET.tostring(suites, encoding="utf-8", xml_declaration=True))
     return path
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import math
-import os
 import re
 import time
 from collections import Counter
@@ -16,6 +15,7 @@ from urllib.parse import urlencode
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from plumbline.storage.results_store import write_atomically
 from reports import fast_reference, payload
 from reports.history import History
 from reports.results import Record, Results
@@ -65,13 +65,8 @@ def write(results: Results, history: Path | None = None) -> Path:
 
 
 def write_page(path: Path, html: str) -> Path:
-    """Write a page under a temporary name, then rename it."""
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.html")
-    try:
-        temporary.write_text(html, encoding="utf-8")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    """Write a page whole or not at all."""
+    write_atomically(path, html.encode())
     return path
 
 

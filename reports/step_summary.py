@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
+from plumbline.storage.results_store import write_atomically
 from reports.results import Record, Results
 from reports.verdicts import (
     VERDICT_STYLES,
@@ -25,12 +25,7 @@ _MARKDOWN_SPECIAL = re.compile(r"[^0-9A-Za-z .,;:()/+%=\u0080-\uffff-]")
 def write(results: Results) -> Path:
     """Write summary.md beside the stored results; returns its path."""
     path = results.folder / "summary.md"
-    temporary = path.with_name(f".summary.{os.getpid()}.md")
-    try:
-        temporary.write_text(render(results), encoding="utf-8")
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_atomically(path, render(results).encode())
     return path
 
 

@@ -43,7 +43,12 @@ class RandomBatch:
         return [row for row in rows if row.engine in kept]
 
     def summary(self) -> dict[str, Any]:
-        """Return what results.json holds of the random scenarios."""
+        """Summarize the random scenarios for results.json.
+
+        Returns:
+            Their number, the counts by verdict and the worst ratio by engine and quantity.
+
+        """
         return {
             "scenarios": self.scenario_count,
             "counts_by_verdict": dict(self.counts_by_verdict),
@@ -55,7 +60,7 @@ class RandomBatch:
 
 
 def _needs_a_look(row: Row) -> bool:
-    """Whether a row is neither agreement nor a gap that is recorded; other recorded verdicts are shown too."""
+    """Whether a row is neither agreement nor a recorded gap; other recorded verdicts are shown too."""
     if row.verdict == Verdict.UNSUPPORTED:
         return not row.known_issue
     return row.verdict not in (Verdict.AGREES, Verdict.NOT_INSTALLED)

@@ -205,7 +205,7 @@ def save(result: RunResult, folder: Path, command: str) -> None:
     """Store a result.
 
     Args:
-        result: the result.
+        result: of `run_plan`.
         folder: output folder.
         command: the command line that made the result.
 
@@ -265,7 +265,7 @@ def exit_code(result: RunResult) -> int:
         result: the run.
 
     Returns:
-        3 where an engine failed unexpectedly; 1 for another unexpected verdict or a stale known issue; else 0.
+        3 where an engine failed unexpectedly; 1 for other unexpected verdicts or a stale known issue; else 0.
 
     """
     new = {row.verdict for row in result.rows if row.known_issue is None}
@@ -275,7 +275,12 @@ def exit_code(result: RunResult) -> int:
 
 
 def git_commit() -> str | None:
-    """Return the checkout's commit, with a + where files differ from it; None outside git."""
+    """Find the commit of the checkout.
+
+    Returns:
+        Its abbreviated hash or tag, with a + where files differ from it; None outside git.
+
+    """
     try:
         done = subprocess.run(
             ["git", "describe", "--always", "--dirty=+", "--abbrev=12"],

@@ -82,7 +82,7 @@ class ScenarioRun:
         self._states = Pickled.of([scenario.state, *drawn])  # argument of many tasks
 
     def tasks(self) -> Iterator[Task]:
-        """Make the tasks that need nothing first: the truths not known yet, and cells of all kinds but states.
+        """Make the tasks that can start: the truths that are missing, and all cells but those of states.
 
         Yields:
             The tasks. Those of states follow their truth, because the worker judges them.
@@ -120,7 +120,12 @@ class ScenarioRun:
         return not self._pending
 
     def findings(self) -> JudgingResult:
-        """Return the rows and tables of the scenario, in the order of the tasks, whichever finished first."""
+        """Collect what was found on the scenario.
+
+        Returns:
+            The rows and tables in the order of the tasks, whichever finished first.
+
+        """
         found = JudgingResult()
         for name, info in self._engines.items():
             if info.missing is not None:
@@ -134,10 +139,10 @@ class ScenarioRun:
         return found
 
     def on_outcome(self, outcome: Outcome) -> list[Task]:
-        """Take the outcome of one of the tasks: keep a truth, judge an answer or keep it until its truth comes.
+        """Take the outcome of a task: keep a truth; judge an answer, or keep it until its truth comes.
 
         Args:
-            outcome: the outcome.
+            outcome: of a task of this scenario.
 
         Returns:
             The tasks that follow from it.
@@ -171,7 +176,12 @@ class ScenarioRun:
         return following
 
     def summary(self) -> dict[str, Any]:
-        """Return what results.json holds of the scenario."""
+        """Describe the scenario for results.json.
+
+        Returns:
+            Its texts, model, initial state, and of its motion the truth and the horizon [s].
+
+        """
         s, truth = self.scenario, self.truths.get(TaskKind.MOTION_TRUTH)
         about = {
             "family": s.family,
@@ -197,7 +207,12 @@ class ScenarioRun:
         return about
 
     def truth_methods(self) -> list[str]:
-        """Return how each truth was computed, with its level."""
+        """Describe how each truth was computed.
+
+        Returns:
+            One phrase per level with a truth.
+
+        """
         levels = {TaskKind.STATE_TRUTH: "state", TaskKind.MOTION_TRUTH: "trajectory"}
         return [
             f"{levels[kind]} level: {truth.method}"

@@ -1,6 +1,6 @@
-"""The instrument's own test: mistakes planted in the engines must be reported, and named by their own term.
+"""The self-test: defects planted in the engines must be reported, and named by their own term.
 
-The tests of the checkout (`tests/execution/test_planted_defects.py`) run in a process of their own, which dies with this one.
+Runs `tests/execution/test_planted_defects.py` of the checkout in a process that dies with this one.
 """
 
 from __future__ import annotations
@@ -24,21 +24,31 @@ _CHILD_SCRIPT = (
 
 @dataclass(frozen=True)
 class SelfTestResult:
-    """What became of the planted mistakes; ``trouble`` is empty where all was as it must be."""
+    """What became of the planted defects."""
 
-    counts: dict[str, int] = field(default_factory=dict)  # planted, reported, named, false namings, …
-    failure: str = ""
+    counts: dict[str, int] = field(default_factory=dict)  # of planted, reported, named, … defects
+    failure: str = ""  # empty where every defect was reported and named as it must be
 
     @property
     def summary(self) -> str:
-        """The answer in words."""
+        """The result in a sentence."""
         if self.failure:
-            return f"the instrument's own test failed: {self.failure}"
-        return "the instrument's own test: " + ", ".join(f"{n} {what}" for what, n in self.counts.items())
+            return f"the self-test failed: {self.failure}"
+        return "self-test: " + ", ".join(f"{n} {what}" for what, n in self.counts.items())
 
 
 def run_self_test(report: Path, tests: str = TEST_FILE, timeout: float = TIMEOUT) -> SelfTestResult:
-    """Run the tests, their JUnit file written to ``report``."""
+    """Run the tests of the planted defects.
+
+    Args:
+        report: path of the JUnit file to write.
+        tests: test file, relative to the checkout.
+        timeout: limit of the wall time [s].
+
+    Returns:
+        The counts, or why they are not as they must be.
+
+    """
     arguments = ["-q", "-p", "no:cacheprovider", f"--rootdir={ROOT}", f"--junitxml={report}", tests]
     command = [sys.executable, "-c", _CHILD_SCRIPT, str(os.getpid()), *arguments]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
@@ -56,7 +66,19 @@ def run_self_test(report: Path, tests: str = TEST_FILE, timeout: float = TIMEOUT
 
 
 def read_junit_report(report: Path) -> SelfTestResult:
-    """The answer that a JUnit file gives."""
+    """Read the result of the self-test.
+
+    Args:
+        report: path of pytest's JUnit file.
+
+    Returns:
+        The counts, which the tests record as properties, and the tests that failed or were skipped.
+
+    Raises:
+        OSError: the file cannot be read.
+        ParseError: the file is not XML.
+
+    """
     cases = list(ET.parse(report).iter("testcase"))
     figures = {
         p.attrib["name"]: int(p.attrib["value"])

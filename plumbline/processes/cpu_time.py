@@ -70,7 +70,7 @@ class CpuTimes:
         """Wrap a result cache so that its work is counted as storage.
 
         Args:
-            result_cache: the cache.
+            result_cache: does the work of the returned one.
 
         Returns:
             A cache with the same content.
@@ -90,7 +90,12 @@ class CpuTimes:
         return TimedCache()
 
     def summary(self) -> str:
-        """Return the CPU times in words, with the harness's share over the engines' own time."""
+        """Describe the CPU times in words.
+
+        Returns:
+            The total, the seconds by kind, and the harness's time over the engines' own.
+
+        """
         total, engines = sum(self.seconds.values()), self.seconds["engines"]
         parts = ", ".join(f"{kind} {s:.1f}" for kind, s in self.seconds.items())
         if not engines:
@@ -98,11 +103,17 @@ class CpuTimes:
         calls = sum(self.seconds[kind] for kind in ("engines", "reference", "truth", "diagnosis"))
         return (
             f"CPU {total:.1f} s: {parts}; over the engines' own time: harness "
-            f"{100 * (total - calls) / engines:.0f} %, truth and reference {100 * (calls - engines) / engines:.0f} %"
+            f"{100 * (total - calls) / engines:.0f} %, truth and reference "
+            f"{100 * (calls - engines) / engines:.0f} %"
         )
 
 
 def cpu_time_spent() -> float:
-    """Return the CPU time [s] of this process and of its children that have ended."""
+    """Measure this process and its children that have ended.
+
+    Returns:
+        CPU time since the process began [s].
+
+    """
     times = os.times()  # in ticks of 10 ms: too coarse for this process's own time, taken in small parts
     return time.process_time() + times.children_user + times.children_system

@@ -64,7 +64,7 @@ class DaskCluster(Executor):
         """Hand a task to the cluster.
 
         Args:
-            task: the task.
+            task: the call, for any of the cluster's workers.
 
         """
         self._submit(task, 1)

@@ -1,8 +1,8 @@
 """Processes and folders that do not outlive their owner.
 
 A scratch folder holds a lock file that its owner keeps locked. The system unlocks it however the owner ends,
-so that the next owner can remove it; no clock and no process number decides, which another machine or container
-may use again.
+so that the next owner can remove it. Clocks and process numbers do not matter: another machine or container
+may use the same ones.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""Engines of other versions: a task's call made by a Python of another environment.
+"""Calls made by a Python of another environment, for other versions of engines.
 
-Inside a worker, `call` keeps one child per environment, ``python -m plumbline.processes.remote_python``,
-and talks to it through its standard input and output in frames: a length of 8 bytes, then a pickle. The
-child is in the worker's process group of fate: it dies with the worker, has its limits, and what kills
-it is told as if the worker had died of it.
+A worker keeps one child process per environment, ``python -m plumbline.processes.remote_python``, and
+exchanges frames with it through its standard input and output: a length of 8 bytes, then a pickle. The
+child is killed when its worker exits and has the worker's limits; a crash of the child is reported as a crash of the worker.
 """
 
 from __future__ import annotations
@@ -25,31 +24,30 @@ from typing import IO, Any
 from plumbline.processes.errors import PlumblineError
 
 ROOT = Path(__file__).resolve().parents[2]
-FRAME_LENGTH = struct.Struct("<Q")
+_FRAME_LENGTH = struct.Struct("<Q")
 
 
 class RemoteCrash(PlumblineError):
-    """The child ended before it answered; the message says how."""
+    """The child ended before it answered; the message says how it ended."""
 
 
 class RemoteError(PlumblineError):
-    """What was raised in the child: class and words, its own class may not exist here."""
+    """An exception of the child, as text: its class may not exist in this environment."""
 
 
-def send_frame(stream: IO[bytes], value: Any) -> None:
-    """One frame."""
+def _send_frame(stream: IO[bytes], value: Any) -> None:
     body = pickle.dumps(value, protocol=5)
-    stream.write(FRAME_LENGTH.pack(len(body)))
+    stream.write(_FRAME_LENGTH.pack(len(body)))
     stream.write(body)
     stream.flush()
 
 
-def receive_frame(stream: IO[bytes]) -> Any:
-    """One frame; EOFError where the other side has gone."""
-    head = stream.read(FRAME_LENGTH.size)
-    if len(head) < FRAME_LENGTH.size:
+def _receive_frame(stream: IO[bytes]) -> Any:
+    """Read one frame; raises EOFError where the other process has ended."""
+    head = stream.read(_FRAME_LENGTH.size)
+    if len(head) < _FRAME_LENGTH.size:
         raise EOFError
-    (size,) = FRAME_LENGTH.unpack(head)
+    (size,) = _FRAME_LENGTH.unpack(head)
     body = stream.read(size)
     if len(body) < size:
         raise EOFError
@@ -57,7 +55,7 @@ def receive_frame(stream: IO[bytes]) -> Any:
 
 
 @cache
-def child_process(python: str) -> subprocess.Popen[bytes]:
+def _child_process(python: str) -> subprocess.Popen[bytes]:
     """The child of this process for an environment's interpreter, started at first use."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
     process = subprocess.Popen(
@@ -70,14 +68,29 @@ def child_process(python: str) -> subprocess.Popen[bytes]:
 
 
 def call_remote(python: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """``function(*arguments)`` in the child; raises Elsewhere or Crashed."""
-    process = child_process(python)
+    """Call a function in the child process of another environment.
+
+    Args:
+        python: that environment's interpreter.
+        function: a function of a module that can be imported there.
+        arguments: its positional arguments, which can be pickled.
+
+    Returns:
+        The function's result.
+
+    Raises:
+        RemoteCrash: the child ended before it answered.
+        RemoteError: the function raised an exception.
+        MemoryError: the function ran out of memory.
+
+    """
+    process = _child_process(python)
     assert process.stdin is not None and process.stdout is not None
     try:
-        send_frame(process.stdin, (function.__module__, function.__qualname__, arguments))
-        raised, value = receive_frame(process.stdout)
+        _send_frame(process.stdin, (function.__module__, function.__qualname__, arguments))
+        raised, value = _receive_frame(process.stdout)
     except (EOFError, BrokenPipeError):
-        child_process.cache_clear()
+        _child_process.cache_clear()
         raise RemoteCrash(describe_exit(process.wait())) from None
     if raised:
         if value[0] == "MemoryError":
@@ -87,13 +100,30 @@ def call_remote(python: str, function: Callable[..., Any], *arguments: Any) -> A
 
 
 def call_timed(function: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
-    """``function(*arguments)``, and the CPU time in s that this process spent on it."""
+    """Call a function and measure the CPU time of this process.
+
+    Args:
+        function: any function.
+        arguments: its positional arguments.
+
+    Returns:
+        The function's result and the CPU time [s].
+
+    """
     begin = time.process_time()
     return function(*arguments), time.process_time() - begin
 
 
 def describe_exit(code: int) -> str:
-    """An exit code in words: the signal's name where one ended the process."""
+    """Describe how a process ended.
+
+    Args:
+        code: exit code; −n where signal n ended the process.
+
+    Returns:
+        A verb phrase, as "died of SIGSEGV" or "exited with code 7".
+
+    """
     if code < 0:
         try:
             return f"died of {signal.Signals(-code).name}"
@@ -102,8 +132,8 @@ def describe_exit(code: int) -> str:
     return f"exited with code {code}"
 
 
-def serve_calls(parent: int) -> None:
-    """The child's loop.  Engines print: the pipe moves away from descriptor 1 before any is loaded."""
+def _serve_calls(parent: int) -> None:
+    """Answer the calls of the parent.  Engines print: the pipe leaves descriptor 1 before any is loaded."""
     from plumbline.processes.isolation import die_with_parent
 
     die_with_parent(parent)
@@ -114,15 +144,15 @@ def serve_calls(parent: int) -> None:
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
     while True:
         try:
-            module, name, arguments = receive_frame(questions)
+            module, name, arguments = _receive_frame(questions)
         except EOFError:
             return
         try:
             answer = False, getattr(import_module(module), name)(*arguments)
         except Exception as error:
             answer = True, (type(error).__name__, str(error))
-        send_frame(answers, answer)
+        _send_frame(answers, answer)
 
 
 if __name__ == "__main__":
-    serve_calls(int(sys.argv[1]))
+    _serve_calls(int(sys.argv[1]))

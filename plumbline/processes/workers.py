@@ -1,8 +1,8 @@
 """Worker processes that can be killed, and the scheduler that hands tasks to them.
 
 Each worker runs in a scratch folder of its own, discards its output at the level of file descriptors (engines
-print from C++), uses one BLAS thread and a limited address space, and dies with its parent. A crash, a timeout
-or a lack of memory loses one task, whose outcome holds the reason.
+print from C++), uses one BLAS thread and a limited address space, and dies with its parent. A crash, a
+timeout or a lack of memory loses one task, whose outcome holds the reason.
 """
 
 from __future__ import annotations
@@ -54,7 +54,12 @@ class Pickled:
         return cls(pickle.dumps(value, protocol=5))
 
     def load(self) -> Any:
-        """Return a new copy of the value."""
+        """Load the pickle.
+
+        Returns:
+            A new copy of the value.
+
+        """
         return pickle.loads(self.data)
 
 
@@ -113,7 +118,7 @@ class ResultCache:
         """Look a task's answer up.
 
         Args:
-            task: the task.
+            task: the call to look up.
 
         Returns:
             Its outcome, or None where the task has to run.
@@ -125,8 +130,8 @@ class ResultCache:
         """Take note of an outcome.
 
         Args:
-            task: the task.
-            outcome: its outcome.
+            task: the call that was made.
+            outcome: its answer or failure.
 
         """
 
@@ -140,7 +145,7 @@ class Executor(ABC):
         """Return the executor."""
         return self
 
-    def __exit__(
+    def __exit__(  # noqa: B027 (nothing to drop by default)
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Drop what still runs."""
@@ -172,7 +177,7 @@ class Executor(ABC):
         """Run tasks without a cache.
 
         Args:
-            tasks: the tasks.
+            tasks: the calls to make, in this order.
 
         Yields:
             Outcomes in the order of completion.
@@ -189,7 +194,7 @@ class Scheduler:
 
         Args:
             executor: makes the calls.
-            result_cache: its answers are not computed again, and it gets every other outcome before the caller.
+            result_cache: its answers are not computed again; it gets every other outcome before the caller.
 
         """
         self._executor = executor
@@ -200,7 +205,7 @@ class Scheduler:
         """Add a task that arose from an outcome; it starts before those that `run` was given.
 
         Args:
-            task: the task.
+            task: the call to make.
 
         """
         self._submitted.append(task)
@@ -277,13 +282,13 @@ class WorkerPool(Executor):
         """Queue a task for the next idle worker.
 
         Args:
-            task: the task.
+            task: the call to make there.
 
         """
         self._tasks[self._pool.schedule(run_task, args=(task,))] = task
 
     def collect(self) -> list[tuple[Task, Outcome]]:
-        """Wait for the first task to finish, at most `_POLL_INTERVAL`, and cancel those over their time limit.
+        """Wait for a task to finish, at most `_POLL_INTERVAL`, and cancel those over their time limit.
 
         Returns:
             The finished tasks and their outcomes.
@@ -313,7 +318,7 @@ def run_task(task: Task) -> Outcome:
     """Make a task's call in this process, or in the environment that the task names.
 
     Args:
-        task: the task.
+        task: the call to make and to judge.
 
     Returns:
         The outcome; exceptions of the call are raised.

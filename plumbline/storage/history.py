@@ -147,8 +147,8 @@ class History:
 
         Returns:
             One record per night: its id, start and exit code, the number of rows, of those that agree
-            (``agree``), are unexpectedly bad (``bad``), or are as a known issue expects (``as_recorded``), and
-            the number of random scenarios.
+            (``agree``), are unexpectedly bad (``bad``), or are as a known issue expects (``as_recorded``),
+            and the number of random scenarios.
 
         """
         return self.query(

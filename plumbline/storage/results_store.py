@@ -1,6 +1,6 @@
-"""The output folder: results.json and Parquet tables, each written whole or not at all.
+"""The output folder of a run: results.json and Parquet tables, each written as a whole or not at all.
 
-Layout (`SCHEMA_VERSION` changes whenever a reader must): results.json, summary.parquet,
+Files (`SCHEMA_VERSION` changes whenever a reader has to): results.json, summary.parquet,
 states.parquet, convergence.parquet, curves.parquet, trajectories.parquet; see
 docs/results.md.
 """
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import os
 import tempfile
 from collections.abc import Iterable, Sequence
@@ -30,9 +29,7 @@ TEXT = pa.string()
 REAL = pa.float64()
 INTEGER = pa.int32()
 ROW_GROUP_SIZE = 8_192  # records encoded together: what waits is small
-MAX_WAITING_TABLES = (
-    32  # tables of a few records that wait apart: each is tens of kilobytes besides its records
-)
+MAX_WAITING_TABLES = 32  # small tables kept apart: each is tens of kilobytes besides its records
 
 
 def _schema(**columns: pa.DataType) -> pa.Schema:
@@ -45,8 +42,8 @@ TABLES: dict[str, pa.Schema] = {
     "summary": _schema(
         key=TEXT, scenario=TEXT, family=TEXT, engine=TEXT, engine_version=TEXT, level=TEXT, integrator=TEXT,
         quantity=TEXT, unit=TEXT, value=REAL, tolerance=REAL, verdict=TEXT, reason=TEXT, ratio=REAL,
-        derivation=TEXT, uncertainty=REAL, compared_until=REAL, order=REAL, declared_order=INTEGER, alias_of=TEXT,
-        known_issue=TEXT, diagnosis=TEXT, user_rtol=REAL, cpu_time=REAL, extra=TEXT,
+        derivation=TEXT, uncertainty=REAL, compared_until=REAL, order=REAL, declared_order=INTEGER,
+        alias_of=TEXT, known_issue=TEXT, diagnosis=TEXT, user_rtol=REAL, cpu_time=REAL, extra=TEXT,
     ),
     "states": _schema(
         **_CELL_COLUMNS, quantity=TEXT, state=INTEGER, body=INTEGER, error=REAL, bound=REAL, scale=REAL,
@@ -63,7 +60,16 @@ TABLES: dict[str, pa.Schema] = {
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write to a temporary name beside ``path``, flush to the disk, rename; the old file stays on failure."""
+    """Replace a file as a whole: write a temporary file beside it, flush it to the disk, rename it.
+
+    Args:
+        path: the file; its old content stays where writing fails.
+        data: its new content.
+
+    Raises:
+        OSError: the file cannot be written.
+
+    """
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:
@@ -73,13 +79,21 @@ def write_atomically(path: Path, data: bytes) -> None:
         os.chmod(temporary, 0o644)
         os.replace(temporary, path)
     except BaseException:
-        with contextlib.suppress(OSError):  # what stopped the writing may stop this too, and is what to tell
+        with contextlib.suppress(OSError):  # the first error is the one to report
             os.unlink(temporary)
         raise
 
 
 def to_json_value(value: Any) -> Any:
-    """JSON has no NaN or infinity: they become null, everywhere below ``value``."""
+    """Replace what JSON cannot hold: NaN and infinity become None.
+
+    Args:
+        value: numbers, texts, and lists and dictionaries of them.
+
+    Returns:
+        The same structure, tuples as lists, keys as texts.
+
+    """
     if isinstance(value, float) and not (-float("inf") < value < float("inf")):
         return None
     if isinstance(value, dict):
@@ -90,22 +104,37 @@ def to_json_value(value: Any) -> Any:
 
 
 def row_record(row: Row) -> dict[str, Any]:
-    """A row as results.json holds it."""
+    """Convert a row to its entry in results.json.
+
+    Args:
+        row: any judged row.
+
+    Returns:
+        The fields of `Row` and the row's ``key``.
+
+    """
     return {"key": row.key, **to_json_value(vars(row))}
 
 
 class ResultTables:
-    """The tables of a run, encoded as they come: ten thousand cells take a few megabytes.
+    """The tables of a run as Parquet files in memory; ten thousand cells take a few megabytes.
 
-    Parquet in zstd, floats split by byte, in row groups of `GROUP` records.
+    Compressed with zstd, floats split by byte, in row groups of `ROW_GROUP_SIZE` records.
     """
 
     def __init__(self) -> None:
+        """Start with empty tables."""
         self._waiting: dict[str, list[pa.Table]] = {}
         self._files: dict[str, tuple[pa.BufferOutputStream, pq.ParquetWriter]] = {}
 
     def add(self, name: str, columns: Columns) -> None:
-        """Take in records of the table ``name``."""
+        """Add records to a table.
+
+        Args:
+            name: a key of `TABLES`.
+            columns: every column of that table.
+
+        """
         schema = TABLES[name]
         count = next((len(c) for c in columns.values() if isinstance(c, list | np.ndarray)), 1)
         arrays = [
@@ -114,26 +143,27 @@ class ResultTables:
             else pa.repeat(pa.scalar(columns[field.name], field.type), count)
             for field in schema
         ]
+        self._append(name, pa.Table.from_arrays(arrays, schema=schema))
+
+    def add_rows(self, rows: Iterable[Row]) -> None:
+        """Add rows to the summary.
+
+        Args:
+            rows: any judged rows.
+
+        """
+        records = [row_record(row) for row in rows]
+        for record in records:
+            record["extra"] = json.dumps(record["extra"])
+        self._append("summary", pa.Table.from_pylist(records, schema=TABLES["summary"]))
+
+    def _append(self, name: str, table: pa.Table) -> None:
         waiting = self._waiting.setdefault(name, [])
-        waiting.append(pa.Table.from_arrays(arrays, schema=schema))
+        waiting.append(table)
         if sum(map(len, waiting)) >= ROW_GROUP_SIZE:
             self._encode(name)
         elif len(waiting) >= MAX_WAITING_TABLES:
             waiting[:] = [pa.concat_tables(waiting).combine_chunks()]
-
-    def add_rows(self, rows: Iterable[Row]) -> None:
-        """Take in rows for the summary."""
-        kept = list(rows)
-        if kept:
-            columns: Columns = {
-                name: [getattr(row, name) for row in kept] for name in ("key", *vars(kept[0]))
-            }
-            for field in TABLES["summary"]:
-                if field.type == REAL:
-                    column = columns[field.name]
-                    columns[field.name] = [x if x is not None and math.isfinite(x) else None for x in column]
-            columns["extra"] = [json.dumps(to_json_value(extra)) for extra in columns["extra"]]
-            self.add("summary", columns)
 
     def _encode(self, name: str) -> None:
         if name not in self._files:
@@ -149,7 +179,15 @@ class ResultTables:
         self._files[name][1].write_table(pa.concat_tables(self._waiting.pop(name, [])), ROW_GROUP_SIZE)
 
     def write_parquet(self, folder: Path) -> None:
-        """Write each as FOLDER/NAME.parquet; nothing can be added any more."""
+        """Write every table; nothing can be added afterwards.
+
+        Args:
+            folder: gets a file NAME.parquet per table.
+
+        Raises:
+            OSError: a file cannot be written.
+
+        """
         for name in TABLES:
             if name in self._waiting or name not in self._files:
                 self._waiting.setdefault(name, []).append(TABLES[name].empty_table())
@@ -186,7 +224,20 @@ def write_results(
     rows: Sequence[Row],
     tables: ResultTables,
 ) -> None:
-    """Write one run's results; the summary in ``tables`` holds ``rows`` and may hold more (of probes)."""
+    """Write the results of one run.
+
+    Args:
+        folder: output folder, made where it is missing.
+        run: metadata of the run.
+        scenarios: model, truth and description by scenario.
+        engines: description by engine.
+        rows: the rows of results.json.
+        tables: the Parquet tables, whose summary may have more rows than results.json (of random scenarios).
+
+    Raises:
+        OSError: a file cannot be written.
+
+    """
     folder.mkdir(parents=True, exist_ok=True)
     tables.write_parquet(folder)
     document = {
@@ -202,7 +253,19 @@ def write_results(
 
 
 def read_results(folder: Path) -> dict[str, Any]:
-    """The document of results.json; ValueError where it is not one of this schema."""
+    """Read results.json, of any readable schema version.
+
+    Args:
+        folder: output folder of a run.
+
+    Returns:
+        The document, with the names of the present schema version.
+
+    Raises:
+        ValueError: the file is missing, damaged or of another version.
+        OSError: the file cannot be read.
+
+    """
     path = folder / "results.json"
     try:
         document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))

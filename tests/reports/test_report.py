@@ -6,6 +6,7 @@ import base64
 import hashlib
 import html
 import json
+import os
 import re
 import shlex
 import shutil
@@ -313,7 +314,7 @@ def test_a_night_of_thousands_of_scenarios_stays_under_8_megabytes(out: Path, tm
 def test_a_page_above_its_budget_has_fewer_points(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     results = Results.load(out)
     whole = page.render(results, History())
-    monkeypatch.setattr(page, "BUDGET", len(whole.encode()) - 30_000)
+    monkeypatch.setattr(page, "MAX_PAGE_BYTES", len(whole.encode()) - 30_000)
     smaller = page.render(results, History())
     assert len(smaller.encode()) <= page.MAX_PAGE_BYTES
     few = chunks(smaller)["scenario-0"]["curves"]  # type: ignore[index,call-overload]
@@ -371,11 +372,11 @@ def test_a_report_that_cannot_be_written_leaves_the_old_one(
     copy = shutil.copytree(out, tmp_path / "copy")
     old = page.write(Results.load(copy)).read_bytes()
 
-    def full(self: Path, data: str, encoding: str) -> int:
-        self.write_bytes(data.encode(encoding)[:1000])
+    def full(descriptor: int) -> None:
+        os.ftruncate(descriptor, 1000)
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path, "write_text", full)
+    monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space"):
         page.write(Results.load(copy))
     assert (copy / "report.html").read_bytes() == old
