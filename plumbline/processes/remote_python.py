@@ -1,8 +1,9 @@
 """Calls made by a Python of another environment, for other versions of engines.
 
 A worker keeps one child process per environment, ``python -m plumbline.processes.remote_python``, and
-exchanges frames with it through its standard input and output: a length of 8 bytes, then a pickle. The
-child is killed when its worker exits and has the worker's limits; a crash of the child is reported as a crash of the worker.
+exchanges frames with it through its standard input and output: a length of 8 bytes, then a pickle. The child
+is killed when its worker exits and has the worker's limits; a crash of the child is reported as a crash of
+the worker.
 """
 
 from __future__ import annotations
