@@ -1,1 +1,1 @@
-"""One file per engine."""
+"""Adapters: one file per engine and formulation, registered in `plumbline.engines.registry`."""
