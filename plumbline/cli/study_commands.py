@@ -39,6 +39,7 @@ def sweep(file: Path, jobs: int, out: Path) -> None:
     """
     from plumbline.studies import sweep as sweeps
     from plumbline.studies import sweep_file
+    from plumbline.studies.tables import write_table
     from reports import sweep_page
 
     try:
@@ -49,7 +50,7 @@ def sweep(file: Path, jobs: int, out: Path) -> None:
     folder = ensure_writable(out)
     with exit_on_io_error():
         table = sweeps.run(spec, cells, jobs)
-        path = sweeps.write(table, folder)
+        path = write_table(table, folder / "sweep.parquet")
         page = sweep_page.write(folder)
     _print_sweep(table, len(cells))
     click.echo(f"results: {path}")
@@ -97,6 +98,7 @@ def drift(names: tuple[str, ...], rtols: tuple[float, ...], max_cpu_seconds: flo
     Writes drift.parquet, and report.html again where OUT holds results: the report shows the table.
     """
     from plumbline.studies import drift as drifts
+    from plumbline.studies.tables import write_table
 
     chosen = read_scenarios(names or ("tumbling-ball", "tumbling-rod"))
     folder = ensure_writable(out)
@@ -109,7 +111,7 @@ def drift(names: tuple[str, ...], rtols: tuple[float, ...], max_cpu_seconds: flo
                 progress=progress,
                 log=lambda sentence: click.echo(sentence, err=True),
             )
-        path = drifts.write(table, folder)
+        path = write_table(table, folder / "drift.parquet")
         print_table(table.to_pylist())
         click.echo(f"results: {path}")
         if (folder / "results.json").is_file():

@@ -7,16 +7,14 @@ too much are left out, and their rows give the predicted cost.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from pathlib import Path
 from time import process_time
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from plumbline.model.kinematics import quaternion_rate
 from plumbline.scenario.loader import Scenario
-from plumbline.storage.results_store import to_json_value, write_atomically
+from plumbline.studies.tables import make_table
 from reference_impl.stabilised import VARIANTS, drift_table
 
 TIMES = (10.0, 100.0, 1000.0)  # s
@@ -65,25 +63,7 @@ def measure_drift(
         progress(done, len(planned), f"{s.name}, {variant}, rtol {rtol:g}")
         records += _measure_variant(s, variant, rtol, max_cpu_seconds, times, log)
     progress(len(planned), len(planned), "done")
-    return pa.Table.from_pylist([to_json_value(record) for record in records], schema=SCHEMA)
-
-
-def write(found: pa.Table, folder: Path) -> Path:
-    """Write a drift table as Parquet.
-
-    Args:
-        found: the table that `measure_drift` returns.
-        folder: existing folder to write to.
-
-    Returns:
-        Path of the file, ``drift.parquet``.
-
-    """
-    sink = pa.BufferOutputStream()
-    pq.write_table(found, sink, compression="zstd")
-    path = folder / "drift.parquet"
-    write_atomically(path, sink.getvalue().to_pybytes())
-    return path
+    return make_table(records, SCHEMA)
 
 
 def _measure_variant(

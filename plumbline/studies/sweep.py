@@ -8,25 +8,23 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.calls import RefinementStudy, describe_engine, run_refinement
 from plumbline.judging.convergence import refinement_resolutions
-from plumbline.judging.rows import RowContext, Verdict
+from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.judging.trajectory import judge_trajectory
 from plumbline.model.datatypes import Integrator, Trajectory
 from plumbline.model.invariants import compute_invariants, position_error
 from plumbline.model.kinematics import quaternion_rate
 from plumbline.processes.workers import Task, WorkerPool
 from plumbline.scenario.loader import Scenario
-from plumbline.storage.results_store import to_json_value, write_atomically
 from plumbline.studies.sweep_file import Sweep, SweepCell
+from plumbline.studies.tables import make_table
 from plumbline.truth.ground_truth import MotionTruth, motion_truth
 from reference_impl import collocation
 
@@ -92,26 +90,7 @@ def run(sweep: Sweep, cells: Sequence[SweepCell], jobs: int = 1) -> pa.Table:
         [(name, COLUMNS.get(name, pa.float64())) for name in names],
         metadata={"sweep": sweep.model_dump_json(by_alias=True)},
     )
-    return pa.Table.from_pylist([to_json_value(record) for record in records], schema=schema)
-
-
-def write(table: pa.Table, folder: Path) -> Path:
-    """Write a sweep's table as Parquet.
-
-    Args:
-        table: the table that `run` returns.
-        folder: folder to write to; it is made where it does not exist.
-
-    Returns:
-        Path of the file, ``sweep.parquet``.
-
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    sink = pa.BufferOutputStream()
-    pq.write_table(table, sink, compression="zstd")
-    path = folder / "sweep.parquet"
-    write_atomically(path, sink.getvalue().to_pybytes())
-    return path
+    return make_table(records, schema)
 
 
 def _group_by_sampling(valid: Sequence[tuple[int, Scenario]]) -> Iterable[list[tuple[int, Scenario]]]:
@@ -180,35 +159,36 @@ def _measure_motion(scenario: Scenario, motion: Trajectory) -> Record:
 
 def _run_engines(workers: WorkerPool, sweep: Sweep, scenarios: dict[int, Scenario]) -> Iterator[Record]:
     """The engines' rows, in the order in which the workers finish them."""
+
+    def record(index: int, engine: str, verdict: Verdict, reason: str | None) -> Record:
+        names = {"cell": index, "implementation": engine, "integrator": sweep.engines[engine]}
+        return names | {"verdict": verdict, "reason": reason}
+
     engines = {engine: describe_engine(engine) for engine in sweep.engines}
     installed = {name: info for name, info in engines.items() if info.missing is None}
     for name in engines.keys() - installed.keys():
         for index in scenarios:
-            yield _engine_record(index, name, sweep) | {
-                "verdict": Verdict.NOT_INSTALLED,
-                "reason": engines[name].missing,
-            }
+            yield record(index, name, Verdict.NOT_INSTALLED, engines[name].missing)
     truths = _compute_truths(workers, scenarios if installed else {})
-    tasks = []
-    for name, info in installed.items():
-        integrator = _integrator(info, sweep.engines[name])
-        for index, s in scenarios.items():
-            steps = _resolutions(integrator, s, sweep.step)
-            arguments = (name, integrator.name, s.model, s.state, s.times, steps)
-            tasks.append(Task((index, name), run_refinement, arguments))
+    integrators = {name: _integrator(info, sweep.engines[name]) for name, info in installed.items()}
+    tasks = [
+        Task(
+            (index, name),
+            run_refinement,
+            (name, integrator.name, s.model, s.state, s.times, _resolutions(integrator, s, sweep.step)),
+        )
+        for name, integrator in integrators.items()
+        for index, s in scenarios.items()
+    ]
     for outcome in workers.run(tasks):
         index, name = outcome.key
-        integrator, truth = _integrator(installed[name], sweep.engines[name]), truths[index]
-        record = _engine_record(index, name, sweep)
+        truth = truths[index]
         if outcome.failure or isinstance(truth, str):
             reason = outcome.failure or f"no truth to judge by: {truth}"
-            yield record | {"verdict": Verdict.FAILED, "reason": reason}
-        else:
-            yield record | _judge_cell(installed[name], integrator, scenarios[index], outcome.value, truth)
-
-
-def _engine_record(index: int, engine: str, sweep: Sweep) -> Record:
-    return {"cell": index, "implementation": engine, "integrator": sweep.engines[engine]}
+            yield record(index, name, Verdict.FAILED, reason)
+            continue
+        row, errors = _judge_cell(installed[name], integrators[name], scenarios[index], outcome.value, truth)
+        yield record(index, name, row.verdict, row.reason) | errors
 
 
 def _integrator(info: EngineInfo, name: str) -> Integrator:
@@ -244,19 +224,20 @@ def _resolutions(integrator: Integrator, scenario: Scenario, step: float | None)
 
 def _judge_cell(
     info: EngineInfo, integrator: Integrator, scenario: Scenario, study: RefinementStudy, truth: MotionTruth
-) -> Record:
-    """The verdict that stands for all of a run's rows on this motion, and the errors behind it."""
+) -> tuple[Row, Record]:
+    """The row with the worst verdict of a run on this motion, and the columns of errors."""
     who = RowContext(scenario.name, scenario.family, info.name, info.title, info.version)
     rows = judge_trajectory(who, scenario.model, truth, integrator, study).rows
-    decisive = max(rows, key=lambda row: row.rank)
-    record: Record = {"verdict": decisive.verdict, "reason": decisive.reason}
     by_quantity = {row.quantity: row for row in rows}
+    errors: Record = {}
     for column, quantity, field in (
         ("position_error", "position_limit", "value"),
         ("attitude_error", "attitude", "value"),
         ("uncertainty", "position_limit", "uncertainty"),
         ("finest_error", "position", "value"),
     ):
-        record[column] = getattr(by_quantity.get(quantity), field, None)
+        errors[column] = getattr(by_quantity.get(quantity), field, None)
     finest = study.runs[-1].trajectory if study.runs else None
-    return record if finest is None else record | _measure_motion(scenario, finest)
+    if finest is not None:
+        errors |= _measure_motion(scenario, finest)
+    return max(rows, key=lambda row: row.rank), errors

@@ -16,6 +16,7 @@ from click.testing import CliRunner
 
 from plumbline.cli.main import main
 from plumbline.studies import drift, sweep
+from plumbline.studies.tables import write_table
 from reports import fast_reference, page, picture, sweep_page
 from reports.results import Results, replace_unprintable
 from tests.helpers import example_results as fixture
@@ -59,7 +60,7 @@ def sweep_rows() -> list[dict[str, Any]]:
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = fixture.build(tmp_path_factory.mktemp("pages") / "a run & more")
-    drift.write(pa.Table.from_pylist([*DRIFT, LEFT_OUT], schema=drift.SCHEMA), folder)
+    write_table(pa.Table.from_pylist([*DRIFT, LEFT_OUT], schema=drift.SCHEMA), folder / "drift.parquet")
     goals = [
         {"what": HOSTILE, "goal": 0.3, "measured": 0.12},
         {"what": NASTY, "goal": 4, "measured": 5.5},
@@ -76,7 +77,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
             "sweep": json.dumps({"scenario": HOSTILE, "count": 1, "seed": 0, "duration": None, "step": 0.1})
         },
     )
-    sweep.write(pa.Table.from_pylist(sweep_rows(), schema=schema), folder)
+    write_table(pa.Table.from_pylist(sweep_rows(), schema=schema), folder / "sweep.parquet")
     sweep_page.write(folder)
     return folder
 

@@ -21,6 +21,7 @@ from plumbline.judging.trajectory import judge_trajectory
 from plumbline.scenario import loader as scenarios
 from plumbline.scenario.errors import ScenarioError
 from plumbline.studies import sweep, sweep_file
+from plumbline.studies.tables import write_table
 from plumbline.truth.ground_truth import MotionTruth, motion_truth
 from tests.helpers import pendulums
 from tests.helpers.planted_defects import MOTION_DEFECTS, Defect, plant
@@ -70,7 +71,7 @@ def test_a_sweep_runs_and_is_kept(tmp_path: Path) -> None:
         write(tmp_path, FILE.replace("points: 3", "points: 2").replace("[-1, 1]", "[1]"))
     )
     table = sweep.run(spec, cells, jobs=1)
-    kept = pq.read_table(sweep.write(table, tmp_path / "out")).to_pylist()
+    kept = pq.read_table(write_table(table, tmp_path / "sweep.parquet")).to_pylist()
     assert len(kept) == 2 * len(cells)
     assert {(row["implementation"], row["verdict"]) for row in kept} == {
         ("reference", "agrees"),
@@ -116,8 +117,8 @@ def judged_by_run_and_sweep(defect: Defect) -> tuple[set[str], str]:
     run_steps = refinement_resolutions(method, s.model.n, s.duration)
     who = RowContext(s.name, s.family, "mujoco", "MuJoCo", "0")
     rows = judge_trajectory(who, s.model, truth, method, study(run_steps)).rows
-    own = sweep._judge_cell(info, method, s, study(sweep._resolutions(method, s, None)), truth)
-    return {row.verdict for row in rows}, own["verdict"]
+    own, _ = sweep._judge_cell(info, method, s, study(sweep._resolutions(method, s, None)), truth)
+    return {row.verdict for row in rows}, own.verdict
 
 
 @pytest.mark.parametrize("defect", MOTION_DEFECTS, ids=lambda defect: defect.name)
