@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import unicodedata
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from annotated_types import Len
@@ -44,7 +44,7 @@ ClosedForm = Literal[
 ]
 
 
-def invalid_value_error(message: str, valid: str, default_conflicts_with: str = "") -> PydanticCustomError:
+def _invalid_value_error(message: str, valid: str, default_conflicts_with: str = "") -> PydanticCustomError:
     """Make the validation error of a value.
 
     Args:
@@ -60,11 +60,11 @@ def invalid_value_error(message: str, valid: str, default_conflicts_with: str = 
     return PydanticCustomError("plumbline", "{message}", context)
 
 
-def _require_printable(value: str) -> str:
+def _require_printable(value: str | None) -> str | None:
     """Refuse control characters and code points that XML cannot hold; line breaks and tabs may stay."""
-    for char in value:
+    for char in value or "":
         if unicodedata.category(char) in ("Cc", "Cs", "Cn") and char not in "\n\t":
-            raise invalid_value_error(f"has the character U+{ord(char):04X}", "printable text")
+            raise _invalid_value_error(f"has the character U+{ord(char):04X}", "printable text")
     return value
 
 
@@ -83,24 +83,34 @@ def unit_vector(values: list[float]) -> Array:
     return np.asarray(vector / np.linalg.norm(vector))
 
 
-def _require_nonzero(values: list[float]) -> list[float]:
+def _require_nonzero(values: list[float] | None) -> list[float] | None:
     """Refuse the zero vector: it has no direction."""
-    if not any(values):
-        raise invalid_value_error("is all zeros, which has no direction", "at least one number other than 0")
+    if values is not None and not any(values):
+        raise _invalid_value_error("is all zeros, which has no direction", "at least one number other than 0")
     return values
+
+
+def _field(description: str, unit: str = "", default: Any = ..., **limits: Any) -> Any:
+    """Declare a field; required unless it has a default."""
+    return Field(
+        default, description=description, json_schema_extra={"unit": unit} if unit else None, **limits
+    )
 
 
 class SchemaModel(BaseModel):
     """Base of all parts of a scenario file: strict types, no unknown fields, no NaN or infinity."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+    alternatives: ClassVar[tuple[str, ...]] = ()  # fields of which exactly one must be given
 
-    def _require_exactly_one(self, *names: str) -> None:
-        """Refuse none or several of the alternatives."""
-        given = [name for name in names if getattr(self, name) is not None]
-        if len(given) != 1:
-            what = "gives none of " + ", ".join(names) if not given else "gives " + " and ".join(given)
-            raise invalid_value_error(what, "exactly one of " + ", ".join(names))
+    @model_validator(mode="after")
+    def _check_alternatives(self) -> Self:
+        given = [name for name in self.alternatives if getattr(self, name) is not None]
+        if self.alternatives and len(given) != 1:
+            names = ", ".join(self.alternatives)
+            what = "gives " + " and ".join(given) if given else f"gives none of {names}"
+            raise _invalid_value_error(what, f"exactly one of {names}")
+        return self
 
 
 Vector = Annotated[list[float], Len(3, 3)]
@@ -109,20 +119,12 @@ Vector = Annotated[list[float], Len(3, 3)]
 class AxisAngle(SchemaModel):
     """A rotation about an axis fixed in the world, right-handed."""
 
-    axis: Vector = Field(description="The axis, world frame; any length but 0.", examples=[[0, 1, 0]])
-    angle: float | None = Field(
-        None, description="The angle; or give `degrees`.", json_schema_extra={"unit": "rad"}
-    )
-    degrees: float | None = Field(
-        None, description="The angle; or give `angle`.", json_schema_extra={"unit": "°"}
-    )
+    alternatives = ("angle", "degrees")
+    axis: Vector = _field("The axis, world frame; any length but 0.", examples=[[0, 1, 0]])
+    angle: float | None = _field("The angle; or give `degrees`.", "rad", None)
+    degrees: float | None = _field("The angle; or give `angle`.", "°", None)
 
     _axis = field_validator("axis")(_require_nonzero)
-
-    @model_validator(mode="after")
-    def _check_alternatives(self) -> AxisAngle:
-        self._require_exactly_one("angle", "degrees")
-        return self
 
     @property
     def radians(self) -> float:
@@ -146,109 +148,73 @@ class AxisAngle(SchemaModel):
 class Euler(SchemaModel):
     """Three rotations about coordinate axes."""
 
-    convention: str = Field(
-        description="The order of the axes, and whether they turn with the body (`intrinsic`) or stay in the "
-        "world (`extrinsic`): `intrinsic zxz` is Euler's own, `intrinsic zyx` is yaw-pitch-roll.",
+    alternatives = ("angles", "degrees")
+    convention: str = _field(
+        "The order of the axes, and whether they turn with the body (`intrinsic`) or stay in the world "
+        "(`extrinsic`): `intrinsic zxz` is Euler's own, `intrinsic zyx` is yaw-pitch-roll.",
         pattern="^(intrinsic|extrinsic) (xyx|xyz|xzx|xzy|yxy|yxz|yzx|yzy|zxy|zxz|zyx|zyz)$",
         examples=["intrinsic zxz"],
     )
-    angles: Vector | None = Field(
-        None,
-        description="The angles in the order of the axes; or give `degrees`.",
-        json_schema_extra={"unit": "rad"},
-    )
-    degrees: Vector | None = Field(
-        None,
-        description="The angles in the order of the axes; or give `angles`.",
-        json_schema_extra={"unit": "°"},
-    )
-
-    @model_validator(mode="after")
-    def _check_alternatives(self) -> Euler:
-        self._require_exactly_one("angles", "degrees")
-        return self
+    angles: Vector | None = _field("The angles in the order of the axes; or give `degrees`.", "rad", None)
+    degrees: Vector | None = _field("The angles in the order of the axes; or give `angles`.", "°", None)
 
 
 class Attitude(SchemaModel):
     """An attitude: exactly one of the three."""
 
-    quaternion: Annotated[list[float], Len(4, 4)] | None = Field(
-        None,
-        description="Quaternion (w, x, y, z), scalar first, body → world. "
-        "Of any length but 0: it is normalised.",
+    alternatives = ("quaternion", "axis_angle", "euler")
+    quaternion: Annotated[list[float], Len(4, 4)] | None = _field(
+        "Quaternion (w, x, y, z), scalar first, body → world. Of any length but 0: it is normalised.",
+        default=None,
         examples=[[0.5, 0.5, 0.5, 0.5]],
     )
-    axis_angle: AxisAngle | None = Field(None, description="A rotation from the world's axes about one axis.")
-    euler: Euler | None = Field(None, description="Three rotations with a named convention.")
+    axis_angle: AxisAngle | None = _field("A rotation from the world's axes about one axis.", default=None)
+    euler: Euler | None = _field("Three rotations with a named convention.", default=None)
 
-    @field_validator("quaternion")
-    @classmethod
-    def _quaternion(cls, value: list[float] | None) -> list[float] | None:
-        return _require_nonzero(value) if value else value
-
-    @model_validator(mode="after")
-    def _check_alternatives(self) -> Attitude:
-        self._require_exactly_one("quaternion", "axis_angle", "euler")
-        return self
+    _quaternion = field_validator("quaternion")(_require_nonzero)
 
 
 class Inertia(SchemaModel):
     """Inertia about the centre of mass, body frame: exactly one of principal, six, matrix."""
 
-    principal: Vector | None = Field(
-        None, description="The three principal moments.", json_schema_extra={"unit": "kg m²"}
+    alternatives = ("principal", "six", "matrix")
+    principal: Vector | None = _field("The three principal moments.", "kg m²", None)
+    axes: Attitude | None = _field(
+        "With `principal`: the attitude of the principal axes in the body's frame (where `axis` and "
+        "`extrinsic` mean the body's axes). Absent: along the body's axes.",
+        default=None,
     )
-    axes: Attitude | None = Field(
-        None,
-        description="With `principal`: the attitude of the principal axes in the body's frame (where `axis` "
-        "and `extrinsic` mean the body's axes). Absent: along the body's axes.",
-    )
-    six: Annotated[list[float], Len(6, 6)] | None = Field(
-        None,
-        description="xx, yy, zz, xy, xz, yz of the matrix; off the diagonal with the matrix's own sign, "
+    six: Annotated[list[float], Len(6, 6)] | None = _field(
+        "xx, yy, zz, xy, xz, yz of the matrix; off the diagonal with the matrix's own sign, "
         "J_xy = −∫ x y dm.",
-        json_schema_extra={"unit": "kg m²"},
+        "kg m²",
+        None,
     )
-    matrix: Annotated[list[Vector], Len(3, 3)] | None = Field(
-        None, description="The symmetric 3 × 3 matrix.", json_schema_extra={"unit": "kg m²"}
-    )
+    matrix: Annotated[list[Vector], Len(3, 3)] | None = _field("The symmetric 3 × 3 matrix.", "kg m²", None)
 
-    @field_validator("principal")
+    @field_validator("principal", "six", "matrix")
     @classmethod
-    def _principal(cls, value: list[float] | None) -> list[float] | None:
+    def _check_physical(cls, value: list[Any] | None) -> list[Any] | None:
         if value:
-            _require_physical_inertia(np.diag(value))
-        return value
-
-    @field_validator("six")
-    @classmethod
-    def _six(cls, value: list[float] | None) -> list[float] | None:
-        if value:
-            _require_physical_inertia(_symmetric_matrix(value))
-        return value
-
-    @field_validator("matrix")
-    @classmethod
-    def _matrix(cls, value: list[list[float]] | None) -> list[list[float]] | None:
-        if value:
-            matrix = np.array(value)
+            matrix = _matrix_of(value)
             if np.any(np.abs(matrix - matrix.T) > INPUT_ROUNDING * np.max(np.abs(matrix))):
-                raise invalid_value_error("is not symmetric", "a matrix that equals its transpose")
+                raise _invalid_value_error("is not symmetric", "a matrix that equals its transpose")
             _require_physical_inertia((matrix + matrix.T) / 2)
         return value
 
     @model_validator(mode="after")
-    def _check_alternatives(self) -> Inertia:
-        self._require_exactly_one("principal", "six", "matrix")
+    def _check_axes(self) -> Inertia:
         if self.axes is not None and self.principal is None:
-            raise invalid_value_error("gives axes without principal", "axes beside principal only")
+            raise _invalid_value_error("gives axes without principal", "axes beside principal only")
         return self
 
 
-def _symmetric_matrix(six: list[float]) -> Array:
-    """Build the matrix of xx, yy, zz, xy, xz, yz."""
-    xx, yy, zz, xy, xz, yz = six
-    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+def _matrix_of(values: list[Any]) -> Array:
+    """Build the matrix of its diagonal, of (xx, yy, zz, xy, xz, yz), or of its rows."""
+    if len(values) == 6:
+        xx, yy, zz, xy, xz, yz = values
+        return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    return np.array(values) if isinstance(values[0], list) else np.diag(values)
 
 
 def _require_physical_inertia(matrix: Array) -> None:
@@ -259,11 +225,11 @@ def _require_physical_inertia(matrix: Array) -> None:
     values = np.linalg.eigvalsh(matrix)
     shown = ", ".join(f"{value:.6g}" for value in values)
     if values[0] <= INPUT_ROUNDING * values[2]:
-        raise invalid_value_error(
+        raise _invalid_value_error(
             f"has the principal moments {shown}, not all positive", "three positive principal moments"
         )
     if values[0] + values[1] < values[2] * (1 - INPUT_ROUNDING):
-        raise invalid_value_error(
+        raise _invalid_value_error(
             f"is not a physical inertia: its principal moments {shown} violate the triangle inequality",
             "principal moments of which none exceeds the sum of the other two",
         )
@@ -272,43 +238,42 @@ def _require_physical_inertia(matrix: Array) -> None:
 class Ball(SchemaModel):
     """A ball joint: the body's proximal point stays where it hangs."""
 
-    kind: Literal["ball"] = Field(description="`ball`.")
+    kind: Literal["ball"] = _field("`ball`.")
 
 
 class Rod(SchemaModel):
     """A massless rigid rod with a ball joint at both ends (the notes' own joint)."""
 
-    kind: Literal["rod"] = Field(description="`rod`.")
+    kind: Literal["rod"] = _field("`rod`.")
     length: float = Field(
         description="Length, greater than 0.", json_schema_extra={"unit": "m", "exclusiveMinimum": 0}
     )
-    direction: Vector = Field(
-        description="From where the rod hangs to the body's proximal point, world frame, at t = 0. Of any "
-        "length but 0: it is normalised.",
+    direction: Vector = _field(
+        "From where the rod hangs to the body's proximal point, world frame, at t = 0. Of any length but 0: "
+        "it is normalised.",
         examples=[[0, 0.6, -0.8]],
     )
-    rate: Vector | None = Field(
+    rate: Vector | None = _field(
+        "Rate of change of the (unit) direction at t = 0, world frame, perpendicular to it. Or give "
+        "`angular_velocity`; absent: 0.",
+        "1/s",
         None,
-        description="Rate of change of the (unit) direction at t = 0, world frame, perpendicular to it. "
-        "Or give `angular_velocity`; absent: 0.",
-        json_schema_extra={"unit": "1/s"},
     )
-    angular_velocity: Vector | None = Field(
+    angular_velocity: Vector | None = _field(
+        "Angular velocity w of the rod at t = 0, world frame: the rate is w × direction, so the part along "
+        "the rod has no effect. Or give `rate`.",
+        "rad/s",
         None,
-        description="Angular velocity w of the rod at t = 0, world frame: the rate is w × direction, so the "
-        "part along the rod has no effect. Or give `rate`.",
-        json_schema_extra={"unit": "rad/s"},
     )
 
     @field_validator("length")
     @classmethod
     def _length(cls, value: float) -> float:
         if value == 0:
-            raise invalid_value_error(
-                "is 0: a rod without length is a ball joint", "{kind: ball}, or a length above 0"
-            )
+            valid = "{kind: ball}, or a length above 0"
+            raise _invalid_value_error("is 0: a rod without length is a ball joint", valid)
         if value < 0:
-            raise invalid_value_error(f"is {value!r}, below 0", "a length above 0")
+            raise _invalid_value_error(f"is {value!r}, below 0", "a length above 0")
         return value
 
     _direction = field_validator("direction")(_require_nonzero)
@@ -319,80 +284,61 @@ class Rod(SchemaModel):
         if value and any(value) and "direction" in info.data:
             along = float(unit_vector(value) @ unit_vector(info.data["direction"]))
             if abs(along) > INPUT_ROUNDING:
-                raise invalid_value_error(
+                raise _invalid_value_error(
                     f"has a part along the direction, {along:.3g} of its length",
                     "a rate perpendicular to the direction, or `angular_velocity` instead",
                 )
         return value
 
     @model_validator(mode="after")
-    def _check_alternatives(self) -> Rod:
+    def _check_rates(self) -> Rod:
         if self.rate is not None and self.angular_velocity is not None:
-            raise invalid_value_error("gives rate and angular_velocity", "one of them")
+            raise _invalid_value_error("gives rate and angular_velocity", "one of them")
         return self
 
 
 class Load(SchemaModel):
     """Constant loads on a body."""
 
-    force: Vector = Field(
-        default=[0.0, 0.0, 0.0],
-        description="Force at the centre of mass, constant in the world frame.",
-        json_schema_extra={"unit": "N"},
-    )
-    moment: Vector = Field(
-        default=[0.0, 0.0, 0.0],
-        description="Moment, constant in the body's frame (the notes' n′): it turns with the body.",
-        json_schema_extra={"unit": "N m"},
+    force: Vector = _field("Force at the centre of mass, constant in the world frame.", "N", [0.0] * 3)
+    moment: Vector = _field(
+        "Moment, constant in the body's frame (the notes' n′): it turns with the body.", "N m", [0.0] * 3
     )
 
 
 class Drag(SchemaModel):
     """Linear drag on a body."""
 
-    force: float = Field(
-        default=0.0,
-        ge=0,
-        description="c_t ≥ 0: the force −c_t ṙ at the centre of mass.",
-        json_schema_extra={"unit": "N s/m"},
-    )
-    moment: float = Field(
-        default=0.0, ge=0, description="c_r ≥ 0: the moment −c_r ω′.", json_schema_extra={"unit": "N m s"}
-    )
+    force: float = _field("c_t ≥ 0: the force −c_t ṙ at the centre of mass.", "N s/m", 0.0, ge=0)
+    moment: float = _field("c_r ≥ 0: the moment −c_r ω′.", "N m s", 0.0, ge=0)
 
 
 class Body(SchemaModel):
     """One rigid body; it hangs from the body before it, the first from the pivot at the world's origin."""
 
-    name: str | None = Field(
+    name: str | None = _field(
+        "A name for readers; absent: its place in the chain.", default=None, max_length=80, examples=["bob"]
+    )
+    mass: float = _field("Mass, greater than 0.", "kg", gt=0)
+    inertia: Inertia = _field("Inertia about the centre of mass, body frame.")
+    joint: Annotated[Ball | Rod, Discriminator("kind")] = _field("How the body hangs.")
+    proximal: Vector = _field(
+        "The point of this body by which it hangs, body frame (the notes' s_1, s_3).", "m"
+    )
+    distal: Vector | None = _field(
+        "The point of this body from which the next one hangs, body frame (the notes' s_2). Needed where a "
+        "body follows.",
+        "m",
         None,
-        max_length=80,
-        description="A name for readers; absent: its place in the chain.",
-        examples=["bob"],
     )
-    mass: float = Field(gt=0, description="Mass, greater than 0.", json_schema_extra={"unit": "kg"})
-    inertia: Inertia = Field(description="Inertia about the centre of mass, body frame.")
-    joint: Annotated[Ball | Rod, Discriminator("kind")] = Field(description="How the body hangs.")
-    proximal: Vector = Field(
-        description="The point of this body by which it hangs, body frame (the notes' s_1, s_3).",
-        json_schema_extra={"unit": "m"},
-    )
-    distal: Vector | None = Field(
-        None,
-        description="The point of this body from which the next one hangs, body frame (the notes' s_2). "
-        "Needed where a body follows.",
-        json_schema_extra={"unit": "m"},
-    )
-    attitude: Attitude = Field(description="Attitude at t = 0, body → world.")
-    angular_velocity: Vector = Field(
-        [0.0, 0.0, 0.0],
-        description="Angular velocity at t = 0, body frame (the notes' ω′).",
-        json_schema_extra={"unit": "rad/s"},
+    attitude: Attitude = _field("Attitude at t = 0, body → world.")
+    angular_velocity: Vector = _field(
+        "Angular velocity at t = 0, body frame (the notes' ω′).", "rad/s", [0.0] * 3
     )
     load: Load = Field(default_factory=Load, description="Constant force and moment on this body.")
     drag: Drag = Field(default_factory=Drag, description="Linear drag on this body.")
 
-    _name = field_validator("name")(lambda value: _require_printable(value) if value else value)
+    _name = field_validator("name")(_require_printable)
 
 
 class BodySequence(SchemaModel):
@@ -402,18 +348,18 @@ class BodySequence(SchemaModel):
     rotation about its axis in the world; the angular velocity, being in the body's frame, goes along.
     """
 
-    repeat: int = Field(ge=1, le=MAX_BODIES, description="Number of bodies.")
-    cycle: list[Body] = Field(min_length=1, description="The bodies that are copied, one after the other.")
-    turn: AxisAngle | None = Field(
-        None, description="The rotation that body j is turned by, j times. Absent: none."
+    repeat: int = _field("Number of bodies.", ge=1, le=MAX_BODIES)
+    cycle: list[Body] = _field("The bodies that are copied, one after the other.", min_length=1)
+    turn: AxisAngle | None = _field(
+        "The rotation that body j is turned by, j times. Absent: none.", default=None
     )
 
 
 def _item_tag(value: Any) -> str:
-    is_sequence = (
-        "repeat" in value or "cycle" in value if isinstance(value, dict) else isinstance(value, BodySequence)
+    repeats = isinstance(value, BodySequence) or (
+        isinstance(value, dict) and ("repeat" in value or "cycle" in value)
     )
-    return "sequence" if is_sequence else "body"
+    return "sequence" if repeats else "body"
 
 
 ChainItem = Annotated[
@@ -424,60 +370,49 @@ ChainItem = Annotated[
 class Document(SchemaModel):
     """A scenario file: one open chain of rigid bodies, its initial state, its loads."""
 
-    schema_version: Literal[1] = Field(description="Version of this format: 1.")
-    name: str | None = Field(
-        None, min_length=1, max_length=80, description="The name in results; absent: the file's name."
+    schema_version: Literal[1] = _field("Version of this format: 1.")
+    name: str | None = _field(
+        "The name in results; absent: the file's name.", default=None, min_length=1, max_length=80
     )
-    family: str = Field(
-        "own",
+    family: str = _field(
+        "Group in reports and for `--family`.",
+        default="own",
         min_length=1,
         max_length=40,
-        description="Group in reports and for `--family`.",
         examples=["double"],
     )
-    title: str = Field(min_length=1, max_length=200, description="One line that describes the scenario.")
-    purpose: str = Field(
-        min_length=1, max_length=1000, description="Which mistakes this scenario reveals, in a sentence."
+    title: str = _field("One line that describes the scenario.", min_length=1, max_length=200)
+    purpose: str = _field(
+        "Which mistakes this scenario reveals, in a sentence.", min_length=1, max_length=1000
     )
-    exact: ClosedForm | None = Field(
-        None,
-        description="The closed-form solution that this scenario has, if any. `small-double` and "
-        "`small-chain` are asymptotic: their error shrinks with the square of the amplitude.",
+    exact: ClosedForm | None = _field(
+        "The closed-form solution that this scenario has, if any. `small-double` and `small-chain` are "
+        "asymptotic: their error shrinks with the square of the amplitude.",
+        default=None,
     )
-    duration: float = Field(
-        2.0,
-        gt=0,
-        description="Length of the motion that is compared; a whole number of samples.",
-        json_schema_extra={"unit": "s"},
+    duration: float = _field(
+        "Length of the motion that is compared; a whole number of samples.", "s", 2.0, gt=0
     )
-    sample: float = Field(
+    sample: float = _field(
+        "Time between compared samples. A binary fraction (1/32 = 0.03125) lets every step 1/2^k hit the "
+        "samples exactly.",
+        "s",
         0.03125,
         gt=0,
         validate_default=True,
-        description="Time between compared samples. A binary fraction (1/32 = 0.03125) lets every step "
-        "1/2^k hit the samples exactly.",
-        json_schema_extra={"unit": "s"},
     )
-    gravity: Vector = Field(
-        [0.0, 0.0, -9.81],
-        description="Acceleration of gravity, world frame.",
-        json_schema_extra={"unit": "m/s²"},
-    )
-    bodies: list[ChainItem] = Field(
-        min_length=1,
-        max_length=MAX_BODIES,
-        description="The chain, from the pivot outwards: single and repeated bodies.",
+    gravity: Vector = _field("Acceleration of gravity, world frame.", "m/s²", [0.0, 0.0, -9.81])
+    bodies: list[ChainItem] = _field(
+        "The chain, from the pivot outwards: single and repeated bodies.", min_length=1, max_length=MAX_BODIES
     )
 
-    _text = field_validator("name", "family", "title", "purpose")(
-        lambda value: _require_printable(value) if value else value
-    )
+    _text = field_validator("name", "family", "title", "purpose")(_require_printable)
 
     @field_validator("name", "family", "title")
     @classmethod
     def _one_line(cls, value: str | None) -> str | None:
         if value and (value != value.strip() or "\n" in value or "\t" in value):
-            raise invalid_value_error("has line breaks, tabs, or blanks at its ends", "one line of text")
+            raise _invalid_value_error("has line breaks, tabs, or blanks at its ends", "one line of text")
         return value
 
     @field_validator("sample")
@@ -487,10 +422,10 @@ class Document(SchemaModel):
         count = duration / value
         message = f"{duration:g} s are {count:.9g} samples of {value:g} s"
         if count > MAX_SAMPLES:
-            raise invalid_value_error(message, f"at most {MAX_SAMPLES} samples", "duration")
+            raise _invalid_value_error(message, f"at most {MAX_SAMPLES} samples", "duration")
         if abs(count - round(count)) > 1e-9 * count or round(count) < 1:
             valid = "a duration that is a whole number of samples"
-            raise invalid_value_error(message, valid, "duration")
+            raise _invalid_value_error(message, valid, "duration")
         return value
 
 
@@ -535,14 +470,8 @@ def inertia_matrix(inertia: Inertia) -> Array:
         (3, 3) about the centre of mass, body frame, exactly symmetric [kg m²].
 
     """
-    if inertia.six is not None:
-        return _symmetric_matrix(inertia.six)
-    if inertia.matrix is not None:
-        matrix = np.array(inertia.matrix)
-        return np.asarray((matrix + matrix.T) / 2)
-    assert inertia.principal is not None  # the model has exactly one
-    if inertia.axes is None:
-        return np.diag(inertia.principal)
-    axes = rotation_matrix(attitude_quaternion(inertia.axes))
-    matrix = axes @ np.diag(inertia.principal) @ axes.T
+    matrix = _matrix_of(inertia.principal or inertia.six or inertia.matrix or [])
+    if inertia.axes is not None:
+        axes = rotation_matrix(attitude_quaternion(inertia.axes))
+        matrix = axes @ matrix @ axes.T
     return np.asarray((matrix + matrix.T) / 2)

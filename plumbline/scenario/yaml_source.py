@@ -78,6 +78,18 @@ class YamlSource:
         """
         return ScenarioError([Problem(self.file, *at, "", message, valid, hint)])
 
+    def add_problem(self, at: Position, path: tuple[PathKey, ...], message: str, valid: str) -> None:
+        """Note a problem that does not stop the parsing.
+
+        Args:
+            at: line and column of the mistake.
+            path: the field.
+            message: what is wrong.
+            valid: what would be valid, a noun phrase.
+
+        """
+        self.problems.append(Problem(self.file, *at, dotted_path(path), message, valid))
+
 
 class _ParsingStopped(Exception):
     """Ends the parsing of a file; holds the message, what would be valid, and the mark."""
@@ -223,14 +235,8 @@ def _plain_data(source: YamlSource, node: Node, path: tuple[PathKey, ...], budge
             key_at = key_node.start_mark.line + 1, key_node.start_mark.column + 1
             if key in mapping:
                 first = source.key_positions[(*path, key)][0]
-                source.problems.append(
-                    Problem(
-                        source.file,
-                        *key_at,
-                        dotted_path((*path, key)),
-                        f"is given twice, first on line {first}",
-                        "each field once",
-                    )
+                source.add_problem(
+                    key_at, (*path, key), f"is given twice, first on line {first}", "each field once"
                 )
                 continue
             source.key_positions[(*path, key)] = key_at
@@ -257,9 +263,7 @@ def _scalar_value(source: YamlSource, node: Node, path: tuple[PathKey, ...], at:
     if kind == "null":
         return None
     if kind not in ("str", "timestamp", "value", "merge"):
-        source.problems.append(
-            Problem(source.file, *at, dotted_path(path), f"has the tag {shorten(str(node.tag))}", NO_TAG)
-        )
+        source.add_problem(at, path, f"has the tag {shorten(str(node.tag))}", NO_TAG)
     return written
 
 

@@ -5,9 +5,11 @@ from __future__ import annotations
 import os
 import pickle
 import time
+from functools import reduce
 from pathlib import Path
 
 import pytest
+from ruamel.yaml import YAML
 
 from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean
 from plumbline.scenario.loader import find_scenario_file, load_scenario, load_scenario_text, load_scenarios
@@ -23,353 +25,16 @@ bodies:
     proximal: [0, 0, 0.4]
     attitude: {quaternion: [1, 0, 0, 0]}
 """
-LENGTH, RATE, ATTITUDE = "length: 0.4", "rate: [1, 0, 0]", "{quaternion: [1, 0, 0, 0]}"
 PRINCIPAL = "{principal: [0.02, 0.03, 0.04]}"
-
-# what is replaced, by what, and the start of the one problem that must come of it
-CASES = {
-    "misspelt field": (
-        "mass:",
-        "mas:",
-        "5:5: bodies[0].mas: unknown field. did you mean 'mass'?; valid would be one of",
-    ),
-    "misspelt top field": ("title:", "titel:", "2:1: titel: unknown field. did you mean 'title'?"),
-    "missing field": (
-        "    proximal: [0, 0, 0.4]\n",
-        "",
-        "5:5: bodies[0].proximal: is missing; valid would be the point",
-    ),
-    "duplicate key": (
-        "mass: 1.5",
-        "mass: 1.5\n    mass: 2",
-        "6:5: bodies[0].mass: is given twice, first on line 5",
-    ),
-    "wrong type": (
-        "[0, 0, 0.4]",
-        "0.4",
-        "8:15: bodies[0].proximal: is the number 0.4; valid would be a list",
-    ),
-    "text for number": (
-        "1.5",
-        "heavy",
-        "5:11: bodies[0].mass: is the text 'heavy', not a number; valid would be a number in kg",
-    ),
-    "quoted number": ("1.5", "'1.5'", "5:11: bodies[0].mass: is the text '1.5', not a number"),
-    "word for number": ("1.5", "true", "5:11: bodies[0].mass: is the word true, not a number"),
-    "nothing for number": ("1.5", "", "5:5: bodies[0].mass: is empty, not a number"),
-    "unit typo": (
-        LENGTH,
-        "length: 0.4m",
-        "7:32: bodies[0].joint.length: is the text '0.4m': write the number alone, 0.4, without 'm'; "
-        "valid would be a number in m",
-    ),
-    "unit after a blank": (
-        "1.5",
-        "1.5 kg",
-        "5:11: bodies[0].mass: is the text '1.5 kg': write the number alone, 1.5,",
-    ),
-    "decimal comma": ("1.5", "1,5", "5:11: bodies[0].mass: is the text '1,5'"),
-    "negative mass": ("1.5", "-1.5", "5:11: bodies[0].mass: is -1.5; valid would be a number above 0"),
-    "zero mass": ("1.5", "0", "5:11: bodies[0].mass: is 0; valid would be a number above 0"),
-    "NaN": (
-        "0.4]",
-        ".nan]",
-        "8:22: bodies[0].proximal[2]: is nan, not a finite number; valid would be a number in m",
-    ),
-    "infinity": ("1.5", "-.inf", "5:11: bodies[0].mass: is -inf, not a finite number"),
-    "beyond double": ("1.5", "1e999", "5:11: bodies[0].mass: is inf, not a finite number"),
-    "overflow later": (
-        "[1, 0, 0]}\n    prox",
-        "[1e308, 0, 0]}\n    angular_velocity: [1e308, 1e308, 1e308]\n    prox",
-        "1:1: has numbers that make omega larger than 1e+30",
-    ),
-    "inertia not positive": (
-        "0.04]",
-        "0]",
-        "6:26: bodies[0].inertia.principal: has the principal moments 0, 0.02, 0.03, not all positive; valid",
-    ),
-    "inertia of no body": (
-        "0.04]",
-        "0.06]",
-        "6:26: bodies[0].inertia.principal: is not a physical inertia: its principal moments 0.02, ",
-    ),
-    "six of no body": (
-        PRINCIPAL,
-        "{six: [1, 1, 1, 0.9, 0, 0]}",
-        "6:20: bodies[0].inertia.six: is not a physical inertia",
-    ),
-    "matrix askew": (
-        PRINCIPAL,
-        "{matrix: [[1, 0.1, 0], [0, 1, 0], [0, 0, 1]]}",
-        "6:23: bodies[0].inertia.matrix: is not symmetric",
-    ),
-    "matrix too small": (
-        PRINCIPAL,
-        "{matrix: [[1, 0, 0], [0, 1, 0]]}",
-        "6:23: bodies[0].inertia.matrix: has 2 entries; valid would be exactly 3",
-    ),
-    "five numbers of six": (
-        PRINCIPAL,
-        "{six: [1, 1, 1, 0, 0]}",
-        "6:20: bodies[0].inertia.six: has 5 entries; valid would be exactly 6",
-    ),
-    "two inertias": (
-        "0.04]",
-        "0.04], six: [1, 1, 1, 0, 0, 0]",
-        "6:14: bodies[0].inertia: gives principal and six; valid would be exactly one",
-    ),
-    "no inertia": (PRINCIPAL, "{}", "6:14: bodies[0].inertia: gives none of principal, six, matrix"),
-    "axes of a matrix": (
-        PRINCIPAL,
-        "{six: [1, 1, 1, 0, 0, 0], axes: {quaternion: [1, 0, 0, 0]}}",
-        "6:14: bodies[0].inertia: gives axes without principal",
-    ),
-    "rod of length 0": (
-        LENGTH,
-        "length: 0",
-        "7:32: bodies[0].joint.length: is 0: a rod without length is a ball joint; valid would be {kind",
-    ),
-    "rod of negative length": (LENGTH, "length: -0.4", "7:32: bodies[0].joint.length: is -0.4, below 0"),
-    "rod without direction": (
-        ", direction: [0, 0.6, -0.8]",
-        "",
-        "7:12: bodies[0].joint.direction: is missing",
-    ),
-    "zero direction": (
-        "[0, 0.6, -0.8]",
-        "[0, 0, 0]",
-        "7:48: bodies[0].joint.direction: is all zeros, which has no direction",
-    ),
-    "rate along the rod": (
-        RATE,
-        "rate: [1, 0.001, 0]",
-        "7:70: bodies[0].joint.rate: has a part along the direction, 0.0006 of",
-    ),
-    "rate twice": (
-        RATE,
-        RATE + ", angular_velocity: [1, 0, 0]",
-        "7:12: bodies[0].joint: gives rate and angular_velocity",
-    ),
-    "rod's field at a ball": (
-        "{kind: rod, length: 0.4, direction: [0, 0.6, -0.8], rate: [1, 0, 0]}",
-        "{kind: ball, length: 0.4}",
-        "7:25: bodies[0].joint.length: unknown field; valid would be one of kind",
-    ),
-    "unknown joint": (
-        "kind: rod",
-        "kind: hinge",
-        "7:12: bodies[0].joint: has the kind 'hinge'; valid would be kind: ball or kind: rod",
-    ),
-    "joint without kind": (
-        "kind: rod",
-        "knd: rod",
-        "7:12: bodies[0].joint: has no kind ('knd' is not a field of it)",
-    ),
-    "zero quaternion": (
-        "[1, 0, 0, 0]}",
-        "[0, 0, 0, 0]}",
-        "9:28: bodies[0].attitude.quaternion: is all zeros",
-    ),
-    "three numbers of four": (
-        "[1, 0, 0, 0]}",
-        "[1, 0, 0]}",
-        "9:28: bodies[0].attitude.quaternion: has 3 entries; valid would be exactly 4",
-    ),
-    "zero axis": (
-        ATTITUDE,
-        "{axis_angle: {axis: [0, 0, 0], angle: 1}}",
-        "9:35: bodies[0].attitude.axis_angle.axis: is all zeros",
-    ),
-    "angle twice": (
-        ATTITUDE,
-        "{axis_angle: {axis: [0, 0, 1], angle: 1, degrees: 2}}",
-        "9:28: bodies[0].attitude.axis_angle: gives angle and degrees",
-    ),
-    "no angle": (
-        ATTITUDE,
-        "{axis_angle: {axis: [0, 0, 1]}}",
-        "9:28: bodies[0].attitude.axis_angle: gives none of angle, degrees",
-    ),
-    "unnamed convention": (
-        ATTITUDE,
-        "{euler: {convention: zxz, angles: [0, 0, 0]}}",
-        "9:36: bodies[0].attitude.euler.convention: is 'zxz'; valid would be intrinsic",
-    ),
-    "no convention": (
-        ATTITUDE,
-        "{euler: {angles: [0, 0, 0]}}",
-        "9:23: bodies[0].attitude.euler.convention: is missing",
-    ),
-    "impossible convention": (
-        ATTITUDE,
-        "{euler: {convention: intrinsic xxz, angles: [0, 0, 0]}}",
-        "9:36: bodies[0].attitude.euler.convention: is 'intr",
-    ),
-    "negative drag": (
-        "    proximal",
-        "    drag: {force: -1}\n    proximal",
-        "8:19: bodies[0].drag.force: is -1; valid would be a number at least 0",
-    ),
-    "distal missing": (
-        "bodies:\n",
-        "bodies:\n  - BARE\n",
-        "5:5: bodies[0].distal: is missing: a body follows",
-    ),
-    "run of no bodies": (
-        "bodies:\n",
-        "bodies:\n  - {repeat: 3, cycle: []}\n",
-        "5:24: bodies[0].cycle: has 0 entries; valid would be at least 1",
-    ),
-    "run too long": (
-        "bodies:\n",
-        "bodies:\n  - {repeat: 20001, cycle: [BODY]}\n",
-        "5:14: bodies[0].repeat: is 20001; valid would be a number at most 20000",
-    ),
-    "half a repeat": (
-        "bodies:\n",
-        "bodies:\n  - {repeat: 2.5, cycle: [BODY]}\n",
-        "5:14: bodies[0].repeat: is the number 2.5, not a whole number; valid would be a whole number",
-    ),
-    "no bodies": (
-        GOOD[GOOD.index("bodies") :],
-        "bodies: []\n",
-        "4:9: bodies: has 0 entries; valid would be at least 1",
-    ),
-    "bodies no list": (
-        GOOD[GOOD.index("bodies") :],
-        "bodies: 3\n",
-        "4:9: bodies: is the number 3; valid would be a list",
-    ),
-    "body no mapping": (
-        GOOD[GOOD.index("bodies") :],
-        "bodies: [3]\n",
-        "4:10: bodies[0]: is the number 3; valid would be a mapping",
-    ),
-    "unknown version": (
-        "version: 1",
-        "version: 2",
-        "1:17: schema_version: is 2; this version of Plumbline reads 1; valid would be 1",
-    ),
-    "version as text": (
-        "version: 1",
-        "version: one",
-        "1:17: schema_version: is 'one'; this version of Plumbline reads 1",
-    ),
-    "no version": ("schema_version: 1\n", "", "1:1: schema_version: is missing"),
-    "unknown exact solution": (
-        "bodies:",
-        "exact: planar\nbodies:",
-        "4:8: exact: is 'planar'. did you mean 'planar-pendulum'?",
-    ),
-    "duration not positive": (
-        "bodies:",
-        "duration: 0\nbodies:",
-        "4:11: duration: is 0; valid would be a number above 0",
-    ),
-    "sample does not divide": (
-        "bodies:",
-        "duration: 1\nsample: 0.3\nbodies:",
-        "5:9: sample: 1 s are 3.33333333 samples of 0.3 s; valid would be a duration that is a whole number",
-    ),
-    "duration is no multiple of the default sample": (
-        "bodies:",
-        "duration: 2.01\nbodies:",
-        "4:11: duration: 2.01 s are 64.32 samples of 0.03125 s; valid would be a duration that is",
-    ),
-    "duration below the default sample": (
-        "bodies:",
-        "duration: 1e-300\nbodies:",
-        "4:11: duration: 1e-300 s are 3.2e-299 samples of 0.03125 s; valid",
-    ),
-    "duration of too many default samples": (
-        "bodies:",
-        "duration: 1e9\nbodies:",
-        "4:11: duration: 1e+09 s are 3.2e+10 samples of 0.03125 s; valid would be at most 1000000 samples",
-    ),
-    "sample too fine": (
-        "bodies:",
-        "duration: 4\nsample: 0.000001\nbodies:",
-        "5:9: sample: 4 s are 4000000 samples of 1e-06 s; valid would be at most 1000000",
-    ),
-    "control character": (
-        "A pendulum",
-        '"A\\0 pendulum"',
-        "2:8: title: has the character U+0000; valid would be printable text",
-    ),
-    "not for XML": ("A pendulum", '"A\\uFFFF pendulum"', "2:8: title: has the character U+FFFF"),
-    "title of two lines": (
-        "A pendulum",
-        '"A\\npendulum"',
-        "2:8: title: has line breaks, tabs, or blanks at its ends",
-    ),
-    "title too long": ("A pendulum", "x" * 201, "2:8: title: has 201 characters; valid would be at most 200"),
-    "title a number": ("A pendulum", "12", "2:8: title: is the number 12; valid would be text"),
-    "object tag": (
-        "1.5",
-        "!!python/object/apply:os.system ['true']",
-        "5:11: bodies[0].mass: is a list, not a number",
-    ),
-    "own tag": (
-        "A pendulum",
-        "!kilo pendulum",
-        "2:8: title: has the tag !kilo; valid would be a plain value without a tag",
-    ),
-    "tag that lies": ("1.5", "!!float abc", "5:11: bodies[0].mass: is the text 'abc', not a number"),
-    "tab": (
-        "    proximal",
-        "\tproximal",
-        "8:1: found character '\\t' that cannot start any token; indent with blanks",
-    ),
-    "unclosed list": (
-        "0, 0.4]",
-        "0, 0.4",
-        "9:13: expected ',' or ']', but got ':'; a bracket [ is not closed",
-    ),
-    "colon in a text": (
-        "A case.",
-        "A case: the first.",
-        "3:16: mapping values are not allowed here; a colon inside a text needs quotes",
-    ),
-    "unclosed brace": ("0.04]}", "0.04]", "7:5: expected ',' or '}', but got '<scalar>'; a brace { is"),
-    "unclosed quote": ("A case.", "'A case.", "10:1: found unexpected end of stream; a quote is not closed"),
-    "line indented too little": (
-        "    proximal",
-        "   proximal",
-        "8:4: expected <block end>, but found '<block mapping start>'; the line is not indented like",
-    ),
-    "line without a colon": (
-        "    proximal: [0, 0, 0.4]",
-        "    proximal",
-        "9:5: could not find expected ':'; a colon is missing",
-    ),
-    "reserved character": (
-        "A case.",
-        "`a case`",
-        "3:10: found character '`' that cannot start any token; a text that starts with this character needs",
-    ),
-    "undefined alias": (
-        "1.5",
-        "*m",
-        "5:11: found undefined alias 'm'; a text that starts with * needs quotes",
-    ),
-    "two documents": (
-        GOOD,
-        GOOD + "---\n" + GOOD,
-        "10:1: but found another document; write one scenario per file",
-    ),
-    "empty": (GOOD, "", "1:1: is empty; valid would be a mapping that starts with schema_version: 1"),
-    "comments only": (GOOD, "# nothing\n", "1:1: is empty"),
-    "a list": (GOOD, "- 1\n", "1:1: is a list; valid would be a mapping that starts with schema_version: 1"),
-    "a sentence": (GOOD, "a pendulum\n", "1:1: is the text 'a pendulum'; valid would be a mapping"),
-    "too deep": ("1.5", "[" * 200_000, "5:19: is nested too deeply; valid would be at most 20 levels"),
-}
-
-
+CASES = YAML(typ="safe").load((Path(__file__).parent / "mistakes.yaml").read_text(encoding="utf-8"))
 BODY = (
     "{mass: 1, inertia: {principal: [1, 1, 1]}, joint: {kind: ball}, proximal: [0, 0, 1], distal: [0, 0, 0], "
     "attitude: {quaternion: [1, 0, 0, 0]}}"
 )
 BARE = BODY.replace("distal: [0, 0, 0], ", "")
+MARKS = {
+    "FILE": GOOD, "CHAIN": GOOD[GOOD.index("bodies") :], "BODY": BODY, "BARE": BARE, "DEEP": "[" * 200_000
+}  # fmt: skip
 
 
 def problems_of(text: str) -> list[str]:
@@ -385,9 +50,12 @@ def test_the_unspoilt_file_is_valid():
 @pytest.mark.timeout(20)
 @pytest.mark.parametrize("case", CASES)
 def test_one_mistake_gives_one_problem_at_its_place(case):
-    old, new, expected = CASES[case]
-    assert GOOD.count(old) >= 1
-    found = problems_of(GOOD.replace(old, new.replace("BODY", BODY).replace("BARE", BARE), 1))
+    old, new = (
+        reduce(lambda text, mark: text.replace(*mark), MARKS.items(), CASES[case][key])
+        for key in ("replace", "by")
+    )
+    assert old in GOOD
+    found, expected = problems_of(GOOD.replace(old, new, 1)), CASES[case]["problem"]
     assert [p.startswith(expected) for p in found] == [True], f"got {found}, expected {expected!r}"
 
 
@@ -395,7 +63,7 @@ def test_all_mistakes_of_a_file_come_at_once():
     text = (
         GOOD.replace("1.5", "-1")
         .replace("title", "headline")
-        .replace(LENGTH, "length: 0")
+        .replace("length: 0.4", "length: 0")
         .replace("0.04]", "9]")
     )
     places = [problem.split(": ")[:2] for problem in problems_of(text)]
