@@ -5,8 +5,11 @@ from __future__ import annotations
 import click
 
 from plumbline import __version__
-from plumbline.cli import result_commands, run_commands, scenario_commands, study_commands
 from plumbline.cli.options import EXIT_CODES
+from plumbline.cli.result_commands import history, report, reproduce
+from plumbline.cli.run_commands import nightly, run
+from plumbline.cli.scenario_commands import check, list_, schema
+from plumbline.cli.study_commands import drift, sweep
 from plumbline.scenario.errors import did_you_mean
 
 START = """
@@ -47,7 +50,7 @@ class SuggestingGroup(click.Group):
     cls=SuggestingGroup,
     epilog=START + EXIT_CODES,
     invoke_without_command=True,
-    context_settings={"help_option_names": ["-h", "--help"]},
+    context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
 )
 @click.version_option(__version__, prog_name="plumbline", message="%(prog)s %(version)s")
 @click.pass_context
@@ -57,16 +60,5 @@ def main(context: click.Context) -> None:
         click.echo(context.get_help())
 
 
-for command in (
-    scenario_commands.list_,
-    run_commands.run,
-    run_commands.nightly,
-    study_commands.sweep,
-    study_commands.drift,
-    result_commands.history,
-    result_commands.report,
-    scenario_commands.check,
-    scenario_commands.schema,
-    result_commands.reproduce,
-):
+for command in (list_, run, nightly, sweep, drift, history, report, check, schema, reproduce):
     main.add_command(command)

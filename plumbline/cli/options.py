@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 import os
 import sys
@@ -10,13 +9,13 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, ParamSpec
+from typing import Any
 
 import click
 
 from plumbline.engines import environments
 from plumbline.engines.registry import ENGINES
-from plumbline.processes.workers import ExecutorUnavailable, Limits
+from plumbline.processes.workers import ExecutorUnavailable
 from plumbline.scenario import loader as scenarios
 from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean
 from plumbline.scenario.yaml_source import read_yaml
@@ -37,9 +36,7 @@ Exit codes:
 An engine that is not installed is a verdict and changes no exit code.
 """
 
-_Parameters = ParamSpec("_Parameters")
-_Command = Callable[..., Any]
-_Decorator = Callable[[_Command], _Command]
+_Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
 class FiniteNumber(click.FloatRange):
@@ -110,40 +107,22 @@ def out_option(default: Path, note: str = "") -> _Decorator:
         The decorator of a command; it passes ``out``.
 
     """
-    return click.option(
-        "--out", type=FolderPath(), default=default, show_default=True, help=f"Output folder{note}."
-    )
+    return click.option("--out", type=FolderPath(), default=default, help=f"Output folder{note}.")
 
 
-def limits_options(timeout: float) -> _Decorator:
-    """Make the options ``--timeout`` and ``--memory``.
+def timeout_option(default: float) -> _Decorator:
+    """Make the option ``--timeout``.
 
     Args:
-        timeout: the default time limit of a task [s].
+        default: the time limit of a task where the option is not given [s].
 
     Returns:
-        The decorator of a command; it passes both as ``limits``.
+        The decorator of a command; it passes ``timeout``.
 
     """
-
-    def decorate(command: Callable[_Parameters, None]) -> _Command:
-        @click.option(
-            "--timeout",
-            type=FiniteNumber(MIN_TIMEOUT),
-            default=timeout,
-            show_default=True,
-            help="Seconds per task.",
-        )
-        @click.option(
-            "--memory", type=FiniteNumber(MIN_MEMORY), default=8.0, show_default=True, help="GB per worker."
-        )
-        @functools.wraps(command)
-        def with_limits(*args: Any, timeout: float, memory: float, **options: Any) -> None:
-            command(*args, **options, limits=Limits(timeout, memory))  # type: ignore[arg-type]
-
-        return with_limits  # fmt: skip
-
-    return decorate
+    return click.option(
+        "--timeout", type=FiniteNumber(MIN_TIMEOUT), default=default, help="Seconds per task."
+    )
 
 
 def _choose_engines(_: click.Context, __: click.Parameter, names: Sequence[str]) -> list[str]:
@@ -177,8 +156,9 @@ jobs_option = click.option(
 scheduler_option = click.option(
     "--scheduler", metavar="ADDRESS", help="A dask cluster to run on instead, as tcp://HOST:8786."
 )
-json_option = click.option(
-    "--json", "as_json", is_flag=True, help="Print JSON on stdout, for other programs."
+json_option = click.option("--json", "as_json", is_flag=True, help="JSON on stdout, for other programs.")
+memory_option = click.option(
+    "--memory", type=FiniteNumber(MIN_MEMORY), default=8.0, help="GB of address space per worker."
 )
 names_argument = click.argument("names", nargs=-1, metavar="[SCENARIO]...")
 

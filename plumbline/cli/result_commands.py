@@ -10,19 +10,19 @@ from typing import Any
 import click
 
 import reports
+from plumbline.cli import options
 from plumbline.cli.console import count_noun, make_console, print_table
-from plumbline.cli.options import DEFAULT_OUT, FolderPath, ensure_writable, examples, json_option
 from plumbline.storage.results_store import read_results
 from plumbline.storage.script_index import read_script_index
 
 
 @click.command(
     short_help="Compare stored nights.",
-    epilog=examples("history nightly", 'history nightly --key "double-*/mujoco/state/*"'),
+    epilog=options.examples("history nightly", 'history nightly --key "double-*/mujoco/state/*"'),
 )
-@click.argument("folder", default="nightly", type=FolderPath())
-@click.option("--key", "pattern", default=None, help="Trend of the rows whose key matches (* and ?).")
-@json_option
+@click.argument("folder", default="nightly", type=options.FolderPath())
+@click.option("--key", "pattern", help="Trend of the rows whose key matches (* and ?).")
+@options.json_option
 def history(folder: Path, pattern: str | None, as_json: bool) -> None:
     """Print verdict counts, first bad nights and changes since the last green one of the nights in FOLDER."""
     from plumbline.storage.history import History
@@ -57,12 +57,11 @@ def _history_lines(document: dict[str, Any]) -> list[str]:
 
 
 @click.command(short_help="Write the report of stored results again.")
-@click.argument("folder", default=DEFAULT_OUT, type=FolderPath())
+@click.argument("folder", default=options.DEFAULT_OUT, type=options.FolderPath())
 @click.option(
     "--history",
     "history_folder",
     type=click.Path(path_type=Path, exists=True, file_okay=False),
-    default=None,
     help="Folder of earlier nights: adds trends and the comparison with the last green one.",
 )
 def report(folder: Path, history_folder: Path | None) -> None:
@@ -72,12 +71,12 @@ def report(folder: Path, history_folder: Path | None) -> None:
         read_script_index(folder)
     except ValueError as error:
         raise click.UsageError(str(error)) from None
-    click.echo(f"report: {reports.write(ensure_writable(folder), history_folder)}")
+    click.echo(f"report: {reports.write(options.ensure_writable(folder), history_folder)}")
 
 
 @click.command(
     short_help="Write a stand-alone script of a disagreement.",
-    epilog=examples(
+    epilog=options.examples(
         "reproduce reports/out", "reproduce reports/out chain-50-balls/pinocchio-aba/state/-/acceleration"
     ),
 )

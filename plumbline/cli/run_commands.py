@@ -11,24 +11,8 @@ from typing import Any
 import click
 
 import reports
+from plumbline.cli import options
 from plumbline.cli.console import ProgressDisplay, print_result
-from plumbline.cli.options import (
-    DEFAULT_OUT,
-    EXIT_CODES,
-    MIN_USER_RTOL,
-    FiniteNumber,
-    choose_scenarios,
-    engines_option,
-    ensure_writable,
-    examples,
-    exit_on_io_error,
-    jobs_option,
-    json_option,
-    limits_options,
-    names_argument,
-    out_option,
-    scheduler_option,
-)
 from plumbline.engines.registry import ENGINES
 from plumbline.execution.plan import Plan
 from plumbline.execution.result_cache import DiskResultCache
@@ -40,57 +24,57 @@ from plumbline.storage.results_store import row_record, to_json_value
 
 @click.command(
     short_help="Compare scenarios on engines.",
-    epilog=examples(
+    epilog=options.examples(
         "run                                    (everything)",
         "run double-tumbling-balls --engine mujoco",
         "run --family chain --level state",
         "run my-pendulum.yaml --out results --json | jq .sentence",
     )
-    + EXIT_CODES,
+    + options.EXIT_CODES,
 )
-@names_argument
+@options.names_argument
 @click.option("--family", "families", multiple=True, help="Only scenarios of this family (may be repeated).")
-@engines_option
+@options.engines_option
 @click.option(
     "--level",
     type=click.Choice(["state", "trajectory", "all"]),
     default="all",
-    show_default=True,
     help="state: accelerations, reactions and energies at 51 states. trajectory: observed orders, limits and "
     "invariants. all: both, and the metamorphic relations.",
 )
-@jobs_option
-@scheduler_option
-@out_option(DEFAULT_OUT)
-@json_option
+@options.jobs_option
+@options.scheduler_option
+@options.out_option(options.DEFAULT_OUT)
+@options.json_option
 @click.option(
     "--user-rtol",
-    type=FiniteNumber(MIN_USER_RTOL, 1.0),
-    default=None,
+    type=options.FiniteNumber(options.MIN_USER_RTOL, 1.0),
     help="A relative tolerance of your own; results and report show it beside each derived verdict, which it "
     "does not change.",
 )
-@limits_options(300.0)
+@options.timeout_option(300.0)
+@options.memory_option
 def run(
     names: tuple[str, ...], families: tuple[str, ...], engines: list[str], level: Any, jobs: int,
-    scheduler: str | None, out: Path, as_json: bool, user_rtol: float | None, limits: Limits,
+    scheduler: str | None, out: Path, as_json: bool, user_rtol: float | None, timeout: float,
+    memory: float,
 ) -> None:  # fmt: skip
     """Compare scenarios (names of the catalogue, or paths of YAML files; default: all) on all engines."""
-    chosen = choose_scenarios(names, families)
-    folder = ensure_writable(out)
+    chosen = options.choose_scenarios(names, families)
+    folder = options.ensure_writable(out)
     cache = DiskResultCache(folder / "cells", _log)
     plan = Plan(
         chosen,
         engines,
         level,
         jobs,
-        limits,
+        Limits(timeout, memory),
         user_rtol=user_rtol,
         is_full_catalogue=not names and not families and engines == list(ENGINES) and level == "all",
         result_cache=cache,
         scheduler=scheduler,
     )
-    with exit_on_io_error():
+    with options.exit_on_io_error():
         with ProgressDisplay(sys.stderr) as progress:
             result = run_plan(plan, progress)
         save(result, folder, _command_line())
@@ -110,56 +94,49 @@ def run(
 
 @click.command(
     short_help="Run everything unattended and keep the history.",
-    epilog=examples(
+    epilog=options.examples(
         "nightly                               (everything)",
         "nightly --random 1000 --seed 7 --out nights",
         "history nightly",
     )
-    + EXIT_CODES,
+    + options.EXIT_CODES,
 )
-@names_argument
-@engines_option
+@options.names_argument
+@options.engines_option
 @click.option(
-    "--random",
-    "random_count",
-    type=click.IntRange(0),
-    default=200,
-    show_default=True,
-    help="Number of random scenarios.",
+    "--random", "random_count", type=click.IntRange(0), default=200, help="Number of random scenarios."
 )
 @click.option(
     "--seed",
     type=click.IntRange(0),
-    default=None,
     help="Seed of the random scenarios. Default: random; printed and stored in results.json.",
 )
 @click.option(
     "--extra-refinements",
     type=click.IntRange(0, 4),
     default=1,
-    show_default=True,
     help="Halvings of the step beyond those of `run`.",
 )
 @click.option(
     "--long-run-seconds",
-    type=FiniteNumber(0),
+    type=options.FiniteNumber(0),
     default=100.0,
-    show_default=True,
     help="Simulated seconds of the long runs whose invariants are judged; 0: no long runs.",
 )
 @click.option(
     "--self-test/--no-self-test",
     default=True,
-    show_default=True,
     help="Plant mistakes in an engine and require that the run reports and names them.",
 )
-@jobs_option
-@scheduler_option
-@out_option(Path("nightly"), "; complete nights are in its folder `history`")
-@limits_options(1800.0)
+@options.jobs_option
+@options.scheduler_option
+@options.out_option(Path("nightly"), "; complete nights are in its folder `history`")
+@options.timeout_option(1800.0)
+@options.memory_option
 def nightly(
     names: tuple[str, ...], engines: list[str], random_count: int, seed: int | None, extra_refinements: int,
-    long_run_seconds: float, self_test: bool, jobs: int, scheduler: str | None, out: Path, limits: Limits,
+    long_run_seconds: float, self_test: bool, jobs: int, scheduler: str | None, out: Path, timeout: float,
+    memory: float,
 ) -> None:  # fmt: skip
     """Run the catalogue with finer steps, long runs, random scenarios and the self-test.
 
@@ -169,13 +146,14 @@ def nightly(
     from plumbline.cli.nightly import run_nightly
     from plumbline.execution.selftest import run_self_test
 
-    chosen = choose_scenarios(names, ())
-    folder = ensure_writable(out)
-    with exit_on_io_error(), ProgressDisplay(sys.stderr) as progress:
+    chosen = options.choose_scenarios(names, ())
+    folder = options.ensure_writable(out)
+    with options.exit_on_io_error(), ProgressDisplay(sys.stderr) as progress:
         result, place = run_nightly(
-            folder, chosen, engines, random_count=random_count, seed=seed, jobs=jobs, limits=limits,
-            is_full_catalogue=not names and engines == list(ENGINES), extra_refinements=extra_refinements, progress=progress,
-            long_run_seconds=long_run_seconds, scheduler=scheduler, self_test=run_self_test if self_test else None,
+            folder, chosen, engines, random_count=random_count, seed=seed, jobs=jobs,
+            limits=Limits(timeout, memory), is_full_catalogue=not names and engines == list(ENGINES),
+            extra_refinements=extra_refinements, long_run_seconds=long_run_seconds, scheduler=scheduler,
+            self_test=run_self_test if self_test else None, progress=progress,
             command=_command_line(), log=_log,
         )  # fmt: skip
     _finish(result, place / "report.html", as_json=False)

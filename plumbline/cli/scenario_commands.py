@@ -8,8 +8,8 @@ from typing import Any
 
 import click
 
+from plumbline.cli import options
 from plumbline.cli.console import count_noun, print_table
-from plumbline.cli.options import json_option, read_scenarios
 from plumbline.engines.registry import ENGINES
 from plumbline.execution.runner import describe_engines
 from plumbline.processes.workers import WorkerPool
@@ -20,7 +20,7 @@ JSON_ONLY = ("purpose", "file")  # columns too long for a terminal
 
 @click.command("list", short_help="List scenarios or engines.")
 @click.argument("what", type=click.Choice(["scenarios", "engines"]))
-@json_option
+@options.json_option
 def list_(what: str, as_json: bool) -> None:
     """List the scenarios of the catalogue, or the engines with their versions and integrators."""
     records = _scenario_records() if what == "scenarios" else _engine_records()
@@ -62,7 +62,7 @@ def _engine_records() -> list[dict[str, Any]]:
 @click.argument("files", nargs=-1, required=True, metavar="FILE...", type=click.Path(path_type=Path))
 def check(files: tuple[Path, ...]) -> None:
     """Check scenario files and print every problem of every file, as file:line:column."""
-    for s in read_scenarios(files):
+    for s in options.read_scenarios(files):
         joints = ", ".join("rod" if rod else "ball" for rod in s.model.rods[:6])
         more = " …" if s.model.n > 6 else ""
         click.echo(f"{s.path}: ok: {s.name}, {count_noun(s.model.n, 'body', 'bodies')} ({joints}{more})")

@@ -10,28 +10,17 @@ import click
 import pyarrow as pa
 
 import reports
+from plumbline.cli import options
 from plumbline.cli.console import ProgressDisplay, count_noun, print_table
-from plumbline.cli.options import (
-    DEFAULT_OUT,
-    EXIT_CODES,
-    FiniteNumber,
-    ensure_writable,
-    examples,
-    exit_on_io_error,
-    jobs_option,
-    names_argument,
-    out_option,
-    read_scenarios,
-)
 from plumbline.scenario.errors import ScenarioError
 
 MAX_LISTED_CELLS = 10
 
 
-@click.command(short_help="Vary a scenario's parameters.", epilog=EXIT_CODES)
+@click.command(short_help="Vary a scenario's parameters.", epilog=options.EXIT_CODES)
 @click.argument("file", metavar="FILE", type=click.Path(path_type=Path))
-@jobs_option
-@out_option(Path("sweep"))
+@options.jobs_option
+@options.out_option(Path("sweep"))
 def sweep(file: Path, jobs: int, out: Path) -> None:
     """Vary a scenario's parameters over a grid or distributions, as a sweep file says (docs/sweeps.md).
 
@@ -47,8 +36,8 @@ def sweep(file: Path, jobs: int, out: Path) -> None:
     except ScenarioError as error:
         click.echo(str(error), err=True)
         sys.exit(2)
-    folder = ensure_writable(out)
-    with exit_on_io_error():
+    folder = options.ensure_writable(out)
+    with options.exit_on_io_error():
         table = sweeps.run(spec, cells, jobs)
         path = write_table(table, folder / "sweep.parquet")
         page = sweep_page.write(folder)
@@ -72,26 +61,24 @@ def _print_sweep(table: pa.Table, cell_count: int) -> None:
 
 @click.command(
     short_help="Measure constraint and energy drift over long times.",
-    epilog=examples("drift", "drift double-tumbling-rods --max-cpu-seconds 30 --out results"),
+    epilog=options.examples("drift", "drift double-tumbling-rods --max-cpu-seconds 30 --out results"),
 )
-@names_argument
+@options.names_argument
 @click.option(
     "--rtol",
     "rtols",
-    type=FiniteNumber(1e-14, 1e-2),
+    type=options.FiniteNumber(1e-14, 1e-2),
     multiple=True,
     default=(1e-6, 1e-9, 1e-12),
-    show_default=True,
     help="Relative tolerance of the integration (may be repeated).",
 )
 @click.option(
     "--max-cpu-seconds",
-    type=FiniteNumber(0, min_open=True),
+    type=options.FiniteNumber(0, min_open=True),
     default=120.0,
-    show_default=True,
     help="CPU seconds that one run may take; later times are left out where they would cost more.",
 )
-@out_option(DEFAULT_OUT)
+@options.out_option(options.DEFAULT_OUT)
 def drift(names: tuple[str, ...], rtols: tuple[float, ...], max_cpu_seconds: float, out: Path) -> None:
     """Measure the drift of raw, Baumgarte and projected runs in 10, 100, 1000 s (default: two scenarios).
 
@@ -100,9 +87,9 @@ def drift(names: tuple[str, ...], rtols: tuple[float, ...], max_cpu_seconds: flo
     from plumbline.studies import drift as drifts
     from plumbline.studies.tables import write_table
 
-    chosen = read_scenarios(names or ("tumbling-ball", "tumbling-rod"))
-    folder = ensure_writable(out)
-    with exit_on_io_error():
+    chosen = options.read_scenarios(names or ("tumbling-ball", "tumbling-rod"))
+    folder = options.ensure_writable(out)
+    with options.exit_on_io_error():
         with ProgressDisplay(sys.stderr) as progress:
             table = drifts.measure_drift(
                 chosen,
