@@ -15,6 +15,7 @@ from click.testing import CliRunner
 import plumbline as package
 from plumbline.cli.console import count_noun, engine_heading
 from plumbline.cli.main import main
+from plumbline.storage.results_store import SCHEMA_VERSION
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -27,9 +28,9 @@ def plumbline(*words, cwd=ROOT, **environment):
     )  # fmt: skip
 
 
-def test_help_teaches_and_documents_exit_codes():
-    said = plumbline("--help")
-    assert said.returncode == 0
+def test_help_has_examples_and_exit_codes():
+    result = plumbline("--help")
+    assert result.returncode == 0
     for words in (
         "Exit codes",
         "0  everything agrees",
@@ -37,9 +38,9 @@ def test_help_teaches_and_documents_exit_codes():
         "2  bad usage",
         "3  an engine failed",
     ):
-        assert words in said.stdout
+        assert words in result.stdout
     assert "\n    python -m plumbline run --family chain --level state\n" in plumbline("run", "--help").stdout
-    assert "\\b" not in said.stdout
+    assert "\\b" not in result.stdout
 
 
 def test_no_arguments_print_the_help():
@@ -99,14 +100,16 @@ def test_list_scenarios_and_engines_as_text_and_json():
 
 
 def test_a_run_writes_everything_and_exits_by_its_verdict(tmp_path):
-    said = plumbline("run", "rest", "--engine", "mujoco", "--engine", "reference", "--out", tmp_path / "o o")
-    assert said.returncode == 0, said.stdout + said.stderr
-    assert "agree" in said.stdout
-    assert "report.html" in said.stdout
+    result = plumbline(
+        "run", "rest", "--engine", "mujoco", "--engine", "reference", "--out", tmp_path / "o o"
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "agree" in result.stdout
+    assert "report.html" in result.stdout
     files = {p.name for p in (tmp_path / "o o").iterdir()}
     assert {"results.json", "summary.parquet", "states.parquet", "report.html", "junit.xml"} <= files
     document = json.loads((tmp_path / "o o" / "results.json").read_text())
-    assert document["schema_version"] == 1
+    assert document["schema_version"] == SCHEMA_VERSION
     assert {row["verdict"] for row in document["rows"] if row["known_issue"] is None} == {"agrees"}
     (tmp_path / "o o" / "report.html").unlink()
     again = plumbline("report", tmp_path / "o o")
@@ -115,33 +118,22 @@ def test_a_run_writes_everything_and_exits_by_its_verdict(tmp_path):
 
 
 def test_stdout_holds_json_alone_with_the_users_tolerance(tmp_path):
-    said = plumbline(
-        "run",
-        "rest",
-        "--engine",
-        "mujoco",
-        "--level",
-        "state",
-        "--json",
-        "--user-rtol",
-        "1e-6",
-        "--out",
-        tmp_path,
-    )
-    document = json.loads(said.stdout)
+    options = "--engine mujoco --level state --json --user-rtol 1e-6 --out"
+    result = plumbline("run", "rest", *options.split(), tmp_path)
+    document = json.loads(result.stdout)
     assert {row["user_rtol"] for row in document["rows"]} == {1e-6}
-    assert document["run"]["exit_code"] == said.returncode == 0
+    assert document["run"]["exit_code"] == result.returncode == 0
 
 
-def test_a_scenario_of_ones_own_by_path_and_a_family(tmp_path):
+def test_a_scenario_by_path(tmp_path):
     mine = tmp_path / "my pendulum.yaml"
     mine.write_text((ROOT / "scenarios" / "single" / "rest.yaml").read_text())
-    said = plumbline("run", mine, "--engine", "pinocchio", "--level", "state", "--out", tmp_path / "out")
-    assert said.returncode == 0, said.stdout + said.stderr
-    assert "my pendulum" in said.stdout
-    said = plumbline("check", mine)
-    assert said.returncode == 0
-    assert "ok" in said.stdout
+    result = plumbline("run", mine, "--engine", "pinocchio", "--level", "state", "--out", tmp_path / "out")
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert "my pendulum" in result.stdout
+    result = plumbline("check", mine)
+    assert result.returncode == 0
+    assert "ok" in result.stdout
 
 
 def test_a_name_stays_text_on_the_terminal_in_html_and_in_junit(tmp_path):
@@ -149,9 +141,9 @@ def test_a_name_stays_text_on_the_terminal_in_html_and_in_junit(tmp_path):
     mine = tmp_path / "hostile.yaml"
     rest = (ROOT / "scenarios" / "single" / "rest.yaml").read_text()
     mine.write_text(rest.replace("schema_version: 1", f"schema_version: 1\nname: {json.dumps(name)}"))
-    said = plumbline("run", mine, "--engine", "mujoco", "--level", "state", "--out", tmp_path / "out")
-    assert said.returncode == 0, said.stdout + said.stderr
-    assert name[:30] in said.stdout
+    result = plumbline("run", mine, "--engine", "mujoco", "--level", "state", "--out", tmp_path / "out")
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert name[:30] in result.stdout
     assert "<img" not in (tmp_path / "out" / "report.html").read_text()
     cases = ElementTree.parse(tmp_path / "out" / "junit.xml").iter("testcase")
     assert any(name in (case.get("name") or "") + (case.get("classname") or "") for case in cases)
@@ -204,21 +196,21 @@ def test_a_closed_form_that_does_not_fit_is_reported_with_line_and_column(tmp_pa
         assert line.endswith("; remove `exact`, or name the closed form that fits")
 
 
-def test_an_output_folder_that_cannot_be_written_is_said_before_any_work(tmp_path):
+def test_an_output_folder_that_cannot_be_written_is_an_error_before_any_work(tmp_path):
     (tmp_path / "file").write_text("x")
-    said = plumbline("run", "rest", "--out", tmp_path / "file" / "out")
-    assert said.returncode == 2
-    assert "cannot write to" in said.stderr
+    result = plumbline("run", "rest", "--out", tmp_path / "file" / "out")
+    assert result.returncode == 2
+    assert "cannot write to" in result.stderr
 
 
 def test_an_engine_that_is_not_installed_is_a_verdict(tmp_path):
     (tmp_path / "mujoco.py").write_text("raise ImportError('no mujoco here')\n")
-    said = plumbline(
+    result = plumbline(
         "run", "rest", "--engine", "mujoco", "--level", "state", "--out", tmp_path / "out",
         PYTHONPATH=f"{tmp_path}{os.pathsep}{ROOT}",
     )  # fmt: skip
-    assert said.returncode == 0, said.stderr
-    assert "not installed" in said.stdout
+    assert result.returncode == 0, result.stderr
+    assert "not installed" in result.stdout
 
 
 def test_schema_is_json():
