@@ -83,7 +83,9 @@ class TaskKey:
     @property
     def cpu_time_kind(self) -> str:
         """The kind of `plumbline.processes.cpu_time` that the call counts as."""
-        return _CPU_TIME_KINDS.get(self.kind, "reference" if self.engine == "reference" else "engines")
+        return _CPU_TIME_KINDS.get(
+            self.kind, "reference" if self.engine.startswith("reference") else "engines"
+        )
 
 
 def task_keys(

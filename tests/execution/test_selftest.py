@@ -62,7 +62,8 @@ def test_a_night_with_a_dull_instrument_is_not_green(tmp_path, trouble):
 
     _, place = nightly.run_nightly(
         tmp_path, loader.load_scenarios(["rest"]), ["mujoco"], random_count=0, seed=1, jobs=1,
-        limits=Limits(), is_full_catalogue=False, command="-", level="state", self_test=said, progress=lambda *_: None,
+        limits=Limits(), is_full_catalogue=False, command="-", level="state",
+        self_test=said, progress=lambda *_: None,
         log=lambda _: None,
     )  # fmt: skip
     run = json.loads((place / "results.json").read_text())["run"]
@@ -77,7 +78,8 @@ def test_a_night_killed_as_it_was_done_is_not_had_twice(tmp_path, monkeypatch):
     def night():
         return nightly.run_nightly(
             tmp_path, loader.load_scenarios(["rest"]), ["mujoco"], random_count=0, seed=None, jobs=1,
-            limits=Limits(), is_full_catalogue=False, command="-", level="state", progress=lambda *_: None, log=lambda _: None,
+            limits=Limits(), is_full_catalogue=False, command="-", level="state",
+            progress=lambda *_: None, log=lambda _: None,
         )  # fmt: skip
 
     def killed(_):

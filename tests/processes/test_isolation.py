@@ -22,7 +22,8 @@ def night(out, engines):
     (s,) = loader.load_scenarios(["planar-small"])
     return nightly.run_nightly(
         out, [replace(s, duration=0.5)], engines, random_count=0, seed=1, jobs=2, limits=LIMITS,
-        is_full_catalogue=False, command="-", extra_refinements=0, level="trajectory", progress=lambda *_: None, log=lambda _: None,
+        is_full_catalogue=False, command="-", extra_refinements=0, level="trajectory",
+        progress=lambda *_: None, log=lambda _: None,
     )  # fmt: skip
 
 

@@ -117,7 +117,8 @@ def night(out):
     chosen = loader.load_scenarios(["rest"])
     result, place = nightly.run_nightly(
         out, chosen, ["mujoco"], random_count=0, seed=1, jobs=1, limits=Limits(),
-        is_full_catalogue=False, command="-", extra_refinements=0, level="state", progress=lambda *_: None, log=lambda _: None,
+        is_full_catalogue=False, command="-", extra_refinements=0, level="state",
+        progress=lambda *_: None, log=lambda _: None,
     )  # fmt: skip
     return [replace(row, cpu_time=0.0) for row in result.rows], place
 
