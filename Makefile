@@ -68,7 +68,7 @@ $(LAUNCHER): Makefile | .venv/pyvenv.cfg
 	$(INSTALL) -r locks/mutation.lock
 	@touch $@
 
-# The page's own checks (axe, tsc, eslint) need npm; where it is missing their tests say so and skip.
+# The page's own checks (axe, tsc, eslint) need npm; where it is missing their tests are skipped with a reason.
 reports/node_modules/.tried: reports/package-lock.json
 	-cd reports && npm ci --no-audit --no-fund --loglevel=error
 	@mkdir -p $(@D) && touch $@

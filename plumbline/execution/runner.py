@@ -238,7 +238,7 @@ def summarize_verdicts(result: RunResult) -> str:
         count = len(rows) + result.random_batch.counts_by_verdict[verdict]
         if not count:
             continue
-        part = f"{count} {verdict.style.plural}"
+        part = f"{count} {verdict if count == 1 else verdict.style.plural}"
         new = [row for row in rows if row.known_issue is None]
         aliases = sum(row.alias_of is not None for row in rows)
         if verdict == Verdict.AGREES and aliases:
@@ -254,7 +254,10 @@ def summarize_verdicts(result: RunResult) -> str:
     text = ", ".join(parts) or "nothing was compared"
     if result.stale_issues:
         ids = ", ".join(issue.id for issue in result.stale_issues)
-        text += f"; {len(result.stale_issues)} known entries no longer occur ({ids})"
+        count = len(result.stale_issues)
+        text += (
+            f"; {count} known {'entry no longer occurs' if count == 1 else 'entries no longer occur'} ({ids})"
+        )
     return text
 
 

@@ -6,7 +6,9 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 from xml.etree import ElementTree
 
 import pytest
@@ -15,6 +17,8 @@ from click.testing import CliRunner
 import plumbline as package
 from plumbline.cli.console import count_noun, engine_heading
 from plumbline.cli.main import main
+from plumbline.execution.runner import summarize_verdicts
+from plumbline.judging.rows import Verdict
 from plumbline.storage.results_store import SCHEMA_VERSION
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -80,6 +84,26 @@ def test_numbers_agree_with_their_nouns():
     assert count_noun(1, "disagreement") == "1 disagreement"
     assert count_noun(0, "disagreement") == "0 disagreements"
     assert count_noun(2, "body", "bodies") == "2 bodies"
+
+
+def test_the_summary_counts_one_and_several():
+    def row(verdict):
+        return SimpleNamespace(
+            verdict=verdict, known_issue=None, alias_of=None, engine="e", scenario="s", quantity="q"
+        )
+
+    one, several = (
+        SimpleNamespace(
+            rows=count * [row(Verdict.AGREES), row(Verdict.DISAGREES)],
+            stale_issues=count * [SimpleNamespace(id="k")],
+            random_batch=SimpleNamespace(counts_by_verdict=Counter()),
+        )
+        for count in (1, 2)
+    )
+    words = "1 agrees", "1 disagrees (e, s: q)", "1 known entry no longer occurs (k)"
+    assert all(part in summarize_verdicts(one) for part in words)
+    words = "2 agree", "2 disagree (e, s: q)", "2 known entries no longer occur (k, k)"
+    assert all(part in summarize_verdicts(several) for part in words)
 
 
 def test_a_column_names_an_engines_version_once():
