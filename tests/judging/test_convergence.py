@@ -1,4 +1,4 @@
-"""Orders and limits of ladders whose answer is known."""
+"""Orders and limits of refinement studies whose answer is known."""
 
 import itertools
 
@@ -20,7 +20,9 @@ from plumbline.model.datatypes import Integrator
 TIMES = np.linspace(0, 2, 17)
 
 
-def rungs(order: int, powers: tuple[int, ...], count: int = 6, size: float = 1.0) -> tuple[np.ndarray, list]:
+def samples_with_error(
+    order: int, powers: tuple[int, ...], count: int = 6, size: float = 1.0
+) -> tuple[np.ndarray, list]:
     """Samples (T, 1, 3) whose error is a sum of powers of h with coefficients of order one."""
     rng = np.random.default_rng(order)
     limit = np.sin(TIMES[:, None, None] + np.arange(3))
@@ -33,7 +35,7 @@ def rungs(order: int, powers: tuple[int, ...], count: int = 6, size: float = 1.0
     ("order", "powers"), [(1, (1, 2, 3)), (2, (2, 4, 6)), (2, (2, 3, 4)), (4, (4, 5, 6))]
 )
 def test_the_order_is_seen_and_the_limit_is_reached(order, powers):
-    limit, ys = rungs(order, powers)
+    limit, ys = samples_with_error(order, powers)
     seen = observed_order(ys, 1e-16, order)
     assert seen.is_asymptotic
     assert seen.value == pytest.approx(order, abs=0.1)
@@ -44,7 +46,7 @@ def test_the_order_is_seen_and_the_limit_is_reached(order, powers):
 
 
 def test_order_two_under_an_order_four_name_is_seen_as_two():
-    _, ys = rungs(2, (2, 3, 4))
+    _, ys = samples_with_error(2, (2, 3, 4))
     seen = observed_order(ys, 1e-16, 4)
     assert seen.is_asymptotic
     assert seen.value == pytest.approx(2, abs=0.1)
@@ -70,7 +72,7 @@ def test_what_three_orders_lead_to(last, shown):
 
 
 def test_an_order_on_its_way_shows_nothing():
-    limit, ys = rungs(1, (1, 2, 3))
+    limit, ys = samples_with_error(1, (1, 2, 3))
     hs = [2.0**-k for k in range(5, 11)]
     creeping = [
         limit + (y - limit) / h * h ** (1.5 + 0.3 * k) for k, (y, h) in enumerate(zip(ys, hs, strict=True))
@@ -79,13 +81,13 @@ def test_an_order_on_its_way_shows_nothing():
 
 
 def test_wrong_powers_are_paid_for_in_uncertainty():
-    limit, ys = rungs(1, (1, 2, 3))
+    limit, ys = samples_with_error(1, (1, 2, 3))
     found = romberg(ys, (4, 5, 6))
     assert np.max(np.linalg.norm(found.y - limit, axis=-1)) <= found.uncertainty[-1]
 
 
 def test_rounding_is_not_an_order():
-    limit, _ = rungs(4, (4,))
+    limit, _ = samples_with_error(4, (4,))
     noise = np.random.default_rng(1).normal(size=(6, *limit.shape)) * 1e-16
     seen = observed_order([limit + n for n in noise], 1e-15, 4)
     assert seen.is_at_rounding_floor
@@ -93,7 +95,7 @@ def test_rounding_is_not_an_order():
 
 
 def test_a_run_that_blew_up_is_a_point_of_the_study():
-    limit, ys = rungs(4, (4, 5, 6))
+    limit, ys = samples_with_error(4, (4, 5, 6))
     ys[0] = np.full_like(limit, np.nan)
     seen = observed_order(ys, 1e-16, 4)
     assert seen.value == pytest.approx(4, abs=0.1)
@@ -102,13 +104,13 @@ def test_a_run_that_blew_up_is_a_point_of_the_study():
     assert np.max(np.abs(romberg(ys, (4, 5, 6)).y - limit)) < 1e-12
 
 
-def test_nothing_finite_is_said():
+def test_without_finite_runs_there_is_no_limit():
     with pytest.raises(ValueError, match="fewer than two finite runs"):
         romberg([np.full((3, 1, 3), np.nan)] * 3, (1, 2))
 
 
 @given(st.integers(1, 60), st.sampled_from([1, 2, 4]), st.floats(0.25, 100))
-def test_ladders_halve_and_keep_four_rungs(bodies, order, duration):
+def test_steps_halve_and_are_at_least_four(bodies, order, duration):
     steps = refinement_resolutions(Integrator("x", "step", order, (order,)), bodies, duration)
     assert steps == refinement_resolutions(
         Integrator("x", "step", order, (order,)), bodies, duration, extra_refinements=0
@@ -118,7 +120,7 @@ def test_ladders_halve_and_keep_four_rungs(bodies, order, duration):
 
 
 @pytest.mark.parametrize(
-    ("order", "bodies", "duration", "finer", "coarse", "fine"),
+    ("order", "bodies", "duration", "extra", "coarse", "fine"),
     [
         (4, 1, 2.0, 0, 5, 12),
         (1, 1, 2.0, 0, 9, 15),
@@ -133,12 +135,12 @@ def test_ladders_halve_and_keep_four_rungs(bodies, order, duration):
         (2, 60, 100.0, 2, 8, 13),
     ],
 )
-def test_a_ladder_is_as_long_as_is_affordable(order, bodies, duration, finer, coarse, fine):
-    steps = refinement_resolutions(Integrator("x", "step", order, (order,)), bodies, duration, finer)
+def test_a_study_has_as_many_steps_as_are_affordable(order, bodies, duration, extra, coarse, fine):
+    steps = refinement_resolutions(Integrator("x", "step", order, (order,)), bodies, duration, extra)
     assert steps == [2.0**-k for k in range(coarse, fine + 1)]
 
 
-def test_an_adaptive_method_climbs_by_tolerances():
+def test_an_adaptive_method_is_refined_by_tolerances():
     method = Integrator("x", "tolerance", 8, min_rtol=1e-13)
     assert refinement_resolutions(method, 50, 100.0) == pytest.approx(
         [1e-7, 1e-9, 1e-11, 1e-13], rel=1e-12, abs=0
@@ -201,7 +203,7 @@ def test_two_consecutive_orders_near_the_declared_one_show_it(orders, declared, 
 
 @pytest.mark.parametrize("more", [(), (1.0,)])
 def test_the_three_finest_orders_above_rounding_lead_somewhere(more):
-    """4.55, 4.3, 4.15 are on their way to 4; what is finer than rounding says nothing."""
+    """4.55, 4.3, 4.15 are on their way to 4; differences below rounding do not count."""
     sizes = 1e3 * 2.0 ** -np.cumsum([0.0, 4.55, 4.3, 4.15, *more])
     seen = observed_order(geometric(*sizes), sizes[3] / 32 * 0.99, 4)
     assert seen.is_asymptotic and seen.value == pytest.approx(4.0, abs=1e-9)
@@ -237,7 +239,7 @@ def test_an_uncertainty_never_shrinks_with_time():
     assert tightest_tolerance_limit(ys).y is ys[-1] and tightest_tolerance_limit(ys).eliminated_powers == 0
 
 
-def test_a_run_that_is_not_finite_in_between_leaves_the_finer_ones_alone():
+def test_a_run_that_is_not_finite_in_between_leaves_the_smaller_steps_usable():
     ys = geometric(4.0, 1.0, 0.25)
     with pytest.raises(ValueError, match="fewer than two"):
         romberg([ys[0], np.full_like(ys[0], np.nan), ys[2]][:2], (1,))

@@ -106,7 +106,7 @@ def test_only_random_scenarios_may_show_it_sometimes():
         entry(intermittent=True)
 
 
-def test_finer_ladders_may_resolve_what_was_not():
+def test_smaller_steps_may_resolve_what_was_unresolved():
     open_ = entry(verdict="unresolved")
     assert judged_by([row("agrees")], [open_], whole=True).stale == [open_]
     assert judged_by([row("agrees")], [open_], whole=True, finer=True).stale == []
@@ -200,7 +200,7 @@ def test_what_an_entry_does_not_say_is_anything():
         about.quantity = "energy"
 
 
-def test_what_finer_ladders_alone_show_is_expected_of_them_alone():
+def test_an_issue_of_smaller_steps_alone_is_expected_only_there():
     nightly = entry(extra_refinements_only=True)
     usual, finer = (judged_by([row()], [nightly], whole=True, finer=f) for f in (False, True))
     assert usual.rows[0].known_issue is None and usual.stale == []

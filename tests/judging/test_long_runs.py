@@ -37,11 +37,11 @@ def long(name, engine, integrator, seconds=100.0):
     s, chosen = load(name), load_adapter(engine) if isinstance(engine, str) else engine
     method = chosen.integrator(integrator)
     plan = plan_long_run(method, s.model.n, seconds)
-    endured = run_long_run_study(chosen.name, integrator, s.model, s.state, s.sample_interval, plan)
+    study = run_long_run_study(chosen.name, integrator, s.model, s.state, s.sample_interval, plan)
     who = RowContext(name, s.family, chosen.name, chosen.title, "1")
     return {
         row.quantity: row
-        for row in judge_long_runs(who, s.model, method, endured, s.closed_form is not None).rows
+        for row in judge_long_runs(who, s.model, method, study, s.closed_form is not None).rows
     }
 
 
@@ -185,7 +185,7 @@ def test_a_run_has_long_cells_beside_the_others():
     plan = Plan([load("conical")], ["mujoco"], "trajectory", limits=Limits(120), long_run_seconds=6.25)
     seen = []
     result = run_plan(plan, lambda done, total, what: seen.append((done, total)))
-    assert seen[-1] == (9, 9)  # the truth, four ladders, four long runs
+    assert seen[-1] == (9, 9)  # the truth, four refinement studies, four long runs
     rows = [row for row in result.rows if row.quantity.endswith("_long")]
     assert len(rows) == 4 * 5 and {row.level for row in rows} == {"invariants"}
     assert len({row.key for row in result.rows}) == len(result.rows)

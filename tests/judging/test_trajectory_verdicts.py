@@ -1,4 +1,4 @@
-"""What decides the rows about motion, on ladders whose errors are known."""
+"""What decides the rows about motion, on refinement studies whose errors are known."""
 
 from __future__ import annotations
 
@@ -46,26 +46,26 @@ def run(error, attitude=None, speed=None, steps=100):
     return Trajectory(TIMES, TRUE.r + error * off, p, TRUE.v + speed * off, TRUE.pdot, steps)
 
 
-def climbed(errors=None, **more):
-    """A ladder with error c h² and cost 1, 2, 3, … s; or with these errors."""
+def refinement_study(errors=None, **more):
+    """A study with error c h² and cost 1, 2, 3, … s; or with these errors."""
     errors = [0.01 * h**2 for h in STEPS] if errors is None else errors
-    rungs = [
+    runs = [
         RefinementRun(h, run(e, **more), None, i + 1.0)
         for i, (h, e) in enumerate(zip(STEPS, errors, strict=True))
     ]
-    return RefinementStudy(rungs, None)
+    return RefinementStudy(runs, None)
 
 
-def rows(climb=None, method=METHOD, model=MODEL, **changes):
-    found = judge_trajectory(WHO, model, truth(**changes), method, climb or climbed())
+def rows(study=None, method=METHOD, model=MODEL, **changes):
+    found = judge_trajectory(WHO, model, truth(**changes), method, study or refinement_study())
     return {row.quantity: row for row in found.rows}
 
 
-def ladder(climb=None, method=METHOD, model=MODEL, **changes):
-    return RefinementAnalysis(WHO, model, truth(**changes), method, (climb or climbed()).runs, 2.0)
+def analysis(study=None, method=METHOD, model=MODEL, **changes):
+    return RefinementAnalysis(WHO, model, truth(**changes), method, (study or refinement_study()).runs, 2.0)
 
 
-def test_a_sound_ladder_agrees_in_everything_and_says_what_it_measured():
+def test_a_sound_study_agrees_in_everything_and_states_what_it_measured():
     found = rows()
     assert list(found) == [
         "order", "position_limit", "position", "attitude_limit", "attitude",
@@ -103,21 +103,23 @@ def test_a_sound_ladder_agrees_in_everything_and_says_what_it_measured():
 
 @pytest.mark.parametrize(("until", "numbers"), [(2.0, [17, 9, 5, 3]), (9.0, [17, 9, 5, 3]), (1.0, [9, 5, 3])])
 def test_windows_halve_down_to_an_eighth_with_three_samples_at_least(until, numbers):
-    assert ladder().window_lengths(until) == numbers
-    assert ladder().window_lengths(0.3) == [3]
-    assert ladder().window_lengths(0.1) == [3]
-    dense = ladder()
+    assert analysis().window_lengths(until) == numbers
+    assert analysis().window_lengths(0.3) == [3]
+    assert analysis().window_lengths(0.1) == [3]
+    dense = analysis()
     dense.truth = truth(trajectory=replace(TRUE, t=np.linspace(0, 2, 65)))
     assert dense.window_lengths(2.0) == [65, 33, 17, 9]
 
 
 def test_an_order_that_stays_away_disagrees_and_one_on_its_way_decides_nothing():
-    one = rows(climbed([0.01 * h for h in STEPS]), replace(METHOD, error_exponents=(1, 2, 3)))["order"]
+    one = rows(refinement_study([0.01 * h for h in STEPS]), replace(METHOD, error_exponents=(1, 2, 3)))[
+        "order"
+    ]
     assert (one.verdict, one.order, one.value) == ("disagrees", pytest.approx(1), pytest.approx(1))
-    lost = rows(climbed([0.01, 0.003, 0.002, 0.0003, 0.0002, 0.00001]))["order"]
+    lost = rows(refinement_study([0.01, 0.003, 0.002, 0.0003, 0.0002, 0.00001]))["order"]
     assert lost.verdict == "unresolved" and lost.reason.startswith("not in the asymptotic range: orders ")
     assert lost.compared_until == 2.0, "the longest window, where none shows an order"
-    floor = rows(climbed([1e-16, 0, 1e-16, 0, 1e-16, 0]))["order"]
+    floor = rows(refinement_study([1e-16, 0, 1e-16, 0, 1e-16, 0]))["order"]
     assert (floor.verdict, floor.order, floor.value) == ("agrees", None, None)
     assert "not observable" in floor.reason and floor.compared_until == 2.0
 
@@ -125,17 +127,17 @@ def test_an_order_that_stays_away_disagrees_and_one_on_its_way_decides_nothing()
 @pytest.mark.parametrize(("factor", "until"), [(0.98, 2.0), (1.02, 1.0)])
 def test_differences_within_four_times_the_rounding_have_no_order(factor, until):
     """32 floors of an eighth of what rounding has grown to; over half the time they are smaller still."""
-    held = ladder()
+    held = analysis()
     per_error = 2.0 * np.hypot(1 / held.truth.length, 1 / held.invariant_scales["gap_rate"])
     error = factor * 4 * RUN_ROUNDING * 3.0 / per_error
-    found = ladder(climbed([error * x for x in (1, 0, 0.6, 0.1, 0.9, 0)]))
+    found = analysis(refinement_study([error * x for x in (1, 0, 0.6, 0.1, 0.9, 0)]))
     assert found.observed.is_at_rounding_floor and found.observed_until == until
 
 
 def test_order_is_of_positions_and_velocities_over_their_scales():
     """Positions without error and velocities of order 1: an order 1, not a rounding floor."""
     made = [RefinementRun(h, run(0.0, 0.0, 0.01 * h), None, 0.0) for h in STEPS]
-    held = ladder(RefinementStudy(made, None))
+    held = analysis(RefinementStudy(made, None))
     assert held.observed.value == pytest.approx(1)
     sizes = held.truth.length, held.invariant_scales["gap_rate"]
     expected = np.concatenate([TRUE.r / sizes[0], made[0].trajectory.v / sizes[1]], -1)
@@ -147,18 +149,18 @@ def test_rounding_of_a_quaternion_is_twice_that_of_the_angle():
     assert grown.tolerance == pytest.approx(2 * RUN_ROUNDING * 1e4, rel=1e-2)
 
 
-def test_a_limit_elsewhere_disagrees_only_where_the_ladder_shows_its_order():
+def test_a_limit_elsewhere_disagrees_only_where_the_study_shows_its_order():
     shifted = [1e-9 + 0.01 * h**2 for h in STEPS]
-    found = rows(climbed(shifted))
+    found = rows(refinement_study(shifted))
     limit = found["position_limit"]
     assert limit.verdict == found["position"].verdict == found["attitude_limit"].verdict == "disagrees"
     assert limit.value == pytest.approx(2e-9, rel=1e-3) and limit.compared_until == 2.0
     assert f"{limit.value / limit.tolerance:.3g} times the uncertainties" in limit.reason
     assert limit.ratio == pytest.approx(limit.value / limit.tolerance)
     wild = [1e-9 + e for e in (0.01, 0.003, 0.002, 0.0003, 0.0002, 0.0002)]
-    lost = rows(climbed(wild))["position_limit"]
+    lost = rows(refinement_study(wild))["position_limit"]
     assert lost.verdict == "unresolved"
-    tight = rows(climbed([1e-9] * 6))["position_limit"]  # at the floor at every step: trusted
+    tight = rows(refinement_study([1e-9] * 6))["position_limit"]  # at the floor at every step: trusted
     assert tight.verdict == "disagrees"
 
 
@@ -185,20 +187,22 @@ def test_a_shorter_window_may_tell_where_the_long_one_cannot():
 def test_the_border_is_the_tolerance_and_the_tolerance_what_is_visible():
     tolerance = rows()["position_limit"].tolerance
     for shift, verdict in ((0.95 * tolerance / 2, "agrees"), (1.05 * tolerance / 2, "disagrees")):
-        assert rows(climbed([shift + 0.01 * h**2 for h in STEPS]))["position_limit"].verdict == verdict
+        assert (
+            rows(refinement_study([shift + 0.01 * h**2 for h in STEPS]))["position_limit"].verdict == verdict
+        )
     for visible, horizon in ((1.01 * tolerance, 2.0), (0.99 * tolerance, 1.0)):  # rounding grows with time
         assert rows(detectable_position=np.full(17, visible))["position_limit"].compared_until == horizon
 
 
 def test_runs_that_did_not_stay_finite_are_points_of_the_study():
-    some = climbed()
+    some = refinement_study()
     some.runs[0] = replace(some.runs[0], trajectory=None, failure="blew up")
     found = judge_trajectory(WHO, MODEL, truth(), METHOD, some)
     assert {row.verdict for row in found.rows} == {"agrees"}
     table = dict(found.tables)["convergence"]
     assert table["steps"][:3] == [0, 0, 100] and np.isnan(table["error"][0])
-    for rung in range(5):
-        some.runs[rung] = replace(some.runs[rung], trajectory=None)
+    for index in range(5):
+        some.runs[index] = replace(some.runs[index], trajectory=None)
     alone = judge_trajectory(WHO, MODEL, truth(), METHOD, some)
     said = {row.quantity: row for row in alone.rows}
     for name in ("position_limit", "attitude_limit"):
@@ -219,7 +223,7 @@ def test_runs_that_did_not_stay_finite_are_points_of_the_study():
 
 def test_a_method_with_a_tolerance_has_no_order_and_its_tightest_run_is_the_limit():
     method = Integrator("DOP853", "tolerance", 8)
-    found = rows(climbed([1e-6, 1e-8, 1e-10, 1e-11, 2e-12, 1e-12]), method)
+    found = rows(refinement_study([1e-6, 1e-8, 1e-10, 1e-11, 2e-12, 1e-12]), method)
     assert "order" not in found
     limit = found["position_limit"]
     assert limit.verdict == "agrees" and "tightest of 6 tolerances" in limit.derivation
@@ -228,21 +232,21 @@ def test_a_method_with_a_tolerance_has_no_order_and_its_tightest_run_is_the_limi
     assert found["attitude_limit"].uncertainty == pytest.approx(2e-12 + 2e-12, rel=1e-2, abs=0)
     assert found["position"].reason.startswith("position at tolerance 0.000976562 is 2e-12 m")
     wild = (1e-7, 5e-8, 4.9e-8, 1e-9, 9e-10, 0)  # no order of any kind
-    off = rows(climbed([1e-6 + e for e in wild]), method)["position_limit"]
+    off = rows(refinement_study([1e-6 + e for e in wild]), method)["position_limit"]
     assert off.verdict == "disagrees", "trusted without any order"
     floor = found["energy_drift"]
     each = ROUNDING_PER_STEP + STEPS[-1]
     assert floor.tolerance == pytest.approx(each * 100 * floor.extra["scale"], rel=1e-12)
-    stays = rows(climbed([0.5 + e for e in (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 0)]), method)["joint_gap"]
+    stays = rows(refinement_study([0.5 + e for e in (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 0)]), method)["joint_gap"]
     assert stays.verdict == "disagrees", "trusted without any order"
 
 
 def test_an_implicit_solver_walks_at_random():
     method = replace(METHOD, solver_rtol=1e-11)
-    held = ladder(method=method)
+    held = analysis(method=method)
     np.testing.assert_allclose(held.rounding, (RUN_ROUNDING + 1e-10) * (1 + TIMES), rtol=1e-12)
     assert held.rounding_description == "(10³ ε + 1e-11 of the step's solver × √100) G(t)"
-    assert ladder().rounding_description == "10³ ε G(t)"
+    assert analysis().rounding_description == "10³ ε G(t)"
 
 
 def test_an_alias_is_told_and_drag_parts_it():
@@ -253,13 +257,13 @@ def test_an_alias_is_told_and_drag_parts_it():
 
 
 def test_attitudes_have_two_signs():
-    some, right = climbed(), ladder()
-    for rung in (2, 4):
-        run = some.runs[rung].trajectory
-        some.runs[rung] = replace(some.runs[rung], trajectory=replace(run, p=-run.p))
-    for mine, theirs in zip(ladder(some).attitudes, right.attitudes, strict=True):
+    some, right = refinement_study(), analysis()
+    for index in (2, 4):
+        run = some.runs[index].trajectory
+        some.runs[index] = replace(some.runs[index], trajectory=replace(run, p=-run.p))
+    for mine, theirs in zip(analysis(some).attitudes, right.attitudes, strict=True):
         assert np.array_equal(mine, theirs)
-    assert np.array_equal(right.positions[1], climbed().runs[1].trajectory.r)
+    assert np.array_equal(right.positions[1], refinement_study().runs[1].trajectory.r)
     assert rows(some)["attitude_limit"].verdict == "agrees"
 
 
@@ -312,7 +316,7 @@ def test_scales_are_sizes_of_what_the_invariants_are_made_of():
     over = np.linspace(1, -1, 17)[:, None, None] * TRUE.r[0]  # from one side of the pivot to the other
     turned = replace(TRUE, r=over, v=0 * TRUE.v, pdot=0 * TRUE.pdot)
     lifted = 2 * abs(MODEL.mass[0] * TRUE.r[0, 0] @ MODEL.gravity)
-    assert ladder(trajectory=turned).invariant_scales["energy_drift"] == pytest.approx(lifted, rel=1e-12)
+    assert analysis(trajectory=turned).invariant_scales["energy_drift"] == pytest.approx(lifted, rel=1e-12)
     long = replace(
         held, truth=truth(trajectory=true, length=50.0)
     ).invariant_scales  # a fall is faster than this
@@ -335,26 +339,26 @@ def test_a_drift_that_falls_with_the_step_agrees_and_one_that_does_not_disagrees
     floor = ROUNDING_PER_STEP * 100 * found.extra["scale"]
     assert found.tolerance == pytest.approx(found.value + floor, rel=1e-3)
     assert found.extra["limit"] < 1e-14 and "at the finest step" in found.reason
-    stays = rows(climbed([1e-6 + 0.01 * h**2 for h in STEPS]))["joint_gap"]
+    stays = rows(refinement_study([1e-6 + 0.01 * h**2 for h in STEPS]))["joint_gap"]
     assert stays.verdict == "disagrees" and "joint gap does not vanish with the step" in stays.reason
     assert "from the finest step to step zero" in stays.derivation
     assert stays.extra["limit"] == pytest.approx(2e-6, rel=0.1)
     assert stays.ratio == pytest.approx(stays.extra["limit"] / stays.tolerance, rel=1e-9)
-    wild = rows(climbed([0.1, 0.03, 0.02, 0.003, 0.002, 0.001]))["joint_gap"]
+    wild = rows(refinement_study([0.1, 0.03, 0.02, 0.003, 0.002, 0.001]))["joint_gap"]
     assert wild.verdict == "unresolved" and wild.reason.endswith("does not decide")
-    untold = rows(climbed([1e-3 + e for e in (0.0, 1e-5, -1e-5, 2e-5, 1e-5, 0)]))["joint_gap"]
+    untold = rows(refinement_study([1e-3 + e for e in (0.0, 1e-5, -1e-5, 2e-5, 1e-5, 0)]))["joint_gap"]
     assert untold.ratio > 1 and untold.verdict == "unresolved", "no order, no trust"
-    alone = climbed()
-    for rung in range(5):
-        alone.runs[rung] = replace(alone.runs[rung], trajectory=None)
+    alone = refinement_study()
+    for index in range(5):
+        alone.runs[index] = replace(alone.runs[index], trajectory=None)
     lost = rows(alone)["joint_gap"]
     assert lost.verdict == "unresolved" and "fewer than two" in lost.reason
     assert lost.tolerance == pytest.approx(floor, abs=0) and lost.derivation.startswith("100 steps, ")
 
 
-def test_an_unresolved_drift_is_allowed_what_the_ladder_leaves_open():
+def test_an_unresolved_drift_is_allowed_what_the_study_leaves_open():
     errors = [1e-3 + e for e in (0.0, 1e-5, -1e-5, 2e-5, 1e-5, 0)]
-    found = rows(climbed(errors, attitude=0.0, speed=0.0))["joint_gap"]
+    found = rows(refinement_study(errors, attitude=0.0, speed=0.0))["joint_gap"]
     limit = romberg([np.full((1, 1, 1), 2 * e) for e in errors], METHOD.error_exponents)  # at 2 s
     own = abs(2e-3 - limit.y[0, 0, 0])
     assert found.verdict == "unresolved" and found.value == pytest.approx(2e-3)
@@ -365,12 +369,12 @@ def test_an_unresolved_drift_is_allowed_what_the_ladder_leaves_open():
 @pytest.mark.parametrize(("steps", "counted"), [(10, 64), (64, 64), (1000, 1000)])
 def test_a_drift_of_rounding_agrees_at_once(steps, counted):
     """So much in every step, of at least 64 steps."""
-    base = rows(climbed([0.0] * 6, steps=steps))["norm_drift"]
+    base = rows(refinement_study([0.0] * 6, steps=steps))["norm_drift"]
     assert base.verdict == "agrees" and base.reason.endswith("rounding")
     assert base.tolerance == pytest.approx(ROUNDING_PER_STEP * counted, rel=1e-12, abs=0)
     assert base.ratio == pytest.approx(base.value / base.tolerance)
     assert base.derivation.startswith(f"{steps} steps, ") and base.compared_until == 2.0
-    held = climbed([0.0] * 6, steps=steps)
+    held = refinement_study([0.0] * 6, steps=steps)
     for factor, said in ((0.9, True), (1.1, False)):
         grown = TRUE.p * (1 + factor * base.tolerance * TIMES / 2)[:, None, None]
         held.runs[-1] = replace(held.runs[-1], trajectory=replace(held.runs[-1].trajectory, p=grown))
@@ -381,12 +385,12 @@ def test_what_the_quadrature_of_the_work_leaves_open_is_allowed():
     """Drag: energy by the samples' spline; its uncertainty is part of the tolerance, and only there."""
     model = replace(MODEL, drag_moment=np.array([1e-5]))
     true = pendulums.motion(model, pendulums.state(model, seed=2, rate=0.5), TIMES)
-    rungs = [
+    runs = [
         RefinementRun(h, replace(true, v=true.v * (1 + h**2 * TIMES[:, None, None])), None, 0.0)
         for h in STEPS
     ]
-    found = rows(RefinementStudy(rungs, None), model=model, trajectory=true)
-    uncertain = compute_invariants(model, rungs[-1].trajectory).work_uncertainty
+    found = rows(RefinementStudy(runs, None), model=model, trajectory=true)
+    uncertain = compute_invariants(model, runs[-1].trajectory).work_uncertainty
     assert uncertain > 1e-8
     row = found["energy_drift"]
     assert f"the work by quadrature ± {uncertain:.2g}" in row.derivation
@@ -398,8 +402,8 @@ def test_what_the_quadrature_of_the_work_leaves_open_is_allowed():
 # --- tables -------------------------------------------------------------------------------------
 
 
-def test_the_tables_hold_every_rung_every_sample_and_every_pose():
-    found = dict(judge_trajectory(WHO, MODEL, truth(horizon=1.0), METHOD, climbed()).tables)
+def test_the_tables_hold_every_run_every_sample_and_every_pose():
+    found = dict(judge_trajectory(WHO, MODEL, truth(horizon=1.0), METHOD, refinement_study()).tables)
     table = found["convergence"]
     assert (table["scenario"], table["engine"], table["integrator"]) == ("s", "mujoco", "Heun")
     assert table["quantity"] == ["position", "attitude"] * 6
@@ -414,13 +418,13 @@ def test_the_tables_hold_every_rung_every_sample_and_every_pose():
     np.testing.assert_allclose(curves["attitude_error"], 0.01 * STEPS[-1] ** 2 * TIMES, atol=1e-14)
     assert np.max(curves["limit_error"]) < 1e-14
     np.testing.assert_allclose(curves["tolerance"], 1e-12 + 0.4 * RUN_ROUNDING * (1 + TIMES), rtol=0.05)
-    finest = climbed().runs[-1].trajectory
+    finest = refinement_study().runs[-1].trajectory
     held = compute_invariants(MODEL, finest)
     np.testing.assert_allclose(curves["joint_gap"], np.linalg.norm(held.joint_gap[:, 0], axis=-1))
     np.testing.assert_allclose(curves["norm_drift"], np.abs(held.norm_drift[:, 0, 0]))
     bare = dict(
         judge_trajectory(
-            WHO, replace(MODEL, gravity=0 * MODEL.gravity), truth(horizon=1.0), METHOD, climbed()
+            WHO, replace(MODEL, gravity=0 * MODEL.gravity), truth(horizon=1.0), METHOD, refinement_study()
         ).tables
     )
     assert np.all(np.isnan(bare["curves"]["momentum_drift"]))
