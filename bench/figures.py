@@ -17,6 +17,8 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
+from plumbline.storage.results_store import write_atomically
+
 COLOURS = ("#0b6e99", "#7a4fa3", "#b85c00", "#2e7d32", "#b3261e", "#5d6b7a", "#8a6d00", "#c2185b", "#00796b")
 
 
@@ -123,14 +125,15 @@ def main(arguments: list[str]) -> None:
     for row in rows:
         met = "met" if row["measured"] <= row["goal"] else "not met"
         print(f"{row['what']}: {row['measured']:.3g} (goal {row['goal']:g}, {met})")
-    (folder / "figures.json").write_text(json.dumps({"goals": rows, "records": found}, indent=1) + "\n")
+    figures = json.dumps({"goals": rows, "records": found}, indent=1) + "\n"
+    write_atomically(folder / "figures.json", figures.encode())
     for record in found:
         if record["kind"] == "work-precision":
             batch = record["batch"]
             name = "work-precision.svg" if batch == 1 else f"work-precision-{batch}.svg"
             many = f"a batch of {batch}" if batch > 1 else "one pendulum"
             title = f"Two bodies on ball joints, {many}: CPU time to an error"
-            (folder / name).write_text(work_precision_svg(record["curves"], title))
+            write_atomically(folder / name, work_precision_svg(record["curves"], title).encode())
 
 
 if __name__ == "__main__":
