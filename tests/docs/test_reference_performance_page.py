@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
-
-from plumbline.studies import sweep_file
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "notes" / "reference-performance.md").read_text(encoding="utf-8")
@@ -75,13 +72,3 @@ def test_the_drifts() -> None:
             ("energy error", "energy"),
         ):
             assert told[column] == f"{row[name]:.1e}"
-
-
-def test_the_shown_sweep_is_one(tmp_path: Path) -> None:
-    shown = re.search(r"```text\n(.*?)```", PAGE, re.DOTALL)
-    assert shown
-    (tmp_path / "sweep.yaml").write_text(shown[1], encoding="utf-8")
-    spec, cells = sweep_file.load(tmp_path / "sweep.yaml")
-    assert len(cells) == 12
-    assert all(cell.scenario is not None for cell in cells)
-    assert set(spec.engines) == {"mujoco", "exudyn"}
