@@ -107,14 +107,11 @@ def render_script(row: dict[str, Any], evidence: Evidence) -> str:
     }
     if other:
         template = _template(other)
-        assert template is not None
         second = template.new_context(context | {"engine": other, "again": True})
         code = "".join(template.blocks["engine"](second))
         names = "|".join(re.findall(r"^def (\w+)", code, re.M))
         context["second_engine"] = re.sub(rf"\b({names})\(", r"other_\1(", code)
-    template = _template(engine)
-    assert template is not None
-    return _space_functions(template.render(context))
+    return _space_functions(_template(engine).render(context))
 
 
 def no_script_reason(engine: str, row: dict[str, Any]) -> str:
@@ -128,30 +125,28 @@ def no_script_reason(engine: str, row: dict[str, Any]) -> str:
         A sentence, or an empty string where the row has a script.
 
     """
-    template = _template(engine)
-    if template is None:
+    if not declared_attribute(engine, "reproduction_template"):
         return f"engine {engine} has no template of scripts"
     relation = row["quantity"]
     if relation.endswith(LONG_RUN_SUFFIXES):
         return "rows of long runs have no script"
     if row["level"] != "relations":
-        is_adaptive = row["level"] != "state" and not row["declared_order"]
-        return "runs of adaptive integrators have no script" if is_adaptive else ""
+        return ""
     if row["integrator"] != "-":
         return "relations of runs have no script"
     if relation.startswith(OTHER_FORMULATION_PREFIX) or relation in (r.name for r in STATE_RELATIONS):
         return ""
     block = {relation: "option"} if relation.startswith(OPTION_PREFIX) else {WELDED_HALVES: "welded"}
-    return "" if block.get(relation) in template.blocks else f"scripts of {engine} cannot show {relation!r}"
+    is_known = block.get(relation) in _template(engine).blocks
+    return "" if is_known else f"scripts of {engine} cannot show {relation!r}"
 
 
 _KINDS: dict[type, str] = {StateEvidence: "state", RelationEvidence: "relation", MotionEvidence: "motion"}
 
 
-def _template(engine: str) -> Template | None:
-    """The template that the engine's adapter names; None where it names none."""
-    name = declared_attribute(engine, "reproduction_template")
-    return _environment().get_template(f"{name}.py.j2") if name else None
+def _template(engine: str) -> Template:
+    """The template that the engine's adapter names."""
+    return _environment().get_template(f"{declared_attribute(engine, 'reproduction_template')}.py.j2")
 
 
 @cache

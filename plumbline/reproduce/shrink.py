@@ -166,8 +166,8 @@ def _parts(
     for is_last in ends if count < n else (False,):
         part = slice(n - count, n) if is_last else slice(0, count)
         few = replace(model, **{k: v[part] for k, v in vars(model).items() if k != "gravity"})
-        at = state_from_minimal(few, state.p[part], state.omega[part], state.u[part], state.udot[part])
-        yield replace(case, model=few, state=at)
+        at = {name: getattr(state, name)[part] for name in ("p", "omega", "u", "udot")}
+        yield _changed(case, few, **at)
 
 
 def _reduce_bodies(search: _Search[M]) -> None:
@@ -208,47 +208,37 @@ def _reduce_steps(search: _Search[M]) -> None:
 _Change = Callable[[ReproductionCase], ReproductionCase]
 
 
+def _changed(case: ReproductionCase, model: Model | None = None, **coordinates: Array) -> ReproductionCase:
+    """Return a case with another model or other minimal coordinates, on its constraint manifold."""
+    new, state = model or case.model, case.state
+    given = {name: getattr(state, name) for name in ("p", "omega", "u", "udot")} | coordinates
+    given |= {name: given[name] * new.rods[:, None] for name in ("u", "udot")}
+    return replace(case, model=new, state=state_from_minimal(new, **given))
+
+
 def _with_fields(**make: Callable[[Array], Array]) -> _Change:
-    """Change fields of the model; the state stays on its constraint manifold."""
-
-    def change(case: ReproductionCase) -> ReproductionCase:
-        m, s = case.model, case.state
-        new = replace(m, **{name: of(getattr(m, name)) for name, of in make.items()})
-        rod = new.rods[:, None]
-        return replace(case, model=new, state=state_from_minimal(new, s.p, s.omega, s.u * rod, s.udot * rod))
-
-    return change
+    """Change fields of the model."""
+    return lambda case: _changed(
+        case, replace(case.model, **{name: of(getattr(case.model, name)) for name, of in make.items()})
+    )
 
 
 def _with_rates(make: Callable[[Array], Array]) -> _Change:
     """Change the rates of bodies and rods."""
-
-    def change(case: ReproductionCase) -> ReproductionCase:
-        s = case.state
-        return replace(case, state=state_from_minimal(case.model, s.p, make(s.omega), s.u, make(s.udot)))
-
-    return change
+    return lambda case: _changed(case, omega=make(case.state.omega), udot=make(case.state.udot))
 
 
 def _with_attitudes(*quaternions: list[float]) -> _Change:
     """Give the bodies these attitudes, in turn."""
-
-    def change(case: ReproductionCase) -> ReproductionCase:
-        m, s = case.model, case.state
-        p = np.array([quaternions[k % len(quaternions)] for k in range(m.n)])
-        return replace(case, state=state_from_minimal(m, p, s.omega, s.u, s.udot))
-
-    return change
+    return lambda case: _changed(case, p=np.resize(quaternions, (case.model.n, 4)))
 
 
 def _with_directions(u: list[float]) -> _Change:
     """Point all rods in one direction (world frame)."""
 
     def change(case: ReproductionCase) -> ReproductionCase:
-        m, s = case.model, case.state
-        along = np.where(m.rods[:, None], u, 0.0)
-        across = s.udot - np.sum(s.udot * along, axis=1, keepdims=True) * along
-        return replace(case, state=state_from_minimal(m, s.p, s.omega, along, across))
+        udot = case.state.udot
+        return _changed(case, u=np.tile(u, (case.model.n, 1)), udot=udot - np.outer(udot @ u, u))
 
     return change
 

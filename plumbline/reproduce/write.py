@@ -264,7 +264,9 @@ def _refinement_study(
     ]
     finest = min((row["extra"]["resolution"] for row in every if "resolution" in row["extra"]), default=None)
     declared = next((row["declared_order"] for row in every if row["declared_order"]), None)
-    if finest is None or declared is None:
+    if declared is None:  # only a step's order is observed
+        raise NotReproducible("runs of integrators with adaptive steps have no script")
+    if finest is None:
         raise NotReproducible("the steps of the refinement study behind this row are not in the results")
     coarsest = 2.0 ** -STEP_EXPONENTS[declared][0]
     steps = tuple(coarsest / 2**k for k in range(round(np.log2(coarsest / finest)) + 1))

@@ -14,7 +14,7 @@ class DamagedScriptIndex(PlumblineError, ValueError):
 
 
 def scripts_folder(folder: Path) -> Path:
-    """Return the folder of the scripts.
+    """Return where stand-alone scripts of a run are kept.
 
     Args:
         folder: a results folder.
@@ -27,7 +27,7 @@ def scripts_folder(folder: Path) -> Path:
 
 
 def read_script_index(folder: Path) -> dict[str, str]:
-    """Read the index.
+    """Look up which rows of a run have a stand-alone script.
 
     Args:
         folder: a results folder.

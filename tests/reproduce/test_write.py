@@ -91,9 +91,13 @@ def test_the_runs_behind_a_row_are_those_of_its_refinement_study(results):
     assert disagreement.case.steps == (2.0**-5, 2.0**-6, 2.0**-7, 2.0**-8)
     assert disagreement.case.until == 1.0 and disagreement.ratio == 20
     assert disagreement.quantities == ("order",)
-    document["rows"] = [found]
-    with pytest.raises(NotReproducible, match="refinement study"):
-        write.find_disagreement(document, [found], 1.0)
+    limit = finest | {"quantity": "position_limit", "declared_order": None}
+    document["rows"] = [found, finest, limit]
+    assert write.find_disagreement(document, [limit], 1.0).case.until == 1.0
+    for rows, reason in (([found], "refinement study"), ([limit], "adaptive steps")):
+        document["rows"] = rows
+        with pytest.raises(NotReproducible, match=reason):
+            write.find_disagreement(document, rows, 1.0)
 
 
 def test_a_lost_worker_leaves_no_script(results):
