@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,9 +22,10 @@ class CpuTimes:
     def __init__(self) -> None:
         """Start with zero seconds of every kind."""
         self.seconds = dict.fromkeys(CPU_TIME_KINDS, 0.0)
+        self._measured = 0.0  # s of this process, counted by `measure`
 
     def add_outcome(self, outcome: Outcome, kind: str) -> None:
-        """Count what a task's call and its judge took in a worker.
+        """Count what a task took in its worker: the call, its judge, imports and transfer.
 
         Args:
             outcome: the task's outcome.
@@ -34,10 +34,11 @@ class CpuTimes:
         """
         self.seconds[kind] += outcome.cpu_time
         self.seconds["judging"] += outcome.judge_cpu_time
+        self.seconds["process"] += outcome.overhead_cpu_time
 
     @contextmanager
     def measure(self, kind: str) -> Iterator[None]:
-        """Count what this process, and its children that end meanwhile, take inside the context.
+        """Count what this process takes inside the context.
 
         Args:
             kind: the kind to count it as.
@@ -46,25 +47,25 @@ class CpuTimes:
             Nothing.
 
         """
-        begin = cpu_time_spent()
+        begin = time.process_time()
         try:
             yield
         finally:
-            self.seconds[kind] += cpu_time_spent() - begin
+            elapsed = time.process_time() - begin
+            self.seconds[kind] += elapsed
+            self._measured += elapsed
 
     @contextmanager
     def measure_overhead(self) -> Iterator[None]:
-        """Count as "process" what is taken inside the context and is not counted as another kind.
+        """Count as "process" what this process takes inside the context and `measure` does not count.
 
         Yields:
             Nothing.
 
         """
-        begin, before = cpu_time_spent(), sum(self.seconds.values())
+        begin, before = time.process_time(), self._measured
         yield
-        counted = sum(self.seconds.values()) - before
-        rest = cpu_time_spent() - begin - counted  # negative where answers came from the result cache
-        self.seconds["process"] += max(0.0, rest)
+        self.seconds["process"] += time.process_time() - begin - (self._measured - before)
 
     def timed_cache(self, result_cache: ResultCache) -> ResultCache:
         """Wrap a result cache so that its work is counted as storage.
@@ -106,14 +107,3 @@ class CpuTimes:
             f"{100 * (total - calls) / engines:.0f} %, truth and reference "
             f"{100 * (calls - engines) / engines:.0f} %"
         )
-
-
-def cpu_time_spent() -> float:
-    """Measure this process and its children that have ended.
-
-    Returns:
-        CPU time since the process began [s].
-
-    """
-    times = os.times()  # in ticks of 10 ms: too coarse for this process's own time, taken in small parts
-    return time.process_time() + times.children_user + times.children_system

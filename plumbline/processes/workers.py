@@ -16,9 +16,11 @@ import tempfile
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from dataclasses import dataclass, field
+from multiprocessing import forkserver
+from multiprocessing.context import BaseContext
 from types import TracebackType
 from typing import Any, Self
 
@@ -32,6 +34,8 @@ _SINGLE_THREAD_ENV = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
 _POLL_INTERVAL = 0.2  # s between checks for tasks that run too long
+_WARM_MODULE = "plumbline.processes.warm"
+_worker_cpu_time = {"reported": 0.0}  # s that this worker has reported in outcomes
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,7 @@ class Outcome:
     cpu_time: float = 0.0  # s of the call
     judge_result: Any = None  # what the task's judge returned; None for an answer from the result cache
     judge_cpu_time: float = 0.0  # s of the judge
+    overhead_cpu_time: float = 0.0  # s of the worker besides these, since its last outcome
 
     @property
     def value(self) -> Any:
@@ -260,9 +265,9 @@ class WorkerPool(Executor):
         os.environ.update(_SINGLE_THREAD_ENV)  # inherited by the workers, before NumPy loads there
         self._pool = ProcessPool(
             max_workers=jobs,
-            context=multiprocessing.get_context("spawn"),
+            context=_warm_context(),
             initializer=initialize_worker,
-            initargs=(str(self._scratch.path), self.limits.gigabytes, os.getpid()),
+            initargs=(str(self._scratch.path), self.limits.gigabytes, os.getpid(), dict(os.environ)),
         )
 
     def __exit__(
@@ -314,6 +319,16 @@ class WorkerPool(Executor):
                 future.cancel()
 
 
+def _warm_context() -> BaseContext:
+    """Fork workers from a process that has libraries loaded; start them anew where there is no fork."""
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([_WARM_MODULE])
+    forkserver.ensure_running()  # in this thread: the warm process ends with the thread that started it
+    return context
+
+
 def run_task(task: Task) -> Outcome:
     """Make a task's call in this process, or in the environment that the task names.
 
@@ -344,7 +359,11 @@ def _call_and_judge(task: Task) -> Outcome:
     judged, judging = None, 0.0
     if task.judge:
         judged, judging = call_timed(task.judge, *_load(task.judge_arguments), value)
-    return Outcome(task.key, Pickled.of(value), None, cost, judged, judging)
+    answer = Pickled.of(value)
+    total = time.process_time()
+    overhead = total - _worker_cpu_time["reported"] - judging - (0.0 if task.python else cost)
+    _worker_cpu_time["reported"] = total
+    return Outcome(task.key, answer, None, cost, judged, judging, overhead)
 
 
 def _load(arguments: Sequence[Any]) -> list[Any]:
@@ -371,16 +390,18 @@ def _outcome_from_future(task: Task, future: Future[Outcome]) -> Outcome:
         return Outcome(task.key, failure=f"{type(error).__name__}: {error}")
 
 
-def initialize_worker(scratch: str, gigabytes: float, parent: int) -> None:
+def initialize_worker(scratch: str, gigabytes: float, parent: int, environment: Mapping[str, str]) -> None:
     """Prepare a worker process before its first task.
 
     Args:
         scratch: folder in which the worker makes its working folder.
         gigabytes: limit of its address space.
         parent: process id of the pool's process.
+        environment: its environment variables; those of the warm process may be older.
 
     """
-    os.environ.update(_SINGLE_THREAD_ENV)
+    os.environ.clear()
+    os.environ.update(environment)
     os.chdir(tempfile.mkdtemp(dir=scratch))
     sink = os.open(os.devnull, os.O_WRONLY)
     os.dup2(sink, 1)

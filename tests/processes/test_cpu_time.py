@@ -6,8 +6,8 @@ import pytest
 
 from plumbline.execution.plan import Plan, TaskKey, TaskKind
 from plumbline.execution.runner import run_plan
-from plumbline.processes.cpu_time import CPU_TIME_KINDS, CpuTimes, cpu_time_spent
-from plumbline.processes.workers import Outcome, ResultCache
+from plumbline.processes.cpu_time import CpuTimes
+from plumbline.processes.workers import Outcome, ResultCache, Task, WorkerPool
 from plumbline.scenario import loader
 
 
@@ -54,11 +54,18 @@ def test_a_memory_is_the_same_and_measured():
 
 def test_a_run_accounts_for_its_time():
     pytest.importorskip("mujoco")
-    begin = cpu_time_spent()
+    begin, wall = time.process_time(), time.monotonic()
     chosen = loader.load_scenarios(["rest"])
-    split = run_plan(Plan(chosen, ["reference", "mujoco"], random_state_count=3), lambda *_: None).cpu_times
-    seconds = {kind: split.seconds[kind] for kind in CPU_TIME_KINDS}
+    plan = Plan(chosen, ["reference", "mujoco"], random_state_count=3, jobs=1)
+    seconds = run_plan(plan, lambda *_: None).cpu_times.seconds
+    own, wall = time.process_time() - begin, time.monotonic() - wall
     assert all(seconds[k] > 0 for k in ("engines", "reference", "truth", "process", "judging")), seconds
-    assert 0.7 * (cpu_time_spent() - begin) < sum(seconds.values()) < 1.1 * (cpu_time_spent() - begin), (
-        seconds
-    )
+    assert 0.7 * own < sum(seconds.values()) < 1.1 * (own + wall), (seconds, own, wall)
+
+
+def test_a_worker_reports_all_its_time():
+    task = Task("a", burn, (0.2,))
+    with WorkerPool(1) as workers:
+        outcomes = [outcome for _ in range(2) for outcome in workers.run([task])]
+    assert all(0.2 <= outcome.cpu_time < 0.3 for outcome in outcomes)
+    assert 0 < outcomes[1].overhead_cpu_time < 0.1
