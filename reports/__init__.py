@@ -10,10 +10,10 @@ def write(folder: Path, history: Path | None = None) -> Path:
 
     Raises OSError or ValueError where results.json cannot be read or a file cannot be written.
     """
-    from reports import junit, page, step_summary
+    from reports import html_report, junit, step_summary
     from reports.results import Results
 
     results = Results.load(folder)
     junit.write(results)
     step_summary.write(results)
-    return page.write(results, history)
+    return html_report.write(results, history)

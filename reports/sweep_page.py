@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow.parquet as pq
 from markupsafe import Markup
 
-from reports import page
+from reports import html_report
 from reports.results import Record, replace_unprintable
 from reports.verdicts import VERDICT_STYLES, count_verdicts, severity
 
@@ -53,7 +53,7 @@ def write(folder: Path) -> Path:
     names = replace_unprintable(table.column_names)
     rows = replace_unprintable(table.rename_columns(names).to_pylist())
     about = replace_unprintable(json.loads((table.schema.metadata or {}).get(b"sweep", b"{}")))
-    return page.write_page(folder / "sweep.html", render(names[: names.index("cell")], rows, about))
+    return html_report.write_page(folder / "sweep.html", render(names[: names.index("cell")], rows, about))
 
 
 def render(parameters: Sequence[str], rows: Sequence[Record], sweep_info: Record) -> str:
@@ -78,12 +78,12 @@ def render(parameters: Sequence[str], rows: Sequence[Record], sweep_info: Record
     poor = [row for row in rows if row["verdict"] not in ("agrees", "not installed")]
     cells = len({row["cell"] for row in rows})
     told = Counter((row["implementation"], row["verdict"]) for row in rows)
-    style = page.stylesheet()
+    style = html_report.stylesheet()
     return (
-        page.template_environment()
+        html_report.template_environment()
         .get_template("sweep.html")
         .render(
-            policy=page.content_security_policy(style),
+            policy=html_report.content_security_policy(style),
             style=Markup(style),
             sentence=f"{cells} cells: "
             + "; ".join(f"{name} {verdict} {k}" for (name, verdict), k in told.items()),

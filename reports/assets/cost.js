@@ -5,7 +5,7 @@ import { axes, decades, path } from "./plot.js";
 import { amend, read } from "./route.js";
 import { decade, h, number, svg } from "./text.js";
 
-/** @typedef {import("./payload").Study} Study @typedef {import("./payload").Index} Index */
+/** @typedef {import("./report_data").Study} Study @typedef {import("./report_data").Index} Index */
 
 const TARGETS = [1e-4, 1e-6, 1e-8, 1e-10];
 

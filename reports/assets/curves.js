@@ -3,7 +3,7 @@ import { fromCode } from "./chunks.js";
 import { decades, powers } from "./plot.js";
 import { decade, h, ink, number, svg } from "./text.js";
 
-/** @typedef {import("./payload").CurveSet} CurveSet */
+/** @typedef {import("./report_data").CurveSet} CurveSet */
 
 const PANELS = /** @type {const} */ ([
   ["position_error", "Position error, finest run", "m"],

@@ -7,7 +7,7 @@ import { axes, decades, path } from "./plot.js";
 import { amend, href } from "./route.js";
 import { copyable, h, number, svg } from "./text.js";
 
-/** @typedef {import("./payload").Index} Index @typedef {import("./payload").ScenarioChunk} ScenarioChunk @typedef {import("./payload").Study} Study */
+/** @typedef {import("./report_data").Index} Index @typedef {import("./report_data").ScenarioChunk} ScenarioChunk @typedef {import("./report_data").Study} Study */
 
 /** @type {(() => void)[]} what the cell on show must end before the next */
 let ending = [];
@@ -170,7 +170,7 @@ function compared(index, data, ours, fields) {
 /** "" for a pure number. @param {string | undefined} unit */
 const unitOf = (unit) => (unit && unit !== "1" && unit !== "–" ? unit : "");
 
-/** @param {Index} index @param {import("./payload").RowDetail} row @param {number} i */
+/** @param {Index} index @param {import("./report_data").RowDetail} row @param {number} i */
 function chosenRow(index, row, i) {
   const { rows } = index;
   const slug = index.slugs[rows.verdict[i]];
@@ -180,7 +180,7 @@ function chosenRow(index, row, i) {
     h("p", { class: "reason" }, index.reasons[i]), derivation(row));
 }
 
-/** @param {import("./payload").RowDetail} row */
+/** @param {import("./report_data").RowDetail} row */
 function derivation(row) {
   const list = h("dl", { class: "derive" });
   /** @param {string} name @param {string | number | null | undefined} value */
@@ -244,15 +244,15 @@ function moving(root, index, data, fields) {
 
 /**
  * Of each engine the curve that ends with the smallest error.
- * @param {import("./payload").CurveSet[]} curves
+ * @param {import("./report_data").CurveSet[]} curves
  */
 function best(curves) {
-  /** @param {import("./payload").CurveSet} set */
+  /** @param {import("./report_data").CurveSet} set */
   const last = (set) => {
     const error = set.position_error ? fromCode(set.position_error[set.position_error.length - 1]) : 0;
     return Number.isNaN(error) ? Infinity : error;
   };
-  /** @type {Map<string, import("./payload").CurveSet>} */
+  /** @type {Map<string, import("./report_data").CurveSet>} */
   const found = new Map();
   for (const set of curves) {
     const other = found.get(set.engine);
@@ -312,7 +312,7 @@ function triangle(plot, one, order) {
   plot.root.append(svg("path", { class: "tri", d: `M${a} ${low}H${b}V${top}Z` }), svg("text", { x: b + 4, y: (top + low) / 2 + 4 }, String(order)));
 }
 
-/** @param {import("./payload").StateSpread[]} spreads */
+/** @param {import("./report_data").StateSpread[]} spreads */
 function stateSpread(spreads) {
   const values = spreads.map((one) => Array.from(one.ratio, fromCode));
   const range = decades([...values.flat(), 1]);

@@ -17,7 +17,7 @@ async function show() {
   if (location.hash === "#main") return;
   const fields = read();
   const view = viewOf(fields);
-  const index = /** @type {import("./payload").Index} */ (await chunk("index"));
+  const index = /** @type {import("./report_data").Index} */ (await chunk("index"));
   if (mine !== latest) return;
   closeCell();
   for (const name of ["matrix", "cell", "cost", "trend"]) byId(name + "-view").hidden = name !== view;

@@ -15,7 +15,7 @@ export function filtersOf(fields) {
 
 /**
  * A test of one row by its number.
- * @param {import("./payload").Index} index @param {Record<string, string>} fields
+ * @param {import("./report_data").Index} index @param {Record<string, string>} fields
  * @returns {(row: number) => boolean}
  */
 export function chosen(index, fields) {
@@ -43,7 +43,7 @@ export function chosen(index, fields) {
 }
 
 /**
- * @param {import("./payload").Index} index @param {Record<string, string>} fields
+ * @param {import("./report_data").Index} index @param {Record<string, string>} fields
  */
 export function showMatrix(index, fields) {
   const table = /** @type {HTMLTableElement} */ (document.getElementById("matrix"));
@@ -105,7 +105,7 @@ export function showMatrix(index, fields) {
   for (const id of ["findings"]) /** @type {HTMLElement} */ (document.getElementById(id)).hidden = filtered;
 }
 
-/** @param {import("./payload").Index} index @param {number} i */
+/** @param {import("./report_data").Index} index @param {number} i */
 function cellOf(index, i) {
   const { rows } = index;
   const slug = index.slugs[rows.verdict[i]];
@@ -130,7 +130,7 @@ export function track(ratio) {
     svg("path", { d: "M0 3H96M48 .5v5" }), svg("circle", { cx: at.toFixed(1), cy: 3, r: 2.4 }));
 }
 
-/** @param {import("./payload").Index} index */
+/** @param {import("./report_data").Index} index */
 function buildFilters(index) {
   const form = /** @type {HTMLFormElement} */ (document.getElementById("filters"));
   /** @param {string} name @param {string} title @param {string[]} values @param {(v: string) => string} [say] */

@@ -2,7 +2,7 @@
 import { superscript, h, ink, number } from "./text.js";
 
 /**
- * @typedef {import("./payload").MotionData} MotionData @typedef {import("./payload").Vec} Vec
+ * @typedef {import("./report_data").MotionData} MotionData @typedef {import("./report_data").Vec} Vec
  * @typedef {MotionData["runs"][number]} Run
  * @typedef {[number, number, number, number]} Quat
  * @typedef {{ r: Vec, q: Quat }} Pose
@@ -86,7 +86,7 @@ function displaced(poses, difference, magnify) {
 
 /**
  * The stage with its transport.
- * @param {import("./payload").ScenarioChunk} data
+ * @param {import("./report_data").ScenarioChunk} data
  * @param {{ engine: string, engines: string[], end: number, start: number, magnify: number | null, crossing: { t: number, name: string } | null,
  *   onTime: (t: number) => void, onRest: (state: Record<string, any>) => void }} o
  */

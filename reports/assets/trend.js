@@ -5,7 +5,7 @@ import { axes, decades, path } from "./plot.js";
 import { amend, href, read } from "./route.js";
 import { h, number, svg } from "./text.js";
 
-/** @typedef {import("./payload").Index} Index @typedef {import("./payload").HistoryChunk} HistoryChunk */
+/** @typedef {import("./report_data").Index} Index @typedef {import("./report_data").HistoryChunk} HistoryChunk */
 
 const SHOWN = 48;
 

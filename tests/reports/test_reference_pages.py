@@ -17,12 +17,12 @@ from click.testing import CliRunner
 from plumbline.cli.main import main
 from plumbline.studies import drift, sweep
 from plumbline.studies.tables import write_table
-from reports import fast_reference, page, picture, sweep_page
+from reports import html_report, reference_tables, screenshot, sweep_page
 from reports.results import Results, replace_unprintable
 from tests.helpers import example_results as fixture
 from tests.helpers.example_results import HOSTILE, NASTY
 
-AXE = Path(page.__file__).parent / "node_modules" / "axe-core" / "axe.min.js"
+AXE = Path(html_report.__file__).parent / "node_modules" / "axe-core" / "axe.min.js"
 MEASURED: dict[str, Any] = {
     "rtol": 1e-9,
     "gap_rate": 4.5e-9,
@@ -66,10 +66,10 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
         {"what": NASTY, "goal": 4, "measured": 5.5},
     ]
     (folder / "figures.json").write_text(json.dumps({"goals": goals, "records": []}))
-    svg = (fast_reference.STORED_RESULTS / "work-precision.svg").read_text(encoding="utf-8")
+    svg = (reference_tables.STORED_RESULTS / "work-precision.svg").read_text(encoding="utf-8")
     trap = '<script>alert(3)</script><image href="https://example.org/x.png"/></svg>'
     (folder / "work-precision.svg").write_text(svg.replace("</svg>", trap))
-    page.write(Results.load(folder))
+    html_report.write(Results.load(folder))
     names = [*list(sweep_rows()[0])[:2], *sweep.COLUMNS]
     schema = pa.schema(
         [(name, sweep.COLUMNS.get(name, pa.float64())) for name in names],
@@ -117,13 +117,13 @@ def test_the_report_has_the_goals_and_the_pictures_as_inert_images(out: Path) ->
 
 
 def test_stored_measurements_stand_in_and_say_so(tmp_path: Path) -> None:
-    kept = fast_reference.benchmark_table(tmp_path)
+    kept = reference_tables.benchmark_table(tmp_path)
     assert kept is not None
     assert kept["stored"]
     assert len(kept["pictures"]) == 2
     assert "shared two-core machine" in kept["note"]
-    assert fast_reference.benchmark_table(tmp_path, tmp_path) is None
-    assert fast_reference.drift_table(tmp_path, tmp_path) is None
+    assert reference_tables.benchmark_table(tmp_path, tmp_path) is None
+    assert reference_tables.drift_table(tmp_path, tmp_path) is None
 
 
 def test_the_map_has_every_place_and_the_worst_speaks(out: Path) -> None:
@@ -165,9 +165,9 @@ def test_intervals_cover_every_value_and_follow_ratios() -> None:
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    found = picture.find_chromium()
+    found = screenshot.find_chromium()
     if not found:
-        pytest.skip(f"no Chromium here: none of {', '.join(picture.BROWSER_NAMES)} is on the path")
+        pytest.skip(f"no Chromium here: none of {', '.join(screenshot.BROWSER_NAMES)} is on the path")
     with sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
         yield browser

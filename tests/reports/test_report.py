@@ -21,13 +21,13 @@ import numpy as np
 import pytest
 
 from plumbline.model.kinematics import quaternion_product
-from reports import junit, pack, page, payload, step_summary
+from reports import chunks, html_report, junit, report_data, step_summary
 from reports.history import History
 from reports.results import Results, replace_unprintable
 from reports.verdicts import VERDICT_STYLES, error_ratio, format_number, needs_attention, severity, worst_row
 from tests.helpers import example_results as fixture
 
-REPORTS = Path(page.__file__).parent
+REPORTS = Path(html_report.__file__).parent
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +37,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def text(out: Path) -> str:
-    return page.write(Results.load(out)).read_text(encoding="utf-8")
+    return html_report.write(Results.load(out)).read_text(encoding="utf-8")
 
 
 class Parsed(HTMLParser):
@@ -61,9 +61,9 @@ class Parsed(HTMLParser):
         self.words += "" if self.raw else data
 
 
-def chunks(text: str) -> dict[str, object]:
+def decoded_chunks(text: str) -> dict[str, object]:
     found = re.findall(r'<script type="application/octet-stream" id="chunk-([\w-]+)">([^<]*)</script>', text)
-    return {name: pack.decode_chunk(body) for name, body in found}
+    return {name: chunks.decode_chunk(body) for name, body in found}
 
 
 def test_the_sentence_counts_and_versions_come_first(out: Path, text: str) -> None:
@@ -125,7 +125,7 @@ def test_no_hostile_text_becomes_markup(text: str) -> None:
 
 
 def test_hostile_names_survive_in_the_data_and_in_links(out: Path, text: str) -> None:
-    data = chunks(text)
+    data = decoded_chunks(text)
     assert fixture.HOSTILE in data["index"]["scenarios"]  # type: ignore[index]
     links = [
         a["href"] for tag, a in Parsed(text).tags if tag == "a" and (a.get("href") or "").startswith("#")
@@ -161,28 +161,28 @@ def test_decimation_keeps_every_peak_and_every_gap() -> None:
     y[spikes[10:]] = 1e-9 * (1 + rng.random(10))
     y[7777] = np.nan
     t = np.linspace(0, 10, len(y))
-    small, times = pack.decimate(y, 300), pack.decimate_times(t, 300)
+    small, times = chunks.decimate(y, 300), chunks.decimate_times(t, 300)
     assert len(small) == len(times) <= 300
     assert np.nanmax(small) == np.nanmax(y) and np.nanmin(small) == np.nanmin(y)
-    edges = pack.bucket_edges(len(y), 300)
+    edges = chunks.bucket_edges(len(y), 300)
     for k, (a, b) in enumerate(pairwise(edges)):
         part = y[a:b]
         assert np.nanmax(small[2 * k : 2 * k + 2]) == np.nanmax(part)
         assert np.isnan(part).any() == np.isnan(small[2 * k : 2 * k + 2]).any()
         assert times[2 * k] == t[a] and times[2 * k + 1] == t[b - 1]
-    assert pack.decimate(y[:300], 300) is not None and len(pack.decimate(y[:300], 300)) == 300
+    assert chunks.decimate(y[:300], 300) is not None and len(chunks.decimate(y[:300], 300)) == 300
 
 
 def test_log_codes_keep_half_a_percent_and_tell_zero_from_nothing() -> None:
     y = np.array([0.0, np.nan, np.inf, 1e-300, 1e-17, 3.3e-9, -2.5, 1e80])
-    codes = pack.log_scale_codes(y).astype(float)
+    codes = chunks.log_scale_codes(y).astype(float)
     assert codes[:4].tolist() == [1, 0, 0, 2]
-    back = 10 ** ((codes[4:] - 2) / pack.STEPS_PER_DECADE + pack.LOWEST_DECADE)
+    back = 10 ** ((codes[4:] - 2) / chunks.STEPS_PER_DECADE + chunks.LOWEST_DECADE)
     assert np.allclose(back, np.abs(y[4:]), rtol=0.0024)
 
 
 def test_chunks_come_back_as_they_went_in() -> None:
-    packer = pack.ChunkBuilder()
+    packer = chunks.ChunkBuilder()
     arrays = [
         np.arange(7, dtype=np.uint8),
         np.linspace(-1, 1, 5, dtype=np.float32),
@@ -193,7 +193,7 @@ def test_chunks_come_back_as_they_went_in() -> None:
     header = {"a": [packer.add(a) for a in arrays], "text": "</script>ä", "none": None}
     chunk = packer.encode(header)
     assert re.fullmatch(r"[A-Za-z0-9+/=]+", chunk)
-    back = pack.decode_chunk(chunk)
+    back = chunks.decode_chunk(chunk)
     assert back["text"] == "</script>ä" and back["none"] is None
     for found, array in zip(back["a"], arrays, strict=True):
         assert np.array_equal(found, array)
@@ -202,7 +202,7 @@ def test_chunks_come_back_as_they_went_in() -> None:
 def test_a_difference_of_1e_9_survives_in_the_motion(out: Path, text: str) -> None:
     results = Results.load(out)
     poses, name = results.table("trajectories"), "double-tumbling"
-    motion = chunks(text)[f"scenario-{list(results.scenarios).index(name)}"]["motion"]  # type: ignore[index,call-overload]
+    motion = decoded_chunks(text)[f"scenario-{list(results.scenarios).index(name)}"]["motion"]  # type: ignore[index,call-overload]
     frames = len(motion["t"])
 
     def r(engine: str, integrator: str) -> np.ndarray:
@@ -224,7 +224,7 @@ def test_rotation_vectors_are_exact_for_tiny_and_large_angles() -> None:
         turned = quaternion_product(np.array([np.cos(angle / 2), *(np.sin(angle / 2) * axis)]), base)
         for sign in (1, -1):
             assert np.allclose(
-                payload.rotation_vector(sign * turned, base), angle * axis, rtol=1e-6, atol=2e-16
+                report_data.rotation_vector(sign * turned, base), angle * axis, rtol=1e-6, atol=2e-16
             )
 
 
@@ -233,7 +233,7 @@ def test_the_first_crossing_is_of_the_undecimated_curve(out: Path, text: str) ->
     curves = results.table("curves")
     seen = 0
     for k, name in enumerate(results.scenarios):
-        for one in chunks(text)[f"scenario-{k}"]["curves"]:  # type: ignore[index,call-overload]
+        for one in decoded_chunks(text)[f"scenario-{k}"]["curves"]:  # type: ignore[index,call-overload]
             mine = (
                 (curves["scenario"] == name)
                 & (curves["engine"] == one["engine"])
@@ -253,7 +253,7 @@ def test_the_first_crossing_is_of_the_undecimated_curve(out: Path, text: str) ->
 
 def test_commands_are_quoted_for_a_shell() -> None:
     row = {"scenario": "x'; rm -rf ~ #", "engine": "mujoco", "level": "invariants", "quantity": "order"}
-    assert shlex.split(payload.rerun_command(row, {"file": ""}))[4:] == [
+    assert shlex.split(report_data.rerun_command(row, {"file": ""}))[4:] == [
         "x'; rm -rf ~ #",
         "--engine",
         "mujoco",
@@ -261,13 +261,13 @@ def test_commands_are_quoted_for_a_shell() -> None:
         "trajectory",
     ]
     row["scenario"] = "--out"
-    assert shlex.split(payload.rerun_command(row, {"file": ""}))[-2:] == ["--", "--out"]
-    assert "'my own.yaml'" in payload.rerun_command(row, {"file": "my own.yaml"})
+    assert shlex.split(report_data.rerun_command(row, {"file": ""}))[-2:] == ["--", "--out"]
+    assert "'my own.yaml'" in report_data.rerun_command(row, {"file": "my own.yaml"})
     row |= {"scenario": "rest", "quantity": "energy_drift_long", "extra": {"asked": 100.0}}
     nightly = "python -m plumbline nightly rest --engine mujoco --random 0 --no-self-test"
-    assert payload.rerun_command(row, {"file": ""}) == nightly
+    assert report_data.rerun_command(row, {"file": ""}) == nightly
     row["extra"] = {"asked": 12.5}
-    assert payload.rerun_command(row, {"file": ""}) == f"{nightly} --long-run-seconds 12.5"
+    assert report_data.rerun_command(row, {"file": ""}) == f"{nightly} --long-run-seconds 12.5"
 
 
 def test_numbers_read_as_people_write_them() -> None:
@@ -280,12 +280,12 @@ def test_the_default_catalogue_stays_under_2_megabytes(
 ) -> None:
     out = fixture.build(tmp_path / "big", hostile=False, scenarios=30, samples=200)
     began = time.perf_counter()
-    size = page.write(Results.load(out)).stat().st_size
+    size = html_report.write(Results.load(out)).stat().st_size
     took = time.perf_counter() - began
     record_property("bytes", size)  # type: ignore[operator]
     record_property("seconds", took)  # type: ignore[operator]
     print(f"30 scenarios: {size:,} bytes in {took:.2f} s")
-    assert size <= page.MAX_PAGE_BYTES
+    assert size <= html_report.MAX_PAGE_BYTES
 
 
 def test_a_night_of_thousands_of_scenarios_stays_under_8_megabytes(out: Path, tmp_path: Path) -> None:
@@ -302,9 +302,9 @@ def test_a_night_of_thousands_of_scenarios_stays_under_8_megabytes(out: Path, tm
     late |= {"verdict": "disagrees", "known_issue": None, "reason": "the needle"}
     (tmp_path / "results.json").write_text(json.dumps(stored))
     began = time.perf_counter()
-    text = page.write(Results.load(tmp_path)).read_text()
+    text = html_report.write(Results.load(tmp_path)).read_text()
     print(f"{len(stored['rows']):,} rows: {len(text):,} bytes in {time.perf_counter() - began:.1f} s")
-    assert len(text.encode()) <= page.MAX_NIGHTLY_PAGE_BYTES
+    assert len(text.encode()) <= html_report.MAX_NIGHTLY_PAGE_BYTES
     assert "random-2499" in text and "the needle" in text
     assert "2000 more scenarios are not in this page" in text
     assert "those with anything unexpected are all here" in text
@@ -313,12 +313,12 @@ def test_a_night_of_thousands_of_scenarios_stays_under_8_megabytes(out: Path, tm
 
 def test_a_page_above_its_budget_has_fewer_points(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     results = Results.load(out)
-    whole = page.render(results, History())
-    monkeypatch.setattr(page, "MAX_PAGE_BYTES", len(whole.encode()) - 30_000)
-    smaller = page.render(results, History())
-    assert len(smaller.encode()) <= page.MAX_PAGE_BYTES
-    few = chunks(smaller)["scenario-0"]["curves"]  # type: ignore[index,call-overload]
-    assert few is None or len(few[0]["t"]) < len(chunks(whole)["scenario-0"]["curves"][0]["t"])  # type: ignore[index,call-overload]
+    whole = html_report.render(results, History())
+    monkeypatch.setattr(html_report, "MAX_PAGE_BYTES", len(whole.encode()) - 30_000)
+    smaller = html_report.render(results, History())
+    assert len(smaller.encode()) <= html_report.MAX_PAGE_BYTES
+    few = decoded_chunks(smaller)["scenario-0"]["curves"]  # type: ignore[index,call-overload]
+    assert few is None or len(few[0]["t"]) < len(decoded_chunks(whole)["scenario-0"]["curves"][0]["t"])  # type: ignore[index,call-overload]
 
 
 def test_a_history_says_what_is_new_and_skips_a_damaged_night(out: Path, tmp_path: Path) -> None:
@@ -329,13 +329,13 @@ def test_a_history_says_what_is_new_and_skips_a_damaged_night(out: Path, tmp_pat
     assert history.last_passed is history.nights[-2]
     fresh = {row["key"] for row in results.rows if history.is_new(row)}
     assert fresh == {row["key"] for row in results.rows if row["verdict"] in ("disagrees", "failed")}
-    data = chunks(page.render(results, history))
+    data = decoded_chunks(html_report.render(results, history))
     table = data["history"]["verdict"].reshape(len(results.rows), 5)  # type: ignore[index,call-overload]
     for line, row in zip(table, results.rows, strict=True):
         assert list(VERDICT_STYLES)[line[-1] - 1] == row["verdict"]
         if row["key"] in fresh:
             assert list(VERDICT_STYLES)[line[0] - 1] == "agrees"
-    words = Parsed(page.render(results, history)).words
+    words = Parsed(html_report.render(results, history)).words
     assert re.search(rf"{len(fresh)}\s+newly failing", words) and "Skipped as damaged: 2026-11-02" in words
 
 
@@ -349,7 +349,7 @@ def test_a_run_of_the_state_level_alone_has_a_page(out: Path, tmp_path: Path) ->
     del stored["run"]["truth"]
     (few / "results.json").write_text(json.dumps(stored))
     shutil.copy(out / "states.parquet", few)
-    data = chunks(page.write(Results.load(few)).read_text())
+    data = decoded_chunks(html_report.write(Results.load(few)).read_text())
     assert data["scenario-0"]["curves"] == [] and data["scenario-0"]["motion"] is None  # type: ignore[index,call-overload]
 
 
@@ -359,7 +359,7 @@ def test_gaps_of_one_reason_are_one_finding(out: Path) -> None:
     rows = [{**gap, "known_issue": None, "scenario": f"s{k}"} for k in range(9)]
     rows += [{**gap, "known_issue": None, "scenario": "s0", "quantity": "energy"}]
     rows += [{**gap, "known_issue": None, "scenario": "s1", "reason": "another"}]
-    first, second = page._unexpected_findings(rows)
+    first, second = html_report._unexpected_findings(rows)
     assert (len(first["scenarios"]), first["more"]) == (8, 1) and first["row"]["scenario"] not in first[
         "scenarios"
     ]
@@ -370,7 +370,7 @@ def test_a_report_that_cannot_be_written_leaves_the_old_one(
     out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     copy = shutil.copytree(out, tmp_path / "copy")
-    old = page.write(Results.load(copy)).read_bytes()
+    old = html_report.write(Results.load(copy)).read_bytes()
 
     def full(descriptor: int) -> None:
         os.ftruncate(descriptor, 1000)
@@ -378,7 +378,7 @@ def test_a_report_that_cannot_be_written_leaves_the_old_one(
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space"):
-        page.write(Results.load(copy))
+        html_report.write(Results.load(copy))
     assert (copy / "report.html").read_bytes() == old
     assert [p.name for p in copy.iterdir() if p.name.startswith(".")] == []
 
@@ -436,5 +436,7 @@ def test_the_pages_own_script_is_linted() -> None:
 
 
 def test_vendored_uplot_comes_with_its_licence(text: str) -> None:
-    assert "uPlot" in page.bundle_script() and "Copyright (c) 2022 Leon Sorokin" in Parsed(text).words
-    assert not re.search(r"\bfetch\(|XMLHttpRequest|WebSocket|EventSource|sendBeacon", page.bundle_script())
+    assert "uPlot" in html_report.bundle_script() and "Copyright (c) 2022 Leon Sorokin" in Parsed(text).words
+    assert not re.search(
+        r"\bfetch\(|XMLHttpRequest|WebSocket|EventSource|sendBeacon", html_report.bundle_script()
+    )

@@ -12,8 +12,8 @@ from urllib.parse import urlencode
 
 import pytest
 
-from reports import page as report
-from reports import picture
+from reports import html_report as report
+from reports import screenshot
 from reports.results import Results
 from tests.helpers import example_results as fixture
 
@@ -39,9 +39,9 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    found = picture.find_chromium()
+    found = screenshot.find_chromium()
     if not found:
-        pytest.skip(f"no Chromium here: none of {', '.join(picture.BROWSER_NAMES)} is on the path")
+        pytest.skip(f"no Chromium here: none of {', '.join(screenshot.BROWSER_NAMES)} is on the path")
     with sync_api.sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
         yield browser
@@ -451,4 +451,4 @@ def test_a_narrow_screen_does_not_scroll_sideways(open_page: Open) -> None:
 def test_the_picture_for_the_readme_is_of_the_report(chromium: Any, out: Path, tmp_path: Path) -> None:
     context = chromium.new_context()  # the fixture's browser proves that there is one
     context.close()
-    assert picture.find_chromium() is not None
+    assert screenshot.find_chromium() is not None

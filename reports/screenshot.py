@@ -1,4 +1,4 @@
-"""A picture of a report, for the README: `python -m reports.picture OUT/report.html PICTURE.png [#view]`."""
+"""A picture of a report, for the README: `python -m reports.screenshot OUT/report.html PICTURE.png [#view]`."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from plumbline.storage.results_store import write_atomically
-from reports import fast_reference, payload
+from reports import reference_tables, report_data
 from reports.history import History
 from reports.results import Record, Results
 from reports.verdicts import (
@@ -76,14 +76,14 @@ def render(results: Results, history: History) -> str:
     shown = results.restricted_to(_scenarios_to_show(results))
     tables = {k: shown.table_by_scenario(k) for k in ("states", "curves", "trajectories")}
     chunks = {
-        "index": payload.index_chunk(shown, history),
-        "convergence": payload.convergence_chunk(shown),
+        "index": report_data.index_chunk(shown, history),
+        "convergence": report_data.convergence_chunk(shown),
     }
     if history.nights:
-        chunks["history"] = payload.history_chunk(shown, history)
+        chunks["history"] = report_data.history_chunk(shown, history)
     for points in (*CURVE_POINTS, 0):
         for k, name in enumerate(shown.scenarios):
-            chunks[f"scenario-{k}"] = payload.scenario_chunk(name, shown, tables, points)
+            chunks[f"scenario-{k}"] = report_data.scenario_chunk(name, shown, tables, points)
         html = _render_template(results, shown, history, chunks, points)
         if len(html.encode()) <= budget:
             break
@@ -127,8 +127,8 @@ def _render_template(
             comparison=_changes_since_last_passed(results, history),
             damaged=history.unreadable,
             nights=len(history.nights),
-            drifts=fast_reference.drift_table(results.folder),
-            benchmarks=fast_reference.benchmark_table(results.folder),
+            drifts=reference_tables.drift_table(results.folder),
+            benchmarks=reference_tables.benchmark_table(results.folder),
             decimated=points,
             notice=(REPORTS_FOLDER / "assets" / "vendor" / "uPlot.LICENSE").read_text(encoding="utf-8"),
             rendered=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),

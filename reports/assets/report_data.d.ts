@@ -1,4 +1,4 @@
-// What reports/payload.py writes and the page reads.
+// What reports/report_data.py writes and the page reads.
 
 export interface Index {
   scenarios: string[]; families: string[]; titles: string[]; engines: string[]; engine_titles: string[];

@@ -12,8 +12,8 @@ import numpy as np
 
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product
+from reports.chunks import ChunkBuilder, decimate, decimate_times, log_scale_codes
 from reports.history import History
-from reports.pack import ChunkBuilder, decimate, decimate_times, log_scale_codes
 from reports.results import Columns, Record, Results, group_rows
 from reports.verdicts import VERDICT_STYLES, error_ratio, severity
 
