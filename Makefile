@@ -33,7 +33,7 @@ nightly: .venv/test.done  ## the full matrix with random scenarios, then the lon
 	$(PYTHON) -m pytest -n 2 --dist loadgroup -m full
 
 bench: .venv/test.done  ## right-hand sides and work-precision beside the engines, as ratios within one run
-	$(PYTHON) -m bench.figures
+	$(PYTHON) -m bench.summary
 
 mutants: .venv/mutation.done  ## do the tests notice mistakes? a sample; MUTANTS="--jobs 2" tries all
 	$(PYTHON) -m tools.mutation reference_impl judging $(MUTANTS)

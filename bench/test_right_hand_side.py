@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bench import contenders
-from bench.alternate import time_interleaved
+from bench import right_hand_sides
+from bench.interleaved_timing import time_interleaved
 
 BODIES = (1, 2, 10, 100, 1000, 10_000)
 
@@ -23,21 +23,21 @@ def record_table(benchmark: Any, table: dict[str, Any]) -> None:
 @pytest.mark.parametrize("bodies", BODIES)
 def test_single(benchmark: Any, bodies: int, rods: bool) -> None:
     """Chains of balls or rods, one state."""
-    model, state = contenders.random_pendulum(bodies, rods)
-    calls = {"reference": contenders.structured_call(model, state)}
+    model, state = right_hand_sides.random_pendulum(bodies, rods)
+    calls = {"reference": right_hand_sides.structured_call(model, state)}
     per_call = dict.fromkeys(("reference", "direct", "superlu", "dense", "mujoco", "pinocchio"), 1)
     if bodies <= 1000:
-        S, b, direct = contenders.direct_call(model, state)
-        calls |= {"direct": direct, "superlu": contenders.superlu_call(S, b)}
+        S, b, direct = right_hand_sides.direct_call(model, state)
+        calls |= {"direct": direct, "superlu": right_hand_sides.superlu_call(S, b)}
         if bodies <= 100:  # Pinocchio's data takes 7 GB at 200 bodies
             calls |= {
-                "dense": contenders.dense_call(S, b),
-                "pinocchio": contenders.pinocchio_aba_call(model, state),
+                "dense": right_hand_sides.dense_call(S, b),
+                "pinocchio": right_hand_sides.pinocchio_aba_call(model, state),
             }
     if bodies <= 300:
-        calls["mujoco"] = contenders.mujoco_forward_call(model, state)
+        calls["mujoco"] = right_hand_sides.mujoco_forward_call(model, state)
     if bodies <= 100:
-        calls["exudyn step"], per_call["exudyn step"] = contenders.exudyn_steps_call(model, state)
+        calls["exudyn step"], per_call["exudyn step"] = right_hand_sides.exudyn_steps_call(model, state)
     timing = benchmark.pedantic(time_interleaved, args=(calls,), rounds=1, iterations=1)
     ours = timing["reference"]
     record_table(
@@ -56,11 +56,11 @@ def test_single(benchmark: Any, bodies: int, rods: bool) -> None:
 @pytest.mark.parametrize("bodies", [1, 2])
 def test_batch(benchmark: Any, bodies: int, batch: int) -> None:
     """Many states of one pendulum in a call, per state."""
-    model, state = contenders.random_pendulum(bodies)
+    model, state = right_hand_sides.random_pendulum(bodies)
     calls = {
-        "reference": contenders.structured_call(model, state, batch),
-        "mujoco": contenders.mujoco_forward_call(model, state),
-        "pinocchio": contenders.pinocchio_aba_call(model, state),
+        "reference": right_hand_sides.structured_call(model, state, batch),
+        "mujoco": right_hand_sides.mujoco_forward_call(model, state),
+        "pinocchio": right_hand_sides.pinocchio_aba_call(model, state),
     }
     timing = benchmark.pedantic(time_interleaved, args=(calls,), rounds=1, iterations=1)
     ours = timing["reference"]
@@ -80,7 +80,9 @@ def test_batch(benchmark: Any, bodies: int, batch: int) -> None:
 def test_growth(benchmark: Any, rods: bool) -> None:
     """The cost exponent between 100 and 10,000 bodies, from alternating rounds of both."""
     sizes = (100, 1000, 10_000)
-    calls = {str(n): contenders.structured_call(*contenders.random_pendulum(n, rods)) for n in sizes}
+    calls = {
+        str(n): right_hand_sides.structured_call(*right_hand_sides.random_pendulum(n, rods)) for n in sizes
+    }
     timing = benchmark.pedantic(time_interleaved, args=(calls,), rounds=1, iterations=1)
     slope = np.log(timing["10000"].ratio_to(timing["100"])) / np.log(100)
     last = np.log10(timing["10000"].ratio_to(timing["1000"]))

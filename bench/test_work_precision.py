@@ -11,7 +11,7 @@ import pytest
 from adapters.exudyn_engine import Exudyn
 from adapters.mujoco_engine import Mujoco
 from adapters.pinocchio_engine import Pinocchio
-from bench import precision
+from bench import work_precision
 from bench.test_right_hand_side import record_table
 from plumbline.model.datatypes import Model, State
 from plumbline.model.kinematics import state_from_minimal
@@ -45,23 +45,25 @@ def perturbed_pendulums(count: int) -> tuple[Model, list[State]]:
 def test_work_precision(benchmark: Any, batch: int) -> None:
     """The reference's curve beside every integrator of the engines."""
     model, states = perturbed_pendulums(batch)
-    expected = precision.reference_positions(model, states)
+    expected = work_precision.reference_positions(model, states)
 
-    def everyone() -> dict[str, list[precision.WorkPrecisionPoint]]:
-        curves = {"reference collocation": precision.collocation_curve(model, states, expected)}
+    def everyone() -> dict[str, list[work_precision.WorkPrecisionPoint]]:
+        curves = {"reference collocation": work_precision.collocation_curve(model, states, expected)}
         if batch == 1:
-            curves["reference DOP853, structured"] = precision.dop853_curve(model, states, expected, True)
-            curves["reference DOP853, direct"] = precision.dop853_curve(model, states, expected, False)
+            curves["reference DOP853, structured"] = work_precision.dop853_curve(
+                model, states, expected, True
+            )
+            curves["reference DOP853, direct"] = work_precision.dop853_curve(model, states, expected, False)
         for engine, integrator, longest in ENGINE_INTEGRATORS if batch == 1 else ENGINE_INTEGRATORS[:1]:
             name = f"{engine.name} {integrator}"
-            curves[name] = precision.fixed_step_curve(
+            curves[name] = work_precision.fixed_step_curve(
                 engine(), integrator, model, states, expected, longest if batch == 1 else 20.0
             )
         return curves
 
     curves = benchmark.pedantic(everyone, rounds=1, iterations=1)
     costs = {
-        name: {f"{e:g}": precision.cost_at_error(points, e) for e in ERRORS}
+        name: {f"{e:g}": work_precision.cost_at_error(points, e) for e in ERRORS}
         for name, points in curves.items()
     }
     engines = [name for name in curves if not name.startswith("reference")]

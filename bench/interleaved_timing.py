@@ -1,4 +1,4 @@
-"""Timing of several contenders in turn, so that a busy machine is busy for all of them."""
+"""Timing of several calls in turn, so that other load on the machine affects all of them alike."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Timing:
-    """CPU seconds per call of one contender, round by round."""
+    """CPU time of one call [s], round by round."""
 
     rounds: tuple[float, ...]
 
@@ -26,15 +26,25 @@ class Timing:
 
 
 def time_interleaved(
-    contenders: Mapping[str, Callable[[], object]], rounds: int = 9, min_seconds: float = 0.02
+    calls: Mapping[str, Callable[[], object]], rounds: int = 9, min_seconds: float = 0.02
 ) -> dict[str, Timing]:
-    """Time every contender once per round, for at least ``least`` s of CPU each, in alternating order."""
-    calls = {name: _calls_to_fill(call, min_seconds) for name, call in contenders.items()}
-    times: dict[str, list[float]] = {name: [] for name in contenders}
+    """Time every call once per round, in alternating order, so that a busy machine slows all of them alike.
+
+    Args:
+        calls: what is timed, by name.
+        rounds: number of rounds.
+        min_seconds: CPU time [s] that one timing takes at least; short calls are repeated.
+
+    Returns:
+        The CPU time of one call in each round, by name.
+
+    """
+    repeats = {name: _repeats_to_fill(call, min_seconds) for name, call in calls.items()}
+    times: dict[str, list[float]] = {name: [] for name in calls}
     for turn in range(rounds):
-        names = list(contenders)
+        names = list(calls)
         for name in names if turn % 2 else reversed(names):
-            call, count = contenders[name], calls[name]
+            call, count = calls[name], repeats[name]
             start = process_time()
             for _ in range(count):
                 call()
@@ -42,8 +52,8 @@ def time_interleaved(
     return {name: Timing(tuple(spent)) for name, spent in times.items()}
 
 
-def _calls_to_fill(call: Callable[[], object], min_seconds: float) -> int:
-    """How many calls fill ``least`` seconds."""
+def _repeats_to_fill(call: Callable[[], object], min_seconds: float) -> int:
+    """Return how many repeats take at least half of ``min_seconds``, scaled to all of it."""
     count = 1
     while True:
         start = process_time()

@@ -1,4 +1,4 @@
-"""`python -m bench.figures [FILE.json [FOLDER]]`: the goals with what was measured, and the picture.
+"""`python -m bench.summary [FILE.json [FOLDER]]`: the goals with what was measured, and the picture.
 
 Reads what pytest-benchmark stored, or runs it where no file is given (several minutes; then the folder is
 reports/out, where `python -m plumbline report` shows the figures).  Writes figures.json and the pictures into
