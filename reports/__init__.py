@@ -1,4 +1,8 @@
-"""From stored results to HTML, JUnit and Markdown."""
+"""The pages of a stored run: report.html, junit.xml and summary.md; and sweep.html of a sweep.
+
+Input: an output folder as `plumbline.storage` writes it, and the folder of earlier nights.
+Output: files in the output folder. Nothing is computed anew and no engine runs.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,19 @@ from pathlib import Path
 
 
 def write(folder: Path, history: Path | None = None) -> Path:
-    """Write report.html, junit.xml and summary.md of the results in ``folder``; returns the report's path.
+    """Write report.html, junit.xml and summary.md of a stored run.
 
-    Raises OSError or ValueError where results.json cannot be read or a file cannot be written.
+    Args:
+        folder: output folder of the run.
+        history: folder of earlier nights, or None.
+
+    Returns:
+        The path of report.html.
+
+    Raises:
+        OSError: a file cannot be read or written.
+        ValueError: results.json is missing or damaged.
+
     """
     from reports import html_report, junit, step_summary
     from reports.results import Results

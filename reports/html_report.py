@@ -15,63 +15,63 @@ from urllib.parse import urlencode
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
+from plumbline.judging.rows import VERDICT_STYLES
 from plumbline.storage.results_store import write_atomically
 from reports import reference_tables, report_data
 from reports.history import History
 from reports.results import Record, Results
 from reports.verdicts import (
-    VERDICT_STYLES,
     count_all_verdicts,
+    css_class,
     error_ratio,
     format_number,
     needs_attention,
+    rank,
     severity,
-    worst_row,
+    unexpected_rows,
 )
 
 REPORTS_FOLDER = Path(__file__).parent
 SCRIPT_MODULES = (
-    "chunks",
-    "text",
-    "route",
-    "plot",
-    "matrix",
-    "curves",
-    "motion",
-    "detail",
-    "cost",
-    "trend",
-    "main",
-)
+    "chunks", "text", "route", "plot", "matrix", "curves", "motion", "detail", "cost", "trend", "main"
+)  # fmt: skip
 MAX_PAGE_BYTES = 2_000_000  # bytes, for the default catalogue
 MAX_NIGHTLY_PAGE_BYTES = 8_000_000  # bytes, with a history or more than 60 scenarios
-CURVE_POINTS = (
-    360,
-    240,
-    160,
-    100,
-    60,
-)  # samples per curve, tried in turn until the page is within its budget
+CURVE_POINTS = (360, 240, 160, 100, 60)  # values per curve, tried in turn until the page is within its budget
 MAX_SCENARIOS = 500  # scenarios in the page at most
 MAX_FINDINGS = 60  # findings written out in the static page
 
 
 def write(results: Results, history: Path | None = None) -> Path:
-    """Render report.html beside the stored results (and earlier runs in ``history``); returns its path.
+    """Write report.html beside the stored results.
 
-    Raises OSError where the page cannot be written.
+    Args:
+        results: the run.
+        history: folder of earlier nights, or None.
+
+    Returns:
+        The page's path.
+
+    Raises:
+        OSError: the page cannot be written.
+
     """
-    return write_page(results.folder / "report.html", render(results, History.load(history, results)))
-
-
-def write_page(path: Path, html: str) -> Path:
-    """Write a page whole or not at all."""
-    write_atomically(path, html.encode())
+    path = results.folder / "report.html"
+    write_atomically(path, render(results, History.load(history, results)).encode())
     return path
 
 
 def render(results: Results, history: History) -> str:
-    """The page as text, with as many points per curve as its budget allows."""
+    """Render the page, with as many points per curve as its size limit allows.
+
+    Args:
+        results: the run.
+        history: earlier runs.
+
+    Returns:
+        HTML.
+
+    """
     budget = MAX_NIGHTLY_PAGE_BYTES if history.nights or len(results.scenarios) > 60 else MAX_PAGE_BYTES
     shown = results.restricted_to(_scenarios_to_show(results))
     tables = {k: shown.table_by_scenario(k) for k in ("states", "curves", "trajectories")}
@@ -91,9 +91,9 @@ def render(results: Results, history: History) -> str:
 
 
 def _scenarios_to_show(results: Results) -> set[str]:
-    """The scenarios that the page has room for: those with anything unexpected first, then as they come."""
-    worrying = dict.fromkeys(row["scenario"] for row in results.rows if needs_attention(row))
-    return set([*worrying, *(name for name in results.scenarios if name not in worrying)][:MAX_SCENARIOS])
+    """Select the scenarios of the page: the unexpected ones first, then in the order of the run."""
+    unexpected = (row["scenario"] for row in results.rows if needs_attention(row))
+    return set(list(dict.fromkeys([*unexpected, *results.scenarios]))[:MAX_SCENARIOS])
 
 
 def _render_template(
@@ -109,12 +109,11 @@ def _render_template(
             run=results.run,
             policy=content_security_policy(style, script),
             script=Markup(script),
-            style=Markup(style),
+            css=Markup(style),
             chunks=chunks,
-            marks=VERDICT_STYLES,
             counts=count_all_verdicts(results),
             total=count_all_verdicts(results).total(),
-            probes=_random_scenario_summary(results),
+            random_batch=_random_scenario_summary(results),
             engines=results.engines,
             families=_matrix_by_family(shown),
             unshown=len(unshown),
@@ -122,8 +121,7 @@ def _render_template(
             attention=attention[:MAX_FINDINGS],
             unlisted=len(attention) - MAX_FINDINGS,
             expected=_known_findings(results.rows),
-            ratio=error_ratio,
-            link=lambda row: cell_link(row["scenario"], row["engine"], row),
+            link=_row_link,
             comparison=_changes_since_last_passed(results, history),
             damaged=history.unreadable,
             nights=len(history.nights),
@@ -136,16 +134,14 @@ def _render_template(
     )
 
 
-def cell_link(scenario: str, engine: str, row: Record | None = None) -> str:
-    """The link to a cell (and to one row in it), as the page's ``route.js`` reads it."""
-    fields = {"scenario": scenario, "engine": engine}
-    if row:
-        fields["row"] = "/".join((row["level"], row["integrator"], row["quantity"]))
-    return "#" + urlencode(fields)
+def _row_link(row: Record) -> str:
+    """Return the link to a row in its cell, as ``route.js`` reads it."""
+    place = "/".join((row["level"], row["integrator"], row["quantity"]))
+    return "#" + urlencode({"scenario": row["scenario"], "engine": row["engine"], "row": place})
 
 
 def _matrix_by_family(results: Results) -> dict[str, Any]:
-    """Matrix by family: per scenario and engine the row that speaks for the cell, and how many there are."""
+    """Arrange the matrix by family: for each scenario and engine the row that stands for the cell."""
     cells: dict[tuple[str, str], list[Record]] = {}
     for row in results.rows:
         cells.setdefault((row["scenario"], row["engine"]), []).append(row)
@@ -155,15 +151,13 @@ def _matrix_by_family(results: Results) -> dict[str, Any]:
         for engine in results.engines:
             rows = cells.get((name, engine))
             if rows:
-                speaker = worst_row(rows)
+                worst = max(rows, key=rank)
                 line[engine] = {
-                    "row": speaker,
-                    "mark": VERDICT_STYLES[speaker["verdict"]],
-                    "ratio": error_ratio(speaker),
-                    "count": len(rows),
+                    "row": worst,
+                    "ratio": error_ratio(worst),
                     "known": sum(r.get("known_issue") is not None for r in rows),
-                    "link": cell_link(name, engine),
-                    "track": ratio_position(error_ratio(speaker)),
+                    "link": "#" + urlencode({"scenario": name, "engine": engine}),
+                    "track": _ratio_position(error_ratio(worst)),
                 }
         family = families.setdefault(scenario["family"], {"lines": [], "summary": {}})
         family["lines"].append({"name": name, "scenario": scenario, "cells": line, "place": place})
@@ -175,20 +169,20 @@ def _matrix_by_family(results: Results) -> dict[str, Any]:
     return families
 
 
-def ratio_position(quotient: float | None) -> float | None:
-    """Where error over tolerance stands on a cell's log scale, 0 (≤ 1e-4) … 96 (≥ 1e4), 48 the tolerance."""
-    if quotient is None:
+def _ratio_position(ratio: float | None) -> float | None:
+    """Place an error over tolerance on a cell's log scale: 0 (≤ 1e-4) … 48 (the tolerance) … 96 (≥ 1e4)."""
+    if ratio is None:
         return None
-    return round(min(max((math.log10(max(quotient, 1e-30)) + 4) * 12, 0), 96), 1)
+    return round(min(max((math.log10(max(ratio, 1e-30)) + 4) * 12, 0), 96), 1)
 
 
 def _unexpected_findings(rows: list[Record]) -> list[Record]:
-    """What nobody expected, worst first: an entry per cell and verdict, gaps of one reason together.
+    """Group the rows that need attention: an entry per cell and verdict, gaps of one reason together.
 
-    Each has its worst row, how many more rows there are and the other scenarios they are in.
+    An entry has its worst row, the number of other rows and the other scenarios in which they are.
     """
     found: dict[tuple[str, ...], Record] = {}
-    for row in sorted(filter(needs_attention, rows), key=lambda r: (-severity(r), -(error_ratio(r) or 0.0))):
+    for row in unexpected_rows(rows):
         gap = row["verdict"] == "unsupported"
         key = (row["engine"], row["verdict"], row["reason"] if gap else row["scenario"])
         entry = found.setdefault(key, {"row": row, "more": -1, "scenarios": {}})
@@ -201,20 +195,12 @@ def _unexpected_findings(rows: list[Record]) -> list[Record]:
 
 
 def _known_findings(rows: list[Record]) -> list[Record]:
-    """Recorded discrepancies and gaps by entry of known.yaml: how many rows, and one of them as example."""
+    """Group the rows of known issues by entry of known_issues.yaml, with one of them as example."""
     found: dict[str, Record] = {}
     for row in rows:
         if row.get("known_issue"):
             entry = found.setdefault(
-                row["known_issue"],
-                {
-                    "id": row["known_issue"],
-                    "row": row,
-                    "count": 0,
-                    "engines": {},
-                    "scenarios": {},
-                    "mark": VERDICT_STYLES[row["verdict"]],
-                },
+                row["known_issue"], {"row": row, "count": 0, "engines": {}, "scenarios": {}}
             )
             entry["count"] += 1
             entry["engines"][row["engine"]] = entry["scenarios"][row["scenario"]] = None
@@ -222,40 +208,48 @@ def _known_findings(rows: list[Record]) -> list[Record]:
 
 
 def _changes_since_last_passed(results: Results, history: History) -> Record | None:
-    """What changed since the last green run; None without a history."""
-    green = history.last_passed
+    """Count the changes since the last run that passed; None without a history."""
+    passed = history.last_passed
     if not history.nights:
         return None
-    if green is None:
-        return {"green": None}
+    if passed is None:
+        return {"passed": None}
     keys = {row["key"] for row in results.rows}
-    before, now = green.run.get("versions") or {}, results.run.get("versions") or {}
+    before, now = passed.run.get("versions") or {}, results.run.get("versions") or {}
     return {
-        "green": green.run,
-        "fresh": sum(history.is_new(row) for row in results.rows),
-        "healed": sum(
-            row["verdict"] == "agrees" and green.rows.get(row["key"], row)["verdict"] != "agrees"
+        "passed": passed.run,
+        "newly_failing": sum(history.is_new(row) for row in results.rows),
+        "newly_agreeing": sum(
+            row["verdict"] == "agrees" and passed.rows.get(row["key"], row)["verdict"] != "agrees"
             for row in results.rows
         ),
-        "gone": len(green.rows.keys() - keys),
-        "added": len(keys - green.rows.keys()),
+        "gone": len(passed.rows.keys() - keys),
+        "added": len(keys - passed.rows.keys()),
         "versions": [(e, before.get(e, "–"), v) for e, v in now.items() if before.get(e) != v],
     }
 
 
 def _random_scenario_summary(results: Results) -> Record | None:
-    """What the random scenarios came to: how many, and the worst error over bound by quantity and engine."""
-    said = results.run["random_batch"]
-    if not said:
+    """Summarise the random scenarios: how many, and the worst error over bound by quantity and engine."""
+    batch = results.run["random_batch"]
+    if not batch:
         return None
     worst: dict[str, dict[str, Record]] = {}
-    for cell in said["worst_ratios"]:
+    for cell in batch["worst_ratios"]:
         worst.setdefault(cell["quantity"], {})[cell["engine"]] = cell
-    return {"scenarios": said["scenarios"], "worst": worst}
+    return {"scenarios": batch["scenarios"], "worst": worst}
 
 
 def bundle_script() -> str:
-    """The page's own modules and uPlot as one classic script: import lines dropped, ``export`` taken off."""
+    """Join uPlot and the page's modules into one classic script, without their import and export keywords.
+
+    Returns:
+        JavaScript.
+
+    Raises:
+        ValueError: two modules use a name, or the script contains the end of a script element.
+
+    """
     parts = [(REPORTS_FOLDER / "assets" / "vendor" / "uPlot.iife.min.js").read_text(encoding="utf-8")]
     names: list[str] = []  # they share one scope, so each must be there once
     for name in SCRIPT_MODULES:
@@ -273,7 +267,12 @@ def bundle_script() -> str:
 
 
 def template_environment() -> Environment:
-    """The templates, with everything escaped and nothing undefined let through."""
+    """Load the templates; every value is escaped and an undefined one is an error.
+
+    Returns:
+        The environment, with the filters and verdict styles that the templates use.
+
+    """
     made = Environment(
         loader=FileSystemLoader(REPORTS_FOLDER / "templates"),
         autoescape=True,
@@ -281,12 +280,27 @@ def template_environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    made.filters |= {"number": format_number, "when": _format_time, "seconds": _format_duration}
+    made.filters |= {
+        "number": format_number,
+        "when": _format_time,
+        "seconds": _format_duration,
+        "css_class": css_class,
+    }
+    made.globals["verdict_styles"] = VERDICT_STYLES
     return made
 
 
 def content_security_policy(style: str, script: str | None = None) -> str:
-    """The Content-Security-Policy of a page with this style and at most this script: no request, no other."""
+    """Return the Content-Security-Policy of a page: no request, and no style or script but its own.
+
+    Args:
+        style: content of the style element.
+        script: content of the script element; None for none.
+
+    Returns:
+        The policy.
+
+    """
     sources = ["default-src 'none'", f"style-src {_csp_hash(style)}", "img-src data:"]
     if script is not None:
         sources.insert(1, f"script-src {_csp_hash(script)}")
@@ -294,7 +308,12 @@ def content_security_policy(style: str, script: str | None = None) -> str:
 
 
 def stylesheet() -> str:
-    """The style of uPlot and the pages' own."""
+    """Join uPlot's style and the pages' own.
+
+    Returns:
+        CSS.
+
+    """
     vendor = (REPORTS_FOLDER / "assets" / "vendor" / "uPlot.min.css").read_text(encoding="utf-8")
     return vendor + (REPORTS_FOLDER / "assets" / "style.css").read_text(encoding="utf-8")
 

@@ -11,11 +11,17 @@ from reports.verdicts import format_number, needs_attention
 
 
 def write(results: Results) -> Path:
-    """Write junit.xml beside the stored results; returns its path.
+    """Write junit.xml beside the stored results: a suite per scenario, a test case per row.
 
-    A suite per scenario, a case per row.  What nobody expected is a failure (a disagreement, a gap
-    that is not recorded) or an error (the engine failed); what is recorded, and an engine that is not
-    installed, is skipped with its reason.
+    An unexpected row is a failure (a disagreement, a gap) or an error (the engine failed). A row that a known
+    issue expects, and one of an engine that is not installed, is skipped with its reason.
+
+    Args:
+        results: the run.
+
+    Returns:
+        The file's path.
+
     """
     suites = ET.Element("testsuites", name="plumbline", time=f"{float(results.run['duration']):.3f}")
     totals = {"tests": 0, "failures": 0, "errors": 0, "skipped": 0}
@@ -39,7 +45,7 @@ def write(results: Results) -> Path:
 
 
 def _add_test_case(suite: ET.Element, row: Record) -> str | None:
-    """Add the row's test case; which total it counts in besides "tests"."""
+    """Add the row's test case; return the total that it counts in besides "tests"."""
     what = row["quantity"] if row["integrator"] == "-" else f"{row['quantity']}[{row['integrator']}]"
     case = ET.SubElement(
         suite,
@@ -54,15 +60,16 @@ def _add_test_case(suite: ET.Element, row: Record) -> str | None:
         ET.SubElement(case, kind, message=message, type=row["verdict"]).text = _failure_text(row)
         return "errors" if kind == "error" else "failures"
     if row["verdict"] != "agrees":
-        recorded = f"recorded as {row['known_issue']}; " if row.get("known_issue") else ""
-        ET.SubElement(case, "skipped", message=recorded + message)
+        expected = f"known issue {row['known_issue']}; " if row.get("known_issue") else ""
+        ET.SubElement(case, "skipped", message=expected + message)
         return "skipped"
     return None
 
 
 def _failure_text(row: Record) -> str:
+    value, tolerance = format_number(row["value"], 4), format_number(row["tolerance"], 4)
     lines = [
-        f"error {format_number(row['value'], 4)}, tolerance {format_number(row['tolerance'], 4)} [{row['unit']}]",
+        f"error {value}, tolerance {tolerance} [{row['unit']}]",
         row["derivation"],
         row["diagnosis"] or "",
         f"engine version {row['engine_version']}, key {row['key']}",

@@ -1,4 +1,4 @@
-"""The report's two tables about the reference itself: how its variants drift, and what it costs.
+"""The report's two tables about the reference implementation: drift of its variants, and its cost.
 
 Both are read from the output folder where it holds them, else from the stored copies in ``bench/results``.
 """
@@ -25,9 +25,16 @@ PICTURE_TITLES = {
 
 
 def drift_table(folder: Path, stored: Path = STORED_RESULTS) -> Record | None:
-    """The drift table as the template takes it: times, and per scenario and rtol a line per variant.
+    """Arrange the drift of the reference's variants for the template.
 
-    None where there is no drift.parquet.
+    Args:
+        folder: output folder of the run.
+        stored: folder with a stored measurement, used where ``folder`` has none.
+
+    Returns:
+        Times, column titles, and a line per variant for each scenario and rtol; None where no folder has a
+        drift.parquet.
+
     """
     place = _first_folder_with("drift.parquet", folder, stored)
     if place is None:
@@ -51,9 +58,18 @@ def drift_table(folder: Path, stored: Path = STORED_RESULTS) -> Record | None:
 
 
 def benchmark_table(folder: Path, stored: Path = STORED_RESULTS) -> Record | None:
-    """The goals with what was measured, a note on how, and the work–precision pictures as data URIs.
+    """Arrange the measured cost of the reference for the template.
 
-    A picture becomes an image, so that nothing in it can run or load. None where there is no figures.json.
+    The pictures are included as images, in which no script can run and from which no request can start.
+
+    Args:
+        folder: output folder of the run.
+        stored: folder with a stored measurement, used where ``folder`` has none.
+
+    Returns:
+        Goals with the measured values, a note on the measurement, and the work–precision pictures as data
+        URIs; None where no folder has a figures.json.
+
     """
     place = _first_folder_with("figures.json", folder, stored)
     if place is None:

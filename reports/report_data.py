@@ -1,4 +1,4 @@
-"""What the page's script works on: an index of all rows, one chunk per scenario, convergence and history."""
+"""Data of the page's script: an index of all rows, a chunk per scenario, convergence studies and history."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from plumbline.judging.rows import VERDICT_STYLES
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product
 from reports.chunks import ChunkBuilder, decimate, decimate_times, log_scale_codes
 from reports.history import History
 from reports.results import Columns, Record, Results, group_rows
-from reports.verdicts import VERDICT_STYLES, error_ratio, severity
+from reports.verdicts import css_class, error_ratio, severity
 
 CURVE_COLUMNS = (
     "position_error",
@@ -28,24 +29,17 @@ CURVE_COLUMNS = (
     "norm_drift",
 )
 CLI_LEVEL = {"state": "state", "trajectory": "trajectory", "invariants": "trajectory"}
-DEFAULT_LONG_RUN_SECONDS = 100.0  # s: how long a nightly's long runs are unless it is told otherwise
+DEFAULT_LONG_RUN_SECONDS = 100.0  # s: the default of the nightly's --long-run-seconds
 CATALOGUE_FOLDER = Path(__file__).parent.parent / "scenarios"
 MAX_MOTION_BYTES = 90_000  # of one scenario's motion, before compression
-_DETAIL_FIELDS = (
+_NUMBER_FIELDS = ("value", "tolerance", "uncertainty", "compared_until", "order", "user_rtol", "cpu_time")
+_TEXT_FIELDS = (
     "unit",
-    "value",
-    "tolerance",
-    "uncertainty",
-    "compared_until",
-    "order",
     "declared_order",
     "alias_of",
     "known_issue",
     "diagnosis",
-    "user_rtol",
-    "cpu_time",
     "derivation",
-    "extra",
     "engine_version",
 )
 
@@ -53,12 +47,21 @@ ScenarioTables = dict[str, dict[str, Columns]]  # by table, then scenario
 
 
 def rerun_command(row: Record, scenario: Record) -> str:
-    """The command line that repeats just this cell, quoted for a POSIX shell; long runs are a nightly's."""
+    """Return the command that repeats one cell.
+
+    Args:
+        row: a stored row of the cell; long runs are repeated by ``nightly``, all others by ``run``.
+        scenario: description of the row's scenario.
+
+    Returns:
+        The command line, quoted for a POSIX shell.
+
+    """
     file = str(scenario.get("file") or "")
     ours = not file or any(CATALOGUE_FOLDER.glob(f"*/{glob.escape(Path(file).name)}"))
     what = row["scenario"] if ours else file
     words = ["python", "-m", "plumbline", "run", "--engine", row["engine"]]
-    if is_long_run(row):
+    if _is_long_run(row):
         words[3:] = ["nightly", "--engine", row["engine"], "--random", "0", "--no-self-test"]
         asked = (row.get("extra") or {}).get("asked", DEFAULT_LONG_RUN_SECONDS)
         words += [] if asked == DEFAULT_LONG_RUN_SECONDS else ["--long-run-seconds", f"{asked:g}"]
@@ -68,20 +71,29 @@ def rerun_command(row: Record, scenario: Record) -> str:
     return shlex.join(words + (["--", what] if what.startswith("-") else []))
 
 
-def is_long_run(row: Record) -> bool:
-    """Whether a row is about a nightly's long runs."""
+def _is_long_run(row: Record) -> bool:
+    """Report whether a row is about a nightly's long runs."""
     return str(row["quantity"]).endswith(("_long", "_long_growth"))
 
 
-def json_number(value: Any, digits: int = 6) -> Any:
-    """A JSON number of a few digits; None for what JSON cannot say."""
+def _json_number(value: Any, digits: int = 6) -> Any:
+    """Round to a few digits; None where the number is not finite."""
     if value is None or isinstance(value, str):
         return value
     return float(f"{float(value):.{digits}g}") if np.isfinite(value) else None
 
 
 def index_chunk(results: Results, history: History) -> str:
-    """Every row, one small number per field, and the dictionaries the numbers point into."""
+    """Encode every row as a small integer per field, with the lists that the integers index.
+
+    Args:
+        results: the run, restricted to the scenarios of the page.
+        history: earlier runs.
+
+    Returns:
+        The chunk, see `reports.chunks`; its header is ``Index`` in report_data.d.ts.
+
+    """
     packer = ChunkBuilder()
     header: dict[str, Any] = {
         "scenarios": list(results.scenarios),
@@ -90,8 +102,8 @@ def index_chunk(results: Results, history: History) -> str:
         "engines": list(results.engines),
         "engine_titles": [e["title"] for e in results.engines.values()],
         "verdicts": list(VERDICT_STYLES),
-        "glyphs": [m.glyph for m in VERDICT_STYLES.values()],
-        "slugs": [m.css_class for m in VERDICT_STYLES.values()],
+        "glyphs": [style.glyph for style in VERDICT_STYLES.values()],
+        "slugs": [css_class(verdict) for verdict in VERDICT_STYLES],
         "reasons": [row["reason"] for row in results.rows],
         "commit": results.run.get("commit"),
         "green": history.last_passed.run["started"] if history.last_passed else None,
@@ -118,36 +130,34 @@ def index_chunk(results: Results, history: History) -> str:
 
 
 def scenario_chunk(name: str, results: Results, tables: ScenarioTables, points: int) -> str:
-    """Everything the cells of one scenario show; ``points`` samples per curve at most, 0 for no curves."""
+    """Encode everything that the cells of one scenario show.
+
+    Args:
+        name: the scenario.
+        results: the run.
+        tables: states, curves and trajectories by scenario.
+        points: largest number of values per curve; 0 for no curves and no motion.
+
+    Returns:
+        The chunk, see `reports.chunks`; its header is ``ScenarioChunk`` in report_data.d.ts.
+
+    """
     packer = ChunkBuilder()
     scenario = results.scenarios[name]
     details: dict[str, Record] = {}
     commands: dict[str, str] = {}
-    for place in results.row_indices[name]:
-        row = results.rows[place]
-        detail: Record = {k: row.get(k) for k in _DETAIL_FIELDS if row.get(k) not in (None, "", {})}
-        for field in (
-            "value",
-            "tolerance",
-            "uncertainty",
-            "compared_until",
-            "order",
-            "user_rtol",
-            "cpu_time",
-        ):
-            if field in detail:
-                detail[field] = json_number(detail[field])
-        if "extra" in detail:
-            detail["extra"] = {k: json_number(v) for k, v in detail["extra"].items()}
-        if row["key"] in results.scripts:
-            detail["script"] = results.scripts[row["key"]]
-        details[str(place)] = detail
-        commands[f"{row['engine']}/{'long' if is_long_run(row) else row['level']}"] = rerun_command(
-            row, scenario
-        )
+    for index in results.row_indices[name]:
+        row = results.rows[index]
+        detail: Record = {k: row[k] for k in _TEXT_FIELDS if row.get(k) not in (None, "")}
+        detail |= {k: _json_number(row[k]) for k in _NUMBER_FIELDS if row.get(k) is not None}
+        detail["extra"] = {k: _json_number(v) for k, v in (row.get("extra") or {}).items()}
+        detail["script"] = results.scripts.get(row["key"])
+        details[str(index)] = {k: v for k, v in detail.items() if v not in (None, {})}
+        level = "long" if _is_long_run(row) else row["level"]
+        commands[f"{row['engine']}/{level}"] = rerun_command(row, scenario)
     header = {
         "scenario": {
-            k: json_number(v) if isinstance(v, float) else v for k, v in scenario.items() if k != "model"
+            k: _json_number(v) if isinstance(v, float) else v for k, v in scenario.items() if k != "model"
         },
         "rows": details,
         "commands": commands,
@@ -173,8 +183,8 @@ def _state_errors(name: str, tables: ScenarioTables, packer: ChunkBuilder) -> li
                 "quantity": quantity,
                 "ratio": packer.add(log_scale_codes(quotient[order])),
                 "worst": [int(states["state"][rows][top]), int(states["body"][rows][top]) + 1],
-                "bound": json_number(np.median(bound), 3),
-                "error": json_number(error[top], 3),
+                "bound": _json_number(np.median(bound), 3),
+                "error": _json_number(error[top], 3),
             }
         )
     return found
@@ -195,9 +205,9 @@ def _error_curves(name: str, tables: ScenarioTables, packer: ChunkBuilder, point
         one: Record = {
             "engine": engine,
             "integrator": integrator,
-            "resolution": json_number(curves["resolution"][rows][0]),
+            "resolution": _json_number(curves["resolution"][rows][0]),
             "t": times[shared],
-            "crossing": json_number(t[int(np.argmax(above))]) if above.any() else None,
+            "crossing": _json_number(t[int(np.argmax(above))]) if above.any() else None,
         }
         if np.isfinite(tolerance).any():
             one["judged"] = judged
@@ -210,7 +220,7 @@ def _error_curves(name: str, tables: ScenarioTables, packer: ChunkBuilder, point
 
 
 def _judged_curve(curves: Columns, rows: np.ndarray) -> str:
-    """The curve that the tolerance is for: the limit of the steps' error where there is one."""
+    """Return the curve that the tolerance applies to: the error of the limit of the steps, if any."""
     limited = "limit_error" in curves and np.isfinite(curves["limit_error"][rows]).any()
     return "limit_error" if limited else "position_error"
 
@@ -227,9 +237,10 @@ def _final_errors(name: str, tables: ScenarioTables) -> dict[tuple[str, ...], fl
 def _motion_frames(
     name: str, scenario: Record, tables: ScenarioTables, packer: ChunkBuilder, points: int
 ) -> Record | None:
-    """Poses of the reference, and how far every other run is from them, one scale per frame.
+    """Encode the poses of the reference, and the differences of every other run from them, scaled per frame.
 
-    A run's pose is r = r_ref + scale·d/127, attitude = exp(scale·w/127) attitude_ref: so 1e-9 survives.
+    A run's pose is r = r_ref + scale·d/127, attitude = exp(scale·w/127) attitude_ref; a difference of 1e-9 m
+    keeps two digits that way.
     """
     poses = tables["trajectories"].get(name, {})
     runs = dict(group_rows(poses, "engine", "integrator"))
@@ -276,7 +287,7 @@ def _motion_frames(
 
 
 def _run_poses(poses: Columns, rows: np.ndarray, n: int) -> tuple[Array, Array, Array]:
-    """R (T, n, 3), unit p (T, n, 4) and t (T,) of one run, whatever the order of its rows."""
+    """Return r (T, n, 3), unit p (T, n, 4) and t (T,) of one run; its records may be in any order."""
     order = rows[np.lexsort((poses["body"][rows], poses["t"][rows]))]
     r = np.stack([poses[k][order] for k in ("rx", "ry", "rz")], -1).reshape(-1, n, 3).astype(float)
     p = np.stack([poses[k][order] for k in ("p0", "p1", "p2", "p3")], -1).reshape(-1, n, 4).astype(float)
@@ -285,7 +296,16 @@ def _run_poses(poses: Columns, rows: np.ndarray, n: int) -> tuple[Array, Array, 
 
 
 def rotation_vector(p: Array, p0: Array) -> Array:
-    """World-frame rotation vector (..., 3) from attitude p0 to attitude p, rad; exact for tiny angles."""
+    """Return the rotation between two attitudes, exact for tiny angles.
+
+    Args:
+        p: (..., 4) unit quaternions, body to world.
+        p0: (..., 4) unit quaternions from which the rotation starts.
+
+    Returns:
+        (..., 3) rotation vectors in the world frame [rad]: p = exp(vector / 2) p0.
+
+    """
     q = quaternion_product(p, quaternion_conjugate(p0))
     q = np.where(q[..., :1] < 0, -q, q)
     size = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
@@ -295,7 +315,7 @@ def rotation_vector(p: Array, p0: Array) -> Array:
 
 
 def _body_shapes(scenario: Record) -> list[Record]:
-    """Per body: attachment points, rod, and the box with its principal moments (axes, half sides)."""
+    """Return each body's attachment points, rod, and the box with its principal moments."""
     model = scenario["model"]
     mass = np.asarray(model["mass"], dtype=float)
     shapes = []
@@ -304,18 +324,26 @@ def _body_shapes(scenario: Record) -> list[Record]:
         half = np.sqrt(np.clip(1.5 / mass[k] * (moments.sum() - 2 * moments), 0, None))
         shapes.append(
             {
-                "proximal": [json_number(x) for x in model["proximal"][k]],
-                "distal": [json_number(x) for x in model["distal"][k]],
-                "length": json_number(model["length"][k]),
-                "axes": [[json_number(x, 4) for x in axis] for axis in axes.T],
-                "half": [json_number(x, 4) for x in half],
+                "proximal": [_json_number(x) for x in model["proximal"][k]],
+                "distal": [_json_number(x) for x in model["distal"][k]],
+                "length": _json_number(model["length"][k]),
+                "axes": [[_json_number(x, 4) for x in axis] for axis in axes.T],
+                "half": [_json_number(x, 4) for x in half],
             }
         )
     return shapes
 
 
 def convergence_chunk(results: Results) -> str:
-    """Every convergence study: error, cost and observed order at each resolution, coarse to fine."""
+    """Encode every convergence study: error, cost and observed order at each resolution, coarse to fine.
+
+    Args:
+        results: the run.
+
+    Returns:
+        The chunk, see `reports.chunks`; its header is a list of ``Study`` in report_data.d.ts.
+
+    """
     columns = results.table("convergence")
     kinds = {(e, i["name"]): i for e, engine in results.engines.items() for i in engine["integrators"]}
     studies = []
@@ -336,7 +364,7 @@ def convergence_chunk(results: Results) -> str:
                 "declared": method.get("order"),
                 "alias": method.get("alias_of"),
                 **{
-                    k: [json_number(v, 4) for v in columns[k][order]]
+                    k: [_json_number(v, 4) for v in columns[k][order]]
                     for k in ("resolution", "error", "cost", "order")
                 },
             }
@@ -345,7 +373,16 @@ def convergence_chunk(results: Results) -> str:
 
 
 def history_chunk(results: Results, history: History) -> str:
-    """Value, error over tolerance and verdict of each of this run's keys over the nights, this run last."""
+    """Encode value, error over tolerance and verdict of each row's key over the nights, this run last.
+
+    Args:
+        results: the run.
+        history: earlier runs, at least one.
+
+    Returns:
+        The chunk, see `reports.chunks`; its header is ``HistoryChunk`` in report_data.d.ts.
+
+    """
     packer = ChunkBuilder()
     verdicts = {verdict: k + 1 for k, verdict in enumerate(VERDICT_STYLES)}
     nights: Sequence[dict[str, Record]] = [

@@ -18,13 +18,13 @@ from plumbline.storage.script_index import read_script_index, scripts_folder
 Record = dict[str, Any]
 Columns = dict[str, np.ndarray]
 
-# What neither XML 1.0 nor a reader can show (control characters, lone surrogates, U+FFFE/F) and what
-# would turn the text around it (bidirectional controls); all become U+FFFD.
+# Characters that XML 1.0 cannot hold or nobody can read (control characters, lone surrogates, U+FFFE/F) and
+# those that change the direction of the text around them (bidirectional controls); all become U+FFFD.
 _UNPRINTABLE = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]"
 )
 
-# What a run of one level only, or of another program, may leave out.
+# Fields that a run of one level, or one of an earlier version, may lack.
 _RUN_DEFAULTS: Record = {
     "random_batch": {},
     "truth": "",
@@ -45,9 +45,17 @@ _SCENARIO_DEFAULTS: Record = {
 
 
 def replace_unprintable(value: Any) -> Any:
-    """The same value with every unprintable character of every text in it replaced by U+FFFD."""
+    """Replace every unprintable character of every text by U+FFFD.
+
+    Args:
+        value: texts, and lists and dictionaries of them, between other values.
+
+    Returns:
+        The same structure.
+
+    """
     if isinstance(value, str):
-        plain = value.isascii() and value.isprintable()  # most are, and this is quicker told
+        plain = value.isascii() and value.isprintable()  # most are, and this test is faster
         return value if plain else _UNPRINTABLE.sub("\N{REPLACEMENT CHARACTER}", value)
     if isinstance(value, dict):
         return {replace_unprintable(k): replace_unprintable(v) for k, v in value.items()}
@@ -58,7 +66,7 @@ def replace_unprintable(value: Any) -> Any:
 
 @dataclass(frozen=True)
 class Results:
-    """One run: ``results.json`` read and cleaned, tables on demand."""
+    """One stored run: results.json as read, with unprintable characters replaced; tables on demand."""
 
     folder: Path
     run: Record
@@ -68,13 +76,32 @@ class Results:
 
     @classmethod
     def load(cls, folder: Path) -> Results:
-        """Read OUT/results.json, of any schema version; raises ValueError where it is missing or damaged."""
+        """Read results.json of any readable schema version.
+
+        Args:
+            folder: output folder of the run.
+
+        Returns:
+            The run.
+
+        Raises:
+            ValueError: the file is missing or damaged.
+
+        """
         stored = replace_unprintable(read_results(folder))
         scenarios = {name: _SCENARIO_DEFAULTS | about for name, about in stored["scenarios"].items()}
         return cls(folder, _RUN_DEFAULTS | stored["run"], scenarios, stored["engines"], stored["rows"])
 
     def table(self, name: str) -> Columns:
-        """Columns of OUT/<name>.parquet as NumPy arrays, texts cleaned; {} where the file is absent."""
+        """Read one Parquet table.
+
+        Args:
+            name: the file's name without ``.parquet``.
+
+        Returns:
+            (n,) arrays by column, with unprintable characters replaced; {} where the file is missing.
+
+        """
         path = self.folder / f"{name}.parquet"
         if not path.exists():
             return {}
@@ -89,12 +116,20 @@ class Results:
     def row_indices(self) -> dict[str, list[int]]:
         """Indices of each scenario's rows."""
         found: dict[str, list[int]] = {name: [] for name in self.scenarios}
-        for place, row in enumerate(self.rows):
-            found[row["scenario"]].append(place)
+        for index, row in enumerate(self.rows):
+            found[row["scenario"]].append(index)
         return found
 
     def table_by_scenario(self, name: str) -> dict[str, Columns]:
-        """The named table, split by scenario."""
+        """Read one Parquet table and split it by scenario.
+
+        Args:
+            name: the file's name without ``.parquet``.
+
+        Returns:
+            For each scenario its columns, as `table` returns them.
+
+        """
         columns = self.table(name)
         return {
             scenario: {k: values[rows] for k, values in columns.items()}
@@ -102,13 +137,21 @@ class Results:
         }
 
     def restricted_to(self, names: Collection[str]) -> Results:
-        """The same run with these scenarios alone."""
+        """Select some scenarios of the run.
+
+        Args:
+            names: scenarios that are kept.
+
+        Returns:
+            The run with only those scenarios and their rows.
+
+        """
         kept = {name: about for name, about in self.scenarios.items() if name in names}
         return replace(self, scenarios=kept, rows=[row for row in self.rows if row["scenario"] in kept])
 
     @cached_property
     def scripts(self) -> dict[str, str]:
-        """Stand-alone script of each row key that has one (OUT/scripts/index.json)."""
+        """Stand-alone script by row key, for the rows that have one."""
         folder = scripts_folder(self.folder)
         return {
             replace_unprintable(key): replace_unprintable((folder / name).read_text("utf-8", "replace"))
@@ -123,7 +166,16 @@ def _clean_texts(values: np.ndarray) -> np.ndarray:
 
 
 def group_rows(columns: Columns, *by: str) -> Iterator[tuple[tuple[str, ...], np.ndarray]]:
-    """Row indices of each distinct combination of the named columns, in order of first appearance."""
+    """Group the records of a table by some of its columns.
+
+    Args:
+        columns: (n,) arrays by column.
+        *by: names of the columns.
+
+    Yields:
+        Each distinct combination of values, in order of first appearance, and the indices of its records.
+
+    """
     if not columns:
         return
     found: dict[tuple[str, ...], list[int]] = {}

@@ -1,4 +1,4 @@
-"""A picture of a report, for the README: `python -m reports.screenshot OUT/report.html PICTURE.png [#view]`."""
+"""Picture of a report for the README: `python -m reports.screenshot OUT/report.html FILE.png [#view]`."""
 
 from __future__ import annotations
 
@@ -10,16 +10,33 @@ BROWSER_NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome
 
 
 def find_chromium() -> str | None:
-    """The system's own Chromium, or None."""
+    """Look for a Chromium on the path.
+
+    Returns:
+        Its path, or None.
+
+    """
     return next((found for name in BROWSER_NAMES if (found := shutil.which(name))), None)
 
 
 def take_screenshot(
     report: Path, image_path: Path, view: str = "", width: int = 1400, height: int = 1000
 ) -> Path:
-    """Open the report at a view ("" the matrix, or "#scenario=…&engine=…") and save what is seen as PNG.
+    """Open the report in Chromium and save the visible part as PNG.
 
-    Raises RuntimeError where there is no Chromium.
+    Args:
+        report: path of report.html.
+        image_path: the picture.
+        view: the part of the address after the file, for example "#scenario=…&engine=…"; "" for the matrix.
+        width: of the window [px].
+        height: of the window [px].
+
+    Returns:
+        ``image_path``.
+
+    Raises:
+        RuntimeError: no Chromium is on the path.
+
     """
     from playwright.sync_api import sync_playwright
 

@@ -15,9 +15,10 @@ import numpy as np
 import pyarrow.parquet as pq
 from markupsafe import Markup
 
+from plumbline.storage.results_store import write_atomically
 from reports import html_report
 from reports.results import Record, replace_unprintable
-from reports.verdicts import VERDICT_STYLES, count_verdicts, severity
+from reports.verdicts import count_verdicts, severity
 
 MAX_AXIS_VALUES = 24  # values of an axis that are shown one by one; more are gathered into intervals
 AXIS_INTERVALS = 16
@@ -30,34 +31,63 @@ MAP_COLUMNS = {  # per implementation: column, title
 
 
 class Axis(NamedTuple):
-    """A parameter's values along one side of the map; ``edges`` where they are intervals, else None."""
+    """A parameter's values along one side of the map."""
 
     name: str
     titles: list[str]
     values: list[float]
-    edges: list[float] | None
+    edges: list[float] | None  # of intervals; None where every value is shown
 
     def index_of(self, value: float) -> int:
-        """Which value or interval it belongs to."""
+        """Find the place of a value along the axis.
+
+        Args:
+            value: a value of the parameter.
+
+        Returns:
+            The index of the value, or of the interval that holds it.
+
+        """
         if self.edges is None:
             return self.values.index(value)
         return min(max(bisect_right(self.edges, value) - 1, 0), len(self.edges) - 2)
 
 
 def write(folder: Path) -> Path:
-    """Render FOLDER/sweep.html from FOLDER/sweep.parquet; its path.
+    """Render sweep.html from sweep.parquet.
 
-    Raises OSError or pyarrow's ArrowInvalid where the table cannot be read.
+    Args:
+        folder: output folder of the sweep.
+
+    Returns:
+        The page's path.
+
+    Raises:
+        OSError: the table cannot be read, or the page not be written.
+        ValueError: the table is damaged (`pyarrow.ArrowInvalid`).
+
     """
     table = pq.read_table(folder / "sweep.parquet")
     names = replace_unprintable(table.column_names)
     rows = replace_unprintable(table.rename_columns(names).to_pylist())
     about = replace_unprintable(json.loads((table.schema.metadata or {}).get(b"sweep", b"{}")))
-    return html_report.write_page(folder / "sweep.html", render(names[: names.index("cell")], rows, about))
+    path = folder / "sweep.html"
+    write_atomically(path, render(names[: names.index("cell")], rows, about).encode())
+    return path
 
 
 def render(parameters: Sequence[str], rows: Sequence[Record], sweep_info: Record) -> str:
-    """The page as text; ``parameters`` are the varied columns, ``about`` the sweep's file."""
+    """Render the page of a sweep.
+
+    Args:
+        parameters: names of the varied columns.
+        rows: the sweep's records, one per cell and implementation.
+        sweep_info: content of the sweep's file; may be empty.
+
+    Returns:
+        HTML.
+
+    """
     varied = [name for name in parameters if len({row[name] for row in rows}) > 1] or list(parameters)
     across = make_axis(varied[0], rows)
     down = make_axis(varied[1], rows) if len(varied) > 1 else None
@@ -77,23 +107,22 @@ def render(parameters: Sequence[str], rows: Sequence[Record], sweep_info: Record
     ]
     poor = [row for row in rows if row["verdict"] not in ("agrees", "not installed")]
     cells = len({row["cell"] for row in rows})
-    told = Counter((row["implementation"], row["verdict"]) for row in rows)
+    counts = Counter((row["implementation"], row["verdict"]) for row in rows)
     style = html_report.stylesheet()
     return (
         html_report.template_environment()
         .get_template("sweep.html")
         .render(
             policy=html_report.content_security_policy(style),
-            style=Markup(style),
+            css=Markup(style),
             sentence=f"{cells} cells: "
-            + "; ".join(f"{name} {verdict} {k}" for (name, verdict), k in told.items()),
+            + "; ".join(f"{name} {verdict} {k}" for (name, verdict), k in counts.items()),
             scenario=sweep_info.get("scenario", ""),
             about=sweep_info,
             across=across,
             down=down,
             folded=varied[2:],
             maps=maps,
-            marks=VERDICT_STYLES,
             poor=poor[:MAX_LISTED_ROWS],
             unlisted=len(poor) - MAX_LISTED_ROWS,
             parameters=parameters,
@@ -103,7 +132,16 @@ def render(parameters: Sequence[str], rows: Sequence[Record], sweep_info: Record
 
 
 def make_axis(name: str, rows: Sequence[Record]) -> Axis:
-    """The parameter's values, or intervals of them where there are too many to show one by one."""
+    """Lay out a parameter's values along an axis, as intervals where there are too many values.
+
+    Args:
+        name: the parameter's column.
+        rows: records of the sweep.
+
+    Returns:
+        The axis.
+
+    """
     values = sorted({float(row[name]) for row in rows})
     if len(values) <= MAX_AXIS_VALUES:
         return Axis(name, [f"{value:.4g}" for value in values], values, None)
@@ -113,9 +151,18 @@ def make_axis(name: str, rows: Sequence[Record]) -> Axis:
 
 
 def map_cells(rows: Sequence[Record], column: str, across: Axis, down: Axis | None) -> Record:
-    """Per place of the map its worst row, largest value, count and shade; the shades' range.
+    """Summarise the records at each place of the map.
 
-    Shades are steps of the value's logarithm between the smallest and the largest on this map.
+    Args:
+        rows: records of one implementation.
+        column: the column whose largest value is shown.
+        across: parameter along the rows.
+        down: parameter along the columns, or None.
+
+    Returns:
+        ``cells``: worst row, largest value, number of records and shade by (down, across) place; a shade is a
+        step of the value's logarithm. ``low`` and ``high``: smallest and largest positive value, or None.
+
     """
     held: dict[tuple[int, int], list[Record]] = {}
     for row in rows:
@@ -130,12 +177,11 @@ def map_cells(rows: Sequence[Record], column: str, across: Axis, down: Axis | No
     low, high = min(logs.values(), default=0.0), max(logs.values(), default=0.0)
     cells: dict[tuple[int, int], dict[str, Any]] = {}
     for place, theirs in held.items():
-        speaker = max(theirs, key=lambda row: (severity(row), size(row)))
+        worst = max(theirs, key=lambda row: (severity(row), size(row)))
         value = largest[place]
         part = (logs[place] - low) / (high - low) if place in logs and high > low else 0.0
         cells[place] = {
-            "row": speaker,
-            "mark": VERDICT_STYLES[speaker["verdict"]],
+            "row": worst,
             "value": value if value > -math.inf else None,
             "count": len(theirs),
             "shade": round(part * (SHADE_COUNT - 1)),

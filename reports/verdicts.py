@@ -1,75 +1,138 @@
-"""How a verdict looks and which one speaks for a cell; shared by the page, JUnit and the step summary."""
+"""Ranking, counting and printing of stored rows, for the page, JUnit and the step summary.
+
+Glyphs, severities and ratios are those of `plumbline.judging.rows`, which the terminal uses as well.
+"""
 
 from __future__ import annotations
 
 import math
 from collections import Counter
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 from plumbline.judging import rows
-from plumbline.judging.rows import Verdict
 from reports.results import Record, Results
 
 
-class VerdictStyle(NamedTuple):
-    """Glyph, CSS class, the verb of "3 …" and what it means."""
-
-    glyph: str
-    css_class: str
-    plural: str
-    meaning: str
-
-
-VERDICT_STYLES = {
-    str(verdict): VerdictStyle(
-        style.glyph,
-        "absent" if verdict == Verdict.NOT_INSTALLED else str(verdict),
-        style.plural,
-        style.meaning,
-    )
-    for verdict, style in rows.VERDICT_STYLES.items()
-}
-
-
 def severity(row: Record) -> int:
-    """9 (failed) … 1 (not installed); from 6 on it was not expected and needs attention."""
+    """Rank the verdict of one row.
+
+    Args:
+        row: a stored row.
+
+    Returns:
+        9 (failed, unexpected) … 1 (not installed), see `plumbline.judging.rows.severity`.
+
+    """
     return rows.severity(row["verdict"], row.get("known_issue"))
 
 
 def needs_attention(row: Record) -> bool:
-    """A disagreement, failure or gap that no entry of known.yaml expects."""
+    """Report a disagreement, failure or gap that no entry of known_issues.yaml expects.
+
+    Args:
+        row: a stored row.
+
+    Returns:
+        True where the row is listed as needing attention.
+
+    """
     return severity(row) >= rows.ATTENTION_SEVERITY
 
 
 def error_ratio(row: Record) -> float | None:
-    """Error over tolerance, as judged; None where the row has none."""
+    """Return a row's error over its tolerance, as judged.
+
+    Args:
+        row: a stored row.
+
+    Returns:
+        The ratio; None where the row has none or it is not finite.
+
+    """
     ratio = row["ratio"]
     return None if ratio is None or not math.isfinite(ratio) else float(ratio)
 
 
-def worst_row(candidates: Iterable[Record]) -> Record:
-    """The row that speaks for a cell: the most severe, among those the largest error over tolerance."""
-    return max(
-        candidates, key=lambda row: rows.cell_rank(row["verdict"], row.get("known_issue"), error_ratio(row))
-    )
+def rank(row: Record) -> tuple[int, float]:
+    """Return the sort key whose maximum over a cell's rows is the row that stands for the cell.
+
+    Args:
+        row: a stored row.
+
+    Returns:
+        Severity, then ratio, see `plumbline.judging.rows.cell_rank`.
+
+    """
+    return rows.cell_rank(row["verdict"], row.get("known_issue"), error_ratio(row))
+
+
+def unexpected_rows(candidates: Iterable[Record]) -> list[Record]:
+    """Select the rows that need attention.
+
+    Args:
+        candidates: stored rows.
+
+    Returns:
+        Those of them that need attention, the most severe first.
+
+    """
+    return sorted(filter(needs_attention, candidates), key=rank, reverse=True)
 
 
 def count_verdicts(records: Iterable[Record]) -> Counter[str]:
-    """Number of rows by verdict."""
+    """Count rows by verdict.
+
+    Args:
+        records: stored rows.
+
+    Returns:
+        The number of rows of each verdict that occurs.
+
+    """
     return Counter(row["verdict"] for row in records)
 
 
 def count_all_verdicts(results: Results) -> Counter[str]:
-    """Number of a run's rows by verdict, those of random scenarios that are only counted among them."""
+    """Count all rows of a run, including those of random scenarios that are stored as counts only.
+
+    Args:
+        results: the run.
+
+    Returns:
+        The number of rows of each verdict that occurs.
+
+    """
     return count_verdicts(results.rows) + Counter(results.run["random_batch"].get("counts_by_verdict", {}))
+
+
+def css_class(verdict: str) -> str:
+    """Return the class of the elements that show a verdict.
+
+    Args:
+        verdict: a value of `plumbline.judging.rows.Verdict`.
+
+    Returns:
+        The verdict with hyphens instead of spaces.
+
+    """
+    return str(verdict).replace(" ", "-")
 
 
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def format_number(x: Any, digits: int = 2) -> str:
-    """A number as people write it: 0.031, 4.2×10⁻⁶; "–" for none."""
+    """Format a number in few digits, without an exponent between 0.001 and 10,000.
+
+    Args:
+        x: a number, or None.
+        digits: significant digits.
+
+    Returns:
+        For example 0.031 or 4.2×10⁻⁶; "–" for None.
+
+    """
     if x is None:
         return "–"
     x = float(x)

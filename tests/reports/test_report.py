@@ -20,11 +20,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from plumbline.judging.rows import VERDICT_STYLES
 from plumbline.model.kinematics import quaternion_product
 from reports import chunks, html_report, junit, report_data, step_summary
 from reports.history import History
 from reports.results import Results, replace_unprintable
-from reports.verdicts import VERDICT_STYLES, error_ratio, format_number, needs_attention, severity, worst_row
+from reports.verdicts import css_class, error_ratio, format_number, needs_attention, rank
 from tests.helpers import example_results as fixture
 
 REPORTS = Path(html_report.__file__).parent
@@ -89,15 +90,17 @@ def test_every_cell_is_in_the_static_matrix_with_glyph_text_and_class(out: Path,
         assert len(cells) == len(results.engines)
         for cell, engine in zip(cells, results.engines, strict=True):
             rows = [r for r in results.rows if r["scenario"] == name and r["engine"] == engine]
-            speaker = max(rows, key=lambda r: (severity(r), error_ratio(r) or -1))
-            mark = VERDICT_STYLES[speaker["verdict"]]
-            assert f'class="cell {mark.css_class}' in cell
-            assert mark.glyph in cell
-            quotient = error_ratio(speaker)
-            assert (format_number(quotient) if quotient is not None else speaker["verdict"]) in cell
+            worst = max(rows, key=rank)
+            assert f'class="cell {css_class(worst["verdict"])}' in cell
+            assert VERDICT_STYLES[worst["verdict"]].glyph in cell
+            ratio = error_ratio(worst)
+            assert (format_number(ratio) if ratio is not None else worst["verdict"]) in cell
 
 
-def test_a_cell_speaks_with_its_worst_row() -> None:
+def test_the_worst_row_stands_for_its_cell() -> None:
+    def worst_row(rows: list[dict[str, object]]) -> dict[str, object]:
+        return max(rows, key=rank)
+
     def row(verdict: str, value: float | None, known: str | None = None) -> dict[str, object]:
         return {"verdict": verdict, "ratio": value, "known_issue": known}
 
