@@ -6,7 +6,8 @@ import base64
 import html
 import json
 import re
-from collections.abc import Iterator
+import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +18,11 @@ from click.testing import CliRunner
 from plumbline.cli.main import main
 from plumbline.studies import drift, sweep
 from plumbline.studies.tables import write_table
-from reports import html_report, reference_tables, screenshot, sweep_page
+from reports import html_report, reference_tables, sweep_page
 from reports.results import Results, replace_unprintable
-from tests.helpers import example_results as fixture
 from tests.helpers.example_results import HOSTILE, NASTY
 
-AXE = Path(html_report.__file__).parent / "node_modules" / "axe-core" / "axe.min.js"
+pytestmark = pytest.mark.xdist_group("reports")
 MEASURED: dict[str, Any] = {
     "rtol": 1e-9,
     "gap_rate": 4.5e-9,
@@ -58,8 +58,8 @@ def sweep_rows() -> list[dict[str, Any]]:
 
 
 @pytest.fixture(scope="module")
-def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = fixture.build(tmp_path_factory.mktemp("pages") / "a run & more")
+def out(example_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = shutil.copytree(example_run, tmp_path_factory.mktemp("pages") / "a run & more")
     write_table(pa.Table.from_pylist([*DRIFT, LEFT_OUT], schema=drift.SCHEMA), folder / "drift.parquet")
     goals = [
         {"what": HOSTILE, "goal": 0.3, "measured": 0.12},
@@ -162,53 +162,36 @@ def test_intervals_cover_every_value_and_follow_ratios() -> None:
     assert [few.index_of(v) for v in (0.5, 1.5, 2.5)] == [0, 1, 2]
 
 
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
-    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    found = screenshot.find_chromium()
-    if not found:
-        pytest.skip(f"no Chromium here: none of {', '.join(screenshot.BROWSER_NAMES)} is on the path")
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
-        yield browser
-        browser.close()
-
-
 @pytest.mark.browser
 @pytest.mark.parametrize("name", ["report.html", "sweep.html"])
 def test_no_request_no_violation_no_script_needed(chromium: Any, out: Path, name: str) -> None:
     trouble: list[str] = []
-    page_ = chromium.new_page(java_script_enabled=False, offline=True)
-    page_.on("console", lambda message: trouble.append(message.text))
-    page_.on("dialog", lambda dialog: (trouble.append(dialog.message), dialog.dismiss()))
+    page = chromium.new_page(java_script_enabled=False, offline=True)
+    page.on("console", lambda message: trouble.append(message.text))
+    page.on("dialog", lambda dialog: (trouble.append(dialog.message), dialog.dismiss()))
     requests: list[str] = []
-    page_.on("request", lambda request: requests.append(request.url))
-    page_.goto((out / name).as_uri())
+    page.on("request", lambda request: requests.append(request.url))
+    page.goto((out / name).as_uri())
     for part in ("#drift", "#benchmarks svg.wp") if name == "report.html" else (".map >> nth=2", "#poor"):
-        assert page_.locator(part).is_visible(), part
-    page_.wait_for_timeout(200)
-    page_.close()
+        assert page.locator(part).is_visible(), part
+    page.wait_for_timeout(200)
+    page.close()
     assert trouble == []
     own = ("data:", (out / name).as_uri())
     assert [url for url in requests if not url.startswith(own)] == []
 
 
 @pytest.mark.browser
-@pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("name", ["report.html", "sweep.html"])
-def test_axe_finds_no_violation_here_either(chromium: Any, out: Path, name: str, scheme: str) -> None:
-    if not AXE.exists():
-        pytest.skip("axe-core is not installed: run `npm ci` in reports/ first")
-    context = chromium.new_context(color_scheme=scheme, bypass_csp=True, offline=True)
-    page_ = context.new_page()
-    page_.goto((out / name).as_uri())
-    page_.add_script_tag(path=str(AXE))
-    found = page_.evaluate("axe.run(document, {resultTypes: ['violations']})")
+def test_axe_finds_no_violation_here_either(
+    chromium: Any, out: Path, name: str, violations: Callable[[Any, str], list[str]]
+) -> None:
+    context = chromium.new_context(bypass_csp=True, offline=True)
+    page = context.new_page()
+    page.goto((out / name).as_uri())
+    found = [violation for scheme in ("light", "dark") for violation in violations(page, scheme)]
     context.close()
-    assert [
-        f"{v['id']}: {n['target']} {n['failureSummary']}" for v in found["violations"] for n in v["nodes"]
-    ] == []
-    assert len(found["passes"]) > 15
+    assert found == []
 
 
 def test_a_sweep_of_one_parameter_is_one_line(tmp_path: Path) -> None:

@@ -11,16 +11,17 @@ import re
 import shlex
 import shutil
 import subprocess
-import time
 import xml.etree.ElementTree as ET
 from html.parser import HTMLParser
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.markup import render
 
-from plumbline.judging.rows import VERDICT_STYLES
+from plumbline.cli import console
+from plumbline.judging.rows import VERDICT_STYLES, Row, Verdict
 from plumbline.model.kinematics import quaternion_product
 from reports import chunks, html_report, junit, report_data, step_summary
 from reports.history import History
@@ -31,14 +32,17 @@ from tests.helpers import example_results as fixture
 REPORTS = Path(html_report.__file__).parent
 
 
+pytestmark = pytest.mark.xdist_group("reports")
+
+
 @pytest.fixture(scope="module")
-def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return fixture.build(tmp_path_factory.mktemp("report") / "a run with spaces")
+def out(example_run: Path) -> Path:
+    return example_run
 
 
 @pytest.fixture(scope="module")
 def text(out: Path) -> str:
-    return html_report.write(Results.load(out)).read_text(encoding="utf-8")
+    return html_report.render(Results.load(out), History())
 
 
 class Parsed(HTMLParser):
@@ -95,6 +99,33 @@ def test_every_cell_is_in_the_static_matrix_with_glyph_text_and_class(out: Path,
             assert VERDICT_STYLES[worst["verdict"]].glyph in cell
             ratio = error_ratio(worst)
             assert (format_number(ratio) if ratio is not None else worst["verdict"]) in cell
+
+
+def test_terminal_and_report_show_the_same_row_of_each_cell(out: Path, text: str) -> None:
+    """The report's link names the row; glyph and ratio of the terminal's cell are those of the same row."""
+    results = Results.load(out)
+    shown = re.findall(
+        r'<td class="cell [^>]*><a href="[^"]*" title="([^"]*)">(.*?)</a></td>', text, re.DOTALL
+    )
+    cells: dict[tuple[str, str], list[Row]] = {
+        (s, e): [] for s, e in product(results.scenarios, results.engines)
+    }
+    for record in results.rows:
+        row = Row(**{k: v for k, v in record.items() if k != "key"} | {"verdict": Verdict(record["verdict"])})
+        cells[row.scenario, row.engine].append(row)
+    assert len(shown) == len(cells)
+    for (title, cell), rows in zip(shown, cells.values(), strict=True):
+        parts = {
+            f"{r.level}, {r.quantity}" + (f", {r.integrator}" if r.integrator != "-" else ""): r for r in rows
+        }
+        row = parts[html.unescape(title).split(": ")[0]]
+        agreeing = sum(r.verdict == "agrees" for r in rows)
+        ratio = "" if row.ratio is None else f" {row.ratio:.1g}"
+        in_terminal = render(console._format_cell(rows)).plain
+        assert in_terminal == f"{row.verdict.style.glyph} {agreeing}/{len(rows)}{ratio}"
+        in_report = Parsed(f"<p>{cell}</p>").words
+        assert in_report.startswith(row.verdict.style.glyph)
+        assert (str(row.verdict) if row.ratio is None else format_number(row.ratio)) in in_report
 
 
 def test_the_worst_row_stands_for_its_cell() -> None:
@@ -278,50 +309,40 @@ def test_numbers_read_as_people_write_them() -> None:
     assert shown == ["0", "1.0", "0.031", "4.2×10⁻⁶", "−1.5×10⁷", "120", "10", "not finite", "–"]
 
 
-def test_the_default_catalogue_stays_under_2_megabytes(
-    tmp_path: Path, record_property: pytest.FixtureRequest
-) -> None:
-    out = fixture.build(tmp_path / "big", hostile=False, scenarios=30, samples=200)
-    began = time.perf_counter()
-    size = html_report.write(Results.load(out)).stat().st_size
-    took = time.perf_counter() - began
-    record_property("bytes", size)  # type: ignore[operator]
-    record_property("seconds", took)  # type: ignore[operator]
-    print(f"30 scenarios: {size:,} bytes in {took:.2f} s")
+def test_the_default_catalogue_stays_under_2_megabytes(catalogue_page: Path) -> None:
+    size = catalogue_page.stat().st_size
+    print(f"30 scenarios: {size:,} bytes")
     assert size <= html_report.MAX_PAGE_BYTES
 
 
 def test_a_night_of_thousands_of_scenarios_stays_under_8_megabytes(out: Path, tmp_path: Path) -> None:
-    stored = json.loads((out / "results.json").read_text())
-    name = "double-tumbling"
-    rows, about = [r for r in stored["rows"] if r["scenario"] == name], stored["scenarios"][name]
-    stored["scenarios"] = {f"random-{k}": about for k in range(2500)}
-    stored["rows"] = [
-        {**row, "scenario": f"random-{k}", "key": row["key"].replace(name, f"random-{k}")}
-        for k in range(2500)
+    stored, name = Results.load(out), "double-tumbling"
+    rows = [row for row in stored.rows if row["scenario"] == name]
+    scenarios = {f"random-{k}": stored.scenarios[name] for k in range(2500)}
+    copies = [
+        row | {"scenario": scenario, "key": row["key"].replace(name, scenario)}
+        for scenario in scenarios
         for row in rows
     ]
-    late = stored["rows"][-1]
-    late |= {"verdict": "disagrees", "known_issue": None, "reason": "the needle"}
-    (tmp_path / "results.json").write_text(json.dumps(stored))
-    began = time.perf_counter()
-    text = html_report.write(Results.load(tmp_path)).read_text()
-    print(f"{len(stored['rows']):,} rows: {len(text):,} bytes in {time.perf_counter() - began:.1f} s")
+    copies[-1] |= {"verdict": "disagrees", "known_issue": None, "reason": "the needle"}
+    night = Results(tmp_path, stored.run, scenarios, stored.engines, copies)
+    text = html_report.render(night, History())
+    print(f"{len(copies):,} rows: {len(text):,} bytes")
     assert len(text.encode()) <= html_report.MAX_NIGHTLY_PAGE_BYTES
     assert "random-2499" in text and "the needle" in text
     assert "2000 more scenarios are not in this page" in text
     assert "those with anything unexpected are all here" in text
-    assert f"<b>{sum(row['verdict'] == 'agrees' for row in stored['rows'])}</b><span>agree" in text
+    assert f"<b>{sum(row['verdict'] == 'agrees' for row in copies)}</b><span>agree" in text
 
 
-def test_a_page_above_its_budget_has_fewer_points(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    results = Results.load(out)
-    whole = html_report.render(results, History())
-    monkeypatch.setattr(html_report, "MAX_PAGE_BYTES", len(whole.encode()) - 30_000)
-    smaller = html_report.render(results, History())
+def test_a_page_above_its_budget_has_fewer_points(
+    out: Path, text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(html_report, "MAX_PAGE_BYTES", len(text.encode()) - 30_000)
+    smaller = html_report.render(Results.load(out), History())
     assert len(smaller.encode()) <= html_report.MAX_PAGE_BYTES
-    few = decoded_chunks(smaller)["scenario-0"]["curves"]  # type: ignore[index,call-overload]
-    assert few is None or len(few[0]["t"]) < len(decoded_chunks(whole)["scenario-0"]["curves"][0]["t"])  # type: ignore[index,call-overload]
+    few, many = (decoded_chunks(page)["scenario-0"]["curves"][0]["t"] for page in (smaller, text))  # type: ignore[index,call-overload]
+    assert len(few) < len(many)
 
 
 def test_a_history_says_what_is_new_and_skips_a_damaged_night(out: Path, tmp_path: Path) -> None:
@@ -332,13 +353,14 @@ def test_a_history_says_what_is_new_and_skips_a_damaged_night(out: Path, tmp_pat
     assert history.last_passed is history.nights[-2]
     fresh = {row["key"] for row in results.rows if history.is_new(row)}
     assert fresh == {row["key"] for row in results.rows if row["verdict"] in ("disagrees", "failed")}
-    data = decoded_chunks(html_report.render(results, history))
+    page = html_report.render(results, history)
+    data = decoded_chunks(page)
     table = data["history"]["verdict"].reshape(len(results.rows), 5)  # type: ignore[index,call-overload]
     for line, row in zip(table, results.rows, strict=True):
         assert list(VERDICT_STYLES)[line[-1] - 1] == row["verdict"]
         if row["key"] in fresh:
             assert list(VERDICT_STYLES)[line[0] - 1] == "agrees"
-    words = Parsed(html_report.render(results, history)).words
+    words = Parsed(page).words
     assert re.search(rf"{len(fresh)}\s+newly failing", words) and "Skipped as damaged: 2026-11-02" in words
 
 

@@ -1,0 +1,63 @@
+"""One stored run and one browser for all tests of the pages; `xdist_group` keeps them on one worker."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from reports import html_report, screenshot
+from reports.results import Results
+from tests.helpers import example_results
+
+AXE = Path(html_report.__file__).parent / "node_modules" / "axe-core" / "axe.min.js"
+
+
+@pytest.fixture(scope="session")
+def example_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Output folder of a run with every verdict and hostile texts; copy it before changing it."""
+    return example_results.build(tmp_path_factory.mktemp("report") / "a run with spaces & more")
+
+
+@pytest.fixture(scope="session")
+def catalogue_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report of a run as large as the default catalogue."""
+    folder = tmp_path_factory.mktemp("catalogue")
+    return html_report.write(
+        Results.load(example_results.build(folder, hostile=False, scenarios=30, samples=200))
+    )
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Any]:
+    """The system's own Chromium."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    found = screenshot.find_chromium()
+    if not found:
+        pytest.skip(f"no Chromium here: none of {', '.join(screenshot.BROWSER_NAMES)} is on the path")
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def violations() -> Callable[[Any, str], list[str]]:
+    """Run axe on a page made with ``bypass_csp``; in the dark scheme only the rules about colours."""
+    if not AXE.exists():
+        pytest.skip("axe-core is not installed: run `npm ci` in reports/ first")
+
+    def run(page: Any, scheme: str) -> list[str]:
+        page.emulate_media(color_scheme=scheme)
+        if not page.evaluate("'axe' in window"):
+            page.add_script_tag(path=str(AXE))
+        rules = ", runOnly: ['color-contrast', 'link-in-text-block']" if scheme == "dark" else ""
+        found = page.evaluate(f"axe.run(document, {{resultTypes: ['violations']{rules}}})")
+        assert len(found["passes"]) > (15 if scheme == "light" else 0)
+        return [
+            f"{v['id']}: {n['target']} {n['failureSummary']}" for v in found["violations"] for n in v["nodes"]
+        ]
+
+    return run
