@@ -21,7 +21,7 @@ from plumbline.model import kinematics
 from plumbline.model.datatypes import BadInput, EngineFailure, Integrator, Model, State, Unsupported
 from tests.helpers import engine_process as worker
 from tests.helpers import newton_euler, pendulums
-from tests.helpers.pendulums import JOINTS
+from tests.helpers.pendulums import JOINT_PATTERNS
 from tests.helpers.refinement import observed_orders, romberg_columns
 
 STATES = 6
@@ -39,7 +39,9 @@ def installed_adapters():
 
 
 INTEGRATORS = [(adapter.name, method) for adapter in installed_adapters() for method in adapter.integrators]
-GAPS = [(adapter.name, kind) for adapter in installed_adapters() for kind in adapter.unsupported]
+UNSUPPORTED_BY_ENGINE = [
+    (adapter.name, kind) for adapter in installed_adapters() for kind in adapter.unsupported
+]
 every_integrator = pytest.mark.parametrize(
     ("engine", "integrator"), INTEGRATORS, ids=[f"{engine}-{method.name}" for engine, method in INTEGRATORS]
 )
@@ -49,7 +51,7 @@ every_integrator = pytest.mark.parametrize(
 def engine(request: pytest.FixtureRequest) -> str:
     """The name of an engine that is installed."""
     try:
-        worker.call(request.param, "version")
+        worker.call_adapter(request.param, "version")
     except ImportError as missing:
         pytest.skip(f"{request.param} is not installed: {missing}")
     return str(request.param)
@@ -57,7 +59,7 @@ def engine(request: pytest.FixtureRequest) -> str:
 
 @cache
 def declared_gaps(engine: str) -> dict[str, str]:
-    return dict(worker.attribute(engine, "unsupported"))
+    return dict(worker.adapter_attribute(engine, "unsupported"))
 
 
 def kinds_of(model: Model) -> set[str]:
@@ -71,7 +73,7 @@ def kinds_of(model: Model) -> set[str]:
 def ask(engine: str, method: str, model: Model, *args):
     """The engine's answer; None for a refusal, which must be declared and have a sentence."""
     try:
-        return worker.call(engine, method, model, *args)
+        return worker.call_adapter(engine, method, model, *args)
     except Unsupported as reason:
         kinds = kinds_of(model)
         assert kinds & declared_gaps(engine).keys(), (
@@ -84,21 +86,21 @@ def ask(engine: str, method: str, model: Model, *args):
 
 def one_body(engine: str, **loads) -> Model:
     """A pendulum of one body that the engine supports: on a ball joint, or else on a rod."""
-    return pendulums.model("r" if "balls" in declared_gaps(engine) else "b", **loads)
+    return pendulums.make_model("r" if "balls" in declared_gaps(engine) else "b", **loads)
 
 
 # -- what it says of itself --------------------------------------------------------------------
 
 
 def test_describes_itself(engine):
-    info = worker.call(engine, "describe")
+    info = worker.call_adapter(engine, "describe")
     assert info.name == engine and info.title and info.version[0].isdigit() and info.missing is None
-    assert worker.attribute(engine, "package")
+    assert worker.adapter_attribute(engine, "package")
     names = [method.name for method in info.integrators]
     assert (not names) == ("integrators" in declared_gaps(engine)), "the declaration of gaps is wrong"
     assert len(set(names)) == len(names)
     with pytest.raises(KeyError, match=names[0] if names else engine):
-        worker.call(engine, "simulate", *still(), TIMES, "no such method", STEP)
+        worker.call_adapter(engine, "simulate", *single_body(), TIMES, "no such method", STEP)
 
 
 @every_integrator
@@ -110,25 +112,25 @@ def test_describes_its_integrators(engine, integrator):
         assert exponents[0] == integrator.order and exponents == sorted(set(exponents))
 
 
-@pytest.mark.parametrize(("engine", "kind"), GAPS)
+@pytest.mark.parametrize(("engine", "kind"), UNSUPPORTED_BY_ENGINE)
 def test_a_declared_gap_is_real(engine, kind):
     """A quantity is never returned; of the models of a kind at least one is refused."""
     assert kind in UNSUPPORTED_KINDS, f"{kind} is none of {', '.join(UNSUPPORTED_KINDS)}"
     assert len(declared_gaps(engine)[kind].split()) > 3, "the reason is a sentence"
     if kind == "integrators":
-        assert not worker.attribute(engine, "integrators")
+        assert not worker.adapter_attribute(engine, "integrators")
         return
     models = [
-        pendulums.model(joints, loads=loaded, drag=loaded)
-        for joints in JOINTS.values()
+        pendulums.make_model(joints, loads=loaded, drag=loaded)
+        for joints in JOINT_PATTERNS.values()
         for loaded in (False, True)
     ]
     if kind in MODEL_KINDS:
-        refused = [ask(engine, "evaluate", model, [pendulums.state(model)]) is None
+        refused = [ask(engine, "evaluate", model, [pendulums.state_from_seed(model)]) is None
                    for model in models if kind in kinds_of(model)]  # fmt: skip
         assert any(refused), f"{engine} refuses no model with {kind}: take {kind} out of `unsupported`"
     else:
-        answers = ask(engine, "evaluate", model := one_body(engine), [pendulums.state(model)])
+        answers = ask(engine, "evaluate", model := one_body(engine), [pendulums.state_from_seed(model)])
         assert getattr(answers[0], kind) is None, f"{engine} returns {kind}: take it out of `unsupported`"
 
 
@@ -136,58 +138,62 @@ def test_a_declared_gap_is_real(engine, kind):
 
 
 @cache
-def truths(joints: str, loaded: bool) -> tuple[Model, list[State], list[newton_euler.Truth]]:
-    subject = pendulums.model(JOINTS[joints], loads=loaded, drag=loaded)
-    states = [pendulums.state(subject, seed) for seed in range(STATES)]
+def expected_states(
+    joints: str, loaded: bool
+) -> tuple[Model, list[State], list[newton_euler.NewtonEulerSolution]]:
+    subject = pendulums.make_model(JOINT_PATTERNS[joints], loads=loaded, drag=loaded)
+    states = [pendulums.state_from_seed(subject, seed) for seed in range(STATES)]
     return subject, states, [newton_euler.solve(subject, at) for at in states]
 
 
-def close(got, expected, scale, what, relative):
+def assert_close(got, expected, scale, quantity, relative):
     """‖got − expected‖∞ ≤ relative · scale."""
     error = np.max(np.abs(np.asarray(got) - expected))
     assert error <= relative * scale, (
-        f"{what}: off by {error:.3e}, {error / scale:.1e} relative\n{got}\n{expected}"
+        f"{quantity}: off by {error:.3e}, {error / scale:.1e} relative\n{got}\n{expected}"
     )
 
 
-def agrees(engine, answer, name, expected, scale, relative=1e-11):
+def assert_agrees(engine, answer, name, expected, scale, relative=1e-11):
     """A state quantity is returned, and close, or is declared as unsupported."""
     got = getattr(answer, name)
     assert (got is None) == (name in declared_gaps(engine)), (
         f"{engine} {'does not return' if got is None else 'returns'} {name}, unlike its `unsupported`"
     )
     if got is not None:
-        close(got, expected, scale, name, relative)
+        assert_close(got, expected, scale, name, relative)
 
 
 @pytest.mark.parametrize("loaded", [False, True], ids=["free", "loads and drag"])
-@pytest.mark.parametrize("joints", JOINTS)
+@pytest.mark.parametrize("joints", JOINT_PATTERNS)
 def test_states_obey_newton_and_euler(engine, joints, loaded):
-    subject, states, truth = truths(joints, loaded)
+    subject, states, truth = expected_states(joints, loaded)
     answers = ask(engine, "evaluate", subject, states)
     # Conditioning allows 1e-11 of the largest acceleration or force in the chain: masses and inertias
     # are within a factor of 4.  Plain sums and products of the inputs allow more.
     g, weight = np.linalg.norm(subject.gravity), np.linalg.norm(subject.gravity) * subject.mass.sum()
     levers = np.cumsum(0.5 + subject.length)
     for at, true, got in zip(states, truth, answers or [], strict=False):
-        agrees(engine, got, "acceleration", true.acceleration, max(g, np.abs(true.acceleration).max()))
+        assert_agrees(engine, got, "acceleration", true.acceleration, max(g, np.abs(true.acceleration).max()))
         turn = max(g / 0.25, np.abs(true.angular_acceleration).max())
-        agrees(engine, got, "angular_acceleration", true.angular_acceleration, turn)
+        assert_agrees(engine, got, "angular_acceleration", true.angular_acceleration, turn)
         force = max(weight, np.abs(true.joint_reaction).max())
-        agrees(engine, got, "joint_reaction", true.joint_reaction, force)
-        energy, height = newton_euler.kinetic(subject, at), newton_euler.potential(subject, at)
-        agrees(engine, got, "kinetic_energy", energy, energy, 1e-12)
-        agrees(engine, got, "potential_energy", height, g * subject.mass @ levers, 1e-13)
+        assert_agrees(engine, got, "joint_reaction", true.joint_reaction, force)
+        energy, height = newton_euler.kinetic_energy(subject, at), newton_euler.potential_energy(subject, at)
+        assert_agrees(engine, got, "kinetic_energy", energy, energy, 1e-12)
+        assert_agrees(engine, got, "potential_energy", height, g * subject.mass @ levers, 1e-13)
         momentum = newton_euler.angular_momentum(subject, at)
         size = np.sum(subject.mass * levers * np.linalg.norm(at.v, axis=1))
-        agrees(engine, got, "angular_momentum", momentum, size, 1e-12)
+        assert_agrees(engine, got, "angular_momentum", momentum, size, 1e-12)
         M = newton_euler.mass_matrix(subject, at)
-        agrees(engine, got, "mass_matrix", M, np.abs(M).max(), 1e-12)
+        assert_agrees(engine, got, "mass_matrix", M, np.abs(M).max(), 1e-12)
 
 
-def still(p=(1.0, 0.0, 0.0, 0.0), omega=(0.0, 0.0, 0.0), pivot=(0.0, 0.0, 0.2), joint=0.0, u=(0, 0, -1.0)):
+def single_body(
+    p=(1.0, 0.0, 0.0, 0.0), omega=(0.0, 0.0, 0.0), pivot=(0.0, 0.0, 0.2), joint=0.0, u=(0, 0, -1.0)
+):
     """One symmetric body without special numbers hidden: (model, state)."""
-    base = pendulums.model("b")
+    base = pendulums.make_model("b")
     subject = replace(
         base,
         mass=np.array([2.0]),
@@ -206,17 +212,17 @@ def still(p=(1.0, 0.0, 0.0, 0.0), omega=(0.0, 0.0, 0.0), pivot=(0.0, 0.0, 0.2), 
 @pytest.mark.parametrize("hang", [{}, {"joint": 0.4}, {"joint": 0.4, "u": (0, 0, 1.0)}], ids=str)
 def test_hangs_at_rest(engine, hang):
     """By hand: nothing accelerates, the joint carries the weight; also on a rod exactly along −z or +z."""
-    subject, at = still(**hang)
+    subject, at = single_body(**hang)
     for got in ask(engine, "evaluate", subject, [at]) or []:
-        agrees(engine, got, "acceleration", 0, 10, 1e-13)
-        agrees(engine, got, "angular_acceleration", 0, 50, 1e-13)
-        agrees(engine, got, "joint_reaction", [[0, 0, 20.0]], 20, 1e-13)
-        agrees(engine, got, "potential_energy", 20 * at.r[0, 2], 20, 1e-15)
+        assert_agrees(engine, got, "acceleration", 0, 10, 1e-13)
+        assert_agrees(engine, got, "angular_acceleration", 0, 50, 1e-13)
+        assert_agrees(engine, got, "joint_reaction", [[0, 0, 20.0]], 20, 1e-13)
+        assert_agrees(engine, got, "potential_energy", 20 * at.r[0, 2], 20, 1e-15)
 
 
 def turned():
     """Body x, y, z point to world y, z, x; the pivot is 0.2 m along body x; spin about world z."""
-    return still((0.5, 0.5, 0.5, 0.5), omega=(0.0, 2.0, 0.0), pivot=(0.2, 0.0, 0.0))
+    return single_body((0.5, 0.5, 0.5, 0.5), omega=(0.0, 2.0, 0.0), pivot=(0.2, 0.0, 0.0))
 
 
 def test_frames_and_quaternion_order(engine):
@@ -229,56 +235,59 @@ def test_frames_and_quaternion_order(engine):
     np.testing.assert_allclose(at.v, [[0.4, 0, 0]], atol=1e-15)
     turn = 4 / 0.13
     for got in ask(engine, "evaluate", subject, [at]) or []:
-        agrees(engine, got, "angular_acceleration", [[0, 0, turn]], turn, 1e-13)
-        agrees(engine, got, "acceleration", [[0, 0.8, -0.2 * turn]], 10, 1e-13)
-        agrees(engine, got, "joint_reaction", [[0, 1.6, 20 - 0.4 * turn]], 20, 1e-13)
-        agrees(engine, got, "kinetic_energy", 0.5 * 4 * (0.04 + 0.08), 1, 1e-13)
-        agrees(engine, got, "angular_momentum", [0, 0, 2 * (0.04 + 0.08)], 1, 1e-13)
+        assert_agrees(engine, got, "angular_acceleration", [[0, 0, turn]], turn, 1e-13)
+        assert_agrees(engine, got, "acceleration", [[0, 0.8, -0.2 * turn]], 10, 1e-13)
+        assert_agrees(engine, got, "joint_reaction", [[0, 1.6, 20 - 0.4 * turn]], 20, 1e-13)
+        assert_agrees(engine, got, "kinetic_energy", 0.5 * 4 * (0.04 + 0.08), 1, 1e-13)
+        assert_agrees(engine, got, "angular_momentum", [0, 0, 2 * (0.04 + 0.08)], 1, 1e-13)
 
 
 @every_integrator
 def test_the_first_sample_is_the_initial_state(engine, integrator):
     subject, at = turned()
-    run = ask(engine, "simulate", subject, at, TIMES[:2], integrator.name, resolution(integrator))
+    run = ask(engine, "simulate", subject, at, TIMES[:2], integrator.name, step_or_tolerance(integrator))
     if run is None:
         return
     pdot = kinematics.quaternion_rate(at.p, at.omega)
     for name, expected in (("r", at.r), ("p", at.p), ("v", at.v), ("pdot", pdot)):
-        close(getattr(run, name)[0], expected, 1, f"first {name}", 1e-14)
+        assert_close(getattr(run, name)[0], expected, 1, f"first {name}", 1e-14)
 
 
 @pytest.mark.parametrize("joints", ["balls", "rods"])
 def test_p_and_minus_p_are_the_same_attitude(engine, joints):
-    subject = pendulums.model(JOINTS[joints])
-    at = pendulums.state(subject)
-    one, other = ask(engine, "evaluate", subject, [at, pendulums.flipped(at)]) or (None, None)
+    subject = pendulums.make_model(JOINT_PATTERNS[joints])
+    at = pendulums.state_from_seed(subject)
+    one, other = ask(engine, "evaluate", subject, [at, pendulums.with_negated_quaternions(at)]) or (
+        None,
+        None,
+    )
     if one is None:
         return
     for name in ("acceleration", "angular_acceleration", "joint_reaction", "angular_momentum", "mass_matrix"):
         if (value := getattr(one, name)) is not None:
-            close(getattr(other, name), value, np.abs(value).max(), name, 1e-12)
+            assert_close(getattr(other, name), value, np.abs(value).max(), name, 1e-12)
 
 
 @pytest.mark.parametrize("joints", ["balls", "rods"])
 @every_integrator
 def test_runs_from_p_and_minus_p_are_the_same_motion(engine, integrator, joints):
-    subject = pendulums.model(JOINTS[joints])
-    at = pendulums.state(subject)
+    subject = pendulums.make_model(JOINT_PATTERNS[joints])
+    at = pendulums.state_from_seed(subject)
     runs = [
-        ask(engine, "simulate", subject, start, TIMES[:5], integrator.name, resolution(integrator))
-        for start in (at, pendulums.flipped(at))
+        ask(engine, "simulate", subject, start, TIMES[:5], integrator.name, step_or_tolerance(integrator))
+        for start in (at, pendulums.with_negated_quaternions(at))
     ]
     if runs == [None, None]:
         return
-    close(runs[1].r, runs[0].r, 1, "r", 1e-10)
+    assert_close(runs[1].r, runs[0].r, 1, "r", 1e-10)
     attitudes = [kinematics.rotation_matrix(run.p) for run in runs]
-    close(attitudes[1], attitudes[0], 1, "A", 1e-10)
+    assert_close(attitudes[1], attitudes[0], 1, "A", 1e-10)
 
 
 # -- trajectories ------------------------------------------------------------------------------
 
 
-def resolution(method: Integrator) -> float:
+def step_or_tolerance(method: Integrator) -> float:
     return STEP if method.kind == "step" else 1e-10
 
 
@@ -286,43 +295,52 @@ def resolution(method: Integrator) -> float:
 def test_sample_times(engine, integrator):
     """Row 0 is the given state; samples are at the given times, and more of them change nothing."""
     subject = one_body(engine)
-    at, size = pendulums.state(subject), resolution(integrator)
+    at, size = pendulums.state_from_seed(subject), step_or_tolerance(integrator)
     fine, coarse = (
-        worker.call(engine, "simulate", subject, at, times, integrator.name, size)
+        worker.call_adapter(engine, "simulate", subject, at, times, integrator.name, size)
         for times in (TIMES, TIMES[::4])
     )
     np.testing.assert_allclose(fine.t, TIMES, rtol=1e-13)
-    close(fine.r[0], at.r, 1, "first r", 1e-14)
+    assert_close(fine.r[0], at.r, 1, "first r", 1e-14)
     # Implicit steps stop their iterations at a tolerance, dense output at another: both below this.
-    close(fine.r[::4], coarse.r, 1, "r at common times", 1e-10)
+    assert_close(fine.r[::4], coarse.r, 1, "r at common times", 1e-10)
     if integrator.kind == "step":
         assert fine.steps == coarse.steps == round(TIMES[-1] / STEP)
         with pytest.raises(BadInput, match="multiples"):
-            worker.call(engine, "simulate", subject, at, TIMES, integrator.name, 0.3 * STEP)
+            worker.call_adapter(engine, "simulate", subject, at, TIMES, integrator.name, 0.3 * STEP)
 
 
 @pytest.mark.parametrize("joints", ["balls", "rods"])
 def test_evaluation_is_deterministic(engine, joints):
     """The same call gives the same bits, also after another model has been through."""
-    subject, other = pendulums.model(JOINTS[joints]), pendulums.model("rb", loads=True, seed=1)
-    first = ask(engine, "evaluate", subject, [pendulums.state(subject)])
-    ask(engine, "evaluate", other, [pendulums.state(other)])
-    second = ask(engine, "evaluate", subject, [pendulums.state(subject)])
+    subject, other = (
+        pendulums.make_model(JOINT_PATTERNS[joints]),
+        pendulums.make_model("rb", loads=True, seed=1),
+    )
+    first = ask(engine, "evaluate", subject, [pendulums.state_from_seed(subject)])
+    ask(engine, "evaluate", other, [pendulums.state_from_seed(other)])
+    second = ask(engine, "evaluate", subject, [pendulums.state_from_seed(subject)])
     assert (first is None) == (second is None)
-    assert first is None or bits(first[0]) == bits(second[0])
+    assert first is None or to_bytes(first[0]) == to_bytes(second[0])
 
 
 @pytest.mark.parametrize("joints", ["balls", "rods"])
 @every_integrator
 def test_runs_are_deterministic(engine, integrator, joints):
-    subject = pendulums.model(JOINTS[joints])
-    args = subject, pendulums.state(subject), TIMES[:5], integrator.name, resolution(integrator)
+    subject = pendulums.make_model(JOINT_PATTERNS[joints])
+    args = (
+        subject,
+        pendulums.state_from_seed(subject),
+        TIMES[:5],
+        integrator.name,
+        step_or_tolerance(integrator),
+    )
     one, other = (ask(engine, "simulate", *args) for _ in range(2))
     assert (one is None) == (other is None)
-    assert one is None or bits(one) == bits(other)
+    assert one is None or to_bytes(one) == to_bytes(other)
 
 
-def bits(record):
+def to_bytes(record):
     return {
         name: np.asarray(value, float).tobytes() for name, value in vars(record).items() if value is not None
     }
@@ -339,34 +357,34 @@ def test_converges_to_the_truth_with_its_declared_order(engine, integrator, case
     runs = [ask(engine, "simulate", subject, at, times, integrator.name, size) for size in resolutions]
     if runs == [None] * len(runs):
         return
-    rows = [stack(run, true) for run in runs]
+    rows = [flatten_trajectory(run, true) for run in runs]
     if integrator.kind == "tolerance":
-        close(rows[0], stack_truth(true), 1, "at 1e-12", 1e-9)
+        assert_close(rows[0], flatten_states(true), 1, "at 1e-12", 1e-9)
         return
     orders = observed_orders(np.array(rows))[-2:]
     assert np.all(np.abs(orders - integrator.order) < 0.1), f"orders {orders}"
     *_, previous, limit = romberg_columns(np.array(rows), integrator.error_exponents)
     uncertainty = 10 * np.max(np.abs(limit[-1] - previous[-1])) + 1e-11
     assert uncertainty < 1e-5, f"extrapolation is uncertain by {uncertainty}"
-    close(limit[-1], stack_truth(true), 1, "extrapolated", uncertainty)
+    assert_close(limit[-1], flatten_states(true), 1, "extrapolated", uncertainty)
 
 
 @cache
 def convergence_case(case: str):
     joints, _, loaded = case.partition(", ")
-    subject = pendulums.model(JOINTS[joints], loads=bool(loaded), drag=bool(loaded))
-    at = pendulums.state(subject, rate=1.0)
+    subject = pendulums.make_model(JOINT_PATTERNS[joints], loads=bool(loaded), drag=bool(loaded))
+    at = pendulums.state_from_seed(subject, rate=1.0)
     times = np.linspace(0, 0.25, 5)  # short of the singularities of an engine that counts in angles
     return subject, at, times, newton_euler.integrate(subject, at, times)
 
 
-def stack(run, true):
+def flatten_trajectory(run, true):
     """All of a trajectory in one row of numbers; p and ṗ with the sign of the truth's."""
     sign = np.sign(np.sum(run.p * np.array([s.p for s in true]), -1, keepdims=True))
     return np.concatenate([np.ravel(x) for x in (run.r, sign * run.p, run.v, sign * run.pdot)])
 
 
-def stack_truth(true):
+def flatten_states(true):
     pdot = [kinematics.quaternion_rate(s.p, s.omega) for s in true]
     columns = [s.r for s in true], [s.p for s in true], [s.v for s in true], pdot
     return np.concatenate([np.ravel(column) for column in columns])
@@ -375,13 +393,13 @@ def stack_truth(true):
 # -- what no engine may see --------------------------------------------------------------------
 
 
-def reached(real, *_):
+def fail_if_called(real, *_):
     raise AssertionError("the engine was reached")
 
 
-def spoiled(name, value):
+def replace_entry(name, value):
     """One body's model and state with one entry of one array replaced."""
-    subject, at = pendulums.model("rb"), pendulums.state(pendulums.model("rb"))
+    subject, at = pendulums.make_model("rb"), pendulums.state_from_seed(pendulums.make_model("rb"))
     holder = at if hasattr(at, name) else subject
     array = np.array(getattr(holder, name))
     array.flat[-1] = value
@@ -394,10 +412,12 @@ ARRAYS = "p omega u udot r v mass inertia proximal distal length gravity force m
 
 def bad_inputs():
     """Model, state, and a word of the message that refuses them."""
-    subject = pendulums.model("rb")
-    at = pendulums.state(subject)
+    subject = pendulums.make_model("rb")
+    at = pendulums.state_from_seed(subject)
     bad = {
-        (name, value): (*spoiled(name, value), name) for name in ARRAYS.split() for value in (np.nan, np.inf)
+        (name, value): (*replace_entry(name, value), name)
+        for name in ARRAYS.split()
+        for value in (np.nan, np.inf)
     }
     for factor in (0.0, 1.1, 1 + 1e-13, -0.5):
         bad["p times", factor] = subject, replace(at, p=at.p * [[1.0], [factor]]), "normalised"
@@ -406,27 +426,27 @@ def bad_inputs():
     return [pytest.param(*case, id="-".join(map(str, name))) for name, case in bad.items()]
 
 
-TAMPER = {"_evaluate": reached, "_simulate": reached}
+TAMPER = {"_evaluate": fail_if_called, "_simulate": fail_if_called}
 
 
 @pytest.mark.parametrize(("subject", "at", "message"), bad_inputs())
 def test_refuses_bad_states(engine, subject, at, message):
     with pytest.raises(BadInput, match=message):
-        worker.call(engine, "evaluate", subject, [at], tamper=TAMPER)
+        worker.call_adapter(engine, "evaluate", subject, [at], overrides=TAMPER)
 
 
 @pytest.mark.parametrize(("subject", "at", "message"), bad_inputs())
 @every_integrator
 def test_refuses_runs_from_bad_states(engine, integrator, subject, at, message):
     with pytest.raises(BadInput, match=message):
-        size = resolution(integrator)
-        worker.call(engine, "simulate", subject, at, TIMES, integrator.name, size, tamper=TAMPER)
+        size = step_or_tolerance(integrator)
+        worker.call_adapter(engine, "simulate", subject, at, TIMES, integrator.name, size, overrides=TAMPER)
 
 
 # -- what must not leave unnoticed -------------------------------------------------------------
 
 
-def honest(real, *args):
+def unchanged(real, *args):
     return real(*args)
 
 
@@ -438,33 +458,33 @@ def early_stop(real, *args):
 def early_stop_padded(real, *args):
     """Stopped early, the last row filled in again, as MuJoCo's rollout does."""
     run = real(*args)
-    return replace(run, **{k: held(getattr(run, k)) for k in ("r", "p", "v", "pdot")})
+    return replace(run, **{k: repeat_sample(getattr(run, k)) for k in ("r", "p", "v", "pdot")})
 
 
-def held(rows):
+def repeat_sample(rows):
     return np.concatenate([rows[:-2], rows[-3:-2], rows[-3:-2]])
 
 
 def stopped_clock(real, *args):
     run = real(*args)
-    return replace(run, t=held(run.t))
+    return replace(run, t=repeat_sample(run.t))
 
 
 def silent_reset(real, *args):
     """Starts over from the initial state in the middle, clock and all rows in good order."""
     run = real(*args)
-    return replace(run, **{k: restarted(getattr(run, k)) for k in ("r", "p", "v", "pdot")})
+    return replace(run, **{k: restart_halfway(getattr(run, k)) for k in ("r", "p", "v", "pdot")})
 
 
-def restarted(rows):
+def restart_halfway(rows):
     half = len(rows) // 2
     return np.concatenate([rows[:half], rows[: len(rows) - half]])
 
 
-def rewound(real, *args):
+def reset_clock_and_state(real, *args):
     """A reset with the engine's clock set back, as MuJoCo's autoreset does."""
     run = real(*args)
-    return replace(run, t=restarted(run.t))
+    return replace(run, t=restart_halfway(run.t))
 
 
 def not_finite(real, *args):
@@ -486,7 +506,7 @@ def missing_body(real, *args):
         (early_stop_padded, "repeats"),
         (stopped_clock, "sampled"),
         (silent_reset, "initial state again"),
-        (rewound, "sampled"),
+        (reset_clock_and_state, "sampled"),
         (not_finite, "v is not finite from t = 0.5"),
         (missing_body, "shape"),
     ],
@@ -495,10 +515,16 @@ def missing_body(real, *args):
 @every_integrator
 def test_detects_in_a_trajectory(engine, integrator, tampering, message):
     subject = one_body(engine)
-    args = (subject, pendulums.state(subject), TIMES, integrator.name, resolution(integrator))
-    worker.call(engine, "simulate", *args, tamper={"_simulate": honest})
+    args = (
+        subject,
+        pendulums.state_from_seed(subject),
+        TIMES,
+        integrator.name,
+        step_or_tolerance(integrator),
+    )
+    worker.call_adapter(engine, "simulate", *args, overrides={"_simulate": unchanged})
     with pytest.raises(EngineFailure, match=message):
-        worker.call(engine, "simulate", *args, tamper={"_simulate": tampering})
+        worker.call_adapter(engine, "simulate", *args, overrides={"_simulate": tampering})
 
 
 def nan_acceleration(real, *args):
@@ -510,11 +536,11 @@ def infinite_energy(real, *args):
     return [replace(answer, kinetic_energy=float("inf")) for answer in real(*args)]
 
 
-def flat_reaction(real, *args):
+def wrong_shape_reaction(real, *args):
     return [replace(answer, joint_reaction=np.zeros(3)) for answer in real(*args)]
 
 
-def lost_state(real, *args):
+def missing_state(real, *args):
     return real(*args)[:-1]
 
 
@@ -523,17 +549,17 @@ def lost_state(real, *args):
     [
         (nan_acceleration, "state 0: acceleration is not finite"),
         (infinite_energy, "kinetic_energy is not finite"),
-        (flat_reaction, "joint_reaction has shape"),
-        (lost_state, "answered 1 of 2 states"),
+        (wrong_shape_reaction, "joint_reaction has shape"),
+        (missing_state, "answered 1 of 2 states"),
     ],
     ids=lambda x: getattr(x, "__name__", ""),
 )
 def test_detects_in_an_evaluation(engine, tampering, message):
     subject = one_body(engine)
-    args = (subject, [pendulums.state(subject), pendulums.state(subject, 1)])
-    assert len(worker.call(engine, "evaluate", *args, tamper={"_evaluate": honest})) == 2
+    args = (subject, [pendulums.state_from_seed(subject), pendulums.state_from_seed(subject, 1)])
+    assert len(worker.call_adapter(engine, "evaluate", *args, overrides={"_evaluate": unchanged})) == 2
     with pytest.raises(EngineFailure, match=message):
-        worker.call(engine, "evaluate", *args, tamper={"_evaluate": tampering})
+        worker.call_adapter(engine, "evaluate", *args, overrides={"_evaluate": tampering})
 
 
 # -- the worker itself -------------------------------------------------------------------------
@@ -546,7 +572,7 @@ def crash():
 def test_a_crash_or_a_hang_loses_one_call():
     name = next(iter(ENGINES))
     with pytest.raises(ProcessExpired):
-        worker.run(name, crash)
+        worker.run_in_engine_process(name, crash)
     with pytest.raises(TimeoutError):
-        worker.run(name, time.sleep, 60, timeout=0.5)
-    assert worker.run(name, abs, -1) == 1
+        worker.run_in_engine_process(name, time.sleep, 60, timeout=0.5)
+    assert worker.run_in_engine_process(name, abs, -1) == 1

@@ -70,7 +70,7 @@ def contract_of(monkeypatch):
 def test_an_engine_of_one_body_on_a_ball_joint_can_pass(contract_of, gaps):
     for kind in gaps:
         contract_of(gaps, "a_declared_gap_is_real", kind)
-    for joints in contract.JOINTS:
+    for joints in contract.JOINT_PATTERNS:
         for loaded in (False, True):
             contract_of(gaps, "states_obey_newton_and_euler", joints, loaded)
     for hang in ({}, {"joint": 0.4}):

@@ -21,10 +21,10 @@ from tests.helpers.refinement import extrapolated, observed_orders
 TIMES = np.linspace(0.0, 2.0, 9)
 
 
-def gentle(joints: str) -> tuple[Model, State]:
+def swinging_pendulum(joints: str) -> tuple[Model, State]:
     """A generic pendulum (offsets, full inertia) that swings in three dimensions below the pivot."""
     rng = np.random.default_rng(len(joints))
-    subject = pendulums.model(joints, seed=3)
+    subject = pendulums.make_model(joints, seed=3)
     n = subject.n
     subject = replace(
         subject,
@@ -39,16 +39,18 @@ def gentle(joints: str) -> tuple[Model, State]:
 
 
 @cache
-def truth(joints: str) -> np.ndarray:
+def true_positions(joints: str) -> np.ndarray:
     """(T, N, 3) positions of the gentle pendulum by an independent solution."""
-    return np.array([at.r for at in newton_euler.integrate(*gentle(joints), TIMES)])
+    return np.array([at.r for at in newton_euler.integrate(*swinging_pendulum(joints), TIMES)])
 
 
-def ladder(engine: Adapter, joints: str, method: str, levels: range) -> tuple[np.ndarray, np.ndarray]:
+def positions_by_step_size(
+    engine: Adapter, joints: str, method: str, levels: range
+) -> tuple[np.ndarray, np.ndarray]:
     """Positions at each step size (levels, T, N, 3), and the independent solution's (T, N, 3)."""
-    subject, start = gentle(joints)
+    subject, start = swinging_pendulum(joints)
     runs = [engine.simulate(subject, start, TIMES, method, 2.0**-k).r for k in levels]
-    return np.array(runs), truth(joints)
+    return np.array(runs), true_positions(joints)
 
 
 @pytest.mark.parametrize("joints", ["b", "bb", "r"])
@@ -62,7 +64,7 @@ def ladder(engine: Adapter, joints: str, method: str, levels: range) -> tuple[np
     ids=["trapezoidal", "generalized-alpha", "RK44"],
 )
 def test_order_and_limit(engine, method, levels, order, joints):
-    runs, true = ladder(engine, joints, method, levels)
+    runs, true = positions_by_step_size(engine, joints, method, levels)
     shown = observed_orders(runs)
     assert abs(shown[1] - order) < 0.1, f"{method} on {joints} shows orders {shown}, declared {order}"
     error = np.abs(extrapolated(runs, engine.integrator(method).error_exponents) - true).max()
@@ -71,13 +73,13 @@ def test_order_and_limit(engine, method, levels, order, joints):
 
 def test_even_powers_are_what_the_trapezoidal_rule_has():
     """Two steps of the even powers reach what two of the consecutive ones do not: the h³ term is absent."""
-    runs, true = ladder(Exudyn(), "b", "trapezoidal", range(7, 10))
+    runs, true = positions_by_step_size(Exudyn(), "b", "trapezoidal", range(7, 10))
     even, each = (np.abs(extrapolated(runs, powers) - true).max() for powers in ((2, 4), (2, 3)))
     assert even < each / 30
 
 
 def test_the_trapezoidal_rule_lets_joints_drift_and_index_3_does_not():
-    subject, start = gentle("br")
+    subject, start = swinging_pendulum("br")
     gaps = {}
     for method in ("trapezoidal", "generalized-alpha"):
         for step in (2.0**-8, 2.0**-9):
@@ -90,8 +92,8 @@ def test_the_trapezoidal_rule_lets_joints_drift_and_index_3_does_not():
 
 def test_builtin_initial_accelerations_are_finite_differences():
     """The reason why `evaluate` solves M, C, f and γ itself: Exudyn's own are off by some 1e-6."""
-    subject = pendulums.model("bb", seed=1)
-    start = pendulums.state(subject)
+    subject = pendulums.make_model("bb", seed=1)
+    start = pendulums.state_from_seed(subject)
     truth = newton_euler.solve(subject, start)
     scale = np.abs(truth.acceleration).max()
     with silence_engine():
@@ -108,17 +110,17 @@ def test_builtin_initial_accelerations_are_finite_differences():
 
 def test_long_chains_at_state_level():
     """50 bodies: maximal coordinates keep rounding; the tree's mass matrix costs digits."""
-    subject = pendulums.model("b" * 25 + "r" * 25)
-    start = pendulums.state(subject, rate=1.0)
+    subject = pendulums.make_model("b" * 25 + "r" * 25)
+    start = pendulums.state_from_seed(subject, rate=1.0)
     truth = newton_euler.solve(subject, start).acceleration
     for engine, bound in ((Exudyn(), 1e-13), (ExudynTree(), 1e-9)):
         error = np.abs(engine.evaluate(subject, [start])[0].acceleration - truth).max() / np.abs(truth).max()
         assert error < bound, f"{engine.name}: {error:.1e}"
 
 
-def swing_over(rate: float) -> tuple[Model, State]:
+def near_singular_pendulum(rate: float) -> tuple[Model, State]:
     """A body on a ball that starts about x and is driven about y, off its first axis."""
-    subject = replace(pendulums.model("b"), gravity=np.zeros(3), moment=np.array([[0.0, 4.0, 0.0]]))
+    subject = replace(pendulums.make_model("b"), gravity=np.zeros(3), moment=np.array([[0.0, 4.0, 0.0]]))
     subject = replace(subject, inertia=0.1 * np.eye(3)[None], proximal=np.zeros((1, 3)))
     zero = np.zeros((1, 3))
     return subject, state_from_minimal(
@@ -128,7 +130,7 @@ def swing_over(rate: float) -> tuple[Model, State]:
 
 def test_tree_says_when_its_angles_become_singular():
     """A constant body moment turns the first axis into the third; before that the motion is right."""
-    subject, start = swing_over(1e-3)
+    subject, start = near_singular_pendulum(1e-3)
     with pytest.raises(Unsupported, match=r"body 1 come near their singularity at t = 0\.2\d* s") as said:
         ExudynTree().simulate(subject, start, np.array([0.0, 2.0]), "RK44", 2.0**-9)
     stated = float(str(said.value).split("t = ")[1].split(" s")[0])
@@ -142,7 +144,7 @@ def test_tree_says_when_its_angles_become_singular():
 
 def test_tree_turns_for_ever_about_its_first_axis():
     """Ten turns about the initial axis: angles grow, nothing is singular."""
-    subject, start = swing_over(10 * np.pi)
+    subject, start = near_singular_pendulum(10 * np.pi)
     subject = replace(subject, moment=np.zeros((1, 3)))
     run = ExudynTree().simulate(subject, start, np.linspace(0, 2, 5), "RK44", 2.0**-8)
     assert np.abs(run.v).max() < 1e-13
@@ -151,15 +153,15 @@ def test_tree_turns_for_ever_about_its_first_axis():
 
 def test_a_failed_newton_iteration_is_named_with_time_and_words():
     """A step of a quarter of a second through a tumbling pendulum: Newton diverges, and that is said."""
-    subject = pendulums.model("rr")
-    start = pendulums.state(subject, rate=20.0)
+    subject = pendulums.make_model("rr")
+    start = pendulums.state_from_seed(subject, rate=20.0)
     with pytest.raises(EngineFailure, match=r"stopped at t = .* s after \d+ steps, asked for 8 .*: .+"):
         Exudyn().simulate(subject, start, TIMES, "generalized-alpha", 0.25)
 
 
 @pytest.mark.parametrize("step", [2.0**-8, 1e-3, 1 / 300])
 def test_steps_are_counted(step):
-    subject, start = gentle("b")
+    subject, start = swinging_pendulum("b")
     times = np.arange(0, 4) * (300 * step if step > 1e-3 else 1.0)
     run = Exudyn().simulate(subject, start, times, "trapezoidal", step)
     assert run.steps == round(times[-1] / step)
@@ -167,12 +169,12 @@ def test_steps_are_counted(step):
 
 def test_nothing_is_printed_or_written(capfd, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    subject, start = gentle("br")
+    subject, start = swinging_pendulum("br")
     for engine in (Exudyn(), ExudynTree()):
         engine.evaluate(subject, [start])
         engine.simulate(subject, start, TIMES[:2], engine.integrators[0].name, 2.0**-8)
-    hard = pendulums.model("rr")
+    hard = pendulums.make_model("rr")
     with pytest.raises(EngineFailure):
-        Exudyn().simulate(hard, pendulums.state(hard, rate=20.0), TIMES, "generalized-alpha", 0.25)
+        Exudyn().simulate(hard, pendulums.state_from_seed(hard, rate=20.0), TIMES, "generalized-alpha", 0.25)
     assert capfd.readouterr() == ("", "")
     assert list(tmp_path.iterdir()) == []

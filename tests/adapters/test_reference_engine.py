@@ -19,28 +19,28 @@ from plumbline.model.kinematics import (
 from tests.helpers.random_chains import random_chain
 
 
-def case(rods, seed=0, loads=True):
+def model_and_state(rods, seed=0, loads=True):
     """A generic model and a state of it."""
     return random_chain(np.random.default_rng(seed), rods, rate=1.0, loads=loads, drag=loads)
 
 
-def rates(model, state):
+def generalized_velocity(model, state):
     """ν of the contract's mass matrix."""
     return np.concatenate([state.udot[model.rods].ravel(), state.omega.ravel()])
 
 
 @pytest.mark.parametrize("rods", [[True], [False], [True, False, True], [False, True, False, False]], ids=str)
 def test_velocity_map_gives_the_bodies_rates(rods):
-    model, state = case(rods)
-    bodies = (velocity_jacobian(model, state) @ rates(model, state)).reshape(model.n, 6)
+    model, state = model_and_state(rods)
+    bodies = (velocity_jacobian(model, state) @ generalized_velocity(model, state)).reshape(model.n, 6)
     np.testing.assert_allclose(bodies, np.hstack([state.v, state.omega]), atol=1e-14)
 
 
 @pytest.mark.parametrize("rods", [[True], [False], [True, False, True], [False, True, False, False]], ids=str)
 def test_energy_momentum_and_mass_matrix_belong_together(rods):
-    model, state = case(rods)
+    model, state = model_and_state(rods)
     (said,) = Reference().evaluate(model, [state])
-    nu = rates(model, state)
+    nu = generalized_velocity(model, state)
     np.testing.assert_allclose(said.kinetic_energy, nu @ said.mass_matrix @ nu / 2, rtol=1e-14)
     np.testing.assert_allclose(said.mass_matrix, mass_matrix(model, state), atol=1e-14)
     spin = np.einsum("nij,njk,nk->ni", rotation_matrix(state.p), model.inertia, state.omega)
@@ -53,7 +53,7 @@ def test_energy_momentum_and_mass_matrix_belong_together(rods):
 @pytest.mark.parametrize("rods", [[True, False], [False, True]], ids=str)
 def test_accelerations_are_the_rates_of_the_velocities(rods):
     """Central differences of the simulated velocities at the middle of a run, to their own h² ω² error."""
-    model, state = case(rods)
+    model, state = model_and_state(rods)
     h = 1e-4
     run = Reference().simulate(model, state, np.array([0, h, 2 * h]), "dop853", 1e-13)
     omega = angular_velocity(run.p, run.pdot)
@@ -66,7 +66,7 @@ def test_accelerations_are_the_rates_of_the_velocities(rods):
 
 def test_trajectories_are_raw():
     """p leaves the unit sphere by truncation and nothing puts it back (E4)."""
-    model, state = case([True, False])
+    model, state = model_and_state([True, False])
     run = Reference().simulate(model, state, np.linspace(0, 2, 21), "dop853", 1e-6)
     off = np.abs(np.sum(run.p**2, -1) - 1)
     np.testing.assert_array_equal(run.p[0], state.p)
@@ -74,7 +74,7 @@ def test_trajectories_are_raw():
 
 
 def test_a_singular_model_fails_with_its_cause():
-    model, state = case([False])
+    model, state = model_and_state([False])
     inertia = np.diag([0.1, 0.1, 0.0])[None]
     pencil = replace(model, inertia=inertia, proximal=np.array([[0, 0, 0.3]]))
     state = state_from_minimal(pencil, state.p, state.omega, state.u, state.udot)
@@ -95,7 +95,7 @@ def test_the_version_is_the_checkouts():
 @pytest.mark.full
 def test_fifty_bodies_for_two_seconds():
     """A chain of 50 balls released with random rates keeps its energy to its tolerance's drift."""
-    model, state = case([False] * 50, loads=False)
+    model, state = model_and_state([False] * 50, loads=False)
     run = Reference().simulate(model, state, np.linspace(0, 2, 5), "dop853", 1e-9)
     omega = angular_velocity(run.p, run.pdot)
     kinetic = np.einsum("n,tni,tni->t", model.mass, run.v, run.v)

@@ -24,7 +24,7 @@ from plumbline.storage.results_store import SCHEMA_VERSION
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def plumbline(*words, cwd=ROOT, **environment):
+def run_plumbline(*words, cwd=ROOT, **environment):
     return subprocess.run(
         [sys.executable, "-m", "plumbline", *map(str, words)],
         cwd=cwd, capture_output=True, text=True, timeout=240,
@@ -33,7 +33,7 @@ def plumbline(*words, cwd=ROOT, **environment):
 
 
 def test_help_has_examples_and_exit_codes():
-    result = plumbline("--help")
+    result = run_plumbline("--help")
     assert result.returncode == 0
     for words in (
         "Exit codes",
@@ -43,7 +43,10 @@ def test_help_has_examples_and_exit_codes():
         "3  an engine failed",
     ):
         assert words in result.stdout
-    assert "\n    python -m plumbline run --family chain --level state\n" in plumbline("run", "--help").stdout
+    assert (
+        "\n    python -m plumbline run --family chain --level state\n"
+        in run_plumbline("run", "--help").stdout
+    )
     assert "\\b" not in result.stdout
 
 
@@ -114,17 +117,17 @@ def test_a_column_names_an_engines_version_once():
 
 
 def test_list_scenarios_and_engines_as_text_and_json():
-    names = [s["name"] for s in json.loads(plumbline("list", "scenarios", "--json").stdout)]
+    names = [s["name"] for s in json.loads(run_plumbline("list", "scenarios", "--json").stdout)]
     assert len(names) >= 27
-    text = plumbline("list", "scenarios").stdout
+    text = run_plumbline("list", "scenarios").stdout
     assert all(name in text for name in names)
-    engines = {e["name"]: e for e in json.loads(plumbline("list", "engines", "--json").stdout)}
+    engines = {e["name"]: e for e in json.loads(run_plumbline("list", "engines", "--json").stdout)}
     assert {"reference", "mujoco", "pinocchio", "exudyn"} <= set(engines)
     assert "RK4" in engines["mujoco"]["integrators"]
 
 
 def test_a_run_writes_everything_and_exits_by_its_verdict(tmp_path):
-    result = plumbline(
+    result = run_plumbline(
         "run", "rest", "--engine", "mujoco", "--engine", "reference", "--out", tmp_path / "o o"
     )
     assert result.returncode == 0, result.stdout + result.stderr
@@ -136,14 +139,14 @@ def test_a_run_writes_everything_and_exits_by_its_verdict(tmp_path):
     assert document["schema_version"] == SCHEMA_VERSION
     assert {row["verdict"] for row in document["rows"] if row["known_issue"] is None} == {"agrees"}
     (tmp_path / "o o" / "report.html").unlink()
-    again = plumbline("report", tmp_path / "o o")
+    again = run_plumbline("report", tmp_path / "o o")
     assert again.returncode == 0, again.stderr
     assert (tmp_path / "o o" / "report.html").exists()
 
 
 def test_stdout_holds_json_alone_with_the_users_tolerance(tmp_path):
     options = "--engine mujoco --level state --json --user-rtol 1e-6 --out"
-    result = plumbline("run", "rest", *options.split(), tmp_path)
+    result = run_plumbline("run", "rest", *options.split(), tmp_path)
     document = json.loads(result.stdout)
     assert {row["user_rtol"] for row in document["rows"]} == {1e-6}
     assert document["run"]["exit_code"] == result.returncode == 0
@@ -152,10 +155,12 @@ def test_stdout_holds_json_alone_with_the_users_tolerance(tmp_path):
 def test_a_scenario_by_path(tmp_path):
     mine = tmp_path / "my pendulum.yaml"
     mine.write_text((ROOT / "scenarios" / "single" / "rest.yaml").read_text())
-    result = plumbline("run", mine, "--engine", "pinocchio", "--level", "state", "--out", tmp_path / "out")
+    result = run_plumbline(
+        "run", mine, "--engine", "pinocchio", "--level", "state", "--out", tmp_path / "out"
+    )
     assert result.returncode == 0, result.stdout + result.stderr
     assert "my pendulum" in result.stdout
-    result = plumbline("check", mine)
+    result = run_plumbline("check", mine)
     assert result.returncode == 0
     assert "ok" in result.stdout
 
@@ -165,7 +170,7 @@ def test_a_name_stays_text_on_the_terminal_in_html_and_in_junit(tmp_path):
     mine = tmp_path / "hostile.yaml"
     rest = (ROOT / "scenarios" / "single" / "rest.yaml").read_text()
     mine.write_text(rest.replace("schema_version: 1", f"schema_version: 1\nname: {json.dumps(name)}"))
-    result = plumbline("run", mine, "--engine", "mujoco", "--level", "state", "--out", tmp_path / "out")
+    result = run_plumbline("run", mine, "--engine", "mujoco", "--level", "state", "--out", tmp_path / "out")
     assert result.returncode == 0, result.stdout + result.stderr
     assert name[:30] in result.stdout
     assert "<img" not in (tmp_path / "out" / "report.html").read_text()
@@ -222,14 +227,14 @@ def test_a_closed_form_that_does_not_fit_is_reported_with_line_and_column(tmp_pa
 
 def test_an_output_folder_that_cannot_be_written_is_an_error_before_any_work(tmp_path):
     (tmp_path / "file").write_text("x")
-    result = plumbline("run", "rest", "--out", tmp_path / "file" / "out")
+    result = run_plumbline("run", "rest", "--out", tmp_path / "file" / "out")
     assert result.returncode == 2
     assert "cannot write to" in result.stderr
 
 
 def test_an_engine_that_is_not_installed_is_a_verdict(tmp_path):
     (tmp_path / "mujoco.py").write_text("raise ImportError('no mujoco here')\n")
-    result = plumbline(
+    result = run_plumbline(
         "run", "rest", "--engine", "mujoco", "--level", "state", "--out", tmp_path / "out",
         PYTHONPATH=f"{tmp_path}{os.pathsep}{ROOT}",
     )  # fmt: skip
@@ -238,4 +243,4 @@ def test_an_engine_that_is_not_installed_is_a_verdict(tmp_path):
 
 
 def test_schema_is_json():
-    assert json.loads(plumbline("schema").stdout)["properties"]
+    assert json.loads(run_plumbline("schema").stdout)["properties"]

@@ -25,7 +25,7 @@ from plumbline.storage.history import History
 from plumbline.storage.results_store import ResultTables, read_table
 
 
-def quiet(*_):
+def ignore_output(*_):
     pass
 
 
@@ -54,18 +54,18 @@ def test_a_random_scenario_is_a_file_like_any_other(tmp_path):
     assert loader.load_scenario(path).digest == random_scenario(3, 4).digest
 
 
-def run(out, **more):
+def run_nightly(out, **more):
     chosen = loader.load_scenarios(["rest"])
     options = {"random_count": 3, "seed": 11, "jobs": 1, "limits": Limits(), "is_full_catalogue": False,
                "extra_refinements": 0} | more  # fmt: skip
-    progress = options.pop("progress", quiet)
+    progress = options.pop("progress", ignore_output)
     return nightly.run_nightly(
-        out, chosen, ["mujoco"], command="-", progress=progress, log=quiet, **options
+        out, chosen, ["mujoco"], command="-", progress=progress, log=ignore_output, **options
     )  # fmt: skip
 
 
 def test_a_night_is_whole_and_remembered(tmp_path):
-    result, place = run(tmp_path)
+    result, place = run_nightly(tmp_path)
     assert {p.name for p in place.iterdir()} >= {
         "results.json", "summary.parquet", "states.parquet", "curves.parquet", "junit.xml",
         "report.html", "summary.md",
@@ -103,16 +103,16 @@ def test_an_unfinished_night_goes_on_with_its_seed(tmp_path):
             raise Killed
 
     with pytest.raises(Killed):
-        run(tmp_path, seed=None, progress=progress)
+        run_nightly(tmp_path, seed=None, progress=progress)
     begun = json.loads((tmp_path / "unfinished" / "plan.json").read_text())
     assert not (tmp_path / "history").exists()
     kept = sorted(tmp_path.glob("unfinished/cells/*.cell"))
     assert len(kept) == 4
     for path in kept:  # what is kept is used: no cell of it is written again
         path.chmod(0o400)
-    result, _ = run(tmp_path, seed=None)
+    result, _ = run_nightly(tmp_path, seed=None)
     assert result.metadata["seed"] == begun["seed"] and result.metadata["started"] == begun["started"]
-    calm, _ = run(tmp_path / "calm", seed=begun["seed"])
+    calm, _ = run_nightly(tmp_path / "calm", seed=begun["seed"])
     assert [(r.key, r.value, r.verdict) for r in result.rows] == [
         (r.key, r.value, r.verdict) for r in calm.rows
     ]

@@ -14,7 +14,7 @@ pytest.importorskip("flint")
 
 @pytest.mark.parametrize("joints", ["rb", "brbbrbrrbbrb"])
 def test_the_model_agrees_with_certified_truth(joints):
-    model = pendulums.model(joints, loads=True, drag=True)
+    model = pendulums.make_model(joints, loads=True, drag=True)
     assert (9 * model.n > MAX_DENSE_UNKNOWNS) == (len(joints) > 6)
     states = random_states(model, 3, 5)
     answers = evaluate_case(make_defect_case(model, states))
@@ -27,7 +27,7 @@ def test_the_model_agrees_with_certified_truth(joints):
 
 
 def test_a_singular_chain_raises():
-    model = pendulums.model("b" * 8)
+    model = pendulums.make_model("b" * 8)
     broken = make_defect_case(model, random_states(model, 1, 1))
     broken.mass[:] = 0.0
     broken.inertia[:] = 0.0

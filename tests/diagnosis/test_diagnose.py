@@ -33,7 +33,7 @@ ALONG = np.array([2.0, -1.0, 2.0]) / 3
 
 @cache
 def known(joints="bb", count=10):
-    model = pendulums.model(joints)
+    model = pendulums.make_model(joints)
     return model, state_truth(model, random_states(model, count, seed=4))
 
 
@@ -98,7 +98,7 @@ def test_eight_states_around_the_worst_one_are_examined(at, first):
 
 @pytest.mark.parametrize(("bodies", "states"), [(6, 8), (7, 4), (12, 4), (13, 2)])
 def test_fewer_states_are_examined_of_long_chains(bodies, states):
-    model = pendulums.model("b" * bodies)
+    model = pendulums.make_model("b" * bodies)
     at = random_states(model, 9, seed=1)
     truth = state_truth(model, at)
     assert len(observe_difference(model, truth.quantities, truth).case.p) == states
@@ -114,7 +114,7 @@ def truth_of(truth, count):
 @pytest.mark.parametrize("size", [1.0, 1e-6])
 def test_derivatives_agree_with_coarse_differences(size):
     """By every fifth cause, against differences a hundred times as far; of bodies of milligrams too."""
-    model = pendulums.model("bb")
+    model = pendulums.make_model("bb")
     model = replace(model, mass=size * model.mass, inertia=size * model.inertia)
     truth = state_truth(model, random_states(model, 4, seed=4))
     seen = observe_difference(model, truth.quantities, truth)
@@ -274,7 +274,7 @@ def test_two_states_show_neither_a_constant_nor_a_stale_field(to):
 
 
 def test_a_state_at_rest_is_evaluated_at_rest_again():
-    model = replace(pendulums.model("rb"), gravity=np.array([0, 0, -9.81]))
+    model = replace(pendulums.make_model("rb"), gravity=np.array([0, 0, -9.81]))
     still = [
         state_from_minimal(model, s.p, 0 * s.omega, s.u, 0 * s.udot) for s in random_states(model, 4, seed=3)
     ]
@@ -290,7 +290,7 @@ def test_a_state_at_rest_is_evaluated_at_rest_again():
 
 @pytest.mark.parametrize(("loads", "drag"), [(True, True), (True, False), (False, True)])
 def test_an_error_in_the_loads_vanishes_without_them(loads, drag):
-    model = pendulums.model("b", loads=loads, drag=drag)
+    model = pendulums.make_model("b", loads=loads, drag=drag)
     truth = state_truth(model, random_states(model, 4, seed=6))
     none = {name: 0 * getattr(model, name) for name in ("force", "moment", "drag_force", "drag_moment")}
 
@@ -303,7 +303,7 @@ def test_an_error_in_the_loads_vanishes_without_them(loads, drag):
 
 
 def test_an_error_in_velocity_terms_vanishes_at_rest():
-    model = pendulums.model("rb")
+    model = pendulums.make_model("rb")
     truth = state_truth(model, random_states(model, 4, seed=3))
 
     def evaluate(asked, states):

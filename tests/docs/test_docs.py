@@ -24,10 +24,10 @@ from plumbline.scenario.field_docs import field_reference
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = ["first-run.md", "add-a-scenario.md", "add-an-engine.md", "sweeps.md"]
 BLOCK = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-LEFT_OUT = shutil.ignore_patterns(".*", "__pycache__", "node_modules", "out")
+IGNORED = shutil.ignore_patterns(".*", "__pycache__", "node_modules", "out")
 
 
-def play(page: str, folder: Path) -> int:
+def run_code_blocks(page: str, folder: Path) -> int:
     """Do what the page's blocks say, in ``folder``; returns how many were checked."""
     environment = os.environ | {
         "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]),
@@ -79,19 +79,19 @@ def play(page: str, folder: Path) -> int:
 @pytest.mark.parametrize("name", PAGES)
 def test_a_worked_page_does_what_it_says(name, tmp_path):
     checkout = tmp_path / "check out"  # a path with a space in it
-    shutil.copytree(ROOT, checkout, ignore=LEFT_OUT)
-    assert play((ROOT / "docs" / name).read_text(encoding="utf-8"), checkout) >= 3
+    shutil.copytree(ROOT, checkout, ignore=IGNORED)
+    assert run_code_blocks((ROOT / "docs" / name).read_text(encoding="utf-8"), checkout) >= 3
 
 
 def test_the_player_sees_a_page_that_lies(tmp_path):
     right = "```text file=a/b.txt\nhello\n```\n```bash run\ncat a/b.txt\n```\n```text output\nhe…\n```\n"
-    assert play(right, tmp_path) == 3
+    assert run_code_blocks(right, tmp_path) == 3
     (tmp_path / "table.py").write_text("OTHER = {\n}\nTABLE = {\n}\n")
-    assert play("```python into=table.py:TABLE\n    1: 2,\n```\n", tmp_path) == 1
+    assert run_code_blocks("```python into=table.py:TABLE\n    1: 2,\n```\n", tmp_path) == 1
     assert (tmp_path / "table.py").read_text() == "OTHER = {\n}\nTABLE = {\n    1: 2,\n}\n"
     for old, new in (("he…", "hi…"), ("cat a/b.txt", "cat a/c.txt"), ("text output", "text output now")):
         with pytest.raises(AssertionError):
-            play(right.replace(old, new), tmp_path)
+            run_code_blocks(right.replace(old, new), tmp_path)
 
 
 def test_the_field_reference_is_up_to_date():

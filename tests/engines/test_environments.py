@@ -28,7 +28,9 @@ from plumbline.scenario import loader
 from plumbline.truth.certified import certify_state
 from tests.helpers.exudyn_initial_accelerations import initial_accelerations
 
-HERE = sys.executable  # the installed environment stands for another one: the way there and back is the same
+PYTHON = (
+    sys.executable
+)  # the installed environment stands for another one: the way there and back is the same
 
 
 def quiet(*_):
@@ -89,17 +91,19 @@ def test_known_entries_hold_for_an_engine_in_any_version_of_their_range():
 # --- the other environment's process -----------------------------------------------------------
 
 
-def there(key, call, *arguments, limits=None):
-    return Task(key, call, arguments, limits or Limits(30, 4), python=HERE)
+def remote_task(key, call, *arguments, limits=None):
+    return Task(key, call, arguments, limits or Limits(30, 4), python=PYTHON)
 
 
 def test_losses_over_there_are_told_like_those_here():
     tasks = [
-        there("a", operator.mul, 1, 2), there("pid", os.getpid), there("noise", print, "x" * 100_000),
-        there("segfault", ctypes.string_at, 0), there("b", operator.mul, 2, 2),
-        there("devour", bytearray, 64 * 2**30),
-        there("complain", operator.getitem, {}, "no"), there("hang", time.sleep, 600, limits=Limits(3, 4)),
-        there("c", operator.mul, 3, 2), there("pid2", os.getpid),
+        remote_task("a", operator.mul, 1, 2), remote_task("pid", os.getpid),
+        remote_task("noise", print, "x" * 100_000),
+        remote_task("segfault", ctypes.string_at, 0), remote_task("b", operator.mul, 2, 2),
+        remote_task("devour", bytearray, 64 * 2**30),
+        remote_task("complain", operator.getitem, {}, "no"),
+        remote_task("hang", time.sleep, 600, limits=Limits(3, 4)),
+        remote_task("c", operator.mul, 3, 2), remote_task("pid2", os.getpid),
     ]  # fmt: skip
     with WorkerPool(1, Limits(30, 4)) as workers:
         found = {o.key: o for o in workers.run(tasks)}
@@ -119,7 +123,7 @@ def test_an_engine_says_the_same_in_both_places():
     with WorkerPool(1) as workers:
         here, away = (
             o.value.quantities[0]
-            for python in ("", HERE)
+            for python in ("", PYTHON)
             for o in workers.run(
                 [Task("k", calls.evaluate_states, ("mujoco", s.model, [s.state]), python=python)]
             )
@@ -130,7 +134,7 @@ def test_an_engine_says_the_same_in_both_places():
 
 # --- real versions: fetched once, then from the cache ------------------------------------------
 
-OLD = [
+OLDER_VERSIONS = [
     "mujoco@3.2.0", "mujoco@3.3.0", "mujoco@3.12.0", "pinocchio@3.3.1", "pinocchio@3.9.0", "pinocchio@4.0.0",
     "pinocchio-aba@3.3.1", "pinocchio-maximal@3.9.0", "exudyn@1.9.0", "exudyn@1.10.0", "exudyn@1.11.0",
     "exudyn-tree@1.9.0",
@@ -141,12 +145,14 @@ OLD = [
 @pytest.mark.timeout(1800)
 def test_the_supported_versions_work_beside_the_installed_ones(tmp_path):
     chosen = loader.load_scenarios(["tumbling-ball", "tumbling-rod"])
-    result = run_plan(Plan(chosen, ["mujoco", *OLD], limits=Limits(600)), quiet)
-    for name in OLD:
+    result = run_plan(Plan(chosen, ["mujoco", *OLDER_VERSIONS], limits=Limits(600)), quiet)
+    for name in OLDER_VERSIONS:
         assert result.engines[name].missing is None
         assert Version(result.engines[name].version) == Version(name.partition("@")[2])
     wrong = {r.key: r for r in result.rows if r.verdict in ("disagrees", "failed")}
-    old = {f"{s.name}/{name}/trajectory/RK4/order" for s in chosen for name in OLD if "mujoco" in name}
+    old = {
+        f"{s.name}/{name}/trajectory/RK4/order" for s in chosen for name in OLDER_VERSIONS if "mujoco" in name
+    }
     sparse = {
         f"{s.name}/{name}/relations/{integrator}/by {solver}"
         for s in chosen
@@ -189,15 +195,15 @@ def test_a_version_that_cannot_be_had_is_a_verdict():
 # --- what is no version, no wheel, or cannot be fetched ------------------------------------------
 
 
-def uv_there():
+def is_uv_installed():
     return shutil.which("uv") or (environments.ROOT / ".uv" / "bin" / "uv").exists()
 
 
-needs_uv = pytest.mark.skipif(not uv_there(), reason="uv is not installed here")
+needs_uv = pytest.mark.skipif(not is_uv_installed(), reason="uv is not installed here")
 
 
 @pytest.fixture
-def index():
+def package_index():
     """Skips with the reason where no package index answers."""
     try:
         environments.newest_requirement("packaging", pre=False)
@@ -205,7 +211,7 @@ def index():
         pytest.skip(f"no package index can be reached: {error}")
 
 
-def wheel(folder, package="mujoco"):
+def build_wheel(folder, package="mujoco"):
     """The installed distribution packed again as the wheel that it came from."""
     found = metadata.distribution(package)
     (tag,) = [line[5:] for line in found.read_text("WHEEL").splitlines() if line.startswith("Tag: ")][:1]
@@ -222,7 +228,7 @@ def test_a_file_that_is_no_wheel_is_bad_usage(tmp_path):
     path.write_text("no zip")
     assert "is not a wheel: it is no zip file" in environments.version_problem(f"mujoco@{path}")
     done = subprocess.run(
-        [HERE, "-m", "plumbline", "run", "rest", "--engine", f"exudyn@{path}"],
+        [PYTHON, "-m", "plumbline", "run", "rest", "--engine", f"exudyn@{path}"],
         cwd=environments.ROOT, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 2 and "is a wheel of mujoco, not of exudyn" in " ".join(done.stderr.split())
@@ -255,8 +261,8 @@ def test_an_index_that_does_not_answer_is_told(tmp_path, monkeypatch, version):
 @pytest.mark.full
 @needs_uv
 @pytest.mark.timeout(1800)
-def test_latest_pre_and_a_wheel_run_beside_the_installed_one(tmp_path, index):
-    names = ["mujoco", "mujoco@latest", "mujoco@pre", f"mujoco@{wheel(tmp_path)}"]
+def test_latest_pre_and_a_wheel_run_beside_the_installed_one(tmp_path, package_index):
+    names = ["mujoco", "mujoco@latest", "mujoco@pre", f"mujoco@{build_wheel(tmp_path)}"]
     result = run_plan(
         Plan(loader.load_scenarios(["tumbling-ball"]), names, "state", limits=Limits(600)), quiet
     )
@@ -273,7 +279,7 @@ def test_latest_pre_and_a_wheel_run_beside_the_installed_one(tmp_path, index):
 @pytest.mark.full
 @needs_uv
 @pytest.mark.timeout(900)
-def test_a_wheel_without_a_content_is_told(tmp_path, index):
+def test_a_wheel_without_a_content_is_told(tmp_path, package_index):
     path = tmp_path / "mujoco-4.0.0-py3-none-any.whl"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("mujoco/__init__.py", "")
@@ -284,7 +290,7 @@ def test_a_wheel_without_a_content_is_told(tmp_path, index):
 
 def test_a_bad_version_is_bad_usage():
     done = subprocess.run(
-        [HERE, "-m", "plumbline", "run", "rest", "--engine", "mujoco@three"],
+        [PYTHON, "-m", "plumbline", "run", "rest", "--engine", "mujoco@three"],
         cwd=environments.ROOT, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 2 and "'three' is not a version" in done.stderr

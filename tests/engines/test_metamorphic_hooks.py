@@ -25,10 +25,10 @@ class Plain(Adapter):
 
 
 def test_an_adapter_without_hooks_gets_their_defaults():
-    engine, model = metamorphic_hooks(Plain()), pendulums.model("b")
+    engine, model = metamorphic_hooks(Plain()), pendulums.make_model("b")
     assert isinstance(engine, MetamorphicHooks) and engine.name == "plain"
     assert engine.options == engine.linear_solvers == ()
-    assert len(engine.evaluate(model, [pendulums.state(model)])) == 1
+    assert len(engine.evaluate(model, [pendulums.state_from_seed(model)])) == 1
     with pytest.raises(Unsupported, match="welds nothing"):
         engine.with_welded_halves()
 

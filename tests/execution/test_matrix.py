@@ -16,17 +16,17 @@ from plumbline.judging import known_issues
 from plumbline.processes.workers import Limits, WorkerPool
 from plumbline.scenario import loader
 
-LONG = 5  # bodies: longer chains climb their ladders in the full form only
+MAX_BODIES_IN_FAST_FORM = 5  # bodies: longer chains climb their ladders in the full form only
 LEVELS = ("state", "trajectory")
 
 
-def cells():
+def matrix_cells():
     for name, path in loader.catalogue().items():
         bodies = loader.load_scenario(path).model.n
         for engine in ENGINES:
             for level in LEVELS:
                 marks = [pytest.mark.xdist_group(name)]  # one process per scenario: its truth is found once
-                if level == "trajectory" and bodies > LONG:
+                if level == "trajectory" and bodies > MAX_BODIES_IN_FAST_FORM:
                     marks.append(pytest.mark.full)
                 family = path.parent.name
                 label = name if family in name else f"{family}-{name}"
@@ -49,7 +49,7 @@ def truths():
     return {}
 
 
-@pytest.mark.parametrize(("name", "engine", "level"), list(cells()))
+@pytest.mark.parametrize(("name", "engine", "level"), list(matrix_cells()))
 @pytest.mark.timeout(900)
 def test_cell(name, engine, level, workers, engines, truths):
     found = loader.load_scenario(loader.find_scenario_file(name))

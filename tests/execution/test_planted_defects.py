@@ -25,7 +25,7 @@ from plumbline.judging.trajectory import judge_trajectory
 from plumbline.model.sampling import random_states
 from plumbline.truth.ground_truth import motion_truth, state_truth
 from tests.helpers import pendulums
-from tests.helpers.pendulums import JOINTS
+from tests.helpers.pendulums import JOINT_PATTERNS
 from tests.helpers.planted_defects import (
     DEFECTS,
     MOTION_DEFECTS,
@@ -48,15 +48,15 @@ TIMES = np.linspace(0, 2, 17)
 @cache
 def subject(joints: str, loaded: bool):
     """A generic pendulum, random states of it and their certified truth."""
-    model = pendulums.model(JOINTS[joints], loads=loaded, drag=loaded)
+    model = pendulums.make_model(JOINT_PATTERNS[joints], loads=loaded, drag=loaded)
     return model, state_truth(model, random_states(model, STATES, seed=1))
 
 
 @cache
 def motion():
     """A slow tumble whose every mistake shows within two seconds."""
-    model = pendulums.model(JOINTS["balls"])
-    state = pendulums.state(model, seed=2, rate=0.5)
+    model = pendulums.make_model(JOINT_PATTERNS["balls"])
+    state = pendulums.state_from_seed(model, seed=2, rate=0.5)
     return model, state, motion_truth(model, state, TIMES, None)
 
 
@@ -218,7 +218,7 @@ def test_defects_are_named_on_every_engine_and_joint(engine, joints):
     """The long form: every defect of numbers, conventions and answers, wherever it makes a difference."""
     missed = {}
     for defect in STATE_DEFECTS:
-        if defect.gamma or not defect.named or not applicable(defect, JOINTS[joints]):
+        if defect.gamma or not defect.named or not applicable(defect, JOINT_PATTERNS[joints]):
             continue
         moved = replace(defect, engine=engine, joints=joints)
         wrong, text = state_report(moved)

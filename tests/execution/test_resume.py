@@ -24,42 +24,43 @@ from plumbline.processes.workers import Outcome, Pickled, Task
 from plumbline.scenario import loader
 
 ROOT = Path(__file__).resolve().parents[2]
-TIMES = {"cpu_time", "cost"}  # what may differ between two runs
-QUICK = ["rest", "tumbling-ball"]
+TIME_FIELDS = {"cpu_time", "cost"}  # what may differ between two runs
+SCENARIOS = ["rest", "tumbling-ball"]
 
 
 def quiet(*_):
     pass
 
 
-def command(out, *more):
-    return [sys.executable, "-m", "plumbline", "run", *QUICK, "--engine", "mujoco", "--engine", "pinocchio",
+def run_command(out, *more):
+    return [sys.executable, "-m", "plumbline", "run", *SCENARIOS,
+            "--engine", "mujoco", "--engine", "pinocchio",
             "--jobs", "2", "--out", str(out), *more]  # fmt: skip
 
 
-def results(out):
+def comparable_results(out):
     """Everything that a run says, without its times."""
     document = json.loads((out / "results.json").read_text())
     run = {k: document["run"][k] for k in ("sentence", "exit_code", "versions", "truth", "stale_issues")}
-    rows = [{k: v for k, v in row.items() if k not in TIMES} for row in document["rows"]]
+    rows = [{k: v for k, v in row.items() if k not in TIME_FIELDS} for row in document["rows"]]
     tables = {}
     for path in sorted(out.glob("*.parquet")):
         table = pq.read_table(path)
-        table = table.drop_columns([c for c in table.column_names if c in TIMES])
+        table = table.drop_columns([c for c in table.column_names if c in TIME_FIELDS])
         tables[path.name] = repr(table.to_pylist())  # to the last bit, and NaN equals NaN
     return run, rows, document["scenarios"], tables
 
 
-def killed(out, after, from_new_cell, *more):
+def run_and_kill(out, after, from_new_cell, *more):
     """Run, kill -9 ``after`` seconds (from the first new cell, if asked); whether it was still running.
 
     No process of it may remain.
     """
-    before = cells(out)
+    before = stored_cells(out)
     process = subprocess.Popen(
-        command(out, *more), cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        run_command(out, *more), cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )
-    while from_new_cell and process.poll() is None and cells(out).keys() <= before.keys():
+    while from_new_cell and process.poll() is None and stored_cells(out).keys() <= before.keys():
         time.sleep(0.01)
     try:
         process.wait(timeout=after)
@@ -73,7 +74,7 @@ def killed(out, after, from_new_cell, *more):
         return True
 
 
-def cells(out):
+def stored_cells(out):
     """Path and time of every stored cell; a run that ends meanwhile clears them away."""
     found = {}
     for path in out.glob("cells/*.cell"):
@@ -82,44 +83,44 @@ def cells(out):
     return found
 
 
-def survive(tmp_path, kills, level):
+def check_results_after_kills(tmp_path, kills, level):
     """Kill ``kills`` times at random moments; runs that finish between them are checked."""
     rng = random.Random(20)
     calm = tmp_path / "calm"
     begin = time.monotonic()
-    subprocess.run(command(calm, "--level", level), cwd=ROOT, capture_output=True, check=True)
+    subprocess.run(run_command(calm, "--level", level), cwd=ROOT, capture_output=True, check=True)
     longest = time.monotonic() - begin
-    expected = results(calm)
+    expected = comparable_results(calm)
     done, finished = 0, 0
     while done < kills:
         out = tmp_path / f"rough{finished}"
-        before = cells(out)
+        before = stored_cells(out)
         from_new_cell = bool(done % 2)
         after = rng.uniform(0.0, 0.2 * longest if from_new_cell else longest)
-        if killed(out, after, from_new_cell, "--level", level):
+        if run_and_kill(out, after, from_new_cell, "--level", level):
             done += 1
-            kept = cells(out)
+            kept = stored_cells(out)
             assert before.items() <= kept.items() or (out / "results.json").exists(), (
                 "a finished cell ran again"
             )
         else:
-            assert results(out) == expected
+            assert comparable_results(out) == expected
             finished += 1
     out = tmp_path / f"rough{finished}"
-    subprocess.run(command(out, "--level", level), cwd=ROOT, capture_output=True, check=True)
-    assert results(out) == expected
+    subprocess.run(run_command(out, "--level", level), cwd=ROOT, capture_output=True, check=True)
+    assert comparable_results(out) == expected
     return done, finished
 
 
 @pytest.mark.timeout(240)
 def test_five_kills_change_nothing(tmp_path):
-    survive(tmp_path, 5, "state")
+    check_results_after_kills(tmp_path, 5, "state")
 
 
 @pytest.mark.full
 @pytest.mark.timeout(3600)
 def test_a_hundred_kills_change_nothing(tmp_path, record_testsuite_property):
-    kills, finished = survive(tmp_path, 100, "all")
+    kills, finished = check_results_after_kills(tmp_path, 100, "all")
     record_testsuite_property("kills", kills)
     record_testsuite_property("runs finished between them", finished)
 
@@ -131,7 +132,7 @@ class Interrupted(Exception):
     pass
 
 
-def run(cells, stop_after=None):
+def run_and_count(cells, stop_after=None):
     """(rows, number of cells that ran); raises Interrupted after ``stop_after`` outcomes."""
     ran = 0
     put = cells.put
@@ -158,15 +159,15 @@ def run(cells, stop_after=None):
 
 
 def test_only_what_was_not_finished_runs_again(tmp_path):
-    expected, everything = run(DiskResultCache(tmp_path / "calm"))
-    _, first = run(DiskResultCache(tmp_path / "rough"), stop_after=2)
-    rows, rest = run(DiskResultCache(tmp_path / "rough"))
+    expected, everything = run_and_count(DiskResultCache(tmp_path / "calm"))
+    _, first = run_and_count(DiskResultCache(tmp_path / "rough"), stop_after=2)
+    rows, rest = run_and_count(DiskResultCache(tmp_path / "rough"))
     assert (everything, first, rest) == (4, 2, 2)
     assert rows == expected
 
 
 def test_a_damaged_cell_is_named_and_runs_again(tmp_path):
-    expected, _ = run(DiskResultCache(tmp_path))
+    expected, _ = run_and_count(DiskResultCache(tmp_path))
     paths = sorted(tmp_path.glob("*.cell"))
     data = bytearray(paths[0].read_bytes())
     data[len(data) // 2] ^= 1
@@ -174,7 +175,7 @@ def test_a_damaged_cell_is_named_and_runs_again(tmp_path):
     paths[1].write_bytes(paths[1].read_bytes()[:-1])
     paths[2].write_bytes(b"")
     told = []
-    rows, ran = run(DiskResultCache(tmp_path, told.append))
+    rows, ran = run_and_count(DiskResultCache(tmp_path, told.append))
     assert ran == 3 and rows == expected
     assert len(told) == 3 and all("damaged" in sentence for sentence in told)
 

@@ -20,39 +20,39 @@ def engines():
         return describe_engines(workers, ["reference", "mujoco"])
 
 
-def made(engines, level):
+def make_scenario_run(engines, level):
     chosen = loader.load_scenario(loader.find_scenario_file("rest"))
     return ScenarioRun(Plan([chosen], list(engines), level, random_state_count=2), chosen, engines)
 
 
-def answered(task, **lost):
+def outcome_of(task, **lost):
     return Outcome(task.key, **lost) if lost else run_task(task)
 
 
 def test_answers_wait_for_the_truth_whatever_comes_first(engines):
     rows = []
     for turned in (False, True):
-        bench = made(engines, "trajectory")
+        bench = make_scenario_run(engines, "trajectory")
         tasks = list(bench.tasks())
         for task in reversed(tasks) if turned else tasks:
             assert not bench.is_done
-            assert bench.on_outcome(answered(task)) == []
+            assert bench.on_outcome(outcome_of(task)) == []
         assert bench.is_done
         rows.append([(r.key, r.value, r.verdict) for r in bench.findings().rows])
     assert rows[0] == rows[1] and len(rows[0]) > 14
 
 
 def test_states_are_asked_for_with_their_truth_and_judged_alike_here_and_by_the_worker(engines):
-    benches = [made(engines, "state"), made(engines, "state")]
+    benches = [make_scenario_run(engines, "state"), make_scenario_run(engines, "state")]
     for bench, elsewhere in zip(benches, (True, False), strict=True):
         (truth,) = bench.tasks()
-        cells = bench.on_outcome(answered(truth))
+        cells = bench.on_outcome(outcome_of(truth))
         assert [(task.key.engine, task.key.kind) for task in cells] == [
             (name, TaskKind.STATE) for name in ("reference", "mujoco")
         ]
         for task in cells:
             assert not bench.is_done
-            found = answered(task)
+            found = outcome_of(task)
             assert len(found.judge_result.rows) == 7
             bench.on_outcome(
                 found if elsewhere else replace(found, judge_result=None)
@@ -63,10 +63,10 @@ def test_states_are_asked_for_with_their_truth_and_judged_alike_here_and_by_the_
 
 
 def test_a_lost_truth_of_states_fails_every_cell_and_says_so(engines):
-    bench = made(engines, "state")
+    bench = make_scenario_run(engines, "state")
     (truth,) = bench.tasks()
     for task in bench.on_outcome(Outcome(truth.key, failure="crashed")):
-        bench.on_outcome(answered(task))
+        bench.on_outcome(outcome_of(task))
     assert bench.is_done
     assert [(r.verdict, r.reason) for r in bench.findings().rows] == [
         ("failed", "no truth to judge by: crashed")
@@ -74,22 +74,22 @@ def test_a_lost_truth_of_states_fails_every_cell_and_says_so(engines):
 
 
 def test_a_motion_truth_whose_worker_died_is_asked_for_once_more_without_a_compiler(engines):
-    bench = made(engines, "trajectory")
+    bench = make_scenario_run(engines, "trajectory")
     truth, *cells = bench.tasks()
     for task in cells:
-        bench.on_outcome(answered(task))
+        bench.on_outcome(outcome_of(task))
     (second,) = bench.on_outcome(Outcome(truth.key, failure="crashed: the worker died of SIGSEGV"))
     assert second.key == truth.key and second.arguments[-1] == 0 and not bench.is_done
-    assert bench.on_outcome(answered(second)) == [] and bench.is_done
+    assert bench.on_outcome(outcome_of(second)) == [] and bench.is_done
     assert all(row.verdict == "agrees" for row in bench.findings().rows)
     assert "Taylor" not in bench.truths[TaskKind.MOTION_TRUTH].method.split("closed form")[0]
 
 
 def test_a_truth_that_is_lost_twice_fails_every_cell_and_says_so(engines):
-    bench = made(engines, "trajectory")
+    bench = make_scenario_run(engines, "trajectory")
     truth, *cells = bench.tasks()
     for task in cells:
-        bench.on_outcome(answered(task))
+        bench.on_outcome(outcome_of(task))
     bench.on_outcome(Outcome(truth.key, failure="crashed"))
     assert bench.on_outcome(Outcome(truth.key, failure="crashed twice")) == [] and bench.is_done
     rows = bench.findings().rows
@@ -97,7 +97,7 @@ def test_a_truth_that_is_lost_twice_fails_every_cell_and_says_so(engines):
     assert all(r.verdict == "failed" and r.reason == "no truth to judge by: crashed twice" for r in rows)
 
 
-def crash(*_):
+def exit_process(*_):
     """Ends its process as a crash does."""
     os._exit(11)
 
@@ -107,7 +107,7 @@ def test_in_a_run_the_second_truth_is_handed_over(monkeypatch):
 
     def first_crashes(self, key, *uncompiled):
         asked.append(truth(self, key, *uncompiled))
-        return asked[-1] if uncompiled else replace(asked[-1], function=crash)
+        return asked[-1] if uncompiled else replace(asked[-1], function=exit_process)
 
     monkeypatch.setattr(ScenarioRun, "truth_task", first_crashes)
     chosen = loader.load_scenario(loader.find_scenario_file("rest"))

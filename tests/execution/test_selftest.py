@@ -10,19 +10,19 @@ from plumbline.execution.selftest import SelfTestResult
 from plumbline.processes.workers import Limits
 from plumbline.scenario import loader
 
-GOOD = """
+PASSING_TEST = """
 def test_rates(record_property):
     record_property("planted", 3)
     record_property("reported", 3)
 """
-BAD = (
-    GOOD
+FAILING_TEST = (
+    PASSING_TEST
     + """
 def test_that_fails():
     assert False
 """
 )
-SKIPPED = """
+SKIPPED_TEST = """
 import pytest
 pytest.importorskip("no_such_module_at_all")
 """
@@ -31,9 +31,9 @@ pytest.importorskip("no_such_module_at_all")
 @pytest.mark.parametrize(
     ("text", "figures", "trouble"),
     [
-        (GOOD, {"planted": 3, "reported": 3}, ""),
-        (BAD, {"planted": 3, "reported": 3}, "test_that_fails"),
-        (SKIPPED, {}, "skipped"),
+        (PASSING_TEST, {"planted": 3, "reported": 3}, ""),
+        (FAILING_TEST, {"planted": 3, "reported": 3}, "test_that_fails"),
+        (SKIPPED_TEST, {}, "skipped"),
         ("import nothing_of_that_name", {}, "cannot be read"),
         ("", {}, "empty"),
     ],

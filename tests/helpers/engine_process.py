@@ -19,11 +19,11 @@ from plumbline.engines.registry import load_adapter
 TIMEOUT = 60.0  # s
 
 
-def call(
+def call_adapter(
     engine: str,
     method: str,
     *args: Any,
-    tamper: dict[str, Callable[..., Any]] | None = None,
+    overrides: dict[str, Callable[..., Any]] | None = None,
     timeout: float = TIMEOUT,
 ) -> Any:
     """``adapter(engine).method(*args)`` in the engine's own process; what it raises is raised here.
@@ -32,15 +32,17 @@ def call(
     what the contract's checks make of it.  Raises pebble.ProcessExpired when the process dies,
     TimeoutError when it must be killed; the next call gets a new process.
     """
-    return run(engine, _invoke, engine, method, args, tamper or {}, timeout=timeout)
+    return run_in_engine_process(engine, _call_method, engine, method, args, overrides or {}, timeout=timeout)
 
 
-def attribute(engine: str, name: str) -> Any:
+def adapter_attribute(engine: str, name: str) -> Any:
     """A class attribute of the adapter, read in its own process."""
-    return run(engine, _attribute, engine, name)
+    return run_in_engine_process(engine, _attribute, engine, name)
 
 
-def run(engine: str, function: Callable[..., Any], *args: Any, timeout: float = TIMEOUT) -> Any:
+def run_in_engine_process(
+    engine: str, function: Callable[..., Any], *args: Any, timeout: float = TIMEOUT
+) -> Any:
     """Any picklable function in the engine's process."""
     return _pool(engine).schedule(function, args=args, timeout=timeout).result()
 
@@ -62,10 +64,12 @@ def _adapter(engine: str) -> Adapter:
     return load_adapter(engine)
 
 
-def _invoke(engine: str, method: str, args: tuple[Any, ...], tamper: dict[str, Callable[..., Any]]) -> Any:
+def _call_method(
+    engine: str, method: str, args: tuple[Any, ...], overrides: dict[str, Callable[..., Any]]
+) -> Any:
     subject = _adapter(engine)
-    if tamper:
-        subject = _doctored(subject, tamper)
+    if overrides:
+        subject = _with_overrides(subject, overrides)
     return getattr(subject, method)(*args)
 
 
@@ -73,12 +77,12 @@ def _attribute(engine: str, name: str) -> Any:
     return getattr(_adapter(engine), name)
 
 
-def _doctored(real: Adapter, tamper: dict[str, Callable[..., Any]]) -> Adapter:
+def _with_overrides(real: Adapter, overrides: dict[str, Callable[..., Any]]) -> Adapter:
     """An instance of a subclass of the real adapter in which some methods pass through a tampering hand."""
 
     def wrap(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         return lambda self, *args: function(lambda *a: getattr(real, name)(*a), *args)
 
-    members = {name: wrap(name, function) for name, function in tamper.items()}
+    members = {name: wrap(name, function) for name, function in overrides.items()}
     doctored: Adapter = type("Doctored", (type(real),), members)()
     return doctored

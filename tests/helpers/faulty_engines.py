@@ -20,61 +20,61 @@ from plumbline.engines import registry
 from plumbline.model.datatypes import Array, Integrator, Model, State, Trajectory
 from plumbline.processes import workers
 
-Run = Callable[[], Trajectory]
+SimulateCall = Callable[[], Trajectory]
 
 
-def segfault(run: Run) -> Trajectory:
+def segfault(run: SimulateCall) -> Trajectory:
     ctypes.string_at(0)
     return run()
 
 
-def abort(run: Run) -> Trajectory:
+def abort(run: SimulateCall) -> Trajectory:
     os.abort()
 
 
-def leave(run: Run) -> Trajectory:
+def exit_process(run: SimulateCall) -> Trajectory:
     os._exit(7)
 
 
-def hang(run: Run) -> Trajectory:
+def hang(run: SimulateCall) -> Trajectory:
     time.sleep(600)
     return run()
 
 
-def hang_with_the_lock(run: Run) -> Trajectory:
+def hang_holding_gil(run: SimulateCall) -> Trajectory:
     ctypes.PyDLL(None).sleep(600)
     return run()
 
 
-def endless_memory(run: Run) -> Trajectory:
+def exhaust_memory(run: SimulateCall) -> Trajectory:
     kept = []
     while True:
         kept.append(np.empty(2**25))  # 256 MB of address space, never touched
 
 
-def not_a_number(run: Run) -> Trajectory:
+def return_nan(run: SimulateCall) -> Trajectory:
     done = run()
     r = done.r.copy()
     r[-1] = np.nan
     return replace(done, r=r)
 
 
-def silent_reset(run: Run) -> Trajectory:
+def silent_reset(run: SimulateCall) -> Trajectory:
     done = run()
     rows = [*range(len(done.t) - 3), 0, 1, 2]
     return Trajectory(done.t, *(getattr(done, k)[rows] for k in ("r", "p", "v", "pdot")), done.steps)
 
 
-def early_stop(run: Run) -> Trajectory:
+def early_stop(run: SimulateCall) -> Trajectory:
     done = run()
     return Trajectory(*(getattr(done, k)[:-3] for k in ("t", "r", "p", "v", "pdot")), done.steps)
 
 
-def raises(run: Run) -> Trajectory:
+def raise_error(run: SimulateCall) -> Trajectory:
     raise RuntimeError("the engine's own words\nover two lines")
 
 
-def litter(run: Run) -> Trajectory:
+def flood_output(run: SimulateCall) -> Trajectory:
     Path("MUJOCO_LOG.TXT").write_text("dropped")
     for _ in range(100):
         os.write(1, b"noise " * 10_000)
@@ -83,29 +83,29 @@ def litter(run: Run) -> Trajectory:
 
 
 # Per fault, the words that the reason of its row must contain; none where the cell is not lost.
-FAULTS: dict[Callable[[Run], Trajectory], str] = {
+ERROR_BY_FAULT: dict[Callable[[SimulateCall], Trajectory], str] = {
     segfault: "crashed: the worker died of SIGSEGV",
     abort: "crashed: the worker died of SIGABRT",
-    leave: "crashed: the worker exited with code 7",
+    exit_process: "crashed: the worker exited with code 7",
     hang: "timeout: no answer within",
-    hang_with_the_lock: "timeout: no answer within",
-    endless_memory: "out of memory: over",
-    not_a_number: "r is not finite from t =",
+    hang_holding_gil: "timeout: no answer within",
+    exhaust_memory: "out of memory: over",
+    return_nan: "r is not finite from t =",
     silent_reset: "is the initial state again (a silent reset)",
     early_stop: "sampled 14 of 17 times",
-    raises: "RuntimeError: the engine's own words over two lines",
-    litter: "",
+    raise_error: "RuntimeError: the engine's own words over two lines",
+    flood_output: "",
 }
-CELL = "implicit"  # the integrator whose cell has the fault; the cell of Euler has none
+FAULTY_INTEGRATOR = "implicit"  # the integrator whose cell has the fault; the cell of Euler has none
 
 
-def engine(fault: Callable[[Run], Trajectory]) -> type[Mujoco]:
+def make_faulty_engine(fault: Callable[[SimulateCall], Trajectory]) -> type[Mujoco]:
     """MuJoCo with two integrators and the fault in one of them."""
 
     class Faulty(Mujoco):
         name = fault.__name__
         title = f"MuJoCo ({fault.__name__})"
-        integrators = tuple(i for i in Mujoco.integrators if i.name in ("Euler", CELL))
+        integrators = tuple(i for i in Mujoco.integrators if i.name in ("Euler", FAULTY_INTEGRATOR))
 
         def _simulate(
             self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
@@ -113,19 +113,19 @@ def engine(fault: Callable[[Run], Trajectory]) -> type[Mujoco]:
             def run() -> Trajectory:
                 return super(Faulty, self)._simulate(model, state, times, integrator, resolution)
 
-            return fault(run) if integrator.name == CELL else run()
+            return fault(run) if integrator.name == FAULTY_INTEGRATOR else run()
 
     return Faulty
 
 
-def register() -> None:
+def register_faulty_engines() -> None:
     """Add the faulty engines to the registry of this process."""
-    for fault in FAULTS:
-        globals()[f"Faulty_{fault.__name__}"] = engine(fault)
+    for fault in ERROR_BY_FAULT:
+        globals()[f"Faulty_{fault.__name__}"] = make_faulty_engine(fault)
         registry.ENGINES[fault.__name__] = f"tests.helpers.faulty_engines:Faulty_{fault.__name__}"
 
 
-def prepare(*arguments: Any) -> None:
+def prepare_worker(*arguments: Any) -> None:
     """Initialise a worker and register the faulty engines there."""
     workers.initialize_worker(*arguments)
-    register()
+    register_faulty_engines()

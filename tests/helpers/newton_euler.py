@@ -17,7 +17,7 @@ from plumbline.model.datatypes import Array, Model, State
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
+class NewtonEulerSolution:
     """r̈ (N, 3) m/s² and F (N, 3) N in the world frame, ω̇′ (N, 3) rad/s² in the body frame."""
 
     acceleration: Array
@@ -25,15 +25,15 @@ class Truth:
     joint_reaction: Array
 
 
-def solve(model: Model, state: State, number: type = np.longdouble) -> Truth:
+def solve(model: Model, state: State, dtype: type = np.longdouble) -> NewtonEulerSolution:
     """The accelerations and joint forces at a state, from p, ω′, u and u̇ alone (r and v follow)."""
 
     def exact(x: Array) -> Array:
-        return np.asarray(x, number)
+        return np.asarray(x, dtype)
 
     n = model.n
-    A = np.zeros((9 * n, 9 * n), number)
-    b = np.zeros(9 * n, number)
+    A = np.zeros((9 * n, 9 * n), dtype)
+    b = np.zeros(9 * n, dtype)
     R = _rotation(exact(state.p))
     omega, u, udot = exact(state.omega), exact(state.u), exact(state.udot)
     J, near, far = exact(model.inertia), exact(model.proximal), exact(model.distal)
@@ -54,7 +54,7 @@ def solve(model: Model, state: State, number: type = np.longdouble) -> Truth:
             A[acc(k), force(k + 1)] = np.eye(3)
             A[ang(k), force(k + 1)] = _skew(far[k]) @ R[k].T
         # The joint: difference of the accelerations of the two attachment points = d̈ = ℓ ü.
-        rows = np.zeros((3, 9 * n), number)
+        rows = np.zeros((3, 9 * n), dtype)
         rows[:, acc(k)], rows[:, ang(k)] = np.eye(3), -R[k] @ _skew(near[k])
         known = -R[k] @ _cross(w, _cross(w, near[k]))
         if k > 0:
@@ -63,11 +63,11 @@ def solve(model: Model, state: State, number: type = np.longdouble) -> Truth:
         if model.length[k] > 0:
             along, across = u[k] / np.sqrt(u[k] @ u[k]), _perpendicular(u[k])
             known = np.array([along @ known - length[k] * (udot[k] @ udot[k]), 0, 0])
-            rows = np.vstack([along @ rows, np.zeros((2, 9 * n), number)])
+            rows = np.vstack([along @ rows, np.zeros((2, 9 * n), dtype)])
             rows[1:, force(k)] = across
         A[force(k)], b[force(k)] = rows, known
     x = _solve(A, b).reshape(n, 9)
-    return Truth(x[:, :3], x[:, 3:6], x[:, 6:])
+    return NewtonEulerSolution(x[:, :3], x[:, 3:6], x[:, 6:])
 
 
 def integrate(model: Model, state: State, times: Array, rtol: float = 3e-14) -> list[State]:
@@ -92,13 +92,13 @@ def integrate(model: Model, state: State, times: Array, rtol: float = 3e-14) -> 
     return [unpack(y) for y in run.y.T]
 
 
-def kinetic(model: Model, state: State) -> float:
+def kinetic_energy(model: Model, state: State) -> float:
     """½ Σ m v·v + ω′·J ω′ (J)."""
     spin = np.einsum("ki,kij,kj", state.omega, model.inertia, state.omega)
     return float(0.5 * (model.mass @ np.sum(state.v**2, -1) + spin))
 
 
-def potential(model: Model, state: State) -> float:
+def potential_energy(model: Model, state: State) -> float:
     """−Σ m g·r (J), zero at the pivot."""
     return float(-model.mass @ state.r @ model.gravity)
 
@@ -141,7 +141,7 @@ def _velocities(R: Array, omega: Array, rod_rate: Array, near: Array, far: Array
     return v
 
 
-def _attachment_acceleration(model: Model, state: State, truth: Truth) -> Array:
+def _attachment_acceleration(model: Model, state: State, truth: NewtonEulerSolution) -> Array:
     """d̈ (N, 3): of body k's proximal point relative to the point where joint k hangs."""
     a = kinematics.rotation_matrix(state.p)
 

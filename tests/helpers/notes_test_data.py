@@ -12,15 +12,15 @@ from reference_impl.euler_parameters import euler_parameter_rate
 from tests.helpers.random_chains import random_state
 
 
-def on_manifold(chain, rng):
+def state_on_manifold(chain, rng):
     """r, p, ṙ, ṗ that satisfy every constraint and its rate to rounding."""
     state = random_state(rng, chain, rate=1.0)
     return state.r, state.p, state.v, euler_parameter_rate(state.p, state.omega)
 
 
-def off_manifold(chain, rng):
+def state_off_manifold(chain, rng):
     """r, p, ṙ, ṗ that satisfy nothing: no joint, no norm, pᵀṗ ≠ 0."""
-    return tuple(x + 0.2 * rng.normal(size=x.shape) for x in on_manifold(chain, rng))
+    return tuple(x + 0.2 * rng.normal(size=x.shape) for x in state_on_manifold(chain, rng))
 
 
 class Symbols:
@@ -43,10 +43,10 @@ class Symbols:
         flat = [self.ring(entry).diff(v) for entry in np.ravel(x) for v in np.ravel(variables)]
         return np.array(flat, object).reshape(*np.shape(x), *np.shape(variables))
 
-    def rate(self, x):
+    def time_derivative(self, x):
         """d_t x along (ṙ, ṗ)."""
         return self.gradient(x, self.q) @ self.qdot
 
-    def zero(self, x):
+    def is_zero(self, x):
         """Whether every entry is the polynomial 0."""
         return all(self.ring(entry) == 0 for entry in np.ravel(x))

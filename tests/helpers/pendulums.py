@@ -12,7 +12,7 @@ from plumbline.model.datatypes import Array, Model, State, Trajectory
 from reference_impl.collocation import integrate_collocation
 from tests.helpers.random_chains import random_state
 
-JOINTS = {  # b: hung by a ball joint, r: by a rod
+JOINT_PATTERNS = {  # b: hung by a ball joint, r: by a rod
     "ball": "b",
     "rod": "r",
     "balls": "bb",
@@ -26,7 +26,7 @@ JOINTS = {  # b: hung by a ball joint, r: by a rod
 
 
 @cache
-def model(joints: str, loads: bool = False, drag: bool = False, seed: int = 0) -> Model:
+def make_model(joints: str, loads: bool = False, drag: bool = False, seed: int = 0) -> Model:
     """A pendulum with one letter of ``joints`` per body, drawn from ``seed``."""
     n = len(joints)
     rng = np.random.default_rng([seed, *joints.encode()])
@@ -50,22 +50,22 @@ def model(joints: str, loads: bool = False, drag: bool = False, seed: int = 0) -
     )
 
 
-def state(subject: Model, seed: int = 0, rate: float = 3.0) -> State:
+def state_from_seed(model: Model, seed: int = 0, rate: float = 3.0) -> State:
     """A random state on the manifold; ``rate`` (rad/s) is the standard deviation of every angular rate."""
-    return random_state(np.random.default_rng(seed), subject, rate)
+    return random_state(np.random.default_rng(seed), model, rate)
 
 
-def motion(subject: Model, at: State, times: Array) -> Trajectory:
+def reference_trajectory(model: Model, state: State, times: Array) -> Trajectory:
     """The motion by the reference's collocation, held on its manifold."""
-    start = at.r, at.p, at.v, kinematics.quaternion_rate(at.p, at.omega)
-    run = integrate_collocation([subject], *start, times, 1e-13, project=True)
+    start = state.r, state.p, state.v, kinematics.quaternion_rate(state.p, state.omega)
+    run = integrate_collocation([model], *start, times, 1e-13, project=True)
     return Trajectory(times, run.r, run.p, run.v, run.pdot, run.steps)
 
 
-def flipped(at: State) -> State:
+def with_negated_quaternions(state: State) -> State:
     """The same state with −p for every second body, the first included."""
-    signs = np.where(np.arange(len(at.p)) % 2, 1.0, -1.0)[:, None]
-    return replace(at, p=signs * at.p)
+    signs = np.where(np.arange(len(state.p)) % 2, 1.0, -1.0)[:, None]
+    return replace(state, p=signs * state.p)
 
 
 def _unit(rng: np.random.Generator, n: int) -> Array:

@@ -14,13 +14,13 @@ from plumbline.model.kinematics import state_from_minimal
 def random_model(
     rng: np.random.Generator,
     rods: Sequence[bool | int],
-    decades: float = 0.0,
+    mass_decades: float = 0.0,
     loads: bool = False,
     drag: bool = False,
 ) -> Model:
     """A chain with a rod at each joint k with rods[k]; masses are log-uniform over ± ``decades``."""
     n = len(rods)
-    mass = 10 ** rng.uniform(-decades, decades, n)
+    mass = 10 ** rng.uniform(-mass_decades, mass_decades, n)
     axes = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
     size = rng.uniform(0.1, 0.6, (n, 3)) ** 2
     principal = mass[:, None] / 5 * (size.sum(1, keepdims=True) - size)  # ellipsoids: always physical
@@ -59,7 +59,9 @@ def random_chain(
     return model, random_state(rng, model, rate)
 
 
-def rescaled(model: Model, state: State, length: float, mass: float, time: float) -> tuple[Model, State]:
+def in_other_units(
+    model: Model, state: State, length: float, mass: float, time: float
+) -> tuple[Model, State]:
     """The same pendulum with lengths, masses and times measured in other units (values multiplied)."""
     force = mass * length / time**2
     scaled = replace(
@@ -78,6 +80,6 @@ def rescaled(model: Model, state: State, length: float, mass: float, time: float
     return scaled, state_from_minimal(scaled, state.p, state.omega / time, state.u, state.udot / time)
 
 
-def norms(difference: Array) -> Array:
+def norms_per_body(difference: Array) -> Array:
     """Euclidean norm per body."""
     return np.asarray(np.linalg.norm(difference, axis=-1))

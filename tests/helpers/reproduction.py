@@ -18,7 +18,7 @@ from plumbline.reproduce.engine_client import EngineClient
 from plumbline.reproduce.measure import ConvergenceMeasure, RelationMeasure, StateMeasure
 from plumbline.reproduce.shrink import ReproductionCase
 from tests.helpers import pendulums
-from tests.helpers.pendulums import JOINTS
+from tests.helpers.pendulums import JOINT_PATTERNS
 
 HOSTILE = '<img src=x onerror="alert(1)">\n"""\nimport os; os.abort()  # \\ \'\'\' \r ; # ünï'
 DRIFTS = ("energy_drift", "momentum_drift", "joint_gap", "gap_rate", "norm_drift")
@@ -33,8 +33,8 @@ def stored_row(engine: str, **more):
 
 
 def state_case(joints: str, loads: bool = False, drag: bool = False, rate: float = 3.0) -> ReproductionCase:
-    model = pendulums.model(JOINTS[joints], loads=loads, drag=drag)
-    return ReproductionCase(model, pendulums.state(model, seed=3, rate=rate))
+    model = pendulums.make_model(JOINT_PATTERNS[joints], loads=loads, drag=drag)
+    return ReproductionCase(model, pendulums.state_from_seed(model, seed=3, rate=rate))
 
 
 def state_evidence(engine: str, case: ReproductionCase):

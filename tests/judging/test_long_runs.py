@@ -32,7 +32,7 @@ def load(name):
     return loader.load_scenarios([name])[0]
 
 
-def long(name, engine, integrator, seconds=100.0):
+def run_long(name, engine, integrator, seconds=100.0):
     """Rows by quantity of one integrator's long runs of a scenario."""
     s, chosen = load(name), load_adapter(engine) if isinstance(engine, str) else engine
     method = chosen.integrator(integrator)
@@ -46,8 +46,8 @@ def long(name, engine, integrator, seconds=100.0):
 
 
 @pytest.fixture
-def planted(monkeypatch):
-    """``planted(defect)``: MuJoCo with it, as the engine that `endure` gets."""
+def use_defect(monkeypatch):
+    """``use_defect(defect)``: MuJoCo with it, as the engine that `endure` gets."""
 
     def put(defect):
         engine = plant(Mujoco, defect)
@@ -58,7 +58,7 @@ def planted(monkeypatch):
 
 
 def test_a_chaotic_motion_keeps_what_is_conserved_for_100_s():
-    rows = long("double-tumbling-balls", "mujoco", "RK4")
+    rows = run_long("double-tumbling-balls", "mujoco", "RK4")
     assert {row.verdict for row in rows.values()} == {"agrees"} and len(rows) == 5
     energy = rows["energy_drift_long"]
     assert energy.level == "invariants" and energy.compared_until == 100.0 and energy.declared_order == 4
@@ -68,31 +68,33 @@ def test_a_chaotic_motion_keeps_what_is_conserved_for_100_s():
 
 
 def test_a_step_too_coarse_for_100_s_is_judged_where_it_is_not():
-    rows = long("tumbling-ball", "mujoco", "Euler")
+    rows = run_long("tumbling-ball", "mujoco", "Euler")
     energy = rows["energy_drift_long"]
     assert energy.verdict == "agrees" and energy.compared_until == 10.0 and abs(energy.order - 1) < 0.2
     assert "within 100 s, which does not decide" in energy.reason
     assert energy.extra["by 100 s"] > 3.0 > energy.extra["scale"] / 2
 
 
-LEAK = Defect(
+SMALL_DRAG_DEFECT = Defect(
     "damping-1e-7", "drag of 1e-7 N m s on every body",
     inputs=model_change(lambda m, _: {"drag_moment": m.drag_moment + 1e-7}),
 )  # fmt: skip
 
 
-def half_way(run):
+def restart_halfway(run):
     """Rows whose second half begins again."""
     half = len(run.t) // 2
     return [*range(half), *range(len(run.t) - half)]
 
 
-def reset(simulate, *arguments):
+def simulate_with_reset(simulate, *arguments):
     run = simulate(*arguments)
-    return Trajectory(run.t, *(getattr(run, k)[half_way(run)] for k in ("r", "p", "v", "pdot")), run.steps)
+    return Trajectory(
+        run.t, *(getattr(run, k)[restart_halfway(run)] for k in ("r", "p", "v", "pdot")), run.steps
+    )
 
 
-def creep(simulate, *arguments):
+def simulate_with_opening_joints(simulate, *arguments):
     """Every joint opens by 1e-9 m/s, unseen by the velocities."""
     run = simulate(*arguments)
     return replace(run, r=run.r + 1e-9 * run.t[:, None, None])
@@ -101,35 +103,35 @@ def creep(simulate, *arguments):
 @pytest.mark.parametrize(
     ("defect", "verdict", "quantities"),
     [
-        (LEAK, "disagrees", {"energy_drift_long"}),
-        (Defect("creep", "", run=creep), "disagrees", {"joint_gap_long"}),
-        (Defect("reset", "", run=reset), "failed", {"all_long"}),
+        (SMALL_DRAG_DEFECT, "disagrees", {"energy_drift_long"}),
+        (Defect("creep", "", run=simulate_with_opening_joints), "disagrees", {"joint_gap_long"}),
+        (Defect("reset", "", run=simulate_with_reset), "failed", {"all_long"}),
         (DEFECTS["norm-1e-9"], "disagrees", {"norm_drift_long"}),
     ],
     ids=lambda x: x.name if isinstance(x, Defect) else None,
 )
-def test_planted_leaks_are_seen(planted, defect, verdict, quantities):
-    rows = long("tumbling-ball", planted(defect), "RK4", 25.0)
+def test_planted_leaks_are_seen(use_defect, defect, verdict, quantities):
+    rows = run_long("tumbling-ball", use_defect(defect), "RK4", 25.0)
     assert {q for q, row in rows.items() if row.verdict == verdict} >= quantities
 
 
-def test_another_order_than_its_name_is_seen(planted):
-    rows = long("tumbling-ball", planted(DEFECTS["order-2-named-RK4"]), "RK4", 12.5)
+def test_another_order_than_its_name_is_seen(use_defect):
+    rows = run_long("tumbling-ball", use_defect(DEFECTS["order-2-named-RK4"]), "RK4", 12.5)
     row = rows["energy_drift_long"]
     assert row.verdict == "disagrees" and row.order < 3.5 and "required 3.9" in row.reason
 
 
 @pytest.mark.full
 def test_a_symmetric_method_is_bounded_and_a_leak_is_not():
-    rows = worker.run("exudyn", long, "spherical", "exudyn", "trapezoidal", 50.0)
+    rows = worker.run_in_engine_process("exudyn", run_long, "spherical", "exudyn", "trapezoidal", 50.0)
     growth = rows["energy_drift_long_growth"]
     assert growth.verdict == "agrees" and growth.value < 0.1 and "bounded" in growth.reason
     assert rows["energy_drift_long"].verdict == "agrees"
-    leak = worker.run("exudyn", leaking)
+    leak = worker.run_in_engine_process("exudyn", growth_row_with_drag)
     assert leak.verdict == "disagrees" and leak.value > 0.9 and "grows with time" in leak.reason
 
 
-def leaking():
+def growth_row_with_drag():
     """The row on the growth of Exudyn's energy with a drag that takes as much as the steps' error."""
     from adapters.exudyn_engine import Exudyn
 
@@ -139,14 +141,14 @@ def leaking():
     )
     before, long_run_study.load_adapter = long_run_study.load_adapter, lambda _: engine
     try:
-        return long("spherical", engine, "trapezoidal", 50.0)["energy_drift_long_growth"]
+        return run_long("spherical", engine, "trapezoidal", 50.0)["energy_drift_long_growth"]
     finally:
         long_run_study.load_adapter = before
 
 
 @pytest.mark.full
 def test_step_control_keeps_each_invariant_within_its_tolerance():
-    rows = worker.run("pinocchio", long, "tumbling-ball", "pinocchio", "dop853", 50.0)
+    rows = worker.run_in_engine_process("pinocchio", run_long, "tumbling-ball", "pinocchio", "dop853", 50.0)
     assert {row.verdict for row in rows.values()} == {"agrees"}
     assert "the error that the tolerance 1e-08 accepts in every step" in rows["energy_drift_long"].reason
 

@@ -27,7 +27,7 @@ from plumbline.model.datatypes import EngineFailure, Unsupported
 from plumbline.model.welding import split_bodies, split_body
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers import pendulums
-from tests.helpers.pendulums import JOINTS
+from tests.helpers.pendulums import JOINT_PATTERNS
 from tests.helpers.planted_defects import STATE_DEFECTS, Defect, field, model_change, parameter, plant
 from tests.helpers.random_chains import random_chain
 
@@ -35,26 +35,30 @@ for engine in ("mujoco", "pinocchio", "exudyn"):
     pytest.importorskip(engine)
 
 
-def states(model):
-    return [pendulums.state(model, seed) for seed in range(3)]
+def random_states_of(model):
+    return [pendulums.state_from_seed(model, seed) for seed in range(3)]
 
 
 @pytest.mark.parametrize("joints", ["ball", "rods", "mixed"])
 def test_the_ways_back_are_those_of_the_equations(joints):
     """Each relation on an independent solution, loads and drag included: the algebra of there and back."""
-    model = pendulums.model(JOINTS[joints], loads=True, drag=True)
+    model = pendulums.make_model(JOINT_PATTERNS[joints], loads=True, drag=True)
     for relation in STATE_RELATIONS:
-        here = model if relation.name != "time reversed" else pendulums.model(JOINTS[joints], loads=True)
-        for state in states(here):
+        here = (
+            model
+            if relation.name != "time reversed"
+            else pendulums.make_model(JOINT_PATTERNS[joints], loads=True)
+        )
+        for state in random_states_of(here):
             right = evaluate_case(make_defect_case(here, [state]))
             other_model, other_state = relation.transform(here, state)
             said = {q: x[0] for q, x in evaluate_case(make_defect_case(other_model, [other_state])).items()}
-            back = relation.transform_back(_quantities(said))
+            back = relation.transform_back(_as_state_quantities(said))
             for q, x in back.items():
                 np.testing.assert_allclose(x, right[q][0], rtol=1e-11, atol=1e-11 * np.max(np.abs(right[q])))
 
 
-def _quantities(said):
+def _as_state_quantities(said):
     from plumbline.model.datatypes import StateQuantities
 
     return StateQuantities(**{q: x if np.ndim(x) else float(x) for q, x in said.items()})
@@ -66,8 +70,8 @@ def _quantities(said):
     + [("reference-printed", "rods")],
 )
 def test_every_engine_keeps_every_relation(engine, joints):
-    model = pendulums.model(JOINTS[joints], loads=True)
-    found = check_relations(engine, model, states(model))
+    model = pendulums.make_model(JOINT_PATTERNS[joints], loads=True)
+    found = check_relations(engine, model, random_states_of(model))
     rows = judge_relations(RowContext("s", "f", engine, engine, "0"), found).rows
     refused = [row.quantity for row in rows if row.verdict == "unsupported"]
     assert refused == (
@@ -81,42 +85,54 @@ def test_every_engine_keeps_every_relation(engine, joints):
     ]
 
 
-def of(name: str) -> Defect:
+def defect_named(name: str) -> Defect:
     return next(d for d in STATE_DEFECTS if d.name == name)
 
 
-BROKEN = {
-    "rotated world": (of("gravity-z"), of("gravity-axes"), of("bodies-exchanged")),
-    "re-chosen body frame": (of("inertia-products-dropped"), of("inertia-xx-1e-6"), of("centre-0.1mm")),
+DEFECTS_BY_RELATION = {
+    "rotated world": (
+        defect_named("gravity-z"),
+        defect_named("gravity-axes"),
+        defect_named("bodies-exchanged"),
+    ),
+    "re-chosen body frame": (
+        defect_named("inertia-products-dropped"),
+        defect_named("inertia-xx-1e-6"),
+        defect_named("centre-0.1mm"),
+    ),
     "masses doubled": (
-        of("damping-1e-6"),
+        defect_named("damping-1e-6"),
         Defect("gram", "mass of body 1 by 1e-3 kg", inputs=parameter("mass", 0, by=1e-3)),
     ),
-    "lengths × 4": (of("distal-1e-5"), of("centre-0.1mm"), of("potential-origin")),
+    "lengths × 4": (
+        defect_named("distal-1e-5"),
+        defect_named("centre-0.1mm"),
+        defect_named("potential-origin"),
+    ),
     "time reversed": (
-        of("damping-1e-6"),
-        of("spatial-acceleration"),
+        defect_named("damping-1e-6"),
+        defect_named("spatial-acceleration"),
         Defect(
             "helical", "n′ + 1e-6 ω′", inputs=model_change(lambda m, s: {"moment": m.moment + 1e-6 * s.omega})
         ),
     ),
-    "as exudyn-tree": (replace(of("mass-1-1e-5"), engine="exudyn"),),
+    "as exudyn-tree": (replace(defect_named("mass-1-1e-5"), engine="exudyn"),),
 }
 
 
-@pytest.mark.parametrize("relation", BROKEN)
+@pytest.mark.parametrize("relation", DEFECTS_BY_RELATION)
 def test_a_defect_of_its_kind_breaks_it(relation):
-    model = pendulums.model(JOINTS["balls"])
+    model = pendulums.make_model(JOINT_PATTERNS["balls"])
     broken = {}
-    for defect in BROKEN[relation]:
+    for defect in DEFECTS_BY_RELATION[relation]:
         engine = plant(type(load_adapter(defect.engine)), defect)
         with patch(
             "plumbline.judging.metamorphic.load_adapter",
             lambda n, e=engine, d=defect: e if n == d.engine else load_adapter(n),
         ):
-            results = check_relations(defect.engine, model, states(model))
+            results = check_relations(defect.engine, model, random_states_of(model))
         broken[defect.name] = any(r.relation == relation and r.ratio > 1 for r in results)
-    assert any(broken.values()) and broken[BROKEN[relation][0].name], broken
+    assert any(broken.values()) and broken[DEFECTS_BY_RELATION[relation][0].name], broken
 
 
 def test_a_refused_state_is_left_out_and_a_refusing_engine_is_told():
@@ -126,10 +142,10 @@ def test_a_refused_state_is_left_out_and_a_refusing_engine_is_told():
         def _evaluate(self, model, asked):
             raise Unsupported("not on a Monday")
 
-    model = pendulums.model(JOINTS["ball"])
+    model = pendulums.make_model(JOINT_PATTERNS["ball"])
     with patch("plumbline.judging.metamorphic.load_adapter", lambda _: Refusing()):
         rows = judge_relations(
-            RowContext("s", "f", "e", "E", "0"), check_relations("mujoco", model, states(model))
+            RowContext("s", "f", "e", "E", "0"), check_relations("mujoco", model, random_states_of(model))
         ).rows
     assert {(row.verdict, row.reason) for row in rows} == {("unsupported", "not on a Monday")}
 
@@ -140,15 +156,15 @@ def test_noise_breaks_what_is_not_bitwise():
     noisy = Defect("noise", "1e-9", answers=field(
         "acceleration", lambda _, __, a: a * (1 + 1e-9 * rng.normal(size=a.shape))))  # fmt: skip
     engine = plant(type(load_adapter("mujoco")), noisy)
-    model = pendulums.model(JOINTS["balls"])
+    model = pendulums.make_model(JOINT_PATTERNS["balls"])
     with patch("plumbline.judging.metamorphic.load_adapter", lambda _: engine):
-        assert all(h.ratio > 1 for h in check_relations("mujoco", model, states(model)))
+        assert all(h.ratio > 1 for h in check_relations("mujoco", model, random_states_of(model)))
 
 
 # -- the engine's other ways, and welded halves -----------------------------------------------------
 
 
-def one_sided(defect: Defect):
+def defect_in_default_formulation(defect: Defect):
     """The real engine with a defect in its usual way alone: its other ways and welded bodies are sound."""
     real = type(load_adapter(defect.engine))
     engine = plant(real, defect)
@@ -157,8 +173,10 @@ def one_sided(defect: Defect):
     return engine
 
 
-WAYS = [(engine, f"by {option}") for engine in ENGINES for option in type(load_adapter(engine)).options]
-WELDERS = [
+OPTION_RELATIONS = [
+    (engine, f"by {option}") for engine in ENGINES for option in type(load_adapter(engine)).options
+]
+WELDING_RELATIONS = [
     (engine, "two welded halves")
     for engine in ENGINES
     if not type(load_adapter(engine)).welding_unsupported_reason
@@ -166,19 +184,21 @@ WELDERS = [
 
 
 @pytest.mark.parametrize("defect", ["inertia-xx-1e-6", "distal-1e-5"])
-@pytest.mark.parametrize(("engine", "relation"), WAYS + WELDERS)
+@pytest.mark.parametrize(("engine", "relation"), OPTION_RELATIONS + WELDING_RELATIONS)
 def test_a_defect_in_one_way_of_the_engine_breaks_it(engine, relation, defect):
-    model = pendulums.model(JOINTS["balls"])
-    bent = one_sided(replace(of(defect), engine=engine))
+    model = pendulums.make_model(JOINT_PATTERNS["balls"])
+    bent = defect_in_default_formulation(replace(defect_named(defect), engine=engine))
     with patch(
         "plumbline.judging.metamorphic.load_adapter", lambda n: bent if n == engine else load_adapter(n)
     ):
-        (found,) = (h for h in check_relations(engine, model, states(model)) if h.relation == relation)
+        (found,) = (
+            h for h in check_relations(engine, model, random_states_of(model)) if h.relation == relation
+        )
     assert found.ratio > 1, found
 
 
 @pytest.mark.parametrize("change", ["inertia", "centre", "mass"])
-@pytest.mark.parametrize("engine", [engine for engine, _ in WELDERS])
+@pytest.mark.parametrize("engine", [engine for engine, _ in WELDING_RELATIONS])
 def test_a_half_that_is_welded_wrongly_breaks_it(engine, change):
     """One number of one half off by 1e-6 of it: what the engine welds is not the body then."""
 
@@ -187,10 +207,12 @@ def test_a_half_that_is_welded_wrongly_breaks_it(engine, change):
         parts[-1] = one, replace(other, **{change: getattr(other, change) * (1 + 1e-6)})
         return parts
 
-    model = pendulums.model(JOINTS["balls"])
+    model = pendulums.make_model(JOINT_PATTERNS["balls"])
     with patch("plumbline.engines.metamorphic_hooks.split_bodies", wrong):
         (found,) = (
-            h for h in check_relations(engine, model, states(model)) if h.relation == "two welded halves"
+            h
+            for h in check_relations(engine, model, random_states_of(model))
+            if h.relation == "two welded halves"
         )
     assert found.ratio > 1, found
 
@@ -218,9 +240,9 @@ def test_two_halves_are_physical_and_make_the_body(shape):
 
 def test_halves_have_roundings_of_their_own():
     """Hung at its centre a body has no potential energy to round; its halves' must cancel."""
-    model = pendulums.model(JOINTS["ball"])
+    model = pendulums.make_model(JOINT_PATTERNS["ball"])
     model = replace(model, proximal=0 * model.proximal)
-    at = pendulums.state(model, 1)
+    at = pendulums.state_from_seed(model, 1)
     plain, welded = state_rounding_bound(model, at), state_rounding_bound(model, at, split_bodies(model))
     assert plain.potential_energy == 0 < welded.potential_energy
     (whole,), (two,) = (
@@ -240,14 +262,14 @@ def test_mujoco_s_solvers_have_nothing_to_do(joints):
     """Solver and Jacobian are of active constraints: without any, the answers are the same bit for bit."""
     mujoco = pytest.importorskip("mujoco")
     engine = pytest.importorskip("adapters.mujoco_engine")
-    model = pendulums.model(JOINTS[joints], loads=True, drag=True)
-    usual = load_adapter("mujoco").evaluate(model, states(model))
+    model = pendulums.make_model(JOINT_PATTERNS[joints], loads=True, drag=True)
+    usual = load_adapter("mujoco").evaluate(model, random_states_of(model))
     kinds, jacobians = ("PGS", "CG", "NEWTON"), ("DENSE", "SPARSE")
     for kind, jacobian in product(kinds, jacobians):
         chain = engine._MujocoChain(model)
         chain.m.opt.solver = getattr(mujoco.mjtSolver, f"mjSOL_{kind}")
         chain.m.opt.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{jacobian}")
-        for at, right in zip(states(model), usual, strict=True):
+        for at, right in zip(random_states_of(model), usual, strict=True):
             said = chain.quantities(at)
             assert chain.d.nefc == 0
             assert all(np.array_equal(getattr(said, q), getattr(right, q)) for q in vars(right))
@@ -263,36 +285,36 @@ def test_an_option_that_there_is_not_is_refused():
 # -- short runs ------------------------------------------------------------------------------------
 
 
-SOLVED = "by EXUdense", "by EigenDense"  # besides the usual one
+LINEAR_SOLVER_RELATIONS = "by EXUdense", "by EigenDense"  # besides the usual one
 
 
 @cache
-def exudyn():
+def exudyn_adapter():
     return pytest.importorskip("adapters.exudyn_engine").Exudyn
 
 
-def trapezoidal():
-    return exudyn()().integrator("trapezoidal")
+def trapezoidal_integrator():
+    return exudyn_adapter()().integrator("trapezoidal")
 
 
-def ran(engine, relation, joints="balls", integrator="trapezoidal"):
-    model = pendulums.model(JOINTS[joints])
+def relation_result(engine, relation, joints="balls", integrator="trapezoidal"):
+    model = pendulums.make_model(JOINT_PATTERNS[joints])
     (found,) = (
         held
-        for held in check_run_relations(engine, model, pendulums.state(model, 1))
+        for held in check_run_relations(engine, model, pendulums.state_from_seed(model, 1))
         if (held.relation, held.integrator) == (relation, integrator)
     )
     return found
 
 
 def test_runs_take_sixteen_steps_of_at_most_a_thirtieth_of_a_radian_each_way():
-    model = pendulums.model(JOINTS["balls"])
-    at = pendulums.state(model, 1)
-    found = list(check_run_relations(exudyn()(), model, at))
+    model = pendulums.make_model(JOINT_PATTERNS["balls"])
+    at = pendulums.state_from_seed(model, 1)
+    found = list(check_run_relations(exudyn_adapter()(), model, at))
     assert [(held.integrator, held.relation) for held in found] == [
         ("trapezoidal", "reversed in time"),
-        *(("trapezoidal", name) for name in SOLVED),
-        *(("generalized-alpha", name) for name in SOLVED),
+        *(("trapezoidal", name) for name in LINEAR_SOLVER_RELATIONS),
+        *(("generalized-alpha", name) for name in LINEAR_SOLVER_RELATIONS),
     ]
     for held in found:
         assert held.steps == (32 if held.relation == "reversed in time" else 16)
@@ -306,11 +328,11 @@ def test_runs_take_sixteen_steps_of_at_most_a_thirtieth_of_a_radian_each_way():
 
 @pytest.mark.parametrize("joints", ["balls", "rods", "mixed"])
 def test_a_symmetric_integrator_comes_back(joints):
-    assert ran(exudyn()(), "reversed in time", joints).ratio < 0.3
-    assert ran(load_adapter("reference"), "reversed in time", joints, "collocation").ratio < 0.3
+    assert relation_result(exudyn_adapter()(), "reversed in time", joints).ratio < 0.3
+    assert relation_result(load_adapter("reference"), "reversed in time", joints, "collocation").ratio < 0.3
 
 
-def damped(real):
+def with_drag(real):
     """A millionth of a newton metre second on every body: it knows the direction of time."""
 
     class Damped(real):
@@ -322,60 +344,60 @@ def damped(real):
 
 @pytest.mark.parametrize("engine", ["exudyn", "reference"])
 def test_damping_is_not_reversed(engine):
-    real = damped(type(load_adapter(engine)))
+    real = with_drag(type(load_adapter(engine)))
     integrator = next(i.name for i in real.integrators if i.is_symmetric)
-    assert ran(real(), "reversed in time", integrator=integrator).ratio > 1
+    assert relation_result(real(), "reversed in time", integrator=integrator).ratio > 1
 
 
 def test_a_scheme_that_is_not_symmetric_does_not_come_back():
-    class Alpha(exudyn()):
-        integrators = tuple(replace(i, is_symmetric=True) for i in exudyn().integrators)
+    class Alpha(exudyn_adapter()):
+        integrators = tuple(replace(i, is_symmetric=True) for i in exudyn_adapter().integrators)
 
-    assert ran(Alpha(), "reversed in time").ratio < 0.3
-    assert ran(Alpha(), "reversed in time", integrator="generalized-alpha").ratio > 1e3
+    assert relation_result(Alpha(), "reversed in time").ratio < 0.3
+    assert relation_result(Alpha(), "reversed in time", integrator="generalized-alpha").ratio > 1e3
 
 
 def test_accelerations_that_are_not_carried_break_the_way_back():
-    class Forgetful(exudyn()):
+    class Forgetful(exudyn_adapter()):
         _run_samples = partialmethod(
-            lambda self, *more, compute_initial_accelerations=True: exudyn()._run_samples(
+            lambda self, *more, compute_initial_accelerations=True: exudyn_adapter()._run_samples(
                 self, *more, compute_initial_accelerations=True
             )
         )
 
-    assert ran(Forgetful(), "reversed in time").ratio > 1
+    assert relation_result(Forgetful(), "reversed in time").ratio > 1
 
 
 @pytest.mark.parametrize("engine", ["exudyn", "exudyn-tree"])
 def test_a_linear_solver_that_solves_something_else_is_seen(engine):
     sound = load_adapter(engine)
-    bent = plant(type(sound), replace(of("distal-1e-5"), engine=engine))
+    bent = plant(type(sound), replace(defect_named("distal-1e-5"), engine=engine))
     sound.with_option = bent.with_option
     for held in check_run_relations(
-        sound, model := pendulums.model(JOINTS["balls"]), pendulums.state(model, 1)
+        sound, model := pendulums.make_model(JOINT_PATTERNS["balls"]), pendulums.state_from_seed(model, 1)
     ):
         assert (held.ratio > 1) == held.relation.startswith("by "), held
 
 
 def test_drag_is_not_reversed_and_a_failing_run_is_told():
-    model = pendulums.model(JOINTS["ball"], drag=True)
-    found = list(check_run_relations(exudyn()(), model, pendulums.state(model)))
+    model = pendulums.make_model(JOINT_PATTERNS["ball"], drag=True)
+    found = list(check_run_relations(exudyn_adapter()(), model, pendulums.state_from_seed(model)))
     assert found and not any(held.relation == "reversed in time" for held in found)
 
-    class Failing(exudyn()):
+    class Failing(exudyn_adapter()):
         def _run_samples(self, *_, **__):
             raise EngineFailure("it stopped")
 
-    model = pendulums.model(JOINTS["ball"])
-    found = list(check_run_relations(Failing(), model, pendulums.state(model)))
+    model = pendulums.make_model(JOINT_PATTERNS["ball"])
+    found = list(check_run_relations(Failing(), model, pendulums.state_from_seed(model)))
     rows = judge_relations(RowContext("s", "f", "e", "E", "0"), found).rows
     assert {(row.verdict, row.reason) for row in rows} == {("failed", "it stopped")}
-    solved = [(name, way) for name in ("trapezoidal", "generalized-alpha") for way in SOLVED]
+    solved = [(name, way) for name in ("trapezoidal", "generalized-alpha") for way in LINEAR_SOLVER_RELATIONS]
     assert [(row.integrator, row.quantity) for row in rows] == [("trapezoidal", "reversed in time"), *solved]
 
 
 def test_a_solver_with_which_a_run_fails_is_told():
-    class Half(exudyn()):
+    class Half(exudyn_adapter()):
         def with_option(self, option):
             found = super().with_option(option)
             found._simulate = failing
@@ -384,25 +406,27 @@ def test_a_solver_with_which_a_run_fails_is_told():
     def failing(*_):
         raise EngineFailure("it stopped")
 
-    model = pendulums.model(JOINTS["ball"])
-    back, *others = check_integrator_relations(Half(), trapezoidal(), model, pendulums.state(model), 1 / 512)
+    model = pendulums.make_model(JOINT_PATTERNS["ball"])
+    back, *others = check_integrator_relations(
+        Half(), trapezoidal_integrator(), model, pendulums.state_from_seed(model), 1 / 512
+    )
     assert back.ratio < 0.3
     assert [(h.relation, h.integrator, h.refusal_reason, h.verdict) for h in others] == [
-        (way, "trapezoidal", "it stopped", "failed") for way in SOLVED
+        (way, "trapezoidal", "it stopped", "failed") for way in LINEAR_SOLVER_RELATIONS
     ]
 
 
 def test_two_solvers_may_both_be_off():
-    found = ran(exudyn()(), "by EigenDense", "mixed")
-    model = pendulums.model(JOINTS["mixed"])
-    at = pendulums.state(model, 1)
+    found = relation_result(exudyn_adapter()(), "by EigenDense", "mixed")
+    model = pendulums.make_model(JOINT_PATTERNS["mixed"])
+    at = pendulums.state_from_seed(model, 1)
     ends = [
         state_at_sample(
             way.simulate(model, at, np.array([0.0, found.end_time]), "trapezoidal", found.resolution), -1
         )
-        for way in (exudyn()(), exudyn()().with_option("EigenDense"))
+        for way in (exudyn_adapter()(), exudyn_adapter()().with_option("EigenDense"))
     ]
-    limit = 2 * run_tolerance(trapezoidal(), model, at, found.end_time, 16)
+    limit = 2 * run_tolerance(trapezoidal_integrator(), model, at, found.end_time, 16)
     assert found.ratio > 0
     assert found.ratio == pytest.approx(max(relative_differences(model, *ends).values()) / limit, rel=1e-9), (
         "the same runs"
@@ -419,22 +443,22 @@ def test_runs_by_tolerance_have_no_solvers_and_are_not_tried_finer():
             tried.append(1)
             raise EngineFailure("it stopped")
 
-    model = pendulums.model(JOINTS["ball"])
-    (held,) = check_run_relations(Failing(), model, pendulums.state(model))
+    model = pendulums.make_model(JOINT_PATTERNS["ball"])
+    (held,) = check_run_relations(Failing(), model, pendulums.state_from_seed(model))
     assert (held.relation, held.verdict, len(tried)) == ("reversed in time", "failed", 1)
 
 
 def test_a_step_too_coarse_to_be_solved_is_taken_finer():
     tried = []
 
-    class Stiff(exudyn()):
+    class Stiff(exudyn_adapter()):
         def _run_samples(self, chain, times, integrator, step, compute_initial_accelerations=True):
             tried.append(step)
             if step > max(tried) / 4:
                 raise EngineFailure("no convergence")
             return super()._run_samples(chain, times, integrator, step, compute_initial_accelerations)
 
-    found = ran(Stiff(), "reversed in time")
+    found = relation_result(Stiff(), "reversed in time")
     assert found.ratio < 0.3 and min(tried) == max(tried) / 4
 
 
@@ -446,5 +470,7 @@ def test_a_light_body_among_heavy_ones_is_solved_less_sharply():
     loads, _ = rng.random() < 0.5, rng.random()
     model, state = random_chain(rng, rods, decades=3, rate=rate, loads=bool(loads))
     assert np.max(model.mass) > 1e2 * np.min(model.mass)
-    (held,) = (h for h in check_run_relations(exudyn()(), model, state) if h.relation == "reversed in time")
+    (held,) = (
+        h for h in check_run_relations(exudyn_adapter()(), model, state) if h.relation == "reversed in time"
+    )
     assert held.ratio < 0.3

@@ -36,8 +36,8 @@ from plumbline.truth.rounding_bound import state_rounding_bound
 from plumbline.truth.sensitivity import perturbation_growth
 from tests.helpers import pendulums
 
-MODEL = pendulums.model("br")
-STATES = [pendulums.state(MODEL, seed=k) for k in range(3)]
+MODEL = pendulums.make_model("br")
+STATES = [pendulums.state_from_seed(MODEL, seed=k) for k in range(3)]
 WHO = RowContext("s", "f", "e", "E", "0")
 METHOD = Integrator("trapezoidal", "step", 2, is_symmetric=True)
 
@@ -52,7 +52,7 @@ def test_values_are_what_is_offered_times_its_factor() -> None:
     assert np.array_equal(twice.inertia, MODEL.inertia)
 
 
-def compared(*shifts, relation=None, refuse=(), refuse_here=()):
+def self_relation_result(*shifts, relation=None, refuse=(), refuse_here=()):
     """The relation of an engine with itself, answers shifted: (state, quantity, so many bounds of both)."""
     bounds = [state_rounding_bound(MODEL, s) for s in STATES]
     said = list(load_adapter("reference").evaluate(MODEL, STATES))
@@ -78,20 +78,20 @@ def compared(*shifts, relation=None, refuse=(), refuse_here=()):
 @pytest.mark.parametrize("quantity", QUANTITIES)
 @pytest.mark.parametrize("by", [0.9, 1.1, 40.0])
 def test_a_relation_is_as_far_off_as_its_worst_quantity_over_both_bounds(quantity: str, by: float) -> None:
-    found = compared((0, "kinetic_energy", 0.5), (2, quantity, by))
+    found = self_relation_result((0, "kinetic_energy", 0.5), (2, quantity, by))
     assert found.ratio == pytest.approx(by, rel=0.05)
     assert (found.quantity, found.worst_state, found.state_count) == (quantity, 2, 3)
     assert (found.relation, found.integrator, found.steps, found.refusal_reason) == ("as itself", "-", 0, "")
 
 
 def test_equal_answers_and_refused_ones() -> None:
-    assert compared().ratio == 0.0
-    some = compared((0, "acceleration", 5.0), (1, "acceleration", 3.0), refuse=(0,))
+    assert self_relation_result().ratio == 0.0
+    some = self_relation_result((0, "acceleration", 5.0), (1, "acceleration", 3.0), refuse=(0,))
     assert (some.state_count, some.worst_state) == (2, 1) and some.refusal_reason == "not state 0"
     assert some.ratio == pytest.approx(3, rel=0.01)
-    mine = compared((2, "acceleration", 5.0), (1, "acceleration", 3.0), refuse_here=(2,))
+    mine = self_relation_result((2, "acceleration", 5.0), (1, "acceleration", 3.0), refuse_here=(2,))
     assert (mine.state_count, mine.worst_state, mine.refusal_reason) == (2, 1, "nor state 2")
-    none = compared(refuse=(0, 1, 2))
+    none = self_relation_result(refuse=(0, 1, 2))
     assert (none.ratio, none.quantity, none.worst_state, none.state_count) == (None, "", 0, 0)
     assert none.verdict == "unsupported"
 
@@ -242,8 +242,10 @@ def test_a_run_may_be_off_by_its_rounding_its_solver_and_its_accelerations_grown
 
 @pytest.mark.parametrize("drag", [False, True])
 def test_every_relation_is_asked_but_time_reversed_with_drag(drag: bool) -> None:
-    model = pendulums.model("b", drag=drag)
-    names = [found.relation for found in check_relations("pinocchio", model, [pendulums.state(model)])]
+    model = pendulums.make_model("b", drag=drag)
+    names = [
+        found.relation for found in check_relations("pinocchio", model, [pendulums.state_from_seed(model)])
+    ]
     told = ["rotated world", "re-chosen body frame", "masses doubled", "lengths × 4"]
     told += [] if drag else ["time reversed"]
     assert names[: len(told)] == told and ("time reversed" in names) is not drag
@@ -255,15 +257,17 @@ def test_both_columns_of_an_engine_are_compared(engine: str) -> None:
     pytest.importorskip(engine.split("-")[0])
     other = load_adapter(engine).other_formulation
     assert load_adapter(other).other_formulation == engine
-    model = pendulums.model("b")
+    model = pendulums.make_model("b")
     assert f"as {other}" in [
-        found.relation for found in check_relations(engine, model, [pendulums.state(model)])
+        found.relation for found in check_relations(engine, model, [pendulums.state_from_seed(model)])
     ]
 
 
 def test_long_chains_are_asked_at_half_as_many_states() -> None:
     pytest.importorskip("mujoco")
     for bodies, states in ((12, 4), (13, 2)):
-        model = pendulums.model("b" * bodies)
-        found = check_relations("mujoco", model, [pendulums.state(model, seed=k, rate=0.5) for k in range(6)])
+        model = pendulums.make_model("b" * bodies)
+        found = check_relations(
+            "mujoco", model, [pendulums.state_from_seed(model, seed=k, rate=0.5) for k in range(6)]
+        )
         assert {one.state_count for one in found if not one.steps and one.ratio is not None} == {states}

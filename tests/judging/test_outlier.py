@@ -23,21 +23,21 @@ for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
 
 
 @cache
-def truth():
-    model = pendulums.model("bb")
+def model_and_truth():
+    model = pendulums.make_model("bb")
     return model, state_truth(model, random_states(model, 3, seed=1))
 
 
-def rows(*bent: str, defect: str = "mass-1-1e-5", leave_out: tuple[str, ...] = ()):
+def rows_of_engines(*defective_engines: str, defect: str = "mass-1-1e-5", leave_out: tuple[str, ...] = ()):
     """State-level rows of the real engines, some with a defect planted in them."""
-    model, right = truth()
+    model, right = model_and_truth()
     (planted,) = (d for d in STATE_DEFECTS if d.name == defect)
     found = []
     for name in ENGINES:
         if name in leave_out:
             continue
         engine = load_adapter(name)
-        if name in bent:
+        if name in defective_engines:
             engine = plant(type(engine), replace(planted, engine=name))
         said = Evaluation(engine.evaluate(model, right.states), None, None, 0.0)
         found += judge_states(RowContext("s", "f", name, engine.title, "0"), right, said).rows
@@ -46,7 +46,7 @@ def rows(*bent: str, defect: str = "mass-1-1e-5", leave_out: tuple[str, ...] = (
 
 @pytest.mark.parametrize("name", ENGINES)
 def test_one_engine_against_the_others_is_the_outlier(name):
-    text = describe_outliers(rows(name))
+    text = describe_outliers(rows_of_engines(name))
     who, others = text.split("; ")
     assert who.startswith(f"outlier: {name} in acceleration, angular acceleration")
     assert others == (
@@ -57,20 +57,20 @@ def test_one_engine_against_the_others_is_the_outlier(name):
 
 
 def test_two_are_both_named_and_a_quantity_alone_is_told():
-    text = describe_outliers(rows("mujoco", "exudyn"))
+    text = describe_outliers(rows_of_engines("mujoco", "exudyn"))
     assert text.startswith("outliers: mujoco in ") and "; exudyn in " in text
     assert text.endswith(
         "; reference, pinocchio and exudyn-tree agree with the certified truth "
         "and, within the sum of their bounds, with each other"
     )
-    text = describe_outliers(rows("pinocchio", defect="reaction-sign"))
+    text = describe_outliers(rows_of_engines("pinocchio", defect="reaction-sign"))
     assert text.startswith("outlier: pinocchio in joint reaction; reference, mujoco and exudyn agree"), text
 
 
 def test_who_agrees_alone_and_where_none_does():
-    alone = describe_outliers(rows("mujoco", leave_out=("exudyn", "exudyn-tree", "pinocchio")))
+    alone = describe_outliers(rows_of_engines("mujoco", leave_out=("exudyn", "exudyn-tree", "pinocchio")))
     assert alone.endswith("; reference agrees with the certified truth")
-    assert "no other engine agrees with the certified truth" in describe_outliers(rows(*ENGINES))
+    assert "no other engine agrees with the certified truth" in describe_outliers(rows_of_engines(*ENGINES))
 
 
 def test_a_truth_of_the_notes_own_may_be_the_one_that_is_wrong():
@@ -78,24 +78,26 @@ def test_a_truth_of_the_notes_own_may_be_the_one_that_is_wrong():
     others = ENGINES[1:]
     uncertified = [
         replace(row, derivation=row.derivation.replace("truth: certified", "truth: the notes' system"))
-        for row in rows(*others)
+        for row in rows_of_engines(*others)
     ]
     assert describe_outliers(uncertified).endswith("the truth is not certified: it may itself be wrong")
     uncertified = [
         replace(row, derivation=row.derivation.replace("truth: certified", "truth: the notes' system"))
-        for row in rows("mujoco")
+        for row in rows_of_engines("mujoco")
     ]
     assert describe_outliers(uncertified).startswith("outlier: mujoco in ")
 
 
 def test_it_follows_the_diagnosis_of_rows_that_disagree_and_of_no_other():
-    assert describe_outliers(rows()) == "" and annotate_outliers(sound := rows()) == sound
-    before = [replace(row, diagnosis="behaves so") for row in rows("mujoco")]
+    assert (
+        describe_outliers(rows_of_engines()) == "" and annotate_outliers(sound := rows_of_engines()) == sound
+    )
+    before = [replace(row, diagnosis="behaves so") for row in rows_of_engines("mujoco")]
     for was, now in zip(before, annotate_outliers(before), strict=True):
         if was.verdict == "disagrees":
             assert now.diagnosis.startswith("behaves so; outlier: mujoco in ")
             assert replace(now, diagnosis=was.diagnosis) == was
         else:
             assert now == was
-    bare = annotate_outliers(rows("mujoco"))
+    bare = annotate_outliers(rows_of_engines("mujoco"))
     assert any(row.diagnosis and row.diagnosis.startswith("outlier: mujoco") for row in bare)

@@ -15,12 +15,12 @@ from plumbline.truth.ground_truth import StateTruth, motion_truth
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers import pendulums
 
-MODEL = pendulums.model("bb")
+MODEL = pendulums.make_model("bb")
 STATES = random_states(MODEL, 3, 1)
 WHO = RowContext("s", "f", "reference", "Reference", "0")
 
 
-def verdict(scale_of_bound, shift=0.0):
+def acceleration_verdict(scale_of_bound, shift=0.0):
     """The verdict on acceleration of the reference against itself, its bound and answer changed."""
     said = load_adapter("reference").evaluate(MODEL, STATES)
     bounds = [state_rounding_bound(MODEL, s) for s in STATES]
@@ -39,14 +39,14 @@ def verdict(scale_of_bound, shift=0.0):
     [(1, 0.5, "agrees"), (1, 2.0, "disagrees"), (1e6, 0.0, "unresolved"), (np.nan, 0.0, "unresolved")],
 )
 def test_a_bound_decides_only_where_it_is_sharp(scale, shift, expected):
-    assert verdict(scale, shift) == expected
+    assert acceleration_verdict(scale, shift) == expected
 
 
 def test_a_blunt_row_says_what_was_measured():
     bounds = [
         replace(b, acceleration=1e6 * b.acceleration) for b in map(state_rounding_bound, [MODEL] * 3, STATES)
     ]
-    row = judged((1, 1, 0.5), bounds=bounds).rows[0]
+    row = judge_shifted_answers((1, 1, 0.5), bounds=bounds).rows[0]
     assert (row.level, row.integrator, row.quantity, row.unit) == ("state", "-", "acceleration", "m/s²")
     assert row.verdict == "unresolved" and row.reason.startswith("inconclusive: the rounding bound is ")
     assert row.tolerance == bounds[1].acceleration[1] and row.ratio == pytest.approx(0.5)
@@ -55,8 +55,8 @@ def test_a_blunt_row_says_what_was_measured():
 @pytest.mark.parametrize("drag", [False, True])
 def test_implicitfast_is_an_alias_of_euler_only_without_drag(drag):
     """And where it is called one, it is Euler to the last bit."""
-    model, times = pendulums.model("b", drag=drag), np.linspace(0, 0.5, 9)
-    state = pendulums.state(model, seed=2, rate=0.5)
+    model, times = pendulums.make_model("b", drag=drag), np.linspace(0, 0.5, 9)
+    state = pendulums.state_from_seed(model, seed=2, rate=0.5)
     truth, mujoco = motion_truth(model, state, times, None), load_adapter("mujoco")
     steps = [2.0**-k for k in range(9, 13)]
     runs = {
@@ -69,7 +69,7 @@ def test_implicitfast_is_an_alias_of_euler_only_without_drag(drag):
     assert same is not drag
 
 
-def judged(*off, bounds=None, **evaluation):
+def judge_shifted_answers(*off, bounds=None, **evaluation):
     """Findings on answers that are ``off`` by so many bounds of acceleration: (state, body, bounds)."""
     right = load_adapter("reference").evaluate(MODEL, STATES)
     bounds = bounds or [state_rounding_bound(MODEL, s) for s in STATES]
@@ -89,7 +89,7 @@ def test_the_row_is_of_the_body_that_is_worst_by_its_own_bound():
     bounds[0] = replace(bounds[0], acceleration=wide)
     small = [b.scale | {"acceleration": 1e-2 * b.scale["acceleration"]} for b in bounds]
     bounds = [replace(b, scale=scale) for b, scale in zip(bounds, small, strict=True)]
-    found = judged((0, 0, 0.5), (1, 0, 1.5), (2, 1, 3.0), bounds=bounds)
+    found = judge_shifted_answers((0, 0, 0.5), (1, 0, 1.5), (2, 1, 3.0), bounds=bounds)
     row = found.rows[0]
     sharp = bounds[2].acceleration[1]
     assert (row.quantity, row.verdict, row.unit, row.level) == ("acceleration", "disagrees", "m/s²", "state")
@@ -111,13 +111,13 @@ def test_the_row_is_of_the_body_that_is_worst_by_its_own_bound():
     assert table["scale"].tolist() == scales
     assert row.extra["relative"] == pytest.approx(max(table["error"] / scales), rel=1e-12, abs=0)
     assert row.extra["bound_relative"] == pytest.approx(np.median(table["bound"] / scales), rel=1e-12, abs=0)
-    (_, table), *_ = judged((0, 0, 0.5), (0, 1, 0.9), bounds=bounds).tables
+    (_, table), *_ = judge_shifted_answers((0, 0, 0.5), (0, 1, 0.9), bounds=bounds).tables
     assert table["body"][0] == 1, "nearer to its bound, though less far off"
 
 
 @pytest.mark.parametrize(("by", "expected"), [(0.98, "agrees"), (1.02, "disagrees")])
 def test_one_bound_is_the_border(by, expected):
-    rows = judged((1, 0, by)).rows
+    rows = judge_shifted_answers((1, 0, by)).rows
     assert rows[0].verdict == expected
     assert all(
         row.verdict == "agrees" and row.value == 0 for row in rows[1:] if row.quantity != "mass_matrix"
@@ -132,13 +132,13 @@ def test_one_bound_is_the_border(by, expected):
 def test_what_an_engine_does_not_offer_or_deliver_is_told():
     right = load_adapter("reference").evaluate(MODEL, STATES)
     less = [*right[:2], replace(right[2], joint_reaction=None)]
-    rows = judged(quantities=less).rows
+    rows = judge_shifted_answers(quantities=less).rows
     (gone,) = (row for row in rows if row.quantity == "joint_reaction")
     assert (gone.verdict, gone.unit, gone.level, gone.integrator) == ("unsupported", "N", "state", "-")
     assert gone.reason == "Reference offers no joint reaction of its own"
     assert len(rows) == len(STATE_UNITS)
     for field, verdict in (("unsupported", "unsupported"), ("failure", "failed")):
-        (row,) = judged(**{field: "because"}).rows
+        (row,) = judge_shifted_answers(**{field: "because"}).rows
         assert (row.quantity, row.verdict, row.reason) == ("all", verdict, "because")
         assert (row.integrator, row.level, row.value) == ("-", "state", None)
 
@@ -151,7 +151,7 @@ def test_vectors_count_by_their_length_and_matrices_by_their_worst_entry():
     momentum = right[0].angular_momentum + np.array([2.0, 3.0, 6.0])
     energy = right[0].kinetic_energy - 5.0
     changed = replace(right[0], mass_matrix=matrix, angular_momentum=momentum, kinetic_energy=energy)
-    rows = {row.quantity: row for row in judged(quantities=[changed, *right[1:]]).rows}
+    rows = {row.quantity: row for row in judge_shifted_answers(quantities=[changed, *right[1:]]).rows}
     assert rows["mass_matrix"].value == 1.0
     assert rows["angular_momentum"].value == pytest.approx(7, rel=1e-12)
     assert rows["kinetic_energy"].value == pytest.approx(5, rel=1e-12)

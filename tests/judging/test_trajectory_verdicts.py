@@ -20,53 +20,73 @@ from plumbline.truth.ground_truth import RUN_ROUNDING, MotionTruth
 from tests.helpers import pendulums
 
 TIMES = np.linspace(0, 2, 17)
-MODEL = pendulums.model("b")
-TRUE = pendulums.motion(MODEL, pendulums.state(MODEL, seed=2, rate=0.5), TIMES)
+MODEL = pendulums.make_model("b")
+TRUE_TRAJECTORY = pendulums.reference_trajectory(
+    MODEL, pendulums.state_from_seed(MODEL, seed=2, rate=0.5), TIMES
+)
 WHO = RowContext("s", "f", "mujoco", "MuJoCo", "4")
 METHOD = Integrator("Heun", "step", 2, (2, 3, 4))
 STEPS = tuple(2.0**-k for k in range(5, 11))
-ALONG = np.array([2.0, -1.0, 2.0]) / 3
+DIRECTION = np.array([2.0, -1.0, 2.0]) / 3
 
 
-def truth(horizon=2.0, **changes):
+def make_truth(horizon=2.0, **changes):
     """A truth that is compared with up to ``horizon``, whatever its uncertainty and growth."""
     one = np.ones(17)
     made = type("MadeTruth", (MotionTruth,), {"horizon": horizon})
-    held = made(TRUE, 1e-12 * one, 2e-12 * one, 1 + TIMES, 1e-6 * one, 2e-6 * one, length=0.4, method="made")
+    held = made(
+        TRUE_TRAJECTORY,
+        1e-12 * one,
+        2e-12 * one,
+        1 + TIMES,
+        1e-6 * one,
+        2e-6 * one,
+        length=0.4,
+        method="made",
+    )
     return replace(held, **changes)
 
 
-def run(error, attitude=None, speed=None, steps=100):
+def trajectory_with_error(error, attitude=None, speed=None, steps=100):
     """The truth, off by ``error`` t m along one direction, ``attitude`` t rad and ``speed`` t m/s."""
     attitude, speed = (error if x is None else x for x in (attitude, speed))
-    off = TIMES[:, None, None] * ALONG
+    off = TIMES[:, None, None] * DIRECTION
     half = attitude * TIMES / 2
-    turn = np.stack([np.cos(half), *(np.sin(half) * ALONG[:, None])], -1)[:, None]
-    p = quaternion_product(TRUE.p, turn)
-    return Trajectory(TIMES, TRUE.r + error * off, p, TRUE.v + speed * off, TRUE.pdot, steps)
+    turn = np.stack([np.cos(half), *(np.sin(half) * DIRECTION[:, None])], -1)[:, None]
+    p = quaternion_product(TRUE_TRAJECTORY.p, turn)
+    return Trajectory(
+        TIMES,
+        TRUE_TRAJECTORY.r + error * off,
+        p,
+        TRUE_TRAJECTORY.v + speed * off,
+        TRUE_TRAJECTORY.pdot,
+        steps,
+    )
 
 
 def refinement_study(errors=None, **more):
     """A study with error c h² and cost 1, 2, 3, … s; or with these errors."""
     errors = [0.01 * h**2 for h in STEPS] if errors is None else errors
     runs = [
-        RefinementRun(h, run(e, **more), None, i + 1.0)
+        RefinementRun(h, trajectory_with_error(e, **more), None, i + 1.0)
         for i, (h, e) in enumerate(zip(STEPS, errors, strict=True))
     ]
     return RefinementStudy(runs, None)
 
 
-def rows(study=None, method=METHOD, model=MODEL, **changes):
-    found = judge_trajectory(WHO, model, truth(**changes), method, study or refinement_study())
+def judged_rows(study=None, method=METHOD, model=MODEL, **changes):
+    found = judge_trajectory(WHO, model, make_truth(**changes), method, study or refinement_study())
     return {row.quantity: row for row in found.rows}
 
 
 def analysis(study=None, method=METHOD, model=MODEL, **changes):
-    return RefinementAnalysis(WHO, model, truth(**changes), method, (study or refinement_study()).runs, 2.0)
+    return RefinementAnalysis(
+        WHO, model, make_truth(**changes), method, (study or refinement_study()).runs, 2.0
+    )
 
 
 def test_a_sound_study_agrees_in_everything_and_states_what_it_measured():
-    found = rows()
+    found = judged_rows()
     assert list(found) == [
         "order", "position_limit", "position", "attitude_limit", "attitude",
         "energy_drift", "momentum_drift", "joint_gap", "gap_rate", "norm_drift",
@@ -107,19 +127,19 @@ def test_windows_halve_down_to_an_eighth_with_three_samples_at_least(until, numb
     assert analysis().window_lengths(0.3) == [3]
     assert analysis().window_lengths(0.1) == [3]
     dense = analysis()
-    dense.truth = truth(trajectory=replace(TRUE, t=np.linspace(0, 2, 65)))
+    dense.truth = make_truth(trajectory=replace(TRUE_TRAJECTORY, t=np.linspace(0, 2, 65)))
     assert dense.window_lengths(2.0) == [65, 33, 17, 9]
 
 
 def test_an_order_that_stays_away_disagrees_and_one_on_its_way_decides_nothing():
-    one = rows(refinement_study([0.01 * h for h in STEPS]), replace(METHOD, error_exponents=(1, 2, 3)))[
-        "order"
-    ]
+    one = judged_rows(
+        refinement_study([0.01 * h for h in STEPS]), replace(METHOD, error_exponents=(1, 2, 3))
+    )["order"]
     assert (one.verdict, one.order, one.value) == ("disagrees", pytest.approx(1), pytest.approx(1))
-    lost = rows(refinement_study([0.01, 0.003, 0.002, 0.0003, 0.0002, 0.00001]))["order"]
+    lost = judged_rows(refinement_study([0.01, 0.003, 0.002, 0.0003, 0.0002, 0.00001]))["order"]
     assert lost.verdict == "unresolved" and lost.reason.startswith("not in the asymptotic range: orders ")
     assert lost.compared_until == 2.0, "the longest window, where none shows an order"
-    floor = rows(refinement_study([1e-16, 0, 1e-16, 0, 1e-16, 0]))["order"]
+    floor = judged_rows(refinement_study([1e-16, 0, 1e-16, 0, 1e-16, 0]))["order"]
     assert (floor.verdict, floor.order, floor.value) == ("agrees", None, None)
     assert "not observable" in floor.reason and floor.compared_until == 2.0
 
@@ -136,74 +156,77 @@ def test_differences_within_four_times_the_rounding_have_no_order(factor, until)
 
 def test_order_is_of_positions_and_velocities_over_their_scales():
     """Positions without error and velocities of order 1: an order 1, not a rounding floor."""
-    made = [RefinementRun(h, run(0.0, 0.0, 0.01 * h), None, 0.0) for h in STEPS]
+    made = [RefinementRun(h, trajectory_with_error(0.0, 0.0, 0.01 * h), None, 0.0) for h in STEPS]
     held = analysis(RefinementStudy(made, None))
     assert held.observed.value == pytest.approx(1)
     sizes = held.truth.length, held.invariant_scales["gap_rate"]
-    expected = np.concatenate([TRUE.r / sizes[0], made[0].trajectory.v / sizes[1]], -1)
+    expected = np.concatenate([TRUE_TRAJECTORY.r / sizes[0], made[0].trajectory.v / sizes[1]], -1)
     np.testing.assert_allclose(held.scaled_states[0], expected, rtol=1e-13)
 
 
 def test_rounding_of_a_quaternion_is_twice_that_of_the_angle():
-    grown = rows(growth=np.full(17, 1e4))["attitude_limit"]
+    grown = judged_rows(growth=np.full(17, 1e4))["attitude_limit"]
     assert grown.tolerance == pytest.approx(2 * RUN_ROUNDING * 1e4, rel=1e-2)
 
 
 def test_a_limit_elsewhere_disagrees_only_where_the_study_shows_its_order():
     shifted = [1e-9 + 0.01 * h**2 for h in STEPS]
-    found = rows(refinement_study(shifted))
+    found = judged_rows(refinement_study(shifted))
     limit = found["position_limit"]
     assert limit.verdict == found["position"].verdict == found["attitude_limit"].verdict == "disagrees"
     assert limit.value == pytest.approx(2e-9, rel=1e-3) and limit.compared_until == 2.0
     assert f"{limit.value / limit.tolerance:.3g} times the uncertainties" in limit.reason
     assert limit.ratio == pytest.approx(limit.value / limit.tolerance)
     wild = [1e-9 + e for e in (0.01, 0.003, 0.002, 0.0003, 0.0002, 0.0002)]
-    lost = rows(refinement_study(wild))["position_limit"]
+    lost = judged_rows(refinement_study(wild))["position_limit"]
     assert lost.verdict == "unresolved"
-    tight = rows(refinement_study([1e-9] * 6))["position_limit"]  # at the floor at every step: trusted
+    tight = judged_rows(refinement_study([1e-9] * 6))["position_limit"]  # at the floor at every step: trusted
     assert tight.verdict == "disagrees"
 
 
 def test_a_shorter_window_may_tell_where_the_long_one_cannot():
     late = np.where(TIMES > 1, 1e-3, 1e-12)
-    found = rows(position_uncertainty=late)
+    found = judged_rows(position_uncertainty=late)
     limit = found["position_limit"]
     assert (limit.verdict, limit.compared_until) == ("agrees", 1.0)
     assert limit.extra["growth"] == 2.0 and "up to t = 1 s" in limit.reason
     assert found["position"].value == pytest.approx(0.01 * STEPS[-1] ** 2, rel=1e-6)
     assert found["position"].tolerance == pytest.approx(0.01 * STEPS[-1] ** 2 + limit.tolerance, rel=1e-6)
     assert found["attitude_limit"].compared_until == 2.0
-    both = rows(detectable_position=np.full(17, 1e-14))
+    both = judged_rows(detectable_position=np.full(17, 1e-14))
     blind = both["position_limit"]
     assert both["position"].verdict == "unresolved", "the finest run is no better than its limit"
     assert (blind.verdict, blind.compared_until) == ("unresolved", 2.0)
     assert "is above the 1e-14 m that a mistake of 0.0001 would make" in blind.reason
-    endless = rows(detectable_position=np.full(17, np.inf))["position_limit"]
+    endless = judged_rows(detectable_position=np.full(17, np.inf))["position_limit"]
     assert endless.verdict == "agrees" and endless.extra["visible"] == 1e308
-    short = rows(horizon=0.5)["position_limit"]
+    short = judged_rows(horizon=0.5)["position_limit"]
     assert short.compared_until == 0.5
 
 
 def test_the_border_is_the_tolerance_and_the_tolerance_what_is_visible():
-    tolerance = rows()["position_limit"].tolerance
+    tolerance = judged_rows()["position_limit"].tolerance
     for shift, verdict in ((0.95 * tolerance / 2, "agrees"), (1.05 * tolerance / 2, "disagrees")):
         assert (
-            rows(refinement_study([shift + 0.01 * h**2 for h in STEPS]))["position_limit"].verdict == verdict
+            judged_rows(refinement_study([shift + 0.01 * h**2 for h in STEPS]))["position_limit"].verdict
+            == verdict
         )
     for visible, horizon in ((1.01 * tolerance, 2.0), (0.99 * tolerance, 1.0)):  # rounding grows with time
-        assert rows(detectable_position=np.full(17, visible))["position_limit"].compared_until == horizon
+        assert (
+            judged_rows(detectable_position=np.full(17, visible))["position_limit"].compared_until == horizon
+        )
 
 
 def test_runs_that_did_not_stay_finite_are_points_of_the_study():
     some = refinement_study()
     some.runs[0] = replace(some.runs[0], trajectory=None, failure="blew up")
-    found = judge_trajectory(WHO, MODEL, truth(), METHOD, some)
+    found = judge_trajectory(WHO, MODEL, make_truth(), METHOD, some)
     assert {row.verdict for row in found.rows} == {"agrees"}
     table = dict(found.tables)["convergence"]
     assert table["steps"][:3] == [0, 0, 100] and np.isnan(table["error"][0])
     for index in range(5):
         some.runs[index] = replace(some.runs[index], trajectory=None)
-    alone = judge_trajectory(WHO, MODEL, truth(), METHOD, some)
+    alone = judge_trajectory(WHO, MODEL, make_truth(), METHOD, some)
     said = {row.quantity: row for row in alone.rows}
     for name in ("position_limit", "attitude_limit"):
         assert said[name].verdict == "unresolved" and "fewer than two" in said[name].reason
@@ -213,17 +236,17 @@ def test_runs_that_did_not_stay_finite_are_points_of_the_study():
     curves = dict(alone.tables)["curves"]
     assert np.all(np.isnan([curves["limit_error"], curves["tolerance"]]))
     some.runs[-1] = replace(some.runs[-1], trajectory=None, failure="NaN at 1 s")
-    (lost,) = judge_trajectory(WHO, MODEL, truth(), METHOD, some).rows
+    (lost,) = judge_trajectory(WHO, MODEL, make_truth(), METHOD, some).rows
     assert (lost.quantity, lost.verdict, lost.integrator) == ("all", "failed", "Heun")
     assert lost.reason == "at the finest resolution 0.000976562: NaN at 1 s"
-    (never,) = judge_trajectory(WHO, MODEL, truth(), METHOD, RefinementStudy([], "no drag here")).rows
+    (never,) = judge_trajectory(WHO, MODEL, make_truth(), METHOD, RefinementStudy([], "no drag here")).rows
     assert (never.quantity, never.verdict, never.reason) == ("all", "unsupported", "no drag here")
     assert (lost.level, never.level, never.integrator) == ("trajectory", "trajectory", "Heun")
 
 
 def test_a_method_with_a_tolerance_has_no_order_and_its_tightest_run_is_the_limit():
     method = Integrator("DOP853", "tolerance", 8)
-    found = rows(refinement_study([1e-6, 1e-8, 1e-10, 1e-11, 2e-12, 1e-12]), method)
+    found = judged_rows(refinement_study([1e-6, 1e-8, 1e-10, 1e-11, 2e-12, 1e-12]), method)
     assert "order" not in found
     limit = found["position_limit"]
     assert limit.verdict == "agrees" and "tightest of 6 tolerances" in limit.derivation
@@ -232,12 +255,14 @@ def test_a_method_with_a_tolerance_has_no_order_and_its_tightest_run_is_the_limi
     assert found["attitude_limit"].uncertainty == pytest.approx(2e-12 + 2e-12, rel=1e-2, abs=0)
     assert found["position"].reason.startswith("position at tolerance 0.000976562 is 2e-12 m")
     wild = (1e-7, 5e-8, 4.9e-8, 1e-9, 9e-10, 0)  # no order of any kind
-    off = rows(refinement_study([1e-6 + e for e in wild]), method)["position_limit"]
+    off = judged_rows(refinement_study([1e-6 + e for e in wild]), method)["position_limit"]
     assert off.verdict == "disagrees", "trusted without any order"
     floor = found["energy_drift"]
     each = ROUNDING_PER_STEP + STEPS[-1]
     assert floor.tolerance == pytest.approx(each * 100 * floor.extra["scale"], rel=1e-12)
-    stays = rows(refinement_study([0.5 + e for e in (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 0)]), method)["joint_gap"]
+    stays = judged_rows(refinement_study([0.5 + e for e in (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 0)]), method)[
+        "joint_gap"
+    ]
     assert stays.verdict == "disagrees", "trusted without any order"
 
 
@@ -251,9 +276,9 @@ def test_an_implicit_solver_walks_at_random():
 
 def test_an_alias_is_told_and_drag_parts_it():
     method = replace(METHOD, alias_of="Euler")
-    assert {row.alias_of for row in rows(method=method).values()} == {"Euler"}
+    assert {row.alias_of for row in judged_rows(method=method).values()} == {"Euler"}
     dragged = replace(MODEL, drag_moment=np.array([0.1]))
-    assert {row.alias_of for row in rows(method=method, model=dragged).values()} == {None}
+    assert {row.alias_of for row in judged_rows(method=method, model=dragged).values()} == {None}
 
 
 def test_attitudes_have_two_signs():
@@ -264,20 +289,20 @@ def test_attitudes_have_two_signs():
     for mine, theirs in zip(analysis(some).attitudes, right.attitudes, strict=True):
         assert np.array_equal(mine, theirs)
     assert np.array_equal(right.positions[1], refinement_study().runs[1].trajectory.r)
-    assert rows(some)["attitude_limit"].verdict == "agrees"
+    assert judged_rows(some)["attitude_limit"].verdict == "agrees"
 
 
 def test_the_sign_of_an_attitude_is_that_of_its_body_and_time():
     """Of two bodies, with signs at random; a component about zero decides nothing."""
-    model = pendulums.model("br")
-    p = pendulums.motion(model, pendulums.state(model, seed=3), TIMES).p
+    model = pendulums.make_model("br")
+    p = pendulums.reference_trajectory(model, pendulums.state_from_seed(model, seed=3), TIMES).p
     p[..., 3] = 1e-12
     other = p * [1, 1, 1, -1e6]
     signs = np.random.default_rng(1).choice([-1.0, 1.0], size=(17, 2, 1))
     still = np.zeros((17, 2, 3))
     runs = [Trajectory(TIMES, still, x, still, 0 * x, 1) for x in (signs * other, p)]
     made = [RefinementRun(h, run, None, 0.0) for h, run in zip(STEPS, runs, strict=False)]
-    held = RefinementAnalysis(WHO, model, truth(trajectory=runs[1]), METHOD, made, 2.0)
+    held = RefinementAnalysis(WHO, model, make_truth(trajectory=runs[1]), METHOD, made, 2.0)
     assert np.array_equal(held.attitudes[0], other) and np.array_equal(held.attitudes[1], p)
 
 
@@ -285,11 +310,11 @@ def test_the_sign_of_an_attitude_is_that_of_its_body_and_time():
 
 
 def test_scales_are_sizes_of_what_the_invariants_are_made_of():
-    model = pendulums.model("br")
-    state = pendulums.state(model, seed=3, rate=4.0)
-    true = pendulums.motion(model, state, TIMES)
+    model = pendulums.make_model("br")
+    state = pendulums.state_from_seed(model, seed=3, rate=4.0)
+    true = pendulums.reference_trajectory(model, state, TIMES)
     held = RefinementAnalysis(
-        WHO, model, truth(trajectory=true), METHOD, [RefinementRun(0.1, true, None, 0.0)], 2.0
+        WHO, model, make_truth(trajectory=true), METHOD, [RefinementRun(0.1, true, None, 0.0)], 2.0
     )
     scales, omega = held.invariant_scales, angular_velocity(true.p, true.pdot)
     g = np.linalg.norm(model.gravity)
@@ -310,15 +335,17 @@ def test_scales_are_sizes_of_what_the_invariants_are_made_of():
     assert scales["joint_gap"] == max(0.4, arm) and scales["norm_drift"] == 1.0
     assert scales["gap_rate"] == pytest.approx(max(speed, spin * 0.4), rel=1e-12)
     still = replace(
-        held, truth=truth(trajectory=replace(true, v=0 * true.v, pdot=0 * true.pdot))
+        held, truth=make_truth(trajectory=replace(true, v=0 * true.v, pdot=0 * true.pdot))
     ).invariant_scales
     assert still["energy_drift"] == pytest.approx(max(potential, swing), rel=1e-12)
-    over = np.linspace(1, -1, 17)[:, None, None] * TRUE.r[0]  # from one side of the pivot to the other
-    turned = replace(TRUE, r=over, v=0 * TRUE.v, pdot=0 * TRUE.pdot)
-    lifted = 2 * abs(MODEL.mass[0] * TRUE.r[0, 0] @ MODEL.gravity)
+    over = (
+        np.linspace(1, -1, 17)[:, None, None] * TRUE_TRAJECTORY.r[0]
+    )  # from one side of the pivot to the other
+    turned = replace(TRUE_TRAJECTORY, r=over, v=0 * TRUE_TRAJECTORY.v, pdot=0 * TRUE_TRAJECTORY.pdot)
+    lifted = 2 * abs(MODEL.mass[0] * TRUE_TRAJECTORY.r[0, 0] @ MODEL.gravity)
     assert analysis(trajectory=turned).invariant_scales["energy_drift"] == pytest.approx(lifted, rel=1e-12)
     long = replace(
-        held, truth=truth(trajectory=true, length=50.0)
+        held, truth=make_truth(trajectory=true, length=50.0)
     ).invariant_scales  # a fall is faster than this
     assert long["joint_gap"] == 50.0
     assert long["gap_rate"] == pytest.approx(
@@ -327,7 +354,7 @@ def test_scales_are_sizes_of_what_the_invariants_are_made_of():
 
 
 def test_a_drift_that_falls_with_the_step_agrees_and_one_that_does_not_disagrees():
-    found = rows()["joint_gap"]
+    found = judged_rows()["joint_gap"]
     whole = 0.02 * STEPS[-1] ** 2
     assert (found.verdict, found.level, found.unit, found.compared_until) == (
         "agrees",
@@ -339,26 +366,26 @@ def test_a_drift_that_falls_with_the_step_agrees_and_one_that_does_not_disagrees
     floor = ROUNDING_PER_STEP * 100 * found.extra["scale"]
     assert found.tolerance == pytest.approx(found.value + floor, rel=1e-3)
     assert found.extra["limit"] < 1e-14 and "at the finest step" in found.reason
-    stays = rows(refinement_study([1e-6 + 0.01 * h**2 for h in STEPS]))["joint_gap"]
+    stays = judged_rows(refinement_study([1e-6 + 0.01 * h**2 for h in STEPS]))["joint_gap"]
     assert stays.verdict == "disagrees" and "joint gap does not vanish with the step" in stays.reason
     assert "from the finest step to step zero" in stays.derivation
     assert stays.extra["limit"] == pytest.approx(2e-6, rel=0.1)
     assert stays.ratio == pytest.approx(stays.extra["limit"] / stays.tolerance, rel=1e-9)
-    wild = rows(refinement_study([0.1, 0.03, 0.02, 0.003, 0.002, 0.001]))["joint_gap"]
+    wild = judged_rows(refinement_study([0.1, 0.03, 0.02, 0.003, 0.002, 0.001]))["joint_gap"]
     assert wild.verdict == "unresolved" and wild.reason.endswith("does not decide")
-    untold = rows(refinement_study([1e-3 + e for e in (0.0, 1e-5, -1e-5, 2e-5, 1e-5, 0)]))["joint_gap"]
+    untold = judged_rows(refinement_study([1e-3 + e for e in (0.0, 1e-5, -1e-5, 2e-5, 1e-5, 0)]))["joint_gap"]
     assert untold.ratio > 1 and untold.verdict == "unresolved", "no order, no trust"
     alone = refinement_study()
     for index in range(5):
         alone.runs[index] = replace(alone.runs[index], trajectory=None)
-    lost = rows(alone)["joint_gap"]
+    lost = judged_rows(alone)["joint_gap"]
     assert lost.verdict == "unresolved" and "fewer than two" in lost.reason
     assert lost.tolerance == pytest.approx(floor, abs=0) and lost.derivation.startswith("100 steps, ")
 
 
 def test_an_unresolved_drift_is_allowed_what_the_study_leaves_open():
     errors = [1e-3 + e for e in (0.0, 1e-5, -1e-5, 2e-5, 1e-5, 0)]
-    found = rows(refinement_study(errors, attitude=0.0, speed=0.0))["joint_gap"]
+    found = judged_rows(refinement_study(errors, attitude=0.0, speed=0.0))["joint_gap"]
     limit = romberg([np.full((1, 1, 1), 2 * e) for e in errors], METHOD.error_exponents)  # at 2 s
     own = abs(2e-3 - limit.y[0, 0, 0])
     assert found.verdict == "unresolved" and found.value == pytest.approx(2e-3)
@@ -369,27 +396,27 @@ def test_an_unresolved_drift_is_allowed_what_the_study_leaves_open():
 @pytest.mark.parametrize(("steps", "counted"), [(10, 64), (64, 64), (1000, 1000)])
 def test_a_drift_of_rounding_agrees_at_once(steps, counted):
     """So much in every step, of at least 64 steps."""
-    base = rows(refinement_study([0.0] * 6, steps=steps))["norm_drift"]
+    base = judged_rows(refinement_study([0.0] * 6, steps=steps))["norm_drift"]
     assert base.verdict == "agrees" and base.reason.endswith("rounding")
     assert base.tolerance == pytest.approx(ROUNDING_PER_STEP * counted, rel=1e-12, abs=0)
     assert base.ratio == pytest.approx(base.value / base.tolerance)
     assert base.derivation.startswith(f"{steps} steps, ") and base.compared_until == 2.0
     held = refinement_study([0.0] * 6, steps=steps)
     for factor, said in ((0.9, True), (1.1, False)):
-        grown = TRUE.p * (1 + factor * base.tolerance * TIMES / 2)[:, None, None]
+        grown = TRUE_TRAJECTORY.p * (1 + factor * base.tolerance * TIMES / 2)[:, None, None]
         held.runs[-1] = replace(held.runs[-1], trajectory=replace(held.runs[-1].trajectory, p=grown))
-        assert rows(held)["norm_drift"].reason.endswith("rounding") is said
+        assert judged_rows(held)["norm_drift"].reason.endswith("rounding") is said
 
 
 def test_what_the_quadrature_of_the_work_leaves_open_is_allowed():
     """Drag: energy by the samples' spline; its uncertainty is part of the tolerance, and only there."""
     model = replace(MODEL, drag_moment=np.array([1e-5]))
-    true = pendulums.motion(model, pendulums.state(model, seed=2, rate=0.5), TIMES)
+    true = pendulums.reference_trajectory(model, pendulums.state_from_seed(model, seed=2, rate=0.5), TIMES)
     runs = [
         RefinementRun(h, replace(true, v=true.v * (1 + h**2 * TIMES[:, None, None])), None, 0.0)
         for h in STEPS
     ]
-    found = rows(RefinementStudy(runs, None), model=model, trajectory=true)
+    found = judged_rows(RefinementStudy(runs, None), model=model, trajectory=true)
     uncertain = compute_invariants(model, runs[-1].trajectory).work_uncertainty
     assert uncertain > 1e-8
     row = found["energy_drift"]
@@ -403,7 +430,7 @@ def test_what_the_quadrature_of_the_work_leaves_open_is_allowed():
 
 
 def test_the_tables_hold_every_run_every_sample_and_every_pose():
-    found = dict(judge_trajectory(WHO, MODEL, truth(horizon=1.0), METHOD, refinement_study()).tables)
+    found = dict(judge_trajectory(WHO, MODEL, make_truth(horizon=1.0), METHOD, refinement_study()).tables)
     table = found["convergence"]
     assert (table["scenario"], table["engine"], table["integrator"]) == ("s", "mujoco", "Heun")
     assert table["quantity"] == ["position", "attitude"] * 6
@@ -424,7 +451,11 @@ def test_the_tables_hold_every_run_every_sample_and_every_pose():
     np.testing.assert_allclose(curves["norm_drift"], np.abs(held.norm_drift[:, 0, 0]))
     bare = dict(
         judge_trajectory(
-            WHO, replace(MODEL, gravity=0 * MODEL.gravity), truth(horizon=1.0), METHOD, refinement_study()
+            WHO,
+            replace(MODEL, gravity=0 * MODEL.gravity),
+            make_truth(horizon=1.0),
+            METHOD,
+            refinement_study(),
         ).tables
     )
     assert np.all(np.isnan(bare["curves"]["momentum_drift"]))

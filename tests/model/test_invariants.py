@@ -26,9 +26,9 @@ from tests.helpers.random_chains import random_chain
 TIMES = np.linspace(0.0, 1.0, 41)
 
 
-def motion(rods: list[bool], times: Array = TIMES, **options: bool) -> tuple[Model, Trajectory]:
+def make_motion(rods: list[bool], times: Array = TIMES, **options: bool) -> tuple[Model, Trajectory]:
     model, state = random_chain(np.random.default_rng(70), rods, **options)
-    return model, pendulums.motion(model, state, times)
+    return model, pendulums.reference_trajectory(model, state, times)
 
 
 def test_position_error_is_the_largest_distance_of_a_body() -> None:
@@ -64,15 +64,17 @@ def test_attitude_error_is_the_largest_rotation_angle(angle: float) -> None:
 def test_energies_and_momentum_are_sums_over_bodies(rods: list[bool]) -> None:
     model, state = random_chain(np.random.default_rng(72), rods)
     kinetic = kinetic_energy(model, state.v, state.omega)
-    assert kinetic == pytest.approx(newton_euler.kinetic(model, state), rel=1e-14)
-    assert potential_energy(model, state.r) == pytest.approx(newton_euler.potential(model, state), rel=1e-13)
+    assert kinetic == pytest.approx(newton_euler.kinetic_energy(model, state), rel=1e-14)
+    assert potential_energy(model, state.r) == pytest.approx(
+        newton_euler.potential_energy(model, state), rel=1e-13
+    )
     momentum = angular_momentum(model, state.r, state.p, state.v, state.omega)
     np.testing.assert_allclose(momentum, newton_euler.angular_momentum(model, state), rtol=0, atol=1e-14)
     two = [np.stack([x, 2 * x]) for x in (state.v, state.omega)]
     assert kinetic_energy(model, *two)[1] == pytest.approx(4 * kinetic, rel=1e-14)
 
 
-def run_with(model: Model, power: Array, times: Array) -> Trajectory:
+def rotating_trajectory(model: Model, power: Array, times: Array) -> Trajectory:
     """A run in which body 1 turns about x, so that a moment of 1 N m about it does this power."""
     still = np.zeros((len(times), model.n, 3))
     omega = still.copy()
@@ -88,14 +90,16 @@ def test_work_of_a_moment_is_the_integral_of_its_power(degree: int) -> None:
     moment = np.zeros((2, 3))
     moment[0, 0] = 1.0
     times = np.linspace(0, 2, 25)
-    run = run_with(model, times**degree, times)
+    run = rotating_trajectory(model, times**degree, times)
     omega = 2 * run.pdot[..., 1:]
     done, uncertainty = work_of_loads(replace(model, moment=moment), run, omega)
     np.testing.assert_allclose(done, times ** (degree + 1) / (degree + 1), rtol=0, atol=1e-12)
     assert (uncertainty < 1e-12) == (degree <= 3)
     drag = replace(model, drag_moment=np.array([0.5, 0.0]))
     lost, _ = work_of_loads(
-        drag, run_with(model, times**2, times), 2 * run_with(model, times**2, times).pdot[..., 1:]
+        drag,
+        rotating_trajectory(model, times**2, times),
+        2 * rotating_trajectory(model, times**2, times).pdot[..., 1:],
     )
     np.testing.assert_allclose(lost, -0.5 * times**5 / 5, rtol=0, atol=1e-12)
 
@@ -121,7 +125,7 @@ def test_the_quadrature_knows_its_error(count: int, sharp: float) -> None:
     """Of a power that few samples hardly resolve the work is uncertain by at least its error."""
     model, _ = random_chain(np.random.default_rng(75), [False])
     times = np.linspace(0, 2, count)
-    run = run_with(model, np.cos(9 * times), times)
+    run = rotating_trajectory(model, np.cos(9 * times), times)
     done, uncertainty = work_of_loads(
         replace(model, moment=np.array([[1.0, 0, 0]])), run, 2 * run.pdot[..., 1:]
     )
@@ -132,7 +136,7 @@ def test_the_quadrature_knows_its_error(count: int, sharp: float) -> None:
 def test_too_few_samples_do_no_quadrature() -> None:
     model, _ = random_chain(np.random.default_rng(76), [False])
     times = np.linspace(0, 1, 12)
-    run = run_with(model, 1 + times, times)
+    run = rotating_trajectory(model, 1 + times, times)
     done, uncertainty = work_of_loads(
         replace(model, moment=np.array([[1.0, 0, 0]])), run, 2 * run.pdot[..., 1:]
     )
@@ -142,7 +146,7 @@ def test_too_few_samples_do_no_quadrature() -> None:
 @pytest.mark.parametrize("options", [{}, {"loads": True}, {"drag": True}], ids=str)
 @pytest.mark.parametrize("rods", [[False, False], [True, False], [True]], ids=str)
 def test_true_motion_has_no_drift(rods: list[bool], options: dict[str, bool]) -> None:
-    model, run = motion(rods, np.linspace(0, 1, 161), **options)
+    model, run = make_motion(rods, np.linspace(0, 1, 161), **options)
     found = compute_invariants(model, run)
     size = float(np.max(kinetic_energy(model, run.v, 2 * run.pdot[..., 1:]))) + 9.81
     assert np.max(np.abs(found.energy_drift)) <= found.work_uncertainty + 1e-11 * size
@@ -159,7 +163,7 @@ def test_true_motion_has_no_drift(rods: list[bool], options: dict[str, bool]) ->
 
 
 def test_a_gap_is_the_vector_of_a_ball_and_the_stretch_of_a_rod() -> None:
-    model, run = motion([False, True])
+    model, run = make_motion([False, True])
     away, faster = np.array([1e-3, -2e-3, 3e-3]), np.array([4e-3, 1e-3, -2e-3])
     moved = compute_invariants(model, replace(run, r=run.r + away, v=run.v + faster))
     np.testing.assert_allclose(moved.joint_gap[:, 0], np.tile(away, (41, 1)), atol=1e-14)
@@ -170,7 +174,7 @@ def test_a_gap_is_the_vector_of_a_ball_and_the_stretch_of_a_rod() -> None:
     v[:, 1, 1] += 1e-3
     down = replace(run, r=r, v=v)
     stretched = compute_invariants(model, down)
-    d = lift_of_joint(model, run)
+    d = joint_vector_of_second_body(model, run)
     d[:, 0] += 1e-3
     long = np.linalg.norm(d, axis=-1)
     np.testing.assert_allclose(stretched.joint_gap[:, 1, 0], long - model.length[1], atol=1e-14)
@@ -185,12 +189,12 @@ def test_a_gap_is_the_vector_of_a_ball_and_the_stretch_of_a_rod() -> None:
 def test_the_ends_of_a_rod_in_one_place_are_its_length_off() -> None:
     model, _ = random_chain(np.random.default_rng(78), [True])
     model = replace(model, proximal=np.zeros((1, 3)))
-    found = compute_invariants(model, run_with(model, TIMES, TIMES))
+    found = compute_invariants(model, rotating_trajectory(model, TIMES, TIMES))
     np.testing.assert_array_equal(found.joint_gap[:, 0, 0], -model.length[0])
     assert not np.any(found.gap_rate), "a stretch has no direction there"
 
 
-def lift_of_joint(model: Model, run: Trajectory) -> Array:
+def joint_vector_of_second_body(model: Model, run: Trajectory) -> Array:
     """ℓ u (T, 3) of the second joint, from where it hangs to the second body's proximal point."""
     found = []
     for r, p in zip(run.r, run.p, strict=True):
@@ -203,7 +207,7 @@ def lift_of_joint(model: Model, run: Trajectory) -> Array:
 @pytest.mark.parametrize("rods", [[False], [True, False, True]], ids=str)
 def test_joint_rates_are_the_slopes_of_the_joint_vectors(rods: list[bool]) -> None:
     """Off the manifold, where they are not zero: ṙ shifted by a constant moves r by it times t."""
-    model, run = motion(rods)
+    model, run = make_motion(rods)
     rng, h = np.random.default_rng(77), 1e-6
     drift = rng.normal(size=(len(rods), 3))
     omega = 2 * quaternion_product(run.p * [1, -1, -1, -1], run.pdot)[..., 1:]
@@ -215,7 +219,7 @@ def test_joint_rates_are_the_slopes_of_the_joint_vectors(rods: list[bool]) -> No
 
 def test_what_is_not_conserved_is_not_judged() -> None:
     """Momentum about gravity: not with loads, drag or without gravity; energy by a shift, norm as it is."""
-    model, run = motion([False])
+    model, run = make_motion([False])
     assert compute_invariants(replace(model, gravity=np.zeros(3)), run).momentum_drift is None
     light, usual = (compute_invariants(replace(model, gravity=x * model.gravity), run) for x in (1e-2, 1))
     np.testing.assert_allclose(light.momentum_drift, usual.momentum_drift, rtol=0, atol=1e-15)

@@ -11,7 +11,7 @@ from plumbline.processes.workers import Outcome, ResultCache, Task, WorkerPool
 from plumbline.scenario import loader
 
 
-def burn(seconds):
+def use_cpu(seconds):
     end = time.process_time() + seconds
     while time.process_time() < end:
         pass
@@ -20,9 +20,9 @@ def burn(seconds):
 def test_what_is_measured_inside_is_not_process_too():
     split = CpuTimes()
     with split.measure_overhead():
-        burn(0.05)
+        use_cpu(0.05)
         with split.measure("judging"):
-            burn(0.1)
+            use_cpu(0.1)
     assert 0.09 < split.seconds["judging"] < 0.2
     assert 0.04 < split.seconds["process"] < 0.1
 
@@ -44,7 +44,7 @@ def test_calls_are_counted_by_whom_they_asked():
 def test_a_memory_is_the_same_and_measured():
     class Slow(ResultCache):
         def get(self, task):
-            burn(0.05)
+            use_cpu(0.05)
             return Outcome(("a",), 3)
 
     split = CpuTimes()
@@ -64,7 +64,7 @@ def test_a_run_accounts_for_its_time():
 
 
 def test_a_worker_reports_all_its_time():
-    task = Task("a", burn, (0.2,))
+    task = Task("a", use_cpu, (0.2,))
     with WorkerPool(1) as workers:
         outcomes = [outcome for _ in range(2) for outcome in workers.run([task])]
     assert all(0.2 <= outcome.cpu_time < 0.3 for outcome in outcomes)

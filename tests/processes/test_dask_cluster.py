@@ -21,7 +21,7 @@ from plumbline.scenario import loader
 
 ROOT = Path(__file__).resolve().parents[2]
 DASK = Path(sys.executable).with_name("dask")
-LOCAL = ("--host", "127.0.0.1")
+LOCALHOST_ARGUMENTS = ("--host", "127.0.0.1")
 
 
 @contextlib.contextmanager
@@ -44,12 +44,19 @@ def cluster(folder, workers):
 
     try:
         start(
-            "scheduler", *LOCAL, "--port", "0", "--no-dashboard", "--dashboard-address", "127.0.0.1:0", *where
+            "scheduler",
+            *LOCALHOST_ARGUMENTS,
+            "--port",
+            "0",
+            "--no-dashboard",
+            "--dashboard-address",
+            "127.0.0.1:0",
+            *where,
         )
         machines = [
             start(
                 "worker",
-                *LOCAL,
+                *LOCALHOST_ARGUMENTS,
                 "--nthreads",
                 "1",
                 "--no-dashboard",
@@ -78,20 +85,20 @@ def cluster(folder, workers):
             process.wait()
 
 
-def said(plan, progress=lambda *_: None):
+def run_rows(plan, progress=lambda *_: None):
     return [replace(row, cpu_time=0.0) for row in run_plan(plan, progress).rows]
 
 
-def plan(**more):
+def make_plan(**more):
     chosen = loader.load_scenarios(["rest", "conical", "double-tumbling-balls"])
     return Plan(chosen, ["mujoco", "pinocchio"], "state", random_state_count=5, **more)
 
 
 @pytest.mark.timeout(300)
 def test_a_cluster_says_the_same_and_outlives_a_machine(tmp_path):
-    expected = said(plan())
+    expected = run_rows(make_plan())
     with cluster(tmp_path, 2) as (address, machines):
-        assert said(plan(scheduler=address)) == expected
+        assert run_rows(make_plan(scheduler=address)) == expected
 
         def lose_one(done, *_):
             if done == 2:
@@ -100,12 +107,12 @@ def test_a_cluster_says_the_same_and_outlives_a_machine(tmp_path):
                     with contextlib.suppress(psutil.NoSuchProcess):
                         os.kill(process.pid, signal.SIGKILL)
 
-        assert said(plan(scheduler=address), lose_one) == expected
+        assert run_rows(make_plan(scheduler=address), lose_one) == expected
         assert machines[0].poll() is not None, "no machine was lost: the test tests nothing"
-        losses_cost_one_task(address)
+        check_losses_cost_one_task(address)
 
 
-def losses_cost_one_task(address):
+def check_losses_cost_one_task(address):
     """A crash and a hang inside a dask worker lose their own task, and no dask worker."""
     import ctypes
     import operator

@@ -18,7 +18,7 @@ from tests.helpers import faulty_engines as faulty
 LIMITS = Limits(seconds=10, gigabytes=4)
 
 
-def night(out, engines):
+def run_nightly(out, engines):
     (s,) = loader.load_scenarios(["planar-small"])
     return nightly.run_nightly(
         out, [replace(s, duration=0.5)], engines, random_count=0, seed=1, jobs=2, limits=LIMITS,
@@ -27,42 +27,44 @@ def night(out, engines):
     )  # fmt: skip
 
 
-def said(rows, engine):
+def comparable_rows(rows, engine):
     """What the rows of an engine say, without who says it and what it cost."""
     return [
         replace(row, engine="", cpu_time=0.0)
         for row in rows
-        if row.engine == engine and row.integrator != faulty.CELL
+        if row.engine == engine and row.integrator != faulty.FAULTY_INTEGRATOR
     ]
 
 
 def test_every_fault_at_once_loses_exactly_its_own_cell(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(registry, "ENGINES", dict(registry.ENGINES))
-    monkeypatch.setattr(workers, "initialize_worker", faulty.prepare)
+    monkeypatch.setattr(workers, "initialize_worker", faulty.prepare_worker)
     monkeypatch.chdir(tmp_path)
-    faulty.register()
-    names = [fault.__name__ for fault in faulty.FAULTS]
-    result, place = night(tmp_path / "out", ["mujoco", *names])
+    faulty.register_faulty_engines()
+    names = [fault.__name__ for fault in faulty.ERROR_BY_FAULT]
+    result, place = run_nightly(tmp_path / "out", ["mujoco", *names])
     lost = {(row.engine, row.integrator): row.reason for row in result.rows if row.verdict == "failed"}
-    expected = {(f.__name__, faulty.CELL): words for f, words in faulty.FAULTS.items() if words}
+    expected = {
+        (f.__name__, faulty.FAULTY_INTEGRATOR): words for f, words in faulty.ERROR_BY_FAULT.items() if words
+    }
     assert lost.keys() == expected.keys(), {k: lost[k] for k in lost.keys() - expected.keys()}
     for cell, words in expected.items():
         assert words in lost[cell], cell
-    sound = said(result.rows, "mujoco")
+    sound = comparable_rows(result.rows, "mujoco")
     euler = [row for row in sound if row.integrator == "Euler"]
     for name in names:
-        assert said(result.rows, name) == euler, "a fault changed a cell beside it"
-    assert said(result.rows, "litter") and not [r for r in result.rows if r.verdict == "disagrees"]
+        assert comparable_rows(result.rows, name) == euler, "a fault changed a cell beside it"
+    assert comparable_rows(result.rows, "litter") and not [r for r in result.rows if r.verdict == "disagrees"]
     # the night is whole, tells of it, and nothing of it is left elsewhere
     stored = json.loads((place / "results.json").read_text())
     assert stored["run"]["exit_code"] == 3 and len(stored["rows"]) == len(result.rows)
     assert [n["id"] for n in History(tmp_path / "out").overview()] == [place.name]
     assert [p.name for p in tmp_path.iterdir()] == ["out"], "an engine's file is in the working folder"
     assert "noise" not in "".join(capfd.readouterr())
-    assert not [p for p in psutil.Process(os.getpid()).children(recursive=True) if works_here(p)]
+    assert not [p for p in psutil.Process(os.getpid()).children(recursive=True) if is_plumbline_worker(p)]
 
 
-def works_here(process):
+def is_plumbline_worker(process):
     """Whether a process is a worker in a scratch folder."""
     try:
         return Path(process.cwd()).parent.name.startswith("plumbline-")

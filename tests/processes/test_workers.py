@@ -33,20 +33,20 @@ def hang() -> None:
     time.sleep(600)
 
 
-def hang_with_the_lock() -> None:
+def hang_holding_gil() -> None:
     """Native code that never returns and never lets go of the interpreter lock."""
     ctypes.PyDLL(None).sleep(600)
 
 
-def devour() -> int:
+def exhaust_memory() -> int:
     return len(bytearray(64 * 2**30))
 
 
-def leave() -> None:
+def exit_process() -> None:
     os._exit(7)
 
 
-def misbehave() -> str:
+def write_file_and_flood_output() -> str:
     """Write a file into the working folder and flood both outputs, as engines do."""
     Path("dropped.txt").write_text("x")
     os.write(1, b"noise\n" * 10_000)
@@ -54,17 +54,17 @@ def misbehave() -> str:
     return os.getcwd()
 
 
-def pid() -> int:
+def process_id() -> int:
     return os.getpid()
 
 
 LOSSES = [
     (segfault, "crashed: the worker died of SIGSEGV"),
     (abort, "crashed: the worker died of SIGABRT"),
-    (leave, "crashed: the worker exited with code 7"),
-    (devour, "out of memory"),
+    (exit_process, "crashed: the worker exited with code 7"),
+    (exhaust_memory, "out of memory"),
     (hang, "timeout: no answer within"),
-    (hang_with_the_lock, "timeout: no answer within"),
+    (hang_holding_gil, "timeout: no answer within"),
 ]
 
 
@@ -85,11 +85,11 @@ def test_a_task_that_an_outcome_submits_runs_while_others_do():
     came = []
     with WorkerPool(2) as workers:
         scheduler = Scheduler(workers)
-        for outcome in scheduler.run([Task("long", nap, (4.0,)), Task("short", nap, (0.0,))]):
+        for outcome in scheduler.run([Task("long", sleep_for, (4.0,)), Task("short", sleep_for, (0.0,))]):
             assert outcome.failure is None
             came.append(outcome.key)
             if outcome.key == "short":
-                scheduler.submit(Task("follows", nap, (0.0,)))
+                scheduler.submit(Task("follows", sleep_for, (0.0,)))
     assert came == ["short", "follows", "long"]
 
 
@@ -143,14 +143,14 @@ def test_the_scheduler_takes_submitted_tasks_first_and_cached_answers_at_once():
 def test_files_and_output_of_an_engine_go_nowhere(capfd, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with WorkerPool(1) as workers:
-        (outcome,) = workers.run([Task("x", misbehave)])
+        (outcome,) = workers.run([Task("x", write_file_and_flood_output)])
     assert outcome.value != str(tmp_path)
     assert not Path(outcome.value).exists(), "the scratch folder is removed"
     assert list(tmp_path.iterdir()) == []
     assert "noise" not in "".join(capfd.readouterr())
 
 
-def nap(seconds: float) -> float:
+def sleep_for(seconds: float) -> float:
     time.sleep(seconds)
     return seconds
 
@@ -160,12 +160,12 @@ def test_a_clock_that_is_set_neither_kills_nor_spares(monkeypatch):
     real, off = time.time, [0.0]
     monkeypatch.setattr(time, "time", lambda: real() + off[0])
     with WorkerPool(3) as workers:
-        list(workers.run([Task(k, nap, (1.0,)) for k in range(6)]))  # now all three are there
+        list(workers.run([Task(k, sleep_for, (1.0,)) for k in range(6)]))  # now all three are there
         for step in (3600.0, -3600.0):
             tasks = [
-                Task("nap", nap, (3.0,), Limits(seconds=60)),
+                Task("nap", sleep_for, (3.0,), Limits(seconds=60)),
                 Task("hang", hang, (), Limits(seconds=4)),
-                Task("go", nap, (1.0,)),
+                Task("go", sleep_for, (1.0,)),
             ]
             found = {}
             for outcome in workers.run(tasks):

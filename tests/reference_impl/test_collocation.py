@@ -17,19 +17,19 @@ from reference_impl import integrate as raw
 from reference_impl.chain import Array
 from reference_impl.collocation import BatchIntegrationResult, gauss_tables, integrate_collocation
 from reference_impl.structured import StructuredSystem, component_first
-from tests.helpers.random_chains import random_chain, rescaled
+from tests.helpers.random_chains import in_other_units, random_chain
 
 TIMES = np.linspace(0.0, 1.0, 11)
 
 
-def start(state: State) -> tuple[Array, Array, Array, Array]:
+def initial_values(state: State) -> tuple[Array, Array, Array, Array]:
     return state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
 
 
 def run(
     model: Model, state: State, rtol: float, times: Array = TIMES, **options: object
 ) -> BatchIntegrationResult:
-    return integrate_collocation([model], *start(state), times, rtol, **options)  # type: ignore[arg-type]
+    return integrate_collocation([model], *initial_values(state), times, rtol, **options)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("S", [4, 12, 20])
@@ -53,7 +53,7 @@ def test_tables_integrate_polynomials_exactly(S: int) -> None:
 def test_two_methods_share_their_digits(rods: list[bool]) -> None:
     """Direct form with DOP853, structured form with collocation: nothing in common but the notes."""
     model, state = random_chain(np.random.default_rng(31), rods, loads=True, drag=True)
-    dop = raw.integrate_dop853(model, *start(state), TIMES, 1e-13)
+    dop = raw.integrate_dop853(model, *initial_values(state), TIMES, 1e-13)
     ours = run(model, state, 1e-13)
     assert np.max(np.abs(ours.r - dop.r)) < (2e-11 if any(rods) else 1e-12)
     assert np.max(np.abs(ours.p - dop.p)) < (2e-11 if any(rods) else 1e-12)
@@ -100,7 +100,9 @@ def test_order_is_twice_the_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_batch_is_every_chain_alone() -> None:
     rng = np.random.default_rng(35)
     drawn = [random_chain(rng, rods) for rods in ([False], [True, False], [False, False, False], [True])]
-    packed = [np.concatenate(parts) for parts in zip(*(start(state) for _, state in drawn), strict=True)]
+    packed = [
+        np.concatenate(parts) for parts in zip(*(initial_values(state) for _, state in drawn), strict=True)
+    ]
     batch = integrate_collocation([model for model, _ in drawn], *packed, TIMES, 1e-12)
     at = 0
     for model, state in drawn:
@@ -157,7 +159,11 @@ def test_other_units_take_the_same_steps(rods: list[bool], dense: bool, nodes: i
         (0.25, 4.0, 0.5),
     ):
         there = run(
-            *rescaled(model, state, length, mass, second), 1e-6, times * second, dense=dense, nodes=nodes
+            *in_other_units(model, state, length, mass, second),
+            1e-6,
+            times * second,
+            dense=dense,
+            nodes=nodes,
         )
         assert (there.steps, there.evaluations) == (here.steps, here.evaluations)
         assert np.array_equal(there.r, here.r * length)
@@ -165,22 +171,22 @@ def test_other_units_take_the_same_steps(rods: list[bool], dense: bool, nodes: i
         assert np.array_equal(there.v, here.v * length / second)
 
 
-class Watched:
+class StepRecorder:
     """A run whose steps, and questions to the right-hand side, are written down."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.tried: list[tuple[float, int, bool, bool]] = []  # h, sweeps, made, limited by the sweeps
-        self.asked = 0
+        self.steps: list[tuple[float, int, bool, bool]] = []  # h, sweeps, made, limited by the sweeps
+        self.evaluations = 0
         step, acceleration = collocation._Stepper.try_step, StructuredSystem.acceleration
 
         def noted(stepper: collocation._Stepper, h: float) -> tuple[bool, bool]:
             before = stepper.sweeps
             made = step(stepper, h)
-            self.tried.append((h, stepper.sweeps - before, *made))
+            self.steps.append((h, stepper.sweeps - before, *made))
             return made
 
         def counted(forest: StructuredSystem, *args: object) -> Array:
-            self.asked += 1
+            self.evaluations += 1
             return acceleration(forest, *args)  # type: ignore[arg-type]
 
         monkeypatch.setattr(collocation._Stepper, "try_step", noted)
@@ -217,13 +223,13 @@ def test_a_step_begins_with_the_last_one_s_polynomial_up_to_its_smallest_term(
 @pytest.mark.parametrize("rods, rtol", [([False, False], 1e-3), ([False, False], 1e-12), ([True], 1e-8)])
 def test_a_run_says_what_it_did(rods: list[bool], rtol: float, monkeypatch: pytest.MonkeyPatch) -> None:
     model, state = random_chain(np.random.default_rng(40), rods, rate=4.0)
-    watched = Watched(monkeypatch)
+    watched = StepRecorder(monkeypatch)
     done = run(model, state, rtol, np.array([0.0, 0.7, 2.1]))
-    made = np.array([h for h, _, ok, _ in watched.tried if ok])
-    assert (done.steps, done.rejected_steps) == (len(made), len(watched.tried) - len(made))
-    assert done.stiff_steps == sum(ok and slow for _, _, ok, slow in watched.tried)
-    assert done.evaluations == sum(sweeps for _, sweeps, _, _ in watched.tried)
-    assert watched.asked == done.evaluations + 2  # for the sizes, and the first guess
+    made = np.array([h for h, _, ok, _ in watched.steps if ok])
+    assert (done.steps, done.rejected_steps) == (len(made), len(watched.steps) - len(made))
+    assert done.stiff_steps == sum(ok and slow for _, _, ok, slow in watched.steps)
+    assert done.evaluations == sum(sweeps for _, sweeps, _, _ in watched.steps)
+    assert watched.evaluations == done.evaluations + 2  # for the sizes, and the first guess
     assert abs(np.sum(made) - 2.1) < 1e-13
     assert np.all(made[1:] <= made[:-1] * (1.6 + 1e-12)), "a step grows to 1.6 times the last at most"
     assert np.min(made[:-1]) > 0.01 * np.max(made), "no crumbs"
@@ -232,9 +238,9 @@ def test_a_run_says_what_it_did(rods: list[bool], rtol: float, monkeypatch: pyte
 def test_steps_that_take_many_sweeps_are_followed_by_shorter_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     """Strong drag: the sweeps decide, so the step is cut before it would have to be repeated."""
     model, state = random_chain(np.random.default_rng(36), [False, False])
-    watched = Watched(monkeypatch)
+    watched = StepRecorder(monkeypatch)
     done = run(replace(model, drag_force=model.mass * 3e3), state, 1e-6, TIMES[:2])
-    pairs = zip(watched.tried[:-2], watched.tried[1:-1], strict=True)
+    pairs = zip(watched.steps[:-2], watched.steps[1:-1], strict=True)
     many = [(h, sweeps, after) for (h, sweeps, made, _), (after, *_) in pairs
             if made and sweeps > collocation.USUAL_SWEEPS]  # fmt: skip
     assert len(many) >= 10
@@ -246,7 +252,7 @@ def test_steps_that_take_many_sweeps_are_followed_by_shorter_ones(monkeypatch: p
             after,
         )
     assert done.rejected_steps < 0.1 * done.steps
-    assert max(sweeps for _, sweeps, made, _ in watched.tried if made) <= collocation.MAX_SWEEPS
+    assert max(sweeps for _, sweeps, made, _ in watched.steps if made) <= collocation.MAX_SWEEPS
 
 
 @pytest.mark.parametrize("dense", [True, False])
@@ -282,10 +288,12 @@ def test_the_last_steps_polynomial_goes_on_in_the_next(ratio: float) -> None:
 def test_a_batch_has_every_chains_own_sizes() -> None:
     """A pendulum of a millimetre beside one of a metre keeps its own scales, and sets the first step."""
     drawn = [random_chain(np.random.default_rng(43), [False] * n) for n in (2, 3, 1)]
-    drawn[1] = rescaled(*drawn[1], 1e-3, 1e-6, 1e-2)
+    drawn[1] = in_other_units(*drawn[1], 1e-3, 1e-6, 1e-2)
 
     def sized(models: list[tuple[Model, State]]) -> collocation._Stepper:
-        r, p, v, pdot = (np.concatenate(parts) for parts in zip(*(start(s) for _, s in models), strict=True))
+        r, p, v, pdot = (
+            np.concatenate(parts) for parts in zip(*(initial_values(s) for _, s in models), strict=True)
+        )
         forest = StructuredSystem([model for model, _ in models])
         stepper = collocation._Stepper(
             forest,
@@ -357,7 +365,7 @@ def test_a_step_is_made_where_its_error_is_within_the_tolerance(monkeypatch: pyt
         return tails[-1]
 
     monkeypatch.setattr(collocation._Stepper, "_error_over_tolerance", noted)
-    r, p, v, pdot = start(state)
+    r, p, v, pdot = initial_values(state)
     forest, found = StructuredSystem([model]), []
     for h in np.geomspace(0.01, 1.0, 60):
         stepper = collocation._Stepper(
@@ -385,18 +393,18 @@ def test_the_tolerance_sets_the_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     model, state = random_chain(np.random.default_rng(47), [False, False])
     done = run(model, state, 1e-6, np.array([0.0, 1.0]), nodes=4)
     assert done.rejected_steps < 0.1 * done.steps and done.stiff_steps == 0
-    watched = Watched(monkeypatch)
+    watched = StepRecorder(monkeypatch)
     run(model, state, 1e-12, np.array([0.0, 2.0]))
-    for (h, sweeps, made, _), (after, *_) in zip(watched.tried[:-2], watched.tried[1:-1], strict=True):
+    for (h, sweeps, made, _), (after, *_) in zip(watched.steps[:-2], watched.steps[1:-1], strict=True):
         assert not made or sweeps > collocation.USUAL_SWEEPS or after > 0.95 * h
 
 
 def test_no_crumb_before_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps that end on the times asked for share the way to each."""
     model, state = random_chain(np.random.default_rng(48), [False])
-    watched, times = Watched(monkeypatch), np.linspace(0, 1.5, 8)
+    watched, times = StepRecorder(monkeypatch), np.linspace(0, 1.5, 8)
     run(model, state, 1e-9, times, dense=False)
-    h = np.array([h for h, _, made, _ in watched.tried if made])
+    h = np.array([h for h, _, made, _ in watched.steps if made])
     ends = np.searchsorted(np.cumsum(h), times[1:] - 1e-9)  # the last step of each interval
     assert np.all(h[ends[1:]] > 0.4 * h[ends[1:] - 1])
 
@@ -404,7 +412,7 @@ def test_no_crumb_before_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_thousand_steps_add_up_to_the_last_digit() -> None:
     """Constant parts: the compensated sums are the exact ones but for one rounding."""
     model, state = random_chain(np.random.default_rng(49), [False])
-    r, p, v, pdot = start(state)
+    r, p, v, pdot = initial_values(state)
     forest, table = StructuredSystem([model]), gauss_tables(4)
     for push in (0.0, 0.3):
         stepper = collocation._Stepper(

@@ -20,13 +20,13 @@ from reference_impl.integrate import (
     unpack_state,
 )
 from reference_impl.joints import constraint_rows
-from tests.helpers.notes_test_data import Symbols, off_manifold, on_manifold
+from tests.helpers.notes_test_data import Symbols, state_off_manifold, state_on_manifold
 from tests.helpers.random_chains import random_model
 
 MIXES = [[True], [False], [True, True], [False, False], [True, False, False, True, False], [False, True] * 5]
 
 
-def vector(x):
+def unknowns_vector(x):
     return np.concatenate([x.acceleration.ravel(), x.pddot.ravel(), x.multiplier, x.norm_multiplier])
 
 
@@ -39,12 +39,12 @@ def test_N2_is_lagranges_equation():
     momentum = x.gradient(T, pdot)
     left = x.gradient(momentum, p) @ pdot + x.gradient(momentum, pdot) @ pddot - x.gradient(T, p)
     quadratic = 8 * (L(pdot).T @ J @ L(pdot) @ p)
-    assert x.zero(left - 4 * (L(p).T @ J @ L(p) @ pddot) + quadratic)
-    assert x.zero(quadratic + 8 * (L(pdot).T @ J @ L(p) @ pdot)), "the sign that the lost dots decide"
-    assert x.zero(x.gradient(moment @ angular_velocity(p, pdot), pdot) - 2 * (L(p).T @ moment))
+    assert x.is_zero(left - 4 * (L(p).T @ J @ L(p) @ pddot) + quadratic)
+    assert x.is_zero(quadratic + 8 * (L(pdot).T @ J @ L(p) @ pdot)), "the sign that the lost dots decide"
+    assert x.is_zero(x.gradient(moment @ angular_velocity(p, pdot), pdot) - 2 * (L(p).T @ moment))
 
 
-@pytest.mark.parametrize("states", [on_manifold, off_manifold])
+@pytest.mark.parametrize("states", [state_on_manifold, state_off_manifold])
 @pytest.mark.parametrize("n", [1, 2])
 def test_N5_is_assembled_as_printed(n, states):
     rng = np.random.default_rng(n)
@@ -56,7 +56,7 @@ def test_N5_is_assembled_as_printed(n, states):
     np.testing.assert_allclose(b, b_printed, rtol=1e-14, atol=1e-14)
 
 
-@pytest.mark.parametrize("states", [on_manifold, off_manifold])
+@pytest.mark.parametrize("states", [state_on_manifold, state_off_manifold])
 @pytest.mark.parametrize("rods", MIXES, ids=str)
 def test_the_band_and_the_dense_form_give_the_same_solution(rods, states):
     """Both solve S x = b to a backward error of a few roundings, so they differ by that times κ at most."""
@@ -65,10 +65,10 @@ def test_the_band_and_the_dense_form_give_the_same_solution(rods, states):
     state = states(chain, rng)
     system = DirectSystem(chain)
     S, b = system.assemble(*state)
-    x, dense = vector(system.solve(*state)), solve_dense(S, b)
+    x, dense = unknowns_vector(system.solve(*state)), solve_dense(S, b)
     np.testing.assert_allclose(x, dense, rtol=0, atol=1e-14 * np.max(np.abs(dense)))
     read, densely = system.solve(*state), system.solve_with_dense_factors(*state)
-    np.testing.assert_array_equal(vector(densely), dense)
+    np.testing.assert_array_equal(unknowns_vector(densely), dense)
     reaction = 1e-13 * np.max(np.abs(read.joint_reaction))
     np.testing.assert_allclose(densely.joint_reaction, read.joint_reaction, rtol=0, atol=reaction)
     residual = np.abs(S @ x - b) / (np.abs(S) @ np.abs(x) + np.abs(b))
@@ -82,7 +82,7 @@ def test_the_solution_obeys_newton_and_euler(rods, without):
     rng = np.random.default_rng(11 + len(rods))
     chain = random_model(rng, rods, loads=True, drag=True)
     chain = dataclasses.replace(chain, **{name: np.zeros(chain.n) for name in without})
-    r, p, v, pdot = on_manifold(chain, rng)
+    r, p, v, pdot = state_on_manifold(chain, rng)
     x = DirectSystem(chain).solve(r, p, v, pdot)
     omega, turn = angular_velocity(p, pdot), A(p)
     near, far = x.joint_reaction, -np.concatenate([x.joint_reaction[1:], np.zeros((1, 3))])
@@ -105,7 +105,7 @@ def test_units_do_not_decide_the_digits():
     """The same motion with masses × 2^±30: without equilibration the pivots would follow the units."""
     rng = np.random.default_rng(5)
     chain = random_model(rng, [True, False, True], loads=True, drag=True)
-    state = on_manifold(chain, rng)
+    state = state_on_manifold(chain, rng)
     x = DirectSystem(chain).solve(*state)
     loads = ("mass", "inertia", "force", "moment", "drag_force", "drag_moment")
     for scale in (2.0**-30, 2.0**30):
@@ -127,11 +127,11 @@ def test_refinement_solves_every_row_to_its_own_rounding():
         chain = dataclasses.replace(
             chain, mass=chain.mass * scale, inertia=chain.inertia * scale[:, None, None]
         )
-        state = on_manifold(chain, rng)
+        state = state_on_manifold(chain, rng)
         system = DirectSystem(chain)
         S, b = system.assemble(*state)
         fullest = np.max(np.count_nonzero(S, axis=1))
-        for x in (vector(system.solve(*state)), solve_dense(S, b)):
+        for x in (unknowns_vector(system.solve(*state)), solve_dense(S, b)):
             x = x.astype(np.longdouble)
             residual = np.abs(S.astype(np.longdouble) @ x - b) / (np.abs(S) @ np.abs(x) + np.abs(b))
             assert np.max(residual) <= (fullest + 1) * np.finfo(float).eps
@@ -141,7 +141,7 @@ def test_a_planted_defect_is_added_to_every_gamma():
     """C_r r̈ + C_p p̈ = γ + δ, a δ for each row."""
     rng = np.random.default_rng(14)
     chain = random_model(rng, [True, False, True], loads=True, drag=True)
-    state = on_manifold(chain, rng)
+    state = state_on_manifold(chain, rng)
     joints, delta = constraint_rows(chain, *state), np.arange(1.0, 6.0)
     x = DirectSystem(chain).solve(*state, gamma_defect=delta)
     np.testing.assert_allclose(
@@ -155,7 +155,7 @@ def test_units_do_not_decide_the_steps_of_N6():
     """A thousandth of the size: the absolute tolerance is in the sizes of the motion."""
     rng = np.random.default_rng(15)
     chain = random_model(rng, [False])
-    r, p, v, pdot = on_manifold(chain, rng)
+    r, p, v, pdot = state_on_manifold(chain, rng)
     times, unit = np.array([0.0, 0.5]), 2.0**-10
     here = integrate_dop853(chain, r, p, v, pdot, times, 1e-6)
     small = dataclasses.replace(
@@ -174,14 +174,14 @@ def test_a_vanishing_step_of_N6_is_an_error():
     chain = random_model(rng, [False], loads=True, drag=True)
     stiff = dataclasses.replace(chain, drag_force=np.array([1e17]))
     with pytest.raises(ArithmeticError, match="DOP853 stopped at t = "):
-        integrate_dop853(stiff, *on_manifold(chain, rng), np.array([1.0, 2.0]), 1e-6)
+        integrate_dop853(stiff, *state_on_manifold(chain, rng), np.array([1.0, 2.0]), 1e-6)
 
 
 def test_energy_changes_by_the_power_of_the_loads():
     """Ė = Σ F·ṙ + n′·ω′ (gravity in E): workless joints, rods and balls."""
     rng = np.random.default_rng(6)
     chain = random_model(rng, [True, False, True, False], loads=True, drag=True)
-    r, p, v, pdot = on_manifold(chain, rng)
+    r, p, v, pdot = state_on_manifold(chain, rng)
     x = DirectSystem(chain).solve(r, p, v, pdot)
     omega, omega_dot = angular_velocity(p, pdot), 2 * (L(p) @ x.pddot[..., None])[..., 0]
     inertial = np.einsum("nij,nj->ni", chain.inertia, omega)
@@ -196,7 +196,7 @@ def test_energy_changes_by_the_power_of_the_loads():
 def test_N6_orders_y_as_r_p_v_pdot():
     rng = np.random.default_rng(8)
     chain = random_model(rng, [True, False], loads=True, drag=True)
-    state = on_manifold(chain, rng)
+    state = state_on_manifold(chain, rng)
     y = pack_state(*state)
     for part, back in zip(state, unpack_state(y, 2), strict=True):
         np.testing.assert_array_equal(part, back)
@@ -205,7 +205,7 @@ def test_N6_orders_y_as_r_p_v_pdot():
     np.testing.assert_array_equal(direct_acceleration(chain)(*state), expected)
 
 
-def planar(amplitude, arm=0.4, mass=1.3, about_centre=0.05):
+def planar_pendulum(amplitude, arm=0.4, mass=1.3, about_centre=0.05):
     """A body on a ball joint that swings about the y axis, at rest at ``amplitude``."""
     rng = np.random.default_rng(0)
     chain = dataclasses.replace(
@@ -223,7 +223,7 @@ def planar(amplitude, arm=0.4, mass=1.3, about_centre=0.05):
 
 def test_N6_swings_with_the_exact_period():
     """After one period 4 K(sin²(θ₀/2)) / ω₀ of a 170° swing the body is back, with rtol's accuracy."""
-    chain, state, period = planar(np.radians(170))
+    chain, state, period = planar_pendulum(np.radians(170))
     errors = []
     for rtol in (1e-6, 1e-9, 1e-12):
         run = integrate_dop853(chain, *state, np.array([0, period / 2, period]), rtol)
@@ -237,7 +237,7 @@ def test_samples_do_not_change_the_steps():
     """Dense output: the same steps whatever times are asked, and the last sample is a step's own end."""
     rng = np.random.default_rng(9)
     chain = random_model(rng, [True, False], loads=True, drag=True)
-    state = on_manifold(chain, rng)
+    state = state_on_manifold(chain, rng)
     few = integrate_dop853(chain, *state, np.array([0.0, 1.0]), 1e-10)
     many = integrate_dop853(chain, *state, np.linspace(0, 1, 101), 1e-10)
     assert (few.steps, few.t.size, many.t.size) == (many.steps, 2, 101)
@@ -252,7 +252,7 @@ def test_natural_sizes_are_of_the_stretched_chain_its_fall_and_its_motion():
     near, far = (np.linalg.norm(s, axis=1) for s in (chain.proximal, chain.distal))
     reach = np.sum(chain.length) + np.sum(near) + far[0] + far[1]
     fall = np.sqrt(np.linalg.norm(chain.gravity) * reach)
-    r, p, v, _ = on_manifold(chain, rng)
+    r, p, v, _ = state_on_manifold(chain, rng)
 
     def sizes(r, v, omega, chain=chain):
         y = state_scales(chain, r, p, v, pdot_of(p, omega))
@@ -274,7 +274,7 @@ def test_natural_sizes_are_of_the_stretched_chain_its_fall_and_its_motion():
 def test_the_structured_form_integrates_the_same_and_steps_are_counted(monkeypatch):
     rng = np.random.default_rng(13)
     chain = random_model(rng, [True, False, True], loads=True, drag=True)
-    state, times = on_manifold(chain, rng), np.linspace(0, 0.3, 4)
+    state, times = state_on_manifold(chain, rng), np.linspace(0, 0.3, 4)
     counted = []
 
     class Counted(integrator.DOP853):
@@ -295,7 +295,7 @@ def test_the_printed_system_is_exact_on_complex_numbers():
     """dS/dp along a direction by a complex step is that by differences: no part drops the imaginary one."""
     rng = np.random.default_rng(14)
     chain = random_model(rng, [True, True], loads=True, drag=True)
-    r, p, v, pdot = on_manifold(chain, rng)
+    r, p, v, pdot = state_on_manifold(chain, rng)
     along, h = rng.normal(size=p.shape), 1e-6
     S, b = notes.assemble_system(chain, r, p + 1e-30j * along, v, pdot)
     ends = [notes.assemble_system(chain, r, p + s * h * along, v, pdot) for s in (1, -1)]
@@ -304,7 +304,7 @@ def test_the_printed_system_is_exact_on_complex_numbers():
 
 
 def test_at_rest_stays_at_rest():
-    chain, state, _ = planar(0.0)
+    chain, state, _ = planar_pendulum(0.0)
     run = integrate_dop853(chain, *state, np.linspace(0, 5, 6), 1e-10)
     np.testing.assert_allclose(run.r, np.broadcast_to(state[0], run.r.shape), rtol=0, atol=1e-14)
 
@@ -313,11 +313,11 @@ def test_fifty_bodies():
     """A chain of 50 balls: solved in its band, to rounding of the dense form; width 10 whatever N."""
     rng = np.random.default_rng(50)
     chain = random_model(rng, [False] * 50, loads=True, drag=True)
-    state = on_manifold(chain, rng)
+    state = state_on_manifold(chain, rng)
     system = DirectSystem(chain)
     dense = solve_dense(*system.assemble(*state))
     np.testing.assert_allclose(
-        vector(system.solve(*state)), dense, rtol=0, atol=1e-13 * np.max(np.abs(dense))
+        unknowns_vector(system.solve(*state)), dense, rtol=0, atol=1e-13 * np.max(np.abs(dense))
     )
     assert system._width <= 10
 
@@ -326,14 +326,14 @@ def test_one_and_two_bodies_are_what_the_notes_print():
     rng = np.random.default_rng(3)
     chain = random_model(rng, [True] * 3, loads=True, drag=True)
     with pytest.raises(ValueError, match="one and two bodies"):
-        notes.assemble_system(chain, *on_manifold(chain, rng))
+        notes.assemble_system(chain, *state_on_manifold(chain, rng))
 
 
 def test_pdot_of_is_on_the_sphere():
     """ṗ = ½ Lᵀω′ and p̈ of the solution satisfy pᵀp̈ = −ṗᵀṗ (N4)."""
     rng = np.random.default_rng(4)
     chain = random_model(rng, [False, True], loads=True, drag=True)
-    r, p, v, pdot = on_manifold(chain, rng)
+    r, p, v, pdot = state_on_manifold(chain, rng)
     np.testing.assert_allclose(pdot_of(p, angular_velocity(p, pdot)), pdot, atol=1e-15)
     x = DirectSystem(chain).solve(r, p, v, pdot)
     np.testing.assert_allclose(np.sum(p * x.pddot, -1), -np.sum(pdot * pdot, -1), atol=1e-13)

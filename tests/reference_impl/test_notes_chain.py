@@ -7,11 +7,11 @@ from reference_impl.chain import Chain
 from reference_impl.euler_parameters import dot
 from reference_impl.joints import constraint_rows
 from reference_impl.notes import DoublePendulum, SinglePendulum
-from tests.helpers.notes_test_data import Symbols, off_manifold, on_manifold
+from tests.helpers.notes_test_data import Symbols, state_off_manifold, state_on_manifold
 from tests.helpers.random_chains import random_model
 
 
-def symbolic(rods):
+def symbolic_chain(rods):
     """A chain of symbols (lengths 2, 3 where there are rods), its symbols and its rows."""
     n = len(rods)
     x = Symbols(bodies=n, attachments=2 * n)
@@ -35,7 +35,7 @@ def jacobians(joints, n):
 @pytest.mark.parametrize("n", [1, 2])
 def test_rods_are_the_printed_forms_identically(n):
     """As polynomials, so on the manifold and off it."""
-    x, chain, joints = symbolic([True] * n)
+    x, chain, joints = symbolic_chain([True] * n)
     C_r, C_p = jacobians(joints, n)
     if n == 1:
         printed = SinglePendulum(x.r[0], x.p[0], x.v[0], x.pdot[0], x.s[0], 2)
@@ -47,24 +47,24 @@ def test_rods_are_the_printed_forms_identically(n):
         (C_p, printed.C_p),
         (joints.gamma, printed.gamma),
     ):
-        assert x.zero(general - as_printed)
+        assert x.is_zero(general - as_printed)
 
 
 @pytest.mark.parametrize("rods", [[False], [False, False], [True, False], [False, True]], ids=str)
 def test_every_mix_of_two_differentiates(rods):
     """C_r, C_p differentiate C for every p; γ does too for balls, and up to E3 for rods."""
-    x, _, joints = symbolic(rods)
+    x, _, joints = symbolic_chain(rods)
     C_r, C_p = jacobians(joints, len(rods))
-    assert x.zero(C_r - x.gradient(joints.C, x.r.ravel()))
-    assert x.zero(C_p - x.gradient(joints.C, x.p.ravel()))
-    assert x.zero(joints.constraint_rate(x.v, x.pdot) - x.rate(joints.C))
-    true = -x.rate(C_r) @ x.v.ravel() - x.rate(C_p) @ x.pdot.ravel()
+    assert x.is_zero(C_r - x.gradient(joints.C, x.r.ravel()))
+    assert x.is_zero(C_p - x.gradient(joints.C, x.p.ravel()))
+    assert x.is_zero(joints.constraint_rate(x.v, x.pdot) - x.time_derivative(joints.C))
+    true = -x.time_derivative(C_r) @ x.v.ravel() - x.time_derivative(C_p) @ x.pdot.ravel()
     ball = ~np.array(rods)[joints.joint]
-    assert x.zero((true - joints.gamma)[ball])
-    assert not ball.all() or x.zero(true - joints.gamma)
+    assert x.is_zero((true - joints.gamma)[ball])
+    assert not ball.all() or x.is_zero(true - joints.gamma)
 
 
-@pytest.mark.parametrize("states", [on_manifold, off_manifold])
+@pytest.mark.parametrize("states", [state_on_manifold, state_off_manifold])
 def test_a_long_mixed_chain_differentiates_by_complex_step(states):
     """Ċ and γ at N = 7; off the manifold pᵀṗ is taken out first, since γ holds only without it (E3)."""
     rng = np.random.default_rng(0)
@@ -80,7 +80,7 @@ def test_a_long_mixed_chain_differentiates_by_complex_step(states):
 def test_consistent_states_satisfy_every_row():
     rng = np.random.default_rng(1)
     chain = random_model(rng, [True, False, False, True, True], loads=True, drag=True)
-    r, p, v, pdot = on_manifold(chain, rng)
+    r, p, v, pdot = state_on_manifold(chain, rng)
     joints = constraint_rows(chain, r, p, v, pdot)
     assert len(joints.C) == 9
     np.testing.assert_allclose(joints.C, 0, atol=1e-15)
@@ -91,7 +91,7 @@ def test_consistent_states_satisfy_every_row():
 def test_a_balls_rows_keep_their_order_in_a_long_chain():
     rng = np.random.default_rng(2)
     chain = random_model(rng, [True, False, False] * 15, loads=True, drag=True)
-    joints = constraint_rows(chain, *on_manifold(chain, rng))
+    joints = constraint_rows(chain, *state_on_manifold(chain, rng))
     assert np.all(np.diff(joints.joint) >= 0)
     balls = joints.r_near[~chain.rods[joints.joint]].reshape(-1, 3, 3)
     np.testing.assert_array_equal(balls, np.broadcast_to(np.eye(3), (30, 3, 3)))

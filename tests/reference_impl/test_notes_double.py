@@ -18,36 +18,36 @@ c1, c2 = p1 @ pd1, p2 @ pd2  # what N10 neglects (E3)
 def test_D2_is_dTd_with_E2s_replacement():
     a, b = A(p1) @ s2, A(p2) @ s3
     d = r[0] + a - r[1] - b
-    assert x.zero(C[1] - (d @ d - x.length[1] ** 2) + a @ a - s2 @ s2 + b @ b - s3 @ s3)
-    assert x.zero(C[0] - first.C)
+    assert x.is_zero(C[1] - (d @ d - x.length[1] ** 2) + a @ a - s2 @ s2 + b @ b - s3 @ s3)
+    assert x.is_zero(C[0] - first.C)
 
 
 def test_D3_D4_are_the_derivatives_of_D2():
-    assert x.zero(C_r - x.gradient(C, r.ravel()))
-    assert x.zero(C_p - x.gradient(C, p.ravel()))
+    assert x.is_zero(C_r - x.gradient(C, r.ravel()))
+    assert x.is_zero(C_p - x.gradient(C, p.ravel()))
 
 
 def test_D5_is_the_rate_of_D3_up_to_E3():
     missing = 4 * (s2 * c1 - s3 * c2)
-    difference = x.rate(C_r[1]) - pendulum.C2_r_rate
-    assert x.zero(difference - np.concatenate([missing, -missing]))
+    difference = x.time_derivative(C_r[1]) - pendulum.C2_r_rate
+    assert x.is_zero(difference - np.concatenate([missing, -missing]))
 
 
 def test_D6_is_the_rate_of_D4_up_to_E3():
-    difference = x.rate(C_p[1]) - pendulum.C2_p_rate
+    difference = x.time_derivative(C_p[1]) - pendulum.C2_p_rate
     missing = np.concatenate([-8 * (s3 @ H(p1, s2)) * c2, -8 * (s2 @ H(p2, s3)) * c1])
-    assert x.zero(difference - missing)
+    assert x.is_zero(difference - missing)
 
 
 def test_gamma_is_minus_the_rates_times_the_velocities():
     rates = pendulum.C2_r_rate @ v.ravel()
     rates = rates + pendulum.C2_p_rate @ pdot.ravel()
-    assert x.zero(pendulum.gamma[1] + rates)
-    assert x.zero(pendulum.gamma[0] - first.gamma)
+    assert x.is_zero(pendulum.gamma[1] + rates)
+    assert x.is_zero(pendulum.gamma[0] - first.gamma)
 
 
 def test_E6_the_recognised_text_without_transposes_is_not_the_derivative():
     lost = 4 * ((r[0] - r[1]) @ H(p1, s2)) - 4 * (s3 @ A(p2) @ H(p1, s2))
-    assert not x.zero(lost - x.gradient(C[1], p1))
+    assert not x.is_zero(lost - x.gradient(C[1], p1))
     unequal = 2 * (v[0] - v[1]) + 4 * (s2 @ L(pd1) @ G(p1).T)
-    assert not x.zero(unequal - pendulum.C2_r_rate[:3])
+    assert not x.is_zero(unequal - pendulum.C2_r_rate[:3])

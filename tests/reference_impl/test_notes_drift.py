@@ -8,10 +8,10 @@ import pytest
 from reference_impl.integrate import direct_acceleration, integrate_dop853
 from reference_impl.joints import constraint_rows
 from reference_impl.stabilised import constraint_errors
-from tests.helpers.notes_test_data import on_manifold
+from tests.helpers.notes_test_data import state_on_manifold
 from tests.helpers.random_chains import random_model
 
-DEFECT = 1e-4
+GAMMA_DEFECT = 1e-4
 
 
 @pytest.mark.parametrize("rods", [[True], [False], [True, False, True]], ids=str)
@@ -19,9 +19,9 @@ def test_an_injected_defect_comes_out_as_delta_t_and_half_delta_t_squared(rods):
     """One δ per row, all different, signs mixed; truncation (rtol 1e-12) is far below 1 % of it."""
     rng = np.random.default_rng(len(rods))
     chain = random_model(rng, rods, loads=True, drag=True)
-    state = on_manifold(chain, rng)
+    state = state_on_manifold(chain, rng)
     count = int(np.sum(np.where(rods, 1, 3)))
-    delta = DEFECT * (1 + np.arange(count)) * (-1.0) ** np.arange(count)
+    delta = GAMMA_DEFECT * (1 + np.arange(count)) * (-1.0) ** np.arange(count)
     times = np.linspace(0, 2, 9)
     run = integrate_dop853(chain, *state, times, 1e-12, direct_acceleration(chain, delta))
     for t, *sample in zip(times[1:], run.r[1:], run.p[1:], run.v[1:], run.pdot[1:], strict=True):
@@ -44,19 +44,21 @@ def test_an_injected_defect_has_exponents_1_and_2():
     rng = np.random.default_rng(7)
     chain = random_model(rng, [True], loads=True, drag=True)
     decades = np.array([0.02, 0.2, 2.0])
-    (gap, gap_rate, _), _ = measure_drift(chain, on_manifold(chain, rng), 1e-11, decades, DEFECT, samples=40)
+    (gap, gap_rate, _), _ = measure_drift(
+        chain, state_on_manifold(chain, rng), 1e-11, decades, GAMMA_DEFECT, samples=40
+    )
     assert abs(np.log10(gap[1] / gap[0]) - 2) < 0.02
     assert abs(np.log10(gap_rate[1] / gap_rate[0]) - 1) < 0.02
     metres = 2 * chain.length[0]  # C = dᵀd − ℓ² is 2 ℓ times the gap
-    np.testing.assert_allclose(gap * metres, DEFECT * decades[1:] ** 2 / 2, rtol=0.01)
-    np.testing.assert_allclose(gap_rate * metres, DEFECT * decades[1:], rtol=0.01)
+    np.testing.assert_allclose(gap * metres, GAMMA_DEFECT * decades[1:] ** 2 / 2, rtol=0.01)
+    np.testing.assert_allclose(gap_rate * metres, GAMMA_DEFECT * decades[1:], rtol=0.01)
 
 
 def drift_falls_with_the_tolerance(rods, decades, tolerances):
     """Drift at each tolerance; every maximum falls by a decade at least for three decades of tolerance."""
     rng = np.random.default_rng(4)
     chain = random_model(rng, rods)
-    state = on_manifold(chain, rng)
+    state = state_on_manifold(chain, rng)
     runs = [measure_drift(chain, state, rtol, decades) for rtol in tolerances]
     for (coarse, _), (fine, _) in pairwise(runs):
         assert np.all(fine < 0.1 * coarse), (coarse, fine)

@@ -12,11 +12,11 @@ from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import I3, A, A_rate, L, dAs_dp, dot
 from reference_impl.integrate import integrate_dop853
 from reference_impl.joints import constraint_rows
-from tests.helpers.notes_test_data import Symbols, off_manifold, on_manifold
+from tests.helpers.notes_test_data import Symbols, state_off_manifold, state_on_manifold
 from tests.helpers.random_chains import random_model
 
 
-def hanging(rods, length=0.5, arm=0.3):
+def hanging_chain(rods, length=0.5, arm=0.3):
     """Bodies at rest straight below each other, attachments on the body's z axis."""
     n = len(rods)
     zeros = np.zeros((n, 3))
@@ -46,7 +46,7 @@ def test_E1_printed_with_length_0_is_singular_and_names_the_body(n):
 
     The printed form reads every joint as a rod.
     """
-    chain, state = hanging([False] * n)
+    chain, state = hanging_chain([False] * n)
     S, b = notes.assemble_system(chain, *state)
     rows_C, rows_E = S[7 * n : 8 * n], S[8 * n :]
     np.testing.assert_allclose(rows_C[:, : 3 * n], 0, atol=1e-15)
@@ -61,7 +61,7 @@ def test_E1_a_rod_whose_ends_meet_is_singular_in_the_general_form_too():
     """Also where rounding leaves 1e-17 of d, which would otherwise be solved as a direction."""
     rng = np.random.default_rng(0)
     chain = random_model(rng, [False, False, False], loads=True, drag=True)
-    r, p, v, pdot = on_manifold(chain, rng)
+    r, p, v, pdot = state_on_manifold(chain, rng)
     rod = dataclasses.replace(chain, length=np.array([0, 0, 0.4]))
     d = constraint_rows(rod, r, p, v, pdot).d[2]
     assert np.linalg.norm(d) < 1e-15
@@ -72,7 +72,7 @@ def test_E1_a_rod_whose_ends_meet_is_singular_in_the_general_form_too():
 def test_E1_the_length_changes_neither_jacobians_nor_gamma():
     rng = np.random.default_rng(1)
     chain = random_model(rng, [True, True], loads=True, drag=True)
-    state = on_manifold(chain, rng)
+    state = state_on_manifold(chain, rng)
     longer = dataclasses.replace(chain, length=chain.length + 1)
     one, other = (DirectSystem(c).assemble(*state) for c in (chain, longer))
     np.testing.assert_array_equal(one[0], other[0])
@@ -83,7 +83,7 @@ def test_E1_the_ball_is_the_limit_of_the_rod():
     """A rod that starts along the ball's reaction swings about it ever less: positions differ by O(ℓ)."""
     rng = np.random.default_rng(2)
     ball = random_model(rng, [False])
-    r, p, v, pdot = on_manifold(ball, rng)
+    r, p, v, pdot = state_on_manifold(ball, rng)
     times = np.linspace(0, 0.5, 6)
     truth = integrate_dop853(ball, r, p, v, pdot, times, 1e-10)
     pull = DirectSystem(ball).solve(r, p, v, pdot).joint_reaction
@@ -117,7 +117,7 @@ def test_E2_changes_only_the_norm_multiplier(n):
                 of_r[k, k - 1], of_p[k, k - 1] = -2 * d[k], -2 * d[k] @ dAs_dp(p[k - 1], chain.distal[k - 1])
         return np.concatenate([of_r.reshape(n, -1), of_p.reshape(n, -1)], axis=1)
 
-    r, p, v, pdot = on_manifold(chain, rng)
+    r, p, v, pdot = state_on_manifold(chain, rng)
     S, b = notes.assemble_system(chain, r, p, v, pdot)
     x, rows, rates = solve_dense(S, b), jacobian(r, p), np.concatenate([v.ravel(), pdot.ravel()])
     difference = (rows - S[7 * n : 8 * n, : 7 * n])[:, 3 * n :].reshape(n, n, 4)  # of C_p, joint by body
@@ -135,7 +135,7 @@ def test_E2_off_the_sphere_is_another_constraint():
     """The notes' C minus dᵀd − ℓ² is s₁ᵀs₁ − s₁ᵀAᵀA s₁: 0 where pᵀp = 1 only."""
     rng = np.random.default_rng(4)
     chain = random_model(rng, [True], loads=True, drag=True)
-    for states, off in ((on_manifold, False), (off_manifold, True)):
+    for states, off in ((state_on_manifold, False), (state_off_manifold, True)):
         r, p, v, pdot = states(chain, rng)
         joints = constraint_rows(chain, r, p, v, pdot)
         turned = A(p[0]) @ chain.proximal[0]
@@ -150,7 +150,7 @@ def test_E3_is_exact_for_a_chain():
     """γ_true − γ = −d_t(C) rows with 2 (pᵀṗ) I added to every Ȧ, the single one −4 (s₁ᵀṙ)(pᵀṗ)."""
     rng = np.random.default_rng(5)
     chain = random_model(rng, [True, True, True], loads=True, drag=True)
-    r, p, v, pdot = off_manifold(chain, rng)
+    r, p, v, pdot = state_off_manifold(chain, rng)
     h = 1e-30
     joints = constraint_rows(chain, r, p, v, pdot)
     moved = constraint_rows(chain, r + 1j * h * v, p + 1j * h * pdot, v.astype(complex), pdot.astype(complex))
@@ -166,7 +166,9 @@ def test_E3_is_exact_for_a_chain():
         np.testing.assert_allclose(missing[k], expected, atol=1e-13)
     assert np.all(np.abs(missing) > 1e-3)
     x = Symbols(bodies=1, attachments=1)
-    assert x.zero(x.rate(A(x.p[0])) - A_rate(x.p[0], x.pdot[0]) - I3 * (2 * (x.p[0] @ x.pdot[0])))
+    assert x.is_zero(
+        x.time_derivative(A(x.p[0])) - A_rate(x.p[0], x.pdot[0]) - I3 * (2 * (x.p[0] @ x.pdot[0]))
+    )
 
 
 # --- E5 -------------------------------------------------------------------------------------------------
@@ -175,7 +177,7 @@ def test_E3_is_exact_for_a_chain():
 @pytest.mark.parametrize("rods", [[True], [False], [True, True], [True, False, True]], ids=str)
 def test_E5_multipliers_at_rest_carry_the_weight(rods):
     """Tension 2 ℓ λ and the reaction are the weight hanging below; λ of a ball is minus the reaction."""
-    chain, state = hanging(rods)
+    chain, state = hanging_chain(rods)
     x = DirectSystem(chain).solve(*state)
     weight = np.cumsum(chain.mass[::-1])[::-1] * 9.81
     np.testing.assert_allclose(x.acceleration, 0, atol=1e-13)
@@ -193,7 +195,7 @@ def test_E5_multipliers_at_rest_carry_the_weight(rods):
 def test_E5_the_reaction_of_a_rod_is_minus_2_lambda_d():
     rng = np.random.default_rng(6)
     chain = random_model(rng, [True, True], loads=True, drag=True)
-    state = on_manifold(chain, rng)
+    state = state_on_manifold(chain, rng)
     x, d = DirectSystem(chain).solve(*state), constraint_rows(chain, *state).d
     np.testing.assert_allclose(x.joint_reaction, -2 * x.multiplier[:, None] * d, atol=1e-14)
     np.testing.assert_allclose(np.abs(x.tension), np.linalg.norm(x.joint_reaction, axis=1), rtol=1e-14)
@@ -205,7 +207,7 @@ def test_E5_the_reaction_of_a_rod_is_minus_2_lambda_d():
 def test_E7_rank_three_without_the_normalisation_row():
     rng = np.random.default_rng(7)
     chain = random_model(rng, [True], loads=True, drag=True)
-    r, p, v, pdot = on_manifold(chain, rng)
+    r, p, v, pdot = state_on_manifold(chain, rng)
     block = 4 * L(p[0]).T @ chain.inertia[0] @ L(p[0])
     assert np.linalg.matrix_rank(block) == 3
     np.testing.assert_allclose(block @ p[0], 0, atol=1e-15)
@@ -223,7 +225,7 @@ def test_E7_rank_three_without_the_normalisation_row():
 def test_E7_p_zero_names_the_body(rods):
     rng = np.random.default_rng(8)
     chain = random_model(rng, rods, loads=True, drag=True)
-    r, p, v, pdot = on_manifold(chain, rng)
+    r, p, v, pdot = state_on_manifold(chain, rng)
     p[1] = 0
     with pytest.raises(SingularSystem, match=r"p of body 2 is 0.*E7"):
         DirectSystem(chain).solve(r, p, v, pdot)
@@ -231,7 +233,7 @@ def test_E7_p_zero_names_the_body(rods):
 
 def test_E7_singular_inertia_names_the_body():
     """No inertia about the axis through the attachments: a spin about it meets no resistance."""
-    chain, state = hanging([False, True])
+    chain, state = hanging_chain([False, True])
     inertia = chain.inertia.copy()
     inertia[1, 2, 2] = 0
     with pytest.raises(SingularSystem, match=r"inertia of body 2 is singular.*E7"):
@@ -244,7 +246,7 @@ def test_E1_a_rod_is_as_short_as_its_own_surroundings_allow():
     """A rod of 1e-9 m is a direction beside bodies of decimetres, and rounding 1e7 m from the pivot."""
     rng = np.random.default_rng(16)
     chain = random_model(rng, [True, True], loads=True, drag=True)
-    r, p, *_ = on_manifold(chain, rng)
+    r, p, *_ = state_on_manifold(chain, rng)
     far = np.array([[0, 0, 0], [1e7, 0, 0]])
     d, entries = 1e-9 * np.eye(3)[:2], (np.ones(1),)
     check_state_solvable(chain, r, p, d, chain.rods, entries)
@@ -257,7 +259,7 @@ def test_E1_a_rod_is_as_short_as_its_own_surroundings_allow():
 @pytest.mark.parametrize("heavy", [1.0, 1e6, 1e-6])
 def test_E7_an_inertia_is_flat_beside_its_own_size(heavy):
     """A stick along a slanting axis has a least principal value of rounding, in any unit."""
-    chain, state = hanging([False, True])
+    chain, state = hanging_chain([False, True])
     turn = np.linalg.qr(np.random.default_rng(15).normal(size=(3, 3)))[0]
     inertia, proximal = heavy * chain.inertia, chain.proximal.copy()
     stick = turn @ np.diag([0.02, 0.02, 0]) @ turn.T
@@ -271,7 +273,7 @@ def test_a_singular_inertia_that_the_joint_makes_good_is_solved():
     """J of a thin stick hung off its axis: S is regular, and its solution is the limit of thicker sticks."""
     rng = np.random.default_rng(9)
     chain = random_model(rng, [False])
-    state = on_manifold(chain, rng)
+    state = state_on_manifold(chain, rng)
     answers = []
     for thin in (1e-6, 0.0):
         stick = dataclasses.replace(chain, inertia=0.05 * np.diag([1.0, 1.0, thin])[None])
@@ -280,7 +282,7 @@ def test_a_singular_inertia_that_the_joint_makes_good_is_solved():
 
 
 def test_no_mass_names_the_body():
-    chain, state = hanging([True, True])
+    chain, state = hanging_chain([True, True])
     massless = dataclasses.replace(chain, mass=np.array([1.0, 0.0]), inertia=0 * chain.inertia)
     with pytest.raises(SingularSystem, match="mass of body 2 is 0"):
         DirectSystem(massless).solve(*state)
@@ -291,7 +293,7 @@ def test_no_mass_names_the_body():
     [(0, np.nan, "body 2"), (1, np.inf, "body 2"), (2, np.nan, "rate"), (3, np.inf, "rate")],
 )
 def test_what_is_not_finite_is_named(part, value, message):
-    chain, state = hanging([True, False])
+    chain, state = hanging_chain([True, False])
     state = [x.copy() for x in state]
     state[part][1, 1] = value
     with pytest.raises(SingularSystem, match=rf"{message}.*not finite"):
@@ -304,7 +306,7 @@ def test_the_pendulum_of_the_notes_is_regular(n):
     rng = np.random.default_rng(10)
     chain = random_model(rng, [True] * n, loads=True, drag=True)
     chain = dataclasses.replace(chain, proximal=np.array([[-0.4, 0, 0]] * n))
-    state = on_manifold(chain, rng)
+    state = state_on_manifold(chain, rng)
     S, b = notes.assemble_system(chain, *state)
     assert S.shape == (9 * n, 9 * n) and np.linalg.matrix_rank(S) == 9 * n
     x = notes.solve_system(chain, *state)
@@ -313,6 +315,6 @@ def test_the_pendulum_of_the_notes_is_regular(n):
     np.testing.assert_allclose(x[: 3 * n], general.acceleration.ravel(), atol=1e-12)
     np.testing.assert_allclose(x[7 * n : 8 * n], general.multiplier, atol=1e-12)
     loose = dataclasses.replace(chain, proximal=np.zeros((n, 3)), distal=np.zeros((n, 3)))
-    S, _ = notes.assemble_system(loose, *on_manifold(loose, rng))
+    S, _ = notes.assemble_system(loose, *state_on_manifold(loose, rng))
     assert np.linalg.matrix_rank(S) == 9 * n
     assert np.linalg.matrix_rank(S[: 8 * n, : 8 * n]) == 7 * n, "C_p = 0: only the norm holds p̈ along p (E7)"

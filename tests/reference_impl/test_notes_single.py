@@ -14,24 +14,24 @@ C, C_r, C_p, gamma = pendulum.C, pendulum.C_r, pendulum.C_p, pendulum.gamma
 
 def test_S1_is_dTd_with_E2s_replacement():
     d, turned = r + A(p) @ s1, A(p) @ s1
-    assert x.zero(C - (d @ d - length**2) + turned @ turned - s1 @ s1)
+    assert x.is_zero(C - (d @ d - length**2) + turned @ turned - s1 @ s1)
 
 
 def test_S2_S3_are_the_derivatives_of_S1():
-    assert x.zero(C_r - x.gradient(C, r))
-    assert x.zero(C_p - x.gradient(C, p))
+    assert x.is_zero(C_r - x.gradient(C, r))
+    assert x.is_zero(C_p - x.gradient(C, p))
 
 
 def test_S4_is_minus_the_rate_of_the_jacobians_up_to_E3():
-    true = -x.rate(C_r) @ v - x.rate(C_p) @ pdot
-    assert x.zero(true - gamma + 4 * (s1 @ v) * (p @ pdot)), "E3 is not exactly −4 (s₁ᵀṙ)(pᵀṗ)"
-    assert not x.zero(true - gamma)
+    true = -x.time_derivative(C_r) @ v - x.time_derivative(C_p) @ pdot
+    assert x.is_zero(true - gamma + 4 * (s1 @ v) * (p @ pdot)), "E3 is not exactly −4 (s₁ᵀṙ)(pᵀṗ)"
+    assert not x.is_zero(true - gamma)
 
 
 def test_S5_is_the_normalisation_and_its_derivatives():
-    assert x.zero(pendulum.C_E - (p @ p - 1))
-    assert x.zero(pendulum.C_Ep - x.gradient(pendulum.C_E, p))
-    assert x.zero(pendulum.gamma_E + x.rate(pendulum.C_Ep) @ pdot)
+    assert x.is_zero(pendulum.C_E - (p @ p - 1))
+    assert x.is_zero(pendulum.C_Ep - x.gradient(pendulum.C_E, p))
+    assert x.is_zero(pendulum.gamma_E + x.time_derivative(pendulum.C_Ep) @ pdot)
 
 
 def test_the_notes_own_s1_on_a_body_axis():

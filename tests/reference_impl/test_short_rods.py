@@ -10,7 +10,7 @@ import pytest
 from plumbline.model.kinematics import quaternion_rate
 from reference_impl.collocation import integrate_collocation
 from reference_impl.direct import DirectSystem
-from tests.helpers.random_chains import random_chain, rescaled
+from tests.helpers.random_chains import in_other_units, random_chain
 from tests.helpers.short_rods import replace_balls_by_rods, slow_manifold_directions, study_rod_limit
 
 LENGTHS = [0.4, 1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6]
@@ -94,7 +94,7 @@ def test_a_small_pendulum_has_the_same_directions() -> None:
     model, state = random_chain(np.random.default_rng(47), [False, False], rate=0.01)
     found = [
         slow_manifold_directions(one, at.r, at.p, at.v, quaternion_rate(at.p, at.omega))
-        for one, at in ((model, state), rescaled(model, state, 2.0**-10, 1.0, 1.0))
+        for one, at in ((model, state), in_other_units(model, state, 2.0**-10, 1.0, 1.0))
     ]
     for here, there in zip(*found, strict=True):
         assert there == pytest.approx(here, rel=1e-9, abs=1e-12)

@@ -14,17 +14,17 @@ from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import L
 from reference_impl.joints import constraint_rows
 from reference_impl.structured import StructuredSystem, component_first
-from tests.helpers.random_chains import norms, random_chain, rescaled
+from tests.helpers.random_chains import in_other_units, norms_per_body, random_chain
 
-MIXES = {
+JOINT_MIXES = {
     "balls": lambda rng, n: [False] * n,
     "rods": lambda rng, n: [True] * n,
     "mixed": lambda rng, n: list(rng.random(n) < 0.5),
 }
-KINDS = pytest.mark.parametrize("mix", MIXES)
+for_each_mix = pytest.mark.parametrize("mix", JOINT_MIXES)
 
 
-def parts(solution: Solution, forest: StructuredSystem) -> list[Solution]:
+def split_by_chain(solution: Solution, forest: StructuredSystem) -> list[Solution]:
     """The forest's answer chain by chain."""
     out = []
     for index, one in enumerate(forest.chains):
@@ -45,18 +45,18 @@ def parts(solution: Solution, forest: StructuredSystem) -> list[Solution]:
     return out
 
 
-@KINDS
+@for_each_mix
 def test_equals_the_direct_form_within_the_derived_bound(mix: str) -> None:
     rng = np.random.default_rng(20)
     for _ in range(12):
         drawn = [
-            random_chain(rng, MIXES[mix](rng, n), decades=1.0, loads=True, drag=True)
+            random_chain(rng, JOINT_MIXES[mix](rng, n), decades=1.0, loads=True, drag=True)
             for n in rng.integers(1, 11, size=4)
         ]
         forest = StructuredSystem([model for model, _ in drawn])
         held = [np.concatenate([getattr(state, name) for _, state in drawn]) for name in ("r", "p", "v")]
         pdot = np.concatenate([quaternion_rate(state.p, state.omega) for _, state in drawn])
-        together = parts(forest.solve(*held, pdot), forest)
+        together = split_by_chain(forest.solve(*held, pdot), forest)
         for (model, state), ours in zip(drawn, together, strict=True):
             direct = DirectSystem(model).solve(
                 state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
@@ -71,7 +71,7 @@ def test_equals_the_direct_form_within_the_derived_bound(mix: str) -> None:
                 assert np.all(np.linalg.norm(ours_ - direct_, axis=-1) <= allowed)
 
 
-@KINDS
+@for_each_mix
 @pytest.mark.parametrize("off", [0.0, 0.05, 1.0])
 def test_all_unknowns_equal_the_direct_forms_on_and_off_the_manifold(mix: str, off: float) -> None:
     """r, p and the rates anywhere: the printed rows' own behaviour (E2, E3) is part of what is equal.
@@ -82,12 +82,14 @@ def test_all_unknowns_equal_the_direct_forms_on_and_off_the_manifold(mix: str, o
     """
     rng = np.random.default_rng(21)
     for _ in range(12):
-        drawn = [random_chain(rng, MIXES[mix](rng, n), 0.5, loads=True, drag=True) for n in (1, 2, 2, 5, 8)]
+        drawn = [
+            random_chain(rng, JOINT_MIXES[mix](rng, n), 0.5, loads=True, drag=True) for n in (1, 2, 2, 5, 8)
+        ]
         forest = StructuredSystem([model for model, _ in drawn])
         r, p, v = (np.concatenate([getattr(s, name) for _, s in drawn]) for name in ("r", "p", "v"))
         pdot = np.concatenate([quaternion_rate(s.p, s.omega) for _, s in drawn])
         r, p, v, pdot = (x + off * rng.normal(size=x.shape) for x in (r, p, v, pdot))
-        for index, ours in enumerate(parts(forest.solve(r, p, v, pdot), forest)):
+        for index, ours in enumerate(split_by_chain(forest.solve(r, p, v, pdot), forest)):
             body = slice(forest.first_body[index], forest.first_body[index + 1])
             direct = DirectSystem(forest.chains[index]).solve(r[body], p[body], v[body], pdot[body])
             for name in (
@@ -123,10 +125,10 @@ def test_a_batch_is_more_chains() -> None:
     assert np.max(np.abs(tiled - np.tile(answer, 3))) <= 1e-13 * scale
 
 
-@KINDS
+@for_each_mix
 def test_singular_configurations_are_reported(mix: str) -> None:
     rng = np.random.default_rng(23)
-    model, state = random_chain(rng, MIXES[mix](rng, 4))
+    model, state = random_chain(rng, JOINT_MIXES[mix](rng, 4))
     forest, pdot = StructuredSystem([model]), quaternion_rate(state.p, state.omega)
     zero = state.p.copy()
     zero[2] = 0
@@ -156,7 +158,7 @@ def test_a_rod_of_length_zero_is_singular() -> None:
         StructuredSystem([literal]).solve(r, state.p, state.v, quaternion_rate(state.p, state.omega))
 
 
-@KINDS
+@for_each_mix
 def test_constraints_are_gaps_of_balls_and_squares_of_rods(mix: str) -> None:
     """C and its rate along (ṙ, ṗ), where joints are open and p is a unit quaternion; a rod has one row."""
     rng = np.random.default_rng(25)
@@ -189,12 +191,12 @@ def test_a_cause_is_named_by_the_body_of_its_own_chain(at: int, words: str) -> N
         broken[at] = kept
 
 
-@KINDS
+@for_each_mix
 @pytest.mark.parametrize("a", [0.5, 8.0])
 def test_baumgarte_adds_2a_and_a_squared_to_every_constraint(mix: str, a: float) -> None:
     """C̈ + 2 a Ċ + a² C = 0 of joints that are open, and of pᵀp − 1."""
     rng = np.random.default_rng(27)
-    model, state = random_chain(rng, MIXES[mix](rng, 4), loads=True, drag=True)
+    model, state = random_chain(rng, JOINT_MIXES[mix](rng, 4), loads=True, drag=True)
     forest, pdot, h = StructuredSystem([model]), quaternion_rate(state.p, state.omega), 1e-6
     q, v = component_first(state.r, state.p), component_first(state.v, pdot)
     q[:3] += 0.1 * rng.normal(size=(3, 4))
@@ -213,28 +215,30 @@ def test_baumgarte_adds_2a_and_a_squared_to_every_constraint(mix: str, a: float)
     np.testing.assert_allclose(E_second, -2 * a * E_rate - a * a * E, rtol=0, atol=1e-11 * (1 + a * a))
 
 
-@KINDS
+@for_each_mix
 def test_a_pendulum_of_any_size_is_solved_alike(mix: str) -> None:
     """Micrometres and milligrams, kilometres and kilotons: no threshold has a unit."""
     rng = np.random.default_rng(28)
-    model, state = random_chain(rng, MIXES[mix](rng, 3), loads=True, drag=True)
+    model, state = random_chain(rng, JOINT_MIXES[mix](rng, 3), loads=True, drag=True)
     here = StructuredSystem([model]).solve(state.r, state.p, state.v, quaternion_rate(state.p, state.omega))
     allowed = state_rounding_bound(model, state)
     for length, mass, second in ((1e-6, 1e-9, 1e-3), (1e3, 1e6, 1e2), (1.0, 1e15, 1.0)):
-        small, at = rescaled(model, state, length, mass, second)
+        small, at = in_other_units(model, state, length, mass, second)
         there = StructuredSystem([small]).solve(at.r, at.p, at.v, quaternion_rate(at.p, at.omega))
         for name, unit, bound in (
             ("acceleration", length / second**2, allowed.acceleration),
             ("pddot", 1 / second**2, allowed.angular_acceleration / 2),
             ("joint_reaction", mass * length / second**2, allowed.joint_reaction),
         ):
-            assert np.all(norms(getattr(there, name) / unit - getattr(here, name)) <= 2 * bound), name
+            assert np.all(norms_per_body(getattr(there, name) / unit - getattr(here, name)) <= 2 * bound), (
+                name
+            )
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e6, 1e-6])
 def test_a_collapsed_rod_is_one_of_its_own_rounding(scale: float) -> None:
     model, state = random_chain(np.random.default_rng(24), [False, False, True])
-    model, state = rescaled(model, state, scale, 1.0, 1.0)
+    model, state = in_other_units(model, state, scale, 1.0, 1.0)
     r = state.r.copy()
     r[2] -= state.u[2] * model.length[2]
     with pytest.raises(SingularSystem, match="rod above body 3 has length 0"):
@@ -243,7 +247,7 @@ def test_a_collapsed_rod_is_one_of_its_own_rounding(scale: float) -> None:
 
 def test_a_rod_short_beside_another_chain_s_is_no_collapsed_one() -> None:
     rng = np.random.default_rng(24)
-    small, large = (rescaled(*random_chain(rng, [True]), scale, 1.0, 1.0) for scale in (1e-6, 1e12))
+    small, large = (in_other_units(*random_chain(rng, [True]), scale, 1.0, 1.0) for scale in (1e-6, 1e12))
     models, states = zip(small, large, strict=True)
     r, p, v, omega = (np.concatenate([getattr(s, k) for s in states]) for k in ("r", "p", "v", "omega"))
     both = StructuredSystem(models).solve(r, p, v, quaternion_rate(p, omega))
@@ -293,11 +297,11 @@ def test_a_body_without_thickness_is_named_beside_a_tiny_one() -> None:
         StructuredSystem([needle])
 
 
-@KINDS
+@for_each_mix
 @pytest.mark.parametrize("alone", ["drag_force", "drag_moment"])
 def test_one_kind_of_drag_alone_counts(mix: str, alone: str) -> None:
     rng = np.random.default_rng(31)
-    model, state = random_chain(rng, MIXES[mix](rng, 3), drag=True)
+    model, state = random_chain(rng, JOINT_MIXES[mix](rng, 3), drag=True)
     other = {"drag_force": "drag_moment", "drag_moment": "drag_force"}[alone]
     model = replace(model, **{other: np.zeros(3)})
     one, pdot, allowed = (
@@ -308,15 +312,15 @@ def test_one_kind_of_drag_alone_counts(mix: str, alone: str) -> None:
     ours, direct = (
         form.solve(state.r, state.p, state.v, pdot) for form in (StructuredSystem([one]), DirectSystem(one))
     )
-    assert np.all(norms(ours.acceleration - direct.acceleration) <= allowed.acceleration)
-    assert np.all(norms(ours.pddot - direct.pddot) <= allowed.angular_acceleration / 2)
+    assert np.all(norms_per_body(ours.acceleration - direct.acceleration) <= allowed.acceleration)
+    assert np.all(norms_per_body(ours.pddot - direct.pddot) <= allowed.angular_acceleration / 2)
 
 
-@KINDS
+@for_each_mix
 def test_the_rate_of_a_gap_is_its_derivative_off_the_manifold_too(mix: str) -> None:
     """Where pᵀṗ is not 0 the matrix A of the notes stretches, and d with it."""
     rng, h = np.random.default_rng(32), 1e-6
-    model, state = random_chain(rng, MIXES[mix](rng, 4))
+    model, state = random_chain(rng, JOINT_MIXES[mix](rng, 4))
     forest = StructuredSystem([model])
     q, v = component_first(state.r, 1.1 * state.p), rng.normal(size=(7, 4))
     ends = [forest.joint_gaps(q + s * h * v, v)[0] for s in (1, -1)]

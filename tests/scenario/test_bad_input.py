@@ -14,7 +14,7 @@ from ruamel.yaml import YAML
 from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean
 from plumbline.scenario.loader import find_scenario_file, load_scenario, load_scenario_text, load_scenarios
 
-GOOD = """\
+VALID_SCENARIO = """\
 schema_version: 1
 title: A pendulum
 purpose: A case.
@@ -26,47 +26,48 @@ bodies:
     attitude: {quaternion: [1, 0, 0, 0]}
 """
 PRINCIPAL = "{principal: [0.02, 0.03, 0.04]}"
-CASES = YAML(typ="safe").load((Path(__file__).parent / "mistakes.yaml").read_text(encoding="utf-8"))
-BODY = (
+ERROR_CASES = YAML(typ="safe").load((Path(__file__).parent / "mistakes.yaml").read_text(encoding="utf-8"))
+VALID_BODY = (
     "{mass: 1, inertia: {principal: [1, 1, 1]}, joint: {kind: ball}, proximal: [0, 0, 1], distal: [0, 0, 0], "
     "attitude: {quaternion: [1, 0, 0, 0]}}"
 )
-BARE = BODY.replace("distal: [0, 0, 0], ", "")
+BODY_WITHOUT_DISTAL = VALID_BODY.replace("distal: [0, 0, 0], ", "")
 MARKS = {
-    "FILE": GOOD, "CHAIN": GOOD[GOOD.index("bodies") :], "BODY": BODY, "BARE": BARE, "DEEP": "[" * 200_000
+    "FILE": VALID_SCENARIO, "CHAIN": VALID_SCENARIO[VALID_SCENARIO.index("bodies") :],
+    "BODY": VALID_BODY, "BARE": BODY_WITHOUT_DISTAL, "DEEP": "[" * 200_000
 }  # fmt: skip
 
 
-def problems_of(text: str) -> list[str]:
+def errors_in(text: str) -> list[str]:
     with pytest.raises(ScenarioError) as caught:
         load_scenario_text(text, "x.yaml")
     return [str(problem).removeprefix("x.yaml:") for problem in caught.value.problems]
 
 
 def test_the_unspoilt_file_is_valid():
-    load_scenario_text(GOOD)
+    load_scenario_text(VALID_SCENARIO)
 
 
 @pytest.mark.timeout(20)
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", ERROR_CASES)
 def test_one_mistake_gives_one_problem_at_its_place(case):
     old, new = (
-        reduce(lambda text, mark: text.replace(*mark), MARKS.items(), CASES[case][key])
+        reduce(lambda text, mark: text.replace(*mark), MARKS.items(), ERROR_CASES[case][key])
         for key in ("replace", "by")
     )
-    assert old in GOOD
-    found, expected = problems_of(GOOD.replace(old, new, 1)), CASES[case]["problem"]
+    assert old in VALID_SCENARIO
+    found, expected = errors_in(VALID_SCENARIO.replace(old, new, 1)), ERROR_CASES[case]["problem"]
     assert [p.startswith(expected) for p in found] == [True], f"got {found}, expected {expected!r}"
 
 
 def test_all_mistakes_of_a_file_come_at_once():
     text = (
-        GOOD.replace("1.5", "-1")
+        VALID_SCENARIO.replace("1.5", "-1")
         .replace("title", "headline")
         .replace("length: 0.4", "length: 0")
         .replace("0.04]", "9]")
     )
-    places = [problem.split(": ")[:2] for problem in problems_of(text)]
+    places = [problem.split(": ")[:2] for problem in errors_in(text)]
     assert places == [
         ["1:1", "title"],
         ["2:1", "headline"],
@@ -78,7 +79,7 @@ def test_all_mistakes_of_a_file_come_at_once():
 
 def test_all_mistakes_of_all_files_come_at_once(tmp_path):
     for name in ("a", "b"):
-        (tmp_path / f"{name}.yaml").write_text(GOOD.replace("1.5", "-1"))
+        (tmp_path / f"{name}.yaml").write_text(VALID_SCENARIO.replace("1.5", "-1"))
     with pytest.raises(ScenarioError) as caught:
         load_scenarios([tmp_path / "a.yaml", tmp_path / "b.yaml", "no-such-scenario"])
     assert [Path(p.file).name for p in caught.value.problems] == ["a.yaml", "b.yaml", "no-such-scenario"]
@@ -86,14 +87,14 @@ def test_all_mistakes_of_all_files_come_at_once(tmp_path):
 
 
 def test_a_body_in_a_run_is_placed_too():
-    head = GOOD[: GOOD.index("  - mass")]
-    load_scenario_text(head + f"  - repeat: 2\n    cycle:\n      - {BODY}\n")
-    bare = BARE.replace("mass: 1", "mass: -1")
-    assert [p[:40] for p in problems_of(head + f"  - repeat: 2\n    cycle:\n      - {bare}\n")] == [
+    head = VALID_SCENARIO[: VALID_SCENARIO.index("  - mass")]
+    load_scenario_text(head + f"  - repeat: 2\n    cycle:\n      - {VALID_BODY}\n")
+    bare = BODY_WITHOUT_DISTAL.replace("mass: 1", "mass: -1")
+    assert [p[:40] for p in errors_in(head + f"  - repeat: 2\n    cycle:\n      - {bare}\n")] == [
         "7:9: bodies[0].cycle[0].distal: is missi",
         "7:16: bodies[0].cycle[0].mass: is -1; va",
     ]
-    load_scenario_text(head + f"  - repeat: 1\n    cycle:\n      - {BARE}\n")
+    load_scenario_text(head + f"  - repeat: 1\n    cycle:\n      - {BODY_WITHOUT_DISTAL}\n")
 
 
 @pytest.mark.timeout(20)
@@ -108,7 +109,7 @@ def test_a_body_in_a_run_is_placed_too():
     ids=["aliases", "list", "keys"],
 )
 def test_a_file_that_is_too_much_ends_soon(bomb):
-    assert "has more than 50000 values (aliases followed)" in problems_of(bomb)[0]
+    assert "has more than 50000 values (aliases followed)" in errors_in(bomb)[0]
 
 
 @pytest.mark.parametrize(
@@ -119,37 +120,37 @@ def test_a_file_that_is_too_much_ends_soon(bomb):
         f"a: !{',' * 900_000} b",
         f"a: *{'b' * 900_000}",
         f"schema_version: 0x{'f' * 900_000}",
-        GOOD.replace("1.5", "'" + "1" * 900_000 + "x'"),
-        GOOD.replace("mass", "m" * 900_000),
-        GOOD.replace("A pendulum", "!" + "a" * 900 + " pendulum"),
-        GOOD.replace("kind: rod", "kind: " + "r" * 900_000),
+        VALID_SCENARIO.replace("1.5", "'" + "1" * 900_000 + "x'"),
+        VALID_SCENARIO.replace("mass", "m" * 900_000),
+        VALID_SCENARIO.replace("A pendulum", "!" + "a" * 900 + " pendulum"),
+        VALID_SCENARIO.replace("kind: rod", "kind: " + "r" * 900_000),
     ],
     ids=["tag", "verbatim tag", "tag of commas", "alias", "number", "text", "field", "short tag", "kind"],
 )
 def test_long_words_are_read_soon_and_quoted_in_part(text):
     begin = time.process_time()
-    found = problems_of(text)
+    found = errors_in(text)
     assert time.process_time() - begin < 5
     assert max(map(len, found)) < 500
 
 
 def test_reading_prints_no_warnings(recwarn):
-    anchors = GOOD.replace("mass: 1.5", "mass: &a 1.5").replace("[0, 0, 0.4]", "&a [0, 0, 0.4]")
+    anchors = VALID_SCENARIO.replace("mass: 1.5", "mass: &a 1.5").replace("[0, 0, 0.4]", "&a [0, 0, 0.4]")
     load_scenario_text(anchors)
     huge = "{matrix: [[1e308, 1e308, 1e308], [1e308, 1e308, 1e308], [1e308, 1e308, 1e308]]}"
-    (problem,) = problems_of(GOOD.replace(PRINCIPAL, huge))
+    (problem,) = errors_in(VALID_SCENARIO.replace(PRINCIPAL, huge))
     assert problem.startswith("6:23: bodies[0].inertia.matrix: ")
     assert not recwarn.list
 
 
 @pytest.mark.parametrize("loop", ["a: &a [*a]", "a: &a {b: *a}"])
 def test_an_alias_of_itself_ends(loop):
-    assert problems_of(loop)[0].startswith("1:4: is nested too deeply")
+    assert errors_in(loop)[0].startswith("1:4: is nested too deeply")
 
 
 def test_many_problems_are_counted_rather_than_listed():
     with pytest.raises(ScenarioError) as caught:
-        load_scenario_text(GOOD + "".join(f"x{i}: 1\n" for i in range(300)))
+        load_scenario_text(VALID_SCENARIO + "".join(f"x{i}: 1\n" for i in range(300)))
     assert len(caught.value.problems) == 300
     assert str(caught.value).endswith("… and 200 more problems")
 
@@ -189,7 +190,7 @@ def test_files_that_cannot_be_read(tmp_path):
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may read everything")
 def test_a_file_without_permission(tmp_path):
     path = tmp_path / "locked.yaml"
-    path.write_text(GOOD)
+    path.write_text(VALID_SCENARIO)
     path.chmod(0)
     with pytest.raises(ScenarioError, match="cannot be read: Permission denied"):
         load_scenario(path)
@@ -205,9 +206,9 @@ def test_a_pipe_does_not_hang(tmp_path):
 
 def test_byte_order_mark_and_carriage_returns_are_fine(tmp_path):
     path = tmp_path / "windows.yaml"
-    path.write_bytes(b"\xef\xbb\xbf" + GOOD.replace("\n", "\r\n").encode())
-    assert load_scenario(path).digest == load_scenario_text(GOOD, "windows.yaml").digest
-    path.write_bytes(b"\xef\xbb\xbf" + GOOD.replace("\n", "\r\n").replace("1.5", "-1").encode())
+    path.write_bytes(b"\xef\xbb\xbf" + VALID_SCENARIO.replace("\n", "\r\n").encode())
+    assert load_scenario(path).digest == load_scenario_text(VALID_SCENARIO, "windows.yaml").digest
+    path.write_bytes(b"\xef\xbb\xbf" + VALID_SCENARIO.replace("\n", "\r\n").replace("1.5", "-1").encode())
     with pytest.raises(ScenarioError, match=r":5:11: bodies\[0\].mass: is -1"):
         load_scenario(path)
 
@@ -227,7 +228,7 @@ def test_an_unknown_name_suggests_the_nearest():
 def test_two_scenarios_of_one_name_are_refused(tmp_path):
     for name in ("a", "b"):
         (tmp_path / f"{name}.yaml").write_text(
-            "name: same\n" + GOOD.replace("1.5", "1" if name == "a" else "2")
+            "name: same\n" + VALID_SCENARIO.replace("1.5", "1" if name == "a" else "2")
         )
     with pytest.raises(ScenarioError, match="name: is named 'same' like"):
         load_scenarios([tmp_path / "a.yaml", tmp_path / "b.yaml"])

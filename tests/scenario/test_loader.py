@@ -23,7 +23,7 @@ from tests.helpers.relative_equilibria import relative_equilibrium
 EPS = np.finfo(float).eps
 
 # Issue 2's list: what must be there, and what its file must contain to be that.
-SINGLE = [
+SINGLE_NAMES = [
     "conical",
     "drag-rod",
     "driven-rod",
@@ -39,7 +39,7 @@ SINGLE = [
     "tumbling-ball",
     "tumbling-rod",
 ]
-DOUBLE = {  # joints: r a rod, b a ball joint
+DOUBLE_JOINTS = {  # joints: r a rod, b a ball joint
     "double-ball-then-rod": "br",
     "double-conical": "bb",
     "double-mass-ratio-1000": "bb",
@@ -49,7 +49,7 @@ DOUBLE = {  # joints: r a rod, b a ball joint
     "double-tumbling-balls": "bb",
     "double-tumbling-rods": "rr",
 }
-CHAIN = {
+CHAIN_JOINTS = {
     "chain-10-balls": "b" * 10,
     "chain-10-rods": "r" * 10,
     "chain-10-small": "b" * 10,
@@ -59,7 +59,7 @@ CHAIN = {
     "chain-5-mixed": "rbrrb",
     "chain-50-balls": "b" * 50,
 }
-EXACT = {
+CLOSED_FORMS = {
     "rest": "rest",
     "planar-small": "planar-pendulum",
     "planar-170": "planar-pendulum",
@@ -79,24 +79,24 @@ def load(name: str) -> scenarios.Scenario:
     return scenarios.load_scenario(scenarios.find_scenario_file(name))
 
 
-def joints(name: str) -> str:
+def joint_pattern(name: str) -> str:
     return "".join("r" if rod else "b" for rod in load(name).model.rods)
 
 
-def close(got, expected, ulps=4):
+def assert_close(got, expected, ulps=4):
     scale = max(1.0, float(np.max(np.abs(expected))))
     np.testing.assert_allclose(got, expected, rtol=0, atol=ulps * EPS * scale)
 
 
 def test_the_catalogue_is_the_issues_list():
-    assert list(scenarios.catalogue()) == [*SINGLE, *DOUBLE, *CHAIN]
-    assert {name: joints(name) for name in DOUBLE} == DOUBLE
-    assert {name: joints(name) for name in CHAIN} == CHAIN
+    assert list(scenarios.catalogue()) == [*SINGLE_NAMES, *DOUBLE_JOINTS, *CHAIN_JOINTS]
+    assert {name: joint_pattern(name) for name in DOUBLE_JOINTS} == DOUBLE_JOINTS
+    assert {name: joint_pattern(name) for name in CHAIN_JOINTS} == CHAIN_JOINTS
     exact = {name: load(name).closed_form for name in scenarios.catalogue()}
-    assert {name: solution for name, solution in exact.items() if solution} == EXACT
+    assert {name: solution for name, solution in exact.items() if solution} == CLOSED_FORMS
 
 
-@pytest.mark.parametrize("name", [*SINGLE, *DOUBLE, *CHAIN])
+@pytest.mark.parametrize("name", [*SINGLE_NAMES, *DOUBLE_JOINTS, *CHAIN_JOINTS])
 def test_scenario_starts_exactly_on_the_manifold(name):
     s = load(name)
     check_state(s.model, s.state)
@@ -110,7 +110,7 @@ def test_scenario_starts_exactly_on_the_manifold(name):
     assert np.all(along <= 2 * EPS * np.maximum(np.linalg.norm(s.state.udot, axis=1), 1e-300))
 
 
-@pytest.mark.parametrize("name", [*SINGLE, *DOUBLE, *CHAIN])
+@pytest.mark.parametrize("name", [*SINGLE_NAMES, *DOUBLE_JOINTS, *CHAIN_JOINTS])
 def test_scenario_says_what_it_is(name):
     s = load(name)
     assert (s.name, s.family, s.schema_version) == (name, s.path.parent.name, 1)
@@ -154,9 +154,9 @@ def test_rest_is_at_rest_below_the_pivot():
 def test_planar_scenarios_move_in_one_plane(name):
     s = load(name)
     normal = rotation_matrix(s.state.p)[:, :, 1]  # each body's y axis
-    close(normal, normal[:1] * np.ones_like(normal))
+    assert_close(normal, normal[:1] * np.ones_like(normal))
     assert abs(normal[0, 2]) < EPS and np.all(np.abs(normal[0, :2]) > 0.1)  # horizontal, no axis of the world
-    close(s.state.r @ normal[0], np.zeros(s.model.n))
+    assert_close(s.state.r @ normal[0], np.zeros(s.model.n))
     assert not np.any(s.state.omega[:, [0, 2]])
     assert not np.any(s.model.inertia[:, 1, [0, 2]]) and not np.any(s.model.proximal[:, 1])
 
@@ -207,10 +207,10 @@ def test_steady_scenarios_are_the_roots_that_their_file_claims(name):
     ours = Rotation.from_euler("z", np.arctan2(*s.state.r[0, 1::-1]) - np.arctan2(*r[0, 1::-1])).as_matrix()
     lever = rotation_matrix(s.state.p) @ s.model.inertia @ rotation_matrix(s.state.p).transpose(0, 2, 1)
     again = ours @ rotation_matrix(p) @ s.model.inertia @ rotation_matrix(p).transpose(0, 2, 1) @ ours.T
-    close(again, lever, 8)  # attitudes as far as a symmetric body's angle about its own axis allows
-    close(np.einsum("ij,kj->ki", ours, u), s.state.u, 8)
+    assert_close(again, lever, 8)  # attitudes as far as a symmetric body's angle about its own axis allows
+    assert_close(np.einsum("ij,kj->ki", ours, u), s.state.u, 8)
     up = np.einsum("kij,kj->ki", rotation_matrix(s.state.p), s.state.omega)
-    close(up, np.array([[0.0, 0.0, 5.0]] * s.model.n), 2)
+    assert_close(up, np.array([[0.0, 0.0, 5.0]] * s.model.n), 2)
     assert np.max(np.linalg.norm(s.state.r[:, :2], axis=1)) > 0.1  # a cone, not hanging at rest
 
 
@@ -233,14 +233,14 @@ CONVENTIONS = [
 ]
 
 
-def same_attitude(p, other):
-    return close(rotation_matrix(np.asarray(p)), Rotation.from_matrix(other).as_matrix(), 16)
+def assert_same_attitude(p, other):
+    return assert_close(rotation_matrix(np.asarray(p)), Rotation.from_matrix(other).as_matrix(), 16)
 
 
 @given(directions, st.floats(-7, 7))
 def test_axis_angle_is_scipys(axis, angle):
     p = attitude_quaternion(Attitude.model_validate({"axis_angle": {"axis": axis, "angle": angle}}))
-    same_attitude(p, Rotation.from_rotvec(angle * np.array(axis) / np.linalg.norm(axis)).as_matrix())
+    assert_same_attitude(p, Rotation.from_rotvec(angle * np.array(axis) / np.linalg.norm(axis)).as_matrix())
 
 
 @given(st.sampled_from(CONVENTIONS), st.lists(st.floats(-400, 400), min_size=3, max_size=3))
@@ -251,7 +251,7 @@ def test_euler_angles_are_scipys(convention, degrees):
     order, axes = convention.split()
     axes = axes.upper() if order == "intrinsic" else axes
     with np.errstate(all="ignore"):
-        same_attitude(p, Rotation.from_euler(axes, degrees, degrees=True).as_matrix())
+        assert_same_attitude(p, Rotation.from_euler(axes, degrees, degrees=True).as_matrix())
 
 
 @given(
@@ -261,7 +261,7 @@ def test_euler_angles_are_scipys(convention, degrees):
 def test_quaternions_of_any_length_are_normalised(q, scale):
     p = attitude_quaternion(Attitude.model_validate({"quaternion": [scale * x for x in q]}))
     assert abs(np.linalg.norm(p) - 1) <= 4 * EPS
-    close(p, np.array(q) / np.linalg.norm(q), 8)
+    assert_close(p, np.array(q) / np.linalg.norm(q), 8)
 
 
 @given(st.lists(st.floats(1e-3, 1), min_size=3, max_size=3), directions, st.floats(-7, 7))
@@ -270,7 +270,7 @@ def test_the_three_forms_of_an_inertia_are_one(moments, axis, angle):
     axes = {"axis_angle": {"axis": axis, "angle": angle}}
     J = inertia_matrix(Inertia.model_validate({"principal": [b + c, a + c, a + b], "axes": axes}))
     R = rotation_matrix(attitude_quaternion(Attitude.model_validate(axes)))
-    close(R.T @ J @ R, np.diag([b + c, a + c, a + b]), 16)
+    assert_close(R.T @ J @ R, np.diag([b + c, a + c, a + b]), 16)
     six = [J[0, 0], J[1, 1], J[2, 2], J[0, 1], J[0, 2], J[1, 2]]
     np.testing.assert_array_equal(inertia_matrix(Inertia.model_validate({"six": six})), J)
     np.testing.assert_array_equal(inertia_matrix(Inertia.model_validate({"matrix": J.tolist()})), J)
@@ -314,14 +314,14 @@ def as_yaml(document: dict) -> str:
     return json.dumps(document, ensure_ascii=False)
 
 
-def document(chain: list, **more) -> dict:
+def scenario_document(chain: list, **more) -> dict:
     return {"schema_version": 1, "title": "A chain", "purpose": "Random.", "bodies": chain, **more}
 
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(bodies, min_size=1, max_size=4), vectors)
 def test_random_scenarios_come_back_bit_for_bit(chain, gravity):
-    s = scenarios.load_scenario_text(as_yaml(document(chain, gravity=gravity)))
+    s = scenarios.load_scenario_text(as_yaml(scenario_document(chain, gravity=gravity)))
     m = s.model
     np.testing.assert_array_equal(m.mass, [b["mass"] for b in chain])
     np.testing.assert_array_equal(m.gravity, gravity)
@@ -343,8 +343,8 @@ def test_random_scenarios_come_back_bit_for_bit(chain, gravity):
     for k, body in enumerate(chain):
         if body["joint"]["kind"] == "rod":
             u = np.array(body["joint"]["direction"]) / np.linalg.norm(body["joint"]["direction"])
-            close(s.state.u[k], u)
-            close(s.state.udot[k], np.cross(body["joint"]["angular_velocity"], u), 8 * 100)
+            assert_close(s.state.u[k], u)
+            assert_close(s.state.udot[k], np.cross(body["joint"]["angular_velocity"], u), 8 * 100)
             assert abs(s.state.u[k] @ s.state.udot[k]) <= 2 * EPS * max(
                 np.linalg.norm(s.state.udot[k]), 1e-300
             )
@@ -358,23 +358,27 @@ def test_random_scenarios_come_back_bit_for_bit(chain, gravity):
 @given(st.lists(bodies, min_size=1, max_size=3), st.integers(1, 7), directions, st.floats(-90, 90))
 def test_a_run_is_its_bodies_written_out(cycle, repeat, axis, degrees):
     turn = {"axis": axis, "degrees": degrees}
-    run = scenarios.load_scenario_text(as_yaml(document([{"repeat": repeat, "cycle": cycle, "turn": turn}])))
-    plain = scenarios.load_scenario_text(as_yaml(document([cycle[j % len(cycle)] for j in range(repeat)])))
+    run = scenarios.load_scenario_text(
+        as_yaml(scenario_document([{"repeat": repeat, "cycle": cycle, "turn": turn}]))
+    )
+    plain = scenarios.load_scenario_text(
+        as_yaml(scenario_document([cycle[j % len(cycle)] for j in range(repeat)]))
+    )
     for field in vars(run.model):
         np.testing.assert_array_equal(getattr(run.model, field), getattr(plain.model, field))
     np.testing.assert_array_equal(run.state.omega, plain.state.omega)
     for j in range(repeat):
         R = Rotation.from_rotvec(np.radians(j * degrees) * np.array(axis) / np.linalg.norm(axis)).as_matrix()
-        close(rotation_matrix(run.state.p[j]), R @ rotation_matrix(plain.state.p[j]), 32)
-        close(run.state.u[j], R @ plain.state.u[j], 32)
-        close(run.state.udot[j], R @ plain.state.udot[j], 32)
+        assert_close(rotation_matrix(run.state.p[j]), R @ rotation_matrix(plain.state.p[j]), 32)
+        assert_close(run.state.u[j], R @ plain.state.u[j], 32)
+        assert_close(run.state.udot[j], R @ plain.state.udot[j], 32)
 
 
 def test_a_rods_rate_may_be_typed_with_finite_digits():
     """A part of 1e-13 along the rod is rounding: accepted, and then taken out."""
     text = (scenarios.CATALOGUE_FOLDER / "single" / "spherical.yaml").read_text(encoding="utf-8")
     s = scenarios.load_scenario_text(text.replace("[0.4, 2.5, 0.3]", "[0.8, 0, 0.6000000000003]"))
-    close(s.state.udot[0], [0.8, 0, 0.6], 2000)
+    assert_close(s.state.udot[0], [0.8, 0, 0.6], 2000)
     assert abs(s.state.u[0] @ s.state.udot[0]) <= 2 * EPS
 
 
@@ -389,9 +393,9 @@ def test_a_run_turns_its_rods_rates_too():
     }
     body["attitude"] = {"quaternion": [1, 0, 0, 0]}
     run = {"repeat": 3, "cycle": [body], "turn": {"axis": [0, 0, 1], "degrees": 90}}
-    s = scenarios.load_scenario_text(as_yaml(document([run])))
-    close(s.state.u, [[0.6, 0, -0.8], [0, 0.6, -0.8], [-0.6, 0, -0.8]])
-    close(s.state.udot, [[0.8, 1.5, 0.6], [-1.5, 0.8, 0.6], [-0.8, -1.5, 0.6]])
+    s = scenarios.load_scenario_text(as_yaml(scenario_document([run])))
+    assert_close(s.state.u, [[0.6, 0, -0.8], [0, 0.6, -0.8], [-0.6, 0, -0.8]])
+    assert_close(s.state.udot, [[0.8, 1.5, 0.6], [-1.5, 0.8, 0.6], [-0.8, -1.5, 0.6]])
 
 
 def test_made_content_passes_the_checks_of_a_file():
@@ -404,12 +408,12 @@ def test_made_content_passes_the_checks_of_a_file():
     }
     chain = [{**body, "distal": [0.0, 0.0, -0.3]}, body]
     made, written = (
-        scenarios.scenario_from_dict(document(chain), "x.yaml"),
-        scenarios.load_scenario_text(as_yaml(document(chain)), "x.yaml"),
+        scenarios.scenario_from_dict(scenario_document(chain), "x.yaml"),
+        scenarios.load_scenario_text(as_yaml(scenario_document(chain)), "x.yaml"),
     )
     assert (made.digest, made.name) == (written.digest, written.name)
     with pytest.raises(scenarios.ScenarioError) as refused:
-        scenarios.scenario_from_dict(document([{**body, "mass": -1.0}, body]), "x.yaml")
+        scenarios.scenario_from_dict(scenario_document([{**body, "mass": -1.0}, body]), "x.yaml")
     assert [(p.file, p.field) for p in refused.value.problems] == [
         ("x.yaml", "bodies[0].distal"), ("x.yaml", "bodies[0].mass"),
     ]  # fmt: skip

@@ -15,7 +15,7 @@ from reports.results import Results
 KEY = "s/mujoco/state/-/acceleration"
 
 
-def night(folder, day, verdicts, version="4.0", known=None, family="single", number=0):
+def store_run(folder, day, verdicts, version="4.0", known=None, family="single", number=0):
     """Store a run of one scenario per verdict: "s", then "s1", …; as a nightly's where it has a number."""
     rows = []
     for k, verdict in enumerate(verdicts):
@@ -38,11 +38,11 @@ def night(folder, day, verdicts, version="4.0", known=None, family="single", num
 
 
 def test_first_bad_night_and_last_green(tmp_path):
-    night(tmp_path, 1, ["disagrees", "agrees"])  # an old trouble that went away
-    night(tmp_path, 2, ["agrees", "agrees"])
-    night(tmp_path, 3, ["agrees", "unresolved"], known="k")  # expected: green
-    night(tmp_path, 4, ["disagrees", "agrees"], version="4.1")
-    night(tmp_path, 5, ["failed", "agrees"], version="4.1")
+    store_run(tmp_path, 1, ["disagrees", "agrees"])  # an old trouble that went away
+    store_run(tmp_path, 2, ["agrees", "agrees"])
+    store_run(tmp_path, 3, ["agrees", "unresolved"], known="k")  # expected: green
+    store_run(tmp_path, 4, ["disagrees", "agrees"], version="4.1")
+    store_run(tmp_path, 5, ["failed", "agrees"], version="4.1")
     history = History(tmp_path)
     (found,) = history.first_bad()
     assert (found["key"], found["first_bad"], found["last_good"]) == (
@@ -62,16 +62,16 @@ def test_first_bad_night_and_last_green(tmp_path):
 
 
 def test_a_key_that_was_never_good(tmp_path):
-    night(tmp_path, 1, ["disagrees"])
-    night(tmp_path, 2, ["disagrees"])
+    store_run(tmp_path, 1, ["disagrees"])
+    store_run(tmp_path, 2, ["disagrees"])
     history = History(tmp_path)
     assert [(f["first_bad"], f["last_good"]) for f in history.first_bad()] == [("20260101T000000Z", None)]
     assert history.changes_since_green() == (None, [])
 
 
 def test_random_scenarios_are_counted_only(tmp_path):
-    night(tmp_path, 1, ["agrees", "agrees"], family="random")
-    night(tmp_path, 2, ["disagrees"], family="random")
+    store_run(tmp_path, 1, ["agrees", "agrees"], family="random")
+    store_run(tmp_path, 2, ["disagrees"], family="random")
     history = History(tmp_path)
     assert history.first_bad() == [] and history.changes_since_green()[1] == []
     assert [n["random"] for n in history.overview()] == [2, 1]
@@ -79,7 +79,7 @@ def test_random_scenarios_are_counted_only(tmp_path):
 
 def test_nights_keep_their_order_when_the_clock_is_set_back(tmp_path):
     for number, (day, verdict) in enumerate([(5, "agrees"), (6, "agrees"), (1, "disagrees")], 1):
-        night(tmp_path, day, [verdict], number=number)
+        store_run(tmp_path, day, [verdict], number=number)
     ids = [f"2026010{day}T000000Z" for day in (5, 6, 1)]
     history = History(tmp_path)
     assert [n.id for n in history.nights] == ids
@@ -90,38 +90,40 @@ def test_nights_keep_their_order_when_the_clock_is_set_back(tmp_path):
     report = ReportHistory.load(tmp_path, last)
     assert [n.run["id"] for n in report.nights] == ids[:2], "the report has the same nights before this one"
     assert report.last_passed.run["id"] == ids[1] and report.is_new(last.rows[0])
-    night(tmp_path / "unfinished", 2, ["disagrees"])  # the next night, before it is moved to the history
+    store_run(tmp_path / "unfinished", 2, ["disagrees"])  # the next night, before it is moved to the history
     next_one = Results.load(tmp_path / "unfinished" / "20260102T000000Z")
     assert [n.run["id"] for n in ReportHistory.load(tmp_path, next_one).nights] == ids
 
 
-def spoil_json(folder):
+def truncate_json(folder):
     (folder / "results.json").write_text("{")
 
 
-def spoil_parquet(folder):
+def truncate_parquet(folder):
     path = folder / "summary.parquet"
     path.write_bytes(path.read_bytes()[:-8])
 
 
-def drop_parquet(folder):
+def delete_parquet(folder):
     (folder / "summary.parquet").unlink()
 
 
-def other_schema(folder):
+def change_schema_version(folder):
     document = json.loads((folder / "results.json").read_text())
     (folder / "results.json").write_text(json.dumps(document | {"schema_version": 99}))
 
 
-def fewer_rows(folder):
+def remove_rows(folder):
     document = json.loads((folder / "results.json").read_text())
     (folder / "results.json").write_text(json.dumps(document | {"rows": []}))
 
 
-@pytest.mark.parametrize("spoil", [spoil_json, spoil_parquet, drop_parquet, other_schema, fewer_rows])
+@pytest.mark.parametrize(
+    "spoil", [truncate_json, truncate_parquet, delete_parquet, change_schema_version, remove_rows]
+)
 def test_a_damaged_night_is_named_and_left_out(tmp_path, spoil):
     for day in (1, 2, 3):
-        night(tmp_path, day, ["agrees"])
+        store_run(tmp_path, day, ["agrees"])
     spoil(tmp_path / "20260102T000000Z")
     history = History(tmp_path)
     assert [n.id for n in history.nights] == ["20260101T000000Z", "20260103T000000Z"]
@@ -136,8 +138,8 @@ def test_an_empty_folder_has_no_nights(tmp_path):
 
 
 def test_the_command_says_it(tmp_path):
-    night(tmp_path / "history", 1, ["agrees"])
-    night(tmp_path / "history", 2, ["disagrees"])
+    store_run(tmp_path / "history", 1, ["agrees"])
+    store_run(tmp_path / "history", 2, ["disagrees"])
     said = CliRunner().invoke(main, ["history", str(tmp_path)])
     assert said.exit_code == 0, said.output
     assert f"{KEY} disagrees since 20260102T000000Z" in " ".join(said.output.split())

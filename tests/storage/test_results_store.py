@@ -39,7 +39,7 @@ STATES = [
 ]
 
 
-def write(folder):
+def write_results(folder):
     tables = results_store.ResultTables()
     names = {"scenario": "s", "engine": "mujoco", "quantity": "q"}
     for part in ([0], [1, 2]):
@@ -59,7 +59,7 @@ def write(folder):
 
 
 def test_what_is_written_is_read_back(tmp_path):
-    write(tmp_path / "new")
+    write_results(tmp_path / "new")
     document = results_store.read_results(tmp_path / "new")
     (row,) = document["rows"]
     assert row["key"] == "s/mujoco/state/-/acceleration"
@@ -72,7 +72,7 @@ def test_what_is_written_is_read_back(tmp_path):
 
 
 def test_nothing_temporary_is_left(tmp_path):
-    write(tmp_path)
+    write_results(tmp_path)
     assert {p.name for p in tmp_path.iterdir()} == {"results.json"} | {
         f"{n}.parquet" for n in results_store.TABLES
     }

@@ -21,10 +21,10 @@ from plumbline.scenario import loader
 from plumbline.storage.history import History
 
 ROOT = Path(__file__).resolve().parents[2]
-ERRORS = [errno.ENOSPC, errno.EIO, errno.EROFS, errno.EDQUOT]
+DISK_ERRORS = [errno.ENOSPC, errno.EIO, errno.EROFS, errno.EDQUOT]
 
 
-class Here(Executor):
+class InProcessWorkers(Executor):
     """Stands for the pool of workers: the same calls in this process, so that hundreds of runs are quick."""
 
     capacity = 1
@@ -39,7 +39,7 @@ class Here(Executor):
         return [(self.task, workers.run_task(self.task))]
 
 
-class Disk:
+class FaultyDisk:
     """Counts every step of every write; fails the ``at``-th, once or from then on."""
 
     def __init__(self, monkeypatch):
@@ -99,18 +99,18 @@ class Disk:
         if self.at and (self.steps == self.at or (self.for_good and self.steps > self.at)):
             raise OSError(self.error, os.strerror(self.error))
 
-    def fault(self, at, error=errno.ENOSPC, for_good=False):
-        self.steps, self.at, self.error, self.for_good = 0, at, error, for_good
+    def fail_at(self, failing_step, error=errno.ENOSPC, persistent=False):
+        self.steps, self.at, self.error, self.for_good = 0, failing_step, error, persistent
 
-    def mend(self):
-        self.fault(0)
+    def repair(self):
+        self.fail_at(0)
 
 
 @pytest.fixture
-def disk(monkeypatch):
-    monkeypatch.setattr(runner, "WorkerPool", Here)
+def faulty_disk(monkeypatch):
+    monkeypatch.setattr(runner, "WorkerPool", InProcessWorkers)
     monkeypatch.setattr(nightly, "Plan", lambda *a, **k: Plan(*a, **k, random_state_count=1))
-    return Disk(monkeypatch)
+    return FaultyDisk(monkeypatch)
 
 
 def night(out):
@@ -123,11 +123,11 @@ def night(out):
     return [replace(row, cpu_time=0.0) for row in result.rows], place
 
 
-def fail_and_go_on(disk, out, expected, at, error, for_good):
-    disk.fault(at, error, for_good)
+def check_recovery(disk, out, expected, failing_step, error, persistent):
+    disk.fail_at(failing_step, error, persistent)
     with pytest.raises(OSError, match=os.strerror(error)):
         night(out)
-    disk.mend()
+    disk.repair()
     found = History(out) if out.exists() else None
     if found:
         assert not found.damaged and len(found.nights) <= 1  # 1: whole, a later step failed
@@ -138,31 +138,31 @@ def fail_and_go_on(disk, out, expected, at, error, for_good):
     assert not list(out.rglob(".*")), "temporary files are left"
 
 
-def every_step(disk, tmp_path, errors, manners):
+def check_every_step(disk, tmp_path, errors, persistence):
     expected, _ = night(tmp_path / "calm")
-    disk.mend()
+    disk.repair()
     assert night(tmp_path / "count")[0] == expected
     steps = disk.steps
     faults = 0
     for at in range(1, steps + 1):
         for error in errors:
-            for for_good in manners:
+            for for_good in persistence:
                 out = tmp_path / f"{at}-{error}-{for_good}"
-                fail_and_go_on(disk, out, expected, at, error, for_good)
+                check_recovery(disk, out, expected, at, error, for_good)
                 faults += 1
     return steps, faults
 
 
 @pytest.mark.timeout(300)
-def test_a_full_disk_at_every_step_of_every_write(disk, tmp_path):
-    steps, _ = every_step(disk, tmp_path, [errno.ENOSPC], [False])
+def test_a_full_disk_at_every_step_of_every_write(faulty_disk, tmp_path):
+    steps, _ = check_every_step(faulty_disk, tmp_path, [errno.ENOSPC], [False])
     assert steps > 30, "the faults no longer reach the writes"
 
 
 @pytest.mark.full
 @pytest.mark.timeout(3600)
-def test_every_error_at_every_step_once_and_for_good(disk, tmp_path, record_testsuite_property):
-    steps, faults = every_step(disk, tmp_path, ERRORS, [False, True])
+def test_every_error_at_every_step_once_and_for_good(faulty_disk, tmp_path, record_testsuite_property):
+    steps, faults = check_every_step(faulty_disk, tmp_path, DISK_ERRORS, [False, True])
     record_testsuite_property("steps of writing", steps)
     record_testsuite_property("faults injected", faults)
 
@@ -197,7 +197,7 @@ def test_a_clock_set_back_overwrites_no_night(tmp_path):
 
 def test_nights_are_told_in_the_order_in_which_they_were_made(tmp_path, monkeypatch):
     """The clock is set back, forward within the second night, and then shows the first one again."""
-    monkeypatch.setattr(runner, "WorkerPool", Here)
+    monkeypatch.setattr(runner, "WorkerPool", InProcessWorkers)
     monkeypatch.setattr(nightly, "Plan", lambda *a, **k: Plan(*a, **k, random_state_count=1))
     days = iter([10, 10, 5, 8, 10, 10])  # when a night begins, and when its run does
 

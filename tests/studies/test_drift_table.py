@@ -19,7 +19,7 @@ from plumbline.studies import drift
 from reference_impl.stabilised import VARIANTS
 
 
-def measured(names: Sequence[str], longest: float, **options: Any) -> list[dict[str, Any]]:
+def measure_drift(names: Sequence[str], longest: float, **options: Any) -> list[dict[str, Any]]:
     found: list[dict[str, Any]] = drift.measure_drift(
         scenarios.load_scenarios(names), longest, rtols=(1e-6,), **options
     ).to_pylist()
@@ -28,7 +28,7 @@ def measured(names: Sequence[str], longest: float, **options: Any) -> list[dict[
 
 def test_every_variant_and_time_has_a_row_and_the_drift_is_the_raw_one(tmp_path: Path) -> None:
     told: list[str] = []
-    rows = measured(["tumbling-ball"], 60, times=(1.0, 10.0), log=told.append)
+    rows = measure_drift(["tumbling-ball"], 60, times=(1.0, 10.0), log=told.append)
     assert [(row["variant"], row["time"]) for row in rows] == [(v, t) for v in VARIANTS for t in (1.0, 10.0)]
     late = {row["variant"]: row for row in rows if row["time"] == 10.0}
     assert late["raw"]["gap"] > 10 * late["baumgarte"]["gap"] > 1e-11
@@ -39,7 +39,7 @@ def test_every_variant_and_time_has_a_row_and_the_drift_is_the_raw_one(tmp_path:
 
 
 def test_a_time_that_costs_too_much_is_left_out_and_says_so() -> None:
-    rows = measured(["tumbling-ball"], 0.001, times=(1.0, 10.0))
+    rows = measure_drift(["tumbling-ball"], 0.001, times=(1.0, 10.0))
     for first, second in zip(rows[::2], rows[1::2], strict=True):
         assert first["gap"] is not None
         assert first["reason"] == ""

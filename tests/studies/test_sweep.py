@@ -26,7 +26,7 @@ from plumbline.truth.ground_truth import MotionTruth, motion_truth
 from tests.helpers import pendulums
 from tests.helpers.planted_defects import MOTION_DEFECTS, Defect, plant
 
-FILE = """\
+SWEEP_FILE = """\
 schema_version: 1
 scenario: double-tumbling-balls
 vary:
@@ -40,14 +40,14 @@ engines: {mujoco: RK4}
 """
 
 
-def write(folder: Path, text: str) -> Path:
+def write_sweep_file(folder: Path, text: str) -> Path:
     path = folder / "sweep.yaml"
     path.write_text(text, encoding="utf-8")
     return path
 
 
 def test_the_grid_and_the_draws(tmp_path: Path) -> None:
-    spec, cells = sweep_file.load(write(tmp_path, FILE))
+    spec, cells = sweep_file.load(write_sweep_file(tmp_path, SWEEP_FILE))
     assert len(cells) == 3 * 2 * spec.count
     assert sorted({cell.values["bodies[0].mass"] for cell in cells}) == pytest.approx([0.5, 1.0, 2.0])
     drawn = [cell.values["bodies[1].proximal[0]"] for cell in cells]
@@ -59,16 +59,16 @@ def test_the_grid_and_the_draws(tmp_path: Path) -> None:
         assert cell.scenario.model.proximal[1, 0] == cell.values["bodies[1].proximal[0]"]
         assert cell.scenario.state.omega[1, 2] == cell.values["bodies[1].angular_velocity[2]"]
         assert cell.scenario.duration == 0.25
-    again = sweep_file.load(write(tmp_path, FILE))[1]
+    again = sweep_file.load(write_sweep_file(tmp_path, SWEEP_FILE))[1]
     assert [cell.values for cell in again] == [cell.values for cell in cells]
-    assert [c.values for c in sweep_file.load(write(tmp_path, FILE.replace("7", "8")))[1]] != [
-        c.values for c in cells
-    ]
+    assert [
+        c.values for c in sweep_file.load(write_sweep_file(tmp_path, SWEEP_FILE.replace("7", "8")))[1]
+    ] != [c.values for c in cells]
 
 
 def test_a_sweep_runs_and_is_kept(tmp_path: Path) -> None:
     spec, cells = sweep_file.load(
-        write(tmp_path, FILE.replace("points: 3", "points: 2").replace("[-1, 1]", "[1]"))
+        write_sweep_file(tmp_path, SWEEP_FILE.replace("points: 3", "points: 2").replace("[-1, 1]", "[1]"))
     )
     table = sweep.run(spec, cells, jobs=1)
     kept = pq.read_table(write_table(table, tmp_path / "sweep.parquet")).to_pylist()
@@ -87,7 +87,7 @@ def test_a_sweep_runs_and_is_kept(tmp_path: Path) -> None:
 def test_values_that_make_no_pendulum_are_a_cell_with_a_reason(tmp_path: Path) -> None:
     vary = "vary: {'bodies[0].mass': {values: [-1, 1]}}"
     text = f"schema_version: 1\nscenario: tumbling-rod\n{vary}\nduration: 0.25\n"
-    spec, cells = sweep_file.load(write(tmp_path, text))
+    spec, cells = sweep_file.load(write_sweep_file(tmp_path, text))
     assert cells[0].scenario is None
     rows = sweep.run(spec, cells).to_pylist()
     assert [row["verdict"] for row in rows] == ["unsupported", "agrees"]
@@ -98,8 +98,8 @@ def test_values_that_make_no_pendulum_are_a_cell_with_a_reason(tmp_path: Path) -
 def cell() -> tuple[scenarios.Scenario, MotionTruth]:
     """A slow tumble whose every mistake shows within two seconds."""
     (s,) = scenarios.load_scenarios(["double-tumbling-balls"])
-    model = pendulums.model("bb")
-    state = pendulums.state(model, seed=2, rate=0.5)
+    model = pendulums.make_model("bb")
+    state = pendulums.state_from_seed(model, seed=2, rate=0.5)
     s = replace(s, model=model, state=state, duration=2.0, sample_interval=0.125)
     return s, motion_truth(model, state, s.times, None)
 
@@ -133,9 +133,11 @@ def test_an_engine_without_defect_agrees_in_both() -> None:
 
 
 def test_an_engine_too_coarse_to_resolve_a_mistake_is_unresolved(tmp_path: Path) -> None:
-    text = FILE.replace("points: 3", "points: 1").replace("[-1, 1]", "[1]").replace("count: 2", "count: 1")
+    text = (
+        SWEEP_FILE.replace("points: 3", "points: 1").replace("[-1, 1]", "[1]").replace("count: 2", "count: 1")
+    )
     text = text.replace("mujoco: RK4", "mujoco: Euler") + "step: 0.03125\n"
-    spec, cells = sweep_file.load(write(tmp_path, text))
+    spec, cells = sweep_file.load(write_sweep_file(tmp_path, text))
     _, row = sweep.run(spec, cells).to_pylist()
     assert (row["implementation"], row["integrator"], row["verdict"]) == ("mujoco", "Euler", "unresolved")
     assert row["position_error"] > 0 and row["finest_error"] > 0 and row["attitude_error"] > 0
@@ -157,8 +159,10 @@ def test_every_step_hits_every_sample(interval: float) -> None:
 
 
 def test_a_missing_engine_and_a_truth_that_fails_are_rows(tmp_path: Path) -> None:
-    text = FILE.replace("points: 3", "points: 1").replace("[-1, 1]", "[1]").replace("count: 2", "count: 1")
-    spec, cells = sweep_file.load(write(tmp_path, text))
+    text = (
+        SWEEP_FILE.replace("points: 3", "points: 1").replace("[-1, 1]", "[1]").replace("count: 2", "count: 1")
+    )
+    spec, cells = sweep_file.load(write_sweep_file(tmp_path, text))
     missing = EngineInfo("mujoco", "MuJoCo", "", (), "mujoco is not installed here: No module")
     with patch("plumbline.studies.sweep.describe_engine", return_value=missing):
         _, row = sweep.run(spec, cells).to_pylist()
@@ -191,4 +195,4 @@ def test_mistakes_in_the_file_are_named_with_their_place(
     tmp_path: Path, change: tuple[str, str], words: str
 ) -> None:
     with pytest.raises(ScenarioError, match=words):
-        sweep_file.load(write(tmp_path, FILE.replace(*change)))
+        sweep_file.load(write_sweep_file(tmp_path, SWEEP_FILE.replace(*change)))

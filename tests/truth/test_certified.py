@@ -24,23 +24,23 @@ from tests.helpers.random_chains import random_chain
 flint = pytest.importorskip("flint")
 mpmath = pytest.importorskip("mpmath")
 
-PATTERNS = [[0], [1], [0, 0], [1, 1], [0, 1], [1, 0], [1, 0, 1, 0]]
+JOINT_PATTERNS = [[0], [1], [0, 0], [1, 1], [0, 1], [1, 0], [1, 0, 1, 0]]
 
 
-def difference(ball: list, other: list) -> float:
+def max_difference(enclosure: list, other: list) -> float:
     """Largest distance of two lists of 3-vectors, one in balls and one in mpf, at 60 digits."""
     with mpmath.workdps(60):
-        pairs = zip((x for row in ball for x in row), (y for row in other for y in row), strict=True)
+        pairs = zip((x for row in enclosure for x in row), (y for row in other for y in row), strict=True)
         return float(max(abs(mpmath.mpf(x.mid().str(58, radius=False)) - y) for x, y in pairs))
 
 
-@pytest.mark.parametrize("rods", PATTERNS, ids=str)
+@pytest.mark.parametrize("rods", JOINT_PATTERNS, ids=str)
 @pytest.mark.parametrize("loads", [False, True])
 def test_the_notes_full_system_at_fifty_digits_agrees(rods, loads):
     model, state = random_chain(np.random.default_rng(3), rods, decades=1, loads=loads, drag=loads)
     balls, other = enclose_quantities(model, state, 250), notes_solution(model, state)
     for quantity, value in other.items():
-        assert difference(balls[quantity], value) < 1e-44 * balls["scale"][quantity], quantity
+        assert max_difference(balls[quantity], value) < 1e-44 * balls["scale"][quantity], quantity
 
 
 @pytest.mark.parametrize("rods", [[0], [1], [0, 0]], ids=str)
@@ -60,7 +60,7 @@ def check_kane(rods):
         model, state = random_chain(np.random.default_rng(seed), rods, loads=True, drag=True)
         balls, other = enclose_quantities(model, state, 250), kane_solution(model, state)
         for quantity, value in other.items():
-            assert difference(balls[quantity], value) < 1e-44 * balls["scale"][quantity], quantity
+            assert max_difference(balls[quantity], value) < 1e-44 * balls["scale"][quantity], quantity
 
 
 def test_kanes_equations_agree_for_rods_in_every_direction():
@@ -71,7 +71,8 @@ def test_kanes_equations_agree_for_rods_in_every_direction():
         turned = state_from_minimal(model, state.p, state.omega, u, np.cross([[0.3, -1.2, 2.0]], u))
         balls, other = enclose_quantities(model, turned, 250), kane_solution(model, turned)
         assert (
-            difference(balls["acceleration"], other["acceleration"]) < 1e-44 * balls["scale"]["acceleration"]
+            max_difference(balls["acceleration"], other["acceleration"])
+            < 1e-44 * balls["scale"]["acceleration"]
         )
 
 
@@ -88,11 +89,11 @@ def test_precision_rises_until_the_radius_is_small():
     answer = certify_state(model, state, bits=60)
     assert answer.bits > 60
     assert answer.radius["acceleration"] <= MAX_RELATIVE_RADIUS * max(
-        norm_max(answer.quantities.acceleration), 9.81
+        max_norm(answer.quantities.acceleration), 9.81
     )
 
 
-def norm_max(v):
+def max_norm(v):
     return float(np.max(np.linalg.norm(v, axis=-1)))
 
 

@@ -18,12 +18,14 @@ from plumbline.truth.elliptic import elliptic_f, elliptic_pi, jacobi
 from tests.helpers.relative_equilibria import relative_equilibrium
 
 TIMES = np.arange(41) * 0.05
-NAMED = {name: load_scenario(path) for name, path in catalogue().items()}
-NAMED = {name: scenario for name, scenario in NAMED.items() if scenario.closed_form}
+CLOSED_FORM_SCENARIOS = {name: load_scenario(path) for name, path in catalogue().items()}
+CLOSED_FORM_SCENARIOS = {
+    name: scenario for name, scenario in CLOSED_FORM_SCENARIOS.items() if scenario.closed_form
+}
 
 
 @dataclass(frozen=True)
-class Case:
+class ScenarioStub:
     """The part of a scenario that `closed_form_motion` reads."""
 
     closed_form: str | None
@@ -47,12 +49,12 @@ def one_body(**changes: Array) -> Model:
     return Model(**(values | changes))
 
 
-def turned(axis: list[float], angle: float) -> Array:
+def quaternion(axis: list[float], angle: float) -> Array:
     axis = np.array(axis) / np.linalg.norm(axis)
     return np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])[None]
 
 
-def start(
+def make_state(
     model: Model, p: Array, omega: list[float], u: Array | None = None, udot: Array | None = None
 ) -> State:
     none = np.zeros((model.n, 3))
@@ -61,7 +63,7 @@ def start(
     )
 
 
-def errors(case, times=TIMES):
+def closed_form_errors(case, times=TIMES):
     """Position (m) and attitude (rad) by which the closed form misses the best integration there is."""
     r, p = closed_form_motion(case)(times)
     try:
@@ -75,19 +77,21 @@ def errors(case, times=TIMES):
     return np.max(position_error(r, true_r)), np.max(attitude_error(p, true_p))
 
 
-SHORT = [name for name, scenario in NAMED.items() if not scenario.closed_form.startswith("small")]
+NOT_SMALL_OSCILLATIONS = [
+    name for name, scenario in CLOSED_FORM_SCENARIOS.items() if not scenario.closed_form.startswith("small")
+]
 
 
-@pytest.mark.parametrize("name", SHORT)
+@pytest.mark.parametrize("name", NOT_SMALL_OSCILLATIONS)
 def test_catalogue(name):
-    position, attitude = errors(NAMED[name])
+    position, attitude = closed_form_errors(CLOSED_FORM_SCENARIOS[name])
     assert position < 1e-13
     assert attitude < 1e-13
 
 
-@pytest.mark.parametrize("name", SHORT)
+@pytest.mark.parametrize("name", NOT_SMALL_OSCILLATIONS)
 def test_the_reference_agrees_with_the_closed_forms(name):
-    case = NAMED[name]
+    case = CLOSED_FORM_SCENARIOS[name]
     run = load_adapter("reference").simulate(case.model, case.state, TIMES, "collocation", 1e-14)
     r, p = closed_form_motion(case)(TIMES)
     assert np.max(position_error(r, run.r)) < 1e-11
@@ -109,11 +113,11 @@ def test_lagrange_top(name):
     tilt, omega, axial = TOPS[name]
     model = one_body(inertia=np.diag([0.02, 0.02, axial])[None])
     p = quaternion_product(
-        turned([0.3, 1.0, 0.2], 0.7),
-        quaternion_product(turned([1.0, 0.5, 0.0], tilt), turned([0, 0, 1], 1.1)),
+        quaternion([0.3, 1.0, 0.2], 0.7),
+        quaternion_product(quaternion([1.0, 0.5, 0.0], tilt), quaternion([0, 0, 1], 1.1)),
     )
-    case = Case("lagrange-top", model, start(model, p, omega))
-    position, attitude = errors(case)
+    case = ScenarioStub("lagrange-top", model, make_state(model, p, omega))
+    position, attitude = closed_form_errors(case)
     height = closed_form_motion(case)(np.linspace(0, 2, 2001))[0][:, 0, 2] / 0.2
     closest = np.min(1 - np.abs(height))  # ½ δ²: the azimuth turns fast there and loses digits
     assert position < 1e-12
@@ -122,10 +126,10 @@ def test_lagrange_top(name):
 
 def test_a_top_released_from_rest_is_refused_as_a_planar_pendulum():
     model = one_body()
-    case = Case("lagrange-top", model, start(model, turned([1, 0, 0], 1.0), [0, 0, 0]))
+    case = ScenarioStub("lagrange-top", model, make_state(model, quaternion([1, 0, 0], 1.0), [0, 0, 0]))
     with pytest.raises(ClosedFormMismatch, match="straight up or down"):
         closed_form_motion(case)
-    position, attitude = errors(replace(case, closed_form="planar-pendulum"))
+    position, attitude = closed_form_errors(replace(case, closed_form="planar-pendulum"))
     assert max(position, attitude) < 1e-12
 
 
@@ -136,11 +140,11 @@ def test_steady_precession_keeps_its_digits():
     theta, rate = 0.6, 1.7  # axis at θ from up; precession at the rate: spin from the balance
     need = (1.3 * 9.81 * 0.2 + transverse * rate**2 * np.cos(theta)) / (axial * rate)
     omega = [0.0, rate * np.sin(theta), need]
-    p = turned([1, 0, 0], theta)
-    case = Case("lagrange-top", model, start(model, p, omega))
+    p = quaternion([1, 0, 0], theta)
+    case = ScenarioStub("lagrange-top", model, make_state(model, p, omega))
     r, _ = closed_form_motion(case)(TIMES)
     assert np.ptp(r[:, 0, 2]) < 1e-14
-    assert max(errors(case)) < 1e-12
+    assert max(closed_form_errors(case)) < 1e-12
 
 
 @pytest.mark.parametrize(
@@ -150,11 +154,13 @@ def test_steady_precession_keeps_its_digits():
     "moments", [[0.02, 0.03, 0.04], [0.04, 0.02, 0.03], [0.02, 0.02, 0.03], [0.02, 0.03, 0.03]], ids=str
 )
 def test_free_top(omega, moments):
-    axes = rotation_matrix(turned([1, 2, -1], 0.8))[0]
+    axes = rotation_matrix(quaternion([1, 2, -1], 0.8))[0]
     inertia = axes @ np.diag(moments) @ axes.T
     model = one_body(inertia=(inertia + inertia.T)[None] / 2, proximal=np.zeros((1, 3)))
     spin = axes @ np.array(omega)
-    position, attitude = errors(Case("free-top", model, start(model, turned([1, 1, 0], 1.0), list(spin))))
+    position, attitude = closed_form_errors(
+        ScenarioStub("free-top", model, make_state(model, quaternion([1, 1, 0], 1.0), list(spin)))
+    )
     assert position == 0
     assert attitude < 2e-12
 
@@ -162,8 +168,8 @@ def test_free_top(omega, moments):
 @pytest.mark.parametrize("omega", [[0, 0, 5.0], [0, 3.0, 0], [0, 0, 0]], ids=str)
 def test_a_free_top_about_a_principal_axis_rotates_uniformly(omega):
     model = one_body(inertia=np.diag([0.02, 0.03, 0.04])[None], proximal=np.zeros((1, 3)))
-    state = start(model, turned([1, 1, 0], 1.0), omega)
-    _, p = closed_form_motion(Case("free-top", model, state))(TIMES)
+    state = make_state(model, quaternion([1, 1, 0], 1.0), omega)
+    _, p = closed_form_motion(ScenarioStub("free-top", model, state))(TIMES)
     half = np.linalg.norm(omega) * TIMES / 2
     axis = np.array(omega) / (np.linalg.norm(omega) or 1.0)
     expected = quaternion_product(
@@ -177,51 +183,57 @@ def test_spherical_pendulum_on_a_rod_rotates_as_a_free_top():
         inertia=np.diag([0.02, 0.03, 0.04])[None], proximal=np.zeros((1, 3)), length=np.array([0.6])
     )
     u = np.array([[0.6, 0.0, -0.8]])
-    state = start(model, turned([1, 0, 1], 0.5), [1.0, -2.0, 0.7], u, np.array([[0.4, 2.0, 0.3]]))
-    assert max(errors(Case("spherical-pendulum", model, state))) < 2e-12
+    state = make_state(model, quaternion([1, 0, 1], 0.5), [1.0, -2.0, 0.7], u, np.array([[0.4, 2.0, 0.3]]))
+    assert max(closed_form_errors(ScenarioStub("spherical-pendulum", model, state))) < 2e-12
 
 
 @pytest.mark.parametrize("rate", [0.0, 4.0, 9.0, 11.0, 16.0, -16.0])
 @pytest.mark.parametrize("angle", [0.3, 2.9, -2.0])
 def test_planar_pendulum(angle, rate):
     model = one_body(inertia=np.diag([0.02, 0.05, 0.03])[None], proximal=np.array([[0.0, 0.0, 0.3]]))
-    p = quaternion_product(turned([0, 0, 1], 0.5), turned([0, 1, 0], angle))
-    position, attitude = errors(Case("planar-pendulum", model, start(model, p, [0.0, rate, 0.0])))
+    p = quaternion_product(quaternion([0, 0, 1], 0.5), quaternion([0, 1, 0], angle))
+    position, attitude = closed_form_errors(
+        ScenarioStub("planar-pendulum", model, make_state(model, p, [0.0, rate, 0.0]))
+    )
     assert max(position, attitude) < (5e-12 if abs(angle) > 2.5 else 1e-12)
 
 
 def test_two_bodies_in_steady_conical_motion():
-    case = NAMED["double-conical"]
+    case = CLOSED_FORM_SCENARIOS["double-conical"]
     fast = np.array([2 * case.state.omega[0, 2]])
     assert fast > 0
     p, omega, u = relative_equilibrium(case.model, 6.0, case.state.p, case.state.u)
     state = state_from_minimal(case.model, p, omega, u, np.zeros_like(u))
-    assert max(errors(Case("double-conical", case.model, state))) < 1e-11
+    assert max(closed_form_errors(ScenarioStub("double-conical", case.model, state))) < 1e-11
 
 
 @pytest.mark.parametrize(
-    "name", [name for name, scenario in NAMED.items() if scenario.closed_form.startswith("small")]
+    "name",
+    [name for name, scenario in CLOSED_FORM_SCENARIOS.items() if scenario.closed_form.startswith("small")],
 )
 def test_small_oscillations_err_by_the_cube_of_the_amplitude(name):
     """Position error ∝ amplitude³, so the relative one ∝ amplitude²: halved, an eighth."""
-    case = NAMED[name]
+    case = CLOSED_FORM_SCENARIOS[name]
     found = []
     for part in (1.0, 0.5, 0.25):
-        smaller = scaled(case, part)
+        smaller = scale_oscillation(case, part)
         run = load_adapter("reference").simulate(smaller.model, smaller.state, TIMES, "collocation", 1e-14)
         motion = closed_form_motion(smaller)
         found.append(np.max(position_error(motion(TIMES)[0], run.r)))
         assert motion.amplitude == pytest.approx(part * closed_form_motion(case).amplitude, rel=1e-4)
-        assert found[-1] < motion.amplitude**2 * np.max(np.abs(smaller.state.r - hanging(smaller).r)) * 100
+        assert (
+            found[-1]
+            < motion.amplitude**2 * np.max(np.abs(smaller.state.r - equilibrium_state(smaller).r)) * 100
+        )
     assert found[0] / found[1] == pytest.approx(8, rel=0.1)
     assert found[1] / found[2] == pytest.approx(8, rel=0.2)
 
 
-def hanging(case):
-    return scaled(case, 0.0).state
+def equilibrium_state(case):
+    return scale_oscillation(case, 0.0).state
 
 
-def scaled(case, part):
+def scale_oscillation(case, part):
     """The same small motion with angles and rates times ``part``."""
     p = np.empty_like(case.state.p)
     for k in range(case.model.n):
@@ -230,57 +242,81 @@ def scaled(case, part):
         axis = np.cross(s, [0, 0, 1.0])
         sine = np.linalg.norm(axis)
         angle = np.arctan2(sine, s[2])
-        back = turned(list(axis if sine else [1.0, 0, 0]), (1 - part) * angle)
+        back = quaternion(list(axis if sine else [1.0, 0, 0]), (1 - part) * angle)
         p[k] = quaternion_product(back[0], case.state.p[k])
     state = state_from_minimal(case.model, p, part * case.state.omega, case.state.u, case.state.udot)
-    return Case(case.closed_form, case.model, state)
+    return ScenarioStub(case.closed_form, case.model, state)
 
 
 def test_small_oscillations_of_a_chain_with_rods():
-    model = replace(NAMED["double-planar-small"].model, length=np.array([0.0, 0.4]))
+    model = replace(CLOSED_FORM_SCENARIOS["double-planar-small"].model, length=np.array([0.0, 0.4]))
     found = []
     for part in (1.0, 0.5):
-        p = np.concatenate([turned([0, 1, 0], 0.002 * part), turned([0, 1, 0], -0.004 * part)])
+        p = np.concatenate([quaternion([0, 1, 0], 0.002 * part), quaternion([0, 1, 0], -0.004 * part)])
         u = np.array([[0, 0, 0], [-np.sin(0.003 * part), 0, -np.cos(0.003 * part)]])
         udot = np.cross([[0, 0, 0], [0, 0.01 * part, 0]], u)
         state = state_from_minimal(model, p, np.zeros((2, 3)), u, udot)
-        found.append(errors(Case("small-double", model, state))[0])
+        found.append(closed_form_errors(ScenarioStub("small-double", model, state))[0])
     assert found[0] < 1e-6
     assert found[0] / found[1] == pytest.approx(8, rel=0.01)
 
 
-WRONG = {
-    "planar-pendulum": (one_body(), start(one_body(), turned([1, 0, 0], 1.0), [1.0, 1.0, 1.0]), "axis"),
+REFUSED_MOTIONS = {
+    "planar-pendulum": (
+        one_body(),
+        make_state(one_body(), quaternion([1, 0, 0], 1.0), [1.0, 1.0, 1.0]),
+        "axis",
+    ),
     "lagrange-top": (
         one_body(inertia=np.diag([0.02, 0.021, 0.03])[None]),
-        start(one_body(), turned([1, 0, 0], 1.0), [1.0, 1.0, 1.0]),
+        make_state(one_body(), quaternion([1, 0, 0], 1.0), [1.0, 1.0, 1.0]),
         "symmetric",
     ),
-    "spherical-pendulum": (one_body(), start(one_body(), turned([1, 0, 0], 1.0), [1.0, 1.0, 1.0]), "no spin"),
-    "free-top": (one_body(), start(one_body(), turned([1, 0, 0], 1.0), [1.0, 1.0, 1.0]), "centre of mass"),
-    "conical": (one_body(), start(one_body(), turned([1, 0, 0], 1.0), [1.0, 1.0, 1.0]), "same vertical"),
-    "rest": (one_body(), start(one_body(), turned([1, 0, 0], 1.0), [0.0, 0.0, 0.0]), "balance"),
-    "small-chain": (one_body(), start(one_body(), turned([1, 0, 0], 1.0), [1.0, 1.0, 1.0]), "one plane"),
+    "spherical-pendulum": (
+        one_body(),
+        make_state(one_body(), quaternion([1, 0, 0], 1.0), [1.0, 1.0, 1.0]),
+        "no spin",
+    ),
+    "free-top": (
+        one_body(),
+        make_state(one_body(), quaternion([1, 0, 0], 1.0), [1.0, 1.0, 1.0]),
+        "centre of mass",
+    ),
+    "conical": (
+        one_body(),
+        make_state(one_body(), quaternion([1, 0, 0], 1.0), [1.0, 1.0, 1.0]),
+        "same vertical",
+    ),
+    "rest": (one_body(), make_state(one_body(), quaternion([1, 0, 0], 1.0), [0.0, 0.0, 0.0]), "balance"),
+    "small-chain": (
+        one_body(),
+        make_state(one_body(), quaternion([1, 0, 0], 1.0), [1.0, 1.0, 1.0]),
+        "one plane",
+    ),
 }
 
 
-@pytest.mark.parametrize("kind", WRONG)
+@pytest.mark.parametrize("kind", REFUSED_MOTIONS)
 def test_another_motion_is_refused_with_the_condition(kind):
-    model, state, words = WRONG[kind]
+    model, state, words = REFUSED_MOTIONS[kind]
     with pytest.raises(ClosedFormMismatch, match=words):
-        closed_form_motion(Case(kind, model, state))
+        closed_form_motion(ScenarioStub(kind, model, state))
 
 
 @pytest.mark.parametrize("kind", CLOSED_FORMS)
 def test_loads_are_refused(kind):
-    case = next(s for s in NAMED.values() if s.closed_form == kind)
+    case = next(s for s in CLOSED_FORM_SCENARIOS.values() if s.closed_form == kind)
     with pytest.raises(ClosedFormMismatch, match="no loads"):
-        closed_form_motion(Case(kind, replace(case.model, moment=case.model.moment + 0.1), case.state))
+        closed_form_motion(
+            ScenarioStub(kind, replace(case.model, moment=case.model.moment + 0.1), case.state)
+        )
 
 
 def test_a_scenario_without_closed_form_has_no_motion():
     assert (
-        closed_form_motion(Case(None, one_body(), start(one_body(), turned([1, 0, 0], 1.0), [0, 0, 0])))
+        closed_form_motion(
+            ScenarioStub(None, one_body(), make_state(one_body(), quaternion([1, 0, 0], 1.0), [0, 0, 0]))
+        )
         is None
     )
 

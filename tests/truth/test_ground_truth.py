@@ -34,7 +34,7 @@ TIMES = np.linspace(0, 1, 9)
 def test_stretched_length_is_the_largest_extent_of_each_body() -> None:
     """At least to its centre, at least its radius of gyration; nothing hangs on the last."""
     model = replace(
-        pendulums.model("rbb"),
+        pendulums.make_model("rbb"),
         mass=np.array([1.0, 2.0, 4.0]),
         inertia=np.array([1e-4, 1e-4, 8.0 * 2 / 3])[:, None, None] * np.eye(3),
         proximal=np.array([[0, 0, 0.3], [0.6, 0, 0], [0, 0, 0.5]]),
@@ -58,8 +58,8 @@ def test_the_least_effect_ignores_invisible_ones() -> None:
 
 @pytest.mark.parametrize("joints", ["b", "rb"])
 def test_each_perturbed_model_has_one_kind_of_error_of_one_part_in_ten_thousand(joints: str) -> None:
-    model = pendulums.model(joints)
-    at = pendulums.state(model, seed=5)
+    model = pendulums.make_model(joints)
+    at = pendulums.state_from_seed(model, seed=5)
     altered = [{"gravity"}, {"mass"}, {"inertia"}, {"proximal", "distal"}]
     found = perturbed_models(model, at)
     assert len(found) == len(altered)
@@ -86,7 +86,7 @@ def test_each_perturbed_model_has_one_kind_of_error_of_one_part_in_ten_thousand(
 
 
 def test_detectable_effects_are_the_least_on_positions_and_attitudes() -> None:
-    model = pendulums.model("b")
+    model = pendulums.make_model("b")
     length = float(np.sum(stretched_length(model)))
     r, p = np.zeros((4, 9, 1, 3)), np.tile([1.0, 0, 0, 0], (4, 9, 1, 1))
     for k, size in enumerate((2e-5, 5e-5, 0.9e-3 * DETECTABLE_PARAMETER_ERROR * length), start=1):
@@ -107,7 +107,7 @@ def test_detectable_effects_are_the_least_on_positions_and_attitudes() -> None:
 
 def test_state_truth_is_certified_or_states_that_it_is_not() -> None:
     pytest.importorskip("flint")
-    model = pendulums.model("rb", loads=True, drag=True)
+    model = pendulums.make_model("rb", loads=True, drag=True)
     states = random_states(model, 3, seed=2)
     found = ground_truth.state_truth(model, states)
     assert re.fullmatch(r"certified: enclosed in ball arithmetic of \d+ bits", found.method)
@@ -126,8 +126,8 @@ def test_state_truth_is_certified_or_states_that_it_is_not() -> None:
 
 
 def test_motion_truth_holds_growth_length_and_detectable_effects() -> None:
-    model = pendulums.model("bb")
-    at = pendulums.state(model, seed=2, rate=0.5)
+    model = pendulums.make_model("bb")
+    at = pendulums.state_from_seed(model, seed=2, rate=0.5)
     found, run = motion_truth(model, at, TIMES, None), trajectory_truth(model, at, TIMES)
     for name in ("r", "p", "v", "pdot"):
         assert np.array_equal(getattr(found.trajectory, name), getattr(run.trajectory, name))
@@ -140,8 +140,8 @@ def test_motion_truth_holds_growth_length_and_detectable_effects() -> None:
     assert found.growth == pytest.approx(
         np.maximum.accumulate(perturbation_growth(model, at, TIMES)), rel=0.05
     )
-    wrong = [pendulums.motion(m, s, TIMES) for m, s in perturbed_models(model, at)]
-    right = pendulums.motion(model, at, TIMES)
+    wrong = [pendulums.reference_trajectory(m, s, TIMES) for m, s in perturbed_models(model, at)]
+    right = pendulums.reference_trajectory(model, at, TIMES)
     shown = detectable_effect(
         model, np.array([x.r for x in (right, *wrong)]), np.array([x.p for x in (right, *wrong)])
     )
@@ -155,8 +155,8 @@ def test_motion_truth_holds_growth_length_and_detectable_effects() -> None:
 def test_two_methods_that_differ_by_more_than_rounding_are_reported(
     position: float, attitude: float, parted: bool
 ) -> None:
-    model = pendulums.model("b")
-    at = pendulums.state(model, seed=2, rate=0.5)
+    model = pendulums.make_model("b")
+    at = pendulums.state_from_seed(model, seed=2, rate=0.5)
     sound = motion_truth(model, at, TIMES, None)
     limit = 1e3 * np.finfo(float).eps * sound.growth  # 10³ ε G(t), as the rows say
     off = np.zeros(9)
@@ -172,17 +172,17 @@ def test_two_methods_that_differ_by_more_than_rounding_are_reported(
 
 
 def test_taylors_method_is_limited_in_bodies() -> None:
-    model = pendulums.model("b")
+    model = pendulums.make_model("b")
     found = motion_truth(
-        model, pendulums.state(model, seed=2, rate=0.5), TIMES[:3], None, max_compiled_bodies=0
+        model, pendulums.state_from_seed(model, seed=2, rate=0.5), TIMES[:3], None, max_compiled_bodies=0
     )
     assert "not used for more than 0 bodies" in found.method
 
 
 def test_a_closed_form_replaces_the_motion() -> None:
-    model = pendulums.model("b")
-    at = pendulums.state(model, seed=2, rate=0.5)
-    run = pendulums.motion(model, at, TIMES)
+    model = pendulums.make_model("b")
+    at = pendulums.state_from_seed(model, seed=2, rate=0.5)
+    run = pendulums.reference_trajectory(model, at, TIMES)
     found = motion_truth(model, at, TIMES, (run.r + 1e-9, run.p, "a book"))
     assert np.array_equal(found.trajectory.r, run.r + 1e-9) and "closed form: a book" in found.method
     assert found.position_uncertainty[-1] == pytest.approx(1e-9 * np.sqrt(3), rel=1e-3, abs=0)

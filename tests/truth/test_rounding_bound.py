@@ -24,12 +24,12 @@ from plumbline.truth.rounding_bound import (
     RoundingBound,
     state_rounding_bound,
 )
-from tests.helpers.random_chains import norms, random_chain, rescaled
+from tests.helpers.random_chains import in_other_units, norms_per_body, random_chain
 
 VECTORS = ("acceleration", "angular_acceleration", "joint_reaction")
 
 
-def over_bound(said, true, bound):
+def error_ratios(said, true, bound):
     """Per quantity, the largest difference over its tolerance."""
     ratios = {}
     for quantity in bound.scale:
@@ -37,7 +37,9 @@ def over_bound(said, true, bound):
         if value is None or expected is None:
             continue
         difference = np.asarray(value) - np.asarray(expected)
-        size = norms(difference) if quantity in (*VECTORS, "angular_momentum") else np.abs(difference)
+        size = (
+            norms_per_body(difference) if quantity in (*VECTORS, "angular_momentum") else np.abs(difference)
+        )
         tolerance = np.maximum(bound.tolerance(quantity), np.finfo(float).tiny)
         ratios[quantity] = float(np.max(size / tolerance))
     return ratios
@@ -60,7 +62,7 @@ def test_relative_bounds_are_independent_of_units(rods, units):
     }
     here, there = (
         state_rounding_bound(model, state),
-        state_rounding_bound(*rescaled(model, state, length, mass, second)),
+        state_rounding_bound(*in_other_units(model, state, length, mass, second)),
     )
     # a bound is itself rounded, through an inverse; a unit forgotten would be off by a power of ten
     for quantity, factor in unit.items():
@@ -72,8 +74,8 @@ def test_relative_bounds_are_independent_of_units(rods, units):
         ), quantity
 
 
-LOSES_DIGITS = "pinocchio-aba"  # on long chains and wide mass ratios, really: see the test after these
-SOUND_ENGINES = [name for name in ENGINES if name != LOSES_DIGITS]
+INACCURATE_ENGINE = "pinocchio-aba"  # on long chains and wide mass ratios, really: see the test after these
+SOUND_ENGINES = [name for name in ENGINES if name != INACCURATE_ENGINE]
 
 
 @pytest.mark.parametrize("name", SOUND_ENGINES)
@@ -110,7 +112,7 @@ def check_errors_within_bound(name, count):
         except Unsupported:
             continue
         true = certify_state(model, state, mass_matrix=n <= 3).quantities
-        for quantity, ratio in over_bound(said, true, state_rounding_bound(model, state)).items():
+        for quantity, ratio in error_ratios(said, true, state_rounding_bound(model, state)).items():
             checks += 1
             worst[quantity] = max(worst.get(quantity, 0.0), ratio)
     print(name, checks, {quantity: f"{ratio:.3f}" for quantity, ratio in worst.items()})
@@ -128,10 +130,10 @@ def test_a_real_loss_of_digits_exceeds_the_bound():
     (state,) = random_states(scenario.model, 1, seed=3)
     true, bound = certify_state(scenario.model, state).quantities, state_rounding_bound(scenario.model, state)
     recursion, matrix = (
-        load_adapter(name).evaluate(scenario.model, [state])[0] for name in (LOSES_DIGITS, "pinocchio")
+        load_adapter(name).evaluate(scenario.model, [state])[0] for name in (INACCURATE_ENGINE, "pinocchio")
     )
-    assert max(over_bound(recursion, true, bound).values()) > 10
-    assert max(over_bound(matrix, true, bound).values()) < 0.5
+    assert max(error_ratios(recursion, true, bound).values()) > 10
+    assert max(error_ratios(matrix, true, bound).values()) < 0.5
 
 
 def test_scales_do_not_vanish_with_the_quantity():
@@ -144,7 +146,7 @@ def test_scales_do_not_vanish_with_the_quantity():
         ), name
 
 
-PLANTED = {
+MODEL_ERRORS = {
     "mass": lambda model, e: replace(model, mass=model.mass * (1 + e * np.array([0.0, 1.0]))),
     "inertia": lambda model, e: replace(
         model,
@@ -159,16 +161,16 @@ PLANTED = {
 
 
 @pytest.mark.parametrize("rods, sharp", [([0, 0], 3e-11), ([1, 1], 1e-9)], ids=["balls", "rods"])
-@pytest.mark.parametrize("what", PLANTED)
+@pytest.mark.parametrize("what", MODEL_ERRORS)
 def test_a_small_parameter_error_exceeds_the_bound(what, rods, sharp):
     """The smallest relative error that ten random states show in every one of ten models."""
     pytest.importorskip("flint")
-    smallest = smallest_seen(what, rods)
+    smallest = smallest_detected_error(what, rods)
     print(f"{what} on {rods}: {smallest:.1e}")
     assert smallest < sharp
 
 
-def smallest_seen(what, rods):
+def smallest_detected_error(what, rods):
     from plumbline.truth.certified import certify_state
 
     rng, worst = np.random.default_rng(5), 0.0
@@ -179,10 +181,10 @@ def smallest_seen(what, rods):
         true = [certify_state(model, state).quantities for state in states]
 
         def seen(e, model=model, states=states, bounds=bounds, true=true):
-            wrong = PLANTED[what](model, e)
+            wrong = MODEL_ERRORS[what](model, e)
             relifted = [state_from_minimal(wrong, s.p, s.omega, s.u, s.udot) for s in states]
             said = [certify_state(wrong, state).quantities for state in relifted]
-            return any(max(over_bound(*each).values()) > 1 for each in zip(said, true, bounds, strict=True))
+            return any(max(error_ratios(*each).values()) > 1 for each in zip(said, true, bounds, strict=True))
 
         grid = 10 ** np.arange(-14, -5, 0.25)
         worst = max(worst, grid[bisect.bisect_left(grid, True, hi=len(grid) - 1, key=seen)])
@@ -242,7 +244,7 @@ def test_fifty_bodies_take_milliseconds():
     assert min(spent) < 0.2
 
 
-class ByDefinition:
+class BoundByDefinition:
     """The bound term by term, from a dense inverse with the force of every joint among the unknowns."""
 
     def __init__(self, model, state, parts):
@@ -256,8 +258,8 @@ class ByDefinition:
         self.torque = [A[k] @ model.moment[k] - model.drag_moment[k] * self.omega[k] for k in range(n)]
         self.gravity = float(np.linalg.norm(model.gravity))
         pieces = undivided_bodies(model) if parts is None else parts
-        self.arm = [max(np.linalg.norm(part.centre) for part in body) for body in pieces]
-        self.light = [min(part.mass for part in body) for body in pieces]
+        self.largest_part_offset = [max(np.linalg.norm(part.centre) for part in body) for body in pieces]
+        self.lightest_part = [min(part.mass for part in body) for body in pieces]
         self.J_min = [min(np.linalg.eigvalsh(part.inertia)[0] for part in body) for body in pieces]
         self.welded = parts is not None
         self.solve()
@@ -277,10 +279,10 @@ class ByDefinition:
             if k + 1 < n:
                 S[k, 0, :, k + 1, 2], S[k, 1, :, k + 1, 2] = eye, far
             S[k, 2, :, k, 0], S[k, 2, :, k, 1] = eye, -near
-            b[k, 2] = -self.inward(k, self.sp)
+            b[k, 2] = -self.centripetal_acceleration(k, self.sp)
             if k:
                 S[k, 2, :, k - 1, 0], S[k, 2, :, k - 1, 1] = -eye, skew(self.sd[k - 1])
-                b[k, 2] += self.inward(k - 1, self.sd)
+                b[k, 2] += self.centripetal_acceleration(k - 1, self.sd)
             if model.rods[k]:
                 across = np.linalg.svd(u[k][None])[2][1:]
                 rate = self.state.udot[k]
@@ -291,10 +293,10 @@ class ByDefinition:
         self.inverse = np.linalg.inv(S.reshape(9 * n, 9 * n)).reshape(n, 3, 3, n, 3, 3)
         self.a, self.alpha, self.F = np.moveaxis(np.einsum("nqikcj,kcj->nqi", self.inverse, b), 1, 0)
 
-    def inward(self, k, s):
+    def centripetal_acceleration(self, k, s):
         return np.cross(self.omega[k], np.cross(self.omega[k], s[k]))
 
-    def through(self, force, moment, joint):
+    def amplified_terms(self, force, moment, joint):
         """Σ ‖block of the inverse‖ · size of the row's terms; (N, 3)."""
         out = np.zeros((self.model.n, 3))
         for k, sizes in enumerate(zip(force, moment, joint, strict=True)):
@@ -311,7 +313,7 @@ class ByDefinition:
             (k, False) for k in range(self.model.n)
         ]
 
-    def rod_push(self, k, tau):
+    def rod_end_forces(self, k, tau):
         """What a torque τ on the massless rod k does: forces (τ × u)/ℓ on what it ends at."""
         n, push = self.model.n, np.cross(tau, self.state.u[k]) / self.model.length[k]
         b = np.zeros((n, 3, 3))
@@ -320,15 +322,15 @@ class ByDefinition:
             b[k - 1, 0], b[k - 1, 1] = -push, np.cross(self.sd[k - 1], -push)
         return b
 
-    def pair(self, k, upper):
+    def torque_pair_response(self, k, upper):
         """(N, 3): size of the answer to unit torque pairs at a joint."""
         answers = []
         for tau in np.eye(3):
             b = np.zeros((self.model.n, 3, 3))
             if upper:
-                b += self.rod_push(k, tau)
+                b += self.rod_end_forces(k, tau)
             elif self.model.rods[k]:
-                b -= self.rod_push(k, tau)
+                b -= self.rod_end_forces(k, tau)
             if not upper:
                 b[k, 1] += tau
             if k and (upper or not self.model.rods[k]):
@@ -336,7 +338,7 @@ class ByDefinition:
             answers.append(np.einsum("nqikcj,kcj->nqi", self.inverse, b))
         return np.sqrt(np.sum(np.square(answers), axis=(0, 3)))
 
-    def turn(self, k, upper, of_body, of_rod):
+    def joint_rotation_rate(self, k, upper, of_body, of_rod):
         """How fast a joint turns."""
         above = of_body[k - 1] if k else np.zeros(3)
         if upper:
@@ -345,7 +347,7 @@ class ByDefinition:
 
     def bound(self):
         model, state, n, g, size = self.model, self.state, self.model.n, self.gravity, np.linalg.norm
-        m, rods, arm = model.mass, model.rods, self.arm
+        m, rods, arm = model.mass, model.rods, self.largest_part_offset
         after = [size(self.F[k + 1]) if k + 1 < n else 0.0 for k in range(n)]
         J = [size(x) for x in model.inertia]
         rod_rate = [size(state.udot[k]) if rods[k] else 0.0 for k in range(n)]
@@ -368,19 +370,19 @@ class ByDefinition:
                 joint[k] = max(joint[k], a[i], sd[i] * alpha[i], sd[i] * rate[i] * W[i])
             if rods[k]:
                 joint[k] = max(joint[k], model.length[k] * rod_rate[k] * W[k])
-            free = (F[k] + after[k] + m[k] * g + weld[k]) / self.light[k]
+            free = (F[k] + after[k] + m[k] * g + weld[k]) / self.lightest_part[k]
             turn = (sp[k] * F[k] + sd[k] * after[k] + J[k] * rate[k] * W[k] + torque[k]) / self.J_min[k]
             row.append((free, turn))
         answer = np.array([(max(a[k], g), alpha[k], F[k]) for k in range(n)])
-        total = self.through(force, moment, joint) + answer
+        total = self.amplified_terms(force, moment, joint) + answer
         elimination = [
             row[k][0] + sp[k] * row[k][1] + (row[k - 1][0] + sd[k - 1] * row[k - 1][1] if k else 0.0)
             for k in range(n)
         ]
-        total += self.through(np.zeros(n), np.zeros(n), elimination)
+        total += self.amplified_terms(np.zeros(n), np.zeros(n), elimination)
 
         rods_turn = np.cross(state.u, state.udot)
-        inward = [[self.inward(k, s) for k in range(n)] for s in (self.sp, self.sd)]
+        inward = [[self.centripetal_acceleration(k, s) for k in range(n)] for s in (self.sp, self.sd)]
         near = [self.a[k] + np.cross(self.alpha[k], self.sp[k]) + inward[0][k] for k in range(n)]
         far = [self.a[k] + np.cross(self.alpha[k], self.sd[k]) + inward[1][k] for k in range(n)]
         ddot = [near[k] - (far[k - 1] if k else 0.0) for k in range(n)]
@@ -391,14 +393,14 @@ class ByDefinition:
             where[k, upper] = [size(place - state.r[b]) + arm[b] if b >= k else 0.0 for b in range(n)]
         D = {i: np.array(x) for i, x in where.items()}
         below = {(k, upper): np.arange(n) >= k for k, upper in where}
-        acc = {i: self.turn(*i, self.alpha, rods_alpha) for i in where}
-        spd = {i: self.turn(*i, self.omega, rods_turn) for i in where}
+        acc = {i: self.joint_rotation_rate(*i, self.alpha, rods_alpha) for i in where}
+        spd = {i: self.joint_rotation_rate(*i, self.omega, rods_turn) for i in where}
         matrix = {(i, j): np.sum(m * D[i] * D[j] + J * (below[i] & below[j])) for i in D for j in D}
         for i in D:
             tau = sum(matrix[i, j] * acc[j] for j in D)
             tau += sum(J[b] * W[b] ** 2 + torque[b] for b in range(n) if below[i][b])
             tau += sum(D[i][b] * (m[b] * (g + a[b]) + load[b]) for b in range(n))
-            total += tau * self.pair(*i)
+            total += tau * self.torque_pair_response(*i)
         swing, turned = (sum(x[i] * acc[i] for i in D) for x in (D, below))
         carried = m * (a + swing + g)
         total += np.stack([swing + a, turned, [np.sum(carried[k:]) for k in range(n)]], 1)
@@ -445,7 +447,10 @@ def test_the_bound_is_its_definition(rods, welded):
             inertia=shrink * model.inertia,
         )
         parts = split_bodies(model) if welded else None
-        ours, theirs = ByDefinition(model, state, parts).bound(), state_rounding_bound(model, state, parts)
+        ours, theirs = (
+            BoundByDefinition(model, state, parts).bound(),
+            state_rounding_bound(model, state, parts),
+        )
         for quantity in ours.scale:
             here, there = theirs.tolerance(quantity), ours.tolerance(quantity)
             np.testing.assert_allclose(here, there, rtol=1e-7, err_msg=quantity)

@@ -32,7 +32,7 @@ EPS = 2.0**-53
 MAX_DIVERGENCE_OVER_HORIZON = 6.0  # measured: 1.2 … 5.9, more for smaller tolerances
 # All of the catalogue whose small perturbations grow ten thousandfold in 15 s: the chaotic ones, and of the
 # regular ones the conical motion and the swing of 170°, which are unstable.
-UNSTABLE = [
+UNSTABLE_SCENARIOS = [
     "double-planar-large",
     "double-tumbling-balls",
     "double-tumbling-rods",
@@ -52,7 +52,7 @@ UNSTABLE = [
 ]
 
 
-def upright():
+def unstable_pendulum():
     """A body standing on its pivot, and the rate λ at which it leaves there."""
     model, _ = random_chain(np.random.default_rng(0), [0])
     model = replace(model, inertia=np.diag([0.02, 0.02, 0.01])[None], proximal=np.array([[0, 0, -0.3]]))
@@ -62,7 +62,7 @@ def upright():
 
 def test_growth_is_exponential_as_far_as_it_goes():
     """Far beyond where a twin of 1e-7 has moved as far as it can."""
-    model, state, own = upright()
+    model, state, own = unstable_pendulum()
     times = np.linspace(0, 24 / own, 121)
     found = perturbation_growth(model, state, times)
     slope = np.diff(np.log(found[20:])) / np.diff(times[20:])
@@ -72,13 +72,14 @@ def test_growth_is_exponential_as_far_as_it_goes():
 
 def test_growth_may_end():
     """A body that falls over and comes to rest: its twins part ten thousandfold, and then no further."""
-    model, state, own = upright()
+    model, state, own = unstable_pendulum()
     model = replace(model, drag_moment=np.array([0.2 * model.mass[0] * 9.81 * 0.3 / own]))
     state = perturbed_states(model, state, perturbation_size=3e-5, count=1)[0]
     times = np.linspace(0, 60 / own, 61)
     found = perturbation_growth(model, state, times)
     base, *others = (
-        pendulums.motion(model, s, times[[0, -1]]) for s in (state, *perturbed_states(model, state))
+        pendulums.reference_trajectory(model, s, times[[0, -1]])
+        for s in (state, *perturbed_states(model, state))
     )
     apart = max(attitude_error(x.p[-1], base.p[-1]) for x in others) / PERTURBATION_SIZE
     assert found[-1] > RENORMALISATION_GROWTH
@@ -87,7 +88,7 @@ def test_growth_may_end():
 
 def test_perturbations_of_a_damped_hanging_body_do_not_grow():
     """All that stays is the turn about the vertical."""
-    model, state, _ = upright()
+    model, state, _ = unstable_pendulum()
     model = replace(model, proximal=-model.proximal, drag_moment=2 * model.mass)
     found = perturbation_growth(
         model, state_from_minimal(model, state.p, *np.zeros((3, 1, 3))), np.linspace(0, 10, 6)
@@ -120,7 +121,7 @@ def test_neighbours_are_on_the_manifold_and_close(rods):
 
 def test_other_models_in_the_batch_move_as_they_do_alone():
     """Past the time at which twins have moved so far that they run on without the others."""
-    model, state, own = upright()
+    model, state, own = unstable_pendulum()
     heavier = replace(model, mass=2 * model.mass, inertia=3 * model.inertia)
     leaning = perturbed_states(heavier, state, perturbation_size=1e-3, count=1)[0]
     times = np.linspace(0, 16 / own, 41)
@@ -137,7 +138,9 @@ def test_growth_is_the_largest_distance_of_a_neighbour(rods):
     """Over the size it was turned by; positions over the largest distance from the pivot."""
     model, state = random_chain(np.random.default_rng(5), rods)
     times = np.linspace(0, 0.6, 13)
-    base, *others = (pendulums.motion(model, s, times) for s in (state, *perturbed_states(model, state)))
+    base, *others = (
+        pendulums.reference_trajectory(model, s, times) for s in (state, *perturbed_states(model, state))
+    )
     arm = np.max(np.linalg.norm(base.r, axis=-1))
     gone = [
         np.maximum(position_error(x.r, base.r) / arm, attitude_error(x.p, base.p)) / PERTURBATION_SIZE
@@ -150,11 +153,13 @@ def test_growth_is_the_largest_distance_of_a_neighbour(rods):
 
 def test_position_distances_are_relative_to_the_distance_from_the_pivot():
     """A point on a rod that stands: positions part exponentially, attitudes as time does."""
-    model = replace(pendulums.model("r"), gravity=np.array([3.0, -6, 6]), proximal=np.zeros((1, 3)))
+    model = replace(pendulums.make_model("r"), gravity=np.array([3.0, -6, 6]), proximal=np.zeros((1, 3)))
     still = np.zeros((1, 3))
     state = state_from_minimal(model, np.array([[1.0, 0, 0, 0]]), still, -model.gravity[None] / 9, still)
     times = np.linspace(0, 1, 9)
-    base, *others = (pendulums.motion(model, s, times) for s in (state, *perturbed_states(model, state)))
+    base, *others = (
+        pendulums.reference_trajectory(model, s, times) for s in (state, *perturbed_states(model, state))
+    )
     parted = [position_error(x.r, base.r) / model.length[0] / PERTURBATION_SIZE for x in others]
     turned = [attitude_error(x.p, base.p) / PERTURBATION_SIZE for x in others]
     assert np.max(parted) > 5 * np.max(turned)
@@ -245,37 +250,37 @@ def test_horizon_is_the_last_tolerable_time():
 def test_no_unstable_scenario_is_left_out(name):
     scenario = load_scenario(find_scenario_file(name))
     found = perturbation_growth(scenario.model, scenario.state, np.arange(301) * 0.05)
-    assert (np.max(found) > RENORMALISATION_GROWTH) == (name in UNSTABLE)
+    assert (np.max(found) > RENORMALISATION_GROWTH) == (name in UNSTABLE_SCENARIOS)
 
 
-@pytest.mark.parametrize("name", UNSTABLE[:2])
+@pytest.mark.parametrize("name", UNSTABLE_SCENARIOS[:2])
 def test_observed_divergence(name):
     check_divergence(name, "extended")
 
 
 @pytest.mark.full
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("name", UNSTABLE[2:])
+@pytest.mark.parametrize("name", UNSTABLE_SCENARIOS[2:])
 def test_observed_divergence_on_every_unstable_scenario(name):
     check_divergence(name, "extended")
 
 
 @pytest.mark.full
 @pytest.mark.timeout(900)
-@pytest.mark.parametrize("name", [name for name in UNSTABLE if not name.startswith("chain")])
+@pytest.mark.parametrize("name", [name for name in UNSTABLE_SCENARIOS if not name.startswith("chain")])
 def test_observed_divergence_from_quad(name):
     """A minute each; longer chains take many, and extended precision, 2000 times finer, must do there."""
     check_divergence(name, "quad")
 
 
-def check_divergence(name, yardstick):
+def check_divergence(name, precision):
     """Double parts from a higher precision when the horizon says, as is seen within 15 s or else 30 s."""
     pytest.importorskip("heyoka")
-    seen = divergences(name, yardstick, 15) or divergences(name, yardstick, 30)
+    seen = count_divergences(name, precision, 15) or count_divergences(name, precision, 30)
     assert seen, "no divergence was seen: nothing was validated"
 
 
-def divergences(name, yardstick, duration):
+def count_divergences(name, precision, duration):
     """How many of five tolerances are passed within ``duration`` s, each after the horizon.
 
     The horizon is the one that runs use: it assumes 10³ ε of the stretched length, which no engine exceeds.
@@ -288,7 +293,7 @@ def divergences(name, yardstick, duration):
     scenario = load_scenario(find_scenario_file(name))
     times = np.arange(20 * duration + 1) * 0.05
     double, fine = (
-        simulate_taylor(scenario.model, scenario.state, times, kind) for kind in ("double", yardstick)
+        simulate_taylor(scenario.model, scenario.state, times, kind) for kind in ("double", precision)
     )
     observed = position_error(double.r, np.asarray(fine.r, dtype=float))
     rounding = EPS * np.max(np.linalg.norm(double.r, axis=-1))

@@ -24,8 +24,8 @@ from tests.helpers.random_chains import random_chain
 
 TIMES = np.arange(41) * 0.05
 CATALOGUE = [load_scenario(path) for path in catalogue().values()]
-BALLS = [s for s in CATALOGUE if not s.model.rods.any()]
-CLOSED = [s for s in CATALOGUE if (closed := closed_form_motion(s)) and closed.amplitude == 0]
+BALL_JOINT_SCENARIOS = [s for s in CATALOGUE if not s.model.rods.any()]
+CLOSED_FORM_SCENARIOS = [s for s in CATALOGUE if (closed := closed_form_motion(s)) and closed.amplitude == 0]
 
 
 pytestmark = pytest.mark.skipif(
@@ -69,7 +69,7 @@ def test_the_uncertainty_covers_the_error_measured_in_higher_precision(scenario)
     """
     precision = "quad" if scenario.model.n <= 2 else "extended"
     fine = simulate_taylor(scenario.model, scenario.state, TIMES, precision)
-    closed = scenario in CLOSED
+    closed = scenario in CLOSED_FORM_SCENARIOS
     exact = (*closed_form_motion(scenario)(TIMES), "") if closed else None
     truth = trajectory_truth(scenario.model, scenario.state, TIMES, exact)
     r, p = (np.asarray(y, dtype=float) for y in (fine.r, fine.p))
@@ -84,7 +84,7 @@ def test_the_uncertainty_covers_the_error_measured_in_higher_precision(scenario)
 # what the truth is, and how sure
 
 
-def check_balls(scenario):
+def check_uncertainty_on_balls(scenario):
     truth = trajectory_truth(scenario.model, scenario.state, TIMES)
     precision = "extended" if scenario.model.n <= MAX_EXTENDED_PRECISION_BODIES else "double"
     print(
@@ -95,18 +95,22 @@ def check_balls(scenario):
     assert np.all(np.diff(truth.position_uncertainty) >= 0)
 
 
-@pytest.mark.parametrize("scenario", [s for s in BALLS if s.model.n < 10], ids=lambda s: s.name)
+@pytest.mark.parametrize(
+    "scenario", [s for s in BALL_JOINT_SCENARIOS if s.model.n < 10], ids=lambda s: s.name
+)
 def test_the_uncertainty_is_below_a_picometre_on_balls(scenario):
-    check_balls(scenario)
+    check_uncertainty_on_balls(scenario)
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("scenario", [s for s in BALLS if s.model.n >= 10], ids=lambda s: s.name)
+@pytest.mark.parametrize(
+    "scenario", [s for s in BALL_JOINT_SCENARIOS if s.model.n >= 10], ids=lambda s: s.name
+)
 def test_the_uncertainty_is_below_a_picometre_on_long_chains_of_balls(scenario):
-    check_balls(scenario)
+    check_uncertainty_on_balls(scenario)
 
 
-@pytest.mark.parametrize("scenario", CLOSED, ids=lambda s: s.name)
+@pytest.mark.parametrize("scenario", CLOSED_FORM_SCENARIOS, ids=lambda s: s.name)
 def test_the_truth_agrees_with_the_closed_forms(scenario):
     r, p = closed_form_motion(scenario)(TIMES)
     truth = trajectory_truth(scenario.model, scenario.state, TIMES, (r, p, "a book"))
@@ -157,12 +161,12 @@ def test_an_error_in_a_closed_form_is_detected():
 # where Taylor's method cannot be had
 
 
-def check_fall_back(why, **arguments):
+def check_fall_back(reason, **arguments):
     scenario = load_scenario(find_scenario_file("double-tumbling-balls"))
     truth = ground_truth.motion_truth(scenario.model, scenario.state, TIMES[:11], None, **arguments)
     assert truth.method == (
         "the notes' form by collocation; uncertainty: its difference from the same by DOP853, "
-        f"no Taylor series: {why}"
+        f"no Taylor series: {reason}"
     )
     assert 0 < truth.position_uncertainty[-1] < 1e-12
 
