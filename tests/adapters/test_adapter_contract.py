@@ -18,7 +18,7 @@ from pebble import ProcessExpired
 from plumbline.engines.adapter import UNSUPPORTED_KINDS
 from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.model import kinematics
-from plumbline.model.datatypes import BadInput, EngineFailure, Integrator, Model, State, Unsupported
+from plumbline.model.datatypes import BadInput, EngineFailure, Unsupported
 from tests.helpers import engine_process as worker
 from tests.helpers import newton_euler, pendulums
 from tests.helpers.pendulums import JOINT_PATTERNS
@@ -48,7 +48,7 @@ every_integrator = pytest.mark.parametrize(
 
 
 @pytest.fixture(scope="module", params=ENGINES)
-def engine(request: pytest.FixtureRequest) -> str:
+def engine(request):
     """The name of an engine that is installed."""
     try:
         worker.call_adapter(request.param, "version")
@@ -58,11 +58,11 @@ def engine(request: pytest.FixtureRequest) -> str:
 
 
 @cache
-def declared_gaps(engine: str) -> dict[str, str]:
+def declared_gaps(engine):
     return dict(worker.adapter_attribute(engine, "unsupported"))
 
 
-def kinds_of(model: Model) -> set[str]:
+def kinds_of(model):
     """The kinds of model, of those that an adapter may declare as unsupported, that a model is of."""
     kinds = {"rods": np.any(model.rods), "balls": not np.all(model.rods), "chains": model.n > 1}
     return {kind for kind, holds in kinds.items() if holds} | (
@@ -70,7 +70,7 @@ def kinds_of(model: Model) -> set[str]:
     )
 
 
-def ask(engine: str, method: str, model: Model, *args):
+def ask(engine, method, model, *args):
     """The engine's answer; None for a refusal, which must be declared and have a sentence."""
     try:
         return worker.call_adapter(engine, method, model, *args)
@@ -84,7 +84,7 @@ def ask(engine: str, method: str, model: Model, *args):
         return None
 
 
-def one_body(engine: str, **loads) -> Model:
+def one_body(engine, **loads):
     """A pendulum of one body that the engine supports: on a ball joint, or else on a rod."""
     return pendulums.make_model("r" if "balls" in declared_gaps(engine) else "b", **loads)
 
@@ -138,9 +138,7 @@ def test_a_declared_gap_is_real(engine, kind):
 
 
 @cache
-def expected_states(
-    joints: str, loaded: bool
-) -> tuple[Model, list[State], list[newton_euler.NewtonEulerSolution]]:
+def expected_states(joints, loaded):
     subject = pendulums.make_model(JOINT_PATTERNS[joints], loads=loaded, drag=loaded)
     states = [pendulums.state_from_seed(subject, seed) for seed in range(STATES)]
     return subject, states, [newton_euler.solve(subject, at) for at in states]
@@ -287,7 +285,7 @@ def test_runs_from_p_and_minus_p_are_the_same_motion(engine, integrator, joints)
 # -- trajectories ------------------------------------------------------------------------------
 
 
-def step_or_tolerance(method: Integrator) -> float:
+def step_or_tolerance(method):
     return STEP if method.kind == "step" else 1e-10
 
 
@@ -370,7 +368,7 @@ def test_converges_to_the_truth_with_its_declared_order(engine, integrator, case
 
 
 @cache
-def convergence_case(case: str):
+def convergence_case(case):
     joints, _, loaded = case.partition(", ")
     subject = pendulums.make_model(JOINT_PATTERNS[joints], loads=bool(loaded), drag=bool(loaded))
     at = pendulums.state_from_seed(subject, rate=1.0)

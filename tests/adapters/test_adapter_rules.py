@@ -1,7 +1,5 @@
 """Rules for adapters: short functions, and a contract that an engine of one body on a ball joint can pass."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 

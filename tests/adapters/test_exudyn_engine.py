@@ -1,7 +1,5 @@
 """What holds of Exudyn alone: orders and limits, the singularity of its tree, what is not used and why."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
@@ -12,8 +10,7 @@ import pytest
 from adapters.exudyn_common import make_settings, silence_engine
 from adapters.exudyn_engine import Exudyn, ExudynChain
 from adapters.exudyn_tree_engine import ExudynTree
-from plumbline.engines.adapter import Adapter
-from plumbline.model.datatypes import EngineFailure, Model, State, Unsupported
+from plumbline.model.datatypes import EngineFailure, Unsupported
 from plumbline.model.kinematics import joint_vectors, state_from_minimal
 from tests.helpers import newton_euler, pendulums
 from tests.helpers.refinement import extrapolated, observed_orders
@@ -21,7 +18,7 @@ from tests.helpers.refinement import extrapolated, observed_orders
 TIMES = np.linspace(0.0, 2.0, 9)
 
 
-def swinging_pendulum(joints: str) -> tuple[Model, State]:
+def swinging_pendulum(joints):
     """A generic pendulum (offsets, full inertia) that swings in three dimensions below the pivot."""
     rng = np.random.default_rng(len(joints))
     subject = pendulums.make_model(joints, seed=3)
@@ -39,14 +36,12 @@ def swinging_pendulum(joints: str) -> tuple[Model, State]:
 
 
 @cache
-def true_positions(joints: str) -> np.ndarray:
+def true_positions(joints):
     """(T, N, 3) positions of the gentle pendulum by an independent solution."""
     return np.array([at.r for at in newton_euler.integrate(*swinging_pendulum(joints), TIMES)])
 
 
-def positions_by_step_size(
-    engine: Adapter, joints: str, method: str, levels: range
-) -> tuple[np.ndarray, np.ndarray]:
+def positions_by_step_size(engine, joints, method, levels):
     """Positions at each step size (levels, T, N, 3), and the independent solution's (T, N, 3)."""
     subject, start = swinging_pendulum(joints)
     runs = [engine.simulate(subject, start, TIMES, method, 2.0**-k).r for k in levels]
@@ -118,7 +113,7 @@ def test_long_chains_at_state_level():
         assert error < bound, f"{engine.name}: {error:.1e}"
 
 
-def near_singular_pendulum(rate: float) -> tuple[Model, State]:
+def near_singular_pendulum(rate):
     """A body on a ball that starts about x and is driven about y, off its first axis."""
     subject = replace(pendulums.make_model("b"), gravity=np.zeros(3), moment=np.array([[0.0, 4.0, 0.0]]))
     subject = replace(subject, inertia=0.1 * np.eye(3)[None], proximal=np.zeros((1, 3)))

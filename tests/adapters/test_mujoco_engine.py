@@ -1,7 +1,5 @@
 """What MuJoCo alone must show: orders and limits at 2 s, long chains, its alias, its way of blowing up."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from pathlib import Path

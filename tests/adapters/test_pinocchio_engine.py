@@ -1,7 +1,5 @@
 """What is Pinocchio's own: its algorithms against each other, its integrators, loads and massless rods."""
 
-from __future__ import annotations
-
 import multiprocessing
 from dataclasses import replace
 from functools import wraps

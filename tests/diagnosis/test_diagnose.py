@@ -1,7 +1,5 @@
 """Each step of a diagnosis on data made for it; whole diagnoses are in `test_planted_defects`."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

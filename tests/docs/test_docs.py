@@ -6,8 +6,6 @@ to), ``bash run`` runs it (it must succeed), ``text output`` is what the run bef
 ``…`` stands for anything.  Other blocks are only shown.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex
@@ -27,7 +25,7 @@ BLOCK = re.compile(r"^```([^\n]*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 IGNORED = shutil.ignore_patterns(".*", "__pycache__", "node_modules", "out")
 
 
-def run_code_blocks(page: str, folder: Path) -> int:
+def run_code_blocks(page, folder):
     """Do what the page's blocks say, in ``folder``; returns how many were checked."""
     environment = os.environ | {
         "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]]),

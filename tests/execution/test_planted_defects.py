@@ -4,8 +4,6 @@ The list, its sizes and the words a diagnosis must use are in `planted`, committ
 was written; the defects here that must *not* be named came after it.
 """
 
-from __future__ import annotations
-
 import zlib
 from contextlib import contextmanager
 from dataclasses import replace
@@ -46,7 +44,7 @@ TIMES = np.linspace(0, 2, 17)
 
 
 @cache
-def subject(joints: str, loaded: bool):
+def subject(joints, loaded):
     """A generic pendulum, random states of it and their certified truth."""
     model = pendulums.make_model(JOINT_PATTERNS[joints], loads=loaded, drag=loaded)
     return model, state_truth(model, random_states(model, STATES, seed=1))
@@ -61,7 +59,7 @@ def motion():
 
 
 @contextmanager
-def planted(defect: Defect, model):
+def planted(defect, model):
     """The real engine with the defect in it."""
     engine = plant(type(load_adapter(defect.engine)), defect)
     if defect.gamma is None:
@@ -73,7 +71,7 @@ def planted(defect: Defect, model):
 
 
 @cache
-def state_report(defect: Defect) -> tuple[list[str], str]:
+def state_report(defect):
     """Quantities that disagree at state level, and the diagnosis."""
     model, truth = subject(defect.joints, defect.loaded)
     with planted(defect, model) as engine:
@@ -85,7 +83,7 @@ def state_report(defect: Defect) -> tuple[list[str], str]:
 
 
 @cache
-def motion_report(defect: Defect) -> list[str]:
+def motion_report(defect):
     """Rows about motion that do not agree; an unresolved cell that no file excuses fails a run, too."""
     model, state, truth = motion()
     engine = plant(type(load_adapter(defect.engine)), defect)
@@ -204,7 +202,7 @@ def test_rates(record_property, capsys):
     assert len(killed) == len(DEFECTS) and len(named) >= 30 and not false, figures
 
 
-def applicable(defect: Defect, joints: str) -> bool:
+def applicable(defect, joints):
     """Whether the pendulum has what the defect alters: a second joint that is a rod, a rod at all."""
     if defect.name == "rod-length-1e-5":
         return joints[1] == "r"

@@ -20,9 +20,7 @@ from plumbline.model.datatypes import Integrator
 TIMES = np.linspace(0, 2, 17)
 
 
-def samples_with_error(
-    order: int, powers: tuple[int, ...], count: int = 6, size: float = 1.0
-) -> tuple[np.ndarray, list]:
+def samples_with_error(order, powers, count=6, size=1.0):
     """Samples (T, 1, 3) whose error is a sum of powers of h with coefficients of order one."""
     rng = np.random.default_rng(order)
     limit = np.sin(TIMES[:, None, None] + np.arange(3))

@@ -1,7 +1,5 @@
 """Relations that need no truth: they hold on every engine, and each breaks under a defect of its kind."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache, partialmethod
 from itertools import product
@@ -85,7 +83,7 @@ def test_every_engine_keeps_every_relation(engine, joints):
     ]
 
 
-def defect_named(name: str) -> Defect:
+def defect_named(name):
     return next(d for d in STATE_DEFECTS if d.name == name)
 
 
@@ -164,7 +162,7 @@ def test_noise_breaks_what_is_not_bitwise():
 # -- the engine's other ways, and welded halves -----------------------------------------------------
 
 
-def defect_in_default_formulation(defect: Defect):
+def defect_in_default_formulation(defect):
     """The real engine with a defect in its usual way alone: its other ways and welded bodies are sound."""
     real = type(load_adapter(defect.engine))
     engine = plant(real, defect)

@@ -1,7 +1,5 @@
 """The arithmetic behind the relations: what is compared, over what, and what the rows say."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -42,7 +40,7 @@ WHO = RowContext("s", "f", "e", "E", "0")
 METHOD = Integrator("trapezoidal", "step", 2, is_symmetric=True)
 
 
-def test_values_are_what_is_offered_times_its_factor() -> None:
+def test_values_are_what_is_offered_times_its_factor():
     said = StateQuantities(np.ones((2, 3)), 2 * np.ones((2, 3)), kinetic_energy=3.0)
     found = quantity_values(said, kinetic_energy=0.5, joint_reaction=9.0)
     assert set(found) == {"acceleration", "angular_acceleration", "kinetic_energy"}
@@ -77,14 +75,14 @@ def self_relation_result(*shifts, relation=None, refuse=(), refuse_here=()):
 
 @pytest.mark.parametrize("quantity", QUANTITIES)
 @pytest.mark.parametrize("by", [0.9, 1.1, 40.0])
-def test_a_relation_is_as_far_off_as_its_worst_quantity_over_both_bounds(quantity: str, by: float) -> None:
+def test_a_relation_is_as_far_off_as_its_worst_quantity_over_both_bounds(quantity, by):
     found = self_relation_result((0, "kinetic_energy", 0.5), (2, quantity, by))
     assert found.ratio == pytest.approx(by, rel=0.05)
     assert (found.quantity, found.worst_state, found.state_count) == (quantity, 2, 3)
     assert (found.relation, found.integrator, found.steps, found.refusal_reason) == ("as itself", "-", 0, "")
 
 
-def test_equal_answers_and_refused_ones() -> None:
+def test_equal_answers_and_refused_ones():
     assert self_relation_result().ratio == 0.0
     some = self_relation_result((0, "acceleration", 5.0), (1, "acceleration", 3.0), refuse=(0,))
     assert (some.state_count, some.worst_state) == (2, 1) and some.refusal_reason == "not state 0"
@@ -101,7 +99,7 @@ def test_equal_answers_and_refused_ones() -> None:
     assert str(evaluate_or_refusal(refusing, MODEL, STATES[0])) == "never"
 
 
-def test_runs_are_measured_by_length_turn_and_speed() -> None:
+def test_runs_are_measured_by_length_turn_and_speed():
     at = STATES[0]
     length, g = float(np.sum(stretched_length(MODEL))), np.linalg.norm(MODEL.gravity)
     spin = max(np.sqrt(g * length) / length, *np.linalg.norm(at.omega, axis=1))
@@ -148,7 +146,7 @@ def test_runs_are_measured_by_length_turn_and_speed() -> None:
     )
 
 
-def test_a_sample_is_taken_as_it_is_and_back_with_opposite_rates() -> None:
+def test_a_sample_is_taken_as_it_is_and_back_with_opposite_rates():
     at = STATES[1]
     r, p, v = (np.stack([0 * x, x]) for x in (at.r, at.p, at.v))
     run = Trajectory(np.array([0.0, 1.0]), r, p, v, np.stack([0 * at.p, quaternion_rate(at.p, at.omega)]), 1)
@@ -162,7 +160,7 @@ def test_a_sample_is_taken_as_it_is_and_back_with_opposite_rates() -> None:
     assert not np.any(state_at_sample(run, 0).r)
 
 
-def test_the_quickest_is_a_body_a_rod_or_the_shortest_link() -> None:
+def test_the_quickest_is_a_body_a_rod_or_the_shortest_link():
     at, g = STATES[0], np.linalg.norm(MODEL.gravity)
     still = replace(at, omega=0 * at.omega, udot=0 * at.udot)
     assert fastest_rate(MODEL, still) == pytest.approx(
@@ -173,7 +171,7 @@ def test_the_quickest_is_a_body_a_rod_or_the_shortest_link() -> None:
     assert fastest_rate(replace(MODEL, gravity=np.zeros(3)), still) == 1.0
 
 
-def test_rows_say_what_held_what_did_not_and_what_was_refused() -> None:
+def test_rows_say_what_held_what_did_not_and_what_was_refused():
     one = RelationResult("masses doubled", 0.25, "joint_reaction", 2, 4)
     off = replace(one, ratio=1.5)
     run = RelationResult(
@@ -223,9 +221,9 @@ def test_rows_say_what_held_what_did_not_and_what_was_refused() -> None:
 
 
 @pytest.mark.parametrize("kind", ["step", "tolerance"])
-def test_a_run_may_be_off_by_its_rounding_its_solver_and_its_accelerations_grown(kind: str) -> None:
+def test_a_run_may_be_off_by_its_rounding_its_solver_and_its_accelerations_grown(kind):
     at, end, steps = STATES[2], 0.5, 81
-    method = Integrator("x", kind, 2, solver_rtol=1e-9, min_rtol=3e-9)  # type: ignore[arg-type]
+    method = Integrator("x", kind, 2, solver_rtol=1e-9, min_rtol=3e-9)
     bound, (_, spin, speed) = state_rounding_bound(MODEL, at), characteristic_scales(MODEL, at)
     ratio = max(MODEL.mass) / min(MODEL.mass)
     solved = (1e-9 * ratio if kind == "step" else 3e-9) * 9
@@ -241,7 +239,7 @@ def test_a_run_may_be_off_by_its_rounding_its_solver_and_its_accelerations_grown
 
 
 @pytest.mark.parametrize("drag", [False, True])
-def test_every_relation_is_asked_but_time_reversed_with_drag(drag: bool) -> None:
+def test_every_relation_is_asked_but_time_reversed_with_drag(drag):
     model = pendulums.make_model("b", drag=drag)
     names = [
         found.relation for found in check_relations("pinocchio", model, [pendulums.state_from_seed(model)])
@@ -253,7 +251,7 @@ def test_every_relation_is_asked_but_time_reversed_with_drag(drag: bool) -> None
 
 
 @pytest.mark.parametrize("engine", ["pinocchio", "pinocchio-maximal", "exudyn", "exudyn-tree"])
-def test_both_columns_of_an_engine_are_compared(engine: str) -> None:
+def test_both_columns_of_an_engine_are_compared(engine):
     pytest.importorskip(engine.split("-")[0])
     other = load_adapter(engine).other_formulation
     assert load_adapter(other).other_formulation == engine
@@ -263,7 +261,7 @@ def test_both_columns_of_an_engine_are_compared(engine: str) -> None:
     ]
 
 
-def test_long_chains_are_asked_at_half_as_many_states() -> None:
+def test_long_chains_are_asked_at_half_as_many_states():
     pytest.importorskip("mujoco")
     for bodies, states in ((12, 4), (13, 2)):
         model = pendulums.make_model("b" * bodies)

@@ -1,7 +1,5 @@
 """The outlier among engines is named, with who agrees, on real engines with and without a defect."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
@@ -28,7 +26,7 @@ def model_and_truth():
     return model, state_truth(model, random_states(model, 3, seed=1))
 
 
-def rows_of_engines(*defective_engines: str, defect: str = "mass-1-1e-5", leave_out: tuple[str, ...] = ()):
+def rows_of_engines(*defective_engines, defect="mass-1-1e-5", leave_out=()):
     """State-level rows of the real engines, some with a defect planted in them."""
     model, right = model_and_truth()
     (planted,) = (d for d in STATE_DEFECTS if d.name == defect)

@@ -1,7 +1,5 @@
 """What decides the rows about motion, on refinement studies whose errors are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

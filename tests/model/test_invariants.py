@@ -1,13 +1,11 @@
 """Errors between two motions and the invariants of one, each against what it is by definition."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from plumbline.model.datatypes import Array, Model, Trajectory
+from plumbline.model.datatypes import Trajectory
 from plumbline.model.invariants import (
     INVARIANT_UNITS,
     angular_momentum,
@@ -26,12 +24,12 @@ from tests.helpers.random_chains import random_chain
 TIMES = np.linspace(0.0, 1.0, 41)
 
 
-def make_motion(rods: list[bool], times: Array = TIMES, **options: bool) -> tuple[Model, Trajectory]:
+def make_motion(rods, times=TIMES, **options):
     model, state = random_chain(np.random.default_rng(70), rods, **options)
     return model, pendulums.reference_trajectory(model, state, times)
 
 
-def test_position_error_is_the_largest_distance_of_a_body() -> None:
+def test_position_error_is_the_largest_distance_of_a_body():
     a = np.zeros((2, 3, 3))
     b = a.copy()
     b[0, 1], b[0, 2], b[1, 0] = [3, 0, 4], [1, 1, 1], [0, 0, -2]
@@ -40,7 +38,7 @@ def test_position_error_is_the_largest_distance_of_a_body() -> None:
 
 
 @pytest.mark.parametrize("angle", [1e-9, 1e-3, 1.0, 3.0, np.pi])
-def test_attitude_error_is_the_largest_rotation_angle(angle: float) -> None:
+def test_attitude_error_is_the_largest_rotation_angle(angle):
     rng = np.random.default_rng(71)
     p = rng.normal(size=(4, 2, 4))
     p /= np.linalg.norm(p, axis=-1, keepdims=True)
@@ -61,7 +59,7 @@ def test_attitude_error_is_the_largest_rotation_angle(angle: float) -> None:
 
 
 @pytest.mark.parametrize("rods", [[False], [True, False, True]], ids=str)
-def test_energies_and_momentum_are_sums_over_bodies(rods: list[bool]) -> None:
+def test_energies_and_momentum_are_sums_over_bodies(rods):
     model, state = random_chain(np.random.default_rng(72), rods)
     kinetic = kinetic_energy(model, state.v, state.omega)
     assert kinetic == pytest.approx(newton_euler.kinetic_energy(model, state), rel=1e-14)
@@ -74,7 +72,7 @@ def test_energies_and_momentum_are_sums_over_bodies(rods: list[bool]) -> None:
     assert kinetic_energy(model, *two)[1] == pytest.approx(4 * kinetic, rel=1e-14)
 
 
-def rotating_trajectory(model: Model, power: Array, times: Array) -> Trajectory:
+def rotating_trajectory(model, power, times):
     """A run in which body 1 turns about x, so that a moment of 1 N m about it does this power."""
     still = np.zeros((len(times), model.n, 3))
     omega = still.copy()
@@ -84,7 +82,7 @@ def rotating_trajectory(model: Model, power: Array, times: Array) -> Trajectory:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 4, 5])
-def test_work_of_a_moment_is_the_integral_of_its_power(degree: int) -> None:
+def test_work_of_a_moment_is_the_integral_of_its_power(degree):
     """Exact to degree 5; up to 3 both splines are, and say so."""
     model, _ = random_chain(np.random.default_rng(73), [False, False])
     moment = np.zeros((2, 3))
@@ -104,7 +102,7 @@ def test_work_of_a_moment_is_the_integral_of_its_power(degree: int) -> None:
     np.testing.assert_allclose(lost, -0.5 * times**5 / 5, rtol=0, atol=1e-12)
 
 
-def test_work_of_a_force_needs_no_quadrature_and_drag_takes() -> None:
+def test_work_of_a_force_needs_no_quadrature_and_drag_takes():
     model, _ = random_chain(np.random.default_rng(74), [False, False])
     rng = np.random.default_rng(74)
     r = rng.normal(size=(25, 2, 3))
@@ -121,7 +119,7 @@ def test_work_of_a_force_needs_no_quadrature_and_drag_takes() -> None:
 
 
 @pytest.mark.parametrize("count, sharp", [(13, 1.0), (25, 0.2), (49, 1e-4)])
-def test_the_quadrature_knows_its_error(count: int, sharp: float) -> None:
+def test_the_quadrature_knows_its_error(count, sharp):
     """Of a power that few samples hardly resolve the work is uncertain by at least its error."""
     model, _ = random_chain(np.random.default_rng(75), [False])
     times = np.linspace(0, 2, count)
@@ -133,7 +131,7 @@ def test_the_quadrature_knows_its_error(count: int, sharp: float) -> None:
     assert 0 < error <= uncertainty < sharp
 
 
-def test_too_few_samples_do_no_quadrature() -> None:
+def test_too_few_samples_do_no_quadrature():
     model, _ = random_chain(np.random.default_rng(76), [False])
     times = np.linspace(0, 1, 12)
     run = rotating_trajectory(model, 1 + times, times)
@@ -145,7 +143,7 @@ def test_too_few_samples_do_no_quadrature() -> None:
 
 @pytest.mark.parametrize("options", [{}, {"loads": True}, {"drag": True}], ids=str)
 @pytest.mark.parametrize("rods", [[False, False], [True, False], [True]], ids=str)
-def test_true_motion_has_no_drift(rods: list[bool], options: dict[str, bool]) -> None:
+def test_true_motion_has_no_drift(rods, options):
     model, run = make_motion(rods, np.linspace(0, 1, 161), **options)
     found = compute_invariants(model, run)
     size = float(np.max(kinetic_energy(model, run.v, 2 * run.pdot[..., 1:]))) + 9.81
@@ -162,7 +160,7 @@ def test_true_motion_has_no_drift(rods: list[bool], options: dict[str, bool]) ->
     assert set(INVARIANT_UNITS) <= set(vars(found))
 
 
-def test_a_gap_is_the_vector_of_a_ball_and_the_stretch_of_a_rod() -> None:
+def test_a_gap_is_the_vector_of_a_ball_and_the_stretch_of_a_rod():
     model, run = make_motion([False, True])
     away, faster = np.array([1e-3, -2e-3, 3e-3]), np.array([4e-3, 1e-3, -2e-3])
     moved = compute_invariants(model, replace(run, r=run.r + away, v=run.v + faster))
@@ -186,7 +184,7 @@ def test_a_gap_is_the_vector_of_a_ball_and_the_stretch_of_a_rod() -> None:
     assert np.max(np.abs(stretched.joint_gap[:, 1, 0])) > 1e-5
 
 
-def test_the_ends_of_a_rod_in_one_place_are_its_length_off() -> None:
+def test_the_ends_of_a_rod_in_one_place_are_its_length_off():
     model, _ = random_chain(np.random.default_rng(78), [True])
     model = replace(model, proximal=np.zeros((1, 3)))
     found = compute_invariants(model, rotating_trajectory(model, TIMES, TIMES))
@@ -194,7 +192,7 @@ def test_the_ends_of_a_rod_in_one_place_are_its_length_off() -> None:
     assert not np.any(found.gap_rate), "a stretch has no direction there"
 
 
-def joint_vector_of_second_body(model: Model, run: Trajectory) -> Array:
+def joint_vector_of_second_body(model, run):
     """ℓ u (T, 3) of the second joint, from where it hangs to the second body's proximal point."""
     found = []
     for r, p in zip(run.r, run.p, strict=True):
@@ -205,7 +203,7 @@ def joint_vector_of_second_body(model: Model, run: Trajectory) -> Array:
 
 
 @pytest.mark.parametrize("rods", [[False], [True, False, True]], ids=str)
-def test_joint_rates_are_the_slopes_of_the_joint_vectors(rods: list[bool]) -> None:
+def test_joint_rates_are_the_slopes_of_the_joint_vectors(rods):
     """Off the manifold, where they are not zero: ṙ shifted by a constant moves r by it times t."""
     model, run = make_motion(rods)
     rng, h = np.random.default_rng(77), 1e-6
@@ -217,7 +215,7 @@ def test_joint_rates_are_the_slopes_of_the_joint_vectors(rods: list[bool]) -> No
     assert np.max(np.abs(rates)) > 0.1
 
 
-def test_what_is_not_conserved_is_not_judged() -> None:
+def test_what_is_not_conserved_is_not_judged():
     """Momentum about gravity: not with loads, drag or without gravity; energy by a shift, norm as it is."""
     model, run = make_motion([False])
     assert compute_invariants(replace(model, gravity=np.zeros(3)), run).momentum_drift is None

@@ -17,36 +17,36 @@ from plumbline.processes.workers import Executor, Limits, Outcome, ResultCache, 
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def double(x: int) -> int:
+def double(x):
     return 2 * x
 
 
-def segfault() -> None:
+def segfault():
     ctypes.string_at(0)
 
 
-def abort() -> None:
+def abort():
     os.abort()
 
 
-def hang() -> None:
+def hang():
     time.sleep(600)
 
 
-def hang_holding_gil() -> None:
+def hang_holding_gil():
     """Native code that never returns and never lets go of the interpreter lock."""
     ctypes.PyDLL(None).sleep(600)
 
 
-def exhaust_memory() -> int:
+def exhaust_memory():
     return len(bytearray(64 * 2**30))
 
 
-def exit_process() -> None:
+def exit_process():
     os._exit(7)
 
 
-def write_file_and_flood_output() -> str:
+def write_file_and_flood_output():
     """Write a file into the working folder and flood both outputs, as engines do."""
     Path("dropped.txt").write_text("x")
     os.write(1, b"noise\n" * 10_000)
@@ -54,7 +54,7 @@ def write_file_and_flood_output() -> str:
     return os.getcwd()
 
 
-def process_id() -> int:
+def process_id():
     return os.getpid()
 
 
@@ -150,7 +150,7 @@ def test_files_and_output_of_an_engine_go_nowhere(capfd, tmp_path, monkeypatch):
     assert "noise" not in "".join(capfd.readouterr())
 
 
-def sleep_for(seconds: float) -> float:
+def sleep_for(seconds):
     time.sleep(seconds)
     return seconds
 

@@ -1,7 +1,5 @@
 """Collocation against DOP853 on the direct form, closed relations, and its own order."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import replace
 from fractions import Fraction
@@ -10,30 +8,26 @@ import numpy as np
 import pytest
 from numpy.polynomial.legendre import legval
 
-from plumbline.model.datatypes import Model, State
 from plumbline.model.kinematics import quaternion_rate
 from reference_impl import collocation
 from reference_impl import integrate as raw
-from reference_impl.chain import Array
-from reference_impl.collocation import BatchIntegrationResult, gauss_tables, integrate_collocation
+from reference_impl.collocation import gauss_tables, integrate_collocation
 from reference_impl.structured import StructuredSystem, component_first
 from tests.helpers.random_chains import in_other_units, random_chain
 
 TIMES = np.linspace(0.0, 1.0, 11)
 
 
-def initial_values(state: State) -> tuple[Array, Array, Array, Array]:
+def initial_values(state):
     return state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
 
 
-def run(
-    model: Model, state: State, rtol: float, times: Array = TIMES, **options: object
-) -> BatchIntegrationResult:
-    return integrate_collocation([model], *initial_values(state), times, rtol, **options)  # type: ignore[arg-type]
+def run(model, state, rtol, times=TIMES, **options):
+    return integrate_collocation([model], *initial_values(state), times, rtol, **options)
 
 
 @pytest.mark.parametrize("S", [4, 12, 20])
-def test_tables_integrate_polynomials_exactly(S: int) -> None:
+def test_tables_integrate_polynomials_exactly(S):
     """∫₀^c of x^k for k < S by A, ∫₀¹ for k < 2 S by b, and both integrals of the dense output."""
     table = gauss_tables(S)
     for k in range(S):
@@ -50,7 +44,7 @@ def test_tables_integrate_polynomials_exactly(S: int) -> None:
 
 
 @pytest.mark.parametrize("rods", [[False], [False, False], [True], [True, False], [False, True, False]])
-def test_two_methods_share_their_digits(rods: list[bool]) -> None:
+def test_two_methods_share_their_digits(rods):
     """Direct form with DOP853, structured form with collocation: nothing in common but the notes."""
     model, state = random_chain(np.random.default_rng(31), rods, loads=True, drag=True)
     dop = raw.integrate_dop853(model, *initial_values(state), TIMES, 1e-13)
@@ -62,7 +56,7 @@ def test_two_methods_share_their_digits(rods: list[bool]) -> None:
 
 
 @pytest.mark.parametrize("dense", [True, False])
-def test_the_error_follows_the_tolerance(dense: bool) -> None:
+def test_the_error_follows_the_tolerance(dense):
     model, state = random_chain(np.random.default_rng(32), [False, False])
     truth = run(model, state, 1e-14)
     growth = 1e3  # of a local error by t = 1 s, at most (a perturbation of this motion grows 1e2-fold)
@@ -71,7 +65,7 @@ def test_the_error_follows_the_tolerance(dense: bool) -> None:
         assert error < growth * rtol
 
 
-def test_dense_output_inside_the_steps() -> None:
+def test_dense_output_inside_the_steps():
     """Samples between the ends of steps are as good as those at the ends."""
     model, state = random_chain(np.random.default_rng(33), [False, True])
     fine = np.linspace(0, 0.5, 83)
@@ -81,7 +75,7 @@ def test_dense_output_inside_the_steps() -> None:
     assert np.max(np.abs(inside.pdot - ends.pdot)) < 1e-7
 
 
-def test_order_is_twice_the_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_order_is_twice_the_nodes(monkeypatch):
     """S = 2 nodes with fixed steps: order 4 at the ends of steps."""
     monkeypatch.setattr(collocation, "USUAL_SWEEPS", 1e6)  # no step is cut for its sweeps
     model, state = random_chain(np.random.default_rng(34), [False], rate=2.0)
@@ -97,7 +91,7 @@ def test_order_is_twice_the_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
     assert np.all(np.abs(orders - 4) < 0.1), orders
 
 
-def test_a_batch_is_every_chain_alone() -> None:
+def test_a_batch_is_every_chain_alone():
     rng = np.random.default_rng(35)
     drawn = [random_chain(rng, rods) for rods in ([False], [True, False], [False, False, False], [True])]
     packed = [
@@ -111,14 +105,14 @@ def test_a_batch_is_every_chain_alone() -> None:
         at += model.n
 
 
-def test_stiffness_is_said() -> None:
+def test_stiffness_is_said():
     model, state = random_chain(np.random.default_rng(36), [False, False])
     stiff = replace(model, drag_force=model.mass * 3e3)
     assert "stiff" in run(stiff, state, 1e-6, TIMES[:2]).note
     assert run(model, state, 1e-6).note == ""
 
 
-def test_rest_stays_at_rest() -> None:
+def test_rest_stays_at_rest():
     model, state = random_chain(np.random.default_rng(37), [False])
     still = replace(model, gravity=np.zeros(3))
     resting = replace(state, omega=np.zeros((1, 3)), v=np.zeros((1, 3)))
@@ -131,7 +125,7 @@ def test_rest_stays_at_rest() -> None:
     assert np.array_equal(ends.r[-1], state.r) and ends.steps == len(TIMES) - 1
 
 
-def test_a_long_chain_runs() -> None:
+def test_a_long_chain_runs():
     """300 bodies; the work per body does not grow."""
     model, state = random_chain(np.random.default_rng(38), [False] * 300, rate=0.1)
     moved = run(model, state, 1e-6, np.array([0.0, 0.02]))
@@ -144,7 +138,7 @@ def test_a_long_chain_runs() -> None:
 @pytest.mark.parametrize("nodes", [4, collocation.DEFAULT_NODES])
 @pytest.mark.parametrize("dense", [True, False])
 @pytest.mark.parametrize("rods", [[False, False], [True, False]], ids=str)
-def test_other_units_take_the_same_steps(rods: list[bool], dense: bool, nodes: int) -> None:
+def test_other_units_take_the_same_steps(rods, dense, nodes):
     """Lengths and times by powers of two, masses by powers of four (roots): every digit is the same.
 
     Of 4 nodes the tail sets the steps, of 16 the sweeps.
@@ -174,32 +168,32 @@ def test_other_units_take_the_same_steps(rods: list[bool], dense: bool, nodes: i
 class StepRecorder:
     """A run whose steps, and questions to the right-hand side, are written down."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self, monkeypatch):
         self.steps: list[tuple[float, int, bool, bool]] = []  # h, sweeps, made, limited by the sweeps
         self.evaluations = 0
         step, acceleration = collocation._Stepper.try_step, StructuredSystem.acceleration
 
-        def noted(stepper: collocation._Stepper, h: float) -> tuple[bool, bool]:
+        def noted(stepper, h):
             before = stepper.sweeps
             made = step(stepper, h)
             self.steps.append((h, stepper.sweeps - before, *made))
             return made
 
-        def counted(forest: StructuredSystem, *args: object) -> Array:
+        def counted(forest, *args):
             self.evaluations += 1
-            return acceleration(forest, *args)  # type: ignore[arg-type]
+            return acceleration(forest, *args)
 
         monkeypatch.setattr(collocation._Stepper, "try_step", noted)
         monkeypatch.setattr(StructuredSystem, "acceleration", counted)
 
 
 def test_a_step_begins_with_the_last_one_s_polynomial_up_to_its_smallest_term(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     model, state = random_chain(np.random.default_rng(40), [False, True], rate=4.0)
     guess, cuts = collocation._Stepper._extrapolated_acceleration, []
 
-    def checked(stepper: collocation._Stepper, ratio: float) -> Array:
+    def checked(stepper, ratio):
         ahead = 1 + 2 * ratio * stepper.table.c  # −1 … 1 is the last step
         modes = stepper.modes
         grown = [np.max(np.abs(modes[:, k]) / stepper.v_size) * legval(ahead[-1], np.eye(k + 1)[k])
@@ -221,7 +215,7 @@ def test_a_step_begins_with_the_last_one_s_polynomial_up_to_its_smallest_term(
 
 
 @pytest.mark.parametrize("rods, rtol", [([False, False], 1e-3), ([False, False], 1e-12), ([True], 1e-8)])
-def test_a_run_says_what_it_did(rods: list[bool], rtol: float, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_says_what_it_did(rods, rtol, monkeypatch):
     model, state = random_chain(np.random.default_rng(40), rods, rate=4.0)
     watched = StepRecorder(monkeypatch)
     done = run(model, state, rtol, np.array([0.0, 0.7, 2.1]))
@@ -235,7 +229,7 @@ def test_a_run_says_what_it_did(rods: list[bool], rtol: float, monkeypatch: pyte
     assert np.min(made[:-1]) > 0.01 * np.max(made), "no crumbs"
 
 
-def test_steps_that_take_many_sweeps_are_followed_by_shorter_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_steps_that_take_many_sweeps_are_followed_by_shorter_ones(monkeypatch):
     """Strong drag: the sweeps decide, so the step is cut before it would have to be repeated."""
     model, state = random_chain(np.random.default_rng(36), [False, False])
     watched = StepRecorder(monkeypatch)
@@ -256,7 +250,7 @@ def test_steps_that_take_many_sweeps_are_followed_by_shorter_ones(monkeypatch: p
 
 
 @pytest.mark.parametrize("dense", [True, False])
-def test_the_last_step_ends_where_it_should(dense: bool) -> None:
+def test_the_last_step_ends_where_it_should(dense):
     """t + (end − t) is not always the end in double precision; what is missing is no step of its own."""
     model, state = random_chain(np.random.default_rng(41), [False])
     drawn = np.random.default_rng(41).uniform([1e-4, 1e-3], [5e-4, 2e-3], (2000, 2))
@@ -266,7 +260,7 @@ def test_the_last_step_ends_where_it_should(dense: bool) -> None:
         assert run(model, state, 1e-4, pair, dense=dense).steps == 1
 
 
-def test_a_step_that_vanishes_is_an_error() -> None:
+def test_a_step_that_vanishes_is_an_error():
     """Drag of 1e13/s holds the sweeps to steps of 1e-13 s: nothing beside 1000 s, but much of 1e-12 s."""
     model, state = random_chain(np.random.default_rng(42), [False])
     model = replace(model, drag_force=1e13 * model.mass)
@@ -276,7 +270,7 @@ def test_a_step_that_vanishes_is_an_error() -> None:
 
 
 @pytest.mark.parametrize("ratio", [0.3, 1.0, 1.6])
-def test_the_last_steps_polynomial_goes_on_in_the_next(ratio: float) -> None:
+def test_the_last_steps_polynomial_goes_on_in_the_next(ratio):
     """Any polynomial of degree < S, at the nodes of a step ``ratio`` times as long."""
     table = gauss_tables(8)
     for k in range(8):
@@ -285,12 +279,12 @@ def test_the_last_steps_polynomial_goes_on_in_the_next(ratio: float) -> None:
         np.testing.assert_allclose(found, (1 + ratio * table.c) ** k, rtol=8 * 6e5 * 2.0**-52)
 
 
-def test_a_batch_has_every_chains_own_sizes() -> None:
+def test_a_batch_has_every_chains_own_sizes():
     """A pendulum of a millimetre beside one of a metre keeps its own scales, and sets the first step."""
     drawn = [random_chain(np.random.default_rng(43), [False] * n) for n in (2, 3, 1)]
     drawn[1] = in_other_units(*drawn[1], 1e-3, 1e-6, 1e-2)
 
-    def sized(models: list[tuple[Model, State]]) -> collocation._Stepper:
+    def sized(models):
         r, p, v, pdot = (
             np.concatenate(parts) for parts in zip(*(initial_values(s) for _, s in models), strict=True)
         )
@@ -318,13 +312,13 @@ def test_a_batch_has_every_chains_own_sizes() -> None:
 
 
 @pytest.mark.parametrize("rods", [[False, False], [True, False]], ids=str)
-def test_joints_that_are_open_close_as_they_are_told(rods: list[bool]) -> None:
+def test_joints_that_are_open_close_as_they_are_told(rods):
     """C̈ + 2 a Ċ + a² C = 0 has (C + (Ċ + a C) t) e^{−a t}; a projection leaves nothing at all."""
     model, state = random_chain(np.random.default_rng(44), rods)
     opened = replace(state, r=state.r + np.array([[0.01, 0, -0.02], [0.03, 0.01, 0]]))
     forest, times, a = StructuredSystem([model]), np.array([0.0, 0.3, 2.0]), 3.0
 
-    def left(found: BatchIntegrationResult) -> Array:
+    def left(found):
         samples = zip(found.r, found.p, found.v, found.pdot, strict=True)
         return np.array(
             [forest.constraints(component_first(r, p), component_first(v, pdot)) for r, p, v, pdot in samples]
@@ -340,14 +334,14 @@ def test_joints_that_are_open_close_as_they_are_told(rods: list[bool]) -> None:
     assert np.max(np.abs(left(run(model, opened, 1e-9, times, project=True))[1:, 0])) < 1e-14
 
 
-def test_close_times_are_no_vanishing_steps() -> None:
+def test_close_times_are_no_vanishing_steps():
     model, state = random_chain(np.random.default_rng(44), [False])
     times = np.array([0.0, 0.1, 0.1 + 5e-15])
     done = run(model, state, 1e-6, times, dense=False)
     assert np.max(np.abs(done.r[2] - done.r[1])) < 1e-13
 
 
-def test_sweeps_end_at_what_rounding_leaves() -> None:
+def test_sweeps_end_at_what_rounding_leaves():
     """No sweep tolerance at all: the sweeps still end, and the motion is as good as double precision."""
     model, state = random_chain(np.random.default_rng(45), [False, True], loads=True, drag=True)
     usual, quiet = run(model, state, 1e-12), run(model, state, 1e-12, sweep_tolerance=0.0)
@@ -355,12 +349,12 @@ def test_sweeps_end_at_what_rounding_leaves() -> None:
     assert np.max(np.abs(quiet.r - usual.r)) < 1e-10
 
 
-def test_a_step_is_made_where_its_error_is_within_the_tolerance(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_is_made_where_its_error_is_within_the_tolerance(monkeypatch):
     """Longer and longer first steps: good ones, then too long for the tolerance, then for the sweeps."""
     model, state = random_chain(np.random.default_rng(46), [False])
     tails, tail = [], collocation._Stepper._error_over_tolerance
 
-    def noted(stepper: collocation._Stepper, a: Array, h: float) -> float:
+    def noted(stepper, a, h):
         tails.append(tail(stepper, a, h))
         return tails[-1]
 
@@ -388,7 +382,7 @@ def test_a_step_is_made_where_its_error_is_within_the_tolerance(monkeypatch: pyt
     assert {(True, False), (False, False), (False, True)} <= set(found)
 
 
-def test_the_tolerance_sets_the_steps(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_tolerance_sets_the_steps(monkeypatch):
     """Of few nodes the next step's error is foreseen; of many, what takes the usual sweeps is kept."""
     model, state = random_chain(np.random.default_rng(47), [False, False])
     done = run(model, state, 1e-6, np.array([0.0, 1.0]), nodes=4)
@@ -399,7 +393,7 @@ def test_the_tolerance_sets_the_steps(monkeypatch: pytest.MonkeyPatch) -> None:
         assert not made or sweeps > collocation.USUAL_SWEEPS or after > 0.95 * h
 
 
-def test_no_crumb_before_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_crumb_before_a_time(monkeypatch):
     """Steps that end on the times asked for share the way to each."""
     model, state = random_chain(np.random.default_rng(48), [False])
     watched, times = StepRecorder(monkeypatch), np.linspace(0, 1.5, 8)
@@ -409,7 +403,7 @@ def test_no_crumb_before_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
     assert np.all(h[ends[1:]] > 0.4 * h[ends[1:] - 1])
 
 
-def test_a_thousand_steps_add_up_to_the_last_digit() -> None:
+def test_a_thousand_steps_add_up_to_the_last_digit():
     """Constant parts: the compensated sums are the exact ones but for one rounding."""
     model, state = random_chain(np.random.default_rng(49), [False])
     r, p, v, pdot = initial_values(state)

@@ -1,7 +1,5 @@
 """The notes' rod of ever smaller length against the ball joint, its limit (E1)."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +15,7 @@ LENGTHS = [0.4, 1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6]
 
 
 @pytest.mark.parametrize("bodies", [1, 2, 3])
-def test_short_rods_converge_to_the_ball_joint_at_first_order(bodies: int) -> None:
+def test_short_rods_converge_to_the_ball_joint_at_first_order(bodies):
     model, state = random_chain(np.random.default_rng(40 + bodies), [False] * bodies, loads=True)
     start = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
     family = study_rod_limit(model, *start, LENGTHS, np.linspace(0, 0.05, 6), 1e-10)
@@ -26,7 +24,7 @@ def test_short_rods_converge_to_the_ball_joint_at_first_order(bodies: int) -> No
     assert family.position[-1] < 1e-4
 
 
-def test_off_the_slow_manifold_the_rod_swings_fast() -> None:
+def test_off_the_slow_manifold_the_rod_swings_fast():
     """A rod that does not point where the ball joint pulls leaves the ball's accelerations altogether."""
     model, state = random_chain(np.random.default_rng(44), [False])
     pdot = quaternion_rate(state.p, state.omega)
@@ -41,7 +39,7 @@ def test_off_the_slow_manifold_the_rod_swings_fast() -> None:
     assert jerk[1] > 30 * jerk[0]
 
 
-def test_a_family_is_what_its_fields_say() -> None:
+def test_a_family_is_what_its_fields_say():
     """Largest differences from the ball, of r̈ and F by the direct form and of the motion; their orders."""
     model, state = random_chain(np.random.default_rng(45), [False, False], loads=True)
     ball, pdot, times = model, quaternion_rate(state.p, state.omega), np.linspace(0, 0.05, 6)
@@ -65,7 +63,7 @@ def test_a_family_is_what_its_fields_say() -> None:
     assert family.observed_order[:, 0] == pytest.approx(np.log(errors[:, 0] / errors[:, 1]) / np.log(5))
 
 
-def test_a_rod_starts_along_the_balls_force_and_turns_with_it() -> None:
+def test_a_rod_starts_along_the_balls_force_and_turns_with_it():
     """u = −F/‖F‖ and its rate along the ball's motion, by differences; a joint without force has none."""
     model, state = random_chain(np.random.default_rng(46), [False, False])
     ball, pdot, h = model, quaternion_rate(state.p, state.omega), 1e-3
@@ -89,7 +87,7 @@ def test_a_rod_starts_along_the_balls_force_and_turns_with_it() -> None:
         slow_manifold_directions(weightless, state.r, state.p, 0 * state.v, 0 * pdot)
 
 
-def test_a_small_pendulum_has_the_same_directions() -> None:
+def test_a_small_pendulum_has_the_same_directions():
     """In units of a millimetre, moving slowly: the instant that u̇ is fitted in is of its own swing."""
     model, state = random_chain(np.random.default_rng(47), [False, False], rate=0.01)
     found = [
@@ -100,7 +98,7 @@ def test_a_small_pendulum_has_the_same_directions() -> None:
         assert there == pytest.approx(here, rel=1e-9, abs=1e-12)
 
 
-def test_the_joint_without_force_is_named() -> None:
+def test_the_joint_without_force_is_named():
     """A body that hangs still, and below it one that its load holds."""
     model, state = random_chain(np.random.default_rng(48), [False, False])
     one = model

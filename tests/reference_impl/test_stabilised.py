@@ -1,7 +1,5 @@
 """Baumgarte and projection hold the manifold that the raw form drifts from, and change nothing else."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -23,7 +21,7 @@ from tests.helpers.random_chains import random_chain
 
 
 @pytest.mark.parametrize("rods", [[False], [True], [False, True, False]])
-def test_every_variant_converges_to_the_same_motion(rods: list[bool]) -> None:
+def test_every_variant_converges_to_the_same_motion(rods):
     model, state = random_chain(np.random.default_rng(60), rods, loads=True, drag=True)
     start = model, state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
     times = np.linspace(0, 0.5, 6)
@@ -34,7 +32,7 @@ def test_every_variant_converges_to_the_same_motion(rods: list[bool]) -> None:
 
 
 @pytest.mark.parametrize("rods", [[False], [True], [True, False, True]])
-def test_projection_is_newton_on_every_constraint(rods: list[bool]) -> None:
+def test_projection_is_newton_on_every_constraint(rods):
     """From 1e-5 off the manifold to rounding; a state on it stays."""
     rng = np.random.default_rng(61)
     model, state = random_chain(rng, rods)
@@ -50,7 +48,7 @@ def test_projection_is_newton_on_every_constraint(rods: list[bool]) -> None:
         assert np.max(np.abs(moved - was)) < 1e-13
 
 
-def test_raw_drifts_and_the_others_do_not() -> None:
+def test_raw_drifts_and_the_others_do_not():
     model, state = random_chain(np.random.default_rng(62), [False])
     table = drift_table(
         model,
@@ -69,7 +67,7 @@ def test_raw_drifts_and_the_others_do_not() -> None:
     assert held["projected", 30.0].energy < 0.05 * held["raw", 30.0].energy
 
 
-def test_baumgarte_pulls_back_at_its_rate() -> None:
+def test_baumgarte_pulls_back_at_its_rate():
     """A gap of 1e-6 with a = 10/s is critically damped: (1 + a t) e^{−a t} of it is left."""
     model, state = random_chain(np.random.default_rng(63), [False])
     r, times = state.r + np.array([1e-6, 0, 0]), np.linspace(0, 1, 5)
@@ -89,7 +87,7 @@ def test_baumgarte_pulls_back_at_its_rate() -> None:
 
 
 @pytest.mark.full
-def test_energy_over_a_thousand_seconds() -> None:
+def test_energy_over_a_thousand_seconds():
     model, state = random_chain(np.random.default_rng(64), [False])
     start = model, state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
     row = drift_table(*start, rtols=(1e-13,), times=(1000.0,), variants=("projected",))[0]
@@ -98,7 +96,7 @@ def test_energy_over_a_thousand_seconds() -> None:
 
 
 @pytest.mark.parametrize("rods", [[True, False, True], [False], [True]], ids=str)
-def test_constraint_errors_are_metres_and_metres_a_second(rods: list[bool]) -> None:
+def test_constraint_errors_are_metres_and_metres_a_second(rods):
     """A rod's stretch and its rate, a ball's distance and speed, each the worst of its state, from `rows`."""
     rng = np.random.default_rng(65)
     model, state = random_chain(rng, rods)
@@ -127,7 +125,7 @@ def test_constraint_errors_are_metres_and_metres_a_second(rods: list[bool]) -> N
     assert still[2] == pytest.approx(np.full(3, 0.5), abs=1e-6)
 
 
-def test_energy_is_over_the_weight_and_reach_of_the_stretched_chain() -> None:
+def test_energy_is_over_the_weight_and_reach_of_the_stretched_chain():
     model, state = random_chain(np.random.default_rng(66), [True, False, True])
     one, pdot = model, quaternion_rate(state.p, state.omega)
     motion = integrate_variant(
@@ -153,7 +151,7 @@ def test_energy_is_over_the_weight_and_reach_of_the_stretched_chain() -> None:
     assert np.all(np.isnan(energy_error(loaded, motion)))
 
 
-def test_a_table_has_a_row_for_each_variant_tolerance_and_time() -> None:
+def test_a_table_has_a_row_for_each_variant_tolerance_and_time():
     """The maxima up to a time, and the share of the steps that falls to it."""
     model, state = random_chain(np.random.default_rng(67), [False])
     start = model, state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
@@ -170,14 +168,14 @@ def test_a_table_has_a_row_for_each_variant_tolerance_and_time() -> None:
         assert row.steps == round(motion.steps * row.time / 4.0)
 
 
-def test_there_are_three_variants_and_no_other() -> None:
+def test_there_are_three_variants_and_no_other():
     model, state = random_chain(np.random.default_rng(68), [False])
     start = model, state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
     with pytest.raises(ValueError, match="no variant 'damped'"):
         integrate_variant("damped", *start, np.array([0.0, 0.1]), 1e-6)
 
 
-def test_projection_from_afar_ends_on_unit_quaternions() -> None:
+def test_projection_from_afar_ends_on_unit_quaternions():
     """From 5 % off what is left of the gaps is of higher order, but p is normalised to rounding."""
     rng = np.random.default_rng(69)
     model, state = random_chain(rng, [True, False, False])
@@ -192,7 +190,7 @@ def test_projection_from_afar_ends_on_unit_quaternions() -> None:
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_a_variant_is_collocation_with_its_own_option_and_no_other(variant: str) -> None:
+def test_a_variant_is_collocation_with_its_own_option_and_no_other(variant):
     model, state = random_chain(np.random.default_rng(70), [False, True])
     state = replace(state, r=state.r + 1e-3)  # off the manifold, where the options differ
     start, times = (state.r, state.p, state.v, quaternion_rate(state.p, state.omega)), np.linspace(0, 0.2, 3)

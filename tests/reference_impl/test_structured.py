@@ -1,7 +1,5 @@
 """The structured form against the direct form it stands in for, on and off the manifold."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -24,7 +22,7 @@ JOINT_MIXES = {
 for_each_mix = pytest.mark.parametrize("mix", JOINT_MIXES)
 
 
-def split_by_chain(solution: Solution, forest: StructuredSystem) -> list[Solution]:
+def split_by_chain(solution, forest):
     """The forest's answer chain by chain."""
     out = []
     for index, one in enumerate(forest.chains):
@@ -46,7 +44,7 @@ def split_by_chain(solution: Solution, forest: StructuredSystem) -> list[Solutio
 
 
 @for_each_mix
-def test_equals_the_direct_form_within_the_derived_bound(mix: str) -> None:
+def test_equals_the_direct_form_within_the_derived_bound(mix):
     rng = np.random.default_rng(20)
     for _ in range(12):
         drawn = [
@@ -73,7 +71,7 @@ def test_equals_the_direct_form_within_the_derived_bound(mix: str) -> None:
 
 @for_each_mix
 @pytest.mark.parametrize("off", [0.0, 0.05, 1.0])
-def test_all_unknowns_equal_the_direct_forms_on_and_off_the_manifold(mix: str, off: float) -> None:
+def test_all_unknowns_equal_the_direct_forms_on_and_off_the_manifold(mix, off):
     """r, p and the rates anywhere: the printed rows' own behaviour (E2, E3) is part of what is equal.
 
     Off the manifold there is no derived bound.  Masses within a factor 10 and rods of 0.2 m and more keep
@@ -106,7 +104,7 @@ def test_all_unknowns_equal_the_direct_forms_on_and_off_the_manifold(mix: str, o
                 assert np.nanmax(np.abs(a - b), initial=0.0) <= 1e-11 * scale, name
 
 
-def test_a_batch_is_more_chains() -> None:
+def test_a_batch_is_more_chains():
     """A chain's answer does not depend on its neighbours in the forest, to the last bit of a sum."""
     rng = np.random.default_rng(22)
     model, state = random_chain(rng, [True, False, True])
@@ -126,7 +124,7 @@ def test_a_batch_is_more_chains() -> None:
 
 
 @for_each_mix
-def test_singular_configurations_are_reported(mix: str) -> None:
+def test_singular_configurations_are_reported(mix):
     rng = np.random.default_rng(23)
     model, state = random_chain(rng, JOINT_MIXES[mix](rng, 4))
     forest, pdot = StructuredSystem([model]), quaternion_rate(state.p, state.omega)
@@ -146,7 +144,7 @@ def test_singular_configurations_are_reported(mix: str) -> None:
             StructuredSystem([replace(model, **change)])
 
 
-def test_a_rod_of_length_zero_is_singular() -> None:
+def test_a_rod_of_length_zero_is_singular():
     """Read literally, C = dᵀd on a ball joint has no gradient (E1)."""
     rng = np.random.default_rng(24)
     model, state = random_chain(rng, [False, False, True])
@@ -159,7 +157,7 @@ def test_a_rod_of_length_zero_is_singular() -> None:
 
 
 @for_each_mix
-def test_constraints_are_gaps_of_balls_and_squares_of_rods(mix: str) -> None:
+def test_constraints_are_gaps_of_balls_and_squares_of_rods(mix):
     """C and its rate along (ṙ, ṗ), where joints are open and p is a unit quaternion; a rod has one row."""
     rng = np.random.default_rng(25)
     rods = {"balls": [False] * 5, "rods": [True] * 5, "mixed": [True, False, True, True, False]}[mix]
@@ -176,7 +174,7 @@ def test_constraints_are_gaps_of_balls_and_squares_of_rods(mix: str) -> None:
 
 
 @pytest.mark.parametrize("at, words", [(0, "body 1"), (3, "body 2"), (6, "body 2")])
-def test_a_cause_is_named_by_the_body_of_its_own_chain(at: int, words: str) -> None:
+def test_a_cause_is_named_by_the_body_of_its_own_chain(at, words):
     """Chains of 2, 3 and 2 bodies; the bodies of all are counted from 0."""
     rng = np.random.default_rng(26)
     drawn = [random_chain(rng, [False] * n) for n in (2, 3, 2)]
@@ -193,7 +191,7 @@ def test_a_cause_is_named_by_the_body_of_its_own_chain(at: int, words: str) -> N
 
 @for_each_mix
 @pytest.mark.parametrize("a", [0.5, 8.0])
-def test_baumgarte_adds_2a_and_a_squared_to_every_constraint(mix: str, a: float) -> None:
+def test_baumgarte_adds_2a_and_a_squared_to_every_constraint(mix, a):
     """C̈ + 2 a Ċ + a² C = 0 of joints that are open, and of pᵀp − 1."""
     rng = np.random.default_rng(27)
     model, state = random_chain(rng, JOINT_MIXES[mix](rng, 4), loads=True, drag=True)
@@ -216,7 +214,7 @@ def test_baumgarte_adds_2a_and_a_squared_to_every_constraint(mix: str, a: float)
 
 
 @for_each_mix
-def test_a_pendulum_of_any_size_is_solved_alike(mix: str) -> None:
+def test_a_pendulum_of_any_size_is_solved_alike(mix):
     """Micrometres and milligrams, kilometres and kilotons: no threshold has a unit."""
     rng = np.random.default_rng(28)
     model, state = random_chain(rng, JOINT_MIXES[mix](rng, 3), loads=True, drag=True)
@@ -236,7 +234,7 @@ def test_a_pendulum_of_any_size_is_solved_alike(mix: str) -> None:
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e6, 1e-6])
-def test_a_collapsed_rod_is_one_of_its_own_rounding(scale: float) -> None:
+def test_a_collapsed_rod_is_one_of_its_own_rounding(scale):
     model, state = random_chain(np.random.default_rng(24), [False, False, True])
     model, state = in_other_units(model, state, scale, 1.0, 1.0)
     r = state.r.copy()
@@ -245,7 +243,7 @@ def test_a_collapsed_rod_is_one_of_its_own_rounding(scale: float) -> None:
         StructuredSystem([model]).solve(r, state.p, state.v, quaternion_rate(state.p, state.omega))
 
 
-def test_a_rod_short_beside_another_chain_s_is_no_collapsed_one() -> None:
+def test_a_rod_short_beside_another_chain_s_is_no_collapsed_one():
     rng = np.random.default_rng(24)
     small, large = (in_other_units(*random_chain(rng, [True]), scale, 1.0, 1.0) for scale in (1e-6, 1e12))
     models, states = zip(small, large, strict=True)
@@ -256,7 +254,7 @@ def test_a_rod_short_beside_another_chain_s_is_no_collapsed_one() -> None:
     np.testing.assert_allclose(both.acceleration[:1], alone.acceleration, rtol=64 * EPS, atol=0)
 
 
-def test_a_collapsed_rod_on_a_body_that_is_not_turned_is_named_too() -> None:
+def test_a_collapsed_rod_on_a_body_that_is_not_turned_is_named_too():
     model, state = random_chain(np.random.default_rng(24), [True])
     at = state_from_minimal(model, np.array([[1.0, 0, 0, 0]]), state.omega, state.u, state.udot)
     with pytest.raises(SingularSystem, match="rod above body 1 has length 0"):
@@ -264,7 +262,7 @@ def test_a_collapsed_rod_on_a_body_that_is_not_turned_is_named_too() -> None:
         StructuredSystem([model]).solve(r, at.p, at.v, quaternion_rate(at.p, at.omega))
 
 
-def test_what_is_lost_to_rounding_or_overflow_is_told() -> None:
+def test_what_is_lost_to_rounding_or_overflow_is_told():
     """Bodies of 1 and 1e20 kg hold each other by rows that double precision cannot tell apart."""
     model, state = random_chain(np.random.default_rng(24), [False] * 3)
     heavy = np.array([1.0, 1e20, 1.0])
@@ -278,7 +276,7 @@ def test_what_is_lost_to_rounding_or_overflow_is_told() -> None:
         forest.acceleration(component_first(state.r, state.p), component_first(state.v, fast))
 
 
-def test_the_copies_of_a_tiled_forest_have_names_too() -> None:
+def test_the_copies_of_a_tiled_forest_have_names_too():
     model, state = random_chain(np.random.default_rng(29), [False, False, False])
     forest = StructuredSystem([model]).repeated(2)
     q, v = component_first(state.r, state.p), component_first(state.v, quaternion_rate(state.p, state.omega))
@@ -289,7 +287,7 @@ def test_the_copies_of_a_tiled_forest_have_names_too() -> None:
     assert forest.first_body.tolist() == [0, 3, 6]
 
 
-def test_a_body_without_thickness_is_named_beside_a_tiny_one() -> None:
+def test_a_body_without_thickness_is_named_beside_a_tiny_one():
     """A needle has no inertia about its axis; a body of 1e-20 kg m² has, however small."""
     model, _ = random_chain(np.random.default_rng(30), [False, False])
     needle = replace(model, inertia=np.stack([1e-20 * np.eye(3), np.diag([1.0, 1.0, 0.0])]))
@@ -299,7 +297,7 @@ def test_a_body_without_thickness_is_named_beside_a_tiny_one() -> None:
 
 @for_each_mix
 @pytest.mark.parametrize("alone", ["drag_force", "drag_moment"])
-def test_one_kind_of_drag_alone_counts(mix: str, alone: str) -> None:
+def test_one_kind_of_drag_alone_counts(mix, alone):
     rng = np.random.default_rng(31)
     model, state = random_chain(rng, JOINT_MIXES[mix](rng, 3), drag=True)
     other = {"drag_force": "drag_moment", "drag_moment": "drag_force"}[alone]
@@ -317,7 +315,7 @@ def test_one_kind_of_drag_alone_counts(mix: str, alone: str) -> None:
 
 
 @for_each_mix
-def test_the_rate_of_a_gap_is_its_derivative_off_the_manifold_too(mix: str) -> None:
+def test_the_rate_of_a_gap_is_its_derivative_off_the_manifold_too(mix):
     """Where pᵀṗ is not 0 the matrix A of the notes stretches, and d with it."""
     rng, h = np.random.default_rng(32), 1e-6
     model, state = random_chain(rng, JOINT_MIXES[mix](rng, 4))

@@ -7,8 +7,6 @@ import html
 import json
 import re
 import shutil
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
@@ -40,7 +38,7 @@ DRIFT = [
 LEFT_OUT = {"scenario": "tumbling-ball", "variant": "raw", "rtol": 1e-9, "time": 1000.0, "reason": NASTY}
 
 
-def sweep_rows() -> list[dict[str, Any]]:
+def sweep_rows():
     """Two parameters, one of them with more values than are shown one by one; every verdict."""
     rows, verdicts = [], ["agrees", "disagrees", "failed", "unresolved", "unsupported", "not installed"]
     for cell in range(90):
@@ -58,7 +56,7 @@ def sweep_rows() -> list[dict[str, Any]]:
 
 
 @pytest.fixture(scope="module")
-def out(example_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def out(example_run, tmp_path_factory):
     folder = shutil.copytree(example_run, tmp_path_factory.mktemp("pages") / "a run & more")
     write_table(pa.Table.from_pylist([*DRIFT, LEFT_OUT], schema=drift.SCHEMA), folder / "drift.parquet")
     goals = [
@@ -82,17 +80,17 @@ def out(example_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def section(text: str, name: str) -> str:
+def section(text, name):
     found = re.search(rf'<section class="fast" id="{name}".*?</section>', text, re.DOTALL)
     assert found, name
     return found[0]
 
 
-def words(markup: str) -> str:
+def words(markup):
     return " ".join(html.unescape(re.sub(r"<[^>]*>", " ", markup)).split())
 
 
-def test_the_report_has_the_drift_of_every_variant(out: Path) -> None:
+def test_the_report_has_the_drift_of_every_variant(out):
     found = section((out / "report.html").read_text(encoding="utf-8"), "drift")
     lines = [words(line) for line in re.findall(r"<tr>.*?</tr>", found, re.DOTALL)]
     raw = next(line for line in lines if line.startswith("raw"))
@@ -105,7 +103,7 @@ def test_the_report_has_the_drift_of_every_variant(out: Path) -> None:
     assert HOSTILE not in found
 
 
-def test_the_report_has_the_goals_and_the_pictures_as_inert_images(out: Path) -> None:
+def test_the_report_has_the_goals_and_the_pictures_as_inert_images(out):
     found = section((out / "report.html").read_text(encoding="utf-8"), "benchmarks")
     assert f"{HOSTILE} 0.3 0.120 ✓ yes" in words(found)
     assert re.search(r"4 5\.50 ✗ no", words(found))
@@ -116,7 +114,7 @@ def test_the_report_has_the_goals_and_the_pictures_as_inert_images(out: Path) ->
     assert HOSTILE not in found
 
 
-def test_stored_measurements_stand_in_and_say_so(tmp_path: Path) -> None:
+def test_stored_measurements_stand_in_and_say_so(tmp_path):
     kept = reference_tables.benchmark_table(tmp_path)
     assert kept is not None
     assert kept["stored"]
@@ -126,7 +124,7 @@ def test_stored_measurements_stand_in_and_say_so(tmp_path: Path) -> None:
     assert reference_tables.drift_table(tmp_path, tmp_path) is None
 
 
-def test_the_map_has_every_place_and_the_worst_speaks(out: Path) -> None:
+def test_the_map_has_every_place_and_the_worst_speaks(out):
     text = (out / "sweep.html").read_text(encoding="utf-8")
     tables = re.findall(r'<table class="map">.*?</table>', text, re.DOTALL)
     assert len(tables) == 3  # two of the reference, one of the engine
@@ -149,7 +147,7 @@ def test_the_map_has_every_place_and_the_worst_speaks(out: Path) -> None:
     assert "<script" not in text
 
 
-def test_intervals_cover_every_value_and_follow_ratios() -> None:
+def test_intervals_cover_every_value_and_follow_ratios():
     name = list(sweep_rows()[0])[1]
     axis = sweep_page.make_axis(name, sweep_rows())
     assert axis.edges is not None
@@ -164,7 +162,7 @@ def test_intervals_cover_every_value_and_follow_ratios() -> None:
 
 @pytest.mark.browser
 @pytest.mark.parametrize("name", ["report.html", "sweep.html"])
-def test_no_request_no_violation_no_script_needed(chromium: Any, out: Path, name: str) -> None:
+def test_no_request_no_violation_no_script_needed(chromium, out, name):
     trouble: list[str] = []
     page = chromium.new_page(java_script_enabled=False, offline=True)
     page.on("console", lambda message: trouble.append(message.text))
@@ -183,9 +181,7 @@ def test_no_request_no_violation_no_script_needed(chromium: Any, out: Path, name
 
 @pytest.mark.browser
 @pytest.mark.parametrize("name", ["report.html", "sweep.html"])
-def test_axe_finds_no_violation_here_either(
-    chromium: Any, out: Path, name: str, violations: Callable[[Any, str], list[str]]
-) -> None:
+def test_axe_finds_no_violation_here_either(chromium, out, name, violations):
     context = chromium.new_context(bypass_csp=True, offline=True)
     page = context.new_page()
     page.goto((out / name).as_uri())
@@ -194,7 +190,7 @@ def test_axe_finds_no_violation_here_either(
     assert found == []
 
 
-def test_a_sweep_of_one_parameter_is_one_line(tmp_path: Path) -> None:
+def test_a_sweep_of_one_parameter_is_one_line(tmp_path):
     rows = [row for row in sweep_rows() if row["bodies[0].mass"] == 0.5 and row["cell"] < 30]
     text = sweep_page.render(["bodies[0].mass", list(rows[0])[1]], _whole(rows), {})
     assert [
@@ -202,7 +198,7 @@ def test_a_sweep_of_one_parameter_is_one_line(tmp_path: Path) -> None:
     ] == [2] * 3
 
 
-def test_the_command_writes_the_map(tmp_path: Path) -> None:
+def test_the_command_writes_the_map(tmp_path):
     vary = ("bodies[0].mass: {values: [0.5, 1]}", "bodies[0].angular_velocity[0]: {values: [0, 1]}")
     head = "schema_version: 1\nscenario: tumbling-ball\nduration: 0.25\nvary:\n  "
     (tmp_path / "sweep.yaml").write_text(head + "\n  ".join(vary))
@@ -214,5 +210,5 @@ def test_the_command_writes_the_map(tmp_path: Path) -> None:
     assert "Scenario tumbling-ball Count 1 Seed 0 Duration 0.25" in told
 
 
-def _whole(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _whole(rows):
     return [dict.fromkeys(sweep.COLUMNS) | row for row in rows]

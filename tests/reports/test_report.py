@@ -36,42 +36,42 @@ pytestmark = pytest.mark.xdist_group("reports")
 
 
 @pytest.fixture(scope="module")
-def out(example_run: Path) -> Path:
+def out(example_run):
     return example_run
 
 
 @pytest.fixture(scope="module")
-def text(out: Path) -> str:
+def text(out):
     return html_report.render(Results.load(out), History())
 
 
 class Parsed(HTMLParser):
     """Tags with attributes, and all text outside scripts and styles."""
 
-    def __init__(self, source: str) -> None:
+    def __init__(self, source):
         super().__init__()
         self.tags: list[tuple[str, dict[str, str | None]]] = []
         self.words = ""
         self.raw = False
         self.feed(source)
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
         self.tags.append((tag, dict(attrs)))
         self.raw = tag in ("script", "style")
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         self.raw = False
 
-    def handle_data(self, data: str) -> None:
+    def handle_data(self, data):
         self.words += "" if self.raw else data
 
 
-def decoded_chunks(text: str) -> dict[str, object]:
+def decoded_chunks(text):
     found = re.findall(r'<script type="application/octet-stream" id="chunk-([\w-]+)">([^<]*)</script>', text)
     return {name: chunks.decode_chunk(body) for name, body in found}
 
 
-def test_the_sentence_counts_and_versions_come_first(out: Path, text: str) -> None:
+def test_the_sentence_counts_and_versions_come_first(out, text):
     results = Results.load(out)
     parsed = Parsed(text)
     before_matrix = parsed.words[: parsed.words.index("Worst error over its tolerance")]
@@ -84,7 +84,7 @@ def test_the_sentence_counts_and_versions_come_first(out: Path, text: str) -> No
         assert engine["version"] in parsed.words
 
 
-def test_every_cell_is_in_the_static_matrix_with_glyph_text_and_class(out: Path, text: str) -> None:
+def test_every_cell_is_in_the_static_matrix_with_glyph_text_and_class(out, text):
     results = Results.load(out)
     table = text[text.index('<table class="matrix"') : text.index("</table>")]
     lines = table.split('<tr class="line"')[1:]
@@ -101,7 +101,7 @@ def test_every_cell_is_in_the_static_matrix_with_glyph_text_and_class(out: Path,
             assert (format_number(ratio) if ratio is not None else worst["verdict"]) in cell
 
 
-def test_terminal_and_report_show_the_same_row_of_each_cell(out: Path, text: str) -> None:
+def test_terminal_and_report_show_the_same_row_of_each_cell(out, text):
     """The report's link names the row; glyph and ratio of the terminal's cell are those of the same row."""
     results = Results.load(out)
     shown = re.findall(
@@ -128,11 +128,11 @@ def test_terminal_and_report_show_the_same_row_of_each_cell(out: Path, text: str
         assert (str(row.verdict) if row.ratio is None else format_number(row.ratio)) in in_report
 
 
-def test_the_worst_row_stands_for_its_cell() -> None:
-    def worst_row(rows: list[dict[str, object]]) -> dict[str, object]:
+def test_the_worst_row_stands_for_its_cell():
+    def worst_row(rows):
         return max(rows, key=rank)
 
-    def row(verdict: str, value: float | None, known: str | None = None) -> dict[str, object]:
+    def row(verdict, value, known=None):
         return {"verdict": verdict, "ratio": value, "known_issue": known}
 
     agree, disagree = row("agrees", 0.9), row("disagrees", 2.0)
@@ -146,7 +146,7 @@ def test_the_worst_row_stands_for_its_cell() -> None:
     assert error_ratio({"verdict": "agrees", "value": 3.0, "tolerance": 4.0, "ratio": 0.2}) == 0.2
 
 
-def test_no_hostile_text_becomes_markup(text: str) -> None:
+def test_no_hostile_text_becomes_markup(text):
     parsed = Parsed(text)
     kinds = {tag for tag, _ in parsed.tags}
     assert "img" not in kinds
@@ -158,36 +158,36 @@ def test_no_hostile_text_becomes_markup(text: str) -> None:
     assert not re.search("[\x00-\x08\x0b-\x1f\x7f\u202e]", text)
 
 
-def test_hostile_names_survive_in_the_data_and_in_links(out: Path, text: str) -> None:
+def test_hostile_names_survive_in_the_data_and_in_links(out, text):
     data = decoded_chunks(text)
-    assert fixture.HOSTILE in data["index"]["scenarios"]  # type: ignore[index]
+    assert fixture.HOSTILE in data["index"]["scenarios"]
     links = [
         a["href"] for tag, a in Parsed(text).tags if tag == "a" and (a.get("href") or "").startswith("#")
     ]
     assert any("scenario=%3Cimg+src%3Dx+onerror%3Dalert%281%29%3E" in (link or "") for link in links)
-    rows = [c["rows"] for name, c in data.items() if name.startswith("scenario-")]  # type: ignore[index,call-overload]
+    rows = [c["rows"] for name, c in data.items() if name.startswith("scenario-")]
     scripts = [row["script"] for group in rows for row in group.values() if "script" in row]
     assert any(fixture.HOSTILE in script for script in scripts)
 
 
-def test_unprintable_characters_become_visible_ones_everywhere() -> None:
+def test_unprintable_characters_become_visible_ones_everywhere():
     bad = "a\x00b\x1bc\u202ed\ud800e\ufffff\x85g\rh\ni"
     assert replace_unprintable({bad: [bad]}) == {"a�b�c�d�e�f�g�h\ni": ["a�b�c�d�e�f�g�h\ni"]}
 
 
-def test_the_page_allows_only_its_own_script_and_style(text: str) -> None:
-    policy = html.unescape(re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1])  # type: ignore[index]
+def test_the_page_allows_only_its_own_script_and_style(text):
+    policy = html.unescape(re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1])
     assert policy.startswith("default-src 'none'")
     assert "unsafe" not in policy and "http" not in policy
     for tag in ("script", "style"):
-        body = re.search(rf"<{tag}>(.*?)</{tag}>", text, re.DOTALL)[1]  # type: ignore[index]
+        body = re.search(rf"<{tag}>(.*?)</{tag}>", text, re.DOTALL)[1]
         digest = base64.b64encode(hashlib.sha256(body.encode()).digest()).decode()
         assert f"{tag}-src 'sha256-{digest}'" in policy
     loading = [a for _, a in Parsed(text).tags if "src" in a or (a.get("href") or "#")[0] not in "#d"]
     assert loading == []
 
 
-def test_decimation_keeps_every_peak_and_every_gap() -> None:
+def test_decimation_keeps_every_peak_and_every_gap():
     rng = np.random.default_rng(1)
     y = rng.random(10_001)
     spikes = rng.choice(len(y), 20, replace=False)
@@ -207,7 +207,7 @@ def test_decimation_keeps_every_peak_and_every_gap() -> None:
     assert chunks.decimate(y[:300], 300) is not None and len(chunks.decimate(y[:300], 300)) == 300
 
 
-def test_log_codes_keep_half_a_percent_and_tell_zero_from_nothing() -> None:
+def test_log_codes_keep_half_a_percent_and_tell_zero_from_nothing():
     y = np.array([0.0, np.nan, np.inf, 1e-300, 1e-17, 3.3e-9, -2.5, 1e80])
     codes = chunks.log_scale_codes(y).astype(float)
     assert codes[:4].tolist() == [1, 0, 0, 2]
@@ -215,7 +215,7 @@ def test_log_codes_keep_half_a_percent_and_tell_zero_from_nothing() -> None:
     assert np.allclose(back, np.abs(y[4:]), rtol=0.0024)
 
 
-def test_chunks_come_back_as_they_went_in() -> None:
+def test_chunks_come_back_as_they_went_in():
     packer = chunks.ChunkBuilder()
     arrays = [
         np.arange(7, dtype=np.uint8),
@@ -233,13 +233,13 @@ def test_chunks_come_back_as_they_went_in() -> None:
         assert np.array_equal(found, array)
 
 
-def test_a_difference_of_1e_9_survives_in_the_motion(out: Path, text: str) -> None:
+def test_a_difference_of_1e_9_survives_in_the_motion(out, text):
     results = Results.load(out)
     poses, name = results.table("trajectories"), "double-tumbling"
-    motion = decoded_chunks(text)[f"scenario-{list(results.scenarios).index(name)}"]["motion"]  # type: ignore[index,call-overload]
+    motion = decoded_chunks(text)[f"scenario-{list(results.scenarios).index(name)}"]["motion"]
     frames = len(motion["t"])
 
-    def r(engine: str, integrator: str) -> np.ndarray:
+    def r(engine, integrator):
         mine = (poses["scenario"] == name) & (poses["engine"] == engine) & (poses["integrator"] == integrator)
         order = np.lexsort((poses["body"][mine], poses["t"][mine]))
         return np.stack([poses[k][mine][order] for k in ("rx", "ry", "rz")], -1).reshape(-1, 2, 3)
@@ -251,7 +251,7 @@ def test_a_difference_of_1e_9_survives_in_the_motion(out: Path, text: str) -> No
     assert np.all(np.abs(drawn - exact[pick]) <= run["scale"][:, None, None] / 254 * 1.001 + 1e-30)
 
 
-def test_rotation_vectors_are_exact_for_tiny_and_large_angles() -> None:
+def test_rotation_vectors_are_exact_for_tiny_and_large_angles():
     axis = np.array([2, -3, 6]) / 7
     base = np.array([0.5, 0.5, -0.5, 0.5])
     for angle in (1e-14, 1e-9, 0.3, 3.0):
@@ -262,12 +262,12 @@ def test_rotation_vectors_are_exact_for_tiny_and_large_angles() -> None:
             )
 
 
-def test_the_first_crossing_is_of_the_undecimated_curve(out: Path, text: str) -> None:
+def test_the_first_crossing_is_of_the_undecimated_curve(out, text):
     results = Results.load(out)
     curves = results.table("curves")
     seen = 0
     for k, name in enumerate(results.scenarios):
-        for one in decoded_chunks(text)[f"scenario-{k}"]["curves"]:  # type: ignore[index,call-overload]
+        for one in decoded_chunks(text)[f"scenario-{k}"]["curves"]:
             mine = (
                 (curves["scenario"] == name)
                 & (curves["engine"] == one["engine"])
@@ -285,7 +285,7 @@ def test_the_first_crossing_is_of_the_undecimated_curve(out: Path, text: str) ->
     assert seen > 3
 
 
-def test_commands_are_quoted_for_a_shell() -> None:
+def test_commands_are_quoted_for_a_shell():
     row = {"scenario": "x'; rm -rf ~ #", "engine": "mujoco", "level": "invariants", "quantity": "order"}
     assert shlex.split(report_data.rerun_command(row, {"file": ""}))[4:] == [
         "x'; rm -rf ~ #",
@@ -304,18 +304,18 @@ def test_commands_are_quoted_for_a_shell() -> None:
     assert report_data.rerun_command(row, {"file": ""}) == f"{nightly} --long-run-seconds 12.5"
 
 
-def test_numbers_read_as_people_write_them() -> None:
+def test_numbers_read_as_people_write_them():
     shown = [format_number(x) for x in (0.0, 1.0, 0.0314, 4.2e-6, -1.5e7, 123.4, 9.99, float("nan"), None)]
     assert shown == ["0", "1.0", "0.031", "4.2×10⁻⁶", "−1.5×10⁷", "120", "10", "not finite", "–"]
 
 
-def test_the_default_catalogue_stays_under_2_megabytes(catalogue_page: Path) -> None:
+def test_the_default_catalogue_stays_under_2_megabytes(catalogue_page):
     size = catalogue_page.stat().st_size
     print(f"30 scenarios: {size:,} bytes")
     assert size <= html_report.MAX_PAGE_BYTES
 
 
-def test_a_night_of_thousands_of_scenarios_stays_under_8_megabytes(out: Path, tmp_path: Path) -> None:
+def test_a_night_of_thousands_of_scenarios_stays_under_8_megabytes(out, tmp_path):
     stored, name = Results.load(out), "double-tumbling"
     rows = [row for row in stored.rows if row["scenario"] == name]
     scenarios = {f"random-{k}": stored.scenarios[name] for k in range(2500)}
@@ -335,17 +335,15 @@ def test_a_night_of_thousands_of_scenarios_stays_under_8_megabytes(out: Path, tm
     assert f"<b>{sum(row['verdict'] == 'agrees' for row in copies)}</b><span>agree" in text
 
 
-def test_a_page_above_its_budget_has_fewer_points(
-    out: Path, text: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_page_above_its_budget_has_fewer_points(out, text, monkeypatch):
     monkeypatch.setattr(html_report, "MAX_PAGE_BYTES", len(text.encode()) - 30_000)
     smaller = html_report.render(Results.load(out), History())
     assert len(smaller.encode()) <= html_report.MAX_PAGE_BYTES
-    few, many = (decoded_chunks(page)["scenario-0"]["curves"][0]["t"] for page in (smaller, text))  # type: ignore[index,call-overload]
+    few, many = (decoded_chunks(page)["scenario-0"]["curves"][0]["t"] for page in (smaller, text))
     assert len(few) < len(many)
 
 
-def test_a_history_says_what_is_new_and_skips_a_damaged_night(out: Path, tmp_path: Path) -> None:
+def test_a_history_says_what_is_new_and_skips_a_damaged_night(out, tmp_path):
     past = fixture.nights(out, tmp_path / "history", count=4)
     results = Results.load(out)
     history = History.load(past, results)
@@ -355,7 +353,7 @@ def test_a_history_says_what_is_new_and_skips_a_damaged_night(out: Path, tmp_pat
     assert fresh == {row["key"] for row in results.rows if row["verdict"] in ("disagrees", "failed")}
     page = html_report.render(results, history)
     data = decoded_chunks(page)
-    table = data["history"]["verdict"].reshape(len(results.rows), 5)  # type: ignore[index,call-overload]
+    table = data["history"]["verdict"].reshape(len(results.rows), 5)
     for line, row in zip(table, results.rows, strict=True):
         assert list(VERDICT_STYLES)[line[-1] - 1] == row["verdict"]
         if row["key"] in fresh:
@@ -364,7 +362,7 @@ def test_a_history_says_what_is_new_and_skips_a_damaged_night(out: Path, tmp_pat
     assert re.search(rf"{len(fresh)}\s+newly failing", words) and "Skipped as damaged: 2026-11-02" in words
 
 
-def test_a_run_of_the_state_level_alone_has_a_page(out: Path, tmp_path: Path) -> None:
+def test_a_run_of_the_state_level_alone_has_a_page(out, tmp_path):
     few = tmp_path / "few"
     few.mkdir()
     stored = json.loads((out / "results.json").read_text())
@@ -375,10 +373,10 @@ def test_a_run_of_the_state_level_alone_has_a_page(out: Path, tmp_path: Path) ->
     (few / "results.json").write_text(json.dumps(stored))
     shutil.copy(out / "states.parquet", few)
     data = decoded_chunks(html_report.write(Results.load(few)).read_text())
-    assert data["scenario-0"]["curves"] == [] and data["scenario-0"]["motion"] is None  # type: ignore[index,call-overload]
+    assert data["scenario-0"]["curves"] == [] and data["scenario-0"]["motion"] is None
 
 
-def test_gaps_of_one_reason_are_one_finding(out: Path) -> None:
+def test_gaps_of_one_reason_are_one_finding(out):
     results = Results.load(out)
     gap = next(row for row in results.rows if row["verdict"] == "unsupported")
     rows = [{**gap, "known_issue": None, "scenario": f"s{k}"} for k in range(9)]
@@ -391,13 +389,11 @@ def test_gaps_of_one_reason_are_one_finding(out: Path) -> None:
     assert (len(second["scenarios"]), second["more"]) == (0, 0)
 
 
-def test_a_report_that_cannot_be_written_leaves_the_old_one(
-    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_report_that_cannot_be_written_leaves_the_old_one(out, tmp_path, monkeypatch):
     copy = shutil.copytree(out, tmp_path / "copy")
     old = html_report.write(Results.load(copy)).read_bytes()
 
-    def full(descriptor: int) -> None:
+    def full(descriptor):
         os.ftruncate(descriptor, 1000)
         raise OSError(28, "No space left on device")
 
@@ -408,7 +404,7 @@ def test_a_report_that_cannot_be_written_leaves_the_old_one(
     assert [p.name for p in copy.iterdir() if p.name.startswith(".")] == []
 
 
-def test_junit_counts_what_it_holds_and_survives_every_text(out: Path) -> None:
+def test_junit_counts_what_it_holds_and_survives_every_text(out):
     results = Results.load(out)
     root = ET.parse(junit.write(Results.load(out))).getroot()
     cases = root.findall("./testsuite/testcase")
@@ -421,7 +417,7 @@ def test_junit_counts_what_it_holds_and_survives_every_text(out: Path) -> None:
     assert any("behaves as if gravity" in (failure.text or "") for failure in root.findall(".//failure"))
 
 
-def test_the_step_summary_shows_text_as_text_and_keeps_its_limit(out: Path) -> None:
+def test_the_step_summary_shows_text_as_text_and_keeps_its_limit(out):
     text = step_summary.write(Results.load(out)).read_text(encoding="utf-8")
     assert "<" not in text and "`" not in text
     assert html.unescape(step_summary.escape_markdown(fixture.HOSTILE)) == fixture.HOSTILE
@@ -435,21 +431,21 @@ def test_the_step_summary_shows_text_as_text_and_keeps_its_limit(out: Path) -> N
     assert "report.html has every cell" in crowded
 
 
-def tool(name: str) -> str:
+def tool(name):
     found = REPORTS / "node_modules" / ".bin" / name
     if not found.exists():
         pytest.skip(f"{name} is not installed: run `npm ci` in reports/ first")
     return str(found)
 
 
-def test_the_pages_own_script_is_type_checked() -> None:
+def test_the_pages_own_script_is_type_checked():
     done = subprocess.run(
         [tool("tsc"), "--noEmit", "-p", "."], cwd=REPORTS, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_the_pages_own_script_is_linted() -> None:
+def test_the_pages_own_script_is_linted():
     done = subprocess.run(
         [tool("eslint"), "--max-warnings", "0", "assets"],
         cwd=REPORTS,
@@ -460,7 +456,7 @@ def test_the_pages_own_script_is_linted() -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_vendored_uplot_comes_with_its_licence(text: str) -> None:
+def test_vendored_uplot_comes_with_its_licence(text):
     assert "uPlot" in html_report.bundle_script() and "Copyright (c) 2022 Leon Sorokin" in Parsed(text).words
     assert not re.search(
         r"\bfetch\(|XMLHttpRequest|WebSocket|EventSource|sendBeacon", html_report.bundle_script()

@@ -1,7 +1,5 @@
 """The report as a person meets it: in a real Chromium, by file://, offline."""
 
-from __future__ import annotations
-
 import base64
 import math
 import re
@@ -9,7 +7,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -32,7 +30,7 @@ CLICK = """async () => {  // s from a click on a cell until its view is complete
 
 
 @pytest.fixture(scope="module")
-def out(example_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def out(example_run, tmp_path_factory):
     folder = shutil.copytree(example_run, tmp_path_factory.mktemp("browser") / "a run & more")
     report.write(Results.load(folder), fixture.nights(folder, tmp_path_factory.mktemp("history"), count=6))
     return folder
@@ -43,11 +41,11 @@ Violations = Callable[[Any, str], list[str]]
 
 
 @pytest.fixture
-def open_page(chromium: Any, out: Path) -> Iterator[Open]:
+def open_page(chromium, out):
     """Opens a view of the report; at the end no error, warning, request or violation may have been seen."""
     contexts, trouble = [], []
 
-    def opened(view: str = "", folder: Path = out, **options: Any) -> Any:
+    def opened(view="", folder=out, **options):
         context = chromium.new_context(viewport={"width": 1400, "height": 900}, offline=True, **options)
         contexts.append(context)
         page = context.new_page()
@@ -66,25 +64,25 @@ def open_page(chromium: Any, out: Path) -> Iterator[Open]:
     assert trouble == []
 
 
-def loads(url: str, folder: Path) -> bool:
+def loads(url, folder):
     return url.split("#")[0] != (folder / "report.html").as_uri() and not url.startswith("data:")
 
 
-def go(page: Any, view: str) -> None:
+def go(page, view):
     """Show another view of an open report."""
     page.evaluate("view => { delete document.documentElement.dataset.shown; location.hash = view; }", view)
     page.wait_for_selector("html[data-shown]")
 
 
-def link(**fields: str) -> str:
+def link(**fields):
     return "#" + urlencode(fields)
 
 
-def visible_lines(page: Any) -> list[str]:
+def visible_lines(page):
     return [x.inner_text() for x in page.locator("tr.line:visible .name").all()]
 
 
-def test_opening_times(chromium: Any, catalogue_page: Path) -> None:
+def test_opening_times(chromium, catalogue_page):
     """The whole default catalogue opens in 1 s and a cell in 0.3 s: the best of up to fifteen times.
 
     The limits are those of an idle machine, and other load only adds: beside three other processes the median
@@ -100,7 +98,7 @@ def test_opening_times(chromium: Any, catalogue_page: Path) -> None:
     assert cell <= CELL
 
 
-def timed(chromium: Any, path: Path) -> tuple[float, float]:
+def timed(chromium, path):
     """Measure the time until the report, and then one of its cells, is complete [s]."""
     page = chromium.new_page()
     began = time.perf_counter()
@@ -113,7 +111,7 @@ def timed(chromium: Any, path: Path) -> tuple[float, float]:
     return opened, cell
 
 
-def test_without_javascript_the_matrix_and_findings_are_there(open_page: Open, out: Path) -> None:
+def test_without_javascript_the_matrix_and_findings_are_there(open_page, out):
     page = open_page(java_script_enabled=False)
     results = Results.load(out)
     assert page.locator("h1").inner_text() == results.run["sentence"]
@@ -124,7 +122,7 @@ def test_without_javascript_the_matrix_and_findings_are_there(open_page: Open, o
     assert page.get_by_text("Filters, curves and motion need JavaScript").is_visible()
 
 
-def test_the_script_draws_the_same_matrix_as_the_static_page(open_page: Open) -> None:
+def test_the_script_draws_the_same_matrix_as_the_static_page(open_page):
     page = open_page()
     read = (
         "cells => cells.map(c => [c.className.replace(' expected', ''), c.querySelector('.q')?.textContent])"
@@ -140,12 +138,12 @@ def test_the_script_draws_the_same_matrix_as_the_static_page(open_page: Open) ->
         )  # codes keep half a percent, text two digits
 
 
-def plain(text: str) -> float:
+def plain(text):
     digits = str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789")
     return float(re.sub(r"×10", "e", text).translate(digits).replace("−", "-"))
 
 
-def test_filters_narrow_the_matrix_and_are_links(open_page: Open) -> None:
+def test_filters_narrow_the_matrix_and_are_links(open_page):
     page = open_page()
     everything = visible_lines(page)
     page.get_by_label("Verdict").select_option("disagrees")
@@ -172,7 +170,7 @@ def test_filters_narrow_the_matrix_and_are_links(open_page: Open) -> None:
     assert "order" in page.locator("td.cell:visible a").first.get_attribute("title")
 
 
-def test_every_view_is_a_link_that_restores_it(open_page: Open) -> None:
+def test_every_view_is_a_link_that_restores_it(open_page):
     cell = {"scenario": "double-two-rods", "engine": "mujoco"}
     page = open_page(link(**cell, row="trajectory/RK4/position", t="1.25", mag="7", curves="all"))
     assert page.locator("h1.cell-title:visible").inner_text() == "double-two-rods on MuJoCo"
@@ -186,7 +184,7 @@ def test_every_view_is_a_link_that_restores_it(open_page: Open) -> None:
     assert "no scenario “<b>no</b>”" in lost.locator("#cell-view").inner_text()
 
 
-def test_families_fold_and_cells_are_walked_by_keyboard(open_page: Open) -> None:
+def test_families_fold_and_cells_are_walked_by_keyboard(open_page):
     page = open_page()
     fold = page.get_by_role("button", name="single")
     fold.focus()
@@ -209,7 +207,7 @@ def test_families_fold_and_cells_are_walked_by_keyboard(open_page: Open) -> None
     page.wait_for_selector("html[data-shown=matrix]")
 
 
-def test_tab_reaches_everything_that_can_be_used(open_page: Open) -> None:
+def test_tab_reaches_everything_that_can_be_used(open_page):
     page = open_page(link(scenario="planar-large", engine="mujoco"))
     usable = "#cell-view :is(a, button, input, select, canvas[tabindex], summary)"
     wanted = page.locator(f"{usable}:not(:disabled):visible").count()
@@ -223,7 +221,7 @@ def test_tab_reaches_everything_that_can_be_used(open_page: Open) -> None:
     assert len(reached - {-1}) == wanted
 
 
-def test_the_detail_says_what_was_compared_and_why(open_page: Open) -> None:
+def test_the_detail_says_what_was_compared_and_why(open_page):
     page = open_page(link(scenario="chain-10", engine="pinocchio"))
     chosen = page.locator(".chosen")
     assert "acceleration" in chosen.inner_text() and "disagrees" in chosen.inner_text()
@@ -247,11 +245,11 @@ def test_the_detail_says_what_was_compared_and_why(open_page: Open) -> None:
     assert "Position error" in panels.first.get_attribute("aria-label")
 
 
-def pixels(page: Any, engine: str) -> str:
+def pixels(page, engine):
     return page.locator(f'canvas[aria-label^="Motion of {engine},"]').evaluate("c => c.toDataURL()")
 
 
-def test_slider_playback_and_the_jump_to_the_first_crossing(open_page: Open) -> None:
+def test_slider_playback_and_the_jump_to_the_first_crossing(open_page):
     from playwright.sync_api import expect
 
     page = open_page(link(scenario="planar-large", engine="exudyn"))
@@ -265,7 +263,7 @@ def test_slider_playback_and_the_jump_to_the_first_crossing(open_page: Open) -> 
     assert pixels(page, "reference") != before
     assert marker.evaluate("m => m.style.transform") != at_rest
     jump = page.get_by_role("button", name="First above tolerance")
-    told = float(re.search(r"([\d.]+) s", jump.inner_text())[1])  # type: ignore[index]
+    told = float(re.search(r"([\d.]+) s", jump.inner_text())[1])
     jump.click()
     assert float(clock.inner_text().removesuffix(" s")) == pytest.approx(told, abs=6e-4)
     assert f"t={told:g}"[:6] in page.url
@@ -279,7 +277,7 @@ def test_slider_playback_and_the_jump_to_the_first_crossing(open_page: Open) -> 
     expect(clock).to_have_text(re.compile(r"^(1\.9[5-9]|2\.0[0-4])\d s$"))
 
 
-def test_difference_mode_makes_tiny_differences_visible(open_page: Open) -> None:
+def test_difference_mode_makes_tiny_differences_visible(open_page):
     """At 1e-9 m and below, two true pictures are the same; magnified, they are not."""
     page = open_page(link(scenario="planar-small", engine="exudyn-tree", t="4"))
     note = page.locator("figure").last.locator(".off").inner_text()
@@ -299,7 +297,7 @@ def test_difference_mode_makes_tiny_differences_visible(open_page: Open) -> None
     assert pixels(page, "exudyn-tree") == true
 
 
-def test_a_drag_and_the_arrow_keys_turn_every_view(open_page: Open) -> None:
+def test_a_drag_and_the_arrow_keys_turn_every_view(open_page):
     page = open_page(link(scenario="double-two-rods", engine="mujoco", t="1"))
     mine, other = pixels(page, "mujoco"), pixels(page, "reference")
     canvas = page.locator('canvas[aria-label^="Motion of mujoco,"]')
@@ -316,7 +314,7 @@ def test_a_drag_and_the_arrow_keys_turn_every_view(open_page: Open) -> None:
     assert pixels(page, "mujoco") != turned
 
 
-def test_trends_mark_versions_and_bad_nights(open_page: Open) -> None:
+def test_trends_mark_versions_and_bad_nights(open_page):
     page = open_page(link(view="trend", engine="mujoco"))
     assert page.locator(".trends svg .mark").count() > 3
     assert page.locator(".trends").get_by_text("4.0.0").first.is_visible()
@@ -329,7 +327,7 @@ def test_trends_mark_versions_and_bad_nights(open_page: Open) -> None:
     assert first.locator("rect.bad").count() == 2  # last night and this one
 
 
-def test_convergence_page_has_every_family_and_method(open_page: Open) -> None:
+def test_convergence_page_has_every_family_and_method(open_page):
     page = open_page(link(view="cost"))
     titles = page.locator("#cost-view svg .title").all_text_contents()
     assert titles == ["single", "double", "chain", "odd & <b>names</b>"]
@@ -340,7 +338,7 @@ def test_convergence_page_has_every_family_and_method(open_page: Open) -> None:
     assert page.get_by_role("columnheader", name="10⁻⁴ rad").is_visible()
 
 
-def test_hostile_names_stay_text_in_every_view(open_page: Open) -> None:
+def test_hostile_names_stay_text_in_every_view(open_page):
     """A dialog, a request or an error would fail `open_page`."""
     for scenario in (fixture.HOSTILE, fixture.NASTY):
         page = open_page()
@@ -364,7 +362,7 @@ def test_hostile_names_stay_text_in_every_view(open_page: Open) -> None:
         assert page.locator("img").count() == 0
 
 
-def test_an_injected_script_is_refused(chromium: Any, out: Path) -> None:
+def test_an_injected_script_is_refused(chromium, out):
     page = chromium.new_page()
     page.goto((out / "report.html").as_uri())
     page.evaluate(
@@ -374,7 +372,7 @@ def test_an_injected_script_is_refused(chromium: Any, out: Path) -> None:
     page.close()
 
 
-def test_axe_finds_no_violation(open_page: Open, violations: Violations) -> None:
+def test_axe_finds_no_violation(open_page, violations):
     page = open_page(bypass_csp=True)
     for view in (
         link(view="matrix"),
@@ -391,7 +389,7 @@ def test_axe_finds_no_violation(open_page: Open, violations: Violations) -> None
             assert violations(page, scheme) == [], f"{view} in {scheme}"
 
 
-def test_it_prints_the_verdict_and_the_whole_matrix(open_page: Open, out: Path, tmp_path: Path) -> None:
+def test_it_prints_the_verdict_and_the_whole_matrix(open_page, out, tmp_path):
     page = open_page(color_scheme="dark")
     page.get_by_role("button", name="single").click()
     page.emulate_media(media="print")
@@ -407,7 +405,7 @@ def test_it_prints_the_verdict_and_the_whole_matrix(open_page: Open, out: Path, 
     assert len(pdf) > 20_000
 
 
-def test_dark_is_dark_and_colour_is_never_alone(open_page: Open) -> None:
+def test_dark_is_dark_and_colour_is_never_alone(open_page):
     page = open_page(color_scheme="dark")
     background = page.evaluate("getComputedStyle(document.documentElement).backgroundColor")
     assert max(int(x) for x in re.findall(r"\d+", background)[:3]) < 60
@@ -415,7 +413,7 @@ def test_dark_is_dark_and_colour_is_never_alone(open_page: Open) -> None:
         assert cell.locator(".g").inner_text().strip() and cell.locator(".q").inner_text().strip()
 
 
-def test_a_narrow_screen_does_not_scroll_sideways(open_page: Open) -> None:
+def test_a_narrow_screen_does_not_scroll_sideways(open_page):
     page = open_page()
     page.set_viewport_size({"width": 390, "height": 800})
     for view in (
@@ -443,7 +441,7 @@ COLOURS = """async (data) => {  // size and number of colours of a picture
 }"""
 
 
-def test_the_picture_for_the_readme_is_of_the_report(chromium: Any, out: Path, tmp_path: Path) -> None:
+def test_the_picture_for_the_readme_is_of_the_report(chromium, out, tmp_path):
     path = tmp_path / "report.png"
     command = [sys.executable, "-m", "reports.screenshot", out / "report.html", path]
     subprocess.run(command, check=True, cwd=Path(report.__file__).parents[1])

@@ -4,8 +4,6 @@ An engine with a defect is one whose own module was changed: the same few lines 
 harness calls it and before the script runs, so that both meet the same engine.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from unittest.mock import patch
@@ -87,13 +85,13 @@ DEFECTS = [  # engine, level, integrator, what must disagree, the defect
 ]
 
 
-def study(engine: str, integrator: str, case: ReproductionCase, until: float) -> ReproductionCase:
+def study(engine, integrator, case, until):
     """The refinement study that a run makes of a case."""
     steps = refinement_resolutions(load_adapter(engine).integrator(integrator), case.model.n, 1.0)
     return replace(case, until=until, steps=tuple(steps[:6]))
 
 
-def disagreement(engine: str, quantities: tuple[str, ...], case: ReproductionCase, **more) -> Disagreement:
+def disagreement(engine, quantities, case, **more):
     given = {"level": "state", "integrator": "-", "ratio": 50.0, "seconds": 60.0} | more
     return Disagreement(EngineClient(engine), quantities=quantities, case=case, **given)
 

@@ -1,7 +1,5 @@
 """Scripts call an engine as its adapter does, run with the engine and NumPy alone, and pass ruff."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Scripts of a results folder: which rows get one, and what damaged or wrong input leads to."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict
 from unittest.mock import patch
@@ -49,7 +47,7 @@ def results(tmp_path):
     return tmp_path
 
 
-def store(folder, document) -> None:
+def store(folder, document):
     (folder / "results.json").write_text(json.dumps(document))
 
 

@@ -38,7 +38,7 @@ MARKS = {
 }  # fmt: skip
 
 
-def errors_in(text: str) -> list[str]:
+def errors_in(text):
     with pytest.raises(ScenarioError) as caught:
         load_scenario_text(text, "x.yaml")
     return [str(problem).removeprefix("x.yaml:") for problem in caught.value.problems]

@@ -1,7 +1,5 @@
 """The catalogue is complete, starts on the manifold, and says of itself what is true."""
 
-from __future__ import annotations
-
 import json
 import math
 from functools import cache
@@ -75,11 +73,11 @@ CLOSED_FORMS = {
 
 
 @cache
-def load(name: str) -> scenarios.Scenario:
+def load(name):
     return scenarios.load_scenario(scenarios.find_scenario_file(name))
 
 
-def joint_pattern(name: str) -> str:
+def joint_pattern(name):
     return "".join("r" if rod else "b" for rod in load(name).model.rods)
 
 
@@ -309,12 +307,12 @@ bodies = st.fixed_dictionaries(
 )
 
 
-def as_yaml(document: dict) -> str:
+def as_yaml(document):
     """JSON is YAML 1.2, and Python writes its floats so that they parse to the same bits."""
     return json.dumps(document, ensure_ascii=False)
 
 
-def scenario_document(chain: list, **more) -> dict:
+def scenario_document(chain, **more):
     return {"schema_version": 1, "title": "A chain", "purpose": "Random.", "bodies": chain, **more}
 
 

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
-import pytest
 from click.testing import CliRunner
 
 from plumbline.cli.main import main
@@ -19,14 +16,14 @@ from plumbline.studies import drift
 from reference_impl.stabilised import VARIANTS
 
 
-def measure_drift(names: Sequence[str], longest: float, **options: Any) -> list[dict[str, Any]]:
+def measure_drift(names, longest, **options):
     found: list[dict[str, Any]] = drift.measure_drift(
         scenarios.load_scenarios(names), longest, rtols=(1e-6,), **options
     ).to_pylist()
     return found
 
 
-def test_every_variant_and_time_has_a_row_and_the_drift_is_the_raw_one(tmp_path: Path) -> None:
+def test_every_variant_and_time_has_a_row_and_the_drift_is_the_raw_one(tmp_path):
     told: list[str] = []
     rows = measure_drift(["tumbling-ball"], 60, times=(1.0, 10.0), log=told.append)
     assert [(row["variant"], row["time"]) for row in rows] == [(v, t) for v in VARIANTS for t in (1.0, 10.0)]
@@ -38,7 +35,7 @@ def test_every_variant_and_time_has_a_row_and_the_drift_is_the_raw_one(tmp_path:
     assert all("to 10 s, about" in sentence for sentence in told)
 
 
-def test_a_time_that_costs_too_much_is_left_out_and_says_so() -> None:
+def test_a_time_that_costs_too_much_is_left_out_and_says_so():
     rows = measure_drift(["tumbling-ball"], 0.001, times=(1.0, 10.0))
     for first, second in zip(rows[::2], rows[1::2], strict=True):
         assert first["gap"] is not None
@@ -47,7 +44,7 @@ def test_a_time_that_costs_too_much_is_left_out_and_says_so() -> None:
         assert "left out: would cost" in second["reason"]
 
 
-def test_a_run_that_fails_is_a_row_with_its_reason() -> None:
+def test_a_run_that_fails_is_a_row_with_its_reason():
     (s,) = scenarios.load_scenarios(["tumbling-ball"])
     massless = replace(s, model=replace(s.model, mass=np.zeros(1)))
     rows = drift.measure_drift([massless], 60, times=(1.0, 10.0), rtols=(1e-6,)).to_pylist()
@@ -55,7 +52,7 @@ def test_a_run_that_fails_is_a_row_with_its_reason() -> None:
     assert all(row["gap"] is None and "failed: the mass of body 1" in row["reason"] for row in rows)
 
 
-def test_the_command_writes_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_writes_the_table(tmp_path, monkeypatch):
     quick = functools.partial(drift.measure_drift, times=(0.5, 1.0))
     monkeypatch.setattr(drift, "measure_drift", quick)
     ran = CliRunner().invoke(main, ["drift", "tumbling-rod", "--rtol", "1e-6", "--out", str(tmp_path)])

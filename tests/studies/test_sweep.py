@@ -1,11 +1,7 @@
 """Sweeps: what a file makes of a scenario, and how a cell is judged."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
@@ -13,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from plumbline.engines.adapter import EngineInfo
-from plumbline.engines.calls import RefinementStudy, run_refinement
+from plumbline.engines.calls import run_refinement
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.convergence import refinement_resolutions
 from plumbline.judging.rows import RowContext
@@ -22,7 +18,7 @@ from plumbline.scenario import loader as scenarios
 from plumbline.scenario.errors import ScenarioError
 from plumbline.studies import sweep, sweep_file
 from plumbline.studies.tables import write_table
-from plumbline.truth.ground_truth import MotionTruth, motion_truth
+from plumbline.truth.ground_truth import motion_truth
 from tests.helpers import pendulums
 from tests.helpers.planted_defects import MOTION_DEFECTS, Defect, plant
 
@@ -40,13 +36,13 @@ engines: {mujoco: RK4}
 """
 
 
-def write_sweep_file(folder: Path, text: str) -> Path:
+def write_sweep_file(folder, text):
     path = folder / "sweep.yaml"
     path.write_text(text, encoding="utf-8")
     return path
 
 
-def test_the_grid_and_the_draws(tmp_path: Path) -> None:
+def test_the_grid_and_the_draws(tmp_path):
     spec, cells = sweep_file.load(write_sweep_file(tmp_path, SWEEP_FILE))
     assert len(cells) == 3 * 2 * spec.count
     assert sorted({cell.values["bodies[0].mass"] for cell in cells}) == pytest.approx([0.5, 1.0, 2.0])
@@ -66,7 +62,7 @@ def test_the_grid_and_the_draws(tmp_path: Path) -> None:
     ] != [c.values for c in cells]
 
 
-def test_a_sweep_runs_and_is_kept(tmp_path: Path) -> None:
+def test_a_sweep_runs_and_is_kept(tmp_path):
     spec, cells = sweep_file.load(
         write_sweep_file(tmp_path, SWEEP_FILE.replace("points: 3", "points: 2").replace("[-1, 1]", "[1]"))
     )
@@ -84,7 +80,7 @@ def test_a_sweep_runs_and_is_kept(tmp_path: Path) -> None:
     assert np.ptp(np.array(ends)[::2], axis=0).max() > 1e-3  # the parameters matter
 
 
-def test_values_that_make_no_pendulum_are_a_cell_with_a_reason(tmp_path: Path) -> None:
+def test_values_that_make_no_pendulum_are_a_cell_with_a_reason(tmp_path):
     vary = "vary: {'bodies[0].mass': {values: [-1, 1]}}"
     text = f"schema_version: 1\nscenario: tumbling-rod\n{vary}\nduration: 0.25\n"
     spec, cells = sweep_file.load(write_sweep_file(tmp_path, text))
@@ -95,7 +91,7 @@ def test_values_that_make_no_pendulum_are_a_cell_with_a_reason(tmp_path: Path) -
 
 
 @cache
-def cell() -> tuple[scenarios.Scenario, MotionTruth]:
+def cell():
     """A slow tumble whose every mistake shows within two seconds."""
     (s,) = scenarios.load_scenarios(["double-tumbling-balls"])
     model = pendulums.make_model("bb")
@@ -104,13 +100,13 @@ def cell() -> tuple[scenarios.Scenario, MotionTruth]:
     return s, motion_truth(model, state, s.times, None)
 
 
-def judged_by_run_and_sweep(defect: Defect) -> tuple[set[str], str]:
+def judged_by_run_and_sweep(defect):
     """The verdicts of a run and that of a sweep on one cell, by an engine with a planted defect."""
     (s, truth), engine = cell(), plant(type(load_adapter(defect.engine)), defect)
     method = engine.integrator(defect.integrator)
     info = EngineInfo("mujoco", "MuJoCo", "0", engine.integrators)
 
-    def study(steps: Sequence[float]) -> RefinementStudy:
+    def study(steps):
         with patch("plumbline.engines.calls.load_adapter", lambda _: engine):
             return run_refinement("mujoco", method.name, s.model, s.state, s.times, steps)
 
@@ -122,17 +118,17 @@ def judged_by_run_and_sweep(defect: Defect) -> tuple[set[str], str]:
 
 
 @pytest.mark.parametrize("defect", MOTION_DEFECTS, ids=lambda defect: defect.name)
-def test_a_defect_that_a_run_reports_is_reported_by_a_sweep(defect: Defect) -> None:
+def test_a_defect_that_a_run_reports_is_reported_by_a_sweep(defect):
     by_run, by_sweep = judged_by_run_and_sweep(defect)
     assert by_run != {"agrees"} and by_sweep in by_run - {"agrees"}
     assert (by_sweep == "disagrees") == ("disagrees" in by_run and "failed" not in by_run)
 
 
-def test_an_engine_without_defect_agrees_in_both() -> None:
+def test_an_engine_without_defect_agrees_in_both():
     assert judged_by_run_and_sweep(Defect("clean", "nothing")) == ({"agrees"}, "agrees")
 
 
-def test_an_engine_too_coarse_to_resolve_a_mistake_is_unresolved(tmp_path: Path) -> None:
+def test_an_engine_too_coarse_to_resolve_a_mistake_is_unresolved(tmp_path):
     text = (
         SWEEP_FILE.replace("points: 3", "points: 1").replace("[-1, 1]", "[1]").replace("count: 2", "count: 1")
     )
@@ -144,7 +140,7 @@ def test_an_engine_too_coarse_to_resolve_a_mistake_is_unresolved(tmp_path: Path)
 
 
 @pytest.mark.parametrize("interval", [0.03125, 0.05])
-def test_every_step_hits_every_sample(interval: float) -> None:
+def test_every_step_hits_every_sample(interval):
     """The steps of a run where the samples allow them; shorter ones where not, or where the file says so."""
     s = replace(scenarios.load_scenarios(["tumbling-rod"])[0], sample_interval=interval)
     method = load_adapter("mujoco").integrator("RK4")
@@ -158,7 +154,7 @@ def test_every_step_hits_every_sample(interval: float) -> None:
     assert len(sweep._resolutions(method, s, 0.002)) == 4
 
 
-def test_a_missing_engine_and_a_truth_that_fails_are_rows(tmp_path: Path) -> None:
+def test_a_missing_engine_and_a_truth_that_fails_are_rows(tmp_path):
     text = (
         SWEEP_FILE.replace("points: 3", "points: 1").replace("[-1, 1]", "[1]").replace("count: 2", "count: 1")
     )
@@ -191,8 +187,6 @@ def test_a_missing_engine_and_a_truth_that_fails_are_rows(tmp_path: Path) -> Non
         (("schema_version: 1", "schema_version: 2"), r":1:.*is not 1"),
     ],
 )
-def test_mistakes_in_the_file_are_named_with_their_place(
-    tmp_path: Path, change: tuple[str, str], words: str
-) -> None:
+def test_mistakes_in_the_file_are_named_with_their_place(tmp_path, change, words):
     with pytest.raises(ScenarioError, match=words):
         sweep_file.load(write_sweep_file(tmp_path, SWEEP_FILE.replace(*change)))

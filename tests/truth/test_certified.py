@@ -1,7 +1,5 @@
 """The certified truth: enclosures that hold, and two formulations that share nothing with it."""
 
-from __future__ import annotations
-
 import sys
 import time
 from dataclasses import replace
@@ -27,7 +25,7 @@ mpmath = pytest.importorskip("mpmath")
 JOINT_PATTERNS = [[0], [1], [0, 0], [1, 1], [0, 1], [1, 0], [1, 0, 1, 0]]
 
 
-def max_difference(enclosure: list, other: list) -> float:
+def max_difference(enclosure, other):
     """Largest distance of two lists of 3-vectors, one in balls and one in mpf, at 60 digits."""
     with mpmath.workdps(60):
         pairs = zip((x for row in enclosure for x in row), (y for row in other for y in row), strict=True)

@@ -9,7 +9,7 @@ import pytest
 from scipy.special import ellipj, ellipkinc
 
 from plumbline.engines.registry import load_adapter
-from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.datatypes import Model, State
 from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import quaternion_product, rotation_matrix, state_from_minimal
 from plumbline.scenario.loader import catalogue, load_scenario
@@ -33,7 +33,7 @@ class ScenarioStub:
     state: State
 
 
-def one_body(**changes: Array) -> Model:
+def one_body(**changes):
     values = {
         "mass": np.array([1.3]),
         "inertia": np.diag([0.02, 0.02, 0.03])[None],
@@ -49,14 +49,12 @@ def one_body(**changes: Array) -> Model:
     return Model(**(values | changes))
 
 
-def quaternion(axis: list[float], angle: float) -> Array:
+def quaternion(axis, angle):
     axis = np.array(axis) / np.linalg.norm(axis)
     return np.concatenate([[np.cos(angle / 2)], np.sin(angle / 2) * axis])[None]
 
 
-def make_state(
-    model: Model, p: Array, omega: list[float], u: Array | None = None, udot: Array | None = None
-) -> State:
+def make_state(model, p, omega, u=None, udot=None):
     none = np.zeros((model.n, 3))
     return state_from_minimal(
         model, p, np.array([omega]), none if u is None else u, none if udot is None else udot

@@ -1,7 +1,5 @@
 """What engines are measured with: sizes, mistakes that must be visible, and where the truth comes from."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import fields, replace
 from unittest.mock import patch
@@ -31,7 +29,7 @@ from tests.helpers import pendulums
 TIMES = np.linspace(0, 1, 9)
 
 
-def test_stretched_length_is_the_largest_extent_of_each_body() -> None:
+def test_stretched_length_is_the_largest_extent_of_each_body():
     """At least to its centre, at least its radius of gyration; nothing hangs on the last."""
     model = replace(
         pendulums.make_model("rbb"),
@@ -47,7 +45,7 @@ def test_stretched_length_is_the_largest_extent_of_each_body() -> None:
     )
 
 
-def test_the_least_effect_ignores_invisible_ones() -> None:
+def test_the_least_effect_ignores_invisible_ones():
     effects = [np.array([0, 1.0, 3, 2]), np.array([0, 5.0, 1, 9]), np.array([0, 1e-9, 2e-9, 0])]
     assert least_detectable_effect(effects, 1e-6).tolist() == [0, 1, 3, 3]
     assert least_detectable_effect(effects, 1e-10).tolist() == [0, 1e-9, 2e-9, 2e-9]
@@ -57,7 +55,7 @@ def test_the_least_effect_ignores_invisible_ones() -> None:
 
 
 @pytest.mark.parametrize("joints", ["b", "rb"])
-def test_each_perturbed_model_has_one_kind_of_error_of_one_part_in_ten_thousand(joints: str) -> None:
+def test_each_perturbed_model_has_one_kind_of_error_of_one_part_in_ten_thousand(joints):
     model = pendulums.make_model(joints)
     at = pendulums.state_from_seed(model, seed=5)
     altered = [{"gravity"}, {"mass"}, {"inertia"}, {"proximal", "distal"}]
@@ -85,7 +83,7 @@ def test_each_perturbed_model_has_one_kind_of_error_of_one_part_in_ten_thousand(
     assert np.any(offsets > 1) and np.any(offsets < 1), "signs are drawn"
 
 
-def test_detectable_effects_are_the_least_on_positions_and_attitudes() -> None:
+def test_detectable_effects_are_the_least_on_positions_and_attitudes():
     model = pendulums.make_model("b")
     length = float(np.sum(stretched_length(model)))
     r, p = np.zeros((4, 9, 1, 3)), np.tile([1.0, 0, 0, 0], (4, 9, 1, 1))
@@ -105,7 +103,7 @@ def test_detectable_effects_are_the_least_on_positions_and_attitudes() -> None:
     )
 
 
-def test_state_truth_is_certified_or_states_that_it_is_not() -> None:
+def test_state_truth_is_certified_or_states_that_it_is_not():
     pytest.importorskip("flint")
     model = pendulums.make_model("rb", loads=True, drag=True)
     states = random_states(model, 3, seed=2)
@@ -125,7 +123,7 @@ def test_state_truth_is_certified_or_states_that_it_is_not() -> None:
     assert all(isinstance(q, StateQuantities) and q.mass_matrix is not None for q in found.quantities)
 
 
-def test_motion_truth_holds_growth_length_and_detectable_effects() -> None:
+def test_motion_truth_holds_growth_length_and_detectable_effects():
     model = pendulums.make_model("bb")
     at = pendulums.state_from_seed(model, seed=2, rate=0.5)
     found, run = motion_truth(model, at, TIMES, None), trajectory_truth(model, at, TIMES)
@@ -152,9 +150,7 @@ def test_motion_truth_holds_growth_length_and_detectable_effects() -> None:
 @pytest.mark.parametrize(
     ("position", "attitude", "parted"), [(0.9, 0.9, False), (1.1, 0.9, True), (0.9, 1.1, True)]
 )
-def test_two_methods_that_differ_by_more_than_rounding_are_reported(
-    position: float, attitude: float, parted: bool
-) -> None:
+def test_two_methods_that_differ_by_more_than_rounding_are_reported(position, attitude, parted):
     model = pendulums.make_model("b")
     at = pendulums.state_from_seed(model, seed=2, rate=0.5)
     sound = motion_truth(model, at, TIMES, None)
@@ -171,7 +167,7 @@ def test_two_methods_that_differ_by_more_than_rounding_are_reported(
         assert motion_truth(model, at, TIMES, None).method == "made" + TRUTHS_DIFFER * parted
 
 
-def test_taylors_method_is_limited_in_bodies() -> None:
+def test_taylors_method_is_limited_in_bodies():
     model = pendulums.make_model("b")
     found = motion_truth(
         model, pendulums.state_from_seed(model, seed=2, rate=0.5), TIMES[:3], None, max_compiled_bodies=0
@@ -179,7 +175,7 @@ def test_taylors_method_is_limited_in_bodies() -> None:
     assert "not used for more than 0 bodies" in found.method
 
 
-def test_a_closed_form_replaces_the_motion() -> None:
+def test_a_closed_form_replaces_the_motion():
     model = pendulums.make_model("b")
     at = pendulums.state_from_seed(model, seed=2, rate=0.5)
     run = pendulums.reference_trajectory(model, at, TIMES)

@@ -1,7 +1,5 @@
 """The state-level tolerance: same in any units, never below an honest engine, sharp enough for a mistake."""
 
-from __future__ import annotations
-
 import bisect
 import time
 import warnings

@@ -1,7 +1,5 @@
 """Growth of perturbations and the horizon: one known in closed form, and divergence as it is observed."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

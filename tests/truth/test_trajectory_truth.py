@@ -1,7 +1,5 @@
 """Truth along trajectories: two methods of different kind and coordinates, and quad precision above them."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from dataclasses import replace
