@@ -27,6 +27,7 @@ class History:
 
     nights: list[EarlierRun] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)  # names of folders that could not be read
+    missing_keys: int = 0  # rows of the last passed run, without random scenarios, that the current one lacks
 
     @classmethod
     def load(cls, folder: Path | None, current: Results) -> History:
@@ -37,18 +38,22 @@ class History:
             current: the run that is reported.
 
         Returns:
-            The nights completed before ``current``, which all are where ``current`` is not among them.
+            The nights completed before ``current``; all nights where ``current`` is not among them.
 
         """
         if folder is None:
             return cls()
         stored = history.History(folder)
         keys = [row["key"] for row in current.rows]
+        before = stored.before(current.run["id"])[-MAX_NIGHTS:]
         nights = [
             EarlierRun(replace_unprintable(run.metadata), stored.rows_by_key(index, keys), run.has_passed)
-            for index, run in stored.before(current.run["id"])[-MAX_NIGHTS:]
+            for index, run in before
         ]
-        return cls(nights, list(stored.damaged))
+        last = next((index for index, run in reversed(before) if run.has_passed), None)
+        compared = stored.query("SELECT key FROM rows WHERE night = ? AND family <> 'random'", [last])
+        missing = {replace_unprintable(row["key"]) for row in compared} - set(keys)
+        return cls(nights, list(stored.damaged), len(missing))
 
     @property
     def last_passed(self) -> EarlierRun | None:
@@ -56,7 +61,7 @@ class History:
         return next((night for night in reversed(self.nights) if night.has_passed), None)
 
     def is_new(self, row: Record) -> bool:
-        """Whether a row's disagreement was not in the last run that passed.
+        """Report whether a row's disagreement was not in the last run that passed.
 
         Args:
             row: a row of the current run.
@@ -65,8 +70,8 @@ class History:
             True where the verdict differs from that run's, or is unexpected and the key is new.
 
         """
-        green = self.last_passed
-        if green is None or row["verdict"] == "agrees":
+        passed = self.last_passed
+        if passed is None or row["verdict"] == "agrees":
             return False
-        before = green.rows.get(row["key"])
+        before = passed.rows.get(row["key"])
         return needs_attention(row) if before is None else before["verdict"] != row["verdict"]

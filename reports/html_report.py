@@ -112,6 +112,7 @@ def _render_template(
             css=Markup(style),
             chunks=chunks,
             counts=count_all_verdicts(results),
+            compared=any(row["verdict"] in ("agrees", "disagrees") for row in results.rows),
             total=count_all_verdicts(results).total(),
             random_batch=_random_scenario_summary(results),
             engines=results.engines,
@@ -223,7 +224,7 @@ def _changes_since_last_passed(results: Results, history: History) -> Record | N
             row["verdict"] == "agrees" and passed.rows.get(row["key"], row)["verdict"] != "agrees"
             for row in results.rows
         ),
-        "gone": len(passed.rows.keys() - keys),
+        "gone": history.missing_keys,
         "added": len(keys - passed.rows.keys()),
         "versions": [(e, before.get(e, "–"), v) for e, v in now.items() if before.get(e) != v],
     }

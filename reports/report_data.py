@@ -106,7 +106,7 @@ def index_chunk(results: Results, history: History) -> str:
         "slugs": [css_class(verdict) for verdict in VERDICT_STYLES],
         "reasons": [row["reason"] for row in results.rows],
         "commit": results.run.get("commit"),
-        "green": history.last_passed.run["started"] if history.last_passed else None,
+        "passed": history.last_passed.run["started"] if history.last_passed else None,
     }
     for name in ("level", "integrator", "quantity"):
         header[name + "s"] = list(dict.fromkeys(row[name] for row in results.rows))

@@ -93,7 +93,7 @@ def _order_row(study: RefinementAnalysis) -> Row:
     order, declared = study.observed, study.integrator.order
     coarse, fine = study.runs[0].resolution, study.runs[-1].resolution
     steps = f"steps {coarse:g} … {fine:g} s, t ≤ {study.observed_until:g} s"
-    listed = ", ".join(f"{o:.2f}" for o in order.orders)
+    listed = ", ".join(f"{o:.2f}" if np.isfinite(o) else "–" for o in order.orders)
     error = None if order.value is None else abs(order.value - declared)
     if order.is_at_rounding_floor:
         verdict, error = Verdict.AGREES, None

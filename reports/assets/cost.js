@@ -21,7 +21,7 @@ export async function showCost(root, index, fields) {
   const strokes = new Map(methods.map((name) => {
     const engine = name.slice(0, name.indexOf(" "));
     const siblings = methods.filter((other) => other.startsWith(engine + " "));
-    return [name, strokeOf((index.engines.indexOf(engine) % 8) + 8 * siblings.indexOf(name))]; // colour says the engine, dashes the integrator
+    return [name, strokeOf((index.engines.indexOf(engine) % 8) + 8 * siblings.indexOf(name))]; // the colour is the engine's, the dashes are the integrator's
   }));
   root.replaceChildren(
     h("h1", { class: "cell-title", tabindex: -1 }, "Convergence and cost"),
@@ -34,7 +34,7 @@ export async function showCost(root, index, fields) {
   }
   const plots = h("div", { class: "plots" });
   const families = [...new Set(index.families)];
-  const xs = /** @type {[number, number]} */ (decades(studies.flatMap((one) => one.cost.map((v) => v ?? 0))) ?? [1e-3, 1]);
+  const xs = /** @type {[number, number]} */ (decades(studies.flatMap((one) => one.cost.map((v, k) => ((one.error[k] ?? 0) > 0 ? (v ?? 0) : 0)))) ?? [1e-3, 1]);
   const ys = /** @type {[number, number]} */ (decades(studies.flatMap((one) => one.error.map((v) => v ?? 0))) ?? [1e-12, 1]);
   for (const family of families) {
     const ours = studies.filter((one) => index.families[index.scenarios.indexOf(one.scenario)] === family);
@@ -56,7 +56,7 @@ export async function showCost(root, index, fields) {
     }
     plots.append(h("div", {}, plot.root));
   }
-  root.append(plots, h("h2", { class: "sub" }, `CPU time to reach an error, geometric mean over the scenarios that reach it`), costTable(studies, methods, unit), h("h2", { class: "sub" }, "Observed order"), orderTable(studies, methods));
+  root.append(plots, h("h2", { class: "sub" }, `CPU time to reach an error, geometric mean over the scenarios that reach it`), costTable(studies, methods, unit), h("h2", { class: "sub" }, "Observed order"), h("p", { class: "why" }, "Of the studies whose order is resolved; one that is not in its asymptotic range shows no order."), orderTable(index, studies, methods));
 }
 
 /** @param {number[]} values */
@@ -90,15 +90,23 @@ function costTable(studies, methods, unit) {
     }))));
 }
 
-/** @param {Study[]} studies @param {string[]} methods */
-function orderTable(studies, methods) {
+/** @param {Index} index @param {Study[]} studies @param {string[]} methods */
+function orderTable(index, studies, methods) {
+  const { rows } = index;
+  const unresolved = new Set();
+  for (let i = 0; i < rows.scenario.length; i++) {
+    if (index.quantitys[rows.quantity[i]] === "order" && index.verdicts[rows.verdict[i]] === "unresolved") {
+      unresolved.add([index.scenarios[rows.scenario[i]], index.engines[rows.engine[i]], index.integrators[rows.integrator[i]]].join("/"));
+    }
+  }
   return h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "Observed order" }, h("table", { class: "plain" },
     h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Engine and integrator"), ["Declared", "Median", "Lowest", "Highest", "Studies"].map((t) => h("th", { scope: "col", class: "r" }, t)))),
     h("tbody", {}, methods.map((name) => {
       const group = studies.filter((one) => `${one.engine} ${one.integrator}` === name && one.kind === "step");
-      const orders = group.map((one) => [...one.order].reverse().find((v) => v !== null) ?? null).filter((v) => v !== null).sort((a, b) => a - b);
-      if (!orders.length) return null;
+      const resolved = group.filter((one) => !unresolved.has([one.scenario, one.engine, one.integrator].join("/")));
+      const orders = resolved.map((one) => [...one.order].reverse().find((v) => v !== null) ?? null).filter((v) => v !== null).sort((a, b) => a - b);
+      if (!group.length) return null;
       return h("tr", {}, h("th", { scope: "row" }, name + (group[0].alias ? ` = ${group[0].alias}` : "")),
-        [number(group[0].declared, 1), ...[orders[orders.length >> 1], orders[0], orders[orders.length - 1]].map((v) => number(v, 3)), String(orders.length)].map((text) => h("td", { class: "r" }, text)));
+        [number(group[0].declared, 1), ...[orders[orders.length >> 1], orders[0], orders[orders.length - 1]].map((v) => number(v, 3)), `${orders.length} of ${group.length}`].map((text) => h("td", { class: "r" }, text)));
     }))));
 }

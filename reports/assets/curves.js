@@ -82,8 +82,8 @@ export function panels(root, series, horizon, onTime) {
       box,
     );
     plot.over.append(marker);
-    // Before uPlot hears of it, which keeps a click to itself where it takes the pointer for moving; and from
-    // the panel's own edge: the target may be a point of the cursor inside it.
+    // Capture phase, because uPlot stops the propagation of a click that it takes for a drag. The position is
+    // measured from the panel's edge, because the target may be a point of the cursor inside the panel.
     box.addEventListener("click", (event) => {
       if (plot.over.contains(/** @type {Node} */ (event.target))) onTime(plot.posToVal(event.clientX - plot.over.getBoundingClientRect().left, "x"));
     }, true);

@@ -1,7 +1,7 @@
 // One cell: what was compared with what, curves, motion, convergence, states, and how to repeat it.
 import { chunk, fromCode } from "./chunks.js";
 import { keys, panels, strokeOf } from "./curves.js";
-import { track } from "./matrix.js";
+import { outranks, track } from "./matrix.js";
 import { motion } from "./motion.js";
 import { axes, decades, path } from "./plot.js";
 import { amend, href } from "./route.js";
@@ -9,7 +9,7 @@ import { copyable, h, number, svg } from "./text.js";
 
 /** @typedef {import("./report_data").Index} Index @typedef {import("./report_data").ScenarioChunk} ScenarioChunk @typedef {import("./report_data").Study} Study */
 
-/** @type {(() => void)[]} what the cell on show must end before the next */
+/** @type {(() => void)[]} clean-up of the cell on show, called before the next one */
 let ending = [];
 
 export function closeCell() {
@@ -18,7 +18,7 @@ export function closeCell() {
 }
 
 /**
- * @param {HTMLElement} root @param {Index} index @param {Record<string, string>} fields @param {string} back link to the matrix as it was left
+ * @param {HTMLElement} root @param {Index} index @param {Record<string, string>} fields @param {string} back link to the matrix with its last filters
  */
 export async function showCell(root, index, fields, back) {
   closeCell();
@@ -39,8 +39,8 @@ export async function showCell(root, index, fields, back) {
   root.replaceChildren(
     h("nav", { class: "crumbs", "aria-label": "Place in the report" },
       h("a", { href: back }, "← Matrix"), h("span", {}, scenario.family), h("span", { class: "sep" }),
-      h("a", { href: href({ scenario: neighbour(-1), engine: fields.engine }), rel: "prev" }, `‹ ${neighbour(-1)}`),
-      h("a", { href: href({ scenario: neighbour(1), engine: fields.engine }), rel: "next" }, `${neighbour(1)} ›`)),
+      index.scenarios.length > 1 && h("a", { href: href({ scenario: neighbour(-1), engine: fields.engine }), rel: "prev" }, `‹ ${neighbour(-1)}`),
+      index.scenarios.length > 1 && h("a", { href: href({ scenario: neighbour(1), engine: fields.engine }), rel: "next" }, `${neighbour(1)} ›`)),
     h("h1", { class: "cell-title", tabindex: -1 }, fields.scenario, h("span", { class: "on" }, ` on ${title}`)),
     h("p", { class: "purpose" }, `${scenario.title}. ${scenario.purpose}`),
     h("dl", { class: "facts" },
@@ -78,17 +78,20 @@ export async function showCell(root, index, fields, back) {
     const line = data.commands[`${fields.engine}/${level}`];
     if (line && ![...root.querySelectorAll("pre")].some((pre) => pre.textContent === line)) root.append(copyable(line, `command for ${level}`));
   }
+  /** @type {Map<string, string[]>} */
+  const scripts = new Map();
   for (const i of ours) {
     const script = data.rows[i]?.script;
-    if (script) root.append(h("details", {}, h("summary", {}, `Stand-alone script: ${index.levels[index.rows.level[i]]}, ${index.quantitys[index.rows.quantity[i]]}`), copyable(script, "script")));
+    if (script) scripts.set(script, [...(scripts.get(script) ?? []), `${index.levels[index.rows.level[i]]}, ${index.quantitys[index.rows.quantity[i]].replaceAll("_", " ")}`]);
   }
+  for (const [script, names] of scripts) root.append(h("details", {}, h("summary", {}, `Stand-alone script: ${[...new Set(names)].join("; ")}`), copyable(script, "script")));
 }
 
 /** @param {string} name @param {string | number} value */
 const fact = (name, value) => h("div", {}, h("dt", {}, name), h("dd", {}, value));
 
 /**
- * The row that speaks for a cell; null for an empty one.
+ * The row that stands for a cell; null for an empty one.
  * @param {Index} index @param {number} s @param {number} e
  */
 function speaker(index, s, e) {
@@ -96,7 +99,7 @@ function speaker(index, s, e) {
   let found = -1;
   for (let i = 0; i < rows.scenario.length; i++) {
     if (rows.scenario[i] !== s || rows.engine[i] !== e) continue;
-    if (found < 0 || rows.severity[i] > rows.severity[found] || (rows.severity[i] === rows.severity[found] && rows.ratio[i] > rows.ratio[found])) found = i;
+    if (found < 0 || outranks(index, i, found)) found = i;
   }
   return found < 0 ? null : found;
 }
@@ -160,7 +163,7 @@ function compared(index, data, ours, fields) {
           return h("th", { scope: "col" }, index.integrators[k] === "-" ? "error, of its bound" : index.integrators[k], alias ? h("span", { class: "why" }, ` = ${alias}`) : null);
         }))), body)));
   }
-  const worst = ours.reduce((a, b) => (rows.severity[b] > rows.severity[a] || (rows.severity[b] === rows.severity[a] && rows.ratio[b] > rows.ratio[a]) ? b : a), ours[0]);
+  const worst = ours.reduce((a, b) => (outranks(index, b, a) ? b : a), ours[0]);
   const asked = ours.find((i) => placeOf(index, i) === fields.row);
   if (ours.length) choose(asked ?? worst, false);
   if (asked !== undefined) queueMicrotask(() => buttons.get(asked)?.focus({ preventScroll: true }));
@@ -180,6 +183,13 @@ function chosenRow(index, row, i) {
     h("p", { class: "reason" }, index.reasons[i]), derivation(row));
 }
 
+/** Label and unit of a row's further numbers; "row" for the unit of its error. @type {Record<string, [string, string]>} */
+const EXTRA = {
+  relative: ["Error over scale", ""], bound_relative: ["Tolerance over scale, median", ""], states: ["States compared", ""], state: ["Worst state", ""], body: ["Worst body", ""],
+  visible: ["Effect of a detectable mistake", "row"], growth: ["Growth of a perturbation", ""], resolution: ["Finest step or tolerance", ""], scale: ["Scale", "row"],
+  whole: ["Drift at the end", "row"], limit: ["Drift of the limit", "row"], asked: ["Requested duration", "s"], end: ["End", "s"],
+};
+
 /** @param {import("./report_data").RowDetail} row */
 function derivation(row) {
   const list = h("dl", { class: "derive" });
@@ -192,10 +202,13 @@ function derivation(row) {
   say("Horizon", row.compared_until === undefined ? null : `${number(row.compared_until, 3)} s, up to which positions were compared`);
   say("Order", row.order === undefined ? null : `observed ${number(row.order, 4)}${row.declared_order ? `, declared ${row.declared_order}` : ""}`);
   say("Alias", row.alias_of ? `equals ${row.alias_of} here, so it is not independent evidence` : null);
-  say("Recorded as", row.known_issue);
-  say("Asked for", row.user_rtol === undefined ? null : `${number(row.user_rtol)} ${unitOf(row.unit)}: the error is ${(row.value ?? Infinity) <= row.user_rtol ? "within" : "above"} the tolerance given on the command line; the verdict does not depend on it`);
-  for (const [name, value] of Object.entries(row.extra ?? {})) say(name.replaceAll("_", " "), number(value, 4));
-  say("Work", row.cpu_time === undefined ? null : `${number(row.cpu_time)} s`);
+  say("Known issue", row.known_issue);
+  say("Your tolerance", row.user_rtol === undefined ? null : `${number(row.user_rtol)} ${unitOf(row.unit)}: the error is ${(row.value ?? Infinity) <= row.user_rtol ? "within" : "above"} the tolerance given on the command line; the verdict does not depend on it`);
+  for (const [name, value] of Object.entries(row.extra ?? {})) {
+    const [label, unit] = EXTRA[name] ?? [name.replaceAll("_", " "), ""];
+    say(label, `${Number.isInteger(value) && Math.abs(value ?? 0) < 1e6 ? value : number(value, 4)} ${unit === "row" ? unitOf(row.unit) : unit}`);
+  }
+  say("CPU time", row.cpu_time === undefined ? null : `${number(row.cpu_time)} s`);
   return list;
 }
 
@@ -208,10 +221,12 @@ function moving(root, index, data, fields) {
   const first = crossings.length ? crossings.reduce((a, b) => (/** @type {number} */ (b.crossing) < /** @type {number} */ (a.crossing) ? b : a)) : null;
   const room = h("section", { class: "moving", "aria-label": "Motion and curves" });
   root.append(h("h2", { class: "sub" }, "Motion and curves"), room);
+  /** @param {string} engine */
+  const titleOf = (engine) => index.engine_titles[index.engines.indexOf(engine)];
   /** @type {ReturnType<typeof panels> | null} */
   let drawn = null;
   const stage = motion(data, {
-    engine: fields.engine, engines: index.engines, end, start: Number(fields.t) || 0, magnify: fields.mag === undefined ? null : Number(fields.mag),
+    engine: fields.engine, engines: index.engines, titleOf, judged: curves.some((set) => set.engine === fields.engine && set.tolerance), end, start: Number(fields.t) || 0, magnify: fields.mag === undefined ? null : Number(fields.mag),
     crossing: first ? { t: /** @type {number} */ (first.crossing), name: first.integrator } : null,
     onTime: (t) => drawn?.setTime(t),
     onRest: (state) => amend(state),
@@ -228,8 +243,8 @@ function moving(root, index, data, fields) {
     drawn?.destroy();
     area.replaceChildren();
     const sets = choice.value === "all" ? best(curves) : curves.filter((set) => set.engine === fields.engine);
-    const series = sets.map((set, k) => ({ set, name: choice.value === "all" ? `${set.engine} ${set.integrator}` : set.integrator, stroke: strokeOf(choice.value === "all" ? index.engines.indexOf(set.engine) : k) }));
-    if (!series.length) area.append(h("p", { class: "note" }, "No trajectory of this engine was stored; the rows above say why."));
+    const series = sets.map((set, k) => ({ set, name: choice.value === "all" ? `${titleOf(set.engine)} ${set.integrator}` : set.integrator, stroke: strokeOf(choice.value === "all" ? index.engines.indexOf(set.engine) : k) }));
+    if (!series.length) area.append(h("p", { class: "note" }, "No trajectory of this engine was stored; the table above has the reasons."));
     legend.replaceChildren(keys(series, sets.some((set) => set.tolerance)));
     drawn = panels(area, series, data.scenario.horizon, (t) => stage.setTime(t));
     drawn.setTime(stage.time());
@@ -287,7 +302,7 @@ function workPrecision(studies, kind) {
     if (kind === "step" && one.declared) triangle(plot, one, one.declared);
   });
   labels.sort((a, b) => a.y - b.y).forEach((label, k) => {
-    if (k) label.y = Math.max(label.y, labels[k - 1].y + 13); // labels of curves that start together stand below each other
+    if (k) label.y = Math.max(label.y, labels[k - 1].y + 13); // labels must not overlap
     plot.root.append(svg("text", { class: `series ${label.css}`, x: label.x, y: label.y }, label.text));
   });
   return h("div", {}, plot.root);
@@ -338,5 +353,5 @@ function stateSpread(spreads) {
     });
   });
   const top = spreads.reduce((a, b) => (Math.max(...b.ratio) > Math.max(...a.ratio) ? b : a));
-  return h("div", {}, plot.root, h("p", { class: "why" }, `Nearest to its bound: ${top.quantity.replaceAll("_", " ")} at state ${top.worst[0]}, body ${top.worst[1]} (error ${number(top.error)}; the bound is ${number(top.bound)} in the median)`));
+  return h("div", {}, plot.root, h("p", { class: "why" }, `Closest to its bound: ${top.quantity.replaceAll("_", " ")} at state ${top.worst[0]}, body ${top.worst[1]} (error ${number(top.error)}; median bound ${number(top.bound)})`));
 }

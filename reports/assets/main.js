@@ -2,7 +2,7 @@
 import { chunk } from "./chunks.js";
 import { showCost } from "./cost.js";
 import { closeCell, showCell } from "./detail.js";
-import { showMatrix } from "./matrix.js";
+import { focusCell, showMatrix } from "./matrix.js";
 import { read, viewOf } from "./route.js";
 import { h } from "./text.js";
 import { showTrend } from "./trend.js";
@@ -11,6 +11,8 @@ import { showTrend } from "./trend.js";
 const byId = (id) => /** @type {HTMLElement} */ (document.getElementById(id));
 let back = "#view=matrix";
 let latest = 0;
+/** @type {Record<string, string>} fields of the view on show */
+let viewed = {};
 
 async function show() {
   const mine = ++latest;
@@ -32,15 +34,18 @@ async function show() {
   } else if (view === "cell") await showCell(byId("cell-view"), index, fields, back);
   else if (view === "cost") await showCost(byId("cost-view"), index, fields);
   else await showTrend(byId("trend-view"), index, fields);
+  viewed = fields;
   document.documentElement.dataset.shown = view;
 }
 
-/** A new address by a link: the view starts at its top, with the focus on its title. */
+/** Show the view of a new address from its top, with the focus on its title; back in the matrix, on the cell that was left. */
 async function follow() {
   const before = document.documentElement.dataset.shown;
+  const left = viewed;
   await show();
   const now = document.documentElement.dataset.shown;
-  if (now !== before || now === "cell") {
+  if (now === "matrix" && before === "cell") focusCell(left);
+  else if (now !== before || now === "cell") {
     scrollTo(0, 0);
     if (!read().row) /** @type {HTMLElement | null} */ (document.querySelector(`#${now}-view h1[tabindex]`))?.focus({ preventScroll: true });
   }

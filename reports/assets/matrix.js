@@ -1,11 +1,11 @@
-// The matrix: filters, what they leave of each cell, and folding of families.
+// The matrix: filters, the cells that pass them, folding of families, keyboard.
 import { fromCode } from "./chunks.js";
 import { amend, href, read } from "./route.js";
 import { h, number, svg } from "./text.js";
 
-/** @type {(Node[])[]} the cells as the page came, restored where no filter is set */
+/** @type {(Node[])[]} the cells of the static page, restored where no filter is set */
 const asWritten = [];
-const FILTERS = /** @type {const} */ (["verdict", "engine", "family", "level", "quantity", "q", "fresh"]);
+const FILTERS = /** @type {const} */ (["scenario", "verdict", "engine", "family", "level", "quantity", "q", "fresh"]);
 let built = false;
 
 /** @param {Record<string, string>} fields */
@@ -14,7 +14,19 @@ export function filtersOf(fields) {
 }
 
 /**
- * A test of one row by its number.
+ * Filters whose value this run does not have, as a sentence; "" where there is none.
+ * @param {import("./report_data").Index} index @param {Record<string, string>} fields
+ */
+function unknownFilters(index, fields) {
+  const values = /** @type {Record<string, string[]>} */ ({ scenario: index.scenarios, verdict: [...index.verdicts, ...index.verdicts.map((v) => "!" + v)],
+    engine: index.engines, family: index.families, level: index.levels, quantity: index.quantitys });
+  const unknown = Object.entries(fields).filter(([name, value]) => values[name] && !values[name].includes(value)).map(([name, value]) => `${name} “${value}”`);
+  if (fields.fresh && !index.passed) unknown.push("earlier run that passed");
+  return unknown.length ? `This run has no ${unknown.join(", no ")}. ` : "";
+}
+
+/**
+ * A test of one row by its index.
  * @param {import("./report_data").Index} index @param {Record<string, string>} fields
  * @returns {(row: number) => boolean}
  */
@@ -31,6 +43,7 @@ export function chosen(index, fields) {
     if (fields.engine && rows.engine[i] !== engine) return false;
     if (fields.level && rows.level[i] !== level) return false;
     if (fields.quantity && rows.quantity[i] !== quantity) return false;
+    if (fields.scenario && index.scenarios[rows.scenario[i]] !== fields.scenario) return false;
     if (fields.family && index.families[rows.scenario[i]] !== fields.family) return false;
     if (fields.fresh && !rows.fresh[i]) return false;
     if (!words.length) return true;
@@ -53,6 +66,13 @@ export function showMatrix(index, fields) {
     buildFolds(table);
     for (const line of table.querySelectorAll("tr.line")) asWritten.push([...line.querySelectorAll("td")].map((td) => td.cloneNode(true)));
     table.addEventListener("keydown", moveByArrow);
+    table.addEventListener("focusin", (event) => event.target instanceof HTMLAnchorElement && setTabStop(table, event.target));
+    document.addEventListener("keydown", (event) => {
+      const search = /** @type {HTMLElement} */ (document.querySelector("#filters [name=q]"));
+      if (event.key !== "/" || event.ctrlKey || event.metaKey || event.altKey || !search.checkVisibility() || (event.target instanceof Element && event.target.matches("input, select, textarea"))) return;
+      event.preventDefault();
+      search.focus();
+    });
   }
   for (const control of document.querySelectorAll("#filters [name]")) {
     const input = /** @type {HTMLInputElement} */ (control);
@@ -62,7 +82,7 @@ export function showMatrix(index, fields) {
   }
   const filters = filtersOf(fields);
   const filtered = Object.keys(filters).length > 0;
-  /** @type {Map<number, { speaker: number, count: number }>} */
+  /** @type {Map<number, number>} */
   const cells = new Map();
   const passes = chosen(index, filters);
   const { rows } = index;
@@ -72,26 +92,21 @@ export function showMatrix(index, fields) {
       if (!passes(i)) continue;
       count++;
       const place = rows.scenario[i] * index.engines.length + rows.engine[i];
-      const cell = cells.get(place);
-      if (!cell) cells.set(place, { speaker: i, count: 1 });
-      else {
-        cell.count++;
-        const more = rows.severity[i] - rows.severity[cell.speaker];
-        if (more > 0 || (more === 0 && rows.ratio[i] > rows.ratio[cell.speaker])) cell.speaker = i;
-      }
+      const worst = cells.get(place);
+      if (worst === undefined || outranks(index, i, worst)) cells.set(place, i);
     }
   }
   let lines = 0;
   table.querySelectorAll("tr.line").forEach((line, place) => {
     const scenario = Number(/** @type {HTMLElement} */ (line).dataset.scenario);
     const ours = index.engines.map((_, e) => cells.get(scenario * index.engines.length + e));
-    const visible = !filtered || ours.some(Boolean);
+    const visible = !filtered || ours.some((i) => i !== undefined);
     /** @type {HTMLElement} */ (line).hidden = !visible;
     if (!visible) return;
     lines++;
     line.querySelectorAll("td").forEach((td, e) => {
       const cell = ours[e];
-      td.replaceWith(!filtered ? asWritten[place][e].cloneNode(true) : cell ? cellOf(index, cell.speaker) : h("td", { class: "cell empty" }));
+      td.replaceWith(!filtered ? asWritten[place][e].cloneNode(true) : cell !== undefined ? cellOf(index, cell) : h("td", { class: "cell empty" }));
     });
   });
   for (const body of table.tBodies) {
@@ -102,7 +117,35 @@ export function showMatrix(index, fields) {
   const status = /** @type {HTMLElement} */ (document.getElementById("status"));
   status.replaceChildren();
   if (filtered) status.append(`${count} of ${rows.scenario.length} comparisons in ${lines} scenario${lines === 1 ? "" : "s"}. `, h("a", { href: href({ view: "matrix" }) }, "Show all"));
-  for (const id of ["findings"]) /** @type {HTMLElement} */ (document.getElementById(id)).hidden = filtered;
+  status.prepend(unknownFilters(index, filters));
+  /** @type {HTMLElement} */ (document.getElementById("findings")).hidden = filtered;
+  setTabStop(table, table.querySelector("a[tabindex='0']"));
+}
+
+/**
+ * Leave one cell in the order of the Tab key, the first visible one unless given; arrow keys reach the others.
+ * @param {HTMLTableElement} table @param {HTMLElement | null} [link]
+ */
+function setTabStop(table, link) {
+  const links = /** @type {NodeListOf<HTMLElement>} */ (table.querySelectorAll("tr.line td a"));
+  const stop = link?.checkVisibility() ? link : [...links].find((one) => one.checkVisibility());
+  for (const one of links) one.tabIndex = one === stop ? 0 : -1;
+}
+
+/** Focus the cell that a view of it was opened from. @param {Record<string, string>} fields */
+export function focusCell(fields) {
+  for (const link of /** @type {NodeListOf<HTMLAnchorElement>} */ (document.querySelectorAll("#matrix tr.line td a"))) {
+    const target = new URLSearchParams(link.hash.slice(1));
+    if (target.get("scenario") === fields.scenario && target.get("engine") === fields.engine) return link.focus();
+  }
+}
+
+/**
+ * Whether row i stands for its cell rather than row k.
+ * @param {import("./report_data").Index} index @param {number} i @param {number} k
+ */
+export function outranks({ rows }, i, k) {
+  return rows.severity[i] > rows.severity[k] || (rows.severity[i] === rows.severity[k] && rows.ratio[i] > rows.ratio[k]);
 }
 
 /** @param {import("./report_data").Index} index @param {number} i */
@@ -143,7 +186,7 @@ function buildFilters(index) {
     pick("family", "Family", [...new Set(index.families)]),
     pick("level", "Level", index.levels),
     pick("quantity", "Quantity", index.quantitys, (v) => v.replaceAll("_", " ")));
-  if (index.green) form.append(h("label", { class: "check" }, h("input", { type: "checkbox", name: "fresh", value: "1" }), "newly failing"));
+  if (index.passed) form.append(h("label", { class: "check" }, h("input", { type: "checkbox", name: "fresh", value: "1" }), "newly failing"));
   form.append(h("button", { type: "button", click: () => (location.hash = "view=matrix") }, "Clear"));
   form.addEventListener("submit", (event) => event.preventDefault());
   form.addEventListener("input", () => {
@@ -163,6 +206,7 @@ function buildFolds(table) {
     const button = h("button", { type: "button", class: "fold", "aria-expanded": "true", click: () => {
       const folded = body.classList.toggle("folded");
       button.setAttribute("aria-expanded", String(!folded));
+      setTabStop(table, table.querySelector("a[tabindex='0']"));
     } });
     button.append(...head.childNodes);
     head.replaceChildren(button);
@@ -184,7 +228,7 @@ function moveByArrow(event) {
     const next = /** @type {HTMLTableRowElement | undefined} */ (lines[row])?.cells[column];
     if (!next || column < 1) return;
     const link = next.querySelector("a");
-    if (!link) continue; // a cell that was not asked: go on in the same direction
+    if (!link) continue; // an empty cell: continue in the same direction
     event.preventDefault();
     link.focus();
     return;

@@ -1,4 +1,4 @@
-// The pendulums, side by side per engine, in perspective, on one clock; and their differences, magnified.
+// The motion of every engine side by side, in perspective, at one time; and the differences, magnified.
 import { superscript, h, ink, number } from "./text.js";
 
 /**
@@ -54,7 +54,7 @@ function basePoses(m, t) {
   for (let body = 0; body < m.bodies; body++) {
     const [a, b] = [frame * m.bodies + body, next * m.bodies + body];
     const along = m.p[4 * a] * m.p[4 * b] + m.p[4 * a + 1] * m.p[4 * b + 1] + m.p[4 * a + 2] * m.p[4 * b + 2] + m.p[4 * a + 3] * m.p[4 * b + 3];
-    const sign = along < 0 ? -1 : 1; // q and −q are one attitude: take the short way
+    const sign = along < 0 ? -1 : 1; // q and −q are the same attitude: interpolate along the shorter arc
     const q = [0, 1, 2, 3].map((i) => (1 - part) * m.p[4 * a + i] + part * sign * m.p[4 * b + i]);
     const size = Math.hypot(...q) || 1;
     const r = [0, 1, 2].map((i) => (((1 - part) * m.r[3 * a + i] + part * m.r[3 * b + i]) * m.span) / 32767);
@@ -85,9 +85,9 @@ function displaced(poses, difference, magnify) {
 }
 
 /**
- * The stage with its transport.
+ * The pictures of all engines with the controls of their time.
  * @param {import("./report_data").ScenarioChunk} data
- * @param {{ engine: string, engines: string[], end: number, start: number, magnify: number | null, crossing: { t: number, name: string } | null,
+ * @param {{ engine: string, engines: string[], titleOf: (engine: string) => string, judged: boolean, end: number, start: number, magnify: number | null, crossing: { t: number, name: string } | null,
  *   onTime: (t: number) => void, onRest: (state: Record<string, any>) => void }} o
  */
 export function motion(data, o) {
@@ -104,8 +104,9 @@ export function motion(data, o) {
   const clock = h("output", { class: "now" });
   const play = h("button", { type: "button", click: () => (playing ? pause() : start()) }, "▶ Play");
   const speed = h("select", { "aria-label": "Speed" }, [0.1, 0.25, 1, 4].map((v) => h("option", { value: v, selected: v === 1 }, `${v}×`)));
-  const jump = h("button", { type: "button", disabled: !o.crossing, click: () => { pause(); setTime(o.crossing?.t ?? 0); rest(); } },
-    o.crossing ? `First above tolerance: ${number(o.crossing.t, 4)} s (${o.crossing.name})` : "Never above its tolerance");
+  const { crossing } = o;
+  const jump = crossing ? h("button", { type: "button", click: () => { pause(); setTime(crossing.t); rest(); } }, `First above tolerance: ${number(crossing.t, 4)} s (${crossing.name})`)
+    : o.judged ? h("span", { class: "scale" }, "These positions stay within their tolerance") : null;
   const power = h("input", { type: "range", class: "mag", min: 0, max: 16, step: 1, "aria-label": "Magnification, power of ten", input: () => { magnify = Number(power.value); drawAll(); }, change: () => rest() });
   const magnified = h("input", { type: "checkbox", change: () => { magnify = magnified.checked ? suited() : null; drawAll(); rest(); } });
   const scale = h("span", { class: "scale" });
@@ -123,8 +124,8 @@ export function motion(data, o) {
       const canvas = h("canvas", { tabindex: 0, role: "img" });
       /** @type {View} */
       const view = { canvas, note, run, runs, colour: `--c${k % 8}` };
-      const choice = h("select", { "aria-label": `Integrator of ${engine}`, change: () => { view.run = runs[Number(choice.value)]; label(view); draw(view); } }, runs.map((one, i) => h("option", { value: i, selected: one === run }, one.integrator)));
-      stage.append(h("figure", { class: engine === o.engine ? "mine" : "" }, h("figcaption", {}, h("b", {}, engine), runs.length > 1 ? choice : h("span", {}, run.integrator)), canvas, h("figcaption", {}, note)));
+      const choice = h("select", { "aria-label": `Integrator of ${o.titleOf(engine)}`, change: () => { view.run = runs[Number(choice.value)]; label(view); draw(view); } }, runs.map((one, i) => h("option", { value: i, selected: one === run }, one.integrator)));
+      stage.append(h("figure", { class: engine === o.engine ? "mine" : "" }, h("figcaption", {}, h("b", { title: o.titleOf(engine) }, o.titleOf(engine)), runs.length > 1 ? choice : h("span", {}, run.integrator)), canvas, h("figcaption", {}, note)));
       label(view);
       orbit(canvas);
       views.push(view);
@@ -133,7 +134,7 @@ export function motion(data, o) {
 
   /** @param {View} view */
   function label(view) {
-    view.canvas.setAttribute("aria-label", `Motion of ${view.run.engine}, ${view.run.integrator}; arrow keys turn the view`);
+    view.canvas.setAttribute("aria-label", `Motion of ${o.titleOf(view.run.engine)}, ${view.run.integrator}; arrow keys turn the view`);
   }
 
   /** @param {Run} run */
@@ -196,7 +197,7 @@ export function motion(data, o) {
     }
     let apart = 0;
     for (let k = 0; k < m.bodies; k++) apart = Math.max(apart, Math.hypot(difference[6 * k], difference[6 * k + 1], difference[6 * k + 2]));
-    view.note.textContent = isBase ? "the base of the differences" : `${number(apart)} m from ${m.base[0]}`;
+    view.note.textContent = isBase ? "the base of the differences" : `${number(apart)} m from ${o.titleOf(m.base[0])}`;
     if (magnify !== null && !isBase) chain(context, see, m, poses, ink("--soft"), true, scene);
     chain(context, see, m, displaced(poses, difference, magnify === null ? 1 : 10 ** magnify), ink(view.colour), false, scene);
   }

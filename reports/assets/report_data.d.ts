@@ -4,7 +4,7 @@ export interface Index {
   scenarios: string[]; families: string[]; titles: string[]; engines: string[]; engine_titles: string[];
   verdicts: string[]; glyphs: string[]; slugs: string[]; reasons: string[];
   levels: string[]; integrators: string[]; quantitys: string[];
-  commit: string | null; green: string | null;
+  commit: string | null; passed: string | null;
   rows: {
     scenario: Uint16Array; engine: Uint8Array; verdict: Uint8Array; level: Uint8Array; integrator: Uint8Array;
     quantity: Uint16Array; severity: Uint8Array; fresh: Uint8Array; ratio: Uint16Array;

@@ -45,7 +45,7 @@ export function superscript(n) {
 }
 
 /**
- * A number as people write it: 0.031, 4.2×10⁻⁶; "–" for none.
+ * A number in few digits: 0.031, 4.2×10⁻⁶; "–" for none.
  * @param {number | null | undefined} x @param {number} [digits]
  */
 export function number(x, digits = 2) {

@@ -21,7 +21,7 @@ export async function showTrend(root, index, fields) {
   const count = nights.length;
   const passes = chosen(index, filtersOf(fields));
   const rows = [...index.rows.scenario.keys()].filter(passes);
-  /** How much a key moved: a change of verdict first, then decades. @param {number} i */
+  /** How much a key changed: a change of verdict first, then decades. @param {number} i */
   const moved = (i) => {
     const verdicts = new Set(past.verdict.subarray(i * count, (i + 1) * count).filter(Boolean));
     const codes = [...past.ratio.subarray(i * count, (i + 1) * count)].filter((c) => c > 1);
@@ -32,14 +32,14 @@ export async function showTrend(root, index, fields) {
   const search = h("input", { type: "search", value: fields.q ?? "", placeholder: "scenario, quantity, verdict", spellcheck: "false", change: () => { amend({ q: search.value }); showTrend(root, index, read()).then(() => root.querySelector("input")?.focus()); } });
   const narrowed = Object.entries(filtersOf(fields)).map(([name, value]) => `${name}: ${value}`).join(", ");
   root.append(
-    h("p", { class: "purpose" }, `Error over tolerance on ${count} nights, ${nights[0].started.slice(0, 10)} to ${nights[count - 1].started.slice(0, 10)}; the dashed line is the tolerance, an upright one a change of that engine's version. Those that moved most come first.`),
+    h("p", { class: "purpose" }, `Error over tolerance on ${count} nights, ${nights[0].started.slice(0, 10)} to ${nights[count - 1].started.slice(0, 10)}; the dashed line is the tolerance, a vertical line a change of that engine's version. Those that changed most come first.`),
     past.damaged.length ? h("p", { class: "note" }, `Skipped as damaged: ${past.damaged.join(", ")}`) : "",
     h("h2", { class: "sub" }, "Nights"), nightTable(past, index),
     h("h2", { class: "sub" }, `${rows.length} key${rows.length === 1 ? "" : "s"}`, narrowed ? ` (${narrowed})` : ""),
     h("div", { class: "filters", role: "search" }, h("label", {}, "Search keys", search)),
     h("p", { class: "keys" }, index.engines.map((name) => h("a", { href: href({ ...fields, view: "trend", engine: name }), "aria-current": fields.engine === name ? "true" : null }, name)), h("a", { href: "#view=trend" }, "all engines")),
     h("div", { class: "trends" }, rows.slice(0, SHOWN).map((i) => trend(past, index, i))));
-  if (rows.length > SHOWN) root.append(h("p", { class: "why" }, `… and ${rows.length - SHOWN} that moved less; narrow them by engine, or by any filter of the matrix in the address.`));
+  if (rows.length > SHOWN) root.append(h("p", { class: "why" }, `… and ${rows.length - SHOWN} that changed less; select an engine, or add a filter of the matrix to the address.`));
 }
 
 /** @param {HistoryChunk} past @param {Index} index @param {number} i */

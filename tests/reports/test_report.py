@@ -12,6 +12,7 @@ import shlex
 import shutil
 import subprocess
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from html.parser import HTMLParser
 from itertools import pairwise, product
 from pathlib import Path
@@ -331,7 +332,7 @@ def test_a_night_of_thousands_of_scenarios_stays_under_8_megabytes(out, tmp_path
     assert len(text.encode()) <= html_report.MAX_NIGHTLY_PAGE_BYTES
     assert "random-2499" in text and "the needle" in text
     assert "2000 more scenarios are not in this page" in text
-    assert "those with anything unexpected are all here" in text
+    assert "none of them has an unexpected verdict" in text
     assert f"<b>{sum(row['verdict'] == 'agrees' for row in copies)}</b><span>agree" in text
 
 
@@ -359,6 +360,9 @@ def test_a_history_says_what_is_new_and_skips_a_damaged_night(out, tmp_path):
         if row["key"] in fresh:
             assert list(VERDICT_STYLES)[line[0] - 1] == "agrees"
     words = Parsed(page).words
+    assert history.missing_keys == 0
+    states = replace(results, rows=[row for row in results.rows if row["level"] == "state"])
+    assert History.load(past, states).missing_keys == len(results.rows) - len(states.rows)
     assert re.search(rf"{len(fresh)}\s+newly failing", words) and "Skipped as damaged: 2026-11-02" in words
 
 
@@ -387,6 +391,14 @@ def test_gaps_of_one_reason_are_one_finding(out):
         "scenarios"
     ]
     assert (len(second["scenarios"]), second["more"]) == (0, 0)
+
+
+def test_a_run_that_compared_nothing_is_not_shown_as_agreement(out):
+    results = Results.load(out)
+    gaps = [row for row in results.rows if row["verdict"] in ("unsupported", "not installed")]
+    words = Parsed(html_report.render(replace(results, rows=gaps), History())).words
+    assert "Nothing was compared" in words and "Nothing needs attention" not in words
+    assert "Every cell agrees" not in words
 
 
 def test_a_report_that_cannot_be_written_leaves_the_old_one(out, tmp_path, monkeypatch):

@@ -1,5 +1,7 @@
 """The report as a person meets it: in a real Chromium, by file://, offline."""
 
+from __future__ import annotations
+
 import base64
 import math
 import re
@@ -7,13 +9,13 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlencode
 
 import pytest
 
+from plumbline.storage.script_index import write_script_index
 from reports import html_report as report
 from reports.results import Results
 from tests.helpers import example_results as fixture
@@ -36,8 +38,25 @@ def out(example_run, tmp_path_factory):
     return folder
 
 
-Open = Callable[..., Any]
-Violations = Callable[[Any, str], list[str]]
+@pytest.fixture(scope="module")
+def single(out, tmp_path_factory):
+    """A run of one scenario: a long text on the truth, an engine of four integrators, a shared script."""
+    whole, name = Results.load(out), "double-two-rods"
+    results = whole.restricted_to({name})
+    results.run["truth"] = "Taylor's method in extended precision. " * 8
+    results = replace(results, folder=tmp_path_factory.mktemp("single"))
+    extra = [
+        row | {"integrator": method, "key": row["key"].replace("/RK4/", f"/{method}/")}
+        for method in ("implicit", "implicitfast")
+        for row in results.rows
+        if row["engine"] == "mujoco" and row["integrator"] == "RK4"
+    ]
+    results.rows.extend(extra)
+    keys = [f"{name}/mujoco/state/-/{quantity}" for quantity in ("acceleration", "joint_reaction")]
+    (results.folder / "scripts").mkdir()
+    (results.folder / "scripts" / "reproduce.py").write_text("print('one script')\n")
+    write_script_index(results.folder, dict.fromkeys(keys, "reproduce.py"))
+    return report.write(results).parent
 
 
 @pytest.fixture
@@ -177,7 +196,7 @@ def test_every_view_is_a_link_that_restores_it(open_page):
     assert "position, RK4" in page.locator(".chosen h3").inner_text()
     assert float(page.get_by_label("Time", exact=True).input_value()) == pytest.approx(1.25)
     assert "×10⁷" in page.locator(".transport .scale").inner_text()
-    assert page.locator(".keys").get_by_text("exudyn midpoint").is_visible()
+    assert page.locator(".keys").get_by_text("Exudyn midpoint").is_visible()
     for view, title in (("cost", "Convergence and cost"), ("trend", "Trends")):
         assert open_page(link(view=view)).locator("h1.cell-title:visible").inner_text() == title
     lost = open_page(link(scenario="<b>no</b>", engine="mujoco"))
@@ -246,21 +265,21 @@ def test_the_detail_says_what_was_compared_and_why(open_page):
 
 
 def pixels(page, engine):
-    return page.locator(f'canvas[aria-label^="Motion of {engine},"]').evaluate("c => c.toDataURL()")
+    return page.get_by_role("img", name=f"Motion of {engine},").evaluate("c => c.toDataURL()")
 
 
 def test_slider_playback_and_the_jump_to_the_first_crossing(open_page):
     from playwright.sync_api import expect
 
     page = open_page(link(scenario="planar-large", engine="exudyn"))
-    before, clock = pixels(page, "reference"), page.locator(".transport .now")
+    before, clock = pixels(page, "The notes"), page.locator(".transport .now")
     marker = page.locator(".now-line").first
     at_rest = marker.evaluate("m => m.style.transform")
     slider = page.get_by_label("Time", exact=True)
     slider.focus()
     page.keyboard.press("End")
     assert clock.inner_text() == "4.000 s"
-    assert pixels(page, "reference") != before
+    assert pixels(page, "The notes") != before
     assert marker.evaluate("m => m.style.transform") != at_rest
     jump = page.get_by_role("button", name="First above tolerance")
     told = float(re.search(r"([\d.]+) s", jump.inner_text())[1])
@@ -283,35 +302,35 @@ def test_difference_mode_makes_tiny_differences_visible(open_page):
     note = page.locator("figure").last.locator(".off").inner_text()
     size = plain(note.split(" m from")[0])
     assert 0 < size < 1e-7
-    true = pixels(page, "exudyn-tree")
+    true = pixels(page, "Exudyn, kinematic tree")
     page.get_by_label("Magnify differences").check()
     assert "mag=" in page.url
     power = page.get_by_label("Magnification, power of ten")
     assert 10 ** int(power.input_value()) * size > 0.001
-    magnified = pixels(page, "exudyn-tree")
+    magnified = pixels(page, "Exudyn, kinematic tree")
     assert magnified != true
     power.focus()
     page.keyboard.press("ArrowRight")
-    assert pixels(page, "exudyn-tree") != magnified
+    assert pixels(page, "Exudyn, kinematic tree") != magnified
     page.get_by_label("Magnify differences").uncheck()
-    assert pixels(page, "exudyn-tree") == true
+    assert pixels(page, "Exudyn, kinematic tree") == true
 
 
 def test_a_drag_and_the_arrow_keys_turn_every_view(open_page):
     page = open_page(link(scenario="double-two-rods", engine="mujoco", t="1"))
-    mine, other = pixels(page, "mujoco"), pixels(page, "reference")
-    canvas = page.locator('canvas[aria-label^="Motion of mujoco,"]')
+    mine, other = pixels(page, "MuJoCo"), pixels(page, "The notes")
+    canvas = page.get_by_role("img", name="Motion of MuJoCo,")
     canvas.scroll_into_view_if_needed()
     box = canvas.bounding_box()
     page.mouse.move(box["x"] + 60, box["y"] + 60)
     page.mouse.down()
     page.mouse.move(box["x"] + 120, box["y"] + 80, steps=4)
     page.mouse.up()
-    turned = pixels(page, "mujoco")
-    assert turned != mine and pixels(page, "reference") != other
+    turned = pixels(page, "MuJoCo")
+    assert turned != mine and pixels(page, "The notes") != other
     canvas.focus()
     page.keyboard.press("ArrowLeft")
-    assert pixels(page, "mujoco") != turned
+    assert pixels(page, "MuJoCo") != turned
 
 
 def test_trends_mark_versions_and_bad_nights(open_page):
@@ -426,6 +445,127 @@ def test_a_narrow_screen_does_not_scroll_sideways(open_page):
         page.evaluate("new Promise((go) => requestAnimationFrame(() => setTimeout(go)))")
         over = page.evaluate("document.documentElement.scrollWidth - innerWidth")
         assert over <= 0, view
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+def test_no_number_and_no_caption_of_the_matrix_is_cut(open_page, width):
+    page = open_page()
+    page.set_viewport_size({"width": width, "height": 800})
+    cut = "cells => cells.filter(c => c.scrollWidth > c.clientWidth).map(c => c.textContent)"
+    assert page.locator(".cell .q").evaluate_all(cut) == []
+    box = page.locator(".matrix caption span").bounding_box()
+    assert box["x"] >= 0 and box["x"] + box["width"] <= width
+
+
+def test_a_table_of_four_integrators_fits_and_a_cut_one_fades(open_page, single):
+    page = open_page(link(scenario="double-two-rods", engine="mujoco"), single)
+    page.set_viewport_size({"width": 1280, "height": 800})
+    assert page.get_by_role("columnheader", name="implicitfast").is_visible()
+    cut = "tables => tables.map(t => t.scrollWidth - t.clientWidth)"
+    assert max(page.locator(".tables .scroll").evaluate_all(cut)) <= 0
+    page.set_viewport_size({"width": 390, "height": 800})
+    table = page.locator(".tables .scroll").last
+    for where, edge in ((0, "36px"), (9999, "0px")):
+        table.evaluate("(table, where) => (table.scrollLeft = where)", where)
+        fade = "([table, edge]) => getComputedStyle(table).getPropertyValue('--edge') === edge"
+        page.wait_for_function(fade, arg=[table.element_handle(), edge])
+
+
+def test_pictures_of_the_motion_are_level_and_keep_their_controls(open_page):
+    page = open_page(link(scenario="double-two-rods", engine="mujoco"))
+    page.set_viewport_size({"width": 1280, "height": 800})
+    tops = {round(canvas.bounding_box()["y"], 1) for canvas in page.locator(".stage canvas").all()}
+    assert len(tops) == 1
+    assert page.locator(".stage select").count() == 2
+    for figure in page.locator(".stage figure").all():
+        box = figure.bounding_box()
+        for part in figure.locator("select, span, b").all():
+            inner = part.bounding_box()
+            assert inner["x"] + inner["width"] <= box["x"] + box["width"] + 0.5
+
+
+def test_numbers_of_the_details_have_names_units_and_no_false_digits(open_page, single):
+    page = open_page(link(scenario="double-two-rods", engine="mujoco", row="state/-/acceleration"), single)
+    details = page.locator(".derive").inner_text()
+    assert re.search(r"States compared\s+51\s", details)
+    assert page.locator(".crumbs").first.get_by_role("link").count() == 1  # no neighbours
+    scripts = page.locator("summary", has_text="Stand-alone script").all_text_contents()
+    assert scripts == ["Stand-alone script: state, acceleration; state, joint reaction"]
+
+
+def test_within_tolerance_is_said_of_the_positions_only(open_page):
+    page = open_page(link(scenario="planar-small", engine="reference"))
+    assert page.get_by_text("These positions stay within their tolerance").is_visible()
+    assert page.get_by_text("Never above").count() == 0
+    assert page.locator(".transport button:disabled").count() == 0
+
+
+def test_an_unknown_filter_is_named(open_page, single):
+    page = open_page(link(verdict="bogus", level="none"))
+    assert "This run has no verdict “bogus”, no level “none”. 0 of" in page.locator("#status").inner_text()
+    go(page, link(scenario="chain-10"))
+    assert visible_lines(page) == ["chain-10"]
+    go(page, link(verdict="!agrees"))
+    assert "This run has no" not in page.locator("#status").inner_text()
+    alone = open_page(link(fresh="1"), single)
+    assert "no earlier run that passed" in alone.locator("#status").inner_text()
+
+
+def test_the_matrix_is_one_stop_of_the_tab_key_and_keeps_its_place(open_page):
+    page = open_page()
+    stops = page.locator("tr.line td a[tabindex='0']")
+    assert stops.count() == 1
+    stops.focus()
+    for key in ("ArrowDown", "ArrowRight"):
+        page.keyboard.press(key)
+    assert stops.count() == 1
+    here = page.evaluate("document.activeElement.getAttribute('href')")
+    page.keyboard.press("Enter")
+    page.wait_for_selector("html[data-shown=cell]")
+    page.go_back()
+    page.wait_for_selector("html[data-shown=matrix]")
+    assert page.evaluate("document.activeElement.getAttribute('href')") == here
+    page.keyboard.press("/")
+    assert page.evaluate("document.activeElement.name") == "q"
+    page.keyboard.press("/")
+    assert page.get_by_label("Search").input_value() == "/"
+    page.get_by_label("Search").fill("chain-10")
+    assert stops.count() == 1 and stops.is_visible()
+
+
+def test_the_search_field_shows_its_whole_placeholder(open_page):
+    page = open_page()
+    room = """i => {
+      const style = getComputedStyle(i), context = document.createElement("canvas").getContext("2d");
+      context.font = style.font;
+      const needed = context.measureText(i.placeholder).width + 16;  // the button that clears it
+      return i.clientWidth - parseFloat(style.paddingLeft) - parseFloat(style.paddingRight) - needed;
+    }"""
+    assert page.get_by_label("Search").evaluate(room) >= 0
+
+
+def test_costs_fill_their_axis_and_unresolved_orders_are_left_out(open_page):
+    page = open_page(link(view="cost"))
+    read = "circles => circles.map(circle => Number(circle.getAttribute('cx')))"
+    places = page.locator("#cost-view svg[role=img] circle").evaluate_all(read)
+    assert min(places) < 52 + 0.3 * (520 - 66)
+    lines = page.get_by_role("region", name="Observed order").locator("tbody tr").all_inner_texts()
+    counts = {line.split("\t")[0]: line.split("\t")[-1] for line in lines}
+    results = Results.load(Path(page.evaluate("decodeURIComponent(location.pathname)")).parent)
+    for engine, method in (("mujoco", "RK4"), ("pinocchio", "Euler")):
+        orders = [
+            row["verdict"] != "unresolved"
+            for row in results.rows
+            if (row["engine"], row["integrator"], row["quantity"]) == (engine, method, "order")
+        ]
+        assert counts[f"{engine} {method}"] == f"{sum(orders)} of {len(orders)}"
+
+
+def test_print_shows_what_the_verdicts_were_measured_against(open_page, single):
+    page = open_page("", single)
+    folded = page.locator("details.truth").bounding_box()["height"]
+    page.emulate_media(media="print")
+    assert page.locator("details.truth").bounding_box()["height"] > folded + 10
 
 
 COLOURS = """async (data) => {  // size and number of colours of a picture
