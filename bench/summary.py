@@ -23,7 +23,7 @@ COLOURS = ("#0b6e99", "#7a4fa3", "#b85c00", "#2e7d32", "#b3261e", "#5d6b7a", "#8
 
 
 def measured_goals(measurements: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The goals whose measurement is among ``found``: what, goal, measured (a ratio or exponent)."""
+    """The goals that were measured: what, goal, measured value (a ratio or exponent)."""
 
     def pick(kind: str, **where: Any) -> dict[str, Any] | None:
         fits = (r for r in measurements if r["kind"] == kind and all(r.get(k) == v for k, v in where.items()))

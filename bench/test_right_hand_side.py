@@ -14,7 +14,7 @@ BODIES = (1, 2, 10, 100, 1000, 10_000)
 
 
 def record_table(benchmark: Any, table: dict[str, Any]) -> None:
-    """Put a table beside pytest-benchmark's own figures, and say it."""
+    """Put a table beside pytest-benchmark's own figures and print it."""
     benchmark.extra_info.update(table)
     print(table)
 

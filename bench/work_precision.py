@@ -21,7 +21,7 @@ TOLERANCES = (1e-3, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-12)
 
 @dataclass(frozen=True)
 class WorkPrecisionPoint:
-    """One run: the resolution it was asked for, its error (m) at the end and its CPU time (s)."""
+    """One run: step or tolerance, error at the end [m] and CPU time [s]."""
 
     resolution: float
     error: float
@@ -43,7 +43,7 @@ def reference_positions(model: Model, states: Sequence[State]) -> Array:
 def measure_run(
     run: Callable[[], Array], expected: Array, resolution: float, repeats: int = 3
 ) -> WorkPrecisionPoint:
-    """The best of ``again`` runs."""
+    """Repeat a run and keep the shortest CPU time."""
     seconds = []
     for _ in range(repeats):
         start = process_time()
@@ -107,7 +107,7 @@ def fixed_step_curve(
 
         setup = measure_run(lambda step=step: run(np.array([0.0, step])), expected, step, 2).seconds
         point = measure_run(lambda: run(SAMPLE_TIMES), expected, step, 2)
-        if point.seconds > setup:  # else too quick to be told from the building of the model
+        if point.seconds > setup:  # else the time is that of building the model
             points.append(WorkPrecisionPoint(step, point.error, point.seconds - setup))
         if point.seconds > max_seconds:
             break

@@ -10,11 +10,11 @@ import { copyable, h, number, svg } from "./text.js";
 /** @typedef {import("./report_data").Index} Index @typedef {import("./report_data").ScenarioChunk} ScenarioChunk @typedef {import("./report_data").Study} Study */
 
 /** @type {(() => void)[]} clean-up of the cell on show, called before the next one */
-let ending = [];
+let cleanups = [];
 
 export function closeCell() {
-  for (const end of ending) end();
-  ending = [];
+  for (const cleanup of cleanups) cleanup();
+  cleanups = [];
 }
 
 /**
@@ -55,11 +55,11 @@ export async function showCell(root, index, fields, back) {
         theirs === null ? null : h("span", { class: `g ${index.slugs[index.rows.verdict[theirs]]}`, "aria-hidden": "true" }, index.glyphs[index.rows.verdict[theirs]]),
         theirs === null ? null : h("span", { class: "vh" }, index.verdicts[index.rows.verdict[theirs]] + " "), index.engine_titles[k]));
     })));
-  const told = new Set();
+  const diagnoses = new Set();
   for (const i of ours) {
     const row = data.rows[i];
-    if (!row?.diagnosis || told.has(row.diagnosis)) continue;
-    told.add(row.diagnosis);
+    if (!row?.diagnosis || diagnoses.has(row.diagnosis)) continue;
+    diagnoses.add(row.diagnosis);
     root.append(h("p", { class: `callout ${index.slugs[index.rows.verdict[i]]}` }, row.diagnosis, h("small", {}, `Diagnosis of ${index.levels[index.rows.level[i]]}, ${index.quantitys[index.rows.quantity[i]]}`)));
   }
   root.append(h("h2", { class: "sub" }, "What was compared"), compared(index, data, ours, fields));
@@ -116,19 +116,19 @@ const placeOf = ({ rows, levels, integrators, quantitys }, i) => [levels[rows.le
  */
 function compared(index, data, ours, fields) {
   const { rows } = index;
-  const told = h("div", { class: "told", "aria-live": "polite" });
+  const chosenBox = h("div", { class: "chosen-row", "aria-live": "polite" });
   const tables = h("div", { class: "tables" });
   /** @type {Map<number, HTMLButtonElement>} */
   const buttons = new Map();
-  /** @param {number} i @param {boolean} tell */
-  const choose = (i, tell) => {
+  /** @param {number} i @param {boolean} byUser */
+  const choose = (i, byUser) => {
     for (const [k, button] of buttons) button.setAttribute("aria-pressed", String(k === i));
-    told.replaceChildren(chosenRow(index, data.rows[i] ?? {}, i));
-    if (tell) amend({ row: placeOf(index, i) });
+    chosenBox.replaceChildren(chosenRow(index, data.rows[i] ?? {}, i));
+    if (byUser) amend({ row: placeOf(index, i) });
   };
-  const byState = ours.filter((i) => index.integrators[rows.integrator[i]] === "-");
-  const moving = ours.filter((i) => index.integrators[rows.integrator[i]] !== "-");
-  for (const part of [byState, moving]) {
+  const withoutIntegrator = ours.filter((i) => index.integrators[rows.integrator[i]] === "-");
+  const byIntegrator = ours.filter((i) => index.integrators[rows.integrator[i]] !== "-");
+  for (const part of [withoutIntegrator, byIntegrator]) {
     if (!part.length) continue;
     const integrators = [...new Set(part.map((i) => rows.integrator[i]))];
     const body = h("tbody");
@@ -156,7 +156,7 @@ function compared(index, data, ours, fields) {
           return h("td", { class: slug }, button);
         })));
     }
-    tables.append(h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": part === byState ? "Without an integrator" : "By integrator" },
+    tables.append(h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": part === withoutIntegrator ? "Without an integrator" : "By integrator" },
       h("table", { class: "plain compared" },
         h("thead", {}, h("tr", {}, h("th", { scope: "col" }, "Quantity"), integrators.map((k) => {
           const alias = part.map((i) => (rows.integrator[i] === k ? data.rows[i]?.alias_of : undefined)).find(Boolean);
@@ -164,10 +164,10 @@ function compared(index, data, ours, fields) {
         }))), body)));
   }
   const worst = ours.reduce((a, b) => (outranks(index, b, a) ? b : a), ours[0]);
-  const asked = ours.find((i) => placeOf(index, i) === fields.row);
-  if (ours.length) choose(asked ?? worst, false);
-  if (asked !== undefined) queueMicrotask(() => buttons.get(asked)?.focus({ preventScroll: true }));
-  return h("div", {}, tables, told);
+  const requested = ours.find((i) => placeOf(index, i) === fields.row);
+  if (ours.length) choose(requested ?? worst, false);
+  if (requested !== undefined) queueMicrotask(() => buttons.get(requested)?.focus({ preventScroll: true }));
+  return h("div", {}, tables, chosenBox);
 }
 
 /** "" for a pure number. @param {string | undefined} unit */
@@ -194,21 +194,21 @@ const EXTRA = {
 function derivation(row) {
   const list = h("dl", { class: "derive" });
   /** @param {string} name @param {string | number | null | undefined} value */
-  const say = (name, value) => value !== null && value !== undefined && value !== "" && list.append(h("dt", {}, name), h("dd", {}, value));
-  say("Diagnosis", row.diagnosis);
-  say("Tolerance", row.tolerance === undefined ? null : `${number(row.tolerance, 4)} ${unitOf(row.unit)}${row.derivation ? ": " + row.derivation : ""}`);
-  say("Measured", row.value === undefined ? null : `${number(row.value, 4)} ${unitOf(row.unit)}`);
-  say("Uncertainty", row.uncertainty === undefined ? null : `${number(row.uncertainty, 3)} ${unitOf(row.unit)}, of the truth and of the limit together`);
-  say("Horizon", row.compared_until === undefined ? null : `${number(row.compared_until, 3)} s, up to which positions were compared`);
-  say("Order", row.order === undefined ? null : `observed ${number(row.order, 4)}${row.declared_order ? `, declared ${row.declared_order}` : ""}`);
-  say("Alias", row.alias_of ? `equals ${row.alias_of} here, so it is not independent evidence` : null);
-  say("Known issue", row.known_issue);
-  say("Your tolerance", row.user_rtol === undefined ? null : `${number(row.user_rtol)} ${unitOf(row.unit)}: the error is ${(row.value ?? Infinity) <= row.user_rtol ? "within" : "above"} the tolerance given on the command line; the verdict does not depend on it`);
+  const entry = (name, value) => value !== null && value !== undefined && value !== "" && list.append(h("dt", {}, name), h("dd", {}, value));
+  entry("Diagnosis", row.diagnosis);
+  entry("Tolerance", row.tolerance === undefined ? null : `${number(row.tolerance, 4)} ${unitOf(row.unit)}${row.derivation ? ": " + row.derivation : ""}`);
+  entry("Measured", row.value === undefined ? null : `${number(row.value, 4)} ${unitOf(row.unit)}`);
+  entry("Uncertainty", row.uncertainty === undefined ? null : `${number(row.uncertainty, 3)} ${unitOf(row.unit)}, of the truth and of the limit together`);
+  entry("Horizon", row.compared_until === undefined ? null : `${number(row.compared_until, 3)} s, up to which positions were compared`);
+  entry("Order", row.order === undefined ? null : `observed ${number(row.order, 4)}${row.declared_order ? `, declared ${row.declared_order}` : ""}`);
+  entry("Alias", row.alias_of ? `equals ${row.alias_of} here, so it is not independent evidence` : null);
+  entry("Known issue", row.known_issue);
+  entry("Your tolerance", row.user_rtol === undefined ? null : `${number(row.user_rtol)} ${unitOf(row.unit)}: the error is ${(row.value ?? Infinity) <= row.user_rtol ? "within" : "above"} the tolerance given on the command line; the verdict does not depend on it`);
   for (const [name, value] of Object.entries(row.extra ?? {})) {
     const [label, unit] = EXTRA[name] ?? [name.replaceAll("_", " "), ""];
-    say(label, `${Number.isInteger(value) && Math.abs(value ?? 0) < 1e6 ? value : number(value, 4)} ${unit === "row" ? unitOf(row.unit) : unit}`);
+    entry(label, `${Number.isInteger(value) && Math.abs(value ?? 0) < 1e6 ? value : number(value, 4)} ${unit === "row" ? unitOf(row.unit) : unit}`);
   }
-  say("CPU time", row.cpu_time === undefined ? null : `${number(row.cpu_time)} s`);
+  entry("CPU time", row.cpu_time === undefined ? null : `${number(row.cpu_time)} s`);
   return list;
 }
 
@@ -232,7 +232,7 @@ function moving(root, index, data, fields) {
     onRest: (state) => amend(state),
   });
   room.append(stage.root);
-  ending.push(stage.destroy);
+  cleanups.push(stage.destroy);
   const choice = h("select", { "aria-label": "Curves shown" }, h("option", { value: "" }, "this engine, every integrator"), h("option", { value: "all" }, "every engine, its best integrator"));
   choice.value = fields.curves === "all" ? "all" : "";
   const legend = h("div");
@@ -254,7 +254,7 @@ function moving(root, index, data, fields) {
     draw();
   });
   if (curves.length) draw();
-  ending.push(() => drawn?.destroy());
+  cleanups.push(() => drawn?.destroy());
 }
 
 /**

@@ -176,9 +176,9 @@ export function track(ratio) {
 /** @param {import("./report_data").Index} index */
 function buildFilters(index) {
   const form = /** @type {HTMLFormElement} */ (document.getElementById("filters"));
-  /** @param {string} name @param {string} title @param {string[]} values @param {(v: string) => string} [say] */
-  const pick = (name, title, values, say = (v) => v) =>
-    h("label", {}, title, h("select", { name }, h("option", { value: "" }, "all"), values.map((v) => h("option", { value: v }, say(v)))));
+  /** @param {string} name @param {string} title @param {string[]} values @param {(v: string) => string} [format] */
+  const pick = (name, title, values, format = (v) => v) =>
+    h("label", {}, title, h("select", { name }, h("option", { value: "" }, "all"), values.map((v) => h("option", { value: v }, format(v)))));
   form.append(
     h("label", {}, "Search", h("input", { type: "search", name: "q", placeholder: "scenario, engine, reason", spellcheck: "false" })),
     pick("verdict", "Verdict", [...index.verdicts, "!agrees"], (v) => (v === "!agrees" ? "anything but agrees" : v)),

@@ -356,13 +356,13 @@ function chain(context, see, m, poses, colour, ghost, scene) {
   /** @type {{ depth: number, paint: () => void }[]} */
   const parts = [];
   /** @type {Vec} */
-  let hang = [0, 0, 0];
+  let attachment = [0, 0, 0];
   const dense = m.bodies > 12;
   poses.forEach(({ r, q }, k) => {
     const shape = m.shape[k];
     const near = add(r, turn(q, shape.proximal));
     const far = add(r, turn(q, shape.distal));
-    const [a, b, c, d] = [see(hang), see(near), see(r), see(far)];
+    const [a, b, c, d] = [see(attachment), see(near), see(r), see(far)];
     const rod = shape.length > 0;
     parts.push({ depth: Math.max(a[2], b[2]), paint: () => {
       context.strokeStyle = colour;
@@ -416,7 +416,7 @@ function chain(context, see, m, poses, colour, ghost, scene) {
         } });
       }
     }
-    hang = far;
+    attachment = far;
   });
   parts.sort((a, b) => b.depth - a.depth).forEach((part) => part.paint());
   if (ghost) return;
