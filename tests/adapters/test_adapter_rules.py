@@ -55,8 +55,10 @@ def contract_of(monkeypatch):
     def run(gaps, test, *args):
         engine = OneBall()
         monkeypatch.setattr(OneBall, "unsupported", {kind: REASONS[kind] for kind in gaps})
-        monkeypatch.setattr(contract.worker, "call", lambda _, method, *a: getattr(engine, method)(*a))
-        monkeypatch.setattr(contract.worker, "attribute", lambda _, name: getattr(engine, name))
+        monkeypatch.setattr(
+            contract.worker, "call_adapter", lambda _, method, *a: getattr(engine, method)(*a)
+        )
+        monkeypatch.setattr(contract.worker, "adapter_attribute", lambda _, name: getattr(engine, name))
         contract.declared_gaps.cache_clear()
         getattr(contract, f"test_{test}")(engine.name, *args)
 
@@ -104,7 +106,7 @@ def test_a_wrong_declaration_fails(contract_of, gaps, test, args, message):
 
 
 def test_a_kind_that_is_supported_after_all_must_go(contract_of, monkeypatch):
-    monkeypatch.setattr(contract, "JOINTS", {"ball": "b"})
+    monkeypatch.setattr(contract, "JOINT_PATTERNS", {"ball": "b"})
     with pytest.raises(AssertionError, match="refuses no model with loads: take loads out"):
         contract_of(("loads",), "a_declared_gap_is_real", "loads")
 
