@@ -58,7 +58,7 @@ def contract_of(monkeypatch):
         monkeypatch.setattr(
             contract.worker, "call_adapter", lambda _, method, *a: getattr(engine, method)(*a)
         )
-        monkeypatch.setattr(worker, "adapter_attribute", lambda _, name: getattr(engine, name))
+        monkeypatch.setattr(contract.worker, "adapter_attribute", lambda _, name: getattr(engine, name))
         contract.declared_gaps.cache_clear()
         getattr(contract, f"test_{test}")(engine.name, *args)
 
