@@ -13,7 +13,7 @@ from rich.table import Table
 
 from plumbline.engines.environments import split_version
 from plumbline.execution.runner import RunResult
-from plumbline.judging.rows import Row, Verdict
+from plumbline.judging.rows import RECORDED_STYLE, Row, Verdict
 
 
 def make_console(file: Any) -> Console:
@@ -107,6 +107,7 @@ class ProgressDisplay:
 VERDICT_COLOURS = {
     Verdict.AGREES: "green", Verdict.DISAGREES: "red bold", Verdict.UNRESOLVED: "yellow",
     Verdict.UNSUPPORTED: "dim", Verdict.NOT_INSTALLED: "dim", Verdict.FAILED: "red bold",
+    Verdict.HARNESS_FAILED: "magenta bold",
 }  # fmt: skip
 MAX_COMPLETE_TABLE = 60  # scenarios; of more, those where everything agrees are left out of the table
 
@@ -119,6 +120,9 @@ def print_result(result: RunResult) -> None:
 
     """
     out = make_console(sys.stdout)
+    in_doubt = {row.reason: None for row in result.rows if row.verdict == Verdict.HARNESS_FAILED}
+    for reason in in_doubt:
+        out.print(f"[magenta bold]{Verdict.HARNESS_FAILED.style.glyph} the harness failed:[/] {escape(reason)}")
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("scenario")
     for name, info in result.engines.items():
@@ -136,22 +140,22 @@ def print_result(result: RunResult) -> None:
     out.print(
         "[dim]each cell: worst verdict, agreeing rows / all rows, error over tolerance of the worst row; "
         + "  ".join(f"{verdict.style.glyph} {verdict}" for verdict in Verdict)
-        + "[/]"
+        + f"  {RECORDED_STYLE.glyph} {RECORDED_STYLE.plural}[/]"
     )
     for row in result.rows:
-        if row.verdict != Verdict.AGREES and row.known_issue is None:
+        if row.verdict not in (Verdict.AGREES, Verdict.HARNESS_FAILED) and row.known_issue is None:
             out.print(f"{_coloured_glyph(row)} {escape(row.key)}: {escape(row.reason)}")
     for entry in result.stale_issues:
         out.print(
-            f"[red]![/] known entry {escape(entry.id)} no longer occurs: remove it from known_issues.yaml"
+            f"[red]![/] known entry {escape(entry.id)} no longer occurs: remove it from its file"
         )
     out.print(f"[bold]{escape(result.metadata['sentence'])}[/]")
 
 
 def _coloured_glyph(row: Row) -> str:
-    """Return the verdict's glyph as rich markup, dimmed where a known issue expects the verdict."""
+    """Return the row's glyph as rich markup, dimmed where a known issue expects the verdict."""
     colour = "dim" if row.known_issue else VERDICT_COLOURS[row.verdict]
-    return f"[{colour}]{row.verdict.style.glyph}[/]"
+    return f"[{colour}]{row.style.glyph}[/]"
 
 
 def engine_heading(name: str, version: str) -> str:

@@ -55,6 +55,7 @@ class EngineInfo:
     integrators: tuple[Integrator, ...]
     missing: str | None = None
     python: str = ""
+    has_failed: bool = False  # the engine is missing for another reason than that it is not installed
 
 
 class Adapter(ABC):

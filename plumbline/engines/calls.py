@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from importlib import metadata
 
 from plumbline.engines.adapter import EngineInfo
-from plumbline.engines.environments import declared_attribute
+from plumbline.engines.environments import BASE_REQUIREMENTS, declared_attribute
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import (
     Array,
@@ -24,6 +24,10 @@ from plumbline.model.datatypes import (
     Trajectory,
     Unsupported,
 )
+
+
+# What every environment has: where one of these is missing, the checkout or the environment is broken.
+_OWN_PACKAGES = {"plumbline", "adapters", "reference_impl", *BASE_REQUIREMENTS, ""}
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,10 +68,15 @@ def describe_engine(engine: str) -> EngineInfo:
         Its description; ``missing`` holds a sentence where the engine is not installed here, or in a
         version that the adapter cannot use.
 
+    Raises:
+        ImportError: another module than the engine's is missing, or the engine is installed but broken.
+
     """
     try:
         return load_adapter(engine).describe()
-    except ImportError as error:
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] in _OWN_PACKAGES:
+            raise
         return EngineInfo(engine, engine, "", (), f"{engine} is not installed here: {error}")
     except AttributeError as error:  # an interface that this version does not have
         version = metadata.version(declared_attribute(engine, "package"))

@@ -16,6 +16,7 @@ from typing import Any
 
 from plumbline.engines import calls, environments
 from plumbline.engines.adapter import EngineInfo
+from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import Plan, ProgressCallback, TaskKey, TaskKind, task_keys
 from plumbline.execution.random_batch import RandomBatch
 from plumbline.execution.scenario_run import ScenarioRun
@@ -44,15 +45,19 @@ class RunResult:
     metadata: dict[str, Any]  # the entry ``run`` of results.json
 
 
-def describe_engines(executor: Executor, engines: Sequence[str]) -> dict[str, EngineInfo]:
+def describe_engines(
+    executor: Executor, engines: Sequence[str], *, are_required: bool = False
+) -> dict[str, EngineInfo]:
     """Ask every engine for its description, in the version that its name demands.
 
     Args:
         executor: makes the calls.
         engines: names, as ``mujoco`` or ``mujoco@3.12.0``.
+        are_required: whether an engine that is not installed has failed, since the user named it.
 
     Returns:
-        Description by name; an engine that crashes when it is imported is described as missing.
+        Description by name; an engine that raises, crashes or hangs when it is imported, and a version whose
+        environment cannot be made, is described as missing and failed.
 
     """
     found: dict[str, EngineInfo] = {}
@@ -62,14 +67,18 @@ def describe_engines(executor: Executor, engines: Sequence[str]) -> dict[str, En
         try:
             python = environments.ensure_interpreter(name) if version else ""
         except environments.EnvironmentUnavailable as error:
-            found[name] = EngineInfo(name, name, "", (), str(error))
+            found[name] = EngineInfo(name, name, "", (), str(error), has_failed=True)
             continue
         key = TaskKey(TaskKind.DESCRIPTION, engine=name)
         tasks.append(Task(key, calls.describe_engine, (base,), executor.limits, python=python))
     pythons = {task.key: task.python for task in tasks}
     for outcome in executor.run(tasks):
         name, python = outcome.key.engine, pythons[outcome.key]
-        info = outcome.value or EngineInfo(name, name, "", (), outcome.failure)
+        info = outcome.value or EngineInfo(
+            name, name, "", (), f"cannot be loaded: {outcome.failure}", has_failed=True
+        )
+        if are_required and info.missing is not None and not info.version and not info.has_failed:
+            info = replace(info, missing=f"{info.missing} (it was named explicitly)", has_failed=True)
         if python:
             title = info.title if info.missing else f"{info.title} {info.version}"
             info = replace(info, name=name, title=title, python=python)
@@ -109,7 +118,7 @@ def run_plan(plan: Plan, progress: ProgressCallback) -> RunResult:
         "level": plan.level,
         "states": plan.random_state_count + 1,
         "sentence": summarize_verdicts(result),
-        "exit_code": exit_code(result),
+        "exit_code": int(exit_code(result)),
         "stale_issues": [issue.id for issue in result.stale_issues],
     }
     if len(plan.random_scenarios):
@@ -125,7 +134,7 @@ class _Run:
         self.cpu_times = CpuTimes()
         self.truth_methods: Counter[str] = Counter()
         self.engines: dict[str, EngineInfo] = {}
-        self.known = known_issues.KnownIssues(known_issues.load_known_issues(), plan.extra_refinements > 0)
+        self.known = known_issues.KnownIssues(plan.known_issues, plan.extra_refinements > 0)
         self.tables = results_store.ResultTables()
         self.random_batch = RandomBatch()
         self.rows: dict[str, list[Row]] = {s.name: [] for s in plan.scenarios}
@@ -134,7 +143,7 @@ class _Run:
 
     def execute(self, executor: Executor, progress: ProgressCallback) -> None:
         plan = self.plan
-        self.engines = describe_engines(executor, plan.engines)
+        self.engines = describe_engines(executor, plan.engines, are_required=plan.are_engines_required)
         has_long_runs = plan.long_run_seconds > 0
         total = len(plan.scenarios) * sum(1 for _ in task_keys("", self.engines, plan.level, has_long_runs))
         total += len(plan.random_scenarios) * sum(1 for _ in task_keys("", self.engines, "state"))
@@ -167,7 +176,7 @@ class _Run:
     def _finish(self, scenario_run: ScenarioRun) -> None:
         """Keep the rows and tables of a scenario whose tasks have all finished."""
         found, name = scenario_run.findings(), scenario_run.scenario.name
-        rows = self.known.mark_known(found.rows)
+        rows = self.known.mark_known(found.rows, scenario_run.scenario.model.n)
         self.truth_methods.update(scenario_run.truth_methods())
         self.tables.add_rows(rows)
         if name not in self.rows:  # a random scenario
@@ -243,7 +252,7 @@ def summarize_verdicts(result: RunResult) -> str:
         aliases = sum(row.alias_of is not None for row in rows)
         if verdict == Verdict.AGREES and aliases:
             part += f" ({aliases} by an alias of another integrator)"
-        if verdict in (Verdict.DISAGREES, Verdict.FAILED) and new:
+        if verdict in (Verdict.DISAGREES, Verdict.FAILED, Verdict.HARNESS_FAILED) and new:
             named = list(dict.fromkeys(f"{row.engine}, {row.scenario}: {row.quantity}" for row in new))
             more = f" and {len(named) - 3} more" if len(named) > 3 else ""
             part += f" ({'; '.join(named[:3])}{more})"
@@ -261,20 +270,39 @@ def summarize_verdicts(result: RunResult) -> str:
     return text
 
 
-def exit_code(result: RunResult) -> int:
+def exit_code(result: RunResult) -> ExitCode:
     """Return the exit code of a run.
 
     Args:
         result: the run.
 
     Returns:
-        3 where an engine failed unexpectedly; 1 for other unexpected verdicts or a stale known issue; else 0.
+        5 where the truth is in doubt or missing; else 3 where an engine failed unexpectedly; else 1 for other
+        unexpected verdicts, a stale known issue, or where nothing was compared; else 0.
 
     """
     new = {row.verdict for row in result.rows if row.known_issue is None}
+    if Verdict.HARNESS_FAILED in new:
+        return ExitCode.HARNESS_FAILED
     if Verdict.FAILED in new:
-        return 3
-    return 1 if new - {Verdict.AGREES, Verdict.NOT_INSTALLED} or result.stale_issues else 0
+        return ExitCode.ENGINE_FAILED
+    is_good = not new - {Verdict.AGREES, Verdict.NOT_INSTALLED} and not result.stale_issues
+    return ExitCode.SUCCESS if is_good and has_comparison(result) else ExitCode.DISAGREEMENT
+
+
+def has_comparison(result: RunResult) -> bool:
+    """Find out whether a run compared anything.
+
+    Args:
+        result: the run.
+
+    Returns:
+        Whether a row agrees, disagrees or is unresolved.
+
+    """
+    compared = {Verdict.AGREES, Verdict.DISAGREES, Verdict.UNRESOLVED}
+    found = {row.verdict for row in result.rows} | set(result.random_batch.counts_by_verdict)
+    return not compared.isdisjoint(found)
 
 
 def git_commit() -> str | None:

@@ -130,6 +130,7 @@ class ScenarioRun:
         for name, info in self._engines.items():
             if info.missing is not None:
                 verdict = Verdict.UNSUPPORTED if info.version else Verdict.NOT_INSTALLED
+                verdict = Verdict.FAILED if info.has_failed else verdict
                 found.rows.append(self._context(name).make_row("state", "-", "all", verdict, info.missing))
             for key in self._keys:
                 if key.engine == name and key in self._findings:
@@ -256,10 +257,17 @@ class ScenarioRun:
         key: TaskKey = outcome.key
         context = self._context(key.engine)
         truth = self.truths.get(key.needed_truth) if key.needed_truth else None
-        if outcome.failure or isinstance(truth, TruthFailure):
-            lost = outcome.failure or f"no truth to judge by: {getattr(truth, 'reason', '')}"
+        doubt = ""
+        if isinstance(truth, TruthFailure):
+            doubt = f"{self.scenario.name} has no truth to judge by: {truth.reason}"
+        elif isinstance(truth, MotionTruth) and truth.conflict:
+            doubt = f"{self.scenario.name}: {truth.conflict}"
+        if outcome.failure or doubt:
+            verdict, lost = (
+                (Verdict.HARNESS_FAILED, doubt) if doubt else (Verdict.FAILED, outcome.failure or "")
+            )
             quantity = "all_long" if key.kind == TaskKind.LONG_RUN else "all"
-            row = context.make_row(_LEVELS[key.kind], key.integrator or "-", quantity, Verdict.FAILED, lost)
+            row = context.make_row(_LEVELS[key.kind], key.integrator or "-", quantity, verdict, lost)
             return JudgingResult(rows=[row])
         if outcome.judge_result is not None:
             found: JudgingResult = outcome.judge_result

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -95,4 +96,10 @@ def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples:
         reason = f"{name} {drift[at]:.2g} {unit}: {at_zero} does not decide"
         return row(Verdict.UNRESOLVED, reason, at, allowed, derivation, ratio, **extra)
 
-    return first_decided(judge_window(number) for number in study.window_lengths(float(times[-1])))
+    found = first_decided(judge_window(number) for number in study.window_lengths(float(times[-1])))
+    duration, last_sample = float(times[-1]), int(np.searchsorted(times, found.compared_until or 0.0))
+    verdict, reason = found.verdict, found.reason
+    if verdict != Verdict.UNRESOLVED and study.is_too_short(last_sample, duration):
+        verdict, reason = Verdict.UNRESOLVED, f"too short a time to decide: {reason}"
+    reason += study.coverage_remark(last_sample, duration, duration)
+    return replace(found, verdict=verdict, reason=reason)

@@ -1,62 +1,86 @@
-"""Known discrepancies and expected gaps: the only file that may excuse a verdict.
+"""Known discrepancies and expected gaps: the only files that may excuse a verdict.
 
 Each entry of known_issues.yaml has scenario, engine, version range, level, integrator, quantity (patterns
 with *; scenario, integrator and quantity may be lists), the expected verdict, its evidence and its reason.
+An expected disagreement also has the largest ratio of error and tolerance that it covers, and a mechanism,
+which is checked where the run has the rows for it: what exceeds the entry is a new disagreement.
 An entry that matches cells of the run but none of their verdicts is stale and fails the run.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
+from itertools import product
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 from packaging.specifiers import InvalidSpecifier, SpecifierSet
 from packaging.version import InvalidVersion, Version
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, field_validator, model_validator
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PositiveFloat,
+    PositiveInt,
+    TypeAdapter,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
-from plumbline.judging.rows import Row
+from plumbline.engines.declared_names import declared_integrators, declared_texts
+from plumbline.engines.registry import ENGINES
+from plumbline.judging.rows import Level, Row
+from plumbline.judging.run_relations import REVERSED_IN_TIME
+from plumbline.judging.state import STATE_UNITS
+from plumbline.judging.state_relations import STATE_RELATIONS, WELDED_HALVES
+from plumbline.model.invariants import INVARIANT_UNITS
+from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean, shorten
+from plumbline.scenario.generator import RANDOM_FAMILY
+from plumbline.scenario.loader import catalogue
+from plumbline.scenario.schema import invalid_value_error
+from plumbline.scenario.validation_messages import problems_from_validation
+from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path, read_yaml
 
 RowKind = tuple[str, str, str, str, str]  # of a row: engine, its version, level, integrator, quantity
 KNOWN_ISSUES_FILE = Path(__file__).with_name("known_issues.yaml")
+LEVELS: tuple[Level, ...] = ("state", "invariants", "trajectory", "relations")
+ANY_LENGTH = 10**9  # bodies
+
+# Relations that give the same problem to the same algorithm in other numbers: only rounding tells them apart.
+SCATTER_RELATIONS = ("rotated world", "re-chosen body frame")
+MIN_SCATTER = 0.05  # of the error's ratio: the least scatter that shows rounding; measured 0.12 … 0.6
+Mechanism = Literal["rounding", "equations", "method"]
+MECHANISMS: dict[Mechanism, str] = {
+    "rounding": "the result loses digits: results for equivalent descriptions of the problem scatter as much",
+    "equations": "the engine solves other equations: the error is the same for equivalent descriptions",
+    "method": "the integrator is another one than declared: its accelerations at given states are right",
+}
 
 
-class KnownIssue(BaseModel):
+@dataclass(frozen=True)
+class KnownIssue:
     """One expected verdict that is not "agrees"."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     id: str
     scenario: str
     engine: str
+    verdict: str
+    evidence: str  # a measurement, a script, a document
+    reason: str  # the cause
     versions: str = ""  # PEP 440 range; empty: any
     level: str = "*"
     integrator: str = "*"
     quantity: str = "*"
-    verdict: Literal["disagrees", "unresolved", "unsupported", "failed"]
-    intermittent: bool = False  # only in some of the random scenarios
+    max_ratio: Mapping[int, float] = field(default_factory=dict)  # by the number of bodies up to which it holds
+    mechanism: Mechanism | None = None
+    shown_by: str = ""  # the engine whose rows show the mechanism; empty: the row's own
+    intermittent: str = ""  # why the verdict may or may not occur; empty: it must
     extra_refinements_only: bool = False  # only with the additional smaller steps of the nightly
-    evidence: str  # a measurement, a script, a document
-    reason: str  # the cause
-
-    @field_validator("versions")
-    @classmethod
-    def _check_version_range(cls, text: str) -> str:
-        try:
-            SpecifierSet(text)
-        except InvalidSpecifier as error:
-            raise ValueError(f"{error}; a version range is written like '>=1.13,<2'") from None
-        return text
-
-    @model_validator(mode="after")
-    def _check_intermittent(self) -> KnownIssue:
-        if self.intermittent and not self.scenario.startswith("random-"):
-            raise ValueError("`intermittent` is for random scenarios (random-*) only")
-        return self
 
     def matches_kind(self, kind: RowKind) -> bool:
         """Return whether the entry is about rows of this kind, in its scenarios.
@@ -82,40 +106,212 @@ class KnownIssue(BaseModel):
         except InvalidVersion:
             return False
 
+    def covered_ratio(self, bodies: int) -> float:
+        """Return the largest ratio of error and tolerance that the entry covers.
 
-def load_known_issues(path: Path = KNOWN_ISSUES_FILE) -> list[KnownIssue]:
+        Args:
+            bodies: length of the chain.
+
+        Returns:
+            The ratio; 0 for a longer chain than any of the entry, infinity where the entry states none.
+
+        """
+        fitting = [limit for limit in self.max_ratio if bodies <= limit]
+        return self.max_ratio[min(fitting)] if fitting else 0.0 if self.max_ratio else math.inf
+
+    def objection(self, row: Row, bodies: int, scatter: Mapping[str, float]) -> str:
+        """Find out whether a row of the expected verdict exceeds what the entry describes.
+
+        Args:
+            row: a row that the entry's patterns and verdict match.
+            bodies: length of the scenario's chain.
+            scatter: by engine the largest ratio of its `SCATTER_RELATIONS` in this scenario and version.
+
+        Returns:
+            Why the entry does not cover the row; empty where it does.
+
+        """
+        ratio, covered = math.inf if row.ratio is None else row.ratio, self.covered_ratio(bodies)
+        if self.max_ratio and not ratio <= covered:
+            return f"the entry {self.id} covers {covered:g} times the tolerance at most"
+        shown = scatter.get(self.shown_by or row.engine.partition("@")[0])
+        if self.mechanism == "rounding" and shown is not None and shown < MIN_SCATTER * ratio:
+            return (
+                f"the entry {self.id} records rounding, but equivalent descriptions of the problem differ by "
+                f"only {shown:.2g} times their tolerance"
+            )
+        if self.mechanism == "equations" and shown is not None and shown > max(1.0, MIN_SCATTER * ratio):
+            return (
+                f"the entry {self.id} records other equations, but equivalent descriptions of the problem "
+                f"differ by {shown:.2g} times their tolerance"
+            )
+        return ""
+
+
+def _as_list(value: Any) -> Any:
+    return value if isinstance(value, list) else [value]
+
+
+def _as_ratios(value: Any) -> Any:
+    return value if isinstance(value, dict) else {ANY_LENGTH: value}
+
+
+_Texts = Annotated[list[str], BeforeValidator(_as_list), Field(min_length=1)]
+
+
+def _field(description: str, default: Any = ...) -> Any:
+    return Field(default, description=description)
+
+
+class _Entry(BaseModel):
+    """An entry as the file has it: lists stand for an issue of each name."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    id: str = _field("A name of the entry, unique in all files.")
+    scenario: _Texts = _field("Name or pattern of scenarios, or a list of them.")
+    engine: str = _field("Name or pattern of engines.")
+    versions: str = _field("A version range, as '>=1.13,<2'.", "")
+    level: str = _field("A level, or *.", "*")
+    integrator: _Texts = _field("Name or pattern of integrators, or a list of them.", ["*"])
+    quantity: _Texts = _field("Name or pattern of quantities, or a list of them.", ["*"])
+    verdict: Literal["disagrees", "unresolved", "unsupported", "failed"] = _field("The expected verdict.")
+    max_ratio: Annotated[dict[PositiveInt, PositiveFloat], BeforeValidator(_as_ratios)] = _field(
+        "The largest ratio of error and tolerance, or a mapping from numbers of bodies to it.", {}
+    )
+    mechanism: Mechanism | None = _field("The mechanism of a disagreement.", None)
+    shown_by: str = _field("The engine whose rows show the mechanism.", "")
+    intermittent: str = _field("Why the verdict may or may not occur.", "")
+    extra_refinements_only: bool = _field("Whether the nightly's smaller steps alone show it.", False)
+    evidence: str = _field("A measurement, a script, a document.")
+    reason: str = _field("The cause.")
+
+    @field_validator("id")
+    @classmethod
+    def _check_id(cls, text: str) -> str:
+        if not text or not text.isprintable():
+            raise invalid_value_error(f"is {shorten(repr(text))}", "one line of printable text")
+        return text
+
+    @field_validator("versions")
+    @classmethod
+    def _check_version_range(cls, text: str) -> str:
+        try:
+            SpecifierSet(text)
+        except InvalidSpecifier:
+            raise invalid_value_error(
+                f"is {shorten(repr(text))}", "a version range, written like '>=1.13,<2'"
+            ) from None
+        return text
+
+    @model_validator(mode="after")
+    def _check_disagreement(self) -> _Entry:
+        missing = [name for name in ("max_ratio", "mechanism") if not getattr(self, name)]
+        if self.verdict == "disagrees" and missing:
+            raise invalid_value_error(
+                f"expects a disagreement without {' and '.join(missing)}",
+                "max_ratio: the largest error over tolerance, and mechanism: " + ", ".join(MECHANISMS),
+            )
+        may_vary = (
+            self.verdict == "unresolved"
+            or self.mechanism == "rounding"
+            or all(name.startswith(f"{RANDOM_FAMILY}-") for name in self.scenario)
+        )
+        if self.intermittent and not may_vary:
+            raise invalid_value_error(
+                "is intermittent",
+                "`intermittent` for the verdict unresolved, the mechanism rounding, or random scenarios "
+                f"({RANDOM_FAMILY}-*)",
+            )
+        return self
+
+    def issues(self) -> Iterator[KnownIssue]:
+        """Make an issue of each name of the lists, with its own id: each must occur."""
+        lists = {name: getattr(self, name) for name in ("scenario", "integrator", "quantity")}
+        for names in product(*lists.values()):
+            told = [name for name, given in zip(names, lists.values(), strict=True) if len(given) > 1]
+            chosen = dict(zip(lists, names, strict=True))
+            yield KnownIssue(**{**self.__dict__, **chosen, "id": ": ".join([self.id, *told])})
+
+
+def load_known_issues(
+    path: Path = KNOWN_ISSUES_FILE, other_scenarios: Iterable[str] = ()
+) -> list[KnownIssue]:
     """Read a file of known issues.
 
     Args:
         path: the file.
+        other_scenarios: names of scenarios that entries may be about, besides the catalogue, the random ones
+            and the files beside ``path``.
 
     Returns:
         One entry for each scenario, integrator and quantity of the file's lists.
 
     Raises:
-        ValueError: the file is not valid; the message names file and entry.
+        ScenarioError: the file is not valid; its problems have file, line and column.
 
     """
     try:
-        raw = YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
-        entries = TypeAdapter(list[KnownIssue]).validate_python(
-            [entry for item in raw or [] for entry in _expand_lists(item)]
-        )
-    except (OSError, YAMLError, ValidationError) as error:
-        raise ValueError(f"{path}: {error}") from None
-    twice = [e.id for i, e in enumerate(entries) if any(e.id == other.id for other in entries[:i])]
-    if twice:
-        raise ValueError(f"{path}: ids used twice: {', '.join(twice)}")
-    return entries
+        source = read_yaml(path)
+    except ScenarioError as error:
+        if [problem.message for problem in error.problems] == ["is empty"]:
+            return []
+        raise
+    if not isinstance(source.data, list):
+        raise source.fatal_error("is not a list", "a list of entries, each as `- id: …`", (1, 1))
+    try:
+        entries = TypeAdapter(list[_Entry]).validate_python(source.data)
+    except ValidationError as error:
+        problems = problems_from_validation(source, error.errors(), _Entry)
+        raise ScenarioError([*source.problems, *problems]) from None
+    beside = (file.stem for file in path.parent.glob("*.yaml")) if path != KNOWN_ISSUES_FILE else ()
+    problems = [*source.problems, *_name_problems(source, entries, {*other_scenarios, *beside})]
+    if problems:
+        raise ScenarioError(problems)
+    return [issue for entry in entries for issue in entry.issues()]
 
 
-def _expand_lists(item: object) -> list[object]:
-    """One entry for each scenario, integrator or quantity of a list, with its own id: each must occur."""
-    for field in ("scenario", "integrator", "quantity"):
-        if isinstance(item, dict) and isinstance(item.get(field), list):
-            each = [{**item, field: name, "id": f"{item.get('id')}: {name}"} for name in item[field]]
-            return [one for entry in each for one in _expand_lists(entry)]
-    return [item]
+def _name_problems(source: YamlSource, entries: Sequence[_Entry], others: set[str]) -> Iterator[Problem]:
+    """Problems of names that nothing has, and of ids that are used twice."""
+    seen: set[str] = set()
+    known: dict[str, set[str]] = {
+        "scenario": {*catalogue(), *others, f"{RANDOM_FAMILY}-1-1"},
+        "engine": set(ENGINES),
+        "shown_by": set(ENGINES),
+        "level": set(map(str, LEVELS)),
+        "integrator": {"-", *declared_integrators()},
+        "quantity": _quantities(),
+    }
+    for number, entry in enumerate(entries):
+        if entry.id in seen:
+            message = f"the id {shorten(repr(entry.id))} is used twice"
+            yield _problem(source, (number, "id"), message, "an id of its own")
+        seen.add(entry.id)
+        for name, words in known.items():
+            given = getattr(entry, name)
+            for place, pattern in enumerate(given if isinstance(given, list) else [given]):
+                if pattern and not any(fnmatchcase(word, pattern) for word in words):
+                    path: tuple[PathKey, ...] = (number, name)
+                    if (*path, place) in source.value_positions:
+                        path = (*path, place)
+                    hint = did_you_mean(pattern, sorted(words)) or f"`list` and the docs have every {name}"
+                    yield _problem(source, path, f"no {name} matches {shorten(repr(pattern))}", hint=hint)
+
+
+def _problem(
+    source: YamlSource, path: tuple[PathKey, ...], message: str, valid: str = "", hint: str = ""
+) -> Problem:
+    place = source.value_positions.get(path) or source.value_positions[path[:1]]
+    return Problem(source.file, *place, dotted_path(path), message, valid, hint)
+
+
+def _quantities() -> set[str]:
+    """Every quantity that a row may have."""
+    trajectory = ("order", "position", "position_limit", "attitude", "attitude_limit")
+    long_runs = ("all_long", "energy_drift_long_growth", *(f"{name}_long" for name in INVARIANT_UNITS))
+    relations = (*(r.name for r in STATE_RELATIONS), WELDED_HALVES, REVERSED_IN_TIME)
+    others = *(f"as {name}" for name in ENGINES), *(f"by {text}" for text in declared_texts())
+    return {"all", *STATE_UNITS, *trajectory, *INVARIANT_UNITS, *long_runs, *relations, *others}
 
 
 class KnownIssues:
@@ -125,7 +321,7 @@ class KnownIssues:
         """Select the entries.
 
         Args:
-            entries: all entries of the file.
+            entries: all entries of the files.
             has_extra_refinements: whether the run takes smaller steps than usual.
 
         """
@@ -150,25 +346,39 @@ class KnownIssues:
             self._by_kind[kind] = [e for e in self.issues if e.matches_kind(kind)]
         return [e for e in self._by_kind[kind] if fnmatchcase(row.scenario, e.scenario)]
 
-    def mark_known(self, rows: Iterable[Row]) -> list[Row]:
+    def mark_known(self, rows: Sequence[Row], bodies: int) -> list[Row]:
         """Mark the rows whose verdict an entry expects.
 
+        A row that is larger than its entry covers, or whose mechanism is another one, stays unmarked; its
+        reason then says so.
+
         Args:
-            rows: judged rows.
+            rows: all judged rows of one scenario.
+            bodies: length of its chain.
 
         Returns:
             The rows in the same order, with the entry's id as ``known_issue``.
 
         """
-        marked = []
+        scatter: dict[str, dict[str, float]] = {}  # by version of the engine, then by engine
         for row in rows:
-            entries = self.issues_for(row)
-            self.matched_ids.update(e.id for e in entries)
-            match = next((e for e in entries if e.verdict == row.verdict), None)
-            if match:
-                self.used_ids.add(match.id)
-            marked.append(replace(row, known_issue=match.id) if match else row)
-        return marked
+            if row.level == "relations" and row.quantity in SCATTER_RELATIONS and row.ratio is not None:
+                of = scatter.setdefault(row.engine_version, {})
+                engine = row.engine.partition("@")[0]
+                of[engine] = max(row.ratio, of.get(engine, 0.0))
+        return [self._mark(row, bodies, scatter.get(row.engine_version, {})) for row in rows]
+
+    def _mark(self, row: Row, bodies: int, scatter: Mapping[str, float]) -> Row:
+        entries = self.issues_for(row)
+        self.matched_ids.update(e.id for e in entries)
+        expecting = [e for e in entries if e.verdict == row.verdict]
+        self.used_ids.update(e.id for e in expecting[:1])
+        objections = [e.objection(row, bodies, scatter) for e in expecting]
+        if "" in objections:
+            match = expecting[objections.index("")]
+            self.used_ids.add(match.id)
+            return replace(row, known_issue=match.id)
+        return replace(row, reason=f"{row.reason}; {objections[0]}") if objections else row
 
     def stale_issues(self, *, is_full_matrix: bool) -> list[KnownIssue]:
         """Find the entries that match rows of the run and none of their verdicts.

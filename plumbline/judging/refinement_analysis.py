@@ -121,6 +121,37 @@ class RefinementAnalysis:
         numbers = [int(np.searchsorted(self.times, e, side="right")) for e in ends]
         return [number for number in dict.fromkeys(numbers) if number >= 3] or [min(3, len(self.times))]
 
+    def coverage_remark(self, at: int, duration: float, wanted: float) -> str:
+        """Describe a comparison that covers less time than the scenario asks for.
+
+        Args:
+            at: index of the last sample that was compared.
+            duration: of the scenario [s].
+            wanted: how much of it can be compared at best [s].
+
+        Returns:
+            Words that follow a reason; empty where everything was compared.
+
+        """
+        if self.times[at] >= duration * (1 - 1e-12):
+            return ""
+        until = f"; covers {self.times[at]:g} s of the scenario's {duration:g} s"
+        return until if wanted >= duration * (1 - 1e-12) else f"{until}, which can be predicted for {wanted:g} s"
+
+    def is_too_short(self, at: int, wanted: float) -> bool:
+        """Whether a comparison up to a sample covers less than half of the wanted time.
+
+        Args:
+            at: index of the last sample that was compared.
+            wanted: how much can be compared at best [s].
+
+        Returns:
+            Whether the next sample, too, is before half of ``wanted``: windows end at whole samples.
+
+        """
+        following = self.times[min(at + 1, len(self.times) - 1)]
+        return bool(following <= wanted / 2 * (1 + 1e-12) and self.times[at] < wanted / 2 * (1 - 1e-12))
+
     def _samples(self, run: RefinementRun, name: str) -> Array:
         """(T, N, width) of one field, NaN where the run failed; quaternions have the finest run's signs."""
         fine: Array = getattr(self.finest, name)

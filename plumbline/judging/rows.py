@@ -21,6 +21,7 @@ class Verdict(StrEnum):
     UNSUPPORTED = "unsupported"
     NOT_INSTALLED = "not installed"
     FAILED = "failed"
+    HARNESS_FAILED = "harness failed"
 
     @property
     def style(self) -> VerdictStyle:
@@ -34,11 +35,14 @@ class VerdictStyle(NamedTuple):
     glyph: str
     plural: str  # the word after a count: "3 disagree"
     meaning: str  # short, for legends
-    severity: int  # 9 (worst) … 1, where no known issue expects the verdict; from 6 on it needs attention
+    severity: int  # 10 (worst) … 1, where no known issue expects the verdict; from 6 on it needs attention
     known_severity: int  # the same where a known issue expects the verdict
 
 
 VERDICT_STYLES = {
+    Verdict.HARNESS_FAILED: VerdictStyle(
+        "☒", "without a truth", "the truth is in doubt or missing: nothing is said of the engine", 10, 10
+    ),
     Verdict.DISAGREES: VerdictStyle("✗", "disagree", "the error is above its derived tolerance", 8, 5),
     Verdict.FAILED: VerdictStyle(
         "!", "failed", "raised, crashed, timed out, ran out of memory or was not finite", 9, 5
@@ -48,7 +52,26 @@ VERDICT_STYLES = {
     Verdict.NOT_INSTALLED: VerdictStyle("∅", "not installed", "the engine is not on this machine", 1, 1),
     Verdict.AGREES: VerdictStyle("✓", "agree", "the error is within its derived tolerance", 4, 4),
 }
+RECORDED_STYLE = VerdictStyle(  # of a disagreement or failure that a known issue expects
+    "≠", "recorded", "a disagreement or failure that known_issues.yaml records", 5, 5
+)
 ATTENTION_SEVERITY = 6  # from here on a verdict needs attention
+
+
+def verdict_style(verdict: str, known_issue: str | None) -> VerdictStyle:
+    """Return how a row is shown: a recorded disagreement has a style of its own.
+
+    Args:
+        verdict: a value of `Verdict`.
+        known_issue: id of the entry of known_issues.yaml that expects the verdict, or None.
+
+    Returns:
+        The style; that of the verdict where nothing is recorded, or only a gap is.
+
+    """
+    if known_issue and verdict in (Verdict.DISAGREES, Verdict.FAILED):
+        return RECORDED_STYLE
+    return VERDICT_STYLES[Verdict(verdict)]
 
 
 def severity(verdict: str, known_issue: str | None) -> int:
@@ -61,7 +84,7 @@ def severity(verdict: str, known_issue: str | None) -> int:
         known_issue: id of the entry of known_issues.yaml that expects the verdict, or None.
 
     Returns:
-        9 (failed, unexpected) … 1 (not installed); from `ATTENTION_SEVERITY` on nothing expects it.
+        10 (the harness failed) … 1 (not installed); from `ATTENTION_SEVERITY` on nothing expects it.
 
     """
     style = VERDICT_STYLES[Verdict(verdict)]
@@ -132,6 +155,11 @@ class Row:
     def key(self) -> str:
         """The row's identity across runs."""
         return "/".join((self.scenario, self.engine, self.level, self.integrator, self.quantity))
+
+    @property
+    def style(self) -> VerdictStyle:
+        """How the row is shown."""
+        return verdict_style(self.verdict, self.known_issue)
 
     @property
     def rank(self) -> tuple[int, float]:

@@ -246,7 +246,13 @@ def _judge_windows(
             reason = f"{name} limit {off[at]:.2g} {unit} off {until}, but no order is observed"
         return _WindowVerdict(Verdict.UNRESOLVED, reason, at)
 
-    return first_decided(judge_window(number - 1) for number in study.window_lengths(study.horizon))
+    found = first_decided(judge_window(number - 1) for number in study.window_lengths(study.horizon))
+    wanted = study.truth.wanted_time
+    remark = study.coverage_remark(found.last_sample, float(study.times[-1]), wanted)
+    verdict, reason = found.verdict, found.reason
+    if verdict != Verdict.UNRESOLVED and study.is_too_short(found.last_sample, wanted):
+        verdict, reason = Verdict.UNRESOLVED, f"too short a time to decide: {reason}"
+    return _WindowVerdict(verdict, reason + remark, found.last_sample)
 
 
 def _convergence_columns(study: RefinementAnalysis) -> Columns:

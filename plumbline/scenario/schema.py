@@ -44,7 +44,7 @@ ClosedForm = Literal[
 ]
 
 
-def _invalid_value_error(message: str, valid: str, default_conflicts_with: str = "") -> PydanticCustomError:
+def invalid_value_error(message: str, valid: str, default_conflicts_with: str = "") -> PydanticCustomError:
     """Make the validation error of a value.
 
     Args:
@@ -64,7 +64,7 @@ def _require_printable(value: str | None) -> str | None:
     """Refuse control characters and code points that XML cannot hold; line breaks and tabs may stay."""
     for char in value or "":
         if unicodedata.category(char) in ("Cc", "Cs", "Cn") and char not in "\n\t":
-            raise _invalid_value_error(f"has the character U+{ord(char):04X}", "printable text")
+            raise invalid_value_error(f"has the character U+{ord(char):04X}", "printable text")
     return value
 
 
@@ -86,7 +86,7 @@ def unit_vector(values: list[float]) -> Array:
 def _require_nonzero(values: list[float] | None) -> list[float] | None:
     """Refuse the zero vector: it has no direction."""
     if values is not None and not any(values):
-        raise _invalid_value_error("is all zeros, which has no direction", "at least one number other than 0")
+        raise invalid_value_error("is all zeros, which has no direction", "at least one number other than 0")
     return values
 
 
@@ -109,7 +109,7 @@ class SchemaModel(BaseModel):
         if self.alternatives and len(given) != 1:
             names = ", ".join(self.alternatives)
             what = "gives " + " and ".join(given) if given else f"gives none of {names}"
-            raise _invalid_value_error(what, f"exactly one of {names}")
+            raise invalid_value_error(what, f"exactly one of {names}")
         return self
 
 
@@ -198,14 +198,14 @@ class Inertia(SchemaModel):
         if value:
             matrix = _matrix_of(value)
             if np.any(np.abs(matrix - matrix.T) > INPUT_ROUNDING * np.max(np.abs(matrix))):
-                raise _invalid_value_error("is not symmetric", "a matrix that equals its transpose")
+                raise invalid_value_error("is not symmetric", "a matrix that equals its transpose")
             _require_physical_inertia((matrix + matrix.T) / 2)
         return value
 
     @model_validator(mode="after")
     def _check_axes(self) -> Inertia:
         if self.axes is not None and self.principal is None:
-            raise _invalid_value_error("gives axes without principal", "axes beside principal only")
+            raise invalid_value_error("gives axes without principal", "axes beside principal only")
         return self
 
 
@@ -225,11 +225,11 @@ def _require_physical_inertia(matrix: Array) -> None:
     values = np.linalg.eigvalsh(matrix)
     shown = ", ".join(f"{value:.6g}" for value in values)
     if values[0] <= INPUT_ROUNDING * values[2]:
-        raise _invalid_value_error(
+        raise invalid_value_error(
             f"has the principal moments {shown}, not all positive", "three positive principal moments"
         )
     if values[0] + values[1] < values[2] * (1 - INPUT_ROUNDING):
-        raise _invalid_value_error(
+        raise invalid_value_error(
             f"is not a physical inertia: its principal moments {shown} violate the triangle inequality",
             "principal moments of which none exceeds the sum of the other two",
         )
@@ -271,9 +271,9 @@ class Rod(SchemaModel):
     def _length(cls, value: float) -> float:
         if value == 0:
             valid = "{kind: ball}, or a length above 0"
-            raise _invalid_value_error("is 0: a rod without length is a ball joint", valid)
+            raise invalid_value_error("is 0: a rod without length is a ball joint", valid)
         if value < 0:
-            raise _invalid_value_error(f"is {value!r}, below 0", "a length above 0")
+            raise invalid_value_error(f"is {value!r}, below 0", "a length above 0")
         return value
 
     _direction = field_validator("direction")(_require_nonzero)
@@ -284,7 +284,7 @@ class Rod(SchemaModel):
         if value and any(value) and "direction" in info.data:
             along = float(unit_vector(value) @ unit_vector(info.data["direction"]))
             if abs(along) > INPUT_ROUNDING:
-                raise _invalid_value_error(
+                raise invalid_value_error(
                     f"has a part along the direction, {along:.3g} of its length",
                     "a rate perpendicular to the direction, or `angular_velocity` instead",
                 )
@@ -293,7 +293,7 @@ class Rod(SchemaModel):
     @model_validator(mode="after")
     def _check_rates(self) -> Rod:
         if self.rate is not None and self.angular_velocity is not None:
-            raise _invalid_value_error("gives rate and angular_velocity", "one of them")
+            raise invalid_value_error("gives rate and angular_velocity", "one of them")
         return self
 
 
@@ -412,7 +412,7 @@ class Document(SchemaModel):
     @classmethod
     def _one_line(cls, value: str | None) -> str | None:
         if value and (value != value.strip() or "\n" in value or "\t" in value):
-            raise _invalid_value_error("has line breaks, tabs, or blanks at its ends", "one line of text")
+            raise invalid_value_error("has line breaks, tabs, or blanks at its ends", "one line of text")
         return value
 
     @field_validator("sample")
@@ -422,10 +422,10 @@ class Document(SchemaModel):
         count = duration / value
         message = f"{duration:g} s are {count:.9g} samples of {value:g} s"
         if count > MAX_SAMPLES:
-            raise _invalid_value_error(message, f"at most {MAX_SAMPLES} samples", "duration")
+            raise invalid_value_error(message, f"at most {MAX_SAMPLES} samples", "duration")
         if abs(count - round(count)) > 1e-9 * count or round(count) < 1:
             valid = "a duration that is a whole number of samples"
-            raise _invalid_value_error(message, valid, "duration")
+            raise invalid_value_error(message, valid, "duration")
         return value
 
 

@@ -19,18 +19,21 @@ KINDS = "kind: ball or kind: rod"
 MAX_NUMBER_LENGTH = 100  # characters; a longer text is not taken for a mistyped number
 
 
-def problems_from_validation(source: YamlSource, errors: Iterable[ErrorDetails]) -> list[Problem]:
+def problems_from_validation(
+    source: YamlSource, errors: Iterable[ErrorDetails], root: type[BaseModel] = Document
+) -> list[Problem]:
     """Make one problem of each validation error; a misspelt field is not reported as missing too.
 
     Args:
         source: the file's positions.
-        errors: pydantic's errors of `plumbline.scenario.schema.Document`.
+        errors: pydantic's errors.
+        root: the model of the file, or of the items of a file that is a list.
 
     Returns:
         The problems, in the order of the errors.
 
     """
-    located = [(error, *_locate_field(source, error["loc"])) for error in errors]
+    located = [(error, *_locate_field(source, error["loc"], root)) for error in errors]
     misspelt = {
         (*path[:-1], closest_match(str(path[-1]), list(model.model_fields)))
         for error, path, model, _ in located
@@ -61,11 +64,11 @@ def _problem_from_error(
 
 
 def _locate_field(
-    source: YamlSource, loc: tuple[PathKey, ...]
+    source: YamlSource, loc: tuple[PathKey, ...], root: type[BaseModel]
 ) -> tuple[tuple[PathKey, ...], type[BaseModel], FieldInfo | None]:
     """Find the path in the file, which has no union tags, the model that the field is in, and the field."""
     path: tuple[PathKey, ...] = ()
-    model: type[BaseModel] = Document
+    model = root
     info: FieldInfo | None = None
     for key in loc:
         if isinstance(key, str) and key in UNION_TAGS and (*path, key) not in source.value_positions:

@@ -24,9 +24,7 @@ from plumbline.truth.sensitivity import perturbation_growth_and_runs, predictabi
 from plumbline.truth.trajectory import MAX_COMPILED_BODIES, ClosedFormSamples, trajectory_truth
 
 RUN_ROUNDING = 1e3 * 2.0**-52  # error of a whole run over its growth G; the largest measured is 115 ε
-TRUTHS_DIFFER = (
-    "; the two methods differ by more than rounding explains: one of them is wrong, or at its limits"
-)
+TRUTHS_DIFFER = "the two truth methods differ by more than rounding explains: one is wrong, or at its limits"
 # an error of this relative size in a parameter must be detectable, or the verdict is "unresolved"
 DETECTABLE_PARAMETER_ERROR = 1e-4
 
@@ -53,12 +51,18 @@ class MotionTruth:
     detectable_attitude: Array  # (T,) rad, the same
     length: float  # m, of the stretched chain: the scale of rounding in positions
     method: str
+    conflict: str = ""  # how the two methods differ by more than rounding explains; empty where they do not
 
     @property
     def horizon(self) -> float:
         """Predictability horizon T_h [s], from the rounding of a run and the truth's uncertainty."""
         rounding = self.length * RUN_ROUNDING
         return predictability_horizon(self.trajectory.t, self.growth, rounding, self.position_uncertainty)
+
+    @property
+    def wanted_time(self) -> float:
+        """How long a run must be compared [s]: the scenario's duration, up to the horizon of rounding alone."""
+        return predictability_horizon(self.trajectory.t, self.growth, self.length * RUN_ROUNDING)
 
 
 def state_truth(model: Model, states: Sequence[State]) -> StateTruth:
@@ -114,9 +118,12 @@ def motion_truth(
     truth = trajectory_truth(model, state, times, closed_form, max_compiled_bodies)
     growth, r, p = perturbation_growth_and_runs(model, state, times, perturbed_models(model, state))
     growth, length = np.maximum.accumulate(growth), float(np.sum(stretched_length(model)))
-    differ = (truth.position_uncertainty > length * RUN_ROUNDING * growth) | (
-        truth.attitude_uncertainty > 2 * RUN_ROUNDING * growth
+    excess = np.maximum(
+        truth.position_uncertainty / (length * RUN_ROUNDING * growth),
+        truth.attitude_uncertainty / (2 * RUN_ROUNDING * growth),
     )
+    # not a number: one of the two is not finite
+    worst, differ = int(np.argmax(excess)), not np.all(excess <= 1)
     return MotionTruth(
         truth.trajectory,
         truth.position_uncertainty,
@@ -124,7 +131,12 @@ def motion_truth(
         growth,
         *detectable_effect(model, r, p),
         length=length,
-        method=truth.method + (TRUTHS_DIFFER if differ.any() else ""),
+        method=truth.method,
+        conflict=f"{TRUTHS_DIFFER}; at t = {times[worst]:g} s they differ by "
+        f"{truth.position_uncertainty[worst]:.2g} m and {truth.attitude_uncertainty[worst]:.2g} rad, "
+        f"{excess[worst]:.2g} times what rounding explains; methods: {truth.method}"
+        if differ
+        else "",
     )
 
 
