@@ -122,7 +122,9 @@ def print_result(result: RunResult) -> None:
     out = make_console(sys.stdout)
     in_doubt = {row.reason: None for row in result.rows if row.verdict == Verdict.HARNESS_FAILED}
     for reason in in_doubt:
-        out.print(f"[magenta bold]{Verdict.HARNESS_FAILED.style.glyph} the harness failed:[/] {escape(reason)}")
+        out.print(
+            f"[magenta bold]{Verdict.HARNESS_FAILED.style.glyph} the harness failed:[/] {escape(reason)}"
+        )
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("scenario")
     for name, info in result.engines.items():
@@ -146,9 +148,7 @@ def print_result(result: RunResult) -> None:
         if row.verdict not in (Verdict.AGREES, Verdict.HARNESS_FAILED) and row.known_issue is None:
             out.print(f"{_coloured_glyph(row)} {escape(row.key)}: {escape(row.reason)}")
     for entry in result.stale_issues:
-        out.print(
-            f"[red]![/] known entry {escape(entry.id)} no longer occurs: remove it from its file"
-        )
+        out.print(f"[red]![/] known entry {escape(entry.id)} no longer occurs: remove it from its file")
     out.print(f"[bold]{escape(result.metadata['sentence'])}[/]")
 
 

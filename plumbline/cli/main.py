@@ -2,6 +2,16 @@
 
 from __future__ import annotations
 
+import errno
+import signal
+import sys
+import tempfile
+import threading
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
 import click
 
 from plumbline import __version__
@@ -10,7 +20,8 @@ from plumbline.cli.result_commands import history, report, reproduce
 from plumbline.cli.run_commands import nightly, run
 from plumbline.cli.scenario_commands import check, list_, schema
 from plumbline.cli.study_commands import drift, sweep
-from plumbline.scenario.errors import did_you_mean
+from plumbline.execution.exit_codes import ExitCode
+from plumbline.scenario.errors import did_you_mean, shorten
 
 START = """
 \b
@@ -44,6 +55,72 @@ class SuggestingGroup(click.Group):
             hint = did_you_mean(args[0], list(self.commands)) or f"there are: {', '.join(self.commands)}"
             raise click.UsageError(f"no command {args[0]!r}; {hint}", ctx)
         return super().resolve_command(ctx, args)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a command; an interruption or an internal error ends with its own exit code and a sentence.
+
+        Args:
+            ctx: the group's context.
+
+        Returns:
+            What the command returns.
+
+        """
+        try:
+            with _termination_as_interrupt():
+                return super().invoke(ctx)
+        except KeyboardInterrupt:
+            resumes = ctx.invoked_subcommand in ("run", "nightly")
+            end = "; finished cells are kept, run the same command to resume" if resumes else ""
+            click.echo(f"\ninterrupted{end}", err=True)
+            sys.exit(ExitCode.INTERRUPTED)
+        except (click.ClickException, click.exceptions.Exit, click.Abort):
+            raise
+        except (OSError, MemoryError) as error:
+            if getattr(error, "errno", None) == errno.EPIPE:
+                raise  # click ends quietly where the reader of a pipe has gone
+            what = "I/O error" if isinstance(error, OSError) else "out of memory"
+            click.echo(f"{what}: {error}", err=True)
+            sys.exit(ExitCode.MACHINE_FAILED)
+        except Exception as error:
+            words = shorten(" ".join(str(error).split()), 200)
+            click.echo(
+                f"internal error: {type(error).__name__}: {words}; the traceback is in {_write_traceback()}",
+                err=True,
+            )
+            sys.exit(ExitCode.HARNESS_FAILED)
+
+
+@contextmanager
+def _termination_as_interrupt() -> Iterator[None]:
+    """Treat SIGTERM and SIGHUP like Ctrl-C, so that workers and temporary folders are removed."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        for name in ("SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)  # Windows has no SIGHUP
+            if number is not None and signal.getsignal(number) == signal.SIG_DFL:  # nohup ignores it
+                before[number] = signal.signal(number, interrupt)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _write_traceback() -> str:
+    """Write the traceback of the current exception to a file; return its path, or the reason without one."""
+    try:
+        with tempfile.NamedTemporaryFile(
+            "w", prefix="plumbline-error-", suffix=".txt", delete=False, encoding="utf-8"
+        ) as file:
+            file.write(traceback.format_exc())
+    except OSError as error:
+        return f"no file: {error.strerror}"
+    return file.name
 
 
 @click.group(

@@ -23,6 +23,7 @@ from plumbline.execution.plan import LevelSelection, Plan, ProgressCallback
 from plumbline.execution.result_cache import DiskResultCache
 from plumbline.execution.runner import RunResult, run_plan, save
 from plumbline.execution.selftest import SelfTestResult
+from plumbline.judging.known_issues import KnownIssue, load_known_issues
 from plumbline.processes.workers import Limits
 from plumbline.reproduce.write import write_scripts
 from plumbline.scenario.generator import RANDOM_FAMILY, RandomScenarios
@@ -87,6 +88,8 @@ def run_nightly(
     level: LevelSelection = "all",
     scheduler: str | None = None,
     self_test: Callable[[Path], SelfTestResult] | None = None,
+    known_issues: Sequence[KnownIssue] | None = None,
+    are_engines_required: bool = False,
     progress: ProgressCallback,
     log: Callable[[str], None],
 ) -> tuple[RunResult, Path]:
@@ -107,6 +110,8 @@ def run_nightly(
         level: levels to compare at.
         scheduler: address of a dask cluster to run on.
         self_test: runs the self-test and writes its JUnit file to the given path; None for no self-test.
+        known_issues: expected verdicts; None for those of the project's file.
+        are_engines_required: whether an engine that is not installed has failed.
         progress: called after every task.
         log: called with sentences for the user.
 
@@ -140,6 +145,8 @@ def run_nightly(
         scheduler=scheduler,
         random_scenarios=random_scenarios,
         result_cache=DiskResultCache(unfinished / "cells", log),
+        are_engines_required=are_engines_required,
+        known_issues=load_known_issues() if known_issues is None else known_issues,
     )
     result = run_plan(plan, progress)
     place = unused_path(history / result.metadata["id"])

@@ -9,13 +9,16 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import click
+from click.core import ParameterSource
 
 from plumbline.engines import environments
 from plumbline.engines.registry import ENGINES
-from plumbline.processes.workers import ExecutorUnavailable
+from plumbline.execution.exit_codes import EXIT_CODE_MEANINGS, ExitCode
+from plumbline.judging.known_issues import KNOWN_ISSUES_FILE, KnownIssue, load_known_issues
+from plumbline.processes.workers import ExecutorLost, ExecutorUnavailable
 from plumbline.scenario import loader as scenarios
 from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean
 from plumbline.scenario.yaml_source import read_yaml
@@ -25,16 +28,10 @@ DEFAULT_OUT = Path("reports") / "out"
 MIN_TIMEOUT = 1.0  # s; starting an engine takes longer than less
 MIN_MEMORY = 1.0  # GB of address space; a worker with NumPy, SciPy and one engine does not start with less
 MIN_USER_RTOL = 1e-16  # below the rounding of a double no two results agree
-EXIT_CODES = """
-\b
-Exit codes:
-  0  everything agrees, or differs as recorded in plumbline/judging/known_issues.yaml
-  1  a disagreement, or a cell unresolved or unsupported that is not recorded
-  2  bad usage or a bad scenario file
-  3  an engine failed: raised, crashed, hung, ran out of memory, was not finite
-  4  the machine failed: disk full, input/output error; the same command resumes
-An engine that is not installed is a verdict and changes no exit code.
-"""
+EXIT_CODES = "\n".join(
+    ["\b", "Exit codes:", *(f"{code:5}  {meaning}" for code, meaning in EXIT_CODE_MEANINGS.items()), ""]
+    + ["An engine that is not installed changes no exit code, unless it was named with --engine.", ""]
+)
 
 _Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -156,6 +153,15 @@ jobs_option = click.option(
 scheduler_option = click.option(
     "--scheduler", metavar="ADDRESS", help="A dask cluster to run on instead, as tcp://HOST:8786."
 )
+known_option = click.option(
+    "--known",
+    "known_files",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="A file of known issues of your own, besides the project's (may be repeated); see "
+    "docs/reading-a-disagreement.md.",
+)
 json_option = click.option("--json", "as_json", is_flag=True, help="JSON on stdout, for other programs.")
 memory_option = click.option(
     "--memory", type=FiniteNumber(MIN_MEMORY), default=8.0, help="GB of address space per worker."
@@ -179,9 +185,55 @@ def read_scenarios(names: Iterable[str | Path]) -> list[scenarios.Scenario]:
     except ScenarioError as load_error:
         error = load_error
     if error.problems:
-        click.echo(str(error), err=True)
-        sys.exit(2)
+        exit_on_bad_file(error)
     return found
+
+
+def exit_on_bad_file(error: ScenarioError) -> NoReturn:
+    """Print the problems of files to stderr and exit with 2.
+
+    Args:
+        error: has every problem, with file, line and column.
+
+    """
+    click.echo(str(error), err=True)
+    sys.exit(ExitCode.BAD_USAGE)
+
+
+def read_known_issues(files: Sequence[Path], chosen: Sequence[scenarios.Scenario]) -> list[KnownIssue]:
+    """Load the project's known issues and the user's; exit with 2 where a file has a problem.
+
+    Args:
+        files: files of the user.
+        chosen: the scenarios of the run, which entries of the user may name.
+
+    Returns:
+        The entries of all files.
+
+    """
+    found: list[KnownIssue] = []
+    for path in (KNOWN_ISSUES_FILE, *files):
+        try:
+            entries = load_known_issues(path, [s.name for s in chosen])
+        except ScenarioError as error:
+            exit_on_bad_file(error)
+        twice = {entry.id for entry in entries} & {entry.id for entry in found}
+        if twice:
+            exit_on_bad_file(
+                ScenarioError([Problem(str(path), 0, 0, "id", f"{min(twice)!r} is in another file too")])
+            )
+        found += entries
+    return found
+
+
+def are_engines_named() -> bool:
+    """Find out whether the engines of the current command were named: one that is missing then fails.
+
+    Returns:
+        Whether ``--engine`` is on the command line.
+
+    """
+    return click.get_current_context().get_parameter_source("engines") == ParameterSource.COMMANDLINE
 
 
 def _closed_form_problem(scenario: scenarios.Scenario) -> Problem | None:
@@ -262,8 +314,7 @@ def exit_on_io_error() -> Iterator[None]:
         yield
     except ExecutorUnavailable as error:
         raise click.BadParameter(str(error), param_hint="--scheduler") from None
-    except OSError as error:
-        click.echo(
-            f"I/O error: {error}. Finished cells were saved; run the same command to resume.", err=True
-        )
-        sys.exit(4)
+    except (OSError, ExecutorLost) as error:
+        what = "I/O error" if isinstance(error, OSError) else "the cluster was lost"
+        click.echo(f"{what}: {error}. Finished cells were saved; run the same command to resume.", err=True)
+        sys.exit(ExitCode.MACHINE_FAILED)

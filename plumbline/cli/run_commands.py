@@ -44,6 +44,7 @@ from plumbline.storage.results_store import row_record, to_json_value
 )
 @options.jobs_option
 @options.scheduler_option
+@options.known_option
 @options.out_option(options.DEFAULT_OUT)
 @options.json_option
 @click.option(
@@ -56,11 +57,12 @@ from plumbline.storage.results_store import row_record, to_json_value
 @options.memory_option
 def run(
     names: tuple[str, ...], families: tuple[str, ...], engines: list[str], level: Any, jobs: int,
-    scheduler: str | None, out: Path, as_json: bool, user_rtol: float | None, timeout: float,
-    memory: float,
+    scheduler: str | None, known_files: tuple[Path, ...], out: Path, as_json: bool, user_rtol: float | None,
+    timeout: float, memory: float,
 ) -> None:  # fmt: skip
     """Compare scenarios (names of the catalogue, or paths of YAML files; default: all) on all engines."""
     chosen = options.choose_scenarios(names, families)
+    known_issues = options.read_known_issues(known_files, chosen)
     folder = options.ensure_writable(out)
     cache = DiskResultCache(folder / "cells", _log)
     plan = Plan(
@@ -73,6 +75,8 @@ def run(
         is_full_catalogue=not names and not families and engines == list(ENGINES) and level == "all",
         result_cache=cache,
         scheduler=scheduler,
+        known_issues=known_issues,
+        are_engines_required=options.are_engines_named(),
     )
     with options.exit_on_io_error():
         with ProgressDisplay(sys.stderr) as progress:
@@ -130,13 +134,14 @@ def run(
 )
 @options.jobs_option
 @options.scheduler_option
+@options.known_option
 @options.out_option(Path("nightly"), "; complete nights are in its folder `history`")
 @options.timeout_option(1800.0)
 @options.memory_option
 def nightly(
     names: tuple[str, ...], engines: list[str], random_count: int, seed: int | None, extra_refinements: int,
-    long_run_seconds: float, self_test: bool, jobs: int, scheduler: str | None, out: Path, timeout: float,
-    memory: float,
+    long_run_seconds: float, self_test: bool, jobs: int, scheduler: str | None, known_files: tuple[Path, ...],
+    out: Path, timeout: float, memory: float,
 ) -> None:  # fmt: skip
     """Run the catalogue with finer steps, long runs, random scenarios and the self-test.
 
@@ -147,6 +152,7 @@ def nightly(
     from plumbline.execution.selftest import run_self_test
 
     chosen = options.choose_scenarios(names, ())
+    known_issues = options.read_known_issues(known_files, chosen)
     folder = options.ensure_writable(out)
     with options.exit_on_io_error(), ProgressDisplay(sys.stderr) as progress:
         result, place = run_nightly(
@@ -154,7 +160,8 @@ def nightly(
             limits=Limits(timeout, memory), is_full_catalogue=not names and engines == list(ENGINES),
             extra_refinements=extra_refinements, long_run_seconds=long_run_seconds, scheduler=scheduler,
             self_test=run_self_test if self_test else None, progress=progress,
-            command=_command_line(), log=_log,
+            command=_command_line(), log=_log, known_issues=known_issues,
+            are_engines_required=options.are_engines_named(),
         )  # fmt: skip
     _finish(result, place / "report.html", as_json=False)
 

@@ -12,6 +12,8 @@ import pyarrow as pa
 import reports
 from plumbline.cli import options
 from plumbline.cli.console import ProgressDisplay, count_noun, print_table
+from plumbline.execution.exit_codes import ExitCode
+from plumbline.judging.rows import Verdict
 from plumbline.scenario.errors import ScenarioError
 
 MAX_LISTED_CELLS = 10
@@ -34,8 +36,7 @@ def sweep(file: Path, jobs: int, out: Path) -> None:
     try:
         spec, cells = sweep_file.load(file)
     except ScenarioError as error:
-        click.echo(str(error), err=True)
-        sys.exit(2)
+        options.exit_on_bad_file(error)
     folder = options.ensure_writable(out)
     with options.exit_on_io_error():
         table = sweeps.run(spec, cells, jobs)
@@ -44,8 +45,16 @@ def sweep(file: Path, jobs: int, out: Path) -> None:
     _print_sweep(table, len(cells))
     click.echo(f"results: {path}")
     click.echo(f"map: {page}")
-    verdicts = set(table["verdict"].to_pylist()) - {"agrees", "not installed"}
-    sys.exit(3 if "failed" in verdicts else 1 if verdicts else 0)
+    sys.exit(_sweep_exit_code(set(table["verdict"].to_pylist())))
+
+
+def _sweep_exit_code(verdicts: set[str]) -> ExitCode:
+    """Return the exit code of a sweep; its file names the engines, so that a missing one has failed."""
+    if Verdict.HARNESS_FAILED in verdicts:
+        return ExitCode.HARNESS_FAILED
+    if verdicts & {Verdict.FAILED, Verdict.NOT_INSTALLED}:
+        return ExitCode.ENGINE_FAILED
+    return ExitCode.SUCCESS if verdicts == {Verdict.AGREES} else ExitCode.DISAGREEMENT
 
 
 def _print_sweep(table: pa.Table, cell_count: int) -> None:
@@ -54,7 +63,7 @@ def _print_sweep(table: pa.Table, cell_count: int) -> None:
     counts = collections.Counter((row["implementation"], row["verdict"]) for row in rows)
     shown = "; ".join(f"{name} {verdict} {count}" for (name, verdict), count in sorted(counts.items()))
     click.echo(f"{count_noun(cell_count, 'cell')}: {shown}")
-    disagreeing = [row for row in rows if row["verdict"] not in ("agrees", "not installed")]
+    disagreeing = [row for row in rows if row["verdict"] != Verdict.AGREES]
     for row in disagreeing[:MAX_LISTED_CELLS]:
         click.echo(f"cell {row['cell']}, {row['implementation']}: {row['verdict']}: {row['reason']}")
 
@@ -103,4 +112,5 @@ def drift(names: tuple[str, ...], rtols: tuple[float, ...], max_cpu_seconds: flo
         click.echo(f"results: {path}")
         if (folder / "results.json").is_file():
             click.echo(f"report: {reports.write(folder)}")
-    sys.exit(3 if any(reason.startswith("failed") for reason in table["reason"].to_pylist()) else 0)
+    has_failed = any(reason.startswith("failed") for reason in table["reason"].to_pylist())
+    sys.exit(ExitCode.ENGINE_FAILED if has_failed else ExitCode.SUCCESS)

@@ -25,7 +25,6 @@ from plumbline.model.datatypes import (
     Unsupported,
 )
 
-
 # What every environment has: where one of these is missing, the checkout or the environment is broken.
 _OWN_PACKAGES = {"plumbline", "adapters", "reference_impl", *BASE_REQUIREMENTS, ""}
 

@@ -76,7 +76,9 @@ class KnownIssue:
     level: str = "*"
     integrator: str = "*"
     quantity: str = "*"
-    max_ratio: Mapping[int, float] = field(default_factory=dict)  # by the number of bodies up to which it holds
+    max_ratio: Mapping[int, float] = field(
+        default_factory=dict
+    )  # by the number of bodies up to which it holds
     mechanism: Mechanism | None = None
     shown_by: str = ""  # the engine whose rows show the mechanism; empty: the row's own
     intermittent: str = ""  # why the verdict may or may not occur; empty: it must

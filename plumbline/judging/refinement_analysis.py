@@ -136,7 +136,9 @@ class RefinementAnalysis:
         if self.times[at] >= duration * (1 - 1e-12):
             return ""
         until = f"; covers {self.times[at]:g} s of the scenario's {duration:g} s"
-        return until if wanted >= duration * (1 - 1e-12) else f"{until}, which can be predicted for {wanted:g} s"
+        return (
+            until if wanted >= duration * (1 - 1e-12) else f"{until}, which can be predicted for {wanted:g} s"
+        )
 
     def is_too_short(self, at: int, wanted: float) -> bool:
         """Whether a comparison up to a sample covers less than half of the wanted time.

@@ -16,7 +16,15 @@ from typing import Any
 
 import distributed
 
-from plumbline.processes.workers import Executor, ExecutorUnavailable, Limits, Outcome, Task, WorkerPool
+from plumbline.processes.workers import (
+    Executor,
+    ExecutorLost,
+    ExecutorUnavailable,
+    Limits,
+    Outcome,
+    Task,
+    WorkerPool,
+)
 
 _dask: Any = distributed  # untyped
 
@@ -57,7 +65,10 @@ class DaskCluster(Executor):
     @property
     def capacity(self) -> int:
         """Two tasks per thread of the cluster, which may grow and shrink."""
-        threads: int = sum(self._client.nthreads().values())
+        try:
+            threads: int = sum(self._client.nthreads().values())
+        except Exception as error:  # distributed raises errors of many kinds where the scheduler has gone
+            raise _lost(error) from None
         return max(2, _TASKS_PER_THREAD * threads)
 
     def start(self, task: Task) -> None:
@@ -75,6 +86,9 @@ class DaskCluster(Executor):
         Returns:
             The task and its outcome; nothing where its machine was lost and it was handed over again.
 
+        Raises:
+            ExecutorLost: the scheduler has gone, or machines were lost with the same task too often.
+
         """
         future = next(self._done)
         task, attempts = self._tasks.pop(future.key)
@@ -84,12 +98,19 @@ class DaskCluster(Executor):
             if attempts <= _MAX_RETRIES:
                 self._submit(task, attempts + 1)
                 return []
-            return [(task, Outcome(task.key, failure=f"the cluster: {type(error).__name__}: {error}"))]
+            raise _lost(error) from None
 
     def _submit(self, task: Task, attempts: int) -> None:
-        future = self._client.submit(_run_isolated, task, pure=False, retries=_MAX_RETRIES)
+        try:
+            future = self._client.submit(_run_isolated, task, pure=False, retries=_MAX_RETRIES)
+        except Exception as error:  # as above
+            raise _lost(error) from None
         self._tasks[future.key] = task, attempts
         self._done.add(future)
+
+
+def _lost(error: Exception) -> ExecutorLost:
+    return ExecutorLost(f"{type(error).__name__}: {' '.join(str(error).split())}")
 
 
 def _run_isolated(task: Task) -> Outcome:

@@ -116,6 +116,10 @@ class ExecutorUnavailable(PlumblineError):
     """The workers or the cluster cannot be had; the message gives the reason."""
 
 
+class ExecutorLost(PlumblineError):
+    """The cluster failed during the run; the message gives the reason."""
+
+
 class ResultCache:
     """Answers of earlier tasks. This base class holds none."""
 

@@ -183,9 +183,10 @@ def _run_engines(workers: WorkerPool, sweep: Sweep, scenarios: dict[int, Scenari
     for outcome in workers.run(tasks):
         index, name = outcome.key
         truth = truths[index]
-        if outcome.failure or isinstance(truth, str):
-            reason = outcome.failure or f"no truth to judge by: {truth}"
-            yield record(index, name, Verdict.FAILED, reason)
+        doubt = f"no truth to judge by: {truth}" if isinstance(truth, str) else truth.conflict
+        if outcome.failure or isinstance(truth, str) or doubt:
+            verdict = Verdict.HARNESS_FAILED if doubt else Verdict.FAILED
+            yield record(index, name, verdict, doubt or outcome.failure)
             continue
         row, errors = _judge_cell(installed[name], integrators[name], scenarios[index], outcome.value, truth)
         yield record(index, name, row.verdict, row.reason) | errors
