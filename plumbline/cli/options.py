@@ -28,10 +28,14 @@ DEFAULT_OUT = Path("reports") / "out"
 MIN_TIMEOUT = 1.0  # s; starting an engine takes longer than less
 MIN_MEMORY = 1.0  # GB of address space; a worker with NumPy, SciPy and one engine does not start with less
 MIN_USER_RTOL = 1e-16  # below the rounding of a double no two results agree
-EXIT_CODES = "\n".join(
-    ["\b", "Exit codes:", *(f"{code:5}  {meaning}" for code, meaning in EXIT_CODE_MEANINGS.items()), ""]
-    + ["An engine that is not installed changes no exit code, unless it was named with --engine.", ""]
-)
+_EXIT_CODE_LINES = "\n".join(f"{code:5}  {meaning}" for code, meaning in EXIT_CODE_MEANINGS.items())
+EXIT_CODES = f"""
+\b
+Exit codes:
+{_EXIT_CODE_LINES}
+
+An engine that is not installed changes no exit code, unless it was named with --engine.
+"""
 
 _Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 

@@ -61,7 +61,7 @@ class MotionTruth:
 
     @property
     def wanted_time(self) -> float:
-        """How long a run must be compared [s]: the scenario's duration, up to the horizon of rounding alone."""
+        """How long a run should be compared [s]: the duration, up to the horizon of rounding alone."""
         return predictability_horizon(self.trajectory.t, self.growth, self.length * RUN_ROUNDING)
 
 

@@ -188,7 +188,7 @@ def test_a_version_that_cannot_be_had_is_a_verdict():
     chosen = loader.load_scenarios(["rest"])
     result = run_plan(Plan(chosen, ["mujoco@99.0.0", "mujoco@3.1.6"], "state"), quiet)
     absent, refused = result.rows
-    assert absent.verdict == "not installed" and "99.0.0" in absent.reason
+    assert absent.verdict == "failed" and "99.0.0" in absent.reason
     assert refused.verdict == "unsupported" and "supports versions >=3.2" in refused.reason
 
 
@@ -253,7 +253,7 @@ def test_an_index_that_does_not_answer_is_told(tmp_path, monkeypatch, version):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     result = run_plan(Plan(loader.load_scenarios(["rest"]), [f"mujoco@{version}"], "state"), quiet)
     (row,) = result.rows
-    assert row.verdict == "not installed"
+    assert row.verdict == "failed" and result.metadata["exit_code"] == 3
     assert "uv cannot make an environment" in row.reason and "http://127.0.0.1:9/simple/mujoco" in row.reason
     assert not list((tmp_path / "plumbline").rglob("*.py")), "half an environment is left"
 
@@ -285,7 +285,7 @@ def test_a_wheel_without_a_content_is_told(tmp_path, package_index):
         archive.writestr("mujoco/__init__.py", "")
     result = run_plan(Plan(loader.load_scenarios(["rest"]), [f"mujoco@{path}"], "state"), quiet)
     (row,) = result.rows
-    assert row.verdict == "not installed" and "uv cannot make an environment" in row.reason
+    assert row.verdict == "failed" and "uv cannot make an environment" in row.reason
 
 
 def test_a_bad_version_is_bad_usage():

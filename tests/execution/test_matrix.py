@@ -74,7 +74,7 @@ def test_cell(name, engine, level, workers, engines, truths):
     excuses = known_issues.KnownIssues(known_issues.load_known_issues(), has_extra_refinements=False)
     wrong = [
         f"{r.key} {r.verdict}: {r.reason}"
-        for r in excuses.mark_known(rows)
+        for r in excuses.mark_known(rows, found.model.n)
         if r.verdict != "agrees" and r.known_issue is None
     ]
     stale = [f"known entry {e.id} no longer occurs" for e in excuses.stale_issues(is_full_matrix=False)]

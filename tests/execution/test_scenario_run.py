@@ -69,7 +69,7 @@ def test_a_lost_truth_of_states_fails_every_cell_and_says_so(engines):
         bench.on_outcome(outcome_of(task))
     assert bench.is_done
     assert [(r.verdict, r.reason) for r in bench.findings().rows] == [
-        ("failed", "no truth to judge by: crashed")
+        ("harness failed", "rest has no truth to judge by: crashed")
     ] * 2
 
 
@@ -94,7 +94,8 @@ def test_a_truth_that_is_lost_twice_fails_every_cell_and_says_so(engines):
     assert bench.on_outcome(Outcome(truth.key, failure="crashed twice")) == [] and bench.is_done
     rows = bench.findings().rows
     assert len(rows) == len(cells)
-    assert all(r.verdict == "failed" and r.reason == "no truth to judge by: crashed twice" for r in rows)
+    reason = "rest has no truth to judge by: crashed twice"
+    assert all(r.verdict == "harness failed" and r.reason == reason for r in rows)
 
 
 def exit_process(*_):

@@ -165,7 +165,7 @@ def test_a_missing_engine_and_a_truth_that_fails_are_rows(tmp_path):
     assert (row["verdict"], row["reason"]) == ("not installed", missing.missing)
     with patch("plumbline.studies.sweep._compute_truths", return_value={0: "crashed"}):
         _, row = sweep.run(spec, cells).to_pylist()
-    assert (row["verdict"], row["reason"]) == ("failed", "no truth to judge by: crashed")
+    assert (row["verdict"], row["reason"]) == ("harness failed", "no truth to judge by: crashed")
 
 
 @pytest.mark.parametrize(

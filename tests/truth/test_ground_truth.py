@@ -164,7 +164,27 @@ def test_two_methods_that_differ_by_more_than_rounding_are_reported(position, at
         "made",
     )
     with patch("plumbline.truth.ground_truth.trajectory_truth", lambda *_: made):
-        assert motion_truth(model, at, TIMES, None).method == "made" + TRUTHS_DIFFER * parted
+        found = motion_truth(model, at, TIMES, None)
+    assert found.method == "made" and bool(found.conflict) is parted
+    assert not parted or (found.conflict.startswith(TRUTHS_DIFFER) and "1.1 times what" in found.conflict)
+
+
+def test_a_truth_that_is_not_a_number_is_in_doubt() -> None:
+    model = pendulums.model("b")
+    at = pendulums.state(model, seed=2, rate=0.5)
+    sound = motion_truth(model, at, TIMES, None)
+    made = TrajectoryTruth(sound.trajectory, np.full(9, np.nan), np.zeros(9), "made")
+    with patch("plumbline.truth.ground_truth.trajectory_truth", lambda *_: made):
+        assert motion_truth(model, at, TIMES, None).conflict
+
+
+def test_the_wanted_time_does_not_shrink_with_the_uncertainty() -> None:
+    model = pendulums.model("b")
+    at = pendulums.state(model, seed=2, rate=0.5)
+    sound = motion_truth(model, at, TIMES, None)
+    vague = replace(sound, position_uncertainty=np.linspace(0, 1e-8, 9))
+    assert sound.horizon == sound.wanted_time == vague.wanted_time == 1.0
+    assert vague.horizon == 0.0
 
 
 def test_taylors_method_is_limited_in_bodies():
