@@ -260,7 +260,9 @@ def summarize_verdicts(result: RunResult) -> str:
         if verdict not in (Verdict.AGREES, Verdict.NOT_INSTALLED) and count > len(new):
             part += f" ({count - len(new)} as recorded)"
         parts.append(part)
-    text = ", ".join(parts) or "nothing was compared"
+    if not has_comparison(result):
+        parts.append("nothing was compared")
+    text = ", ".join(parts)
     if result.stale_issues:
         ids = ", ".join(issue.id for issue in result.stale_issues)
         count = len(result.stale_issues)

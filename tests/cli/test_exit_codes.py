@@ -1,0 +1,223 @@
+"""Exit codes: one table, and no way to exit 0 without a comparison."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from unittest.mock import patch
+
+import pytest
+from click.testing import CliRunner
+
+from plumbline.cli.main import main
+from plumbline.cli.study_commands import _sweep_exit_code
+from plumbline.execution.exit_codes import EXIT_CODE_MEANINGS, ExitCode
+from plumbline.execution.plan import Plan
+from plumbline.execution.runner import run_plan
+from plumbline.processes import workers
+from plumbline.processes.workers import ExecutorLost, Limits
+from plumbline.scenario import loader
+from plumbline.truth.ground_truth import TRUTHS_DIFFER
+from tests.helpers import wrong_truths
+
+ROOT = Path(__file__).resolve().parents[2]
+WORDS = ("-m", "plumbline", "run")
+
+
+def run(out, *words, **environment):
+    return subprocess.run(
+        [sys.executable, *WORDS, *words, "--out", str(out)],
+        cwd=ROOT, capture_output=True, text=True, timeout=240,
+        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+    )  # fmt: skip
+
+
+def with_module(folder, name, text):
+    (folder / f"{name}.py").write_text(text)
+    return {"PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
+
+
+# one table
+
+
+def test_every_code_has_a_meaning_and_the_help_has_the_table():
+    assert set(EXIT_CODE_MEANINGS) == set(ExitCode)
+    shown = CliRunner().invoke(main, ["--help"]).stdout
+    for code, meaning in EXIT_CODE_MEANINGS.items():
+        assert re.search(rf"^ +{code:d}  {re.escape(meaning)}$", shown, re.M), code
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/reading-a-disagreement.md"])
+def test_the_pages_have_the_same_table(page):
+    rows = re.findall(r"^\| (\d+) \| (.+) \|$", (ROOT / page).read_text(encoding="utf-8"), re.M)
+    assert rows == [(str(int(code)), meaning) for code, meaning in EXIT_CODE_MEANINGS.items()]
+
+
+# nothing compared is not success
+
+
+def test_an_engine_without_the_level_compares_nothing(tmp_path):
+    result = run(tmp_path, "rest", "--engine", "pinocchio-aba", "--level", "trajectory")
+    assert result.returncode == ExitCode.DISAGREEMENT, result.stdout + result.stderr
+    assert "nothing was compared" in result.stdout
+    assert "Every cell agrees" not in (tmp_path / "report.html").read_text()
+
+
+def test_recorded_gaps_alone_are_no_comparison(tmp_path):
+    result = run(tmp_path, "chain-3-balls", "--engine", "reference-printed", "--level", "state")
+    assert result.returncode == ExitCode.DISAGREEMENT, result.stdout + result.stderr
+    assert "(1 as recorded), nothing was compared" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("import os\nos.abort()\n", "crashed: the worker died of SIGABRT"),
+        ("raise RuntimeError('libGL broken')\n", "RuntimeError: libGL broken"),
+        ("raise ImportError('libGL.so.1: cannot open')\n", "ImportError: libGL.so.1: cannot open"),
+        ("import time\ntime.sleep(600)\n", "timeout: no answer within 5 s"),
+    ],
+)
+def test_an_engine_that_fails_at_import_has_failed(tmp_path, text, words):
+    place = with_module(tmp_path, "mujoco", text)
+    names = ["--engine", "mujoco", "--engine", "reference", "--level", "state", "--timeout", "5"]
+    result = run(tmp_path / "out", "rest", *names, **place)
+    assert result.returncode == ExitCode.ENGINE_FAILED, result.stdout + result.stderr
+    assert words in result.stdout and "1 failed" in result.stdout and "7 agree" in result.stdout
+
+
+MISSING = "raise ModuleNotFoundError(\"No module named 'exudyn'\", name='exudyn')\n"
+
+
+def test_a_missing_engine_is_a_failure_only_where_it_was_named(tmp_path):
+    place = with_module(tmp_path, "exudyn", MISSING)
+    named = run(tmp_path / "a", "rest", "--engine", "exudyn", "--level", "state", **place)
+    assert named.returncode == ExitCode.ENGINE_FAILED, named.stdout + named.stderr
+    assert "it was named explicitly" in named.stdout
+    usual = run(tmp_path / "b", "rest", "--level", "state", **place)
+    assert usual.returncode == ExitCode.SUCCESS, usual.stdout + usual.stderr
+    assert "2 not installed" in usual.stdout
+
+
+def test_a_missing_module_of_the_harness_is_no_missing_engine(tmp_path):
+    place = with_module(tmp_path, "exudyn", "raise ModuleNotFoundError('No module', name='scipy.x')\n")
+    result = run(tmp_path / "out", "rest", "--level", "state", **place)
+    assert result.returncode == ExitCode.ENGINE_FAILED and "ModuleNotFoundError" in result.stdout
+
+
+def test_a_version_whose_environment_cannot_be_made_has_failed(tmp_path):
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    result = run(
+        tmp_path / "out", "rest", "--engine", "mujoco@0.0.1", "--level", "state",
+        PATH=str(empty), XDG_CACHE_HOME=str(empty),
+    )  # fmt: skip
+    if (ROOT / ".uv").exists():
+        pytest.skip("uv is in the checkout")
+    assert result.returncode == ExitCode.ENGINE_FAILED, result.stdout + result.stderr
+    assert "1 failed" in result.stdout and "uv is not on PATH" in " ".join(result.stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "code"),
+    [
+        ({"agrees"}, 0),
+        ({"agrees", "disagrees"}, 1),
+        ({"agrees", "not installed"}, 3),
+        ({"disagrees", "failed"}, 3),
+        ({"failed", "harness failed"}, 5),
+        (set(), 1),
+    ],
+)
+def test_a_sweep_needs_the_engines_that_its_file_names(verdicts, code):
+    assert _sweep_exit_code(verdicts) == code
+
+
+# the harness
+
+
+def test_a_truth_with_a_wrong_gravity_fails_the_harness(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(workers, "initialize_worker", wrong_truths.prepare)
+    result = CliRunner().invoke(
+        main, ["run", "tumbling-ball", "--engine", "mujoco", "--jobs", "1", "--out", str(tmp_path)]
+    )
+    assert result.exit_code == ExitCode.HARNESS_FAILED, result.output
+    first = " ".join(result.stdout.split())
+    assert first.startswith(f"☒ the harness failed: tumbling-ball: {TRUTHS_DIFFER}")
+    document = json.loads((tmp_path / "results.json").read_text())
+    doubtful = {row["level"] for row in document["rows"] if row["verdict"] == "harness failed"}
+    assert doubtful == {"trajectory"}
+    assert not [row for row in document["rows"] if row["level"] in ("trajectory", "invariants")
+                and row["verdict"] != "harness failed"]  # fmt: skip
+    assert 'type="harness failed"' in (tmp_path / "junit.xml").read_text()
+
+
+def test_the_same_run_without_the_mistake_is_green():
+    chosen = loader.load_scenarios(["tumbling-ball"])
+    result = run_plan(Plan(chosen, ["mujoco"], "trajectory", limits=Limits(120)), lambda *_: None)
+    assert result.metadata["exit_code"] == 0, result.metadata["sentence"]
+
+
+def test_an_internal_error_is_a_sentence_and_a_file(tmp_path):
+    words = ["run", "rest", "--engine", "reference", "--level", "state", "--out", str(tmp_path)]
+    with patch("plumbline.cli.run_commands.run_plan", side_effect=KeyError("a mistake\nof two lines")):
+        result = CliRunner().invoke(main, words)
+    assert result.exit_code == ExitCode.HARNESS_FAILED
+    (line,) = result.stderr.splitlines()
+    found = re.fullmatch(r"internal error: KeyError: '.+'; the traceback is in (.+)", line)
+    path = Path(found[1])
+    assert "a mistake" in path.read_text() and "Traceback" in path.read_text()
+    path.unlink()
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [(ExecutorLost("the scheduler has gone"), "the cluster was lost"), (OSError(28, "full"), "I/O error")],
+)
+def test_a_machine_that_fails_exits_with_4(tmp_path, error, words):
+    arguments = ["run", "rest", "--engine", "reference", "--level", "state", "--out", str(tmp_path)]
+    with patch("plumbline.cli.run_commands.run_plan", side_effect=error):
+        result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == ExitCode.MACHINE_FAILED and words in result.stderr
+
+
+# interruptions
+
+
+@pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_an_interrupted_run_says_how_to_resume_and_leaves_no_process(tmp_path, which):
+    process = subprocess.Popen(
+        [sys.executable, *WORDS, "chain-3-balls", "--engine", "mujoco", "--jobs", "1", "--out", tmp_path],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    deadline = time.monotonic() + 60
+    while not list(tmp_path.glob("cells/*.cell")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(which)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == ExitCode.INTERRUPTED, told
+    assert told.rstrip().endswith("interrupted; finished cells are kept, run the same command to resume")
+    assert "Traceback" not in told and "leaked" not in told
+    assert list(tmp_path.glob("cells/*.cell"))
+    deadline = time.monotonic() + 10
+    while time.monotonic() < deadline:
+        try:
+            os.killpg(process.pid, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.1)
+    raise AssertionError("a process is left")
+
+
+def test_an_interruption_while_loading_prints_no_traceback(tmp_path):
+    (tmp_path / "click.py").write_text("raise KeyboardInterrupt\n")
+    done = subprocess.run(
+        [sys.executable, "-m", "plumbline", "--help"], cwd=ROOT, capture_output=True, text=True,
+        env={**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"},
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (ExitCode.INTERRUPTED, "")
