@@ -15,7 +15,7 @@ from urllib.parse import urlencode
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from plumbline.judging.rows import VERDICT_STYLES
+from plumbline.judging.rows import SHOWN_STYLES
 from plumbline.storage.results_store import write_atomically
 from reports import reference_tables, report_data
 from reports.history import History
@@ -28,6 +28,7 @@ from reports.verdicts import (
     needs_attention,
     rank,
     severity,
+    shown_verdict,
     unexpected_rows,
 )
 
@@ -165,7 +166,9 @@ def _matrix_by_family(results: Results) -> dict[str, Any]:
     for family in families.values():
         for engine in results.engines:
             family["summary"][engine] = Counter(
-                line["cells"][engine]["row"]["verdict"] for line in family["lines"] if engine in line["cells"]
+                shown_verdict(line["cells"][engine]["row"])
+                for line in family["lines"]
+                if engine in line["cells"]
             )
     return families
 
@@ -287,7 +290,8 @@ def template_environment() -> Environment:
         "seconds": _format_duration,
         "css_class": css_class,
     }
-    made.globals["verdict_styles"] = VERDICT_STYLES
+    made.globals["verdict_styles"] = SHOWN_STYLES
+    made.filters["shown_verdict"] = shown_verdict
     return made
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from plumbline.storage.results_store import write_atomically
 from reports.results import Record, Results
-from reports.verdicts import format_number, needs_attention
+from reports.verdicts import format_number, needs_attention, shown_verdict
 
 
 def write(results: Results) -> Path:
@@ -56,12 +56,12 @@ def _add_test_case(suite: ET.Element, row: Record) -> str | None:
     )
     message = f"{row['verdict']}: {row['reason']}"
     if needs_attention(row):
-        kind = "error" if row["verdict"] == "failed" else "failure"
+        kind = "error" if row["verdict"] in ("failed", "harness failed") else "failure"
         ET.SubElement(case, kind, message=message, type=row["verdict"]).text = _failure_text(row)
         return "errors" if kind == "error" else "failures"
     if row["verdict"] != "agrees":
         expected = f"known issue {row['known_issue']}; " if row.get("known_issue") else ""
-        ET.SubElement(case, "skipped", message=expected + message)
+        ET.SubElement(case, "skipped", message=expected + message, type=shown_verdict(row))
         return "skipped"
     return None
 

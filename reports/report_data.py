@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.judging.rows import VERDICT_STYLES
+from plumbline.judging.rows import SHOWN_STYLES
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product
 from reports.chunks import ChunkBuilder, decimate, decimate_times, log_scale_codes
 from reports.history import History
 from reports.results import Columns, Record, Results, group_rows
-from reports.verdicts import css_class, error_ratio, severity
+from reports.verdicts import css_class, error_ratio, severity, shown_verdict
 
 CURVE_COLUMNS = (
     "position_error",
@@ -101,9 +101,9 @@ def index_chunk(results: Results, history: History) -> str:
         "titles": [s["title"] for s in results.scenarios.values()],
         "engines": list(results.engines),
         "engine_titles": [e["title"] for e in results.engines.values()],
-        "verdicts": list(VERDICT_STYLES),
-        "glyphs": [style.glyph for style in VERDICT_STYLES.values()],
-        "slugs": [css_class(verdict) for verdict in VERDICT_STYLES],
+        "verdicts": list(SHOWN_STYLES),
+        "glyphs": [style.glyph for style in SHOWN_STYLES.values()],
+        "slugs": [css_class(verdict) for verdict in SHOWN_STYLES],
         "reasons": [row["reason"] for row in results.rows],
         "commit": results.run.get("commit"),
         "passed": history.last_passed.run["started"] if history.last_passed else None,
@@ -120,7 +120,8 @@ def index_chunk(results: Results, history: History) -> str:
         ("quantity", "quantitys", np.uint16),
     ):
         place = {value: k for k, value in enumerate(header[plural])}
-        rows[name] = packer.add(np.array([place[row[name]] for row in results.rows], dtype=kind))
+        values = [shown_verdict(row) if name == "verdict" else row[name] for row in results.rows]
+        rows[name] = packer.add(np.array([place[value] for value in values], dtype=kind))
     rows["severity"] = packer.add(np.array([severity(row) for row in results.rows], dtype=np.uint8))
     rows["fresh"] = packer.add(np.array([history.is_new(row) for row in results.rows], dtype=np.uint8))
     quotients = [error_ratio(row) for row in results.rows]
@@ -384,7 +385,7 @@ def history_chunk(results: Results, history: History) -> str:
 
     """
     packer = ChunkBuilder()
-    verdicts = {verdict: k + 1 for k, verdict in enumerate(VERDICT_STYLES)}
+    verdicts = {verdict: k + 1 for k, verdict in enumerate(SHOWN_STYLES)}
     nights: Sequence[dict[str, Record]] = [
         *(night.rows for night in history.nights),
         {row["key"]: row for row in results.rows},
@@ -404,6 +405,8 @@ def history_chunk(results: Results, history: History) -> str:
         "damaged": history.unreadable,
         "value": packer.add(log_scale_codes(table(lambda r: r.get("value")))),
         "ratio": packer.add(log_scale_codes(table(error_ratio))),
-        "verdict": packer.add(np.nan_to_num(table(lambda r: verdicts.get(r["verdict"], 0))).astype(np.uint8)),
+        "verdict": packer.add(
+            np.nan_to_num(table(lambda r: verdicts.get(shown_verdict(r), 0))).astype(np.uint8)
+        ),
     }
     return packer.encode(header)

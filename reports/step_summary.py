@@ -7,10 +7,10 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from plumbline.judging.rows import VERDICT_STYLES
+from plumbline.judging.rows import SHOWN_STYLES
 from plumbline.storage.results_store import write_atomically
 from reports.results import Record, Results
-from reports.verdicts import count_all_verdicts, error_ratio, format_number, unexpected_rows
+from reports.verdicts import count_all_verdicts, error_ratio, format_number, shown_verdict, unexpected_rows
 
 MAX_SUMMARY_BYTES = 1_000_000  # bytes; GitHub drops a step's summary above 1 MiB = 1,048,576 bytes
 _MARKDOWN_SPECIAL = re.compile(r"[^0-9A-Za-z .,;:()/+%=\u0080-\uffff-]")
@@ -64,9 +64,7 @@ def render(results: Results) -> str:
         f"## {escape_markdown(run['sentence'], 2000)}",
         "",
         " · ".join(
-            f"{style.glyph} **{counts[v]}** {style.plural}"
-            for v, style in VERDICT_STYLES.items()
-            if counts[v]
+            f"{style.glyph} **{counts[v]}** {style.plural}" for v, style in SHOWN_STYLES.items() if counts[v]
         ),
         "",
         *_verdict_table(results),
@@ -101,7 +99,7 @@ def _verdict_table(results: Results) -> list[str]:
     """Counts of each verdict by family and engine; the first hundred families where there are more."""
     cells: dict[tuple[str, str], Counter[str]] = {}
     for row in results.rows:
-        cells.setdefault((row["family"], row["engine"]), Counter())[row["verdict"]] += 1
+        cells.setdefault((row["family"], row["engine"]), Counter())[shown_verdict(row)] += 1
     families = list(dict.fromkeys(row["family"] for row in results.rows))
     heads = [
         f"{escape_markdown(e['title'])} {escape_markdown(e['version'] or '')}"
@@ -113,7 +111,7 @@ def _verdict_table(results: Results) -> list[str]:
         for engine in results.engines:
             counts = cells.get((family, engine), Counter())
             texts.append(
-                " ".join(f"{s.glyph}&nbsp;{counts[v]}" for v, s in VERDICT_STYLES.items() if counts[v])
+                " ".join(f"{s.glyph}&nbsp;{counts[v]}" for v, s in SHOWN_STYLES.items() if counts[v])
             )
         lines.append(f"| {escape_markdown(family)} | " + " | ".join(texts) + " |")
     return lines + ([f"\n… and {len(families) - 100} more families."] if len(families) > 100 else [])
@@ -140,7 +138,7 @@ def _finding_line(row: Record) -> str:
         f" *{escape_markdown(row['diagnosis'])}*" if row.get("diagnosis") else ""
     )
     cells = (
-        f"{VERDICT_STYLES[row['verdict']].glyph} {row['verdict']}",
+        f"{SHOWN_STYLES[row['verdict']].glyph} {row['verdict']}",
         escape_markdown(row["scenario"], 120),
         escape_markdown(row["engine"]),
         escape_markdown(what),

@@ -21,10 +21,23 @@ def severity(row: Record) -> int:
         row: a stored row.
 
     Returns:
-        9 (failed, unexpected) … 1 (not installed), see `plumbline.judging.rows.severity`.
+        10 (the harness failed) … 1 (not installed), see `plumbline.judging.rows.severity`.
 
     """
     return rows.severity(row["verdict"], row.get("known_issue"))
+
+
+def shown_verdict(row: Record) -> str:
+    """Return what one row is shown as.
+
+    Args:
+        row: a stored row.
+
+    Returns:
+        A key of `plumbline.judging.rows.SHOWN_STYLES`.
+
+    """
+    return rows.shown_verdict(row["verdict"], row.get("known_issue"))
 
 
 def needs_attention(row: Record) -> bool:
@@ -81,16 +94,16 @@ def unexpected_rows(candidates: Iterable[Record]) -> list[Record]:
 
 
 def count_verdicts(records: Iterable[Record]) -> Counter[str]:
-    """Count rows by verdict.
+    """Count rows by what they are shown as: recorded disagreements apart.
 
     Args:
         records: stored rows.
 
     Returns:
-        The number of rows of each verdict that occurs.
+        The number of rows of each key of `plumbline.judging.rows.SHOWN_STYLES` that occurs.
 
     """
-    return Counter(row["verdict"] for row in records)
+    return Counter(map(shown_verdict, records))
 
 
 def count_all_verdicts(results: Results) -> Counter[str]:
@@ -110,7 +123,7 @@ def css_class(verdict: str) -> str:
     """Return the class of the elements that show a verdict.
 
     Args:
-        verdict: a value of `plumbline.judging.rows.Verdict`.
+        verdict: a key of `plumbline.judging.rows.SHOWN_STYLES`.
 
     Returns:
         The verdict with hyphens instead of spaces.

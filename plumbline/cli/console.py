@@ -13,7 +13,7 @@ from rich.table import Table
 
 from plumbline.engines.environments import split_version
 from plumbline.execution.runner import RunResult
-from plumbline.judging.rows import RECORDED_STYLE, Row, Verdict
+from plumbline.judging.rows import SHOWN_STYLES, Row, Verdict
 
 
 def make_console(file: Any) -> Console:
@@ -141,8 +141,8 @@ def print_result(result: RunResult) -> None:
     out.print(table)
     out.print(
         "[dim]each cell: worst verdict, agreeing rows / all rows, error over tolerance of the worst row; "
-        + "  ".join(f"{verdict.style.glyph} {verdict}" for verdict in Verdict)
-        + f"  {RECORDED_STYLE.glyph} {RECORDED_STYLE.plural}[/]"
+        + "  ".join(f"{style.glyph} {shown}" for shown, style in SHOWN_STYLES.items())
+        + "[/]"
     )
     for row in result.rows:
         if row.verdict not in (Verdict.AGREES, Verdict.HARNESS_FAILED) and row.known_issue is None:

@@ -52,26 +52,28 @@ VERDICT_STYLES = {
     Verdict.NOT_INSTALLED: VerdictStyle("∅", "not installed", "the engine is not on this machine", 1, 1),
     Verdict.AGREES: VerdictStyle("✓", "agree", "the error is within its derived tolerance", 4, 4),
 }
-RECORDED_STYLE = VerdictStyle(  # of a disagreement or failure that a known issue expects
-    "≠", "recorded", "a disagreement or failure that known_issues.yaml records", 5, 5
-)
+RECORDED = "recorded"  # what terminal and report show for a disagreement or failure that is recorded
+SHOWN_STYLES: dict[str, VerdictStyle] = {
+    **{str(verdict): style for verdict, style in VERDICT_STYLES.items()},
+    RECORDED: VerdictStyle(
+        "≠", "recorded", "a disagreement or failure as known_issues.yaml records it", 5, 5
+    ),
+}
 ATTENTION_SEVERITY = 6  # from here on a verdict needs attention
 
 
-def verdict_style(verdict: str, known_issue: str | None) -> VerdictStyle:
-    """Return how a row is shown: a recorded disagreement has a style of its own.
+def shown_verdict(verdict: str, known_issue: str | None) -> str:
+    """Return what a row is shown as: a recorded disagreement is neither agreement nor a new disagreement.
 
     Args:
         verdict: a value of `Verdict`.
         known_issue: id of the entry of known_issues.yaml that expects the verdict, or None.
 
     Returns:
-        The style; that of the verdict where nothing is recorded, or only a gap is.
+        A key of `SHOWN_STYLES`: the verdict, or `RECORDED`.
 
     """
-    if known_issue and verdict in (Verdict.DISAGREES, Verdict.FAILED):
-        return RECORDED_STYLE
-    return VERDICT_STYLES[Verdict(verdict)]
+    return RECORDED if known_issue and verdict in (Verdict.DISAGREES, Verdict.FAILED) else str(verdict)
 
 
 def severity(verdict: str, known_issue: str | None) -> int:
@@ -159,7 +161,7 @@ class Row:
     @property
     def style(self) -> VerdictStyle:
         """How the row is shown."""
-        return verdict_style(self.verdict, self.known_issue)
+        return SHOWN_STYLES[shown_verdict(self.verdict, self.known_issue)]
 
     @property
     def rank(self) -> tuple[int, float]:

@@ -18,6 +18,7 @@ from plumbline.cli.study_commands import _sweep_exit_code
 from plumbline.execution.exit_codes import EXIT_CODE_MEANINGS, ExitCode
 from plumbline.execution.plan import Plan
 from plumbline.execution.runner import run_plan
+from plumbline.judging.known_issues import load_known_issues
 from plumbline.processes import workers
 from plumbline.processes.workers import ExecutorLost, Limits
 from plumbline.scenario import loader
@@ -221,3 +222,43 @@ def test_an_interruption_while_loading_prints_no_traceback(tmp_path):
         env={**os.environ, "PYTHONPATH": f"{tmp_path}{os.pathsep}{ROOT}"},
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (ExitCode.INTERRUPTED, "")
+
+
+# known issues of the user
+
+MINE = "- {id: mine, scenario: rest, engine: mujoco, level: state, verdict: unresolved, evidence: e, reason: r}\n"
+
+
+@pytest.mark.parametrize("command", ["run", "nightly"])
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("- {id: [red]x[/nope]}", ":1:12: "),
+        (MINE.replace("mujoco", "mujocoo"), ":1:35: [0].engine: no engine matches 'mujocoo'; did you mean"),
+        (None, "cannot be read: No such file"),
+        (MINE.replace("mine", "conical-is-unstable"), "id: 'conical-is-unstable' is in another file too"),
+    ],
+)
+def test_a_bad_file_of_known_issues_is_bad_usage(tmp_path, command, text, words):
+    path = tmp_path / "known.yaml"
+    if text is not None:
+        path.write_text(text)
+    result = CliRunner().invoke(main, [command, "rest", "--known", str(path), "--out", str(tmp_path / "out")])
+    assert result.exit_code == ExitCode.BAD_USAGE, result.output
+    assert f"{path}" in result.stderr and words in result.stderr, result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+class Stopped(Exception):
+    pass
+
+
+@pytest.mark.parametrize("where", ["plumbline.cli.run_commands.run_plan", "plumbline.cli.nightly.run_plan"])
+def test_known_issues_of_the_user_are_added_to_those_of_the_project(tmp_path, where):
+    (tmp_path / "known.yaml").write_text(MINE)
+    words = ["run" if "run_commands" in where else "nightly", "rest", "--known", str(tmp_path / "known.yaml")]
+    with patch(where, side_effect=Stopped) as called:
+        CliRunner().invoke(main, [*words, "--engine", "mujoco", "--out", str(tmp_path / "out")])
+    (plan, _), _ = called.call_args
+    assert [issue.id for issue in plan.known_issues] == [e.id for e in load_known_issues()] + ["mine"]
+    assert plan.are_engines_required

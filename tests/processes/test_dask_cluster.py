@@ -136,3 +136,35 @@ def test_no_scheduler_is_told():
         cwd=ROOT, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 2 and "nonsense" in done.stderr
+
+
+class LostClient:
+    """A client whose scheduler has gone."""
+
+    def nthreads(self):
+        raise OSError("timed out")
+
+    def submit(self, *_, **__):
+        raise RuntimeError("the client is closed")
+
+
+class LostFuture:
+    key = "a"
+
+    def result(self):
+        raise RuntimeError("its machine was lost")
+
+
+def test_a_lost_cluster_ends_the_run():
+    from plumbline.processes import dask_cluster
+    from plumbline.processes.workers import ExecutorLost
+
+    made = object.__new__(dask_cluster.DaskCluster)
+    made._client, made._tasks = LostClient(), {"a": (Task("a", len), dask_cluster._MAX_RETRIES + 1)}
+    made._done = iter([LostFuture()])
+    with pytest.raises(ExecutorLost, match="OSError: timed out"):
+        _ = made.capacity
+    with pytest.raises(ExecutorLost, match="RuntimeError: its machine was lost"):
+        made.collect()
+    with pytest.raises(ExecutorLost, match="RuntimeError: the client is closed"):
+        made.start(Task("b", len))
