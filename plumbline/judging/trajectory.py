@@ -150,6 +150,7 @@ class _WindowVerdict:
     verdict: Verdict
     reason: str
     last_sample: int  # index of the window's last sample
+    remark: str = ""  # on the time that the window does not cover
 
 
 def _rows_against_truth(study: RefinementAnalysis, quantity: _ComparedQuantity) -> list[Row]:
@@ -208,7 +209,7 @@ def _rows_against_truth(study: RefinementAnalysis, quantity: _ComparedQuantity) 
         name,
         found.verdict,  # own ≤ estimate where the limit agrees: the triangle inequality
         f"{name} at {resolution} {finest:g} is {own:.2g} {unit} from the truth, "
-        f"the refinement study estimates {estimate:.2g}",
+        f"the refinement study estimates {estimate:.2g}{found.remark}",
         unit,
         value=own,
         tolerance=estimate,
@@ -252,7 +253,7 @@ def _judge_windows(
     verdict, reason = found.verdict, found.reason
     if verdict != Verdict.UNRESOLVED and study.is_too_short(found.last_sample, wanted):
         verdict, reason = Verdict.UNRESOLVED, f"too short a time to decide: {reason}"
-    return _WindowVerdict(verdict, reason + remark, found.last_sample)
+    return _WindowVerdict(verdict, reason + remark, found.last_sample, remark)
 
 
 def _convergence_columns(study: RefinementAnalysis) -> Columns:

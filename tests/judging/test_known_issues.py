@@ -4,7 +4,9 @@ import contextlib
 import json
 import math
 import random
+import re
 from dataclasses import FrozenInstanceError
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -20,6 +22,7 @@ from plumbline.processes.cpu_time import CpuTimes
 from plumbline.scenario.errors import ScenarioError
 from plumbline.storage.results_store import ResultTables
 
+ROOT = Path(__file__).resolve().parents[2]
 WHO = RowContext("tumbling-ball", "single", "mujoco", "MuJoCo", "4.0.0")
 ENTRY = {
     "id": "a", "scenario": "tumbling-ball", "engine": "mujoco", "quantity": "acceleration",
@@ -231,6 +234,15 @@ def test_the_mechanism_may_be_shown_by_another_column_of_the_engine():
         shown = ratio_row(scatter, "relations", "re-chosen body frame", "pinocchio-aba")
         judged = judged_by([*rows, shown], [known], whole=True)
         assert (judged.rows[0].known_issue == "a") is covered
+
+
+def test_the_example_of_the_page_is_valid_and_the_page_has_every_mechanism(tmp_path):
+    page = (ROOT / "docs" / "reading-a-disagreement.md").read_text()
+    path = tmp_path / "mine.yaml"
+    path.write_text(re.search(r"```yaml\n(- id: .*?)```", page, re.S)[1])
+    assert len(known_issues.load_known_issues(path)) == 5
+    assert all(f"`{mechanism}`: " in page for mechanism in known_issues.MECHANISMS)
+    assert f"at least {known_issues.MIN_SCATTER} of" in page
 
 
 def test_integrators_read_from_the_source_are_those_that_adapters_have():

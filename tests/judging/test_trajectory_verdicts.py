@@ -470,3 +470,42 @@ def test_poses_are_in_order_of_time_then_body():
     assert table["t"].tolist() == [0, 0, 1, 1] and table["body"].tolist() == [0, 1, 0, 1]
     assert table["rx"].tolist() == [0, 3, 6, 9] and table["p0"].tolist() == [100, 104, 108, 112]
     assert list(table)[2:] == ["rx", "ry", "rz", "p0", "p1", "p2", "p3"]
+
+
+# how much of the scenario's time is compared
+
+
+@pytest.mark.parametrize(
+    ("until", "verdict", "words"),
+    [
+        (2.0, "agrees", ""),
+        (1.5, "agrees", "; covers 1.5 s of the scenario's 2 s"),
+        (1.0, "agrees", "; covers 1 s of the scenario's 2 s"),
+        (0.875, "unresolved", "; covers 0.875 s of the scenario's 2 s"),
+    ],
+)
+def test_a_comparison_of_less_than_half_of_the_time_decides_nothing(until, verdict, words):
+    rows = judged_rows(horizon=until)
+    for name in ("position_limit", "position", "attitude_limit", "attitude"):
+        assert rows[name].verdict == verdict and rows[name].compared_until == until
+        reason = rows[name].reason
+        assert reason.endswith(words) if words else "covers" not in reason
+    for name in ("position_limit", "attitude_limit"):
+        reason = rows[name].reason
+        assert reason.startswith("too short a time to decide: ") == (verdict == "unresolved")
+
+
+def test_a_motion_that_can_be_predicted_for_less_is_compared_up_to_there():
+    growth = 10.0 ** (8 * TIMES)  # 1e3 ε of 0.4 m grows beyond 1e-9 m after 0.5 s
+    rows = judged_rows(horizon=0.5, growth=growth)
+    assert rows["position_limit"].verdict == "agrees"
+    assert rows["position_limit"].reason.endswith(
+        "; covers 0.5 s of the scenario's 2 s, which can be predicted for 0.5 s"
+    )
+
+
+def test_a_window_just_below_half_of_the_time_counts_as_half():
+    found = analysis(horizon=2.0)
+    assert not found.is_too_short(8, 2.0)  # 1 s
+    assert found.is_too_short(7, 2.0)  # 0.875 s: the sample at 1 s is within the half
+    assert not found.is_too_short(7, 1.9)  # 0.875 s of 0.95 s: the next sample is beyond it
