@@ -226,15 +226,15 @@ def test_an_interruption_while_loading_prints_no_traceback(tmp_path):
 
 # known issues of the user
 
-MINE = "- {id: mine, scenario: rest, engine: mujoco, level: state, verdict: unresolved, evidence: e, reason: r}\n"
+MINE = "- {id: mine, scenario: rest, engine: mujoco, verdict: unresolved, evidence: e, reason: r}\n"
 
 
 @pytest.mark.parametrize("command", ["run", "nightly"])
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("- {id: [red]x[/nope]}", ":1:12: "),
-        (MINE.replace("mujoco", "mujocoo"), ":1:35: [0].engine: no engine matches 'mujocoo'; did you mean"),
+        ("- {id: [red]x[/nope]}", ":1:13: "),
+        (MINE.replace("mujoco", "mujocoo"), ":1:38: [0].engine: no engine matches 'mujocoo'; did you mean"),
         (None, "cannot be read: No such file"),
         (MINE.replace("mine", "conical-is-unstable"), "id: 'conical-is-unstable' is in another file too"),
     ],
