@@ -466,7 +466,7 @@ def test_a_light_body_among_heavy_ones_is_solved_less_sharply():
     n, _ = int(rng.integers(1, 9)), rng.choice(3)
     rods, rate = list(rng.random(n) < 0.4), float(rng.choice([0.5, 2, 10]))
     loads, _ = rng.random() < 0.5, rng.random()
-    model, state = random_chain(rng, rods, decades=3, rate=rate, loads=bool(loads))
+    model, state = random_chain(rng, rods, mass_decades=3, rate=rate, loads=bool(loads))
     assert np.max(model.mass) > 1e2 * np.min(model.mass)
     (held,) = (
         h for h in check_run_relations(exudyn_adapter()(), model, state) if h.relation == "reversed in time"

@@ -48,7 +48,7 @@ def test_equals_the_direct_form_within_the_derived_bound(mix):
     rng = np.random.default_rng(20)
     for _ in range(12):
         drawn = [
-            random_chain(rng, JOINT_MIXES[mix](rng, n), decades=1.0, loads=True, drag=True)
+            random_chain(rng, JOINT_MIXES[mix](rng, n), mass_decades=1.0, loads=True, drag=True)
             for n in rng.integers(1, 11, size=4)
         ]
         forest = StructuredSystem([model for model, _ in drawn])

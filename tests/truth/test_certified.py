@@ -35,7 +35,7 @@ def max_difference(enclosure, other):
 @pytest.mark.parametrize("rods", JOINT_PATTERNS, ids=str)
 @pytest.mark.parametrize("loads", [False, True])
 def test_the_notes_full_system_at_fifty_digits_agrees(rods, loads):
-    model, state = random_chain(np.random.default_rng(3), rods, decades=1, loads=loads, drag=loads)
+    model, state = random_chain(np.random.default_rng(3), rods, mass_decades=1, loads=loads, drag=loads)
     balls, other = enclose_quantities(model, state, 250), notes_solution(model, state)
     for quantity, value in other.items():
         assert max_difference(balls[quantity], value) < 1e-44 * balls["scale"][quantity], quantity
@@ -75,7 +75,7 @@ def test_kanes_equations_agree_for_rods_in_every_direction():
 
 
 def test_enclosures_contain_the_results_of_a_higher_precision():
-    model, state = random_chain(np.random.default_rng(7), [0, 1, 0, 0, 1], decades=2)
+    model, state = random_chain(np.random.default_rng(7), [0, 1, 0, 0, 1], mass_decades=2)
     coarse, fine = enclose_quantities(model, state, 120, True), enclose_quantities(model, state, 500, True)
     for quantity in set(coarse) - {"scale"}:
         for x, y in zip(np.ravel(coarse[quantity]), np.ravel(fine[quantity]), strict=True):
@@ -83,7 +83,7 @@ def test_enclosures_contain_the_results_of_a_higher_precision():
 
 
 def test_precision_rises_until_the_radius_is_small():
-    model, state = random_chain(np.random.default_rng(1), [0] * 6, decades=3)
+    model, state = random_chain(np.random.default_rng(1), [0] * 6, mass_decades=3)
     answer = certify_state(model, state, bits=60)
     assert answer.bits > 60
     assert answer.radius["acceleration"] <= MAX_RELATIVE_RADIUS * max(

@@ -47,7 +47,7 @@ def error_ratios(said, true, bound):
 @pytest.mark.parametrize("units", [(0.3, 1, 1), (1, 7e3, 1), (1, 1, 60.1), (39.37, 2.2046, 1e-3)], ids=str)
 def test_relative_bounds_are_independent_of_units(rods, units):
     length, mass, second = units
-    model, state = random_chain(np.random.default_rng(2), rods, decades=1, loads=True, drag=True)
+    model, state = random_chain(np.random.default_rng(2), rods, mass_decades=1, loads=True, drag=True)
     force = mass * length / second**2
     unit = {
         "acceleration": length / second**2,
@@ -104,7 +104,9 @@ def check_errors_within_bound(name, count):
         if name == "reference-printed":  # the notes print one and two bodies on rods
             n = 1 + n % 2
             rods = [1] * n
-        model, state = random_chain(rng, rods, decades=rng.uniform(0, 3), rate=10 ** rng.uniform(-1, 1.3))
+        model, state = random_chain(
+            rng, rods, mass_decades=rng.uniform(0, 3), rate=10 ** rng.uniform(-1, 1.3)
+        )
         try:
             said = engine.evaluate(model, [state])[0]
         except Unsupported:
@@ -436,7 +438,7 @@ def test_the_bound_is_its_definition(rods, welded):
         *((0.0, 1.0, 0.0, 1.0), (1.0, 1.0, 1.0, 1.0), (30.0, 1.0, 1.0, 1.0)),
         *((1.0, 0.0, 1e3, 1.0), (3.0, 1e-3, 0.0, 1.0), (3.0, 1.0, 1.0, 1e-4), (0.1, 1.0, 30.0, 1e-2)),
     ):
-        model, state = random_chain(rng, rods, decades=1, rate=rate, loads=True, drag=True)
+        model, state = random_chain(rng, rods, mass_decades=1, rate=rate, loads=True, drag=True)
         model = replace(
             model,
             gravity=gravity * model.gravity,
