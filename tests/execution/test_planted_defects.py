@@ -5,7 +5,7 @@ was written; the defects here that must *not* be named came after it.
 """
 
 import zlib
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import cache
 from unittest.mock import patch
@@ -25,6 +25,7 @@ from plumbline.truth.ground_truth import motion_truth, state_truth
 from tests.helpers import pendulums
 from tests.helpers.pendulums import JOINT_PATTERNS
 from tests.helpers.planted_defects import (
+    CONTROLS,
     DEFECTS,
     MOTION_DEFECTS,
     PAIRS,
@@ -34,6 +35,7 @@ from tests.helpers.planted_defects import (
     field,
     model_change,
     plant,
+    relifted,
 )
 
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
@@ -47,13 +49,24 @@ TIMES = np.linspace(0, 2, 17)
 def subject(joints, loaded):
     """A generic pendulum, random states of it and their certified truth."""
     model = pendulums.make_model(JOINT_PATTERNS[joints], loads=loaded, drag=loaded)
-    return model, state_truth(model, random_states(model, STATES, seed=1))
+    return model, state_truth(model, [*random_states(model, STATES, seed=1), *identity_states(model)])
+
+
+def identity_states(model):
+    """Two states with the identity attitude: of one body, and of all."""
+    *_, first, second = random_states(model, 2, seed=3)
+    identity = np.array([1.0, 0, 0, 0])
+    odd = np.where(np.arange(model.n)[:, None] % 2, second.p, identity)
+    return [
+        relifted(model, first, p=odd),
+        relifted(model, second, p=np.tile(identity, (model.n, 1))),
+    ]
 
 
 @cache
-def motion():
+def motion(loaded=False):
     """A slow tumble whose every mistake shows within two seconds."""
-    model = pendulums.make_model(JOINT_PATTERNS["balls"])
+    model = pendulums.make_model(JOINT_PATTERNS["balls"], loads=loaded, drag=loaded)
     state = pendulums.state_from_seed(model, seed=2, rate=0.5)
     return model, state, motion_truth(model, state, TIMES, None)
 
@@ -63,7 +76,8 @@ def planted(defect, model):
     """The real engine with the defect in it."""
     engine = plant(type(load_adapter(defect.engine)), defect)
     if defect.gamma is None:
-        yield engine
+        with defect.inside() if defect.inside else nullcontext():
+            yield engine
         return
     bent = type("BentHere", (Bent,), {"model": model, "defect": staticmethod(defect.gamma)})
     with patch("adapters.reference_engine.DirectSystem", bent):
@@ -85,11 +99,10 @@ def state_report(defect):
 @cache
 def motion_report(defect):
     """Rows about motion that do not agree; an unresolved cell that no file excuses fails a run, too."""
-    model, state, truth = motion()
-    engine = plant(type(load_adapter(defect.engine)), defect)
-    integrator = engine.integrator(defect.integrator)
-    steps = refinement_resolutions(integrator, model.n, float(TIMES[-1]))
-    with patch("plumbline.engines.calls.load_adapter", lambda _: engine):
+    model, state, truth = motion(defect.loaded)
+    with planted(defect, model) as engine, patch("plumbline.engines.calls.load_adapter", lambda _: engine):
+        integrator = engine.integrator(defect.integrator)
+        steps = refinement_resolutions(integrator, model.n, float(TIMES[-1]))
         runs = run_refinement(defect.engine, integrator.name, model, state, TIMES, steps)
     who = RowContext("planted", "planted", defect.name, defect.name, "0")
     rows = judge_trajectory(who, model, truth, integrator, runs).rows
@@ -101,8 +114,8 @@ def ids(defects):
 
 
 def test_the_list_is_long_enough_and_each_defect_has_its_own_name():
-    assert len(DEFECTS) >= 40 and len({d.name for d in DEFECTS}) == len(DEFECTS)
-    assert sum(bool(d.named) for d in DEFECTS) >= 30
+    assert len(DEFECTS) >= 134 and len(CONTROLS) >= 20 and len({d.name for d in DEFECTS}) == len(DEFECTS)
+    assert sum(bool(d.named) for d in DEFECTS) >= 100
 
 
 @pytest.mark.parametrize("defect", **ids(STATE_DEFECTS))
@@ -125,6 +138,12 @@ def test_the_same_engine_without_defect_is_not_reported():
         for engine in ("mujoco", "pinocchio", "exudyn", "reference"):
             wrong, text = state_report(replace(clean, joints=joints, loaded=loaded, engine=engine))
             assert not wrong, f"{engine} on {joints}: {wrong}, {text}"
+
+
+@pytest.mark.parametrize("defect", **ids(CONTROLS))
+def test_an_equivalent_implementation_is_not_accused(defect):
+    wrong, text = state_report(defect)
+    assert not wrong, text
 
 
 @pytest.mark.parametrize(("defect", "both"), PAIRS, ids=[d.name for d, _ in PAIRS])

@@ -7,15 +7,23 @@ them need only be reported.  Indices in names count from 1, as in the results.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Literal
+from unittest.mock import patch
 
 import numpy as np
 
 from plumbline.engines.adapter import Adapter
 from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, Trajectory
-from plumbline.model.kinematics import quaternion_conjugate, rotation_matrix, state_from_minimal
+from plumbline.model.kinematics import (
+    quaternion_conjugate,
+    quaternion_product,
+    rotation_matrix,
+    state_from_minimal,
+)
 from reference_impl.direct import DirectSystem, Solution
 from reference_impl.euler_parameters import angular_velocity
 
@@ -26,7 +34,7 @@ Run = Callable[[Callable[..., Trajectory], Model, State, Array, Integrator, floa
 
 @dataclass(frozen=True)
 class Defect:
-    """One planted defect. Exactly one of inputs, answers, gamma and run is given."""
+    """One planted defect. Exactly one of inputs, answers, gamma, run and inside is given."""
 
     name: str
     size: str  # in words and numbers
@@ -40,6 +48,7 @@ class Defect:
     gamma: Callable[[Model, State], Array] | None = None  # (c,) added to γ, on the reference
     run: Run | None = None
     integrator: str = "RK4"
+    inside: Callable[[], AbstractContextManager[Any]] | None = None  # alters the engine's own model
 
 
 def plant(real: type[Adapter], defect: Defect) -> Adapter:
@@ -211,6 +220,11 @@ def stale(*names: str) -> Answers:
     return alter
 
 
+def spins(model: Model, state: State) -> Array:
+    """J ω′ of each body (N, 3)."""
+    return np.asarray((model.inertia @ state.omega[..., None])[..., 0])
+
+
 def spin_part(model: Model, state: State) -> Array:
     """½ ω′·J ω′ summed (J)."""
     return np.asarray(0.5 * np.einsum("ki,kij,kj", state.omega, model.inertia, state.omega))
@@ -313,6 +327,202 @@ def early_stop(
 def damped(simulate: Any, model: Model, state: State, times: Array, i: Integrator, h: float) -> Trajectory:
     """Drag of 1e-6 N m s on every body."""
     return simulate(replace(model, drag_moment=model.drag_moment + 1e-6), state, times, i, h)
+
+
+# --- of one body, or in a rare branch ------------------------------------------------------------
+
+
+def only(k: int, right: Array, wrong: Array) -> Array:
+    """Row k of the second, the other rows of the first."""
+    out = np.array(right)
+    out[k] = wrong[k]
+    return out
+
+
+def load_of(k: int, **change: Callable[[Model, State], Array]) -> Inputs:
+    """Fields of the model replaced in the row of one body."""
+    return model_change(lambda m, s: {name: only(k, getattr(m, name), f(m, s)) for name, f in change.items()})
+
+
+def state_of(k: int, **change: Callable[[Model, State], Array]) -> Inputs:
+    """Minimal coordinates of one body replaced."""
+    return lambda m, s: (m, relifted(m, s, **{x: only(k, getattr(s, x), f(m, s)) for x, f in change.items()}))
+
+
+def answer_of(k: int, name: str, change: Callable[[Model, State, Array], Array]) -> Answers:
+    """One quantity of one body altered in each answer."""
+    return field(name, lambda m, s, x: only(k, x, change(m, s, x)))
+
+
+def provided(condition: Callable[[Model, State], bool], change: Inputs) -> Inputs:
+    """A change in a branch that is rarely taken."""
+    return lambda m, s: change(m, s) if condition(m, s) else (m, s)
+
+
+def moment_added(extra: Callable[[Model, State], Array], *bodies: int) -> Inputs:
+    """A moment (N, 3) in body axes on some bodies, or on all."""
+
+    def change(model: Model, state: State) -> dict[str, Array]:
+        on = np.isin(np.arange(model.n), bodies)[:, None] if bodies else True
+        return {"moment": model.moment + np.where(on, extra(model, state), 0.0)}
+
+    return model_change(change)
+
+
+def acting_at(point: str, force: Callable[[Model, State], Array]) -> Callable[[Model, State], Array]:
+    """s × Aᵀ F: the moment of a world force that acts at a point of the body."""
+    return lambda m, s: np.cross(getattr(m, point), body(s, force(m, s)))
+
+
+def relative_attitudes(_: Model, state: State) -> Array:
+    """Attitudes relative to the body before: q₁* q₂."""
+    before = np.concatenate([[[1.0, 0, 0, 0]], state.p[:-1]])
+    return unit(quaternion_product(quaternion_conjugate(before), state.p))
+
+
+def product_reversed(model: Model, state: State) -> Array:
+    """q₁ and q₁* q₂ multiplied in the other order."""
+    before = np.concatenate([[[1.0, 0, 0, 0]], state.p[:-1]])
+    return unit(quaternion_product(relative_attitudes(model, state), before))
+
+
+def relative_rates(_: Model, state: State) -> Array:
+    """ω′ relative to the body before, in the body's own frame."""
+    absolute = world(state, state.omega)
+    return state.omega - body(state, np.concatenate([np.zeros((1, 3)), absolute[:-1]]))
+
+
+def drag_moment_from(rate: Callable[[Model, State], Array]) -> Inputs:
+    """−c_r times another rate."""
+    return model_change(
+        lambda m, s: {"drag_moment": 0 * m.drag_moment,
+                      "moment": m.moment - m.drag_moment[:, None] * rate(m, s)}
+    )  # fmt: skip
+
+
+def drag_force_from(velocity: Callable[[Model, State], Array]) -> Inputs:
+    """−c_t times another velocity."""
+    return model_change(
+        lambda m, s: {"drag_force": 0 * m.drag_force,
+                      "force": m.force - m.drag_force[:, None] * velocity(m, s)}
+    )  # fmt: skip
+
+
+def proximal_velocity(model: Model, state: State) -> Array:
+    """Velocity of each body's proximal point."""
+    return state.v + world(state, np.cross(state.omega, model.proximal))
+
+
+def one_inertia(k: int, change: Callable[[Model, State], Array]) -> Inputs:
+    """The inertia of one body replaced."""
+    return load_of(k, inertia=change)
+
+
+def stale_state(*names: str) -> Inputs:
+    """Minimal coordinates of the state before; of the first state its own."""
+    last: list[State] = []
+
+    def alter(model: Model, state: State) -> tuple[Model, State]:
+        before = last[-1] if last and last[-1].p.shape == state.p.shape else state
+        last[:] = [state]
+        return model, relifted(model, state, **{name: getattr(before, name) for name in names})
+
+    return alter
+
+
+def stale_of(k: int, name: str) -> Answers:
+    """One body's row still holds what it was at the state before."""
+
+    def alter(_: Model, __: list[State], said: list[StateQuantities]) -> list[StateQuantities]:
+        before = [said[-1], *said[:-1]]
+        return [
+            replace(a, **{name: only(k, getattr(a, name), getattr(b, name))})
+            for a, b in zip(said, before, strict=True)
+        ]
+
+    return alter
+
+
+def at_identity(k: int) -> Callable[[Model, State], bool]:
+    """Whether a body has the identity attitude."""
+    return lambda _, state: bool(abs(state.p[k, 0]) == 1.0)
+
+
+def rod_bend_after_balls(model: Model, state: State) -> Array:
+    """−(−2 ḋᵀḋ) of the rods that follow a ball joint, in the layout of `Bent`: 3 rows a ball, 1 a rod."""
+    rows, before = [], False
+    for k, rod in enumerate(model.rods):
+        after_ball = bool(rod) and k > 0 and not before
+        before = bool(rod)
+        bend = 2 * model.length[k] ** 2 * np.sum(state.udot[k] ** 2)
+        rows += [bend * after_ball] if rod else [0.0] * 3
+    return np.array(rows)
+
+
+def proximal_bend(k: int) -> Callable[[Model, State], Array]:
+    """−(what ω × (ω × s) of body k gives to γ of its own ball joint)."""
+
+    def defect(model: Model, state: State) -> Array:
+        bent = world(state, np.cross(state.omega, np.cross(state.omega, model.proximal)))
+        return np.where(np.arange(model.n)[:, None] == k, bent, 0.0).ravel()
+
+    return defect
+
+
+def noise_growing(base: float, size: float) -> Callable[[Model, State, Array], Array]:
+    """Relative noise that depends on every bit of the state and grows from body to body."""
+
+    def noisy(model: Model, state: State, x: Array) -> Array:
+        bits = state.p.tobytes() + state.omega.tobytes() + model.gravity.tobytes()
+        rng = np.random.default_rng(zlib.crc32(bits))
+        return np.asarray(x * (1 + size * base ** np.arange(len(x))[:, None] * rng.normal(size=x.shape)))
+
+    return noisy
+
+
+@contextmanager
+def mujoco_armature(*values: float) -> Iterator[None]:
+    """Armature of the ball joints, one value each or one for all."""
+    from adapters import mujoco_engine
+
+    real = mujoco_engine._MujocoChain.__init__
+
+    def build(self: Any, *args: Any, **options: Any) -> None:
+        real(self, *args, **options)
+        self.m.dof_armature[:] = np.repeat(values, 3) if len(values) > 1 else values[0]
+
+    with patch.object(mujoco_engine._MujocoChain, "__init__", build):
+        yield
+
+
+@contextmanager
+def mujoco_damping(value: float) -> Iterator[None]:
+    """Viscous damping in every joint."""
+    from adapters import mujoco_engine
+
+    real = mujoco_engine._MujocoChain.__init__
+
+    def build(self: Any, *args: Any, **options: Any) -> None:
+        real(self, *args, **options)
+        self.m.dof_damping[:] = value
+
+    with patch.object(mujoco_engine._MujocoChain, "__init__", build):
+        yield
+
+
+@contextmanager
+def pinocchio_armature(value: float) -> Iterator[None]:
+    """Armature of every joint."""
+    from adapters import pinocchio_engine
+
+    real = pinocchio_engine.PinocchioChain.__init__
+
+    def build(self: Any, *args: Any, **options: Any) -> None:
+        real(self, *args, **options)
+        self.model.armature = np.full(self.model.nv, value)
+
+    with patch.object(pinocchio_engine.PinocchioChain, "__init__", build):
+        yield
 
 
 M, P, E, R = "mujoco", "pinocchio", "exudyn", "reference"
@@ -432,6 +642,210 @@ STATE_DEFECTS = (
            answers=field("acceleration", lambda _, __, a: single(a))),
 )  # fmt: skip
 
+# Of a single body, a single load, a rare branch: committed before any mechanism that names them.
+BODY_DEFECTS = (
+    # loads
+    Defect("force-2-dropped", "F of body 2 × 0", ("applied force of body 2",), M, loaded=True,
+           inputs=load_of(1, force=lambda m, _: 0 * m.force)),
+    Defect("force-1-0.1-percent", "F of body 1 × 1.001", ("applied force of body 1",), P, "rods", loaded=True,
+           inputs=load_of(0, force=lambda m, _: 1.001 * m.force)),
+    Defect("force-2-sign", "F of body 2 × -1", ("applied force of body 2",), E, loaded=True,
+           inputs=load_of(1, force=lambda m, _: -m.force)),
+    Defect("force-x-of-2-dropped", "F_x of body 2 = 0", ("applied force x of body 2",), P, loaded=True,
+           inputs=parameter("force", 1, 0, times=0.0)),
+    Defect("moment-1-dropped", "n′ of body 1 × 0", ("applied moment of body 1",), E, loaded=True,
+           inputs=load_of(0, moment=lambda m, _: 0 * m.moment)),
+    Defect("moment-2-doubled", "n′ of body 2 × 2", ("applied moment of body 2",), P, "rod-ball", loaded=True,
+           inputs=load_of(1, moment=lambda m, _: 2 * m.moment)),
+    Defect("moment-1-sign", "n′ of body 1 × -1", ("applied moment of body 1",), M, "rods", loaded=True,
+           inputs=load_of(0, moment=lambda m, _: -m.moment)),
+    Defect("moment-z-of-1-dropped", "n′_z of body 1 = 0", ("applied moment z of body 1",), M, loaded=True,
+           inputs=parameter("moment", 0, 2, times=0.0)),
+    Defect("loads-2-dropped", "F and n′ of body 2 × 0", ("applied loads of body 2",), M, loaded=True,
+           inputs=load_of(1, force=lambda m, _: 0 * m.force, moment=lambda m, _: 0 * m.moment)),
+    Defect("loads-3-dropped", "F and n′ of body 3 of five × 0", ("applied loads of body 3",), P, "mixed",
+           loaded=True,
+           inputs=load_of(2, force=lambda m, _: 0 * m.force, moment=lambda m, _: 0 * m.moment)),
+    Defect("load-where-none-is", "F_y of body 1 = 1e-5 N", ("applied force y of body 1",), E,
+           inputs=parameter("force", 0, 1, by=1e-5)),
+    Defect("force-1-in-body-frame", "A F of body 1", ("force of body 1 were taken in the body frame",), P,
+           loaded=True, inputs=load_of(0, force=lambda m, s: world(s, m.force))),
+    Defect("moment-2-in-world-frame", "Aᵀ n′ of body 2", ("moment of body 2 were taken in the world frame",),
+           M, loaded=True, inputs=load_of(1, moment=lambda m, s: body(s, m.moment))),
+    Defect("force-turned-back", "Aᵀ F in place of F", ("applied force were rotated with Aᵀ",), E, loaded=True,
+           inputs=model_change(lambda m, s: {"force": body(s, m.force)})),
+    Defect("moment-turned-twice", "A n′ in place of n′", ("applied moment were rotated with A",), P,
+           loaded=True, inputs=model_change(lambda m, s: {"moment": world(s, m.moment)})),
+    Defect("loads-exchanged", "F of the other body", ("applied force of another body",), M, loaded=True,
+           inputs=model_change(lambda m, _: {"force": m.force[::-1]})),
+    Defect("force-1-at-proximal", "F of body 1 at its proximal point",
+           ("force of body 1 acted at its proximal point",), P, loaded=True,
+           inputs=moment_added(acting_at("proximal", lambda m, _: m.force), 0)),
+    Defect("forces-at-proximal", "all F at the proximal points", ("force acted at the proximal point",), M,
+           "rods", loaded=True, inputs=moment_added(acting_at("proximal", lambda m, _: m.force))),
+    Defect("force-1-at-distal", "F of body 1 at its distal point",
+           ("force of body 1 acted at its distal point",), E, loaded=True,
+           inputs=moment_added(acting_at("distal", lambda m, _: m.force), 0)),
+    Defect("weight-2-at-proximal", "weight of body 2 at its proximal point",
+           ("weight of body 2 acted at its proximal point",), M,
+           inputs=moment_added(acting_at("proximal", lambda m, _: m.mass[:, None] * m.gravity), 1)),
+    Defect("weight-at-distal", "all weights at the distal points", ("weight acted at the distal point",), P,
+           inputs=moment_added(acting_at("distal", lambda m, _: m.mass[:, None] * m.gravity))),
+    # drag
+    Defect("drag-force-2-dropped", "c_t of body 2 × 0", ("drag force of body 2",), M, loaded=True,
+           inputs=parameter("drag_force", 1, times=0.0)),
+    Defect("drag-force-1-1e-6", "c_t of body 1 × (1 + 1e-6)", ("drag force of body 1",), P, loaded=True,
+           inputs=parameter("drag_force", 0, times=1 + 1e-6)),
+    Defect("drag-moment-1-dropped", "c_r of body 1 × 0", ("drag moment of body 1",), E, loaded=True,
+           inputs=parameter("drag_moment", 0, times=0.0)),
+    Defect("drag-moment-2-sign", "c_r of body 2 × -1", ("drag moment of body 2",), P, "rods", loaded=True,
+           inputs=parameter("drag_moment", 1, times=-1.0)),
+    Defect("drag-2-doubled", "c_t and c_r of body 2 × 2", ("drag of body 2",), M, loaded=True,
+           inputs=load_of(1, drag_force=lambda m, _: 2 * m.drag_force,
+                          drag_moment=lambda m, _: 2 * m.drag_moment)),
+    Defect("drag-exchanged", "c_t for c_r", ("c_t and c_r were exchanged",), M, loaded=True,
+           inputs=model_change(lambda m, _: {"drag_force": m.drag_moment, "drag_moment": m.drag_force})),
+    Defect("drag-2-exchanged", "c_t for c_r of body 2", ("c_t and c_r of body 2 were exchanged",), P,
+           loaded=True, inputs=load_of(1, drag_force=lambda m, _: m.drag_moment,
+                                       drag_moment=lambda m, _: m.drag_force)),
+    Defect("drag-ct-for-cr", "c_t used for both", ("c_t were used as c_r",), E, loaded=True,
+           inputs=model_change(lambda m, _: {"drag_moment": m.drag_force})),
+    Defect("drag-force-in-body-frame", "-c_t Aᵀ ṙ", ("drag force were taken in the body frame",), M,
+           loaded=True, inputs=drag_force_from(lambda _, s: body(s, s.v))),
+    Defect("drag-moment-in-world-frame", "-c_r A ω′", ("drag moment were taken in the world frame",), P,
+           loaded=True, inputs=drag_moment_from(lambda _, s: world(s, s.omega))),
+    Defect("drag-of-proximal-velocity", "-c_t times the velocity of the proximal point",
+           ("velocity of the proximal point",), E, loaded=True, inputs=drag_force_from(proximal_velocity)),
+    Defect("drag-at-proximal", "-c_t ṙ at the proximal point",
+           ("drag force acted at the proximal point",), M, loaded=True,
+           inputs=moment_added(acting_at("proximal", lambda m, s: -m.drag_force[:, None] * s.v))),
+    Defect("damping-of-body-2", "c_r of body 2 by 1e-6 N m s", ("rotation of body 2",), P,
+           inputs=parameter("drag_moment", 1, by=1e-6)),
+    Defect("joint-damping", "1e-4 N m s in every joint", ("damping in every joint", "damping in the joints"),
+           M, inside=lambda: mujoco_damping(1e-4)),
+    Defect("armature", "1e-4 kg m² in every joint", ("armature",), M, inside=lambda: mujoco_armature(1e-4)),
+    Defect("armature-of-joint-2", "1e-6 kg m² in joint 2", ("armature of joint 2",), M,
+           inside=lambda: mujoco_armature(0.0, 1e-6)),
+    Defect("armature-of-three-percent", "1e-3 kg m² in every joint", ("armature",), P,
+           inside=lambda: pinocchio_armature(1e-3)),
+    # velocity terms
+    Defect("gyroscopic-1-dropped", "ω′ × J ω′ of body 1 × 0", ("gyroscopic term of body 1",), P,
+           inputs=moment_added(gyroscopic, 0)),
+    Defect("gyroscopic-2-dropped", "ω′ × J ω′ of body 2 × 0", ("gyroscopic term of body 2",), E, "rods",
+           inputs=moment_added(gyroscopic, 1)),
+    Defect("gyroscopic-2-sign", "ω′ × J ω′ of body 2 × -1", ("gyroscopic term of body 2",), M, "rod-ball",
+           inputs=moment_added(lambda m, s: 2 * gyroscopic(m, s), 1)),
+    Defect("gyroscopic-1-1e-6", "ω′ × J ω′ of body 1 × (1 + 1e-6)", ("gyroscopic term of body 1",), M,
+           inputs=moment_added(lambda m, s: -1e-6 * gyroscopic(m, s), 0)),
+    Defect("gamma-2-proximal-dropped", "ω × (ω × s) of body 2 missing in γ",
+           ("proximal term of γ of body 2",), R, gamma=proximal_bend(1)),
+    # attitude, rates, inertia and points of one body
+    Defect("attitude-2-conjugated", "q* of body 2", ("rotation matrix of body 2 were transposed",), M,
+           inputs=state_of(1, p=lambda _, s: quaternion_conjugate(s.p))),
+    Defect("attitude-1-conjugated", "q* of body 1", ("rotation matrix of body 1 were transposed",), E, "rods",
+           inputs=state_of(0, p=lambda _, s: quaternion_conjugate(s.p))),
+    Defect("attitude-3-conjugated", "q* of body 3 of five", ("rotation matrix of body 3 were transposed",), P,
+           "mixed", inputs=state_of(2, p=lambda _, s: quaternion_conjugate(s.p))),
+    Defect("product-order-2", "(q₁* q₂) q₁ for q₂", ("quaternion product of body 2",), P,
+           inputs=state_of(1, p=product_reversed)),
+    Defect("relative-attitude-2", "q₁* q₂ for q₂", ("attitude of body 2 relative to",), E,
+           inputs=state_of(1, p=relative_attitudes)),
+    Defect("relative-rate-2", "ω′ relative to body 1 for body 2", ("angular velocity of body 2 relative to",),
+           M, inputs=state_of(1, omega=relative_rates)),
+    Defect("quaternion-order-1", "(x, y, z, w) of body 1", ("quaternion order of body 1",), M,
+           inputs=state_of(0, p=lambda _, s: np.roll(s.p, -1, axis=1))),
+    Defect("world-rate-2", "A ω′ of body 2", ("world-frame angular velocity of body 2",), P,
+           inputs=state_of(1, omega=lambda _, s: world(s, s.omega))),
+    Defect("rate-2-1e-6", "ω′ of body 2 × (1 + 1e-6)", ("angular rate ω′ of body 2",), E,
+           inputs=state_of(1, omega=lambda _, s: (1 + 1e-6) * s.omega)),
+    Defect("rod-rate-2-dropped", "u̇ of rod 2 = 0", ("rod rate u̇ of rod 2",), M, "rods",
+           inputs=state_of(1, udot=lambda _, s: 0 * s.udot)),
+    Defect("inertia-2-in-world-axes", "A J Aᵀ of body 2", ("inertia of body 2 in world axes",), P,
+           inputs=one_inertia(1, lambda m, s: (lambda x: (x + x.mT) / 2)(
+               rotation_matrix(s.p).mT @ m.inertia @ rotation_matrix(s.p)))),
+    Defect("inertia-1-about-proximal", "J + m (s² I - s sᵀ) of body 1",
+           ("inertia of body 1 about the proximal point",), M,
+           inputs=one_inertia(0, lambda m, s: about_proximal(m, s)["inertia"])),
+    Defect("products-2-dropped", "products of inertia of body 2 = 0", ("products of inertia of body 2",), E,
+           inputs=one_inertia(1, lambda m, _: m.inertia * np.eye(3))),
+    Defect("products-1-sign", "products of inertia of body 1 × -1", ("products of inertia of body 1",), P,
+           inputs=one_inertia(0, lambda m, _: m.inertia * (2 * np.eye(3) - 1))),
+    Defect("points-1-exchanged", "proximal and distal of body 1", ("proximal and distal points of body 1",),
+           M, inputs=load_of(0, proximal=lambda m, _: m.distal, distal=lambda m, _: m.proximal)),
+    Defect("points-1-sign", "proximal and distal of body 1 × -1", ("attachment points of body 1",), P,
+           inputs=load_of(0, proximal=lambda m, _: -m.proximal, distal=lambda m, _: -m.distal)),
+    Defect("mass-and-inertia-2", "mass and inertia of body 2 × (1 + 1e-5)", ("mass and inertia of body 2",),
+           M, inputs=load_of(1, mass=lambda m, _: (1 + 1e-5) * m.mass,
+                             inertia=lambda m, _: (1 + 1e-5) * m.inertia)),
+    # answers of one body
+    Defect("acceleration-1-stale", "r̈ of body 1 of the state before", ("of body 1 of the previous state",), M,
+           answers=stale_of(0, "acceleration")),
+    Defect("reaction-2-stale", "F of body 2 of the state before", ("of body 2 of the previous state",), P,
+           "rods", answers=stale_of(1, "joint_reaction")),
+    Defect("angular-1-for-2", "ω̇′ of body 1 for that of body 2", ("angular acceleration of body 1 as that",),
+           E, answers=field("angular_acceleration", lambda _, __, a: a[[0, 0]])),
+    Defect("acceleration-4-for-3", "r̈ of body 4 for that of body 3 of five",
+           ("acceleration of body 4 as that of body 3",), P, "mixed",
+           answers=field("acceleration", lambda _, __, a: a[[0, 1, 3, 3, 4]])),
+    Defect("reaction-2-sign", "-F of body 2", ("joint reaction of body 2 with the opposite sign",), M,
+           answers=answer_of(1, "joint_reaction", lambda _, __, f: -f)),
+    Defect("angular-2-in-world", "A ω̇′ of body 2", ("angular acceleration of body 2 in the world frame",), P,
+           answers=answer_of(1, "angular_acceleration", lambda _, s, a: world(s, a))),
+    Defect("reaction-1-in-body", "Aᵀ F of body 1", ("joint reaction of body 1 in the body frame",), E,
+           answers=answer_of(0, "joint_reaction", lambda _, s, f: body(s, f))),
+    Defect("reaction-without-loads", "reaction that balances inertia and weight only",
+           ("joint reaction without the applied forces",), M, loaded=True,
+           answers=field("joint_reaction",
+                         lambda m, _, f: f + np.cumsum(m.force[::-1], axis=0)[::-1])),
+    Defect("reaction-without-force-2", "reaction without F of body 2",
+           ("joint reaction without the applied force of body 2",), P, loaded=True,
+           answers=field("joint_reaction", lambda m, _, f: f + m.force[1])),
+    Defect("reaction-without-drag", "reaction without -c_t ṙ", ("joint reaction without the drag forces",), E,
+           loaded=True, answers=field("joint_reaction", lambda m, s, f: f - np.cumsum(
+               (m.drag_force[:, None] * s.v)[::-1], axis=0)[::-1])),
+    Defect("kinetic-without-body-2", "T of body 1 alone", ("kinetic energy without body 2",), M,
+           answers=field("kinetic_energy", lambda m, s, e: e - float(0.5 * m.mass[1] * s.v[1] @ s.v[1]
+                         + 0.5 * s.omega[1] @ m.inertia[1] @ s.omega[1]))),
+    Defect("potential-without-body-1", "V of body 2 alone", ("potential energy without body 1",), P,
+           answers=field("potential_energy", lambda m, s, e: e + float(m.mass[0] * m.gravity @ s.r[0]))),
+    Defect("momentum-spin-in-body-axes", "J ω′ not turned into the world", ("spin in body axes",), E,
+           answers=field("angular_momentum", lambda m, s, x: x + np.sum(
+               spins(m, s) - world(s, spins(m, s)), axis=0))),
+    # rare branches
+    Defect("n3-gyroscopic", "ω′ × J ω′ of body 3 dropped where N ≥ 3", ("gyroscopic term of body 3",), M,
+           "mixed", inputs=provided(lambda m, _: m.n >= 3, moment_added(gyroscopic, 2))),
+    Defect("rod-after-ball-length", "rods after balls longer by 1e-6", ("length of rod 4",), P, "mixed",
+           inputs=parameter("length", 3, times=1 + 1e-6)),
+    Defect("rod-after-ball-gamma", "γ of rods after balls without ḋᵀḋ", ("rod term of γ of rod 4",), R,
+           "mixed", gamma=rod_bend_after_balls),
+    Defect("loaded-mass", "mass of body 1 × (1 + 1e-5) where there is a load", ("mass of body 1",), E,
+           loaded=True,
+           inputs=provided(lambda m, _: m.has_loads, parameter("mass", 0, times=1 + 1e-5))),
+    Defect("loaded-gravity", "no gravity where there is a load", ("no gravity", "gravity's size"), M,
+           loaded=True, inputs=provided(lambda m, _: m.has_loads, model_change(
+               lambda m, _: {"gravity": 0 * m.gravity}))),
+    Defect("identity-gyroscopic", "ω′ × J ω′ of body 1 dropped at its identity attitude", (), M,
+           inputs=provided(at_identity(0), moment_added(gyroscopic, 0))),
+    Defect("identity-inertia", "products of inertia dropped at the identity attitude of body 2", (), P,
+           inputs=provided(at_identity(1), model_change(lambda m, _: {"inertia": m.inertia * np.eye(3)}))),
+    Defect("identity-rate-lost", "ω′ of body 1 = 0 at its identity attitude", (), E,
+           inputs=provided(at_identity(0), state_of(0, omega=lambda _, s: 0 * s.omega))),
+    Defect("fast-gyroscopic", "ω′ × J ω′ dropped above 12 rad/s", (), P,
+           inputs=provided(lambda _, s: np.max(np.abs(s.omega)) > 12, moment_added(gyroscopic))),
+    Defect("rod-upward", "u̇ × -1 of rods that point upward", (), M, "rods",
+           inputs=lambda m, s: (m, relifted(m, s, udot=np.where(s.u[:, 2:] > 0, -1.0, 1.0) * s.udot))),
+    Defect("stale-rates", "ω′ of the state before", (), P, inputs=stale_state("omega")),
+    Defect("stale-attitudes", "attitudes of the state before", (), M, inputs=stale_state("p")),
+    # loss of digits
+    Defect("digits-lost-along-chain", "noise of 1e-15 in r̈, ten times as large from body to body",
+           ("loses digits",), M, "balls-10",
+           answers=field("acceleration", noise_growing(10.0, 1e-15))),
+    Defect("digits-of-reactions", "noise of 1e-14 in F, eight times as large from body to body",
+           ("loses digits",), P, "balls-10",
+           answers=field("joint_reaction", noise_growing(8.0, 1e-14))),
+)  # fmt: skip
+STATE_DEFECTS = (*STATE_DEFECTS, *BODY_DEFECTS)
+
 MOTION_DEFECTS = (
     Defect("order-1-named-RK4", "Euler's step under the name RK4", level="motion", run=euler_inside),
     Defect("order-2-named-RK4", "an order-2 step under the name RK4", level="motion", run=richardson_inside),
@@ -454,6 +868,22 @@ MOTION_DEFECTS = (
            run=sampled(lambda run: {"v": run.v[[0, *range(len(run.t) - 1)]]})),
     Defect("gravity-1e-5-in-time", "gravity × (1 + 1e-5)", level="motion",
            inputs=model_change(lambda m, _: {"gravity": m.gravity * (1 + 1e-5)})),
+    Defect("force-2-dropped-in-time", "F of body 2 × 0", level="motion", loaded=True,
+           inputs=load_of(1, force=lambda m, _: 0 * m.force)),
+    Defect("drag-exchanged-in-time", "c_t for c_r", level="motion", loaded=True,
+           inputs=model_change(lambda m, _: {"drag_force": m.drag_moment, "drag_moment": m.drag_force})),
+    Defect("moment-1-at-the-start-only", "n′ of body 1 as it was in world axes at the start", level="motion",
+           loaded=True, engine=P, integrator="rkmk4",
+           inputs=load_of(0, moment=lambda m, s: body(s, m.moment))),
+    Defect("armature-in-time", "1e-4 kg m² in every joint", level="motion",
+           inside=lambda: mujoco_armature(1e-4)),
+    Defect("attitude-2-conjugated-in-time", "q* of body 2 in the samples", level="motion",
+           run=sampled(lambda run: {"p": np.stack(
+               [run.p[:, 0], quaternion_conjugate(run.p[:, 1])], axis=1)})),
+    Defect("row-of-another-body", "ṙ of body 1 for that of body 2", level="motion",
+           run=sampled(lambda run: {"v": run.v[:, [0, 0]]})),
+    Defect("noise-1e-8-in-samples", "positions with noise of 1e-8 m", level="motion",
+           run=sampled(lambda run: {"r": run.r + 1e-8 * np.random.default_rng(5).normal(size=run.r.shape)})),
 )  # fmt: skip
 
 DEFECTS = STATE_DEFECTS + MOTION_DEFECTS
@@ -472,3 +902,172 @@ PAIRS = (
 )  # fmt: skip
 # Seen by nothing where an engine gives accelerations alone: masses and inertias scaled together.
 BLIND = next(d for d in STATE_DEFECTS if d.name == "mass-and-inertia-together")
+
+# --- equivalent implementations, none of which may be accused -------------------------------------
+
+
+def negated(*bodies: int) -> Inputs:
+    """−p for some bodies: the same attitudes."""
+    return lambda m, s: (m, replace(s, p=np.where(np.isin(np.arange(m.n), bodies)[:, None], -s.p, s.p)))
+
+
+def another_frame(q: Array) -> Defect:
+    """Every body described in axes turned by a unit quaternion, the answers turned back."""
+    turn = rotation_matrix(q)
+
+    def inputs(model: Model, state: State) -> tuple[Model, State]:
+        inertia = turn @ model.inertia @ turn.T
+        other = replace(
+            model, inertia=(inertia + inertia.mT) / 2, proximal=model.proximal @ turn.T,
+            distal=model.distal @ turn.T, moment=model.moment @ turn.T,
+        )  # fmt: skip
+        p = unit(quaternion_product(state.p, quaternion_conjugate(q)))
+        return other, state_from_minimal(other, p, state.omega @ turn.T, state.u, state.udot)
+
+    back = field("angular_acceleration", lambda _, __, a: a @ turn)
+    return Defect("", "", inputs=inputs, answers=back)
+
+
+def another_world(q: Array) -> Defect:
+    """Everything in world axes turned by a unit quaternion, the answers turned back."""
+    turn = rotation_matrix(q)
+
+    def inputs(model: Model, state: State) -> tuple[Model, State]:
+        other = replace(model, gravity=turn @ model.gravity, force=model.force @ turn.T)
+        p = unit(quaternion_product(q, state.p))
+        return other, state_from_minimal(other, p, state.omega, state.u @ turn.T, state.udot @ turn.T)
+
+    def back(m: Model, states: list[State], said: list[StateQuantities]) -> list[StateQuantities]:
+        for name in ("acceleration", "joint_reaction", "angular_momentum"):
+            said = field(name, lambda _, __, x: x @ turn)(m, states, said)
+        return said
+
+    return Defect("", "", inputs=inputs, answers=back)
+
+
+def other_units(mass: float, length: float) -> Defect:
+    """The engine computes in other units of mass and length (of time the same)."""
+    m, x = mass, length
+
+    def inputs(model: Model, state: State) -> tuple[Model, State]:
+        factors = {
+            "mass": m, "inertia": m * x * x, "proximal": x, "distal": x, "length": x, "gravity": x,
+            "force": m * x, "moment": m * x * x, "drag_force": m, "drag_moment": m * x * x,
+        }  # fmt: skip
+        other = replace(model, **{name: getattr(model, name) * f for name, f in factors.items()})
+        return other, relifted(other, state)
+
+    def back(model: Model, states: list[State], said: list[StateQuantities]) -> list[StateQuantities]:
+        factors = {
+            "acceleration": x, "joint_reaction": m * x, "kinetic_energy": m * x * x,
+            "potential_energy": m * x * x, "angular_momentum": m * x * x, "mass_matrix": m * x * x,
+        }  # fmt: skip
+        return [
+            replace(a, **{k: getattr(a, k) / f for k, f in factors.items() if getattr(a, k) is not None})
+            for a in said
+        ]
+
+    return Defect("", "", inputs=inputs, answers=back)
+
+
+def no_matrix(_: Model, __: list[State], said: list[StateQuantities]) -> list[StateQuantities]:
+    """The mass matrix belongs to the engine's own coordinates and is not given."""
+    return [replace(a, mass_matrix=None) for a in said]
+
+
+def after(first: Answers | None, second: Answers) -> Answers:
+    """Two changes of the answers in a row."""
+    return lambda m, states, said: second(m, states, first(m, states, said) if first else said)
+
+
+def recomputed_reaction(order: int) -> Callable[[Model, State, StateQuantities], dict[str, Any]]:
+    """Reactions from the accelerations, summed from the free end (1) or as total less the rest (-1)."""
+
+    def change(m: Model, s: State, a: StateQuantities) -> dict[str, Any]:
+        f = m.mass[:, None] * (a.acceleration - m.gravity) - m.force + m.drag_force[:, None] * s.v
+        if order > 0:
+            return {"joint_reaction": np.cumsum(f[::-1], axis=0)[::-1]}
+        return {"joint_reaction": np.sum(f, axis=0) - np.cumsum(f, axis=0) + f}
+
+    return change
+
+
+def recomputed(change: Callable[[Model, State, StateQuantities], dict[str, Any]]) -> Answers:
+    """Quantities recomputed from model, state and the other answers."""
+    return lambda m, states, said: [replace(a, **change(m, s, a)) for s, a in zip(states, said, strict=True)]
+
+
+def sums(order: int) -> Callable[[Model, State, StateQuantities], dict[str, Any]]:
+    """Energies and momentum summed anew, bodies in the given order."""
+
+    def change(m: Model, s: State, _: StateQuantities) -> dict[str, Any]:
+        at = range(m.n)[::order]
+        spin, turned = spins(m, s), world(s, spins(m, s))
+        kinetic = sum(m.mass[k] * (s.v[k] @ s.v[k]) + s.omega[k] @ spin[k] for k in at)
+        return {
+            "kinetic_energy": float(0.5 * kinetic),
+            "potential_energy": float(-sum(m.mass[k] * (m.gravity @ s.r[k]) for k in at)),
+            "angular_momentum": sum(np.cross(s.r[k], m.mass[k] * s.v[k]) + turned[k] for k in at),
+        }
+
+    return change
+
+
+def control(name: str, size: str, engine: str, like: Defect, joints: str = "balls", **kind: Any) -> Defect:
+    """A control with the changes of another defect; its mass matrix is not judged."""
+    answers = after(like.answers, no_matrix)
+    return Defect(name, size, (), engine, joints, inputs=like.inputs, answers=answers, **kind)
+
+
+def euler_twice(_: Model, state: State) -> Array:
+    """Attitudes by way of the rotation matrix."""
+    from scipy.spatial.transform import Rotation
+
+    q = Rotation.from_matrix(rotation_matrix(state.p)).as_quat()
+    return unit(np.roll(q, 1, axis=-1))
+
+
+ANY, HALF = np.array([1.0, -3.0, 2.0, 5.0]) / np.sqrt(39.0), np.array([0.5, 0.5, 0.5, 0.5])
+CONTROLS = (
+    Defect("minus-p-1", "-p of body 1", engine=M, inputs=negated(0)),
+    Defect("minus-p-all", "-p of all bodies", engine=P, joints="rods", inputs=negated(0, 1)),
+    Defect("minus-p-2", "-p of body 2", engine=E, loaded=True, inputs=negated(1)),
+    control("frames-turned", "other body axes", M, another_frame(ANY), loaded=True),
+    control("frames-permuted", "body axes exchanged", P, another_frame(HALF), "rods", loaded=True),
+    control("frames-turned-exudyn", "other body axes", E, another_frame(ANY), "rod-ball"),
+    control("world-turned", "other world axes", M, another_world(ANY), "rods", loaded=True),
+    control("world-permuted", "world axes exchanged", P, another_world(HALF), "balls", loaded=True),
+    control("world-turned-exudyn", "other world axes", E, another_world(ANY), "mixed"),
+    control("grams", "mass in grams", M, other_units(1e3, 1.0), loaded=True),
+    control("millimetres", "length in millimetres", P, other_units(1.0, 1e3), "rods", loaded=True),
+    control("pounds-and-feet", "other units", E, other_units(2.2, 3.3), loaded=True),
+    control("tonnes-and-kilometres", "other units", R, other_units(1e-3, 1e-3), "rod-ball"),
+    Defect("reactions-from-the-end", "F summed from the free end", engine=M, loaded=True,
+           answers=recomputed(recomputed_reaction(1))),
+    Defect("reactions-as-rest", "F as the total less the rest", engine=E, joints="rods", loaded=True,
+           answers=recomputed(recomputed_reaction(-1))),
+    Defect("sums-forward", "energies and momentum summed anew", engine=P, joints="mixed",
+           answers=recomputed(sums(1))),
+    Defect("sums-backward", "energies and momentum summed from the free end", engine=M, joints="mixed",
+           loaded=True, answers=recomputed(sums(-1))),
+    Defect("by-rotation-matrix", "attitudes by way of their matrices", engine=P, loaded=True,
+           inputs=state_of(1, p=euler_twice)),
+    Defect("rates-there-and-back", "ω′ turned into the world and back", engine=E, loaded=True,
+           inputs=state_change(lambda _, s: {"omega": body(s, world(s, s.omega))})),
+    Defect("accelerations-there-and-back", "r̈ turned into body axes and back", engine=M, joints="rods",
+           answers=field("acceleration", lambda _, s, a: world(s, body(s, a)))),
+    Defect("drag-as-load", "drag given as loads", engine=M, loaded=True, inputs=model_change(
+        lambda m, s: {"force": m.force - m.drag_force[:, None] * s.v, "drag_force": 0 * m.drag_force,
+                      "moment": m.moment - m.drag_moment[:, None] * s.omega,
+                      "drag_moment": 0 * m.drag_moment})),
+    Defect("weight-as-load", "weight given as a load, gravity 0", engine=P, loaded=True,
+           inputs=model_change(lambda m, _: {"gravity": 0 * m.gravity,
+                                             "force": m.force + m.mass[:, None] * m.gravity}),
+           answers=recomputed(lambda m, s, a: sums(1)(m, s, a))),
+    Defect("one-ulp", "every answer rounded differently in its last digit", engine=M, loaded=True,
+           answers=field("acceleration", noise_growing(1.0, 1e-16))),
+    Defect("one-ulp-of-reactions", "the last digit of F", engine=E, joints="rods",
+           answers=field("joint_reaction", noise_growing(1.0, 2e-16))),
+    Defect("spin-axis-moved", "u made a unit vector again", engine=M, joints="rods",
+           inputs=state_change(lambda _, s: {"u": s.u / np.linalg.norm(s.u, axis=1, keepdims=True)})),
+)  # fmt: skip
