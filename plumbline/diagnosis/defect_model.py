@@ -1,7 +1,7 @@
 """State quantities of mechanisms with a given defect: Newton–Euler equations in double precision, in batches.
 
-A `DefectCase` is B mechanisms of N bodies at one state each; besides the numbers of the model it has a factor
-on each velocity term, 1 in an engine without defect.  Independent of `reference_impl`, and fast rather than
+A `DefectCase` is B mechanisms of N bodies at one state each; besides the numbers of the model it has for each
+body a factor on each velocity term, 1 in an engine without defect, and armature of its joint, then 0.  Independent of `reference_impl`, and fast rather than
 certified: an equilibrated solve with one refinement keeps its rounding below the bounds of the comparison.
 """
 
@@ -43,10 +43,11 @@ class DefectCase:
     omega: Array
     u: Array
     udot: Array
-    gyroscopic_factor: Array  # (B,) factor of ω′ × J ω′ (the notes' 8 L̇ᵀJL̇p)
-    proximal_factor: Array  # (B,) factor of ω × (ω × s) of the lower body in γ
-    distal_factor: Array  # (B,) … of the upper body
-    rod_factor: Array  # (B,) factor of ℓ u̇² in a rod's γ
+    gyroscopic_factor: Array  # (B, N) factor of ω′ × J ω′ (the notes' 8 L̇ᵀJL̇p)
+    proximal_factor: Array  # (B, N) factor of ω × (ω × s) of the lower body in γ
+    distal_factor: Array  # (B, N) … of the upper body
+    rod_factor: Array  # (B, N) factor of ℓ u̇² in a rod's γ
+    armature: Array  # (B, N) kg m², inertia of joint k against the body before, in ball joints only
 
     @property
     def n(self) -> int:
@@ -54,7 +55,7 @@ class DefectCase:
         return int(self.mass.shape[1])
 
     def model_and_state(self, b: int) -> tuple[Model, State]:
-        """Extract one mechanism; the factors on velocity terms are dropped.
+        """Extract one mechanism; factors on velocity terms and armature are dropped.
 
         Args:
             b: index of the mechanism, 0 … B − 1.
@@ -80,11 +81,11 @@ def make_defect_case(model: Model, states: Sequence[State]) -> DefectCase:
 
     """
     size = len(states)
-    ones = np.ones(size)
+    ones = np.ones((size, model.n))
     return DefectCase(
         **{name: np.repeat(getattr(model, name)[None], size, 0) for name in MODEL_FIELDS},
         **{name: np.array([getattr(s, name) for s in states]) for name in STATE_FIELDS},
-        gyroscopic_factor=ones, proximal_factor=ones, distal_factor=ones, rod_factor=ones,
+        gyroscopic_factor=ones, proximal_factor=ones, distal_factor=ones, rod_factor=ones, armature=0 * ones,
     )  # fmt: skip
 
 
@@ -100,6 +101,40 @@ def concatenate_cases(cases: Sequence[DefectCase]) -> DefectCase:
     """
     names = [f.name for f in fields(DefectCase)]
     return replace(cases[0], **{n: np.concatenate([getattr(c, n) for c in cases]) for n in names})
+
+
+def select_states(case: DefectCase, states: Sequence[int]) -> DefectCase:
+    """Take some mechanisms out of a batch.
+
+    Args:
+        case: the batch.
+        states: their indices, 0 … B − 1.
+
+    Returns:
+        A batch of those, in the given order.
+
+    """
+    return replace(case, **{f.name: getattr(case, f.name)[list(states)] for f in fields(DefectCase)})
+
+
+def relative_rates(c: DefectCase) -> Array:
+    """Return the angular velocity of every body relative to the body before it.
+
+    Args:
+        c: mechanisms and states.
+
+    Returns:
+        ω′ − A₂ᵀA₁ω′₁ (B, N, 3), in each body's own frame; of the first body its absolute one.
+
+    """
+    return np.asarray(c.omega - _carried_rates(c, rotation_matrix(c.p)))
+
+
+def _carried_rates(c: DefectCase, a: Array) -> Array:
+    """A₂ᵀA₁ω′₁ (B, N, 3): angular velocity of the body before in each body's frame; 0 for the first."""
+    world = rotate_vectors(a, c.omega)
+    before = np.concatenate([np.zeros_like(world[:, :1]), world[:, :-1]], axis=1)
+    return rotate_vectors(a.mT, before)
 
 
 def centre_positions_and_velocities(c: DefectCase) -> tuple[Array, Array]:
@@ -143,7 +178,13 @@ def evaluate_case(c: DefectCase) -> dict[str, Array]:
         "acceleration": acceleration,
         "angular_acceleration": angular,
         "joint_reaction": reaction,
-        "kinetic_energy": 0.5 * np.sum(c.mass * np.sum(v * v, -1) + np.sum(c.omega * spin, -1), axis=1),
+        "kinetic_energy": 0.5
+        * np.sum(
+            c.mass * np.sum(v * v, -1)
+            + np.sum(c.omega * spin, -1)
+            + c.armature * np.sum(relative_rates(c) ** 2, -1),
+            axis=1,
+        ),
         "potential_energy": -np.sum(c.mass * np.einsum("bki,bi->bk", r, c.gravity), axis=1),
         "angular_momentum": momentum,
     }
@@ -161,11 +202,11 @@ def _solve_newton_euler(c: DefectCase, a: Array, v: Array, spin: Array) -> tuple
     b[..., :3] = c.mass[..., None] * c.gravity[:, None] + load
     b[..., 3:6] = (
         c.moment - c.drag_moment[..., None] * c.omega
-        - c.gyroscopic_factor[:, None, None] * np.cross(c.omega, spin)
+        - c.gyroscopic_factor[..., None] * np.cross(c.omega, spin)
     )  # fmt: skip
     centripetal = [rotate_vectors(a, np.cross(c.omega, np.cross(c.omega, s))) for s in (c.proximal, c.distal)]
-    b[..., 6:] = -c.proximal_factor[:, None, None] * centripetal[0]
-    b[:, 1:, 6:] += c.distal_factor[:, None, None] * centripetal[1][:, :-1]
+    b[..., 6:] = -c.proximal_factor[..., None] * centripetal[0]
+    b[:, 1:, 6:] += (c.distal_factor[..., None] * centripetal[1])[:, :-1]
     rod = c.length > 0
     for i in range(n):
         S[:, i, :3, i, :3] = c.mass[:, i, None, None] * eye
@@ -181,7 +222,7 @@ def _solve_newton_euler(c: DefectCase, a: Array, v: Array, spin: Array) -> tuple
     for i in map(int, np.flatnonzero(rod.any(0))):
         held = rod[:, i]
         u, udot = c.u[held, i], c.udot[held, i]
-        centripetal_rod = c.rod_factor[held] * c.length[held, i] * np.sum(udot * udot, -1)
+        centripetal_rod = c.rod_factor[held, i] * c.length[held, i] * np.sum(udot * udot, -1)
         rows = np.einsum("bi,bijk->bjk", u, S[held, i, 6:].reshape(-1, 3, n, 9))
         first = np.cross(u, np.eye(3)[np.argmin(np.abs(u), axis=-1)])
         first /= np.linalg.norm(first, axis=-1, keepdims=True)
@@ -192,6 +233,25 @@ def _solve_newton_euler(c: DefectCase, a: Array, v: Array, spin: Array) -> tuple
         b[held, i, 7:] = 0.0
     x = _solve_with_refinement(S.reshape(size, 9 * n, 9 * n), b.reshape(size, 9 * n)).reshape(size, n, 9)
     return x[..., :3], x[..., 3:6], x[..., 6:]
+
+
+def _add_armature(c: DefectCase, a: Array, S: Array, b: Array) -> None:
+    """Add −I ẇ to the moments of each body and its opposite to the body before, w its relative rate.
+
+    ẇ = ω̇′ − R ω̇′₁ + w × R ω′₁ with R = A₂ᵀA₁ (B, 3, 3), from the first body's frame into the second's.
+    """
+    carried = _carried_rates(c, a)
+    bias = np.cross(c.omega - carried, carried)
+    for i in range(c.n):
+        inertia = c.armature[:, i, None, None]
+        S[:, i, 3:6, i, 3:6] += inertia * np.eye(3)
+        b[:, i, 3:6] -= inertia[:, 0] * bias[:, i]
+        if i:
+            turn = a[:, i].mT @ a[:, i - 1]
+            S[:, i, 3:6, i - 1, 3:6] -= inertia * turn
+            S[:, i - 1, 3:6, i, 3:6] -= inertia * turn.mT
+            S[:, i - 1, 3:6, i - 1, 3:6] += inertia * np.eye(3)
+            b[:, i - 1, 3:6] += inertia[:, 0] * rotate_vectors(turn.mT, bias[:, i])
 
 
 def _solve_with_refinement(S: Array, b: Array) -> Array:

@@ -7,12 +7,12 @@ every quantity, body and state.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from plumbline.diagnosis.defect_model import DefectCase, concatenate_cases, evaluate_case
+from plumbline.diagnosis.defect_model import DefectCase, concatenate_cases, evaluate_case, select_states
 from plumbline.diagnosis.hypotheses import Cause, all_causes
 from plumbline.model.datatypes import Array
 from plumbline.truth.rounding_bound import state_rounding_bound
@@ -20,8 +20,9 @@ from plumbline.truth.rounding_bound import state_rounding_bound
 MIN_SIGNIFICANT_RATIO = 3.0  # an amount must differ from its nominal by this many times its resolution
 MAX_EXPLAINED_RATIO = 1.0  # in bounds: a prediction agrees within the sum of both states' bounds
 MAX_ITERATIONS = 12
-MAX_CANDIDATES = 12
+MAX_CANDIDATES = 16
 DERIVATIVE_STEP = 1e-6  # of central differences, relative to the cause's scale
+MIN_CHANGE_RATIO = 2.0  # in bounds of both pendulums: a smaller difference would need no change
 TINY = float(np.finfo(float).tiny)
 
 Answers = dict[str, Array]
@@ -51,6 +52,36 @@ class ObservedDifference:
         bounds = bounds or self.bounds
         ratios = [max_error_ratio(self.reported[q] - predicted[q], bounds[q]) for q in self.reported]
         return float(np.max(ratios))  # not a number where any of them is
+
+    def at_state(self, i: int) -> ObservedDifference:
+        """Restrict the data to one state.
+
+        Args:
+            i: its index.
+
+        Returns:
+            The data at this state.
+
+        """
+        return self._restricted(slice(i, i + 1), self.reported)
+
+    def of_quantities(self, quantities: Sequence[str]) -> ObservedDifference:
+        """Restrict the data to some quantities.
+
+        Args:
+            quantities: their names.
+
+        Returns:
+            The data of these quantities.
+
+        """
+        return self._restricted(slice(None), quantities)
+
+    def _restricted(self, states: slice, quantities: Iterable[str]) -> ObservedDifference:
+        parts = (self.reported, self.expected, self.bounds, self.previous_expected)
+        case = select_states(self.case, range(len(self.case.p))[states])
+        kept = ({q: part[q][states] for q in quantities if q in part} for part in parts)
+        return ObservedDifference(case, *kept)
 
     def weighted_vector(self, x: Answers) -> Array:
         """Flatten quantities into one vector without units.
@@ -145,7 +176,8 @@ def remaining_ratio(difference: ObservedDifference, model_answers: Answers, fit:
 
     Returns:
         The largest remaining difference over the bounds of the true and, where needed, also of the altered
-        mechanism; infinite where the altered numbers are no mechanism.
+        mechanism; infinite where the altered numbers are no mechanism, or where these bounds would allow the
+        difference without any change. Above 1 it is that of the first state that is not explained.
 
     """
     altered = fit.cause.alter(difference.case, fit.fitted_amount)
@@ -155,12 +187,22 @@ def remaining_ratio(difference: ObservedDifference, model_answers: Answers, fit:
             ratio = difference.error_ratio(predicted)
             if ratio <= MAX_EXPLAINED_RATIO:
                 return ratio
-            bounds = [state_rounding_bound(*altered.model_and_state(i)) for i in range(len(altered.p))]
+            worst = change = 0.0
+            for i in range(len(altered.p)):  # the costly bounds one after the other, until one is exceeded
+                bound = state_rounding_bound(*altered.model_and_state(i))
+                both = {
+                    q: x[i : i + 1] + np.array([bound.tolerance(q)]) for q, x in difference.bounds.items()
+                }
+                here = difference.at_state(i)
+                ratio = here.error_ratio({q: x[i : i + 1] for q, x in predicted.items()}, both)
+                if not ratio <= MAX_EXPLAINED_RATIO:  # also where it is not a number
+                    return ratio if np.isfinite(ratio) else np.inf
+                worst = max(worst, ratio)
+                change = max(change, here.error_ratio(here.expected, both))
         except np.linalg.LinAlgError:
             return np.inf
-    both = {q: x + np.array([b.tolerance(q) for b in bounds]) for q, x in difference.bounds.items()}
-    ratio = difference.error_ratio(predicted, both)
-    return ratio if np.isfinite(ratio) else np.inf
+    # bounds that would allow the difference without any change explain nothing
+    return worst if change > MIN_CHANGE_RATIO else np.inf
 
 
 def derivatives_by_amount(difference: ObservedDifference, at: Sequence[tuple[Cause, float]]) -> Array:

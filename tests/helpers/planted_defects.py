@@ -519,7 +519,7 @@ def pinocchio_armature(value: float) -> Iterator[None]:
 
     def build(self: Any, *args: Any, **options: Any) -> None:
         real(self, *args, **options)
-        self.model.armature = np.full(self.model.nv, value)
+        self.pin_model.armature = np.full(self.pin_model.nv, value)
 
     with patch.object(pinocchio_engine.PinocchioChain, "__init__", build):
         yield
