@@ -1,8 +1,9 @@
 """State quantities of mechanisms with a given defect: Newton–Euler equations in double precision, in batches.
 
 A `DefectCase` is B mechanisms of N bodies at one state each; besides the numbers of the model it has for each
-body a factor on each velocity term, 1 in an engine without defect, and armature of its joint, then 0.  Independent of `reference_impl`, and fast rather than
-certified: an equilibrated solve with one refinement keeps its rounding below the bounds of the comparison.
+body a factor on each velocity term, 1 in an engine without defect, and armature of its joint, then 0.
+Independent of `reference_impl`, and fast rather than certified: an equilibrated solve with one
+refinement keeps its rounding below the bounds of the comparison.
 """
 
 from __future__ import annotations
@@ -219,6 +220,8 @@ def _solve_newton_euler(c: DefectCase, a: Array, v: Array, spin: Array) -> tuple
         S[:, i, 6:, i, :3], S[:, i, 6:, i, 3:6] = eye, -a[:, i] @ near[:, i]
         if i:
             S[:, i, 6:, i - 1, :3], S[:, i, 6:, i - 1, 3:6] = -eye, a[:, i - 1] @ far[:, i - 1]
+    if np.any(c.armature):
+        _add_armature(c, a, S, b)
     for i in map(int, np.flatnonzero(rod.any(0))):
         held = rod[:, i]
         u, udot = c.u[held, i], c.udot[held, i]

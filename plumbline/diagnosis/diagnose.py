@@ -2,19 +2,23 @@
 
 Every cause of `hypotheses` is evaluated with `defect_model` and fitted (`fit`); all causes that explain every
 quantity are named, because the data cannot distinguish them.  Where there is none, each wrong quantity is
-compared with the table of `output_defects`.
+compared with the table of `output_defects`, and those without a match are explained together, because a
+defect may be in the accelerations and not in the energies.  An error that scatters where little more than the
+last bits of the problem change has no such cause: `digit_loss`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from plumbline.diagnosis.defect_model import evaluate_case, make_defect_case
+from plumbline.diagnosis.digit_loss import DigitLoss, Evaluate, find_digit_loss
 from plumbline.diagnosis.fit import (
     MAX_EXPLAINED_RATIO,
+    MIN_CHANGE_RATIO,
     TINY,
     ObservedDifference,
     find_explanations,
@@ -22,9 +26,9 @@ from plumbline.diagnosis.fit import (
     per_entry,
 )
 from plumbline.diagnosis.hypotheses import format_significant
-from plumbline.diagnosis.output_defects import OUTPUT_DEFECTS
+from plumbline.diagnosis.output_defects import output_defects
 from plumbline.engines.registry import load_adapter
-from plumbline.model.datatypes import Array, Model, State, StateQuantities
+from plumbline.model.datatypes import Array, Model, StateQuantities
 from plumbline.model.kinematics import state_from_minimal
 from plumbline.truth.ground_truth import StateTruth
 from plumbline.truth.rounding_bound import state_rounding_bound
@@ -36,8 +40,6 @@ QUANTITIES = (
 MAX_STATES = 8  # examined; fewer for long chains
 # in bounds: of a hundred fitted causes, some explain a smaller difference by chance
 MIN_DIAGNOSABLE_RATIO = 8.0
-
-Evaluate = Callable[[Model, list[State]], list[StateQuantities]]
 
 
 def explain_disagreement(
@@ -84,8 +86,49 @@ def diagnose(
     if ratio <= MIN_DIAGNOSABLE_RATIO:
         text = "the difference is too close to the rounding bound to name a single term"
     else:
-        text = _describe_explanations(difference) or _describe_quantities(difference)
+        text = _describe_cause(difference, model, evaluate)
     return text + (f" ({_localise_difference(model, difference, evaluate)})" if evaluate else "")
+
+
+def _describe_cause(difference: ObservedDifference, model: Model, evaluate: Evaluate | None) -> str:
+    """Sentence on what explains the difference: of all quantities together, of each, or as loss of digits."""
+    loss = _digit_loss(difference, difference.wrong_quantities(MIN_DIAGNOSABLE_RATIO), model, evaluate)
+    text = _describe_explanations(difference, loss is not None)
+    if text:
+        return text
+    named, unnamed = _name_quantities(difference)
+    close = [q for q in difference.wrong_quantities() if q not in named and q not in unnamed]
+    parts = ["behaves as if " + "; and ".join(dict.fromkeys(named.values()))] if named else []
+    if unnamed:
+        loss = loss or (_digit_loss(difference, unnamed, model, evaluate) if named else None)
+        together = "" if loss else _describe_part(difference, [*unnamed, *close])
+        if together:
+            parts.append(together)
+            close = []
+        elif loss and loss.grows:
+            parts.append(loss.describe())
+        else:
+            parts.append(
+                "no single change of a parameter, term or convention explains the " + _enumerate(unnamed)
+            )
+            if loss:
+                parts.append(loss.describe())
+    if close:
+        parts.append(
+            f"the difference of the {_enumerate(close)} is too close to the rounding bound to name a term"
+        )
+    return "; ".join(parts)
+
+
+def _digit_loss(
+    difference: ObservedDifference, quantities: Sequence[str], model: Model, evaluate: Evaluate | None
+) -> DigitLoss | None:
+    """How the error of some quantities scatters; None where it does not or nothing can be evaluated."""
+    return find_digit_loss(difference.of_quantities(quantities), model, evaluate) if evaluate else None
+
+
+def _enumerate(quantities: Sequence[str]) -> str:
+    return " and ".join(q.replace("_", " ") for q in quantities)
 
 
 def observe_difference(
@@ -133,9 +176,9 @@ def observe_difference(
 # --- causes -------------------------------------------------------------------------------------
 
 
-def _describe_explanations(difference: ObservedDifference) -> str:
+def _describe_explanations(difference: ObservedDifference, are_conventions_only: bool = False) -> str:
     """Sentence that names every cause that explains all quantities; empty where there is none."""
-    found = find_explanations(difference)
+    found = find_explanations(difference, are_conventions_only=are_conventions_only)
     if not found:
         return ""
     first, *others = (fit.cause.describe(fit.fitted_amount, fit.resolution) for fit, _ in found)
@@ -147,25 +190,22 @@ def _describe_explanations(difference: ObservedDifference) -> str:
     )
 
 
+def _describe_part(difference: ObservedDifference, quantities: Sequence[str]) -> str:
+    """Sentence that names a cause which acts on some quantities alone; empty where there is none."""
+    if len(quantities) == len(difference.reported):
+        return ""
+    text = _describe_explanations(difference.of_quantities(quantities))
+    return text and f"in the {_enumerate(quantities)} alone it {text}"
+
+
 # --- returned quantities -------------------------------------------------------------------------
 
 
-def _describe_quantities(difference: ObservedDifference) -> str:
-    """Sentence that names a defect for each wrong quantity alone, as far as there is one."""
-    wrong = [
-        q
-        for q, x in difference.expected.items()
-        if max_error_ratio(difference.reported[q] - x, difference.bounds[q]) > MAX_EXPLAINED_RATIO
-    ]
+def _name_quantities(difference: ObservedDifference) -> tuple[dict[str, str], list[str]]:
+    """What was returned in place of each wrong quantity, and the quantities without a name."""
+    wrong = difference.wrong_quantities(MIN_DIAGNOSABLE_RATIO)
     texts = {q: diagnose_quantity(difference, q) for q in wrong}
-    named = [text for text in dict.fromkeys(texts.values()) if text]
-    unnamed = [q.replace("_", " ") for q, text in texts.items() if not text]
-    parts = ["behaves as if " + "; and ".join(named)] if named else []
-    if unnamed:
-        parts.append(
-            f"no single change of a parameter, term or convention explains the {' and '.join(unnamed)}"
-        )
-    return "; ".join(parts)
+    return {q: text for q, text in texts.items() if text}, [q for q, text in texts.items() if not text]
 
 
 def diagnose_quantity(difference: ObservedDifference, quantity: str) -> str | None:
@@ -179,18 +219,46 @@ def diagnose_quantity(difference: ObservedDifference, quantity: str) -> str | No
         The completion of "behaves as if …"; None where no known defect explains the quantity.
 
     """
-    name = quantity.replace("_", " ")
-    reported, expected = difference.reported[quantity], difference.expected[quantity]
-    bound = difference.bounds[quantity]
+    every = _diagnose_bodies(difference, quantity, None, "")
+    reported, bound = difference.reported[quantity], difference.bounds[quantity]
+    if every or bound.ndim < 2 or bound.shape[1] < 2:
+        return every
+    off = reported - difference.expected[quantity]
+    wrong = [
+        k for k in range(bound.shape[1]) if max_error_ratio(off[:, k], bound[:, k]) > MAX_EXPLAINED_RATIO
+    ]
+    if not wrong or len(wrong) == bound.shape[1]:
+        return None
+    of = f" of bod{'y' if len(wrong) == 1 else 'ies'} {' and '.join(str(k + 1) for k in wrong)}"
+    return _diagnose_bodies(difference, quantity, wrong, of)
+
+
+def _diagnose_bodies(
+    difference: ObservedDifference, quantity: str, bodies: list[int] | None, of: str
+) -> str | None:
+    """What was returned in place of one quantity of all or of some bodies, which ``of`` names."""
+    name = quantity.replace("_", " ") + of
+
+    def rows_of_bodies(x: Array) -> Array:
+        return x if bodies is None else x[:, bodies]
+
+    reported, expected = (rows_of_bodies(x[quantity]) for x in (difference.reported, difference.expected))
+    bound = rows_of_bodies(difference.bounds[quantity])
 
     def matches(x: Array, rows: slice = slice(None)) -> bool:
-        return max_error_ratio((reported - x)[rows], (2 * bound)[rows]) <= MAX_EXPLAINED_RATIO
+        """Whether x is what was reported, and differs from what is right by more than both bounds."""
+        is_near = max_error_ratio((reported - x)[rows], (2 * bound)[rows]) <= MAX_EXPLAINED_RATIO
+        return is_near and max_error_ratio((x - expected)[rows], (2 * bound)[rows]) > MIN_CHANGE_RATIO
 
-    if len(reported) > 2 and matches(difference.previous_expected[quantity], slice(1, None)):
+    if len(reported) > 2 and matches(rows_of_bodies(difference.previous_expected[quantity]), slice(1, None)):
         return f"it returned the {name} of the previous state (a stale field)"
-    for defect in OUTPUT_DEFECTS:
-        if defect.quantity == quantity and matches(defect.compute(difference.case, difference.expected)):
-            return defect.description
+    if bodies is not None and len(bodies) == 1:
+        for k in range(difference.case.n):
+            if k not in bodies and matches(difference.expected[quantity][:, [k]]):
+                return f"it returned the {quantity.replace('_', ' ')} of body {k + 1} as that{of}"
+    for defect in output_defects(difference.case, quantity):
+        if matches(rows_of_bodies(defect.compute(difference.case, difference.expected))):
+            return defect.description.format(of=of)
     weight = 1 / per_entry(bound, reported)
     square = max(float(np.sum((expected * weight) ** 2)), TINY)
     factor = float(np.sum(reported * expected * weight**2) / square)

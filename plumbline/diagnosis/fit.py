@@ -53,6 +53,22 @@ class ObservedDifference:
         ratios = [max_error_ratio(self.reported[q] - predicted[q], bounds[q]) for q in self.reported]
         return float(np.max(ratios))  # not a number where any of them is
 
+    def wrong_quantities(self, ratio: float = MAX_EXPLAINED_RATIO) -> list[str]:
+        """List the quantities whose error exceeds a number of bounds.
+
+        Args:
+            ratio: the number.
+
+        Returns:
+            Their names.
+
+        """
+        return [
+            q
+            for q, x in self.expected.items()
+            if q in self.reported and not max_error_ratio(self.reported[q] - x, self.bounds[q]) <= ratio
+        ]
+
     def at_state(self, i: int) -> ObservedDifference:
         """Restrict the data to one state.
 
@@ -148,11 +164,15 @@ def per_entry(bound: Array, values: Array) -> Array:
     return bound[..., None] if values.ndim > bound.ndim else bound
 
 
-def find_explanations(difference: ObservedDifference) -> list[tuple[FittedCause, float]]:
+def find_explanations(
+    difference: ObservedDifference, *, are_conventions_only: bool = False
+) -> list[tuple[FittedCause, float]]:
     """Fit all causes and keep those that explain all quantities.
 
     Args:
         difference: the data to be explained.
+        are_conventions_only: whether to try only causes without an amount: where the error scatters, no
+            number explains it.
 
     Returns:
         Causes, conventions before numbers, with the largest difference that they leave, in rounding bounds.
@@ -161,7 +181,8 @@ def find_explanations(difference: ObservedDifference) -> list[tuple[FittedCause,
     model_answers = evaluate_case(difference.case)
     causes = list(all_causes(difference.case))
     fits = [FittedCause(cause, cause.nominal, 0.0) for cause in causes if cause.scale is None]
-    fits += fit_causes(difference, model_answers, [cause for cause in causes if cause.scale is not None])
+    if not are_conventions_only:
+        fits += fit_causes(difference, model_answers, [cause for cause in causes if cause.scale is not None])
     found = [(fit, remaining_ratio(difference, model_answers, fit)) for fit in fits]
     return [(fit, ratio) for fit, ratio in found if ratio <= MAX_EXPLAINED_RATIO]
 

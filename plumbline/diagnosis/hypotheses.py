@@ -134,7 +134,7 @@ def _drag_force(c: DefectCase) -> Array:
 
 
 def _weight(c: DefectCase) -> Array:
-    """m g (B, N, 3)."""
+    """Weight m g of each body (B, N, 3)."""
     return np.asarray(c.mass[..., None] * c.gravity[:, None])
 
 
@@ -185,7 +185,7 @@ FACTORS = (
     Factor(("rod_factor",), "the rod term of γ (ḋᵀḋ)", None, _has_rods),
 )  # fmt: skip
 
-# Fields of one body multiplied by a factor: fields, subject.  The first field must not be zero there.
+# Fields of one body, all of them not zero there, multiplied by a factor that should be 1; and the subject.
 BODY_FACTORS = (
     (("mass", "inertia"), "mass and inertia of body {k}"),
     (("inertia",), "inertia of body {k}"),
@@ -257,7 +257,8 @@ CONVENTIONS = (
     *(Convention(f"the {name}{{of}} acted at {{its}} {point} point instead of the centre of mass",
                  _moment_of(point, force), needs)
       for point in ("proximal", "distal")
-      for name, force, needs in (("applied force", lambda c: c.force, "force"), ("weight", _weight, "gravity"),
+      for name, force, needs in (("applied force", lambda c: c.force, "force"),
+                                 ("weight", _weight, "gravity"),
                                  ("drag force", _drag_force, "drag_force"))),
     Convention("the drag force{of} were taken in the body frame instead of the world frame",
                lambda c: _drag_from_velocity(c, to_body(c, centre_positions_and_velocities(c)[1])),
@@ -302,10 +303,12 @@ def all_causes(case: DefectCase) -> Iterator[Cause]:
 
 def _is_factor_of_body(case: DefectCase, names: tuple[str, ...], k: int) -> bool:
     """Whether a factor on fields of body k has an effect that no factor on all bodies has."""
-    if case.n == 1 or names == ("distal_factor",) and k + 1 == case.n:
+    if case.n == 1:
         return names == ("inertia",)
-    if names in (("proximal_factor",), ("rod_factor",)):
-        return bool(case.length[0, k] > 0) == (names == ("rod_factor",)) or names == ("proximal_factor",)
+    if names == ("distal_factor",):
+        return k + 1 < case.n
+    if names == ("rod_factor",):
+        return bool(case.length[0, k] > 0)
     return all(bool(np.any(getattr(case, name)[:, k])) for name in names)
 
 
@@ -493,9 +496,12 @@ def _convention_causes(case: DefectCase, convention: Convention) -> Iterator[Cau
         return
     altered = convention.change(case)
     per_body = [
-        k for k in range(case.n)
-        if any(np.any(x[:, k] != getattr(case, name)[:, k]) for name, x in altered.items() if name != "gravity")
-    ]  # fmt: skip
+        k
+        for k in range(case.n)
+        if any(
+            np.any(x[:, k] != getattr(case, name)[:, k]) for name, x in altered.items() if name != "gravity"
+        )
+    ]
     has_bodies = "{of}" in convention.description
     bodies = per_body if has_bodies and 1 < case.n <= MAX_BODIES_OF_BODY_CONVENTIONS else []
     if len(bodies) != 1 and (per_body or "gravity" in altered):

@@ -1,11 +1,12 @@
 """Table of what an engine or its adapter may return in place of a quantity.
 
-Descriptions complete "behaves as if …".
+Descriptions complete "behaves as if …"; {of} in them becomes "" or, where only one body is wrong,
+" of body k".
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,26 +60,98 @@ BODY_PERMUTATIONS: dict[str, Callable[[Array], Array]] = {
 
 
 def _of_another_body(name: str, which: str) -> OutputDefect:
-    description = f"it returned the {name.replace('_', ' ')} of another body, {which}"
+    description = f"it returned the {name.replace('_', ' ')}{{of}} of another body, {which}"
     return OutputDefect(name, description, lambda _, q: BODY_PERMUTATIONS[which](q[name]))
+
+
+def _drag_force(c: DefectCase) -> Array:
+    """−c_t ṙ (B, N, 3)."""
+    return np.asarray(-c.drag_force[..., None] * centre_positions_and_velocities(c)[1])
+
+
+FORCES: dict[str, Callable[[DefectCase], Array]] = {
+    "applied force": lambda c: c.force,
+    "drag force": _drag_force,
+    "weight": lambda c: np.asarray(c.mass[..., None] * c.gravity[:, None]),
+}
+
+
+def _scalar_terms(c: DefectCase) -> dict[str, tuple[str, Array]]:
+    """What each body adds to energies and momentum: by description the quantity and (B, N[, 3])."""
+    r, v = centre_positions_and_velocities(c)
+    spin = rotate_vectors(c.inertia, c.omega)
+    m = c.mass[..., None]
+    orbital = np.cross(r, m * v)
+    return {
+        "kinetic energy without {}": (
+            "kinetic_energy", 0.5 * (c.mass * np.sum(v * v, -1) + np.sum(c.omega * spin, -1))),
+        "kinetic energy without the rotation of {}": ("kinetic_energy", 0.5 * np.sum(c.omega * spin, -1)),
+        "kinetic energy without the translation of {}": ("kinetic_energy", 0.5 * c.mass * np.sum(v * v, -1)),
+        "potential energy without {}": ("potential_energy", -c.mass * np.sum(r * c.gravity[:, None], -1)),
+        "angular momentum without {}": ("angular_momentum", orbital + to_world(c, spin)),
+        "angular momentum without the spin of {}": ("angular_momentum", to_world(c, spin)),
+        "angular momentum without the translation of {}": ("angular_momentum", orbital),
+        "angular momentum with the spin in body axes of {}": ("angular_momentum", to_world(c, spin) - spin),
+    }  # fmt: skip
+
+
+def output_defects(case: DefectCase, quantity: str) -> Iterator[OutputDefect]:
+    """List what may be returned in place of a quantity.
+
+    Args:
+        case: the mechanism, at the states to be explained.
+        quantity: its name.
+
+    Yields:
+        The table's defects of the quantity, then those in one force, one body or one term of it.
+
+    """
+    yield from (defect for defect in OUTPUT_DEFECTS if defect.quantity == quantity)
+    if quantity == "joint_reaction":
+        for name, force in FORCES.items():
+            missing = force(case)
+            bodies = [k for k in range(case.n) if np.any(missing[:, k])]
+            if len(bodies) > 1:
+                yield _reaction_without(f"the {name}s", missing)
+            for k in bodies:
+                alone = np.where(np.arange(case.n)[:, None] == k, missing, 0.0)
+                yield _reaction_without(f"the {name} of body {k + 1}", alone)
+        return
+    for words, (name, term) in _scalar_terms(case).items():
+        if name == quantity:
+            if "in body axes" in words:
+                yield _without_term(quantity, words.format("all bodies"), np.sum(term, axis=1))
+            for k in range(case.n):
+                yield _without_term(quantity, words.format(f"body {k + 1}"), term[:, k])
+
+
+def _reaction_without(what: str, missing: Array) -> OutputDefect:
+    """Forces (B, N, 3) left out of the sum over the bodies that a joint carries."""
+    carried = np.cumsum(missing[:, ::-1], axis=1)[:, ::-1]
+    words = f"it returned the joint reaction without {what}"
+    return OutputDefect("joint_reaction", words, lambda _, q: q["joint_reaction"] + carried)
+
+
+def _without_term(quantity: str, what: str, term: Array) -> OutputDefect:
+    return OutputDefect(quantity, f"it returned the {what}", lambda _, q: q[quantity] - term)
 
 
 OUTPUT_DEFECTS = (
     OutputDefect("acceleration",
-                 "it returned the spatial acceleration (r̈ − ω × ṙ) instead of the classical one",
+                 "it returned the spatial acceleration{of} (r̈ − ω × ṙ) instead of the classical one",
                  lambda c, q: q["acceleration"]
                  - np.cross(to_world(c, c.omega), centre_positions_and_velocities(c)[1])),
-    OutputDefect("acceleration", "it returned the acceleration minus gravity",
+    OutputDefect("acceleration", "it returned the acceleration{of} minus gravity",
                  lambda c, q: q["acceleration"] - c.gravity[:, None]),
-    OutputDefect("acceleration", "it returned the acceleration plus gravity",
+    OutputDefect("acceleration", "it returned the acceleration{of} plus gravity",
                  lambda c, q: q["acceleration"] + c.gravity[:, None]),
-    OutputDefect("acceleration", "it returned the acceleration of the proximal point",
+    OutputDefect("acceleration", "it returned the acceleration of the proximal point{of}",
                  lambda c, q: q["acceleration"] + _arm_acceleration(c, q)),
-    OutputDefect("acceleration", "it returned the acceleration in the body frame",
+    OutputDefect("acceleration", "it returned the acceleration{of} in the body frame",
                  lambda c, q: to_body(c, q["acceleration"])),
-    OutputDefect("joint_reaction", "it returned the joint reaction in the body frame",
+    OutputDefect("joint_reaction", "it returned the joint reaction{of} in the body frame",
                  lambda c, q: to_body(c, q["joint_reaction"])),
-    OutputDefect("angular_acceleration", "it returned the angular acceleration in the world frame",
+    OutputDefect("angular_acceleration", "it returned the angular acceleration{of} in the world frame",
                  lambda c, q: to_world(c, q["angular_acceleration"])),
     *(_of_another_body(name, which)
       for name in ("acceleration", "angular_acceleration", "joint_reaction") for which in BODY_PERMUTATIONS),

@@ -169,7 +169,8 @@ class _Run:
     def _tasks(self) -> Iterator[Task]:
         order = sorted(self.plan.scenarios, key=lambda s: -s.model.n)  # no long task alone at the end
         for number, scenario in enumerate(itertools.chain(order, self.plan.random_scenarios)):
-            scenario_run = ScenarioRun(self.plan, scenario, self.engines, number >= len(order))
+            is_random = number >= len(order)
+            scenario_run = ScenarioRun(self.plan, scenario, self.engines, is_random, self.known)
             self.open[scenario.name] = scenario_run
             yield from scenario_run.tasks()
 

@@ -14,6 +14,7 @@ from plumbline.engines.adapter import EngineInfo
 from plumbline.execution.plan import STATES_PER_RANDOM_SCENARIO, Plan, TaskKey, TaskKind, task_keys
 from plumbline.judging import metamorphic, outlier
 from plumbline.judging.convergence import refinement_resolutions
+from plumbline.judging.known_issues import KnownIssues
 from plumbline.judging.long_run_study import plan_long_run, run_long_run_study
 from plumbline.judging.long_runs import judge_long_runs
 from plumbline.judging.rows import JudgingResult, Level, RowContext, Verdict
@@ -52,7 +53,12 @@ class ScenarioRun:
     """
 
     def __init__(
-        self, plan: Plan, scenario: Scenario, engines: Mapping[str, EngineInfo], is_random: bool = False
+        self,
+        plan: Plan,
+        scenario: Scenario,
+        engines: Mapping[str, EngineInfo],
+        is_random: bool = False,
+        known: KnownIssues | None = None,
     ) -> None:
         """Draw the states of the scenario and list its tasks.
 
@@ -61,11 +67,12 @@ class ScenarioRun:
             scenario: the scenario.
             engines: description of each engine of the plan.
             is_random: whether it is a random scenario, which is compared at state level at few states.
+            known: discrepancies whose cause is on record, so that it is not searched again.
 
         """
         self.scenario = scenario
         self.truths: dict[TaskKind, StateTruth | MotionTruth | TruthFailure] = {}
-        self._plan, self._engines = plan, engines
+        self._plan, self._engines, self._known = plan, engines, known
         level = "state" if is_random else plan.level
         self._keys = list(task_keys(scenario.name, engines, level, plan.long_run_seconds > 0))
         self._pending = set(self._keys)  # without an outcome
@@ -171,7 +178,7 @@ class ScenarioRun:
                 self._waiting.append(answer)
                 continue
             found = self._findings[answer.key] = self._judge(answer)
-            if answer.key.kind == TaskKind.STATE and any(r.verdict == Verdict.DISAGREES for r in found.rows):
+            if answer.key.kind == TaskKind.STATE and self._has_unexplained_rows(found):
                 following.append(self._diagnosis_task(answer.key.engine, answer.value.quantities))
         self._pending |= {task.key for task in following}
         return following
@@ -286,6 +293,12 @@ class ScenarioRun:
         if self._plan.user_rtol is not None:
             found.rows = [replace(row, user_rtol=self._plan.user_rtol) for row in found.rows]
         return found
+
+    def _has_unexplained_rows(self, found: JudgingResult) -> bool:
+        """Whether a row disagrees whose cause is not on record: an entry's mechanism is its explanation."""
+        disputed = [row for row in found.rows if row.verdict == Verdict.DISAGREES]
+        marked = self._known.mark_known(disputed) if self._known else disputed
+        return any(row.known_issue is None for row in marked)
 
     def _diagnosis_task(self, engine: str, quantities: list[StateQuantities]) -> Task:
         """The task that searches the wrong term of an engine that disagrees at state level."""

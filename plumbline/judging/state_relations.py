@@ -26,6 +26,7 @@ from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.relation_result import OPTION_PREFIX, OTHER_FORMULATION_PREFIX, RelationResult
 from plumbline.model.datatypes import Array, Model, State, StateQuantities, Unsupported
+from plumbline.model.equivalent import rotate_world, unrotate_world
 from plumbline.model.kinematics import (
     quaternion_conjugate,
     quaternion_product,
@@ -101,16 +102,11 @@ def scale_fields(model: Model, **factors: float) -> Model:
 
 
 def _rotate_world(model: Model, state: State) -> tuple[Model, State]:
-    turn = rotation_matrix(Q)
-    rotated = replace(model, gravity=turn @ model.gravity, force=model.force @ turn.T)
-    p = quaternion_product(Q, state.p)
-    p /= np.linalg.norm(p, axis=-1, keepdims=True)
-    return rotated, state_from_minimal(rotated, p, state.omega, state.u @ turn.T, state.udot @ turn.T)
+    return rotate_world(model, state, Q)
 
 
 def _unrotate_world(answers: StateQuantities) -> dict[str, Array]:
-    world = ("acceleration", "joint_reaction", "angular_momentum")
-    return {q: x @ rotation_matrix(Q) if q in world else x for q, x in quantity_values(answers).items()}
+    return unrotate_world(quantity_values(answers), Q)
 
 
 def _rotate_body_frames(model: Model, state: State) -> tuple[Model, State]:

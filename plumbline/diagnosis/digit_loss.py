@@ -1,0 +1,116 @@
+"""Loss of digits as a mechanism: the error is no function of the problem but of its last bits.
+
+A wrong term or parameter gives nearly the same error in a world that is turned by a millionth of a radian.
+Rounding that an algorithm amplifies gives another error each time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from plumbline.diagnosis.defect_model import evaluate_case, make_defect_case
+from plumbline.diagnosis.fit import Answers, ObservedDifference, max_error_ratio
+from plumbline.model.datatypes import Array, Model, State, StateQuantities
+from plumbline.model.equivalent import first_bodies, rotate_world, unrotate_world
+from plumbline.truth.rounding_bound import state_rounding_bound
+
+COPIES = 8
+TURN = 1e-6  # rad
+MIN_SCATTER = 0.5  # of the error; about 1 where errors are independent, about TURN where they have a cause
+MIN_GROWTH = 4.0  # of the error in rounding bounds, from half of the chain to the whole
+
+Evaluate = Callable[[Model, list[State]], list[StateQuantities]]
+
+
+@dataclass(frozen=True)
+class DigitLoss:
+    """How the error of an engine scatters, and how it depends on the length of the chain."""
+
+    scatter: float  # median distance of the errors of equivalent problems from their mean, over the error
+    ratio_by_length: dict[int, float]  # error in rounding bounds of the first n bodies, by n, descending
+
+    @property
+    def grows(self) -> bool:
+        """Whether the error grows with the chain by more than its bound does."""
+        ratios = list(self.ratio_by_length.values())
+        return len(ratios) > 1 and ratios[0] > MIN_GROWTH * ratios[1]
+
+    def describe(self) -> str:
+        """Describe the loss.
+
+        Returns:
+            A sentence without subject.
+
+        """
+        text = (
+            f"loses digits: the answer scatters by {self.scatter:.2g} of its error when the world is turned "
+            f"by {TURN:g} rad"
+        )
+        if self.grows:
+            lengths = ", ".join(f"{ratio:.2g} for {n}" for n, ratio in self.ratio_by_length.items())
+            text += f", and the error grows with the chain (in rounding bounds: {lengths} bodies)"
+            return text + "; rounding in the algorithm"
+        return text + "; rounding or noise in the algorithm"
+
+
+def find_digit_loss(difference: ObservedDifference, model: Model, evaluate: Evaluate) -> DigitLoss | None:
+    """Test whether the error at the worst state scatters when the world is turned by a tiny angle.
+
+    Args:
+        difference: the data to be explained.
+        model: the mechanism.
+        evaluate: evaluates the engine.
+
+    Returns:
+        The loss; None where the error has a cause, or where the engine fails on the turned problems.
+
+    """
+    each = [difference.at_state(i) for i in range(len(difference.case.p))]
+    worst = int(np.argmax([here.error_ratio(here.expected) for here in each]))
+    here, (_, state) = each[worst], difference.case.model_and_state(worst)
+    rng = np.random.default_rng(0)
+    errors = []
+    try:
+        evaluate(model, [state])  # an engine that keeps something of the call before keeps it of this problem
+        for _ in range(COPIES):
+            axis = rng.normal(size=3)
+            q = np.array([np.cos(TURN / 2), *(np.sin(TURN / 2) * axis / np.linalg.norm(axis))])
+            turned, turned_state = rotate_world(model, state, q)
+            (answer,) = evaluate(turned, [turned_state])
+            values = unrotate_world(_values(answer, here), q)
+            errors.append(here.weighted_vector({name: x - here.expected[name] for name, x in values.items()}))
+        scatter = _scatter(np.array(errors), here.residual(here.expected))
+        return DigitLoss(scatter, _ratios(here, model, state, evaluate)) if scatter >= MIN_SCATTER else None
+    except Exception:  # an engine may raise anything; then nothing is known about its digits
+        return None
+
+
+def _scatter(errors: Array, error: Array) -> float:
+    """Median distance of vectors (COPIES, K) from their mean over the length of another; 0 if not finite."""
+    largest = float(max(np.max(np.abs(errors)), np.max(np.abs(error))))
+    if not 0 < largest < np.inf:
+        return 0.0
+    errors, error = errors / largest, error / largest
+    distances = np.linalg.norm(errors - np.mean(errors, axis=0), axis=1)
+    return float(np.median(distances) / np.linalg.norm(error))
+
+
+def _values(answer: StateQuantities, here: ObservedDifference) -> Answers:
+    """The quantities of one answer as a batch of one state."""
+    return {name: np.asarray(getattr(answer, name), float)[None] for name in here.reported}
+
+
+def _ratios(here: ObservedDifference, model: Model, state: State, evaluate: Evaluate) -> dict[int, float]:
+    """Worst error, in rounding bounds, of the whole chain and of its first half and quarter."""
+    ratios = {model.n: here.error_ratio(here.expected)}
+    for n in sorted({-(-model.n // 2), -(-model.n // 4)} - {model.n}, reverse=True):
+        short, at = first_bodies(model, state, n)
+        right = evaluate_case(make_defect_case(short, [at]))
+        values, bound = _values(evaluate(short, [at])[0], here), state_rounding_bound(short, at)
+        ratios[n] = max(
+            max_error_ratio(x - right[name], np.array([bound.tolerance(name)])) for name, x in values.items()
+        )
+    return ratios

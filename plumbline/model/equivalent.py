@@ -1,0 +1,61 @@
+"""Other descriptions of the same pendulum, whose answers follow from the answers to the first."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.kinematics import quaternion_product, rotation_matrix, state_from_minimal
+
+WORLD_VECTORS = ("acceleration", "joint_reaction", "angular_momentum")  # state quantities in world axes
+
+
+def rotate_world(model: Model, state: State, q: Array) -> tuple[Model, State]:
+    """Rotate everything in world axes: gravity, applied forces, attitudes and rod directions.
+
+    Args:
+        model: the pendulum.
+        state: a state of it.
+        q: (4,) unit quaternion of the rotation, scalar first.
+
+    Returns:
+        The rotated pendulum and its state; attitudes are unit quaternions again.
+
+    """
+    turn = rotation_matrix(q)
+    rotated = replace(model, gravity=turn @ model.gravity, force=model.force @ turn.T)
+    p = quaternion_product(q, state.p)
+    p /= np.linalg.norm(p, axis=-1, keepdims=True)
+    return rotated, state_from_minimal(rotated, p, state.omega, state.u @ turn.T, state.udot @ turn.T)
+
+
+def unrotate_world(answers: dict[str, Array], q: Array) -> dict[str, Array]:
+    """Rotate state quantities of a rotated pendulum back.
+
+    Args:
+        answers: quantities by their names in `StateQuantities`.
+        q: (4,) the quaternion that `rotate_world` was given.
+
+    Returns:
+        The same quantities in the axes of the first description.
+
+    """
+    return {name: x @ rotation_matrix(q) if name in WORLD_VECTORS else x for name, x in answers.items()}
+
+
+def first_bodies(model: Model, state: State, count: int) -> tuple[Model, State]:
+    """Cut a chain behind some bodies.
+
+    Args:
+        model: the pendulum.
+        state: a state of it.
+        count: number of bodies that remain, from the pivot.
+
+    Returns:
+        The shorter pendulum, and the same state of it.
+
+    """
+    fields = {name: x if name == "gravity" else x[:count] for name, x in vars(model).items()}
+    return Model(**fields), State(**{name: x[:count] for name, x in vars(state).items()})
