@@ -1,6 +1,7 @@
 """Loss of digits as a mechanism: the error is no function of the problem but of its last bits.
 
-A wrong term or parameter gives nearly the same error in a world that is turned by a millionth of a radian.
+A wrong term or parameter gives nearly the same error where the axes of the world and of the bodies are
+turned by a millionth of a radian.
 Rounding that an algorithm amplifies gives another error each time.
 """
 
@@ -14,12 +15,19 @@ import numpy as np
 from plumbline.diagnosis.defect_model import evaluate_case, make_defect_case
 from plumbline.diagnosis.fit import Answers, ObservedDifference, max_error_ratio
 from plumbline.model.datatypes import Array, Model, State, StateQuantities
-from plumbline.model.equivalent import first_bodies, rotate_world, unrotate_world
+from plumbline.model.equivalent import (
+    first_bodies,
+    rotate_body_frames,
+    rotate_world,
+    unrotate_body_frames,
+    unrotate_world,
+)
 from plumbline.truth.rounding_bound import state_rounding_bound
 
 COPIES = 8
 TURN = 1e-6  # rad
-MIN_SCATTER = 0.5  # of the error; about 1 where errors are independent, about TURN where they have a cause
+MIN_SCATTER = 0.3  # of the error; 0.5 to 1 where its digits are lost, about TURN where it has a cause
+MIN_COPY_ERROR = 0.02  # of the error; an engine that keeps the call before is off by about TURN in a copy
 MIN_GROWTH = 4.0  # of the error in rounding bounds, from half of the chain to the whole
 
 Evaluate = Callable[[Model, list[State]], list[StateQuantities]]
@@ -29,7 +37,7 @@ Evaluate = Callable[[Model, list[State]], list[StateQuantities]]
 class DigitLoss:
     """How the error of an engine scatters, and how it depends on the length of the chain."""
 
-    scatter: float  # median distance of the errors of equivalent problems from their mean, over the error
+    scatter: float  # median distance of the errors of equivalent problems from their mean, over their size
     ratio_by_length: dict[int, float]  # error in rounding bounds of the first n bodies, by n, descending
 
     @property
@@ -46,8 +54,8 @@ class DigitLoss:
 
         """
         text = (
-            f"loses digits: the answer scatters by {self.scatter:.2g} of its error when the world is turned "
-            f"by {TURN:g} rad"
+            f"loses digits: the answer scatters by {self.scatter:.2g} of its error when world and body "
+            f"axes are turned by {TURN:g} rad"
         )
         if self.grows:
             lengths = ", ".join(f"{ratio:.2g} for {n}" for n, ratio in self.ratio_by_length.items())
@@ -57,7 +65,7 @@ class DigitLoss:
 
 
 def find_digit_loss(difference: ObservedDifference, model: Model, evaluate: Evaluate) -> DigitLoss | None:
-    """Test whether the error at the worst state scatters when the world is turned by a tiny angle.
+    """Test whether the error at the worst state scatters when all axes are turned by a tiny angle.
 
     Args:
         difference: the data to be explained.
@@ -76,11 +84,10 @@ def find_digit_loss(difference: ObservedDifference, model: Model, evaluate: Eval
     try:
         evaluate(model, [state])  # an engine that keeps something of the call before keeps it of this problem
         for _ in range(COPIES):
-            axis = rng.normal(size=3)
-            q = np.array([np.cos(TURN / 2), *(np.sin(TURN / 2) * axis / np.linalg.norm(axis))])
-            turned, turned_state = rotate_world(model, state, q)
+            world, body = (_tiny_rotation(rng) for _ in range(2))
+            turned, turned_state = rotate_body_frames(*rotate_world(model, state, world), body)
             (answer,) = evaluate(turned, [turned_state])
-            values = unrotate_world(_values(answer, here), q)
+            values = unrotate_body_frames(unrotate_world(_values(answer, here), world), body)
             errors.append(here.weighted_vector({name: x - here.expected[name] for name, x in values.items()}))
         scatter = _scatter(np.array(errors), here.residual(here.expected))
         return DigitLoss(scatter, _ratios(here, model, state, evaluate)) if scatter >= MIN_SCATTER else None
@@ -88,14 +95,24 @@ def find_digit_loss(difference: ObservedDifference, model: Model, evaluate: Eval
         return None
 
 
+def _tiny_rotation(rng: np.random.Generator) -> Array:
+    """Unit quaternion of a rotation by `TURN` about a random axis."""
+    axis = rng.normal(size=3)
+    return np.array([np.cos(TURN / 2), *(np.sin(TURN / 2) * axis / np.linalg.norm(axis))])
+
+
 def _scatter(errors: Array, error: Array) -> float:
-    """Median distance of vectors (COPIES, K) from their mean over the length of another; 0 if not finite."""
+    """Median distance of vectors (COPIES, K) from their mean over their median length.
+
+    0 where they are not finite, or all much shorter than ``error`` (K,): then it is not they that scatter.
+    """
     largest = float(max(np.max(np.abs(errors)), np.max(np.abs(error))))
     if not 0 < largest < np.inf:
         return 0.0
     errors, error = errors / largest, error / largest
     distances = np.linalg.norm(errors - np.mean(errors, axis=0), axis=1)
-    return float(np.median(distances) / np.linalg.norm(error))
+    length = float(np.median(np.linalg.norm(errors, axis=1)))
+    return float(np.median(distances)) / length if length > MIN_COPY_ERROR * np.linalg.norm(error) else 0.0
 
 
 def _values(answer: StateQuantities, here: ObservedDifference) -> Answers:

@@ -26,13 +26,13 @@ from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.relation_result import OPTION_PREFIX, OTHER_FORMULATION_PREFIX, RelationResult
 from plumbline.model.datatypes import Array, Model, State, StateQuantities, Unsupported
-from plumbline.model.equivalent import rotate_world, unrotate_world
-from plumbline.model.kinematics import (
-    quaternion_conjugate,
-    quaternion_product,
-    rotation_matrix,
-    state_from_minimal,
+from plumbline.model.equivalent import (
+    rotate_body_frames,
+    rotate_world,
+    unrotate_body_frames,
+    unrotate_world,
 )
+from plumbline.model.kinematics import state_from_minimal
 from plumbline.model.welding import split_bodies
 from plumbline.truth.rounding_bound import RoundingBound, state_rounding_bound
 
@@ -110,26 +110,11 @@ def _unrotate_world(answers: StateQuantities) -> dict[str, Array]:
 
 
 def _rotate_body_frames(model: Model, state: State) -> tuple[Model, State]:
-    """A body vector x becomes Q x."""
-    turn = rotation_matrix(Q)
-    inertia = turn @ model.inertia @ turn.T
-    rotated = replace(
-        model,
-        inertia=(inertia + inertia.mT) / 2,
-        proximal=model.proximal @ turn.T,
-        distal=model.distal @ turn.T,
-        moment=model.moment @ turn.T,
-    )
-    p = quaternion_product(state.p, quaternion_conjugate(Q))
-    p /= np.linalg.norm(p, axis=-1, keepdims=True)
-    return rotated, state_from_minimal(rotated, p, state.omega @ turn.T, state.u, state.udot)
+    return rotate_body_frames(model, state, Q)
 
 
 def _unrotate_body_frames(answers: StateQuantities) -> dict[str, Array]:
-    return {
-        q: x @ rotation_matrix(Q) if q == "angular_acceleration" else x
-        for q, x in quantity_values(answers).items()
-    }
+    return unrotate_body_frames(quantity_values(answers), Q)
 
 
 def _double_masses(model: Model, state: State) -> tuple[Model, State]:

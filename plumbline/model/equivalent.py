@@ -7,9 +7,15 @@ from dataclasses import replace
 import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import quaternion_product, rotation_matrix, state_from_minimal
+from plumbline.model.kinematics import (
+    quaternion_conjugate,
+    quaternion_product,
+    rotation_matrix,
+    state_from_minimal,
+)
 
 WORLD_VECTORS = ("acceleration", "joint_reaction", "angular_momentum")  # state quantities in world axes
+BODY_VECTORS = ("angular_acceleration",)  # … in body axes
 
 
 def rotate_world(model: Model, state: State, q: Array) -> tuple[Model, State]:
@@ -43,6 +49,46 @@ def unrotate_world(answers: dict[str, Array], q: Array) -> dict[str, Array]:
 
     """
     return {name: x @ rotation_matrix(q) if name in WORLD_VECTORS else x for name, x in answers.items()}
+
+
+def rotate_body_frames(model: Model, state: State, q: Array) -> tuple[Model, State]:
+    """Describe every body in other axes of its own: a body vector x becomes Q x.
+
+    Args:
+        model: the pendulum.
+        state: a state of it.
+        q: (4,) unit quaternion of the rotation Q, scalar first.
+
+    Returns:
+        The same pendulum in these axes and its state; attitudes are unit quaternions again.
+
+    """
+    turn = rotation_matrix(q)
+    inertia = turn @ model.inertia @ turn.T
+    rotated = replace(
+        model,
+        inertia=(inertia + inertia.mT) / 2,
+        proximal=model.proximal @ turn.T,
+        distal=model.distal @ turn.T,
+        moment=model.moment @ turn.T,
+    )
+    p = quaternion_product(state.p, quaternion_conjugate(q))
+    p /= np.linalg.norm(p, axis=-1, keepdims=True)
+    return rotated, state_from_minimal(rotated, p, state.omega @ turn.T, state.u, state.udot)
+
+
+def unrotate_body_frames(answers: dict[str, Array], q: Array) -> dict[str, Array]:
+    """Rotate state quantities in body axes back.
+
+    Args:
+        answers: quantities by their names in `StateQuantities`.
+        q: (4,) the quaternion that `rotate_body_frames` was given.
+
+    Returns:
+        The same quantities in the axes of the first description.
+
+    """
+    return {name: x @ rotation_matrix(q) if name in BODY_VECTORS else x for name, x in answers.items()}
 
 
 def first_bodies(model: Model, state: State, count: int) -> tuple[Model, State]:

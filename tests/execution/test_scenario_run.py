@@ -8,6 +8,7 @@ import pytest
 from plumbline.execution.plan import Plan, TaskKind
 from plumbline.execution.runner import describe_engines, run_plan
 from plumbline.execution.scenario_run import ScenarioRun
+from plumbline.judging.known_issues import KnownIssue, KnownIssues
 from plumbline.processes.workers import Limits, Outcome, WorkerPool, run_task
 from plumbline.scenario import loader
 
@@ -115,3 +116,24 @@ def test_in_a_run_the_second_truth_is_handed_over(monkeypatch):
     result = run_plan(Plan([chosen], ["mujoco"], "trajectory", limits=Limits(120)), lambda *_: None)
     assert len(asked) == 2
     assert result.metadata["exit_code"] == 0, result.metadata["sentence"]
+
+
+@pytest.mark.parametrize(("quantities", "diagnosed"), [(("acceleration",), True), (("*",), False)])
+def test_a_cell_whose_disagreements_are_all_recorded_is_not_diagnosed(engines, quantities, diagnosed):
+    entries = [
+        KnownIssue(
+            id=q, scenario="rest", engine="mujoco", quantity=q, verdict="disagrees", evidence="e", reason="r"
+        )
+        for q in quantities
+    ]
+    chosen = loader.load_scenario(loader.find_scenario_file("rest"))
+    plan = Plan([chosen], ["mujoco"], "state", random_state_count=2)
+    known = KnownIssues(entries, has_extra_refinements=False)
+    bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]}, known=known)
+    (truth,) = bench.tasks()
+    (cell,) = bench.on_outcome(answered(truth))
+    found = answered(cell)
+    wrong = [replace(row, verdict="disagrees") for row in found.judge_result.rows]
+    following = bench.on_outcome(replace(found, judge_result=replace(found.judge_result, rows=wrong)))
+    assert [task.key.kind for task in following] == [TaskKind.DIAGNOSIS] * diagnosed
+    assert bench.is_done is not diagnosed

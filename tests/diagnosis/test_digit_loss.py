@@ -1,0 +1,141 @@
+"""Loss of digits: errors that scatter with the last bits of a problem, against errors with a cause."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from plumbline.diagnosis.diagnose import diagnose, observe_difference
+from plumbline.diagnosis.digit_loss import MIN_SCATTER, DigitLoss, find_digit_loss
+from plumbline.engines.registry import load_adapter
+from plumbline.model.equivalent import first_bodies, rotate_world, unrotate_world
+from plumbline.model.sampling import random_states
+from plumbline.scenario import loader
+from plumbline.truth.certified import certify_state
+from plumbline.truth.ground_truth import state_truth
+from tests.helpers import pendulums
+
+pytest.importorskip("flint")
+
+
+@cache
+def known(joints="bb", loaded=True):
+    model = pendulums.model(joints, loads=loaded, drag=loaded)
+    return model, state_truth(model, random_states(model, 3, seed=4))
+
+
+def answering(change):
+    """An engine that returns the truth, its acceleration changed by the state, the model and the truth."""
+
+    def evaluate(model, states):
+        said = state_truth(model, states).quantities
+        return [
+            replace(a, acceleration=change(model, s, a.acceleration))
+            for s, a in zip(states, said, strict=True)
+        ]
+
+    return evaluate
+
+
+def loss_of(change, joints="bb"):
+    model, truth = known(joints)
+    evaluate = answering(change)
+    difference = observe_difference(model, evaluate(model, truth.states), truth)
+    return find_digit_loss(difference, model, evaluate)
+
+
+def noise(state, shape):
+    return np.random.default_rng(zlib.crc32(state.p.tobytes())).normal(size=shape)
+
+
+def test_a_turned_world_turns_the_answers():
+    model, truth = known("rb")
+    q = np.array([0.1, 0.7, -0.1, 0.7])
+    turned = certify_state(*rotate_world(model, truth.states[0], q)).quantities
+    back = unrotate_world({"acceleration": turned.acceleration, "kinetic_energy": turned.kinetic_energy}, q)
+    np.testing.assert_allclose(back["acceleration"], truth.quantities[0].acceleration, rtol=1e-12)
+    assert back["kinetic_energy"] == pytest.approx(truth.quantities[0].kinetic_energy, rel=1e-13)
+    np.testing.assert_allclose(
+        turned.angular_acceleration, truth.quantities[0].angular_acceleration, rtol=1e-11
+    )
+
+
+def test_the_first_bodies_of_a_chain_are_where_they_were():
+    model, truth = known("rbb")
+    short, state = first_bodies(model, truth.states[0], 2)
+    assert short.n == 2 and np.array_equal(short.gravity, model.gravity)
+    assert np.array_equal(state.r, truth.states[0].r[:2]) and np.array_equal(short.mass, model.mass[:2])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda m, s, a: 1.001 * a,
+        lambda m, s, a: (
+            a + 1e-9 * np.array([1.0, 2, 3])
+        ),  # a constant in the world: it turns with the problem
+        lambda m, s, a: a + 1e-6 * np.sign(s.v),
+        lambda m, s, a: a * np.nan,
+    ],
+    ids=["factor", "constant", "sign", "nan"],
+)
+def test_an_error_with_a_cause_does_not_scatter(change):
+    assert loss_of(change) is None
+
+
+def test_an_engine_that_keeps_the_call_before_loses_no_digits():
+    model, truth = known()
+    kept = list(truth.quantities[-1:])
+
+    def evaluate(asked, states):
+        said = [*kept, *state_truth(asked, states).quantities]
+        kept[:] = said[-1:]
+        return said[:-1]
+
+    difference = observe_difference(model, evaluate(model, truth.states), truth)
+    assert difference.error_ratio(difference.expected) > 1e9
+    assert find_digit_loss(difference, model, evaluate) is None
+
+
+def test_noise_scatters_and_grows_only_where_it_does():
+    flat = loss_of(lambda m, s, a: a * (1 + 1e-9 * noise(s, a.shape)), "bbbb")
+    assert flat is not None and flat.scatter > MIN_SCATTER and not flat.grows
+    assert flat.describe().endswith("; rounding or noise in the algorithm")
+    growing = loss_of(
+        lambda m, s, a: a * (1 + 1e-12 * 10.0 ** np.arange(m.n)[:, None] * noise(s, a.shape)), "bbbb"
+    )
+    assert growing is not None and growing.grows
+    assert growing.describe().startswith("loses digits: the answer scatters by ")
+    assert growing.describe().endswith(" bodies); rounding in the algorithm")
+    assert list(growing.ratio_by_length) == [4, 2, 1]
+
+
+def test_growth_compares_the_chain_with_its_half():
+    assert DigitLoss(1.0, {8: 41.0, 4: 10.0, 2: 90.0}).grows
+    assert not DigitLoss(1.0, {8: 39.0, 4: 10.0, 2: 0.1}).grows
+    assert not DigitLoss(1.0, {1: 39.0}).grows
+
+
+def test_an_engine_that_fails_on_turned_problems_is_not_said_to_lose_digits():
+    model, truth = known()
+    said = [replace(a, acceleration=2 * a.acceleration) for a in truth.quantities]
+
+    def evaluate(asked, states):
+        raise RuntimeError("no")
+
+    assert find_digit_loss(observe_difference(model, said, truth), model, evaluate) is None
+
+
+@pytest.mark.parametrize("name", ["chain-30-balls", "chain-50-balls"])
+def test_what_aba_loses_on_long_chains_has_its_name(name):
+    pytest.importorskip("pinocchio")
+    model = loader.load_scenario(loader.find_scenario_file(name)).model
+    truth = state_truth(model, random_states(model, 2, seed=1))
+    evaluate = load_adapter("pinocchio-aba").evaluate
+    text = diagnose(model, evaluate(model, truth.states), truth, evaluate)
+    assert text.startswith("loses digits: the answer scatters by "), text
+    assert "the error grows with the chain" in text and "behaves as if" not in text, text
