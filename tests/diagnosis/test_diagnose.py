@@ -242,7 +242,8 @@ def test_a_defect_in_the_dynamics_alone_is_named():
     said = [replace(a, **{q: wrong[q][i] for q in VECTORS}) for i, a in enumerate(truth.quantities)]
     text = diagnose(model, said, truth)
     assert text.startswith(
-        "in the acceleration and angular acceleration and joint reaction alone it behaves as if mass of body 2"
+        "in the acceleration and angular acceleration and joint reaction alone "
+        "it behaves as if mass of body 2"
     ), text
 
 
