@@ -1,7 +1,5 @@
 """Loss of digits: errors that scatter with the last bits of a problem, against errors with a cause."""
 
-from __future__ import annotations
-
 import zlib
 from dataclasses import replace
 from functools import cache
@@ -24,7 +22,7 @@ pytest.importorskip("flint")
 
 @cache
 def known(joints="bb", loaded=True):
-    model = pendulums.model(joints, loads=loaded, drag=loaded)
+    model = pendulums.make_model(joints, loads=loaded, drag=loaded)
     return model, state_truth(model, random_states(model, 3, seed=4))
 
 

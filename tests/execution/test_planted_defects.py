@@ -197,7 +197,7 @@ def test_the_diagnosis_states_where_the_difference_persists():
     assert "vanishes without loads and drag" in at["loads-ignored"]
 
 
-WITHOUT_NAME = "no single change of a parameter, term or convention explains the acceleration"
+WITHOUT_NAME = "no single change of a parameter, term or convention explains the "
 BRANCHES = [
     d for d in STATE_DEFECTS if d.name.startswith(("identity-", "fast-", "rod-upward", "stale-rates"))
 ]

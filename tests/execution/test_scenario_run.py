@@ -8,7 +8,6 @@ import pytest
 from plumbline.execution.plan import Plan, TaskKind
 from plumbline.execution.runner import describe_engines, run_plan
 from plumbline.execution.scenario_run import ScenarioRun
-from plumbline.judging.known_issues import KnownIssue, KnownIssues
 from plumbline.processes.workers import Limits, Outcome, WorkerPool, run_task
 from plumbline.scenario import loader
 
@@ -118,22 +117,31 @@ def test_in_a_run_the_second_truth_is_handed_over(monkeypatch):
     assert result.metadata["exit_code"] == 0, result.metadata["sentence"]
 
 
-@pytest.mark.parametrize(("quantities", "diagnosed"), [(("acceleration",), True), (("*",), False)])
+class Recorded:
+    """Known issues about some quantities."""
+
+    def __init__(self, *quantities):
+        self.quantities = quantities
+
+    def mark_known(self, rows):
+        return [replace(row, known_issue="id") if row.quantity in self.quantities else row for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("quantities", "diagnosed"),
+    [((), True), (("acceleration",), True), (("acceleration", "joint_reaction"), False)],
+)
 def test_a_cell_whose_disagreements_are_all_recorded_is_not_diagnosed(engines, quantities, diagnosed):
-    entries = [
-        KnownIssue(
-            id=q, scenario="rest", engine="mujoco", quantity=q, verdict="disagrees", evidence="e", reason="r"
-        )
-        for q in quantities
-    ]
     chosen = loader.load_scenario(loader.find_scenario_file("rest"))
     plan = Plan([chosen], ["mujoco"], "state", random_state_count=2)
-    known = KnownIssues(entries, has_extra_refinements=False)
-    bench = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]}, known=known)
-    (truth,) = bench.tasks()
-    (cell,) = bench.on_outcome(answered(truth))
-    found = answered(cell)
-    wrong = [replace(row, verdict="disagrees") for row in found.judge_result.rows]
-    following = bench.on_outcome(replace(found, judge_result=replace(found.judge_result, rows=wrong)))
+    run = ScenarioRun(plan, chosen, {"mujoco": engines["mujoco"]}, known=Recorded(*quantities))
+    (truth,) = run.tasks()
+    (cell,) = run.on_outcome(outcome_of(truth))
+    found = outcome_of(cell)
+    wrong = [
+        replace(row, verdict="disagrees") if row.quantity in ("acceleration", "joint_reaction") else row
+        for row in found.judge_result.rows
+    ]
+    following = run.on_outcome(replace(found, judge_result=replace(found.judge_result, rows=wrong)))
     assert [task.key.kind for task in following] == [TaskKind.DIAGNOSIS] * diagnosed
-    assert bench.is_done is not diagnosed
+    assert run.is_done is not diagnosed

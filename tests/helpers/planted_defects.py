@@ -40,7 +40,7 @@ class Defect:
     size: str  # in words and numbers
     named: tuple[str, ...] = ()
     engine: str = "mujoco"
-    joints: str = "balls"  # key of tests.helpers.pendulums.JOINTS
+    joints: str = "balls"  # key of tests.helpers.pendulums.JOINT_PATTERNS
     loaded: bool = False  # with applied loads and drag
     level: Literal["state", "motion"] = "state"
     inputs: Inputs | None = None
