@@ -42,6 +42,7 @@ from tests.helpers.planted_defects import (
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(engine)
 
+pytestmark = pytest.mark.xdist_group("planted defects")  # the reports are cached in one process
 STATES = 10
 TIMES = np.linspace(0, 2, 17)
 
@@ -209,6 +210,7 @@ def test_a_defect_in_a_rare_branch_gets_no_wrong_name(defect):
     assert WITHOUT_NAME in state_report(defect)[1]
 
 
+@pytest.mark.timeout(900)
 def test_rates(record_property, capsys):
     """Kill rate, naming rate and false namings, as the nightly report gives them."""
     killed = [d for d in DEFECTS if (motion_report(d) if d.level == "motion" else state_report(d)[0])]
