@@ -297,7 +297,7 @@ class ScenarioRun:
     def _has_unexplained_rows(self, found: JudgingResult) -> bool:
         """Whether a row disagrees whose cause is not on record: an entry's mechanism is its explanation."""
         disputed = [row for row in found.rows if row.verdict == Verdict.DISAGREES]
-        marked = self._known.mark_known(disputed) if self._known else disputed
+        marked = self._known.mark_known(disputed, self.scenario.model.n) if self._known else disputed
         return any(row.known_issue is None for row in marked)
 
     def _diagnosis_task(self, engine: str, quantities: list[StateQuantities]) -> Task:

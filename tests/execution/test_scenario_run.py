@@ -123,7 +123,7 @@ class Recorded:
     def __init__(self, *quantities):
         self.quantities = quantities
 
-    def mark_known(self, rows):
+    def mark_known(self, rows, bodies):
         return [replace(row, known_issue="id") if row.quantity in self.quantities else row for row in rows]
 
 
