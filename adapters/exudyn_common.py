@@ -147,7 +147,8 @@ class _StepRecorder(Generic[Sample]):
         self.error: Exception | None = None
 
     def after_step(self, _: Any, t: float) -> bool:
-        if t == 0:  # Exudyn calls once before the first step
+        if t == 0:  # Exudyn calls once before the first step: its initial accelerations are there now
+            self.samples[0] = self.read_sample()
             return True
         self.taken += 1
         try:

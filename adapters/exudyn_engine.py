@@ -16,6 +16,7 @@ body on its last, and outputs of the body are read at the point on its first hal
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from typing import Any, ClassVar
 
 import exudyn
@@ -38,14 +39,18 @@ from adapters.exudyn_common import (
     set_linear_solver,
     silence_engine,
 )
-from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, Trajectory
+from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, StepRun, Trajectory
 from plumbline.model.kinematics import (
     angular_velocity,
     quaternion_rate,
     rotation_matrix,
     velocity_jacobian,
 )
+from plumbline.model.step_methods import ConstrainedMethod, generalized_alpha
 from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
+
+SPECTRAL_RADIUS = 0.9
+STEP_TOLERANCES = {"solver_atol": 1e-13, "solver_rtol": 1e-14}  # of single steps, which rounding limits
 
 
 class ExudynChain:
@@ -157,6 +162,21 @@ class ExudynChain:
             return here
         return here - self.output_at(self.last_piece[k - 1], output_type, self.model.distal[k - 1])
 
+    def multipliers(self) -> Array:
+        """Read the constraints' multipliers.
+
+        Returns:
+            (N, 4): of joint k three (of a rod's distance one, then zeros), then that of the node's |p| = 1.
+
+        """
+        data, found = self.mbs.systemData, np.zeros((self.model.n, 4))
+        values = np.array(data.GetAECoordinates())
+        for k, (joint, node) in enumerate(zip(self.joints, self.nodes, strict=True)):
+            of_joint = values[data.GetObjectLTGAE(joint)]
+            found[k, : len(of_joint)] = of_joint
+            found[k, 3:] = values[data.GetNodeLTGAE(node)]
+        return found
+
 
 class Exudyn(ExudynAdapter):
     """Maximal coordinates with Euler parameters: the closest peer of the notes' own form."""
@@ -174,6 +194,7 @@ class Exudyn(ExudynAdapter):
             is_symmetric=True,
             solver_rtol=NEWTON_TOLERANCE,
             note="TrapezoidalIndex2: implicit trapezoidal rule, constraints on velocities",
+            method=ConstrainedMethod(0.5, 0.5, 0.25, 0.5, "velocity", **STEP_TOLERANCES),
         ),
         Integrator(
             "generalized-alpha",
@@ -182,11 +203,13 @@ class Exudyn(ExudynAdapter):
             (2, 3, 4, 5, 6),
             solver_rtol=NEWTON_TOLERANCE,
             note="generalized-α with spectral radius 0.9, constraints on positions (index 3)",
+            method=generalized_alpha(SPECTRAL_RADIUS, **STEP_TOLERANCES),
         ),
     )
     usual_linear_solver = "EigenSparse"
     linear_solvers = ("EXUdense", "EigenDense")
     welding_unsupported_reason = ""
+    is_single_step: bool = False  # full Newton iterations to `STEP_TOLERANCES`; multipliers are sampled too
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         with silence_engine():
@@ -199,6 +222,16 @@ class Exudyn(ExudynAdapter):
             chain = ExudynChain(model, state)
             samples = self._run_samples(chain, times, integrator, resolution)
         return _trajectory(model, state, times, samples, resolution)
+
+    def _step(self, model: Model, state: State, times: Array, integrator: Integrator, step: float) -> StepRun:
+        other = copy(self)
+        other.is_single_step, other._samples = True, []
+        run = other._simulate(model, state, times, integrator, step)
+        shape = len(times), model.n, -1
+        acceleration, multipliers = (
+            np.array([sample[i] for sample in other._samples]).reshape(shape) for i in (2, 3)
+        )
+        return StepRun(run, acceleration, multipliers)
 
     def _simulate_round_trip(
         self, model: Model, state: State, end: float, integrator: Integrator, resolution: float
@@ -232,10 +265,20 @@ class Exudyn(ExudynAdapter):
         if integrator.name == "trapezoidal":
             alpha.useNewmark = alpha.useIndex2Constraints = True
         else:
-            alpha.spectralRadius = 0.9
+            alpha.spectralRadius = SPECTRAL_RADIUS
         parts = data.GetODE2Coordinates, data.GetODE2Coordinates_t, data.GetODE2Coordinates_tt
         solver = exudyn.MainSolverImplicitSecondOrder()
-        return run_solver(solver, chain.mbs, settings, times, step, lambda: tuple(part() for part in parts))
+        if not self.is_single_step:
+            return run_solver(solver, chain.mbs, settings, times, step, lambda: tuple(part() for part in parts))
+        newton = settings.timeIntegration.newton
+        newton.useModifiedNewton = False
+        newton.absoluteTolerance = STEP_TOLERANCES["solver_atol"]
+        newton.relativeTolerance = STEP_TOLERANCES["solver_rtol"]
+        self._samples = run_solver(
+            solver, chain.mbs, settings, times, step,
+            lambda: (*(part() for part in parts), chain.multipliers()),
+        )  # fmt: skip
+        return [sample[:3] for sample in self._samples]
 
 
 def _trajectory(

@@ -47,6 +47,7 @@ from plumbline.model.datatypes import (
     Model,
     State,
     StateQuantities,
+    StepRun,
     Trajectory,
     Unsupported,
 )
@@ -56,6 +57,7 @@ from plumbline.model.kinematics import (
     quaternion_rate,
     rotation_matrix,
 )
+from plumbline.model.step_methods import RUNGE_KUTTA_4, JointSpaceMethod
 
 SENSOR_OUTPUTS = (
     Output.Position,
@@ -281,7 +283,14 @@ class ExudynTree(ExudynAdapter):
     reproduction_template = "exudyn-tree"
     other_formulation = "exudyn"
     integrators: ClassVar[tuple[Integrator, ...]] = (
-        Integrator("RK44", "step", 4, (4, 5, 6, 7, 8), note="classical Runge-Kutta on joint angles"),
+        Integrator(
+            "RK44",
+            "step",
+            4,
+            (4, 5, 6, 7, 8),
+            note="classical Runge-Kutta on joint angles",
+            method=JointSpaceMethod("Runge-Kutta", "joint angles", **RUNGE_KUTTA_4),
+        ),
     )
     unsupported: ClassVar[Mapping[str, str]] = {
         "joint_reaction": "minimal coordinates have no forces at the joints"
@@ -309,6 +318,12 @@ class ExudynTree(ExudynAdapter):
             )
         r, p, v, pdot = (np.array(column) for column in zip(*samples, strict=True))
         return Trajectory(times.copy(), r, p, v, pdot, round(float(times[-1] / resolution)))
+
+    def _step(self, model: Model, state: State, times: Array, integrator: Integrator, step: float) -> StepRun:
+        groups = _Linkage(model, state).revolute_groups
+        axes = [group.axes[:, 2 - i] for group in groups for i in range(group.angle_count)]
+        run = self._simulate(model, state, times, integrator, step)
+        return StepRun(run, angle_axes=np.array(axes))
 
 
 def _rk44_settings() -> Any:

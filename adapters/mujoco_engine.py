@@ -30,7 +30,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Literal
 
 import mujoco
 import numpy as np
@@ -46,10 +46,18 @@ from plumbline.model.datatypes import (
     StateQuantities,
     Trajectory,
 )
+from plumbline.model.step_methods import RUNGE_KUTTA_4, JointSpaceMethod
 from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 
 FIRST_ORDER_POWERS = (1, 2, 3, 4, 5, 6)
+ROD_AXIAL_INERTIA = 0.01  # J_z of a rod over the mean principal inertia of the body that it carries
 IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def _euler(implicit_forces: Literal["none", "applied", "all"]) -> JointSpaceMethod:
+    return JointSpaceMethod(
+        "semi-implicit Euler", "joint rotations", ROD_AXIAL_INERTIA / 3, implicit_forces=implicit_forces
+    )
 
 
 class Mujoco(MetamorphicHooks):
@@ -61,9 +69,16 @@ class Mujoco(MetamorphicHooks):
     reproduction_template = "mujoco"
     supported_versions = ">=3.2,<5"
     integrators = (
-        Integrator("Euler", "step", 1, FIRST_ORDER_POWERS, note="semi-implicit Euler"),
         Integrator(
-            "implicit", "step", 1, FIRST_ORDER_POWERS, note="Euler, implicit in velocity with Coriolis terms"
+            "Euler", "step", 1, FIRST_ORDER_POWERS, note="semi-implicit Euler", method=_euler("none")
+        ),
+        Integrator(
+            "implicit",
+            "step",
+            1,
+            FIRST_ORDER_POWERS,
+            note="Euler, implicit in velocity with Coriolis terms",
+            method=_euler("all"),
         ),
         Integrator(
             "implicitfast",
@@ -72,8 +87,18 @@ class Mujoco(MetamorphicHooks):
             FIRST_ORDER_POWERS,
             alias_of="Euler",
             note="implicit in velocity without Coriolis terms: equals Euler bit for bit unless there is drag",
+            method=_euler("applied"),
         ),
-        Integrator("RK4", "step", 4, (4, 5, 6, 7, 8), note="classical Runge–Kutta on the rotation group"),
+        Integrator(
+            "RK4",
+            "step",
+            4,
+            (4, 5, 6, 7, 8),
+            note="classical Runge–Kutta on the rotation group",
+            method=JointSpaceMethod(
+                "Runge-Kutta", "joint rotations", ROD_AXIAL_INERTIA / 3, **RUNGE_KUTTA_4
+            ),
+        ),
     )
     options = ("dense mass matrix",)
     welding_unsupported_reason = ""
@@ -127,7 +152,7 @@ class _MujocoChain:
         parent, hang = spec.worldbody, np.zeros(3)
         for k in range(model.n):
             if model.length[k] > 0:
-                axial = np.array([0, 0, 0.01 * _principal_inertia(model.inertia[k])[0].mean()])
+                axial = np.array([0, 0, ROD_AXIAL_INERTIA * _principal_inertia(model.inertia[k])[0].mean()])
                 parent = self._add_body(parent, hang, 0.0, axial, joint=np.zeros(3))
                 hang = np.array([0, 0, -model.length[k]])
             pieces = (parts or undivided_bodies(model))[k]

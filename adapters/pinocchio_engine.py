@@ -49,8 +49,10 @@ from plumbline.model.kinematics import (
     quaternion_rate,
     rotation_matrix,
 )
+from plumbline.model.step_methods import RUNGE_KUTTA_4, JointSpaceMethod
 from plumbline.model.welding import BodyParts, undivided_bodies
 
+ROD_AXIAL_INERTIA = 1 / 3  # of a rod about its own axis, over the trace of the inertia that it carries
 MAX_DENSE_JOINTS = 10  # joints up to which their 3 × 3 blocks are solved faster as one matrix
 FIXED_STEPS = {"semi-implicit-euler": semi_implicit_euler, "rkmk4": rkmk4}
 
@@ -77,7 +79,7 @@ class PinocchioChain:
             if model.length[k] > 0:
                 joint = self._add_spherical_joint(joint, hang, f"rod {k}")
                 # Any axial inertia does; this one keeps its place among the others when units change.
-                axial = np.diag([0.0, 0.0, np.trace(model.inertia[k]) / 3])
+                axial = np.diag([0.0, 0.0, ROD_AXIAL_INERTIA * np.trace(model.inertia[k])])
                 massless = pin.Inertia(0.0, np.zeros(3), axial)
                 self.pin_model.appendBodyToJoint(joint, massless, pin.SE3.Identity())
                 hang = np.array([0.0, 0.0, model.length[k]])
@@ -345,6 +347,7 @@ class Pinocchio(PinocchioAdapter):
             1,
             error_exponents=(1, 2, 3, 4, 5),
             note="v += h a(q, v) by aba, then q = integrate(q, h v)",
+            method=JointSpaceMethod("semi-implicit Euler", "joint rotations", ROD_AXIAL_INERTIA),
         ),
         Integrator(
             "rkmk4",
@@ -352,6 +355,7 @@ class Pinocchio(PinocchioAdapter):
             4,
             error_exponents=(4, 5, 6, 7, 8),
             note="Munthe-Kaas form of the classical Runge–Kutta method, on aba, integrate and dIntegrate",
+            method=JointSpaceMethod("Runge-Kutta", "joint rotations", ROD_AXIAL_INERTIA, **RUNGE_KUTTA_4),
         ),
         Integrator("dop853", "tolerance", 8, note="SciPy's DOP853 on (q, v) with crba and the tangent map"),
     )

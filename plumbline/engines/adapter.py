@@ -24,6 +24,7 @@ from plumbline.model.datatypes import (
     Model,
     State,
     StateQuantities,
+    StepRun,
     Trajectory,
     Unsupported,
 )
@@ -94,6 +95,10 @@ class Adapter(ABC):
     ) -> Trajectory:
         """Run from ``state`` and sample at ``times`` (times[0] = 0), each of which ends a step exactly."""
         raise Unsupported(f"the adapter does not simulate with {integrator.name}")
+
+    def _step(self, model: Model, state: State, times: Array, integrator: Integrator, step: float) -> StepRun:
+        """Take consecutive steps; ``times`` (T,) are 0, step, 2 step, …."""
+        return StepRun(self._simulate(model, state, times, integrator, step))
 
     def describe(self) -> EngineInfo:
         """Describe the engine as it is loaded.
@@ -176,6 +181,33 @@ class Adapter(ABC):
         trajectory = self._simulate(model, state, times, method, resolution)
         _check_trajectory(model, times, trajectory, f"{self.name} {integrator}")
         return trajectory
+
+
+    def step(self, model: Model, state: State, integrator: str, step: float, count: int) -> StepRun:
+        """Take a few steps from a state and sample after each; errors are those of `evaluate`.
+
+        Args:
+            model: the pendulum.
+            state: the initial state.
+            integrator: name of a fixed-step integrator of `integrators` with a declared method.
+            step: step [s].
+            count: number of steps.
+
+        Returns:
+            The samples, not normalised and not projected.
+
+        """
+        check_state(model, state)
+        times = step * np.arange(count + 1)
+        run = self._step(model, state, times, self.integrator(integrator), step)
+        _check_trajectory(model, times, run.trajectory, f"{self.name} {integrator}")
+        for name, width in (("coordinate_acceleration", 7), ("multipliers", 4)):
+            value, label = getattr(run, name), f"{self.name} {integrator}: {name}"
+            if value is not None:
+                _check_shape(value, (len(times), model.n, width), label)
+                if not np.all(np.isfinite(value)):
+                    raise EngineFailure(f"{label} is not finite")
+        return run
 
 
 def check_state(model: Model, state: State) -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from plumbline.model.step_methods import StepMethod
 from plumbline.processes.errors import PlumblineError
 from reference_impl.chain import Array as Array
 from reference_impl.chain import Chain
@@ -78,6 +79,17 @@ class Trajectory:
     steps: int  # steps the integrator took
 
 
+@dataclass(frozen=True, eq=False)
+class StepRun:
+    """Consecutive steps of one integrator, and what its formula needs besides the motion."""
+
+    trajectory: Trajectory  # T samples at 0, h, 2 h, …
+    coordinate_acceleration: Array | None = None  # (T, N, 7) m/s² and 1/s², second derivatives of (r, p)
+    # (T, N, 4) multipliers: of joint k (three, world axes; of a rod the first: its tension) [N], and of |p| = 1
+    multipliers: Array | None = None
+    angle_axes: Array | None = None  # (angles, 3) world axes of revolute joints at the start, from the pivot on
+
+
 @dataclass(frozen=True)
 class Integrator:
     """One integration method of an engine.
@@ -95,3 +107,4 @@ class Integrator:
     min_rtol: float = 1e-12  # for kind "tolerance": below, rounding on long chains stalls the step
     alias_of: str | None = None  # equals that integrator without drag: not independent evidence
     note: str = ""  # a sentence on what it is
+    method: StepMethod | None = None  # the formula of one step; None: the level "step" does not apply
