@@ -21,6 +21,7 @@ from plumbline.model.datatypes import (
     Model,
     State,
     StateQuantities,
+    StepRun,
     Trajectory,
     Unsupported,
 )
@@ -55,6 +56,16 @@ class RefinementStudy:
 
     runs: list[RefinementRun]
     unsupported: str | None  # the engine's reason for refusing
+
+
+@dataclass(frozen=True, eq=False)
+class StepEvaluation:
+    """Single steps of one integrator from several states, or the reason why there are none."""
+
+    runs: list[tuple[int, float, StepRun | None]]  # index of the state, step [s], None where it was refused
+    unsupported: str | None  # the engine's first reason for refusing
+    failure: str | None  # what the engine did instead
+    cpu_time: float  # CPU s
 
 
 def describe_engine(engine: str) -> EngineInfo:
@@ -146,6 +157,54 @@ def run_refinement(
             failure = format_exception(error)
         runs.append(RefinementRun(resolution, trajectory, failure, time.process_time() - begin))
     return RefinementStudy(runs, None)
+
+
+def run_steps(
+    engine: str,
+    integrator: str,
+    model: Model,
+    states: Sequence[State],
+    steps: Sequence[float],
+    counts: Sequence[int],
+) -> StepEvaluation:
+    """Take a few steps of each size from each state; what the engine raises becomes a reason.
+
+    Args:
+        engine: its name in the registry.
+        integrator: name of one of the engine's integrators.
+        model: the pendulum.
+        states: states of it.
+        steps: steps [s].
+        counts: numbers of steps, ascending; where the engine refuses the largest, the next smaller is tried
+            (angles may become singular on the way).
+
+    Returns:
+        The steps.
+
+    Raises:
+        MemoryError: the worker reached its memory limit, which the pool reports.
+
+    """
+    begin = time.process_time()
+    runs: list[tuple[int, float, StepRun | None]] = []
+    unsupported = failure = None
+    adapter = load_adapter(engine)
+    try:
+        for index, state in enumerate(states):
+            for step in steps:
+                run: StepRun | None = None
+                for count in reversed(counts):
+                    try:
+                        run = adapter.step(model, state, integrator, step, count)
+                        break
+                    except Unsupported as refusal:
+                        unsupported = unsupported or str(refusal)
+                runs.append((index, step, run))
+    except MemoryError:
+        raise
+    except Exception as error:  # as above
+        failure = format_exception(error)
+    return StepEvaluation(runs, unsupported, failure, time.process_time() - begin)
 
 
 def format_exception(error: Exception) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
-Level = Literal["state", "invariants", "trajectory", "relations"]
+Level = Literal["state", "step", "invariants", "trajectory", "relations"]
 Columns = dict[str, Any]  # column name → its values (n,), or the one value of all n records
 
 

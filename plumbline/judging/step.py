@@ -1,0 +1,270 @@
+"""Step level: one step and ten of the declared method, against its formula in extended precision.
+
+Engines in joint coordinates are compared with the formula itself: positions, attitudes and rates per body,
+within a rounding bound.  With b the state-level bounds of accelerations, W and V the largest rate and speed of
+any link up to body k, n its place in the chain of links, ℓ the chain's stretched length up to it, ε = 2⁻⁵³:
+
+    ω′  1.5 h b_α + 32 ε n W              ṙ  1.5 h b_a + 32 ε n max(V, W ℓ)
+    p   h (bound of ω′) + 32 ε n          r  h (bound of ṙ) + 32 ε n ℓ
+
+b holds the error of the accelerations, the factor 1.5 the stages elsewhere, the second term the roundings of
+quaternion products and of the way from joint rates to the bodies'.  Ten steps: the sum over the steps, times
+the growth of perturbations.
+
+Engines that solve a step iteratively are compared in parts that need no iteration: the quadrature of their own
+accelerations, the residual of their equations, and their first accelerations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from plumbline.engines.calls import StepEvaluation
+from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict
+from plumbline.model.datatypes import Array, Integrator, Model, State, StepRun
+from plumbline.model.kinematics import angular_velocity
+from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod
+from plumbline.truth.ground_truth import stretched_length
+from plumbline.truth.rounding_bound import EPS, MAX_RELATIVE_BOUND, RoundingBound, state_rounding_bound
+from plumbline.truth.step_formulas import (
+    HAS_EXTENDED_PRECISION,
+    LinkStates,
+    constrained_quadrature,
+    constrained_residual,
+    engine_coordinates,
+    first_coordinate_acceleration,
+    joint_space_steps,
+)
+
+STEP_COUNTS = (1, 10)
+STEP_SIZES = (0.01, 0.0237)  # s; large: a bound grows as h, the effect of a wrong formula faster
+STEP_STATES = 5  # the initial state and random ones
+MAX_STEP_BODIES = 10
+STEP_ROUNDINGS = 32
+ACCELERATION_FACTOR = 1.5
+FIRST_ACCELERATION_RTOL = 1e-5  # Exudyn's are finite differences, off by 1e-7 of the largest
+STEP_UNITS = {"step_position": "m", "step_attitude": "rad", "step_velocity": "m/s", "step_rate": "rad/s"}
+CONSTRAINED_UNITS = {
+    "step_quadrature": "1",
+    "step_equations": "N",
+    "step_first_acceleration": "m/s²",
+}
+
+
+@dataclass
+class _Comparisons:
+    """Errors of one quantity over bodies, states and steps."""
+
+    errors: list[float] = field(default_factory=list)
+    bounds: list[float] = field(default_factory=list)
+    looseness: list[float] = field(default_factory=list)  # bound over the effect of the accelerations
+    places: list[str] = field(default_factory=list)
+
+    def add(self, errors: Array, bounds: Array, effects: Array, place: str) -> None:
+        """Add the errors (K,) of the bodies, or of one body, at one place."""
+        for k, (error, bound, effect) in enumerate(zip(errors, bounds, effects, strict=True)):
+            self.errors.append(float(error))
+            self.bounds.append(float(bound))
+            self.looseness.append(float(bound / effect) if effect > 0 else 0.0)
+            self.places.append(f"body {k + 1}, {place}")
+
+
+def judge_steps(
+    context: RowContext, integrator: Integrator, model: Model, states: Sequence[State], answer: StepEvaluation
+) -> JudgingResult:
+    """Judge the steps of one integrator by its declared formula.
+
+    Args:
+        context: scenario and engine.
+        integrator: the integrator, with a declared method.
+        model: the pendulum.
+        states: the states that the steps start from.
+        answer: the engine's steps, or why there are none.
+
+    Returns:
+        One row per quantity.
+
+    """
+    method = integrator.method
+    refusal = answer.unsupported if not any(run for *_, run in answer.runs) else None
+    if not HAS_EXTENDED_PRECISION:
+        refusal = "the formulas need an extended precision that this machine does not have"
+    if refusal or answer.failure:
+        verdict = Verdict.FAILED if answer.failure else Verdict.UNSUPPORTED
+        reason = answer.failure or refusal or ""
+        return JudgingResult([context.make_row("step", integrator.name, "all", verdict, reason)])
+    runs = [(index, h, run) for index, h, run in answer.runs if run is not None]
+    if isinstance(method, JointSpaceMethod):
+        found, units = _compare_with_formula(method, model, states, runs), STEP_UNITS
+    else:
+        assert isinstance(method, ConstrainedMethod)
+        found, units = _compare_parts(method, model, states, runs), CONSTRAINED_UNITS
+    alias = None if model.has_drag else integrator.alias_of  # with drag the two methods differ
+    note = f"{len(runs)} of {len(answer.runs)} runs" if len(runs) < len(answer.runs) else f"{len(runs)} runs"
+    return JudgingResult(
+        [
+            _row(context, integrator, quantity, units[quantity], comparisons, note, alias, answer.cpu_time)
+            for quantity, comparisons in found.items()
+        ]
+    )
+
+
+def _row(
+    context: RowContext, integrator: Integrator, quantity: str, unit: str, found: _Comparisons, note: str,
+    alias: str | None, cpu_time: float,
+) -> Row:  # fmt: skip
+    """The row of one quantity: its worst ratio decides, unless every bound is too loose to detect an error."""
+    error, bound = np.array(found.errors), np.array(found.bounds)
+    ratios = error / np.maximum(bound, np.finfo(float).tiny)
+    at, looseness = int(np.argmax(ratios)), np.array(found.looseness)
+    ratio, is_sharp = float(ratios[at]), looseness <= MAX_RELATIVE_BOUND
+    name = quantity.removeprefix("step_").replace("_", " ")
+    if ratio > 1:
+        verdict = Verdict.DISAGREES
+        reason = (
+            f"{context.title} does not take the declared step of {integrator.name}: {name} off by "
+            f"{error[at]:.3g} {unit} ({found.places[at]}), {ratio:.3g} times the rounding bound"
+        )
+    elif not ratio <= 1 or np.mean(is_sharp) < 0.5:
+        verdict = Verdict.UNRESOLVED
+        reason = (
+            f"inconclusive: at {np.mean(~is_sharp):.0%} of the comparisons the rounding bound is above "
+            f"{MAX_RELATIVE_BOUND:g} of the accelerations' effect, too loose to detect an error"
+        )
+    else:
+        verdict = Verdict.AGREES
+        reason = f"{name} within {ratio:.2g} of the rounding bound of the declared step in {note}"
+    return context.make_row(
+        "step", integrator.name, quantity, verdict, reason, unit,
+        value=float(error[at]), tolerance=float(bound[at]), ratio=ratio, alias_of=alias, cpu_time=cpu_time,
+        derivation=f"{bound[at]:.2g} {unit} at {found.places[at]}; in the median {np.median(looseness):.1g} of "
+        f"the accelerations' effect on a step; steps of {', '.join(f'{h:g}' for h in STEP_SIZES)} s; truth: the "
+        "declared formula in extended precision (docs/integrators.md)",
+        extra={"comparisons": float(len(error)), "bound_relative": float(np.median(looseness))},
+    )  # fmt: skip
+
+
+# -- joint coordinates -------------------------------------------------------------------------------
+
+
+def _compare_with_formula(
+    method: JointSpaceMethod, model: Model, states: Sequence[State], runs: Sequence[tuple[int, float, StepRun]]
+) -> dict[str, _Comparisons]:
+    found = {quantity: _Comparisons() for quantity in STEP_UNITS}
+    starts, sizes = [states[index] for index, *_ in runs], [h for _, h, _ in runs]
+    axes = [run.angle_axes for *_, run in runs]
+    steps = joint_space_steps(model, starts, sizes, method, max(STEP_COUNTS), axes)
+    bounds = {index: state_rounding_bound(model, states[index]) for index, *_ in runs}
+    for i, (index, h, run) in enumerate(runs):
+        for count in STEP_COUNTS:
+            if count >= len(run.trajectory.t):
+                continue
+            true = LinkStates(*(getattr(steps[count - 1], name)[i] for name in LinkStates.__match_args__))
+            end = _rounded(true)
+            ends = bounds[index], state_rounding_bound(model, end)
+            bound = _joint_space_bound(model, (states[index], end), ends, h, count)
+            scale = _effects(ends, h, count)
+            place = f"state {index}, {count} step{'s' * (count > 1)} of {h:g} s"
+            for quantity, error in _errors(true, run, count).items():
+                found[quantity].add(error, bound[quantity], scale[quantity], place)
+    return found
+
+
+def _rounded(links: LinkStates) -> State:
+    parts = (np.asarray(getattr(links, name), float) for name in ("p", "omega", "u", "udot", "r", "v"))
+    return State(*parts)
+
+
+def _errors(true: LinkStates, run: StepRun, count: int) -> dict[str, Array]:
+    """Differences (N,) per body; quaternions as they are, not normalised."""
+    t = run.trajectory
+    p = t.p[count].astype(np.longdouble)
+    gaps = [np.linalg.norm(np.asarray(sign * p - true.p, float), axis=-1) for sign in (1, -1)]
+    omega = angular_velocity(p, t.pdot[count])
+    pairs = {
+        "step_position": (t.r[count], true.r),
+        "step_velocity": (t.v[count], true.v),
+        "step_rate": (omega, true.omega),
+    }
+    found = {name: np.linalg.norm(np.asarray(a - b, float), axis=-1) for name, (a, b) in pairs.items()}
+    return found | {"step_attitude": 2 * np.minimum(*gaps)}
+
+
+def _joint_space_bound(
+    model: Model, ends: tuple[State, State], bounds: tuple[RoundingBound, RoundingBound], h: float, count: int
+) -> dict[str, Array]:
+    norm = np.linalg.norm
+    rate = np.max([np.maximum(norm(s.omega, axis=1), norm(s.udot, axis=1)) for s in ends], axis=0)
+    speed = np.max([norm(s.v, axis=1) for s in ends], axis=0)
+    W, V = np.maximum.accumulate(rate), np.maximum.accumulate(speed)
+    arm = np.cumsum(stretched_length(model))
+    rounding = STEP_ROUNDINGS * EPS * (np.arange(1, model.n + 1) + np.cumsum(model.rods))
+    turning, acceleration = (
+        np.max([b.tolerance(name) for b in bounds], axis=0) for name in ("angular_acceleration", "acceleration")
+    )
+    omega = count * (ACCELERATION_FACTOR * h * turning + rounding * W)
+    velocity = count * (ACCELERATION_FACTOR * h * acceleration + rounding * np.maximum(V, W * arm))
+    return {
+        "step_rate": omega,
+        "step_velocity": velocity,
+        "step_attitude": count * (h * omega + rounding),
+        "step_position": count * (h * velocity + rounding * arm),
+    }
+
+
+def _effects(bounds: tuple[RoundingBound, RoundingBound], h: float, count: int) -> dict[str, Array]:
+    """The accelerations' effect (N,) on each quantity: what a bound is compared with."""
+    turning, acceleration = (
+        h * count * np.max([b.scale[name] for b in bounds], axis=0)
+        for name in ("angular_acceleration", "acceleration")
+    )
+    return {
+        "step_rate": turning,
+        "step_velocity": acceleration,
+        "step_attitude": h * turning,
+        "step_position": h * acceleration,
+    }
+
+
+# -- constraints and an iterative solver -------------------------------------------------------------
+
+
+def _compare_parts(
+    method: ConstrainedMethod, model: Model, states: Sequence[State], runs: Sequence[tuple[int, float, StepRun]]
+) -> dict[str, _Comparisons]:
+    found = {quantity: _Comparisons() for quantity in CONSTRAINED_UNITS}
+    for index, h, run in runs:
+        place = f"state {index}, steps of {h:g} s"
+        q, qdot, qddot = engine_coordinates(run)
+        size = [np.max(np.abs(np.asarray(x, float)), axis=-1) for x in (q, qdot, qddot)]
+        size[2] = np.maximum.accumulate(size[2], axis=0)  # the averaged a depends on all earlier ones
+        predicted_q, predicted_rate = constrained_quadrature(method, run, h)
+        roundings = STEP_ROUNDINGS * EPS
+        before = np.maximum(size[1][:-1], size[1][1:])
+        errors = (
+            (predicted_q - q[1:], roundings * (size[0][1:] + h * before + h * h * size[2][1:]), h * h),
+            (predicted_rate - qdot[1:], roundings * (before + h * size[2][1:]), h),
+        )
+        for difference, bound, power in errors:
+            error = np.asarray(np.max(np.abs(difference), axis=-1), float)  # (T − 1, N)
+            worst = np.argmax(error / np.maximum(bound, np.finfo(float).tiny), axis=0)
+            body = np.arange(model.n)
+            found["step_quadrature"].add(
+                error[worst, body], bound[worst, body], power * size[2][1:][worst, body], place
+            )
+        residual = constrained_residual(model, method, run)
+        allowed = np.maximum(method.solver_atol, method.solver_rtol * residual.first_residual)
+        allowed = allowed + roundings * residual.size
+        worst_step = int(np.argmax(residual.residual / allowed))
+        found["step_equations"].add(
+            residual.residual[worst_step : worst_step + 1], allowed[worst_step : worst_step + 1],
+            residual.size[worst_step : worst_step + 1], place,
+        )  # fmt: skip
+        first = first_coordinate_acceleration(model, states[index])
+        allowed = FIRST_ACCELERATION_RTOL * np.full(model.n, float(np.max(np.abs(first))))
+        error = np.asarray(np.max(np.abs(first - qddot[0]), axis=-1), float)
+        found["step_first_acceleration"].add(error, allowed, np.zeros(model.n), place)
+    return found
