@@ -50,7 +50,7 @@ from plumbline.model.step_methods import ConstrainedMethod, generalized_alpha
 from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 
 SPECTRAL_RADIUS = 0.9
-STEP_TOLERANCES = {"solver_atol": 1e-13, "solver_rtol": 1e-14}  # of single steps, which rounding limits
+STEP_TOLERANCES = {"solver_atol": NEWTON_TOLERANCE, "solver_rtol": NEWTON_TOLERANCE}
 
 
 class ExudynChain:
@@ -269,7 +269,9 @@ class Exudyn(ExudynAdapter):
         parts = data.GetODE2Coordinates, data.GetODE2Coordinates_t, data.GetODE2Coordinates_tt
         solver = exudyn.MainSolverImplicitSecondOrder()
         if not self.is_single_step:
-            return run_solver(solver, chain.mbs, settings, times, step, lambda: tuple(part() for part in parts))
+            return run_solver(
+                solver, chain.mbs, settings, times, step, lambda: tuple(part() for part in parts)
+            )
         newton = settings.timeIntegration.newton
         newton.useModifiedNewton = False
         newton.absoluteTolerance = STEP_TOLERANCES["solver_atol"]

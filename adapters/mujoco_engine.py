@@ -69,9 +69,7 @@ class Mujoco(MetamorphicHooks):
     reproduction_template = "mujoco"
     supported_versions = ">=3.2,<5"
     integrators = (
-        Integrator(
-            "Euler", "step", 1, FIRST_ORDER_POWERS, note="semi-implicit Euler", method=_euler("none")
-        ),
+        Integrator("Euler", "step", 1, FIRST_ORDER_POWERS, note="semi-implicit Euler", method=_euler("none")),
         Integrator(
             "implicit",
             "step",
@@ -95,9 +93,7 @@ class Mujoco(MetamorphicHooks):
             4,
             (4, 5, 6, 7, 8),
             note="classical Runge–Kutta on the rotation group",
-            method=JointSpaceMethod(
-                "Runge-Kutta", "joint rotations", ROD_AXIAL_INERTIA / 3, **RUNGE_KUTTA_4
-            ),
+            method=JointSpaceMethod("Runge-Kutta", "joint rotations", ROD_AXIAL_INERTIA / 3, **RUNGE_KUTTA_4),
         ),
     )
     options = ("dense mass matrix",)

@@ -182,7 +182,6 @@ class Adapter(ABC):
         _check_trajectory(model, times, trajectory, f"{self.name} {integrator}")
         return trajectory
 
-
     def step(self, model: Model, state: State, integrator: str, step: float, count: int) -> StepRun:
         """Take a few steps from a state and sample after each; errors are those of `evaluate`.
 

@@ -164,7 +164,7 @@ def run_steps(
     integrator: str,
     model: Model,
     states: Sequence[State],
-    steps: Sequence[float],
+    steps: Sequence[Sequence[float]],
     counts: Sequence[int],
 ) -> StepEvaluation:
     """Take a few steps of each size from each state; what the engine raises becomes a reason.
@@ -174,7 +174,7 @@ def run_steps(
         integrator: name of one of the engine's integrators.
         model: the pendulum.
         states: states of it.
-        steps: steps [s].
+        steps: steps [s] from each state.
         counts: numbers of steps, ascending; where the engine refuses the largest, the next smaller is tried
             (angles may become singular on the way).
 
@@ -190,8 +190,8 @@ def run_steps(
     unsupported = failure = None
     adapter = load_adapter(engine)
     try:
-        for index, state in enumerate(states):
-            for step in steps:
+        for index, (state, sizes) in enumerate(zip(states, steps, strict=True)):
+            for step in sizes:
                 run: StepRun | None = None
                 for count in reversed(counts):
                     try:

@@ -4,10 +4,10 @@ Engines in joint coordinates are compared with the formula itself: positions, at
 within a rounding bound.  With b the state-level bounds of accelerations, W and V the largest rate and speed of
 any link up to body k, n its place in the chain of links, ℓ the chain's stretched length up to it, ε = 2⁻⁵³:
 
-    ω′  1.5 h b_α + 32 ε n W              ṙ  1.5 h b_a + 32 ε n max(V, W ℓ)
+    ω′  3 h b_α + 32 ε n W              ṙ  3 h b_a + 32 ε n max(V, W ℓ)
     p   h (bound of ω′) + 32 ε n          r  h (bound of ṙ) + 32 ε n ℓ
 
-b holds the error of the accelerations, the factor 1.5 the stages elsewhere, the second term the roundings of
+b holds the error of the accelerations, the factor 3 the stages elsewhere, the second term the roundings of
 quaternion products and of the way from joint rates to the bodies'.  Ten steps: the sum over the steps, times
 the growth of perturbations.
 
@@ -25,8 +25,9 @@ import numpy as np
 from plumbline.engines.calls import StepEvaluation
 from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict
 from plumbline.model.datatypes import Array, Integrator, Model, State, StepRun
-from plumbline.model.kinematics import angular_velocity
-from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod
+from plumbline.model.kinematics import angular_velocity, state_from_minimal
+from plumbline.model.sampling import derive_seed
+from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod, StepMethod
 from plumbline.truth.ground_truth import stretched_length
 from plumbline.truth.rounding_bound import EPS, MAX_RELATIVE_BOUND, RoundingBound, state_rounding_bound
 from plumbline.truth.step_formulas import (
@@ -41,10 +42,12 @@ from plumbline.truth.step_formulas import (
 
 STEP_COUNTS = (1, 10)
 STEP_SIZES = (0.01, 0.0237)  # s; large: a bound grows as h, the effect of a wrong formula faster
+MAX_STEP_RATE = 10.0  # rad/s; in faster motions the steps are smaller: explicit methods become unstable
 STEP_STATES = 5  # the initial state and random ones
 MAX_STEP_BODIES = 10
 STEP_ROUNDINGS = 32
-ACCELERATION_FACTOR = 1.5
+ACCELERATION_FACTOR = 3.0
+DISTURBANCE = 1e-9  # of rates, to measure the growth of perturbations
 FIRST_ACCELERATION_RTOL = 1e-5  # Exudyn's are finite differences, off by 1e-7 of the largest
 STEP_UNITS = {"step_position": "m", "step_attitude": "rad", "step_velocity": "m/s", "step_rate": "rad/s"}
 CONSTRAINED_UNITS = {
@@ -52,6 +55,31 @@ CONSTRAINED_UNITS = {
     "step_equations": "N",
     "step_first_acceleration": "m/s²",
 }
+
+
+def step_sizes(method: StepMethod, model: Model, state: State) -> list[float]:
+    """Choose the steps from a state: `STEP_SIZES`, in proportion smaller where the motion is fast.
+
+    Args:
+        method: the method.
+        model: the pendulum.
+        state: a state of it.
+
+    Returns:
+        Steps [s]: `STEP_SIZES` × 10 rad/s over the largest rate of a body, where that is larger.  As rates
+        count (α² + ω⁴/4)^¼ = √(2 |p̈|) and, of methods with constraints, √(F |s| / J) of a joint's force: their
+        Newton iteration leaves that stiffness out and diverges at large steps.
+
+    """
+    norm = np.linalg.norm
+    turning = np.asarray(first_coordinate_acceleration(model, state)[:, 3:], float)
+    squares = [2 * np.max(norm(turning, axis=1)), np.max(norm(state.udot, axis=1)) ** 2]
+    if isinstance(method, ConstrainedMethod):
+        force = np.asarray(state_rounding_bound(model, state).scale["joint_reaction"])
+        lever = norm(model.proximal, axis=1) + norm(model.distal, axis=1)
+        squares.append(np.max(force * lever / np.linalg.eigvalsh(model.inertia)[:, 0]))
+    rate = float(np.sqrt(np.max(squares)))
+    return [h * min(1.0, MAX_STEP_RATE / rate if rate > 0 else 1.0) for h in STEP_SIZES]
 
 
 @dataclass
@@ -151,26 +179,56 @@ def _row(
 
 
 def _compare_with_formula(
-    method: JointSpaceMethod, model: Model, states: Sequence[State], runs: Sequence[tuple[int, float, StepRun]]
+    method: JointSpaceMethod,
+    model: Model,
+    states: Sequence[State],
+    runs: Sequence[tuple[int, float, StepRun]],
 ) -> dict[str, _Comparisons]:
     found = {quantity: _Comparisons() for quantity in STEP_UNITS}
     starts, sizes = [states[index] for index, *_ in runs], [h for _, h, _ in runs]
     axes = [run.angle_axes for *_, run in runs]
-    steps = joint_space_steps(model, starts, sizes, method, max(STEP_COUNTS), axes)
     bounds = {index: state_rounding_bound(model, states[index]) for index, *_ in runs}
+    disturbed = [_disturbed(model, states[index], bounds[index]) for index, *_ in runs]
+    steps = joint_space_steps(model, starts + disturbed, sizes + sizes, method, max(STEP_COUNTS), axes + axes)
     for i, (index, h, run) in enumerate(runs):
+        pairs = [(_pick(links, i), _pick(links, i + len(runs))) for links in steps]
+        weights = _step_bound(model, (states[index],), (bounds[index],), h)
+        separations = [_separation(*pair, weights) for pair in pairs]
         for count in STEP_COUNTS:
             if count >= len(run.trajectory.t):
                 continue
-            true = LinkStates(*(getattr(steps[count - 1], name)[i] for name in LinkStates.__match_args__))
+            true, growth = pairs[count - 1][0], max(separations[:count]) / separations[0]
             end = _rounded(true)
             ends = bounds[index], state_rounding_bound(model, end)
-            bound = _joint_space_bound(model, (states[index], end), ends, h, count)
+            bound = _step_bound(model, (states[index], end), ends, h)
             scale = _effects(ends, h, count)
             place = f"state {index}, {count} step{'s' * (count > 1)} of {h:g} s"
             for quantity, error in _errors(true, run, count).items():
-                found[quantity].add(error, bound[quantity], scale[quantity], place)
+                found[quantity].add(error, count * growth * bound[quantity], scale[quantity], place)
     return found
+
+
+def _pick(links: LinkStates, i: int) -> LinkStates:
+    return LinkStates(*(getattr(links, name)[i] for name in LinkStates.__match_args__))
+
+
+def _disturbed(model: Model, state: State, bound: RoundingBound) -> State:
+    """A state nearby: rates off in random directions, in the proportions in which roundings disturb them."""
+    rng = np.random.default_rng(derive_seed("disturbed step"))
+    tolerance = np.asarray(bound.angular_acceleration)
+    size = DISTURBANCE * max(float(np.max(np.linalg.norm(state.omega, axis=1))), 1.0) / np.max(tolerance)
+    omega = state.omega + (size * tolerance)[:, None] * rng.normal(size=(model.n, 3))
+    return state_from_minimal(model, state.p, omega, state.u, state.udot)
+
+
+def _separation(one: LinkStates, other: LinkStates, weights: dict[str, Array]) -> float:
+    """The largest difference of rates or velocities of two motions, in units of the bounds of a step."""
+    found = [
+        np.linalg.norm(np.asarray(getattr(one, name) - getattr(other, name), float), axis=-1)
+        / weights[quantity]
+        for name, quantity in (("omega", "step_rate"), ("v", "step_velocity"))
+    ]
+    return float(np.max(found))
 
 
 def _rounded(links: LinkStates) -> State:
@@ -193,9 +251,10 @@ def _errors(true: LinkStates, run: StepRun, count: int) -> dict[str, Array]:
     return found | {"step_attitude": 2 * np.minimum(*gaps)}
 
 
-def _joint_space_bound(
-    model: Model, ends: tuple[State, State], bounds: tuple[RoundingBound, RoundingBound], h: float, count: int
+def _step_bound(
+    model: Model, ends: tuple[State, ...], bounds: tuple[RoundingBound, ...], h: float
 ) -> dict[str, Array]:
+    """Bounds (N,) of one step, from the states at its ends."""
     norm = np.linalg.norm
     rate = np.max([np.maximum(norm(s.omega, axis=1), norm(s.udot, axis=1)) for s in ends], axis=0)
     speed = np.max([norm(s.v, axis=1) for s in ends], axis=0)
@@ -203,15 +262,16 @@ def _joint_space_bound(
     arm = np.cumsum(stretched_length(model))
     rounding = STEP_ROUNDINGS * EPS * (np.arange(1, model.n + 1) + np.cumsum(model.rods))
     turning, acceleration = (
-        np.max([b.tolerance(name) for b in bounds], axis=0) for name in ("angular_acceleration", "acceleration")
+        np.max([b.tolerance(name) for b in bounds], axis=0)
+        for name in ("angular_acceleration", "acceleration")
     )
-    omega = count * (ACCELERATION_FACTOR * h * turning + rounding * W)
-    velocity = count * (ACCELERATION_FACTOR * h * acceleration + rounding * np.maximum(V, W * arm))
+    omega = ACCELERATION_FACTOR * h * turning + rounding * W
+    velocity = ACCELERATION_FACTOR * h * acceleration + rounding * np.maximum(V, W * arm)
     return {
         "step_rate": omega,
         "step_velocity": velocity,
-        "step_attitude": count * (h * omega + rounding),
-        "step_position": count * (h * velocity + rounding * arm),
+        "step_attitude": h * omega + rounding,
+        "step_position": h * velocity + rounding * arm,
     }
 
 
@@ -233,7 +293,10 @@ def _effects(bounds: tuple[RoundingBound, RoundingBound], h: float, count: int) 
 
 
 def _compare_parts(
-    method: ConstrainedMethod, model: Model, states: Sequence[State], runs: Sequence[tuple[int, float, StepRun]]
+    method: ConstrainedMethod,
+    model: Model,
+    states: Sequence[State],
+    runs: Sequence[tuple[int, float, StepRun]],
 ) -> dict[str, _Comparisons]:
     found = {quantity: _Comparisons() for quantity in CONSTRAINED_UNITS}
     for index, h, run in runs:
@@ -256,8 +319,9 @@ def _compare_parts(
                 error[worst, body], bound[worst, body], power * size[2][1:][worst, body], place
             )
         residual = constrained_residual(model, method, run)
-        allowed = np.maximum(method.solver_atol, method.solver_rtol * residual.first_residual)
-        allowed = allowed + roundings * residual.size
+        allowed = (
+            np.maximum(method.solver_atol, method.solver_rtol * residual.size) + roundings * residual.size
+        )
         worst_step = int(np.argmax(residual.residual / allowed))
         found["step_equations"].add(
             residual.residual[worst_step : worst_step + 1], allowed[worst_step : worst_step + 1],

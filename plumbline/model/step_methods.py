@@ -37,9 +37,9 @@ class JointSpaceMethod:
 class ConstrainedMethod:
     """A generalised-α or Newmark step in maximal coordinates q = (r, p) with multipliers λ.
 
-        (1−αm) a₁ + αm a₀ = (1−αf) q̈₁ + αf q̈₀,   a₀ = q̈₀ at the start
-        q₁ = q₀ + h q̇₀ + h² ((½−β) a₀ + β a₁),   q̇₁ = q̇₀ + h ((1−γ) a₀ + γ a₁)
-        M(q₁) q̈₁ + C(q₁)ᵀ λ₁ = f(q₁, q̇₁),   g(q₁) = 0 or ġ(q₁, q̇₁) = 0
+    (1−αm) a₁ + αm a₀ = (1−αf) q̈₁ + αf q̈₀,   a₀ = q̈₀ at the start
+    q₁ = q₀ + h q̇₀ + h² ((½−β) a₀ + β a₁),   q̇₁ = q̇₀ + h ((1−γ) a₀ + γ a₁)
+    M(q₁) q̈₁ + C(q₁)ᵀ λ₁ = f(q₁, q̇₁),   g(q₁) = 0 or ġ(q₁, q̇₁) = 0
     """
 
     alpha_m: float
@@ -60,9 +60,7 @@ RUNGE_KUTTA_4 = {
 }
 
 
-def generalized_alpha(
-    spectral_radius: float, *, solver_atol: float, solver_rtol: float
-) -> ConstrainedMethod:
+def generalized_alpha(spectral_radius: float, *, solver_atol: float, solver_rtol: float) -> ConstrainedMethod:
     """Return the generalised-α method with constraints on positions (index 3).
 
     Args:

@@ -135,7 +135,11 @@ class _LinkChain:
         M = np.moveaxis(M, (-4, -2), (0, 1))  # (nj, nj, ..., 3, 3)
         M[i, j] = np.swapaxes(M[j, i], -1, -2)
         c = _cross_matrix(centre)
-        own = A @ self.inertia @ np.swapaxes(A, -1, -2) - m[..., None] * (c @ c) - beyond[..., None] * (left @ left)
+        own = (
+            A @ self.inertia @ np.swapaxes(A, -1, -2)
+            - m[..., None] * (c @ c)
+            - beyond[..., None] * (left @ left)
+        )
         diagonal = np.arange(self.count)
         M[diagonal, diagonal] = np.moveaxis(own, -3, 0)
         M = np.moveaxis(M, (0, 1), (-4, -2))
