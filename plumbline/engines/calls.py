@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
 
 from plumbline.engines.adapter import EngineInfo
@@ -59,12 +59,21 @@ class RefinementStudy:
 
 
 @dataclass(frozen=True, eq=False)
-class StepEvaluation:
-    """Single steps of one integrator from several states, or the reason why there are none."""
+class StepAttempt:
+    """A few steps of one size from one state."""
 
-    runs: list[tuple[int, float, StepRun | None]]  # index of the state, step [s], None where it was refused
-    unsupported: str | None  # the engine's first reason for refusing
-    failure: str | None  # what the engine did instead
+    state: int  # index of the state
+    step: float  # s
+    run: StepRun | None = None  # the steps, fewer where more were refused or failed
+    refusal: str = ""  # why the engine refused to take more steps
+    failure: str = ""  # what it did instead of taking more steps
+
+
+@dataclass(frozen=True, eq=False)
+class StepEvaluation:
+    """Single steps of one integrator from several states."""
+
+    attempts: list[StepAttempt]
     cpu_time: float  # CPU s
 
 
@@ -175,8 +184,8 @@ def run_steps(
         model: the pendulum.
         states: states of it.
         steps: steps [s] from each state.
-        counts: numbers of steps, ascending; where the engine refuses the largest, the next smaller is tried
-            (angles may become singular on the way).
+        counts: numbers of steps, ascending; where the engine refuses the largest or fails, the next smaller is
+            tried: angles may become singular on the way, and an explicit method unstable.
 
     Returns:
         The steps.
@@ -186,25 +195,22 @@ def run_steps(
 
     """
     begin = time.process_time()
-    runs: list[tuple[int, float, StepRun | None]] = []
-    unsupported = failure = None
-    adapter = load_adapter(engine)
-    try:
-        for index, (state, sizes) in enumerate(zip(states, steps, strict=True)):
-            for step in sizes:
-                run: StepRun | None = None
-                for count in reversed(counts):
-                    try:
-                        run = adapter.step(model, state, integrator, step, count)
-                        break
-                    except Unsupported as refusal:
-                        unsupported = unsupported or str(refusal)
-                runs.append((index, step, run))
-    except MemoryError:
-        raise
-    except Exception as error:  # as above
-        failure = format_exception(error)
-    return StepEvaluation(runs, unsupported, failure, time.process_time() - begin)
+    adapter, attempts = load_adapter(engine), []
+    for index, (state, sizes) in enumerate(zip(states, steps, strict=True)):
+        for step in sizes:
+            attempt = StepAttempt(index, step)
+            for count in reversed(counts):
+                try:
+                    attempt = replace(attempt, run=adapter.step(model, state, integrator, step, count))
+                    break
+                except Unsupported as refusal:
+                    attempt = replace(attempt, refusal=attempt.refusal or str(refusal))
+                except MemoryError:
+                    raise
+                except Exception as error:  # as above
+                    attempt = replace(attempt, failure=attempt.failure or format_exception(error))
+            attempts.append(attempt)
+    return StepEvaluation(attempts, time.process_time() - begin)
 
 
 def format_exception(error: Exception) -> str:

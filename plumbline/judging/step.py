@@ -4,12 +4,13 @@ Engines in joint coordinates are compared with the formula itself: positions, at
 within a rounding bound.  With b the state-level bounds of accelerations, W and V the largest rate and speed of
 any link up to body k, n its place in the chain of links, ℓ the chain's stretched length up to it, ε = 2⁻⁵³:
 
-    ω′  3 h b_α + 32 ε n W              ṙ  3 h b_a + 32 ε n max(V, W ℓ)
+    ω′  3 h (b_α + c) + 32 ε n W        ṙ  3 h (b_a + c ℓ) + 32 ε n max(V, W ℓ)
     p   h (bound of ω′) + 32 ε n          r  h (bound of ṙ) + 32 ε n ℓ
 
 b holds the error of the accelerations, the factor 3 the stages elsewhere, the second term the roundings of
-quaternion products and of the way from joint rates to the bodies'.  Ten steps: the sum over the steps, times
-the growth of perturbations.
+quaternion products and of the way from joint rates to the bodies', c = h W Σ (b_α of the links before, and of
+rods about their own axes) what relative rates pass on.  Ten steps: the sum over the steps, times
+the growth of perturbations, as one.
 
 Engines that solve a step iteratively are compared in parts that need no iteration: the quadrature of their own
 accelerations, the residual of their equations, and their first accelerations.
@@ -29,18 +30,18 @@ from plumbline.model.kinematics import angular_velocity, state_from_minimal
 from plumbline.model.sampling import derive_seed
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod, StepMethod
 from plumbline.truth.ground_truth import stretched_length
-from plumbline.truth.rounding_bound import EPS, MAX_RELATIVE_BOUND, RoundingBound, state_rounding_bound
+from plumbline.truth.rounding_bound import EPS, RoundingBound, state_rounding_bound
 from plumbline.truth.step_formulas import (
     HAS_EXTENDED_PRECISION,
     LinkStates,
     constrained_quadrature,
     constrained_residual,
     engine_coordinates,
+    fastest_rates,
     first_coordinate_acceleration,
     joint_space_steps,
 )
 
-STEP_COUNTS = (1, 10)
 STEP_SIZES = (0.01, 0.0237)  # s; large: a bound grows as h, the effect of a wrong formula faster
 MAX_STEP_RATE = 10.0  # rad/s; in faster motions the steps are smaller: explicit methods become unstable
 STEP_STATES = 5  # the initial state and random ones
@@ -49,6 +50,8 @@ STEP_ROUNDINGS = 32
 ACCELERATION_FACTOR = 3.0
 DISTURBANCE = 1e-9  # of rates, to measure the growth of perturbations
 FIRST_ACCELERATION_RTOL = 1e-5  # Exudyn's are finite differences, off by 1e-7 of the largest
+MAX_STEP_BOUND = 1e-6  # of the accelerations' effect; a looser bound could hide a mistake
+MAX_GROWTH = 1e4  # of perturbations; beyond it the method itself is unstable, and nothing is compared
 STEP_UNITS = {"step_position": "m", "step_attitude": "rad", "step_velocity": "m/s", "step_rate": "rad/s"}
 CONSTRAINED_UNITS = {
     "step_quadrature": "1",
@@ -57,29 +60,46 @@ CONSTRAINED_UNITS = {
 }
 
 
-def step_sizes(method: StepMethod, model: Model, state: State) -> list[float]:
-    """Choose the steps from a state: `STEP_SIZES`, in proportion smaller where the motion is fast.
+def step_counts(method: StepMethod | None) -> tuple[int, ...]:
+    """Choose after how many steps engine and formula are compared.
+
+    Args:
+        method: the method.
+
+    Returns:
+        Counts, ascending; few where each step is compared with the one before.
+
+    """
+    return (1, 3) if isinstance(method, ConstrainedMethod) else (1, 10)
+
+
+def step_sizes(method: StepMethod, model: Model, states: Sequence[State]) -> list[list[float]]:
+    """Choose the steps from each state: `STEP_SIZES`, in proportion smaller where the motion is fast.
 
     Args:
         method: the method.
         model: the pendulum.
-        state: a state of it.
+        states: states of it.
 
     Returns:
-        Steps [s]: `STEP_SIZES` × 10 rad/s over the largest rate of a body, where that is larger.  As rates
-        count (α² + ω⁴/4)^¼ = √(2 |p̈|) and, of methods with constraints, √(F |s| / J) of a joint's force: their
-        Newton iteration leaves that stiffness out and diverges at large steps.
+        Steps [s] per state: `STEP_SIZES` × `MAX_STEP_RATE` over the fastest rate, where that is larger.  It is
+        the largest of √(2 |p̈|) = (α² + ω⁴/4)^¼ of a body, of |u̇| of a rod, of the linearised equations'
+        eigenvalues, and for methods with constraints of √(F |s| / J) of a joint's force: their Newton iteration
+        leaves that stiffness out and diverges at large steps.
 
     """
-    norm = np.linalg.norm
-    turning = np.asarray(first_coordinate_acceleration(model, state)[:, 3:], float)
-    squares = [2 * np.max(norm(turning, axis=1)), np.max(norm(state.udot, axis=1)) ** 2]
-    if isinstance(method, ConstrainedMethod):
-        force = np.asarray(state_rounding_bound(model, state).scale["joint_reaction"])
-        lever = norm(model.proximal, axis=1) + norm(model.distal, axis=1)
-        squares.append(np.max(force * lever / np.linalg.eigvalsh(model.inertia)[:, 0]))
-    rate = float(np.sqrt(np.max(squares)))
-    return [h * min(1.0, MAX_STEP_RATE / rate if rate > 0 else 1.0) for h in STEP_SIZES]
+    norm, found = np.linalg.norm, []
+    for state, fastest in zip(states, fastest_rates(model, states), strict=True):
+        turning = np.asarray(first_coordinate_acceleration(model, state)[:, 3:], float)
+        squares = [2 * np.max(norm(turning, axis=1)), np.max(norm(state.udot, axis=1)) ** 2, fastest**2]
+        if isinstance(method, ConstrainedMethod):
+            force = np.asarray(state_rounding_bound(model, state).scale["joint_reaction"])
+            lever = norm(model.proximal, axis=1) + norm(model.distal, axis=1)
+            squares.append(np.max(force * lever / np.linalg.eigvalsh(model.inertia)[:, 0]))
+            squares = [4 * np.max(squares)]
+        rate = float(np.sqrt(np.max(squares)))
+        found.append([h * min(1.0, MAX_STEP_RATE / rate if rate > 0 else 1.0) for h in STEP_SIZES])
+    return found
 
 
 @dataclass
@@ -116,22 +136,34 @@ def judge_steps(
         One row per quantity.
 
     """
-    method = integrator.method
-    refusal = answer.unsupported if not any(run for *_, run in answer.runs) else None
-    if not HAS_EXTENDED_PRECISION:
-        refusal = "the formulas need an extended precision that this machine does not have"
-    if refusal or answer.failure:
-        verdict = Verdict.FAILED if answer.failure else Verdict.UNSUPPORTED
-        reason = answer.failure or refusal or ""
+    method, verdict, reason = integrator.method, Verdict.UNSUPPORTED, ""
+    attempts = [attempt for attempt in answer.attempts if attempt.run is not None]
+    runs = [(attempt.state, attempt.step, attempt.run) for attempt in attempts if attempt.run is not None]
+    if isinstance(method, ConstrainedMethod):
+        failures = [attempt.failure for attempt in answer.attempts]
+    else:
+        failures = [attempt.failure for attempt in answer.attempts if attempt.run is None]
+    if any(failures):
+        verdict, reason = Verdict.FAILED, next(filter(None, failures))
+    elif not runs:
+        reason = next(attempt.refusal for attempt in answer.attempts)
+    elif not HAS_EXTENDED_PRECISION:
+        reason = "the formulas need an extended precision that this machine does not have"
+    if reason:
         return JudgingResult([context.make_row("step", integrator.name, "all", verdict, reason)])
-    runs = [(index, h, run) for index, h, run in answer.runs if run is not None]
     if isinstance(method, JointSpaceMethod):
-        found, units = _compare_with_formula(method, model, states, runs), STEP_UNITS
+        steps = _FormulaSteps(method, model, states, runs)
+        for i, attempt in enumerate(attempts):
+            if attempt.failure and steps.is_stable(i):
+                row = context.make_row("step", integrator.name, "all", Verdict.FAILED, attempt.failure)
+                return JudgingResult([row])
+        found, units = steps.compare(runs), STEP_UNITS
     else:
         assert isinstance(method, ConstrainedMethod)
         found, units = _compare_parts(method, model, states, runs), CONSTRAINED_UNITS
     alias = None if model.has_drag else integrator.alias_of  # with drag the two methods differ
-    note = f"{len(runs)} of {len(answer.runs)} runs" if len(runs) < len(answer.runs) else f"{len(runs)} runs"
+    complete = sum(not (attempt.refusal or attempt.failure) for attempt in answer.attempts)
+    note = f"{complete} runs of {max(step_counts(method))} steps"
     return JudgingResult(
         [
             _row(context, integrator, quantity, units[quantity], comparisons, note, alias, answer.cpu_time)
@@ -148,7 +180,7 @@ def _row(
     error, bound = np.array(found.errors), np.array(found.bounds)
     ratios = error / np.maximum(bound, np.finfo(float).tiny)
     at, looseness = int(np.argmax(ratios)), np.array(found.looseness)
-    ratio, is_sharp = float(ratios[at]), looseness <= MAX_RELATIVE_BOUND
+    ratio, is_sharp = float(ratios[at]), looseness <= MAX_STEP_BOUND
     name = quantity.removeprefix("step_").replace("_", " ")
     if ratio > 1:
         verdict = Verdict.DISAGREES
@@ -160,7 +192,7 @@ def _row(
         verdict = Verdict.UNRESOLVED
         reason = (
             f"inconclusive: at {np.mean(~is_sharp):.0%} of the comparisons the rounding bound is above "
-            f"{MAX_RELATIVE_BOUND:g} of the accelerations' effect, too loose to detect an error"
+            f"{MAX_STEP_BOUND:g} of the accelerations' effect, too loose to detect an error"
         )
     else:
         verdict = Verdict.AGREES
@@ -178,34 +210,77 @@ def _row(
 # -- joint coordinates -------------------------------------------------------------------------------
 
 
-def _compare_with_formula(
-    method: JointSpaceMethod,
-    model: Model,
-    states: Sequence[State],
-    runs: Sequence[tuple[int, float, StepRun]],
-) -> dict[str, _Comparisons]:
-    found = {quantity: _Comparisons() for quantity in STEP_UNITS}
-    starts, sizes = [states[index] for index, *_ in runs], [h for _, h, _ in runs]
-    axes = [run.angle_axes for *_, run in runs]
-    bounds = {index: state_rounding_bound(model, states[index]) for index, *_ in runs}
-    disturbed = [_disturbed(model, states[index], bounds[index]) for index, *_ in runs]
-    steps = joint_space_steps(model, starts + disturbed, sizes + sizes, method, max(STEP_COUNTS), axes + axes)
-    for i, (index, h, run) in enumerate(runs):
-        pairs = [(_pick(links, i), _pick(links, i + len(runs))) for links in steps]
-        weights = _step_bound(model, (states[index],), (bounds[index],), h)
-        separations = [_separation(*pair, weights) for pair in pairs]
-        for count in STEP_COUNTS:
-            if count >= len(run.trajectory.t):
-                continue
-            true, growth = pairs[count - 1][0], max(separations[:count]) / separations[0]
-            end = _rounded(true)
-            ends = bounds[index], state_rounding_bound(model, end)
-            bound = _step_bound(model, (states[index], end), ends, h)
-            scale = _effects(ends, h, count)
-            place = f"state {index}, {count} step{'s' * (count > 1)} of {h:g} s"
-            for quantity, error in _errors(true, run, count).items():
-                found[quantity].add(error, count * growth * bound[quantity], scale[quantity], place)
-    return found
+class _FormulaSteps:
+    """The declared steps from several states, and from states nearby that show how differences grow."""
+
+    def __init__(
+        self, method: JointSpaceMethod, model: Model, states: Sequence[State],
+        runs: Sequence[tuple[int, float, StepRun]],
+    ) -> None:  # fmt: skip
+        self.method, self.model = method, model
+        self.starts, sizes = [states[index] for index, *_ in runs], [h for _, h, _ in runs]
+        axes = [run.angle_axes for *_, run in runs]
+        self.bounds = {index: state_rounding_bound(model, states[index]) for index, *_ in runs}
+        disturbed = [_disturbed(model, states[index], self.bounds[index]) for index, *_ in runs]
+        count = max(step_counts(method))
+        both = joint_space_steps(model, self.starts + disturbed, sizes + sizes, method, count, axes + axes)
+        self.true = [[_pick(links, i) for links in both] for i in range(len(runs))]
+        self.growth = np.empty((len(runs), count + 1))  # of perturbations, running maximum
+        for i, (index, h, _) in enumerate(runs):
+            weights = self.step_bound((self.starts[i],), (self.bounds[index],), h, 1)
+            apart = [_separation(links, i, len(runs), weights) for links in both]
+            self.growth[i] = np.maximum.accumulate(np.array(apart) / apart[0])
+
+    def is_stable(self, i: int) -> bool:
+        """Whether the method itself goes through from the i-th state."""
+        return bool(self.growth[i, -1] < MAX_GROWTH)
+
+    def compare(self, runs: Sequence[tuple[int, float, StepRun]]) -> dict[str, _Comparisons]:
+        """Compare engines' steps with the formula's, body by body."""
+        found = {quantity: _Comparisons() for quantity in STEP_UNITS}
+        for i, (index, h, run) in enumerate(runs):
+            for count in step_counts(self.method):
+                if count >= len(run.trajectory.t) or not self.growth[i, count] < MAX_GROWTH:
+                    continue
+                end = _rounded(self.true[i][count])
+                ends = self.bounds[index], state_rounding_bound(self.model, end)
+                bound = self.step_bound((self.starts[i], end), ends, h, count)
+                scale = _effects(ends, h, count)
+                place = f"state {index}, {count} step{'s' * (count > 1)} of {h:g} s"
+                for quantity, error in _errors(self.true[i][count], run, count).items():
+                    limit = count * self.growth[i, count] * bound[quantity]
+                    found[quantity].add(error, limit, scale[quantity], place)
+        return found
+
+    def step_bound(
+        self, ends: tuple[State, ...], bounds: tuple[RoundingBound, ...], h: float, count: int
+    ) -> dict[str, Array]:
+        """Bounds (N,) of one of ``count`` steps, from the states at their ends."""
+        norm, model = np.linalg.norm, self.model
+        rate = np.max([np.maximum(norm(s.omega, axis=1), norm(s.udot, axis=1)) for s in ends], axis=0)
+        speed = np.max([norm(s.v, axis=1) for s in ends], axis=0)
+        W, V = np.maximum.accumulate(rate), np.maximum.accumulate(speed)
+        arm = np.cumsum(stretched_length(model))
+        rounding = STEP_ROUNDINGS * EPS * (np.arange(1, model.n + 1) + np.cumsum(model.rods))
+        turning, acceleration, torque = (
+            np.max([getattr(b, name) for b in bounds], axis=0)
+            for name in ("angular_acceleration", "acceleration", "rod_torque")
+        )
+        # Rates are kept relative to the link before: what rounding does to one link, and to the spin of a rod,
+        # reaches those beyond it once they have turned against it.
+        above = np.concatenate([[0.0], turning[:-1]])
+        if self.method.coordinates == "joint rotations":
+            axial = self.method.rod_axial_inertia * np.trace(model.inertia, axis1=1, axis2=2)
+            above = above + torque / axial
+        leaked = count * np.minimum(1.0, h * W) * np.cumsum(above)
+        omega = ACCELERATION_FACTOR * h * (turning + leaked) + rounding * W
+        velocity = ACCELERATION_FACTOR * h * (acceleration + leaked * arm) + rounding * np.maximum(V, W * arm)
+        return {
+            "step_rate": omega,
+            "step_velocity": velocity,
+            "step_attitude": h * omega + rounding,
+            "step_position": h * velocity + rounding * arm,
+        }
 
 
 def _pick(links: LinkStates, i: int) -> LinkStates:
@@ -221,13 +296,14 @@ def _disturbed(model: Model, state: State, bound: RoundingBound) -> State:
     return state_from_minimal(model, state.p, omega, state.u, state.udot)
 
 
-def _separation(one: LinkStates, other: LinkStates, weights: dict[str, Array]) -> float:
-    """The largest difference of rates or velocities of two motions, in units of the bounds of a step."""
-    found = [
-        np.linalg.norm(np.asarray(getattr(one, name) - getattr(other, name), float), axis=-1)
-        / weights[quantity]
-        for name, quantity in (("omega", "step_rate"), ("v", "step_velocity"))
-    ]
+def _separation(links: LinkStates, i: int, count: int, weights: dict[str, Array]) -> float:
+    """How far the motion nearby is from motion i of ``count``, in units of the bounds of a step."""
+    found = []
+    for name, quantity in (("omega", "step_rate"), ("v", "step_velocity")):
+        motions = getattr(links, name)
+        with np.errstate(all="ignore"):
+            apart = np.asarray(motions[i] - motions[i + count], float)
+            found.append(np.linalg.norm(apart, axis=-1) / weights[quantity])
     return float(np.max(found))
 
 
@@ -249,30 +325,6 @@ def _errors(true: LinkStates, run: StepRun, count: int) -> dict[str, Array]:
     }
     found = {name: np.linalg.norm(np.asarray(a - b, float), axis=-1) for name, (a, b) in pairs.items()}
     return found | {"step_attitude": 2 * np.minimum(*gaps)}
-
-
-def _step_bound(
-    model: Model, ends: tuple[State, ...], bounds: tuple[RoundingBound, ...], h: float
-) -> dict[str, Array]:
-    """Bounds (N,) of one step, from the states at its ends."""
-    norm = np.linalg.norm
-    rate = np.max([np.maximum(norm(s.omega, axis=1), norm(s.udot, axis=1)) for s in ends], axis=0)
-    speed = np.max([norm(s.v, axis=1) for s in ends], axis=0)
-    W, V = np.maximum.accumulate(rate), np.maximum.accumulate(speed)
-    arm = np.cumsum(stretched_length(model))
-    rounding = STEP_ROUNDINGS * EPS * (np.arange(1, model.n + 1) + np.cumsum(model.rods))
-    turning, acceleration = (
-        np.max([b.tolerance(name) for b in bounds], axis=0)
-        for name in ("angular_acceleration", "acceleration")
-    )
-    omega = ACCELERATION_FACTOR * h * turning + rounding * W
-    velocity = ACCELERATION_FACTOR * h * acceleration + rounding * np.maximum(V, W * arm)
-    return {
-        "step_rate": omega,
-        "step_velocity": velocity,
-        "step_attitude": h * omega + rounding,
-        "step_position": h * velocity + rounding * arm,
-    }
 
 
 def _effects(bounds: tuple[RoundingBound, RoundingBound], h: float, count: int) -> dict[str, Array]:

@@ -51,6 +51,7 @@ class RoundingBound:
     angular_momentum: float  # kg m²/s
     mass_matrix: float  # kg m², of each entry
     scale: dict[str, Array | float]
+    rod_torque: Array  # (N,) N m, of the torques at both ends of the rod that body k hangs by; 0 for a ball
 
     def tolerance(self, quantity: str) -> Array | float:
         """Look up a tolerance by the name of its quantity.
@@ -142,6 +143,10 @@ def state_rounding_bound(model: Model, state: State, parts: BodyParts | None = N
     d = np.stack([swing + terms.a, turning, carried], 1)
     total = ROUNDING_FACTOR * EPS * (tB + tS + tJ + d)
 
+    rod_torque = np.zeros(model.n)
+    rod_torque[model.rods] = joints.torque[: model.rods.sum()]
+    rod_torque += np.where(model.rods, joints.torque[model.rods.sum() :], 0.0)
+
     rate, speed = joints.is_below.T @ joints.rate, joints.D.T @ joints.rate
     lever = np.cumsum(terms.sp + model.length) + _from_previous(np.cumsum(terms.sd))
     kinetic = float(0.5 * np.sum(m * speed**2 + J * rate**2))
@@ -165,6 +170,7 @@ def state_rounding_bound(model: Model, state: State, parts: BodyParts | None = N
             "angular_momentum": momentum,
             "mass_matrix": mass_entry,
         },
+        rod_torque=ROUNDING_FACTOR * EPS * rod_torque,
     )
 
 

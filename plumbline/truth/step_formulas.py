@@ -56,7 +56,8 @@ def joint_space_steps(
         angle_axes: for "joint angles", the axes (angles, 3) of the revolute joints at each state.
 
     Returns:
-        The motion (B, N, ·) after 1, 2, …, ``count`` steps.
+        The motion (B, N, ·) after 0, 1, 2, …, ``count`` steps; not finite where a step leads into a
+        singularity.
 
     """
     chain = _LinkChain(model, method.rod_axial_inertia)
@@ -67,11 +68,46 @@ def joint_space_steps(
     )
     q, v = system.start(states)
     h = np.array(steps, LongDouble)[:, None, None]
-    found = []
-    for _ in range(count):
-        q, v = _STEPS[method.formula](system, method, q, v, h)
-        found.append(chain.bodies(*system.links(q, v)))
+    found = [chain.bodies(*system.links(q, v))]
+    with np.errstate(all="ignore"):
+        for _ in range(count):
+            q, v = _STEPS[method.formula](system, method, q, v, h)
+            found.append(chain.bodies(*system.links(q, v)))
     return found
+
+
+def fastest_rates(model: Model, states: Sequence[State], iterations: int = 12) -> Array:
+    """Estimate the spectral radius of the linearised equations of motion by power iteration.
+
+    Args:
+        model: the mechanism.
+        states: B states.
+        iterations: how many; the growth over the second half counts.
+
+    Returns:
+        (B,) [1/s].
+
+    """
+    chain = _LinkChain(model, 1.0)
+    system = _JointRotations(chain)
+    q, v = system.start(states)
+    a = system.acceleration(q, v)
+    rng = np.random.default_rng(0)
+    theta, rate = rng.normal(size=(2, *v.shape)).astype(LongDouble)
+
+    def size(theta: Array, rate: Array) -> Array:
+        return np.asarray(np.sqrt(np.sum(theta * theta + rate * rate, axis=(-2, -1), keepdims=True)))
+
+    tiny, growth = LongDouble(1e-7), []
+    for _ in range(iterations):
+        total = size(theta, rate)
+        theta, rate = tiny * theta / total, tiny * rate / total
+        change = system.acceleration(system.move(q, theta), v + rate) - a
+        # d/dt of a displacement in the moving frame: δθ̇ = δv − v × θ
+        theta, rate = rate - _cross(v, theta), change
+        growth.append(size(theta, rate) / tiny)
+    later = np.log(np.array(growth[iterations // 2 :], float))
+    return np.asarray(np.exp(np.mean(later, axis=0)).ravel())
 
 
 # -- the equations of motion -------------------------------------------------------------------------

@@ -1,0 +1,148 @@
+"""The step level: the formulas, honest engines on random pendulums, and planted integrators."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+from plumbline.engines.calls import StepAttempt, StepEvaluation, run_steps
+from plumbline.engines.registry import load_adapter
+from plumbline.judging.rows import RowContext, Verdict
+from plumbline.judging.step import STEP_STATES, judge_steps, step_counts, step_sizes
+from plumbline.model.sampling import random_states
+from plumbline.model.step_methods import RUNGE_KUTTA_4, JointSpaceMethod
+from plumbline.truth import step_formulas
+from plumbline.truth.certified import certify_state
+from tests.helpers import pendulums
+from tests.helpers.pendulums import JOINTS
+from tests.helpers.planted_steps import STEP_DEFECTS, StepDefect, planted_step
+
+for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
+    pytest.importorskip(engine)
+if not step_formulas.HAS_EXTENDED_PRECISION:
+    pytest.skip("no extended precision on this machine", allow_module_level=True)
+
+ENGINES = ("mujoco", "pinocchio", "exudyn", "exudyn-tree")
+WHO = RowContext("steps", "test", "engine", "engine", "0")
+
+
+def methods(engine):
+    return [i for i in load_adapter(engine).integrators if i.method is not None]
+
+
+def judged(adapter, integrator, model, states):
+    """Rows of an adapter's steps, judged by the integrator's declared method."""
+    sizes, counts = step_sizes(integrator.method, model, states), step_counts(integrator.method)
+    with patch("plumbline.engines.calls.load_adapter", lambda _: adapter):
+        answer = run_steps(adapter.name, integrator.name, model, states, sizes, counts)
+    return judge_steps(WHO, integrator, model, states, answer).rows
+
+
+@cache
+def subject(joints, has_drag=False, loads=False):
+    model = pendulums.model(JOINTS[joints], loads=loads, drag=has_drag)
+    return model, random_states(model, STEP_STATES, seed=5)
+
+
+def disagreeing(rows):
+    return {row.quantity: row.ratio for row in rows if row.verdict != Verdict.AGREES}
+
+
+@pytest.mark.parametrize("joints", list(JOINTS))
+def test_accelerations_equal_the_certified_ones(joints):
+    model, states = subject(joints, True, True)
+    found = step_formulas.first_coordinate_acceleration(model, states[0])
+    true = certify_state(model, states[0]).quantities
+    scale = np.max(np.abs(true.acceleration))
+    np.testing.assert_allclose(found[:, :3].astype(float), true.acceleration, rtol=0, atol=4e-16 * scale)
+    chain = step_formulas._LinkChain(model, 0.2)
+    p, omega = chain.attitudes(states[:1])
+    A = step_formulas._rotation(p)
+    alpha = step_formulas._times(np.swapaxes(A, -1, -2), chain.acceleration(A, omega))[0, chain.of_body]
+    scale = np.max(np.abs(true.angular_acceleration))
+    np.testing.assert_allclose(alpha.astype(float), true.angular_acceleration, rtol=0, atol=4e-16 * scale)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("joints", ["ball", "rod", "balls", "rods", "rod-ball", "ball-rod", "mixed"])
+def test_honest_engines_take_the_declared_step(engine, joints):
+    model, states = subject(joints, True, True)
+    for integrator in methods(engine):
+        rows = judged(load_adapter(engine), integrator, model, states)
+        assert not disagreeing(rows), [row.reason for row in rows]
+        assert all(row.level == "step" and row.ratio < 1 for row in rows)
+
+
+@cache
+def defect_report(defect: StepDefect):
+    model, states = subject(defect.joints, defect.has_drag)
+    integrator = load_adapter(defect.engine).integrator(defect.integrator)
+    with planted_step(defect) as adapter:
+        return judged(adapter, integrator, model, states)
+
+
+@pytest.mark.parametrize("defect", STEP_DEFECTS, ids=[d.name for d in STEP_DEFECTS])
+def test_every_other_integrator_is_reported(defect):
+    rows = defect_report(defect)
+    assert any(row.verdict == Verdict.DISAGREES for row in rows), [row.reason for row in rows]
+
+
+def test_the_planting_itself_is_honest():
+    """The declared step, taken by the helpers that plant others, is not reported."""
+    from tests.helpers import planted_steps as planted
+
+    honest = [
+        StepDefect("rk4", "", engine, name, joints,
+                   step=lambda s, q, v, h: planted.runge_kutta(s, q, v, h, planted.CLASSICAL, planted.WEIGHTS))
+        for engine, name in planted.RK4S for joints in ("balls", "rods")
+    ]  # fmt: skip
+    honest += [StepDefect("implicit", "", "mujoco", "implicit", step=planted.implicit, has_drag=True)]
+    honest += [StepDefect("as-declared", "", "exudyn", i.name) for i in methods("exudyn")]
+    for defect in honest:
+        rows = defect_report(defect)
+        assert not disagreeing(rows), (defect, [row.reason for row in rows])
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "pinocchio"])
+def test_a_rods_axial_inertia_is_a_part_of_the_method(engine):
+    """It changes no motion, but steps on chains of rods: declared wrong, the step is not the declared one."""
+    model, states = subject("mixed")
+    for integrator in methods(engine):
+        wrong = replace(integrator.method, rod_axial_inertia=2 * integrator.method.rod_axial_inertia)
+        rows = judged(load_adapter(engine), replace(integrator, method=wrong), model, states)
+        assert disagreeing(rows), integrator.name
+        single, at = subject("rod")
+        assert not disagreeing(judged(load_adapter(engine), replace(integrator, method=wrong), single, at))
+
+
+def test_a_weight_wrong_by_1e_minus_9_is_reported_on_one_body():
+    model, states = subject("ball")
+    method = JointSpaceMethod("Runge-Kutta", "joint rotations", 0.01 / 3, **RUNGE_KUTTA_4)
+    weights = (1 / 6, 1 / 3 + 1e-9, 1 / 3 - 1e-9, 1 / 6)
+    integrator = replace(load_adapter("mujoco").integrator("RK4"), method=replace(method, weights=weights))
+    assert disagreeing(judged(load_adapter("mujoco"), integrator, model, states))
+
+
+def test_an_engine_that_refuses_or_fails_has_one_row():
+    model, states = subject("balls")
+    integrator = load_adapter("exudyn-tree").integrator("RK44")
+    refused = StepEvaluation([StepAttempt(0, 0.01, refusal="angles are singular")], 0.1)
+    (row,) = judge_steps(WHO, integrator, model, states, refused).rows
+    assert (row.verdict, row.quantity, row.reason) == (Verdict.UNSUPPORTED, "all", "angles are singular")
+    failed = StepEvaluation([StepAttempt(0, 0.01, failure="it crashed")], 0.1)
+    (row,) = judge_steps(WHO, integrator, model, states, failed).rows
+    assert (row.verdict, row.reason) == (Verdict.FAILED, "it crashed")
+
+
+@pytest.mark.parametrize("joints", ["rods", "mixed"])
+def test_a_coarser_step_is_taken_from_slower_states_only(joints):
+    model, states = subject(joints)
+    method = load_adapter("mujoco").integrator("RK4").method
+    slow = replace(states[0], omega=0 * states[0].omega, udot=0 * states[0].udot, v=0 * states[0].v)
+    fast = replace(states[0], omega=50 * np.ones_like(states[0].omega))
+    of_fast, of_slow = (max(sizes) for sizes in step_sizes(method, model, [fast, slow]))
+    assert of_fast < 0.2 * of_slow <= 0.2 * 0.0237
