@@ -28,7 +28,7 @@ CURVE_COLUMNS = (
     "gap_rate",
     "norm_drift",
 )
-CLI_LEVEL = {"state": "state", "trajectory": "trajectory", "invariants": "trajectory"}
+CLI_LEVEL = {"state": "state", "step": "step", "trajectory": "trajectory", "invariants": "trajectory"}
 DEFAULT_LONG_RUN_SECONDS = 100.0  # s: the default of the nightly's --long-run-seconds
 CATALOGUE_FOLDER = Path(__file__).parent.parent / "scenarios"
 MAX_MOTION_BYTES = 90_000  # of one scenario's motion, before compression

@@ -15,7 +15,7 @@ from plumbline.scenario.loader import Scenario
 RANDOM_STATES = 50  # random states per scenario, besides the initial one
 STATES_PER_RANDOM_SCENARIO = 9  # the same for a random scenario: there are many of them
 
-LevelSelection = Literal["state", "trajectory", "all"]
+LevelSelection = Literal["state", "step", "trajectory", "all"]
 ProgressCallback = Callable[[int, int, str], None]  # finished tasks, all tasks, name of the last one
 
 
@@ -46,6 +46,7 @@ class TaskKind(StrEnum):
     STATE_TRUTH = "state truth"
     MOTION_TRUTH = "motion truth"
     STATE = "state"
+    STEP = "step"
     RELATIONS = "relations"
     TRAJECTORY = "trajectory"
     LONG_RUN = "long run"
@@ -92,7 +93,11 @@ class TaskKey:
 
 
 def task_keys(
-    scenario: str, engines: Mapping[str, EngineInfo], level: LevelSelection, has_long_runs: bool = False
+    scenario: str,
+    engines: Mapping[str, EngineInfo],
+    level: LevelSelection,
+    has_long_runs: bool = False,
+    has_steps: bool = True,
 ) -> Iterator[TaskKey]:
     """List the tasks of a scenario that are known beforehand.
 
@@ -101,6 +106,7 @@ def task_keys(
         engines: descriptions of the engines; those that are missing get no task.
         level: which levels to compare at.
         has_long_runs: whether invariants are judged over long runs.
+        has_steps: whether the scenario is small enough for the step level.
 
     Yields:
         The truths, then the cells engine by engine.
@@ -116,6 +122,10 @@ def task_keys(
             continue
         if has_states:
             yield TaskKey(TaskKind.STATE, scenario, name)
+        if has_steps and level in ("step", "all"):
+            for one in info.integrators:
+                if one.method is not None:
+                    yield TaskKey(TaskKind.STEP, scenario, name, one.name)
         if level == "all":
             yield TaskKey(TaskKind.RELATIONS, scenario, name)
         if has_runs:

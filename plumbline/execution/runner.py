@@ -19,7 +19,7 @@ from plumbline.engines.adapter import EngineInfo
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import Plan, ProgressCallback, TaskKey, TaskKind, task_keys
 from plumbline.execution.random_batch import RandomBatch
-from plumbline.execution.scenario_run import ScenarioRun
+from plumbline.execution.scenario_run import ScenarioRun, has_steps
 from plumbline.judging import known_issues
 from plumbline.judging.rows import Row, Verdict
 from plumbline.processes.cpu_time import CpuTimes
@@ -145,7 +145,10 @@ class _Run:
         plan = self.plan
         self.engines = describe_engines(executor, plan.engines, are_required=plan.are_engines_required)
         has_long_runs = plan.long_run_seconds > 0
-        total = len(plan.scenarios) * sum(1 for _ in task_keys("", self.engines, plan.level, has_long_runs))
+        total = sum(
+            sum(1 for _ in task_keys("", self.engines, plan.level, has_long_runs, has_steps(scenario)))
+            for scenario in plan.scenarios
+        )
         total += len(plan.random_scenarios) * sum(1 for _ in task_keys("", self.engines, "state"))
         scheduler = Scheduler(executor, self.cpu_times.timed_cache(plan.result_cache))
         for done, outcome in enumerate(scheduler.run(self._tasks()), start=1):

@@ -19,6 +19,13 @@ from plumbline.judging.long_run_study import plan_long_run, run_long_run_study
 from plumbline.judging.long_runs import judge_long_runs
 from plumbline.judging.rows import JudgingResult, Level, RowContext, Verdict
 from plumbline.judging.state import judge_states
+from plumbline.judging.step import (
+    MAX_STEP_BODIES,
+    STEP_STATES,
+    judge_steps,
+    step_counts,
+    step_sizes,
+)
 from plumbline.judging.trajectory import judge_trajectory
 from plumbline.model.datatypes import Integrator, StateQuantities
 from plumbline.model.sampling import derive_seed, random_states
@@ -30,6 +37,7 @@ from plumbline.truth.ground_truth import MotionTruth, StateTruth
 
 _LEVELS: dict[TaskKind, Level] = {
     TaskKind.STATE: "state",
+    TaskKind.STEP: "step",
     TaskKind.RELATIONS: "relations",
     TaskKind.TRAJECTORY: "trajectory",
     TaskKind.LONG_RUN: "invariants",
@@ -41,6 +49,19 @@ class TruthFailure:
     """The truth could not be computed."""
 
     reason: str
+
+
+def has_steps(scenario: Scenario) -> bool:
+    """Return whether a scenario is compared at step level.
+
+    Args:
+        scenario: any scenario.
+
+    Returns:
+        True for chains of at most `MAX_STEP_BODIES` bodies.
+
+    """
+    return scenario.model.n <= MAX_STEP_BODIES
 
 
 class ScenarioRun:
@@ -74,7 +95,9 @@ class ScenarioRun:
         self.truths: dict[TaskKind, StateTruth | MotionTruth | TruthFailure] = {}
         self._plan, self._engines, self._known = plan, engines, known
         level = "state" if is_random else plan.level
-        self._keys = list(task_keys(scenario.name, engines, level, plan.long_run_seconds > 0))
+        self._keys = list(
+            task_keys(scenario.name, engines, level, plan.long_run_seconds > 0, has_steps(scenario))
+        )
         self._pending = set(self._keys)  # without an outcome
         self._findings: dict[TaskKey, JudgingResult] = {}
         self._has_retried_truth = False
@@ -87,6 +110,7 @@ class ScenarioRun:
             derive_seed("states", scenario.digest),
         )
         self._states = Pickled.of([scenario.state, *drawn])  # argument of many tasks
+        self._step_states = [scenario.state, *drawn][:STEP_STATES]
 
     def tasks(self) -> Iterator[Task]:
         """Make the tasks that can start: the truths that are missing, and all cells but those of states.
@@ -246,6 +270,14 @@ class ScenarioRun:
                 judge = judge_states, (self._context(key.engine), self._state_truth)
         elif key.kind == TaskKind.RELATIONS:
             call = metamorphic.check_relations
+        elif key.kind == TaskKind.STEP:
+            call, integrator = calls.run_steps, self._integrator(key)
+            assert integrator.method is not None
+            sizes = step_sizes(integrator.method, s.model, self._step_states)
+            arguments = (
+                integrator.name, s.model, self._step_states, sizes, step_counts(integrator.method)
+            )  # fmt: skip
+            judge = judge_steps, (self._context(key.engine), integrator, s.model, self._step_states)
         else:
             integrator = self._integrator(key)
             if key.kind == TaskKind.TRAJECTORY:
@@ -283,6 +315,10 @@ class ScenarioRun:
         elif isinstance(truth, MotionTruth):
             integrator = self._integrator(key)
             found = judge_trajectory(context, self.scenario.model, truth, integrator, outcome.value)
+        elif key.kind == TaskKind.STEP:
+            found = judge_steps(
+                context, self._integrator(key), self.scenario.model, self._step_states, outcome.value
+            )
         elif key.kind == TaskKind.LONG_RUN:
             is_regular = self.scenario.closed_form is not None
             found = judge_long_runs(

@@ -278,8 +278,8 @@ class _FormulaSteps:
         return {
             "step_rate": omega,
             "step_velocity": velocity,
-            "step_attitude": h * omega + rounding,
-            "step_position": h * velocity + rounding * arm,
+            "step_attitude": count * h * omega + rounding,
+            "step_position": count * h * velocity + rounding * arm,
         }
 
 

@@ -127,6 +127,8 @@ def no_script_reason(engine: str, row: dict[str, Any]) -> str:
     """
     if not declared_attribute(engine, "reproduction_template"):
         return f"engine {engine} has no template of scripts"
+    if row["level"] == "step":
+        return "rows of single steps have no script"
     relation = row["quantity"]
     if relation.endswith(LONG_RUN_SUFFIXES):
         return "rows of long runs have no script"

@@ -104,7 +104,7 @@ function speaker(index, s, e) {
   return found < 0 ? null : found;
 }
 
-const LEVELS = ["state", "trajectory", "invariants", "relations"];
+const LEVELS = ["state", "step", "trajectory", "invariants", "relations"];
 
 /** The name of a row within its cell. @param {Index} index @param {number} i */
 const placeOf = ({ rows, levels, integrators, quantitys }, i) => [levels[rows.level[i]], integrators[rows.integrator[i]], quantitys[rows.quantity[i]]].join("/");
