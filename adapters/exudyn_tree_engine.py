@@ -57,7 +57,7 @@ from plumbline.model.kinematics import (
     quaternion_rate,
     rotation_matrix,
 )
-from plumbline.model.step_methods import RUNGE_KUTTA_4, JointSpaceMethod
+from plumbline.model.step_methods import classical_runge_kutta
 
 SENSOR_OUTPUTS = (
     Output.Position,
@@ -289,7 +289,7 @@ class ExudynTree(ExudynAdapter):
             4,
             (4, 5, 6, 7, 8),
             note="classical Runge-Kutta on joint angles",
-            method=JointSpaceMethod("Runge-Kutta", "joint angles", **RUNGE_KUTTA_4),
+            method=classical_runge_kutta("joint angles"),
         ),
     )
     unsupported: ClassVar[Mapping[str, str]] = {

@@ -46,7 +46,7 @@ from plumbline.model.datatypes import (
     StateQuantities,
     Trajectory,
 )
-from plumbline.model.step_methods import RUNGE_KUTTA_4, JointSpaceMethod
+from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
 from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 
 FIRST_ORDER_POWERS = (1, 2, 3, 4, 5, 6)
@@ -93,7 +93,7 @@ class Mujoco(MetamorphicHooks):
             4,
             (4, 5, 6, 7, 8),
             note="classical Runge–Kutta on the rotation group",
-            method=JointSpaceMethod("Runge-Kutta", "joint rotations", ROD_AXIAL_INERTIA / 3, **RUNGE_KUTTA_4),
+            method=classical_runge_kutta("joint rotations", ROD_AXIAL_INERTIA / 3),
         ),
     )
     options = ("dense mass matrix",)

@@ -49,7 +49,7 @@ from plumbline.model.kinematics import (
     quaternion_rate,
     rotation_matrix,
 )
-from plumbline.model.step_methods import RUNGE_KUTTA_4, JointSpaceMethod
+from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
 from plumbline.model.welding import BodyParts, undivided_bodies
 
 ROD_AXIAL_INERTIA = 1 / 3  # of a rod about its own axis, over the trace of the inertia that it carries
@@ -355,7 +355,7 @@ class Pinocchio(PinocchioAdapter):
             4,
             error_exponents=(4, 5, 6, 7, 8),
             note="Munthe-Kaas form of the classical Runge–Kutta method, on aba, integrate and dIntegrate",
-            method=JointSpaceMethod("Runge-Kutta", "joint rotations", ROD_AXIAL_INERTIA, **RUNGE_KUTTA_4),
+            method=classical_runge_kutta("joint rotations", ROD_AXIAL_INERTIA),
         ),
         Integrator("dop853", "tolerance", 8, note="SciPy's DOP853 on (q, v) with crba and the tangent map"),
     )

@@ -39,9 +39,9 @@ from plumbline.storage.results_store import row_record, to_json_value
     "--level",
     type=click.Choice(["state", "step", "trajectory", "all"]),
     default="all",
-    help="state: accelerations, reactions and energies at 51 states. step: single steps against the declared "
-    "formula of each integrator. trajectory: observed orders, limits and invariants. all: all of them, and the "
-    "metamorphic relations.",
+    help="state: accelerations, reactions and energies at 51 states. step: single steps against the "
+    "declared formula of each integrator. trajectory: observed orders, limits and invariants. all: all of "
+    "them, and the metamorphic relations.",
 )
 @options.jobs_option
 @options.scheduler_option

@@ -197,7 +197,7 @@ class Adapter(ABC):
 
         """
         check_state(model, state)
-        times = step * np.arange(count + 1)
+        times = np.asarray(step * np.arange(count + 1), float)
         run = self._step(model, state, times, self.integrator(integrator), step)
         _check_trajectory(model, times, run.trajectory, f"{self.name} {integrator}")
         for name, width in (("coordinate_acceleration", 7), ("multipliers", 4)):

@@ -184,8 +184,8 @@ def run_steps(
         model: the pendulum.
         states: states of it.
         steps: steps [s] from each state.
-        counts: numbers of steps, ascending; where the engine refuses the largest or fails, the next smaller is
-            tried: angles may become singular on the way, and an explicit method unstable.
+        counts: numbers of steps, ascending; where the engine refuses the largest or fails, the next
+            smaller is tried: angles may become singular on the way, and an explicit method unstable.
 
     Returns:
         The steps.

@@ -95,7 +95,7 @@ class TaskKey:
 def task_keys(
     scenario: str,
     engines: Mapping[str, EngineInfo],
-    level: LevelSelection,
+    level: LevelSelection | Literal["random"],
     has_long_runs: bool = False,
     has_steps: bool = True,
 ) -> Iterator[TaskKey]:
@@ -104,7 +104,7 @@ def task_keys(
     Args:
         scenario: name of the scenario.
         engines: descriptions of the engines; those that are missing get no task.
-        level: which levels to compare at.
+        level: which levels to compare at; "random" is state and step level.
         has_long_runs: whether invariants are judged over long runs.
         has_steps: whether the scenario is small enough for the step level.
 
@@ -112,7 +112,7 @@ def task_keys(
         The truths, then the cells engine by engine.
 
     """
-    has_states, has_runs = level in ("state", "all"), level in ("trajectory", "all")
+    has_states, has_runs = level in ("state", "random", "all"), level in ("trajectory", "all")
     if has_states:
         yield TaskKey(TaskKind.STATE_TRUTH, scenario)
     if has_runs:
@@ -122,7 +122,7 @@ def task_keys(
             continue
         if has_states:
             yield TaskKey(TaskKind.STATE, scenario, name)
-        if has_steps and level in ("step", "all"):
+        if has_steps and level in ("step", "random", "all"):
             for one in info.integrators:
                 if one.method is not None:
                     yield TaskKey(TaskKind.STEP, scenario, name, one.name)

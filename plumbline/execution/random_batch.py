@@ -1,4 +1,4 @@
-"""Random scenarios at state level: rows that need no look are counted, the others are kept."""
+"""Random scenarios: rows that need no look are counted, the others are kept."""
 
 from __future__ import annotations
 

@@ -87,14 +87,14 @@ class ScenarioRun:
             plan: what to run.
             scenario: the scenario.
             engines: description of each engine of the plan.
-            is_random: whether it is a random scenario, which is compared at state level at few states.
+            is_random: whether it is a random scenario, which is compared at few states, and by single steps.
             known: discrepancies whose cause is on record, so that it is not searched again.
 
         """
         self.scenario = scenario
         self.truths: dict[TaskKind, StateTruth | MotionTruth | TruthFailure] = {}
         self._plan, self._engines, self._known = plan, engines, known
-        level = "state" if is_random else plan.level
+        level = "random" if is_random else plan.level
         self._keys = list(
             task_keys(scenario.name, engines, level, plan.long_run_seconds > 0, has_steps(scenario))
         )

@@ -1,8 +1,8 @@
 """Step level: one step and ten of the declared method, against its formula in extended precision.
 
 Engines in joint coordinates are compared with the formula itself: positions, attitudes and rates per body,
-within a rounding bound.  With b the state-level bounds of accelerations, W and V the largest rate and speed of
-any link up to body k, n its place in the chain of links, ℓ the chain's stretched length up to it, ε = 2⁻⁵³:
+within a rounding bound.  With b the state-level bounds of accelerations, W and V the largest rate and speed
+of any link up to body k, n its place among the links, ℓ the chain's stretched length up to it, ε = 2⁻⁵³:
 
     ω′  3 h (b_α + c) + 32 ε n W        ṙ  3 h (b_a + c ℓ) + 32 ε n max(V, W ℓ)
     p   h (bound of ω′) + 32 ε n          r  h (bound of ṙ) + 32 ε n ℓ
@@ -12,8 +12,8 @@ quaternion products and of the way from joint rates to the bodies', c = h W Σ (
 rods about their own axes) what relative rates pass on.  Ten steps: the sum over the steps, times
 the growth of perturbations, as one.
 
-Engines that solve a step iteratively are compared in parts that need no iteration: the quadrature of their own
-accelerations, the residual of their equations, and their first accelerations.
+Engines that solve a step iteratively are compared in parts that need no iteration: the quadrature of their
+own accelerations, the residual of their equations, and their first accelerations.
 """
 
 from __future__ import annotations
@@ -82,10 +82,10 @@ def step_sizes(method: StepMethod, model: Model, states: Sequence[State]) -> lis
         states: states of it.
 
     Returns:
-        Steps [s] per state: `STEP_SIZES` × `MAX_STEP_RATE` over the fastest rate, where that is larger.  It is
-        the largest of √(2 |p̈|) = (α² + ω⁴/4)^¼ of a body, of |u̇| of a rod, of the linearised equations'
-        eigenvalues, and for methods with constraints of √(F |s| / J) of a joint's force: their Newton iteration
-        leaves that stiffness out and diverges at large steps.
+        Steps [s] per state: `STEP_SIZES` × `MAX_STEP_RATE` over the fastest rate, where that is larger.  It
+        is the largest of √(2 |p̈|) = (α² + ω⁴/4)^¼ of a body, of |u̇| of a rod, of the linearised equations'
+        eigenvalues, and for methods with constraints of √(F |s| / J) of a joint's force, doubled: their
+        Newton iteration leaves that stiffness out and diverges at large steps.
 
     """
     norm, found = np.linalg.norm, []
@@ -176,7 +176,7 @@ def _row(
     context: RowContext, integrator: Integrator, quantity: str, unit: str, found: _Comparisons, note: str,
     alias: str | None, cpu_time: float,
 ) -> Row:  # fmt: skip
-    """The row of one quantity: its worst ratio decides, unless every bound is too loose to detect an error."""
+    """The row of one quantity: its worst ratio decides, unless most bounds are too loose."""
     error, bound = np.array(found.errors), np.array(found.bounds)
     ratios = error / np.maximum(bound, np.finfo(float).tiny)
     at, looseness = int(np.argmax(ratios)), np.array(found.looseness)
@@ -200,9 +200,9 @@ def _row(
     return context.make_row(
         "step", integrator.name, quantity, verdict, reason, unit,
         value=float(error[at]), tolerance=float(bound[at]), ratio=ratio, alias_of=alias, cpu_time=cpu_time,
-        derivation=f"{bound[at]:.2g} {unit} at {found.places[at]}; in the median {np.median(looseness):.1g} of "
-        f"the accelerations' effect on a step; steps of {', '.join(f'{h:g}' for h in STEP_SIZES)} s; truth: the "
-        "declared formula in extended precision (docs/integrators.md)",
+        derivation=f"{bound[at]:.2g} {unit} at {found.places[at]}; in the median {np.median(looseness):.1g} "
+        "of the accelerations' effect on a step; truth: the declared formula in extended precision "
+        "(docs/integrators.md)",
         extra={"comparisons": float(len(error)), "bound_relative": float(np.median(looseness))},
     )  # fmt: skip
 
@@ -266,8 +266,8 @@ class _FormulaSteps:
             np.max([getattr(b, name) for b in bounds], axis=0)
             for name in ("angular_acceleration", "acceleration", "rod_torque")
         )
-        # Rates are kept relative to the link before: what rounding does to one link, and to the spin of a rod,
-        # reaches those beyond it once they have turned against it.
+        # Rates are kept relative to the link before: what rounding does to one link, and to the spin of a
+        # rod, reaches those beyond it once they have turned against it.
         above = np.concatenate([[0.0], turning[:-1]])
         if self.method.coordinates == "joint rotations":
             axial = self.method.rod_axial_inertia * np.trace(model.inertia, axis1=1, axis2=2)
@@ -330,7 +330,7 @@ def _errors(true: LinkStates, run: StepRun, count: int) -> dict[str, Array]:
 def _effects(bounds: tuple[RoundingBound, RoundingBound], h: float, count: int) -> dict[str, Array]:
     """The accelerations' effect (N,) on each quantity: what a bound is compared with."""
     turning, acceleration = (
-        h * count * np.max([b.scale[name] for b in bounds], axis=0)
+        h * count * np.max([np.asarray(b.scale[name]) for b in bounds], axis=0)
         for name in ("angular_acceleration", "acceleration")
     )
     return {

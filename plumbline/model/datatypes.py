@@ -85,7 +85,7 @@ class StepRun:
 
     trajectory: Trajectory  # T samples at 0, h, 2 h, …
     coordinate_acceleration: Array | None = None  # (T, N, 7) m/s² and 1/s², second derivatives of (r, p)
-    # (T, N, 4) multipliers: of joint k (three, world axes; of a rod the first: its tension) [N], and of |p| = 1
+    # (T, N, 4): multipliers of joint k, three [N], world axes (a rod's first is its tension), and of |p| = 1
     multipliers: Array | None = None
     angle_axes: Array | None = (
         None  # (angles, 3) world axes of revolute joints at the start, from the pivot on

@@ -19,8 +19,8 @@ class JointSpaceMethod:
         Runge-Kutta           θ̇ = dexp⁻¹(θ) v,   v̇ = a(q ⊕ θ, v),   from θ = 0;   q₁ = q ⊕ θ₁
 
     Coordinates "joint rotations": each ball joint and each rod's upper end has a relative quaternion, and as
-    its velocity the relative angular velocity in the child's frame; q ⊕ t = q exp(t). "joint angles": revolute
-    joints; q ⊕ t = q + t and dexp⁻¹ is the identity.
+    its velocity the relative angular velocity in the child's frame; q ⊕ t = q exp(t). "joint angles":
+    revolute joints; q ⊕ t = q + t and dexp⁻¹ is the identity.
     """
 
     formula: Literal["semi-implicit Euler", "Runge-Kutta"]
@@ -47,17 +47,34 @@ class ConstrainedMethod:
     beta: float
     gamma: float
     constraint_level: Literal["position", "velocity"]
-    # Newton's iteration ends below max(solver_atol, solver_rtol × norm of the first residual) [N, and m or m/s].
+    # Newton's iteration ends below solver_atol, or solver_rtol × the first residual [N, and m or m/s].
     solver_atol: float
     solver_rtol: float
 
 
 StepMethod = JointSpaceMethod | ConstrainedMethod
 
-RUNGE_KUTTA_4 = {
-    "stages": ((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
-    "weights": (1 / 6, 1 / 3, 1 / 3, 1 / 6),
-}
+
+def classical_runge_kutta(
+    coordinates: Literal["joint rotations", "joint angles"], rod_axial_inertia: float = 1.0
+) -> JointSpaceMethod:
+    """Return the classical Runge-Kutta method of order 4.
+
+    Args:
+        coordinates: of `JointSpaceMethod`.
+        rod_axial_inertia: of `JointSpaceMethod`; of no effect for joint angles.
+
+    Returns:
+        The method.
+
+    """
+    return JointSpaceMethod(
+        "Runge-Kutta",
+        coordinates,
+        rod_axial_inertia,
+        stages=((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
+        weights=(1 / 6, 1 / 3, 1 / 3, 1 / 6),
+    )
 
 
 def generalized_alpha(spectral_radius: float, *, solver_atol: float, solver_rtol: float) -> ConstrainedMethod:

@@ -1,7 +1,7 @@
 """One step of a declared method, computed from its formula in extended precision (x87 long double).
 
-Joint-space methods: the accelerations at the states that a step visits come from the Newton–Euler equations in
-absolute angular accelerations; nothing is shared with an engine, the reference or the certified truth.
+Joint-space methods: the accelerations at the states that a step visits come from the Newton–Euler equations
+in absolute angular accelerations; nothing is shared with an engine, the reference or the certified truth.
 Constrained methods are not solved: their quadrature and their equations are evaluated at the engine's answer.
 docs/integrators.md states every formula with its source.
 
@@ -13,14 +13,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
-from plumbline.model.datatypes import Array, Model, State, StepRun
+from plumbline.model.datatypes import Model, State, StepRun
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod
 
+Array = NDArray[Any]  # in this module of extended precision, where nothing else is stated
 LongDouble = np.longdouble
 HAS_EXTENDED_PRECISION = np.finfo(LongDouble).eps < 1e-18  # False on Apple's arm64 and with MSVC
 
@@ -179,7 +181,7 @@ class _LinkChain:
         diagonal = np.arange(self.count)
         M[diagonal, diagonal] = np.moveaxis(own, -3, 0)
         M = np.moveaxis(M, (0, 1), (-4, -2))
-        return M.reshape(*M.shape[:-4], 3 * self.count, 3 * self.count)
+        return np.asarray(M.reshape(*M.shape[:-4], 3 * self.count, 3 * self.count))
 
     def moments(self, A: Array, omega: Array, forces: str = "all") -> Array:
         """Moments (..., nj, 3) on the links, world: loads, drag and velocity terms, or drag alone."""
@@ -224,7 +226,7 @@ class _System(Protocol):
 
 
 class _JointRotations:
-    """q: quaternions (..., nj, 4) relative to the link before; v: relative rates (..., nj, 3), child's frame."""
+    """q: quaternions (..., nj, 4) relative to the link before; v: their rates (..., nj, 3), child's frame."""
 
     def __init__(self, chain: _LinkChain) -> None:
         self.chain = chain
@@ -353,7 +355,7 @@ class _JointAngles:
                 target = target - np.sum(u * alpha[:, j], -1, keepdims=True) * u
                 target = target - np.sum(u * turning, -1, keepdims=True) * _cross(u, turning)
                 three.append(-u)
-            rates = _solve3(*three, target - bend)
+            rates = _solve3(three[0], three[1], three[2], target - bend)
             found.append(rates[:, :count])
             before = target + rates[:, 2:] * u if self.is_rod[j] else target
             omega_before = turning
@@ -361,7 +363,7 @@ class _JointAngles:
 
     def _turns(self, q: Array, v: Array) -> tuple[Array, Array, Array]:
         """Quaternions and world rates of the links, and the axes now: a product of exponentials."""
-        turn = np.zeros((len(q), 4), LongDouble)
+        turn: Array = np.zeros((len(q), 4), LongDouble)
         turn[:, 0] = 1
         spin, p, omega = np.zeros((len(q), 3), LongDouble), [], []
         axes = np.empty_like(self.axes)
@@ -517,7 +519,7 @@ def constrained_residual(model: Model, method: ConstrainedMethod, run: StepRun) 
         norms = 2 * np.sum(p * pdot, -1, keepdims=True)
     gaps = np.where(rods[:, None] & (np.arange(3) > 0), LongDouble(0), gaps)
 
-    def norm(*parts: Array) -> Array:
+    def norm(*parts: Any) -> Array:
         return np.asarray(np.sqrt(sum(np.sum(part**2, axis=(-2, -1)) for part in parts)), float)
 
     sums = [sum(term[i] for term in terms) for i in range(2)]
@@ -611,7 +613,7 @@ def _cross_matrix(s: Array) -> Array:
 
 def _times(A: Array, v: Array) -> Array:
     """A v of matrices (..., m, n) and vectors (..., n)."""
-    return np.sum(A * v[..., None, :], axis=-1)
+    return np.asarray(np.sum(A * v[..., None, :], axis=-1))
 
 
 def _cross(a: Array, b: Array) -> Array:
@@ -660,7 +662,7 @@ def _turn_of_z(u: Array) -> Array:
 
 
 def _solve(S: Array, b: Array) -> Array:
-    """Solve S x = b (..., n) by elimination without pivoting: the symmetric part of S is positive definite."""
+    """Solve S x = b (..., n) without pivoting: the symmetric part of S is positive definite."""
     S, b = S.copy(), b.copy()
     n = S.shape[-1]
     for k in range(n - 1):

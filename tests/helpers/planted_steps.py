@@ -1,7 +1,7 @@
 """Other time integrators, planted under the names of the declared ones: what the step level must report.
 
-Every defect has the order of the method that it replaces, or nearly so: order, limit and drift of a refinement
-study do not show it.  Accelerations, rotations and read-outs are the real engine's.
+Every defect has the order of the method that it replaces, or nearly so: order, limit and drift of a
+refinement study do not show it.  Accelerations, rotations and read-outs are the real engine's.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from typing import Any, Literal
 from unittest.mock import patch
 
@@ -78,7 +79,7 @@ class MujocoSystem:
 
 
 def inverse_differential(theta: Array, v: Array, terms: int = 9) -> Array:
-    """v + θ×v/2 + θ×(θ×v)/12 + …, joint by joint; ``terms`` of the series after v (more than two: in full)."""
+    """v + θ×v/2 + θ×(θ×v)/12 + …, joint by joint: ``terms`` after v (more than two: in full)."""
     t, w = theta.reshape(-1, 3), v.reshape(-1, 3)
     once = np.cross(t, w)
     twice = np.cross(t, once)
@@ -291,7 +292,7 @@ def _mujoco_run(step: Step, model: Model, state: State, times: Array, h: float) 
         chain.d.qpos, chain.d.qvel = q, v
         rows.append(tuple(np.array(part) for part in chain.sample()))
     r, p, rdot, pdot = (np.array(column) for column in zip(*rows, strict=True))
-    return Trajectory(times, r, p, rdot, pdot, int(round(times[-1] / h)))
+    return Trajectory(times, r, p, rdot, pdot, round(times[-1] / h))
 
 
 def _pinocchio_step(step: Step) -> Step:
@@ -327,7 +328,7 @@ def _requadrated(how: str, samples: list[Any], h: float) -> list[Any]:
     beta = 0.25 * (gamma + 0.5) ** 2
     alpha_m *= -1 if how == "sign of alpha_m" else 1
     out, a = [samples[0]], samples[0][2]
-    for q0, q1 in zip(samples, samples[1:], strict=False):
+    for q0, q1 in pairwise(samples):
         q, v = out[-1][0], out[-1][1]
         if how == "rates by Euler":
             out.append((q1[0], v + h * q1[2], *q1[2:]))

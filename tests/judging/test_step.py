@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from unittest.mock import patch
 
 import numpy as np
@@ -14,7 +14,7 @@ from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.step import STEP_STATES, judge_steps, step_counts, step_sizes
 from plumbline.model.sampling import random_states
-from plumbline.model.step_methods import RUNGE_KUTTA_4, JointSpaceMethod
+from plumbline.model.step_methods import classical_runge_kutta
 from plumbline.truth import step_formulas
 from plumbline.truth.certified import certify_state
 from tests.helpers import pendulums
@@ -97,7 +97,7 @@ def test_the_planting_itself_is_honest():
 
     honest = [
         StepDefect("rk4", "", engine, name, joints,
-                   step=lambda s, q, v, h: planted.runge_kutta(s, q, v, h, planted.CLASSICAL, planted.WEIGHTS))
+                   step=partial(planted.runge_kutta, a=planted.CLASSICAL, b=planted.WEIGHTS))
         for engine, name in planted.RK4S for joints in ("balls", "rods")
     ]  # fmt: skip
     honest += [StepDefect("implicit", "", "mujoco", "implicit", step=planted.implicit, has_drag=True)]
@@ -121,7 +121,7 @@ def test_a_rods_axial_inertia_is_a_part_of_the_method(engine):
 
 def test_a_weight_wrong_by_1e_minus_9_is_reported_on_one_body():
     model, states = subject("ball")
-    method = JointSpaceMethod("Runge-Kutta", "joint rotations", 0.01 / 3, **RUNGE_KUTTA_4)
+    method = classical_runge_kutta("joint rotations", 0.01 / 3)
     weights = (1 / 6, 1 / 3 + 1e-9, 1 / 3 - 1e-9, 1 / 6)
     integrator = replace(load_adapter("mujoco").integrator("RK4"), method=replace(method, weights=weights))
     assert disagreeing(judged(load_adapter("mujoco"), integrator, model, states))
