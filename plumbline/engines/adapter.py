@@ -195,6 +195,9 @@ class Adapter(ABC):
         Returns:
             The samples, not normalised and not projected.
 
+        Raises:
+            EngineFailure: a sample, acceleration or multiplier is missing, not finite or of another shape.
+
         """
         check_state(model, state)
         times = np.asarray(step * np.arange(count + 1), float)

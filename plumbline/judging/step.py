@@ -64,7 +64,7 @@ def step_counts(method: StepMethod | None) -> tuple[int, ...]:
     """Choose after how many steps engine and formula are compared.
 
     Args:
-        method: the method.
+        method: the declared formula.
 
     Returns:
         Counts, ascending; few where each step is compared with the one before.
@@ -77,7 +77,7 @@ def step_sizes(method: StepMethod, model: Model, states: Sequence[State]) -> lis
     """Choose the steps from each state: `STEP_SIZES`, in proportion smaller where the motion is fast.
 
     Args:
-        method: the method.
+        method: the declared formula.
         model: the pendulum.
         states: states of it.
 

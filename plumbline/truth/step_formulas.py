@@ -53,7 +53,7 @@ def joint_space_steps(
         model: the mechanism.
         states: B initial states.
         steps: the step [s] from each.
-        method: the method.
+        method: the declared formula.
         count: how many steps.
         angle_axes: for "joint angles", the axes (angles, 3) of the revolute joints at each state.
 
@@ -418,7 +418,7 @@ def constrained_quadrature(method: ConstrainedMethod, run: StepRun, h: float) ->
     """Predict q₁ and q̇₁ of every step from the engine's own q̈ and its coordinates before the step.
 
     Args:
-        method: the method.
+        method: the declared formula.
         run: T samples of consecutive steps with accelerations.
         h: step [s].
 
