@@ -33,7 +33,7 @@ class StepDefect:
     size: str  # in words
     engine: str
     integrator: str  # the name that it goes by
-    joints: str = "balls"  # key of tests.helpers.pendulums.JOINTS
+    joints: str = "balls"  # key of tests.helpers.pendulums.JOINT_PATTERNS
     has_drag: bool = False
     step: Step | None = None  # replaces the step, on the engine's accelerations and rotations
     integrator_used: str = ""  # another integrator of the same engine in its place

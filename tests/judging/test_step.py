@@ -18,7 +18,7 @@ from plumbline.model.step_methods import classical_runge_kutta
 from plumbline.truth import step_formulas
 from plumbline.truth.certified import certify_state
 from tests.helpers import pendulums
-from tests.helpers.pendulums import JOINTS
+from tests.helpers.pendulums import JOINT_PATTERNS
 from tests.helpers.planted_steps import STEP_DEFECTS, StepDefect, planted_step
 
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
@@ -44,7 +44,7 @@ def judged(adapter, integrator, model, states):
 
 @cache
 def subject(joints, has_drag=False, loads=False):
-    model = pendulums.model(JOINTS[joints], loads=loads, drag=has_drag)
+    model = pendulums.make_model(JOINT_PATTERNS[joints], loads=loads, drag=has_drag)
     return model, random_states(model, STEP_STATES, seed=5)
 
 
@@ -52,7 +52,7 @@ def disagreeing(rows):
     return {row.quantity: row.ratio for row in rows if row.verdict != Verdict.AGREES}
 
 
-@pytest.mark.parametrize("joints", list(JOINTS))
+@pytest.mark.parametrize("joints", list(JOINT_PATTERNS))
 def test_accelerations_equal_the_certified_ones(joints):
     model, states = subject(joints, True, True)
     found = step_formulas.first_coordinate_acceleration(model, states[0])
