@@ -15,6 +15,7 @@ from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.step import STEP_STATES, judge_steps, step_counts, step_sizes
 from plumbline.model.sampling import random_states
 from plumbline.model.step_methods import classical_runge_kutta
+from plumbline.scenario.generator import RandomScenarios
 from plumbline.truth import step_formulas
 from plumbline.truth.certified import certify_state
 from tests.helpers import pendulums
@@ -146,3 +147,22 @@ def test_a_coarser_step_is_taken_from_slower_states_only(joints):
     fast = replace(states[0], omega=50 * np.ones_like(states[0].omega))
     of_fast, of_slow = (max(sizes) for sizes in step_sizes(method, model, [fast, slow]))
     assert of_fast < 0.2 * of_slow <= 0.2 * 0.0237
+
+
+RANDOM_COUNT = 100
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("engine", ENGINES)
+def test_no_honest_engine_is_reported_on_random_scenarios(engine):
+    """Of wild masses only the known loss of digits by aba and by Exudyn's dense solver."""
+    reported = {}
+    for scenario in RandomScenarios(12, RANDOM_COUNT):
+        states = [scenario.state, *random_states(scenario.model, STEP_STATES - 1, seed=1)]
+        is_wild = "wild" in scenario.title and engine in ("pinocchio", "exudyn-tree")
+        for integrator in methods(engine):
+            rows = judged(load_adapter(engine), integrator, scenario.model, states)
+            bad = [row.reason for row in rows if row.verdict in (Verdict.DISAGREES, Verdict.FAILED)]
+            if bad and not is_wild:
+                reported[scenario.name, integrator.name] = bad
+    assert not reported
