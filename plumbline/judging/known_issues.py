@@ -38,6 +38,7 @@ from plumbline.judging.rows import Level, Row
 from plumbline.judging.run_relations import REVERSED_IN_TIME
 from plumbline.judging.state import STATE_UNITS
 from plumbline.judging.state_relations import STATE_RELATIONS, WELDED_HALVES
+from plumbline.judging.step import CONSTRAINED_UNITS, STEP_UNITS
 from plumbline.model.invariants import INVARIANT_UNITS
 from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean, shorten
 from plumbline.scenario.generator import RANDOM_FAMILY
@@ -48,7 +49,7 @@ from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path, rea
 
 RowKind = tuple[str, str, str, str, str]  # of a row: engine, its version, level, integrator, quantity
 KNOWN_ISSUES_FILE = Path(__file__).with_name("known_issues.yaml")
-LEVELS: tuple[Level, ...] = ("state", "invariants", "trajectory", "relations")
+LEVELS: tuple[Level, ...] = ("state", "step", "invariants", "trajectory", "relations")
 ANY_LENGTH = 10**9  # bodies
 
 # Relations that give the same problem to the same algorithm in other numbers: only rounding tells them apart.
@@ -313,7 +314,8 @@ def _quantities() -> set[str]:
     long_runs = ("all_long", "energy_drift_long_growth", *(f"{name}_long" for name in INVARIANT_UNITS))
     relations = (*(r.name for r in STATE_RELATIONS), WELDED_HALVES, REVERSED_IN_TIME)
     others = *(f"as {name}" for name in ENGINES), *(f"by {text}" for text in declared_texts())
-    return {"all", *STATE_UNITS, *trajectory, *INVARIANT_UNITS, *long_runs, *relations, *others}
+    steps = (*STEP_UNITS, *CONSTRAINED_UNITS)
+    return {"all", *STATE_UNITS, *steps, *trajectory, *INVARIANT_UNITS, *long_runs, *relations, *others}
 
 
 class KnownIssues:
