@@ -144,6 +144,7 @@ def run_nightly(
         is_full_catalogue=is_full_catalogue,
         scheduler=scheduler,
         random_scenarios=random_scenarios,
+        random_level="random",
         result_cache=DiskResultCache(unfinished / "cells", log),
         are_engines_required=are_engines_required,
         known_issues=load_known_issues() if known_issues is None else known_issues,

@@ -37,6 +37,7 @@ class Plan:
     is_full_catalogue: bool = False  # the full catalogue on all engines: every known issue must occur
     scheduler: str | None = None  # address of a dask cluster to run on, instead of ``jobs`` workers here
     random_scenarios: Sequence[Scenario] = ()  # compared at few states only; may be made one by one
+    random_level: Literal["state", "random"] = "state"  # of the random scenarios; "random": state and step
     result_cache: ResultCache = field(default_factory=ResultCache)
 
 

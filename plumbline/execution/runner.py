@@ -149,7 +149,7 @@ class _Run:
             sum(1 for _ in task_keys("", self.engines, plan.level, has_long_runs, has_steps(scenario)))
             for scenario in plan.scenarios
         )
-        total += len(plan.random_scenarios) * sum(1 for _ in task_keys("", self.engines, "random"))
+        total += len(plan.random_scenarios) * sum(1 for _ in task_keys("", self.engines, plan.random_level))
         scheduler = Scheduler(executor, self.cpu_times.timed_cache(plan.result_cache))
         for done, outcome in enumerate(scheduler.run(self._tasks()), start=1):
             self.cpu_times.add_outcome(outcome, outcome.key.cpu_time_kind)

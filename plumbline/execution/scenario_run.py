@@ -94,7 +94,7 @@ class ScenarioRun:
         self.scenario = scenario
         self.truths: dict[TaskKind, StateTruth | MotionTruth | TruthFailure] = {}
         self._plan, self._engines, self._known = plan, engines, known
-        level = "random" if is_random else plan.level
+        level = plan.random_level if is_random else plan.level
         self._keys = list(
             task_keys(scenario.name, engines, level, plan.long_run_seconds > 0, has_steps(scenario))
         )
