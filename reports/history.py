@@ -71,7 +71,7 @@ class History:
 
         """
         passed = self.last_passed
-        if passed is None or row["verdict"] == "agrees":
+        if passed is None or row["verdict"] in ("agrees", "information"):
             return False
         before = passed.rows.get(row["key"])
         return needs_attention(row) if before is None else before["verdict"] != row["verdict"]

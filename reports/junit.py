@@ -11,10 +11,11 @@ from reports.verdicts import format_number, needs_attention, shown_verdict
 
 
 def write(results: Results) -> Path:
-    """Write junit.xml beside the stored results: a suite per scenario, a test case per row.
+    """Write junit.xml beside the stored results: a suite per scenario, a test case per check.
 
     An unexpected row is a failure (a disagreement, a gap) or an error (the engine failed). A row that a known
     issue expects, and one of an engine that is not installed, is skipped with its reason.
+    Rows that are information are only counted, in a property of the suite.
 
     Args:
         results: the run.
@@ -26,9 +27,17 @@ def write(results: Results) -> Path:
     suites = ET.Element("testsuites", name="plumbline", time=f"{float(results.run['duration']):.3f}")
     totals = {"tests": 0, "failures": 0, "errors": 0, "skipped": 0}
     for name, scenario in results.scenarios.items():
-        rows = [results.rows[place] for place in results.row_indices[name]]
+        found = [results.rows[place] for place in results.row_indices[name]]
+        rows = [row for row in found if row["verdict"] != "information"]
         suite = ET.SubElement(suites, "testsuite", name=name, timestamp=str(results.run["started"])[:19])
-        ET.SubElement(ET.SubElement(suite, "properties"), "property", name="family", value=scenario["family"])
+        properties = {
+            "family": scenario["family"],
+            "run": str(results.run["sentence"]),
+            "information": str(len(found) - len(rows)),
+        }
+        element = ET.SubElement(suite, "properties")
+        for key, value in properties.items():
+            ET.SubElement(element, "property", name=key, value=value)
         counted = dict.fromkeys(totals, 0)
         for row in rows:
             outcome = _add_test_case(suite, row)

@@ -108,6 +108,7 @@ VERDICT_COLOURS = {
     Verdict.AGREES: "green", Verdict.DISAGREES: "red bold", Verdict.UNRESOLVED: "yellow",
     Verdict.UNSUPPORTED: "dim", Verdict.NOT_INSTALLED: "dim", Verdict.FAILED: "red bold",
     Verdict.HARNESS_FAILED: "magenta bold",
+    Verdict.INFORMATION: "dim",
 }  # fmt: skip
 MAX_COMPLETE_TABLE = 60  # scenarios; of more, those where everything agrees are left out of the table
 
@@ -135,17 +136,18 @@ def print_result(result: RunResult) -> None:
     for scenario in result.scenarios:
         of = [[r for r in rows_of[scenario] if r.engine == engine] for engine in result.engines]
         if len(result.scenarios) <= MAX_COMPLETE_TABLE or any(
-            r.verdict != Verdict.AGREES for rows in of for r in rows
+            r.verdict not in (Verdict.AGREES, Verdict.INFORMATION) for rows in of for r in rows
         ):
             table.add_row(escape(scenario), *map(_format_cell, of))
     out.print(table)
     out.print(
-        "[dim]each cell: worst verdict, agreeing rows / all rows, error over tolerance of the worst row; "
+        "[dim]each cell: worst verdict, agreeing checks / all checks, error over tolerance of the worst row; "
         + "  ".join(f"{style.glyph} {shown}" for shown, style in SHOWN_STYLES.items())
         + "[/]"
     )
     for row in result.rows:
-        if row.verdict not in (Verdict.AGREES, Verdict.HARNESS_FAILED) and row.known_issue is None:
+        is_silent = row.verdict in (Verdict.AGREES, Verdict.INFORMATION, Verdict.HARNESS_FAILED)
+        if not is_silent and row.known_issue is None:
             out.print(f"{_coloured_glyph(row)} {escape(row.key)}: {escape(row.reason)}")
     for entry in result.stale_issues:
         out.print(f"[red]![/] known entry {escape(entry.id)} no longer occurs: remove it from its file")
@@ -179,5 +181,6 @@ def _format_cell(rows: Sequence[Row]) -> str:
         return ""
     worst = max(rows, key=lambda row: row.rank)
     agreeing = sum(row.verdict == Verdict.AGREES for row in rows)
+    checks = sum(row.verdict != Verdict.INFORMATION for row in rows)
     ratio = "" if worst.ratio is None else f" {worst.ratio:.1g}"
-    return f"{_coloured_glyph(worst)} {agreeing}/{len(rows)}{ratio}"
+    return f"{_coloured_glyph(worst)} {agreeing}/{checks}{ratio}"

@@ -236,7 +236,7 @@ def save(result: RunResult, folder: Path, command: str) -> None:
 
 
 def summarize_verdicts(result: RunResult) -> str:
-    """Return the verdicts of a run in one sentence: counts, disagreements by name, what was expected.
+    """Return the verdicts of a run in one sentence: independent checks, verdicts, disagreements by name.
 
     Args:
         result: the run.
@@ -245,28 +245,26 @@ def summarize_verdicts(result: RunResult) -> str:
         The sentence.
 
     """
-    parts = []
+    parts, checks = [], 0
     for verdict in Verdict:
         rows = [row for row in result.rows if row.verdict == verdict]
         count = len(rows) + result.random_batch.counts_by_verdict[verdict]
         if not count:
             continue
-        part = f"{count} {verdict if count == 1 else verdict.style.plural}"
+        part = f"{count:,} {verdict if count == 1 else verdict.style.plural}"
+        checks += count if verdict.is_comparison else 0
         new = [row for row in rows if row.known_issue is None]
-        aliases = sum(row.alias_of is not None for row in rows)
-        if verdict == Verdict.AGREES and aliases:
-            part += f" ({aliases} by an alias of another integrator)"
         if verdict in (Verdict.DISAGREES, Verdict.FAILED, Verdict.HARNESS_FAILED) and new:
             named = list(dict.fromkeys(f"{row.engine}, {row.scenario}: {row.quantity}" for row in new))
             more = f" and {len(named) - 3} more" if len(named) > 3 else ""
             part += f" ({'; '.join(named[:3])}{more})"
         # rows of random scenarios that are only counted are expected, except where there is nothing to expect
-        if verdict not in (Verdict.AGREES, Verdict.NOT_INSTALLED) and count > len(new):
+        if verdict.needs_attention and count > len(new):
             part += f" ({count - len(new)} as recorded)"
         parts.append(part)
     if not has_comparison(result):
         parts.append("nothing was compared")
-    text = ", ".join(parts)
+    text = f"{checks:,} independent check{'s' * (checks != 1)}: {', '.join(parts)}"
     if result.stale_issues:
         ids = ", ".join(issue.id for issue in result.stale_issues)
         count = len(result.stale_issues)
@@ -292,7 +290,7 @@ def exit_code(result: RunResult) -> ExitCode:
         return ExitCode.HARNESS_FAILED
     if Verdict.FAILED in new:
         return ExitCode.ENGINE_FAILED
-    is_good = not new - {Verdict.AGREES, Verdict.NOT_INSTALLED} and not result.stale_issues
+    is_good = not any(verdict.needs_attention for verdict in new) and not result.stale_issues
     return ExitCode.SUCCESS if is_good and has_comparison(result) else ExitCode.DISAGREEMENT
 
 
@@ -306,9 +304,8 @@ def has_comparison(result: RunResult) -> bool:
         Whether a row agrees, disagrees or is unresolved.
 
     """
-    compared = {Verdict.AGREES, Verdict.DISAGREES, Verdict.UNRESOLVED}
     found = {row.verdict for row in result.rows} | set(result.random_batch.counts_by_verdict)
-    return not compared.isdisjoint(found)
+    return any(verdict.is_comparison for verdict in found)
 
 
 def git_commit() -> str | None:

@@ -17,7 +17,7 @@ from plumbline.judging.convergence import refinement_resolutions
 from plumbline.judging.known_issues import KnownIssues
 from plumbline.judging.long_run_study import plan_long_run, run_long_run_study
 from plumbline.judging.long_runs import judge_long_runs
-from plumbline.judging.rows import JudgingResult, Level, RowContext, Verdict
+from plumbline.judging.rows import JudgingResult, Level, RowContext, Verdict, mark_aliases
 from plumbline.judging.state import judge_states
 from plumbline.judging.step import (
     MAX_STEP_BODIES,
@@ -326,6 +326,7 @@ class ScenarioRun:
             )
         else:
             found = metamorphic.judge_relations(context, outcome.value)
+        found.rows = mark_aliases(found.rows)
         if self._plan.user_rtol is not None:
             found.rows = [replace(row, user_rtol=self._plan.user_rtol) for row in found.rows]
         return found

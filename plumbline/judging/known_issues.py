@@ -34,7 +34,7 @@ from pydantic import (
 
 from plumbline.engines.declared_names import declared_integrators, declared_texts
 from plumbline.engines.registry import ENGINES
-from plumbline.judging.rows import Level, Row
+from plumbline.judging.rows import Level, Row, Verdict
 from plumbline.judging.run_relations import REVERSED_IN_TIME
 from plumbline.judging.state import STATE_UNITS
 from plumbline.judging.state_relations import STATE_RELATIONS, WELDED_HALVES
@@ -342,9 +342,11 @@ class KnownIssues:
             row: a judged row.
 
         Returns:
-            The entries, in the order of the file.
+            The entries, in the order of the file; none for information, which needs no excuse.
 
         """
+        if row.verdict == Verdict.INFORMATION:
+            return []
         kind = row.engine, row.engine_version, row.level, row.integrator, row.quantity
         if kind not in self._by_kind:
             self._by_kind[kind] = [e for e in self.issues if e.matches_kind(kind)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
@@ -22,6 +22,17 @@ class Verdict(StrEnum):
     NOT_INSTALLED = "not installed"
     FAILED = "failed"
     HARNESS_FAILED = "harness failed"
+    INFORMATION = "information"  # implied by other rows: it cannot fail by itself
+
+    @property
+    def is_comparison(self) -> bool:
+        """Whether a row with this verdict compared something and could have disagreed by itself."""
+        return self in (Verdict.AGREES, Verdict.DISAGREES, Verdict.UNRESOLVED)
+
+    @property
+    def needs_attention(self) -> bool:
+        """Whether a row with this verdict needs attention where no known issue expects it."""
+        return self.style.severity >= ATTENTION_SEVERITY
 
     @property
     def style(self) -> VerdictStyle:
@@ -35,7 +46,7 @@ class VerdictStyle(NamedTuple):
     glyph: str
     plural: str  # the word after a count: "3 disagree"
     meaning: str  # short, for legends
-    severity: int  # 10 (worst) … 1, where no known issue expects the verdict; from 6 on it needs attention
+    severity: int  # 10 (worst) … 0, where no known issue expects the verdict; from 6 on it needs attention
     known_severity: int  # the same where a known issue expects the verdict
 
 
@@ -51,6 +62,7 @@ VERDICT_STYLES = {
     Verdict.UNSUPPORTED: VerdictStyle("–", "unsupported", "the engine cannot do this", 6, 2),
     Verdict.NOT_INSTALLED: VerdictStyle("∅", "not installed", "the engine is not on this machine", 1, 1),
     Verdict.AGREES: VerdictStyle("✓", "agree", "the error is within its derived tolerance", 4, 4),
+    Verdict.INFORMATION: VerdictStyle("i", "are information", "implied by other rows; not a check", 0, 0),
 }
 RECORDED = "recorded"  # what terminal and report show for a disagreement or failure that is recorded
 SHOWN_STYLES: dict[str, VerdictStyle] = {
@@ -86,7 +98,7 @@ def severity(verdict: str, known_issue: str | None) -> int:
         known_issue: id of the entry of known_issues.yaml that expects the verdict, or None.
 
     Returns:
-        10 (the harness failed) … 1 (not installed); from `ATTENTION_SEVERITY` on nothing expects it.
+        10 (the harness failed) … 0 (information); from `ATTENTION_SEVERITY` on nothing expects it.
 
     """
     style = VERDICT_STYLES[Verdict(verdict)]
@@ -212,6 +224,27 @@ class RowContext:
             self.scenario, self.family, self.engine, self.version, level, integrator, quantity, unit,
             verdict=verdict, reason=reason, **more,
         )  # fmt: skip
+
+
+def mark_aliases(rows: Iterable[Row]) -> list[Row]:
+    """Turn the agreement of an integrator that equals another one into information.
+
+    Args:
+        rows: judged rows.
+
+    Returns:
+        The rows in the same order. Only agreement changes: an alias that disagrees or is unresolved where
+        the other integrator agrees is not the alias that it was declared to be.
+
+    """
+    return [
+        replace(
+            row, verdict=Verdict.INFORMATION, reason=f"{row.integrator} is {row.alias_of} here: {row.reason}"
+        )
+        if row.alias_of is not None and row.verdict == Verdict.AGREES
+        else row
+        for row in rows
+    ]
 
 
 class _Decidable(Protocol):

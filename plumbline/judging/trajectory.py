@@ -66,7 +66,8 @@ def trajectory_rows(study: RefinementAnalysis) -> list[Row]:
         study: the refinement study.
 
     Returns:
-        A row on the order, for fixed steps; then per quantity one on the limit and one on the finest run.
+        A row on the order, for fixed steps; then per quantity one on the limit, and for information one on
+        the finest run.
 
     """
     truth = study.truth
@@ -154,7 +155,7 @@ class _WindowVerdict:
 
 
 def _rows_against_truth(study: RefinementAnalysis, quantity: _ComparedQuantity) -> list[Row]:
-    """Two rows: the limit against the truth; the finest run, within the study's estimate of its error."""
+    """Two rows: the limit against the truth; for information the finest run and the study's estimate."""
     name, unit, samples = quantity.name, quantity.unit, quantity.samples
     method, make_row = study.integrator.name, study.context.make_row
     try:
@@ -177,7 +178,6 @@ def _rows_against_truth(study: RefinementAnalysis, quantity: _ComparedQuantity) 
     common = {
         "compared_until": end,
         "uncertainty": float(limit_uncertainty[at] + quantity.truth_uncertainty[at]),
-        "ratio": float(off[at] / tolerance[at]),  # the limit's, which decides both rows
         **study.common_fields,
     }
     own = float(np.maximum.accumulate(quantity.error(samples[-1], quantity.true))[at])
@@ -192,6 +192,7 @@ def _rows_against_truth(study: RefinementAnalysis, quantity: _ComparedQuantity) 
         unit,
         value=float(off[at]),
         tolerance=float(tolerance[at]),
+        ratio=float(off[at] / tolerance[at]),
         derivation=f"up to t = {end:g} s: limit ({how}) ± {limit_uncertainty[at]:.2g}, "
         f"truth ({study.truth.method}) ± {quantity.truth_uncertainty[at]:.2g}, "
         f"rounding {study.rounding_description} × {quantity.scale:.3g} {unit} = {rounding[at]:.2g}; "
@@ -207,7 +208,7 @@ def _rows_against_truth(study: RefinementAnalysis, quantity: _ComparedQuantity) 
         "trajectory",
         method,
         name,
-        found.verdict,  # own ≤ estimate where the limit agrees: the triangle inequality
+        Verdict.INFORMATION,  # own ≤ estimate where the limit agrees, by the triangle inequality
         f"{name} at {resolution} {finest:g} is {own:.2g} {unit} from the truth, "
         f"the refinement study estimates {estimate:.2g}{found.remark}",
         unit,

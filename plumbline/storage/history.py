@@ -20,7 +20,7 @@ import duckdb
 from plumbline.scenario.generator import RANDOM_FAMILY
 from plumbline.storage.results_store import Record, read_results, read_table
 
-UNEXPECTED_VERDICT_SQL = "verdict <> 'agrees' AND known_issue IS NULL"
+UNEXPECTED_VERDICT_SQL = "verdict NOT IN ('agrees', 'information') AND known_issue IS NULL"
 _ROW_COLUMNS = {
     "key": "VARCHAR", "scenario": "VARCHAR", "family": "VARCHAR", "engine": "VARCHAR", "level": "VARCHAR",
     "quantity": "VARCHAR", "unit": "VARCHAR", "value": "DOUBLE", "tolerance": "DOUBLE", "ratio": "DOUBLE",
@@ -147,14 +147,15 @@ class History:
 
         Returns:
             One record per night: its id, start and exit code, the number of rows, of those that agree
-            (``agree``), are unexpectedly bad (``bad``), or are as a known issue expects (``as_recorded``),
-            and the number of random scenarios.
+            (``agree``), are implied by others (``information``), are unexpectedly bad (``bad``), or are as a
+            known issue expects (``as_recorded``), and the number of random scenarios.
 
         """
         return self.query(
             f"""
             SELECT id, started, exit_code, count(key) AS rows,
                    count(*) FILTER (verdict = 'agrees') AS agree,
+                   count(*) FILTER (verdict = 'information') AS information,
                    count(*) FILTER ({UNEXPECTED_VERDICT_SQL}) AS bad,
                    count(*) FILTER (known_issue IS NOT NULL) AS as_recorded,
                    count(DISTINCT scenario) FILTER (family = '{RANDOM_FAMILY}') AS random

@@ -35,11 +35,13 @@ export function chosen(index, fields) {
   const words = (fields.q ?? "").toLowerCase().split(/\s+/).filter(Boolean);
   const negated = (fields.verdict ?? "").startsWith("!");
   const verdict = index.verdicts.indexOf(negated ? fields.verdict.slice(1) : (fields.verdict ?? ""));
+  const information = index.verdicts.indexOf("information");
   const engine = index.engines.indexOf(fields.engine ?? "");
   const level = index.levels.indexOf(fields.level ?? "");
   const quantity = index.quantitys.indexOf(fields.quantity ?? "");
   return (i) => {
     if (fields.verdict && (rows.verdict[i] === verdict) === negated) return false;
+    if (negated && rows.verdict[i] === information) return false;
     if (fields.engine && rows.engine[i] !== engine) return false;
     if (fields.level && rows.level[i] !== level) return false;
     if (fields.quantity && rows.quantity[i] !== quantity) return false;

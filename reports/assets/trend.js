@@ -70,7 +70,8 @@ function trend(past, index, i) {
     if (!verdict) return;
     const slug = index.slugs[verdict - 1];
     const y = v > 0 ? Math.min(Math.max(plot.y(v), plot.top), plot.bottom) : plot.bottom;
-    plot.root.append(svg(slug === "agrees" ? "circle" : "rect", slug === "agrees" ? { class: "pt s0", cx: plot.x(k), cy: y, r: 2 } : { class: "bad", x: plot.x(k) - 3, y: y - 3, width: 6, height: 6 },
+    const fine = slug === "agrees" || slug === "information";
+    plot.root.append(svg(fine ? "circle" : "rect", fine ? { class: "pt s0", cx: plot.x(k), cy: y, r: 2 } : { class: "bad", x: plot.x(k) - 3, y: y - 3, width: 6, height: 6 },
       svg("title", {}, `${nights[k].started.slice(0, 10)}: ${index.verdicts[verdict - 1]}, error ${number(values[k])}, ${number(v)} of its tolerance`)));
   });
   return h("div", {}, link, plot.root);

@@ -17,11 +17,12 @@ from click.testing import CliRunner
 import plumbline as package
 from plumbline.cli.console import count_noun, engine_heading
 from plumbline.cli.main import main
-from plumbline.execution.runner import summarize_verdicts
-from plumbline.judging.rows import Verdict
+from plumbline.execution.runner import exit_code, summarize_verdicts
+from plumbline.judging.rows import RowContext, Verdict
 from plumbline.storage.results_store import SCHEMA_VERSION
 
 ROOT = Path(__file__).resolve().parents[2]
+CONTEXT = RowContext("scenario", "family", "engine", "Engine", "1.0")
 
 
 def run_plumbline(*words, cwd=ROOT, **environment):
@@ -103,10 +104,24 @@ def test_the_summary_counts_one_and_several():
         )
         for count in (1, 2)
     )
-    words = "1 agrees", "1 disagrees (e, s: q)", "1 known entry no longer occurs (k)"
+    assert summarize_verdicts(one).startswith("2 independent checks: 1 agrees, ")
+    words = "1 disagrees (e, s: q)", "1 known entry no longer occurs (k)"
     assert all(part in summarize_verdicts(one) for part in words)
     words = "2 agree", "2 disagree (e, s: q)", "2 known entries no longer occur (k, k)"
     assert all(part in summarize_verdicts(several) for part in words)
+
+
+def test_information_is_counted_apart_and_changes_no_exit_code():
+    verdicts = [Verdict.AGREES] * 1200 + [Verdict.INFORMATION] * 3
+    result = SimpleNamespace(
+        rows=[CONTEXT.make_row("state", "-", "q", verdict, "why") for verdict in verdicts],
+        stale_issues=[],
+        random_batch=SimpleNamespace(counts_by_verdict=Counter()),
+    )
+    assert summarize_verdicts(result) == "1,200 independent checks: 1,200 agree, 3 are information"
+    assert exit_code(result) == 0
+    result.rows.append(CONTEXT.make_row("state", "-", "all", Verdict.UNSUPPORTED, "why"))
+    assert summarize_verdicts(result).startswith("1,200 independent checks: "), "nothing was compared there"
 
 
 def test_a_column_names_an_engines_version_once():
@@ -137,7 +152,15 @@ def test_a_run_writes_everything_and_exits_by_its_verdict(tmp_path):
     assert {"results.json", "summary.parquet", "states.parquet", "report.html", "junit.xml"} <= files
     document = json.loads((tmp_path / "o o" / "results.json").read_text())
     assert document["schema_version"] == SCHEMA_VERSION
-    assert {row["verdict"] for row in document["rows"] if row["known_issue"] is None} == {"agrees"}
+    checks = [row for row in document["rows"] if row["verdict"] != "information"]
+    assert {row["verdict"] for row in checks if row["known_issue"] is None} == {"agrees"}
+    shown = {row["quantity"] for row in document["rows"] if row not in checks and row["alias_of"] is None}
+    assert shown == {"position", "attitude"}
+    count = sum(row["verdict"] in ("agrees", "disagrees", "unresolved") for row in checks)
+    assert document["run"]["sentence"].startswith(f"{count} independent checks: ")
+    for name in ("report.html", "summary.md", "junit.xml"):
+        assert f"{count} independent checks" in (tmp_path / "o o" / name).read_text(), name
+    assert (tmp_path / "o o" / "junit.xml").read_text().count("<testcase ") == len(checks)
     (tmp_path / "o o" / "report.html").unlink()
     again = run_plumbline("report", tmp_path / "o o")
     assert again.returncode == 0, again.stderr

@@ -73,7 +73,7 @@ def test_cell(name, engine, level, workers, engines, truths):
     wrong = [
         f"{r.key} {r.verdict}: {r.reason}"
         for r in excuses.mark_known(rows, found.model.n)
-        if r.verdict != "agrees" and r.known_issue is None
+        if r.verdict.needs_attention and r.known_issue is None
     ]
     stale = [f"known entry {e.id} no longer occurs" for e in excuses.stale_issues(is_full_matrix=False)]
     assert not wrong + stale, "\n".join(wrong + stale)

@@ -108,7 +108,7 @@ def motion_report(defect):
         runs = run_refinement(defect.engine, integrator.name, model, state, TIMES, steps)
     who = RowContext("planted", "planted", defect.name, defect.name, "0")
     rows = judge_trajectory(who, model, truth, integrator, runs).rows
-    return [f"{row.verdict}: {row.quantity}: {row.reason}" for row in rows if row.verdict != "agrees"]
+    return [f"{row.verdict}: {row.quantity}: {row.reason}" for row in rows if row.verdict.needs_attention]
 
 
 def ids(defects):

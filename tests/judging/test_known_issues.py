@@ -265,6 +265,12 @@ def test_a_list_of_scenarios_is_an_entry_for_each(tmp_path):
     assert [(e.id, e.scenario) for e in found] == [("a: x", "x"), ("a: y", "y")]
 
 
+def test_information_needs_no_entry_and_matches_none():
+    any_row = entry(level="*", integrator="*", quantity="*")
+    found = judged_by([row("information")], [any_row], whole=True)
+    assert found.rows[0].known_issue is None and found.stale == []
+
+
 def test_only_random_scenarios_may_show_it_sometimes():
     chance = entry(scenario="random-*", intermittent="at times")
     who = RowContext("random-1-2", "random", "mujoco", "MuJoCo", "4.0.0")
