@@ -48,23 +48,33 @@ def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation)
             reason = f"{context.title} offers no {quantity.replace('_', ' ')} of its own"
             result.rows.append(context.make_row("state", "-", quantity, Verdict.UNSUPPORTED, reason, unit))
             continue
-        worst = _worst_error_per_state(quantity, truth, evaluation)
+        worst, looseness = _worst_error_per_state(quantity, truth, evaluation)
         names = {"scenario": context.scenario, "engine": context.engine, "quantity": quantity}
         result.tables.append(("states", names | worst))
-        result.rows.append(_quantity_row(context, quantity, unit, worst, truth.method, evaluation.cpu_time))
+        result.rows.append(
+            _quantity_row(context, quantity, unit, worst, looseness, truth.method, evaluation.cpu_time)
+        )
     return result
 
 
-def _worst_error_per_state(quantity: str, truth: StateTruth, evaluation: Evaluation) -> Columns:
-    """Per state (S,): error, bound and scale of the body with the largest ratio of error and bound."""
+def _worst_error_per_state(quantity: str, truth: StateTruth, evaluation: Evaluation) -> tuple[Columns, Array]:
+    """Per state (S,): error, bound and scale of the body with the largest ratio of error and bound.
+
+    Besides them the largest ratio of bound and scale of any body (S,); inf where a bound is not a number.
+    """
     pairs = zip(evaluation.quantities, truth.quantities, strict=True)
     differences = [getattr(answer, quantity) - getattr(true, quantity) for answer, true in pairs]
     error = _error_norms(quantity, np.array(differences))
     bound = np.array([bound.tolerance(quantity) for bound in truth.bounds]).reshape(error.shape)
     scale = np.array([bound.scale[quantity] for bound in truth.bounds]).reshape(error.shape)
-    state, body = np.arange(len(error)), np.argmax(error / np.maximum(bound, TINY), axis=1)
+    known = np.isfinite(bound)
+    ratio = np.where(known, error / np.maximum(bound, TINY), -1.0)  # without a bound nothing is compared
+    state, body = np.arange(len(error)), np.argmax(ratio, axis=1)
     at = state, body
-    return {"state": state, "body": body, "error": error[at], "bound": bound[at], "scale": scale[at]}
+    relative = np.where(scale > 0, bound / np.where(scale > 0, scale, 1.0), np.where(bound > 0, np.inf, 0.0))
+    looseness = np.max(np.where(known, relative, np.inf), axis=1)
+    worst = {"state": state, "body": body, "error": error[at], "bound": bound[at], "scale": scale[at]}
+    return worst, looseness
 
 
 def _error_norms(quantity: str, difference: Array) -> Array:
@@ -77,31 +87,44 @@ def _error_norms(quantity: str, difference: Array) -> Array:
 
 
 def _quantity_row(
-    context: RowContext, quantity: str, unit: str, worst: Columns, method: str, cpu_time: float
+    context: RowContext,
+    quantity: str,
+    unit: str,
+    worst: Columns,
+    looseness: Array,
+    method: str,
+    cpu_time: float,
 ) -> Row:
-    """The row of one quantity: its worst ratio decides, unless the bound is too loose to detect an error."""
+    """The row of one quantity.
+
+    A disagreement in any state decides. States whose bound is too loose to detect an error do not count as
+    compared; of fewer than half of the states no agreement follows.
+    """
     error, bound, scale = worst["error"], worst["bound"], worst["scale"]
-    ratios, has_scale = error / np.maximum(bound, TINY), scale > 0
+    known, has_scale = np.isfinite(bound), scale > 0
+    ratios = np.where(known, error / np.maximum(bound, TINY), 0.0)
     at, ratio, count = int(np.argmax(ratios)), float(np.max(ratios)), len(ratios)
+    sharp = looseness <= MAX_RELATIVE_BOUND
+    compared, loosest = int(np.sum(sharp)), float(np.max(looseness))
     relative = float(np.max(error[has_scale] / scale[has_scale], initial=0.0))
-    looseness = float(np.median(bound[has_scale] / scale[has_scale])) if has_scale.any() else 0.0
     state, body = int(worst["state"][at]), int(worst["body"][at]) + 1
     name, where = quantity.replace("_", " "), f"state {state}, body {body}"
+    loose = (
+        f"the rounding bound is up to {loosest:.1g} of the quantity's scale (limit {MAX_RELATIVE_BOUND:g}) at "
+        f"{count - compared} of {count} states, too loose to detect an error"
+    )
     if ratio > 1:
         verdict = Verdict.DISAGREES
         reason = (
             f"the {name} of {context.title} is off by {error[at]:.3g} {unit} at {where}, {ratio:.3g} times "
             f"the rounding bound; {int(np.sum(ratios > 1))} of {count} states disagree"
         )
-    elif ratio <= 1 and looseness <= MAX_RELATIVE_BOUND:
+    elif compared and 2 * compared >= count:
         verdict = Verdict.AGREES
-        reason = f"{name} within {ratio:.2g} of the rounding bound at {count} states"
-    else:  # also where a bound is not a number
-        verdict = Verdict.UNRESOLVED
-        reason = (
-            f"inconclusive: the rounding bound is {looseness:.1g} of the quantity's scale "
-            f"(limit {MAX_RELATIVE_BOUND:g}), too loose to detect an error"
-        )
+        reason = f"{name} within {ratio:.2g} of the rounding bound at {compared} states"
+        reason += f"; {loose}" if compared < count else ""
+    else:
+        verdict, reason = Verdict.UNRESOLVED, f"inconclusive: {loose}"
     return context.make_row(
         "state",
         "-",
@@ -113,12 +136,14 @@ def _quantity_row(
         tolerance=float(bound[at]),
         ratio=ratio,
         derivation=f"first-order rounding bound per body and state, {bound[at]:.2g} {unit} at {where}, "
-        f"{looseness:.1g} of the scale in the median of {count} states; truth: {method}",
+        f"and at most {loosest:.1g} of the scale at {count} states, {MAX_RELATIVE_BOUND:g} at {compared} of "
+        f"them; truth: {method}",
         cpu_time=cpu_time,
         extra={
             "relative": relative,
             "states": float(count),
-            "bound_relative": looseness,
+            "compared_states": float(compared),
+            "bound_relative": loosest,
             "state": float(state),
             "body": float(body),
         },

@@ -50,6 +50,40 @@ def test_a_blunt_row_says_what_was_measured():
     assert (row.level, row.integrator, row.quantity, row.unit) == ("state", "-", "acceleration", "m/s²")
     assert row.verdict == "unresolved" and row.reason.startswith("inconclusive: the rounding bound is ")
     assert row.tolerance == bounds[1].acceleration[1] and row.ratio == pytest.approx(0.5)
+    assert "at 3 of 3 states" in row.reason and row.extra["compared_states"] == 0.0
+
+
+def loosened(bounds, *states, body=slice(None), by=1e6):
+    """The bounds with those of the acceleration at some states too loose, or not a number."""
+    found = list(bounds)
+    for state in states:
+        acceleration = found[state].acceleration.copy()
+        acceleration[body] *= by
+        found[state] = replace(found[state], acceleration=acceleration)
+    return found
+
+
+@pytest.mark.parametrize(("loose", "verdict"), [((0,), "agrees"), ((0, 2), "unresolved")])
+@pytest.mark.parametrize("body", [slice(None), 1])
+@pytest.mark.parametrize("by", [1e6, np.nan, np.inf])
+def test_each_state_counts_only_with_its_own_bound(loose, verdict, body, by):
+    sharp = [state_rounding_bound(MODEL, s) for s in STATES]
+    row = judge_shifted_answers((1, 0, 0.5), bounds=loosened(sharp, *loose, body=body, by=by)).rows[0]
+    assert row.verdict == verdict, row.reason
+    assert f"at {len(loose)} of 3 states, too loose" in row.reason
+    assert row.extra["compared_states"] == 3 - len(loose) and row.ratio == pytest.approx(0.5, rel=1e-2)
+    if verdict == "agrees":
+        assert row.reason.startswith("acceleration within 0.5 of the rounding bound at 2 states; ")
+
+
+@pytest.mark.parametrize("by", [1e6, np.nan])
+def test_a_disagreement_in_any_state_decides_whatever_the_other_bounds_are(by):
+    sharp = [state_rounding_bound(MODEL, s) for s in STATES]
+    bounds = loosened(sharp, 0, 1, 2, body=1, by=by)
+    assert judge_shifted_answers((1, 0, 1.5), bounds=bounds).rows[0].verdict == "disagrees", (
+        "a sharp body of a loose state"
+    )
+    assert judge_shifted_answers((2, 1, 1.5), bounds=loosened(sharp, 0, 1, 2)).rows[0].verdict == "disagrees"
 
 
 @pytest.mark.parametrize("drag", [False, True])
@@ -110,7 +144,8 @@ def test_the_row_is_of_the_body_that_is_worst_by_its_own_bound():
     scales = [bounds[i].scale["acceleration"][body] for i, body in ((0, 0), (1, 0), (2, 1))]
     assert table["scale"].tolist() == scales
     assert row.extra["relative"] == pytest.approx(max(table["error"] / scales), rel=1e-12, abs=0)
-    assert row.extra["bound_relative"] == pytest.approx(np.median(table["bound"] / scales), rel=1e-12, abs=0)
+    relative = max(np.max(b.acceleration / b.scale["acceleration"]) for b in bounds)
+    assert row.extra["bound_relative"] == pytest.approx(relative, rel=1e-12, abs=0)
     (_, table), *_ = judge_shifted_answers((0, 0, 0.5), (0, 1, 0.9), bounds=bounds).tables
     assert table["body"][0] == 1, "nearer to its bound, though less far off"
 
