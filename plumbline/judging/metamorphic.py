@@ -6,7 +6,8 @@ from collections.abc import Sequence
 
 from plumbline.engines.metamorphic_hooks import metamorphic_hooks
 from plumbline.engines.registry import load_adapter
-from plumbline.judging.relation_result import RelationResult
+from plumbline.judging.relation_result import REPEATABILITY, RelationResult
+from plumbline.judging.repeatability import check_repeatability
 from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict
 from plumbline.judging.run_relations import check_run_relations
 from plumbline.judging.state_relations import check_state_relations
@@ -22,11 +23,12 @@ def check_relations(engine: str, model: Model, states: Sequence[State]) -> list[
         states: states of it; runs start from the first.
 
     Returns:
-        The results of the relations at states, then of those of runs.
+        The results of repeatability, of the relations at states, and of those of runs.
 
     """
     adapter = metamorphic_hooks(load_adapter(engine))
     return [
+        *check_repeatability(adapter, model, states),  # first: the adapter has not been asked before
         *check_state_relations(adapter, model, states),
         *check_run_relations(adapter, model, states[0]),
     ]
@@ -40,7 +42,8 @@ def judge_relations(context: RowContext, results: Sequence[RelationResult]) -> J
         results: the results of `check_relations`.
 
     Returns:
-        One row per result, its value the ratio of difference and tolerance.
+        One row per result, its value the ratio of difference and tolerance; of repeatability the largest
+        relative difference, which must be zero.
 
     """
     return JudgingResult([_relation_row(context, result) for result in results])
@@ -52,6 +55,8 @@ def _relation_row(context: RowContext, result: RelationResult) -> Row:
             "relations", result.integrator, result.relation, result.verdict, result.refusal_reason
         )
     extra = {"states": float(result.state_count), "state": float(result.worst_state)}
+    if result.relation == REPEATABILITY:
+        return _repeatability_row(context, result, extra)
     if result.steps:
         limit = "what rounding and the tolerance of the step's solver explain"
         over, where = f"{result.steps} steps", "the end"
@@ -74,4 +79,21 @@ def _relation_row(context: RowContext, result: RelationResult) -> Row:
     return context.make_row(
         "relations", result.integrator, result.relation, verdict, f"{result.relation}: {reason}",
         value=result.ratio, tolerance=1.0, derivation=derivation, extra=extra,
+    )  # fmt: skip
+
+
+def _repeatability_row(context: RowContext, result: RelationResult, extra: dict[str, float]) -> Row:
+    """The row of equal questions: it disagrees on any bit that differs."""
+    asked = f"a run of {result.steps} steps" if result.steps else f"{result.state_count} states"
+    if result.refusal_reason:
+        verdict, reason = Verdict.DISAGREES, result.refusal_reason
+    elif result.quantity:
+        verdict = Verdict.DISAGREES
+        reason = f"{result.quantity}, differs by {result.ratio:.2g} of its size from the first answer"
+    else:
+        verdict, reason = Verdict.AGREES, f"{asked} gave the same bits each time"
+    return context.make_row(
+        "relations", result.integrator, REPEATABILITY, verdict, f"{REPEATABILITY} of {context.title}: {reason}",
+        value=result.ratio, tolerance=0.0, extra=extra,
+        derivation="equal questions must give equal bits: alone, in one call, in reverse order, after another",
     )  # fmt: skip

@@ -9,6 +9,8 @@ from plumbline.judging.rows import Verdict
 OTHER_FORMULATION_PREFIX = "as "  # names of relations: "as NAME" is the engine's other formulation NAME
 OPTION_PREFIX = "by "  # "by NAME" is another algorithm or linear solver of the same engine
 
+REPEATABILITY = "repeatability"  # equal questions, equal bits: the ratio is the largest relative difference
+
 
 @dataclass(frozen=True)
 class RelationResult:

@@ -60,7 +60,7 @@ def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation)
 def _worst_error_per_state(quantity: str, truth: StateTruth, evaluation: Evaluation) -> tuple[Columns, Array]:
     """Per state (S,): error, bound and scale of the body with the largest ratio of error and bound.
 
-    Besides them the largest ratio of bound and scale of any body (S,); inf where a bound is not a number.
+    Besides them the ratio of bound and scale (S, N) of every body; inf where a bound is not a number.
     """
     pairs = zip(evaluation.quantities, truth.quantities, strict=True)
     differences = [getattr(answer, quantity) - getattr(true, quantity) for answer, true in pairs]
@@ -72,7 +72,7 @@ def _worst_error_per_state(quantity: str, truth: StateTruth, evaluation: Evaluat
     state, body = np.arange(len(error)), np.argmax(ratio, axis=1)
     at = state, body
     relative = np.where(scale > 0, bound / np.where(scale > 0, scale, 1.0), np.where(bound > 0, np.inf, 0.0))
-    looseness = np.max(np.where(known, relative, np.inf), axis=1)
+    looseness = np.where(known, relative, np.inf)
     worst = {"state": state, "body": body, "error": error[at], "bound": bound[at], "scale": scale[at]}
     return worst, looseness
 
@@ -97,21 +97,25 @@ def _quantity_row(
 ) -> Row:
     """The row of one quantity.
 
-    A disagreement in any state decides. States whose bound is too loose to detect an error do not count as
-    compared; of fewer than half of the states no agreement follows.
+    A disagreement in any state decides. A state does not count as compared where the bound of its worst body
+    is too loose to detect an error, or any bound is not a number; of fewer than half of the states no
+    agreement follows. The reason counts the bodies with a loose bound in any case.
     """
     error, bound, scale = worst["error"], worst["bound"], worst["scale"]
     known, has_scale = np.isfinite(bound), scale > 0
     ratios = np.where(known, error / np.maximum(bound, TINY), 0.0)
     at, ratio, count = int(np.argmax(ratios)), float(np.max(ratios)), len(ratios)
-    sharp = looseness <= MAX_RELATIVE_BOUND
+    own = looseness[worst["state"], worst["body"]]
+    sharp = (own <= MAX_RELATIVE_BOUND) & np.all(np.isfinite(looseness), axis=1)
     compared, loosest = int(np.sum(sharp)), float(np.max(looseness))
+    loose_count = int(np.sum(looseness > MAX_RELATIVE_BOUND))
     relative = float(np.max(error[has_scale] / scale[has_scale], initial=0.0))
     state, body = int(worst["state"][at]), int(worst["body"][at]) + 1
     name, where = quantity.replace("_", " "), f"state {state}, body {body}"
     loose = (
-        f"the rounding bound is up to {loosest:.1g} of the quantity's scale (limit {MAX_RELATIVE_BOUND:g}) at "
-        f"{count - compared} of {count} states, too loose to detect an error"
+        f"the rounding bound is up to {loosest:.1g} of the quantity's scale (limit {MAX_RELATIVE_BOUND:g}) "
+        f"at {count - compared} of {count} states and in {loose_count} of {looseness.size} comparisons, too "
+        "loose to detect an error"
     )
     if ratio > 1:
         verdict = Verdict.DISAGREES
@@ -122,7 +126,7 @@ def _quantity_row(
     elif compared and 2 * compared >= count:
         verdict = Verdict.AGREES
         reason = f"{name} within {ratio:.2g} of the rounding bound at {compared} states"
-        reason += f"; {loose}" if compared < count else ""
+        reason += f"; {loose}" if loose_count else ""
     else:
         verdict, reason = Verdict.UNRESOLVED, f"inconclusive: {loose}"
     return context.make_row(
