@@ -92,8 +92,9 @@ def _repeatability_row(context: RowContext, result: RelationResult, extra: dict[
         reason = f"{result.quantity}, differs by {result.ratio:.2g} of its size from the first answer"
     else:
         verdict, reason = Verdict.AGREES, f"{asked} gave the same bits each time"
+    reason = f"{REPEATABILITY} of {context.title}: {reason}"
     return context.make_row(
-        "relations", result.integrator, REPEATABILITY, verdict, f"{REPEATABILITY} of {context.title}: {reason}",
-        value=result.ratio, tolerance=0.0, extra=extra,
-        derivation="equal questions must give equal bits: alone, in one call, in reverse order, after another",
+        "relations", result.integrator, REPEATABILITY, verdict, reason, value=result.ratio, tolerance=0.0,
+        derivation="equal questions give equal bits: alone, in one call, in reverse order, after another one",
+        extra=extra,
     )  # fmt: skip

@@ -66,7 +66,7 @@ def check_repeatability(
 
 
 def _check_states(engine: MetamorphicHooks, model: Model, states: Sequence[State]) -> RelationResult:
-    """Compare the answers at states that are asked alone, together, in reverse order and after another one."""
+    """Compare the answers at states that are asked alone, together, in reverse order, after another one."""
     alone = [evaluate_or_refusal(engine.evaluate, model, state) for state in states]
     used = [k for k, answer in enumerate(alone) if not isinstance(answer, Unsupported)]
     if not used:
