@@ -14,13 +14,13 @@ from plumbline.judging.repeatability import check_repeatability
 from plumbline.judging.rows import RowContext
 from plumbline.model.datatypes import EngineFailure, Unsupported
 from tests.helpers import pendulums
-from tests.helpers.pendulums import JOINTS
+from tests.helpers.pendulums import JOINT_PATTERNS
 
 for name in ("mujoco", "pinocchio", "exudyn"):
     pytest.importorskip(name)
 
-MODEL = pendulums.model(JOINTS["rods"], loads=True, drag=True)
-STATES = [pendulums.state(MODEL, seed=k) for k in range(4)]
+MODEL = pendulums.make_model(JOINT_PATTERNS["rods"], loads=True, drag=True)
+STATES = [pendulums.state_from_seed(MODEL, seed=k) for k in range(4)]
 ULP = np.finfo(float).eps
 
 
