@@ -21,10 +21,22 @@ from plumbline.execution.plan import Plan, ProgressCallback, TaskKey, TaskKind, 
 from plumbline.execution.random_batch import RandomBatch
 from plumbline.execution.scenario_run import ScenarioRun, has_steps
 from plumbline.judging import known_issues
+from plumbline.judging.identity import RUN_SCENARIO, IdentityCheck
 from plumbline.judging.rows import Row, Verdict
 from plumbline.processes.cpu_time import CpuTimes
 from plumbline.processes.workers import Executor, ExecutorUnavailable, Scheduler, Task, WorkerPool
 from plumbline.storage import results_store
+
+RUN_SUMMARY: dict[str, Any] = {  # of the rows that are about the whole run
+    "family": "run",
+    "title": "All scenarios of the run together",
+    "purpose": "Shows two columns that are one computation under two names.",
+    "file": "",
+    "bodies": 0,
+    "joints": [],
+    "duration": 0.0,
+    "sample": 0.0,
+}
 
 
 @dataclass
@@ -119,6 +131,7 @@ def run_plan(plan: Plan, progress: ProgressCallback) -> RunResult:
         "states": plan.random_state_count + 1,
         "sentence": summarize_verdicts(result),
         "exit_code": int(exit_code(result)),
+        "identity": run.identity.summary(),
         "stale_issues": [issue.id for issue in result.stale_issues],
     }
     if len(plan.random_scenarios):
@@ -144,6 +157,7 @@ class _Run:
     def execute(self, executor: Executor, progress: ProgressCallback) -> None:
         plan = self.plan
         self.engines = describe_engines(executor, plan.engines, are_required=plan.are_engines_required)
+        self.identity = IdentityCheck(self.engines)
         has_long_runs = plan.long_run_seconds > 0
         total = sum(
             sum(1 for _ in task_keys("", self.engines, plan.level, has_long_runs, has_steps(scenario)))
@@ -163,6 +177,9 @@ class _Run:
             progress(done, total, str(outcome.key))
 
     def result(self) -> RunResult:
+        if rows := self.known.mark_known(self.identity.rows(), bodies=0):
+            self.rows[RUN_SCENARIO], self.summaries[RUN_SCENARIO] = rows, RUN_SUMMARY
+            self.tables.add_rows(rows)
         return RunResult(
             [row for rows in self.rows.values() for row in rows],
             self.known.stale_issues(is_full_matrix=self.plan.is_full_catalogue),
@@ -182,6 +199,8 @@ class _Run:
         found, name = scenario_run.findings(), scenario_run.scenario.name
         rows = self.known.mark_known(found.rows, scenario_run.scenario.model.n)
         self.truth_methods.update(scenario_run.truth_methods())
+        if fingerprints := scenario_run.fingerprints():
+            self.identity.add_scenario(fingerprints)
         self.tables.add_rows(rows)
         if name not in self.rows:  # a random scenario
             rows = self.random_batch.add_scenario(rows)

@@ -17,7 +17,7 @@ from plumbline.judging.convergence import refinement_resolutions
 from plumbline.judging.known_issues import KnownIssues
 from plumbline.judging.long_run_study import plan_long_run, run_long_run_study
 from plumbline.judging.long_runs import judge_long_runs
-from plumbline.judging.rows import JudgingResult, Level, RowContext, Verdict, mark_aliases
+from plumbline.judging.rows import Fingerprints, JudgingResult, Level, RowContext, Verdict, mark_aliases
 from plumbline.judging.state import judge_states
 from plumbline.judging.step import (
     MAX_STEP_BODIES,
@@ -206,6 +206,20 @@ class ScenarioRun:
                 following.append(self._diagnosis_task(answer.key.engine, answer.value.quantities))
         self._pending |= {task.key for task in following}
         return following
+
+    def fingerprints(self) -> dict[str, Fingerprints]:
+        """Collect what identifies the answers of each engine.
+
+        Returns:
+            By engine the hashes of its answers' bits; empty for a scenario with a closed form, in which
+            different computations may give equal bits, as at rest.
+
+        """
+        found: dict[str, Fingerprints] = {}
+        if self.scenario.closed_form is None:
+            for key, judged in self._findings.items():
+                found.setdefault(key.engine, {}).update(judged.fingerprints)
+        return found
 
     def summary(self) -> dict[str, Any]:
         """Describe the scenario for results.json.

@@ -108,26 +108,26 @@ def _check_run(
         except (Unsupported, EngineFailure) as refusal:
             return refusal
 
+    def run_result(size: float, where: str, reason: str = "") -> RelationResult:
+        return RelationResult(
+            REPEATABILITY, size, where, 0, 1, reason, integrator=integrator.name, steps=RUN_STEPS,
+            resolution=resolution, end_time=float(times[-1]),
+        )  # fmt: skip
+
     first = simulate(model, state)
     simulate(*_other_question(model, state))
     again = simulate(model, state)
-    common = {
-        "integrator": integrator.name,
-        "steps": RUN_STEPS,
-        "resolution": resolution,
-        "end_time": float(times[-1]),
-    }
     if isinstance(first, Trajectory) and isinstance(again, Trajectory):
         size, name = _largest_difference(first, again)
         where = f"{name} of a run, asked after another run" if name else ""
-        return RelationResult(REPEATABILITY, size, where, 0, 1, **common)
+        return run_result(size, where)
     if isinstance(first, Unsupported) and isinstance(again, Unsupported):
         return None
     if isinstance(first, EngineFailure) and isinstance(again, EngineFailure):
         return refused_result(REPEATABILITY, integrator, again)
     refusal = first if not isinstance(first, Trajectory) else again
     reason = f"one of two equal runs was refused or failed: {refusal}"
-    return RelationResult(REPEATABILITY, np.inf, "", 0, 1, reason, **common)
+    return run_result(np.inf, "", reason)
 
 
 def _other_question(model: Model, state: State) -> tuple[Model, State]:

@@ -9,6 +9,8 @@ from enum import StrEnum
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
 Level = Literal["state", "step", "invariants", "trajectory", "relations"]
+# hash of an answer's bits, by integrator ("-" at states), quantity and resolution ("" at states)
+Fingerprints = dict[tuple[str, str, str], bytes]
 Columns = dict[str, Any]  # column name → its values (n,), or the one value of all n records
 
 
@@ -276,7 +278,8 @@ def first_decided(candidates: Iterable[_DecidableT]) -> _DecidableT:
 
 @dataclass
 class JudgingResult:
-    """Rows, and parts of the stored tables behind them."""
+    """Rows, parts of the stored tables behind them, and what identifies the judged answers."""
 
     rows: list[Row] = field(default_factory=list)
     tables: list[tuple[str, Columns]] = field(default_factory=list)  # name of the stored table, its columns
+    fingerprints: Fingerprints = field(default_factory=dict)

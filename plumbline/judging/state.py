@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from plumbline.engines.calls import Evaluation
+from plumbline.judging.identity import state_fingerprints
 from plumbline.judging.rows import Columns, JudgingResult, Row, RowContext, Verdict
 from plumbline.model.datatypes import Array
 from plumbline.truth.ground_truth import StateTruth
@@ -42,7 +43,7 @@ def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation)
         return JudgingResult([row])
     if evaluation.failure is not None:
         return JudgingResult([context.make_row("state", "-", "all", Verdict.FAILED, evaluation.failure)])
-    result = JudgingResult()
+    result = JudgingResult(fingerprints=state_fingerprints(evaluation.quantities))
     for quantity, unit in STATE_UNITS.items():
         if any(getattr(answer, quantity) is None for answer in evaluation.quantities):
             reason = f"{context.title} offers no {quantity.replace('_', ' ')} of its own"

@@ -15,6 +15,7 @@ import numpy as np
 
 from plumbline.engines.calls import RefinementStudy
 from plumbline.judging.convergence import ORDER_CHANGE_FACTOR, ORDER_MARGIN
+from plumbline.judging.identity import run_fingerprints
 from plumbline.judging.invariant_drift import invariant_rows
 from plumbline.judging.refinement_analysis import RefinementAnalysis
 from plumbline.judging.rows import Columns, JudgingResult, Row, RowContext, Verdict, first_decided
@@ -56,7 +57,8 @@ def judge_trajectory(
         ("curves", of_finest | _time_series_columns(analysis)),
         ("trajectories", of_finest | pose_columns(finest.trajectory)),
     ]
-    return JudgingResult(rows, tables)
+    finished = {run.resolution: run.trajectory for run in study.runs if run.trajectory is not None}
+    return JudgingResult(rows, tables, run_fingerprints(integrator.name, finished))
 
 
 def trajectory_rows(study: RefinementAnalysis) -> list[Row]:
