@@ -241,7 +241,11 @@ def _random_scenario_summary(results: Results) -> Record | None:
     worst: dict[str, dict[str, Record]] = {}
     for cell in batch["worst_ratios"]:
         worst.setdefault(cell["quantity"], {})[cell["engine"]] = cell
-    return {"scenarios": batch["scenarios"], "worst": worst}
+    return {
+        "scenarios": batch["scenarios"],
+        "trajectories": batch.get("trajectories", 0),
+        "worst": worst,
+    }
 
 
 def bundle_script() -> str:

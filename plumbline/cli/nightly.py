@@ -83,6 +83,7 @@ def run_nightly(
     limits: Limits,
     is_full_catalogue: bool,
     command: str,
+    random_trajectory_count: int = 0,
     extra_refinements: int = EXTRA_REFINEMENTS,
     long_run_seconds: float = 0.0,
     level: LevelSelection = "all",
@@ -105,6 +106,7 @@ def run_nightly(
         limits: limits of each task.
         is_full_catalogue: whether every known issue must occur.
         command: the command line, stored with the results.
+        random_trajectory_count: how many of the random scenarios are compared at every level.
         extra_refinements: halvings of the finest step beyond a run's refinement study.
         long_run_seconds: length of the long runs [s]; 0 for none.
         level: levels to compare at.
@@ -145,6 +147,7 @@ def run_nightly(
         scheduler=scheduler,
         random_scenarios=random_scenarios,
         random_level="random",
+        random_trajectory_count=random_trajectory_count,
         result_cache=DiskResultCache(unfinished / "cells", log),
         are_engines_required=are_engines_required,
         known_issues=load_known_issues() if known_issues is None else known_issues,

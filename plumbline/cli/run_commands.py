@@ -112,6 +112,12 @@ def run(
     "--random", "random_count", type=click.IntRange(0), default=200, help="Number of random scenarios."
 )
 @click.option(
+    "--random-trajectories",
+    type=click.IntRange(0),
+    default=20,
+    help="How many of the random scenarios are also simulated; the others are compared at states.",
+)
+@click.option(
     "--seed",
     type=click.IntRange(0),
     help="Seed of the random scenarios. Default: random; printed and stored in results.json.",
@@ -140,9 +146,9 @@ def run(
 @options.timeout_option(1800.0)
 @options.memory_option
 def nightly(
-    names: tuple[str, ...], engines: list[str], random_count: int, seed: int | None, extra_refinements: int,
-    long_run_seconds: float, self_test: bool, jobs: int, scheduler: str | None, known_files: tuple[Path, ...],
-    out: Path, timeout: float, memory: float,
+    names: tuple[str, ...], engines: list[str], random_count: int, random_trajectories: int, seed: int | None,
+    extra_refinements: int, long_run_seconds: float, self_test: bool, jobs: int, scheduler: str | None,
+    known_files: tuple[Path, ...], out: Path, timeout: float, memory: float,
 ) -> None:  # fmt: skip
     """Run the catalogue with finer steps, long runs, random scenarios and the self-test.
 
@@ -157,7 +163,8 @@ def nightly(
     folder = options.ensure_writable(out)
     with options.exit_on_io_error(), ProgressDisplay(sys.stderr) as progress:
         result, place = run_nightly(
-            folder, chosen, engines, random_count=random_count, seed=seed, jobs=jobs,
+            folder, chosen, engines, random_count=random_count,
+            random_trajectory_count=random_trajectories, seed=seed, jobs=jobs,
             limits=Limits(timeout, memory), is_full_catalogue=not names and engines == list(ENGINES),
             extra_refinements=extra_refinements, long_run_seconds=long_run_seconds, scheduler=scheduler,
             self_test=run_self_test if self_test else None, progress=progress,

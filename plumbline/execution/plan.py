@@ -36,8 +36,9 @@ class Plan:
     user_rtol: float | None = None  # relative to each quantity's scale; shown beside the verdict only
     is_full_catalogue: bool = False  # the full catalogue on all engines: every known issue must occur
     scheduler: str | None = None  # address of a dask cluster to run on, instead of ``jobs`` workers here
-    random_scenarios: Sequence[Scenario] = ()  # compared at few states only; may be made one by one
+    random_scenarios: Sequence[Scenario] = ()  # compared at few states; may be made one by one
     random_level: Literal["state", "random"] = "state"  # of the random scenarios; "random": state and step
+    random_trajectory_count: int = 0  # so many of the random scenarios, the first ones, run at every level
     result_cache: ResultCache = field(default_factory=ResultCache)
 
 

@@ -63,4 +63,4 @@ def _needs_a_look(row: Row) -> bool:
     """Whether a row is neither agreement nor a recorded gap; other recorded verdicts are shown too."""
     if row.verdict == Verdict.UNSUPPORTED:
         return not row.known_issue
-    return row.verdict.needs_attention
+    return Verdict(row.verdict).needs_attention

@@ -135,7 +135,8 @@ def run_plan(plan: Plan, progress: ProgressCallback) -> RunResult:
         "stale_issues": [issue.id for issue in result.stale_issues],
     }
     if len(plan.random_scenarios):
-        result.metadata["random_batch"] = result.random_batch.summary()
+        count = min(plan.random_trajectory_count, len(plan.random_scenarios))
+        result.metadata["random_batch"] = result.random_batch.summary() | {"trajectories": count}
     return result
 
 
@@ -163,7 +164,10 @@ class _Run:
             sum(1 for _ in task_keys("", self.engines, plan.level, has_long_runs, has_steps(scenario)))
             for scenario in plan.scenarios
         )
-        total += len(plan.random_scenarios) * sum(1 for _ in task_keys("", self.engines, plan.random_level))
+        runs = min(plan.random_trajectory_count, len(plan.random_scenarios))
+        total += runs * sum(1 for _ in task_keys("", self.engines, plan.level))
+        others = len(plan.random_scenarios) - runs
+        total += others * sum(1 for _ in task_keys("", self.engines, plan.random_level))
         scheduler = Scheduler(executor, self.cpu_times.timed_cache(plan.result_cache))
         for done, outcome in enumerate(scheduler.run(self._tasks()), start=1):
             self.cpu_times.add_outcome(outcome, outcome.key.cpu_time_kind)
@@ -188,9 +192,11 @@ class _Run:
 
     def _tasks(self) -> Iterator[Task]:
         order = sorted(self.plan.scenarios, key=lambda s: -s.model.n)  # no long task alone at the end
-        for number, scenario in enumerate(itertools.chain(order, self.plan.random_scenarios)):
-            is_random = number >= len(order)
-            scenario_run = ScenarioRun(self.plan, scenario, self.engines, is_random, self.known)
+        for number, scenario in enumerate(itertools.chain(order, self.plan.random_scenarios), -len(order)):
+            level = self.plan.level if number < self.plan.random_trajectory_count else None
+            scenario_run = ScenarioRun(
+                self.plan, scenario, self.engines, number >= 0, self.known, level=level
+            )
             self.open[scenario.name] = scenario_run
             yield from scenario_run.tasks()
 

@@ -11,7 +11,14 @@ import numpy as np
 from plumbline.diagnosis.diagnose import explain_disagreement
 from plumbline.engines import calls, environments
 from plumbline.engines.adapter import EngineInfo
-from plumbline.execution.plan import STATES_PER_RANDOM_SCENARIO, Plan, TaskKey, TaskKind, task_keys
+from plumbline.execution.plan import (
+    STATES_PER_RANDOM_SCENARIO,
+    LevelSelection,
+    Plan,
+    TaskKey,
+    TaskKind,
+    task_keys,
+)
 from plumbline.judging import metamorphic, outlier
 from plumbline.judging.convergence import refinement_resolutions
 from plumbline.judging.known_issues import KnownIssues
@@ -80,6 +87,7 @@ class ScenarioRun:
         engines: Mapping[str, EngineInfo],
         is_random: bool = False,
         known: KnownIssues | None = None,
+        level: LevelSelection | None = None,
     ) -> None:
         """Draw the states of the scenario and list its tasks.
 
@@ -87,17 +95,18 @@ class ScenarioRun:
             plan: what to run.
             scenario: the scenario.
             engines: description of each engine of the plan.
-            is_random: whether it is a random scenario, which is compared at few states, and by single steps.
+            is_random: whether it is a random scenario, which is compared at few states and without long runs.
             known: discrepancies whose cause is on record, so that it is not searched again.
+            level: levels to compare at; None for the plan's, or for those of its random scenarios.
 
         """
         self.scenario = scenario
         self.truths: dict[TaskKind, StateTruth | MotionTruth | TruthFailure] = {}
         self._plan, self._engines, self._known = plan, engines, known
-        level = plan.random_level if is_random else plan.level
-        self._keys = list(
-            task_keys(scenario.name, engines, level, plan.long_run_seconds > 0, has_steps(scenario))
-        )
+        if level is None:
+            level = plan.random_level if is_random else plan.level
+        has_long_runs = plan.long_run_seconds > 0 and not is_random
+        self._keys = list(task_keys(scenario.name, engines, level, has_long_runs, has_steps(scenario)))
         self._pending = set(self._keys)  # without an outcome
         self._findings: dict[TaskKey, JudgingResult] = {}
         self._has_retried_truth = False

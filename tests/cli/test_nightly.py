@@ -148,3 +148,13 @@ def test_what_someone_should_see_is_kept_whole_with_its_file(tmp_path):
     )
     found = sorted(tmp_path.iterdir())
     assert [loader.load_scenario(path).digest for path in found] == [drawn[1].digest, drawn[2].digest]
+
+
+def test_some_random_scenarios_run_at_every_level(tmp_path):
+    result, place = run_nightly(tmp_path, random_count=2, random_trajectory_count=1, seed=4)
+    rows = [row for row in read_table(place, "summary").to_pylist() if row["family"] == RANDOM_FAMILY]
+    levels = {k: {row["level"] for row in rows if row["scenario"] == f"random-4-{k}"} for k in range(2)}
+    assert levels == {0: {"state", "trajectory", "invariants", "relations"}, 1: {"state"}}
+    assert result.metadata["random_batch"]["trajectories"] == 1
+    assert result.metadata["exit_code"] == 0, result.metadata["sentence"]
+    assert "2 random scenarios at state level, 1 of them at every level" in (place / "summary.md").read_text()
