@@ -125,7 +125,7 @@ def _random_scenario_summary(results: Results) -> list[str]:
     worst = max(batch["worst_ratios"], key=lambda cell: cell["ratio"], default=None)
     text = f"{batch['scenarios']} random scenarios at state level"
     if count := batch.get("trajectories"):
-        text += f", {count} of them at every level"
+        text += f", {count} of them (motions) at every level"
     if worst:
         place = escape_markdown(f"{worst['engine']}, {worst['quantity']}, {worst['scenario']}")
         text += (

@@ -106,7 +106,7 @@ def run_nightly(
         limits: limits of each task.
         is_full_catalogue: whether every known issue must occur.
         command: the command line, stored with the results.
-        random_trajectory_count: how many of the random scenarios are compared at every level.
+        random_trajectory_count: number of random motions, which are compared at every level.
         extra_refinements: halvings of the finest step beyond a run's refinement study.
         long_run_seconds: length of the long runs [s]; 0 for none.
         level: levels to compare at.
@@ -134,7 +134,7 @@ def run_nightly(
     log(f"random scenarios: {night.random_count}, seed {night.seed}")
     if finished:
         log(f"resuming the night begun {night.started}: {finished} cells are finished")
-    random_scenarios = RandomScenarios(night.seed, night.random_count)
+    random_scenarios = RandomScenarios(night.seed, night.random_count, random_trajectory_count)
     plan = Plan(
         scenarios,
         engines,
@@ -190,12 +190,12 @@ def unused_path(place: Path) -> Path:
     return next(name for name in names if not name.exists())
 
 
-def write_random_scenario_files(result: RunResult, drawn: Sequence[Scenario], folder: Path) -> None:
+def write_random_scenario_files(result: RunResult, drawn: RandomScenarios, folder: Path) -> None:
     """Write the files of the random scenarios that have rows in the result, so that `run FILE` repeats them.
 
     Args:
         result: the night's result.
-        drawn: the random scenarios, by their number.
+        drawn: the random scenarios.
         folder: folder of the files.
 
     Raises:
@@ -203,7 +203,7 @@ def write_random_scenario_files(result: RunResult, drawn: Sequence[Scenario], fo
 
     """
     names = {row.scenario for row in result.rows if row.family == RANDOM_FAMILY}
-    for s in (drawn[int(name.rpartition("-")[2])] for name in sorted(names)):
+    for s in map(drawn.named, sorted(names)):
         folder.mkdir(exist_ok=True)
         text = json.dumps(s.document, indent=1)  # JSON is YAML
         write_atomically(folder / f"{s.name}.yaml", text.encode())

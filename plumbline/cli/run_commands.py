@@ -115,7 +115,7 @@ def run(
     "--random-trajectories",
     type=click.IntRange(0),
     default=20,
-    help="How many of the random scenarios are also simulated; the others are compared at states.",
+    help="Number of random motions besides, which are compared at every level; the others only at states.",
 )
 @click.option(
     "--seed",

@@ -17,6 +17,10 @@ from plumbline.scenario.loader import Scenario, scenario_from_dict
 RANDOM_FAMILY = "random"
 MAX_RANDOM_BODIES = 10
 MASS_DECADES = 3.0  # masses in a wild scenario reach from 1e-3 to 1e3 kg; in a tame one 0.1 to 10 kg
+MAX_MOTION_BODIES = 3
+MOTION_MOMENT = 0.02  # moments of loads and drag in a random motion, over those of other random scenarios
+MOTION_PREFIX = "random-motion-"
+MOTION_SAMPLE = 2.0**-5  # s, the coarsest step of an order-4 method; the work of loads is a quadrature
 RANDOM_PURPOSE = (
     "Nobody chose it, so nobody's blind spot shaped it: generic geometry, full inertia, rates and loads "
     "shows any mistake that a symmetric or planar case hides."
@@ -24,10 +28,14 @@ RANDOM_PURPOSE = (
 
 
 class RandomScenarios(Sequence[Scenario]):
-    """The first ``count`` scenarios of a seed; each is made when it is accessed."""
+    """The first scenarios of a seed: ``motion_count`` random motions, then ``count`` others.
 
-    def __init__(self, seed: int, count: int) -> None:
-        self.seed, self.indices = seed, range(count)
+    Each is made when it is accessed.
+    """
+
+    def __init__(self, seed: int, count: int, motion_count: int = 0) -> None:
+        self.seed, self.motion_count = seed, motion_count
+        self.indices = range(-motion_count, count)
 
     def __len__(self) -> int:
         """How many."""
@@ -40,8 +48,26 @@ class RandomScenarios(Sequence[Scenario]):
     def __getitem__(self, index: int | slice) -> Scenario | list[Scenario]:
         """Scenario k."""
         if isinstance(index, slice):
-            return [random_scenario(self.seed, number) for number in self.indices[index]]
-        return random_scenario(self.seed, self.indices[index])
+            return [self._make(number) for number in self.indices[index]]
+        return self._make(self.indices[index])
+
+    def named(self, name: str) -> Scenario:
+        """Make the scenario of a name.
+
+        Args:
+            name: ``random-SEED-INDEX`` or ``random-motion-SEED-INDEX``, of this seed.
+
+        Returns:
+            The scenario.
+
+        """
+        number = int(name.rpartition("-")[2])
+        return self._make(number - self.motion_count if name.startswith(MOTION_PREFIX) else number)
+
+    def _make(self, number: int) -> Scenario:
+        if number >= 0:
+            return random_scenario(self.seed, number)
+        return random_motion(self.seed, number + self.motion_count)
 
 
 def random_scenario(seed: int, index: int) -> Scenario:
@@ -56,6 +82,42 @@ def random_scenario(seed: int, index: int) -> Scenario:
 
     """
     content = random_document(seed, index)
+    return scenario_from_dict(content, f"{content['name']}.yaml")
+
+
+def random_motion(seed: int, index: int) -> Scenario:
+    """Make one random scenario whose motion can be resolved in time: short, moderate rates, similar masses.
+
+    Args:
+        seed: the seed of the whole batch.
+        index: the scenario's place among the batch's motions, from 0.
+
+    Returns:
+        The scenario, named ``random-motion-SEED-INDEX``.
+
+    """
+    rng = np.random.default_rng(derive_seed("random motion", str(seed), str(index)))
+    n = int(rng.integers(1, MAX_MOTION_BODIES + 1))
+    rate, gravity = 10 ** rng.uniform(-0.5, 0.3, 2)  # rad/s, m/s²
+    direction = rng.normal(size=3)
+    loaded, dragged = rng.random(2) < 0.5
+    bodies = [_random_body(rng, 0.3, rate, bool(loaded), bool(dragged), i == n - 1) for i in range(n)]
+    for body in bodies:  # moments that turn a body in a second, not in the time between two samples
+        if "load" in body:
+            body["load"]["moment"] = [MOTION_MOMENT * x for x in body["load"]["moment"]]
+        if "drag" in body:
+            body["drag"]["moment"] *= MOTION_MOMENT
+    content = {
+        "schema_version": 1,
+        "name": f"{MOTION_PREFIX}{seed}-{index}",
+        "family": RANDOM_FAMILY,
+        "title": f"Random motion {index} of seed {seed}: {'1 body' if n == 1 else f'{n} bodies'}",
+        "purpose": RANDOM_PURPOSE,
+        "duration": 0.5,
+        "sample": MOTION_SAMPLE,
+        "gravity": (gravity / np.linalg.norm(direction) * direction).tolist(),
+        "bodies": bodies,
+    }
     return scenario_from_dict(content, f"{content['name']}.yaml")
 
 

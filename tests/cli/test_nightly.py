@@ -150,11 +150,28 @@ def test_what_someone_should_see_is_kept_whole_with_its_file(tmp_path):
     assert [loader.load_scenario(path).digest for path in found] == [drawn[1].digest, drawn[2].digest]
 
 
-def test_some_random_scenarios_run_at_every_level(tmp_path):
-    result, place = run_nightly(tmp_path, random_count=2, random_trajectory_count=1, seed=4)
+def test_random_motions_run_at_every_level(tmp_path):
+    result, place = run_nightly(tmp_path, random_count=1, random_trajectory_count=2, seed=4)
     rows = [row for row in read_table(place, "summary").to_pylist() if row["family"] == RANDOM_FAMILY]
-    levels = {k: {row["level"] for row in rows if row["scenario"] == f"random-4-{k}"} for k in range(2)}
-    assert levels == {0: {"state", "trajectory", "invariants", "relations"}, 1: {"state"}}
-    assert result.metadata["random_batch"]["trajectories"] == 1
+    levels = {}
+    for row in rows:
+        levels.setdefault(row["scenario"], set()).add(row["level"])
+    every = {"state", "trajectory", "invariants", "relations"}
+    assert levels == {"random-motion-4-0": every, "random-motion-4-1": every, "random-4-0": {"state"}}
+    assert result.metadata["random_batch"]["trajectories"] == 2
     assert result.metadata["exit_code"] == 0, result.metadata["sentence"]
-    assert "2 random scenarios at state level, 1 of them at every level" in (place / "summary.md").read_text()
+    summary = (place / "summary.md").read_text()
+    assert "3 random scenarios at state level, 2 of them" in summary
+
+
+def test_random_motions_do_not_change_the_other_random_scenarios():
+    drawn = RandomScenarios(4, 3, 2)
+    names = ["random-motion-4-0", "random-motion-4-1", "random-4-0", "random-4-1", "random-4-2"]
+    assert [one.name for one in drawn] == names and len(drawn) == 5
+    assert [drawn.named(name).digest for name in names] == [one.digest for one in drawn]
+    assert [one.digest for one in drawn[2:]] == [one.digest for one in RandomScenarios(4, 3)]
+    motions = list(RandomScenarios(9, 0, 40))
+    assert {one.model.n for one in motions} == {1, 2, 3}
+    assert all(one.model.gravity.all() and one.closed_form is None for one in motions)
+    assert {bool(np.any(one.model.force)) for one in motions} == {True, False}
+    assert {one.model.has_drag for one in motions} == {True, False}
