@@ -22,7 +22,7 @@ from plumbline.judging.run_relations import (
     fastest_rate,
     refused_result,
 )
-from plumbline.judging.state_relations import evaluate_or_refusal
+from plumbline.judging.state_relations import LONG_CHAIN_BODIES, MAX_STATES, evaluate_or_refusal
 from plumbline.model.datatypes import (
     Array,
     EngineFailure,
@@ -35,7 +35,6 @@ from plumbline.model.datatypes import (
 )
 from plumbline.model.kinematics import state_from_minimal
 
-MAX_REPEATED_STATES = 4
 Difference = tuple[float, str]  # relative to the largest entry of the quantity, and a description
 
 
@@ -54,7 +53,8 @@ def check_repeatability(
         largest relative difference, 0 where every bit is the same.
 
     """
-    yield _check_states(engine, model, states[:MAX_REPEATED_STATES])
+    count = MAX_STATES if model.n <= LONG_CHAIN_BODIES else MAX_STATES // 2
+    yield _check_states(engine, model, states[:count])
     step = 2.0 ** float(np.floor(-np.log2(STEPS_PER_RADIAN * fastest_rate(model, states[0]))))
     for integrator in engine.integrators:
         for divisor in STEP_DIVISORS:
