@@ -34,6 +34,7 @@ from pydantic import (
 
 from plumbline.engines.declared_names import declared_integrators, declared_texts
 from plumbline.engines.registry import ENGINES
+from plumbline.judging.relation_result import REPEATABILITY
 from plumbline.judging.rows import Level, Row, Verdict
 from plumbline.judging.run_relations import REVERSED_IN_TIME
 from plumbline.judging.state import STATE_UNITS
@@ -41,7 +42,7 @@ from plumbline.judging.state_relations import STATE_RELATIONS, WELDED_HALVES
 from plumbline.judging.step import CONSTRAINED_UNITS, STEP_UNITS
 from plumbline.model.invariants import INVARIANT_UNITS
 from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean, shorten
-from plumbline.scenario.generator import RANDOM_FAMILY
+from plumbline.scenario.generator import MOTION_PREFIX, RANDOM_FAMILY
 from plumbline.scenario.loader import catalogue
 from plumbline.scenario.schema import invalid_value_error
 from plumbline.scenario.validation_messages import problems_from_validation
@@ -278,7 +279,7 @@ def _name_problems(source: YamlSource, entries: Sequence[_Entry], others: set[st
     """Problems of names that nothing has, and of ids that are used twice."""
     seen: set[str] = set()
     known: dict[str, set[str]] = {
-        "scenario": {*catalogue(), *others, f"{RANDOM_FAMILY}-1-1"},
+        "scenario": {*catalogue(), *others, f"{RANDOM_FAMILY}-1-1", f"{MOTION_PREFIX}1-1"},
         "engine": set(ENGINES),
         "shown_by": set(ENGINES),
         "level": set(map(str, LEVELS)),
@@ -309,10 +310,10 @@ def _problem(
 
 
 def _quantities() -> set[str]:
-    """Every quantity that a row may have."""
-    trajectory = ("order", "position", "position_limit", "attitude", "attitude_limit")
+    """Every quantity that a row may have, except of information."""
+    trajectory = ("order", "position_limit", "attitude_limit")
     long_runs = ("all_long", "energy_drift_long_growth", *(f"{name}_long" for name in INVARIANT_UNITS))
-    relations = (*(r.name for r in STATE_RELATIONS), WELDED_HALVES, REVERSED_IN_TIME)
+    relations = (*(r.name for r in STATE_RELATIONS), WELDED_HALVES, REVERSED_IN_TIME, REPEATABILITY)
     others = *(f"as {name}" for name in ENGINES), *(f"by {text}" for text in declared_texts())
     steps = (*STEP_UNITS, *CONSTRAINED_UNITS)
     return {"all", *STATE_UNITS, *steps, *trajectory, *INVARIANT_UNITS, *long_runs, *relations, *others}
