@@ -141,10 +141,10 @@ def test_an_implicit_integrator_that_calls_euler_is_reported(is_euler):
 def test_a_run_reports_an_alias_that_is_not_declared(monkeypatch, tmp_path):
     describe = runner.describe_engines
 
-    def undeclared(*arguments):
+    def undeclared(*arguments, **options):
         return {
             name: replace(one, integrators=tuple(replace(i, alias_of=None) for i in one.integrators))
-            for name, one in describe(*arguments).items()
+            for name, one in describe(*arguments, **options).items()
         }
 
     names = ("rest", "planar-small", "tumbling-ball", "tumbling-rod", "on-axis-rod")
