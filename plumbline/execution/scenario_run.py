@@ -103,10 +103,9 @@ class ScenarioRun:
         self.scenario = scenario
         self.truths: dict[TaskKind, StateTruth | MotionTruth | TruthFailure] = {}
         self._plan, self._engines, self._known = plan, engines, known
-        if level is None:
-            level = plan.random_level if is_random else plan.level
+        levels = level or (plan.random_level if is_random else plan.level)
         has_long_runs = plan.long_run_seconds > 0 and not is_random
-        self._keys = list(task_keys(scenario.name, engines, level, has_long_runs, has_steps(scenario)))
+        self._keys = list(task_keys(scenario.name, engines, levels, has_long_runs, has_steps(scenario)))
         self._pending = set(self._keys)  # without an outcome
         self._findings: dict[TaskKey, JudgingResult] = {}
         self._has_retried_truth = False
