@@ -156,8 +156,8 @@ def test_random_motions_run_at_every_level(tmp_path):
     levels = {}
     for row in rows:
         levels.setdefault(row["scenario"], set()).add(row["level"])
-    every = {"state", "trajectory", "invariants", "relations"}
-    assert levels == {"random-motion-4-0": every, "random-motion-4-1": every, "random-4-0": {"state"}}
+    every = {"state", "step", "trajectory", "invariants", "relations"}
+    assert levels == {"random-motion-4-0": every, "random-motion-4-1": every, "random-4-0": {"state", "step"}}
     assert result.metadata["random_batch"]["trajectories"] == 2
     assert result.metadata["exit_code"] == 0, result.metadata["sentence"]
     summary = (place / "summary.md").read_text()
