@@ -73,22 +73,24 @@ def test_a_night_is_whole_and_remembered(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["history"]
     stored = json.loads((place / "results.json").read_text())["run"]
     assert (stored["seed"], stored["random"]) == (11, 3)
-    assert not [r for r in result.rows if r.family == RANDOM_FAMILY], "what agrees is folded"
-    folded, random = (
-        result.random_batch.counts_by_verdict,
-        [r for r in read_table(place, "summary").to_pylist() if r["family"] == RANDOM_FAMILY],
-    )
+    kept = [row for row in result.rows if row.family == RANDOM_FAMILY]
+    for row in kept:  # scenarios without anything remarkable are only counted
+        assert any(other.verdict != "agrees" for other in kept if other.scenario == row.scenario), row.key
+    counted = result.random_batch.counts_by_verdict
+    random = [r for r in read_table(place, "summary").to_pylist() if r["family"] == RANDOM_FAMILY]
     assert {r["scenario"] for r in random} == {f"random-11-{k}" for k in range(3)}
-    assert all(r["level"] == "state" for r in random) and folded.total() == len(random)
-    assert stored["random_batch"]["scenarios"] == 3 and len(stored["random_batch"]["worst_ratios"]) == 7
-    assert max(cell["ratio"] for cell in stored["random_batch"]["worst_ratios"]) == max(
-        r["ratio"] for r in random if r["verdict"] == "agrees"
-    )
-    checks = sum(row.verdict == "agrees" for row in result.rows) + folded["agrees"]
-    assert stored["sentence"].startswith(f"{checks} independent checks: {checks} agree")
+    assert {r["level"] for r in random} == {"state", "step"}
+    assert counted.total() + len(kept) == len(random)
+    assert stored["random_batch"]["scenarios"] == 3
+    keys = {row.key for row in kept}
+    ratios = [r["ratio"] for r in random if r["verdict"] == "agrees" and r["key"] not in keys]
+    assert max(cell["ratio"] for cell in stored["random_batch"]["worst_ratios"]) == max(ratios)
+    agree = sum(row.verdict == "agrees" for row in result.rows) + counted["agrees"]
+    checks = sum(row.verdict.is_comparison for row in result.rows) + counted["agrees"]
+    assert stored["sentence"].startswith(f"{checks} independent checks: {agree} agree")
     assert "3 random scenarios" in (place / "report.html").read_text()
     assert "3 random scenarios" in (place / "summary.md").read_text()
-    levels = {"state", "trajectory", "invariants", "relations"}
+    levels = {"state", "step", "trajectory", "invariants", "relations"}
     assert {r.level for r in result.rows if r.scenario == "rest"} == levels
     (seen,) = History(tmp_path).overview()
     assert seen["id"] == place.name and seen["random"] == 3
