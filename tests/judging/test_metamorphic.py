@@ -145,7 +145,8 @@ def test_a_refused_state_is_left_out_and_a_refusing_engine_is_told():
         rows = judge_relations(
             RowContext("s", "f", "e", "E", "0"), check_relations("mujoco", model, random_states_of(model))
         ).rows
-    assert {(row.verdict, row.reason) for row in rows} == {("unsupported", "not on a Monday")}
+    of_states = [row for row in rows if row.integrator == "-"]  # its runs are as before
+    assert {(row.verdict, row.reason) for row in of_states} == {("unsupported", "not on a Monday")}
 
 
 def test_noise_breaks_what_is_not_bitwise():
@@ -156,7 +157,8 @@ def test_noise_breaks_what_is_not_bitwise():
     engine = plant(type(load_adapter("mujoco")), noisy)
     model = pendulums.make_model(JOINT_PATTERNS["balls"])
     with patch("plumbline.judging.metamorphic.load_adapter", lambda _: engine):
-        assert all(h.ratio > 1 for h in check_relations("mujoco", model, random_states_of(model)))
+        found = check_relations("mujoco", model, random_states_of(model))
+    assert all(result.ratio > 1 for result in found if result.integrator == "-")  # its runs are as before
 
 
 # -- the engine's other ways, and welded halves -----------------------------------------------------
