@@ -158,7 +158,9 @@ def test_noise_breaks_what_is_not_bitwise():
     model = pendulums.make_model(JOINT_PATTERNS["balls"])
     with patch("plumbline.judging.metamorphic.load_adapter", lambda _: engine):
         found = check_relations("mujoco", model, random_states_of(model))
-    assert all(result.ratio > 1 for result in found if result.integrator == "-")  # its runs are as before
+    for result in found:
+        if result.integrator == "-":  # its runs are as before; a repetition must be the same to the bit
+            assert result.ratio > (0 if result.relation == "repeatability" else 1), result.relation
 
 
 # -- the engine's other ways, and welded halves -----------------------------------------------------
