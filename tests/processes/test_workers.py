@@ -210,11 +210,11 @@ def test_no_orphan_is_left_when_the_parent_is_killed(tmp_path):
     script.write_text(
         "import sys\n"
         f"sys.path[:0] = {[str(Path(__file__).resolve().parents[2]), str(Path(__file__).parent)]!r}\n"
-        "from test_workers import hang, pid\n"
+        "from test_workers import hang, process_id\n"
         "from plumbline.processes.workers import Task, WorkerPool\n"
         "if __name__ == '__main__':\n"
         "    with WorkerPool(1) as workers:\n"
-        "        for outcome in workers.run([Task(0, pid), Task(1, hang)]):\n"
+        "        for outcome in workers.run([Task(0, process_id), Task(1, hang)]):\n"
         "            print(outcome.value, flush=True)\n"
     )
     parent = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True)
