@@ -54,7 +54,9 @@ def test_every_fault_at_once_loses_exactly_its_own_cell(tmp_path, monkeypatch, c
     euler = [row for row in sound if row.integrator == "Euler"]
     for name in names:
         assert comparable_rows(result.rows, name) == euler, "a fault changed a cell beside it"
-    assert comparable_rows(result.rows, "flood_output") and not [r for r in result.rows if r.verdict == "disagrees"]
+    assert comparable_rows(result.rows, "flood_output") and not [
+        r for r in result.rows if r.verdict == "disagrees"
+    ]
     # the night is whole, tells of it, and nothing of it is left elsewhere
     stored = json.loads((place / "results.json").read_text())
     assert stored["run"]["exit_code"] == 3 and len(stored["rows"]) == len(result.rows)

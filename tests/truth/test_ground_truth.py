@@ -170,8 +170,8 @@ def test_two_methods_that_differ_by_more_than_rounding_are_reported(position, at
 
 
 def test_a_truth_that_is_not_a_number_is_in_doubt() -> None:
-    model = pendulums.model("b")
-    at = pendulums.state(model, seed=2, rate=0.5)
+    model = pendulums.make_model("b")
+    at = pendulums.state_from_seed(model, seed=2, rate=0.5)
     sound = motion_truth(model, at, TIMES, None)
     made = TrajectoryTruth(sound.trajectory, np.full(9, np.nan), np.zeros(9), "made")
     with patch("plumbline.truth.ground_truth.trajectory_truth", lambda *_: made):
@@ -179,8 +179,8 @@ def test_a_truth_that_is_not_a_number_is_in_doubt() -> None:
 
 
 def test_the_wanted_time_does_not_shrink_with_the_uncertainty() -> None:
-    model = pendulums.model("b")
-    at = pendulums.state(model, seed=2, rate=0.5)
+    model = pendulums.make_model("b")
+    at = pendulums.state_from_seed(model, seed=2, rate=0.5)
     sound = motion_truth(model, at, TIMES, None)
     vague = replace(sound, position_uncertainty=np.linspace(0, 1e-8, 9))
     assert sound.horizon == sound.wanted_time == vague.wanted_time == 1.0

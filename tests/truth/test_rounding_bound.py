@@ -396,11 +396,13 @@ class BoundByDefinition:
         acc = {i: self.joint_rotation_rate(*i, self.alpha, rods_alpha) for i in where}
         spd = {i: self.joint_rotation_rate(*i, self.omega, rods_turn) for i in where}
         matrix = {(i, j): np.sum(m * D[i] * D[j] + J * (below[i] & below[j])) for i in D for j in D}
+        rod_torque = np.zeros(n)
         for i in D:
             tau = sum(matrix[i, j] * acc[j] for j in D)
             tau += sum(J[b] * W[b] ** 2 + torque[b] for b in range(n) if below[i][b])
             tau += sum(D[i][b] * (m[b] * (g + a[b]) + load[b]) for b in range(n))
             total += tau * self.torque_pair_response(*i)
+            rod_torque[i[0]] += tau if rods[i[0]] else 0.0
         swing, turned = (sum(x[i] * acc[i] for i in D) for x in (D, below))
         carried = m * (a + swing + g)
         total += np.stack([swing + a, turned, [np.sum(carried[k:]) for k in range(n)]], 1)
@@ -421,7 +423,10 @@ class BoundByDefinition:
         }
         vectors = dict(zip(VECTORS, tolerance.T, strict=True))
         return RoundingBound(
-            **vectors, **{q: SUM_ROUNDING_FACTOR * EPS * x for q, x in scalars.items()}, scale=scale | scalars
+            **vectors,
+            **{q: SUM_ROUNDING_FACTOR * EPS * x for q, x in scalars.items()},
+            scale=scale | scalars,
+            rod_torque=ROUNDING_FACTOR * EPS * rod_torque,
         )
 
 
