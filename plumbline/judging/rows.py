@@ -54,7 +54,7 @@ class VerdictStyle(NamedTuple):
 
 VERDICT_STYLES = {
     Verdict.HARNESS_FAILED: VerdictStyle(
-        "☒", "without a truth", "the truth is in doubt or missing: nothing is said of the engine", 10, 10
+        "☒", "without a truth", "the truth is in doubt or missing: the engine is not judged", 10, 10
     ),
     Verdict.DISAGREES: VerdictStyle("✗", "disagree", "the error is above its derived tolerance", 8, 5),
     Verdict.FAILED: VerdictStyle(
