@@ -15,7 +15,7 @@ from plumbline.scenario import loader
 from plumbline.storage.history import History
 from tests.helpers import faulty_engines as faulty
 
-LIMITS = Limits(seconds=10, gigabytes=4)
+LIMITS = Limits(seconds=30, gigabytes=4)  # a sound cell beside two other test processes takes up to 10 s
 
 
 def run_nightly(out, engines):
