@@ -42,6 +42,7 @@ def test_every_fault_at_once_loses_exactly_its_own_cell(tmp_path, monkeypatch, c
     monkeypatch.chdir(tmp_path)
     faulty.register_faulty_engines()
     names = [fault.__name__ for fault in faulty.ERROR_BY_FAULT]
+    workers_of_other_tests = find_plumbline_workers()  # the pool of the matrix test lives as long as its session
     result, place = run_nightly(tmp_path / "out", ["mujoco", *names])
     lost = {(row.engine, row.integrator): row.reason for row in result.rows if row.verdict == "failed"}
     expected = {
@@ -63,7 +64,12 @@ def test_every_fault_at_once_loses_exactly_its_own_cell(tmp_path, monkeypatch, c
     assert [n["id"] for n in History(tmp_path / "out").overview()] == [place.name]
     assert [p.name for p in tmp_path.iterdir()] == ["out"], "an engine's file is in the working folder"
     assert "noise" not in "".join(capfd.readouterr())
-    assert not [p for p in psutil.Process(os.getpid()).children(recursive=True) if is_plumbline_worker(p)]
+    assert not find_plumbline_workers() - workers_of_other_tests
+
+
+def find_plumbline_workers():
+    """The worker processes below this process."""
+    return {p for p in psutil.Process(os.getpid()).children(recursive=True) if is_plumbline_worker(p)}
 
 
 def is_plumbline_worker(process):
