@@ -10,6 +10,9 @@ INSTALL = $(UV) pip install --quiet --require-hashes --python $(PYTHON)
 export UV_PYTHON_DOWNLOADS := never
 export UV_SYSTEM_CERTS := true
 export OMP_NUM_THREADS := 1
+# Bytecode is compiled once and kept, whatever the machine's default: the tests start many processes.
+export UV_COMPILE_BYTECODE := 1
+export PYTHONDONTWRITEBYTECODE :=
 MUTANTS ?= --sample 300 --seed 1 --jobs 2
 
 .PHONY: help run test nightly bench mutants lint lock clean
