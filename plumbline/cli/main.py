@@ -10,16 +10,13 @@ import threading
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from typing import Any
 
 import click
 
 from plumbline import __version__
-from plumbline.cli.options import EXIT_CODES
-from plumbline.cli.result_commands import history, report, reproduce
-from plumbline.cli.run_commands import nightly, run
-from plumbline.cli.scenario_commands import check, list_, schema
-from plumbline.cli.study_commands import drift, sweep
+from plumbline.cli.help_texts import EXIT_CODES
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.scenario.errors import did_you_mean, shorten
 
@@ -32,8 +29,62 @@ Start with:
 """
 
 
-class SuggestingGroup(click.Group):
-    """A group of commands that suggests the nearest name for an unknown command."""
+COMMANDS = {  # where each is, and its line in the list; imported when it is typed: all of them take a second
+    "list": ("scenario_commands:list_", "List scenarios or engines."),
+    "run": ("run_commands:run", "Compare scenarios on engines."),
+    "nightly": ("run_commands:nightly", "Run everything unattended and keep the history."),
+    "sweep": ("study_commands:sweep", "Vary a scenario's parameters."),
+    "drift": ("study_commands:drift", "Measure constraint and energy drift over long times."),
+    "history": ("result_commands:history", "Compare stored nights."),
+    "report": ("result_commands:report", "Write the report of stored results again."),
+    "check": ("scenario_commands:check", "Check scenario files."),
+    "schema": ("scenario_commands:schema", "Print the JSON Schema of scenario files."),
+    "reproduce": ("result_commands:reproduce", "Write a stand-alone script of a disagreement."),
+}
+
+
+class LazyGroup(click.Group):
+    """A group that imports a command when it is used, and suggests the nearest name for an unknown one."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """List the names of the commands.
+
+        Args:
+            ctx: the group's context.
+
+        Returns:
+            The names in alphabetical order.
+
+        """
+        return sorted(COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """Import a command.
+
+        Args:
+            ctx: the group's context.
+            cmd_name: the command's name.
+
+        Returns:
+            The command; None where there is none of that name.
+
+        """
+        if cmd_name not in COMMANDS:
+            return None
+        module, _, attribute = COMMANDS[cmd_name][0].partition(":")
+        command: click.Command = getattr(import_module(f"plumbline.cli.{module}"), attribute)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the list of commands without importing them.
+
+        Args:
+            ctx: the group's context.
+            formatter: takes the list.
+
+        """
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, COMMANDS[name][1]) for name in self.list_commands(ctx)])
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
@@ -51,8 +102,8 @@ class SuggestingGroup(click.Group):
             UsageError: there is no such command.
 
         """
-        if args and args[0] not in self.commands:
-            hint = did_you_mean(args[0], list(self.commands)) or f"there are: {', '.join(self.commands)}"
+        if args and args[0] not in COMMANDS:
+            hint = did_you_mean(args[0], list(COMMANDS)) or f"there are: {', '.join(COMMANDS)}"
             raise click.UsageError(f"no command {args[0]!r}; {hint}", ctx)
         return super().resolve_command(ctx, args)
 
@@ -124,7 +175,7 @@ def _write_traceback() -> str:
 
 
 @click.group(
-    cls=SuggestingGroup,
+    cls=LazyGroup,
     epilog=START + EXIT_CODES,
     invoke_without_command=True,
     context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
@@ -135,7 +186,3 @@ def main(context: click.Context) -> None:
     """Compare multibody engines with each other and with the notes' equations on identical pendulums."""
     if context.invoked_subcommand is None:
         click.echo(context.get_help())
-
-
-for command in (list_, run, nightly, sweep, drift, history, report, check, schema, reproduce):
-    main.add_command(command)

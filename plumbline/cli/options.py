@@ -16,7 +16,7 @@ from click.core import ParameterSource
 
 from plumbline.engines import environments
 from plumbline.engines.registry import ENGINES
-from plumbline.execution.exit_codes import EXIT_CODE_MEANINGS, ExitCode
+from plumbline.execution.exit_codes import ExitCode
 from plumbline.judging.known_issues import KNOWN_ISSUES_FILE, KnownIssue, load_known_issues
 from plumbline.processes.workers import ExecutorLost, ExecutorUnavailable
 from plumbline.scenario import loader as scenarios
@@ -28,15 +28,6 @@ DEFAULT_OUT = Path("reports") / "out"
 MIN_TIMEOUT = 1.0  # s; starting an engine takes longer than less
 MIN_MEMORY = 1.0  # GB of address space; a worker with NumPy, SciPy and one engine does not start with less
 MIN_USER_RTOL = 1e-16  # below the rounding of a double no two results agree
-_EXIT_CODE_LINES = "\n".join(f"{code:5}  {meaning}" for code, meaning in EXIT_CODE_MEANINGS.items())
-EXIT_CODES = f"""
-\b
-Exit codes:
-{_EXIT_CODE_LINES}
-
-An engine that is not installed changes no exit code, unless it was named with --engine.
-"""
-
 _Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
 
@@ -82,19 +73,6 @@ class FolderPath(click.Path):
         if not os.fspath(value):
             self.fail("the path is empty; the current folder is written as a dot.", param, ctx)
         return super().convert(value, param, ctx)
-
-
-def examples(*lines: str) -> str:
-    """Format example commands for the end of a help text.
-
-    Args:
-        *lines: what follows ``python -m plumbline``, remarks included.
-
-    Returns:
-        A paragraph whose line breaks click keeps.
-
-    """
-    return "\n".join(["\b", "Examples:", *(f"  python -m plumbline {line}" for line in lines), "", ""])
 
 
 def out_option(default: Path, note: str = "") -> _Decorator:

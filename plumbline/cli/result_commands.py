@@ -12,13 +12,13 @@ import click
 import reports
 from plumbline.cli import options
 from plumbline.cli.console import count_noun, make_console, print_table
+from plumbline.cli.help_texts import examples
 from plumbline.storage.results_store import read_results
 from plumbline.storage.script_index import read_script_index
 
 
 @click.command(
-    short_help="Compare stored nights.",
-    epilog=options.examples("history nightly", 'history nightly --key "double-*/mujoco/state/*"'),
+    epilog=examples("history nightly", 'history nightly --key "double-*/mujoco/state/*"'),
 )
 @click.argument("folder", default="nightly", type=options.FolderPath())
 @click.option("--key", "pattern", help="Trend of the rows whose key matches (* and ?).")
@@ -56,7 +56,7 @@ def _history_lines(document: dict[str, Any]) -> list[str]:
     return lines + [f"{since}: {c['key']} {c['was']} → {c['is']}" for c in document["since_green"]]
 
 
-@click.command(short_help="Write the report of stored results again.")
+@click.command()
 @click.argument("folder", default=options.DEFAULT_OUT, type=options.FolderPath())
 @click.option(
     "--history",
@@ -75,8 +75,7 @@ def report(folder: Path, history_folder: Path | None) -> None:
 
 
 @click.command(
-    short_help="Write a stand-alone script of a disagreement.",
-    epilog=options.examples(
+    epilog=examples(
         "reproduce reports/out", "reproduce reports/out chain-50-balls/pinocchio-aba/state/-/acceleration"
     ),
 )

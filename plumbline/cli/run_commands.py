@@ -13,24 +13,23 @@ import click
 import reports
 from plumbline.cli import options
 from plumbline.cli.console import ProgressDisplay, print_result
+from plumbline.cli.help_texts import EXIT_CODES, examples
 from plumbline.engines.registry import ENGINES
 from plumbline.execution.plan import Plan
 from plumbline.execution.result_cache import DiskResultCache
 from plumbline.execution.runner import RunResult, run_plan, save
 from plumbline.processes.workers import Limits
-from plumbline.reproduce.write import write_scripts
 from plumbline.storage.results_store import row_record, to_json_value
 
 
 @click.command(
-    short_help="Compare scenarios on engines.",
-    epilog=options.examples(
+    epilog=examples(
         "run                                    (everything)",
         "run double-tumbling-balls --engine mujoco",
         "run --family chain --level state",
         "run my-pendulum.yaml --out results --json | jq .sentence",
     )
-    + options.EXIT_CODES,
+    + EXIT_CODES,
 )
 @options.names_argument
 @click.option("--family", "families", multiple=True, help="Only scenarios of this family (may be repeated).")
@@ -79,6 +78,8 @@ def run(
         known_issues=known_issues,
         are_engines_required=options.are_engines_named(),
     )
+    from plumbline.reproduce.write import write_scripts
+
     with options.exit_on_io_error():
         with ProgressDisplay(sys.stderr) as progress:
             result = run_plan(plan, progress)
@@ -98,13 +99,12 @@ def run(
 
 
 @click.command(
-    short_help="Run everything unattended and keep the history.",
-    epilog=options.examples(
+    epilog=examples(
         "nightly                               (everything)",
         "nightly --random 1000 --seed 7 --out nights",
         "history nightly",
     )
-    + options.EXIT_CODES,
+    + EXIT_CODES,
 )
 @options.names_argument
 @options.engines_option

@@ -18,7 +18,7 @@ from plumbline.scenario import loader as scenarios
 JSON_ONLY = ("purpose", "file")  # columns too long for a terminal
 
 
-@click.command("list", short_help="List scenarios or engines.")
+@click.command("list")
 @click.argument("what", type=click.Choice(["scenarios", "engines"]))
 @options.json_option
 def list_(what: str, as_json: bool) -> None:
@@ -58,7 +58,7 @@ def _engine_records() -> list[dict[str, Any]]:
     ]
 
 
-@click.command(short_help="Check scenario files.")
+@click.command()
 @click.argument("files", nargs=-1, required=True, metavar="FILE...", type=click.Path(path_type=Path))
 def check(files: tuple[Path, ...]) -> None:
     """Check scenario files and print every problem of every file, as file:line:column."""
@@ -68,7 +68,7 @@ def check(files: tuple[Path, ...]) -> None:
         click.echo(f"{s.path}: ok: {s.name}, {count_noun(s.model.n, 'body', 'bodies')} ({joints}{more})")
 
 
-@click.command(short_help="Print the JSON Schema of scenario files.")
+@click.command()
 def schema() -> None:
     """Print the JSON Schema of scenario files, for editors and other programs."""
     click.echo(json.dumps(scenarios.json_schema(), ensure_ascii=False, indent=1))

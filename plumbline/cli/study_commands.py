@@ -12,6 +12,7 @@ import pyarrow as pa
 import reports
 from plumbline.cli import options
 from plumbline.cli.console import ProgressDisplay, count_noun, print_table
+from plumbline.cli.help_texts import EXIT_CODES, examples
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.judging.rows import Verdict
 from plumbline.scenario.errors import ScenarioError
@@ -19,7 +20,7 @@ from plumbline.scenario.errors import ScenarioError
 MAX_LISTED_CELLS = 10
 
 
-@click.command(short_help="Vary a scenario's parameters.", epilog=options.EXIT_CODES)
+@click.command(epilog=EXIT_CODES)
 @click.argument("file", metavar="FILE", type=click.Path(path_type=Path))
 @options.jobs_option
 @options.out_option(Path("sweep"))
@@ -69,8 +70,7 @@ def _print_sweep(table: pa.Table, cell_count: int) -> None:
 
 
 @click.command(
-    short_help="Measure constraint and energy drift over long times.",
-    epilog=options.examples("drift", "drift double-tumbling-rods --max-cpu-seconds 30 --out results"),
+    epilog=examples("drift", "drift double-tumbling-rods --max-cpu-seconds 30 --out results"),
 )
 @options.names_argument
 @click.option(

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.diagnosis.diagnose import explain_disagreement
 from plumbline.engines import calls, environments
 from plumbline.engines.adapter import EngineInfo
 from plumbline.execution.plan import (
@@ -361,6 +360,8 @@ class ScenarioRun:
 
     def _diagnosis_task(self, engine: str, quantities: list[StateQuantities]) -> Task:
         """The task that searches the wrong term of an engine that disagrees at state level."""
+        from plumbline.diagnosis.diagnose import explain_disagreement  # few runs need it
+
         (base, _), info = environments.split_version(engine), self._engines[engine]
         key = TaskKey(TaskKind.DIAGNOSIS, self.scenario.name, engine)
         arguments = (base, self.scenario.model, quantities, self._state_truth)

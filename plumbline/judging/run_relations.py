@@ -22,7 +22,6 @@ from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import angular_velocity
 from plumbline.truth.ground_truth import RUN_ROUNDING, stretched_length
 from plumbline.truth.rounding_bound import state_rounding_bound
-from plumbline.truth.sensitivity import perturbation_growth
 
 REVERSED_IN_TIME = "reversed in time"
 STEP_DIVISORS = 1, 4, 16  # of the step, tried one after the other where an implicit integrator fails
@@ -176,6 +175,8 @@ def run_tolerance(integrator: Integrator, model: Model, state: State, end: float
         of_step = integrator.solver_rtol * float(np.max(model.mass) / np.min(model.mass))
     bound, (_, spin, speed) = state_rounding_bound(model, state), characteristic_scales(model, state)
     pushed = end * max(np.max(bound.acceleration) / speed, np.max(bound.angular_acceleration) / spin)
+    from plumbline.truth.sensitivity import perturbation_growth  # with SciPy: not in a run's own process
+
     growth = perturbation_growth(model, state, np.array([0.0, end / 2, end]))
     return float((RUN_ROUNDING + of_step * np.sqrt(steps) + pushed) * np.max(growth))
 

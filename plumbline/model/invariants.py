@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
+import scipy
 
 from plumbline.model.datatypes import Array, Model, Trajectory
 from plumbline.model.kinematics import angular_velocity, joint_vectors, rotation_matrix
@@ -137,9 +137,11 @@ def work_of_loads(model: Model, run: Trajectory, omega: Array) -> tuple[Array, f
     )
     if not np.any(power) or len(run.t) < 13:
         return exact, 0.0
-    quintic, cubic = (make_interp_spline(run.t, power, k=k).antiderivative()(run.t) for k in (5, 3))
+    quintic, cubic = (
+        scipy.interpolate.make_interp_spline(run.t, power, k=k).antiderivative()(run.t) for k in (5, 3)
+    )
     half = slice(None, None, 2)
-    coarse = make_interp_spline(run.t[half], power[half], k=5).antiderivative()(run.t[half])
+    coarse = scipy.interpolate.make_interp_spline(run.t[half], power[half], k=5).antiderivative()(run.t[half])
     away = max(np.max(np.abs(quintic - cubic)), np.max(np.abs(quintic[half] - coarse)))
     return exact + quintic, float(away)
 

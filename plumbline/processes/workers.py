@@ -22,13 +22,14 @@ from dataclasses import dataclass, field
 from multiprocessing import forkserver
 from multiprocessing.context import BaseContext
 from types import TracebackType
-from typing import Any, Self
-
-from pebble import ProcessExpired, ProcessPool
+from typing import TYPE_CHECKING, Any, Self
 
 from plumbline.processes.errors import PlumblineError
 from plumbline.processes.isolation import ScratchFolder, die_with_parent
 from plumbline.processes.remote_python import RemoteCrash, RemoteError, call_remote, call_timed, describe_exit
+
+if TYPE_CHECKING:
+    from pebble import ProcessPool
 
 _SINGLE_THREAD_ENV = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
@@ -254,7 +255,7 @@ class WorkerPool(Executor):
     """Worker processes on this machine."""
 
     def __init__(self, jobs: int, limits: Limits | None = None) -> None:
-        """Start the workers.
+        """Prepare the pool; its workers start with the first task.
 
         Args:
             jobs: number of worker processes.
@@ -263,23 +264,18 @@ class WorkerPool(Executor):
         """
         self.limits = limits or Limits()
         self._jobs = jobs
+        self._pool: ProcessPool | None = None
         self._scratch = ScratchFolder()
         self._tasks: dict[Future[Any], Task] = {}
         self._started: dict[Future[Any], float] = {}  # monotonic time at which a task was first seen running
-        os.environ.update(_SINGLE_THREAD_ENV)  # inherited by the workers, before NumPy loads there
-        self._pool = ProcessPool(
-            max_workers=jobs,
-            context=_warm_context(),
-            initializer=initialize_worker,
-            initargs=(str(self._scratch.path), self.limits.gigabytes, os.getpid(), dict(os.environ)),
-        )
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Kill what still runs and remove the scratch folders."""
-        self._pool.stop()  # type: ignore[no-untyped-call]
-        self._pool.join()
+        if self._pool is not None:
+            self._pool.stop()  # type: ignore[no-untyped-call]
+            self._pool.join()
         self._scratch.remove()
 
     @property
@@ -294,7 +290,20 @@ class WorkerPool(Executor):
             task: the call to make there.
 
         """
+        if self._pool is None:
+            self._pool = self._make_pool()
         self._tasks[self._pool.schedule(run_task, args=(task,))] = task
+
+    def _make_pool(self) -> ProcessPool:
+        from pebble import ProcessPool  # with asyncio: not in a run whose answers all come from the cache
+
+        os.environ.update(_SINGLE_THREAD_ENV)  # inherited by the workers, before NumPy loads there
+        return ProcessPool(
+            max_workers=self._jobs,
+            context=_warm_context(),
+            initializer=initialize_worker,
+            initargs=(str(self._scratch.path), self.limits.gigabytes, os.getpid(), dict(os.environ)),
+        )
 
     def collect(self) -> list[tuple[Task, Outcome]]:
         """Wait for a task to finish, at most `_POLL_INTERVAL`, and cancel those over their time limit.
@@ -376,6 +385,8 @@ def _load(arguments: Sequence[Any]) -> list[Any]:
 
 def _outcome_from_future(task: Task, future: Future[Outcome]) -> Outcome:
     """The outcome of a finished future, or how its worker was lost."""
+    from pebble import ProcessExpired
+
     try:
         return future.result()
     except CancelledError:  # by `_cancel_overdue` only

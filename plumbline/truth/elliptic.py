@@ -8,7 +8,7 @@ Carlson's symmetric integrals.
 from __future__ import annotations
 
 import numpy as np
-from scipy.special import elliprf, elliprj
+import scipy
 
 from plumbline.model.datatypes import Array
 
@@ -52,8 +52,10 @@ def elliptic_f(phi: Array | float, m1: float) -> Array:
 
     """
     half_turns, s, c = _reduce_angle(phi)
-    part = s * elliprf(c * c, c * c + m1 * s * s, 1.0)
-    return np.asarray(part + 2 * half_turns * elliprf(0.0, m1, 1.0) if np.any(half_turns) else part)
+    part = s * scipy.special.elliprf(c * c, c * c + m1 * s * s, 1.0)
+    return np.asarray(
+        part + 2 * half_turns * scipy.special.elliprf(0.0, m1, 1.0) if np.any(half_turns) else part
+    )
 
 
 def elliptic_pi(n: float, phi: Array | float, m1: float) -> Array:
@@ -77,7 +79,9 @@ def elliptic_pi(n: float, phi: Array | float, m1: float) -> Array:
 def _elliptic_pi_reduced(n: float, s: Array, c: Array, m1: float) -> Array:
     """Π from the sine and cosine of an amplitude in [−π/2, π/2]."""
     d, q = c * c + m1 * s * s, c * c + (1 - n) * s * s
-    return np.asarray(s * elliprf(c * c, d, 1.0) + n / 3 * s**3 * elliprj(c * c, d, 1.0, q))
+    return np.asarray(
+        s * scipy.special.elliprf(c * c, d, 1.0) + n / 3 * s**3 * scipy.special.elliprj(c * c, d, 1.0, q)
+    )
 
 
 def _reduce_angle(phi: Array | float) -> tuple[Array, Array, Array]:

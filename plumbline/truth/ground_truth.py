@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,8 +21,9 @@ from plumbline.model.sampling import derive_seed
 from plumbline.truth import TruthUnavailable
 from plumbline.truth.certified import certify_state
 from plumbline.truth.rounding_bound import RoundingBound, state_rounding_bound
-from plumbline.truth.sensitivity import perturbation_growth_and_runs, predictability_horizon
-from plumbline.truth.trajectory import MAX_COMPILED_BODIES, ClosedFormSamples, trajectory_truth
+
+if TYPE_CHECKING:
+    from plumbline.truth.trajectory import ClosedFormSamples
 
 RUN_ROUNDING = 1e3 * 2.0**-52  # error of a whole run over its growth G; the largest measured is 115 ε
 TRUTHS_DIFFER = "the two truth methods differ by more than rounding explains: one is wrong, or at its limits"
@@ -56,12 +58,16 @@ class MotionTruth:
     @property
     def horizon(self) -> float:
         """Predictability horizon T_h [s], from the rounding of a run and the truth's uncertainty."""
+        from plumbline.truth.sensitivity import predictability_horizon
+
         rounding = self.length * RUN_ROUNDING
         return predictability_horizon(self.trajectory.t, self.growth, rounding, self.position_uncertainty)
 
     @property
     def wanted_time(self) -> float:
         """How long a run should be compared [s]: the duration, up to the horizon of rounding alone."""
+        from plumbline.truth.sensitivity import predictability_horizon
+
         return predictability_horizon(self.trajectory.t, self.growth, self.length * RUN_ROUNDING)
 
 
@@ -97,7 +103,7 @@ def motion_truth(
     state: State,
     times: Array,
     closed_form: ClosedFormSamples | None,
-    max_compiled_bodies: int = MAX_COMPILED_BODIES,
+    max_compiled_bodies: int | None = None,
 ) -> MotionTruth:
     """Compute the true motion, the growth of perturbations and the effects of small parameter errors.
 
@@ -106,7 +112,8 @@ def motion_truth(
         state: initial state.
         times: (T,) [s] of the samples, times[0] = 0.
         closed_form: samples of a closed form at ``times``, if the scenario has one.
-        max_compiled_bodies: longest chain for Taylor's method; 0 after it has crashed a worker.
+        max_compiled_bodies: longest chain for Taylor's method, None for `MAX_COMPILED_BODIES` of
+            `plumbline.truth.trajectory`; 0 after it has crashed a worker.
 
     Returns:
         The motion with all that `MotionTruth` holds.
@@ -115,8 +122,15 @@ def motion_truth(
         EngineFailure: the integrator of the notes' form stops early.
 
     """
-    truth = trajectory_truth(model, state, times, closed_form, max_compiled_bodies)
-    growth, r, p = perturbation_growth_and_runs(model, state, times, perturbed_models(model, state))
+    # with SciPy: not in a run's own process, which needs the classes of this module
+    from plumbline.truth import sensitivity, trajectory
+
+    if max_compiled_bodies is None:
+        max_compiled_bodies = trajectory.MAX_COMPILED_BODIES
+    truth = trajectory.trajectory_truth(model, state, times, closed_form, max_compiled_bodies)
+    growth, r, p = sensitivity.perturbation_growth_and_runs(
+        model, state, times, perturbed_models(model, state)
+    )
     growth, length = np.maximum.accumulate(growth), float(np.sum(stretched_length(model)))
     excess = np.maximum(
         truth.position_uncertainty / (length * RUN_ROUNDING * growth),

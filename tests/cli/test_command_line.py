@@ -16,7 +16,7 @@ from click.testing import CliRunner
 
 import plumbline as package
 from plumbline.cli.console import count_noun, engine_heading
-from plumbline.cli.main import main
+from plumbline.cli.main import COMMANDS, main
 from plumbline.execution.runner import exit_code, summarize_verdicts
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.storage.results_store import SCHEMA_VERSION
@@ -59,8 +59,10 @@ def test_no_arguments_print_the_help():
 
 def test_every_command_has_a_short_help_that_the_list_shows_whole():
     listed = CliRunner().invoke(main, []).stdout
-    for name, command in main.commands.items():
-        assert command.short_help and re.search(rf"^  {name} +{re.escape(command.short_help)}$", listed, re.M)
+    for name, (_, short_help) in COMMANDS.items():
+        assert re.search(rf"^  {name} +{re.escape(short_help)}$", listed, re.M)
+        command = main.get_command(None, name)
+        assert command.name == name and command.help
 
 
 def test_the_version_is_that_of_the_project():

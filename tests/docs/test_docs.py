@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from plumbline.cli.main import main
+from plumbline.cli.main import COMMANDS, main
 from plumbline.scenario.field_docs import field_reference
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -120,7 +120,7 @@ def documented_commands():
             words = shlex.split(
                 text.split("#")[0].split("   ")[0].replace("[", " ").replace("]", " "), posix=True
             )
-            if words[0] in main.commands:
+            if words[0] in COMMANDS:
                 yield page, [word.strip(",") for word in words]
 
 
@@ -128,7 +128,8 @@ def test_documented_commands_and_options_exist():
     found = list(documented_commands())
     assert len(found) >= 20
     for page, (name, *words) in found:
-        options = {option for param in main.commands[name].params for option in param.opts} | {"--help"}
+        params = main.get_command(None, name).params
+        options = {option for param in params for option in param.opts} | {"--help"}
         unknown = {word.split("=")[0] for word in words if word.startswith("--")} - options
         assert not unknown, f"{page.name}: {name} has no option {unknown}"
 

@@ -71,5 +71,5 @@ def test_commands_of_the_nightly_exist():
         assert re.search(rf"^{re.escape(target)}:", makefile, re.MULTILINE), target
     for line in asked:
         name, *words = shlex.split(re.sub(r"\$\{SEED:\+(.*?)\}( |$)", r"\1 ", line).partition("||")[0])
-        options = {option for param in main.commands[name].params for option in param.opts}
+        options = {option for param in main.get_command(None, name).params for option in param.opts}
         assert {word for word in words if word.startswith("--")} <= options, line

@@ -163,7 +163,7 @@ def test_two_methods_that_differ_by_more_than_rounding_are_reported(position, at
         2 * attitude * limit * off,
         "made",
     )
-    with patch("plumbline.truth.ground_truth.trajectory_truth", lambda *_: made):
+    with patch("plumbline.truth.trajectory.trajectory_truth", lambda *_: made):
         found = motion_truth(model, at, TIMES, None)
     assert found.method == "made" and bool(found.conflict) is parted
     assert not parted or (found.conflict.startswith(TRUTHS_DIFFER) and "1.1 times what" in found.conflict)
@@ -174,7 +174,7 @@ def test_a_truth_that_is_not_a_number_is_in_doubt() -> None:
     at = pendulums.state_from_seed(model, seed=2, rate=0.5)
     sound = motion_truth(model, at, TIMES, None)
     made = TrajectoryTruth(sound.trajectory, np.full(9, np.nan), np.zeros(9), "made")
-    with patch("plumbline.truth.ground_truth.trajectory_truth", lambda *_: made):
+    with patch("plumbline.truth.trajectory.trajectory_truth", lambda *_: made):
         assert motion_truth(model, at, TIMES, None).conflict
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.linalg import eigh
+import scipy
 
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product
@@ -67,7 +67,7 @@ def torque_free_attitude(inertia: Array, p: Array, omega: Array) -> Callable[[Ar
         ClosedFormMismatch: the motion is exactly on the separatrix.
 
     """
-    moments, axes = eigh(inertia)
+    moments, axes = scipy.linalg.eigh(inertia)
     w = axes.T @ omega
     gap = (
         moments[2] * (moments[2] - moments[1]) * w[2] ** 2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import eigh
+import scipy
 
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import quaternion_product, rotate_vectors, rotation_matrix
@@ -65,7 +65,7 @@ def small_oscillation(model: Model, state: State) -> ClosedFormMotion:
         lever[b, len(rods) + b] = near[b]
     M = lever.T @ (model.mass[:, None] * lever) + np.diag(np.concatenate([np.zeros(len(rods)), J]))
     K = np.diag(gravity * (model.mass @ lever))
-    squared_frequency, modes = eigh(K, M)
+    squared_frequency, modes = scipy.linalg.eigh(K, M)
     frequency = np.sqrt(squared_frequency)
     cosines, sines = modes.T @ M @ angle, modes.T @ M @ rate / frequency
 
