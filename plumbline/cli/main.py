@@ -35,6 +35,7 @@ COMMANDS = {  # where each is, and its line in the list; imported when it is typ
     "nightly": ("run_commands:nightly", "Run everything unattended and keep the history."),
     "sweep": ("study_commands:sweep", "Vary a scenario's parameters."),
     "drift": ("study_commands:drift", "Measure constraint and energy drift over long times."),
+    "coverage": ("study_commands:coverage", "Compute the smallest mistakes that a run would report."),
     "history": ("result_commands:history", "Compare stored nights."),
     "report": ("result_commands:report", "Write the report of stored results again."),
     "check": ("scenario_commands:check", "Check scenario files."),
@@ -186,3 +187,10 @@ def main(context: click.Context) -> None:
     """Compare multibody engines with each other and with the notes' equations on identical pendulums."""
     if context.invoked_subcommand is None:
         click.echo(context.get_help())
+<<<<<<< HEAD
+=======
+
+
+for command in (list_, run, nightly, sweep, drift, coverage, history, report, check, schema, reproduce):
+    main.add_command(command)
+>>>>>>> ab80c07 (Coverage: the smallest mistake in each number of a scenario that each level reports, and the command)

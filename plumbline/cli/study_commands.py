@@ -1,10 +1,13 @@
-"""Commands that study one scenario over ranges of parameters or long times: sweep, drift."""
+"""Commands that study scenarios beyond one run: sweep, drift, coverage."""
 
 from __future__ import annotations
 
 import collections
+import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import click
 import pyarrow as pa
@@ -13,8 +16,13 @@ import reports
 from plumbline.cli import options
 from plumbline.cli.console import ProgressDisplay, count_noun, print_table
 from plumbline.cli.help_texts import EXIT_CODES, examples
+from plumbline.engines.registry import ENGINES
 from plumbline.execution.exit_codes import ExitCode
-from plumbline.judging.rows import Verdict
+from plumbline.execution.plan import RANDOM_STATES, Plan
+from plumbline.execution.runner import run_plan
+from plumbline.judging.coverage import COVERED_LEVELS, CoverageEntry
+from plumbline.judging.rows import Level, Verdict
+from plumbline.processes.workers import Limits, WorkerPool
 from plumbline.scenario.errors import ScenarioError
 
 MAX_LISTED_CELLS = 10
@@ -114,3 +122,85 @@ def drift(names: tuple[str, ...], rtols: tuple[float, ...], max_cpu_seconds: flo
             click.echo(f"report: {reports.write(folder)}")
     has_failed = any(reason.startswith("failed") for reason in table["reason"].to_pylist())
     sys.exit(ExitCode.ENGINE_FAILED if has_failed else ExitCode.SUCCESS)
+
+
+@click.command(
+    epilog=examples(
+        "coverage double-tumbling-rods",
+        "coverage --level state --json | jq '.entries[] | select(.smallest == null)'",
+        "coverage drag-rod --engine mujoco --engine exudyn",
+    )
+    + EXIT_CODES,
+)
+@options.names_argument
+@click.option(
+    "--engine",
+    "engines",
+    multiple=True,
+    type=click.Choice(list(ENGINES)),
+    default=("reference",),
+    help="Engine whose tolerances count at trajectory and invariants level (may be repeated: then the "
+    "bluntest counts).",
+)
+@click.option(
+    "--level",
+    "level",
+    type=click.Choice([*COVERED_LEVELS, "all"]),
+    default="all",
+    help="Only this level. state and step need no engine; the others run each engine's refinement studies.",
+)
+@options.jobs_option
+@options.out_option(options.DEFAULT_OUT)
+@options.json_option
+@options.timeout_option(600.0)
+@options.memory_option
+def coverage(
+    names: tuple[str, ...], engines: tuple[str, ...], level: Any, jobs: int, out: Path, as_json: bool,
+    timeout: float, memory: float,
+) -> None:  # fmt: skip
+    """Compute, for every number of every body, the smallest mistake that a run would report.
+
+    The engine is correct, but one number of its model or initial state is wrong: a mass, an entry of an
+    inertia, a point, a length, gravity, a load, a drag coefficient, an attitude or a rate. The table has one
+    entry per level and number: the smallest mistake as a fraction of the number (of a natural size where it
+    is zero), and the row that reports it first; or the proof that no mistake can be seen there.
+
+    Prints the range per kind of number, and everything with --json. Writes coverage.parquet, and report.html
+    again where OUT holds results: the report shows the table.
+    """
+    from plumbline.studies import coverage as study
+    from plumbline.studies.tables import write_table
+
+    chosen = options.choose_scenarios(names, ())
+    levels: tuple[Level, ...] = COVERED_LEVELS if level == "all" else (level,)
+    folder, limits = options.ensure_writable(out), Limits(timeout, memory)
+    with options.exit_on_io_error():
+        with ProgressDisplay(sys.stderr) as progress:
+            rows = []
+            if {"trajectory", "invariants"} & set(levels):
+                rows = run_plan(Plan(chosen, list(engines), "trajectory", jobs, limits), progress).rows
+            with WorkerPool(jobs, limits) as executor:
+                found = study.measure_coverage(executor, chosen, rows, RANDOM_STATES, levels, progress)
+        path = write_table(study.coverage_table(found), folder / study.FILE)
+        report = reports.write(folder) if (folder / "results.json").is_file() else None
+    if as_json:
+        _print_coverage_json(found)
+    else:
+        print_table(map(asdict, study.summarize_coverage(found)))
+        for sentence in study.blind_spots(found) if not names else []:
+            click.echo(sentence)
+    for kind, written in (("results", path), ("report", report)):
+        if written is not None:
+            click.echo(f"{kind}: {written}", err=as_json)
+
+
+def _print_coverage_json(found: list[CoverageEntry]) -> None:
+    """Print every entry, the summary and what no scenario sees."""
+    from plumbline.studies import coverage as study
+
+    document = {
+        "summary": [asdict(one) for one in study.summarize_coverage(found)],
+        "blind_spots": study.blind_spots(found),
+        "entries": [asdict(entry) for entry in found],
+    }
+    click.echo(json.dumps(document, ensure_ascii=False, indent=1))

@@ -34,7 +34,7 @@ from plumbline.judging.step import (
 )
 from plumbline.judging.trajectory import judge_trajectory
 from plumbline.model.datatypes import Integrator, StateQuantities
-from plumbline.model.sampling import derive_seed, random_states
+from plumbline.model.sampling import compared_states
 from plumbline.processes.workers import Outcome, Pickled, Task
 from plumbline.scenario.loader import Scenario
 from plumbline.truth import ground_truth
@@ -111,13 +111,10 @@ class ScenarioRun:
         self._waiting: list[Outcome] = []  # answers that arrived before their truth
         self._state_truth: Pickled | None = None  # for judges and diagnoses in workers
         count = plan.random_state_count
-        drawn = random_states(
-            scenario.model,
-            min(count, STATES_PER_RANDOM_SCENARIO) if is_random else count,
-            derive_seed("states", scenario.digest),
-        )
-        self._states = Pickled.of([scenario.state, *drawn])  # argument of many tasks
-        self._step_states = [scenario.state, *drawn][:STEP_STATES]
+        count = min(count, STATES_PER_RANDOM_SCENARIO) if is_random else count
+        states = compared_states(scenario.model, scenario.state, scenario.digest, count)
+        self._states = Pickled.of(states)  # argument of many tasks
+        self._step_states = states[:STEP_STATES]
 
     def tasks(self) -> Iterator[Task]:
         """Make the tasks that can start: the truths that are missing, and all cells but those of states.

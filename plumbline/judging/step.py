@@ -18,7 +18,7 @@ own accelerations, the residual of their equations, and their first acceleration
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -152,12 +152,13 @@ def judge_steps(
     if reason:
         return JudgingResult([context.make_row("step", integrator.name, "all", verdict, reason)])
     if isinstance(method, JointSpaceMethod):
-        steps = _FormulaSteps(method, model, states, runs)
+        starts = [(index, h, run.angle_axes) for index, h, run in runs]
+        steps = FormulaSteps(method, model, states, starts)
         for i, attempt in enumerate(attempts):
             if attempt.failure and steps.is_stable(i):
                 row = context.make_row("step", integrator.name, "all", Verdict.FAILED, attempt.failure)
                 return JudgingResult([row])
-        found, units = steps.compare(runs), STEP_UNITS
+        found, units = steps.compare([run for *_, run in runs]), STEP_UNITS
     else:
         assert isinstance(method, ConstrainedMethod)
         found, units = _compare_parts(method, model, states, runs), CONSTRAINED_UNITS
@@ -210,46 +211,54 @@ def _row(
 # -- joint coordinates -------------------------------------------------------------------------------
 
 
-class _FormulaSteps:
+class FormulaSteps:
     """The declared steps from several states, and from states nearby that show how differences grow."""
 
     def __init__(
         self, method: JointSpaceMethod, model: Model, states: Sequence[State],
-        runs: Sequence[tuple[int, float, StepRun]],
+        starts: Sequence[tuple[int, float, Array | None]],
     ) -> None:  # fmt: skip
-        self.method, self.model = method, model
-        self.starts, sizes = [states[index] for index, *_ in runs], [h for _, h, _ in runs]
-        axes = [run.angle_axes for *_, run in runs]
-        self.bounds = {index: state_rounding_bound(model, states[index]) for index, *_ in runs}
-        disturbed = [_disturbed(model, states[index], self.bounds[index]) for index, *_ in runs]
+        """Take the steps from ``starts``: index of a state, step [s], axes of revolute joints or None."""
+        self.method, self.model, self.places = method, model, [(index, h) for index, h, _ in starts]
+        self.starts, sizes = [states[index] for index, *_ in starts], [h for _, h, _ in starts]
+        axes = [angle_axes for *_, angle_axes in starts]
+        self.bounds = {index: state_rounding_bound(model, states[index]) for index, *_ in starts}
+        disturbed = [_disturbed(model, states[index], self.bounds[index]) for index, *_ in starts]
         count = max(step_counts(method))
         both = joint_space_steps(model, self.starts + disturbed, sizes + sizes, method, count, axes + axes)
-        self.true = [[_pick(links, i) for links in both] for i in range(len(runs))]
-        self.growth = np.empty((len(runs), count + 1))  # of perturbations, running maximum
-        for i, (index, h, _) in enumerate(runs):
+        self.true = [[_pick(links, i) for links in both] for i in range(len(starts))]
+        self.growth = np.empty((len(starts), count + 1))  # of perturbations, running maximum
+        for i, (index, h, _) in enumerate(starts):
             weights = self.step_bound((self.starts[i],), (self.bounds[index],), h, 1)
-            apart = [_separation(links, i, len(runs), weights) for links in both]
+            apart = [_separation(links, i, len(starts), weights) for links in both]
             self.growth[i] = np.maximum.accumulate(np.array(apart) / apart[0])
 
     def is_stable(self, i: int) -> bool:
         """Whether the method itself goes through from the i-th state."""
         return bool(self.growth[i, -1] < MAX_GROWTH)
 
-    def compare(self, runs: Sequence[tuple[int, float, StepRun]]) -> dict[str, _Comparisons]:
-        """Compare engines' steps with the formula's, body by body."""
-        found = {quantity: _Comparisons() for quantity in STEP_UNITS}
-        for i, (index, h, run) in enumerate(runs):
+    def limits(self) -> Iterator[tuple[int, int, dict[str, Array], dict[str, Array]]]:
+        """Per start i and number of steps that are compared: the limits of errors and the scales, (N,)."""
+        for i, (index, h) in enumerate(self.places):
             for count in step_counts(self.method):
-                if count >= len(run.trajectory.t) or not self.growth[i, count] < MAX_GROWTH:
+                if not self.growth[i, count] < MAX_GROWTH:
                     continue
                 end = _rounded(self.true[i][count])
                 ends = self.bounds[index], state_rounding_bound(self.model, end)
                 bound = self.step_bound((self.starts[i], end), ends, h, count)
-                scale = _effects(ends, h, count)
-                place = f"state {index}, {count} step{'s' * (count > 1)} of {h:g} s"
-                for quantity, error in _errors(self.true[i][count], run, count).items():
-                    limit = count * self.growth[i, count] * bound[quantity]
-                    found[quantity].add(error, limit, scale[quantity], place)
+                grown = {name: count * self.growth[i, count] * limit for name, limit in bound.items()}
+                yield i, count, grown, _effects(ends, h, count)
+
+    def compare(self, runs: Sequence[StepRun]) -> dict[str, _Comparisons]:
+        """Compare engines' steps with the formula's, body by body."""
+        found = {quantity: _Comparisons() for quantity in STEP_UNITS}
+        for i, count, limit, scale in self.limits():
+            if count >= len(runs[i].trajectory.t):
+                continue
+            index, h = self.places[i]
+            place = f"state {index}, {count} step{'s' * (count > 1)} of {h:g} s"
+            for quantity, error in _errors(self.true[i][count], runs[i], count).items():
+                found[quantity].add(error, limit[quantity], scale[quantity], place)
         return found
 
     def step_bound(

@@ -23,6 +23,22 @@ def derive_seed(*parts: str) -> int:
     return int.from_bytes(hashlib.sha256("\0".join(parts).encode()).digest()[:8], "big")
 
 
+def compared_states(model: Model, state: State, digest: str, count: int) -> list[State]:
+    """Draw the states at which a scenario is compared.
+
+    Args:
+        model: the scenario's mechanism.
+        state: its initial state.
+        digest: hash of its numbers, which the draw depends on.
+        count: how many random states.
+
+    Returns:
+        The initial state, then the random ones.
+
+    """
+    return [state, *random_states(model, count, derive_seed("states", digest))]
+
+
 def random_states(model: Model, count: int, seed: int) -> list[State]:
     """Draw states of the model: attitudes and rod directions uniform, rates slow to fast.
 

@@ -118,7 +118,7 @@ def state_rounding_bound(model: Model, state: State, parts: BodyParts | None = N
         LinAlgError: the system is singular.
 
     """
-    system = _NewtonEulerSystem(model, state)
+    system = NewtonEulerSystem(model, state)
     terms = _TermSizes(model, state, system, parts)
     joints = _JointSpaceTerms(model, state, system, terms)
     m, J, g = terms.m, terms.J, terms.g
@@ -178,7 +178,7 @@ class _TermSizes:
     """Magnitudes (N,) of the terms in the equations of each body, with norms named as their vectors."""
 
     def __init__(
-        self, model: Model, state: State, system: _NewtonEulerSystem, parts: BodyParts | None
+        self, model: Model, state: State, system: NewtonEulerSystem, parts: BodyParts | None
     ) -> None:
         norm, n = np.linalg.norm, model.n
         self.m, self.g, self.J = model.mass, float(norm(model.gravity)), norm(model.inertia, axis=(1, 2))
@@ -221,10 +221,10 @@ class _TermSizes:
 class _JointSpaceTerms:
     """Terms of M q̈ + h with one joint per ball and two per rod (its upper end, and its tip).
 
-    Joints are ordered as in `_NewtonEulerSystem.torque_pair_responses`.
+    Joints are ordered as in `NewtonEulerSystem.torque_pair_responses`.
     """
 
-    def __init__(self, model: Model, state: State, system: _NewtonEulerSystem, terms: _TermSizes) -> None:
+    def __init__(self, model: Model, state: State, system: NewtonEulerSystem, terms: _TermSizes) -> None:
         norm, rods, body = np.linalg.norm, model.rods, np.arange(model.n)
         tip = state.r + system.sp
         position = np.concatenate([(tip - model.length[:, None] * state.u)[rods], tip])
@@ -246,7 +246,7 @@ class _JointSpaceTerms:
         self.torque = self.mass_matrix @ self.acceleration + h
 
 
-class _NewtonEulerSystem:
+class NewtonEulerSystem:
     """The Newton–Euler system of the chain at one state, its inverse and its solution; world axes.
 
     With x = (r̈, α) per body and F = E λ per joint, E = u for a rod (padded to 3×3) and I for a ball,

@@ -120,7 +120,7 @@ def perturbation_growth_and_runs(
         if done + stop >= len(times) - 1:
             return np.asarray(np.maximum(np.max(growth, axis=0), 1.0)), *runs
         base, *moved = (
-            _project_to_manifold(model, r[k, stop], p[k, stop], v[k, stop], pdot[k, stop])
+            project_to_manifold(model, r[k, stop], p[k, stop], v[k, stop], pdot[k, stop])
             for k in (0, *neighbours)
         )
         size = np.minimum(distance[:, stop], PERTURBATION_SIZE)
@@ -174,8 +174,20 @@ def _integrate_batch(
     return r_, p_, v_, pdot_
 
 
-def _project_to_manifold(model: Model, r: Array, p: Array, v: Array, pdot: Array) -> State:
-    """The state on the manifold with the minimal coordinates of an integrated one, (N, ·) each."""
+def project_to_manifold(model: Model, r: Array, p: Array, v: Array, pdot: Array) -> State:
+    """Return the state on the constraint manifold with the minimal coordinates of an integrated one.
+
+    Args:
+        model: the mechanism.
+        r: (N, 3) centres of mass [m], world frame.
+        p: (N, 4) quaternions, normalised here.
+        v: (N, 3) ṙ [m/s].
+        pdot: (N, 4) ṗ [1/s].
+
+    Returns:
+        The state.
+
+    """
     p = p / np.linalg.norm(p, axis=1, keepdims=True)
     omega = angular_velocity(p, pdot)
     A = rotation_matrix(p)

@@ -1,0 +1,384 @@
+"""Coverage: the smallest mistake in each parameter that a run of a correct engine would report.
+
+The engine is correct, but its model or initial state has one wrong number. To first order each judged
+quantity is off in proportion; the mistake at which the first of them passes its bound is the smallest that
+the level reports. docs/coverage.md explains the table.
+
+- state: every quantity at every compared state, within the rounding bound. A mistake in the initial state
+  shows at that state only.
+- step: one step and ten of the classical Runge-Kutta method, within the bound of the level.
+- trajectory and invariants: the tolerances of the judged rows; the effect is that on the true motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from plumbline.judging.rows import Level, Row, Verdict
+from plumbline.judging.state import STATE_UNITS
+from plumbline.judging.step import MAX_STEP_BODIES, STEP_STATES, FormulaSteps, step_sizes
+from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.invariants import INVARIANT_UNITS, attitude_error, compute_invariants, position_error
+from plumbline.model.kinematics import angular_velocity
+from plumbline.model.step_methods import classical_runge_kutta
+from plumbline.truth.parameter_effects import (
+    MOTION_MISTAKE,
+    PerturbedMotion,
+    StateSensitivity,
+    initial_state_effects,
+    perturbed_motions,
+)
+from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters
+from plumbline.truth.rounding_bound import EPS, state_rounding_bound
+from plumbline.truth.sensitivity import project_to_manifold
+
+COVERED_LEVELS: tuple[Level, ...] = ("state", "step", "trajectory", "invariants")
+MAX_MISTAKE = 0.1  # of a parameter's scale: only larger ones are reported, or none; the level does not see it
+DOUBTFUL_MISTAKE = 1e-6  # from here on an effect may be rounding of the runs: a proof is tried
+NO_EFFECT = 1e-9  # of the largest effect that a term could have: rounding
+PROOF_SAMPLES = 17  # of the motion, at which a parameter's term is shown to vanish
+TINY = float(np.finfo(float).tiny)
+STEP_METHOD = classical_runge_kutta("joint rotations")
+_TERMS = {  # the term of the equations of motion that contains a parameter, by kind
+    "gravity": "m g",
+    "mass": "m (r̈ − g)",
+    "inertia": "J ω̇′ + ω′ × J ω′",
+    "proximal": "s × F and ω̇ × s + ω × (ω × s)",
+    "distal": "s × F and ω̇ × s + ω × (ω × s)",
+    "length": "ℓ |u̇|²",
+    "force": "the force",
+    "moment": "the moment",
+    "drag_force": "c ṙ",
+    "drag_moment": "c ω′",
+}
+
+
+@dataclass(frozen=True)
+class CoverageEntry:
+    """The smallest mistake in one parameter that one level of one scenario reports."""
+
+    scenario: str
+    level: Level
+    body: int  # from 1; 0 for gravity
+    joint: str  # that the body hangs by: ball or rod; empty for gravity
+    kind: str  # of the parameter, as in `plumbline.truth.parameters.UNITS`
+    parameter: str  # kind and component
+    value: float
+    unit: str
+    scale: float  # what ``smallest`` is relative to, in ``unit``
+    smallest: float | None  # smallest mistake that is reported, over ``scale``, at least ε; None: none is
+    engine: str  # the engine that needs the largest; empty at levels where engines do not differ
+    row: str  # integrator and quantity of the row that reports it first
+    proof: str = ""  # why no mistake can be seen here, a sentence
+
+    @property
+    def is_seen(self) -> bool:
+        """Whether the level reports a mistake in this parameter."""
+        return self.smallest is not None
+
+
+class _Ratios:
+    """Per parameter the largest error over bound that a relative mistake of 1 makes, and where."""
+
+    def __init__(self, count: int) -> None:
+        self.ratio, self.row = np.zeros(count), [""] * count
+
+    def add(self, at: int, ratio: float, row: str) -> None:
+        """Keep the larger ratio of a parameter."""
+        if ratio > self.ratio[at]:
+            self.ratio[at], self.row[at] = ratio, row
+
+
+def _sharpest(several: Sequence[_Ratios]) -> _Ratios:
+    """Of each parameter the largest ratio."""
+    found = _Ratios(len(several[0].ratio))
+    for one in several:
+        for i, (ratio, row) in enumerate(zip(one.ratio, one.row, strict=True)):
+            found.add(i, float(ratio), row)
+    return found
+
+
+def scenario_coverage(
+    name: str,
+    model: Model,
+    state: State,
+    times: Array,
+    states: Sequence[State],
+    rows: Iterable[Row],
+    levels: Sequence[Level] = COVERED_LEVELS,
+) -> list[CoverageEntry]:
+    """Compute the coverage table of one scenario.
+
+    Args:
+        name: of the scenario.
+        model: its mechanism.
+        state: its initial state.
+        times: (T,) its sample times [s].
+        states: the states of the levels state and step, the initial one first.
+        rows: judged rows of the scenario, of correct engines; those that agree count, and only their engines,
+            quantities and tolerances.
+        levels: of `COVERED_LEVELS`.
+
+    Returns:
+        One entry per level and parameter. At trajectory and invariants level a mistake counts as seen if it
+        is reported in every engine that has rows there: the entry is that of the bluntest engine.
+
+    """
+    parameters = list_parameters(model, state)
+    judged = [row for row in rows if row.scenario == name and row.verdict == Verdict.AGREES]
+    found: list[CoverageEntry] = []
+    if "state" in levels:
+        offered: dict[str, set[str]] = {}
+        for row in judged:
+            if row.level == "state":
+                offered.setdefault(row.engine, set()).add(row.quantity)
+        by_quantity = _state_ratios(model, states, parameters)
+        by_engine = {
+            engine: _sharpest([by_quantity[q] for q in STATE_UNITS if q in names])
+            for engine, names in (offered or {"": set(STATE_UNITS)}).items()
+        }
+        found += _entries(
+            name,
+            "state",
+            model,
+            parameters,
+            by_engine,
+            _proofs(model, states, parameters, by_engine, "state"),
+        )
+    if "step" in levels and model.n <= MAX_STEP_BODIES:
+        some = states[:STEP_STATES]
+        by_engine = {"": _step_ratios(model, some, parameters)}
+        found += _entries(
+            name, "step", model, parameters, by_engine, _proofs(model, some, parameters, by_engine, "step")
+        )
+    motion_levels = [level for level in ("trajectory", "invariants") if level in levels]
+    of_runs = [row for row in judged if row.level in motion_levels and row.compared_until is not None]
+    if of_runs:
+        found += _motion_entries(name, model, state, times, parameters, of_runs)
+    return found
+
+
+def _entries(
+    name: str, level: Level, model: Model, parameters: Sequence[Parameter], by_engine: Mapping[str, _Ratios],
+    proofs: Mapping[int, str],
+) -> list[CoverageEntry]:  # fmt: skip
+    """The entries of one level: of each parameter the bluntest engine."""
+    found, joints = [], ["", *("rod" if rod else "ball" for rod in model.rods)]
+    for i, one in enumerate(parameters):
+        engine = min(by_engine, key=lambda e: by_engine[e].ratio[i])
+        ratio = float(by_engine[engine].ratio[i])
+        smallest = max(1 / ratio, EPS) if ratio > 1 / MAX_MISTAKE and i not in proofs else None
+        found.append(
+            CoverageEntry(
+                name,
+                level,
+                one.body + 1,
+                joints[one.body + 1],
+                one.kind,
+                one.name,
+                one.value,
+                one.unit,
+                one.scale,
+                smallest,
+                engine if smallest else "",
+                by_engine[engine].row[i] if smallest else "",
+                proofs.get(i, ""),
+            )
+        )
+    return found
+
+
+# -- states ------------------------------------------------------------------------------------------
+
+
+def _state_ratios(
+    model: Model, states: Sequence[State], parameters: Sequence[Parameter]
+) -> dict[str, _Ratios]:
+    """Effects over rounding bounds at all states, by quantity; mistakes in the state at the first."""
+    of_model = [i for i, one in enumerate(parameters) if one.kind not in STATE_KINDS]
+    of_state = [i for i, one in enumerate(parameters) if one.kind in STATE_KINDS]
+    ratios = {quantity: _Ratios(len(parameters)) for quantity in STATE_UNITS}
+    for number, state in enumerate(states):
+        bounds = state_rounding_bound(model, state)
+        found = [(of_model, StateSensitivity(model, state).effects([parameters[i] for i in of_model]))]
+        if number == 0:
+            found.append((of_state, initial_state_effects(model, state, [parameters[i] for i in of_state])))
+        for indices, effects in found:
+            for quantity, effect in effects.items():
+                bound = np.maximum(np.asarray(bounds.tolerance(quantity)), TINY)
+                with np.errstate(over="ignore"):  # a bound of zero, as that of the energy at rest
+                    worst = np.max(effect / bound, axis=1)
+                for i, value in zip(indices, worst, strict=True):
+                    ratios[quantity].add(i, value * parameters[i].scale, quantity)
+    return ratios
+
+
+# -- steps -------------------------------------------------------------------------------------------
+
+
+def _step_ratios(model: Model, states: Sequence[State], parameters: Sequence[Parameter]) -> _Ratios:
+    """Effects after one step and ten over the bounds of the step level."""
+    sizes = step_sizes(STEP_METHOD, model, states)
+    starts = [(index, h, None) for index in range(len(states)) for h in sizes[index]]
+    steps = FormulaSteps(STEP_METHOD, model, states, starts)
+    limits: dict[int, dict[int, dict[str, Array]]] = {}
+    for i, count, limit, _ in steps.limits():
+        limits.setdefault(i, {})[count] = limit
+    ratios = _Ratios(len(parameters))
+    for i, counts in limits.items():
+        index, h = steps.places[i]
+        chosen = [k for k, one in enumerate(parameters) if index == 0 or one.kind not in STATE_KINDS]
+        times = np.asarray(h * np.arange(max(counts) + 1), float)
+        motions = perturbed_motions(model, states[index], times, [parameters[k] for k in chosen], substeps=1)
+        for k, motion in zip(chosen, motions, strict=True):
+            for count, limit in counts.items():
+                for quantity, error in _step_errors(motion, count).items():
+                    worst = float(np.max(error / np.maximum(limit[quantity], TINY)))
+                    ratios.add(k, worst / MOTION_MISTAKE, quantity)
+    return ratios
+
+
+def _step_errors(motion: PerturbedMotion, count: int) -> dict[str, Array]:
+    """Differences (N,) after some steps, as the step level measures them."""
+    run, true = motion.run, motion.true
+    omega, true_omega = (angular_velocity(t.p[count], t.pdot[count]) for t in (run, true))
+    pairs = {
+        "step_position": run.r[count] - true.r[count],
+        "step_velocity": run.v[count] - true.v[count],
+        "step_rate": omega - true_omega,
+        "step_attitude": 2 * (run.p[count] - true.p[count]),
+    }
+    return {name: np.linalg.norm(x, axis=-1) for name, x in pairs.items()}
+
+
+# -- motions -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _MotionTolerance:
+    """What a row of a run compares: the running maximum of a difference up to a time with a tolerance."""
+
+    row: Row
+    quantity: str  # "position", "attitude", or an invariant
+    tolerance: float
+    last_sample: int
+
+
+def _motion_tolerance(row: Row, times: Array) -> _MotionTolerance | None:
+    """The tolerance that a mistake must pass in this row; None where the row compares no motion."""
+    quantity = row.quantity.removesuffix("_limit")
+    if quantity not in ("position", "attitude", *INVARIANT_UNITS) or not row.tolerance:
+        return None
+    tolerance = row.tolerance
+    if "limit" in row.extra and row.ratio:  # the row's tolerance covers the finest run, this one its limit
+        tolerance = row.extra["limit"] / row.ratio
+    end = int(np.searchsorted(times, (row.compared_until or 0.0) * (1 + 1e-12), side="right")) - 1
+    return _MotionTolerance(row, quantity, tolerance, end)
+
+
+def _motion_entries(
+    name: str, model: Model, state: State, times: Array, parameters: Sequence[Parameter], rows: Sequence[Row]
+) -> list[CoverageEntry]:
+    """The entries of trajectory and invariants level, by the tolerances of judged rows."""
+    tolerances = [one for row in rows if (one := _motion_tolerance(row, times)) is not None]
+    if not tolerances:
+        return []
+    end = max(one.last_sample for one in tolerances)
+    levels = list(dict.fromkeys(one.row.level for one in tolerances))
+    engines = list(dict.fromkeys(one.row.engine for one in tolerances))
+    ratios = {level: {engine: _Ratios(len(parameters)) for engine in engines} for level in levels}
+    has_invariants, true, invariants = "invariants" in levels, None, None
+    for i, motion in enumerate(perturbed_motions(model, state, times[: end + 1], parameters)):
+        if has_invariants and motion.true is not true:
+            invariants = compute_invariants(model, motion.true)
+        true = motion.true
+        effects = {
+            "position": position_error(motion.run.r, true.r),
+            "attitude": attitude_error(motion.run.p, true.p),
+        }
+        if invariants is not None:
+            own = compute_invariants(model, motion.run)
+            for quantity in INVARIANT_UNITS:
+                series, before = getattr(own, quantity), getattr(invariants, quantity)
+                if series is not None:
+                    effects[quantity] = np.max(np.linalg.norm(series - before, axis=-1), axis=1)
+        reached = {quantity: np.maximum.accumulate(effect) for quantity, effect in effects.items()}
+        for one in tolerances:
+            ratio = reached[one.quantity][one.last_sample] / one.tolerance / MOTION_MISTAKE
+            row = f"{one.row.integrator} {one.row.quantity}"
+            ratios[one.row.level][one.row.engine].add(i, float(ratio), row)
+    assert true is not None
+    along = np.linspace(0, end, PROOF_SAMPLES).astype(int)
+    visited = [
+        state,
+        *(project_to_manifold(model, true.r[at], true.p[at], true.v[at], true.pdot[at]) for at in along[1:]),
+    ]
+    found = []
+    for level in levels:
+        proofs = _proofs(model, visited, parameters, ratios[level], level)
+        found += _entries(name, level, model, parameters, ratios[level], proofs)
+    return found
+
+
+# -- proofs ------------------------------------------------------------------------------------------
+
+
+def _proofs(
+    model: Model, states: Sequence[State], parameters: Sequence[Parameter], by_engine: Mapping[str, _Ratios],
+    level: Level,
+) -> dict[int, str]:  # fmt: skip
+    """Why parameters that are not seen cannot be seen, by index; those without a reason are left out.
+
+    The equations are linear in each parameter and in the joint forces at given accelerations. Where a
+    parameter's term vanishes, or joint forces alone take it up, the true accelerations solve the equations
+    with the mistake too, however large it is; along a whole motion, the true motion does.
+    """
+    found = {}
+    if level == "invariants":
+        found = {
+            i: "the invariants are conserved from every initial state"
+            for i, one in enumerate(parameters)
+            if one.kind in STATE_KINDS
+        }
+    blunt = np.min([ratios.ratio for ratios in by_engine.values()], axis=0) <= 1 / DOUBTFUL_MISTAKE
+    unseen = [i for i in map(int, np.flatnonzero(blunt)) if parameters[i].kind not in STATE_KINDS]
+    if not unseen:
+        return found
+    where = {
+        "state": "at every compared state",
+        "step": "at every state that a compared step starts from",
+    }.get(level, "along the whole motion")
+    some = [parameters[i] for i in unseen]
+    terms, pull = np.zeros(len(unseen)), np.zeros(len(unseen))  # largest, over what they could be
+    for state in states:
+        sensitivity = StateSensitivity(model, state)
+        own, moved = _relative_terms(sensitivity, some)
+        terms, pull = np.maximum(terms, own), np.maximum(pull, moved)
+    for k, i in enumerate(unseen):
+        term = _TERMS[parameters[i].kind]
+        if terms[k] <= NO_EFFECT:
+            found[i] = f"its term in the equations of motion, {term}, is zero {where}"
+        elif pull[k] <= NO_EFFECT and level != "state":
+            found[i] = f"joint forces alone take up its term, {term}, {where}: no acceleration changes"
+    return found
+
+
+def _relative_terms(sensitivity: StateSensitivity, parameters: Sequence[Parameter]) -> tuple[Array, Array]:
+    """Of each parameter (P,) its terms, and the accelerations that they cause, over natural sizes."""
+    model, system, norm = sensitivity.model, sensitivity.system, np.linalg.norm
+    g = float(norm(model.gravity))
+    a, alpha = np.maximum(norm(system.acceleration, axis=1), g), norm(system.alpha, axis=1)
+    force = model.mass * a + norm(system.F, axis=1) + TINY
+    span = np.sqrt(np.trace(model.inertia, axis1=1, axis2=2) / (2 * model.mass))
+    span = np.max([span, norm(model.proximal, axis=1), norm(model.distal, axis=1)], axis=0)
+    natural = np.stack([force, span * force, a + TINY], axis=1)  # of the three kinds of rows
+    scale = np.array([one.scale for one in parameters])
+    rows = np.array([sensitivity.terms(one) for one in parameters]).reshape(-1, model.n, 3, 3)
+    terms = np.max(norm(rows, axis=-1) / natural, axis=(1, 2)) * scale
+    moved = sensitivity.effects(parameters)
+    turning = np.maximum(alpha, a / span) + TINY
+    pull = [moved["acceleration"] / (a + TINY), moved["angular_acceleration"] / turning]
+    return terms, np.max(pull, axis=(0, 2)) * scale

@@ -1,0 +1,170 @@
+"""Coverage tables of many scenarios, as records and as a file beside the results of a run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+
+import pyarrow as pa
+
+from plumbline.judging.coverage import COVERED_LEVELS, CoverageEntry, scenario_coverage
+from plumbline.judging.rows import Level, Row
+from plumbline.model.sampling import compared_states
+from plumbline.processes.workers import Executor, Task
+from plumbline.scenario.loader import Scenario
+from plumbline.studies.tables import make_table
+
+FILE = "coverage.parquet"
+SCHEMA = pa.schema(
+    [
+        ("scenario", pa.string()),
+        ("level", pa.string()),
+        ("body", pa.int32()),  # from 1; 0 for gravity
+        ("joint", pa.string()),
+        ("kind", pa.string()),
+        ("parameter", pa.string()),
+        ("value", pa.float64()),
+        ("unit", pa.string()),
+        ("scale", pa.float64()),  # in ``unit``
+        ("smallest", pa.float64()),  # over ``scale``; null where the level sees no mistake
+        ("engine", pa.string()),
+        ("row", pa.string()),
+        ("proof", pa.string()),
+    ]
+)
+
+
+class CoverageFailure(Exception):
+    """The coverage of a scenario could not be computed; the message names it and the reason."""
+
+
+def measure_coverage(
+    executor: Executor,
+    scenarios: Sequence[Scenario],
+    rows: Iterable[Row],
+    state_count: int,
+    levels: Sequence[Level] = COVERED_LEVELS,
+    progress: Callable[[int, int, str], None] = lambda done, total, what: None,
+) -> list[CoverageEntry]:
+    """Compute the coverage of scenarios.
+
+    Args:
+        executor: makes the calls, one per scenario.
+        scenarios: the scenarios.
+        rows: judged rows of correct engines on them.
+        state_count: random states per scenario at state level.
+        levels: of `COVERED_LEVELS`.
+        progress: called with scenarios done, scenarios in all and the last one.
+
+    Returns:
+        The entries, in the order of the scenarios.
+
+    Raises:
+        CoverageFailure: a call failed.
+
+    """
+    by_scenario: dict[str, list[Row]] = {s.name: [] for s in scenarios}
+    for row in rows:
+        if row.scenario in by_scenario:
+            by_scenario[row.scenario].append(row)
+    tasks = []
+    for s in sorted(scenarios, key=lambda s: -s.model.n):  # no long task alone at the end
+        states = compared_states(s.model, s.state, s.digest, state_count)
+        arguments = s.name, s.model, s.state, s.times, states, by_scenario[s.name], levels
+        tasks.append(Task(s.name, scenario_coverage, arguments, executor.limits))
+    found: dict[str, list[CoverageEntry]] = {}
+    for outcome in executor.run(tasks):
+        if outcome.failure:
+            raise CoverageFailure(f"no coverage of {outcome.key}: {outcome.failure}")
+        found[outcome.key] = outcome.value
+        progress(len(found), len(tasks), outcome.key)
+    return [entry for s in scenarios for entry in found[s.name]]
+
+
+def coverage_table(entries: Iterable[CoverageEntry]) -> pa.Table:
+    """Put coverage entries into a table.
+
+    Args:
+        entries: of `measure_coverage`.
+
+    Returns:
+        One row per entry, with the columns of `SCHEMA`.
+
+    """
+    return make_table([asdict(entry) for entry in entries], SCHEMA)
+
+
+@dataclass(frozen=True)
+class CoverageSummary:
+    """One kind of parameter at one level, over all bodies and scenarios."""
+
+    level: Level
+    kind: str
+    entries: int
+    seen: int
+    sharpest: float | None  # smallest mistake over its scale, the least of all entries
+    median: float | None
+    bluntest: float | None
+    invisible: int  # entries with a proof
+    blind: int  # entries that are neither seen nor proven to be invisible
+
+
+def summarize_coverage(entries: Iterable[CoverageEntry]) -> list[CoverageSummary]:
+    """Summarize entries by level and kind of parameter.
+
+    Args:
+        entries: of any scenarios.
+
+    Returns:
+        The summaries, in the order of first appearance.
+
+    """
+    groups: dict[tuple[Level, str], list[CoverageEntry]] = {}
+    for entry in entries:
+        groups.setdefault((entry.level, entry.kind), []).append(entry)
+    found = []
+    for (level, kind), members in groups.items():
+        seen = sorted(entry.smallest for entry in members if entry.smallest is not None)
+        proven = sum(bool(entry.proof) for entry in members)
+        found.append(
+            CoverageSummary(
+                level,
+                kind,
+                len(members),
+                len(seen),
+                sharpest=seen[0] if seen else None,
+                median=seen[len(seen) // 2] if seen else None,
+                bluntest=seen[-1] if seen else None,
+                invisible=proven,
+                blind=len(members) - len(seen) - proven,
+            )
+        )
+    return found
+
+
+def blind_spots(entries: Iterable[CoverageEntry]) -> list[str]:
+    """List what no scenario shows at a level.
+
+    A parameter is looked for separately on the first body and on later ones, and by the joint that the body
+    hangs by. It counts as seen where its value is not zero and a mistake relative to that value is reported:
+    an engine that ignores drag is right wherever there is none.
+
+    Args:
+        entries: of a whole catalogue.
+
+    Returns:
+        Sentences; empty where every parameter is seen at every level, or has a proof wherever it is not.
+
+    """
+    seen: dict[tuple[str, ...], bool] = {}
+    for entry in entries:
+        place = ("first body" if entry.body == 1 else "later body") if entry.body else "gravity"
+        key = entry.level, entry.parameter, place, entry.joint
+        counts = entry.is_seen and (entry.scale == abs(entry.value) or entry.unit == "rad")
+        always = entry.level == "invariants" and bool(entry.proof)
+        seen[key] = seen.get(key, False) or counts or always
+    return [
+        f"{level} level: no scenario sees {parameter}" + (f" of a {place} on a {joint}" if joint else "")
+        for (level, parameter, place, joint), is_seen in seen.items()
+        if not is_seen
+    ]

@@ -1,0 +1,317 @@
+"""First-order effects of a mistake in one parameter: on state quantities, and on a motion.
+
+State quantities: with x = (r̈, α) and F the solution of the Newton-Euler system S at one state, a change of a
+parameter θ of the model changes what the equations lack at that solution, and
+
+    δ(r̈, α, F) = S⁻¹ (δf − δM x + δCᵀ λ, δγ − δC x)
+
+Every term is written out below, one per kind of parameter. Mistakes in the state itself are evaluated by
+central differences, motions by differences of two runs, both with the reference's structured form.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from plumbline.engines.integrators import runge_kutta_4
+from plumbline.model.datatypes import Array, Model, State, Trajectory
+from plumbline.model.invariants import angular_momentum, kinetic_energy, potential_energy
+from plumbline.model.kinematics import (
+    angular_velocity,
+    mass_matrix,
+    quaternion_rate,
+    rotate_vectors,
+    rotation_matrix,
+    velocity_jacobian,
+)
+from plumbline.truth.parameters import AXES, INERTIA_ENTRIES, Parameter, perturb
+from plumbline.truth.rounding_bound import NewtonEulerSystem
+from plumbline.truth.step_formulas import fastest_rates
+from reference_impl.structured import StructuredSystem, component_first
+
+STATE_MISTAKE = 1e-4  # of a state's parameters, in central differences
+MOTION_MISTAKE = 1e-5  # of a parameter's scale, in the runs that show its effect on the motion
+MOTION_STEP = 2.0**-7  # s, largest step of those runs; both runs of a difference make the same error
+MAX_STEP_ANGLE = 0.125  # rad that the fastest mode turns in a step
+MAX_BATCH_BODIES = 4000  # of one batch of runs: more do not fit the processor's cache
+
+
+class StateSensitivity:
+    """The Newton-Euler solution at one state, and how parameters of the model change it."""
+
+    def __init__(self, model: Model, state: State) -> None:
+        """Solve the equations at the state.
+
+        Args:
+            model: the mechanism.
+            state: a state on the constraint manifold.
+
+        """
+        self.model, self.state = model, state
+        self.system = NewtonEulerSystem(model, state)
+        self.A = rotation_matrix(state.p)
+        self.omega = rotate_vectors(self.A, state.omega)
+        self.momentum = model.mass[:, None] * state.v
+        self.spin = rotate_vectors(self.A, rotate_vectors(model.inertia, state.omega))
+        # of body k and all beyond it
+        self.mass_beyond, self.first_moment_beyond, self.momentum_beyond = (
+            _suffix_sum(x) for x in (model.mass, model.mass[:, None] * state.r, self.momentum)
+        )
+        self.W = velocity_jacobian(model, state).reshape(model.n, 6, -1)
+        self.W_beyond = _suffix_sum(model.mass[:, None, None] * self.W[:, :3])
+
+    def terms(self, parameter: Parameter) -> Array:
+        """Return what a unit change of a parameter adds to the equations at the solution.
+
+        Args:
+            parameter: of the model, not of the state.
+
+        Returns:
+            (N, 9): of each body the force [N] and moment [N m] in its equations of motion (world frame), and
+            the acceleration [m/s²] in its joint's rows, per unit of the parameter.
+
+        """
+        model, system, k = self.model, self.system, parameter.body
+        rows = np.zeros((model.n, 9))
+        if parameter.kind == "gravity":
+            rows[:, AXES.index(parameter.entry)] = model.mass
+        elif parameter.kind == "mass":
+            rows[k, :3] = model.gravity - system.acceleration[k]
+        elif parameter.kind == "inertia":
+            E, w = _entry(parameter), self.state.omega[k]
+            body_alpha = self.A[k].T @ system.alpha[k]
+            rows[k, 3:6] = -self.A[k] @ (E @ body_alpha + np.cross(w, E @ w))
+        elif parameter.kind == "force":
+            rows[k, AXES.index(parameter.entry)] = 1.0
+        elif parameter.kind == "moment":
+            rows[k, 3:6] = self.A[k][:, AXES.index(parameter.entry)]
+        elif parameter.kind == "drag_force":
+            rows[k, :3] = -self.state.v[k]
+        elif parameter.kind == "drag_moment":
+            rows[k, 3:6] = -self.omega[k]
+        else:
+            self._add_geometry(parameter, rows)
+        return rows
+
+    def _add_geometry(self, parameter: Parameter, rows: Array) -> None:
+        """A point's own terms, those of its joint, and the drag of the velocities beyond it."""
+        model, system, k = self.model, self.system, parameter.body
+        arm, speed, first = self._shift(parameter)
+        rows[first:, :3] -= model.drag_force[first:, None] * speed
+        if parameter.kind == "length":
+            rows[k, 6] = -np.sum(self.state.udot[k] ** 2)
+            return
+        swing = np.cross(system.alpha[k], arm) + np.cross(self.omega[k], np.cross(self.omega[k], arm))
+        if parameter.kind == "proximal":  # arm = −A e: the centre moves away from the point
+            rows[k, 3:6] = np.cross(-arm, system.F[k])
+            rows[k, 6:] = self._joint_row(k, swing)
+        elif k + 1 < model.n:
+            rows[k, 3:6] = -np.cross(arm, system.F[k + 1])
+            rows[k + 1, 6:] = self._joint_row(k + 1, swing)
+
+    def _shift(self, parameter: Parameter) -> tuple[Array, Array, int]:
+        """Displacement and velocity of all bodies from the third result on, per unit of a length."""
+        k = parameter.body
+        if parameter.kind == "length":
+            return self.state.u[k], self.state.udot[k], k
+        sign, first = (-1.0, k) if parameter.kind == "proximal" else (1.0, k + 1)
+        arm = sign * self.A[k][:, AXES.index(parameter.entry)]
+        return arm, np.cross(self.omega[k], arm), first
+
+    def _joint_row(self, k: int, acceleration: Array) -> Array:
+        """The rows of joint k that an acceleration enters."""
+        if not self.model.rods[k]:
+            return acceleration
+        return np.array([self.state.u[k] @ acceleration, 0.0, 0.0])
+
+    def effects(self, parameters: Sequence[Parameter]) -> dict[str, Array]:
+        """Return the effects of unit changes of parameters on every state quantity.
+
+        Args:
+            parameters: P parameters of the model, not of the state.
+
+        Returns:
+            By name of the quantity the norms (P, N) per body of vectors, or (P, 1), per unit of the
+            parameter.
+
+        """
+        n, names = self.model.n, ("acceleration", "angular_acceleration", "joint_reaction")
+        rows = np.array([self.terms(parameter) for parameter in parameters])  # (P, N, 9)
+        flat = np.concatenate([rows[..., :6].reshape(-1, 6 * n), rows[..., 6:].reshape(-1, 3 * n)], axis=1)
+        inverse = self.system.inverse_columns.reshape(9 * n, 9 * n)
+        solved = (flat @ inverse.T).reshape(len(parameters), n, 3, 3)
+        found = {name: np.linalg.norm(solved[:, :, i], axis=-1) for i, name in enumerate(names)}
+        scalars = np.array([self._scalars(parameter) for parameter in parameters])
+        for i, name in enumerate(("kinetic_energy", "potential_energy", "angular_momentum", "mass_matrix")):
+            found[name] = scalars[:, i : i + 1]
+        return found
+
+    def _scalars(self, parameter: Parameter) -> tuple[float, float, float, float]:
+        """Changes of both energies, of the angular momentum and of the largest entry of the mass matrix."""
+        model, state, k = self.model, self.state, parameter.body
+        if parameter.kind == "gravity":
+            return 0.0, abs(float(self.first_moment_beyond[0, AXES.index(parameter.entry)])), 0.0, 0.0
+        if parameter.kind == "mass":
+            v, r, W = state.v[k], state.r[k], self.W[k, :3]
+            largest = float(np.max(np.sum(W * W, axis=0), initial=0.0))
+            return float(v @ v) / 2, abs(float(r @ model.gravity)), _norm(np.cross(r, v)), largest
+        if parameter.kind == "inertia":
+            E, w = _entry(parameter), state.omega[k]
+            return abs(float(w @ E @ w)) / 2, 0.0, _norm(E @ w), 1.0
+        if parameter.kind not in ("proximal", "distal", "length"):
+            return 0.0, 0.0, 0.0, 0.0
+        arm, speed, first = self._shift(parameter)
+        if first >= model.n:
+            return 0.0, 0.0, 0.0, 0.0
+        momentum = np.cross(arm, self.momentum_beyond[first]) + np.cross(
+            self.first_moment_beyond[first], speed
+        )
+        return (
+            abs(float(self.momentum_beyond[first] @ speed)),
+            abs(float(self.mass_beyond[first] * (model.gravity @ arm))),
+            _norm(momentum),
+            self._mass_matrix_change(parameter, arm, first),
+        )
+
+    def _mass_matrix_change(self, parameter: Parameter, arm: Array, first: int) -> float:
+        """Largest entry of Σ m (δWᵀ W + Wᵀ δW): δW has the columns of one rod or body only."""
+        model, k = self.model, parameter.body
+        rods = int(np.sum(model.rods))
+        if parameter.kind == "length":
+            at = 3 * int(np.sum(model.rods[:k]))
+            change = np.eye(3) - np.outer(self.state.u[k], self.state.u[k])
+        else:
+            at = 3 * (rods + k)
+            change = np.cross(self.A[k].T, arm).T  # column j: velocity of the arm's end by ω′ about axis j
+        block = change.T @ self.W_beyond[first]
+        own = block[:, at : at + 3] + block[:, at : at + 3].T
+        block[:, at : at + 3] = own
+        return float(np.max(np.abs(block)))
+
+
+def _entry(parameter: Parameter) -> Array:
+    """The symmetric unit matrix (3, 3) of an entry of the inertia."""
+    found = np.zeros((3, 3))
+    i, j = INERTIA_ENTRIES[parameter.entry]
+    found[i, j] = found[j, i] = 1.0
+    return found
+
+
+def _norm(v: Array) -> float:
+    return float(np.linalg.norm(v))
+
+
+def _suffix_sum(x: Array) -> Array:
+    """Sums over body k and all beyond it."""
+    return np.asarray(np.cumsum(x[::-1], axis=0)[::-1])
+
+
+def initial_state_effects(model: Model, state: State, parameters: Sequence[Parameter]) -> dict[str, Array]:
+    """Return the effects of unit changes of a state's parameters on every state quantity.
+
+    Args:
+        model: the mechanism.
+        state: the state.
+        parameters: P parameters of the state, at least one.
+
+    Returns:
+        As `StateSensitivity.effects`.
+
+    """
+    d = STATE_MISTAKE
+    states = [perturb(model, state, one, sign * d)[1] for one in parameters for sign in (1, -1)]
+    r, p, v, omega = (np.concatenate([getattr(s, name) for s in states]) for name in ("r", "p", "v", "omega"))
+    solved = StructuredSystem([model]).repeated(len(states)).solve(r, p, v, quaternion_rate(p, omega))
+
+    def change(x: Array) -> Array:
+        """Central differences (P, …) of values in the order of the states."""
+        plus, minus = np.moveaxis(np.asarray(x).reshape(len(parameters), 2, *np.shape(x)[1:]), 1, 0)
+        scale = np.array([one.scale for one in parameters]).reshape(-1, *(1,) * (plus.ndim - 1))
+        return np.asarray((plus - minus) / (2 * d * scale))
+
+    def per_state(x: Array) -> Array:
+        return x.reshape(len(states), model.n, -1)
+
+    r, p, v, omega = map(per_state, (r, p, v, omega))
+    vectors = {
+        "acceleration": solved.acceleration,
+        "angular_acceleration": angular_velocity(p, per_state(solved.pddot)),
+        "joint_reaction": solved.joint_reaction,
+    }
+    found = {name: np.linalg.norm(change(per_state(x)), axis=-1) for name, x in vectors.items()}
+    scalars = kinetic_energy(model, v, omega), potential_energy(model, r)
+    found["kinetic_energy"], found["potential_energy"] = (np.abs(change(x))[:, None] for x in scalars)
+    momentum = change(angular_momentum(model, r, p, v, omega))
+    found["angular_momentum"] = np.linalg.norm(momentum, axis=-1, keepdims=True)
+    matrices = np.array([mass_matrix(model, s) for s in states])
+    found["mass_matrix"] = np.max(np.abs(change(matrices)), axis=(1, 2))[:, None]
+    return found
+
+
+# -- motions -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class PerturbedMotion:
+    """A motion with a mistake in one parameter, and the same without it by the same integrator."""
+
+    parameter: Parameter
+    run: Trajectory
+    true: Trajectory
+
+
+def perturbed_motions(
+    model: Model, state: State, times: Array, parameters: Sequence[Parameter], substeps: int | None = None
+) -> Iterator[PerturbedMotion]:
+    """Simulate a motion with each parameter off by `MOTION_MISTAKE` of its scale.
+
+    Args:
+        model: the mechanism.
+        state: its initial state.
+        times: (T,) sample times [s], equally spaced.
+        parameters: of `list_parameters`.
+        substeps: Runge-Kutta steps between two samples; None for as many as the motion needs.
+
+    Yields:
+        The motions, in the order of the parameters.
+
+    """
+    if substeps is None:
+        rates = [float(np.max(fastest_rates(model, [state]))), *np.linalg.norm(state.omega, axis=1) / 2]
+        step = min(MOTION_STEP, MAX_STEP_ANGLE / max(rates))
+        substeps = max(1, int(np.ceil((times[1] - times[0]) / step)))
+    size = max(1, MAX_BATCH_BODIES // model.n - 1)
+    for first in range(0, len(parameters), size):
+        part = parameters[first : first + size]
+        cases = [(model, state), *(perturb(model, state, one, MOTION_MISTAKE) for one in part)]
+        true, *runs = _simulate_batch(cases, times, substeps)
+        for parameter, run in zip(part, runs, strict=True):
+            yield PerturbedMotion(parameter, run, true)
+
+
+def _simulate_batch(cases: Sequence[tuple[Model, State]], times: Array, substeps: int) -> list[Trajectory]:
+    """Runs of all cases by the classical Runge-Kutta method in (r, p), unstabilised."""
+    system = StructuredSystem([model for model, _ in cases])
+    r, p, v = (np.concatenate([getattr(state, name) for _, state in cases]) for name in ("r", "p", "v"))
+    pdot = quaternion_rate(p, np.concatenate([state.omega for _, state in cases]))
+    y = np.stack([component_first(r, p), component_first(v, pdot)])  # (2, 7, M)
+
+    def slope(y: Array) -> Array:
+        return np.stack([y[1], system.acceleration(y[0], y[1])])
+
+    samples = [y]
+    for h in np.diff(times):
+        for _ in range(substeps):
+            y = runge_kutta_4(slope, y, h / substeps)
+        samples.append(y)
+    # (cases, 2, T, N, 7)
+    found = np.moveaxis(
+        np.array(samples).reshape(len(times), 2, 7, len(cases), -1), (3, 1, 0, 4, 2), (0, 1, 2, 3, 4)
+    )
+    return [
+        Trajectory(times, q[..., :3], q[..., 3:], rate[..., :3], rate[..., 3:], substeps * (len(times) - 1))
+        for q, rate in found
+    ]
