@@ -20,7 +20,7 @@ import numpy as np
 from plumbline.judging.rows import Level, Row, Verdict
 from plumbline.judging.state import STATE_UNITS
 from plumbline.judging.step import MAX_STEP_BODIES, STEP_STATES, FormulaSteps, step_sizes
-from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.datatypes import Array, Model, State, Trajectory
 from plumbline.model.invariants import INVARIANT_UNITS, attitude_error, compute_invariants, position_error
 from plumbline.model.kinematics import angular_velocity
 from plumbline.model.step_methods import classical_runge_kutta
@@ -37,6 +37,8 @@ from plumbline.truth.sensitivity import project_to_manifold
 
 COVERED_LEVELS: tuple[Level, ...] = ("state", "step", "trajectory", "invariants")
 MAX_MISTAKE = 0.1  # of a parameter's scale: only larger ones are reported, or none; the level does not see it
+WEAK_MISTAKE = 1e-9  # from here on the order of an effect is found by a second mistake …
+LARGER_MISTAKE = 4.0  # … that is larger by this factor
 DOUBTFUL_MISTAKE = 1e-6  # from here on an effect may be rounding of the runs: a proof is tried
 NO_EFFECT = 1e-9  # of the largest effect that a term could have: rounding
 PROOF_SAMPLES = 17  # of the motion, at which a parameter's term is shown to vanish
@@ -268,13 +270,17 @@ class _MotionTolerance:
 
 
 def _motion_tolerance(row: Row, times: Array) -> _MotionTolerance | None:
-    """The tolerance that a mistake must pass in this row; None where the row compares no motion."""
+    """The tolerance that a mistake must pass in this row; None where the row compares no motion.
+
+    An invariant that is exactly zero, as the joint gap of a body that turns about the pivot, says nothing of
+    the uncertainty that a mistaken motion would have.
+    """
     quantity = row.quantity.removesuffix("_limit")
     if quantity not in ("position", "attitude", *INVARIANT_UNITS) or not row.tolerance:
         return None
-    tolerance = row.tolerance
-    if "limit" in row.extra and row.ratio:  # the row's tolerance covers the finest run, this one its limit
-        tolerance = row.extra["limit"] / row.ratio
+    if quantity in INVARIANT_UNITS and row.value == 0:
+        return None
+    tolerance = row.extra.get("limit_tolerance", row.tolerance)
     end = int(np.searchsorted(times, (row.compared_until or 0.0) * (1 + 1e-12), side="right")) - 1
     return _MotionTolerance(row, quantity, tolerance, end)
 
@@ -286,41 +292,80 @@ def _motion_entries(
     tolerances = [one for row in rows if (one := _motion_tolerance(row, times)) is not None]
     if not tolerances:
         return []
-    end = max(one.last_sample for one in tolerances)
-    levels = list(dict.fromkeys(one.row.level for one in tolerances))
-    engines = list(dict.fromkeys(one.row.engine for one in tolerances))
-    ratios = {level: {engine: _Ratios(len(parameters)) for engine in engines} for level in levels}
-    has_invariants, true, invariants = "invariants" in levels, None, None
-    for i, motion in enumerate(perturbed_motions(model, state, times[: end + 1], parameters)):
-        if has_invariants and motion.true is not true:
-            invariants = compute_invariants(model, motion.true)
-        true = motion.true
-        effects = {
+    times = times[: max(one.last_sample for one in tolerances) + 1]
+    quantities = {one.quantity for one in tolerances}
+    effects, true = _motion_effects(model, state, times, parameters, quantities, MOTION_MISTAKE)
+    ratios = _motion_ratios(tolerances, len(parameters), effects, {})
+    weak = [
+        i
+        for i in range(len(parameters))
+        if any(one.ratio[i] <= 1 / WEAK_MISTAKE for engines in ratios.values() for one in engines.values())
+    ]
+    if weak:  # a second, larger mistake shows whether the effect grows with its square, or is rounding
+        again = [parameters[i] for i in weak]
+        larger, _ = _motion_effects(model, state, times, again, quantities, LARGER_MISTAKE * MOTION_MISTAKE)
+        by_index = {i: {q: x[k] for q, x in larger.items()} for k, i in enumerate(weak)}
+        ratios = _motion_ratios(tolerances, len(parameters), effects, by_index)
+    along = np.linspace(0, len(times) - 1, PROOF_SAMPLES).astype(int)[1:]
+    visited = [project_to_manifold(model, true.r[at], true.p[at], true.v[at], true.pdot[at]) for at in along]
+    found = []
+    for level, by_engine in ratios.items():
+        proofs = _proofs(model, [state, *visited], parameters, by_engine, level)
+        found += _entries(name, level, model, parameters, by_engine, proofs)
+    return found
+
+
+def _motion_effects(
+    model: Model,
+    state: State,
+    times: Array,
+    parameters: Sequence[Parameter],
+    quantities: set[str],
+    size: float,
+) -> tuple[dict[str, Array], Trajectory]:
+    """Running maxima (P, T) of what mistakes of a size do to a motion, by quantity; and the true motion."""
+    effects: dict[str, list[Array]] = {quantity: [] for quantity in quantities}
+    true: Trajectory | None = None
+    for motion in perturbed_motions(model, state, times, parameters, mistake=size):
+        if motion.true is not true:
+            true = motion.true
+            invariants = compute_invariants(model, true) if quantities & set(INVARIANT_UNITS) else None
+        found = {
             "position": position_error(motion.run.r, true.r),
             "attitude": attitude_error(motion.run.p, true.p),
         }
         if invariants is not None:
             own = compute_invariants(model, motion.run)
-            for quantity in INVARIANT_UNITS:
-                series, before = getattr(own, quantity), getattr(invariants, quantity)
-                if series is not None:
-                    effects[quantity] = np.max(np.linalg.norm(series - before, axis=-1), axis=1)
-        reached = {quantity: np.maximum.accumulate(effect) for quantity, effect in effects.items()}
-        for one in tolerances:
-            ratio = reached[one.quantity][one.last_sample] / one.tolerance / MOTION_MISTAKE
-            row = f"{one.row.integrator} {one.row.quantity}"
-            ratios[one.row.level][one.row.engine].add(i, float(ratio), row)
+            for quantity in quantities & set(INVARIANT_UNITS):
+                difference = getattr(own, quantity) - getattr(invariants, quantity)
+                found[quantity] = np.max(np.linalg.norm(difference, axis=-1), axis=1)
+        for quantity in quantities:
+            effects[quantity].append(np.maximum.accumulate(found[quantity]))
     assert true is not None
-    along = np.linspace(0, end, PROOF_SAMPLES).astype(int)
-    visited = [
-        state,
-        *(project_to_manifold(model, true.r[at], true.p[at], true.v[at], true.pdot[at]) for at in along[1:]),
-    ]
-    found = []
-    for level in levels:
-        proofs = _proofs(model, visited, parameters, ratios[level], level)
-        found += _entries(name, level, model, parameters, ratios[level], proofs)
-    return found
+    return {quantity: np.array(found) for quantity, found in effects.items()}, true
+
+
+def _motion_ratios(
+    tolerances: Sequence[_MotionTolerance], count: int, effects: Mapping[str, Array],
+    larger: Mapping[int, Mapping[str, Array]],
+) -> dict[Level, dict[str, _Ratios]]:  # fmt: skip
+    """Effects over tolerances by level and engine; of some parameters by the order of the effect."""
+    engines = list(dict.fromkeys(one.row.engine for one in tolerances))
+    ratios: dict[Level, dict[str, _Ratios]] = {}
+    for one in tolerances:
+        by_engine = ratios.setdefault(one.row.level, {engine: _Ratios(count) for engine in engines})
+        label = f"{one.row.integrator} {one.row.quantity}"
+        for i in range(count):
+            effect = float(effects[one.quantity][i, one.last_sample])
+            ratio = effect / one.tolerance / MOTION_MISTAKE
+            if i in larger:
+                growth = float(larger[i][one.quantity][one.last_sample]) / max(effect, TINY)
+                if growth < LARGER_MISTAKE / 2:
+                    ratio = 0.0  # rounding
+                elif growth > 2 * LARGER_MISTAKE:  # grows with the square of the mistake
+                    ratio = float(np.sqrt(effect / one.tolerance)) / MOTION_MISTAKE
+            by_engine[one.row.engine].add(i, ratio, label)
+    return ratios
 
 
 # -- proofs ------------------------------------------------------------------------------------------

@@ -65,16 +65,19 @@ def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples:
             **study.common_fields,
         )  # fmt: skip
 
-    end = len(times) - 1
-    if drift[end] <= floor:
-        reason = f"{name} {drift[end]:.2g} {unit}: rounding"
-        return row(Verdict.AGREES, reason, end, floor, ratio=float(drift[end] / floor))
+    end, failure, tolerance = len(times) - 1, "", np.full(len(times), floor)
     try:
         limit = study.extrapolated_limit(samples)
+        tolerance = limit.uncertainty + floor + work_uncertainty
     except ValueError as error:
-        return row(Verdict.UNRESOLVED, str(error), end, floor)
+        failure = str(error)
+    if drift[end] <= floor:
+        reason = f"{name} {drift[end]:.2g} {unit}: rounding"
+        ratio = float(drift[end] / floor)
+        return row(Verdict.AGREES, reason, end, floor, ratio=ratio, limit_tolerance=float(tolerance[end]))
+    if failure:
+        return row(Verdict.UNRESOLVED, failure, end, floor)
     limit_drift = np.maximum.accumulate(np.max(np.linalg.norm(limit.y, axis=-1), axis=1))
-    tolerance = limit.uncertainty + floor + work_uncertainty
     is_trusted = not study.has_steps or observed_order(samples, floor, study.integrator.order).is_asymptotic
 
     def judge_window(number: int) -> Row:
@@ -86,7 +89,8 @@ def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples:
             f"{to_limit:.2g} from the finest step to step zero, itself ± {limit.uncertainty[at]:.2g}; "
             f"{rounding}; the work by quadrature ± {work_uncertainty:.2g}"
         )
-        ratio, extra = float(limit_drift[at] / tolerance[at]), {"limit": float(limit_drift[at])}
+        ratio = float(limit_drift[at] / tolerance[at])
+        extra = {"limit": float(limit_drift[at]), "limit_tolerance": float(tolerance[at])}
         if limit_drift[at] <= tolerance[at] <= DETECTABLE_PARAMETER_ERROR * scale:
             reason = f"{name} {drift[at]:.2g} {unit} at the finest step, {at_zero}"
             return row(Verdict.AGREES, reason, at, allowed, derivation, ratio, **extra)

@@ -218,7 +218,15 @@ class FormulaSteps:
         self, method: JointSpaceMethod, model: Model, states: Sequence[State],
         starts: Sequence[tuple[int, float, Array | None]],
     ) -> None:  # fmt: skip
-        """Take the steps from ``starts``: index of a state, step [s], axes of revolute joints or None."""
+        """Take the steps.
+
+        Args:
+            method: the declared formula.
+            model: the pendulum.
+            states: states of it.
+            starts: of each run the index of its state, the step [s], and the axes of revolute joints or None.
+
+        """
         self.method, self.model, self.places = method, model, [(index, h) for index, h, _ in starts]
         self.starts, sizes = [states[index] for index, *_ in starts], [h for _, h, _ in starts]
         axes = [angle_axes for *_, angle_axes in starts]
@@ -234,11 +242,25 @@ class FormulaSteps:
             self.growth[i] = np.maximum.accumulate(np.array(apart) / apart[0])
 
     def is_stable(self, i: int) -> bool:
-        """Whether the method itself goes through from the i-th state."""
+        """Find out whether the method itself goes through.
+
+        Args:
+            i: index of the start.
+
+        Returns:
+            Whether perturbations grow by less than `MAX_GROWTH`.
+
+        """
         return bool(self.growth[i, -1] < MAX_GROWTH)
 
     def limits(self) -> Iterator[tuple[int, int, dict[str, Array], dict[str, Array]]]:
-        """Per start i and number of steps that are compared: the limits of errors and the scales, (N,)."""
+        """Compute the limits of errors after every number of steps that is compared.
+
+        Yields:
+            Index of the start, number of steps, and by quantity the limits and what a limit is compared with,
+            (N,) each.
+
+        """
         for i, (index, h) in enumerate(self.places):
             for count in step_counts(self.method):
                 if not self.growth[i, count] < MAX_GROWTH:
@@ -250,7 +272,15 @@ class FormulaSteps:
                 yield i, count, grown, _effects(ends, h, count)
 
     def compare(self, runs: Sequence[StepRun]) -> dict[str, _Comparisons]:
-        """Compare engines' steps with the formula's, body by body."""
+        """Compare engines' steps with the formula's, body by body.
+
+        Args:
+            runs: one per start, with as many steps as the engine took.
+
+        Returns:
+            Errors and bounds by quantity.
+
+        """
         found = {quantity: _Comparisons() for quantity in STEP_UNITS}
         for i, count, limit, scale in self.limits():
             if count >= len(runs[i].trajectory.t):
@@ -264,7 +294,18 @@ class FormulaSteps:
     def step_bound(
         self, ends: tuple[State, ...], bounds: tuple[RoundingBound, ...], h: float, count: int
     ) -> dict[str, Array]:
-        """Bounds (N,) of one of ``count`` steps, from the states at their ends."""
+        """Compute the bounds of one of several steps.
+
+        Args:
+            ends: the states at the ends of the steps.
+            bounds: rounding bounds at ``ends``.
+            h: step [s].
+            count: number of steps.
+
+        Returns:
+            By quantity the bounds (N,), in its unit of `STEP_UNITS`.
+
+        """
         norm, model = np.linalg.norm, self.model
         rate = np.max([np.maximum(norm(s.omega, axis=1), norm(s.udot, axis=1)) for s in ends], axis=0)
         speed = np.max([norm(s.v, axis=1) for s in ends], axis=0)

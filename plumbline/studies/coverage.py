@@ -50,7 +50,7 @@ def measure_coverage(
 
     Args:
         executor: makes the calls, one per scenario.
-        scenarios: the scenarios.
+        scenarios: which to cover.
         rows: judged rows of correct engines on them.
         state_count: random states per scenario at state level.
         levels: of `COVERED_LEVELS`.

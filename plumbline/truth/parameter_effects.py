@@ -18,9 +18,16 @@ import numpy as np
 
 from plumbline.engines.integrators import runge_kutta_4
 from plumbline.model.datatypes import Array, Model, State, Trajectory
-from plumbline.model.invariants import angular_momentum, kinetic_energy, potential_energy
+from plumbline.model.invariants import (
+    angular_momentum,
+    joint_vector_rates,
+    kinetic_energy,
+    potential_energy,
+)
 from plumbline.model.kinematics import (
     angular_velocity,
+    forward_kinematics,
+    joint_vectors,
     mass_matrix,
     quaternion_rate,
     rotate_vectors,
@@ -214,7 +221,7 @@ def initial_state_effects(model: Model, state: State, parameters: Sequence[Param
 
     Args:
         model: the mechanism.
-        state: the state.
+        state: minimal coordinates and rates, on the constraint manifold.
         parameters: P parameters of the state, at least one.
 
     Returns:
@@ -260,13 +267,18 @@ class PerturbedMotion:
 
     parameter: Parameter
     run: Trajectory
-    true: Trajectory
+    true: Trajectory  # of the same object for all motions of a batch
 
 
 def perturbed_motions(
-    model: Model, state: State, times: Array, parameters: Sequence[Parameter], substeps: int | None = None
+    model: Model,
+    state: State,
+    times: Array,
+    parameters: Sequence[Parameter],
+    substeps: int | None = None,
+    mistake: float = MOTION_MISTAKE,
 ) -> Iterator[PerturbedMotion]:
-    """Simulate a motion with each parameter off by `MOTION_MISTAKE` of its scale.
+    """Simulate a motion with each parameter off by a fraction of its scale.
 
     Args:
         model: the mechanism.
@@ -274,6 +286,7 @@ def perturbed_motions(
         times: (T,) sample times [s], equally spaced.
         parameters: of `list_parameters`.
         substeps: Runge-Kutta steps between two samples; None for as many as the motion needs.
+        mistake: the fraction.
 
     Yields:
         The motions, in the order of the parameters.
@@ -286,7 +299,7 @@ def perturbed_motions(
     size = max(1, MAX_BATCH_BODIES // model.n - 1)
     for first in range(0, len(parameters), size):
         part = parameters[first : first + size]
-        cases = [(model, state), *(perturb(model, state, one, MOTION_MISTAKE) for one in part)]
+        cases = [(model, state), *(perturb(model, state, one, mistake) for one in part)]
         true, *runs = _simulate_batch(cases, times, substeps)
         for parameter, run in zip(part, runs, strict=True):
             yield PerturbedMotion(parameter, run, true)
@@ -312,6 +325,19 @@ def _simulate_batch(cases: Sequence[tuple[Model, State]], times: Array, substeps
         np.array(samples).reshape(len(times), 2, 7, len(cases), -1), (3, 1, 0, 4, 2), (0, 1, 2, 3, 4)
     )
     return [
-        Trajectory(times, q[..., :3], q[..., 3:], rate[..., :3], rate[..., 3:], substeps * (len(times) - 1))
-        for q, rate in found
+        _on_manifold(model, Trajectory(times, q[..., :3], q[..., 3:], rate[..., :3], rate[..., 3:], substeps))
+        for (model, _), (q, rate) in zip(cases, found, strict=True)
     ]
+
+
+def _on_manifold(model: Model, run: Trajectory) -> Trajectory:
+    """The run with unit quaternions, and positions and velocities that satisfy the joints exactly."""
+    omega = angular_velocity(run.p, run.pdot)
+    ell = np.where(model.rods, model.length, np.inf)[:, None]
+    u = joint_vectors(model, run.r, run.p) / ell
+    u = u / np.where(model.rods[:, None], np.linalg.norm(u, axis=-1, keepdims=True), 1.0)
+    udot = joint_vector_rates(model, run, omega) / ell
+    udot = udot - np.sum(udot * u, axis=-1, keepdims=True) * u
+    p = run.p / np.linalg.norm(run.p, axis=-1, keepdims=True)
+    r, v = forward_kinematics(model, p, omega, u, udot)
+    return Trajectory(run.t, r, p, v, quaternion_rate(p, omega), run.steps)

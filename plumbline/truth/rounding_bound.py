@@ -257,6 +257,13 @@ class NewtonEulerSystem:
     """
 
     def __init__(self, model: Model, state: State) -> None:
+        """Assemble, invert and solve the system.
+
+        Args:
+            model: the mechanism.
+            state: a state on the constraint manifold.
+
+        """
         n, body, rods = model.n, np.arange(model.n), model.rods
         A = rotation_matrix(state.p)
         inertia = A @ model.inertia @ A.mT
@@ -297,9 +304,16 @@ class NewtonEulerSystem:
         self.acceleration, self.alpha, self.F = np.moveaxis(self.inverse_columns @ rows, 1, 0)  # (N, 3) each
 
     def propagate(self, force: Array, moment: Array, joint: Array) -> Array:
-        """First-order change (N, 3) of r̈, α and F for errors of these sizes (N,) in the three rows per body.
+        """Compute the first-order change for errors in the rows: Frobenius norms of the inverse's 3×3 blocks.
 
-        The Frobenius norms of the 3×3 blocks of the inverse, times the errors.
+        Args:
+            force: sizes (N,) of the errors in the force rows [N].
+            moment: sizes (N,) in the moment rows [N m].
+            joint: sizes (N,) in the joint rows [m/s²].
+
+        Returns:
+            (N, 3) of r̈ [m/s²], α [rad/s²] and F [N].
+
         """
         n, norm = self.n, np.linalg.norm
         of_body = norm(self.inverse_columns[..., : 6 * n].reshape(n, 3, 3, n, 2, 3), axis=(2, 5))
@@ -308,16 +322,25 @@ class NewtonEulerSystem:
         return np.asarray(np.einsum("nqkc,kc->nq", B, np.stack([force, moment, joint], 1)))
 
     def rod_angular_acceleration(self) -> Array:
-        """Angular acceleration (N, 3) of each rod without axial spin, u × d̈/ℓ; 0 for a ball."""
+        """Compute the angular acceleration of each rod without axial spin, u × d̈/ℓ.
+
+        Returns:
+            (N, 3) [rad/s²], world frame; 0 for a ball.
+
+        """
         near = self.acceleration + np.cross(self.alpha, self.sp) + self.centripetal_p
         far = self.acceleration + np.cross(self.alpha, self.sd) + self.centripetal_d
         ell = np.where(self.rods, self.length, np.inf)[:, None]
         return np.cross(self.u, near - _from_previous(far)) / ell
 
     def torque_pair_responses(self) -> Array:
-        """Norms (joints, N, 3) of the response to a unit torque pair at each joint, rods' upper joints first.
+        """Compute the norms of the response to a unit torque pair at each joint.
 
         A torque τ on a massless rod is balanced by forces ∓(τ × u)/ℓ at its ends.
+
+        Returns:
+            (joints, N, 3) of r̈, α and F, the rods' upper joints first.
+
         """
         wrench = self.inverse_columns[..., : 6 * self.n].reshape(self.n, 3, 3, self.n, 2, 3)
         force, moment = np.moveaxis(wrench[..., 0, :], 3, 0), np.moveaxis(wrench[..., 1, :], 3, 0)

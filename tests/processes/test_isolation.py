@@ -42,7 +42,9 @@ def test_every_fault_at_once_loses_exactly_its_own_cell(tmp_path, monkeypatch, c
     monkeypatch.chdir(tmp_path)
     faulty.register_faulty_engines()
     names = [fault.__name__ for fault in faulty.ERROR_BY_FAULT]
-    workers_of_other_tests = find_plumbline_workers()  # the pool of the matrix test lives as long as its session
+    workers_of_other_tests = (
+        find_plumbline_workers()
+    )  # the pool of the matrix test lives as long as its session
     result, place = run_nightly(tmp_path / "out", ["mujoco", *names])
     lost = {(row.engine, row.integrator): row.reason for row in result.rows if row.verdict == "failed"}
     expected = {

@@ -1,0 +1,137 @@
+"""Real runs of correct engines with one wrong number: does a level report it?
+
+The engine is the real one; between the harness and the adapter one parameter of the model, or of the initial
+state, is changed. The truth and all bounds are those of the unchanged scenario.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import cache
+from unittest.mock import patch
+
+import numpy as np
+
+from plumbline.engines.adapter import Adapter
+from plumbline.engines.calls import Evaluation, run_refinement, run_steps
+from plumbline.engines.registry import load_adapter
+from plumbline.judging.convergence import refinement_resolutions
+from plumbline.judging.coverage import CoverageEntry, scenario_coverage
+from plumbline.judging.rows import Level, Row, RowContext
+from plumbline.judging.state import judge_states
+from plumbline.judging.step import STEP_STATES, judge_steps, step_counts, step_sizes
+from plumbline.judging.trajectory import judge_trajectory
+from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, StepRun, Trajectory
+from plumbline.model.sampling import compared_states
+from plumbline.scenario.loader import Scenario, load_scenarios
+from plumbline.truth.closed_form import closed_form_motion
+from plumbline.truth.ground_truth import MotionTruth, StateTruth, motion_truth, state_truth
+from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters, perturb
+
+STATES = 50
+STATE_ENGINE, STEP_ENGINE, STEP_INTEGRATOR = "reference", "pinocchio", "rkmk4"
+MOTION_ENGINE, MOTION_INTEGRATOR = "reference", "collocation"
+Change = Callable[[Model, State], tuple[Model, State]]
+
+
+@cache
+def scenario(name: str) -> Scenario:
+    """A scenario of the catalogue."""
+    return load_scenarios([name])[0]
+
+
+@cache
+def states(name: str) -> list[State]:
+    """The states at which it is compared."""
+    s = scenario(name)
+    return compared_states(s.model, s.state, s.digest, STATES)
+
+
+@cache
+def true_states(name: str) -> StateTruth:
+    """The certified truth at those states."""
+    return state_truth(scenario(name).model, states(name))
+
+
+@cache
+def true_motion(name: str) -> MotionTruth:
+    """The true motion, as a run computes it."""
+    s = scenario(name)
+    closed = closed_form_motion(s)
+    exact = (*closed(s.times), closed.source) if closed and closed.amplitude == 0 else None
+    return motion_truth(s.model, s.state, s.times, exact)
+
+
+def with_change(engine: str, change: Change) -> Adapter:
+    """The real engine, given a changed model and state."""
+    real = type(load_adapter(engine))
+
+    class Changed(real):  # type: ignore[misc, valid-type]
+        def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
+            return [super(Changed, self)._evaluate(m, [s])[0] for m, s in (change(model, x) for x in states)]
+
+        def _simulate(
+            self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
+        ) -> Trajectory:
+            changed: Trajectory = super()._simulate(*change(model, state), times, integrator, resolution)
+            return changed
+
+        def _step(
+            self, model: Model, state: State, times: Array, integrator: Integrator, step: float
+        ) -> StepRun:
+            return StepRun(self._simulate(model, state, times, integrator, step))
+
+    return Changed()
+
+
+def judged_rows(name: str, level: Level, change: Change) -> list[Row]:
+    """The rows of one level of a scenario, of the level's engine with a change."""
+    s, context = scenario(name), RowContext(name, "", MOTION_ENGINE, MOTION_ENGINE, "0")
+    if level == "state":
+        answers = with_change(STATE_ENGINE, change).evaluate(s.model, states(name))
+        return judge_states(context, true_states(name), Evaluation(answers, None, None, 0.0)).rows
+    adapter = with_change(STEP_ENGINE if level == "step" else MOTION_ENGINE, change)
+    with patch("plumbline.engines.calls.load_adapter", lambda _: adapter):
+        if level == "step":
+            integrator, some = adapter.integrator(STEP_INTEGRATOR), states(name)[:STEP_STATES]
+            assert integrator.method is not None
+            sizes, counts = step_sizes(integrator.method, s.model, some), step_counts(integrator.method)
+            answer = run_steps(STEP_ENGINE, STEP_INTEGRATOR, s.model, some, sizes, counts)
+            return judge_steps(context, integrator, s.model, some, answer).rows
+        integrator = adapter.integrator(MOTION_INTEGRATOR)
+        steps = refinement_resolutions(integrator, s.model.n, s.duration)
+        study = run_refinement(MOTION_ENGINE, MOTION_INTEGRATOR, s.model, s.state, s.times, steps)
+    return judge_trajectory(context, s.model, true_motion(name), integrator, study).rows
+
+
+@cache
+def coverage(name: str, level: Level) -> tuple[CoverageEntry, ...]:
+    """The coverage table of one level, by the tolerances of the level's engine."""
+    s = scenario(name)
+    rows = judged_rows(name, level, lambda m, x: (m, x)) if level in ("trajectory", "invariants") else []
+    return tuple(scenario_coverage(name, s.model, s.state, s.times, states(name), rows, (level,)))
+
+
+def is_reported(entry: CoverageEntry, factor: float) -> bool:
+    """Whether a mistake of so many times the table's smallest one is reported at the entry's level."""
+    s = scenario(entry.scenario)
+    parameter = next(
+        one
+        for one in list_parameters(s.model, s.state)
+        if (one.body + 1, one.name) == (entry.body, entry.parameter)
+    )
+    assert entry.smallest is not None
+    rows = judged_rows(entry.scenario, entry.level, change_of(parameter, s.state, factor * entry.smallest))
+    return any(row.level == entry.level and row.verdict.needs_attention for row in rows)
+
+
+def change_of(parameter: Parameter, initial: State, size: float) -> Change:
+    """A mistake in the model, or in the initial state alone."""
+
+    def change(model: Model, state: State) -> tuple[Model, State]:
+        is_initial = np.array_equal(state.p, initial.p) and np.array_equal(state.omega, initial.omega)
+        if parameter.kind in STATE_KINDS and not is_initial:
+            return model, state
+        return perturb(model, state, parameter, size)
+
+    return change
