@@ -187,10 +187,3 @@ def main(context: click.Context) -> None:
     """Compare multibody engines with each other and with the notes' equations on identical pendulums."""
     if context.invoked_subcommand is None:
         click.echo(context.get_help())
-<<<<<<< HEAD
-=======
-
-
-for command in (list_, run, nightly, sweep, drift, coverage, history, report, check, schema, reproduce):
-    main.add_command(command)
->>>>>>> ab80c07 (Coverage: the smallest mistake in each number of a scenario that each level reports, and the command)
