@@ -24,7 +24,7 @@ run: .venv/truth.tried  ## the main job: the whole catalogue on all engines, tab
 	$(PYTHON) -m plumbline run
 
 test: lint reports/node_modules/.tried  ## style, types and the fast tests
-	$(PYTHON) -m pytest -n 2 --dist loadgroup
+	$(PYTHON) -m pytest -n 2
 
 lint: .venv/test.done  ## style and types only
 	$(PYTHON) -m ruff check .
@@ -33,7 +33,7 @@ lint: .venv/test.done  ## style and types only
 
 nightly: .venv/test.done  ## the full matrix with random scenarios, then the long tests
 	$(PYTHON) -m plumbline nightly
-	$(PYTHON) -m pytest -n 2 --dist loadgroup -m full
+	$(PYTHON) -m pytest -n 2 -m full
 
 bench: .venv/test.done  ## right-hand sides and work-precision beside the engines, as ratios within one run
 	$(PYTHON) -m bench.summary

@@ -1,4 +1,9 @@
-"""Rules for every test: a skip in continuous integration is an error unless it is listed here."""
+"""Rules for every test: which process runs it, and which skips continuous integration allows.
+
+`pytest -n 2` keeps the tests of a file in one process, so that what they share is computed once; the
+scenarios of the matrix are distributed one by one.  (pytest-xdist's loadgroup has no effect with pytest 9.2:
+pytest-dev/pytest-xdist#1386.)
+"""
 
 import os
 import re
@@ -8,6 +13,29 @@ import pytest
 ALLOWED_SKIPS = {  # pattern of the skip's reason: why continuous integration cannot run the test
     r"root may read everything": "the test needs a user without root's permissions",
 }
+
+LONGEST_FIRST = (  # begun last, one of these would keep one process busy while the others have no work
+    "planted_defects", "resume", "report_browser", "storage_faults", "step", "dask_cluster", "exit_codes",
+    "docs", "isolation", "trajectory_truth", "identity", "command_line", "adapter_contract", "sensitivity",
+    "selftest", "metamorphic", "certified", "nightly", "workers", "scripts", "report", "reference_pages",
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(items):
+    rank = {f"test_{name}.py": place for place, name in enumerate(LONGEST_FIRST)}
+    items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config, log):
+    from xdist.scheduler import LoadFileScheduling
+
+    class Scheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid):
+            return nodeid.partition(": ")[0] if "::test_cell[" in nodeid else super()._split_scope(nodeid)
+
+    config.option.loadscopereorder = False  # else files of many short tests begin first
+    return Scheduling(config, log)
 
 
 def _is_unexpected(report):

@@ -23,7 +23,7 @@ from plumbline.execution.plan import LevelSelection, Plan, ProgressCallback
 from plumbline.execution.result_cache import DiskResultCache
 from plumbline.execution.runner import RunResult, run_plan, save
 from plumbline.execution.selftest import SelfTestResult
-from plumbline.judging.known_issues import KnownIssue, load_known_issues
+from plumbline.judging.known_issues import KnownIssue, project_known_issues
 from plumbline.processes.workers import Limits
 from plumbline.reproduce.write import write_scripts
 from plumbline.scenario.generator import RANDOM_FAMILY, RandomScenarios
@@ -150,7 +150,7 @@ def run_nightly(
         random_trajectory_count=random_trajectory_count,
         result_cache=DiskResultCache(unfinished / "cells", log),
         are_engines_required=are_engines_required,
-        known_issues=load_known_issues() if known_issues is None else known_issues,
+        known_issues=project_known_issues() if known_issues is None else known_issues,
     )
     result = run_plan(plan, progress)
     place = unused_path(history / result.metadata["id"])

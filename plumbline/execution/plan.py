@@ -8,7 +8,7 @@ from enum import StrEnum
 from typing import Literal
 
 from plumbline.engines.adapter import EngineInfo
-from plumbline.judging.known_issues import KnownIssue, load_known_issues
+from plumbline.judging.known_issues import KnownIssue, project_known_issues
 from plumbline.processes.workers import Limits, ResultCache
 from plumbline.scenario.loader import Scenario
 
@@ -32,7 +32,7 @@ class Plan:
     extra_refinements: int = 0  # how many times the finest step is halved beyond the usual refinement study
     long_run_seconds: float = 0.0  # s of the long runs whose invariants are judged; 0: none
     are_engines_required: bool = False  # whether an engine that is not installed has failed
-    known_issues: Sequence[KnownIssue] = field(default_factory=load_known_issues)
+    known_issues: Sequence[KnownIssue] = field(default_factory=project_known_issues)
     user_rtol: float | None = None  # relative to each quantity's scale; shown beside the verdict only
     is_full_catalogue: bool = False  # the full catalogue on all engines: every known issue must occur
     scheduler: str | None = None  # address of a dask cluster to run on, instead of ``jobs`` workers here

@@ -13,6 +13,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -273,6 +274,20 @@ def load_known_issues(
     if problems:
         raise ScenarioError(problems)
     return [issue for entry in entries for issue in entry.issues()]
+
+
+@cache
+def project_known_issues() -> tuple[KnownIssue, ...]:
+    """Read the project's own file of known issues, once in a process.
+
+    Returns:
+        The entries of `KNOWN_ISSUES_FILE`.
+
+    Raises:
+        ScenarioError: the file is not valid.
+
+    """
+    return tuple(load_known_issues())
 
 
 def _name_problems(source: YamlSource, entries: Sequence[_Entry], others: set[str]) -> Iterator[Problem]:

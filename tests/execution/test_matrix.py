@@ -14,23 +14,20 @@ from plumbline.execution.runner import describe_engines
 from plumbline.execution.scenario_run import ScenarioRun
 from plumbline.judging import known_issues
 from plumbline.processes.workers import Limits, WorkerPool
-from plumbline.scenario import loader
+from tests.helpers.catalogue import catalogue_scenarios
 
 MAX_BODIES_IN_FAST_FORM = 5  # bodies: longer chains climb their ladders in the full form only
 LEVELS = ("state", "trajectory")
 
 
 def matrix_cells():
-    for name, path in loader.catalogue().items():
-        bodies = loader.load_scenario(path).model.n
+    for name, scenario in catalogue_scenarios().items():
         for engine in ENGINES:
             for level in LEVELS if load_adapter(engine).integrators else LEVELS[:1]:
-                marks = [pytest.mark.xdist_group(name)]  # one process per scenario: its truth is found once
-                if level == "trajectory" and bodies > MAX_BODIES_IN_FAST_FORM:
-                    marks.append(pytest.mark.full)
-                family = path.parent.name
-                label = name if family in name else f"{family}-{name}"
-                yield pytest.param(name, engine, level, id=f"{label}-{engine}-{level}", marks=marks)
+                is_full = level == "trajectory" and scenario.model.n > MAX_BODIES_IN_FAST_FORM
+                marks = [pytest.mark.full] if is_full else []
+                label = name if scenario.family in name else f"{scenario.family}-{name}"
+                yield pytest.param(name, engine, level, id=f"{label}: {engine}-{level}", marks=marks)
 
 
 @pytest.fixture(scope="session")
@@ -52,7 +49,7 @@ def truths():
 @pytest.mark.parametrize(("name", "engine", "level"), list(matrix_cells()))
 @pytest.mark.timeout(900)
 def test_cell(name, engine, level, workers, engines, truths):
-    found = loader.load_scenario(loader.find_scenario_file(name))
+    found = catalogue_scenarios()[name]
     info = engines[engine]
     if info.missing:
         pytest.skip(info.missing)
@@ -69,7 +66,7 @@ def test_cell(name, engine, level, workers, engines, truths):
         tasks = [task for task in follow if task.key.kind != TaskKind.DIAGNOSIS]
     rows = bench.findings().rows
     assert rows, "no answer at all"
-    excuses = known_issues.KnownIssues(known_issues.load_known_issues(), has_extra_refinements=False)
+    excuses = known_issues.KnownIssues(known_issues.project_known_issues(), has_extra_refinements=False)
     wrong = [
         f"{r.key} {r.verdict}: {r.reason}"
         for r in excuses.mark_known(rows, found.model.n)

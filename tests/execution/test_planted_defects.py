@@ -42,7 +42,6 @@ from tests.helpers.planted_defects import (
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(engine)
 
-pytestmark = pytest.mark.xdist_group("planted defects")  # the reports are cached in one process
 STATES = 10
 TIMES = np.linspace(0, 2, 17)
 

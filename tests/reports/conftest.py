@@ -1,4 +1,4 @@
-"""One stored run and one browser for all tests of the pages; `xdist_group` keeps them on one worker."""
+"""One stored run and one browser for all tests of the pages."""
 
 from __future__ import annotations
 

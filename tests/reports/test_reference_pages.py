@@ -20,7 +20,6 @@ from reports import html_report, reference_tables, sweep_page
 from reports.results import Results, replace_unprintable
 from tests.helpers.example_results import HOSTILE, NASTY
 
-pytestmark = pytest.mark.xdist_group("reports")
 MEASURED: dict[str, Any] = {
     "rtol": 1e-9,
     "gap_rate": 4.5e-9,

@@ -33,9 +33,6 @@ from tests.helpers import example_results as fixture
 REPORTS = Path(html_report.__file__).parent
 
 
-pytestmark = pytest.mark.xdist_group("reports")
-
-
 @pytest.fixture(scope="module")
 def out(example_run):
     return example_run

@@ -20,7 +20,7 @@ from reports import html_report as report
 from reports.results import Results
 from tests.helpers import example_results as fixture
 
-pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("reports")]
+pytestmark = pytest.mark.browser
 OPENING, CELL = 1.0, 0.3  # s, the issue's figures
 CLICK = """async () => {  // s from a click on a cell until its view is complete and painted
   const began = performance.now();

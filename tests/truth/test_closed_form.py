@@ -12,15 +12,14 @@ from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import Model, State
 from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import quaternion_product, rotation_matrix, state_from_minimal
-from plumbline.scenario.loader import catalogue, load_scenario
 from plumbline.truth.closed_form import CLOSED_FORMS, ClosedFormMismatch, closed_form_motion
 from plumbline.truth.elliptic import elliptic_f, elliptic_pi, jacobi
+from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.relative_equilibria import relative_equilibrium
 
 TIMES = np.arange(41) * 0.05
-CLOSED_FORM_SCENARIOS = {name: load_scenario(path) for name, path in catalogue().items()}
 CLOSED_FORM_SCENARIOS = {
-    name: scenario for name, scenario in CLOSED_FORM_SCENARIOS.items() if scenario.closed_form
+    name: scenario for name, scenario in catalogue_scenarios().items() if scenario.closed_form
 }
 
 

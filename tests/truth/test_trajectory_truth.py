@@ -11,17 +11,18 @@ import pytest
 from plumbline.model.datatypes import EngineFailure
 from plumbline.model.invariants import attitude_error, position_error
 from plumbline.processes.workers import Limits, Task, WorkerPool
-from plumbline.scenario.loader import catalogue, find_scenario_file, load_scenario
+from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth import ground_truth, trajectory
 from plumbline.truth.certified import certify_state
 from plumbline.truth.closed_form import closed_form_motion
 from plumbline.truth.notes_motion import simulate_notes_form
 from plumbline.truth.taylor import load_heyoka, simulate_taylor
 from plumbline.truth.trajectory import MAX_EXTENDED_PRECISION_BODIES, NOTES_RTOL, trajectory_truth
+from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.random_chains import random_chain
 
 TIMES = np.arange(41) * 0.05
-CATALOGUE = [load_scenario(path) for path in catalogue().values()]
+CATALOGUE = list(catalogue_scenarios().values())
 BALL_JOINT_SCENARIOS = [s for s in CATALOGUE if not s.model.rods.any()]
 CLOSED_FORM_SCENARIOS = [s for s in CATALOGUE if (closed := closed_form_motion(s)) and closed.amplitude == 0]
 
