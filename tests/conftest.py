@@ -10,6 +10,8 @@ import re
 
 import pytest
 
+from plumbline.processes.user_cache import user_cache_folder
+
 ALLOWED_SKIPS = {  # pattern of the skip's reason: why continuous integration cannot run the test
     r"root may read everything": "the test needs a user without root's permissions",
 }
@@ -36,6 +38,15 @@ def pytest_xdist_make_scheduler(config, log):
 
     config.option.loadscopereorder = False  # else files of many short tests begin first
     return Scheduling(config, log)
+
+
+@pytest.fixture(autouse=True)
+def own_cells(tmp_path_factory, monkeypatch):
+    """A test finds no cells of other runs. It shares the environments of engines, which take long to make."""
+    folder = tmp_path_factory.mktemp("cache")
+    (folder / "engines").symlink_to(user_cache_folder() / "engines")
+    monkeypatch.setenv("PLUMBLINE_CACHE", str(folder))
+    return folder / "cells"
 
 
 def _is_unexpected(report):

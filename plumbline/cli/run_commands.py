@@ -16,7 +16,7 @@ from plumbline.cli.console import ProgressDisplay, print_result
 from plumbline.cli.help_texts import EXIT_CODES, examples
 from plumbline.engines.registry import ENGINES
 from plumbline.execution.plan import Plan
-from plumbline.execution.result_cache import DiskResultCache
+from plumbline.execution.result_cache import DiskResultCache, user_cells_folder
 from plumbline.execution.runner import RunResult, run_plan, save
 from plumbline.processes.workers import Limits
 from plumbline.storage.results_store import row_record, to_json_value
@@ -53,18 +53,19 @@ from plumbline.storage.results_store import row_record, to_json_value
     help="A relative tolerance of your own; results and report show it beside each derived verdict, which it "
     "does not change.",
 )
+@click.option("--fresh", is_flag=True, help="Compute everything again, also what earlier runs computed.")
 @options.timeout_option(300.0)
 @options.memory_option
 def run(
     names: tuple[str, ...], families: tuple[str, ...], engines: list[str], level: Any, jobs: int,
     scheduler: str | None, known_files: tuple[Path, ...], out: Path, as_json: bool, user_rtol: float | None,
-    timeout: float, memory: float,
+    fresh: bool, timeout: float, memory: float,
 ) -> None:  # fmt: skip
     """Compare scenarios (names of the catalogue, or paths of YAML files; default: all) on all engines."""
     chosen = options.choose_scenarios(names, families)
     known_issues = options.read_known_issues(known_files, chosen)
     folder = options.ensure_writable(out)
-    cache = DiskResultCache(folder / "cells", _log)
+    cache = DiskResultCache(user_cells_folder(), _log, is_fresh=fresh)
     plan = Plan(
         chosen,
         engines,
@@ -87,7 +88,7 @@ def run(
         with result.cpu_times.measure("report"):
             write_scripts(folder)
             report = reports.write(folder)
-        cache.clear()
+        cache.trim()
     if as_json:
         document = {
             "run": result.metadata,
@@ -187,5 +188,7 @@ def _finish(result: RunResult, report: Path, as_json: bool) -> None:
     if not as_json:
         print_result(result)
     click.echo(f"report: {report}", err=as_json)
+    if cached := result.cpu_times.cached_count:
+        _log(f"{cached} answers of earlier runs were used; --fresh computes them again")
     _log(result.cpu_times.summary())
     sys.exit(result.metadata["exit_code"])

@@ -24,6 +24,7 @@ from packaging.version import InvalidVersion, Version
 from plumbline.engines.registry import ENGINES
 from plumbline.processes.errors import PlumblineError
 from plumbline.processes.isolation import ScratchFolder
+from plumbline.processes.user_cache import user_cache_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 BASE_REQUIREMENTS = ("numpy", "scipy", "packaging")  # imported by adapters and by the core in workers
@@ -154,7 +155,7 @@ def ensure_interpreter(name: str) -> str:
     wanted = [requirement, *BASE_REQUIREMENTS]
     wanted += [need for versions, need in extra if SpecifierSet(versions).contains(number)]
     tag = hashlib.sha256("\n".join([*wanted, sys.version]).encode()).hexdigest()[:8]
-    place = _environments_folder() / f"{package}-{label}-{tag}"
+    place = user_cache_folder() / "engines" / f"{package}-{label}-{tag}"
     if not _interpreter_path(place).exists():
         place.parent.mkdir(parents=True, exist_ok=True)
         with ScratchFolder(".making-", place.parent) as scratch:
@@ -171,14 +172,6 @@ def ensure_interpreter(name: str) -> str:
 
 def _interpreter_path(environment: Path) -> Path:
     return environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
-
-
-def _environments_folder() -> Path:
-    if os.name == "nt":
-        home = Path(os.environ.get("LOCALAPPDATA") or Path.home() / "AppData" / "Local")
-    else:
-        home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return home / "plumbline" / "engines"
 
 
 def newest_requirement(package: str, *, pre: bool) -> str:

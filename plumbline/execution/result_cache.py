@@ -1,15 +1,17 @@
-"""Finished cells of an unfinished run on disk: killed at any moment, the same command resumes.
+"""Finished cells on disk: an unchanged cell is not computed again, and a killed run goes on where it stopped.
 
-A cell is one task's answer before it is judged, in OUT/cells/HASH.cell.  The hash covers everything that the
-answer depends on: the call and its arguments (model, states, times, steps, integrator), the engine's version,
-this project's code and the libraries under it.  A file is the SHA-256 of the rest, then a pickle, written
-whole or not at all; the cell of a damaged file is reported and runs again.  Loading a pickle can run any
-code: share results, never this folder.
+A cell is one task's answer and what its judge returned, in FOLDER/HASH.cell.  The hash covers everything that
+they depend on: the calls and their arguments (model, states, times, steps, integrator, truth), the engine's
+version, this project's code below `execution`, and what is installed.  A file is the SHA-256 of the rest,
+then a pickle, written whole or not at all; the cell of a damaged file is reported and runs again.  Loading a
+pickle can run any code: share results, never this folder.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
+import os
 import pickle
 import platform
 import shutil
@@ -18,32 +20,38 @@ import sys
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from plumbline.processes.user_cache import user_cache_folder
 from plumbline.processes.workers import Outcome, Pickled, ResultCache, Task
 from plumbline.storage.results_store import write_atomically
 
 ROOT = Path(__file__).resolve().parents[2]
 _HASHED_PACKAGES = ("plumbline", "adapters", "reference_impl")
-_HASHED_LIBRARIES = ("numpy", "scipy", "python-flint")  # of truth and reference; engines have their versions
+# Tasks call functions of the packages below these; tests/architecture checks that those import none of them.
+_UNHASHED_PACKAGES = ("plumbline/cli", "plumbline/execution", "plumbline/reproduce", "plumbline/storage",
+                      "plumbline/studies")  # fmt: skip
+MAX_BYTES = 2 * 2**30  # of the cells that runs share; the whole catalogue at all levels takes a tenth of it
 
 
 class DiskResultCache(ResultCache):
-    """The finished cells of one output folder."""
+    """The finished cells of one folder."""
 
-    def __init__(self, folder: Path, log: Callable[[str], None] = lambda _: None) -> None:
+    def __init__(
+        self, folder: Path, log: Callable[[str], None] = lambda _: None, *, is_fresh: bool = False
+    ) -> None:
         """Open the cache.
 
         Args:
             folder: folder of the cells, made when the first one is written.
             log: called with a sentence about each damaged file.
+            is_fresh: whether cells of earlier runs are computed again.
 
         """
-        self._folder, self._log = folder, log
+        self._folder, self._log, self._is_fresh = folder, log, is_fresh
         self._pending_paths: dict[Any, Path] = {}  # of running tasks, by their keys
 
     def cell_path(self, task: Task) -> Path:
@@ -69,8 +77,11 @@ class DiskResultCache(ResultCache):
 
         """
         path = self._pending_paths[task.key] = self.cell_path(task)
+        if self._is_fresh:
+            return None
         try:
             data = path.read_bytes()
+            os.utime(path)  # the cells that are used last stay longest
         except FileNotFoundError:
             return None
         except OSError as error:
@@ -80,8 +91,11 @@ class DiskResultCache(ResultCache):
             self._log(f"{path}: damaged; the cell runs again")
             return None
         del self._pending_paths[task.key]
-        answer, cost = pickle.loads(data[32:])
-        return Outcome(task.key, Pickled(answer), cpu_time=cost)
+        answer, cost, judged = pickle.loads(data[32:])
+        return Outcome(
+            task.key, None if answer is None else Pickled(answer), cpu_time=cost, judge_result=judged,
+            is_cached=True,
+        )  # fmt: skip
 
     def put(self, task: Task, outcome: Outcome) -> None:
         """Write an answer to disk, except a failure, whose cause may have been the machine.
@@ -95,14 +109,45 @@ class DiskResultCache(ResultCache):
 
         """
         path = self._pending_paths.pop(task.key, None) or self.cell_path(task)
-        if outcome.failure is None:
+        if outcome.failure is None and not outcome.judge_failure:
             self._folder.mkdir(parents=True, exist_ok=True)
-            body = pickle.dumps((outcome.pickled.data, outcome.cpu_time), protocol=5)
+            answer = outcome.pickled.data if task.sends_answer else None
+            body = pickle.dumps((answer, outcome.cpu_time, outcome.judge_result), protocol=5)
             write_atomically(path, hashlib.sha256(body).digest() + body)
 
     def clear(self) -> None:
         """Remove all cells, after the run has been stored."""
         shutil.rmtree(self._folder, ignore_errors=True)
+
+    def trim(self, max_bytes: int = MAX_BYTES) -> None:
+        """Remove the cells that were not used for longest, until the others fit.
+
+        Args:
+            max_bytes: what the cells may take together.
+
+        """
+        found = []
+        for path in self._folder.glob("*.cell"):
+            with contextlib.suppress(OSError):  # another run may have removed it
+                about = path.stat()
+                found.append((about.st_mtime, about.st_size, path))
+        excess = sum(size for _, size, _ in found) - max_bytes
+        for _, size, path in sorted(found):
+            if excess <= 0:
+                return
+            with contextlib.suppress(OSError):
+                path.unlink()
+                excess -= size
+
+
+def user_cells_folder() -> Path:
+    """Locate the cells that the user's runs share.
+
+    Returns:
+        The folder; it need not exist.
+
+    """
+    return user_cache_folder() / "cells"
 
 
 def task_hash(task: Task) -> str:
@@ -120,28 +165,38 @@ def task_hash(task: Task) -> str:
     """
     digest = hashlib.sha256()
     name = f"{task.function.__module__}.{task.function.__qualname__}"
-    for part in (_environment_fingerprint(), name, task.version, task.arguments):
+    judge = f"{task.judge.__module__}.{task.judge.__qualname__}" if task.judge else ""
+    answer = name, task.version, task.python, task.arguments
+    for part in (_environment_fingerprint(), *answer, judge, task.judge_arguments, task.sends_answer):
         _update_hash(digest, part)
     return digest.hexdigest()
 
 
 @cache
 def _environment_fingerprint() -> str:
-    """Hash the project's code, the interpreter, the libraries and the kind of machine."""
+    """Hash the project's code, the interpreter, what is installed and the kind of machine."""
     digest = hashlib.sha256()
     for folder in _HASHED_PACKAGES:
         for path in sorted((ROOT / folder).rglob("*.py")):
-            _update_hash(digest, (path.relative_to(ROOT).as_posix(), path.read_bytes()))
-    _update_hash(digest, (sys.version, platform.machine(), *map(_installed_version, _HASHED_LIBRARIES)))
+            name = path.relative_to(ROOT).as_posix()
+            if not name.startswith(_UNHASHED_PACKAGES):
+                _update_hash(digest, (name, path.read_bytes()))
+    _update_hash(digest, (sys.version, platform.machine(), *_installed_distributions()))
     return digest.hexdigest()
 
 
-def _installed_version(package: str) -> str:
-    """A distribution's version, empty where it is not installed."""
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return ""
+def _installed_distributions() -> list[tuple[str, int, int]]:
+    """Name with version of every installed distribution, size and time [ns] of its list of files.
+
+    An engine that is built and installed again under the same version has another time.
+    """
+    found = []
+    for folder in dict.fromkeys(map(Path, sys.path)):
+        for path in sorted(folder.glob("*.dist-info")):
+            with contextlib.suppress(OSError):
+                about = (path / "RECORD").stat()
+                found.append((path.name, about.st_size, about.st_mtime_ns))
+    return found
 
 
 def _update_hash(digest: Any, value: Any) -> None:

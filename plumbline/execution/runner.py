@@ -24,7 +24,14 @@ from plumbline.judging import known_issues
 from plumbline.judging.identity import RUN_SCENARIO, IdentityCheck
 from plumbline.judging.rows import Row, Verdict
 from plumbline.processes.cpu_time import CpuTimes
-from plumbline.processes.workers import Executor, ExecutorUnavailable, Scheduler, Task, WorkerPool
+from plumbline.processes.workers import (
+    Executor,
+    ExecutorUnavailable,
+    ResultCache,
+    Scheduler,
+    Task,
+    WorkerPool,
+)
 from plumbline.storage import results_store
 
 RUN_SUMMARY: dict[str, Any] = {  # of the rows that are about the whole run
@@ -58,7 +65,11 @@ class RunResult:
 
 
 def describe_engines(
-    executor: Executor, engines: Sequence[str], *, are_required: bool = False
+    executor: Executor,
+    engines: Sequence[str],
+    *,
+    are_required: bool = False,
+    result_cache: ResultCache | None = None,
 ) -> dict[str, EngineInfo]:
     """Ask every engine for its description, in the version that its name demands.
 
@@ -66,6 +77,7 @@ def describe_engines(
         executor: makes the calls.
         engines: names, as ``mujoco`` or ``mujoco@3.12.0``.
         are_required: whether an engine that is not installed has failed, since the user named it.
+        result_cache: descriptions of earlier runs with the same installation.
 
     Returns:
         Description by name; an engine that raises, crashes or hangs when it is imported, and a version whose
@@ -84,7 +96,7 @@ def describe_engines(
         key = TaskKey(TaskKind.DESCRIPTION, engine=name)
         tasks.append(Task(key, calls.describe_engine, (base,), executor.limits, python=python))
     pythons = {task.key: task.python for task in tasks}
-    for outcome in executor.run(tasks):
+    for outcome in Scheduler(executor, result_cache).run(tasks):
         name, python = outcome.key.engine, pythons[outcome.key]
         info = outcome.value or EngineInfo(
             name, name, "", (), f"cannot be loaded: {outcome.failure}", has_failed=True
@@ -131,6 +143,7 @@ def run_plan(plan: Plan, progress: ProgressCallback) -> RunResult:
         "states": plan.random_state_count + 1,
         "sentence": summarize_verdicts(result),
         "exit_code": int(exit_code(result)),
+        "cached_tasks": run.cpu_times.cached_count,
         "identity": run.identity.summary(),
         "stale_issues": [issue.id for issue in result.stale_issues],
     }
@@ -157,7 +170,10 @@ class _Run:
 
     def execute(self, executor: Executor, progress: ProgressCallback) -> None:
         plan = self.plan
-        self.engines = describe_engines(executor, plan.engines, are_required=plan.are_engines_required)
+        cache = self.cpu_times.timed_cache(plan.result_cache)
+        self.engines = describe_engines(
+            executor, plan.engines, are_required=plan.are_engines_required, result_cache=cache
+        )
         self.identity = IdentityCheck(self.engines)
         has_long_runs = plan.long_run_seconds > 0
         total = sum(
@@ -168,7 +184,7 @@ class _Run:
         total += runs * sum(1 for _ in task_keys("", self.engines, plan.level))
         others = len(plan.random_scenarios) - runs
         total += others * sum(1 for _ in task_keys("", self.engines, plan.random_level))
-        scheduler = Scheduler(executor, self.cpu_times.timed_cache(plan.result_cache))
+        scheduler = Scheduler(executor, cache)
         for done, outcome in enumerate(scheduler.run(self._tasks()), start=1):
             self.cpu_times.add_outcome(outcome, outcome.key.cpu_time_kind)
             with self.cpu_times.measure("judging"):

@@ -29,8 +29,7 @@ from plumbline.judging.step import (
     MAX_STEP_BODIES,
     STEP_STATES,
     judge_steps,
-    step_counts,
-    step_sizes,
+    run_step_study,
 )
 from plumbline.judging.trajectory import judge_trajectory
 from plumbline.model.datatypes import Integrator, StateQuantities
@@ -108,8 +107,7 @@ class ScenarioRun:
         self._pending = set(self._keys)  # without an outcome
         self._findings: dict[TaskKey, JudgingResult] = {}
         self._has_retried_truth = False
-        self._waiting: list[Outcome] = []  # answers that arrived before their truth
-        self._state_truth: Pickled | None = None  # for judges and diagnoses in workers
+        self._pickled_truths: dict[TaskKind, Pickled] = {}  # for judges and diagnoses in workers
         count = plan.random_state_count
         count = min(count, STATES_PER_RANDOM_SCENARIO) if is_random else count
         states = compared_states(scenario.model, scenario.state, scenario.digest, count)
@@ -117,18 +115,17 @@ class ScenarioRun:
         self._step_states = states[:STEP_STATES]
 
     def tasks(self) -> Iterator[Task]:
-        """Make the tasks that can start: the truths that are missing, and all cells but those of states.
+        """Make the tasks that can start: the truths that are missing, and the cells that need none.
 
         Yields:
-            The tasks. Those of states follow their truth, because the worker judges them.
+            The tasks. Other cells follow their truth, because the worker judges them.
 
         """
         for key in self._keys:
-            if not key.is_truth:
-                if key.kind != TaskKind.STATE:
-                    yield self._cell_task(key)
-            elif key.kind not in self.truths:
+            if key.is_truth and key.kind not in self.truths:
                 yield self.truth_task(key)
+            elif not key.is_truth and key.needed_truth is None:
+                yield self._cell_task(key)
 
     def truth_task(self, key: TaskKey, *compiled_bodies: int) -> Task:
         """Make the task of a truth.
@@ -175,7 +172,7 @@ class ScenarioRun:
         return found
 
     def on_outcome(self, outcome: Outcome) -> list[Task]:
-        """Take the outcome of a task: keep a truth; judge an answer, or keep it until its truth comes.
+        """Take the outcome of a task: keep a truth or what the judge found.
 
         Args:
             outcome: of a task of this scenario.
@@ -192,22 +189,15 @@ class ScenarioRun:
         following = []
         if key.kind == TaskKind.DIAGNOSIS:
             self._add_diagnosis(outcome)
-        elif not key.is_truth:
-            self._waiting.append(outcome)
-        else:
+        elif key.is_truth:
             self.truths[key.kind] = TruthFailure(outcome.failure) if outcome.failure else outcome.value
-            if key.kind == TaskKind.STATE_TRUTH:
-                self._state_truth = None if outcome.failure else outcome.pickled
-                following = [self._cell_task(k) for k in self._keys if k.kind == TaskKind.STATE]
-        waiting, self._waiting = self._waiting, []
-        for answer in waiting:
-            needed = answer.key.needed_truth
-            if needed is not None and needed not in self.truths:
-                self._waiting.append(answer)
-                continue
-            found = self._findings[answer.key] = self._judge(answer)
-            if answer.key.kind == TaskKind.STATE and self._has_unexplained_rows(found):
-                following.append(self._diagnosis_task(answer.key.engine, answer.value.quantities))
+            if not outcome.failure:
+                self._pickled_truths[key.kind] = outcome.pickled
+            following = [self._cell_task(k) for k in self._keys if k.needed_truth == key.kind]
+        else:
+            found = self._findings[key] = self._judged(outcome)
+            if key.kind == TaskKind.STATE and self._has_unexplained_rows(found):
+                following = [self._diagnosis_task(key.engine, outcome.value.quantities)]
         self._pending |= {task.key for task in following}
         return following
 
@@ -278,43 +268,53 @@ class ScenarioRun:
         return next(i for i in self._engines[key.engine].integrators if i.name == key.integrator)
 
     def _cell_task(self, key: TaskKey) -> Task:
-        s, plan, info = self.scenario, self._plan, self._engines[key.engine]
-        call: Callable[..., Any]
-        arguments: tuple[Any, ...] = (s.model, self._states)
-        judge: tuple[Any, ...] = ()  # function and arguments of the judge in the worker
-        if key.kind == TaskKind.STATE:
-            call = calls.evaluate_states
-            if self._state_truth is not None:
-                judge = judge_states, (self._context(key.engine), self._state_truth)
-        elif key.kind == TaskKind.RELATIONS:
-            call = metamorphic.check_relations
-        elif key.kind == TaskKind.STEP:
-            call, integrator = calls.run_steps, self._integrator(key)
-            assert integrator.method is not None
-            sizes = step_sizes(integrator.method, s.model, self._step_states)
-            arguments = (
-                integrator.name, s.model, self._step_states, sizes, step_counts(integrator.method)
-            )  # fmt: skip
-            judge = judge_steps, (self._context(key.engine), integrator, s.model, self._step_states)
-        else:
-            integrator = self._integrator(key)
-            if key.kind == TaskKind.TRAJECTORY:
-                call = calls.run_refinement
-                steps = refinement_resolutions(integrator, s.model.n, s.duration, plan.extra_refinements)
-                arguments = (integrator.name, s.model, s.state, s.times, steps)
-            else:
-                call = run_long_run_study
-                length = plan_long_run(integrator, s.model.n, plan.long_run_seconds)
-                arguments = (integrator.name, s.model, s.state, s.sample_interval, length)
-        base, _ = environments.split_version(key.engine)
-        return Task(key, call, (base, *arguments), plan.limits, info.version, info.python, *judge)
+        call, arguments = self._call(key)
+        (base, _), info = environments.split_version(key.engine), self._engines[key.engine]
+        judge, judge_arguments = self._judge(key)
+        return Task(
+            key, call, (base, *arguments), self._plan.limits, info.version, info.python, judge,
+            judge_arguments, sends_answer=key.kind == TaskKind.STATE,
+        )  # fmt: skip
 
-    def _judge(self, outcome: Outcome) -> JudgingResult:
-        """Judge one cell."""
+    def _call(self, key: TaskKey) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        """The function that computes a cell, and its arguments after the engine."""
+        s, plan = self.scenario, self._plan
+        if key.kind == TaskKind.STATE:
+            return calls.evaluate_states, (s.model, self._states)
+        if key.kind == TaskKind.RELATIONS:
+            return metamorphic.check_relations, (s.model, self._states)
+        integrator = self._integrator(key)
+        if key.kind == TaskKind.STEP:
+            return run_step_study, (integrator, s.model, self._step_states)
+        if key.kind == TaskKind.TRAJECTORY:
+            steps = refinement_resolutions(integrator, s.model.n, s.duration, plan.extra_refinements)
+            return calls.run_refinement, (integrator.name, s.model, s.state, s.times, steps)
+        length = plan_long_run(integrator, s.model.n, plan.long_run_seconds)
+        return run_long_run_study, (integrator.name, s.model, s.state, s.sample_interval, length)
+
+    def _judge(self, key: TaskKey) -> tuple[Callable[..., JudgingResult] | None, tuple[Any, ...]]:
+        """The function that judges a cell's answer in the worker, and its arguments; None without a truth."""
+        s, context = self.scenario, self._context(key.engine)
+        if key.kind == TaskKind.RELATIONS:
+            return metamorphic.judge_relations, (context,)
+        if key.kind == TaskKind.STEP:
+            return judge_steps, (context, self._integrator(key), s.model, self._step_states)
+        if key.kind == TaskKind.LONG_RUN:
+            is_regular = s.closed_form is not None
+            return judge_long_runs, (context, s.model, self._integrator(key), is_regular)
+        assert key.needed_truth is not None
+        truth = self._pickled_truths.get(key.needed_truth)
+        if truth is None:
+            return None, ()
+        if key.kind == TaskKind.STATE:
+            return judge_states, (context, truth)
+        return judge_trajectory, (context, s.model, truth, self._integrator(key))
+
+    def _judged(self, outcome: Outcome) -> JudgingResult:
+        """What the judge of a cell found, or why there is none."""
         key: TaskKey = outcome.key
-        context = self._context(key.engine)
         truth = self.truths.get(key.needed_truth) if key.needed_truth else None
-        doubt = ""
+        doubt = f"the answer cannot be judged: {outcome.judge_failure}" if outcome.judge_failure else ""
         if isinstance(truth, TruthFailure):
             doubt = f"{self.scenario.name} has no truth to judge by: {truth.reason}"
         elif isinstance(truth, MotionTruth) and truth.conflict:
@@ -324,26 +324,11 @@ class ScenarioRun:
                 (Verdict.HARNESS_FAILED, doubt) if doubt else (Verdict.FAILED, outcome.failure or "")
             )
             quantity = "all_long" if key.kind == TaskKind.LONG_RUN else "all"
-            row = context.make_row(_LEVELS[key.kind], key.integrator or "-", quantity, verdict, lost)
+            row = self._context(key.engine).make_row(
+                _LEVELS[key.kind], key.integrator or "-", quantity, verdict, lost
+            )
             return JudgingResult(rows=[row])
-        if outcome.judge_result is not None:
-            found: JudgingResult = outcome.judge_result
-        elif isinstance(truth, StateTruth):
-            found = judge_states(context, truth, outcome.value)
-        elif isinstance(truth, MotionTruth):
-            integrator = self._integrator(key)
-            found = judge_trajectory(context, self.scenario.model, truth, integrator, outcome.value)
-        elif key.kind == TaskKind.STEP:
-            found = judge_steps(
-                context, self._integrator(key), self.scenario.model, self._step_states, outcome.value
-            )
-        elif key.kind == TaskKind.LONG_RUN:
-            is_regular = self.scenario.closed_form is not None
-            found = judge_long_runs(
-                context, self.scenario.model, self._integrator(key), outcome.value, is_regular
-            )
-        else:
-            found = metamorphic.judge_relations(context, outcome.value)
+        found: JudgingResult = outcome.judge_result
         found.rows = mark_aliases(found.rows)
         if self._plan.user_rtol is not None:
             found.rows = [replace(row, user_rtol=self._plan.user_rtol) for row in found.rows]
@@ -361,7 +346,7 @@ class ScenarioRun:
 
         (base, _), info = environments.split_version(engine), self._engines[engine]
         key = TaskKey(TaskKind.DIAGNOSIS, self.scenario.name, engine)
-        arguments = (base, self.scenario.model, quantities, self._state_truth)
+        arguments = (base, self.scenario.model, quantities, self._pickled_truths[TaskKind.STATE_TRUTH])
         return Task(key, explain_disagreement, arguments, self._plan.limits, info.version, info.python)
 
     def _add_diagnosis(self, outcome: Outcome) -> None:

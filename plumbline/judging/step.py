@@ -20,15 +20,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 
-from plumbline.engines.calls import StepEvaluation
+from plumbline.engines.calls import StepEvaluation, run_steps
 from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict
 from plumbline.model.datatypes import Array, Integrator, Model, State, StepRun
 from plumbline.model.kinematics import angular_velocity, state_from_minimal
 from plumbline.model.sampling import derive_seed
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod, StepMethod
+from plumbline.processes.workers import Pickled
 from plumbline.truth.ground_truth import stretched_length
 from plumbline.truth.rounding_bound import EPS, RoundingBound, state_rounding_bound
 from plumbline.truth.step_formulas import (
@@ -73,11 +75,39 @@ def step_counts(method: StepMethod | None) -> tuple[int, ...]:
     return (1, 3) if isinstance(method, ConstrainedMethod) else (1, 10)
 
 
-def step_sizes(method: StepMethod, model: Model, states: Sequence[State]) -> list[list[float]]:
+def run_step_study(
+    engine: str, integrator: Integrator, model: Model, states: Sequence[State]
+) -> StepEvaluation:
+    """Take the steps that `judge_steps` judges (to be called in a worker).
+
+    Args:
+        engine: name of the engine in the registry.
+        integrator: one of its integrators, with a declared formula.
+        model: the pendulum.
+        states: states of it.
+
+    Returns:
+        The steps.
+
+    """
+    assert integrator.method is not None
+    sizes = _remembered_step_sizes(
+        isinstance(integrator.method, ConstrainedMethod), Pickled.of((model, states))
+    )
+    return run_steps(engine, integrator.name, model, states, sizes, step_counts(integrator.method))
+
+
+@lru_cache(maxsize=4)
+def _remembered_step_sizes(has_constraints: bool, arguments: Pickled) -> list[list[float]]:
+    """The steps of a scenario, whose integrators a worker gets in a row."""
+    return step_sizes(has_constraints, *arguments.load())
+
+
+def step_sizes(has_constraints: bool, model: Model, states: Sequence[State]) -> list[list[float]]:
     """Choose the steps from each state: `STEP_SIZES`, in proportion smaller where the motion is fast.
 
     Args:
-        method: the declared formula.
+        has_constraints: whether the declared formula is a `ConstrainedMethod`.
         model: the pendulum.
         states: states of it.
 
@@ -92,7 +122,7 @@ def step_sizes(method: StepMethod, model: Model, states: Sequence[State]) -> lis
     for state, fastest in zip(states, fastest_rates(model, states), strict=True):
         turning = np.asarray(first_coordinate_acceleration(model, state)[:, 3:], float)
         squares = [2 * np.max(norm(turning, axis=1)), np.max(norm(state.udot, axis=1)) ** 2, fastest**2]
-        if isinstance(method, ConstrainedMethod):
+        if has_constraints:
             force = np.asarray(state_rounding_bound(model, state).scale["joint_reaction"])
             lever = norm(model.proximal, axis=1) + norm(model.distal, axis=1)
             squares.append(np.max(force * lever / np.linalg.eigvalsh(model.inertia)[:, 0]))

@@ -16,22 +16,29 @@ class CpuTimes:
 
     Attributes:
         seconds: CPU time [s] by kind of `CPU_TIME_KINDS`; "process" is starting workers and moving data.
+        cached_count: number of tasks whose answer was in the result cache.
 
     """
 
     def __init__(self) -> None:
         """Start with zero seconds of every kind."""
         self.seconds = dict.fromkeys(CPU_TIME_KINDS, 0.0)
+        self.cached_count = 0
         self._measured = 0.0  # s of this process, counted by `measure`
 
     def add_outcome(self, outcome: Outcome, kind: str) -> None:
         """Count what a task took in its worker: the call, its judge, imports and transfer.
+
+        An answer from the result cache took nothing.
 
         Args:
             outcome: the task's outcome.
             kind: the kind of the call, of `CPU_TIME_KINDS`.
 
         """
+        if outcome.is_cached:
+            self.cached_count += 1
+            return
         self.seconds[kind] += outcome.cpu_time
         self.seconds["judging"] += outcome.judge_cpu_time
         self.seconds["process"] += outcome.overhead_cpu_time

@@ -88,6 +88,7 @@ class Task:
     python: str = ""  # interpreter of another environment that makes the call; empty: the worker itself
     judge: Callable[..., Any] | None = None  # called in the worker with judge_arguments and the answer
     judge_arguments: tuple[Any, ...] = ()
+    sends_answer: bool = True  # False: only what the judge returned comes back
 
 
 @dataclass(frozen=True)
@@ -98,9 +99,11 @@ class Outcome:
     raw_value: Any = None  # the answer, or its pickle as the worker sent it
     failure: str | None = None
     cpu_time: float = 0.0  # s of the call
-    judge_result: Any = None  # what the task's judge returned; None for an answer from the result cache
+    judge_result: Any = None  # what the task's judge returned
+    judge_failure: str = ""  # why it returned nothing, where it raised
     judge_cpu_time: float = 0.0  # s of the judge
     overhead_cpu_time: float = 0.0  # s of the worker besides these, since its last outcome
+    is_cached: bool = False  # whether an earlier call gave the answer
 
     @property
     def value(self) -> Any:
@@ -369,14 +372,21 @@ def _call_and_judge(task: Task) -> Outcome:
         value, cost = call_remote(task.python, call_timed, task.function, *arguments)
     else:
         value, cost = call_timed(task.function, *arguments)
-    judged, judging = None, 0.0
+    judged, failure, judging = None, "", 0.0
     if task.judge:
-        judged, judging = call_timed(task.judge, *_load(task.judge_arguments), value)
-    answer = Pickled.of(value)
+        begin = time.process_time()
+        try:
+            judged = task.judge(*_load(task.judge_arguments), value)
+        except MemoryError:
+            raise
+        except Exception as error:  # the harness's, not the engine's
+            failure = f"{type(error).__name__}: {error}"
+        judging = time.process_time() - begin
+    answer = Pickled.of(value) if task.sends_answer else None
     total = time.process_time()
     overhead = total - _worker_cpu_time["reported"] - judging - (0.0 if task.python else cost)
     _worker_cpu_time["reported"] = total
-    return Outcome(task.key, answer, None, cost, judged, judging, overhead)
+    return Outcome(task.key, answer, None, cost, judged, failure, judging, overhead)
 
 
 def _load(arguments: Sequence[Any]) -> list[Any]:

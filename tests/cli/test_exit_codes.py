@@ -190,21 +190,21 @@ def test_a_machine_that_fails_exits_with_4(tmp_path, error, words):
 
 
 @pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_an_interrupted_run_says_how_to_resume_and_leaves_no_process(tmp_path, which):
+def test_an_interrupted_run_says_how_to_resume_and_leaves_no_process(tmp_path, own_cells, which):
     process = subprocess.Popen(
         [sys.executable, *WORDS, "chain-3-balls", "--engine", "mujoco", "--jobs", "1", "--out", tmp_path],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     deadline = time.monotonic() + 60
-    while not list(tmp_path.glob("cells/*.cell")) and time.monotonic() < deadline:
+    while not list(own_cells.glob("*.cell")) and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(which)
     _, told = process.communicate(timeout=60)
     assert process.returncode == ExitCode.INTERRUPTED, told
     assert told.rstrip().endswith("interrupted; finished cells are kept, run the same command to resume")
     assert "Traceback" not in told and "leaked" not in told
-    assert list(tmp_path.glob("cells/*.cell"))
+    assert list(own_cells.glob("*.cell"))
     deadline = time.monotonic() + 10
     while time.monotonic() < deadline:
         try:

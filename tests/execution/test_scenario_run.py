@@ -29,11 +29,12 @@ def outcome_of(task, **lost):
     return Outcome(task.key, **lost) if lost else run_task(task)
 
 
-def test_answers_wait_for_the_truth_whatever_comes_first(engines):
+def test_runs_follow_their_truth_and_may_finish_in_any_order(engines):
     rows = []
     for turned in (False, True):
         bench = make_scenario_run(engines, "trajectory")
-        tasks = list(bench.tasks())
+        (truth,) = bench.tasks()
+        tasks = bench.on_outcome(outcome_of(truth))
         for task in reversed(tasks) if turned else tasks:
             assert not bench.is_done
             assert bench.on_outcome(outcome_of(task)) == []
@@ -42,24 +43,33 @@ def test_answers_wait_for_the_truth_whatever_comes_first(engines):
     assert rows[0] == rows[1] and len(rows[0]) > 14
 
 
-def test_states_are_asked_for_with_their_truth_and_judged_alike_here_and_by_the_worker(engines):
-    benches = [make_scenario_run(engines, "state"), make_scenario_run(engines, "state")]
-    for bench, elsewhere in zip(benches, (True, False), strict=True):
-        (truth,) = bench.tasks()
-        cells = bench.on_outcome(outcome_of(truth))
-        assert [(task.key.engine, task.key.kind) for task in cells] == [
-            (name, TaskKind.STATE) for name in ("reference", "mujoco")
-        ]
-        for task in cells:
-            assert not bench.is_done
-            found = outcome_of(task)
-            assert len(found.judge_result.rows) == 7
-            bench.on_outcome(
-                found if elsewhere else replace(found, judge_result=None)
-            )  # as the memory has it
-        assert bench.is_done
-    by_worker, here = ([replace(r, cpu_time=0.0) for r in bench.findings().rows] for bench in benches)
-    assert by_worker == here and len(here) == 14
+def test_states_follow_their_truth_and_are_judged_by_the_worker(engines):
+    bench = make_scenario_run(engines, "state")
+    (truth,) = bench.tasks()
+    cells = bench.on_outcome(outcome_of(truth))
+    assert [(task.key.engine, task.key.kind) for task in cells] == [
+        (name, TaskKind.STATE) for name in ("reference", "mujoco")
+    ]
+    for task in cells:
+        assert not bench.is_done
+        found = outcome_of(task)
+        assert len(found.judge_result.rows) == 7
+        bench.on_outcome(found)
+    assert bench.is_done and len(bench.findings().rows) == 14
+
+
+def raise_key_error(*_):
+    raise KeyError("a mistake")
+
+
+def test_a_judge_that_raises_is_a_failure_of_the_harness(engines):
+    bench = make_scenario_run(engines, "state")
+    (truth,) = bench.tasks()
+    for task in bench.on_outcome(outcome_of(truth)):
+        bench.on_outcome(outcome_of(replace(task, judge=raise_key_error)))
+    assert [(r.verdict, r.reason) for r in bench.findings().rows] == [
+        ("harness failed", "the answer cannot be judged: KeyError: 'a mistake'")
+    ] * 2
 
 
 def test_a_lost_truth_of_states_fails_every_cell_and_says_so(engines):
@@ -75,23 +85,24 @@ def test_a_lost_truth_of_states_fails_every_cell_and_says_so(engines):
 
 def test_a_motion_truth_whose_worker_died_is_asked_for_once_more_without_a_compiler(engines):
     bench = make_scenario_run(engines, "trajectory")
-    truth, *cells = bench.tasks()
-    for task in cells:
-        bench.on_outcome(outcome_of(task))
+    (truth,) = bench.tasks()
     (second,) = bench.on_outcome(Outcome(truth.key, failure="crashed: the worker died of SIGSEGV"))
     assert second.key == truth.key and second.arguments[-1] == 0 and not bench.is_done
-    assert bench.on_outcome(outcome_of(second)) == [] and bench.is_done
+    for task in bench.on_outcome(outcome_of(second)):
+        bench.on_outcome(outcome_of(task))
+    assert bench.is_done
     assert not any(row.verdict.needs_attention for row in bench.findings().rows)
     assert "Taylor" not in bench.truths[TaskKind.MOTION_TRUTH].method.split("closed form")[0]
 
 
 def test_a_truth_that_is_lost_twice_fails_every_cell_and_says_so(engines):
     bench = make_scenario_run(engines, "trajectory")
-    truth, *cells = bench.tasks()
+    (truth,) = bench.tasks()
+    bench.on_outcome(Outcome(truth.key, failure="crashed"))
+    cells = bench.on_outcome(Outcome(truth.key, failure="crashed twice"))
     for task in cells:
         bench.on_outcome(outcome_of(task))
-    bench.on_outcome(Outcome(truth.key, failure="crashed"))
-    assert bench.on_outcome(Outcome(truth.key, failure="crashed twice")) == [] and bench.is_done
+    assert bench.is_done
     rows = bench.findings().rows
     assert len(rows) == len(cells)
     reason = "rest has no truth to judge by: crashed twice"
