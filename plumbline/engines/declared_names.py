@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import ast
+from collections.abc import Sequence
 from functools import cache
+from pathlib import Path
 
 from plumbline.engines.environments import ROOT
+from plumbline.processes.user_cache import content_key, recall, remember
 
 
 @cache
@@ -16,15 +19,7 @@ def declared_integrators() -> frozenset[str]:
         The first arguments of all `Integrator`s that are built in the folder of the adapters.
 
     """
-    return frozenset(
-        str(node.args[0].value)
-        for node in _adapter_nodes()
-        if isinstance(node, ast.Call)
-        and isinstance(node.func, ast.Name)
-        and node.func.id == "Integrator"
-        and node.args
-        and isinstance(node.args[0], ast.Constant)
-    )
+    return _declared_names()[0]
 
 
 @cache
@@ -35,14 +30,35 @@ def declared_texts() -> frozenset[str]:
         Every string literal.
 
     """
-    return frozenset(
-        node.value
-        for node in _adapter_nodes()
-        if isinstance(node, ast.Constant) and isinstance(node.value, str)
-    )
+    return _declared_names()[1]
 
 
 @cache
-def _adapter_nodes() -> tuple[ast.AST, ...]:
-    files = sorted((ROOT / "adapters").glob("*.py"))
-    return tuple(node for path in files for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+def _declared_names() -> tuple[frozenset[str], frozenset[str]]:
+    """Names of integrators, and all texts; remembered, because parsing all adapters takes a while."""
+    sources = [path.read_bytes() for path in sorted((ROOT / "adapters").glob("*.py"))]
+    key = content_key("adapters", Path(__file__).read_bytes(), *sources)
+    found: tuple[frozenset[str], frozenset[str]] | None = recall(key)
+    if found is None:
+        nodes = [node for source in sources for node in ast.walk(ast.parse(source))]
+        found = _integrators(nodes), _texts(nodes)
+        remember(key, found)
+    return found
+
+
+def _integrators(nodes: Sequence[ast.AST]) -> frozenset[str]:
+    return frozenset(
+        str(node.args[0].value)
+        for node in nodes
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id == "Integrator"
+        and node.args
+        and isinstance(node.args[0], ast.Constant)
+    )
+
+
+def _texts(nodes: Sequence[ast.AST]) -> frozenset[str]:
+    return frozenset(
+        node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    )

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
 import pickle
 import platform
 import shutil
@@ -25,9 +24,8 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.processes.user_cache import user_cache_folder
+from plumbline.processes.user_cache import CheckedFiles, DamagedFile, user_cache_folder
 from plumbline.processes.workers import Outcome, Pickled, ResultCache, Task
-from plumbline.storage.results_store import write_atomically
 
 ROOT = Path(__file__).resolve().parents[2]
 _HASHED_PACKAGES = ("plumbline", "adapters", "reference_impl")
@@ -52,19 +50,8 @@ class DiskResultCache(ResultCache):
 
         """
         self._folder, self._log, self._is_fresh = folder, log, is_fresh
-        self._pending_paths: dict[Any, Path] = {}  # of running tasks, by their keys
-
-    def cell_path(self, task: Task) -> Path:
-        """Locate the answer to a task.
-
-        Args:
-            task: any task; its key does not matter.
-
-        Returns:
-            The path of its file, which need not exist.
-
-        """
-        return self._folder / f"{task_hash(task)}.cell"
+        self._files = CheckedFiles(folder)
+        self._names: dict[Any, str] = {}  # files of running tasks, by their keys
 
     def get(self, task: Task) -> Outcome | None:
         """Read a stored answer.
@@ -76,22 +63,19 @@ class DiskResultCache(ResultCache):
             The outcome, or None where there is no undamaged file.
 
         """
-        path = self._pending_paths[task.key] = self.cell_path(task)
-        if self._is_fresh:
-            return None
+        name = self._names[task.key] = _file_name(task)
         try:
-            data = path.read_bytes()
-            os.utime(path)  # the cells that are used last stay longest
-        except FileNotFoundError:
+            body = None if self._is_fresh else self._files.read(name)
+        except DamagedFile as error:
+            self._log(f"{error}; the cell runs again")
             return None
         except OSError as error:
-            self._log(f"{path}: cannot be read ({error.strerror}); the cell runs again")
+            self._log(f"{self._files.path(name)}: cannot be read ({error.strerror}); the cell runs again")
             return None
-        if hashlib.sha256(data[32:]).digest() != data[:32]:
-            self._log(f"{path}: damaged; the cell runs again")
+        if body is None:
             return None
-        del self._pending_paths[task.key]
-        answer, cost, judged = pickle.loads(data[32:])
+        del self._names[task.key]
+        answer, cost, judged = pickle.loads(body)
         return Outcome(
             task.key, None if answer is None else Pickled(answer), cpu_time=cost, judge_result=judged,
             is_cached=True,
@@ -108,12 +92,11 @@ class DiskResultCache(ResultCache):
             OSError: the file cannot be written.
 
         """
-        path = self._pending_paths.pop(task.key, None) or self.cell_path(task)
+        name = self._names.pop(task.key, None) or _file_name(task)
         if outcome.failure is None and not outcome.judge_failure:
-            self._folder.mkdir(parents=True, exist_ok=True)
             answer = outcome.pickled.data if task.sends_answer else None
-            body = pickle.dumps((answer, outcome.cpu_time, outcome.judge_result), protocol=5)
-            write_atomically(path, hashlib.sha256(body).digest() + body)
+            content = answer, outcome.cpu_time, outcome.judge_result
+            self._files.write(name, pickle.dumps(content, protocol=5))
 
     def clear(self) -> None:
         """Remove all cells, after the run has been stored."""
@@ -126,18 +109,7 @@ class DiskResultCache(ResultCache):
             max_bytes: what the cells may take together.
 
         """
-        found = []
-        for path in self._folder.glob("*.cell"):
-            with contextlib.suppress(OSError):  # another run may have removed it
-                about = path.stat()
-                found.append((about.st_mtime, about.st_size, path))
-        excess = sum(size for _, size, _ in found) - max_bytes
-        for _, size, path in sorted(found):
-            if excess <= 0:
-                return
-            with contextlib.suppress(OSError):
-                path.unlink()
-                excess -= size
+        self._files.trim(max_bytes)
 
 
 def user_cells_folder() -> Path:
@@ -148,6 +120,10 @@ def user_cells_folder() -> Path:
 
     """
     return user_cache_folder() / "cells"
+
+
+def _file_name(task: Task) -> str:
+    return f"{task_hash(task)}.cell"
 
 
 def task_hash(task: Task) -> str:

@@ -1,13 +1,122 @@
-"""The user's cache folder."""
+"""The user's cache folder: what can be made again, in files that carry their checksum."""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import os
+import pickle
+import tempfile
 from pathlib import Path
+from typing import Any
+
+_CHECKSUM_SIZE = 32  # bytes
+_MAX_REMEMBERED_BYTES = 20 * 2**20
+
+
+class DamagedFile(ValueError):
+    """The content of a file does not fit its checksum."""
+
+
+class CheckedFiles:
+    """Files of one folder, each written whole or not at all.
+
+    No file is flushed to the disk: after a power failure, its checksum shows that it is damaged.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Name the folder.
+
+        Args:
+            folder: made when the first file is written.
+
+        """
+        self._folder = folder
+
+    def path(self, name: str) -> Path:
+        """Locate a file.
+
+        Args:
+            name: the last part of its path.
+
+        Returns:
+            Its path; it need not exist.
+
+        """
+        return self._folder / name
+
+    def read(self, name: str) -> bytes | None:
+        """Read a file, and note that it was used.
+
+        Args:
+            name: the last part of its path.
+
+        Returns:
+            Its content; None where there is no such file.
+
+        Raises:
+            DamagedFile: the content does not fit its checksum.
+            OSError: the file cannot be read.
+
+        """
+        path = self.path(name)
+        try:
+            data = path.read_bytes()
+        except FileNotFoundError:
+            return None
+        body = data[_CHECKSUM_SIZE:]
+        if hashlib.sha256(body).digest() != data[:_CHECKSUM_SIZE]:
+            raise DamagedFile(f"{path}: damaged")
+        with contextlib.suppress(OSError):
+            os.utime(path)
+        return body
+
+    def write(self, name: str, body: bytes) -> None:
+        """Write or replace a file.
+
+        Args:
+            name: the last part of its path.
+            body: its content.
+
+        Raises:
+            OSError: the file cannot be written.
+
+        """
+        self._folder.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=self._folder, prefix=".new-")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                file.write(hashlib.sha256(body).digest() + body)
+            os.replace(temporary, self.path(name))
+        except BaseException:
+            with contextlib.suppress(OSError):  # the first error is the one to report
+                os.unlink(temporary)
+            raise
+
+    def trim(self, max_bytes: int) -> None:
+        """Remove the files that were not used for longest, until the others fit.
+
+        Args:
+            max_bytes: what the files may take together.
+
+        """
+        found = []
+        with contextlib.suppress(FileNotFoundError):
+            for entry in os.scandir(self._folder):
+                with contextlib.suppress(OSError):  # another run may have removed it
+                    about = entry.stat()
+                    found.append((about.st_mtime, about.st_size, entry.path))
+        excess = sum(size for _, size, _ in found) - max_bytes
+        for _, size, path in sorted(found):
+            if excess <= 0:
+                return
+            with contextlib.suppress(OSError):
+                os.unlink(path)
+                excess -= size
 
 
 def user_cache_folder() -> Path:
-    """Locate the folder of what can be made again.
+    """Locate the user's cache folder.
 
     Returns:
         The folder of the variable PLUMBLINE_CACHE, else ``plumbline`` in the platform's cache folder; it need
@@ -21,3 +130,54 @@ def user_cache_folder() -> Path:
     else:
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     return home / "plumbline"
+
+
+def content_key(*parts: bytes | str) -> str:
+    """Make the name under which a value is remembered.
+
+    Args:
+        *parts: everything that the value depends on, the code that makes it included.
+
+    Returns:
+        A hash of the parts.
+
+    """
+    digest = hashlib.sha256()
+    for part in parts:
+        body = part.encode() if isinstance(part, str) else part
+        digest.update(b"%d\n" % len(body) + body)
+    return digest.hexdigest()
+
+
+def recall(key: str) -> Any:
+    """Read a remembered value.
+
+    Args:
+        key: of `content_key`.
+
+    Returns:
+        The value; None where there is none, or none that can be read.
+
+    """
+    try:
+        body = _remembered().read(key)
+    except (OSError, DamagedFile):
+        return None
+    return None if body is None else pickle.loads(body)
+
+
+def remember(key: str, value: Any) -> None:
+    """Store a value for later processes; where that fails, they make it again.
+
+    Args:
+        key: of `content_key`.
+        value: a value that can be pickled.
+
+    """
+    with contextlib.suppress(OSError):
+        _remembered().write(key, pickle.dumps(value, protocol=5))
+        _remembered().trim(_MAX_REMEMBERED_BYTES)
+
+
+def _remembered() -> CheckedFiles:
+    return CheckedFiles(user_cache_folder() / "parsed")

@@ -15,8 +15,11 @@ import numpy as np
 import psutil
 import pyarrow.parquet as pq
 import pytest
+from click.testing import CliRunner
 
+from plumbline.cli.main import main
 from plumbline.engines import calls
+from plumbline.execution import result_cache
 from plumbline.execution.plan import Plan
 from plumbline.execution.result_cache import DiskResultCache, task_hash
 from plumbline.execution.runner import run_plan
@@ -231,3 +234,56 @@ def test_the_key_is_the_content():
         task_hash(replace(base, arguments=(Pickled.of([state]),))) for state in (s.state, s.state, turned)
     ]
     assert packed[0] == packed[1] != packed[2]
+
+
+# --- cells that runs share ---------------------------------------------------------------------
+
+
+def run_in_process(*more):
+    result = CliRunner().invoke(main, ["run", "rest", "--engine", "mujoco", "--level", "state", *more])
+    assert result.exit_code == 0, result.output
+    return result.stderr
+
+
+def test_an_unchanged_run_computes_nothing_and_a_fresh_one_everything(tmp_path):
+    for out, more in ((tmp_path / "1", ()), (tmp_path / "2", ()), (tmp_path / "3", ("--fresh",))):
+        told = run_in_process("--out", str(out), *more)
+        assert ("2 answers of earlier runs were used" in told) == (out.name == "2")
+    first, again, fresh = (comparable_results(tmp_path / name) for name in "123")
+    assert first == again == fresh
+
+
+def test_cells_that_were_not_used_for_longest_are_removed_first(tmp_path):
+    run_and_count(DiskResultCache(tmp_path))
+    paths = sorted(tmp_path.glob("*.cell"))
+    for age, path in enumerate(paths):
+        os.utime(path, (1e9 - age, 1e9 - age))
+    kept = sum(path.stat().st_size for path in paths[:2])
+    DiskResultCache(tmp_path).trim(kept)
+    assert sorted(tmp_path.glob("*.cell")) == paths[:2]
+
+
+def test_a_judge_that_changes_has_another_cell():
+    judged = Task("a", quiet, (), judge=quiet, judge_arguments=(1,))
+    others = [
+        replace(judged, judge_arguments=(2,)),
+        replace(judged, judge=run_in_process),
+        replace(judged, python="/another/python"),
+        replace(judged, sends_answer=False),
+    ]
+    assert len({task_hash(judged), *map(task_hash, others)}) == 5
+
+
+def test_another_installation_has_other_cells(tmp_path, monkeypatch):
+    """The same version of an engine, built and installed again."""
+    task = Task("a", quiet)
+    hashes = set()
+    for size in (1, 2):
+        record = tmp_path / "engine-1.0.dist-info" / "RECORD"
+        record.parent.mkdir(exist_ok=True)
+        record.write_text("x" * size)
+        monkeypatch.syspath_prepend(tmp_path)
+        result_cache._environment_fingerprint.cache_clear()
+        hashes.add(task_hash(task))
+    result_cache._environment_fingerprint.cache_clear()
+    assert len(hashes) == 2
