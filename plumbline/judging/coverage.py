@@ -223,7 +223,7 @@ def _state_ratios(
 
 def _step_ratios(model: Model, states: Sequence[State], parameters: Sequence[Parameter]) -> _Ratios:
     """Effects after one step and ten over the bounds of the step level."""
-    sizes = step_sizes(STEP_METHOD, model, states)
+    sizes = step_sizes(False, model, states)
     starts = [(index, h, None) for index in range(len(states)) for h in sizes[index]]
     steps = FormulaSteps(STEP_METHOD, model, states, starts)
     limits: dict[int, dict[int, dict[str, Array]]] = {}
