@@ -2,20 +2,22 @@
 
 A cell is one task's answer and what its judge returned, in FOLDER/HASH.cell.  The hash covers everything that
 they depend on: the calls and their arguments (model, states, times, steps, integrator, truth), the engine's
-version, this project's code below `execution`, and what is installed.  A file is the SHA-256 of the rest,
-then a pickle, written whole or not at all; the cell of a damaged file is reported and runs again.  Loading a
-pickle can run any code: share results, never this folder.
+version, this project's code below `execution`, and the files that can be imported.  A file is the SHA-256 of
+the rest, then a pickle, written whole or not at all; the cell of a damaged file is reported and runs again.
+Loading a pickle can run any code: share results, never this folder.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
 import pickle
 import platform
 import shutil
 import struct
 import sys
+import sysconfig
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from functools import cache
@@ -150,29 +152,41 @@ def task_hash(task: Task) -> str:
 
 @cache
 def _environment_fingerprint() -> str:
-    """Hash the project's code, the interpreter, what is installed and the kind of machine."""
+    """Hash the project's code, the interpreter, what can be imported, and the kind of machine."""
     digest = hashlib.sha256()
     for folder in _HASHED_PACKAGES:
         for path in sorted((ROOT / folder).rglob("*.py")):
             name = path.relative_to(ROOT).as_posix()
             if not name.startswith(_UNHASHED_PACKAGES):
                 _update_hash(digest, (name, path.read_bytes()))
-    _update_hash(digest, (sys.version, platform.machine(), *_installed_distributions()))
+    _update_hash(digest, (sys.version, platform.machine(), *_importable_files()))
     return digest.hexdigest()
 
 
-def _installed_distributions() -> list[tuple[str, int, int]]:
-    """Name with version of every installed distribution, size and time [ns] of its list of files.
+def _importable_files() -> list[tuple[str, int, int]]:
+    """Name, size and time of change [ns] of every file below the folders that Python imports from.
 
-    An engine that is built and installed again under the same version has another time.
+    An engine may be built again under the same version, patched where it is installed, or replaced by a
+    module on PYTHONPATH; none of that changes the versions of what is installed.  The standard library
+    belongs to the interpreter's version; of this checkout the code that tasks call is hashed by content.
     """
-    found = []
-    for folder in dict.fromkeys(map(Path, sys.path)):
-        for path in sorted(folder.glob("*.dist-info")):
-            with contextlib.suppress(OSError):
-                about = (path / "RECORD").stat()
-                found.append((path.name, about.st_size, about.st_mtime_ns))
-    return found
+    standard = {os.path.realpath(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib")}
+    skipped = {*standard, *(os.path.join(path, "lib-dynload") for path in standard)}
+    folders = [path for path in map(os.path.realpath, sys.path) if path not in skipped]
+    seen, found = set(skipped), []
+    while folders:
+        folder = folders.pop()
+        if folder in seen:
+            continue
+        seen.add(folder)
+        with contextlib.suppress(OSError), os.scandir(folder) as entries:
+            for entry in entries:
+                if not entry.is_dir():
+                    about = entry.stat()
+                    found.append((entry.path, about.st_size, about.st_mtime_ns))
+                elif entry.name != "__pycache__" and folder != str(ROOT):
+                    folders.append(entry.path)
+    return sorted(found)
 
 
 def _update_hash(digest: Any, value: Any) -> None:

@@ -274,15 +274,15 @@ def test_a_judge_that_changes_has_another_cell():
     assert len({task_hash(judged), *map(task_hash, others)}) == 5
 
 
-def test_another_installation_has_other_cells(tmp_path, monkeypatch):
-    """The same version of an engine, built and installed again."""
+@pytest.mark.parametrize("file", ["engine-1.0.dist-info/RECORD", "engine/libengine.so.4", "mujoco.py"])
+def test_another_installation_has_other_cells(tmp_path, monkeypatch, file):
+    """The same version of an engine: installed again, built again in its place, replaced on PYTHONPATH."""
     task = Task("a", quiet)
+    (tmp_path / file).parent.mkdir(exist_ok=True)
+    monkeypatch.syspath_prepend(tmp_path)
     hashes = set()
     for size in (1, 2):
-        record = tmp_path / "engine-1.0.dist-info" / "RECORD"
-        record.parent.mkdir(exist_ok=True)
-        record.write_text("x" * size)
-        monkeypatch.syspath_prepend(tmp_path)
+        (tmp_path / file).write_text("x" * size)
         result_cache._environment_fingerprint.cache_clear()
         hashes.add(task_hash(task))
     result_cache._environment_fingerprint.cache_clear()
