@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import cross_matrix, rotate_vectors, rotation_matrix
+from plumbline.model.kinematics import cross, cross_matrix, rotate_vectors, rotation_matrix
 
 MODEL_FIELDS = (
     "mass", "inertia", "proximal", "distal", "length", "gravity", "force", "moment", "drag_force",
@@ -150,7 +150,7 @@ def centre_positions_and_velocities(c: DefectCase) -> tuple[Array, Array]:
     """
     a = rotation_matrix(c.p)
     near, far = rotate_vectors(a, c.proximal), rotate_vectors(a, c.distal)
-    near_v, far_v = (rotate_vectors(a, np.cross(c.omega, s)) for s in (c.proximal, c.distal))
+    near_v, far_v = (rotate_vectors(a, cross(c.omega, s)) for s in (c.proximal, c.distal))
     rod, rod_v = c.length[..., None] * c.u, c.length[..., None] * c.udot
     r = np.cumsum(rod - near + far, axis=1) - far
     return r, np.cumsum(rod_v - near_v + far_v, axis=1) - far_v
@@ -174,7 +174,7 @@ def evaluate_case(c: DefectCase) -> dict[str, Array]:
     a = rotation_matrix(c.p)
     spin = rotate_vectors(c.inertia, c.omega)
     acceleration, angular, reaction = _solve_newton_euler(c, a, v, spin)
-    momentum = np.sum(np.cross(r, c.mass[..., None] * v) + rotate_vectors(a, spin), axis=1)
+    momentum = np.sum(cross(r, c.mass[..., None] * v) + rotate_vectors(a, spin), axis=1)
     return {
         "acceleration": acceleration,
         "angular_acceleration": angular,
@@ -203,9 +203,9 @@ def _solve_newton_euler(c: DefectCase, a: Array, v: Array, spin: Array) -> tuple
     b[..., :3] = c.mass[..., None] * c.gravity[:, None] + load
     b[..., 3:6] = (
         c.moment - c.drag_moment[..., None] * c.omega
-        - c.gyroscopic_factor[..., None] * np.cross(c.omega, spin)
+        - c.gyroscopic_factor[..., None] * cross(c.omega, spin)
     )  # fmt: skip
-    centripetal = [rotate_vectors(a, np.cross(c.omega, np.cross(c.omega, s))) for s in (c.proximal, c.distal)]
+    centripetal = [rotate_vectors(a, cross(c.omega, cross(c.omega, s))) for s in (c.proximal, c.distal)]
     b[..., 6:] = -c.proximal_factor[..., None] * centripetal[0]
     b[:, 1:, 6:] += (c.distal_factor[..., None] * centripetal[1])[:, :-1]
     rod = c.length > 0
@@ -227,11 +227,11 @@ def _solve_newton_euler(c: DefectCase, a: Array, v: Array, spin: Array) -> tuple
         u, udot = c.u[held, i], c.udot[held, i]
         centripetal_rod = c.rod_factor[held, i] * c.length[held, i] * np.sum(udot * udot, -1)
         rows = np.einsum("bi,bijk->bjk", u, S[held, i, 6:].reshape(-1, 3, n, 9))
-        first = np.cross(u, np.eye(3)[np.argmin(np.abs(u), axis=-1)])
+        first = cross(u, np.eye(3)[np.argmin(np.abs(u), axis=-1)])
         first /= np.linalg.norm(first, axis=-1, keepdims=True)
         S[held, i, 6:] = 0.0
         S[held, i, 6] = rows
-        S[held, i, 7, i, 6:], S[held, i, 8, i, 6:] = first, np.cross(u, first)
+        S[held, i, 7, i, 6:], S[held, i, 8, i, 6:] = first, cross(u, first)
         b[held, i, 6] = np.sum(u * b[held, i, 6:], -1) - centripetal_rod
         b[held, i, 7:] = 0.0
     x = _solve_with_refinement(S.reshape(size, 9 * n, 9 * n), b.reshape(size, 9 * n)).reshape(size, n, 9)
@@ -244,7 +244,7 @@ def _add_armature(c: DefectCase, a: Array, S: Array, b: Array) -> None:
     ẇ = ω̇′ − R ω̇′₁ + w × R ω′₁ with R = A₂ᵀA₁ (B, 3, 3), from the first body's frame into the second's.
     """
     carried = _carried_rates(c, a)
-    bias = np.cross(c.omega - carried, carried)
+    bias = cross(c.omega - carried, carried)
     for i in range(c.n):
         inertia = c.armature[:, i, None, None]
         S[:, i, 3:6, i, 3:6] += inertia * np.eye(3)

@@ -26,7 +26,7 @@ from typing import cast
 import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import cross_matrix, rotate_vectors, rotation_matrix
+from plumbline.model.kinematics import cross, cross_matrix, rotate_vectors, rotation_matrix
 from plumbline.model.welding import BodyParts, part_offsets
 
 EPS = 2.0**-53
@@ -238,7 +238,7 @@ class _JointSpaceTerms:
             turns = [(of_rod - above)[rods], of_body - np.where(rods[:, None], of_rod, above)]
             return np.asarray(norm(np.concatenate(turns), axis=1))
 
-        self.rate = relative(system.omega, np.cross(state.u, state.udot))
+        self.rate = relative(system.omega, cross(state.u, state.udot))
         self.acceleration = relative(system.alpha, system.rod_angular_acceleration())
         m, J = terms.m, terms.J
         self.mass_matrix = (self.D * m) @ self.D.T + (self.is_below * J) @ self.is_below.T
@@ -293,13 +293,11 @@ class NewtonEulerSystem:
         F_rows = E @ np.concatenate([-X.T, K_inverse], 1).reshape(n, 3, 9 * n)
         self.inverse_columns = np.concatenate([x_rows, F_rows[:, None]], 1)
 
-        self.centripetal_p, self.centripetal_d = (
-            np.cross(omega, np.cross(omega, s)) for s in (self.sp, self.sd)
-        )
+        self.centripetal_p, self.centripetal_d = (cross(omega, cross(omega, s)) for s in (self.sp, self.sd))
         gamma = (E.mT @ (_from_previous(self.centripetal_d) - self.centripetal_p)[..., None])[..., 0]
         gamma[:, 0] -= np.where(rods, model.length * np.sum(state.udot**2, -1), 0.0)
         force = model.mass[:, None] * model.gravity + self.load
-        moment = self.torque - np.cross(omega, rotate_vectors(inertia, omega))
+        moment = self.torque - cross(omega, rotate_vectors(inertia, omega))
         rows = np.concatenate([np.concatenate([force, moment], -1).ravel(), gamma.ravel()])
         self.acceleration, self.alpha, self.F = np.moveaxis(self.inverse_columns @ rows, 1, 0)  # (N, 3) each
 
@@ -328,10 +326,10 @@ class NewtonEulerSystem:
             (N, 3) [rad/s²], world frame; 0 for a ball.
 
         """
-        near = self.acceleration + np.cross(self.alpha, self.sp) + self.centripetal_p
-        far = self.acceleration + np.cross(self.alpha, self.sd) + self.centripetal_d
+        near = self.acceleration + cross(self.alpha, self.sp) + self.centripetal_p
+        far = self.acceleration + cross(self.alpha, self.sd) + self.centripetal_d
         ell = np.where(self.rods, self.length, np.inf)[:, None]
-        return np.cross(self.u, near - _from_previous(far)) / ell
+        return cross(self.u, near - _from_previous(far)) / ell
 
     def torque_pair_responses(self) -> Array:
         """Compute the norms of the response to a unit torque pair at each joint.
