@@ -1,21 +1,24 @@
-"""Processes and folders that do not outlive their owner.
+"""Processes, folders and locks that do not outlive their owner.
 
-A scratch folder holds a lock file that its owner keeps locked. The system unlocks it however the owner ends,
-so that the next owner can remove it. Clocks and process numbers do not matter: another machine or container
-may use the same ones.
+An owner keeps a lock file locked. The system unlocks it however the owner ends, so that the next owner can
+take or remove what it guards. Clocks and process numbers do not matter: another machine or container may use
+the same ones.
 """
 
 from __future__ import annotations
 
 import contextlib
 import ctypes
+import errno
 import os
 import shutil
 import signal
 import sys
 import tempfile
 from pathlib import Path
-from typing import IO
+from typing import IO, Self
+
+from plumbline.processes.errors import PlumblineError
 
 try:
     import fcntl
@@ -23,6 +26,7 @@ except ImportError:  # Windows: orphaned folders stay there
     fcntl = None  # type: ignore[assignment]
 
 _LOCK_FILE = "owner.lock"
+_RANDOM_NAME = "[a-z0-9_]" * 8  # what mkdtemp adds to a prefix
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 
 
@@ -38,6 +42,67 @@ def die_with_parent(parent: int) -> None:
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent and not Path(f"/proc/{parent}").exists():
         os._exit(1)  # the parent ended before the call
+
+
+class LockHeld(PlumblineError):
+    """Another process holds the lock."""
+
+
+class FileLock:
+    """A lock file, held until it is released or its process ends."""
+
+    def __init__(self, path: Path) -> None:
+        """Make the file where it is missing, and lock it.
+
+        Args:
+            path: the file.
+
+        Raises:
+            LockHeld: another process holds it.
+            OSError: the file cannot be made.
+
+        """
+        self._path = path
+        while True:
+            self._file = path.open("ab")
+            try:
+                _try_lock(self._file)
+                if self._is_in_place():
+                    return
+            except BlockingIOError:
+                self._file.close()
+                raise LockHeld(str(path)) from None
+            self._file.close()  # its last owner removed the file after it was opened here
+
+    def _is_in_place(self) -> bool:
+        """Whether the locked file is the one that its path names."""
+        with contextlib.suppress(FileNotFoundError):
+            return os.path.samestat(os.fstat(self._file.fileno()), self._path.stat())
+        return False
+
+    def __enter__(self) -> Self:
+        """Return the lock."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Release the lock."""
+        self.release()
+
+    def release(self) -> None:
+        """Remove the file, as far as that is possible, and unlock it."""
+        with contextlib.suppress(OSError):
+            self._path.unlink()
+        self._file.close()
+
+
+def _try_lock(file: IO[bytes]) -> None:
+    """Lock a file where the file system has locks; raise BlockingIOError if another process holds it."""
+    if fcntl is not None:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):
+                raise
 
 
 class ScratchFolder:
@@ -57,13 +122,13 @@ class ScratchFolder:
 
         """
         remove_orphaned_folders(prefix, parent)
-        self.path = Path(tempfile.mkdtemp(prefix=prefix, dir=parent))
-        self._lock: IO[bytes] | None = None
-        if fcntl is not None:
-            made = self.path / f"{_LOCK_FILE}.new"  # renamed once it is locked
-            self._lock = made.open("wb")
-            fcntl.flock(self._lock, fcntl.LOCK_EX)
-            os.rename(made, self.path / _LOCK_FILE)
+        while True:
+            self.path = Path(tempfile.mkdtemp(prefix=prefix, dir=parent))
+            try:
+                self._lock = FileLock(self.path / _LOCK_FILE)
+                return
+            except (FileNotFoundError, LockHeld):
+                pass  # another process took the folder for an orphan, as it was not locked yet
 
     def __enter__(self) -> Path:
         """Return the folder."""
@@ -76,8 +141,7 @@ class ScratchFolder:
     def remove(self) -> None:
         """Remove the folder, as far as that is possible."""
         shutil.rmtree(self.path, ignore_errors=True)
-        if self._lock is not None:
-            self._lock.close()
+        self._lock.release()
 
 
 def remove_orphaned_folders(prefix: str, parent: Path | None = None) -> list[Path]:
@@ -92,10 +156,13 @@ def remove_orphaned_folders(prefix: str, parent: Path | None = None) -> list[Pat
 
     """
     removed = []
-    locks = Path(parent or tempfile.gettempdir()).glob(f"{prefix}*/{_LOCK_FILE}")
-    for lock in locks if fcntl is not None else ():
-        with contextlib.suppress(OSError), lock.open("r+b") as file:  # another user's, or just removed
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # OSError: its owner is alive
-            shutil.rmtree(lock.parent, ignore_errors=True)
-            removed.append(lock.parent)
+    folders = Path(parent or tempfile.gettempdir()).glob(f"{prefix}{_RANDOM_NAME}")
+    for folder in folders if fcntl is not None else ():
+        with contextlib.suppress(OSError, LockHeld):  # of another user, alive, just removed, or none of ours
+            if (folder / _LOCK_FILE).exists():
+                with FileLock(folder / _LOCK_FILE):
+                    shutil.rmtree(folder, ignore_errors=True)
+            else:
+                folder.rmdir()  # an owner that ended before it locked the folder left it empty
+            removed.append(folder)
     return removed

@@ -7,6 +7,7 @@ timeout or a lack of memory loses one task, whose outcome holds the reason.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import gc
 import multiprocessing
@@ -19,6 +20,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from dataclasses import dataclass, field
+from functools import cache
 from multiprocessing import forkserver
 from multiprocessing.context import BaseContext
 from types import TracebackType
@@ -35,6 +37,7 @@ _SINGLE_THREAD_ENV = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
 )
 _POLL_INTERVAL = 0.2  # s between checks for tasks that run too long
+_MAX_POLL_GAP = 2.0  # s: a longer time between two checks is one in which this process was stopped, or busy
 _WARM_MODULE = "plumbline.processes.warm"
 _worker_cpu_time = {"reported": 0.0}  # s that this worker has reported in outcomes
 
@@ -270,7 +273,8 @@ class WorkerPool(Executor):
         self._pool: ProcessPool | None = None
         self._scratch = ScratchFolder()
         self._tasks: dict[Future[Any], Task] = {}
-        self._started: dict[Future[Any], float] = {}  # monotonic time at which a task was first seen running
+        self._started: dict[Future[Any], float] = {}  # `_clock` when a task was first seen running
+        self._clock, self._last_poll = 0.0, time.monotonic()  # s
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -327,22 +331,36 @@ class WorkerPool(Executor):
     def _cancel_overdue(self) -> None:
         """Cancel tasks over their time limit, which kills their workers.
 
-        The pool's own timeout goes by the wall clock: set forward it would kill tasks that are in time.
+        The pool's own timeout goes by the wall clock: set forward it would kill tasks that are in time. While
+        this process is stopped, as by Ctrl-Z, its workers are too, and that time does not count.
         """
         now = time.monotonic()
+        self._clock += min(now - self._last_poll, _MAX_POLL_GAP)
+        self._last_poll = now
         for future, task in self._tasks.items():
-            if future.running() and now - self._started.setdefault(future, now) > task.limits.seconds:
-                future.cancel()
+            if future.running():
+                started = self._started.setdefault(future, self._clock)
+                if self._clock - started > task.limits.seconds:
+                    future.cancel()
 
 
 def _warm_context() -> BaseContext:
     """Fork workers from a process that has libraries loaded; start them anew where there is no fork."""
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
+    _keep_sockets_in_scratch_folder()
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([_WARM_MODULE])
     forkserver.ensure_running()  # in this thread: the warm process ends with the thread that started it
     return context
+
+
+@cache
+def _keep_sockets_in_scratch_folder() -> None:
+    """Have multiprocessing put its sockets where the next run removes them if this process is killed."""
+    folder = ScratchFolder()
+    atexit.register(folder.remove)
+    multiprocessing.current_process()._config["tempdir"] = str(folder.path)  # type: ignore[attr-defined]
 
 
 def run_task(task: Task) -> Outcome:

@@ -196,9 +196,8 @@ def test_what_a_killed_run_leaves_is_removed_by_the_next(tmp_path, monkeypatch):
     assert dead.is_dir() and alive.is_dir(), "nobody has come by yet"
     with WorkerPool(1) as workers:
         mine = workers._scratch.path
-        assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith("plumbline-")) == sorted(
-            [alive.name, mine.name, "plumbline-of-somebody"]
-        )
+        left = {path.name for path in tmp_path.iterdir()}
+        assert {alive.name, mine.name, "plumbline-of-somebody"} <= left and dead.name not in left
     owners[1].kill()
     owners[1].wait()
     assert not mine.exists() and remove_orphaned_folders("plumbline-") == [alive]
@@ -226,3 +225,33 @@ def test_no_orphan_is_left_when_the_parent_is_killed(tmp_path):
     while Path(f"/proc/{worker}").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not Path(f"/proc/{worker}").exists()
+
+
+@pytest.mark.skipif(not hasattr(os, "killpg"), reason="no process groups")
+def test_a_run_that_is_stopped_and_continued_loses_no_task(tmp_path):
+    """As Ctrl-Z and fg: the process and its workers stand still for longer than the time limit."""
+    script = tmp_path / "stopped.py"
+    script.write_text(
+        "import sys\n"
+        f"sys.path[:0] = {[str(ROOT), str(Path(__file__).parent)]!r}\n"
+        "from test_workers import hang, process_id, sleep_for\n"
+        "from plumbline.processes.workers import Limits, Task, WorkerPool\n"
+        "if __name__ == '__main__':\n"
+        "    limits = Limits(seconds=5)\n"
+        "    with WorkerPool(1) as workers:\n"
+        "        for tasks in ([Task(0, process_id)], [Task(1, sleep_for, (1.5,), limits)],\n"
+        "                      [Task(2, hang, (), limits)]):\n"
+        "            for outcome in workers.run(tasks):\n"
+        "                print(outcome.failure or outcome.value, flush=True)\n"
+    )
+    parent = subprocess.Popen(
+        [sys.executable, script], stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    assert parent.stdout.readline().strip().isdigit()
+    time.sleep(0.5)
+    os.killpg(parent.pid, signal.SIGSTOP)
+    time.sleep(7)
+    os.killpg(parent.pid, signal.SIGCONT)
+    assert parent.stdout.readline().strip() == "1.5"
+    assert "timeout: no answer within 5 s" in parent.stdout.readline(), "a hang is still found"
+    assert parent.wait(timeout=60) == 0
