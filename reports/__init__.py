@@ -21,13 +21,14 @@ def write(folder: Path, history: Path | None = None) -> Path:
 
     Raises:
         OSError: a file cannot be read or written.
-        ValueError: results.json is missing or damaged.
+        DamagedResults: a file of the folder is missing or damaged.
 
     """
     from reports import html_report, junit, step_summary
     from reports.results import Results
 
     results = Results.load(folder)
+    page = html_report.write(results, history)  # first: it reads every table, so nothing is half written
     junit.write(results)
     step_summary.write(results)
-    return html_report.write(results, history)
+    return page

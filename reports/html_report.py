@@ -8,6 +8,7 @@ import math
 import re
 import time
 from collections import Counter
+from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -274,6 +275,7 @@ def bundle_script() -> str:
     return script
 
 
+@cache
 def template_environment() -> Environment:
     """Load the templates; every value is escaped and an undefined one is an error.
 

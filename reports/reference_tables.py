@@ -9,6 +9,7 @@ import base64
 import json
 from pathlib import Path
 
+from plumbline.storage.results_schema import DamagedResults
 from reports.results import Record, Results, replace_unprintable
 
 STORED_RESULTS = Path(__file__).parent.parent / "bench" / "results"
@@ -74,7 +75,7 @@ def benchmark_table(folder: Path, stored: Path = STORED_RESULTS) -> Record | Non
     place = _first_folder_with("figures.json", folder, stored)
     if place is None:
         return None
-    goals = replace_unprintable(json.loads((place / "figures.json").read_text(encoding="utf-8"))["goals"])
+    goals = _stored_goals(place / "figures.json")
     readme = place / "README.md"
     note = (
         replace_unprintable(readme.read_text(encoding="utf-8")).split("\n\n")[0] if readme.is_file() else ""
@@ -89,6 +90,17 @@ def benchmark_table(folder: Path, stored: Path = STORED_RESULTS) -> Record | Non
         "note": note.replace("`", "") if place != folder else "",
         "stored": place != folder,
     }
+
+
+def _stored_goals(path: Path) -> list[Record]:
+    """Read the goals of figures.json and their measured values; raise DamagedResults where they are none."""
+    try:
+        goals: list[Record] = replace_unprintable(json.loads(path.read_text(encoding="utf-8"))["goals"])
+        if not all(isinstance(goal[name], int | float) for goal in goals for name in ("measured", "goal")):
+            raise ValueError("a goal or a measured value is no number")
+    except (ValueError, LookupError, TypeError, RecursionError) as error:
+        raise DamagedResults(f"{path}: not the figures of a benchmark ({error})") from None
+    return goals
 
 
 def _first_folder_with(name: str, *folders: Path) -> Path | None:

@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.judging.rows import SHOWN_STYLES
+from plumbline.judging.rows import RUN_FAMILY, SHOWN_STYLES
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product
+from plumbline.storage.results_schema import DamagedResults
 from reports.chunks import ChunkBuilder, decimate, decimate_times, log_scale_codes
 from reports.history import History
 from reports.results import Columns, Record, Results, group_rows
@@ -31,6 +32,7 @@ CURVE_COLUMNS = (
 CLI_LEVEL = {"state": "state", "step": "step", "trajectory": "trajectory", "invariants": "trajectory"}
 DEFAULT_LONG_RUN_SECONDS = 100.0  # s: the default of the nightly's --long-run-seconds
 CATALOGUE_FOLDER = Path(__file__).parent.parent / "scenarios"
+RERUN_FOLDER = "repeated"
 MAX_MOTION_BYTES = 90_000  # of one scenario's motion, before compression
 _NUMBER_FIELDS = ("value", "tolerance", "uncertainty", "compared_until", "order", "user_rtol", "cpu_time")
 _TEXT_FIELDS = (
@@ -47,7 +49,7 @@ ScenarioTables = dict[str, dict[str, Columns]]  # by table, then scenario
 
 
 def rerun_command(row: Record, scenario: Record) -> str:
-    """Return the command that repeats one cell.
+    """Return the command that repeats one cell, in a folder of its own: the run that it explains is kept.
 
     Args:
         row: a stored row of the cell; long runs are repeated by ``nightly``, all others by ``run``.
@@ -58,7 +60,7 @@ def rerun_command(row: Record, scenario: Record) -> str:
 
     """
     file = str(scenario.get("file") or "")
-    ours = not file or any(CATALOGUE_FOLDER.glob(f"*/{glob.escape(Path(file).name)}"))
+    ours = not file or ("/" not in file and any(CATALOGUE_FOLDER.glob(f"*/{glob.escape(file)}")))
     what = row["scenario"] if ours else file
     words = ["python", "-m", "plumbline", "run", "--engine", row["engine"]]
     if _is_long_run(row):
@@ -67,6 +69,9 @@ def rerun_command(row: Record, scenario: Record) -> str:
         words += [] if asked == DEFAULT_LONG_RUN_SECONDS else ["--long-run-seconds", f"{asked:g}"]
     else:
         words += ["--level", CLI_LEVEL.get(row["level"], "all")]
+    words += ["--out", RERUN_FOLDER]
+    if scenario.get("family") == RUN_FAMILY:  # a row about the whole run
+        return shlex.join(words)
     words[4:4] = [] if what.startswith("-") else [what]
     return shlex.join(words + (["--", what] if what.startswith("-") else []))
 
@@ -245,7 +250,7 @@ def _motion_frames(
     """
     poses = tables["trajectories"].get(name, {})
     runs = dict(group_rows(poses, "engine", "integrator"))
-    if not runs:
+    if not runs or scenario["model"] is None:
         return None
     n = int(scenario["bodies"])
     errors = _final_errors(name, tables)
@@ -290,6 +295,8 @@ def _motion_frames(
 def _run_poses(poses: Columns, rows: np.ndarray, n: int) -> tuple[Array, Array, Array]:
     """Return r (T, n, 3), unit p (T, n, 4) and t (T,) of one run; its records may be in any order."""
     order = rows[np.lexsort((poses["body"][rows], poses["t"][rows]))]
+    if len(order) % n or np.any(poses["body"][order].reshape(-1, n) != np.arange(n)):
+        raise DamagedResults(f"trajectories.parquet: has not the {n} bodies of results.json at every time")
     r = np.stack([poses[k][order] for k in ("rx", "ry", "rz")], -1).reshape(-1, n, 3).astype(float)
     p = np.stack([poses[k][order] for k in ("p0", "p1", "p2", "p3")], -1).reshape(-1, n, 4).astype(float)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow.parquet as pq
 
-from plumbline.storage.results_store import read_results
+from plumbline.storage.results_store import read_results, read_table
 from plumbline.storage.script_index import read_script_index, scripts_folder
 
 Record = dict[str, Any]
@@ -23,25 +22,6 @@ Columns = dict[str, np.ndarray]
 _UNPRINTABLE = re.compile(
     "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]"
 )
-
-# Fields that a run of one level, or one of an earlier version, may lack.
-_RUN_DEFAULTS: Record = {
-    "random_batch": {},
-    "truth": "",
-    "machine": {},
-    "commit": None,
-    "command": "",
-    "platform": "",
-    "versions": {},
-}
-_SCENARIO_DEFAULTS: Record = {
-    "horizon": None,
-    "truth_uncertainty": None,
-    "exact": None,
-    "truth": None,
-    "file": "",
-    "digest": "",
-}
 
 
 def replace_unprintable(value: Any) -> Any:
@@ -85,12 +65,11 @@ class Results:
             The run.
 
         Raises:
-            ValueError: the file is missing or damaged.
+            DamagedResults: the file is missing or damaged.
 
         """
         stored = replace_unprintable(read_results(folder))
-        scenarios = {name: _SCENARIO_DEFAULTS | about for name, about in stored["scenarios"].items()}
-        return cls(folder, _RUN_DEFAULTS | stored["run"], scenarios, stored["engines"], stored["rows"])
+        return cls(folder, stored["run"], stored["scenarios"], stored["engines"], stored["rows"])
 
     def table(self, name: str) -> Columns:
         """Read one Parquet table.
@@ -101,11 +80,14 @@ class Results:
         Returns:
             (n,) arrays by column, with unprintable characters replaced; {} where the file is missing.
 
+        Raises:
+            DamagedResults: the file is damaged.
+
         """
-        path = self.folder / f"{name}.parquet"
-        if not path.exists():
+        try:
+            table = read_table(self.folder, name)
+        except FileNotFoundError:
             return {}
-        table = pq.read_table(path)
         columns: Columns = {}
         for column in table.column_names:
             values = table[column].to_numpy(zero_copy_only=False)

@@ -116,7 +116,9 @@ def count_all_verdicts(results: Results) -> Counter[str]:
         The number of rows of each verdict that occurs.
 
     """
-    return count_verdicts(results.rows) + Counter(results.run["random_batch"].get("counts_by_verdict", {}))
+    return count_verdicts(results.rows) + Counter(
+        (results.run["random_batch"] or {}).get("counts_by_verdict", {})
+    )
 
 
 def css_class(verdict: str) -> str:

@@ -165,6 +165,9 @@ def run_nightly(
         result.metadata["sentence"] += f"; {answer.summary}"
         if answer.failure:
             result.metadata["exit_code"] = result.metadata["exit_code"] or 1
+    for name, about in result.scenarios.items():
+        if about["family"] == RANDOM_FAMILY:
+            about["file"] = (place / "scenarios" / f"{name}.yaml").as_posix()
     save(result, folder, command)
     write_random_scenario_files(result, random_scenarios, folder / "scenarios")
     with result.cpu_times.measure("report"):

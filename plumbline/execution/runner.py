@@ -22,7 +22,7 @@ from plumbline.execution.random_batch import RandomBatch
 from plumbline.execution.scenario_run import ScenarioRun, has_steps
 from plumbline.judging import known_issues
 from plumbline.judging.identity import RUN_SCENARIO, IdentityCheck
-from plumbline.judging.rows import Row, Verdict
+from plumbline.judging.rows import RUN_FAMILY, Row, Verdict
 from plumbline.processes.cpu_time import CpuTimes
 from plumbline.processes.workers import (
     Executor,
@@ -35,7 +35,7 @@ from plumbline.processes.workers import (
 from plumbline.storage import results_store
 
 RUN_SUMMARY: dict[str, Any] = {  # of the rows that are about the whole run
-    "family": "run",
+    "family": RUN_FAMILY,
     "title": "All scenarios of the run together",
     "purpose": "Shows two columns that are one computation under two names.",
     "file": "",

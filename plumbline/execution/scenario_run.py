@@ -227,7 +227,7 @@ class ScenarioRun:
             "family": s.family,
             "title": s.title,
             "purpose": s.purpose,
-            "file": s.path.name,
+            "file": s.origin,
             "bodies": s.model.n,
             "joints": ["rod" if rod else "ball" for rod in s.model.rods],
             "duration": s.duration,

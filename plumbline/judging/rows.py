@@ -66,6 +66,7 @@ VERDICT_STYLES = {
     Verdict.AGREES: VerdictStyle("✓", "agree", "the error is within its derived tolerance", 4, 4),
     Verdict.INFORMATION: VerdictStyle("i", "are information", "implied by other rows; not a check", 0, 0),
 }
+RUN_FAMILY = "run"  # of a row that is about the whole run, in place of a scenario's family
 RECORDED = "recorded"  # what terminal and report show for a disagreement or failure that is recorded
 SHOWN_STYLES: dict[str, VerdictStyle] = {
     **{str(verdict): style for verdict, style in VERDICT_STYLES.items()},

@@ -72,6 +72,14 @@ class Scenario:
     document: dict[str, Any] = field(repr=False, default_factory=dict)  # the checked content as plain data
 
     @property
+    def origin(self) -> str:
+        """The file: its name where it is of the catalogue, else its path as given, which has a slash."""
+        if CATALOGUE_FOLDER in self.path.parents:
+            return self.path.name
+        path = self.path.as_posix()
+        return path if "/" in path else f"./{path}"
+
+    @property
     def times(self) -> Array:
         """(T,) s, the sample times from 0 to the duration."""
         return (

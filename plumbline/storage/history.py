@@ -18,6 +18,7 @@ from typing import Any
 import duckdb
 
 from plumbline.scenario.generator import RANDOM_FAMILY
+from plumbline.storage.results_schema import DamagedResults
 from plumbline.storage.results_store import Record, read_results, read_table
 
 UNEXPECTED_VERDICT_SQL = "verdict NOT IN ('agrees', 'information') AND known_issue IS NULL"
@@ -74,7 +75,7 @@ class History:
         for path in sorted((inside if inside.is_dir() else folder).glob("*/results.json")):
             try:
                 self.nights.append(_read_complete_run(path.parent))
-            except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            except (OSError, DamagedResults) as error:
                 self.damaged[path.parent.name] = " ".join(str(error).split())
         self.nights.sort(key=lambda night: night.order)
         self._load_tables()
@@ -287,7 +288,7 @@ def stored_runs(folder: Path) -> Iterator[StoredRun]:
 
     """
     for path in sorted(folder.glob("*/results.json")):
-        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        with contextlib.suppress(OSError, DamagedResults):
             yield StoredRun(path.parent, read_results(path.parent)["run"])
 
 
@@ -305,15 +306,12 @@ def next_night_number(folder: Path) -> int:
 
 
 def _read_complete_run(folder: Path) -> StoredRun:
-    """Read a run's metadata; raises ValueError or OSError where results.json or the summary is damaged."""
+    """Read a run's metadata; raise DamagedResults where results.json or the summary is damaged."""
     document = read_results(folder)
     run = StoredRun(folder, document["run"])
-    if not isinstance(run.metadata["started"], str) or not isinstance(run.metadata["exit_code"], int):
-        raise ValueError("the start or the exit code of the run is not in results.json")
-    run.metadata["versions"].items()
     table = read_table(folder, "summary")
     expected = len(document["rows"])
-    expected += sum(run.metadata.get("random_batch", {}).get("counts_by_verdict", {}).values())
+    expected += sum((run.metadata["random_batch"] or {}).get("counts_by_verdict", {}).values())
     if len(table) != expected:
-        raise ValueError(f"summary.parquet has {len(table)} rows, results.json expects {expected}")
+        raise DamagedResults(f"summary.parquet has {len(table)} rows, results.json expects {expected}")
     return run

@@ -20,6 +20,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from plumbline.judging.rows import Columns, Row
+from plumbline.scenario.errors import shorten
+from plumbline.storage.results_schema import DamagedResults, check_results
 from plumbline.storage.upgrade import upgrade_document, upgrade_summary
 
 Record = dict[str, Any]
@@ -57,6 +59,25 @@ TABLES: dict[str, pa.Schema] = {
         **_RUN_COLUMNS, t=REAL, body=INTEGER, rx=REAL, ry=REAL, rz=REAL, p0=REAL, p1=REAL, p2=REAL, p3=REAL
     ),
 }  # fmt: skip
+DRIFT_TABLE = _schema(
+    scenario=TEXT,
+    variant=TEXT,
+    rtol=REAL,
+    time=REAL,  # s, the errors are the largest over [0, time]
+    gap=REAL,  # m; null, with a reason, where the run was left out or failed
+    gap_rate=REAL,  # m/s
+    norm=REAL,  # |‖p‖ − 1|
+    energy=REAL,  # |E − E(0)| over Σ m g reach; null with loads or drag
+    steps=pa.int64(),
+    cpu_seconds=REAL,  # of the run, to this time in proportion
+    reason=TEXT,
+)
+_NEVER_NULL = {  # columns by which readers group and sort
+    "key", "scenario", "family", "engine", "level", "integrator", "quantity", "verdict", "state", "body",
+    "variant", "rtol", "time", "reason",
+}  # fmt: skip
+# What is made of results.json after it has been written; see `write_results`.
+_MADE_OF_RESULTS = ("report.html", "junit.xml", "summary.md", "scripts/index.json", "scripts/*.py")
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -174,6 +195,7 @@ class ResultTables:
                 compression="zstd",
                 use_dictionary=[f.name for f in schema if f.type == TEXT],
                 column_encoding={f.name: "BYTE_STREAM_SPLIT" for f in schema if f.type == REAL},
+                write_page_checksum=True,
             )
             self._files[name] = sink, writer
         self._files[name][1].write_table(pa.concat_tables(self._waiting.pop(name, [])), ROW_GROUP_SIZE)
@@ -198,22 +220,45 @@ class ResultTables:
 
 
 def read_table(folder: Path, name: str) -> pa.Table:
-    """Read one table of a run.
+    """Read one table of a run, or the table of `plumbline drift` in its folder.
 
     Args:
         folder: output folder of the run.
-        name: a key of `TABLES`.
+        name: a key of `TABLES`, or ``drift``.
 
     Returns:
         The table; a summary with the names of the present schema version.
 
     Raises:
-        OSError: the file is missing.
-        ValueError: the file is damaged (`pyarrow.ArrowInvalid`).
+        FileNotFoundError: the file is missing.
+        OSError: the file cannot be read.
+        DamagedResults: the file is damaged, or lacks a column.
 
     """
-    table = pq.read_table(folder / f"{name}.parquet")
-    return upgrade_summary(table) if name == "summary" else table
+    path = folder / f"{name}.parquet"
+    schema = DRIFT_TABLE if name == "drift" else TABLES[name]
+    try:
+        with pq.ParquetFile(path, page_checksum_verification=True) as file:
+            table = file.read()
+        table.validate(full=True)
+        table = upgrade_summary(table) if name == "summary" else table
+    except (pa.ArrowException, OSError, ValueError, LookupError, TypeError) as error:
+        if isinstance(error, OSError) and error.errno:  # Arrow's own errors of this kind have no number
+            raise
+        raise DamagedResults(f"{path}: is damaged: {shorten(' '.join(str(error).split()), 200)}") from None
+    for field in schema:
+        if field.name not in table.column_names:
+            raise DamagedResults(
+                f"{path}: has no column {field.name}; valid would be {', '.join(schema.names)}"
+            )
+        column = table[field.name]
+        if column.type != field.type:
+            raise DamagedResults(
+                f"{path}: {field.name}: is of type {column.type}; valid would be {field.type}"
+            )
+        if field.name in _NEVER_NULL and column.null_count:
+            raise DamagedResults(f"{path}: {field.name}: has empty values; valid would be {field.type}")
+    return table
 
 
 def write_results(
@@ -225,6 +270,9 @@ def write_results(
     tables: ResultTables,
 ) -> None:
     """Write the results of one run.
+
+    An earlier run in the folder is removed first, results.json before all else, and the new results.json is
+    written last: a folder that has it is complete, and a folder never mixes two runs.
 
     Args:
         folder: output folder, made where it is missing.
@@ -239,6 +287,10 @@ def write_results(
 
     """
     folder.mkdir(parents=True, exist_ok=True)
+    (folder / "results.json").unlink(missing_ok=True)
+    for pattern in (*_MADE_OF_RESULTS, ".*.parquet.*", ".*.json.*"):  # and temporary files of a killed run
+        for path in folder.glob(pattern):
+            path.unlink(missing_ok=True)
     tables.write_parquet(folder)
     document = {
         "schema_version": SCHEMA_VERSION,
@@ -247,7 +299,6 @@ def write_results(
         "engines": engines,
         "rows": [row_record(row) for row in rows],
     }
-    # results.json last: its presence says that the folder is complete
     text = json.dumps(to_json_value(document), ensure_ascii=False, indent=1)
     write_atomically(folder / "results.json", text.encode())
 
@@ -262,20 +313,27 @@ def read_results(folder: Path) -> dict[str, Any]:
         The document, with the names of the present schema version.
 
     Raises:
-        ValueError: the file is missing, damaged or of another version.
+        DamagedResults: the file is missing, damaged or of another version.
         OSError: the file cannot be read.
 
     """
     path = folder / "results.json"
     try:
-        document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        found = document["schema_version"]
-    except FileNotFoundError:
-        raise ValueError(
-            f"{path}: no results here; `python -m plumbline run --out {folder}` makes them"
+        document = json.loads(path.read_text(encoding="utf-8"))
+        version = document["schema_version"]
+        if version in READABLE_VERSIONS:
+            document = upgrade_document(document)
+    except (FileNotFoundError, NotADirectoryError):
+        raise DamagedResults(
+            f"{path}: no results here, or not completely written; `python -m plumbline run --out {folder}` "
+            "makes them"
         ) from None
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: not a results file of plumbline ({error})") from None
-    if found not in READABLE_VERSIONS:
-        raise ValueError(f"{path}: schema_version {found}, this version reads {SCHEMA_VERSION}")
-    return upgrade_document(document)
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        found = shorten(f"{type(error).__name__}: {error}", 200)
+        raise DamagedResults(f"{path}: not a results file of plumbline ({found})") from None
+    if version not in READABLE_VERSIONS:
+        raise DamagedResults(
+            f"{path}: schema_version {shorten(repr(version))}, this version reads {SCHEMA_VERSION}"
+        )
+    check_results(path, document)
+    return document  # type: ignore[no-any-return]

@@ -5,12 +5,8 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from plumbline.processes.errors import PlumblineError
+from plumbline.storage.results_schema import DamagedResults
 from plumbline.storage.results_store import write_atomically
-
-
-class DamagedScriptIndex(PlumblineError, ValueError):
-    """scripts/index.json is not what `write_script_index` writes; the message names the file."""
 
 
 def scripts_folder(folder: Path) -> Path:
@@ -36,7 +32,7 @@ def read_script_index(folder: Path) -> dict[str, str]:
         File name of the script of each row key that has one; empty where there is no index.
 
     Raises:
-        DamagedScriptIndex: the file is not a JSON object of plain file names.
+        DamagedResults: the file is not a JSON object of plain file names.
 
     """
     path = scripts_folder(folder) / "index.json"
@@ -45,9 +41,9 @@ def read_script_index(folder: Path) -> dict[str, str]:
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, RecursionError) as error:
-        raise DamagedScriptIndex(f"{path}: not readable as JSON ({error}); remove it to go on") from None
+        raise DamagedResults(f"{path}: not readable as JSON ({error}); remove it to go on") from None
     if not isinstance(index, dict) or not all(_is_file_name(name) for name in index.values()):
-        raise DamagedScriptIndex(f"{path}: not an object of row keys and file names; remove it to go on")
+        raise DamagedResults(f"{path}: not an object of row keys and file names; remove it to go on")
     return index
 
 

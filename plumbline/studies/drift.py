@@ -14,25 +14,11 @@ import pyarrow as pa
 
 from plumbline.model.kinematics import quaternion_rate
 from plumbline.scenario.loader import Scenario
+from plumbline.storage.results_store import DRIFT_TABLE
 from plumbline.studies.tables import make_table
 from reference_impl.stabilised import VARIANTS, drift_table
 
 TIMES = (10.0, 100.0, 1000.0)  # s
-SCHEMA = pa.schema(
-    [
-        ("scenario", pa.string()),
-        ("variant", pa.string()),
-        ("rtol", pa.float64()),
-        ("time", pa.float64()),  # s, the errors are the largest over [0, time]
-        ("gap", pa.float64()),  # m; null, with a reason, where the run was left out or failed
-        ("gap_rate", pa.float64()),  # m/s
-        ("norm", pa.float64()),  # |‖p‖ − 1|
-        ("energy", pa.float64()),  # |E − E(0)| over Σ m g reach; null with loads or drag
-        ("steps", pa.int64()),
-        ("cpu_seconds", pa.float64()),  # of the run, to this time in proportion
-        ("reason", pa.string()),
-    ]
-)
 
 
 def measure_drift(
@@ -54,7 +40,7 @@ def measure_drift(
         log: called with the predicted cost of each long run.
 
     Returns:
-        One row per scenario, variant, tolerance and time, with the columns of `SCHEMA`.
+        One row per scenario, variant, tolerance and time, with the columns of `DRIFT_TABLE`.
 
     """
     planned = [(s, variant, rtol) for s in selected_scenarios for rtol in rtols for variant in VARIANTS]
@@ -63,7 +49,7 @@ def measure_drift(
         progress(done, len(planned), f"{s.name}, {variant}, rtol {rtol:g}")
         records += _measure_variant(s, variant, rtol, max_cpu_seconds, times, log)
     progress(len(planned), len(planned), "done")
-    return make_table(records, SCHEMA)
+    return make_table(records, DRIFT_TABLE)
 
 
 def _measure_variant(

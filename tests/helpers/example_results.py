@@ -17,7 +17,7 @@ import numpy as np
 
 from plumbline.judging.rows import Row, RowContext, Verdict, error_ratio
 from plumbline.storage.results_store import ResultTables, read_results, write_results
-from plumbline.storage.script_index import write_script_index
+from plumbline.storage.script_index import scripts_folder, write_script_index
 
 G = 9.81
 HOSTILE = "<img src=x onerror=alert(1)>"
@@ -272,6 +272,15 @@ def build(
             (out / "scripts" / f"reproduce-{k}.py").write_text(text)
         index = {row_.key: f"reproduce-{k}.py" for k, row_ in enumerate(bad)}
         write_script_index(out, index)
+    return out
+
+
+def build_small(out: Path) -> Path:
+    """Write a small output folder with every kind of file, and return it."""
+    build(out, hostile=False, scenarios=1, samples=4, duration=0.125)
+    scripts_folder(out).mkdir(exist_ok=True)
+    (scripts_folder(out) / "a.py").write_text("print('a script')\n")
+    write_script_index(out, {read_results(out)["rows"][0]["key"]: "a.py"})
     return out
 
 

@@ -14,7 +14,8 @@ import pytest
 from click.testing import CliRunner
 
 from plumbline.cli.main import main
-from plumbline.studies import drift, sweep
+from plumbline.storage.results_store import DRIFT_TABLE
+from plumbline.studies import sweep
 from plumbline.studies.tables import write_table
 from reports import html_report, reference_tables, sweep_page
 from reports.results import Results, replace_unprintable
@@ -57,7 +58,7 @@ def sweep_rows():
 @pytest.fixture(scope="module")
 def out(example_run, tmp_path_factory):
     folder = shutil.copytree(example_run, tmp_path_factory.mktemp("pages") / "a run & more")
-    write_table(pa.Table.from_pylist([*DRIFT, LEFT_OUT], schema=drift.SCHEMA), folder / "drift.parquet")
+    write_table(pa.Table.from_pylist([*DRIFT, LEFT_OUT], schema=DRIFT_TABLE), folder / "drift.parquet")
     goals = [
         {"what": HOSTILE, "goal": 0.3, "measured": 0.12},
         {"what": NASTY, "goal": 4, "measured": 5.5},

@@ -291,15 +291,23 @@ def test_commands_are_quoted_for_a_shell():
         "mujoco",
         "--level",
         "trajectory",
+        "--out",
+        "repeated",
     ]
     row["scenario"] = "--out"
     assert shlex.split(report_data.rerun_command(row, {"file": ""}))[-2:] == ["--", "--out"]
-    assert "'my own.yaml'" in report_data.rerun_command(row, {"file": "my own.yaml"})
+    assert "'./my own.yaml'" in report_data.rerun_command(row, {"file": "./my own.yaml"})
+    assert " run rest " in report_data.rerun_command(row | {"scenario": "rest"}, {"file": "rest.yaml"})
+    mine = report_data.rerun_command(row | {"scenario": "rest"}, {"file": "./rest.yaml"})
+    assert " run ./rest.yaml " in mine, "a file of the user that is named like one of the catalogue"
+    whole = report_data.rerun_command(row | {"level": "relations"}, {"file": "", "family": "run"})
+    assert whole == "python -m plumbline run --engine mujoco --level all --out repeated"
     row |= {"scenario": "rest", "quantity": "energy_drift_long", "extra": {"asked": 100.0}}
     nightly = "python -m plumbline nightly rest --engine mujoco --random 0 --no-self-test"
-    assert report_data.rerun_command(row, {"file": ""}) == nightly
+    out = " --out repeated"
+    assert report_data.rerun_command(row, {"file": ""}) == nightly + out
     row["extra"] = {"asked": 12.5}
-    assert report_data.rerun_command(row, {"file": ""}) == f"{nightly} --long-run-seconds 12.5"
+    assert report_data.rerun_command(row, {"file": ""}) == f"{nightly} --long-run-seconds 12.5{out}"
 
 
 def test_numbers_read_as_people_write_them():

@@ -9,13 +9,16 @@ import pytest
 from click.testing import CliRunner
 
 from plumbline.cli.main import main
+from plumbline.engines.registry import load_adapter
+from plumbline.judging.rows import RowContext
 from plumbline.processes.workers import Outcome
 from plumbline.reproduce import write
 from plumbline.reproduce.write import NotReproducible, write_scripts
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.storage import results_store
-from plumbline.storage.script_index import DamagedScriptIndex, read_script_index
-from tests.helpers.reproduction import run_alone, stored_row
+from plumbline.storage.results_schema import DamagedResults
+from plumbline.storage.script_index import read_script_index
+from tests.helpers.reproduction import run_alone
 
 for name in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(name)
@@ -28,21 +31,32 @@ def results(tmp_path):
     """A results folder with real disagreements of aba, one row that agrees and one without a script."""
     scenario = load_scenario(find_scenario_file("chain-30-balls"))
     about = {
+        "family": "chain",
+        "title": "Thirty balls",
+        "bodies": scenario.model.n,
         "digest": scenario.digest,
         "model": {k: np.asarray(v).tolist() for k, v in asdict(scenario.model).items()},
         "state": {k: getattr(scenario.state, k).tolist() for k in ("p", "omega", "u", "udot")},
     }
+    version = load_adapter("pinocchio-aba").version()
+    who = RowContext("chain", "chain", "pinocchio-aba", "Pinocchio", version)
     rows = [
-        stored_row("pinocchio-aba", key=key, scenario="chain", level=level, integrator=integrator,
-                   quantity=quantity, verdict=verdict, reason="off", diagnosis=None, ratio=400.0,
-                   declared_order=None, extra={"state": 0.0})
+        results_store.row_record(
+            who.make_row(level, integrator, quantity, verdict, "off", ratio=400.0, extra={"state": 0.0})
+        ) | {"key": key}
         for key, level, integrator, quantity, verdict in (
             ("a", "state", "-", "acceleration", "disagrees"),
             ("b", "relations", "rkmk4", "reversed in time", "disagrees"),
             ("c", "state", "-", "joint_reaction", "agrees"),
             ("d", "relations", "-", "re-chosen body frame", "disagrees"))
     ]  # fmt: skip
-    document = {"schema_version": results_store.SCHEMA_VERSION, "scenarios": {"chain": about}, "rows": rows}
+    document = {
+        "schema_version": results_store.SCHEMA_VERSION,
+        "run": {"id": "x", "started": "2026-01-01", "duration": 1.0, "sentence": "off", "exit_code": 1},
+        "scenarios": {"chain": about},
+        "engines": {"pinocchio-aba": {"title": "Pinocchio", "version": version}},
+        "rows": rows,
+    }
     store(tmp_path, document)
     return tmp_path
 
@@ -134,7 +148,7 @@ INDICES = (
 def test_a_damaged_index_is_named(results, text):
     (results / "scripts").mkdir()
     (results / "scripts" / "index.json").write_bytes(text.encode("utf-8", "surrogateescape"))
-    with pytest.raises(DamagedScriptIndex, match=r"index\.json"):
+    with pytest.raises(DamagedResults, match=r"index\.json"):
         read_script_index(results)
     for arguments in (("reproduce", results, "a"), ("report", results)):
         code, output = command(*arguments)
@@ -172,4 +186,5 @@ def test_damaged_results_are_named_and_raise_nothing_else(results):
             for arguments in (("reproduce", results), ("reproduce", results, "a")):
                 code, output = command(*arguments)
                 assert code in (0, 1, 2), output
+                assert code != 2 or "results.json" in output or "no row 'a' disagrees" in output, output
                 assert code != 2 or "results.json" in output or "no row 'a'" in output, output

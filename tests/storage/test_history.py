@@ -28,13 +28,16 @@ def store_run(folder, day, verdicts, version="4.0", known=None, family="single",
         "started": f"2026-01-0{day}T00:00:00+00:00",
         "exit_code": int(bad),
         "sentence": "",
+        "duration": 1.0,
         "versions": {"mujoco": version},
     }
     if number:
         run["night"] = number
     tables = results_store.ResultTables()
     tables.add_rows(rows)
-    results_store.write_results(folder / run["id"], run, {}, {}, rows, tables)
+    scenarios = {row.scenario: {"family": family, "title": "", "bodies": 1} for row in rows}
+    engines = {"mujoco": {"title": "MuJoCo", "version": version}}
+    results_store.write_results(folder / run["id"], run, scenarios, engines, rows, tables)
 
 
 def test_first_bad_night_and_last_green(tmp_path):

@@ -6,11 +6,13 @@ import os
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from plumbline.judging.rows import Row, RowContext
 from plumbline.storage import results_store
+from plumbline.storage.results_schema import DamagedResults
 
 ROW = RowContext("s", "single", "mujoco", "MuJoCo", "4.0").make_row(
     "state",
@@ -39,7 +41,11 @@ STATES = [
 ]
 
 
-def write_results(folder):
+RUN = {"started": "2026-01-01", "duration": 1.0, "sentence": "one", "exit_code": 0}
+ENGINE = {"title": "MuJoCo", "version": "4.0"}
+
+
+def write_results(folder, run_id="x"):
     tables = results_store.ResultTables()
     names = {"scenario": "s", "engine": "mujoco", "quantity": "q"}
     for part in ([0], [1, 2]):
@@ -55,7 +61,10 @@ def write_results(folder):
             },
         )
     tables.add_rows([ROW])
-    results_store.write_results(folder, {"id": "x"}, {"s": {"title": "<b>"}}, {}, [ROW], tables)
+    scenario = {"family": "single", "title": "<b>", "bodies": 1}
+    results_store.write_results(
+        folder, RUN | {"id": run_id}, {"s": scenario}, {"mujoco": ENGINE}, [ROW], tables
+    )
 
 
 def test_what_is_written_is_read_back(tmp_path):
@@ -135,3 +144,102 @@ def test_the_field_reference_names_every_field_and_column():
     for name, schema in results_store.TABLES.items():
         if name != "summary":
             assert f"- `{name}`: {', '.join(schema.names)}" in text, name
+
+
+PAGES = ("report.html", "junit.xml", "summary.md", "scripts/index.json", "scripts/a.py")
+
+
+@pytest.mark.parametrize("step", range(6))
+def test_a_run_that_is_killed_while_it_saves_leaves_no_mixture(tmp_path, monkeypatch, step):
+    write_results(tmp_path, "old")
+    (tmp_path / "scripts").mkdir()
+    for name in (*PAGES, "drift.parquet"):
+        (tmp_path / name).write_text("of the old run, but for drift")
+    replace, count = os.replace, iter(range(100))
+
+    def kill(*paths):
+        if next(count) == step:
+            raise KeyboardInterrupt
+        replace(*paths)
+
+    monkeypatch.setattr(os, "replace", kill)
+    with pytest.raises(KeyboardInterrupt):
+        write_results(tmp_path, "new")
+    monkeypatch.undo()
+    assert not [name for name in PAGES if (tmp_path / name).exists()]
+    assert (tmp_path / "drift.parquet").exists(), "no part of a run"
+    with pytest.raises(DamagedResults, match=r"no results here, or not completely written"):
+        results_store.read_results(tmp_path)
+    write_results(tmp_path, "new")
+    assert results_store.read_results(tmp_path)["run"]["id"] == "new"
+
+
+def test_temporary_files_of_a_killed_run_are_removed(tmp_path):
+    for name in (".states.parquet.a1b2c3d4", ".results.json.a1b2c3d4"):
+        (tmp_path / name).write_text("half")
+    write_results(tmp_path)
+    assert not list(tmp_path.glob(".*"))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda d: d.pop("run"), "run: is missing"),
+        (lambda d: d["run"].update(exit_code="0"), "run.exit_code: is the text '0', not a whole number"),
+        (lambda d: d["rows"][0].update(value="x"), "rows[0].value: is the text 'x', not a number"),
+        (
+            lambda d: d["rows"][0].update(verdict="agree"),
+            "rows[0].verdict: is 'agree'. did you mean 'agrees'?",
+        ),
+        (lambda d: d["rows"][0].update(scenario="t"), "rows[0].scenario is 't'; valid would be one of the"),
+        (lambda d: d["rows"][0].pop("reason"), "rows[0].reason: is missing"),
+        (lambda d: d["scenarios"]["s"].update(model={"mass": [1]}), "model.inertia does not fit the bodies"),
+        (lambda d: d.update(engines=[]), "engines: is a list"),
+        (lambda d: d["rows"].extend([3] * 9), "… and 4 more problems"),
+    ],
+)
+def test_a_wrong_field_is_named(tmp_path, change, words):
+    write_results(tmp_path)
+    path = tmp_path / "results.json"
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+    with pytest.raises(DamagedResults) as caught:
+        results_store.read_results(tmp_path)
+    assert str(caught.value).startswith(f"{path}: ") and words in str(caught.value)
+
+
+def without(name):
+    return lambda table: table.drop_columns([name])
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (without("bound"), "has no column bound"),
+        (lambda t: t.set_column(4, "body", t["error"]), "body: is of type double; valid would be int32"),
+        (lambda t: t.set_column(4, "body", pa.nulls(3, pa.int32())), "body: has empty values"),
+    ],
+)
+def test_a_table_without_what_readers_need_is_named(tmp_path, change, words):
+    write_results(tmp_path)
+    path = tmp_path / "states.parquet"
+    pq.write_table(change(pq.read_table(path)), path)
+    with pytest.raises(DamagedResults) as caught:
+        results_store.read_table(tmp_path, "states")
+    assert str(caught.value).startswith(f"{path}: ") and words in str(caught.value)
+
+
+def test_every_changed_byte_of_a_tables_data_is_found(tmp_path):
+    """Pages have checksums: no damaged number is read as another number."""
+    write_results(tmp_path)
+    path = tmp_path / "states.parquet"
+    whole, before = path.read_bytes(), results_store.read_table(tmp_path, "states").to_pylist()
+    found = 0
+    for at in range(len(whole)):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 16]) + whole[at + 1 :])
+        try:
+            assert results_store.read_table(tmp_path, "states").to_pylist() == before
+        except DamagedResults:
+            found += 1
+    assert found > len(whole) / 3, "of the others most are statistics and names that nobody reads"

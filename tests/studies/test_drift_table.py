@@ -12,6 +12,7 @@ from click.testing import CliRunner
 
 from plumbline.cli.main import main
 from plumbline.scenario import loader as scenarios
+from plumbline.storage.results_store import DRIFT_TABLE
 from plumbline.studies import drift
 from reference_impl.stabilised import VARIANTS
 
@@ -58,7 +59,7 @@ def test_the_command_writes_the_table(tmp_path, monkeypatch):
     ran = CliRunner().invoke(main, ["drift", "tumbling-rod", "--rtol", "1e-6", "--out", str(tmp_path)])
     assert ran.exit_code == 0, ran.output
     kept = pq.read_table(tmp_path / "drift.parquet")
-    assert kept.schema.names == drift.SCHEMA.names
+    assert kept.schema.names == DRIFT_TABLE.names
     assert {(row["time"], row["rtol"]) for row in kept.to_pylist()} == {(0.5, 1e-6), (1.0, 1e-6)}
     assert "baumgarte" in ran.output
     assert CliRunner().invoke(main, ["drift", "no-such-thing", "--out", str(tmp_path)]).exit_code == 2

@@ -1,0 +1,207 @@
+"""What results.json must hold: types, ranges, array sizes, and rows of scenarios and engines of the run.
+
+Some fields may be missing and unknown fields are ignored, so that results of earlier versions stay readable.
+"""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from plumbline.judging.rows import Level
+from plumbline.model.datatypes import Model
+from plumbline.processes.errors import PlumblineError
+from plumbline.scenario.errors import shorten
+from plumbline.scenario.schema import MAX_BODIES, invalid_value_error
+from plumbline.scenario.validation_messages import problems_from_validation
+from plumbline.scenario.yaml_source import YamlSource
+
+MAX_LISTED_PROBLEMS = 5
+MAX_MAGNITUDE = 1e30  # of the model's numbers, as in scenario files
+
+_MODEL_SHAPES: dict[str, tuple[int, ...]] = {  # of one body; (3,) where none is named
+    "inertia": (3, 3), "mass": (), "length": (), "drag_force": (), "drag_moment": (),
+}  # fmt: skip
+_STATE_SHAPES: dict[str, tuple[int, ...]] = {"p": (4,), "omega": (3,), "u": (3,), "udot": (3,)}
+_Count = Annotated[int, Field(ge=0, le=2**53)]
+_Duration = Annotated[float, Field(ge=0, le=1e15)]  # s
+_VerdictWord = Literal[
+    "agrees", "disagrees", "unresolved", "unsupported", "not installed", "failed", "harness failed",
+    "information",
+]  # fmt: skip
+
+
+class DamagedResults(PlumblineError, ValueError):
+    """A file of a results folder is not what a run writes; the message names the file and what is wrong."""
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="ignore", strict=True, allow_inf_nan=False)
+
+
+class _Scenario(_Part):
+    family: str
+    title: str
+    purpose: str = ""
+    file: str = ""
+    bodies: int = Field(ge=0, le=MAX_BODIES)
+    joints: list[str] = []
+    duration: _Duration = 0.0
+    sample: _Duration = 0.0
+    exact: str | None = None
+    digest: str = ""
+    horizon: float | None = None
+    growth: float | None = None
+    truth: str | None = None
+    truth_uncertainty: float | None = None
+    model: dict[str, Any] | None = None
+    state: dict[str, Any] | None = None
+
+    @model_validator(mode="after")
+    def _check_arrays(self) -> _Scenario:
+        shapes = {f.name: (self.bodies, *_MODEL_SHAPES.get(f.name, (3,))) for f in fields(Model)}
+        _check_shapes("model", self.model, shapes | {"gravity": (3,)})
+        _check_shapes("state", self.state, {k: (self.bodies, *shape) for k, shape in _STATE_SHAPES.items()})
+        if self.model is not None and min(self.model["mass"], default=1.0) <= 0:
+            raise invalid_value_error("has a mass that is not positive", "masses above 0 kg")
+        return self
+
+
+def _check_shapes(what: str, given: dict[str, Any] | None, shapes: dict[str, tuple[int, ...]]) -> None:
+    """Raise the validation error of an array that is missing, of another shape or not finite."""
+    for name, shape in shapes.items() if given is not None else ():
+        try:
+            array = np.array(given.get(name))  # type: ignore[union-attr]
+        except ValueError:  # rows of several lengths
+            array = np.array(None)
+        is_finite = array.dtype.kind in "if" and bool(np.all(np.abs(array.astype(float)) <= MAX_MAGNITUDE))
+        if array.shape != shape or not is_finite:
+            size = " × ".join(map(str, shape))
+            raise invalid_value_error(f"{what}.{name} does not fit the bodies", f"{size} finite numbers")
+
+
+class _Integrator(_Part):
+    name: str
+    kind: Literal["step", "tolerance"] = "step"
+    order: int = 0
+    note: str = ""
+    alias_of: str | None = None
+
+
+class _Engine(_Part):
+    title: str
+    version: str
+    missing: str | None = None
+    integrators: list[_Integrator] = []
+
+
+class _WorstRatio(_Part):
+    engine: str
+    quantity: str
+    scenario: str
+    ratio: float
+
+
+class _RandomBatch(_Part):
+    scenarios: _Count
+    trajectories: _Count = 0
+    counts_by_verdict: dict[_VerdictWord, _Count] = {}
+    worst_ratios: list[_WorstRatio]
+
+
+class _Run(_Part):
+    id: str
+    started: str
+    duration: _Duration
+    sentence: str
+    exit_code: int = Field(ge=0, le=255)
+    python: str = ""
+    platform: str = ""
+    command: str = ""
+    commit: str | None = None
+    truth: str = ""
+    machine: dict[str, str] = {}
+    versions: dict[str, str] = {}
+    random_batch: _RandomBatch | None = None
+    night: _Count = 0
+    random: _Count | None = None
+    seed: int | None = None
+
+
+class _Row(_Part):
+    key: str
+    scenario: str
+    family: str
+    engine: str
+    engine_version: str
+    level: Level
+    integrator: str
+    quantity: str
+    unit: str
+    value: float | None
+    tolerance: float | None
+    ratio: float | None
+    verdict: _VerdictWord
+    reason: str
+    derivation: str
+    uncertainty: float | None
+    compared_until: float | None
+    order: float | None
+    declared_order: int | None
+    alias_of: str | None
+    known_issue: str | None
+    diagnosis: str | None
+    user_rtol: float | None
+    cpu_time: _Duration
+    extra: dict[str, float | int | str | None]
+
+
+class _Results(_Part):
+    run: _Run
+    scenarios: dict[str, _Scenario]
+    engines: dict[str, _Engine]
+    rows: list[_Row]
+
+    @model_validator(mode="after")
+    def _check_names(self) -> _Results:
+        for index, row in enumerate(self.rows):
+            for what, known in (("scenario", self.scenarios), ("engine", self.engines)):
+                if (name := getattr(row, what)) not in known:
+                    raise invalid_value_error(
+                        f"rows[{index}].{what} is {shorten(repr(name))}", f"one of the {what}s of the file"
+                    )
+        return self
+
+
+def check_results(path: Path, document: Any) -> None:
+    """Check the content of a results.json of the present schema version; fill in fields that may be missing.
+
+    Args:
+        path: the file, for the message.
+        document: its content, as plain data; missing fields of its run, scenarios and engines are added.
+
+    Raises:
+        DamagedResults: the content is not what a run writes.
+
+    """
+    try:
+        _Results.model_validate(document)
+    except ValidationError as error:
+        details = error.errors(include_url=False)
+        source = YamlSource(str(path), document)
+        problems = problems_from_validation(source, details[:MAX_LISTED_PROBLEMS], _Results)
+        lines = [str(replace(problem, line=0, valid=problem.valid.rstrip(": "))) for problem in problems]
+        if len(details) > MAX_LISTED_PROBLEMS:
+            lines.append(f"… and {len(details) - MAX_LISTED_PROBLEMS} more problems")
+        raise DamagedResults("\n".join(lines)) from None
+    parts: list[tuple[type[_Part], dict[str, Any]]] = [(_Run, document["run"])]
+    parts += [(_Scenario, about) for about in document["scenarios"].values()]
+    parts += [(_Engine, about) for about in document["engines"].values()]
+    for model, part in parts:
+        for name, info in model.model_fields.items():
+            if name not in part and not info.is_required():
+                part[name] = info.get_default(call_default_factory=True)
