@@ -26,6 +26,7 @@ from reference_impl.structured import StructuredSystem, component_first
 
 DEFAULT_NODES = 16  # a sweep of a small chain costs NumPy's calls and not its nodes: 8 … 20 were tried
 MAX_SWEEPS = 14  # at most in a step; more are better spent on a shorter step
+PROBED_STEPS = 50  # steps after which the length of a step no longer depends on the first guess
 USUAL_SWEEPS = 6  # sweeps: a step that needs more is made shorter, one that needs fewer may grow
 
 
@@ -118,6 +119,7 @@ def integrate_collocation(
     dense: bool = True,
     baumgarte: float = 0.0,
     project: bool = False,
+    max_steps: float = np.inf,
 ) -> BatchIntegrationResult:
     """Integrate all chains with common steps.
 
@@ -141,12 +143,14 @@ def integrate_collocation(
             where the polynomial has S, so the square of the tail counts.
         baumgarte: a [1/s] of Baumgarte's stabilisation; 0 is the notes' raw form.
         project: move the end of every step, and every sample, onto the constraints.
+        max_steps: the run ends with an error as soon as its steps show that it would need more.
 
     Returns:
         The motion of all chains at ``times``.
 
     Raises:
-        ArithmeticError: the step vanishes, or (`SingularSystem`) S is singular on the way.
+        ArithmeticError: the step vanishes, there would be more than ``max_steps``, or (`SingularSystem`) S is
+            singular on the way.
 
     """
     forest = chains if isinstance(chains, StructuredSystem) else StructuredSystem(chains)
@@ -173,6 +177,10 @@ def integrate_collocation(
             h = (goal - t) / max(1.0, np.ceil((goal - t) / stepper.h - 0.15))
         if h < 1e-13 * max(span, abs(t)) and goal - t > h:
             raise ArithmeticError(f"collocation stopped at t = {t} s: the step vanishes")
+        if steps + rejected >= PROBED_STEPS and steps + (times[-1] - t) / h > max_steps:
+            raise ArithmeticError(
+                f"collocation needs more than {max_steps:g} steps: at t = {t:.3g} s they are {h:.3g} s long"
+            )
         ok, slow = stepper.try_step(h)
         if not ok:
             rejected += 1

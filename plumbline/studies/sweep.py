@@ -1,4 +1,4 @@
-"""Parameter sweeps: the reference runs all cells in one batch, engines run them cell by cell.
+"""Parameter sweeps: the reference runs cells in batches, engines run them cell by cell, all in workers.
 
 An engine's cell is judged as a run judges it: the same refinement study, compared with the same truth up to
 the same horizon (`plumbline.judging.trajectory`).
@@ -7,29 +7,31 @@ the same horizon (`plumbline.judging.trajectory`).
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import product
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
 from plumbline.engines.adapter import EngineInfo
-from plumbline.engines.calls import RefinementStudy, describe_engine, run_refinement
+from plumbline.engines.calls import RefinementStudy, run_refinement
 from plumbline.judging.convergence import refinement_resolutions
 from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.judging.trajectory import judge_trajectory
 from plumbline.model.datatypes import Integrator, Trajectory
 from plumbline.model.invariants import compute_invariants, position_error
 from plumbline.model.kinematics import quaternion_rate
-from plumbline.processes.workers import Task, WorkerPool
+from plumbline.processes.workers import Outcome, Task, WorkerPool
 from plumbline.scenario.loader import Scenario
-from plumbline.studies.sweep_file import Sweep, SweepCell
+from plumbline.studies.sweep_file import REFINEMENT_LEVELS, Sweep, SweepCell
 from plumbline.studies.tables import make_table
 from plumbline.truth.ground_truth import MotionTruth, motion_truth
 from reference_impl import collocation
 
 REFERENCE_RTOLS = (1e-9, 1e-11)  # of the reference: a run, and the tighter run that gives its uncertainty
-REFINEMENT_LEVELS = 4  # step sizes of an engine where the file names the coarsest
+MAX_REFERENCE_STEPS = 1e6  # about 20 min
+BATCH_SIZE = 256  # cells that the reference integrates together; more take as long per cell
 
 COLUMNS: dict[str, pa.DataType] = {
     "cell": pa.int32(),
@@ -52,35 +54,39 @@ COLUMNS: dict[str, pa.DataType] = {
 Record = dict[str, Any]  # column name → value
 
 
-def run(sweep: Sweep, cells: Sequence[SweepCell], jobs: int = 1) -> pa.Table:
+def run(
+    sweep: Sweep,
+    cells: Sequence[SweepCell],
+    workers: WorkerPool,
+    engines: Mapping[str, EngineInfo],
+    progress: Callable[[int, int, str], None] = lambda done, total, what: None,
+) -> pa.Table:
     """Run and judge all cells of a sweep.
 
     Args:
         sweep: the sweep's file.
         cells: its cells, from `plumbline.studies.sweep_file.load`.
-        jobs: number of worker processes for truths and engines.
+        workers: run the reference, the truths and the engines.
+        engines: description of each engine of the sweep.
+        progress: called after every task with tasks done, tasks in all and the task's name.
 
     Returns:
         One row per cell and implementation: the cell's values, then `COLUMNS`.
 
     """
     by_index = {cell.index: cell for cell in cells}
-    valid = [(cell.index, cell.scenario) for cell in cells if cell.scenario is not None]
+    valid = {cell.index: cell.scenario for cell in cells if cell.scenario is not None}
     records: list[Record] = [
-        {
-            "cell": cell.index,
-            "implementation": "reference",
-            "verdict": Verdict.UNSUPPORTED,
-            "reason": cell.invalid_reason,
-        }
+        _reference_record(cell.index, Verdict.UNSUPPORTED, cell.invalid_reason)
         for cell in cells
         if cell.scenario is None
     ]
-    for group in _group_by_sampling(valid):
-        records += _run_reference_batch(group)
+    counted = _Progress(workers, progress)
+    references = list(_run_references(counted, valid))
+    lost = {record["cell"]: record["reason"] for record in references if record["verdict"] == Verdict.FAILED}
+    records += references
     if sweep.engines:
-        with WorkerPool(jobs) as workers:
-            records += _run_engines(workers, sweep, dict(valid))
+        records += _run_engines(counted, sweep, engines, valid, lost)
     for record in records:
         record |= by_index[record["cell"]].values
     order = ["reference", *sweep.engines]
@@ -93,48 +99,74 @@ def run(sweep: Sweep, cells: Sequence[SweepCell], jobs: int = 1) -> pa.Table:
     return make_table(records, schema)
 
 
-def _group_by_sampling(valid: Sequence[tuple[int, Scenario]]) -> Iterable[list[tuple[int, Scenario]]]:
-    """Group cells (index, scenario) that have the same duration and sample interval: each is one batch."""
-    groups: dict[tuple[float, float], list[tuple[int, Scenario]]] = defaultdict(list)
-    for index, scenario in valid:
-        groups[scenario.duration, scenario.sample_interval].append((index, scenario))
-    return groups.values()
+class _Progress:
+    """Runs tasks and counts them."""
+
+    def __init__(self, workers: WorkerPool, progress: Callable[[int, int, str], None]) -> None:
+        self.limits, self._workers, self._progress = workers.limits, workers, progress
+        self._done, self._total = 0, 0
+
+    def run(self, tasks: Sequence[Task], what: str) -> Iterator[Outcome]:
+        self._total += len(tasks)
+        for outcome in self._workers.run(tasks):
+            self._done += 1
+            self._progress(self._done, self._total, what)
+            yield outcome
+
+
+def _batches(valid: Mapping[int, Scenario]) -> list[list[int]]:
+    """Indices of cells that have the same duration and sample interval, in batches of limited size."""
+    groups: dict[tuple[float, float], list[int]] = defaultdict(list)
+    for index, scenario in valid.items():
+        groups[scenario.duration, scenario.sample_interval].append(index)
+    return [group[k : k + BATCH_SIZE] for group in groups.values() for k in range(0, len(group), BATCH_SIZE)]
+
+
+def _reference_record(index: int, verdict: Verdict, reason: str) -> Record:
+    return {"cell": index, "implementation": "reference", "verdict": verdict, "reason": reason}
+
+
+def _run_references(counted: _Progress, valid: Mapping[int, Scenario]) -> Iterator[Record]:
+    """The reference's rows; the cells of a batch that fails run one by one, so that only one cell is lost."""
+    batches = _batches(valid)
+    while batches:
+        tasks = [
+            Task(k, _run_reference_batch, ([(i, valid[i]) for i in batch],), counted.limits)
+            for k, batch in enumerate(batches)
+        ]
+        failed: list[list[int]] = []
+        for outcome in counted.run(tasks, "reference"):
+            batch = batches[outcome.key]
+            if outcome.failure is None:
+                yield from outcome.value
+            elif len(batch) > 1:
+                failed += [[index] for index in batch]
+            else:
+                yield _reference_record(batch[0], Verdict.FAILED, outcome.failure)
+        batches = failed
 
 
 def _run_reference_batch(group: Sequence[tuple[int, Scenario]]) -> list[Record]:
-    """The reference's rows; the cells of a batch that fails run one by one, so that only one cell is lost."""
+    """The reference's rows of one batch, in a worker; raise ArithmeticError where a cell fails."""
     chains = [s.model for _, s in group]
     r, p, v = (np.concatenate([getattr(s.state, name) for _, s in group]) for name in ("r", "p", "v"))
     pdot = np.concatenate([quaternion_rate(s.state.p, s.state.omega) for _, s in group])
     times = group[0][1].times
-    try:
-        coarse, fine = (
-            collocation.integrate_collocation(chains, r, p, v, pdot, times, rtol) for rtol in REFERENCE_RTOLS
-        )
-    except ArithmeticError as error:
-        if len(group) > 1:
-            return [record for one in group for record in _run_reference_batch([one])]
-        return [
-            {
-                "cell": group[0][0],
-                "implementation": "reference",
-                "verdict": Verdict.FAILED,
-                "reason": str(error),
-            }
-        ]
+    coarse, fine = (
+        collocation.integrate_collocation(chains, r, p, v, pdot, times, rtol, max_steps=MAX_REFERENCE_STEPS)
+        for rtol in REFERENCE_RTOLS
+    )
     records, first = [], 0
     for index, scenario in group:
         body = slice(first, first := first + scenario.model.n)
         motion = Trajectory(
             times, fine.r[:, body], fine.p[:, body], fine.v[:, body], fine.pdot[:, body], fine.steps
         )
+        reason = "the reference; its uncertainty is the change to the tighter tolerance"
         records.append(
             {
-                "cell": index,
-                "implementation": "reference",
+                **_reference_record(index, Verdict.AGREES, reason),
                 "integrator": "collocation",
-                "verdict": Verdict.AGREES,
-                "reason": "the reference; its uncertainty is the change to the tighter tolerance",
                 "uncertainty": float(np.max(position_error(coarse.r[:, body], motion.r))),
                 **_measure_motion(scenario, motion),
             }
@@ -157,30 +189,42 @@ def _measure_motion(scenario: Scenario, motion: Trajectory) -> Record:
     }
 
 
-def _run_engines(workers: WorkerPool, sweep: Sweep, scenarios: dict[int, Scenario]) -> Iterator[Record]:
-    """The engines' rows, in the order in which the workers finish them."""
+def _run_engines(
+    counted: _Progress,
+    sweep: Sweep,
+    engines: Mapping[str, EngineInfo],
+    scenarios: Mapping[int, Scenario],
+    lost: Mapping[int, str],
+) -> Iterator[Record]:
+    """The engines' rows, in the order in which the workers finish them; ``lost`` cells have no truth."""
 
     def record(index: int, engine: str, verdict: Verdict, reason: str | None) -> Record:
         names = {"cell": index, "implementation": engine, "integrator": sweep.engines[engine]}
         return names | {"verdict": verdict, "reason": reason}
 
-    engines = {engine: describe_engine(engine) for engine in sweep.engines}
     installed = {name: info for name, info in engines.items() if info.missing is None}
     for name in engines.keys() - installed.keys():
+        verdict = Verdict.FAILED if engines[name].has_failed else Verdict.NOT_INSTALLED
         for index in scenarios:
-            yield record(index, name, Verdict.NOT_INSTALLED, engines[name].missing)
-    truths = _compute_truths(workers, scenarios if installed else {})
+            yield record(index, name, verdict, engines[name].missing)
+    solvable = {index: s for index, s in scenarios.items() if index not in lost}
+    truths: dict[int, MotionTruth | str] = dict(lost)
+    truths |= _compute_truths(counted, solvable if installed else {})
+    for name, index in product(installed, lost):
+        reason = f"no truth to judge by: the reference failed: {lost[index]}"
+        yield record(index, name, Verdict.HARNESS_FAILED, reason)
     integrators = {name: _integrator(info, sweep.engines[name]) for name, info in installed.items()}
     tasks = [
         Task(
             (index, name),
             run_refinement,
             (name, integrator.name, s.model, s.state, s.times, _resolutions(integrator, s, sweep.step)),
+            counted.limits,
         )
         for name, integrator in integrators.items()
-        for index, s in scenarios.items()
+        for index, s in solvable.items()
     ]
-    for outcome in workers.run(tasks):
+    for outcome in counted.run(tasks, "engines"):
         index, name = outcome.key
         truth = truths[index]
         doubt = f"no truth to judge by: {truth}" if isinstance(truth, str) else truth.conflict
@@ -196,7 +240,7 @@ def _integrator(info: EngineInfo, name: str) -> Integrator:
     return next(integrator for integrator in info.integrators if integrator.name == name)
 
 
-def _compute_truths(workers: WorkerPool, scenarios: dict[int, Scenario]) -> dict[int, MotionTruth | str]:
+def _compute_truths(counted: _Progress, scenarios: Mapping[int, Scenario]) -> dict[int, MotionTruth | str]:
     """By cell its true motion, or the reason why there is none.
 
     A task that fails, as where compiled code crashes its worker, is repeated without compiled code.
@@ -204,11 +248,12 @@ def _compute_truths(workers: WorkerPool, scenarios: dict[int, Scenario]) -> dict
     truths: dict[int, MotionTruth | str] = {}
     for without_compiler in ((), (0,)):
         tasks = [
-            Task(index, motion_truth, (s.model, s.state, s.times, None, *without_compiler))
+            Task(index, motion_truth, (s.model, s.state, s.times, None, *without_compiler), counted.limits)
             for index, s in scenarios.items()
             if not isinstance(truths.get(index), MotionTruth)
         ]
-        truths |= {outcome.key: outcome.failure or outcome.value for outcome in workers.run(tasks)}
+        outcomes = counted.run(tasks, "truth")
+        truths |= {outcome.key: outcome.failure or outcome.value for outcome in outcomes}
     return truths
 
 

@@ -23,36 +23,43 @@ from __future__ import annotations
 import copy
 import itertools
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, ValidationError
 
-from plumbline.engines.registry import ENGINES, load_adapter
+from plumbline.engines.adapter import EngineInfo
+from plumbline.engines.registry import ENGINES
 from plumbline.model.sampling import derive_seed
 from plumbline.scenario import loader as scenarios
-from plumbline.scenario.errors import Problem, ScenarioError
+from plumbline.scenario.errors import Problem, ScenarioError, shorten
 from plumbline.scenario.loader import Scenario
 from plumbline.scenario.schema import SchemaModel
+from plumbline.scenario.validation_messages import problems_from_validation
 from plumbline.scenario.yaml_source import PathKey, YamlSource, read_yaml
 
 MAX_CELLS = 100_000
+MAX_STEPS = 10_000_000  # of one run: minutes of an engine
+REFINEMENT_LEVELS = 4  # step sizes of an engine where the file names the coarsest
+
+
+Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
 class Axis(SchemaModel):
     """How one field varies: a range or values (a grid axis), or a distribution; exactly one of them."""
 
-    start: float | None = Field(None, alias="from")
-    to: float | None = None
-    points: int | None = Field(None, ge=1, le=10_000)
-    log: bool = False
-    values: list[float] | None = Field(None, min_length=1)
-    uniform: tuple[float, float] | None = None
-    normal: tuple[float, float] | None = None
-    log_uniform: tuple[float, float] | None = None
+    start: float | None = Field(None, alias="from", description="The first value of a range.")
+    to: float | None = Field(None, description="The last value of a range.")
+    points: int | None = Field(None, ge=1, le=10_000, description="Number of values of a range.")
+    log: bool = Field(False, description="The word true where values of equal ratios are wanted.")
+    values: list[float] | None = Field(None, min_length=1, description="The values.")
+    uniform: Pair | None = Field(None, description="The lower and the upper bound, as [0.5, 2].")
+    normal: Pair | None = Field(None, description="Mean and standard deviation, as [1, 0.1].")
+    log_uniform: Pair | None = Field(None, description="The lower and the upper bound, as [0.5, 2].")
 
     def grid_values(self) -> list[float] | None:
         """List the values of a grid axis.
@@ -79,9 +86,9 @@ class Axis(SchemaModel):
 
         """
         if self.normal is not None:
-            return float(rng.normal(*self.normal))
+            return float(rng.normal(self.normal[0], self.normal[1]))
         if self.uniform is not None:
-            return float(rng.uniform(*self.uniform))
+            return float(rng.uniform(self.uniform[0], self.uniform[1]))
         assert self.log_uniform is not None
         return float(np.exp(rng.uniform(*np.log(self.log_uniform))))
 
@@ -113,14 +120,19 @@ class Axis(SchemaModel):
 class Sweep(SchemaModel):
     """A sweep file."""
 
-    schema_version: int
-    scenario: str
-    vary: dict[str, Axis] = Field(min_length=1)
-    count: int = Field(1, ge=1, le=MAX_CELLS)
-    seed: int = Field(0, ge=0)
-    duration: float | None = Field(None, gt=0, le=1000)
-    engines: dict[str, str] = Field(default_factory=dict)
-    step: float | None = Field(None, gt=0)
+    schema_version: Literal[1] = Field(description="Version of this format: 1.")
+    scenario: str = Field(description="A name of the catalogue, or a path beside this file.", min_length=1)
+    vary: dict[str, Axis] = Field(
+        description="Fields of the scenario, as `bodies[0].mass: {from: 0.5, to: 2, points: 5}`.",
+        min_length=1,
+    )
+    count: int = Field(1, ge=1, le=MAX_CELLS, description="Random values per grid point.")
+    seed: int = Field(0, ge=0, le=2**63, description="Seed of the random values.")
+    duration: float | None = Field(None, gt=0, le=1000, description="Duration in s.")
+    engines: dict[str, str] = Field(
+        default_factory=dict, description="Engines and their integrators, as `{mujoco: RK4}`."
+    )
+    step: float | None = Field(None, gt=0, description="The coarsest of four steps in s.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,16 +165,11 @@ def load(path: Path) -> tuple[Sweep, list[SweepCell]]:
         problems.append(Problem(source.file, *_source_position(source, loc), field, message, valid))
 
     try:
-        sweep = Sweep.model_validate(_coerce_types(source.data))
+        sweep = Sweep.model_validate(source.data)
     except ValidationError as error:
-        for e in error.errors():
-            report(e["loc"], ".".join(str(key) for key in e["loc"]), e["msg"].lower())
-        raise ScenarioError(problems) from None
-    if sweep.schema_version != 1:
-        report(("schema_version",), "schema_version", "is not 1")
-    for engine, integrator in sweep.engines.items():
-        if problem := _engine_problem(engine, integrator):
-            report(("engines", engine), f"engines.{engine}", *problem)
+        raise ScenarioError([*problems, *problems_from_validation(source, error.errors(), Sweep)]) from None
+    for engine in sweep.engines.keys() - ENGINES.keys():
+        report(("engines", engine), f"engines.{engine}", "is no engine", ", ".join(ENGINES))
     beside = path.parent / sweep.scenario
     try:
         base = scenarios.load_scenario(
@@ -186,7 +193,41 @@ def load(path: Path) -> tuple[Sweep, list[SweepCell]]:
         problems.append(Problem(source.file, 1, 1, "", f"has {size} cells", f"at most {MAX_CELLS}"))
     if problems:
         raise ScenarioError(problems)
-    return sweep, list(_make_cells(sweep, base))
+    cells = list(_make_cells(sweep, base))
+    longest = max((cell.scenario.duration for cell in cells if cell.scenario), default=0.0)
+    shortest = longest * 2 ** (REFINEMENT_LEVELS - 1) / MAX_STEPS
+    if sweep.step is not None and sweep.step < shortest:
+        report(
+            ("step",),
+            "step",
+            f"is {sweep.step:g}",
+            f"at least {shortest:g}: {MAX_STEPS:.0e} of its finest steps",
+        )
+        raise ScenarioError(problems)
+    return sweep, cells
+
+
+def check_integrators(path: Path, sweep: Sweep, engines: Mapping[str, EngineInfo]) -> None:
+    """Check that each engine has the integrator that the file names for it.
+
+    Args:
+        path: the file.
+        sweep: its content.
+        engines: description of each of its engines; one that is missing is not checked.
+
+    Raises:
+        ScenarioError: an engine has no such integrator.
+
+    """
+    source, problems = read_yaml(path), []
+    for name, info in engines.items():
+        known = [integrator.name for integrator in info.integrators]
+        if info.missing is None and sweep.engines[name] not in known:
+            place = _source_position(source, ("engines", name))
+            message = f"has no integrator {shorten(repr(sweep.engines[name]))}"
+            problems.append(Problem(source.file, *place, f"engines.{name}", message, ", ".join(known)))
+    if problems:
+        raise ScenarioError(problems)
 
 
 def _make_cells(sweep: Sweep, base: Scenario) -> Iterator[SweepCell]:
@@ -238,36 +279,8 @@ def _is_number(document: Any, name: str) -> bool:
         return False
 
 
-def _engine_problem(engine: str, integrator: str) -> tuple[str, str] | None:
-    """What is wrong with an engine's entry and what is valid; None also where it is not installed."""
-    if engine not in ENGINES:
-        return "is no engine", ", ".join(ENGINES)
-    try:
-        known = [i.name for i in load_adapter(engine).integrators]
-    except ImportError:
-        return None
-    return None if integrator in known else (f"has no integrator {integrator!r}", ", ".join(known))
-
-
 def _source_position(source: YamlSource, loc: Sequence[Any]) -> tuple[int, int]:
     path = tuple(loc)
     while path and path not in source.value_positions:
         path = path[:-1]
     return source.value_positions.get(path, (1, 1))
-
-
-def _coerce_types(data: Any) -> Any:
-    """Turn the lists of distributions into the pairs that the schema expects."""
-    if not isinstance(data, dict):
-        return data
-    vary = data.get("vary")
-    if isinstance(vary, dict):
-        pairs = ("uniform", "normal", "log_uniform")
-        vary = {
-            name: {k: tuple(v) if k in pairs and isinstance(v, list) else v for k, v in axis.items()}
-            if isinstance(axis, dict)
-            else axis
-            for name, axis in vary.items()
-        }
-        data = {**data, "vary": vary}
-    return data

@@ -1,5 +1,6 @@
 """Sweeps: what a file makes of a scenario, and how a cell is judged."""
 
+import time
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import cache
@@ -12,15 +13,18 @@ import pytest
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.calls import run_refinement
 from plumbline.engines.registry import load_adapter
+from plumbline.execution.runner import describe_engines
 from plumbline.judging.convergence import refinement_resolutions
 from plumbline.judging.rows import RowContext
 from plumbline.judging.trajectory import judge_trajectory
+from plumbline.processes.workers import Limits, WorkerPool
 from plumbline.scenario import loader as scenarios
 from plumbline.scenario.errors import ScenarioError
 from plumbline.studies import sweep, sweep_file
 from plumbline.studies.tables import write_table
 from plumbline.truth.ground_truth import motion_truth
 from tests.helpers import pendulums
+from tests.helpers.mutations import limited_time
 from tests.helpers.planted_defects import MOTION_DEFECTS, Defect, plant
 
 SWEEP_FILE = """\
@@ -41,6 +45,13 @@ def write_sweep_file(folder, text):
     path = folder / "sweep.yaml"
     path.write_text(text, encoding="utf-8")
     return path
+
+
+def run_sweep(spec, cells, seconds=300.0, progress=lambda *_: None, **engines):
+    """The rows of a sweep; descriptions of engines may be given instead of those found here."""
+    with WorkerPool(1, Limits(seconds)) as workers:
+        found = describe_engines(workers, list(spec.engines)) | engines
+        return sweep.run(spec, cells, workers, found, progress)
 
 
 def test_the_grid_and_the_draws(tmp_path):
@@ -67,7 +78,7 @@ def test_a_sweep_runs_and_is_kept(tmp_path):
     spec, cells = sweep_file.load(
         write_sweep_file(tmp_path, SWEEP_FILE.replace("points: 3", "points: 2").replace("[-1, 1]", "[1]"))
     )
-    table = sweep.run(spec, cells, jobs=1)
+    table = run_sweep(spec, cells)
     kept = pq.read_table(write_table(table, tmp_path / "sweep.parquet")).to_pylist()
     assert len(kept) == 2 * len(cells)
     assert {(row["implementation"], row["verdict"]) for row in kept} == {
@@ -86,7 +97,7 @@ def test_values_that_make_no_pendulum_are_a_cell_with_a_reason(tmp_path):
     text = f"schema_version: 1\nscenario: tumbling-rod\n{vary}\nduration: 0.25\n"
     spec, cells = sweep_file.load(write_sweep_file(tmp_path, text))
     assert cells[0].scenario is None
-    rows = sweep.run(spec, cells).to_pylist()
+    rows = run_sweep(spec, cells).to_pylist()
     assert [row["verdict"] for row in rows] == ["unsupported", "agrees"]
     assert "bodies[0].mass" in rows[0]["reason"]
 
@@ -139,7 +150,7 @@ def test_an_engine_too_coarse_to_resolve_a_mistake_is_unresolved(tmp_path):
     )
     text = text.replace("mujoco: RK4", "mujoco: Euler") + "step: 0.03125\n"
     spec, cells = sweep_file.load(write_sweep_file(tmp_path, text))
-    _, row = sweep.run(spec, cells).to_pylist()
+    _, row = run_sweep(spec, cells).to_pylist()
     assert (row["implementation"], row["integrator"], row["verdict"]) == ("mujoco", "Euler", "unresolved")
     assert row["position_error"] > 0 and row["finest_error"] > 0 and row["attitude_error"] > 0
 
@@ -165,11 +176,10 @@ def test_a_missing_engine_and_a_truth_that_fails_are_rows(tmp_path):
     )
     spec, cells = sweep_file.load(write_sweep_file(tmp_path, text))
     missing = EngineInfo("mujoco", "MuJoCo", "", (), "mujoco is not installed here: No module")
-    with patch("plumbline.studies.sweep.describe_engine", return_value=missing):
-        _, row = sweep.run(spec, cells).to_pylist()
+    _, row = run_sweep(spec, cells, mujoco=missing).to_pylist()
     assert (row["verdict"], row["reason"]) == ("not installed", missing.missing)
     with patch("plumbline.studies.sweep._compute_truths", return_value={0: "crashed"}):
-        _, row = sweep.run(spec, cells).to_pylist()
+        _, row = run_sweep(spec, cells).to_pylist()
     assert (row["verdict"], row["reason"]) == ("harness failed", "no truth to judge by: crashed")
 
 
@@ -183,15 +193,73 @@ def test_a_missing_engine_and_a_truth_that_fails_are_rows(tmp_path):
         (("uniform: [-0.05, 0.05]", "uniform: [0.05, -0.05]"), r":6:.*low ≤ high"),
         (("uniform: [-0.05, 0.05]", "normal: [0, -1]"), r":6:.*standard deviation"),
         (("values: [-1, 1]", "values: [-1, 1], uniform: [0, 1]"), r":5:.*exactly one"),
-        (("mujoco: RK4", "mujoco: RK5"), r":10:.*no integrator 'RK5'"),
         (("mujoco: RK4", "mujoko: RK4"), r":10:.*no engine"),
         (("scenario: double", "scenario: duble"), r"unknown scenario"),
-        (("seed: 7", "seeds: 7"), r":8:.*seeds"),
-        (("points: 3", "points: 90000"), r":4:.*points"),
+        (("seed: 7", "seeds: 7"), r":8:1: seeds: unknown field. did you mean 'seed'"),
+        (("points: 3", "points: 90000"), r":4:.*points: is 90000; valid would be a number at most 10000"),
+        (("points: 3", "points: three"), r":4:.*points: is the text 'three', not a whole number"),
+        (
+            ("values: [-1, 1]", "values: 3"),
+            r":5:.*values: is the number 3; valid would be a list: the values",
+        ),
+        (("uniform: [-0.05, 0.05]", "uniform: [1, 2, 3]"), r":6:.*uniform: has 3 entries"),
+        (("uniform: [-0.05, 0.05]", "uniform: 1 cm"), r":6:.*uniform: is the text '1 cm'"),
+        (("scenario: double-tumbling-balls", "scenario: ''"), r":2:.*scenario: has 0 characters"),
+        (("scenario: double-tumbling-balls\n", ""), r":1:1: scenario: is missing; valid would be a name of"),
+        (("duration: 0.25", "duration: long"), r":9:.*duration: is the text 'long', not a number"),
+        (("duration: 0.25", "step: 1e-9"), r":9:7: step: is 1e-09; valid would be at least"),
+        (("engines: {mujoco: RK4}", "engines: [mujoco]"), r":10:.*engines: is a list"),
         (("count: 2", "count: 90000"), r"540000 cells"),
-        (("schema_version: 1", "schema_version: 2"), r":1:.*is not 1"),
+        (("schema_version: 1", "schema_version: 2"), r":1:.*is 2; this version of Plumbline reads 1"),
+        ((SWEEP_FILE, "- 3"), r":1:1: is a list; valid would be a mapping that starts with schema_version"),
     ],
 )
 def test_mistakes_in_the_file_are_named_with_their_place(tmp_path, change, words):
     with pytest.raises(ScenarioError, match=words):
         sweep_file.load(write_sweep_file(tmp_path, SWEEP_FILE.replace(*change)))
+
+
+def test_an_integrator_that_the_engine_has_not_is_named_with_its_place(tmp_path):
+    path = write_sweep_file(tmp_path, SWEEP_FILE.replace("mujoco: RK4", "mujoco: RK5"))
+    spec, _ = sweep_file.load(path)
+    engines = {"mujoco": EngineInfo("mujoco", "MuJoCo", "4", load_adapter("mujoco").integrators)}
+    with pytest.raises(ScenarioError, match=r":10:19: engines\.mujoco: has no integrator 'RK5'; valid would"):
+        sweep_file.check_integrators(path, spec, engines)
+    missing = {"mujoco": EngineInfo("mujoco", "MuJoCo", "", (), "not here")}
+    sweep_file.check_integrators(path, spec, missing)
+
+
+def test_a_cell_that_no_step_is_short_enough_for_ends_soon_and_alone(tmp_path):
+    vary = "vary: {'gravity[2]': {values: [-9.81, -1.0e20]}}"
+    head = "schema_version: 1\nscenario: double-tumbling-balls\n"
+    text = f"{head}{vary}\nduration: 0.25\nengines: {{mujoco: RK4}}\n"
+    spec, cells = sweep_file.load(write_sweep_file(tmp_path, text))
+    done = []
+    begin = time.monotonic()
+    with limited_time(20):
+        rows = run_sweep(spec, cells, progress=lambda *counts: done.append(counts)).to_pylist()
+    assert time.monotonic() - begin < 120, "of it most is the machine's other work"
+    found = {(row["cell"], row["implementation"]): row for row in rows}
+    assert [found[0, name]["verdict"] for name in ("reference", "mujoco")] == ["agrees", "agrees"]
+    assert found[1, "reference"]["verdict"] == "failed"
+    assert "needs more than 1e+06 steps" in found[1, "reference"]["reason"]
+    assert found[1, "mujoco"]["verdict"] == "harness failed"
+    assert "the reference failed" in found[1, "mujoco"]["reason"]
+    assert [count for count, _, _ in done] == list(range(1, len(done) + 1))
+    assert all(count <= total for count, total, _ in done) and done[-1][0] == done[-1][1]
+    assert {what for _, _, what in done} == {"reference", "truth", "engines"}
+
+
+def hang(*_):
+    time.sleep(600)
+
+
+def test_a_reference_that_hangs_is_stopped(tmp_path, monkeypatch):
+    """A batch that is over its time is tried cell by cell, each with the same limit."""
+    monkeypatch.setattr(sweep, "_run_reference_batch", hang)
+    text = SWEEP_FILE.replace("engines: {mujoco: RK4}", "").replace("points: 3", "points: 1")
+    spec, cells = sweep_file.load(write_sweep_file(tmp_path, text.replace("count: 2", "count: 1")))
+    rows = run_sweep(spec, cells, seconds=1.0).to_pylist()
+    assert [(row["verdict"], row["reason"][:23]) for row in rows] == [
+        ("failed", "timeout: no answer with")
+    ] * 2
