@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 import sys
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,13 +17,16 @@ from plumbline.engines import environments
 from plumbline.engines.registry import ENGINES
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.judging.known_issues import KNOWN_ISSUES_FILE, KnownIssue, load_known_issues
+from plumbline.processes.errors import PlumblineError
+from plumbline.processes.isolation import FileLock, LockHeld
 from plumbline.processes.workers import ExecutorLost, ExecutorUnavailable
 from plumbline.scenario import loader as scenarios
-from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean
+from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean, shorten
 from plumbline.scenario.yaml_source import read_yaml
 from plumbline.truth.closed_form import ClosedFormMismatch, closed_form_motion
 
 DEFAULT_OUT = Path("reports") / "out"
+LOCK_FILE = ".lock"  # of an output folder, held by the command that writes to it
 MIN_TIMEOUT = 1.0  # s; starting an engine takes longer than less
 MIN_MEMORY = 1.0  # GB of address space; a worker with NumPy, SciPy and one engine does not start with less
 MIN_USER_RTOL = 1e-16  # below the rounding of a double no two results agree
@@ -58,7 +60,7 @@ class FolderPath(click.Path):
     def __init__(self) -> None:
         super().__init__(path_type=Path)
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
         """Parse the path of a folder.
 
         Args:
@@ -72,7 +74,37 @@ class FolderPath(click.Path):
         """
         if not os.fspath(value):
             self.fail("the path is empty; the current folder is written as a dot.", param, ctx)
-        return super().convert(value, param, ctx)
+        path = Path(os.fsdecode(value))
+        try:
+            path.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            pass  # the command finds out whether it can be made
+        except (OSError, ValueError) as error:  # too long, without permission, or with a null character
+            self.fail(f"{shorten(repr(value))}: {getattr(error, 'strerror', None) or error}.", param, ctx)
+        return path
+
+
+class ResultsPath(FolderPath):
+    """A results folder, named by itself or by its results.json."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """Parse the path of a results folder.
+
+        Args:
+            value: the text of the command line, or a default.
+            param: the option or argument, for the message.
+            ctx: the command's context, for the message.
+
+        Returns:
+            The path of the folder.
+
+        """
+        path = super().convert(value, param, ctx)
+        if path.name == "results.json" and not path.is_dir():
+            return path.parent
+        if path.exists() and not path.is_dir():
+            self.fail(f"{path} is neither a results folder nor its results.json.", param, ctx)
+        return path
 
 
 def out_option(default: Path, note: str = "") -> _Decorator:
@@ -259,8 +291,8 @@ def _nearest_or_all(name: str, known: Iterable[str]) -> str:
     return did_you_mean(name, names) or f"there are: {', '.join(names)}"
 
 
-def ensure_writable(folder: Path) -> Path:
-    """Make the output folder and try to write to it, before any work is done.
+def claim_folder(folder: Path) -> Path:
+    """Make the output folder, try to write to it and lock it until the command ends, before any work is done.
 
     Args:
         folder: the folder; parents are made too.
@@ -269,16 +301,39 @@ def ensure_writable(folder: Path) -> Path:
         The folder.
 
     Raises:
-        BadParameter: the folder cannot be made or written to (exit code 2).
+        BadParameter: the folder cannot be made or written to, or another command uses it (exit code 2).
 
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise click.BadParameter(f"cannot write to {folder}: {error.strerror}", param_hint="--out") from None
+        lock = FileLock(folder / LOCK_FILE)
+    except LockHeld:
+        raise click.BadParameter(
+            f"another command writes to {folder} at present; wait until it has ended, or name another folder",
+            param_hint="--out",
+        ) from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise click.BadParameter(f"cannot write to {folder}: {reason}", param_hint="--out") from None
+    click.get_current_context().with_resource(lock)
     return folder
+
+
+@contextmanager
+def exit_on_damaged_results() -> Iterator[None]:
+    """Turn the error of stored results into bad usage (exit code 2).
+
+    Yields:
+        Nothing.
+
+    Raises:
+        UsageError: a file of a results folder is missing or damaged, or has no such row.
+
+    """
+    try:
+        yield
+    except PlumblineError as error:  # DamagedResults or NotReproducible, whose modules load SciPy
+        raise click.UsageError(str(error)) from None
 
 
 @contextmanager

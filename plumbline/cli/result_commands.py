@@ -14,7 +14,6 @@ from plumbline.cli import options
 from plumbline.cli.console import count_noun, make_console, print_table
 from plumbline.cli.help_texts import examples
 from plumbline.storage.results_store import read_results
-from plumbline.storage.script_index import read_script_index
 
 
 @click.command(
@@ -27,8 +26,7 @@ def history(folder: Path, pattern: str | None, as_json: bool) -> None:
     """Print verdict counts, first bad nights and changes since the last green one of the nights in FOLDER."""
     from plumbline.storage.history import History
 
-    if not folder.is_dir():
-        raise click.UsageError(f"no folder {folder}: no nights yet; `python -m plumbline nightly` makes one")
+    _check_history_folder(folder)
     document = History(folder).to_document(pattern)
     if as_json:
         click.echo(json.dumps(document, ensure_ascii=False, indent=1))
@@ -46,6 +44,12 @@ def history(folder: Path, pattern: str | None, as_json: bool) -> None:
         out.print(line, markup=False)
 
 
+def _check_history_folder(folder: Path) -> None:
+    if not folder.is_dir():
+        what = f"{folder} is a file and no folder of nights" if folder.exists() else f"no folder {folder}"
+        raise click.UsageError(f"{what}: no nights yet; `python -m plumbline nightly` makes one")
+
+
 def _history_lines(document: dict[str, Any]) -> list[str]:
     lines = [f"damaged, left out: {sentence}" for sentence in document["damaged"]]
     lines += [f"version: {sentence}" for sentence in document["versions"]]
@@ -57,21 +61,20 @@ def _history_lines(document: dict[str, Any]) -> list[str]:
 
 
 @click.command()
-@click.argument("folder", default=options.DEFAULT_OUT, type=options.FolderPath())
+@click.argument("folder", default=options.DEFAULT_OUT, type=options.ResultsPath())
 @click.option(
     "--history",
     "history_folder",
-    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    type=options.FolderPath(),
     help="Folder of earlier nights: adds trends and the comparison with the last green one.",
 )
 def report(folder: Path, history_folder: Path | None) -> None:
-    """Write report.html, junit.xml and summary.md again, from the results stored in FOLDER."""
-    try:
-        read_results(folder)
-        read_script_index(folder)
-    except ValueError as error:
-        raise click.UsageError(str(error)) from None
-    click.echo(f"report: {reports.write(options.ensure_writable(folder), history_folder)}")
+    """Write report.html, junit.xml and summary.md again, from the results in FOLDER."""
+    if history_folder is not None:
+        _check_history_folder(history_folder)
+    with options.exit_on_damaged_results():
+        read_results(folder)  # before the folder is made writable: there may be none
+        click.echo(f"report: {reports.write(options.claim_folder(folder), history_folder)}")
 
 
 @click.command(
@@ -79,9 +82,9 @@ def report(folder: Path, history_folder: Path | None) -> None:
         "reproduce reports/out", "reproduce reports/out chain-50-balls/pinocchio-aba/state/-/acceleration"
     ),
 )
-@click.argument("result", type=click.Path(path_type=Path, exists=True))
+@click.argument("folder", metavar="RESULT", type=options.ResultsPath())
 @click.argument("keys", nargs=-1, metavar="[KEY]...")
-def reproduce(result: Path, keys: tuple[str, ...]) -> None:
+def reproduce(folder: Path, keys: tuple[str, ...]) -> None:
     """Write a stand-alone script that shows a disagreement, for the engine's maintainers.
 
     RESULT is a results folder or its results.json; KEY is a row's key. Without KEY, the disagreements are
@@ -89,17 +92,15 @@ def reproduce(result: Path, keys: tuple[str, ...]) -> None:
     """
     from plumbline.reproduce.write import list_disagreements, write_scripts
 
-    folder = result if result.is_dir() else result.parent
-    try:
+    with options.exit_on_damaged_results():
         if not keys:
             found = list_disagreements(folder)
             for key, reason in found.items():
                 click.echo(f"{key}: {reason}")
             click.echo(count_noun(len(found), "disagreement") if found else "nothing disagrees", err=True)
             return
-        written = write_scripts(folder, keys)
-    except ValueError as error:
-        raise click.UsageError(str(error)) from None
+        read_results(folder)
+        written = write_scripts(options.claim_folder(folder), keys)
     for path in dict.fromkeys(written.files.values()):
         click.echo(str(path))
     for key, reason in written.reasons.items():

@@ -64,7 +64,7 @@ def run(
     """Compare scenarios (names of the catalogue, or paths of YAML files; default: all) on all engines."""
     chosen = options.choose_scenarios(names, families)
     known_issues = options.read_known_issues(known_files, chosen)
-    folder = options.ensure_writable(out)
+    folder = options.claim_folder(out)
     cache = DiskResultCache(user_cells_folder(), _log, is_fresh=fresh)
     plan = Plan(
         chosen,
@@ -161,7 +161,7 @@ def nightly(
 
     chosen = options.choose_scenarios(names, ())
     known_issues = options.read_known_issues(known_files, chosen)
-    folder = options.ensure_writable(out)
+    folder = options.claim_folder(out)
     with options.exit_on_io_error(), ProgressDisplay(sys.stderr) as progress:
         result, place = run_nightly(
             folder, chosen, engines, random_count=random_count,

@@ -32,11 +32,13 @@ MAX_LISTED_CELLS = 10
 @click.argument("file", metavar="FILE", type=click.Path(path_type=Path))
 @options.jobs_option
 @options.out_option(Path("sweep"))
-def sweep(file: Path, jobs: int, out: Path) -> None:
+@options.timeout_option(300.0)
+def sweep(file: Path, jobs: int, out: Path, timeout: float) -> None:
     """Vary a scenario's parameters over a grid or distributions, as a sweep file says (docs/sweeps.md).
 
     Writes sweep.parquet, one row per cell and implementation, and its map, sweep.html.
     """
+    from plumbline.execution.runner import describe_engines
     from plumbline.studies import sweep as sweeps
     from plumbline.studies import sweep_file
     from plumbline.studies.tables import write_table
@@ -44,11 +46,15 @@ def sweep(file: Path, jobs: int, out: Path) -> None:
 
     try:
         spec, cells = sweep_file.load(file)
+        folder = options.claim_folder(out)
+        with options.exit_on_io_error(), WorkerPool(jobs, Limits(timeout)) as workers:
+            engines = describe_engines(workers, list(spec.engines))
+            sweep_file.check_integrators(file, spec, engines)
+            with ProgressDisplay(sys.stderr) as progress:
+                table = sweeps.run(spec, cells, workers, engines, progress)
     except ScenarioError as error:
         options.exit_on_bad_file(error)
-    folder = options.ensure_writable(out)
     with options.exit_on_io_error():
-        table = sweeps.run(spec, cells, jobs)
         path = write_table(table, folder / "sweep.parquet")
         page = sweep_page.write(folder)
     _print_sweep(table, len(cells))
@@ -105,7 +111,7 @@ def drift(names: tuple[str, ...], rtols: tuple[float, ...], max_cpu_seconds: flo
     from plumbline.studies.tables import write_table
 
     chosen = options.read_scenarios(names or ("tumbling-ball", "tumbling-rod"))
-    folder = options.ensure_writable(out)
+    folder = options.claim_folder(out)
     with options.exit_on_io_error():
         with ProgressDisplay(sys.stderr) as progress:
             table = drifts.measure_drift(
@@ -173,7 +179,7 @@ def coverage(
 
     chosen = options.choose_scenarios(names, ())
     levels: tuple[Level, ...] = COVERED_LEVELS if level == "all" else (level,)
-    folder, limits = options.ensure_writable(out), Limits(timeout, memory)
+    folder, limits = options.claim_folder(out), Limits(timeout, memory)
     with options.exit_on_io_error():
         with ProgressDisplay(sys.stderr) as progress:
             rows = []
