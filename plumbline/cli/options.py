@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -27,8 +28,12 @@ from plumbline.truth.closed_form import ClosedFormMismatch, closed_form_motion
 
 DEFAULT_OUT = Path("reports") / "out"
 LOCK_FILE = ".lock"  # of an output folder, held by the command that writes to it
-MIN_TIMEOUT = 1.0  # s; starting an engine takes longer than less
-MIN_MEMORY = 1.0  # GB of address space; a worker with NumPy, SciPy and one engine does not start with less
+MIN_TIMEOUT, MAX_TIMEOUT = 1.0, 1e7  # s; starting an engine takes longer than less
+MIN_MEMORY, MAX_MEMORY = 1.0, 1e6  # GB of address space; a worker with an engine does not start with less
+MAX_JOBS = 1024  # worker processes of one machine
+MAX_RANDOM_SCENARIOS = 1_000_000
+MAX_SEED = 2**63 - 1
+MAX_LONG_RUN = 1e5  # s
 MIN_USER_RTOL = 1e-16  # below the rounding of a double no two results agree
 _Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 
@@ -132,7 +137,7 @@ def timeout_option(default: float) -> _Decorator:
 
     """
     return click.option(
-        "--timeout", type=FiniteNumber(MIN_TIMEOUT), default=default, help="Seconds per task."
+        "--timeout", type=FiniteNumber(MIN_TIMEOUT, MAX_TIMEOUT), default=default, help="Seconds per task."
     )
 
 
@@ -149,6 +154,13 @@ def _choose_engines(_: click.Context, __: click.Parameter, names: Sequence[str])
     return chosen or order
 
 
+def _check_address(_: click.Context, __: click.Parameter, address: str | None) -> str | None:
+    """Refuse what is no address of a scheduler; whether one answers there is found out later."""
+    if address is not None and not re.fullmatch(r"(\w+://)?(\[[\da-fA-F:]+\]|[\w.-]+):\d{1,5}", address):
+        raise click.BadParameter(f"{shorten(repr(address))} is no address such as tcp://HOST:8786")
+    return address
+
+
 engines_option = click.option(
     "--engine",
     "engines",
@@ -159,13 +171,16 @@ engines_option = click.option(
 )
 jobs_option = click.option(
     "--jobs",
-    type=click.IntRange(1),
-    default=lambda: os.cpu_count() or 1,
+    type=click.IntRange(1, MAX_JOBS),
+    default=lambda: min(os.cpu_count() or 1, MAX_JOBS),
     show_default="one per core",
     help="Worker processes.",
 )
 scheduler_option = click.option(
-    "--scheduler", metavar="ADDRESS", help="A dask cluster to run on instead, as tcp://HOST:8786."
+    "--scheduler",
+    metavar="ADDRESS",
+    callback=_check_address,
+    help="A dask cluster to run on instead, as tcp://HOST:8786.",
 )
 known_option = click.option(
     "--known",
@@ -178,7 +193,7 @@ known_option = click.option(
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="JSON on stdout, for other programs.")
 memory_option = click.option(
-    "--memory", type=FiniteNumber(MIN_MEMORY), default=8.0, help="GB of address space per worker."
+    "--memory", type=FiniteNumber(MIN_MEMORY, MAX_MEMORY), default=8.0, help="GB of address space per worker."
 )
 names_argument = click.argument("names", nargs=-1, metavar="[SCENARIO]...")
 

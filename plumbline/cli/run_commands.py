@@ -110,17 +110,21 @@ def run(
 @options.names_argument
 @options.engines_option
 @click.option(
-    "--random", "random_count", type=click.IntRange(0), default=200, help="Number of random scenarios."
+    "--random",
+    "random_count",
+    type=click.IntRange(0, options.MAX_RANDOM_SCENARIOS),
+    default=200,
+    help="Number of random scenarios.",
 )
 @click.option(
     "--random-trajectories",
-    type=click.IntRange(0),
+    type=click.IntRange(0, options.MAX_RANDOM_SCENARIOS),
     default=20,
     help="Number of random motions besides, which are compared at every level; the others only at states.",
 )
 @click.option(
     "--seed",
-    type=click.IntRange(0),
+    type=click.IntRange(0, options.MAX_SEED),
     help="Seed of the random scenarios. Default: random; printed and stored in results.json.",
 )
 @click.option(
@@ -131,7 +135,7 @@ def run(
 )
 @click.option(
     "--long-run-seconds",
-    type=options.FiniteNumber(0),
+    type=options.FiniteNumber(0, options.MAX_LONG_RUN),
     default=100.0,
     help="Simulated seconds of the long runs whose invariants are judged; 0: no long runs.",
 )

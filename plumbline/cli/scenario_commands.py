@@ -51,7 +51,7 @@ def _engine_records() -> list[dict[str, Any]]:
         {
             "name": name,
             "title": info.title,
-            "version": info.version or "not installed",
+            "version": info.version or ("failed" if info.has_failed else "not installed"),
             "integrators": [i.name for i in info.integrators],
         }
         for name, info in found.items()

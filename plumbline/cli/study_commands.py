@@ -45,7 +45,8 @@ def sweep(file: Path, jobs: int, out: Path, timeout: float) -> None:
     from reports import sweep_page
 
     try:
-        spec, cells = sweep_file.load(file)
+        with ProgressDisplay(sys.stderr) as progress:
+            spec, cells = sweep_file.load(file, progress)
         folder = options.claim_folder(out)
         with options.exit_on_io_error(), WorkerPool(jobs, Limits(timeout)) as workers:
             engines = describe_engines(workers, list(spec.engines))

@@ -87,6 +87,11 @@ class KnownIssue:
     intermittent: str = ""  # why the verdict may or may not occur; empty: it must
     extra_refinements_only: bool = False  # only with the additional smaller steps of the nightly
 
+    @property
+    def diagnosis(self) -> str | None:
+        """The recorded mechanism and cause, for rows without a diagnosis; None where none is stated."""
+        return f"recorded: {MECHANISMS[self.mechanism]}. {self.reason}" if self.mechanism else None
+
     def matches_kind(self, kind: RowKind) -> bool:
         """Return whether the entry is about rows of this kind, in its scenarios.
 
@@ -379,7 +384,8 @@ class KnownIssues:
             bodies: length of its chain.
 
         Returns:
-            The rows in the same order, with the entry's id as ``known_issue``.
+            The rows in the same order, with the entry's id as ``known_issue``; the entry's mechanism is their
+            diagnosis where they have none.
 
         """
         scatter: dict[str, dict[str, float]] = {}  # by version of the engine, then by engine
@@ -399,7 +405,7 @@ class KnownIssues:
         if "" in objections:
             match = expecting[objections.index("")]
             self.used_ids.add(match.id)
-            return replace(row, known_issue=match.id)
+            return replace(row, known_issue=match.id, diagnosis=row.diagnosis or match.diagnosis)
         return replace(row, reason=f"{row.reason}; {objections[0]}") if objections else row
 
     def stale_issues(self, *, is_full_matrix: bool) -> list[KnownIssue]:

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import quaternion_product, rotation_matrix, state_from_minimal
-from plumbline.scenario.errors import Problem, ScenarioError, closest_match
+from plumbline.scenario.errors import Problem, ScenarioError, closest_match, shorten
 from plumbline.scenario.schema import (
     MAX_BODIES,
     Body,
@@ -26,7 +26,7 @@ from plumbline.scenario.schema import (
     unit_vector,
 )
 from plumbline.scenario.validation_messages import problems_from_validation
-from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path, parse_yaml, read_yaml
+from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path, is_file, parse_yaml, read_yaml
 
 __all__ = [
     "Problem",
@@ -196,13 +196,13 @@ def find_scenario_file(name: str | Path) -> Path:
     if str(name) in known:
         return known[str(name)]
     path = Path(name)
-    if path.suffix in (".yaml", ".yml") or len(path.parts) > 1 or path.is_file():
+    if path.suffix in (".yaml", ".yml") or len(path.parts) > 1 or is_file(path):
         return path
     valid = f"a path of a YAML file, or one of: {', '.join(known)}"
     near = closest_match(str(name), [*known, *FAMILIES], cutoff=0.6)
     hint = f". did you mean {f'`--family {near}`' if near in FAMILIES else repr(near)}?" if near else ""
     message = f"unknown scenario{hint}"
-    raise ScenarioError([Problem(str(name), 0, 0, "", message, valid)])
+    raise ScenarioError([Problem(shorten(str(name)), 0, 0, "", message, valid)])
 
 
 def json_schema() -> dict[str, Any]:

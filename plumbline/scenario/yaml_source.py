@@ -69,6 +69,22 @@ def dotted_path(path: tuple[PathKey, ...]) -> str:
     return "".join(f"[{key}]" if isinstance(key, int) else f".{shorten(key)}" for key in path).lstrip(".")
 
 
+def is_file(path: Path) -> bool:
+    """Find out whether a path is that of a file; a text that cannot be a path is none.
+
+    Args:
+        path: any path, of any length.
+
+    Returns:
+        True where there is a regular file that can be looked at.
+
+    """
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # too long, without permission, or with a null character
+        return False
+
+
 def read_yaml(path: Path) -> YamlSource:
     """Read a YAML file.
 

@@ -96,6 +96,7 @@ class _Engine(_Part):
     title: str
     version: str
     missing: str | None = None
+    has_failed: bool = False
     integrators: list[_Integrator] = []
 
 

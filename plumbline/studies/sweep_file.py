@@ -22,8 +22,9 @@ from __future__ import annotations
 
 import copy
 import itertools
+import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -39,9 +40,11 @@ from plumbline.scenario.errors import Problem, ScenarioError, shorten
 from plumbline.scenario.loader import Scenario
 from plumbline.scenario.schema import SchemaModel
 from plumbline.scenario.validation_messages import problems_from_validation
-from plumbline.scenario.yaml_source import PathKey, YamlSource, read_yaml
+from plumbline.scenario.yaml_source import PathKey, YamlSource, is_file, read_yaml
 
 MAX_CELLS = 100_000
+MAX_TOTAL_BODIES = 1_000_000  # of all cells: a gigabyte
+REPORTED_CELLS = 500  # cells between two reports of progress
 MAX_STEPS = 10_000_000  # of one run: minutes of an engine
 REFINEMENT_LEVELS = 4  # step sizes of an engine where the file names the coarsest
 
@@ -127,7 +130,7 @@ class Sweep(SchemaModel):
         min_length=1,
     )
     count: int = Field(1, ge=1, le=MAX_CELLS, description="Random values per grid point.")
-    seed: int = Field(0, ge=0, le=2**63, description="Seed of the random values.")
+    seed: int = Field(0, ge=0, lt=2**63, description="Seed of the random values.")
     duration: float | None = Field(None, gt=0, le=1000, description="Duration in s.")
     engines: dict[str, str] = Field(
         default_factory=dict, description="Engines and their integrators, as `{mujoco: RK4}`."
@@ -145,11 +148,14 @@ class SweepCell:
     invalid_reason: str = ""  # why not
 
 
-def load(path: Path) -> tuple[Sweep, list[SweepCell]]:
+def load(
+    path: Path, progress: Callable[[int, int, str], None] = lambda done, total, what: None
+) -> tuple[Sweep, list[SweepCell]]:
     """Read a sweep file and make its cells.
 
     Args:
         path: the file.
+        progress: called now and then with cells made and cells in all: a hundred thousand take minutes.
 
     Returns:
         The sweep, and one cell for each grid point and draw.
@@ -170,41 +176,53 @@ def load(path: Path) -> tuple[Sweep, list[SweepCell]]:
         raise ScenarioError([*problems, *problems_from_validation(source, error.errors(), Sweep)]) from None
     for engine in sweep.engines.keys() - ENGINES.keys():
         report(("engines", engine), f"engines.{engine}", "is no engine", ", ".join(ENGINES))
-    beside = path.parent / sweep.scenario
     try:
-        base = scenarios.load_scenario(
-            beside if beside.is_file() else scenarios.find_scenario_file(sweep.scenario)
-        )
+        beside = path.parent / sweep.scenario
+        file = beside if is_file(beside) else scenarios.find_scenario_file(sweep.scenario)
+    except ScenarioError as error:
+        report(("scenario",), "scenario", error.problems[0].message, error.problems[0].valid)
+        raise ScenarioError(problems) from None
+    try:
+        base = scenarios.load_scenario(file)
     except ScenarioError as error:
         raise ScenarioError([*problems, *error.problems]) from None
-    size, has_draws = 1, False
     for name, axis in sweep.vary.items():
         if not _is_number(base.document, name):
             valid = "a field as `bodies[0].mass`, written in the scenario"
-            report(("vary", name), name, f"is no number of {base.name}", valid)
+            report(("vary", name), shorten(name), f"is no number of {base.name}", valid)
         if message := axis.validation_error():
-            report(("vary", name), name, message)
-            continue
-        grid = axis.grid_values()
-        size *= len(grid or [0])
-        has_draws |= grid is None
-    size *= sweep.count if has_draws else 1
-    if size > MAX_CELLS:
-        problems.append(Problem(source.file, 1, 1, "", f"has {size} cells", f"at most {MAX_CELLS}"))
+            report(("vary", name), shorten(name), message)
+    if not problems and (excess := _size_error(sweep, base)):
+        report((), "", *excess)
     if problems:
         raise ScenarioError(problems)
-    cells = list(_make_cells(sweep, base))
+    cells: list[SweepCell] = []
+    for cell in _make_cells(sweep, base):
+        cells.append(cell)
+        if len(cells) % REPORTED_CELLS == 0:
+            progress(len(cells), _cell_count(sweep), "cells of the sweep")
     longest = max((cell.scenario.duration for cell in cells if cell.scenario), default=0.0)
     shortest = longest * 2 ** (REFINEMENT_LEVELS - 1) / MAX_STEPS
     if sweep.step is not None and sweep.step < shortest:
-        report(
-            ("step",),
-            "step",
-            f"is {sweep.step:g}",
-            f"at least {shortest:g}: {MAX_STEPS:.0e} of its finest steps",
-        )
+        valid = f"at least {shortest:g}: {MAX_STEPS:.0e} of its finest steps"
+        report(("step",), "step", f"is {sweep.step:g}", valid)
         raise ScenarioError(problems)
     return sweep, cells
+
+
+def _cell_count(sweep: Sweep) -> int:
+    grids = [axis.grid_values() for axis in sweep.vary.values()]
+    return math.prod(len(grid) for grid in grids if grid is not None) * (sweep.count if None in grids else 1)
+
+
+def _size_error(sweep: Sweep, base: Scenario) -> tuple[str, str] | None:
+    """What is too much about the cells, and what would be valid."""
+    size = _cell_count(sweep)
+    if size > MAX_CELLS:
+        return f"has {size} cells", f"at most {MAX_CELLS}"
+    if size * base.model.n > MAX_TOTAL_BODIES:
+        return f"has {size} cells of {base.model.n} bodies", f"at most {MAX_TOTAL_BODIES} bodies in all"
+    return None
 
 
 def check_integrators(path: Path, sweep: Sweep, engines: Mapping[str, EngineInfo]) -> None:

@@ -1,14 +1,21 @@
-"""Damaged files of results folders end commands with exit code 2 and the file's name, never a traceback."""
+"""Damaged files, stored or of users, end a command with exit code 2 and a place, never a traceback."""
 
+import itertools
 import json
 import random
 import shutil
 from collections import Counter
+from unittest.mock import patch
 
 import pytest
 from click.testing import CliRunner
 
 from plumbline.cli.main import main
+from plumbline.engines.adapter import EngineInfo
+from plumbline.engines.registry import load_adapter
+from plumbline.judging.known_issues import KNOWN_ISSUES_FILE
+from plumbline.scenario.yaml_source import YamlSource, parse_yaml
+from plumbline.studies import sweep_file
 from reports.reference_tables import STORED_RESULTS
 from tests.helpers import example_results
 from tests.helpers.mutations import damaged_bytes, damaged_document, limited_time
@@ -17,7 +24,7 @@ STORED_FILES = (
     "results.json", "results.json", "results.json", "scripts/index.json", "summary.parquet", "states.parquet",
     "convergence.parquet", "curves.parquet", "trajectories.parquet", "drift.parquet", "figures.json",
 )  # fmt: skip
-TEXT_SIZE = 400  # letters; a longer message is no sentence
+TEXT_SIZE = 700  # letters; a longer message is no sentence
 
 
 @pytest.fixture(scope="module")
@@ -36,11 +43,15 @@ def damage(stored, folder, draw):
     shutil.copytree(stored, folder)
     name = draw.choice([name for name in STORED_FILES if (folder / name).is_file()])
     path = folder / name
-    if name.endswith(".json") and draw.random() < 0.7:
-        path.write_bytes(json.dumps(damaged_document(json.loads(path.read_bytes()), draw)).encode())
-    else:
-        path.write_bytes(damaged_bytes(path.read_bytes(), draw))
+    path.write_bytes(damaged(path.read_bytes(), json.loads if name.endswith(".json") else None, draw))
     return name
+
+
+def damaged(data, load, draw):
+    """Damage a file's bytes or, where it can be loaded, the document in it."""
+    if load is None or draw.random() < 0.3:
+        return damaged_bytes(data, draw)
+    return json.dumps(damaged_document(load(data), draw)).encode("utf-8", "surrogatepass")
 
 
 def check_examples(stored, tmp_path, command, count, seed):
@@ -51,7 +62,7 @@ def check_examples(stored, tmp_path, command, count, seed):
         words = {
             "report": ["report", str(folder)],
             "report --history": ["report", str(stored), "--history", str(tmp_path)],
-            "history": ["history", str(tmp_path), "--key", "*"],
+            "history": ["history", str(tmp_path), "--key", "*/order"],
             "reproduce": ["reproduce", str(folder)],
         }[command]
         with limited_time():
@@ -72,8 +83,8 @@ COMMANDS = ("report", "report --history", "history", "reproduce")
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_damaged_results_are_bad_files(stored, tmp_path, command):
-    outcomes = check_examples(stored, tmp_path, command, 100, seed=1)
-    assert command in ("history", "report --history") or min(outcomes[0], outcomes[2]) > 10, outcomes
+    outcomes = check_examples(stored, tmp_path, command, 60, seed=1)
+    assert command in ("history", "report --history") or min(outcomes[0], outcomes[2]) > 5, outcomes
 
 
 @pytest.mark.full
@@ -82,3 +93,92 @@ def test_damaged_results_are_bad_files(stored, tmp_path, command):
 def test_thousands_of_damaged_results_are_bad_files(stored, tmp_path, command, record_testsuite_property):
     outcomes = check_examples(stored, tmp_path, command, 5000, seed=2)
     record_testsuite_property(f"damaged stores, {command}: by exit code", dict(outcomes))
+
+
+SWEEP = b"""\
+schema_version: 1
+scenario: double-tumbling-balls
+vary:
+  bodies[0].mass: {from: 0.5, to: 2.0, points: 3, log: true}
+  bodies[1].angular_velocity[2]: {values: [-1, 0, 1]}
+  bodies[0].proximal[0]: {uniform: [0.05, 0.09]}
+  bodies[1].mass: {normal: [0.9, 0.05]}
+count: 4
+seed: 7
+duration: 1.0
+engines: {mujoco: RK4, exudyn: trapezoidal}
+step: 0.002
+"""
+MAX_CELLS = 30  # of an example: more of them show nothing new
+
+
+class Accepted(BaseException):
+    """Raised where the work of a command would begin."""
+
+
+@pytest.fixture(scope="module")
+def no_work():
+    """Cut off what a sweep does once its file has been accepted."""
+    engines = {"mujoco", "exudyn", "pinocchio", "reference"}
+    found = {name: EngineInfo(name, name, "1", load_adapter(name).integrators) for name in engines}
+    missing = EngineInfo("", "", "", (), "not asked for its description in this test")
+    make_cells = sweep_file._make_cells
+    with (
+        patch("plumbline.studies.sweep.run", side_effect=Accepted),
+        patch("plumbline.cli.study_commands.WorkerPool"),
+        patch(
+            "plumbline.execution.runner.describe_engines",
+            lambda _, names: {name: found.get(name, missing) for name in names},
+        ),
+        patch.object(sweep_file, "_make_cells", lambda *a: itertools.islice(make_cells(*a), MAX_CELLS)),
+    ):
+        yield
+
+
+def check_user_files(tmp_path, data, words, count, seed):
+    """Damage a user's file again and again; count how often the command that reads it goes on."""
+    draw, path, outcomes = random.Random(seed), tmp_path / "mine.yaml", Counter()
+    for number in range(count):
+        path.write_bytes(damaged(data, lambda text: parse_yaml(YamlSource("x"), text.decode()).data, draw))
+        about = f"example {number} of seed {seed}"
+        try:
+            with limited_time():
+                result = CliRunner().invoke(main, [*words, str(path), "--out", str(tmp_path / "out")])
+        except Accepted:
+            outcomes["accepted"] += 1
+            continue
+        about = f"{about}: {result.output[-2000:]}"
+        assert result.exit_code == 2, about
+        problems = result.stderr.splitlines()
+        assert problems and all(str(path) in problem or "… and" in problem for problem in problems), about
+        assert max(map(len, problems)) < TEXT_SIZE + len(str(path)), about
+        outcomes["refused"] += 1
+    return dict(outcomes)
+
+
+def check_sweeps(tmp_path, count, seed):
+    return check_user_files(tmp_path, SWEEP, ["sweep"], count, seed)
+
+
+def check_known(tmp_path, count, seed):
+    text = KNOWN_ISSUES_FILE.read_bytes().split(b"\n- id: ")
+    data = b"\n".join(b"- id: my-" + entry for entry in text[1:8])
+    (tmp_path / "project.yaml").write_text("")  # the project's own file, without its entries
+    with (
+        patch("plumbline.cli.run_commands.run_plan", side_effect=Accepted),
+        patch("plumbline.cli.options.KNOWN_ISSUES_FILE", tmp_path / "project.yaml"),
+    ):
+        return check_user_files(tmp_path, data, ["run", "rest", "--known"], count, seed)
+
+
+@pytest.mark.parametrize("check", [check_sweeps, check_known])
+def test_damaged_files_of_users_are_bad_files(no_work, tmp_path, check):
+    outcomes = check(tmp_path, 150, seed=1)
+    assert min(outcomes.values()) > 5 and len(outcomes) == 2, outcomes
+
+
+@pytest.mark.full
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("check", [check_sweeps, check_known])
+def test_thousands_of_damaged_files_of_users(no_work, tmp_path, check, record_testsuite_property):
+    record_testsuite_property(f"damaged files, {check.__name__}", check(tmp_path, 5000, seed=2))

@@ -89,6 +89,9 @@ def test_an_engine_that_fails_at_import_has_failed(tmp_path, text, words):
     result = run(tmp_path / "out", "rest", *names, **place)
     assert result.returncode == ExitCode.ENGINE_FAILED, result.stdout + result.stderr
     assert words in result.stdout and "1 failed" in result.stdout and "7 agree" in result.stdout
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert re.search(r">MuJoCo|>mujoco", page) and '<span class="version">failed</span>' in page
+    assert '<span class="version">not installed</span>' not in page
 
 
 MISSING = "raise ModuleNotFoundError(\"No module named 'exudyn'\", name='exudyn')\n"
