@@ -53,10 +53,9 @@ class FiniteNumber(click.FloatRange):
             The number.
 
         """
-        number = float(super().convert(value, param, ctx))
-        if not math.isfinite(number):
+        if not math.isfinite(click.FLOAT.convert(value, param, ctx)):
             self.fail(f"{value} is not a finite number.", param, ctx)
-        return number
+        return float(super().convert(value, param, ctx))
 
 
 class FolderPath(click.Path):
