@@ -126,7 +126,8 @@ def drift(names: tuple[str, ...], rtols: tuple[float, ...], max_cpu_seconds: flo
         print_table(table.to_pylist())
         click.echo(f"results: {path}")
         if (folder / "results.json").is_file():
-            click.echo(f"report: {reports.write(folder)}")
+            with options.exit_on_damaged_results():
+                click.echo(f"report: {reports.write(folder)}")
     has_failed = any(reason.startswith("failed") for reason in table["reason"].to_pylist())
     sys.exit(ExitCode.ENGINE_FAILED if has_failed else ExitCode.SUCCESS)
 
@@ -189,7 +190,8 @@ def coverage(
             with WorkerPool(jobs, limits) as executor:
                 found = study.measure_coverage(executor, chosen, rows, RANDOM_STATES, levels, progress)
         path = write_table(study.coverage_table(found), folder / study.FILE)
-        report = reports.write(folder) if (folder / "results.json").is_file() else None
+        with options.exit_on_damaged_results():
+            report = reports.write(folder) if (folder / "results.json").is_file() else None
     if as_json:
         _print_coverage_json(found)
     else:

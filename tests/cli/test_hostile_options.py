@@ -11,7 +11,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from plumbline.cli.main import main
+from plumbline.cli.main import COMMANDS, main
 from tests.helpers import example_results
 from tests.helpers.mutations import limited_time
 
@@ -32,12 +32,13 @@ VALID = {  # by option or argument, a word that is accepted
     "long_run_seconds": "10", "file": "sweep.yaml", "files": "mine.yaml", "keys": "a/b",
     "folder": "history/20260101T000000Z",
     "what": "scenarios", "rtols": "1e-6", "max_cpu_seconds": "3", "history_folder": "history", "pattern": "*",
-    "as_json": "", "self_test": "", "help": "",
+    "as_json": "", "self_test": "", "fresh": "", "help": "",
 }  # fmt: skip
 WORK = (  # where the work of a command begins
     "plumbline.cli.run_commands.run_plan", "plumbline.cli.nightly.run_plan", "plumbline.studies.sweep.run",
     "plumbline.execution.runner.describe_engines", "plumbline.cli.scenario_commands.describe_engines",
-    "plumbline.studies.drift.measure_drift", "plumbline.reproduce.write.make_script",
+    "plumbline.studies.drift.measure_drift", "plumbline.cli.study_commands.run_plan",
+    "plumbline.reproduce.write.make_script",
 )  # fmt: skip
 WORKERS = (
     "plumbline.cli.study_commands.WorkerPool", "plumbline.cli.scenario_commands.WorkerPool",
@@ -95,8 +96,8 @@ def random_words(command, draw, places):
 
 def check_commands(places, count, seed):
     """Call every command with random words; count the outcomes of each."""
-    draw, outcomes = random.Random(seed), {name: Counter() for name in main.commands}
-    names = sorted(main.commands)
+    draw, outcomes = random.Random(seed), {name: Counter() for name in COMMANDS}
+    names = sorted(COMMANDS)
     with ExitStack() as stack:
         for target in WORK:
             stack.enter_context(patch(target, side_effect=Accepted))
@@ -104,7 +105,7 @@ def check_commands(places, count, seed):
             stack.enter_context(patch(target)).return_value.__enter__.side_effect = Accepted
         for number in range(count):
             name = names[number % len(names)]
-            words = [name, *random_words(main.commands[name], draw, places)]
+            words = [name, *random_words(main.get_command(None, name), draw, places)]
             try:
                 with limited_time():
                     result = CliRunner().invoke(main, words)
