@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from rich.console import Console
@@ -11,9 +11,9 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from plumbline.engines.environments import split_version
+from plumbline.cli.verdict_matrix import VerdictMatrix, coloured_glyph
 from plumbline.execution.runner import RunResult
-from plumbline.judging.rows import SHOWN_STYLES, Row, Verdict
+from plumbline.judging.rows import SHOWN_STYLES, Verdict
 
 
 def make_console(file: Any) -> Console:
@@ -104,13 +104,20 @@ class ProgressDisplay:
             print(f"{done} of {total} tasks done", file=self.file, flush=True)
 
 
-VERDICT_COLOURS = {
-    Verdict.AGREES: "green", Verdict.DISAGREES: "red bold", Verdict.UNRESOLVED: "yellow",
-    Verdict.UNSUPPORTED: "dim", Verdict.NOT_INSTALLED: "dim", Verdict.FAILED: "red bold",
-    Verdict.HARNESS_FAILED: "magenta bold",
-    Verdict.INFORMATION: "dim",
-}  # fmt: skip
-MAX_COMPLETE_TABLE = 60  # scenarios; of more, those where everything agrees are left out of the table
+def print_matrix(matrix: VerdictMatrix) -> None:
+    """Print the matrix of verdicts and its legend on stdout.
+
+    Args:
+        matrix: scenarios × engines.
+
+    """
+    out = make_console(sys.stdout)
+    out.print(matrix.table())
+    out.print(
+        "[dim]each cell: worst verdict, agreeing checks / all checks, error over tolerance of the worst row; "
+        + "  ".join(f"{style.glyph} {shown}" for shown, style in SHOWN_STYLES.items())
+        + "[/]"
+    )
 
 
 def print_result(result: RunResult) -> None:
@@ -126,61 +133,14 @@ def print_result(result: RunResult) -> None:
         out.print(
             f"[magenta bold]{Verdict.HARNESS_FAILED.style.glyph} the harness failed:[/] {escape(reason)}"
         )
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    table.add_column("scenario")
-    for name, info in result.engines.items():
-        table.add_column(escape(engine_heading(name, info.version)))
-    rows_of: dict[str, list[Row]] = {scenario: [] for scenario in result.scenarios}
-    for row in result.rows:
-        rows_of[row.scenario].append(row)
+    matrix = VerdictMatrix(result.engines)
     for scenario in result.scenarios:
-        of = [[r for r in rows_of[scenario] if r.engine == engine] for engine in result.engines]
-        if len(result.scenarios) <= MAX_COMPLETE_TABLE or any(
-            r.verdict not in (Verdict.AGREES, Verdict.INFORMATION) for rows in of for r in rows
-        ):
-            table.add_row(escape(scenario), *map(_format_cell, of))
-    out.print(table)
-    out.print(
-        "[dim]each cell: worst verdict, agreeing checks / all checks, error over tolerance of the worst row; "
-        + "  ".join(f"{style.glyph} {shown}" for shown, style in SHOWN_STYLES.items())
-        + "[/]"
-    )
+        matrix.replace_rows(scenario, [row for row in result.rows if row.scenario == scenario])
+    print_matrix(matrix)
     for row in result.rows:
         is_silent = row.verdict in (Verdict.AGREES, Verdict.INFORMATION, Verdict.HARNESS_FAILED)
         if not is_silent and row.known_issue is None:
-            out.print(f"{_coloured_glyph(row)} {escape(row.key)}: {escape(row.reason)}")
+            out.print(f"{coloured_glyph(row)} {escape(row.key)}: {escape(row.reason)}")
     for entry in result.stale_issues:
         out.print(f"[red]![/] known entry {escape(entry.id)} no longer occurs: remove it from its file")
     out.print(f"[bold]{escape(result.metadata['sentence'])}[/]")
-
-
-def _coloured_glyph(row: Row) -> str:
-    """Return the row's glyph as rich markup, dimmed where a known issue expects the verdict."""
-    colour = "dim" if row.known_issue else VERDICT_COLOURS[row.verdict]
-    return f"[{colour}]{row.style.glyph}[/]"
-
-
-def engine_heading(name: str, version: str) -> str:
-    """Write an engine with its version once: ``mujoco@3.12.0`` becomes "mujoco 3.12.0".
-
-    Args:
-        name: the engine as it was named on the command line.
-        version: the installed version; empty where the engine is not installed.
-
-    Returns:
-        The heading of the engine's column.
-
-    """
-    base, requested = split_version(name)
-    return f"{base if requested == version else name} {version}".strip()
-
-
-def _format_cell(rows: Sequence[Row]) -> str:
-    """Return one cell of the matrix: the worst row's glyph, the counts and the worst row's ratio."""
-    if not rows:
-        return ""
-    worst = max(rows, key=lambda row: row.rank)
-    agreeing = sum(row.verdict == Verdict.AGREES for row in rows)
-    checks = sum(row.verdict != Verdict.INFORMATION for row in rows)
-    ratio = "" if worst.ratio is None else f" {worst.ratio:.1g}"
-    return f"{_coloured_glyph(worst)} {agreeing}/{checks}{ratio}"

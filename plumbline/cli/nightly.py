@@ -19,7 +19,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import reports
-from plumbline.execution.plan import LevelSelection, Plan, ProgressCallback
+from plumbline.execution.plan import LevelSelection, Plan, ProgressCallback, RunObserver
 from plumbline.execution.result_cache import DiskResultCache
 from plumbline.execution.runner import RunResult, run_plan, save
 from plumbline.execution.selftest import SelfTestResult
@@ -92,6 +92,7 @@ def run_nightly(
     known_issues: Sequence[KnownIssue] | None = None,
     are_engines_required: bool = False,
     progress: ProgressCallback,
+    observer: RunObserver | None = None,
     log: Callable[[str], None],
 ) -> tuple[RunResult, Path]:
     """Run a night, or what is left of an interrupted one.
@@ -115,6 +116,7 @@ def run_nightly(
         known_issues: expected verdicts; None for those of the project's file.
         are_engines_required: whether an engine that is not installed has failed.
         progress: called after every task.
+        observer: gets the rows of named scenarios as they are judged.
         log: called with sentences for the user.
 
     Returns:
@@ -152,7 +154,7 @@ def run_nightly(
         are_engines_required=are_engines_required,
         known_issues=project_known_issues() if known_issues is None else known_issues,
     )
-    result = run_plan(plan, progress)
+    result = run_plan(plan, progress, observer)
     place = unused_path(history / result.metadata["id"])
     result.metadata |= {"id": place.name, "night": next_night_number(history)}
     result.metadata |= {"started": night.started, "random": night.random_count, "seed": night.seed}

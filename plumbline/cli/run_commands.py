@@ -12,8 +12,9 @@ import click
 
 import reports
 from plumbline.cli import options
-from plumbline.cli.console import ProgressDisplay, print_result
+from plumbline.cli.console import print_matrix, print_result
 from plumbline.cli.help_texts import EXIT_CODES, examples
+from plumbline.cli.run_display import RunDisplay
 from plumbline.engines.registry import ENGINES
 from plumbline.execution.plan import Plan
 from plumbline.execution.result_cache import DiskResultCache, user_cells_folder
@@ -82,8 +83,7 @@ def run(
     from plumbline.reproduce.write import write_scripts
 
     with options.exit_on_io_error():
-        with ProgressDisplay(sys.stderr) as progress:
-            result = run_plan(plan, progress)
+        result = _run_visibly(plan, as_json)
         save(result, folder, _command_line())
         with result.cpu_times.measure("report"):
             write_scripts(folder)
@@ -166,17 +166,31 @@ def nightly(
     chosen = options.choose_scenarios(names, ())
     known_issues = options.read_known_issues(known_files, chosen)
     folder = options.claim_folder(out)
-    with options.exit_on_io_error(), ProgressDisplay(sys.stderr) as progress:
+    display = RunDisplay(sys.stderr)
+    with options.exit_on_io_error(), display as progress:
         result, place = run_nightly(
             folder, chosen, engines, random_count=random_count,
             random_trajectory_count=random_trajectories, seed=seed, jobs=jobs,
             limits=Limits(timeout, memory), is_full_catalogue=not names and engines == list(ENGINES),
             extra_refinements=extra_refinements, long_run_seconds=long_run_seconds, scheduler=scheduler,
             self_test=run_self_test if self_test else None, progress=progress,
-            command=_command_line(), log=_log, known_issues=known_issues,
+            observer=display, command=_command_line(), log=_log, known_issues=known_issues,
             are_engines_required=options.are_engines_named(),
         )  # fmt: skip
     _finish(result, place / "report.html", as_json=False)
+
+
+def _run_visibly(plan: Plan, as_json: bool) -> RunResult:
+    """Run a plan and show verdicts as they come; an interruption leaves the table of what has finished."""
+    display = RunDisplay(sys.stderr)
+    try:
+        with display as progress:
+            return run_plan(plan, progress, display)
+    except KeyboardInterrupt:
+        if not as_json and display.finished.scenario_count:
+            print_matrix(display.finished)
+            click.echo(f"{display.finished.scenario_count} of {len(plan.scenarios)} scenarios finished")
+        raise
 
 
 def _command_line() -> str:

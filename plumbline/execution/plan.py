@@ -9,6 +9,7 @@ from typing import Literal
 
 from plumbline.engines.adapter import EngineInfo
 from plumbline.judging.known_issues import KnownIssue, project_known_issues
+from plumbline.judging.rows import Row
 from plumbline.processes.workers import Limits, ResultCache
 from plumbline.scenario.loader import Scenario
 
@@ -17,6 +18,28 @@ STATES_PER_RANDOM_SCENARIO = 9  # the same for a random scenario: there are many
 
 LevelSelection = Literal["state", "step", "trajectory", "all"]
 ProgressCallback = Callable[[int, int, str], None]  # finished tasks, all tasks, name of the last one
+
+
+class RunObserver:
+    """Follows a run. This base class ignores what it is given."""
+
+    def on_start(self, engines: Mapping[str, EngineInfo]) -> None:
+        """Take the descriptions of the engines.
+
+        Args:
+            engines: description by name.
+
+        """
+
+    def on_rows(self, scenario: str, rows: Sequence[Row], is_complete: bool) -> None:
+        """Take rows of a scenario of the catalogue or the user, as they are judged.
+
+        Args:
+            scenario: its name.
+            rows: new rows; all rows of the scenario where it is complete.
+            is_complete: whether all its tasks have finished.
+
+        """
 
 
 @dataclass(frozen=True)

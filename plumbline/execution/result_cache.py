@@ -96,7 +96,7 @@ class DiskResultCache(ResultCache):
         """
         name = self._names.pop(task.key, None) or _file_name(task)
         if outcome.failure is None and not outcome.judge_failure:
-            answer = outcome.pickled.data if task.sends_answer else None
+            answer = None if outcome.raw_value is None else outcome.pickled.data
             content = answer, outcome.cpu_time, outcome.judge_result
             self._files.write(name, pickle.dumps(content, protocol=5))
 
@@ -142,12 +142,15 @@ def task_hash(task: Task) -> str:
 
     """
     digest = hashlib.sha256()
-    name = f"{task.function.__module__}.{task.function.__qualname__}"
-    judge = f"{task.judge.__module__}.{task.judge.__qualname__}" if task.judge else ""
-    answer = name, task.version, task.python, task.arguments
-    for part in (_environment_fingerprint(), *answer, judge, task.judge_arguments, task.sends_answer):
+    parts = _function_name(task.function), task.version, task.python, task.arguments
+    judge = _function_name(task.judge), task.judge_arguments, _function_name(task.needs_answer)
+    for part in (_environment_fingerprint(), *parts, *judge):
         _update_hash(digest, part)
     return digest.hexdigest()
+
+
+def _function_name(function: Callable[..., Any] | None) -> str:
+    return f"{function.__module__}.{function.__qualname__}" if function else ""
 
 
 @cache
@@ -203,7 +206,7 @@ def _update_hash(digest: Any, value: Any) -> None:
         case bytes():
             head, body = "bytes", value
         case Pickled():
-            head, body = "packed", value.data
+            head, body = "packed", value.digest
         case np.ndarray():
             head, body = f"array {value.dtype.str} {value.shape}", np.ascontiguousarray(value).tobytes()
         case list() | tuple():

@@ -17,7 +17,7 @@ from typing import Any
 from plumbline.engines import calls, environments
 from plumbline.engines.adapter import EngineInfo
 from plumbline.execution.exit_codes import ExitCode
-from plumbline.execution.plan import Plan, ProgressCallback, TaskKey, TaskKind, task_keys
+from plumbline.execution.plan import Plan, ProgressCallback, RunObserver, TaskKey, TaskKind, task_keys
 from plumbline.execution.random_batch import RandomBatch
 from plumbline.execution.scenario_run import ScenarioRun, has_steps
 from plumbline.judging import known_issues
@@ -27,6 +27,7 @@ from plumbline.processes.cpu_time import CpuTimes
 from plumbline.processes.workers import (
     Executor,
     ExecutorUnavailable,
+    Outcome,
     ResultCache,
     Scheduler,
     Task,
@@ -110,12 +111,13 @@ def describe_engines(
     return {name: found[name] for name in engines}
 
 
-def run_plan(plan: Plan, progress: ProgressCallback) -> RunResult:
+def run_plan(plan: Plan, progress: ProgressCallback, observer: RunObserver | None = None) -> RunResult:
     """Run a whole plan.
 
     Args:
         plan: what to run.
         progress: called after every task.
+        observer: gets the rows as they are judged.
 
     Returns:
         The result; a task that is lost becomes a row with the verdict failed.
@@ -125,7 +127,7 @@ def run_plan(plan: Plan, progress: ProgressCallback) -> RunResult:
 
     """
     begin, started = time.monotonic(), datetime.now(UTC)
-    run = _Run(plan)
+    run = _Run(plan, observer or RunObserver())
     with run.cpu_times.measure_overhead(), make_executor(plan) as executor:
         run.execute(executor, progress)
     result = run.result()
@@ -156,12 +158,14 @@ def run_plan(plan: Plan, progress: ProgressCallback) -> RunResult:
 class _Run:
     """A plan while it runs."""
 
-    def __init__(self, plan: Plan) -> None:
-        self.plan = plan
+    def __init__(self, plan: Plan, observer: RunObserver) -> None:
+        self.plan, self.observer = plan, observer
         self.cpu_times = CpuTimes()
         self.truth_methods: Counter[str] = Counter()
         self.engines: dict[str, EngineInfo] = {}
-        self.known = known_issues.KnownIssues(plan.known_issues, plan.extra_refinements > 0)
+        self.known, self.known_of_observer = (  # the second marks rows before their scenario is complete
+            known_issues.KnownIssues(plan.known_issues, plan.extra_refinements > 0) for _ in range(2)
+        )
         self.tables = results_store.ResultTables()
         self.random_batch = RandomBatch()
         self.rows: dict[str, list[Row]] = {s.name: [] for s in plan.scenarios}
@@ -175,6 +179,7 @@ class _Run:
             executor, plan.engines, are_required=plan.are_engines_required, result_cache=cache
         )
         self.identity = IdentityCheck(self.engines)
+        self.observer.on_start(self.engines)
         has_long_runs = plan.long_run_seconds > 0
         total = sum(
             sum(1 for _ in task_keys("", self.engines, plan.level, has_long_runs, has_steps(scenario)))
@@ -189,6 +194,7 @@ class _Run:
             self.cpu_times.add_outcome(outcome, outcome.key.cpu_time_kind)
             with self.cpu_times.measure("judging"):
                 following = self.open[outcome.key.scenario].on_outcome(outcome)
+                self._show_rows(self.open[outcome.key.scenario], outcome)
                 while self.open and (first := next(iter(self.open.values()))).is_done:
                     self._finish(self.open.pop(first.scenario.name))
             for task in following:
@@ -215,6 +221,13 @@ class _Run:
             )
             self.open[scenario.name] = scenario_run
             yield from scenario_run.tasks()
+
+    def _show_rows(self, scenario_run: ScenarioRun, outcome: Outcome) -> None:
+        name, bodies = scenario_run.scenario.name, scenario_run.scenario.model.n
+        rows = scenario_run.findings().rows if scenario_run.is_done else scenario_run.new_rows(outcome)
+        if name in self.rows and rows:  # random scenarios are many
+            rows = self.known_of_observer.mark_known(rows, bodies)
+            self.observer.on_rows(name, rows, scenario_run.is_done)
 
     def _finish(self, scenario_run: ScenarioRun) -> None:
         """Keep the rows and tables of a scenario whose tasks have all finished."""

@@ -23,7 +23,7 @@ from plumbline.judging.convergence import refinement_resolutions
 from plumbline.judging.known_issues import KnownIssues
 from plumbline.judging.long_run_study import plan_long_run, run_long_run_study
 from plumbline.judging.long_runs import judge_long_runs
-from plumbline.judging.rows import Fingerprints, JudgingResult, Level, RowContext, Verdict, mark_aliases
+from plumbline.judging.rows import Fingerprints, JudgingResult, Level, Row, RowContext, Verdict, mark_aliases
 from plumbline.judging.state import judge_states
 from plumbline.judging.step import (
     MAX_STEP_BODIES,
@@ -201,6 +201,19 @@ class ScenarioRun:
         self._pending |= {task.key for task in following}
         return following
 
+    def new_rows(self, outcome: Outcome) -> list[Row]:
+        """Return what was found by an outcome.
+
+        Args:
+            outcome: that `on_outcome` has taken.
+
+        Returns:
+            The rows; none of a truth or a diagnosis.
+
+        """
+        found = self._findings.get(outcome.key)
+        return found.rows if found else []
+
     def fingerprints(self) -> dict[str, Fingerprints]:
         """Collect what identifies the answers of each engine.
 
@@ -273,7 +286,7 @@ class ScenarioRun:
         judge, judge_arguments = self._judge(key)
         return Task(
             key, call, (base, *arguments), self._plan.limits, info.version, info.python, judge,
-            judge_arguments, sends_answer=key.kind == TaskKind.STATE,
+            judge_arguments, JudgingResult.has_disagreement,  # only a diagnosis needs the answer
         )  # fmt: skip
 
     def _call(self, key: TaskKey) -> tuple[Callable[..., Any], tuple[Any, ...]]:

@@ -284,3 +284,12 @@ class JudgingResult:
     rows: list[Row] = field(default_factory=list)
     tables: list[tuple[str, Columns]] = field(default_factory=list)  # name of the stored table, its columns
     fingerprints: Fingerprints = field(default_factory=dict)
+
+    def has_disagreement(self) -> bool:
+        """Find out whether a row disagrees.
+
+        Returns:
+            Whether there is such a row.
+
+        """
+        return any(row.verdict == Verdict.DISAGREES for row in self.rows)

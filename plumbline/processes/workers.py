@@ -10,6 +10,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import gc
+import hashlib
 import multiprocessing
 import os
 import pickle
@@ -20,7 +21,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, cached_property
 from multiprocessing import forkserver
 from multiprocessing.context import BaseContext
 from types import TracebackType
@@ -61,6 +62,11 @@ class Pickled:
         """
         return cls(pickle.dumps(value, protocol=5))
 
+    @cached_property
+    def digest(self) -> bytes:
+        """SHA-256 of the pickle."""
+        return hashlib.sha256(self.data).digest()
+
     def load(self) -> Any:
         """Load the pickle.
 
@@ -91,7 +97,8 @@ class Task:
     python: str = ""  # interpreter of another environment that makes the call; empty: the worker itself
     judge: Callable[..., Any] | None = None  # called in the worker with judge_arguments and the answer
     judge_arguments: tuple[Any, ...] = ()
-    sends_answer: bool = True  # False: only what the judge returned comes back
+    # asked of what the judge returned, whether the answer is needed besides; None: it is
+    needs_answer: Callable[[Any], bool] | None = None
 
 
 @dataclass(frozen=True)
@@ -400,7 +407,8 @@ def _call_and_judge(task: Task) -> Outcome:
         except Exception as error:  # the harness's, not the engine's
             failure = f"{type(error).__name__}: {error}"
         judging = time.process_time() - begin
-    answer = Pickled.of(value) if task.sends_answer else None
+    is_needed = task.needs_answer is None or judged is None or task.needs_answer(judged)
+    answer = Pickled.of(value) if is_needed else None
     total = time.process_time()
     overhead = total - _worker_cpu_time["reported"] - judging - (0.0 if task.python else cost)
     _worker_cpu_time["reported"] = total

@@ -269,7 +269,7 @@ def test_a_judge_that_changes_has_another_cell():
         replace(judged, judge_arguments=(2,)),
         replace(judged, judge=run_in_process),
         replace(judged, python="/another/python"),
-        replace(judged, sends_answer=False),
+        replace(judged, needs_answer=quiet),
     ]
     assert len({task_hash(judged), *map(task_hash, others)}) == 5
 

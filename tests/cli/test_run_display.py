@@ -1,0 +1,102 @@
+"""What a run shows while it goes on, and what an interrupted one leaves on the terminal."""
+
+from io import StringIO
+from unittest.mock import patch
+
+import pytest
+from click.testing import CliRunner
+
+from plumbline.cli.main import main
+from plumbline.cli.run_display import RunDisplay
+from plumbline.cli.verdict_matrix import VerdictMatrix
+from plumbline.engines.adapter import EngineInfo
+from plumbline.execution.exit_codes import ExitCode
+from plumbline.execution.plan import Plan, RunObserver
+from plumbline.execution.runner import run_plan
+from plumbline.judging.rows import Row, Verdict
+from plumbline.scenario import loader
+
+ENGINES = {"mujoco": EngineInfo("mujoco", "MuJoCo", "4.0.0", ())}
+
+
+def row(scenario, verdict, ratio=0.1):
+    return Row(
+        scenario, "test", "mujoco", "4.0.0", "state", "-", "acceleration", "m/s²", None, None, verdict, "r",
+        ratio=ratio,
+    )  # fmt: skip
+
+
+class Terminal(StringIO):
+    def isatty(self):
+        return True
+
+
+def test_the_worst_scenario_comes_first():
+    matrix = VerdictMatrix(ENGINES)
+    for name, verdict in (("a", Verdict.AGREES), ("b", Verdict.DISAGREES), ("c", Verdict.UNRESOLVED)):
+        matrix.add_rows(name, [row(name, verdict)])
+    assert list(matrix.table().columns[0].cells) == ["b", "c", "a"]
+    assert list(matrix.table(max_lines=1).columns[0].cells) == ["b"]
+
+
+def test_a_terminal_shows_cells_of_a_scenario_that_still_runs():
+    file = Terminal()
+    display = RunDisplay(file)
+    with display as progress:
+        display.on_start(ENGINES)
+        display.on_rows("conical", [row("conical", Verdict.DISAGREES)], is_complete=False)
+        progress(1, 7, "conical mujoco state")
+        shown = file.getvalue()
+        assert "conical" in shown and "✗" in shown and "0/1" in shown and "1/7" in shown
+    assert display.finished.scenario_count == 0
+
+
+def test_elsewhere_a_line_tells_each_finished_scenario():
+    file = StringIO()
+    display = RunDisplay(file)
+    with display:
+        display.on_start(ENGINES)
+        display.on_rows("conical", [row("conical", Verdict.AGREES)], is_complete=False)
+        assert file.getvalue() == ""
+        display.on_rows("conical", [row("conical", Verdict.AGREES)], is_complete=True)
+    assert file.getvalue() == "conical: mujoco ✓ 1/1 0.1\n"
+
+
+def test_an_interrupted_run_leaves_the_table_of_what_has_finished(tmp_path):
+    def interrupted(plan, progress, observer):
+        observer.on_start(ENGINES)
+        observer.on_rows("rest", [row("rest", Verdict.AGREES)], True)
+        observer.on_rows("conical", [row("conical", Verdict.AGREES)], False)
+        raise KeyboardInterrupt
+
+    words = ["run", "rest", "conical", "--engine", "mujoco", "--out", str(tmp_path)]
+    with patch("plumbline.cli.run_commands.run_plan", side_effect=interrupted):
+        result = CliRunner().invoke(main, words)
+    assert result.exit_code == ExitCode.INTERRUPTED
+    assert "rest" in result.stdout and "1 of 2 scenarios finished" in result.stdout
+    assert "conical" not in result.stdout
+    assert result.stderr.endswith("interrupted; finished cells are kept, run the same command to resume\n")
+
+
+class Recorder(RunObserver):
+    def __init__(self):
+        self.partial, self.complete = [], {}
+
+    def on_start(self, engines):
+        assert list(engines) == ["mujoco"]
+
+    def on_rows(self, scenario, rows, is_complete):
+        if is_complete:
+            self.complete[scenario] = list(rows)
+        else:
+            self.partial += rows
+
+
+@pytest.mark.parametrize("level", ["state", "trajectory"])
+def test_an_observer_gets_the_rows_of_the_result(level):
+    chosen = loader.load_scenarios(["rest", "conical"])
+    recorder = Recorder()
+    result = run_plan(Plan(chosen, ["mujoco"], level, random_state_count=2), lambda *_: None, recorder)
+    assert [r for s in chosen for r in recorder.complete[s.name]] == result.rows
+    assert {r.key for r in recorder.partial} <= {r.key for r in result.rows}
+    assert bool(recorder.partial) == (level == "trajectory")
