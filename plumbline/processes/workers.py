@@ -397,22 +397,22 @@ def _call_and_judge(task: Task) -> Outcome:
         value, cost = call_remote(task.python, call_timed, task.function, *arguments)
     else:
         value, cost = call_timed(task.function, *arguments)
-    judged, failure, judging = None, "", 0.0
+    answer, judged, failure, judging = Pickled.of(value), None, "", 0.0
     if task.judge:
         begin = time.process_time()
         try:
-            judged = task.judge(*_load(task.judge_arguments), value)
+            # a copy, whose arrays lie in memory alike wherever the call was made: sums depend on that
+            judged = task.judge(*_load(task.judge_arguments), answer.load())
         except MemoryError:
             raise
         except Exception as error:  # the harness's, not the engine's
             failure = f"{type(error).__name__}: {error}"
         judging = time.process_time() - begin
     is_needed = task.needs_answer is None or judged is None or task.needs_answer(judged)
-    answer = Pickled.of(value) if is_needed else None
     total = time.process_time()
     overhead = total - _worker_cpu_time["reported"] - judging - (0.0 if task.python else cost)
     _worker_cpu_time["reported"] = total
-    return Outcome(task.key, answer, None, cost, judged, failure, judging, overhead)
+    return Outcome(task.key, answer if is_needed else None, None, cost, judged, failure, judging, overhead)
 
 
 def _load(arguments: Sequence[Any]) -> list[Any]:
