@@ -5,6 +5,7 @@ scenarios of the matrix are distributed one by one.  (pytest-xdist's loadgroup h
 pytest-dev/pytest-xdist#1386.)
 """
 
+import itertools
 import os
 import re
 
@@ -40,10 +41,18 @@ def pytest_xdist_make_scheduler(config, log):
     return Scheduling(config, log)
 
 
+@pytest.fixture(scope="session")
+def cache_folders(tmp_path_factory):
+    """Paths of caches, one for each test: tmp_path_factory would look through all of them to name another."""
+    folder = tmp_path_factory.mktemp("caches")
+    return (folder / str(number) for number in itertools.count())
+
+
 @pytest.fixture(autouse=True)
-def own_cells(tmp_path_factory, monkeypatch):
+def own_cells(cache_folders, monkeypatch):
     """A test finds no cells of other runs. It shares the environments of engines, which take long to make."""
-    folder = tmp_path_factory.mktemp("cache")
+    folder = next(cache_folders)
+    folder.mkdir()
     (folder / "engines").symlink_to(user_cache_folder() / "engines")
     monkeypatch.setenv("PLUMBLINE_CACHE", str(folder))
     return folder / "cells"
