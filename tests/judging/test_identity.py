@@ -11,6 +11,7 @@ from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.registry import load_adapter
 from plumbline.execution import runner
 from plumbline.execution.plan import Plan
+from plumbline.execution.result_cache import DiskResultCache
 from plumbline.judging.identity import (
     MIN_SCENARIOS,
     RUN_SCENARIO,
@@ -149,11 +150,13 @@ def test_a_run_reports_an_alias_that_is_not_declared(monkeypatch, tmp_path):
 
     names = ("rest", "planar-small", "tumbling-ball", "tumbling-rod", "on-axis-rod")
     chosen = [loader.load_scenario(loader.find_scenario_file(name)) for name in names]
-    declared = runner.run_plan(Plan(chosen, ["mujoco"], "trajectory", limits=Limits(120)), lambda *_: None)
+    cells = DiskResultCache(tmp_path / "cells")
+    plan = Plan(chosen, ["mujoco"], "trajectory", limits=Limits(120), result_cache=cells)
+    declared = runner.run_plan(plan, lambda *_: None)
     assert declared.metadata["exit_code"] == 0 and declared.metadata["identity"]["scenarios"] == 3
     assert RUN_SCENARIO not in declared.scenarios
     monkeypatch.setattr(runner, "describe_engines", undeclared)
-    result = runner.run_plan(Plan(chosen, ["mujoco"], "trajectory", limits=Limits(120)), lambda *_: None)
+    result = runner.run_plan(plan, lambda *_: None)
     (row,) = [row for row in result.rows if row.verdict.needs_attention]
     assert (row.scenario, row.integrator, row.quantity) == (
         RUN_SCENARIO, "implicitfast", "identity with mujoco Euler",
@@ -162,8 +165,8 @@ def test_a_run_reports_an_alias_that_is_not_declared(monkeypatch, tmp_path):
         result.metadata["exit_code"] == 1
         and "1 disagrees (mujoco, all scenarios" in result.metadata["sentence"]
     )
-    runner.save(result, tmp_path, "test")
-    page = reports.write(tmp_path).read_text()
+    runner.save(result, tmp_path / "out", "test")
+    page = reports.write(tmp_path / "out").read_text()
     assert "implicitfast equals that of MuJoCo with Euler bit for bit" in page
-    stored = json.loads((tmp_path / "results.json").read_text())
+    stored = json.loads((tmp_path / "out" / "results.json").read_text())
     assert stored["scenarios"][RUN_SCENARIO]["family"] == "run"
