@@ -11,7 +11,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from reference_impl.chain import Array, Chain
 from reference_impl.direct import check_state_solvable, solve_dense
@@ -138,6 +137,22 @@ class DoublePendulum(NamedTuple):
         return np.array([self.bodies[0].gamma, gamma_2])
 
 
+def block_diagonal(blocks: Array) -> Array:
+    """Put matrices on the diagonal of one; scipy's block_diag would take two fifths of `solve_system`.
+
+    Args:
+        blocks: (n, i, j).
+
+    Returns:
+        (n i, n j), zero beside the blocks.
+
+    """
+    n, i, j = blocks.shape
+    matrix = np.zeros((n, i, n, j), blocks.dtype)
+    matrix[np.arange(n), :, np.arange(n)] = blocks
+    return matrix.reshape(n * i, n * j)
+
+
 def assemble_system(chain: Chain, r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, Array]:
     """Assemble S and b of (N5) for one body (S1–S5) or two (D1–D6); every joint is read as a rod.
 
@@ -165,11 +180,11 @@ def assemble_system(chain: Chain, r: Array, p: Array, v: Array, pdot: Array) -> 
         bodies, C_r, C_p, gamma = two.bodies, two.C_r, two.C_p, two.gamma
     else:
         raise ValueError(f"the notes print one and two bodies, not {n}")
-    C_Ep = block_diag(*(body.C_Ep for body in bodies))
+    C_Ep = block_diagonal(np.array([[body.C_Ep] for body in bodies]))
     gamma_E = np.array([body.gamma_E for body in bodies])
-    M = block_diag(*(m * np.eye(3) for m in chain.mass))  # (D1), and the next two lines
-    J = block_diag(*chain.inertia)
-    L_, Ldot = block_diag(*L(p)), block_diag(*L(pdot))
+    M = block_diagonal(chain.mass[:, None, None] * np.eye(3))  # (D1), and the next two lines
+    J = block_diagonal(chain.inertia)
+    L_, Ldot = block_diagonal(L(p)), block_diagonal(L(pdot))
     p_, omega = p.ravel(), 2 * (L(p) @ pdot[..., None])[..., 0]
     F = chain.mass[:, None] * chain.gravity + chain.force - chain.drag_force[:, None] * v
     moment = chain.moment - chain.drag_moment[:, None] * omega  # n′
