@@ -27,6 +27,7 @@ from reference_impl.structured import StructuredSystem, component_first
 DEFAULT_NODES = 16  # a sweep of a small chain costs NumPy's calls and not its nodes: 8 … 20 were tried
 MAX_SWEEPS = 14  # at most in a step; more are better spent on a shorter step
 PROBED_STEPS = 50  # steps after which the length of a step no longer depends on the first guess
+MAX_BODIES_AT_ONCE = 1000  # nodes × bodies of one right-hand side: larger temporary arrays leave the caches
 USUAL_SWEEPS = 6  # sweeps: a step that needs more is made shorter, one that needs fewer may grow
 
 
@@ -233,7 +234,10 @@ class _Stepper:
         dense: bool,
         baumgarte: float,
     ) -> None:
-        self.forest, self.tiled, self.table = forest, forest.repeated(len(table.c)), table
+        self.forest, self.table = forest, table
+        parts = -(-len(table.c) * forest.body_count // MAX_BODIES_AT_ONCE)
+        nodes = np.array_split(np.arange(len(table.c)), min(parts, len(table.c)))
+        self.tiles = [(slice(at[0], at[-1] + 1), forest.repeated(len(at))) for at in nodes]
         self.q, self.v, self.rtol, self.sweep_tolerance = q, v, rtol, quiet
         self.dense, self.baumgarte = dense, baumgarte
         self.q_compensation, self.v_compensation = (
@@ -260,7 +264,7 @@ class _Stepper:
 
     def try_step(self, h: float) -> tuple[bool, bool]:
         """Try a step: (whether it was made, whether the sweeps were what limited it). Sets the next ``h``."""
-        table, S, M = self.table, len(self.table.c), self.forest.body_count
+        table, S = self.table, len(self.table.c)
         if self.modes.size:
             a = self._extrapolated_acceleration(h / self.last_step)
         else:
@@ -274,8 +278,7 @@ class _Stepper:
             V += v0
             Q = hA @ V
             Q += q0
-            new = self.tiled.acceleration(Q.reshape(7, -1), V.reshape(7, -1), self.baumgarte)
-            new = new.reshape(7, S, M)
+            new = self._accelerations(Q, V)
             a -= new
             np.abs(a, out=a)
             a *= weight
@@ -304,6 +307,14 @@ class _Stepper:
             self.h = h * factor
         self._advance(a, h)
         return True, slow
+
+    def _accelerations(self, Q: Array, V: Array) -> Array:
+        """The accelerations (7, S, M) at all nodes."""
+        new = np.empty_like(Q)
+        for nodes, tile in self.tiles:
+            part = tile.acceleration(Q[:, nodes].reshape(7, -1), V[:, nodes].reshape(7, -1), self.baumgarte)
+            new[:, nodes] = part.reshape(7, -1, self.forest.body_count)
+        return new
 
     def _extrapolated_acceleration(self, ratio: float) -> Array:
         """The last step's polynomial at the nodes of the next one, cut where its terms there are smallest.
