@@ -219,31 +219,35 @@ class _KinematicTree:
         return np.einsum("kij,kj->ki", self.body_axes_of_links, values) if local else values
 
     def quaternions_at(self, angles: Array) -> Array:
-        """Return the quaternions (N, 4) at the angles: continuous, and the state's own at 0."""
-        now = then = np.array([1.0, 0.0, 0.0, 0.0])  # of the frame before, which a rod turns along
-        out = np.empty((self.model.n, 4))
+        """Return the quaternions (T, N, 4) at the angles (T, ·): continuous, and the state's own at 0."""
+        unit = np.array([1.0, 0.0, 0.0, 0.0])
+        now, then = np.tile(unit, (len(angles), 1)), unit  # of the frame before, which a rod turns along
+        out = np.empty((len(angles), self.model.n, 4))
         for group in self.revolute_groups:
-            half = 0.5 * angles[group.first_angle :][: group.angle_count]
-            spun = np.array([1.0, 0.0, 0.0, 0.0])
-            for i, h in enumerate(half):
-                spun = quaternion_product(spun, np.array([np.cos(h), *(np.sin(h) * np.eye(3)[2 - i])]))
-            spun[1:] = group.body_axes @ spun[1:]
+            spun = np.tile(unit, (len(angles), 1))
+            for i in range(group.angle_count):
+                half, turn = 0.5 * angles[:, group.first_angle + i], np.zeros_like(spun)
+                turn[:, 0], turn[:, 3 - i] = np.cos(half), np.sin(half)
+                spun = quaternion_product(spun, turn)
+            spun[:, 1:] = np.matvec(group.body_axes, spun[:, 1:])
             if group.angle_count == 2:
                 now = quaternion_product(now, spun)
             else:
                 start = self.state.p[group.body]
-                now = quaternion_product(
-                    quaternion_product(now, quaternion_product(quaternion_conjugate(then), start)), spun
-                )
+                between = quaternion_product(quaternion_conjugate(then), start)
+                now = quaternion_product(quaternion_product(now, between), spun)
                 then = start
-                out[group.body] = now
+                out[:, group.body] = now
         return out
 
     def read_sample(self) -> tuple[Array, Array, Array, Array]:
-        """Return r, p, v and ṗ of all bodies."""
-        p = self.quaternions_at(self.mbs.systemData.GetODE2Coordinates())
-        pdot = quaternion_rate(p, self.read_sensors(Output.AngularVelocityLocal))
-        return self.read_sensors(Output.Position), p, self.read_sensors(Output.Velocity), pdot
+        """Return the angles, and r, v and ω′ of all bodies."""
+        return (
+            np.array(self.mbs.systemData.GetODE2Coordinates()),
+            self.read_sensors(Output.Position),
+            self.read_sensors(Output.Velocity),
+            self.read_sensors(Output.AngularVelocityLocal),
+        )
 
     def check_singularity(self, t: float) -> None:
         """Raise Unsupported once a middle angle is near ±90°."""
@@ -316,8 +320,10 @@ class ExudynTree(ExudynAdapter):
             samples = run_solver(
                 solver, tree.mbs, settings, times, resolution, tree.read_sample, tree.check_singularity
             )
-        r, p, v, pdot = (np.array(column) for column in zip(*samples, strict=True))
-        return Trajectory(times.copy(), r, p, v, pdot, round(float(times[-1] / resolution)))
+        angles, r, v, omega = (np.array(column) for column in zip(*samples, strict=True))
+        p = tree.quaternions_at(angles)
+        steps = round(float(times[-1] / resolution))
+        return Trajectory(times.copy(), r, p, v, quaternion_rate(p, omega), steps)
 
     def _step(self, model: Model, state: State, times: Array, integrator: Integrator, step: float) -> StepRun:
         groups = _Linkage(model, state).revolute_groups

@@ -127,7 +127,8 @@ class Mujoco(MetamorphicHooks):
                 mujoco.mj_step(chain.m, chain.d, nstep=int(done))
                 t.append(chain.d.time)  # the engine's own clock: the contract's checks notice a reset
                 rows.append(chain.sample())
-        r, p, v, pdot = (np.array(column) for column in zip(*rows, strict=True))
+        r, p, v, omega = (np.array(column) for column in zip(*rows, strict=True))
+        pdot = kinematics.quaternion_rate(p, omega)
         return Trajectory(t=np.array(t), r=r, p=p, v=v, pdot=pdot, steps=int(counts[-1]))
 
 
@@ -253,7 +254,7 @@ class _MujocoChain:
         )
 
     def sample(self) -> tuple[Array, Array, Array, Array]:
-        """Return r, p, v, ṗ of the links, read with a second data so that the run is not disturbed."""
+        """Return r, p, v, ω′ of the links, read with a second data so that the run is not disturbed."""
         m, probe = self.m, self.readout_data
         probe.qpos, probe.qvel = self.d.qpos, self.d.qvel
         mujoco.mj_kinematics(m, probe)
@@ -262,7 +263,7 @@ class _MujocoChain:
         velocity = self._spatial_motion(mujoco.mj_objectVelocity, probe)
         p = probe.xquat[self.link_ids]
         omega = _to_body_frame(probe.xmat[self.link_ids], velocity[:, :3])
-        return probe.xpos[self.link_ids], p, velocity[:, 3:], kinematics.quaternion_rate(p, omega)
+        return probe.xpos[self.link_ids], p, velocity[:, 3:], omega
 
     def _spatial_motion(self, mujoco_function: Callable[..., None], data: Any) -> Array:
         """Return mj_objectVelocity or mj_objectAcceleration of the links (N, 6), rotation first, world."""

@@ -115,16 +115,15 @@ def rkmk4(system: LieGroupSystem, q: Array, v: Array, h: float) -> tuple[Array, 
         Configuration and velocity after the step.
 
     """
-
-    def slope(y: Array) -> Array:
-        theta, w = y
-        if not theta.any():  # dexp is the identity
-            return np.array([w, system.acceleration(q, w)])
-        rate = system.exponential_coordinate_rate(q, theta, w)
-        return np.array([rate, system.acceleration(system.integrate(q, theta), w)])
-
-    theta, v = runge_kutta_4(slope, np.array([np.zeros_like(v), v]), h)
-    return system.integrate(q, theta), v
+    accelerate, move, rate = system.acceleration, system.integrate, system.exponential_coordinate_rate
+    a1 = accelerate(q, v)  # at θ = 0, where dexp is the identity and θ̇ = v
+    theta, v2 = h / 2 * v, v + h / 2 * a1
+    w2, a2 = rate(q, theta, v2), accelerate(move(q, theta), v2)
+    theta, v3 = h / 2 * w2, v + h / 2 * a2
+    w3, a3 = rate(q, theta, v3), accelerate(move(q, theta), v3)
+    theta, v4 = h * w3, v + h * a3
+    w4, a4 = rate(q, theta, v4), accelerate(move(q, theta), v4)
+    return move(q, h / 6 * (v + 2 * w2 + 2 * w3 + w4)), v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
 
 
 def runge_kutta_4(slope: Callable[[Array], Array], y: Array, h: float) -> Array:

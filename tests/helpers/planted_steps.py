@@ -21,6 +21,7 @@ from adapters import exudyn_engine, exudyn_tree_engine, mujoco_engine, pinocchio
 from plumbline.engines.adapter import Adapter
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import Array, Integrator, Model, State, Trajectory
+from plumbline.model.kinematics import quaternion_rate
 
 Step = Callable[[Any, Array, Array, float], tuple[Array, Array]]  # system, q, v, h -> q, v
 
@@ -291,8 +292,8 @@ def _mujoco_run(step: Step, model: Model, state: State, times: Array, h: float) 
             q, v = step(system, q, v, h)
         chain.d.qpos, chain.d.qvel = q, v
         rows.append(tuple(np.array(part) for part in chain.sample()))
-    r, p, rdot, pdot = (np.array(column) for column in zip(*rows, strict=True))
-    return Trajectory(times, r, p, rdot, pdot, round(times[-1] / h))
+    r, p, rdot, omega = (np.array(column) for column in zip(*rows, strict=True))
+    return Trajectory(times, r, p, rdot, quaternion_rate(p, omega), round(times[-1] / h))
 
 
 def _pinocchio_step(step: Step) -> Step:
