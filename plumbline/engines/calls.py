@@ -7,7 +7,7 @@ in a local process, in another environment or on another machine.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from importlib import metadata
 
@@ -18,6 +18,7 @@ from plumbline.model.datatypes import (
     Array,
     BadInput,
     EngineFailure,
+    Integrator,
     Model,
     State,
     StateQuantities,
@@ -132,7 +133,13 @@ def evaluate_states(engine: str, model: Model, states: Sequence[State]) -> Evalu
 
 
 def run_refinement(
-    engine: str, integrator: str, model: Model, state: State, times: Array, resolutions: Sequence[float]
+    engine: str,
+    integrator: str,
+    model: Model,
+    state: State,
+    times: Array,
+    resolutions: Sequence[float],
+    is_enough: Callable[[Model, Integrator, Sequence[RefinementRun]], bool] | None = None,
 ) -> RefinementStudy:
     """Simulate the same motion at each resolution; a run that fails is kept with its reason.
 
@@ -143,6 +150,7 @@ def run_refinement(
         state: the initial state.
         times: sample times (T,) [s].
         resolutions: steps [s] or relative tolerances, coarse to fine.
+        is_enough: asked after every run whether those so far will do; None to run at all resolutions.
 
     Returns:
         The runs; up to the first refusal where the engine does not support the motion.
@@ -165,6 +173,8 @@ def run_refinement(
         except Exception as error:  # as above
             failure = format_exception(error)
         runs.append(RefinementRun(resolution, trajectory, failure, time.process_time() - begin))
+        if is_enough is not None and is_enough(model, adapter.integrator(integrator), runs):
+            break
     return RefinementStudy(runs, None)
 
 

@@ -23,6 +23,7 @@ from plumbline.judging.convergence import refinement_resolutions
 from plumbline.judging.known_issues import KnownIssues
 from plumbline.judging.long_run_study import plan_long_run, run_long_run_study
 from plumbline.judging.long_runs import judge_long_runs
+from plumbline.judging.refinement_study import run_refinement_study
 from plumbline.judging.rows import Fingerprints, JudgingResult, Level, Row, RowContext, Verdict, mark_aliases
 from plumbline.judging.state import judge_states
 from plumbline.judging.step import (
@@ -301,7 +302,7 @@ class ScenarioRun:
             return run_step_study, (integrator, s.model, self._step_states)
         if key.kind == TaskKind.TRAJECTORY:
             steps = refinement_resolutions(integrator, s.model.n, s.duration, plan.extra_refinements)
-            return calls.run_refinement, (integrator.name, s.model, s.state, s.times, steps)
+            return run_refinement_study, (integrator.name, s.model, s.state, s.times, steps)
         length = plan_long_run(integrator, s.model.n, plan.long_run_seconds)
         return run_long_run_study, (integrator.name, s.model, s.state, s.sample_interval, length)
 

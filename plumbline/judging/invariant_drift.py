@@ -36,15 +36,28 @@ def invariant_rows(study: RefinementAnalysis) -> list[Row]:
     return rows
 
 
+def rounding_floor(steps: int, scale: float, accepted_error: float = 0.0) -> float:
+    """Return the drift of an invariant that the rounding of all steps explains.
+
+    Args:
+        steps: number of steps of the run.
+        scale: size of the quantities that the invariant is a difference of, in its unit.
+        accepted_error: what step control accepts in every step, relative to the scale.
+
+    Returns:
+        The drift, in the invariant's unit.
+
+    """
+    return (ROUNDING_PER_STEP + accepted_error) * max(steps, 64) * scale
+
+
 def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples: Sequence[Array]) -> Row:
     """The limit of a drift is zero, within its uncertainty and the rounding of all steps."""
     name, scale, times = quantity.replace("_", " "), study.invariant_scales[quantity], study.times
     last, steps = study.invariant_drifts[-1], study.finest.steps
     assert last is not None
-    per_step = ROUNDING_PER_STEP
-    if not study.has_steps:
-        per_step += study.runs[-1].resolution  # error that step control accepts in every step
-    floor = per_step * max(steps, 64) * scale
+    accepted = 0.0 if study.has_steps else study.runs[-1].resolution  # by step control in every step
+    floor, per_step = rounding_floor(steps, scale, accepted), ROUNDING_PER_STEP + accepted
     work_uncertainty = last.work_uncertainty if quantity == "energy_drift" else 0.0
     drift = np.maximum.accumulate(np.max(np.linalg.norm(samples[-1], axis=-1), axis=1))
     rounding = f"{steps} steps, {per_step:.1g} × {scale:.3g} {unit} each: {floor:.2g}"

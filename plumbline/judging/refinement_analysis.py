@@ -22,6 +22,28 @@ from plumbline.model.invariants import Invariants, compute_invariants, invariant
 from plumbline.truth.ground_truth import RUN_ROUNDING, MotionTruth
 
 
+def run_samples(runs: Sequence[RefinementRun], name: str) -> list[Array]:
+    """Collect one field of all runs of a study.
+
+    Args:
+        runs: coarse to fine; the finest one succeeded.
+        name: of a field of `Trajectory`.
+
+    Returns:
+        Per run (T, N, width); NaN where the run failed. Quaternions have the signs of the finest run's.
+
+    """
+    assert runs[-1].trajectory is not None
+    fine: Array = getattr(runs[-1].trajectory, name)
+    found = []
+    for run in runs:
+        y = np.full_like(fine, np.nan) if run.trajectory is None else getattr(run.trajectory, name)
+        if name == "p":
+            y = y * np.where(np.sum(y * fine, axis=-1, keepdims=True) < 0, -1.0, 1.0)
+        found.append(y)
+    return found
+
+
 @dataclass
 class RefinementAnalysis:
     """The runs of a refinement study, coarse to fine, and what follows from all of them together."""
@@ -46,15 +68,14 @@ class RefinementAnalysis:
         last = self.runs[-1].trajectory
         assert last is not None
         self.finest = last
-        self.positions = [self._samples(run, "r") for run in self.runs]
-        self.attitudes = [self._samples(run, "p") for run in self.runs]
+        self.positions, self.attitudes = run_samples(self.runs, "r"), run_samples(self.runs, "p")
         self.invariant_scales = invariant_scales(self.model, self.truth.trajectory, self.truth.length)
         # Positions alone may converge faster than the method: symplectic Euler from a state without
         # torque is a leapfrog in r, and shows its order 1 in ṙ only.
         sizes = self.truth.length, self.invariant_scales["gap_rate"]
         self.scaled_states = [
-            np.concatenate([r / sizes[0], self._samples(run, "v") / sizes[1]], axis=-1)
-            for r, run in zip(self.positions, self.runs, strict=True)
+            np.concatenate([r / sizes[0], v / sizes[1]], axis=-1)
+            for r, v in zip(self.positions, run_samples(self.runs, "v"), strict=True)
         ]
         trajectories = [run.trajectory for run in self.runs]
         self.invariant_drifts = [
@@ -153,16 +174,6 @@ class RefinementAnalysis:
         """
         following = self.times[min(at + 1, len(self.times) - 1)]
         return bool(following <= wanted / 2 * (1 + 1e-12) and self.times[at] < wanted / 2 * (1 - 1e-12))
-
-    def _samples(self, run: RefinementRun, name: str) -> Array:
-        """(T, N, width) of one field, NaN where the run failed; quaternions have the finest run's signs."""
-        fine: Array = getattr(self.finest, name)
-        if run.trajectory is None:
-            return np.full_like(fine, np.nan)
-        y: Array = getattr(run.trajectory, name)
-        if name == "p":
-            y = y * np.where(np.sum(y * fine, axis=-1, keepdims=True) < 0, -1.0, 1.0)
-        return y
 
     def _observe_order(self) -> tuple[ObservedOrder, float]:
         """The order in the longest window that shows one, and that window's end [s]."""

@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 from plumbline.diagnosis.diagnose import diagnose
-from plumbline.engines.calls import Evaluation, run_refinement
+from plumbline.engines.calls import Evaluation
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.convergence import refinement_resolutions
+from plumbline.judging.refinement_study import run_refinement_study
 from plumbline.judging.rows import RowContext
 from plumbline.judging.state import judge_states
 from plumbline.judging.trajectory import judge_trajectory
@@ -104,7 +105,7 @@ def motion_report(defect):
     with planted(defect, model) as engine, patch("plumbline.engines.calls.load_adapter", lambda _: engine):
         integrator = engine.integrator(defect.integrator)
         steps = refinement_resolutions(integrator, model.n, float(TIMES[-1]))
-        runs = run_refinement(defect.engine, integrator.name, model, state, TIMES, steps)
+        runs = run_refinement_study(defect.engine, integrator.name, model, state, TIMES, steps)
     who = RowContext("planted", "planted", defect.name, defect.name, "0")
     rows = judge_trajectory(who, model, truth, integrator, runs).rows
     return [f"{row.verdict}: {row.quantity}: {row.reason}" for row in rows if row.verdict.needs_attention]

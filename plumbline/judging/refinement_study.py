@@ -1,0 +1,98 @@
+"""A refinement study that stops where a finer step could not lower its bounds; runs inside a worker.
+
+A verdict on a limit has the bound T = U + R G + (uncertainty of the truth): U the uncertainty of the limit
+(`romberg`), R the rounding of a run, G ≥ 1 the growth of perturbations.  R does not fall with the step:
+whatever a finer study finds, its bound T′ is R at least.  Where U ≤ μ R therefore
+
+    T ≤ T′ + U ≤ (1 + μ) T′,      μ = `STOP_MARGIN`:
+
+the smallest mistake that the verdict detects is at most μ larger than with all steps.  Of an invariant the
+rounding is that of all steps, and in the next run twice as large: there U ≤ R is enough for T ≤ T′.
+
+The rule is given the model and the engine's own runs, and nothing of the truth: a wrong truth cannot end a
+study, and a study whose order or whose limit is not resolved goes on to its finest step.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+
+from plumbline.engines import calls
+from plumbline.engines.calls import RefinementRun, RefinementStudy
+from plumbline.judging.convergence import ORDER_MARGIN, max_norm, observed_order, romberg
+from plumbline.judging.invariant_drift import rounding_floor
+from plumbline.judging.refinement_analysis import run_samples
+from plumbline.model.datatypes import Array, Integrator, Model, State
+from plumbline.model.invariants import INVARIANT_UNITS, compute_invariants, invariant_scales
+from plumbline.truth.ground_truth import RUN_ROUNDING, stretched_length  # constants, no truth
+
+STOP_MARGIN = 1 / 8  # μ: what a finer step could lower a bound by, relative to the bound
+MIN_RUNS = 4  # three differences between consecutive runs, two orders
+
+
+def run_refinement_study(
+    engine: str, integrator: str, model: Model, state: State, times: Array, steps: Sequence[float]
+) -> RefinementStudy:
+    """Simulate the same motion at each step until the study is resolved.
+
+    Args:
+        engine: its name in the registry.
+        integrator: name of one of the engine's integrators.
+        model: the pendulum.
+        state: the initial state.
+        times: sample times (T,) [s].
+        steps: steps [s] or relative tolerances, coarse to fine.
+
+    Returns:
+        The runs; of a method with step control at every tolerance.
+
+    Raises:
+        MemoryError: the worker reached its memory limit, which the pool reports.
+
+    """
+    return calls.run_refinement(engine, integrator, model, state, times, steps, is_resolved)
+
+
+def is_resolved(model: Model, integrator: Integrator, runs: Sequence[RefinementRun]) -> bool:
+    """Return whether order and limits are resolved, so that a finer step could lower no bound by much.
+
+    Args:
+        model: the pendulum.
+        integrator: the integrator of the runs.
+        runs: coarse to fine.
+
+    Returns:
+        True where the observed order is the declared one, or every difference is rounding, and the limits of
+        positions, attitudes and all invariants are known to `STOP_MARGIN` of rounding.
+
+    """
+    after_failures = list(itertools.takewhile(lambda run: run.trajectory is not None, reversed(runs)))[::-1]
+    trajectories = [run.trajectory for run in after_failures if run.trajectory is not None]
+    if integrator.kind != "step" or len(trajectories) < MIN_RUNS:
+        return False
+    finest, length = trajectories[-1], float(np.sum(stretched_length(model)))
+    scales = invariant_scales(model, finest, length)
+    r, p, v = (run_samples(after_failures, name) for name in "rpv")
+    speed = scales["gap_rate"]
+    scaled = [np.concatenate([a / length, b / speed], axis=-1) for a, b in zip(r, v, strict=True)]
+    order = observed_order(scaled, RUN_ROUNDING / 8, integrator.order)
+    is_declared = order.is_asymptotic and abs((order.value or 0.0) - integrator.order) <= ORDER_MARGIN
+    if not (is_declared or order.is_at_rounding_floor):
+        return False
+    rounding = RUN_ROUNDING + integrator.solver_rtol * np.sqrt(finest.steps)
+    for samples, scale in ((r, length), (p, 1.0)):  # |δp| is half an angle, whose scale is 2
+        limit = romberg(samples, integrator.error_exponents)
+        if limit.uncertainty[-1] > STOP_MARGIN * rounding * scale:
+            return False
+    drifts = [compute_invariants(model, trajectory) for trajectory in trajectories]
+    for name in INVARIANT_UNITS:
+        series = [getattr(drift, name) for drift in drifts]
+        floor = rounding_floor(finest.steps, scales[name])
+        if series[-1] is None or max_norm(series[-1]) <= floor:
+            continue
+        if romberg(series, integrator.error_exponents).uncertainty[-1] > floor:
+            return False
+    return True
