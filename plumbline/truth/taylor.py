@@ -10,7 +10,7 @@ model.  Vectors (3,) and matrices (3, 3) of expressions are NumPy arrays of obje
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal
@@ -20,7 +20,8 @@ import numpy as np
 from plumbline.model.datatypes import Array, EngineFailure, Model, State
 from plumbline.truth import import_truth_tool
 
-Precision = Literal["double", "extended", "quad"]
+Precision = Literal["double", "extended", "quad", "octuple"]
+OCTUPLE_BITS, OCTUPLE_DIGITS = 237, 75
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,24 +57,60 @@ def simulate_taylor(
         EngineFailure: a step fails, or heyoka was built without quad precision.
 
     """
-    hy, mp = load_heyoka(), import_truth_tool("mpmath")
-    number_type = _number_type(hy, precision)
-    integrator = _compiled_integrator(tuple(bool(rod) for rod in model.rods), model.has_drag, precision)
-    with mp.workdps(60):
-
-        def number(x: Any) -> Any:
-            return float(x) if number_type is float else number_type(mp.nstr(mp.mpf(x), 40))
-
-        used = len(integrator.pars)  # up to the last parameter that appears in the equations
-        integrator.pars[:] = [number(x) for x in _parameter_values(mp, model)[:used]]
-        integrator.state[:] = [number(x) for x in _initial_values(mp, model, state)]
-        proximal, distal = ([_vector(map(number, s)) for s in x] for x in (model.proximal, model.distal))
-        length = [number(x) for x in model.length]
-    integrator.time = number_type(0.0)
-    outcome, _, _, steps, _, samples = integrator.propagate_grid([number_type(float(t)) for t in times])
+    integrator, number = _prepared_integrator(model, state, precision)
+    proximal, distal = ([_vector(map(number, s)) for s in x] for x in (model.proximal, model.distal))
+    length = [number(x) for x in model.length]
+    outcome, _, _, steps, _, samples = integrator.propagate_grid([number(float(t)) for t in times])
     if "time_limit" not in str(outcome):
         raise EngineFailure(f"heyoka stopped: {outcome}")
     return _forward_kinematics(model, times, np.asarray(samples), proximal, distal, length, int(steps))
+
+
+def integrate_steps(
+    model: Model, state: State, max_step: float, precision: Precision
+) -> Generator[tuple[Any, list[tuple[list[Any], bool]]], list[Any], None]:
+    """Integrate step by step, each from the values that the caller sends.
+
+    Args:
+        model: the mechanism.
+        state: initial state, of which the minimal coordinates are used.
+        max_step: longest step [s].
+        precision: "quad" or "octuple".
+
+    Yields:
+        The length of a step [s], and per coordinate its Taylor coefficients with respect to time and whether
+        it is a rate: p and u of each body, then ω′ and u̇ of each body; numbers of mpmath.  The caller sends
+        the values from which the next step starts, in the same order.
+
+    Raises:
+        TruthUnavailable: heyoka (Linux only) or mpmath is not installed.
+        EngineFailure: a step fails, or heyoka was built without that precision.
+
+    """
+    mp = import_truth_tool("mpmath")
+    integrator, number = _prepared_integrator(model, state, precision)
+    order = _positions_then_rates(model)
+    while True:
+        outcome, _ = integrator.step(number(max_step), write_tc=True)
+        if str(outcome).split(".")[-1].split(":")[0] not in ("success", "time_limit"):
+            raise EngineFailure(f"heyoka stopped: {outcome}")
+        series = [([mp.mpf(str(c)) for c in integrator.tc[i]], is_rate) for i, is_rate in order]
+        values = yield mp.mpf(str(integrator.last_h)), series
+        for (i, _), value in zip(order, values, strict=True):
+            integrator.state[i] = number(value)
+
+
+def _positions_then_rates(model: Model) -> list[tuple[int, bool]]:
+    """Places in heyoka's state of p and u of all bodies, then of ω′ and u̇, and whether each is a rate."""
+    q: list[int] = []
+    v: list[int] = []
+    first = 0
+    for rod in model.rods:
+        own = first + 6 * bool(rod)
+        q += [*range(own, own + 4), *range(first, min(first + 3, own))]
+        v += [*range(own + 4, own + 7), *range(min(first + 3, own), own)]
+        first = own + 7
+    return [(i, False) for i in q] + [(i, True) for i in v]
 
 
 @cache
@@ -100,10 +137,38 @@ def load_heyoka() -> Any:
     return hy
 
 
-def _number_type(hy: Any, precision: Precision) -> Any:
+def _prepared_integrator(
+    model: Model, state: State, precision: Precision
+) -> tuple[Any, Callable[[Any], Any]]:
+    """The integrator of a model at time 0 in a state, and the conversion to its numbers."""
+    mp, number = import_truth_tool("mpmath"), _number_conversion(precision)
+    integrator = _compiled_integrator(tuple(bool(rod) for rod in model.rods), model.has_drag, precision)
+    with mp.workdps(100):
+        used = len(integrator.pars)  # up to the last parameter that appears in the equations
+        integrator.pars[:] = [number(x) for x in _parameter_values(mp, model)[:used]]
+        integrator.state[:] = [number(x) for x in _initial_values(mp, model, state)]
+    integrator.time = number(0.0)
+    return integrator, number
+
+
+def _number_conversion(precision: Precision) -> Callable[[Any], Any]:
+    """The map from numbers of mpmath or Python to those of the integrator."""
+    hy, mp = load_heyoka(), import_truth_tool("mpmath")
+    if precision == "double":
+        return float
     if precision == "quad" and not hasattr(hy, "real128"):
         raise EngineFailure("this heyoka has no quad precision")
-    return {"double": float, "extended": np.longdouble, "quad": getattr(hy, "real128", None)}[precision]
+    if precision == "octuple" and not hasattr(hy, "real"):
+        raise EngineFailure("this heyoka has no multiprecision numbers")
+
+    def number(x: Any) -> Any:
+        with mp.workdps(100):
+            text = mp.nstr(mp.mpf(x), OCTUPLE_DIGITS if precision == "octuple" else 40)
+        if precision == "octuple":
+            return hy.real(text, OCTUPLE_BITS)
+        return np.longdouble(text) if precision == "extended" else hy.real128(text)
+
+    return number
 
 
 def _initial_values(mp: Any, model: Model, state: State) -> list[Any]:
@@ -145,7 +210,7 @@ def _compiled_integrator(rods: tuple[bool, ...], drag: bool, precision: Precisio
     """The Taylor integrator of a chain with that sequence of joints."""
     hy = load_heyoka()
     system = _equations_of_motion(hy, rods, drag)
-    zero = _number_type(hy, precision)(0.0)
+    zero = _number_conversion(precision)(0.0)
     # Unoptimised code takes two to three times as long to run and a tenth of the time to compile: for ten
     # bodies 0.4 s, where optimising takes 3 … 6 s and saves 0.4 s of a run of 2 s in double, 1 s in extended.
     return hy.taylor_adaptive(

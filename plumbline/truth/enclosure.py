@@ -1,0 +1,204 @@
+"""Certificates of motions: candidates by Taylor's method, and their proof by `enclosure_checker`.
+
+Nothing here is trusted but the conversion of the model: of a wrong candidate the checker rejects the
+certificate, or it proves a wider enclosure.
+"""
+
+from __future__ import annotations
+
+import gzip
+import json
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from plumbline.model.datatypes import Array, Model, State
+from plumbline.truth import import_truth_tool
+from plumbline.truth.taylor import integrate_steps
+
+if TYPE_CHECKING:
+    from plumbline.truth.enclosure_checker import Enclosure
+
+CertificatePrecision = Literal["quad", "octuple"]
+BITS: dict[CertificatePrecision, int] = {"quad": 110, "octuple": 230}  # after the binary point
+LENGTH_BITS = 20  # after the binary point, of a step
+MAX_STEPS_TRIED = (0.5, 0.25, 0.125)  # longest step in units of time; a motion at rest has infinite ones
+
+
+def load_checker() -> Any:
+    """Import the checker, which needs python-flint.
+
+    Returns:
+        The module `plumbline.truth.enclosure_checker`.
+
+    Raises:
+        TruthUnavailable: python-flint is not installed.
+
+    """
+    import_truth_tool("flint")
+    from plumbline.truth import enclosure_checker
+
+    return enclosure_checker
+
+
+def prove_motion(
+    model: Model,
+    state: State,
+    times: Array,
+    scenario: str = "",
+    precision: CertificatePrecision = "quad",
+    on_step: Callable[[int, int], None] = lambda _done, _of: None,
+) -> tuple[bytes, Enclosure]:
+    """Find a candidate and prove it; where it is rejected, try again with shorter steps.
+
+    Args:
+        model: the mechanism.
+        state: initial state, of which the minimal coordinates are used.
+        times: (T,) [s] of the samples, ascending from 0 on.
+        scenario: content hash of the scenario, written to the certificate.
+        precision: of the candidate.
+        on_step: called after each proved step with the numbers of proved steps and of all.
+
+    Returns:
+        The certificate as the bytes of its file, and what it proves.
+
+    Raises:
+        Rejected: no candidate could be proved (of `plumbline.truth.enclosure_checker`).
+        TruthUnavailable: python-flint, heyoka (Linux only) or mpmath is not installed.
+        EngineFailure: heyoka stops, or was built without that precision.
+
+    """
+    checker = load_checker()
+    for attempt, max_step in enumerate(MAX_STEPS_TRIED, 1):
+        raw = make_certificate(model, state, times, scenario, precision, max_step)
+        try:
+            return raw, checker.enclose_motion(checker.parse_certificate(raw), on_step)
+        except checker.Rejected:
+            if attempt == len(MAX_STEPS_TRIED):
+                raise
+    raise AssertionError("unreachable")
+
+
+def make_certificate(
+    model: Model,
+    state: State,
+    times: Array,
+    scenario: str = "",
+    precision: CertificatePrecision = "quad",
+    max_step: float = MAX_STEPS_TRIED[0],
+) -> bytes:
+    """Write a candidate motion as a certificate, without proving it.
+
+    Args:
+        model: the mechanism.
+        state: initial state, of which the minimal coordinates are used.
+        times: (T,) [s] of the samples, ascending from 0 on.
+        scenario: content hash of the scenario.
+        precision: of the candidate.
+        max_step: longest step, in the certificate's unit of time.
+
+    Returns:
+        The bytes of the file, compressed; the same input gives the same bytes.
+
+    Raises:
+        TruthUnavailable: heyoka (Linux only), python-flint or mpmath is not installed.
+        EngineFailure: heyoka stops, or was built without that precision.
+
+    """
+    checker, bits, exponent = load_checker(), BITS[precision], time_exponent(model, state)
+    document = {
+        "format": checker.FORMAT,
+        "version": checker.VERSION,
+        "scenario": scenario,
+        "time_exponent": exponent,
+        "bits": bits,
+        **{name: _hexadecimal(x) for name, x in checked_numbers(model, state).items()},
+        "times": _hexadecimal(times),
+        "steps": _candidate_steps(model, state, float(times[-1]), precision, exponent, max_step),
+    }
+    return gzip.compress(json.dumps(document, separators=(",", ":")).encode(), mtime=0)
+
+
+def checked_numbers(model: Model, state: State) -> dict[str, Array]:
+    """Return the numbers of a certificate by the checker's names: the one place that knows both records.
+
+    Args:
+        model: the mechanism.
+        state: its initial state.
+
+    Returns:
+        Arrays of doubles as the checker's ``SHAPES`` lists them.
+
+    """
+    return {
+        name: getattr(state if name in ("p", "omega", "u", "udot") else model, name)
+        for name in load_checker().SHAPES
+    }
+
+
+def time_exponent(model: Model, state: State) -> int:
+    """Choose the unit of time 2**exponent s, in which the rates of the motion are about 1.
+
+    Args:
+        model: the mechanism.
+        state: its initial state.
+
+    Returns:
+        The exponent.
+
+    """
+    levers = np.linalg.norm(model.proximal, axis=1) + model.length
+    swing = (
+        math.sqrt(float(np.linalg.norm(model.gravity)) / lever) if (lever := float(np.min(levers))) else 0.0
+    )
+    rate = max(float(np.max(np.abs(state.omega))), float(np.max(np.abs(state.udot))), swing, 2.0**-10)
+    return -round(math.log2(rate))
+
+
+def _hexadecimal(x: Array) -> Any:
+    """Nested lists of hexadecimal texts."""
+    return [_hexadecimal(row) for row in x] if np.ndim(x) else float(x).hex()
+
+
+def _candidate_steps(
+    model: Model,
+    state: State,
+    duration: float,
+    precision: CertificatePrecision,
+    exponent: int,
+    max_step: float,
+) -> list[list[Any]]:
+    """Steps of a certificate: each starts exactly where the one before ends.
+
+    A Taylor coefficient c_j [1/sʲ] of a step of H seconds becomes the integer nearest to c_j Hʲ 2**bits, of a
+    rate times the unit of time.
+    """
+    mp, bits = import_truth_tool("mpmath"), BITS[precision]
+    grain = 1 << (bits - LENGTH_BITS)  # lengths are multiples of it
+    steps: list[list[Any]] = []
+    with mp.workprec(2 * bits):
+        left = max(1, math.ceil(math.ldexp(duration, LENGTH_BITS - exponent)))  # grains
+        generator = integrate_steps(model, state, math.ldexp(max_step, exponent), precision)
+        h, series = next(generator)
+        start: list[int] = []
+        while True:
+            count = min(left, max(1, int(mp.floor(mp.ldexp(h, LENGTH_BITS - exponent)))))
+            seconds = mp.ldexp(mp.mpf(count), exponent - LENGTH_BITS)
+            rows = []
+            for i, (taylor, is_rate) in enumerate(series):
+                scale = bits + (exponent if is_rate else 0)
+                row = [int(mp.nint(mp.ldexp(c * seconds**j, scale))) for j, c in enumerate(taylor)]
+                if start:
+                    row[0] = start[i]
+                rows.append(row)
+            steps.append([count * grain, *rows])
+            start, left = [sum(row) for row in rows], left - count
+            if not left:
+                return steps
+            values = [
+                mp.ldexp(mp.mpf(value), -bits - (exponent if is_rate else 0))
+                for value, (_, is_rate) in zip(start, series, strict=True)
+            ]
+            h, series = generator.send(values)
