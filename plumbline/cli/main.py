@@ -36,6 +36,8 @@ COMMANDS = {  # where each is, and its line in the list; imported when it is typ
     "sweep": ("study_commands:sweep", "Vary a scenario's parameters."),
     "drift": ("study_commands:drift", "Measure constraint and energy drift over long times."),
     "coverage": ("study_commands:coverage", "Compute the smallest mistakes that a run would report."),
+    "prove": ("proof_commands:prove", "Enclose motions rigorously and write certificates."),
+    "verify": ("proof_commands:verify", "Prove certificates again."),
     "history": ("result_commands:history", "Compare stored nights."),
     "report": ("result_commands:report", "Write the report of stored results again."),
     "check": ("scenario_commands:check", "Check scenario files."),

@@ -19,7 +19,8 @@ class ExitCode(IntEnum):
 
 EXIT_CODE_MEANINGS = {
     ExitCode.SUCCESS: "everything agrees, or differs as recorded in known_issues.yaml",
-    ExitCode.DISAGREEMENT: "a disagreement, an unrecorded gap, a stale record, or nothing was compared",
+    ExitCode.DISAGREEMENT: "a disagreement, an unrecorded gap, a stale record, a certificate that proves "
+    "nothing, or nothing was compared",
     ExitCode.BAD_USAGE: "bad usage or a bad file",
     ExitCode.ENGINE_FAILED: "an engine failed: raised, crashed, hung, or is missing though it was named",
     ExitCode.MACHINE_FAILED: "the machine failed: disk full, input/output error, cluster lost",

@@ -40,6 +40,7 @@ from plumbline.scenario.loader import Scenario
 from plumbline.truth import ground_truth
 from plumbline.truth.closed_form import closed_form_motion
 from plumbline.truth.ground_truth import MotionTruth, StateTruth
+from plumbline.truth.proved_motion import find_proof
 
 _LEVELS: dict[TaskKind, Level] = {
     TaskKind.STATE: "state",
@@ -144,7 +145,9 @@ class ScenarioRun:
             return Task(key, ground_truth.state_truth, (s.model, self._states), self._plan.limits)
         closed = closed_form_motion(s)
         exact = (*closed(s.times), closed.source) if closed and closed.amplitude == 0 else None
-        arguments = (s.model, s.state, s.times, exact, *compiled_bodies)
+        arguments = (s.model, s.state, s.times, exact, *(compiled_bodies or (None,)))
+        proof = find_proof(s.model, s.state, s.times)
+        arguments += () if proof is None else (proof,)
         return Task(key, ground_truth.motion_truth, arguments, self._plan.limits)
 
     @property

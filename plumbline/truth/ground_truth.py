@@ -20,6 +20,7 @@ from plumbline.model.kinematics import state_from_minimal
 from plumbline.model.sampling import derive_seed
 from plumbline.truth import TruthUnavailable
 from plumbline.truth.certified import certify_state
+from plumbline.truth.proved_motion import ProvedMotion
 from plumbline.truth.rounding_bound import RoundingBound, state_rounding_bound
 
 if TYPE_CHECKING:
@@ -104,6 +105,7 @@ def motion_truth(
     times: Array,
     closed_form: ClosedFormSamples | None,
     max_compiled_bodies: int | None = None,
+    proof: ProvedMotion | None = None,
 ) -> MotionTruth:
     """Compute the true motion, the growth of perturbations and the effects of small parameter errors.
 
@@ -114,6 +116,7 @@ def motion_truth(
         closed_form: samples of a closed form at ``times``, if the scenario has one.
         max_compiled_bodies: longest chain for Taylor's method, None for `MAX_COMPILED_BODIES` of
             `plumbline.truth.trajectory`; 0 after it has crashed a worker.
+        proof: the motion as a certificate proves it; it takes the place of the two methods.
 
     Returns:
         The motion with all that `MotionTruth` holds.
@@ -127,7 +130,7 @@ def motion_truth(
 
     if max_compiled_bodies is None:
         max_compiled_bodies = trajectory.MAX_COMPILED_BODIES
-    truth = trajectory.trajectory_truth(model, state, times, closed_form, max_compiled_bodies)
+    truth = trajectory.trajectory_truth(model, state, times, closed_form, max_compiled_bodies, proof)
     growth, r, p = sensitivity.perturbation_growth_and_runs(
         model, state, times, perturbed_models(model, state)
     )

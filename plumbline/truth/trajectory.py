@@ -17,6 +17,7 @@ from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import quaternion_rate
 from plumbline.truth import TruthUnavailable
 from plumbline.truth.notes_motion import simulate_notes_form
+from plumbline.truth.proved_motion import ProvedMotion
 from plumbline.truth.taylor import Precision, simulate_taylor
 
 NOTES_RTOL = 1e-13  # of the notes' form: at 1e-14 it is no closer to extended precision, the rest is rounding
@@ -43,8 +44,9 @@ def trajectory_truth(
     times: Array,
     closed_form: ClosedFormSamples | None = None,
     max_compiled_bodies: int = MAX_COMPILED_BODIES,
+    proof: ProvedMotion | None = None,
 ) -> TrajectoryTruth:
-    """Compute the motion by two methods.
+    """Compute the motion by two methods, or take it from a proof.
 
     Where heyoka is missing, fails, or the chain has more than ``max_compiled_bodies``, DOP853 on the notes'
     equations takes its place: another integrator but the same equations, and ``method`` states that.
@@ -55,14 +57,17 @@ def trajectory_truth(
         times: (T,) [s] of the samples, times[0] = 0.
         closed_form: samples of a closed form at ``times``; they replace r and p of the result.
         max_compiled_bodies: longest chain that heyoka compiles; 0 to avoid heyoka.
+        proof: the motion as a certificate proves it, if there is one; nothing is computed then.
 
     Returns:
-        The motion and the differences between the two methods.
+        The motion and the differences between the two methods, or the radii of the proof.
 
     Raises:
         EngineFailure: the integrator of the notes' form stops early.
 
     """
+    if proof is not None:
+        return TrajectoryTruth(proof.trajectory, proof.position_radius, proof.attitude_radius, proof.method)
     failure = ""
     try:
         run, method = _simulate_minimal_coordinates(model, state, times, max_compiled_bodies)

@@ -273,21 +273,25 @@ def test_a_missing_step_is_rejected(proofs):
         enclose(document | {"steps": steps[:-1]})
 
 
-def test_a_remainder_that_is_dropped_voids_the_proof(proofs, monkeypatch):
-    """Series cut below the order of a candidate: balls that are true with the remainder, wrong without."""
-    _, _, document, right = proofs["ball"]
-    document = document | {
-        "steps": [[step[0], *(row[:24] for row in step[1:])] for step in document["steps"]]
-    }
+def test_the_bound_of_the_defect_holds_where_series_are_cut_and_contains_the_remainder(proofs, monkeypatch):
+    """Series cut six powers below the candidate's order; without the remainder the bound is smaller."""
+    _, _, document, _ = proofs["ball"]
+    certificate = checker.parse_certificate(json.dumps(document).encode())
+    mechanism, (length, *rows) = checker._Mechanism(certificate), certificate.steps[0]
+    y = checker._polynomials(rows, certificate.bits)
     usual = checker._fold
-
-    def lower(degree):
-        return degree if degree == checker.DEGREE else degree - 4
-
-    monkeypatch.setattr(checker, "_fold", lambda poly, degree: usual(poly, lower(degree)))
-    assert overlap(enclose(document), right)
-    monkeypatch.setattr(checker, "_fold", lambda poly, degree: poly.truncate(lower(degree) + 1))
-    assert not overlap(enclose(document), right)
+    with ctx.workprec(certificate.bits + checker.GUARD_BITS):
+        h = arb(length) * arb(2) ** -certificate.bits
+        vdot = [poly.derivative() * (1 / h) for poly in y[mechanism.nq :]]
+        at_end = [[checker._Dual(arb_poly([poly(arb(1))]), 0) for poly in x] for x in (y, vdot)]
+        monkeypatch.setattr(checker, "_fold", lambda poly, degree: usual(poly, max(degree - 6, 0)))
+        _, bounds = checker._bound_defect(mechanism, y, vdot, h)
+        monkeypatch.setattr(checker, "_fold", lambda poly, degree: poly.truncate(max(degree - 6, 0) + 1))
+        _, wrong = checker._bound_defect(mechanism, y, vdot, h)
+        monkeypatch.setattr(checker, "_fold", usual)
+        for k, g in enumerate(mechanism.equations(*at_end)[1]):
+            assert abs(g.value(arb(0))) < bounds[k]
+            assert wrong[k] < bounds[k]
 
 
 def test_a_wrong_bound_of_the_remainder_is_noticed(monkeypatch):

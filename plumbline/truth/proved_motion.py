@@ -1,0 +1,126 @@
+"""Proved motions as doubles with a radius, kept in the user's cache by what they are proved for."""
+
+from __future__ import annotations
+
+import contextlib
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from plumbline.model.datatypes import Array, Model, State, Trajectory
+from plumbline.model.kinematics import quaternion_rate
+from plumbline.processes.user_cache import CheckedFiles, DamagedFile, content_key, user_cache_folder
+from plumbline.truth import import_truth_tool
+from plumbline.truth.enclosure import checked_numbers
+
+if TYPE_CHECKING:
+    from plumbline.truth.enclosure_checker import Enclosure
+
+MAX_BYTES = 50 * 2**20  # of all stored motions; one of 10 bodies and 41 samples takes 50 kB
+
+
+@dataclass(frozen=True, eq=False)
+class ProvedMotion:
+    """The midpoints of an enclosure, rounded to double, and bounds of their error that hold for certain."""
+
+    trajectory: Trajectory
+    position_radius: Array  # (T,) m, largest of any body up to each time, with the rounding to double
+    attitude_radius: Array  # (T,) rad, the same
+    enclosure_radius: float  # m, largest of the enclosure's positions, without the rounding to double
+
+    @property
+    def method(self) -> str:
+        """How the motion was found, in words."""
+        return (
+            f"proved: enclosed in ball arithmetic within {self.enclosure_radius:.2g} m; "
+            "uncertainty: the rounding of the midpoints to double"
+        )
+
+
+def round_enclosure(enclosure: Enclosure) -> ProvedMotion:
+    """Round an enclosure to doubles.
+
+    Args:
+        enclosure: what a certificate proves.
+
+    Returns:
+        The motion with its error bounds.
+
+    """
+    r, position_error = _rounded(enclosure.r)
+    p, attitude_error = _rounded(enclosure.p)
+    v, _ = _rounded(enclosure.v)
+    omega, _ = _rounded(enclosure.omega)
+    times = np.array(enclosure.times)
+    return ProvedMotion(
+        Trajectory(times, r, p, v, quaternion_rate(p, omega), 0),
+        np.maximum.accumulate(position_error),
+        # unit quaternions at a distance d differ by a rotation of 4 asin(d / 2), others by 2 asin(d)
+        np.maximum.accumulate(2.1 * attitude_error),
+        enclosure.radius("r"),
+    )
+
+
+def _rounded(balls: Array) -> tuple[Array, Array]:
+    """Midpoints (T, N, …) as doubles, and (T,) the largest distance of any body's vector from its balls."""
+    arb = import_truth_tool("flint").arb
+    rounded = np.frompyfunc(lambda ball: float(ball.mid()), 1, 1)(balls).astype(float)
+    distance = np.frompyfunc(lambda ball, x: float(abs(ball - arb(x)).upper()), 2, 1)(balls, rounded)
+    up = 1 + 1e-12  # for the roundings here
+    return rounded, np.max(np.linalg.norm(distance.astype(float), axis=-1), axis=-1) * up
+
+
+def store_proof(model: Model, state: State, times: Array, proof: ProvedMotion) -> None:
+    """Keep a proved motion for later runs.
+
+    Args:
+        model: the mechanism that it is proved for.
+        state: its initial state.
+        times: (T,) [s] of the samples.
+        proof: the motion.
+
+    Raises:
+        OSError: the file cannot be written.
+
+    """
+    files = _files()
+    files.write(_name(model, state, times), pickle.dumps(proof, protocol=5))
+    files.trim(MAX_BYTES)
+
+
+def find_proof(model: Model, state: State, times: Array) -> ProvedMotion | None:
+    """Read the proved motion of a model, if there is one by the present checker.
+
+    Args:
+        model: the mechanism.
+        state: its initial state.
+        times: (T,) [s] of the samples.
+
+    Returns:
+        The motion; None where there is none, or none that can be read.
+
+    """
+    body = None
+    with contextlib.suppress(OSError, DamagedFile):
+        body = _files().read(_name(model, state, times))
+    if body is None:
+        return None
+    proof: ProvedMotion = pickle.loads(body)
+    return proof
+
+
+def _files() -> CheckedFiles:
+    return CheckedFiles(user_cache_folder() / "proofs")
+
+
+def _name(model: Model, state: State, times: Array) -> str:
+    """The content that a proof depends on: the numbers, the times, the checker and this file."""
+    numbers: dict[str, Any] = checked_numbers(model, state) | {"times": times}
+    arrays = [np.ascontiguousarray(x, dtype=float).tobytes() for x in numbers.values()]
+    code = [
+        Path(__file__).with_name(name).read_bytes() for name in ("enclosure_checker.py", Path(__file__).name)
+    ]
+    return f"{content_key(*code, *arrays)}.proof"
