@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import stat
 import sys
 import time
 from pathlib import Path
@@ -20,6 +21,7 @@ from plumbline.scenario.loader import Scenario
 from plumbline.truth import TruthUnavailable
 
 PRECISIONS = ("quad", "octuple")
+MAX_DURATION = 1000.0  # s; two bodies take minutes for 30 s
 
 
 @click.command(
@@ -34,7 +36,7 @@ PRECISIONS = ("quad", "octuple")
 @click.argument("names", nargs=-1, required=True, metavar="SCENARIO...")
 @click.option(
     "--duration",
-    type=options.FiniteNumber(0, min_open=True),
+    type=options.FiniteNumber(0, MAX_DURATION, min_open=True),
     help="Seconds to enclose, in the scenario's sample interval. Default: the scenario's own.",
 )
 @click.option(
@@ -56,7 +58,7 @@ def prove(names: tuple[str, ...], duration: float | None, precision: Any, out: P
     from plumbline.storage.results_store import write_atomically
 
     chosen = options.read_scenarios(names)
-    folder = options.ensure_writable(out)
+    folder = options.claim_folder(out)
     records = []
     with options.exit_on_io_error(), ProgressDisplay(sys.stderr) as progress:
         for s in chosen:
@@ -125,14 +127,17 @@ def _verify(path: Path, progress: Any) -> dict[str, Any]:
     record: dict[str, Any] = {"file": str(path)}
     began = time.process_time()
     try:
+        if not stat.S_ISREG(path.stat().st_mode):  # a device may have no end
+            raise checker.MalformedCertificate("not a file")
         certificate = checker.parse_certificate(path.read_bytes())
         enclosure = checker.enclose_motion(
             certificate, lambda done, of: progress(done, of, f"{path.name}: steps")
         )
     except checker.MalformedCertificate as error:
         return record | {"verdict": "malformed", "reason": str(error)}
-    except OSError as error:
-        return record | {"verdict": "malformed", "reason": f"cannot be read: {error.strerror}"}
+    except (OSError, ValueError) as error:  # ValueError: a path with a null character
+        words = getattr(error, "strerror", None) or error
+        return record | {"verdict": "malformed", "reason": f"cannot be read: {words}"}
     except checker.Rejected as error:
         return record | {"verdict": "rejected", "reason": str(error)}
     return record | _radii(enclosure) | {"cpu": time.process_time() - began}
@@ -151,10 +156,10 @@ def _finish(records: list[dict[str, Any]], as_json: bool) -> None:
         click.echo(json.dumps(records, ensure_ascii=False, indent=1))
     else:
         print_table(record for record in records if record["verdict"] == "proved")
-        for record in records:
-            if record["verdict"] != "proved":
-                name = record.get("scenario") or record["file"]
-                click.echo(f"{name}: {record['verdict']}: {record['reason']}", err=True)
+    for record in records:
+        if record["verdict"] != "proved":
+            name = record.get("scenario") or record["file"]
+            click.echo(f"{name}: {record['verdict']}: {record['reason']}", err=True)
     verdicts = {record["verdict"] for record in records}
     if "malformed" in verdicts:
         sys.exit(ExitCode.BAD_USAGE)

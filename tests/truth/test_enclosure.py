@@ -1,8 +1,11 @@
 """Enclosures of motions: the parts of the proof, planted faults, and what the enclosures must contain."""
 
 import ast
+import contextlib
 import gzip
 import json
+import random
+from collections import Counter
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,6 +18,7 @@ from plumbline.truth.certified import certify_state
 from plumbline.truth.enclosure import load_checker, make_certificate, prove_motion
 from plumbline.truth.taylor import simulate_taylor
 from plumbline.truth.trajectory import trajectory_truth
+from tests.helpers.mutations import damaged_bytes, damaged_document, limited_time
 from tests.helpers.random_chains import random_chain
 
 TRUTH_TOOLS = all(find_spec(module) for module in ("heyoka", "mpmath", "flint"))
@@ -342,6 +346,31 @@ def test_a_truncated_file_is_malformed(proofs):
 def test_a_malformed_field_is_named(proofs, change, message):
     with pytest.raises(checker.MalformedCertificate, match=message):
         enclose(proofs["ball"][2] | change)
+
+
+def test_damaged_documents_are_malformed_or_rejected(proofs):
+    """No other exception, whatever the document holds."""
+    document, draw = proofs["ball"][2], random.Random(8)
+    for _ in range(40):
+        damaged = json.dumps(damaged_document(document | {"steps": document["steps"][:1]}, draw)).encode()
+        with limited_time(), contextlib.suppress(checker.MalformedCertificate, checker.Rejected):
+            checker.enclose_motion(checker.parse_certificate(damaged))
+
+
+def test_damaged_files_are_malformed_or_read_whole(proofs):
+    """The gzip checksum covers the content, not the header."""
+    model, state, _, _ = proofs["ball"]
+    raw, draw = make_certificate(model, state, TIMES), random.Random(9)
+    outcomes = Counter()
+    for _ in range(100):
+        with limited_time():
+            try:
+                found = checker.parse_certificate(damaged_bytes(raw, draw))
+            except checker.MalformedCertificate:
+                outcomes["malformed"] += 1
+            else:
+                assert found.steps == checker.parse_certificate(raw).steps
+    assert outcomes["malformed"] > 50
 
 
 def test_a_motion_at_rest_is_enclosed():
