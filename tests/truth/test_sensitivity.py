@@ -17,11 +17,11 @@ from plumbline.truth.sensitivity import (
     RENORMALISATION_GROWTH,
     _interpolate_states,
     _make_state,
-    _project_to_manifold,
     perturbation_growth,
     perturbation_growth_and_runs,
     perturbed_states,
     predictability_horizon,
+    project_to_manifold,
 )
 from tests.helpers import pendulums
 from tests.helpers.random_chains import random_chain
@@ -108,7 +108,7 @@ def test_neighbours_are_on_the_manifold_and_close(rods):
     for twin in perturbed_states(model, state):
         assert 1e-9 < np.max(np.abs(twin.r - state.r)) < 1e-5
         assert np.sum(twin.u * twin.udot, axis=1) == pytest.approx(np.zeros(len(rods)), abs=1e-14)
-        back = _project_to_manifold(model, twin.r, twin.p, twin.v, quaternion_rate(twin.p, twin.omega))
+        back = project_to_manifold(model, twin.r, twin.p, twin.v, quaternion_rate(twin.p, twin.omega))
         for name in ("p", "omega", "u", "udot", "r", "v"):
             assert getattr(back, name) == pytest.approx(getattr(twin, name), abs=1e-13), name
         half = _interpolate_states(model, state, twin, 0.5)
@@ -181,7 +181,7 @@ def test_projection_normalises_quaternions():
     """To a few roundings; of ω′, which comes from a rate of p, a few more."""
     model, state = random_chain(np.random.default_rng(3), [0, 1])
     found = _make_state(model, 2 * state.p, state.omega, 3 * state.u, state.udot)
-    raw = _project_to_manifold(
+    raw = project_to_manifold(
         model, state.r, 2 * state.p, state.v, 0.5 * quaternion_rate(state.p, state.omega)
     )
     for name in ("p", "u", "r"):
