@@ -36,7 +36,7 @@ _UNHASHED_PACKAGES = ("plumbline/cli", "plumbline/execution", "plumbline/reprodu
                       "plumbline/studies")  # fmt: skip
 # never read by an import; half of the files that are installed
 _SOURCES_OF_COMPILERS = (".hpp", ".hxx", ".ipp", ".h", ".c", ".cpp", ".f90", ".pxd", ".pyi", ".cmake")
-MAX_BYTES = 2 * 2**30  # of the cells that runs share; the whole catalogue at all levels takes a tenth of it
+MAX_BYTES = 2 * 2**30  # of the cells that runs share
 
 
 class DiskResultCache(ResultCache):

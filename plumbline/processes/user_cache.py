@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 _CHECKSUM_SIZE = 32  # bytes
-_MAX_REMEMBERED_BYTES = 20 * 2**20
+_MAX_REMEMBERED_BYTES = 200 * 2**20  # an integrator of thirty bodies takes 9 MB
 
 
 class DamagedFile(ValueError):
@@ -161,9 +161,9 @@ def recall(key: str) -> Any:
     """
     try:
         body = _remembered().read(key)
-    except (OSError, DamagedFile):
+        return None if body is None else pickle.loads(body)
+    except Exception:  # damaged, or of another version of what made it: it is made again
         return None
-    return None if body is None else pickle.loads(body)
 
 
 def remember(key: str, value: Any) -> None:
@@ -180,4 +180,4 @@ def remember(key: str, value: Any) -> None:
 
 
 def _remembered() -> CheckedFiles:
-    return CheckedFiles(user_cache_folder() / "parsed")
+    return CheckedFiles(user_cache_folder() / "remembered")
