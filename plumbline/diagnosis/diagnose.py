@@ -15,7 +15,13 @@ from dataclasses import replace
 import numpy as np
 
 from plumbline.diagnosis.defect_model import evaluate_case, make_defect_case
-from plumbline.diagnosis.digit_loss import DigitLoss, Evaluate, find_digit_loss
+from plumbline.diagnosis.digit_loss import (
+    DigitLoss,
+    Evaluate,
+    describe_scatter,
+    find_digit_loss,
+    measure_scatter,
+)
 from plumbline.diagnosis.fit import (
     MAX_EXPLAINED_RATIO,
     MIN_CHANGE_RATIO,
@@ -27,6 +33,7 @@ from plumbline.diagnosis.fit import (
 )
 from plumbline.diagnosis.hypotheses import format_significant
 from plumbline.diagnosis.output_defects import output_defects
+from plumbline.diagnosis.result import Diagnosis
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import Array, Model, StateQuantities
 from plumbline.model.kinematics import state_from_minimal
@@ -43,8 +50,8 @@ MIN_DIAGNOSABLE_RATIO = 8.0
 
 
 def explain_disagreement(
-    engine: str, model: Model, engine_quantities: list[StateQuantities], truth: StateTruth
-) -> str:
+    engine: str, model: Model, engine_quantities: list[StateQuantities], truth: StateTruth, is_known: bool
+) -> Diagnosis:
     """Diagnose quantities that disagree with the truth; loads the engine, so call it in a worker.
 
     Args:
@@ -52,12 +59,18 @@ def explain_disagreement(
         model: the mechanism.
         engine_quantities: what the engine returned at the states of ``truth``.
         truth: true quantities and bounds.
+        is_known: whether the cause is on record as rounding: then only the scatter of the error is measured.
 
     Returns:
-        The sentence of `diagnose`.
+        The sentence of `diagnose`, or the scatter of the error.
 
     """
-    return diagnose(model, engine_quantities, truth, load_adapter(engine).evaluate)
+    evaluate = load_adapter(engine).evaluate
+    if not is_known:
+        return Diagnosis(diagnose(model, engine_quantities, truth, evaluate))
+    difference = observe_difference(model, engine_quantities, truth)
+    scatter = measure_scatter(difference.of_quantities(difference.wrong_quantities()), model, evaluate)
+    return Diagnosis("" if scatter is None else describe_scatter(scatter), scatter)
 
 
 def diagnose(

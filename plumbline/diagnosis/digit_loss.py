@@ -14,7 +14,7 @@ import numpy as np
 
 from plumbline.diagnosis.defect_model import evaluate_case, make_defect_case
 from plumbline.diagnosis.fit import Answers, ObservedDifference, max_error_ratio
-from plumbline.model.datatypes import Array, Model, State, StateQuantities
+from plumbline.model.datatypes import Array, Model, State, StateQuantities, StepRun
 from plumbline.model.equivalent import (
     first_bodies,
     rotate_body_frames,
@@ -22,7 +22,9 @@ from plumbline.model.equivalent import (
     unrotate_body_frames,
     unrotate_world,
 )
+from plumbline.model.step_methods import JointSpaceMethod
 from plumbline.truth.rounding_bound import state_rounding_bound
+from plumbline.truth.step_comparison import FormulaSteps
 
 COPIES = 8
 TURN = 1e-6  # rad
@@ -31,6 +33,20 @@ MIN_COPY_ERROR = 0.02  # of the error; an engine that keeps the call before is o
 MIN_GROWTH = 4.0  # of the error in rounding bounds, from half of the chain to the whole
 
 Evaluate = Callable[[Model, list[State]], list[StateQuantities]]
+
+
+def describe_scatter(scatter: float) -> str:
+    """Describe how an error scatters.
+
+    Args:
+        scatter: of `measure_scatter`.
+
+    Returns:
+        A sentence without subject.
+
+    """
+    verb = "loses digits: the answer scatters" if scatter >= MIN_SCATTER else "has a cause: it scatters"
+    return f"{verb} by {scatter:.2g} of its error when world and body axes are turned by {TURN:g} rad"
 
 
 @dataclass(frozen=True)
@@ -76,23 +92,82 @@ def find_digit_loss(difference: ObservedDifference, model: Model, evaluate: Eval
         The loss; None where the error has a cause, or where the engine fails on the turned problems.
 
     """
+    try:
+        scatter, here, state = _measure_scatter(difference, model, evaluate)
+        return DigitLoss(scatter, _ratios(here, model, state, evaluate)) if scatter >= MIN_SCATTER else None
+    except Exception:  # an engine may raise anything; then nothing is known about its digits
+        return None
+
+
+def measure_scatter(difference: ObservedDifference, model: Model, evaluate: Evaluate) -> float | None:
+    """Measure how the error at the worst state scatters when all axes are turned by a tiny angle.
+
+    Args:
+        difference: an engine's error.
+        model: the mechanism.
+        evaluate: evaluates the engine.
+
+    Returns:
+        The median distance of the errors from their mean, over their size; None where the engine fails.
+
+    """
+    try:
+        return _measure_scatter(difference, model, evaluate)[0]
+    except Exception:  # as above
+        return None
+
+
+def measure_step_scatter(
+    model: Model, state: State, h: float, method: JointSpaceMethod, step: Callable[[Model, State], StepRun]
+) -> float | None:
+    """Measure how the error of a step scatters when all axes are turned by a tiny angle.
+
+    Args:
+        model: the mechanism.
+        state: where the step starts.
+        h: step [s].
+        method: the declared formula.
+        step: takes one step of the engine.
+
+    Returns:
+        As `measure_scatter`.
+
+    """
+    rng = np.random.default_rng(0)
+    problems = [(model, state)]
+    problems += [
+        rotate_body_frames(*rotate_world(model, state, _tiny_rotation(rng)), _tiny_rotation(rng))
+        for _ in range(COPIES)
+    ]
+    try:
+        # turning an error back would change it by the angle only
+        errors = []
+        for turned, turned_state in problems:
+            run = step(turned, turned_state)
+            formula = FormulaSteps(method, turned, [turned_state], [(0, h, run.angle_axes)])
+            errors.append(formula.residuals(method, [run]))
+        return _scatter(np.array(errors[1:]), errors[0])
+    except Exception:  # as above
+        return None
+
+
+def _measure_scatter(
+    difference: ObservedDifference, model: Model, evaluate: Evaluate
+) -> tuple[float, ObservedDifference, State]:
+    """The scatter at the worst state, the difference there, and the state."""
     each = [difference.at_state(i) for i in range(len(difference.case.p))]
     worst = int(np.argmax([here.error_ratio(here.expected) for here in each]))
     here, (_, state) = each[worst], difference.case.model_and_state(worst)
     rng = np.random.default_rng(0)
     errors = []
-    try:
-        evaluate(model, [state])  # an engine that keeps something of the call before keeps it of this problem
-        for _ in range(COPIES):
-            world, body = (_tiny_rotation(rng) for _ in range(2))
-            turned, turned_state = rotate_body_frames(*rotate_world(model, state, world), body)
-            (answer,) = evaluate(turned, [turned_state])
-            values = unrotate_body_frames(unrotate_world(_values(answer, here), world), body)
-            errors.append(here.weighted_vector({name: x - here.expected[name] for name, x in values.items()}))
-        scatter = _scatter(np.array(errors), here.residual(here.expected))
-        return DigitLoss(scatter, _ratios(here, model, state, evaluate)) if scatter >= MIN_SCATTER else None
-    except Exception:  # an engine may raise anything; then nothing is known about its digits
-        return None
+    evaluate(model, [state])  # an engine that keeps something of the call before keeps it of this problem
+    for _ in range(COPIES):
+        world, body = (_tiny_rotation(rng) for _ in range(2))
+        turned, turned_state = rotate_body_frames(*rotate_world(model, state, world), body)
+        (answer,) = evaluate(turned, [turned_state])
+        values = unrotate_body_frames(unrotate_world(_values(answer, here), world), body)
+        errors.append(here.weighted_vector({name: x - here.expected[name] for name, x in values.items()}))
+    return _scatter(np.array(errors), here.residual(here.expected)), here, state
 
 
 def _tiny_rotation(rng: np.random.Generator) -> Array:

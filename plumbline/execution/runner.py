@@ -23,6 +23,7 @@ from plumbline.execution.scenario_run import ScenarioRun, has_steps
 from plumbline.judging import known_issues
 from plumbline.judging.identity import RUN_SCENARIO, IdentityCheck
 from plumbline.judging.rows import RUN_FAMILY, Row, Verdict
+from plumbline.model.invariants import inertia_ratio
 from plumbline.processes.cpu_time import CpuTimes
 from plumbline.processes.workers import (
     Executor,
@@ -232,7 +233,8 @@ class _Run:
     def _finish(self, scenario_run: ScenarioRun) -> None:
         """Keep the rows and tables of a scenario whose tasks have all finished."""
         found, name = scenario_run.findings(), scenario_run.scenario.name
-        rows = self.known.mark_known(found.rows, scenario_run.scenario.model.n)
+        model = scenario_run.scenario.model
+        rows = self.known.mark_known(found.rows, model.n, inertia_ratio(model))
         self.truth_methods.update(scenario_run.truth_methods())
         if fingerprints := scenario_run.fingerprints():
             self.identity.add_scenario(fingerprints)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from plumbline.diagnosis.result import Diagnosis
 from plumbline.engines import calls, environments
 from plumbline.engines.adapter import EngineInfo
 from plumbline.execution.plan import (
@@ -33,7 +34,8 @@ from plumbline.judging.step import (
     run_step_study,
 )
 from plumbline.judging.trajectory import judge_trajectory
-from plumbline.model.datatypes import Integrator, StateQuantities
+from plumbline.model.datatypes import Integrator
+from plumbline.model.invariants import inertia_ratio
 from plumbline.model.sampling import compared_states
 from plumbline.processes.workers import Outcome, Pickled, Task
 from plumbline.scenario.loader import Scenario
@@ -102,7 +104,7 @@ class ScenarioRun:
         """
         self.scenario = scenario
         self.truths: dict[TaskKind, StateTruth | MotionTruth | TruthFailure] = {}
-        self._plan, self._engines, self._known = plan, engines, known
+        self._plan, self._engines, self._known, self._is_random = plan, engines, known, is_random
         levels = level or (plan.random_level if is_random else plan.level)
         has_long_runs = plan.long_run_seconds > 0 and not is_random
         self._keys = list(task_keys(scenario.name, engines, levels, has_long_runs, has_steps(scenario)))
@@ -200,8 +202,8 @@ class ScenarioRun:
             following = [self._cell_task(k) for k in self._keys if k.needed_truth == key.kind]
         else:
             found = self._findings[key] = self._judged(outcome)
-            if key.kind == TaskKind.STATE and self._has_unexplained_rows(found):
-                following = [self._diagnosis_task(key.engine, outcome.value.quantities)]
+            if key.kind in (TaskKind.STATE, TaskKind.STEP):
+                following = self._diagnosis_tasks(outcome, found)
         self._pending |= {task.key for task in following}
         return following
 
@@ -351,22 +353,43 @@ class ScenarioRun:
             found.rows = [replace(row, user_rtol=self._plan.user_rtol) for row in found.rows]
         return found
 
-    def _has_unexplained_rows(self, found: JudgingResult) -> bool:
-        """Whether a row disagrees whose cause is not on record: an entry's mechanism is its explanation."""
+    def _diagnosis_tasks(self, answer: Outcome, found: JudgingResult) -> list[Task]:
+        """The task that searches the cause of a cell's disagreement, or measures how the error scatters.
+
+        A cause that is on record is not searched again. In random scenarios, most of which have no relations,
+        the scatter is measured instead, by which the recorded mechanism is checked.
+        """
         disputed = [row for row in found.rows if row.verdict == Verdict.DISAGREES]
-        marked = self._known.mark_known(disputed, self.scenario.model.n) if self._known else disputed
-        return any(row.known_issue is None for row in marked)
+        model, marked = self.scenario.model, disputed
+        if self._known and disputed:
+            marked = self._known.mark_known(disputed, model.n, inertia_ratio(model))
+        is_known = all(row.known_issue is not None for row in marked)
+        key: TaskKey = answer.key
+        if not disputed or (is_known and not self._is_random):
+            return []
+        from plumbline.diagnosis.diagnose import explain_disagreement  # few runs need them
+        from plumbline.diagnosis.integrator_search import explain_disagreeing_steps
 
-    def _diagnosis_task(self, engine: str, quantities: list[StateQuantities]) -> Task:
-        """The task that searches the wrong term of an engine that disagrees at state level."""
-        from plumbline.diagnosis.diagnose import explain_disagreement  # few runs need it
-
-        (base, _), info = environments.split_version(engine), self._engines[engine]
-        key = TaskKey(TaskKind.DIAGNOSIS, self.scenario.name, engine)
-        arguments = (base, self.scenario.model, quantities, self._pickled_truths[TaskKind.STATE_TRUTH])
-        return Task(key, explain_disagreement, arguments, self._plan.limits, info.version, info.python)
+        (base, _), info = environments.split_version(key.engine), self._engines[key.engine]
+        subject = TaskKey(TaskKind.DIAGNOSIS, self.scenario.name, key.engine, key.integrator)
+        call: Callable[..., Diagnosis] = explain_disagreement
+        arguments: tuple[Any, ...] = ()
+        if key.kind == TaskKind.STATE:
+            truth = self._pickled_truths[TaskKind.STATE_TRUTH]
+            arguments = (base, model, answer.value.quantities, truth, is_known)
+        else:
+            call = explain_disagreeing_steps
+            arguments = (base, key.integrator, model, self._step_states, answer.value, is_known)
+        return [Task(subject, call, arguments, self._plan.limits, info.version, info.python)]
 
     def _add_diagnosis(self, outcome: Outcome) -> None:
-        text = outcome.value or f"no diagnosis: {outcome.failure}"
-        cell = self._findings[replace(outcome.key, kind=TaskKind.STATE)]
-        cell.rows = [replace(r, diagnosis=text) if r.verdict == Verdict.DISAGREES else r for r in cell.rows]
+        diagnosis: Diagnosis = outcome.value or Diagnosis(f"no diagnosis: {outcome.failure}")
+        kind = TaskKind.STEP if outcome.key.integrator else TaskKind.STATE
+        cell = self._findings[replace(outcome.key, kind=kind)]
+        extra = {} if diagnosis.scatter is None else {"scatter": diagnosis.scatter}
+        cell.rows = [
+            replace(row, diagnosis=diagnosis.text or None, extra=row.extra | extra)
+            if row.verdict == Verdict.DISAGREES
+            else row
+            for row in cell.rows
+        ]

@@ -19,7 +19,7 @@ import numpy as np
 
 from plumbline.judging.rows import Level, Row, Verdict
 from plumbline.judging.state import STATE_UNITS
-from plumbline.judging.step import MAX_STEP_BODIES, STEP_STATES, FormulaSteps, step_sizes
+from plumbline.judging.step import MAX_STEP_BODIES, STEP_STATES, step_sizes
 from plumbline.model.datatypes import Array, Model, State, Trajectory
 from plumbline.model.invariants import INVARIANT_UNITS, attitude_error, compute_invariants, position_error
 from plumbline.model.kinematics import angular_velocity
@@ -34,6 +34,7 @@ from plumbline.truth.parameter_effects import (
 from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters
 from plumbline.truth.rounding_bound import EPS, state_rounding_bound
 from plumbline.truth.sensitivity import project_to_manifold
+from plumbline.truth.step_comparison import FormulaSteps
 
 COVERED_LEVELS: tuple[Level, ...] = ("state", "step", "trajectory", "invariants")
 MAX_MISTAKE = 0.1  # of a parameter's scale: only larger ones are reported, or none; the level does not see it

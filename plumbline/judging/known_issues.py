@@ -40,7 +40,6 @@ from plumbline.judging.rows import Level, Row, Verdict
 from plumbline.judging.run_relations import REVERSED_IN_TIME
 from plumbline.judging.state import STATE_UNITS
 from plumbline.judging.state_relations import STATE_RELATIONS, WELDED_HALVES
-from plumbline.judging.step import CONSTRAINED_UNITS, STEP_UNITS
 from plumbline.model.invariants import INVARIANT_UNITS
 from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean, shorten
 from plumbline.scenario.generator import MOTION_PREFIX, RANDOM_FAMILY
@@ -48,6 +47,7 @@ from plumbline.scenario.loader import catalogue
 from plumbline.scenario.schema import invalid_value_error
 from plumbline.scenario.validation_messages import problems_from_validation
 from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path, read_yaml
+from plumbline.truth.step_comparison import CONSTRAINED_UNITS, STEP_UNITS
 
 RowKind = tuple[str, str, str, str, str]  # of a row: engine, its version, level, integrator, quantity
 KNOWN_ISSUES_FILE = Path(__file__).with_name("known_issues.yaml")
@@ -57,6 +57,7 @@ ANY_LENGTH = 10**9  # bodies
 # Relations that give the same problem to the same algorithm in other numbers: only rounding tells them apart.
 SCATTER_RELATIONS = ("rotated world", "re-chosen body frame")
 MIN_SCATTER = 0.05  # of the error's ratio: the least scatter that shows rounding; measured 0.12 … 0.6
+MIN_OWN_SCATTER = 0.3  # the same of the row's own error in a random scenario; measured 0.6 … 1.4
 Mechanism = Literal["rounding", "equations", "method"]
 MECHANISMS: dict[Mechanism, str] = {
     "rounding": "the result loses digits: results for equivalent descriptions of the problem scatter as much",
@@ -82,6 +83,7 @@ class KnownIssue:
     max_ratio: Mapping[int, float] = field(
         default_factory=dict
     )  # by the number of bodies up to which it holds
+    max_ratio_by_inertia: float | None = None  # the same, over `plumbline.model.invariants.inertia_ratio`
     mechanism: Mechanism | None = None
     shown_by: str = ""  # the engine whose rows show the mechanism; empty: the row's own
     intermittent: str = ""  # why the verdict may or may not occur; empty: it must
@@ -116,36 +118,55 @@ class KnownIssue:
         except InvalidVersion:
             return False
 
-    def covered_ratio(self, bodies: int) -> float:
+    def covered_ratio(self, bodies: int, inertia_ratio: float) -> float:
         """Return the largest ratio of error and tolerance that the entry covers.
 
         Args:
             bodies: length of the chain.
+            inertia_ratio: its `plumbline.model.invariants.inertia_ratio`.
 
         Returns:
             The ratio; 0 for a longer chain than any of the entry, infinity where the entry states none.
 
         """
+        if self.max_ratio_by_inertia is not None:
+            return self.max_ratio_by_inertia * inertia_ratio
         fitting = [limit for limit in self.max_ratio if bodies <= limit]
         return self.max_ratio[min(fitting)] if fitting else 0.0 if self.max_ratio else math.inf
 
-    def objection(self, row: Row, bodies: int, scatter: Mapping[str, float]) -> str:
+    def scatter_of(self, row: Row, scatter: Mapping[str, float]) -> float | None:
+        """Return how far results for equivalent descriptions of a row's problem differ.
+
+        Args:
+            row: a row of the expected verdict.
+            scatter: of `objection`.
+
+        Returns:
+            In tolerances: the row's own, or that of the engine which shows the mechanism; None: not measured.
+
+        """
+        own = None if self.shown_by else _scatter_of(row)
+        return scatter.get(self.shown_by or row.engine.partition("@")[0]) if own is None else own
+
+    def objection(self, row: Row, covered: float, scatter: Mapping[str, float]) -> str:
         """Find out whether a row of the expected verdict exceeds what the entry describes.
 
         Args:
             row: a row that the entry's patterns and verdict match.
-            bodies: length of the scenario's chain.
-            scatter: by engine the largest ratio of its `SCATTER_RELATIONS` in this scenario and version.
+            covered: the entry's `covered_ratio` for the scenario.
+            scatter: by engine how far its results for equivalent descriptions of the problem differ, in
+                tolerances, in this scenario and version.
 
         Returns:
             Why the entry does not cover the row; empty where it does.
 
         """
-        ratio, covered = math.inf if row.ratio is None else row.ratio, self.covered_ratio(bodies)
-        if self.max_ratio and not ratio <= covered:
+        ratio = math.inf if row.ratio is None else row.ratio
+        if not ratio <= covered and covered < math.inf:
             return f"the entry {self.id} covers {covered:g} times the tolerance at most"
-        shown = scatter.get(self.shown_by or row.engine.partition("@")[0])
-        if self.mechanism == "rounding" and shown is not None and shown < MIN_SCATTER * ratio:
+        shown = self.scatter_of(row, scatter)
+        least = MIN_OWN_SCATTER if "scatter" in row.extra else MIN_SCATTER
+        if self.mechanism == "rounding" and shown is not None and shown < least * ratio:
             return (
                 f"the entry {self.id} records rounding, but equivalent descriptions of the problem differ by "
                 f"only {shown:.2g} times their tolerance"
@@ -156,6 +177,15 @@ class KnownIssue:
                 f"differ by {shown:.2g} times their tolerance"
             )
         return ""
+
+
+def _scatter_of(row: Row) -> float | None:
+    """How far results for equivalent descriptions differ, in the row's tolerance; None: it does not tell."""
+    if row.ratio is None:
+        return None
+    if row.level == "relations" and row.quantity in SCATTER_RELATIONS:
+        return row.ratio
+    return row.ratio * row.extra["scatter"] if "scatter" in row.extra else None
 
 
 def _as_list(value: Any) -> Any:
@@ -189,6 +219,9 @@ class _Entry(BaseModel):
     max_ratio: Annotated[dict[PositiveInt, PositiveFloat], BeforeValidator(_as_ratios)] = _field(
         "The largest ratio of error and tolerance, or a mapping from numbers of bodies to it.", {}
     )
+    max_ratio_by_inertia: PositiveFloat | None = _field(
+        "The largest ratio of error and tolerance, over the chain's largest ratio of inertias.", None
+    )
     mechanism: Mechanism | None = _field("The mechanism of a disagreement.", None)
     shown_by: str = _field("The engine whose rows show the mechanism.", "")
     intermittent: str = _field("Why the verdict may or may not occur.", "")
@@ -216,7 +249,8 @@ class _Entry(BaseModel):
 
     @model_validator(mode="after")
     def _check_disagreement(self) -> _Entry:
-        missing = [name for name in ("max_ratio", "mechanism") if not getattr(self, name)]
+        missing = [] if self.max_ratio or self.max_ratio_by_inertia else ["max_ratio"]
+        missing += [] if self.mechanism else ["mechanism"]
         if self.verdict == "disagrees" and missing:
             raise invalid_value_error(
                 f"expects a disagreement without {' and '.join(missing)}",
@@ -373,7 +407,7 @@ class KnownIssues:
             self._by_kind[kind] = [e for e in self.issues if e.matches_kind(kind)]
         return [e for e in self._by_kind[kind] if fnmatchcase(row.scenario, e.scenario)]
 
-    def mark_known(self, rows: Sequence[Row], bodies: int) -> list[Row]:
+    def mark_known(self, rows: Sequence[Row], bodies: int, inertia_ratio: float = 1.0) -> list[Row]:
         """Mark the rows whose verdict an entry expects.
 
         A row that is larger than its entry covers, or whose mechanism is another one, stays unmarked; its
@@ -382,6 +416,7 @@ class KnownIssues:
         Args:
             rows: all judged rows of one scenario.
             bodies: length of its chain.
+            inertia_ratio: its `plumbline.model.invariants.inertia_ratio`.
 
         Returns:
             The rows in the same order, with the entry's id as ``known_issue``; the entry's mechanism is their
@@ -390,22 +425,27 @@ class KnownIssues:
         """
         scatter: dict[str, dict[str, float]] = {}  # by version of the engine, then by engine
         for row in rows:
-            if row.level == "relations" and row.quantity in SCATTER_RELATIONS and row.ratio is not None:
+            if row.ratio is not None and (found := _scatter_of(row)) is not None:
                 of = scatter.setdefault(row.engine_version, {})
                 engine = row.engine.partition("@")[0]
-                of[engine] = max(row.ratio, of.get(engine, 0.0))
-        return [self._mark(row, bodies, scatter.get(row.engine_version, {})) for row in rows]
+                of[engine] = max(found, of.get(engine, 0.0))
+        chain = bodies, inertia_ratio
+        return [self._mark(row, chain, scatter.get(row.engine_version, {})) for row in rows]
 
-    def _mark(self, row: Row, bodies: int, scatter: Mapping[str, float]) -> Row:
+    def _mark(self, row: Row, chain: tuple[int, float], scatter: Mapping[str, float]) -> Row:
         entries = self.issues_for(row)
         self.matched_ids.update(e.id for e in entries)
         expecting = [e for e in entries if e.verdict == row.verdict]
         self.used_ids.update(e.id for e in expecting[:1])
-        objections = [e.objection(row, bodies, scatter) for e in expecting]
+        objections = [e.objection(row, e.covered_ratio(*chain), scatter) for e in expecting]
         if "" in objections:
             match = expecting[objections.index("")]
             self.used_ids.add(match.id)
-            return replace(row, known_issue=match.id, diagnosis=row.diagnosis or match.diagnosis)
+            diagnosis = row.diagnosis or match.diagnosis
+            shown = match.scatter_of(row, scatter)
+            if match.mechanism == "rounding" and not row.diagnosis and shown is not None:
+                diagnosis = f"{diagnosis} Checked: they differ by {shown:.2g} tolerances."
+            return replace(row, known_issue=match.id, diagnosis=diagnosis)
         return replace(row, reason=f"{row.reason}; {objections[0]}") if objections else row
 
     def stale_issues(self, *, is_full_matrix: bool) -> list[KnownIssue]:

@@ -231,3 +231,20 @@ def invariant_scales(model: Model, run: Trajectory, length: float) -> dict[str, 
         "gap_rate": max(speed, spin * length),
         "norm_drift": 1.0,
     }
+
+
+def inertia_ratio(model: Model) -> float:
+    """Return how strongly inertias differ along a chain, which algorithms that pass them inward feel.
+
+    Args:
+        model: the mechanism.
+
+    Returns:
+        The largest, over the bodies, of (M |c − s|² + J_max) / J_min: M the mass of the bodies beyond, c − s
+        the arm from its proximal to its distal point, J_max and J_min its extreme principal inertias.
+
+    """
+    beyond = np.cumsum(model.mass[::-1])[::-1] - model.mass
+    arm = np.linalg.norm(model.distal - model.proximal, axis=1)
+    principal = np.linalg.eigvalsh(model.inertia)
+    return float(np.max((beyond * arm**2 + principal[:, -1]) / principal[:, 0]))

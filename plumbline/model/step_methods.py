@@ -16,14 +16,18 @@ class JointSpaceMethod:
     With v̇ = a(q, v), and ⊕ for a joint-wise displacement:
 
         semi-implicit Euler   v₁ = v + h (M + h D)⁻¹ M a,   q₁ = q ⊕ h v₁,   D = −∂(M a)/∂v of some forces
+        positions first       q₁ = q ⊕ h v,   v₁ = v + h a(q₁, v)
+        velocity Verlet       q₁ = q ⊕ (h v + ½ h² a),   v₁ = v + ½ h (a + a(q₁, v + ½ h a))
         Runge-Kutta           θ̇ = dexp⁻¹(θ) v,   v̇ = a(q ⊕ θ, v),   from θ = 0;   q₁ = q ⊕ θ₁
 
     Coordinates "joint rotations": each ball joint and each rod's upper end has a relative quaternion, and as
     its velocity the relative angular velocity in the child's frame; q ⊕ t = q exp(t). "joint angles":
     revolute joints; q ⊕ t = q + t and dexp⁻¹ is the identity.
+
+    The fields from ``new_velocity_share`` on are for formulas that an engine may take in place of its own.
     """
 
-    formula: Literal["semi-implicit Euler", "Runge-Kutta"]
+    formula: Literal["semi-implicit Euler", "positions first", "velocity Verlet", "Runge-Kutta"]
     coordinates: Literal["joint rotations", "joint angles"]
     # A rod's inertia about its own axis over the trace of the inertia that it carries. It changes no motion,
     # but a step: relative rates on a rod give it an axial spin of O(h²).
@@ -31,6 +35,14 @@ class JointSpaceMethod:
     implicit_forces: Literal["none", "applied", "all"] = "none"  # forces in D: drag; drag and Coriolis terms
     stages: tuple[tuple[float, ...], ...] = ()  # the tableau's rows below the diagonal
     weights: tuple[float, ...] = ()
+    new_velocity_share: float = 1.0  # x in q₁ = q ⊕ h (x v₁ + (1−x) v): 0 is explicit Euler
+    stale_joint: int | None = None  # a joint whose position is moved by the old velocity
+    is_rotation_exact: bool = True  # else quaternions are moved by p + h ṗ and normalised
+    damping_factor: float = 1.0  # on D
+    is_damping_symmetric: bool = False  # (D + Dᵀ)/2 in place of D
+    correction_terms: int | None = None  # of dexp⁻¹ after v; None: all
+    step_factor: float = 1.0  # on h
+    substeps: int = 1  # so many steps of h / substeps each
 
 
 @dataclass(frozen=True)
@@ -94,3 +106,27 @@ def generalized_alpha(spectral_radius: float, *, solver_atol: float, solver_rtol
     gamma = 0.5 + alpha_f - alpha_m
     beta = 0.25 * (gamma + 0.5) ** 2
     return ConstrainedMethod(alpha_m, alpha_f, beta, gamma, "position", solver_atol, solver_rtol)
+
+
+def describe_method(method: JointSpaceMethod) -> str:
+    """Write the declared formula as one line of text.
+
+    Args:
+        method: of an integrator.
+
+    Returns:
+        The formula with its symbols explained, without its coordinates' definition.
+
+    """
+    if method.formula == "semi-implicit Euler":
+        forces = {"applied": "the applied forces", "all": "all forces, Coriolis terms included"}
+        of = forces.get(method.implicit_forces)
+        if of is None:
+            return "v1 = v + h a(q, v); q1 = q exp(h v1), joint by joint"
+        return f"v1 = v + h inv(M + h D) M a, D = -d(f)/dv of {of}; q1 = q exp(h v1), joint by joint"
+    if method.formula != "Runge-Kutta":
+        return method.formula
+    rows = "; ".join(", ".join(f"{x:.6g}" for x in row) for row in method.stages[1:])
+    weights = ", ".join(f"{x:.6g}" for x in method.weights)
+    slope = "theta' = inv(dexp(theta)) v" if method.coordinates == "joint rotations" else "theta' = v"
+    return f"Runge-Kutta on {slope}, v' = a(q + theta, v), with stages ({rows}) and weights ({weights})"

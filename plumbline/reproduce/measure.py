@@ -30,6 +30,7 @@ from plumbline.judging.state_relations import (
 )
 from plumbline.judging.trajectory import trajectory_rows
 from plumbline.model.datatypes import Array, Integrator, StateQuantities
+from plumbline.model.step_methods import JointSpaceMethod, describe_method
 from plumbline.model.welding import split_bodies
 from plumbline.reproduce.engine_client import EngineClient
 from plumbline.reproduce.shrink import ReproductionCase, smallest_case
@@ -37,6 +38,7 @@ from plumbline.truth import TruthUnavailable
 from plumbline.truth.certified import certify_state
 from plumbline.truth.ground_truth import MotionTruth, motion_truth
 from plumbline.truth.rounding_bound import state_rounding_bound
+from plumbline.truth.step_comparison import FormulaSteps
 
 LIMITS = ("position_limit", "position", "attitude_limit", "attitude")
 WORK_SAMPLES = 64  # of a run where the work of moments and drag is integrated
@@ -84,7 +86,21 @@ class MotionEvidence:
     eliminated: dict[str, int]  # how many powers of the step Romberg's scheme eliminates, per quantity
 
 
-Evidence = StateEvidence | RelationEvidence | MotionEvidence
+@dataclass(frozen=True, eq=False)
+class StepEvidence:
+    """A few steps that are not those of the declared formula."""
+
+    case: ReproductionCase
+    ratio: float
+    times: Array  # (2,) s, start and end
+    count: int  # of steps
+    integrator: Integrator
+    formula: str  # in words
+    expected: dict[str, Array]  # at the end
+    bound: dict[str, Array]  # (N,)
+
+
+Evidence = StateEvidence | RelationEvidence | MotionEvidence | StepEvidence
 
 
 @dataclass(frozen=True)
@@ -117,6 +133,8 @@ class Disagreement:
             return StateMeasure(self.engine, self.quantities)
         if self.level == "relations":
             return RelationMeasure(self.engine, self.quantities[0])
+        if self.level == "step":
+            return StepMeasure(self.engine, self.integrator)
         return ConvergenceMeasure(self.engine, self.integrator, self.level, self.quantities)
 
     def shrink(self) -> Evidence | None:
@@ -135,7 +153,13 @@ class Disagreement:
             ratio = evidence.ratio if evidence else 0.0
         # the CPU time of another environment's process is not counted in this process
         clock = time.monotonic if self.engine.python else time.process_time
-        found = smallest_case(self.case, self._measure, ratio, self.seconds, clock)
+        cases = [self.case]
+        if self.level == "step":  # one step shows most
+            cases.insert(0, replace(self.case, until=self.case.steps[0]))
+        for case in cases:
+            found = smallest_case(case, self._measure, ratio, self.seconds, clock)
+            if found is not None:
+                break
         return cast("Evidence | None", found)
 
 
@@ -247,6 +271,40 @@ def inverse_transforms(relation: Relation, answers: StateQuantities) -> dict[str
             raise NotImplementedError(f"relation {relation.name!r} does not act on each body by a matrix")
         found[q] = way
     return found
+
+
+@dataclass(frozen=True)
+class StepMeasure:
+    """Difference of an engine's steps from the declared formula, over the bounds of rounding."""
+
+    engine: EngineClient
+    method: str  # name of the integrator
+
+    def __call__(self, case: ReproductionCase) -> StepEvidence | None:
+        """Measure a case; None where the engine refuses it or the formula goes through a singularity."""
+        (h,), model, state = case.steps, case.model, case.state
+        count = round(case.until / h)
+        if abs(case.until / h - count) > 1e-9:
+            return None
+        try:
+            integrator = self.engine.integrator(self.method)
+            answer = self.engine.call(calls.run_steps, self.method, model, [state], [[h]], [count])
+            method, run = integrator.method, answer.attempts[0].run
+            if not isinstance(method, JointSpaceMethod) or run is None:
+                return None
+            steps = FormulaSteps(method, model, [state], [(0, h, run.angle_axes)], [count])
+            ((_, _, limits, _),) = steps.limits()
+            ratio = max(max(c.ratios) for c in steps.compare([run]).values())
+        except Exception:
+            return None
+        true = steps.true[0][count]
+        names = {"step_position": "r", "step_attitude": "p", "step_velocity": "v", "step_rate": "omega"}
+        return StepEvidence(
+            case, ratio, np.array([0.0, case.until]), count, integrator, describe_method(method),
+            {quantity: np.asarray(getattr(true, name), float) for quantity, name in names.items()},
+            # attitudes are compared as quaternions
+            {quantity: limits[quantity] / (2 if name == "p" else 1) for quantity, name in names.items()},
+        )  # fmt: skip
 
 
 @dataclass

@@ -31,8 +31,15 @@ from plumbline.model.kinematics import (
     velocity_jacobian,
 )
 from plumbline.model.welding import split_bodies
-from plumbline.reproduce.measure import Evidence, MotionEvidence, RelationEvidence, StateEvidence
+from plumbline.reproduce.measure import (
+    Evidence,
+    MotionEvidence,
+    RelationEvidence,
+    StateEvidence,
+    StepEvidence,
+)
 from plumbline.reproduce.shrink import ReproductionCase
+from plumbline.truth.step_comparison import CONSTRAINED_UNITS
 
 TEMPLATES = Path(__file__).parent / "templates"
 LONG_RUN_SUFFIXES = ("_long", "_long_growth")  # of the quantities that long runs judge
@@ -77,7 +84,7 @@ def render_script(row: dict[str, Any], evidence: Evidence) -> str:
         The script's text.
 
     """
-    engine, kind = split_version(row["engine"])[0], _KINDS[type(evidence)]
+    engine, shows = split_version(row["engine"])[0], _KINDS[type(evidence)]
     try:
         version = Version(str(row["engine_version"]))
     except InvalidVersion:
@@ -91,7 +98,8 @@ def render_script(row: dict[str, Any], evidence: Evidence) -> str:
     context = {
         "row": row,
         "evidence": evidence,
-        "kind": kind,
+        "kind": "motion" if shows == "step" else shows,  # how the engine is called
+        "shows": shows,  # the template of what is compared
         "engine": engine,
         "way": way,
         "again": False,
@@ -127,8 +135,8 @@ def no_script_reason(engine: str, row: dict[str, Any]) -> str:
     """
     if not declared_attribute(engine, "reproduction_template"):
         return f"engine {engine} has no template of scripts"
-    if row["level"] == "step":
-        return "rows of single steps have no script"
+    if row["level"] == "step" and row["quantity"] in CONSTRAINED_UNITS:
+        return "rows of single steps with constraints have no script"
     relation = row["quantity"]
     if relation.endswith(LONG_RUN_SUFFIXES):
         return "rows of long runs have no script"
@@ -143,7 +151,12 @@ def no_script_reason(engine: str, row: dict[str, Any]) -> str:
     return "" if is_known else f"scripts of {engine} cannot show {relation!r}"
 
 
-_KINDS: dict[type, str] = {StateEvidence: "state", RelationEvidence: "relation", MotionEvidence: "motion"}
+_KINDS: dict[type, str] = {
+    StateEvidence: "state",
+    RelationEvidence: "relation",
+    MotionEvidence: "motion",
+    StepEvidence: "step",
+}
 
 
 def _template(engine: str) -> Template:

@@ -6,7 +6,7 @@ import hashlib
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from plumbline.judging.convergence import STEP_EXPONENTS
 from plumbline.judging.rows import Verdict
 from plumbline.model.datatypes import BadInput, Model, State
 from plumbline.model.kinematics import state_from_minimal
-from plumbline.model.sampling import derive_seed, random_states
+from plumbline.model.sampling import compared_states
 from plumbline.processes.errors import PlumblineError
 from plumbline.processes.workers import Limits, Task, WorkerPool
 from plumbline.reproduce.engine_client import EngineClient
@@ -173,7 +173,8 @@ def find_disagreement(document: dict[str, Any], rows: list[StoredRow], seconds: 
         NotReproducible: there is no script for such rows, or the results do not hold what is needed.
 
     """
-    row, ratio = rows[0], max(_ratio(row) for row in rows)
+    row = max(rows, key=_ratio) if rows[0]["level"] == "step" else rows[0]
+    ratio = max(_ratio(row) for row in rows)
     base, version = environments.split_version(row["engine"])
     if reason := no_script_reason(base, row):
         raise NotReproducible(reason)
@@ -191,8 +192,10 @@ def find_disagreement(document: dict[str, Any], rows: list[StoredRow], seconds: 
         case = _refinement_study(document, rows, model, state)
     else:
         index = int(row["extra"]["state"])
-        states = random_states(model, index, derive_seed("states", scenario["digest"])) if index else [state]
-        case = ReproductionCase(model, states[-1])
+        case = ReproductionCase(model, compared_states(model, state, scenario["digest"], index)[-1])
+        if row["level"] == "step":
+            h = float(row["extra"]["step"])
+            case = replace(case, until=h * row["extra"]["steps"], steps=(h,))
     quantities = tuple(row["quantity"] for row in rows)
     return Disagreement(engine, row["level"], quantities, row["integrator"], case, ratio, seconds)
 

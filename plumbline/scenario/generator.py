@@ -1,12 +1,14 @@
 """Random scenarios: any mix of joints, full inertias, masses over decades, slow to fast, loads and drag.
 
 Scenario k of a seed depends on the seed and k alone, so one of ten thousand can be made without the others.
-Each is the content of a scenario file and passes the checks of one.
+Each is the content of a scenario file and passes the checks of one.  Two of five have special values in
+place of generic ones: rare branches of an engine are taken at exact zeros, identities and equalities.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, overload
 
 import numpy as np
@@ -20,6 +22,8 @@ MASS_DECADES = 3.0  # masses in a wild scenario reach from 1e-3 to 1e3 kg; in a 
 MAX_MOTION_BODIES = 3
 MOTION_MOMENT = 0.02  # moments of loads and drag in a random motion, over those of other random scenarios
 MOTION_PREFIX = "random-motion-"
+SPECIAL_INDICES = (0, 2)  # modulo 5: of scenarios with special values
+SPECIAL_CHANCE = 0.4  # of each kind of special value in such a scenario
 MOTION_SAMPLE = 2.0**-5  # s, the coarsest step of an order-4 method; the work of loads is a quadrature
 RANDOM_PURPOSE = (
     "Nobody chose it, so nobody's blind spot shaped it: generic geometry, full inertia, rates and loads "
@@ -118,6 +122,7 @@ def random_motion(seed: int, index: int) -> Scenario:
         "gravity": (gravity / np.linalg.norm(direction) * direction).tolist(),
         "bodies": bodies,
     }
+    _specialize(content, "random motion", seed, index, MOTION_MOMENT)
     return scenario_from_dict(content, f"{content['name']}.yaml")
 
 
@@ -139,7 +144,7 @@ def random_document(seed: int, index: int) -> dict[str, Any]:
     rate = 10 ** rng.uniform(-1.0, 1.0)  # rad/s
     loaded, dragged = rng.random(2) < 0.3
     size = "1 body" if n == 1 else f"{n} bodies"
-    return {
+    content = {
         "schema_version": 1,
         "name": f"random-{seed}-{index}",
         "family": RANDOM_FAMILY,
@@ -150,6 +155,8 @@ def random_document(seed: int, index: int) -> dict[str, Any]:
             _random_body(rng, decades, rate, bool(loaded), bool(dragged), i == n - 1) for i in range(n)
         ],
     }
+    _specialize(content, "random scenario", seed, index, 1.0)
+    return content
 
 
 def _random_body(
@@ -186,3 +193,94 @@ def _random_body(
     if has_drag:
         found["drag"] = {"force": mass * rng.uniform(0.0, 1.0), "moment": mass * rng.uniform(0.0, 0.1)}
     return found
+
+
+# --- special values -------------------------------------------------------------------------------
+
+
+def _specialize(content: dict[str, Any], kind: str, seed: int, index: int, moment: float) -> None:
+    """Give a scenario special values, where its turn has come; ``moment`` is a factor on moments of loads.
+
+    They come from random numbers of their own: all other scenarios are what they would be without.
+    """
+    if index % 5 not in SPECIAL_INDICES:
+        return
+    rng = np.random.default_rng(derive_seed(f"special values of a {kind}", str(seed), str(index)))
+    changes: dict[str, Callable[[np.random.Generator, dict[str, Any]], None]] = {
+        "an attitude": _set_attitude,
+        "zeros": _set_zeros,
+        "an inertia": _set_inertia,
+        "loads": partial(_set_loads, moment=moment),
+    }
+    made = [what for what in changes if rng.random() < SPECIAL_CHANCE] or [str(rng.choice(list(changes)))]
+    for what in made:
+        some = rng.random(len(content["bodies"])) < 0.6
+        for body, is_changed in zip(content["bodies"], some, strict=True):
+            if is_changed or len(some) == 1:
+                changes[what](rng, body)
+    if rng.random() < SPECIAL_CHANCE / 2:
+        made.append("equal masses")
+        for body in content["bodies"]:
+            _scale_mass(body, content["bodies"][0]["mass"] / body["mass"])
+    if rng.random() < SPECIAL_CHANCE:
+        made.append("gravity")
+        direction = rng.choice([0.0, 1.0], 3) * rng.normal(size=3)
+        content["gravity"] = (10 ** rng.uniform(-1.0, 1.0) * direction).tolist()
+    if rng.random() < SPECIAL_CHANCE / 4:
+        made.append("all attitudes the identity")
+        for body in content["bodies"]:
+            body["attitude"] = {"quaternion": [1.0, 0.0, 0.0, 0.0]}
+    content["title"] += f"; special: {', '.join(made)}"
+
+
+def _set_attitude(rng: np.random.Generator, body: dict[str, Any]) -> None:
+    """Make the attitude the identity, a turn about one axis, or one with a negative scalar or none."""
+    axis = np.eye(3)[rng.integers(3)] * rng.normal()
+    turn = np.array([[1.0, 0, 0, 0], [-1.0, 0, 0, 0], [rng.normal(), *axis], [0, *axis],
+                     [-abs(rng.normal()), *rng.normal(size=3)]])  # fmt: skip
+    body["attitude"] = {"quaternion": turn[rng.choice(5, p=[0.5, 0.1, 0.2, 0.1, 0.1])].tolist()}
+
+
+def _set_zeros(rng: np.random.Generator, body: dict[str, Any]) -> None:
+    """Set components of offsets and rates to zero; a rod along a coordinate axis, a body at rest."""
+    for name in ("proximal", "distal", "angular_velocity"):
+        if name in body:
+            kept = np.eye(3, dtype=bool)[rng.integers(3)] | (rng.random(3) < 0.4)
+            body[name] = np.where(kept, body[name], 0.0).tolist()
+    if rng.random() < 0.3:
+        body["angular_velocity"] = [0.0, 0.0, 0.0]
+    if body["joint"]["kind"] == "rod":
+        axis = np.eye(3)[rng.integers(3)] * rng.choice([-1.0, 1.0])
+        body["joint"] |= {"direction": axis.tolist()}
+        if rng.random() < 0.3:
+            body["joint"] |= {"angular_velocity": [0.0, 0.0, 0.0]}
+
+
+def _set_inertia(rng: np.random.Generator, body: dict[str, Any]) -> None:
+    """Make the inertia that of a ball, of a body of revolution, or diagonal."""
+    first, second, third = body["inertia"]["principal"]
+    values = [[first] * 3, [first, first, min(third, 1.9 * first)], [first, second, third]]
+    turned = body["inertia"]["axes"] if rng.random() < 0.3 else {"quaternion": [1.0, 0.0, 0.0, 0.0]}
+    body["inertia"] = {"principal": values[rng.integers(3)], "axes": turned}
+
+
+def _set_loads(rng: np.random.Generator, body: dict[str, Any], moment: float) -> None:
+    """Give the body loads and drag of its own, of forces or moments or both."""
+    mass, zero = body["mass"], [0.0, 0.0, 0.0]
+    force, torque = mass * rng.normal(size=(2, 3)) * [[1.0], [moment]]
+    if rng.random() < 0.7:
+        has = rng.random(2) < 0.6
+        body["load"] = {"force": force.tolist() if has[0] else zero,
+                        "moment": torque.tolist() if has[1] or not has[0] else zero}  # fmt: skip
+    if rng.random() < 0.7:
+        drag = mass * rng.uniform(size=2) * [1.0, 0.1 * moment] * [rng.random() < 0.7, rng.random() < 0.7]
+        body["drag"] = {"force": float(drag[0]), "moment": float(drag[1])}
+
+
+def _scale_mass(body: dict[str, Any], factor: float) -> None:
+    """Multiply the mass and what is in proportion to it."""
+    body["mass"] *= factor
+    body["inertia"]["principal"] = [factor * x for x in body["inertia"]["principal"]]
+    for what in ("load", "drag"):
+        for name, value in body.get(what, {}).items():
+            body[what][name] = [factor * x for x in value] if isinstance(value, list) else factor * value

@@ -64,16 +64,17 @@ def joint_space_steps(
     """
     chain = _LinkChain(model, method.rod_axial_inertia)
     system: _System = (
-        _JointRotations(chain)
+        _JointRotations(chain, method)
         if method.coordinates == "joint rotations"
         else _JointAngles(chain, states, [axes for axes in angle_axes if axes is not None])
     )
     q, v = system.start(states)
-    h = np.array(steps, LongDouble)[:, None, None]
+    h = np.array(steps, LongDouble)[:, None, None] * LongDouble(method.step_factor) / method.substeps
     found = [chain.bodies(*system.links(q, v))]
     with np.errstate(all="ignore"):
         for _ in range(count):
-            q, v = _STEPS[method.formula](system, method, q, v, h)
+            for _ in range(method.substeps):
+                q, v = _STEPS[method.formula](system, method, q, v, h)
             found.append(chain.bodies(*system.links(q, v)))
     return found
 
@@ -91,7 +92,7 @@ def fastest_rates(model: Model, states: Sequence[State], iterations: int = 12) -
 
     """
     chain = _LinkChain(model, 1.0)
-    system = _JointRotations(chain)
+    system = _JointRotations(chain, JointSpaceMethod("Runge-Kutta", "joint rotations"))
     q, v = system.start(states)
     a = system.acceleration(q, v)
     rng = np.random.default_rng(0)
@@ -228,8 +229,8 @@ class _System(Protocol):
 class _JointRotations:
     """q: quaternions (..., nj, 4) relative to the link before; v: their rates (..., nj, 3), child's frame."""
 
-    def __init__(self, chain: _LinkChain) -> None:
-        self.chain = chain
+    def __init__(self, chain: _LinkChain, method: JointSpaceMethod) -> None:
+        self.chain, self.method = chain, method
 
     def start(self, states: Sequence[State]) -> tuple[Array, Array]:
         p, omega = self.chain.attitudes(states)
@@ -245,7 +246,10 @@ class _JointRotations:
         return p, np.cumsum(_times(_rotation(p), v), axis=-2)
 
     def move(self, q: Array, displacement: Array) -> Array:
-        return quaternion_product(q, _exponential(displacement))
+        if self.method.is_rotation_exact:
+            return quaternion_product(q, _exponential(displacement))
+        turn = np.concatenate([np.ones_like(displacement[..., :1]), displacement / 2], -1)
+        return _unit(quaternion_product(q, turn))
 
     def displacement_rate(self, theta: Array, v: Array) -> Array:
         """dexp⁻¹(θ) v = v + θ×v/2 + (1 − (θ/2) cot(θ/2)) θ×(θ×v)/θ², of displacements on the right."""
@@ -254,7 +258,9 @@ class _JointRotations:
         half = np.where(small, LongDouble(1), angle / 2)
         series = LongDouble(1) / 12 + angle**2 / 720 + angle**4 / 30240
         factor = np.where(small, series, (1 - half / np.tan(half)) / (4 * half * half))
-        once = _cross(theta, v)
+        once, terms = _cross(theta, v), self.method.correction_terms
+        if terms is not None:
+            return np.asarray(v + (terms > 0) * once / 2 + (terms > 1) * _cross(theta, once) / 12)
         return np.asarray(v + once / 2 + factor * _cross(theta, once))
 
     def acceleration(self, q: Array, v: Array) -> Array:
@@ -287,7 +293,9 @@ class _JointRotations:
         units = np.eye(nv, dtype=LongDouble).reshape(nv, *(1,) * (q.ndim - 2), self.chain.count, 3)
         # f is quadratic in v: a central difference of any size is exact
         columns = (generalized_forces(v - units, forces) - generalized_forces(v + units, forces)) / 2
-        D = np.moveaxis(columns, 0, -1)
+        D = LongDouble(self.method.damping_factor) * np.moveaxis(columns, 0, -1)
+        if self.method.is_damping_symmetric:
+            D = (D + np.swapaxes(D, -1, -2)) / 2
         MT = np.swapaxes(T, -1, -2) @ M @ T
         solved = _solve(MT + h * D, generalized_forces(v, "all"))
         return solved.reshape(v.shape)
@@ -385,10 +393,29 @@ def _semi_implicit_euler(
     system: _System, method: JointSpaceMethod, q: Array, v: Array, h: Array
 ) -> tuple[Array, Array]:
     if method.implicit_forces == "none":
-        v = v + h * system.acceleration(q, v)
+        new = v + h * system.acceleration(q, v)
     else:
-        v = v + h * system.damped_acceleration(q, v, h, method.implicit_forces)
-    return system.move(q, h * v), v
+        new = v + h * system.damped_acceleration(q, v, h, method.implicit_forces)
+    share = LongDouble(method.new_velocity_share)
+    mover = share * new + (1 - share) * v
+    if method.stale_joint is not None:
+        mover[..., method.stale_joint, :] = v[..., method.stale_joint, :]
+    return system.move(q, h * mover), new
+
+
+def _positions_first(
+    system: _System, method: JointSpaceMethod, q: Array, v: Array, h: Array
+) -> tuple[Array, Array]:
+    q = system.move(q, h * v)
+    return q, v + h * system.acceleration(q, v)
+
+
+def _velocity_verlet(
+    system: _System, method: JointSpaceMethod, q: Array, v: Array, h: Array
+) -> tuple[Array, Array]:
+    a = system.acceleration(q, v)
+    q = system.move(q, h * v + h * h * a / 2)
+    return q, v + h / 2 * (a + system.acceleration(q, v + h / 2 * a))
 
 
 def _runge_kutta(
@@ -408,7 +435,12 @@ def _runge_kutta(
     return system.move(q, theta), v + weighted(method.weights, accelerations)
 
 
-_STEPS = {"semi-implicit Euler": _semi_implicit_euler, "Runge-Kutta": _runge_kutta}
+_STEPS = {
+    "semi-implicit Euler": _semi_implicit_euler,
+    "positions first": _positions_first,
+    "velocity Verlet": _velocity_verlet,
+    "Runge-Kutta": _runge_kutta,
+}
 
 
 # -- constrained methods -----------------------------------------------------------------------------

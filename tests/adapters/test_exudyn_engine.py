@@ -7,11 +7,15 @@ import exudyn
 import numpy as np
 import pytest
 
-from adapters.exudyn_common import make_settings, silence_engine
+from adapters import exudyn_tree_engine
+from adapters.exudyn_common import make_settings, set_linear_solver, silence_engine
 from adapters.exudyn_engine import Exudyn, ExudynChain
 from adapters.exudyn_tree_engine import ExudynTree
-from plumbline.model.datatypes import EngineFailure, Unsupported
+from plumbline.model.datatypes import EngineFailure, Model, Unsupported
 from plumbline.model.kinematics import joint_vectors, state_from_minimal
+from plumbline.reproduce.engine_client import EngineClient
+from plumbline.reproduce.measure import StepMeasure
+from plumbline.reproduce.shrink import ReproductionCase
 from tests.helpers import newton_euler, pendulums
 from tests.helpers.refinement import extrapolated, observed_orders
 
@@ -173,3 +177,34 @@ def test_nothing_is_printed_or_written(capfd, tmp_path, monkeypatch):
         Exudyn().simulate(hard, pendulums.state_from_seed(hard, rate=20.0), TIMES, "generalized-alpha", 0.25)
     assert capfd.readouterr() == ("", "")
     assert list(tmp_path.iterdir()) == []
+
+
+def light_and_heavy_balls():
+    """Five balls of 5 g to 47 kg with small inertias: random-11-88, shrunk by `plumbline reproduce`."""
+    mass = np.array([0.0054, 5.2, 0.18, 0.0103, 47.3])
+    offsets = np.zeros((5, 3)), np.tile([0.0, 0.0, -0.6], (5, 1))
+    offsets[0][3] = [0.0, 0.0, 1.0]
+    zero = np.zeros(5)
+    model = Model(
+        mass=mass, inertia=np.tile(np.diag([2e-4, 2e-4, 3e-4]), (5, 1, 1)), proximal=offsets[0],
+        distal=offsets[1], length=zero, gravity=np.array([0.0, 0.0, -10.0]), force=np.zeros((5, 3)),
+        moment=np.zeros((5, 3)), drag_force=zero, drag_moment=zero,
+    )  # fmt: skip
+    p = np.resize([[0.6, 0.8, 0.0, 0.0], [0.6, 0.0, 0.8, 0.0]], (5, 4))
+    return model, state_from_minimal(model, p, *np.zeros((3, 5, 3)))
+
+
+@pytest.mark.parametrize(("solver", "least", "most"), [("EXUdense", 10, 1000), ("EigenSparse", 0, 1)])
+def test_the_trees_dense_solver_loses_digits_where_inertias_differ(solver, least, most, monkeypatch):
+    """The evidence of `random-tree-dense-steps`: measured 375 and 0.03 rounding bounds, in rates."""
+    real = exudyn_tree_engine.run_solver
+
+    def run(one, mbs, settings, *more, **names):
+        set_linear_solver(settings, solver)
+        return real(one, mbs, settings, *more, **names)
+
+    monkeypatch.setattr(exudyn_tree_engine, "run_solver", run)
+    h = 1.8e-4
+    case = ReproductionCase(*light_and_heavy_balls(), until=h, steps=(h,))
+    ratio = StepMeasure(EngineClient("exudyn-tree"), "RK44")(case).ratio
+    assert least <= ratio <= most

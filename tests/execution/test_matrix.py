@@ -1,7 +1,8 @@
 """The product as tests: every scenario × engine × level is a test of its own.
 
 `pytest -k "double and mujoco"` runs those of one family and engine; the failure message is the
-verdict's own sentence.  By default the long chains run at state level only; `-m full` runs the rest.
+verdict's own sentence.  By default the long chains run at state level only, and single steps of one and two
+bodies; `-m full` runs the rest.
 """
 
 import os
@@ -11,20 +12,27 @@ import pytest
 from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.execution.plan import Plan, TaskKind
 from plumbline.execution.runner import describe_engines
-from plumbline.execution.scenario_run import ScenarioRun
+from plumbline.execution.scenario_run import ScenarioRun, has_steps
 from plumbline.judging import known_issues
+from plumbline.model.invariants import inertia_ratio
 from plumbline.processes.workers import Limits, WorkerPool
 from tests.helpers.catalogue import catalogue_scenarios
 
-MAX_BODIES_IN_FAST_FORM = 5  # bodies: longer chains climb their ladders in the full form only
-LEVELS = ("state", "trajectory")
+MAX_BODIES_IN_FAST_FORM = {"state": 50, "step": 2, "trajectory": 5}  # longer chains in the full form only
+
+
+def levels(engine, scenario):
+    """Levels at which an engine is compared on a scenario."""
+    integrators = load_adapter(engine).integrators
+    has_formulas = any(i.method is not None for i in integrators) and has_steps(scenario)
+    return ("state", *["step"] * has_formulas, *["trajectory"] * bool(integrators))
 
 
 def matrix_cells():
     for name, scenario in catalogue_scenarios().items():
         for engine in ENGINES:
-            for level in LEVELS if load_adapter(engine).integrators else LEVELS[:1]:
-                is_full = level == "trajectory" and scenario.model.n > MAX_BODIES_IN_FAST_FORM
+            for level in levels(engine, scenario):
+                is_full = scenario.model.n > MAX_BODIES_IN_FAST_FORM[level]
                 marks = [pytest.mark.full] if is_full else []
                 label = name if scenario.family in name else f"{scenario.family}-{name}"
                 yield pytest.param(name, engine, level, id=f"{label}: {engine}-{level}", marks=marks)
@@ -69,7 +77,7 @@ def test_cell(name, engine, level, workers, engines, truths):
     excuses = known_issues.KnownIssues(known_issues.project_known_issues(), has_extra_refinements=False)
     wrong = [
         f"{r.key} {r.verdict}: {r.reason}"
-        for r in excuses.mark_known(rows, found.model.n)
+        for r in excuses.mark_known(rows, found.model.n, inertia_ratio(found.model))
         if r.verdict.needs_attention and r.known_issue is None
     ]
     stale = [f"known entry {e.id} no longer occurs" for e in excuses.stale_issues(is_full_matrix=False)]

@@ -19,7 +19,7 @@ from plumbline.judging.convergence import refinement_resolutions
 from plumbline.judging.coverage import CoverageEntry, scenario_coverage
 from plumbline.judging.rows import Level, Row, RowContext
 from plumbline.judging.state import judge_states
-from plumbline.judging.step import STEP_STATES, judge_steps, step_counts, step_sizes
+from plumbline.judging.step import STEP_STATES, judge_steps, step_sizes
 from plumbline.judging.trajectory import judge_trajectory
 from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, StepRun, Trajectory
 from plumbline.model.sampling import compared_states
@@ -27,6 +27,7 @@ from plumbline.scenario.loader import Scenario, load_scenarios
 from plumbline.truth.closed_form import closed_form_motion
 from plumbline.truth.ground_truth import MotionTruth, StateTruth, motion_truth, state_truth
 from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters, perturb
+from plumbline.truth.step_comparison import step_counts
 
 STATES = 50
 STATE_ENGINE, STEP_ENGINE, STEP_INTEGRATOR = "reference", "pinocchio", "rkmk4"
@@ -95,7 +96,7 @@ def judged_rows(name: str, level: Level, change: Change) -> list[Row]:
         if level == "step":
             integrator, some = adapter.integrator(STEP_INTEGRATOR), states(name)[:STEP_STATES]
             assert integrator.method is not None
-            sizes, counts = step_sizes(integrator.method, s.model, some), step_counts(integrator.method)
+            sizes, counts = step_sizes(False, s.model, some), step_counts(integrator.method)
             answer = run_steps(STEP_ENGINE, STEP_INTEGRATOR, s.model, some, sizes, counts)
             return judge_steps(context, integrator, s.model, some, answer).rows
         integrator = adapter.integrator(MOTION_INTEGRATOR)

@@ -130,6 +130,13 @@ def two_half_steps(system: Any, q: Array, v: Array, h: float) -> tuple[Array, Ar
     return q, v
 
 
+def velocity_verlet(system: Any, q: Array, v: Array, h: float) -> tuple[Array, Array]:
+    """Kick, drift, kick; the second kick by the accelerations at the half-way velocity."""
+    half = v + h / 2 * system.acceleration(q, v)
+    q = system.integrate(q, h * half)
+    return q, half + h / 2 * system.acceleration(q, half)
+
+
 def last_body_stale(system: Any, q: Array, v: Array, h: float) -> tuple[Array, Array]:
     """The last joint's position by the old velocity, all others semi-implicitly."""
     new = v + h * system.acceleration(q, v)
@@ -195,6 +202,7 @@ STEP_DEFECTS = (
             ("first-order-quaternion", "p + h ṗ normalised", first_order_quaternion),
             ("two-half-steps", "two steps of h/2", two_half_steps),
             ("last-joint-stale", "stale velocity of the last joint only", last_body_stale),
+            ("verlet", "velocity Verlet", velocity_verlet),
         )
     ),
     *(
@@ -249,6 +257,53 @@ STEP_DEFECTS = (
     StepDefect("first-accelerations-zero-alpha", "q̈₀ = 0", E, "generalized-alpha",
                settings=(("computeInitialAccelerations", False),)),
 )  # fmt: skip
+
+
+# What the diagnosis must say, by the beginning of a defect's name; of others, that nothing explains them.
+STEP_NAMES = {
+    "exchanged-halves": "exchanged the halves of semi-implicit Euler",
+    "stale-velocity": "explicit Euler's step",
+    "mean-velocity": "the mean of the old and the new velocity",
+    "first-order-quaternion": "quaternions by p + h ṗ",
+    "two-half-steps": "2 steps of 1/2 of the size",
+    "last-joint-stale": "the joint of body 2 by the old velocity",
+    "verlet": "velocity Verlet's step",
+    "no-dexp": "left dexp⁻¹ out",
+    "one-dexp-term": "cut dexp⁻¹ after θ×v/2",
+    "third-stage-by-first": "third stage by the first slope",
+    "three-eighths-rule": "3/8 rule",
+    "weights-2.001": "weight of stage 2 were larger by 0.000167",
+    "implicit-is-euler": "semi-implicit Euler's step, with all forces explicit",
+    "implicit-is-implicitfast": "with the drag implicit",
+    "damping-halved": "derivatives of forces in the matrix were 0.5 times as large",
+    "damping-symmetric": "symmetrised the derivatives",
+    "implicit-stale": "positions by the old velocity",
+    "drag-explicit": "with all forces explicit",
+    "drag-implicit": "with the drag implicit",
+    "euler-is-rk4": "the classical Runge–Kutta method",
+    "long-step": "a step 1.000000001 times as long",
+    "tree-rk33": "Heun's method of order 3",
+    "tree-rk67": "Butcher's method of order 6",
+    "spectral-radius-0.8": "spectral radius 0.8",
+    "spectral-radius-0.89": "spectral radius 0.89",
+    "spectral-radius-0.900001": "spectral radius 0.900001",
+    "newmark-for-alpha": "the trapezoidal rule",
+    "newmark-on-velocities": "constraints on velocities",
+    "alpha-acceleration": "a were q̈",
+    "alpha-m-sign": "αm had the opposite sign",
+    "trapezoidal-beta": "β were 0.1667",
+    "trapezoidal-gamma": "γ were 0.500001",
+    "trapezoidal-index-3": "constraints on positions",
+    "trapezoidal-is-alpha": "spectral radius 0.9 with constraints on positions",
+    "rates-by-euler": "γ were 1 ",
+    "first-accelerations-zero": "first accelerations were 0",
+}
+
+
+def words_for(defect: StepDefect) -> str:
+    """What the diagnosis must say about a defect; empty where no formula explains it."""
+    found = [name for name in STEP_NAMES if defect.name.startswith(name)]
+    return STEP_NAMES[max(found, key=len)] if found else ""
 
 
 # -- planting ------------------------------------------------------------------------------------
@@ -332,7 +387,7 @@ def _requadrated(how: str, samples: list[Any], h: float) -> list[Any]:
     for q0, q1 in pairwise(samples):
         q, v = out[-1][0], out[-1][1]
         if how == "rates by Euler":
-            out.append((q1[0], v + h * q1[2], *q1[2:]))
+            out.append((q + h * v + h * h / 4 * (q0[2] + q1[2]), v + h * q1[2], *q1[2:]))
             continue
         new = ((1 - alpha_f) * q1[2] + alpha_f * q0[2] - alpha_m * a) / (1 - alpha_m)
         if how == "a is the acceleration":

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from contextlib import contextmanager, redirect_stdout
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
@@ -14,8 +15,9 @@ from plumbline.engines.metamorphic_hooks import metamorphic_hooks
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.relation_result import OPTION_PREFIX, OTHER_FORMULATION_PREFIX
 from plumbline.judging.state_relations import QUANTITIES, STATE_RELATIONS, WELDED_HALVES
+from plumbline.model.step_methods import JointSpaceMethod
 from plumbline.reproduce.engine_client import EngineClient
-from plumbline.reproduce.measure import ConvergenceMeasure, RelationMeasure, StateMeasure
+from plumbline.reproduce.measure import ConvergenceMeasure, RelationMeasure, StateMeasure, StepMeasure
 from plumbline.reproduce.shrink import ReproductionCase
 from tests.helpers import pendulums
 from tests.helpers.pendulums import JOINT_PATTERNS
@@ -61,6 +63,17 @@ def step_integrators(engine: str) -> list[str]:
     return [i.name for i in load_adapter(engine).integrators if i.kind == "step"]
 
 
+def step_methods(engine: str) -> list[str]:
+    """Integrators with a formula in joint coordinates, which a script can show."""
+    return [i.name for i in load_adapter(engine).integrators if isinstance(i.method, JointSpaceMethod)]
+
+
+def step_evidence(engine: str, integrator: str, case: ReproductionCase, count: int = 1, h: float = 0.0237):
+    found = StepMeasure(EngineClient(engine), integrator)(replace(case, until=count * h, steps=(h,)))
+    assert found is not None
+    return found
+
+
 def second_ways(engine: str) -> list[str]:
     """Relations in which the engine itself is set to a second way."""
     hooks = metamorphic_hooks(load_adapter(engine))
@@ -75,6 +88,8 @@ def every_evidence(engine: str, joints: str, loaded: bool):
     yield state_evidence(engine, case)
     for relation in (STATE_RELATIONS[0].name, *second_ways(engine)):
         yield relation_evidence(engine, relation, case)
+    for integrator in step_methods(engine):
+        yield step_evidence(engine, integrator, case)
     for integrator in step_integrators(engine):
         for level in ("trajectory", "invariants"):
             measure, study = motion_measure(engine, integrator, level, joints, loaded, 0.25)

@@ -269,6 +269,34 @@ def test_only_random_scenarios_may_show_it_sometimes():
     assert judged_by([row(who=who)], [chance], whole=True).rows[0].known_issue == "a"
 
 
+def test_a_size_may_be_in_proportion_to_the_chains_ratio_of_inertias():
+    recorded = entry(max_ratio_by_inertia=2.0, mechanism="rounding")
+    at = replace(row(), ratio=50.0)
+    excuses = known_issues.KnownIssues([recorded], has_extra_refinements=False)
+    assert excuses.mark_known([at], 2, 26.0)[0].known_issue == "a"
+    (found,) = excuses.mark_known([at], 2, 24.0)
+    assert found.known_issue is None and "covers 48 times the tolerance at most" in found.reason
+
+
+def test_the_scatter_of_a_row_itself_shows_its_mechanism():
+    """Of a random scenario, which has no relations: measured by the diagnosis."""
+    recorded = entry(max_ratio={10: 100.0}, mechanism="rounding")
+    scattering, steady, unknown = (
+        replace(row(), ratio=50.0, extra=extra) for extra in ({"scatter": 0.9}, {"scatter": 1e-4}, {})
+    )
+    assert judged_by([scattering], [recorded], whole=True).rows[0].known_issue == "a"
+    assert judged_by([unknown], [recorded], whole=True).rows[0].known_issue == "a"
+    (found,) = judged_by([steady], [recorded], whole=True).rows
+    assert found.known_issue is None and "differ by only" in found.reason
+
+
+def test_a_checked_mechanism_is_in_the_rows_diagnosis():
+    recorded = entry(level="*", quantity="*", max_ratio={10: 100.0}, mechanism="rounding")
+    turned = replace(WHO.make_row("relations", "-", "rotated world", "agrees", "why"), ratio=20.0)
+    found = judged_by([replace(row(), ratio=50.0), turned], [recorded], whole=True).rows
+    assert found[0].diagnosis == "loses digits: results for equivalent descriptions differ by 20 tolerances"
+
+
 def test_smaller_steps_may_resolve_what_was_unresolved():
     open_ = entry(verdict="unresolved")
     assert judged_by([row("agrees")], [open_], whole=True).stale == [open_]
@@ -291,7 +319,7 @@ def test_the_projects_own_file_is_valid_and_gives_evidence():
     for e in known_issues.load_known_issues():
         assert len(e.evidence) > 20
         assert len(e.reason) > 20
-        assert e.verdict != "disagrees" or (e.max_ratio and e.mechanism)
+        assert e.verdict != "disagrees" or ((e.max_ratio or e.max_ratio_by_inertia) and e.mechanism)
 
 
 @pytest.mark.parametrize(

@@ -12,12 +12,13 @@ import pytest
 from plumbline.engines.calls import StepAttempt, StepEvaluation, run_steps
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import RowContext, Verdict
-from plumbline.judging.step import STEP_STATES, judge_steps, step_counts, step_sizes
+from plumbline.judging.step import STEP_STATES, judge_steps, step_sizes
 from plumbline.model.sampling import random_states
 from plumbline.model.step_methods import ConstrainedMethod, classical_runge_kutta
 from plumbline.scenario.generator import RandomScenarios
 from plumbline.truth import step_formulas
 from plumbline.truth.certified import certify_state
+from plumbline.truth.step_comparison import step_counts
 from tests.helpers import pendulums
 from tests.helpers.pendulums import JOINT_PATTERNS
 from tests.helpers.planted_steps import STEP_DEFECTS, StepDefect, planted_step
@@ -35,14 +36,19 @@ def methods(engine):
     return [i for i in load_adapter(engine).integrators if i.method is not None]
 
 
-def judged(adapter, integrator, model, states):
-    """Rows of an adapter's steps, judged by the integrator's declared method."""
+def stepped(adapter, integrator, model, states):
+    """Steps of an adapter, whatever it steps with."""
     sizes, counts = (
         step_sizes(isinstance(integrator.method, ConstrainedMethod), model, states),
         step_counts(integrator.method),
     )
     with patch("plumbline.engines.calls.load_adapter", lambda _: adapter):
-        answer = run_steps(adapter.name, integrator.name, model, states, sizes, counts)
+        return run_steps(adapter.name, integrator.name, model, states, sizes, counts)
+
+
+def judged(adapter, integrator, model, states):
+    """Rows of an adapter's steps, judged by the integrator's declared method."""
+    answer = stepped(adapter, integrator, model, states)
     return judge_steps(WHO, integrator, model, states, answer).rows
 
 

@@ -11,6 +11,7 @@ from plumbline.model.invariants import (
     angular_momentum,
     attitude_error,
     compute_invariants,
+    inertia_ratio,
     joint_vector_rates,
     kinetic_energy,
     position_error,
@@ -232,3 +233,13 @@ def test_what_is_not_conserved_is_not_judged():
     about = model.mass[0] * np.cross(run.r[1:, 0], run.v[1:, 0]) @ [0, 0, -1.0]
     assert shifted.momentum_drift is not None
     np.testing.assert_allclose(shifted.momentum_drift[1:, 0, 0], about, atol=1e-11)
+
+
+def test_the_ratio_of_inertias_of_a_light_body_that_carries_a_heavy_one():
+    model = pendulums.make_model(pendulums.JOINT_PATTERNS["balls"])
+    light = replace(
+        model, mass=np.array([1.0, 1000.0]), inertia=np.array([np.diag([0.1, 0.2, 0.2])] * 2),
+        proximal=np.array([[0, 0, 0.5]] * 2), distal=np.array([[0, 0, -0.5]] * 2),
+    )  # fmt: skip
+    assert inertia_ratio(light) == pytest.approx((1000.0 + 0.2) / 0.1)
+    assert inertia_ratio(replace(light, mass=light.mass[::-1])) == pytest.approx((1.0 + 0.2) / 0.1)

@@ -71,6 +71,9 @@ DEFECTS = [  # engine, level, integrator, what must disagree, the defect
     ("exudyn-tree", "state", "-", "acceleration", TREE),
     ("mujoco", "trajectory", "RK4", "order", EULER),
     ("exudyn", "trajectory", "trapezoidal", "attitude_limit", STRONG),
+    ("mujoco", "step", "RK4", "step_rate", EULER),
+    ("pinocchio", "step", "rkmk4", "step_attitude", NO_DEXP),
+    ("exudyn-tree", "step", "RK44", "step_velocity", TREE),
     ("pinocchio", "invariants", "semi-implicit-euler", "energy_drift", SYRUP),
     ("pinocchio-aba", "relations", "-", "by crba", SYRUP),
     pytest.param("pinocchio", "state", "-", "mass_matrix", BIASED, marks=FULL),
@@ -104,7 +107,10 @@ def disagreement(engine, quantities, case, **more):
 def test_a_defect_in_an_engine_is_shown_by_its_script(engine, level, integrator, wanted, lines, tmp_path):
     """The script is run in a process of its own; without the defect the same script finds nothing."""
     case = state_case("balls", rate=1.0)
-    case = case if integrator == "-" else study(engine, integrator, case, 0.25)
+    if level == "step":
+        case = replace(case, until=0.1, steps=(0.01,))
+    elif integrator != "-":
+        case = study(engine, integrator, case, 0.25)
     found = disagreement(engine, (wanted,), case, level=level, integrator=integrator, seconds=1.5)
     with defective(lines):
         script, reason = make_script(found, stored_row(engine, level=level))

@@ -28,7 +28,9 @@ from tests.helpers.reproduction import (
     second_ways,
     state_case,
     state_evidence,
+    step_evidence,
     step_integrators,
+    step_methods,
     stored_row,
 )
 
@@ -37,6 +39,7 @@ for name in ("mujoco", "pinocchio", "exudyn", "flint"):
 
 ROOT = Path(__file__).resolve().parents[2]
 INTEGRATORS = [(engine, name) for engine in ENGINES for name in step_integrators(engine)]
+STEPS = [(engine, name) for engine in ENGINES for name in step_methods(engine)]
 WAYS = [(engine, name) for engine in ENGINES for name in second_ways(engine)]
 
 
@@ -64,7 +67,7 @@ def test_every_template_renders_to_what_ruff_accepts(engine, tmp_path):
 
 
 def test_every_template_is_used():
-    frame = {"script", "state", "relation", "motion", "invariants", "exudyn-common"}
+    frame = {"script", "state", "step", "relation", "motion", "invariants", "exudyn-common"}
     assert {path.name.removesuffix(".py.j2") for path in TEMPLATES.iterdir()} - frame == {
         name for name in REGISTERED if not no_script_reason(name, {"level": "state", "quantity": "energy"})
     } - {"pinocchio-aba"}
@@ -92,6 +95,16 @@ def test_a_script_of_runs_steps_as_the_adapter_does(engine, integrator):
     for run, mine in zip(runs, names["runs"], strict=True):
         for name, values in zip(("r", "p", "v"), mine, strict=False):
             assert np.max(np.abs(values - getattr(run.trajectory, name))) < 1e-10, (name, run.resolution)
+
+
+@pytest.mark.parametrize(("engine", "integrator"), STEPS)
+@pytest.mark.parametrize("count", [1, 5])
+def test_a_script_of_a_step_finds_what_the_harness_finds(engine, integrator, count):
+    evidence = step_evidence(engine, integrator, state_case("rod-ball", loads=True, drag=True), count, 0.01)
+    found, _ = execute(render_script(stored_row(engine), evidence))
+    assert evidence.ratio < 1 and len(found) == 4 and max(found) < 1
+    late = {q: x * (1 + 1e-9) for q, x in evidence.expected.items()}
+    assert min(execute(render_script(stored_row(engine), replace(evidence, expected=late)))[0]) > 1
 
 
 @pytest.mark.parametrize(
@@ -186,6 +199,8 @@ def test_literals_are_exact_and_hostile_names_stay_text(tmp_path):
         ("pinocchio", "relations", "by cholesky", "-", ""),
         ("mujoco", "relations", "two welded halves", "-", ""),
         ("exudyn", "relations", "as exudyn-tree", "-", ""),
+        ("mujoco", "step", "step_rate", "RK4", ""),
+        ("exudyn", "step", "step_quadrature", "trapezoidal", "steps with constraints have no script"),
     ],
 )
 def test_what_has_no_script_is_explained_in_a_sentence(engine, level, quantity, integrator, words):

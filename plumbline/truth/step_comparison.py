@@ -1,0 +1,415 @@
+"""Steps of an engine against its declared formula: differences, and the bounds that rounding explains.
+
+Engines in joint coordinates are compared with the formula itself: positions, attitudes and rates per body,
+within a rounding bound.  With b the state-level bounds of accelerations, W and V the largest rate and speed
+of any link up to body k, n its place among the links, ℓ the chain's stretched length up to it, ε = 2⁻⁵³:
+
+    ω′  3 h (b_α + c) + 32 ε n W        ṙ  3 h (b_a + c ℓ) + 32 ε n max(V, W ℓ)
+    p   h (bound of ω′) + 32 ε n          r  h (bound of ṙ) + 32 ε n ℓ
+
+b holds the error of the accelerations, the factor 3 the stages elsewhere, the second term the roundings of
+quaternion products and of the way from joint rates to the bodies', c = h W Σ (b_α of the links before, and of
+rods about their own axes) what relative rates pass on.  Ten steps: the sum over the steps, times
+the growth of perturbations, as one.
+
+Engines that solve a step iteratively are compared in parts that need no iteration: the quadrature of their
+own accelerations, the residual of their equations, and their first accelerations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from plumbline.model.datatypes import Array, Model, State, StepRun
+from plumbline.model.kinematics import angular_velocity, state_from_minimal
+from plumbline.model.sampling import derive_seed
+from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod, StepMethod
+from plumbline.truth.ground_truth import stretched_length
+from plumbline.truth.rounding_bound import EPS, RoundingBound, state_rounding_bound
+from plumbline.truth.step_formulas import (
+    LinkStates,
+    constrained_quadrature,
+    constrained_residual,
+    engine_coordinates,
+    first_coordinate_acceleration,
+    joint_space_steps,
+)
+
+STEP_ROUNDINGS = 32
+ACCELERATION_FACTOR = 3.0
+DISTURBANCE = 1e-9  # of rates, to measure the growth of perturbations
+FIRST_ACCELERATION_RTOL = 1e-5  # Exudyn's are finite differences, off by 1e-7 of the largest
+RESIDUAL_STEPS = 2  # after one, Euler does not show the axial inertia of rods
+MAX_GROWTH = 1e4  # of perturbations; beyond it the method itself is unstable, and nothing is compared
+STEP_UNITS = {"step_position": "m", "step_attitude": "rad", "step_velocity": "m/s", "step_rate": "rad/s"}
+CONSTRAINED_UNITS = {
+    "step_quadrature": "1",
+    "step_equations": "N",
+    "step_first_acceleration": "m/s²",
+}
+
+Runs = Sequence[tuple[int, float, StepRun]]  # index of the state, step [s], steps
+
+
+def step_counts(method: StepMethod | None) -> tuple[int, ...]:
+    """Choose after how many steps engine and formula are compared.
+
+    Args:
+        method: the declared formula.
+
+    Returns:
+        Counts, ascending; few where each step is compared with the one before.
+
+    """
+    return (1, 3) if isinstance(method, ConstrainedMethod) else (1, 10)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where steps are compared."""
+
+    state: int  # index
+    step: float  # s
+    count: int  # of steps
+
+    def __str__(self) -> str:
+        return f"state {self.state}, {self.count} step{'s' * (self.count > 1)} of {self.step:g} s"
+
+
+@dataclass
+class Comparisons:
+    """Errors of one quantity over bodies, states and steps."""
+
+    errors: list[float] = field(default_factory=list)
+    bounds: list[float] = field(default_factory=list)
+    looseness: list[float] = field(default_factory=list)  # bound over the effect of the accelerations
+    bodies: list[int] = field(default_factory=list)  # from 0
+    places: list[Place] = field(default_factory=list)
+
+    @property
+    def ratios(self) -> list[float]:
+        """Errors over their bounds."""
+        tiny = np.finfo(float).tiny
+        return [error / max(bound, tiny) for error, bound in zip(self.errors, self.bounds, strict=True)]
+
+    def add(self, errors: Array, bounds: Array, effects: Array, place: Place) -> None:
+        """Add the errors of the bodies, or of one body, at one place.
+
+        Args:
+            errors: (K,) sizes of differences.
+            bounds: (K,) what rounding explains, in the same unit.
+            effects: (K,) effect of the accelerations on the quantity.
+            place: state and steps.
+
+        """
+        for k, (error, bound, effect) in enumerate(zip(errors, bounds, effects, strict=True)):
+            self.errors.append(float(error))
+            self.bounds.append(float(bound))
+            self.looseness.append(float(bound / effect) if effect > 0 else 0.0)
+            self.bodies.append(k)
+            self.places.append(place)
+
+
+# -- joint coordinates -------------------------------------------------------------------------------
+
+
+class FormulaSteps:
+    """The declared steps from several states, and from states nearby that show how differences grow."""
+
+    def __init__(
+        self, method: JointSpaceMethod, model: Model, states: Sequence[State],
+        starts: Sequence[tuple[int, float, Array | None]], counts: Sequence[int] = (),
+    ) -> None:  # fmt: skip
+        """Take the steps.
+
+        Args:
+            method: the declared formula.
+            model: the pendulum.
+            states: states of it.
+            starts: of each run the index of its state, the step [s], and the axes of revolute joints or None.
+            counts: numbers of steps that are compared, ascending; empty for `step_counts`.
+
+        """
+        self.method, self.model, self.places = method, model, [(index, h) for index, h, _ in starts]
+        self.starts, sizes = [states[index] for index, *_ in starts], [h for _, h, _ in starts]
+        axes = [angle_axes for *_, angle_axes in starts]
+        self.bounds = {index: state_rounding_bound(model, states[index]) for index, *_ in starts}
+        disturbed = [_disturbed(model, states[index], self.bounds[index]) for index, *_ in starts]
+        self.counts = tuple(counts) or step_counts(method)
+        count = max(self.counts)
+        both = joint_space_steps(model, self.starts + disturbed, sizes + sizes, method, count, axes + axes)
+        self.true = [[_pick(links, i) for links in both] for i in range(len(starts))]
+        self.growth = np.empty((len(starts), count + 1))  # of perturbations, running maximum
+        for i, (index, h, _) in enumerate(starts):
+            weights = self.step_bound((self.starts[i],), (self.bounds[index],), h, 1)
+            apart = [_separation(links, i, len(starts), weights) for links in both]
+            self.growth[i] = np.maximum.accumulate(np.array(apart) / apart[0])
+
+    def is_stable(self, i: int) -> bool:
+        """Find out whether the method itself goes through.
+
+        Args:
+            i: index of the start.
+
+        Returns:
+            Whether perturbations grow by less than `MAX_GROWTH`.
+
+        """
+        return bool(self.growth[i, -1] < MAX_GROWTH)
+
+    def limits(self) -> Iterator[tuple[int, int, dict[str, Array], dict[str, Array]]]:
+        """Compute the limits of errors after every number of steps that is compared.
+
+        Yields:
+            Index of the start, number of steps, and by quantity the limits and what a limit is compared with,
+            (N,) each.
+
+        """
+        for i, (index, h) in enumerate(self.places):
+            for count in self.counts:
+                if not self.growth[i, count] < MAX_GROWTH:
+                    continue
+                end = _rounded(self.true[i][count])
+                ends = self.bounds[index], state_rounding_bound(self.model, end)
+                bound = self.step_bound((self.starts[i], end), ends, h, count)
+                grown = {name: count * self.growth[i, count] * limit for name, limit in bound.items()}
+                yield i, count, grown, _effects(ends, h, count)
+
+    def compare(self, runs: Sequence[StepRun]) -> dict[str, Comparisons]:
+        """Compare engines' steps with the formula's, body by body.
+
+        Args:
+            runs: one per start, with as many steps as the engine took.
+
+        Returns:
+            Errors and bounds by quantity.
+
+        """
+        found = {quantity: Comparisons() for quantity in STEP_UNITS}
+        for i, count, limit, scale in self.limits():
+            if count >= len(runs[i].trajectory.t):
+                continue
+            index, h = self.places[i]
+            place = Place(index, h, count)
+            for quantity, error in _errors(self.true[i][count], runs[i], count).items():
+                found[quantity].add(error, limit[quantity], scale[quantity], place)
+        return found
+
+    def residuals(self, method: JointSpaceMethod, runs: Sequence[StepRun]) -> Array:
+        """Return the differences of an engine's first steps from those of another formula.
+
+        Args:
+            method: the other formula, in the same coordinates.
+            runs: the engine's steps, as given before.
+
+        Returns:
+            One vector over all runs, bodies and components after `RESIDUAL_STEPS` steps, each in rounding
+            bounds of the declared formula.
+
+        """
+        sizes, axes = [h for _, h in self.places], [run.angle_axes for run in runs]
+        motions = joint_space_steps(self.model, self.starts, sizes, method, RESIDUAL_STEPS, axes)
+        found = []
+        for i, ((index, h), run) in enumerate(zip(self.places, runs, strict=True)):
+            count = min(RESIDUAL_STEPS, len(run.trajectory.t) - 1)
+            end = _rounded(self.true[i][count])
+            ends = self.bounds[index], state_rounding_bound(self.model, end)
+            bound = self.step_bound((self.starts[i], end), ends, h, count)
+            for name, difference in _differences(_pick(motions[count], i), run, count).items():
+                found.append((difference / (count * bound[name][:, None])).ravel())
+        return np.concatenate(found)
+
+    def step_bound(
+        self, ends: tuple[State, ...], bounds: tuple[RoundingBound, ...], h: float, count: int
+    ) -> dict[str, Array]:
+        """Compute the bounds of one of several steps.
+
+        Args:
+            ends: the states at the ends of the steps.
+            bounds: rounding bounds at ``ends``.
+            h: step [s].
+            count: number of steps.
+
+        Returns:
+            By quantity the bounds (N,), in its unit of `STEP_UNITS`.
+
+        """
+        norm, model = np.linalg.norm, self.model
+        rate = np.max([np.maximum(norm(s.omega, axis=1), norm(s.udot, axis=1)) for s in ends], axis=0)
+        speed = np.max([norm(s.v, axis=1) for s in ends], axis=0)
+        W, V = np.maximum.accumulate(rate), np.maximum.accumulate(speed)
+        arm = np.cumsum(stretched_length(model))
+        rounding = STEP_ROUNDINGS * EPS * (np.arange(1, model.n + 1) + np.cumsum(model.rods))
+        turning, acceleration, torque = (
+            np.max([getattr(b, name) for b in bounds], axis=0)
+            for name in ("angular_acceleration", "acceleration", "rod_torque")
+        )
+        # Rates are kept relative to the link before: what rounding does to one link, and to the spin of a
+        # rod, reaches those beyond it once they have turned against it.
+        above = np.concatenate([[0.0], turning[:-1]])
+        if self.method.coordinates == "joint rotations":
+            axial = self.method.rod_axial_inertia * np.trace(model.inertia, axis1=1, axis2=2)
+            above = above + torque / axial
+        leaked = count * np.minimum(1.0, h * W) * np.cumsum(above)
+        omega = ACCELERATION_FACTOR * h * (turning + leaked) + rounding * W
+        velocity = ACCELERATION_FACTOR * h * (acceleration + leaked * arm) + rounding * np.maximum(V, W * arm)
+        return {
+            "step_rate": omega,
+            "step_velocity": velocity,
+            "step_attitude": count * h * omega + rounding,
+            "step_position": count * h * velocity + rounding * arm,
+        }
+
+
+def _pick(links: LinkStates, i: int) -> LinkStates:
+    return LinkStates(*(getattr(links, name)[i] for name in LinkStates.__match_args__))
+
+
+def _disturbed(model: Model, state: State, bound: RoundingBound) -> State:
+    """A state nearby: rates off in random directions, in the proportions in which roundings disturb them."""
+    rng = np.random.default_rng(derive_seed("disturbed step"))
+    tolerance = np.asarray(bound.angular_acceleration)
+    size = DISTURBANCE * max(float(np.max(np.linalg.norm(state.omega, axis=1))), 1.0) / np.max(tolerance)
+    omega = state.omega + (size * tolerance)[:, None] * rng.normal(size=(model.n, 3))
+    return state_from_minimal(model, state.p, omega, state.u, state.udot)
+
+
+def _separation(links: LinkStates, i: int, count: int, weights: dict[str, Array]) -> float:
+    """How far the motion nearby is from motion i of ``count``, in units of the bounds of a step."""
+    found = []
+    for name, quantity in (("omega", "step_rate"), ("v", "step_velocity")):
+        motions = getattr(links, name)
+        with np.errstate(all="ignore"):
+            apart = np.asarray(motions[i] - motions[i + count], float)
+            found.append(np.linalg.norm(apart, axis=-1) / weights[quantity])
+    return float(np.max(found))
+
+
+def _rounded(links: LinkStates) -> State:
+    parts = (np.asarray(getattr(links, name), float) for name in ("p", "omega", "u", "udot", "r", "v"))
+    return State(*parts)
+
+
+def _differences(true: LinkStates, run: StepRun, count: int) -> dict[str, Array]:
+    """Differences (N, ·) per body; of attitudes twice those of quaternions as they are, not normalised."""
+    t = run.trajectory
+    p = t.p[count].astype(np.longdouble)
+    sign = np.where(np.sum(p * true.p, axis=-1, keepdims=True) < 0, -1, 1)
+    pairs = {
+        "step_position": (t.r[count], true.r),
+        "step_velocity": (t.v[count], true.v),
+        "step_rate": (angular_velocity(p, t.pdot[count]), true.omega),
+        "step_attitude": (2 * sign * p, 2 * true.p),
+    }
+    return {name: np.asarray(a - b, float) for name, (a, b) in pairs.items()}
+
+
+def _errors(true: LinkStates, run: StepRun, count: int) -> dict[str, Array]:
+    """Sizes (N,) of the differences."""
+    found = _differences(true, run, count)
+    return {name: np.linalg.norm(difference, axis=-1) for name, difference in found.items()}
+
+
+def _effects(bounds: tuple[RoundingBound, RoundingBound], h: float, count: int) -> dict[str, Array]:
+    """The accelerations' effect (N,) on each quantity: what a bound is compared with."""
+    turning, acceleration = (
+        h * count * np.max([np.asarray(b.scale[name]) for b in bounds], axis=0)
+        for name in ("angular_acceleration", "acceleration")
+    )
+    return {
+        "step_rate": turning,
+        "step_velocity": acceleration,
+        "step_attitude": h * turning,
+        "step_position": h * acceleration,
+    }
+
+
+# -- constraints and an iterative solver -------------------------------------------------------------
+
+
+def compare_parts(
+    method: ConstrainedMethod,
+    model: Model,
+    states: Sequence[State],
+    runs: Runs,
+) -> dict[str, Comparisons]:
+    """Compare an iterative engine's steps in parts that need no iteration.
+
+    Args:
+        method: the declared formula.
+        model: the pendulum.
+        states: states that the steps start from.
+        runs: the engine's steps.
+
+    Returns:
+        The differences by quantity: quadrature, equations, first acceleration.
+
+    """
+    found = {quantity: Comparisons() for quantity in CONSTRAINED_UNITS}
+    for index, h, run in runs:
+        place = Place(index, h, len(run.trajectory.t) - 1)
+        for difference, bound, effect in _quadrature_differences(method, run, h):
+            error = np.max(np.abs(difference), axis=-1)  # (T − 1, N)
+            worst = np.argmax(error / np.maximum(bound, np.finfo(float).tiny), axis=0)
+            body = np.arange(model.n)
+            found["step_quadrature"].add(error[worst, body], bound[worst, body], effect[worst, body], place)
+        residual = constrained_residual(model, method, run)
+        allowed = (
+            np.maximum(method.solver_atol, method.solver_rtol * residual.size)
+            + STEP_ROUNDINGS * EPS * residual.size
+        )
+        worst_step = int(np.argmax(residual.residual / allowed))
+        found["step_equations"].add(
+            residual.residual[worst_step : worst_step + 1], allowed[worst_step : worst_step + 1],
+            residual.size[worst_step : worst_step + 1], place,
+        )  # fmt: skip
+        first = first_coordinate_acceleration(model, states[index])
+        allowed = FIRST_ACCELERATION_RTOL * np.full(model.n, float(np.max(np.abs(first))))
+        error = np.asarray(np.max(np.abs(first - engine_coordinates(run)[2][0]), axis=-1), float)
+        found["step_first_acceleration"].add(error, allowed, np.zeros(model.n), place)
+    return found
+
+
+def quadrature_residuals(method: ConstrainedMethod, runs: Runs) -> Array:
+    """Return the differences of an engine's steps from the quadrature of its accelerations.
+
+    Args:
+        method: a formula, declared or not.
+        runs: the engine's steps.
+
+    Returns:
+        One vector over all runs, steps, bodies and coordinates, each in rounding bounds.
+
+    """
+    found = []
+    for _, h, run in runs:
+        for difference, bound, _ in _quadrature_differences(method, run, h):
+            found.append((difference / np.maximum(bound, np.finfo(float).tiny)[..., None]).ravel())
+    return np.concatenate(found)
+
+
+def _quadrature_differences(
+    method: ConstrainedMethod, run: StepRun, h: float
+) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
+    """Of q and q̇: differences (T − 1, N, 7), their bounds and the accelerations' effect (T − 1, N)."""
+    q, qdot, qddot = engine_coordinates(run)
+    size = [np.max(np.abs(np.asarray(x, float)), axis=-1) for x in (q, qdot, qddot)]
+    size[2] = np.maximum.accumulate(size[2], axis=0)  # the averaged a depends on all earlier ones
+    predicted_q, predicted_rate = constrained_quadrature(method, run, h)
+    roundings = STEP_ROUNDINGS * EPS
+    before = np.maximum(size[1][:-1], size[1][1:])
+    return (
+        (
+            np.asarray(predicted_q - q[1:], float),
+            roundings * (size[0][1:] + h * before + h * h * size[2][1:]),
+            h * h * size[2][1:],
+        ),
+        (
+            np.asarray(predicted_rate - qdot[1:], float),
+            roundings * (before + h * size[2][1:]),
+            h * size[2][1:],
+        ),
+    )

@@ -1,0 +1,71 @@
+"""The diagnosis of steps: planted integrators are named, and nothing else is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from plumbline.diagnosis.integrator_search import UNEXPLAINED, explain_steps
+from plumbline.engines.registry import load_adapter
+from plumbline.truth import step_formulas
+from tests.helpers.planted_steps import STEP_DEFECTS, planted_step, words_for
+from tests.judging.test_step import methods, stepped, subject
+
+for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
+    pytest.importorskip(engine)
+if not step_formulas.HAS_EXTENDED_PRECISION:
+    pytest.skip("no extended precision on this machine", allow_module_level=True)
+
+
+def explanation(adapter, integrator, joints="balls", has_drag=False, engine_sees=lambda model: model):
+    """Diagnosis of an adapter's steps on a model; the engine may see another one."""
+    model, states = subject(joints, has_drag)
+    answer = stepped(adapter, integrator, engine_sees(model), states)
+    return explain_steps(model, states, integrator.method, answer)
+
+
+@pytest.mark.parametrize("defect", STEP_DEFECTS, ids=[d.name for d in STEP_DEFECTS])
+def test_a_planted_integrator_is_named(defect):
+    integrator = load_adapter(defect.engine).integrator(defect.integrator)
+    with planted_step(defect) as adapter:
+        text = explanation(adapter, integrator, defect.joints, defect.has_drag)
+    words = words_for(defect)
+    assert words in text if words else text == UNEXPLAINED, text
+    assert "cannot distinguish" not in text, text
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "pinocchio", "exudyn", "exudyn-tree"])
+@pytest.mark.parametrize("joints", ["balls", "rods"])
+def test_no_integrator_is_named_where_none_is_wrong(engine, joints):
+    """The declared step; the declared step of other accelerations; steps with noise."""
+    adapter = load_adapter(engine)
+    for integrator in methods(engine):
+        assert "too close to the rounding bound" in explanation(adapter, integrator, joints)
+
+        def heavier(model):
+            return replace(model, gravity=model.gravity * (1 + 1e-5))
+
+        text = explanation(adapter, integrator, joints, engine_sees=heavier)
+        assert "behaves as if" not in text, text
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "pinocchio"])
+def test_a_wrong_axial_inertia_of_rods_is_named(engine):
+    adapter = load_adapter(engine)
+    integrator = adapter.integrators[0]
+    right = integrator.method.rod_axial_inertia
+    wrong = replace(integrator, method=replace(integrator.method, rod_axial_inertia=2 * right))
+    text = explanation(adapter, wrong, "mixed")
+    assert f"axial inertia of rods were {right:.3g}"[:36] in text and "behaves as if" in text, text
+
+
+def test_noise_is_not_named():
+    model, states = subject("balls")
+    integrator = load_adapter("mujoco").integrator("Euler")
+    answer = stepped(load_adapter("mujoco"), integrator, model, states)
+    rng = np.random.default_rng(1)
+    for attempt in answer.attempts:
+        attempt.run.trajectory.v[...] *= 1 + 1e-9 * rng.normal(size=attempt.run.trajectory.v.shape)
+    assert explain_steps(model, states, integrator.method, answer) == UNEXPLAINED
