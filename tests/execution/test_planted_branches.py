@@ -1,0 +1,90 @@
+"""Rare branches: what a run and a night compare suffices to report each planted one.
+
+A state is evaluated only where the defect alters what the engine is given, as elsewhere it cannot show.
+"""
+
+import itertools
+from functools import cache
+
+import numpy as np
+import pytest
+
+from plumbline.engines.calls import Evaluation
+from plumbline.engines.registry import load_adapter
+from plumbline.execution.plan import RANDOM_STATES, STATES_PER_RANDOM_SCENARIO
+from plumbline.judging.rows import RowContext
+from plumbline.judging.state import judge_states
+from plumbline.judging.step import STEP_STATES
+from plumbline.model.sampling import compared_states
+from plumbline.scenario.generator import RandomScenarios
+from plumbline.truth import step_formulas
+from plumbline.truth.ground_truth import state_truth
+from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.planted_branches import BRANCH_DEFECTS, BRANCH_STEPS
+from tests.helpers.planted_defects import plant
+from tests.helpers.planted_steps import planted_step
+from tests.judging.test_step import judged
+
+for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
+    pytest.importorskip(engine)
+
+pytestmark = pytest.mark.xdist_group("planted branches")  # the scenarios are made once
+WHO = RowContext("branches", "test", "engine", "engine", "0")
+RANDOM_COUNT = 200  # of a night
+SEED = 404
+MAX_BODIES = 10
+MAX_EVALUATED = 3  # states of a scenario
+
+
+@cache
+def problems():
+    """Scenarios of the catalogue and of a night, each with the states that are compared."""
+    chosen = [s for s in catalogue_scenarios().values() if s.model.n <= MAX_BODIES]
+    counts = [RANDOM_STATES] * len(chosen) + [STATES_PER_RANDOM_SCENARIO] * RANDOM_COUNT
+    chosen += list(RandomScenarios(SEED, RANDOM_COUNT))
+    return [
+        (s, compared_states(s.model, s.state, s.digest, count))
+        for s, count in zip(chosen, counts, strict=True)
+    ]
+
+
+def is_altered(defect, model, state):
+    other, at = defect.inputs(model, state)
+    fields = [(getattr(at, k), getattr(state, k)) for k in ("p", "omega", "u", "udot")]
+    fields += [(getattr(other, k), value) for k, value in vars(model).items()]
+    return not all(np.array_equal(a, b) for a, b in fields)
+
+
+def is_reported(defect, model, states):
+    truth = state_truth(model, states)
+    answers = plant(type(load_adapter(defect.engine)), defect).evaluate(model, states)
+    rows = judge_states(WHO, truth, Evaluation(answers, None, None, 0.0)).rows
+    return any(row.verdict == "disagrees" for row in rows)
+
+
+@pytest.mark.parametrize("defect", BRANCH_DEFECTS, ids=[d.name for d in BRANCH_DEFECTS])
+def test_a_defect_in_a_rare_branch_is_reported(defect):
+    reported = (
+        is_reported(defect, s.model, altered)
+        for s, states in problems()
+        if (altered := list(itertools.islice(
+            (state for state in states if is_altered(defect, s.model, state)), MAX_EVALUATED)))
+    )  # fmt: skip
+    assert any(reported), f"no scenario reports {defect.size}"
+
+
+@pytest.mark.skipif(not step_formulas.HAS_EXTENDED_PRECISION, reason="no extended precision on this machine")
+@pytest.mark.parametrize("defect", BRANCH_STEPS, ids=[d.name for d in BRANCH_STEPS])
+def test_a_step_in_a_rare_branch_is_reported(defect):
+    integrator = load_adapter(defect.engine).integrator(defect.integrator)
+    with planted_step(defect) as adapter:
+        assert any(
+            row.verdict == "disagrees"
+            for s, states in problems()
+            for row in judged(adapter, integrator, s.model, states[:STEP_STATES])
+        ), f"no scenario reports {defect.size}"
+
+
+def test_the_list_holds_thirty_branches_and_more():
+    assert len(BRANCH_DEFECTS) + len(BRANCH_STEPS) >= 44
+    assert len({d.name for d in (*BRANCH_DEFECTS, *BRANCH_STEPS)}) >= 44
