@@ -136,34 +136,3 @@ class ChunkBuilder:
         text += b" " * (-len(text) % 4)
         body = len(text).to_bytes(4, "little") + text + b"".join(self._parts)
         return base64.b64encode(gzip.compress(body, 9, mtime=0)).decode()
-
-
-def decode_chunk(chunk: str) -> Any:
-    """Decode a chunk as ``chunks.js`` does in the page.
-
-    Args:
-        chunk: base64, from `ChunkBuilder.encode`.
-
-    Returns:
-        The header, with the arrays in place of the references.
-
-    """
-    body = gzip.decompress(base64.b64decode(chunk))
-    length = int.from_bytes(body[:4], "little")
-    data = body[4 + length :]
-
-    def fill(value: Any) -> Any:
-        if isinstance(value, list):
-            return [fill(v) for v in value]
-        if not isinstance(value, dict):
-            return value
-        if "$" not in value:
-            return {k: fill(v) for k, v in value.items()}
-        offset, size, kind = value["$"]
-        width = int(kind[1])
-        raw = data[offset : offset + size * width]
-        if width == 2:
-            raw = bytes(b for pair in zip(raw[:size], raw[size:], strict=True) for b in pair)
-        return np.frombuffer(raw, dtype="<" + kind)
-
-    return fill(json.loads(body[4 : 4 + length]))

@@ -17,6 +17,7 @@ from unittest.mock import patch
 import numpy as np
 
 from plumbline.engines.adapter import Adapter
+from plumbline.model import equivalent
 from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, Trajectory
 from plumbline.model.kinematics import (
     quaternion_conjugate,
@@ -900,8 +901,6 @@ PAIRS = (
         (),
     ),
 )  # fmt: skip
-# Seen by nothing where an engine gives accelerations alone: masses and inertias scaled together.
-BLIND = next(d for d in STATE_DEFECTS if d.name == "mass-and-inertia-together")
 
 # --- equivalent implementations, none of which may be accused -------------------------------------
 
@@ -911,38 +910,18 @@ def negated(*bodies: int) -> Inputs:
     return lambda m, s: (m, replace(s, p=np.where(np.isin(np.arange(m.n), bodies)[:, None], -s.p, s.p)))
 
 
-def another_frame(q: Array) -> Defect:
-    """Every body described in axes turned by a unit quaternion, the answers turned back."""
-    turn = rotation_matrix(q)
+def in_axes(
+    q: Array,
+    rotate: Callable[[Model, State, Array], tuple[Model, State]],
+    unrotate: Callable[[dict[str, Any], Array], dict[str, Any]],
+) -> Defect:
+    """Everything described in axes rotated by a unit quaternion, the answers rotated back."""
 
-    def inputs(model: Model, state: State) -> tuple[Model, State]:
-        inertia = turn @ model.inertia @ turn.T
-        other = replace(
-            model, inertia=(inertia + inertia.mT) / 2, proximal=model.proximal @ turn.T,
-            distal=model.distal @ turn.T, moment=model.moment @ turn.T,
-        )  # fmt: skip
-        p = unit(quaternion_product(state.p, quaternion_conjugate(q)))
-        return other, state_from_minimal(other, p, state.omega @ turn.T, state.u, state.udot)
+    def answers(_: Model, __: list[State], found: list[StateQuantities]) -> list[StateQuantities]:
+        given = [{name: x for name, x in vars(a).items() if x is not None} for a in found]
+        return [replace(a, **unrotate(quantities, q)) for a, quantities in zip(found, given, strict=True)]
 
-    back = field("angular_acceleration", lambda _, __, a: a @ turn)
-    return Defect("", "", inputs=inputs, answers=back)
-
-
-def another_world(q: Array) -> Defect:
-    """Everything in world axes turned by a unit quaternion, the answers turned back."""
-    turn = rotation_matrix(q)
-
-    def inputs(model: Model, state: State) -> tuple[Model, State]:
-        other = replace(model, gravity=turn @ model.gravity, force=model.force @ turn.T)
-        p = unit(quaternion_product(q, state.p))
-        return other, state_from_minimal(other, p, state.omega, state.u @ turn.T, state.udot @ turn.T)
-
-    def back(m: Model, states: list[State], said: list[StateQuantities]) -> list[StateQuantities]:
-        for name in ("acceleration", "joint_reaction", "angular_momentum"):
-            said = field(name, lambda _, __, x: x @ turn)(m, states, said)
-        return said
-
-    return Defect("", "", inputs=inputs, answers=back)
+    return Defect("", "", inputs=lambda model, state: rotate(model, state, q), answers=answers)
 
 
 def other_units(mass: float, length: float) -> Defect:
@@ -1013,6 +992,10 @@ def sums(order: int) -> Callable[[Model, State, StateQuantities], dict[str, Any]
     return change
 
 
+BODY_AXES = (equivalent.rotate_body_frames, equivalent.unrotate_body_frames)
+WORLD_AXES = (equivalent.rotate_world, equivalent.unrotate_world)
+
+
 def control(name: str, size: str, engine: str, like: Defect, joints: str = "balls", **kind: Any) -> Defect:
     """A control with the changes of another defect; its mass matrix is not judged."""
     answers = after(like.answers, no_matrix)
@@ -1032,12 +1015,12 @@ CONTROLS = (
     Defect("minus-p-1", "-p of body 1", engine=M, inputs=negated(0)),
     Defect("minus-p-all", "-p of all bodies", engine=P, joints="rods", inputs=negated(0, 1)),
     Defect("minus-p-2", "-p of body 2", engine=E, loaded=True, inputs=negated(1)),
-    control("frames-turned", "other body axes", M, another_frame(ANY), loaded=True),
-    control("frames-permuted", "body axes exchanged", P, another_frame(HALF), "rods", loaded=True),
-    control("frames-turned-exudyn", "other body axes", E, another_frame(ANY), "rod-ball"),
-    control("world-turned", "other world axes", M, another_world(ANY), "rods", loaded=True),
-    control("world-permuted", "world axes exchanged", P, another_world(HALF), "balls", loaded=True),
-    control("world-turned-exudyn", "other world axes", E, another_world(ANY), "mixed"),
+    control("frames-turned", "other body axes", M, in_axes(ANY, *BODY_AXES), loaded=True),
+    control("frames-permuted", "body axes exchanged", P, in_axes(HALF, *BODY_AXES), "rods", loaded=True),
+    control("frames-turned-exudyn", "other body axes", E, in_axes(ANY, *BODY_AXES), "rod-ball"),
+    control("world-turned", "other world axes", M, in_axes(ANY, *WORLD_AXES), "rods", loaded=True),
+    control("world-permuted", "world axes exchanged", P, in_axes(HALF, *WORLD_AXES), "balls", loaded=True),
+    control("world-turned-exudyn", "other world axes", E, in_axes(ANY, *WORLD_AXES), "mixed"),
     control("grams", "mass in grams", M, other_units(1e3, 1.0), loaded=True),
     control("millimetres", "length in millimetres", P, other_units(1.0, 1e3), "rods", loaded=True),
     control("pounds-and-feet", "other units", E, other_units(2.2, 3.3), loaded=True),

@@ -22,6 +22,16 @@ def initial_values(state):
     return state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
 
 
+def make_stepper(forest, initial, table):
+    """A stepper before its first step, with the scales of the initial values."""
+    r, p, v, pdot = initial
+    stepper = collocation._Stepper(
+        forest, component_first(r, p), component_first(v, pdot), 1e-6, 1e-7, table, True, baumgarte=0.0
+    )
+    stepper.initialise_scales(*initial)
+    return stepper
+
+
 def run(model, state, rtol, times=TIMES, **options):
     return integrate_collocation([model], *initial_values(state), times, rtol, **options)
 
@@ -289,18 +299,7 @@ def test_a_batch_has_every_chains_own_sizes():
             np.concatenate(parts) for parts in zip(*(initial_values(s) for _, s in models), strict=True)
         )
         forest = StructuredSystem([model for model, _ in models])
-        stepper = collocation._Stepper(
-            forest,
-            component_first(r, p),
-            component_first(v, pdot),
-            1e-6,
-            1e-7,
-            gauss_tables(4),
-            True,
-            baumgarte=0.0,
-        )
-        stepper.initialise_scales(r, p, v, pdot)
-        return stepper
+        return make_stepper(forest, (r, p, v, pdot), gauss_tables(4))
 
     together, alone = sized(drawn), [sized([one]) for one in drawn]
     for name in ("q_size", "v_size"):
@@ -359,20 +358,9 @@ def test_a_step_is_made_where_its_error_is_within_the_tolerance(monkeypatch):
         return tails[-1]
 
     monkeypatch.setattr(collocation._Stepper, "_error_over_tolerance", noted)
-    r, p, v, pdot = initial_values(state)
     forest, found = StructuredSystem([model]), []
     for h in np.geomspace(0.01, 1.0, 60):
-        stepper = collocation._Stepper(
-            forest,
-            component_first(r, p),
-            component_first(v, pdot),
-            1e-6,
-            1e-7,
-            gauss_tables(8),
-            True,
-            baumgarte=0.0,
-        )
-        stepper.initialise_scales(r, p, v, pdot)
+        stepper = make_stepper(forest, initial_values(state), gauss_tables(8))
         tails.clear()
         made, slow = stepper.try_step(h)
         assert made == (bool(tails) and tails[0] <= 1)
@@ -409,9 +397,7 @@ def test_a_thousand_steps_add_up_to_the_last_digit():
     r, p, v, pdot = initial_values(state)
     forest, table = StructuredSystem([model]), gauss_tables(4)
     for push in (0.0, 0.3):
-        stepper = collocation._Stepper(
-            forest, component_first(r, p), component_first(v, pdot), 1e-6, 1e-7, table, True, baumgarte=0.0
-        )
+        stepper = make_stepper(forest, (r, p, v, pdot), table)
         first, a, h = (stepper.q, stepper.v), np.full((7, 4, 1), push), 0.1
         stepper.new_modes = table.node_to_mode @ a
         stepper._advance(a, h)
