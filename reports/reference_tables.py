@@ -96,8 +96,10 @@ def _stored_goals(path: Path) -> list[Record]:
     """Read the goals of figures.json and their measured values; raise DamagedResults where they are none."""
     try:
         goals: list[Record] = replace_unprintable(json.loads(path.read_text(encoding="utf-8"))["goals"])
-        if not all(isinstance(goal[name], int | float) for goal in goals for name in ("measured", "goal")):
-            raise ValueError("a goal or a measured value is no number")
+        kinds = {"what": str, "measured": int | float, "goal": int | float}
+        for name, kind in kinds.items():
+            if not all(isinstance(goal[name], kind) for goal in goals):
+                raise ValueError(f"a goal's {name!r} is of another kind")
     except (ValueError, LookupError, TypeError, RecursionError) as error:
         raise DamagedResults(f"{path}: not the figures of a benchmark ({error})") from None
     return goals

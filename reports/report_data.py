@@ -85,7 +85,7 @@ def _json_number(value: Any, digits: int = 6) -> Any:
     """Round to a few digits; None where the number is not finite."""
     if value is None or isinstance(value, str):
         return value
-    return float(f"{float(value):.{digits}g}") if np.isfinite(value) else None
+    return float(f"{float(value):.{digits}g}") if np.isfinite(float(value)) else None
 
 
 def index_chunk(results: Results, history: History) -> str:

@@ -179,7 +179,7 @@ class History:
             SELECT key, id, started, value, tolerance, unit, ratio, verdict
             FROM rows JOIN nights USING (night) WHERE key GLOB ? ORDER BY key, night
             """,
-            [pattern],
+            [pattern.encode("utf-8", "replace").decode()],  # what is no UTF-8 text matches no key
         )
 
     def first_bad(self) -> list[Record]:

@@ -87,7 +87,7 @@ def _check_shapes(what: str, given: dict[str, Any] | None, shapes: dict[str, tup
 class _Integrator(_Part):
     name: str
     kind: Literal["step", "tolerance"] = "step"
-    order: int = 0
+    order: _Count = 0
     note: str = ""
     alias_of: str | None = None
 
@@ -152,13 +152,13 @@ class _Row(_Part):
     uncertainty: float | None
     compared_until: float | None
     order: float | None
-    declared_order: int | None
+    declared_order: _Count | None
     alias_of: str | None
     known_issue: str | None
     diagnosis: str | None
     user_rtol: float | None
     cpu_time: _Duration
-    extra: dict[str, float | int | str | None]
+    extra: dict[str, float | str | None]
 
 
 class _Results(_Part):

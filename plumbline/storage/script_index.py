@@ -8,6 +8,8 @@ from pathlib import Path
 from plumbline.storage.results_schema import DamagedResults
 from plumbline.storage.results_store import write_atomically
 
+MAX_NAME_BYTES = 255  # of a file's name, on most file systems
+
 
 def scripts_folder(folder: Path) -> Path:
     """Return where stand-alone scripts of a run are kept.
@@ -60,4 +62,6 @@ def write_script_index(folder: Path, index: dict[str, str]) -> None:
 
 
 def _is_file_name(name: object) -> bool:
-    return isinstance(name, str) and bool(name) and name == Path(name).name and "\0" not in name
+    if not isinstance(name, str) or not name.isprintable() or name != Path(name).name:
+        return False
+    return 0 < len(name.encode()) <= MAX_NAME_BYTES

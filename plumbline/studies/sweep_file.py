@@ -179,9 +179,13 @@ def load(
     try:
         beside = path.parent / sweep.scenario
         file = beside if is_file(beside) else scenarios.find_scenario_file(sweep.scenario)
+        found = "" if is_file(file) else f"is {shorten(repr(sweep.scenario))}, and there is no such file"
+        valid = "a name of the catalogue, or the path of a scenario file beside this one"
     except ScenarioError as error:
-        report(("scenario",), "scenario", error.problems[0].message, error.problems[0].valid)
-        raise ScenarioError(problems) from None
+        found, valid = error.problems[0].message, error.problems[0].valid
+    if found:
+        report(("scenario",), "scenario", found, valid)
+        raise ScenarioError(problems)
     try:
         base = scenarios.load_scenario(file)
     except ScenarioError as error:

@@ -192,6 +192,10 @@ def test_a_missing_engine_and_a_truth_that_fails_are_rows(tmp_path):
         (("values: [-1, 1]", "values: [-1, 1], uniform: [0, 1]"), r":5:.*exactly one"),
         (("mujoco: RK4", "mujoko: RK4"), r":10:.*no engine"),
         (("scenario: double", "scenario: duble"), r":2:11: scenario: unknown scenario"),
+        (
+            ("scenario: double-", "scenario: ../"),
+            r":2:11: scenario: is '\.\./tumbling-balls', and there is no",
+        ),
         (("seed: 7", "seeds: 7"), r":8:1: seeds: unknown field. did you mean 'seed'"),
         (("points: 3", "points: 90000"), r":4:.*points: is 90000; valid would be a number at most 10000"),
         (("points: 3", "points: three"), r":4:.*points: is the text 'three', not a whole number"),
