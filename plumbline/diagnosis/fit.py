@@ -308,6 +308,8 @@ def fit_cause(
                 (slope,) = derivatives_by_amount(difference, [(cause, amount)])
         except np.linalg.LinAlgError:
             return None
+        if not np.any(slope):  # the fit has reached amounts whose changes have no effect
+            return None
         step = float(slope @ residual / (slope @ slope))
         amount += step
         resolution = 1 / float(np.linalg.norm(slope))

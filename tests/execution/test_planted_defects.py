@@ -148,6 +148,13 @@ def test_an_equivalent_implementation_is_not_accused(defect):
     assert not wrong, text
 
 
+@pytest.mark.parametrize("name", ["frames-turned", "world-permuted"])
+def test_answers_that_stay_in_other_axes_are_reported(name):
+    control = next(control for control in CONTROLS if control.name == name)
+    wrong, text = state_report(replace(control, name=f"{name}-for-good", answers=None))
+    assert wrong and text
+
+
 @pytest.mark.parametrize(("defect", "both"), PAIRS, ids=[d.name for d, _ in PAIRS])
 def test_causes_with_the_same_effect_are_named_together(defect, both):
     wrong, text = state_report(defect)
