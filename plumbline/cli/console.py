@@ -135,7 +135,9 @@ def print_result(result: RunResult) -> None:
         )
     matrix = VerdictMatrix(result.engines)
     for scenario in result.scenarios:
-        matrix.replace_rows(scenario, [row for row in result.rows if row.scenario == scenario])
+        matrix.replace_rows(scenario, [])
+    for row in result.rows:
+        matrix.add_rows(row.scenario, [row])
     print_matrix(matrix)
     for row in result.rows:
         is_silent = row.verdict in (Verdict.AGREES, Verdict.INFORMATION, Verdict.HARNESS_FAILED)
