@@ -62,10 +62,18 @@ TARGETS = {
     "judging": [
         *(
             f"plumbline/judging/{name}.py"
-            for name in ("convergence", "known_issues", "metamorphic*", "state", "trajectory*")
+            for name in (
+                "convergence",
+                "known_issues",
+                "metamorphic",
+                "refinement_analysis",
+                "run_relations",
+                "state*",
+                "trajectory",
+            )
         ),
         *(f"plumbline/truth/{name}.py" for name in ("ground_truth", "rounding_bound", "sensitivity")),
-        "plumbline/diagnosis/diagnose.py",
+        *(f"plumbline/diagnosis/{name}.py" for name in ("diagnose", "fit")),
         "plumbline/model/invariants.py",
     ],
 }
