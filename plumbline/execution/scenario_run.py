@@ -306,9 +306,11 @@ class ScenarioRun:
         if key.kind == TaskKind.STEP:
             return run_step_study, (integrator, s.model, self._step_states)
         if key.kind == TaskKind.TRAJECTORY:
-            steps = refinement_resolutions(integrator, s.model.n, s.duration, plan.extra_refinements)
+            steps = refinement_resolutions(
+                integrator, s.model.n, s.duration, plan.extra_refinements, s.sample_interval
+            )
             return run_refinement_study, (integrator.name, s.model, s.state, s.times, steps)
-        length = plan_long_run(integrator, s.model.n, plan.long_run_seconds)
+        length = plan_long_run(integrator, s.model.n, plan.long_run_seconds, s.sample_interval)
         return run_long_run_study, (integrator.name, s.model, s.state, s.sample_interval, length)
 
     def _judge(self, key: TaskKey) -> tuple[Callable[..., JudgingResult] | None, tuple[Any, ...]]:

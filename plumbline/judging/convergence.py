@@ -26,8 +26,25 @@ RTOL_FACTORS = (
 )  # relative tolerances of an adaptive method, over its tightest: no verdict needs more
 
 
+def step_unit(sample_interval: float) -> float:
+    """Return the unit of the steps 1, 1/2, 1/4, … that hit every sample.
+
+    Args:
+        sample_interval: time between samples [s].
+
+    Returns:
+        ``sample_interval`` times the power of two that brings it next to 1 [s]; 1 for a power of two.
+
+    """
+    return float(sample_interval * 2.0 ** -round(np.log2(sample_interval)))
+
+
 def refinement_resolutions(
-    integrator: Integrator, bodies: int, duration: float, extra_refinements: int = 0
+    integrator: Integrator,
+    bodies: int,
+    duration: float,
+    extra_refinements: int = 0,
+    sample_interval: float = 1.0,
 ) -> list[float]:
     """Choose the resolutions of a refinement study.
 
@@ -36,9 +53,11 @@ def refinement_resolutions(
         bodies: number of bodies; long chains stop where the finest run would pass `MAX_BODY_STEPS`.
         duration: length of the motion [s].
         extra_refinements: how many times the finest step is halved beyond that (in the nightly).
+        sample_interval: time between samples [s].
 
     Returns:
-        From coarse to fine at least four steps [s], powers of two; or two relative tolerances.
+        From coarse to fine at least four steps [s], powers of two of `step_unit`; or two relative
+        tolerances.
 
     """
     if integrator.kind == "tolerance":
@@ -46,7 +65,8 @@ def refinement_resolutions(
     coarse, fine = STEP_EXPONENTS[integrator.order]
     affordable = int(np.floor(np.log2(MAX_BODY_STEPS / (bodies * max(duration, 1.0)))))
     fine = max(min(fine, affordable), coarse + 3) + extra_refinements
-    return [2.0**-k for k in range(coarse, fine + 1)]
+    unit = step_unit(sample_interval)
+    return [unit * 2.0**-k for k in range(coarse, fine + 1)]
 
 
 def max_norm(y: Array) -> float:

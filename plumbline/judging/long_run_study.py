@@ -10,6 +10,7 @@ import numpy as np
 
 from plumbline.engines.calls import format_exception
 from plumbline.engines.registry import load_adapter
+from plumbline.judging.convergence import step_unit
 from plumbline.model.datatypes import Array, Integrator, Model, State, Trajectory, Unsupported
 from plumbline.model.invariants import INVARIANT_UNITS, compute_invariants, invariant_scales
 from plumbline.truth.ground_truth import stretched_length
@@ -74,13 +75,16 @@ class LongRunStudy:
     unsupported: str | None = None
 
 
-def plan_long_run(integrator: Integrator, bodies: int, seconds: float) -> LongRunPlan:
+def plan_long_run(
+    integrator: Integrator, bodies: int, seconds: float, sample_interval: float = 1.0
+) -> LongRunPlan:
     """Choose the affordable length and the resolutions of long runs.
 
     Args:
         integrator: has fixed steps of an order, or a tolerance.
         bodies: number of bodies.
         seconds: requested length [s].
+        sample_interval: time between samples [s].
 
     Returns:
         The plan; its length is halved until the finest run keeps to `MAX_BODY_STEPS` or `MAX_BODY_SECONDS`.
@@ -92,7 +96,7 @@ def plan_long_run(integrator: Integrator, bodies: int, seconds: float) -> LongRu
     else:
         coarse, fine = LONG_RUN_STEP_EXPONENTS[integrator.order]
         affordable = MAX_BODY_STEPS[integrator.order] / bodies / 2**fine
-        resolutions = tuple(2.0**-k for k in range(coarse, fine + 1))
+        resolutions = tuple(step_unit(sample_interval) * 2.0**-k for k in range(coarse, fine + 1))
     halvings = max(0, int(np.ceil(np.log2(seconds / affordable))))
     return LongRunPlan(seconds / 2**halvings, resolutions, seconds)
 

@@ -13,7 +13,7 @@ from unittest.mock import patch
 import numpy as np
 
 from plumbline.engines.adapter import Adapter
-from plumbline.engines.calls import Evaluation, run_refinement, run_steps
+from plumbline.engines.calls import Evaluation, run_refinement
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.convergence import refinement_resolutions
 from plumbline.judging.coverage import CoverageEntry, scenario_coverage
@@ -100,7 +100,7 @@ def judged_rows(name: str, level: Level, change: Change) -> list[Row]:
             answer = run_steps(STEP_ENGINE, STEP_INTEGRATOR, s.model, some, sizes, counts)
             return judge_steps(context, integrator, s.model, some, answer).rows
         integrator = adapter.integrator(MOTION_INTEGRATOR)
-        steps = refinement_resolutions(integrator, s.model.n, s.duration)
+        steps = refinement_resolutions(integrator, s.model.n, s.duration, 0, s.sample_interval)
         study = run_refinement(MOTION_ENGINE, MOTION_INTEGRATOR, s.model, s.state, s.times, steps)
     return judge_trajectory(context, s.model, true_motion(name), integrator, study).rows
 
