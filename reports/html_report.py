@@ -18,7 +18,7 @@ from markupsafe import Markup
 
 from plumbline.judging.rows import SHOWN_STYLES
 from plumbline.storage.results_store import write_atomically
-from reports import reference_tables, report_data
+from reports import coverage_table, reference_tables, report_data
 from reports.history import History
 from reports.results import Record, Results
 from reports.verdicts import (
@@ -128,6 +128,7 @@ def _render_template(
             comparison=_changes_since_last_passed(results, history),
             damaged=history.unreadable,
             nights=len(history.nights),
+            coverage=coverage_table.coverage_tables(results.folder),
             drifts=reference_tables.drift_table(results.folder),
             benchmarks=reference_tables.benchmark_table(results.folder),
             decimated=points,

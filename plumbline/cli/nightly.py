@@ -18,18 +18,23 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+import pyarrow as pa
+
 import reports
 from plumbline.execution.plan import LevelSelection, Plan, ProgressCallback, RunObserver
 from plumbline.execution.result_cache import DiskResultCache
 from plumbline.execution.runner import RunResult, run_plan, save
 from plumbline.execution.selftest import SelfTestResult
 from plumbline.judging.known_issues import KnownIssue, project_known_issues
-from plumbline.processes.workers import Limits
+from plumbline.processes.workers import Limits, WorkerPool
 from plumbline.reproduce.write import write_scripts
 from plumbline.scenario.generator import RANDOM_FAMILY, RandomScenarios
 from plumbline.scenario.loader import Scenario
 from plumbline.storage.history import next_night_number, stored_runs
 from plumbline.storage.results_store import write_atomically
+from plumbline.studies.coverage import FILE as COVERAGE_FILE
+from plumbline.studies.coverage import coverage_table, measure_coverage
+from plumbline.studies.tables import write_table
 
 EXTRA_REFINEMENTS = 1  # halvings of the finest step beyond a run's refinement study
 
@@ -170,7 +175,10 @@ def run_nightly(
     for name, about in result.scenarios.items():
         if about["family"] == RANDOM_FAMILY:
             about["file"] = (place / "scenarios" / f"{name}.yaml").as_posix()
+    coverage = night_coverage(result, plan, progress) if level == "all" else None
     save(result, folder, command)
+    if coverage is not None:
+        write_table(coverage, folder / COVERAGE_FILE)
     write_random_scenario_files(result, random_scenarios, folder / "scenarios")
     with result.cpu_times.measure("report"):
         write_scripts(folder)
@@ -179,6 +187,29 @@ def run_nightly(
     os.replace(folder, place)
     shutil.rmtree(unfinished)
     return result, place
+
+
+def night_coverage(result: RunResult, plan: Plan, progress: ProgressCallback) -> pa.Table:
+    """Compute the coverage of the night's catalogue, by the tolerances of its own rows.
+
+    Args:
+        result: the night's result.
+        plan: what was run.
+        progress: called after every scenario.
+
+    Returns:
+        The table of `plumbline.studies.coverage`.
+
+    Raises:
+        CoverageFailure: the coverage of a scenario could not be computed.
+
+    """
+    with WorkerPool(plan.jobs, plan.limits) as executor:
+        found = measure_coverage(
+            executor, plan.scenarios, result.rows, plan.random_state_count, progress=progress,
+            cpu_times=result.cpu_times,
+        )  # fmt: skip
+    return coverage_table(found)
 
 
 def unused_path(place: Path) -> Path:

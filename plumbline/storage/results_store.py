@@ -72,9 +72,25 @@ DRIFT_TABLE = _schema(
     cpu_seconds=REAL,  # of the run, to this time in proportion
     reason=TEXT,
 )
+COVERAGE_TABLE = _schema(
+    scenario=TEXT,
+    level=TEXT,
+    body=INTEGER,  # from 1; 0 for gravity
+    joint=TEXT,
+    kind=TEXT,
+    parameter=TEXT,
+    value=REAL,  # in ``unit``
+    unit=TEXT,
+    scale=REAL,  # in ``unit``
+    smallest=REAL,  # over ``scale``; null where the level sees no mistake
+    engine=TEXT,
+    row=TEXT,
+    proof=TEXT,
+)
+_STUDIES = {"drift": DRIFT_TABLE, "coverage": COVERAGE_TABLE}  # tables beside those of a run
 _NEVER_NULL = {  # columns by which readers group and sort
     "key", "scenario", "family", "engine", "level", "integrator", "quantity", "verdict", "state", "body",
-    "variant", "rtol", "time", "reason",
+    "variant", "rtol", "time", "reason", "kind", "parameter", "proof",
 }  # fmt: skip
 # What is made of results.json after it has been written; see `write_results`.
 _MADE_OF_RESULTS = ("report.html", "junit.xml", "summary.md", "scripts/index.json", "scripts/*.py")
@@ -236,7 +252,7 @@ def read_table(folder: Path, name: str) -> pa.Table:
 
     """
     path = folder / f"{name}.parquet"
-    schema = DRIFT_TABLE if name == "drift" else TABLES[name]
+    schema = _STUDIES.get(name) or TABLES[name]
     try:
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             table = file.read()

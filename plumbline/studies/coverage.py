@@ -10,31 +10,17 @@ import pyarrow as pa
 from plumbline.judging.coverage import COVERED_LEVELS, CoverageEntry, scenario_coverage
 from plumbline.judging.rows import Level, Row
 from plumbline.model.sampling import compared_states
+from plumbline.processes.cpu_time import CpuTimes
+from plumbline.processes.errors import PlumblineError
 from plumbline.processes.workers import Executor, Task
 from plumbline.scenario.loader import Scenario
+from plumbline.storage.results_store import COVERAGE_TABLE
 from plumbline.studies.tables import make_table
 
 FILE = "coverage.parquet"
-SCHEMA = pa.schema(
-    [
-        ("scenario", pa.string()),
-        ("level", pa.string()),
-        ("body", pa.int32()),  # from 1; 0 for gravity
-        ("joint", pa.string()),
-        ("kind", pa.string()),
-        ("parameter", pa.string()),
-        ("value", pa.float64()),
-        ("unit", pa.string()),
-        ("scale", pa.float64()),  # in ``unit``
-        ("smallest", pa.float64()),  # over ``scale``; null where the level sees no mistake
-        ("engine", pa.string()),
-        ("row", pa.string()),
-        ("proof", pa.string()),
-    ]
-)
 
 
-class CoverageFailure(Exception):
+class CoverageFailure(PlumblineError):
     """The coverage of a scenario could not be computed; the message names it and the reason."""
 
 
@@ -45,6 +31,7 @@ def measure_coverage(
     state_count: int,
     levels: Sequence[Level] = COVERED_LEVELS,
     progress: Callable[[int, int, str], None] = lambda done, total, what: None,
+    cpu_times: CpuTimes | None = None,
 ) -> list[CoverageEntry]:
     """Compute the coverage of scenarios.
 
@@ -55,6 +42,7 @@ def measure_coverage(
         state_count: random states per scenario at state level.
         levels: of `COVERED_LEVELS`.
         progress: called with scenarios done, scenarios in all and the last one.
+        cpu_times: gets the CPU time as "judging".
 
     Returns:
         The entries, in the order of the scenarios.
@@ -74,6 +62,8 @@ def measure_coverage(
         tasks.append(Task(s.name, scenario_coverage, arguments, executor.limits))
     found: dict[str, list[CoverageEntry]] = {}
     for outcome in executor.run(tasks):
+        if cpu_times is not None:
+            cpu_times.add_outcome(outcome, "judging")
         if outcome.failure:
             raise CoverageFailure(f"no coverage of {outcome.key}: {outcome.failure}")
         found[outcome.key] = outcome.value
@@ -88,10 +78,10 @@ def coverage_table(entries: Iterable[CoverageEntry]) -> pa.Table:
         entries: of `measure_coverage`.
 
     Returns:
-        One row per entry, with the columns of `SCHEMA`.
+        One row per entry, with the columns of `COVERAGE_TABLE`.
 
     """
-    return make_table([asdict(entry) for entry in entries], SCHEMA)
+    return make_table([asdict(entry) for entry in entries], COVERAGE_TABLE)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from plumbline.cli import nightly
@@ -88,9 +89,14 @@ def test_a_night_is_whole_and_remembered(tmp_path):
     result, place = run_nightly(tmp_path)
     assert {p.name for p in place.iterdir()} >= {
         "results.json", "summary.parquet", "states.parquet", "curves.parquet", "junit.xml",
-        "report.html", "summary.md",
+        "report.html", "summary.md", "coverage.parquet",
     }  # fmt: skip
     assert sorted(p.name for p in tmp_path.iterdir()) == ["history"]
+    covered = pq.read_table(place / "coverage.parquet").to_pylist()
+    assert {row["level"] for row in covered} == {"state", "step", "trajectory", "invariants"}
+    assert {row["engine"] for row in covered if row["smallest"]} <= {"", "mujoco"}
+    assert all(row["smallest"] or row["proof"] for row in covered)
+    assert 'id="coverage"' in (place / "report.html").read_text(encoding="utf-8")
     stored = json.loads((place / "results.json").read_text())["run"]
     assert (stored["seed"], stored["random"]) == (11, 3)
     kept = [row for row in result.rows if row.family == RANDOM_FAMILY]

@@ -7,6 +7,7 @@ import html
 import json
 import re
 import shutil
+from dataclasses import replace
 from typing import Any
 
 import pyarrow as pa
@@ -14,9 +15,12 @@ import pytest
 from click.testing import CliRunner
 
 from plumbline.cli.main import main
+from plumbline.judging.coverage import CoverageEntry
 from plumbline.storage.results_store import DRIFT_TABLE
 from plumbline.studies import sweep
+from plumbline.studies.coverage import coverage_table
 from plumbline.studies.tables import write_table
+from reports import coverage_table as coverage_page
 from reports import html_report, reference_tables, sweep_page
 from reports.results import Results, replace_unprintable
 from tests.helpers.example_results import HOSTILE, NASTY
@@ -34,6 +38,15 @@ DRIFT = [
     for name in ("tumbling-ball", HOSTILE)
     for variant in ("raw", "projected")
     for time in (10.0, 100.0)
+]
+SEEN = CoverageEntry(
+    "tumbling-ball", "state", 1, "ball", "mass", "mass", 1.3, "kg", 1.3, 3.2e-14, "reference", "acceleration"
+)  # fmt: skip
+COVERAGE = [
+    SEEN,
+    replace(SEEN, scenario=HOSTILE, smallest=4.5e-13, body=2),
+    replace(SEEN, level="step", smallest=None, proof=NASTY),
+    replace(SEEN, level="step", smallest=7.1e-12, scenario=HOSTILE),
 ]
 LEFT_OUT = {"scenario": "tumbling-ball", "variant": "raw", "rtol": 1e-9, "time": 1000.0, "reason": NASTY}
 
@@ -59,6 +72,7 @@ def sweep_rows():
 def out(example_run, tmp_path_factory):
     folder = shutil.copytree(example_run, tmp_path_factory.mktemp("pages") / "a run & more")
     write_table(pa.Table.from_pylist([*DRIFT, LEFT_OUT], schema=DRIFT_TABLE), folder / "drift.parquet")
+    write_table(coverage_table(COVERAGE), folder / "coverage.parquet")
     goals = [
         {"what": HOSTILE, "goal": 0.3, "measured": 0.12},
         {"what": NASTY, "goal": 4, "measured": 5.5},
@@ -112,6 +126,19 @@ def test_the_report_has_the_goals_and_the_pictures_as_inert_images(out):
     assert "example.org" not in found
     assert "<script" not in found
     assert HOSTILE not in found
+
+
+def test_the_report_has_the_coverage_and_the_reasons(out):
+    found = section((out / "report.html").read_text(encoding="utf-8"), "coverage")
+    assert "mass 3×10⁻¹⁴ … 5×10⁻¹³ 7×10⁻¹² … 7×10⁻¹² (1 of 2)" in words(found).replace("−", "⁻")
+    assert "none of 1" in words(found)
+    assert "step mass" in words(found) and replace_unprintable(NASTY).split()[0] in words(found)
+    assert HOSTILE in words(found)
+    assert HOSTILE not in found
+
+
+def test_without_coverage_the_report_has_no_such_section(tmp_path):
+    assert coverage_page.coverage_tables(tmp_path) is None
 
 
 def test_stored_measurements_stand_in_and_say_so(tmp_path):
