@@ -300,7 +300,12 @@ def _motion_entries(
     weak = [
         i
         for i in range(len(parameters))
-        if any(one.ratio[i] <= 1 / WEAK_MISTAKE for engines in ratios.values() for one in engines.values())
+        if any(
+            one.ratio[i] <= 1 / WEAK_MISTAKE
+            for level, engines in ratios.items()
+            for one in engines.values()
+            if not (level == "invariants" and parameters[i].kind in STATE_KINDS)
+        )
     ]
     if weak:  # a second, larger mistake shows whether the effect grows with its square, or is rounding
         again = [parameters[i] for i in weak]

@@ -26,6 +26,7 @@ from plumbline.model.invariants import (
 )
 from plumbline.model.kinematics import (
     angular_velocity,
+    cross_matrix,
     forward_kinematics,
     joint_vectors,
     mass_matrix,
@@ -42,7 +43,7 @@ from reference_impl.structured import StructuredSystem, component_first
 STATE_MISTAKE = 1e-4  # of a state's parameters, in central differences
 MOTION_MISTAKE = 1e-5  # of a parameter's scale, in the runs that show its effect on the motion
 MOTION_STEP = 2.0**-7  # s, largest step of those runs; both runs of a difference make the same error
-MAX_STEP_ANGLE = 0.125  # rad that the fastest mode turns in a step
+MAX_STEP_ANGLE = 0.25  # rad that the fastest mode turns in a step
 MAX_BATCH_BODIES = 4000  # of one batch of runs: more do not fit the processor's cache
 
 
@@ -61,6 +62,9 @@ class StateSensitivity:
         self.system = NewtonEulerSystem(model, state)
         self.A = rotation_matrix(state.p)
         self.omega = rotate_vectors(self.A, state.omega)
+        turning = cross_matrix(self.omega)
+        self.turning, self.swing = turning, cross_matrix(self.system.alpha) + turning @ turning
+        self.pull = cross_matrix(self.system.F)
         self.momentum = model.mass[:, None] * state.v
         self.spin = rotate_vectors(self.A, rotate_vectors(model.inertia, state.omega))
         # of body k and all beyond it
@@ -90,7 +94,7 @@ class StateSensitivity:
         elif parameter.kind == "inertia":
             E, w = _entry(parameter), self.state.omega[k]
             body_alpha = self.A[k].T @ system.alpha[k]
-            rows[k, 3:6] = -self.A[k] @ (E @ body_alpha + np.cross(w, E @ w))
+            rows[k, 3:6] = -self.A[k] @ (E @ body_alpha) - self.turning[k] @ (self.A[k] @ (E @ w))
         elif parameter.kind == "force":
             rows[k, AXES.index(parameter.entry)] = 1.0
         elif parameter.kind == "moment":
@@ -105,18 +109,18 @@ class StateSensitivity:
 
     def _add_geometry(self, parameter: Parameter, rows: Array) -> None:
         """A point's own terms, those of its joint, and the drag of the velocities beyond it."""
-        model, system, k = self.model, self.system, parameter.body
+        model, k = self.model, parameter.body
         arm, speed, first = self._shift(parameter)
         rows[first:, :3] -= model.drag_force[first:, None] * speed
         if parameter.kind == "length":
             rows[k, 6] = -np.sum(self.state.udot[k] ** 2)
             return
-        swing = np.cross(system.alpha[k], arm) + np.cross(self.omega[k], np.cross(self.omega[k], arm))
+        swing = self.swing[k] @ arm
         if parameter.kind == "proximal":  # arm = −A e: the centre moves away from the point
-            rows[k, 3:6] = np.cross(-arm, system.F[k])
+            rows[k, 3:6] = self.pull[k] @ arm
             rows[k, 6:] = self._joint_row(k, swing)
         elif k + 1 < model.n:
-            rows[k, 3:6] = -np.cross(arm, system.F[k + 1])
+            rows[k, 3:6] = self.pull[k + 1] @ arm
             rows[k + 1, 6:] = self._joint_row(k + 1, swing)
 
     def _shift(self, parameter: Parameter) -> tuple[Array, Array, int]:
@@ -126,7 +130,7 @@ class StateSensitivity:
             return self.state.u[k], self.state.udot[k], k
         sign, first = (-1.0, k) if parameter.kind == "proximal" else (1.0, k + 1)
         arm = sign * self.A[k][:, AXES.index(parameter.entry)]
-        return arm, np.cross(self.omega[k], arm), first
+        return arm, self.turning[k] @ arm, first
 
     def _joint_row(self, k: int, acceleration: Array) -> Array:
         """The rows of joint k that an acceleration enters."""
@@ -164,7 +168,7 @@ class StateSensitivity:
         if parameter.kind == "mass":
             v, r, W = state.v[k], state.r[k], self.W[k, :3]
             largest = float(np.max(np.sum(W * W, axis=0), initial=0.0))
-            return float(v @ v) / 2, abs(float(r @ model.gravity)), _norm(np.cross(r, v)), largest
+            return float(v @ v) / 2, abs(float(r @ model.gravity)), _norm(cross_matrix(r) @ v), largest
         if parameter.kind == "inertia":
             E, w = _entry(parameter), state.omega[k]
             return abs(float(w @ E @ w)) / 2, 0.0, _norm(E @ w), 1.0
@@ -173,8 +177,9 @@ class StateSensitivity:
         arm, speed, first = self._shift(parameter)
         if first >= model.n:
             return 0.0, 0.0, 0.0, 0.0
-        momentum = np.cross(arm, self.momentum_beyond[first]) + np.cross(
-            self.first_moment_beyond[first], speed
+        momentum = (
+            cross_matrix(arm) @ self.momentum_beyond[first]
+            + cross_matrix(self.first_moment_beyond[first]) @ speed
         )
         return (
             abs(float(self.momentum_beyond[first] @ speed)),
@@ -192,7 +197,7 @@ class StateSensitivity:
             change = np.eye(3) - np.outer(self.state.u[k], self.state.u[k])
         else:
             at = 3 * (rods + k)
-            change = np.cross(self.A[k].T, arm).T  # column j: velocity of the arm's end by ω′ about axis j
+            change = -cross_matrix(arm) @ self.A[k]  # column j: velocity of the arm's end by ω′ about axis j
         block = change.T @ self.W_beyond[first]
         own = block[:, at : at + 3] + block[:, at : at + 3].T
         block[:, at : at + 3] = own
@@ -208,7 +213,7 @@ def _entry(parameter: Parameter) -> Array:
 
 
 def _norm(v: Array) -> float:
-    return float(np.linalg.norm(v))
+    return float(np.sqrt(v @ v))
 
 
 def _suffix_sum(x: Array) -> Array:
