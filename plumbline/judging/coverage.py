@@ -31,7 +31,7 @@ from plumbline.truth.parameter_effects import (
     initial_state_effects,
     perturbed_motions,
 )
-from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters
+from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters, perturb
 from plumbline.truth.rounding_bound import EPS, state_rounding_bound
 from plumbline.truth.sensitivity import project_to_manifold
 from plumbline.truth.step_comparison import FormulaSteps
@@ -309,7 +309,9 @@ def _motion_entries(
     ]
     if weak:  # a second, larger mistake shows whether the effect grows with its square, or is rounding
         again = [parameters[i] for i in weak]
-        larger, _ = _motion_effects(model, state, times, again, quantities, LARGER_MISTAKE * MOTION_MISTAKE)
+        larger, true = _motion_effects(
+            model, state, times, again, quantities, LARGER_MISTAKE * MOTION_MISTAKE
+        )
         by_index = {i: {q: x[k] for q, x in larger.items()} for k, i in enumerate(weak)}
         ratios = _motion_ratios(tolerances, len(parameters), effects, by_index)
     along = np.linspace(0, len(times) - 1, PROOF_SAMPLES).astype(int)[1:]
@@ -328,11 +330,12 @@ def _motion_effects(
     parameters: Sequence[Parameter],
     quantities: set[str],
     size: float,
+    refinement: int = 1,
 ) -> tuple[dict[str, Array], Trajectory]:
     """Running maxima (P, T) of what mistakes of a size do to a motion, by quantity; and the true motion."""
     effects: dict[str, list[Array]] = {quantity: [] for quantity in quantities}
     true: Trajectory | None = None
-    for motion in perturbed_motions(model, state, times, parameters, mistake=size):
+    for motion in perturbed_motions(model, state, times, parameters, None, size, refinement):
         if motion.true is not true:
             true = motion.true
             invariants = compute_invariants(model, true) if quantities & set(INVARIANT_UNITS) else None
@@ -356,10 +359,9 @@ def _motion_ratios(
     larger: Mapping[int, Mapping[str, Array]],
 ) -> dict[Level, dict[str, _Ratios]]:  # fmt: skip
     """Effects over tolerances by level and engine; of some parameters by the order of the effect."""
-    engines = list(dict.fromkeys(one.row.engine for one in tolerances))
     ratios: dict[Level, dict[str, _Ratios]] = {}
     for one in tolerances:
-        by_engine = ratios.setdefault(one.row.level, {engine: _Ratios(count) for engine in engines})
+        of_engine = ratios.setdefault(one.row.level, {}).setdefault(one.row.engine, _Ratios(count))
         label = f"{one.row.integrator} {one.row.quantity}"
         for i in range(count):
             effect = float(effects[one.quantity][i, one.last_sample])
@@ -370,7 +372,7 @@ def _motion_ratios(
                     ratio = 0.0  # rounding
                 elif growth > 2 * LARGER_MISTAKE:  # grows with the square of the mistake
                     ratio = float(np.sqrt(effect / one.tolerance)) / MOTION_MISTAKE
-            by_engine[one.row.engine].add(i, ratio, label)
+            of_engine.add(i, ratio, label)
     return ratios
 
 
@@ -394,6 +396,8 @@ def _proofs(
             for i, one in enumerate(parameters)
             if one.kind in STATE_KINDS
         }
+    if level == "state":
+        found = _state_proofs(model, states[0], parameters, by_engine)
     blunt = np.min([ratios.ratio for ratios in by_engine.values()], axis=0) <= 1 / DOUBTFUL_MISTAKE
     unseen = [i for i in map(int, np.flatnonzero(blunt)) if parameters[i].kind not in STATE_KINDS]
     if not unseen:
@@ -414,6 +418,28 @@ def _proofs(
             found[i] = f"its term in the equations of motion, {term}, is zero {where}"
         elif pull[k] <= NO_EFFECT and level != "state":
             found[i] = f"joint forces alone take up its term, {term}, {where}: no acceleration changes"
+    return found
+
+
+def _state_proofs(
+    model: Model, state: State, parameters: Sequence[Parameter], by_engine: Mapping[str, _Ratios]
+) -> dict[int, str]:
+    """The parameters of the initial state on which no compared quantity depends, up to a tenth."""
+    ratio = np.min([ratios.ratio for ratios in by_engine.values()], axis=0)
+    found = {}
+    for i, one in enumerate(parameters):
+        if one.kind not in STATE_KINDS or ratio[i] > 1 / MAX_MISTAKE:
+            continue
+        effects = []
+        for size in (0.0, MAX_MISTAKE / 3, MAX_MISTAKE):
+            changed = perturb(model, state, one, size)[1]
+            bounds = state_rounding_bound(model, changed)
+            effects += [
+                float(np.max(effect / np.maximum(np.asarray(bounds.tolerance(quantity)), TINY)))
+                for quantity, effect in initial_state_effects(model, changed, [one], MAX_MISTAKE).items()
+            ]
+        if max(effects) * one.scale * MAX_MISTAKE <= 1:
+            found[i] = "no quantity at the initial state changes with it: their derivatives vanish"
     return found
 
 

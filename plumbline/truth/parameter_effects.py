@@ -221,19 +221,22 @@ def _suffix_sum(x: Array) -> Array:
     return np.asarray(np.cumsum(x[::-1], axis=0)[::-1])
 
 
-def initial_state_effects(model: Model, state: State, parameters: Sequence[Parameter]) -> dict[str, Array]:
+def initial_state_effects(
+    model: Model, state: State, parameters: Sequence[Parameter], mistake: float = STATE_MISTAKE
+) -> dict[str, Array]:
     """Return the effects of unit changes of a state's parameters on every state quantity.
 
     Args:
         model: the mechanism.
         state: minimal coordinates and rates, on the constraint manifold.
         parameters: P parameters of the state, at least one.
+        mistake: size of the central differences, as a fraction of each scale.
 
     Returns:
         As `StateSensitivity.effects`.
 
     """
-    d = STATE_MISTAKE
+    d = mistake
     states = [perturb(model, state, one, sign * d)[1] for one in parameters for sign in (1, -1)]
     r, p, v, omega = (np.concatenate([getattr(s, name) for s in states]) for name in ("r", "p", "v", "omega"))
     solved = StructuredSystem([model]).repeated(len(states)).solve(r, p, v, quaternion_rate(p, omega))
@@ -282,6 +285,7 @@ def perturbed_motions(
     parameters: Sequence[Parameter],
     substeps: int | None = None,
     mistake: float = MOTION_MISTAKE,
+    refinement: int = 1,
 ) -> Iterator[PerturbedMotion]:
     """Simulate a motion with each parameter off by a fraction of its scale.
 
@@ -292,6 +296,7 @@ def perturbed_motions(
         parameters: of `list_parameters`.
         substeps: Runge-Kutta steps between two samples; None for as many as the motion needs.
         mistake: the fraction.
+        refinement: multiplies the number of steps.
 
     Yields:
         The motions, in the order of the parameters.
@@ -305,7 +310,7 @@ def perturbed_motions(
     for first in range(0, len(parameters), size):
         part = parameters[first : first + size]
         cases = [(model, state), *(perturb(model, state, one, mistake) for one in part)]
-        true, *runs = _simulate_batch(cases, times, substeps)
+        true, *runs = _simulate_batch(cases, times, substeps * refinement)
         for parameter, run in zip(part, runs, strict=True):
             yield PerturbedMotion(parameter, run, true)
 
