@@ -13,13 +13,14 @@ from unittest.mock import patch
 import numpy as np
 
 from plumbline.engines.adapter import Adapter
-from plumbline.engines.calls import Evaluation, run_refinement
+from plumbline.engines.calls import Evaluation
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.convergence import refinement_resolutions
 from plumbline.judging.coverage import CoverageEntry, scenario_coverage
+from plumbline.judging.refinement_study import run_refinement_study
 from plumbline.judging.rows import Level, Row, RowContext
 from plumbline.judging.state import judge_states
-from plumbline.judging.step import STEP_STATES, judge_steps, step_sizes
+from plumbline.judging.step import STEP_STATES, judge_steps, run_step_study
 from plumbline.judging.trajectory import judge_trajectory
 from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, StepRun, Trajectory
 from plumbline.model.sampling import compared_states
@@ -27,7 +28,6 @@ from plumbline.scenario.loader import Scenario, load_scenarios
 from plumbline.truth.closed_form import closed_form_motion
 from plumbline.truth.ground_truth import MotionTruth, StateTruth, motion_truth, state_truth
 from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters, perturb
-from plumbline.truth.step_comparison import step_counts
 
 STATES = 50
 STATE_ENGINE, STEP_ENGINE, STEP_INTEGRATOR = "reference", "pinocchio", "rkmk4"
@@ -95,13 +95,11 @@ def judged_rows(name: str, level: Level, change: Change) -> list[Row]:
     with patch("plumbline.engines.calls.load_adapter", lambda _: adapter):
         if level == "step":
             integrator, some = adapter.integrator(STEP_INTEGRATOR), states(name)[:STEP_STATES]
-            assert integrator.method is not None
-            sizes, counts = step_sizes(False, s.model, some), step_counts(integrator.method)
-            answer = run_steps(STEP_ENGINE, STEP_INTEGRATOR, s.model, some, sizes, counts)
+            answer = run_step_study(STEP_ENGINE, integrator, s.model, some)
             return judge_steps(context, integrator, s.model, some, answer).rows
         integrator = adapter.integrator(MOTION_INTEGRATOR)
         steps = refinement_resolutions(integrator, s.model.n, s.duration, 0, s.sample_interval)
-        study = run_refinement(MOTION_ENGINE, MOTION_INTEGRATOR, s.model, s.state, s.times, steps)
+        study = run_refinement_study(MOTION_ENGINE, MOTION_INTEGRATOR, s.model, s.state, s.times, steps)
     return judge_trajectory(context, s.model, true_motion(name), integrator, study).rows
 
 
