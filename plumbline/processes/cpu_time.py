@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from plumbline.processes.workers import Outcome, ResultCache, Task
 
 CPU_TIME_KINDS = ("engines", "reference", "truth", "diagnosis", "process", "judging", "storage", "report")
+MIN_ENGINE_TIME = 5.0  # s
 
 
 class CpuTimes:
@@ -101,12 +102,13 @@ class CpuTimes:
         """Describe the CPU times in words.
 
         Returns:
-            The total, the seconds by kind, and the harness's time over the engines' own.
+            The total, the seconds by kind, and the harness's time over the engines' own; of less than
+            `MIN_ENGINE_TIME` of the engines a ratio would say nothing.
 
         """
         total, engines = sum(self.seconds.values()), self.seconds["engines"]
         parts = ", ".join(f"{kind} {s:.1f}" for kind, s in self.seconds.items())
-        if not engines:
+        if engines < MIN_ENGINE_TIME:
             return f"CPU {total:.1f} s: {parts}"
         calls = sum(self.seconds[kind] for kind in ("engines", "reference", "truth", "diagnosis"))
         return (
