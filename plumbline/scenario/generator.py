@@ -24,7 +24,7 @@ MOTION_MOMENT = 0.02  # moments of loads and drag in a random motion, over those
 MOTION_PREFIX = "random-motion-"
 SPECIAL_INDICES = (0, 2)  # modulo 5: of scenarios with special values
 SPECIAL_CHANCE = 0.4  # of each kind of special value in such a scenario
-MOTION_SAMPLE = 2.0**-5  # s, the coarsest step of an order-4 method
+MOTION_SAMPLE = 2.0**-5  # s, the coarsest step of an order-4 method; the work of loads is a quadrature
 LOADED_MOTION_SAMPLE = (
     2.0**-7
 )  # s, as the catalogue's: the work of loads and drag is a quadrature over samples
@@ -126,8 +126,6 @@ def random_motion(seed: int, index: int) -> Scenario:
         "bodies": bodies,
     }
     _specialize(content, "random motion", seed, index, MOTION_MOMENT)
-    if any("load" in body or "drag" in body for body in bodies):
-        content["sample"] = LOADED_MOTION_SAMPLE
     return scenario_from_dict(content, f"{content['name']}.yaml")
 
 

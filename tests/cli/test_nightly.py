@@ -203,5 +203,4 @@ def test_random_motions_do_not_change_the_other_random_scenarios():
     assert {one.model.n for one in motions} == {1, 2, 3}
     assert all(one.closed_form is None for one in motions)
     assert {bool(np.any(one.model.force)) for one in motions} == {True, False}
-    assert all(one.sample_interval == 2.0**-7 for one in motions if one.model.has_drag or one.model.has_loads)
     assert {one.model.has_drag for one in motions} == {True, False}
