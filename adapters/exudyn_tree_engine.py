@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from math import remainder, tau
+from math import cos, remainder, tau
 from typing import Any, ClassVar
 
 import exudyn
@@ -253,8 +253,8 @@ class _KinematicTree:
         """Raise Unsupported once a middle angle is near ±90°."""
         angles = self.mbs.systemData.GetODE2Coordinates()
         for group in self.revolute_groups:
-            middle = float(angles[group.first_angle + 1])
-            if np.cos(middle) < MIN_COS_MIDDLE_ANGLE:
+            middle = angles[group.first_angle + 1]
+            if cos(middle) < MIN_COS_MIDDLE_ANGLE:
                 what = "rod" if group.angle_count == 2 else "ball joint"
                 raise Unsupported(
                     f"the angles of the {what} of body {group.body + 1} come near their singularity at "
