@@ -20,8 +20,8 @@ from functools import cache
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
 
-from reference_impl.chain import Array, Chain
 from reference_impl.integrate import IntegrationResult, state_scales
+from reference_impl.mechanism import Array, Mechanism
 from reference_impl.structured import StructuredSystem, component_first
 
 DEFAULT_NODES = 16  # a sweep of a small chain costs NumPy's calls and not its nodes: 8 … 20 were tried
@@ -107,7 +107,7 @@ def gauss_tables(S: int) -> GaussTables:
 
 
 def integrate_collocation(
-    chains: Sequence[Chain] | StructuredSystem,
+    chains: Sequence[Mechanism] | StructuredSystem,
     r: Array,
     p: Array,
     v: Array,

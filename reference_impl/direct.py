@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from reference_impl.chain import Array, Chain
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import L, angular_velocity, dot
 from reference_impl.joints import ConstraintRows, constraint_rows, far_body_values, joint_of_rows
+from reference_impl.mechanism import Array, Mechanism
 
 EPS = float(np.finfo(float).eps)
 
@@ -37,7 +37,7 @@ class DirectSystem:
     (λ_k, r̈_k, p̈_k, λ_E,k), where they fill a band of width 10 beside the diagonal whatever N is.
     """
 
-    def __init__(self, chain: Chain) -> None:
+    def __init__(self, chain: Mechanism) -> None:
         self.chain = chain
         n, joint = chain.n, joint_of_rows(chain)
         c = len(joint)
@@ -269,7 +269,7 @@ def is_singular(pivots: Array) -> bool:
 
 
 def check_state_solvable(
-    chain: Chain, r: Array, p: Array, d: Array, rods: NDArray[np.bool_], entries: tuple[Array, ...]
+    chain: Mechanism, r: Array, p: Array, d: Array, rods: NDArray[np.bool_], entries: tuple[Array, ...]
 ) -> None:
     """Check that the state alone does not make S singular (E1, E7).
 
@@ -307,7 +307,7 @@ def check_state_solvable(
         )
 
 
-def _check_pivots(chain: Chain, pivots: Array) -> None:
+def _check_pivots(chain: Mechanism, pivots: Array) -> None:
     """Raise SingularSystem with the likeliest cause where the factored S is singular to rounding."""
     if not is_singular(pivots):
         return

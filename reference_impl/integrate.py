@@ -9,9 +9,9 @@ import numpy as np
 from scipy.integrate import DOP853
 
 from reference_impl import notes
-from reference_impl.chain import Array, Chain
 from reference_impl.direct import DirectSystem
 from reference_impl.euler_parameters import angular_velocity
+from reference_impl.mechanism import Array, Mechanism
 from reference_impl.structured import StructuredSystem, component_first
 
 Acceleration = Callable[[Array, Array, Array, Array], Array]  # r̈ and p̈, (7 N,), at r, p, ṙ, ṗ (N, ·)
@@ -62,7 +62,7 @@ def unpack_state(y: Array, n: int) -> tuple[Array, Array, Array, Array]:
     return r, p, v, pdot
 
 
-def direct_acceleration(chain: Chain, gamma_defect: float | Array = 0.0) -> Acceleration:
+def direct_acceleration(chain: Mechanism, gamma_defect: float | Array = 0.0) -> Acceleration:
     """Return the right-hand side of the direct form.
 
     Args:
@@ -77,7 +77,7 @@ def direct_acceleration(chain: Chain, gamma_defect: float | Array = 0.0) -> Acce
     return lambda r, p, v, pdot: system.solve_unknowns(r, p, v, pdot, gamma_defect)[0][: 7 * chain.n]
 
 
-def structured_acceleration(chain: Chain) -> Acceleration:
+def structured_acceleration(chain: Mechanism) -> Acceleration:
     """Return the right-hand side of the structured form, which takes less time on long chains.
 
     Args:
@@ -96,7 +96,7 @@ def structured_acceleration(chain: Chain) -> Acceleration:
     return acceleration
 
 
-def notes_acceleration(chain: Chain) -> Acceleration:
+def notes_acceleration(chain: Mechanism) -> Acceleration:
     """Return the right-hand side by the equations exactly as the notes print them.
 
     Args:
@@ -109,7 +109,7 @@ def notes_acceleration(chain: Chain) -> Acceleration:
     return lambda *state: notes.solve_system(chain, *state)[: 7 * chain.n]
 
 
-def state_scales(chain: Chain, r: Array, p: Array, v: Array, pdot: Array) -> Array:
+def state_scales(chain: Mechanism, r: Array, p: Array, v: Array, pdot: Array) -> Array:
     """Return the size that each part of y has in this motion, for absolute tolerances.
 
     A coordinate that passes through zero needs no more digits there than the motion as a whole: the
@@ -138,7 +138,7 @@ def state_scales(chain: Chain, r: Array, p: Array, v: Array, pdot: Array) -> Arr
 
 
 def integrate_dop853(
-    chain: Chain,
+    chain: Mechanism,
     r: Array,
     p: Array,
     v: Array,

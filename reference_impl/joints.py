@@ -22,8 +22,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from reference_impl.chain import Chain
 from reference_impl.euler_parameters import I3, A, AnyArray, B, G, L, dot, outer
+from reference_impl.mechanism import Mechanism
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ def far_body_values(x: AnyArray) -> AnyArray:
     return np.concatenate([np.zeros_like(x[:1]), x[:-1]])
 
 
-def joint_of_rows(chain: Chain) -> NDArray[np.intp]:
+def joint_of_rows(chain: Mechanism) -> NDArray[np.intp]:
     """Number the rows of C by their joints.
 
     Args:
@@ -98,7 +98,7 @@ class _RowLayout:
 
 
 @lru_cache(maxsize=64)  # chains are never changed, and a run uses the same one ten thousand times
-def _row_layout(chain: Chain) -> _RowLayout:
+def _row_layout(chain: Mechanism) -> _RowLayout:
     k = np.arange(chain.n)
     s = np.stack([chain.proximal, far_body_values(chain.distal)])
     rod, ball = np.flatnonzero(chain.rods), np.flatnonzero(~chain.rods)
@@ -116,7 +116,9 @@ def _row_layout(chain: Chain) -> _RowLayout:
     )
 
 
-def constraint_rows(chain: Chain, r: AnyArray, p: AnyArray, v: AnyArray, pdot: AnyArray) -> ConstraintRows:
+def constraint_rows(
+    chain: Mechanism, r: AnyArray, p: AnyArray, v: AnyArray, pdot: AnyArray
+) -> ConstraintRows:
     """Evaluate C, C_r, C_p and γ of every joint (S1–S4, D2–D6 for rods; E1, N8 for balls).
 
     Args:

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from reference_impl.chain import Array, Chain
 from reference_impl.direct import check_state_solvable, solve_dense
 from reference_impl.euler_parameters import A, A_rate, AnyArray, B, G, H, L, outer
+from reference_impl.mechanism import Array, Mechanism
 
 Number = Any  # float, complex or exact
 
@@ -153,7 +153,7 @@ def block_diagonal(blocks: Array) -> Array:
     return matrix.reshape(n * i, n * j)
 
 
-def assemble_system(chain: Chain, r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, Array]:
+def assemble_system(chain: Mechanism, r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, Array]:
     """Assemble S and b of (N5) for one body (S1–S5) or two (D1–D6); every joint is read as a rod.
 
     Args:
@@ -204,7 +204,7 @@ def assemble_system(chain: Chain, r: Array, p: Array, v: Array, pdot: Array) -> 
     return S, np.concatenate(b)
 
 
-def solve_system(chain: Chain, r: Array, p: Array, v: Array, pdot: Array) -> Array:
+def solve_system(chain: Mechanism, r: Array, p: Array, v: Array, pdot: Array) -> Array:
     """Solve (N5) for x = (r̈, p̈, λ, λ_E).
 
     Args:

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reference_impl.chain import Array, Chain
 from reference_impl.collocation import DEFAULT_NODES, BatchIntegrationResult, integrate_collocation
 from reference_impl.euler_parameters import angular_velocity
 from reference_impl.integrate import IntegrationResult
+from reference_impl.mechanism import Array, Mechanism
 from reference_impl.structured import StructuredSystem, component_first
 
 BAUMGARTE_RATE = 10.0  # 1/s
@@ -38,7 +38,7 @@ class DriftRow:
 
 def integrate_variant(
     variant: str,
-    chain: Chain,
+    chain: Mechanism,
     r: Array,
     p: Array,
     v: Array,
@@ -83,7 +83,7 @@ def integrate_variant(
 
 
 def drift_table(
-    chain: Chain,
+    chain: Mechanism,
     r: Array,
     p: Array,
     v: Array,
@@ -123,7 +123,7 @@ def drift_table(
     return table
 
 
-def constraint_errors(chain: Chain, motion: IntegrationResult) -> tuple[Array, Array, Array]:
+def constraint_errors(chain: Mechanism, motion: IntegrationResult) -> tuple[Array, Array, Array]:
     """Measure the constraint errors of a motion, of the worst joint or body at each sample.
 
     Args:
@@ -146,7 +146,7 @@ def constraint_errors(chain: Chain, motion: IntegrationResult) -> tuple[Array, A
     return gap, gap_rate, norm
 
 
-def energy_error(chain: Chain, motion: IntegrationResult) -> Array:
+def energy_error(chain: Mechanism, motion: IntegrationResult) -> Array:
     """Measure the change of the energy.
 
     Args:

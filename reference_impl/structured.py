@@ -24,11 +24,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import lapack
 
-from reference_impl.chain import Array, Chain
 from reference_impl.direct import EPS, Solution, check_state_solvable
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import G, L, tilde
 from reference_impl.joints import joint_of_rows
+from reference_impl.mechanism import Array, Mechanism
 
 # Constants that turn flattened outer products of p with another vector into what is needed of them.
 _L, _G = L(np.eye(4)), G(np.eye(4))  # (4, 3, 4) each: L(p) = Σ pᵢ Lᵢ
@@ -90,7 +90,7 @@ class StructuredSystem:
     what they call take the component-first q = (r; p), v = (ṙ; ṗ), (7, M) each.
     """
 
-    def __init__(self, chains: Sequence[Chain]) -> None:
+    def __init__(self, chains: Sequence[Mechanism]) -> None:
         self.chains = tuple(chains)
         mass, inertia, proximal, distal, length = (
             np.concatenate([getattr(chain, name) for chain in chains])

@@ -1,6 +1,6 @@
 """The data that packages exchange: small frozen dataclasses of NumPy arrays.
 
-`Model`, the mechanism, is the reference's `Chain` under the name that scenarios and engines use.
+`Model`, the mechanism, is the reference's `Mechanism` under the name that scenarios and engines use.
 
 Frames and units, everywhere: SI; world z up, pivot at the world origin; ``r`` is a centre of mass in the
 world frame; quaternions are scalar first and turn body vectors into world vectors; ``omega`` is the angular
@@ -14,10 +14,10 @@ from typing import Literal
 
 from plumbline.model.step_methods import StepMethod
 from plumbline.processes.errors import PlumblineError
-from reference_impl.chain import Array as Array
-from reference_impl.chain import Chain
+from reference_impl.mechanism import Array as Array
+from reference_impl.mechanism import Mechanism
 
-Model = Chain
+Model = Mechanism
 
 
 class Unsupported(PlumblineError):

@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from reference_impl.chain import Array, Chain
 from reference_impl.collocation import BatchIntegrationResult, integrate_collocation
+from reference_impl.mechanism import Array, Mechanism
 from reference_impl.structured import StructuredSystem
 
 
@@ -32,8 +32,8 @@ class RodLengthStudy:
 
 
 def replace_balls_by_rods(
-    ball: Chain, r: Array, p: Array, v: Array, pdot: Array, length: float
-) -> tuple[Chain, Array, Array]:
+    ball: Mechanism, r: Array, p: Array, v: Array, pdot: Array, length: float
+) -> tuple[Mechanism, Array, Array]:
     """The chain with every ball joint made a rod of ``length`` m, and its r, ṙ (N, 3) on the slow manifold.
 
     r, ṙ (N, 3), p, ṗ (N, 4) are of the ball-jointed chain; p and ṗ stay.  Raises ValueError where
@@ -44,7 +44,9 @@ def replace_balls_by_rods(
     return rods, r + np.cumsum(length * u, axis=0), v + np.cumsum(length * udot, axis=0)
 
 
-def slow_manifold_directions(ball: Chain, r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, Array]:
+def slow_manifold_directions(
+    ball: Mechanism, r: Array, p: Array, v: Array, pdot: Array
+) -> tuple[Array, Array]:
     """U = −F/‖F‖ (N, 3) of the ball joints' forces, and u̇ (1/s) along the ball's motion.
 
     u̇ is the slope of the polynomial of degree 8 through u at nine times of the next instant.
@@ -71,7 +73,7 @@ def slow_manifold_directions(ball: Chain, r: Array, p: Array, v: Array, pdot: Ar
 
 
 def study_rod_limit(
-    ball: Chain,
+    ball: Mechanism,
     r: Array,
     p: Array,
     v: Array,

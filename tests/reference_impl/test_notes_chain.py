@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from reference_impl.chain import Chain
 from reference_impl.euler_parameters import dot
 from reference_impl.joints import constraint_rows
+from reference_impl.mechanism import Mechanism
 from reference_impl.notes import DoublePendulum, SinglePendulum
 from tests.helpers.notes_test_data import Symbols, state_off_manifold, state_on_manifold
 from tests.helpers.random_chains import random_model
@@ -17,7 +17,7 @@ def symbolic_chain(rods):
     x = Symbols(bodies=n, attachments=2 * n)
     none = np.zeros(n)
     length = np.where(rods, np.arange(2, 2 + n), 0)
-    chain = Chain(none, none, x.s[:n], x.s[n:], length, none, none, none, none, none)
+    chain = Mechanism(none, none, x.s[:n], x.s[n:], length, none, none, none, none, none)
     return x, chain, constraint_rows(chain, x.r, x.p, x.v, x.pdot)
 
 

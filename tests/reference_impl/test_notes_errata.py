@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from reference_impl import notes
-from reference_impl.chain import Chain
 from reference_impl.direct import DirectSystem, check_state_solvable, solve_dense
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import I3, A, A_rate, L, dAs_dp, dot
 from reference_impl.integrate import integrate_dop853
 from reference_impl.joints import constraint_rows
+from reference_impl.mechanism import Mechanism
 from tests.helpers.notes_test_data import Symbols, state_off_manifold, state_on_manifold
 from tests.helpers.random_chains import random_model
 
@@ -20,7 +20,7 @@ def hanging_chain(rods, length=0.5, arm=0.3):
     """Bodies at rest straight below each other, attachments on the body's z axis."""
     n = len(rods)
     zeros = np.zeros((n, 3))
-    chain = Chain(
+    chain = Mechanism(
         mass=np.arange(1.0, n + 1),
         inertia=np.broadcast_to(0.02 * np.diag([1.0, 1.2, 0.9]), (n, 3, 3)),
         proximal=zeros + np.array([0, 0, arm]),

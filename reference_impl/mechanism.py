@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Chain:
+class Mechanism:
     """An open chain of N rigid bodies, each hung from the one before and the first from the world origin.
 
     Joint k connects body k to body k−1, joint 0 to the pivot.  ``length[k] > 0`` makes it the notes'
