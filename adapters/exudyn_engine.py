@@ -15,7 +15,7 @@ body on its last, and outputs of the body are read at the point on its first hal
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
 from typing import Any, ClassVar
 
@@ -49,6 +49,14 @@ from plumbline.model.kinematics import (
 from plumbline.model.step_methods import ConstrainedMethod, generalized_alpha
 from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 
+# Of ObjectJointGeneric: three displacements and three rotations, in the joint's axes of the far body.
+CONSTRAINED_AXES = {
+    "hinge": [1, 1, 1, 1, 1, 0],
+    "universal": [1, 1, 1, 0, 0, 1],
+    "slide": [1, 1, 0, 1, 1, 1],
+    "cylindrical": [1, 1, 0, 1, 1, 0],
+    "weld": [1, 1, 1, 1, 1, 1],
+}
 SPECTRAL_RADIUS = 0.9
 STEP_TOLERANCES = {"solver_atol": NEWTON_TOLERANCE, "solver_rtol": NEWTON_TOLERANCE}
 
@@ -65,8 +73,8 @@ class ExudynChain:
         self.model, self.state = model, state
         self.mbs, self.container = make_system()
         mbs, parts = self.mbs, parts or undivided_bodies(model)
-        ground = mbs.AddObject(items.ObjectGround())
-        pivot = hang = mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=ground))
+        self.ground = mbs.AddObject(items.ObjectGround())
+        pivot = mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=self.ground))
         self.nodes: list[Any] = []
         self.piece_bodies: list[Any] = []
         self.joints: list[Any] = []
@@ -75,6 +83,7 @@ class ExudynChain:
         self.last_piece: list[int] = []
         self.body_of_piece: list[int] = []
         self.piece_centre = [part.centre for pieces in parts for part in pieces]
+        self.jacobian_rate = np.zeros((0, 0))  # d_t(C_q), where joints need it
         self.qdot = np.empty((len(self.piece_centre), 7))
         attitude, pdot = rotation_matrix(state.p), quaternion_rate(state.p, state.omega)
         for k in range(model.n):
@@ -83,12 +92,11 @@ class ExudynChain:
                 self._add_piece(k, part, attitude[k], pdot[k])
             self.last_piece.append(len(self.piece_bodies) - 1)
             first, last = self.first_piece[k], self.last_piece[k]
-            self._add_joint(k, hang)
+            self._add_joint(k)
             if last > first:
                 middle = [self._add_marker(piece, np.zeros(3)) for piece in (first, last)]
                 self.welds.append(mbs.AddObject(items.ObjectJointGeneric(markerNumbers=middle)))
             add_loads(mbs, model, k, self._add_marker(first, np.zeros(3)), pivot, model.moment[k])
-            hang = self._add_marker(last, model.distal[k])
         mbs.Assemble()
 
     def _add_piece(self, k: int, part: RigidPart, attitude: Array, pdot: Array) -> None:
@@ -105,13 +113,46 @@ class ExudynChain:
         self.piece_bodies.append(body)
         self.body_of_piece.append(k)
 
-    def _add_joint(self, k: int, hang: Any) -> None:
-        ends = [hang, self._add_marker(self.first_piece[k], self.model.proximal[k])]
-        if self.model.length[k] > 0:
-            joint = items.ObjectConnectorDistance(markerNumbers=ends, distance=self.model.length[k])
+    def _add_joint(self, k: int) -> None:
+        model, kind, far = self.model, self.model.kind[k], self.model.body[k, 0]
+        if far >= 0:
+            hang = self._add_marker(self.last_piece[far], model.point[k, 0])
         else:
+            at = model.point[k, 0].tolist()
+            hang = self.mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=self.ground, localPosition=at))
+        ends = [hang, self._add_marker(self.first_piece[k], model.proximal[k])]
+        if kind == "free":
+            self.joints.append(None)
+            return
+        if kind == "rod":
+            joint = items.ObjectConnectorDistance(markerNumbers=ends, distance=model.length[k])
+        elif kind == "ball":
             joint = items.ObjectJointSpherical(markerNumbers=ends)
+        else:
+            turns = rotation_matrix(model.turn[k])
+            joint = items.ObjectJointGeneric(
+                markerNumbers=ends,
+                constrainedAxes=CONSTRAINED_AXES[kind],
+                rotationMarker0=turns[0],
+                rotationMarker1=turns[1],
+            )
         self.joints.append(self.mbs.AddObject(joint))
+
+    def joint_rows(self, k: int) -> list[int]:
+        """List the rows of joint k that hold something; a generic joint has a row λ = 0 per free axis.
+
+        Args:
+            k: the body below the joint.
+
+        Returns:
+            Their indices.
+
+        """
+        if self.joints[k] is None:
+            return []
+        rows = list(self.mbs.systemData.GetObjectLTGAE(self.joints[k]))
+        held = CONSTRAINED_AXES.get(self.model.kind[k], [1] * len(rows))
+        return [row for row, is_held in zip(rows, held, strict=True) if is_held]
 
     def _add_marker(self, piece: int, point: Array) -> Any:
         """Add a marker on a piece, at a point (3,) of its body."""
@@ -147,7 +188,7 @@ class ExudynChain:
         return np.array([self.output_at(i, output_type, np.zeros(3)) for i in self.first_piece])
 
     def joint_output(self, k: int, output_type: Any) -> Array:
-        """Read an output of joint k: at body k's proximal point, less that at the point where it hangs.
+        """Read an output of joint k: at its near point, less that at its far point.
 
         Args:
             k: the body below the joint.
@@ -157,10 +198,11 @@ class ExudynChain:
             The difference (3,).
 
         """
+        far = self.model.body[k, 0]
         here = self.output_at(self.first_piece[k], output_type, self.model.proximal[k])
-        if k == 0:
-            return here
-        return here - self.output_at(self.last_piece[k - 1], output_type, self.model.distal[k - 1])
+        if far < 0:
+            return np.asarray(here - self.model.point[k, 0] * (output_type == Output.Position))
+        return here - self.output_at(self.last_piece[far], output_type, self.model.point[k, 0])
 
     def multipliers(self) -> Array:
         """Read the constraints' multipliers.
@@ -208,6 +250,7 @@ class Exudyn(ExudynAdapter):
     )
     usual_linear_solver = "EigenSparse"
     linear_solvers = ("EXUdense", "EigenDense")
+    builds_trees = True
     welding_unsupported_reason = ""
     is_single_step: bool = False  # full Newton iterations to `STEP_TOLERANCES`; multipliers are sampled too
 
@@ -305,12 +348,22 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
     mbs, data, n = chain.mbs, chain.mbs.systemData, len(chain.piece_bodies)
     M, f, C = _system_matrices(chain)
     gamma = _constraint_accelerations(chain, C)
-    x = _solve(np.block([[M, C.T], [C, np.zeros((len(C), len(C)))]]), np.concatenate([f, gamma]))
+    used = np.any(C != 0, axis=1)  # a generic joint's free axes have none
+    x = np.zeros(len(M) + len(C))
+    part = np.concatenate([np.ones(len(M), bool), used])
+    C_used, gamma = C[used], gamma[used]
+    x[part] = _solve(
+        np.block([[M, C_used.T], [C_used, np.zeros((len(C_used), len(C_used)))]]), np.concatenate([f, gamma])
+    )
     data.SetODE2Coordinates_tt(x[: 7 * n])
     multiplier = x[7 * n :]
-    joint_rows = [data.GetObjectLTGAE(joint) for joint in chain.joints]
+    joint_rows = [chain.joint_rows(k) for k in range(chain.model.n)]
     reaction = [
         -C[rows, 7 * i : 7 * i + 3].T @ multiplier[rows]
+        for i, rows in zip(chain.first_piece, joint_rows, strict=True)
+    ]
+    turning = [
+        -C[rows, 7 * i + 3 : 7 * i + 7].T @ multiplier[rows]
         for i, rows in zip(chain.first_piece, joint_rows, strict=True)
     ]
     momentum = (M @ chain.qdot.ravel()).reshape(n, 7)  # 4LᵀJLṗ = 2LᵀJω′, and L Lᵀ = I gives Jω′ = ½ L (…)
@@ -324,6 +377,7 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
         acceleration=chain.body_outputs(Output.Acceleration),
         angular_acceleration=chain.body_outputs(Output.AngularAccelerationLocal),
         joint_reaction=np.array(reaction),
+        joint_moment=None if chain.model.is_chain else _joint_moments(chain, reaction, turning),
         kinetic_energy=kinetic,
         potential_energy=float(-np.sum(weight * r)),  # its own PotentialEnergy is always 0
         angular_momentum=np.sum(np.cross(r, momentum[:, :3]), 0)
@@ -333,6 +387,18 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
     )
 
 
+def _joint_moments(chain: ExudynChain, force: list[Array], of_p: list[Array]) -> Array:
+    """Return the moments (N, 3) about the near points from the generalised forces on r and p (4,).
+
+    A ½ L Q_p is the moment about the centre of the piece that the body hangs by; angular_velocity is 2 L (…).
+    """
+    A = rotation_matrix(chain.state.p)
+    about_centre = angular_velocity(chain.state.p, np.array(of_p)) / 4
+    centre = np.array([chain.piece_centre[i] for i in chain.first_piece])
+    lever = np.matvec(A, chain.model.proximal - centre)
+    return np.asarray(np.matvec(A, about_centre) - np.cross(lever, force))
+
+
 def _system_matrices(chain: ExudynChain) -> tuple[Array, Array, Array]:
     """Return M (7N, 7N), f (7N,) and C (nc, 7N)."""
     settings = make_settings()
@@ -340,10 +406,30 @@ def _system_matrices(chain: ExudynChain) -> tuple[Array, Array, Array]:
     solver: Any = exudyn.MainSolverImplicitSecondOrder()
     with initialized_solver(solver, chain.mbs, settings):
         M, f = mass_matrix_and_force(solver, chain.mbs)
-        # ComputeJacobianAE adds to the Jacobian, which starts unset.
-        solver.SetSystemJacobian(np.zeros_like(solver.GetSystemJacobian()))
-        solver.ComputeJacobianAE(chain.mbs)
-        return M, f, np.array(solver.GetSystemJacobian())[len(M) :, : len(M)]
+
+        def constraint_jacobian() -> Array:
+            # ComputeJacobianAE adds to the Jacobian, which starts unset.
+            solver.SetSystemJacobian(np.zeros_like(solver.GetSystemJacobian()))
+            solver.ComputeJacobianAE(chain.mbs)
+            return np.array(solver.GetSystemJacobian())[len(M) :, : len(M)]
+
+        C = constraint_jacobian()
+        chain.jacobian_rate = np.zeros_like(C)
+        if any(chain.model.kind[k] in CONSTRAINED_AXES for k in range(chain.model.n)):
+            chain.jacobian_rate = _rate_along_velocity(chain, constraint_jacobian)
+        return M, f, C
+
+
+def _rate_along_velocity(chain: ExudynChain, jacobian: Callable[[], Array]) -> Array:
+    """Return d_t(C_q) along q̇: of a polynomial of degree 4 at most in t, so that five points give it."""
+    data, qdot = chain.mbs.systemData, chain.qdot.ravel()
+    step = 0.5 / max(float(np.max(np.abs(qdot))), 1e-6)
+    values = []
+    for count in (-2, -1, 1, 2):
+        data.SetODE2Coordinates(count * step * qdot)
+        values.append(jacobian())
+    data.SetODE2Coordinates(0 * qdot)
+    return np.asarray((values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * step))
 
 
 def _constraint_accelerations(chain: ExudynChain, C: Array) -> Array:
@@ -357,6 +443,10 @@ def _constraint_accelerations(chain: ExudynChain, C: Array) -> Array:
     for i, node in enumerate(chain.nodes):
         gamma[data.GetNodeLTGAE(node)] = -2 * chain.qdot[i, 3:] @ chain.qdot[i, 3:]
     for k, joint in enumerate(chain.joints):
+        if model.kind[k] not in ("rod", "ball"):
+            rows = chain.joint_rows(k)
+            gamma[rows] = -chain.jacobian_rate[rows] @ chain.qdot.ravel()
+            continue
         bend = chain.joint_output(k, Output.Acceleration)
         if model.length[k] > 0:  # (‖d‖)¨ = (dᵀd̈ + ḋᵀḋ - (‖d‖˙)²) / ‖d‖, and ‖d‖˙ = 0 on the manifold
             d, ddot = (chain.joint_output(k, what) for what in (Output.Position, Output.Velocity))

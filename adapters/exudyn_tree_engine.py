@@ -5,6 +5,10 @@
            singular where u comes parallel to the first axis.  The rod takes its axial spin from the
            body before it; it has no inertia, so that spin acts on nothing, and the mass matrix is regular
 
+    hinge, universal, slide, cylindrical: revolutes and slides along the joint's own axes, the inner links
+           massless; a welded body is merged into its far body's link; a free body hangs on three slides
+           along the world's axes and a ball.  Of such trees the angular momentum is not in the momenta M q̇
+
 Axes are chosen by the initial state: all angles start at 0, and the first axis is that of the initial
 relative rotation, along which the first angle may turn without limit.  Frames and offsets: at the start,
 with E the link's axes in the world as columns and B = Aᵀ E the same in the body's frame,
@@ -42,6 +46,7 @@ from adapters.exudyn_common import (
     silence_engine,
 )
 from plumbline.model.datatypes import (
+    KINDS,
     Array,
     Integrator,
     Model,
@@ -52,10 +57,14 @@ from plumbline.model.datatypes import (
     Unsupported,
 )
 from plumbline.model.kinematics import (
+    JointFrame,
+    minimal_rates,
+    own_rates,
     quaternion_conjugate,
     quaternion_product,
     quaternion_rate,
     rotation_matrix,
+    velocity_jacobian,
 )
 from plumbline.model.step_methods import classical_runge_kutta
 
@@ -83,9 +92,10 @@ class _RevoluteGroup:
 
 @dataclass(eq=False)
 class _Link:
-    """A link of the kinematic tree, on a revolute; its parent is the link before."""
+    """A link of the kinematic tree, on a revolute or a slide."""
 
     joint: Any
+    parent: int  # −1: the world
     axes_in_parent: Array  # (3, 3)
     offset: Array  # (3,) m, in the parent
     centre: Array = field(default_factory=lambda: np.zeros(3))  # of mass, m
@@ -94,27 +104,54 @@ class _Link:
 
 
 class _Linkage:
-    """The links of a chain at one state, and the matrix W of q̇ = W ν."""
+    """The links of a mechanism at one state, and the matrix W of q̇ = W ν.
+
+    Per body: its link, the link's axes in the body's frame (3, 3) as columns, and the link's origin there.
+    """
 
     def __init__(self, model: Model, state: State) -> None:
         self.model, self.state = model, state
-        self.rod_count = int(np.sum(model.rods))
         self.attitude = rotation_matrix(state.p)
-        self.nu = np.concatenate([state.udot[model.rods].ravel(), state.omega.ravel()])
+        self.nu = minimal_rates(model, state)
         self.links: list[_Link] = []
         self.revolute_groups: list[_RevoluteGroup] = []
         self.link_of_body: list[int] = []
+        self.body_axes: list[Array] = []
+        self.origins: list[Array] = []
         self.W = np.zeros((0, len(self.nu)))
-        # Of the last link: its axes in the world, the point in it where the next one hangs, and its angular
-        # velocity in the world as a matrix on ν.
-        self._axes, self._hang, self._spin = np.eye(3), np.zeros(3), np.zeros((3, len(self.nu)))
-        for k in range(model.n):
-            if model.length[k] > 0:
+        self.link_axes: list[Array] = []  # as `_axes` and `_spin`, at each body
+        self.link_spins: list[Array] = []
+        self._body_spins = self.attitude @ velocity_jacobian(model, state).reshape(model.n, 6, -1)[:, 3:]
+        # Of the last link: its number, its axes in the world, the point in it where the next one hangs, and
+        # its angular velocity in the world as a matrix on ν.
+        self._last, self._axes, self._hang = -1, np.eye(3), np.zeros(3)
+        self._spin = np.zeros((3, len(self.nu)))
+        for k, (kind, own) in enumerate(zip(model.kind, own_rates(model), strict=True)):
+            self._go_to_far_body(k)
+            if kind == "weld":
+                self._weld_body(k)
+                continue
+            if kind == "rod":
                 self._add_rod(k)
-            self._add_body(k)
+            if kind == "free":
+                self._add_shifts(own)
+            if KINDS[kind].has_attitude:
+                self._add_turned_body(k)
+            else:
+                self._add_jointed_body(k, own)
+
+    def _go_to_far_body(self, k: int) -> None:
+        """Continue from the link that joint k hangs on."""
+        far, point = self.model.body[k, 0], self.model.point[k, 0]
+        if far < 0:
+            self._last, self._axes, self._hang, self._spin = -1, np.eye(3), point, 0 * self._spin
+            return
+        B, origin = self.body_axes[far], self.origins[far]
+        self._last, self._axes = self.link_of_body[far], self.link_axes[far]
+        self._hang, self._spin = B.T @ (point - origin), self.link_spins[far]
 
     def _add_rod(self, k: int) -> None:
-        u = self.state.u[k]
+        u, far = self.state.u[k], self.model.body[k, 0]
         start = 3 * int(np.sum(self.model.rods[:k]))
         target = np.zeros_like(self._spin)  # the rod's u × u̇
         target[:, start : start + 3] = np.cross(u, np.eye(3)).T
@@ -122,33 +159,85 @@ class _Linkage:
         turning = relative @ self.nu
         z = _unit_vector(turning - u * (u @ turning), _fallback_axis(u, self.model.gravity))
         axes = np.stack([u, np.cross(z, u), z], axis=1)
-        self._add_revolutes(2, axes, self.attitude[k - 1].T @ axes if k else axes, relative, k)
+        self._add_revolutes(2, axes, self.attitude[far].T @ axes if far >= 0 else axes, relative, k)
         self._hang = np.array([self.model.length[k], 0.0, 0.0])
 
-    def _add_body(self, k: int) -> None:
+    def _add_shifts(self, own: slice) -> None:
+        """Add three massless slides along the world's axes, for the centre of mass of a free body."""
+        self._hang = self.state.r[len(self.link_of_body)]
+        for axis, name in enumerate(("PrismaticX", "PrismaticY", "PrismaticZ")):
+            self._add_link(name, np.eye(3), own.start + axis)
+
+    def _add_turned_body(self, k: int) -> None:
         model, A = self.model, self.attitude[k]
-        start = 3 * (self.rod_count + k)
-        target = np.zeros_like(self._spin)
-        target[:, start : start + 3] = A
-        relative = target - self._spin
-        z = _unit_vector(relative @ self.nu, _fallback_axis(A @ model.proximal[k], model.gravity))
+        near = model.proximal[k] * (model.kind[k] != "free")
+        relative = self._body_spins[k] - self._spin
+        z = _unit_vector(relative @ self.nu, _fallback_axis(A @ near, model.gravity))
         x = _perpendicular_unit(z)
         axes = np.stack([x, np.cross(z, x), z], axis=1)
         B = A.T @ axes
         self._add_revolutes(3, axes, B, relative, k)
-        link = self.links[-1]
-        link.centre, link.mass = -B.T @ model.proximal[k], float(model.mass[k])
-        link.inertia = B.T @ model.inertia[k] @ B
+        self._finish_body(k, B, near)
+
+    def _add_jointed_body(self, k: int, own: slice) -> None:
+        """Add one link per motion of a joint; all but the last are massless."""
+        A, far = self.attitude[k], self.model.body[k, 0]
+        above = self.attitude[far] if far >= 0 else np.eye(3)
+        joint = JointFrame(self.model, k, above)
+        (shift, _), _ = joint.motion(self.state.x[k], self.state.xdot[k])
+        axes = A @ rotation_matrix(self.model.turn[k, 1])
+        if self.model.kind[k] == "universal":  # the link between has x of the far and y of the near body
+            x, y = joint.axes(self.state.x[k])[0][1], axes[:, 1]
+            axes = np.stack([x, y, np.cross(x, y)], axis=1)
+        self._hang = self._hang + self._axes.T @ shift
+        for i, (what, axis) in enumerate(joint.motions):
+            name = ("Revolute" if what == "turn" else "Prismatic") + "XYZ"[axis]
+            self._add_link(name, axes, own.start + i)
+        self._finish_body(k, A.T @ axes, self.model.proximal[k])
+
+    def _add_link(self, joint: str, axes: Array, rate: int) -> None:
+        """Add a link with these axes in the world on a joint whose rate is that one of ν."""
+        self.links.append(
+            _Link(getattr(exudyn.JointType, joint), self._last, self._axes.T @ axes, self._hang)
+        )
+        self._last, self._axes, self._hang = len(self.links) - 1, axes, np.zeros(3)
+        self.W = np.vstack([self.W, np.eye(len(self.nu))[rate]])
+
+    def _finish_body(self, k: int, B: Array, origin: Array) -> None:
+        """Give the last link the mass of body k, whose frame it has B and the link's origin in."""
         self.link_of_body.append(len(self.links) - 1)
-        self._hang = B.T @ (model.distal[k] - model.proximal[k])
+        self.body_axes.append(B)
+        self.origins.append(origin)
+        self.link_axes.append(self._axes)
+        self.link_spins.append(self._spin if KINDS[self.model.kind[k]].has_attitude else self._body_spins[k])
+        link = self.links[-1]
+        link.centre, link.mass = -B.T @ origin, float(self.model.mass[k])
+        link.inertia = B.T @ self.model.inertia[k] @ B
+
+    def _weld_body(self, k: int) -> None:
+        """Merge body k into the link of its far body."""
+        far, A = self.model.body[k, 0], self.attitude[k]
+        B, index = A.T @ self._axes, self.link_of_body[far]
+        place = self.state.r[far] + self.attitude[far] @ self.origins[far]
+        self.link_of_body.append(index)
+        self.body_axes.append(B)
+        self.link_axes.append(self._axes)
+        self.link_spins.append(self._spin)
+        self.origins.append(A.T @ (place - self.state.r[k]))
+        link, mass, centre = self.links[index], float(self.model.mass[k]), -B.T @ self.origins[k]
+        arm = centre - link.centre
+        parallel = link.mass * mass / (link.mass + mass) * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+        link.inertia = link.inertia + B.T @ self.model.inertia[k] @ B + parallel
+        link.centre = (link.mass * link.centre + mass * centre) / (link.mass + mass)
+        link.mass += mass
 
     def _add_revolutes(self, count: int, axes: Array, body_axes: Array, relative: Array, body: int) -> None:
         """Add massless revolutes that turn ``axes`` against the link before at the rate ``relative`` ν."""
         self.revolute_groups.append(_RevoluteGroup(len(self.links), count, axes, body_axes, body))
         twist, offset = self._axes.T @ axes, self._hang
         for i, joint in enumerate(("RevoluteZ", "RevoluteY", "RevoluteX")[:count]):
-            self.links.append(_Link(getattr(exudyn.JointType, joint), twist, offset))
-            twist, offset = np.eye(3), np.zeros(3)
+            self.links.append(_Link(getattr(exudyn.JointType, joint), self._last, twist, offset))
+            self._last, twist, offset = len(self.links) - 1, np.eye(3), np.zeros(3)
             axis = axes[:, 2 - i]
             self.W = np.vstack([self.W, axis @ relative])
             self._spin = self._spin + np.outer(axis, axis @ relative)
@@ -165,9 +254,7 @@ class _KinematicTree:
         self.initial_angle_rates = self.linkage.W @ self.linkage.nu
         self.mbs, self.container = make_system()
         self.tree = self._add_tree(self.linkage.links)
-        self.body_axes_of_links = np.array(
-            [group.body_axes for group in self.revolute_groups if group.angle_count == 3]
-        )  # (N, 3, 3) B
+        self.body_axes_of_links = np.array(self.linkage.body_axes)  # (N, 3, 3) B
         self.sensors: dict[Any, list[Any]] = {output: [] for output in SENSOR_OUTPUTS}
         ground = self.mbs.AddObject(items.ObjectGround())
         pivot = self.mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=ground))
@@ -192,7 +279,7 @@ class _KinematicTree:
                 nodeNumber=node,
                 gravity=self.model.gravity.tolist(),
                 jointTypes=[link.joint for link in links],
-                linkParents=list(range(-1, len(links) - 1)),
+                linkParents=[link.parent for link in links],
                 jointTransformations=matrices([link.axes_in_parent for link in links]),
                 jointOffsets=vectors([link.offset for link in links]),
                 linkInertiasCOM=matrices([link.inertia for link in links]),
@@ -203,7 +290,7 @@ class _KinematicTree:
 
     def _add_loads_and_sensors(self, k: int, ground: Any) -> None:
         link = self.linkage.link_of_body[k]
-        centre = self.linkage.links[link].centre.tolist()
+        centre = (-self.body_axes_of_links[k].T @ self.linkage.origins[k]).tolist()
         place = {"objectNumber": self.tree, "linkNumber": link, "localPosition": centre}
         marker = self.mbs.AddMarker(items.MarkerKinematicTreeRigid(**place))
         moment = self.body_axes_of_links[k].T @ self.model.moment[k]
@@ -299,6 +386,7 @@ class ExudynTree(ExudynAdapter):
     unsupported: ClassVar[Mapping[str, str]] = {
         "joint_reaction": "minimal coordinates have no forces at the joints"
     }
+    builds_trees = True
     usual_linear_solver = "EXUdense"
     linear_solvers = ("EigenSparse",)
     welding_unsupported_reason = (
@@ -341,23 +429,16 @@ def _rk44_settings() -> Any:
 def _evaluate_state(tree: _KinematicTree) -> StateQuantities:
     """Evaluate all but joint forces, which minimal coordinates do not have, from M, f and outputs.
 
-        M q̈ = f,   T = ½ q̇ᵀ M q̇,   V = -Σ m g·r of its links,   μ = M q̇
-
-    The momentum μ of an angle is the angular momentum of all beyond it about that angle's axis.  A ball at
-    the pivot has three axes there; a rod has two, and along u the angular momentum about the pivot is that
-    about the rod's end, where the ball's axes are.
+    M q̈ = f,   T = ½ q̇ᵀ M q̇,   V = -Σ m g·r of its links,   μ = M q̇
     """
     solver: Any = exudyn.MainSolverExplicit()
     with initialized_solver(solver, tree.mbs, _rk44_settings()):
         M, f = mass_matrix_and_force(solver, tree.mbs)
     tree.mbs.systemData.SetODE2Coordinates_tt(np.linalg.solve(M, f))
     momentum = M @ tree.initial_angle_rates
-    first, *rest = tree.revolute_groups
-    L = first.axes[:, ::-1][:, : first.angle_count] @ momentum[: first.angle_count]
-    if first.angle_count == 2:
-        beyond = rest[0].axes[:, ::-1] @ momentum[2:5]
-        L = L + first.axes[:, 0] * (first.axes[:, 0] @ beyond)
     masses = np.array(tree.mbs.GetObjectParameter(tree.tree, "linkMasses"))[tree.linkage.link_of_body]
+    if "weld" in tree.model.kind:  # links with several bodies
+        masses = tree.model.mass
     gravity = np.array(tree.mbs.GetObjectParameter(tree.tree, "gravity"))
     W = tree.linkage.W
     return StateQuantities(
@@ -365,6 +446,21 @@ def _evaluate_state(tree: _KinematicTree) -> StateQuantities:
         angular_acceleration=tree.read_sensors(Output.AngularAccelerationLocal),
         kinetic_energy=float(0.5 * tree.initial_angle_rates @ momentum),
         potential_energy=float(-masses @ (tree.read_sensors(Output.Position) @ gravity)),
-        angular_momentum=L,
+        angular_momentum=_angular_momentum(tree, momentum) if tree.model.is_chain else None,
         mass_matrix=W.T @ M @ W,
     )
+
+
+def _angular_momentum(tree: _KinematicTree, momentum: Array) -> Array:
+    """Return the angular momentum (3,) about the pivot of a chain from the momenta of its angles.
+
+    The momentum of an angle is the angular momentum of all beyond it about that angle's axis.  A ball at the
+    pivot has three axes there; a rod has two, and along u the angular momentum about the pivot is that about
+    the rod's end, where the ball's axes are.
+    """
+    first, *rest = tree.revolute_groups
+    L = first.axes[:, ::-1][:, : first.angle_count] @ momentum[: first.angle_count]
+    if first.angle_count == 2:
+        beyond = rest[0].axes[:, ::-1] @ momentum[2:5]
+        L = L + first.axes[:, 0] * (first.axes[:, 0] @ beyond)
+    return np.asarray(L)

@@ -5,6 +5,10 @@ rod's own axis):
 
     link k    body frame: the project's, at the centre of mass;  joint at s_prox(k)
               pos = s_dist(k−1) − s_prox(k), or (0, 0, −ℓ_k) − s_prox(k) where it hangs on a rod
+    hinge, universal, slide, cylindrical, weld, with (q_a, q_b) the joint's axes in its far and near body:
+              quat = q_a conj(q_b);  pos = s_far − A(quat) s_near;  axis e of joint at s_near: A(q_b) e
+              a cylindrical joint is a slide and a hinge, a universal joint two hinges, a weld none
+    free k    qpos (r, p), qvel (ṙ, ω′);  these joints' qpos and qvel are x and ẋ
     rod k     body frame and joint at the point where the rod hangs, u_k = −R z;  pos = s_dist(k−1)
               mass 0, inertia diag(0, 0, J_z): exact for any J_z while the rod's axial spin is zero,
               which ball joints at both ends conserve
@@ -18,7 +22,8 @@ rod's own axis):
 Loads act inside every integrator stage: the world force is `xfrc_applied`; n′ − c_r ω′ and −c_t ṙ
 are actuators on a site at the centre of mass, a constant and a velocity bias along each axis.
 `cfrc_int` counts actuator forces as if the joint carried them, so before it is read the drag
-force that acted is declared as an applied one too.
+force and the moments that acted are declared as applied ones too; its moments are about the centre of mass of
+the tree that hangs on the world, and are shifted to the near point.
 
 Welded halves are bodies without a joint on a massless one in their body's place.  The option "dense mass
 matrix" finds the accelerations by a dense solve with `mj_fullM`.  MuJoCo's solvers (PGS, CG, Newton) and
@@ -38,6 +43,7 @@ import numpy as np
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.model import kinematics
 from plumbline.model.datatypes import (
+    KINDS,
     Array,
     EngineFailure,
     Integrator,
@@ -49,6 +55,7 @@ from plumbline.model.datatypes import (
 from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
 from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 
+JOINT_TYPES = {"turn": mujoco.mjtJoint.mjJNT_HINGE, "slide": mujoco.mjtJoint.mjJNT_SLIDE}
 FIRST_ORDER_POWERS = (1, 2, 3, 4, 5, 6)
 ROD_AXIAL_INERTIA = 0.01  # J_z of a rod over the mean principal inertia of the body that it carries
 IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
@@ -97,6 +104,7 @@ class Mujoco(MetamorphicHooks):
         ),
     )
     options = ("dense mass matrix",)
+    builds_trees = True
     welding_unsupported_reason = ""
 
     def version(self) -> str:
@@ -135,7 +143,7 @@ class Mujoco(MetamorphicHooks):
 class _MujocoChain:
     """A compiled chain and its data.
 
-    Engine body ids: ``link_ids[k]`` of link k, ``jointed_body_ids`` of all bodies on joints.
+    Engine body ids: ``link_ids[k]`` of link k, ``ball_ids`` of all bodies on ball joints.
     """
 
     def __init__(self, model: Model, parts: BodyParts | None = None, dense: bool = False) -> None:
@@ -143,19 +151,19 @@ class _MujocoChain:
         _compiler_options(spec).autolimits = False
         self.model, self.use_dense_solve = model, dense
         self.link_ids: list[int] = []
-        self.jointed_body_ids: list[int] = []
+        self.ball_ids: list[int] = []
         self.mass: list[float] = [0.0]
         self.inertia: list[Array] = [np.zeros(3)]
-        parent, hang = spec.worldbody, np.zeros(3)
-        for k in range(model.n):
-            if model.length[k] > 0:
+        links: list[Any] = []
+        for k, (kind, far) in enumerate(zip(model.kind, model.body[:, 0], strict=True)):
+            parent, hang = links[far] if far >= 0 else spec.worldbody, model.point[k, 0]
+            if kind == "rod":
                 axial = np.array([0, 0, ROD_AXIAL_INERTIA * _principal_inertia(model.inertia[k])[0].mean()])
                 parent = self._add_body(parent, hang, 0.0, axial, joint=np.zeros(3))
                 hang = np.array([0, 0, -model.length[k]])
             pieces = (parts or undivided_bodies(model))[k]
-            parent = self._add_link(parent, hang - model.proximal[k], model.proximal[k], pieces)
-            hang = model.distal[k]
-            _add_load_actuators(spec, parent, k, model)
+            links.append(self._add_link(parent, k, hang, pieces))
+            _add_load_actuators(spec, links[k], k, model)
         m = self.m = spec.compile()
         m.opt.gravity = model.gravity
         m.opt.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT | _autoreset_flag()
@@ -168,10 +176,23 @@ class _MujocoChain:
         self.applied_wrenches[self.link_ids, :3] = model.force
         self.readout_data = mujoco.MjData(m)
 
-    def _add_link(self, parent: Any, pos: Array, joint: Array, pieces: tuple[RigidPart, ...]) -> Any:
-        """Add a body of one part, or a massless one with its parts welded to it."""
+    def _add_link(self, parent: Any, k: int, hang: Array, pieces: tuple[RigidPart, ...]) -> Any:
+        """Add a body of one part, or a massless one with its parts welded to it, on its joint."""
         one = pieces[0] if len(pieces) == 1 else RigidPart(0.0, np.zeros(3), np.zeros((3, 3)))
-        link = self._add_body(parent, pos, one.mass, *_principal_inertia(one.inertia), joint=joint)
+        kind, near = self.model.kind[k], self.model.proximal[k]
+        if kind in ("rod", "ball"):
+            link = self._add_body(parent, hang - near, one.mass, *_principal_inertia(one.inertia), joint=near)
+        else:
+            q_far, q_near = self.model.turn[k]
+            quat = kinematics.quaternion_product(q_far, kinematics.quaternion_conjugate(q_near))
+            pos = hang - kinematics.rotation_matrix(quat) @ near
+            pos, quat = (np.zeros(3), IDENTITY_QUATERNION) if kind == "free" else (pos, quat)
+            link = self._add_body(parent, pos, one.mass, *_principal_inertia(one.inertia), quat=quat)
+            if kind == "free":
+                _set_attributes(link.add_joint(), type=mujoco.mjtJoint.mjJNT_FREE)
+            for what, axis in KINDS[kind].motions:
+                along = kinematics.rotation_matrix(q_near)[:, axis]
+                _set_attributes(link.add_joint(), type=JOINT_TYPES[what], pos=near, axis=along)
         self.link_ids.append(len(self.mass) - 1)
         for piece in pieces if len(pieces) > 1 else ():  # before the next link: ids go depth first
             self._add_body(link, piece.centre, piece.mass, *_principal_inertia(piece.inertia))
@@ -185,15 +206,17 @@ class _MujocoChain:
         inertia: Array,
         axes: Array = IDENTITY_QUATERNION,
         joint: Array | None = None,
+        quat: Array = IDENTITY_QUATERNION,
     ) -> Any:
-        """Add a body on a ball joint, or welded; of unit mass until ``mass`` and ``inertia`` are set."""
+        """Add a body on a ball joint, or on none; of unit mass until ``mass`` and ``inertia`` are set."""
         body = _set_attributes(
             parent.add_body(),
-            pos=pos, mass=1.0, inertia=np.ones(3), ipos=np.zeros(3), iquat=axes, explicitinertial=True,
+            pos=pos, quat=quat, mass=1.0, inertia=np.ones(3), ipos=np.zeros(3), iquat=axes,
+            explicitinertial=True,
         )  # fmt: skip
         if joint is not None:
             _set_attributes(body.add_joint(), type=mujoco.mjtJoint.mjJNT_BALL, pos=joint)
-            self.jointed_body_ids.append(len(self.mass))
+            self.ball_ids.append(len(self.mass))
         self.mass.append(mass)
         self.inertia.append(inertia)
         return body
@@ -203,10 +226,9 @@ class _MujocoChain:
         rods = np.flatnonzero(self.model.rods)
         q = np.zeros((self.m.nbody, 4))
         q[0, 0] = 1
-        E = np.zeros((self.m.nbody, 3, 3 * (len(rods) + self.model.n)))
-        for k, b in enumerate(self.link_ids):
-            q[b] = state.p[k]
-            E[b, :, 3 * (len(rods) + k) :][:, :3] = np.eye(3)
+        E = np.zeros((self.m.nbody, 3, kinematics.rate_count(self.model)))
+        q[self.link_ids] = state.p
+        E[self.link_ids] = kinematics.velocity_jacobian(self.model, state).reshape(self.model.n, 6, -1)[:, 3:]
         for j, (b, u) in enumerate(zip(np.array(self.link_ids)[rods] - 1, state.u[rods], strict=True)):
             q[b] = _rod_quaternion(u)
             E[b, :, 3 * j : 3 * j + 3] = kinematics.rotation_matrix(q[b]).T @ np.cross(u, np.eye(3)).T
@@ -216,15 +238,26 @@ class _MujocoChain:
         """Write a state into the engine's data; returns T (nv, nu)."""
         m, d = self.m, self.d
         q, E = self.body_frames(state)
-        own, up = self.jointed_body_ids, m.body_parentid[self.jointed_body_ids]
+        own, up = self.ball_ids, m.body_parentid[self.ball_ids]
         turn = kinematics.rotation_matrix(
             kinematics.quaternion_product(kinematics.quaternion_conjugate(q[own]), q[up])
         )  # R_bᵀ R_a
-        T = (E[own] - turn @ E[up]).reshape(m.nv, -1)
-        nu = np.concatenate([state.udot[self.model.rods].ravel(), state.omega.ravel()])
+        first = m.body_jntadr[own]
+        T = np.zeros((m.nv, E.shape[-1]))
+        T[m.jnt_dofadr[first][:, None] + np.arange(3)] = E[own] - turn @ E[up]
         mujoco.mj_resetData(m, d)
-        d.qpos = kinematics.quaternion_product(kinematics.quaternion_conjugate(q[up]), q[own]).ravel()
-        d.qvel = T @ nu
+        d.qpos[m.jnt_qposadr[first][:, None] + np.arange(4)] = kinematics.quaternion_product(
+            kinematics.quaternion_conjugate(q[up]), q[own]
+        )
+        for k, (b, rates) in enumerate(zip(self.link_ids, kinematics.own_rates(self.model), strict=True)):
+            kind, count = self.model.kind[k], rates.stop - rates.start
+            if kind in ("rod", "ball", "weld"):
+                continue
+            at, dof = m.jnt_qposadr[m.body_jntadr[b]], m.body_dofadr[b]
+            T[dof : dof + count, rates] = np.eye(count)
+            x = np.concatenate([state.r[k], state.p[k]]) if kind == "free" else state.x[k, :count]
+            d.qpos[at : at + len(x)] = x
+        d.qvel = T @ kinematics.minimal_rates(self.model, state)
         d.xfrc_applied = self.applied_wrenches
         return np.asarray(T)
 
@@ -240,6 +273,8 @@ class _MujocoChain:
             d.qacc = np.linalg.solve(M, d.qfrc_smooth)
         velocity = self._spatial_motion(mujoco.mj_objectVelocity, d)
         d.xfrc_applied[link, :3] -= self.model.drag_force[:, None] * velocity[:, 3:]
+        moment = np.matvec(d.xmat[link].reshape(-1, 3, 3), self.model.moment)
+        d.xfrc_applied[link, 3:] = moment - self.model.drag_moment[:, None] * velocity[:, :3]
         mujoco.mj_rnePostConstraint(m, d)
         acceleration = self._spatial_motion(mujoco.mj_objectAcceleration, d)
         com, momentum = d.subtree_com[0], m.body_subtreemass[0] * d.subtree_linvel[0]
@@ -247,11 +282,19 @@ class _MujocoChain:
             acceleration=acceleration[:, 3:] + self.model.gravity,
             angular_acceleration=_to_body_frame(d.xmat[link], acceleration[:, :3]),
             joint_reaction=d.cfrc_int[link, 3:].copy(),
+            joint_moment=None if self.model.is_chain else self._joint_moments(),
             kinetic_energy=float(d.energy[1]),
             potential_energy=float(d.energy[0]),
             angular_momentum=d.subtree_angmom[0] + np.cross(com, momentum),
             mass_matrix=T.T @ M @ T,
         )
+
+    def _joint_moments(self) -> Array:
+        """Return the moments (N, 3) about the joints' near points, world frame."""
+        m, d, link = self.m, self.d, self.link_ids
+        near = d.xpos[link] + np.matvec(d.xmat[link].reshape(-1, 3, 3), self.model.proximal)
+        arm = d.subtree_com[m.body_rootid[link]] - near
+        return np.asarray(d.cfrc_int[link, :3] + np.cross(arm, d.cfrc_int[link, 3:]))
 
     def sample(self) -> tuple[Array, Array, Array, Array]:
         """Return r, p, v, ω′ of the links, read with a second data so that the run is not disturbed."""

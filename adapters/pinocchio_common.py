@@ -47,19 +47,35 @@ def translation(point: Array) -> pin.SE3:
     return pin.SE3(np.eye(3), point)
 
 
-def append_parts(pin_model: pin.Model, joint: int, parts: tuple[RigidPart, ...], centre: Array) -> None:
+def append_parts(pin_model: pin.Model, joint: int, parts: tuple[RigidPart, ...], placement: pin.SE3) -> None:
     """Append the parts of a body to a joint; Pinocchio welds everything appended to one joint.
 
     Args:
         pin_model: the model under construction.
         joint: index of the joint that carries the body.
         parts: the body's parts.
-        centre: the body's centre of mass (3,) [m] in the joint's frame.
+        placement: of the body's frame in the joint's frame.
 
     """
     for part in parts:
         inertia = pin.Inertia(part.mass, np.zeros(3), part.inertia)
-        pin_model.appendBodyToJoint(joint, inertia, translation(part.centre + centre))
+        pin_model.appendBodyToJoint(joint, inertia, placement * translation(part.centre))
+
+
+def composite(*joints: Any) -> pin.JointModelComposite:
+    """Make one joint of several.
+
+    Args:
+        *joints: Pinocchio's models of them, from the parent on.
+
+    Returns:
+        The joint.
+
+    """
+    joint = pin.JointModelComposite()
+    for part in joints:
+        joint.addJoint(part)
+    return joint
 
 
 def add_frame(pin_model: pin.Model, name: str, joint: int, point: Array) -> int:

@@ -1,4 +1,4 @@
-"""Pinocchio in minimal coordinates: a chain of spherical joints.
+"""Pinocchio in minimal coordinates: a chain of spherical joints, or a tree with any joints.
 
 Frames, quaternion order and offsets.  Joint frame k is at body k's proximal point with the body's axes, so
 in it the centre of mass is at c = -proximal_k and the next joint at distal_k - proximal_k.  A rod is a
@@ -10,6 +10,11 @@ With a, b the absolute attitudes of a joint's parent and of itself (quaternions,
 angular velocities, each in its own frame, Pinocchio's coordinates of joint j are
 
     q_j = (a⁻¹ b) as (x, y, z, w),        v_j = W_b - R(a⁻¹ b)ᵀ W_a,        W_rod = R(b)ᵀ (u × udot).
+
+Other joints have their frame at the near point too, its axes those of the joint, body axes = B × joint axes,
+B = A(q_near)ᵀ (q_far, q_near: the joint's axes in its bodies), and q_j = x, v_j = ẋ: RZ for a hinge, PZ for a
+slide, RX·RY for a universal, PZ·RZ for a cylindrical joint; a free body is a free flyer at its centre of
+mass, a welded body is appended to the joint of its far body.
 
 Applied loads enter as `fext`, force and moment on the joint's body, in and about its frame:
 
@@ -26,7 +31,7 @@ off on the catalogue's ten balls, 2e-8 on thirty, 8e-3 on fifty, where `crba` is
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pinocchio as pin
@@ -36,35 +41,44 @@ from adapters.pinocchio_common import (
     PinocchioAdapter,
     add_frame,
     append_parts,
+    composite,
     configuration_rate,
     energies_and_momentum,
     point_acceleration,
     translation,
 )
 from plumbline.engines.integrators import dop853, rkmk4, sample_steps, semi_implicit_euler
-from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, Trajectory
+from plumbline.model.datatypes import KINDS, Array, Integrator, Model, State, StateQuantities, Trajectory
 from plumbline.model.kinematics import (
+    own_rates,
     quaternion_conjugate,
     quaternion_product,
     quaternion_rate,
     rotation_matrix,
+    velocity_jacobian,
 )
 from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
 from plumbline.model.welding import BodyParts, undivided_bodies
 
 ROD_AXIAL_INERTIA = 1 / 3  # of a rod about its own axis, over the trace of the inertia that it carries
 MAX_DENSE_JOINTS = 10  # joints up to which their 3 × 3 blocks are solved faster as one matrix
+JOINT_MODELS = {
+    "hinge": pin.JointModelRZ,
+    "slide": pin.JointModelPZ,
+    "universal": lambda: composite(pin.JointModelRX(), pin.JointModelRY()),
+    "cylindrical": lambda: composite(pin.JointModelPZ(), pin.JointModelRZ()),
+}
 FIXED_STEPS = {"semi-implicit-euler": semi_implicit_euler, "rkmk4": rkmk4}
 
 
 class PinocchioChain:
     """A `Model` as Pinocchio's model and data, and the map between their coordinates.
 
-    nj joints: one per body and one more per rod, each spherical, the parent of j being j - 1.
-    q is (4 nj,), v is (3 nj,) in Pinocchio's conventions.  ``algorithm`` finds the accelerations: "crba"
-    solves with the engine's mass matrix densely, "cholesky" with its own sparse factors, "forwardDynamics"
-    in its solver for constraints, of which there are none, "aba" and "aba-world" are its articulated-body
-    algorithm in local and in world coordinates.
+    nj joints: one per body that is not welded and one more per rod.  Of a chain all are spherical, the parent
+    of j being j - 1, q is (4 nj,) and v (3 nj,) in Pinocchio's conventions.  ``algorithm`` finds the
+    accelerations: "crba" solves with the engine's mass matrix densely, "cholesky" with its own sparse
+    factors, "forwardDynamics" in its solver for constraints, of which there are none, "aba" and "aba-world"
+    are its articulated-body algorithm in local and in world coordinates.
     """
 
     def __init__(self, model: Model, algorithm: str, parts: BodyParts | None = None):
@@ -74,30 +88,52 @@ class PinocchioChain:
         self.pin_model.gravity = pin.Motion(model.gravity, np.zeros(3))
         self.body_joints: list[int] = []  # joint of body k
         self.com_frames: list[int] = []  # frame at body k's centre of mass
-        joint, hang = 0, np.zeros(3)
-        for k in range(model.n):
-            if model.length[k] > 0:
-                joint = self._add_spherical_joint(joint, hang, f"rod {k}")
+        self.placements: list[pin.SE3] = []  # of body k's frame in its joint's frame
+        for k, (kind, far) in enumerate(zip(model.kind, model.body[:, 0], strict=True)):
+            joint = self.body_joints[far] if far >= 0 else 0
+            hang = (self.placements[far] if far >= 0 else pin.SE3.Identity()) * translation(model.point[k, 0])
+            if kind in ("rod", "ball"):
+                hang.rotation = np.eye(3)
+            if kind == "rod":
+                joint = self._add_joint(joint, pin.JointModelSpherical(), hang, f"rod {k}")
                 # Any axial inertia does; this one keeps its place among the others when units change.
                 axial = np.diag([0.0, 0.0, ROD_AXIAL_INERTIA * np.trace(model.inertia[k])])
                 massless = pin.Inertia(0.0, np.zeros(3), axial)
                 self.pin_model.appendBodyToJoint(joint, massless, pin.SE3.Identity())
-                hang = np.array([0.0, 0.0, model.length[k]])
-            joint = self._add_spherical_joint(joint, hang, f"body {k}")
-            append_parts(self.pin_model, joint, parts[k], -model.proximal[k])
-            self.com_frames.append(add_frame(self.pin_model, f"com {k}", joint, -model.proximal[k]))
+                hang = translation(np.array([0.0, 0.0, model.length[k]]))
+            joint = self._add_body(k, joint, hang)
+            append_parts(self.pin_model, joint, parts[k], self.placements[k])
+            centre = self.placements[k].translation
+            self.com_frames.append(add_frame(self.pin_model, f"com {k}", joint, centre))
             self.body_joints.append(joint)
-            hang = model.distal[k] - model.proximal[k]
         self.data = self.pin_model.createData()
         self.joint_count = self.pin_model.njoints - 1
-        self.body_rows = np.array(self.body_joints) - 1  # rows of the bodies among the joints
-        self.rod_rows = np.setdiff1d(np.arange(self.joint_count), self.body_rows)
-        self.com_placements = [translation(-s) for s in model.proximal]
+        self.body_rows = [joint - 1 for joint in self.body_joints]  # of the bodies among the joints
+        self.rod_rows = [j for j in range(self.joint_count) if j not in self.body_rows]
+        self.parent_rows = [int(parent) - 1 for parent in self.pin_model.parents][1:]
+        self.joints = list(self.pin_model.joints)[1:]
         self.zero_torque = np.zeros(self.pin_model.nv)
         self._init_loads()
 
-    def _add_spherical_joint(self, parent: int, offset: Array, name: str) -> int:
-        return int(self.pin_model.addJoint(parent, pin.JointModelSpherical(), translation(offset), name))
+    def _add_joint(self, parent: int, joint: Any, placement: pin.SE3, name: str) -> int:
+        return int(self.pin_model.addJoint(parent, joint, placement, name))
+
+    def _add_body(self, k: int, parent: int, hang: pin.SE3) -> int:
+        """Add the joint of body k, at ``hang`` with the far body's axes, and the body's placement in it."""
+        model, kind = self.source_model, self.source_model.kind[k]
+        if kind in ("rod", "ball"):
+            self.placements.append(translation(-model.proximal[k]))
+            return self._add_joint(parent, pin.JointModelSpherical(), hang, f"body {k}")
+        if kind == "free":
+            self.placements.append(pin.SE3.Identity())
+            return self._add_joint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"body {k}")
+        far, near = (pin.SE3(rotation_matrix(q), np.zeros(3)) for q in model.turn[k])
+        place = near.inverse() * translation(-model.proximal[k])
+        if kind == "weld":
+            self.placements.append(hang * far * place)
+            return parent
+        self.placements.append(place)
+        return self._add_joint(parent, JOINT_MODELS[kind](), hang * far, f"body {k}")
 
     def _init_loads(self) -> None:
         """Set `fext` to the constant loads; a moment is constant in the joint's frame, the others vary."""
@@ -105,10 +141,20 @@ class PinocchioChain:
         self.fext = pin.StdVec_Force()
         for _ in range(self.pin_model.njoints):
             self.fext.append(pin.Force.Zero())
-        for k, j in enumerate(self.body_joints):
-            self.fext[j] = pin.Force(np.zeros(3), model.moment[k])
+        self.loads = [
+            place.act(pin.Force(np.zeros(3), n))
+            for place, n in zip(self.placements, model.moment, strict=True)
+        ]
         varying = np.any(model.force != 0, axis=1) | (model.drag_force != 0) | (model.drag_moment != 0)
         self.bodies_with_varying_loads = [int(k) for k in np.flatnonzero(varying)]
+        self._add_up_loads()
+
+    def _add_up_loads(self) -> None:
+        """Set `fext` of every joint to the loads of its bodies: one, and those welded to it."""
+        taken = set()
+        for j, load in zip(self.body_joints, self.loads, strict=True):
+            self.fext[j] = self.fext[j] + load if j in taken else load
+            taken.add(j)
 
     def coordinates(self, state: State) -> tuple[Array, Array]:
         """Map a state to Pinocchio's coordinates.
@@ -120,17 +166,43 @@ class PinocchioChain:
             q (4 nj,) and v (3 nj,).
 
         """
-        attitude, spin = np.empty((self.joint_count, 4)), np.empty((self.joint_count, 3))
-        attitude[self.body_rows], spin[self.body_rows] = state.p, state.omega
-        for j, k in zip(self.rod_rows, np.flatnonzero(self.source_model.rods), strict=True):
-            attitude[j] = rod_quaternion(state.u[k])
-            spin[j] = rotation_matrix(attitude[j]).T @ np.cross(state.u[k], state.udot[k])
-            spin[j, 2] = 0.0  # the rod does not spin about itself; here it is a rounding of zero
-        relative = attitude.copy()
-        relative[1:] = quaternion_product(quaternion_conjugate(attitude[:-1]), attitude[1:])
-        v = spin.copy()
-        v[1:] -= np.matvec(rotation_matrix(relative[1:]).mT, spin[:-1])
-        return np.roll(relative, -1, axis=1).ravel(), v.ravel()
+        model = self.source_model
+        attitude, spin = np.zeros((self.joint_count, 4)), np.zeros((self.joint_count, 3))
+        for k, row in enumerate(self.body_rows):
+            if model.kind[k] == "weld":
+                continue
+            attitude[row], spin[row] = state.p[k], state.omega[k]
+            if not KINDS[model.kind[k]].has_attitude:
+                attitude[row] = quaternion_product(state.p[k], model.turn[k, 1])
+                spin[row] = self.placements[k].rotation @ state.omega[k]
+        for row, k in zip(self.rod_rows, np.flatnonzero(model.rods).tolist(), strict=True):
+            attitude[row] = rod_quaternion(state.u[k])
+            spin[row] = rotation_matrix(attitude[row]).T @ np.cross(state.u[k], state.udot[k])
+            spin[row, 2] = 0.0  # the rod does not spin about itself; here it is a rounding of zero
+        relative, v = attitude.copy(), spin.copy()
+        up = np.array(self.parent_rows)
+        own = np.flatnonzero(up >= 0)
+        up = up[own]
+        relative[own] = quaternion_product(quaternion_conjugate(attitude[up]), attitude[own])
+        v[own] -= np.matvec(rotation_matrix(relative[own]).mT, spin[up])
+        return self._pack(state, np.roll(relative, -1, axis=1), v)
+
+    def _pack(self, state: State, relative: Array, spin: Array) -> tuple[Array, Array]:
+        """Put the coordinates of all joints into q and v: of balls and rods ``relative`` and ``spin``."""
+        model = self.source_model
+        q, v = pin.neutral(self.pin_model), np.zeros(self.pin_model.nv)
+        bodies = {j: k for k, j in enumerate(self.body_rows) if model.kind[k] != "weld"}
+        for j, joint in enumerate(self.joints):
+            k = bodies.get(j)
+            at, to = slice(joint.idx_q, joint.idx_q + joint.nq), slice(joint.idx_v, joint.idx_v + joint.nv)
+            if k is None or model.kind[k] in ("rod", "ball"):
+                q[at], v[to] = relative[j], spin[j]
+            elif model.kind[k] == "free":
+                q[at] = *state.r[k], *np.roll(state.p[k], -1)
+                v[to] = *(rotation_matrix(state.p[k]).T @ state.v[k]), *state.omega[k]
+            else:
+                q[at], v[to] = state.x[k, : joint.nq], state.xdot[k, : joint.nv]
+        return q, v
 
     def _absolute_attitudes(self, q: Array) -> Array:
         """Return the attitudes (T, nj, 4) of the joints, scalar first, at configurations q (T, 4 nj)."""
@@ -152,11 +224,13 @@ class PinocchioChain:
         pin.forwardKinematics(self.pin_model, self.data, q, v)
         model = self.source_model
         for k in self.bodies_with_varying_loads:
-            j, centre = self.body_joints[k], self.com_placements[k]
+            j, centre = self.body_joints[k], self.placements[k]
             motion = centre.actInv(self.data.v[j])  # of the centre of mass, body axes
-            force = self.data.oMi[j].rotation.T @ model.force[k] - model.drag_force[k] * motion.linear
+            force = centre.rotation.T @ (self.data.oMi[j].rotation.T @ model.force[k])
+            force = force - model.drag_force[k] * motion.linear
             moment = model.moment[k] - model.drag_moment[k] * motion.angular
-            self.fext[j] = centre.act(pin.Force(force, moment))
+            self.loads[k] = centre.act(pin.Force(force, moment))
+        self._add_up_loads()
 
     def acceleration(self, q: Array, v: Array) -> Array:
         """Evaluate the accelerations under gravity and loads, by the chosen algorithm.
@@ -257,14 +331,18 @@ class PinocchioChain:
         pin.forwardKinematics(engine, data, q, v, a)
         pin.updateFramePlacements(engine, data)
         acceleration = [point_acceleration(engine, data, f) for f in self.com_frames]
-        angular = [data.a[j].angular.copy() for j in self.body_joints]
+        bodies = list(zip(self.body_joints, self.placements, strict=True))
+        angular = [place.rotation.T @ data.a[j].angular for j, place in bodies]
         turn = [data.oMi[j].rotation.copy() for j in self.body_joints]
         pin.rnea(engine, data, q, v, a, self.fext)
-        reaction = [r @ data.f[j].linear for r, j in zip(turn, self.body_joints, strict=True)]
+        wrench = self._joint_wrenches()
+        reaction = [r @ f.linear for r, f in zip(turn, wrench, strict=True)]
+        moment = [r @ f.angular for r, f in zip(turn, wrench, strict=True)]
         return StateQuantities(
             acceleration=np.array(acceleration),
             angular_acceleration=np.array(angular),
             joint_reaction=np.array(reaction),
+            joint_moment=None if self.source_model.is_chain else np.array(moment),
             **energies_and_momentum(engine, data, q, v),
             mass_matrix=self._mass_matrix(state, q),
         )
@@ -274,19 +352,65 @@ class PinocchioChain:
 
         v = T W takes absolute rates W to joint rates, W = S ν takes ν to absolute rates.
         """
-        relative = rotation_matrix(np.roll(q.reshape(-1, 4), 1, axis=1))
-        t = np.eye(3 * self.joint_count)
-        for j in range(1, self.joint_count):
-            t[3 * j : 3 * j + 3, 3 * j - 3 : 3 * j] = -relative[j].T
-        s = np.zeros((3 * self.joint_count, 3 * self.joint_count))
-        for i, (j, k) in enumerate(zip(self.rod_rows, np.flatnonzero(self.source_model.rods), strict=True)):
-            s[3 * j : 3 * j + 3, 3 * i : 3 * i + 3] = rotation_matrix(
-                rod_quaternion(state.u[k])
-            ).T @ pin.skew(state.u[k])
-        for i, j in enumerate(self.body_rows, start=len(self.rod_rows)):
-            s[3 * j : 3 * j + 3, 3 * i : 3 * i + 3] = np.eye(3)
-        m, ts = pin.crba(self.pin_model, self.data, q), t @ s
-        return np.asarray(ts.T @ m @ ts)
+        model, nj = self.source_model, self.joint_count
+        jacobian, rods = (
+            velocity_jacobian(model, state).reshape(model.n, 6, -1),
+            np.flatnonzero(model.rods).tolist(),
+        )
+        spin = np.zeros((nj, 3, jacobian.shape[-1]))  # angular velocities of the joints' frames on ν
+        for i, (j, k) in enumerate(zip(self.rod_rows, rods, strict=True)):
+            spin[j, :, 3 * i : 3 * i + 3] = rotation_matrix(rod_quaternion(state.u[k])).T @ pin.skew(
+                state.u[k]
+            )
+        for k, row in enumerate(self.body_rows):
+            if model.kind[k] != "weld":
+                spin[row] = self.placements[k].rotation @ jacobian[k, 3:]
+        t = np.eye(3 * nj)  # takes absolute rates to those of spherical joints
+        spherical = [j for j, joint in enumerate(self.joints) if joint.shortname() == "JointModelSpherical"]
+        for j in spherical:
+            at, up = self.joints[j].idx_q, self.parent_rows[j]
+            if up >= 0:
+                relative = rotation_matrix(np.roll(q[at : at + 4], 1))
+                t[3 * j : 3 * j + 3, 3 * up : 3 * up + 3] = -relative.T
+        relative_spin = (t @ spin.reshape(3 * nj, -1)).reshape(nj, 3, -1)
+        rates = np.zeros((self.pin_model.nv, jacobian.shape[-1]))
+        for row in spherical:
+            rates[self.joints[row].idx_v :][:3] = relative_spin[row]
+        for k, own in enumerate(own_rates(model)):
+            kind, joint = model.kind[k], self.joints[self.body_rows[k]]
+            if kind == "free":
+                rates[joint.idx_v :][:3, own][:, :3] = rotation_matrix(state.p[k]).T
+                rates[joint.idx_v + 3 :][:3, own][:, 3:] = np.eye(3)
+            elif KINDS[kind].motions:
+                rates[joint.idx_v : joint.idx_v + joint.nv, own] = np.eye(joint.nv)
+        return np.asarray(rates.T @ pin.crba(self.pin_model, self.data, q) @ rates)
+
+    def _joint_wrenches(self) -> list[pin.Force]:
+        """Return each body's joint wrench after `rnea`, in its joint's axes and about its near point.
+
+        The engine merges welded bodies: the wrench of a weld is what the bodies beyond it need.
+        """
+        data, model = self.data, self.source_model
+        wrench = [data.f[j].copy() for j in self.body_joints]
+        for k in reversed(range(model.n)):
+            if model.kind[k] != "weld":
+                continue
+            j = self.body_joints[k]
+            inertia = self.placements[k].act(pin.Inertia(model.mass[k], np.zeros(3), model.inertia[k]))
+            need = inertia * data.a_gf[j] + inertia.vxiv(data.v[j]) - self.loads[k]
+            for child in np.flatnonzero(model.body[:, 0] == k):
+                need = need + self._in_frame_of(j, self.body_joints[child], wrench[child])
+            wrench[k] = need
+        for k in range(model.n):
+            if model.kind[k] == "weld":
+                wrench[k] = translation(self.placements[k].act(model.proximal[k])).actInv(wrench[k])
+        return wrench
+
+    def _in_frame_of(self, joint: int, child: int, wrench: pin.Force) -> pin.Force:
+        """Return a wrench given in the frame of a joint beyond another one, in the frame of that one."""
+        while child != joint:
+            wrench, child = self.data.liMi[child].act(wrench), self.pin_model.parents[child]
+        return wrench
 
     def trajectory(self, times: Array, q: Array, v: Array, steps: int) -> Trajectory:
         """Map samples to the bodies' positions, attitudes and rates.
@@ -305,7 +429,7 @@ class PinocchioChain:
         r, rdot, omega = np.empty(shape), np.empty(shape), np.empty(shape)
         for i in range(len(times)):
             pin.forwardKinematics(self.pin_model, self.data, q[i], v[i])
-            for k, (j, centre) in enumerate(zip(self.body_joints, self.com_placements, strict=True)):
+            for k, (j, centre) in enumerate(zip(self.body_joints, self.placements, strict=True)):
                 pose, motion = self.data.oMi[j], centre.actInv(self.data.v[j])
                 r[i, k] = pose.act(centre.translation)
                 rdot[i, k] = pose.rotation @ motion.linear
@@ -359,6 +483,7 @@ class Pinocchio(PinocchioAdapter):
         ),
         Integrator("dop853", "tolerance", 8, note="SciPy's DOP853 on (q, v) with crba and the tangent map"),
     )
+    builds_trees = True
     options: ClassVar[tuple[str, ...]] = ("cholesky", "forwardDynamics")
     usual_algorithm: ClassVar[str] = "crba"  # for the accelerations of state evaluation
 

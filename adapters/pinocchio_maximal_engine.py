@@ -14,6 +14,9 @@ accelerations γ at v̇ = 0 of the attachment points: with Δ for near minus far
 
     ball  ΔJ v̇ + Δγ = 0,        rod  uᵀ ΔJ v̇ + uᵀ Δγ + ℓ u̇ᵀu̇ = 0.
 
+Other joints hold the near point against the far body's point where it is, and the body's turn, in the
+directions that their motions leave: rows of the same Jacobians and accelerations (`_relative_motion`).
+
 The option "inverse of the KKT matrix" solves the same rows with the engine's inverse of the whole matrix.
 """
 
@@ -35,8 +38,8 @@ from adapters.pinocchio_common import (
     point_acceleration,
     translation,
 )
-from plumbline.model.datatypes import Array, Model, State, StateQuantities, Unsupported
-from plumbline.model.kinematics import rotation_matrix, velocity_jacobian
+from plumbline.model.datatypes import KINDS, Array, Model, State, StateQuantities, Unsupported
+from plumbline.model.kinematics import JointFrame, rotation_matrix, velocity_jacobian
 from plumbline.model.welding import BodyParts
 
 MAX_BODIES = 30  # bodies; the engine's workspace grows with N³: 0.4 GB here, 1.5 GB at 50
@@ -51,10 +54,12 @@ class _FreeFlyerSystem:
         self.pin_model.gravity = pin.Motion(model.gravity, np.zeros(3))
         for k in range(model.n):
             joint = self.pin_model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"body {k}")
-            append_parts(self.pin_model, joint, parts[k], np.zeros(3))
-        # Attachment points of joint k: (engine joint, point) on body k, and on body k-1 or the world.
-        near = [(k + 1, model.proximal[k]) for k in range(model.n)]
-        far = [(k, model.distal[k - 1] if k else np.zeros(3)) for k in range(model.n)]
+            append_parts(self.pin_model, joint, parts[k], pin.SE3.Identity())
+        # Attachment points of joint k: (engine joint, point) on its bodies; joint 0 is the world.
+        far, near = (
+            [(int(body) + 1, at) for body, at in zip(model.body[:, i], model.point[:, i], strict=True)]
+            for i in (0, 1)
+        )
         self.near_frames, self.far_frames = (
             [add_frame(self.pin_model, f"{side} {k}", *point) for k, point in enumerate(points)]
             for side, points in (("near", near), ("far", far))
@@ -78,11 +83,12 @@ class _FreeFlyerSystem:
         force = np.matvec(turn.mT, model.force) - model.drag_force[:, None] * local
         moment = model.moment - model.drag_moment[:, None] * state.omega
         tau = np.hstack([force, moment]).ravel()
-        if self.use_kkt_inverse or np.any(model.rods):
-            reaction = self._solve_constraint_rows(state, q, v, tau)
+        if self.use_kkt_inverse or set(model.kind) != {"ball"}:
+            reaction, moment = self._solve_constraint_rows(state, q, v, tau)
         else:
             pin.constraintDynamics(engine, data, q, v, tau, self.contacts, self.contact_data)
             reaction = np.matvec(turn, [contact.contact_force.linear for contact in self.contact_data])
+            moment = np.zeros_like(reaction)
         a = data.ddq.reshape(-1, 6)
         w = velocity_jacobian(model, state)
         w.reshape(model.n, 6, -1)[:, :3] = turn.mT @ w.reshape(model.n, 6, -1)[:, :3]
@@ -91,37 +97,88 @@ class _FreeFlyerSystem:
             acceleration=np.matvec(turn, a[:, :3] + np.cross(state.omega, local)),
             angular_acceleration=a[:, 3:].copy(),
             joint_reaction=reaction,
+            joint_moment=None if model.is_chain else moment,
             mass_matrix=w.T @ inertia @ w,
             **energies_and_momentum(engine, data, q, v),
         )
 
-    def _solve_constraint_rows(self, state: State, q: Array, v: Array, tau: Array) -> Array:
-        """Solve with rows built here into ``data.ddq``; returns the joint reactions (N, 3) [N], world."""
+    def _solve_constraint_rows(self, state: State, q: Array, v: Array, tau: Array) -> tuple[Array, Array]:
+        """Solve with rows built here into ``data.ddq``; return the joints' forces and moments (N, 3)."""
         engine, data, model = self.pin_model, self.data, self.source_model
         pin.forwardKinematics(engine, data, q, v, np.zeros(engine.nv))
         pin.computeJointJacobians(engine, data, q)
         pin.updateFramePlacements(engine, data)
-        jacobian, drift, directions = [], [], []
+        rows, drifts, directions = [np.zeros((0, engine.nv))], [np.zeros(0)], []
         for k in range(model.n):
-            both = self.near_frames[k], self.far_frames[k]
-            j_near, j_far = (pin.getFrameJacobian(engine, data, f, WORLD_ALIGNED)[:3] for f in both)
-            g_near, g_far = (point_acceleration(engine, data, f) for f in both)
-            along = state.u[k : k + 1] if model.length[k] > 0 else np.eye(3)
-            jacobian.append(along @ (j_near - j_far))
-            drift.append(along @ (g_near - g_far) + model.length[k] * state.udot[k] @ state.udot[k])
-            directions.append(along)
-        rows, bend = np.vstack(jacobian), np.concatenate(drift)
+            jacobian, drift = self._relative_motion(k, state)
+            push, turn = self._held_directions(k, state)
+            rows += [push @ jacobian[:3], turn @ jacobian[3:]]
+            drifts += [push @ drift[:3] + model.length[k] * state.udot[k] @ state.udot[k], turn @ drift[3:]]
+            directions.append((push, turn))
+        constraints, bend = np.vstack(rows), np.concatenate(drifts)
         if self.use_kkt_inverse:
             force = tau - pin.nonLinearEffects(engine, data, q, v)
-            inverse = pin.computeKKTContactDynamicMatrixInverse(engine, data, q, rows, 0.0)
+            inverse = pin.computeKKTContactDynamicMatrixInverse(engine, data, q, constraints, 0.0)
             x = inverse @ np.concatenate([force, -bend])
             data.ddq, multiplier = x[: engine.nv], -x[engine.nv :]
         else:
-            pin.forwardDynamics(engine, data, q, v, tau, rows, bend, 0.0)
+            pin.forwardDynamics(engine, data, q, v, tau, constraints, bend, 0.0)
             multiplier = data.lambda_c
-        ends = np.cumsum([len(along) for along in directions])[:-1]
-        multipliers = np.split(multiplier, ends)
-        return np.array([along.T @ m for along, m in zip(directions, multipliers, strict=True)])
+        ends = np.cumsum([len(some) for pair in directions for some in pair])[:-1]
+        parts = iter(np.split(multiplier, ends))
+        wrench = np.array([[some.T @ next(parts) for some in pair] for pair in directions])
+        return wrench[:, 0], wrench[:, 1]
+
+    def _relative_motion(self, k: int, state: State) -> tuple[Array, Array]:
+        """Jacobian (6, nv) of joint k, and its acceleration at v̇ = 0 less what allowed rates cause.
+
+        Of the near point against the point of the far body where it is, and of the angular velocity.  The
+        rates ṡ of slides and Ω of turns, each carried by the angular velocity w of those before, cause the
+        relative accelerations 2 ω_far × ṡ and Σ w × Ω.
+        """
+        engine, data, model = self.pin_model, self.data, self.source_model
+        frames = self.near_frames[k], self.far_frames[k]
+        j_near, j_far = (pin.getFrameJacobian(engine, data, f, WORLD_ALIGNED) for f in frames)
+        drift_near, drift_far = (
+            np.concatenate([
+                point_acceleration(engine, data, f),
+                pin.getFrameAcceleration(engine, data, f, WORLD_ALIGNED).angular,
+            ])
+            for f in frames
+        )  # fmt: skip
+        jacobian, drift = j_near - j_far, drift_near - drift_far
+        if KINDS[model.kind[k]].has_attitude:
+            return jacobian, drift
+        placements = [data.oMf[f] for f in frames]
+        d = placements[0].translation - placements[1].translation
+        spin = pin.getFrameVelocity(engine, data, frames[1], WORLD_ALIGNED).angular
+        jacobian[:3] -= -pin.skew(d) @ j_far[3:]
+        drift[:3] -= np.cross(drift_far[3:], d) + np.cross(spin, np.cross(spin, d))
+        carried = spin.copy()
+        joint = JointFrame(model, k, placements[1].rotation)
+        for (what, axis), rate in zip(joint.axes(state.x[k]), state.xdot[k], strict=False):
+            if what == "slide":
+                drift[:3] -= 2 * np.cross(spin, axis * rate)
+            else:
+                drift[3:] -= np.cross(carried, axis * rate)
+                carried = carried + axis * rate
+        return jacobian, drift
+
+    def _held_directions(self, k: int, state: State) -> tuple[Array, Array]:
+        """Unit vectors (c, 3) along which joint k holds the near point, and about which it holds the body."""
+        model, kind = self.source_model, self.source_model.kind[k]
+        if KINDS[kind].has_attitude:
+            push = {"rod": state.u[k : k + 1], "ball": np.eye(3), "free": np.zeros((0, 3))}[kind]
+            return push, np.zeros((0, 3))
+        far = self.data.oMf[self.far_frames[k]].rotation
+        axes = JointFrame(model, k, far).axes(state.x[k])
+        slides, turns = ([axis for what, axis in axes if what == name] for name in ("slide", "turn"))
+        return _complement(slides), _complement(turns)
+
+
+def _complement(axes: list[Array]) -> Array:
+    """Orthonormal vectors (3 − m, 3) perpendicular to m independent ones."""
+    return np.asarray(np.linalg.svd(np.reshape(axes, (-1, 3)))[2][len(axes) :])
 
 
 class PinocchioMaximal(PinocchioAdapter):
@@ -135,6 +192,7 @@ class PinocchioMaximal(PinocchioAdapter):
     unsupported: ClassVar[Mapping[str, str]] = {
         "integrators": "Pinocchio in maximal coordinates is compared at state level only"
     }
+    builds_trees = True
     options = ("inverse of the KKT matrix",)
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:

@@ -52,7 +52,13 @@ def notes_state(state: State) -> tuple[Array, Array, Array, Array]:
 
 
 def state_quantities(
-    model: Model, state: State, acceleration: Array, pddot: Array, reaction: Array, S: Array
+    model: Model,
+    state: State,
+    acceleration: Array,
+    pddot: Array,
+    reaction: Array,
+    S: Array,
+    moment: Array | None = None,
 ) -> StateQuantities:
     """Compute the contract's quantities of one state from the solution of S x = b.
 
@@ -61,8 +67,10 @@ def state_quantities(
         state: one on the constraint manifold.
         acceleration: r̈ (N, 3) [m/s²], world frame.
         pddot: p̈ (N, 4) [1/s²].
-        reaction: forces on the bodies at their proximal points (N, 3) [N], world frame (E5).
+        reaction: forces on the bodies at their joints' near points (N, 3) [N], world frame (E5).
         S: the matrix of (N5), of which rows and columns of r̈ and p̈ are used.
+        moment: moments on the bodies about these points (N, 3) [N m], world frame; absent for chains of rods
+            and balls, where it is 0.
 
     Returns:
         Every quantity of the contract.
@@ -80,6 +88,7 @@ def state_quantities(
         acceleration=acceleration,
         angular_acceleration=2 * (L(p) @ pddot[..., None])[..., 0],
         joint_reaction=reaction,
+        joint_moment=moment,
         kinetic_energy=float(y @ T @ y) / 2,
         potential_energy=-float(np.sum(model.mass * (r @ model.gravity))),
         angular_momentum=np.sum(np.cross(r, model.mass[:, None] * v) + spin[..., 0], axis=0),

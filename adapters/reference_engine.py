@@ -24,6 +24,7 @@ from plumbline.model.datatypes import (
     State,
     StateQuantities,
     Trajectory,
+    Unsupported,
 )
 from reference_impl.collocation import integrate_collocation
 from reference_impl.direct import DirectSystem, Solution
@@ -51,6 +52,7 @@ class Reference(MetamorphicHooks):
         ),
     )
 
+    builds_trees = True
     options = ("dense factors", "O(N) form")
     welding_unsupported_reason = NO_WELD
 
@@ -66,6 +68,8 @@ class Reference(MetamorphicHooks):
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         system = DirectSystem(model)
         solve: Callable[..., Solution] = system.solve
+        if self.option == "O(N) form" and not model.is_chain:
+            raise Unsupported("the reference's O(N) form covers chains of rods and balls")
         if self.option:
             dense = self.option == "dense factors"
             solve = system.solve_with_dense_factors if dense else StructuredSystem([model]).solve
@@ -77,7 +81,8 @@ class Reference(MetamorphicHooks):
     @staticmethod
     def _quantities(system: DirectSystem, state: State, x: Solution) -> StateQuantities:
         S, _ = system.assemble(*notes_state(state))
-        return state_quantities(system.chain, state, x.acceleration, x.pddot, x.joint_reaction, S)
+        moment = None if system.chain.is_chain else x.joint_moment
+        return state_quantities(system.chain, state, x.acceleration, x.pddot, x.joint_reaction, S, moment)
 
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import reverse_cuthill_mckee
 
 from reference_impl.errors import SingularSystem
-from reference_impl.euler_parameters import L, angular_velocity, dot
-from reference_impl.joints import ConstraintRows, constraint_rows, far_body_values, joint_of_rows
+from reference_impl.euler_parameters import A, L, angular_velocity, dot
+from reference_impl.joints import ConstraintRows, constraint_rows, joint_of_rows, of_far_body
 from reference_impl.mechanism import Array, Mechanism
 
 EPS = float(np.finfo(float).eps)
@@ -26,7 +28,8 @@ class Solution:
     norm_multiplier: Array  # (N,) λ_E: no physical meaning, not comparable across formulations (E2)
     joint: NDArray[np.intp]  # (c,) the joint of each row
     tension: Array  # (N,) N, 2 ℓ λ of the rods, positive in tension; NaN at ball joints
-    joint_reaction: Array  # (N, 3) N, force on body k at its proximal point, world frame: −C_rᵀ λ
+    joint_reaction: Array  # (N, 3) N, force on body k at the near point of joint k, world frame: −C_rᵀ λ
+    joint_moment: Array | None = None  # (N, 3) N m, moment on body k about that point, world frame
 
 
 class DirectSystem:
@@ -44,12 +47,13 @@ class DirectSystem:
         r, p = np.arange(3 * n).reshape(n, 3), 3 * n + np.arange(4 * n).reshape(n, 4)
         row, norm = 7 * n + np.arange(c), 7 * n + c + np.arange(n)
         self.joint, self.size = joint, 8 * n + c
-        self._rods, self._first = chain.rods, np.searchsorted(joint, np.arange(n))  # each joint's first row
+        self._rods = chain.rods
         self._masses = np.repeat(chain.mass, 3)
         self._drag = bool(chain.drag_force.any() or chain.drag_moment.any())
         self._weight = chain.mass[:, None] * chain.gravity + chain.force
-        self._near, self._far = joint, np.flatnonzero(joint > 0)
-        near, far = joint, joint[self._far] - 1
+        far = chain.body[joint, 0]
+        self._far = np.flatnonzero(far >= 0)
+        near, far = joint, far[self._far]
         # Where each block of `_blocks` stands: rows and columns, broadcast against each other.
         places = [
             (r, r),
@@ -64,7 +68,8 @@ class DirectSystem:
         self._lower = sum(np.broadcast(*x).size for x in places[:2])  # constraint blocks stand in S twice
         self._i, self._j = np.concatenate([i, j[self._lower :]]), np.concatenate([j, i[self._lower :]])
 
-        owner = np.concatenate([np.repeat(np.arange(n), 3), np.repeat(np.arange(n), 4), joint, np.arange(n)])
+        body = _band_order(chain)
+        owner = np.concatenate([np.repeat(body, 3), np.repeat(body, 4), body[joint], body])
         kind = np.repeat([1, 2, 0, 3], [3 * n, 4 * n, c, n])
         self._order = np.lexsort((np.arange(self.size), kind, owner))  # position in the band → printed
         place = np.argsort(self._order)
@@ -111,7 +116,7 @@ class DirectSystem:
             SingularSystem: S is singular; the message names the body and the cause (E1, E7).
 
         """
-        return self._solution_from_unknowns(*self.solve_unknowns(r, p, v, pdot, gamma_defect))
+        return self._solution_from_unknowns(p, *self.solve_unknowns(r, p, v, pdot, gamma_defect))
 
     def solve_unknowns(
         self, r: Array, p: Array, v: Array, pdot: Array, gamma_defect: float | Array = 0.0
@@ -172,7 +177,7 @@ class DirectSystem:
 
         """
         S, b = self.assemble(r, p, v, pdot)
-        return self._solution_from_unknowns(solve_dense(S, b), constraint_rows(self.chain, r, p, v, pdot))
+        return self._solution_from_unknowns(p, solve_dense(S, b), constraint_rows(self.chain, r, p, v, pdot))
 
     def _entries(self, r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, Array, ConstraintRows]:
         """The entries of S in the order of `_i`, `_j`, then b, and the joints they come from."""
@@ -199,11 +204,13 @@ class DirectSystem:
         b = np.concatenate([force.ravel(), p_force.ravel(), joints.gamma, -2 * dot(pdot, pdot)])
         return np.concatenate([values, values[self._lower :]]), b, joints
 
-    def _solution_from_unknowns(self, x: Array, joints: ConstraintRows) -> Solution:
+    def _solution_from_unknowns(self, p: Array, x: Array, joints: ConstraintRows) -> Solution:
         """The parts of x, and λ as forces."""
         n, c = self.chain.n, len(self.joint)
         multiplier = x[7 * n : 7 * n + c]
-        reaction = -np.add.reduceat(multiplier[:, None] * joints.r_near, self._first)
+        reaction, of_p = np.zeros((n, 3)), np.zeros((n, 4))
+        np.add.at(reaction, self.joint, multiplier[:, None] * joints.r_near)
+        np.add.at(of_p, self.joint, multiplier[:, None] * joints.p_near)
         tension, rod = np.full(n, np.nan), self._rods
         tension[rod] = 2 * self.chain.length[rod] * multiplier[rod[self.joint]]
         return Solution(
@@ -213,8 +220,29 @@ class DirectSystem:
             norm_multiplier=x[7 * n + c :],
             joint=self.joint,
             tension=tension,
-            joint_reaction=np.asarray(reaction),
+            joint_reaction=-reaction,
+            joint_moment=_joint_moment(self.chain, p, -reaction, -of_p),
         )
+
+
+def _joint_moment(chain: Mechanism, p: Array, force: Array, of_p: Array) -> Array:
+    """Moments (N, 3) about the near points of wrenches given by their force and generalised force on p.
+
+    A ½ L Q_p is the moment about the centre of mass; L p = 0 takes the normalisation's share out (E2).
+    """
+    turn = A(p)
+    near = (turn @ chain.point[:, 1, :, None])[..., 0]
+    about_centre = (turn @ (L(p) @ of_p[..., None]))[..., 0] / 2
+    return np.asarray(about_centre - np.cross(near, force))
+
+
+def _band_order(chain: Mechanism) -> NDArray[np.intp]:
+    """Places (N,) of the bodies and their joints in the band: near each other where joined."""
+    if chain.is_chain:
+        return np.arange(chain.n)
+    far, near = chain.body[chain.body[:, 0] >= 0].T
+    order = reverse_cuthill_mckee(csr_array((np.ones(len(far)), (far, near)), (chain.n, chain.n)))
+    return np.argsort(order)
 
 
 def solve_dense(S: Array, b: Array) -> Array:
@@ -296,7 +324,7 @@ def check_state_solvable(
         raise SingularSystem(f"p of body {body} is 0: 4 LᵀJL and the normalisation row vanish with it (E7)")
     if not rods.any():
         return
-    spans = [r, far_body_values(r), chain.proximal, far_body_values(chain.distal)]
+    spans = [r, of_far_body(r, chain.body[:, 0]), chain.point[:, 1], chain.point[:, 0]]
     rounding = 16 * EPS * np.max(np.abs(spans), axis=(0, 2))
     collapsed = rods & (np.sqrt(dot(d, d)) <= rounding)
     if collapsed.any():

@@ -1,17 +1,23 @@
-"""The constraints of an open chain of N bodies on any mix of rods and ball joints: C, C_r, C_p, γ.
+"""The constraints of a tree of N bodies: C, C_r, C_p, γ of every joint, each row a product of two vectors.
 
-Joint k has one row (rod) or three (ball) and touches body k, its near body, and body k−1, its far
-body; the far body of joint 0 is the pivot.  With x = r_k − r_{k−1}, a = A_{k−1} s_{k−1,distal} and
-b = A_k s_{k,proximal} (r, a and their rates are 0 at the pivot), d = x + b − a and
+Joint k touches body k, its near body, and its far body or the world.  With d from the far to the near point,
+f = (x, y, z) the joint's axes fixed in the far body, h = (X, Y, Z) the same in the near body, and
+e = (i, j, k) the world's, every row is C = uᵀw with u and w out of these (`KINDS` lists them).  Exact for
+every p,
+
+    (L1)  (A s)_p = 2 H(p,s),   (A s)˙ = 2 H(p,s) ṗ,   (A s)¨ = 2 H(p,s) p̈ + 2 H(ṗ,s) ṗ               (N8)
+    (L2)  C_q = uᵀ w_q + wᵀ u_q
+    (L3)  γ   = −( uᵀ w̃ + wᵀ ũ + 2 u̇ᵀẇ ),   ũ = ü at q̈ = 0
+
+A rod's row is C = dᵀd − ℓ² as the notes write it.  With x = r_near − r_far, a = A_far s_far and
+b = A_near s_near,
 
     rod   C = xᵀx + 2 xᵀ(b − a) + bᵀb − 2 aᵀb + aᵀa − ℓ²,  bᵀb and aᵀa replaced by s-products (E2)
           C_r near, far =  2 dᵀ, −2 dᵀ                                                     (S2, D3)
           C_p near, far =  4 (x − a)ᵀH_near, −4 (x + b)ᵀH_far                              (S3, D4)
-    ball  C = d,  C_r = I, −I,  C_p = 2 H_near, −2 H_far                                   (E1, N8)
 
-and γ = −d_t(C_r) ṙ − d_t(C_p) ṗ with Ȧ = 2 G L̇ᵀ in the rods' rows, as the notes have it (E3).
-The ball's γ = −2 Ḣ_near ṗ_near + 2 Ḣ_far ṗ_far is exact for every p.  For one and two
-bodies on rods they are S1–S4 and D2–D6, which `notes` has as printed.
+and γ = −d_t(C_r) ṙ − d_t(C_p) ṗ with Ȧ = 2 G L̇ᵀ, as the notes have it (E3); on the manifold it is the row
+dᵀd of (L2, L3).  For one and two bodies on rods these are S1–S4 and D2–D6, which `notes` has as printed.
 """
 
 from __future__ import annotations
@@ -23,20 +29,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reference_impl.euler_parameters import I3, A, AnyArray, B, G, L, dot, outer
-from reference_impl.mechanism import Mechanism
+from reference_impl.mechanism import KINDS, Mechanism
+
+VECTORS = "ijkxyzXYZd"  # what rows are products of
 
 
 @dataclass(frozen=True, eq=False)
 class ConstraintRows:
-    """The joints' rows in the order of the joints; c rows in all, c = Σ (1 per rod, 3 per ball)."""
+    """The joints' rows in the order of the joints, c in all."""
 
     joint: NDArray[np.intp]  # (c,) the joint of the row; its near body
-    C: AnyArray  # (c,) m² of a rod, m of a ball
+    far: NDArray[np.intp]  # (c,) the far body of the row, −1 the world
+    C: AnyArray  # (c,) m² of a rod, m or 1 of the others
     r_near: AnyArray  # (c, 3) ∂C/∂r of the near body; of the far body it is −r_near
     p_near: AnyArray  # (c, 4) ∂C/∂p of the near body
-    p_far: AnyArray  # (c, 4) ∂C/∂p of the far body; 0 for the pivot
+    p_far: AnyArray  # (c, 4) ∂C/∂p of the far body; 0 for the world
     gamma: AnyArray  # (c,) C̈ = C_r r̈ + C_p p̈ − γ
-    d: AnyArray  # (N, 3) m, world frame, from where joint k hangs to the near body's proximal point
+    d: AnyArray  # (N, 3) m, world frame, from the far to the near point of joint k
 
     def constraint_rate(self, v: AnyArray, pdot: AnyArray) -> AnyArray:
         """Return Ċ = C_r ṙ + C_p ṗ.
@@ -46,83 +55,104 @@ class ConstraintRows:
             pdot: rates ṗ (N, 4) [1/s].
 
         Returns:
-            Ċ (c,): m²/s of a rod, m/s of a ball.
+            Ċ (c,): m²/s of a rod, m/s or 1/s of the others.
 
         """
-        far_v, far_pdot = far_body_values(v), far_body_values(pdot)
         k = self.joint
-        moved = dot(self.r_near, v[k] - far_v[k])
-        return np.asarray(moved + dot(self.p_near, pdot[k]) + dot(self.p_far, far_pdot[k]))
+        moved = dot(self.r_near, v[k] - of_far_body(v, self.far))
+        return np.asarray(moved + dot(self.p_near, pdot[k]) + dot(self.p_far, of_far_body(pdot, self.far)))
 
 
-def far_body_values(x: AnyArray) -> AnyArray:
-    """Return the far body's value for every joint.
+def of_far_body(x: AnyArray, far: NDArray[np.intp]) -> AnyArray:
+    """Return the far bodies' values.
 
     Args:
         x: values of the bodies (N, ...).
+        far: (j,) bodies, −1 the world.
 
     Returns:
-        (N, ...): zeros for the pivot, then x of bodies 0 … N−2.
+        (j, ...): zeros for the world.
 
     """
-    return np.concatenate([np.zeros_like(x[:1]), x[:-1]])
+    values = x[far]
+    values[far < 0] = 0
+    return values
 
 
-def joint_of_rows(chain: Mechanism) -> NDArray[np.intp]:
+def joint_of_rows(mechanism: Mechanism) -> NDArray[np.intp]:
     """Number the rows of C by their joints.
 
     Args:
-        chain: the mechanism; a rod has one row, a ball joint three.
+        mechanism: bodies and joints; a rod has one row, a ball joint three.
 
     Returns:
         (c,) the joint of each row, ascending.
 
     """
-    return np.repeat(np.arange(chain.n), np.where(chain.rods, 1, 3))
+    return np.repeat(np.arange(mechanism.n), [len(KINDS[kind].rows) for kind in mechanism.kind])
 
 
 @dataclass(frozen=True, eq=False)
 class _RowLayout:
-    """What the rows of a chain have in common at every state."""
+    """What the rows of a mechanism have in common at every state."""
 
-    bodies: NDArray[np.intp]  # (2, N) near and far body of each joint; the pivot's is body 0, see `s`
-    s: AnyArray  # (2, N, 3) m, their points; 0 for the pivot, which takes body 0 out: H(p, 0) = 0
+    bodies: NDArray[np.intp]  # (2, N) near and far body of each joint; for the world body 0, see `s`
+    s: AnyArray  # (2, N, 3) m, their points; 0 for the world, which takes body 0 out: H(p, 0) = 0
     B: AnyArray  # (2, N, 4, 4) B(s)
+    world_point: AnyArray  # (N, 3) m, the far point where the far body is the world, else 0
     point_squares: AnyArray  # (N,) m²: sᵀs of both points less ℓ²
-    rod_joints: NDArray[np.intp] | slice  # joints that are rods; all of them as a slice, which copies nothing
-    ball_joints: NDArray[np.intp] | slice
-    rod_count: int  # how many
-    ball_count: int
+    rods: NDArray[np.intp] | slice  # joints that are rods; all of them as a slice, which copies nothing
+    rod_rows: NDArray[np.intp]  # their rows
     joint: NDArray[np.intp]  # (c,) the joint of each row
-    order: NDArray[np.intp]  # (c,) rows of the rods, then of the balls, in the order of the joints
+    far: NDArray[np.intp]  # (c,) its far body, −1 the world
+    product_rows: NDArray[np.intp]  # (k,) the rows that are products of `factors`
+    factors: NDArray[np.intp]  # (2, k) u and w of these rows, places in VECTORS
+    turned: NDArray[np.intp]  # (t,) joints that have axes
+    axes: AnyArray  # (2, t, 3, 3) h and f in the near and far body, rows; 0 for the world
+    B_of_axes: AnyArray  # (2, t, 3, 4, 4) B of the axes
+    world_axes: AnyArray  # (t, 3, 3) f where the far body is the world, else 0
 
 
-@lru_cache(maxsize=64)  # chains are never changed, and a run uses the same one ten thousand times
-def _row_layout(chain: Mechanism) -> _RowLayout:
-    k = np.arange(chain.n)
-    s = np.stack([chain.proximal, far_body_values(chain.distal)])
-    rod, ball = np.flatnonzero(chain.rods), np.flatnonzero(~chain.rods)
+@lru_cache(maxsize=64)  # mechanisms are never changed, and a run uses the same one ten thousand times
+def _row_layout(mechanism: Mechanism) -> _RowLayout:
+    far, near = mechanism.body.T
+    world = far < 0
+    s = np.stack([mechanism.point[:, 1], np.where(world[:, None], 0, mechanism.point[:, 0])])
+    joint = joint_of_rows(mechanism)
+    pairs = [pair for kind in mechanism.kind for pair in KINDS[kind].rows]
+    is_rod = np.array([pair == ("d", "d") for pair in pairs], bool)
+    rods = joint[is_rod]
+    used = [{name for pair in KINDS[kind].rows for name in pair} for kind in mechanism.kind]
+    turned = np.array([k for k, names in enumerate(used) if names & set("xyzXYZ")], np.intp)
+    f, h = np.moveaxis(A(mechanism.turn[turned]).swapaxes(-1, -2), 1, 0)  # rows: the axes
+    axes = np.stack([h, np.where(world[turned, None, None], 0, f)])
+    factors = [[VECTORS.index(name) for name in pair] for pair in pairs if pair != ("d", "d")]
     return _RowLayout(
-        bodies=np.stack([k, np.maximum(k - 1, 0)]),
+        bodies=np.stack([near, np.maximum(far, 0)]),
         s=s,
         B=B(s),
-        point_squares=dot(s, s).sum(0) - chain.length**2,
-        rod_joints=rod if len(ball) else slice(None),
-        ball_joints=ball if len(rod) else slice(None),
-        rod_count=len(rod),
-        ball_count=len(ball),
-        joint=joint_of_rows(chain),
-        order=np.argsort(np.concatenate([rod, np.repeat(ball, 3)]), kind="stable"),
+        world_point=np.where(world[:, None], mechanism.point[:, 0], 0),
+        point_squares=dot(s, s).sum(0) - mechanism.length**2,
+        rods=slice(None) if len(rods) == mechanism.n else rods,
+        rod_rows=np.flatnonzero(is_rod),
+        joint=joint,
+        far=far[joint],
+        product_rows=np.flatnonzero(~is_rod),
+        factors=np.array(factors, np.intp).reshape(-1, 2).T,
+        turned=turned,
+        axes=axes,
+        B_of_axes=B(axes),
+        world_axes=np.where(world[turned, None, None], f, 0),
     )
 
 
 def constraint_rows(
-    chain: Mechanism, r: AnyArray, p: AnyArray, v: AnyArray, pdot: AnyArray
+    mechanism: Mechanism, r: AnyArray, p: AnyArray, v: AnyArray, pdot: AnyArray
 ) -> ConstraintRows:
-    """Evaluate C, C_r, C_p and γ of every joint (S1–S4, D2–D6 for rods; E1, N8 for balls).
+    """Evaluate C, C_r, C_p and γ of every joint (S1–S4, D2–D6 for rods; L1–L3 for the others).
 
     Args:
-        chain: the mechanism.
+        mechanism: bodies and joints.
         r: positions (N, 3) [m], world frame.
         p: Euler parameters (N, 4).
         v: velocities ṙ (N, 3) [m/s], world frame.
@@ -132,45 +162,77 @@ def constraint_rows(
         The rows in the order of the joints, on or off the constraints.
 
     """
-    fixed = _row_layout(chain)
-    s = fixed.s
+    fixed = _row_layout(mechanism)
+    s, far = fixed.s, mechanism.body[:, 0]
     q, qdot = p[fixed.bodies], pdot[fixed.bodies]  # (2, N, 4): near and far body of each joint
-    x, xdot = r.copy(), v.copy()  # from the far body to the near one
-    x[1:] -= r[:-1]
-    xdot[1:] -= v[:-1]
+    x = r - of_far_body(r, far) - fixed.world_point  # from the far body (the far point) to the near one
+    xdot = v - of_far_body(v, far)
     both = np.stack([q, qdot])
     turn = G(both)
     (H_near, H_far), (H_near_rate, H_far_rate) = turn @ fixed.B + outer(s, both)  # H, Ḣ (D4)
     b, a = _matrix_vector(A(q), s)
     d = x + b - a
 
-    parts: list[tuple[AnyArray, ...]] = []
-    if fixed.rod_count:
-        k = fixed.rod_joints
+    c = len(fixed.joint)
+    C, gamma, r_near, p_near, p_far = (
+        np.zeros(shape, d.dtype) for shape in ((c,), (c,), (c, 3), (c, 4), (c, 4))
+    )
+    if len(fixed.rod_rows):
+        k, row = fixed.rods, fixed.rod_rows
         bdot, adot = 2 * _matrix_vector(
             turn[0][:, k], _vector_matrix(s[:, k], L(qdot[:, k]))
         )  # Ȧ s, Ȧ = 2 G L̇ᵀ (N10)
         y, ydot, z, zdot = x[k] - a[k], xdot[k] - adot, x[k] + b[k], xdot[k] + bdot
-        C = dot(x[k], x[k]) + 2 * dot(x[k], b[k] - a[k]) - 2 * dot(a[k], b[k]) + fixed.point_squares[k]
+        C[row] = dot(x[k], x[k]) + 2 * dot(x[k], b[k] - a[k]) - 2 * dot(a[k], b[k]) + fixed.point_squares[k]
         near_rate = _vector_matrix(ydot, H_near[k]) + _vector_matrix(y, H_near_rate[k])
         far_rate = _vector_matrix(zdot, H_far[k]) + _vector_matrix(z, H_far_rate[k])
-        gamma = (
+        gamma[row] = (
             -2 * dot(zdot - adot, xdot[k]) - 4 * dot(near_rate, qdot[0, k]) + 4 * dot(far_rate, qdot[1, k])
         )
-        parts.append((C, 2 * d[k], 4 * _vector_matrix(y, H_near[k]), -4 * _vector_matrix(z, H_far[k]), gamma))
-    if fixed.ball_count:
-        k = fixed.ball_joints
-        gamma = 2 * (_matrix_vector(H_far_rate[k], qdot[1, k]) - _matrix_vector(H_near_rate[k], qdot[0, k]))
-        identity = np.broadcast_to(I3, (fixed.ball_count, 3, 3))
-        blocks = (d[k], identity, 2 * H_near[k], -2 * H_far[k], gamma)
-        parts.append(
-            tuple(np.reshape(block, (3 * fixed.ball_count, *np.shape(block)[2:])) for block in blocks)
-        )
-    columns = parts[0]
-    if len(parts) == 2:
-        columns = tuple(np.concatenate(column)[fixed.order] for column in zip(*parts, strict=True))
-    C, r_near, p_near, p_far, gamma = columns
-    return ConstraintRows(joint=fixed.joint, C=C, r_near=r_near, p_near=p_near, p_far=p_far, gamma=gamma, d=d)
+        r_near[row] = 2 * d[k]
+        p_near[row], p_far[row] = 4 * _vector_matrix(y, H_near[k]), -4 * _vector_matrix(z, H_far[k])
+    if len(fixed.product_rows):
+        row = fixed.product_rows
+        H_d = np.stack([[H_near, H_far], [H_near_rate, H_far_rate]])
+        vectors = _factor_vectors(fixed, d, xdot, both, H_d)
+        C[row], gamma[row], r_near[row], p_near[row], p_far[row] = _product_rows(fixed, vectors)
+    return ConstraintRows(fixed.joint, fixed.far, C, r_near, p_near, p_far, gamma, d)
+
+
+def _factor_vectors(
+    fixed: _RowLayout, d: AnyArray, xdot: AnyArray, both: AnyArray, H_d: AnyArray
+) -> tuple[AnyArray, ...]:
+    """The vectors of VECTORS of every joint (N, 10, 3), ∂/∂p of the near and far body, rates and ũ (L1)."""
+    n, q, qdot = len(d), both[0], both[1]
+    value, rate, bias = (np.zeros((n, len(VECTORS), 3), d.dtype) for _ in range(3))
+    of_p = np.zeros((2, n, len(VECTORS), 3, 4), d.dtype)  # near, far
+    value[:, :3] = I3
+    H, H_rate = H_d
+    swing, bend = (2 * _matrix_vector(h, qdot) for h in (H, H_rate))  # (2, N, 3): near, far
+    value[:, 9], rate[:, 9], bias[:, 9] = d, xdot + swing[0] - swing[1], bend[0] - bend[1]
+    of_p[0, :, 9], of_p[1, :, 9] = 2 * H[0], -2 * H[1]
+    k = fixed.turned
+    if len(k):
+        t = fixed.axes
+        qk, qdotk = q[:, k, None], qdot[:, k, None]  # (2, t, 1, 4)
+        axis_H, axis_H_rate = (G(x) @ fixed.B_of_axes + outer(t, x) for x in (qk, qdotk))
+        turned = _matrix_vector(A(qk), t)
+        for side, at in ((0, slice(6, 9)), (1, slice(3, 6))):
+            value[k, at] = turned[side] + (fixed.world_axes if side else 0)
+            of_p[side, k, at] = 2 * axis_H[side]
+            rate[k, at] = 2 * _matrix_vector(axis_H[side], qdotk[side])
+            bias[k, at] = 2 * _matrix_vector(axis_H_rate[side], qdotk[side])
+    return value, of_p, rate, bias
+
+
+def _product_rows(fixed: _RowLayout, vectors: tuple[AnyArray, ...]) -> tuple[AnyArray, ...]:
+    """C, γ, C_r near, C_p near and C_p far of the rows that are products (L2, L3)."""
+    value, of_p, rate, bias = vectors
+    k, (iu, iw) = fixed.joint[fixed.product_rows], fixed.factors
+    u, w = value[k, iu], value[k, iw]
+    p_near, p_far = (_vector_matrix(u, x[k, iw]) + _vector_matrix(w, x[k, iu]) for x in of_p)
+    gamma = -(dot(u, bias[k, iw]) + dot(w, bias[k, iu]) + 2 * dot(rate[k, iu], rate[k, iw]))
+    return dot(u, w), gamma, u * (iw == 9)[:, None], p_near, p_far
 
 
 def _matrix_vector(matrix: AnyArray, vector: AnyArray) -> AnyArray:

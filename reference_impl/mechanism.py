@@ -1,34 +1,162 @@
-"""The mechanism that the equations are written for: an open chain of rigid bodies on rods and ball joints."""
+"""The mechanism that the equations are written for: rigid bodies on joints, as an open tree."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Kind = Literal["rod", "ball", "hinge", "universal", "slide", "cylindrical", "weld", "free"]
+
+
+class JointKind(NamedTuple):
+    """What a joint holds, and what it leaves free."""
+
+    # Rows C = uᵀw by the names of u and w: i, j, k the world's axes, x, y, z the joint's in the far body,
+    # X, Y, Z in the near one, d from the far to the near point.
+    rows: tuple[tuple[str, str], ...]
+    # Its scalar coordinates from the far body on: turns about or slides along one of the axes 0, 1, 2.
+    motions: tuple[tuple[Literal["turn", "slide"], int], ...] = ()
+    has_attitude: bool = False  # whether p of the near body is a coordinate, not a result
+
+
+_POINT = (("i", "d"), ("j", "d"), ("k", "d"))
+_ATTITUDE = (("x", "Y"), ("y", "Z"), ("z", "X"))
+KINDS: dict[Kind, JointKind] = {
+    "rod": JointKind((("d", "d"),), has_attitude=True),
+    "ball": JointKind(_POINT, has_attitude=True),
+    "hinge": JointKind((*_POINT, ("x", "Z"), ("y", "Z")), (("turn", 2),)),
+    "universal": JointKind((*_POINT, ("x", "Y")), (("turn", 0), ("turn", 1))),
+    "slide": JointKind((("x", "d"), ("y", "d"), *_ATTITUDE), (("slide", 2),)),
+    "cylindrical": JointKind((("x", "d"), ("y", "d"), ("x", "Z"), ("y", "Z")), (("slide", 2), ("turn", 2))),
+    "weld": JointKind((*_POINT, *_ATTITUDE)),
+    "free": JointKind((), has_attitude=True),
+}
+CHAIN_FIELDS = (
+    "mass", "inertia", "proximal", "distal", "length",
+    "gravity", "force", "moment", "drag_force", "drag_moment",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
 class Mechanism:
-    """An open chain of N rigid bodies, each hung from the one before and the first from the world origin.
+    """A tree of N rigid bodies: joint k holds body k, its near body, on a far body or on the world (−1).
 
-    Joint k connects body k to body k−1, joint 0 to the pivot.  ``length[k] > 0`` makes it the notes'
-    massless rigid rod with a ball joint at both ends, ``length[k] == 0`` a ball joint, the limit ℓ → 0 (E1).
+    The far body of a joint comes before the near one, and the bodies of a branch follow each other (depth
+    first).  A "rod" is the notes' massless rigid rod with a ball joint at both ends, a "ball" its limit ℓ → 0
+    (E1).  A chain, each body on the one before and the first on the world's origin, is made by `chain`;
     N = 1 and N = 2 on rods are the notes' own pendulums.
     """
 
     mass: Array  # (N,) kg
     inertia: Array  # (N, 3, 3) kg m², J about the centre of mass, body frame
-    proximal: Array  # (N, 3) m, body frame, where body k hangs: s_1 of body 1, s_3 of body 2
-    distal: Array  # (N, 3) m, body frame, where body k+1 hangs on body k: s_2; unused for the last body
-    length: Array  # (N,) m, ℓ of joint k, 0 for a ball joint
+    kind: tuple[Kind, ...]  # (N,) of the joints
+    body: NDArray[np.intp]  # (N, 2) far and near body of each joint; body[k, 0] < body[k, 1] = k
+    point: Array  # (N, 2, 3) m, far and near point of each joint, each in the frame of its body
+    turn: Array  # (N, 2, 4) unit quaternions: the joint's axes in the far and the near body
+    length: Array  # (N,) m, ℓ of a rod, 0 for other joints
     gravity: Array  # (3,) m/s², world frame
     force: Array  # (N, 3) N, constant applied force at the centre of mass, world frame
     moment: Array  # (N, 3) N m, constant applied moment n′, body frame
     drag_force: Array  # (N,) N s/m, c_t: F = −c_t ṙ at the centre of mass
     drag_moment: Array  # (N,) N m s, c_r: n′ = −c_r ω′
+
+    @classmethod
+    def chain(
+        cls,
+        mass: Array,
+        inertia: Array,
+        proximal: Array,
+        distal: Array,
+        length: Array,
+        gravity: Array,
+        force: Array,
+        moment: Array,
+        drag_force: Array,
+        drag_moment: Array,
+    ) -> Mechanism:
+        """Make an open chain on rods and ball joints, hung from the world's origin.
+
+        Args:
+            mass: (N,) [kg].
+            inertia: (N, 3, 3) about the centres of mass, body frames [kg m²].
+            proximal: (N, 3) where body k hangs: the notes' s_1 of body 1, s_3 of body 2; body frame [m].
+            distal: (N, 3) where body k+1 hangs on body k: s_2; body frame, unused for the last body [m].
+            length: (N,) of the rods, 0 for a ball joint [m].
+            gravity: (3,) world frame [m/s²].
+            force: (N, 3) constant applied forces at the centres of mass, world frame [N].
+            moment: (N, 3) constant applied moments n′, body frame [N m].
+            drag_force: (N,) c_t [N s/m].
+            drag_moment: (N,) c_r [N m s].
+
+        Returns:
+            The chain.
+
+        """
+        k = np.arange(len(length))
+        far = np.concatenate([np.zeros_like(distal[:1]), distal[:-1]])
+        return cls(
+            mass=mass,
+            inertia=inertia,
+            kind=_chain_kinds(length),
+            body=np.stack([k - 1, k], axis=1),
+            point=np.stack([far, proximal], axis=1),
+            turn=np.tile([1.0, 0.0, 0.0, 0.0], (len(k), 2, 1)),
+            length=length,
+            gravity=gravity,
+            force=force,
+            moment=moment,
+            drag_force=drag_force,
+            drag_moment=drag_moment,
+        )
+
+    def changed(self, **changes: Any) -> Mechanism:
+        """Copy the mechanism with other values of some fields.
+
+        Args:
+            **changes: fields by name.  Of a chain also ``proximal`` and ``distal`` as `chain` takes them, and
+                a new ``length`` decides which joints are rods.
+
+        Returns:
+            The copy.
+
+        """
+        near, far = changes.pop("proximal", None), changes.pop("distal", None)
+        point = changes.get("point", self.point)
+        if near is not None:
+            changes["point"] = point = np.stack([point[:, 0], near], axis=1)
+        if far is not None:
+            hang = np.concatenate([np.zeros_like(far[:1]), far[:-1]])
+            changes["point"] = np.stack([hang, point[:, 1]], axis=1)
+        if "length" in changes and "kind" not in changes and self.is_chain:
+            changes["kind"] = _chain_kinds(changes["length"])
+        return replace(self, **changes)
+
+    @property
+    def fields(self) -> dict[str, Any]:
+        """The fields by name: of a chain, those that `chain` takes."""
+        names = CHAIN_FIELDS if self.is_chain else tuple(vars(self))
+        return {name: getattr(self, name) for name in names}
+
+    @classmethod
+    def from_fields(cls, fields: dict[str, Any]) -> Mechanism:
+        """Make a mechanism of its `fields`.
+
+        Args:
+            fields: as `fields` returns them; lists will do for arrays.
+
+        Returns:
+            The mechanism.
+
+        """
+        if "proximal" in fields:
+            return cls.chain(**{name: np.array(value, float) for name, value in fields.items()})
+        named = ("kind", "body")
+        arrays = {name: np.array(value, float) for name, value in fields.items() if name not in named}
+        return cls(kind=tuple(fields["kind"]), body=np.array(fields["body"], np.intp), **arrays)
 
     @property
     def n(self) -> int:
@@ -36,9 +164,25 @@ class Mechanism:
         return len(self.mass)
 
     @property
+    def is_chain(self) -> bool:
+        """Whether every body hangs on the one before, the first on the world, by rods and balls."""
+        is_row = bool(np.all(self.body[:, 0] == np.arange(self.n) - 1)) and not np.any(self.point[0, 0])
+        return is_row and set(self.kind) <= {"rod", "ball"}
+
+    @property
+    def proximal(self) -> Array:
+        """(N, 3) m, body frame: the point by which body k hangs, the near point of joint k."""
+        return self.point[:, 1]
+
+    @property
+    def distal(self) -> Array:
+        """(N, 3) m, body frame: the point of body k on which body k+1 of a chain hangs; 0 for the last."""
+        return np.concatenate([self.point[1:, 0], np.zeros_like(self.point[:1, 0])])
+
+    @property
     def rods(self) -> NDArray[np.bool_]:
         """(N,) True where joint k is a rod."""
-        return np.asarray(self.length > 0)
+        return np.array([kind == "rod" for kind in self.kind])
 
     @property
     def has_drag(self) -> bool:
@@ -49,3 +193,8 @@ class Mechanism:
     def has_loads(self) -> bool:
         """Whether any constant force or moment is applied."""
         return bool(np.any(self.force) or np.any(self.moment))
+
+
+def _chain_kinds(length: Array) -> tuple[Kind, ...]:
+    """Rods where there is a length, balls elsewhere."""
+    return tuple("rod" if size > 0 else "ball" for size in length)

@@ -92,6 +92,8 @@ class StructuredSystem:
 
     def __init__(self, chains: Sequence[Mechanism]) -> None:
         self.chains = tuple(chains)
+        if not all(chain.is_chain for chain in chains):
+            raise ValueError("the structured form covers chains of rods and balls")
         mass, inertia, proximal, distal, length = (
             np.concatenate([getattr(chain, name) for chain in chains])
             for name in ("mass", "inertia", "proximal", "distal", "length")

@@ -65,7 +65,7 @@ class DefectCase:
             Its model, and its state with r and v computed from the minimal coordinates.
 
         """
-        model = Model(**{name: getattr(self, name)[b] for name in MODEL_FIELDS})
+        model = Model.chain(**{name: getattr(self, name)[b] for name in MODEL_FIELDS})
         r, v = centre_positions_and_velocities(self)
         return model, State(**{name: getattr(self, name)[b] for name in STATE_FIELDS}, r=r[b], v=v[b])
 

@@ -28,6 +28,7 @@ from plumbline.model.datatypes import (
     Trajectory,
     Unsupported,
 )
+from plumbline.model.kinematics import rate_count
 
 UNIT_NORM_TOLERANCE = 8 * np.finfo(float).eps  # a quaternion normalised in double is this close to |p| = 1
 
@@ -41,6 +42,7 @@ UNSUPPORTED_KINDS = {
     "rods": "the engine refuses models in which a body hangs by a massless rod, or some of them",
     "balls": "the engine refuses models in which a body hangs by a ball joint, or some of them",
     "chains": "the engine refuses models of more than one body, or some of them",
+    "trees": "the engine refuses models with other joints than rods and balls, or with branches",
     "loads": "the engine refuses models with applied forces, moments and drag, or some of them",
     "integrators": "the engine evaluates states and does not simulate",
 }
@@ -75,6 +77,7 @@ class Adapter(ABC):
     # Requirements of environments with another version: (range of versions, additional requirement).
     extra_requirements: ClassVar[tuple[tuple[str, str], ...]] = ()
     other_formulation: ClassVar[str] = ""  # the same engine's column in other coordinates
+    builds_trees: ClassVar[bool] = False  # whether states of trees with any joints are evaluated
     reproduction_template: ClassVar[str] = ""  # template of stand-alone scripts; without one there are none
 
     @abstractmethod
@@ -149,6 +152,7 @@ class Adapter(ABC):
         cannot do this; the message is the reason) pass through.
 
         """
+        self._check_mechanism(model, self.builds_trees)
         for state in states:
             check_state(model, state)
         answers = self._evaluate(model, states)
@@ -174,6 +178,7 @@ class Adapter(ABC):
             The trajectory at ``times``, not normalised and not projected.
 
         """
+        self._check_mechanism(model, False)
         check_state(model, state)
         method = self.integrator(integrator)
         if method.kind == "step":
@@ -199,6 +204,7 @@ class Adapter(ABC):
             EngineFailure: a sample, acceleration or multiplier is missing, not finite or of another shape.
 
         """
+        self._check_mechanism(model, False)
         check_state(model, state)
         times = np.asarray(step * np.arange(count + 1), float)
         run = self._step(model, state, times, self.integrator(integrator), step)
@@ -210,6 +216,13 @@ class Adapter(ABC):
                 if not np.all(np.isfinite(value)):
                     raise EngineFailure(f"{label} is not finite")
         return run
+
+    def _check_mechanism(self, model: Model, has_trees: bool) -> None:
+        """Refuse what the adapter does not build."""
+        if not (has_trees or model.is_chain):
+            raise Unsupported(
+                f"the adapter of {self.title} covers chains of rods and balls hung from the origin"
+            )
 
 
 def check_state(model: Model, state: State) -> None:
@@ -223,8 +236,9 @@ def check_state(model: Model, state: State) -> None:
         BadInput: one of these does not hold; the message names the array.
 
     """
-    for name, shape in (("p", (model.n, 4)), *((k, (model.n, 3)) for k in ("omega", "u", "udot", "r", "v"))):
-        array = getattr(state, name)
+    widths = {"p": 4, "x": 2, "xdot": 2}
+    for name, array in vars(state).items():
+        shape = model.n, widths.get(name, 3)
         if np.shape(array) != shape:
             raise BadInput(f"state.{name} has shape {np.shape(array)}, expected {shape}")
         if array.dtype != np.float64:
@@ -234,8 +248,8 @@ def check_state(model: Model, state: State) -> None:
     norms = np.linalg.norm(state.p, axis=-1)
     if np.any(np.abs(norms - 1) > UNIT_NORM_TOLERANCE):
         raise BadInput(f"state.p is not normalised: |p| = {norms.tolist()}")
-    for array_name in vars(model):
-        if not np.all(np.isfinite(getattr(model, array_name))):
+    for array_name, values in vars(model).items():
+        if array_name != "kind" and not np.all(np.isfinite(values)):
             raise BadInput(f"model.{array_name} is not finite")
 
 
@@ -298,7 +312,8 @@ def _check_quantities(model: Model, answer: StateQuantities, label: str) -> None
         "angular_momentum": (3,),
         "kinetic_energy": (),
         "potential_energy": (),
-        "mass_matrix": (3 * (model.n + int(model.rods.sum())),) * 2,
+        "joint_moment": (model.n, 3),
+        "mass_matrix": (rate_count(model),) * 2,
     }
     for name, shape in shapes.items():
         value = getattr(answer, name)

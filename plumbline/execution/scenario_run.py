@@ -253,7 +253,7 @@ class ScenarioRun:
             "sample": s.sample_interval,
             "exact": s.closed_form,
             "digest": s.digest,
-            "model": {key: np.asarray(value).tolist() for key, value in vars(s.model).items()},
+            "model": {key: np.asarray(value).tolist() for key, value in s.model.fields.items()},
             "state": {key: getattr(s.state, key).tolist() for key in ("p", "omega", "u", "udot")},
         }
         if isinstance(truth, MotionTruth):

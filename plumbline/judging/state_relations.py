@@ -18,7 +18,7 @@ every unit and independent of axes), except for welded halves, whose equations h
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -98,7 +98,7 @@ def scale_fields(model: Model, **factors: float) -> Model:
         The other pendulum.
 
     """
-    return replace(model, **{name: getattr(model, name) * factor for name, factor in factors.items()})
+    return model.changed(**{name: getattr(model, name) * factor for name, factor in factors.items()})
 
 
 def _rotate_world(model: Model, state: State) -> tuple[Model, State]:

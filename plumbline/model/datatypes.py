@@ -9,15 +9,23 @@ velocity in the body frame (the notes' ω′ = 2 L(p) ṗ). N is the number of b
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
+
+import numpy as np
 
 from plumbline.model.step_methods import StepMethod
 from plumbline.processes.errors import PlumblineError
+from reference_impl.mechanism import KINDS as KINDS
 from reference_impl.mechanism import Array as Array
+from reference_impl.mechanism import Kind as Kind
 from reference_impl.mechanism import Mechanism
 
 Model = Mechanism
+
+
+def _no_coordinates() -> Array:
+    return np.zeros((0, 2))
 
 
 class Unsupported(PlumblineError):
@@ -34,11 +42,13 @@ class BadInput(PlumblineError, ValueError):
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """One exact state on the constraint manifold: minimal coordinates p, omega, u, udot; r, v follow.
+    """One exact state on the constraint manifold: its minimal coordinates, and all that follows from them.
 
-    ``u`` is the unit direction of rod k, from the point where the rod hangs to the proximal point of body k,
-    and ``udot`` its rate (u·udot = 0); both are zero for ball joints.  The rod's angular velocity without
-    axial spin is u × udot.  `plumbline.model.kinematics.state_from_minimal` makes states.
+    Minimal are p and omega of bodies on rods and balls and of free ones, u and udot of rods, r and v of free
+    bodies, x and xdot of the other joints; of the other bodies p, omega, r and v follow.  ``u`` is the unit
+    direction of rod k, from the point where the rod hangs to the near point of body k, and ``udot`` its rate
+    (u·udot = 0); both are zero for other joints.  The rod's angular velocity without axial spin is u × udot.
+    `plumbline.model.kinematics.state_from_minimal` makes states.
     """
 
     p: Array  # (N, 4) –
@@ -47,6 +57,15 @@ class State:
     udot: Array  # (N, 3) 1/s, world frame
     r: Array  # (N, 3) m, world frame
     v: Array  # (N, 3) m/s, world frame: ṙ
+    # (N, 2) rad or m: coordinates of joint k in the order of its kind's motions, angles unwrapped; rates
+    x: Array = field(default_factory=_no_coordinates)
+    xdot: Array = field(default_factory=_no_coordinates)
+
+    def __post_init__(self) -> None:
+        """Give mechanisms without such coordinates zeros of the right shape."""
+        for name in ("x", "xdot"):
+            if not getattr(self, name).size:
+                object.__setattr__(self, name, np.zeros((len(self.p), 2)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,13 +74,14 @@ class StateQuantities:
 
     acceleration: Array  # (N, 3) m/s², r̈ of the centres of mass, world frame
     angular_acceleration: Array  # (N, 3) rad/s², ω̇′, body frame
-    joint_reaction: Array | None = None  # (N, 3) N, force on body k at its proximal point, world frame
+    joint_reaction: Array | None = None  # (N, 3) N, force on body k at its joint's near point, world frame
     kinetic_energy: float | None = None  # J
     potential_energy: float | None = None  # J, zero at the pivot: -Σ m g·r
     angular_momentum: Array | None = None  # (3,) kg m²/s about the pivot, world frame
-    # (nu, nu), kinetic energy = ½ νᵀ M ν with ν = (udot of the rods in order, then omega of all bodies),
-    # i.e. nu = 3·(number of rods) + 3 N; a rod's 3×3 part acts on udot through u × udot.
+    # (nu, nu), kinetic energy = ½ νᵀ M ν with ν = (udot of the rods in order, then body by body omega, or
+    # (v, omega) of a free body, or the xdot of its joint); a rod's 3×3 part acts on udot through u × udot.
     mass_matrix: Array | None = None
+    joint_moment: Array | None = None  # (N, 3) N m, moment on body k about that point, world frame
 
 
 @dataclass(frozen=True, eq=False)

@@ -68,8 +68,7 @@ def rotate_body_frames(model: Model, state: State, q: Array) -> tuple[Model, Sta
     rotated = replace(
         model,
         inertia=(inertia + inertia.mT) / 2,
-        proximal=model.proximal @ turn.T,
-        distal=model.distal @ turn.T,
+        point=np.where((model.body >= 0)[..., None], model.point @ turn.T, model.point),
         moment=model.moment @ turn.T,
     )
     p = quaternion_product(state.p, quaternion_conjugate(q))
@@ -104,4 +103,4 @@ def first_bodies(model: Model, state: State, count: int) -> tuple[Model, State]:
 
     """
     fields = {name: x if name == "gravity" else x[:count] for name, x in vars(model).items()}
-    return Model(**fields), State(**{name: x[:count] for name, x in vars(state).items()})
+    return replace(model, **fields), State(**{name: x[:count] for name, x in vars(state).items()})

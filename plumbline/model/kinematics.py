@@ -6,9 +6,12 @@ Imports nothing of the project but its types.
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 
-from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.datatypes import KINDS, Array, Kind, Model, State
 
 
 def rotation_matrix(p: Array) -> Array:
@@ -136,60 +139,177 @@ def angular_velocity(p: Array, pdot: Array) -> Array:
     return 2.0 * quaternion_product(quaternion_conjugate(p), pdot)[..., 1:]
 
 
-def state_from_minimal(model: Model, p: Array, omega: Array, u: Array, udot: Array) -> State:
-    """Complete minimal coordinates to a state: centres of mass and their velocities from the pivot outwards.
+def state_from_minimal(
+    model: Model,
+    p: Array,
+    omega: Array,
+    u: Array,
+    udot: Array,
+    x: Array | None = None,
+    xdot: Array | None = None,
+    r: Array | None = None,
+    v: Array | None = None,
+) -> State:
+    """Complete minimal coordinates to a state, from the world outwards.
 
     Args:
-        model: the chain of N bodies.
-        p: (N, 4) unit quaternions, body → world.
-        omega: (N, 3) angular velocities, body frame [rad/s].
-        u: (N, 3) unit directions of the rods, world frame; zero for ball joints.
+        model: the mechanism of N bodies.
+        p: (N, 4) unit quaternions, body → world; of bodies whose joint leaves their attitude free.
+        omega: (N, 3) angular velocities of the same bodies, body frame [rad/s].
+        u: (N, 3) unit directions of the rods, world frame; zero for other joints.
         udot: (N, 3) their rates, perpendicular to ``u`` [1/s].
+        x: (N, 2) coordinates of hinges, slides and their like [rad, m]; absent: zeros.
+        xdot: (N, 2) their rates.
+        r: (N, 3) centres of mass of free bodies, world frame [m]; absent: zeros.
+        v: (N, 3) their velocities [m/s].
 
     Returns:
         The state, on the constraint manifold to rounding.
 
     """
-    r, v = forward_kinematics(model, p, omega, u, udot)
-    return State(p=p, omega=omega, u=u, udot=udot, r=r, v=v)
+    pair, vector = np.zeros((model.n, 2)), np.zeros((model.n, 3))
+    start = State(
+        p=p,
+        omega=omega,
+        u=u,
+        udot=udot,
+        r=vector if r is None else r,
+        v=vector if v is None else v,
+        x=pair if x is None else x,
+        xdot=pair if xdot is None else xdot,
+    )
+    return complete_state(model, start)
 
 
-def forward_kinematics(model: Model, p: Array, omega: Array, u: Array, udot: Array) -> tuple[Array, Array]:
-    """Return the centres of mass and their velocities, of one state or of many.
+def complete_state(model: Model, state: State) -> State:
+    """Compute all that follows from the minimal coordinates of a state, from the world outwards.
 
     Args:
-        model: the chain of N bodies.
-        p: (..., N, 4) unit quaternions, body → world.
-        omega: (..., N, 3) angular velocities, body frame [rad/s].
-        u: (..., N, 3) unit directions of the rods, world frame; zero for ball joints.
-        udot: (..., N, 3) their rates [1/s].
+        model: the mechanism of N bodies; it need not be the one that the state was made for.
+        state: a state of which the minimal coordinates are used.
 
     Returns:
-        Positions r [m] and velocities ṙ [m/s], (..., N, 3) each, world frame.
+        The state of the model with the same minimal coordinates.
 
     """
-    a = rotation_matrix(p)  # (..., N, 3, 3)
-    r, v = np.empty(omega.shape), np.empty(omega.shape)
-    near, far = cross(omega, model.proximal), cross(omega, model.distal)
-    tip = tip_v = np.zeros(3)
-    for k in range(model.n):
-        turn = a[..., k, :, :]
-        hang = tip + model.length[k] * u[..., k, :]
-        hang_v = tip_v + model.length[k] * udot[..., k, :]
-        r[..., k, :] = hang - turn @ model.proximal[k]
-        v[..., k, :] = hang_v - (turn @ near[..., k, :, None])[..., 0]
-        tip = r[..., k, :] + turn @ model.distal[k]
-        tip_v = v[..., k, :] + (turn @ far[..., k, :, None])[..., 0]
-    return r, v
+    p, omega, r, v = forward_kinematics(model, *vars(state).values())
+    return replace(state, p=p, omega=omega, r=r, v=v)
+
+
+def forward_kinematics(
+    model: Model,
+    p: Array,
+    omega: Array,
+    u: Array,
+    udot: Array,
+    r: Array,
+    v: Array,
+    x: Array,
+    xdot: Array,
+) -> tuple[Array, Array, Array, Array]:
+    """Return attitudes, angular velocities, centres of mass and their velocities, of one state or of many.
+
+    Args:
+        model: the mechanism of N bodies.
+        p: (..., N, 4) unit quaternions, body → world, where they are coordinates.
+        omega: (..., N, 3) angular velocities of the same bodies, body frame [rad/s].
+        u: (..., N, 3) unit directions of the rods, world frame; zero for other joints.
+        udot: (..., N, 3) their rates [1/s].
+        r: (..., N, 3) centres of mass of free bodies, world frame [m].
+        v: (..., N, 3) their velocities [m/s].
+        x: (..., N, 2) joint coordinates [rad, m].
+        xdot: (..., N, 2) their rates.
+
+    Returns:
+        p (..., N, 4), ω′ (..., N, 3), r and ṙ (..., N, 3) of all bodies.
+
+    """
+    p, omega, r, v = p.copy(), omega.copy(), r.copy(), v.copy()
+    A = rotation_matrix(p)  # (..., N, 3, 3)
+    for k, (kind, far) in enumerate(zip(model.kind, model.body[:, 0], strict=True)):
+        if kind == "free":
+            continue
+        above = A[..., far, :, :] if far >= 0 else np.eye(3)
+        tip, tip_v, spin = model.point[k, 0], np.zeros(3), np.zeros(3)
+        if far >= 0:
+            tip = r[..., far, :] + above @ model.point[k, 0]
+            swing = cross(omega[..., far, :], model.point[k, 0])
+            tip_v = v[..., far, :] + rotate_vectors(above, swing)
+            spin = rotate_vectors(above, omega[..., far, :])
+        d, d_rate = model.length[k] * u[..., k, :], model.length[k] * udot[..., k, :]
+        if not KINDS[kind].has_attitude:
+            (d, relative), (d_rate, turning) = JointFrame(model, k, above).motion(
+                x[..., k, :], xdot[..., k, :]
+            )
+            d_rate = d_rate + cross(spin, d)
+            own = quaternion_product(p[..., far, :], relative) if far >= 0 else relative
+            p[..., k, :] = own / np.linalg.norm(own, axis=-1, keepdims=True)
+            A[..., k, :, :] = rotation_matrix(p[..., k, :])
+            omega[..., k, :] = rotate_vectors(A[..., k, :, :].mT, spin + turning)
+        near = cross(omega[..., k, :], model.proximal[k])
+        r[..., k, :] = tip + d - A[..., k, :, :] @ model.proximal[k]
+        v[..., k, :] = tip_v + d_rate - rotate_vectors(A[..., k, :, :], near)
+    return p, omega, r, v
+
+
+class JointFrame:
+    """Joint k with coordinates x seen from its far body, of attitude ``above`` (..., 3, 3).
+
+    The coordinates are those of the kind's motions, in order from the far body on.
+    """
+
+    def __init__(self, model: Model, k: int, above: Array) -> None:
+        self.motions = KINDS[model.kind[k]].motions
+        self.turn_far, self.turn_near = model.turn[k]
+        self.above = above
+
+    def motion(self, x: Array, xdot: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        """Return where the near body is from the far one, and its rates seen from there.
+
+        Args:
+            x: (..., 2) coordinates.
+            xdot: (..., 2) their rates.
+
+        Returns:
+            The shift of the near point (..., 3) [m], world axes, and the quaternion (..., 4) near → far body;
+            then the rates of the shift and Ω = ω_near − ω_far, (..., 3), world axes.
+
+        """
+        shift = shift_rate = spin = np.zeros(3)
+        turn = self.turn_far
+        for i, (what, axis) in enumerate(self.motions):
+            value, rate = x[..., i, None], xdot[..., i, None]
+            along = rotate_vectors(self.above, rotation_matrix(turn)[..., axis])
+            if what == "slide":
+                shift, shift_rate = shift + along * value, shift_rate + along * rate
+            else:
+                spin = spin + along * rate
+                half = np.zeros((*value.shape[:-1], 4))
+                half[..., :1], half[..., 1 + axis, None] = np.cos(value / 2), np.sin(value / 2)
+                turn = quaternion_product(turn, half)
+        return (shift, quaternion_product(turn, quaternion_conjugate(self.turn_near))), (shift_rate, spin)
+
+    def axes(self, x: Array) -> list[tuple[str, Array]]:
+        """Return what moves, and along or about which world axis.
+
+        Args:
+            x: (2,) coordinates.
+
+        Returns:
+            "turn" or "slide" and the axis (3,), of every motion.
+
+        """
+        rates = [self.motion(x, unit)[1] for unit in np.eye(2)]
+        return [(what, rate[what == "turn"]) for (what, _), rate in zip(self.motions, rates, strict=False)]
 
 
 def joint_vectors(model: Model, r: Array, p: Array) -> Array:
-    """Return d_k, the vectors from the point where joint k hangs to the proximal point of body k.
+    """Return d_k, the vectors from the far to the near point of every joint.
 
-    Zero for a ball joint that is closed, of length ℓ_k for a rod.
+    Zero for a joint that is closed, of length ℓ_k for a rod, along the axis for a slide.
 
     Args:
-        model: the chain of N bodies.
+        model: the mechanism of N bodies.
         r: (..., N, 3) centres of mass, world frame [m].
         p: (..., N, 4) quaternions, normalised here.
 
@@ -197,49 +317,104 @@ def joint_vectors(model: Model, r: Array, p: Array) -> Array:
         (..., N, 3) vectors, world frame [m].
 
     """
-    a = rotation_matrix(p)
+    a, far = rotation_matrix(p), model.body[:, 0]
     near = r + np.einsum("...kij,kj->...ki", a, model.proximal)
-    far = r + np.einsum("...kij,kj->...ki", a, model.distal)
-    hang = np.concatenate([np.zeros_like(far[..., :1, :]), far[..., :-1, :]], -2)
+    hang = r[..., far, :] + np.einsum("...kij,kj->...ki", a[..., far, :, :], model.point[:, 0])
+    hang[..., far < 0, :] = model.point[far < 0, 0]
     return np.asarray(near - hang)
+
+
+def rate_count(model: Model) -> int:
+    """Count the minimal rates ν of `velocity_jacobian`.
+
+    Args:
+        model: the mechanism.
+
+    Returns:
+        Their number: the size of `StateQuantities.mass_matrix`.
+
+    """
+    return 3 * int(model.rods.sum()) + sum(map(_own_rate_count, model.kind))
+
+
+def _own_rate_count(kind: Kind) -> int:
+    """Rates in ν that are a body's own: ω′, (ṙ, ω′) of a free body, else those of its joint."""
+    return 6 if kind == "free" else 3 if KINDS[kind].has_attitude else len(KINDS[kind].motions)
+
+
+def own_rates(model: Model) -> list[slice]:
+    """Return where each body's own rates are in ν, behind those of the rods.
+
+    Args:
+        model: the mechanism.
+
+    Returns:
+        N slices of ν.
+
+    """
+    first = 3 * int(model.rods.sum()) + np.cumsum([0, *map(_own_rate_count, model.kind)])
+    return [slice(int(start), int(end)) for start, end in pairwise(first)]
+
+
+def minimal_rates(model: Model, state: State) -> Array:
+    """Return ν, the minimal rates of a state.
+
+    Args:
+        model: the mechanism.
+        state: a state of it.
+
+    Returns:
+        (nu,) in the order of `velocity_jacobian`.
+
+    """
+    own: list[Array] = []
+    for k, kind in enumerate(model.kind):
+        own += [state.v[k]] if kind == "free" else []
+        own += [state.omega[k] if KINDS[kind].has_attitude else state.xdot[k, : len(KINDS[kind].motions)]]
+    return np.concatenate([state.udot[model.rods].ravel(), *own])
 
 
 def velocity_jacobian(model: Model, state: State) -> Array:
     """Return the map W from the minimal rates to the bodies' velocities: (v_0, ω′_0, v_1, ω′_1, …) = W ν.
 
-    ν holds udot of the rods in order, then ω′ of all bodies, as in `StateQuantities.mass_matrix`.  A rod
-    moves its lower end by ℓ (u × udot) × u = ℓ (I − u uᵀ) udot, so the axial part of udot moves nothing; the
-    angular velocity ω′ of a body moves its point s by −A s̃ ω′ (world frame).
+    ν holds udot of the rods in order, then body by body ω′, (ṙ, ω′) of a free body, or the rates of its
+    joint, as in `StateQuantities.mass_matrix`.  A rod moves its lower end by ℓ (u × udot) × u
+    = ℓ (I − u uᵀ) udot, so the axial part of udot moves nothing; the angular velocity ω′ of a body moves its
+    point s by −A s̃ ω′ (world frame).
 
     Args:
-        model: the chain of N bodies.
+        model: the mechanism of N bodies.
         state: a state on the constraint manifold.
 
     Returns:
-        (6N, nu) matrix, nu = 3·(number of rods) + 3N; linear velocities in the world frame, angular in the
-            body's.
+        (6N, nu) matrix; linear velocities in the world frame, angular in the body's.
 
     """
     n, rods = model.n, np.flatnonzero(model.rods)
     a = rotation_matrix(state.p)
-
-    def lever(s: Array) -> Array:
-        """−A s̃ (N, 3, 3): the velocity of point s of each body per ω′ of the body."""
-        return np.asarray(cross(s[:, None, :], a))  # row i: aᵢ·(ω′ × s) = (s × aᵢ)·ω′
-
-    prox, dist = lever(model.proximal), lever(model.distal)
-    out = np.zeros((n, 6, 3 * (len(rods) + n)))
-    tip = np.zeros((3, out.shape[-1]))  # velocity of where the next body hangs, as a function of ν
-    for k in range(n):
-        own = slice(3 * (len(rods) + k), 3 * (len(rods) + k) + 3)
-        if model.length[k] > 0:
-            rod = 3 * int(np.searchsorted(rods, k))
-            tip[:, rod : rod + 3] = model.length[k] * (np.eye(3) - np.outer(state.u[k], state.u[k]))
-        out[k, :3] = tip
-        out[k, :3, own] = -prox[k]
-        out[k, 3:, own] = np.eye(3)
-        tip = out[k, :3].copy()
-        tip[:, own] += dist[k]
+    near = cross(model.proximal[:, None, :], a)  # −A s̃ (N, 3, 3), row i: aᵢ·(ω′ × s) = (s × aᵢ)·ω′
+    out = np.zeros((n, 6, rate_count(model)))
+    for k, (kind, far, own) in enumerate(zip(model.kind, model.body[:, 0], own_rates(model), strict=True)):
+        if kind == "free":
+            out[k, :, own] = np.eye(6)
+            continue
+        tip, spin = np.zeros((2, 3, out.shape[-1]))  # velocity of the near point, angular velocity, world
+        if far >= 0:
+            tip = out[far, :3] + cross(model.point[k, 0], a[far]) @ out[far, 3:]
+            spin = a[far] @ out[far, 3:]
+        if kind == "rod":
+            at = 3 * int(np.searchsorted(rods, k))
+            tip[:, at : at + 3] = model.length[k] * (np.eye(3) - np.outer(state.u[k], state.u[k]))
+        if KINDS[kind].has_attitude:
+            out[k, 3:, own] = np.eye(3)
+        else:
+            joint = JointFrame(model, k, a[far] if far >= 0 else np.eye(3))
+            shift = joint.motion(state.x[k], state.xdot[k])[0][0]
+            tip = tip + cross_matrix(-shift) @ spin
+            for i, (what, axis) in enumerate(joint.axes(state.x[k])):
+                (tip if what == "slide" else spin)[:, own.start + i] += axis
+            out[k, 3:] = a[k].T @ spin
+        out[k, :3] = tip - near[k] @ out[k, 3:]
     return out.reshape(6 * n, -1)
 
 

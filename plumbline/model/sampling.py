@@ -6,7 +6,7 @@ import hashlib
 
 import numpy as np
 
-from plumbline.model.datatypes import Model, State
+from plumbline.model.datatypes import KINDS, Model, State
 from plumbline.model.kinematics import forward_kinematics
 
 
@@ -42,6 +42,7 @@ def compared_states(model: Model, state: State, digest: str, count: int) -> list
 def random_states(model: Model, count: int, seed: int) -> list[State]:
     """Draw states of the model: attitudes and rod directions uniform, rates slow to fast.
 
+    Angles are uniform over ±3 rad, shifts and free positions Gaussian over 1 m.
     Rates are Gaussian with a standard deviation drawn per state, log-uniform from a tenth to four times the
     pendulum's own rate √(g/ℓ), so that gravity dominates in some states and the velocity terms in others.
 
@@ -69,5 +70,14 @@ def random_states(model: Model, count: int, seed: int) -> list[State]:
     p /= np.linalg.norm(p, axis=-1, keepdims=True)
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
     u, udot = (np.where(model.rods[:, None], x, 0.0) for x in (u, np.cross(udot, u)))
-    r, v = forward_kinematics(model, p, omega, u, udot)
-    return [State(*parts) for parts in zip(p, omega, u, udot, r, v, strict=True)]
+    free = np.array([kind == "free" for kind in model.kind])[:, None]
+    x, xdot, r, v = (np.zeros((count, model.n, size)) for size in (2, 2, 3, 3))
+    for k in range(count if set(model.kind) - {"rod", "ball"} else 0):
+        for i, kind in enumerate(model.kind):
+            for j, (motion, _) in enumerate(KINDS[kind].motions):
+                x[k, i, j] = rng.uniform(-3, 3) if motion == "turn" else rng.normal()
+        spread = own_rate * 10 ** rng.uniform(-1.0, np.log10(4.0))
+        xdot[k] = spread * rng.normal(size=xdot[k].shape)
+        r[k], v[k] = (np.where(free, size * rng.normal(size=r[k].shape), 0.0) for size in (1.0, spread))
+    p, omega, r, v = forward_kinematics(model, p, omega, u, udot, r, v, x, xdot)
+    return [State(*parts) for parts in zip(p, omega, u, udot, r, v, x, xdot, strict=True)]

@@ -201,7 +201,7 @@ def _space_functions(code: str) -> str:
 
 def _chain(case: ReproductionCase, name: str, code: str) -> str:
     """Write the fields of a chain that the code uses."""
-    values = {**vars(case.model), **vars(case.state), **_derived_fields(case.model, case.state)}
+    values = {**case.model.fields, **vars(case.state), **_derived_fields(case.model, case.state)}
     used = [field for field in FIELD_COMMENTS if re.search(rf"\bc\.{field}\b", code)]
     lines = []
     for f in used:

@@ -35,7 +35,7 @@ class ReproductionCase:
     def content(self) -> tuple[object, ...]:
         """Every number of the case, hashable: equal for equal cases."""
         state = (getattr(self.state, name) for name in ("p", "omega", "u", "udot"))
-        numbers = tuple(np.asarray(x).tobytes() for x in (*vars(self.model).values(), *state))
+        numbers = tuple(np.asarray(x).tobytes() for x in (*self.model.fields.values(), *state))
         return (*numbers, self.until, self.steps)
 
 
@@ -165,7 +165,7 @@ def _parts(
     model, state, n = case.model, case.state, case.model.n
     for is_last in ends if count < n else (False,):
         part = slice(n - count, n) if is_last else slice(0, count)
-        few = replace(model, **{k: v[part] for k, v in vars(model).items() if k != "gravity"})
+        few = Model.chain(**{k: v if k == "gravity" else v[part] for k, v in model.fields.items()})
         at = {name: getattr(state, name)[part] for name in ("p", "omega", "u", "udot")}
         yield _changed(case, few, **at)
 
@@ -219,7 +219,7 @@ def _changed(case: ReproductionCase, model: Model | None = None, **coordinates: 
 def _with_fields(**make: Callable[[Array], Array]) -> _Change:
     """Change fields of the model."""
     return lambda case: _changed(
-        case, replace(case.model, **{name: of(getattr(case.model, name)) for name, of in make.items()})
+        case, case.model.changed(**{name: of(getattr(case.model, name)) for name, of in make.items()})
     )
 
 

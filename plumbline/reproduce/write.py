@@ -185,7 +185,7 @@ def find_disagreement(document: dict[str, Any], rows: list[StoredRow], seconds: 
     scenario = document["scenarios"].get(row["scenario"])
     if scenario is None:
         raise NotReproducible(f"the results do not hold the scenario {row['scenario']!r}")
-    model = Model(**{name: np.array(value, float) for name, value in scenario["model"].items()})
+    model = Model.from_fields(scenario["model"])
     start = {name: np.array(value, float) for name, value in scenario["state"].items()}
     state = state_from_minimal(model, **start)
     if row["level"] in ("trajectory", "invariants"):

@@ -252,7 +252,7 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
     with np.errstate(all="ignore"):
         model = _build_model(document, [body for body, _ in bodies])
         state = state_from_minimal(model, *_minimal_coordinates(bodies))
-    for name, array in {**vars(model), **vars(state)}.items():
+    for name, array in {**model.fields, **vars(state)}.items():
         if not np.all(np.abs(array) <= MAX_MAGNITUDE):
             raise source.fatal_error(
                 f"has numbers that make {name} larger than {MAX_MAGNITUDE:g}",
@@ -321,7 +321,7 @@ def _build_model(document: Document, bodies: list[Body]) -> Model:
     zero = [0.0, 0.0, 0.0]
     distal = [body.distal or zero for body in bodies]
     distal[-1] = zero
-    return Model(
+    return Model.chain(
         mass=np.array([body.mass for body in bodies], dtype=float),
         inertia=np.array([inertia_matrix(body.inertia) for body in bodies]),
         proximal=np.array([body.proximal for body in bodies], dtype=float),

@@ -1,5 +1,6 @@
 """Certified truth at one state: rigorous enclosures in ball arithmetic (python-flint).
 
+Of a chain on rods and balls; other mechanisms are in `certified_tree`.
 The minimal coordinates (p, ω′, u, u̇ as doubles) are normalised, positions and velocities follow from them,
 and the Newton–Euler equations are solved for the joint forces: eliminated onto the joints, the system is
 symmetric, positive definite and block-tridiagonal, so that a chain costs O(N).  With s̃ the cross-product
@@ -14,7 +15,6 @@ Every quantity has a radius that encloses all roundings of its computation.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,6 +23,8 @@ import numpy as np
 from plumbline.model.datatypes import Array, Model, State, StateQuantities
 from plumbline.processes.errors import PlumblineError
 from plumbline.truth import import_truth_tool
+from plumbline.truth.balls import BallArithmetic, entries, flatten, midpoints
+from plumbline.truth.certified_tree import enclose_tree
 
 MAX_RELATIVE_RADIUS = 1e-25  # relative to the largest magnitude of the quantity's own terms
 MAX_BITS = 20_000
@@ -73,8 +75,8 @@ def certify_state(
             f"no enclosure below {MAX_RELATIVE_RADIUS:g} relative at {MAX_BITS} bits: singular or nearly so"
         )
     quantities = {name: ball for name, ball in balls.items() if name != "scale"}
-    middle = {name: _midpoints(ball) for name, ball in quantities.items()}
-    radius = {name: max(float(x.rad()) for x in _flatten(ball)) for name, ball in quantities.items()}
+    middle = {name: midpoints(ball) for name, ball in quantities.items()}
+    radius = {name: max(float(x.rad()) for x in flatten(ball)) for name, ball in quantities.items()}
     found = StateQuantities(
         acceleration=middle["acceleration"],
         angular_acceleration=middle["angular_acceleration"],
@@ -82,10 +84,11 @@ def certify_state(
         kinetic_energy=float(middle["kinetic_energy"][0]),
         potential_energy=float(middle["potential_energy"][0]),
         angular_momentum=middle["angular_momentum"],
+        joint_moment=middle.get("joint_moment"),
     )
     if mass_matrix:
         found = replace(found, mass_matrix=middle["mass_matrix"])
-    return CertifiedQuantities(found, middle["tension"], radius, bits)
+    return CertifiedQuantities(found, middle.get("tension", np.zeros(model.n)), radius, bits)
 
 
 def enclose_quantities(
@@ -110,65 +113,31 @@ def enclose_quantities(
     flint = import_truth_tool("flint")
     with flint.ctx.workprec(bits):
         try:
+            if not model.is_chain:
+                return enclose_tree(flint, model, state, mass_matrix)
             return _solve_and_enclose(_BallChain(flint, model, state), mass_matrix)
         except ZeroDivisionError:
             return None
 
 
-class _BallChain:
+class _BallChain(BallArithmetic):
     """Model and state in balls: every vector is a 3×1 ``arb_mat`` in world axes; ``J`` is in body axes."""
 
     def __init__(self, flint: Any, model: Model, state: State) -> None:
-        self.flint, self.model, self.n = flint, model, model.n
-        self.mat, self.arb = flint.arb_mat, flint.arb
+        super().__init__(flint, model)
         self.A = [self.rotation(p) for p in state.p]
-        self.m = [self.arb(float(m)) for m in model.mass]
         self.ell = [self.arb(float(length)) for length in model.length]
-        self.J = [self.matrix(J) for J in model.inertia]
         self.w = [a * self.vector(w) for a, w in zip(self.A, state.omega, strict=True)]
         self.sp = [a * self.vector(s) for a, s in zip(self.A, model.proximal, strict=True)]
         self.sd = [a * self.vector(s) for a, s in zip(self.A, model.distal, strict=True)]
         self.I = [a * J * a.transpose() for a, J in zip(self.A, self.J, strict=True)]
         self.I_inverse = [a * J.inv() * a.transpose() for a, J in zip(self.A, self.J, strict=True)]
-        self.g = self.vector(model.gravity)
-        self.zero = self.vector((0.0, 0.0, 0.0))
-        self.eye = self.matrix(np.eye(3))
         self.u, self.udot = [], []
         for k in range(self.n):
-            u, udot = self.zero, self.zero
-            if model.rods[k]:
-                u, udot = self.vector(state.u[k]), self.vector(state.udot[k])
-                u = u * (1 / self.dot(u, u).sqrt())
-                udot = udot - u * self.dot(u, udot)
+            u, udot = self.rod_direction(state, k) if model.rods[k] else (self.zero, self.zero)
             self.u.append(u)
             self.udot.append(udot)
         self.r, self.v = self.positions_and_velocities()
-
-    def vector(self, v: Iterable[float]) -> Any:
-        return self.mat(3, 1, [self.arb(float(x)) for x in v])
-
-    def matrix(self, m: Array) -> Any:
-        return self.mat(3, 3, [self.arb(float(x)) for x in np.ravel(m)])
-
-    def cross_matrix(self, a: Any) -> Any:
-        """ã: ã b = a × b."""
-        x, y, z = a[0, 0], a[1, 0], a[2, 0]
-        return self.mat(3, 3, [0, -z, y, z, 0, -x, -y, x, 0])
-
-    @staticmethod
-    def dot(a: Any, b: Any) -> Any:
-        return a[0, 0] * b[0, 0] + a[1, 0] * b[1, 0] + a[2, 0] * b[2, 0]
-
-    def rotation(self, p: Array) -> Any:
-        """A (N7) of the normalised quaternion: the homogeneous quadratic form over pᵀp."""
-        w, x, y, z = (self.arb(float(c)) for c in p)
-        ww, xx, yy, zz = w * w, x * x, y * y, z * z
-        entries = [
-            [ww + xx - yy - zz, 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), ww - xx + yy - zz, 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), ww - xx - yy + zz],
-        ]
-        return self.mat(entries) * (1 / (ww + xx + yy + zz))
 
     def positions_and_velocities(self) -> tuple[list[Any], list[Any]]:
         """Centres of mass and their velocities, from the pivot outwards."""
@@ -195,15 +164,15 @@ def _solve_and_enclose(c: _BallChain, mass_matrix: bool) -> dict[str, Any]:
         potential -= c.m[k] * c.dot(c.g, c.r[k])
         momentum += c.cross_matrix(c.r[k]) * c.v[k] * c.m[k] + spin
     balls: dict[str, Any] = {
-        "acceleration": [_entries(a) for a in acceleration],
-        "angular_acceleration": [_entries(a) for a in angular],
-        "joint_reaction": [_entries(f) for f in F],
+        "acceleration": [entries(a) for a in acceleration],
+        "angular_acceleration": [entries(a) for a in angular],
+        "joint_reaction": [entries(f) for f in F],
         "kinetic_energy": [kinetic],
         "potential_energy": [potential],
-        "angular_momentum": _entries(momentum),
+        "angular_momentum": entries(momentum),
         "tension": [-c.dot(c.u[k], F[k]) for k in range(c.n)],
-        "r": [_entries(r) for r in c.r],
-        "v": [_entries(v) for v in c.v],
+        "r": [entries(r) for r in c.r],
+        "v": [entries(v) for v in c.v],
     }
     if mass_matrix:
         balls["mass_matrix"] = _mass_matrix(c)
@@ -294,9 +263,9 @@ def _term_scales(c: _BallChain, balls: dict[str, Any]) -> dict[str, float]:
     norm = np.linalg.norm
     lever = float(np.sum(norm(model.proximal, axis=1) + norm(model.distal, axis=1) + model.length))
     spins = c.w + [c.cross_matrix(c.u[k]) * c.udot[k] for k in range(c.n)]
-    rate = float(np.max(norm(_midpoints([_entries(w) for w in spins]), axis=1)))
+    rate = float(np.max(norm(midpoints([entries(w) for w in spins]), axis=1)))
     g = float(norm(model.gravity))
-    size = {name: float(np.max(np.abs(_midpoints(ball)))) for name, ball in balls.items()}
+    size = {name: float(np.max(np.abs(midpoints(ball)))) for name, ball in balls.items()}
     a = max(size["acceleration"], g, rate**2 * lever)
     mass, inertia = float(np.sum(model.mass)), float(np.sum(norm(model.inertia, axis=(1, 2))))
     force = max(size["joint_reaction"], mass * a)
@@ -316,21 +285,4 @@ def _term_scales(c: _BallChain, balls: dict[str, Any]) -> dict[str, float]:
 
 def _is_sharp(name: str, balls: dict[str, Any]) -> bool:
     """Whether every radius of the quantity is small enough (an infinite or NaN one is not)."""
-    return all(float(x.rad()) <= MAX_RELATIVE_RADIUS * balls["scale"][name] for x in _flatten(balls[name]))
-
-
-def _entries(v: Any) -> list[Any]:
-    """The three balls of a 3×1 matrix."""
-    return list(v.entries())
-
-
-def _flatten(ball: list[Any]) -> list[Any]:
-    """All balls of a list or of a list of lists."""
-    return [x for row in ball for x in row] if isinstance(ball[0], list) else ball
-
-
-def _midpoints(ball: list[Any]) -> Array:
-    """Midpoints rounded to double, in the ball list's shape."""
-    return np.array(
-        [[float(x.mid()) for x in row] if isinstance(row, list) else float(row.mid()) for row in ball]
-    )
+    return all(float(x.rad()) <= MAX_RELATIVE_RADIUS * balls["scale"][name] for x in flatten(balls[name]))

@@ -201,7 +201,7 @@ def perturbed_models(model: Model, state: State) -> list[tuple[Model, State]]:
         replace(model, gravity=model.gravity * (1 + DETECTABLE_PARAMETER_ERROR)),
         replace(model, mass=perturbed(model.mass)),
         replace(model, inertia=model.inertia * (factors + factors.mT) / 2),
-        replace(model, proximal=perturbed(model.proximal), distal=perturbed(model.distal)),
+        model.changed(proximal=perturbed(model.proximal), distal=perturbed(model.distal)),
     ]
     return [(m, state_from_minimal(m, state.p, state.omega, state.u, state.udot)) for m in models]
 

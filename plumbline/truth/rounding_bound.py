@@ -28,6 +28,7 @@ import numpy as np
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import cross, cross_matrix, rotate_vectors, rotation_matrix
 from plumbline.model.welding import BodyParts, part_offsets
+from plumbline.truth.rounding_bound_tree import tree_tolerances
 
 EPS = 2.0**-53
 ROUNDING_FACTOR = 64  # state quantities; the worst error of a sound engine is about a sixth of it (tests)
@@ -52,6 +53,7 @@ class RoundingBound:
     mass_matrix: float  # kg m², of each entry
     scale: dict[str, Array | float]
     rod_torque: Array  # (N,) N m, of the torques at both ends of the rod that body k hangs by; 0 for a ball
+    joint_moment: Array | None = None  # (N,) N m; absent for chains of rods and balls, which have none
 
     def tolerance(self, quantity: str) -> Array | float:
         """Look up a tolerance by the name of its quantity.
@@ -88,7 +90,7 @@ class RoundingBound:
             The sentence, with the largest tolerance and its ratio to the scale.
 
         """
-        if quantity in ("acceleration", "angular_acceleration", "joint_reaction"):
+        if quantity in ("acceleration", "angular_acceleration", "joint_reaction", "joint_moment"):
             how = (
                 f"{ROUNDING_FACTOR} roundings (2^-53) of the largest terms of the Newton-Euler equations, of "
                 "their elimination onto the joints and of the joint-space form, each propagated through the "
@@ -118,6 +120,8 @@ def state_rounding_bound(model: Model, state: State, parts: BodyParts | None = N
         LinAlgError: the system is singular.
 
     """
+    if not model.is_chain:
+        return _tree_bound(model, state)
     system = NewtonEulerSystem(model, state)
     terms = _TermSizes(model, state, system, parts)
     joints = _JointSpaceTerms(model, state, system, terms)
@@ -171,6 +175,21 @@ def state_rounding_bound(model: Model, state: State, parts: BodyParts | None = N
             "mass_matrix": mass_entry,
         },
         rod_torque=ROUNDING_FACTOR * EPS * rod_torque,
+    )
+
+
+def _tree_bound(model: Model, state: State) -> RoundingBound:
+    """The tolerances of a mechanism that is not a chain of rods and balls."""
+    total, scale, sums, rod_torque = tree_tolerances(model, state)
+    total = ROUNDING_FACTOR * EPS * total
+    return RoundingBound(
+        acceleration=total[:, 0],
+        angular_acceleration=total[:, 1],
+        joint_reaction=total[:, 2],
+        joint_moment=total[:, 3],
+        scale=scale,
+        rod_torque=ROUNDING_FACTOR * EPS * rod_torque,
+        **{name: SUM_ROUNDING_FACTOR * EPS * size for name, size in sums.items()},
     )
 
 

@@ -192,8 +192,7 @@ def single_body(
 ):
     """One symmetric body without special numbers hidden: (model, state)."""
     base = pendulums.make_model("b")
-    subject = replace(
-        base,
+    subject = base.changed(
         mass=np.array([2.0]),
         inertia=np.diag([0.03, 0.04, 0.05])[None],
         proximal=np.array([pivot], float),
@@ -401,11 +400,11 @@ def replace_entry(name, value):
     holder = at if hasattr(at, name) else subject
     array = np.array(getattr(holder, name))
     array.flat[-1] = value
-    changed = replace(holder, **{name: array})
+    changed = replace(at, **{name: array}) if holder is at else subject.changed(**{name: array})
     return (subject, changed) if holder is at else (changed, at)
 
 
-ARRAYS = "p omega u udot r v mass inertia proximal distal length gravity force moment drag_force drag_moment"
+ARRAYS = "p omega u udot r v mass inertia point length gravity force moment drag_force drag_moment"
 
 
 def bad_inputs():

@@ -27,8 +27,7 @@ def swinging_pendulum(joints):
     rng = np.random.default_rng(len(joints))
     subject = pendulums.make_model(joints, seed=3)
     n = subject.n
-    subject = replace(
-        subject,
+    subject = subject.changed(
         proximal=0.05 * rng.normal(size=(n, 3)) + [0, 0, 0.25],
         distal=0.05 * rng.normal(size=(n, 3)) - [0, 0, 0.25],
     )
@@ -120,7 +119,7 @@ def test_long_chains_at_state_level():
 def near_singular_pendulum(rate):
     """A body on a ball that starts about x and is driven about y, off its first axis."""
     subject = replace(pendulums.make_model("b"), gravity=np.zeros(3), moment=np.array([[0.0, 4.0, 0.0]]))
-    subject = replace(subject, inertia=0.1 * np.eye(3)[None], proximal=np.zeros((1, 3)))
+    subject = subject.changed(inertia=0.1 * np.eye(3)[None], proximal=np.zeros((1, 3)))
     zero = np.zeros((1, 3))
     return subject, state_from_minimal(
         subject, np.array([[1.0, 0, 0, 0]]), np.array([[rate, 0.0, 0.0]]), zero, zero
@@ -144,7 +143,7 @@ def test_tree_says_when_its_angles_become_singular():
 def test_tree_turns_for_ever_about_its_first_axis():
     """Ten turns about the initial axis: angles grow, nothing is singular."""
     subject, start = near_singular_pendulum(10 * np.pi)
-    subject = replace(subject, moment=np.zeros((1, 3)))
+    subject = subject.changed(moment=np.zeros((1, 3)))
     run = ExudynTree().simulate(subject, start, np.linspace(0, 2, 5), "RK44", 2.0**-8)
     assert np.abs(run.v).max() < 1e-13
     assert np.abs(np.abs(run.p[-1, 0]) - np.abs(start.p[0])).max() < 1e-9

@@ -110,8 +110,8 @@ def test_flat_bodies_and_points_on_the_joint():
     """A lamina (J_x + J_y = J_z to the last bit), a pivot at the centre of mass, a mass of a microgram."""
     subject, at = swinging_pendulum("rb")
     J = np.array([np.diag([0.01, 0.02, 0.03]), np.diag([1e-11, 2e-11, 2e-11])])
-    subject = replace(
-        subject, inertia=J, mass=np.array([1.0, 1e-9]), proximal=np.array([[0, 0, 0.0], [0.1, 0, 0]])
+    subject = subject.changed(
+        inertia=J, mass=np.array([1.0, 1e-9]), proximal=np.array([[0, 0, 0.0], [0.1, 0, 0]])
     )
     at = kinematics.state_from_minimal(subject, at.p, at.omega, at.u, at.udot)
     (got,) = worker.call_adapter("mujoco", "evaluate", subject, [at])

@@ -76,7 +76,7 @@ def test_trajectories_are_raw():
 def test_a_singular_model_fails_with_its_cause():
     model, state = model_and_state([False])
     inertia = np.diag([0.1, 0.1, 0.0])[None]
-    pencil = replace(model, inertia=inertia, proximal=np.array([[0, 0, 0.3]]))
+    pencil = model.changed(inertia=inertia, proximal=np.array([[0, 0, 0.3]]))
     state = state_from_minimal(pencil, state.p, state.omega, state.u, state.udot)
     with pytest.raises(EngineFailure, match="inertia of body 1 is singular"):
         Reference().evaluate(pencil, [state])

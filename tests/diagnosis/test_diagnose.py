@@ -114,7 +114,7 @@ def truth_of(truth, count):
 def test_derivatives_agree_with_coarse_differences(size):
     """By every fifth cause, against differences a hundred times as far; of bodies of milligrams too."""
     model = pendulums.make_model("bb")
-    model = replace(model, mass=size * model.mass, inertia=size * model.inertia)
+    model = model.changed(mass=size * model.mass, inertia=size * model.inertia)
     truth = state_truth(model, random_states(model, 4, seed=4))
     seen = observe_difference(model, truth.quantities, truth)
     for cause in [c for c in all_causes(seen.case) if c.scale is not None][::5]:
@@ -199,7 +199,7 @@ def test_an_impossible_mechanism_explains_nothing():
 @pytest.mark.parametrize(("off", "explained"), [(0.9, True), (1.9, True), (2.1, False)])
 def test_a_prediction_may_be_off_by_the_bounds_of_both_pendulums(off, explained):
     model, truth = known(count=4)
-    light = replace(model, inertia=0.75 * model.inertia)
+    light = model.changed(inertia=0.75 * model.inertia)
     wrong = evaluate_case(make_defect_case(light, truth.states))
     said = []
     for i, (right, state) in enumerate(zip(truth.quantities, truth.states, strict=True)):
@@ -238,7 +238,7 @@ def test_a_quantity_close_to_its_bound_is_not_named_beside_a_wrong_one():
 
 def test_a_defect_in_the_dynamics_alone_is_named():
     model, truth = known(count=4)
-    wrong = evaluate_case(make_defect_case(replace(model, mass=model.mass * [1, 1.001]), truth.states))
+    wrong = evaluate_case(make_defect_case(model.changed(mass=model.mass * [1, 1.001]), truth.states))
     said = [replace(a, **{q: wrong[q][i] for q in VECTORS}) for i, a in enumerate(truth.quantities)]
     text = diagnose(model, said, truth)
     assert text.startswith(
@@ -387,7 +387,7 @@ def with_a_mass(factor, noise=0.0, count=4):
     """What an engine would say whose first mass is ``factor`` times as large, off by ``noise`` bounds."""
     model, truth = known(count=count)
     rng = np.random.default_rng(5)
-    wrong = evaluate_case(make_defect_case(replace(model, mass=model.mass * [factor, 1.0]), truth.states))
+    wrong = evaluate_case(make_defect_case(model.changed(mass=model.mass * [factor, 1.0]), truth.states))
     said = [replace(a, **{q: wrong[q][i] for q in QUANTITIES}) for i, a in enumerate(truth.quantities)]
     off = [
         replace(a, acceleration=a.acceleration + noise * b.acceleration[:, None] * rng.normal(size=(2, 3)))

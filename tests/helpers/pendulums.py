@@ -36,7 +36,7 @@ def make_model(joints: str, loads: bool = False, drag: bool = False, seed: int =
         a, b, c = rng.uniform(0.01, 0.04, 3)  # of three masses on axes: any such tensor is physical
         inertia.append(frame @ np.diag([b + c, a + c, a + b]) @ frame.T)
     J = np.array(inertia)
-    return Model(
+    return Model.chain(
         mass=rng.uniform(0.5, 2.0, n),
         inertia=(J + J.transpose(0, 2, 1)) / 2,
         proximal=0.25 * _unit(rng, n),

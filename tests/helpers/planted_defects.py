@@ -116,7 +116,7 @@ def parameter(field: str, *index: int, by: float = 0.0, times: float = 1.0) -> I
         value = getattr(model, field).copy()
         for at in {index, (*index[:1], *index[:0:-1])}:
             value[at] = value[at] * times + by
-        wrong = replace(model, **{field: value})
+        wrong = model.changed(**{field: value})
         return wrong, relifted(wrong, state)
 
     return alter
@@ -126,7 +126,7 @@ def model_change(change: Callable[[Model, State], dict[str, Array]]) -> Inputs:
     """Fields of the model replaced, depending on the state or not."""
 
     def alter(model: Model, state: State) -> tuple[Model, State]:
-        wrong = replace(model, **change(model, state))
+        wrong = model.changed(**change(model, state))
         return wrong, relifted(wrong, state)
 
     return alter
@@ -194,7 +194,7 @@ def unit(p: Array) -> Array:
 
 def single_inside(model: Model, state: State) -> tuple[Model, State]:
     """Everything the engine is given passes through single precision."""
-    wrong = replace(model, **{k: single(v) for k, v in vars(model).items()})
+    wrong = model.changed(**{k: single(v) for k, v in model.fields.items()})
     rounded = {k: single(getattr(state, k)) for k in ("omega", "u", "udot")}
     return wrong, relifted(wrong, state, p=unit(single(state.p)), **rounded)
 
@@ -327,7 +327,7 @@ def early_stop(
 
 def damped(simulate: Any, model: Model, state: State, times: Array, i: Integrator, h: float) -> Trajectory:
     """Drag of 1e-6 N m s on every body."""
-    return simulate(replace(model, drag_moment=model.drag_moment + 1e-6), state, times, i, h)
+    return simulate(model.changed(drag_moment=model.drag_moment + 1e-6), state, times, i, h)
 
 
 # --- of one body, or in a rare branch ------------------------------------------------------------
@@ -933,7 +933,7 @@ def other_units(mass: float, length: float) -> Defect:
             "mass": m, "inertia": m * x * x, "proximal": x, "distal": x, "length": x, "gravity": x,
             "force": m * x, "moment": m * x * x, "drag_force": m, "drag_moment": m * x * x,
         }  # fmt: skip
-        other = replace(model, **{name: getattr(model, name) * f for name, f in factors.items()})
+        other = model.changed(**{name: getattr(model, name) * f for name, f in factors.items()})
         return other, relifted(other, state)
 
     def back(model: Model, states: list[State], said: list[StateQuantities]) -> list[StateQuantities]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -25,7 +24,7 @@ def random_model(
     size = rng.uniform(0.1, 0.6, (n, 3)) ** 2
     principal = mass[:, None] / 5 * (size.sum(1, keepdims=True) - size)  # ellipsoids: always physical
     inertia = axes @ (principal[..., None] * axes.mT)
-    return Model(
+    return Model.chain(
         mass=mass,
         inertia=(inertia + inertia.mT) / 2,
         proximal=0.3 * rng.normal(size=(n, 3)),
@@ -64,8 +63,7 @@ def in_other_units(
 ) -> tuple[Model, State]:
     """The same pendulum with lengths, masses and times measured in other units (values multiplied)."""
     force = mass * length / time**2
-    scaled = replace(
-        model,
+    scaled = model.changed(
         mass=model.mass * mass,
         inertia=model.inertia * mass * length**2,
         proximal=model.proximal * length,

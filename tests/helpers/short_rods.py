@@ -8,7 +8,7 @@ motion start the rod there, up to O(ℓ).  Accelerations and motions then differ
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -40,7 +40,7 @@ def replace_balls_by_rods(
     a joint carries no force, so that no direction is the slow one.
     """
     u, udot = slow_manifold_directions(ball, r, p, v, pdot)
-    rods = replace(ball, length=np.full(ball.n, length))
+    rods = ball.changed(length=np.full(ball.n, length))
     return rods, r + np.cumsum(length * u, axis=0), v + np.cumsum(length * udot, axis=0)
 
 

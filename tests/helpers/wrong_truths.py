@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 from plumbline.model.datatypes import Model
@@ -18,7 +17,7 @@ def prepare(*arguments: Any) -> None:
     right = trajectory.simulate_taylor
 
     def wrong(model: Model, *rest: Any) -> Any:
-        return right(replace(model, gravity=model.gravity * (1 + GRAVITY_ERROR)), *rest)
+        return right(model.changed(gravity=model.gravity * (1 + GRAVITY_ERROR)), *rest)
 
     trajectory.simulate_taylor = wrong  # type: ignore[assignment]
 

@@ -243,7 +243,7 @@ def test_two_halves_are_physical_and_make_the_body(shape):
 def test_halves_have_roundings_of_their_own():
     """Hung at its centre a body has no potential energy to round; its halves' must cancel."""
     model = pendulums.make_model(JOINT_PATTERNS["ball"])
-    model = replace(model, proximal=0 * model.proximal)
+    model = model.changed(proximal=0 * model.proximal)
     at = pendulums.state_from_seed(model, 1)
     plain, welded = state_rounding_bound(model, at), state_rounding_bound(model, at, split_bodies(model))
     assert plain.potential_energy == 0 < welded.potential_energy
@@ -339,7 +339,7 @@ def with_drag(real):
 
     class Damped(real):
         def _simulate_round_trip(self, model, *more):
-            return super()._simulate_round_trip(replace(model, drag_moment=np.full(model.n, 1e-6)), *more)
+            return super()._simulate_round_trip(model.changed(drag_moment=np.full(model.n, 1e-6)), *more)
 
     return Damped
 

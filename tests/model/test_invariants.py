@@ -91,10 +91,10 @@ def test_work_of_a_moment_is_the_integral_of_its_power(degree):
     times = np.linspace(0, 2, 25)
     run = rotating_trajectory(model, times**degree, times)
     omega = 2 * run.pdot[..., 1:]
-    done, uncertainty = work_of_loads(replace(model, moment=moment), run, omega)
+    done, uncertainty = work_of_loads(model.changed(moment=moment), run, omega)
     np.testing.assert_allclose(done, times ** (degree + 1) / (degree + 1), rtol=0, atol=1e-12)
     assert (uncertainty < 1e-12) == (degree <= 3)
-    drag = replace(model, drag_moment=np.array([0.5, 0.0]))
+    drag = model.changed(drag_moment=np.array([0.5, 0.0]))
     lost, _ = work_of_loads(
         drag,
         rotating_trajectory(model, times**2, times),
@@ -112,10 +112,10 @@ def test_work_of_a_force_needs_no_quadrature_and_drag_takes():
     v[:, 1, 2] = times**2
     p = np.tile([1.0, 0, 0, 0], (25, 2, 1))
     run, still = Trajectory(times, r, p, v, 0 * p, 1), np.zeros((25, 2, 3))
-    done, uncertainty = work_of_loads(replace(model, force=force), run, still)
+    done, uncertainty = work_of_loads(model.changed(force=force), run, still)
     np.testing.assert_allclose(done, np.sum(force * (r - r[0]), axis=(1, 2)), rtol=0, atol=1e-14)
     assert uncertainty == 0.0
-    lost, _ = work_of_loads(replace(model, drag_force=np.array([7.0, 3.0])), run, still)
+    lost, _ = work_of_loads(model.changed(drag_force=np.array([7.0, 3.0])), run, still)
     np.testing.assert_allclose(lost, -3 * times**5 / 5, rtol=0, atol=1e-12)
 
 
@@ -126,7 +126,7 @@ def test_the_quadrature_knows_its_error(count, sharp):
     times = np.linspace(0, 2, count)
     run = rotating_trajectory(model, np.cos(9 * times), times)
     done, uncertainty = work_of_loads(
-        replace(model, moment=np.array([[1.0, 0, 0]])), run, 2 * run.pdot[..., 1:]
+        model.changed(moment=np.array([[1.0, 0, 0]])), run, 2 * run.pdot[..., 1:]
     )
     error = float(np.max(np.abs(done - np.sin(9 * times) / 9)))
     assert 0 < error <= uncertainty < sharp
@@ -137,7 +137,7 @@ def test_too_few_samples_do_no_quadrature():
     times = np.linspace(0, 1, 12)
     run = rotating_trajectory(model, 1 + times, times)
     done, uncertainty = work_of_loads(
-        replace(model, moment=np.array([[1.0, 0, 0]])), run, 2 * run.pdot[..., 1:]
+        model.changed(moment=np.array([[1.0, 0, 0]])), run, 2 * run.pdot[..., 1:]
     )
     assert not np.any(done) and uncertainty == 0.0
 
@@ -187,7 +187,7 @@ def test_a_gap_is_the_vector_of_a_ball_and_the_stretch_of_a_rod():
 
 def test_the_ends_of_a_rod_in_one_place_are_its_length_off():
     model, _ = random_chain(np.random.default_rng(78), [True])
-    model = replace(model, proximal=np.zeros((1, 3)))
+    model = model.changed(proximal=np.zeros((1, 3)))
     found = compute_invariants(model, rotating_trajectory(model, TIMES, TIMES))
     np.testing.assert_array_equal(found.joint_gap[:, 0, 0], -model.length[0])
     assert not np.any(found.gap_rate), "a stretch has no direction there"
@@ -198,7 +198,7 @@ def joint_vector_of_second_body(model, run):
     found = []
     for r, p in zip(run.r, run.p, strict=True):
         still = np.zeros((2, 3))
-        hung = state_from_minimal(replace(model, length=np.zeros(2)), p, still, still, still).r
+        hung = state_from_minimal(model.changed(length=np.zeros(2)), p, still, still, still).r
         found.append(r[1] - hung[1] - (r[0] - hung[0]))
     return np.array(found)
 
@@ -219,11 +219,11 @@ def test_joint_rates_are_the_slopes_of_the_joint_vectors(rods):
 def test_what_is_not_conserved_is_not_judged():
     """Momentum about gravity: not with loads, drag or without gravity; energy by a shift, norm as it is."""
     model, run = make_motion([False])
-    assert compute_invariants(replace(model, gravity=np.zeros(3)), run).momentum_drift is None
-    light, usual = (compute_invariants(replace(model, gravity=x * model.gravity), run) for x in (1e-2, 1))
+    assert compute_invariants(model.changed(gravity=np.zeros(3)), run).momentum_drift is None
+    light, usual = (compute_invariants(model.changed(gravity=x * model.gravity), run) for x in (1e-2, 1))
     np.testing.assert_allclose(light.momentum_drift, usual.momentum_drift, rtol=0, atol=1e-15)
-    assert compute_invariants(replace(model, force=np.ones((1, 3))), run).momentum_drift is None
-    assert compute_invariants(replace(model, drag_moment=np.ones(1)), run).momentum_drift is None
+    assert compute_invariants(model.changed(force=np.ones((1, 3))), run).momentum_drift is None
+    assert compute_invariants(model.changed(drag_moment=np.ones(1)), run).momentum_drift is None
     long = compute_invariants(model, replace(run, p=1.01 * run.p))
     np.testing.assert_allclose(long.norm_drift, 0.01, atol=1e-13)
     faster = replace(run, v=np.concatenate([run.v[:1], 2 * run.v[1:]]))

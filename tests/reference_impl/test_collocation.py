@@ -117,14 +117,14 @@ def test_a_batch_is_every_chain_alone():
 
 def test_stiffness_is_said():
     model, state = random_chain(np.random.default_rng(36), [False, False])
-    stiff = replace(model, drag_force=model.mass * 3e3)
+    stiff = model.changed(drag_force=model.mass * 3e3)
     assert "stiff" in run(stiff, state, 1e-6, TIMES[:2]).note
     assert run(model, state, 1e-6).note == ""
 
 
 def test_rest_stays_at_rest():
     model, state = random_chain(np.random.default_rng(37), [False])
-    still = replace(model, gravity=np.zeros(3))
+    still = model.changed(gravity=np.zeros(3))
     resting = replace(state, omega=np.zeros((1, 3)), v=np.zeros((1, 3)))
     moved = run(still, resting, 1e-10)
     assert np.array_equal(moved.r[-1], state.r)
@@ -243,7 +243,7 @@ def test_steps_that_take_many_sweeps_are_followed_by_shorter_ones(monkeypatch):
     """Strong drag: the sweeps decide, so the step is cut before it would have to be repeated."""
     model, state = random_chain(np.random.default_rng(36), [False, False])
     watched = StepRecorder(monkeypatch)
-    done = run(replace(model, drag_force=model.mass * 3e3), state, 1e-6, TIMES[:2])
+    done = run(model.changed(drag_force=model.mass * 3e3), state, 1e-6, TIMES[:2])
     pairs = zip(watched.steps[:-2], watched.steps[1:-1], strict=True)
     many = [(h, sweeps, after) for (h, sweeps, made, _), (after, *_) in pairs
             if made and sweeps > collocation.USUAL_SWEEPS]  # fmt: skip
@@ -273,7 +273,7 @@ def test_the_last_step_ends_where_it_should(dense):
 def test_a_step_that_vanishes_is_an_error():
     """Drag of 1e13/s holds the sweeps to steps of 1e-13 s: nothing beside 1000 s, but much of 1e-12 s."""
     model, state = random_chain(np.random.default_rng(42), [False])
-    model = replace(model, drag_force=1e13 * model.mass)
+    model = model.changed(drag_force=1e13 * model.mass)
     with pytest.raises(ArithmeticError, match=r"stopped at t = 0\.0 s: the step vanishes"):
         run(model, state, 1e-6, np.array([0.0, 1e3]))
     assert run(model, state, 1e-6, np.array([0.0, 1e-12])).steps > 2

@@ -1,7 +1,5 @@
 """The system of the notes, N1–N6: Lagrange's equation, S and b as printed, their solution, N6."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 from scipy.special import ellipk
@@ -81,7 +79,7 @@ def test_the_solution_obeys_newton_and_euler(rods, without):
     """m r̈ = F + reactions and J ω̇′ + ω′ × J ω′ = moments of the reactions about the centre of mass + n′."""
     rng = np.random.default_rng(11 + len(rods))
     chain = random_model(rng, rods, loads=True, drag=True)
-    chain = dataclasses.replace(chain, **{name: np.zeros(chain.n) for name in without})
+    chain = chain.changed(**{name: np.zeros(chain.n) for name in without})
     r, p, v, pdot = state_on_manifold(chain, rng)
     x = DirectSystem(chain).solve(r, p, v, pdot)
     omega, turn = angular_velocity(p, pdot), A(p)
@@ -109,7 +107,7 @@ def test_units_do_not_decide_the_digits():
     x = DirectSystem(chain).solve(*state)
     loads = ("mass", "inertia", "force", "moment", "drag_force", "drag_moment")
     for scale in (2.0**-30, 2.0**30):
-        scaled = dataclasses.replace(chain, **{name: scale * getattr(chain, name) for name in loads})
+        scaled = chain.changed(**{name: scale * getattr(chain, name) for name in loads})
         y = DirectSystem(scaled).solve(*state)
         np.testing.assert_allclose(y.acceleration, x.acceleration, rtol=0, atol=1e-13)
         np.testing.assert_allclose(y.joint_reaction / scale, x.joint_reaction, rtol=0, atol=1e-13)
@@ -124,9 +122,7 @@ def test_refinement_solves_every_row_to_its_own_rounding():
     for _ in range(100):
         chain = random_model(rng, list(rng.random(4) < 0.5), loads=True, drag=True)
         scale = 10 ** rng.uniform(-3, 3, 4)
-        chain = dataclasses.replace(
-            chain, mass=chain.mass * scale, inertia=chain.inertia * scale[:, None, None]
-        )
+        chain = chain.changed(mass=chain.mass * scale, inertia=chain.inertia * scale[:, None, None])
         state = state_on_manifold(chain, rng)
         system = DirectSystem(chain)
         S, b = system.assemble(*state)
@@ -158,8 +154,7 @@ def test_units_do_not_decide_the_steps_of_N6():
     r, p, v, pdot = state_on_manifold(chain, rng)
     times, unit = np.array([0.0, 0.5]), 2.0**-10
     here = integrate_dop853(chain, r, p, v, pdot, times, 1e-6)
-    small = dataclasses.replace(
-        chain,
+    small = chain.changed(
         inertia=unit**2 * chain.inertia,
         **{name: unit * getattr(chain, name) for name in ("proximal", "distal", "gravity")},
     )
@@ -172,7 +167,7 @@ def test_units_do_not_decide_the_steps_of_N6():
 def test_a_vanishing_step_of_N6_is_an_error():
     rng = np.random.default_rng(16)
     chain = random_model(rng, [False], loads=True, drag=True)
-    stiff = dataclasses.replace(chain, drag_force=np.array([1e17]))
+    stiff = chain.changed(drag_force=np.array([1e17]))
     with pytest.raises(ArithmeticError, match="DOP853 stopped at t = "):
         integrate_dop853(stiff, *state_on_manifold(chain, rng), np.array([1.0, 2.0]), 1e-6)
 
@@ -208,8 +203,7 @@ def test_N6_orders_y_as_r_p_v_pdot():
 def planar_pendulum(amplitude, arm=0.4, mass=1.3, about_centre=0.05):
     """A body on a ball joint that swings about the y axis, at rest at ``amplitude``."""
     rng = np.random.default_rng(0)
-    chain = dataclasses.replace(
-        random_model(rng, [False]),
+    chain = random_model(rng, [False]).changed(
         mass=np.array([mass]),
         inertia=about_centre * np.eye(3)[None],
         proximal=np.array([[0, 0, arm]]),
@@ -267,7 +261,7 @@ def test_natural_sizes_are_of_the_stretched_chain_its_fall_and_its_motion():
     assert sizes(r, still, turn) == pytest.approx([reach, 1, 40 * reach, 20], rel=1e-13)
     away = sizes(r - [[0, 9.0, 0]] * np.ones((3, 1)), still, still)
     assert away[0] == np.max(np.abs(r - [0, 9.0, 0])) > reach
-    point = dataclasses.replace(chain, proximal=still, distal=still, length=np.zeros(3), gravity=np.zeros(3))
+    point = chain.changed(proximal=still, distal=still, length=np.zeros(3), gravity=np.zeros(3))
     assert sizes(still, still, still, point) == [1, 1, 0, 0]
 
 

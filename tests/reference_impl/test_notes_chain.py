@@ -17,7 +17,7 @@ def symbolic_chain(rods):
     x = Symbols(bodies=n, attachments=2 * n)
     none = np.zeros(n)
     length = np.where(rods, np.arange(2, 2 + n), 0)
-    chain = Mechanism(none, none, x.s[:n], x.s[n:], length, none, none, none, none, none)
+    chain = Mechanism.chain(none, none, x.s[:n], x.s[n:], length, none, none, none, none, none)
     return x, chain, constraint_rows(chain, x.r, x.p, x.v, x.pdot)
 
 

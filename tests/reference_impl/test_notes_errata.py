@@ -1,7 +1,5 @@
 """What a reader of the notes must know, E1–E7 (E4, the drift, has a file of its own)."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -20,7 +18,7 @@ def hanging_chain(rods, length=0.5, arm=0.3):
     """Bodies at rest straight below each other, attachments on the body's z axis."""
     n = len(rods)
     zeros = np.zeros((n, 3))
-    chain = Mechanism(
+    chain = Mechanism.chain(
         mass=np.arange(1.0, n + 1),
         inertia=np.broadcast_to(0.02 * np.diag([1.0, 1.2, 0.9]), (n, 3, 3)),
         proximal=zeros + np.array([0, 0, arm]),
@@ -62,7 +60,7 @@ def test_E1_a_rod_whose_ends_meet_is_singular_in_the_general_form_too():
     rng = np.random.default_rng(0)
     chain = random_model(rng, [False, False, False], loads=True, drag=True)
     r, p, v, pdot = state_on_manifold(chain, rng)
-    rod = dataclasses.replace(chain, length=np.array([0, 0, 0.4]))
+    rod = chain.changed(length=np.array([0, 0, 0.4]))
     d = constraint_rows(rod, r, p, v, pdot).d[2]
     assert np.linalg.norm(d) < 1e-15
     with pytest.raises(SingularSystem, match="rod above body 3 has length 0"):
@@ -73,7 +71,7 @@ def test_E1_the_length_changes_neither_jacobians_nor_gamma():
     rng = np.random.default_rng(1)
     chain = random_model(rng, [True, True], loads=True, drag=True)
     state = state_on_manifold(chain, rng)
-    longer = dataclasses.replace(chain, length=chain.length + 1)
+    longer = chain.changed(length=chain.length + 1)
     one, other = (DirectSystem(c).assemble(*state) for c in (chain, longer))
     np.testing.assert_array_equal(one[0], other[0])
     np.testing.assert_array_equal(one[1], other[1])
@@ -90,7 +88,7 @@ def test_E1_the_ball_is_the_limit_of_the_rod():
     direction = -pull / np.linalg.norm(pull)
     errors = []
     for length in (1e-2, 1e-3, 1e-4):
-        rod = dataclasses.replace(ball, length=np.array([length]))
+        rod = ball.changed(length=np.array([length]))
         run = integrate_dop853(rod, r + length * direction, p, v, pdot, times, 1e-10)
         errors.append(np.max(np.abs(run.r - truth.r)))
     assert errors[0] < 0.1 and errors[1] < 0.2 * errors[0] and errors[2] < 0.2 * errors[1], errors
@@ -214,7 +212,7 @@ def test_E7_rank_three_without_the_normalisation_row():
     S, b = DirectSystem(chain).assemble(r, p, v, pdot)
     assert np.linalg.matrix_rank(S) == 9
     # Hung at its centre of mass C_p = 0, so nothing but the normalisation row holds the kernel along p.
-    loose = dataclasses.replace(chain, proximal=np.zeros((1, 3)))
+    loose = chain.changed(proximal=np.zeros((1, 3)))
     S, b = DirectSystem(loose).assemble(r, p, v, pdot)
     assert np.linalg.matrix_rank(S[:8, :8]) == 7
     with pytest.raises(SingularSystem):
@@ -237,9 +235,9 @@ def test_E7_singular_inertia_names_the_body():
     inertia = chain.inertia.copy()
     inertia[1, 2, 2] = 0
     with pytest.raises(SingularSystem, match=r"inertia of body 2 is singular.*E7"):
-        DirectSystem(dataclasses.replace(chain, inertia=inertia)).solve(*state)
+        DirectSystem(chain.changed(inertia=inertia)).solve(*state)
     with pytest.raises(SingularSystem, match=r"inertia of body 2 is singular.*E7"):
-        integrate_dop853(dataclasses.replace(chain, inertia=inertia), *state, np.array([0.0, 1.0]), 1e-6)
+        integrate_dop853(chain.changed(inertia=inertia), *state, np.array([0.0, 1.0]), 1e-6)
 
 
 def test_E1_a_rod_is_as_short_as_its_own_surroundings_allow():
@@ -264,7 +262,7 @@ def test_E7_an_inertia_is_flat_beside_its_own_size(heavy):
     inertia, proximal = heavy * chain.inertia, chain.proximal.copy()
     stick = turn @ np.diag([0.02, 0.02, 0]) @ turn.T
     inertia[1], proximal[1] = heavy * (stick + stick.T) / 2, 0.3 * turn[:, 2]
-    flat = dataclasses.replace(chain, mass=heavy * chain.mass, inertia=inertia, proximal=proximal)
+    flat = chain.changed(mass=heavy * chain.mass, inertia=inertia, proximal=proximal)
     with pytest.raises(SingularSystem, match=r"inertia of body 2 is singular.*E7"):
         DirectSystem(flat).solve(*state)
 
@@ -276,14 +274,14 @@ def test_a_singular_inertia_that_the_joint_makes_good_is_solved():
     state = state_on_manifold(chain, rng)
     answers = []
     for thin in (1e-6, 0.0):
-        stick = dataclasses.replace(chain, inertia=0.05 * np.diag([1.0, 1.0, thin])[None])
+        stick = chain.changed(inertia=0.05 * np.diag([1.0, 1.0, thin])[None])
         answers.append(DirectSystem(stick).solve(*state).acceleration)
     np.testing.assert_allclose(answers[0], answers[1], atol=1e-3)
 
 
 def test_no_mass_names_the_body():
     chain, state = hanging_chain([True, True])
-    massless = dataclasses.replace(chain, mass=np.array([1.0, 0.0]), inertia=0 * chain.inertia)
+    massless = chain.changed(mass=np.array([1.0, 0.0]), inertia=0 * chain.inertia)
     with pytest.raises(SingularSystem, match="mass of body 2 is 0"):
         DirectSystem(massless).solve(*state)
 
@@ -305,7 +303,7 @@ def test_the_pendulum_of_the_notes_is_regular(n):
     """On rods of ℓ > 0, s₁ on a body axis included, S has rank 9 N (E7), x satisfies every row of (N5)."""
     rng = np.random.default_rng(10)
     chain = random_model(rng, [True] * n, loads=True, drag=True)
-    chain = dataclasses.replace(chain, proximal=np.array([[-0.4, 0, 0]] * n))
+    chain = chain.changed(proximal=np.array([[-0.4, 0, 0]] * n))
     state = state_on_manifold(chain, rng)
     S, b = notes.assemble_system(chain, *state)
     assert S.shape == (9 * n, 9 * n) and np.linalg.matrix_rank(S) == 9 * n
@@ -314,7 +312,7 @@ def test_the_pendulum_of_the_notes_is_regular(n):
     general = DirectSystem(chain).solve(*state)
     np.testing.assert_allclose(x[: 3 * n], general.acceleration.ravel(), atol=1e-12)
     np.testing.assert_allclose(x[7 * n : 8 * n], general.multiplier, atol=1e-12)
-    loose = dataclasses.replace(chain, proximal=np.zeros((n, 3)), distal=np.zeros((n, 3)))
+    loose = chain.changed(proximal=np.zeros((n, 3)), distal=np.zeros((n, 3)))
     S, _ = notes.assemble_system(loose, *state_on_manifold(loose, rng))
     assert np.linalg.matrix_rank(S) == 9 * n
     assert np.linalg.matrix_rank(S[: 8 * n, : 8 * n]) == 7 * n, "C_p = 0: only the norm holds p̈ along p (E7)"

@@ -366,7 +366,7 @@ def test_a_run_is_its_bodies_written_out(cycle, repeat, axis, degrees):
     plain = scenarios.load_scenario_text(
         as_yaml(scenario_document([cycle[j % len(cycle)] for j in range(repeat)]))
     )
-    for field in vars(run.model):
+    for field in run.model.fields:
         np.testing.assert_array_equal(getattr(run.model, field), getattr(plain.model, field))
     np.testing.assert_array_equal(run.state.omega, plain.state.omega)
     for j in range(repeat):

@@ -147,16 +147,15 @@ def test_scales_do_not_vanish_with_the_quantity():
 
 
 MODEL_ERRORS = {
-    "mass": lambda model, e: replace(model, mass=model.mass * (1 + e * np.array([0.0, 1.0]))),
-    "inertia": lambda model, e: replace(
-        model,
+    "mass": lambda model, e: model.changed(mass=model.mass * (1 + e * np.array([0.0, 1.0]))),
+    "inertia": lambda model, e: model.changed(
         inertia=model.inertia
         + e * np.array([0.0, 1.0])[:, None, None] * np.diag([0, model.inertia[1, 1, 1], 0]),
     ),
-    "offset": lambda model, e: replace(
-        model, proximal=model.proximal * (1 + e * np.array([[0, 0, 0], [0, 0, 1.0]]))
+    "offset": lambda model, e: model.changed(
+        proximal=model.proximal * (1 + e * np.array([[0, 0, 0], [0, 0, 1.0]]))
     ),
-    "gravity": lambda model, e: replace(model, gravity=model.gravity * (1 + e)),
+    "gravity": lambda model, e: model.changed(gravity=model.gravity * (1 + e)),
 }
 
 
@@ -209,7 +208,7 @@ def test_bounds_are_sharp_and_describe_their_derivation():
 
 def test_extreme_mass_ratios_give_an_inconclusive_bound():
     model, state = random_chain(np.random.default_rng(1), [0] * 10)
-    model = replace(model, mass=np.geomspace(1e-6, 1e6, 10), inertia=model.inertia * 1e-4)
+    model = model.changed(mass=np.geomspace(1e-6, 1e6, 10), inertia=model.inertia * 1e-4)
     assert state_rounding_bound(model, state).relative_bound("angular_acceleration") > MAX_RELATIVE_BOUND
 
 
@@ -218,10 +217,10 @@ def test_states_without_motion_or_gravity_have_finite_bounds():
         warnings.simplefilter("error")
         for rods in ([0], [1], [0, 1]):
             model, state = random_chain(np.random.default_rng(3), rods, rate=0.0)
-            still = replace(model, gravity=np.zeros(3))
+            still = model.changed(gravity=np.zeros(3))
             for bound in (state_rounding_bound(model, state), state_rounding_bound(still, state)):
                 assert all(np.all(np.isfinite(bound.tolerance(q))) for q in bound.scale)
-            centred = replace(model, proximal=np.zeros_like(model.proximal))
+            centred = model.changed(proximal=np.zeros_like(model.proximal))
             assert np.all(np.isfinite(state_rounding_bound(centred, state).acceleration))
 
 
@@ -444,8 +443,7 @@ def test_the_bound_is_its_definition(rods, welded):
         *((1.0, 0.0, 1e3, 1.0), (3.0, 1e-3, 0.0, 1.0), (3.0, 1.0, 1.0, 1e-4), (0.1, 1.0, 30.0, 1e-2)),
     ):
         model, state = random_chain(rng, rods, mass_decades=1, rate=rate, loads=True, drag=True)
-        model = replace(
-            model,
+        model = model.changed(
             gravity=gravity * model.gravity,
             force=loads * model.force,
             moment=loads * model.moment,

@@ -53,7 +53,7 @@ UNSTABLE_SCENARIOS = [
 def unstable_pendulum():
     """A body standing on its pivot, and the rate λ at which it leaves there."""
     model, _ = random_chain(np.random.default_rng(0), [0])
-    model = replace(model, inertia=np.diag([0.02, 0.02, 0.01])[None], proximal=np.array([[0, 0, -0.3]]))
+    model = model.changed(inertia=np.diag([0.02, 0.02, 0.01])[None], proximal=np.array([[0, 0, -0.3]]))
     state = state_from_minimal(model, np.array([[1.0, 0, 0, 0]]), *np.zeros((3, 1, 3)))
     return model, state, float(np.sqrt(model.mass[0] * 9.81 * 0.3 / (0.02 + model.mass[0] * 0.09)))
 
@@ -71,7 +71,7 @@ def test_growth_is_exponential_as_far_as_it_goes():
 def test_growth_may_end():
     """A body that falls over and comes to rest: its twins part ten thousandfold, and then no further."""
     model, state, own = unstable_pendulum()
-    model = replace(model, drag_moment=np.array([0.2 * model.mass[0] * 9.81 * 0.3 / own]))
+    model = model.changed(drag_moment=np.array([0.2 * model.mass[0] * 9.81 * 0.3 / own]))
     state = perturbed_states(model, state, perturbation_size=3e-5, count=1)[0]
     times = np.linspace(0, 60 / own, 61)
     found = perturbation_growth(model, state, times)
@@ -87,7 +87,7 @@ def test_growth_may_end():
 def test_perturbations_of_a_damped_hanging_body_do_not_grow():
     """All that stays is the turn about the vertical."""
     model, state, _ = unstable_pendulum()
-    model = replace(model, proximal=-model.proximal, drag_moment=2 * model.mass)
+    model = model.changed(proximal=-model.proximal, drag_moment=2 * model.mass)
     found = perturbation_growth(
         model, state_from_minimal(model, state.p, *np.zeros((3, 1, 3))), np.linspace(0, 10, 6)
     )
@@ -120,7 +120,7 @@ def test_neighbours_are_on_the_manifold_and_close(rods):
 def test_other_models_in_the_batch_move_as_they_do_alone():
     """Past the time at which twins have moved so far that they run on without the others."""
     model, state, own = unstable_pendulum()
-    heavier = replace(model, mass=2 * model.mass, inertia=3 * model.inertia)
+    heavier = model.changed(mass=2 * model.mass, inertia=3 * model.inertia)
     leaning = perturbed_states(heavier, state, perturbation_size=1e-3, count=1)[0]
     times = np.linspace(0, 16 / own, 41)
     found, r, p = perturbation_growth_and_runs(model, state, times, [(heavier, leaning)])
@@ -151,7 +151,7 @@ def test_growth_is_the_largest_distance_of_a_neighbour(rods):
 
 def test_position_distances_are_relative_to_the_distance_from_the_pivot():
     """A point on a rod that stands: positions part exponentially, attitudes as time does."""
-    model = replace(pendulums.make_model("r"), gravity=np.array([3.0, -6, 6]), proximal=np.zeros((1, 3)))
+    model = pendulums.make_model("r").changed(gravity=np.array([3.0, -6, 6]), proximal=np.zeros((1, 3)))
     still = np.zeros((1, 3))
     state = state_from_minimal(model, np.array([[1.0, 0, 0, 0]]), still, -model.gravity[None] / 9, still)
     times = np.linspace(0, 1, 9)

@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from dataclasses import replace
 from importlib.util import find_spec
 
 import numpy as np
@@ -148,7 +147,7 @@ def test_a_parameter_error_of_1e_11_in_one_method_is_detected(monkeypatch, side,
     right = getattr(trajectory, side)
 
     def wrong(model, *rest):
-        return right(replace(model, **{field: getattr(model, field) * factor}), *rest)
+        return right(model.changed(**{field: getattr(model, field) * factor}), *rest)
 
     monkeypatch.setattr(trajectory, side, wrong)
     planted = ground_truth.motion_truth(scenario.model, scenario.state, TIMES, None)

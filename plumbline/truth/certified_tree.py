@@ -1,0 +1,292 @@
+"""Certified quantities of a tree with any joints: its equations in joint coordinates, in ball arithmetic.
+
+No constraint rows: each joint has the motions that it allows, as columns S_k (6, m_k) of twists about the
+world's origin, (angular velocity; velocity of the point at the origin), world axes, carried rigidly by all
+bodies beyond.  With I_c the composite inertia of a subtree and w its wrench at ν̇ = 0, both about the origin,
+
+    M_jk = S_jᵀ I_c,k S_k  for j on the path from the world to k     (composite rigid bodies, CRBA)
+    h_k  = S_kᵀ w_k                                                  (recursive Newton–Euler, RNEA)
+    M ν̇ = −h
+
+(Featherstone, Rigid Body Dynamics Algorithms, 2008, tables 5.1 and 6.2).  A rod lets its near end slide
+along two tangents of the sphere about its far end, and has a ball joint there.  Rates ν are relative to the
+far body.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from plumbline.model.datatypes import KINDS, Model, State
+from plumbline.model.kinematics import own_rates, rate_count
+from plumbline.truth.balls import BallArithmetic, entries, midpoints
+
+
+class _BallTree(BallArithmetic):
+    """Model and state in balls: lists over the bodies of 3×1 ``arb_mat`` in world axes.
+
+    Attitudes A, centres r, velocities v, angular velocities w; of the joints the near points P, the motions S
+    and the tangents of rods; accelerations that the joints allow, to which S ν̇ adds: ``bend`` r̈, ``twist`` ω̇.
+    """
+
+    def __init__(self, flint: Any, model: Model, state: State) -> None:
+        super().__init__(flint, model)
+        self.state, self.far = state, [int(far) for far in model.body[:, 0]]
+        self.A: list[Any] = []
+        self.r: list[Any] = []
+        self.v: list[Any] = []
+        self.w: list[Any] = []
+        self.P: list[Any] = []
+        self.S: list[Any] = []
+        self.bend: list[Any] = []
+        self.twist: list[Any] = []
+        self.tangents: list[list[Any]] = []
+        self.units = [self.vector(e) for e in np.eye(3)]
+        for k in range(self.n):
+            self._add_body(k)
+
+    def _add_body(self, k: int) -> None:
+        """Place joint k, from its far point to its near point, and body k."""
+        model, state, kind, far = self.model, self.state, self.model.kind[k], self.far[k]
+        P, v, a = self.vector(model.point[k, 0]), self.zero, self.zero
+        w = alpha = self.zero
+        if far >= 0:
+            w, alpha, arm = self.w[far], self.twist[far], self.A[far] * P
+            cross = self.cross_matrix(w)
+            P, v = self.r[far] + arm, self.v[far] + cross * arm
+            a = self.bend[far] + self.cross_matrix(alpha) * arm + cross * (cross * arm)
+        columns: list[tuple[Any, Any]] = []  # angular velocity, velocity of the near point
+        self.tangents.append([])
+        if kind == "rod":
+            u, udot = self.rod_direction(state, k)
+            ell = self.arb(float(model.length[k]))
+            P, v, a = P + u * ell, v + udot * ell, a - u * (self.dot(udot, udot) * ell)
+            first = self.cross_matrix(u) * self.units[int(np.argmin(np.abs(state.u[k])))]
+            self.tangents[k] = [first, self.cross_matrix(u) * first]
+            columns = [(self.zero, t * ell) for t in self.tangents[k]]
+        if kind == "free":
+            P, v, a = self.vector(state.r[k]), self.vector(state.v[k]), self.zero
+            columns = [(self.zero, e) for e in self.units]
+        if KINDS[kind].has_attitude:
+            A = self.rotation(state.p[k])
+            w = A * self.vector(state.omega[k])
+            columns += [(e, self.zero) for e in self.units]
+        else:
+            A, w, P, v, a, alpha = self._move(k, w, P, v, a, alpha, columns)
+        near = self.zero if kind == "free" else A * self.vector(model.point[k, 1])
+        cross, origin = self.cross_matrix(w), self.cross_matrix(P)
+        twists = [[*entries(axis), *entries(along + origin * axis)] for axis, along in columns]
+        self.A.append(A)
+        self.w.append(w)
+        self.P.append(P)
+        self.r.append(P - near)
+        self.v.append(v - cross * near)
+        self.twist.append(alpha)
+        self.bend.append(a - self.cross_matrix(alpha) * near - cross * (cross * near))
+        self.S.append(self.mat(6, len(twists), [x for row in zip(*twists, strict=True) for x in row]))
+
+    def _move(
+        self, k: int, w: Any, P: Any, v: Any, a: Any, alpha: Any, columns: list[Any]
+    ) -> tuple[Any, ...]:
+        """Go along the motions of joint k; adds its columns."""
+        A = self.rotation(self.model.turn[k, 0])
+        if self.far[k] >= 0:
+            A = self.A[self.far[k]] * A
+        for i, (what, number) in enumerate(KINDS[self.model.kind[k]].motions):
+            x, rate = (self.arb(float(values[k, i])) for values in (self.state.x, self.state.xdot))
+            axis, cross = A * self.units[number], self.cross_matrix(w)
+            if what == "slide":
+                shift = axis * x
+                P, v = P + shift, v + cross * shift + axis * rate
+                a = a + self.cross_matrix(alpha) * shift + cross * (cross * shift) + cross * axis * (2 * rate)
+                columns.append((self.zero, axis))
+            else:
+                w, alpha = w + axis * rate, alpha + cross * axis * rate
+                A = A * self.turn_about(number, x)
+                columns.append((axis, self.zero))
+        return A * self.rotation(self.model.turn[k, 1]).transpose(), w, P, v, a, alpha
+
+    def turn_about(self, axis: int, angle: Any) -> Any:
+        """The rotation about a coordinate axis."""
+        c, s = angle.cos(), angle.sin()
+        m = [[self.arb(int(i == j)) for j in range(3)] for i in range(3)]
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        m[i][i], m[i][j], m[j][i], m[j][j] = c, -s, s, c
+        return self.mat(m)
+
+    def spatial_inertia(self, k: int) -> Any:
+        """Inertia (6, 6) of body k about the world's origin: twist → momentum, angular part first."""
+        c = self.cross_matrix(self.r[k]) * self.m[k]
+        top = self.A[k] * self.J[k] * self.A[k].transpose() - c * self.cross_matrix(self.r[k])
+        rows = [[*[top[i, j] for j in range(3)], *[c[i, j] for j in range(3)]] for i in range(3)] + [
+            [*[-c[i, j] for j in range(3)], *[self.m[k] * int(i == j) for j in range(3)]] for i in range(3)
+        ]
+        return self.mat(rows)
+
+    def wrench_at_rest(self, k: int) -> Any:
+        """Moment about the origin and force (6, 1) that body k needs at ν̇ = 0, besides weight and loads."""
+        model, ball = self.model, self.arb
+        force = (self.bend[k] - self.g) * self.m[k] - self.vector(model.force[k])
+        force = force + self.v[k] * ball(float(model.drag_force[k]))
+        inertia = self.A[k] * self.J[k] * self.A[k].transpose()
+        moment = inertia * self.twist[k] + self.cross_matrix(self.w[k]) * (inertia * self.w[k])
+        moment = moment - self.A[k] * self.vector(model.moment[k])
+        moment = moment + self.w[k] * ball(float(model.drag_moment[k])) + self.cross_matrix(self.r[k]) * force
+        return self.mat(6, 1, [*entries(moment), *entries(force)])
+
+
+def enclose_tree(flint: Any, model: Model, state: State, mass_matrix: bool) -> dict[str, Any]:
+    """Enclose every quantity of a tree at the working precision.
+
+    Args:
+        flint: the module python-flint.
+        model: the mechanism.
+        state: the state, of which the minimal coordinates are used.
+        mass_matrix: whether to compute the mass matrix too.
+
+    Returns:
+        As `plumbline.truth.certified.enclose_quantities`.
+
+    Raises:
+        ZeroDivisionError: the mass matrix is not invertible, at this precision.
+
+    """
+    c = _BallTree(flint, model, state)
+    M, first = _joint_mass_matrix(c)
+    inertias, wrenches = ([of(k) for k in range(c.n)] for of in (c.spatial_inertia, c.wrench_at_rest))
+    total = _subtree_sums(c, wrenches)
+    h = [x for k in range(c.n) for x in entries(c.S[k].transpose() * total[k])]
+    rates = entries(M.solve(c.mat(len(h), 1, [-x for x in h]))) if h else []
+    acceleration, angular, kinetic, potential, momentum = [], [], c.arb(0), c.arb(0), c.zero
+    gained: list[Any] = []  # twist that ν̇ adds
+    for k in range(c.n):
+        own = c.mat(6, 1, [0] * 6)
+        if first[k + 1] > first[k]:
+            own = c.S[k] * c.mat(first[k + 1] - first[k], 1, rates[first[k] : first[k + 1]])
+        gained.append(own + gained[c.far[k]] if c.far[k] >= 0 else own)
+        top, bottom = (c.mat(3, 1, entries(gained[k])[part]) for part in (slice(0, 3), slice(3, 6)))
+        acceleration.append(c.bend[k] + bottom + c.cross_matrix(top) * c.r[k])
+        angular.append(c.A[k].transpose() * (c.twist[k] + top))
+        spin = c.A[k] * (c.J[k] * (c.A[k].transpose() * c.w[k]))
+        kinetic += (c.m[k] * c.dot(c.v[k], c.v[k]) + c.dot(c.w[k], spin)) / 2
+        potential -= c.m[k] * c.dot(c.g, c.r[k])
+        momentum += c.cross_matrix(c.r[k]) * c.v[k] * c.m[k] + spin
+        wrenches[k] = wrenches[k] + inertias[k] * gained[k]
+    force, moment = [], []
+    for k, wrench in enumerate(_subtree_sums(c, wrenches)):
+        about_origin, pull = (c.mat(3, 1, entries(wrench)[part]) for part in (slice(0, 3), slice(3, 6)))
+        force.append(entries(pull))
+        moment.append(entries(about_origin - c.cross_matrix(c.P[k]) * pull))
+    balls: dict[str, Any] = {
+        "acceleration": [entries(a) for a in acceleration],
+        "angular_acceleration": [entries(a) for a in angular],
+        "joint_reaction": force,
+        "joint_moment": moment,
+        "kinetic_energy": [kinetic],
+        "potential_energy": [potential],
+        "angular_momentum": entries(momentum),
+        "r": [entries(r) for r in c.r],
+        "v": [entries(v) for v in c.v],
+    }
+    if mass_matrix:
+        T = _relative_rates(c, first)
+        balls["mass_matrix"] = (T.transpose() * M * T).tolist()
+    return balls | {"scale": _term_scales(c, balls)}
+
+
+def _subtree_sums(c: _BallTree, wrenches: list[Any]) -> list[Any]:
+    """Per body the sum over it and all bodies beyond."""
+    total = list(wrenches)
+    for k in reversed(range(c.n)):
+        if c.far[k] >= 0:
+            total[c.far[k]] = total[c.far[k]] + total[k]
+    return total
+
+
+def _joint_mass_matrix(c: _BallTree) -> tuple[Any, list[int]]:
+    """M of the relative rates, and where each joint's begin."""
+    first = [int(i) for i in np.cumsum([0, *(S.ncols() for S in c.S)])]
+    composite = _subtree_sums(c, [c.spatial_inertia(k) for k in range(c.n)])
+    rows = [[c.arb(0)] * first[-1] for _ in range(first[-1])]
+    for k in range(c.n):
+        if not c.S[k].ncols():
+            continue
+        momentum, j = composite[k] * c.S[k], k
+        while j >= 0:
+            block = c.S[j].transpose() * momentum
+            for row in range(c.S[j].ncols()):
+                for column in range(c.S[k].ncols()):
+                    rows[first[j] + row][first[k] + column] = block[row, column]
+                    rows[first[k] + column][first[j] + row] = block[row, column]
+            j = c.far[j]
+    return c.mat(rows) if rows else c.mat(0, 0), first
+
+
+def _relative_rates(c: _BallTree, first: list[int]) -> Any:
+    """The matrix from the rates ν of `StateQuantities.mass_matrix` to the relative ones.
+
+    A ball joint's are A ω′ − ω_far, a rod's besides tᵀ(u̇ − ω_far × u)/tᵀt along its tangents t.
+    """
+    rows = [[c.arb(0)] * rate_count(c.model) for _ in range(first[-1])]
+    spins: list[dict[int, Any]] = []  # of each body: column of ν → its angular velocity, world axes
+    rods = np.cumsum(c.model.rods) - 1
+    for k, own in enumerate(own_rates(c.model)):
+        kind, far = c.model.kind[k], c.far[k]
+        above = spins[far] if far >= 0 and kind != "free" else {}
+        spin, at = dict(above), first[k]
+        if kind == "rod":
+            u, _ = c.rod_direction(c.state, k)
+            for row, t in enumerate(c.tangents[k]):
+                scale = 1 / c.dot(t, t)
+                for i in range(3):
+                    rows[at + row][3 * int(rods[k]) + i] = t[i, 0] * scale
+                for column, w in above.items():
+                    rows[at + row][column] = -c.dot(t, c.cross_matrix(w) * u) * scale
+            at += 2
+        if kind == "free":
+            for i in range(3):
+                rows[at + i][own.start + i] = c.arb(1)
+            at += 3
+        if KINDS[kind].has_attitude:
+            spin = {}
+            for i in range(3):
+                spin[own.stop - 3 + i] = w = c.A[k] * c.units[i]
+                for row in range(3):
+                    rows[at + row][own.stop - 3 + i] = w[row, 0]
+            for column, w in above.items():
+                for row in range(3):
+                    rows[at + row][column] = -w[row, 0]
+        else:
+            for i in range(c.S[k].ncols()):
+                rows[at + i][own.start + i] = c.arb(1)
+                spin[own.start + i] = c.mat(3, 1, [c.S[k][row, i] for row in range(3)])
+        spins.append(spin)
+    return c.mat(rows) if rows else c.mat(0, 0)
+
+
+def _term_scales(c: _BallTree, balls: dict[str, Any]) -> dict[str, float]:
+    """Sizes of the terms of each quantity; radii are compared with them because a quantity may be zero."""
+    norm, model = np.linalg.norm, c.model
+    size = {name: float(np.max(np.abs(midpoints(ball)), initial=0.0)) for name, ball in balls.items()}
+    lever = float(np.sum(norm(model.point, axis=2)) + np.sum(model.length) + np.sum(np.abs(c.state.x)))
+    lever = max(lever, size["r"])
+    rate = float(np.max(norm(midpoints([entries(w) for w in c.w]), axis=1)))
+    rate = max(rate, float(np.max(np.abs(c.state.xdot))), float(np.max(np.abs(c.state.udot))))
+    g = float(norm(model.gravity))
+    a = max(size["acceleration"], g, rate**2 * lever)
+    mass, inertia = float(np.sum(model.mass)), float(np.sum(norm(model.inertia, axis=(1, 2))))
+    force = max(size["joint_reaction"], mass * a)
+    return {
+        "acceleration": a,
+        "angular_acceleration": max(size["angular_acceleration"], rate**2, a / lever if lever else 0.0),
+        "joint_reaction": force,
+        "joint_moment": max(size["joint_moment"], force * lever),
+        "kinetic_energy": size["kinetic_energy"],
+        "potential_energy": max(size["potential_energy"], mass * g * lever),
+        "angular_momentum": max(size["angular_momentum"], (mass * lever**2 + inertia) * rate),
+        "r": lever,
+        "v": max(size["v"], lever * rate),
+        "mass_matrix": size.get("mass_matrix", 0.0),
+    }

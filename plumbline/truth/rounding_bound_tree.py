@@ -1,0 +1,344 @@
+"""The tolerance of the state level for trees with any joints: the parts of `rounding_bound`, joint by joint.
+
+Joint k holds its body with a force F and a moment M about its near point in the directions that its motions
+leave, E_k (6, c).  With x = (r̈, α) per body, world axes, C the held rows of a_near − a_far, α_near − α_far,
+
+    M x − Cᵀ λ = f,    C x = γ,    K = C M⁻¹ Cᵀ
+
+Roundings of the terms of each body's equations and of each joint's are propagated through the inverse (tB),
+those of the elimination C M⁻¹ f likewise (tS); a joint-space engine rounds the terms of M q̈ + h, which act as
+torque pairs at turns and as force pairs at slides (tJ); d is the accumulation along the branches.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from plumbline.model.datatypes import KINDS, Array, Model, State
+from plumbline.model.kinematics import (
+    JointFrame,
+    cross_matrix,
+    joint_vectors,
+    rotate_vectors,
+    rotation_matrix,
+)
+
+
+class _TreeTerms:
+    """The Newton–Euler system of a tree at one state, its solution, and the sizes of all that is rounded.
+
+    Norms (N,) are named as their vectors: a, alpha, F, moment (of the joint), arm (centre to near point).
+    """
+
+    def __init__(self, model: Model, state: State) -> None:
+        self.model, self.state, self.n, self.far = model, state, model.n, model.body[:, 0]
+        self.A = rotation_matrix(state.p)
+        self.inertia = self.A @ model.inertia @ self.A.mT
+        self.omega = rotate_vectors(self.A, state.omega)
+        self.near = rotate_vectors(self.A, model.proximal)  # centre to near point, world axes
+        self.d = joint_vectors(model, state.r, state.p)
+        has_far = self.far >= 0
+        # centre of the far body to its point where the near point is
+        self.far_arm = np.where(has_far[:, None], state.r + self.near - state.r[self.far], 0.0)
+        self.below = np.eye(self.n, dtype=bool)  # [k, b]: body b is k or beyond it
+        for k in reversed(range(self.n)):
+            if self.far[k] >= 0:
+                self.below[self.far[k]] |= self.below[k]
+        self.load = model.force - model.drag_force[:, None] * state.v
+        self.torque = rotate_vectors(self.A, model.moment) - model.drag_moment[:, None] * self.omega
+        self._solve()
+        self._measure()
+
+    def _held_and_bend(self, k: int) -> tuple[Array, Array]:
+        """E (6, c) of joint k, and the relative acceleration (6,) that the velocities alone cause."""
+        model, state, kind, far = self.model, self.state, self.model.kind[k], self.far[k]
+        bend = np.zeros(6)
+        cross = np.cross
+        spin = self.omega[far] if far >= 0 else np.zeros(3)
+        bend[:3] = cross(self.omega[k], cross(self.omega[k], self.near[k])) - cross(
+            spin, cross(spin, self.far_arm[k])
+        )
+        if kind == "rod":
+            bend[:3] += cross(spin, cross(spin, self.d[k]))  # the far point is not where the near point is
+            bend[:3] += model.length[k] * state.udot[k] @ state.udot[k] * state.u[k]
+            return np.concatenate([state.u[k], np.zeros(3)])[:, None], bend
+        if KINDS[kind].has_attitude:
+            return np.eye(6, 3 if kind == "ball" else 0), bend
+        axes = JointFrame(model, k, self.A[far] if far >= 0 else np.eye(3)).axes(state.x[k])
+        carried = spin
+        for (what, axis), rate in zip(axes, state.xdot[k], strict=False):
+            if what == "slide":
+                bend[:3] -= 2 * cross(spin, axis * rate)
+            else:
+                bend[3:] -= cross(carried, axis * rate)
+                carried = carried + axis * rate
+        free = [
+            np.array([axis for what, axis in axes if what == name]).reshape(-1, 3)
+            for name in ("slide", "turn")
+        ]
+        push, turn = (np.linalg.svd(some)[2][len(some) :].T for some in free)
+        held = np.zeros((6, push.shape[1] + turn.shape[1]))
+        held[:3, : push.shape[1]], held[3:, push.shape[1] :] = push, turn
+        return held, bend
+
+    def _solve(self) -> None:
+        n, model = self.n, self.model
+        held = [self._held_and_bend(k) for k in range(n)]
+        first = np.cumsum([0, *(E.shape[1] for E, _ in held)])
+        C = np.zeros((first[-1], n, 6))
+        E_rows = np.zeros((n, 6, first[-1]))
+        gamma = np.zeros(first[-1])
+        for k, (E, bend) in enumerate(held):
+            rows = slice(first[k], first[k + 1])
+            C[rows, k, :3], C[rows, k, 3:] = E[:3].T, E[3:].T - E[:3].T @ cross_matrix(self.near[k])
+            if self.far[k] >= 0:
+                arm = self.far_arm[k] - (self.d[k] if model.kind[k] == "rod" else 0.0)
+                C[rows, self.far[k], :3] = -E[:3].T
+                C[rows, self.far[k], 3:] = E[:3].T @ cross_matrix(arm) - E[3:].T
+            E_rows[k, :, rows] = E
+            gamma[rows] = -E.T @ bend
+        M_inverse = np.zeros((n, 6, n, 6))
+        body = np.arange(n)
+        M_inverse[body, :3, body, :3] = np.eye(3) / model.mass[:, None, None]
+        M_inverse[body, 3:, body, 3:] = np.linalg.inv(self.inertia)
+        flat, M_flat = C.reshape(-1, 6 * n), M_inverse.reshape(6 * n, 6 * n)
+        CM = flat @ M_flat
+        K = CM @ flat.T
+        s = 1 / np.sqrt(np.diag(K))  # equilibrated: pivots must not depend on the units
+        K_inverse = np.linalg.inv(K * s * s[:, None]) * s * s[:, None] if len(K) else K
+        X = CM.T @ K_inverse
+        x_rows = np.concatenate([M_flat - X @ CM, X], 1).reshape(n, 2, 3, -1)
+        wrench_rows = (E_rows @ np.concatenate([-X.T, K_inverse], 1)).reshape(n, 2, 3, -1)
+        inverse = np.concatenate([x_rows, wrench_rows], 1)  # (N, 4, 3, 6 N + c): r̈, α, F, M of each body
+        self.of_body = inverse[..., : 6 * n].reshape(n, 4, 3, n, 2, 3)
+        # per joint the response to errors of its six relative accelerations
+        self.of_joint = np.einsum("nqir,kjr->nqikj", inverse[..., 6 * n :], E_rows).reshape(n, 4, 3, n, 2, 3)
+        force = model.mass[:, None] * model.gravity + self.load
+        moment = self.torque - cross(self.omega, rotate_vectors(self.inertia, self.omega))
+        right = np.concatenate([np.concatenate([force, moment], -1).ravel(), gamma])
+        self.solution = np.moveaxis(inverse @ right, 1, 0)  # (4, N, 3)
+
+    def _measure(self) -> None:
+        norm, model = np.linalg.norm, self.model
+        self.g, self.m, self.J = float(norm(model.gravity)), model.mass, norm(model.inertia, axis=(1, 2))
+        self.a, self.alpha, self.F, self.moment = norm(self.solution, axis=-1)
+        self.arm, self.reach = norm(self.near, axis=1), norm(self.far_arm, axis=1) + norm(self.d, axis=1)
+        own = norm(self.omega, axis=1) + norm(self.state.udot, axis=1) + norm(self.state.xdot, axis=1)
+        # largest rate of any body or joint between the world and here, per body
+        self.W = np.max(np.where(self.below.T, own, 0.0), axis=1)
+        self.transport = norm(self.omega, axis=1) * norm(self.state.v, axis=1)
+        self.load_size, self.torque_size = norm(self.load, axis=1), norm(self.torque, axis=1)
+        self.spin = self.J * norm(self.omega, axis=1) * self.W
+        slides = [[what == "slide" for what, _ in KINDS[kind].motions] + [False] * 2 for kind in model.kind]
+        self.slide_rate = np.abs(self.state.xdot) @ [1, 1] * [any(some) for some in slides]
+        children = [np.flatnonzero(self.far == k) for k in range(self.n)]
+        self.F_children = np.array([np.sum(self.F[kids]) for kids in children])
+        self.moment_children = np.array(
+            [np.sum(self.moment[kids] + self.reach[kids] * self.F[kids]) for kids in children]
+        )
+
+    def of_far(self, x: Array) -> Array:
+        """Value (N,) at the far body of each joint, 0 at the world."""
+        return np.where(self.far >= 0, x[self.far], 0.0)
+
+    def propagate(self, force: Array, moment: Array, linear: Array, angular: Array) -> Array:
+        """First-order change (N, 4) of r̈, α, F, M for errors (N,) in the equations of bodies and joints."""
+        errors = np.stack([force, moment, linear, angular], 1)
+        norms = np.concatenate(
+            [np.linalg.norm(part, axis=(2, 5)) for part in (self.of_body, self.of_joint)], axis=-1
+        )  # (N, 4, N, 4)
+        return np.asarray(np.einsum("nqkc,kc->nq", norms, errors))
+
+    def body_errors(self) -> tuple[Array, Array, Array, Array]:
+        """Largest term of each Newton and Euler equation, and of each joint's relative accelerations."""
+        # spatial accelerations in a body's axes hold ω × ṙ, which a moving free body makes large
+        weights = [
+            self.m * self.a,
+            self.m * self.g,
+            self.m * self.transport,
+            self.F,
+            self.F_children,
+            self.load_size,
+        ]
+        moments = [self.J * self.alpha, self.spin, self.arm * self.F, self.torque_size, self.moment]
+        far_a, far_alpha = self.of_far(self.a), self.of_far(self.alpha)
+        linear = [self.a, self.arm * self.alpha, self.arm * self.W**2, far_a, self.reach * far_alpha,
+                  self.reach * self.W**2, self.W * self.slide_rate]  # fmt: skip
+        angular = [self.alpha, far_alpha, self.W**2]
+        sizes = (weights, [*moments, self.moment_children], linear, angular)
+        force, moment, linear_size, angular_size = (np.max(terms, 0) for terms in sizes)
+        return force, moment, linear_size, angular_size
+
+    def elimination_errors(self) -> tuple[Array, Array]:
+        """Terms of C M⁻¹ f in the linear and angular rows of each joint."""
+        least = np.linalg.eigvalsh(self.model.inertia)[:, 0]
+        free = (self.F + self.F_children + self.m * self.g + self.load_size) / self.m
+        turn = self.arm * self.F + self.moment + self.moment_children + self.spin + self.torque_size
+        turn = turn / least
+        far_free, far_turn = self.of_far(free), self.of_far(turn)
+        return free + self.arm * turn + far_free + self.reach * far_turn, turn + far_turn
+
+
+class _JointSpace:
+    """Joint coordinates of a tree: turns at near points (a rod's also at its far point), and slides.
+
+    Per coordinate and body: ``lever`` [m or 1] the size of the velocity of the centre per unit rate,
+    ``turns`` 1 where the body turns with it.
+    """
+
+    def __init__(self, terms: _TreeTerms) -> None:
+        self.terms, model, state = terms, terms.model, terms.state
+        omega, alpha = terms.omega, terms.solution[1]
+        self.pairs: list[tuple[str, int]] = []
+        lever: list[Any] = []
+        turns: list[Any] = []
+        rates: list[Any] = []
+        accelerations: list[Any] = []
+        for k, kind in enumerate(model.kind):
+            far = terms.far[k]
+            below = terms.below[k].astype(float)
+            tip = state.r[k] + terms.near[k]
+            above_w, above_a = (omega[far], alpha[far]) if far >= 0 else (np.zeros(3), np.zeros(3))
+            if kind == "rod":
+                spin = cross(state.u[k], state.udot[k])
+                swing = self._rod_acceleration(k)
+                self._add(
+                    lever,
+                    turns,
+                    rates,
+                    accelerations,
+                    tip - terms.d[k],
+                    below,
+                    spin - above_w,
+                    swing - above_a,
+                )
+                self.pairs.append(("upper", k))
+                self._add(lever, turns, rates, accelerations, tip, below, omega[k] - spin, alpha[k] - swing)
+                self.pairs.append(("lower", k))
+                continue
+            motions = {what for what, _ in KINDS[kind].motions}
+            if KINDS[kind].has_attitude or "turn" in motions:
+                self._add(
+                    lever, turns, rates, accelerations, tip, below, omega[k] - above_w, alpha[k] - above_a
+                )
+                self.pairs.append(("turn", k))
+            if kind == "free" or "slide" in motions:
+                lever.append(below)
+                turns.append(0 * below)
+                rates.append(terms.slide_rate[k] if kind != "free" else np.linalg.norm(state.v[k]))
+                accelerations.append(np.linalg.norm(self._slide_acceleration(k)))
+                self.pairs.append(("slide", k))
+        shape = (len(lever), terms.n)
+        self.lever, self.turns = np.reshape(lever, shape), np.reshape(turns, shape)
+        self.rate, self.acceleration = np.array(rates), np.array(accelerations)
+        m, J = terms.m, terms.J
+        self.mass_matrix = (self.lever * m) @ self.lever.T + (self.turns * J) @ self.turns.T
+        h = self.turns @ (J * terms.W**2 + terms.torque_size)
+        h += self.lever @ (m * (terms.g + terms.a) + terms.load_size)
+        self.load = self.mass_matrix @ self.acceleration + h  # N m or N
+
+    def _add(
+        self, lever: list[Any], turns: list[Any], rates: list[Any], accelerations: list[Any],
+        at: Array, below: Array, rate: Array, acceleration: Array,
+    ) -> None:  # fmt: skip
+        """Add a turn at a point of the world."""
+        lever.append(below * np.linalg.norm(self.terms.state.r - at, axis=1))
+        turns.append(below)
+        rates.append(np.linalg.norm(rate))
+        accelerations.append(np.linalg.norm(acceleration))
+
+    def _point_acceleration(self, body: int, arm: Array) -> Array:
+        if body < 0:
+            return np.zeros(3)
+        t = self.terms
+        w, alpha = t.omega[body], t.solution[1, body]
+        return np.asarray(t.solution[0, body] + cross(alpha, arm) + cross(w, cross(w, arm)))
+
+    def _slide_acceleration(self, k: int) -> Array:
+        t = self.terms
+        near = self._point_acceleration(k, t.near[k])
+        return near - self._point_acceleration(t.far[k], t.far_arm[k])
+
+    def _rod_acceleration(self, k: int) -> Array:
+        """Angular acceleration of a rod without axial spin, u × d̈/ℓ."""
+        t = self.terms
+        near = self._point_acceleration(k, t.near[k])
+        far = self._point_acceleration(t.far[k], t.far_arm[k] - t.d[k])
+        return np.asarray(cross(t.state.u[k], near - far) / t.model.length[k])
+
+    def responses(self) -> Array:
+        """Norms (coordinates, N, 4) of the response to a unit torque or force pair at each coordinate."""
+        t = self.terms
+        force, moment = np.moveaxis(t.of_body, 3, 0)[..., 0, :], np.moveaxis(t.of_body, 3, 0)[..., 1, :]
+        none = np.zeros_like(force[0])
+
+        def push(body: int, arm: Array) -> Array:
+            return np.asarray(force[body] + moment[body] @ cross_matrix(arm)) if body >= 0 else none
+
+        found = []
+        for what, k in self.pairs:
+            far = t.far[k]
+            above = moment[far] if far >= 0 else none
+            if what == "turn":
+                found.append(moment[k] - above)
+            elif what == "slide":
+                found.append(push(k, t.near[k]) - push(far, t.far_arm[k]))
+            else:  # a torque on a massless rod is balanced by forces ∓(τ × u)/ℓ at its ends
+                ends = push(k, t.near[k]) - push(far, t.far_arm[k] - t.d[k])
+                through = -ends @ cross_matrix(t.state.u[k]) / t.model.length[k]
+                found.append(through - above if what == "upper" else moment[k] - through)
+        return np.asarray(np.linalg.norm(np.reshape(found, (len(found), t.n, 4, 3, 3)), axis=(3, 4)))
+
+
+def tree_tolerances(
+    model: Model, state: State
+) -> tuple[Array, dict[str, Array | float], dict[str, float], Array]:
+    """Compute the sizes of all roundings of a tree at one state.
+
+    Args:
+        model: the mechanism; masses > 0, inertias positive definite.
+        state: the state at which quantities are compared.
+
+    Returns:
+        tB + tS + tJ + d (N, 4) of r̈ [m/s²], α [rad/s²], F [N] and M [N m]; the scales of all quantities; the
+        sums behind the energies [J], the angular momentum and the mass matrix; torques of rods (N,) [N m].
+
+    """
+    t = _TreeTerms(model, state)
+    joints = _JointSpace(t)
+    force, moment, linear, angular = t.body_errors()
+    total = t.propagate(force, moment, linear, angular)
+    total += t.propagate(0 * force, 0 * moment, *t.elimination_errors())
+    total += np.einsum("jnq,j->nq", joints.responses(), joints.load)
+    swing, turning = joints.lever.T @ joints.acceleration, joints.turns.T @ joints.acceleration
+    tip = state.r + t.near
+    carried = t.m * (t.a + swing + t.g + t.transport) + t.load_size
+    lever = np.linalg.norm(state.r - tip[:, None], axis=2) * t.below
+    carried_moment = t.below @ (t.J * (t.alpha + turning) + t.spin + t.torque_size) + lever @ carried
+    result = np.stack([np.maximum(t.a, t.g), t.alpha, t.F, t.moment], 1)
+    total += result
+    total += np.stack([swing + t.a + t.transport, turning, t.below @ carried, carried_moment], 1)
+
+    rate, speed = joints.turns.T @ joints.rate, joints.lever.T @ joints.rate
+    steps = np.linalg.norm(model.point, axis=2).sum(1) + np.linalg.norm(t.d, axis=1)
+    steps += np.linalg.norm(state.r, axis=1) * [kind == "free" for kind in model.kind]
+    height = t.below.T @ steps
+    sums = {
+        "kinetic_energy": float(0.5 * np.sum(t.m * speed**2 + t.J * rate**2)),
+        "potential_energy": float(t.g * np.sum(t.m * height)),
+        "angular_momentum": float(np.sum(t.m * height * speed + t.J * rate)),
+        "mass_matrix": float(np.max(joints.mass_matrix, initial=0.0)),
+    }
+    scale: dict[str, Array | float] = {
+        "acceleration": result[:, 0],
+        "angular_acceleration": np.max([t.alpha, moment / t.J, turning], 0),
+        "joint_reaction": np.maximum(t.F, t.m * t.g),
+        "joint_moment": np.max([t.moment, t.arm * t.F, t.J * t.alpha], 0),
+        **sums,
+    }
+    rods = np.zeros(t.n)
+    for (what, k), load in zip(joints.pairs, joints.load, strict=True):
+        rods[k] += load * (what in ("upper", "lower"))
+    return total, scale, sums, rods

@@ -1,0 +1,91 @@
+"""Rows that are products of two vectors (L1–L3), exactly and off the manifold; the direct form of trees."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from plumbline.model.datatypes import KINDS, Model
+from plumbline.model.sampling import random_states
+from reference_impl.direct import DirectSystem
+from reference_impl.euler_parameters import euler_parameter_rate
+from reference_impl.joints import constraint_rows
+from reference_impl.structured import StructuredSystem
+from tests.helpers.random_trees import random_tree
+
+HELD = [kind for kind in KINDS if kind not in ("rod", "free")]  # the rod's row is the notes' own
+
+
+def rationals(rng, *shape):
+    numbers = [Fraction(int(a), int(b)) for a, b in rng.integers(1, 9, (int(np.prod(shape)), 2)) * [[1, 1]]]
+    signs = rng.choice([-1, 1], len(numbers))
+    return np.array([int(s) * x for s, x in zip(signs, numbers, strict=True)], object).reshape(shape)
+
+
+@pytest.mark.parametrize("far", [-1, 0], ids=["on the world", "on a body"])
+@pytest.mark.parametrize("kind", HELD)
+def test_rates_and_gamma_of_every_row_are_exact(kind, far):
+    """Along q + t v every row is a polynomial of degree 4 at most: five points give Ċ and C̈ in rationals."""
+    rng = np.random.default_rng([len(kind), far + 1])
+    n, none = far + 2, np.zeros(far + 2)
+    model = Model(
+        mass=none, inertia=none, kind=("free",) * (n - 1) + (kind,),
+        body=np.array([[-1, 0], [far, n - 1]][2 - n :]), point=rationals(rng, n, 2, 3),
+        turn=rationals(rng, n, 2, 4), length=none, gravity=none, force=none, moment=none,
+        drag_force=none, drag_moment=none,
+    )  # fmt: skip
+    r, p, v, pdot = (rationals(rng, n, size) for size in (3, 4, 3, 4))
+    along = [constraint_rows(model, r + t * v, p + t * pdot, v, pdot).C for t in range(-2, 3)]
+    first = (along[0] - 8 * along[1] + 8 * along[3] - along[4]) / Fraction(12)
+    second = (-along[0] + 16 * along[1] - 30 * along[2] + 16 * along[3] - along[4]) / Fraction(12)
+    rows = constraint_rows(model, r, p, v, pdot)
+    assert len(first) == len(KINDS[kind].rows)
+    assert np.array_equal(first, rows.constraint_rate(v, pdot)) and any(first)
+    assert np.array_equal(second, -rows.gamma) and any(second)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_states_of_trees_are_on_the_manifold_and_rows_differentiate_off_it(seed):
+    rng = np.random.default_rng(seed)
+    model = random_tree(rng, 8)
+    for state in random_states(model, 2, seed):
+        at = state.r, state.p, state.v, euler_parameter_rate(state.p, state.omega)
+        rows = constraint_rows(model, *at)
+        speed = max(1.0, np.max(np.abs(state.v)), np.max(np.abs(state.omega)))
+        np.testing.assert_allclose(rows.C, 0, atol=1e-14)
+        np.testing.assert_allclose(rows.constraint_rate(*at[2:]), 0, atol=1e-14 * speed)
+
+        r, p, v, pdot = (x + 0.2 * rng.normal(size=x.shape) for x in at)
+        step = 1e-30
+        moved = constraint_rows(model, r + 1j * step * v, p + 1j * step * pdot, v, pdot)
+        rows = constraint_rows(model, r, p, v, pdot)
+        held = np.array([model.kind[k] != "rod" for k in rows.joint], bool)  # rods: E2, E3
+        rate = rows.constraint_rate(v, pdot)
+        scale = max(1.0, np.max(np.abs(rows.gamma)))
+        np.testing.assert_allclose((moved.C.imag / step)[held], rate[held], atol=1e-13 * scale)
+        bend = moved.constraint_rate(v, pdot).imag / step
+        np.testing.assert_allclose(bend[held], -rows.gamma[held], atol=1e-13 * scale)
+
+
+def test_the_solution_of_a_tree_obeys_newton_and_euler_on_every_body():
+    rng = np.random.default_rng(3)
+    model = random_tree(rng, 9)
+    (state,) = random_states(model, 1, 3)
+    at = state.r, state.p, state.v, euler_parameter_rate(state.p, state.omega)
+    x = DirectSystem(model).solve(*at)
+    dense = DirectSystem(model).solve_with_dense_factors(*at)
+    np.testing.assert_allclose(
+        x.acceleration, dense.acceleration, atol=1e-12 * np.max(np.abs(x.acceleration))
+    )
+    wanted = model.mass[:, None] * (x.acceleration - model.gravity) - model.force
+    wanted += model.drag_force[:, None] * state.v
+    found = x.joint_reaction.copy()
+    for k, far in enumerate(model.body[:, 0]):
+        if far >= 0:
+            found[far] -= x.joint_reaction[k]
+    np.testing.assert_allclose(found, wanted, atol=1e-12 * np.max(np.abs(wanted)))
+
+
+def test_the_structured_form_refuses_trees():
+    with pytest.raises(ValueError, match="chains of rods and balls"):
+        StructuredSystem([random_tree(np.random.default_rng(0), 3, ("hinge",))])
