@@ -63,7 +63,7 @@ def _engine_records() -> list[dict[str, Any]]:
 def check(files: tuple[Path, ...]) -> None:
     """Check scenario files and print every problem of every file, as file:line:column."""
     for s in options.read_scenarios(files):
-        joints = ", ".join("rod" if rod else "ball" for rod in s.model.rods[:6])
+        joints = ", ".join(s.model.kind[:6])
         more = " …" if s.model.n > 6 else ""
         click.echo(f"{s.path}: ok: {s.name}, {count_noun(s.model.n, 'body', 'bodies')} ({joints}{more})")
 

@@ -42,7 +42,6 @@ UNSUPPORTED_KINDS = {
     "rods": "the engine refuses models in which a body hangs by a massless rod, or some of them",
     "balls": "the engine refuses models in which a body hangs by a ball joint, or some of them",
     "chains": "the engine refuses models of more than one body, or some of them",
-    "trees": "the engine refuses models with other joints than rods and balls, or with branches",
     "loads": "the engine refuses models with applied forces, moments and drag, or some of them",
     "integrators": "the engine evaluates states and does not simulate",
 }
@@ -220,9 +219,7 @@ class Adapter(ABC):
     def _check_mechanism(self, model: Model, has_trees: bool) -> None:
         """Refuse what the adapter does not build."""
         if not (has_trees or model.is_chain):
-            raise Unsupported(
-                f"the adapter of {self.title} covers chains of rods and balls hung from the origin"
-            )
+            raise Unsupported(f"the adapter of {self.title} covers chains of rods and balls from the origin")
 
 
 def check_state(model: Model, state: State) -> None:

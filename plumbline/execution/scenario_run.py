@@ -108,6 +108,8 @@ class ScenarioRun:
         levels = level or (plan.random_level if is_random else plan.level)
         has_long_runs = plan.long_run_seconds > 0 and not is_random
         self._keys = list(task_keys(scenario.name, engines, levels, has_long_runs, has_steps(scenario)))
+        if not scenario.model.is_chain:  # states are all that is compared of trees
+            self._keys = [key for key in self._keys if key.kind in (TaskKind.STATE_TRUTH, TaskKind.STATE)]
         self._pending = set(self._keys)  # without an outcome
         self._findings: dict[TaskKey, JudgingResult] = {}
         self._has_retried_truth = False
@@ -202,7 +204,8 @@ class ScenarioRun:
             following = [self._cell_task(k) for k in self._keys if k.needed_truth == key.kind]
         else:
             found = self._findings[key] = self._judged(outcome)
-            if key.kind in (TaskKind.STATE, TaskKind.STEP):
+            is_chain = self.scenario.model.is_chain  # the hypotheses are those of chains
+            if key.kind in (TaskKind.STATE, TaskKind.STEP) and is_chain:
                 following = self._diagnosis_tasks(outcome, found)
         self._pending |= {task.key for task in following}
         return following
@@ -242,19 +245,21 @@ class ScenarioRun:
 
         """
         s, truth = self.scenario, self.truths.get(TaskKind.MOTION_TRUTH)
+        more = () if s.model.is_chain else ("r", "v", "x", "xdot")
+        state_keys = ("p", "omega", "u", "udot", *more)
         about = {
             "family": s.family,
             "title": s.title,
             "purpose": s.purpose,
             "file": s.origin,
             "bodies": s.model.n,
-            "joints": ["rod" if rod else "ball" for rod in s.model.rods],
+            "joints": list(s.model.kind),
             "duration": s.duration,
             "sample": s.sample_interval,
             "exact": s.closed_form,
             "digest": s.digest,
             "model": {key: np.asarray(value).tolist() for key, value in s.model.fields.items()},
-            "state": {key: getattr(s.state, key).tolist() for key in ("p", "omega", "u", "udot")},
+            "state": {key: getattr(s.state, key).tolist() for key in state_keys},
         }
         if isinstance(truth, MotionTruth):
             about |= {

@@ -18,6 +18,7 @@ STATE_UNITS = {
     "acceleration": "m/s²",
     "angular_acceleration": "rad/s²",
     "joint_reaction": "N",
+    "joint_moment": "N m",
     "kinetic_energy": "J",
     "potential_energy": "J",
     "angular_momentum": "kg m²/s",
@@ -45,6 +46,8 @@ def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation)
         return JudgingResult([context.make_row("state", "-", "all", Verdict.FAILED, evaluation.failure)])
     result = JudgingResult(fingerprints=state_fingerprints(evaluation.quantities))
     for quantity, unit in STATE_UNITS.items():
+        if all(getattr(true, quantity) is None for true in truth.quantities):
+            continue  # a chain of rods and balls has no joint moments
         if any(getattr(answer, quantity) is None for answer in evaluation.quantities):
             reason = f"{context.title} offers no {quantity.replace('_', ' ')} of its own"
             result.rows.append(context.make_row("state", "-", quantity, Verdict.UNSUPPORTED, reason, unit))

@@ -202,10 +202,10 @@ def forward_kinematics(
     omega: Array,
     u: Array,
     udot: Array,
-    r: Array,
-    v: Array,
-    x: Array,
-    xdot: Array,
+    r: Array | None = None,
+    v: Array | None = None,
+    x: Array | None = None,
+    xdot: Array | None = None,
 ) -> tuple[Array, Array, Array, Array]:
     """Return attitudes, angular velocities, centres of mass and their velocities, of one state or of many.
 
@@ -215,7 +215,7 @@ def forward_kinematics(
         omega: (..., N, 3) angular velocities of the same bodies, body frame [rad/s].
         u: (..., N, 3) unit directions of the rods, world frame; zero for other joints.
         udot: (..., N, 3) their rates [1/s].
-        r: (..., N, 3) centres of mass of free bodies, world frame [m].
+        r: (..., N, 3) centres of mass of free bodies, world frame [m]; absent, like the rest: zeros.
         v: (..., N, 3) their velocities [m/s].
         x: (..., N, 2) joint coordinates [rad, m].
         xdot: (..., N, 2) their rates.
@@ -224,7 +224,9 @@ def forward_kinematics(
         p (..., N, 4), ω′ (..., N, 3), r and ṙ (..., N, 3) of all bodies.
 
     """
-    p, omega, r, v = p.copy(), omega.copy(), r.copy(), v.copy()
+    r, v = (np.zeros(omega.shape) if given is None else given.copy() for given in (r, v))
+    x, xdot = (np.zeros((*omega.shape[:-1], 2)) if given is None else given for given in (x, xdot))
+    p, omega = p.copy(), omega.copy()
     A = rotation_matrix(p)  # (..., N, 3, 3)
     for k, (kind, far) in enumerate(zip(model.kind, model.body[:, 0], strict=True)):
         if kind == "free":

@@ -13,6 +13,8 @@ SECTION_HEADINGS = {  # in the page's order
     "BodySequence": "`bodies[]`: repeated bodies",
     "Ball": "`joint`, kind ball",
     "Rod": "`joint`, kind rod",
+    "Articulated": "`joint`, with axes",
+    "Free": "`joint`, kind free",
     "Attitude": "`attitude`",
     "AxisAngle": "`axis_angle`, `turn`",
     "Euler": "`euler`",
@@ -33,17 +35,44 @@ INTRODUCTION = f"""\
 [Add a scenario](add-a-scenario.md) is a worked example.
 
 A scenario file is YAML 1.2 (UTF-8, no tabs for indentation) of schema version {SCHEMA_VERSION}.
-It describes one open chain of rigid bodies that hangs from the world's origin, its state at t = 0
-and its loads. Everything is in SI units; angles are in rad unless the field is called `degrees`;
-the world's z axis points up; a body's frame has its origin at the centre of mass. Write numbers without
-a unit. Unknown fields are errors.
+It describes one open chain or tree of rigid bodies, its state at t = 0 and its loads. Everything is in
+SI units; angles are in rad unless the field is called `degrees`; the world's z axis points up; a body's
+frame has its origin at the centre of mass. Write numbers without a unit. Unknown fields are errors.
 
 `python -m plumbline check FILE…` reports every mistake of every file with line and column;
 `python -m plumbline schema` prints the JSON Schema for editors.
 
-The initial state is given by attitudes, rod directions and rates; positions and velocities follow, so
-every state satisfies the joints. Quaternions and directions are normalised; the part of a rod's rate along
-the rod that rounding left is removed.
+The initial state is given by attitudes, rod directions, joint coordinates and rates; positions and velocities
+follow, so every state satisfies the joints. Quaternions and directions are normalised; the part of a rod's
+rate along the rod that rounding left is removed.
+
+A body hangs from the one before it unless it names another `parent`. This tree has an arm that turns about
+the world's vertical, and on it a pendulum on a hinge and a slider; trees are compared at state level only:
+
+```yaml
+schema_version: 1
+title: An arm with a pendulum and a slider
+purpose: Two bodies that hang from one, on joints with axes.
+bodies:
+  - name: arm
+    mass: 0.5
+    inertia: {{principal: [0.001, 0.01, 0.01]}}
+    joint: {{kind: hinge, axis: [0, 0, 1], rates: [2.0]}}
+    proximal: [-0.2, 0, 0]
+    distal: [0.2, 0, 0]
+  - name: pendulum
+    mass: 0.2
+    inertia: {{principal: [0.002, 0.002, 0.0001]}}
+    joint: {{kind: hinge, axis: [1, 0, 0], coordinates: [0.5]}}
+    proximal: [0, 0, 0.15]
+  - name: slider
+    parent: arm
+    anchor: [0.05, 0, 0]
+    mass: 0.1
+    inertia: {{principal: [0.0001, 0.0001, 0.0001]}}
+    joint: {{kind: slide, axis: [1, 0, 0], coordinates: [0.02]}}
+    proximal: [0, 0, 0]
+```
 """
 
 

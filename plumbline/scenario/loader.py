@@ -15,11 +15,14 @@ from pydantic import ValidationError
 
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import quaternion_product, rotation_matrix, state_from_minimal
-from plumbline.scenario.errors import Problem, ScenarioError, closest_match, shorten
+from plumbline.scenario.errors import Problem, ScenarioError, closest_match, did_you_mean, shorten
 from plumbline.scenario.schema import (
     MAX_BODIES,
+    Articulated,
     Body,
+    BodySequence,
     Document,
+    Free,
     Rod,
     attitude_quaternion,
     inertia_matrix,
@@ -43,7 +46,7 @@ __all__ = [
 
 CATALOGUE_FOLDER = Path(__file__).resolve().parents[2] / "scenarios"
 MAX_MAGNITUDE = 1e30  # beyond it squares and products leave the range where engines can compute
-FAMILIES = ("single", "double", "chain")
+FAMILIES = ("single", "double", "chain", "hinge", "tree")
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,15 +248,16 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
     if problems or document is None:
         raise ScenarioError(problems)
     bodies = list(_expand_repeats(document))
+    far = _resolve_parents(source, document, [body for body, _ in bodies])
     if len(bodies) > MAX_BODIES:
         raise source.fatal_error(
             f"has {len(bodies)} bodies", f"at most {MAX_BODIES}", source.value_positions[("bodies",)]
         )
     with np.errstate(all="ignore"):
-        model = _build_model(document, [body for body, _ in bodies])
+        model = _build_model(document, [body for body, _ in bodies], far)
         state = state_from_minimal(model, *_minimal_coordinates(bodies))
     for name, array in {**model.fields, **vars(state)}.items():
-        if not np.all(np.abs(array) <= MAX_MAGNITUDE):
+        if name != "kind" and not np.all(np.abs(array) <= MAX_MAGNITUDE):
             raise source.fatal_error(
                 f"has numbers that make {name} larger than {MAX_MAGNITUDE:g}",
                 "SI numbers of a pendulum",
@@ -295,6 +299,10 @@ def _missing_distal_problems(source: YamlSource) -> Iterator[Problem]:
             ends = index == len(items) - 1 and count == place + 1  # the chain's last body, copied once
             if ends or not isinstance(body, dict) or body.get("distal") is not None:
                 continue
+            last_of_item = place == len(written) - 1 and len(written) == count
+            follower = items[index + 1] if last_of_item and index + 1 < len(items) else None
+            if isinstance(follower, dict) and ({"parent", "anchor"} & set(follower) or _is_free(follower)):
+                continue  # hangs elsewhere, or is checked with its parent
             if any(closest_match(key, ["distal"]) for key in body if key not in Body.model_fields):
                 continue  # misspelt, and named as such
             yield Problem(
@@ -317,15 +325,102 @@ def _expand_repeats(document: Document) -> Iterator[tuple[Body, Array]]:
             yield item.cycle[j % len(item.cycle)], turn
 
 
-def _build_model(document: Document, bodies: list[Body]) -> Model:
-    zero = [0.0, 0.0, 0.0]
-    distal = [body.distal or zero for body in bodies]
-    distal[-1] = zero
-    return Model.chain(
+def _is_free(item: dict[str, Any]) -> bool:
+    joint = item.get("joint")
+    return isinstance(joint, dict) and joint.get("kind") == "free"
+
+
+def _resolve_parents(source: YamlSource, document: Document, bodies: list[Body]) -> list[int]:
+    """The far body of each body, −1 the world; refuses parents that do not exist or come too late."""
+    paths: list[tuple[PathKey, ...]] = []
+    for index, item in enumerate(document.bodies):
+        paths += [("bodies", index)] * (item.repeat if isinstance(item, BodySequence) else 1)
+    far: list[int] = []
+    problems: list[Problem] = []
+    for k, body in enumerate(bodies):
+        parent, field_name, message, valid = _parent_of(bodies, k, far)
+        far.append(parent)
+        if message:
+            path = (*paths[k], field_name)
+            place = source.value_positions.get(path) or source.value_positions[paths[k]]
+            problems.append(Problem(source.file, *place, dotted_path(path), message, valid))
+        elif parent >= 0 and body.anchor is None and bodies[parent].distal is None:
+            path, valid = (*paths[k], "anchor"), "the point of the parent, as [0, 0, -0.2] (m)"
+            message = "is missing: the parent has no distal"
+            problems.append(
+                Problem(source.file, *source.value_positions[paths[k]], dotted_path(path), message, valid)
+            )
+    if problems:
+        raise ScenarioError(problems)
+    return far
+
+
+def _parent_of(bodies: list[Body], k: int, far: list[int]) -> tuple[int, str, str, str]:
+    """The body that body k hangs on, or a field, what is wrong with it, and what would be valid."""
+    body, names = bodies[k], [body.name for body in bodies]
+    parent = -1 if body.parent == "world" or body.joint.kind == "free" else k - 1
+    if body.parent not in (None, "world"):
+        given, earlier = repr(body.parent), [i for i, name in enumerate(names[:k]) if name == body.parent]
+        if not earlier:
+            hint = did_you_mean(str(body.parent), [name for name in names[:k] if name])
+            why = "which is not above this body" if body.parent in names else f"no body's name. {hint}"
+            valid = "the name of a body above this one, or world"
+            return -1, "parent", f"is {given}, {why}".strip(" ."), valid
+        if len(earlier) > 1:
+            return -1, "parent", f"is {given}, the name of {len(earlier)} bodies", "a name that one body has"
+        parent = earlier[0]
+        branch = [k - 1]  # where body k may hang: on the body before, or on one that leads to it
+        while branch[-1] >= 0:
+            branch.append(far[branch[-1]])
+        if parent not in branch:
+            valid = f"this body inside the branch of {given}: the bodies of a branch follow each other"
+            return -1, "parent", f"is {given}, whose branch ended above", valid
+    if body.joint.kind == "weld" and parent < 0:
+        return (
+            parent,
+            "joint",
+            "welds a body to the world, where it never moves",
+            "another joint, or a parent",
+        )
+    return parent, "", "", ""
+
+
+def _far_point(bodies: list[Body], k: int, far: int) -> list[float]:
+    """Where body k hangs, in the frame of its parent."""
+    return bodies[k].anchor or (bodies[far].distal if far >= 0 else None) or [0.0, 0.0, 0.0]
+
+
+def _joint_turns(body: Body) -> tuple[Array, Array]:
+    """Quaternions of the joint's axes in the parent and in the body."""
+    joint, identity = body.joint, np.array([1.0, 0.0, 0.0, 0.0])
+    if not isinstance(joint, Articulated):
+        return identity, identity
+    if joint.axis is not None:
+        turn = _turn_to(unit_vector(joint.axis))
+        return turn, turn
+    frame = attitude_quaternion(joint.frame) if joint.frame else identity
+    return frame, attitude_quaternion(joint.body_frame) if joint.body_frame else frame
+
+
+def _turn_to(axis: Array) -> Array:
+    """A unit quaternion that takes z to a unit vector; below the horizontal after half a turn about x."""
+    x, y, z = axis
+    if z >= 0:
+        return unit_vector([1 + z, -y, x, 0.0])
+    below = quaternion_product(np.array([1 - z, y, -x, 0.0]), np.array([0.0, 1.0, 0.0, 0.0]))
+    return unit_vector(below.tolist())
+
+
+def _build_model(document: Document, bodies: list[Body], far: list[int]) -> Model:
+    free = np.array([body.joint.kind == "free" for body in bodies])
+    points = [[_far_point(bodies, k, far[k]), body.proximal] for k, body in enumerate(bodies)]
+    return Model(
+        kind=tuple(body.joint.kind for body in bodies),
+        body=np.stack([far, np.arange(len(bodies))], axis=1),
+        point=np.where(free[:, None, None], 0.0, np.array(points, dtype=float)),
+        turn=np.array([_joint_turns(body) for body in bodies]),
         mass=np.array([body.mass for body in bodies], dtype=float),
         inertia=np.array([inertia_matrix(body.inertia) for body in bodies]),
-        proximal=np.array([body.proximal for body in bodies], dtype=float),
-        distal=np.array(distal, dtype=float),
         length=np.array([body.joint.length if isinstance(body.joint, Rod) else 0.0 for body in bodies]),
         gravity=np.array(document.gravity, dtype=float),
         force=np.array([body.load.force for body in bodies], dtype=float),
@@ -335,11 +430,18 @@ def _build_model(document: Document, bodies: list[Body]) -> Model:
     )
 
 
-def _minimal_coordinates(bodies: list[tuple[Body, Array]]) -> tuple[Array, Array, Array, Array]:
-    """p, omega, u, udot of the chain: unit and perpendicular to rounding."""
+def _minimal_coordinates(bodies: list[tuple[Body, Array]]) -> tuple[Array, ...]:
+    """p, omega, u, udot, x, xdot, r, v: unit and perpendicular to rounding."""
     n = len(bodies)
-    p, u, udot = np.empty((n, 4)), np.zeros((n, 3)), np.zeros((n, 3))
+    p, u, udot, r, v = np.empty((n, 4)), *np.zeros((4, n, 3))
+    x, xdot = np.zeros((2, n, 2))
     for k, (body, turn) in enumerate(bodies):
+        if body.attitude is None:
+            p[k] = 1.0, 0.0, 0.0, 0.0
+            assert isinstance(body.joint, Articulated)
+            for target, values in ((x, body.joint.coordinates), (xdot, body.joint.rates)):
+                target[k, : len(values or [])] = values or []
+            continue
         p[k] = unit_vector(quaternion_product(turn, attitude_quaternion(body.attitude)).tolist())
         if isinstance(body.joint, Rod):
             world = rotation_matrix(turn)
@@ -351,4 +453,8 @@ def _minimal_coordinates(bodies: list[tuple[Body, Array]]) -> tuple[Array, Array
             for _ in range(2):  # the second pass removes what rounding left of the first
                 rate = rate - (rate @ u[k]) * u[k]
             udot[k] = rate
-    return p, np.array([body.angular_velocity for body, _ in bodies], dtype=float), u, udot
+        if isinstance(body.joint, Free):
+            r[k] = np.array(body.joint.position) - rotation_matrix(p[k]) @ np.array(body.proximal)
+            v[k] = body.joint.velocity
+    omega = np.array([body.angular_velocity for body, _ in bodies], dtype=float)
+    return p, omega, u, udot, x, xdot, r, v

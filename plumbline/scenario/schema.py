@@ -17,14 +17,16 @@ from pydantic import (
     ConfigDict,
     Discriminator,
     Field,
+    SerializerFunctionWrapHandler,
     Tag,
     ValidationInfo,
     field_validator,
+    model_serializer,
     model_validator,
 )
 from pydantic_core import PydanticCustomError
 
-from plumbline.model.datatypes import Array
+from plumbline.model.datatypes import KINDS, Array
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
 
 SCHEMA_VERSION = 1
@@ -297,6 +299,63 @@ class Rod(SchemaModel):
         return self
 
 
+class Articulated(SchemaModel):
+    """A joint with axes: `hinge`, `universal`, `slide`, `cylindrical` or `weld`.
+
+    Its axes x, y, z are fixed in the parent by `frame` and in the body by `body_frame`; at coordinates 0 both
+    coincide.  A hinge turns about z, a slide moves along z, a cylindrical joint does both (slide first), a
+    universal joint turns about x of the parent and then about y of the body, a weld does nothing.
+    """
+
+    kind: Literal["hinge", "universal", "slide", "cylindrical", "weld"] = _field(
+        "`hinge`, `universal`, `slide`, `cylindrical` or `weld`."
+    )
+    axis: Vector | None = _field(
+        "z of the joint's axes in the parent's frame, parallel to the body's at coordinates 0. Of any length "
+        "but 0. Or give `frame`; not for a universal joint or a weld.",
+        default=None,
+        examples=[[0, 1, 0]],
+    )
+    frame: Attitude | None = _field(
+        "Attitude of the joint's axes in the parent's frame. Absent: parallel.", default=None
+    )
+    body_frame: Attitude | None = _field(
+        "Attitude of the joint's axes in the body's frame. Absent: as in the parent's.", default=None
+    )
+    coordinates: list[float] | None = _field(
+        "At t = 0 the angle [rad] of a hinge, the shift [m] of a slide, both of a cylindrical joint (shift "
+        "first), the two angles of a universal joint. Absent: 0.",
+        default=None,
+    )
+    rates: list[float] | None = _field("Their rates at t = 0 [rad/s, m/s]. Absent: 0.", default=None)
+
+    _axis = field_validator("axis")(_require_nonzero)
+
+    @field_validator("coordinates", "rates")
+    @classmethod
+    def _check_count(cls, value: list[float] | None, info: ValidationInfo) -> list[float] | None:
+        kind = info.data.get("kind")
+        if value is not None and kind is not None and len(value) != (count := len(KINDS[kind].motions)):
+            raise invalid_value_error(f"has {len(value)} numbers", f"{count} for a {kind} joint")
+        return value
+
+    @model_validator(mode="after")
+    def _check_axes(self) -> Articulated:
+        if self.axis is not None and (self.frame is not None or self.body_frame is not None):
+            raise invalid_value_error("gives axis and a frame", "one of them")
+        if self.axis is not None and self.kind in ("universal", "weld"):
+            raise invalid_value_error(f"gives an axis to a {self.kind} joint", "`frame` and `body_frame`")
+        return self
+
+
+class Free(SchemaModel):
+    """No joint: the body moves freely in the world."""
+
+    kind: Literal["free"] = _field("`free`.")
+    position: Vector = _field("Of the body's proximal point at t = 0, world frame.", "m", [0.0] * 3)
+    velocity: Vector = _field("Of the body's centre of mass at t = 0, world frame.", "m/s", [0.0] * 3)
+
+
 class Load(SchemaModel):
     """Constant loads on a body."""
 
@@ -314,24 +373,40 @@ class Drag(SchemaModel):
 
 
 class Body(SchemaModel):
-    """One rigid body; it hangs from the body before it, the first from the pivot at the world's origin."""
+    """One rigid body; it hangs from its parent: the body before it, or another one, or the world."""
 
     name: str | None = _field(
         "A name for readers; absent: its place in the chain.", default=None, max_length=80, examples=["bob"]
     )
     mass: float = _field("Mass, greater than 0.", "kg", gt=0)
     inertia: Inertia = _field("Inertia about the centre of mass, body frame.")
-    joint: Annotated[Ball | Rod, Discriminator("kind")] = _field("How the body hangs.")
+    joint: Annotated[Ball | Rod | Articulated | Free, Discriminator("kind")] = _field("How the body hangs.")
+    parent: str | None = _field(
+        "The name of the body that this one hangs from, above it in the file, or `world`. Absent: the body "
+        "before it, for the first the world. The bodies of a branch follow each other.",
+        default=None,
+    )
+    anchor: Vector | None = _field(
+        "The point of the parent from which this body hangs, in the parent's frame. Absent: the parent's "
+        "`distal`, the origin of the world.",
+        "m",
+        None,
+    )
     proximal: Vector = _field(
         "The point of this body by which it hangs, body frame (the notes' s_1, s_3).", "m"
     )
     distal: Vector | None = _field(
         "The point of this body from which the next one hangs, body frame (the notes' s_2). Needed where a "
-        "body follows.",
+        "body follows that has no `anchor`.",
         "m",
         None,
     )
-    attitude: Attitude = _field("Attitude at t = 0, body → world.")
+    attitude: Attitude | None = _field(
+        "Attitude at t = 0, body → world. Required on rods and balls and for free bodies; on other joints it "
+        "follows from the joint's coordinates.",
+        default=None,
+        validate_default=True,
+    )
     angular_velocity: Vector = _field(
         "Angular velocity at t = 0, body frame (the notes' ω′).", "rad/s", [0.0] * 3
     )
@@ -339,6 +414,38 @@ class Body(SchemaModel):
     drag: Drag = Field(default_factory=Drag, description="Linear drag on this body.")
 
     _name = field_validator("name")(_require_printable)
+
+    @field_validator("attitude")
+    @classmethod
+    def _check_attitude(cls, value: Attitude | None, info: ValidationInfo) -> Attitude | None:
+        joint = info.data.get("joint")
+        if joint is not None and (value is None) == KINDS[joint.kind].has_attitude:
+            if value is None:
+                raise invalid_value_error("is missing", "the attitude at t = 0, body → world")
+            raise invalid_value_error(f"is given for a body on a {joint.kind}", "`coordinates` of the joint")
+        return value
+
+    @field_validator("angular_velocity")
+    @classmethod
+    def _check_angular_velocity(cls, value: list[float], info: ValidationInfo) -> list[float]:
+        joint = info.data.get("joint")
+        if any(value) and joint is not None and not KINDS[joint.kind].has_attitude:
+            raise invalid_value_error(f"is given for a body on a {joint.kind}", "`rates` of the joint")
+        return value
+
+    @field_validator("parent")
+    @classmethod
+    def _check_parent(cls, value: str | None, info: ValidationInfo) -> str | None:
+        joint = info.data.get("joint")
+        if joint is not None and joint.kind == "free" and value not in (None, "world"):
+            raise invalid_value_error("is given for a free body", "no parent, or `world`")
+        return value
+
+    @model_serializer(mode="wrap")
+    def _omit_absent_parent(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what chains do not have: a scenario's digest depends on its content alone."""
+        data: dict[str, Any] = handler(self)
+        return {k: v for k, v in data.items() if v is not None or k not in ("parent", "anchor")}
 
 
 class BodySequence(SchemaModel):
@@ -349,10 +456,27 @@ class BodySequence(SchemaModel):
     """
 
     repeat: int = _field("Number of bodies.", ge=1, le=MAX_BODIES)
-    cycle: list[Body] = _field("The bodies that are copied, one after the other.", min_length=1)
+    cycle: list[Body] = _field(
+        "The bodies that are copied, one after the other; none has a `parent`.", min_length=1
+    )
     turn: AxisAngle | None = _field(
         "The rotation that body j is turned by, j times. Absent: none.", default=None
     )
+
+    @field_validator("cycle")
+    @classmethod
+    def _check_cycle(cls, value: list[Body]) -> list[Body]:
+        if any(body.parent is not None or body.joint.kind in ("free", "weld") for body in value):
+            raise invalid_value_error(
+                "has a parent, a weld or a free body", "bodies that hang on the one before"
+            )
+        return value
+
+    @model_validator(mode="after")
+    def _check_turn(self) -> BodySequence:
+        if self.turn is not None and any(isinstance(body.joint, Articulated) for body in self.cycle):
+            raise invalid_value_error("turns joints with axes", "turn with rods and ball joints only")
+        return self
 
 
 def _item_tag(value: Any) -> str:

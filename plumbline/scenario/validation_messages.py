@@ -10,12 +10,29 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails
 
+from plumbline.model.datatypes import KINDS as JOINT_KINDS
 from plumbline.scenario.errors import Problem, closest_match, did_you_mean, shorten
-from plumbline.scenario.schema import SCHEMA_VERSION, Ball, Body, BodySequence, Document, Rod
+from plumbline.scenario.schema import (
+    SCHEMA_VERSION,
+    Articulated,
+    Ball,
+    Body,
+    BodySequence,
+    Document,
+    Free,
+    Rod,
+)
 from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path
 
-UNION_TAGS: dict[str, type[BaseModel]] = {"ball": Ball, "rod": Rod, "body": Body, "sequence": BodySequence}
-KINDS = "kind: ball or kind: rod"
+UNION_TAGS: dict[str, type[BaseModel]] = {
+    **dict.fromkeys(JOINT_KINDS, Articulated),
+    "ball": Ball,
+    "rod": Rod,
+    "free": Free,
+    "body": Body,
+    "sequence": BodySequence,
+}
+KINDS = "one of kind: " + ", ".join(JOINT_KINDS)
 MAX_NUMBER_LENGTH = 100  # characters; a longer text is not taken for a mistyped number
 
 

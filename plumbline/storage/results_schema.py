@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from plumbline.judging.rows import Level
-from plumbline.model.datatypes import Model
+from plumbline.model.datatypes import CHAIN_FIELDS, KINDS, Model
 from plumbline.processes.errors import PlumblineError
 from plumbline.scenario.errors import shorten
 from plumbline.scenario.schema import MAX_BODIES, invalid_value_error
@@ -25,8 +25,10 @@ MAX_MAGNITUDE = 1e30  # of the model's numbers, as in scenario files
 
 _MODEL_SHAPES: dict[str, tuple[int, ...]] = {  # of one body; (3,) where none is named
     "inertia": (3, 3), "mass": (), "length": (), "drag_force": (), "drag_moment": (),
+    "body": (2,), "point": (2, 3), "turn": (2, 4),
 }  # fmt: skip
 _STATE_SHAPES: dict[str, tuple[int, ...]] = {"p": (4,), "omega": (3,), "u": (3,), "udot": (3,)}
+_TREE_STATE_SHAPES = _STATE_SHAPES | {"r": (3,), "v": (3,), "x": (2,), "xdot": (2,)}
 _Count = Annotated[int, Field(ge=0, le=2**53)]
 _Duration = Annotated[float, Field(ge=0, le=1e15)]  # s
 _VerdictWord = Literal[
@@ -63,12 +65,21 @@ class _Scenario(_Part):
 
     @model_validator(mode="after")
     def _check_arrays(self) -> _Scenario:
-        shapes = {f.name: (self.bodies, *_MODEL_SHAPES.get(f.name, (3,))) for f in fields(Model)}
+        is_tree = self.model is not None and "kind" in self.model
+        names = [f.name for f in fields(Model) if f.name != "kind"] if is_tree else CHAIN_FIELDS
+        shapes = {name: (self.bodies, *_MODEL_SHAPES.get(name, (3,))) for name in names}
         _check_shapes("model", self.model, shapes | {"gravity": (3,)})
-        _check_shapes("state", self.state, {k: (self.bodies, *shape) for k, shape in _STATE_SHAPES.items()})
+        state_shapes = _TREE_STATE_SHAPES if is_tree else _STATE_SHAPES
+        _check_shapes("state", self.state, {k: (self.bodies, *shape) for k, shape in state_shapes.items()})
+        if is_tree and self.model is not None and not _are_kinds(self.model["kind"], self.bodies):
+            raise invalid_value_error("model.kind does not fit the bodies", f"{self.bodies} kinds of joints")
         if self.model is not None and min(self.model["mass"], default=1.0) <= 0:
             raise invalid_value_error("has a mass that is not positive", "masses above 0 kg")
         return self
+
+
+def _are_kinds(given: Any, count: int) -> bool:
+    return isinstance(given, list) and len(given) == count and all(kind in KINDS for kind in given)
 
 
 def _check_shapes(what: str, given: dict[str, Any] | None, shapes: dict[str, tuple[int, ...]]) -> None:

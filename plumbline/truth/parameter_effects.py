@@ -349,5 +349,5 @@ def _on_manifold(model: Model, run: Trajectory) -> Trajectory:
     udot = joint_vector_rates(model, run, omega) / ell
     udot = udot - np.sum(udot * u, axis=-1, keepdims=True) * u
     p = run.p / np.linalg.norm(run.p, axis=-1, keepdims=True)
-    r, v = forward_kinematics(model, p, omega, u, udot)
+    _, _, r, v = forward_kinematics(model, p, omega, u, udot)
     return Trajectory(run.t, r, p, v, quaternion_rate(p, omega), run.steps)

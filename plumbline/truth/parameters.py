@@ -7,7 +7,7 @@ no drag, a product of inertia of a principal frame, an angle) of a natural size 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -153,7 +153,7 @@ def perturb(model: Model, state: State, parameter: Parameter, size: float) -> tu
         array[k, AXES.index(parameter.entry)] += change
     else:
         array[k] += change
-    changed = replace(model, **{kind: array})
+    changed = model.changed(**{kind: array})
     return changed, state_from_minimal(changed, state.p, state.omega, state.u, state.udot)
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from plumbline.model.datatypes import KINDS, Array, Model, State
 from plumbline.model.kinematics import (
     JointFrame,
+    cross,
     cross_matrix,
     joint_vectors,
     rotate_vectors,
@@ -55,7 +56,6 @@ class _TreeTerms:
         """E (6, c) of joint k, and the relative acceleration (6,) that the velocities alone cause."""
         model, state, kind, far = self.model, self.state, self.model.kind[k], self.far[k]
         bend = np.zeros(6)
-        cross = np.cross
         spin = self.omega[far] if far >= 0 else np.zeros(3)
         bend[:3] = cross(self.omega[k], cross(self.omega[k], self.near[k])) - cross(
             spin, cross(spin, self.far_arm[k])
@@ -153,7 +153,7 @@ class _TreeTerms:
 
     def body_errors(self) -> tuple[Array, Array, Array, Array]:
         """Largest term of each Newton and Euler equation, and of each joint's relative accelerations."""
-        # spatial accelerations in a body's axes hold ω × ṙ, which a moving free body makes large
+        # spatial algebra in a body's axes holds ω × ṙ and ṙ × m ṙ, which a moving free body makes large
         weights = [
             self.m * self.a,
             self.m * self.g,
@@ -162,7 +162,14 @@ class _TreeTerms:
             self.F_children,
             self.load_size,
         ]
-        moments = [self.J * self.alpha, self.spin, self.arm * self.F, self.torque_size, self.moment]
+        moments = [
+            self.m * np.linalg.norm(self.state.v, axis=1) ** 2,
+            self.J * self.alpha,
+            self.spin,
+            self.arm * self.F,
+            self.torque_size,
+            self.moment,
+        ]
         far_a, far_alpha = self.of_far(self.a), self.of_far(self.alpha)
         linear = [self.a, self.arm * self.alpha, self.arm * self.W**2, far_a, self.reach * far_alpha,
                   self.reach * self.W**2, self.W * self.slide_rate]  # fmt: skip

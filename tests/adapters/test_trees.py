@@ -1,10 +1,13 @@
 """Every engine on trees: each kind of joint alone, and all kinds mixed, against the certified truth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import KINDS, Unsupported
+from plumbline.model.kinematics import complete_state, quaternion_product
 from plumbline.model.sampling import random_states
 from plumbline.truth.certified import certify_state
 from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, state_rounding_bound
@@ -47,3 +50,51 @@ def test_motions_of_trees_are_refused():
     (state,) = random_states(model, 1, 0)
     with pytest.raises(Unsupported, match="chains of rods and balls"):
         load_adapter("mujoco").simulate(model, state, np.array([0.0, 0.25]), "RK4", 0.125)
+
+
+def turned(model, k, side, axis):
+    """The joint's axes in one body turned by 1e-7 rad about one of themselves."""
+    turn = model.turn.copy()
+    turn[k, side] = quaternion_product(turn[k, side], np.array([1.0, *(5e-8 * np.eye(3)[axis])]))
+    return model.changed(turn=turn / np.linalg.norm(turn, axis=-1, keepdims=True))
+
+
+def exchanged_universal_axes(model, k):
+    """The near body's axis turns first: x and y of the far body exchanged with those of the near one."""
+    turn = model.turn.copy()
+    turn[k] = quaternion_product(turn[k], np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]))
+    return model.changed(turn=turn)
+
+
+def moved_point(model, k, side):
+    point = model.point.copy()
+    point[k, side, 0] += 1e-7
+    return model.changed(point=point)
+
+
+FAULTS = {
+    "axis in the far body": ("hinge", lambda m: turned(m, 1, 0, 0)),
+    "axis in the near body": ("hinge", lambda m: turned(m, 1, 1, 1)),
+    "axis of a slide": ("slide", lambda m: turned(m, 1, 0, 0)),
+    "frame of a weld": ("weld", lambda m: turned(m, 1, 1, 2)),
+    "order of a universal joint's axes": ("universal", lambda m: exchanged_universal_axes(m, 1)),
+    "far point": ("cylindrical", lambda m: moved_point(m, 1, 0)),
+    "near point": ("ball", lambda m: moved_point(m, 1, 1)),
+    "another parent": ("hinge", lambda m: m.changed(body=np.array([[-1, 0], [0, 1], [0, 2]]))),
+    "a hinge that slides": ("cylindrical", lambda m: m.changed(kind=("hinge", "slide", "hinge"))),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("engine", [engine for engine in ENGINES if engine != "reference"])
+def test_a_fault_in_a_joint_is_seen(engine, fault):
+    kind, change = FAULTS[fault]
+    rng = np.random.default_rng(7)
+    model = replace(random_tree(rng, 3, ("hinge",)), body=np.array([[-1, 0], [0, 1], [1, 2]]))
+    model = replace(model, kind=("hinge", kind, "hinge"))
+    (state,) = random_states(model, 1, 3)
+    wrong = change(model)
+    truth, bound = certify_state(model, state).quantities, state_rounding_bound(model, state)
+    (found,) = load_adapter(engine).evaluate(wrong, [complete_state(wrong, state)])
+    error = np.linalg.norm(found.acceleration - truth.acceleration, axis=1)
+    assert np.max(error / bound.acceleration) > 1

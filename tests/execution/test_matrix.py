@@ -23,7 +23,7 @@ MAX_BODIES_IN_FAST_FORM = {"state": 50, "step": 2, "trajectory": 5}  # longer ch
 
 def levels(engine, scenario):
     """Levels at which an engine is compared on a scenario."""
-    integrators = load_adapter(engine).integrators
+    integrators = load_adapter(engine).integrators if scenario.model.is_chain else ()
     has_formulas = any(i.method is not None for i in integrators) and has_steps(scenario)
     return ("state", *["step"] * has_formulas, *["trajectory"] * bool(integrators))
 

@@ -80,6 +80,17 @@ def load(name):
     return scenarios.load_scenario(scenarios.find_scenario_file(name))
 
 
+TREE_JOINTS = {
+    "cart-pole": ("slide", "hinge"),
+    "double-hinge-skew": ("hinge", "hinge"),
+    "furuta": ("hinge", "hinge"),
+    "hinge-pendulum": ("hinge",),
+    "slider-on-arm": ("hinge", "slide"),
+    "universal-pendulum": ("universal",),
+    "tree-of-seven": ("ball", "hinge", "universal", "weld", "cylindrical", "rod", "slide", "free"),
+}
+
+
 def joint_pattern(name):
     return "".join("r" if rod else "b" for rod in load(name).model.rods)
 
@@ -90,7 +101,8 @@ def assert_close(got, expected, ulps=4):
 
 
 def test_the_catalogue_is_the_issues_list():
-    assert list(scenarios.catalogue()) == [*SINGLE_NAMES, *DOUBLE_JOINTS, *CHAIN_JOINTS]
+    assert list(scenarios.catalogue()) == [*SINGLE_NAMES, *DOUBLE_JOINTS, *CHAIN_JOINTS, *TREE_JOINTS]
+    assert {name: load(name).model.kind for name in TREE_JOINTS} == TREE_JOINTS
     assert {name: joint_pattern(name) for name in DOUBLE_JOINTS} == DOUBLE_JOINTS
     assert {name: joint_pattern(name) for name in CHAIN_JOINTS} == CHAIN_JOINTS
     exact = {name: load(name).closed_form for name in scenarios.catalogue()}

@@ -21,7 +21,7 @@ from tests.helpers.catalogue import catalogue_scenarios
 from tests.helpers.random_chains import random_chain
 
 TIMES = np.arange(41) * 0.05
-CATALOGUE = list(catalogue_scenarios().values())
+CATALOGUE = [s for s in catalogue_scenarios().values() if s.model.is_chain]
 BALL_JOINT_SCENARIOS = [s for s in CATALOGUE if not s.model.rods.any()]
 CLOSED_FORM_SCENARIOS = [s for s in CATALOGUE if (closed := closed_form_motion(s)) and closed.amplitude == 0]
 
