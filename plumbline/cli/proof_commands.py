@@ -57,7 +57,7 @@ def prove(names: tuple[str, ...], duration: float | None, precision: Any, out: P
     """
     from plumbline.storage.results_store import write_atomically
 
-    chosen = options.read_scenarios(names)
+    chosen = options.require_chains(options.read_scenarios(names))
     folder = options.claim_folder(out)
     records = []
     with options.exit_on_io_error(), ProgressDisplay(sys.stderr) as progress:

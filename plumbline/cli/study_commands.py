@@ -111,7 +111,7 @@ def drift(names: tuple[str, ...], rtols: tuple[float, ...], max_cpu_seconds: flo
     from plumbline.studies import drift as drifts
     from plumbline.studies.tables import write_table
 
-    chosen = options.read_scenarios(names or ("tumbling-ball", "tumbling-rod"))
+    chosen = options.require_chains(options.read_scenarios(names or ("tumbling-ball", "tumbling-rod")))
     folder = options.claim_folder(out)
     with options.exit_on_io_error():
         with ProgressDisplay(sys.stderr) as progress:
@@ -180,6 +180,7 @@ def coverage(
     from plumbline.studies.tables import write_table
 
     chosen = options.choose_scenarios(names, ())
+    chosen = options.require_chains(chosen) if names else [s for s in chosen if s.model.is_chain]
     levels: tuple[Level, ...] = COVERED_LEVELS if level == "all" else (level,)
     folder, limits = options.claim_folder(out), Limits(timeout, memory)
     with options.exit_on_io_error():

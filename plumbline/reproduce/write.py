@@ -186,6 +186,8 @@ def find_disagreement(document: dict[str, Any], rows: list[StoredRow], seconds: 
     if scenario is None:
         raise NotReproducible(f"the results do not hold the scenario {row['scenario']!r}")
     model = Model.from_fields(scenario["model"])
+    if not model.is_chain:
+        raise NotReproducible("scripts cover chains of rods and ball joints, this is a tree")
     start = {name: np.array(value, float) for name, value in scenario["state"].items()}
     state = state_from_minimal(model, **start)
     if row["level"] in ("trajectory", "invariants"):

@@ -190,6 +190,8 @@ def load(
         base = scenarios.load_scenario(file)
     except ScenarioError as error:
         raise ScenarioError([*problems, *error.problems]) from None
+    if not base.model.is_chain:
+        report(("scenario",), "scenario", f"{base.name} is a tree", "a chain of rods and ball joints")
     for name, axis in sweep.vary.items():
         if not _is_number(base.document, name):
             valid = "a field as `bodies[0].mass`, written in the scenario"

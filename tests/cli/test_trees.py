@@ -1,0 +1,35 @@
+"""Commands that cover chains only refuse trees; a run compares trees at state level and reports them."""
+
+import json
+
+import pytest
+from click.testing import CliRunner
+
+from plumbline.cli.main import main
+
+
+@pytest.mark.parametrize("command", ["prove", "coverage", "drift"])
+def test_commands_for_chains_refuse_trees(command, tmp_path):
+    done = CliRunner().invoke(main, [command, "furuta", "--out", str(tmp_path / "out")])
+    assert done.exit_code == 2 and "furuta is a tree" in done.output
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_sweep_of_a_tree_is_refused_with_its_place(tmp_path):
+    (tmp_path / "s.yaml").write_text(
+        "schema_version: 1\nscenario: furuta\nvary:\n  bodies[0].mass: {values: [1.0]}\n"
+    )
+    done = CliRunner().invoke(main, ["sweep", str(tmp_path / "s.yaml"), "--out", str(tmp_path / "out")])
+    assert done.exit_code == 2 and "furuta is a tree" in done.output
+
+
+def test_a_tree_is_compared_with_its_joint_moments(tmp_path):
+    done = CliRunner().invoke(
+        main, ["run", "universal-pendulum", "--engine", "mujoco", "--out", str(tmp_path), "--json"]
+    )
+    assert done.exit_code == 0, done.output
+    results = json.loads((tmp_path / "results.json").read_text())
+    rows = {row["quantity"]: row["verdict"] for row in results["rows"]}
+    assert rows["joint_moment"] == rows["acceleration"] == "agrees"
+    assert {row["level"] for row in results["rows"]} == {"state"}
+    assert results["scenarios"]["universal-pendulum"]["model"]["kind"] == ["universal"]
