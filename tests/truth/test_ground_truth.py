@@ -63,6 +63,8 @@ def test_each_perturbed_model_has_one_kind_of_error_of_one_part_in_ten_thousand(
     for (wrong, state), names in zip(found, altered, strict=True):
         for name in model.fields:
             was, now = getattr(model, name), getattr(wrong, name)
+            if name == "distal":  # nothing hangs on the last body
+                was, now = was[:-1], now[:-1]
             if name not in names:
                 assert np.array_equal(was, now), name
                 continue
