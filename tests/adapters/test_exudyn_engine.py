@@ -184,7 +184,7 @@ def light_and_heavy_balls():
     offsets = np.zeros((5, 3)), np.tile([0.0, 0.0, -0.6], (5, 1))
     offsets[0][3] = [0.0, 0.0, 1.0]
     zero = np.zeros(5)
-    model = Model(
+    model = Model.chain(
         mass=mass, inertia=np.tile(np.diag([2e-4, 2e-4, 3e-4]), (5, 1, 1)), proximal=offsets[0],
         distal=offsets[1], length=zero, gravity=np.array([0.0, 0.0, -10.0]), force=np.zeros((5, 3)),
         moment=np.zeros((5, 3)), drag_force=zero, drag_moment=zero,

@@ -51,7 +51,7 @@ def problems():
 def is_altered(defect, model, state):
     other, at = defect.inputs(model, state)
     fields = [(getattr(at, k), getattr(state, k)) for k in ("p", "omega", "u", "udot")]
-    fields += [(getattr(other, k), value) for k, value in vars(model).items()]
+    fields += [(getattr(other, k), value) for k, value in model.fields.items()]
     return not all(np.array_equal(a, b) for a, b in fields)
 
 
