@@ -16,13 +16,14 @@ import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.truth import import_truth_tool
-from plumbline.truth.taylor import integrate_steps
+from plumbline.truth.taylor import taylor_series
 
 if TYPE_CHECKING:
     from plumbline.truth.enclosure_checker import Enclosure
 
 CertificatePrecision = Literal["quad", "octuple"]
 BITS: dict[CertificatePrecision, int] = {"quad": 110, "octuple": 230}  # after the binary point
+ORDER_PER_BIT = 0.55  # of the series: a step is 0.28 of their radius of convergence
 LENGTH_BITS = 20  # after the binary point, of a step
 MAX_STEPS_TRIED = (0.5, 0.25, 0.125)  # longest step in units of time; a motion at rest has infinite ones
 
@@ -180,10 +181,11 @@ def _candidate_steps(
     steps: list[list[Any]] = []
     with mp.workprec(2 * bits):
         left = max(1, math.ceil(math.ldexp(duration, LENGTH_BITS - exponent)))  # grains
-        generator = integrate_steps(model, state, math.ldexp(max_step, exponent), precision)
-        h, series = next(generator)
+        generator = taylor_series(model, state, round(ORDER_PER_BIT * bits), precision)
+        series = next(generator)
         start: list[int] = []
         while True:
+            h = min(mp.ldexp(max_step, exponent), *(_longest_step(row, bits) for row, _ in series))
             count = min(left, max(1, int(mp.floor(mp.ldexp(h, LENGTH_BITS - exponent)))))
             seconds = mp.ldexp(mp.mpf(count), exponent - LENGTH_BITS)
             rows = []
@@ -201,4 +203,11 @@ def _candidate_steps(
                 mp.ldexp(mp.mpf(value), -bits - (exponent if is_rate else 0))
                 for value, (_, is_rate) in zip(start, series, strict=True)
             ]
-            h, series = generator.send(values)
+            series = generator.send(values)
+
+
+def _longest_step(taylor: list[Any], bits: int) -> Any:
+    """The step [s] at which the last two terms of a Taylor series are 2**-(bits + 3)."""
+    mp, last = import_truth_tool("mpmath"), len(taylor) - 1
+    terms = ((k, abs(taylor[k])) for k in (last, last - 1))
+    return min((mp.root(mp.ldexp(1 / c, -bits - 3), k) for k, c in terms if c), default=mp.inf)
