@@ -21,7 +21,9 @@ from pathlib import Path
 import pyarrow as pa
 
 import reports
+from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import LevelSelection, Plan, ProgressCallback, RunObserver
+from plumbline.execution.proofs import prove_changed_motions
 from plumbline.execution.result_cache import DiskResultCache
 from plumbline.execution.runner import RunResult, run_plan, save
 from plumbline.execution.selftest import SelfTestResult
@@ -94,6 +96,7 @@ def run_nightly(
     level: LevelSelection = "all",
     scheduler: str | None = None,
     self_test: Callable[[Path], SelfTestResult] | None = None,
+    proof_cpu_seconds: float = 0.0,
     known_issues: Sequence[KnownIssue] | None = None,
     are_engines_required: bool = False,
     progress: ProgressCallback,
@@ -117,6 +120,7 @@ def run_nightly(
         long_run_seconds: length of the long runs [s]; 0 for none.
         level: levels to compare at.
         scheduler: address of a dask cluster to run on.
+        proof_cpu_seconds: CPU time after which no further proof of a motion is begun [s]; 0: none is begun.
         self_test: runs the self-test and writes its JUnit file to the given path; None for no self-test.
         known_issues: expected verdicts; None for those of the project's file.
         are_engines_required: whether an engine that is not installed has failed.
@@ -159,12 +163,20 @@ def run_nightly(
         are_engines_required=are_engines_required,
         known_issues=project_known_issues() if known_issues is None else known_issues,
     )
+    proofs = (
+        prove_changed_motions(scenarios, jobs, limits, proof_cpu_seconds, log) if proof_cpu_seconds else None
+    )
     result = run_plan(plan, progress, observer)
     place = unused_path(history / result.metadata["id"])
     result.metadata |= {"id": place.name, "night": next_night_number(history)}
     result.metadata |= {"started": night.started, "random": night.random_count, "seed": night.seed}
     folder = unfinished / "night"
     shutil.rmtree(folder, ignore_errors=True)
+    if proofs is not None:
+        result.metadata["proofs"] = asdict(proofs)
+        result.metadata["sentence"] += f"; {proofs.sentence}"
+        if proofs.exceeded:
+            result.metadata["exit_code"] = ExitCode.HARNESS_FAILED
     if self_test is not None:
         folder.mkdir()
         answer = self_test(folder / "self_test.xml")

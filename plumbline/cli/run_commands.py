@@ -22,6 +22,8 @@ from plumbline.execution.runner import RunResult, run_plan, save
 from plumbline.processes.workers import Limits
 from plumbline.storage.results_store import row_record, to_json_value
 
+MAX_PROOF_CPU_SECONDS = 1e6
+
 
 @click.command(
     epilog=examples(
@@ -144,6 +146,13 @@ def run(
     default=True,
     help="Plant mistakes in an engine and require that the run reports and names them.",
 )
+@click.option(
+    "--proof-cpu-seconds",
+    type=options.FiniteNumber(0, MAX_PROOF_CPU_SECONDS),
+    default=600.0,
+    help="CPU seconds after which no further motion of the catalogue is proved; 0: none is. Motions that "
+    "earlier nights or `prove` have proved are not proved again.",
+)
 @options.jobs_option
 @options.scheduler_option
 @options.known_option
@@ -152,7 +161,8 @@ def run(
 @options.memory_option
 def nightly(
     names: tuple[str, ...], engines: list[str], random_count: int, random_trajectories: int, seed: int | None,
-    extra_refinements: int, long_run_seconds: float, self_test: bool, jobs: int, scheduler: str | None,
+    extra_refinements: int, long_run_seconds: float, self_test: bool,
+    proof_cpu_seconds: float, jobs: int, scheduler: str | None,
     known_files: tuple[Path, ...], out: Path, timeout: float, memory: float,
 ) -> None:  # fmt: skip
     """Run the catalogue with finer steps, long runs, random scenarios and the self-test.
@@ -174,6 +184,7 @@ def nightly(
             limits=Limits(timeout, memory), is_full_catalogue=not names and engines == list(ENGINES),
             extra_refinements=extra_refinements, long_run_seconds=long_run_seconds, scheduler=scheduler,
             self_test=run_self_test if self_test else None, progress=progress,
+            proof_cpu_seconds=proof_cpu_seconds,
             observer=display, command=_command_line(), log=_log, known_issues=known_issues,
             are_engines_required=options.are_engines_named(),
         )  # fmt: skip

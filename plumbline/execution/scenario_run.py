@@ -40,7 +40,7 @@ from plumbline.model.sampling import compared_states
 from plumbline.processes.workers import Outcome, Pickled, Task
 from plumbline.scenario.loader import Scenario
 from plumbline.truth import ground_truth
-from plumbline.truth.closed_form import closed_form_motion
+from plumbline.truth.closed_form import exact_samples
 from plumbline.truth.ground_truth import MotionTruth, StateTruth
 from plumbline.truth.proved_motion import find_proof
 
@@ -147,9 +147,7 @@ class ScenarioRun:
         s = self.scenario
         if key.kind == TaskKind.STATE_TRUTH:
             return Task(key, ground_truth.state_truth, (s.model, self._states), self._plan.limits)
-        closed = closed_form_motion(s)
-        exact = (*closed(s.times), closed.source) if closed and closed.amplitude == 0 else None
-        arguments = (s.model, s.state, s.times, exact, *(compiled_bodies or (None,)))
+        arguments = (s.model, s.state, s.times, exact_samples(s, s.times), *(compiled_bodies or (None,)))
         proof = find_proof(s.model, s.state, s.times)
         arguments += () if proof is None else (proof,)
         return Task(key, ground_truth.motion_truth, arguments, self._plan.limits)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 CertificatePrecision = Literal["quad", "octuple"]
 BITS: dict[CertificatePrecision, int] = {"quad": 110, "octuple": 230}  # after the binary point
-ORDER_PER_BIT = 0.55  # of the series: a step is 0.28 of their radius of convergence
+ORDER_PER_BIT = 0.5  # of the series: a step is a quarter of their radius of convergence
 LENGTH_BITS = 20  # after the binary point, of a step
 MAX_STEPS_TRIED = (0.5, 0.25, 0.125)  # longest step in units of time; a motion at rest has infinite ones
 

@@ -69,7 +69,7 @@ from flint import arb, arb_mat, arb_poly, ctx, fmpq
 from numpy.typing import NDArray
 
 FORMAT, VERSION = "plumbline enclosure certificate", 1
-DEGREE = 10  # of Ψ and of the Jacobian: R falls with the step's power DEGREE + 1
+DEGREE = 11  # of Ψ and of the Jacobian: R falls with the step's power DEGREE + 1
 LOW_BITS = 64  # precision of the linear part
 GUARD_BITS = 40  # of the defect, beyond the certificate's own
 MIN_TUBE = 2.0**-44

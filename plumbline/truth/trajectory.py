@@ -16,8 +16,9 @@ from plumbline.model.datatypes import Array, Model, State, Trajectory
 from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import quaternion_rate
 from plumbline.truth import TruthUnavailable
+from plumbline.truth.enclosure import prove_motion
 from plumbline.truth.notes_motion import simulate_notes_form
-from plumbline.truth.proved_motion import ProvedMotion
+from plumbline.truth.proved_motion import ProvedMotion, round_enclosure
 from plumbline.truth.taylor import Precision, simulate_taylor
 
 NOTES_RTOL = 1e-13  # of the notes' form: at 1e-14 it is no closer to extended precision, the rest is rounding
@@ -25,6 +26,7 @@ NOTES_RTOL = 1e-13  # of the notes' form: at 1e-14 it is no closer to extended p
 MAX_EXTENDED_PRECISION_BODIES = 5
 MAX_COMPILED_BODIES = 50  # the equations of fifty bodies take 2 s to compile
 NOTES_METHOD = "the notes' form by collocation"
+ROUNDING = 2.0**-51  # of a motion stored in double, relative to its size
 ClosedFormSamples = tuple[Array, Array, str]  # r (T, N, 3) m and p (T, N, 4) of a closed form, and its source
 
 
@@ -89,6 +91,41 @@ def trajectory_truth(
         np.maximum.accumulate(attitude_error(run.p, other.p)),
         f"{method}; uncertainty: its difference from {other_method}",
     )
+
+
+def prove_and_judge_claim(
+    model: Model, state: State, times: Array, closed_form: ClosedFormSamples | None = None
+) -> tuple[ProvedMotion, float]:
+    """Prove a motion, and compare the error of the truth by two methods with the uncertainty that it claims.
+
+    Args:
+        model: the mechanism.
+        state: initial state.
+        times: (T,) [s] of the samples, times[0] = 0.
+        closed_form: as for `trajectory_truth`.
+
+    Returns:
+        The proved motion, and the largest error over claim of any sample; the claim includes the rounding of
+        both motions to double.
+
+    Raises:
+        Rejected: no candidate could be proved.
+        TruthUnavailable: a truth tool is not installed.
+        EngineFailure: an integrator stops early.
+
+    """
+    _, enclosure = prove_motion(model, state, times)
+    proof = round_enclosure(enclosure)
+    truth = trajectory_truth(model, state, times, closed_form)
+    run, right = truth.trajectory, proof.trajectory
+    size = float(np.max(np.abs(right.r)))
+    position = position_error(run.r, right.r) / (
+        truth.position_uncertainty + proof.position_radius + ROUNDING * size
+    )
+    attitude = attitude_error(run.p, right.p) / (
+        truth.attitude_uncertainty + proof.attitude_radius + 4 * ROUNDING
+    )
+    return proof, float(np.max([position, attitude]))
 
 
 def _simulate_minimal_coordinates(

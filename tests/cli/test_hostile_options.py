@@ -32,7 +32,8 @@ VALID = {  # by option or argument, a word that is accepted
     "long_run_seconds": "10", "file": "sweep.yaml", "files": "mine.yaml", "keys": "a/b",
     "folder": "history/20260101T000000Z",
     "what": "scenarios", "rtols": "1e-6", "max_cpu_seconds": "3", "history_folder": "history", "pattern": "*",
-    "duration": "1", "precision": "quad", "as_json": "", "self_test": "", "fresh": "", "help": "",
+    "duration": "1", "precision": "quad", "proof_cpu_seconds": "9",
+    "as_json": "", "self_test": "", "fresh": "", "help": "",
 }  # fmt: skip
 WORK = (  # where the work of a command begins
     "plumbline.cli.run_commands.run_plan", "plumbline.cli.nightly.run_plan", "plumbline.studies.sweep.run",

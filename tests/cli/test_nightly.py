@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from importlib.util import find_spec
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -9,6 +10,7 @@ import pytest
 
 from plumbline.cli import nightly
 from plumbline.cli.nightly import NightPlan
+from plumbline.execution.proofs import TRUTH_TOOLS
 from plumbline.execution.random_batch import RandomBatch
 from plumbline.execution.runner import RunResult
 from plumbline.judging.rows import RowContext
@@ -83,6 +85,17 @@ def run_nightly(out, **more):
     return nightly.run_nightly(
         out, chosen, ["mujoco"], command="-", progress=progress, log=ignore_output, **options
     )  # fmt: skip
+
+
+@pytest.mark.skipif(not all(map(find_spec, TRUTH_TOOLS)), reason="the truth tools are not installed")
+def test_a_night_proves_motions_and_uses_them(tmp_path):
+    result, place = run_nightly(tmp_path, random_count=0, proof_cpu_seconds=10.0)
+    assert result.metadata["proofs"]["proved"] == ["rest"]
+    assert "; motions: 1 proved, 1 of them now" in result.metadata["sentence"]
+    stored = json.loads((place / "results.json").read_text())
+    assert stored["scenarios"]["rest"]["truth"].startswith("proved: ")
+    result, _ = run_nightly(tmp_path, random_count=0, proof_cpu_seconds=10.0)
+    assert result.metadata["proofs"]["proved"] == [] and result.metadata["proofs"]["known"] == 1
 
 
 def test_a_night_is_whole_and_remembered(tmp_path):

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol
 
-from plumbline.model.datatypes import Model, State
+from plumbline.model.datatypes import Array, Model, State
 from plumbline.truth.closed_form.free_top import free_top
 from plumbline.truth.closed_form.heavy_top import lagrange_top, spherical_pendulum
 from plumbline.truth.closed_form.motion import ClosedFormMismatch, ClosedFormMotion
@@ -22,6 +22,7 @@ from plumbline.truth.closed_form.steady_motion import equilibrium, steady_rotati
 
 __all__ = [
     "CLOSED_FORMS", "ClosedFormMismatch", "ClosedFormMotion", "ClosedFormScenario", "closed_form_motion",
+    "exact_samples",
 ]  # fmt: skip
 
 CLOSED_FORMS: dict[str, Callable[[Model, State], ClosedFormMotion]] = {
@@ -69,3 +70,21 @@ def closed_form_motion(scenario: ClosedFormScenario) -> ClosedFormMotion | None:
     if scenario.closed_form is None:
         return None
     return CLOSED_FORMS[scenario.closed_form](scenario.model, scenario.state)
+
+
+def exact_samples(scenario: ClosedFormScenario, times: Array) -> tuple[Array, Array, str] | None:
+    """Sample the closed form that a scenario names, unless it is asymptotic.
+
+    Args:
+        scenario: its model and initial state must be the motion that ``closed_form`` names.
+        times: (T,) [s].
+
+    Returns:
+        Positions (T, N, 3) [m], attitudes (T, N, 4) and the source; None where there is no exact motion.
+
+    Raises:
+        ClosedFormMismatch: the scenario violates a condition of its closed form.
+
+    """
+    closed = closed_form_motion(scenario)
+    return (*closed(times), closed.source) if closed and closed.amplitude == 0 else None
