@@ -112,7 +112,7 @@ def test_a_run_uses_the_proof_of_its_own_numbers_only():
 
     assert proved_motion.find_proof(scenario.model, scenario.state, times[:-1]) is None
     mass = np.nextafter(scenario.model.mass, np.inf)
-    other = type(scenario.model)(**(vars(scenario.model) | {"mass": mass}))
+    other = scenario.model.changed(mass=mass)
     assert proved_motion.find_proof(other, scenario.state, times) is None
 
 

@@ -70,11 +70,11 @@ def test_every_number_of_a_model_is_a_parameter():
         "force": 3 * n, "moment": 3 * n, "drag_force": n, "drag_moment": n, "attitude": 3 * n,
         "omega": 3 * n, "direction": 2 * n, "rod_rate": 2 * n,
     }  # fmt: skip
-    assert set(vars(model)) == set(UNITS) - set(STATE_KINDS)
+    assert set(model.fields) == set(UNITS) - set(STATE_KINDS)
     for one in parameters:
         changed, moved = perturb(model, state, one, 1e-3)
         names = {
-            name for name in vars(model) if not np.array_equal(getattr(model, name), getattr(changed, name))
+            name for name in model.fields if not np.array_equal(getattr(model, name), getattr(changed, name))
         }
         assert names == (set() if one.kind in STATE_KINDS else {one.kind}), one
         if one.kind in STATE_KINDS:

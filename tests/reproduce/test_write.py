@@ -1,7 +1,6 @@
 """Scripts of a results folder: which rows get one, and what damaged or wrong input leads to."""
 
 import json
-from dataclasses import asdict
 from unittest.mock import patch
 
 import numpy as np
@@ -35,7 +34,7 @@ def results(tmp_path):
         "title": "Thirty balls",
         "bodies": scenario.model.n,
         "digest": scenario.digest,
-        "model": {k: np.asarray(v).tolist() for k, v in asdict(scenario.model).items()},
+        "model": {k: np.asarray(v).tolist() for k, v in scenario.model.fields.items()},
         "state": {k: getattr(scenario.state, k).tolist() for k in ("p", "omega", "u", "udot")},
     }
     version = load_adapter("pinocchio-aba").version()
