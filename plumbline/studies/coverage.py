@@ -51,6 +51,7 @@ def measure_coverage(
         CoverageFailure: a call failed.
 
     """
+    scenarios = [s for s in scenarios if s.model.is_chain]  # trees have no sensitivities yet
     by_scenario: dict[str, list[Row]] = {s.name: [] for s in scenarios}
     for row in rows:
         if row.scenario in by_scenario:

@@ -24,7 +24,8 @@ def generic(pattern="rods"):
 
 
 def catalogue(most_bodies):
-    return [name for name in scenarios.catalogue() if scenario(name).model.n <= most_bodies]
+    models = {name: scenario(name).model for name in scenarios.catalogue()}
+    return [name for name, model in models.items() if model.is_chain and model.n <= most_bodies]
 
 
 def confirmed_entries(names, count, seed):
