@@ -249,7 +249,7 @@ def test_the_detail_says_what_was_compared_and_why(open_page):
     page.locator(".compared button.row").filter(has_text="agrees").first.click()
     assert "agrees" in chosen.inner_text() and "row=state" in page.url
     codes = page.locator(".code pre").all_text_contents()
-    assert "python -m plumbline run chain-10 --engine pinocchio --level state" in codes
+    assert "python -m plumbline run chain-10 --engine pinocchio --level state --out repeated" in codes
     assert any("import numpy" in code for code in codes)
     plot = page.get_by_role("img", name=re.compile("Error against step: .*RK4 order"))
     assert plot.locator(".tri").count() >= 1
