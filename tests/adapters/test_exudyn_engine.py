@@ -126,7 +126,7 @@ def near_singular_pendulum(rate):
     )
 
 
-def test_tree_says_when_its_angles_become_singular():
+def test_the_tree_reports_singular_angles():
     """A constant body moment turns the first axis into the third; before that the motion is right."""
     subject, start = near_singular_pendulum(1e-3)
     with pytest.raises(Unsupported, match=r"body 1 come near their singularity at t = 0\.2\d* s") as said:

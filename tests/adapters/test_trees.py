@@ -39,7 +39,7 @@ def test_states_of_random_trees_are_right(engine, mix):
 
 
 @pytest.mark.parametrize("engine", ["reference-printed"])
-def test_an_engine_that_builds_no_trees_says_so(engine):
+def test_an_engine_that_builds_no_trees_gives_the_reason(engine):
     model = random_tree(np.random.default_rng(0), 3, ("hinge",))
     with pytest.raises(Unsupported, match="chains of rods and balls"):
         load_adapter(engine).evaluate(model, random_states(model, 1, 0))

@@ -193,7 +193,7 @@ def test_a_machine_that_fails_exits_with_4(tmp_path, error, words):
 
 
 @pytest.mark.parametrize("which", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_an_interrupted_run_says_how_to_resume_and_leaves_no_process(tmp_path, own_cells, which):
+def test_an_interrupted_run_explains_how_to_resume_and_leaves_no_process(tmp_path, own_cells, which):
     process = subprocess.Popen(
         [sys.executable, *WORDS, "chain-3-balls", "--engine", "mujoco", "--jobs", "1", "--out", tmp_path],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,

@@ -169,7 +169,7 @@ def test_a_damaged_plan_begins_a_new_night(tmp_path, spoilt):
     assert NightPlan.resume_or_start(tmp_path, night.seed + 1, 7) != night
 
 
-def test_what_someone_should_see_is_kept_whole_with_its_file(tmp_path):
+def test_remarkable_random_scenarios_are_kept_with_their_files(tmp_path):
     drawn = RandomScenarios(2, 3)
     probes, kept = RandomBatch(), []
     for s, verdict in zip(drawn, ("agrees", "disagrees", "unsupported"), strict=True):

@@ -51,7 +51,7 @@ def test_a_terminal_shows_cells_of_a_scenario_that_still_runs():
     assert display.finished.scenario_count == 0
 
 
-def test_elsewhere_a_line_tells_each_finished_scenario():
+def test_without_a_terminal_each_finished_scenario_is_one_line():
     file = StringIO()
     display = RunDisplay(file)
     with display:

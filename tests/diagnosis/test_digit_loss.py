@@ -118,7 +118,7 @@ def test_growth_compares_the_chain_with_its_half():
     assert not DigitLoss(1.0, {1: 39.0}).grows
 
 
-def test_an_engine_that_fails_on_turned_problems_is_not_said_to_lose_digits():
+def test_an_engine_that_fails_on_turned_problems_is_not_accused_of_losing_digits():
     model, truth = known()
     said = [replace(a, acceleration=2 * a.acceleration) for a in truth.quantities]
 

@@ -75,7 +75,7 @@ def run_code_blocks(page, folder):
 
 @pytest.mark.skipif(shutil.which("bash") is None, reason="the pages' commands are for bash")
 @pytest.mark.parametrize("name", PAGES)
-def test_a_worked_page_does_what_it_says(name, tmp_path):
+def test_a_worked_page_gives_the_printed_results(name, tmp_path):
     checkout = tmp_path / "check out"  # a path with a space in it
     shutil.copytree(ROOT, checkout, ignore=IGNORED)
     assert run_code_blocks((ROOT / "docs" / name).read_text(encoding="utf-8"), checkout) >= 3

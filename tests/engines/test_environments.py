@@ -69,7 +69,7 @@ def test_what_an_adapter_declares_is_read_without_importing_it(engine):
     assert calls.describe_engine(engine).missing is None, "the installed version is in the declared range"
 
 
-def test_a_version_out_of_range_says_so(monkeypatch):
+def test_a_version_out_of_range_is_reported(monkeypatch):
     from adapters.mujoco_engine import Mujoco
 
     monkeypatch.setattr(Mujoco, "supported_versions", "<1")
@@ -95,7 +95,7 @@ def remote_task(key, call, *arguments, limits=None):
     return Task(key, call, arguments, limits or Limits(30, 4), python=PYTHON)
 
 
-def test_losses_over_there_are_told_like_those_here():
+def test_losses_in_another_environment_are_reported_like_local_ones():
     tasks = [
         remote_task("a", operator.mul, 1, 2), remote_task("pid", os.getpid),
         remote_task("noise", print, "x" * 100_000),
@@ -118,7 +118,7 @@ def test_losses_over_there_are_told_like_those_here():
     assert not psutil.wait_procs(alive, timeout=10)[1], "a child outlived its worker"
 
 
-def test_an_engine_says_the_same_in_both_places():
+def test_an_engine_gives_the_same_answer_in_another_environment():
     s = loader.load_scenarios(["double-tumbling-balls"])[0]
     with WorkerPool(1) as workers:
         here, away = (
@@ -234,7 +234,7 @@ def test_a_file_that_is_no_wheel_is_bad_usage(tmp_path):
     assert done.returncode == 2 and "is a wheel of mujoco, not of exudyn" in " ".join(done.stderr.split())
 
 
-def test_without_uv_the_reason_says_what_to_install(tmp_path, monkeypatch):
+def test_without_uv_the_reason_names_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(environments, "ROOT", tmp_path)
@@ -244,7 +244,7 @@ def test_without_uv_the_reason_says_what_to_install(tmp_path, monkeypatch):
 
 @needs_uv
 @pytest.mark.parametrize("version", ["9.9.9", "latest"])
-def test_an_index_that_does_not_answer_is_told(tmp_path, monkeypatch, version):
+def test_an_index_that_does_not_answer_is_reported(tmp_path, monkeypatch, version):
     for name in ("UV_INDEX_URL", "UV_EXTRA_INDEX_URL", "UV_INDEX", "UV_FIND_LINKS"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("UV_DEFAULT_INDEX", "http://127.0.0.1:9/simple")  # the port of discard: refused
@@ -279,7 +279,7 @@ def test_latest_pre_and_a_wheel_run_beside_the_installed_one(tmp_path, package_i
 @pytest.mark.full
 @needs_uv
 @pytest.mark.timeout(900)
-def test_a_wheel_without_a_content_is_told(tmp_path, package_index):
+def test_an_empty_wheel_is_reported(tmp_path, package_index):
     path = tmp_path / "mujoco-4.0.0-py3-none-any.whl"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("mujoco/__init__.py", "")

@@ -72,7 +72,7 @@ def test_a_judge_that_raises_is_a_failure_of_the_harness(engines):
     ] * 2
 
 
-def test_a_lost_truth_of_states_fails_every_cell_and_says_so(engines):
+def test_a_lost_truth_of_states_fails_every_cell_with_the_reason(engines):
     bench = make_scenario_run(engines, "state")
     (truth,) = bench.tasks()
     for task in bench.on_outcome(Outcome(truth.key, failure="crashed")):
@@ -83,7 +83,7 @@ def test_a_lost_truth_of_states_fails_every_cell_and_says_so(engines):
     ] * 2
 
 
-def test_a_motion_truth_whose_worker_died_is_asked_for_once_more_without_a_compiler(engines):
+def test_a_motion_truth_whose_worker_died_is_computed_again_without_a_compiler(engines):
     bench = make_scenario_run(engines, "trajectory")
     (truth,) = bench.tasks()
     (second,) = bench.on_outcome(Outcome(truth.key, failure="crashed: the worker died of SIGSEGV"))
@@ -95,7 +95,7 @@ def test_a_motion_truth_whose_worker_died_is_asked_for_once_more_without_a_compi
     assert "Taylor" not in bench.truths[TaskKind.MOTION_TRUTH].method.split("closed form")[0]
 
 
-def test_a_truth_that_is_lost_twice_fails_every_cell_and_says_so(engines):
+def test_a_truth_that_is_lost_twice_fails_every_cell_with_the_reason(engines):
     bench = make_scenario_run(engines, "trajectory")
     (truth,) = bench.tasks()
     bench.on_outcome(Outcome(truth.key, failure="crashed"))

@@ -53,7 +53,7 @@ def test_one_that_hangs_is_ended(tmp_path):
 
 
 @pytest.mark.parametrize("trouble", ["", "half of them"])
-def test_a_night_with_a_dull_instrument_is_not_green(tmp_path, trouble):
+def test_a_night_whose_self_test_misses_a_defect_is_not_green(tmp_path, trouble):
     pytest.importorskip("mujoco")
 
     def said(report):

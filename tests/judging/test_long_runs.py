@@ -156,7 +156,7 @@ def test_step_control_keeps_each_invariant_within_its_tolerance():
 # --- lengths, and the statistic -----------------------------------------------------------------
 
 
-def test_the_affordable_length_is_told():
+def test_the_affordable_length_is_reported():
     rk4 = Integrator("RK4", "step", 4)
     assert plan_long_run(rk4, 1, 100.0) == LongRunPlan(100.0, (2.0**-7, 2.0**-8, 2.0**-9), 100.0)
     for n in range(1, 60):

@@ -133,7 +133,7 @@ def test_a_defect_of_its_kind_breaks_it(relation):
     assert any(broken.values()) and broken[DEFECTS_BY_RELATION[relation][0].name], broken
 
 
-def test_a_refused_state_is_left_out_and_a_refusing_engine_is_told():
+def test_a_refused_state_is_left_out_and_a_refusing_engine_is_reported():
     class Refusing(type(load_adapter("mujoco"))):
         name = "refusing"
 
@@ -381,7 +381,7 @@ def test_a_linear_solver_that_solves_something_else_is_seen(engine):
         assert (held.ratio > 1) == held.relation.startswith("by "), held
 
 
-def test_drag_is_not_reversed_and_a_failing_run_is_told():
+def test_drag_is_not_reversed_and_a_failing_run_is_reported():
     model = pendulums.make_model(JOINT_PATTERNS["ball"], drag=True)
     found = list(check_run_relations(exudyn_adapter()(), model, pendulums.state_from_seed(model)))
     assert found and not any(held.relation == "reversed in time" for held in found)
@@ -398,7 +398,7 @@ def test_drag_is_not_reversed_and_a_failing_run_is_told():
     assert [(row.integrator, row.quantity) for row in rows] == [("trapezoidal", "reversed in time"), *solved]
 
 
-def test_a_solver_with_which_a_run_fails_is_told():
+def test_a_solver_with_which_a_run_fails_is_reported():
     class Half(exudyn_adapter()):
         def with_option(self, option):
             found = super().with_option(option)

@@ -239,7 +239,7 @@ def test_a_run_may_be_off_by_its_rounding_its_solver_and_its_accelerations_grown
 
 
 @pytest.mark.parametrize("drag", [False, True])
-def test_every_relation_is_asked_but_time_reversed_with_drag(drag):
+def test_every_relation_is_tried_but_reversed_time_with_drag(drag):
     model = pendulums.make_model("b", drag=drag)
     names = [
         found.relation for found in check_relations("pinocchio", model, [pendulums.state_from_seed(model)])
@@ -265,7 +265,7 @@ def test_both_columns_of_an_engine_are_compared(engine):
     ]
 
 
-def test_long_chains_are_asked_at_half_as_many_states():
+def test_relations_of_long_chains_use_half_as_many_states():
     pytest.importorskip("mujoco")
     for bodies, states in ((12, 4), (13, 2)):
         model = pendulums.make_model("b" * bodies)

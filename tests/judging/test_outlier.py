@@ -54,7 +54,7 @@ def test_one_engine_against_the_others_is_the_outlier(name):
     )
 
 
-def test_two_are_both_named_and_a_quantity_alone_is_told():
+def test_two_outliers_are_both_named_and_a_single_quantity_is_reported():
     text = describe_outliers(rows_of_engines("mujoco", "exudyn"))
     assert text.startswith("outliers: mujoco in ") and "; exudyn in " in text
     assert text.endswith(

@@ -44,7 +44,7 @@ def test_a_bound_decides_only_where_it_is_sharp(scale, shift, expected):
     assert acceleration_verdict(scale, shift) == expected
 
 
-def test_a_blunt_row_says_what_was_measured():
+def test_the_reason_of_an_inconclusive_row_states_the_measured_bound():
     bounds = [
         replace(b, acceleration=1e6 * b.acceleration) for b in map(state_rounding_bound, [MODEL] * 3, STATES)
     ]
@@ -167,7 +167,7 @@ def test_one_bound_is_the_border(by, expected):
     assert rows[0].extra["bound_relative"] < 1e-9 and rows[1].ratio == 0.0
 
 
-def test_what_an_engine_does_not_offer_or_deliver_is_told():
+def test_quantities_that_an_engine_does_not_offer_or_deliver_are_reported():
     right = load_adapter("reference").evaluate(MODEL, STATES)
     less = [*right[:2], replace(right[2], joint_reaction=None)]
     rows = judge_shifted_answers(quantities=less).rows

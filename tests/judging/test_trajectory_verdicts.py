@@ -275,7 +275,7 @@ def test_an_implicit_solver_walks_at_random():
     assert analysis().rounding_description == "10³ ε G(t)"
 
 
-def test_an_alias_is_told_and_drag_parts_it():
+def test_an_alias_is_reported_and_differs_with_drag():
     method = replace(METHOD, alias_of="Euler")
     assert {row.alias_of for row in judged_rows(method=method).values()} == {"Euler"}
     dragged = replace(MODEL, drag_moment=np.array([0.1]))

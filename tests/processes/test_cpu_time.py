@@ -27,7 +27,7 @@ def test_what_is_measured_inside_is_not_process_too():
     assert 0.04 < split.seconds["process"] < 0.1
 
 
-def test_calls_are_counted_by_whom_they_asked():
+def test_calls_are_counted_by_the_engine_called():
     split = CpuTimes()
     costs = {
         TaskKey(TaskKind.MOTION_TRUTH, "s"): 1.0,

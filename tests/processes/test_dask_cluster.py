@@ -95,7 +95,7 @@ def make_plan(**more):
 
 
 @pytest.mark.timeout(300)
-def test_a_cluster_says_the_same_and_outlives_a_machine(tmp_path):
+def test_a_cluster_gives_the_same_answers_and_survives_a_lost_machine(tmp_path):
     expected = run_rows(make_plan())
     with cluster(tmp_path, 2) as (address, machines):
         assert run_rows(make_plan(scheduler=address)) == expected
@@ -130,7 +130,7 @@ def check_losses_cost_one_task(address):
     assert "timeout" in found["hang"].failure
 
 
-def test_no_scheduler_is_told():
+def test_a_missing_scheduler_is_reported():
     done = subprocess.run(
         [sys.executable, "-m", "plumbline", "run", "rest", "--scheduler", "nonsense"],
         cwd=ROOT, capture_output=True, text=True,

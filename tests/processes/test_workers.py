@@ -68,7 +68,7 @@ LOSSES = [
 ]
 
 
-def test_each_loss_costs_one_task_and_says_so():
+def test_each_loss_costs_one_task_and_is_reported():
     limits = Limits(seconds=5, gigabytes=4)
     quick = Limits(seconds=2, gigabytes=4)
     with WorkerPool(2, limits) as workers:

@@ -115,7 +115,7 @@ def test_a_batch_is_every_chain_alone():
         at += model.n
 
 
-def test_stiffness_is_said():
+def test_stiffness_is_reported():
     model, state = random_chain(np.random.default_rng(36), [False, False])
     stiff = model.changed(drag_force=model.mass * 3e3)
     assert "stiff" in run(stiff, state, 1e-6, TIMES[:2]).note
@@ -225,7 +225,7 @@ def test_a_step_begins_with_the_last_one_s_polynomial_up_to_its_smallest_term(
 
 
 @pytest.mark.parametrize("rods, rtol", [([False, False], 1e-3), ([False, False], 1e-12), ([True], 1e-8)])
-def test_a_run_says_what_it_did(rods, rtol, monkeypatch):
+def test_a_run_reports_its_steps(rods, rtol, monkeypatch):
     model, state = random_chain(np.random.default_rng(40), rods, rate=4.0)
     watched = StepRecorder(monkeypatch)
     done = run(model, state, rtol, np.array([0.0, 0.7, 2.1]))
@@ -311,7 +311,7 @@ def test_a_batch_has_every_chains_own_sizes():
 
 
 @pytest.mark.parametrize("rods", [[False, False], [True, False]], ids=str)
-def test_joints_that_are_open_close_as_they_are_told(rods):
+def test_open_joints_close_at_the_stabilisation_rate(rods):
     """C̈ + 2 a Ċ + a² C = 0 has (C + (Ċ + a C) t) e^{−a t}; a projection leaves nothing at all."""
     model, state = random_chain(np.random.default_rng(44), rods)
     opened = replace(state, r=state.r + np.array([[0.01, 0, -0.02], [0.03, 0.01, 0]]))

@@ -260,7 +260,7 @@ def test_a_collapsed_rod_on_a_body_that_is_not_turned_is_named_too():
         StructuredSystem([model]).solve(r, at.p, at.v, quaternion_rate(at.p, at.omega))
 
 
-def test_what_is_lost_to_rounding_or_overflow_is_told():
+def test_losses_to_rounding_or_overflow_are_reported():
     """Bodies of 1 and 1e20 kg hold each other by rows that double precision cannot tell apart."""
     model, state = random_chain(np.random.default_rng(24), [False] * 3)
     heavy = np.array([1.0, 1e20, 1.0])

@@ -373,7 +373,7 @@ def test_a_page_above_its_budget_has_fewer_points(out, text, monkeypatch):
     assert len(few) < len(many)
 
 
-def test_a_history_says_what_is_new_and_skips_a_damaged_night(out, tmp_path):
+def test_a_history_shows_what_is_new_and_skips_a_damaged_night(out, tmp_path):
     past = fixture.nights(out, tmp_path / "history", count=4)
     results = Results.load(out)
     history = History.load(past, results)

@@ -240,7 +240,7 @@ def test_tab_reaches_everything_that_can_be_used(open_page):
     assert len(reached - {-1}) == wanted
 
 
-def test_the_detail_says_what_was_compared_and_why(open_page):
+def test_the_detail_shows_what_was_compared_and_why(open_page):
     page = open_page(link(scenario="chain-10", engine="pinocchio"))
     chosen = page.locator(".chosen")
     assert "acceleration" in chosen.inner_text() and "disagrees" in chosen.inner_text()
@@ -493,7 +493,7 @@ def test_numbers_of_the_details_have_names_units_and_no_false_digits(open_page, 
     assert scripts == ["Stand-alone script: state, acceleration; state, joint reaction"]
 
 
-def test_within_tolerance_is_said_of_the_positions_only(open_page):
+def test_within_tolerance_is_shown_for_positions_only(open_page):
     page = open_page(link(scenario="planar-small", engine="reference"))
     assert page.get_by_text("These positions stay within their tolerance").is_visible()
     assert page.get_by_text("Never above").count() == 0

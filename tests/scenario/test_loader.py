@@ -124,7 +124,7 @@ def test_scenario_starts_exactly_on_the_manifold(name):
 
 
 @pytest.mark.parametrize("name", [*SINGLE_NAMES, *DOUBLE_JOINTS, *CHAIN_JOINTS])
-def test_scenario_says_what_it_is(name):
+def test_a_scenario_has_title_and_purpose(name):
     s = load(name)
     assert (s.name, s.family, s.schema_version) == (name, s.path.parent.name, 1)
     assert s.path.name == f"{name}.yaml"
@@ -228,7 +228,7 @@ def test_steady_scenarios_are_the_roots_that_their_file_claims(name):
     assert np.max(np.linalg.norm(s.state.r[:, :2], axis=1)) > 0.1  # a cone, not hanging at rest
 
 
-def test_no_equilibrium_is_said():
+def test_a_missing_equilibrium_is_reported():
     s = load("conical")
     with pytest.raises(ValueError, match="no relative equilibrium found near the guess"):
         relative_equilibrium(s.model, float("nan"), s.state.p, s.state.u)

@@ -140,7 +140,7 @@ def test_an_empty_folder_has_no_nights(tmp_path):
     assert all(part == [] for part in document.values())
 
 
-def test_the_command_says_it(tmp_path):
+def test_the_command_reports_it(tmp_path):
     store_run(tmp_path / "history", 1, ["agrees"])
     store_run(tmp_path / "history", 2, ["disagrees"])
     said = CliRunner().invoke(main, ["history", str(tmp_path)])

@@ -132,7 +132,7 @@ def test_foreign_or_broken_results_are_refused_by_name(tmp_path, text):
         results_store.read_results(tmp_path)
 
 
-def test_no_results_says_how_to_make_them(tmp_path):
+def test_missing_results_are_reported_with_the_command_that_makes_them(tmp_path):
     with pytest.raises(ValueError, match="plumbline run"):
         results_store.read_results(tmp_path)
 

@@ -168,7 +168,7 @@ def test_every_error_at_every_step_once_and_for_good(faulty_disk, tmp_path, reco
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limits of file size")
-def test_the_command_says_so_and_goes_on(tmp_path, own_cells):
+def test_the_command_reports_the_damage_and_continues(tmp_path, own_cells):
     """The kernel refuses files above 120 kB: the cells fit, the report does not."""
     import resource
 
@@ -194,7 +194,7 @@ def test_a_clock_set_back_overwrites_no_night(tmp_path):
     assert nightly.unused_path(place).name == "20260101T000000Z-2"
 
 
-def test_nights_are_told_in_the_order_in_which_they_were_made(tmp_path, monkeypatch):
+def test_nights_are_listed_in_the_order_of_their_making(tmp_path, monkeypatch):
     """The clock is set back, forward within the second night, and then shows the first one again."""
     monkeypatch.setattr(runner, "WorkerPool", InProcessWorkers)
     monkeypatch.setattr(nightly, "Plan", lambda *a, **k: Plan(*a, **k, random_state_count=1))

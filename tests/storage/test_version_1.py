@@ -75,7 +75,7 @@ def test_history_report_and_reproduce_read_them(results):
     assert answer.exit_code == 0 and "nothing disagrees" in answer.output, answer.output
 
 
-def test_a_disagreement_of_version_1_can_be_asked_for(results):
+def test_a_disagreement_of_version_1_can_be_selected(results):
     document = json.loads((results / "results.json").read_text())
     for row in document["rows"]:
         if row["key"] == KEY:

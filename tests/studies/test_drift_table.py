@@ -36,7 +36,7 @@ def test_every_variant_and_time_has_a_row_and_the_drift_is_the_raw_one(tmp_path)
     assert all("to 10 s, about" in sentence for sentence in told)
 
 
-def test_a_time_that_costs_too_much_is_left_out_and_says_so():
+def test_a_time_that_costs_too_much_is_left_out_with_a_reason():
     rows = measure_drift(["tumbling-ball"], 0.001, times=(1.0, 10.0))
     for first, second in zip(rows[::2], rows[1::2], strict=True):
         assert first["gap"] is not None
