@@ -129,9 +129,9 @@ def near_singular_pendulum(rate):
 def test_the_tree_reports_singular_angles():
     """A constant body moment turns the first axis into the third; before that the motion is right."""
     subject, start = near_singular_pendulum(1e-3)
-    with pytest.raises(Unsupported, match=r"body 1 come near their singularity at t = 0\.2\d* s") as said:
+    with pytest.raises(Unsupported, match=r"body 1 come near their singularity at t = 0\.2\d* s") as reported:
         ExudynTree().simulate(subject, start, np.array([0.0, 2.0]), "RK44", 2.0**-9)
-    stated = float(str(said.value).split("t = ")[1].split(" s")[0])
+    stated = float(str(reported.value).split("t = ")[1].split(" s")[0])
     # from rest, ½ (4 / 0.1) t² about the second or third axis of the chart: 84.26° at 0.2712 s
     assert stated == pytest.approx(np.sqrt(2 * np.arccos(0.1) / 40), abs=2.0**-9)
     before = np.array([0.0, 0.25])

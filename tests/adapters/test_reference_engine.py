@@ -39,15 +39,15 @@ def test_velocity_map_gives_the_bodies_rates(rods):
 @pytest.mark.parametrize("rods", [[True], [False], [True, False, True], [False, True, False, False]], ids=str)
 def test_energy_momentum_and_mass_matrix_belong_together(rods):
     model, state = model_and_state(rods)
-    (said,) = Reference().evaluate(model, [state])
+    (reported,) = Reference().evaluate(model, [state])
     nu = generalized_velocity(model, state)
-    np.testing.assert_allclose(said.kinetic_energy, nu @ said.mass_matrix @ nu / 2, rtol=1e-14)
-    np.testing.assert_allclose(said.mass_matrix, mass_matrix(model, state), atol=1e-14)
+    np.testing.assert_allclose(reported.kinetic_energy, nu @ reported.mass_matrix @ nu / 2, rtol=1e-14)
+    np.testing.assert_allclose(reported.mass_matrix, mass_matrix(model, state), atol=1e-14)
     spin = np.einsum("nij,njk,nk->ni", rotation_matrix(state.p), model.inertia, state.omega)
     momentum = np.cross(state.r, model.mass[:, None] * state.v) + spin
-    np.testing.assert_allclose(said.angular_momentum, momentum.sum(0), atol=1e-14)
+    np.testing.assert_allclose(reported.angular_momentum, momentum.sum(0), atol=1e-14)
     weight = -model.mass[:, None] * model.gravity
-    np.testing.assert_allclose(said.potential_energy, np.sum(weight * state.r), rtol=1e-13)
+    np.testing.assert_allclose(reported.potential_energy, np.sum(weight * state.r), rtol=1e-13)
 
 
 @pytest.mark.parametrize("rods", [[True, False], [False, True]], ids=str)
@@ -59,9 +59,9 @@ def test_accelerations_are_the_rates_of_the_velocities(rods):
     omega = angular_velocity(run.p, run.pdot)
     p = run.p[1] / np.linalg.norm(run.p[1], axis=1, keepdims=True)
     now = replace(state, p=p, r=run.r[1], v=run.v[1], omega=omega[1])
-    (said,) = Reference().evaluate(model, [now])
-    np.testing.assert_allclose((run.v[2] - run.v[0]) / (2 * h), said.acceleration, atol=1e-4)
-    np.testing.assert_allclose((omega[2] - omega[0]) / (2 * h), said.angular_acceleration, atol=1e-4)
+    (reported,) = Reference().evaluate(model, [now])
+    np.testing.assert_allclose((run.v[2] - run.v[0]) / (2 * h), reported.acceleration, atol=1e-4)
+    np.testing.assert_allclose((omega[2] - omega[0]) / (2 * h), reported.angular_acceleration, atol=1e-4)
 
 
 def test_trajectories_are_raw():

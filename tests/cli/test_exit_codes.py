@@ -203,10 +203,10 @@ def test_an_interrupted_run_explains_how_to_resume_and_leaves_no_process(tmp_pat
     while not list(own_cells.glob("*.cell")) and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(which)
-    _, told = process.communicate(timeout=60)
-    assert process.returncode == ExitCode.INTERRUPTED, told
-    assert told.rstrip().endswith("interrupted; finished cells are kept, run the same command to resume")
-    assert "Traceback" not in told and "leaked" not in told
+    _, reported = process.communicate(timeout=60)
+    assert process.returncode == ExitCode.INTERRUPTED, reported
+    assert reported.rstrip().endswith("interrupted; finished cells are kept, run the same command to resume")
+    assert "Traceback" not in reported and "leaked" not in reported
     assert list(own_cells.glob("*.cell"))
     deadline = time.monotonic() + 10
     while time.monotonic() < deadline:

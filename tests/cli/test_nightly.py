@@ -155,15 +155,15 @@ def test_an_unfinished_night_goes_on_with_its_seed(tmp_path):
         path.chmod(0o400)
     result, _ = run_nightly(tmp_path, seed=None)
     assert result.metadata["seed"] == begun["seed"] and result.metadata["started"] == begun["started"]
-    calm, _ = run_nightly(tmp_path / "calm", seed=begun["seed"])
+    uninterrupted, _ = run_nightly(tmp_path / "calm", seed=begun["seed"])
     assert [(r.key, r.value, r.verdict) for r in result.rows] == [
-        (r.key, r.value, r.verdict) for r in calm.rows
+        (r.key, r.value, r.verdict) for r in uninterrupted.rows
     ]
 
 
-@pytest.mark.parametrize("spoilt", ["", "{", '{"seed": 1}', "[]"])
-def test_a_damaged_plan_begins_a_new_night(tmp_path, spoilt):
-    (tmp_path / "plan.json").write_text(spoilt)
+@pytest.mark.parametrize("damage", ["", "{", '{"seed": 1}', "[]"])
+def test_a_damaged_plan_begins_a_new_night(tmp_path, damage):
+    (tmp_path / "plan.json").write_text(damage)
     night = NightPlan.resume_or_start(tmp_path, None, 7)
     assert NightPlan.resume_or_start(tmp_path, None, 7) == night
     assert NightPlan.resume_or_start(tmp_path, night.seed + 1, 7) != night
@@ -173,10 +173,12 @@ def test_remarkable_random_scenarios_are_kept_with_their_files(tmp_path):
     drawn = RandomScenarios(2, 3)
     probes, kept = RandomBatch(), []
     for s, verdict in zip(drawn, ("agrees", "disagrees", "unsupported"), strict=True):
-        who = RowContext(s.name, RANDOM_FAMILY, "mujoco", "MuJoCo", "4")
-        fine = who.make_row("state", "-", "joint_reaction", "agrees", "why", ratio=0.5)
+        context = RowContext(s.name, RANDOM_FAMILY, "mujoco", "MuJoCo", "4")
+        fine = context.make_row("state", "-", "joint_reaction", "agrees", "why", ratio=0.5)
         other = replace(fine, engine="exudyn")
-        kept += probes.add_scenario([other, fine, who.make_row("state", "-", "acceleration", verdict, "why")])
+        kept += probes.add_scenario(
+            [other, fine, context.make_row("state", "-", "acceleration", verdict, "why")]
+        )
     assert [r.verdict for r in kept] == ["agrees", "disagrees", "agrees", "unsupported"]
     assert {r.engine for r in kept} == {"mujoco"}, "what another engine says calmly of it is folded"
     assert probes.counts_by_verdict == {"agrees": 5} and probes.worst_ratios["mujoco", "joint_reaction"] == (

@@ -295,10 +295,12 @@ def test_a_difference_within_the_bound_is_in_the_mass_matrix():
 def test_a_failure_of_the_second_evaluation_is_reported():
     model, said, truth = changed("acceleration", lambda i, x, b: 1.5 * x)
 
-    def evaluate(asked, states):
-        if not np.any(asked.gravity):
+    def evaluate(requested, states):
+        if not np.any(requested.gravity):
             raise RuntimeError("no\n  weight")
-        return [replace(t, acceleration=1.5 * t.acceleration) for t in state_truth(asked, states).quantities]
+        return [
+            replace(t, acceleration=1.5 * t.acceleration) for t in state_truth(requested, states).quantities
+        ]
 
     text = diagnose(model, said, truth, evaluate)
     assert text.startswith("behaves as if it returned the acceleration multiplied by 1.5 (the difference ")
@@ -337,8 +339,8 @@ def test_a_state_at_rest_is_evaluated_at_rest_again():
     ]
     truth = state_truth(model, still)
 
-    def evaluate(asked, states):
-        right = state_truth(asked, states).quantities
+    def evaluate(requested, states):
+        right = state_truth(requested, states).quantities
         return [replace(t, acceleration=1.5 * t.acceleration) for t in right]
 
     text = diagnose(model, evaluate(model, still), truth, evaluate)
@@ -351,8 +353,8 @@ def test_an_error_in_the_loads_vanishes_without_them(loads, drag):
     truth = state_truth(model, random_states(model, 4, seed=6))
     none = {name: 0 * getattr(model, name) for name in ("force", "moment", "drag_force", "drag_moment")}
 
-    def evaluate(asked, states):
-        return state_truth(replace(asked, **none), states).quantities
+    def evaluate(requested, states):
+        return state_truth(replace(requested, **none), states).quantities
 
     text = diagnose(model, evaluate(model, truth.states), truth, evaluate)
     at_rest = "persists" if loads else "vanishes"  # drag does, too
@@ -363,9 +365,9 @@ def test_an_error_in_velocity_terms_vanishes_at_rest():
     model = pendulums.make_model("rb")
     truth = state_truth(model, random_states(model, 4, seed=3))
 
-    def evaluate(asked, states):
-        still = [state_from_minimal(asked, s.p, 0 * s.omega, s.u, 0 * s.udot) for s in states]
-        return state_truth(asked, still).quantities
+    def evaluate(requested, states):
+        still = [state_from_minimal(requested, s.p, 0 * s.omega, s.u, 0 * s.udot) for s in states]
+        return state_truth(requested, still).quantities
 
     text = diagnose(model, evaluate(model, truth.states), truth, evaluate)
     assert text.endswith("(the difference vanishes at rest, persists without gravity)")
@@ -374,10 +376,12 @@ def test_an_error_in_velocity_terms_vanishes_at_rest():
 def test_a_failure_is_reported_in_eighty_characters_and_the_next_trial_runs():
     model, said, truth = changed("acceleration", lambda i, x, b: 1.5 * x)
 
-    def evaluate(asked, states):
+    def evaluate(requested, states):
         if not any(np.any(s.omega) for s in states):
             raise RuntimeError("x" * 100)
-        return [replace(t, acceleration=1.5 * t.acceleration) for t in state_truth(asked, states).quantities]
+        return [
+            replace(t, acceleration=1.5 * t.acceleration) for t in state_truth(requested, states).quantities
+        ]
 
     text = diagnose(model, said, truth, evaluate)
     assert text.endswith(f"(the difference fails at rest: {'x' * 80}, persists without gravity)")

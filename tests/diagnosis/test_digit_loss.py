@@ -30,10 +30,10 @@ def answering(change):
     """An engine that returns the truth, its acceleration changed by the state, the model and the truth."""
 
     def evaluate(model, states):
-        said = state_truth(model, states).quantities
+        reported = state_truth(model, states).quantities
         return [
             replace(a, acceleration=change(model, s, a.acceleration))
-            for s, a in zip(states, said, strict=True)
+            for s, a in zip(states, reported, strict=True)
         ]
 
     return evaluate
@@ -89,10 +89,10 @@ def test_an_engine_that_keeps_the_call_before_loses_no_digits():
     model, truth = known()
     kept = list(truth.quantities[-1:])
 
-    def evaluate(asked, states):
-        said = [*kept, *state_truth(asked, states).quantities]
-        kept[:] = said[-1:]
-        return said[:-1]
+    def evaluate(requested, states):
+        reported = [*kept, *state_truth(requested, states).quantities]
+        kept[:] = reported[-1:]
+        return reported[:-1]
 
     difference = observe_difference(model, evaluate(model, truth.states), truth)
     assert difference.error_ratio(difference.expected) > 1e9
@@ -120,12 +120,12 @@ def test_growth_compares_the_chain_with_its_half():
 
 def test_an_engine_that_fails_on_turned_problems_is_not_accused_of_losing_digits():
     model, truth = known()
-    said = [replace(a, acceleration=2 * a.acceleration) for a in truth.quantities]
+    reported = [replace(a, acceleration=2 * a.acceleration) for a in truth.quantities]
 
-    def evaluate(asked, states):
+    def evaluate(requested, states):
         raise RuntimeError("no")
 
-    assert find_digit_loss(observe_difference(model, said, truth), model, evaluate) is None
+    assert find_digit_loss(observe_difference(model, reported, truth), model, evaluate) is None
 
 
 @pytest.mark.parametrize("name", ["chain-30-balls", "chain-50-balls"])

@@ -31,8 +31,8 @@ def record(**where):
     return dict(found["microseconds"])
 
 
-def close(told, stored):
-    return float(told.replace(",", "")) == pytest.approx(stored, rel=0.05 if "e" in told else 5.1e-3)
+def close(reported, stored):
+    return float(reported.replace(",", "")) == pytest.approx(stored, rel=0.05 if "e" in reported else 5.1e-3)
 
 
 def test_the_goals():
@@ -49,10 +49,10 @@ def test_the_times(kind):
     for row in table(f"bodies, {second}"):
         bodies, other = row.pop(f"bodies, {second}").split(", ")
         stored = record(kind=kind, bodies=int(bodies), **{second: other if kind == "single" else int(other)})
-        for column, told in row.items():
+        for column, reported in row.items():
             name = COLUMNS[column]
-            assert (told == "–") == (name not in stored), (bodies, other, column)
-            assert told == "–" or close(told, stored[name]), (bodies, other, column)
+            assert (reported == "–") == (name not in stored), (bodies, other, column)
+            assert reported == "–" or close(reported, stored[name]), (bodies, other, column)
 
 
 def test_the_drifts():
@@ -60,12 +60,12 @@ def test_the_drifts():
     late = [row for row in stored if row["time"] == 1000]
     rows = table("scenario")
     assert len(rows) == len(late) == 21
-    for told, row in zip(rows, late, strict=True):
-        assert (told["scenario"], told["variant"]) == (row["scenario"], row["variant"])
-        assert float(told["rtol"]) == row["rtol"]
+    for reported, row in zip(rows, late, strict=True):
+        assert (reported["scenario"], reported["variant"]) == (row["scenario"], row["variant"])
+        assert float(reported["rtol"]) == row["rtol"]
         for column, name in (
             ("joint gap, m", "gap"),
             ("gap rate, m/s", "gap_rate"),
             ("energy error", "energy"),
         ):
-            assert told[column] == f"{row[name]:.1e}"
+            assert reported[column] == f"{row[name]:.1e}"

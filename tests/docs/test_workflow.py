@@ -65,11 +65,11 @@ def test_commands_of_the_nightly_exist():
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     lines = [line for step in workflow_steps() for line in step.get("run", "").splitlines()]
     made = [line.split()[1] for line in lines if line.startswith("make ")]
-    asked = [line.partition("-m plumbline ")[2] for line in lines if "-m plumbline " in line]
-    assert made and asked
+    requested = [line.partition("-m plumbline ")[2] for line in lines if "-m plumbline " in line]
+    assert made and requested
     for target in made:
         assert re.search(rf"^{re.escape(target)}:", makefile, re.MULTILINE), target
-    for line in asked:
+    for line in requested:
         name, *words = shlex.split(re.sub(r"\$\{SEED:\+(.*?)\}( |$)", r"\1 ", line).partition("||")[0])
         options = {option for param in main.get_command(None, name).params for option in param.opts}
         assert {word for word in words if word.startswith("--")} <= options, line

@@ -55,7 +55,9 @@ def worst_ratios(result):
     """The largest error over its bound, per engine, of rows only counted and of rows kept."""
     counted = [(cell["engine"], cell["ratio"]) for cell in result.metadata["random_batch"]["worst_ratios"]]
     kept = [(row.engine, row.ratio) for row in result.rows if row.ratio is not None]
-    return {engine: max(ratio for who, ratio in counted + kept if who == engine) for engine in ENGINES}
+    return {
+        engine: max(ratio for context, ratio in counted + kept if context == engine) for engine in ENGINES
+    }
 
 
 def count_by_verdict(result):

@@ -91,11 +91,11 @@ def state_report(defect):
     """Quantities that disagree at state level, and the diagnosis."""
     model, truth = subject(defect.joints, defect.loaded)
     with planted(defect, model) as engine:
-        said = engine.evaluate(model, truth.states)
-        who = RowContext("planted", "planted", defect.name, defect.name, "0")
-        rows = judge_states(who, truth, Evaluation(said, None, None, 0.0)).rows
+        reported = engine.evaluate(model, truth.states)
+        context = RowContext("planted", "planted", defect.name, defect.name, "0")
+        rows = judge_states(context, truth, Evaluation(reported, None, None, 0.0)).rows
         wrong = [row.quantity for row in rows if row.verdict == "disagrees"]
-        return wrong, diagnose(model, said, truth, engine.evaluate) if wrong else ""
+        return wrong, diagnose(model, reported, truth, engine.evaluate) if wrong else ""
 
 
 @cache
@@ -106,8 +106,8 @@ def motion_report(defect):
         integrator = engine.integrator(defect.integrator)
         steps = refinement_resolutions(integrator, model.n, float(TIMES[-1]))
         runs = run_refinement_study(defect.engine, integrator.name, model, state, TIMES, steps)
-    who = RowContext("planted", "planted", defect.name, defect.name, "0")
-    rows = judge_trajectory(who, model, truth, integrator, runs).rows
+    context = RowContext("planted", "planted", defect.name, defect.name, "0")
+    rows = judge_trajectory(context, model, truth, integrator, runs).rows
     return [f"{row.verdict}: {row.quantity}: {row.reason}" for row in rows if row.verdict.needs_attention]
 
 
@@ -193,10 +193,10 @@ def test_a_difference_without_single_cause_is_not_named(defect):
 
 def test_a_difference_next_to_the_bound_is_not_named():
     model, truth = subject("balls", False)
-    said = list(truth.quantities)
+    reported = list(truth.quantities)
     shift = 1.8 * truth.bounds[3].acceleration[:, None] * np.array([[0.6, -0.48, 0.64]])
-    said[3] = replace(said[3], acceleration=said[3].acceleration + shift)
-    assert diagnose(model, said, truth).startswith("the difference is too close to the rounding bound")
+    reported[3] = replace(reported[3], acceleration=reported[3].acceleration + shift)
+    assert diagnose(model, reported, truth).startswith("the difference is too close to the rounding bound")
 
 
 def test_the_diagnosis_states_where_the_difference_persists():
@@ -223,9 +223,9 @@ def test_rates(record_property, capsys):
     killed = [d for d in DEFECTS if (motion_report(d) if d.level == "motion" else state_report(d)[0])]
     nameable = [d for d in DEFECTS if d.named]
     named = [d for d in nameable if any(words in state_report(d)[1] for words in d.named)]
-    said = [d for d in (*STATE_DEFECTS, *UNNAMEABLE) if "behaves as if" in state_report(d)[1]]
-    said += [d for d in UNNAMEABLE if not state_report(d)[1].startswith("no single change")]
-    false = [d.name for d in said if (d.named and d not in named) or d in UNNAMEABLE]
+    reported = [d for d in (*STATE_DEFECTS, *UNNAMEABLE) if "behaves as if" in state_report(d)[1]]
+    reported += [d for d in UNNAMEABLE if not state_report(d)[1].startswith("no single change")]
+    false = [d.name for d in reported if (d.named and d not in named) or d in UNNAMEABLE]
     false += [d.name for d in BRANCHES if WITHOUT_NAME not in state_report(d)[1]]
     figures = {
         "planted": len(DEFECTS),

@@ -98,13 +98,17 @@ def stored_cells(out):
 def check_results_after_kills(tmp_path, kills, level):
     """Kill ``kills`` times at random moments; runs that finish between them are checked."""
     rng = random.Random(20)
-    calm = tmp_path / "calm"
+    uninterrupted = tmp_path / "calm"
     begin = time.monotonic()
     subprocess.run(
-        run_command(calm, "--level", level), cwd=ROOT, env=environment(calm), capture_output=True, check=True
+        run_command(uninterrupted, "--level", level),
+        cwd=ROOT,
+        env=environment(uninterrupted),
+        capture_output=True,
+        check=True,
     )
     longest = time.monotonic() - begin
-    expected = comparable_results(calm)
+    expected = comparable_results(uninterrupted)
     done, finished = 0, 0
     while done < kills:
         out = tmp_path / f"rough{finished}"
@@ -188,10 +192,10 @@ def test_a_damaged_cell_is_named_and_runs_again(tmp_path):
     paths[0].write_bytes(data)
     paths[1].write_bytes(paths[1].read_bytes()[:-1])
     paths[2].write_bytes(b"")
-    told = []
-    rows, ran = run_and_count(DiskResultCache(tmp_path, told.append))
+    reported = []
+    rows, ran = run_and_count(DiskResultCache(tmp_path, reported.append))
     assert ran == 3 and rows == expected
-    assert len(told) == 3 and all("damaged" in sentence for sentence in told)
+    assert len(reported) == 3 and all("damaged" in sentence for sentence in reported)
 
 
 def test_a_lost_cell_is_tried_again(tmp_path):
@@ -247,8 +251,8 @@ def run_in_process(*more):
 
 def test_an_unchanged_run_computes_nothing_and_a_fresh_one_everything(tmp_path):
     for out, more in ((tmp_path / "1", ()), (tmp_path / "2", ()), (tmp_path / "3", ("--fresh",))):
-        told = run_in_process("--out", str(out), *more)
-        assert ("2 answers of earlier runs were used" in told) == (out.name == "2")
+        reported = run_in_process("--out", str(out), *more)
+        assert ("2 answers of earlier runs were used" in reported) == (out.name == "2")
     first, again, fresh = (comparable_results(tmp_path / name) for name in "123")
     assert first == again == fresh
 

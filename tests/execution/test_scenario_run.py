@@ -115,16 +115,16 @@ def exit_process(*_):
 
 
 def test_in_a_run_the_second_truth_is_handed_over(monkeypatch):
-    truth, asked = ScenarioRun.truth_task, []
+    truth, requested = ScenarioRun.truth_task, []
 
     def first_crashes(self, key, *uncompiled):
-        asked.append(truth(self, key, *uncompiled))
-        return asked[-1] if uncompiled else replace(asked[-1], function=exit_process)
+        requested.append(truth(self, key, *uncompiled))
+        return requested[-1] if uncompiled else replace(requested[-1], function=exit_process)
 
     monkeypatch.setattr(ScenarioRun, "truth_task", first_crashes)
     chosen = loader.load_scenario(loader.find_scenario_file("rest"))
     result = run_plan(Plan([chosen], ["mujoco"], "trajectory", limits=Limits(120)), lambda *_: None)
-    assert len(asked) == 2
+    assert len(requested) == 2
     assert result.metadata["exit_code"] == 0, result.metadata["sentence"]
 
 

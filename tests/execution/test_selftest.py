@@ -56,14 +56,14 @@ def test_one_that_hangs_is_ended(tmp_path):
 def test_a_night_whose_self_test_misses_a_defect_is_not_green(tmp_path, trouble):
     pytest.importorskip("mujoco")
 
-    def said(report):
+    def reported(report):
         report.write_text("<testsuite/>")
         return SelfTestResult({"planted": 67, "reported": 67}, trouble)
 
     _, place = nightly.run_nightly(
         tmp_path, loader.load_scenarios(["rest"]), ["mujoco"], random_count=0, seed=1, jobs=1,
         limits=Limits(), is_full_catalogue=False, command="-", level="state",
-        self_test=said, progress=lambda *_: None,
+        self_test=reported, progress=lambda *_: None,
         log=lambda _: None,
     )  # fmt: skip
     run = json.loads((place / "results.json").read_text())["run"]

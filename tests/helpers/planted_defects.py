@@ -58,8 +58,8 @@ def plant(real: type[Adapter], defect: Defect) -> Adapter:
     class Planted(real):  # type: ignore[misc, valid-type]
         def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
             given = [defect.inputs(model, s) if defect.inputs else (model, s) for s in states]
-            said = [super(Planted, self)._evaluate(m, [s])[0] for m, s in given]
-            return defect.answers(model, list(states), said) if defect.answers else said
+            reported = [super(Planted, self)._evaluate(m, [s])[0] for m, s in given]
+            return defect.answers(model, list(states), reported) if defect.answers else reported
 
         def _simulate(
             self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
@@ -202,10 +202,10 @@ def single_inside(model: Model, state: State) -> tuple[Model, State]:
 def field(name: str, change: Callable[[Model, State, Any], Any]) -> Answers:
     """One quantity of each answer altered."""
 
-    def alter(model: Model, states: list[State], said: list[StateQuantities]) -> list[StateQuantities]:
+    def alter(model: Model, states: list[State], reported: list[StateQuantities]) -> list[StateQuantities]:
         return [
             replace(a, **{name: change(model, s, getattr(a, name))})
-            for s, a in zip(states, said, strict=True)
+            for s, a in zip(states, reported, strict=True)
         ]
 
     return alter
@@ -214,9 +214,11 @@ def field(name: str, change: Callable[[Model, State, Any], Any]) -> Answers:
 def stale(*names: str) -> Answers:
     """Fields still hold what they were at the state before."""
 
-    def alter(_: Model, __: list[State], said: list[StateQuantities]) -> list[StateQuantities]:
-        before = [said[-1], *said[:-1]]
-        return [replace(a, **{n: getattr(b, n) for n in names}) for a, b in zip(said, before, strict=True)]
+    def alter(_: Model, __: list[State], reported: list[StateQuantities]) -> list[StateQuantities]:
+        before = [reported[-1], *reported[:-1]]
+        return [
+            replace(a, **{n: getattr(b, n) for n in names}) for a, b in zip(reported, before, strict=True)
+        ]
 
     return alter
 
@@ -231,10 +233,10 @@ def spin_part(model: Model, state: State) -> Array:
     return np.asarray(0.5 * np.einsum("ki,kij,kj", state.omega, model.inertia, state.omega))
 
 
-def about_centre(model: Model, state: State, said: Array) -> Array:
+def about_centre(model: Model, state: State, reported: Array) -> Array:
     """Angular momentum about the common centre of mass instead of the pivot."""
     centre = model.mass @ state.r / np.sum(model.mass)
-    return np.asarray(said - np.cross(centre, model.mass @ state.v))
+    return np.asarray(reported - np.cross(centre, model.mass @ state.v))
 
 
 def far_centripetal(model: Model, state: State) -> Array:
@@ -434,11 +436,11 @@ def stale_state(*names: str) -> Inputs:
 def stale_of(k: int, name: str) -> Answers:
     """One body's row still holds what it was at the state before."""
 
-    def alter(_: Model, __: list[State], said: list[StateQuantities]) -> list[StateQuantities]:
-        before = [said[-1], *said[:-1]]
+    def alter(_: Model, __: list[State], reported: list[StateQuantities]) -> list[StateQuantities]:
+        before = [reported[-1], *reported[:-1]]
         return [
             replace(a, **{name: only(k, getattr(a, name), getattr(b, name))})
-            for a, b in zip(said, before, strict=True)
+            for a, b in zip(reported, before, strict=True)
         ]
 
     return alter
@@ -690,7 +692,8 @@ BODY_DEFECTS = (
     Defect("weight-2-at-proximal", "weight of body 2 at its proximal point",
            ("weight of body 2 acted at its proximal point",), M,
            inputs=moment_added(acting_at("proximal", lambda m, _: m.mass[:, None] * m.gravity), 1)),
-    Defect("weight-at-distal", "all weights at the distal points", ("weight acted at the distal point",), P,
+    Defect("weight-at-distal", "weights at the distal points, which the last body has none of",
+           ("weight of body 1 acted at its distal point",), P,
            inputs=moment_added(acting_at("distal", lambda m, _: m.mass[:, None] * m.gravity))),
     # drag
     Defect("drag-force-2-dropped", "c_t of body 2 × 0", ("drag force of body 2",), M, loaded=True,
@@ -936,27 +939,27 @@ def other_units(mass: float, length: float) -> Defect:
         other = model.changed(**{name: getattr(model, name) * f for name, f in factors.items()})
         return other, relifted(other, state)
 
-    def back(model: Model, states: list[State], said: list[StateQuantities]) -> list[StateQuantities]:
+    def back(model: Model, states: list[State], reported: list[StateQuantities]) -> list[StateQuantities]:
         factors = {
             "acceleration": x, "joint_reaction": m * x, "kinetic_energy": m * x * x,
             "potential_energy": m * x * x, "angular_momentum": m * x * x, "mass_matrix": m * x * x,
         }  # fmt: skip
         return [
             replace(a, **{k: getattr(a, k) / f for k, f in factors.items() if getattr(a, k) is not None})
-            for a in said
+            for a in reported
         ]
 
     return Defect("", "", inputs=inputs, answers=back)
 
 
-def no_matrix(_: Model, __: list[State], said: list[StateQuantities]) -> list[StateQuantities]:
+def no_matrix(_: Model, __: list[State], reported: list[StateQuantities]) -> list[StateQuantities]:
     """The mass matrix belongs to the engine's own coordinates and is not given."""
-    return [replace(a, mass_matrix=None) for a in said]
+    return [replace(a, mass_matrix=None) for a in reported]
 
 
 def after(first: Answers | None, second: Answers) -> Answers:
     """Two changes of the answers in a row."""
-    return lambda m, states, said: second(m, states, first(m, states, said) if first else said)
+    return lambda m, states, reported: second(m, states, first(m, states, reported) if first else reported)
 
 
 def recomputed_reaction(order: int) -> Callable[[Model, State, StateQuantities], dict[str, Any]]:
@@ -973,7 +976,9 @@ def recomputed_reaction(order: int) -> Callable[[Model, State, StateQuantities],
 
 def recomputed(change: Callable[[Model, State, StateQuantities], dict[str, Any]]) -> Answers:
     """Quantities recomputed from model, state and the other answers."""
-    return lambda m, states, said: [replace(a, **change(m, s, a)) for s, a in zip(states, said, strict=True)]
+    return lambda m, states, reported: [
+        replace(a, **change(m, s, a)) for s, a in zip(states, reported, strict=True)
+    ]
 
 
 def sums(order: int) -> Callable[[Model, State, StateQuantities], dict[str, Any]]:

@@ -32,8 +32,8 @@ def entry(**changes):
     return known_issues.KnownIssue(**{**ENTRY, **changes})
 
 
-def row(verdict="disagrees", quantity="acceleration", who=WHO):
-    return who.make_row("state", "-", quantity, verdict, "why")
+def row(verdict="disagrees", quantity="acceleration", context=WHO):
+    return context.make_row("state", "-", quantity, verdict, "why")
 
 
 def judged_by(rows, entries, whole, finer=False, bodies=1):
@@ -179,8 +179,8 @@ def test_what_an_entry_may_name(tmp_path, changes):
 
 
 def ratio_row(ratio, level="state", quantity="acceleration", engine="mujoco", verdict="disagrees"):
-    who = RowContext("tumbling-ball", "single", engine, "MuJoCo", "4.0.0")
-    return who.make_row(level, "-", quantity, verdict, "why", ratio=ratio)
+    context = RowContext("tumbling-ball", "single", engine, "MuJoCo", "4.0.0")
+    return context.make_row(level, "-", quantity, verdict, "why", ratio=ratio)
 
 
 @pytest.mark.parametrize(
@@ -264,9 +264,9 @@ def test_information_needs_no_entry_and_matches_none():
 
 def test_only_random_scenarios_may_show_it_sometimes():
     chance = entry(scenario="random-*", intermittent="at times")
-    who = RowContext("random-1-2", "random", "mujoco", "MuJoCo", "4.0.0")
-    assert judged_by([row("agrees", who=who)], [chance], whole=True).stale == []
-    assert judged_by([row(who=who)], [chance], whole=True).rows[0].known_issue == "a"
+    context = RowContext("random-1-2", "random", "mujoco", "MuJoCo", "4.0.0")
+    assert judged_by([row("agrees", context=context)], [chance], whole=True).stale == []
+    assert judged_by([row(context=context)], [chance], whole=True).rows[0].known_issue == "a"
 
 
 def test_a_size_may_be_in_proportion_to_the_chains_ratio_of_inertias():
@@ -340,8 +340,8 @@ def test_the_projects_own_file_is_valid_and_gives_evidence():
 )
 @pytest.mark.parametrize("engine", ["mujoco", "mujoco@3.12.0"])
 def test_an_entry_covers_what_all_its_patterns_match(changes, spoken_of, engine):
-    who = RowContext("tumbling-ball", "single", engine, "MuJoCo", "4.0.0")
-    assert covers(entry(**changes), row(who=who)) is spoken_of
+    context = RowContext("tumbling-ball", "single", engine, "MuJoCo", "4.0.0")
+    assert covers(entry(**changes), row(context=context)) is spoken_of
 
 
 @pytest.mark.parametrize(
@@ -354,8 +354,8 @@ def test_an_entry_covers_what_all_its_patterns_match(changes, spoken_of, engine)
     ],
 )
 def test_versions_that_are_none_and_those_before_a_release(version, versions, inside):
-    who = RowContext("tumbling-ball", "single", "mujoco", "MuJoCo", version)
-    assert covers(entry(versions=versions), row(who=who)) is inside
+    context = RowContext("tumbling-ball", "single", "mujoco", "MuJoCo", version)
+    assert covers(entry(versions=versions), row(context=context)) is inside
 
 
 def test_the_entry_with_the_rows_verdict_excuses_it_and_the_other_is_stale():

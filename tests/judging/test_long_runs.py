@@ -38,10 +38,10 @@ def run_long(name, engine, integrator, seconds=100.0):
     method = chosen.integrator(integrator)
     plan = plan_long_run(method, s.model.n, seconds)
     study = run_long_run_study(chosen.name, integrator, s.model, s.state, s.sample_interval, plan)
-    who = RowContext(name, s.family, chosen.name, chosen.title, "1")
+    context = RowContext(name, s.family, chosen.name, chosen.title, "1")
     return {
         row.quantity: row
-        for row in judge_long_runs(who, s.model, method, study, s.closed_form is not None).rows
+        for row in judge_long_runs(context, s.model, method, study, s.closed_form is not None).rows
     }
 
 

@@ -50,16 +50,18 @@ def test_the_ways_back_are_those_of_the_equations(joints):
         for state in random_states_of(here):
             right = evaluate_case(make_defect_case(here, [state]))
             other_model, other_state = relation.transform(here, state)
-            said = {q: x[0] for q, x in evaluate_case(make_defect_case(other_model, [other_state])).items()}
-            back = relation.transform_back(_as_state_quantities(said))
+            reported = {
+                q: x[0] for q, x in evaluate_case(make_defect_case(other_model, [other_state])).items()
+            }
+            back = relation.transform_back(_as_state_quantities(reported))
             for q, x in back.items():
                 np.testing.assert_allclose(x, right[q][0], rtol=1e-11, atol=1e-11 * np.max(np.abs(right[q])))
 
 
-def _as_state_quantities(said):
+def _as_state_quantities(reported):
     from plumbline.model.datatypes import StateQuantities
 
-    return StateQuantities(**{q: x if np.ndim(x) else float(x) for q, x in said.items()})
+    return StateQuantities(**{q: x if np.ndim(x) else float(x) for q, x in reported.items()})
 
 
 @pytest.mark.parametrize(
@@ -137,7 +139,7 @@ def test_a_refused_state_is_left_out_and_a_refusing_engine_is_reported():
     class Refusing(type(load_adapter("mujoco"))):
         name = "refusing"
 
-        def _evaluate(self, model, asked):
+        def _evaluate(self, model, requested):
             raise Unsupported("not on a Monday")
 
     model = pendulums.make_model(JOINT_PATTERNS["ball"])
@@ -253,9 +255,13 @@ def test_halves_have_roundings_of_their_own():
     assert 0 <= abs(two.potential_energy - whole.potential_energy) <= welded.potential_energy
     for q in QUANTITIES:
         assert np.all(np.asarray(welded.tolerance(q)) >= plain.tolerance(q))
-    with patch("plumbline.judging.state_relations.check_state_relation", wraps=check_state_relation) as asked:
+    with patch(
+        "plumbline.judging.state_relations.check_state_relation", wraps=check_state_relation
+    ) as requested:
         check_relations("mujoco", model, [at])
-    (_, *_, (one,), (other,)) = next(c.args for c in asked.call_args_list if c.args[0].name == WELDED_HALVES)
+    (_, *_, (one,), (other,)) = next(
+        c.args for c in requested.call_args_list if c.args[0].name == WELDED_HALVES
+    )
     assert one.potential_energy == 0 and other.potential_energy == welded.potential_energy
 
 
@@ -272,9 +278,9 @@ def test_mujoco_s_solvers_have_nothing_to_do(joints):
         chain.m.opt.solver = getattr(mujoco.mjtSolver, f"mjSOL_{kind}")
         chain.m.opt.jacobian = getattr(mujoco.mjtJacobian, f"mjJAC_{jacobian}")
         for at, right in zip(random_states_of(model), usual, strict=True):
-            said = chain.quantities(at)
+            reported = chain.quantities(at)
             assert chain.d.nefc == 0
-            assert all(np.array_equal(getattr(said, q), getattr(right, q)) for q in vars(right))
+            assert all(np.array_equal(getattr(reported, q), getattr(right, q)) for q in vars(right))
 
 
 def test_an_option_that_there_is_not_is_refused():

@@ -41,10 +41,10 @@ METHOD = Integrator("trapezoidal", "step", 2, is_symmetric=True)
 
 
 def test_values_are_what_is_offered_times_its_factor():
-    said = StateQuantities(np.ones((2, 3)), 2 * np.ones((2, 3)), kinetic_energy=3.0)
-    found = quantity_values(said, kinetic_energy=0.5, joint_reaction=9.0)
+    reported = StateQuantities(np.ones((2, 3)), 2 * np.ones((2, 3)), kinetic_energy=3.0)
+    found = quantity_values(reported, kinetic_energy=0.5, joint_reaction=9.0)
     assert set(found) == {"acceleration", "angular_acceleration", "kinetic_energy"}
-    assert found["kinetic_energy"] == 1.5 and np.array_equal(found["acceleration"], said.acceleration)
+    assert found["kinetic_energy"] == 1.5 and np.array_equal(found["acceleration"], reported.acceleration)
     twice = scale_fields(MODEL, mass=2.0, length=3.0)
     assert np.array_equal(twice.mass, 2 * MODEL.mass) and np.array_equal(twice.length, 3 * MODEL.length)
     assert np.array_equal(twice.inertia, MODEL.inertia)
@@ -53,24 +53,24 @@ def test_values_are_what_is_offered_times_its_factor():
 def self_relation_result(*shifts, relation=None, refuse=(), refuse_here=()):
     """The relation of an engine with itself, answers shifted: (state, quantity, so many bounds of both)."""
     bounds = [state_rounding_bound(MODEL, s) for s in STATES]
-    said = list(load_adapter("reference").evaluate(MODEL, STATES))
-    other = list(said)
+    reported = list(load_adapter("reference").evaluate(MODEL, STATES))
+    other = list(reported)
     for index, quantity, by in shifts:
-        x = np.asarray(getattr(said[index], quantity))
+        x = np.asarray(getattr(reported[index], quantity))
         off = by * 2 * np.asarray(bounds[index].tolerance(quantity))
         off = off[:, None] * [0.6, 0, -0.8] if x.ndim == 2 else off * np.eye(3)[0] if x.ndim else -off
         other[index] = replace(other[index], **{quantity: x + off})
-    asked = iter(range(3))
+    requested = iter(range(3))
 
     def there(_model, _states):
-        index = next(asked)
+        index = next(requested)
         if index in refuse:
             raise Unsupported(f"not state {index}")
         return [other[index]]
 
-    said = [Unsupported(f"nor state {k}") if k in refuse_here else x for k, x in enumerate(said)]
+    reported = [Unsupported(f"nor state {k}") if k in refuse_here else x for k, x in enumerate(reported)]
     relation = relation or Relation("as itself", unchanged, quantity_values)
-    return check_state_relation(relation, said, there, MODEL, STATES, bounds, bounds)
+    return check_state_relation(relation, reported, there, MODEL, STATES, bounds, bounds)
 
 
 @pytest.mark.parametrize("quantity", QUANTITIES)

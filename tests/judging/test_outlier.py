@@ -37,16 +37,16 @@ def rows_of_engines(*defective_engines, defect="mass-1-1e-5", leave_out=()):
         engine = load_adapter(name)
         if name in defective_engines:
             engine = plant(type(engine), replace(planted, engine=name))
-        said = Evaluation(engine.evaluate(model, right.states), None, None, 0.0)
-        found += judge_states(RowContext("s", "f", name, engine.title, "0"), right, said).rows
+        reported = Evaluation(engine.evaluate(model, right.states), None, None, 0.0)
+        found += judge_states(RowContext("s", "f", name, engine.title, "0"), right, reported).rows
     return found
 
 
 @pytest.mark.parametrize("name", ENGINES)
 def test_one_engine_against_the_others_is_the_outlier(name):
     text = describe_outliers(rows_of_engines(name))
-    who, others = text.split("; ")
-    assert who.startswith(f"outlier: {name} in acceleration, angular acceleration")
+    context, others = text.split("; ")
+    assert context.startswith(f"outlier: {name} in acceleration, angular acceleration")
     assert others == (
         ", ".join(sound := [e for e in ENGINES if e != name])[: -len(sound[-1]) - 2]
         + f" and {sound[-1]} agree with the certified truth and, within the sum of their bounds, "

@@ -24,13 +24,13 @@ CHAIN_QUANTITIES = [quantity for quantity in STATE_UNITS if quantity != "joint_m
 
 def acceleration_verdict(scale_of_bound, shift=0.0):
     """The verdict on acceleration of the reference against itself, its bound and answer changed."""
-    said = load_adapter("reference").evaluate(MODEL, STATES)
+    reported = load_adapter("reference").evaluate(MODEL, STATES)
     bounds = [state_rounding_bound(MODEL, s) for s in STATES]
     bounds = [replace(b, acceleration=b.acceleration * scale_of_bound) for b in bounds]
-    truth = StateTruth(STATES, said, bounds, "itself")
+    truth = StateTruth(STATES, reported, bounds, "itself")
     off = [
         replace(a, acceleration=a.acceleration + shift * b.acceleration[:, None])
-        for a, b in zip(said, bounds, strict=True)
+        for a, b in zip(reported, bounds, strict=True)
     ]
     rows = judge_states(WHO, truth, Evaluation(off, None, None, 0.0)).rows
     return next(row.verdict for row in rows if row.quantity == "acceleration")
@@ -110,12 +110,12 @@ def judge_shifted_answers(*off, bounds=None, **evaluation):
     """Findings on answers that are ``off`` by so many bounds of acceleration: (state, body, bounds)."""
     right = load_adapter("reference").evaluate(MODEL, STATES)
     bounds = bounds or [state_rounding_bound(MODEL, s) for s in STATES]
-    said = list(right)
+    reported = list(right)
     for state, body, by in off:
         shift = np.zeros((2, 3))
         shift[body] = by * bounds[state].acceleration[body] * np.array([2.0, -1.0, 2.0]) / 3
-        said[state] = replace(said[state], acceleration=said[state].acceleration + shift)
-    answer = {"quantities": said, "unsupported": None, "failure": None, "cpu_time": 0.25} | evaluation
+        reported[state] = replace(reported[state], acceleration=reported[state].acceleration + shift)
+    answer = {"quantities": reported, "unsupported": None, "failure": None, "cpu_time": 0.25} | evaluation
     return judge_states(WHO, StateTruth(STATES, right, bounds, "itself"), Evaluation(**answer))
 
 

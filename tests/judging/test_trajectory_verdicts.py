@@ -228,12 +228,12 @@ def test_runs_that_did_not_stay_finite_are_points_of_the_study():
     for index in range(5):
         some.runs[index] = replace(some.runs[index], trajectory=None)
     alone = judge_trajectory(WHO, MODEL, make_truth(), METHOD, some)
-    said = {row.quantity: row for row in alone.rows}
+    reported = {row.quantity: row for row in alone.rows}
     for name in ("position_limit", "attitude_limit"):
-        assert said[name].verdict == "unresolved" and "fewer than two" in said[name].reason
-        assert (said[name].level, said[name].integrator) == ("trajectory", "Heun")
-        assert said[name].unit == ("m" if name == "position_limit" else "rad")
-    assert "position" not in said
+        assert reported[name].verdict == "unresolved" and "fewer than two" in reported[name].reason
+        assert (reported[name].level, reported[name].integrator) == ("trajectory", "Heun")
+        assert reported[name].unit == ("m" if name == "position_limit" else "rad")
+    assert "position" not in reported
     curves = dict(alone.tables)["curves"]
     assert np.all(np.isnan([curves["limit_error"], curves["tolerance"]]))
     some.runs[-1] = replace(some.runs[-1], trajectory=None, failure="NaN at 1 s")
@@ -403,10 +403,10 @@ def test_a_drift_of_rounding_agrees_at_once(steps, counted):
     assert base.ratio == pytest.approx(base.value / base.tolerance)
     assert base.derivation.startswith(f"{steps} steps, ") and base.compared_until == 2.0
     held = refinement_study([0.0] * 6, steps=steps)
-    for factor, said in ((0.9, True), (1.1, False)):
+    for factor, reported in ((0.9, True), (1.1, False)):
         grown = TRUE_TRAJECTORY.p * (1 + factor * base.tolerance * TIMES / 2)[:, None, None]
         held.runs[-1] = replace(held.runs[-1], trajectory=replace(held.runs[-1].trajectory, p=grown))
-        assert judged_rows(held)["norm_drift"].reason.endswith("rounding") is said
+        assert judged_rows(held)["norm_drift"].reason.endswith("rounding") is reported
 
 
 def test_what_the_quadrature_of_the_work_leaves_open_is_allowed():

@@ -325,10 +325,10 @@ def test_open_joints_close_at_the_stabilisation_rate(rods):
 
     C = left(run(model, opened, 1e-9, times, baumgarte=a))
     (C_0, rate_0), t = C[0], times[:, None, None]
-    told = (C_0 + (rate_0 + a * C_0) * t) * np.exp(-a * t)
+    reported = (C_0 + (rate_0 + a * C_0) * t) * np.exp(-a * t)
     assert np.max(np.abs(C_0)) > 0.01
     growth = 1e3  # of local errors of 1e-9, as above
-    np.testing.assert_allclose(C[:, 0], told, rtol=0, atol=growth * 1e-9)
+    np.testing.assert_allclose(C[:, 0], reported, rtol=0, atol=growth * 1e-9)
     # Numbers of size 1, some roundings each.
     assert np.max(np.abs(left(run(model, opened, 1e-9, times, project=True))[1:, 0])) < 1e-14
 

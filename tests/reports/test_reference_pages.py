@@ -231,10 +231,10 @@ def test_the_command_writes_the_map(tmp_path):
     (tmp_path / "sweep.yaml").write_text(head + "\n  ".join(vary))
     ran = CliRunner().invoke(main, ["sweep", str(tmp_path / "sweep.yaml"), "--out", str(tmp_path / "out")])
     assert ran.exit_code == 0, ran.output
-    told = words((tmp_path / "out" / "sweep.html").read_text(encoding="utf-8"))
-    assert "4 cells: reference agrees 4" in told
-    assert "bodies[0].angular_velocity[0] ↓" in told
-    assert "Scenario tumbling-ball Count 1 Seed 0 Duration 0.25" in told
+    reported = words((tmp_path / "out" / "sweep.html").read_text(encoding="utf-8"))
+    assert "4 cells: reference agrees 4" in reported
+    assert "bodies[0].angular_velocity[0] ↓" in reported
+    assert "Scenario tumbling-ball Count 1 Seed 0 Duration 0.25" in reported
 
 
 def _whole(rows):

@@ -205,5 +205,5 @@ def test_literals_are_exact_and_hostile_names_stay_text(tmp_path):
 )
 def test_what_has_no_script_is_explained_in_a_sentence(engine, level, quantity, integrator, words):
     row = {"level": level, "quantity": quantity, "integrator": integrator}
-    said = no_script_reason(engine, row)
-    assert words in said and bool(words) == bool(said)
+    reported = no_script_reason(engine, row)
+    assert words in reported and bool(words) == bool(reported)

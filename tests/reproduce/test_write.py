@@ -38,10 +38,10 @@ def results(tmp_path):
         "state": {k: getattr(scenario.state, k).tolist() for k in ("p", "omega", "u", "udot")},
     }
     version = load_adapter("pinocchio-aba").version()
-    who = RowContext("chain", "chain", "pinocchio-aba", "Pinocchio", version)
+    context = RowContext("chain", "chain", "pinocchio-aba", "Pinocchio", version)
     rows = [
         results_store.row_record(
-            who.make_row(level, integrator, quantity, verdict, "off", ratio=400.0, extra={"state": 0.0})
+            context.make_row(level, integrator, quantity, verdict, "off", ratio=400.0, extra={"state": 0.0})
         ) | {"key": key}
         for key, level, integrator, quantity, verdict in (
             ("a", "state", "-", "acceleration", "disagrees"),

@@ -19,9 +19,9 @@ def store_run(folder, day, verdicts, version="4.0", known=None, family="single",
     """Store a run of one scenario per verdict: "s", then "s1", …; as a nightly's where it has a number."""
     rows = []
     for k, verdict in enumerate(verdicts):
-        who = RowContext(f"s{k or ''}", family, "mujoco", "MuJoCo", version)
+        context = RowContext(f"s{k or ''}", family, "mujoco", "MuJoCo", version)
         more = {"value": 10.0**-day, "tolerance": 1.0, "known_issue": known}
-        rows.append(who.make_row("state", "-", "acceleration", verdict, f"it {verdict}", "m/s²", **more))
+        rows.append(context.make_row("state", "-", "acceleration", verdict, f"it {verdict}", "m/s²", **more))
     bad = any(v != "agrees" for v in verdicts) and known is None
     run = {
         "id": f"2026010{day}T000000Z",
@@ -143,9 +143,9 @@ def test_an_empty_folder_has_no_nights(tmp_path):
 def test_the_command_reports_it(tmp_path):
     store_run(tmp_path / "history", 1, ["agrees"])
     store_run(tmp_path / "history", 2, ["disagrees"])
-    said = CliRunner().invoke(main, ["history", str(tmp_path)])
-    assert said.exit_code == 0, said.output
-    assert f"{KEY} disagrees since 20260102T000000Z" in " ".join(said.output.split())
+    reported = CliRunner().invoke(main, ["history", str(tmp_path)])
+    assert reported.exit_code == 0, reported.output
+    assert f"{KEY} disagrees since 20260102T000000Z" in " ".join(reported.output.split())
     data = CliRunner().invoke(main, ["history", str(tmp_path), "--key", "s/*", "--json"])
     assert len(json.loads(data.output)["trend"]) == 2
     nothing = CliRunner().invoke(main, ["history", str(tmp_path / "absent")])

@@ -25,15 +25,15 @@ def measure_drift(names, longest, **options):
 
 
 def test_every_variant_and_time_has_a_row_and_the_drift_is_the_raw_one(tmp_path):
-    told: list[str] = []
-    rows = measure_drift(["tumbling-ball"], 60, times=(1.0, 10.0), log=told.append)
+    reported: list[str] = []
+    rows = measure_drift(["tumbling-ball"], 60, times=(1.0, 10.0), log=reported.append)
     assert [(row["variant"], row["time"]) for row in rows] == [(v, t) for v in VARIANTS for t in (1.0, 10.0)]
     late = {row["variant"]: row for row in rows if row["time"] == 10.0}
     assert late["raw"]["gap"] > 10 * late["baumgarte"]["gap"] > 1e-11
     assert late["projected"]["gap"] < 1e-14
     assert all(0 < row["energy"] < 1e-5 and row["cpu_seconds"] > 0 and not row["reason"] for row in rows)
-    assert len(told) == len(VARIANTS)
-    assert all("to 10 s, about" in sentence for sentence in told)
+    assert len(reported) == len(VARIANTS)
+    assert all("to 10 s, about" in sentence for sentence in reported)
 
 
 def test_a_time_that_costs_too_much_is_left_out_with_a_reason():

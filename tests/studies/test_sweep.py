@@ -124,8 +124,8 @@ def judged_by_run_and_sweep(defect):
             return run_refinement("mujoco", method.name, s.model, s.state, s.times, steps)
 
     run_steps = refinement_resolutions(method, s.model.n, s.duration)
-    who = RowContext(s.name, s.family, "mujoco", "MuJoCo", "0")
-    rows = judge_trajectory(who, s.model, truth, method, study(run_steps)).rows
+    context = RowContext(s.name, s.family, "mujoco", "MuJoCo", "0")
+    rows = judge_trajectory(context, s.model, truth, method, study(run_steps)).rows
     own, _ = sweep._judge_cell(info, method, s, study(sweep._resolutions(method, s, None)), truth)
     return {row.verdict for row in rows if row.verdict.is_comparison or row.verdict == "failed"}, own.verdict
 

@@ -96,25 +96,25 @@ def max_norm(v):
 
 def test_energy_momentum_and_mass_matrix_follow_their_definitions():
     model, state = random_chain(np.random.default_rng(2), [1, 0, 1])
-    said = certify_state(model, state, mass_matrix=True).quantities
+    reported = certify_state(model, state, mass_matrix=True).quantities
     A = rotation_matrix(state.p)
     spin = np.einsum("kij,kj->ki", model.inertia, state.omega)
     kinetic = 0.5 * np.sum(model.mass * np.sum(state.v**2, 1)) + 0.5 * np.sum(state.omega * spin)
     momentum = np.sum(np.cross(state.r, model.mass[:, None] * state.v) + (A @ spin[..., None])[..., 0], 0)
-    assert said.kinetic_energy == pytest.approx(kinetic, rel=1e-13)
-    assert said.potential_energy == pytest.approx(9.81 * np.sum(model.mass * state.r[:, 2]), rel=1e-13)
-    assert said.angular_momentum == pytest.approx(momentum, rel=1e-12)
+    assert reported.kinetic_energy == pytest.approx(kinetic, rel=1e-13)
+    assert reported.potential_energy == pytest.approx(9.81 * np.sum(model.mass * state.r[:, 2]), rel=1e-13)
+    assert reported.angular_momentum == pytest.approx(momentum, rel=1e-12)
     rates = np.concatenate([state.udot[model.rods].ravel(), state.omega.ravel()])
-    assert 0.5 * rates @ said.mass_matrix @ rates == pytest.approx(kinetic, rel=1e-13)
-    assert np.array_equal(said.mass_matrix, said.mass_matrix.T)
+    assert 0.5 * rates @ reported.mass_matrix @ rates == pytest.approx(kinetic, rel=1e-13)
+    assert np.array_equal(reported.mass_matrix, reported.mass_matrix.T)
 
 
 def test_power_of_gravity_equals_the_change_of_kinetic_energy():
     """d/dt T = Σ m ṙ·r̈ + ω′·(J ω̇′) = Σ m g·ṙ + loads: the accelerations do what the energies say."""
     model, state = random_chain(np.random.default_rng(4), [0, 1, 1], loads=True)
-    said = certify_state(model, state).quantities
-    change = np.sum(model.mass[:, None] * state.v * said.acceleration)
-    change += np.sum(state.omega * np.einsum("kij,kj->ki", model.inertia, said.angular_acceleration))
+    reported = certify_state(model, state).quantities
+    change = np.sum(model.mass[:, None] * state.v * reported.acceleration)
+    change += np.sum(state.omega * np.einsum("kij,kj->ki", model.inertia, reported.angular_acceleration))
     work = np.sum(state.v * (model.mass[:, None] * model.gravity + model.force)) + np.sum(
         state.omega * model.moment
     )

@@ -113,10 +113,10 @@ def test_state_truth_is_certified_or_states_that_it_is_not():
     with patch("plumbline.truth.ground_truth.certify_state", side_effect=TruthUnavailable("gone")):
         other = ground_truth.state_truth(model, states)
     assert "truth tools are not installed" in other.method
-    said = load_adapter("reference").evaluate(model, states)
+    reported = load_adapter("reference").evaluate(model, states)
     for truth in (found, other):
         assert truth.states == states
-        for mine, theirs, bound, state in zip(truth.quantities, said, truth.bounds, states, strict=True):
+        for mine, theirs, bound, state in zip(truth.quantities, reported, truth.bounds, states, strict=True):
             assert np.array_equal(bound.acceleration, state_rounding_bound(model, state).acceleration)
             for q in bound.scale:
                 off = np.max(np.abs(np.asarray(getattr(mine, q)) - getattr(theirs, q)))
@@ -151,7 +151,7 @@ def test_motion_truth_holds_growth_length_and_detectable_effects():
 @pytest.mark.parametrize(
     ("position", "attitude", "parted"), [(0.9, 0.9, False), (1.1, 0.9, True), (0.9, 1.1, True)]
 )
-def test_two_methods_that_differ_by_more_than_rounding_are_reported(position, attitude, parted):
+def test_two_methods_that_differ_by_more_than_rounding_are_reported(position, attitude, diverged):
     model = pendulums.make_model("b")
     at = pendulums.state_from_seed(model, seed=2, rate=0.5)
     sound = motion_truth(model, at, TIMES, None)
@@ -166,8 +166,8 @@ def test_two_methods_that_differ_by_more_than_rounding_are_reported(position, at
     )
     with patch("plumbline.truth.trajectory.trajectory_truth", lambda *_: made):
         found = motion_truth(model, at, TIMES, None)
-    assert found.method == "made" and bool(found.conflict) is parted
-    assert not parted or (found.conflict.startswith(TRUTHS_DIFFER) and "1.1 times what" in found.conflict)
+    assert found.method == "made" and bool(found.conflict) is diverged
+    assert not diverged or (found.conflict.startswith(TRUTHS_DIFFER) and "1.1 times what" in found.conflict)
 
 
 def test_a_truth_that_is_not_a_number_is_in_doubt() -> None:

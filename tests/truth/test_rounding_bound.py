@@ -27,11 +27,11 @@ from tests.helpers.random_chains import in_other_units, norms_per_body, random_c
 VECTORS = ("acceleration", "angular_acceleration", "joint_reaction")
 
 
-def error_ratios(said, true, bound):
+def error_ratios(reported, true, bound):
     """Per quantity, the largest difference over its tolerance."""
     ratios = {}
     for quantity in bound.scale:
-        value, expected = getattr(said, quantity), getattr(true, quantity)
+        value, expected = getattr(reported, quantity), getattr(true, quantity)
         if value is None or expected is None:
             continue
         difference = np.asarray(value) - np.asarray(expected)
@@ -108,11 +108,11 @@ def check_errors_within_bound(name, count):
             rng, rods, mass_decades=rng.uniform(0, 3), rate=10 ** rng.uniform(-1, 1.3)
         )
         try:
-            said = engine.evaluate(model, [state])[0]
+            reported = engine.evaluate(model, [state])[0]
         except Unsupported:
             continue
         true = certify_state(model, state, mass_matrix=n <= 3).quantities
-        for quantity, ratio in error_ratios(said, true, state_rounding_bound(model, state)).items():
+        for quantity, ratio in error_ratios(reported, true, state_rounding_bound(model, state)).items():
             checks += 1
             worst[quantity] = max(worst.get(quantity, 0.0), ratio)
     print(name, checks, {quantity: f"{ratio:.3f}" for quantity, ratio in worst.items()})
@@ -182,8 +182,10 @@ def smallest_detected_error(what, rods):
         def seen(e, model=model, states=states, bounds=bounds, true=true):
             wrong = MODEL_ERRORS[what](model, e)
             relifted = [state_from_minimal(wrong, s.p, s.omega, s.u, s.udot) for s in states]
-            said = [certify_state(wrong, state).quantities for state in relifted]
-            return any(max(error_ratios(*each).values()) > 1 for each in zip(said, true, bounds, strict=True))
+            reported = [certify_state(wrong, state).quantities for state in relifted]
+            return any(
+                max(error_ratios(*each).values()) > 1 for each in zip(reported, true, bounds, strict=True)
+            )
 
         grid = 10 ** np.arange(-14, -5, 0.25)
         worst = max(worst, grid[bisect.bisect_left(grid, True, hi=len(grid) - 1, key=seen)])

@@ -159,10 +159,10 @@ def test_position_distances_are_relative_to_the_distance_from_the_pivot():
     base, *others = (
         pendulums.reference_trajectory(model, s, times) for s in (state, *perturbed_states(model, state))
     )
-    parted = [position_error(x.r, base.r) / model.length[0] / PERTURBATION_SIZE for x in others]
+    diverged = [position_error(x.r, base.r) / model.length[0] / PERTURBATION_SIZE for x in others]
     turned = [attitude_error(x.p, base.p) / PERTURBATION_SIZE for x in others]
-    assert np.max(parted) > 5 * np.max(turned)
-    expected = np.maximum(np.max([parted, turned], axis=(0, 1)), 1.0)
+    assert np.max(diverged) > 5 * np.max(turned)
+    expected = np.maximum(np.max([diverged, turned], axis=(0, 1)), 1.0)
     assert perturbation_growth(model, state, times) == pytest.approx(expected, rel=0.01)
 
 

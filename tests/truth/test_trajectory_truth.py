@@ -123,8 +123,8 @@ def test_accelerations_along_a_run_agree_with_the_certified_ones():
     model, state = random_chain(np.random.default_rng(4), [1, 0], loads=True, drag=True)
     h = 1e-4
     run = simulate_taylor(model, state, np.array([0.0, h, 2 * h]), "extended")
-    said = certify_state(model, state).quantities
-    for values, expected in ((run.omega, said.angular_acceleration), (run.v, said.acceleration)):
+    reported = certify_state(model, state).quantities
+    for values, expected in ((run.omega, reported.angular_acceleration), (run.v, reported.acceleration)):
         slope = np.asarray((-3 * values[0] + 4 * values[1] - values[2]) / (2 * h), dtype=float)
         assert slope == pytest.approx(expected, abs=3e-6 * np.max(np.abs(expected)))
 
