@@ -38,7 +38,7 @@ MAX_SYMMETRIC_GROWTH = 0.5  # log2 of the drift's growth when time doubles: 0 if
 
 
 def judge_long_runs(
-    context: RowContext, model: Model, integrator: Integrator, study: LongRunStudy, is_regular: bool
+    context: RowContext, model: Model, integrator: Integrator, is_regular: bool, study: LongRunStudy
 ) -> JudgingResult:
     """Judge the invariants of one integrator's long runs.
 
@@ -46,8 +46,8 @@ def judge_long_runs(
         context: scenario and engine.
         model: the pendulum.
         integrator: the integrator of the runs.
-        study: the runs.
         is_regular: whether the motion is known to be without chaos.
+        study: the runs.
 
     Returns:
         Rows of level "invariants": ``*_long`` per invariant, ``energy_drift_long_growth`` for a symmetric

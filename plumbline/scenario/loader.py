@@ -201,7 +201,7 @@ def find_scenario_file(name: str | Path) -> Path:
     path = Path(name)
     if path.suffix in (".yaml", ".yml") or len(path.parts) > 1 or is_file(path):
         return path
-    valid = f"a path of a YAML file, or one of: {', '.join(known)}"
+    valid = "a path of a YAML file, or a name that `plumbline list scenarios` shows"
     near = closest_match(str(name), [*known, *FAMILIES], cutoff=0.6)
     hint = f". did you mean {f'`--family {near}`' if near in FAMILIES else repr(near)}?" if near else ""
     message = f"unknown scenario{hint}"

@@ -262,6 +262,6 @@ def test_known_issues_of_the_user_are_added_to_those_of_the_project(tmp_path, wh
     words = ["run" if "run_commands" in where else "nightly", "rest", "--known", str(tmp_path / "known.yaml")]
     with patch(where, side_effect=Stopped) as called:
         CliRunner().invoke(main, [*words, "--engine", "mujoco", "--out", str(tmp_path / "out")])
-    (plan, _), _ = called.call_args
+    plan = called.call_args.args[0]
     assert [issue.id for issue in plan.known_issues] == [e.id for e in load_known_issues()] + ["mine"]
     assert plan.are_engines_required

@@ -41,7 +41,7 @@ def run_long(name, engine, integrator, seconds=100.0):
     context = RowContext(name, s.family, chosen.name, chosen.title, "1")
     return {
         row.quantity: row
-        for row in judge_long_runs(context, s.model, method, study, s.closed_form is not None).rows
+        for row in judge_long_runs(context, s.model, method, s.closed_form is not None, study).rows
     }
 
 

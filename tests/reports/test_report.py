@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 from rich.markup import render
 
-from plumbline.cli import console
+from plumbline.cli import verdict_matrix
 from plumbline.judging.rows import VERDICT_STYLES, Row, Verdict
 from plumbline.model.kinematics import quaternion_product
 from reports import chunks, html_report, junit, report_data, step_summary
@@ -143,7 +143,7 @@ def test_terminal_and_report_show_the_same_row_of_each_cell(out, text):
         row = parts[html.unescape(title).split(": ")[0]]
         agreeing = sum(r.verdict == "agrees" for r in rows)
         ratio = "" if row.ratio is None else f" {row.ratio:.1g}"
-        in_terminal = render(console._format_cell(rows)).plain
+        in_terminal = render(verdict_matrix._format_cell(rows)).plain
         assert in_terminal == f"{row.verdict.style.glyph} {agreeing}/{len(rows)}{ratio}"
         in_report = Parsed(f"<p>{cell}</p>").words
         assert in_report.startswith(row.verdict.style.glyph)

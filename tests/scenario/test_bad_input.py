@@ -219,7 +219,8 @@ def test_an_unknown_name_suggests_the_nearest():
     ):
         find_scenario_file("tumbling-bal")
     with pytest.raises(
-        ScenarioError, match="unknown scenario; valid would be a path of a YAML file, or one of"
+        ScenarioError,
+        match=r"unknown scenario; valid would be a path .*, or a name that .*list scenarios",
     ):
         find_scenario_file("qqqqqq")
     assert did_you_mean("Distl", ["mass", "distal"]) == "did you mean 'distal'?"
