@@ -352,13 +352,16 @@ class WorkerPool(Executor):
 
 
 def _warm_context() -> BaseContext:
-    """Fork workers from a process that has libraries loaded; start them anew where there is no fork."""
+    """Fork workers from a process that has libraries loaded; start them anew where that is not possible."""
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
     _keep_sockets_in_scratch_folder()
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([_WARM_MODULE])
-    forkserver.ensure_running()  # in this thread: the warm process ends with the thread that started it
+    try:
+        forkserver.ensure_running()  # in this thread: the warm process ends with the thread that started it
+    except OSError:  # the path of its socket has at most 107 bytes, and TMPDIR may be longer
+        return multiprocessing.get_context("spawn")
     return context
 
 

@@ -40,6 +40,7 @@ WORK = (  # where the work of a command begins
     "plumbline.execution.runner.describe_engines", "plumbline.cli.scenario_commands.describe_engines",
     "plumbline.studies.drift.measure_drift", "plumbline.cli.study_commands.run_plan",
     "plumbline.reproduce.write.make_script", "plumbline.truth.enclosure.prove_motion",
+    "plumbline.cli.nightly.prove_changed_motions",
 )  # fmt: skip
 WORKERS = (
     "plumbline.cli.study_commands.WorkerPool", "plumbline.cli.scenario_commands.WorkerPool",

@@ -72,7 +72,15 @@ def test_a_new_folder_that_another_run_takes_for_an_orphan_is_made_again(tmp_pat
         assert str(folder) == made[1] and folder.is_dir()
 
 
-def test_sockets_of_a_killed_run_are_removed_by_the_next(tmp_path):
+@pytest.fixture
+def short_folder():
+    """A folder in which a socket's path has room."""
+    with tempfile.TemporaryDirectory(prefix="sockets-") as folder:
+        yield Path(folder)
+
+
+@pytest.mark.parametrize("is_short", [True, False], ids=["sockets", "no room for sockets"])
+def test_sockets_of_a_killed_run_are_removed_by_the_next(tmp_path, request, is_short):
     script = tmp_path / "killed.py"
     script.write_text(
         f"import sys, time\nsys.path.insert(0, {str(ROOT)!r})\n"
@@ -83,8 +91,8 @@ def test_sockets_of_a_killed_run_are_removed_by_the_next(tmp_path):
         "        print('begun', flush=True)\n"
         "        time.sleep(float(sys.argv[1]))\n"
     )
-    place = tmp_path / "tmp"
-    place.mkdir()
+    place = request.getfixturevalue("short_folder") if is_short else tmp_path / ("x" * 60)
+    place.mkdir(exist_ok=True)
 
     def start(seconds):
         words = [sys.executable, script, seconds]

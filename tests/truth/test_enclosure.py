@@ -260,7 +260,7 @@ def test_a_number_that_is_off_by_one_ulp_gives_wider_balls_that_are_true(proofs,
     array = getattr(record, field).copy()
     largest = np.unravel_index(np.argmax(np.abs(array)), array.shape)  # of an inertia, on the diagonal
     array[largest] = np.nextafter(array[largest], np.inf)
-    changed = replace(record, **{field: array})
+    changed = replace(state, **{field: array}) if record is state else model.changed(**{field: array})
     pair = (model, changed) if record is state else (changed, state)
     raw, right = prove_motion(*pair, TIMES)
     own = json.loads(gzip.decompress(raw))
