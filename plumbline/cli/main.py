@@ -127,6 +127,9 @@ class LazyGroup(click.Group):
             resumes = ctx.invoked_subcommand in ("run", "nightly")
             end = "; finished cells are kept, run the same command to resume" if resumes else ""
             click.echo(f"\ninterrupted{end}", err=True)
+            # CPython remembers an interruption that passed through exec(), as of a dataclass being made, and
+            # would end with the signal instead of the exit code; the next exec() makes it forget.
+            exec("")
             sys.exit(ExitCode.INTERRUPTED)
         except (click.ClickException, click.exceptions.Exit, click.Abort):
             raise

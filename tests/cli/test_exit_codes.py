@@ -218,6 +218,20 @@ def test_an_interrupted_run_explains_how_to_resume_and_leaves_no_process(tmp_pat
     raise AssertionError("a process is left")
 
 
+def test_an_interruption_inside_exec_has_the_exit_code_too(tmp_path):
+    """As of a dataclass that is being made while a command is imported."""
+    (tmp_path / "interrupted.py").write_text(
+        "from unittest.mock import patch\nfrom plumbline.cli.main import main\n"
+        "def stop(*_, **__):\n    exec('raise KeyboardInterrupt')\n"
+        "with patch('plumbline.cli.run_commands.run_plan', stop):\n    main(['run', 'rest'])\n"
+    )
+    words = [sys.executable, "-m", "interrupted"]  # only of modules is the exit code replaced
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(tmp_path)])}
+    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60)
+    assert "interrupted" in done.stderr
+    assert done.returncode == ExitCode.INTERRUPTED, done
+
+
 def test_an_interruption_while_loading_prints_no_traceback(tmp_path):
     (tmp_path / "click.py").write_text("raise KeyboardInterrupt\n")
     done = subprocess.run(

@@ -149,7 +149,7 @@ def test_motion_truth_holds_growth_length_and_detectable_effects():
 
 
 @pytest.mark.parametrize(
-    ("position", "attitude", "parted"), [(0.9, 0.9, False), (1.1, 0.9, True), (0.9, 1.1, True)]
+    ("position", "attitude", "diverged"), [(0.9, 0.9, False), (1.1, 0.9, True), (0.9, 1.1, True)]
 )
 def test_two_methods_that_differ_by_more_than_rounding_are_reported(position, attitude, diverged):
     model = pendulums.make_model("b")
