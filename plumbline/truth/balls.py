@@ -147,3 +147,39 @@ def midpoints(ball: list[Any]) -> Array:
     return np.array(
         [[float(x.mid()) for x in row] if isinstance(row, list) else float(row.mid()) for row in ball]
     )
+
+
+def term_scales(model: Model, balls: dict[str, Any], lever: float, rate: float) -> dict[str, float]:
+    """Estimate the sizes of the terms of each quantity.
+
+    Radii are compared with them, because a quantity itself may be zero.
+
+    Args:
+        model: the mechanism.
+        balls: entries of each quantity, by name.
+        lever: largest distance of a body from the world's origin [m].
+        rate: largest rate of rotation [rad/s].
+
+    Returns:
+        By quantity the size, in its unit.
+
+    """
+    size = {name: float(np.max(np.abs(midpoints(ball)), initial=0.0)) for name, ball in balls.items()}
+    g = float(np.linalg.norm(model.gravity))
+    a = max(size["acceleration"], g, rate**2 * lever)
+    mass, inertia = float(np.sum(model.mass)), float(np.sum(np.linalg.norm(model.inertia, axis=(1, 2))))
+    force = max(size["joint_reaction"], mass * a)
+    scales = {
+        "acceleration": a,
+        "angular_acceleration": max(size["angular_acceleration"], rate**2, a / lever if lever else 0.0),
+        "joint_reaction": force,
+        "joint_moment": max(size.get("joint_moment", 0.0), force * lever),
+        "tension": force,
+        "kinetic_energy": size["kinetic_energy"],
+        "potential_energy": max(size["potential_energy"], mass * g * lever),
+        "angular_momentum": max(size["angular_momentum"], (mass * lever**2 + inertia) * rate),
+        "r": max(size["r"], lever),
+        "v": max(size["v"], lever * rate),
+        "mass_matrix": size.get("mass_matrix", 0.0),
+    }
+    return {name: scale for name, scale in scales.items() if name in balls}

@@ -23,7 +23,7 @@ import numpy as np
 from plumbline.model.datatypes import Array, Model, State, StateQuantities
 from plumbline.processes.errors import PlumblineError
 from plumbline.truth import import_truth_tool
-from plumbline.truth.balls import BallArithmetic, entries, flatten, midpoints
+from plumbline.truth.balls import BallArithmetic, entries, flatten, midpoints, term_scales
 from plumbline.truth.certified_tree import enclose_tree
 
 MAX_RELATIVE_RADIUS = 1e-25  # relative to the largest magnitude of the quantity's own terms
@@ -258,29 +258,13 @@ def _mass_matrix(c: _BallChain) -> list[list[Any]]:
 
 
 def _term_scales(c: _BallChain, balls: dict[str, Any]) -> dict[str, float]:
-    """Sizes of the terms of each quantity; radii are compared with them because a quantity may be zero."""
-    model = c.model
-    norm = np.linalg.norm
+    """Sizes of the terms of each quantity, see `term_scales`."""
+    norm, model = np.linalg.norm, c.model
     lever = float(np.sum(norm(model.proximal, axis=1) + norm(model.distal, axis=1) + model.length))
     spins = c.w + [c.cross_matrix(c.u[k]) * c.udot[k] for k in range(c.n)]
     rate = float(np.max(norm(midpoints([entries(w) for w in spins]), axis=1)))
-    g = float(norm(model.gravity))
-    size = {name: float(np.max(np.abs(midpoints(ball)))) for name, ball in balls.items()}
-    a = max(size["acceleration"], g, rate**2 * lever)
-    mass, inertia = float(np.sum(model.mass)), float(np.sum(norm(model.inertia, axis=(1, 2))))
-    force = max(size["joint_reaction"], mass * a)
-    return {
-        "acceleration": a,
-        "angular_acceleration": max(size["angular_acceleration"], rate**2, a / lever if lever else 0.0),
-        "joint_reaction": force,
-        "tension": force,
-        "kinetic_energy": size["kinetic_energy"],
-        "potential_energy": max(size["potential_energy"], mass * g * lever),
-        "angular_momentum": max(size["angular_momentum"], (mass * lever**2 + inertia) * rate),
-        "r": max(size["r"], lever),
-        "v": max(size["v"], lever * rate),
-        "mass_matrix": size.get("mass_matrix", 0.0),
-    }
+    return term_scales(model, balls, lever, rate)
+
 
 
 def _is_sharp(name: str, balls: dict[str, Any]) -> bool:

@@ -21,7 +21,7 @@ import numpy as np
 
 from plumbline.model.datatypes import KINDS, Model, State
 from plumbline.model.kinematics import own_rates, rate_count
-from plumbline.truth.balls import BallArithmetic, entries, midpoints
+from plumbline.truth.balls import BallArithmetic, entries, midpoints, term_scales
 
 
 class _BallTree(BallArithmetic):
@@ -267,26 +267,10 @@ def _relative_rates(c: _BallTree, first: list[int]) -> Any:
 
 
 def _term_scales(c: _BallTree, balls: dict[str, Any]) -> dict[str, float]:
-    """Sizes of the terms of each quantity; radii are compared with them because a quantity may be zero."""
+    """Sizes of the terms of each quantity, see `term_scales`."""
     norm, model = np.linalg.norm, c.model
-    size = {name: float(np.max(np.abs(midpoints(ball)), initial=0.0)) for name, ball in balls.items()}
     lever = float(np.sum(norm(model.point, axis=2)) + np.sum(model.length) + np.sum(np.abs(c.state.x)))
-    lever = max(lever, size["r"])
+    lever = max(lever, float(np.max(np.abs(midpoints(balls["r"])))))
     rate = float(np.max(norm(midpoints([entries(w) for w in c.w]), axis=1)))
     rate = max(rate, float(np.max(np.abs(c.state.xdot))), float(np.max(np.abs(c.state.udot))))
-    g = float(norm(model.gravity))
-    a = max(size["acceleration"], g, rate**2 * lever)
-    mass, inertia = float(np.sum(model.mass)), float(np.sum(norm(model.inertia, axis=(1, 2))))
-    force = max(size["joint_reaction"], mass * a)
-    return {
-        "acceleration": a,
-        "angular_acceleration": max(size["angular_acceleration"], rate**2, a / lever if lever else 0.0),
-        "joint_reaction": force,
-        "joint_moment": max(size["joint_moment"], force * lever),
-        "kinetic_energy": size["kinetic_energy"],
-        "potential_energy": max(size["potential_energy"], mass * g * lever),
-        "angular_momentum": max(size["angular_momentum"], (mass * lever**2 + inertia) * rate),
-        "r": lever,
-        "v": max(size["v"], lever * rate),
-        "mass_matrix": size.get("mass_matrix", 0.0),
-    }
+    return term_scales(model, balls, lever, rate)
