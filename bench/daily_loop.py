@@ -1,17 +1,17 @@
-"""`python -m bench.daily_loop [all] [random COUNT]`: how long the commands of a day take.
+"""`python -m bench.daily_loop [--all] [--random COUNT]`: how long the commands of a day take.
 
 Measures `--help`, one scenario and the whole catalogue at state level, each for the first time and again
-unchanged; with `all` also the whole catalogue at every level; with `random COUNT` also COUNT random scenarios
-on one run with two workers against two independent runs at the same time.  Appends a record with date,
-commit, processor and load to bench/results/daily_loop.json.  Needs about two minutes on two idle cores; the
-load before and after shows whether the machine was idle.
+unchanged; with `--all` also the whole catalogue at every level; with `--random COUNT` also COUNT random
+scenarios on one run with two workers against two independent runs at the same time.  Appends a record with
+date, commit, processor and load to bench/results/daily_loop.json.  Needs about two minutes on two idle cores;
+the load before and after shows whether the machine was idle.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
-import platform
 import subprocess
 import sys
 import tempfile
@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from plumbline.execution.runner import git_commit
+from plumbline.processes.processor import processor_name
 from plumbline.storage.results_store import write_atomically
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -106,7 +107,7 @@ def two_workers_over_two_runs(count: int) -> dict[str, float]:
     """
 
     def start(jobs: int, part: int, parts: int) -> subprocess.Popen[str]:
-        words = ["-m", "bench.daily_loop", "part", *map(str, (count, jobs, part, parts))]
+        words = ["-m", "bench.daily_loop", "--part", *map(str, (count, jobs, part, parts))]
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
         return subprocess.Popen(
             [sys.executable, *words], cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True
@@ -120,25 +121,12 @@ def two_workers_over_two_runs(count: int) -> dict[str, float]:
     return {"one run": together, "two runs": apart, "ratio": together / apart}
 
 
-def processor_name() -> str:
-    """Name the processor.
-
-    Returns:
-        Its name as the system tells it.
-
-    """
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor()
-    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), "")
-
-
-def measure(arguments: list[str]) -> dict[str, Any]:
-    """Measure what the command line asks for.
+def measure(is_all_levels: bool, random_count: int) -> dict[str, Any]:
+    """Measure the commands.
 
     Args:
-        arguments: words of the command line.
+        is_all_levels: whether the whole catalogue is run at every level too.
+        random_count: number of random scenarios for the comparison of two workers with two runs; 0: none.
 
     Returns:
         The record to store.
@@ -156,24 +144,29 @@ def measure(arguments: list[str]) -> dict[str, Any]:
         record["--help"] = time_command(["--help"], folder)
         record[f"run {SCENARIO} --level state"] = time_run([SCENARIO, "--level", "state"], folder / "one")
         record["run --level state"] = time_run(["--level", "state"], folder / "state")
-        if "all" in arguments:
+        if is_all_levels:
             record["run"] = time_run([], folder / "all")
-    if "random" in arguments:
-        count = int(arguments[arguments.index("random") + 1])
-        record[f"{count} random scenarios"] = two_workers_over_two_runs(count)
+    if random_count:
+        record[f"{random_count} random scenarios"] = two_workers_over_two_runs(random_count)
     return record | {"load after": os.getloadavg()}
 
 
-def main(arguments: list[str]) -> None:
+def main() -> None:
     """Measure, print and store; or run one part of the random scenarios for the measurement."""
-    if arguments[:1] == ["part"]:
-        print(random_scenarios_per_second(*map(int, arguments[1:])))
+    assert __doc__
+    parser = argparse.ArgumentParser("python -m bench.daily_loop", description=__doc__.partition("\n\n")[2])
+    parser.add_argument("--all", action="store_true", help="run the whole catalogue at every level too")
+    parser.add_argument("--random", type=int, default=0, metavar="COUNT", help="number of random scenarios")
+    parser.add_argument("--part", type=int, nargs=4, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.part:
+        print(random_scenarios_per_second(*options.part))
         return
-    record = measure(arguments)
+    record = measure(options.all, options.random)
     print(json.dumps(record, indent=1))
     stored = json.loads(STORED.read_text(encoding="utf-8")) if STORED.exists() else []
     write_atomically(STORED, (json.dumps([*stored, record], indent=1) + "\n").encode())
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main()

@@ -13,7 +13,6 @@ import contextlib
 import hashlib
 import os
 import pickle
-import platform
 import shutil
 import struct
 import sys
@@ -26,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from plumbline.processes.processor import processor_features
 from plumbline.processes.user_cache import CheckedFiles, DamagedFile, user_cache_folder
 from plumbline.processes.workers import Outcome, Pickled, ResultCache, Task
 
@@ -157,14 +157,14 @@ def _function_name(function: Callable[..., Any] | None) -> str:
 
 @cache
 def _environment_fingerprint() -> str:
-    """Hash the project's code, the interpreter, what can be imported, and the kind of machine."""
+    """Hash the project's code, the interpreter, what can be imported, and the processor."""
     digest = hashlib.sha256()
     for folder in _HASHED_PACKAGES:
         for path in sorted((ROOT / folder).rglob("*.py")):
             name = path.relative_to(ROOT).as_posix()
             if not name.startswith(_UNHASHED_PACKAGES):
                 _update_hash(digest, (name, path.read_bytes()))
-    _update_hash(digest, (sys.version, platform.machine(), *_importable_files()))
+    _update_hash(digest, (sys.version, processor_features(), *_importable_files()))
     return digest.hexdigest()
 
 

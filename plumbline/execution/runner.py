@@ -25,6 +25,7 @@ from plumbline.judging.identity import RUN_SCENARIO, IdentityCheck
 from plumbline.judging.rows import RUN_FAMILY, Row, Verdict
 from plumbline.model.invariants import inertia_ratio
 from plumbline.processes.cpu_time import CpuTimes
+from plumbline.processes.processor import processor_name
 from plumbline.processes.workers import (
     Executor,
     ExecutorUnavailable,
@@ -137,7 +138,7 @@ def run_plan(plan: Plan, progress: ProgressCallback, observer: RunObserver | Non
         "started": started.isoformat(timespec="seconds"),
         "duration": time.monotonic() - begin,
         "platform": platform.platform(),
-        "machine": {"processor": platform.machine(), "cores": str(os.cpu_count()), "jobs": str(plan.jobs)},
+        "machine": {"processor": processor_name(), "cores": str(os.cpu_count()), "jobs": str(plan.jobs)},
         "commit": git_commit(),
         "python": platform.python_version(),
         "versions": {name: info.version for name, info in result.engines.items()},

@@ -10,7 +10,6 @@ model.  Vectors (3,) and matrices (3, 3) of expressions are NumPy arrays of obje
 from __future__ import annotations
 
 import math
-import platform
 import sys
 from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from typing import Any, Literal
 import numpy as np
 
 from plumbline.model.datatypes import Array, EngineFailure, Model, State
+from plumbline.processes.processor import processor_features
 from plumbline.processes.user_cache import content_key, recall, remember
 from plumbline.truth import import_truth_tool
 
@@ -219,23 +219,14 @@ def _compiled_integrator(
     """
     hy = load_heyoka()
     code = Path(__file__).read_bytes()
-    key = content_key("Taylor", code, hy.__version__, _processor(), repr((rods, drag, precision, order)))
+    key = content_key(
+        "Taylor", code, hy.__version__, processor_features(), repr((rods, drag, precision, order))
+    )
     integrator = recall(key)
     if integrator is None:
         integrator = _compile_integrator(hy, rods, drag, precision, order)
         remember(key, integrator)
     return integrator
-
-
-def _processor() -> str:
-    """What machine code depends on."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:
-        return platform.processor()
-    return "".join(
-        sorted({line for line in lines if line.startswith(("model", "flags", "Features", "CPU p"))})
-    )
 
 
 def _compile_integrator(

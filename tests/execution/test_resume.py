@@ -291,3 +291,14 @@ def test_another_installation_has_other_cells(tmp_path, monkeypatch, file):
         hashes.add(task_hash(task))
     result_cache._environment_fingerprint.cache_clear()
     assert len(hashes) == 2
+
+
+def test_another_processor_has_other_cells(monkeypatch):
+    """The last bits of results depend on its vector instructions."""
+    task, hashes = Task("a", quiet), set()
+    for features in ("flags: fma", "flags: fma avx512f"):
+        monkeypatch.setattr(result_cache, "processor_features", lambda features=features: features)
+        result_cache._environment_fingerprint.cache_clear()
+        hashes.add(task_hash(task))
+    result_cache._environment_fingerprint.cache_clear()
+    assert len(hashes) == 2
