@@ -123,9 +123,10 @@ class LazyGroup(click.Group):
         try:
             with _termination_as_interrupt():
                 return super().invoke(ctx)
-        except KeyboardInterrupt:
-            resumes = ctx.invoked_subcommand in ("run", "nightly")
-            end = "; finished cells are kept, run the same command to resume" if resumes else ""
+        except KeyboardInterrupt as interruption:
+            resume = " ".join(("run the same command", *interruption.args, "to resume"))
+            is_kept = ctx.invoked_subcommand in ("run", "nightly")
+            end = f"; finished cells are kept, {resume}" if is_kept else ""
             click.echo(f"\ninterrupted{end}", err=True)
             # CPython remembers an interruption that passed through exec(), as of a dataclass being made, and
             # would end with the signal instead of the exit code; the next exec() makes it forget.

@@ -85,7 +85,7 @@ def run(
     from plumbline.reproduce.write import write_scripts
 
     with options.exit_on_io_error():
-        result = _run_visibly(plan, as_json)
+        result = _run_visibly(plan, as_json, fresh)
         save(result, folder, _command_line())
         with result.cpu_times.measure("report"):
             write_scripts(folder)
@@ -191,7 +191,7 @@ def nightly(
     _finish(result, place / "report.html", as_json=False)
 
 
-def _run_visibly(plan: Plan, as_json: bool) -> RunResult:
+def _run_visibly(plan: Plan, as_json: bool, is_fresh: bool) -> RunResult:
     """Run a plan and show verdicts as they come; an interruption leaves the table of what has finished."""
     display = RunDisplay(sys.stderr)
     try:
@@ -201,6 +201,8 @@ def _run_visibly(plan: Plan, as_json: bool) -> RunResult:
         if not as_json and display.finished.scenario_count:
             print_matrix(display.finished)
             click.echo(f"{display.finished.scenario_count} of {len(plan.scenarios)} scenarios finished")
+        if is_fresh:  # with it the finished cells would be computed again
+            raise KeyboardInterrupt("without --fresh") from None
         raise
 
 

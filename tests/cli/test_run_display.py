@@ -62,20 +62,22 @@ def test_without_a_terminal_each_finished_scenario_is_one_line():
     assert file.getvalue() == "conical: mujoco ✓ 1/1 0.1\n"
 
 
-def test_an_interrupted_run_leaves_the_table_of_what_has_finished(tmp_path):
+@pytest.mark.parametrize(("option", "resume"), [((), ""), (("--fresh",), " without --fresh")])
+def test_an_interrupted_run_leaves_the_table_of_what_has_finished(tmp_path, option, resume):
     def interrupted(plan, progress, observer):
         observer.on_start(ENGINES)
         observer.on_rows("rest", [row("rest", Verdict.AGREES)], True)
         observer.on_rows("conical", [row("conical", Verdict.AGREES)], False)
         raise KeyboardInterrupt
 
-    words = ["run", "rest", "conical", "--engine", "mujoco", "--out", str(tmp_path)]
+    words = ["run", "rest", "conical", "--engine", "mujoco", "--out", str(tmp_path), *option]
     with patch("plumbline.cli.run_commands.run_plan", side_effect=interrupted):
         result = CliRunner().invoke(main, words)
     assert result.exit_code == ExitCode.INTERRUPTED
     assert "rest" in result.stdout and "1 of 2 scenarios finished" in result.stdout
     assert "conical" not in result.stdout
-    assert result.stderr.endswith("interrupted; finished cells are kept, run the same command to resume\n")
+    end = f"interrupted; finished cells are kept, run the same command{resume} to resume\n"
+    assert result.stderr.endswith(end)
 
 
 class Recorder(RunObserver):
