@@ -157,6 +157,6 @@ def format_number(x: Any, digits: int = 2) -> str:
         return "0"
     mantissa, exponent = f"{x:.{digits - 1}e}".split("e")
     power = int(exponent)
-    if -3 < power < 4:
+    if -4 < power < 4:
         return f"{float(f'{x:.{digits}g}'):.{max(0, digits - 1 - power)}f}"
     return f"{mantissa}×10{str(power).translate(_SUPERSCRIPT)}".replace("-", "−")

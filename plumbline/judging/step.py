@@ -179,7 +179,7 @@ def _row(
         derivation=f"{bound[at]:.2g} {unit} at {place}; in the median {np.median(looseness):.1g} "
         "of the accelerations' effect on a step; truth: the declared formula in extended precision "
         "(docs/integrators.md)",
-        extra={"comparisons": float(len(error)), "bound_relative": float(np.median(looseness)),
+        extra={"comparisons": float(len(error)), "bound_relative": float(np.max(looseness)),
                "state": float(found.places[at].state), "step": found.places[at].step,
                "steps": float(found.places[at].count)},
     )  # fmt: skip

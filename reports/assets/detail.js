@@ -185,9 +185,9 @@ function chosenRow(index, row, i) {
 
 /** Label and unit of a row's further numbers; "row" for the unit of its error. @type {Record<string, [string, string]>} */
 const EXTRA = {
-  relative: ["Error over scale", ""], bound_relative: ["Tolerance over scale, median", ""], states: ["States compared", ""], state: ["Worst state", ""], body: ["Worst body", ""],
+  relative: ["Error over scale", ""], bound_relative: ["Tolerance over scale, largest", ""], states: ["States compared", ""], compared_states: ["With a tolerance tight enough", ""], comparisons: ["Comparisons", ""], scenarios: ["Scenarios", ""], state: ["Worst state", ""], body: ["Worst body", ""],
   visible: ["Effect of a detectable mistake", "row"], growth: ["Growth of a perturbation", ""], resolution: ["Finest step or tolerance", ""], scale: ["Scale", "row"],
-  whole: ["Drift at the end", "row"], limit: ["Drift of the limit", "row"], asked: ["Requested duration", "s"], end: ["End", "s"],
+  whole: ["Drift at the end", "row"], limit: ["Drift of the limit", "row"], limit_tolerance: ["Tolerance of the limit", "row"], asked: ["Requested duration", "s"], end: ["End", "s"], step: ["Step size", "s"], steps: ["Steps", ""], scatter: ["Scatter of the error over the tolerance", ""],
 };
 
 /** @param {import("./report_data").RowDetail} row */

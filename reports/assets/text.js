@@ -54,7 +54,7 @@ export function number(x, digits = 2) {
   if (x === 0) return "0";
   const [mantissa, exponent] = x.toExponential(digits - 1).split("e");
   const power = Number(exponent);
-  const text = power > -3 && power < 4 ? Number(x.toPrecision(digits)).toFixed(Math.max(0, digits - 1 - power)) : `${mantissa}×10${superscript(power)}`;
+  const text = power > -4 && power < 4 ? Number(x.toPrecision(digits)).toFixed(Math.max(0, digits - 1 - power)) : `${mantissa}×10${superscript(power)}`;
   return text.replace("-", "−");
 }
 
