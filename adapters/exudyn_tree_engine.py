@@ -6,7 +6,7 @@
            body before it; it has no inertia, so that spin acts on nothing, and the mass matrix is regular
 
     hinge, universal, slide, cylindrical: revolutes and slides along the joint's own axes, the inner links
-           massless; a welded body is merged into its far body's link; a free body hangs on three slides
+           massless; a welded body is merged into its far body's link; a free body is attached to three slides
            along the world's axes and a ball.  Of such trees the angular momentum is not in the momenta M q̇
 
 Axes are chosen by the initial state: all angles start at 0, and the first axis is that of the initial
@@ -141,7 +141,7 @@ class _Linkage:
                 self._add_jointed_body(k, own)
 
     def _go_to_far_body(self, k: int) -> None:
-        """Continue from the link that joint k hangs on."""
+        """Continue from the link that joint k is attached to."""
         far, point = self.model.body[k, 0], self.model.point[k, 0]
         if far < 0:
             self._last, self._axes, self._hang, self._spin = -1, np.eye(3), point, 0 * self._spin

@@ -23,7 +23,7 @@ Loads act inside every integrator stage: the world force is `xfrc_applied`; n′
 are actuators on a site at the centre of mass, a constant and a velocity bias along each axis.
 `cfrc_int` counts actuator forces as if the joint carried them, so before it is read the drag
 force and the moments that acted are declared as applied ones too; its moments are about the centre of mass of
-the tree that hangs on the world, and are shifted to the near point.
+the tree that is attached to the world, and are shifted to the near point.
 
 Welded halves are bodies without a joint on a massless one in their body's place.  The option "dense mass
 matrix" finds the accelerations by a dense solve with `mj_fullM`.  MuJoCo's solvers (PGS, CG, Newton) and

@@ -20,10 +20,7 @@ ORDER_CHANGE_FACTOR = 3.0  # three consecutive orders this many of their changes
 ROUNDING_FLOOR_FACTOR = 32.0  # a difference this many times rounding gives its order to 0.05: log2(1 + 1/32)
 STEP_EXPONENTS = {1: (9, 15), 2: (8, 12), 4: (5, 12)}  # by order: coarsest and finest step, -log2 of seconds
 MAX_BODY_STEPS = 2**19  # most steps × bodies of the finest run, without extra refinements
-RTOL_FACTORS = (
-    1e2,
-    1.0,
-)  # relative tolerances of an adaptive method, over its tightest: no verdict needs more
+RTOL_FACTORS = 1e2, 1.0  # relative tolerances of an adaptive method, over its tightest: no verdict needs more
 
 
 def step_unit(sample_interval: float) -> float:

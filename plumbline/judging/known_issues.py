@@ -54,7 +54,7 @@ KNOWN_ISSUES_FILE = Path(__file__).with_name("known_issues.yaml")
 LEVELS: tuple[Level, ...] = ("state", "step", "invariants", "trajectory", "relations")
 ANY_LENGTH = 10**9  # bodies
 
-# Relations that give the same problem to the same algorithm in other numbers: only rounding tells them apart.
+# Relations that give the same problem to the same algorithm in other numbers: only rounding can differ.
 SCATTER_RELATIONS = ("rotated world", "re-chosen body frame")
 MIN_SCATTER = 0.05  # of the error's ratio: the least scatter that shows rounding; measured 0.12 … 0.6
 MIN_OWN_SCATTER = 0.3  # the same of the row's own error in a random scenario; measured 0.56 … 1.6
@@ -180,7 +180,7 @@ class KnownIssue:
 
 
 def _scatter_of(row: Row) -> float | None:
-    """How far results for equivalent descriptions differ, in the row's tolerance; None: it does not tell."""
+    """How far results for equivalent descriptions differ, in the row's tolerance; None if not measured."""
     if row.ratio is None:
         return None
     if row.level == "relations" and row.quantity in SCATTER_RELATIONS:
@@ -273,9 +273,9 @@ class _Entry(BaseModel):
         """Make an issue of each name of the lists, with its own id: each must occur."""
         lists = {name: getattr(self, name) for name in ("scenario", "integrator", "quantity")}
         for names in product(*lists.values()):
-            told = [name for name, given in zip(names, lists.values(), strict=True) if len(given) > 1]
+            varied = [name for name, given in zip(names, lists.values(), strict=True) if len(given) > 1]
             chosen = dict(zip(lists, names, strict=True))
-            yield KnownIssue(**{**self.__dict__, **chosen, "id": ": ".join([self.id, *told])})
+            yield KnownIssue(**{**self.__dict__, **chosen, "id": ": ".join([self.id, *varied])})
 
 
 def load_known_issues(

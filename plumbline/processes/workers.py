@@ -389,7 +389,7 @@ def run_task(task: Task) -> Outcome:
     try:
         return _call_and_judge(task)
     except MemoryError:
-        pass  # what filled the memory hangs on the traceback, which the pool would keep during the next task
+        pass  # the traceback, which the pool would keep during the next task, references what filled it
     gc.collect()
     raise MemoryError
 

@@ -356,7 +356,7 @@ def _resolve_parents(source: YamlSource, document: Document, bodies: list[Body])
 
 
 def _parent_of(bodies: list[Body], k: int, far: list[int]) -> tuple[int, str, str, str]:
-    """The body that body k hangs on, or a field, what is wrong with it, and what would be valid."""
+    """The parent of body k, or a field, what is wrong with it, and what would be valid."""
     body, names = bodies[k], [body.name for body in bodies]
     parent = -1 if body.parent == "world" or body.joint.kind == "free" else k - 1
     if body.parent not in (None, "world"):

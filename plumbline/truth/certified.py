@@ -266,7 +266,6 @@ def _term_scales(c: _BallChain, balls: dict[str, Any]) -> dict[str, float]:
     return term_scales(model, balls, lever, rate)
 
 
-
 def _is_sharp(name: str, balls: dict[str, Any]) -> bool:
     """Whether every radius of the quantity is small enough (an infinite or NaN one is not)."""
     return all(float(x.rad()) <= MAX_RELATIVE_RADIUS * balls["scale"][name] for x in flatten(balls[name]))

@@ -5,8 +5,8 @@ in absolute angular accelerations; nothing is shared with an engine, the referen
 Constrained methods are not solved: their quadrature and their equations are evaluated at the engine's answer.
 docs/integrators.md states every formula with its source.
 
-Arrays have leading axes ``...`` for many states at once.  A chain of links hangs on ball joints: bodies, and
-rods as massless links with an inertia about their own axis only.
+Arrays have leading axes ``...`` for many states at once.  The links of a chain are connected by ball joints:
+bodies, and rods as massless links with an inertia about their own axis only.
 """
 
 from __future__ import annotations
