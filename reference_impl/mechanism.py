@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -39,6 +39,16 @@ CHAIN_FIELDS = (
     "mass", "inertia", "proximal", "distal", "length",
     "gravity", "force", "moment", "drag_force", "drag_moment",
 )  # fmt: skip
+JOINT_ELEMENTS = ("armature", "damping", "stiffness", "rest", "effort")
+SPRING_FIELDS = ("spring_body", "spring_point", "spring_stiffness", "spring_damping", "spring_length")
+
+
+def _no_pairs() -> Array:
+    return np.zeros((0, 2))
+
+
+def _no_numbers() -> Array:
+    return np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +73,29 @@ class Mechanism:
     moment: Array  # (N, 3) N m, constant applied moment n′, body frame
     drag_force: Array  # (N,) N s/m, c_t: F = −c_t ṙ at the centre of mass
     drag_moment: Array  # (N,) N m s, c_r: n′ = −c_r ω′
+    # Passive elements of the scalar coordinates φ of each joint, zeros where there are none; of a ball joint
+    # the first number holds about every axis, and φ is the rotation vector of the near body in the far one.
+    armature: Array = field(
+        default_factory=_no_pairs
+    )  # (N, 2) kg m² or kg, a: rotors that turn with φ̇, ½ a φ̇²
+    damping: Array = field(default_factory=_no_pairs)  # N m s or N s/m, c: −c φ̇
+    stiffness: Array = field(default_factory=_no_pairs)  # N m or N/m, k: −k (φ − φ₀)
+    rest: Array = field(default_factory=_no_pairs)  # rad or m, φ₀
+    effort: Array = field(default_factory=_no_pairs)  # N m or N, constant, on the near body along φ
+    # K springs and dampers between two points: tension k (l − l₀) + c l̇ at the distance l
+    spring_body: NDArray[np.intp] = field(default_factory=lambda: np.zeros((0, 2), np.intp))  # (K, 2), −1
+    spring_point: Array = field(
+        default_factory=lambda: np.zeros((0, 2, 3))
+    )  # (K, 2, 3) m, each in the frame of its body, or of the world
+    spring_stiffness: Array = field(default_factory=_no_numbers)  # (K,) N/m
+    spring_damping: Array = field(default_factory=_no_numbers)  # (K,) N s/m
+    spring_length: Array = field(default_factory=_no_numbers)  # (K,) m, l₀
+
+    def __post_init__(self) -> None:
+        """Give joints without passive elements zeros."""
+        for name in JOINT_ELEMENTS:
+            if not getattr(self, name).size:
+                object.__setattr__(self, name, np.zeros((len(self.kind), 2)))
 
     @classmethod
     def chain(
@@ -137,8 +170,10 @@ class Mechanism:
 
     @property
     def fields(self) -> dict[str, Any]:
-        """The fields by name: of a chain, those that `chain` takes."""
-        names = CHAIN_FIELDS if self.is_chain else tuple(vars(self))
+        """The fields by name: of a chain, those that `chain` takes; no elements where there are none."""
+        absent = JOINT_ELEMENTS[: 0 if self.has_joint_elements else None]
+        absent += SPRING_FIELDS[: 0 if len(self.spring_body) else None]
+        names = CHAIN_FIELDS if self.is_chain else [name for name in vars(self) if name not in absent]
         return {name: getattr(self, name) for name in names}
 
     @classmethod
@@ -154,9 +189,13 @@ class Mechanism:
         """
         if "proximal" in fields:
             return cls.chain(**{name: np.array(value, float) for name, value in fields.items()})
-        named = ("kind", "body")
-        arrays = {name: np.array(value, float) for name, value in fields.items() if name not in named}
-        return cls(kind=tuple(fields["kind"]), body=np.array(fields["body"], np.intp), **arrays)
+        integers = ("body", "spring_body")
+        arrays = {
+            name: np.array(value, np.intp if name in integers else float)
+            for name, value in fields.items()
+            if name != "kind"
+        }
+        return cls(kind=tuple(fields["kind"]), **arrays)
 
     @property
     def n(self) -> int:
@@ -165,9 +204,9 @@ class Mechanism:
 
     @property
     def is_chain(self) -> bool:
-        """Whether every body hangs on the one before, the first on the world, by rods and balls."""
+        """Whether every body hangs on the one before, the first on the world, by bare rods and balls."""
         is_row = bool(np.all(self.body[:, 0] == np.arange(self.n) - 1)) and not np.any(self.point[0, 0])
-        return is_row and set(self.kind) <= {"rod", "ball"}
+        return is_row and set(self.kind) <= {"rod", "ball"} and not self.has_elements
 
     @property
     def proximal(self) -> Array:
@@ -183,6 +222,16 @@ class Mechanism:
     def rods(self) -> NDArray[np.bool_]:
         """(N,) True where joint k is a rod."""
         return np.array([kind == "rod" for kind in self.kind])
+
+    @property
+    def has_joint_elements(self) -> bool:
+        """Whether any joint has a rotor, a damper, a spring or an effort."""
+        return any(np.any(getattr(self, name)) for name in JOINT_ELEMENTS)
+
+    @property
+    def has_elements(self) -> bool:
+        """Whether there are passive elements or efforts, of joints or between points."""
+        return self.has_joint_elements or len(self.spring_body) > 0
 
     @property
     def has_drag(self) -> bool:

@@ -77,6 +77,7 @@ class Adapter(ABC):
     extra_requirements: ClassVar[tuple[tuple[str, str], ...]] = ()
     other_formulation: ClassVar[str] = ""  # the same engine's column in other coordinates
     builds_trees: ClassVar[bool] = False  # whether states of trees with any joints are evaluated
+    builds_elements: ClassVar[bool] = False  # … and of mechanisms with rotors, springs, dampers and efforts
     reproduction_template: ClassVar[str] = ""  # template of stand-alone scripts; without one there are none
 
     @abstractmethod
@@ -220,6 +221,10 @@ class Adapter(ABC):
         """Refuse what the adapter does not build."""
         if not (has_trees or model.is_chain):
             raise Unsupported(f"the adapter of {self.title} covers chains of rods and balls from the origin")
+        if model.has_elements and not self.builds_elements:
+            raise Unsupported(
+                f"the adapter of {self.title} covers no rotors, springs, dampers and efforts of joints"
+            )
 
 
 def check_state(model: Model, state: State) -> None:

@@ -17,7 +17,9 @@ import numpy as np
 from plumbline.model.step_methods import StepMethod
 from plumbline.processes.errors import PlumblineError
 from reference_impl.mechanism import CHAIN_FIELDS as CHAIN_FIELDS
+from reference_impl.mechanism import JOINT_ELEMENTS as JOINT_ELEMENTS
 from reference_impl.mechanism import KINDS as KINDS
+from reference_impl.mechanism import SPRING_FIELDS as SPRING_FIELDS
 from reference_impl.mechanism import Array as Array
 from reference_impl.mechanism import Kind as Kind
 from reference_impl.mechanism import Mechanism

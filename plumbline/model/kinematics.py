@@ -326,6 +326,24 @@ def joint_vectors(model: Model, r: Array, p: Array) -> Array:
     return np.asarray(near - hang)
 
 
+def spring_vectors(model: Model, r: Array, p: Array) -> Array:
+    """Return the vectors from the first to the second point of every spring.
+
+    Args:
+        model: the mechanism of N bodies with K springs.
+        r: (..., N, 3) centres of mass, world frame [m].
+        p: (..., N, 4) quaternions, normalised here.
+
+    Returns:
+        (..., K, 3) vectors, world frame [m].
+
+    """
+    a, body = rotation_matrix(p), model.spring_body
+    ends = r[..., body, :] + rotate_vectors(a[..., body, :, :], model.spring_point)
+    ends[..., body < 0, :] = model.spring_point[body < 0]
+    return np.asarray(ends[..., 1, :] - ends[..., 0, :])
+
+
 def rate_count(model: Model) -> int:
     """Count the minimal rates ν of `velocity_jacobian`.
 

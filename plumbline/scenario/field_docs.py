@@ -21,6 +21,7 @@ SECTION_HEADINGS = {  # in the page's order
     "Inertia": "`inertia`",
     "Load": "`load`",
     "Drag": "`drag`",
+    "Spring": "`springs[]`: a spring between two points",
 }
 BOUND_FORMATS = {
     "exclusiveMinimum": "> {}",
@@ -47,7 +48,8 @@ follow, so every state satisfies the joints. Quaternions and directions are norm
 rate along the rod that rounding left is removed.
 
 A body hangs from the one before it unless it names another `parent`. This tree has an arm that turns about
-the world's vertical, and on it a pendulum on a hinge and a slider; trees are compared at state level only:
+the world's vertical, and on it a pendulum on a hinge with a damper and a rotor, and a slider with a spring of
+its own and one to the pendulum; trees are compared at state level only:
 
 ```yaml
 schema_version: 1
@@ -63,15 +65,20 @@ bodies:
   - name: pendulum
     mass: 0.2
     inertia: {{principal: [0.002, 0.002, 0.0001]}}
-    joint: {{kind: hinge, axis: [1, 0, 0], coordinates: [0.5]}}
+    joint: {{kind: hinge, axis: [1, 0, 0], coordinates: [0.5], damping: 0.01, armature: 0.0005}}
     proximal: [0, 0, 0.15]
   - name: slider
     parent: arm
     anchor: [0.05, 0, 0]
     mass: 0.1
     inertia: {{principal: [0.0001, 0.0001, 0.0001]}}
-    joint: {{kind: slide, axis: [1, 0, 0], coordinates: [0.02]}}
+    joint: {{kind: slide, axis: [1, 0, 0], coordinates: [0.02], stiffness: 20, rest: 0.01}}
     proximal: [0, 0, 0]
+springs:
+  - bodies: [pendulum, slider]
+    points: [[0, 0, -0.1], [0, 0, 0]]
+    stiffness: 5
+    length: 0.2
 ```
 """
 

@@ -11,12 +11,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import quaternion_product, rotation_matrix, state_from_minimal
+from plumbline.model.datatypes import JOINT_ELEMENTS, Array, Model, State
+from plumbline.model.kinematics import (
+    quaternion_product,
+    rotation_matrix,
+    spring_vectors,
+    state_from_minimal,
+)
 from plumbline.scenario.errors import Problem, ScenarioError, closest_match, did_you_mean, shorten
 from plumbline.scenario.schema import (
+    INPUT_ROUNDING,
     MAX_BODIES,
     Articulated,
     Body,
@@ -249,13 +256,22 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
         raise ScenarioError(problems)
     bodies = list(_expand_repeats(document))
     far = _resolve_parents(source, document, [body for body, _ in bodies])
+    springs = _resolve_springs(source, document, [body for body, _ in bodies])
     if len(bodies) > MAX_BODIES:
         raise source.fatal_error(
             f"has {len(bodies)} bodies", f"at most {MAX_BODIES}", source.value_positions[("bodies",)]
         )
     with np.errstate(all="ignore"):
-        model = _build_model(document, [body for body, _ in bodies], far)
+        model = _build_model(document, [body for body, _ in bodies], far, springs)
         state = state_from_minimal(model, *_minimal_coordinates(bodies))
+        distances = np.linalg.norm(spring_vectors(model, state.r, state.p), axis=-1)
+    for k in np.flatnonzero(distances <= INPUT_ROUNDING * np.max(np.abs(model.spring_point), initial=0.0)):
+        place = source.value_positions[("springs", int(k))]
+        raise source.fatal_error(
+            f"has spring {k + 1} between two points that coincide at t = 0, where it has no direction",
+            "points that are apart",
+            place,
+        )
     for name, array in {**model.fields, **vars(state)}.items():
         if name != "kind" and not np.all(np.abs(array) <= MAX_MAGNITUDE):
             raise source.fatal_error(
@@ -385,6 +401,41 @@ def _parent_of(bodies: list[Body], k: int, far: list[int]) -> tuple[int, str, st
     return parent, "", "", ""
 
 
+def _resolve_springs(source: YamlSource, document: Document, bodies: list[Body]) -> NDArray[np.intp]:
+    """The bodies (K, 2) of the springs, −1 the world."""
+    names, problems = [body.name for body in bodies], []
+    found = np.full((len(document.springs), 2), -1, np.intp)
+    for k, spring in enumerate(document.springs):
+        for side, name in enumerate(spring.bodies):
+            message, valid = "", "the name of a body, or world"
+            if names.count(name) > 1:
+                message = f"is {name!r}, the name of {names.count(name)} bodies"
+            elif name in names:
+                found[k, side] = names.index(name)
+            elif name != "world":
+                hint = did_you_mean(name, [other for other in names if other])
+                message = f"is {name!r}, no body's name. {hint}".strip(" .")
+            if side and not message and found[k, 0] == found[k, 1]:
+                message, valid = f"is {name!r} like the other end", "two different bodies"
+            if message:
+                path = ("springs", k, "bodies", side)
+                place = source.value_positions.get(path) or source.value_positions[("springs", k)]
+                problems.append(Problem(source.file, *place, dotted_path(path), message, valid))
+    if problems:
+        raise ScenarioError(problems)
+    return found
+
+
+def _joint_elements(bodies: list[Body]) -> dict[str, Array]:
+    """The elements of all joints (N, 2), zeros where there are none."""
+    found = {name: np.zeros((len(bodies), 2)) for name in JOINT_ELEMENTS}
+    for name, values in found.items():
+        for k, body in enumerate(bodies):
+            given = getattr(body.joint, name, None) or []
+            values[k, : len(given)] = given
+    return found
+
+
 def _far_point(bodies: list[Body], k: int, far: int) -> list[float]:
     """Where body k hangs, in the frame of its parent."""
     return bodies[k].anchor or (bodies[far].distal if far >= 0 else None) or [0.0, 0.0, 0.0]
@@ -411,7 +462,9 @@ def _turn_to(axis: Array) -> Array:
     return unit_vector(below.tolist())
 
 
-def _build_model(document: Document, bodies: list[Body], far: list[int]) -> Model:
+def _build_model(
+    document: Document, bodies: list[Body], far: list[int], spring_body: NDArray[np.intp]
+) -> Model:
     free = np.array([body.joint.kind == "free" for body in bodies])
     points = [[_far_point(bodies, k, far[k]), body.proximal] for k, body in enumerate(bodies)]
     return Model(
@@ -427,6 +480,12 @@ def _build_model(document: Document, bodies: list[Body], far: list[int]) -> Mode
         moment=np.array([body.load.moment for body in bodies], dtype=float),
         drag_force=np.array([body.drag.force for body in bodies], dtype=float),
         drag_moment=np.array([body.drag.moment for body in bodies], dtype=float),
+        **_joint_elements(bodies),
+        spring_body=spring_body,
+        spring_point=np.array([spring.points for spring in document.springs], dtype=float).reshape(-1, 2, 3),
+        spring_stiffness=np.array([spring.stiffness for spring in document.springs], dtype=float),
+        spring_damping=np.array([spring.damping for spring in document.springs], dtype=float),
+        spring_length=np.array([spring.length for spring in document.springs], dtype=float),
     )
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from annotated_types import Len
 from pydantic import (
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Discriminator,
     Field,
@@ -26,7 +27,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from plumbline.model.datatypes import KINDS, Array
+from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Array
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
 
 SCHEMA_VERSION = 1
@@ -237,8 +238,69 @@ def _require_physical_inertia(matrix: Array) -> None:
         )
 
 
-class Ball(SchemaModel):
-    """A ball joint: the body's proximal point stays where it hangs."""
+def _listed(value: Any) -> Any:
+    return [value] if isinstance(value, (int, float)) and not isinstance(value, bool) else value
+
+
+# one number per coordinate of a joint; a single number may stand without brackets
+PerCoordinate = Annotated[list[float], BeforeValidator(_listed, json_schema_input_type=float | list[float])]
+
+
+def _require_not_negative(values: list[float] | None) -> list[float] | None:
+    for value in values or ():
+        if value < 0:
+            raise invalid_value_error(f"is {value!r}, below 0", "0 or more")
+    return values
+
+
+class JointElements(SchemaModel):
+    """Passive elements of a joint."""
+
+    kind: str
+    armature: PerCoordinate | None = _field(
+        "Inertia a of rotors that turn with the rate φ̇ of the joint's coordinate, ½ a φ̇² (kg m², or kg of a "
+        "slide). One number; two for the coordinates of a universal or cylindrical joint. Absent: 0.",
+        default=None,
+        examples=[0.01],
+    )
+    damping: PerCoordinate | None = _field(
+        "Coefficient c of a damper, −c φ̇ (N m s, or N s/m of a slide). As many numbers. Absent: 0.",
+        default=None,
+    )
+    stiffness: PerCoordinate | None = _field(
+        "Stiffness k of a spring, −k (φ − φ₀) (N m, or N/m of a slide); angles count on beyond π. As many "
+        "numbers. Absent: 0.",
+        default=None,
+    )
+
+    _not_negative = field_validator("armature", "damping", "stiffness")(_require_not_negative)
+
+    @field_validator("armature", "damping", "stiffness", "rest", "effort", check_fields=False)
+    @classmethod
+    def _check_element(cls, value: list[float] | None, info: ValidationInfo) -> list[float] | None:
+        kind = info.data.get("kind")
+        if value is None or kind is None:
+            return value
+        count = 1 if kind == "ball" else len(KINDS[kind].motions)
+        if not count:
+            raise invalid_value_error(f"is given for a {kind} joint, which does not move", "nothing")
+        if len(value) != count:
+            given = f"has {len(value)} {'number' if len(value) == 1 else 'numbers'}"
+            raise invalid_value_error(given, f"{count} for a {kind} joint")
+        return value
+
+    @model_serializer(mode="wrap")
+    def _omit_absent_elements(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out what is absent: a scenario's digest depends on its content alone."""
+        data: dict[str, Any] = handler(self)
+        return {k: v for k, v in data.items() if v is not None or k not in JOINT_ELEMENTS}
+
+
+class Ball(JointElements):
+    """A ball joint: the body's proximal point stays where it hangs.
+
+    Its passive elements are the same about every axis; φ is the rotation vector of the body in its parent.
+    """
 
     kind: Literal["ball"] = _field("`ball`.")
 
@@ -299,7 +361,7 @@ class Rod(SchemaModel):
         return self
 
 
-class Articulated(SchemaModel):
+class Articulated(JointElements):
     """A joint with axes: `hinge`, `universal`, `slide`, `cylindrical` or `weld`.
 
     Its axes x, y, z are fixed in the parent by `frame` and in the body by `body_frame`; at coordinates 0 both
@@ -328,6 +390,15 @@ class Articulated(SchemaModel):
         default=None,
     )
     rates: list[float] | None = _field("Their rates at t = 0 [rad/s, m/s]. Absent: 0.", default=None)
+    rest: PerCoordinate | None = _field(
+        "Coordinates φ₀ at which the springs are unloaded [rad, m]. With `stiffness` only. Absent: 0.",
+        default=None,
+    )
+    effort: PerCoordinate | None = _field(
+        "Constant torques [N m] or forces [N] along the coordinates on this body, the opposite on its parent."
+        " Absent: 0.",
+        default=None,
+    )
 
     _axis = field_validator("axis")(_require_nonzero)
 
@@ -345,6 +416,12 @@ class Articulated(SchemaModel):
             raise invalid_value_error("gives axis and a frame", "one of them")
         if self.axis is not None and self.kind in ("universal", "weld"):
             raise invalid_value_error(f"gives an axis to a {self.kind} joint", "`frame` and `body_frame`")
+        return self
+
+    @model_validator(mode="after")
+    def _check_rest(self) -> Articulated:
+        if self.rest is not None and self.stiffness is None:
+            raise invalid_value_error("gives rest without stiffness", "both, or neither")
         return self
 
 
@@ -491,6 +568,21 @@ ChainItem = Annotated[
 ]
 
 
+class Spring(SchemaModel):
+    """A spring and damper between two points, of two bodies or of a body and the world.
+
+    It pulls with the tension k (l − l₀) + c l̇ at the distance l.
+    """
+
+    bodies: Annotated[list[str], Len(2, 2)] = _field(
+        "The names of its two bodies; `world` for a point of the world.", examples=[["world", "bob"]]
+    )
+    points: Annotated[list[Vector], Len(2, 2)] = _field("A point of each, in the frame of its body.", "m")
+    stiffness: float = _field("k ≥ 0.", "N/m", 0.0, ge=0)
+    damping: float = _field("c ≥ 0.", "N s/m", 0.0, ge=0)
+    length: float = _field("l₀ ≥ 0: the distance at which the spring is unloaded.", "m", 0.0, ge=0)
+
+
 class Document(SchemaModel):
     """A scenario file: one open chain of rigid bodies, its initial state, its loads."""
 
@@ -530,6 +622,8 @@ class Document(SchemaModel):
         "The chain, from the pivot outwards: single and repeated bodies.", min_length=1, max_length=MAX_BODIES
     )
 
+    springs: list[Spring] = _field("Springs and dampers between points.", default=[])
+
     _text = field_validator("name", "family", "title", "purpose")(_require_printable)
 
     @field_validator("name", "family", "title")
@@ -551,6 +645,12 @@ class Document(SchemaModel):
             valid = "a duration that is a whole number of samples"
             raise invalid_value_error(message, valid, "duration")
         return value
+
+    @model_serializer(mode="wrap")
+    def _omit_absent_springs(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out an empty list of springs: a scenario's digest depends on its content alone."""
+        data: dict[str, Any] = handler(self)
+        return {k: v for k, v in data.items() if v or k != "springs"}
 
 
 def attitude_quaternion(attitude: Attitude) -> Array:

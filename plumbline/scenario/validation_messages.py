@@ -154,7 +154,12 @@ def _message_and_valid(
             return f"is {_describe_value(given)}", _field_description(info, kind)
         case "too_short" | "too_long":
             bound = context.get("min_length", context.get("max_length"))
-            fixed = isinstance(given, list) and bound in (3, 4, 6)  # vectors, quaternions, six, matrix
+            fixed = isinstance(given, list) and bound in (
+                2,
+                3,
+                4,
+                6,
+            )  # pairs, vectors, quaternions, six, matrix
             few = "exactly" if fixed else "at least" if kind == "too_short" else "at most"
             return f"has {context.get('actual_length')} entries", f"{few} {bound}"
         case "string_too_short" | "string_too_long":

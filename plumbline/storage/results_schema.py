@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from plumbline.judging.rows import Level
-from plumbline.model.datatypes import CHAIN_FIELDS, KINDS, Model
+from plumbline.model.datatypes import CHAIN_FIELDS, JOINT_ELEMENTS, KINDS, SPRING_FIELDS, Model
 from plumbline.processes.errors import PlumblineError
 from plumbline.scenario.errors import shorten
 from plumbline.scenario.schema import MAX_BODIES, invalid_value_error
@@ -25,7 +25,9 @@ MAX_MAGNITUDE = 1e30  # of the model's numbers, as in scenario files
 
 _MODEL_SHAPES: dict[str, tuple[int, ...]] = {  # of one body; (3,) where none is named
     "inertia": (3, 3), "mass": (), "length": (), "drag_force": (), "drag_moment": (),
-    "body": (2,), "point": (2, 3), "turn": (2, 4),
+    "body": (2,), "point": (2, 3), "turn": (2, 4), **dict.fromkeys(JOINT_ELEMENTS, (2,)),
+    "spring_body": (2,), "spring_point": (2, 3), "spring_stiffness": (), "spring_damping": (),
+    "spring_length": (),
 }  # fmt: skip
 _STATE_SHAPES: dict[str, tuple[int, ...]] = {"p": (4,), "omega": (3,), "u": (3,), "udot": (3,)}
 _TREE_STATE_SHAPES = _STATE_SHAPES | {"r": (3,), "v": (3,), "x": (2,), "xdot": (2,)}
@@ -66,8 +68,15 @@ class _Scenario(_Part):
     @model_validator(mode="after")
     def _check_arrays(self) -> _Scenario:
         is_tree = self.model is not None and "kind" in self.model
-        names = [f.name for f in fields(Model) if f.name != "kind"] if is_tree else CHAIN_FIELDS
-        shapes = {name: (self.bodies, *_MODEL_SHAPES.get(name, (3,))) for name in names}
+        model, counts = self.model or {}, dict.fromkeys(SPRING_FIELDS, 0)
+        if isinstance(model.get("spring_body"), list):
+            counts = dict.fromkeys(SPRING_FIELDS, len(model["spring_body"]))
+        absent = {name for name in (*JOINT_ELEMENTS, *SPRING_FIELDS) if name not in model}
+        absent -= set(SPRING_FIELDS) if "spring_body" in model else set()
+        names = (
+            [f.name for f in fields(Model) if f.name not in {"kind", *absent}] if is_tree else CHAIN_FIELDS
+        )
+        shapes = {name: (counts.get(name, self.bodies), *_MODEL_SHAPES.get(name, (3,))) for name in names}
         _check_shapes("model", self.model, shapes | {"gravity": (3,)})
         state_shapes = _TREE_STATE_SHAPES if is_tree else _STATE_SHAPES
         _check_shapes("state", self.state, {k: (self.bodies, *shape) for k, shape in state_shapes.items()})

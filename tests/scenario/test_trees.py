@@ -2,22 +2,29 @@
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
+from plumbline.model.datatypes import JOINT_ELEMENTS
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.scenario.errors import ScenarioError
 from plumbline.scenario.loader import load_scenario_text
+from plumbline.storage.results_schema import _Scenario
+from reference_impl.mechanism import Mechanism
 
 HEAD = "schema_version: 1\ntitle: t\npurpose: p\nbodies:\n"
 BODY = "mass: 1, inertia: {principal: [1, 1, 1]}, proximal: [0, 0, 1]"
 
 
-def load(*bodies):
-    return load_scenario_text(HEAD + "".join(f"  - {{{BODY}, {body}}}\n" for body in bodies))
+def load(*bodies, springs=()):
+    text = HEAD + "".join(f"  - {{{BODY}, {body}}}\n" for body in bodies)
+    return load_scenario_text(
+        text + "springs:\n" * bool(springs) + "".join(f"  - {{{s}}}\n" for s in springs)
+    )
 
 
-def problems(*bodies):
+def problems(*bodies, springs=()):
     with pytest.raises(ScenarioError) as error:
-        load(*bodies)
+        load(*bodies, springs=springs)
     return [str(problem) for problem in error.value.problems]
 
 
@@ -111,3 +118,80 @@ def test_mistakes_are_named_with_their_place(name):
     bodies, words = MISTAKES[name]
     found = "\n".join(problems(*bodies))
     assert all(word in found for word in words), found
+
+
+ARM = "name: arm, joint: {kind: hinge, axis: [0, 0, 1]}, distal: [0, 0, -1]"
+BOB = f"name: bob, {BALL}"
+
+
+def test_passive_elements_are_built_as_written():
+    s = load(
+        ARM.replace("1]}", "1], armature: 0.5, stiffness: [3], rest: 1, effort: -2}"),
+        f"name: bob, {BALL.replace('ball', 'ball, damping: 0.25, armature: 1')}",
+        "joint: {kind: universal, damping: [1, 2], effort: [0, 4]}, parent: arm",
+        springs=(
+            "bodies: [world, bob], points: [[0, 0, 1], [0, 1, 0]], stiffness: 7, length: 0.5",
+            "bodies: [bob, arm], points: [[0, 0, 3], [0, 0, 0]], damping: 2",
+        ),
+    ).model
+    assert s.armature.tolist() == [[0.5, 0], [1, 0], [0, 0]]
+    assert s.damping.tolist() == [[0, 0], [0.25, 0], [1, 2]]
+    assert s.stiffness.tolist() == [[3, 0], [0, 0], [0, 0]] and s.rest.tolist() == [[1, 0], [0, 0], [0, 0]]
+    assert s.effort.tolist() == [[-2, 0], [0, 0], [0, 4]]
+    assert s.spring_body.tolist() == [[-1, 1], [1, 0]] and s.spring_point[0].tolist() == [
+        [0, 0, 1],
+        [0, 1, 0],
+    ]
+    assert s.spring_stiffness.tolist() == [7, 0] and s.spring_damping.tolist() == [0, 2]
+    assert s.spring_length.tolist() == [0.5, 0]
+    again = Mechanism.from_fields({k: np.asarray(v).tolist() for k, v in s.fields.items()})
+    assert all(np.array_equal(getattr(again, name), value) for name, value in vars(s).items())
+
+
+def test_a_chain_with_an_element_is_no_bare_chain_and_bare_files_keep_their_digest():
+    bare, damped = load(BALL), load(BALL.replace("ball", "ball, damping: 1"))
+    assert bare.model.is_chain and not damped.model.is_chain and damped.model.has_elements
+    assert "springs" not in bare.document and set(bare.document["bodies"][0]["joint"]) == {"kind"}
+    assert bare.digest != damped.digest
+    assert not set(bare.model.fields) & {"armature", "spring_body"}
+    assert set(load(ARM, BOB).model.fields) & {"armature", "spring_body"} == set()
+
+
+def spring(bodies, more="stiffness: 1", points="[[0, 0, 1], [0, 1, 0]]"):
+    return (f"bodies: {bodies}, points: {points}, {more}",)
+
+
+ELEMENT_MISTAKES = {
+    "too many": (ARM.replace("1]}", "1], damping: [1, 2]}"), (), ["5:", "has 2 numbers", "1 for a hinge"]),
+    "too few": ("joint: {kind: universal, armature: 1}", (), ["5:", "has 1 number", "2 for a univ"]),
+    "negative": (BALL.replace("ball", "ball, stiffness: -1"), (), ["5:", "stiffness: is -1.0, below 0"]),
+    "of a weld": ("parent: bob, joint: {kind: weld, damping: 1}", (), ["given for a weld"]),
+    "effort of a ball": (BALL.replace("ball", "ball, effort: 1"), (), ["5:", "effort: unknown field"]),
+    "rest alone": (ARM.replace("1]}", "1], rest: 1}"), (), ["gives rest without stiffness"]),
+    "a word": (ARM.replace("1]}", "1], damping: high}"), (), ["damping: is the text 'high'"]),
+    "no such body": (ARM, spring("[arm, bbo]"), ["8:", "springs[0].bodies[1]: is 'bbo', no body's name"]),
+    "one body": (ARM, spring("[arm, arm]"), ["springs[0].bodies[1]: is 'arm' like the other end"]),
+    "the world twice": (ARM, spring("[world, world]"), ["is 'world' like the other end"]),
+    "a single body": (ARM, spring("[arm]"), ["springs[0].bodies: has 1 entries", "exactly 2"]),
+    "a name twice": (f"name: bob, {BALL}", spring("[world, bob]"), ["is 'bob', the name of 2 bodies"]),
+    "no distance": (ARM, spring("[world, bob]", points="[[0, 0, 0], [0, 0, 1]]"), ["8:", "coincide"]),
+    "negative length": (ARM, spring("[world, bob]", "length: -1"), ["springs[0].length: is -1"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ELEMENT_MISTAKES)
+def test_mistakes_in_elements_are_named_with_their_place(name):
+    first, springs, words = ELEMENT_MISTAKES[name]
+    found = "\n".join(problems(first, f"parent: world, {BOB}", springs=springs))
+    assert all(word in found for word in words), found
+
+
+def test_stored_models_need_no_elements_and_check_those_they_have():
+    model = load(ARM.replace("1]}", "1], damping: 2}"), BOB, springs=spring("[world, bob]")).model
+    stored = {k: np.asarray(v).tolist() for k, v in model.fields.items()}
+    about = {"family": "tree", "title": "t", "bodies": 2}
+    _Scenario.model_validate(about | {"model": stored})
+    _Scenario.model_validate(about | {"model": {k: v for k, v in stored.items() if k not in JOINT_ELEMENTS}})
+    for name in ("damping", "spring_point", "spring_length"):
+        with pytest.raises(ValidationError, match=f"model.{name} does not fit"):
+            _Scenario.model_validate(about | {"model": stored | {name: [[1.0]]}})
