@@ -10,17 +10,14 @@ import numpy as np
 from plumbline.model.datatypes import Array, Model, State
 
 
-class BallArithmetic:
-    """A model in balls; vectors are 3×1 ``arb_mat``; ``J`` is in body axes, gravity ``g`` in world axes."""
+class BallVectors:
+    """Vectors and rotations in balls; vectors are 3×1 ``arb_mat``."""
 
-    def __init__(self, flint: Any, model: Model) -> None:
-        self.flint, self.model, self.n = flint, model, model.n
-        self.mat, self.arb = flint.arb_mat, flint.arb
-        self.m = [self.arb(float(m)) for m in model.mass]
-        self.J = [self.matrix(J) for J in model.inertia]
-        self.g = self.vector(model.gravity)
+    def __init__(self, flint: Any) -> None:
+        self.flint, self.mat, self.arb = flint, flint.arb_mat, flint.arb
         self.zero = self.vector((0.0, 0.0, 0.0))
         self.eye = self.matrix(np.eye(3))
+        self.units = [self.vector(e) for e in np.eye(3)]
 
     def vector(self, v: Iterable[float]) -> Any:
         """A vector of doubles.
@@ -91,6 +88,17 @@ class BallArithmetic:
             [2 * (x * z - w * y), 2 * (y * z + w * x), ww - xx - yy + zz],
         ]
         return self.mat(entries_) * (1 / (ww + xx + yy + zz))
+
+
+class BallArithmetic(BallVectors):
+    """A model in balls; ``J`` is in body axes, gravity ``g`` in world axes."""
+
+    def __init__(self, flint: Any, model: Model) -> None:
+        super().__init__(flint)
+        self.model, self.n = model, model.n
+        self.m = [self.arb(float(m)) for m in model.mass]
+        self.J = [self.matrix(J) for J in model.inertia]
+        self.g = self.vector(model.gravity)
 
     def rod_direction(self, state: State, k: int) -> tuple[Any, Any]:
         """U of rod k as a unit vector and u̇ perpendicular to it.

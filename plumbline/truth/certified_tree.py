@@ -22,9 +22,10 @@ import numpy as np
 from plumbline.model.datatypes import KINDS, Model, State
 from plumbline.model.kinematics import own_rates, rate_count
 from plumbline.truth.balls import BallArithmetic, entries, midpoints, term_scales
+from plumbline.truth.joint_tree import JointTree
 
 
-class _BallTree(BallArithmetic):
+class _BallTree(JointTree, BallArithmetic):
     """Model and state in balls: lists over the bodies of 3×1 ``arb_mat`` in world axes.
 
     Attitudes A, centres r, velocities v, angular velocities w; of the joints the near points P, the motions S
@@ -43,7 +44,6 @@ class _BallTree(BallArithmetic):
         self.bend: list[Any] = []
         self.twist: list[Any] = []
         self.tangents: list[list[Any]] = []
-        self.units = [self.vector(e) for e in np.eye(3)]
         for k in range(self.n):
             self._add_body(k)
 
@@ -76,8 +76,7 @@ class _BallTree(BallArithmetic):
         else:
             A, w, P, v, a, alpha = self._move(k, w, P, v, a, alpha, columns)
         near = self.zero if kind == "free" else A * self.vector(model.point[k, 1])
-        cross, origin = self.cross_matrix(w), self.cross_matrix(P)
-        twists = [[*entries(axis), *entries(along + origin * axis)] for axis, along in columns]
+        cross = self.cross_matrix(w)
         self.A.append(A)
         self.w.append(w)
         self.P.append(P)
@@ -85,7 +84,7 @@ class _BallTree(BallArithmetic):
         self.v.append(v - cross * near)
         self.twist.append(alpha)
         self.bend.append(a - self.cross_matrix(alpha) * near - cross * (cross * near))
-        self.S.append(self.mat(6, len(twists), [x for row in zip(*twists, strict=True) for x in row]))
+        self.S.append(self.twist_columns(P, columns))
 
     def _move(
         self, k: int, w: Any, P: Any, v: Any, a: Any, alpha: Any, columns: list[Any]
@@ -115,15 +114,6 @@ class _BallTree(BallArithmetic):
         i, j = (axis + 1) % 3, (axis + 2) % 3
         m[i][i], m[i][j], m[j][i], m[j][j] = c, -s, s, c
         return self.mat(m)
-
-    def spatial_inertia(self, k: int) -> Any:
-        """Inertia (6, 6) of body k about the world's origin: twist → momentum, angular part first."""
-        c = self.cross_matrix(self.r[k]) * self.m[k]
-        top = self.A[k] * self.J[k] * self.A[k].transpose() - c * self.cross_matrix(self.r[k])
-        rows = [[*[top[i, j] for j in range(3)], *[c[i, j] for j in range(3)]] for i in range(3)] + [
-            [*[-c[i, j] for j in range(3)], *[self.m[k] * int(i == j) for j in range(3)]] for i in range(3)
-        ]
-        return self.mat(rows)
 
     def wrench_at_rest(self, k: int) -> Any:
         """Moment about the origin and force (6, 1) that body k needs at ν̇ = 0, besides weight and loads."""
@@ -156,9 +146,9 @@ def enclose_tree(flint: Any, model: Model, state: State, mass_matrix: bool) -> d
     if model.has_elements:
         raise NotImplementedError("passive elements have no certified quantities yet")
     c = _BallTree(flint, model, state)
-    M, first = _joint_mass_matrix(c)
+    M, first = c.joint_mass_matrix()
     inertias, wrenches = ([of(k) for k in range(c.n)] for of in (c.spatial_inertia, c.wrench_at_rest))
-    total = _subtree_sums(c, wrenches)
+    total = c.subtree_sums(wrenches)
     h = [x for k in range(c.n) for x in entries(c.S[k].transpose() * total[k])]
     rates = entries(M.solve(c.mat(len(h), 1, [-x for x in h]))) if h else []
     acceleration, angular, kinetic, potential, momentum = [], [], c.arb(0), c.arb(0), c.zero
@@ -177,7 +167,7 @@ def enclose_tree(flint: Any, model: Model, state: State, mass_matrix: bool) -> d
         momentum += c.cross_matrix(c.r[k]) * c.v[k] * c.m[k] + spin
         wrenches[k] = wrenches[k] + inertias[k] * gained[k]
     force, moment = [], []
-    for k, wrench in enumerate(_subtree_sums(c, wrenches)):
+    for k, wrench in enumerate(c.subtree_sums(wrenches)):
         about_origin, pull = (c.mat(3, 1, entries(wrench)[part]) for part in (slice(0, 3), slice(3, 6)))
         force.append(entries(pull))
         moment.append(entries(about_origin - c.cross_matrix(c.P[k]) * pull))
@@ -196,34 +186,6 @@ def enclose_tree(flint: Any, model: Model, state: State, mass_matrix: bool) -> d
         T = _relative_rates(c, first)
         balls["mass_matrix"] = (T.transpose() * M * T).tolist()
     return balls | {"scale": _term_scales(c, balls)}
-
-
-def _subtree_sums(c: _BallTree, wrenches: list[Any]) -> list[Any]:
-    """Per body the sum over it and all bodies beyond."""
-    total = list(wrenches)
-    for k in reversed(range(c.n)):
-        if c.far[k] >= 0:
-            total[c.far[k]] = total[c.far[k]] + total[k]
-    return total
-
-
-def _joint_mass_matrix(c: _BallTree) -> tuple[Any, list[int]]:
-    """M of the relative rates, and where each joint's begin."""
-    first = [int(i) for i in np.cumsum([0, *(S.ncols() for S in c.S)])]
-    composite = _subtree_sums(c, [c.spatial_inertia(k) for k in range(c.n)])
-    rows = [[c.arb(0)] * first[-1] for _ in range(first[-1])]
-    for k in range(c.n):
-        if not c.S[k].ncols():
-            continue
-        momentum, j = composite[k] * c.S[k], k
-        while j >= 0:
-            block = c.S[j].transpose() * momentum
-            for row in range(c.S[j].ncols()):
-                for column in range(c.S[k].ncols()):
-                    rows[first[j] + row][first[k] + column] = block[row, column]
-                    rows[first[k] + column][first[j] + row] = block[row, column]
-            j = c.far[j]
-    return c.mat(rows) if rows else c.mat(0, 0), first
 
 
 def _relative_rates(c: _BallTree, first: list[int]) -> Any:
