@@ -144,9 +144,7 @@ class ModelQuantities:
 
     poses: Mapping[str, Array]  # body name → (3, 4): rotation body → world, and origin [m]
     mass_matrix: Array | None = None  # (n, n) with armature
-    bias_force: Array | None = (
-        None  # (n,) h: Coriolis, centrifugal and gravity, on the left
-    )
+    bias_force: Array | None = None  # (n,) h: Coriolis, centrifugal and gravity, on the left
     gravity_force: Array | None = None  # (n,) h at v = 0
     passive_force: Array | None = None  # (n,) of dampers and springs, as on the right
     acceleration: Array | None = None  # (n,) v̇ without friction loss, contacts, limits, actuators

@@ -1,0 +1,254 @@
+"""XML of model files with line numbers; nothing outside the file is read, and entities are refused."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+from xml.sax.saxutils import escape, quoteattr
+
+from plumbline.importers.neutral_model import Source
+from plumbline.scenario.errors import Problem, ScenarioError, shorten
+
+MAX_BYTES = 64 * 2**20  # the largest robot of the known collections has 2 MB
+MAX_DEPTH = 500  # nested elements; MuJoCo's own limit is 500 bodies deep
+_DECLARATION = re.compile(rb"\A(?:\xef\xbb\xbf)?\s*<\?xml([^>]*)\?>")
+_ENCODING = re.compile(rb"encoding\s*=\s*[\"']([A-Za-z][\w.-]*)[\"']")
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\Z")
+
+
+class ModelFileError(ScenarioError):
+    """A model file that cannot be used; ``problems`` has every mistake that was found in it."""
+
+
+@dataclass
+class Element:
+    """An element with its attributes, children and position."""
+
+    tag: str
+    attributes: dict[str, str]
+    source: Source
+    children: list[Element] = field(default_factory=list)
+    text: str = ""
+
+    def walk(self) -> Iterator[Element]:
+        """Go through this element and all below it, in the order of the file.
+
+        Yields:
+            Elements.
+
+        """
+        stack = [self]
+        while stack:
+            element = stack.pop()
+            yield element
+            stack.extend(reversed(element.children))
+
+    def find_all(self, tag: str) -> list[Element]:
+        """List the children of a tag.
+
+        Args:
+            tag: their tag.
+
+        Returns:
+            The children, in the order of the file.
+
+        """
+        return [child for child in self.children if child.tag == tag]
+
+    def find(self, tag: str) -> Element | None:
+        """Return the first child of a tag.
+
+        Args:
+            tag: of the child, as written in the file.
+
+        Returns:
+            The child, or None.
+
+        """
+        return next((child for child in self.children if child.tag == tag), None)
+
+    def problem(self, message: str, attribute: str = "", valid: str = "", hint: str = "") -> Problem:
+        """Make a problem at this element.
+
+        Args:
+            message: what is wrong.
+            attribute: the attribute that it is about, if any.
+            valid: what would be valid.
+            hint: how to correct it.
+
+        Returns:
+            The problem.
+
+        """
+        name = self.attributes.get("name")
+        where = f"<{self.tag} name={shorten(repr(name))}>" if name is not None else f"<{self.tag}>"
+        return Problem(
+            self.source.file,
+            self.source.line,
+            1,
+            f"{where} {attribute}".strip(),
+            message,
+            valid,
+            hint,
+        )
+
+
+def parse_numbers(element: Element, attribute: str, count: int, problems: list[Problem]) -> list[float]:
+    """Read the numbers of an attribute, each rounded to double once.
+
+    Args:
+        element: has the attribute.
+        attribute: its name.
+        count: how many numbers it must have.
+        problems: gets what is wrong.
+
+    Returns:
+        ``count`` finite numbers; zeros where something is wrong.
+
+    """
+    words = element.attributes[attribute].split()
+    valid = f"{count} finite number{'s' if count > 1 else ''}"
+    values = [float(word) if _NUMBER.match(word) else math.nan for word in words]
+    if len(words) != count:
+        problems.append(element.problem(f"has {len(words)} numbers", attribute, valid))
+    elif bad := [word for word, value in zip(words, values, strict=True) if not math.isfinite(value)]:
+        problems.append(element.problem(f"{shorten(repr(bad[0]))} is no finite number", attribute, valid))
+    else:
+        return values
+    return [0.0] * count
+
+
+def read_xml(path: Path, shown: str) -> Element:
+    """Parse a file.
+
+    Args:
+        path: the file.
+        shown: its name in messages and sources.
+
+    Returns:
+        The root element.
+
+    Raises:
+        ModelFileError: the file cannot be read, is not well-formed, or declares entities.
+
+    """
+    try:
+        if path.is_dir():
+            raise ModelFileError([Problem(shown, 0, 0, "", "is a folder", "a URDF or MJCF file")])
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ModelFileError([Problem(shown, 0, 0, "", f"cannot be read: {reason}")]) from None
+    if len(data) > MAX_BYTES:
+        raise ModelFileError([Problem(shown, 0, 0, "", f"is larger than {MAX_BYTES >> 20} MB")])
+    return parse_xml(data, shown)
+
+
+def parse_xml(data: bytes, shown: str) -> Element:
+    """Parse the content of a file.
+
+    Args:
+        data: the content.
+        shown: the file's name in messages and sources.
+
+    Returns:
+        The root element.
+
+    Raises:
+        ModelFileError: it is not well-formed, or declares entities.
+
+    """
+    data, encoding = _without_declaration(data)
+    handler = _Handler(shown)
+    try:
+        handler.parser = expat.ParserCreate(encoding)
+        handler.connect()
+        handler.parser.Parse(data, True)
+    except expat.ExpatError as error:
+        words = expat.ErrorString(error.code)
+        problem = Problem(shown, error.lineno, error.offset + 1, "", f"is not well-formed XML: {words}")
+        raise ModelFileError([problem]) from None
+    except (ValueError, LookupError) as error:  # of an encoding that expat leaves to Python
+        raise ModelFileError([Problem(shown, 1, 1, "", f"cannot be decoded: {error}")]) from None
+    assert handler.root is not None
+    return handler.root
+
+
+def _without_declaration(data: bytes) -> tuple[bytes, str | None]:
+    """Blank the XML declaration, whose version is wrong in some published files; keep its encoding."""
+    match = _DECLARATION.match(data)
+    if match is None:
+        return data, None
+    encoding = _ENCODING.search(match[1])
+    blank = re.sub(rb"[^\n]", b" ", match[0])
+    return blank + data[match.end() :], encoding[1].decode("ascii") if encoding else "utf-8"
+
+
+class _Handler:
+    """Builds the tree from the parser's calls."""
+
+    def __init__(self, shown: str) -> None:
+        self.shown, self.root = shown, None  # type: str, Element | None
+        self.stack: list[Element] = []
+        self.parser: Any = None
+
+    def connect(self) -> None:
+        self.parser.buffer_text = True
+        self.parser.StartElementHandler = self.start
+        self.parser.EndElementHandler = lambda _: self.stack.pop()
+        self.parser.CharacterDataHandler = self.characters
+        self.parser.EntityDeclHandler = self.refuse_entity
+        self.parser.ExternalEntityRefHandler = self.refuse_entity
+
+    def start(self, tag: str, attributes: dict[str, str]) -> None:
+        element = Element(tag, attributes, Source(self.shown, self.parser.CurrentLineNumber))
+        if len(self.stack) >= MAX_DEPTH:
+            raise ModelFileError([element.problem(f"is nested more than {MAX_DEPTH} deep")])
+        if self.stack:
+            self.stack[-1].children.append(element)
+        else:
+            self.root = element
+        self.stack.append(element)
+
+    def characters(self, text: str) -> None:
+        if self.stack and not text.isspace():
+            self.stack[-1].text += text
+
+    def refuse_entity(self, *_: object) -> None:
+        line = self.parser.CurrentLineNumber
+        problem = Problem(self.shown, line, 1, "", "declares or uses an entity", "a file without entities")
+        raise ModelFileError([problem])
+
+
+def write_xml(root: Element) -> str:
+    """Write a tree as text.
+
+    Args:
+        root: the root element.
+
+    Returns:
+        The text, an element per line.
+
+    """
+    lines: list[str] = []
+    stack: list[tuple[int, Element | str]] = [(0, root)]
+    while stack:
+        depth, item = stack.pop()
+        if isinstance(item, str):
+            lines.append("  " * depth + item)
+            continue
+        head = f"<{item.tag}" + "".join(f" {k}={quoteattr(v)}" for k, v in item.attributes.items())
+        if not item.children:
+            text = escape(item.text)
+            lines.append("  " * depth + (f"{head}>{text}</{item.tag}>" if text else f"{head}/>"))
+            continue
+        lines.append("  " * depth + head + ">" + escape(item.text))
+        stack.append((depth, f"</{item.tag}>"))
+        stack.extend((depth + 1, child) for child in reversed(item.children))
+    return "\n".join(lines) + "\n"
