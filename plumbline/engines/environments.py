@@ -21,13 +21,14 @@ from packaging.specifiers import SpecifierSet
 from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel_filename
 from packaging.version import InvalidVersion, Version
 
-from plumbline.engines.registry import ENGINES
+from plumbline.engines.registry import ENGINES, IMPORTERS
 from plumbline.processes.errors import PlumblineError
 from plumbline.processes.isolation import ScratchFolder
 from plumbline.processes.user_cache import user_cache_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 BASE_REQUIREMENTS = ("numpy", "scipy", "packaging")  # imported by adapters and by the core in workers
+OPTIONAL_IMPORTERS = ROOT / ".importers"  # environment that `make importers` makes
 INSTALL_TIMEOUT = 900  # s for uv to fetch and install
 
 
@@ -85,19 +86,19 @@ def _wheel_problem(path: Path, package: str) -> str | None:
 
 
 def declared_attribute(engine: str, attribute: str) -> Any:
-    """Read a literal class attribute of an adapter without importing it.
+    """Read a literal class attribute of an adapter, or of an importer without adapter, without importing it.
 
     The name of the distribution, for one, is needed where the engine is not installed.
 
     Args:
         engine: name in the registry.
-        attribute: name of a class attribute of the adapter or of one of its bases, written as a literal.
+        attribute: name of a class attribute of the class or of one of its bases, written as a literal.
 
     Returns:
         Its value; None where no class declares it.
 
     """
-    module, _, class_name = ENGINES[engine].partition(":")
+    module, _, class_name = {**IMPORTERS, **ENGINES}[engine].partition(":")
     return _read_attribute(module, class_name, attribute)
 
 
@@ -168,6 +169,31 @@ def ensure_interpreter(name: str) -> str:
                 if not _interpreter_path(place).exists():
                     raise
     return str(_interpreter_path(place))
+
+
+def importer_interpreter(name: str) -> str:
+    """Find the Python that has an importer.
+
+    Args:
+        name: an importer of model files, with or without a version, as typed on the command line.
+
+    Returns:
+        Path of the interpreter; empty for this process's own.
+
+    Raises:
+        EnvironmentUnavailable: the importer is optional and its environment has not been made, or uv fails.
+
+    """
+    base, version = split_version(name)
+    if version:
+        return ensure_interpreter(name)
+    module, _, class_name = IMPORTERS[base].partition(":")
+    if not _read_attribute(module, class_name, "is_optional"):
+        return ""
+    python = _interpreter_path(OPTIONAL_IMPORTERS)
+    if not python.exists():
+        raise EnvironmentUnavailable(f"{base} is not installed here; `make importers` installs it")
+    return str(python)
 
 
 def _interpreter_path(environment: Path) -> Path:

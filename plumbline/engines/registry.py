@@ -5,6 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 
 from plumbline.engines.adapter import Adapter
+from plumbline.importers.importer import Importer
 
 ENGINES = {
     "reference": "adapters.reference_engine:Reference",
@@ -15,6 +16,12 @@ ENGINES = {
     "pinocchio-maximal": "adapters.pinocchio_maximal_engine:PinocchioMaximal",
     "exudyn": "adapters.exudyn_engine:Exudyn",
     "exudyn-tree": "adapters.exudyn_tree_engine:ExudynTree",
+}
+
+# Importers of model files, by the name as typed; an engine may have one without an adapter.
+IMPORTERS = {
+    "mujoco": "adapters.mujoco_importer:MujocoImporter",
+    "pinocchio": "adapters.pinocchio_importer:PinocchioImporter",
 }
 
 
@@ -30,4 +37,19 @@ def load_adapter(name: str) -> Adapter:
     """
     module, _, class_name = ENGINES[name].partition(":")
     found: type[Adapter] = getattr(import_module(module), class_name)
+    return found()
+
+
+def load_importer(name: str) -> Importer:
+    """Import an importer column, and with it its engine; ImportError means that the engine is not installed.
+
+    Args:
+        name: a key of `IMPORTERS`.
+
+    Returns:
+        A new instance of the column.
+
+    """
+    module, _, class_name = IMPORTERS[name].partition(":")
+    found: type[Importer] = getattr(import_module(module), class_name)
     return found()

@@ -52,6 +52,19 @@ class Importer(ABC):
     formats: ClassVar[tuple[Format, ...]]
     # Quantities that the engine does not compute (a field of `ModelQuantities`), and why, in a sentence.
     unsupported: ClassVar[dict[str, str]] = {}
+    supported_versions: ClassVar[str] = ""  # PEP 440 range of versions that the column works with
+    # Requirements of environments with another version: (range of versions, additional requirement).
+    extra_requirements: ClassVar[tuple[tuple[str, str], ...]] = ()
+    is_optional: ClassVar[bool] = False  # installed by `make importers`, in an environment of its own
+
+    @abstractmethod
+    def version(self) -> str:
+        """Return the version of the engine that is loaded.
+
+        Returns:
+            A PEP 440 version.
+
+        """
 
     @abstractmethod
     def read(self, file: ModelFile) -> Reading:

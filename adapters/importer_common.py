@@ -1,0 +1,176 @@
+"""Parts shared by the importer columns: canonical velocities, screws of joints, what a library prints."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+
+from plumbline.importers.neutral_model import ElementaryJoint, JointKind, ModelQuantities
+from plumbline.model.datatypes import Array
+from plumbline.model.kinematics import rotation_matrix
+
+MAX_WARNINGS = 20
+_ROTATION_EPSILON = 1e-12  # |ω| of a unit screw below which the motion is a displacement
+
+
+def to_canonical(quantities: ModelQuantities, T: Array, Tdot_v: Array) -> ModelQuantities:
+    """Transform quantities in an engine's velocities v_e = T v to canonical velocities v.
+
+    M = TᵀM_eT,  h = Tᵀ(M_e Ṫv + h_e),  f = Tᵀf_e,  v̇ = T⁻¹(v̇_e − Ṫv).
+
+    Args:
+        quantities: in the engine's velocities.
+        T: the map (n, n).
+        Tdot_v: Ṫv (n,).
+
+    Returns:
+        The quantities in canonical velocities; those that are None stay so.
+
+    Raises:
+        ValueError: there is a bias force without a mass matrix.
+
+    """
+    M, h, a = quantities.mass_matrix, quantities.bias_force, quantities.acceleration
+    if h is not None and M is None:
+        raise ValueError("a bias force in canonical velocities needs the mass matrix")
+    return replace(
+        quantities,
+        mass_matrix=None if M is None else T.T @ M @ T,
+        bias_force=None if h is None or M is None else T.T @ (M @ Tdot_v + h),
+        gravity_force=None if quantities.gravity_force is None else T.T @ quantities.gravity_force,
+        passive_force=None if quantities.passive_force is None else T.T @ quantities.passive_force,
+        acceleration=None if a is None else np.asarray(np.linalg.solve(T, a - Tdot_v), float),
+    )
+
+
+def joint_from_screw(name: str, angular: Array, linear: Array) -> ElementaryJoint:
+    """Describe a joint of one degree of freedom by its motion at the reference.
+
+    Args:
+        name: of the joint.
+        angular: angular velocity (3,) of the body at unit rate, body axes.
+        linear: velocity (3,) of the body frame's origin at unit rate, body axes [m].
+
+    Returns:
+        A hinge through the point of its axis that is next to the body frame's origin, or a slide.
+
+    """
+    size = float(np.linalg.norm(angular))
+    if size > _ROTATION_EPSILON:
+        return make_joint(name, "hinge", angular / size, np.cross(angular, linear) / size**2)
+    return make_joint(name, "slide", linear / np.linalg.norm(linear))
+
+
+def make_joint(
+    name: str, kind: JointKind, axis: Array | None = None, anchor: Array | None = None
+) -> ElementaryJoint:
+    """Make a joint without passive forces.
+
+    Args:
+        name: of the joint.
+        kind: its kind of motion.
+        axis: unit vector (3,), body frame; zero where None.
+        anchor: point (3,) [m], body frame; zero where None.
+
+    Returns:
+        The joint, with arrays of its own.
+
+    """
+    along, point = (np.zeros(3) if x is None else np.array(x, float) for x in (axis, anchor))
+    return ElementaryJoint(name, kind, along, point)
+
+
+def pose(rotation: Array, origin: Array) -> Array:
+    """Return the matrix (3, 4) of a pose.
+
+    Args:
+        rotation: body → world (3, 3).
+        origin: of the body frame (3,) [m], world.
+
+    Returns:
+        Rotation and origin side by side.
+
+    """
+    return np.hstack([np.asarray(rotation, float), np.asarray(origin, float).reshape(3, 1)])
+
+
+def pose_of_coordinates(x: Array) -> Array:
+    """Return the pose that the canonical coordinates of a free joint give.
+
+    Args:
+        x: position [m] and unit quaternion (7,).
+
+    Returns:
+        The pose (4, 4) of the body frame in the world.
+
+    """
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rotation_matrix(x[3:]), x[:3]
+    return matrix
+
+
+def quaternion_of(rotation: Array) -> Array:
+    """Return the unit quaternion of a rotation matrix.
+
+    Args:
+        rotation: a proper rotation (3, 3).
+
+    Returns:
+        The quaternion (4,), scalar first and not negative.
+
+    """
+    R = np.asarray(rotation, float)
+    products = np.array(  # 4 q qᵀ, of whose columns the longest is taken
+        [
+            [1 + R[0, 0] + R[1, 1] + R[2, 2], R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]],
+            [R[2, 1] - R[1, 2], 1 + R[0, 0] - R[1, 1] - R[2, 2], R[1, 0] + R[0, 1], R[0, 2] + R[2, 0]],
+            [R[0, 2] - R[2, 0], R[1, 0] + R[0, 1], 1 - R[0, 0] + R[1, 1] - R[2, 2], R[2, 1] + R[1, 2]],
+            [R[1, 0] - R[0, 1], R[0, 2] + R[2, 0], R[2, 1] + R[1, 2], 1 - R[0, 0] - R[1, 1] + R[2, 2]],
+        ]
+    )
+    column = products[np.argmax(np.diag(products))]
+    q = column / np.linalg.norm(column)
+    return np.asarray(-q if q[0] < 0 else q)
+
+
+def free_joint_name(body: str) -> str:
+    """Return the name of a body's free joint.
+
+    Args:
+        body: name of the body.
+
+    Returns:
+        The name that both the file's and the engine's descriptions use.
+
+    """
+    return f"{body}/free"
+
+
+@contextmanager
+def captured_output() -> Iterator[list[str]]:
+    """Collect what libraries print while a file is loaded.
+
+    Yields:
+        A list that holds the printed lines, without repetitions, at the end of the block.
+
+    """
+    lines: list[str] = []
+    with tempfile.TemporaryFile() as sink:
+        kept = [os.dup(1), os.dup(2)]
+        try:
+            os.dup2(sink.fileno(), 1)
+            os.dup2(sink.fileno(), 2)
+            yield lines
+        finally:
+            for descriptor, old in zip((1, 2), kept, strict=True):
+                os.dup2(old, descriptor)
+                os.close(old)
+            sink.seek(0)
+            text = sink.read(200_000).decode(errors="replace")
+            lines.extend(list(dict.fromkeys(line.strip() for line in text.splitlines() if line.strip())))
+            del lines[MAX_WARNINGS:]

@@ -1,0 +1,199 @@
+"""MuJoCo's importer of URDF and MJCF files.
+
+The neutral model's conventions are MuJoCo's: ordered joints in a body, coordinates and velocities as in
+`qpos` and `qvel`, so that T = 1.  A reading is the compiled `MjModel`.
+
+    M   mj_fullM, with armature    h   qfrc_bias    h(v = 0)   the same at rest
+    f   qfrc_passive               v̇   qacc_smooth
+    energies   mj_energyVel, and mj_energyPos without springs
+
+What is not compared is switched off after compiling: actuators with their armature, tendon forces, buoyancy
+and drag of a fluid, gravity compensation.  Contacts, limits, equalities and friction loss do not enter these
+quantities.  A URDF's root link is fused with the world, MuJoCo's default; with a free base links are not
+fused and the root link gets a free joint.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from adapters.importer_common import captured_output, free_joint_name, pose
+from plumbline.importers.importer import Importer, ModelFile, Reading
+from plumbline.importers.neutral_model import (
+    CanonicalState,
+    ElementaryJoint,
+    JointKind,
+    ModelQuantities,
+    NeutralBody,
+    NeutralModel,
+)
+from plumbline.model.datatypes import Array
+from plumbline.model.kinematics import rotation_matrix
+
+KINDS: dict[int, JointKind] = {
+    int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
+    int(mujoco.mjtJoint.mjJNT_SLIDE): "slide",
+    int(mujoco.mjtJoint.mjJNT_BALL): "ball",
+    int(mujoco.mjtJoint.mjJNT_FREE): "free",
+}
+NOT_COMPARED = (  # arrays of a compiled model whose features are not compared
+    "actuator_armature", "tendon_stiffness", "tendon_damping", "tendon_armature", "body_gravcomp",
+)  # fmt: skip
+
+
+class MujocoImporter(Importer):
+    """MuJoCo's URDF and MJCF compiler."""
+
+    name = "mujoco"
+    title = "MuJoCo"
+    package = "mujoco"
+    formats = ("urdf", "mjcf")
+    supported_versions = ">=3.2,<5"
+
+    def version(self) -> str:
+        """Return the version of the loaded library.
+
+        Returns:
+            As MuJoCo reports it.
+
+        """
+        return str(mujoco.mj_versionString())
+
+    def read(self, file: ModelFile) -> Reading:
+        """Compile a file and describe the compiled model.
+
+        Args:
+            file: the file and how to load it.
+
+        Returns:
+            The description, or MuJoCo's refusal.
+
+        """
+        with captured_output() as warnings:
+            try:
+                m = _compiled(file)
+            except ValueError as error:
+                return Reading(self.version(), refusal=str(error))
+        bodies = tuple(_body(m, i) for i in range(1, m.nbody))
+        model = NeutralModel(_model_name(m), bodies, np.array(m.opt.gravity))
+        return Reading(self.version(), model, warnings=tuple(warnings))
+
+    def evaluate(self, file: ModelFile, states: Sequence[CanonicalState]) -> list[ModelQuantities]:
+        """Compute the quantities with MuJoCo's own routines.
+
+        Args:
+            file: a file that `read` accepts.
+            states: canonical states.
+
+        Returns:
+            One record per state.
+
+        """
+        m = _compiled(file)
+        _switch_off(m)
+        d = mujoco.MjData(m)
+        return [_quantities(m, d, state) for state in states]
+
+
+def _compiled(file: ModelFile) -> Any:
+    if file.format == "mjcf" or file.base == "fixed":
+        return mujoco.MjModel.from_xml_path(file.path)
+    spec = mujoco.MjSpec.from_file(file.path)
+    getattr(spec, "compiler", spec).fusestatic = False  # an attribute of the spec before 3.2.5
+    root = spec.worldbody.first_body()
+    if root is not None:
+        joint = root.add_joint()
+        joint.type, joint.name = mujoco.mjtJoint.mjJNT_FREE, free_joint_name(root.name)
+    return spec.compile()
+
+
+def _switch_off(m: Any) -> None:
+    """Switch off what is not compared."""
+    for name in NOT_COMPARED:
+        if hasattr(m, name):  # later versions have more of them
+            getattr(m, name)[:] = 0
+    m.opt.density = m.opt.viscosity = 0
+    disabled = mujoco.mjtDisableBit
+    m.opt.disableflags |= disabled.mjDSBL_ACTUATION | disabled.mjDSBL_CONTACT | disabled.mjDSBL_CONSTRAINT
+
+
+def _model_name(m: Any) -> str:
+    return bytes(m.names).split(b"\0", 1)[0].decode(errors="replace")
+
+
+def _body(m: Any, i: int) -> NeutralBody:
+    start = m.body_jntadr[i]
+    name = m.body(i).name or f"body{i}"
+    R = rotation_matrix(m.body_iquat[i])
+    return NeutralBody(
+        name=name,
+        parent=int(m.body_parentid[i]) - 1,
+        position=np.array(m.body_pos[i]),
+        attitude=np.array(m.body_quat[i]),
+        joints=tuple(_joint(m, j, name) for j in range(start, start + m.body_jntnum[i])),
+        mass=float(m.body_mass[i]),
+        center=np.array(m.body_ipos[i]),
+        inertia=R @ np.diag(m.body_inertia[i]) @ R.T,
+    )
+
+
+def _joint(m: Any, j: int, body: str) -> ElementaryJoint:
+    kind, dof, q = KINDS[int(m.jnt_type[j])], m.jnt_dofadr[j], m.jnt_qposadr[j]
+    is_scalar = kind in ("hinge", "slide")
+    return ElementaryJoint(
+        name=m.joint(j).name or (free_joint_name(body) if kind == "free" else f"{body}/joint{j}"),
+        kind=kind,
+        axis=np.array(m.jnt_axis[j]) if is_scalar else np.zeros(3),
+        anchor=np.array(m.jnt_pos[j]) if kind in ("hinge", "ball") else np.zeros(3),
+        reference=float(m.qpos0[q]) if is_scalar else 0.0,
+        armature=float(m.dof_armature[dof]),
+        damping=float(m.dof_damping[dof]),
+        stiffness=float(m.jnt_stiffness[j]),
+        spring_reference=float(m.qpos_spring[q]) if is_scalar else 0.0,
+        friction_loss=float(m.dof_frictionloss[dof]),
+    )
+
+
+def _quantities(m: Any, d: Any, state: CanonicalState) -> ModelQuantities:
+    mujoco.mj_resetData(m, d)
+    d.qpos[:] = state.coordinates
+    mujoco.mj_forward(m, d)
+    gravity_force = np.array(d.qfrc_bias)
+    d.qvel[:] = state.velocities
+    mujoco.mj_forward(m, d)
+    poses = {
+        m.body(i).name or f"body{i}": pose(d.xmat[i].reshape(3, 3), d.xpos[i]) for i in range(1, m.nbody)
+    }
+    mujoco.mj_energyVel(m, d)
+    return ModelQuantities(
+        poses=poses,
+        mass_matrix=_full_mass_matrix(m, d),
+        bias_force=np.array(d.qfrc_bias),
+        gravity_force=gravity_force,
+        passive_force=np.array(d.qfrc_passive),
+        acceleration=np.array(d.qacc_smooth),
+        kinetic_energy=float(d.energy[1]),
+        potential_energy=_gravity_potential(m, d),
+    )
+
+
+def _gravity_potential(m: Any, d: Any) -> float:
+    """MuJoCo's potential energy counts springs too: they are switched off for this one call."""
+    kept = np.array(m.jnt_stiffness)
+    m.jnt_stiffness[:] = 0
+    mujoco.mj_energyPos(m, d)
+    m.jnt_stiffness[:] = kept
+    return float(d.energy[0])
+
+
+def _full_mass_matrix(m: Any, d: Any) -> Array:
+    M = np.zeros((m.nv, m.nv))
+    try:
+        mujoco.mj_fullM(m, d, M)
+    except TypeError:  # 3.4 and older take other arguments
+        mujoco.mj_fullM(m, M, d.qM)
+    return M

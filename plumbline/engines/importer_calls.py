@@ -1,0 +1,125 @@
+"""Calls of importers, made in worker processes: importers crash and hang.
+
+What an importer raises becomes its refusal; what it computes is checked here, for every column alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from importlib import metadata
+
+import numpy as np
+from packaging.specifiers import SpecifierSet
+
+from plumbline.engines.adapter import EngineInfo
+from plumbline.engines.calls import format_exception
+from plumbline.engines.environments import BASE_REQUIREMENTS, declared_attribute
+from plumbline.engines.registry import load_importer
+from plumbline.importers.importer import ModelFile, Reading
+from plumbline.importers.neutral_model import CanonicalState, ModelQuantities
+from plumbline.model.datatypes import Array, EngineFailure
+
+_OWN_PACKAGES = {"plumbline", "adapters", *BASE_REQUIREMENTS, ""}
+_VECTORS = ("bias_force", "gravity_force", "passive_force", "acceleration")
+
+
+def describe_importer(name: str) -> EngineInfo:
+    """Load an importer and describe it.
+
+    Args:
+        name: its name in the registry of importers.
+
+    Returns:
+        Its title and version; ``missing`` is a sentence where it is not installed here, or in a version that
+        the column does not support.
+
+    Raises:
+        ImportError: another module than the engine's is missing, or the engine is installed but broken.
+
+    """
+    try:
+        importer = load_importer(name)
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] in _OWN_PACKAGES:
+            raise
+        return EngineInfo(name, name, "", (), f"{name} is not installed here: {error}")
+    except AttributeError as error:  # an interface that this version does not have
+        version = metadata.version(declared_attribute(name, "package"))
+        return EngineInfo(name, name, version, (), f"the column cannot use version {version}: {error}")
+    version, missing = importer.version(), None
+    supported = importer.supported_versions
+    if supported and not SpecifierSet(supported).contains(version, prereleases=True):
+        missing = f"the column supports versions {supported} of {importer.package}, this is {version}"
+    return EngineInfo(name, importer.title, version, (), missing)
+
+
+def read_model_file(name: str, file: ModelFile) -> Reading:
+    """Have an importer read a file; what it raises is its refusal.
+
+    Args:
+        name: the importer's name in the registry.
+        file: the file and how to load it.
+
+    Returns:
+        The engine's reading, or its refusal.
+
+    Raises:
+        MemoryError: the worker reached its memory limit, which the pool reports.
+
+    """
+    importer = load_importer(name)
+    if file.format not in importer.formats:
+        return Reading(importer.version(), refusal=f"{importer.title} reads no {file.format.upper()} files")
+    try:
+        return importer.read(file)
+    except MemoryError:
+        raise
+    except Exception as error:  # an importer may raise anything: its message is the answer
+        return Reading(importer.version(), refusal=format_exception(error))
+
+
+def evaluate_model_file(
+    name: str, file: ModelFile, states: Sequence[CanonicalState]
+) -> list[ModelQuantities]:
+    """Have an importer's engine compute the quantities at each state.
+
+    Args:
+        name: the importer's name in the registry.
+        file: a file that the importer accepts.
+        states: canonical states of the importer's own reading, all of the same length.
+
+    Returns:
+        One record per state.
+
+    Raises:
+        EngineFailure: an answer is missing, or has another shape, or is not finite; the message names it.
+            Accelerations may be infinite: where links are massless, M may be singular.
+
+    """
+    answers = load_importer(name).evaluate(file, states)
+    if len(answers) != len(states):
+        raise EngineFailure(f"{name} answered {len(answers)} of {len(states)} states")
+    for index, (state, answer) in enumerate(zip(states, answers, strict=True)):
+        _check(answer, len(state.velocities), f"{name}, state {index}")
+    return answers
+
+
+def _check(answer: ModelQuantities, count: int, label: str) -> None:
+    """Check the shapes and the finiteness of an answer."""
+    shapes: Mapping[str, tuple[int, ...]] = {
+        "mass_matrix": (count, count),
+        **dict.fromkeys(_VECTORS, (count,)),
+        "kinetic_energy": (),
+        "potential_energy": (),
+    }
+    arrays: dict[str, tuple[Array | float | None, tuple[int, ...]]] = {
+        name: (getattr(answer, name), shape) for name, shape in shapes.items()
+    }
+    arrays |= {f"pose of {body}": (matrix, (3, 4)) for body, matrix in answer.poses.items()}
+    for name, (value, shape) in arrays.items():
+        if value is None:
+            continue
+        if np.shape(value) != shape:
+            raise EngineFailure(f"{label}: {name} has shape {np.shape(value)}, expected {shape}")
+        if name != "acceleration" and not np.all(np.isfinite(value)):
+            raise EngineFailure(f"{label}: {name} is not finite")

@@ -1,0 +1,120 @@
+"""Importer columns: a pendulum in closed form, agreement of the columns, refusals, losses of the worker."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plumbline.engines.environments import EnvironmentUnavailable, importer_interpreter
+from plumbline.engines.importer_calls import describe_importer, evaluate_model_file, read_model_file
+from plumbline.engines.registry import IMPORTERS
+from plumbline.importers.importer import ModelFile
+from plumbline.importers.neutral_model import CanonicalState
+from plumbline.processes.workers import Limits, Task, WorkerPool
+
+FILES = Path(__file__).parent / "model_files"
+GRAVITY = 9.81
+MASS, ARM, INERTIA = 2.0, 0.5, 0.375  # of the pendulum files: kg, m, kg m²
+CASES = [("pendulum.urdf", "fixed"), ("arm.urdf", "fixed"), ("arm.urdf", "free"), ("tree.xml", "fixed")]
+
+
+def file_of(name, base="fixed"):
+    form = "urdf" if name.endswith(".urdf") else "mjcf"
+    return ModelFile(str(FILES / name), form, base, str(FILES))
+
+
+@pytest.fixture(scope="module")
+def pool():
+    with WorkerPool(1) as workers:
+        yield workers
+
+
+def call(pool, importer, function, *arguments, seconds=60.0):
+    """Call in a worker, as the command does: an importer may end its process."""
+    try:
+        python = importer_interpreter(importer)
+    except EnvironmentUnavailable as error:
+        pytest.skip(str(error))
+    limits = Limits(seconds=seconds)
+    (outcome,) = pool.run([Task(0, function, (importer, *arguments), limits, python=python)])
+    assert outcome.failure is None, outcome.failure
+    return outcome.value
+
+
+def random_state(model, seed):
+    generator = np.random.default_rng(seed)
+    coordinates, velocities = [], []
+    for joint, _, rates in model.joint_slices():
+        turn = generator.normal(size=4)
+        turn /= np.linalg.norm(turn)
+        coordinates += {
+            "free": [*generator.normal(size=3), *turn], "ball": list(turn),
+        }.get(joint.kind, [generator.uniform(-1, 1)])  # fmt: skip
+        velocities += list(generator.normal(size=rates.stop - rates.start))
+    return CanonicalState(np.array(coordinates), np.array(velocities))
+
+
+@pytest.mark.parametrize("name", ["pendulum.urdf", "pendulum.xml"])
+@pytest.mark.parametrize("importer", IMPORTERS)
+def test_a_pendulum_has_its_closed_form(pool, importer, name):
+    reading = call(pool, importer, read_model_file, file_of(name))
+    if reading.refusal.endswith("reads no MJCF files"):
+        pytest.skip(reading.refusal)
+    (joint,) = reading.model.joints
+    assert (joint.name, joint.kind) == ("pivot", "hinge")
+    angle, rate = 0.7, 1.3
+    state = CanonicalState(np.array([angle]), np.array([rate]))
+    (found,) = call(pool, importer, evaluate_model_file, file_of(name), [state])
+    M, torque = INERTIA + MASS * ARM**2, MASS * GRAVITY * ARM * np.sin(angle)
+    expected = {
+        "mass_matrix": [[M]], "bias_force": [torque], "gravity_force": [torque], "passive_force": [0.0],
+        "acceleration": [-torque / M], "kinetic_energy": M * rate**2 / 2,
+        "potential_energy": -MASS * GRAVITY * ARM * np.cos(angle),
+    }  # fmt: skip
+    for quantity, value in expected.items():
+        answer = getattr(found, quantity)
+        if answer is not None:
+            np.testing.assert_allclose(answer, value, rtol=1e-14, err_msg=quantity)
+    c, s = np.cos(angle), np.sin(angle)
+    turned = [[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0]]
+    np.testing.assert_allclose(found.poses["bob"], turned, atol=1e-15)
+
+
+@pytest.mark.parametrize("name, base", CASES)
+@pytest.mark.parametrize("importer", [name for name in IMPORTERS if name != "mujoco"])
+def test_columns_agree_where_files_are_read_alike(pool, importer, name, base):
+    file = file_of(name, base)
+    readings = [call(pool, column, read_model_file, file) for column in ("mujoco", importer)]
+    if readings[1].refusal:
+        pytest.skip(readings[1].refusal)
+    names = [[(joint.name, joint.kind) for joint in reading.model.joints] for reading in readings]
+    assert names[0] == names[1]
+    states = [random_state(readings[0].model, seed) for seed in range(3)]
+    answers = [call(pool, column, evaluate_model_file, file, states) for column in ("mujoco", importer)]
+    for expected, found in zip(*answers, strict=True):
+        for quantity in vars(found):
+            value, answer = getattr(expected, quantity), getattr(found, quantity)
+            if quantity == "poses":
+                assert len(answer) >= len(readings[1].model.bodies)
+                for body in value.keys() & answer.keys():
+                    np.testing.assert_allclose(answer[body], value[body], atol=1e-14, err_msg=body)
+            elif answer is not None:
+                scale = np.max(np.abs(value)) + 1
+                np.testing.assert_allclose(answer, value, atol=1e-13 * scale, err_msg=quantity)
+
+
+@pytest.mark.parametrize("importer", IMPORTERS)
+@pytest.mark.parametrize(
+    "text", ["", "<robot", "<robot name='a'><link name='b'/><link name='b'/></robot>", "\0\1\2"]
+)
+def test_a_bad_file_is_refused_in_the_importers_words(pool, tmp_path, importer, text):
+    path = tmp_path / "bad.urdf"
+    path.write_text(text)
+    reading = call(pool, importer, read_model_file, ModelFile(str(path), "urdf", root=str(tmp_path)))
+    assert reading.model is None and reading.refusal and reading.version
+
+
+@pytest.mark.parametrize("importer", IMPORTERS)
+def test_an_importer_describes_itself(pool, importer):
+    info = call(pool, importer, describe_importer)
+    assert info.missing is None and info.version and info.name == importer
