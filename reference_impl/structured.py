@@ -62,7 +62,7 @@ def _matrix_vector(matrix: Array, vector: Array) -> Array:
 
 def _dot(a: Array, b: Array) -> Array:
     """Sum over the first axis of a b."""
-    return np.asarray(np.einsum("i...,i...->...", a, b))
+    return np.asarray(np.vecdot(a, b, axis=0))
 
 
 class FactoredJoints(NamedTuple):
@@ -123,6 +123,7 @@ class StructuredSystem:
         self.inverse_mass = 1 / mass  # (M,) 1/kg
         self.J, self.K = last(inertia), last(K)  # (3, 3, M)
         self.s = last(points)  # (2, 3, M) m, proximal and distal point, body frame
+        self.lever = float(np.abs(points).max())  # m
         self.free_acceleration = last(weight / mass[:, None])  # (3, M) m/s²
         self.drag_rate = drag_force / mass  # (M,) 1/s
         self.has_drag = bool(np.any(drag_force) or np.any(drag_moment))
@@ -145,6 +146,7 @@ class StructuredSystem:
         self.is_linked = np.ones(self.body_count)  # 0 where a body hangs on the pivot
         self.is_linked[self.first_body[:-1]] = 0
         self.rods = length > 0
+        self.slack = np.where(self.rods, 0, np.inf)  # of d, which may be 0 at a ball
         self.pair_inverse_mass = self.inverse_mass + self._at_parent(self.inverse_mass)  # (M,) 1/kg
         self.child_inverse_mass = self.inverse_mass * self._at_child(
             np.ones(self.body_count)
@@ -262,12 +264,11 @@ class StructuredSystem:
             rows = X
             rows[1] = self._at_parent(X[1])
         else:
-            d = q[:3] + As[0] - self._at_parent(q[:3] + As[1])
+            off = 2 * (norm - 1) * self.s
+            far = self._at_parent(np.concatenate([q[:3] + As[1], off[1]]))
+            d = q[:3] + As[0] - far[:3]
             self._check_rods(q, d)
-            off = norm - 1
-            U = self._padded_rows(2 * d)
-            U_near = self._padded_rows(2 * (d - off * self.s[0]))
-            U_far = self._padded_rows(2 * (d + self._at_parent(off * self.s[1])))
+            U, U_near, U_far = (self._padded_rows(w) for w in (2 * d, 2 * d - off[0], 2 * d + far[3:]))
             rows = np.empty((2, c, 3, self.body_count))
             np.einsum("icm,ijm->cjm", U_near, X[0], out=rows[0])
             np.einsum("icm,ijm->cjm", U_far, self._at_parent(X[1]), out=rows[1])
@@ -301,8 +302,8 @@ class StructuredSystem:
 
     def _check_rods(self, q: Array, d: Array) -> None:
         """Raise SingularSystem where a rod has length 0 to rounding."""
-        shortest = float(np.min(_dot(d, d)[self.rods]))
-        span = max(float(np.max(np.abs(q[:3]))), float(np.max(np.abs(self.s))))
+        shortest = (_dot(d, d) + self.slack).min()
+        span = max(np.abs(q[:3]).max(), self.lever)
         if not shortest > (16 * EPS * span) ** 2:
             self._raise_singular(q, d, certain=False)
 
@@ -371,18 +372,11 @@ class StructuredSystem:
         moved = self.moment_terms + _matrix_vector(self.spin_terms, terms)
         beta, point = moved[:3], _matrix_vector(R, moved[3:].reshape(2, 3, -1))
         point += linear
-        h = point[0] - self._at_parent(point[1])
-        if Rs is not None:
-            h = self._rod_rows(
-                joints,
-                linear,
-                point - linear,
-                h,
-                v,
-                sigma,
-                Rs,
-                _matrix_vector(R, _matrix_vector(_tilde(omega), self.s)),
-            )
+        if Rs is None:
+            h = point[0] - self._at_parent(point[1])
+        else:
+            swing = _matrix_vector(R, _matrix_vector(_tilde(omega), self.s))
+            h = self._rod_rows(joints, linear, point - linear, v, sigma, swing, Rs)
         if a:
             C, rate = self.constraints(q, v)
             h = h + 2 * a * rate + a * a * C
@@ -405,32 +399,40 @@ class StructuredSystem:
         self,
         joints: FactoredJoints,
         linear: Array,
-        point: Array,
         relative: Array,
         v: Array,
         sigma: Array,
-        Rs: Array,
         swing: Array,
+        Rs: Array,
     ) -> Array:
         """H (c, M) where there are rods: C̈ without the joints' forces, with the notes' E2 and E3.
 
-        ``linear`` r̈ and ``point`` the points' accelerations about the centres without joints,
-        ``relative`` the balls' rows, ``swing`` R(ω×s).
+        ``linear`` r̈ and ``relative`` the points' accelerations about the centres without joints, ``swing``
+        R(ω×s).
         """
         assert joints.U is not None and joints.U_near is not None and joints.U_far is not None
-        velocity = swing + 2 * sigma * (Rs + self.s)  # d_t(A s)
-        excess = 2 * sigma * self.s  # d_t(A s) − 2 G L̇ᵀ s (E3)
-        ddot = v[:3] + velocity[0] - self._at_parent(v[:3] + velocity[1])
-        own = _dot(excess[0], velocity[0]) + self._at_parent(_dot(excess[1], velocity[1]))
-        quadratic = 2 * (_dot(ddot, ddot - excess[0] + self._at_parent(excess[1])) - own)
-        shared = linear - self._at_parent(linear)
-        row = _dot(joints.U[:, 0], shared) + _dot(joints.U_near[:, 0], point[0])
-        row += quadratic - _dot(joints.U_far[:, 0], self._at_parent(point[1]))
+        terms = np.empty((2, 13, self.body_count))  # of both points
+        velocity, excess, centre, point, product = (
+            terms[:, rows] for rows in (slice(3), slice(3, 6), slice(6, 9), slice(9, 12), 12)
+        )
+        double = 2 * sigma
+        np.multiply(double, self.s, out=excess)  # d_t(A s) − 2 G L̇ᵀ s (E3)
+        turning = swing + double * Rs + excess  # d_t(A s)
+        np.add(v[:3], turning, out=velocity)
+        centre[:], point[:] = linear, relative
+        np.einsum("cim,cim->cm", excess, turning, out=product)
+        np.negative(product[1], out=product[1])
+        near, far = terms[0], self._at_parent(terms[1])
+        difference = near - far
+        ddot = difference[:3]
+        row = _dot(joints.U[:, 0], difference[6:9]) + _dot(joints.U_near[:, 0], near[9:12])
+        row -= _dot(joints.U_far[:, 0], far[9:12])
+        row += 2 * (_dot(ddot, ddot - difference[3:6]) - difference[12])
         if self.rows_per_joint == 1:
             return np.asarray(row[None])
-        rods_only = np.where(self.rods, 0.0, relative)
-        rods_only[0] = np.where(self.rods, row, relative[0])
-        return rods_only
+        rows = np.where(self.rods, 0.0, difference[6:9] + difference[9:12])
+        rows[0] = np.where(self.rods, row, rows[0])
+        return rows
 
     def solve(self, r: Array, p: Array, v: Array, pdot: Array) -> Solution:
         """Solve (N5) for every chain.
