@@ -62,7 +62,7 @@ def _matrix_vector(matrix: Array, vector: Array) -> Array:
 
 def _dot(a: Array, b: Array) -> Array:
     """Sum over the first axis of a b."""
-    return np.asarray(np.vecdot(a, b, axis=0))
+    return np.asarray(np.vecdot(a, b, axis=0))  # type: ignore[call-overload]  # its stubs do not have axis
 
 
 class FactoredJoints(NamedTuple):
