@@ -1,0 +1,314 @@
+"""MJCF files: includes expanded, unnamed bodies and joints named, and where the file says each number.
+
+MuJoCo defines the format: its compiled model is the neutral reading (`plumbline.importers.model_file`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+from plumbline.importers.neutral_model import ElementaryJoint, Feature, NeutralBody, NeutralModel, Source
+from plumbline.importers.xml_tree import Element, ModelFileError, read_xml
+from plumbline.scenario.errors import shorten
+
+MAX_INCLUDES = 200
+_JOINT_FIELDS = {
+    "axis": "axis", "anchor": "pos", "reference": "ref", "armature": "armature", "damping": "damping",
+    "stiffness": "stiffness", "spring_reference": "springref", "friction_loss": "frictionloss",
+}  # fmt: skip
+_ASSET_FOLDERS = {"mesh": "meshdir", "hfield": "meshdir", "skin": "meshdir", "texture": "texturedir"}
+_FILES = {"file", "fileright", "fileleft", "fileup", "filedown", "filefront", "fileback"}
+_SECTIONS = ("actuator", "tendon", "equality", "contact", "sensor", "keyframe", "deformable", "extension")
+_STRIPPED = ("contact", "sensor", "keyframe", "asset", "visual")  # what refers to geometry
+
+
+def expand_includes(root: Element, path: Path, root_folder: Path, shown: str) -> None:
+    """Put the content of included files in place of each <include>.
+
+    Args:
+        root: the file's root element, which is changed.
+        path: the file.
+        root_folder: folder outside of which nothing is read.
+        shown: the file's name in messages.
+
+    Raises:
+        ModelFileError: an included file is missing, outside the folder, or included in a circle.
+
+    """
+    included: set[Path] = {path.resolve()}
+    stack = [root]
+    while stack:
+        element = stack.pop()
+        place = 0
+        while place < len(element.children):
+            child = element.children[place]
+            if child.tag != "include":
+                place += 1
+                continue
+            target = _include_target(child, path.parent, root_folder)
+            if target in included:
+                message = f"includes {child.attributes['file']!r} twice or in a circle"
+                raise ModelFileError([child.problem(message, "file", "a file that is included once")])
+            included.add(target)
+            if len(included) > MAX_INCLUDES:
+                raise ModelFileError([child.problem(f"there are more than {MAX_INCLUDES} includes")])
+            name = str(Path(shown).parent / child.attributes["file"])
+            element.children[place : place + 1] = read_xml(target, name).children
+        stack.extend(element.children)
+
+
+def _include_target(element: Element, folder: Path, root_folder: Path) -> Path:
+    name = element.attributes.get("file", "")
+    target = resolve_inside(folder / name, root_folder)
+    if target is None:
+        message = f"{shorten(repr(name))} is outside {root_folder}"
+        hint = "name a folder that holds both with --root"
+        raise ModelFileError([element.problem(message, "file", hint=hint)])
+    if not target.is_file():
+        raise ModelFileError([element.problem(f"there is no file {shorten(repr(name))}", "file")])
+    return target
+
+
+def resolve_inside(path: Path, folder: Path) -> Path | None:
+    """Resolve a path with its links.
+
+    Args:
+        path: any path.
+        folder: a resolved folder.
+
+    Returns:
+        The resolved path; None where it is outside the folder or cannot be resolved.
+
+    """
+    try:
+        target = path.resolve()
+    except (OSError, ValueError, RuntimeError):
+        return None
+    return target if target.is_relative_to(folder) else None
+
+
+def body_elements(root: Element) -> Iterator[Element]:
+    """Go through the bodies of a file.
+
+    Args:
+        root: the file's root element.
+
+    Yields:
+        Elements <body>, a parent before its children.
+
+    """
+    for world in root.find_all("worldbody"):
+        yield from (element for element in world.walk() if element.tag == "body")
+
+
+def joint_elements(body: Element) -> list[Element]:
+    """List the joints of a body, in frames too.
+
+    Args:
+        body: an element <body>.
+
+    Returns:
+        Its elements <joint> and <freejoint>, in the order of the file.
+
+    """
+    found: list[Element] = []
+    stack = list(reversed(body.children))
+    while stack:
+        element = stack.pop()
+        if element.tag in ("joint", "freejoint"):
+            found.append(element)
+        elif element.tag in ("frame", "replicate"):
+            stack.extend(reversed(element.children))
+    return found
+
+
+def name_elements(root: Element) -> bool:
+    """Give a name to every body and joint that has none: "body@LINE", "joint@LINE", "BODY/free".
+
+    Args:
+        root: the file's root element, which is changed.
+
+    Returns:
+        Whether anything was named.
+
+    """
+    used = {element.attributes.get("name", "") for element in root.walk()}
+    changed = False
+    for body in body_elements(root):
+        for element in (body, *joint_elements(body)):
+            if element.attributes.get("name"):
+                continue
+            is_free = element.tag == "freejoint" or element.attributes.get("type") == "free"
+            wanted = f"{element.tag}@{element.source.line}"
+            name = wanted = f"{body.attributes['name']}/free" if is_free else wanted
+            count = 1
+            while name in used:
+                count += 1
+                name = f"{wanted}.{count}"
+            used.add(name)
+            element.attributes["name"] = name
+            changed = True
+    return changed
+
+
+def make_paths_absolute(root: Element, folder: Path) -> None:
+    """Write file names of assets as absolute paths, so that a copy elsewhere finds them.
+
+    Args:
+        root: the file's root element, which is changed.
+        folder: the file's folder.
+
+    """
+    for element, attribute, path in asset_files(root, folder):
+        element.attributes[attribute] = str(path)
+    for compiler in root.find_all("compiler"):
+        for name in ("meshdir", "texturedir", "assetdir"):
+            compiler.attributes.pop(name, None)
+
+
+def asset_files(root: Element, folder: Path) -> Iterator[tuple[Element, str, Path]]:
+    """Go through the files that a MJCF refers to, besides includes.
+
+    Args:
+        root: the file's root element.
+        folder: the file's folder.
+
+    Yields:
+        Element, attribute, path.
+
+    """
+    folders: dict[str, str] = {}
+    for compiler in root.find_all("compiler"):
+        folders |= {k: v for k, v in compiler.attributes.items() if k.endswith("dir")}
+    for element in root.walk():
+        kind = _ASSET_FOLDERS.get(element.tag, "")
+        below = folders.get(kind, folders.get("assetdir", "")) if kind else ""
+        for attribute in sorted(_FILES & element.attributes.keys()):
+            if element.tag != "include":
+                yield element, attribute, folder / below / element.attributes[attribute]
+
+
+def strip_geometry(root: Element) -> None:
+    """Remove geometry from bodies whose inertia is explicit, and what refers to geometry.
+
+    Args:
+        root: the file's root element, which is changed.
+
+    """
+    from_geoms = any(c.attributes.get("inertiafromgeom") == "true" for c in root.find_all("compiler"))
+    kept = False
+    for world in root.find_all("worldbody"):
+        for holder in world.walk():
+            explicit = holder.tag == "worldbody" or holder.find("inertial") is not None
+            if explicit and not from_geoms:
+                holder.children = [c for c in holder.children if c.tag not in ("geom", "light", "camera")]
+        kept |= any(e.tag == "geom" and "mesh" in e.attributes for e in world.walk())
+    dropped = set(_STRIPPED) - ({"asset"} if kept else set())
+    root.children = [child for child in root.children if child.tag not in dropped]
+
+
+def with_sources(model: NeutralModel, root: Element) -> NeutralModel:
+    """Add to a compiled model where the file says each of its numbers.
+
+    Args:
+        model: MuJoCo's reading of the file.
+        root: the file's root element, with all names.
+
+    Returns:
+        The model with sources, and with the features that are not compared.
+
+    """
+    bodies = {e.attributes["name"]: e for e in body_elements(root)}
+    defaults = _DefaultClasses(root)
+    default_source = Source(root.source.file, 0)
+    found = [_body_with_sources(body, bodies, defaults, default_source) for body in model.bodies]
+    gravity = next((o.source for o in root.find_all("option") if "gravity" in o.attributes), default_source)
+    features = [
+        Feature(element.tag if element.tag != "general" else section.tag, _name_of(element), element.source)
+        for section in root.children
+        if section.tag in _SECTIONS
+        for element in section.children
+    ]
+    features += _joint_features(root, defaults)
+    return replace(model, bodies=tuple(found), not_compared=tuple(features), gravity_source=gravity)
+
+
+def _name_of(element: Element) -> str:
+    for name in ("name", "joint", "tendon", "joint1", "body1", "geom1", "site"):
+        if name in element.attributes:
+            return element.attributes[name]
+    return ""
+
+
+def _joint_features(root: Element, defaults: _DefaultClasses) -> list[Feature]:
+    found = []
+    for body in body_elements(root):
+        for joint in joint_elements(body):
+            for attribute, what in (("range", "limit"), ("frictionloss", "friction")):
+                source = defaults.source(joint, attribute)
+                if source is not None:
+                    found.append(Feature(what, joint.attributes.get("name", ""), source))
+        if "gravcomp" in body.attributes:
+            found.append(Feature("gravity compensation", body.attributes["name"], body.source))
+    return found
+
+
+class _DefaultClasses:
+    """Where an attribute of a joint comes from: the element, or a default class."""
+
+    def __init__(self, root: Element) -> None:
+        self.classes: dict[str, list[Element]] = {}  # name → the elements <default>, the own one first
+        self.class_of: dict[int, str] = {}  # id of a joint element → its class
+        for top in root.find_all("default"):
+            stack: list[tuple[Element, list[Element]]] = [(top, [])]
+            while stack:
+                element, above = stack.pop()
+                chain = [element, *above]
+                name = element.attributes.get("class", "main")
+                self.classes[name] = chain + self.classes.get(name, [])
+                stack.extend((child, chain) for child in element.find_all("default"))
+        for world in root.find_all("worldbody"):
+            walk: list[tuple[Element, str]] = [(world, "main")]
+            while walk:
+                element, inherited = walk.pop()
+                if element.tag in ("joint", "freejoint"):
+                    self.class_of[id(element)] = element.attributes.get("class", inherited)
+                inherited = element.attributes.get("childclass", inherited)
+                walk.extend((child, inherited) for child in element.children)
+
+    def source(self, joint: Element, attribute: str) -> Source | None:
+        """Where an attribute of a joint is said; None: nowhere."""
+        if attribute in joint.attributes:
+            return joint.source
+        if joint.tag == "freejoint":
+            return None
+        for element in self.classes.get(self.class_of.get(id(joint), "main"), []):
+            default = element.find("joint")
+            if default is not None and attribute in default.attributes:
+                return default.source
+        return None
+
+
+def _body_with_sources(
+    body: NeutralBody, elements: Mapping[str, Element], defaults: _DefaultClasses, nowhere: Source
+) -> NeutralBody:
+    element = elements.get(body.name)
+    if element is None:  # of a <replicate> or <attach>, whose names are made by the compiler
+        return replace(body, source=nowhere)
+    inertial = element.find("inertial") or element.find("geom") or element
+    fields = dict.fromkeys(("mass", "center", "inertia"), inertial.source)
+    named = {e.attributes.get("name", ""): e for e in joint_elements(element)}
+    joints = tuple(_joint_with_sources(j, named.get(j.name), defaults, nowhere) for j in body.joints)
+    return replace(body, joints=joints, source=element.source, fields=fields)
+
+
+def _joint_with_sources(
+    joint: ElementaryJoint, element: Element | None, defaults: _DefaultClasses, nowhere: Source
+) -> ElementaryJoint:
+    if element is None:
+        return replace(joint, source=nowhere)
+    sources = {name: defaults.source(element, attribute) for name, attribute in _JOINT_FIELDS.items()}
+    fields = {name: source for name, source in sources.items() if source is not None}
+    return replace(joint, source=element.source, fields=fields)

@@ -1,0 +1,184 @@
+"""From the file that a user names to the file that importers open, and the neutral model of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+from urllib.parse import unquote
+
+from plumbline.importers import mjcf
+from plumbline.importers.importer import Base, Format, ModelFile, Reading
+from plumbline.importers.neutral_model import NeutralModel
+from plumbline.importers.urdf import read_urdf
+from plumbline.importers.xml_tree import Element, ModelFileError, read_xml, write_xml
+from plumbline.scenario.errors import Problem, shorten
+
+BaseChoice = Literal["fixed", "free", "auto"]
+_ROOT_TAGS: dict[str, Format] = {"robot": "urdf", "mujoco": "mjcf"}
+
+
+@dataclass(frozen=True, eq=False)
+class PreparedFile:
+    """A file that has been checked and is ready for importers."""
+
+    shown: str  # as the user typed it
+    tree: Element  # of the file that importers open; sources are those of the user's files
+    file: ModelFile
+    urdf_model: NeutralModel | None  # the own reading; None for MJCF, which MuJoCo compiles in a worker
+
+    def neutral_model(self, reading: Reading | None) -> NeutralModel:
+        """Return what the file says.
+
+        Args:
+            reading: MuJoCo's reading of an MJCF file; not used for a URDF.
+
+        Returns:
+            The neutral model with sources.
+
+        Raises:
+            ModelFileError: MuJoCo, which defines MJCF, refuses the file.
+
+        """
+        if self.urdf_model is not None:
+            return self.urdf_model
+        if reading is None or reading.model is None:
+            words = reading.refusal if reading else "MuJoCo did not answer"
+            message = f"MuJoCo, which defines MJCF, refuses it: {shorten(words, 400)}"
+            raise ModelFileError([Problem(self.shown, _line_in(words), 1, "", message)])
+        return mjcf.with_sources(reading.model, self.tree)
+
+
+def prepare_file(
+    shown: str, scratch: Path, root: Path | None = None, base: BaseChoice = "auto", strip: bool = False
+) -> PreparedFile:
+    """Check a model file and make it ready for importers.
+
+    Args:
+        shown: the path as typed.
+        scratch: a folder for a copy with all names, or without geometry.
+        root: folder outside of which no file is read; None: the nearest folder above the file that has a
+            package.xml, else the file's own.
+        base: of a URDF, whether the root link is fixed; "auto" is fixed.
+        strip: leave visual and collision geometry out.
+
+    Returns:
+        The file.
+
+    Raises:
+        ModelFileError: the file cannot be used; every mistake that was found has its line.
+
+    """
+    path = Path(shown)
+    tree = read_xml(path, shown)
+    kind = _format_of(tree, shown)
+    folder = (root or package_folder(path)).resolve()
+    if mjcf.resolve_inside(path, folder) is None:
+        raise ModelFileError([Problem(shown, 0, 0, "", f"is outside the root folder {folder}")])
+    chosen: Base = "free" if base == "free" else "fixed"
+    if kind == "mjcf" and base != "auto":
+        hint = "leave --base out, or add or remove the <freejoint> in the file"
+        raise ModelFileError(
+            [Problem(shown, 1, 1, "", "an MJCF file says itself whether its base moves", hint=hint)]
+        )
+    is_copied = strip
+    if kind == "mjcf":
+        count = sum(1 for element in tree.walk() if element.tag == "include")
+        mjcf.expand_includes(tree, path, folder, shown)
+        is_copied |= mjcf.name_elements(tree) or count > 0
+        if strip:
+            mjcf.strip_geometry(tree)
+    elif strip:
+        for link in tree.find_all("link"):
+            link.children = [c for c in link.children if c.tag not in ("visual", "collision")]
+    model = read_urdf(tree, chosen) if kind == "urdf" else None
+    _check_references(tree, kind, path.parent, folder)
+    opened = path.resolve()
+    if is_copied:
+        if kind == "mjcf":
+            mjcf.make_paths_absolute(tree, path.parent.resolve())
+        opened = scratch / path.name
+        opened.write_text(write_xml(tree), encoding="utf-8")
+    return PreparedFile(shown, tree, ModelFile(str(opened), kind, chosen, str(folder)), model)
+
+
+def package_folder(path: Path) -> Path:
+    """Find the package that a file is in.
+
+    Args:
+        path: a model file.
+
+    Returns:
+        The nearest folder above it that has a package.xml, else its own folder.
+
+    """
+    folder = path.resolve().parent
+    return next((p for p in (folder, *folder.parents) if (p / "package.xml").is_file()), folder)
+
+
+def _format_of(tree: Element, shown: str) -> Format:
+    """Return the format; other formats get a sentence that says what to do."""
+    names = [n for element in tree.walk() for n in (element.tag, *element.attributes)]
+    if any(name.startswith(("xacro:", "xmlns:xacro")) and not name.startswith("xmlns") for name in names):
+        hint = f"expand it first: xacro {shown} > robot.urdf"
+        raise ModelFileError([Problem(shown, tree.source.line, 1, "", "is a xacro file", hint=hint)])
+    if tree.tag in _ROOT_TAGS:
+        return _ROOT_TAGS[tree.tag]
+    message, hint = f"its root element is <{shorten(tree.tag)}>", ""
+    if tree.tag in ("sdf", "world", "model"):
+        message, hint = "is an SDF file", "convert it to URDF (gz sdf prints SDF, sdformat_urdf reads it)"
+    elif tree.tag == "mujocoinclude":
+        hint = "name the file that includes it"
+    problem = Problem(shown, tree.source.line, 1, "", message, "<robot> (URDF) or <mujoco> (MJCF)", hint)
+    raise ModelFileError([problem])
+
+
+def _check_references(tree: Element, kind: Format, folder: Path, root: Path) -> None:
+    """Refuse files that are missing, outside the root, or on the network."""
+    problems = []
+    if kind == "mjcf":
+        found = list(mjcf.asset_files(tree, folder))
+    else:
+        found = [
+            (element, "filename", Path(element.attributes["filename"]))
+            for link in tree.find_all("link")
+            for element in link.walk()
+            if element.tag in ("mesh", "texture") and "filename" in element.attributes
+        ]
+    for element, attribute, path in found:
+        name = element.attributes[attribute]
+        if kind == "urdf":
+            scheme, _, rest = name.rpartition("://")
+            if scheme not in ("", "package", "model", "file"):
+                problems.append(element.problem(f"{shorten(repr(name))} is on the network", attribute))
+                continue
+            candidates = (
+                _package_paths(unquote(rest), root)
+                if scheme in ("package", "model")
+                else [folder / (unquote(rest) if scheme else name)]
+            )
+        else:
+            candidates = [path]
+        inside = [target for c in candidates if (target := mjcf.resolve_inside(c, root)) is not None]
+        hint = "--strip-geometry leaves meshes out; --root names another folder"
+        if not inside:
+            problems.append(element.problem(f"{shorten(repr(name))} is outside {root}", attribute, hint=hint))
+        elif not any(target.is_file() for target in inside):
+            problems.append(
+                element.problem(f"there is no file {shorten(repr(name))} in {root}", attribute, hint=hint)
+            )
+    if problems:
+        raise ModelFileError(problems)
+
+
+def _package_paths(rest: str, root: Path) -> list[Path]:
+    """Where package://NAME/REST may be: in the root, which is the package or holds it."""
+    inner = rest.partition("/")[2]
+    return [root / rest, root / inner, *([root.parent / rest] if root.name == rest.partition("/")[0] else [])]
+
+
+def _line_in(words: str) -> int:
+    """The line that MuJoCo's message names; 1 where it names none."""
+    _, found, rest = words.partition("line ")
+    digits = "".join(c for c in rest[:8] if c.isdigit())
+    return int(digits) if found and digits else 1
