@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
-Level = Literal["state", "step", "invariants", "trajectory", "relations"]
+Level = Literal["state", "step", "invariants", "trajectory", "relations", "model"]
 # hash of an answer's bits, by integrator ("-" at states), quantity and resolution ("" at states)
 Fingerprints = dict[tuple[str, str, str], bytes]
 Columns = dict[str, Any]  # column name → its values (n,), or the one value of all n records

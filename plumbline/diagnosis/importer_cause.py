@@ -1,0 +1,429 @@
+"""Which parameter an importer reads otherwise than the file says, proved.
+
+Candidates are the differences between the importer's own description and the neutral model, fixed bodies
+lumped in both, and terms that the description has but the dynamics may leave out.  A set of changes is a
+cause only where the changed neutral model reproduces every quantity of the importer within its tolerance;
+then groups of changes (one field of several joints or bodies) and single changes that are not needed are
+dropped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from plumbline.importers.lumping import lump_fixed_bodies
+from plumbline.importers.neutral_model import (
+    CanonicalState,
+    ElementaryJoint,
+    ModelQuantities,
+    NeutralBody,
+    NeutralModel,
+    Source,
+)
+from plumbline.model.datatypes import Array
+from plumbline.model.kinematics import rotation_matrix
+from plumbline.truth.model_comparison import (
+    Mismatch,
+    certify_states,
+    joint_permutation,
+    mismatches,
+    permuted,
+)
+
+RELATIVE_CHANGE = 1e-11  # differences of descriptions below this are rounding
+JOINT_FIELDS = ("axis", "anchor", "reference", "armature", "damping", "stiffness", "spring_reference")
+BODY_FIELDS = ("position", "attitude", "mass", "center", "inertia")
+OMITTED_FIELDS = ("damping", "stiffness", "armature", "spring_reference")  # may be held and not applied
+FIELD_WORDS = {
+    "center": "centre of mass", "spring_reference": "spring reference", "position": "position in its parent",
+    "attitude": "attitude in its parent", "reference": "reference coordinate", "joints": "joints",
+}  # fmt: skip
+MAX_SINGLE_TRIALS = 40  # changes of one field that are tried one by one
+PRUNING_STATES = 3
+States = Callable[[NeutralModel], Sequence[CanonicalState]]
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """One parameter that differs."""
+
+    field: str
+    body: str  # empty: the whole model
+    joint: str  # empty: the body
+    own: Any  # as the file says
+    theirs: Any  # as the importer reads it
+    source: Source
+    is_omitted: bool = False  # the importer's description has the file's value, its dynamics leave it out
+
+    @property
+    def owner(self) -> str:
+        """What the parameter belongs to, in words."""
+        if self.joint:
+            return f"joint {self.joint}"
+        return f"body {self.body}" if self.body else "the model"
+
+
+@dataclass(frozen=True, eq=False)
+class Cause:
+    """Parameters of one field whose change is needed to reproduce an importer's quantities."""
+
+    field: str
+    changes: tuple[Change, ...]
+    sentence: str
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """What explains an importer's difference."""
+
+    causes: tuple[Cause, ...] = ()
+    remaining: float = 0.0  # largest ratio of error and tolerance that the causes leave
+    differences: tuple[Change, ...] = ()  # of the descriptions, where no cause is proved
+    is_proved: bool = False
+
+    @property
+    def sentence(self) -> str:
+        """The causes in one sentence each; empty where none is proved."""
+        return " ".join(cause.sentence for cause in self.causes)
+
+
+def explain_importer(
+    title: str,
+    model: NeutralModel,
+    reading: NeutralModel,
+    answers: Sequence[ModelQuantities],
+    states: States,
+) -> Explanation:
+    """Find the parameters that explain an importer's quantities.
+
+    Args:
+        title: name and version of the importer's engine, for the sentences.
+        model: what the file says.
+        reading: the importer's description.
+        answers: the importer's quantities at the states of its reading.
+        states: gives the states of a model; of joints with one name and kind the same values.
+
+    Returns:
+        The causes, each with a sentence, or the differences of the descriptions where nothing is proved.
+
+    """
+    structure, moved = _with_joints_of(model, reading)
+    own, theirs = lump_fixed_bodies(moved), lump_fixed_bodies(reading)
+    changes = differences(own, theirs)
+    trial = _Trial(own, theirs, reading, answers, states, bool(structure))
+    found = trial.smallest(changes)
+    if found is None:
+        omitted = omissions(apply_changes(own, theirs, changes))
+        for size in (1, 2, 3):
+            for chosen in combinations(omitted, size):
+                found = found or trial.smallest([*changes, *(c for group in chosen for c in group)])
+            if found is not None:
+                break
+    if found is None:
+        return Explanation(differences=(*structure, *changes))
+    remaining = trial.remaining(found, len(answers))
+    causes = _causes(title, [*structure, *found], remaining)
+    return Explanation(causes, remaining, is_proved=True)
+
+
+def _with_joints_of(model: NeutralModel, reading: NeutralModel) -> tuple[list[Change], NeutralModel]:
+    """Give each body the joints that the importer gives it; a body that it does not have is fixed."""
+    read = {body.name: body.joints for body in reading.bodies}
+    changes, bodies = [], []
+    for body in model.bodies:
+        theirs = read.get(body.name, ())
+        if _kinds(body.joints) != _kinds(theirs):
+            source = body.joints[0].source if body.joints else body.source
+            changes.append(Change("joints", body.name, "", body.joints, theirs, source))
+            body = replace(body, joints=theirs)
+        bodies.append(body)
+    return changes, replace(model, bodies=tuple(bodies))
+
+
+def _kinds(joints: Sequence[ElementaryJoint]) -> list[tuple[str, str]]:
+    return [(joint.name, joint.kind) for joint in joints]
+
+
+class _Trial:
+    """Tries sets of changes against an importer's quantities."""
+
+    def __init__(
+        self,
+        own: NeutralModel,
+        theirs: NeutralModel,
+        reading: NeutralModel,
+        answers: Sequence[ModelQuantities],
+        states: States,
+        has_structure: bool,
+    ) -> None:
+        self.own, self.theirs, self.reading, self.answers, self.states = own, theirs, reading, answers, states
+        self.has_structure = has_structure  # whether the own model has been given other joints already
+
+    def worst(self, changes: Sequence[Change], count: int) -> Mapping[str, Mismatch] | None:
+        """Worst entries with the changes made; None where the joints still differ."""
+        changed = apply_changes(self.own, self.theirs, changes)
+        order = joint_permutation(changed, self.reading)
+        if order is None:
+            return None
+        truths = certify_states(changed, self.states(changed)[:count])
+        return mismatches(changed, truths, [permuted(one, order) for one in self.answers[:count]])
+
+    def remaining(self, changes: Sequence[Change], count: int) -> float:
+        """Largest ratio of error and tolerance with the changes made."""
+        found = self.worst(changes, count)
+        return np.inf if found is None else max((m.ratio for m in found.values()), default=0.0)
+
+    def smallest(self, changes: Sequence[Change]) -> list[Change] | None:
+        """Drop the changes that are not needed; None where all together do not reproduce the quantities."""
+        count = min(PRUNING_STATES, len(self.answers))
+        if not (changes or self.has_structure) or self.remaining(changes, count) > 1:
+            return None
+        needed = list(changes)
+        for field in dict.fromkeys(change.field for change in changes):
+            rest = [change for change in needed if change.field != field]
+            if self.remaining(rest, count) <= 1:
+                needed = rest
+        for field in dict.fromkeys(change.field for change in needed):
+            members = [change for change in needed if change.field == field]
+            if 1 < len(members) <= MAX_SINGLE_TRIALS:
+                for member in members:
+                    rest = [change for change in needed if change is not member]
+                    if self.remaining(rest, count) <= 1:
+                        needed = rest
+        is_some = bool(needed) or self.has_structure
+        return needed if is_some and self.remaining(needed, len(self.answers)) <= 1 else None
+
+
+def differences(own: NeutralModel, theirs: NeutralModel) -> list[Change]:
+    """List the parameters in which two descriptions differ by more than rounding.
+
+    Args:
+        own: the neutral model, fixed bodies lumped.
+        theirs: an importer's description, fixed bodies lumped.
+
+    Returns:
+        The changes that turn the first into the second; the structure of bodies and joints first.
+
+    """
+    found: list[Change] = []
+    if _differs(own.gravity, theirs.gravity, 0.0):
+        found.append(Change("gravity", "", "", own.gravity, theirs.gravity, own.gravity_source))
+    named = {body.name: body for body in theirs.bodies}
+    size = max((float(np.linalg.norm(body.position)) for body in own.bodies), default=0.0)
+    parents = [_parent_names(model) for model in (own, theirs)]
+    for body in own.bodies:
+        other = named.get(body.name)
+        if other is None:
+            continue
+        if parents[0][body.name] != parents[1][body.name]:
+            names = parents[0][body.name], parents[1][body.name]
+            found.append(Change("parent", body.name, "", *names, body.source))
+        found += _joint_changes(body, other, size)
+        for field in BODY_FIELDS:
+            values = getattr(body, field), getattr(other, field)
+            scale = size if field in ("position", "center") else 0.0
+            if field == "attitude":
+                is_different = _differs(rotation_matrix(values[0]), rotation_matrix(values[1]), 0.0)
+            elif field in ("position", "attitude") and body.joints and body.joints[0].kind == "free":
+                is_different = False  # a free joint's coordinates are those of the body frame
+            else:
+                is_different = _differs(*values, scale)
+            if is_different and not (field == "center" and body.mass == 0 == other.mass):
+                found.append(Change(field, body.name, "", *values, body.fields.get(field, body.source)))
+    own_names = {body.name for body in own.bodies}
+    extra = [body for body in theirs.bodies if body.name not in own_names]
+    return [Change("additional body", b.name, "", None, b, Source("", 0)) for b in extra] + found
+
+
+def _parent_names(model: NeutralModel) -> dict[str, str]:
+    return {b.name: model.bodies[b.parent].name if b.parent >= 0 else "world" for b in model.bodies}
+
+
+def _differs(own: Any, theirs: Any, scale: float) -> bool:
+    a, b = np.asarray(own, float), np.asarray(theirs, float)
+    size = max(float(np.max(np.abs(a))), float(np.max(np.abs(b))), scale)
+    return bool(np.max(np.abs(a - b)) > RELATIVE_CHANGE * size)
+
+
+def _joint_changes(body: NeutralBody, other: NeutralBody, size: float) -> list[Change]:
+    """Differences of the joints of one body."""
+    found = []
+    for joint, read in zip(body.joints, other.joints, strict=True):
+        for field in JOINT_FIELDS:
+            values = getattr(joint, field), getattr(read, field)
+            if field == "spring_reference" and joint.stiffness == 0 == read.stiffness:
+                continue
+            if field == "anchor":
+                is_different = _differs(_across(joint), _across(read), size)
+            else:
+                is_different = _differs(*values, 0.0)
+            if is_different:
+                source = joint.fields.get(field, joint.source)
+                found.append(Change(field, body.name, joint.name, *values, source))
+    return found
+
+
+def _across(joint: ElementaryJoint) -> Array:
+    """The anchor without its part along a hinge's axis, which moves nothing."""
+    if joint.kind != "hinge":
+        return np.asarray(joint.anchor, float)
+    return np.asarray(joint.anchor - joint.axis * float(joint.axis @ joint.anchor), float)
+
+
+def omissions(model: NeutralModel) -> list[list[Change]]:
+    """List terms of a model that an engine's dynamics may leave out, per field all joints together.
+
+    Args:
+        model: a model, fixed bodies lumped.
+
+    Returns:
+        Groups of changes that set the field to zero.
+
+    """
+    groups = []
+    for field in OMITTED_FIELDS:
+        group = [
+            Change(field, body.name, joint.name, value, 0.0, joint.fields.get(field, joint.source), True)
+            for body in model.bodies
+            for joint in body.joints
+            if (value := getattr(joint, field))
+        ]
+        groups += [group] if group else []
+    if np.any(model.gravity):
+        groups.append([Change("gravity", "", "", model.gravity, np.zeros(3), model.gravity_source, True)])
+    return groups
+
+
+def apply_changes(own: NeutralModel, theirs: NeutralModel, changes: Sequence[Change]) -> NeutralModel:
+    """Make changes in a model.
+
+    Args:
+        own: the neutral model, fixed bodies lumped.
+        theirs: the importer's description, from which additional bodies are taken.
+        changes: of `differences` and `omissions`.
+
+    Returns:
+        The changed model.
+
+    """
+    bodies = {body.name: body for body in own.bodies}
+    parents = _parent_names(own) | {
+        c.body: _parent_names(theirs)[c.body] for c in changes if c.field == "additional body"
+    }
+    gravity = own.gravity
+    for change in changes:
+        if change.field == "gravity":
+            gravity = change.theirs
+        elif change.field == "additional body":
+            bodies[change.body] = change.theirs
+        elif change.field == "parent":
+            parents[change.body] = change.theirs
+        elif change.joint:
+            body = bodies[change.body]
+            joints = tuple(
+                replace(joint, **{change.field: change.theirs}) if joint.name == change.joint else joint
+                for joint in body.joints
+            )
+            bodies[change.body] = replace(body, joints=joints)
+        else:
+            bodies[change.body] = replace(bodies[change.body], **{change.field: change.theirs})
+    return replace(own, bodies=_ordered(bodies, parents), gravity=gravity)
+
+
+def _ordered(bodies: Mapping[str, NeutralBody], parents: Mapping[str, str]) -> tuple[NeutralBody, ...]:
+    """Bodies with the indices of their parents, parents first; without a parent: on the world."""
+    placed: dict[str, int] = {}
+    found: list[NeutralBody] = []
+    waiting = list(bodies.values())
+    while waiting:
+        ready = [b for b in waiting if parents[b.name] in placed or parents[b.name] not in bodies]
+        for body in ready or waiting[:1]:
+            placed[body.name] = len(found)
+            found.append(replace(body, parent=placed.get(parents[body.name], -1)))
+        done = {body.name for body in found}
+        waiting = [body for body in waiting if body.name not in done]
+    return tuple(found)
+
+
+def _causes(title: str, changes: Sequence[Change], remaining: float) -> tuple[Cause, ...]:
+    """Group the changes by field and write a sentence about each group."""
+    groups: dict[tuple[str, bool], list[Change]] = {}
+    for change in changes:
+        groups.setdefault((change.field, change.is_omitted), []).append(change)
+    alone = len(groups) == 1
+    found = []
+    for (field, _), members in groups.items():
+        proof = "this alone explains" if alone else f"with the other {len(groups) - 1} it explains"
+        sentence = (
+            f"{title} {_describe(members)}; {proof} every quantity (worst {remaining:.2g} of the rounding)."
+        )
+        found.append(Cause(field, tuple(members), sentence))
+    return tuple(found)
+
+
+def _describe(members: Sequence[Change]) -> str:
+    """What an importer does to one field, as a verb phrase."""
+    first, word = members[0], FIELD_WORDS.get(members[0].field, members[0].field)
+    if first.field == "additional body":
+        names = ", ".join(change.body for change in members[:6])
+        return f"adds {'body' if len(members) == 1 else 'bodies'} {names}"
+    if first.field == "joints":
+        return "; ".join(
+            f"reads the joints of body {c.body} as {_joint_words(c.theirs)}; "
+            f"the file says {_joint_words(c.own)} ({c.source})"
+            for c in members[:3]
+        )
+    if first.is_omitted:
+        owners = first.owner if len(members) == 1 else f"{len(members)} joints ({_names(members)})"
+        return f"holds the {word} of {owners} but leaves it out of its equations ({first.source})"
+    if len(members) == 1:
+        own, theirs = format_value(first.own, first.theirs), format_value(first.theirs, first.own)
+        return f"reads the {word} of {first.owner} as {theirs}; the file says {own} ({first.source})"
+    values = {format_value(change.theirs, change.own) for change in members}
+    as_ = f"as {values.pop()}" if len(values) == 1 else "otherwise"
+    kind = "joints" if first.joint else "bodies"
+    own, theirs = format_value(first.own, first.theirs), format_value(first.theirs, first.own)
+    return (
+        f"reads the {word} of {len(members)} {kind} {as_} ({_names(members)}); "
+        f"of {first.owner} the file says {own} ({first.source}), it reads {theirs}"
+    )
+
+
+def _names(members: Sequence[Change]) -> str:
+    names = [change.joint or change.body for change in members]
+    return ", ".join(names[:4]) + (" …" if len(names) > 4 else "")
+
+
+def _joint_words(joints: Sequence[ElementaryJoint]) -> str:
+    return ", ".join(f"{joint.kind} {joint.name}" for joint in joints) or "none (fixed)"
+
+
+def format_value(value: Any, other: Any) -> str:
+    """Write a value with as many digits as tell it from another one.
+
+    Args:
+        value: a number, an array or a text.
+        other: the value that it is compared with.
+
+    Returns:
+        The text.
+
+    """
+    if isinstance(value, str):
+        return value
+    a, b = np.asarray(value, float), np.asarray(other, float)
+    for digits in (4, 7, 10, 13, 17):
+        if a.shape != b.shape or _text(a, digits) != _text(b, digits):
+            break
+    return _text(a, digits)
+
+
+def _text(a: Array, digits: int) -> str:
+    if a.ndim == 0:
+        return f"{float(a):.{digits}g}"
+    return "(" + ", ".join(_text(part, digits) for part in a) + ")"

@@ -1,0 +1,184 @@
+"""An importer's quantities against the certified ones: the same states and order, the worst entries."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from plumbline.importers.neutral_model import CanonicalState, ModelQuantities, NeutralModel
+from plumbline.model.datatypes import Array
+from plumbline.truth.certified_model import CertifiedModelQuantities, certify_model
+
+TINY = float(np.finfo(float).tiny)  # replaces a tolerance of zero, so that an error of zero has the ratio 0
+_SPREAD = 0.5  # m: random displacements are up to this
+
+
+@dataclass(frozen=True)
+class Mismatch:
+    """The worst entry of one quantity."""
+
+    error: float
+    tolerance: float
+    ratio: float
+    state: int
+    where: str  # body or joints
+
+
+def model_states(
+    model: NeutralModel, count: int, seed: int, at: Mapping[str, float] | None = None
+) -> tuple[CanonicalState, ...]:
+    """Draw states; a joint of one name and kind gets the same values in every model.
+
+    Args:
+        model: whose joints.
+        count: how many states.
+        seed: of the random numbers.
+        at: coordinates of hinges and slides by name, instead of random states; the others are at their
+            reference and nothing moves.
+
+    Returns:
+        Canonical states.
+
+    """
+    if at is not None:
+        return (_given_state(model, at),)
+    coordinates = np.zeros((count, 0))
+    velocities = np.zeros((count, 0))
+    for joint in model.joints:
+        rng = np.random.default_rng([seed, *f"{joint.kind} {joint.name}".encode()])
+        v = rng.normal(size=(count, {"ball": 3, "free": 6}.get(joint.kind, 1)))
+        q = rng.normal(size=(count, 4))
+        q /= np.linalg.norm(q, axis=1, keepdims=True)
+        place = rng.uniform(-_SPREAD, _SPREAD, (count, 3))
+        x = {
+            "hinge": rng.uniform(-np.pi, np.pi, (count, 1)),
+            "slide": place[:, :1],
+            "ball": q,
+            "free": np.hstack([place, q]),
+        }[joint.kind]
+        coordinates, velocities = np.hstack([coordinates, x]), np.hstack([velocities, v])
+    return tuple(map(CanonicalState, coordinates, velocities))
+
+
+def _given_state(model: NeutralModel, at: Mapping[str, float]) -> CanonicalState:
+    parts: list[Array] = []
+    for body in model.bodies:
+        for joint in body.joints:
+            turn = np.array([1.0, 0.0, 0.0, 0.0])
+            parts.append(
+                {
+                    "ball": turn,
+                    "free": np.concatenate([body.position, body.attitude]),
+                }.get(joint.kind, np.array([at.get(joint.name, joint.reference)]))
+            )
+    return CanonicalState(np.concatenate([*parts, np.zeros(0)]), np.zeros(model.velocity_count))
+
+
+def joint_permutation(model: NeutralModel, reading: NeutralModel) -> list[int] | None:
+    """Find the velocities of a model among those of an importer's reading.
+
+    Args:
+        model: the neutral model.
+        reading: of an importer.
+
+    Returns:
+        For each velocity of the model its index in the reading; None where the joints differ in name or kind.
+
+    """
+    places = {(joint.name, joint.kind): v for joint, _, v in reading.joint_slices()}
+    wanted = [(joint.name, joint.kind) for joint in model.joints]
+    if sorted(places) != sorted(wanted):
+        return None
+    return [i for key in wanted for i in range(places[key].start, places[key].stop)]
+
+
+def permuted(answer: ModelQuantities, order: Sequence[int]) -> ModelQuantities:
+    """Bring an importer's quantities into the order of the model's velocities.
+
+    Args:
+        answer: in the order of its reading.
+        order: of `joint_permutation`.
+
+    Returns:
+        The quantities in the model's order.
+
+    """
+    index = np.array(order, int)
+    changed: dict[str, Any] = {
+        name: getattr(answer, name)[index]
+        for name in ("bias_force", "gravity_force", "passive_force", "acceleration")
+        if getattr(answer, name) is not None
+    }
+    if answer.mass_matrix is not None:
+        changed["mass_matrix"] = answer.mass_matrix[np.ix_(index, index)]
+    return replace(answer, **changed)
+
+
+def mismatches(
+    model: NeutralModel,
+    truths: Sequence[CertifiedModelQuantities],
+    answers: Sequence[ModelQuantities],
+) -> dict[str, Mismatch]:
+    """Find the worst entry of every quantity that both sides have.
+
+    Args:
+        model: the certified model.
+        truths: its quantities at each state.
+        answers: an importer's at the same states, in the model's order.
+
+    Returns:
+        By quantity; potential energies as differences to that of the first state.
+
+    """
+    names = [j.name for j, _, v in model.joint_slices() for _ in range(v.start, v.stop)]
+    found: dict[str, Mismatch] = {}
+
+    def note(quantity: str, error: Any, tolerance: Any, state: int, labels: Sequence[str]) -> None:
+        errors = np.atleast_1d(np.asarray(error, float))
+        if not errors.size:
+            return
+        tolerances = np.broadcast_to(tolerance, errors.shape)
+        ratios = errors / np.maximum(tolerances, TINY)
+        at = np.unravel_index(int(np.argmax(ratios)), ratios.shape)
+        if quantity not in found or ratios[at] > found[quantity].ratio:
+            where = " and ".join(dict.fromkeys(labels[int(i)] for i in at)) if labels else ""
+            found[quantity] = Mismatch(
+                float(errors[at]), float(tolerances[at]), float(ratios[at]), state, where
+            )
+
+    first = truths[0].quantities.potential_energy, answers[0].potential_energy
+    for state, (truth, answer) in enumerate(zip(truths, answers, strict=True)):
+        for body, pose in truth.quantities.poses.items():
+            if body in answer.poses:
+                error, limit = np.abs(answer.poses[body] - pose), truth.tolerance["poses"][body]
+                note("position", error[:, 3], limit[:, 3], state, [f"body {body}"] * 3)
+                note("attitude", np.max(error[:, :3]), limit[0, 0], state, [f"body {body}"])
+        for quantity in ("mass_matrix", "gravity_force", "bias_force", "passive_force", "acceleration"):
+            own, other = getattr(truth.quantities, quantity), getattr(answer, quantity)
+            if own is not None and other is not None:
+                note(quantity, np.abs(other - own), truth.tolerance[quantity], state, names)
+        if answer.kinetic_energy is not None and truth.quantities.kinetic_energy is not None:
+            gap = abs(answer.kinetic_energy - truth.quantities.kinetic_energy)
+            note("kinetic_energy", gap, truth.tolerance["kinetic_energy"], state, ())
+        if state and None not in (*first, answer.potential_energy):
+            change = answer.potential_energy - first[1]  # type: ignore[operator]
+            own = truth.quantities.potential_energy - first[0]  # type: ignore[operator]
+            note("potential_energy", abs(change - own), truth.tolerance["potential_energy"], state, ())
+    return found
+
+
+def certify_states(model: NeutralModel, states: Sequence[CanonicalState]) -> list[CertifiedModelQuantities]:
+    """Certify a model at several states.
+
+    Args:
+        model: a neutral model.
+        states: its canonical states.
+
+    Returns:
+        One record per state.
+
+    """
+    return [certify_model(model, state) for state in states]
