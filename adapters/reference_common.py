@@ -59,6 +59,8 @@ def state_quantities(
     reaction: Array,
     S: Array,
     moment: Array | None = None,
+    rotor_count: int = 0,
+    spring_energy: float = 0.0,
 ) -> StateQuantities:
     """Compute the contract's quantities of one state from the solution of S x = b.
 
@@ -71,6 +73,8 @@ def state_quantities(
         S: the matrix of (N5), of which rows and columns of r̈ and p̈ are used.
         moment: moments on the bodies about these points (N, 3) [N m], world frame; absent for chains of rods
             and balls, where it is 0.
+        rotor_count: rows of rotors in S, behind those of the constraints.
+        spring_energy: potential energy of springs [J].
 
     Returns:
         Every quantity of the contract.
@@ -78,7 +82,9 @@ def state_quantities(
     """
     n = model.n
     r, p, v, pdot = notes_state(state)
-    T, y = S[: 7 * n, : 7 * n], np.concatenate([v.ravel(), pdot.ravel()])
+    rotors = slice(len(S) - n - rotor_count, len(S) - n)  # rows J_φ with −1/a on the diagonal
+    J = S[rotors, : 7 * n]
+    T, y = S[: 7 * n, : 7 * n] - J.T / np.diag(S)[rotors] @ J, np.concatenate([v.ravel(), pdot.ravel()])
     # The contract's mass matrix is Zᵀ T Z with y = Z ν.
     bodies = velocity_jacobian(model, state).reshape(n, 6, -1)
     pdot_rows = L(p).swapaxes(-1, -2) @ bodies[:, 3:] / 2
@@ -90,7 +96,7 @@ def state_quantities(
         joint_reaction=reaction,
         joint_moment=moment,
         kinetic_energy=float(y @ T @ y) / 2,
-        potential_energy=-float(np.sum(model.mass * (r @ model.gravity))),
+        potential_energy=spring_energy - float(np.sum(model.mass * (r @ model.gravity))),
         angular_momentum=np.sum(np.cross(r, model.mass[:, None] * v) + spin[..., 0], axis=0),
         mass_matrix=Z.T @ T @ Z,
     )

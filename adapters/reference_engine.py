@@ -52,7 +52,7 @@ class Reference(MetamorphicHooks):
         ),
     )
 
-    builds_trees = True
+    builds_trees = builds_elements = True
     options = ("dense factors", "O(N) form")
     welding_unsupported_reason = NO_WELD
 
@@ -74,15 +74,26 @@ class Reference(MetamorphicHooks):
             dense = self.option == "dense factors"
             solve = system.solve_with_dense_factors if dense else StructuredSystem([model]).solve
         try:
-            return [self._quantities(system, state, solve(*notes_state(state))) for state in states]
+            return [self._quantities(system, state, solve) for state in states]
         except SingularSystem as error:
             raise EngineFailure(f"{self.title}: {error}") from error
 
     @staticmethod
-    def _quantities(system: DirectSystem, state: State, x: Solution) -> StateQuantities:
-        S, _ = system.assemble(*notes_state(state))
-        moment = None if system.chain.is_chain else x.joint_moment
-        return state_quantities(system.chain, state, x.acceleration, x.pddot, x.joint_reaction, S, moment)
+    def _quantities(system: DirectSystem, state: State, solve: Callable[..., Solution]) -> StateQuantities:
+        at, elements = notes_state(state), system.elements
+        S, _ = system.assemble(*at)
+        x = solve(*at, x=state.x) if elements else solve(*at)
+        return state_quantities(
+            system.chain,
+            state,
+            x.acceleration,
+            x.pddot,
+            x.joint_reaction,
+            S,
+            None if system.chain.is_chain else x.joint_moment,
+            system.rotor_count,
+            elements.evaluate(*at, state.x).potential if elements else 0.0,
+        )
 
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float

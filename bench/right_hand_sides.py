@@ -44,7 +44,7 @@ def structured_call(model: Model, state: State, batch: int = 1) -> Call:
 def direct_call(model: Model, state: State) -> tuple[sparse.csc_matrix, Array, Call]:
     """The direct form: S (sparse) and b assembled, and the banded solve of a state from scratch."""
     system, pdot = DirectSystem(model), quaternion_rate(state.p, state.omega)
-    values, b, _ = system._entries(state.r, state.p, state.v, pdot)
+    values, b, *_ = system._entries(state.r, state.p, state.v, pdot)
     S = sparse.csc_matrix((values, (system._i, system._j)), shape=(system.size, system.size))
     return S, b, lambda: system.solve(state.r, state.p, state.v, pdot)
 

@@ -10,6 +10,7 @@ from scipy.linalg import lapack
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
+from reference_impl.elements import ElementForces, Elements
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import A, L, angular_velocity, dot
 from reference_impl.joints import ConstraintRows, constraint_rows, joint_of_rows, of_far_body
@@ -24,11 +25,14 @@ class Solution:
 
     acceleration: Array  # (N, 3) m/s², r̈, world frame
     pddot: Array  # (N, 4) 1/s², p̈
-    multiplier: Array  # (c,) λ by row of `joint`: N/m for a rod's row, N for a ball's three
+    # (c,) λ by row of `joint`: N/m for a rod's row, N for a ball's three, a φ̈ for a rotor's at the end
+    multiplier: Array
     norm_multiplier: Array  # (N,) λ_E: no physical meaning, not comparable across formulations (E2)
     joint: NDArray[np.intp]  # (c,) the joint of each row
     tension: Array  # (N,) N, 2 ℓ λ of the rods, positive in tension; NaN at ball joints
-    joint_reaction: Array  # (N, 3) N, force on body k at the near point of joint k, world frame: −C_rᵀ λ
+    joint_reaction: (
+        Array  # (N, 3) N, force on body k at the near point of joint k, world frame: −C_rᵀ λ, with elements
+    )
     joint_moment: Array | None = None  # (N, 3) N m, moment on body k about that point, world frame
 
 
@@ -38,11 +42,15 @@ class DirectSystem:
     `assemble` is the specification: S and b dense, blocks and signs as printed in (N5), unknowns in
     the printed order (r̈, p̈, λ, λ_E).  `solve` takes the same entries body by body, in the order
     (λ_k, r̈_k, p̈_k, λ_E,k), where they fill a band of width 10 beside the diagonal whatever N is.
+    Rotors' rows and unknowns stand behind λ (`elements`).
     """
 
     def __init__(self, chain: Mechanism) -> None:
         self.chain = chain
-        n, joint = chain.n, joint_of_rows(chain)
+        self.elements = Elements(chain) if chain.has_elements else None
+        rotors = self.elements.joint[self.elements.rotors] if self.elements else np.zeros(0, np.intp)
+        self.rotor_count = len(rotors)
+        n, joint = chain.n, np.concatenate([joint_of_rows(chain), rotors])
         c = len(joint)
         r, p = np.arange(3 * n).reshape(n, 3), 3 * n + np.arange(4 * n).reshape(n, 4)
         row, norm = 7 * n + np.arange(c), 7 * n + c + np.arange(n)
@@ -58,6 +66,7 @@ class DirectSystem:
         places = [
             (r, r),
             (p[:, :, None], p[:, None, :]),
+            (row[c - self.rotor_count :],) * 2,
             (row[:, None], r[near]),
             (row[self._far, None], r[far]),
             (row[:, None], p[near]),
@@ -65,7 +74,7 @@ class DirectSystem:
             (norm[:, None], p),
         ]
         i, j = (np.concatenate([np.broadcast_arrays(*x)[side].ravel() for x in places]) for side in (0, 1))
-        self._lower = sum(np.broadcast(*x).size for x in places[:2])  # constraint blocks stand in S twice
+        self._lower = sum(np.broadcast(*x).size for x in places[:3])  # constraint blocks stand in S twice
         self._i, self._j = np.concatenate([i, j[self._lower :]]), np.concatenate([j, i[self._lower :]])
 
         body = _band_order(chain)
@@ -94,12 +103,18 @@ class DirectSystem:
             S (m, m) and b (m,), m = 8 N + c, for x = (r̈, p̈, λ, λ_E).
 
         """
-        values, b, _ = self._entries(r, p, v, pdot)
-        S = np.zeros((self.size, self.size))
-        S[self._i, self._j] = values
-        return S, b
+        values, b, *_ = self._entries(r, p, v, pdot)
+        return self._dense(values), b
 
-    def solve(self, r: Array, p: Array, v: Array, pdot: Array, gamma_defect: float | Array = 0.0) -> Solution:
+    def solve(
+        self,
+        r: Array,
+        p: Array,
+        v: Array,
+        pdot: Array,
+        gamma_defect: float | Array = 0.0,
+        x: Array | None = None,
+    ) -> Solution:
         """Solve (N5).
 
         Args:
@@ -108,6 +123,7 @@ class DirectSystem:
             v: velocities ṙ (N, 3) [m/s], world frame.
             pdot: rates ṗ (N, 4) [1/s].
             gamma_defect: added to γ, one number or one per row (c,): a planted fault of known growth (E4).
+            x: joint coordinates (N, 2) near which angles of springs are taken; absent: principal values.
 
         Returns:
             r̈, p̈, λ, λ_E and the forces at the joints.
@@ -116,11 +132,17 @@ class DirectSystem:
             SingularSystem: S is singular; the message names the body and the cause (E1, E7).
 
         """
-        return self._solution_from_unknowns(p, *self.solve_unknowns(r, p, v, pdot, gamma_defect))
+        return self._solution_from_unknowns(p, *self.solve_unknowns(r, p, v, pdot, gamma_defect, x))
 
     def solve_unknowns(
-        self, r: Array, p: Array, v: Array, pdot: Array, gamma_defect: float | Array = 0.0
-    ) -> tuple[Array, ConstraintRows]:
+        self,
+        r: Array,
+        p: Array,
+        v: Array,
+        pdot: Array,
+        gamma_defect: float | Array = 0.0,
+        x: Array | None = None,
+    ) -> tuple[Array, ConstraintRows, ElementForces | None]:
         """Solve (N5) for its unknowns alone.
 
         S is equilibrated symmetrically by powers of two (its blocks have the units kg, kg m² and m,
@@ -134,16 +156,17 @@ class DirectSystem:
             v: velocities ṙ (N, 3) [m/s], world frame.
             pdot: rates ṗ (N, 4) [1/s].
             gamma_defect: added to γ, one number or one per row (c,): a planted fault of known growth (E4).
+            x: as for `solve`.
 
         Returns:
-            x (m,) in the printed order, and the rows of the constraints.
+            x (m,) in the printed order, the rows of the constraints and rotors, and what elements there are.
 
         Raises:
             SingularSystem: S is singular; the message names the body and the cause (E1, E7).
 
         """
         with np.errstate(all="ignore"):  # an overflow raises SingularSystem below
-            values, b, joints = self._entries(r, p, v, pdot)
+            values, b, joints, elements = self._entries(r, p, v, pdot, x)
             n, c = self.chain.n, len(self.joint)
             b[7 * n : 7 * n + c] += gamma_defect
             check_state_solvable(self.chain, r, p, joints.d, self._rods, (values, b, v))
@@ -156,14 +179,16 @@ class DirectSystem:
         lu, pivots, _ = lapack.dgbtrf(band, self._width, self._width, overwrite_ab=True)
         _check_pivots(self.chain, lu[2 * self._width])
         right = b[self._order] * scale
-        x, _ = lapack.dgbtrs(lu, self._width, self._width, right, pivots)
-        residual = right - np.add.reduceat(entries * x[self._column], self._row_start)
-        x += lapack.dgbtrs(lu, self._width, self._width, residual, pivots)[0]
+        y, _ = lapack.dgbtrs(lu, self._width, self._width, right, pivots)
+        residual = right - np.add.reduceat(entries * y[self._column], self._row_start)
+        y += lapack.dgbtrs(lu, self._width, self._width, residual, pivots)[0]
         solution = np.empty(self.size)
-        solution[self._order] = x * scale
-        return solution, joints
+        solution[self._order] = y * scale
+        return solution, joints, elements
 
-    def solve_with_dense_factors(self, r: Array, p: Array, v: Array, pdot: Array) -> Solution:
+    def solve_with_dense_factors(
+        self, r: Array, p: Array, v: Array, pdot: Array, *, x: Array | None = None
+    ) -> Solution:
         """Solve (N5) by dense factors of the assembled S, an independent way to the x of `solve`.
 
         Args:
@@ -171,23 +196,39 @@ class DirectSystem:
             p: Euler parameters (N, 4).
             v: velocities ṙ (N, 3) [m/s], world frame.
             pdot: rates ṗ (N, 4) [1/s].
+            x: as for `solve`.
 
         Returns:
             As `solve`.
 
         """
-        S, b = self.assemble(r, p, v, pdot)
-        return self._solution_from_unknowns(p, solve_dense(S, b), constraint_rows(self.chain, r, p, v, pdot))
+        values, b, joints, elements = self._entries(r, p, v, pdot, x)
+        return self._solution_from_unknowns(p, solve_dense(self._dense(values), b), joints, elements)
 
-    def _entries(self, r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, Array, ConstraintRows]:
-        """The entries of S in the order of `_i`, `_j`, then b, and the joints they come from."""
-        chain = self.chain
+    def _dense(self, values: Array) -> Array:
+        S = np.zeros((self.size, self.size))
+        S[self._i, self._j] = values
+        return S
+
+    def _entries(
+        self, r: Array, p: Array, v: Array, pdot: Array, x: Array | None = None
+    ) -> tuple[Array, Array, ConstraintRows, ElementForces | None]:
+        """The entries of S in the order of `_i`, `_j`, then b, and the rows and elements they come from."""
+        chain, elements, rotors = self.chain, None, np.zeros(0)
         joints = constraint_rows(chain, r, p, v, pdot)
+        if self.elements:
+            elements, own = self.elements.evaluate(r, p, v, pdot, x), self.elements.rotors
+            rotors = self.elements.armature[own]
+            rows = elements.r_near[own], elements.p_near[own], elements.p_far[own], -elements.bias[own]
+            joints = joints.followed_by(
+                self.elements.joint[own], chain.body[self.elements.joint[own], 0], *rows
+            )
         L_, L_rate = L(p), L(pdot)
         JL = chain.inertia @ L_
         blocks = (
             self._masses,  # M
             4 * (L_.swapaxes(-1, -2) @ JL),  # 4 LᵀJL
+            -1 / rotors,
             joints.r_near,  # C_r
             -joints.r_near[self._far],
             joints.p_near,  # C_p
@@ -201,16 +242,23 @@ class DirectSystem:
             moment = moment - chain.drag_moment[:, None] * angular_velocity(p, pdot)
         quadratic = chain.inertia @ (L_rate @ p[..., None])
         p_force = 8 * (L_rate.swapaxes(-1, -2) @ quadratic) + 2 * (L_.swapaxes(-1, -2) @ moment[..., None])
+        if elements:
+            force, p_force = force + elements.force, p_force + elements.p_force[..., None]
         b = np.concatenate([force.ravel(), p_force.ravel(), joints.gamma, -2 * dot(pdot, pdot)])
-        return np.concatenate([values, values[self._lower :]]), b, joints
+        return np.concatenate([values, values[self._lower :]]), b, joints, elements
 
-    def _solution_from_unknowns(self, p: Array, x: Array, joints: ConstraintRows) -> Solution:
+    def _solution_from_unknowns(
+        self, p: Array, x: Array, joints: ConstraintRows, elements: ElementForces | None
+    ) -> Solution:
         """The parts of x, and λ as forces."""
         n, c = self.chain.n, len(self.joint)
         multiplier = x[7 * n : 7 * n + c]
         reaction, of_p = np.zeros((n, 3)), np.zeros((n, 4))
         np.add.at(reaction, self.joint, multiplier[:, None] * joints.r_near)
         np.add.at(of_p, self.joint, multiplier[:, None] * joints.p_near)
+        if self.elements and elements:
+            np.add.at(reaction, self.elements.joint, -elements.torque[:, None] * elements.r_near)
+            np.add.at(of_p, self.elements.joint, -elements.torque[:, None] * elements.p_near)
         tension, rod = np.full(n, np.nan), self._rods
         tension[rod] = 2 * self.chain.length[rod] * multiplier[rod[self.joint]]
         return Solution(

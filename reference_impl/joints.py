@@ -22,7 +22,7 @@ dᵀd of (L2, L3).  For one and two bodies on rods these are S1–S4 and D2–D6
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -46,6 +46,21 @@ class ConstraintRows:
     p_far: AnyArray  # (c, 4) ∂C/∂p of the far body; 0 for the world
     gamma: AnyArray  # (c,) C̈ = C_r r̈ + C_p p̈ − γ
     d: AnyArray  # (N, 3) m, world frame, from the far to the near point of joint k
+
+    def followed_by(self, joint: NDArray[np.intp], *rows: AnyArray) -> ConstraintRows:
+        """Append rows that hold nothing: those of rotors, whose C counts as 0.
+
+        Args:
+            joint: (m,) their joints.
+            *rows: their far bodies (m,), and ∂/∂r near, ∂/∂p near, ∂/∂p far and γ.
+
+        Returns:
+            All rows.
+
+        """
+        names = ("joint", "far", "r_near", "p_near", "p_far", "gamma", "C")
+        more = zip(names, (joint, *rows, np.zeros(len(joint))), strict=True)
+        return replace(self, **{name: np.concatenate([getattr(self, name), x]) for name, x in more})
 
     def constraint_rate(self, v: AnyArray, pdot: AnyArray) -> AnyArray:
         """Return Ċ = C_r ṙ + C_p ṗ.

@@ -1,0 +1,156 @@
+"""Passive elements: rotors, dampers, springs and efforts of joints, springs and dampers between points.
+
+A scalar coordinate φ of a joint turns about, or slides along, an axis w of the far or the near body.  With
+the notation of `joints`, a and b from the centres of mass to the points, ω = 2 G ṗ and Ω = ω_near − ω_far,
+
+    turn   φ̇ = wᵀΩ                       φ̈₀ = ẇᵀΩ                       (φ̈ at q̈ = 0)
+    slide  φ  = wᵀd,  φ̇ = wᵀḋ + ẇᵀd     φ̈₀ = (wᵀd)¨ at q̈ = 0
+
+and δφ = fᵀ(δr_near − δr_far) + n_nearᵀδθ_near − n_farᵀδθ_far, δθ = 2 G δp, with f = 0, n = w of a turn and
+f = w, n_near = b × w, n_far = (a + d) × w of a slide: J_φ, and the wrench of a unit torque or force.
+
+    spring, damper, effort   τ = e − k (φ − φ₀) − c φ̇              adds J_φᵀ τ to the right of (N5)
+    rotor                    J_φ q̈ − μ/a = −φ̈₀,  μ = a φ̈           one row and one unknown more (L4)
+    between points           t = k (l − l₀) + c l̇,  l̇ = dᵀḋ/l      pulls both points together, l = |d|
+
+A ball joint has three coordinates about the near body's axes; φ is the rotation vector θ u of the turn from
+the far to the near body, along whose axis the torque −k θ u acts: V = ½ k θ².  Exact on the constraints.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from reference_impl.euler_parameters import A, G, L, dot
+from reference_impl.mechanism import KINDS, Array, Mechanism
+
+
+@dataclass(frozen=True, eq=False)
+class ElementForces:
+    """The elements of a mechanism at one state; e joint coordinates that have some, in the joints' order."""
+
+    r_near: Array  # (e, 3) J_φ of r of the near body; of the far body it is −r_near
+    p_near: Array  # (e, 4) J_φ of p of the near body
+    p_far: Array  # (e, 4) J_φ of p of the far body
+    bias: Array  # (e,) φ̈₀
+    torque: Array  # (e,) N m or N, τ
+    force: Array  # (N, 3) N, of all elements but rotors, world frame
+    p_force: Array  # (N, 4) N m, the generalised force on p of the same
+    potential: float  # J, of the springs
+    dissipation: float  # W, of the dampers
+
+
+class Elements:
+    """The elements of one mechanism; what they have in common at every state."""
+
+    def __init__(self, mechanism: Mechanism) -> None:
+        m = self.mechanism = mechanism
+        found: list[tuple[int, int, int, bool, bool]] = []
+        for k, kind in enumerate(m.kind):
+            balls = [("turn", 0), ("turn", 1), ("turn", 2)]
+            for i, (what, axis) in enumerate(balls if kind == "ball" else KINDS[kind].motions):
+                column = 0 if kind == "ball" else i
+                if (
+                    m.armature[k, column]
+                    or m.damping[k, column]
+                    or m.stiffness[k, column]
+                    or m.effort[k, column]
+                ):
+                    found.append((k, column, axis, what == "slide", i == 0 and kind != "ball"))
+        table = np.array(found, np.intp).reshape(-1, 5).T
+        self.joint, self.column, self.axis = table[:3]
+        self.is_slide, self.is_far = table[3:].astype(bool)  # is_far: its axis is fixed in the far body
+        self.is_ball = np.array([m.kind[k] == "ball" for k in self.joint], bool)
+        at = self.joint, self.column
+        self.armature, self.damping, self.stiffness = m.armature[at], m.damping[at], m.stiffness[at]
+        self.effort, self.rest = m.effort[at], m.rest[at]
+        self.rotors = np.flatnonzero(self.armature)  # coordinates that have a row of their own
+        self.bodies = np.stack([self.joint, m.body[self.joint, 0]])  # (2, e) near, far
+        self.points = np.moveaxis(m.point[self.joint, ::-1], 1, 0)
+        self.turns = np.moveaxis(m.turn[self.joint, ::-1], 1, 0)
+
+    def evaluate(self, r: Array, p: Array, v: Array, pdot: Array, x: Array | None = None) -> ElementForces:
+        """Evaluate all elements.
+
+        Args:
+            r: positions (N, 3) [m], world frame.
+            p: Euler parameters (N, 4).
+            v: velocities ṙ (N, 3) [m/s], world frame.
+            pdot: rates ṗ (N, 4) [1/s].
+            x: joint coordinates (N, 2) near which angles are taken [rad]; absent: principal values.
+
+        Returns:
+            Their rows and forces.
+
+        """
+        state = _with_world(r, p, v, pdot)
+        re, pe, ve, pdot_e = (y[self.bodies] for y in state)  # (2, e, ·) near, far
+        turn, rates = A(pe), 2 * G(pe)
+        (wb, wa), (b, a) = np.matvec(rates, pdot_e), np.matvec(turn, self.points)
+        h, f = (turn @ A(self.turns)).swapaxes(-1, -2)  # rows: the axes
+        e, is_far, is_slide = np.arange(len(self.joint)), self.is_far[:, None], self.is_slide[:, None]
+        w, carrier = np.where(is_far, f[e, self.axis], h[e, self.axis]), np.where(is_far, wa, wb)
+        d = re[0] + b - re[1] - a
+        d_rate = ve[0] + np.cross(wb, b) - ve[1] - np.cross(wa, a)
+        push = w * is_slide
+        n_near, n_far = (np.where(is_slide, np.cross(arm, w), w) for arm in (b, a + d))
+        rate = dot(push, ve[0] - ve[1]) + dot(n_near, wb) - dot(n_far, wa)
+        w_rate = np.cross(carrier, w)
+        bend = np.cross(wb, np.cross(wb, b)) - np.cross(wa, np.cross(wa, a))
+        slide_bias = dot(w, bend) + 2 * dot(w_rate, d_rate) + dot(np.cross(wa, w_rate), d)
+        stretch = np.where(self.is_slide, dot(w, d), self._angles(f, h, pe, x)) - self.rest
+        torque = self.effort - self.stiffness * stretch - self.damping * rate
+        wrench = torque[:, None] * np.stack([np.hstack([push, n_near]), -np.hstack([push, n_far])])
+        spring_wrench, potential, lost = self._point_springs(state)
+        total = np.zeros((len(r) + 1, 6))  # force, and moment about the centre of mass; the world last
+        np.add.at(total, self.bodies, wrench)
+        np.add.at(total, self.mechanism.spring_body.T, spring_wrench)
+        return ElementForces(
+            r_near=push,
+            p_near=np.vecmat(n_near, rates[0]),
+            p_far=-np.vecmat(n_far, rates[1]),
+            bias=np.where(self.is_slide, slide_bias, dot(w_rate, wb - wa)),
+            torque=torque,
+            force=total[:-1, :3],
+            p_force=np.vecmat(total[:-1, 3:], 2 * G(p)),
+            potential=potential + float(self.stiffness @ stretch**2) / 2,
+            dissipation=lost + float(self.damping @ rate**2),
+        )
+
+    def _angles(self, f: Array, h: Array, p: Array, x: Array | None) -> Array:
+        """Angles (e,) of turns, and of balls the components of the rotation vector."""
+        e, (i, j, k) = np.arange(len(self.axis)), (self.axis + np.arange(3)[:, None]) % 3
+        cosine = np.where(self.is_far, dot(f[e, j], h[e, j]), dot(f[e, k], h[e, k]))
+        angle = np.arctan2(dot(f[e, k], h[e, j]), cosine)
+        if x is not None:
+            angle += 2 * np.pi * np.round((x[self.joint, self.column] - angle) / (2 * np.pi))
+        near, far = self.turns[..., :1] * p + np.vecmat(self.turns[..., 1:], L(p))  # p ∘ turn
+        scalar, vector = dot(far, near), np.matvec(L(far), near)
+        size = np.sqrt(dot(vector, vector))
+        theta = 2 * np.arctan2(size, np.abs(scalar)) * np.where(scalar < 0, -1, 1)
+        ratio = np.divide(theta, size, out=np.full_like(size, 2.0), where=size > 0)
+        return np.where(self.is_ball, ratio * vector[e, i], angle)
+
+    def _point_springs(self, state: tuple[Array, ...]) -> tuple[Array, float, float]:
+        """Wrenches (2, K, 6) on both bodies of each spring, its potential energy and dissipated power."""
+        m = self.mechanism
+        r, p, v, pdot = (y[m.spring_body.T] for y in state)
+        arm = np.matvec(A(p), np.moveaxis(m.spring_point, 1, 0))
+        d, d_rate = (
+            np.diff(r + arm, axis=0)[0],
+            np.diff(v + np.cross(np.matvec(2 * G(p), pdot), arm), axis=0)[0],
+        )
+        length = np.sqrt(dot(d, d))
+        rate, stretch = dot(d, d_rate) / length, length - m.spring_length
+        tension = m.spring_stiffness * stretch + m.spring_damping * rate
+        pull = (tension / length)[:, None] * d * np.array([1.0, -1.0])[:, None, None]
+        potential, lost = m.spring_stiffness @ stretch**2 / 2, m.spring_damping @ rate**2
+        return np.concatenate([pull, np.cross(arm, pull)], axis=-1), float(potential), float(lost)
+
+
+def _with_world(r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, ...]:
+    """The state with the world as the last body, where index −1 finds it."""
+    rest = (np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), np.zeros(4))
+    return tuple(np.vstack([y, world]) for y, world in zip((r, p, v, pdot), rest, strict=True))
