@@ -6,7 +6,7 @@ bodies beyond.  With I_c the composite inertia of a subtree and w its wrench at 
 
     M_jk = S_jᵀ I_c,k S_k  for j on the path from the world to k     (composite rigid bodies, CRBA)
     h_k  = S_kᵀ w_k                                                  (recursive Newton–Euler, RNEA)
-    M ν̇ = −h
+    M ν̇ = −h,   with passive elements also of `plumbline.truth.ball_elements`
 
 (Featherstone, Rigid Body Dynamics Algorithms, 2008, tables 5.1 and 6.2).  A rod lets its near end slide
 along two tangents of the sphere about its far end, and has a ball joint there.  Rates ν are relative to the
@@ -21,6 +21,7 @@ import numpy as np
 
 from plumbline.model.datatypes import KINDS, Model, State
 from plumbline.model.kinematics import own_rates, rate_count
+from plumbline.truth.ball_elements import ball_elements
 from plumbline.truth.balls import BallArithmetic, entries, midpoints, term_scales
 from plumbline.truth.joint_tree import JointTree
 
@@ -143,15 +144,23 @@ def enclose_tree(flint: Any, model: Model, state: State, mass_matrix: bool) -> d
         ZeroDivisionError: the mass matrix is not invertible, at this precision.
 
     """
-    if model.has_elements:
-        raise NotImplementedError("passive elements have no certified quantities yet")
     c = _BallTree(flint, model, state)
     M, first = c.joint_mass_matrix()
     inertias, wrenches = ([of(k) for k in range(c.n)] for of in (c.spatial_inertia, c.wrench_at_rest))
+    kinetic = potential = c.arb(0)
+    effort = [c.arb(0)] * first[-1]
+    if model.has_elements:
+        elements = ball_elements(c)
+        kinetic, potential = elements.kinetic, elements.potential
+        wrenches = [wrench - pull for wrench, pull in zip(wrenches, elements.wrench, strict=True)]
+        effort = [x for own in elements.effort for x in own]
+        for i, a in enumerate(a for own in elements.armature for a in own):
+            M[i, i] += a
     total = c.subtree_sums(wrenches)
     h = [x for k in range(c.n) for x in entries(c.S[k].transpose() * total[k])]
-    rates = entries(M.solve(c.mat(len(h), 1, [-x for x in h]))) if h else []
-    acceleration, angular, kinetic, potential, momentum = [], [], c.arb(0), c.arb(0), c.zero
+    right = [push - x for push, x in zip(effort, h, strict=True)]
+    rates = entries(M.solve(c.mat(len(h), 1, right))) if h else []
+    acceleration, angular, momentum = [], [], c.zero
     gained: list[Any] = []  # twist that ν̇ adds
     for k in range(c.n):
         own = c.mat(6, 1, [0] * 6)

@@ -25,6 +25,7 @@ from plumbline.model.kinematics import (
     rotate_vectors,
     rotation_matrix,
 )
+from plumbline.truth.element_terms import joint_elements, spring_terms
 
 
 class _TreeTerms:
@@ -47,8 +48,10 @@ class _TreeTerms:
         for k in reversed(range(self.n)):
             if self.far[k] >= 0:
                 self.below[self.far[k]] |= self.below[k]
-        self.load = model.force - model.drag_force[:, None] * state.v
+        self.springs = spring_terms(model, state)
+        self.load = model.force - model.drag_force[:, None] * state.v + self.springs.force
         self.torque = rotate_vectors(self.A, model.moment) - model.drag_moment[:, None] * self.omega
+        self.torque = self.torque + self.springs.moment
         self._solve()
         self._measure()
 
@@ -92,11 +95,7 @@ class _TreeTerms:
         gamma = np.zeros(first[-1])
         for k, (E, bend) in enumerate(held):
             rows = slice(first[k], first[k + 1])
-            C[rows, k, :3], C[rows, k, 3:] = E[:3].T, E[3:].T - E[:3].T @ cross_matrix(self.near[k])
-            if self.far[k] >= 0:
-                arm = self.far_arm[k] - (self.d[k] if model.kind[k] == "rod" else 0.0)
-                C[rows, self.far[k], :3] = -E[:3].T
-                C[rows, self.far[k], 3:] = E[:3].T @ cross_matrix(arm) - E[3:].T
+            C[rows] = self._relative_rows(k, E)
             E_rows[k, :, rows] = E
             gamma[rows] = -E.T @ bend
         M_inverse = np.zeros((n, 6, n, 6))
@@ -104,21 +103,55 @@ class _TreeTerms:
         M_inverse[body, :3, body, :3] = np.eye(3) / model.mass[:, None, None]
         M_inverse[body, 3:, body, 3:] = np.linalg.inv(self.inertia)
         flat, M_flat = C.reshape(-1, 6 * n), M_inverse.reshape(6 * n, 6 * n)
+        self.elements = joint_elements(model, self.state, [bend for _, bend in held])
+        J, directions, M_flat = self._rotors(M_flat)
         CM = flat @ M_flat
         K = CM @ flat.T
         s = 1 / np.sqrt(np.diag(K))  # equilibrated: pivots must not depend on the units
         K_inverse = np.linalg.inv(K * s * s[:, None]) * s * s[:, None] if len(K) else K
         X = CM.T @ K_inverse
-        x_rows = np.concatenate([M_flat - X @ CM, X], 1).reshape(n, 2, 3, -1)
-        wrench_rows = (E_rows @ np.concatenate([-X.T, K_inverse], 1)).reshape(n, 2, 3, -1)
+        x_rows = np.concatenate([M_flat - X @ CM, X], 1)
+        wrench_rows = E_rows @ np.concatenate([-X.T, K_inverse], 1)
+        armature, bias, torque = (
+            np.array([getattr(e, name) for e in self.elements]) for name in ("armature", "bias", "torque")
+        )
+        if len(armature):  # the joint's whole wrench: its elements' too
+            wrench_rows -= directions @ (armature[:, None] * (J @ x_rows))
+        x_rows, wrench_rows = (some.reshape(n, 2, 3, -1) for some in (x_rows, wrench_rows))
         inverse = np.concatenate([x_rows, wrench_rows], 1)  # (N, 4, 3, 6 N + c): r̈, α, F, M of each body
         self.of_body = inverse[..., : 6 * n].reshape(n, 4, 3, n, 2, 3)
         # per joint the response to errors of its six relative accelerations
         self.of_joint = np.einsum("nqir,kjr->nqikj", inverse[..., 6 * n :], E_rows).reshape(n, 4, 3, n, 2, 3)
         force = model.mass[:, None] * model.gravity + self.load
         moment = self.torque - cross(self.omega, rotate_vectors(self.inertia, self.omega))
-        right = np.concatenate([np.concatenate([force, moment], -1).ravel(), gamma])
-        self.solution = np.moveaxis(inverse @ right, 1, 0)  # (4, N, 3)
+        body_terms = np.concatenate([force, moment], -1).ravel() + (torque - armature * bias) @ J
+        own = (directions @ (torque - armature * bias)).reshape(n, 2, 3)
+        self.solution = np.moveaxis(inverse @ np.concatenate([body_terms, gamma]), 1, 0)  # (4, N, 3)
+        self.solution[2:] += np.moveaxis(own, 1, 0)
+
+    def _relative_rows(self, k: int, E: Array) -> Array:
+        """Rows (c, N, 6) of the relative acceleration of joint k along the columns of E (6, c)."""
+        rows = np.zeros((E.shape[1], self.n, 6))
+        rows[:, k, :3], rows[:, k, 3:] = E[:3].T, E[3:].T - E[:3].T @ cross_matrix(self.near[k])
+        if self.far[k] >= 0:
+            arm = self.far_arm[k] - (self.d[k] if self.model.kind[k] == "rod" else 0.0)
+            rows[:, self.far[k], :3] = -E[:3].T
+            rows[:, self.far[k], 3:] = E[:3].T @ cross_matrix(arm) - E[3:].T
+        return rows
+
+    def _rotors(self, M_inverse: Array) -> tuple[Array, Array, Array]:
+        """Rows J (e, 6N) of the elements, their directions (N, 6, e), and (M + Jᵀ a J)⁻¹."""
+        J = np.zeros((len(self.elements), 6 * self.n))
+        directions = np.zeros((self.n, 6, len(self.elements)))
+        for i, element in enumerate(self.elements):
+            J[i] = self._relative_rows(element.k, element.direction[:, None]).ravel()
+            directions[element.k, :, i] = element.direction
+        a = np.array([element.armature for element in self.elements])
+        if not np.any(a):
+            return J, directions, M_inverse
+        MJ = M_inverse @ J[a > 0].T
+        inner = np.linalg.inv(np.diag(1 / a[a > 0]) + J[a > 0] @ MJ)
+        return J, directions, M_inverse - MJ @ inner @ MJ.T
 
     def _measure(self) -> None:
         norm, model = np.linalg.norm, self.model
@@ -129,7 +162,11 @@ class _TreeTerms:
         # largest rate of any body or joint between the world and here, per body
         self.W = np.max(np.where(self.below.T, own, 0.0), axis=1)
         self.transport = norm(self.omega, axis=1) * norm(self.state.v, axis=1)
-        self.load_size, self.torque_size = norm(self.load, axis=1), norm(self.torque, axis=1)
+        self.load_size = norm(self.load, axis=1) + self.springs.size
+        self.torque_size = norm(self.torque, axis=1) + self.springs.moment_size
+        self.element_size = np.zeros(self.n)  # of each joint
+        for element in self.elements:
+            self.element_size[element.k] += element.size
         self.spin = self.J * norm(self.omega, axis=1) * self.W
         slides = [[what == "slide" for what, _ in KINDS[kind].motions] + [False] * 2 for kind in model.kind]
         self.slide_rate = np.abs(self.state.xdot) @ [1, 1] * [any(some) for some in slides]
@@ -244,6 +281,10 @@ class _JointSpace:
         self.mass_matrix = (self.lever * m) @ self.lever.T + (self.turns * J) @ self.turns.T
         h = self.turns @ (J * terms.W**2 + terms.torque_size)
         h += self.lever @ (m * (terms.g + terms.a) + terms.load_size)
+        for element in terms.elements:
+            row = self.pairs.index(("slide" if element.is_slide else "turn", element.k))
+            self.mass_matrix[row, row] += element.armature
+            h[row] += element.size
         self.load = self.mass_matrix @ self.acceleration + h  # N m or N
 
     def _add(
@@ -299,6 +340,14 @@ class _JointSpace:
         return np.asarray(np.linalg.norm(np.reshape(found, (len(found), t.n, 4, 3, 3)), axis=(3, 4)))
 
 
+def _directions_used(t: _TreeTerms) -> Array:
+    """(N, 2): 1 where elements of a joint pull, and where they turn."""
+    used = np.zeros((t.n, 2))
+    for element in t.elements:
+        used[element.k, int(not element.is_slide)] = 1.0
+    return used
+
+
 def tree_tolerances(
     model: Model, state: State
 ) -> tuple[Array, dict[str, Array | float], dict[str, float], Array]:
@@ -326,6 +375,7 @@ def tree_tolerances(
     carried_moment = t.below @ (t.J * (t.alpha + turning) + t.spin + t.torque_size) + lever @ carried
     result = np.stack([np.maximum(t.a, t.g), t.alpha, t.F, t.moment], 1)
     total += result
+    total[:, 2:] += t.element_size[:, None] * _directions_used(t)
     total += np.stack([swing + t.a + t.transport, turning, t.below @ carried, carried_moment], 1)
 
     rate, speed = joints.turns.T @ joints.rate, joints.lever.T @ joints.rate
@@ -333,8 +383,10 @@ def tree_tolerances(
     steps += np.linalg.norm(state.r, axis=1) * [kind == "free" for kind in model.kind]
     height = t.below.T @ steps
     sums = {
-        "kinetic_energy": float(0.5 * np.sum(t.m * speed**2 + t.J * rate**2)),
-        "potential_energy": float(t.g * np.sum(t.m * height)),
+        "kinetic_energy": float(0.5 * np.sum(t.m * speed**2 + t.J * rate**2))
+        + sum(element.kinetic for element in t.elements),
+        "potential_energy": float(t.g * np.sum(t.m * height))
+        + sum((element.potential for element in t.elements), t.springs.potential),
         "angular_momentum": float(np.sum(t.m * height * speed + t.J * rate)),
         "mass_matrix": float(np.max(joints.mass_matrix, initial=0.0)),
     }
@@ -342,7 +394,7 @@ def tree_tolerances(
         "acceleration": result[:, 0],
         "angular_acceleration": np.max([t.alpha, moment / t.J, turning], 0),
         "joint_reaction": np.maximum(t.F, t.m * t.g),
-        "joint_moment": np.max([t.moment, t.arm * t.F, t.J * t.alpha], 0),
+        "joint_moment": np.max([t.moment, t.arm * t.F, t.J * t.alpha, t.element_size], 0),
         **sums,
     }
     rods = np.zeros(t.n)

@@ -9,13 +9,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from adapters.reference_engine import Reference
+from plumbline.model.datatypes import KINDS
 from plumbline.model.kinematics import complete_state, state_from_minimal
 from plumbline.model.sampling import random_states
 from plumbline.truth.balls import midpoints
 from plumbline.truth.certified import certify_state, enclose_quantities
 from plumbline.truth.certified_tree import enclose_tree
+from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, state_rounding_bound
 from tests.helpers.random_chains import random_chain
-from tests.helpers.random_trees import random_tree
+from tests.helpers.random_trees import ELEMENTS, random_tree
 
 
 @pytest.mark.parametrize("rods", [(0,), (1,), (1, 0, 0, 1, 1)])
@@ -63,6 +65,116 @@ def test_the_reference_agrees_on_random_trees(seed):
             scale = max(1.0, np.max(np.abs(value)))
             np.testing.assert_allclose(getattr(found, name), value, atol=1e-12 * scale, err_msg=name)
         assert max(truth.radius.values()) < 1e-20
+
+
+@pytest.mark.parametrize(
+    "kinds", [("ball",), ("hinge",), ("universal",), ("slide",), ("cylindrical",), tuple(KINDS)]
+)
+@pytest.mark.parametrize("element", [*((name,) for name in ELEMENTS), ELEMENTS])
+def test_the_reference_agrees_on_trees_with_elements(element, kinds):
+    for seed in range(2):
+        model = random_tree(np.random.default_rng([seed, 7]), 5, kinds, elements=element)
+        (state,) = random_states(model, 1, seed)
+        (found,) = Reference().evaluate(model, [state])
+        truth = certify_state(model, state, mass_matrix=True)
+        bound = state_rounding_bound(model, state)
+        for name, value in vars(truth.quantities).items():
+            error = np.asarray(getattr(found, name) - value)
+            error = np.linalg.norm(error, axis=-1) if error.shape[-1:] == (3,) else np.abs(error)
+            assert np.all(error <= bound.tolerance(name)), name
+            assert bound.relative_bound(name) < MAX_RELATIVE_BOUND
+        assert max(truth.radius.values()) < 1e-20
+
+
+def one_body(kind, **elements):
+    tree = random_tree(np.random.default_rng(3), 1, (kind,), loads=False)
+    tree = replace(tree, gravity=np.zeros(3))
+    return tree.changed(**{name: np.array([[value, 0.0]]) for name, value in elements.items()})
+
+
+def at(model, x, rate):
+    (state,) = random_states(model, 1, 3)
+    return complete_state(model, replace(state, x=np.array([[x, 0.0]]), xdot=np.array([[rate, 0.0]])))
+
+
+def test_a_sprung_and_damped_slide_is_the_damped_oscillator():
+    model = one_body("slide", armature=0.5, stiffness=3.0, damping=0.7, rest=0.2, effort=1.5)
+    state = at(model, 0.9, -2.0)
+    truth = certify_state(model, state).quantities
+    wanted = (1.5 - 3.0 * 0.7 + 0.7 * 2.0) / (model.mass[0] + 0.5)
+    axis = rotation_of(model.turn[0, 0])[:, 2]
+    np.testing.assert_allclose(truth.acceleration[0], wanted * axis, rtol=1e-14, atol=1e-14)
+    # the joint's whole force along the axis is what accelerates the body: the rotor's is taken off
+    np.testing.assert_allclose(truth.joint_reaction[0] @ axis, model.mass[0] * wanted, rtol=1e-14)
+    assert truth.potential_energy == pytest.approx(3.0 * 0.7**2 / 2)
+    assert truth.kinetic_energy == pytest.approx((model.mass[0] + 0.5) * 2.0)
+
+
+@pytest.mark.parametrize("turns", [-1, 0, 2])
+def test_a_sprung_hinge_counts_whole_turns(turns):
+    model = one_body("hinge", stiffness=2.0, rest=0.5)
+    near, far = (at(model, 0.4 + 2 * np.pi * n, 0.0) for n in (0, turns))
+    a, b = (certify_state(model, state).quantities.angular_acceleration[0] for state in (near, far))
+    assert np.linalg.norm(b) == pytest.approx(np.linalg.norm(a) * abs(2 * np.pi * turns - 0.1) / 0.1)
+    (found,) = Reference().evaluate(model, [far])
+    np.testing.assert_allclose(found.angular_acceleration[0], b, rtol=1e-12)
+
+
+def test_a_rotor_is_a_body_that_spins_with_the_joint():
+    """A rotor on a hinge is a second body on it, welded, whose only inertia is about the axis."""
+    rng = np.random.default_rng(8)
+    tree = random_tree(rng, 2, ("hinge",))
+    state = random_states(tree, 1, 8)[0]
+    k, a = 1, 0.7
+    axis = rotation_of(tree.turn[k, 1])[:, 2]
+    alone = replace(tree, body=np.array([[-1, 0], [-1, 1]]))  # from the world, where both spin alike
+    state = complete_state(alone, state)
+    heavy = alone.inertia.copy()
+    heavy[k] += a * np.outer(axis, axis)
+    armature = np.zeros((2, 2))
+    armature[k, 0] = a
+    body, rotor = (
+        certify_state(model, state, mass_matrix=True).quantities
+        for model in (alone.changed(inertia=heavy), alone.changed(armature=armature))
+    )
+    for name in ("acceleration", "angular_acceleration", "kinetic_energy", "mass_matrix"):
+        np.testing.assert_allclose(getattr(rotor, name), getattr(body, name), rtol=1e-12, err_msg=name)
+
+
+def test_a_ball_spring_pulls_along_the_rotation_vector():
+    model = one_body("ball", stiffness=2.0)
+    rest = (
+        Rotation.from_quat(np.roll(model.turn[0, 0], -1))
+        * Rotation.from_quat(np.roll(model.turn[0, 1], -1)).inv()
+    )
+    vector = np.array([0.6, -1.1, 0.3])
+    attitude = Rotation.from_rotvec(vector) * rest
+    (state,) = random_states(model, 1, 3)
+    p = np.roll(attitude.as_quat(), 1)[None]
+    state = complete_state(model, replace(state, p=p / np.linalg.norm(p), omega=np.zeros((1, 3))))
+    truth = certify_state(model, state).quantities
+    assert truth.potential_energy == pytest.approx(vector @ vector)
+    moment = truth.joint_moment[0]
+    np.testing.assert_allclose(moment, -2.0 * vector, rtol=1e-12)
+    at_rest = np.roll(rest.as_quat(), 1)[None]
+    unloaded = complete_state(model, replace(state, p=at_rest / np.linalg.norm(at_rest)))
+    assert np.max(np.abs(certify_state(model, unloaded).quantities.angular_acceleration)) < 1e-13
+
+
+def test_point_springs_pull_both_bodies_together():
+    rng = np.random.default_rng(5)
+    model = random_tree(rng, 2, ("free",), loads=False)
+    model = replace(model, gravity=np.zeros(3)).changed(
+        spring_body=np.array([[0, 1]]), spring_point=np.zeros((1, 2, 3)), spring_stiffness=np.array([5.0]),
+        spring_damping=np.array([0.5]), spring_length=np.array([0.3]),
+    )  # fmt: skip
+    (state,) = random_states(model, 1, 5)
+    truth = certify_state(model, state).quantities
+    d, rate = state.r[1] - state.r[0], state.v[1] - state.v[0]
+    length = np.linalg.norm(d)
+    pull = (5.0 * (length - 0.3) + 0.5 * d @ rate / length) * d / length
+    np.testing.assert_allclose(truth.acceleration, [pull / model.mass[0], -pull / model.mass[1]], rtol=1e-12)
+    assert truth.potential_energy == pytest.approx(2.5 * (length - 0.3) ** 2)
 
 
 def test_a_tree_of_thirty_takes_a_tenth_of_a_second():
