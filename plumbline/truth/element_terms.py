@@ -91,7 +91,7 @@ def joint_elements(model: Model, state: State, bends: list[Array]) -> list[Joint
 
 
 def _motion(model: Model, state: State, body: int) -> tuple[Array, float, float]:
-    """Angular velocity (3,) of a body, world axes, and how far from the origin and how fast its points are."""
+    """Angular velocity (3,) of a body, world axes; distance from the origin and speed of its points."""
     if body < 0:
         return np.zeros(3), 0.0, 0.0
     norm, lever = np.linalg.norm, 2 * float(np.max(np.abs(model.point)))
