@@ -341,9 +341,9 @@ def _product(a: list[Any], b: list[Any]) -> list[Any]:
 
 
 def _magnitude(a: list[Any]) -> Any:
-    """Matrix of upper bounds over s ∈ [0, 1] of the entries' absolute values: Σ |coefficients|."""
-    sums = [sum(map(abs, x), arb(0)).upper() for x in zip(*(m.entries() for m in a), strict=True)]
-    return arb_mat(a[0].nrows(), a[0].ncols(), sums)
+    """Matrix of balls around upper bounds, over s ∈ [0, 1], of the entries' absolute values: Σ |coefficients|."""
+    bounds = [arb_mat(x.nrows(), x.ncols(), [c.abs_upper() for c in x.entries()]) for x in a]
+    return sum(bounds[1:], bounds[0])
 
 
 def _norm(a: Any) -> Any:
