@@ -341,7 +341,7 @@ def _product(a: list[Any], b: list[Any]) -> list[Any]:
 
 
 def _magnitude(a: list[Any]) -> Any:
-    """Matrix of balls around upper bounds, over s ∈ [0, 1], of the entries' absolute values: Σ |coefficients|."""
+    """Balls around upper bounds over s ∈ [0, 1] of the absolute values of the entries: Σ |coefficients|."""
     bounds = [arb_mat(x.nrows(), x.ncols(), [c.abs_upper() for c in x.entries()]) for x in a]
     return sum(bounds[1:], bounds[0])
 
