@@ -15,7 +15,7 @@ export UV_COMPILE_BYTECODE := 1
 export PYTHONDONTWRITEBYTECODE :=
 MUTANTS ?= --sample 300 --seed 1 --jobs 2
 
-.PHONY: help run test nightly bench mutants lint lock clean
+.PHONY: help run test nightly bench mutants importers lint lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' Makefile | sed 's/:.*##/\t/' | expand -t 12
@@ -77,13 +77,30 @@ reports/node_modules/.tried: reports/package-lock.json
 	-cd reports && npm ci --no-audit --no-fund --loglevel=error
 	@mkdir -p $(@D) && touch $@
 
+importers: .importers/.done  ## more importers for `plumbline model` (Drake, DART, PyBullet, Exudyn's), in an environment of their own
+
+.importers/.done: locks/importers.lock | .venv/pyvenv.cfg
+	$(UV) venv --quiet --allow-existing .importers
+	$(UV) pip install --quiet --require-hashes --python .importers/bin/python -r locks/importers.lock
+	@touch $@
+
+# Only the robots' files are wanted: no dependency of these packages is installed, and nothing imports them.
+.corpora/.done: locks/corpora.lock | .venv/pyvenv.cfg
+	$(UV) venv --quiet --allow-existing .corpora
+	UV_COMPILE_BYTECODE=0 $(UV) pip install --quiet --require-hashes --no-deps --python .corpora/bin/python \
+		-r locks/corpora.lock
+	@touch $@
+
 LOCK = $(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes \
-	--no-emit-index-url --no-header --no-annotate pyproject.toml
+	--no-emit-index-url --no-header --no-annotate
 lock: | .venv/pyvenv.cfg  ## resolve the dependencies again (needs the network)
-	$(LOCK) --upgrade -o locks/main.lock
-	$(LOCK) -c locks/main.lock --group truth -o locks/truth.lock
-	$(LOCK) -c locks/truth.lock $(addprefix --group ,test truth browser history cluster bench) -o locks/test.lock
-	$(LOCK) -c locks/test.lock --group mutation -o locks/mutation.lock
+	$(LOCK) pyproject.toml --upgrade -o locks/main.lock
+	$(LOCK) pyproject.toml -c locks/main.lock --group truth -o locks/truth.lock
+	$(LOCK) pyproject.toml -c locks/truth.lock $(addprefix --group ,test truth browser history cluster bench) \
+		-o locks/test.lock
+	$(LOCK) pyproject.toml -c locks/test.lock --group mutation -o locks/mutation.lock
+	$(LOCK) --group importers -c locks/main.lock -o locks/importers.lock
+	$(LOCK) --group corpora --no-deps -o locks/corpora.lock
 
 clean:  ## remove the environment and what runs made
-	rm -rf .venv .uv reports/node_modules reports/out
+	rm -rf .venv .uv .importers .corpora reports/node_modules reports/out

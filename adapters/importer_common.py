@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
 
-from plumbline.importers.neutral_model import ElementaryJoint, JointKind, ModelQuantities
+from plumbline.importers.importer import ModelFile
+from plumbline.importers.neutral_model import (
+    ElementaryJoint,
+    JointKind,
+    ModelQuantities,
+    NeutralBody,
+)
 from plumbline.model.datatypes import Array
-from plumbline.model.kinematics import rotation_matrix
+from plumbline.model.kinematics import quaternion_product, rotation_matrix
 
 MAX_WARNINGS = 20
 _ROTATION_EPSILON = 1e-12  # |ω| of a unit screw below which the motion is a displacement
@@ -149,6 +156,49 @@ def free_joint_name(body: str) -> str:
 
     """
     return f"{body}/free"
+
+
+def merge_made_up_bodies(bodies: Sequence[NeutralBody], file: ModelFile) -> list[NeutralBody]:
+    """Merge massless bodies that an importer made up for the joints of a body of an MJCF file.
+
+    The joints J_i of the upper body, seen from the lower body with pose P in it, are P⁻¹J_iP.
+
+    Args:
+        bodies: of the engine's model; depth first.
+        file: the file; one that is no MJCF changes nothing.
+
+    Returns:
+        The bodies that the file names, and those with mass or with several children.
+
+    """
+    if file.format != "mjcf":
+        return list(bodies)
+    named = {body.get("name", "") for body in ElementTree.parse(file.path).getroot().iter("body")}
+    children = [[k for k, b in enumerate(bodies) if b.parent == i] for i in range(len(bodies))]
+    kept, moved = list(bodies), list(range(len(bodies)))
+    for i, upper in enumerate(bodies):
+        if upper.mass == 0 and upper.name not in named and len(children[i]) == 1:
+            (k,) = children[i]
+            upper, lower = kept[i], kept[k]
+            R, R_upper = rotation_matrix(lower.attitude), rotation_matrix(upper.attitude)
+            joints = tuple(
+                replace(
+                    joint,
+                    axis=R.T @ joint.axis,
+                    anchor=R.T @ (joint.anchor - lower.position) if joint.kind == "hinge" else joint.anchor,
+                )
+                for joint in upper.joints
+            )
+            kept[k] = replace(
+                lower,
+                parent=upper.parent,
+                position=upper.position + R_upper @ lower.position,
+                attitude=quaternion_product(upper.attitude, lower.attitude),
+                joints=joints + lower.joints,
+            )
+            moved[i] = -1
+    places = {i: k for k, i in enumerate(i for i in moved if i >= 0)}
+    return [replace(kept[i], parent=places.get(kept[i].parent, -1)) for i in places]
 
 
 @contextmanager

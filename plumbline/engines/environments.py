@@ -28,7 +28,6 @@ from plumbline.processes.user_cache import user_cache_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 BASE_REQUIREMENTS = ("numpy", "scipy", "packaging")  # imported by adapters and by the core in workers
-OPTIONAL_IMPORTERS = ROOT / ".importers"  # environment that `make importers` makes
 INSTALL_TIMEOUT = 900  # s for uv to fetch and install
 
 
@@ -188,9 +187,10 @@ def importer_interpreter(name: str) -> str:
     if version:
         return ensure_interpreter(name)
     module, _, class_name = IMPORTERS[base].partition(":")
-    if not _read_attribute(module, class_name, "is_optional"):
+    folder = _read_attribute(module, class_name, "environment")
+    if not folder:
         return ""
-    python = _interpreter_path(OPTIONAL_IMPORTERS)
+    python = _interpreter_path(ROOT / folder)
     if not python.exists():
         raise EnvironmentUnavailable(f"{base} is not installed here; `make importers` installs it")
     return str(python)

@@ -22,6 +22,9 @@ ENGINES = {
 IMPORTERS = {
     "mujoco": "adapters.mujoco_importer:MujocoImporter",
     "pinocchio": "adapters.pinocchio_importer:PinocchioImporter",
+    "drake": "adapters.drake_importer:DrakeImporter",
+    "dart": "adapters.dart_importer:DartImporter",
+    "pybullet": "adapters.pybullet_importer:PybulletImporter",
 }
 
 

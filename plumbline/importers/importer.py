@@ -55,7 +55,7 @@ class Importer(ABC):
     supported_versions: ClassVar[str] = ""  # PEP 440 range of versions that the column works with
     # Requirements of environments with another version: (range of versions, additional requirement).
     extra_requirements: ClassVar[tuple[tuple[str, str], ...]] = ()
-    is_optional: ClassVar[bool] = False  # installed by `make importers`, in an environment of its own
+    environment: ClassVar[str] = ""  # folder that `make importers` installs it into; empty: the main one
 
     @abstractmethod
     def version(self) -> str:

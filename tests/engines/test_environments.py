@@ -294,3 +294,11 @@ def test_a_bad_version_is_bad_usage():
         cwd=environments.ROOT, capture_output=True, text=True,
     )  # fmt: skip
     assert done.returncode == 2 and "'three' is not a version" in done.stderr
+
+
+def test_importers_of_the_main_environment_and_of_their_own(monkeypatch, tmp_path):
+    assert environments.importer_interpreter("mujoco") == ""
+    monkeypatch.setattr(environments, "ROOT", tmp_path)
+    monkeypatch.setattr(environments, "_read_attribute", lambda module, name, attribute: ".importers")
+    with pytest.raises(environments.EnvironmentUnavailable, match="make importers"):
+        environments.importer_interpreter("drake")
