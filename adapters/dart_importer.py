@@ -128,7 +128,7 @@ class _Layout:
     """Skeletons with the order of their bodies and joints in the reading."""
 
     def __init__(self, skeletons: list[Any], file: ModelFile) -> None:
-        self.skeletons = skeletons
+        self.skeletons, self.file = skeletons, file
         self.places: list[_Place] = []
         bodies: list[NeutralBody] = []
         for s, skeleton in enumerate(skeletons):
@@ -162,7 +162,7 @@ class _Layout:
         if kind == "WeldJoint":
             return ()
         if kind == "FreeJoint" and node.getParentBodyNode() is None:
-            return (make_joint(free_joint_name(node.getName()), "free"),)
+            return (make_joint(free_joint_name(node.getName(), self.file), "free"),)
         if kind == "BallJoint":
             joints: tuple[ElementaryJoint, ...] = (make_joint(name, "ball", anchor=T_C[:3, 3]),)
         elif kind == "RevoluteJoint":

@@ -131,7 +131,7 @@ class _Layout:
     """A plant with the order of its bodies and joints in the reading."""
 
     def __init__(self, plant: Any, file: ModelFile) -> None:
-        self.plant, self.context = plant, plant.CreateDefaultContext()
+        self.plant, self.context, self.file = plant, plant.CreateDefaultContext(), file
         joints = [plant.get_joint(j) for j in plant.GetJointIndices()]
         self.parent_joint = {joint.child_body().index(): joint for joint in joints}
         self.rotor_inertia: dict[str, float] = {}
@@ -186,7 +186,7 @@ class _Layout:
         elif kind == "ball_rpy":
             found = make_joint(joint.name(), "ball", anchor=anchor)
         elif kind == "quaternion_floating" and joint.parent_body() is self.plant.world_body():
-            found = make_joint(free_joint_name(body.name()), "free")
+            found = make_joint(free_joint_name(body.name(), self.file), "free")
         else:
             raise NotImplementedError(f"a joint of type {kind}")
         armature = self.rotor_inertia.get(joint.name(), 0.0)

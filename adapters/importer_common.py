@@ -145,17 +145,36 @@ def quaternion_of(rotation: Array) -> Array:
     return np.asarray(-q if q[0] < 0 else q)
 
 
-def free_joint_name(body: str) -> str:
-    """Return the name of a body's free joint.
+def free_joint_name(body: str, file: ModelFile) -> str:
+    """Return the name of a body's free joint, which most engines do not keep.
 
     Args:
         body: name of the body.
+        file: the file that says it, if it is an MJCF.
 
     Returns:
-        The name that both the file's and the engine's descriptions use.
+        The name that the file's description uses.
 
     """
-    return f"{body}/free"
+    own = joint_names(file).get(body, []) if file.format == "mjcf" else []
+    return own[0] if len(own) == 1 else f"{body}/free"
+
+
+def joint_names(file: ModelFile) -> dict[str, list[str]]:
+    """Read the names of the joints of each body of an MJCF file.
+
+    Args:
+        file: an MJCF file.
+
+    Returns:
+        Names of the joints, in their order, by the body's name.
+
+    """
+    root = ElementTree.parse(file.path).getroot()
+    return {
+        body.get("name", ""): [joint.get("name", "") for joint in body if joint.tag in ("joint", "freejoint")]
+        for body in root.iter("body")
+    }
 
 
 def merge_made_up_bodies(bodies: Sequence[NeutralBody], file: ModelFile) -> list[NeutralBody]:
@@ -173,7 +192,7 @@ def merge_made_up_bodies(bodies: Sequence[NeutralBody], file: ModelFile) -> list
     """
     if file.format != "mjcf":
         return list(bodies)
-    named = {body.get("name", "") for body in ElementTree.parse(file.path).getroot().iter("body")}
+    named = joint_names(file)
     children = [[k for k, b in enumerate(bodies) if b.parent == i] for i in range(len(bodies))]
     kept, moved = list(bodies), list(range(len(bodies)))
     for i, upper in enumerate(bodies):

@@ -107,7 +107,7 @@ def _compiled(file: ModelFile) -> Any:
     root = spec.worldbody.first_body()
     if root is not None:
         joint = root.add_joint()
-        joint.type, joint.name = mujoco.mjtJoint.mjJNT_FREE, free_joint_name(root.name)
+        joint.type, joint.name = mujoco.mjtJoint.mjJNT_FREE, free_joint_name(root.name, file)
     return spec.compile()
 
 
@@ -145,7 +145,7 @@ def _joint(m: Any, j: int, body: str) -> ElementaryJoint:
     kind, dof, q = KINDS[int(m.jnt_type[j])], m.jnt_dofadr[j], m.jnt_qposadr[j]
     is_scalar = kind in ("hinge", "slide")
     return ElementaryJoint(
-        name=m.joint(j).name or (free_joint_name(body) if kind == "free" else f"{body}/joint{j}"),
+        name=m.joint(j).name or (f"{body}/free" if kind == "free" else f"{body}/joint{j}"),
         kind=kind,
         axis=np.array(m.jnt_axis[j]) if is_scalar else np.zeros(3),
         anchor=np.array(m.jnt_pos[j]) if kind in ("hinge", "ball") else np.zeros(3),

@@ -15,7 +15,6 @@ Damping is in the model, and no routine of Pinocchio applies it; `aba` is called
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
@@ -27,6 +26,7 @@ from adapters.importer_common import (
     captured_output,
     free_joint_name,
     joint_from_screw,
+    joint_names,
     make_joint,
     pose,
     pose_of_coordinates,
@@ -140,8 +140,8 @@ class _Layout:
         self.q_neutral = pin.neutral(model)
         pin.computeJointJacobians(model, self.data, self.q_neutral)
         self.body_frames = [f for f in model.frames if f.type == pin.FrameType.BODY]
-        self.is_mjcf = file.format == "mjcf"
-        names = _joint_names(file) if self.is_mjcf else {}
+        self.file = file
+        names = joint_names(file) if file.format == "mjcf" else {}
         self.places: list[_Place] = []
         x = rate = 0
         for j in range(1, model.njoints):  # Pinocchio's order is depth first
@@ -189,8 +189,9 @@ class _Layout:
         zero = above * m.jointPlacements[j] * P
         kind = self._kind(j)
         if kind == "free":
-            name = m.names[j] if self.is_mjcf else free_joint_name(frame.name)  # a URDF does not name it
-            joints: tuple[ElementaryJoint, ...] = (make_joint(name, "free"),)
+            joints: tuple[ElementaryJoint, ...] = (
+                make_joint(free_joint_name(frame.name, self.file), "free"),
+            )
         elif kind == "ball":
             joints = (make_joint(m.names[j], "ball", anchor=P.inverse().translation),)
         else:
@@ -277,12 +278,3 @@ class _Layout:
 
 def _scalar_last(rotation: Array) -> Array:
     return np.roll(quaternion_of(rotation), -1)
-
-
-def _joint_names(file: ModelFile) -> dict[str, list[str]]:
-    """Names of the joints of each named body of an MJCF file."""
-    root = ElementTree.parse(file.path).getroot()
-    return {
-        body.get("name", ""): [joint.get("name", "") for joint in body if joint.tag in ("joint", "freejoint")]
-        for body in root.iter("body")
-    }

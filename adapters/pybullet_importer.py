@@ -147,7 +147,7 @@ class _Layout:
     """Multibodies with the order of their links and joints in the reading."""
 
     def __init__(self, ids: Sequence[int], file: ModelFile) -> None:
-        self.ids = ids
+        self.ids, self.file = ids, file
         self.places: list[_Place] = []
         self.links: list[tuple[int, int, str]] = []
         bodies: list[NeutralBody] = []
@@ -166,7 +166,7 @@ class _Layout:
         if link == BASE:
             name, parent, zero = bullet.getBodyInfo(body)[0].decode(), -1, _link_pose(body, BASE)
             if mass > 0:  # a fixed base has no mass in Bullet
-                joints = (make_joint(free_joint_name(name), "free"),)
+                joints = (make_joint(free_joint_name(name, self.file), "free"),)
         else:
             name, parent = infos[link][12].decode(), index[infos[link][16]]
             zero = np.linalg.inv(_link_pose(body, infos[link][16])) @ _link_pose(body, link)
