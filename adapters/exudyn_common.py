@@ -94,6 +94,26 @@ def add_loads(mbs: Any, model: Model, k: int, marker: Any, ground: Any, moment: 
         )
 
 
+def add_point_spring(mbs: Any, model: Model, i: int, markers: list[Any]) -> None:
+    """Add a spring and damper between two points.
+
+    Args:
+        mbs: the system under construction.
+        model: the mechanism.
+        i: the spring.
+        markers: markers at its points.
+
+    """
+    mbs.AddObject(
+        items.ObjectConnectorSpringDamper(
+            markerNumbers=markers,
+            referenceLength=float(model.spring_length[i]),
+            stiffness=float(model.spring_stiffness[i]),
+            damping=float(model.spring_damping[i]),
+        )
+    )
+
+
 @contextlib.contextmanager
 def initialized_solver(solver: Any, mbs: Any, settings: Any) -> Iterator[None]:
     """Initialise a solver for a single evaluation, and finalise it at the end.

@@ -9,6 +9,10 @@ reference; the reference is the initial state itself, so that the displacements 
 The rod's constraint is ‖d‖ - ℓ, so its multiplier is the tension (2ℓ times the notes' λ); reactions are
 read as -C_rᵀ λ, whatever the constraint's scale and sign.
 
+Springs, dampers and efforts of a joint are torsional and linear spring-dampers between its markers: turned so
+that the axis is the connector's z (turns) or given (slides); of a universal joint's second axis, fixed in the
+near body, the markers are exchanged and the angle is −φ.  Their forces are not in −C_qᵀλ and are added to it.
+
 Welded halves are nodes of their own with a rigid joint between: the body hangs by its first half, the next
 body on its last, and outputs of the body are read at the point on its first half where its centre is.
 """
@@ -28,6 +32,7 @@ from adapters.exudyn_common import (
     ExudynAdapter,
     Output,
     add_loads,
+    add_point_spring,
     initialized_solver,
     items,
     kinetic_energy,
@@ -39,9 +44,21 @@ from adapters.exudyn_common import (
     set_linear_solver,
     silence_engine,
 )
-from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, StepRun, Trajectory
+from plumbline.model.datatypes import (
+    KINDS,
+    Array,
+    Integrator,
+    Model,
+    State,
+    StateQuantities,
+    StepRun,
+    Trajectory,
+    Unsupported,
+)
 from plumbline.model.kinematics import (
+    JointFrame,
     angular_velocity,
+    elastic_energy,
     quaternion_rate,
     rotation_matrix,
     velocity_jacobian,
@@ -57,6 +74,7 @@ CONSTRAINED_AXES = {
     "cylindrical": [1, 1, 0, 1, 1, 0],
     "weld": [1, 1, 1, 1, 1, 1],
 }
+SECOND_AXIS = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # columns x, −z, y of the joint's axes
 SPECTRAL_RADIUS = 0.9
 STEP_TOLERANCES = {"solver_atol": NEWTON_TOLERANCE, "solver_rtol": NEWTON_TOLERANCE}
 
@@ -83,6 +101,9 @@ class ExudynChain:
         self.last_piece: list[int] = []
         self.body_of_piece: list[int] = []
         self.piece_centre = [part.centre for pieces in parts for part in pieces]
+        # spring-dampers of joints: joint, connector, whether it pushes, and the axis in the world along which
+        # the body below gets the opposite of the connector's force
+        self.connectors: list[tuple[int, Any, bool, Array]] = []
         self.jacobian_rate = np.zeros((0, 0))  # d_t(C_q), where joints need it
         self.qdot = np.empty((len(self.piece_centre), 7))
         attitude, pdot = rotation_matrix(state.p), quaternion_rate(state.p, state.omega)
@@ -97,6 +118,10 @@ class ExudynChain:
                 middle = [self._add_marker(piece, np.zeros(3)) for piece in (first, last)]
                 self.welds.append(mbs.AddObject(items.ObjectJointGeneric(markerNumbers=middle)))
             add_loads(mbs, model, k, self._add_marker(first, np.zeros(3)), pivot, model.moment[k])
+        for i, (bodies, points) in enumerate(zip(model.spring_body, model.spring_point, strict=True)):
+            add_point_spring(
+                mbs, model, i, [self._end_marker(*end) for end in zip(bodies, points, strict=True)]
+            )
         mbs.Assemble()
 
     def _add_piece(self, k: int, part: RigidPart, attitude: Array, pdot: Array) -> None:
@@ -115,12 +140,10 @@ class ExudynChain:
 
     def _add_joint(self, k: int) -> None:
         model, kind, far = self.model, self.model.kind[k], self.model.body[k, 0]
-        if far >= 0:
-            hang = self._add_marker(self.last_piece[far], model.point[k, 0])
-        else:
-            at = model.point[k, 0].tolist()
-            hang = self.mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=self.ground, localPosition=at))
-        ends = [hang, self._add_marker(self.first_piece[k], model.proximal[k])]
+        ends = [
+            self._end_marker(far, model.point[k, 0]),
+            self._add_marker(self.first_piece[k], model.proximal[k]),
+        ]
         if kind == "free":
             self.joints.append(None)
             return
@@ -137,6 +160,41 @@ class ExudynChain:
                 rotationMarker1=turns[1],
             )
         self.joints.append(self.mbs.AddObject(joint))
+        self._add_joint_elements(k, ends)
+
+    def _add_joint_elements(self, k: int, ends: list[Any]) -> None:
+        """Add spring-dampers for the coordinates of joint k that have springs, dampers or efforts."""
+        model, far = self.model, self.model.body[k, 0]
+        above = rotation_matrix(self.state.p[far]) if far >= 0 else np.eye(3)
+        axes = JointFrame(model, k, above).axes(self.state.x[k])
+        for i, ((what, number), (_, axis)) in enumerate(zip(KINDS[model.kind[k]].motions, axes, strict=True)):
+            stiffness, damping, effort = (x[k, i] for x in (model.stiffness, model.damping, model.effort))
+            if not (stiffness or damping or effort):
+                continue
+            coefficients = {"stiffness": float(stiffness), "damping": float(damping)}
+            turns = rotation_matrix(model.turn[k])
+            sign = -1 if what == "turn" and i and number == 1 else 1  # a universal joint's second axis
+            if what == "slide":
+                connector = items.ObjectConnectorLinearSpringDamper(
+                    markerNumbers=ends, axisMarker0=turns[0][:, number], offset=float(model.rest[k, i]),
+                    force=float(-effort), **coefficients,
+                )  # fmt: skip
+            else:
+                # the connector's angle is a principal value
+                whole = 2 * np.pi * np.round(self.state.x[k, i] / (2 * np.pi))
+                local = np.roll(np.eye(3), -number - 1, axis=1) if sign > 0 else SECOND_AXIS
+                connector = items.ObjectConnectorTorsionalSpringDamper(
+                    markerNumbers=ends[::sign], rotationMarker0=turns[::sign][0] @ local,
+                    rotationMarker1=turns[::sign][1] @ local, offset=float(sign * (model.rest[k, i] - whole)),
+                    torque=float(-sign * effort), **coefficients,
+                )  # fmt: skip
+            self.connectors.append((k, self.mbs.AddObject(connector), what == "slide", sign * axis))
+
+    def _end_marker(self, body: int, point: Array) -> Any:
+        """Add a marker at a point of a body on which others hang, or of the world."""
+        if body >= 0:
+            return self._add_marker(self.last_piece[body], point)
+        return self.mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=self.ground, localPosition=point.tolist()))
 
     def joint_rows(self, k: int) -> list[int]:
         """List the rows of joint k that hold something; a generic joint has a row λ = 0 per free axis.
@@ -250,11 +308,21 @@ class Exudyn(ExudynAdapter):
     )
     usual_linear_solver = "EigenSparse"
     linear_solvers = ("EXUdense", "EigenDense")
-    builds_trees = True
+    builds_trees = builds_elements = True
     welding_unsupported_reason = ""
     is_single_step: bool = False  # full Newton iterations to `STEP_TOLERANCES`; multipliers are sampled too
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
+        balls = [k for k, kind in enumerate(model.kind) if kind == "ball"]
+        if np.any(model.armature):
+            raise Unsupported("Exudyn has no rotor between two bodies in maximal coordinates")
+        if np.any(model.stiffness[balls]) or np.any(model.damping[balls]):
+            raise Unsupported("Exudyn has no spring along the rotation vector of a ball joint")
+        if np.any(model.stiffness[[k for k, kind in enumerate(model.kind) if kind == "universal"]]):
+            raise Unsupported(
+                "the angle of Exudyn's torsional spring, atan2(-A01, A00) of the relative turn A, is that "
+                "of a joint with one turn, not of a universal joint"
+            )
         with silence_engine():
             return [_evaluate_state(ExudynChain(model, at, self.body_pieces(model))) for at in states]
 
@@ -366,6 +434,7 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
         -C[rows, 7 * i + 3 : 7 * i + 7].T @ multiplier[rows]
         for i, rows in zip(chain.first_piece, joint_rows, strict=True)
     ]
+    elements = _element_wrenches(chain)
     momentum = (M @ chain.qdot.ravel()).reshape(n, 7)  # 4LᵀJLṗ = 2LᵀJω′, and L Lᵀ = I gives Jω′ = ½ L (…)
     p = chain.state.p[chain.body_of_piece]
     spin = angular_velocity(p, momentum[:, 3:]) / 4  # angular_velocity is 2 L(p) (…)
@@ -376,15 +445,28 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
     return StateQuantities(
         acceleration=chain.body_outputs(Output.Acceleration),
         angular_acceleration=chain.body_outputs(Output.AngularAccelerationLocal),
-        joint_reaction=np.array(reaction),
-        joint_moment=None if chain.model.is_chain else _joint_moments(chain, reaction, turning),
+        joint_reaction=np.array(reaction) + elements[:, :3],
+        joint_moment=None
+        if chain.model.is_chain
+        else _joint_moments(chain, reaction, turning) + elements[:, 3:],
         kinetic_energy=kinetic,
-        potential_energy=float(-np.sum(weight * r)),  # its own PotentialEnergy is always 0
+        # its own PotentialEnergy is always 0, and springs have none
+        potential_energy=elastic_energy(chain.model, chain.state) - float(np.sum(weight * r)),
         angular_momentum=np.sum(np.cross(r, momentum[:, :3]), 0)
         + np.einsum("kij,kj->i", rotation_matrix(p), spin),
         # Of welded pieces the engine has no mass matrix on ν.
         mass_matrix=None if rates is None else rates.T @ M @ rates,
     )
+
+
+def _element_wrenches(chain: ExudynChain) -> Array:
+    """Return what spring-dampers do to the bodies below their joints: force and moment (N, 6), world axes."""
+    total = np.zeros((chain.model.n, 6))
+    for k, connector, pushes, axis in chain.connectors:
+        output = Output.ForceLocal if pushes else Output.TorqueLocal
+        own = slice(3) if pushes else slice(3, 6)
+        total[k, own] -= chain.mbs.GetObjectOutput(connector, output) * axis
+    return total
 
 
 def _joint_moments(chain: ExudynChain, force: list[Array], of_p: list[Array]) -> Array:

@@ -9,6 +9,9 @@
            massless; a welded body is merged into its far body's link; a free body is attached to three slides
            along the world's axes and a ball.  Of such trees the angular momentum is not in the momenta M q̇
 
+    rotors, springs, dampers, efforts: an ObjectGenericODE2 on the coordinates of their joints; a ball joint's
+           would be functions of its three angles, and are not built
+
 Axes are chosen by the initial state: all angles start at 0, and the first axis is that of the initial
 relative rotation, along which the first angle may turn without limit.  Frames and offsets: at the start,
 with E the link's axes in the world as columns and B = Aᵀ E the same in the body's frame,
@@ -35,6 +38,7 @@ from adapters.exudyn_common import (
     ExudynAdapter,
     Output,
     add_loads,
+    add_point_spring,
     initialized_solver,
     items,
     make_settings,
@@ -58,6 +62,7 @@ from plumbline.model.datatypes import (
 )
 from plumbline.model.kinematics import (
     JointFrame,
+    elastic_energy,
     minimal_rates,
     own_rates,
     quaternion_conjugate,
@@ -119,6 +124,7 @@ class _Linkage:
         self.body_axes: list[Array] = []
         self.origins: list[Array] = []
         self.W = np.zeros((0, len(self.nu)))
+        self.motions: list[tuple[int, int, int]] = []  # link, joint and its coordinate
         self.link_axes: list[Array] = []  # as `_axes` and `_spin`, at each body
         self.link_spins: list[Array] = []
         self._body_spins = self.attitude @ velocity_jacobian(model, state).reshape(model.n, 6, -1)[:, 3:]
@@ -193,6 +199,7 @@ class _Linkage:
         for i, (what, axis) in enumerate(joint.motions):
             name = ("Revolute" if what == "turn" else "Prismatic") + "XYZ"[axis]
             self._add_link(name, axes, own.start + i)
+            self.motions.append((self._last, k, i))
         self._finish_body(k, A.T @ axes, self.model.proximal[k])
 
     def _add_link(self, joint: str, axes: Array, rate: int) -> None:
@@ -254,19 +261,57 @@ class _KinematicTree:
         self.initial_angle_rates = self.linkage.W @ self.linkage.nu
         self.mbs, self.container = make_system()
         self.tree = self._add_tree(self.linkage.links)
+        self._add_joint_elements()
         self.body_axes_of_links = np.array(self.linkage.body_axes)  # (N, 3, 3) B
         self.sensors: dict[Any, list[Any]] = {output: [] for output in SENSOR_OUTPUTS}
         ground = self.mbs.AddObject(items.ObjectGround())
         pivot = self.mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=ground))
         for k in range(model.n):
             self._add_loads_and_sensors(k, pivot)
+        for i, (bodies, points) in enumerate(zip(model.spring_body, model.spring_point, strict=True)):
+            ends = [self._point_marker(ground, int(b), at) for b, at in zip(bodies, points, strict=True)]
+            add_point_spring(self.mbs, model, i, ends)
         self.mbs.Assemble()
+
+    def _point_marker(self, ground: Any, body: int, point: Array) -> Any:
+        """Add a marker at a point of a body, or of the world."""
+        if body < 0:
+            return self.mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=ground, localPosition=point.tolist()))
+        local = self.body_axes_of_links[body].T @ (point - self.linkage.origins[body])
+        return self.mbs.AddMarker(
+            items.MarkerKinematicTreeRigid(
+                objectNumber=self.tree,
+                linkNumber=self.linkage.link_of_body[body],
+                localPosition=local.tolist(),
+            )
+        )
+
+    def _add_joint_elements(self) -> None:
+        """Add rotors, dampers, springs and efforts, on coordinates that are x less the state's x."""
+        model, count = self.model, len(self.linkage.links)
+        a, c, k, force = np.zeros((4, count))
+        for link, joint, i in self.linkage.motions:
+            a[link], c[link], k[link] = (
+                x[joint, i] for x in (model.armature, model.damping, model.stiffness)
+            )
+            force[link] = model.effort[joint, i] + k[link] * (model.rest[joint, i] - self.state.x[joint, i])
+        if not (np.any(a) or np.any(c) or np.any(k) or np.any(force)):
+            return
+        self.mbs.AddObject(
+            items.ObjectGenericODE2(
+                nodeNumbers=[self.node],
+                massMatrix=np.diag(a),
+                dampingMatrix=np.diag(c),
+                stiffnessMatrix=np.diag(k),
+                forceVector=force,
+            )
+        )
 
     def _add_tree(self, links: list[_Link]) -> Any:
         zeros = [0.0] * len(links)
         matrices: Any = exudyn.Matrix3DList
         vectors: Any = exudyn.Vector3DList
-        node = self.mbs.AddNode(
+        node = self.node = self.mbs.AddNode(
             items.NodeGenericODE2(
                 referenceCoordinates=zeros,
                 initialCoordinates=zeros,
@@ -386,7 +431,7 @@ class ExudynTree(ExudynAdapter):
     unsupported: ClassVar[Mapping[str, str]] = {
         "joint_reaction": "minimal coordinates have no forces at the joints"
     }
-    builds_trees = True
+    builds_trees = builds_elements = True
     usual_linear_solver = "EXUdense"
     linear_solvers = ("EigenSparse",)
     welding_unsupported_reason = (
@@ -394,6 +439,12 @@ class ExudynTree(ExudynAdapter):
     )
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
+        balls = [k for k, kind in enumerate(model.kind) if kind == "ball"]
+        if any(np.any(x[balls]) for x in (model.armature, model.damping, model.stiffness)):
+            raise Unsupported(
+                "a ball joint of Exudyn's kinematic tree is three revolutes, whose angles are not the "
+                "rotation vector that springs, dampers and rotors of ball joints act on"
+            )
         with silence_engine():
             return [_evaluate_state(_KinematicTree(model, state)) for state in states]
 
@@ -445,7 +496,8 @@ def _evaluate_state(tree: _KinematicTree) -> StateQuantities:
         acceleration=tree.read_sensors(Output.Acceleration),
         angular_acceleration=tree.read_sensors(Output.AngularAccelerationLocal),
         kinetic_energy=float(0.5 * tree.initial_angle_rates @ momentum),
-        potential_energy=float(-masses @ (tree.read_sensors(Output.Position) @ gravity)),
+        potential_energy=elastic_energy(tree.model, tree.state)  # springs have no output of it
+        - float(masses @ (tree.read_sensors(Output.Position) @ gravity)),
         angular_momentum=_angular_momentum(tree, momentum) if tree.model.is_chain else None,
         mass_matrix=W.T @ M @ W,
     )

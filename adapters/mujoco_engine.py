@@ -25,6 +25,9 @@ are actuators on a site at the centre of mass, a constant and a velocity bias al
 force and the moments that acted are declared as applied ones too; its moments are about the centre of mass of
 the tree that is attached to the world, and are shifted to the near point.
 
+Rotors are the engine's armature, springs and dampers its own, a ball's spring unloaded at qpos q_a conj(q_b);
+efforts are `qfrc_applied`.  A spring between points is a spatial tendon over two sites.
+
 Welded halves are bodies without a joint on a massless one in their body's place.  The option "dense mass
 matrix" finds the accelerations by a dense solve with `mj_fullM`.  MuJoCo's solvers (PGS, CG, Newton) and
 Jacobians (dense, sparse) concern active constraints: here there are none, and the answers are the same bit
@@ -104,7 +107,7 @@ class Mujoco(MetamorphicHooks):
         ),
     )
     options = ("dense mass matrix",)
-    builds_trees = True
+    builds_trees = builds_elements = True
     welding_unsupported_reason = ""
 
     def version(self) -> str:
@@ -164,12 +167,15 @@ class _MujocoChain:
             pieces = (parts or undivided_bodies(model))[k]
             links.append(self._add_link(parent, k, hang, pieces))
             _add_load_actuators(spec, links[k], k, model)
+        _add_tendons(spec, links, model)
         m = self.m = spec.compile()
         m.opt.gravity = model.gravity
         m.opt.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT | _autoreset_flag()
         # After compiling: the compiler refuses massless bodies, and cannot adjust what it does not see.
         m.body_mass[:] = self.mass
         m.body_inertia[:] = self.inertia
+        self.effort = np.zeros(m.nv)
+        self._set_elements()
         d = self.d = mujoco.MjData(m)
         mujoco.mj_setConst(m, d)
         self.applied_wrenches = np.zeros((m.nbody, 6))
@@ -221,6 +227,21 @@ class _MujocoChain:
         self.inertia.append(inertia)
         return body
 
+    def _set_elements(self) -> None:
+        """Set rotors, dampers, springs and efforts of the joints, and the springs between points."""
+        m, model = self.m, self.model
+        for k, (kind, b) in enumerate(zip(model.kind, self.link_ids, strict=True)):
+            motions = KINDS[kind].motions
+            for i in range(1 if kind == "ball" else len(motions)):
+                joint = m.body_jntadr[b] + i
+                dofs = m.jnt_dofadr[joint] + np.arange(3 if kind == "ball" else 1)
+                rest = kinematics.ball_spring_rest(model, k) if kind == "ball" else model.rest[k, i : i + 1]
+                m.dof_armature[dofs], m.dof_damping[dofs] = model.armature[k, i], model.damping[k, i]
+                m.jnt_stiffness[joint], self.effort[dofs] = model.stiffness[k, i], model.effort[k, i]
+                m.qpos_spring[m.jnt_qposadr[joint] + np.arange(len(rest))] = rest
+        m.tendon_stiffness[:], m.tendon_damping[:] = model.spring_stiffness, model.spring_damping
+        m.tendon_lengthspring[:] = model.spring_length[:, None]
+
     def body_frames(self, state: State) -> tuple[Array, Array]:
         """Return the quaternions (nbody, 4) of all bodies and E (nbody, 3, nu): their ω = E ν, own frames."""
         rods = np.flatnonzero(self.model.rods)
@@ -258,7 +279,7 @@ class _MujocoChain:
             x = np.concatenate([state.r[k], state.p[k]]) if kind == "free" else state.x[k, :count]
             d.qpos[at : at + len(x)] = x
         d.qvel = T @ kinematics.minimal_rates(self.model, state)
-        d.xfrc_applied = self.applied_wrenches
+        d.xfrc_applied, d.qfrc_applied = self.applied_wrenches, self.effort
         return np.asarray(T)
 
     def quantities(self, state: State) -> StateQuantities:
@@ -332,6 +353,16 @@ def _add_load_actuators(spec: Any, body: Any, k: int, model: Model) -> None:
                 biastype=mujoco.mjtBias.mjBIAS_AFFINE,
                 biasprm=[bias, 0, rate, 0, 0, 0, 0, 0, 0, 0],
             )
+
+
+def _add_tendons(spec: Any, links: list[Any], model: Model) -> None:
+    """Add a tendon between two sites for every spring between points."""
+    for i, (bodies, points) in enumerate(zip(model.spring_body, model.spring_point, strict=True)):
+        tendon = _set_attributes(spec.add_tendon(), name=f"spring{i}")
+        for side, (body, point) in enumerate(zip(bodies, points, strict=True)):
+            owner = links[body] if body >= 0 else spec.worldbody
+            _set_attributes(owner.add_site(), name=f"end{i}{'ab'[side]}", pos=point)
+            tendon.wrap_site(f"end{i}{'ab'[side]}")
 
 
 def _principal_inertia(J: Array) -> tuple[Array, Array]:

@@ -110,7 +110,9 @@ def point_acceleration(pin_model: pin.Model, data: pin.Data, frame: int) -> Arra
     return np.asarray(pin.getFrameClassicalAcceleration(pin_model, data, frame, WORLD_ALIGNED).linear)
 
 
-def energies_and_momentum(pin_model: pin.Model, data: pin.Data, q: Array, v: Array) -> dict[str, Any]:
+def energies_and_momentum(
+    pin_model: pin.Model, data: pin.Data, q: Array, v: Array, elastic: float = 0.0
+) -> dict[str, Any]:
     """Evaluate the quantities of the whole mechanism.
 
     Args:
@@ -118,6 +120,7 @@ def energies_and_momentum(pin_model: pin.Model, data: pin.Data, q: Array, v: Arr
         data: the workspace made for it.
         q: configuration, in Pinocchio's convention.
         v: velocity, in Pinocchio's convention.
+        elastic: potential energy of springs [J], which the engine has none of.
 
     Returns:
         ``kinetic_energy`` and ``potential_energy`` [J] and ``angular_momentum`` (3,) [kg m²/s] about the
@@ -129,7 +132,7 @@ def energies_and_momentum(pin_model: pin.Model, data: pin.Data, q: Array, v: Arr
     momentum = pin.computeCentroidalMomentum(pin_model, data, q, v)
     return {
         "kinetic_energy": float(kinetic),
-        "potential_energy": float(potential),
+        "potential_energy": float(potential) + elastic,
         "angular_momentum": momentum.angular + np.cross(data.com[0], momentum.linear),
     }
 

@@ -20,6 +20,9 @@ Applied loads enter as `fext`, force and moment on the joint's body, in and abou
 
     f = Rᵀ (F - c_t ṙ),        n = n′ - c_r ω′ + c × f.
 
+Rotors are the engine's armature.  Springs, dampers and efforts of joints enter as torques τ(q, v) of the
+joints, springs between points as `fext`; their energy is not the engine's and is added.
+
 Accelerations come from `crba` with a dense solve in state evaluation and in dop853, from `aba` in the two
 fixed-step integrators (which are `plumbline.engines.integrators`: Pinocchio has none).  The two agree on
 short chains.  On long ones `aba` (4.1.0) loses digits that the problem does not cost, because the
@@ -50,11 +53,14 @@ from adapters.pinocchio_common import (
 from plumbline.engines.integrators import dop853, rkmk4, sample_steps, semi_implicit_euler
 from plumbline.model.datatypes import KINDS, Array, Integrator, Model, State, StateQuantities, Trajectory
 from plumbline.model.kinematics import (
+    ball_spring_rest,
+    elastic_energy,
     own_rates,
     quaternion_conjugate,
     quaternion_product,
     quaternion_rate,
     rotation_matrix,
+    rotation_vector,
     velocity_jacobian,
 )
 from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
@@ -113,6 +119,14 @@ class PinocchioChain:
         self.parent_rows = [int(parent) - 1 for parent in self.pin_model.parents][1:]
         self.joints = list(self.pin_model.joints)[1:]
         self.zero_torque = np.zeros(self.pin_model.nv)
+        self.moving = [
+            (k, self.joints[row])
+            for k, row in enumerate(self.body_rows)
+            if model.kind[k] == "ball" or KINDS[model.kind[k]].motions
+        ]  # joints that can have elements
+        for k, joint in self.moving:
+            own = slice(1 if model.kind[k] == "ball" else joint.nv)
+            self.pin_model.armature[joint.idx_v : joint.idx_v + joint.nv] = model.armature[k, own]
         self._init_loads()
 
     def _add_joint(self, parent: int, joint: Any, placement: pin.SE3, name: str) -> int:
@@ -146,6 +160,7 @@ class PinocchioChain:
             for place, n in zip(self.placements, model.moment, strict=True)
         ]
         varying = np.any(model.force != 0, axis=1) | (model.drag_force != 0) | (model.drag_moment != 0)
+        varying[model.spring_body[model.spring_body >= 0]] = True
         self.bodies_with_varying_loads = [int(k) for k in np.flatnonzero(varying)]
         self._add_up_loads()
 
@@ -230,7 +245,58 @@ class PinocchioChain:
             force = force - model.drag_force[k] * motion.linear
             moment = model.moment[k] - model.drag_moment[k] * motion.angular
             self.loads[k] = centre.act(pin.Force(force, moment))
+        for i in range(len(model.spring_body)):
+            self._add_spring(i)
         self._add_up_loads()
+
+    def _add_spring(self, i: int) -> None:
+        """Add to the loads what a spring between points does to its bodies."""
+        model = self.source_model
+        ends, velocities = model.spring_point[i].copy(), np.zeros((2, 3))
+        bodies = [(side, int(b)) for side, b in enumerate(model.spring_body[i]) if b >= 0]
+        for side, b in bodies:
+            joint, place = self.body_joints[b], self.placements[b]
+            pose, motion = self.data.oMi[joint] * place, place.actInv(self.data.v[joint])
+            velocities[side] = pose.rotation @ (motion.linear + np.cross(motion.angular, ends[side]))
+            ends[side] = pose.act(ends[side])
+        d, rate = ends[1] - ends[0], velocities[1] - velocities[0]
+        length = np.linalg.norm(d)
+        tension = model.spring_stiffness[i] * (length - model.spring_length[i])
+        tension += model.spring_damping[i] * (d @ rate) / length
+        for side, b in bodies:
+            place, sign = self.placements[b], 1 - 2 * side
+            turn = (self.data.oMi[self.body_joints[b]] * place).rotation
+            force = turn.T @ d * (sign * tension / length)
+            moment = np.cross(model.spring_point[i, side], force)
+            self.loads[b] = self.loads[b] + place.act(pin.Force(force, moment))
+
+    def joint_torque(self, q: Array, v: Array) -> Array:
+        """Evaluate springs, dampers and efforts of the joints.
+
+        Args:
+            q: configuration (nq,).
+            v: velocity (nv,).
+
+        Returns:
+            τ (nv,).
+
+        """
+        model, torque = self.source_model, self.zero_torque
+        if not model.has_joint_elements:
+            return torque
+        torque = torque.copy()
+        for k, joint in self.moving:
+            at, own = slice(joint.idx_v, joint.idx_v + joint.nv), slice(joint.nv)
+            if model.kind[k] == "ball":
+                turn, own = np.roll(q[joint.idx_q : joint.idx_q + 4], 1), slice(1)
+                rest = quaternion_conjugate(ball_spring_rest(model, k))
+                stretch = rotation_vector(quaternion_product(rest, turn))  # body axes, as v
+            else:
+                stretch = q[joint.idx_q : joint.idx_q + joint.nv] - model.rest[k, own]
+            torque[at] = (
+                model.effort[k, own] - model.stiffness[k, own] * stretch - model.damping[k, own] * v[at]
+            )
+        return torque
 
     def acceleration(self, q: Array, v: Array) -> Array:
         """Evaluate the accelerations under gravity and loads, by the chosen algorithm.
@@ -244,9 +310,10 @@ class PinocchioChain:
 
         """
         self.update_loads(q, v)
+        torque = self.joint_torque(q, v)
         if self.algorithm in ("crba", "cholesky", "forwardDynamics"):
             engine, data = self.pin_model, self.data
-            bias = pin.rnea(engine, data, q, v, self.zero_torque, self.fext)
+            bias = pin.rnea(engine, data, q, v, self.zero_torque, self.fext) - torque
             if self.algorithm == "forwardDynamics":  # it counts the velocity terms and gravity itself
                 force, no_rows = pin.nonLinearEffects(engine, data, q, v) - bias, np.zeros((0, engine.nv))
                 return np.asarray(pin.forwardDynamics(engine, data, q, v, force, no_rows, np.zeros(0), 0.0))
@@ -256,7 +323,7 @@ class PinocchioChain:
             pin.cholesky.decompose(engine, data)  # along the tree's branches: sparse
             return np.ravel(pin.cholesky.solve(engine, data, -bias))
         convention = pin.Convention.WORLD if self.algorithm == "aba-world" else pin.Convention.LOCAL
-        return np.asarray(pin.aba(self.pin_model, self.data, q, v, self.zero_torque, self.fext, convention))
+        return np.asarray(pin.aba(self.pin_model, self.data, q, v, torque, self.fext, convention))
 
     def exponential_coordinate_rate(self, q: Array, theta: Array, v: Array) -> Array:
         """Apply dexp⁻¹ of θ to a velocity, joint by joint.
@@ -343,7 +410,7 @@ class PinocchioChain:
             angular_acceleration=np.array(angular),
             joint_reaction=np.array(reaction),
             joint_moment=None if self.source_model.is_chain else np.array(moment),
-            **energies_and_momentum(engine, data, q, v),
+            **energies_and_momentum(engine, data, q, v, elastic_energy(self.source_model, state)),
             mass_matrix=self._mass_matrix(state, q),
         )
 
@@ -483,7 +550,7 @@ class Pinocchio(PinocchioAdapter):
         ),
         Integrator("dop853", "tolerance", 8, note="SciPy's DOP853 on (q, v) with crba and the tangent map"),
     )
-    builds_trees = True
+    builds_trees = builds_elements = True
     options: ClassVar[tuple[str, ...]] = ("cholesky", "forwardDynamics")
     usual_algorithm: ClassVar[str] = "crba"  # for the accelerations of state evaluation
 

@@ -111,6 +111,36 @@ def quaternion_conjugate(p: Array) -> Array:
     return np.asarray(p * np.array([1.0, -1.0, -1.0, -1.0]))
 
 
+def rotation_vector(q: Array) -> Array:
+    """Return the rotation vector θ u of quaternions, 0 ≤ θ ≤ π.
+
+    Args:
+        q: (..., 4) quaternions, scalar first, of any length but 0.
+
+    Returns:
+        (..., 3) vectors [rad], the same in both frames.
+
+    """
+    size = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    theta = 2 * np.arctan2(size, np.abs(q[..., :1])) * np.where(q[..., :1] < 0, -1, 1)
+    ratio = np.divide(theta, size, out=np.full_like(size, 2.0), where=size > 0)
+    return np.asarray(ratio * q[..., 1:])
+
+
+def ball_spring_rest(model: Model, k: int) -> Array:
+    """Return the turn of a ball joint at which its spring is unloaded.
+
+    Args:
+        model: the mechanism.
+        k: the joint.
+
+    Returns:
+        (4,) quaternion, near → far body.
+
+    """
+    return quaternion_product(model.turn[k, 0], quaternion_conjugate(model.turn[k, 1]))
+
+
 def quaternion_rate(p: Array, omega: Array) -> Array:
     """Return ṗ = ½ L(p)ᵀ ω′, the inverse of `angular_velocity` for unit quaternions.
 
@@ -342,6 +372,28 @@ def spring_vectors(model: Model, r: Array, p: Array) -> Array:
     ends = r[..., body, :] + rotate_vectors(a[..., body, :, :], model.spring_point)
     ends[..., body < 0, :] = model.spring_point[body < 0]
     return np.asarray(ends[..., 1, :] - ends[..., 0, :])
+
+
+def elastic_energy(model: Model, state: State) -> float:
+    """Return the potential energy of all springs.
+
+    Args:
+        model: the mechanism.
+        state: a state of it.
+
+    Returns:
+        Σ ½ k (x − x₀)² + Σ ½ k θ² + Σ ½ k (l − l₀)² [J].
+
+    """
+    energy = np.sum(model.stiffness * (state.x - model.rest) ** 2)
+    for k, kind in enumerate(model.kind):
+        if kind == "ball" and model.stiffness[k, 0]:
+            rest, far = ball_spring_rest(model, k), model.body[k, 0]
+            turned = quaternion_product(state.p[far], rest) if far >= 0 else rest
+            turn = rotation_vector(quaternion_product(quaternion_conjugate(turned), state.p[k]))
+            energy += model.stiffness[k, 0] * (turn @ turn - state.x[k, 0] ** 2)
+    length = np.linalg.norm(spring_vectors(model, state.r, state.p), axis=-1)
+    return float(energy + np.sum(model.spring_stiffness * (length - model.spring_length) ** 2)) / 2
 
 
 def rate_count(model: Model) -> int:

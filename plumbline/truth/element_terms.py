@@ -14,11 +14,13 @@ import numpy as np
 from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Array, Model, State
 from plumbline.model.kinematics import (
     JointFrame,
+    ball_spring_rest,
     cross,
     quaternion_conjugate,
     quaternion_product,
     rotate_vectors,
     rotation_matrix,
+    rotation_vector,
     spring_vectors,
 )
 
@@ -105,7 +107,10 @@ def _coordinates(
     """What moves, the axis, the column of the elements, x, ẋ and the bias of every coordinate of joint k."""
     kind, far = model.kind[k], model.body[k, 0]
     if kind == "ball":
-        values = _rotation_vector(model, state, k), spins[0] - spins[1], -cross(spins[1], spins[0])
+        rest = ball_spring_rest(model, k)
+        unloaded = quaternion_product(state.p[far], rest) if far >= 0 else rest
+        turn = rotation_vector(quaternion_product(quaternion_conjugate(unloaded), state.p[k]))
+        values = rotation_matrix(unloaded) @ turn, spins[0] - spins[1], -cross(spins[1], spins[0])
         of_axis = zip(np.eye(3), *(value.tolist() for value in values), strict=True)
         return [("turn", axis, 0, x, rate, bias) for axis, x, rate, bias in of_axis]
     if KINDS[kind].has_attitude:
@@ -116,18 +121,6 @@ def _coordinates(
         (what, axis, i, float(state.x[k, i]), float(state.xdot[k, i]), biases[i])
         for i, (what, axis) in enumerate(axes)
     ]
-
-
-def _rotation_vector(model: Model, state: State, k: int) -> Array:
-    """θ u (3,), world axes, of the turn from the far to the near body's axes of a ball joint."""
-    far, above = model.turn[k, 0], model.body[k, 0]
-    if above >= 0:
-        far = quaternion_product(state.p[above], far)
-    q = quaternion_product(quaternion_conjugate(far), quaternion_product(state.p[k], model.turn[k, 1]))
-    q = q * np.copysign(1.0, q[0])
-    size = float(np.linalg.norm(q[1:]))
-    ratio = 2 * np.arctan2(size, q[0]) / size if size else 2.0
-    return np.asarray(rotation_matrix(far) @ q[1:] * ratio)
 
 
 def spring_terms(model: Model, state: State) -> SpringTerms:

@@ -11,7 +11,7 @@ from plumbline.model.kinematics import complete_state, quaternion_product
 from plumbline.model.sampling import random_states
 from plumbline.truth.certified import certify_state
 from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, state_rounding_bound
-from tests.helpers.random_trees import random_tree
+from tests.helpers.random_trees import ELEMENTS, random_tree
 
 ENGINES = ["reference", "mujoco", "pinocchio", "pinocchio-aba", "pinocchio-maximal", "exudyn", "exudyn-tree"]
 MIXES = {**{kind: (kind,) for kind in KINDS}, "all": tuple(KINDS)}
@@ -36,6 +36,66 @@ def test_states_of_random_trees_are_right(engine, mix):
                 error = np.linalg.norm(error, axis=-1) if error.shape[-1:] == (3,) else np.abs(error)
                 assert np.all(error <= bound.tolerance(name)), (name, seed, model.kind)
                 assert bound.relative_bound(name) < MAX_RELATIVE_BOUND, (name, seed, scale)
+
+
+MOVING = ("ball", "hinge", "universal", "slide", "cylindrical")
+# what an engine cannot build: element, kind of joint, and words of its reason
+MISSING = {
+    "pinocchio-maximal": [(element, None, "covers no rotors, springs") for element in ELEMENTS],
+    "exudyn": [
+        ("armature", None, "no rotor between two bodies"),
+        *((element, "ball", "rotation vector") for element in ("damping", "stiffness")),
+        ("stiffness", "universal", "a joint with one turn"),
+    ],
+    "exudyn-tree": [(element, "ball", "three revolutes") for element in ("armature", "damping", "stiffness")],
+}
+
+
+def reasons_to_refuse(engine, model, element):
+    found = []
+    for what, kind, words in MISSING.get(engine, ()):
+        has = [k for k, own in enumerate(model.kind) if kind in (own, None) and own in MOVING]
+        is_there = len(model.spring_body) if what == "springs" else np.any(getattr(model, what)[has])
+        found += [words] * bool(what in element and is_there)
+    return found
+
+
+@pytest.mark.parametrize("kinds", [*((kind,) for kind in MOVING), tuple(KINDS)], ids="+".join)
+@pytest.mark.parametrize("element", [*((name,) for name in ELEMENTS), ELEMENTS], ids="+".join)
+@pytest.mark.parametrize("engine", ENGINES)
+def test_states_of_trees_with_elements_are_right_or_refused(engine, element, kinds):
+    adapter = load_adapter(engine)
+    for seed in range(2):
+        model = random_tree(np.random.default_rng([seed, 5]), 5, kinds, elements=element)
+        (state,) = random_states(model, 1, seed)
+        if reasons := reasons_to_refuse(engine, model, element):
+            with pytest.raises(Unsupported) as caught:
+                adapter.evaluate(model, [state])
+            assert any(words in str(caught.value) for words in reasons)
+            continue
+        (found,) = adapter.evaluate(model, [state])
+        truth = certify_state(model, state, mass_matrix=True).quantities
+        bound = state_rounding_bound(model, state)
+        for name in bound.scale:
+            answer, value = getattr(found, name), getattr(truth, name)
+            if answer is None and engine == "exudyn-tree":
+                continue
+            error = np.asarray(answer - value)
+            error = np.linalg.norm(error, axis=-1) if error.shape[-1:] == (3,) else np.abs(error)
+            assert np.all(error <= bound.tolerance(name)), (name, seed, model.kind)
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "pinocchio", "pinocchio-aba", "exudyn", "exudyn-tree"])
+def test_a_spring_on_a_hinge_that_has_turned_round_twice(engine):
+    model = random_tree(np.random.default_rng(3), 2, ("hinge",)).changed(
+        stiffness=np.array([[2.0, 0.0], [3.0, 0.0]]), rest=np.array([[0.4, 0.0], [-9.0, 0.0]])
+    )
+    (state,) = random_states(model, 1, 3)
+    state = complete_state(model, replace(state, x=state.x + 2 * np.pi * np.array([[2, 0], [-3, 0]])))
+    (found,) = load_adapter(engine).evaluate(model, [state])
+    truth, bound = certify_state(model, state).quantities, state_rounding_bound(model, state)
+    error = np.linalg.norm(found.acceleration - truth.acceleration, axis=1)
+    assert np.all(error <= bound.acceleration)
 
 
 @pytest.mark.parametrize("engine", ["reference-printed"])
