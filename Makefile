@@ -77,11 +77,17 @@ reports/node_modules/.tried: reports/package-lock.json
 	-cd reports && npm ci --no-audit --no-fund --loglevel=error
 	@mkdir -p $(@D) && touch $@
 
-importers: .importers/.done  ## more importers for `plumbline model` (Drake, DART, PyBullet, Exudyn's), in an environment of their own
+importers: .importers/.done .importers-exudyn/.done  ## more importers for `plumbline model`: Drake, DART, PyBullet, Exudyn's
 
 .importers/.done: locks/importers.lock | .venv/pyvenv.cfg
 	$(UV) venv --quiet --allow-existing .importers
 	$(UV) pip install --quiet --require-hashes --python .importers/bin/python -r locks/importers.lock
+	@touch $@
+
+# Only for Python 3.12 and older: the toolbox that Exudyn's loader needs has no wheels for later ones.
+.importers-exudyn/.done: locks/exudyn-importer.lock | .venv/pyvenv.cfg
+	$(UV) venv --quiet --allow-existing .importers-exudyn
+	-$(UV) pip install --quiet --require-hashes --python .importers-exudyn/bin/python -r locks/exudyn-importer.lock
 	@touch $@
 
 # Only the robots' files are wanted: no dependency of these packages is installed, and nothing imports them.
@@ -100,7 +106,8 @@ lock: | .venv/pyvenv.cfg  ## resolve the dependencies again (needs the network)
 		-o locks/test.lock
 	$(LOCK) pyproject.toml -c locks/test.lock --group mutation -o locks/mutation.lock
 	$(LOCK) --group importers -c locks/main.lock -o locks/importers.lock
+	$(LOCK) --group exudyn-importer -o locks/exudyn-importer.lock
 	$(LOCK) --group corpora --no-deps -o locks/corpora.lock
 
 clean:  ## remove the environment and what runs made
-	rm -rf .venv .uv .importers .corpora reports/node_modules reports/out
+	rm -rf .venv .uv .importers .importers-exudyn .corpora reports/node_modules reports/out

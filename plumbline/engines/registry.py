@@ -22,6 +22,7 @@ ENGINES = {
 IMPORTERS = {
     "mujoco": "adapters.mujoco_importer:MujocoImporter",
     "pinocchio": "adapters.pinocchio_importer:PinocchioImporter",
+    "exudyn": "adapters.exudyn_importer:ExudynImporter",
     "drake": "adapters.drake_importer:DrakeImporter",
     "dart": "adapters.dart_importer:DartImporter",
     "pybullet": "adapters.pybullet_importer:PybulletImporter",

@@ -133,6 +133,14 @@ def describe_exit(code: int) -> str:
     return f"exited with code {code}"
 
 
+def _accept_arrays_of_numpy_2() -> None:
+    """Pickles of NumPy 2 name modules that NumPy 1 has under another name."""
+    from importlib.util import find_spec
+
+    if find_spec("numpy._core") and not find_spec("numpy._core.numeric"):
+        sys.modules["numpy._core.numeric"] = import_module("numpy.core.numeric")
+
+
 def _serve_calls(parent: int) -> None:
     """Answer the calls of the parent.  Engines print: the pipe leaves descriptor 1 before any is loaded."""
     from plumbline.processes.isolation import die_with_parent
@@ -143,6 +151,7 @@ def _serve_calls(parent: int) -> None:
     os.dup2(sink, 1)
     questions = os.fdopen(os.dup(0), "rb")
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    _accept_arrays_of_numpy_2()
     while True:
         try:
             module, name, arguments = _receive_frame(questions)

@@ -1,0 +1,167 @@
+"""Exudyn's URDF loader, LoadURDFrobot and GetURDFrobotData, which use the Robotics Toolbox for Python.
+
+The loader returns a list of links with joints; as its documentation shows, each becomes a `RobotLink` of a
+`Robot`, its parent the link of that name, and the robot an `ObjectKinematicTree`.  A parent that is not in
+the list (it has no joint) is the ground.
+
+    hinge, slide    q = x;  v_e = v
+    M, f of M q̈ = f by the implicit solver's ComputeMassMatrix and ComputeODE2RHS;  h = −f
+    poses   Robot.JointHT
+
+Exudyn 1.13 calls functions of the Robotics Toolbox that version 1.5 no longer has, and 1.1 needs NumPy 1: the
+loader has an environment of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import exudyn as exudyn_module
+import exudyn.robotics as robotics_module
+import exudyn.robotics.utilities as loader_module
+import numpy as np
+
+from adapters.exudyn_common import initialized_solver, mass_matrix_and_force
+from adapters.importer_common import captured_output, joint_from_screw, pose, quaternion_of
+from plumbline.importers.importer import Importer, ModelFile, Reading
+from plumbline.importers.neutral_model import CanonicalState, ModelQuantities, NeutralBody, NeutralModel
+from plumbline.model.datatypes import Array
+
+exudyn: Any = exudyn_module  # the stubs of these modules lack types and attributes
+robotics: Any = robotics_module
+loader: Any = loader_module
+GRAVITY = (0.0, 0.0, -9.81)  # m/s²: the caller of the loader sets it
+AXES = {"x": np.eye(3)[0], "y": np.eye(3)[1], "z": np.eye(3)[2]}
+
+
+class ExudynImporter(Importer):
+    """Exudyn's URDF loader."""
+
+    name = "exudyn"
+    title = "Exudyn"
+    package = "exudyn"
+    formats = ("urdf",)
+    environment = ".importers-exudyn"
+    unsupported: ClassVar[dict[str, str]] = {
+        "passive_force": "the loader returns friction and leaves it to the caller to apply it",
+        "acceleration": "Exudyn's initial accelerations are finite differences",
+        "kinetic_energy": "a kinematic tree does not return its energies",
+        "potential_energy": "a kinematic tree does not return its energies",
+    }
+
+    def version(self) -> str:
+        """Return the version of the loaded module.
+
+        Returns:
+            As Exudyn reports it.
+
+        """
+        return str(exudyn.GetVersionString())
+
+    def read(self, file: ModelFile) -> Reading:
+        """Load a file and describe the links that the loader returns.
+
+        Args:
+            file: the file and how to load it.
+
+        Returns:
+            The description, or the loader's refusal.
+
+        """
+        if file.base == "free":
+            return Reading(self.version(), refusal="the loader fixes the root link")
+        with captured_output() as warnings:
+            try:
+                links = _loaded(file)
+            except Exception as error:  # of the loader, the toolbox or the parser
+                return Reading(self.version(), refusal=f"{type(error).__name__}: {error}")
+        bodies = tuple(_body(link, links) for link in links)
+        return Reading(self.version(), NeutralModel("", bodies, np.array(GRAVITY)), warnings=tuple(warnings))
+
+    def evaluate(self, file: ModelFile, states: Sequence[CanonicalState]) -> list[ModelQuantities]:
+        """Compute the quantities with Exudyn's own routines.
+
+        Args:
+            file: a file that `read` accepts.
+            states: canonical states of the model that `read` returned.
+
+        Returns:
+            One record per state.
+
+        """
+        links = _loaded(file)
+        if not links:
+            return [ModelQuantities({}) for _ in states]
+        tree = _Tree(links)
+        return [tree.quantities(state) for state in states]
+
+
+def _loaded(file: ModelFile) -> list[dict[str, Any]]:
+    path = Path(file.path)
+    loaded = loader.LoadURDFrobot(path.name, str(path.parent))
+    links: list[dict[str, Any]] = loader.GetURDFrobotData(loaded["robot"], loaded["urdf"], verbose=0)[
+        "linkList"
+    ]
+    names = {link["name"]: k for k, link in enumerate(links)}
+    for link in links:
+        link["parent"] = names.get(link["parentName"], -1)
+        link["joint"] = _joint_name(loaded["urdf"], link["name"])
+    return links
+
+
+def _joint_name(urdf: Any, link: str) -> str:
+    """The loader returns names of links only: a joint is named after its child in the toolbox's file."""
+    return next((str(joint.name) for joint in urdf.joints if joint.child == link), link)
+
+
+def _body(link: dict[str, Any], links: list[dict[str, Any]]) -> NeutralBody:
+    kind, axis = link["jointType"][0], AXES[link["jointType"][1]]
+    turning, shift = (axis, np.zeros(3)) if kind == "R" else (np.zeros(3), axis)
+    placement = np.array(link["preHT"], float)
+    return NeutralBody(
+        link["name"], link["parent"], placement[:3, 3].copy(), quaternion_of(placement[:3, :3]),
+        (joint_from_screw(link["joint"], turning, shift),), float(link["mass"]),
+        np.array(link["com"], float), np.array(link["inertiaCOM"], float),
+    )  # fmt: skip
+
+
+class _Tree:
+    """A kinematic tree of the links, in the loader's order."""
+
+    def __init__(self, links: list[dict[str, Any]]) -> None:
+        self.names = [link["name"] for link in links]
+        self.robot = robotics.Robot(gravity=list(GRAVITY), referenceConfiguration=[0.0] * len(links))
+        for link in links:
+            self.robot.AddLink(
+                robotics.RobotLink(
+                    mass=link["mass"], COM=link["com"], inertia=link["inertiaCOM"],
+                    preHT=link["preHT"], jointType=link["jointType"], parent=link["parent"],
+                )
+            )  # fmt: skip
+        self.system = exudyn.SystemContainer().AddSystem()
+        self.robot.CreateKinematicTree(self.system)
+        self.system.Assemble()
+        self.settings = exudyn.SimulationSettings()
+        self.settings.timeIntegration.verboseMode = 0
+        self.settings.solutionSettings.writeSolutionToFile = False
+        self.settings.timeIntegration.generalizedAlpha.computeInitialAccelerations = False
+
+    def _mass_and_bias(self, q: Array, v: Array) -> tuple[Array, Array]:
+        initial = exudyn.ConfigurationType.Initial
+        self.system.systemData.SetODE2Coordinates(q.tolist(), initial)
+        self.system.systemData.SetODE2Coordinates_t(v.tolist(), initial)
+        solver = exudyn.MainSolverImplicitSecondOrder()
+        with initialized_solver(solver, self.system, self.settings):
+            M, force = mass_matrix_and_force(solver, self.system)
+        return M, -force
+
+    def quantities(self, state: CanonicalState) -> ModelQuantities:
+        """Evaluate Exudyn's routines at one state."""
+        q, v = state.coordinates, state.velocities
+        M, bias = self._mass_and_bias(q, v)
+        gravity = self._mass_and_bias(q, np.zeros(len(v)))[1]
+        frames = zip(self.names, self.robot.JointHT(list(q)), strict=True)
+        poses = {name: pose(np.array(H.rotation), np.array(H.translation)) for name, H in frames}
+        return ModelQuantities(poses, M, bias, gravity)
