@@ -21,7 +21,7 @@ with E the link's axes in the world as columns and B = Aᵀ E the same in the bo
 
 Attitudes are quaternions, scalar first, multiplied up along the chain from the angles (Exudyn has none):
 
-    p_k = p_{k-1} p_{k-1}(0)⁻¹ p_k(0) · [turns of the joint's angles about the axes B]
+    p_k = [turns of the angles of all links from the world to body k about their axes at the start] p_k(0)
 """
 
 from __future__ import annotations
@@ -65,7 +65,6 @@ from plumbline.model.kinematics import (
     elastic_energy,
     minimal_rates,
     own_rates,
-    quaternion_conjugate,
     quaternion_product,
     quaternion_rate,
     rotation_matrix,
@@ -80,6 +79,7 @@ SENSOR_OUTPUTS = (
     Output.Acceleration,
     Output.AngularAccelerationLocal,
 )
+SLIDES = tuple(getattr(exudyn.JointType, name) for name in ("PrismaticX", "PrismaticY", "PrismaticZ"))
 # cosine of a middle angle, 84.3°: the other two angles' rates grow as its inverse
 MIN_COS_MIDDLE_ANGLE = 0.1
 
@@ -103,6 +103,7 @@ class _Link:
     parent: int  # −1: the world
     axes_in_parent: Array  # (3, 3)
     offset: Array  # (3,) m, in the parent
+    axis: Array  # (3,) of the joint at the start, world frame
     centre: Array = field(default_factory=lambda: np.zeros(3))  # of mass, m
     inertia: Array = field(default_factory=lambda: np.zeros((3, 3)))  # kg m², about the centre of mass
     mass: float = 0.0  # kg
@@ -204,9 +205,8 @@ class _Linkage:
 
     def _add_link(self, joint: str, axes: Array, rate: int) -> None:
         """Add a link with these axes in the world on a joint whose rate is that one of ν."""
-        self.links.append(
-            _Link(getattr(exudyn.JointType, joint), self._last, self._axes.T @ axes, self._hang)
-        )
+        kind, along = getattr(exudyn.JointType, joint), axes[:, "XYZ".index(joint[-1])]
+        self.links.append(_Link(kind, self._last, self._axes.T @ axes, self._hang, along))
         self._last, self._axes, self._hang = len(self.links) - 1, axes, np.zeros(3)
         self.W = np.vstack([self.W, np.eye(len(self.nu))[rate]])
 
@@ -243,9 +243,9 @@ class _Linkage:
         self.revolute_groups.append(_RevoluteGroup(len(self.links), count, axes, body_axes, body))
         twist, offset = self._axes.T @ axes, self._hang
         for i, joint in enumerate(("RevoluteZ", "RevoluteY", "RevoluteX")[:count]):
-            self.links.append(_Link(getattr(exudyn.JointType, joint), self._last, twist, offset))
-            self._last, twist, offset = len(self.links) - 1, np.eye(3), np.zeros(3)
             axis = axes[:, 2 - i]
+            self.links.append(_Link(getattr(exudyn.JointType, joint), self._last, twist, offset, axis))
+            self._last, twist, offset = len(self.links) - 1, np.eye(3), np.zeros(3)
             self.W = np.vstack([self.W, axis @ relative])
             self._spin = self._spin + np.outer(axis, axis @ relative)
         self._axes = axes
@@ -352,25 +352,16 @@ class _KinematicTree:
 
     def quaternions_at(self, angles: Array) -> Array:
         """Return the quaternions (T, N, 4) at the angles (T, ·): continuous, and the state's own at 0."""
-        unit = np.array([1.0, 0.0, 0.0, 0.0])
-        now, then = np.tile(unit, (len(angles), 1)), unit  # of the frame before, which a rod turns along
-        out = np.empty((len(angles), self.model.n, 4))
-        for group in self.revolute_groups:
-            spun = np.tile(unit, (len(angles), 1))
-            for i in range(group.angle_count):
-                half, turn = 0.5 * angles[:, group.first_angle + i], np.zeros_like(spun)
-                turn[:, 0], turn[:, 3 - i] = np.cos(half), np.sin(half)
-                spun = quaternion_product(spun, turn)
-            spun[:, 1:] = np.matvec(group.body_axes, spun[:, 1:])
-            if group.angle_count == 2:
-                now = quaternion_product(now, spun)
-            else:
-                start = self.state.p[group.body]
-                between = quaternion_product(quaternion_conjugate(then), start)
-                now = quaternion_product(quaternion_product(now, between), spun)
-                then = start
-                out[:, group.body] = now
-        return out
+        turned: list[Array] = []
+        for link, angle in zip(self.linkage.links, angles.T, strict=True):
+            half, turn = 0.5 * angle[:, None], np.zeros((len(angles), 4))
+            turn[:, :1], turn[:, 1:] = np.cos(half), np.sin(half) * link.axis
+            if link.joint in SLIDES:
+                turn[:] = 1.0, 0.0, 0.0, 0.0
+            turned.append(quaternion_product(turned[link.parent], turn) if link.parent >= 0 else turn)
+        links = self.linkage.link_of_body
+        moved = [turned[link] if link >= 0 else np.array([1.0, 0.0, 0.0, 0.0]) for link in links]
+        return np.stack([quaternion_product(q, p) for q, p in zip(moved, self.state.p, strict=True)], 1)
 
     def read_sample(self) -> tuple[Array, Array, Array, Array]:
         """Return the angles, and r, v and ω′ of all bodies."""

@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
-from plumbline.model.datatypes import Array
+from plumbline.model.datatypes import Array, Unsupported
 from plumbline.model.kinematics import quaternion_rate
 from plumbline.model.welding import RigidPart
 
@@ -157,18 +157,23 @@ def init_constraint_dynamics(pin_model: pin.Model, data: pin.Data, contacts: Any
 
 
 def configuration_rate(pin_model: pin.Model, q: Array, v: Array) -> Array:
-    """Map a velocity to the rate of the configuration of spherical joints.
+    """Map a velocity to the rate of the configuration.
 
     Args:
-        pin_model: a model of spherical joints.
-        q: configuration (4 nj,).
-        v: velocity (3 nj,).
+        pin_model: of any joints; before version 4 of spherical ones.
+        q: configuration (nq,).
+        v: velocity (nv,).
 
     Returns:
-        q̇ (4 nj,); version 3 has no tangent map, and q̇ = ½ q v is evaluated here.
+        q̇ (nq,); version 3 has no tangent map, and q̇ = ½ q v of spherical joints is evaluated here.
+
+    Raises:
+        Unsupported: version 3, and joints other than spherical ones.
 
     """
     if hasattr(pin, "tangentMapProduct"):
         return np.asarray(pin.tangentMapProduct(pin_model, q, v[:, None])).ravel()
+    if 3 * len(q) != 4 * len(v):
+        raise Unsupported("Pinocchio before version 4 has no tangent map of joints other than balls and rods")
     p = np.roll(q.reshape(-1, 4), 1, axis=1)
     return np.roll(quaternion_rate(p, v.reshape(-1, 3)), -1, axis=1).ravel()

@@ -220,11 +220,31 @@ class PinocchioChain:
         return q, v
 
     def _absolute_attitudes(self, q: Array) -> Array:
-        """Return the attitudes (T, nj, 4) of the joints, scalar first, at configurations q (T, 4 nj)."""
-        p = np.roll(q.reshape(len(q), self.joint_count, 4), 1, axis=2)
-        for j in range(1, self.joint_count):
-            p[:, j] = quaternion_product(p[:, j - 1], p[:, j])
-        return p
+        """Return the attitudes (T, nj, 4) of the joints' frames, scalar first, at q (T, nq)."""
+        model, frames = self.source_model, np.empty((len(q), self.joint_count, 4))
+        bodies = {row: k for k, row in enumerate(self.body_rows) if model.kind[k] != "weld"}
+        for j, joint in enumerate(self.joints):
+            kind = model.kind[bodies[j]] if j in bodies else "rod"
+            turn = np.roll(q[:, joint.idx_q : joint.idx_q + joint.nq][:, -4:], 1, axis=1)
+            if KINDS[kind].motions:
+                turn = _joint_turns(model, bodies[j], q[:, joint.idx_q :])
+                far = model.body[bodies[j], 0]
+                above = model.turn[bodies[j], 0]
+                turn = quaternion_product(self._frame_in_joint(far, above), turn)
+            up = self.parent_rows[j]
+            frames[:, j] = quaternion_product(frames[:, up], turn) if up >= 0 else turn
+        return frames
+
+    def _frame_in_joint(self, k: int, turn: Array) -> Array:
+        """Return a quaternion given in body k, −1 the world, as one in the frame of the body's joint."""
+        model = self.source_model
+        while k >= 0 and model.kind[k] == "weld":
+            far, near = model.turn[k]
+            turn = quaternion_product(quaternion_product(far, quaternion_conjugate(near)), turn)
+            k = int(model.body[k, 0])
+        if k >= 0 and KINDS[model.kind[k]].motions:
+            turn = quaternion_product(quaternion_conjugate(model.turn[k, 1]), turn)
+        return turn
 
     def update_loads(self, q: Array, v: Array) -> None:
         """Set `fext` to the loads at a state.
@@ -338,7 +358,7 @@ class PinocchioChain:
 
         """
         dexp = pin.dIntegrate(self.pin_model, q, theta, pin.ArgumentPosition.ARG1)
-        if self.joint_count <= MAX_DENSE_JOINTS:
+        if self.joint_count <= MAX_DENSE_JOINTS or not self.source_model.is_chain:
             return np.asarray(lapack.dgesv(dexp, v)[2])
         each = np.arange(self.joint_count)
         blocks = dexp.reshape(self.joint_count, 3, self.joint_count, 3)[each, :, each, :]  # the rest is zero
@@ -499,10 +519,29 @@ class PinocchioChain:
             for k, (j, centre) in enumerate(zip(self.body_joints, self.placements, strict=True)):
                 pose, motion = self.data.oMi[j], centre.actInv(self.data.v[j])
                 r[i, k] = pose.act(centre.translation)
-                rdot[i, k] = pose.rotation @ motion.linear
+                rdot[i, k] = pose.rotation @ (centre.rotation @ motion.linear)
                 omega[i, k] = motion.angular
-        p = self._absolute_attitudes(q)[:, self.body_rows]
+        frames, unit = self._absolute_attitudes(q), np.array([1.0, 0.0, 0.0, 0.0])
+        at_rest = np.tile(unit, (len(q), 1))
+        p = np.stack(
+            [
+                quaternion_product(frames[:, row] if row >= 0 else at_rest, self._frame_in_joint(k, unit))
+                for k, row in enumerate(self.body_rows)
+            ],
+            1,
+        )
         return Trajectory(t=times, r=r, p=p, v=rdot, pdot=quaternion_rate(p, omega), steps=steps)
+
+
+def _joint_turns(model: Model, k: int, x: Array) -> Array:
+    """Return the quaternions (T, 4) of joint k at coordinates x (T, ≥ motions), its own axes."""
+    turn = np.tile([1.0, 0.0, 0.0, 0.0], (len(x), 1))
+    for i, (what, axis) in enumerate(KINDS[model.kind[k]].motions):
+        if what == "turn":
+            half = np.zeros_like(turn)
+            half[:, 0], half[:, 1 + axis] = np.cos(x[:, i] / 2), np.sin(x[:, i] / 2)
+            turn = quaternion_product(turn, half)
+    return turn
 
 
 def rod_quaternion(u: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Gauss–Legendre collocation of r̈, p̈ = f(r, p, ṙ, ṗ) by Picard sweeps, for one chain or a whole batch.
+"""Gauss–Legendre collocation of r̈, p̈ = f(r, p, ṙ, ṗ) by Picard sweeps, for one mechanism or a whole batch.
 
 A step holds S nodes of every body in one forest, so that a sweep costs one right-hand side of S times
 the bodies and no more NumPy calls than a single state.  With a the accelerations at the nodes c and A the
@@ -22,7 +22,8 @@ from numpy.polynomial.legendre import leggauss, legvander
 
 from reference_impl.integrate import IntegrationResult, state_scales
 from reference_impl.mechanism import Array, Mechanism
-from reference_impl.structured import StructuredSystem, component_first
+from reference_impl.structured import component_first
+from reference_impl.tree_elimination import EliminatedSystem, eliminated_system
 
 DEFAULT_NODES = 16  # a sweep of a small chain costs NumPy's calls and not its nodes: 8 … 20 were tried
 MAX_SWEEPS = 14  # at most in a step; more are better spent on a shorter step
@@ -107,7 +108,7 @@ def gauss_tables(S: int) -> GaussTables:
 
 
 def integrate_collocation(
-    chains: Sequence[Mechanism] | StructuredSystem,
+    chains: Sequence[Mechanism] | EliminatedSystem,
     r: Array,
     p: Array,
     v: Array,
@@ -154,7 +155,7 @@ def integrate_collocation(
             singular on the way.
 
     """
-    forest = chains if isinstance(chains, StructuredSystem) else StructuredSystem(chains)
+    forest = chains if isinstance(chains, EliminatedSystem) else eliminated_system(chains)
     quiet = 0.1 * rtol if sweep_tolerance is None else sweep_tolerance
     stepper = _Stepper(
         forest,
@@ -225,7 +226,7 @@ class _Stepper:
 
     def __init__(
         self,
-        forest: StructuredSystem,
+        forest: EliminatedSystem,
         q: Array,
         v: Array,
         rtol: float,

@@ -12,7 +12,8 @@ from reference_impl import notes
 from reference_impl.direct import DirectSystem
 from reference_impl.euler_parameters import angular_velocity
 from reference_impl.mechanism import Array, Mechanism
-from reference_impl.structured import StructuredSystem, component_first
+from reference_impl.structured import component_first
+from reference_impl.tree_elimination import eliminated_system
 
 Acceleration = Callable[[Array, Array, Array, Array], Array]  # r̈ and p̈, (7 N,), at r, p, ṙ, ṗ (N, ·)
 
@@ -78,7 +79,7 @@ def direct_acceleration(chain: Mechanism, gamma_defect: float | Array = 0.0) -> 
 
 
 def structured_acceleration(chain: Mechanism) -> Acceleration:
-    """Return the right-hand side of the structured form, which takes less time on long chains.
+    """Return the right-hand side of the O(bodies) form, which takes less time on long chains.
 
     Args:
         chain: the mechanism.
@@ -87,7 +88,7 @@ def structured_acceleration(chain: Mechanism) -> Acceleration:
         r̈ and p̈ (7 N,) as a function of r, p, ṙ, ṗ.
 
     """
-    system = StructuredSystem([chain])
+    system = eliminated_system([chain])
 
     def acceleration(r: Array, p: Array, v: Array, pdot: Array) -> Array:
         a = system.acceleration(component_first(r, p), component_first(v, pdot))
@@ -113,7 +114,7 @@ def state_scales(chain: Mechanism, r: Array, p: Array, v: Array, pdot: Array) ->
     """Return the size that each part of y has in this motion, for absolute tolerances.
 
     A coordinate that passes through zero needs no more digits there than the motion as a whole: the
-    stretched chain for r, 1 for p, and for the rates the larger of the initial ones and of those that
+    stretched mechanism for r, 1 for p, and for the rates the larger of the initial ones and of those that
     falling through the chain's own length reaches.
 
     Args:
@@ -128,7 +129,7 @@ def state_scales(chain: Mechanism, r: Array, p: Array, v: Array, pdot: Array) ->
 
     """
     span = float(np.sum(chain.length + np.linalg.norm(chain.proximal, axis=1)))
-    span += float(np.sum(np.linalg.norm(chain.distal[:-1], axis=1)))
+    span += float(np.sum(np.linalg.norm(chain.point[1:, 0], axis=1)) + np.linalg.norm(chain.point[0, 0]))
     span = max(span, float(np.max(np.abs(r)))) or 1.0
     fall = float(np.sqrt(np.linalg.norm(chain.gravity) * span))
     omega = float(np.max(np.abs(angular_velocity(p, pdot))))

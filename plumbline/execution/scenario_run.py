@@ -108,8 +108,11 @@ class ScenarioRun:
         levels = level or (plan.random_level if is_random else plan.level)
         has_long_runs = plan.long_run_seconds > 0 and not is_random
         self._keys = list(task_keys(scenario.name, engines, levels, has_long_runs, has_steps(scenario)))
-        if not scenario.model.is_chain:  # states are all that is compared of trees
-            self._keys = [key for key in self._keys if key.kind in (TaskKind.STATE_TRUTH, TaskKind.STATE)]
+        if not scenario.model.is_chain:  # not yet covered of trees
+            kinds = [TaskKind.STEP, TaskKind.RELATIONS]
+            if scenario.model.has_elements:
+                kinds += [TaskKind.MOTION_TRUTH, TaskKind.TRAJECTORY, TaskKind.LONG_RUN]
+            self._keys = [key for key in self._keys if key.kind not in kinds]
         self._pending = set(self._keys)  # without an outcome
         self._findings: dict[TaskKey, JudgingResult] = {}
         self._has_retried_truth = False

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from plumbline.model.datatypes import Array, Model, Trajectory
+from plumbline.model.datatypes import KINDS, Array, Model, Trajectory
 from plumbline.model.kinematics import angular_velocity, joint_vectors, rotation_matrix
 
 
@@ -154,7 +154,8 @@ def compute_invariants(model: Model, run: Trajectory) -> Invariants:
         run: T samples of its motion.
 
     Returns:
-        The series; ``momentum_drift`` is None with loads, drag or without gravity.
+        The series; ``momentum_drift`` is None with loads, drag or without gravity, and where a joint at the
+        world has a moment about the vertical through the origin.
 
     """
     omega = angular_velocity(run.p, run.pdot)
@@ -162,7 +163,7 @@ def compute_invariants(model: Model, run: Trajectory) -> Invariants:
     done, uncertainty = work_of_loads(model, run, omega)
     gravity = np.linalg.norm(model.gravity)
     momentum = None
-    if gravity > 0 and not (model.has_loads or model.has_drag):
+    if gravity > 0 and not (model.has_loads or model.has_drag) and _turns_freely_about_gravity(model):
         about = angular_momentum(model, run.r, run.p, run.v, omega) @ (model.gravity / gravity)
         momentum = (about - about[0])[:, None, None]
     d = joint_vectors(model, run.r, run.p)
@@ -173,6 +174,7 @@ def compute_invariants(model: Model, run: Trajectory) -> Invariants:
     stretching = np.zeros_like(d)
     stretching[..., 0] = np.sum(d * ddot, axis=-1) / np.where(distance > 0, distance, 1.0)
     rods = model.rods[:, None]
+    d, ddot = _across_slides(model, run.p, omega, d, ddot)
     return Invariants(
         energy_drift=(energy - energy[0] - done)[:, None, None],
         momentum_drift=momentum,
@@ -197,8 +199,43 @@ def joint_vector_rates(model: Model, run: Trajectory, omega: Array) -> Array:
     """
     a = rotation_matrix(run.p)
     near = run.v + np.einsum("tkij,tkj->tki", a, np.cross(omega, model.proximal))
-    far = run.v + np.einsum("tkij,tkj->tki", a, np.cross(omega, model.distal))
-    return np.asarray(near - np.concatenate([np.zeros_like(far[:, :1]), far[:, :-1]], axis=1))
+    far = model.body[:, 0]
+    swing = np.einsum("tkij,tkj->tki", a[:, far], np.cross(omega[:, far], model.point[:, 0]))
+    return np.asarray(near - np.where((far < 0)[:, None], 0.0, run.v[:, far] + swing))
+
+
+def _across_slides(model: Model, p: Array, omega: Array, d: Array, ddot: Array) -> tuple[Array, Array]:
+    """Return d and ḋ (T, N, 3) without their part along slides, and 0 of free bodies."""
+    d, ddot = d.copy(), ddot.copy()
+    for k, (kind, far) in enumerate(zip(model.kind, model.body[:, 0], strict=True)):
+        if kind == "free":
+            d[:, k] = ddot[:, k] = 0.0
+        if not any(what == "slide" for what, _ in KINDS[kind].motions):
+            continue
+        axis, spin = rotation_matrix(model.turn[k, 0])[:, 2] * np.ones_like(d[:, k]), np.zeros_like(d[:, k])
+        if far >= 0:
+            above = rotation_matrix(p[:, far])
+            axis, spin = np.matvec(above, axis), np.matvec(above, omega[:, far])
+        ddot[:, k] -= np.cross(spin, d[:, k])
+        for y in (d, ddot):
+            y[:, k] -= axis * np.sum(axis * y[:, k], axis=-1, keepdims=True)
+    return d, ddot
+
+
+def _turns_freely_about_gravity(model: Model) -> bool:
+    """Whether no joint at the world has a moment about the axis along gravity through the origin."""
+    along = model.gravity / np.linalg.norm(model.gravity)
+    for k in np.flatnonzero(model.body[:, 0] < 0):
+        kind, at = model.kind[k], model.point[k, 0]
+        if kind == "free":
+            continue
+        axis = rotation_matrix(model.turn[k, 0])[:, 2]
+        turns = kind in ("rod", "ball") or (
+            kind in ("hinge", "cylindrical") and np.linalg.norm(np.cross(axis, along)) < 1e-14
+        )
+        if not turns or np.linalg.norm(np.cross(at, along)) > 1e-14 * np.linalg.norm(at):
+            return False
+    return True
 
 
 def invariant_scales(model: Model, run: Trajectory, length: float) -> dict[str, float]:

@@ -24,7 +24,7 @@ def rotation_matrix(p: Array) -> Array:
         (..., 3, 3) rotations, body → world.
 
     """
-    p = np.asarray(p, dtype=float)
+    p = np.asarray(p, dtype=np.result_type(p, float))
     w, x, y, z = np.moveaxis(p, -1, 0)
     s = w * w + x * x + y * y + z * z
     rows = [
@@ -316,7 +316,7 @@ class JointFrame:
                 shift, shift_rate = shift + along * value, shift_rate + along * rate
             else:
                 spin = spin + along * rate
-                half = np.zeros((*value.shape[:-1], 4))
+                half = np.zeros((*value.shape[:-1], 4), value.dtype)
                 half[..., :1], half[..., 1 + axis, None] = np.cos(value / 2), np.sin(value / 2)
                 turn = quaternion_product(turn, half)
         return (shift, quaternion_product(turn, quaternion_conjugate(self.turn_near))), (shift_rate, spin)

@@ -16,7 +16,7 @@ import numpy as np
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import Array, Model, State, StateQuantities, Trajectory
 from plumbline.model.invariants import attitude_error, position_error
-from plumbline.model.kinematics import state_from_minimal
+from plumbline.model.kinematics import complete_state
 from plumbline.model.sampling import derive_seed
 from plumbline.truth import TruthUnavailable
 from plumbline.truth.certified import certify_state
@@ -135,6 +135,8 @@ def motion_truth(
         model, state, times, perturbed_models(model, state)
     )
     growth, length = np.maximum.accumulate(growth), float(np.sum(stretched_length(model)))
+    if not model.is_chain:  # what is free or slides leaves the stretched mechanism
+        length = max(length, float(np.max(np.linalg.norm(truth.trajectory.r, axis=-1))))
     excess = np.maximum(
         truth.position_uncertainty / (length * RUN_ROUNDING * growth),
         truth.attitude_uncertainty / (2 * RUN_ROUNDING * growth),
@@ -158,21 +160,25 @@ def motion_truth(
 
 
 def stretched_length(model: Model) -> Array:
-    """Measure how far each body and its rod extend the stretched chain.
+    """Measure how far each body and its rod extend the stretched mechanism.
 
     Args:
         model: the mechanism.
 
     Returns:
-        (N,) [m] rod length plus the largest of: distance from the proximal to the distal point, distance from
-        the proximal point to the centre of mass, radius of gyration.
+        (N,) [m] rod length, and the far point's distance from the world's origin where the body hangs on the
+        world, plus the largest of: distance from the near point to the far points of the joints beyond,
+        distance from the near point to the centre of mass, radius of gyration.
 
     """
-    span = np.linalg.norm(model.proximal - model.distal, axis=1)
-    span[-1] = 0.0
+    span, far = np.zeros(model.n), model.body[:, 0]
+    on_body = far >= 0
+    distance = np.linalg.norm(model.proximal[far[on_body]] - model.point[on_body, 0], axis=1)
+    np.maximum.at(span, far[on_body], distance)
     gyration = np.sqrt(np.trace(model.inertia, axis1=1, axis2=2) / (2 * model.mass))
     sizes = [span, np.linalg.norm(model.proximal, axis=1), gyration]
-    return np.asarray(model.length + np.max(sizes, axis=0))
+    from_origin = np.where(on_body, 0.0, np.linalg.norm(model.point[:, 0], axis=1))
+    return np.asarray(model.length + np.max(sizes, axis=0) + from_origin)
 
 
 def perturbed_models(model: Model, state: State) -> list[tuple[Model, State]]:
@@ -201,9 +207,11 @@ def perturbed_models(model: Model, state: State) -> list[tuple[Model, State]]:
         replace(model, gravity=model.gravity * (1 + DETECTABLE_PARAMETER_ERROR)),
         replace(model, mass=perturbed(model.mass)),
         replace(model, inertia=model.inertia * (factors + factors.mT) / 2),
-        model.changed(proximal=perturbed(model.proximal), distal=perturbed(model.distal)),
+        model.changed(proximal=perturbed(model.proximal), distal=perturbed(model.distal))
+        if model.is_chain
+        else replace(model, point=perturbed(model.point)),
     ]
-    return [(m, state_from_minimal(m, state.p, state.omega, state.u, state.udot)) for m in models]
+    return [(m, complete_state(m, state)) for m in models]
 
 
 def detectable_effect(model: Model, r: Array, p: Array) -> tuple[Array, Array]:

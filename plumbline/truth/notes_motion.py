@@ -1,4 +1,4 @@
-"""Motions by the notes' equations in the reference's structured form, for comparison with other methods."""
+"""Motions by the notes' equations in the reference's O(bodies) form, for comparison with other methods."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from plumbline.model.datatypes import Array, EngineFailure, Model, State, Trajectory
 from plumbline.model.kinematics import quaternion_rate
 from reference_impl.collocation import integrate_collocation
-from reference_impl.structured import StructuredSystem
+from reference_impl.tree_elimination import EliminatedSystem, eliminated_system
 
 NotesIntegrator = Literal["collocation", "dop853"]
 
@@ -37,7 +37,7 @@ def simulate_notes_form(
         EngineFailure: the integrator stops early.
 
     """
-    system = StructuredSystem([model])
+    system = eliminated_system([model])
     start = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
     try:
         if method == "dop853":
@@ -49,7 +49,7 @@ def simulate_notes_form(
 
 
 def _simulate_dop853(
-    system: StructuredSystem, start: tuple[Array, Array, Array, Array], times: Array, rtol: float
+    system: EliminatedSystem, start: tuple[Array, Array, Array, Array], times: Array, rtol: float
 ) -> Trajectory:
     """The raw form by DOP853, with absolute tolerances of ``rtol`` times 1 m, 1, 1 m/s and 1 1/s.
 

@@ -15,6 +15,7 @@ from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import (
     angular_velocity,
+    complete_state,
     joint_vectors,
     quaternion_conjugate,
     quaternion_product,
@@ -25,7 +26,8 @@ from plumbline.model.kinematics import (
 )
 from plumbline.model.sampling import derive_seed
 from reference_impl.collocation import integrate_collocation
-from reference_impl.structured import StructuredSystem
+from reference_impl.structured import component_first
+from reference_impl.tree_elimination import EliminatedSystem, eliminated_system
 
 PERTURBATION_SIZE = 1e-7  # of each angle [rad], of each rate relative to the largest rate of the motion
 PERTURBATION_COUNT = 4  # random directions
@@ -100,13 +102,13 @@ def perturbation_growth_and_runs(
 
     """
     neighbours = range(1, PERTURBATION_COUNT + 1)
-    system = StructuredSystem([model] * (PERTURBATION_COUNT + 1) + [m for m, _ in other_models])
+    system = eliminated_system([model] * (PERTURBATION_COUNT + 1) + [m for m, _ in other_models])
     states = [state, *perturbed_states(model, state), *(s for _, s in other_models)]
     r, p, v, pdot = _integrate_batch(system, states, times)
     unperturbed = [0, *range(PERTURBATION_COUNT + 1, len(states))]
     runs = r[unperturbed], p[unperturbed]
     if other_models:
-        system = StructuredSystem([model]).repeated(PERTURBATION_COUNT + 1)
+        system = eliminated_system([model]).repeated(PERTURBATION_COUNT + 1)
     size, growth = np.full(PERTURBATION_COUNT, PERTURBATION_SIZE), np.empty((PERTURBATION_COUNT, len(times)))
     earlier_growth, done, arm = np.ones(PERTURBATION_COUNT), 0, 1e-3
     while True:
@@ -158,12 +160,19 @@ def perturbed_states(
         omega = state.omega + spread * rng.normal(size=(model.n, 3))
         u = state.u + np.cross(perturbation_size * rng.normal(size=(model.n, 3)), state.u)
         udot = state.udot + np.cross(spread * rng.normal(size=(model.n, 3)), state.u)
-        found.append(_make_state(model, p, omega, u, udot))
+        if model.is_chain:
+            found.append(_make_state(model, p, omega, u, udot))
+            continue
+        x, r = (y + perturbation_size * rng.normal(size=y.shape) for y in (state.x, state.r))
+        xdot, v = (y + spread * rng.normal(size=y.shape) for y in (state.xdot, state.v))
+        found.append(
+            complete_state(model, State(*_unit_coordinates(model, p, omega, u, udot), r, v, x, xdot))
+        )
     return found
 
 
 def _integrate_batch(
-    system: StructuredSystem, states: list[State], times: Array
+    system: EliminatedSystem, states: list[State], times: Array
 ) -> tuple[Array, Array, Array, Array]:
     """r, p, ṙ, ṗ (runs, T, N, ·) of a batch of chains of as many bodies, from times[0]."""
     r, p, v = (np.concatenate([getattr(state, name) for state in states]) for name in ("r", "p", "v"))
@@ -175,7 +184,10 @@ def _integrate_batch(
 
 
 def project_to_manifold(model: Model, r: Array, p: Array, v: Array, pdot: Array) -> State:
-    """Return the state on the constraint manifold with the minimal coordinates of an integrated one.
+    """Return the state on the constraint manifold next to an integrated one.
+
+    Of a chain it has the same minimal coordinates; of a tree, r, p, ω′ and ṙ are those of the nearest state,
+    and joint coordinates are not computed.
 
     Args:
         model: the mechanism.
@@ -188,6 +200,10 @@ def project_to_manifold(model: Model, r: Array, p: Array, v: Array, pdot: Array)
         The state.
 
     """
+    if not model.is_chain:
+        q, qdot = eliminated_system([model]).project(component_first(r, p), component_first(v, pdot))
+        p, zeros = np.ascontiguousarray(q[3:].T), np.zeros((model.n, 3))
+        return State(p, angular_velocity(p, qdot[3:].T), zeros, zeros, q[:3].T, qdot[:3].T)
     p = p / np.linalg.norm(p, axis=1, keepdims=True)
     omega = angular_velocity(p, pdot)
     A = rotation_matrix(p)
@@ -203,13 +219,25 @@ def _interpolate_states(model: Model, base: State, other: State, part: float) ->
     turn = turn * np.where(turn[:, :1] < 0, -1.0, 1.0)
     turn[:, 1:] *= part
     turn[:, 0] = np.sqrt(1 - np.sum(turn[:, 1:] ** 2, 1))
-    mixed = (getattr(base, x) + part * (getattr(other, x) - getattr(base, x)) for x in ("omega", "u", "udot"))
-    return _make_state(model, quaternion_product(base.p, turn), *mixed)
+    names = ("omega", "u", "udot") if model.is_chain else ("omega", "r", "v")
+    mixed = [getattr(base, x) + part * (getattr(other, x) - getattr(base, x)) for x in names]
+    p = quaternion_product(base.p, turn)
+    if model.is_chain:
+        return _make_state(model, p, *mixed)
+    omega, r, v = mixed
+    return project_to_manifold(model, r, p, v, quaternion_rate(p, omega))
 
 
 def _make_state(model: Model, p: Array, omega: Array, u: Array, udot: Array) -> State:
-    """The state of coordinates that may be off their unit spheres; u and u̇ are 0 for ball joints."""
+    """The state of a chain with coordinates that may be off their unit spheres."""
+    return state_from_minimal(model, *_unit_coordinates(model, p, omega, u, udot))
+
+
+def _unit_coordinates(
+    model: Model, p: Array, omega: Array, u: Array, udot: Array
+) -> tuple[Array, Array, Array, Array]:
+    """The coordinates on their unit spheres; u and u̇ are 0 for joints other than rods."""
     rods = model.rods[:, None]
     u = np.where(rods, u / np.maximum(np.linalg.norm(u, axis=1, keepdims=True), np.finfo(float).tiny), 0.0)
     udot = np.where(rods, udot - np.sum(udot * u, axis=1, keepdims=True) * u, 0.0)
-    return state_from_minimal(model, p / np.linalg.norm(p, axis=1, keepdims=True), omega, u, udot)
+    return p / np.linalg.norm(p, axis=1, keepdims=True), omega, u, udot

@@ -2,7 +2,8 @@
 
 Coordinates per body: the quaternion p, ω′, and for a rod u, u̇ (world frame).  The joint forces come from the
 block elimination described in `certified`, written as expressions in the coordinates; no constraint is
-integrated, so nothing drifts.  One compiled integrator serves every model with the same sequence of joints:
+integrated, so nothing drifts.  Trees with other joints have the equations of `taylor_tree`.  One compiled
+integrator serves every model with the same sequence of joints:
 the numbers of the model enter as parameters, which also keeps double-precision constants out of the quad
 model.  Vectors (3,) and matrices (3, 3) of expressions are NumPy arrays of objects.
 """
@@ -11,7 +12,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -20,12 +21,15 @@ from typing import Any, Literal
 import numpy as np
 
 from plumbline.model.datatypes import Array, EngineFailure, Model, State
+from plumbline.model.kinematics import forward_kinematics
 from plumbline.processes.processor import processor_features
 from plumbline.processes.user_cache import content_key, recall, remember
-from plumbline.truth import import_truth_tool
+from plumbline.truth import TruthUnavailable, import_truth_tool, taylor_tree
+from plumbline.truth.taylor_tree import Topology, rotation_matrix, vector
 
 Precision = Literal["double", "extended", "quad", "octuple"]
 OCTUPLE_BITS, OCTUPLE_DIGITS = 237, 75
+_Joints = tuple[bool, ...] | Topology  # of a chain whether each joint is a rod
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +66,13 @@ def simulate_taylor(
 
     """
     integrator, number = _prepared_integrator(model, state, precision)
-    proximal, distal = ([_vector(map(number, s)) for s in x] for x in (model.proximal, model.distal))
-    length = [number(x) for x in model.length]
     outcome, _, _, steps, _, samples = integrator.propagate_grid([number(float(t)) for t in times])
     if "time_limit" not in str(outcome):
         raise EngineFailure(f"heyoka stopped: {outcome}")
+    if not model.is_chain:
+        return _tree_kinematics(model, times, samples, int(steps))
+    proximal, distal = ([vector(map(number, s)) for s in x] for x in (model.proximal, model.distal))
+    length = [number(x) for x in model.length]
     return _forward_kinematics(model, times, np.asarray(samples), proximal, distal, length, int(steps))
 
 
@@ -87,10 +93,12 @@ def taylor_series(
         values around which to expand next, in the same order.
 
     Raises:
-        TruthUnavailable: heyoka (Linux only) or mpmath is not installed.
+        TruthUnavailable: heyoka (Linux only) or mpmath is not installed, or the mechanism is no chain.
         EngineFailure: a step fails, or heyoka was built without that precision.
 
     """
+    if not model.is_chain:
+        raise TruthUnavailable("motions are proved of chains of rods and balls only")
     mp = import_truth_tool("mpmath")
     integrator, number = _prepared_integrator(model, state, precision, order)
     places = _positions_then_rates(model)
@@ -145,12 +153,16 @@ def _prepared_integrator(
 ) -> tuple[Any, Callable[[Any], Any]]:
     """The integrator of a model at time 0 in a state, and the conversion to its numbers."""
     mp, number = import_truth_tool("mpmath"), _number_conversion(precision)
-    rods = tuple(bool(rod) for rod in model.rods)
-    integrator = _compiled_integrator(rods, model.has_drag, precision, order)
+    joints: _Joints = taylor_tree.topology(model)
+    parameters, values = taylor_tree.parameter_values, taylor_tree.initial_values
+    if model.is_chain:
+        joints = tuple(bool(rod) for rod in model.rods)
+        parameters, values = _parameter_values, _initial_values
+    integrator = _compiled_integrator(joints, model.has_drag, precision, order)
     with mp.workdps(100):
         used = len(integrator.pars)  # up to the last parameter that appears in the equations
-        integrator.pars[:] = [number(x) for x in _parameter_values(mp, model)[:used]]
-        integrator.state[:] = [number(x) for x in _initial_values(mp, model, state)]
+        integrator.pars[:] = [number(x) for x in parameters(mp, model)[:used]]
+        integrator.state[:] = [number(x) for x in values(mp, model, state)]
     integrator.time = number(0.0)
     return integrator, number
 
@@ -210,29 +222,28 @@ def _cross_matrix(mp: Any, s: Array) -> Any:
 
 
 @cache
-def _compiled_integrator(
-    rods: tuple[bool, ...], drag: bool, precision: Precision, order: int | None = None
-) -> Any:
-    """The Taylor integrator of a chain with that sequence of joints; None: the precision's own order.
+def _compiled_integrator(joints: _Joints, drag: bool, precision: Precision, order: int | None = None) -> Any:
+    """The Taylor integrator of a mechanism with these joints; order None: the precision's own.
 
     It is remembered with its machine code: to read it takes a third to a quarter of the time of compiling it.
     """
     hy = load_heyoka()
-    code = Path(__file__).read_bytes()
+    code = b"".join(Path(file).read_bytes() for file in (__file__, taylor_tree.__file__))
     key = content_key(
-        "Taylor", code, hy.__version__, processor_features(), repr((rods, drag, precision, order))
+        "Taylor", code, hy.__version__, processor_features(), repr((joints, drag, precision, order))
     )
     integrator = recall(key)
     if integrator is None:
-        integrator = _compile_integrator(hy, rods, drag, precision, order)
+        integrator = _compile_integrator(hy, joints, drag, precision, order)
         remember(key, integrator)
     return integrator
 
 
-def _compile_integrator(
-    hy: Any, rods: tuple[bool, ...], drag: bool, precision: Precision, order: int | None
-) -> Any:
-    system = _equations_of_motion(hy, rods, drag)
+def _compile_integrator(hy: Any, joints: _Joints, drag: bool, precision: Precision, order: int | None) -> Any:
+    if isinstance(joints, Topology):
+        system = taylor_tree.equations_of_motion(hy, joints)
+    else:
+        system = _equations_of_motion(hy, joints, drag)
     number = _number_conversion(precision)
     zero = number(0.0)
     # Unoptimised code takes two to three times as long to run and a tenth of the time to compile: for ten
@@ -257,14 +268,14 @@ class _Body:
         self.force_per_mass, self.moment = self.take(3), self.take(3)
         self.length, self.drag_force_per_mass, self.drag_moment = self.take(3)
         self.p, self.w, self.u, self.udot = (
-            _vector(hy.make_vars(*(f"{name}{i}_{k}" for i in range(size))))
+            vector(hy.make_vars(*(f"{name}{i}_{k}" for i in range(size))))
             for name, size in (("p", 4), ("w", 3), ("u", 3), ("d", 3))
         )
-        self.A = _rotation_matrix(self.p)
+        self.A = rotation_matrix(self.p)
 
     def take(self, count: int) -> Any:
         self.next_parameter += count
-        return _vector(self.hy.par[i] for i in range(self.next_parameter - count, self.next_parameter))
+        return vector(self.hy.par[i] for i in range(self.next_parameter - count, self.next_parameter))
 
     def centripetal(self, s: Any) -> Any:
         """ω′ × (ω′ × s) (3,), body frame."""
@@ -316,11 +327,11 @@ def _free_accelerations(
     hy: Any, rods: tuple[bool, ...], drag: bool, bodies: list[_Body]
 ) -> tuple[list[Any], list[Any], list[Any]]:
     """Without joint forces: ω̇′ (body frame), accelerations of proximal and distal points (world frame)."""
-    gravity = _vector(hy.par[i] for i in range(3))
+    gravity = vector(hy.par[i] for i in range(3))
     turn: list[Any] = []
     near_a: list[Any] = []
     far_a: list[Any] = []
-    v = _vector([hy.expression(0.0)] * 3)
+    v = vector([hy.expression(0.0)] * 3)
     for body, rod in zip(bodies, rods, strict=True):
         moment = body.moment - np.cross(body.w, body.J @ body.w)
         free = gravity + body.force_per_mass
@@ -354,7 +365,7 @@ def _joint_forces(
             coupling = -_project(directions[k - 1], above.A @ above.Ypd @ above.A.T, E)
         D = _project(E, D, E)
         if rods[k]:
-            e = _vector([body.u @ e - body.length * (body.udot @ body.udot)])
+            e = vector([body.u @ e - body.length * (body.udot @ body.udot)])
         if k:
             off.append(coupling)
             gain = np.stack([solves[-1](column) for column in coupling.T])
@@ -367,24 +378,6 @@ def _joint_forces(
         multiplier = solves[k](rhs[k] if multiplier is None else rhs[k] - off[k] @ multiplier)
         F[k] = multiplier[0] * bodies[k].u if rods[k] else multiplier
     return F
-
-
-def _vector(entries: Iterable[Any]) -> Any:
-    """One-dimensional array of objects, which may be arrays themselves."""
-    return np.fromiter(entries, dtype=object)
-
-
-def _rotation_matrix(p: Any) -> Any:
-    w, x, y, z = p
-    ww, xx, yy, zz = w * w, x * x, y * y, z * z
-    x2, y2, w2 = x + x, y + y, w + w  # no constant: quad arrays do not mix with Python's numbers
-    return _vector(
-        [
-            *(ww + xx - yy - zz, x2 * y - w2 * z, x2 * z + w2 * y),
-            *(x2 * y + w2 * z, ww - xx + yy - zz, y2 * z - w2 * x),
-            *(x2 * z - w2 * y, y2 * z + w2 * x, ww - xx - yy + zz),
-        ]
-    ).reshape(3, 3)
 
 
 def _project(E: Any, Y: Any, E2: Any) -> Any:
@@ -410,7 +403,7 @@ def _symmetric_solve(D: Any) -> Callable[[Any], Any]:
         y2 = b[2] - l20 * b[0] - l21 * y1
         x2 = y2 / d2
         x1 = y1 / d1 - l21 * x2
-        return _vector([b[0] / d0 - l10 * x1 - l20 * x2, x1, x2])
+        return vector([b[0] / d0 - l10 * x1 - l20 * x2, x1, x2])
 
     return solve
 
@@ -422,14 +415,31 @@ def _forward_kinematics(
     columns = iter(y.T)
     zero = y[:, 0] - y[:, 0]
     parts: dict[str, list[Any]] = {name: [] for name in ("p", "omega", "u", "udot", "r", "v")}
-    tip = tip_v = _vector([zero] * 3)
+    tip = tip_v = vector([zero] * 3)
     for k in range(model.n):
-        u, udot = (_vector([next(columns) if model.rods[k] else zero for _ in range(3)]) for _ in range(2))
-        p, w = _vector(next(columns) for _ in range(4)), _vector(next(columns) for _ in range(3))
-        A = _rotation_matrix(p)
+        u, udot = (vector([next(columns) if model.rods[k] else zero for _ in range(3)]) for _ in range(2))
+        p, w = vector(next(columns) for _ in range(4)), vector(next(columns) for _ in range(3))
+        A = rotation_matrix(p)
         r = tip + u * length[k] - A @ proximal[k]
         v = tip_v + udot * length[k] - A @ np.cross(w, proximal[k])
         tip, tip_v = r + A @ distal[k], v + A @ np.cross(w, distal[k])
         for part, value in zip(parts.values(), (p, w, u, udot, r, v), strict=True):
             part.append(np.stack(list(value), 1))
     return MinimalCoordinateRun(t=times, steps=steps, **{name: np.stack(x, 1) for name, x in parts.items()})
+
+
+def _tree_kinematics(model: Model, times: Array, samples: Any, steps: int) -> MinimalCoordinateRun:
+    """Coordinates by name and what follows from them; in extended precision where the samples have more."""
+    y = np.asarray(samples)
+    if y.dtype not in (np.dtype(float), np.dtype(np.longdouble)):
+        y = np.vectorize(lambda x: np.longdouble(str(x)), otypes=[np.longdouble])(y)
+    shape = {"p": 4, "x": 2, "xdot": 2}
+    names = ("p", "omega", "u", "udot", "r", "v", "x", "xdot")
+    parts = {name: np.zeros((len(times), model.n, shape.get(name, 3)), y.dtype) for name in names}
+    parts["p"][..., 0], at = 1, 0
+    for k, kind in enumerate(model.kind):
+        for name, size in taylor_tree.coordinate_names(kind):
+            parts[name][:, k, :size] = y[:, at : at + size]
+            at += size
+    p, omega, r, v = forward_kinematics(model, *parts.values())
+    return MinimalCoordinateRun(times, p, omega, parts["u"], parts["udot"], r, v, steps)
