@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from plumbline.judging.rows import RUN_FAMILY, SHOWN_STYLES
-from plumbline.model.datatypes import Array
-from plumbline.model.kinematics import quaternion_conjugate, quaternion_product
+from plumbline.model.datatypes import KINDS, Array, Model
+from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
 from plumbline.storage.results_schema import DamagedResults
 from reports.chunks import ChunkBuilder, decimate, decimate_times, log_scale_codes
 from reports.history import History
@@ -323,18 +323,27 @@ def rotation_vector(p: Array, p0: Array) -> Array:
 
 
 def _body_shapes(scenario: Record) -> list[Record]:
-    """Return each body's attachment points, rod, and the box with its principal moments."""
-    model = scenario["model"]
-    mass = np.asarray(model["mass"], dtype=float)
+    """Return each body's joint with its points and axes, and the box with its principal moments."""
+    model = Model.from_fields(scenario["model"])
+    mass = model.mass
     shapes = []
-    for k in range(len(mass)):
-        moments, axes = np.linalg.eigh(np.asarray(model["inertia"][k], dtype=float))
+
+    def axes_in(k: int, side: int, numbers: list[int]) -> list[list[float | None]]:
+        turned = rotation_matrix(model.turn[k, side])
+        return [[_json_number(x, 4) for x in turned[:, i]] for i in numbers]
+
+    for k, kind in enumerate(model.kind):
+        moving = [axis for _, axis in KINDS[kind].motions]  # the first in the far, the last in the near body
+        moments, axes = np.linalg.eigh(model.inertia[k])
         half = np.sqrt(np.clip(1.5 / mass[k] * (moments.sum() - 2 * moments), 0, None))
         shapes.append(
             {
-                "proximal": [_json_number(x) for x in model["proximal"][k]],
-                "distal": [_json_number(x) for x in model["distal"][k]],
-                "length": _json_number(model["length"][k]),
+                "joint": kind,
+                "far": int(model.body[k, 0]),
+                "hang": [_json_number(x) for x in model.point[k, 0]],
+                "near": [_json_number(x) for x in model.point[k, 1]],
+                "far_axes": axes_in(k, 0, moving[:-1]),
+                "near_axes": axes_in(k, 1, moving[-1:]),
                 "axes": [[_json_number(x, 4) for x in axis] for axis in axes.T],
                 "half": [_json_number(x, 4) for x in half],
             }

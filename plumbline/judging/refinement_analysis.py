@@ -10,6 +10,7 @@ import numpy as np
 
 from plumbline.engines.calls import RefinementRun
 from plumbline.judging.convergence import (
+    ORDER_MARGIN,
     ExtrapolatedLimit,
     ObservedOrder,
     observed_order,
@@ -176,12 +177,17 @@ class RefinementAnalysis:
         return bool(following <= wanted / 2 * (1 + 1e-12) and self.times[at] < wanted / 2 * (1 - 1e-12))
 
     def _observe_order(self) -> tuple[ObservedOrder, float]:
-        """The order in the longest window that shows one, and that window's end [s]."""
+        """The order in the longest window that shows one, and that window's end [s].
+
+        An order above the declared one counts only where no shorter window shows the declared one: late in a
+        sensitive motion the next power of the step may outgrow the leading one down to the finest step.
+        """
         tried = []
         for number in self.window_lengths(self.horizon):
             floor = float(self.rounding[number - 1] / 8)  # trials found 115 ε G at most, an eighth of it
             order = observed_order([y[:number] for y in self.scaled_states], floor, self.integrator.order)
             tried.append((order, float(self.times[number - 1])))
-            if order.is_asymptotic or order.is_at_rounding_floor:
+            is_high = order.value is not None and order.value > self.integrator.order + ORDER_MARGIN
+            if order.is_at_rounding_floor or (order.is_asymptotic and not is_high):
                 return tried[-1]
-        return tried[0]
+        return next((found for found in tried if found[0].is_asymptotic), tried[0])

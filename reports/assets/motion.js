@@ -198,8 +198,8 @@ export function motion(data, o) {
     let apart = 0;
     for (let k = 0; k < m.bodies; k++) apart = Math.max(apart, Math.hypot(difference[6 * k], difference[6 * k + 1], difference[6 * k + 2]));
     view.note.textContent = isBase ? "the base of the differences" : `${number(apart)} m from ${o.titleOf(m.base[0])}`;
-    if (magnify !== null && !isBase) chain(context, see, m, poses, ink("--soft"), true, scene);
-    chain(context, see, m, displaced(poses, difference, magnify === null ? 1 : 10 ** magnify), ink(view.colour), false, scene);
+    if (magnify !== null && !isBase) tree(context, see, m, poses, ink("--soft"), true, scene);
+    tree(context, see, m, displaced(poses, difference, magnify === null ? 1 : 10 ** magnify), ink(view.colour), false, scene);
   }
 
   function drawAll() {
@@ -260,13 +260,17 @@ export function motion(data, o) {
   };
 }
 
-/** Middle and radius of the space that the base run moves in. @param {MotionData} m */
+/** Middle and radius of the space that the base run moves in; free bodies beside a mechanism may leave it. @param {MotionData} m */
 function bounds(m) {
   /** @type {Vec} */
   const low = [0, 0, 0];
   /** @type {Vec} */
   const high = [0, 0, 0];
+  /** @type {(k: number) => string} joint at the world of a body's branch */
+  const root = (k) => (m.shape[k].far < 0 ? m.shape[k].joint : root(m.shape[k].far));
+  const held = m.shape.map((_, k) => root(k) !== "free");
   for (let i = 0; i < m.r.length; i++) {
+    if (held.includes(true) && !held[Math.floor(i / 3) % m.bodies]) continue;
     const v = (m.r[i] * m.span) / 32767;
     low[i % 3] = Math.min(low[i % 3], v);
     high[i % 3] = Math.max(high[i % 3], v);
@@ -348,22 +352,23 @@ function trail(context, see, m, now) {
 const FACES = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]];
 
 /**
- * Pivot, rods, arms and bodies (boxes with the bodies' own principal moments), far ones first.
+ * Joints with their axes, rods, arms and bodies (boxes with the bodies' own principal moments), far ones first.
  * @param {CanvasRenderingContext2D} context @param {See} see @param {MotionData} m @param {Pose[]} poses @param {string} colour @param {boolean} ghost @param {Scene} scene
  */
-function chain(context, see, m, poses, colour, ghost, scene) {
+function tree(context, see, m, poses, colour, ghost, scene) {
   const paper = ink("--card");
   /** @type {{ depth: number, paint: () => void }[]} */
   const parts = [];
-  /** @type {Vec} */
-  let attachment = [0, 0, 0];
   const dense = m.bodies > 12;
   poses.forEach(({ r, q }, k) => {
     const shape = m.shape[k];
-    const near = add(r, turn(q, shape.proximal));
-    const far = add(r, turn(q, shape.distal));
-    const [a, b, c, d] = [see(attachment), see(near), see(r), see(far)];
-    const rod = shape.length > 0;
+    const parent = shape.far < 0 ? null : poses[shape.far];
+    const hang = parent ? add(parent.r, turn(parent.q, shape.hang)) : shape.hang;
+    const near = shape.joint === "free" ? r : add(r, turn(q, shape.near));
+    const [a, b, c] = [see(hang), see(near), see(r)];
+    const [free, rod] = [shape.joint === "free", shape.joint === "rod" || shape.joint === "slide" || shape.joint === "cylindrical"];
+    const lines = [...shape.far_axes.map((axis) => [hang, parent ? turn(parent.q, axis) : axis]), ...shape.near_axes.map((axis) => [near, turn(q, axis)])]
+      .map(([at, axis]) => [add(at, axis, -0.08 * scene.radius), add(at, axis, 0.08 * scene.radius)].map(see));
     parts.push({ depth: Math.max(a[2], b[2]), paint: () => {
       context.strokeStyle = colour;
       context.globalAlpha = ghost ? 0.55 : 1;
@@ -373,9 +378,13 @@ function chain(context, see, m, poses, colour, ghost, scene) {
         polyline(context, [a, b]);
       }
       context.lineWidth = ghost ? 1 : dense ? 2 : 1.2;
-      polyline(context, k < m.bodies - 1 ? [b, c, d] : [b, c]);
+      polyline(context, [b, c]);
+      if (parent && !free) polyline(context, [see(parent.r), a]);
       context.setLineDash([]);
-      if (!ghost && !dense) {
+      if (!ghost && !dense && !free) {
+        context.strokeStyle = ink("--ink");
+        for (const line of lines) polyline(context, line);
+        context.strokeStyle = colour;
         context.fillStyle = paper;
         for (const [x, y] of rod ? [a, b] : [b]) {
           context.beginPath();
@@ -416,20 +425,25 @@ function chain(context, see, m, poses, colour, ghost, scene) {
         } });
       }
     }
-    attachment = far;
   });
   parts.sort((a, b) => b.depth - a.depth).forEach((part) => part.paint());
   if (ghost) return;
-  const [x, y] = see([0, 0, 0]);
   context.fillStyle = ink("--ink");
-  context.beginPath();
-  context.moveTo(x, y);
-  context.lineTo(x - 6, y - 9);
-  context.lineTo(x + 6, y - 9);
-  context.fill();
+  for (const shape of m.shape.filter((one) => one.far < 0 && one.joint !== "free")) {
+    const [x, y] = see(shape.hang);
+    context.beginPath();
+    context.moveTo(x, y);
+    context.lineTo(x - 6, y - 9);
+    context.lineTo(x + 6, y - 9);
+    context.fill();
+  }
   context.strokeStyle = ink("--soft");
   context.globalAlpha = 0.25;
   context.lineWidth = 2;
-  polyline(context, [/** @type {Vec} */ ([0, 0, 0]), ...poses.map((pose) => pose.r)].map((v) => see([v[0], v[1], scene.ground]))); // shadow
+  poses.forEach(({ r }, k) => { // shadow
+    const { joint, far, hang } = m.shape[k];
+    const from = joint === "free" ? r : far < 0 ? hang : poses[far].r;
+    polyline(context, [from, r].map((v) => see([v[0], v[1], scene.ground])));
+  });
   context.globalAlpha = 1;
 }

@@ -24,7 +24,8 @@ export interface CurveSet {
 }
 
 export type Vec = [number, number, number];
-export interface Shape { proximal: Vec; distal: Vec; length: number; axes: Vec[]; half: Vec }
+/** Far body (−1 the world) and point, near point, and joint axes in the far and in the near body. */
+export interface Shape { joint: string; far: number; hang: Vec; near: Vec; far_axes: Vec[]; near_axes: Vec[]; axes: Vec[]; half: Vec }
 export interface MotionData {
   t: Float32Array; bodies: number; base: [string, string]; span: number; r: Int16Array; p: Int16Array; shape: Shape[];
   runs: { engine: string; integrator: string; scale: Float32Array; d: Int8Array }[];
