@@ -300,7 +300,7 @@ def choose_scenarios(names: Sequence[str], families: Sequence[str]) -> list[scen
 
 
 def require_chains(found: Sequence[scenarios.Scenario]) -> list[scenarios.Scenario]:
-    """Refuse trees, which are compared at state level only.
+    """Refuse trees, for commands that cover chains.
 
     Args:
         found: scenarios that the user named.

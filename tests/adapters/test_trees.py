@@ -105,13 +105,6 @@ def test_an_engine_that_builds_no_trees_gives_the_reason(engine):
         load_adapter(engine).evaluate(model, random_states(model, 1, 0))
 
 
-def test_motions_of_trees_are_refused():
-    model = random_tree(np.random.default_rng(0), 3, ("hinge",))
-    (state,) = random_states(model, 1, 0)
-    with pytest.raises(Unsupported, match="chains of rods and balls"):
-        load_adapter("mujoco").simulate(model, state, np.array([0.0, 0.25]), "RK4", 0.125)
-
-
 def turned(model, k, side, axis):
     """The joint's axes in one body turned by 1e-7 rad about one of themselves."""
     turn = model.turn.copy()

@@ -1,0 +1,112 @@
+"""The O(bodies) form of trees against the direct form, on and off the manifold."""
+
+import numpy as np
+import pytest
+
+from plumbline.model.datatypes import KINDS
+from plumbline.model.kinematics import quaternion_rate
+from plumbline.model.sampling import random_states
+from reference_impl.collocation import integrate_collocation
+from reference_impl.direct import DirectSystem
+from reference_impl.errors import SingularSystem
+from reference_impl.euler_parameters import dot
+from reference_impl.integrate import integrate_dop853
+from reference_impl.joints import constraint_rows
+from reference_impl.structured import StructuredSystem, component_first
+from reference_impl.tree_elimination import TreeSystem, eliminated_system
+from tests.helpers.random_chains import random_model
+from tests.helpers.random_trees import random_tree
+
+
+def off_manifold(model, seed, size):
+    """A state whose coordinates and rates are all off by ``size``."""
+    rng = np.random.default_rng(seed)
+    (state,) = random_states(model, 1, seed)
+    parts = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+    return [x + size * rng.normal(size=x.shape) for x in parts]
+
+
+def accelerations(system, parts):
+    r, p, v, pdot = parts
+    a = system.acceleration(component_first(r, p), component_first(v, pdot))
+    return np.concatenate([a[:3].T.ravel(), a[3:].T.ravel()])
+
+
+@pytest.mark.parametrize("size", [0.0, 0.1])
+@pytest.mark.parametrize("seed", range(12))
+def test_accelerations_are_those_of_the_direct_form(seed, size):
+    model = random_tree(np.random.default_rng(seed), 7)
+    parts = off_manifold(model, seed, size)
+    expected = DirectSystem(model).solve_unknowns(*parts)[0][: 7 * model.n]
+    found = accelerations(TreeSystem([model]), parts)
+    np.testing.assert_allclose(found, expected, atol=1e-12 * np.max(np.abs(expected)))
+
+
+def test_trees_side_by_side_do_not_touch_each_other():
+    models = [random_tree(np.random.default_rng(seed), n) for seed, n in enumerate((3, 1, 5))]
+    models[1] = models[1].changed(gravity=np.array([1.0, 2.0, 3.0]))
+    parts = [off_manifold(model, 1, 0.05) for model in models]
+    together = [np.concatenate(part) for part in zip(*parts, strict=True)]
+    system = TreeSystem(models)
+    both = (
+        TreeSystem(models)
+        .repeated(2)
+        .acceleration(np.tile(component_first(*together[:2]), 2), np.tile(component_first(*together[2:]), 2))
+    )
+    once = system.acceleration(component_first(*together[:2]), component_first(*together[2:]))
+    assert np.array_equal(both, np.tile(once, 2))
+    for model, own, first in zip(models, parts, system.first_body, strict=False):
+        alone = TreeSystem([model]).acceleration(component_first(*own[:2]), component_first(*own[2:]))
+        np.testing.assert_allclose(once[:, first : first + model.n], alone, rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_projection_ends_on_the_constraints(kind):
+    model = random_tree(np.random.default_rng(3), 5, (kind,))
+    r, p, v, pdot = off_manifold(model, 4, 1e-5)
+    q, qdot = TreeSystem([model]).project(component_first(r, p), component_first(v, pdot))
+    rows = constraint_rows(model, q[:3].T, q[3:].T, qdot[:3].T, qdot[3:].T)
+    rate = rows.constraint_rate(qdot[:3].T, qdot[3:].T)
+    assert np.max(np.abs(np.concatenate([rows.C, rate])), initial=0.0) < 2e-14
+    assert np.max(np.abs(dot(q[3:].T, q[3:].T) - 1)) < 1e-15
+    assert np.max(np.abs(q - component_first(r, p))) < 1e-3
+
+
+def test_baumgarte_damps_constraint_errors():
+    """C̈ + 2 a Ċ + a² C = 0, row by row, by differences along the motion."""
+    model, a, h = random_tree(np.random.default_rng(8), 5), 3.0, 1e-5
+    parts = off_manifold(model, 2, 1e-3)
+    q, v = component_first(*parts[:2]), component_first(*parts[2:])
+    acceleration = TreeSystem([model]).acceleration(q, v, baumgarte=a)
+
+    def rate(t):
+        at, moving = q + t * v + t * t / 2 * acceleration, v + t * acceleration
+        rows = constraint_rows(model, at[:3].T, at[3:].T, moving[:3].T, moving[3:].T)
+        return rows.C, rows.constraint_rate(moving[:3].T, moving[3:].T)
+
+    (C, first), ahead, back = rate(0.0), rate(h)[1], rate(-h)[1]
+    np.testing.assert_allclose((ahead - back) / (2 * h), -2 * a * first - a * a * C, atol=1e-6)
+
+
+def test_both_integrators_agree_on_a_tree():
+    """The direct form with DOP853 and the O(bodies) form with collocation."""
+    model = random_tree(np.random.default_rng(6), 5)
+    start, times = off_manifold(model, 6, 0.0), np.array([0.0, 0.2, 0.5])
+    one = integrate_collocation([model], *start, times, 1e-12)
+    other = integrate_dop853(model, *start, times, 1e-12)
+    np.testing.assert_allclose(one.r, other.r, atol=1e-9)
+    np.testing.assert_allclose(one.p, other.p, atol=1e-9)
+
+
+def test_chains_keep_their_own_form():
+    chain = random_model(np.random.default_rng(0), [1, 0])
+    tree = random_tree(np.random.default_rng(0), 2, ("hinge",))
+    assert isinstance(eliminated_system([chain]), StructuredSystem)
+    assert isinstance(eliminated_system([chain, tree]), TreeSystem)
+
+
+def test_a_singular_body_is_an_error():
+    model = random_tree(np.random.default_rng(0), 3, ("hinge",))
+    flat = model.changed(mass=0 * model.mass, inertia=0 * model.inertia)
+    with pytest.raises(SingularSystem):
+        accelerations(TreeSystem([flat]), off_manifold(model, 0, 0.0))
