@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from plumbline.storage.results_store import write_atomically
@@ -28,29 +29,45 @@ def write(results: Results) -> Path:
     totals = {"tests": 0, "failures": 0, "errors": 0, "skipped": 0}
     for name, scenario in results.scenarios.items():
         found = [results.rows[place] for place in results.row_indices[name]]
-        rows = [row for row in found if row["verdict"] != "information"]
-        suite = ET.SubElement(suites, "testsuite", name=name, timestamp=str(results.run["started"])[:19])
-        properties = {
-            "family": scenario["family"],
-            "run": str(results.run["sentence"]),
-            "information": str(len(found) - len(rows)),
-        }
-        element = ET.SubElement(suite, "properties")
-        for key, value in properties.items():
-            ET.SubElement(element, "property", name=key, value=value)
-        counted = dict.fromkeys(totals, 0)
-        for row in rows:
-            outcome = _add_test_case(suite, row)
-            counted["tests"] += 1
-            if outcome:
-                counted[outcome] += 1
-        suite.attrib |= {k: str(v) for k, v in counted.items()}
-        suite.set("time", f"{sum(row['cpu_time'] for row in rows):.3f}")
+        about = {"family": scenario["family"], "run": str(results.run["sentence"])}
+        suite, counted = add_suite(suites, name, found, about)
+        suite.set("timestamp", str(results.run["started"])[:19])
         totals = {k: v + counted[k] for k, v in totals.items()}
     suites.attrib |= {k: str(v) for k, v in totals.items()}
     path = results.folder / "junit.xml"
     write_atomically(path, ET.tostring(suites, encoding="utf-8", xml_declaration=True))
     return path
+
+
+def add_suite(
+    suites: ET.Element, name: str, found: Sequence[Record], properties: Mapping[str, str]
+) -> tuple[ET.Element, dict[str, int]]:
+    """Add a suite with a test case per check.
+
+    Args:
+        suites: the root element.
+        name: of the suite.
+        found: all rows; those that are information are only counted, in a property.
+        properties: further properties of the suite.
+
+    Returns:
+        The suite, and how many tests, failures, errors and skipped tests it has.
+
+    """
+    rows = [row for row in found if row["verdict"] != "information"]
+    suite = ET.SubElement(suites, "testsuite", name=name)
+    element = ET.SubElement(suite, "properties")
+    for key, value in {**properties, "information": str(len(found) - len(rows))}.items():
+        ET.SubElement(element, "property", name=key, value=value)
+    counted = {"tests": 0, "failures": 0, "errors": 0, "skipped": 0}
+    for row in rows:
+        outcome = _add_test_case(suite, row)
+        counted["tests"] += 1
+        if outcome:
+            counted[outcome] += 1
+    suite.attrib |= {k: str(v) for k, v in counted.items()}
+    suite.set("time", f"{sum(row['cpu_time'] for row in rows):.3f}")
+    return suite, counted
 
 
 def _add_test_case(suite: ET.Element, row: Record) -> str | None:

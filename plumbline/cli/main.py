@@ -32,6 +32,7 @@ Start with:
 COMMANDS = {  # where each is, and its line in the list; imported when it is typed: all of them take a second
     "list": ("scenario_commands:list_", "List scenarios or engines."),
     "run": ("run_commands:run", "Compare scenarios on engines."),
+    "model": ("model_commands:model", "Compare what importers make of a URDF or MJCF file."),
     "nightly": ("run_commands:nightly", "Run everything unattended and keep the history."),
     "sweep": ("study_commands:sweep", "Vary a scenario's parameters."),
     "drift": ("study_commands:drift", "Measure constraint and energy drift over long times."),

@@ -239,10 +239,28 @@ def read_known_issues(files: Sequence[Path], chosen: Sequence[scenarios.Scenario
         The entries of all files.
 
     """
+    return _read_known_issues((KNOWN_ISSUES_FILE, *files), [s.name for s in chosen])
+
+
+def read_user_known_issues(files: Sequence[Path], names: Sequence[str]) -> list[KnownIssue]:
+    """Load the user's known issues of model files; exit with 2 where a file has a problem.
+
+    Args:
+        files: files of the user.
+        names: the model files as typed, which entries may name as their scenario.
+
+    Returns:
+        The entries of all files.
+
+    """
+    return _read_known_issues(files, names)
+
+
+def _read_known_issues(files: Sequence[Path], names: Sequence[str]) -> list[KnownIssue]:
     found: list[KnownIssue] = []
-    for path in (KNOWN_ISSUES_FILE, *files):
+    for path in files:
         try:
-            entries = load_known_issues(path, [s.name for s in chosen])
+            entries = load_known_issues(path, names)
         except ScenarioError as error:
             exit_on_bad_file(error)
         twice = {entry.id for entry in entries} & {entry.id for entry in found}

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.importers.lumping import lump_fixed_bodies
+from plumbline.importers.lumping import fixed_parts, lump_fixed_bodies, merge_bodies
 from plumbline.importers.neutral_model import (
     CanonicalState,
     ElementaryJoint,
@@ -58,6 +58,8 @@ class Change:
     own: Any  # as the file says
     theirs: Any  # as the importer reads it
     source: Source
+    also: Mapping[str, Any] | None = None  # what changes with it in the body that carries it
+    carrier: str = ""  # the body that this one is fixed to, where it is not the body itself
     is_omitted: bool = False  # the importer's description has the file's value, its dynamics leave it out
 
     @property
@@ -114,7 +116,7 @@ def explain_importer(
     """
     structure, moved = _with_joints_of(model, reading)
     own, theirs = lump_fixed_bodies(moved), lump_fixed_bodies(reading)
-    changes = differences(own, theirs)
+    changes = _single_parts(differences(own, theirs), moved, theirs)
     trial = _Trial(own, theirs, reading, answers, states, bool(structure))
     found = trial.smallest(changes)
     if found is None:
@@ -143,6 +145,49 @@ def _with_joints_of(model: NeutralModel, reading: NeutralModel) -> tuple[list[Ch
             body = replace(body, joints=theirs)
         bodies.append(body)
     return changes, replace(model, bodies=tuple(bodies))
+
+
+def _single_parts(changes: Sequence[Change], model: NeutralModel, theirs: NeutralModel) -> list[Change]:
+    """Replace changes of a lumped body's mass, centre and inertia by the one of its parts that makes them."""
+    named = {body.name: body for body in theirs.bodies}
+    found = list(changes)
+    for name, parts in fixed_parts(model).items():
+        inertial = [c for c in found if c.body == name and c.field in ("mass", "center", "inertia")]
+        if not inertial or len(parts) == 1:
+            continue
+        single = _single_part(parts, named[name])
+        if single is not None:
+            found = [single, *(c for c in found if c not in inertial)]
+    return found
+
+
+def _single_part(parts: Sequence[tuple[NeutralBody, Array, Array]], read: NeutralBody) -> Change | None:
+    """The one part whose mass, centre or whole inertial explains a lumped body; None where there is none."""
+    lumped = _merge(parts)
+    also = {name: getattr(read, name) for name in ("mass", "center", "inertia")}
+    for place, (part, _, A) in enumerate(parts):
+        trials: list[tuple[str, dict[str, Any]]] = [("mass", {"mass": part.mass + read.mass - lumped.mass})]
+        if part.mass:
+            moment = read.mass * read.center - lumped.mass * lumped.center
+            trials.append(("center", {"center": part.center + A.T @ moment / part.mass}))
+        trials.append(("inertial", {"mass": 0.0, "center": np.zeros(3), "inertia": np.zeros((3, 3))}))
+        for name, values in trials:
+            changed = [*parts[:place], (replace(part, **values), *parts[place][1:]), *parts[place + 1 :]]
+            one = _merge(changed)
+            size = float(np.linalg.norm(one.center))
+            if not any(_differs(getattr(one, n), value, size * (n == "center")) for n, value in also.items()):
+                own, new = (part.mass, 0.0) if name == "inertial" else (getattr(part, name), values[name])
+                source = part.fields.get(name, part.source)
+                carrier = parts[0][0].name
+                return Change(name, part.name, "", own, new, source, also=also, carrier=carrier)
+    return None
+
+
+def _merge(parts: Sequence[tuple[NeutralBody, Array, Array]]) -> NeutralBody:
+    body = parts[0][0]
+    for added in parts[1:]:
+        body = merge_bodies(body, *added)
+    return body
 
 
 def _kinds(joints: Sequence[ElementaryJoint]) -> list[tuple[str, str]]:
@@ -288,14 +333,24 @@ def omissions(model: NeutralModel) -> list[list[Change]]:
     groups = []
     for field in OMITTED_FIELDS:
         group = [
-            Change(field, body.name, joint.name, value, 0.0, joint.fields.get(field, joint.source), True)
+            Change(
+                field,
+                body.name,
+                joint.name,
+                value,
+                0.0,
+                joint.fields.get(field, joint.source),
+                is_omitted=True,
+            )
             for body in model.bodies
             for joint in body.joints
             if (value := getattr(joint, field))
         ]
         groups += [group] if group else []
     if np.any(model.gravity):
-        groups.append([Change("gravity", "", "", model.gravity, np.zeros(3), model.gravity_source, True)])
+        groups.append(
+            [Change("gravity", "", "", model.gravity, np.zeros(3), model.gravity_source, is_omitted=True)]
+        )
     return groups
 
 
@@ -331,7 +386,8 @@ def apply_changes(own: NeutralModel, theirs: NeutralModel, changes: Sequence[Cha
             )
             bodies[change.body] = replace(body, joints=joints)
         else:
-            bodies[change.body] = replace(bodies[change.body], **{change.field: change.theirs})
+            name = change.carrier or change.body
+            bodies[name] = replace(bodies[name], **(change.also or {change.field: change.theirs}))
     return replace(own, bodies=_ordered(bodies, parents), gravity=gravity)
 
 
@@ -372,6 +428,9 @@ def _describe(members: Sequence[Change]) -> str:
     if first.field == "additional body":
         names = ", ".join(change.body for change in members[:6])
         return f"adds {'body' if len(members) == 1 else 'bodies'} {names}"
+    if first.field == "inertial":
+        names = ", ".join(f"{change.body} ({change.own:.4g} kg, {change.source})" for change in members[:6])
+        return f"leaves out the mass and inertia of {names}, fixed to body {first.carrier}"
     if first.field == "joints":
         return "; ".join(
             f"reads the joints of body {c.body} as {_joint_words(c.theirs)}; "

@@ -101,6 +101,21 @@ def declared_attribute(engine: str, attribute: str) -> Any:
     return _read_attribute(module, class_name, attribute)
 
 
+def declared_importer_attribute(importer: str, attribute: str) -> Any:
+    """Read a literal class attribute of an importer column without importing it.
+
+    Args:
+        importer: name in the registry of importers.
+        attribute: name of a class attribute.
+
+    Returns:
+        Its value; None where no class declares it.
+
+    """
+    module, _, class_name = IMPORTERS[importer].partition(":")
+    return _read_attribute(module, class_name, attribute)
+
+
 def _read_attribute(module: str, class_name: str, attribute: str) -> Any:
     """Read an attribute in the source of a class, or of the first of its bases that has it."""
     source = ROOT / f"{module.replace('.', '/')}.py"
@@ -186,8 +201,7 @@ def importer_interpreter(name: str) -> str:
     base, version = split_version(name)
     if version:
         return ensure_interpreter(name)
-    module, _, class_name = IMPORTERS[base].partition(":")
-    folder = _read_attribute(module, class_name, "environment")
+    folder = declared_importer_attribute(base, "environment")
     if not folder:
         return ""
     python = _interpreter_path(ROOT / folder)

@@ -8,7 +8,7 @@ import platform
 import subprocess
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -338,17 +338,34 @@ def exit_code(result: RunResult) -> ExitCode:
         result: the run.
 
     Returns:
+        As `exit_code_of_rows`.
+
+    """
+    return exit_code_of_rows(
+        result.rows, has_stale_issues=bool(result.stale_issues), has_comparison=has_comparison(result)
+    )
+
+
+def exit_code_of_rows(rows: Iterable[Row], *, has_stale_issues: bool, has_comparison: bool) -> ExitCode:
+    """Return the exit code that judged rows demand.
+
+    Args:
+        rows: all rows, or those that need a look.
+        has_stale_issues: whether a known issue no longer occurs.
+        has_comparison: whether anything was compared.
+
+    Returns:
         5 where the truth is in doubt or missing; else 3 where an engine failed unexpectedly; else 1 for other
         unexpected verdicts, a stale known issue, or where nothing was compared; else 0.
 
     """
-    new = {row.verdict for row in result.rows if row.known_issue is None}
+    new = {row.verdict for row in rows if row.known_issue is None}
     if Verdict.HARNESS_FAILED in new:
         return ExitCode.HARNESS_FAILED
     if Verdict.FAILED in new:
         return ExitCode.ENGINE_FAILED
-    is_good = not any(verdict.needs_attention for verdict in new) and not result.stale_issues
-    return ExitCode.SUCCESS if is_good and has_comparison(result) else ExitCode.DISAGREEMENT
+    is_good = not any(verdict.needs_attention for verdict in new) and not has_stale_issues
+    return ExitCode.SUCCESS if is_good and has_comparison else ExitCode.DISAGREEMENT
 
 
 def has_comparison(result: RunResult) -> bool:

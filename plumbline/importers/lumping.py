@@ -21,6 +21,24 @@ def lump_fixed_bodies(model: NeutralModel) -> NeutralModel:
         A model whose bodies all have joints; what is fixed to the world is left out.
 
     """
+    return _lumped(model)[0]
+
+
+def fixed_parts(model: NeutralModel) -> dict[str, list[tuple[NeutralBody, Array, Array]]]:
+    """List the bodies that `lump_fixed_bodies` lumps into each body, that body first.
+
+    Args:
+        model: any model.
+
+    Returns:
+        By name of the carrying body: the body, its position and its rotation matrix in the carrier.
+
+    """
+    return _lumped(model)[1]
+
+
+def _lumped(model: NeutralModel) -> tuple[NeutralModel, dict[str, list[tuple[NeutralBody, Array, Array]]]]:
+    parts: dict[str, list[tuple[NeutralBody, Array, Array]]] = {}
     carrier: list[int] = []  # index of the new body that carries the old one; −1: the world
     pose: list[tuple[Array, Array]] = []  # of the old body in its carrier: position, quaternion
     bodies: list[NeutralBody] = []
@@ -33,18 +51,31 @@ def lump_fixed_bodies(model: NeutralModel) -> NeutralModel:
             attitude = quaternion_product(turn, attitude)
         if body.joints:
             bodies.append(replace(body, parent=onto, position=position, attitude=attitude))
+            parts[body.name] = [(body, np.zeros(3), np.eye(3))]
             carrier.append(len(bodies) - 1)
             pose.append((np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])))
             continue
         carrier.append(onto)
         pose.append((position, attitude))
         if onto >= 0:
-            bodies[onto] = _merged(bodies[onto], body, position, rotation_matrix(attitude))
-    return replace(model, bodies=tuple(bodies))
+            parts[bodies[onto].name].append((body, position, rotation_matrix(attitude)))
+            bodies[onto] = merge_bodies(bodies[onto], body, position, rotation_matrix(attitude))
+    return replace(model, bodies=tuple(bodies)), parts
 
 
-def _merged(body: NeutralBody, added: NeutralBody, position: Array, A: Array) -> NeutralBody:
-    """A body with the mass of another one that is fixed to it."""
+def merge_bodies(body: NeutralBody, added: NeutralBody, position: Array, A: Array) -> NeutralBody:
+    """Give a body the mass of another one that is fixed to it.
+
+    Args:
+        body: the carrier.
+        added: the body that is fixed to it.
+        position: of the added body's frame (3,) [m] in the carrier's.
+        A: rotation matrix (3, 3), added body → carrier.
+
+    Returns:
+        The carrier with the mass, centre of mass and inertia of both.
+
+    """
     mass = body.mass + added.mass
     center = position + A @ added.center
     middle = (body.mass * body.center + added.mass * center) / mass if mass else body.center

@@ -126,7 +126,7 @@ def _format_of(tree: Element, shown: str) -> Format:
         return _ROOT_TAGS[tree.tag]
     message, hint = f"its root element is <{shorten(tree.tag)}>", ""
     if tree.tag in ("sdf", "world", "model"):
-        message, hint = "is an SDF file", "convert it to URDF (gz sdf prints SDF, sdformat_urdf reads it)"
+        message, hint = "is an SDF file", "convert it to URDF, or name the URDF that it was made from"
     elif tree.tag == "mujocoinclude":
         hint = "name the file that includes it"
     problem = Problem(shown, tree.source.line, 1, "", message, "<robot> (URDF) or <mujoco> (MJCF)", hint)

@@ -22,7 +22,7 @@ With q the coordinates of an engine and v_e = T v its velocities: M = TᵀM_eT, 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from plumbline.model.datatypes import Array
@@ -150,3 +150,22 @@ class ModelQuantities:
     acceleration: Array | None = None  # (n,) v̇ without friction loss, contacts, limits, actuators
     kinetic_energy: float | None = None  # J: ½ vᵀMv, with armature
     potential_energy: float | None = None  # J: −Σ m g·c of gravity alone, zero at the world's origin
+
+
+def without_passive_forces(model: NeutralModel) -> NeutralModel:
+    """Leave dampers and springs out, for engines whose equations do not have them.
+
+    Args:
+        model: any model.
+
+    Returns:
+        The model without them; the same object where it has none.
+
+    """
+    if not any(joint.damping or joint.stiffness for joint in model.joints):
+        return model
+    bodies = tuple(
+        replace(body, joints=tuple(replace(j, damping=0.0, stiffness=0.0) for j in body.joints))
+        for body in model.bodies
+    )
+    return replace(model, bodies=bodies)

@@ -34,7 +34,8 @@ from pydantic import (
 )
 
 from plumbline.engines.declared_names import declared_integrators, declared_texts
-from plumbline.engines.registry import ENGINES
+from plumbline.engines.registry import ENGINES, IMPORTERS
+from plumbline.judging.model_file import MODEL_UNITS
 from plumbline.judging.relation_result import REPEATABILITY
 from plumbline.judging.rows import Level, Row, Verdict
 from plumbline.judging.run_relations import REVERSED_IN_TIME
@@ -51,7 +52,7 @@ from plumbline.truth.step_comparison import CONSTRAINED_UNITS, STEP_UNITS
 
 RowKind = tuple[str, str, str, str, str]  # of a row: engine, its version, level, integrator, quantity
 KNOWN_ISSUES_FILE = Path(__file__).with_name("known_issues.yaml")
-LEVELS: tuple[Level, ...] = ("state", "step", "invariants", "trajectory", "relations")
+LEVELS: tuple[Level, ...] = ("state", "step", "invariants", "trajectory", "relations", "model")
 ANY_LENGTH = 10**9  # bodies
 
 # Relations that give the same problem to the same algorithm in other numbers: only rounding can differ.
@@ -334,7 +335,7 @@ def _name_problems(source: YamlSource, entries: Sequence[_Entry], others: set[st
     seen: set[str] = set()
     known: dict[str, set[str]] = {
         "scenario": {*catalogue(), *others, f"{RANDOM_FAMILY}-1-1", f"{MOTION_PREFIX}1-1"},
-        "engine": set(ENGINES),
+        "engine": {*ENGINES, *IMPORTERS},
         "shown_by": set(ENGINES),
         "level": set(map(str, LEVELS)),
         "integrator": {"-", *declared_integrators()},
@@ -370,7 +371,17 @@ def _quantities() -> set[str]:
     relations = (*(r.name for r in STATE_RELATIONS), WELDED_HALVES, REVERSED_IN_TIME, REPEATABILITY)
     others = *(f"as {name}" for name in ENGINES), *(f"by {text}" for text in declared_texts())
     steps = (*STEP_UNITS, *CONSTRAINED_UNITS)
-    return {"all", *STATE_UNITS, *steps, *trajectory, *INVARIANT_UNITS, *long_runs, *relations, *others}
+    return {
+        "all",
+        *STATE_UNITS,
+        *MODEL_UNITS,
+        *steps,
+        *trajectory,
+        *INVARIANT_UNITS,
+        *long_runs,
+        *relations,
+        *others,
+    }
 
 
 class KnownIssues:

@@ -68,9 +68,8 @@ def certify_model(model: NeutralModel, state: CanonicalState) -> CertifiedModelQ
         sharp = all(
             float(x.rad()) <= MAX_RELATIVE_RADIUS * max(limit, MIN_MAGNITUDE)
             for name, ball in balls.items()
-            for x, limit in zip(
-                flatten(ball or []), np.ravel(certified.tolerance.get(name, 0.0)), strict=True
-            )
+            if ball
+            for x, limit in zip(flatten(ball), np.ravel(certified.tolerance[name]), strict=True)
         )
         if (sharp and balls["acceleration"] is not None) or bits >= MAX_BITS:
             return certified
@@ -214,6 +213,7 @@ def _enclose(c: _BallModel) -> tuple[dict[str, Any], dict[str, Array]]:
             rates = entries(M.solve(c.mat(len(h), 1, [f - b for f, b in zip(passive, h, strict=True)])))
         except ZeroDivisionError:
             rates = []
+        rates = rates if all(rate.is_finite() for rate in rates) else []
     balls = {
         "mass_matrix": M.tolist() if gravity else [],
         "bias_force": h,
@@ -266,7 +266,7 @@ def _rotation_vector(c: _BallModel, q: Array) -> list[Any]:
     length = c.dot(vector, vector).sqrt()
     if not np.any(q[1:]):
         return entries(vector)
-    return entries(vector * (2 * length.atan2(scalar) / length))
+    return entries(vector * (2 * c.arb.atan2(length, scalar) / length))
 
 
 @dataclass(frozen=True, eq=False)

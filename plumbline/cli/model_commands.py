@@ -1,0 +1,280 @@
+"""The command `model`: one URDF or MJCF file, every engine's importer."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.markup import escape
+from rich.table import Table
+
+from plumbline import __version__
+from plumbline.cli import options
+from plumbline.cli.console import ProgressDisplay, count_noun, make_console
+from plumbline.cli.help_texts import EXIT_CODES, examples
+from plumbline.cli.verdict_matrix import coloured_glyph, engine_heading
+from plumbline.engines.environments import split_version, version_problem
+from plumbline.engines.registry import IMPORTERS
+from plumbline.execution.model_run import FileResult, ModelPlan, ModelRunResult, run_model_files
+from plumbline.importers.neutral_model import Feature
+from plumbline.judging.model_file import MODEL_UNITS
+from plumbline.judging.rows import Row, Verdict
+from plumbline.processes.workers import Limits
+from plumbline.scenario.errors import MAX_LISTED_PROBLEMS, did_you_mean
+from plumbline.storage.results_store import row_record, to_json_value
+
+COLUMN_HEADINGS = {
+    "joints": "joints", "total_mass": "mass", "position": "position", "attitude": "attitude",
+    "mass_matrix": "M", "gravity_force": "gravity", "bias_force": "h", "passive_force": "passive",
+    "acceleration": "accel.", "kinetic_energy": "kinetic", "potential_energy": "potential",
+}  # fmt: skip
+MAX_STATES = 10_000
+
+
+def _choose_importers(_: click.Context, __: click.Parameter, names: Sequence[str]) -> tuple[str, ...]:
+    for name in names:
+        base, _version = split_version(name)
+        if base not in IMPORTERS:
+            hint = did_you_mean(base, list(IMPORTERS)) or f"there are: {', '.join(IMPORTERS)}"
+            raise click.BadParameter(f"no importer {base!r}; {hint}")
+        if problem := version_problem(name):
+            raise click.BadParameter(f"{name}: {problem}")
+    return tuple(dict.fromkeys(names)) or tuple(IMPORTERS)
+
+
+def _parse_state(_: click.Context, __: click.Parameter, text: str | None) -> dict[str, float] | None:
+    """Parse j1=0.3,j2=-0.1."""
+    if text is None:
+        return None
+    state: dict[str, float] = {}
+    for part in filter(None, (part.strip() for part in text.split(","))):
+        name, sign, value = part.rpartition("=")
+        try:
+            state[name.strip()] = float(options.FiniteNumber().convert(value, None, None))
+        except click.BadParameter as error:
+            raise click.BadParameter(f"{part!r}: {error.message}") from None
+        if not sign:
+            raise click.BadParameter(f"{part!r} is no JOINT=NUMBER")
+    return state
+
+
+@click.command(
+    epilog=examples(
+        "model robot.urdf",
+        "model robot.urdf --base free --engine mujoco --engine pinocchio",
+        "model robots/*.xml --strip-geometry --json | jq '.files[].causes'",
+        "model arm.urdf --engine mujoco@3.9.0 --engine mujoco@4.0.0",
+        "model arm.urdf --at shoulder=0.3,elbow=-1.2",
+    )
+    + EXIT_CODES
+)
+@click.argument("files", nargs=-1, required=True, metavar="FILE...")
+@click.option(
+    "--base",
+    type=click.Choice(["auto", "fixed", "free"]),
+    default="auto",
+    help="Of a URDF: whether its root link is fixed to the world or moves freely. The format does not say; "
+    "auto is fixed. An MJCF file says it itself.",
+)
+@click.option(
+    "--engine",
+    "engines",
+    multiple=True,
+    callback=_choose_importers,
+    help="Only this engine's importer (may be repeated); mujoco@3.9.0, @latest or @path/to.whl for another "
+    f"version. Default: {', '.join(IMPORTERS)}.",
+)
+@click.option(
+    "--states",
+    "state_count",
+    type=click.IntRange(1, MAX_STATES),
+    default=20,
+    help="Random states at which the quantities are compared; the same for the same file name.",
+)
+@click.option(
+    "--at",
+    "state",
+    metavar="STATE",
+    callback=_parse_state,
+    help="Compare at this state at rest instead: JOINT=NUMBER,… in rad or m; other joints at their "
+    "reference.",
+)
+@click.option(
+    "--strip-geometry",
+    is_flag=True,
+    help="Load a copy without visual and collision geometry, so that missing meshes do not matter. In MJCF "
+    "only bodies with <inertial> are stripped: elsewhere geometry defines the mass.",
+)
+@click.option(
+    "--root",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    help="Folder outside of which no file is read, and to which package:// refers. Default: the nearest "
+    "folder above the file that has a package.xml, else the file's own.",
+)
+@options.known_option
+@options.jobs_option
+@options.timeout_option(120.0)
+@options.memory_option
+@options.json_option
+@click.option("--out", type=options.FolderPath(), help="Folder for report, junit.xml, SARIF and results.")
+def model(
+    files: tuple[str, ...], base: Any, engines: tuple[str, ...], state_count: int,
+    state: dict[str, float] | None, strip_geometry: bool, root: Path | None, known_files: tuple[Path, ...],
+    jobs: int, timeout: float, memory: float, as_json: bool, out: Path | None,
+) -> None:  # fmt: skip
+    """Compare what engines' importers make of a URDF or MJCF file, and name the parameter that differs.
+
+    Each importer loads the file in a process of its own. At random states its joints, masses, poses, mass
+    matrix M, bias force h, gravity and passive forces, accelerations and energies are compared with
+    certified values of what the file says: of a URDF by Plumbline's own reader, of an MJCF by MuJoCo's
+    compiled model, since MuJoCo defines that format. A difference is named by body or joint, parameter, both
+    values and line where one change of the model reproduces all of the importer's numbers to rounding.
+
+    Actuators, tendons, equalities, contacts, limits and mimic joints are not compared, and listed.
+    """
+    plan = ModelPlan(
+        files, engines, options.are_engines_named(), base, root, strip_geometry, state_count,
+        state, jobs, Limits(timeout, memory),
+        tuple(options.read_user_known_issues(known_files, files)),
+    )  # fmt: skip
+    folder = options.claim_folder(out) if out is not None else None
+    with options.exit_on_io_error(), ProgressDisplay(sys.stderr) as progress:
+        result = run_model_files(plan, progress)
+    if as_json:
+        click.echo(json.dumps(model_document(result), ensure_ascii=False, indent=1))
+    else:
+        for file in result.files:
+            _print_file(file, result)
+    for problem in result.problems[:MAX_LISTED_PROBLEMS]:
+        click.echo(str(problem), err=True)
+    if folder is not None:
+        _write_reports(result, folder, as_json)
+    sys.exit(result.exit_code)
+
+
+def _write_reports(result: ModelRunResult, folder: Path, as_json: bool) -> None:
+    from reports import model_page
+
+    with options.exit_on_io_error():
+        page = model_page.write(folder, model_document(result))
+    click.echo(f"report: {page}", err=as_json)
+
+
+def model_document(result: ModelRunResult) -> dict[str, Any]:
+    """Write a result as a document for other programs.
+
+    Args:
+        result: of a run.
+
+    Returns:
+        JSON values.
+
+    """
+    document = {
+        "version": __version__,
+        "engines": {name: {"version": i.version, "missing": i.missing} for name, i in result.engines.items()},
+        "files": [
+            {
+                "file": file.file,
+                "name": file.model.name,
+                "bodies": len(file.model.bodies),
+                "degrees_of_freedom": file.model.velocity_count,
+                "rows": [row_record(row) for row in file.rows],
+                "causes": list(_cause_records(file)),
+                "drawing": [
+                    {
+                        "name": body.name,
+                        "parent": file.model.bodies[body.parent].name if body.parent >= 0 else "",
+                        "origin": file.poses[body.name][:, 3].tolist(),
+                    }
+                    for body in file.model.bodies
+                    if body.name in file.poses
+                ],
+                "not_compared": [_feature_record(f) for f in file.model.not_compared],
+                "ambiguous": [_feature_record(f) for f in file.model.ambiguous],
+            }
+            for file in result.files
+        ],
+        "problems": [{"file": p.file, "line": p.line, "text": str(p)} for p in result.problems],
+        "exit_code": int(result.exit_code),
+    }
+    found: dict[str, Any] = to_json_value(document)
+    return found
+
+
+def _cause_records(file: FileResult) -> Iterator[dict[str, Any]]:
+    for name, explanation in file.explanations.items():
+        rows = [row for row in file.rows if row.engine == name and row.verdict == Verdict.DISAGREES]
+        is_known = all(row.known_issue is not None for row in rows)
+        for cause in explanation.causes:
+            first = cause.changes[0]
+            source = {"file": first.source.file, "line": first.source.line}
+            yield {
+                "engine": name, "field": cause.field, "body": first.body, "joint": first.joint,
+                "count": len(cause.changes), "source": source, "sentence": cause.sentence, "known": is_known,
+            }  # fmt: skip
+
+
+def _feature_record(feature: Feature) -> dict[str, Any]:
+    source = feature.source
+    return {"what": feature.what, "name": feature.name, "file": source.file, "line": source.line}
+
+
+def _print_file(file: FileResult, result: ModelRunResult) -> None:
+    """Print the table of one file, the causes and what is not compared."""
+    out = make_console(sys.stdout)
+    counts = count_noun(len(file.model.bodies), "body", "bodies"), file.model.velocity_count
+    out.print(f"[bold]{escape(file.file)}[/]: {counts[0]}, {counts[1]} degrees of freedom")
+    by_engine: dict[str, list[Row]] = {}
+    for row in file.rows:
+        by_engine.setdefault(row.engine, []).append(row)
+    out.print(_file_table(by_engine, result))
+    for name, rows in by_engine.items():
+        for line in _reasons(name, rows, file):
+            out.print(line)
+    for title, features in (("not compared", file.model.not_compared), ("left open", file.model.ambiguous)):
+        if features:
+            out.print(f"[dim]{title}: {escape(_feature_words(features))}[/]")
+
+
+def _file_table(by_engine: dict[str, list[Row]], result: ModelRunResult) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    table.add_column("importer")
+    shown = [q for q in MODEL_UNITS if any(row.quantity == q for rows in by_engine.values() for row in rows)]
+    for quantity in shown:
+        table.add_column(COLUMN_HEADINGS[quantity])
+    for name, rows in by_engine.items():
+        cells = {row.quantity: coloured_glyph(row) for row in rows}
+        heading = engine_heading(name, result.engines[name].version) if name in result.engines else name
+        first = f"{cells['all']} {escape(heading)}" if "all" in cells else escape(heading)
+        table.add_row(first, *(cells.get(quantity, "") for quantity in shown))
+    return table
+
+
+def _reasons(name: str, rows: Sequence[Row], file: FileResult) -> list[str]:
+    """Say why an importer's rows do not agree: proved causes, else each row's reason."""
+    silent = (Verdict.AGREES, Verdict.INFORMATION, Verdict.NOT_INSTALLED)
+    bad = [row for row in rows if row.verdict not in silent and row.known_issue is None]
+    explanation = file.explanations.get(name)
+    if explanation is not None and explanation.causes and bad:
+        return [f"{coloured_glyph(bad[0])} {escape(cause.sentence)}" for cause in explanation.causes]
+    lines = [f"{coloured_glyph(row)} {escape(f'{row.engine}: {row.reason}')}" for row in bad]
+    if explanation is not None and bad:
+        fields = Counter(change.field for change in explanation.differences)
+        words = ", ".join(f"{field} ({count})" for field, count in fields.items()) or "nothing"
+        lines.append(f"  no cause is proved; its description differs from the file in: {escape(words)}")
+    return lines
+
+
+def _feature_words(features: Sequence[Feature]) -> str:
+    counted = Counter(feature.what for feature in features)
+    first = {feature.what: feature for feature in reversed(features)}
+    return ", ".join(
+        f"{count} × {what} ({first[what].name}, {first[what].source}{' …' if count > 1 else ''})"
+        for what, count in counted.items()
+    )

@@ -1,0 +1,374 @@
+"""Run `plumbline model`: files × importers through workers to judged rows, causes and one result per file."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from plumbline.diagnosis.importer_cause import Explanation, explain_importer
+from plumbline.engines.adapter import EngineInfo
+from plumbline.engines.environments import (
+    EnvironmentUnavailable,
+    declared_importer_attribute,
+    importer_interpreter,
+    split_version,
+)
+from plumbline.engines.importer_calls import describe_importer, evaluate_model_file, read_model_file
+from plumbline.engines.registry import IMPORTERS
+from plumbline.execution.exit_codes import ExitCode
+from plumbline.execution.runner import exit_code_of_rows
+from plumbline.importers.importer import Reading
+from plumbline.importers.model_file import BaseChoice, PreparedFile, prepare_file
+from plumbline.importers.neutral_model import CanonicalState, NeutralModel, without_passive_forces
+from plumbline.importers.xml_tree import ModelFileError
+from plumbline.judging.known_issues import KnownIssue, KnownIssues
+from plumbline.judging.model_file import Answer, judge_answer
+from plumbline.judging.rows import Row, RowContext, Verdict
+from plumbline.model.datatypes import Array
+from plumbline.processes.isolation import ScratchFolder
+from plumbline.processes.workers import Executor, Limits, Outcome, Task, WorkerPool
+from plumbline.scenario.errors import Problem, did_you_mean, shorten
+from plumbline.truth.model_comparison import certify_states, model_states
+
+MODEL_FAMILY = "model file"
+MJCF_READER = "mujoco"  # whose compiled model is the neutral reading of MJCF
+SEED = 17
+ProgressCallback = Callable[[int, int, str], None]
+
+
+@dataclass(frozen=True)
+class ModelPlan:
+    """What `plumbline model` compares."""
+
+    files: tuple[str, ...]
+    importers: tuple[str, ...] = tuple(IMPORTERS)
+    are_importers_required: bool = False  # named by the user: one that is missing has failed
+    base: BaseChoice = "auto"
+    root: Path | None = None
+    strip_geometry: bool = False
+    state_count: int = 20
+    at: Mapping[str, float] | None = None  # one state instead of random ones
+    jobs: int = 1
+    limits: Limits = field(default_factory=lambda: Limits(120.0))
+    known_issues: tuple[KnownIssue, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class FileResult:
+    """One file's result."""
+
+    file: str  # as typed
+    model: NeutralModel
+    rows: tuple[Row, ...]
+    explanations: Mapping[str, Explanation]  # by importer
+    poses: Mapping[str, Array]  # of the bodies at the first state, for the drawing
+
+
+@dataclass(frozen=True, eq=False)
+class ModelRunResult:
+    """All files' results."""
+
+    files: tuple[FileResult, ...]
+    engines: Mapping[str, EngineInfo]
+    problems: tuple[Problem, ...]  # of files that cannot be used
+    stale_issues: tuple[KnownIssue, ...]
+
+    @property
+    def rows(self) -> list[Row]:
+        """The rows of all files."""
+        return [row for file in self.files for row in file.rows]
+
+    @property
+    def exit_code(self) -> ExitCode:
+        """2 where a file cannot be used, else as everywhere."""
+        if self.problems:
+            return ExitCode.BAD_USAGE
+        has_comparison = any(row.verdict.is_comparison for row in self.rows)
+        return exit_code_of_rows(
+            self.rows, has_stale_issues=bool(self.stale_issues), has_comparison=has_comparison
+        )
+
+
+def run_model_files(plan: ModelPlan, progress: ProgressCallback) -> ModelRunResult:
+    """Compare files across importers.
+
+    Args:
+        plan: the files and how to compare them.
+        progress: called after every task.
+
+    Returns:
+        The result; a file with mistakes is in its problems and does not stop the others.
+
+    """
+    with ScratchFolder("plumbline-model-") as scratch, WorkerPool(plan.jobs, plan.limits) as workers:
+        return _ModelRun(plan, scratch, workers, progress).execute()
+
+
+class _ModelRun:
+    """The phases of one run: describe, read, evaluate, judge."""
+
+    def __init__(self, plan: ModelPlan, scratch: Path, workers: Executor, progress: ProgressCallback) -> None:
+        self.plan, self.scratch, self.workers, self.progress = plan, scratch, workers, progress
+        self.done = 0
+        self.pythons: dict[str, str] = {}
+        self.engines: dict[str, EngineInfo] = {}
+        self.problems: list[Problem] = []
+
+    def execute(self) -> ModelRunResult:
+        """Run the phases."""
+        prepared = self.prepare()
+        self.describe()
+        readings = self.read(prepared)
+        models = self.neutral_models(prepared, readings)
+        answers = self.evaluate({shown: prepared[shown] for shown in models}, readings)
+        files = list(self.judge(models, answers))
+        known = KnownIssues(self.plan.known_issues, False)
+        files = [replace(f, rows=tuple(known.mark_known(f.rows, len(f.model.bodies)))) for f in files]
+        stale = known.stale_issues(is_full_matrix=False)
+        return ModelRunResult(tuple(files), self.engines, tuple(self.problems), tuple(stale))
+
+    def outcomes(self, tasks: Sequence[Task]) -> Iterator[Outcome]:
+        """Run tasks and report the progress."""
+        total = self.done + len(tasks)
+        for outcome in self.workers.run(tasks):
+            self.done += 1
+            self.progress(self.done, total, " ".join(map(str, outcome.key)))
+            yield outcome
+
+    def prepare(self) -> dict[str, PreparedFile]:
+        """Check the files."""
+        found: dict[str, PreparedFile] = {}
+        for number, shown in enumerate(dict.fromkeys(self.plan.files)):
+            folder = self.scratch / str(number)
+            folder.mkdir()
+            try:
+                found[shown] = prepare_file(
+                    shown, folder, self.plan.root, self.plan.base, self.plan.strip_geometry
+                )
+            except ModelFileError as error:
+                self.problems += error.problems
+        return found
+
+    def describe(self) -> None:
+        """Ask the importers for their versions."""
+        wanted = dict.fromkeys((*self.plan.importers, MJCF_READER))
+        tasks = []
+        for name in wanted:
+            base = split_version(name)[0]
+            try:
+                self.pythons[name] = importer_interpreter(name)
+            except EnvironmentUnavailable as error:
+                self.engines[name] = self.missing(EngineInfo(name, name, "", (), str(error)))
+                continue
+            key = ("version", name)
+            tasks.append(Task(key, describe_importer, (base,), self.plan.limits, python=self.pythons[name]))
+        for outcome in self.outcomes(tasks):
+            name = outcome.key[1]
+            info = outcome.value or EngineInfo(
+                name, name, "", (), f"cannot be loaded: {outcome.failure}", has_failed=True
+            )
+            self.engines[name] = self.missing(replace(info, name=name))
+        self.engines = {name: self.engines[name] for name in wanted}
+
+    def missing(self, info: EngineInfo) -> EngineInfo:
+        """A missing importer that the user named has failed."""
+        if info.missing and self.plan.are_importers_required and info.name in self.plan.importers:
+            return replace(info, has_failed=True)
+        return info
+
+    def usable(self) -> list[str]:
+        """The importers that can run."""
+        return [name for name, info in self.engines.items() if info.missing is None]
+
+    def task(self, kind: str, shown: str, name: str, function: Any, *arguments: Any) -> Task:
+        """A call of an importer."""
+        base = split_version(name)[0]
+        key = (kind, shown, name)
+        return Task(key, function, (base, *arguments), self.plan.limits, python=self.pythons[name])
+
+    def read(self, prepared: Mapping[str, PreparedFile]) -> dict[tuple[str, str], Answer]:
+        """Have every importer read every file of a format that it reads; MuJoCo always reads MJCF."""
+        tasks = [
+            self.task("read", shown, name, read_model_file, file.file)
+            for shown, file in prepared.items()
+            for name in self.usable()
+            if file.file.format in declared_formats(name)
+            and (name in self.plan.importers or file.file.format == "mjcf")
+        ]
+        found = {}
+        for outcome in self.outcomes(tasks):
+            reading: Reading | None = outcome.value
+            found[outcome.key[1:]] = Answer(reading, failure=outcome.failure or "")
+        return found
+
+    def neutral_models(
+        self, prepared: Mapping[str, PreparedFile], readings: Mapping[tuple[str, str], Answer]
+    ) -> dict[str, NeutralModel]:
+        """What the files say."""
+        found = {}
+        for shown, file in prepared.items():
+            answer = readings.get((shown, MJCF_READER))
+            try:
+                model = file.neutral_model(answer.reading if answer else None)
+            except ModelFileError as error:
+                self.problems += error.problems
+                continue
+            names = [joint.name for joint in model.joints if joint.kind in ("hinge", "slide")]
+            unknown = [name for name in self.plan.at or () if name not in names]
+            for name in unknown:
+                hint = did_you_mean(name, names) or f"there are: {', '.join(names[:20])}"
+                message = f"no hinge or slide {shorten(repr(name))}, which --at names"
+                self.problems.append(Problem(shown, 0, 0, "", message, hint=hint))
+            if not unknown:
+                found[shown] = model
+        return found
+
+    def evaluate(
+        self, prepared: Mapping[str, PreparedFile], readings: Mapping[tuple[str, str], Answer]
+    ) -> dict[tuple[str, str], Answer]:
+        """Evaluate the quantities at the states of each reading."""
+        answers = {
+            key: answer
+            for key, answer in readings.items()
+            if key[0] in prepared and key[1] in self.plan.importers
+        }
+        tasks = []
+        for (shown, name), answer in answers.items():
+            if answer.reading is not None and answer.reading.model is not None:
+                states = self.states(shown, answer.reading.model)
+                answers[shown, name] = replace(answer, states=states)
+                file = prepared[shown].file
+                tasks.append(self.task("evaluate", shown, name, evaluate_model_file, file, states))
+        for outcome in self.outcomes(tasks):
+            key = outcome.key[1:]
+            if outcome.failure:
+                answers[key] = replace(answers[key], failure=outcome.failure)
+            else:
+                answers[key] = replace(answers[key], quantities=tuple(outcome.value))
+        return answers
+
+    def states(self, shown: str, model: NeutralModel) -> tuple[CanonicalState, ...]:
+        """The states of one file; the same values for joints of one name and kind in every reading."""
+        return model_states(model, self.plan.state_count, state_seed(shown), self.plan.at)
+
+    def judge(
+        self, models: Mapping[str, NeutralModel], answers: Mapping[tuple[str, str], Answer]
+    ) -> Iterator[FileResult]:
+        """Judge the files in workers, in the order in which they were named."""
+        tasks = []
+        for shown, model in models.items():
+            columns = []
+            for name in self.plan.importers:
+                info = self.engines[name]
+                answer = answers.get((shown, name))
+                columns.append((name, info, answer or Answer(failure=info.missing or "")))
+            arguments = (shown, model, tuple(columns), self.plan.state_count, self.plan.at)
+            tasks.append(Task(("judge", shown), judge_file, arguments, self.plan.limits))
+        found = {}
+        for outcome in self.outcomes(tasks):
+            shown = outcome.key[1]
+            if outcome.failure:
+                context = RowContext(shown, MODEL_FAMILY, "-", "Plumbline", "")
+                reason = f"the judging failed: {outcome.failure}"
+                row = context.make_row("model", "-", "all", Verdict.HARNESS_FAILED, reason)
+                found[shown] = FileResult(shown, models[shown], (row,), {}, {})
+            else:
+                found[shown] = outcome.value
+        yield from (found[shown] for shown in models)
+
+
+def state_seed(shown: str) -> int:
+    """Derive the seed of a file's random states from its name, so that its folder does not matter.
+
+    Args:
+        shown: the path as typed.
+
+    Returns:
+        The seed.
+
+    """
+    return int.from_bytes(hashlib.sha256(Path(shown).name.encode()).digest()[:4], "big") + SEED
+
+
+def declared_formats(name: str) -> tuple[str, ...]:
+    """Read which formats an importer reads, without importing it.
+
+    Args:
+        name: its name, with or without a version.
+
+    Returns:
+        The formats.
+
+    """
+    return tuple(declared_importer_attribute(split_version(name)[0], "formats") or ())
+
+
+def judge_file(
+    shown: str,
+    model: NeutralModel,
+    columns: Sequence[tuple[str, EngineInfo, Answer]],
+    state_count: int,
+    at: Mapping[str, float] | None,
+) -> FileResult:
+    """Judge every importer's answer about one file, and look for causes.
+
+    Args:
+        shown: the path as typed.
+        model: what the file says.
+        columns: name and description of each importer, and its answer.
+        state_count: number of random states.
+        at: the one state to compare at instead.
+
+    Returns:
+        The file's result.
+
+    """
+
+    def states(one: NeutralModel) -> tuple[CanonicalState, ...]:
+        return model_states(one, state_count, state_seed(shown), at)
+
+    truths = certify_states(model, states(model))
+    bare = without_passive_forces(model)
+    bare_truths = certify_states(bare, states(bare)) if bare is not model else truths
+    rows: list[Row] = []
+    explanations: dict[str, Explanation] = {}
+    for name, info, answer in columns:
+        context = RowContext(shown, MODEL_FAMILY, name, info.title, info.version)
+        if answer.reading is None and not answer.failure:
+            reason = f"{info.title} reads no such files"
+            rows.append(context.make_row("model", "-", "all", Verdict.INFORMATION, reason))
+            continue
+        if info.missing is not None:
+            verdict = Verdict.FAILED if info.has_failed else Verdict.NOT_INSTALLED
+            rows.append(context.make_row("model", "-", "all", verdict, info.missing))
+            continue
+        unsupported = declared_importer_attribute(split_version(name)[0], "unsupported") or {}
+        applies = "passive_force" not in unsupported
+        judged = (model, truths) if applies else (bare, bare_truths)
+        found = judge_answer(context, *judged, answer, unsupported)
+        if any(row.verdict == Verdict.DISAGREES for row in found):
+            explanations[name] = explanation = _explain(context, judged[0], answer, states, applies)
+            found = [_with_diagnosis(row, explanation) for row in found]
+        rows += found
+    poses = truths[0].quantities.poses if truths else {}
+    return FileResult(shown, model, tuple(rows), explanations, poses)
+
+
+def _explain(
+    context: RowContext, model: NeutralModel, answer: Answer, states: Any, applies_passive_forces: bool
+) -> Explanation:
+    assert answer.reading is not None and answer.reading.model is not None
+    reading = answer.reading.model
+    if not applies_passive_forces:
+        reading = without_passive_forces(reading)
+    return explain_importer(f"{context.title} {context.version}", model, reading, answer.quantities, states)
+
+
+def _with_diagnosis(row: Row, explanation: Explanation) -> Row:
+    if row.verdict != Verdict.DISAGREES:
+        return row
+    sentence = explanation.sentence or "no change of the model's parameters reproduces it"
+    return replace(row, diagnosis=sentence)

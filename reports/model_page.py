@@ -1,0 +1,193 @@
+"""Pages of `plumbline model`: model.html, junit.xml and model.sarif beside the stored model.json.
+
+Input: the document that the command prints with --json.  Output: files in the same folder; nothing runs.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import xml.etree.ElementTree as ET
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from plumbline.storage.results_store import write_atomically
+from reports import html_report, junit
+from reports.results import Record, replace_unprintable
+from reports.verdicts import needs_attention
+
+SARIF_SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
+DRAWING_SIZE = 360  # px, width and height of the drawing's square
+_MARGIN = 24
+_AZIMUTH, _ELEVATION = math.radians(35), math.radians(25)  # of the view
+
+
+def write(folder: Path, document: Record) -> Path:
+    """Write model.json, model.html, junit.xml and model.sarif.
+
+    Args:
+        folder: output folder.
+        document: result of a run, as the command prints it with --json.
+
+    Returns:
+        The path of model.html.
+
+    Raises:
+        OSError: a file cannot be written.
+
+    """
+    document = replace_unprintable(document)
+    text = json.dumps(document, ensure_ascii=False, indent=1)
+    write_atomically(folder / "model.json", text.encode())
+    path = folder / "model.html"
+    write_atomically(path, render(document).encode())
+    write_atomically(folder / "junit.xml", _junit(document))
+    write_atomically(folder / "model.sarif", json.dumps(sarif(document), indent=1).encode())
+    return path
+
+
+def render(document: Record) -> str:
+    """Render the page.
+
+    Args:
+        document: of a run.
+
+    Returns:
+        HTML, one file without a script.
+
+    """
+    files = []
+    for file in document["files"]:
+        engines: dict[str, list[Record]] = {}
+        for row in file["rows"]:
+            engines.setdefault(row["engine"], []).append(row)
+        quantities = list(dict.fromkeys(row["quantity"] for row in file["rows"] if row["quantity"] != "all"))
+        files.append(
+            {
+                **file,
+                "columns": {name: {row["quantity"]: row for row in rows} for name, rows in engines.items()},
+                "quantities": quantities,
+                "findings": [row for row in file["rows"] if needs_attention(row) and not row["diagnosis"]],
+                "lines": draw(file["drawing"], {cause["body"] for cause in file["causes"]}),
+            }
+        )
+    counts = Counter(row["verdict"] for file in document["files"] for row in file["rows"])
+    style = html_report.stylesheet()
+    return (
+        html_report.template_environment()
+        .get_template("model.html")
+        .render(
+            policy=html_report.content_security_policy(style),
+            css=Markup(style),
+            sentence=_sentence(document),
+            engines=document["engines"],
+            problems=document["problems"],
+            files=files,
+            counts=counts,
+            size=DRAWING_SIZE,
+        )
+    )
+
+
+def _sentence(document: Record) -> str:
+    causes = sum(len(file["causes"]) for file in document["files"])
+    bad = sum(any(needs_attention(row) for row in file["rows"]) for file in document["files"])
+    count = len(document["files"])
+    what = f"{count} model file{'s' * (count != 1)}"
+    if not bad:
+        return f"{what}: every importer that reads them reads the same robot"
+    return f"{what}, {bad} read differently: {causes} cause{'s' * (causes != 1)} named and proved"
+
+
+def draw(bodies: list[Record], marked: set[str]) -> list[Record]:
+    """Project a robot's bodies to the drawing.
+
+    Args:
+        bodies: name, parent's name and origin [m] of each body's frame.
+        marked: names of the bodies that differ.
+
+    Returns:
+        One line per body from its parent's origin to its own: x1, y1, x2, y2 [px], name, is_marked.
+
+    """
+    flat: dict[str, tuple[float, float]] = {"": (0.0, 0.0)}
+    for body in bodies:
+        x, y, z = body["origin"]
+        across = y * math.cos(_AZIMUTH) - x * math.sin(_AZIMUTH)
+        depth = x * math.cos(_AZIMUTH) + y * math.sin(_AZIMUTH)
+        flat[body["name"]] = across, -(z * math.cos(_ELEVATION) - depth * math.sin(_ELEVATION))
+    low = [min(p[i] for p in flat.values()) for i in (0, 1)]
+    span = max(max(p[i] for p in flat.values()) - low[i] for i in (0, 1)) or 1.0
+    scale = (DRAWING_SIZE - 2 * _MARGIN) / span
+
+    def place(name: str) -> list[float]:
+        return [round(_MARGIN + (flat[name][i] - low[i]) * scale, 1) for i in (0, 1)]
+
+    found = []
+    for body in bodies:
+        (x1, y1), (x2, y2) = place(body["parent"]), place(body["name"])
+        is_marked = body["name"] in marked
+        found.append({"x1": x1, "y1": y1, "x2": x2, "y2": y2, "name": body["name"], "is_marked": is_marked})
+    return found
+
+
+def _junit(document: Record) -> bytes:
+    """A suite per file, a test case per check."""
+    suites = ET.Element("testsuites", name="plumbline model")
+    for file in document["files"]:
+        junit.add_suite(suites, file["file"], file["rows"], {"robot": str(file["name"])})
+    return bytes(ET.tostring(suites, encoding="utf-8", xml_declaration=True))
+
+
+def sarif(document: Record) -> dict[str, Any]:
+    """Write the findings for code scanning.
+
+    Args:
+        document: of a run.
+
+    Returns:
+        A SARIF 2.1.0 log: a result per cause at the line of the file, per other finding, and per bad file.
+
+    """
+    results = [
+        _sarif_result(
+            f"importer/{cause['field'].replace(' ', '-')}", cause["sentence"], source, cause["engine"]
+        )
+        for file in document["files"]
+        for cause in file["causes"]
+        if not cause["known"]
+        for source in [cause["source"] if cause["source"]["line"] else {"file": file["file"], "line": 1}]
+    ]
+    for file in document["files"]:
+        for row in file["rows"]:
+            if needs_attention(row) and not row["diagnosis"]:
+                source = {"file": file["file"], "line": 1}
+                text = f"{row['engine']}: {row['reason']}"
+                results.append(_sarif_result(f"importer/{row['verdict']}", text, source, row["engine"]))
+    for problem in document["problems"]:
+        source = {"file": problem["file"], "line": max(1, problem["line"])}
+        results.append(_sarif_result("file/bad", problem["text"], source, ""))
+    rules = [{"id": name} for name in dict.fromkeys(result["ruleId"] for result in results)]
+    driver = {"name": "Plumbline", "version": document["version"], "rules": rules}
+    return {
+        "$schema": SARIF_SCHEMA,
+        "version": "2.1.0",
+        "runs": [{"tool": {"driver": driver}, "results": results}],
+    }
+
+
+def _sarif_result(rule: str, text: str, source: Record, engine: str) -> Record:
+    place = {
+        "artifactLocation": {"uri": Path(source["file"]).as_posix()},
+        "region": {"startLine": source["line"]},
+    }
+    return {
+        "ruleId": rule,
+        "level": "error",
+        "message": {"text": text},
+        "locations": [{"physicalLocation": place}],
+        "partialFingerprints": {"plumbline/v1": f"{rule} {engine} {source['file']}"},
+    }

@@ -1,0 +1,97 @@
+"""Causes of importers' differences: planted defects of many kinds are reported and named; nothing else is."""
+
+import numpy as np
+import pytest
+
+from plumbline.engines.importer_calls import evaluate_model_file, read_model_file
+from plumbline.execution.model_run import judge_file, state_seed
+from plumbline.importers.importer import ModelFile
+from plumbline.importers.model_file import prepare_file
+from plumbline.importers.xml_tree import parse_xml, write_xml
+from plumbline.judging.model_file import Answer
+from plumbline.judging.rows import Verdict
+from plumbline.truth.model_comparison import model_states
+from tests.helpers.importer_columns import MUJOCO
+from tests.helpers.planted_importer_defects import MJCF_DEFECTS, URDF_DEFECTS
+from tests.helpers.random_robots import random_mjcf, random_urdf
+
+STATES = 4
+ROBOTS = 10
+
+
+def judged(tmp_path, text, mutated, suffix):
+    """Judge MuJoCo, which reads the mutated text, about the file that has the text."""
+    path = tmp_path / f"robot{suffix}"
+    path.write_text(text)
+    other = tmp_path / f"other{suffix}"
+    other.write_text(mutated)
+    prepared = prepare_file(str(path), tmp_path)
+    own = read_model_file("mujoco", prepared.file)
+    model = prepared.neutral_model(own)
+    file = ModelFile(str(other), prepared.file.format)
+    reading = read_model_file("mujoco", file)
+    if reading.model is None:
+        return None
+    states = model_states(reading.model, STATES, state_seed(str(path)))
+    answers = evaluate_model_file("mujoco", file, states)
+    answer = Answer(reading, states, tuple(answers))
+    return judge_file(str(path), model, [("mujoco", MUJOCO, answer)], STATES, None)
+
+
+def planted(tmp_path, name, seed):
+    """The result of one planted defect and how it must be named; None where the robot has no such thing."""
+    is_urdf = name in URDF_DEFECTS
+    rng = np.random.default_rng([seed, len(name), *name.encode()])
+    make = random_urdf if is_urdf else random_mjcf
+    for _ in range(20):
+        text = make(rng, int(rng.integers(3, 6)))
+        tree = parse_xml(text.encode(), "robot")
+        expected = (URDF_DEFECTS if is_urdf else MJCF_DEFECTS)[name](tree, rng)
+        if expected is not None:
+            result = judged(tmp_path, text, write_xml(tree), ".urdf" if is_urdf else ".xml")
+            if result is not None:
+                return result, expected
+    raise AssertionError(f"no robot for {name}")
+
+
+def is_named(result, expected):
+    causes = [c for explanation in result.explanations.values() for c in explanation.causes]
+    found = {(c.field, change.joint or change.body) for c in causes for change in c.changes}
+    return {owner for _, owner in found} == {expected.owner} and {f for f, _ in found} <= expected.fields
+
+
+@pytest.mark.parametrize("name", [*URDF_DEFECTS, *MJCF_DEFECTS])
+def test_a_planted_defect_is_reported_and_named(tmp_path, name):
+    result, expected = planted(tmp_path, name, 0)
+    assert any(row.verdict == Verdict.DISAGREES for row in result.rows), name
+    sentences = {e.sentence for e in result.explanations.values()}
+    assert is_named(result, expected), (expected, sentences)
+
+
+@pytest.mark.full
+@pytest.mark.timeout(3000)
+def test_planted_defects_on_many_robots(tmp_path):
+    names = [*URDF_DEFECTS, *MJCF_DEFECTS]
+    assert len(names) >= 40
+    reported, named, missed = 0, 0, []
+    for name in names:
+        for seed in range(1, 1 + ROBOTS):
+            result, expected = planted(tmp_path, name, seed)
+            is_reported = any(row.verdict == Verdict.DISAGREES for row in result.rows)
+            reported += is_reported
+            named += is_named(result, expected)
+            if not is_named(result, expected):
+                missed.append((name, seed, expected, [e.sentence for e in result.explanations.values()]))
+    total = len(names) * ROBOTS
+    print(f"{total} planted, {reported} reported, {named} named right", *missed, sep="\n")
+    assert reported >= 0.99 * total
+    assert named >= 0.95 * total
+
+
+def test_an_undisturbed_importer_is_silent(tmp_path):
+    rng = np.random.default_rng(5)
+    for make, suffix in ((random_urdf, ".urdf"), (random_mjcf, ".xml")):
+        text = make(rng, 6)
+        result = judged(tmp_path, text, text, suffix)
+        assert {row.verdict for row in result.rows} == {Verdict.AGREES}
+        assert not result.explanations

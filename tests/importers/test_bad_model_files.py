@@ -1,0 +1,176 @@
+"""Bad model files: clear errors with file and line, no entity, no file outside the root, no hang."""
+
+import time
+
+import numpy as np
+import pytest
+
+from plumbline.importers.model_file import prepare_file
+from plumbline.importers.xml_tree import ModelFileError, parse_xml, write_xml
+from tests.helpers.random_robots import random_mjcf, random_urdf
+
+INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
+LINKS = f'<link name="a">{INERTIAL}</link>\n<link name="b">{INERTIAL}</link>\n'
+JOINT = '<joint name="j" type="revolute"><parent link="a"/><child link="b"/></joint>'
+BOMB = '<!DOCTYPE r [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;&a;&a;">]>\n<robot name="r">&b;</robot>'
+EXTERNAL = '<!DOCTYPE r [<!ENTITY x SYSTEM "file:///etc/passwd">]>\n<robot name="r">&x;</robot>'
+
+
+def robot(old="", new="", more=""):
+    """The robot of two links and a joint with the first occurrence of a text replaced."""
+    return f"<robot>{LINKS}{JOINT}{more}</robot>".replace(old, new, 1)
+
+
+def with_mesh(name):
+    return robot("</link>", f'<visual><geometry><mesh filename="{name}"/></geometry></visual></link>')
+
+
+CIRCLE = (
+    "\n<link name='c'/><link name='d'/>"
+    '<joint name="k" type="fixed"><parent link="c"/><child link="d"/></joint>'
+    '<joint name="l" type="fixed"><parent link="d"/><child link="c"/></joint>'
+)
+SECOND_JOINT = "\n" + JOINT.replace('"j"', '"k"')
+# name → content, and what the message must contain
+BAD_FILES = {
+    "empty": ("", "not well-formed XML"),
+    "no XML": ("hello", ":1:1: is not well-formed"),
+    "unclosed": ("<robot>\n<link>\n</robot>", ":3:3: is not well-formed XML: mismatched tag"),
+    "entity bomb": (BOMB, ":1:1: declares or uses an entity"),
+    "external entity": (EXTERNAL, ":1:1: declares or uses an entity"),
+    "too deep": ("<robot>" + "<a>" * 1000 + "</a>" * 1000 + "</robot>", "nested more than 500 deep"),
+    "no links": ('<robot name="r"/>', ":1:1: <robot name='r'>: has no <link>"),
+    "another root": ("<html/>", "<robot> (URDF) or <mujoco> (MJCF)"),
+    "SDF": (
+        '<sdf version="1.7"/>',
+        "is an SDF file; valid would be <robot> (URDF) or <mujoco> (MJCF); convert it to URDF",
+    ),
+    "xacro": (
+        '<robot xmlns:xacro="http://x"><xacro:property name="a" value="1"/></robot>',
+        "is a xacro file; expand it first: xacro",
+    ),
+    "include file": ("<mujocoinclude/>", "name the file that includes it"),
+    "duplicate link": (robot(more="\n" + LINKS), ":4:1: <link name='a'> name: has the name of the link at"),
+    "no name": (robot(more="<link/>"), ":3:1: <link> name: has no name"),
+    "missing link": (robot('link="b"', 'link="c"'), ":3:1: <child> link: there is no link 'c'"),
+    "no parent": (robot('<parent link="a"/>'), ":3:1: <joint name='j'>: has no <parent>"),
+    "two parents": (
+        robot(more=SECOND_JOINT),
+        ":4:1: <joint name='k'>: link 'b' is the child of joint 'j' too",
+    ),
+    "two roots": (robot(JOINT), "has 2 links that are no joint's child: 'a'"),
+    "circle": (robot(more=CIRCLE), "is in a circle of joints, with the links 'c', 'd'"),
+    "unknown type": (
+        robot("revolute", "revolte"),
+        ":3:1: <joint name='j'> type: is 'revolte'; valid would be one of revolute",
+    ),
+    "zero axis": (
+        robot("</joint>", '<axis xyz="0 0 0"/></joint>'),
+        ":3:1: <axis> xyz: is zero; valid would be a direction",
+    ),
+    "NaN": (
+        robot("</joint>", '<axis xyz="0 nan 0"/></joint>'),
+        ":3:1: <axis> xyz: 'nan' is no finite number; valid would be 3 finite numbers",
+    ),
+    "overflow": (robot('value="1"', 'value="1e999"'), "'1e999' is no finite number"),
+    "two numbers": (
+        robot("</joint>", '<origin xyz="0 1"/></joint>'),
+        ":3:1: <origin> xyz: has 2 numbers; valid would be 3 finite numbers",
+    ),
+    "negative mass": (
+        robot('value="1"', 'value="-2"'),
+        ":1:1: <mass> value: is -2 kg; valid would be a mass, at least 0",
+    ),
+    "no mass": (robot('<mass value="1"/>'), ":1:1: <inertial>: has no <mass value=…>"),
+    "mesh on the network": (with_mesh("http://x/y.stl"), "is on the network"),
+    "mesh outside": (with_mesh("/etc/passwd"), "'/etc/passwd' is outside"),
+    "missing mesh": (with_mesh("package://p/no.stl"), "--strip-geometry leaves meshes out"),
+    "include outside": ('<mujoco>\n<include file="../../etc/passwd"/></mujoco>', ":2:1: <include> file:"),
+    "include itself": ('<mujoco>\n<include file="robot.xml"/></mujoco>', "twice or in a circle"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_a_bad_file_gets_a_clear_error_with_its_line(tmp_path, name):
+    content, message = BAD_FILES[name]
+    path = tmp_path / "robot.xml"
+    path.write_text(content)
+    with pytest.raises(ModelFileError) as caught:
+        prepare_file(str(path), tmp_path)
+    assert message in str(caught.value)
+    assert all(str(problem).startswith(f"{path}:") for problem in caught.value.problems), caught.value
+
+
+def test_every_mistake_of_a_file_is_listed(tmp_path):
+    path = tmp_path / "robot.urdf"
+    path.write_text(f"<robot>{LINKS}{JOINT}</robot>".replace('value="1"', 'value="-1"').replace("ixx", "IXX"))
+    with pytest.raises(ModelFileError) as caught:
+        prepare_file(str(path), tmp_path)
+    assert len(caught.value.problems) == 4
+
+
+def test_a_header_with_a_wrong_version_and_another_encoding_is_read(tmp_path):
+    path = tmp_path / "robot.urdf"
+    path.write_bytes(
+        f'<?xml version="0.0" encoding="iso-8859-1"?>\n<robot name="é">{LINKS}{JOINT}</robot>'.encode(
+            "latin-1"
+        )
+    )
+    prepared = prepare_file(str(path), tmp_path)
+    assert prepared.urdf_model.name == "é"
+    assert prepared.urdf_model.bodies[1].source.line == 3
+
+
+def mutated(rng, text):
+    """Change a text at one to four places: bytes, words, attributes or whole lines."""
+    for _ in range(int(rng.integers(1, 5))):
+        at = int(rng.integers(len(text)))
+        end = min(len(text), at + int(rng.integers(1, 30)))
+        words = [
+            "",
+            "nan",
+            "-1",
+            "1e999",
+            '"',
+            "<",
+            ">",
+            "&x;",
+            "\0",
+            "é",
+            "link0",
+            "0 0 0",
+            text[at:end] * 2,
+        ]
+        text = text[:at] + words[int(rng.integers(len(words)))] + text[end:]
+    return text
+
+
+def check_mutants(tmp_path, count):
+    rng = np.random.default_rng(17)
+    refused = 0
+    for k in range(count):
+        make, suffix = ((random_urdf, ".urdf"), (random_mjcf, ".xml"))[k % 2]
+        path = tmp_path / f"robot{suffix}"
+        path.write_text(mutated(rng, make(rng, 3)))
+        begin = time.process_time()
+        try:
+            prepared = prepare_file(str(path), tmp_path)
+        except ModelFileError as error:
+            refused += 1
+            assert all(problem.line > 0 or "robot" in problem.file for problem in error.problems)
+            assert all(problem.message for problem in error.problems)
+        else:
+            again = parse_xml(write_xml(prepared.tree).encode(), "again")
+            assert [e.attributes for e in again.walk()] == [e.attributes for e in prepared.tree.walk()]
+        assert time.process_time() - begin < 2
+    return refused
+
+
+def test_mutated_files_are_read_or_refused(tmp_path):
+    assert 0.5 * 200 < check_mutants(tmp_path, 200) < 200
+
+
+@pytest.mark.full
+@pytest.mark.timeout(1000)
+def test_five_thousand_mutated_files_are_read_or_refused(tmp_path):
+    assert 0.5 * 5000 < check_mutants(tmp_path, 5000) < 5000

@@ -1,0 +1,97 @@
+"""Certified quantities of model files: closed forms, energy, MuJoCo's dynamics, and no false alarms."""
+
+import math
+
+import numpy as np
+import pytest
+
+from plumbline.engines.importer_calls import evaluate_model_file, read_model_file
+from plumbline.importers.lumping import lump_fixed_bodies
+from plumbline.importers.model_file import prepare_file
+from plumbline.importers.neutral_model import CanonicalState, ElementaryJoint, NeutralBody, NeutralModel
+from plumbline.importers.urdf import read_urdf
+from plumbline.importers.xml_tree import parse_xml
+from plumbline.truth.certified_model import certify_model
+from plumbline.truth.model_comparison import certify_states, mismatches, model_states
+from tests.helpers.random_robots import random_mjcf, random_urdf
+
+FALSE_ALARM_ROBOTS = 500  # of each format, with 10 states
+
+
+def pendulum(**joint):
+    hinge = ElementaryJoint("j", "hinge", np.array([0.0, 1.0, 0.0]), np.zeros(3), **joint)
+    turn, center = np.array([1.0, 0, 0, 0]), np.array([0, 0, -0.5])
+    body = NeutralBody("b", -1, np.zeros(3), turn, (hinge,), 2.0, center, np.diag([1, 3, 2.0]))
+    return NeutralModel("pendulum", (body,), np.array([0, 0, -10.0]))
+
+
+def test_a_pendulum_has_its_closed_form():
+    state = CanonicalState(np.array([0.4]), np.array([-0.7]))
+    certified = certify_model(
+        pendulum(armature=0.25, damping=0.3, stiffness=2.0, spring_reference=0.1, reference=0.15), state
+    ).quantities
+    angle, M = 0.4 - 0.15, 3 + 2 * 0.5**2 + 0.25
+    gravity, passive = 2 * 10 * 0.5 * math.sin(angle), 0.3 * 0.7 - 2 * (0.4 - 0.1)
+    assert certified.mass_matrix == pytest.approx(np.array([[M]]), rel=1e-15)
+    assert certified.bias_force == pytest.approx([gravity], rel=1e-14)
+    assert certified.gravity_force == pytest.approx([gravity], rel=1e-14)
+    assert certified.passive_force == pytest.approx([passive], rel=1e-14)
+    assert certified.acceleration == pytest.approx([(passive - gravity) / M], rel=1e-14)
+    assert certified.kinetic_energy == pytest.approx(M * 0.7**2 / 2, rel=1e-15)
+    assert certified.potential_energy == pytest.approx(-2 * 10 * 0.5 * math.cos(angle), rel=1e-15)
+
+
+def test_lumped_bodies_have_the_same_quantities():
+    rng = np.random.default_rng(3)
+    text = random_urdf(rng, 5, ("revolute", "fixed", "fixed"))
+    model = read_urdf(parse_xml(text.encode(), "robot"), "fixed")
+    lumped = lump_fixed_bodies(model)
+    assert len(lumped.bodies) < len(model.bodies)
+    states = model_states(model, 3, 1)
+    found = mismatches(
+        lumped, certify_states(lumped, states), [t.quantities for t in certify_states(model, states)]
+    )
+    assert max(m.ratio for m in found.values()) < 0.2
+
+
+def test_a_massless_moving_link_has_no_acceleration():
+    model = pendulum()
+    body = model.bodies[0]
+    still = NeutralBody("c", 0, np.zeros(3), body.attitude, body.joints, 0.0, np.zeros(3), np.zeros((3, 3)))
+    certified = certify_model(
+        NeutralModel("m", (body, still), model.gravity), CanonicalState(np.zeros(2), np.ones(2))
+    )
+    assert certified.quantities.acceleration is None
+    assert certified.quantities.mass_matrix[1, 1] == 0
+
+
+def compare(tmp_path, text, suffix, count, importer="mujoco"):
+    path = tmp_path / f"robot{suffix}"
+    path.write_text(text)
+    prepared = prepare_file(str(path), tmp_path)
+    model = prepared.neutral_model(read_model_file("mujoco", prepared.file))
+    states = model_states(model, count, 7)
+    answers = evaluate_model_file(importer, prepared.file, states)
+    return {name: m.ratio for name, m in mismatches(model, certify_states(model, states), answers).items()}
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_mujoco_agrees_at_random_states_of_random_robots(tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    for make, suffix in ((random_urdf, ".urdf"), (random_mjcf, ".xml")):
+        found = compare(tmp_path, make(rng, 5), suffix, 3)
+        assert {"position", "attitude", "mass_matrix", "bias_force", "acceleration"} <= found.keys()
+        assert max(found.values()) <= 1, found
+
+
+@pytest.mark.full
+@pytest.mark.timeout(3000)
+def test_no_false_alarm_in_ten_thousand_states(tmp_path):
+    rng = np.random.default_rng(11)
+    worst = {}
+    for _ in range(FALSE_ALARM_ROBOTS):
+        for make, suffix in ((random_urdf, ".urdf"), (random_mjcf, ".xml")):
+            for name, ratio in compare(tmp_path, make(rng, int(rng.integers(1, 9))), suffix, 10).items():
+                worst[name] = max(ratio, worst.get(name, 0.0))
+    print(worst)
+    assert max(worst.values()) <= 1
