@@ -54,12 +54,12 @@ def _parse_state(_: click.Context, __: click.Parameter, text: str | None) -> dic
     state: dict[str, float] = {}
     for part in filter(None, (part.strip() for part in text.split(","))):
         name, sign, value = part.rpartition("=")
+        if not sign:
+            raise click.BadParameter(f"{part!r} is no JOINT=NUMBER")
         try:
             state[name.strip()] = float(options.FiniteNumber().convert(value, None, None))
         except click.BadParameter as error:
             raise click.BadParameter(f"{part!r}: {error.message}") from None
-        if not sign:
-            raise click.BadParameter(f"{part!r} is no JOINT=NUMBER")
     return state
 
 

@@ -11,7 +11,7 @@ from plumbline.importers import mjcf
 from plumbline.importers.importer import Base, Format, ModelFile, Reading
 from plumbline.importers.neutral_model import NeutralModel
 from plumbline.importers.urdf import read_urdf
-from plumbline.importers.xml_tree import Element, ModelFileError, read_xml, write_xml
+from plumbline.importers.xml_tree import Element, ModelFileError, read_xml, write_xml_in_place
 from plumbline.scenario.errors import Problem, shorten
 
 BaseChoice = Literal["fixed", "free", "auto"]
@@ -98,7 +98,7 @@ def prepare_file(
         if kind == "mjcf":
             mjcf.make_paths_absolute(tree, path.parent.resolve())
         opened = scratch / path.name
-        opened.write_text(write_xml(tree), encoding="utf-8")
+        opened.write_text(write_xml_in_place(tree), encoding="utf-8")
     return PreparedFile(shown, tree, ModelFile(str(opened), kind, chosen, str(folder)), model)
 
 

@@ -226,6 +226,34 @@ class _Handler:
         raise ModelFileError([problem])
 
 
+def write_xml_in_place(root: Element) -> str:
+    """Write a tree so that its elements are on the lines of their file, which messages of engines then name.
+
+    Args:
+        root: the root element.
+
+    Returns:
+        The text; elements of included files stand on the line of what precedes them.
+
+    """
+    parts: list[str] = []
+    line = 1
+    stack: list[Element | str] = [root]
+    while stack:
+        item = stack.pop()
+        if isinstance(item, str):
+            parts.append(item)
+            continue
+        if item.source.file == root.source.file and item.source.line > line:
+            parts.append("\n" * (item.source.line - line))
+            line = item.source.line
+        attributes = "".join(f" {k}={quoteattr(v)}" for k, v in item.attributes.items())
+        parts.append(f"<{item.tag}{attributes}>{escape(item.text)}")
+        stack.append(f"</{item.tag}>")
+        stack.extend(reversed(item.children))
+    return "".join(parts) + "\n"
+
+
 def write_xml(root: Element) -> str:
     """Write a tree as text.
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from plumbline.importers.model_file import prepare_file
-from plumbline.importers.xml_tree import ModelFileError, parse_xml, write_xml
+from plumbline.importers.xml_tree import ModelFileError, parse_xml, write_xml, write_xml_in_place
 from tests.helpers.random_robots import random_mjcf, random_urdf
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
@@ -160,8 +160,10 @@ def check_mutants(tmp_path, count):
             assert all(problem.line > 0 or "robot" in problem.file for problem in error.problems)
             assert all(problem.message for problem in error.problems)
         else:
-            again = parse_xml(write_xml(prepared.tree).encode(), "again")
-            assert [e.attributes for e in again.walk()] == [e.attributes for e in prepared.tree.walk()]
+            for write in (write_xml, write_xml_in_place):
+                again = parse_xml(write(prepared.tree).encode(), "again")
+                assert [e.attributes for e in again.walk()] == [e.attributes for e in prepared.tree.walk()]
+            assert [e.source.line for e in again.walk()] == [e.source.line for e in prepared.tree.walk()]
         assert time.process_time() - begin < 2
     return refused
 
