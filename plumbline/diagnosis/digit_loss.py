@@ -16,11 +16,12 @@ from plumbline.diagnosis.defect_model import evaluate_case, make_defect_case
 from plumbline.diagnosis.fit import Answers, ObservedDifference, max_error_ratio
 from plumbline.model.datatypes import Array, Model, State, StateQuantities, StepRun
 from plumbline.model.equivalent import (
+    BODY_VECTORS,
+    WORLD_VECTORS,
     first_bodies,
     rotate_body_frames,
     rotate_world,
-    unrotate_body_frames,
-    unrotate_world,
+    unrotate,
 )
 from plumbline.model.step_methods import JointSpaceMethod
 from plumbline.truth.rounding_bound import state_rounding_bound
@@ -165,7 +166,7 @@ def _measure_scatter(
         world, body = (_tiny_rotation(rng) for _ in range(2))
         turned, turned_state = rotate_body_frames(*rotate_world(model, state, world), body)
         (answer,) = evaluate(turned, [turned_state])
-        values = unrotate_body_frames(unrotate_world(_values(answer, here), world), body)
+        values = unrotate(unrotate(_values(answer, here), WORLD_VECTORS, world), BODY_VECTORS, body)
         errors.append(here.weighted_vector({name: x - here.expected[name] for name, x in values.items()}))
     return _scatter(np.array(errors), here.residual(here.expected)), here, state
 

@@ -27,10 +27,11 @@ from plumbline.engines.registry import load_adapter
 from plumbline.judging.relation_result import OPTION_PREFIX, OTHER_FORMULATION_PREFIX, RelationResult
 from plumbline.model.datatypes import Array, Model, State, StateQuantities, Unsupported
 from plumbline.model.equivalent import (
+    BODY_VECTORS,
+    WORLD_VECTORS,
     rotate_body_frames,
     rotate_world,
-    unrotate_body_frames,
-    unrotate_world,
+    unrotate,
 )
 from plumbline.model.kinematics import state_from_minimal
 from plumbline.model.welding import split_bodies
@@ -106,7 +107,7 @@ def _rotate_world(model: Model, state: State) -> tuple[Model, State]:
 
 
 def _unrotate_world(answers: StateQuantities) -> dict[str, Array]:
-    return unrotate_world(quantity_values(answers), Q)
+    return unrotate(quantity_values(answers), WORLD_VECTORS, Q)
 
 
 def _rotate_body_frames(model: Model, state: State) -> tuple[Model, State]:
@@ -114,7 +115,7 @@ def _rotate_body_frames(model: Model, state: State) -> tuple[Model, State]:
 
 
 def _unrotate_body_frames(answers: StateQuantities) -> dict[str, Array]:
-    return unrotate_body_frames(quantity_values(answers), Q)
+    return unrotate(quantity_values(answers), BODY_VECTORS, Q)
 
 
 def _double_masses(model: Model, state: State) -> tuple[Model, State]:

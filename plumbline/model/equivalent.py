@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -37,20 +38,6 @@ def rotate_world(model: Model, state: State, q: Array) -> tuple[Model, State]:
     return rotated, state_from_minimal(rotated, p, state.omega, state.u @ turn.T, state.udot @ turn.T)
 
 
-def unrotate_world(answers: dict[str, Array], q: Array) -> dict[str, Array]:
-    """Rotate state quantities of a rotated pendulum back.
-
-    Args:
-        answers: quantities by their names in `StateQuantities`.
-        q: (4,) the quaternion that `rotate_world` was given.
-
-    Returns:
-        The same quantities in the axes of the first description.
-
-    """
-    return {name: x @ rotation_matrix(q) if name in WORLD_VECTORS else x for name, x in answers.items()}
-
-
 def rotate_body_frames(model: Model, state: State, q: Array) -> tuple[Model, State]:
     """Describe every body in other axes of its own: a body vector x becomes Q x.
 
@@ -76,18 +63,19 @@ def rotate_body_frames(model: Model, state: State, q: Array) -> tuple[Model, Sta
     return rotated, state_from_minimal(rotated, p, state.omega @ turn.T, state.u, state.udot)
 
 
-def unrotate_body_frames(answers: dict[str, Array], q: Array) -> dict[str, Array]:
-    """Rotate state quantities in body axes back.
+def unrotate(answers: dict[str, Array], vectors: Sequence[str], q: Array) -> dict[str, Array]:
+    """Rotate vectors of a rotated pendulum back.
 
     Args:
         answers: quantities by their names in `StateQuantities`.
-        q: (4,) the quaternion that `rotate_body_frames` was given.
+        vectors: names of those to rotate: `WORLD_VECTORS` or `BODY_VECTORS`.
+        q: (4,) the quaternion that `rotate_world` or `rotate_body_frames` was given.
 
     Returns:
         The same quantities in the axes of the first description.
 
     """
-    return {name: x @ rotation_matrix(q) if name in BODY_VECTORS else x for name, x in answers.items()}
+    return {name: x @ rotation_matrix(q) if name in vectors else x for name, x in answers.items()}
 
 
 def first_bodies(model: Model, state: State, count: int) -> tuple[Model, State]:

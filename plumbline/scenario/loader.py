@@ -36,7 +36,7 @@ from plumbline.scenario.schema import (
     unit_vector,
 )
 from plumbline.scenario.validation_messages import problems_from_validation
-from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path, is_file, parse_yaml, read_yaml
+from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path, is_file, read_yaml
 
 __all__ = [
     "Problem",
@@ -128,6 +128,8 @@ def load_scenario_text(content: str, name: str = "scenario") -> Scenario:
         ScenarioError: the text has problems; the error holds all of them.
 
     """
+    from plumbline.scenario.yaml_parser import parse_yaml
+
     return build_scenario(parse_yaml(YamlSource(name), content), Path(name))
 
 

@@ -79,7 +79,7 @@ class _BoundedComposer(Composer):  # type: ignore[misc,unused-ignore]
         return node
 
 
-def parse(source: YamlSource, content: str) -> YamlSource:
+def parse_yaml(source: YamlSource, content: str) -> YamlSource:
     """Parse YAML text.
 
     Args:

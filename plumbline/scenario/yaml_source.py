@@ -122,6 +122,8 @@ def read_yaml(path: Path) -> YamlSource:
     if (parsed := recall(key)) is not None:
         source.data, source.value_positions, source.key_positions = parsed
         return source
+    from plumbline.scenario.yaml_parser import parse_yaml  # only files that no run has read yet need it
+
     parse_yaml(source, content)
     if not source.problems:
         remember(key, (source.data, source.value_positions, source.key_positions))
@@ -131,22 +133,3 @@ def read_yaml(path: Path) -> YamlSource:
 @cache
 def _parser_code() -> list[bytes]:
     return [path.read_bytes() for path in sorted(Path(__file__).parent.glob("yaml_*.py"))]
-
-
-def parse_yaml(source: YamlSource, content: str) -> YamlSource:
-    """Parse YAML text.
-
-    Args:
-        source: receives data, positions and problems.
-        content: the text.
-
-    Returns:
-        ``source``.
-
-    Raises:
-        ScenarioError: the text is empty, is not YAML, or is too large or too deep for a scenario.
-
-    """
-    from plumbline.scenario.yaml_parser import parse
-
-    return parse(source, content)

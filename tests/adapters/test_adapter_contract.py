@@ -89,7 +89,7 @@ def one_body(engine, **loads):
     return pendulums.make_model("r" if "balls" in declared_gaps(engine) else "b", **loads)
 
 
-# -- what it says of itself --------------------------------------------------------------------
+# -- what it declares --------------------------------------------------------------------------
 
 
 def test_describes_itself(engine):
@@ -106,7 +106,7 @@ def test_describes_itself(engine):
 @every_integrator
 def test_describes_its_integrators(engine, integrator):
     assert integrator.alias_of in (None, *(method.name for name, method in INTEGRATORS if name == engine))
-    assert integrator.note, f"{integrator.name} has no sentence that says what it is"
+    assert integrator.note, f"{integrator.name} has no sentence that explains it"
     if integrator.kind == "step":
         exponents = list(integrator.error_exponents)
         assert exponents[0] == integrator.order and exponents == sorted(set(exponents))

@@ -150,7 +150,7 @@ def test_tree_turns_for_ever_about_its_first_axis():
 
 
 def test_a_failed_newton_iteration_is_named_with_time_and_words():
-    """A step of a quarter of a second through a tumbling pendulum: Newton diverges, and that is said."""
+    """A step of 0.25 s through a tumbling pendulum: Newton diverges, and the error reports it."""
     subject = pendulums.make_model("rr")
     start = pendulums.state_from_seed(subject, rate=20.0)
     with pytest.raises(EngineFailure, match=r"stopped at t = .* s after \d+ steps, asked for 8 .*: .+"):

@@ -53,7 +53,7 @@ def test_algorithms_and_formulations_agree(joints, loaded):
     """aba in both conventions, crba with a solve, and constrained free bodies: one engine, one answer."""
     model = pendulums.make_model(JOINT_PATTERNS[joints], loads=loaded, drag=loaded)
     states = [pendulums.state_from_seed(model, seed) for seed in range(10)]
-    # The world convention is 1e-11 off by five bodies already, as the docstring of the adapter says of aba.
+    # The world convention is 1e-11 off by five bodies already, see the adapter's docstring on aba.
     others = [by("aba"), PinocchioMaximal(), *([by("aba-world")] if model.n <= 2 else [])]
     first = by("crba")
     for other in others:

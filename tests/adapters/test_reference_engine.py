@@ -76,12 +76,12 @@ def test_trajectories_are_raw():
 def test_a_singular_model_fails_with_its_cause():
     model, state = model_and_state([False])
     inertia = np.diag([0.1, 0.1, 0.0])[None]
-    pencil = model.changed(inertia=inertia, proximal=np.array([[0, 0, 0.3]]))
-    state = state_from_minimal(pencil, state.p, state.omega, state.u, state.udot)
+    thin_body = model.changed(inertia=inertia, proximal=np.array([[0, 0, 0.3]]))
+    state = state_from_minimal(thin_body, state.p, state.omega, state.u, state.udot)
     with pytest.raises(EngineFailure, match="inertia of body 1 is singular"):
-        Reference().evaluate(pencil, [state])
+        Reference().evaluate(thin_body, [state])
     with pytest.raises(EngineFailure, match="inertia of body 1 is singular"):
-        Reference().simulate(pencil, state, np.array([0.0, 1.0]), "dop853", 1e-6)
+        Reference().simulate(thin_body, state, np.array([0.0, 1.0]), "dop853", 1e-6)
 
 
 def test_the_version_is_the_checkouts():

@@ -140,7 +140,7 @@ FAULTS = {
 
 @pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.parametrize("engine", [engine for engine in ENGINES if engine != "reference"])
-def test_a_fault_in_a_joint_is_seen(engine, fault):
+def test_a_fault_in_a_joint_is_reported(engine, fault):
     kind, change = FAULTS[fault]
     rng = np.random.default_rng(7)
     model = replace(random_tree(rng, 3, ("hinge",)), body=np.array([[-1, 0], [0, 1], [1, 2]]))

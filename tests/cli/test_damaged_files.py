@@ -14,7 +14,8 @@ from plumbline.cli.main import main
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.known_issues import KNOWN_ISSUES_FILE
-from plumbline.scenario.yaml_source import YamlSource, parse_yaml
+from plumbline.scenario.yaml_parser import parse_yaml
+from plumbline.scenario.yaml_source import YamlSource
 from plumbline.studies import sweep_file
 from reports.reference_tables import STORED_RESULTS
 from tests.helpers import example_results
@@ -121,7 +122,7 @@ def no_work():
     """Cut off what a sweep does once its file has been accepted."""
     engines = {"mujoco", "exudyn", "pinocchio", "reference"}
     found = {name: EngineInfo(name, name, "1", load_adapter(name).integrators) for name in engines}
-    missing = EngineInfo("", "", "", (), "not asked for its description in this test")
+    missing = EngineInfo("", "", "", (), "not described in this test")
     make_cells = sweep_file._make_cells
     with (
         patch("plumbline.studies.sweep.run", side_effect=Accepted),

@@ -106,7 +106,7 @@ def test_a_night_is_whole_and_remembered(tmp_path):
     }  # fmt: skip
     assert sorted(p.name for p in tmp_path.iterdir()) == ["history"]
     covered = pq.read_table(place / "coverage.parquet").to_pylist()
-    # at rest every invariant is exactly zero, which says nothing of a mistaken motion
+    # at rest every invariant is exactly zero, so it reveals no wrong motion
     assert {row["level"] for row in covered} == {"state", "step", "trajectory"}
     assert {row["engine"] for row in covered if row["smallest"]} <= {"", "mujoco"}
     assert all(row["smallest"] or row["proof"] for row in covered)
@@ -180,7 +180,7 @@ def test_remarkable_random_scenarios_are_kept_with_their_files(tmp_path):
             [other, fine, context.make_row("state", "-", "acceleration", verdict, "why")]
         )
     assert [r.verdict for r in kept] == ["agrees", "disagrees", "agrees", "unsupported"]
-    assert {r.engine for r in kept} == {"mujoco"}, "what another engine says calmly of it is folded"
+    assert {r.engine for r in kept} == {"mujoco"}, "rows of engines that agree are only counted"
     assert probes.counts_by_verdict == {"agrees": 5} and probes.worst_ratios["mujoco", "joint_reaction"] == (
         0.5,
         drawn[0].name,

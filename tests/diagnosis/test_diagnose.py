@@ -39,11 +39,11 @@ def known(joints="bb", count=10):
 def changed(quantity, to, joints="bb", count=10):
     """Model, reported quantities and truth: the truth with ``to(index, value, bound)`` for one quantity."""
     model, truth = known(joints, count)
-    said = [
+    reported = [
         replace(a, **{quantity: to(i, getattr(a, quantity), np.asarray(b.tolerance(quantity)))})
         for i, (a, b) in enumerate(zip(truth.quantities, truth.bounds, strict=True))
     ]
-    return model, said, truth
+    return model, reported, truth
 
 
 def test_error_ratios_are_in_units_of_the_bounds():
@@ -57,19 +57,23 @@ def test_error_ratios_are_in_units_of_the_bounds():
 
 def test_a_difference_is_measured_per_quantity_and_as_one_vector():
     one, two = np.array([[[2.0, 0, 0]]]), np.array([6.0])
-    said = {"acceleration": one, "kinetic_energy": two}
-    seen = ObservedDifference(
-        known()[0], said, said, {"acceleration": np.array([[0.5]]), "kinetic_energy": np.array([3.0])}, {}
+    reported = {"acceleration": one, "kinetic_energy": two}
+    observed = ObservedDifference(
+        known()[0],
+        reported,
+        reported,
+        {"acceleration": np.array([[0.5]]), "kinetic_energy": np.array([3.0])},
+        {},
     )
-    still = {q: 0 * x for q, x in said.items()}
-    assert seen.error_ratio(still) == 4.0
-    assert seen.error_ratio(still | {"acceleration": one}) == 2.0
+    still = {q: 0 * x for q, x in reported.items()}
+    assert observed.error_ratio(still) == 4.0
+    assert observed.error_ratio(still | {"acceleration": one}) == 2.0
     wide = {"acceleration": np.array([[4.0]]), "kinetic_energy": np.array([6.0])}
-    assert seen.error_ratio(still, wide) == 1.0
-    assert seen.error_ratio(still | {"kinetic_energy": two}, wide) == 0.5
-    assert np.isnan(seen.error_ratio(still | {"kinetic_energy": np.array([np.nan])}))
-    assert seen.residual(still).tolist() == seen.weighted_vector(said).tolist()
-    assert seen.weighted_vector(said).tolist() == [4.0, 0, 0, 2.0]
+    assert observed.error_ratio(still, wide) == 1.0
+    assert observed.error_ratio(still | {"kinetic_energy": two}, wide) == 0.5
+    assert np.isnan(observed.error_ratio(still | {"kinetic_energy": np.array([np.nan])}))
+    assert observed.residual(still).tolist() == observed.weighted_vector(reported).tolist()
+    assert observed.weighted_vector(reported).tolist() == [4.0, 0, 0, 2.0]
     energy, allowed = {"kinetic_energy": np.array([6.0, 8.0])}, {"kinetic_energy": np.array([3.0, 2.0])}
     assert ObservedDifference(known()[0], energy, energy, allowed, {}).weighted_vector(energy).tolist() == [
         2.0,
@@ -79,19 +83,19 @@ def test_a_difference_is_measured_per_quantity_and_as_one_vector():
 
 @pytest.mark.parametrize(("at", "first"), [(0, 0), (3, 0), (5, 1), (9, 2)])
 def test_eight_states_around_the_worst_one_are_examined(at, first):
-    model, said, truth = changed("acceleration", lambda i, a, b: a + 100 * b[:, None] * (i == at))
-    seen = observe_difference(model, said, truth)
-    assert len(seen.case.p) == 8
+    model, reported, truth = changed("acceleration", lambda i, a, b: a + 100 * b[:, None] * (i == at))
+    observed = observe_difference(model, reported, truth)
+    assert len(observed.case.p) == 8
     for k in range(8):
-        assert np.array_equal(seen.case.p[k], truth.states[first + k].p)
-        assert np.array_equal(seen.reported["acceleration"][k], said[first + k].acceleration)
-        assert np.array_equal(seen.expected["acceleration"][k], truth.quantities[first + k].acceleration)
-        assert np.array_equal(seen.bounds["joint_reaction"][k], truth.bounds[first + k].joint_reaction)
+        assert np.array_equal(observed.case.p[k], truth.states[first + k].p)
+        assert np.array_equal(observed.reported["acceleration"][k], reported[first + k].acceleration)
+        assert np.array_equal(observed.expected["acceleration"][k], truth.quantities[first + k].acceleration)
+        assert np.array_equal(observed.bounds["joint_reaction"][k], truth.bounds[first + k].joint_reaction)
         if first + k:
             before = truth.quantities[first + k - 1]
-            assert np.array_equal(seen.previous_expected["acceleration"][k], before.acceleration)
-    assert set(seen.reported) == set(QUANTITIES)
-    less = [replace(said[0], joint_reaction=None), *said[1:]]
+            assert np.array_equal(observed.previous_expected["acceleration"][k], before.acceleration)
+    assert set(observed.reported) == set(QUANTITIES)
+    less = [replace(reported[0], joint_reaction=None), *reported[1:]]
     assert "joint_reaction" not in observe_difference(model, less, truth).reported
 
 
@@ -116,14 +120,14 @@ def test_derivatives_agree_with_coarse_differences(size):
     model = pendulums.make_model("bb")
     model = model.changed(mass=size * model.mass, inertia=size * model.inertia)
     truth = state_truth(model, random_states(model, 4, seed=4))
-    seen = observe_difference(model, truth.quantities, truth)
-    for cause in [c for c in all_causes(seen.case) if c.scale is not None][::5]:
-        (slope,) = derivatives_by_amount(seen, [(cause, cause.nominal)])
+    observed = observe_difference(model, truth.quantities, truth)
+    for cause in [c for c in all_causes(observed.case) if c.scale is not None][::5]:
+        (slope,) = derivatives_by_amount(observed, [(cause, cause.nominal)])
         ends = [
-            evaluate_case(cause.alter(seen.case, cause.nominal + s * 1e-4 * cause.scale)) for s in (1, -1)
+            evaluate_case(cause.alter(observed.case, cause.nominal + s * 1e-4 * cause.scale)) for s in (1, -1)
         ]
-        by_hand = seen.weighted_vector(
-            {q: (ends[0][q] - ends[1][q]) / (2e-4 * cause.scale) for q in seen.reported}
+        by_hand = observed.weighted_vector(
+            {q: (ends[0][q] - ends[1][q]) / (2e-4 * cause.scale) for q in observed.reported}
         )
         np.testing.assert_allclose(slope, by_hand, rtol=1e-5, atol=1e-5 * np.max(np.abs(by_hand)))
 
@@ -140,8 +144,8 @@ def test_derivatives_agree_with_coarse_differences(size):
     ids=["sign", "factor", "constant", "single"],
 )
 def test_a_misread_quantity_is_named(quantity, to, words):
-    model, said, truth = changed(quantity, to)
-    assert diagnose_quantity(observe_difference(model, said, truth), quantity) == words.format(
+    model, reported, truth = changed(quantity, to)
+    assert diagnose_quantity(observe_difference(model, reported, truth), quantity) == words.format(
         quantity.replace("_", " ")
     )
 
@@ -149,51 +153,55 @@ def test_a_misread_quantity_is_named(quantity, to, words):
 def test_a_stale_field_and_an_origin_elsewhere_are_named():
     model, truth = known()
     stale = [truth.quantities[0], *truth.quantities[:-1]]  # the first has none before it
-    said = [replace(a, joint_reaction=b.joint_reaction) for a, b in zip(truth.quantities, stale, strict=True)]
-    text = diagnose_quantity(observe_difference(model, said, truth), "joint_reaction")
+    reported = [
+        replace(a, joint_reaction=b.joint_reaction) for a, b in zip(truth.quantities, stale, strict=True)
+    ]
+    text = diagnose_quantity(observe_difference(model, reported, truth), "joint_reaction")
     assert text == "it returned the joint reaction of the previous state (a stale field)"
-    model, said, truth = changed("potential_energy", lambda i, x, b: x + 0.75)
-    seen = observe_difference(model, said, truth)
-    assert diagnose_quantity(seen, "potential_energy") == (
+    model, reported, truth = changed("potential_energy", lambda i, x, b: x + 0.75)
+    observed = observe_difference(model, reported, truth)
+    assert diagnose_quantity(observed, "potential_energy") == (
         "the origin of the potential energy were elsewhere: +0.75 J at every state"
     )
-    assert diagnose_quantity(seen, "kinetic_energy") != diagnose_quantity(seen, "potential_energy")
+    assert diagnose_quantity(observed, "kinetic_energy") != diagnose_quantity(observed, "potential_energy")
 
 
 def test_noise_is_not_named():
     rng = np.random.default_rng(1)
-    model, said, truth = changed("acceleration", lambda i, x, b: x * (1 + 1e-6 * rng.normal(size=x.shape)))
-    seen = observe_difference(model, said, truth)
-    assert diagnose_quantity(seen, "acceleration") is None
-    assert find_explanations(seen) == []
-    text = diagnose(model, said, truth)
+    model, reported, truth = changed(
+        "acceleration", lambda i, x, b: x * (1 + 1e-6 * rng.normal(size=x.shape))
+    )
+    observed = observe_difference(model, reported, truth)
+    assert diagnose_quantity(observed, "acceleration") is None
+    assert find_explanations(observed) == []
+    text = diagnose(model, reported, truth)
     assert text == "no single change of a parameter, term or convention explains the acceleration"
 
 
 def test_of_two_differences_one_may_be_named():
     rng = np.random.default_rng(2)
-    model, said, truth = changed(
+    model, reported, truth = changed(
         "joint_reaction", lambda i, x, b: x * (1 + 1e-6 * rng.normal(size=x.shape)), count=4
     )
-    said = [replace(a, acceleration=1.25 * a.acceleration) for a in said]
-    assert diagnose(model, said, truth) == (
+    reported = [replace(a, acceleration=1.25 * a.acceleration) for a in reported]
+    assert diagnose(model, reported, truth) == (
         "behaves as if it returned the acceleration multiplied by 1.25; "
         "no single change of a parameter, term or convention explains the joint reaction"
     )
 
 
-def the_cause(seen, words):
+def the_cause(observed, words):
     """The one with these words for an amount of 2."""
-    (found,) = (cause for cause in all_causes(seen.case) if cause.describe(2.0, 0.0) == words)
+    (found,) = (cause for cause in all_causes(observed.case) if cause.describe(2.0, 0.0) == words)
     return found
 
 
 def test_an_impossible_mechanism_explains_nothing():
     """Bodies without any inertia have no angular acceleration to predict."""
-    model, said, truth = changed("acceleration", lambda i, x, b: 2 * x)
-    seen = observe_difference(model, said, truth)
-    cause = the_cause(seen, "all inertias were doubled")
-    assert remaining_ratio(seen, evaluate_case(seen.case), FittedCause(cause, 0.0, 0.0)) == np.inf
+    model, reported, truth = changed("acceleration", lambda i, x, b: 2 * x)
+    observed = observe_difference(model, reported, truth)
+    cause = the_cause(observed, "all inertias were doubled")
+    assert remaining_ratio(observed, evaluate_case(observed.case), FittedCause(cause, 0.0, 0.0)) == np.inf
 
 
 @pytest.mark.parametrize(("off", "explained"), [(0.9, True), (1.9, True), (2.1, False)])
@@ -201,36 +209,36 @@ def test_a_prediction_may_be_off_by_the_bounds_of_both_pendulums(off, explained)
     model, truth = known(count=4)
     light = model.changed(inertia=0.75 * model.inertia)
     wrong = evaluate_case(make_defect_case(light, truth.states))
-    said = []
+    reported = []
     for i, (right, state) in enumerate(zip(truth.quantities, truth.states, strict=True)):
         both = truth.bounds[i].acceleration + state_rounding_bound(light, state).acceleration
         values = {q: wrong[q][i] for q in QUANTITIES}
         values["acceleration"] = values["acceleration"] + off / 2 * both[:, None] * ALONG
-        said.append(replace(right, **values))
-    seen = observe_difference(model, said, truth)
-    cause = the_cause(seen, "all inertias were doubled")
-    remaining = remaining_ratio(seen, evaluate_case(seen.case), FittedCause(cause, 0.75, 0.0))
+        reported.append(replace(right, **values))
+    observed = observe_difference(model, reported, truth)
+    cause = the_cause(observed, "all inertias were doubled")
+    remaining = remaining_ratio(observed, evaluate_case(observed.case), FittedCause(cause, 0.75, 0.0))
     assert (remaining <= MAX_EXPLAINED_RATIO) is explained
     assert remaining == pytest.approx(off if off < 1 else off / 2, rel=0.5)
 
 
 @pytest.mark.parametrize(("off", "remaining"), [(0.9, 0.9), (1.9, np.inf), (2.1, 1.05)])
 def test_no_change_is_no_explanation_of_more_than_one_bound(off, remaining):
-    model, said, truth = changed("acceleration", lambda i, x, b: x + off * b[:, None] * ALONG)
-    seen = observe_difference(model, said, truth)
-    cause = the_cause(seen, "all inertias were doubled")  # once as large: the right pendulum
-    left = remaining_ratio(seen, evaluate_case(seen.case), FittedCause(cause, 1.0, 0.0))
+    model, reported, truth = changed("acceleration", lambda i, x, b: x + off * b[:, None] * ALONG)
+    observed = observe_difference(model, reported, truth)
+    cause = the_cause(observed, "all inertias were doubled")  # once as large: the right pendulum
+    left = remaining_ratio(observed, evaluate_case(observed.case), FittedCause(cause, 1.0, 0.0))
     assert left == pytest.approx(remaining, rel=1e-3)  # the model rounds too
 
 
 def test_a_quantity_close_to_its_bound_is_not_named_beside_a_wrong_one():
     """A factor of 1.00000000000002 explained a row whose cell had a large difference elsewhere."""
-    model, said, truth = changed("acceleration", lambda i, x, b: 1.25 * x, count=4)
-    said = [
+    model, reported, truth = changed("acceleration", lambda i, x, b: 1.25 * x, count=4)
+    reported = [
         replace(a, potential_energy=a.potential_energy + 5 * b.potential_energy)
-        for a, b in zip(said, truth.bounds, strict=True)
+        for a, b in zip(reported, truth.bounds, strict=True)
     ]
-    assert diagnose(model, said, truth) == (
+    assert diagnose(model, reported, truth) == (
         "behaves as if it returned the acceleration multiplied by 1.25; "
         "the difference of the potential energy is too close to the rounding bound to name a term"
     )
@@ -239,8 +247,8 @@ def test_a_quantity_close_to_its_bound_is_not_named_beside_a_wrong_one():
 def test_a_defect_in_the_dynamics_alone_is_named():
     model, truth = known(count=4)
     wrong = evaluate_case(make_defect_case(model.changed(mass=model.mass * [1, 1.001]), truth.states))
-    said = [replace(a, **{q: wrong[q][i] for q in VECTORS}) for i, a in enumerate(truth.quantities)]
-    text = diagnose(model, said, truth)
+    reported = [replace(a, **{q: wrong[q][i] for q in VECTORS}) for i, a in enumerate(truth.quantities)]
+    text = diagnose(model, reported, truth)
     assert text.startswith(
         "in the acceleration and angular acceleration and joint reaction alone "
         "it behaves as if mass of body 2"
@@ -260,8 +268,8 @@ def test_a_defect_in_the_dynamics_alone_is_named():
     ],
 )
 def test_a_misread_quantity_of_one_body_is_named(name, to, words):
-    model, said, truth = changed(name, lambda i, x, b: to(x))
-    assert words in diagnose_quantity(observe_difference(model, said, truth), name)
+    model, reported, truth = changed(name, lambda i, x, b: to(x))
+    assert words in diagnose_quantity(observe_difference(model, reported, truth), name)
 
 
 @pytest.mark.parametrize(
@@ -275,25 +283,25 @@ def test_a_convention_is_named(words):
             make_defect_case(model, truth.states), 0
         )
     )
-    said = [replace(a, **{q: wrong[q][i] for q in QUANTITIES}) for i, a in enumerate(truth.quantities)]
-    ((fit, remaining),) = find_explanations(observe_difference(model, said, truth))
+    reported = [replace(a, **{q: wrong[q][i] for q in QUANTITIES}) for i, a in enumerate(truth.quantities)]
+    ((fit, remaining),) = find_explanations(observe_difference(model, reported, truth))
     assert fit.cause.describe(fit.fitted_amount, fit.resolution) == words
     assert remaining <= MAX_EXPLAINED_RATIO
 
 
 def test_a_difference_within_the_bound_is_in_the_mass_matrix():
-    model, said, truth = changed("acceleration", lambda i, x, b: x + 0.4 * b[:, None])
-    assert diagnose(model, said, truth) == (
+    model, reported, truth = changed("acceleration", lambda i, x, b: x + 0.4 * b[:, None])
+    assert diagnose(model, reported, truth) == (
         "the difference is in the mass matrix alone; all other quantities are right"
     )
-    model, said, truth = changed("acceleration", lambda i, x, b: x + 4.0 * b[:, None])
-    assert diagnose(model, said, truth) == (
+    model, reported, truth = changed("acceleration", lambda i, x, b: x + 4.0 * b[:, None])
+    assert diagnose(model, reported, truth) == (
         "the difference is too close to the rounding bound to name a single term"
     )
 
 
 def test_a_failure_of_the_second_evaluation_is_reported():
-    model, said, truth = changed("acceleration", lambda i, x, b: 1.5 * x)
+    model, reported, truth = changed("acceleration", lambda i, x, b: 1.5 * x)
 
     def evaluate(requested, states):
         if not np.any(requested.gravity):
@@ -302,21 +310,21 @@ def test_a_failure_of_the_second_evaluation_is_reported():
             replace(t, acceleration=1.5 * t.acceleration) for t in state_truth(requested, states).quantities
         ]
 
-    text = diagnose(model, said, truth, evaluate)
+    text = diagnose(model, reported, truth, evaluate)
     assert text.startswith("behaves as if it returned the acceleration multiplied by 1.5 (the difference ")
     assert text.endswith("persists at rest, fails without gravity: no weight)")
 
 
 def test_without_a_difference_no_amount_is_significant():
     model, truth = known()
-    seen = observe_difference(model, truth.quantities, truth)
-    right = evaluate_case(seen.case)
-    amounts = [cause for cause in all_causes(seen.case) if cause.scale is not None]
+    observed = observe_difference(model, truth.quantities, truth)
+    right = evaluate_case(observed.case)
+    amounts = [cause for cause in all_causes(observed.case) if cause.scale is not None]
     assert {cause.nominal for cause in amounts} >= {0.0, 1.0}
     for cause in amounts:
-        (slope,) = derivatives_by_amount(seen, [(cause, cause.nominal)])
+        (slope,) = derivatives_by_amount(observed, [(cause, cause.nominal)])
         if np.any(slope):
-            assert fit_cause(seen, right, cause, slope) is None
+            assert fit_cause(observed, right, cause, slope) is None
 
 
 @pytest.mark.parametrize(
@@ -324,11 +332,11 @@ def test_without_a_difference_no_amount_is_significant():
 )
 def test_two_states_show_neither_a_constant_nor_a_stale_field(to):
     """Of thirteen bodies two states are looked at, too few to see a pattern over states."""
-    model, said, truth = changed("acceleration", to, "b" * 13, 9)
-    assert diagnose_quantity(observe_difference(model, said, truth), "acceleration") is None
-    model, said, truth = changed("acceleration", lambda i, x, b: x + 0.5, "b" * 7, 9)
+    model, reported, truth = changed("acceleration", to, "b" * 13, 9)
+    assert diagnose_quantity(observe_difference(model, reported, truth), "acceleration") is None
+    model, reported, truth = changed("acceleration", lambda i, x, b: x + 0.5, "b" * 7, 9)
     assert "added a constant" in str(
-        diagnose_quantity(observe_difference(model, said, truth), "acceleration")
+        diagnose_quantity(observe_difference(model, reported, truth), "acceleration")
     )
 
 
@@ -374,7 +382,7 @@ def test_an_error_in_velocity_terms_vanishes_at_rest():
 
 
 def test_a_failure_is_reported_in_eighty_characters_and_the_next_trial_runs():
-    model, said, truth = changed("acceleration", lambda i, x, b: 1.5 * x)
+    model, reported, truth = changed("acceleration", lambda i, x, b: 1.5 * x)
 
     def evaluate(requested, states):
         if not any(np.any(s.omega) for s in states):
@@ -383,7 +391,7 @@ def test_a_failure_is_reported_in_eighty_characters_and_the_next_trial_runs():
             replace(t, acceleration=1.5 * t.acceleration) for t in state_truth(requested, states).quantities
         ]
 
-    text = diagnose(model, said, truth, evaluate)
+    text = diagnose(model, reported, truth, evaluate)
     assert text.endswith(f"(the difference fails at rest: {'x' * 80}, persists without gravity)")
 
 
@@ -392,65 +400,69 @@ def with_a_mass(factor, noise=0.0, count=4):
     model, truth = known(count=count)
     rng = np.random.default_rng(5)
     wrong = evaluate_case(make_defect_case(model.changed(mass=model.mass * [factor, 1.0]), truth.states))
-    said = [replace(a, **{q: wrong[q][i] for q in QUANTITIES}) for i, a in enumerate(truth.quantities)]
+    reported = [replace(a, **{q: wrong[q][i] for q in QUANTITIES}) for i, a in enumerate(truth.quantities)]
     off = [
         replace(a, acceleration=a.acceleration + noise * b.acceleration[:, None] * rng.normal(size=(2, 3)))
-        for a, b in zip(said, truth.bounds, strict=True)
+        for a, b in zip(reported, truth.bounds, strict=True)
     ]
     return observe_difference(model, off, truth)
 
 
 @pytest.mark.parametrize("factor", [0.99, 1.01])
 def test_amounts_above_and_below_the_nominal_are_found(factor):
-    seen = with_a_mass(factor)
-    right, found = evaluate_case(seen.case), [c for c in all_causes(seen.case) if c.scale is not None]
-    fits = fit_causes(seen, right, found)
-    named = [fit for fit in fits if remaining_ratio(seen, right, fit) <= MAX_EXPLAINED_RATIO]
-    mass = seen.case.mass[0, 0]
+    observed = with_a_mass(factor)
+    right, found = evaluate_case(observed.case), [c for c in all_causes(observed.case) if c.scale is not None]
+    fits = fit_causes(observed, right, found)
+    named = [fit for fit in fits if remaining_ratio(observed, right, fit) <= MAX_EXPLAINED_RATIO]
+    mass = observed.case.mass[0, 0]
     (fit,) = (fit for fit in named if fit.cause.nominal == mass)
     assert abs(fit.fitted_amount - factor * mass) < 3 * fit.resolution < 1e-9 * mass
     (slope,) = derivatives_by_amount(
-        seen, [(fit.cause, fit.fitted_amount)]
+        observed, [(fit.cause, fit.fitted_amount)]
     )  # by differences, true to 1e-5 (above)
     assert fit.resolution == pytest.approx(1 / np.linalg.norm(slope), rel=1e-5, abs=0)
 
 
 def test_a_fit_to_noisy_data_is_no_explanation():
-    seen = with_a_mass(1.001, noise=1e6)
-    (cause,) = (c for c in all_causes(seen.case) if c.scale is not None and c.nominal == seen.case.mass[0, 0])
-    (slope,) = derivatives_by_amount(seen, [(cause, cause.nominal)])
-    fit = fit_cause(seen, evaluate_case(seen.case), cause, slope)
+    observed = with_a_mass(1.001, noise=1e6)
+    (cause,) = (
+        c for c in all_causes(observed.case) if c.scale is not None and c.nominal == observed.case.mass[0, 0]
+    )
+    (slope,) = derivatives_by_amount(observed, [(cause, cause.nominal)])
+    fit = fit_cause(observed, evaluate_case(observed.case), cause, slope)
     assert fit is not None and abs(fit.fitted_amount - 1.001 * cause.nominal) < 1e7 * fit.resolution
-    assert remaining_ratio(seen, evaluate_case(seen.case), fit) > MAX_EXPLAINED_RATIO
+    assert remaining_ratio(observed, evaluate_case(observed.case), fit) > MAX_EXPLAINED_RATIO
 
 
 @pytest.mark.parametrize(
     ("off", "words"), [(1.5, "it returned the acceleration multiplied by 1.25"), (2.5, None)]
 )
 def test_a_misread_quantity_may_be_off_by_both_bounds(off, words):
-    model, said, truth = changed(
+    model, reported, truth = changed(
         "acceleration", lambda i, x, b: 1.25 * x + (i == 3) * off * b[:, None] * ALONG
     )
-    assert diagnose_quantity(observe_difference(model, said, truth), "acceleration") == words
+    assert diagnose_quantity(observe_difference(model, reported, truth), "acceleration") == words
 
 
 def test_three_states_show_a_stale_field_and_a_constant():
     model, truth = known(count=3)
     before = [truth.quantities[0], *truth.quantities[:-1]]
-    said = [replace(a, acceleration=b.acceleration) for a, b in zip(truth.quantities, before, strict=True)]
-    assert "stale" in str(diagnose_quantity(observe_difference(model, said, truth), "acceleration"))
-    said[1] = truth.quantities[1]
-    assert diagnose_quantity(observe_difference(model, said, truth), "acceleration") is None, (
+    reported = [
+        replace(a, acceleration=b.acceleration) for a, b in zip(truth.quantities, before, strict=True)
+    ]
+    assert "stale" in str(diagnose_quantity(observe_difference(model, reported, truth), "acceleration"))
+    reported[1] = truth.quantities[1]
+    assert diagnose_quantity(observe_difference(model, reported, truth), "acceleration") is None, (
         "one state was not of the one before"
     )
-    model, said, truth = changed("acceleration", lambda i, x, b: x + 0.5, count=3)
+    model, reported, truth = changed("acceleration", lambda i, x, b: x + 0.5, count=3)
     assert "added a constant" in str(
-        diagnose_quantity(observe_difference(model, said, truth), "acceleration")
+        diagnose_quantity(observe_difference(model, reported, truth), "acceleration")
     )
 
 
 @pytest.mark.parametrize(("factor", "words"), [(-0.5, "-0.5"), (1.000123456, "1.000123"), (2.0, "2")])
 def test_a_factor_is_described_with_the_digits_that_it_needs(factor, words):
-    model, said, truth = changed("acceleration", lambda i, x, b: factor * x)
+    model, reported, truth = changed("acceleration", lambda i, x, b: factor * x)
     text = f"it returned the acceleration multiplied by {words}"
-    assert diagnose_quantity(observe_difference(model, said, truth), "acceleration") == text
+    assert diagnose_quantity(observe_difference(model, reported, truth), "acceleration") == text

@@ -10,7 +10,7 @@ import pytest
 from plumbline.diagnosis.diagnose import diagnose, observe_difference
 from plumbline.diagnosis.digit_loss import MIN_SCATTER, DigitLoss, find_digit_loss
 from plumbline.engines.registry import load_adapter
-from plumbline.model.equivalent import first_bodies, rotate_world, unrotate_world
+from plumbline.model.equivalent import WORLD_VECTORS, first_bodies, rotate_world, unrotate
 from plumbline.model.sampling import random_states
 from plumbline.scenario import loader
 from plumbline.truth.certified import certify_state
@@ -54,7 +54,9 @@ def test_a_turned_world_turns_the_answers():
     model, truth = known("rb")
     q = np.array([0.1, 0.7, -0.1, 0.7])
     turned = certify_state(*rotate_world(model, truth.states[0], q)).quantities
-    back = unrotate_world({"acceleration": turned.acceleration, "kinetic_energy": turned.kinetic_energy}, q)
+    back = unrotate(
+        {"acceleration": turned.acceleration, "kinetic_energy": turned.kinetic_energy}, WORLD_VECTORS, q
+    )
     np.testing.assert_allclose(back["acceleration"], truth.quantities[0].acceleration, rtol=1e-12)
     assert back["kinetic_energy"] == pytest.approx(truth.quantities[0].kinetic_energy, rel=1e-13)
     np.testing.assert_allclose(

@@ -19,10 +19,10 @@ if not step_formulas.HAS_EXTENDED_PRECISION:
     pytest.skip("no extended precision on this machine", allow_module_level=True)
 
 
-def explanation(adapter, integrator, joints="balls", has_drag=False, engine_sees=lambda model: model):
+def explanation(adapter, integrator, joints="balls", has_drag=False, change=lambda model: model):
     """Diagnosis of an adapter's steps on a model; the engine may see another one."""
     model, states = subject(joints, has_drag)
-    answer = stepped(adapter, integrator, engine_sees(model), states)
+    answer = stepped(adapter, integrator, change(model), states)
     return explain_steps(model, states, integrator.method, answer)
 
 
@@ -47,7 +47,7 @@ def test_no_integrator_is_named_where_none_is_wrong(engine, joints):
         def heavier(model):
             return replace(model, gravity=model.gravity * (1 + 1e-5))
 
-        text = explanation(adapter, integrator, joints, engine_sees=heavier)
+        text = explanation(adapter, integrator, joints, change=heavier)
         assert "behaves as if" not in text, text
 
 

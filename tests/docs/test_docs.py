@@ -1,6 +1,6 @@
 """The worked pages do what they say: their code blocks are run, in order, in a copy of the checkout.
 
-A fenced block's info string says what becomes of it: ``file=PATH`` writes it there,
+A fenced block's info string names its use: ``file=PATH`` writes it there,
 ``into=PATH:NAME`` puts it below the line of that file that starts with NAME (a table that is added
 to), ``bash run`` runs it (it must succeed), ``text output`` is what the run before it printed, where
 ``…`` stands for anything.  Other blocks are only shown.
@@ -81,7 +81,7 @@ def test_a_worked_page_gives_the_printed_results(name, tmp_path):
     assert run_code_blocks((ROOT / "docs" / name).read_text(encoding="utf-8"), checkout) >= 3
 
 
-def test_the_player_sees_a_page_that_lies(tmp_path):
+def test_a_page_with_wrong_output_fails(tmp_path):
     right = "```text file=a/b.txt\nhello\n```\n```bash run\ncat a/b.txt\n```\n```text output\nhe…\n```\n"
     assert run_code_blocks(right, tmp_path) == 3
     (tmp_path / "table.py").write_text("OTHER = {\n}\nTABLE = {\n}\n")

@@ -168,7 +168,7 @@ def test_the_supported_versions_work_beside_the_installed_ones(tmp_path):
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(("version", "sound"), [("1.9.0", False), ("1.10.0", False), ("1.11.0", True)])
 def test_exudyn_started_from_wrong_accelerations_with_its_sparse_solver(version, sound):
-    """The relation says that two solvers of one engine differ; this says which is wrong, and where."""
+    """The relation says that two solvers of one engine differ; this shows which is wrong, and where."""
     chosen = loader.load_scenarios(["double-tumbling-balls"])[0]
     true = certify_state(chosen.model, chosen.state).quantities.acceleration
     python = environments.ensure_interpreter(f"exudyn@{version}")
@@ -272,7 +272,7 @@ def test_latest_pre_and_a_wheel_run_beside_the_installed_one(tmp_path, package_i
     assert not latest.is_prerelease and newest >= latest >= Version("4.0.0")
     assert found[names[3]].version == found["mujoco"].version
     values = {name: [row.value for row in result.rows if row.engine == name] for name in ("mujoco", names[3])}
-    assert values["mujoco"] == values[names[3]], "the same wheel says the same"
+    assert values["mujoco"] == values[names[3]], "the same wheel gives the same answer"
     assert {row.verdict for row in result.rows} == {"agrees"}
 
 

@@ -29,7 +29,7 @@ for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(engine)
 
 pytestmark = pytest.mark.xdist_group("planted branches")  # the scenarios are made once
-WHO = RowContext("branches", "test", "engine", "engine", "0")
+CONTEXT = RowContext("branches", "test", "engine", "engine", "0")
 RANDOM_COUNT = 200  # of a night
 SEED = 404
 MAX_BODIES = 10
@@ -58,7 +58,7 @@ def is_altered(defect, model, state):
 def is_reported(defect, model, states):
     truth = state_truth(model, states)
     answers = plant(type(load_adapter(defect.engine)), defect).evaluate(model, states)
-    rows = judge_states(WHO, truth, Evaluation(answers, None, None, 0.0)).rows
+    rows = judge_states(CONTEXT, truth, Evaluation(answers, None, None, 0.0)).rows
     return any(row.verdict == "disagrees" for row in rows)
 
 
@@ -70,7 +70,7 @@ def test_a_defect_in_a_rare_branch_is_reported(defect):
         if (altered := list(itertools.islice(
             (state for state in states if is_altered(defect, s.model, state)), MAX_EVALUATED)))
     )  # fmt: skip
-    assert any(reported), f"no scenario reports {defect.size}"
+    assert any(reported), f"no scenario reports {defect.description}"
 
 
 @pytest.mark.skipif(not step_formulas.HAS_EXTENDED_PRECISION, reason="no extended precision on this machine")
@@ -82,7 +82,7 @@ def test_a_step_in_a_rare_branch_is_reported(defect):
             row.verdict == "disagrees"
             for s, states in problems()
             for row in judged(adapter, integrator, s.model, states[:STEP_STATES])
-        ), f"no scenario reports {defect.size}"
+        ), f"no scenario reports {defect.description}"
 
 
 def test_the_list_holds_thirty_branches_and_more():

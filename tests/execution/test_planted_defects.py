@@ -29,15 +29,15 @@ from tests.helpers.planted_defects import (
     BODY_DEFECTS,
     CONTROLS,
     DEFECTS,
+    INDISTINGUISHABLE,
     MOTION_DEFECTS,
-    PAIRS,
     STATE_DEFECTS,
-    Bent,
     Defect,
-    field,
+    WrongGammaSystem,
+    answer_change,
     model_change,
     plant,
-    relifted,
+    with_coordinates,
 )
 
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
@@ -60,8 +60,8 @@ def identity_states(model):
     identity = np.array([1.0, 0, 0, 0])
     odd = np.where(np.arange(model.n)[:, None] % 2, second.p, identity)
     return [
-        relifted(model, first, p=odd),
-        relifted(model, second, p=np.tile(identity, (model.n, 1))),
+        with_coordinates(model, first, p=odd),
+        with_coordinates(model, second, p=np.tile(identity, (model.n, 1))),
     ]
 
 
@@ -78,11 +78,11 @@ def planted(defect, model):
     """The real engine with the defect in it."""
     engine = plant(type(load_adapter(defect.engine)), defect)
     if defect.gamma is None:
-        with defect.inside() if defect.inside else nullcontext():
+        with defect.engine_patch() if defect.engine_patch else nullcontext():
             yield engine
         return
-    bent = type("BentHere", (Bent,), {"model": model, "defect": staticmethod(defect.gamma)})
-    with patch("adapters.reference_engine.DirectSystem", bent):
+    system = type("BentHere", (WrongGammaSystem,), {"model": model, "defect": staticmethod(defect.gamma)})
+    with patch("adapters.reference_engine.DirectSystem", system):
         yield engine
 
 
@@ -117,20 +117,20 @@ def ids(defects):
 
 def test_the_list_is_long_enough_and_each_defect_has_its_own_name():
     assert len(DEFECTS) >= 134 and len(CONTROLS) >= 20 and len({d.name for d in DEFECTS}) == len(DEFECTS)
-    assert sum(bool(d.named) for d in DEFECTS) >= 100
+    assert sum(bool(d.expected) for d in DEFECTS) >= 100
 
 
 @pytest.mark.parametrize("defect", **ids(STATE_DEFECTS))
 def test_every_state_defect_is_reported_and_named(defect):
     wrong, text = state_report(defect)
-    assert wrong, f"nothing reports {defect.size}"
-    if defect.named:
-        assert any(words in text for words in defect.named), f"{defect.size}: said {text!r}"
+    assert wrong, f"nothing reports {defect.description}"
+    if defect.expected:
+        assert any(words in text for words in defect.expected), f"{defect.description}: {text!r}"
 
 
 @pytest.mark.parametrize("defect", **ids(MOTION_DEFECTS))
 def test_every_motion_defect_is_reported(defect):
-    assert motion_report(defect), f"nothing reports {defect.size}"
+    assert motion_report(defect), f"nothing reports {defect.description}"
 
 
 def test_the_same_engine_without_defect_is_not_reported():
@@ -155,7 +155,7 @@ def test_answers_that_stay_in_other_axes_are_reported(name):
     assert wrong and text
 
 
-@pytest.mark.parametrize(("defect", "both"), PAIRS, ids=[d.name for d, _ in PAIRS])
+@pytest.mark.parametrize(("defect", "both"), INDISTINGUISHABLE, ids=[d.name for d, _ in INDISTINGUISHABLE])
 def test_causes_with_the_same_effect_are_named_together(defect, both):
     wrong, text = state_report(defect)
     assert bool(wrong) == bool(both)
@@ -163,8 +163,8 @@ def test_causes_with_the_same_effect_are_named_together(defect, both):
 
 
 def test_scaled_mass_and_inertia_are_invisible_to_accelerations_alone():
-    blind = next(d for d in STATE_DEFECTS if d.name == "mass-and-inertia-together")
-    wrong, _ = state_report(blind)
+    defect = next(d for d in STATE_DEFECTS if d.name == "mass-and-inertia-together")
+    wrong, _ = state_report(defect)
     assert "joint_reaction" in wrong and not {"acceleration", "angular_acceleration"} & set(wrong)
 
 
@@ -174,9 +174,9 @@ def noisy(_, state, a):
 
 
 UNNAMEABLE = (
-    Defect("noise", "r̈ × (1 + 1e-9 noise)", answers=field("acceleration", noisy)),
+    Defect("noise", "r̈ × (1 + 1e-9 noise)", answers=answer_change("acceleration", noisy)),
     Defect("cubed", "ω̇′ + 1e-6 ω̇′³", engine="pinocchio",
-           answers=field("angular_acceleration", lambda _, __, a: a + 1e-6 * a**3)),
+           answers=answer_change("angular_acceleration", lambda _, __, a: a + 1e-6 * a**3)),
     Defect("two-at-once", "mass of body 1 and inertia xx of body 2 × (1 + 1e-4)",
            inputs=model_change(lambda m, _: {
                "mass": m.mass * [1 + 1e-4, 1], "inertia": m.inertia * [[[1]], [[1 + 1e-4]]]})),
@@ -221,11 +221,11 @@ def test_a_defect_in_a_rare_branch_gets_no_wrong_name(defect):
 def test_rates(record_property, capsys):
     """Kill rate, naming rate and false namings, as the nightly report gives them."""
     killed = [d for d in DEFECTS if (motion_report(d) if d.level == "motion" else state_report(d)[0])]
-    nameable = [d for d in DEFECTS if d.named]
-    named = [d for d in nameable if any(words in state_report(d)[1] for words in d.named)]
+    nameable = [d for d in DEFECTS if d.expected]
+    named = [d for d in nameable if any(words in state_report(d)[1] for words in d.expected)]
     reported = [d for d in (*STATE_DEFECTS, *UNNAMEABLE) if "behaves as if" in state_report(d)[1]]
     reported += [d for d in UNNAMEABLE if not state_report(d)[1].startswith("no single change")]
-    false = [d.name for d in reported if (d.named and d not in named) or d in UNNAMEABLE]
+    false = [d.name for d in reported if (d.expected and d not in named) or d in UNNAMEABLE]
     false += [d.name for d in BRANCHES if WITHOUT_NAME not in state_report(d)[1]]
     figures = {
         "planted": len(DEFECTS),
@@ -261,7 +261,7 @@ def test_defects_are_named_on_every_engine_and_joint(engine, joints):
     """The long form: every defect of numbers, conventions and answers, wherever it makes a difference."""
     missed = {}
     for defect in STATE_DEFECTS:
-        if defect.gamma or defect.inside or not defect.named:
+        if defect.gamma or defect.engine_patch or not defect.expected:
             continue
         if defect in BODY_DEFECTS:
             if joints != defect.joints:  # its body, joint or load is one of its own pendulum
@@ -270,6 +270,6 @@ def test_defects_are_named_on_every_engine_and_joint(engine, joints):
             continue
         moved = replace(defect, engine=engine, joints=joints)
         wrong, text = state_report(moved)
-        if not wrong or not any(words in text for words in defect.named):
+        if not wrong or not any(words in text for words in defect.expected):
             missed[defect.name] = text
     assert not missed

@@ -47,7 +47,7 @@ def environment(out):
 
 
 def comparable_results(out):
-    """Everything that a run says, without its times."""
+    """All results of a run without its times."""
     document = json.loads((out / "results.json").read_text())
     run = {k: document["run"][k] for k in ("sentence", "exit_code", "versions", "truth", "stale_issues")}
     rows = [{k: v for k, v in row.items() if k not in TIME_FIELDS} for row in document["rows"]]

@@ -1,4 +1,4 @@
-"""The nightly asks the instrument's own test, and what that says counts."""
+"""The nightly runs the self-test, and its result counts."""
 
 import json
 
@@ -40,7 +40,7 @@ pytest.importorskip("no_such_module_at_all")
 )
 def test_the_answer_is_that_of_the_tests(tmp_path, text, figures, trouble):
     (tmp_path / "test_it.py").write_text(text)
-    answer = selftest.run_self_test(tmp_path / "said.xml", str(tmp_path / "test_it.py"))
+    answer = selftest.run_self_test(tmp_path / "results.xml", str(tmp_path / "test_it.py"))
     assert answer.counts == figures
     assert trouble in answer.failure and bool(trouble) == bool(answer.failure)
     assert ("failed" in answer.summary) == bool(trouble)
@@ -48,7 +48,7 @@ def test_the_answer_is_that_of_the_tests(tmp_path, text, figures, trouble):
 
 def test_one_that_hangs_is_ended(tmp_path):
     (tmp_path / "test_it.py").write_text("import time\ndef test_a(): time.sleep(60)\n")
-    answer = selftest.run_self_test(tmp_path / "said.xml", str(tmp_path / "test_it.py"), timeout=3)
+    answer = selftest.run_self_test(tmp_path / "results.xml", str(tmp_path / "test_it.py"), timeout=3)
     assert answer.failure == "no answer within 3 s"
 
 

@@ -67,10 +67,10 @@ def _adapter(engine: str) -> Adapter:
 def _call_method(
     engine: str, method: str, args: tuple[Any, ...], overrides: dict[str, Callable[..., Any]]
 ) -> Any:
-    subject = _adapter(engine)
+    planted_adapter = _adapter(engine)
     if overrides:
-        subject = _with_overrides(subject, overrides)
-    return getattr(subject, method)(*args)
+        planted_adapter = _with_overrides(planted_adapter, overrides)
+    return getattr(planted_adapter, method)(*args)
 
 
 def _attribute(engine: str, name: str) -> Any:

@@ -17,18 +17,18 @@ from tests.helpers.planted_defects import (
     Inputs,
     M,
     P,
+    added_moment,
     at_identity,
-    body,
-    gyroscopic,
-    load_of,
+    body_change,
+    body_state_change,
+    gyroscopic_moment,
     model_change,
-    moment_added,
-    parameter,
-    provided,
-    relifted,
+    parameter_change,
     state_change,
-    state_of,
-    world,
+    to_body,
+    to_world,
+    when,
+    with_coordinates,
 )
 from tests.helpers.planted_steps import (
     CLASSICAL,
@@ -44,34 +44,34 @@ from tests.helpers.planted_steps import (
 Condition = Callable[[Model, State], bool]
 
 
-def rate(state: State) -> float:
+def fastest_rate(state: State) -> float:
     """The fastest angular velocity (rad/s)."""
     return float(np.max(np.linalg.norm(state.omega, axis=1)))
 
 
-def with_bodies(count: int) -> Condition:
+def at_least_bodies(count: int) -> Condition:
     """At least so many bodies."""
     return lambda m, _: m.n >= count
 
 
-def both(*conditions: Condition) -> Condition:
+def all_of(*conditions: Condition) -> Condition:
     """All of several conditions."""
     return lambda m, s: all(condition(m, s) for condition in conditions)
 
 
-def last_of(change: Callable[[int], Inputs]) -> Inputs:
+def on_last_body(change: Callable[[int], Inputs]) -> Inputs:
     """A change of the last body."""
     return lambda m, s: change(m.n - 1)(m, s)
 
 
-def later(change: Callable[[int], Inputs], k: int) -> Inputs:
+def on_body(change: Callable[[int], Inputs], k: int) -> Inputs:
     """A change of body k (from 0), where there is one."""
     return lambda m, s: change(k)(m, s) if m.n > k else (m, s)
 
 
 def scaled(name: str, factor: float) -> Callable[[int], Inputs]:
     """A field of one body times a factor."""
-    return lambda k: load_of(k, **{name: lambda m, _: getattr(m, name) * factor})
+    return lambda k: body_change(k, **{name: lambda m, _: getattr(m, name) * factor})
 
 
 def mass_ratio(model: Model) -> float:
@@ -80,17 +80,17 @@ def mass_ratio(model: Model) -> float:
     return float(np.max(np.maximum(ratios, 1 / ratios), initial=1.0))
 
 
-def principal_equal(model: Model) -> Array:
+def is_axisymmetric(model: Model) -> Array:
     """Which bodies have diagonal inertias with two equal entries."""
     d = np.diagonal(model.inertia, axis1=1, axis2=2)
     is_diagonal = np.all(model.inertia == model.inertia * np.eye(3), axis=(1, 2))
     return is_diagonal & ((d[:, 0] == d[:, 1]) | (d[:, 1] == d[:, 2]))
 
 
-def rods_where(which: Callable[[State], Array], **factors: float) -> Inputs:
+def rod_rates_scaled(which: Callable[[State], Array], **factors: float) -> Inputs:
     """u̇ of the rods of a direction times a factor."""
     return lambda m, s: (
-        m, relifted(m, s, udot=np.where(which(s)[:, None], factors["udot"], 1.0) * s.udot)
+        m, with_coordinates(m, s, udot=np.where(which(s)[:, None], factors["udot"], 1.0) * s.udot)
     )  # fmt: skip
 
 
@@ -98,28 +98,29 @@ SMALL = 1 + 1e-6
 BRANCH_DEFECTS = (
     # the size of a rate
     Defect("above-30", "gyroscopic term dropped above 30 rad/s", engine=M,
-           inputs=provided(lambda _, s: rate(s) > 30, moment_added(gyroscopic))),
+           inputs=when(lambda _, s: fastest_rate(s) > 30, added_moment(gyroscopic_moment))),
     Defect("below-0.3", "rates × (1 + 1e-6) below 0.3 rad/s", engine=P,
-           inputs=provided(lambda _, s: rate(s) < 0.3,
-                           state_change(lambda _, s: {"omega": s.omega * SMALL}))),
+           inputs=when(lambda _, s: fastest_rate(s) < 0.3,
+                       state_change(lambda _, s: {"omega": s.omega * SMALL}))),
     Defect("one-body-at-rest", "g × (1 + 1e-6) where a body is at rest", engine=M,
-           inputs=provided(lambda _, s: bool(np.any(np.all(s.omega == 0, axis=1))),
-                           model_change(lambda m, _: {"gravity": m.gravity * SMALL}))),
+           inputs=when(lambda _, s: bool(np.any(np.all(s.omega == 0, axis=1))),
+                       model_change(lambda m, _: {"gravity": m.gravity * SMALL}))),
     Defect("component-at-rest", "ω′ × -1 of bodies with a zero component", engine=E,
            inputs=state_change(lambda _, s: {
                "omega": np.where(np.any(s.omega == 0, axis=1, keepdims=True), -s.omega, s.omega)})),
     # one body
-    Defect("third-inertia", "J of body 3 × (1 + 1e-6)", engine=M, inputs=later(scaled("inertia", SMALL), 2)),
-    Defect("fourth-moment", "n′ of body 4 × 0", engine=P, inputs=later(scaled("moment", 0.0), 3)),
-    Defect("fifth-distal", "c of body 5 × (1 + 1e-6)", engine=E, inputs=later(scaled("distal", SMALL), 4)),
+    Defect("third-inertia", "J of body 3 × (1 + 1e-6)", engine=M,
+           inputs=on_body(scaled("inertia", SMALL), 2)),
+    Defect("fourth-moment", "n′ of body 4 × 0", engine=P, inputs=on_body(scaled("moment", 0.0), 3)),
+    Defect("fifth-distal", "c of body 5 × (1 + 1e-6)", engine=E, inputs=on_body(scaled("distal", SMALL), 4)),
     Defect("last-of-three-force", "F of the last of three and more × 0", engine=M,
-           inputs=provided(with_bodies(3), last_of(scaled("force", 0.0)))),
+           inputs=when(at_least_bodies(3), on_last_body(scaled("force", 0.0)))),
     Defect("last-force-in-body-frame", "F of the last body in body axes", engine=P,
-           inputs=last_of(lambda k: load_of(k, force=lambda m, s: world(s, m.force)))),
-    Defect("second-drag", "c_r of body 2 × 2", engine=M, inputs=later(scaled("drag_moment", 2.0), 1)),
-    Defect("third-drag-force", "c_t of body 3 × 0", engine=E, inputs=later(scaled("drag_force", 0.0), 2)),
+           inputs=on_last_body(lambda k: body_change(k, force=lambda m, s: to_world(s, m.force)))),
+    Defect("second-drag", "c_r of body 2 × 2", engine=M, inputs=on_body(scaled("drag_moment", 2.0), 1)),
+    Defect("third-drag-force", "c_t of body 3 × 0", engine=E, inputs=on_body(scaled("drag_force", 0.0), 2)),
     Defect("third-drags-exchanged", "c_t and c_r of body 3 exchanged", engine=M,
-           inputs=later(lambda k: load_of(k, drag_force=lambda m, _: m.drag_moment,
+           inputs=on_body(lambda k: body_change(k, drag_force=lambda m, _: m.drag_moment,
                                           drag_moment=lambda m, _: m.drag_force), 2)),
     Defect("load-and-drag-together", "F × (1 + 1e-6) of bodies with drag", engine=P, inputs=model_change(
         lambda m, _: {"force": np.where(m.drag_force[:, None] > 0, m.force * SMALL, m.force)})),
@@ -135,46 +136,47 @@ BRANCH_DEFECTS = (
     Defect("zero-scalar", "ω′ × -1 of bodies turned by half a turn", engine=P,
            inputs=state_change(lambda _, s: {"omega": np.where(s.p[:, :1] == 0, -1.0, 1.0) * s.omega})),
     Defect("identity-of-third", "ω′ of body 3 × 0 at its identity attitude", engine=M,
-           inputs=provided(lambda m, s: m.n > 2 and at_identity(2)(m, s),
-                           state_of(2, omega=lambda _, s: 0 * s.omega))),
+           inputs=when(lambda m, s: m.n > 2 and at_identity(2)(m, s),
+                       body_state_change(2, omega=lambda _, s: 0 * s.omega))),
     Defect("identity-moment", "n′ of body 1 in world axes at the identity attitude of body 2", engine=E,
-           inputs=provided(lambda m, s: m.n > 1 and at_identity(1)(m, s),
-                           load_of(0, moment=lambda m, s: body(s, m.moment)))),
+           inputs=when(lambda m, s: m.n > 1 and at_identity(1)(m, s),
+                       body_change(0, moment=lambda m, s: to_body(s, m.moment)))),
     Defect("same-attitude", "J × (1 + 1e-6) where neighbours have one attitude", engine=P,
-           inputs=provided(lambda m, s: m.n > 1 and bool(np.any(np.all(s.p[1:] == s.p[:-1], axis=1))),
-                           model_change(lambda m, _: {"inertia": m.inertia * SMALL}))),
+           inputs=when(lambda m, s: m.n > 1 and bool(np.any(np.all(s.p[1:] == s.p[:-1], axis=1))),
+                       model_change(lambda m, _: {"inertia": m.inertia * SMALL}))),
     # numbers of the model
     Defect("equal-masses", "m of body 2 × (1 + 1e-6) where it equals that of body 1", engine=M,
-           inputs=provided(lambda m, _: m.n > 1 and m.mass[0] == m.mass[1],
-                           parameter("mass", 1, times=SMALL))),
+           inputs=when(lambda m, _: m.n > 1 and m.mass[0] == m.mass[1],
+                       parameter_change("mass", 1, times=SMALL))),
     Defect("mass-ratio-300", "m of body 1 × (1 + 1e-4) where neighbours differ by 300", engine=P,
-           inputs=provided(lambda m, _: mass_ratio(m) > 300, parameter("mass", 0, times=1 + 1e-4))),
+           inputs=when(lambda m, _: mass_ratio(m) > 300, parameter_change("mass", 0, times=1 + 1e-4))),
     Defect("light-body", "J × (1 + 1e-6) of bodies below 20 g", engine=E, inputs=model_change(
         lambda m, _: {"inertia": m.inertia * np.where(m.mass < 0.02, SMALL, 1.0)[:, None, None]})),
     Defect("heavy-body", "m × (1 + 1e-6) of bodies above 100 kg", engine=M, inputs=model_change(
         lambda m, _: {"mass": m.mass * np.where(m.mass > 100, SMALL, 1.0)})),
     Defect("symmetric-inertia", "J × (1 + 1e-6) of bodies of revolution", engine=P, inputs=model_change(
-        lambda m, _: {"inertia": m.inertia * np.where(principal_equal(m), SMALL, 1.0)[:, None, None]})),
+        lambda m, _: {"inertia": m.inertia * np.where(is_axisymmetric(m), SMALL, 1.0)[:, None, None]})),
     Defect("full-inertia-last", "products of inertia of the last body × (1 + 1e-5)", engine=M,
-           inputs=last_of(lambda k: load_of(
+           inputs=on_last_body(lambda k: body_change(
                k, inertia=lambda m, _: m.inertia * (1 + 1e-5 * (1 - np.eye(3)))))),
     Defect("sideways-gravity", "g × (1 + 1e-6) where it has horizontal parts", engine=E,
-           inputs=provided(lambda m, _: bool(np.any(m.gravity[:2])),
-                           model_change(lambda m, _: {"gravity": m.gravity * SMALL}))),
+           inputs=when(lambda m, _: bool(np.any(m.gravity[:2])),
+                       model_change(lambda m, _: {"gravity": m.gravity * SMALL}))),
     Defect("zero-offset", "the proximal offset's zero component 1e-7 m", engine=P, inputs=model_change(
         lambda m, _: {"proximal": np.where(m.proximal == 0, 1e-7, m.proximal)})),
     # rods
     Defect("rod-along-axis", "u̇ × -1 of rods along a coordinate axis", engine=M,
-           inputs=rods_where(lambda s: np.max(np.abs(s.u), axis=1) == 1, udot=-1.0)),
+           inputs=rod_rates_scaled(lambda s: np.max(np.abs(s.u), axis=1) == 1, udot=-1.0)),
     Defect("rod-straight-down", "u̇ × 0 of rods straight down", engine=P,
-           inputs=rods_where(lambda s: s.u[:, 2] == -1, udot=0.0)),
+           inputs=rod_rates_scaled(lambda s: s.u[:, 2] == -1, udot=0.0)),
     Defect("long-rod", "ℓ × (1 + 1e-6) above 1.5 m", engine=E, inputs=model_change(
         lambda m, _: {"length": m.length * np.where(m.length > 1.5, SMALL, 1.0)})),
     Defect("rod-after-ball-after-rod", "ℓ of the third × (1 + 1e-6) where kinds alternate", engine=M,
-           inputs=provided(lambda m, _: m.n > 2 and bool(m.rods[0] and not m.rods[1] and m.rods[2]),
-                           lambda m, s: parameter("length", 2, times=SMALL)(m, s))),
+           inputs=when(lambda m, _: m.n > 2 and bool(m.rods[0] and not m.rods[1] and m.rods[2]),
+                       lambda m, s: parameter_change("length", 2, times=SMALL)(m, s))),
     Defect("rod-last-drag", "c_t × 2 of the last body on a rod", engine=P,
-           inputs=provided(lambda m, _: m.n > 1 and bool(m.rods[-1]), last_of(scaled("drag_force", 2.0)))),
+           inputs=when(lambda m, _: m.n > 1 and bool(m.rods[-1]),
+                       on_last_body(scaled("drag_force", 2.0)))),
 )  # fmt: skip
 
 
@@ -192,7 +194,7 @@ def rk4(system: object, q: Array, v: Array, h: float) -> tuple[Array, Array]:
     return runge_kutta(system, q, v, h, CLASSICAL, WEIGHTS)
 
 
-def where(condition: Callable[[object, Array, Array, float], bool], wrong: Step, right: Step) -> Step:
+def wrong_when(condition: Callable[[object, Array, Array, float], bool], wrong: Step, right: Step) -> Step:
     """A wrong step in a branch."""
 
     def step(system: object, q: Array, v: Array, h: float) -> tuple[Array, Array]:
@@ -206,39 +208,41 @@ def is_power_of_two(h: float) -> bool:
     return float(np.frexp(h)[0]) == 0.5
 
 
-def relative_scalars(system: object, q: Array) -> Array:
+def joint_scalar_parts(system: object, q: Array) -> Array:
     """Scalar parts of the joints' quaternions."""
     return np.asarray(system.quaternions(q)[:, 0])  # type: ignore[attr-defined]
 
 
-def longer(factor: float, right: Step) -> Step:
+def step_scaled(factor: float, right: Step) -> Step:
     """The right step of another size."""
     return lambda system, q, v, h: right(system, q, v, h * factor)
 
 
 BRANCH_STEPS = (
     StepDefect("not-power-of-two", "h × (1 + 1e-7) unless h is a power of two", M, "Euler",
-               step=where(lambda _, q, v, h: not is_power_of_two(h), longer(1 + 1e-7, euler), euler)),
+               step=wrong_when(lambda _, q, v, h: not is_power_of_two(h),
+                               step_scaled(1 + 1e-7, euler), euler)),
     StepDefect("not-power-of-two-rk4", "h × (1 + 1e-7) unless h is a power of two", P, "rkmk4",
-               step=where(lambda _, q, v, h: not is_power_of_two(h), longer(1 + 1e-7, rk4), rk4)),
+               step=wrong_when(lambda _, q, v, h: not is_power_of_two(h), step_scaled(1 + 1e-7, rk4), rk4)),
     StepDefect("long-steps", "explicit Euler above h = 0.02", M, "Euler",
-               step=where(lambda _, q, v, h: h > 0.02, stale_velocity, euler)),
+               step=wrong_when(lambda _, q, v, h: h > 0.02, stale_velocity, euler)),
     StepDefect("fast-joint", "explicit Euler above 15 rad/s", P, "semi-implicit-euler",
-               step=where(lambda _, q, v, h: np.max(np.abs(v)) > 15, stale_velocity, euler)),
+               step=wrong_when(lambda _, q, v, h: np.max(np.abs(v)) > 15, stale_velocity, euler)),
     StepDefect("slow-joint", "exchanged halves below 0.5 rad/s", M, "Euler",
-               step=where(lambda _, q, v, h: np.max(np.abs(v)) < 0.5, exchanged_halves, euler)),
+               step=wrong_when(lambda _, q, v, h: np.max(np.abs(v)) < 0.5, exchanged_halves, euler)),
     StepDefect("large-turn", "p + h ṗ where a joint turns by more than 0.1 rad", M, "Euler",
-               step=where(lambda _, q, v, h: h * np.max(np.abs(v)) > 0.1, first_order_quaternion, euler)),
+               step=wrong_when(lambda _, q, v, h: h * np.max(np.abs(v)) > 0.1,
+                               first_order_quaternion, euler)),
     StepDefect("negative-scalars", "explicit Euler where all joints' scalar parts are negative", P,
                "semi-implicit-euler",
-               step=where(lambda s, q, v, h: bool(np.all(relative_scalars(s, q) < 0)),
+               step=wrong_when(lambda s, q, v, h: bool(np.all(joint_scalar_parts(s, q) < 0)),
                           stale_velocity, euler)),
     StepDefect("identity-joint", "exchanged halves where a joint is at the identity", M, "Euler",
-               step=where(lambda s, q, v, h: bool(np.any(np.abs(relative_scalars(s, q)) == 1)),
+               step=wrong_when(lambda s, q, v, h: bool(np.any(np.abs(joint_scalar_parts(s, q)) == 1)),
                           exchanged_halves, euler)),
     StepDefect("three-joints", "explicit Euler with three joints and more", M, "Euler",
-               step=where(lambda _, q, v, h: len(v) >= 9, stale_velocity, euler)),
+               step=wrong_when(lambda _, q, v, h: len(v) >= 9, stale_velocity, euler)),
     StepDefect("rk4-one-body", "θ̇ = v with one joint", M, "RK4",
-               step=where(lambda _, q, v, h: len(v) == 3, lambda s, q, v, h: runge_kutta(
+               step=wrong_when(lambda _, q, v, h: len(v) == 3, lambda s, q, v, h: runge_kutta(
                    s, q, v, h, CLASSICAL, WEIGHTS, terms=0), rk4)),
 )  # fmt: skip

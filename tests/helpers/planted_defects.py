@@ -1,8 +1,8 @@
 """Defects with known names and sizes, planted in real adapters: what the harness must report, and name.
 
 A defect alters what a real engine is given (model, state), what it gives back, or how it steps in time;
-the engine itself runs.  ``named`` are the words of which the diagnosis must use one; a defect without
-them need only be reported.  Indices in names count from 1, as in the results.
+the engine itself runs.  ``expected`` are the words of which the diagnosis must use one; a
+defect without them need only be reported.  Indices in names count from 1, as in the results.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ Run = Callable[[Callable[..., Trajectory], Model, State, Array, Integrator, floa
 
 @dataclass(frozen=True)
 class Defect:
-    """One planted defect. Exactly one of inputs, answers, gamma, run and inside is given."""
+    """One planted defect. Exactly one of inputs, answers, gamma, run and engine_patch is given."""
 
     name: str
-    size: str  # in words and numbers
-    named: tuple[str, ...] = ()
+    description: str  # with its size
+    expected: tuple[str, ...] = ()  # words of the diagnosis, one of which must occur
     engine: str = "mujoco"
     joints: str = "balls"  # key of tests.helpers.pendulums.JOINT_PATTERNS
     loaded: bool = False  # with applied loads and drag
@@ -49,7 +49,7 @@ class Defect:
     gamma: Callable[[Model, State], Array] | None = None  # (c,) added to γ, on the reference
     run: Run | None = None
     integrator: str = "RK4"
-    inside: Callable[[], AbstractContextManager[Any]] | None = None  # alters the engine's own model
+    engine_patch: Callable[[], AbstractContextManager[Any]] | None = None  # alters the engine's own model
 
 
 def plant(real: type[Adapter], defect: Defect) -> Adapter:
@@ -74,7 +74,7 @@ def plant(real: type[Adapter], defect: Defect) -> Adapter:
     return Planted()
 
 
-class Bent(DirectSystem):
+class WrongGammaSystem(DirectSystem):
     """The notes' system with something added to γ: patched into the reference's adapter."""
 
     model: Model
@@ -103,21 +103,21 @@ def joint_directions(model: Model, r: Array, p: Array, omega: Array | None = Non
 # --- what is altered ----------------------------------------------------------------------------
 
 
-def relifted(model: Model, state: State, **minimal: Array) -> State:
+def with_coordinates(model: Model, state: State, **minimal: Array) -> State:
     """The state of a model from its minimal coordinates, some of them replaced."""
     parts = {k: minimal.get(k, getattr(state, k)) for k in ("p", "omega", "u", "udot")}
     return state_from_minimal(model, **parts)
 
 
-def parameter(field: str, *index: int, by: float = 0.0, times: float = 1.0) -> Inputs:
+def parameter_change(answer_change: str, *index: int, by: float = 0.0, times: float = 1.0) -> Inputs:
     """One number of the model wrong (an inertia's product on both sides), or a whole field of it."""
 
     def alter(model: Model, state: State) -> tuple[Model, State]:
-        value = getattr(model, field).copy()
+        value = getattr(model, answer_change).copy()
         for at in {index, (*index[:1], *index[:0:-1])}:
             value[at] = value[at] * times + by
-        wrong = model.changed(**{field: value})
-        return wrong, relifted(wrong, state)
+        wrong = model.changed(**{answer_change: value})
+        return wrong, with_coordinates(wrong, state)
 
     return alter
 
@@ -127,32 +127,32 @@ def model_change(change: Callable[[Model, State], dict[str, Array]]) -> Inputs:
 
     def alter(model: Model, state: State) -> tuple[Model, State]:
         wrong = model.changed(**change(model, state))
-        return wrong, relifted(wrong, state)
+        return wrong, with_coordinates(wrong, state)
 
     return alter
 
 
 def state_change(change: Callable[[Model, State], dict[str, Array]]) -> Inputs:
     """Minimal coordinates of the state replaced."""
-    return lambda model, state: (model, relifted(model, state, **change(model, state)))
+    return lambda model, state: (model, with_coordinates(model, state, **change(model, state)))
 
 
-def world(state: State, vectors: Array) -> Array:
+def to_world(state: State, vectors: Array) -> Array:
     """A x of each body."""
     return np.asarray((rotation_matrix(state.p) @ vectors[..., None])[..., 0])
 
 
-def body(state: State, vectors: Array) -> Array:
+def to_body(state: State, vectors: Array) -> Array:
     """Aᵀ x of each body."""
     return np.asarray((rotation_matrix(state.p).mT @ vectors[..., None])[..., 0])
 
 
-def gyroscopic(model: Model, state: State) -> Array:
+def gyroscopic_moment(model: Model, state: State) -> Array:
     """ω′ × J ω′ (N, 3)."""
     return np.cross(state.omega, (model.inertia @ state.omega[..., None])[..., 0])
 
 
-def centre_moved(k: int, shift: Array) -> Inputs:
+def centre_of_mass_moved(k: int, shift: Array) -> Inputs:
     """The centre of mass of body k at ``shift`` from where it is: its attachments move the other way."""
 
     def change(model: Model, _: State) -> dict[str, Array]:
@@ -162,14 +162,14 @@ def centre_moved(k: int, shift: Array) -> Inputs:
     return model_change(change)
 
 
-def about_proximal(model: Model, _: State) -> dict[str, Array]:
+def inertia_about_proximal(model: Model, _: State) -> dict[str, Array]:
     """Inertia of every body about its proximal point (Huygens and Steiner)."""
     s = model.proximal
     square = np.sum(s * s, -1)[:, None, None] * np.eye(3) - s[:, :, None] * s[:, None, :]
     return {"inertia": model.inertia + model.mass[:, None, None] * square}
 
 
-def tilted(k: int, angle: float) -> Inputs:
+def attitude_turned(k: int, angle: float) -> Inputs:
     """The attitude of body k turned by an angle about its own x axis."""
 
     def change(_: Model, state: State) -> dict[str, Array]:
@@ -182,24 +182,24 @@ def tilted(k: int, angle: float) -> Inputs:
     return state_change(change)
 
 
-def single(x: Array) -> Array:
+def to_single_precision(x: Array) -> Array:
     """Rounded to single precision."""
     return np.asarray(x, np.float32).astype(float)
 
 
-def unit(p: Array) -> Array:
+def normalised(p: Array) -> Array:
     """Normalised."""
     return np.asarray(p / np.linalg.norm(p, axis=-1, keepdims=True))
 
 
-def single_inside(model: Model, state: State) -> tuple[Model, State]:
+def inputs_in_single_precision(model: Model, state: State) -> tuple[Model, State]:
     """Everything the engine is given passes through single precision."""
-    wrong = model.changed(**{k: single(v) for k, v in model.fields.items()})
-    rounded = {k: single(getattr(state, k)) for k in ("omega", "u", "udot")}
-    return wrong, relifted(wrong, state, p=unit(single(state.p)), **rounded)
+    wrong = model.changed(**{k: to_single_precision(v) for k, v in model.fields.items()})
+    rounded = {k: to_single_precision(getattr(state, k)) for k in ("omega", "u", "udot")}
+    return wrong, with_coordinates(wrong, state, p=normalised(to_single_precision(state.p)), **rounded)
 
 
-def field(name: str, change: Callable[[Model, State, Any], Any]) -> Answers:
+def answer_change(name: str, change: Callable[[Model, State, Any], Any]) -> Answers:
     """One quantity of each answer altered."""
 
     def alter(model: Model, states: list[State], reported: list[StateQuantities]) -> list[StateQuantities]:
@@ -211,7 +211,7 @@ def field(name: str, change: Callable[[Model, State, Any], Any]) -> Answers:
     return alter
 
 
-def stale(*names: str) -> Answers:
+def stale_answers(*names: str) -> Answers:
     """Fields still hold what they were at the state before."""
 
     def alter(_: Model, __: list[State], reported: list[StateQuantities]) -> list[StateQuantities]:
@@ -223,12 +223,12 @@ def stale(*names: str) -> Answers:
     return alter
 
 
-def spins(model: Model, state: State) -> Array:
+def body_spins(model: Model, state: State) -> Array:
     """J ω′ of each body (N, 3)."""
     return np.asarray((model.inertia @ state.omega[..., None])[..., 0])
 
 
-def spin_part(model: Model, state: State) -> Array:
+def rotational_energy(model: Model, state: State) -> Array:
     """½ ω′·J ω′ summed (J)."""
     return np.asarray(0.5 * np.einsum("ki,kij,kj", state.omega, model.inertia, state.omega))
 
@@ -239,19 +239,19 @@ def about_centre(model: Model, state: State, reported: Array) -> Array:
     return np.asarray(reported - np.cross(centre, model.mass @ state.v))
 
 
-def far_centripetal(model: Model, state: State) -> Array:
+def distal_gamma(model: Model, state: State) -> Array:
     """−(what the far body's ω × (ω × s) gives to a ball's γ)."""
-    bent = world(state, np.cross(state.omega, np.cross(state.omega, model.distal)))
-    return -np.concatenate([np.zeros((1, 3)), bent[:-1]]).ravel()
+    centripetal = to_world(state, np.cross(state.omega, np.cross(state.omega, model.distal)))
+    return -np.concatenate([np.zeros((1, 3)), centripetal[:-1]]).ravel()
 
 
-def all_gamma(model: Model, state: State) -> Array:
+def ball_gamma(model: Model, state: State) -> Array:
     """−γ of ball joints."""
-    bent = world(state, np.cross(state.omega, np.cross(state.omega, model.proximal)))
-    return bent.ravel() + far_centripetal(model, state)
+    centripetal = to_world(state, np.cross(state.omega, np.cross(state.omega, model.proximal)))
+    return centripetal.ravel() + distal_gamma(model, state)
 
 
-def rod_bend(model: Model, state: State) -> Array:
+def rod_gamma(model: Model, state: State) -> Array:
     """−(−2 ḋᵀḋ) of the rods' γ."""
     return np.asarray(2 * model.length**2 * np.sum(state.udot**2, -1))
 
@@ -259,14 +259,14 @@ def rod_bend(model: Model, state: State) -> Array:
 # --- in time ------------------------------------------------------------------------------------
 
 
-def euler_inside(
+def euler_as_rk4(
     simulate: Any, model: Model, state: State, times: Array, i: Integrator, h: float
 ) -> Trajectory:
     """A first-order step under the name of RK4."""
     return simulate(model, state, times, replace(i, name="Euler"), h)
 
 
-def richardson_inside(
+def extrapolated_euler(
     simulate: Any, model: Model, state: State, times: Array, i: Integrator, h: float
 ) -> Trajectory:
     """An order-2 step under the name of RK4: Euler extrapolated once."""
@@ -275,17 +275,17 @@ def richardson_inside(
     return replace(
         fine,
         r=2 * fine.r - coarse.r,
-        p=unit(2 * fine.p - sign * coarse.p),
+        p=normalised(2 * fine.p - sign * coarse.p),
         v=2 * fine.v - coarse.v,
         pdot=2 * fine.pdot - sign * coarse.pdot,
         steps=coarse.steps,
     )
 
 
-def slow_clock(
+def fast_clock(
     simulate: Any, model: Model, state: State, times: Array, i: Integrator, h: float
 ) -> Trajectory:
-    """Time runs 1e-6 too fast; the clock shows what was asked."""
+    """Time runs 1e-6 too fast; the sample times are the requested ones."""
     off = 1 + 1e-6
     return replace(simulate(model, state, times * off, i, h * off), t=times)
 
@@ -300,8 +300,8 @@ def one_step_late(
     return Trajectory(times, *(getattr(run, k)[kept] for k in ("r", "p", "v", "pdot")), run.steps)
 
 
-def rows_of(rows: Callable[[int], list[int]]) -> Run:
-    """Rows of the trajectory taken from others, the times as asked."""
+def rows_reordered(rows: Callable[[int], list[int]]) -> Run:
+    """Rows of the trajectory taken from others, the times as requested."""
 
     def alter(simulate: Any, model: Model, state: State, times: Array, i: Integrator, h: float) -> Trajectory:
         run, order = simulate(model, state, times, i, h), rows(len(times))
@@ -310,7 +310,7 @@ def rows_of(rows: Callable[[int], list[int]]) -> Run:
     return alter
 
 
-def sampled(change: Callable[[Trajectory], dict[str, Array]]) -> Run:
+def sample_change(change: Callable[[Trajectory], dict[str, Array]]) -> Run:
     """Columns of the trajectory replaced."""
 
     def alter(simulate: Any, model: Model, state: State, times: Array, i: Integrator, h: float) -> Trajectory:
@@ -320,9 +320,7 @@ def sampled(change: Callable[[Trajectory], dict[str, Array]]) -> Run:
     return alter
 
 
-def early_stop(
-    simulate: Any, model: Model, state: State, times: Array, i: Integrator, h: float
-) -> Trajectory:
+def short_run(simulate: Any, model: Model, state: State, times: Array, i: Integrator, h: float) -> Trajectory:
     """The run ends before the last samples."""
     return simulate(model, state, times[:-3], i, h)
 
@@ -335,34 +333,38 @@ def damped(simulate: Any, model: Model, state: State, times: Array, i: Integrato
 # --- of one body, or in a rare branch ------------------------------------------------------------
 
 
-def only(k: int, right: Array, wrong: Array) -> Array:
+def with_row(k: int, right: Array, wrong: Array) -> Array:
     """Row k of the second, the other rows of the first."""
     out = np.array(right)
     out[k] = wrong[k]
     return out
 
 
-def load_of(k: int, **change: Callable[[Model, State], Array]) -> Inputs:
+def body_change(k: int, **change: Callable[[Model, State], Array]) -> Inputs:
     """Fields of the model replaced in the row of one body."""
-    return model_change(lambda m, s: {name: only(k, getattr(m, name), f(m, s)) for name, f in change.items()})
+    return model_change(
+        lambda m, s: {name: with_row(k, getattr(m, name), f(m, s)) for name, f in change.items()}
+    )
 
 
-def state_of(k: int, **change: Callable[[Model, State], Array]) -> Inputs:
+def body_state_change(k: int, **change: Callable[[Model, State], Array]) -> Inputs:
     """Minimal coordinates of one body replaced."""
-    return lambda m, s: (m, relifted(m, s, **{x: only(k, getattr(s, x), f(m, s)) for x, f in change.items()}))
+    return state_change(
+        lambda m, s: {name: with_row(k, getattr(s, name), f(m, s)) for name, f in change.items()}
+    )
 
 
-def answer_of(k: int, name: str, change: Callable[[Model, State, Array], Array]) -> Answers:
+def body_answer_change(k: int, name: str, change: Callable[[Model, State, Array], Array]) -> Answers:
     """One quantity of one body altered in each answer."""
-    return field(name, lambda m, s, x: only(k, x, change(m, s, x)))
+    return answer_change(name, lambda m, s, x: with_row(k, x, change(m, s, x)))
 
 
-def provided(condition: Callable[[Model, State], bool], change: Inputs) -> Inputs:
+def when(condition: Callable[[Model, State], bool], change: Inputs) -> Inputs:
     """A change in a branch that is rarely taken."""
     return lambda m, s: change(m, s) if condition(m, s) else (m, s)
 
 
-def moment_added(extra: Callable[[Model, State], Array], *bodies: int) -> Inputs:
+def added_moment(extra: Callable[[Model, State], Array], *bodies: int) -> Inputs:
     """A moment (N, 3) in body axes on some bodies, or on all."""
 
     def change(model: Model, state: State) -> dict[str, Array]:
@@ -372,27 +374,27 @@ def moment_added(extra: Callable[[Model, State], Array], *bodies: int) -> Inputs
     return model_change(change)
 
 
-def acting_at(point: str, force: Callable[[Model, State], Array]) -> Callable[[Model, State], Array]:
+def moment_of_force_at(point: str, force: Callable[[Model, State], Array]) -> Callable[[Model, State], Array]:
     """s × Aᵀ F: the moment of a world force that acts at a point of the body."""
-    return lambda m, s: np.cross(getattr(m, point), body(s, force(m, s)))
+    return lambda m, s: np.cross(getattr(m, point), to_body(s, force(m, s)))
 
 
 def relative_attitudes(_: Model, state: State) -> Array:
     """Attitudes relative to the body before: q₁* q₂."""
     before = np.concatenate([[[1.0, 0, 0, 0]], state.p[:-1]])
-    return unit(quaternion_product(quaternion_conjugate(before), state.p))
+    return normalised(quaternion_product(quaternion_conjugate(before), state.p))
 
 
-def product_reversed(model: Model, state: State) -> Array:
+def reversed_product(model: Model, state: State) -> Array:
     """q₁ and q₁* q₂ multiplied in the other order."""
     before = np.concatenate([[[1.0, 0, 0, 0]], state.p[:-1]])
-    return unit(quaternion_product(relative_attitudes(model, state), before))
+    return normalised(quaternion_product(relative_attitudes(model, state), before))
 
 
 def relative_rates(_: Model, state: State) -> Array:
     """ω′ relative to the body before, in the body's own frame."""
-    absolute = world(state, state.omega)
-    return state.omega - body(state, np.concatenate([np.zeros((1, 3)), absolute[:-1]]))
+    absolute = to_world(state, state.omega)
+    return state.omega - to_body(state, np.concatenate([np.zeros((1, 3)), absolute[:-1]]))
 
 
 def drag_moment_from(rate: Callable[[Model, State], Array]) -> Inputs:
@@ -413,12 +415,12 @@ def drag_force_from(velocity: Callable[[Model, State], Array]) -> Inputs:
 
 def proximal_velocity(model: Model, state: State) -> Array:
     """Velocity of each body's proximal point."""
-    return state.v + world(state, np.cross(state.omega, model.proximal))
+    return state.v + to_world(state, np.cross(state.omega, model.proximal))
 
 
 def one_inertia(k: int, change: Callable[[Model, State], Array]) -> Inputs:
     """The inertia of one body replaced."""
-    return load_of(k, inertia=change)
+    return body_change(k, inertia=change)
 
 
 def stale_state(*names: str) -> Inputs:
@@ -428,18 +430,18 @@ def stale_state(*names: str) -> Inputs:
     def alter(model: Model, state: State) -> tuple[Model, State]:
         before = last[-1] if last and last[-1].p.shape == state.p.shape else state
         last[:] = [state]
-        return model, relifted(model, state, **{name: getattr(before, name) for name in names})
+        return model, with_coordinates(model, state, **{name: getattr(before, name) for name in names})
 
     return alter
 
 
-def stale_of(k: int, name: str) -> Answers:
+def stale_body_answer(k: int, name: str) -> Answers:
     """One body's row still holds what it was at the state before."""
 
     def alter(_: Model, __: list[State], reported: list[StateQuantities]) -> list[StateQuantities]:
         before = [reported[-1], *reported[:-1]]
         return [
-            replace(a, **{name: only(k, getattr(a, name), getattr(b, name))})
+            replace(a, **{name: with_row(k, getattr(a, name), getattr(b, name))})
             for a, b in zip(reported, before, strict=True)
         ]
 
@@ -451,7 +453,7 @@ def at_identity(k: int) -> Callable[[Model, State], bool]:
     return lambda _, state: bool(abs(state.p[k, 0]) == 1.0)
 
 
-def rod_bend_after_balls(model: Model, state: State) -> Array:
+def rod_gamma_after_balls(model: Model, state: State) -> Array:
     """−(−2 ḋᵀḋ) of the rods that follow a ball joint, in the layout of `Bent`: 3 rows a ball, 1 a rod."""
     rows, before = [], False
     for k, rod in enumerate(model.rods):
@@ -462,12 +464,12 @@ def rod_bend_after_balls(model: Model, state: State) -> Array:
     return np.array(rows)
 
 
-def proximal_bend(k: int) -> Callable[[Model, State], Array]:
+def proximal_gamma(k: int) -> Callable[[Model, State], Array]:
     """−(what ω × (ω × s) of body k gives to γ of its own ball joint)."""
 
     def defect(model: Model, state: State) -> Array:
-        bent = world(state, np.cross(state.omega, np.cross(state.omega, model.proximal)))
-        return np.where(np.arange(model.n)[:, None] == k, bent, 0.0).ravel()
+        centripetal = to_world(state, np.cross(state.omega, np.cross(state.omega, model.proximal)))
+        return np.where(np.arange(model.n)[:, None] == k, centripetal, 0.0).ravel()
 
     return defect
 
@@ -534,32 +536,32 @@ X = np.array([1.0, 0.0, 0.0])
 STATE_DEFECTS = (
     # numbers of the model
     Defect("inertia-yy-1e-4", "J_yy of body 2 × (1 + 1e-4)", ("inertia yy of body 2",), M,
-           inputs=parameter("inertia", 1, 1, 1, times=1 + 1e-4)),
+           inputs=parameter_change("inertia", 1, 1, 1, times=1 + 1e-4)),
     Defect("inertia-xx-1e-6", "J_xx of body 1 × (1 + 1e-6)", ("inertia xx of body 1",), P,
-           inputs=parameter("inertia", 0, 0, 0, times=1 + 1e-6)),
+           inputs=parameter_change("inertia", 0, 0, 0, times=1 + 1e-6)),
     Defect("inertia-yy-7-percent", "J_yy of body 2 × 0.93", ("inertia yy of body 2",), E, "rods",
-           inputs=parameter("inertia", 1, 1, 1, times=0.93)),
+           inputs=parameter_change("inertia", 1, 1, 1, times=0.93)),
     Defect("inertia-xy-sign", "J_xy of body 1 × -1", ("inertia xy of body 1",), M,
-           inputs=parameter("inertia", 0, 0, 1, times=-1.0)),
+           inputs=parameter_change("inertia", 0, 0, 1, times=-1.0)),
     Defect("inertia-products-dropped", "all products of inertia 0", ("products of inertia",), P,
            inputs=model_change(lambda m, _: {"inertia": m.inertia * np.eye(3)})),
     Defect("inertia-about-proximal", "J + m (s² I - s sᵀ)", ("inertia about the proximal point",), E,
-           inputs=model_change(about_proximal)),
+           inputs=model_change(inertia_about_proximal)),
     Defect("inertia-in-world-axes", "A J Aᵀ in place of J", ("inertia in world axes",), M,
            inputs=model_change(lambda m, s: {"inertia": (lambda x: (x + x.mT) / 2)(
                rotation_matrix(s.p).mT @ m.inertia @ rotation_matrix(s.p))})),
     Defect("centre-0.1mm", "centre of mass of body 1 by 0.1 mm in x", ("centre of mass of body 1",), M,
-           inputs=centre_moved(0, 1e-4 * X)),
+           inputs=centre_of_mass_moved(0, 1e-4 * X)),
     Defect("proximal-1e-5", "proximal y of body 1 by 1e-5 m", ("proximal y of body 1",), P,
-           inputs=parameter("proximal", 0, 1, by=1e-5)),
+           inputs=parameter_change("proximal", 0, 1, by=1e-5)),
     Defect("distal-1e-5", "distal x of body 1 by 1e-5 m", ("distal x of body 1",), E,
-           inputs=parameter("distal", 0, 0, by=1e-5)),
+           inputs=parameter_change("distal", 0, 0, by=1e-5)),
     Defect("rod-length-1e-5", "length of rod 2 × (1 + 1e-5)", ("length of rod 2",), M, "rods",
-           inputs=parameter("length", 1, times=1 + 1e-5)),
+           inputs=parameter_change("length", 1, times=1 + 1e-5)),
     Defect("mass-1-1e-5", "mass of body 1 × (1 + 1e-5)", ("mass of body 1",), E,
-           inputs=parameter("mass", 0, times=1 + 1e-5)),
+           inputs=parameter_change("mass", 0, times=1 + 1e-5)),
     Defect("mass-2-1e-5", "mass of body 2 × (1 + 1e-5)", ("mass of body 2",), P, "rods",
-           inputs=parameter("mass", 1, times=1 + 1e-5)),
+           inputs=parameter_change("mass", 1, times=1 + 1e-5)),
     Defect("mass-and-inertia-together", "all masses and inertias × (1 + 1e-4)", ("all masses and inertias",),
            inputs=model_change(lambda m, _: {k: getattr(m, k) * (1 + 1e-4) for k in ("mass", "inertia")})),
     Defect("lengths-1e-5", "all offsets × (1 + 1e-5)", ("all lengths",), P,
@@ -568,7 +570,7 @@ STATE_DEFECTS = (
     Defect("gravity-1e-5", "gravity × (1 + 1e-5)", ("gravity's size",), P,
            inputs=model_change(lambda m, _: {"gravity": m.gravity * (1 + 1e-5)})),
     Defect("gravity-z", "gravity z by -1e-3 m/s²", ("gravity z",), E,
-           inputs=parameter("gravity", 2, by=-1e-3)),
+           inputs=parameter_change("gravity", 2, by=-1e-3)),
     Defect("gravity-sign", "gravity × -1", ("gravity reversed", "gravity's size"), M, "rods",
            inputs=model_change(lambda m, _: {"gravity": -m.gravity})),
     Defect("gravity-axes", "gravity's y and z exchanged", ("gravity's y and z",), P,
@@ -582,16 +584,16 @@ STATE_DEFECTS = (
     Defect("loads-ignored", "F and n′ 0", ("without applied loads",), P, loaded=True,
            inputs=model_change(lambda m, _: {"force": 0 * m.force, "moment": 0 * m.moment})),
     Defect("force-in-body-frame", "A F in place of F", ("applied force were taken in the body frame",), M,
-           loaded=True, inputs=model_change(lambda m, s: {"force": world(s, m.force)})),
+           loaded=True, inputs=model_change(lambda m, s: {"force": to_world(s, m.force)})),
     Defect("moment-in-world-frame", "Aᵀ n′ in place of n′", ("applied moment were taken in the world frame",),
-           E, loaded=True, inputs=model_change(lambda m, s: {"moment": body(s, m.moment)})),
+           E, loaded=True, inputs=model_change(lambda m, s: {"moment": to_body(s, m.moment)})),
     # numbers of the state
     Defect("rotation-transposed", "A → Aᵀ", ("rotation matrix were transposed",), M,
            inputs=state_change(lambda _, s: {"p": quaternion_conjugate(s.p)})),
     Defect("quaternion-order", "(x, y, z, w) read as (w, x, y, z)", ("quaternion order",), P,
            inputs=state_change(lambda _, s: {"p": np.roll(s.p, -1, axis=1)})),
     Defect("world-rate-for-body-rate", "A ω′ in place of ω′", ("world-frame angular velocity",), E,
-           inputs=state_change(lambda _, s: {"omega": world(s, s.omega)})),
+           inputs=state_change(lambda _, s: {"omega": to_world(s, s.omega)})),
     Defect("rates-doubled", "ω′ × 2", ("angular rates",), P,
            inputs=state_change(lambda _, s: {"omega": 2 * s.omega})),
     Defect("rates-in-degrees", "ω′ × π/180", ("angular rates",), M,
@@ -599,304 +601,307 @@ STATE_DEFECTS = (
     Defect("rod-rate-dropped", "u̇ = 0", ("rod rate",), M, "rods",
            inputs=state_change(lambda _, s: {"udot": 0 * s.udot})),
     Defect("tilt-1e-6", "body 2 turned by 1e-6 rad about its x", ("attitude of body 2",), E,
-           inputs=tilted(1, 1e-6)),
-    Defect("single-inside", "all inputs through single precision", (), M, inputs=single_inside),
+           inputs=attitude_turned(1, 1e-6)),
+    Defect("single-inside", "all inputs through single precision", (), M, inputs=inputs_in_single_precision),
     # terms of the equations
     Defect("gyroscopic-dropped", "8 L̇ᵀJL̇p × 0", ("gyroscopic term",), P,
-           inputs=model_change(lambda m, s: {"moment": m.moment + gyroscopic(m, s)})),
+           inputs=model_change(lambda m, s: {"moment": m.moment + gyroscopic_moment(m, s)})),
     Defect("gyroscopic-doubled", "8 L̇ᵀJL̇p × 2", ("gyroscopic term",), M, "rods",
-           inputs=model_change(lambda m, s: {"moment": m.moment - gyroscopic(m, s)})),
+           inputs=model_change(lambda m, s: {"moment": m.moment - gyroscopic_moment(m, s)})),
     Defect("gamma-far-dropped", "γ without the far body's term", ("distal term of γ",), R,
-           gamma=far_centripetal),
-    Defect("gamma-dropped", "γ = 0 (missing J̇v)", ("γ (J̇v)",), R, gamma=all_gamma),
-    Defect("gamma-rod-dropped", "γ of rods without ḋᵀḋ", ("rod term of γ",), R, "rods", gamma=rod_bend),
+           gamma=distal_gamma),
+    Defect("gamma-dropped", "γ = 0 (missing J̇v)", ("γ (J̇v)",), R, gamma=ball_gamma),
+    Defect("gamma-rod-dropped", "γ of rods without ḋᵀḋ", ("rod term of γ",), R, "rods", gamma=rod_gamma),
     # what comes back
     Defect("spatial-acceleration", "r̈ - ω × ṙ in place of r̈", ("spatial acceleration",), P,
-           answers=field("acceleration", lambda _, s, a: a - np.cross(world(s, s.omega), s.v))),
+           answers=answer_change("acceleration", lambda _, s, a: a - np.cross(to_world(s, s.omega), s.v))),
     Defect("proper-acceleration", "r̈ - g in place of r̈", ("acceleration minus gravity",), M,
-           answers=field("acceleration", lambda m, _, a: a - m.gravity)),
+           answers=answer_change("acceleration", lambda m, _, a: a - m.gravity)),
     Defect("acceleration-in-body-frame", "Aᵀ r̈", ("acceleration in the body frame",), E,
-           answers=field("acceleration", lambda _, s, a: body(s, a))),
+           answers=answer_change("acceleration", lambda _, s, a: to_body(s, a))),
     Defect("angular-acceleration-in-world-frame", "A ω̇′", ("angular acceleration in the world frame",), P,
-           answers=field("angular_acceleration", lambda _, s, a: world(s, a))),
+           answers=answer_change("angular_acceleration", lambda _, s, a: to_world(s, a))),
     Defect("reaction-sign", "-F", ("joint reaction with the opposite sign",), M, "rods",
-           answers=field("joint_reaction", lambda _, __, f: -f)),
+           answers=answer_change("joint_reaction", lambda _, __, f: -f)),
     Defect("reaction-on-wrong-body", "F of the next joint", ("joint reaction of another body",), E,
-           answers=field("joint_reaction", lambda _, __, f: np.roll(f, -1, axis=0))),
+           answers=answer_change("joint_reaction", lambda _, __, f: np.roll(f, -1, axis=0))),
     Defect("reaction-in-body-frame", "Aᵀ F", ("joint reaction in the body frame",), P,
-           answers=field("joint_reaction", lambda _, s, f: body(s, f))),
+           answers=answer_change("joint_reaction", lambda _, s, f: to_body(s, f))),
     Defect("bodies-exchanged", "rows of the accelerations in reverse", ("another body",), M,
-           answers=field("acceleration", lambda _, __, a: a[::-1])),
+           answers=answer_change("acceleration", lambda _, __, a: a[::-1])),
     Defect("potential-origin", "zero 0.1 m above the pivot", ("origin of the potential energy",), M,
-           answers=field("potential_energy", lambda m, _, e: e + 0.1 * np.sum(m.mass) * 9.7)),
+           answers=answer_change("potential_energy", lambda m, _, e: e + 0.1 * np.sum(m.mass) * 9.7)),
     Defect("potential-sign", "-V", ("potential energy with the opposite sign",), E,
-           answers=field("potential_energy", lambda _, __, e: -e)),
+           answers=answer_change("potential_energy", lambda _, __, e: -e)),
     Defect("kinetic-without-spin", "T - ½ ω′·J ω′", ("kinetic energy without rotation",), P,
-           answers=field("kinetic_energy", lambda m, s, e: e - float(spin_part(m, s)))),
+           answers=answer_change("kinetic_energy", lambda m, s, e: e - float(rotational_energy(m, s)))),
     Defect("kinetic-twice", "2 T", ("kinetic energy",), M,
-           answers=field("kinetic_energy", lambda _, __, e: 2 * e)),
+           answers=answer_change("kinetic_energy", lambda _, __, e: 2 * e)),
     Defect("momentum-about-centre", "L about the centre of mass", ("about the centre of mass",), E,
-           answers=field("angular_momentum", about_centre)),
+           answers=answer_change("angular_momentum", about_centre)),
     Defect("stale-reaction", "F of the state before", ("of the previous state",), P,
-           answers=stale("joint_reaction")),
+           answers=stale_answers("joint_reaction")),
     Defect("stale-everything", "r̈, ω̇′ and F of the state before", ("of the previous state",), M, "rods",
-           answers=stale("acceleration", "angular_acceleration", "joint_reaction")),
+           answers=stale_answers("acceleration", "angular_acceleration", "joint_reaction")),
     Defect("single-precision-out", "r̈ rounded to single precision", ("single precision",), E,
-           answers=field("acceleration", lambda _, __, a: single(a))),
+           answers=answer_change("acceleration", lambda _, __, a: to_single_precision(a))),
 )  # fmt: skip
 
 # Of a single body, a single load, a rare branch: committed before any mechanism that names them.
 BODY_DEFECTS = (
     # loads
     Defect("force-2-dropped", "F of body 2 × 0", ("applied force of body 2",), M, loaded=True,
-           inputs=load_of(1, force=lambda m, _: 0 * m.force)),
+           inputs=body_change(1, force=lambda m, _: 0 * m.force)),
     Defect("force-1-0.1-percent", "F of body 1 × 1.001", ("applied force of body 1",), P, "rods", loaded=True,
-           inputs=load_of(0, force=lambda m, _: 1.001 * m.force)),
+           inputs=body_change(0, force=lambda m, _: 1.001 * m.force)),
     Defect("force-2-sign", "F of body 2 × -1", ("applied force of body 2",), E, loaded=True,
-           inputs=load_of(1, force=lambda m, _: -m.force)),
+           inputs=body_change(1, force=lambda m, _: -m.force)),
     Defect("force-x-of-2-dropped", "F_x of body 2 = 0", ("applied force x of body 2",), P, loaded=True,
-           inputs=parameter("force", 1, 0, times=0.0)),
+           inputs=parameter_change("force", 1, 0, times=0.0)),
     Defect("moment-1-dropped", "n′ of body 1 × 0", ("applied moment of body 1",), E, loaded=True,
-           inputs=load_of(0, moment=lambda m, _: 0 * m.moment)),
+           inputs=body_change(0, moment=lambda m, _: 0 * m.moment)),
     Defect("moment-2-doubled", "n′ of body 2 × 2", ("applied moment of body 2",), P, "rod-ball", loaded=True,
-           inputs=load_of(1, moment=lambda m, _: 2 * m.moment)),
+           inputs=body_change(1, moment=lambda m, _: 2 * m.moment)),
     Defect("moment-1-sign", "n′ of body 1 × -1", ("applied moment of body 1",), M, "rods", loaded=True,
-           inputs=load_of(0, moment=lambda m, _: -m.moment)),
+           inputs=body_change(0, moment=lambda m, _: -m.moment)),
     Defect("moment-z-of-1-dropped", "n′_z of body 1 = 0", ("applied moment z of body 1",), M, loaded=True,
-           inputs=parameter("moment", 0, 2, times=0.0)),
+           inputs=parameter_change("moment", 0, 2, times=0.0)),
     Defect("loads-2-dropped", "F and n′ of body 2 × 0", ("applied loads of body 2",), M, loaded=True,
-           inputs=load_of(1, force=lambda m, _: 0 * m.force, moment=lambda m, _: 0 * m.moment)),
+           inputs=body_change(1, force=lambda m, _: 0 * m.force, moment=lambda m, _: 0 * m.moment)),
     Defect("loads-3-dropped", "F and n′ of body 3 of five × 0", ("applied loads of body 3",), P, "mixed",
            loaded=True,
-           inputs=load_of(2, force=lambda m, _: 0 * m.force, moment=lambda m, _: 0 * m.moment)),
+           inputs=body_change(2, force=lambda m, _: 0 * m.force, moment=lambda m, _: 0 * m.moment)),
     Defect("load-where-none-is", "F_y of body 1 = 1e-5 N", ("applied force y of body 1",), E,
-           inputs=parameter("force", 0, 1, by=1e-5)),
+           inputs=parameter_change("force", 0, 1, by=1e-5)),
     Defect("force-1-in-body-frame", "A F of body 1", ("force of body 1 were taken in the body frame",), P,
-           loaded=True, inputs=load_of(0, force=lambda m, s: world(s, m.force))),
+           loaded=True, inputs=body_change(0, force=lambda m, s: to_world(s, m.force))),
     Defect("moment-2-in-world-frame", "Aᵀ n′ of body 2", ("moment of body 2 were taken in the world frame",),
-           M, loaded=True, inputs=load_of(1, moment=lambda m, s: body(s, m.moment))),
+           M, loaded=True, inputs=body_change(1, moment=lambda m, s: to_body(s, m.moment))),
     Defect("force-turned-back", "Aᵀ F in place of F", ("applied force were rotated with Aᵀ",), E, loaded=True,
-           inputs=model_change(lambda m, s: {"force": body(s, m.force)})),
+           inputs=model_change(lambda m, s: {"force": to_body(s, m.force)})),
     Defect("moment-turned-twice", "A n′ in place of n′", ("applied moment were rotated with A",), P,
-           loaded=True, inputs=model_change(lambda m, s: {"moment": world(s, m.moment)})),
+           loaded=True, inputs=model_change(lambda m, s: {"moment": to_world(s, m.moment)})),
     Defect("loads-exchanged", "F of the other body", ("applied force of another body",), M, loaded=True,
            inputs=model_change(lambda m, _: {"force": m.force[::-1]})),
     Defect("force-1-at-proximal", "F of body 1 at its proximal point",
            ("force of body 1 acted at its proximal point",), P, loaded=True,
-           inputs=moment_added(acting_at("proximal", lambda m, _: m.force), 0)),
+           inputs=added_moment(moment_of_force_at("proximal", lambda m, _: m.force), 0)),
     Defect("forces-at-proximal", "all F at the proximal points", ("force acted at the proximal point",), M,
-           "rods", loaded=True, inputs=moment_added(acting_at("proximal", lambda m, _: m.force))),
+           "rods", loaded=True, inputs=added_moment(moment_of_force_at("proximal", lambda m, _: m.force))),
     Defect("force-1-at-distal", "F of body 1 at its distal point",
            ("force of body 1 acted at its distal point",), E, loaded=True,
-           inputs=moment_added(acting_at("distal", lambda m, _: m.force), 0)),
+           inputs=added_moment(moment_of_force_at("distal", lambda m, _: m.force), 0)),
     Defect("weight-2-at-proximal", "weight of body 2 at its proximal point",
            ("weight of body 2 acted at its proximal point",), M,
-           inputs=moment_added(acting_at("proximal", lambda m, _: m.mass[:, None] * m.gravity), 1)),
+           inputs=added_moment(moment_of_force_at("proximal", lambda m, _: m.mass[:, None] * m.gravity), 1)),
     Defect("weight-at-distal", "weights at the distal points, which the last body has none of",
            ("weight of body 1 acted at its distal point",), P,
-           inputs=moment_added(acting_at("distal", lambda m, _: m.mass[:, None] * m.gravity))),
+           inputs=added_moment(moment_of_force_at("distal", lambda m, _: m.mass[:, None] * m.gravity))),
     # drag
     Defect("drag-force-2-dropped", "c_t of body 2 × 0", ("drag force of body 2",), M, loaded=True,
-           inputs=parameter("drag_force", 1, times=0.0)),
+           inputs=parameter_change("drag_force", 1, times=0.0)),
     Defect("drag-force-1-1e-6", "c_t of body 1 × (1 + 1e-6)", ("drag force of body 1",), P, loaded=True,
-           inputs=parameter("drag_force", 0, times=1 + 1e-6)),
+           inputs=parameter_change("drag_force", 0, times=1 + 1e-6)),
     Defect("drag-moment-1-dropped", "c_r of body 1 × 0", ("drag moment of body 1",), E, loaded=True,
-           inputs=parameter("drag_moment", 0, times=0.0)),
+           inputs=parameter_change("drag_moment", 0, times=0.0)),
     Defect("drag-moment-2-sign", "c_r of body 2 × -1", ("drag moment of body 2",), P, "rods", loaded=True,
-           inputs=parameter("drag_moment", 1, times=-1.0)),
+           inputs=parameter_change("drag_moment", 1, times=-1.0)),
     Defect("drag-2-doubled", "c_t and c_r of body 2 × 2", ("drag of body 2",), M, loaded=True,
-           inputs=load_of(1, drag_force=lambda m, _: 2 * m.drag_force,
+           inputs=body_change(1, drag_force=lambda m, _: 2 * m.drag_force,
                           drag_moment=lambda m, _: 2 * m.drag_moment)),
     Defect("drag-exchanged", "c_t for c_r", ("c_t and c_r were exchanged",), M, loaded=True,
            inputs=model_change(lambda m, _: {"drag_force": m.drag_moment, "drag_moment": m.drag_force})),
     Defect("drag-2-exchanged", "c_t for c_r of body 2", ("c_t and c_r of body 2 were exchanged",), P,
-           loaded=True, inputs=load_of(1, drag_force=lambda m, _: m.drag_moment,
+           loaded=True, inputs=body_change(1, drag_force=lambda m, _: m.drag_moment,
                                        drag_moment=lambda m, _: m.drag_force)),
     Defect("drag-ct-for-cr", "c_t used for both", ("c_t were used as c_r",), E, loaded=True,
            inputs=model_change(lambda m, _: {"drag_moment": m.drag_force})),
     Defect("drag-force-in-body-frame", "-c_t Aᵀ ṙ", ("drag force were taken in the body frame",), M,
-           loaded=True, inputs=drag_force_from(lambda _, s: body(s, s.v))),
+           loaded=True, inputs=drag_force_from(lambda _, s: to_body(s, s.v))),
     Defect("drag-moment-in-world-frame", "-c_r A ω′", ("drag moment were taken in the world frame",), P,
-           loaded=True, inputs=drag_moment_from(lambda _, s: world(s, s.omega))),
+           loaded=True, inputs=drag_moment_from(lambda _, s: to_world(s, s.omega))),
     Defect("drag-of-proximal-velocity", "-c_t times the velocity of the proximal point",
            ("velocity of the proximal point",), E, loaded=True, inputs=drag_force_from(proximal_velocity)),
     Defect("drag-at-proximal", "-c_t ṙ at the proximal point",
            ("drag force acted at the proximal point",), M, loaded=True,
-           inputs=moment_added(acting_at("proximal", lambda m, s: -m.drag_force[:, None] * s.v))),
+           inputs=added_moment(moment_of_force_at("proximal", lambda m, s: -m.drag_force[:, None] * s.v))),
     Defect("damping-of-body-2", "c_r of body 2 by 1e-6 N m s", ("rotation of body 2",), P,
-           inputs=parameter("drag_moment", 1, by=1e-6)),
+           inputs=parameter_change("drag_moment", 1, by=1e-6)),
     Defect("joint-damping", "1e-4 N m s in every joint", ("damping in every joint", "damping in the joints"),
-           M, inside=lambda: mujoco_damping(1e-4)),
-    Defect("armature", "1e-4 kg m² in every joint", ("armature",), M, inside=lambda: mujoco_armature(1e-4)),
+           M, engine_patch=lambda: mujoco_damping(1e-4)),
+    Defect("armature", "1e-4 kg m² in every joint", ("armature",), M,
+           engine_patch=lambda: mujoco_armature(1e-4)),
     Defect("armature-of-joint-2", "1e-6 kg m² in joint 2", ("armature of joint 2",), M,
-           inside=lambda: mujoco_armature(0.0, 1e-6)),
+           engine_patch=lambda: mujoco_armature(0.0, 1e-6)),
     Defect("armature-of-three-percent", "1e-3 kg m² in every joint", ("armature",), P,
-           inside=lambda: pinocchio_armature(1e-3)),
+           engine_patch=lambda: pinocchio_armature(1e-3)),
     # velocity terms
     Defect("gyroscopic-1-dropped", "ω′ × J ω′ of body 1 × 0", ("gyroscopic term of body 1",), P,
-           inputs=moment_added(gyroscopic, 0)),
+           inputs=added_moment(gyroscopic_moment, 0)),
     Defect("gyroscopic-2-dropped", "ω′ × J ω′ of body 2 × 0", ("gyroscopic term of body 2",), E, "rods",
-           inputs=moment_added(gyroscopic, 1)),
+           inputs=added_moment(gyroscopic_moment, 1)),
     Defect("gyroscopic-2-sign", "ω′ × J ω′ of body 2 × -1", ("gyroscopic term of body 2",), M, "rod-ball",
-           inputs=moment_added(lambda m, s: 2 * gyroscopic(m, s), 1)),
+           inputs=added_moment(lambda m, s: 2 * gyroscopic_moment(m, s), 1)),
     Defect("gyroscopic-1-1e-6", "ω′ × J ω′ of body 1 × (1 + 1e-6)", ("gyroscopic term of body 1",), M,
-           inputs=moment_added(lambda m, s: -1e-6 * gyroscopic(m, s), 0)),
+           inputs=added_moment(lambda m, s: -1e-6 * gyroscopic_moment(m, s), 0)),
     Defect("gamma-2-proximal-dropped", "ω × (ω × s) of body 2 missing in γ",
-           ("proximal term of γ of body 2",), R, gamma=proximal_bend(1)),
+           ("proximal term of γ of body 2",), R, gamma=proximal_gamma(1)),
     # attitude, rates, inertia and points of one body
     Defect("attitude-2-conjugated", "q* of body 2", ("rotation matrix of body 2 were transposed",), M,
-           inputs=state_of(1, p=lambda _, s: quaternion_conjugate(s.p))),
+           inputs=body_state_change(1, p=lambda _, s: quaternion_conjugate(s.p))),
     Defect("attitude-1-conjugated", "q* of body 1", ("rotation matrix of body 1 were transposed",), E, "rods",
-           inputs=state_of(0, p=lambda _, s: quaternion_conjugate(s.p))),
+           inputs=body_state_change(0, p=lambda _, s: quaternion_conjugate(s.p))),
     Defect("attitude-3-conjugated", "q* of body 3 of five", ("rotation matrix of body 3 were transposed",), P,
-           "mixed", inputs=state_of(2, p=lambda _, s: quaternion_conjugate(s.p))),
+           "mixed", inputs=body_state_change(2, p=lambda _, s: quaternion_conjugate(s.p))),
     Defect("product-order-2", "(q₁* q₂) q₁ for q₂", ("quaternion product of body 2",), P,
-           inputs=state_of(1, p=product_reversed)),
+           inputs=body_state_change(1, p=reversed_product)),
     Defect("relative-attitude-2", "q₁* q₂ for q₂", ("attitude of body 2 relative to",), E,
-           inputs=state_of(1, p=relative_attitudes)),
+           inputs=body_state_change(1, p=relative_attitudes)),
     Defect("relative-rate-2", "ω′ relative to body 1 for body 2", ("angular velocity of body 2 relative to",),
-           M, inputs=state_of(1, omega=relative_rates)),
+           M, inputs=body_state_change(1, omega=relative_rates)),
     Defect("quaternion-order-1", "(x, y, z, w) of body 1", ("quaternion order of body 1",), M,
-           inputs=state_of(0, p=lambda _, s: np.roll(s.p, -1, axis=1))),
+           inputs=body_state_change(0, p=lambda _, s: np.roll(s.p, -1, axis=1))),
     Defect("world-rate-2", "A ω′ of body 2", ("world-frame angular velocity of body 2",), P,
-           inputs=state_of(1, omega=lambda _, s: world(s, s.omega))),
+           inputs=body_state_change(1, omega=lambda _, s: to_world(s, s.omega))),
     Defect("rate-2-1e-6", "ω′ of body 2 × (1 + 1e-6)", ("angular rate ω′ of body 2",), E,
-           inputs=state_of(1, omega=lambda _, s: (1 + 1e-6) * s.omega)),
+           inputs=body_state_change(1, omega=lambda _, s: (1 + 1e-6) * s.omega)),
     Defect("rod-rate-2-dropped", "u̇ of rod 2 = 0", ("rod rate u̇ of rod 2",), M, "rods",
-           inputs=state_of(1, udot=lambda _, s: 0 * s.udot)),
+           inputs=body_state_change(1, udot=lambda _, s: 0 * s.udot)),
     Defect("inertia-2-in-world-axes", "A J Aᵀ of body 2", ("inertia of body 2 in world axes",), P,
            inputs=one_inertia(1, lambda m, s: (lambda x: (x + x.mT) / 2)(
                rotation_matrix(s.p).mT @ m.inertia @ rotation_matrix(s.p)))),
     Defect("inertia-1-about-proximal", "J + m (s² I - s sᵀ) of body 1",
            ("inertia of body 1 about the proximal point",), M,
-           inputs=one_inertia(0, lambda m, s: about_proximal(m, s)["inertia"])),
+           inputs=one_inertia(0, lambda m, s: inertia_about_proximal(m, s)["inertia"])),
     Defect("products-2-dropped", "products of inertia of body 2 = 0", ("products of inertia of body 2",), E,
            inputs=one_inertia(1, lambda m, _: m.inertia * np.eye(3))),
     Defect("products-1-sign", "products of inertia of body 1 × -1", ("products of inertia of body 1",), P,
            inputs=one_inertia(0, lambda m, _: m.inertia * (2 * np.eye(3) - 1))),
     Defect("points-1-exchanged", "proximal and distal of body 1", ("proximal and distal points of body 1",),
-           M, inputs=load_of(0, proximal=lambda m, _: m.distal, distal=lambda m, _: m.proximal)),
+           M, inputs=body_change(0, proximal=lambda m, _: m.distal, distal=lambda m, _: m.proximal)),
     Defect("points-1-sign", "proximal and distal of body 1 × -1", ("attachment points of body 1",), P,
-           inputs=load_of(0, proximal=lambda m, _: -m.proximal, distal=lambda m, _: -m.distal)),
+           inputs=body_change(0, proximal=lambda m, _: -m.proximal, distal=lambda m, _: -m.distal)),
     Defect("mass-and-inertia-2", "mass and inertia of body 2 × (1 + 1e-5)", ("mass and inertia of body 2",),
-           M, inputs=load_of(1, mass=lambda m, _: (1 + 1e-5) * m.mass,
+           M, inputs=body_change(1, mass=lambda m, _: (1 + 1e-5) * m.mass,
                              inertia=lambda m, _: (1 + 1e-5) * m.inertia)),
     # answers of one body
     Defect("acceleration-1-stale", "r̈ of body 1 of the state before", ("of body 1 of the previous state",), M,
-           answers=stale_of(0, "acceleration")),
+           answers=stale_body_answer(0, "acceleration")),
     Defect("reaction-2-stale", "F of body 2 of the state before", ("of body 2 of the previous state",), P,
-           "rods", answers=stale_of(1, "joint_reaction")),
+           "rods", answers=stale_body_answer(1, "joint_reaction")),
     Defect("angular-1-for-2", "ω̇′ of body 1 for that of body 2", ("angular acceleration of body 1 as that",),
-           E, answers=field("angular_acceleration", lambda _, __, a: a[[0, 0]])),
+           E, answers=answer_change("angular_acceleration", lambda _, __, a: a[[0, 0]])),
     Defect("acceleration-4-for-3", "r̈ of body 4 for that of body 3 of five",
            ("acceleration of body 4 as that of body 3",), P, "mixed",
-           answers=field("acceleration", lambda _, __, a: a[[0, 1, 3, 3, 4]])),
+           answers=answer_change("acceleration", lambda _, __, a: a[[0, 1, 3, 3, 4]])),
     Defect("reaction-2-sign", "-F of body 2", ("joint reaction of body 2 with the opposite sign",), M,
-           answers=answer_of(1, "joint_reaction", lambda _, __, f: -f)),
+           answers=body_answer_change(1, "joint_reaction", lambda _, __, f: -f)),
     Defect("angular-2-in-world", "A ω̇′ of body 2", ("angular acceleration of body 2 in the world frame",), P,
-           answers=answer_of(1, "angular_acceleration", lambda _, s, a: world(s, a))),
+           answers=body_answer_change(1, "angular_acceleration", lambda _, s, a: to_world(s, a))),
     Defect("reaction-1-in-body", "Aᵀ F of body 1", ("joint reaction of body 1 in the body frame",), E,
-           answers=answer_of(0, "joint_reaction", lambda _, s, f: body(s, f))),
+           answers=body_answer_change(0, "joint_reaction", lambda _, s, f: to_body(s, f))),
     Defect("reaction-without-loads", "reaction that balances inertia and weight only",
            ("joint reaction without the applied forces",), M, loaded=True,
-           answers=field("joint_reaction",
+           answers=answer_change("joint_reaction",
                          lambda m, _, f: f + np.cumsum(m.force[::-1], axis=0)[::-1])),
     Defect("reaction-without-force-2", "reaction without F of body 2",
            ("joint reaction without the applied force of body 2",), P, loaded=True,
-           answers=field("joint_reaction", lambda m, _, f: f + m.force[1])),
+           answers=answer_change("joint_reaction", lambda m, _, f: f + m.force[1])),
     Defect("reaction-without-drag", "reaction without -c_t ṙ", ("joint reaction without the drag forces",), E,
-           loaded=True, answers=field("joint_reaction", lambda m, s, f: f - np.cumsum(
+           loaded=True, answers=answer_change("joint_reaction", lambda m, s, f: f - np.cumsum(
                (m.drag_force[:, None] * s.v)[::-1], axis=0)[::-1])),
     Defect("kinetic-without-body-2", "T of body 1 alone", ("kinetic energy without body 2",), M,
-           answers=field("kinetic_energy", lambda m, s, e: e - float(0.5 * m.mass[1] * s.v[1] @ s.v[1]
+           answers=answer_change("kinetic_energy", lambda m, s, e: e - float(0.5 * m.mass[1] * s.v[1] @ s.v[1]
                          + 0.5 * s.omega[1] @ m.inertia[1] @ s.omega[1]))),
     Defect("potential-without-body-1", "V of body 2 alone", ("potential energy without body 1",), P,
-           answers=field("potential_energy", lambda m, s, e: e + float(m.mass[0] * m.gravity @ s.r[0]))),
+           answers=answer_change("potential_energy",
+                                 lambda m, s, e: e + float(m.mass[0] * m.gravity @ s.r[0]))),
     Defect("momentum-spin-in-body-axes", "J ω′ not turned into the world", ("spin in body axes",), E,
-           answers=field("angular_momentum", lambda m, s, x: x + np.sum(
-               spins(m, s) - world(s, spins(m, s)), axis=0))),
+           answers=answer_change("angular_momentum", lambda m, s, x: x + np.sum(
+               body_spins(m, s) - to_world(s, body_spins(m, s)), axis=0))),
     # rare branches
     Defect("n3-gyroscopic", "ω′ × J ω′ of body 3 dropped where N ≥ 3", ("gyroscopic term of body 3",), M,
-           "mixed", inputs=provided(lambda m, _: m.n >= 3, moment_added(gyroscopic, 2))),
+           "mixed", inputs=when(lambda m, _: m.n >= 3, added_moment(gyroscopic_moment, 2))),
     Defect("rod-after-ball-length", "rods after balls longer by 1e-6", ("length of rod 4",), P, "mixed",
-           inputs=parameter("length", 3, times=1 + 1e-6)),
+           inputs=parameter_change("length", 3, times=1 + 1e-6)),
     Defect("rod-after-ball-gamma", "γ of rods after balls without ḋᵀḋ", ("rod term of γ of rod 4",), R,
-           "mixed", gamma=rod_bend_after_balls),
+           "mixed", gamma=rod_gamma_after_balls),
     Defect("loaded-mass", "mass of body 1 × (1 + 1e-5) where there is a load", ("mass of body 1",), E,
            loaded=True,
-           inputs=provided(lambda m, _: m.has_loads, parameter("mass", 0, times=1 + 1e-5))),
+           inputs=when(lambda m, _: m.has_loads, parameter_change("mass", 0, times=1 + 1e-5))),
     Defect("loaded-gravity", "no gravity where there is a load", ("no gravity", "gravity's size"), M,
-           loaded=True, inputs=provided(lambda m, _: m.has_loads, model_change(
+           loaded=True, inputs=when(lambda m, _: m.has_loads, model_change(
                lambda m, _: {"gravity": 0 * m.gravity}))),
     Defect("identity-gyroscopic", "ω′ × J ω′ of body 1 dropped at its identity attitude", (), M,
-           inputs=provided(at_identity(0), moment_added(gyroscopic, 0))),
+           inputs=when(at_identity(0), added_moment(gyroscopic_moment, 0))),
     Defect("identity-inertia", "products of inertia dropped at the identity attitude of body 2", (), P,
-           inputs=provided(at_identity(1), model_change(lambda m, _: {"inertia": m.inertia * np.eye(3)}))),
+           inputs=when(at_identity(1), model_change(lambda m, _: {"inertia": m.inertia * np.eye(3)}))),
     Defect("identity-rate-lost", "ω′ of body 1 = 0 at its identity attitude", (), E,
-           inputs=provided(at_identity(0), state_of(0, omega=lambda _, s: 0 * s.omega))),
+           inputs=when(at_identity(0), body_state_change(0, omega=lambda _, s: 0 * s.omega))),
     Defect("fast-gyroscopic", "ω′ × J ω′ dropped above 12 rad/s", (), P,
-           inputs=provided(lambda _, s: np.max(np.abs(s.omega)) > 12, moment_added(gyroscopic))),
+           inputs=when(lambda _, s: np.max(np.abs(s.omega)) > 12, added_moment(gyroscopic_moment))),
     Defect("rod-upward", "u̇ × -1 of rods that point upward", (), M, "rods",
-           inputs=lambda m, s: (m, relifted(m, s, udot=np.where(s.u[:, 2:] > 0, -1.0, 1.0) * s.udot))),
+           inputs=state_change(lambda _, s: {"udot": np.where(s.u[:, 2:] > 0, -1.0, 1.0) * s.udot})),
     Defect("stale-rates", "ω′ of the state before", (), P, inputs=stale_state("omega")),
     Defect("stale-attitudes", "attitudes of the state before", (), M, inputs=stale_state("p")),
     # loss of digits
     Defect("digits-lost-along-chain", "noise of 1e-15 in r̈, ten times as large from body to body",
            ("loses digits",), M, "balls-10",
-           answers=field("acceleration", noise_growing(10.0, 1e-15))),
+           answers=answer_change("acceleration", noise_growing(10.0, 1e-15))),
     Defect("digits-of-reactions", "noise of 1e-14 in F, eight times as large from body to body",
            ("loses digits",), P, "balls-10",
-           answers=field("joint_reaction", noise_growing(8.0, 1e-14))),
+           answers=answer_change("joint_reaction", noise_growing(8.0, 1e-14))),
 )  # fmt: skip
 STATE_DEFECTS = (*STATE_DEFECTS, *BODY_DEFECTS)
 
 MOTION_DEFECTS = (
-    Defect("order-1-named-RK4", "Euler's step under the name RK4", level="motion", run=euler_inside),
-    Defect("order-2-named-RK4", "an order-2 step under the name RK4", level="motion", run=richardson_inside),
-    Defect("clock-1e-6", "time × (1 + 1e-6)", level="motion", run=slow_clock),
+    Defect("order-1-named-RK4", "Euler's step under the name RK4", level="motion", run=euler_as_rk4),
+    Defect("order-2-named-RK4", "an order-2 step under the name RK4", level="motion", run=extrapolated_euler),
+    Defect("clock-1e-6", "time × (1 + 1e-6)", level="motion", run=fast_clock),
     Defect("one-step-late", "samples shifted by one step", level="motion", run=one_step_late),
     Defect("silent-reset", "the last third starts again", level="motion",
-           run=rows_of(lambda n: [*range(n - n // 3), *range(n // 3)])),
+           run=rows_reordered(lambda n: [*range(n - n // 3), *range(n // 3)])),
     Defect("repeated-last-rows", "the last three rows repeat", level="motion",
-           run=rows_of(lambda n: [*range(n - 2), n - 3, n - 3])),
-    Defect("early-stop", "the last three samples missing", level="motion", run=early_stop),
+           run=rows_reordered(lambda n: [*range(n - 2), n - 3, n - 3])),
+    Defect("early-stop", "the last three samples missing", level="motion", run=short_run),
     Defect("not-finite", "the last row NaN", level="motion",
-           run=sampled(lambda run: {"r": np.where(np.arange(len(run.t))[:, None, None] == len(run.t) - 1,
-                                                  np.nan, run.r)})),
+           run=sample_change(lambda run: {
+               "r": np.where(np.arange(len(run.t))[:, None, None] == len(run.t) - 1, np.nan, run.r)})),
     Defect("damping-1e-6-in-time", "drag of 1e-6 N m s on every body", level="motion", run=damped),
     Defect("single-precision-samples", "positions rounded to single precision", level="motion",
-           run=sampled(lambda run: {"r": single(run.r)})),
+           run=sample_change(lambda run: {"r": to_single_precision(run.r)})),
     Defect("norm-1e-9", "quaternions × (1 + 1e-9) from the second row on", level="motion",
-           run=sampled(lambda run: {"p": run.p * (1 + 1e-9 * (run.t > 0))[:, None, None]})),
+           run=sample_change(lambda run: {"p": run.p * (1 + 1e-9 * (run.t > 0))[:, None, None]})),
     Defect("stale-velocity", "ṙ of the sample before", level="motion",
-           run=sampled(lambda run: {"v": run.v[[0, *range(len(run.t) - 1)]]})),
+           run=sample_change(lambda run: {"v": run.v[[0, *range(len(run.t) - 1)]]})),
     Defect("gravity-1e-5-in-time", "gravity × (1 + 1e-5)", level="motion",
            inputs=model_change(lambda m, _: {"gravity": m.gravity * (1 + 1e-5)})),
     Defect("force-2-dropped-in-time", "F of body 2 × 0", level="motion", loaded=True,
-           inputs=load_of(1, force=lambda m, _: 0 * m.force)),
+           inputs=body_change(1, force=lambda m, _: 0 * m.force)),
     Defect("drag-exchanged-in-time", "c_t for c_r", level="motion", loaded=True,
            inputs=model_change(lambda m, _: {"drag_force": m.drag_moment, "drag_moment": m.drag_force})),
     Defect("moment-1-at-the-start-only", "n′ of body 1 as it was in world axes at the start", level="motion",
            loaded=True, engine=P, integrator="rkmk4",
-           inputs=load_of(0, moment=lambda m, s: body(s, m.moment))),
+           inputs=body_change(0, moment=lambda m, s: to_body(s, m.moment))),
     Defect("armature-in-time", "1e-4 kg m² in every joint", level="motion",
-           inside=lambda: mujoco_armature(1e-4)),
+           engine_patch=lambda: mujoco_armature(1e-4)),
     Defect("attitude-2-conjugated-in-time", "q* of body 2 in the samples", level="motion",
-           run=sampled(lambda run: {"p": np.stack(
+           run=sample_change(lambda run: {"p": np.stack(
                [run.p[:, 0], quaternion_conjugate(run.p[:, 1])], axis=1)})),
     Defect("row-of-another-body", "ṙ of body 1 for that of body 2", level="motion",
-           run=sampled(lambda run: {"v": run.v[:, [0, 0]]})),
+           run=sample_change(lambda run: {"v": run.v[:, [0, 0]]})),
     Defect("noise-1e-8-in-samples", "positions with noise of 1e-8 m", level="motion",
-           run=sampled(lambda run: {"r": run.r + 1e-8 * np.random.default_rng(5).normal(size=run.r.shape)})),
+           run=sample_change(lambda run: {
+               "r": run.r + 1e-8 * np.random.default_rng(5).normal(size=run.r.shape)})),
 )  # fmt: skip
 
 DEFECTS = STATE_DEFECTS + MOTION_DEFECTS
 
 # Two causes with one effect on every quantity: the diagnosis must name both, or see neither.
-PAIRS = (
+INDISTINGUISHABLE = (
     (
         Defect("centre-of-last-body", "centre of mass of body 2 by 1e-5 m in x",
-               inputs=centre_moved(1, 1e-5 * X)),
+               inputs=centre_of_mass_moved(1, 1e-5 * X)),
         ("centre of mass of body 2", "proximal x of body 2"),
     ),
     (
@@ -908,7 +913,7 @@ PAIRS = (
 # --- equivalent implementations, none of which may be accused -------------------------------------
 
 
-def negated(*bodies: int) -> Inputs:
+def negated_quaternions(*bodies: int) -> Inputs:
     """−p for some bodies: the same attitudes."""
     return lambda m, s: (m, replace(s, p=np.where(np.isin(np.arange(m.n), bodies)[:, None], -s.p, s.p)))
 
@@ -916,13 +921,16 @@ def negated(*bodies: int) -> Inputs:
 def in_axes(
     q: Array,
     rotate: Callable[[Model, State, Array], tuple[Model, State]],
-    unrotate: Callable[[dict[str, Any], Array], dict[str, Any]],
+    vectors: Sequence[str],
 ) -> Defect:
     """Everything described in axes rotated by a unit quaternion, the answers rotated back."""
 
     def answers(_: Model, __: list[State], found: list[StateQuantities]) -> list[StateQuantities]:
         given = [{name: x for name, x in vars(a).items() if x is not None} for a in found]
-        return [replace(a, **unrotate(quantities, q)) for a, quantities in zip(found, given, strict=True)]
+        return [
+            replace(a, **equivalent.unrotate(quantities, vectors, q))  # type: ignore[arg-type]
+            for a, quantities in zip(found, given, strict=True)
+        ]
 
     return Defect("", "", inputs=lambda model, state: rotate(model, state, q), answers=answers)
 
@@ -937,7 +945,7 @@ def other_units(mass: float, length: float) -> Defect:
             "force": m * x, "moment": m * x * x, "drag_force": m, "drag_moment": m * x * x,
         }  # fmt: skip
         other = model.changed(**{name: getattr(model, name) * f for name, f in factors.items()})
-        return other, relifted(other, state)
+        return other, with_coordinates(other, state)
 
     def back(model: Model, states: list[State], reported: list[StateQuantities]) -> list[StateQuantities]:
         factors = {
@@ -952,12 +960,12 @@ def other_units(mass: float, length: float) -> Defect:
     return Defect("", "", inputs=inputs, answers=back)
 
 
-def no_matrix(_: Model, __: list[State], reported: list[StateQuantities]) -> list[StateQuantities]:
+def without_mass_matrix(_: Model, __: list[State], reported: list[StateQuantities]) -> list[StateQuantities]:
     """The mass matrix belongs to the engine's own coordinates and is not given."""
     return [replace(a, mass_matrix=None) for a in reported]
 
 
-def after(first: Answers | None, second: Answers) -> Answers:
+def both_changes(first: Answers | None, second: Answers) -> Answers:
     """Two changes of the answers in a row."""
     return lambda m, states, reported: second(m, states, first(m, states, reported) if first else reported)
 
@@ -981,12 +989,12 @@ def recomputed(change: Callable[[Model, State, StateQuantities], dict[str, Any]]
     ]
 
 
-def sums(order: int) -> Callable[[Model, State, StateQuantities], dict[str, Any]]:
+def recomputed_sums(order: int) -> Callable[[Model, State, StateQuantities], dict[str, Any]]:
     """Energies and momentum summed anew, bodies in the given order."""
 
     def change(m: Model, s: State, _: StateQuantities) -> dict[str, Any]:
         at = range(m.n)[::order]
-        spin, turned = spins(m, s), world(s, spins(m, s))
+        spin, turned = body_spins(m, s), to_world(s, body_spins(m, s))
         kinetic = sum(m.mass[k] * (s.v[k] @ s.v[k]) + s.omega[k] @ spin[k] for k in at)
         return {
             "kinetic_energy": float(0.5 * kinetic),
@@ -997,29 +1005,29 @@ def sums(order: int) -> Callable[[Model, State, StateQuantities], dict[str, Any]
     return change
 
 
-BODY_AXES = (equivalent.rotate_body_frames, equivalent.unrotate_body_frames)
-WORLD_AXES = (equivalent.rotate_world, equivalent.unrotate_world)
+BODY_AXES = (equivalent.rotate_body_frames, equivalent.BODY_VECTORS)
+WORLD_AXES = (equivalent.rotate_world, equivalent.WORLD_VECTORS)
 
 
 def control(name: str, size: str, engine: str, like: Defect, joints: str = "balls", **kind: Any) -> Defect:
     """A control with the changes of another defect; its mass matrix is not judged."""
-    answers = after(like.answers, no_matrix)
+    answers = both_changes(like.answers, without_mass_matrix)
     return Defect(name, size, (), engine, joints, inputs=like.inputs, answers=answers, **kind)
 
 
-def euler_twice(_: Model, state: State) -> Array:
+def through_rotation_matrix(_: Model, state: State) -> Array:
     """Attitudes by way of the rotation matrix."""
     from scipy.spatial.transform import Rotation
 
     q = Rotation.from_matrix(rotation_matrix(state.p)).as_quat()
-    return unit(np.roll(q, 1, axis=-1))
+    return normalised(np.roll(q, 1, axis=-1))
 
 
 ANY, HALF = np.array([1.0, -3.0, 2.0, 5.0]) / np.sqrt(39.0), np.array([0.5, 0.5, 0.5, 0.5])
 CONTROLS = (
-    Defect("minus-p-1", "-p of body 1", engine=M, inputs=negated(0)),
-    Defect("minus-p-all", "-p of all bodies", engine=P, joints="rods", inputs=negated(0, 1)),
-    Defect("minus-p-2", "-p of body 2", engine=E, loaded=True, inputs=negated(1)),
+    Defect("minus-p-1", "-p of body 1", engine=M, inputs=negated_quaternions(0)),
+    Defect("minus-p-all", "-p of all bodies", engine=P, joints="rods", inputs=negated_quaternions(0, 1)),
+    Defect("minus-p-2", "-p of body 2", engine=E, loaded=True, inputs=negated_quaternions(1)),
     control("frames-turned", "other body axes", M, in_axes(ANY, *BODY_AXES), loaded=True),
     control("frames-permuted", "body axes exchanged", P, in_axes(HALF, *BODY_AXES), "rods", loaded=True),
     control("frames-turned-exudyn", "other body axes", E, in_axes(ANY, *BODY_AXES), "rod-ball"),
@@ -1035,15 +1043,15 @@ CONTROLS = (
     Defect("reactions-as-rest", "F as the total less the rest", engine=E, joints="rods", loaded=True,
            answers=recomputed(recomputed_reaction(-1))),
     Defect("sums-forward", "energies and momentum summed anew", engine=P, joints="mixed",
-           answers=recomputed(sums(1))),
+           answers=recomputed(recomputed_sums(1))),
     Defect("sums-backward", "energies and momentum summed from the free end", engine=M, joints="mixed",
-           loaded=True, answers=recomputed(sums(-1))),
+           loaded=True, answers=recomputed(recomputed_sums(-1))),
     Defect("by-rotation-matrix", "attitudes by way of their matrices", engine=P, loaded=True,
-           inputs=state_of(1, p=euler_twice)),
+           inputs=body_state_change(1, p=through_rotation_matrix)),
     Defect("rates-there-and-back", "ω′ turned into the world and back", engine=E, loaded=True,
-           inputs=state_change(lambda _, s: {"omega": body(s, world(s, s.omega))})),
+           inputs=state_change(lambda _, s: {"omega": to_body(s, to_world(s, s.omega))})),
     Defect("accelerations-there-and-back", "r̈ turned into body axes and back", engine=M, joints="rods",
-           answers=field("acceleration", lambda _, s, a: world(s, body(s, a)))),
+           answers=answer_change("acceleration", lambda _, s, a: to_world(s, to_body(s, a)))),
     Defect("drag-as-load", "drag given as loads", engine=M, loaded=True, inputs=model_change(
         lambda m, s: {"force": m.force - m.drag_force[:, None] * s.v, "drag_force": 0 * m.drag_force,
                       "moment": m.moment - m.drag_moment[:, None] * s.omega,
@@ -1051,11 +1059,11 @@ CONTROLS = (
     Defect("weight-as-load", "weight given as a load, gravity 0", engine=P, loaded=True,
            inputs=model_change(lambda m, _: {"gravity": 0 * m.gravity,
                                              "force": m.force + m.mass[:, None] * m.gravity}),
-           answers=recomputed(lambda m, s, a: sums(1)(m, s, a))),
+           answers=recomputed(lambda m, s, a: recomputed_sums(1)(m, s, a))),
     Defect("one-ulp", "every answer rounded differently in its last digit", engine=M, loaded=True,
-           answers=field("acceleration", noise_growing(1.0, 1e-16))),
+           answers=answer_change("acceleration", noise_growing(1.0, 1e-16))),
     Defect("one-ulp-of-reactions", "the last digit of F", engine=E, joints="rods",
-           answers=field("joint_reaction", noise_growing(1.0, 2e-16))),
+           answers=answer_change("joint_reaction", noise_growing(1.0, 2e-16))),
     Defect("spin-axis-moved", "u made a unit vector again", engine=M, joints="rods",
            inputs=state_change(lambda _, s: {"u": s.u / np.linalg.norm(s.u, axis=1, keepdims=True)})),
 )  # fmt: skip

@@ -31,7 +31,7 @@ class StepDefect:
     """A wrong integrator: of step, integrator_used, settings and samples one is given."""
 
     name: str
-    size: str  # in words
+    description: str
     engine: str
     integrator: str  # the name that it goes by
     joints: str = "balls"  # key of tests.helpers.pendulums.JOINT_PATTERNS

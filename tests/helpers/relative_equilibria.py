@@ -75,8 +75,8 @@ def _residual(model: Model, rate: float, p: Any, u: Any) -> Any:
     r = hang + lever
     spin = np.array([0, 0, rate], dtype=p.dtype)
     a = np.cross(spin, np.cross(spin, r))
-    pull = model.mass[:, None] * (a - model.gravity)
-    force = np.cumsum(pull[::-1], 0)[::-1]  # on body k at its proximal point
+    force_needed = model.mass[:, None] * (a - model.gravity)
+    force = np.cumsum(force_needed[::-1], 0)[::-1]  # on body k at its proximal point
     below = np.concatenate([force[1:], np.zeros_like(u[:1])])
     omega = _rotate_vectors(p * np.array([1, -1, -1, -1]), spin)
     gyro = _rotate_vectors(p, np.cross(omega, np.einsum("kij,kj->ki", model.inertia.astype(p.dtype), omega)))

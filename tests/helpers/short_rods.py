@@ -24,7 +24,7 @@ class RodLengthStudy:
     length: Array  # (K,) m
     acceleration: Array  # (K,) m/s², largest ‖r̈ − r̈_ball‖ at the start
     reaction: Array  # (K,) N, largest ‖F − F_ball‖ at the start
-    position: Array  # (K,) m, largest distance from the ball's motion over the asked times
+    position: Array  # (K,) m, largest distance from the ball's motion over the sample times
     observed_order: (
         Array  # (3, K − 1) observed order in ℓ of each, from neighbours: 1 where the ball is the limit
     )

@@ -21,7 +21,7 @@ from plumbline.scenario.errors import ScenarioError
 from plumbline.storage.results_store import ResultTables
 
 ROOT = Path(__file__).resolve().parents[2]
-WHO = RowContext("tumbling-ball", "single", "mujoco", "MuJoCo", "4.0.0")
+CONTEXT = RowContext("tumbling-ball", "single", "mujoco", "MuJoCo", "4.0.0")
 ENTRY = {
     "id": "a", "scenario": "tumbling-ball", "engine": "mujoco", "quantity": "acceleration",
     "verdict": "disagrees", "evidence": "seen", "reason": "because",
@@ -32,7 +32,7 @@ def entry(**changes):
     return known_issues.KnownIssue(**{**ENTRY, **changes})
 
 
-def row(verdict="disagrees", quantity="acceleration", context=WHO):
+def row(verdict="disagrees", quantity="acceleration", context=CONTEXT):
     return context.make_row("state", "-", quantity, verdict, "why")
 
 
@@ -45,7 +45,7 @@ def judged_by(rows, entries, whole, finer=False, bodies=1):
 
 
 def covers(an_entry, of):
-    """Whether an entry speaks of the cell of a row."""
+    """Whether an entry covers the cell of a row."""
     return known_issues.KnownIssues([an_entry], has_extra_refinements=False).issues_for(of) == [an_entry]
 
 
@@ -292,7 +292,7 @@ def test_the_scatter_of_a_row_itself_shows_its_mechanism():
 
 def test_a_checked_mechanism_is_in_the_rows_diagnosis():
     recorded = entry(level="*", quantity="*", max_ratio={10: 100.0}, mechanism="rounding")
-    turned = replace(WHO.make_row("relations", "-", "rotated world", "agrees", "why"), ratio=20.0)
+    turned = replace(CONTEXT.make_row("relations", "-", "rotated world", "agrees", "why"), ratio=20.0)
     found = judged_by([replace(row(), ratio=50.0), turned], [recorded], whole=True).rows
     assert "Checked: they differ by 20 tolerances." in found[0].diagnosis
 
@@ -323,7 +323,7 @@ def test_the_projects_own_file_is_valid_and_gives_evidence():
 
 
 @pytest.mark.parametrize(
-    ("changes", "spoken_of"),
+    ("changes", "is_covered"),
     [
         ({}, True),
         ({"scenario": "tumbling-*"}, True),
@@ -339,9 +339,9 @@ def test_the_projects_own_file_is_valid_and_gives_evidence():
     ],
 )
 @pytest.mark.parametrize("engine", ["mujoco", "mujoco@3.12.0"])
-def test_an_entry_covers_what_all_its_patterns_match(changes, spoken_of, engine):
+def test_an_entry_covers_what_all_its_patterns_match(changes, is_covered, engine):
     context = RowContext("tumbling-ball", "single", engine, "MuJoCo", "4.0.0")
-    assert covers(entry(**changes), row(context=context)) is spoken_of
+    assert covers(entry(**changes), row(context=context)) is is_covered
 
 
 @pytest.mark.parametrize(
@@ -389,7 +389,7 @@ def test_what_an_entry_does_not_say_is_anything():
     bare = {name: ENTRY[name] for name in ("id", "scenario", "engine", "verdict", "evidence", "reason")}
     about = known_issues.KnownIssue(**bare)
     for level, integrator, quantity in (("state", "-", "energy"), ("trajectory", "RK4", "position_limit")):
-        assert covers(about, WHO.make_row(level, integrator, quantity, "disagrees", "why"))
+        assert covers(about, CONTEXT.make_row(level, integrator, quantity, "disagrees", "why"))
     assert not about.intermittent and about.versions == ""
     with pytest.raises(FrozenInstanceError):
         about.quantity = "energy"

@@ -127,8 +127,8 @@ def test_a_symmetric_method_is_bounded_and_a_leak_is_not():
     growth = rows["energy_drift_long_growth"]
     assert growth.verdict == "agrees" and growth.value < 0.1 and "bounded" in growth.reason
     assert rows["energy_drift_long"].verdict == "agrees"
-    leak = worker.run_in_engine_process("exudyn", growth_row_with_drag)
-    assert leak.verdict == "disagrees" and leak.value > 0.9 and "grows with time" in leak.reason
+    damped = worker.run_in_engine_process("exudyn", growth_row_with_drag)
+    assert damped.verdict == "disagrees" and damped.value > 0.9 and "grows with time" in damped.reason
 
 
 def growth_row_with_drag():

@@ -26,7 +26,14 @@ from plumbline.model.welding import split_bodies, split_body
 from plumbline.truth.rounding_bound import state_rounding_bound
 from tests.helpers import pendulums
 from tests.helpers.pendulums import JOINT_PATTERNS
-from tests.helpers.planted_defects import STATE_DEFECTS, Defect, field, model_change, parameter, plant
+from tests.helpers.planted_defects import (
+    STATE_DEFECTS,
+    Defect,
+    answer_change,
+    model_change,
+    parameter_change,
+    plant,
+)
 from tests.helpers.random_chains import random_chain
 
 for engine in ("mujoco", "pinocchio", "exudyn"):
@@ -102,7 +109,7 @@ DEFECTS_BY_RELATION = {
     ),
     "masses doubled": (
         defect_named("damping-1e-6"),
-        Defect("gram", "mass of body 1 by 1e-3 kg", inputs=parameter("mass", 0, by=1e-3)),
+        Defect("gram", "mass of body 1 by 1e-3 kg", inputs=parameter_change("mass", 0, by=1e-3)),
     ),
     "lengths × 4": (
         defect_named("distal-1e-5"),
@@ -154,7 +161,7 @@ def test_a_refused_state_is_left_out_and_a_refusing_engine_is_reported():
 def test_noise_breaks_what_is_not_bitwise():
     """An engine that loses digits is seen without any truth: as aba on thirty balls is."""
     rng = np.random.default_rng(5)
-    noisy = Defect("noise", "1e-9", answers=field(
+    noisy = Defect("noise", "1e-9", answers=answer_change(
         "acceleration", lambda _, __, a: a * (1 + 1e-9 * rng.normal(size=a.shape))))  # fmt: skip
     engine = plant(type(load_adapter("mujoco")), noisy)
     model = pendulums.make_model(JOINT_PATTERNS["balls"])
@@ -191,9 +198,9 @@ WELDING_RELATIONS = [
 @pytest.mark.parametrize(("engine", "relation"), OPTION_RELATIONS + WELDING_RELATIONS)
 def test_a_defect_in_one_way_of_the_engine_breaks_it(engine, relation, defect):
     model = pendulums.make_model(JOINT_PATTERNS["balls"])
-    bent = defect_in_default_formulation(replace(defect_named(defect), engine=engine))
+    faulty = defect_in_default_formulation(replace(defect_named(defect), engine=engine))
     with patch(
-        "plumbline.judging.metamorphic.load_adapter", lambda n: bent if n == engine else load_adapter(n)
+        "plumbline.judging.metamorphic.load_adapter", lambda n: faulty if n == engine else load_adapter(n)
     ):
         (found,) = (
             h for h in check_relations(engine, model, random_states_of(model)) if h.relation == relation
@@ -379,8 +386,8 @@ def test_accelerations_that_are_not_carried_break_the_way_back():
 @pytest.mark.parametrize("engine", ["exudyn", "exudyn-tree"])
 def test_a_linear_solver_that_solves_something_else_is_seen(engine):
     sound = load_adapter(engine)
-    bent = plant(type(sound), replace(defect_named("distal-1e-5"), engine=engine))
-    sound.with_option = bent.with_option
+    faulty = plant(type(sound), replace(defect_named("distal-1e-5"), engine=engine))
+    sound.with_option = faulty.with_option
     for held in check_run_relations(
         sound, model := pendulums.make_model(JOINT_PATTERNS["balls"]), pendulums.state_from_seed(model, 1)
     ):

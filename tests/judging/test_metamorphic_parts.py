@@ -109,8 +109,8 @@ def test_runs_are_measured_by_length_turn_and_speed():
     assert characteristic_scales(MODEL, still) == pytest.approx(
         (length, np.sqrt(g / length), np.sqrt(g * length)), rel=1e-14
     )
-    thrown = replace(still, v=np.array([[0, 0, 40.0], [0, 50.0, 0]]))
-    assert characteristic_scales(MODEL, thrown)[2] == 50.0
+    fast = replace(still, v=np.array([[0, 0, 40.0], [0, 50.0, 0]]))
+    assert characteristic_scales(MODEL, fast)[2] == 50.0
     assert characteristic_scales(replace(MODEL, gravity=np.zeros(3)), still)[1] == np.finfo(float).tiny
     turn = np.array([np.cos(5e-4), np.sin(5e-4), 0, 0])
     other = replace(
@@ -248,9 +248,9 @@ def test_every_relation_is_tried_but_reversed_time_with_drag(drag):
         "an adapter that was not called before"
     )
     names = [name for name in names if name != "repeatability"]
-    told = ["rotated world", "re-chosen body frame", "masses doubled", "lengths × 4"]
-    told += [] if drag else ["time reversed"]
-    assert names[: len(told)] == told and ("time reversed" in names) is not drag
+    expected = ["rotated world", "re-chosen body frame", "masses doubled", "lengths × 4"]
+    expected += [] if drag else ["time reversed"]
+    assert names[: len(expected)] == expected and ("time reversed" in names) is not drag
     assert "as pinocchio-maximal" in names and "two welded halves" in names
 
 

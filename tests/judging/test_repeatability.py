@@ -128,7 +128,7 @@ def test_runs_that_depend_on_the_run_before_or_on_chance_disagree(run, wrong):
 
 
 def test_what_is_refused_or_fails_each_time_is_no_difference_and_what_changes_is_one():
-    def moody(error, often):
+    def failing_now_and_then(error, often):
         def run(memory, arguments, done):
             memory["count"] = memory.get("count", 0) + 1
             if arguments[3].name == "RK4" and (often or memory["count"] % 2):
@@ -137,8 +137,8 @@ def test_what_is_refused_or_fails_each_time_is_no_difference_and_what_changes_is
 
         return run
 
-    assert set(rows(planted(run=moody(Unsupported("singular"), True)))) == {"-", "Euler"}
-    failed = rows(planted(run=moody(EngineFailure("diverged"), True)))["RK4"]
+    assert set(rows(planted(run=failing_now_and_then(Unsupported("singular"), True)))) == {"-", "Euler"}
+    failed = rows(planted(run=failing_now_and_then(EngineFailure("diverged"), True)))["RK4"]
     assert (failed.verdict, failed.reason) == ("failed", "diverged")
     for error in (Unsupported("singular"), EngineFailure("diverged")):
         memory = {"count": 1}  # the first run of RK4 succeeds, the one after another run does not

@@ -171,9 +171,9 @@ def test_quantities_that_an_engine_does_not_offer_or_deliver_are_reported():
     right = load_adapter("reference").evaluate(MODEL, STATES)
     less = [*right[:2], replace(right[2], joint_reaction=None)]
     rows = judge_shifted_answers(quantities=less).rows
-    (gone,) = (row for row in rows if row.quantity == "joint_reaction")
-    assert (gone.verdict, gone.unit, gone.level, gone.integrator) == ("unsupported", "N", "state", "-")
-    assert gone.reason == "Reference offers no joint reaction of its own"
+    (row,) = (row for row in rows if row.quantity == "joint_reaction")
+    assert (row.verdict, row.unit, row.level, row.integrator) == ("unsupported", "N", "state", "-")
+    assert row.reason == "Reference offers no joint reaction of its own"
     assert len(rows) == len(CHAIN_QUANTITIES)
     for field, verdict in (("unsupported", "unsupported"), ("failure", "failed")):
         (row,) = judge_shifted_answers(**{field: "because"}).rows

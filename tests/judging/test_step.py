@@ -29,7 +29,7 @@ if not step_formulas.HAS_EXTENDED_PRECISION:
     pytest.skip("no extended precision on this machine", allow_module_level=True)
 
 ENGINES = ("mujoco", "pinocchio", "exudyn", "exudyn-tree")
-WHO = RowContext("steps", "test", "engine", "engine", "0")
+CONTEXT = RowContext("steps", "test", "engine", "engine", "0")
 
 
 def methods(engine):
@@ -49,7 +49,7 @@ def stepped(adapter, integrator, model, states):
 def judged(adapter, integrator, model, states):
     """Rows of an adapter's steps, judged by the integrator's declared method."""
     answer = stepped(adapter, integrator, model, states)
-    return judge_steps(WHO, integrator, model, states, answer).rows
+    return judge_steps(CONTEXT, integrator, model, states, answer).rows
 
 
 @cache
@@ -141,10 +141,10 @@ def test_an_engine_that_refuses_or_fails_has_one_row():
     model, states = subject("balls")
     integrator = load_adapter("exudyn-tree").integrator("RK44")
     refused = StepEvaluation([StepAttempt(0, 0.01, refusal="angles are singular")], 0.1)
-    (row,) = judge_steps(WHO, integrator, model, states, refused).rows
+    (row,) = judge_steps(CONTEXT, integrator, model, states, refused).rows
     assert (row.verdict, row.quantity, row.reason) == (Verdict.UNSUPPORTED, "all", "angles are singular")
     failed = StepEvaluation([StepAttempt(0, 0.01, failure="it crashed")], 0.1)
-    (row,) = judge_steps(WHO, integrator, model, states, failed).rows
+    (row,) = judge_steps(CONTEXT, integrator, model, states, failed).rows
     assert (row.verdict, row.reason) == (Verdict.FAILED, "it crashed")
 
 

@@ -178,8 +178,8 @@ def test_a_limit_elsewhere_disagrees_only_where_the_study_shows_its_order():
     assert limit.value == pytest.approx(2e-9, rel=1e-3) and limit.compared_until == 2.0
     assert f"{limit.value / limit.tolerance:.3g} times the uncertainties" in limit.reason
     assert limit.ratio == pytest.approx(limit.value / limit.tolerance)
-    wild = [1e-9 + e for e in (0.01, 0.003, 0.002, 0.0003, 0.0002, 0.0002)]
-    lost = judged_rows(refinement_study(wild))["position_limit"]
+    irregular = [1e-9 + e for e in (0.01, 0.003, 0.002, 0.0003, 0.0002, 0.0002)]
+    lost = judged_rows(refinement_study(irregular))["position_limit"]
     assert lost.verdict == "unresolved"
     tight = judged_rows(refinement_study([1e-9] * 6))["position_limit"]  # at the floor at every step: trusted
     assert tight.verdict == "disagrees"
@@ -255,16 +255,16 @@ def test_a_method_with_a_tolerance_has_no_order_and_its_tightest_run_is_the_limi
     assert limit.uncertainty == pytest.approx(1e-12 + 2e-12, rel=1e-2, abs=0)
     assert found["attitude_limit"].uncertainty == pytest.approx(2e-12 + 2e-12, rel=1e-2, abs=0)
     assert found["position"].reason.startswith("position at tolerance 0.000976562 is 2e-12 m")
-    wild = (1e-7, 5e-8, 4.9e-8, 1e-9, 9e-10, 0)  # no order of any kind
-    off = judged_rows(refinement_study([1e-6 + e for e in wild]), method)["position_limit"]
+    irregular = (1e-7, 5e-8, 4.9e-8, 1e-9, 9e-10, 0)  # no order of any kind
+    off = judged_rows(refinement_study([1e-6 + e for e in irregular]), method)["position_limit"]
     assert off.verdict == "disagrees", "trusted without any order"
     floor = found["energy_drift"]
     each = ROUNDING_PER_STEP + STEPS[-1]
     assert floor.tolerance == pytest.approx(each * 100 * floor.extra["scale"], rel=1e-12)
-    stays = judged_rows(refinement_study([0.5 + e for e in (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 0)]), method)[
+    constant = judged_rows(refinement_study([0.5 + e for e in (1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 0)]), method)[
         "joint_gap"
     ]
-    assert stays.verdict == "disagrees", "trusted without any order"
+    assert constant.verdict == "disagrees", "trusted without any order"
 
 
 def test_an_implicit_solver_walks_at_random():
@@ -325,8 +325,8 @@ def test_scales_are_sizes_of_what_the_invariants_are_made_of():
     ]
     height = [model.mass * (r @ model.gravity) for r in true.r]
     potential = np.max([np.sum(np.abs(x)) for x in height])
-    swing = np.ptp([np.sum(x) for x in height])
-    assert scales["energy_drift"] == pytest.approx(max(*kinetic, potential, swing), rel=1e-12)
+    height_energy = np.ptp([np.sum(x) for x in height])
+    assert scales["energy_drift"] == pytest.approx(max(*kinetic, potential, height_energy), rel=1e-12)
     fall = np.sqrt(g * 0.4)
     speed = max(fall, *np.linalg.norm(true.v, axis=-1).ravel())
     spin = max(fall / 0.4, *np.linalg.norm(omega, axis=-1).ravel())
@@ -338,13 +338,13 @@ def test_scales_are_sizes_of_what_the_invariants_are_made_of():
     still = replace(
         held, truth=make_truth(trajectory=replace(true, v=0 * true.v, pdot=0 * true.pdot))
     ).invariant_scales
-    assert still["energy_drift"] == pytest.approx(max(potential, swing), rel=1e-12)
+    assert still["energy_drift"] == pytest.approx(max(potential, height_energy), rel=1e-12)
     over = (
         np.linspace(1, -1, 17)[:, None, None] * TRUE_TRAJECTORY.r[0]
     )  # from one side of the pivot to the other
     turned = replace(TRUE_TRAJECTORY, r=over, v=0 * TRUE_TRAJECTORY.v, pdot=0 * TRUE_TRAJECTORY.pdot)
-    lifted = 2 * abs(MODEL.mass[0] * TRUE_TRAJECTORY.r[0, 0] @ MODEL.gravity)
-    assert analysis(trajectory=turned).invariant_scales["energy_drift"] == pytest.approx(lifted, rel=1e-12)
+    raised = 2 * abs(MODEL.mass[0] * TRUE_TRAJECTORY.r[0, 0] @ MODEL.gravity)
+    assert analysis(trajectory=turned).invariant_scales["energy_drift"] == pytest.approx(raised, rel=1e-12)
     long = replace(
         held, truth=make_truth(trajectory=true, length=50.0)
     ).invariant_scales  # a fall is faster than this
@@ -367,15 +367,17 @@ def test_a_drift_that_falls_with_the_step_agrees_and_one_that_does_not_disagrees
     floor = ROUNDING_PER_STEP * 100 * found.extra["scale"]
     assert found.tolerance == pytest.approx(found.value + floor, rel=1e-3)
     assert found.extra["limit"] < 1e-14 and "at the finest step" in found.reason
-    stays = judged_rows(refinement_study([1e-6 + 0.01 * h**2 for h in STEPS]))["joint_gap"]
-    assert stays.verdict == "disagrees" and "joint gap does not vanish with the step" in stays.reason
-    assert "from the finest step to step zero" in stays.derivation
-    assert stays.extra["limit"] == pytest.approx(2e-6, rel=0.1)
-    assert stays.ratio == pytest.approx(stays.extra["limit"] / stays.tolerance, rel=1e-9)
-    wild = judged_rows(refinement_study([0.1, 0.03, 0.02, 0.003, 0.002, 0.001]))["joint_gap"]
-    assert wild.verdict == "unresolved" and wild.reason.endswith("does not decide")
-    untold = judged_rows(refinement_study([1e-3 + e for e in (0.0, 1e-5, -1e-5, 2e-5, 1e-5, 0)]))["joint_gap"]
-    assert untold.ratio > 1 and untold.verdict == "unresolved", "no order, no trust"
+    constant = judged_rows(refinement_study([1e-6 + 0.01 * h**2 for h in STEPS]))["joint_gap"]
+    assert constant.verdict == "disagrees" and "joint gap does not vanish with the step" in constant.reason
+    assert "from the finest step to step zero" in constant.derivation
+    assert constant.extra["limit"] == pytest.approx(2e-6, rel=0.1)
+    assert constant.ratio == pytest.approx(constant.extra["limit"] / constant.tolerance, rel=1e-9)
+    irregular = judged_rows(refinement_study([0.1, 0.03, 0.02, 0.003, 0.002, 0.001]))["joint_gap"]
+    assert irregular.verdict == "unresolved" and irregular.reason.endswith("does not decide")
+    unclear = judged_rows(refinement_study([1e-3 + e for e in (0.0, 1e-5, -1e-5, 2e-5, 1e-5, 0)]))[
+        "joint_gap"
+    ]
+    assert unclear.ratio > 1 and unclear.verdict == "unresolved", "no order, no trust"
     alone = refinement_study()
     for index in range(5):
         alone.runs[index] = replace(alone.runs[index], trajectory=None)

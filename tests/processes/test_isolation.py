@@ -1,4 +1,4 @@
-"""A night over engines with every fault at once: each loses its own cell, named with its reason, no other."""
+"""A nightly run over engines with every fault: each loses its own cell, with its reason, and no other."""
 
 import json
 import os
@@ -28,7 +28,7 @@ def run_nightly(out, engines):
 
 
 def comparable_rows(rows, engine):
-    """What the rows of an engine say, without who says it and what it cost."""
+    """The rows of an engine without its name and their cost."""
     return [
         replace(row, engine="", cpu_time=0.0)
         for row in rows
@@ -60,7 +60,7 @@ def test_every_fault_at_once_loses_exactly_its_own_cell(tmp_path, monkeypatch, c
     assert comparable_rows(result.rows, "flood_output") and not [
         r for r in result.rows if r.verdict == "disagrees"
     ]
-    # the night is whole, tells of it, and nothing of it is left elsewhere
+    # the night's results are complete, its failures are recorded, and no file is left elsewhere
     stored = json.loads((place / "results.json").read_text())
     assert stored["run"]["exit_code"] == 3 and len(stored["rows"]) == len(result.rows)
     assert [n["id"] for n in History(tmp_path / "out").overview()] == [place.name]

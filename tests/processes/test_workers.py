@@ -1,4 +1,4 @@
-"""Worker processes: every way to lose one costs one task, and says how."""
+"""Worker processes: every way to lose one costs one task and is reported."""
 
 import ctypes
 import os
@@ -34,7 +34,7 @@ def hang():
 
 
 def hang_holding_gil():
-    """Native code that never returns and never lets go of the interpreter lock."""
+    """Native code that never returns and never releases the interpreter lock."""
     ctypes.PyDLL(None).sleep(600)
 
 
@@ -82,15 +82,15 @@ def test_each_loss_costs_one_task_and_is_reported():
 
 
 def test_a_task_that_an_outcome_submits_runs_while_others_do():
-    came = []
+    finished = []
     with WorkerPool(2) as workers:
         scheduler = Scheduler(workers)
         for outcome in scheduler.run([Task("long", sleep_for, (4.0,)), Task("short", sleep_for, (0.0,))]):
             assert outcome.failure is None
-            came.append(outcome.key)
+            finished.append(outcome.key)
             if outcome.key == "short":
                 scheduler.submit(Task("follows", sleep_for, (0.0,)))
-    assert came == ["short", "follows", "long"]
+    assert finished == ["short", "follows", "long"]
 
 
 class Immediate(Executor):

@@ -76,7 +76,7 @@ def test_angular_velocity_is_the_rotation_rate():
     np.testing.assert_allclose(A_rate(q, qdot), A(q) @ tilde(omega), atol=5e-15)
 
 
-def test_complex_step_sees_the_same_derivatives():
+def test_complex_steps_give_the_same_derivatives():
     rng = np.random.default_rng(2)
     q, qdot, point, h = rng.normal(size=4), rng.normal(size=4), rng.normal(size=3), 1e-30
     step = (A(q + 1j * h * qdot) @ point).imag / h

@@ -13,7 +13,7 @@ from reference_impl.joints import constraint_rows
 from reference_impl.structured import StructuredSystem
 from tests.helpers.random_trees import random_tree
 
-HELD = [kind for kind in KINDS if kind not in ("rod", "free")]  # the rod's row is the notes' own
+TESTED_KINDS = [kind for kind in KINDS if kind not in ("rod", "free")]  # the rod's row is the notes' own
 
 
 def rationals(rng, *shape):
@@ -23,7 +23,7 @@ def rationals(rng, *shape):
 
 
 @pytest.mark.parametrize("far", [-1, 0], ids=["on the world", "on a body"])
-@pytest.mark.parametrize("kind", HELD)
+@pytest.mark.parametrize("kind", TESTED_KINDS)
 def test_rates_and_gamma_of_every_row_are_exact(kind, far):
     """Along q + t v every row is a polynomial of degree 4 at most: five points give Ċ and C̈ in rationals."""
     rng = np.random.default_rng([len(kind), far + 1])

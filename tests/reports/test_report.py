@@ -466,10 +466,10 @@ def test_the_step_summary_shows_text_as_text_and_keeps_its_limit(out):
     results = Results.load(out)
     bad = next(row for row in results.rows if row["verdict"] == "disagrees")
     results.rows.extend({**bad, "scenario": f"s{k}", "reason": "long " * 60} for k in range(5000))
-    crowded = step_summary.render(results)
-    assert len(crowded.encode()) <= 1024 * 1024
-    assert re.search(r"… and \d{3,} more", crowded)
-    assert "report.html has every cell" in crowded
+    summary = step_summary.render(results)
+    assert len(summary.encode()) <= 1024 * 1024
+    assert re.search(r"… and \d{3,} more", summary)
+    assert "report.html has every cell" in summary
 
 
 def tool(name):

@@ -26,40 +26,40 @@ from tests.helpers.reproduction import defective, execute, run_alone, state_case
 for name in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(name)
 
-HEAVY = """import mujoco
+HEAVY_MUJOCO = """import mujoco
 real = mujoco.mj_setConst
 def heavy(m, d):
     m.body_mass[-1] *= 1.0001
     real(m, d)
 mujoco.mj_setConst = heavy
 """
-EULER = """import mujoco, types
+MUJOCO_EULER = """import mujoco, types
 mujoco.mjtIntegrator = types.SimpleNamespace(mjINT_RK4=mujoco.mjtIntegrator.mjINT_EULER)
 """
-NO_DEXP = """import pinocchio, numpy
+PINOCCHIO_NO_DEXP = """import pinocchio, numpy
 pinocchio.dIntegrate = lambda m, q, v, arg: numpy.eye(m.nv)
 """
-SYRUP = """import pinocchio
+DAMPED_PINOCCHIO = """import pinocchio
 real = pinocchio.aba
 pinocchio.aba = lambda m, d, q, v, *more: real(m, d, q, v, *more) - 1e-3 * v
 """
-BIASED = """import pinocchio
+BIASED_PINOCCHIO = """import pinocchio
 real = pinocchio.crba
 pinocchio.crba = lambda *all: real(*all) * 1.0001
 """
-STRONG = """import exudyn.itemInterface as items
+STRONG_EXUDYN = """import exudyn.itemInterface as items
 real = items.LoadMassProportional
 def strong(markerNumber, loadVector):
     return real(markerNumber=markerNumber, loadVector=[1.0001 * x for x in loadVector])
 items.LoadMassProportional = strong
 """
-TREE = """import exudyn.itemInterface as items
+STRONG_TREE = """import exudyn.itemInterface as items
 real = items.ObjectKinematicTree
 def strong(**given):
     return real(**{**given, "gravity": [1.001 * x for x in given["gravity"]]})
 items.ObjectKinematicTree = strong
 """
-FLYER = """import pinocchio
+FAST_PINOCCHIO = """import pinocchio
 for name in ("constraintDynamics", "forwardDynamics"):
     def fast(m, d, q, v, tau, *more, real=getattr(pinocchio, name)):
         return real(m, d, q, 1.0001 * v, tau, *more)
@@ -67,24 +67,24 @@ for name in ("constraintDynamics", "forwardDynamics"):
 """
 FULL = pytest.mark.full
 DEFECTS = [  # engine, level, integrator, what must disagree, the defect
-    ("mujoco", "state", "-", "joint_reaction", HEAVY),
-    ("exudyn-tree", "state", "-", "acceleration", TREE),
-    ("mujoco", "trajectory", "RK4", "order", EULER),
-    ("exudyn", "trajectory", "trapezoidal", "attitude_limit", STRONG),
-    ("mujoco", "step", "RK4", "step_rate", EULER),
-    ("pinocchio", "step", "rkmk4", "step_attitude", NO_DEXP),
-    ("exudyn-tree", "step", "RK44", "step_velocity", TREE),
-    ("pinocchio", "invariants", "semi-implicit-euler", "energy_drift", SYRUP),
-    ("pinocchio-aba", "relations", "-", "by crba", SYRUP),
-    pytest.param("pinocchio", "state", "-", "mass_matrix", BIASED, marks=FULL),
-    pytest.param("pinocchio-maximal", "state", "-", "acceleration", FLYER, marks=FULL),
-    pytest.param("exudyn", "state", "-", "acceleration", STRONG, marks=FULL),
-    pytest.param("mujoco", "trajectory", "RK4", "position_limit", HEAVY, marks=FULL),
-    pytest.param("pinocchio", "trajectory", "rkmk4", "order", NO_DEXP, marks=FULL),
-    pytest.param("exudyn-tree", "trajectory", "RK44", "position_limit", TREE, marks=FULL),
-    pytest.param("mujoco", "invariants", "RK4", "energy_drift", HEAVY, marks=FULL),
-    pytest.param("exudyn", "invariants", "generalized-alpha", "energy_drift", STRONG, marks=FULL),
-    pytest.param("pinocchio", "relations", "-", "as pinocchio-maximal", FLYER, marks=FULL),
+    ("mujoco", "state", "-", "joint_reaction", HEAVY_MUJOCO),
+    ("exudyn-tree", "state", "-", "acceleration", STRONG_TREE),
+    ("mujoco", "trajectory", "RK4", "order", MUJOCO_EULER),
+    ("exudyn", "trajectory", "trapezoidal", "attitude_limit", STRONG_EXUDYN),
+    ("mujoco", "step", "RK4", "step_rate", MUJOCO_EULER),
+    ("pinocchio", "step", "rkmk4", "step_attitude", PINOCCHIO_NO_DEXP),
+    ("exudyn-tree", "step", "RK44", "step_velocity", STRONG_TREE),
+    ("pinocchio", "invariants", "semi-implicit-euler", "energy_drift", DAMPED_PINOCCHIO),
+    ("pinocchio-aba", "relations", "-", "by crba", DAMPED_PINOCCHIO),
+    pytest.param("pinocchio", "state", "-", "mass_matrix", BIASED_PINOCCHIO, marks=FULL),
+    pytest.param("pinocchio-maximal", "state", "-", "acceleration", FAST_PINOCCHIO, marks=FULL),
+    pytest.param("exudyn", "state", "-", "acceleration", STRONG_EXUDYN, marks=FULL),
+    pytest.param("mujoco", "trajectory", "RK4", "position_limit", HEAVY_MUJOCO, marks=FULL),
+    pytest.param("pinocchio", "trajectory", "rkmk4", "order", PINOCCHIO_NO_DEXP, marks=FULL),
+    pytest.param("exudyn-tree", "trajectory", "RK44", "position_limit", STRONG_TREE, marks=FULL),
+    pytest.param("mujoco", "invariants", "RK4", "energy_drift", HEAVY_MUJOCO, marks=FULL),
+    pytest.param("exudyn", "invariants", "generalized-alpha", "energy_drift", STRONG_EXUDYN, marks=FULL),
+    pytest.param("pinocchio", "relations", "-", "as pinocchio-maximal", FAST_PINOCCHIO, marks=FULL),
 ]
 
 

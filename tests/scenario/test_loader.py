@@ -1,4 +1,4 @@
-"""The catalogue is complete, starts on the manifold, and says of itself what is true."""
+"""The catalogue is complete, starts on the manifold, and its descriptions are true."""
 
 import json
 import math

@@ -1,4 +1,4 @@
-"""Nights in a folder, asked together; a damaged one is named and left out."""
+"""The history over all nights of a folder; a damaged one is named and left out."""
 
 import json
 

@@ -119,7 +119,7 @@ def judged_by_run_and_sweep(defect):
     info = EngineInfo("mujoco", "MuJoCo", "0", engine.integrators)
 
     def study(steps):
-        inside = defect.inside() if defect.inside else nullcontext()
+        inside = defect.engine_patch() if defect.engine_patch else nullcontext()
         with inside, patch("plumbline.engines.calls.load_adapter", lambda _: engine):
             return run_refinement("mujoco", method.name, s.model, s.state, s.times, steps)
 
@@ -154,7 +154,7 @@ def test_an_engine_too_coarse_to_resolve_a_mistake_is_unresolved(tmp_path):
 
 @pytest.mark.parametrize("interval", [0.03125, 0.05])
 def test_every_step_hits_every_sample(interval):
-    """The steps of a run where the samples allow them; shorter ones where not, or where the file says so."""
+    """The steps of a run where the samples allow them; else shorter ones, or those of the file."""
     s = replace(scenarios.load_scenarios(["tumbling-rod"])[0], sample_interval=interval)
     method = load_adapter("mujoco").integrator("RK4")
     usual = refinement_resolutions(method, s.model.n, s.duration)

@@ -106,15 +106,17 @@ def test_neighbours_are_on_the_manifold_and_close(rods):
     model, state = random_chain(np.random.default_rng(3), rods)
     # Numbers of size 1 … 5, each some dozen roundings of 1e-16; a middle on the sphere is off the chord's
     # by the square of the distance, (3e-7)², times them.
-    for twin in perturbed_states(model, state):
-        assert 1e-9 < np.max(np.abs(twin.r - state.r)) < 1e-5
-        assert np.sum(twin.u * twin.udot, axis=1) == pytest.approx(np.zeros(len(rods)), abs=1e-14)
-        back = project_to_manifold(model, twin.r, twin.p, twin.v, quaternion_rate(twin.p, twin.omega))
+    for neighbour in perturbed_states(model, state):
+        assert 1e-9 < np.max(np.abs(neighbour.r - state.r)) < 1e-5
+        assert np.sum(neighbour.u * neighbour.udot, axis=1) == pytest.approx(np.zeros(len(rods)), abs=1e-14)
+        back = project_to_manifold(
+            model, neighbour.r, neighbour.p, neighbour.v, quaternion_rate(neighbour.p, neighbour.omega)
+        )
         for name in ("p", "omega", "u", "udot", "r", "v"):
-            assert getattr(back, name) == pytest.approx(getattr(twin, name), abs=1e-13), name
-        half = _interpolate_states(model, state, twin, 0.5)
+            assert getattr(back, name) == pytest.approx(getattr(neighbour, name), abs=1e-13), name
+        half = _interpolate_states(model, state, neighbour, 0.5)
         for name in ("p", "omega", "u", "udot", "r", "v"):
-            middle = (getattr(twin, name) + getattr(state, name)) / 2
+            middle = (getattr(neighbour, name) + getattr(state, name)) / 2
             assert getattr(half, name) == pytest.approx(middle, abs=1e-12), name
 
 
@@ -168,14 +170,14 @@ def test_position_distances_are_relative_to_the_distance_from_the_pivot():
 
 def test_interpolation_between_distant_states():
     model, state = random_chain(np.random.default_rng(3), [0, 1, 1])
-    twin = perturbed_states(model, state, perturbation_size=0.3, count=1)[0]
-    other = replace(twin, p=-twin.p)  # the same attitude
-    for far in (twin, other):
+    neighbour = perturbed_states(model, state, perturbation_size=0.3, count=1)[0]
+    other = replace(neighbour, p=-neighbour.p)  # the same attitude
+    for far in (neighbour, other):
         there = _interpolate_states(model, state, far, 1.0)
         for name in ("p", "omega", "u", "udot", "r", "v"):
-            assert getattr(there, name) == pytest.approx(getattr(twin, name), abs=1e-13), name
+            assert getattr(there, name) == pytest.approx(getattr(neighbour, name), abs=1e-13), name
         half = _interpolate_states(model, state, far, 0.5)
-        assert half.p == pytest.approx(_interpolate_states(model, state, twin, 0.5).p, abs=1e-15)
+        assert half.p == pytest.approx(_interpolate_states(model, state, neighbour, 0.5).p, abs=1e-15)
 
 
 def test_projection_normalises_quaternions():
@@ -273,7 +275,7 @@ def test_observed_divergence_from_quad(name):
 
 
 def check_divergence(name, precision):
-    """Double parts from a higher precision when the horizon says, as is seen within 15 s or else 30 s."""
+    """Double precision departs from a higher precision at the horizon, observed within 15 s or else 30 s."""
     pytest.importorskip("heyoka")
     seen = count_divergences(name, precision, 15) or count_divergences(name, precision, 30)
     assert seen, "no divergence was seen: nothing was validated"
