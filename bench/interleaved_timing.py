@@ -21,7 +21,15 @@ class Timing:
         return min(self.rounds)
 
     def ratio_to(self, other: Timing) -> float:
-        """Median over the rounds of this one's time over the other's of the same round."""
+        """Compare with another call, round by round.
+
+        Args:
+            other: times of the other call in the same rounds.
+
+        Returns:
+            The median over the rounds of this call's time over the other's.
+
+        """
         return float(np.median(np.array(self.rounds) / other.rounds))
 
 

@@ -23,12 +23,32 @@ Call = Callable[[], object]
 
 
 def random_pendulum(bodies: int, rods: bool = False, seed: int = 1) -> tuple[Model, State]:
-    """A random chain with full inertia tensors and offset attachments."""
+    """Draw a random chain with full inertia tensors and offset attachments.
+
+    Args:
+        bodies: number of bodies.
+        rods: whether every joint is a rod; else every joint is a ball joint.
+        seed: of the random numbers.
+
+    Returns:
+        The model and a state on its manifold.
+
+    """
     return random_chain(np.random.default_rng(seed), [rods] * bodies)
 
 
 def structured_call(model: Model, state: State, batch: int = 1) -> Call:
-    """The reference's structured form; ``batch`` chains in one call, each at a state of its own."""
+    """Prepare the reference's structured form.
+
+    Args:
+        model: the pendulum.
+        state: its state; the copies of a batch have rates within ± 10 % of it.
+        batch: number of chains that one call evaluates.
+
+    Returns:
+        The call that computes the accelerations of all chains.
+
+    """
     forest = StructuredSystem([model]).repeated(batch)
     q, v = (
         np.tile(x, batch)
@@ -42,7 +62,16 @@ def structured_call(model: Model, state: State, batch: int = 1) -> Call:
 
 
 def direct_call(model: Model, state: State) -> tuple[sparse.csc_matrix, Array, Call]:
-    """The direct form: S (sparse) and b assembled, and the banded solve of a state from scratch."""
+    """Prepare the direct form and assemble its system S x = b.
+
+    Args:
+        model: the pendulum.
+        state: attitudes, directions and rates of its bodies.
+
+    Returns:
+        S, b, and the call that assembles and solves the banded system.
+
+    """
     system, pdot = DirectSystem(model), quaternion_rate(state.p, state.omega)
     values, b, *_ = system._entries(state.r, state.p, state.v, pdot)
     S = sparse.csc_matrix((values, (system._i, system._j)), shape=(system.size, system.size))
@@ -50,32 +79,79 @@ def direct_call(model: Model, state: State) -> tuple[sparse.csc_matrix, Array, C
 
 
 def superlu_call(S: sparse.csc_matrix, b: Array) -> Call:
-    """Sparse LU of the same S: factor and solve only, S handed over assembled and in SuperLU's format."""
+    """Prepare SciPy's sparse LU of an assembled system: the call factors and solves only.
+
+    Args:
+        S: matrix in SuperLU's format.
+        b: right-hand side.
+
+    Returns:
+        The call that solves S x = b.
+
+    """
     return lambda: splu(S).solve(b)
 
 
 def dense_call(S: sparse.csc_matrix, b: Array) -> Call:
-    """The dense direct form: factor, solve and one refinement, S handed over assembled."""
+    """Prepare the dense solve of an assembled system: factor, solve and one step of refinement.
+
+    Args:
+        S: matrix; it is made dense here.
+        b: right-hand side.
+
+    Returns:
+        The call that solves S x = b.
+
+    """
     matrix = S.toarray()
     return lambda: solve_dense(matrix, b)
 
 
 def mujoco_forward_call(model: Model, state: State) -> Call:
-    """MuJoCo's mj_forward."""
+    """Prepare MuJoCo's mj_forward.
+
+    Args:
+        model: the pendulum.
+        state: attitudes, directions and rates of its bodies.
+
+    Returns:
+        The call that computes MuJoCo's accelerations.
+
+    """
     held = mujoco_engine._MujocoChain(model)
     held.set_state(state)
     return lambda: mujoco.mj_forward(held.m, held.d)
 
 
 def pinocchio_aba_call(model: Model, state: State) -> Call:
-    """Pinocchio's aba."""
+    """Prepare Pinocchio's articulated-body algorithm, pin.aba.
+
+    Args:
+        model: the pendulum.
+        state: attitudes, directions and rates of its bodies.
+
+    Returns:
+        The call that computes Pinocchio's accelerations.
+
+    """
     held = pinocchio_engine.PinocchioChain(model, "aba")
     q, v = held.coordinates(state)
     return lambda: pin.aba(held.pin_model, held.data, q, v, held.zero_torque)
 
 
 def exudyn_steps_call(model: Model, state: State, step: float = 1e-4, count: int = 10) -> tuple[Call, int]:
-    """Exudyn's trapezoidal steps, ``count`` to a call; a step is some two right-hand sides and a Jacobian."""
+    """Prepare Exudyn's trapezoidal rule: a step costs about two right-hand sides and a Jacobian.
+
+    Args:
+        model: the pendulum.
+        state: its initial state.
+        step: of the integrator [s].
+        count: number of steps in one call.
+
+    Returns:
+        The call, and its number of steps.
+
+    """
     held = exudyn_engine.ExudynChain(model, state)
     chosen = make_settings()
     chosen.linearSolver.solverType = exudyn.LinearSolverType.EigenSparse

@@ -23,7 +23,15 @@ COLOURS = ("#0b6e99", "#7a4fa3", "#b85c00", "#2e7d32", "#b3261e", "#5d6b7a", "#8
 
 
 def measured_goals(measurements: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The goals that were measured: what, goal, measured value (a ratio or exponent)."""
+    """Select the goals that were measured.
+
+    Args:
+        measurements: records of the benchmarks, as pytest-benchmark stores them in ``extra_info``.
+
+    Returns:
+        One row per goal: what, goal and measured value, each a ratio or an exponent.
+
+    """
 
     def pick(kind: str, **where: Any) -> dict[str, Any] | None:
         fits = (r for r in measurements if r["kind"] == kind and all(r.get(k) == v for k, v in where.items()))
@@ -58,7 +66,16 @@ def measured_goals(measurements: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def work_precision_svg(curves: dict[str, list[dict[str, float]]], title: str) -> str:
-    """Work–precision curves as SVG: error (m) falls to the right, CPU time (s) rises; both logarithmic."""
+    """Draw work–precision curves: error falls to the right, CPU time rises; both axes are logarithmic.
+
+    Args:
+        curves: points with ``error`` [m] and ``seconds`` (CPU time [s]), by name of the integrator.
+        title: heading of the picture.
+
+    Returns:
+        The SVG document.
+
+    """
     points = [p for curve in curves.values() for p in curve if 0 < p["error"] < 1 and p["seconds"] > 0]
     errors, seconds = ([np.log10(p[k]) for p in points] for k in ("error", "seconds"))
     left, right = int(np.ceil(max(errors))), int(np.floor(min(errors)))
@@ -107,7 +124,15 @@ def work_precision_svg(curves: dict[str, list[dict[str, float]]], title: str) ->
 
 
 def run_benchmarks(folder: Path) -> Path:
-    """Run all benchmarks with one BLAS thread; the path of what pytest-benchmark stored."""
+    """Run all benchmarks with one BLAS thread.
+
+    Args:
+        folder: where pytest-benchmark stores its results; created where it is missing.
+
+    Returns:
+        Path of the results.
+
+    """
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "benchmarks.json"
     command = [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", "bench", f"--benchmark-json={path}"]
@@ -117,7 +142,12 @@ def run_benchmarks(folder: Path) -> Path:
 
 
 def main(arguments: list[str]) -> None:
-    """Write and print the figures of a stored run, or of one made now."""
+    """Write and print the figures of a stored run, or of one made now.
+
+    Args:
+        arguments: path of stored results and folder to write to; both may be left out.
+
+    """
     stored = Path(arguments[0]) if arguments else run_benchmarks(Path("reports") / "out")
     folder = Path(arguments[1]) if len(arguments) > 1 else stored.parent
     found = [b["extra_info"] for b in json.loads(stored.read_text())["benchmarks"] if b["extra_info"]]

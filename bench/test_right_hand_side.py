@@ -14,7 +14,13 @@ BODIES = (1, 2, 10, 100, 1000, 10_000)
 
 
 def record_table(benchmark: Any, table: dict[str, Any]) -> None:
-    """Put a table beside pytest-benchmark's own figures and print it."""
+    """Put a table beside pytest-benchmark's own figures and print it.
+
+    Args:
+        benchmark: pytest-benchmark's fixture.
+        table: entries of ``extra_info``.
+
+    """
     benchmark.extra_info.update(table)
     print(table)
 

@@ -29,7 +29,15 @@ ENGINE_INTEGRATORS = (
 
 
 def perturbed_pendulums(count: int) -> tuple[Model, list[State]]:
-    """The catalogue's tumbling two-ball pendulum; in a batch its rates vary by a fifth, body by body."""
+    """Load the catalogue's tumbling two-ball pendulum with several initial states.
+
+    Args:
+        count: number of states; all but the first have rates that differ by about a fifth.
+
+    Returns:
+        The model and its states.
+
+    """
     scenario = load_scenario(find_scenario_file("double-tumbling-balls"))
     model, state = scenario.model, scenario.state
     rng = np.random.default_rng(64)

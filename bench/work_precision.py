@@ -29,13 +29,30 @@ class WorkPrecisionPoint:
 
 
 def stack_states(states: Sequence[State]) -> tuple[Array, Array, Array, Array]:
-    """r, p, ṙ, ṗ of a batch, body first."""
+    """Stack the coordinates of a batch of states.
+
+    Args:
+        states: B states of N bodies.
+
+    Returns:
+        r (BN, 3) [m], p (BN, 4), ṙ (BN, 3) [m/s] and ṗ (BN, 4) [1/s], state by state.
+
+    """
     r, p, v = (np.concatenate([getattr(state, name) for state in states]) for name in ("r", "p", "v"))
     return r, p, v, np.concatenate([quaternion_rate(state.p, state.omega) for state in states])
 
 
 def reference_positions(model: Model, states: Sequence[State]) -> Array:
-    """(bodies of all states, 3) m at the end, by collocation at the tightest tolerance, one by one."""
+    """Compute the positions at t = 2 s by collocation at the tightest tolerance, state by state.
+
+    Args:
+        model: the pendulum, N bodies.
+        states: B initial states.
+
+    Returns:
+        Positions of all bodies (BN, 3) [m].
+
+    """
     runs = [integrate_collocation([model], *stack_states([state]), SAMPLE_TIMES, 1e-14) for state in states]
     return np.concatenate([run.r[-1] for run in runs])
 
@@ -43,7 +60,18 @@ def reference_positions(model: Model, states: Sequence[State]) -> Array:
 def measure_run(
     run: Callable[[], Array], expected: Array, resolution: float, repeats: int = 3
 ) -> WorkPrecisionPoint:
-    """Repeat a run and keep the shortest CPU time."""
+    """Repeat a run and keep the shortest CPU time.
+
+    Args:
+        run: computes the positions at the end (BN, 3) [m].
+        expected: the exact positions (BN, 3) [m].
+        resolution: step [s] or tolerance, kept with the result.
+        repeats: number of runs.
+
+    Returns:
+        Largest error of a body and the shortest CPU time.
+
+    """
     seconds = []
     for _ in range(repeats):
         start = process_time()
@@ -55,7 +83,17 @@ def measure_run(
 
 
 def collocation_curve(model: Model, states: Sequence[State], expected: Array) -> list[WorkPrecisionPoint]:
-    """The reference's collocation on all states in one batch; the time of a run of one step is taken off."""
+    """Measure the reference's collocation on all states in one batch.
+
+    Args:
+        model: the pendulum.
+        states: initial states.
+        expected: positions at the end (BN, 3) [m].
+
+    Returns:
+        One point per tolerance; the time of a run of one step is subtracted.
+
+    """
     chains, start, points = [model] * len(states), stack_states(states), []
     for rtol in TOLERANCES:
 
@@ -71,7 +109,18 @@ def collocation_curve(model: Model, states: Sequence[State], expected: Array) ->
 def dop853_curve(
     model: Model, states: Sequence[State], expected: Array, structured: bool
 ) -> list[WorkPrecisionPoint]:
-    """The reference's DOP853 on either form, state by state."""
+    """Measure the reference's DOP853, state by state.
+
+    Args:
+        model: the pendulum.
+        states: initial states.
+        expected: positions at the end (BN, 3) [m].
+        structured: whether the structured form evaluates the right-hand side; else the direct form.
+
+    Returns:
+        One point per tolerance.
+
+    """
 
     def run(rtol: float) -> Array:
         ends = [
@@ -97,7 +146,20 @@ def fixed_step_curve(
     expected: Array,
     max_seconds: float,
 ) -> list[WorkPrecisionPoint]:
-    """An engine's own integrator; the time of building its model (a run of one step) is taken off."""
+    """Measure an engine's own integrator with a fixed step, halved until a run takes too long.
+
+    Args:
+        engine: adapter of the engine.
+        integrator: name of the integrator.
+        model: the pendulum.
+        states: initial states.
+        expected: positions at the end (BN, 3) [m].
+        max_seconds: CPU time of a run [s] after which no finer step is tried.
+
+    Returns:
+        One point per step; the time of a run of one step, which builds the engine's model, is subtracted.
+
+    """
     points = []
     for step in (1.6e-2, 8e-3, 4e-3, 2e-3, 1e-3, 5e-4, 2.5e-4, 1.25e-4, 6.25e-5):
 
@@ -115,7 +177,16 @@ def fixed_step_curve(
 
 
 def cost_at_error(points: Sequence[WorkPrecisionPoint], error: float) -> float:
-    """CPU seconds at which the curve first reaches ``error``, log–log between its points; NaN if never."""
+    """Interpolate the cost of an error on a work–precision curve, log–log between its points.
+
+    Args:
+        points: the curve, coarsest first.
+        error: position error [m].
+
+    Returns:
+        CPU time [s] at which the curve first reaches the error; NaN if it never does.
+
+    """
     for worse, better in pairwise(points):
         if better.error <= error < worse.error:
             weight = np.log(error / worse.error) / np.log(better.error / worse.error)

@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("plumbline", "adapters", "reference_impl", "reports")
+PACKAGES = ("plumbline", "adapters", "reference_impl", "reports", "bench")
 SECTIONS = ("Args", "Returns", "Yields", "Raises")
 FILLER = {"the", "a", "an", "of", "to", "in", "for", "and", "this", "that", "its", "return", "returns", "is"}
 FunctionNode = ast.FunctionDef | ast.AsyncFunctionDef
@@ -148,7 +148,7 @@ def main(arguments: list[str]) -> int:
         file
         for root in roots
         for file in (sorted(root.rglob("*.py")) if root.is_dir() else [root])
-        if "node_modules" not in file.parts and "out" not in file.parts
+        if not {"node_modules", "out"} & set(file.parts) and not file.name.startswith("test_")
     ]
     problems = [problem for file in files for problem in problems_in_file(file)]
     print("\n".join(problems) or "every public function is documented")
