@@ -8,7 +8,8 @@ body, are merged into that body.
     ball            roll-pitch-yaw(q) = R_M R(x) R_Mᵀ with R_M = R_BMᵀ;  v_e = R_FM R_M v, so that Ṫv = 0
     free            q = (quaternion, position);  v_e = (R_B ω, ṙ), so that Ṫv = 0
 
-    h = CalcBiasTerm − CalcGravityGeneralizedForces;  v̇ by EvalTimeDerivatives of the continuous plant
+    h = CalcBiasTerm − CalcGravityGeneralizedForces;  v̇ by EvalTimeDerivatives of the continuous plant, which
+        refuses plants with constraints (mimic joints among them)
     f = damping of the joints, AddInDamping, and what force elements besides gravity add to inverse dynamics
 
 A URDF's root link is free in Drake; with a fixed base it is welded to the world.
@@ -204,7 +205,10 @@ class _Layout:
         M = np.array(plant.CalcMassMatrix(context))
         gravity = np.array(plant.CalcGravityGeneralizedForces(context))
         coriolis = np.array(plant.CalcBiasTerm(context))
-        accelerations = plant.EvalTimeDerivatives(context).get_generalized_velocity().CopyToVector()
+        accelerations = None
+        if not plant.num_constraints():
+            derivatives = plant.EvalTimeDerivatives(context)
+            accelerations = np.array(derivatives.get_generalized_velocity().CopyToVector())
         poses = {}
         for index in self.order:
             body = plant.get_body(index)
@@ -213,7 +217,7 @@ class _Layout:
         has_springs = plant.num_force_elements() > 1  # besides gravity
         engine = ModelQuantities(
             poses, M, coriolis - gravity, -gravity, self._passive_force(coriolis, gravity),
-            np.array(accelerations), float(plant.CalcKineticEnergy(context)),
+            accelerations, float(plant.CalcKineticEnergy(context)),
             None if has_springs else float(plant.CalcPotentialEnergy(context)),
         )  # fmt: skip
         return to_canonical(engine, T, np.zeros(len(v)))

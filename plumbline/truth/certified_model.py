@@ -33,6 +33,9 @@ ROUNDING_FACTOR = 16.0
 EPSILON = 2.0**-53
 START_BITS, MAX_BITS = 128, 2048
 MAX_RELATIVE_RADIUS = 1e-22  # of the magnitudes of the terms
+FLOOR = (
+    2.0**-30
+)  # of the largest entry: for entries whose terms vanish exactly, and not in an engine's frames
 MIN_MAGNITUDE = 1e-300  # so that terms that are all zero have a radius to compare with
 
 
@@ -273,7 +276,7 @@ def _rotation_vector(c: _BallModel, q: Array) -> list[Any]:
 class _Magnitudes:
     """Sums of the magnitudes of the terms of each quantity, as the module's docstring defines them."""
 
-    length: Array  # (bodies,) m
+    length: Array  # (bodies,) m, with the way to the centre of mass, by which engines place bodies
     turns: Array  # (bodies,) number of frames on the path, and the angles' sum
     mass_matrix: Array  # (n, n)
     bias_force: Array  # (n,)
@@ -284,7 +287,7 @@ class _Magnitudes:
 
 def _magnitudes(model: NeutralModel, state: CanonicalState) -> _Magnitudes:
     count, n, g = len(model.bodies), model.velocity_count, float(np.linalg.norm(model.gravity))
-    path, turns, rate, slide = (np.zeros(count) for _ in range(4))
+    path, turns, rate, slide, reach = (np.zeros(count) for _ in range(5))
     over = np.zeros((count, n))  # 1 for rotations, −1 for slides on the path of a body
     M, h, gravity, passive, potential = np.zeros((n, n)), np.zeros(n), np.zeros(n), np.zeros(n), 0.0
     places = iter(model.joint_slices())
@@ -311,6 +314,7 @@ def _magnitudes(model: NeutralModel, state: CanonicalState) -> _Magnitudes:
                 stretch + abs(joint.spring_reference) + np.pi
             )
         ell, J = path[k] + float(np.linalg.norm(body.center)), float(np.linalg.norm(body.inertia))
+        reach[k] = max(ell, reach[body.parent] if body.parent >= 0 else 0.0)
         u, w = np.where(over[k] > 0, ell, -over[k]), over[k] > 0
         M += body.mass * np.outer(u, u) + J * np.outer(w, w)
         gravity += body.mass * u * g
@@ -318,7 +322,8 @@ def _magnitudes(model: NeutralModel, state: CanonicalState) -> _Magnitudes:
         potential += body.mass * g * ell
     for i, (armature, _) in enumerate(_armature_and_rate(model, state)):
         M[i, i] += armature
-    return _Magnitudes(path, turns, M, h, gravity, passive, potential)
+    M, h, gravity = (terms + FLOOR * np.max(terms, initial=0.0) for terms in (M, h, gravity))
+    return _Magnitudes(reach, turns, M, h, gravity, passive, potential)
 
 
 def _with_tolerances(
