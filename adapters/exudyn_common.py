@@ -219,6 +219,8 @@ def run_solver(
         finished = solver.SolveSystem(mbs, settings)
     except (RuntimeError, ValueError, ENGINE_ERROR) as error:
         raise EngineFailure(f"Exudyn stopped after {recorder.taken} of {steps} steps: {error}") from error
+    finally:
+        mbs.SetPostStepUserFunction(0)  # the recorder holds the system: together they would never be freed
     if recorder.error is not None:
         raise recorder.error
     end = mbs.systemData.GetTime()

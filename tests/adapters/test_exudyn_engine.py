@@ -1,5 +1,6 @@
 """What holds of Exudyn alone: orders and limits, the singularity of its tree, what is not used and why."""
 
+import gc
 from dataclasses import replace
 from functools import cache
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from adapters import exudyn_tree_engine
-from adapters.exudyn_common import make_settings, set_linear_solver, silence_engine
+from adapters.exudyn_common import _StepRecorder, make_settings, set_linear_solver, silence_engine
 from adapters.exudyn_engine import Exudyn, ExudynChain
 from adapters.exudyn_tree_engine import ExudynTree
 from plumbline.model.datatypes import EngineFailure, Model, Unsupported
@@ -176,6 +177,15 @@ def test_nothing_is_printed_or_written(capfd, tmp_path, monkeypatch):
         Exudyn().simulate(hard, pendulums.state_from_seed(hard, rate=20.0), TIMES, "generalized-alpha", 0.25)
     assert capfd.readouterr() == ("", "")
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("engine", "method"), [(Exudyn(), "trapezoidal"), (ExudynTree(), "RK44")])
+def test_a_system_is_freed_after_its_run(engine, method):
+    """Random scenarios are thousands of systems in one worker; Python cannot free a cycle through Exudyn."""
+    model, state = swinging_pendulum("r")
+    engine.step(model, state, method, 1e-3, 2)
+    gc.collect()
+    assert not [one for one in gc.get_objects() if type(one) is _StepRecorder]
 
 
 def light_and_heavy_balls():
