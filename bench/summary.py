@@ -7,8 +7,10 @@ the folder (the file's own where none is given) and prints the table.
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
+import platform
 import subprocess
 import sys
 from pathlib import Path
@@ -17,6 +19,7 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
+from plumbline.processes.processor import processor_name
 from plumbline.storage.results_store import write_atomically
 
 COLOURS = ("#0b6e99", "#7a4fa3", "#b85c00", "#2e7d32", "#b3261e", "#5d6b7a", "#8a6d00", "#c2185b", "#00796b")
@@ -123,6 +126,27 @@ def work_precision_svg(curves: dict[str, list[dict[str, float]]], title: str) ->
     return "\n".join([*out, "</svg>"]) + "\n"
 
 
+def describe_machine() -> dict[str, str]:
+    """Describe what the figures depend on besides the code.
+
+    Returns:
+        Processor, operating system, NumPy's BLAS, and the kernel that it chose for this processor.
+
+    """
+    blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]
+    kernel = "unknown"
+    for path in Path(np.__file__).parents[1].glob("numpy.libs/libscipy_openblas*"):
+        core_name = ctypes.CDLL(str(path)).scipy_openblas_get_corename64_
+        core_name.restype = ctypes.c_char_p
+        kernel = core_name().decode()
+    return {
+        "processor": processor_name(),
+        "system": platform.platform(),
+        "BLAS": f"{blas['name']} {blas['version']}",
+        "BLAS kernel": kernel,
+    }
+
+
 def run_benchmarks(folder: Path) -> Path:
     """Run all benchmarks with one BLAS thread.
 
@@ -155,7 +179,7 @@ def main(arguments: list[str]) -> None:
     for row in rows:
         met = "met" if row["measured"] <= row["goal"] else "not met"
         print(f"{row['what']}: {row['measured']:.3g} (goal {row['goal']:g}, {met})")
-    figures = json.dumps({"goals": rows, "records": found}, indent=1) + "\n"
+    figures = json.dumps({"machine": describe_machine(), "goals": rows, "records": found}, indent=1) + "\n"
     write_atomically(folder / "figures.json", figures.encode())
     for record in found:
         if record["kind"] == "work-precision":
