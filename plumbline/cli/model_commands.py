@@ -20,9 +20,9 @@ from plumbline.cli.help_texts import EXIT_CODES, examples
 from plumbline.cli.verdict_matrix import coloured_glyph, engine_heading
 from plumbline.engines.environments import split_version, version_problem
 from plumbline.engines.registry import IMPORTERS
-from plumbline.execution.model_run import FileResult, ModelPlan, ModelRunResult, run_model_files
+from plumbline.execution.model_run import ModelPlan, ModelRunResult, run_model_files
 from plumbline.importers.neutral_model import Feature
-from plumbline.judging.model_file import MODEL_UNITS
+from plumbline.judging.model_file import MODEL_UNITS, FileResult
 from plumbline.judging.rows import Row, Verdict
 from plumbline.processes.workers import Limits
 from plumbline.scenario.errors import MAX_LISTED_PROBLEMS, did_you_mean
@@ -175,8 +175,14 @@ def model_document(result: ModelRunResult) -> dict[str, Any]:
         JSON values.
 
     """
+    plan = result.plan
     document = {
         "version": __version__,
+        "options": {
+            "base": plan.base,
+            "root": None if plan.root is None else str(plan.root),
+            "strip_geometry": plan.strip_geometry,
+        },
         "engines": {name: {"version": i.version, "missing": i.missing} for name, i in result.engines.items()},
         "files": [
             {
@@ -239,7 +245,7 @@ def _print_file(file: FileResult, result: ModelRunResult) -> None:
             out.print(line)
     for title, features in (("not compared", file.model.not_compared), ("left open", file.model.ambiguous)):
         if features:
-            out.print(f"[dim]{title}: {escape(_feature_words(features))}[/]")
+            out.print(f"[dim]{title}: {escape(_feature_words(features, file.file))}[/]")
 
 
 def _file_table(by_engine: dict[str, list[Row]], result: ModelRunResult) -> Table:
@@ -271,10 +277,14 @@ def _reasons(name: str, rows: Sequence[Row], file: FileResult) -> list[str]:
     return lines
 
 
-def _feature_words(features: Sequence[Feature]) -> str:
+def _feature_words(features: Sequence[Feature], shown: str) -> str:
     counted = Counter(feature.what for feature in features)
     first = {feature.what: feature for feature in reversed(features)}
+    places = {
+        what: f"line {f.source.line}" if f.source.file == shown else str(f.source)
+        for what, f in first.items()
+    }
     return ", ".join(
-        f"{count} × {what} ({first[what].name}, {first[what].source}{' …' if count > 1 else ''})"
+        f"{count} × {what} ({first[what].name}, {places[what]}{' …' if count > 1 else ''})"
         for what, count in counted.items()
     )

@@ -60,6 +60,37 @@ def _history_lines(document: dict[str, Any]) -> list[str]:
     return lines + [f"{since}: {c['key']} {c['was']} → {c['is']}" for c in document["since_green"]]
 
 
+def _reproduce_model(folder: Path, keys: tuple[str, ...], form: str | None) -> None:
+    """Write scripts of importers' differences, or list the differences."""
+    from plumbline.reproduce.model_script import NoModelScript, stored_differences, write_model_script
+    from plumbline.storage.results_store import write_atomically
+
+    document = json.loads((folder / "model.json").read_text(encoding="utf-8"))
+    found = stored_differences(document)
+    if not keys:
+        for key, row in found.items():
+            click.echo(f"{key}: {row['diagnosis'] or row['reason']}")
+        click.echo(count_noun(len(found), "difference") if found else "nothing differs", err=True)
+        return
+    chosen, about = options.claim_folder(folder), document["options"]
+    root = None if about["root"] is None else Path(about["root"])
+    for key in keys:
+        if key not in found:
+            raise click.UsageError(f"no difference {key!r}; without KEY the command lists them")
+        row = found[key]
+        engine = row["engine"].partition("@")[0]
+        try:
+            script = write_model_script(
+                row["scenario"], row["engine"], form or engine, about["base"], root, about["strip_geometry"]
+            )
+        except NoModelScript as error:
+            raise click.ClickException(f"{key}: {error}") from None
+        path = chosen / "scripts" / f"{Path(row['scenario']).stem}-{row['engine'].replace('@', '-')}.py"
+        path.parent.mkdir(exist_ok=True)
+        write_atomically(path, script.text.encode())
+        click.echo(str(path))
+
+
 @click.command()
 @click.argument("folder", default=options.DEFAULT_OUT, type=options.ResultsPath())
 @click.option(
@@ -84,12 +115,20 @@ def report(folder: Path, history_folder: Path | None) -> None:
 )
 @click.argument("folder", metavar="RESULT", type=options.ResultsPath())
 @click.argument("keys", nargs=-1, metavar="[KEY]...")
-def reproduce(folder: Path, keys: tuple[str, ...]) -> None:
+@click.option(
+    "--form",
+    help="Of results of `model`: the engine whose calls the script uses. Default: the importer's own.",
+)
+def reproduce(folder: Path, keys: tuple[str, ...], form: str | None) -> None:
     """Write a stand-alone script that shows a disagreement, for the engine's maintainers.
 
     RESULT is a results folder or its results.json; KEY is a row's key. Without KEY, the disagreements are
-    listed.
+    listed. Of a folder that `model --out` wrote, the script holds the smallest model file that still shows
+    the difference.
     """
+    if (folder / "model.json").is_file():
+        _reproduce_model(folder, keys, form)
+        return
     from plumbline.reproduce.write import list_disagreements, write_scripts
 
     with options.exit_on_damaged_results():

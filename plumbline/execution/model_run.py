@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from plumbline.diagnosis.importer_cause import Explanation, explain_importer
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.environments import (
     EnvironmentUnavailable,
@@ -22,20 +20,17 @@ from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.runner import exit_code_of_rows
 from plumbline.importers.importer import Reading
 from plumbline.importers.model_file import BaseChoice, PreparedFile, prepare_file
-from plumbline.importers.neutral_model import CanonicalState, NeutralModel, without_passive_forces
+from plumbline.importers.neutral_model import CanonicalState, NeutralModel
 from plumbline.importers.xml_tree import ModelFileError
 from plumbline.judging.known_issues import KnownIssue, KnownIssues
-from plumbline.judging.model_file import Answer, judge_answer
+from plumbline.judging.model_file import MODEL_FAMILY, Answer, FileResult, judge_file, state_seed
 from plumbline.judging.rows import Row, RowContext, Verdict
-from plumbline.model.datatypes import Array
 from plumbline.processes.isolation import ScratchFolder
 from plumbline.processes.workers import Executor, Limits, Outcome, Task, WorkerPool
 from plumbline.scenario.errors import Problem, did_you_mean, shorten
-from plumbline.truth.model_comparison import certify_states, model_states
+from plumbline.truth.model_comparison import model_states
 
-MODEL_FAMILY = "model file"
 MJCF_READER = "mujoco"  # whose compiled model is the neutral reading of MJCF
-SEED = 17
 ProgressCallback = Callable[[int, int, str], None]
 
 
@@ -57,20 +52,10 @@ class ModelPlan:
 
 
 @dataclass(frozen=True, eq=False)
-class FileResult:
-    """One file's result."""
-
-    file: str  # as typed
-    model: NeutralModel
-    rows: tuple[Row, ...]
-    explanations: Mapping[str, Explanation]  # by importer
-    poses: Mapping[str, Array]  # of the bodies at the first state, for the drawing
-
-
-@dataclass(frozen=True, eq=False)
 class ModelRunResult:
     """All files' results."""
 
+    plan: ModelPlan
     files: tuple[FileResult, ...]
     engines: Mapping[str, EngineInfo]
     problems: tuple[Problem, ...]  # of files that cannot be used
@@ -128,7 +113,7 @@ class _ModelRun:
         known = KnownIssues(self.plan.known_issues, False)
         files = [replace(f, rows=tuple(known.mark_known(f.rows, len(f.model.bodies)))) for f in files]
         stale = known.stale_issues(is_full_matrix=False)
-        return ModelRunResult(tuple(files), self.engines, tuple(self.problems), tuple(stale))
+        return ModelRunResult(self.plan, tuple(files), self.engines, tuple(self.problems), tuple(stale))
 
     def outcomes(self, tasks: Sequence[Task]) -> Iterator[Outcome]:
         """Run tasks and report the progress."""
@@ -280,19 +265,6 @@ class _ModelRun:
         yield from (found[shown] for shown in models)
 
 
-def state_seed(shown: str) -> int:
-    """Derive the seed of a file's random states from its name, so that its folder does not matter.
-
-    Args:
-        shown: the path as typed.
-
-    Returns:
-        The seed.
-
-    """
-    return int.from_bytes(hashlib.sha256(Path(shown).name.encode()).digest()[:4], "big") + SEED
-
-
 def declared_formats(name: str) -> tuple[str, ...]:
     """Read which formats an importer reads, without importing it.
 
@@ -304,71 +276,3 @@ def declared_formats(name: str) -> tuple[str, ...]:
 
     """
     return tuple(declared_importer_attribute(split_version(name)[0], "formats") or ())
-
-
-def judge_file(
-    shown: str,
-    model: NeutralModel,
-    columns: Sequence[tuple[str, EngineInfo, Answer]],
-    state_count: int,
-    at: Mapping[str, float] | None,
-) -> FileResult:
-    """Judge every importer's answer about one file, and look for causes.
-
-    Args:
-        shown: the path as typed.
-        model: what the file says.
-        columns: name and description of each importer, and its answer.
-        state_count: number of random states.
-        at: the one state to compare at instead.
-
-    Returns:
-        The file's result.
-
-    """
-
-    def states(one: NeutralModel) -> tuple[CanonicalState, ...]:
-        return model_states(one, state_count, state_seed(shown), at)
-
-    truths = certify_states(model, states(model))
-    bare = without_passive_forces(model)
-    bare_truths = certify_states(bare, states(bare)) if bare is not model else truths
-    rows: list[Row] = []
-    explanations: dict[str, Explanation] = {}
-    for name, info, answer in columns:
-        context = RowContext(shown, MODEL_FAMILY, name, info.title, info.version)
-        if answer.reading is None and not answer.failure:
-            reason = f"{info.title} reads no such files"
-            rows.append(context.make_row("model", "-", "all", Verdict.INFORMATION, reason))
-            continue
-        if info.missing is not None:
-            verdict = Verdict.FAILED if info.has_failed else Verdict.NOT_INSTALLED
-            rows.append(context.make_row("model", "-", "all", verdict, info.missing))
-            continue
-        unsupported = declared_importer_attribute(split_version(name)[0], "unsupported") or {}
-        applies = "passive_force" not in unsupported
-        judged = (model, truths) if applies else (bare, bare_truths)
-        found = judge_answer(context, *judged, answer, unsupported)
-        if any(row.verdict == Verdict.DISAGREES for row in found):
-            explanations[name] = explanation = _explain(context, judged[0], answer, states, applies)
-            found = [_with_diagnosis(row, explanation) for row in found]
-        rows += found
-    poses = truths[0].quantities.poses if truths else {}
-    return FileResult(shown, model, tuple(rows), explanations, poses)
-
-
-def _explain(
-    context: RowContext, model: NeutralModel, answer: Answer, states: Any, applies_passive_forces: bool
-) -> Explanation:
-    assert answer.reading is not None and answer.reading.model is not None
-    reading = answer.reading.model
-    if not applies_passive_forces:
-        reading = without_passive_forces(reading)
-    return explain_importer(f"{context.title} {context.version}", model, reading, answer.quantities, states)
-
-
-def _with_diagnosis(row: Row, explanation: Explanation) -> Row:
-    if row.verdict != Verdict.DISAGREES:
-        return row
-    sentence = explanation.sentence or "no change of the model's parameters reproduces it"
-    return replace(row, diagnosis=sentence)

@@ -21,7 +21,7 @@ _JOINT_FIELDS = {
 _ASSET_FOLDERS = {"mesh": "meshdir", "hfield": "meshdir", "skin": "meshdir", "texture": "texturedir"}
 _FILES = {"file", "fileright", "fileleft", "fileup", "filedown", "filefront", "fileback"}
 _SECTIONS = ("actuator", "tendon", "equality", "contact", "sensor", "keyframe", "deformable", "extension")
-_STRIPPED = ("contact", "sensor", "keyframe", "asset", "visual")  # what refers to geometry
+_STRIPPED = ("contact", "sensor", "keyframe", "visual")  # what refers to geometry
 
 
 def expand_includes(root: Element, path: Path, root_folder: Path, shown: str) -> None:
@@ -204,9 +204,16 @@ def strip_geometry(root: Element) -> None:
             explicit = holder.tag == "worldbody" or holder.find("inertial") is not None
             if explicit and not from_geoms:
                 holder.children = [c for c in holder.children if c.tag not in ("geom", "light", "camera")]
-        kept |= any(e.tag == "geom" and "mesh" in e.attributes for e in world.walk())
-    dropped = set(_STRIPPED) - ({"asset"} if kept else set())
-    root.children = [child for child in root.children if child.tag not in dropped]
+        kept |= any(
+            e.tag == "geom" and {"mesh", "hfield", "class"} & e.attributes.keys() for e in world.walk()
+        )
+    root.children = [child for child in root.children if child.tag not in _STRIPPED]
+    dropped = {"texture", "skin"} | (set() if kept else {"mesh", "hfield"})
+    for asset in root.find_all("asset"):
+        asset.children = [child for child in asset.children if child.tag not in dropped]
+        for material in asset.find_all("material"):
+            material.attributes.pop("texture", None)
+            material.children = []
 
 
 def with_sources(model: NeutralModel, root: Element) -> NeutralModel:
@@ -226,7 +233,7 @@ def with_sources(model: NeutralModel, root: Element) -> NeutralModel:
     found = [_body_with_sources(body, bodies, defaults, default_source) for body in model.bodies]
     gravity = next((o.source for o in root.find_all("option") if "gravity" in o.attributes), default_source)
     features = [
-        Feature(element.tag if element.tag != "general" else section.tag, _name_of(element), element.source)
+        Feature(section.tag, _name_of(element), element.source)
         for section in root.children
         if section.tag in _SECTIONS
         for element in section.children

@@ -6,14 +6,34 @@ tolerance is made of the magnitudes of the terms (`plumbline.truth.certified_mod
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
+from plumbline.diagnosis.importer_cause import Explanation, explain_importer
+from plumbline.engines.adapter import EngineInfo
+from plumbline.engines.environments import declared_importer_attribute, split_version
 from plumbline.importers.importer import Reading
-from plumbline.importers.neutral_model import CanonicalState, ModelQuantities, NeutralModel
+from plumbline.importers.neutral_model import (
+    CanonicalState,
+    ModelQuantities,
+    NeutralModel,
+    without_passive_forces,
+)
 from plumbline.judging.rows import Row, RowContext, Verdict
+from plumbline.model.datatypes import Array
 from plumbline.truth.certified_model import CertifiedModelQuantities
-from plumbline.truth.model_comparison import TINY, Mismatch, joint_permutation, mismatches, permuted
+from plumbline.truth.model_comparison import (
+    TINY,
+    Mismatch,
+    certify_states,
+    joint_permutation,
+    mismatches,
+    model_states,
+    permuted,
+)
 
 MODEL_UNITS = {
     "joints": "1",
@@ -28,7 +48,20 @@ MODEL_UNITS = {
     "kinetic_energy": "J",
     "potential_energy": "J",
 }
+MODEL_FAMILY = "model file"  # of the rows, in place of a scenario's family
+SEED = 17
 MASS_ROUNDING = 2.0**-48  # relative, of the sum of the masses
+
+
+@dataclass(frozen=True, eq=False)
+class FileResult:
+    """One file's result."""
+
+    file: str  # as typed
+    model: NeutralModel
+    rows: tuple[Row, ...]
+    explanations: Mapping[str, Explanation]  # by importer
+    poses: Mapping[str, Array]  # of the bodies at the first state, for the drawing
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,3 +184,84 @@ def _quantity_row(context: RowContext, quantity: str, unit: str, worst: Mismatch
         value=worst.error, tolerance=worst.tolerance, ratio=worst.ratio,
         derivation="magnitudes of the terms × rounding (plumbline/truth/certified_model.py)",
     )  # fmt: skip
+
+
+def state_seed(shown: str) -> int:
+    """Derive the seed of a file's random states from its name, so that its folder does not matter.
+
+    Args:
+        shown: the path as typed.
+
+    Returns:
+        The seed.
+
+    """
+    return int.from_bytes(hashlib.sha256(Path(shown).name.encode()).digest()[:4], "big") + SEED
+
+
+def judge_file(
+    shown: str,
+    model: NeutralModel,
+    columns: Sequence[tuple[str, EngineInfo, Answer]],
+    state_count: int,
+    at: Mapping[str, float] | None,
+) -> FileResult:
+    """Judge every importer's answer about one file, and look for causes.
+
+    Args:
+        shown: the path as typed.
+        model: what the file says.
+        columns: name and description of each importer, and its answer.
+        state_count: number of random states.
+        at: the one state to compare at instead.
+
+    Returns:
+        The file's result.
+
+    """
+
+    def states(one: NeutralModel) -> tuple[CanonicalState, ...]:
+        return model_states(one, state_count, state_seed(shown), at)
+
+    truths = certify_states(model, states(model))
+    bare = without_passive_forces(model)
+    bare_truths = certify_states(bare, states(bare)) if bare is not model else truths
+    rows: list[Row] = []
+    explanations: dict[str, Explanation] = {}
+    for name, info, answer in columns:
+        context = RowContext(shown, MODEL_FAMILY, name, info.title, info.version)
+        if answer.reading is None and not answer.failure:
+            reason = f"{info.title} reads no such files"
+            rows.append(context.make_row("model", "-", "all", Verdict.INFORMATION, reason))
+            continue
+        if info.missing is not None:
+            verdict = Verdict.FAILED if info.has_failed else Verdict.NOT_INSTALLED
+            rows.append(context.make_row("model", "-", "all", verdict, info.missing))
+            continue
+        unsupported = declared_importer_attribute(split_version(name)[0], "unsupported") or {}
+        applies = "passive_force" not in unsupported
+        judged = (model, truths) if applies else (bare, bare_truths)
+        found = judge_answer(context, *judged, answer, unsupported)
+        if any(row.verdict == Verdict.DISAGREES for row in found):
+            explanations[name] = explanation = _explain(context, judged[0], answer, states, applies)
+            found = [_with_diagnosis(row, explanation) for row in found]
+        rows += found
+    poses = truths[0].quantities.poses if truths else {}
+    return FileResult(shown, model, tuple(rows), explanations, poses)
+
+
+def _explain(
+    context: RowContext, model: NeutralModel, answer: Answer, states: Any, applies_passive_forces: bool
+) -> Explanation:
+    assert answer.reading is not None and answer.reading.model is not None
+    reading = answer.reading.model
+    if not applies_passive_forces:
+        reading = without_passive_forces(reading)
+    return explain_importer(f"{context.title} {context.version}", model, reading, answer.quantities, states)
+
+
+def _with_diagnosis(row: Row, explanation: Explanation) -> Row:
+    if row.verdict != Verdict.DISAGREES:
+        return row
+    sentence = explanation.sentence or "no change of the model's parameters reproduces it"
+    return replace(row, diagnosis=sentence)

@@ -141,7 +141,8 @@ def mismatches(
         if not errors.size:
             return
         tolerances = np.broadcast_to(tolerance, errors.shape)
-        ratios = errors / np.maximum(tolerances, TINY)
+        with np.errstate(over="ignore"):  # an error where there are no terms at all
+            ratios = errors / np.maximum(tolerances, TINY)
         at = np.unravel_index(int(np.argmax(ratios)), ratios.shape)
         if quantity not in found or ratios[at] > found[quantity].ratio:
             where = " and ".join(dict.fromkeys(labels[int(i)] for i in at)) if labels else ""

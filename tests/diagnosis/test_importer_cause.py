@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 
 from plumbline.engines.importer_calls import evaluate_model_file, read_model_file
-from plumbline.execution.model_run import judge_file, state_seed
 from plumbline.importers.importer import ModelFile
 from plumbline.importers.model_file import prepare_file
 from plumbline.importers.xml_tree import parse_xml, write_xml
-from plumbline.judging.model_file import Answer
+from plumbline.judging.model_file import Answer, judge_file, state_seed
 from plumbline.judging.rows import Verdict
 from plumbline.truth.model_comparison import model_states
 from tests.helpers.importer_columns import MUJOCO
