@@ -393,8 +393,10 @@ def tree_tolerances(
     scale: dict[str, Array | float] = {
         "acceleration": result[:, 0],
         "angular_acceleration": np.max([t.alpha, moment / t.J, turning], 0),
-        "joint_reaction": np.maximum(t.F, t.m * t.g),
-        "joint_moment": np.max([t.moment, t.arm * t.F, t.J * t.alpha, t.element_size], 0),
+        "joint_reaction": np.max([t.F, t.m * t.g, t.m * t.a], 0),
+        "joint_moment": np.max(
+            [t.moment, t.arm * t.F, t.J * t.alpha, t.element_size, lever @ (t.m * t.g)], 0
+        ),
         **sums,
     }
     rods = np.zeros(t.n)
