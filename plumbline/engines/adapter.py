@@ -152,7 +152,7 @@ class Adapter(ABC):
         cannot do this; the message is the reason) pass through.
 
         """
-        self._check_mechanism(model, self.builds_trees)
+        self._check_mechanism(model, self.builds_elements)
         for state in states:
             check_state(model, state)
         answers = self._evaluate(model, states)
@@ -178,7 +178,7 @@ class Adapter(ABC):
             The trajectory at ``times``, not normalised and not projected.
 
         """
-        self._check_mechanism(model, self.builds_trees)
+        self._check_mechanism(model, False)
         check_state(model, state)
         method = self.integrator(integrator)
         if method.kind == "step":
@@ -204,7 +204,7 @@ class Adapter(ABC):
             EngineFailure: a sample, acceleration or multiplier is missing, not finite or of another shape.
 
         """
-        self._check_mechanism(model, self.builds_trees)
+        self._check_mechanism(model, False)
         check_state(model, state)
         times = np.asarray(step * np.arange(count + 1), float)
         run = self._step(model, state, times, self.integrator(integrator), step)
@@ -217,13 +217,14 @@ class Adapter(ABC):
                     raise EngineFailure(f"{label} is not finite")
         return run
 
-    def _check_mechanism(self, model: Model, has_trees: bool) -> None:
-        """Refuse what the adapter does not build."""
-        if not (has_trees or model.is_chain):
+    def _check_mechanism(self, model: Model, has_elements: bool) -> None:
+        """Refuse what the adapter does not build, and elements unless it evaluates states with them."""
+        if not (self.builds_trees or model.is_chain):
             raise Unsupported(f"the adapter of {self.title} covers chains of rods and balls from the origin")
-        if model.has_elements and not self.builds_elements:
+        if model.has_elements and not has_elements:
+            what = "motions with" if self.builds_elements else "joints with"
             raise Unsupported(
-                f"the adapter of {self.title} covers no rotors, springs, dampers and efforts of joints"
+                f"the adapter of {self.title} covers no {what} rotors, springs, dampers and efforts"
             )
 
 

@@ -9,8 +9,10 @@ from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import KINDS, Unsupported
 from plumbline.model.kinematics import complete_state, quaternion_product
 from plumbline.model.sampling import random_states
+from plumbline.truth import TruthUnavailable
 from plumbline.truth.certified import certify_state
 from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, state_rounding_bound
+from plumbline.truth.taylor import simulate_taylor
 from tests.helpers.random_trees import ELEMENTS, random_tree
 
 ENGINES = ["reference", "mujoco", "pinocchio", "pinocchio-aba", "pinocchio-maximal", "exudyn", "exudyn-tree"]
@@ -41,7 +43,7 @@ def test_states_of_random_trees_are_right(engine, mix):
 MOVING = ("ball", "hinge", "universal", "slide", "cylindrical")
 # what an engine cannot build: element, kind of joint, and words of its reason
 MISSING = {
-    "pinocchio-maximal": [(element, None, "covers no rotors, springs") for element in ELEMENTS],
+    "pinocchio-maximal": [(element, None, "no joints with rotors, springs") for element in ELEMENTS],
     "exudyn": [
         ("armature", None, "no rotor between two bodies"),
         *((element, "ball", "rotation vector") for element in ("damping", "stiffness")),
@@ -96,6 +98,17 @@ def test_a_spring_on_a_hinge_that_has_turned_round_twice(engine):
     truth, bound = certify_state(model, state).quantities, state_rounding_bound(model, state)
     error = np.linalg.norm(found.acceleration - truth.acceleration, axis=1)
     assert np.all(error <= bound.acceleration)
+
+
+@pytest.mark.parametrize("engine", ["reference", "mujoco", "pinocchio", "exudyn", "exudyn-tree"])
+def test_motions_with_elements_are_refused(engine):
+    adapter, model = load_adapter(engine), random_tree(np.random.default_rng(0), 2, elements=("damping",))
+    (state,) = random_states(model, 1, 0)
+    name, times = adapter.integrators[0].name, np.array([0.0, 0.125])
+    with pytest.raises(Unsupported, match="no motions with rotors, springs"):
+        adapter.simulate(model, state, times, name, 0.125 if adapter.integrators[0].kind == "step" else 1e-9)
+    with pytest.raises(TruthUnavailable, match="no rotors, springs"):
+        simulate_taylor(model, state, times, "quad")
 
 
 @pytest.mark.parametrize("engine", ["reference-printed"])

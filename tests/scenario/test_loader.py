@@ -80,14 +80,30 @@ def load(name):
     return scenarios.load_scenario(scenarios.find_scenario_file(name))
 
 
+TREE_OF_SEVEN = ("ball", "hinge", "universal", "weld", "cylindrical", "rod", "slide", "free")
 TREE_JOINTS = {
+    "acrobot": ("hinge", "hinge"),
     "cart-pole": ("slide", "hinge"),
+    "damped-hinge": ("hinge",),
     "double-hinge-skew": ("hinge", "hinge"),
     "furuta": ("hinge", "hinge"),
+    "furuta-motor": ("hinge", "hinge"),
     "hinge-pendulum": ("hinge",),
+    "light-cart-pole": ("slide", "hinge"),
     "slider-on-arm": ("hinge", "slide"),
+    "spring-pendulum": ("free",),
+    "sprung-ball": ("ball", "ball"),
+    "sprung-cylinder": ("cylindrical",),
+    "sprung-hinge": ("hinge",),
+    "sprung-slide": ("slide",),
+    "sprung-slider-on-arm": ("hinge", "slide"),
+    "sprung-universal": ("universal",),
     "universal-pendulum": ("universal",),
-    "tree-of-seven": ("ball", "hinge", "universal", "weld", "cylindrical", "rod", "slide", "free"),
+    "free-body-with-rotors": ("free", "hinge", "hinge", "hinge"),
+    "open-governor": ("hinge", "hinge", "hinge"),
+    "robot-arm": ("hinge",) * 6,
+    "tree-of-seven": TREE_OF_SEVEN,
+    "tree-of-seven-sprung": TREE_OF_SEVEN,
 }
 
 
