@@ -24,7 +24,7 @@ run: .venv/truth.tried  ## the main job: the whole catalogue on all engines, tab
 	$(PYTHON) -m plumbline run
 
 test: lint reports/node_modules/.tried  ## style, types and the fast tests
-	$(PYTHON) -m pytest -n 2
+	$(PYTHON) -m pytest -n 3
 
 lint: .venv/test.done  ## style and types only
 	$(PYTHON) -m ruff check .

@@ -1,7 +1,8 @@
 """Rules for every test: which process runs it, and which skips continuous integration allows.
 
-`pytest -n 2` keeps the tests of a file in one process, so that what they share is computed once; the
-scenarios of the matrix are distributed one by one.  (pytest-xdist's loadgroup has no effect with pytest 9.2:
+`pytest -n 3` keeps the tests of a file in one process, so that what they share is computed once; the
+scenarios of the matrix are distributed one by one.  Three processes keep two cores busy while a test waits
+for a time limit, a cluster or a browser.  (pytest-xdist's loadgroup has no effect with pytest 9.2:
 pytest-dev/pytest-xdist#1386.)
 """
 
@@ -19,16 +20,20 @@ ALLOWED_SKIPS = {  # pattern of the skip's reason: why continuous integration ca
 }
 
 LONGEST_FIRST = (  # begun last, one of these would keep one process busy while the others have no work
-    "matrix", "planted_defects", "report_browser", "resume", "dask_cluster", "isolation", "adapter_contract",
-    "exit_codes", "docs", "trajectory_truth", "nightly", "command_line", "step", "sensitivity", "metamorphic",
-    "certified", "storage_faults", "mujoco_engine", "honest_engines", "identity", "scripts", "rounding_bound",
-    "report", "reference_pages", "notes_drift", "selftest",
+    "planted_defects", "report_browser", "integrator_search", "exit_codes", "resume", "dask_cluster",
+    "isolation", "docs", "workers", "nightly", "command_line", "enclosure", "coverage", "step",
+    "honest_engines", "environments", "storage_faults", "damaged_files", "report", "adapter_contract",
+    "sweep", "certified", "scripts", "notes_drift", "mujoco_engine", "metamorphic", "trajectory_truth",
+    "planted_branches", "output_folder", "sensitivity", "rounding_bound", "diagnose", "reference_pages",
+    "selftest",
 )  # fmt: skip
+LAST = ("matrix",)  # scenario by scenario it fills what is left
 
 
 def pytest_collection_modifyitems(items):
     rank = {f"test_{name}.py": place for place, name in enumerate(LONGEST_FIRST)}
-    items.sort(key=lambda item: rank.get(item.path.name, len(rank)))
+    rank |= {f"test_{name}.py": len(rank) + 1 for name in LAST}
+    items.sort(key=lambda item: rank.get(item.path.name, len(LONGEST_FIRST)))
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -128,7 +128,11 @@ def relative_rates(c: DefectCase) -> Array:
         ω′ − A₂ᵀA₁ω′₁ (B, N, 3), in each body's own frame; of the first body its absolute one.
 
     """
-    return np.asarray(c.omega - _carried_rates(c, rotation_matrix(c.p)))
+    return _relative_rates(c, rotation_matrix(c.p))
+
+
+def _relative_rates(c: DefectCase, a: Array) -> Array:
+    return np.asarray(c.omega - _carried_rates(c, a))
 
 
 def _carried_rates(c: DefectCase, a: Array) -> Array:
@@ -148,7 +152,10 @@ def centre_positions_and_velocities(c: DefectCase) -> tuple[Array, Array]:
         r [m] and ṙ [m/s], (B, N, 3) each, world frame.
 
     """
-    a = rotation_matrix(c.p)
+    return _centre_positions_and_velocities(c, rotation_matrix(c.p))
+
+
+def _centre_positions_and_velocities(c: DefectCase, a: Array) -> tuple[Array, Array]:
     near, far = rotate_vectors(a, c.proximal), rotate_vectors(a, c.distal)
     near_v, far_v = (rotate_vectors(a, cross(c.omega, s)) for s in (c.proximal, c.distal))
     rod, rod_v = c.length[..., None] * c.u, c.length[..., None] * c.udot
@@ -170,8 +177,8 @@ def evaluate_case(c: DefectCase) -> dict[str, Array]:
         LinAlgError: a mechanism is singular.
 
     """
-    r, v = centre_positions_and_velocities(c)
     a = rotation_matrix(c.p)
+    r, v = _centre_positions_and_velocities(c, a)
     spin = rotate_vectors(c.inertia, c.omega)
     acceleration, angular, reaction = _solve_newton_euler(c, a, v, spin)
     momentum = np.sum(cross(r, c.mass[..., None] * v) + rotate_vectors(a, spin), axis=1)
@@ -183,7 +190,7 @@ def evaluate_case(c: DefectCase) -> dict[str, Array]:
         * np.sum(
             c.mass * np.sum(v * v, -1)
             + np.sum(c.omega * spin, -1)
-            + c.armature * np.sum(relative_rates(c) ** 2, -1),
+            + c.armature * np.sum(_relative_rates(c, a) ** 2, -1),
             axis=1,
         ),
         "potential_energy": -np.sum(c.mass * np.einsum("bki,bi->bk", r, c.gravity), axis=1),

@@ -204,7 +204,7 @@ def remaining_ratio(difference: ObservedDifference, model_answers: Answers, fit:
     altered = fit.cause.alter(difference.case, fit.fitted_amount)
     with np.errstate(all="ignore"):  # the altered numbers may be no mechanism: a negative mass, for example
         try:
-            predicted = _predict_answers(difference, model_answers, altered)
+            predicted = _predict_answers(difference, model_answers, evaluate_case(altered))
             ratio = difference.error_ratio(predicted)
             if ratio <= MAX_EXPLAINED_RATIO:
                 return ratio
@@ -237,8 +237,8 @@ def derivatives_by_amount(difference: ObservedDifference, at: Sequence[tuple[Cau
         (causes, K) in bounds per unit of each amount.
 
     """
-    size, columns = len(difference.case.p), []
-    batch = max(1, 4096 // (size * difference.case.n**2))
+    columns: list[Array] = []
+    batch = max(1, 4096 // (len(difference.case.p) * difference.case.n**2))
     for start in range(0, len(at), batch):
         causes = at[start : start + batch]
         steps = [DERIVATIVE_STEP * (cause.scale or 1.0) for cause, _ in causes]
@@ -247,12 +247,23 @@ def derivatives_by_amount(difference: ObservedDifference, at: Sequence[tuple[Cau
             for (cause, x), h in zip(causes, steps, strict=True)
             for sign in (1, -1)
         ]
-        answers = evaluate_case(concatenate_cases(sides))
-        for i, h in enumerate(steps):
-            up, down = (slice((2 * i + j) * size, (2 * i + j + 1) * size) for j in (0, 1))
-            slope = {q: (answers[q][up] - answers[q][down]) / (2 * h) for q in difference.reported}
-            columns.append(difference.weighted_vector(slope))
+        answers = _evaluate_together(sides)
+        columns += [
+            _slope(difference, up, down, h)
+            for up, down, h in zip(answers[::2], answers[1::2], steps, strict=True)
+        ]
     return np.array(columns)
+
+
+def _slope(difference: ObservedDifference, up: Answers, down: Answers, h: float) -> Array:
+    """Central difference over ± h, in bounds per unit."""
+    return difference.weighted_vector({q: (up[q] - down[q]) / (2 * h) for q in difference.reported})
+
+
+def _evaluate_together(cases: Sequence[DefectCase]) -> list[Answers]:
+    """Answers of batches of equal size, evaluated as one."""
+    size, answers = len(cases[0].p), evaluate_case(concatenate_cases(cases))
+    return [{q: x[i * size : (i + 1) * size] for q, x in answers.items()} for i in range(len(cases))]
 
 
 def fit_causes(
@@ -297,17 +308,21 @@ def fit_cause(
 
     """
     amount, resolution, best = cause.nominal, np.inf, np.inf
+    h = DERIVATIVE_STEP * (cause.scale or 1.0)
     for _ in range(MAX_ITERATIONS):
+        moved = amount != cause.nominal
         try:
-            predicted = _predict_answers(difference, model_answers, cause.alter(difference.case, amount))
-            residual = difference.residual(predicted)
-            if not np.all(np.isfinite(residual)) or float(residual @ residual) > best * 4:
-                return None
-            best = min(best, float(residual @ residual))
-            if amount != cause.nominal:
-                (slope,) = derivatives_by_amount(difference, [(cause, amount)])
+            here, *sides = _evaluate_together(
+                [cause.alter(difference.case, amount + shift) for shift in (0.0, *((h, -h) if moved else ()))]
+            )
         except np.linalg.LinAlgError:
             return None
+        residual = difference.residual(_predict_answers(difference, model_answers, here))
+        if not np.all(np.isfinite(residual)) or float(residual @ residual) > best * 4:
+            return None
+        best = min(best, float(residual @ residual))
+        if moved:
+            slope = _slope(difference, sides[0], sides[1], h)
         if not np.any(slope):  # the fit has reached amounts whose changes have no effect
             return None
         step = float(slope @ residual / (slope @ slope))
@@ -319,7 +334,6 @@ def fit_cause(
     return FittedCause(cause, amount, resolution) if significant else None
 
 
-def _predict_answers(difference: ObservedDifference, model_answers: Answers, altered: DefectCase) -> Answers:
+def _predict_answers(difference: ObservedDifference, model_answers: Answers, answers: Answers) -> Answers:
     """The truth, changed as the fast model changes, so that the model's own rounding cancels."""
-    answers = evaluate_case(altered)
     return {q: difference.expected[q] + (answers[q] - model_answers[q]) for q in difference.reported}

@@ -25,14 +25,15 @@ def rotation_matrix(p: Array) -> Array:
 
     """
     p = np.asarray(p, dtype=np.result_type(p, float))
-    w, x, y, z = np.moveaxis(p, -1, 0)
-    s = w * w + x * x + y * y + z * z
-    rows = [
-        [s - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), s - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), s - 2 * (x * x + y * y)],
-    ]
-    return np.asarray(np.stack([np.stack(row, -1) for row in rows], -2) / s[..., None, None])
+    w, x, y, z = p[..., 0], p[..., 1], p[..., 2], p[..., 3]
+    ww, xx, yy, zz = w * w, x * x, y * y, z * z
+    wx, wy, wz, xy, xz, yz = w * x, w * y, w * z, x * y, x * z, y * z
+    s = ww + xx + yy + zz
+    A = np.empty((*p.shape[:-1], 3, 3), p.dtype)
+    A[..., 0, 0], A[..., 0, 1], A[..., 0, 2] = s - 2 * (yy + zz), 2 * (xy - wz), 2 * (xz + wy)
+    A[..., 1, 0], A[..., 1, 1], A[..., 1, 2] = 2 * (xy + wz), s - 2 * (xx + zz), 2 * (yz - wx)
+    A[..., 2, 0], A[..., 2, 1], A[..., 2, 2] = 2 * (xz - wy), 2 * (yz + wx), s - 2 * (xx + yy)
+    return A / s[..., None, None]
 
 
 def rotate_vectors(A: Array, v: Array) -> Array:

@@ -116,6 +116,9 @@ class Comparisons:
 # -- joint coordinates -------------------------------------------------------------------------------
 
 
+_EndBounds = tuple[tuple[RoundingBound, RoundingBound], dict[str, Array]]
+
+
 class FormulaSteps:
     """The declared steps from several states, and from states nearby that show how differences grow."""
 
@@ -139,6 +142,7 @@ class FormulaSteps:
         self.bounds = {index: state_rounding_bound(model, states[index]) for index, *_ in starts}
         disturbed = [_disturbed(model, states[index], self.bounds[index]) for index, *_ in starts]
         self.counts = tuple(counts) or step_counts(method)
+        self._end_bounds: dict[tuple[int, int], _EndBounds] = {}
         count = max(self.counts)
         both = joint_space_steps(model, self.starts + disturbed, sizes + sizes, method, count, axes + axes)
         self.true = [[_pick(links, i) for links in both] for i in range(len(starts))]
@@ -168,13 +172,11 @@ class FormulaSteps:
             (N,) each.
 
         """
-        for i, (index, h) in enumerate(self.places):
+        for i, (_, h) in enumerate(self.places):
             for count in self.counts:
                 if not self.growth[i, count] < MAX_GROWTH:
                     continue
-                end = _rounded(self.true[i][count])
-                ends = self.bounds[index], state_rounding_bound(self.model, end)
-                bound = self.step_bound((self.starts[i], end), ends, h, count)
+                ends, bound = self._bounds_after(i, count)
                 grown = {name: count * self.growth[i, count] * limit for name, limit in bound.items()}
                 yield i, count, grown, _effects(ends, h, count)
 
@@ -213,14 +215,20 @@ class FormulaSteps:
         sizes, axes = [h for _, h in self.places], [run.angle_axes for run in runs]
         motions = joint_space_steps(self.model, self.starts, sizes, method, RESIDUAL_STEPS, axes)
         found = []
-        for i, ((index, h), run) in enumerate(zip(self.places, runs, strict=True)):
+        for i, run in enumerate(runs):
             count = min(RESIDUAL_STEPS, len(run.trajectory.t) - 1)
-            end = _rounded(self.true[i][count])
-            ends = self.bounds[index], state_rounding_bound(self.model, end)
-            bound = self.step_bound((self.starts[i], end), ends, h, count)
+            _, bound = self._bounds_after(i, count)
             for name, difference in _differences(_pick(motions[count], i), run, count).items():
                 found.append((difference / (count * bound[name][:, None])).ravel())
         return np.concatenate(found)
+
+    def _bounds_after(self, i: int, count: int) -> _EndBounds:
+        """Rounding bounds at both ends of a run's first steps, and those of the steps; computed once."""
+        if (i, count) not in self._end_bounds:
+            (index, h), end = self.places[i], _rounded(self.true[i][count])
+            ends = self.bounds[index], state_rounding_bound(self.model, end)
+            self._end_bounds[i, count] = ends, self.step_bound((self.starts[i], end), ends, h, count)
+        return self._end_bounds[i, count]
 
     def step_bound(
         self, ends: tuple[State, ...], bounds: tuple[RoundingBound, ...], h: float, count: int
