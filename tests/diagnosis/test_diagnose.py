@@ -219,7 +219,8 @@ def test_a_prediction_may_be_off_by_the_bounds_of_both_pendulums(off, explained)
     cause = the_cause(observed, "all inertias were doubled")
     remaining = remaining_ratio(observed, evaluate_case(observed.case), FittedCause(cause, 0.75, 0.0))
     assert (remaining <= MAX_EXPLAINED_RATIO) is explained
-    assert remaining == pytest.approx(off if off < 1 else off / 2, rel=0.5)
+    # below 1 it is in bounds of the first pendulum, which differ from those of the other by up to 9 %
+    assert remaining == pytest.approx(off if off < 1 else off / 2, rel=0.09 / 2)
 
 
 @pytest.mark.parametrize(("off", "remaining"), [(0.9, 0.9), (1.9, np.inf), (2.1, 1.05)])

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from plumbline.judging.convergence import (
+    ORDER_MARGIN,
     extrapolated_order,
     max_norm,
     observed_order,
@@ -36,7 +37,7 @@ def test_the_order_is_seen_and_the_limit_is_reached(order, powers):
     limit, ys = samples_with_error(order, powers)
     seen = observed_order(ys, 1e-16, order)
     assert seen.is_asymptotic
-    assert seen.value == pytest.approx(order, abs=0.1)
+    assert seen.value == pytest.approx(order, abs=ORDER_MARGIN)
     found = romberg(ys, powers)
     error = np.max(np.linalg.norm(found.y - limit, axis=-1))
     assert error <= found.uncertainty[-1] + 1e-14
@@ -47,7 +48,7 @@ def test_order_two_under_an_order_four_name_is_seen_as_two():
     _, ys = samples_with_error(2, (2, 3, 4))
     seen = observed_order(ys, 1e-16, 4)
     assert seen.is_asymptotic
-    assert seen.value == pytest.approx(2, abs=0.1)
+    assert seen.value == pytest.approx(2, abs=ORDER_MARGIN)
 
 
 @pytest.mark.parametrize(
@@ -96,7 +97,7 @@ def test_a_run_that_blew_up_is_a_point_of_the_study():
     limit, ys = samples_with_error(4, (4, 5, 6))
     ys[0] = np.full_like(limit, np.nan)
     seen = observed_order(ys, 1e-16, 4)
-    assert seen.value == pytest.approx(4, abs=0.1)
+    assert seen.value == pytest.approx(4, abs=ORDER_MARGIN)
     assert np.isnan(seen.orders).tolist() == [True, False, False, False]
     assert seen.differences[0] == np.inf
     assert np.max(np.abs(romberg(ys, (4, 5, 6)).y - limit)) < 1e-12

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import base64
 import gzip
 import hashlib
@@ -502,3 +503,30 @@ def test_vendored_uplot_comes_with_its_licence(text):
     assert not re.search(
         r"\bfetch\(|XMLHttpRequest|WebSocket|EventSource|sendBeacon", html_report.bundle_script()
     )
+
+
+def further_numbers():
+    """Keys of ``extra`` that the judging code writes, by file."""
+    found = set()
+    for path in sorted((REPORTS.parent / "plumbline" / "judging").glob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            is_argument = isinstance(node, ast.keyword) and node.arg == "extra"
+            targets = getattr(node, "targets", None) or [getattr(node, "target", None)]
+            is_variable = isinstance(node, ast.Assign | ast.AugAssign) and any(
+                isinstance(target, ast.Name) and target.id == "extra" for target in targets
+            )
+            if is_argument or is_variable:
+                dicts = [x for x in ast.walk(node.value) if isinstance(x, ast.Dict)]
+                keys = [key.value for x in dicts for key in x.keys if isinstance(key, ast.Constant)]
+                found |= {(path.name, key) for key in keys}
+    return found
+
+
+def test_every_further_number_of_a_row_has_a_label():
+    """Apart from those by time, "by 10 s", which are their own label."""
+    script = (REPORTS / "assets" / "detail.js").read_text(encoding="utf-8")
+    table = re.search(r"^const EXTRA = \{(.*?)^\};", script, re.MULTILINE | re.DOTALL)[1]
+    labels = set(re.findall(r"(\w+): \[\"", table))
+    written = further_numbers()
+    assert {file for file, _ in written} >= {"state.py", "step.py", "trajectory.py", "metamorphic.py"}
+    assert not {(file, key) for file, key in written if key not in labels}

@@ -137,7 +137,8 @@ def test_motion_truth_holds_growth_length_and_detectable_effects():
     )
     assert np.all(np.diff(found.growth) >= 0) and found.growth[0] >= 1
     assert found.growth == pytest.approx(
-        np.maximum.accumulate(perturbation_growth(model, at, TIMES)), rel=0.05
+        np.maximum.accumulate(perturbation_growth(model, at, TIMES)),
+        rel=1e-4,  # in other company, so by other steps
     )
     wrong = [pendulums.reference_trajectory(m, s, TIMES) for m, s in perturbed_models(model, at)]
     right = pendulums.reference_trajectory(model, at, TIMES)
@@ -145,7 +146,7 @@ def test_motion_truth_holds_growth_length_and_detectable_effects():
         model, np.array([x.r for x in (right, *wrong)]), np.array([x.p for x in (right, *wrong)])
     )
     for mine, theirs in zip((found.detectable_position, found.detectable_attitude), shown, strict=True):
-        assert mine[1:] == pytest.approx(theirs[1:], rel=1e-3) and mine[-1] > 1e-7
+        assert mine[1:] == pytest.approx(theirs[1:], rel=1e-5) and mine[-1] > 1e-7
 
 
 @pytest.mark.parametrize(
@@ -202,4 +203,4 @@ def test_a_closed_form_replaces_the_motion():
     run = pendulums.reference_trajectory(model, at, TIMES)
     found = motion_truth(model, at, TIMES, (run.r + 1e-9, run.p, "a book"))
     assert np.array_equal(found.trajectory.r, run.r + 1e-9) and "closed form: a book" in found.method
-    assert found.position_uncertainty[-1] == pytest.approx(1e-9 * np.sqrt(3), rel=1e-3, abs=0)
+    assert found.position_uncertainty[-1] == pytest.approx(1e-9 * np.sqrt(3), rel=1e-6, abs=0)

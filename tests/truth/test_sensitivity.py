@@ -66,7 +66,8 @@ def test_growth_is_exponential_as_far_as_it_goes():
     found = perturbation_growth(model, state, times)
     slope = np.diff(np.log(found[20:])) / np.diff(times[20:])
     assert found[-1] > 1e9
-    assert slope == pytest.approx(np.full(100, own), rel=0.02)
+    # from t = 4/λ on, what falls as exp(−λ t) is exp(−8) = 3.4e-4 of what grows, its slope twice that
+    assert slope == pytest.approx(np.full(100, own), rel=1e-3)
 
 
 def test_growth_may_end():
@@ -127,11 +128,16 @@ def test_other_models_in_the_batch_move_as_they_do_alone():
     leaning = perturbed_states(heavier, state, perturbation_size=1e-3, count=1)[0]
     times = np.linspace(0, 16 / own, 41)
     found, r, p = perturbation_growth_and_runs(model, state, times, [(heavier, leaning)])
-    assert found == pytest.approx(perturbation_growth(model, state, times), rel=1e-3)
+    assert found == pytest.approx(perturbation_growth(model, state, times), rel=1e-5)
     for run, (m, s) in enumerate([(model, state), (heavier, leaning)]):
         alone = simulate_notes_form(m, s, times, 1e-12)
         assert np.max(position_error(r[run], alone.r)) < 1e-7
         assert np.max(np.abs(p[run] - alone.p)) < 1e-6
+
+
+def second_order(growth):
+    """What the square of the largest perturbation contributes, with a factor for how sharply motions bend."""
+    return 10 * PERTURBATION_SIZE * np.max(growth)
 
 
 @pytest.mark.parametrize("rods", [[0, 0], [1], [0, 1]], ids=str)
@@ -149,7 +155,7 @@ def test_growth_is_the_largest_distance_of_a_neighbour(rods):
     ]
     expected = np.maximum(np.max(gone, axis=0), 1.0)
     assert 2 < np.max(expected) < RENORMALISATION_GROWTH
-    assert perturbation_growth(model, state, times) == pytest.approx(expected, rel=0.01)
+    assert perturbation_growth(model, state, times) == pytest.approx(expected, rel=second_order(expected))
 
 
 def test_position_distances_are_relative_to_the_distance_from_the_pivot():
@@ -165,7 +171,7 @@ def test_position_distances_are_relative_to_the_distance_from_the_pivot():
     turned = [attitude_error(x.p, base.p) / PERTURBATION_SIZE for x in others]
     assert np.max(diverged) > 5 * np.max(turned)
     expected = np.maximum(np.max([diverged, turned], axis=(0, 1)), 1.0)
-    assert perturbation_growth(model, state, times) == pytest.approx(expected, rel=0.01)
+    assert perturbation_growth(model, state, times) == pytest.approx(expected, rel=second_order(expected))
 
 
 def test_interpolation_between_distant_states():
