@@ -24,13 +24,12 @@ from plumbline.model.datatypes import (
     State,
     StateQuantities,
     Trajectory,
-    Unsupported,
 )
 from reference_impl.collocation import integrate_collocation
 from reference_impl.direct import DirectSystem, Solution
 from reference_impl.errors import SingularSystem
 from reference_impl.integrate import integrate_dop853
-from reference_impl.structured import StructuredSystem
+from reference_impl.tree_elimination import eliminated_system
 
 
 class Reference(MetamorphicHooks):
@@ -68,11 +67,9 @@ class Reference(MetamorphicHooks):
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         system = DirectSystem(model)
         solve: Callable[..., Solution] = system.solve
-        if self.option == "O(N) form" and not model.is_chain:
-            raise Unsupported("the reference's O(N) form covers chains of rods and balls")
         if self.option:
             dense = self.option == "dense factors"
-            solve = system.solve_with_dense_factors if dense else StructuredSystem([model]).solve
+            solve = system.solve_with_dense_factors if dense else eliminated_system([model]).solve
         try:
             return [self._quantities(system, state, solve) for state in states]
         except SingularSystem as error:
@@ -109,7 +106,7 @@ class Reference(MetamorphicHooks):
     def _simulate_round_trip(
         self, model: Model, state: State, end: float, integrator: Integrator, resolution: float
     ) -> Trajectory:
-        system, times = StructuredSystem([model]), np.array([0.0, end, 2 * end])
+        system, times = eliminated_system([model]), np.array([0.0, end, 2 * end])
         try:
             there = integrate_collocation(system, *notes_state(state), times[:2], resolution)
             turned = there.r[-1], there.p[-1], -there.v[-1], -there.pdot[-1]

@@ -269,14 +269,24 @@ class DirectSystem:
             joint=self.joint,
             tension=tension,
             joint_reaction=-reaction,
-            joint_moment=_joint_moment(self.chain, p, -reaction, -of_p),
+            joint_moment=joint_moments(self.chain, p, -reaction, -of_p),
         )
 
 
-def _joint_moment(chain: Mechanism, p: Array, force: Array, of_p: Array) -> Array:
-    """Moments (N, 3) about the near points of wrenches given by their force and generalised force on p.
+def joint_moments(chain: Mechanism, p: Array, force: Array, of_p: Array) -> Array:
+    """Compute the moments about the near points of wrenches given by force and generalised force on p.
 
     A ½ L Q_p is the moment about the centre of mass; L p = 0 takes the normalisation's share out (E2).
+
+    Args:
+        chain: the mechanism.
+        p: Euler parameters (N, 4).
+        force: (N, 3) [N], world frame.
+        of_p: Q_p (N, 4) [N m].
+
+    Returns:
+        (N, 3) [N m], world frame.
+
     """
     turn = A(p)
     near = (turn @ chain.point[:, 1, :, None])[..., 0]

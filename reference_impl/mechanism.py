@@ -239,6 +239,11 @@ class Mechanism:
         return bool(np.any(self.drag_force) or np.any(self.drag_moment))
 
     @property
+    def is_dissipative(self) -> bool:
+        """Whether drag or a damper takes energy out."""
+        return self.has_drag or bool(np.any(self.damping) or np.any(self.spring_damping))
+
+    @property
     def has_loads(self) -> bool:
         """Whether any constant force or moment is applied."""
         return bool(np.any(self.force) or np.any(self.moment))

@@ -10,6 +10,8 @@ leave
 
     A_far += f_kᵀ S_k⁻¹ f_k,   b_far −= f_kᵀ S_k⁻¹ (n_k A_k⁻¹ b_k − γ_k).
 
+A rotor (L4) is one row more of its joint, with 1/a on the diagonal of S_k; see `elements`.
+
 Joints of the same depth and number of rows are eliminated together, those of many trees at once.
 """
 
@@ -22,9 +24,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from reference_impl.direct import Solution, joint_moments
+from reference_impl.elements import Elements
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import L, angular_velocity, dot
-from reference_impl.joints import ConstraintRows, constraint_rows, joint_of_rows
+from reference_impl.joints import constraint_rows, joint_of_rows
 from reference_impl.mechanism import Array, Mechanism
 from reference_impl.structured import StructuredSystem, component_first
 
@@ -38,18 +42,32 @@ class _Level:
     row: NDArray[np.intp]  # (g, c)
 
 
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """The rows of all joints, then of all rotors; forces of elements."""
+
+    C: Array  # (c,)
+    rate: Array  # (c,) Ċ
+    r_near: Array  # (rows, 3)
+    p_near: Array  # (rows, 4)
+    p_far: Array  # (rows, 4)
+    gamma: Array  # (rows,)
+    element_force: tuple[Array, Array] | None = None  # (M, 3) and of p (M, 4), of elements but rotors
+    of_joints: tuple[Array, Array] | None = None  # (e, 3), (e, 4): of joint coordinates on near bodies
+
+
 class TreeSystem:
     """Trees side by side; M bodies in all.  q = (r; p) and v = (ṙ; ṗ), (7, M), as in `StructuredSystem`."""
 
-    def __init__(self, chains: Sequence[Mechanism]) -> None:
+    def __init__(self, chains: Sequence[Mechanism], x: Array | None = None) -> None:
         """Join the mechanisms.
 
         Args:
             chains: the mechanisms.
+            x: joint coordinates (M, 2) near which the angles of springs are taken [rad]; absent: principal
+                values.
 
         """
-        if any(chain.has_elements for chain in chains):
-            raise ValueError("the O(bodies) form has no passive elements yet")
         self.chains = tuple(chains)
         self.first_body = np.cumsum([0, *(chain.n for chain in chains)])
         self.body_count = int(self.first_body[-1])
@@ -59,13 +77,20 @@ class TreeSystem:
         depth: NDArray[np.intp] = np.zeros(self.body_count, np.intp)
         for k in np.flatnonzero(far >= 0):
             depth[k] = depth[far[k]] + 1
-        joint = joint_of_rows(self.forest)
+        self.x, self.elements = x, Elements(self.forest) if self.forest.has_elements else None
+        joint, self.compliance = joint_of_rows(self.forest), np.zeros(0)
+        if self.elements:  # the rows of rotors follow those of all constraints
+            rotors = self.elements.rotors
+            self.compliance = 1 / self.elements.armature[rotors]
+            joint = np.concatenate([joint, self.elements.joint[rotors]])
+        self.compliance = np.concatenate([np.zeros(len(joint) - len(self.compliance)), self.compliance])
+        self.joint, self.far = joint, far[joint]
         count = np.bincount(joint, minlength=self.body_count)
-        first = np.cumsum(count) - count
+        first, in_order = np.cumsum(count) - count, np.argsort(joint, kind="stable")
         self.levels = []
         for level, rows in sorted(set(zip(depth.tolist(), count.tolist(), strict=True))):
             at = np.flatnonzero((depth == level) & (count == rows))
-            self.levels.append(_Level(at, far[at], first[at, None] + np.arange(rows)))
+            self.levels.append(_Level(at, far[at], in_order[first[at, None] + np.arange(rows)]))
         self.inertia = np.zeros((self.body_count, 6, 6))
         self.inertia[:, :3, :3] = self.forest.mass[:, None, None] * np.eye(3)
         self.inertia[:, 3:, 3:] = self.forest.inertia
@@ -80,7 +105,9 @@ class TreeSystem:
             A system of ``count`` times as many trees.
 
         """
-        return self if count == 1 else TreeSystem(self.chains * count)
+        if count == 1:
+            return self
+        return TreeSystem(self.chains * count, None if self.x is None else np.tile(self.x, (count, 1)))
 
     def acceleration(self, q: Array, v: Array, baumgarte: float = 0.0) -> Array:
         """Return the accelerations, on or off the constraints.
@@ -97,12 +124,16 @@ class TreeSystem:
             SingularSystem: S is singular.
 
         """
-        (p, rdot, pdot), forest, a = (q[3:].T, v[:3].T, v[3:].T), self.forest, baumgarte
+        return self._solve_motion(q, v, baumgarte)[0]
+
+    def _solve_motion(self, q: Array, v: Array, a: float) -> tuple[Array, Array, _Rows]:
+        """(r̈; p̈) (7, M), the multipliers of all rows, and the rows."""
+        (p, rdot, pdot), forest = (q[3:].T, v[:3].T, v[3:].T), self.forest
         with np.errstate(all="ignore"):  # what is not finite raises SingularSystem
             rows = self._rows(q, v)
             gamma, norm, sigma, stretch = rows.gamma, dot(p, p), dot(p, pdot), dot(pdot, pdot)
             if a:
-                gamma = gamma - 2 * a * rows.constraint_rate(rdot, pdot) - a * a * rows.C
+                gamma[: len(rows.C)] -= 2 * a * rows.rate + a * a * rows.C
                 stretch = stretch + 2 * a * sigma + 0.5 * a * a * (norm - 1)
             omega = angular_velocity(p, pdot)
             momentum = np.matvec(forest.inertia, omega)
@@ -110,12 +141,54 @@ class TreeSystem:
             moment = forest.moment - forest.drag_moment[:, None] * omega
             moment = moment - (np.cross(omega, momentum) + 2 * sigma[:, None] * momentum) / norm[:, None]
             along = p * (stretch / norm)[:, None]  # −p̈ along p
-            gamma = gamma + dot(rows.p_near, along[rows.joint]) + dot(rows.p_far, along[rows.far])
-            linear, turn = self._eliminate(rows, p, np.concatenate([force, moment], 1), gamma)
+            gamma = gamma + dot(rows.p_near, along[self.joint]) + dot(rows.p_far, along[self.far])
+            if rows.element_force is not None:
+                force, of_p = force + rows.element_force[0], rows.element_force[1]
+                moment = moment + np.matvec(L(p), of_p) / (2 * norm)[:, None]
+            linear, turn, multiplier = self._eliminate(rows, p, np.concatenate([force, moment], 1), gamma)
         found = component_first(linear, turn - along)
         if not np.isfinite(found.sum()):
             raise SingularSystem("the accelerations are not finite: S is singular, or the state is no number")
-        return found
+        return found, multiplier, rows
+
+    def solve(self, r: Array, p: Array, v: Array, pdot: Array, *, x: Array | None = None) -> Solution:
+        """Solve (N5) for every tree.
+
+        Args:
+            r: positions (M, 3) [m], world frame.
+            p: Euler parameters (M, 4).
+            v: velocities ṙ (M, 3) [m/s], world frame.
+            pdot: rates ṗ (M, 4) [1/s].
+            x: joint coordinates (M, 2) in place of those of the constructor.
+
+        Returns:
+            r̈, p̈, λ and the wrenches at the joints, those of elements included; λ_E is not computed (NaN).
+
+        Raises:
+            SingularSystem: S is singular.
+
+        """
+        self.x = self.x if x is None else x
+        motion, multiplier, rows = self._solve_motion(component_first(r, p), component_first(v, pdot), 0.0)
+        forest, c = self.forest, len(rows.C)
+        pull, of_p = np.zeros((self.body_count, 3)), np.zeros((self.body_count, 4))
+        np.subtract.at(pull, self.joint, multiplier[:, None] * rows.r_near)
+        np.subtract.at(of_p, self.joint, multiplier[:, None] * rows.p_near)
+        if rows.of_joints is not None and self.elements:
+            np.add.at(pull, self.elements.joint, rows.of_joints[0])
+            np.add.at(of_p, self.elements.joint, rows.of_joints[1])
+        tension, rod = np.full(self.body_count, np.nan), forest.rods
+        tension[rod] = 2 * forest.length[rod] * multiplier[:c][rod[self.joint[:c]]]
+        return Solution(
+            acceleration=motion[:3].T,
+            pddot=motion[3:].T,
+            multiplier=multiplier[:c],
+            norm_multiplier=np.full(self.body_count, np.nan),
+            joint=self.joint[:c],
+            tension=tension,
+            joint_reaction=pull,
+            joint_moment=joint_moments(forest, p, pull, of_p),
+        )
 
     def project(self, q: Array, v: Array) -> tuple[Array, Array]:
         """Project onto C = 0, pᵀp = 1, Ċ = 0, pᵀṗ = 0 by Newton steps in the metric of M and 4 LᵀJL.
@@ -136,22 +209,41 @@ class TreeSystem:
         for _ in range(2):  # the second step takes the square of the gap away
             q[3:] /= np.sqrt(dot(q[3:].T, q[3:].T))
             rows = self._rows(q, v)
-            q += component_first(*self._eliminate(rows, q[3:].T, rest, -rows.C))
+            q += component_first(*self._eliminate(rows, q[3:].T, rest, -self._with_rotors(rows.C))[:2])
         q[3:] /= np.sqrt(dot(q[3:].T, q[3:].T))
         v[3:] -= q[3:] * dot(q[3:].T, v[3:].T)
         rows = self._rows(q, v)
-        rate = rows.constraint_rate(v[:3].T, v[3:].T)
-        v += component_first(*self._eliminate(rows, q[3:].T, rest, -rate))
+        v += component_first(*self._eliminate(rows, q[3:].T, rest, -self._with_rotors(rows.rate))[:2])
         return q, v
 
-    def _rows(self, q: Array, v: Array) -> ConstraintRows:
-        return constraint_rows(self.forest, q[:3].T, q[3:].T, v[:3].T, v[3:].T)
+    def _with_rotors(self, values: Array) -> Array:
+        """Append zeros for the rows of rotors."""
+        return np.concatenate([values, np.zeros(len(self.joint) - len(values))])
 
-    def _eliminate(self, rows: ConstraintRows, p: Array, wrench: Array, gamma: Array) -> tuple[Array, Array]:
-        """Solve for a: r̈ (M, 3) and Lᵀα/2π (M, 4), with b = ``wrench`` (M, 6)."""
+    def _rows(self, q: Array, v: Array) -> _Rows:
+        state = q[:3].T, q[3:].T, v[:3].T, v[3:].T
+        rows = constraint_rows(self.forest, *state)
+        rate = rows.constraint_rate(*state[2:])
+        parts = rows.r_near, rows.p_near, rows.p_far, rows.gamma
+        if self.elements is None:
+            return _Rows(rows.C, rate, *parts)
+        found, rotors = self.elements.evaluate(*state, self.x), self.elements.rotors
+        p_far = np.where(self.forest.body[self.elements.joint, 0, None] < 0, 0.0, found.p_far)
+        own = found.r_near, found.p_near, p_far, -found.bias
+        r_near, p_near, p_far, gamma = (
+            np.concatenate([part, more[rotors]]) for part, more in zip(parts, own, strict=True)
+        )
+        torque = found.torque[:, None]
+        return _Rows(
+            rows.C, rate, r_near, p_near, p_far, gamma, (found.force, found.p_force),
+            (torque * found.r_near, torque * found.p_near),
+        )  # fmt: skip
+
+    def _eliminate(self, rows: _Rows, p: Array, wrench: Array, gamma: Array) -> tuple[Array, Array, Array]:
+        """Solve for a: r̈ (M, 3) and Lᵀα/2π (M, 4), with b = ``wrench`` (M, 6); and for all multipliers."""
         turn = L(p).swapaxes(-1, -2) / (2 * dot(p, p))[:, None, None]
-        near = np.concatenate([rows.r_near, np.vecmat(rows.p_near, turn[rows.joint])], 1)
-        far = np.concatenate([-rows.r_near, np.vecmat(rows.p_far, turn[rows.far])], 1)
+        near = np.concatenate([rows.r_near, np.vecmat(rows.p_near, turn[self.joint])], 1)
+        far = np.concatenate([-rows.r_near, np.vecmat(rows.p_far, turn[self.far])], 1)
         A, b, kept = self.inertia.copy(), wrench.copy(), []
         try:
             for level in reversed(self.levels):
@@ -159,27 +251,29 @@ class TreeSystem:
                 solved = np.linalg.solve(A[level.body], np.concatenate([n.mT, b[level.body, :, None]], 2))
                 X, y = solved[..., :-1], solved[..., -1]
                 right = np.concatenate([f, (np.matvec(n, y) - gamma[level.row])[..., None]], 2)
-                Z = np.linalg.solve(n @ X, right)
+                Z = np.linalg.solve(n @ X + self.compliance[level.row][:, None] * np.eye(n.shape[1]), right)
                 kept.append((X, y, Z))
                 up = level.far >= 0
                 np.add.at(A, level.far[up], (f.mT @ Z[..., :-1])[up])
                 np.subtract.at(b, level.far[up], np.vecmat(Z[..., -1], f)[up])
         except np.linalg.LinAlgError:
             raise SingularSystem("S is singular: the rows of a joint are not independent") from None
-        a = np.zeros((self.body_count + 1, 6))  # the last one is the world
+        a, multiplier = np.zeros((self.body_count + 1, 6)), np.zeros(len(self.joint))  # a[-1]: the world
         for level, (X, y, Z) in zip(self.levels, reversed(kept), strict=True):
-            a[level.body] = y - np.matvec(X, np.matvec(Z[..., :-1], a[level.far]) + Z[..., -1])
-        return a[:-1, :3], np.matvec(turn, a[:-1, 3:])
+            multiplier[level.row] = own = np.matvec(Z[..., :-1], a[level.far]) + Z[..., -1]
+            a[level.body] = y - np.matvec(X, own)
+        return a[:-1, :3], np.matvec(turn, a[:-1, 3:]), multiplier
 
 
 EliminatedSystem = StructuredSystem | TreeSystem
 
 
-def eliminated_system(mechanisms: Sequence[Mechanism]) -> EliminatedSystem:
+def eliminated_system(mechanisms: Sequence[Mechanism], x: Array | None = None) -> EliminatedSystem:
     """Make the O(bodies) form of the notes' system.
 
     Args:
         mechanisms: chains of rods and balls, or trees with any joints.
+        x: as of `TreeSystem`.
 
     Returns:
         The form of chains where all are such, else that of trees.
@@ -187,7 +281,7 @@ def eliminated_system(mechanisms: Sequence[Mechanism]) -> EliminatedSystem:
     """
     if all(mechanism.is_chain for mechanism in mechanisms):
         return StructuredSystem(mechanisms)
-    return TreeSystem(mechanisms)
+    return TreeSystem(mechanisms, x)
 
 
 def _joined(mechanisms: Sequence[Mechanism], first: NDArray[np.intp]) -> Mechanism:

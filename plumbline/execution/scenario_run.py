@@ -109,7 +109,7 @@ class ScenarioRun:
         has_long_runs = plan.long_run_seconds > 0 and not is_random
         self._keys = list(task_keys(scenario.name, engines, levels, has_long_runs, has_steps(scenario)))
         if not scenario.model.is_chain:  # not yet covered of trees
-            kinds = [TaskKind.STEP, TaskKind.RELATIONS]
+            kinds = [TaskKind.STEP]
             if scenario.model.has_elements:
                 kinds += [TaskKind.MOTION_TRUTH, TaskKind.TRAJECTORY, TaskKind.LONG_RUN]
             self._keys = [key for key in self._keys if key.kind not in kinds]

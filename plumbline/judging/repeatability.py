@@ -33,7 +33,7 @@ from plumbline.model.datatypes import (
     Trajectory,
     Unsupported,
 )
-from plumbline.model.kinematics import state_from_minimal
+from plumbline.model.kinematics import complete_state
 
 Difference = tuple[float, str]  # relative to the largest entry of the quantity, and a description
 
@@ -138,7 +138,8 @@ def _other_question(model: Model, state: State) -> tuple[Model, State]:
         inertia=1.25 * model.inertia,
         gravity=model.gravity[[1, 2, 0]] + 0.5,
     )
-    return other, state_from_minimal(other, state.p, -0.75 * state.omega, state.u, -0.75 * state.udot)
+    slower = {name: -0.75 * getattr(state, name) for name in ("omega", "udot", "v", "xdot")}
+    return other, complete_state(other, replace(state, **slower))
 
 
 def _largest_difference(

@@ -69,7 +69,7 @@ def check_integrator_relations(
         One result per relation.
 
     """
-    if integrator.is_symmetric and not model.has_drag:
+    if integrator.is_symmetric and not model.is_dissipative:
         yield _check_time_reversal(engine, integrator, model, state, step)
     if integrator.kind == "step" and engine.linear_solvers:
         yield from _check_linear_solvers(engine, integrator, model, state, step)

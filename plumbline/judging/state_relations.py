@@ -1,4 +1,4 @@
-"""Metamorphic relations at a state: the same pendulum described in another way, for the same engine.
+"""Metamorphic relations at a state: the same mechanism described in another way, for the same engine.
 
 Each relation changes model and state so that the effect on every answer is known exactly, and maps the
 answers back; or it asks for another algorithm of the same engine.  The two answers may differ by the sum of
@@ -7,9 +7,10 @@ every unit and independent of axes), except for welded halves, whose equations h
 
     rotated world        everything in world axes rotated by Q
     re-chosen body frame body axes rotated by Q: p Q*, s → Q s, J → Q J Qᵀ, ω′ → Q ω′ (inertias become full)
-    masses doubled       m, J, loads and drag × 2: the same motion, forces and energies × 2
+    masses doubled       m, J, loads, drag and elements × 2: the same motion, forces and energies × 2
     lengths × 4          s, ℓ × 4, J × 16, ω and u̇ / 2, moments × 4, c_t / 2, c_r × 8: r̈ and F the same
     time reversed        ω, u̇ → −ω, −u̇ without drag: r̈, ω̇′, F, energies the same, L → −L
+    siblings permuted    branches on the same body in another order: the same answers in that order
     as …                 the engine's other formulation (maximal or minimal coordinates)
     by …                 the engine's other algorithm for the accelerations (dense, sparse, …)
     two welded halves    every body built of two bodies that are rigidly joined
@@ -18,22 +19,24 @@ every unit and independent of axes), except for welded halves, whose equations h
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.relation_result import OPTION_PREFIX, OTHER_FORMULATION_PREFIX, RelationResult
-from plumbline.model.datatypes import Array, Model, State, StateQuantities, Unsupported
+from plumbline.model.datatypes import KINDS, Array, Model, State, StateQuantities, Unsupported
 from plumbline.model.equivalent import (
     BODY_VECTORS,
     WORLD_VECTORS,
+    reorder_bodies,
     rotate_body_frames,
     rotate_world,
+    siblings_reversed,
     unrotate,
 )
-from plumbline.model.kinematics import state_from_minimal
+from plumbline.model.kinematics import complete_state
 from plumbline.model.welding import split_bodies
 from plumbline.truth.rounding_bound import RoundingBound, state_rounding_bound
 
@@ -41,8 +44,8 @@ WELDED_HALVES = "two welded halves"
 MAX_STATES, LONG_CHAIN_BODIES = 4, 12  # states per relation; half of them for chains of more bodies
 Q = np.array([1.0, 2.0, 3.0, 4.0]) / np.sqrt(30.0)  # unit quaternion that rotates no axis into an axis
 QUANTITIES = (
-    "acceleration", "angular_acceleration", "joint_reaction", "kinetic_energy", "potential_energy",
-    "angular_momentum",
+    "acceleration", "angular_acceleration", "joint_reaction", "joint_moment", "kinetic_energy",
+    "potential_energy", "angular_momentum",
 )  # fmt: skip
 Evaluate = Callable[[Model, list[State]], list[StateQuantities]]
 
@@ -120,7 +123,8 @@ def _unrotate_body_frames(answers: StateQuantities) -> dict[str, Array]:
 
 def _double_masses(model: Model, state: State) -> tuple[Model, State]:
     fields = ("mass", "inertia", "force", "moment", "drag_force", "drag_moment")
-    return scale_fields(model, **dict.fromkeys(fields, 2.0)), state
+    elements = ("armature", "damping", "stiffness", "effort", "spring_stiffness", "spring_damping")
+    return scale_fields(model, **dict.fromkeys((*fields, *elements), 2.0)), state
 
 
 def _halve_forces(answers: StateQuantities) -> dict[str, Array]:
@@ -129,20 +133,58 @@ def _halve_forces(answers: StateQuantities) -> dict[str, Array]:
 
 def _scale_lengths(model: Model, state: State) -> tuple[Model, State]:
     """Lengths × 4 and times × 2."""
-    large = scale_fields(
-        model, proximal=4.0, distal=4.0, length=4.0, inertia=16.0, moment=4.0, drag_force=0.5, drag_moment=8.0
+    slides = np.zeros((model.n, 2), bool)
+    for k, kind in enumerate(model.kind):
+        slides[k, : len(KINDS[kind].motions)] = [what == "slide" for what, _ in KINDS[kind].motions]
+
+    def of_joint(turn: float, slide: float) -> Array:
+        return np.where(slides, slide, turn)
+
+    large = replace(
+        model,
+        point=4 * model.point,
+        length=4 * model.length,
+        inertia=16 * model.inertia,
+        moment=4 * model.moment,
+        drag_force=model.drag_force / 2,
+        drag_moment=8 * model.drag_moment,
+        armature=of_joint(16, 1) * model.armature,
+        damping=of_joint(8, 0.5) * model.damping,
+        stiffness=of_joint(4, 0.25) * model.stiffness,
+        rest=of_joint(1, 4) * model.rest,
+        effort=of_joint(4, 1) * model.effort,
+        spring_point=4 * model.spring_point,
+        spring_length=4 * model.spring_length,
+        spring_stiffness=model.spring_stiffness / 4,
+        spring_damping=model.spring_damping / 2,
     )
-    return large, state_from_minimal(large, state.p, state.omega / 2, state.u, state.udot / 2)
+    rates = {"omega": state.omega / 2, "udot": state.udot / 2, "v": 2 * state.v}
+    x, xdot = of_joint(1, 4) * state.x, of_joint(0.5, 2) * state.xdot
+    return large, complete_state(large, replace(state, x=x, xdot=xdot, r=4 * state.r, **rates))
 
 
 def _unscale_lengths(answers: StateQuantities) -> dict[str, Array]:
     return quantity_values(
-        answers, angular_acceleration=4.0, kinetic_energy=0.25, potential_energy=0.25, angular_momentum=0.125
-    )
+        answers, angular_acceleration=4.0, joint_moment=0.25, kinetic_energy=0.25, potential_energy=0.25,
+        angular_momentum=0.125,
+    )  # fmt: skip
 
 
 def _reverse_time(model: Model, state: State) -> tuple[Model, State]:
-    return model, state_from_minimal(model, state.p, -state.omega, state.u, -state.udot)
+    rates = {name: -getattr(state, name) for name in ("omega", "udot", "v", "xdot")}
+    return model, complete_state(model, replace(state, **rates))
+
+
+def _permute_siblings(model: Model) -> Relation:
+    """The relation of a model's branches in another order."""
+    order = siblings_reversed(model)
+    back = np.argsort(order)
+
+    def in_order(answers: StateQuantities) -> dict[str, Array]:
+        found = quantity_values(answers)
+        return {q: x[back] if x.ndim == 2 else x for q, x in found.items()}
+
+    return Relation("siblings permuted", lambda m, state: reorder_bodies(m, state, order), in_order)
 
 
 TIME_REVERSED = Relation(
@@ -177,8 +219,10 @@ def check_state_relations(
     others: list[tuple[Relation, Evaluate]] = [
         (relation, engine.evaluate)
         for relation in STATE_RELATIONS
-        if not (relation is TIME_REVERSED and model.has_drag)
+        if not (relation is TIME_REVERSED and model.is_dissipative)
     ]
+    if np.any(np.diff(siblings_reversed(model)) < 0):
+        others.append((_permute_siblings(model), engine.evaluate))
     others += [
         (Relation(OPTION_PREFIX + option), engine.with_option(option).evaluate) for option in engine.options
     ]

@@ -1,4 +1,4 @@
-"""Other descriptions of the same pendulum, whose answers follow from the answers to the first."""
+"""Other descriptions of the same mechanism, whose answers follow from the answers to the first."""
 
 from __future__ import annotations
 
@@ -6,16 +6,27 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import (
+    complete_state,
     quaternion_conjugate,
     quaternion_product,
     rotation_matrix,
-    state_from_minimal,
 )
 
-WORLD_VECTORS = ("acceleration", "joint_reaction", "angular_momentum")  # state quantities in world axes
+WORLD_VECTORS = (
+    "acceleration",
+    "joint_reaction",
+    "joint_moment",
+    "angular_momentum",
+)  # state quantities in world axes
+# fields of a model that have one entry per body or its joint
+BODY_FIELDS = (
+    "mass", "inertia", "point", "turn", "length", "force", "moment", "drag_force", "drag_moment", "armature",
+    "damping", "stiffness", "rest", "effort",
+)  # fmt: skip
 BODY_VECTORS = ("angular_acceleration",)  # … in body axes
 
 
@@ -23,44 +34,54 @@ def rotate_world(model: Model, state: State, q: Array) -> tuple[Model, State]:
     """Rotate everything in world axes: gravity, applied forces, attitudes and rod directions.
 
     Args:
-        model: the pendulum.
+        model: the mechanism.
         state: a state of it.
         q: (4,) unit quaternion of the rotation, scalar first.
 
     Returns:
-        The rotated pendulum and its state; attitudes are unit quaternions again.
+        The rotated mechanism and its state; attitudes are unit quaternions again.
 
     """
     turn = rotation_matrix(q)
-    rotated = replace(model, gravity=turn @ model.gravity, force=model.force @ turn.T)
-    p = quaternion_product(q, state.p)
-    p /= np.linalg.norm(p, axis=-1, keepdims=True)
-    return rotated, state_from_minimal(rotated, p, state.omega, state.u @ turn.T, state.udot @ turn.T)
+    fixed, spring_end = model.body < 0, model.spring_body < 0
+    rotated = replace(
+        model,
+        gravity=turn @ model.gravity,
+        force=model.force @ turn.T,
+        point=np.where(fixed[..., None], model.point @ turn.T, model.point),
+        turn=np.where(fixed[..., None], _normalised(quaternion_product(q, model.turn)), model.turn),
+        spring_point=np.where(spring_end[..., None], model.spring_point @ turn.T, model.spring_point),
+    )
+    vectors = {name: getattr(state, name) @ turn.T for name in ("u", "udot", "r", "v")}
+    p = _normalised(quaternion_product(q, state.p))
+    return rotated, complete_state(rotated, replace(state, p=p, **vectors))
 
 
 def rotate_body_frames(model: Model, state: State, q: Array) -> tuple[Model, State]:
     """Describe every body in other axes of its own: a body vector x becomes Q x.
 
     Args:
-        model: the pendulum.
+        model: the mechanism.
         state: a state of it.
         q: (4,) unit quaternion of the rotation Q, scalar first.
 
     Returns:
-        The same pendulum in these axes and its state; attitudes are unit quaternions again.
+        The same mechanism in these axes and its state; attitudes are unit quaternions again.
 
     """
     turn = rotation_matrix(q)
     inertia = turn @ model.inertia @ turn.T
+    moving, spring_end = model.body >= 0, model.spring_body >= 0
     rotated = replace(
         model,
         inertia=(inertia + inertia.mT) / 2,
-        point=np.where((model.body >= 0)[..., None], model.point @ turn.T, model.point),
+        point=np.where(moving[..., None], model.point @ turn.T, model.point),
+        turn=np.where(moving[..., None], _normalised(quaternion_product(q, model.turn)), model.turn),
         moment=model.moment @ turn.T,
+        spring_point=np.where(spring_end[..., None], model.spring_point @ turn.T, model.spring_point),
     )
-    p = quaternion_product(state.p, quaternion_conjugate(q))
-    p /= np.linalg.norm(p, axis=-1, keepdims=True)
-    return rotated, state_from_minimal(rotated, p, state.omega @ turn.T, state.u, state.udot)
+    p = _normalised(quaternion_product(state.p, quaternion_conjugate(q)))
+    return rotated, complete_state(rotated, replace(state, p=p, omega=state.omega @ turn.T))
 
 
 def unrotate(answers: dict[str, Array], vectors: Sequence[str], q: Array) -> dict[str, Array]:
@@ -78,11 +99,53 @@ def unrotate(answers: dict[str, Array], vectors: Sequence[str], q: Array) -> dic
     return {name: x @ rotation_matrix(q) if name in vectors else x for name, x in answers.items()}
 
 
+def _normalised(q: Array) -> Array:
+    return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
+
+
+def siblings_reversed(model: Model) -> NDArray[np.intp]:
+    """Order the bodies depth first with the branches on every body, and on the world, in reverse.
+
+    Args:
+        model: the mechanism.
+
+    Returns:
+        (N,) the bodies in the new order; ascending where no two joints hang on the same body.
+
+    """
+    order: list[int] = []
+    waiting = np.flatnonzero(model.body[:, 0] < 0).tolist()
+    while waiting:
+        order.append(waiting.pop())
+        waiting += np.flatnonzero(model.body[:, 0] == order[-1]).tolist()
+    return np.array(order, np.intp)
+
+
+def reorder_bodies(model: Model, state: State, order: NDArray[np.intp]) -> tuple[Model, State]:
+    """Number the bodies and joints in another order.
+
+    Args:
+        model: the mechanism.
+        state: a state of it.
+        order: (N,) the bodies in the new order, each behind its far body.
+
+    Returns:
+        The same mechanism and state.
+
+    """
+    place = np.append(np.argsort(order), -1)  # the world is −1 in both
+    fields = {name: x[order] for name, x in vars(model).items() if name in BODY_FIELDS}
+    body = np.stack([place[model.body[order, 0]], np.arange(model.n)], axis=1)
+    kind = tuple(model.kind[k] for k in order)
+    reordered = replace(model, kind=kind, body=body, spring_body=place[model.spring_body], **fields)
+    return reordered, State(**{name: x[order] for name, x in vars(state).items()})
+
+
 def first_bodies(model: Model, state: State, count: int) -> tuple[Model, State]:
     """Cut a chain behind some bodies.
 
     Args:
-        model: the pendulum.
+        model: the mechanism.
         state: a state of it.
         count: number of bodies that remain, from the pivot.
 

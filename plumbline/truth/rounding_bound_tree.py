@@ -375,6 +375,8 @@ def tree_tolerances(
     carried_moment = t.below @ (t.J * (t.alpha + turning) + t.spin + t.torque_size) + lever @ carried
     result = np.stack([np.maximum(t.a, t.g), t.alpha, t.F, t.moment], 1)
     total += result
+    free = np.array([kind == "free" for kind in model.kind])  # its wrench is what rounding leaves
+    total[free, 2:] += np.stack([t.below @ force, t.below @ moment], 1)[free]
     total[:, 2:] += t.element_size[:, None] * _directions_used(t)
     total += np.stack([swing + t.a + t.transport, turning, t.below @ carried, carried_moment], 1)
 
