@@ -31,5 +31,6 @@ def test_a_tree_is_compared_with_its_joint_moments(tmp_path):
     results = json.loads((tmp_path / "results.json").read_text())
     rows = {row["quantity"]: row["verdict"] for row in results["rows"]}
     assert rows["joint_moment"] == rows["acceleration"] == "agrees"
-    assert {row["level"] for row in results["rows"]} == {"state", "trajectory", "invariants"}
+    levels = {"state", "trajectory", "invariants", "relations"}
+    assert {row["level"] for row in results["rows"]} == levels
     assert results["scenarios"]["universal-pendulum"]["model"]["kind"] == ["universal"]

@@ -260,7 +260,7 @@ def test_halves_have_roundings_of_their_own():
         e.evaluate(model, [at]) for e in (load_adapter("mujoco"), load_adapter("mujoco").with_welded_halves())
     )
     assert 0 <= abs(two.potential_energy - whole.potential_energy) <= welded.potential_energy
-    for q in QUANTITIES:
+    for q in set(QUANTITIES) - {"joint_moment"}:  # chains have none
         assert np.all(np.asarray(welded.tolerance(q)) >= plain.tolerance(q))
     with patch(
         "plumbline.judging.state_relations.check_state_relation", wraps=check_state_relation

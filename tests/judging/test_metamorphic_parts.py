@@ -73,7 +73,7 @@ def self_relation_result(*shifts, relation=None, refuse=(), refuse_here=()):
     return check_state_relation(relation, reported, there, MODEL, STATES, bounds, bounds)
 
 
-@pytest.mark.parametrize("quantity", QUANTITIES)
+@pytest.mark.parametrize("quantity", [q for q in QUANTITIES if q != "joint_moment"])  # chains have none
 @pytest.mark.parametrize("by", [0.9, 1.1, 40.0])
 def test_a_relation_is_as_far_off_as_its_worst_quantity_over_both_bounds(quantity, by):
     found = self_relation_result((0, "kinetic_energy", 0.5), (2, quantity, by))
