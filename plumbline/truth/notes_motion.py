@@ -37,7 +37,7 @@ def simulate_notes_form(
         EngineFailure: the integrator stops early.
 
     """
-    system = eliminated_system([model])
+    system = eliminated_system([model], state.x)
     start = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
     try:
         if method == "dop853":

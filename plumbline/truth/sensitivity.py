@@ -102,13 +102,14 @@ def perturbation_growth_and_runs(
 
     """
     neighbours = range(1, PERTURBATION_COUNT + 1)
-    system = eliminated_system([model] * (PERTURBATION_COUNT + 1) + [m for m, _ in other_models])
     states = [state, *perturbed_states(model, state), *(s for _, s in other_models)]
+    models = [model] * (PERTURBATION_COUNT + 1) + [m for m, _ in other_models]
+    system = eliminated_system(models, np.concatenate([s.x for s in states]))
     r, p, v, pdot = _integrate_batch(system, states, times)
     unperturbed = [0, *range(PERTURBATION_COUNT + 1, len(states))]
     runs = r[unperturbed], p[unperturbed]
     if other_models:
-        system = eliminated_system([model]).repeated(PERTURBATION_COUNT + 1)
+        system = eliminated_system([model], state.x).repeated(PERTURBATION_COUNT + 1)
     size, growth = np.full(PERTURBATION_COUNT, PERTURBATION_SIZE), np.empty((PERTURBATION_COUNT, len(times)))
     earlier_growth, done, arm = np.ones(PERTURBATION_COUNT), 0, 1e-3
     while True:

@@ -152,8 +152,6 @@ def _prepared_integrator(
     model: Model, state: State, precision: Precision, order: int | None = None
 ) -> tuple[Any, Callable[[Any], Any]]:
     """The integrator of a model at time 0 in a state, and the conversion to its numbers."""
-    if model.has_elements:
-        raise TruthUnavailable("Taylor's method has no rotors, springs, dampers and efforts yet")
     mp, number = import_truth_tool("mpmath"), _number_conversion(precision)
     joints: _Joints = taylor_tree.topology(model)
     parameters, values = taylor_tree.parameter_values, taylor_tree.initial_values

@@ -4,6 +4,8 @@ The same sums over subtrees as in `certified_tree` (composite rigid bodies, recu
 the world's origin, and M ν̇ = −h by M = Lᵀ D L, which keeps the zeros between branches (Featherstone, Rigid
 Body Dynamics Algorithms, 2008, section 6.5).  A rod moves its near end by ℓ (I − u uᵀ) ν̇, three columns of
 rank two: m ℓ² u uᵀ added to its block of M leaves their part across u, and sets that along u to 0.
+Rotors, springs and dampers act on the relative rates ν of their joints, which those of a ball joint are too:
+Ω along the world's axes, whose rotor adds a (Ω̇ + Ω × ω) in the turning near body's axes.
 Coordinates per body: u, u̇ of a rod (world axes), r, ṙ of a free body, p and ω′ of both and of balls, x and ẋ
 of the other joints.
 """
@@ -15,7 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from plumbline.model.datatypes import KINDS, Kind, Model, State
+from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Kind, Model, State
+from plumbline.truth import TruthUnavailable
 
 
 class Topology(NamedTuple):
@@ -24,6 +27,8 @@ class Topology(NamedTuple):
     kind: tuple[Kind, ...]
     far: tuple[int, ...]  # far body of each joint, −1 the world
     has_drag: bool
+    has_joint_elements: bool = False
+    springs: tuple[tuple[int, int], ...] = ()  # bodies of springs between points, −1 the world
 
 
 def topology(model: Model) -> Topology:
@@ -33,10 +38,17 @@ def topology(model: Model) -> Topology:
         model: the mechanism.
 
     Returns:
-        Kinds of joints, far bodies, and whether there is drag.
+        Kinds of joints, far bodies, and what elements there are.
+
+    Raises:
+        TruthUnavailable: a spring acts on a ball joint; its torque has no Taylor series where it is at rest.
 
     """
-    return Topology(model.kind, tuple(int(far) for far in model.body[:, 0]), model.has_drag)
+    if any(kind == "ball" and k > 0 for kind, k in zip(model.kind, model.stiffness[:, 0], strict=True)):
+        raise TruthUnavailable("not used for springs of ball joints, which are singular at rest")
+    far = tuple(int(far) for far in model.body[:, 0])
+    springs = tuple((int(a), int(b)) for a, b in model.spring_body)
+    return Topology(model.kind, far, model.has_drag, model.has_joint_elements, springs)
 
 
 def coordinate_names(kind: Kind) -> list[tuple[str, int]]:
@@ -101,6 +113,10 @@ def parameter_values(mp: Any, model: Model) -> list[Any]:
             values += rotation_matrix(unit / mp.norm(unit)).ravel().tolist()
         values += [*model.force[k].tolist(), *model.moment[k].tolist()]
         values += [float(x[k]) for x in (model.drag_force, model.drag_moment, model.length)]
+        values += [x for name in JOINT_ELEMENTS for x in getattr(model, name)[k].tolist()]
+    for j, point in enumerate(model.spring_point):
+        numbers = model.spring_stiffness, model.spring_damping, model.spring_length
+        values += [*point.ravel().tolist(), *(float(x[j]) for x in numbers)]
     return values
 
 
@@ -120,7 +136,10 @@ def equations_of_motion(hy: Any, tree: Topology) -> list[tuple[Any, Any]]:
         bodies.append(_Body(hy, tree, k, bodies[far] if far >= 0 else None))
     gravity = vector(hy.par[i] for i in range(3))
     inertias = _subtree_sums(tree, [body.spatial_inertia() for body in bodies])
-    wrenches = _subtree_sums(tree, [body.wrench_at_rest(gravity, tree.has_drag) for body in bodies])
+    own_wrenches = [body.wrench_at_rest(gravity, tree.has_drag) for body in bodies]
+    for j, ends in enumerate(tree.springs):
+        _add_spring(hy, bodies, own_wrenches, ends, 3 + _PARAMETERS * len(bodies) + _SPRING_PARAMETERS * j)
+    wrenches = _subtree_sums(tree, own_wrenches)
     rates = _solve_sparse(*_mass_matrix(tree, bodies, inertias, wrenches))
     gained: list[Any] = []
     system: list[tuple[Any, Any]] = []
@@ -142,6 +161,7 @@ class _Body:
 
     A: Any
     r: Any
+    relative_spin: Any  # Ω of a ball joint
     bend: Any
 
     def __init__(self, hy: Any, tree: Topology, k: int, far: _Body | None) -> None:
@@ -151,6 +171,7 @@ class _Body:
         turn_far, turn_near = self._take(9).reshape(3, 3), self._take(9).reshape(3, 3)
         self.force, self.moment = self._take(3), self._take(3)
         self.drag_force, self.drag_moment, self.length = self._take(3)
+        self.elements = self._take(10).reshape(5, 2)  # rows in the order of `JOINT_ELEMENTS`
         kind = tree.kind[k]
         self.x: dict[str, Any] = {
             name: vector(hy.expression(f"{name}{i}_{k}") for i in range(size))
@@ -178,7 +199,9 @@ class _Body:
             columns = [(zero, e) for e in units]
         if KINDS[kind].has_attitude:
             self.A = rotation_matrix(self.x["p"])
+            far_spin = self.w
             self.w = self.A @ self.x["omega"]
+            self.relative_spin = self.w - far_spin
             columns += [(e, zero) for e in units]
         else:
             self.A = self._move(kind, axes, columns) @ turn_near.T
@@ -213,6 +236,17 @@ class _Body:
                 turned[:, j], turned[:, k] = c * axes[:, j] + s * axes[:, k], c * axes[:, k] - s * axes[:, j]
                 axes = turned
         return axes
+
+    def joint_elements(self, kind: Kind) -> list[tuple[Any, Any]]:
+        """Of each rate ν of the joint: what its rotor adds to M, and what its elements add to h."""
+        a, c, k, rest, effort = self.elements
+        if kind == "ball":
+            bend = np.cross(self.relative_spin, self.w)
+            return [(a[0], a[0] * bend[i] + c[0] * self.relative_spin[i]) for i in range(3)]
+        if KINDS[kind].has_attitude:
+            return []
+        x, rate = (self.x.get(name, ()) for name in ("x", "xdot"))
+        return [(a[i], c[i] * rate[i] + k[i] * (x[i] - rest[i]) - effort[i]) for i in range(len(x))]
 
     def spatial_inertia(self) -> Any:
         """Inertia (6, 6) about the world's origin: twist → momentum, angular part first."""
@@ -261,7 +295,28 @@ class _Body:
         return found
 
 
-_PARAMETERS = 1 + 9 + 6 + 18 + 6 + 3  # of a body
+_PARAMETERS = 1 + 9 + 6 + 18 + 6 + 3 + 10  # of a body
+_SPRING_PARAMETERS = 6 + 3
+
+
+def _add_spring(
+    hy: Any, bodies: list[_Body], wrenches: list[Any], ends: tuple[int, int], first_parameter: int
+) -> None:
+    """Subtract the pull of a spring between two points from the wrenches that its bodies need."""
+    numbers = vector(hy.par[i] for i in range(first_parameter, first_parameter + _SPRING_PARAMETERS))
+    points, (k, c, rest), places, rates = numbers[:6].reshape(2, 3), numbers[6:], [], []
+    for end, point in zip(ends, points, strict=True):
+        body = bodies[end] if end >= 0 else None
+        arm = point if body is None else body.A @ point
+        places.append(arm if body is None else body.r + arm)
+        rates.append(vector([0.0] * 3) if body is None else body.v + np.cross(body.w, arm))
+    d = places[1] - places[0]
+    length = hy.sqrt(d @ d)
+    tension = k * (length - rest) + c * (d @ (rates[1] - rates[0])) / length
+    for end, place, sign in zip(ends, places, (1.0, -1.0), strict=True):
+        if end >= 0:
+            pull = (sign * tension / length) * d
+            wrenches[end] = wrenches[end] - np.concatenate([np.cross(place, pull), pull])
 
 
 def _subtree_sums(tree: Topology, values: list[Any]) -> list[Any]:
@@ -293,6 +348,10 @@ def _mass_matrix(
                 j = tree.far[j]
                 own = len(bodies[j].S) if j >= 0 else 0
         last[k] = reached
+        if tree.has_joint_elements:
+            for i, (rotor, force) in enumerate(body.joint_elements(tree.kind[k])):
+                H[first[k] + i][first[k] + i] = H[first[k] + i][first[k] + i] + rotor
+                right[first[k] + i] = right[first[k] + i] - force
         if tree.kind[k] == "rod":  # no motion along u
             u, size = body.x["u"], body.m * body.length * body.length
             for i in range(3):

@@ -56,6 +56,24 @@ def test_both_methods_agree_on_mixed_trees():
         assert np.max(truth.position_uncertainty) < 1e-11 * max(1.0, np.max(np.abs(truth.trajectory.r)))
 
 
+@pytest.mark.parametrize("element", ["armature", "damping", "stiffness", "effort", "springs"])
+@pytest.mark.parametrize("kinds", [("hinge", "cylindrical", "rod"), ("universal", "slide", "weld")], ids=str)
+def test_both_methods_agree_on_every_element(kinds, element):
+    model = random_tree(np.random.default_rng(3), 3, kinds, elements=(element,))
+    (state,) = random_states(model, 1, 2)
+    times = TIMES[:3]
+    other = simulate_notes_form(model, state, times, NOTES_RTOL)
+    r, p, _ = taylor(model, state, times, "double")
+    assert np.max(position_error(r, other.r)) < 1e-13
+    assert np.max(attitude_error(p, other.p)) < 1e-12
+
+
+def test_springs_of_balls_are_left_to_the_notes_form():
+    model = random_tree(np.random.default_rng(3), 2, ("ball",), elements=("stiffness",))
+    (state,) = random_states(model, 1, 2)
+    assert "springs of ball joints" in trajectory_truth(model, state, TIMES[:3]).method
+
+
 def test_precisions_agree():
     model = random_tree(np.random.default_rng(3), 3, ("rod", "universal", "cylindrical"))
     (state,) = random_states(model, 1, 1)
