@@ -79,7 +79,9 @@ class MujocoImporter(Importer):
             except ValueError as error:
                 return Reading(self.version(), refusal=str(error))
         bodies = tuple(_body(m, i) for i in range(1, m.nbody))
-        model = NeutralModel(_model_name(m), bodies, np.array(m.opt.gravity))
+        is_weightless = m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
+        gravity = np.zeros(3) if is_weightless else np.array(m.opt.gravity)
+        model = NeutralModel(_model_name(m), bodies, gravity)
         return Reading(self.version(), model, warnings=tuple(warnings))
 
     def evaluate(self, file: ModelFile, states: Sequence[CanonicalState]) -> list[ModelQuantities]:

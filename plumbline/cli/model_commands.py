@@ -31,7 +31,8 @@ from plumbline.storage.results_store import row_record, to_json_value
 COLUMN_HEADINGS = {
     "joints": "joints", "total_mass": "mass", "position": "position", "attitude": "attitude",
     "mass_matrix": "M", "gravity_force": "gravity", "bias_force": "h", "passive_force": "passive",
-    "acceleration": "accel.", "kinetic_energy": "kinetic", "potential_energy": "potential",
+    "damping": "damping", "acceleration": "accel.",
+    "kinetic_energy": "kinetic", "potential_energy": "potential",
 }  # fmt: skip
 MAX_STATES = 10_000
 
@@ -268,7 +269,8 @@ def _reasons(name: str, rows: Sequence[Row], file: FileResult) -> list[str]:
     bad = [row for row in rows if row.verdict not in silent and row.known_issue is None]
     explanation = file.explanations.get(name)
     if explanation is not None and explanation.causes and bad:
-        return [f"{coloured_glyph(bad[0])} {escape(cause.sentence)}" for cause in explanation.causes]
+        lines = [f"{coloured_glyph(bad[0])} {escape(cause.sentence)}" for cause in explanation.causes]
+        return lines + [f"{coloured_glyph(r)} {escape(r.reason)}" for r in bad if r.quantity == "damping"]
     lines = [f"{coloured_glyph(row)} {escape(f'{row.engine}: {row.reason}')}" for row in bad]
     if explanation is not None and bad:
         fields = Counter(change.field for change in explanation.differences)

@@ -27,6 +27,7 @@ from plumbline.importers.neutral_model import (
 )
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import rotation_matrix
+from plumbline.truth.certified_model import CertifiedModelQuantities
 from plumbline.truth.model_comparison import (
     Mismatch,
     certify_states,
@@ -38,6 +39,10 @@ from plumbline.truth.model_comparison import (
 RELATIVE_CHANGE = 1e-11  # differences of descriptions below this are rounding
 JOINT_FIELDS = ("axis", "anchor", "reference", "armature", "damping", "stiffness", "spring_reference")
 BODY_FIELDS = ("position", "attitude", "mass", "center", "inertia")
+FRAME = "frame"
+FRAME_FIELDS = ("position", "attitude", "anchor", "reference")  # which may describe one pose in several ways
+MAX_OMISSIONS = 4
+ARMATURE_ENERGY = "armature in the kinetic energy"
 OMITTED_FIELDS = ("damping", "stiffness", "armature", "spring_reference")  # may be held and not applied
 FIELD_WORDS = {
     "center": "centre of mass", "spring_reference": "spring reference", "position": "position in its parent",
@@ -118,14 +123,11 @@ def explain_importer(
     own, theirs = lump_fixed_bodies(moved), lump_fixed_bodies(reading)
     changes = _single_parts(differences(own, theirs), moved, theirs)
     trial = _Trial(own, theirs, reading, answers, states, bool(structure))
-    found = trial.smallest(changes)
-    if found is None:
-        omitted = omissions(apply_changes(own, theirs, changes))
-        for size in (1, 2, 3):
-            for chosen in combinations(omitted, size):
-                found = found or trial.smallest([*changes, *(c for group in chosen for c in group)])
-            if found is not None:
-                break
+    without_frames = [change for change in changes if change.field not in FRAME_FIELDS]
+    bases = [changes]
+    if len(without_frames) < len(changes):
+        bases += [without_frames, trial.with_needed_frames(changes)]
+    found = next((f for f in (trial.smallest_with_omissions(base) for base in bases) if f is not None), None)
     if found is None:
         return Explanation(differences=(*structure, *changes))
     remaining = trial.remaining(found, len(answers))
@@ -180,6 +182,12 @@ def _single_part(parts: Sequence[tuple[NeutralBody, Array, Array]], read: Neutra
                 source = part.fields.get(name, part.source)
                 carrier = parts[0][0].name
                 return Change(name, part.name, "", own, new, source, also=also, carrier=carrier)
+    massless = [part for part, _, _ in parts[1:] if part.mass == 0 and np.any(part.inertia)]
+    kept = [entry for entry in parts if entry[0] not in massless]
+    if massless and not _differs(_merge(kept).inertia, read.inertia, 0.0):
+        names = ", ".join(part.name for part in massless)
+        source, carrier = massless[0].fields.get("inertia", massless[0].source), parts[0][0].name
+        return Change("inertial", names, "", 0.0, 0.0, source, also=also, carrier=carrier)
     return None
 
 
@@ -215,8 +223,81 @@ class _Trial:
         order = joint_permutation(changed, self.reading)
         if order is None:
             return None
-        truths = certify_states(changed, self.states(changed)[:count])
+        states = self.states(changed)[:count]
+        truths = certify_states(changed, states)
+        still = {change.joint for change in changes if change.field == ARMATURE_ENERGY}
+        truths = [_without_armature(changed, still, *pair) for pair in zip(states, truths, strict=True)]
+        offsets = {change.body: change.theirs for change in changes if change.field == FRAME}
+        truths = [_with_frames(truth, offsets) for truth in truths]
         return mismatches(changed, truths, [permuted(one, order) for one in self.answers[:count]])
+
+    def smallest_with_omissions(self, changes: Sequence[Change]) -> list[Change] | None:
+        """Try the changes alone, then with terms that the dynamics may leave out."""
+        changed, wrong = apply_changes(self.own, self.theirs, changes), self.wrong(changes)
+        is_energy_only = "kinetic_energy" in wrong and wrong <= {"kinetic_energy", "position", "attitude"}
+        omitted = energy_omissions(changed) if is_energy_only else omissions(changed)
+        for size in range(MAX_OMISSIONS + 1):
+            for chosen in combinations(omitted, size):
+                found = self.smallest([*changes, *(change for group in chosen for change in group)])
+                if found is not None:
+                    return found
+        return None
+
+    def misplaced(self, changes: Sequence[Change]) -> float:
+        """How many bodies are elsewhere at the first state, with the changes made."""
+        changed = apply_changes(self.own, self.theirs, changes)
+        if joint_permutation(changed, self.reading) is None:
+            return np.inf
+        (truth,) = certify_states(changed, self.states(changed)[:1])
+        own, theirs = truth.quantities.poses, self.answers[0].poses
+        return sum(
+            bool(np.any(np.abs(own[b] - theirs[b]) > truth.tolerance["poses"][b])) for b in own if b in theirs
+        )
+
+    def with_needed_frames(self, changes: Sequence[Change]) -> list[Change]:
+        """Keep the changes of frames that put a body where the importer has it."""
+        kept = [change for change in changes if change.field not in FRAME_FIELDS]
+        count = self.misplaced(kept)
+        for body in dict.fromkeys(c.body for c in changes if c.field in FRAME_FIELDS):
+            more = [*kept, *(c for c in changes if c.body == body and c.field in FRAME_FIELDS)]
+            if (fewer := self.misplaced(more)) < count:
+                kept, count = more, fewer
+        return kept
+
+    def wrong_at_first(self, changes: Sequence[Change]) -> bool:
+        """Whether more than poses is wrong at the first state, which is cheap to find out."""
+        found = self.worst(changes, 1)
+        return found is None or any(
+            m.ratio > 1 for name, m in found.items() if name not in ("position", "attitude")
+        )
+
+    def wrong(self, changes: Sequence[Change]) -> set[str]:
+        """Quantities that are not reproduced with the changes made."""
+        found = self.worst(changes, min(PRUNING_STATES, len(self.answers)))
+        return {name for name, m in (found or {}).items() if m.ratio > 1}
+
+    def frame_changes(self, changes: Sequence[Change], count: int) -> list[Change]:
+        """Frames that lie elsewhere in their bodies, where nothing but poses is wrong."""
+        found = self.worst(changes, count)
+        if found is None or {n for n, m in found.items() if m.ratio > 1} - {"position", "attitude"}:
+            return []
+        changed = apply_changes(self.own, self.theirs, changes)
+        truths = certify_states(changed, self.states(changed)[:count])
+        frames = []
+        for body in changed.bodies:
+            pairs = [
+                (truth.quantities.poses[body.name], answer.poses[body.name])
+                for truth, answer in zip(truths, self.answers, strict=False)
+                if body.name in answer.poses
+            ]
+            offsets = [
+                _composed(np.column_stack([own[:, :3].T, -own[:, :3].T @ own[:, 3]]), theirs)
+                for own, theirs in pairs
+            ]
+            if offsets and np.max(np.abs(offsets[0] - np.eye(3, 4))) > RELATIVE_CHANGE:
+                source = body.fields.get("position", body.source)
+                frames.append(Change(FRAME, body.name, "", np.eye(3, 4), offsets[0], source))
+        return frames
 
     def remaining(self, changes: Sequence[Change], count: int) -> float:
         """Largest ratio of error and tolerance with the changes made."""
@@ -226,9 +307,17 @@ class _Trial:
     def smallest(self, changes: Sequence[Change]) -> list[Change] | None:
         """Drop the changes that are not needed; None where all together do not reproduce the quantities."""
         count = min(PRUNING_STATES, len(self.answers))
-        if not (changes or self.has_structure) or self.remaining(changes, count) > 1:
-            return None
         needed = list(changes)
+        if self.wrong_at_first(needed):
+            return None
+        if self.remaining(needed, count) > 1:
+            needed += self.frame_changes(needed, count)
+        if not (needed or self.has_structure) or self.remaining(needed, count) > 1:
+            return None
+        for body in dict.fromkeys(change.body for change in changes if change.field in FRAME_FIELDS):
+            rest = [c for c in needed if not (c.body == body and c.field in FRAME_FIELDS)]
+            if self.remaining(rest, count) <= 1:
+                needed = rest
         for field in dict.fromkeys(change.field for change in changes):
             rest = [change for change in needed if change.field != field]
             if self.remaining(rest, count) <= 1:
@@ -242,6 +331,32 @@ class _Trial:
                         needed = rest
         is_some = bool(needed) or self.has_structure
         return needed if is_some and self.remaining(needed, len(self.answers)) <= 1 else None
+
+
+def _with_frames(truth: CertifiedModelQuantities, offsets: Mapping[str, Array]) -> CertifiedModelQuantities:
+    """Poses of bodies whose frame is elsewhere in the body: X → X Y."""
+    poses = {
+        body: _composed(pose, offsets[body]) if body in offsets else pose
+        for body, pose in truth.quantities.poses.items()
+    }
+    return replace(truth, quantities=replace(truth.quantities, poses=poses))
+
+
+def _composed(pose: Array, offset: Array) -> Array:
+    R, p = pose[:, :3], pose[:, 3]
+    return np.column_stack([R @ offset[:, :3], p + R @ offset[:, 3]])
+
+
+def _without_armature(
+    model: NeutralModel, names: set[str], state: CanonicalState, truth: CertifiedModelQuantities
+) -> CertifiedModelQuantities:
+    """The kinetic energy without the armature of the named joints."""
+    energy = truth.quantities.kinetic_energy
+    assert energy is not None
+    for joint, _, v in model.joint_slices():
+        if joint.name in names:
+            energy -= joint.armature * float(state.velocities[v] @ state.velocities[v]) / 2
+    return replace(truth, quantities=replace(truth.quantities, kinetic_energy=energy))
 
 
 def differences(own: NeutralModel, theirs: NeutralModel) -> list[Change]:
@@ -354,6 +469,29 @@ def omissions(model: NeutralModel) -> list[list[Change]]:
     return groups
 
 
+def energy_omissions(model: NeutralModel) -> list[list[Change]]:
+    """List armatures that a kinetic energy may leave out, by joints along coordinate axes and alone or not.
+
+    Args:
+        model: a model, fixed bodies lumped.
+
+    Returns:
+        Groups of changes, a change per joint with an armature.
+
+    """
+    groups: dict[tuple[bool, bool], list[Change]] = {}
+    for body in model.bodies:
+        for joint in body.joints:
+            if joint.armature:
+                source = joint.fields.get("armature", joint.source)
+                change = Change(
+                    ARMATURE_ENERGY, body.name, joint.name, joint.armature, 0.0, source, is_omitted=True
+                )
+                is_aligned = bool(np.max(joint.axis) == 1)  # engines have own joint types for these
+                groups.setdefault((is_aligned, len(body.joints) > 1), []).append(change)
+    return list(groups.values())
+
+
 def apply_changes(own: NeutralModel, theirs: NeutralModel, changes: Sequence[Change]) -> NeutralModel:
     """Make changes in a model.
 
@@ -372,6 +510,8 @@ def apply_changes(own: NeutralModel, theirs: NeutralModel, changes: Sequence[Cha
     }
     gravity = own.gravity
     for change in changes:
+        if change.field in (ARMATURE_ENERGY, FRAME):
+            continue
         if change.field == "gravity":
             gravity = change.theirs
         elif change.field == "additional body":
@@ -425,18 +565,28 @@ def _causes(title: str, changes: Sequence[Change], remaining: float) -> tuple[Ca
 def _describe(members: Sequence[Change]) -> str:
     """What an importer does to one field, as a verb phrase."""
     first, word = members[0], FIELD_WORDS.get(members[0].field, members[0].field)
+    if first.field == FRAME:
+        shift = format_value(first.theirs[:, 3], np.zeros(3))
+        return (
+            f"puts the frame of {len(members)} bodies ({_names(members)}) elsewhere in the body, that of "
+            f"{first.body} at {shift} ({first.source}), which moves no mass"
+        )
     if first.field == "additional body":
         names = ", ".join(change.body for change in members[:6])
         return f"adds {'body' if len(members) == 1 else 'bodies'} {names}"
     if first.field == "inertial":
         names = ", ".join(f"{change.body} ({change.own:.4g} kg, {change.source})" for change in members[:6])
-        return f"leaves out the mass and inertia of {names}, fixed to body {first.carrier}"
+        what = "mass and inertia" if first.own else "inertia"
+        return f"leaves out the {what} of {names}, fixed to body {first.carrier}"
     if first.field == "joints":
         return "; ".join(
             f"reads the joints of body {c.body} as {_joint_words(c.theirs)}; "
             f"the file says {_joint_words(c.own)} ({c.source})"
             for c in members[:3]
         )
+    if first.field == ARMATURE_ENERGY:
+        owners = first.owner if len(members) == 1 else f"{len(members)} joints ({_names(members)})"
+        return f"leaves the armature of {owners} out of its kinetic energy ({first.source})"
     if first.is_omitted:
         owners = first.owner if len(members) == 1 else f"{len(members)} joints ({_names(members)})"
         return f"holds the {word} of {owners} but leaves it out of its equations ({first.source})"

@@ -204,9 +204,9 @@ def strip_geometry(root: Element) -> None:
             explicit = holder.tag == "worldbody" or holder.find("inertial") is not None
             if explicit and not from_geoms:
                 holder.children = [c for c in holder.children if c.tag not in ("geom", "light", "camera")]
-        kept |= any(
-            e.tag == "geom" and {"mesh", "hfield", "class"} & e.attributes.keys() for e in world.walk()
-        )
+        kept |= any(e.tag == "geom" and {"mesh", "hfield"} & e.attributes.keys() for e in world.walk())
+    for default in root.find_all("default"):
+        kept |= any(e.tag == "geom" and "mesh" in e.attributes for e in default.walk())
     root.children = [child for child in root.children if child.tag not in _STRIPPED]
     dropped = {"texture", "skin"} | (set() if kept else {"mesh", "hfield"})
     for asset in root.find_all("asset"):
@@ -231,7 +231,8 @@ def with_sources(model: NeutralModel, root: Element) -> NeutralModel:
     defaults = _DefaultClasses(root)
     default_source = Source(root.source.file, 0)
     found = [_body_with_sources(body, bodies, defaults, default_source) for body in model.bodies]
-    gravity = next((o.source for o in root.find_all("option") if "gravity" in o.attributes), default_source)
+    options = [e for o in root.find_all("option") for e in (*o.find_all("flag"), o)]
+    gravity = next((e.source for e in options if "gravity" in e.attributes), default_source)
     features = [
         Feature(section.tag, _name_of(element), element.source)
         for section in root.children

@@ -248,7 +248,8 @@ def write_xml_in_place(root: Element) -> str:
             parts.append("\n" * (item.source.line - line))
             line = item.source.line
         attributes = "".join(f" {k}={quoteattr(v)}" for k, v in item.attributes.items())
-        parts.append(f"<{item.tag}{attributes}>{escape(item.text)}")
+        text = " ".join(item.text.split("\n"))  # its line breaks would move what follows
+        parts.append(f"<{item.tag}{attributes}>{escape(text)}")
         stack.append(f"</{item.tag}>")
         stack.extend(reversed(item.children))
     return "".join(parts) + "\n"

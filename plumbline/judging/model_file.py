@@ -44,6 +44,7 @@ MODEL_UNITS = {
     "gravity_force": "SI",
     "bias_force": "SI",
     "passive_force": "SI",
+    "damping": "SI",
     "acceleration": "SI",
     "kinetic_energy": "J",
     "potential_energy": "J",
@@ -168,6 +169,32 @@ def _mass_row(context: RowContext, model: NeutralModel, reading: NeutralModel) -
     )
 
 
+def _damping_row(context: RowContext, model: NeutralModel, reading: NeutralModel) -> Row:
+    """The damping that an importer holds and whose engine does not apply: for the user's own forces."""
+    read = {joint.name: joint.damping for joint in reading.joints}
+    wrong = [
+        (joint, read[joint.name])
+        for joint in model.joints
+        if joint.name in read and abs(read[joint.name] - joint.damping) > MASS_ROUNDING * joint.damping
+    ]
+    if not wrong:
+        reason = "the damping of every joint is read as the file says"
+        return context.make_row(
+            "model", "-", "damping", Verdict.AGREES, reason, "SI", value=0.0, tolerance=0.0
+        )
+    joint, value = wrong[0]
+    error = max(abs(value - joint.damping) for joint, value in wrong)
+    count = f" and of {len(wrong) - 1} other joints" if len(wrong) > 1 else ""
+    source = joint.fields.get("damping", joint.source)
+    reason = (
+        f"{context.title} {context.version} reads the damping of joint {joint.name}{count} as {value:g}; "
+        f"the file says {joint.damping:g} ({source}); its equations do not use it"
+    )
+    return context.make_row(
+        "model", "-", "damping", Verdict.DISAGREES, reason, "SI", value=error, tolerance=0.0, diagnosis=reason
+    )
+
+
 def _quantity_row(context: RowContext, quantity: str, unit: str, worst: Mismatch, count: int) -> Row:
     agrees = worst.ratio <= 1
     where = f" at {worst.where}" if worst.where else ""
@@ -245,6 +272,8 @@ def judge_file(
         if any(row.verdict == Verdict.DISAGREES for row in found):
             explanations[name] = explanation = _explain(context, judged[0], answer, states, applies)
             found = [_with_diagnosis(row, explanation) for row in found]
+        if not applies and answer.reading is not None and answer.reading.model is not None:
+            found.append(_damping_row(context, model, answer.reading.model))
         rows += found
     poses = truths[0].quantities.poses if truths else {}
     return FileResult(shown, model, tuple(rows), explanations, poses)

@@ -1,9 +1,11 @@
 """Causes of importers' differences: planted defects of many kinds are reported and named; nothing else is."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from plumbline.engines.importer_calls import evaluate_model_file, read_model_file
+from plumbline.engines.importer_calls import describe_importer, evaluate_model_file, read_model_file
 from plumbline.importers.importer import ModelFile
 from plumbline.importers.model_file import prepare_file
 from plumbline.importers.xml_tree import parse_xml, write_xml
@@ -94,3 +96,69 @@ def test_an_undisturbed_importer_is_silent(tmp_path):
         result = judged(tmp_path, text, text, suffix)
         assert {row.verdict for row in result.rows} == {Verdict.AGREES}
         assert not result.explanations
+
+
+MASSLESS = """<robot name="arm"><link name="base"/>
+<link name="upper"><inertial><mass value="2"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>
+</inertial></link>
+<link name="tip"><inertial><mass value="0"/>
+<inertia ixx="0.1" ixy="0" ixz="0" iyy="0.1" iyz="0" izz="0.1"/></inertial></link>
+<joint name="j" type="continuous"><parent link="base"/><child link="upper"/><axis xyz="0 1 0"/></joint>
+<joint name="f" type="fixed"><parent link="upper"/><child link="tip"/></joint></robot>
+"""
+
+
+def test_mujoco_leaves_out_the_inertia_of_massless_fixed_links(tmp_path):
+    """A difference of MuJoCo 4.0.0 itself, seen on robots of pybullet and example-robot-data."""
+    result = judged(tmp_path, MASSLESS, MASSLESS, ".urdf")
+    ((cause,),) = (explanation.causes for explanation in result.explanations.values())
+    assert "leaves out the inertia of tip (0 kg, " in cause.sentence
+    assert "robot.urdf:4), fixed to body upper; this alone explains every quantity" in cause.sentence
+
+
+def test_damping_that_is_held_and_not_applied_is_judged_as_it_is_read(tmp_path):
+    text = MASSLESS.replace('value="0"', 'value="1"').replace(
+        '<axis xyz="0 1 0"/>', '<axis xyz="0 1 0"/><dynamics damping="0.3"/>'
+    )
+    path = tmp_path / "arm.urdf"
+    path.write_text(text)
+    prepared = prepare_file(str(path), tmp_path)
+    info = describe_importer("pinocchio")
+    reading = read_model_file("pinocchio", prepared.file)
+    states = model_states(reading.model, STATES, state_seed(str(path)))
+    answer = Answer(reading, states, tuple(evaluate_model_file("pinocchio", prepared.file, states)))
+    model = prepared.neutral_model(None)
+    for said, verdict in ((0.3, Verdict.AGREES), (0.4, Verdict.DISAGREES)):
+        joint = replace(model.joints[0], damping=said)
+        bodies = tuple(replace(b, joints=(joint,)) if b.joints else b for b in model.bodies)
+        result = judge_file(
+            str(path), replace(model, bodies=bodies), [("pinocchio", info, answer)], STATES, None
+        )
+        verdicts = {row.quantity: row.verdict for row in result.rows}
+        assert verdicts["damping"] == verdict
+        assert verdicts["acceleration"] == Verdict.AGREES
+
+
+ARMATURE = """<mujoco><worldbody><body name="a"><joint name="j" axis="0 1 0" armature="0.5"/>
+<inertial pos="0 0 -1" mass="1" diaginertia="1 1 1"/>
+<body name="b" pos="0 0 -1"><joint name="k" axis="0 -1 0" armature="0.5"/>
+<inertial pos="0 0 -1" mass="1" diaginertia="1 1 1"/></body></body></worldbody></mujoco>
+"""
+
+
+def test_pinocchio_leaves_some_armatures_out_of_its_kinetic_energy(tmp_path):
+    """A difference of Pinocchio 4.1.0 itself: of joints whose axis is no positive coordinate axis."""
+    path = tmp_path / "m.xml"
+    path.write_text(ARMATURE)
+    prepared = prepare_file(str(path), tmp_path)
+    model = prepared.neutral_model(read_model_file("mujoco", prepared.file))
+    reading = read_model_file("pinocchio", prepared.file)
+    states = model_states(reading.model, STATES, state_seed(str(path)))
+    answer = Answer(reading, states, tuple(evaluate_model_file("pinocchio", prepared.file, states)))
+    result = judge_file(
+        str(path), model, [("pinocchio", describe_importer("pinocchio"), answer)], STATES, None
+    )
+    assert {row.quantity for row in result.rows if row.verdict == Verdict.DISAGREES} == {"kinetic_energy"}
+    ((cause,),) = (explanation.causes for explanation in result.explanations.values())
+    assert "leaves the armature of joint k out of its kinetic energy" in cause.sentence
+    assert "m.xml:3); this alone explains every quantity" in cause.sentence
