@@ -111,7 +111,7 @@ class ScenarioRun:
         if not scenario.model.is_chain:  # not yet covered of trees
             kinds = [TaskKind.STEP]
             if scenario.model.has_elements:
-                kinds += [TaskKind.MOTION_TRUTH, TaskKind.TRAJECTORY, TaskKind.LONG_RUN]
+                kinds += [TaskKind.MOTION_TRUTH, TaskKind.TRAJECTORY, TaskKind.LONG_RUN, TaskKind.RELATIONS]
             self._keys = [key for key in self._keys if key.kind not in kinds]
         self._pending = set(self._keys)  # without an outcome
         self._findings: dict[TaskKey, JudgingResult] = {}

@@ -9,10 +9,8 @@ from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import KINDS, Unsupported
 from plumbline.model.kinematics import complete_state, quaternion_product
 from plumbline.model.sampling import random_states
-from plumbline.truth import TruthUnavailable
 from plumbline.truth.certified import certify_state
 from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, state_rounding_bound
-from plumbline.truth.taylor import simulate_taylor
 from tests.helpers.random_trees import ELEMENTS, random_tree
 
 ENGINES = ["reference", "mujoco", "pinocchio", "pinocchio-aba", "pinocchio-maximal", "exudyn", "exudyn-tree"]
@@ -107,8 +105,6 @@ def test_motions_with_elements_are_refused(engine):
     name, times = adapter.integrators[0].name, np.array([0.0, 0.125])
     with pytest.raises(Unsupported, match="no motions with rotors, springs"):
         adapter.simulate(model, state, times, name, 0.125 if adapter.integrators[0].kind == "step" else 1e-9)
-    with pytest.raises(TruthUnavailable, match="no rotors, springs"):
-        simulate_taylor(model, state, times, "quad")
 
 
 @pytest.mark.parametrize("engine", ["reference-printed"])
