@@ -39,6 +39,7 @@ from plumbline.truth.model_comparison import (
 RELATIVE_CHANGE = 1e-11  # differences of descriptions below this are rounding
 JOINT_FIELDS = ("axis", "anchor", "reference", "armature", "damping", "stiffness", "spring_reference")
 BODY_FIELDS = ("position", "attitude", "mass", "center", "inertia")
+DEFAULT_INERTIAL = "default inertial"
 FRAME = "frame"
 FRAME_FIELDS = ("position", "attitude", "anchor", "reference")  # which may describe one pose in several ways
 MAX_OMISSIONS = 4
@@ -155,7 +156,7 @@ def _single_parts(changes: Sequence[Change], model: NeutralModel, theirs: Neutra
     found = list(changes)
     for name, parts in fixed_parts(model).items():
         inertial = [c for c in found if c.body == name and c.field in ("mass", "center", "inertia")]
-        if not inertial or len(parts) == 1:
+        if not inertial:
             continue
         single = _single_part(parts, named[name])
         if single is not None:
@@ -175,13 +176,19 @@ def _single_part(parts: Sequence[tuple[NeutralBody, Array, Array]], read: Neutra
         trials.append(("inertial", {"mass": 0.0, "center": np.zeros(3), "inertia": np.zeros((3, 3))}))
         for name, values in trials:
             changed = [*parts[:place], (replace(part, **values), *parts[place][1:]), *parts[place + 1 :]]
-            one = _merge(changed)
-            size = float(np.linalg.norm(one.center))
-            if not any(_differs(getattr(one, n), value, size * (n == "center")) for n, value in also.items()):
+            if _is_same_inertial(_merge(changed), read):
                 own, new = (part.mass, 0.0) if name == "inertial" else (getattr(part, name), values[name])
                 source = part.fields.get(name, part.source)
                 carrier = parts[0][0].name
                 return Change(name, part.name, "", own, new, source, also=also, carrier=carrier)
+    empty = [part for part, _, _ in parts if part.mass == 0 and not np.any(part.inertia)]
+    given = [
+        (replace(part, mass=1.0, inertia=np.eye(3)) if part in empty else part, position, A)
+        for part, position, A in parts
+    ]
+    if empty and _is_same_inertial(_merge(given), read):
+        names, source = ", ".join(part.name for part in empty), empty[0].source
+        return Change(DEFAULT_INERTIAL, names, "", 0.0, 1.0, source, also=also, carrier=parts[0][0].name)
     massless = [part for part, _, _ in parts[1:] if part.mass == 0 and np.any(part.inertia)]
     kept = [entry for entry in parts if entry[0] not in massless]
     if massless and not _differs(_merge(kept).inertia, read.inertia, 0.0):
@@ -189,6 +196,16 @@ def _single_part(parts: Sequence[tuple[NeutralBody, Array, Array]], read: Neutra
         source, carrier = massless[0].fields.get("inertia", massless[0].source), parts[0][0].name
         return Change("inertial", names, "", 0.0, 0.0, source, also=also, carrier=carrier)
     return None
+
+
+def _is_same_inertial(one: NeutralBody, read: NeutralBody) -> bool:
+    """Whether mass, centre of mass and inertia of two bodies are the same, but for rounding."""
+    size = float(np.linalg.norm(one.center))
+    return not (
+        _differs(one.mass, read.mass, 0.0)
+        or _differs(one.center, read.center, size)
+        or _differs(one.inertia, read.inertia, 0.0)
+    )
 
 
 def _merge(parts: Sequence[tuple[NeutralBody, Array, Array]]) -> NeutralBody:
@@ -571,13 +588,17 @@ def _describe(members: Sequence[Change]) -> str:
             f"puts the frame of {len(members)} bodies ({_names(members)}) elsewhere in the body, that of "
             f"{first.body} at {shift} ({first.source}), which moves no mass"
         )
+    if first.field == DEFAULT_INERTIAL:
+        names = "; ".join(f"{change.body} ({change.source})" for change in members[:6])
+        return f"gives 1 kg and an inertia of 1 kg m² to bodies without mass: {names}"
     if first.field == "additional body":
         names = ", ".join(change.body for change in members[:6])
         return f"adds {'body' if len(members) == 1 else 'bodies'} {names}"
     if first.field == "inertial":
         names = ", ".join(f"{change.body} ({change.own:.4g} kg, {change.source})" for change in members[:6])
         what = "mass and inertia" if first.own else "inertia"
-        return f"leaves out the {what} of {names}, fixed to body {first.carrier}"
+        where = "" if first.body == first.carrier else f", fixed to body {first.carrier}"
+        return f"leaves out the {what} of {names}{where}"
     if first.field == "joints":
         return "; ".join(
             f"reads the joints of body {c.body} as {_joint_words(c.theirs)}; "

@@ -186,6 +186,10 @@ class _ModelRun:
         found = {}
         for outcome in self.outcomes(tasks):
             reading: Reading | None = outcome.value
+            if reading is not None:  # a copy's path would mean nothing to the user
+                shown = outcome.key[1]
+                words = reading.refusal.replace(prepared[shown].file.path, shown)
+                reading = replace(reading, refusal=words)
             found[outcome.key[1:]] = Answer(reading, failure=outcome.failure or "")
         return found
 

@@ -25,7 +25,7 @@ from plumbline.importers.neutral_model import (
     without_passive_forces,
 )
 from plumbline.importers.xml_tree import Element, ModelFileError, write_xml
-from plumbline.judging.model_file import Answer, FileResult, judge_file, moving_mass, state_seed
+from plumbline.judging.model_file import Answer, FileResult, judge_file, state_seed
 from plumbline.judging.rows import Verdict
 from plumbline.processes.errors import PlumblineError
 from plumbline.processes.isolation import ScratchFolder
@@ -39,7 +39,7 @@ from plumbline.truth.model_comparison import (
     permuted,
 )
 
-FORMS = ("mujoco", "pinocchio", "drake")
+FORMS = ("mujoco", "pinocchio", "drake", "dart")
 SHRINKING_SECONDS = 60.0
 SHRINKING_STATES = 2
 TASK_SECONDS = 30.0
@@ -295,14 +295,13 @@ def _shown_number(bench: _Bench, model: NeutralModel, reading: NeutralModel) -> 
         count = float(reading.velocity_count)
         state = CanonicalState(np.zeros(0), np.zeros(0))
         return _Shown("freedom", (), "degrees of freedom", state, count, float(model.velocity_count))
-    if bench.info.name and moving_mass(model) == 0:
-        raise NoModelScript("the smallest file has no mass")
     states = _simple_states(reading)
     answers = bench.evaluate(states)
     applied = all(answer.passive_force is not None for answer in answers)
     judged = model if applied else without_passive_forces(model)
     inverse = np.argsort(order)
-    for quantity in SHOWN_QUANTITIES:
+    shown = [q for q in SHOWN_QUANTITIES if q != "passive_force" or bench.name == "mujoco"]
+    for quantity in shown:
         for state, answer in zip(states, answers, strict=True):
             own = _reordered(state, reading, model)
             (truth,) = certify_states(judged, [own])

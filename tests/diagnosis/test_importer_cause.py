@@ -162,3 +162,18 @@ def test_pinocchio_leaves_some_armatures_out_of_its_kinetic_energy(tmp_path):
     ((cause,),) = (explanation.causes for explanation in result.explanations.values())
     assert "leaves the armature of joint k out of its kinetic energy" in cause.sentence
     assert "m.xml:3); this alone explains every quantity" in cause.sentence
+
+
+def test_a_default_inertial_is_named_by_the_links_that_have_none(tmp_path):
+    """What DART 6.20.0 and PyBullet 3.2.7 do with links without <inertial>."""
+    bare = '<link name="tip"/>'
+    start, end = MASSLESS.index('<link name="tip">'), MASSLESS.index('<joint name="j"')
+    one = '<mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
+    texts = [
+        MASSLESS[:start] + tip + MASSLESS[end:]
+        for tip in (bare, f'<link name="tip"><inertial>{one}</inertial></link>')
+    ]
+    result = judged(tmp_path, *texts, ".urdf")
+    ((cause,),) = (explanation.causes for explanation in result.explanations.values())
+    assert cause.field == "default inertial"
+    assert "gives 1 kg and an inertia of 1 kg m² to bodies without mass: tip (" in cause.sentence
