@@ -312,7 +312,7 @@ class Exudyn(ExudynAdapter):
     welding_unsupported_reason = ""
     is_single_step: bool = False  # full Newton iterations to `STEP_TOLERANCES`; multipliers are sampled too
 
-    def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
+    def _check_elements(self, model: Model) -> None:
         balls = [k for k, kind in enumerate(model.kind) if kind == "ball"]
         if np.any(model.armature):
             raise Unsupported("Exudyn has no rotor between two bodies in maximal coordinates")
@@ -323,12 +323,16 @@ class Exudyn(ExudynAdapter):
                 "the angle of Exudyn's torsional spring, atan2(-A01, A00) of the relative turn A, is that "
                 "of a joint with one turn, not of a universal joint"
             )
+
+    def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
+        self._check_elements(model)
         with silence_engine():
             return [_evaluate_state(ExudynChain(model, at, self.body_pieces(model))) for at in states]
 
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
+        self._check_elements(model)
         with silence_engine():
             chain = ExudynChain(model, state)
             samples = self._run_samples(chain, times, integrator, resolution)
@@ -347,6 +351,7 @@ class Exudyn(ExudynAdapter):
     def _simulate_round_trip(
         self, model: Model, state: State, end: float, integrator: Integrator, resolution: float
     ) -> Trajectory:
+        self._check_elements(model)
         initial, leg = exudyn.ConfigurationType.Initial, np.array([0.0, end])
         with silence_engine():
             chain = ExudynChain(model, state)

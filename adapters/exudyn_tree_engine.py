@@ -429,19 +429,23 @@ class ExudynTree(ExudynAdapter):
         "a kinematic tree has revolute and prismatic joints, none that holds two links rigidly"
     )
 
-    def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
+    def _check_elements(self, model: Model) -> None:
         balls = [k for k, kind in enumerate(model.kind) if kind == "ball"]
         if any(np.any(x[balls]) for x in (model.armature, model.damping, model.stiffness)):
             raise Unsupported(
                 "a ball joint of Exudyn's kinematic tree is three revolutes, whose angles are not the "
                 "rotation vector that springs, dampers and rotors of ball joints act on"
             )
+
+    def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
+        self._check_elements(model)
         with silence_engine():
             return [_evaluate_state(_KinematicTree(model, state)) for state in states]
 
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
+        self._check_elements(model)
         with silence_engine():
             tree = _KinematicTree(model, state)
             settings = _rk44_settings()

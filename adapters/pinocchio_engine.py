@@ -53,7 +53,6 @@ from adapters.pinocchio_common import (
 from plumbline.engines.integrators import dop853, rkmk4, sample_steps, semi_implicit_euler
 from plumbline.model.datatypes import KINDS, Array, Integrator, Model, State, StateQuantities, Trajectory
 from plumbline.model.kinematics import (
-    ball_spring_rest,
     elastic_energy,
     own_rates,
     quaternion_conjugate,
@@ -309,7 +308,8 @@ class PinocchioChain:
             at, own = slice(joint.idx_v, joint.idx_v + joint.nv), slice(joint.nv)
             if model.kind[k] == "ball":
                 turn, own = np.roll(q[joint.idx_q : joint.idx_q + 4], 1), slice(1)
-                rest = quaternion_conjugate(ball_spring_rest(model, k))
+                above = self._frame_in_joint(int(model.body[k, 0]), model.turn[k, 0])  # as q
+                rest = quaternion_product(model.turn[k, 1], quaternion_conjugate(above))
                 stretch = rotation_vector(quaternion_product(rest, turn))  # body axes, as v
             else:
                 stretch = q[joint.idx_q : joint.idx_q + joint.nv] - model.rest[k, own]

@@ -126,7 +126,7 @@ class TreeSystem:
         """
         return self._solve_motion(q, v, baumgarte)[0]
 
-    def _solve_motion(self, q: Array, v: Array, a: float) -> tuple[Array, Array, _Rows]:
+    def _solve_motion(self, q: Array, v: Array, a: float, refine: bool = False) -> tuple[Array, Array, _Rows]:
         """(r̈; p̈) (7, M), the multipliers of all rows, and the rows."""
         (p, rdot, pdot), forest = (q[3:].T, v[:3].T, v[3:].T), self.forest
         with np.errstate(all="ignore"):  # what is not finite raises SingularSystem
@@ -145,7 +145,8 @@ class TreeSystem:
             if rows.element_force is not None:
                 force, of_p = force + rows.element_force[0], rows.element_force[1]
                 moment = moment + np.matvec(L(p), of_p) / (2 * norm)[:, None]
-            linear, turn, multiplier = self._eliminate(rows, p, np.concatenate([force, moment], 1), gamma)
+            body_terms = np.concatenate([force, moment], 1)
+            linear, turn, multiplier = self._eliminate(rows, p, body_terms, gamma, refine)
         found = component_first(linear, turn - along)
         if not np.isfinite(found.sum()):
             raise SingularSystem("the accelerations are not finite: S is singular, or the state is no number")
@@ -169,7 +170,8 @@ class TreeSystem:
 
         """
         self.x = self.x if x is None else x
-        motion, multiplier, rows = self._solve_motion(component_first(r, p), component_first(v, pdot), 0.0)
+        q, qdot = component_first(r, p), component_first(v, pdot)
+        motion, multiplier, rows = self._solve_motion(q, qdot, 0.0, refine=True)
         forest, c = self.forest, len(rows.C)
         pull, of_p = np.zeros((self.body_count, 3)), np.zeros((self.body_count, 4))
         np.subtract.at(pull, self.joint, multiplier[:, None] * rows.r_near)
@@ -239,11 +241,30 @@ class TreeSystem:
             (torque * found.r_near, torque * found.p_near),
         )  # fmt: skip
 
-    def _eliminate(self, rows: _Rows, p: Array, wrench: Array, gamma: Array) -> tuple[Array, Array, Array]:
-        """Solve for a: r̈ (M, 3) and Lᵀα/2π (M, 4), with b = ``wrench`` (M, 6); and for all multipliers."""
+    def _eliminate(
+        self, rows: _Rows, p: Array, wrench: Array, gamma: Array, refine: bool = False
+    ) -> tuple[Array, Array, Array]:
+        """Solve for a: r̈ (M, 3) and Lᵀα/2π (M, 4), with b = ``wrench`` (M, 6); and for all multipliers.
+
+        Refined once, it keeps the digits that a light body before a heavy one costs.
+        """
         turn = L(p).swapaxes(-1, -2) / (2 * dot(p, p))[:, None, None]
         near = np.concatenate([rows.r_near, np.vecmat(rows.p_near, turn[self.joint])], 1)
         far = np.concatenate([-rows.r_near, np.vecmat(rows.p_far, turn[self.far])], 1)
+        a, multiplier = self._substitute(near, far, wrench, gamma)
+        if refine:
+            left = wrench - np.matvec(self.inertia, a)
+            np.subtract.at(left, self.joint, multiplier[:, None] * near)
+            held = self.far >= 0
+            np.subtract.at(left, self.far[held], (multiplier[:, None] * far)[held])
+            far_a = np.where(held[:, None], a[self.far], 0.0)
+            open_ = gamma - dot(near, a[self.joint]) - dot(far, far_a) + self.compliance * multiplier
+            a_change, change = self._substitute(near, far, left, open_)
+            a, multiplier = a + a_change, multiplier + change
+        return a[:, :3], np.matvec(turn, a[:, 3:]), multiplier
+
+    def _substitute(self, near: Array, far: Array, wrench: Array, gamma: Array) -> tuple[Array, Array]:
+        """Eliminate from the leaves, substitute from the world: a (M, 6) and the multipliers."""
         A, b, kept = self.inertia.copy(), wrench.copy(), []
         try:
             for level in reversed(self.levels):
@@ -262,7 +283,7 @@ class TreeSystem:
         for level, (X, y, Z) in zip(self.levels, reversed(kept), strict=True):
             multiplier[level.row] = own = np.matvec(Z[..., :-1], a[level.far]) + Z[..., -1]
             a[level.body] = y - np.matvec(X, own)
-        return a[:-1, :3], np.matvec(turn, a[:-1, 3:]), multiplier
+        return a[:-1], multiplier
 
 
 EliminatedSystem = StructuredSystem | TreeSystem

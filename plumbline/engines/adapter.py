@@ -178,7 +178,7 @@ class Adapter(ABC):
             The trajectory at ``times``, not normalised and not projected.
 
         """
-        self._check_mechanism(model, False)
+        self._check_mechanism(model, self.builds_elements)
         check_state(model, state)
         method = self.integrator(integrator)
         if method.kind == "step":
@@ -204,7 +204,7 @@ class Adapter(ABC):
             EngineFailure: a sample, acceleration or multiplier is missing, not finite or of another shape.
 
         """
-        self._check_mechanism(model, False)
+        self._check_mechanism(model, self.builds_elements)
         check_state(model, state)
         times = np.asarray(step * np.arange(count + 1), float)
         run = self._step(model, state, times, self.integrator(integrator), step)

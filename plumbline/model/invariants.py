@@ -7,8 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 import scipy
 
-from plumbline.model.datatypes import KINDS, Array, Model, Trajectory
-from plumbline.model.kinematics import angular_velocity, joint_vectors, rotation_matrix
+from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Array, Model, Trajectory
+from plumbline.model.kinematics import (
+    angular_velocity,
+    ball_spring_rest,
+    joint_vectors,
+    quaternion_conjugate,
+    quaternion_product,
+    rotation_matrix,
+    rotation_vector,
+    spring_vectors,
+)
 
 
 def position_error(a: Array, b: Array) -> Array:
@@ -134,6 +143,7 @@ def work_of_loads(model: Model, run: Trajectory, omega: Array) -> tuple[Array, f
         np.einsum("ki,tki->t", model.moment, omega)
         - np.einsum("k,tki,tki->t", model.drag_force, run.v, run.v)
         - np.einsum("k,tki,tki->t", model.drag_moment, omega, omega)
+        + element_energies(model, run, omega).power
     )
     if not np.any(power) or len(run.t) < 13:
         return exact, 0.0
@@ -160,10 +170,13 @@ def compute_invariants(model: Model, run: Trajectory) -> Invariants:
     """
     omega = angular_velocity(run.p, run.pdot)
     energy = kinetic_energy(model, run.v, omega) + potential_energy(model, run.r)
+    elements = element_energies(model, run, omega)
+    energy = energy + elements.rotors + elements.springs
     done, uncertainty = work_of_loads(model, run, omega)
     gravity = np.linalg.norm(model.gravity)
     momentum = None
-    if gravity > 0 and not (model.has_loads or model.has_drag) and _turns_freely_about_gravity(model):
+    is_bare = not (model.has_loads or model.has_drag or model.has_elements)
+    if gravity > 0 and is_bare and _turns_freely_about_gravity(model):
         about = angular_momentum(model, run.r, run.p, run.v, omega) @ (model.gravity / gravity)
         momentum = (about - about[0])[:, None, None]
     d = joint_vectors(model, run.r, run.p)
@@ -183,6 +196,92 @@ def compute_invariants(model: Model, run: Trajectory) -> Invariants:
         norm_drift=np.linalg.norm(run.p, axis=-1, keepdims=True) - 1,
         work_uncertainty=uncertainty,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class ElementEnergies:
+    """What rotors, springs, dampers and efforts hold and do along a run of T samples; zeros without any."""
+
+    rotors: Array  # (T,) J
+    springs: Array  # (T,) J
+    power: Array  # (T,) W: of efforts, less what dampers take
+
+
+def element_energies(model: Model, run: Trajectory, omega: Array) -> ElementEnergies:
+    """Compute the energies of passive elements and the power of efforts and dampers.
+
+    Angles start between −π and π and are continuous from sample to sample.
+
+    Args:
+        model: the mechanism.
+        run: T samples of its motion.
+        omega: (T, N, 3) angular velocities of the run, body frame [rad/s].
+
+    Returns:
+        Their time series.
+
+    """
+    rotors, springs, power = np.zeros((3, len(run.t)))
+    if not model.has_elements:
+        return ElementEnergies(rotors, springs, power)
+    A, d, d_rate = (
+        rotation_matrix(run.p),
+        joint_vectors(model, run.r, run.p),
+        joint_vector_rates(model, run, omega),
+    )
+    spin = np.matvec(A, omega)
+    for k, far in enumerate(model.body[:, 0]):
+        if not any(np.any(getattr(model, name)[k]) for name in JOINT_ELEMENTS):
+            continue
+        still = np.tile(np.eye(3), (len(run.t), 1, 1))
+        above, far_spin = (A[:, far], spin[:, far]) if far >= 0 else (still, 0 * spin[:, k])
+        far_axes, near_axes = (
+            above @ rotation_matrix(model.turn[k, 0]),
+            A[:, k] @ rotation_matrix(model.turn[k, 1]),
+        )
+        relative, turning = far_axes.mT @ near_axes, spin[:, k] - far_spin
+        if model.kind[k] == "ball":
+            rest = ball_spring_rest(model, k)
+            unloaded = quaternion_product(run.p[:, far], rest) if far >= 0 else np.tile(rest, (len(run.t), 1))
+            turn = rotation_vector(quaternion_product(quaternion_conjugate(unloaded), run.p[:, k]))
+            pairs = [(0, turn, turning)]
+        else:
+            pairs = []
+            for i, (what, axis) in enumerate(KINDS[model.kind[k]].motions):
+                along = far_axes[..., axis] if i == 0 or what == "slide" else near_axes[..., axis]
+                if what == "slide":
+                    x, rate = _dot(along, d[:, k]), _dot(along, d_rate[:, k] - np.cross(far_spin, d[:, k]))
+                else:
+                    one, two = (axis + 1) % 3, (axis + 2) % 3
+                    kept = (
+                        two if model.kind[k] == "universal" and i == 1 else one
+                    )  # perpendicular to both axes
+                    sine, cosine = relative[:, two, one], relative[:, kept, kept]
+                    x, rate = np.unwrap(np.arctan2(sine, cosine)), _dot(along, turning)
+                pairs.append((i, (x - model.rest[k, i])[:, None], rate[:, None]))
+        for i, stretch, rates in pairs:
+            squares = np.sum(rates**2, axis=-1)
+            rotors += model.armature[k, i] * squares / 2
+            springs += model.stiffness[k, i] * np.sum(stretch**2, axis=-1) / 2
+            power += model.effort[k, i] * rates[:, 0] - model.damping[k, i] * squares
+    return _with_point_springs(model, run, spin, ElementEnergies(rotors, springs, power))
+
+
+def _with_point_springs(
+    model: Model, run: Trajectory, spin: Array, found: ElementEnergies
+) -> ElementEnergies:
+    """Add springs and dampers between points."""
+    d, body = spring_vectors(model, run.r, run.p), model.spring_body
+    arm = np.matvec(rotation_matrix(run.p)[:, body], model.spring_point)
+    ends = np.where((body < 0)[..., None], 0.0, run.v[:, body] + np.cross(spin[:, body], arm))
+    length = np.linalg.norm(d, axis=-1)
+    rate = _dot(d, ends[..., 1, :] - ends[..., 0, :]) / np.where(length > 0, length, 1.0)
+    springs = found.springs + ((length - model.spring_length) ** 2) @ model.spring_stiffness / 2
+    return ElementEnergies(found.rotors, springs, found.power - rate**2 @ model.spring_damping)
+
+
+def _dot(a: Array, b: Array) -> Array:
+    return np.asarray(np.sum(a * b, axis=-1))
 
 
 def joint_vector_rates(model: Model, run: Trajectory, omega: Array) -> Array:
@@ -255,6 +354,9 @@ def invariant_scales(model: Model, run: Trajectory, length: float) -> dict[str, 
     omega = angular_velocity(run.p, run.pdot)
     kinetic = float(np.max(kinetic_energy(model, run.v, omega)))
     potential = float(np.max(np.sum(model.mass * np.abs(run.r @ model.gravity), axis=-1)))
+    elements = element_energies(model, run, omega)
+    kinetic += float(np.max(elements.rotors))
+    potential = max(potential, float(np.max(elements.springs)))
     swing = float(np.ptp(potential_energy(model, run.r)))
     fall = float(np.sqrt(np.linalg.norm(model.gravity) * length))
     speed = max(fall, float(np.max(np.linalg.norm(run.v, axis=-1))))

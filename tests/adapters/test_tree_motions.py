@@ -57,6 +57,33 @@ def test_motions_of_random_trees_converge_to_the_truth(engine, mix):
     assert compared
 
 
+ELEMENTS = ("armature", "damping", "stiffness", "effort", "springs")
+
+
+@pytest.mark.parametrize("kinds", [("hinge", "slide", "universal", "cylindrical", "rod"), ("ball", "hinge")])
+@pytest.mark.parametrize("element", ELEMENTS)
+@pytest.mark.parametrize("engine", ENGINES)
+def test_motions_with_elements_converge_to_the_truth_and_conserve_energy(engine, element, kinds):
+    adapter = load_adapter(engine)
+    model = random_tree(np.random.default_rng(3), 4, kinds, loads=False, elements=(element,))
+    state, times = calm_state(model, 3), np.arange(17) / 128
+    true = simulate_notes_form(model, state, times, 1e-12)
+    for method in adapter.integrators:
+        resolutions = (2.0**-9, 2.0**-10) if method.kind == "step" else (1e-8, 1e-11)
+        try:
+            runs = [adapter.simulate(model, state, times, method.name, h) for h in resolutions]
+        except Unsupported as reason:
+            assert engine.startswith("exudyn") and any(x in str(reason) for x in ("rotor", "rotation vector"))
+            continue
+        errors = [position_error(x.r, true.r)[-1] + attitude_error(x.p, true.p)[-1] for x in runs]
+        if method.kind == "step" and errors[1] > 1e-12:
+            assert np.log2(errors[0] / errors[1]) == pytest.approx(method.order, abs=0.3), method.name
+        assert errors[1] < (1e-8 if method.kind == "tolerance" or method.order == 4 else 5e-2)
+        found = [compute_invariants(model, run) for run in runs]
+        drift = [np.max(np.abs(x.energy_drift)) for x in found]
+        assert drift[1] < 0.6 * drift[0] or drift[1] < 1e-6 + found[1].work_uncertainty, (method.name, drift)
+
+
 def test_an_engine_that_builds_no_trees_refuses_motions():
     model = random_tree(np.random.default_rng(0), 3, ("hinge",))
     (state,) = random_states(model, 1, 0)

@@ -98,15 +98,6 @@ def test_a_spring_on_a_hinge_that_has_turned_round_twice(engine):
     assert np.all(error <= bound.acceleration)
 
 
-@pytest.mark.parametrize("engine", ["reference", "mujoco", "pinocchio", "exudyn", "exudyn-tree"])
-def test_motions_with_elements_are_refused(engine):
-    adapter, model = load_adapter(engine), random_tree(np.random.default_rng(0), 2, elements=("damping",))
-    (state,) = random_states(model, 1, 0)
-    name, times = adapter.integrators[0].name, np.array([0.0, 0.125])
-    with pytest.raises(Unsupported, match="no motions with rotors, springs"):
-        adapter.simulate(model, state, times, name, 0.125 if adapter.integrators[0].kind == "step" else 1e-9)
-
-
 @pytest.mark.parametrize("engine", ["reference-printed"])
 def test_an_engine_that_builds_no_trees_gives_the_reason(engine):
     model = random_tree(np.random.default_rng(0), 3, ("hinge",))
