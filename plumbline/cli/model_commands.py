@@ -235,8 +235,9 @@ def _feature_record(feature: Feature) -> dict[str, Any]:
 def _print_file(file: FileResult, result: ModelRunResult) -> None:
     """Print the table of one file, the causes and what is not compared."""
     out = make_console(sys.stdout)
-    counts = count_noun(len(file.model.bodies), "body", "bodies"), file.model.velocity_count
-    out.print(f"[bold]{escape(file.file)}[/]: {counts[0]}, {counts[1]} degrees of freedom")
+    bodies = count_noun(len(file.model.bodies), "body", "bodies")
+    freedom = count_noun(file.model.velocity_count, "degree of freedom", "degrees of freedom")
+    out.print(f"[bold]{escape(file.file)}[/]: {bodies}, {freedom}")
     by_engine: dict[str, list[Row]] = {}
     for row in file.rows:
         by_engine.setdefault(row.engine, []).append(row)

@@ -142,7 +142,7 @@ def _with_joints_of(model: NeutralModel, reading: NeutralModel) -> tuple[list[Ch
     changes, bodies = [], []
     for body in model.bodies:
         theirs = read.get(body.name, ())
-        if _kinds(body.joints) != _kinds(theirs):
+        if _kinds(body.joints) != _kinds(theirs) and not _are_free(body.joints, theirs):
             source = body.joints[0].source if body.joints else body.source
             changes.append(Change("joints", body.name, "", body.joints, theirs, source))
             body = replace(body, joints=theirs)
@@ -213,6 +213,10 @@ def _merge(parts: Sequence[tuple[NeutralBody, Array, Array]]) -> NeutralBody:
     for added in parts[1:]:
         body = merge_bodies(body, *added)
     return body
+
+
+def _are_free(*joints: Sequence[ElementaryJoint]) -> bool:
+    return all([joint.kind for joint in one] == ["free"] for one in joints)
 
 
 def _kinds(joints: Sequence[ElementaryJoint]) -> list[tuple[str, str]]:

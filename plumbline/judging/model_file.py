@@ -29,6 +29,7 @@ from plumbline.truth.model_comparison import (
     TINY,
     Mismatch,
     certify_states,
+    joint_keys,
     joint_permutation,
     mismatches,
     model_states,
@@ -142,7 +143,7 @@ def _joints_row(
     if order is not None:
         reason = f"the same {count} joints with {model.velocity_count} degrees of freedom"
         return context.make_row("model", "-", "joints", Verdict.AGREES, reason, value=0.0, tolerance=0.0)
-    own, theirs = ({(j.name, j.kind) for j in m.joints} for m in (model, reading))
+    own, theirs = (set(joint_keys(m)) for m in (model, reading))
     parts = [
         f"{what} {', '.join(f'{name} ({kind})' for name, kind in sorted(joints)[:6])}"
         + (" …" if len(joints) > 6 else "")

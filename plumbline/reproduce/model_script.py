@@ -33,6 +33,7 @@ from plumbline.processes.workers import Limits, Task, WorkerPool
 from plumbline.reproduce.model_shrink import shrink_tree
 from plumbline.truth.model_comparison import (
     certify_states,
+    joint_keys,
     joint_permutation,
     mismatches,
     model_states,
@@ -324,10 +325,11 @@ def _shown_number(bench: _Bench, model: NeutralModel, reading: NeutralModel) -> 
 
 def _reordered(state: CanonicalState, reading: NeutralModel, model: NeutralModel) -> CanonicalState:
     """The state of a reading in the order of the model's joints."""
-    parts: Mapping[str, tuple[Any, Any]] = {
-        joint.name: (state.coordinates[x], state.velocities[v]) for joint, x, v in reading.joint_slices()
+    parts = {
+        key: (state.coordinates[x], state.velocities[v])
+        for key, (_, x, v) in zip(joint_keys(reading), reading.joint_slices(), strict=True)
     }
-    chosen = [parts[joint.name] for joint in model.joints]
+    chosen = [parts[key] for key in joint_keys(model)]
     return CanonicalState(
         np.concatenate([x for x, _ in chosen] or [np.zeros(0)]),
         np.concatenate([v for _, v in chosen] or [np.zeros(0)]),

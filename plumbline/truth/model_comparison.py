@@ -47,8 +47,8 @@ def model_states(
         return (_given_state(model, at),)
     coordinates = np.zeros((count, 0))
     velocities = np.zeros((count, 0))
-    for joint in model.joints:
-        rng = np.random.default_rng([seed, *f"{joint.kind} {joint.name}".encode()])
+    for joint, (name, kind) in zip(model.joints, joint_keys(model), strict=True):
+        rng = np.random.default_rng([seed, *f"{kind} {name}".encode()])
         v = rng.normal(size=(count, {"ball": 3, "free": 6}.get(joint.kind, 1)))
         q = rng.normal(size=(count, 4))
         q /= np.linalg.norm(q, axis=1, keepdims=True)
@@ -77,6 +77,23 @@ def _given_state(model: NeutralModel, at: Mapping[str, float]) -> CanonicalState
     return CanonicalState(np.concatenate([*parts, np.zeros(0)]), np.zeros(model.velocity_count))
 
 
+def joint_keys(model: NeutralModel) -> list[tuple[str, str]]:
+    """Identify joints across readings: free ones by their body, since importers name them otherwise.
+
+    Args:
+        model: any model.
+
+    Returns:
+        Name and kind of each joint, in canonical order.
+
+    """
+    return [
+        (f"{body.name}/free" if joint.kind == "free" else joint.name, joint.kind)
+        for body in model.bodies
+        for joint in body.joints
+    ]
+
+
 def joint_permutation(model: NeutralModel, reading: NeutralModel) -> list[int] | None:
     """Find the velocities of a model among those of an importer's reading.
 
@@ -88,8 +105,8 @@ def joint_permutation(model: NeutralModel, reading: NeutralModel) -> list[int] |
         For each velocity of the model its index in the reading; None where the joints differ in name or kind.
 
     """
-    places = {(joint.name, joint.kind): v for joint, _, v in reading.joint_slices()}
-    wanted = [(joint.name, joint.kind) for joint in model.joints]
+    places = {key: v for key, (_, _, v) in zip(joint_keys(reading), reading.joint_slices(), strict=True)}
+    wanted = joint_keys(model)
     if sorted(places) != sorted(wanted):
         return None
     return [i for key in wanted for i in range(places[key].start, places[key].stop)]

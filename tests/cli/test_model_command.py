@@ -35,7 +35,7 @@ def test_importers_that_agree_exit_with_0_and_a_table(tmp_path):
     path.write_text(ROBOT)
     result = run(path, "--engine", "mujoco", "--engine", "pinocchio", "--states", 3)
     assert result.exit_code == 0, result.output
-    assert "3 bodies, 1 degrees of freedom" in result.stdout
+    assert "3 bodies, 1 degree of freedom" in result.stdout
     assert "✗" not in result.stdout
     assert "not compared: 1 × limit" in result.stdout
     assert "left open: 1 × link without <inertial>" in result.stdout

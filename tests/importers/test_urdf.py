@@ -1,0 +1,82 @@
+"""The reader of URDF: what each kind of joint means, judged by MuJoCo's and Pinocchio's own readings."""
+
+import numpy as np
+import pytest
+
+from plumbline.engines.importer_calls import evaluate_model_file, read_model_file
+from plumbline.importers.model_file import prepare_file
+from plumbline.importers.neutral_model import without_passive_forces
+from plumbline.truth.model_comparison import (
+    certify_states,
+    joint_permutation,
+    mismatches,
+    model_states,
+    permuted,
+)
+from tests.helpers.random_robots import random_urdf
+
+
+def prepared_file(tmp_path, text, base="auto"):
+    path = tmp_path / "robot.urdf"
+    path.write_text(text)
+    return prepare_file(str(path), tmp_path, base=base)
+
+
+def ratios(prepared, importer):
+    """Error over tolerance by quantity, in the order of the file's joints."""
+    model = prepared.neutral_model(None)
+    reading = read_model_file(importer, prepared.file).model
+    order = joint_permutation(model, reading)
+    assert order is not None, [(j.name, j.kind) for j in reading.joints]
+    answers = evaluate_model_file(importer, prepared.file, model_states(reading, 3, 1))
+    if importer == "pinocchio":
+        model = without_passive_forces(model)
+    truths = certify_states(model, model_states(model, 3, 1))
+    return {n: m.ratio for n, m in mismatches(model, truths, [permuted(a, order) for a in answers]).items()}
+
+
+@pytest.mark.parametrize("importer", ["mujoco", "pinocchio"])
+@pytest.mark.parametrize("base", ["fixed", "free"])
+@pytest.mark.parametrize("kinds", [(), ("revolute", "fixed"), ("prismatic", "continuous")])
+def test_importers_that_read_a_file_alike_agree_with_the_own_reader(tmp_path, importer, base, kinds):
+    text = random_urdf(np.random.default_rng(len(kinds)), 5, kinds)
+    found = ratios(prepared_file(tmp_path, text, base), importer)
+    assert len(found) >= 7
+    assert max(found.values()) <= 1, found
+
+
+@pytest.mark.parametrize("importer", ["mujoco", "pinocchio"])
+def test_a_floating_joint_of_the_root_is_a_free_joint(tmp_path, importer):
+    text = random_urdf(np.random.default_rng(3), 3, ("revolute",)).replace("revolute", "floating", 1)
+    model = prepared_file(tmp_path, text).urdf_model
+    assert model.joints[0].kind == "free"
+    found = ratios(prepared_file(tmp_path, text), importer)
+    assert max(found.values()) <= 1, found
+
+
+def test_planar_and_inner_floating_joints_are_elementary_ones(tmp_path):
+    robots = (random_urdf(np.random.default_rng(seed), 3, ("revolute",)) for seed in range(50))
+    inner = '<parent link="link1"/><child link="link2"/>'
+    text = next(robot for robot in robots if inner in robot)
+    first, second, third = (f'name="joint{k}" type="revolute"' for k in (1, 2, 3))
+    text = text.replace(second, second.replace("revolute", "floating"))
+    text = text.replace(third, third.replace("revolute", "planar"))
+    model = prepared_file(tmp_path, text).urdf_model
+    assert first in text
+    kinds = {body.name: [joint.kind for joint in body.joints] for body in model.bodies}
+    assert sorted(map(tuple, kinds.values())) == sorted(
+        [(), ("hinge",), ("slide", "slide", "slide", "ball"), ("slide", "slide", "hinge")]
+    )
+    planar = next(b for b in model.bodies if len(b.joints) == 3)
+    x, y, angle = (joint.axis for joint in planar.joints)
+    np.testing.assert_allclose(np.cross(x, y), angle, atol=1e-15)
+
+
+def test_decimals_are_rounded_once_and_axes_normalised(tmp_path):
+    text = random_urdf(np.random.default_rng(5), 1, ("revolute",))
+    start = text.index("<axis")
+    text = text[:start] + '<axis xyz="1e200 0 1e200"/>' + text[text.index("/>", start) + 2 :]
+    text = text.replace("<mass value=", '<mass value="0.1000000000000000055511151231257827" x=', 1)
+    model = prepared_file(tmp_path, text).urdf_model
+    assert model.bodies[0].mass == 0.1
+    np.testing.assert_array_equal(model.joints[0].axis, np.array([1, 0, 1]) / np.sqrt(2))
