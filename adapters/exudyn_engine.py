@@ -63,6 +63,7 @@ from plumbline.model.kinematics import (
     rotation_matrix,
     velocity_jacobian,
 )
+from plumbline.model.loops import independent_rows
 from plumbline.model.step_methods import ConstrainedMethod, generalized_alpha
 from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 
@@ -122,6 +123,8 @@ class ExudynChain:
             add_point_spring(
                 mbs, model, i, [self._end_marker(*end) for end in zip(bodies, points, strict=True)]
             )
+        for k in range(model.n, len(model.kind)):
+            self._add_joint(k)
         mbs.Assemble()
 
     def _add_piece(self, k: int, part: RigidPart, attitude: Array, pdot: Array) -> None:
@@ -139,10 +142,10 @@ class ExudynChain:
         self.body_of_piece.append(k)
 
     def _add_joint(self, k: int) -> None:
-        model, kind, far = self.model, self.model.kind[k], self.model.body[k, 0]
+        model, kind, (far, near) = self.model, self.model.kind[k], self.model.body[k]
         ends = [
             self._end_marker(far, model.point[k, 0]),
-            self._add_marker(self.first_piece[k], model.proximal[k]),
+            self._add_marker(self.first_piece[near], model.proximal[k]),
         ]
         if kind == "free":
             self.joints.append(None)
@@ -200,7 +203,7 @@ class ExudynChain:
         """List the rows of joint k that hold something; a generic joint has a row λ = 0 per free axis.
 
         Args:
-            k: the body below the joint.
+            k: the joint.
 
         Returns:
             Their indices.
@@ -249,15 +252,15 @@ class ExudynChain:
         """Read an output of joint k: at its near point, less that at its far point.
 
         Args:
-            k: the body below the joint.
+            k: the joint.
             output_type: a member of ``exudyn.OutputVariableType``.
 
         Returns:
             The difference (3,).
 
         """
-        far = self.model.body[k, 0]
-        here = self.output_at(self.first_piece[k], output_type, self.model.proximal[k])
+        far, near = self.model.body[k]
+        here = self.output_at(self.first_piece[near], output_type, self.model.proximal[k])
         if far < 0:
             return np.asarray(here - self.model.point[k, 0] * (output_type == Output.Position))
         return here - self.output_at(self.last_piece[far], output_type, self.model.point[k, 0])
@@ -422,6 +425,10 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
     M, f, C = _system_matrices(chain)
     gamma = _constraint_accelerations(chain, C)
     used = np.any(C != 0, axis=1)  # a generic joint's free axes have none
+    if chain.model.has_loops:
+        some = np.flatnonzero(used)
+        used = np.zeros(len(C), bool)
+        used[some[independent_rows(C[some])]] = True
     x = np.zeros(len(M) + len(C))
     part = np.concatenate([np.ones(len(M), bool), used])
     C_used, gamma = C[used], gamma[used]
@@ -430,14 +437,14 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
     )
     data.SetODE2Coordinates_tt(x[: 7 * n])
     multiplier = x[7 * n :]
-    joint_rows = [chain.joint_rows(k) for k in range(chain.model.n)]
+    joint_rows = [chain.joint_rows(k) for k in range(len(chain.joints))]
+    pieces = [chain.first_piece[near] for near in chain.model.body[:, 1]]
     reaction = [
-        -C[rows, 7 * i : 7 * i + 3].T @ multiplier[rows]
-        for i, rows in zip(chain.first_piece, joint_rows, strict=True)
+        -C[rows, 7 * i : 7 * i + 3].T @ multiplier[rows] for i, rows in zip(pieces, joint_rows, strict=True)
     ]
     turning = [
         -C[rows, 7 * i + 3 : 7 * i + 7].T @ multiplier[rows]
-        for i, rows in zip(chain.first_piece, joint_rows, strict=True)
+        for i, rows in zip(pieces, joint_rows, strict=True)
     ]
     elements = _element_wrenches(chain)
     momentum = (M @ chain.qdot.ravel()).reshape(n, 7)  # 4LᵀJLṗ = 2LᵀJω′, and L Lᵀ = I gives Jω′ = ½ L (…)
@@ -446,7 +453,7 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
     r = np.array([mbs.GetObjectOutputBody(body, Output.Position) for body in chain.piece_bodies])
     weight = (M @ np.tile([*chain.model.gravity, 0, 0, 0, 0], n)).reshape(n, 7)[:, :3]
     kinetic = kinetic_energy(mbs, chain.piece_bodies, float(0.5 * np.sum(chain.qdot * momentum)))
-    rates = None if chain.welds else _coordinate_rate_map(chain.model, chain.state)
+    rates = None if chain.welds or chain.model.has_loops else _coordinate_rate_map(chain.model, chain.state)
     return StateQuantities(
         acceleration=chain.body_outputs(Output.Acceleration),
         angular_acceleration=chain.body_outputs(Output.AngularAccelerationLocal),
@@ -465,8 +472,8 @@ def _evaluate_state(chain: ExudynChain) -> StateQuantities:
 
 
 def _element_wrenches(chain: ExudynChain) -> Array:
-    """Return what spring-dampers do to the bodies below their joints: force and moment (N, 6), world axes."""
-    total = np.zeros((chain.model.n, 6))
+    """Return what spring-dampers do to the bodies below their joints: force and moment (J, 6), world axes."""
+    total = np.zeros((len(chain.model.kind), 6))
     for k, connector, pushes, axis in chain.connectors:
         output = Output.ForceLocal if pushes else Output.TorqueLocal
         own = slice(3) if pushes else slice(3, 6)
@@ -475,13 +482,14 @@ def _element_wrenches(chain: ExudynChain) -> Array:
 
 
 def _joint_moments(chain: ExudynChain, force: list[Array], of_p: list[Array]) -> Array:
-    """Return the moments (N, 3) about the near points from the generalised forces on r and p (4,).
+    """Return the moments (J, 3) about the near points from the generalised forces on r and p (4,).
 
     A ½ L Q_p is the moment about the centre of the piece that the body hangs by; angular_velocity is 2 L (…).
     """
-    A = rotation_matrix(chain.state.p)
-    about_centre = angular_velocity(chain.state.p, np.array(of_p)) / 4
-    centre = np.array([chain.piece_centre[i] for i in chain.first_piece])
+    near = chain.model.body[:, 1]
+    A = rotation_matrix(chain.state.p)[near]
+    about_centre = angular_velocity(chain.state.p[near], np.array(of_p)) / 4
+    centre = np.array([chain.piece_centre[chain.first_piece[i]] for i in near])
     lever = np.matvec(A, chain.model.proximal - centre)
     return np.asarray(np.matvec(A, about_centre) - np.cross(lever, force))
 
@@ -502,7 +510,7 @@ def _system_matrices(chain: ExudynChain) -> tuple[Array, Array, Array]:
 
         C = constraint_jacobian()
         chain.jacobian_rate = np.zeros_like(C)
-        if any(chain.model.kind[k] in CONSTRAINED_AXES for k in range(chain.model.n)):
+        if set(chain.model.kind) & set(CONSTRAINED_AXES):
             chain.jacobian_rate = _rate_along_velocity(chain, constraint_jacobian)
         return M, f, C
 

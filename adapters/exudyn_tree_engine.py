@@ -423,6 +423,7 @@ class ExudynTree(ExudynAdapter):
         "joint_reaction": "minimal coordinates have no forces at the joints"
     }
     builds_trees = builds_elements = True
+    loops_unsupported_reason = "a kinematic tree of Exudyn has no joints that close loops"
     usual_linear_solver = "EXUdense"
     linear_solvers = ("EigenSparse",)
     welding_unsupported_reason = (

@@ -28,6 +28,10 @@ the tree that is attached to the world, and are shifted to the near point.
 Rotors are the engine's armature, springs and dampers its own, a ball's spring unloaded at qpos q_a conj(q_b);
 efforts are `qfrc_applied`.  A spring between points is a spatial tendon over two sites.
 
+Loops: each closing joint's near body is cut in two parts, of which one hangs on that joint, and a weld holds
+the parts together.  MuJoCo's constraints are soft: the forces solve (A + R) f = a_ref − a₀ with R > 0.  At a
+closed state a_ref is 0 and all answers are linear in R to first order; they are extrapolated to R = 0.
+
 Welded halves are bodies without a joint on a massless one in their body's place.  The option "dense mass
 matrix" finds the accelerations by a dense solve with `mj_fullM`.  MuJoCo's solvers (PGS, CG, Newton) and
 Jacobians (dense, sparse) concern active constraints: here there are none, and the answers are the same bit
@@ -55,11 +59,15 @@ from plumbline.model.datatypes import (
     StateQuantities,
     Trajectory,
 )
+from plumbline.model.loops import CutMechanism, cut_open, determinate_part
 from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
 from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 
 JOINT_TYPES = {"turn": mujoco.mjtJoint.mjJNT_HINGE, "slide": mujoco.mjtJoint.mjJNT_SLIDE}
 FIRST_ORDER_POWERS = (1, 2, 3, 4, 5, 6)
+MAX_IMPEDANCE = 0.9999  # of soft constraints: the largest that MuJoCo accepts
+REGULARISATIONS = (1e-4, 1e-5, 1e-6)  # of MuJoCo's own R; below 1e-8 rounding spoils its solver
+MIN_SOFTNESS = 1e-9  # a smaller relative effect of R is rounding
 ROD_AXIAL_INERTIA = 0.01  # J_z of a rod over the mean principal inertia of the body that it carries
 IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -120,6 +128,11 @@ class Mujoco(MetamorphicHooks):
         return str(mujoco.mj_versionString())
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
+        if model.has_loops:
+            cut = cut_open(model)
+            tree = _MujocoChain(cut.model, ends=cut.ends)
+            with _raise_on_warnings(tree.d):
+                return [_rigid_limit(tree, cut, state) for state in states]
         chain = _MujocoChain(model, self.body_pieces(model), dense=bool(self.option))
         with _raise_on_warnings(chain.d):
             return [chain.quantities(state) for state in states]
@@ -149,7 +162,13 @@ class _MujocoChain:
     Engine body ids: ``link_ids[k]`` of link k, ``ball_ids`` of all bodies on ball joints.
     """
 
-    def __init__(self, model: Model, parts: BodyParts | None = None, dense: bool = False) -> None:
+    def __init__(
+        self,
+        model: Model,
+        parts: BodyParts | None = None,
+        dense: bool = False,
+        ends: tuple[tuple[int, int], ...] = (),
+    ) -> None:
         spec = mujoco.MjSpec()
         _compiler_options(spec).autolimits = False
         self.model, self.use_dense_solve = model, dense
@@ -168,6 +187,14 @@ class _MujocoChain:
             links.append(self._add_link(parent, k, hang, pieces))
             _add_load_actuators(spec, links[k], k, model)
         _add_tendons(spec, links, model)
+        for loop, pair in enumerate(ends):
+            names = [f"end {loop} {side}" for side in (1, 2)]
+            for k, name in zip(pair, names, strict=True):
+                _set_attributes(links[k].add_site(), name=name)
+            _set_attributes(
+                spec.add_equality(), type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_SITE,
+                name1=names[0], name2=names[1], solref=[-1.0, -1.0], solimp=[*[MAX_IMPEDANCE] * 2, 1, 0.5, 2],
+            )  # fmt: skip
         m = self.m = spec.compile()
         m.opt.gravity = model.gravity
         m.opt.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT | _autoreset_flag()
@@ -178,6 +205,8 @@ class _MujocoChain:
         self._set_elements()
         d = self.d = mujoco.MjData(m)
         mujoco.mj_setConst(m, d)
+        m.opt.tolerance, m.opt.solver = 0.0, mujoco.mjtSolver.mjSOL_NEWTON
+        self.softness = m.body_invweight0.copy(), m.dof_invweight0.copy()
         self.applied_wrenches = np.zeros((m.nbody, 6))
         self.applied_wrenches[self.link_ids, :3] = model.force
         self.readout_data = mujoco.MjData(m)
@@ -241,6 +270,10 @@ class _MujocoChain:
                 m.qpos_spring[m.jnt_qposadr[joint] + np.arange(len(rest))] = rest
         m.tendon_stiffness[:], m.tendon_damping[:] = model.spring_stiffness, model.spring_damping
         m.tendon_lengthspring[:] = model.spring_length[:, None]
+
+    def soften(self, scale: float) -> None:
+        """Scale the regularisation R of the welds: nothing else depends on these numbers."""
+        self.m.body_invweight0[:], self.m.dof_invweight0[:] = (scale * x for x in self.softness)
 
     def body_frames(self, state: State) -> tuple[Array, Array]:
         """Return the quaternions (nbody, 4) of all bodies and E (nbody, 3, nu): their ω = E ν, own frames."""
@@ -335,6 +368,26 @@ class _MujocoChain:
         for k, b in enumerate(self.link_ids):
             mujoco_function(self.m, data, mujoco.mjtObj.mjOBJ_BODY, b, out[k], 0)
         return out
+
+
+def _rigid_limit(tree: _MujocoChain, cut: CutMechanism, state: State) -> StateQuantities:
+    """Evaluate at regularisations R falling by tens, check order 1, and extrapolate to none (Neville)."""
+    there, found = cut.state(state), list[dict[str, Array]]()
+    for scale in REGULARISATIONS:
+        tree.soften(scale)
+        answer = determinate_part(cut.source, state, cut.source_quantities(tree.quantities(there)))
+        found.append({name: np.asarray(x) for name, x in vars(answer).items() if x is not None})
+    limit: dict[str, Any] = {}
+    for name, first in found[0].items():
+        second, third = found[1][name], found[2][name]
+        steps = [float(np.max(np.abs(x))) for x in (first - second, second - third)]
+        if steps[0] > MIN_SOFTNESS * np.max(np.abs(third)) and not 9 <= steps[0] / steps[1] <= 11:
+            order = np.log10(steps[0] / steps[1])
+            raise EngineFailure(f"MuJoCo's {name} is of order {order:.2g} in its regularisation, not 1")
+        pair = [(10 * x - y) / 9 for x, y in ((second, first), (third, second))]
+        value = (100 * pair[1] - pair[0]) / 99
+        limit[name] = value if value.ndim else float(value)
+    return StateQuantities(**limit)
 
 
 def _add_load_actuators(spec: Any, body: Any, k: int, model: Model) -> None:

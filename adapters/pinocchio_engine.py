@@ -16,6 +16,11 @@ B = A(q_near)ᵀ (q_far, q_near: the joint's axes in its bodies), and q_j = x, v
 slide, RX·RY for a universal, PZ·RZ for a cylindrical joint; a free body is a free flyer at its centre of
 mass, a welded body is appended to the joint of its far body.
 
+Loops: each closing joint's near body is cut in two parts, of which one hangs on that joint, and the parts are
+welded by a CONTACT_6D constraint in `constraintDynamics`, which takes loads as joint torques only; its
+proximal iterations converge where rows depend on others too.  The constraint's forces are then `fext` of the
+`rnea` that gives the joints' wrenches.
+
 Applied loads enter as `fext`, force and moment on the joint's body, in and about its frame:
 
     f = Rᵀ (F - c_t ṙ),        n = n′ - c_r ω′ + c × f.
@@ -47,6 +52,7 @@ from adapters.pinocchio_common import (
     composite,
     configuration_rate,
     energies_and_momentum,
+    init_constraint_dynamics,
     point_acceleration,
     translation,
 )
@@ -62,10 +68,12 @@ from plumbline.model.kinematics import (
     rotation_vector,
     velocity_jacobian,
 )
+from plumbline.model.loops import cut_open
 from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
 from plumbline.model.welding import BodyParts, undivided_bodies
 
 ROD_AXIAL_INERTIA = 1 / 3  # of a rod about its own axis, over the trace of the inertia that it carries
+PROXIMAL_DAMPING, MAX_PROXIMAL_STEPS = 1e-8, 50  # of constraintDynamics: any damping from 1e-12 to 1e-3 does
 MAX_DENSE_JOINTS = 10  # joints up to which their 3 × 3 blocks are solved faster as one matrix
 JOINT_MODELS = {
     "hinge": pin.JointModelRZ,
@@ -83,10 +91,17 @@ class PinocchioChain:
     of j being j - 1, q is (4 nj,) and v (3 nj,) in Pinocchio's conventions.  ``algorithm`` finds the
     accelerations: "crba" solves with the engine's mass matrix densely, "cholesky" with its own sparse
     factors, "forwardDynamics" in its solver for constraints, of which there are none, "aba" and "aba-world"
-    are its articulated-body algorithm in local and in world coordinates.
+    are its articulated-body algorithm in local and in world coordinates.  ``ends``: pairs of bodies of a tree
+    that are welded together, each at its centre of mass.
     """
 
-    def __init__(self, model: Model, algorithm: str, parts: BodyParts | None = None):
+    def __init__(
+        self,
+        model: Model,
+        algorithm: str,
+        parts: BodyParts | None = None,
+        ends: Sequence[tuple[int, int]] = (),
+    ):
         self.source_model, self.algorithm = model, algorithm
         parts = parts or undivided_bodies(model)
         self.pin_model = pin.Model()
@@ -126,6 +141,15 @@ class PinocchioChain:
         for k, joint in self.moving:
             own = slice(1 if model.kind[k] == "ball" else joint.nv)
             self.pin_model.armature[joint.idx_v : joint.idx_v + joint.nv] = model.armature[k, own]
+        self.ends = ends
+        self.welds, self.weld_data = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
+        for ends_of_loop in ends:
+            places = [(self.body_joints[k], self.placements[k]) for k in ends_of_loop]
+            kind, frame = pin.ContactType.CONTACT_6D, pin.ReferenceFrame.LOCAL
+            self.welds.append(pin.RigidConstraintModel(kind, self.pin_model, *places[0], *places[1], frame))
+            self.weld_data.append(self.welds[-1].createData())
+        if ends:
+            init_constraint_dynamics(self.pin_model, self.data, self.welds, self.weld_data)
         self._init_loads()
 
     def _add_joint(self, parent: int, joint: Any, placement: pin.SE3, name: str) -> int:
@@ -158,6 +182,7 @@ class PinocchioChain:
             place.act(pin.Force(np.zeros(3), n))
             for place, n in zip(self.placements, model.moment, strict=True)
         ]
+        self.constant_loads = list(self.loads)
         varying = np.any(model.force != 0, axis=1) | (model.drag_force != 0) | (model.drag_moment != 0)
         varying[model.spring_body[model.spring_body >= 0]] = True
         self.bodies_with_varying_loads = [int(k) for k in np.flatnonzero(varying)]
@@ -329,8 +354,12 @@ class PinocchioChain:
             v̇ (3 nj,).
 
         """
+        if self.ends:
+            self.loads = list(self.constant_loads)
         self.update_loads(q, v)
         torque = self.joint_torque(q, v)
+        if self.ends:
+            return self._closed_acceleration(q, v, torque)
         if self.algorithm in ("crba", "cholesky", "forwardDynamics"):
             engine, data = self.pin_model, self.data
             bias = pin.rnea(engine, data, q, v, self.zero_torque, self.fext) - torque
@@ -344,6 +373,20 @@ class PinocchioChain:
             return np.ravel(pin.cholesky.solve(engine, data, -bias))
         convention = pin.Convention.WORLD if self.algorithm == "aba-world" else pin.Convention.LOCAL
         return np.asarray(pin.aba(self.pin_model, self.data, q, v, torque, self.fext, convention))
+
+    def _closed_acceleration(self, q: Array, v: Array, torque: Array) -> Array:
+        """Evaluate the accelerations with the loops closed; their forces are added to the loads."""
+        engine, data = self.pin_model, self.data
+        push = torque + pin.nonLinearEffects(engine, data, q, v)
+        push -= pin.rnea(engine, data, q, v, self.zero_torque, self.fext)
+        settings = pin.ProximalSettings(1e-15, PROXIMAL_DAMPING, MAX_PROXIMAL_STEPS)
+        a = pin.constraintDynamics(engine, data, q, v, push, self.welds, self.weld_data, settings).copy()
+        for (b, c), solved in zip(self.ends, self.weld_data, strict=True):
+            force = solved.contact_force  # on b, in the frame of b and c
+            self.loads[b] += self.placements[b].act(force)
+            self.loads[c] -= self.placements[c].act(force)
+        self._add_up_loads()
+        return np.asarray(a)
 
     def exponential_coordinate_rate(self, q: Array, theta: Array, v: Array) -> Array:
         """Apply dexp⁻¹ of θ to a velocity, joint by joint.
@@ -594,6 +637,10 @@ class Pinocchio(PinocchioAdapter):
     usual_algorithm: ClassVar[str] = "crba"  # for the accelerations of state evaluation
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
+        if model.has_loops:
+            cut = cut_open(model)
+            tree = PinocchioChain(cut.model, self.usual_algorithm, ends=cut.ends)
+            return [cut.source_quantities(tree.quantities(cut.state(state))) for state in states]
         chain = PinocchioChain(model, self.option or self.usual_algorithm, self.body_pieces(model))
         return [chain.quantities(state) for state in states]
 
@@ -622,3 +669,4 @@ class PinocchioAba(Pinocchio):
     }
     options = ("crba",)
     usual_algorithm = "aba"
+    loops_unsupported_reason = "aba has no constraints; the column pinocchio closes loops"

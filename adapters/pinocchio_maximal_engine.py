@@ -40,6 +40,7 @@ from adapters.pinocchio_common import (
 )
 from plumbline.model.datatypes import KINDS, Array, Model, State, StateQuantities, Unsupported
 from plumbline.model.kinematics import JointFrame, rotation_matrix, velocity_jacobian
+from plumbline.model.loops import independent_rows, joint_coordinates
 from plumbline.model.welding import BodyParts
 
 MAX_BODIES = 30  # bodies; the engine's workspace grows with N³: 0.4 GB here, 1.5 GB at 50
@@ -76,6 +77,7 @@ class _FreeFlyerSystem:
     def quantities(self, state: State) -> StateQuantities:
         """Return all state quantities at one state."""
         engine, data, model = self.pin_model, self.data, self.source_model
+        self.u, self.udot, self.x, self.xdot = joint_coordinates(model, state)
         turn = rotation_matrix(state.p)
         local = np.matvec(turn.mT, state.v)
         q = np.hstack([state.r, np.roll(state.p, -1, axis=1)]).ravel()
@@ -83,7 +85,7 @@ class _FreeFlyerSystem:
         force = np.matvec(turn.mT, model.force) - model.drag_force[:, None] * local
         moment = model.moment - model.drag_moment[:, None] * state.omega
         tau = np.hstack([force, moment]).ravel()
-        if self.use_kkt_inverse or set(model.kind) != {"ball"}:
+        if self.use_kkt_inverse or model.has_loops or set(model.kind) != {"ball"}:
             reaction, moment = self._solve_constraint_rows(state, q, v, tau)
         else:
             pin.constraintDynamics(engine, data, q, v, tau, self.contacts, self.contact_data)
@@ -109,21 +111,24 @@ class _FreeFlyerSystem:
         pin.computeJointJacobians(engine, data, q)
         pin.updateFramePlacements(engine, data)
         rows, drifts, directions = [np.zeros((0, engine.nv))], [np.zeros(0)], []
-        for k in range(model.n):
+        for k in range(len(model.kind)):
             jacobian, drift = self._relative_motion(k, state)
             push, turn = self._held_directions(k, state)
             rows += [push @ jacobian[:3], turn @ jacobian[3:]]
-            drifts += [push @ drift[:3] + model.length[k] * state.udot[k] @ state.udot[k], turn @ drift[3:]]
+            drifts += [push @ drift[:3] + model.length[k] * self.udot[k] @ self.udot[k], turn @ drift[3:]]
             directions.append((push, turn))
         constraints, bend = np.vstack(rows), np.concatenate(drifts)
+        kept = independent_rows(constraints) if model.has_loops else np.arange(len(bend))
+        multiplier = np.zeros(len(bend))
+        constraints, bend = constraints[kept], bend[kept]
         if self.use_kkt_inverse:
             force = tau - pin.nonLinearEffects(engine, data, q, v)
             inverse = pin.computeKKTContactDynamicMatrixInverse(engine, data, q, constraints, 0.0)
             x = inverse @ np.concatenate([force, -bend])
-            data.ddq, multiplier = x[: engine.nv], -x[engine.nv :]
+            data.ddq, multiplier[kept] = x[: engine.nv], -x[engine.nv :]
         else:
             pin.forwardDynamics(engine, data, q, v, tau, constraints, bend, 0.0)
-            multiplier = data.lambda_c
+            multiplier[kept] = data.lambda_c
         ends = np.cumsum([len(some) for pair in directions for some in pair])[:-1]
         parts = iter(np.split(multiplier, ends))
         wrench = np.array([[some.T @ next(parts) for some in pair] for pair in directions])
@@ -156,7 +161,7 @@ class _FreeFlyerSystem:
         drift[:3] -= np.cross(drift_far[3:], d) + np.cross(spin, np.cross(spin, d))
         carried = spin.copy()
         joint = JointFrame(model, k, placements[1].rotation)
-        for (what, axis), rate in zip(joint.axes(state.x[k]), state.xdot[k], strict=False):
+        for (what, axis), rate in zip(joint.axes(self.x[k]), self.xdot[k], strict=False):
             if what == "slide":
                 drift[:3] -= 2 * np.cross(spin, axis * rate)
             else:
@@ -168,10 +173,10 @@ class _FreeFlyerSystem:
         """Unit vectors (c, 3) along which joint k holds the near point, and about which it holds the body."""
         model, kind = self.source_model, self.source_model.kind[k]
         if KINDS[kind].has_attitude:
-            push = {"rod": state.u[k : k + 1], "ball": np.eye(3), "free": np.zeros((0, 3))}[kind]
+            push = {"rod": self.u[k : k + 1], "ball": np.eye(3), "free": np.zeros((0, 3))}[kind]
             return push, np.zeros((0, 3))
         far = self.data.oMf[self.far_frames[k]].rotation
-        axes = JointFrame(model, k, far).axes(state.x[k])
+        axes = JointFrame(model, k, far).axes(self.x[k])
         slides, turns = ([axis for what, axis in axes if what == name] for name in ("slide", "turn"))
         return _complement(slides), _complement(turns)
 

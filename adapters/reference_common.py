@@ -98,7 +98,7 @@ def state_quantities(
         kinetic_energy=float(y @ T @ y) / 2,
         potential_energy=spring_energy - float(np.sum(model.mass * (r @ model.gravity))),
         angular_momentum=np.sum(np.cross(r, model.mass[:, None] * v) + spin[..., 0], axis=0),
-        mass_matrix=Z.T @ T @ Z,
+        mass_matrix=None if model.has_loops else Z.T @ T @ Z,
     )
 
 

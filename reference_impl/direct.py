@@ -1,12 +1,17 @@
-"""S x = b (N1–N5) for a chain of N bodies: assembled, solved, and the multipliers as forces (E5)."""
+"""S x = b (N1–N5) for N bodies on joints: assembled, solved, and the multipliers as forces (E5).
+
+In a loop rows may depend on others.  Rows are then kept by a pivoted QR of the scaled rows, of C without its
+part along p, which the normalisation rows hold; the kept ones determine r̈ and p̈.  λ is determined up to Z,
+the null space of these rows' transpose, and of a joint's wrench the part perpendicular to the wrenches of Z.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack
+from scipy.linalg import lapack, null_space, qr
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
@@ -17,6 +22,7 @@ from reference_impl.joints import ConstraintRows, constraint_rows, joint_of_rows
 from reference_impl.mechanism import Array, Mechanism
 
 EPS = float(np.finfo(float).eps)
+RANK_TOLERANCE = 1e-11  # of scaled rows: below it a row of a loop depends on the others
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +35,14 @@ class Solution:
     multiplier: Array
     norm_multiplier: Array  # (N,) λ_E: no physical meaning, not comparable across formulations (E2)
     joint: NDArray[np.intp]  # (c,) the joint of each row
-    tension: Array  # (N,) N, 2 ℓ λ of the rods, positive in tension; NaN at ball joints
-    joint_reaction: (
-        Array  # (N, 3) N, force on body k at the near point of joint k, world frame: −C_rᵀ λ, with elements
-    )
-    joint_moment: Array | None = None  # (N, 3) N m, moment on body k about that point, world frame
+    tension: Array  # (J,) N, 2 ℓ λ of the rods, positive in tension; NaN at ball joints
+    # (J, 3) N, force on the near body at the near point, world frame: −C_rᵀ λ, with elements
+    joint_reaction: Array
+    joint_moment: Array | None = None  # (J, 3) N m, moment on that body about that point, world frame
+    # Of loops: (c,) False where a row depends on others and was left out; (J, 6, 6) projectors of wrenches
+    # (F, N/ℓ) on their determinate parts, ℓ of `DirectSystem.wrench_length`
+    kept: NDArray[np.bool_] | None = None
+    determinate: Array | None = None
 
 
 class DirectSystem:
@@ -59,9 +68,9 @@ class DirectSystem:
         self._masses = np.repeat(chain.mass, 3)
         self._drag = bool(chain.drag_force.any() or chain.drag_moment.any())
         self._weight = chain.mass[:, None] * chain.gravity + chain.force
-        far = chain.body[joint, 0]
+        far, near = chain.body[joint].T
         self._far = np.flatnonzero(far >= 0)
-        near, far = joint, far[self._far]
+        far = far[self._far]
         # Where each block of `_blocks` stands: rows and columns, broadcast against each other.
         places = [
             (r, r),
@@ -78,7 +87,7 @@ class DirectSystem:
         self._i, self._j = np.concatenate([i, j[self._lower :]]), np.concatenate([j, i[self._lower :]])
 
         body = _band_order(chain)
-        owner = np.concatenate([np.repeat(body, 3), np.repeat(body, 4), body[joint], body])
+        owner = np.concatenate([np.repeat(body, 3), np.repeat(body, 4), body[near], body])
         kind = np.repeat([1, 2, 0, 3], [3 * n, 4 * n, c, n])
         self._order = np.lexsort((np.arange(self.size), kind, owner))  # position in the band → printed
         place = np.argsort(self._order)
@@ -132,6 +141,8 @@ class DirectSystem:
             SingularSystem: S is singular; the message names the body and the cause (E1, E7).
 
         """
+        if self.chain.has_loops:
+            return self._solve_loops(r, p, v, pdot, gamma_defect, x)
         return self._solution_from_unknowns(p, *self.solve_unknowns(r, p, v, pdot, gamma_defect, x))
 
     def solve_unknowns(
@@ -205,6 +216,58 @@ class DirectSystem:
         values, b, joints, elements = self._entries(r, p, v, pdot, x)
         return self._solution_from_unknowns(p, solve_dense(self._dense(values), b), joints, elements)
 
+    def _solve_loops(
+        self, r: Array, p: Array, v: Array, pdot: Array, gamma_defect: float | Array, x: Array | None
+    ) -> Solution:
+        """Solve with the rows that do not depend on others, by dense factors."""
+        n, c, plain = self.chain.n, len(self.joint), len(self.joint) - self.rotor_count
+        values, b, joints, elements = self._entries(r, p, v, pdot, x)
+        S = self._dense(values)
+        b[7 * n : 7 * n + c] += gamma_defect
+        check_state_solvable(self.chain, r, p, joints.d, self._rods, (values, b, v))
+        rows = S[7 * n : 7 * n + plain, : 7 * n].copy()
+        of_p = rows[:, 3 * n :].reshape(plain, n, 4)
+        of_p -= p * (dot(of_p, p) / dot(p, p))[..., None]
+        scale = 1 / np.linalg.norm(rows, axis=1)
+        rows *= scale[:, None]
+        _, triangle, order = qr(rows.T, mode="economic", pivoting=True)
+        size = np.abs(np.diagonal(triangle))
+        used = np.ones(self.size, bool)
+        used[7 * n + order[int(np.sum(size > RANK_TOLERANCE * size[0])) :]] = False
+        unknowns = np.zeros(self.size)
+        unknowns[used] = solve_dense(S[np.ix_(used, used)], b[used])
+        solution = self._solution_from_unknowns(p, unknowns, joints, elements)
+        null = np.zeros((c, plain - int(np.sum(used[7 * n : 7 * n + plain]))))
+        null[:plain] = null_space(rows.T, rcond=RANK_TOLERANCE) * scale[:, None]
+        determinate = self._determinate(p, null, joints)
+        return replace(solution, kept=used[7 * n : 7 * n + c], determinate=determinate)
+
+    def _determinate(self, p: Array, null: Array, joints: ConstraintRows) -> Array:
+        """Projectors (J, 6, 6) off the wrenches (F, N/ℓ) of multipliers (c, z) that hold nothing."""
+        count = len(self.chain.kind)
+        found, projectors = np.zeros((null.shape[1], count, 6)), np.tile(np.eye(6), (count, 1, 1))
+        for wrench, multiplier in zip(found, null.T, strict=True):
+            force, of_p = self._constraint_forces(multiplier, joints)
+            moment = joint_moments(self.chain, p, force, of_p)
+            wrench[:] = np.concatenate([force, moment / self.wrench_length], axis=1)
+        for k, projector in enumerate(projectors):
+            vectors, sizes, _ = np.linalg.svd(found[:, k].T, full_matrices=False)
+            lost = vectors[:, sizes > RANK_TOLERANCE * np.max(np.abs(found), initial=0.0)]
+            projector -= lost @ lost.T
+        return projectors
+
+    @property
+    def wrench_length(self) -> float:
+        """ℓ [m], the mean distance of joints from centres of mass: N/ℓ is comparable with F."""
+        return float(np.mean(np.linalg.norm(self.chain.point, axis=2))) or 1.0
+
+    def _constraint_forces(self, multiplier: Array, joints: ConstraintRows) -> tuple[Array, Array]:
+        """Forces (J, 3) and generalised forces on p (J, 4) of the joints' rows on the near bodies."""
+        force, of_p = np.zeros((len(self.chain.kind), 3)), np.zeros((len(self.chain.kind), 4))
+        np.add.at(force, self.joint, -multiplier[:, None] * joints.r_near)
+        np.add.at(of_p, self.joint, -multiplier[:, None] * joints.p_near)
+        return force, of_p
+
     def _dense(self, values: Array) -> Array:
         S = np.zeros((self.size, self.size))
         S[self._i, self._j] = values
@@ -220,9 +283,8 @@ class DirectSystem:
             elements, own = self.elements.evaluate(r, p, v, pdot, x), self.elements.rotors
             rotors = self.elements.armature[own]
             rows = elements.r_near[own], elements.p_near[own], elements.p_far[own], -elements.bias[own]
-            joints = joints.followed_by(
-                self.elements.joint[own], chain.body[self.elements.joint[own], 0], *rows
-            )
+            of_rotors = self.elements.joint[own]
+            joints = joints.followed_by(of_rotors, *chain.body[of_rotors, ::-1].T, *rows)
         L_, L_rate = L(p), L(pdot)
         JL = chain.inertia @ L_
         blocks = (
@@ -253,13 +315,11 @@ class DirectSystem:
         """The parts of x, and λ as forces."""
         n, c = self.chain.n, len(self.joint)
         multiplier = x[7 * n : 7 * n + c]
-        reaction, of_p = np.zeros((n, 3)), np.zeros((n, 4))
-        np.add.at(reaction, self.joint, multiplier[:, None] * joints.r_near)
-        np.add.at(of_p, self.joint, multiplier[:, None] * joints.p_near)
+        reaction, of_p = self._constraint_forces(multiplier, joints)
         if self.elements and elements:
-            np.add.at(reaction, self.elements.joint, -elements.torque[:, None] * elements.r_near)
-            np.add.at(of_p, self.elements.joint, -elements.torque[:, None] * elements.p_near)
-        tension, rod = np.full(n, np.nan), self._rods
+            np.add.at(reaction, self.elements.joint, elements.torque[:, None] * elements.r_near)
+            np.add.at(of_p, self.elements.joint, elements.torque[:, None] * elements.p_near)
+        tension, rod = np.full(len(self.chain.kind), np.nan), self._rods
         tension[rod] = 2 * self.chain.length[rod] * multiplier[rod[self.joint]]
         return Solution(
             acceleration=x[: 3 * n].reshape(n, 3),
@@ -268,8 +328,8 @@ class DirectSystem:
             norm_multiplier=x[7 * n + c :],
             joint=self.joint,
             tension=tension,
-            joint_reaction=-reaction,
-            joint_moment=joint_moments(self.chain, p, -reaction, -of_p),
+            joint_reaction=reaction,
+            joint_moment=joint_moments(self.chain, p, reaction, of_p),
         )
 
 
@@ -281,13 +341,14 @@ def joint_moments(chain: Mechanism, p: Array, force: Array, of_p: Array) -> Arra
     Args:
         chain: the mechanism.
         p: Euler parameters (N, 4).
-        force: (N, 3) [N], world frame.
-        of_p: Q_p (N, 4) [N m].
+        force: (J, 3) [N], on the near bodies, world frame.
+        of_p: Q_p (J, 4) [N m].
 
     Returns:
-        (N, 3) [N m], world frame.
+        (J, 3) [N m], world frame.
 
     """
+    p = p[chain.body[:, 1]]
     turn = A(p)
     near = (turn @ chain.point[:, 1, :, None])[..., 0]
     about_centre = (turn @ (L(p) @ of_p[..., None]))[..., 0] / 2
@@ -365,7 +426,7 @@ def check_state_solvable(
         p: Euler parameters (N, 4).
         d: vectors along the rods (N, 3) [m].  One below its own rounding (16 ε of the vectors that it is the
             sum of) counts as zero, because a row made of it would be noise.
-        rods: (N,) True where joint k is a rod.
+        rods: (J,) True where joint k is a rod.
         entries: arrays that must be finite: entries of S and b, and ṙ.
 
     Raises:
@@ -382,7 +443,7 @@ def check_state_solvable(
         raise SingularSystem(f"p of body {body} is 0: 4 LᵀJL and the normalisation row vanish with it (E7)")
     if not rods.any():
         return
-    spans = [r, of_far_body(r, chain.body[:, 0]), chain.point[:, 1], chain.point[:, 0]]
+    spans = [r[chain.body[:, 1]], of_far_body(r, chain.body[:, 0]), chain.point[:, 1], chain.point[:, 0]]
     rounding = 16 * EPS * np.max(np.abs(spans), axis=(0, 2))
     collapsed = rods & (np.sqrt(dot(d, d)) <= rounding)
     if collapsed.any():

@@ -67,7 +67,7 @@ class Elements:
         self.armature, self.damping, self.stiffness = m.armature[at], m.damping[at], m.stiffness[at]
         self.effort, self.rest = m.effort[at], m.rest[at]
         self.rotors = np.flatnonzero(self.armature)  # coordinates that have a row of their own
-        self.bodies = np.stack([self.joint, m.body[self.joint, 0]])  # (2, e) near, far
+        self.bodies = m.body[self.joint, ::-1].T  # (2, e) near, far
         self.points = np.moveaxis(m.point[self.joint, ::-1], 1, 0)
         self.turns = np.moveaxis(m.turn[self.joint, ::-1], 1, 0)
 

@@ -1,9 +1,9 @@
-"""The constraints of a tree of N bodies: C, C_r, C_p, γ of every joint, each row a product of two vectors.
+"""The constraints of N bodies: C, C_r, C_p, γ of every joint, each row a product of two vectors.
 
-Joint k touches body k, its near body, and its far body or the world.  With d from the far to the near point,
-f = (x, y, z) the joint's axes fixed in the far body, h = (X, Y, Z) the same in the near body, and
-e = (i, j, k) the world's, every row is C = uᵀw with u and w out of these (`KINDS` lists them).  Exact for
-every p,
+A joint touches its near body (in the tree joint k body k) and its far body or the world.  With d from the
+far to the near point, f = (x, y, z) the joint's axes fixed in the far body, h = (X, Y, Z) the same in the
+near body, and e = (i, j, k) the world's, every row is C = uᵀw with u and w out of these (`KINDS` lists them).
+Exact for every p,
 
     (L1)  (A s)_p = 2 H(p,s),   (A s)˙ = 2 H(p,s) ṗ,   (A s)¨ = 2 H(p,s) p̈ + 2 H(ṗ,s) ṗ               (N8)
     (L2)  C_q = uᵀ w_q + wᵀ u_q
@@ -38,27 +38,28 @@ VECTORS = "ijkxyzXYZd"  # what rows are products of
 class ConstraintRows:
     """The joints' rows in the order of the joints, c in all."""
 
-    joint: NDArray[np.intp]  # (c,) the joint of the row; its near body
+    joint: NDArray[np.intp]  # (c,) the joint of the row
+    near: NDArray[np.intp]  # (c,) the near body of the row
     far: NDArray[np.intp]  # (c,) the far body of the row, −1 the world
     C: AnyArray  # (c,) m² of a rod, m or 1 of the others
     r_near: AnyArray  # (c, 3) ∂C/∂r of the near body; of the far body it is −r_near
     p_near: AnyArray  # (c, 4) ∂C/∂p of the near body
     p_far: AnyArray  # (c, 4) ∂C/∂p of the far body; 0 for the world
     gamma: AnyArray  # (c,) C̈ = C_r r̈ + C_p p̈ − γ
-    d: AnyArray  # (N, 3) m, world frame, from the far to the near point of joint k
+    d: AnyArray  # (J, 3) m, world frame, from the far to the near point of joint k
 
     def followed_by(self, joint: NDArray[np.intp], *rows: AnyArray) -> ConstraintRows:
         """Append rows that hold nothing: those of rotors, whose C counts as 0.
 
         Args:
             joint: (m,) their joints.
-            *rows: their far bodies (m,), and ∂/∂r near, ∂/∂p near, ∂/∂p far and γ.
+            *rows: their near and far bodies (m,), and ∂/∂r near, ∂/∂p near, ∂/∂p far and γ.
 
         Returns:
             All rows.
 
         """
-        names = ("joint", "far", "r_near", "p_near", "p_far", "gamma", "C")
+        names = ("joint", "near", "far", "r_near", "p_near", "p_far", "gamma", "C")
         more = zip(names, (joint, *rows, np.zeros(len(joint))), strict=True)
         return replace(self, **{name: np.concatenate([getattr(self, name), x]) for name, x in more})
 
@@ -73,7 +74,7 @@ class ConstraintRows:
             Ċ (c,): m²/s of a rod, m/s or 1/s of the others.
 
         """
-        k = self.joint
+        k = self.near
         moved = dot(self.r_near, v[k] - of_far_body(v, self.far))
         return np.asarray(moved + dot(self.p_near, pdot[k]) + dot(self.p_far, of_far_body(pdot, self.far)))
 
@@ -104,21 +105,22 @@ def joint_of_rows(mechanism: Mechanism) -> NDArray[np.intp]:
         (c,) the joint of each row, ascending.
 
     """
-    return np.repeat(np.arange(mechanism.n), [len(KINDS[kind].rows) for kind in mechanism.kind])
+    return np.repeat(np.arange(len(mechanism.kind)), [len(KINDS[kind].rows) for kind in mechanism.kind])
 
 
 @dataclass(frozen=True, eq=False)
 class _RowLayout:
     """What the rows of a mechanism have in common at every state."""
 
-    bodies: NDArray[np.intp]  # (2, N) near and far body of each joint; for the world body 0, see `s`
-    s: AnyArray  # (2, N, 3) m, their points; 0 for the world, which takes body 0 out: H(p, 0) = 0
-    B: AnyArray  # (2, N, 4, 4) B(s)
-    world_point: AnyArray  # (N, 3) m, the far point where the far body is the world, else 0
-    point_squares: AnyArray  # (N,) m²: sᵀs of both points less ℓ²
+    bodies: NDArray[np.intp]  # (2, J) near and far body of each joint; for the world body 0, see `s`
+    s: AnyArray  # (2, J, 3) m, their points; 0 for the world, which takes body 0 out: H(p, 0) = 0
+    B: AnyArray  # (2, J, 4, 4) B(s)
+    world_point: AnyArray  # (J, 3) m, the far point where the far body is the world, else 0
+    point_squares: AnyArray  # (J,) m²: sᵀs of both points less ℓ²
     rods: NDArray[np.intp] | slice  # joints that are rods; all of them as a slice, which copies nothing
     rod_rows: NDArray[np.intp]  # their rows
     joint: NDArray[np.intp]  # (c,) the joint of each row
+    near: NDArray[np.intp]  # (c,) its near body
     far: NDArray[np.intp]  # (c,) its far body, −1 the world
     product_rows: NDArray[np.intp]  # (k,) the rows that are products of `factors`
     factors: NDArray[np.intp]  # (2, k) u and w of these rows, places in VECTORS
@@ -148,9 +150,10 @@ def _row_layout(mechanism: Mechanism) -> _RowLayout:
         B=B(s),
         world_point=np.where(world[:, None], mechanism.point[:, 0], 0),
         point_squares=dot(s, s).sum(0) - mechanism.length**2,
-        rods=slice(None) if len(rods) == mechanism.n else rods,
+        rods=slice(None) if len(rods) == len(mechanism.kind) else rods,
         rod_rows=np.flatnonzero(is_rod),
         joint=joint,
+        near=near[joint],
         far=far[joint],
         product_rows=np.flatnonzero(~is_rod),
         factors=np.array(factors, np.intp).reshape(-1, 2).T,
@@ -178,10 +181,10 @@ def constraint_rows(
 
     """
     fixed = _row_layout(mechanism)
-    s, far = fixed.s, mechanism.body[:, 0]
-    q, qdot = p[fixed.bodies], pdot[fixed.bodies]  # (2, N, 4): near and far body of each joint
-    x = r - of_far_body(r, far) - fixed.world_point  # from the far body (the far point) to the near one
-    xdot = v - of_far_body(v, far)
+    s, (far, near) = fixed.s, mechanism.body.T
+    q, qdot = p[fixed.bodies], pdot[fixed.bodies]  # (2, J, 4): near and far body of each joint
+    x = r[near] - of_far_body(r, far) - fixed.world_point  # from the far body (the far point) to the near one
+    xdot = v[near] - of_far_body(v, far)
     both = np.stack([q, qdot])
     turn = G(both)
     (H_near, H_far), (H_near_rate, H_far_rate) = turn @ fixed.B + outer(s, both)  # H, Ḣ (D4)
@@ -211,19 +214,19 @@ def constraint_rows(
         H_d = np.stack([[H_near, H_far], [H_near_rate, H_far_rate]])
         vectors = _factor_vectors(fixed, d, xdot, both, H_d)
         C[row], gamma[row], r_near[row], p_near[row], p_far[row] = _product_rows(fixed, vectors)
-    return ConstraintRows(fixed.joint, fixed.far, C, r_near, p_near, p_far, gamma, d)
+    return ConstraintRows(fixed.joint, fixed.near, fixed.far, C, r_near, p_near, p_far, gamma, d)
 
 
 def _factor_vectors(
     fixed: _RowLayout, d: AnyArray, xdot: AnyArray, both: AnyArray, H_d: AnyArray
 ) -> tuple[AnyArray, ...]:
-    """The vectors of VECTORS of every joint (N, 10, 3), ∂/∂p of the near and far body, rates and ũ (L1)."""
+    """The vectors of VECTORS of every joint (J, 10, 3), ∂/∂p of the near and far body, rates and ũ (L1)."""
     n, q, qdot = len(d), both[0], both[1]
     value, rate, bias = (np.zeros((n, len(VECTORS), 3), d.dtype) for _ in range(3))
     of_p = np.zeros((2, n, len(VECTORS), 3, 4), d.dtype)  # near, far
     value[:, :3] = I3
     H, H_rate = H_d
-    swing, bend = (2 * _matrix_vector(h, qdot) for h in (H, H_rate))  # (2, N, 3): near, far
+    swing, bend = (2 * _matrix_vector(h, qdot) for h in (H, H_rate))  # (2, J, 3): near, far
     value[:, 9], rate[:, 9], bias[:, 9] = d, xdot + swing[0] - swing[1], bend[0] - bend[1]
     of_p[0, :, 9], of_p[1, :, 9] = 2 * H[0], -2 * H[1]
     k = fixed.turned

@@ -1,8 +1,9 @@
-"""The mechanism that the equations are written for: rigid bodies on joints, as an open tree."""
+"""The mechanism that the equations are written for: rigid bodies on joints, a tree and what closes it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -51,23 +52,28 @@ def _no_numbers() -> Array:
     return np.zeros(0)
 
 
+JOINT_FIELDS = ("kind", "body", "point", "turn", "length", *JOINT_ELEMENTS)
+BODY_FIELDS = ("force", "moment", "drag_force", "drag_moment")  # besides mass and inertia
+
+
 @dataclass(frozen=True, eq=False)
 class Mechanism:
-    """A tree of N rigid bodies: joint k holds body k, its near body, on a far body or on the world (−1).
+    """A tree of N rigid bodies: joint k < N holds body k, its near body, on a far body or on the world (−1).
 
     The far body of a joint comes before the near one, and the bodies of a branch follow each other (depth
-    first).  A "rod" is the notes' massless rigid rod with a ball joint at both ends, a "ball" its limit ℓ → 0
-    (E1).  A chain, each body on the one before and the first on the world's origin, is made by `chain`;
-    N = 1 and N = 2 on rods are the notes' own pendulums.
+    first).  Joints k ≥ N close loops, between any two bodies or a body and the world; J joints in all, as
+    many as bodies in a tree.  A "rod" is the notes' massless rigid rod with a ball joint at both ends, a
+    "ball" its limit ℓ → 0 (E1).  A chain, each body on the one before and the first on the world's origin, is
+    made by `chain`; N = 1 and N = 2 on rods are the notes' own pendulums.
     """
 
     mass: Array  # (N,) kg
     inertia: Array  # (N, 3, 3) kg m², J about the centre of mass, body frame
-    kind: tuple[Kind, ...]  # (N,) of the joints
-    body: NDArray[np.intp]  # (N, 2) far and near body of each joint; body[k, 0] < body[k, 1] = k
-    point: Array  # (N, 2, 3) m, far and near point of each joint, each in the frame of its body
-    turn: Array  # (N, 2, 4) unit quaternions: the joint's axes in the far and the near body
-    length: Array  # (N,) m, ℓ of a rod, 0 for other joints
+    kind: tuple[Kind, ...]  # (J,) of the joints
+    body: NDArray[np.intp]  # (J, 2) far and near body of each joint; body[k, 0] < body[k, 1] = k in the tree
+    point: Array  # (J, 2, 3) m, far and near point of each joint, each in the frame of its body
+    turn: Array  # (J, 2, 4) unit quaternions: the joint's axes in the far and the near body
+    length: Array  # (J,) m, ℓ of a rod, 0 for other joints
     gravity: Array  # (3,) m/s², world frame
     force: Array  # (N, 3) N, constant applied force at the centre of mass, world frame
     moment: Array  # (N, 3) N m, constant applied moment n′, body frame
@@ -205,12 +211,24 @@ class Mechanism:
     @property
     def is_chain(self) -> bool:
         """Whether every body hangs on the one before, the first on the world, by bare rods and balls."""
+        if self.has_loops:
+            return False
         is_row = bool(np.all(self.body[:, 0] == np.arange(self.n) - 1)) and not np.any(self.point[0, 0])
         return is_row and set(self.kind) <= {"rod", "ball"} and not self.has_elements
 
     @property
+    def has_loops(self) -> bool:
+        """Whether joints close loops."""
+        return len(self.kind) > self.n
+
+    @property
+    def tree(self) -> Mechanism:
+        """The mechanism without its closing joints; itself where there are none."""
+        return _tree_of(self) if self.has_loops else self
+
+    @property
     def proximal(self) -> Array:
-        """(N, 3) m, body frame: the point by which body k hangs, the near point of joint k."""
+        """(J, 3) m, body frame: the point by which body k hangs, the near point of joint k."""
         return self.point[:, 1]
 
     @property
@@ -220,7 +238,7 @@ class Mechanism:
 
     @property
     def rods(self) -> NDArray[np.bool_]:
-        """(N,) True where joint k is a rod."""
+        """(J,) True where joint k is a rod."""
         return np.array([kind == "rod" for kind in self.kind])
 
     @property
@@ -247,6 +265,11 @@ class Mechanism:
     def has_loads(self) -> bool:
         """Whether any constant force or moment is applied."""
         return bool(np.any(self.force) or np.any(self.moment))
+
+
+@lru_cache(maxsize=64)  # what is computed of a mechanism is remembered by its identity
+def _tree_of(mechanism: Mechanism) -> Mechanism:
+    return replace(mechanism, **{name: getattr(mechanism, name)[: mechanism.n] for name in JOINT_FIELDS})
 
 
 def _chain_kinds(length: Array) -> tuple[Kind, ...]:

@@ -29,6 +29,7 @@ from plumbline.model.datatypes import (
     Unsupported,
 )
 from plumbline.model.kinematics import rate_count
+from plumbline.model.loops import determinate_part
 
 UNIT_NORM_TOLERANCE = 8 * np.finfo(float).eps  # a quaternion normalised in double is this close to |p| = 1
 
@@ -78,6 +79,7 @@ class Adapter(ABC):
     other_formulation: ClassVar[str] = ""  # the same engine's column in other coordinates
     builds_trees: ClassVar[bool] = False  # whether states of trees with any joints are evaluated
     builds_elements: ClassVar[bool] = False  # … and of mechanisms with rotors, springs, dampers and efforts
+    loops_unsupported_reason: ClassVar[str] = ""  # why states of mechanisms with loops are not, if so
     reproduction_template: ClassVar[str] = ""  # template of stand-alone scripts; without one there are none
 
     @abstractmethod
@@ -158,6 +160,9 @@ class Adapter(ABC):
         answers = self._evaluate(model, states)
         if len(answers) != len(states):
             raise EngineFailure(f"{self.name} answered {len(answers)} of {len(states)} states")
+        if model.has_loops:
+            pairs = zip(states, answers, strict=True)
+            answers = [determinate_part(model, state, answer) for state, answer in pairs]
         for index, answer in enumerate(answers):
             _check_quantities(model, answer, f"{self.name}, state {index}")
         return answers
@@ -219,6 +224,8 @@ class Adapter(ABC):
 
     def _check_mechanism(self, model: Model, has_elements: bool) -> None:
         """Refuse what the adapter does not build, and elements unless it evaluates states with them."""
+        if self.builds_trees and model.has_loops and self.loops_unsupported_reason:
+            raise Unsupported(self.loops_unsupported_reason)
         if not (self.builds_trees or model.is_chain):
             raise Unsupported(f"the adapter of {self.title} covers chains of rods and balls from the origin")
         if model.has_elements and not has_elements:
@@ -311,11 +318,11 @@ def _check_quantities(model: Model, answer: StateQuantities, label: str) -> None
     shapes = {
         "acceleration": (model.n, 3),
         "angular_acceleration": (model.n, 3),
-        "joint_reaction": (model.n, 3),
+        "joint_reaction": (len(model.kind), 3),
         "angular_momentum": (3,),
         "kinetic_energy": (),
         "potential_energy": (),
-        "joint_moment": (model.n, 3),
+        "joint_moment": (len(model.kind), 3),
         "mass_matrix": (rate_count(model),) * 2,
     }
     for name, shape in shapes.items():

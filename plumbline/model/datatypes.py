@@ -16,8 +16,10 @@ import numpy as np
 
 from plumbline.model.step_methods import StepMethod
 from plumbline.processes.errors import PlumblineError
+from reference_impl.mechanism import BODY_FIELDS as BODY_FIELDS
 from reference_impl.mechanism import CHAIN_FIELDS as CHAIN_FIELDS
 from reference_impl.mechanism import JOINT_ELEMENTS as JOINT_ELEMENTS
+from reference_impl.mechanism import JOINT_FIELDS as JOINT_FIELDS
 from reference_impl.mechanism import KINDS as KINDS
 from reference_impl.mechanism import SPRING_FIELDS as SPRING_FIELDS
 from reference_impl.mechanism import Array as Array
@@ -77,14 +79,15 @@ class StateQuantities:
 
     acceleration: Array  # (N, 3) m/s², r̈ of the centres of mass, world frame
     angular_acceleration: Array  # (N, 3) rad/s², ω̇′, body frame
-    joint_reaction: Array | None = None  # (N, 3) N, force on body k at its joint's near point, world frame
+    # (J, 3) N, force on the near body at the joint's near point, world frame; in loops the determinate part
+    joint_reaction: Array | None = None
     kinetic_energy: float | None = None  # J
     potential_energy: float | None = None  # J, zero at the pivot: -Σ m g·r
     angular_momentum: Array | None = None  # (3,) kg m²/s about the pivot, world frame
     # (nu, nu), kinetic energy = ½ νᵀ M ν with ν = (udot of the rods in order, then body by body omega, or
     # (v, omega) of a free body, or the xdot of its joint); a rod's 3×3 part acts on udot through u × udot.
     mass_matrix: Array | None = None
-    joint_moment: Array | None = None  # (N, 3) N m, moment on body k about that point, world frame
+    joint_moment: Array | None = None  # (J, 3) N m, moment on that body about that point, world frame
 
 
 @dataclass(frozen=True, eq=False)

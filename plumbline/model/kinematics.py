@@ -255,6 +255,7 @@ def forward_kinematics(
         p (..., N, 4), ω′ (..., N, 3), r and ṙ (..., N, 3) of all bodies.
 
     """
+    model = model.tree
     r, v = (np.zeros(omega.shape) if given is None else given.copy() for given in (r, v))
     x, xdot = (np.zeros((*omega.shape[:-1], 2)) if given is None else given for given in (x, xdot))
     p, omega = p.copy(), omega.copy()
@@ -347,11 +348,11 @@ def joint_vectors(model: Model, r: Array, p: Array) -> Array:
         p: (..., N, 4) quaternions, normalised here.
 
     Returns:
-        (..., N, 3) vectors, world frame [m].
+        (..., J, 3) vectors, world frame [m].
 
     """
-    a, far = rotation_matrix(p), model.body[:, 0]
-    near = r + np.einsum("...kij,kj->...ki", a, model.proximal)
+    a, (far, body) = rotation_matrix(p), model.body.T
+    near = r[..., body, :] + np.einsum("...kij,kj->...ki", a[..., body, :, :], model.proximal)
     hang = r[..., far, :] + np.einsum("...kij,kj->...ki", a[..., far, :, :], model.point[:, 0])
     hang[..., far < 0, :] = model.point[far < 0, 0]
     return np.asarray(near - hang)
@@ -407,7 +408,7 @@ def rate_count(model: Model) -> int:
         Their number: the size of `StateQuantities.mass_matrix`.
 
     """
-    return 3 * int(model.rods.sum()) + sum(map(_own_rate_count, model.kind))
+    return 3 * int(model.tree.rods.sum()) + sum(map(_own_rate_count, model.tree.kind))
 
 
 def _own_rate_count(kind: Kind) -> int:
@@ -425,7 +426,7 @@ def own_rates(model: Model) -> list[slice]:
         N slices of ν.
 
     """
-    first = 3 * int(model.rods.sum()) + np.cumsum([0, *map(_own_rate_count, model.kind)])
+    first = 3 * int(model.tree.rods.sum()) + np.cumsum([0, *map(_own_rate_count, model.tree.kind)])
     return [slice(int(start), int(end)) for start, end in pairwise(first)]
 
 
@@ -440,7 +441,7 @@ def minimal_rates(model: Model, state: State) -> Array:
         (nu,) in the order of `velocity_jacobian`.
 
     """
-    own: list[Array] = []
+    model, own = model.tree, list[Array]()
     for k, kind in enumerate(model.kind):
         own += [state.v[k]] if kind == "free" else []
         own += [state.omega[k] if KINDS[kind].has_attitude else state.xdot[k, : len(KINDS[kind].motions)]]
@@ -463,6 +464,7 @@ def velocity_jacobian(model: Model, state: State) -> Array:
         (6N, nu) matrix; linear velocities in the world frame, angular in the body's.
 
     """
+    model = model.tree
     n, rods = model.n, np.flatnonzero(model.rods)
     a = rotation_matrix(state.p)
     near = cross(model.proximal[:, None, :], a)  # −A s̃ (N, 3, 3), row i: aᵢ·(ω′ × s) = (s × aᵢ)·ω′

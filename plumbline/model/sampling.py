@@ -7,7 +7,20 @@ import hashlib
 import numpy as np
 
 from plumbline.model.datatypes import KINDS, Model, State
-from plumbline.model.kinematics import forward_kinematics
+from plumbline.model.kinematics import forward_kinematics, own_rates
+from plumbline.model.loops import (
+    allowed_rates,
+    assembled,
+    displaced,
+    loop_gaps,
+    smallest_singular_value,
+    with_rates,
+)
+
+MIN_SAMPLED_SINGULAR_VALUE = 1e-2  # of a loop's rows: nearer to a singular pose bounds are loose
+STEPS_BETWEEN, STEP_SIZE = 2, 0.5  # random steps between two states of a loop [rad, m]
+MAX_DRAWS = 10  # draws per state that is wanted
+CLOSED = 1e-12  # gap of a loop that Newton's method has closed [m, rad]
 
 
 def derive_seed(*parts: str) -> int:
@@ -36,7 +49,10 @@ def compared_states(model: Model, state: State, digest: str, count: int) -> list
         The initial state, then the random ones.
 
     """
-    return [state, *random_states(model, count, derive_seed("states", digest))]
+    seed = derive_seed("states", digest)
+    if model.has_loops:
+        return [state, *random_loop_states(model, state, count, seed)]
+    return [state, *random_states(model, count, seed)]
 
 
 def random_states(model: Model, count: int, seed: int) -> list[State]:
@@ -55,11 +71,7 @@ def random_states(model: Model, count: int, seed: int) -> list[State]:
         The states, on the constraint manifold; ``u`` and ``udot`` are zero where the joint is a ball joint.
 
     """
-    rng = np.random.default_rng(seed)
-    hanging_length = np.linalg.norm(model.proximal, axis=1) + model.length
-    own_rate = np.sqrt(
-        max(float(np.linalg.norm(model.gravity)), 1e-3) / max(float(np.mean(hanging_length)), 1e-3)
-    )
+    rng, own_rate = np.random.default_rng(seed), _own_rate(model)
     p, omega, u, udot = (np.zeros((count, model.n, size)) for size in (4, 3, 3, 3))
     for k in range(count):
         p[k] = rng.normal(size=(model.n, 4))
@@ -81,3 +93,45 @@ def random_states(model: Model, count: int, seed: int) -> list[State]:
         r[k], v[k] = (np.where(free, size * rng.normal(size=r[k].shape), 0.0) for size in (1.0, spread))
     p, omega, r, v = forward_kinematics(model, p, omega, u, udot, r, v, x, xdot)
     return [State(*parts) for parts in zip(p, omega, u, udot, r, v, x, xdot, strict=True)]
+
+
+def random_loop_states(model: Model, state: State, count: int, seed: int) -> list[State]:
+    """Draw states of a mechanism with loops, along its own motions from an assembled one.
+
+    Steps of random directions that the loops allow are followed by Newton's method.  Rates are Gaussian as in
+    `random_states`, projected on those that the loops allow.  Poses nearer to a singular one than
+    `MIN_SAMPLED_SINGULAR_VALUE` are drawn again.
+
+    Args:
+        model: the mechanism.
+        state: assembled.
+        count: how many states.
+        seed: the same seed gives the same states.
+
+    Returns:
+        The states; fewer where the mechanism leaves its singular poses nowhere.
+
+    """
+    rng, own_rate = np.random.default_rng(seed), _own_rate(model)
+    found, here = list[State](), state
+    for _ in range(MAX_DRAWS * count):
+        if len(found) == count:
+            break
+        for _ in range(STEPS_BETWEEN):
+            step = allowed_rates(model, here, STEP_SIZE * rng.normal(size=own_rates(model)[-1].stop))
+            moved = assembled(model, displaced(model.tree, here, step))
+            if np.max(loop_gaps(model, moved)[0]) < CLOSED:
+                here = moved
+        if smallest_singular_value(model, here) < MIN_SAMPLED_SINGULAR_VALUE:
+            continue
+        spread = own_rate * 10 ** rng.uniform(-1.0, np.log10(4.0))
+        rates = allowed_rates(model, here, spread * rng.normal(size=own_rates(model)[-1].stop))
+        found.append(assembled(model, with_rates(model.tree, here, rates)))
+    return found
+
+
+def _own_rate(model: Model) -> float:
+    """√(g/ℓ) of the pendulums [rad/s]."""
+    hanging_length = np.linalg.norm(model.proximal, axis=1) + model.length
+    g = max(float(np.linalg.norm(model.gravity)), 1e-3)
+    return float(np.sqrt(g / max(float(np.mean(hanging_length)), 1e-3)))

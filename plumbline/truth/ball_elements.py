@@ -56,8 +56,10 @@ def ball_elements(c: Any) -> BallElements:
         if kind in ("rod", "free"):
             continue
         for i in range(c.S[k].ncols()):
-            x, rate, rest, push = (
-                c.arb(float(y[k, i])) for y in (c.state.x, c.state.xdot, model.rest, model.effort)
+            (x, rate), rest, push = (
+                c.coordinate(k, i),
+                c.arb(float(model.rest[k, i])),
+                c.arb(float(model.effort[k, i])),
             )
             armature[k][i] = a[i]
             effort[k][i] = push - stiffness[i] * (x - rest) - d[i] * rate

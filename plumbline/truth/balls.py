@@ -80,7 +80,19 @@ class BallVectors:
             A 3×3 matrix, body → world.
 
         """
-        w, x, y, z = (self.arb(float(c)) for c in p)
+        return self.rotation_of([self.arb(float(c)) for c in p])
+
+    def rotation_of(self, q: list[Any]) -> Any:
+        """A of a quaternion of balls, as `rotation`.
+
+        Args:
+            q: four balls, scalar first.
+
+        Returns:
+            A 3×3 matrix, body → world.
+
+        """
+        w, x, y, z = q
         ww, xx, yy, zz = w * w, x * x, y * y, z * z
         entries_ = [
             [ww + xx - yy - zz, 2 * (x * y - w * z), 2 * (x * z + w * y)],

@@ -1,6 +1,6 @@
 """Certified truth at one state: rigorous enclosures in ball arithmetic (python-flint).
 
-Of a chain on rods and balls; other mechanisms are in `certified_tree`.
+Of a chain on rods and balls; other mechanisms are in `certified_tree` and `certified_loop`.
 The minimal coordinates (p, ω′, u, u̇ as doubles) are normalised, positions and velocities follow from them,
 and the Newton–Euler equations are solved for the joint forces: eliminated onto the joints, the system is
 symmetric, positive definite and block-tridiagonal, so that a chain costs O(N).  With s̃ the cross-product
@@ -21,13 +21,16 @@ from typing import Any
 import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State, StateQuantities
+from plumbline.model.loops import determinate_part
 from plumbline.processes.errors import PlumblineError
 from plumbline.truth import import_truth_tool
 from plumbline.truth.balls import BallArithmetic, entries, flatten, midpoints, term_scales
+from plumbline.truth.certified_loop import enclose_loop
 from plumbline.truth.certified_tree import enclose_tree
 
 MAX_RELATIVE_RADIUS = 1e-25  # relative to the largest magnitude of the quantity's own terms
 MAX_BITS = 20_000
+MAX_GAP = 1e-13  # of rows of loops that depend on others, over lengths and speeds: more is another mechanism
 
 
 class CertificationFailure(PlumblineError, ArithmeticError):
@@ -39,7 +42,7 @@ class CertifiedQuantities:
     """State quantities with a bound of their error."""
 
     quantities: StateQuantities  # midpoints of the enclosures, rounded to double
-    tension: Array  # (N,) N, of each rod: 2 ℓ λ of the notes (E5), positive when it pulls; 0 for a ball joint
+    tension: Array  # (J,) N, of each rod: 2 ℓ λ of the notes (E5), positive when it pulls; 0 for a ball joint
     radius: dict[str, float]  # per quantity: largest error of the midpoints, before rounding to double
     bits: int  # precision that was needed
 
@@ -74,6 +77,11 @@ def certify_state(
         raise CertificationFailure(
             f"no enclosure below {MAX_RELATIVE_RADIUS:g} relative at {MAX_BITS} bits: singular or nearly so"
         )
+    gap, size = balls["scale"].get("gap", 0.0), max(1.0, balls["scale"]["r"], balls["scale"]["v"])
+    if gap > MAX_GAP * size:
+        raise CertificationFailure(
+            f"a loop is not closed: rows that depend on others leave a gap of {gap:.1g}"
+        )
     quantities = {name: ball for name, ball in balls.items() if name != "scale"}
     middle = {name: midpoints(ball) for name, ball in quantities.items()}
     radius = {name: max(float(x.rad()) for x in flatten(ball)) for name, ball in quantities.items()}
@@ -86,7 +94,9 @@ def certify_state(
         angular_momentum=middle["angular_momentum"],
         joint_moment=middle.get("joint_moment"),
     )
-    if mass_matrix:
+    if model.has_loops:
+        found = determinate_part(model, state, found)
+    elif mass_matrix:
         found = replace(found, mass_matrix=middle["mass_matrix"])
     return CertifiedQuantities(found, middle.get("tension", np.zeros(model.n)), radius, bits)
 
@@ -113,6 +123,8 @@ def enclose_quantities(
     flint = import_truth_tool("flint")
     with flint.ctx.workprec(bits):
         try:
+            if model.has_loops:
+                return enclose_loop(flint, model, state)
             if not model.is_chain:
                 return enclose_tree(flint, model, state, mass_matrix)
             return _solve_and_enclose(_BallChain(flint, model, state), mass_matrix)

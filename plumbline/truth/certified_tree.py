@@ -15,6 +15,7 @@ far body.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from plumbline.truth.balls import BallArithmetic, entries, midpoints, term_scale
 from plumbline.truth.joint_tree import JointTree
 
 
-class _BallTree(JointTree, BallArithmetic):
+class BallTree(JointTree, BallArithmetic):
     """Model and state in balls: lists over the bodies of 3×1 ``arb_mat`` in world axes.
 
     Attitudes A, centres r, velocities v, angular velocities w; of the joints the near points P, the motions S
@@ -48,6 +49,56 @@ class _BallTree(JointTree, BallArithmetic):
         for k in range(self.n):
             self._add_body(k)
 
+    def coordinate(self, k: int, i: int) -> tuple[Any, Any]:
+        """Return a scalar coordinate and its rate.
+
+        Args:
+            k: the joint.
+            i: which of its motions.
+
+        Returns:
+            Two balls [rad, m] and per second.
+
+        """
+        return self.arb(float(self.state.x[k, i])), self.arb(float(self.state.xdot[k, i]))
+
+    def attitude(self, k: int) -> tuple[Any, Any]:
+        """Return A and the angular velocity of a body, where they are coordinates.
+
+        Args:
+            k: the body.
+
+        Returns:
+            A 3×3 matrix, and a vector in world axes [rad/s].
+
+        """
+        A = self.rotation(self.state.p[k])
+        return A, A * self.vector(self.state.omega[k])
+
+    def rod(self, k: int) -> tuple[Any, Any]:
+        """Return the direction of a rod and its rate.
+
+        Args:
+            k: the rod.
+
+        Returns:
+            Two vectors, world axes.
+
+        """
+        return self.rod_direction(self.state, k)
+
+    def free_point(self, k: int) -> tuple[Any, Any]:
+        """Return the centre of mass of a free body and its velocity.
+
+        Args:
+            k: the body.
+
+        Returns:
+            Two vectors, world axes [m, m/s].
+
+        """
+        return self.vector(self.state.r[k]), self.vector(self.state.v[k])
+
     def _add_body(self, k: int) -> None:
         """Place joint k, from its far point to its near point, and body k."""
         model, state, kind, far = self.model, self.state, self.model.kind[k], self.far[k]
@@ -61,18 +112,17 @@ class _BallTree(JointTree, BallArithmetic):
         columns: list[tuple[Any, Any]] = []  # angular velocity, velocity of the near point
         self.tangents.append([])
         if kind == "rod":
-            u, udot = self.rod_direction(state, k)
+            u, udot = self.rod(k)
             ell = self.arb(float(model.length[k]))
             P, v, a = P + u * ell, v + udot * ell, a - u * (self.dot(udot, udot) * ell)
             first = self.cross_matrix(u) * self.units[int(np.argmin(np.abs(state.u[k])))]
             self.tangents[k] = [first, self.cross_matrix(u) * first]
             columns = [(self.zero, t * ell) for t in self.tangents[k]]
         if kind == "free":
-            P, v, a = self.vector(state.r[k]), self.vector(state.v[k]), self.zero
+            (P, v), a = self.free_point(k), self.zero
             columns = [(self.zero, e) for e in self.units]
         if KINDS[kind].has_attitude:
-            A = self.rotation(state.p[k])
-            w = A * self.vector(state.omega[k])
+            A, w = self.attitude(k)
             columns += [(e, self.zero) for e in self.units]
         else:
             A, w, P, v, a, alpha = self._move(k, w, P, v, a, alpha, columns)
@@ -95,7 +145,7 @@ class _BallTree(JointTree, BallArithmetic):
         if self.far[k] >= 0:
             A = self.A[self.far[k]] * A
         for i, (what, number) in enumerate(KINDS[self.model.kind[k]].motions):
-            x, rate = (self.arb(float(values[k, i])) for values in (self.state.x, self.state.xdot))
+            x, rate = self.coordinate(k, i)
             axis, cross = A * self.units[number], self.cross_matrix(w)
             if what == "slide":
                 shift = axis * x
@@ -109,7 +159,16 @@ class _BallTree(JointTree, BallArithmetic):
         return A * self.rotation(self.model.turn[k, 1]).transpose(), w, P, v, a, alpha
 
     def turn_about(self, axis: int, angle: Any) -> Any:
-        """The rotation about a coordinate axis."""
+        """Return the rotation about a coordinate axis.
+
+        Args:
+            axis: 0, 1 or 2.
+            angle: a ball [rad].
+
+        Returns:
+            A 3×3 matrix.
+
+        """
         c, s = angle.cos(), angle.sin()
         m = [[self.arb(int(i == j)) for j in range(3)] for i in range(3)]
         i, j = (axis + 1) % 3, (axis + 2) % 3
@@ -117,7 +176,15 @@ class _BallTree(JointTree, BallArithmetic):
         return self.mat(m)
 
     def wrench_at_rest(self, k: int) -> Any:
-        """Moment about the origin and force (6, 1) that body k needs at ν̇ = 0, besides weight and loads."""
+        """Return what a body needs at ν̇ = 0, besides weight and loads.
+
+        Args:
+            k: the body.
+
+        Returns:
+            Its moment about the origin and its force, a 6×1 matrix.
+
+        """
         model, ball = self.model, self.arb
         force = (self.bend[k] - self.g) * self.m[k] - self.vector(model.force[k])
         force = force + self.v[k] * ball(float(model.drag_force[k]))
@@ -144,9 +211,42 @@ def enclose_tree(flint: Any, model: Model, state: State, mass_matrix: bool) -> d
         ZeroDivisionError: the mass matrix is not invertible, at this precision.
 
     """
-    c = _BallTree(flint, model, state)
+    c = BallTree(flint, model, state)
+    equations = equations_of_motion(c)
+    M, right = equations.M, equations.right
+    rates = entries(M.solve(c.mat(len(right), 1, right))) if right else []
+    balls = moving_quantities(c, equations, rates)
+    if mass_matrix:
+        T = _relative_rates(c, equations.first)
+        balls["mass_matrix"] = (T.transpose() * M * T).tolist()
+    return balls | {"scale": quantity_scales(c, balls)}
+
+
+@dataclass(frozen=True, eq=False)
+class TreeEquations:
+    """M ν̇ = right in a tree's relative rates."""
+
+    M: Any
+    right: list[Any]
+    first: list[int]  # where each joint's rates begin
+    wrenches: list[Any]  # (6, 1) that each body needs at ν̇ = 0
+    kinetic: Any  # J, of rotors
+    potential: Any  # J, of springs
+
+
+def equations_of_motion(c: BallTree) -> TreeEquations:
+    """Set up the equations of a tree.
+
+    Args:
+        c: the tree.
+
+    Returns:
+        The equations.
+
+    """
+    model = c.model
     M, first = c.joint_mass_matrix()
-    inertias, wrenches = ([of(k) for k in range(c.n)] for of in (c.spatial_inertia, c.wrench_at_rest))
+    wrenches = [c.wrench_at_rest(k) for k in range(c.n)]
     kinetic = potential = c.arb(0)
     effort = [c.arb(0)] * first[-1]
     if model.has_elements:
@@ -159,7 +259,28 @@ def enclose_tree(flint: Any, model: Model, state: State, mass_matrix: bool) -> d
     total = c.subtree_sums(wrenches)
     h = [x for k in range(c.n) for x in entries(c.S[k].transpose() * total[k])]
     right = [push - x for push, x in zip(effort, h, strict=True)]
-    rates = entries(M.solve(c.mat(len(h), 1, right))) if h else []
+    return TreeEquations(M, right, first, wrenches, kinetic, potential)
+
+
+def moving_quantities(
+    c: BallTree, equations: TreeEquations, rates: list[Any], applied: dict[int, Any] | None = None
+) -> dict[str, Any]:
+    """Compute the quantities of a tree from ν̇.
+
+    Args:
+        c: the tree.
+        equations: of the same tree.
+        rates: ν̇.
+        applied: further wrenches (6, 1) on bodies: moment about the origin, force.
+
+    Returns:
+        By quantity, as `enclose_tree`, without the mass matrix and the scales.
+
+    """
+    first, wrenches = equations.first, list(equations.wrenches)
+    kinetic, potential = equations.kinetic, equations.potential
+    for k, wrench in (applied or {}).items():
+        wrenches[k] = wrenches[k] - wrench
     acceleration, angular, momentum = [], [], c.zero
     gained: list[Any] = []  # twist that ν̇ adds
     for k in range(c.n):
@@ -174,13 +295,13 @@ def enclose_tree(flint: Any, model: Model, state: State, mass_matrix: bool) -> d
         kinetic += (c.m[k] * c.dot(c.v[k], c.v[k]) + c.dot(c.w[k], spin)) / 2
         potential -= c.m[k] * c.dot(c.g, c.r[k])
         momentum += c.cross_matrix(c.r[k]) * c.v[k] * c.m[k] + spin
-        wrenches[k] = wrenches[k] + inertias[k] * gained[k]
+        wrenches[k] = wrenches[k] + c.spatial_inertia(k) * gained[k]
     force, moment = [], []
     for k, wrench in enumerate(c.subtree_sums(wrenches)):
         about_origin, pull = (c.mat(3, 1, entries(wrench)[part]) for part in (slice(0, 3), slice(3, 6)))
         force.append(entries(pull))
         moment.append(entries(about_origin - c.cross_matrix(c.P[k]) * pull))
-    balls: dict[str, Any] = {
+    return {
         "acceleration": [entries(a) for a in acceleration],
         "angular_acceleration": [entries(a) for a in angular],
         "joint_reaction": force,
@@ -191,13 +312,9 @@ def enclose_tree(flint: Any, model: Model, state: State, mass_matrix: bool) -> d
         "r": [entries(r) for r in c.r],
         "v": [entries(v) for v in c.v],
     }
-    if mass_matrix:
-        T = _relative_rates(c, first)
-        balls["mass_matrix"] = (T.transpose() * M * T).tolist()
-    return balls | {"scale": _term_scales(c, balls)}
 
 
-def _relative_rates(c: _BallTree, first: list[int]) -> Any:
+def _relative_rates(c: BallTree, first: list[int]) -> Any:
     """The matrix from the rates ν of `StateQuantities.mass_matrix` to the relative ones.
 
     A ball joint's are A ω′ − ω_far, a rod's besides tᵀ(u̇ − ω_far × u)/tᵀt along its tangents t.
@@ -239,8 +356,17 @@ def _relative_rates(c: _BallTree, first: list[int]) -> Any:
     return c.mat(rows) if rows else c.mat(0, 0)
 
 
-def _term_scales(c: _BallTree, balls: dict[str, Any]) -> dict[str, float]:
-    """Sizes of the terms of each quantity, see `term_scales`."""
+def quantity_scales(c: BallTree, balls: dict[str, Any]) -> dict[str, float]:
+    """Estimate the sizes of the terms of each quantity, see `term_scales`.
+
+    Args:
+        c: the tree.
+        balls: its quantities.
+
+    Returns:
+        Sizes by quantity.
+
+    """
     norm, model = np.linalg.norm, c.model
     lever = float(np.sum(norm(model.point, axis=2)) + np.sum(model.length) + np.sum(np.abs(c.state.x)))
     lever = max(lever, float(np.max(np.abs(midpoints(balls["r"])))))

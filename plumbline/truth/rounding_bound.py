@@ -183,8 +183,8 @@ def _tree_bound(model: Model, state: State) -> RoundingBound:
     total, scale, sums, rod_torque = tree_tolerances(model, state)
     total = ROUNDING_FACTOR * EPS * total
     return RoundingBound(
-        acceleration=total[:, 0],
-        angular_acceleration=total[:, 1],
+        acceleration=total[: model.n, 0],
+        angular_acceleration=total[: model.n, 1],
         joint_reaction=total[:, 2],
         joint_moment=total[:, 3],
         scale=scale,

@@ -5,6 +5,11 @@ leave, E_k (6, c).  With x = (r̈, α) per body, world axes, C the held rows of 
 
     M x − Cᵀ λ = f,    C x = γ,    K = C M⁻¹ Cᵀ
 
+Loops are cut open (`plumbline.model.loops`); rows a_b − a_c, α_b − α_c join the two parts of a body, and K
+has a pseudo-inverse where rows depend on others.  The dependent coordinates of a state are known only to
+rounding over the smallest singular value σ of these rows, which changes every term by as much: all
+tolerances are 1 + 1/σ times as large.
+
 Roundings of the terms of each body's equations and of each joint's are propagated through the inverse (tB),
 those of the elimination C M⁻¹ f likewise (tS); a joint-space engine rounds the terms of M q̈ + h, which act as
 torque pairs at turns and as force pairs at slides (tJ); d is the accumulation along the branches.
@@ -12,6 +17,7 @@ torque pairs at turns and as force pairs at slides (tJ); d is the accumulation a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -25,6 +31,7 @@ from plumbline.model.kinematics import (
     rotate_vectors,
     rotation_matrix,
 )
+from plumbline.model.loops import cut_open, smallest_singular_value
 from plumbline.truth.element_terms import joint_elements, spring_terms
 
 
@@ -34,7 +41,8 @@ class _TreeTerms:
     Norms (N,) are named as their vectors: a, alpha, F, moment (of the joint), arm (centre to near point).
     """
 
-    def __init__(self, model: Model, state: State) -> None:
+    def __init__(self, model: Model, state: State, ends: Sequence[tuple[int, int]] = ()) -> None:
+        self.ends = ends
         self.model, self.state, self.n, self.far = model, state, model.n, model.body[:, 0]
         self.A = rotation_matrix(state.p)
         self.inertia = self.A @ model.inertia @ self.A.mT
@@ -90,9 +98,12 @@ class _TreeTerms:
         n, model = self.n, self.model
         held = [self._held_and_bend(k) for k in range(n)]
         first = np.cumsum([0, *(E.shape[1] for E, _ in held)])
-        C = np.zeros((first[-1], n, 6))
-        E_rows = np.zeros((n, 6, first[-1]))
-        gamma = np.zeros(first[-1])
+        C = np.zeros((first[-1] + 6 * len(self.ends), n, 6))
+        E_rows = np.zeros((n, 6, len(C)))
+        gamma = np.zeros(len(C))
+        for loop, (b, c) in enumerate(self.ends):
+            rows = slice(first[-1] + 6 * loop, first[-1] + 6 * loop + 6)
+            C[rows, b], C[rows, c] = np.eye(6), -np.eye(6)
         for k, (E, bend) in enumerate(held):
             rows = slice(first[k], first[k + 1])
             C[rows] = self._relative_rows(k, E)
@@ -108,7 +119,9 @@ class _TreeTerms:
         CM = flat @ M_flat
         K = CM @ flat.T
         s = 1 / np.sqrt(np.diag(K))  # equilibrated: pivots must not depend on the units
-        K_inverse = np.linalg.inv(K * s * s[:, None]) * s * s[:, None] if len(K) else K
+        scaled = K * s * s[:, None]
+        K_inverse = np.linalg.pinv(scaled, 1e-13, hermitian=True) if self.ends else np.linalg.inv(scaled)
+        K_inverse = K_inverse * s * s[:, None]
         X = CM.T @ K_inverse
         x_rows = np.concatenate([M_flat - X @ CM, X], 1)
         wrench_rows = E_rows @ np.concatenate([-X.T, K_inverse], 1)
@@ -118,6 +131,9 @@ class _TreeTerms:
         if len(armature):  # the joint's whole wrench: its elements' too
             wrench_rows -= directions @ (armature[:, None] * (J @ x_rows))
         x_rows, wrench_rows = (some.reshape(n, 2, 3, -1) for some in (x_rows, wrench_rows))
+        weld_x, weld_wrench = X[:, first[-1] :], E_rows @ K_inverse[:, first[-1] :]
+        welds = [some.reshape(n, 2, 3, -1) for some in (weld_x, weld_wrench)]
+        self.of_weld = np.concatenate(welds, 1)
         inverse = np.concatenate([x_rows, wrench_rows], 1)  # (N, 4, 3, 6 N + c): r̈, α, F, M of each body
         self.of_body = inverse[..., : 6 * n].reshape(n, 4, 3, n, 2, 3)
         # per joint the response to errors of its six relative accelerations
@@ -214,6 +230,20 @@ class _TreeTerms:
         sizes = (weights, [*moments, self.moment_children], linear, angular)
         force, moment, linear_size, angular_size = (np.max(terms, 0) for terms in sizes)
         return force, moment, linear_size, angular_size
+
+    def weld_errors(self) -> Array:
+        """First-order change (N, 4) of r̈, α, F, M by errors in the rows that join parts of a body."""
+        total = np.zeros((self.n, 4))
+        for loop, pair in enumerate(self.ends):
+            around = np.any([self.below[:, k] for k in pair], axis=0)
+            reach = np.sum((self.reach + self.arm)[around])
+            sizes = [
+                np.max(self.a[around]) + reach * np.max(self.W[around] ** 2 + self.alpha[around]),
+                np.max(self.alpha[around] + self.W[around] ** 2),
+            ]
+            response = self.of_weld[..., 6 * loop : 6 * loop + 6].reshape(self.n, 4, 3, 2, 3)
+            total += np.linalg.norm(response, axis=(2, 4)) @ sizes
+        return total
 
     def elimination_errors(self) -> tuple[Array, Array]:
         """Terms of C M⁻¹ f in the linear and angular rows of each joint."""
@@ -362,7 +392,29 @@ def tree_tolerances(
         sums behind the energies [J], the angular momentum and the mass matrix; torques of rods (N,) [N m].
 
     """
-    t = _TreeTerms(model, state)
+    if model.has_loops:
+        return _loop_tolerances(model, state)
+    return _tolerances(_TreeTerms(model, state))
+
+
+def _loop_tolerances(
+    model: Model, state: State
+) -> tuple[Array, dict[str, Array | float], dict[str, float], Array]:
+    """`tree_tolerances` of a mechanism with loops: rows of joints where the tree has rows of bodies."""
+    cut = cut_open(model)
+    terms = _TreeTerms(cut.model, cut.state(state), cut.ends)
+    total, scale, sums, _ = _tolerances(terms)
+    spread = 1 + 1 / smallest_singular_value(model, state)
+    total = (total + terms.weld_errors()) * spread
+    sums = {name: size * spread for name, size in sums.items()}
+    for name, value in scale.items():
+        if isinstance(value, np.ndarray):
+            scale[name] = value[cut.place if name.startswith("joint") else cut.place[: model.n]]
+    return total[cut.place], scale, sums, np.zeros(model.n)
+
+
+def _tolerances(t: _TreeTerms) -> tuple[Array, dict[str, Array | float], dict[str, float], Array]:
+    model, state = t.model, t.state
     joints = _JointSpace(t)
     force, moment, linear, angular = t.body_errors()
     total = t.propagate(force, moment, linear, angular)

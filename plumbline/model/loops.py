@@ -1,0 +1,492 @@
+"""Loops: the mechanism cut open at its closing joints, and what closing them requires.
+
+Cut open it is a tree: each closing joint carries a part c of its near body b, which has to stay in that
+body's place.  With the velocities of `velocity_jacobian`, and vex R the vector of R's skew part,
+
+    F = (r_b − r_c, −vex(A_bᵀ A_c)) = 0,        J ν = (v_b − v_c, ω′_b − ω′_c) = 0.
+
+Six rows per loop, whatever joint closes it.  Rows may depend on the others: then the forces in the loop are
+not unique, and of each joint's wrench only the determinate part is (`determinate_part`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plumbline.model.datatypes import BODY_FIELDS, JOINT_FIELDS, KINDS, Array, Model, State, StateQuantities
+from plumbline.model.kinematics import (
+    JointFrame,
+    complete_state,
+    cross,
+    joint_vectors,
+    minimal_rates,
+    own_rates,
+    quaternion_product,
+    rotate_vectors,
+    rotation_matrix,
+    velocity_jacobian,
+)
+
+MIN_SINGULAR_VALUE = 1e-6  # of the rows that hold, below it a pose counts as singular
+RANK_TOLERANCE = 1e-11  # of singular values of scaled rows: below it a row depends on the others
+NEWTON_STEPS = 30
+PER_BODY = ("acceleration", "angular_acceleration")  # quantities with one row per body
+
+
+@dataclass(frozen=True, eq=False)
+class CutMechanism:
+    """A mechanism cut open at its closing joints."""
+
+    source: Model  # N bodies, J joints
+    model: Model  # a tree of J bodies, depth first
+    place: NDArray[np.intp]  # (J,) which body of the tree joint k of the source holds
+    ends: tuple[tuple[int, int], ...]  # of each loop the bodies b and c of the tree that coincide
+
+    def state(self, state: State) -> State:
+        """Describe a state of the mechanism as one of the tree.
+
+        Args:
+            state: of the mechanism, its loops closed.
+
+        Returns:
+            The tree's state; the parts go by the closing joints' own coordinates.
+
+        """
+        fields = {name: value[self.source.body[:, 1]] for name, value in vars(state).items()}
+        fields |= zip(("u", "udot", "x", "xdot"), joint_coordinates(self.source, state), strict=True)
+        order = np.argsort(self.place)
+        return complete_state(self.model, State(**{name: value[order] for name, value in fields.items()}))
+
+    def source_state(self, state: State) -> State:
+        """Describe a state of the tree as one of the mechanism.
+
+        Args:
+            state: of the tree, its ends together.
+
+        Returns:
+            The mechanism's state.
+
+        """
+        bodies = self.place[: self.source.n]
+        return complete_state(
+            self.source, State(**{name: value[bodies] for name, value in vars(state).items()})
+        )
+
+    def source_quantities(self, answer: StateQuantities) -> StateQuantities:
+        """Describe quantities of the tree as those of the mechanism.
+
+        Args:
+            answer: of the tree.
+
+        Returns:
+            Of the mechanism; without a mass matrix.
+
+        """
+        bodies, found = self.place[: self.source.n], {}
+        for name, value in vars(answer).items():
+            of_joint = name in ("joint_reaction", "joint_moment")
+            places = self.place if of_joint else bodies if name in PER_BODY else None
+            found[name] = value if value is None or places is None else value[places]
+        return StateQuantities(**found | {"mass_matrix": None})
+
+    def gap(self, state: State) -> Array:
+        """Return F.
+
+        Args:
+            state: of the tree.
+
+        Returns:
+            (6 L,) loop by loop [m, rad]; of opposite attitudes 1 rad or more.
+
+        """
+        a, found = rotation_matrix(state.p), []
+        for b, c in self.ends:
+            relative = a[b].T @ a[c]
+            skew = (relative - relative.T)[[2, 0, 1], [1, 2, 0]] / 2
+            if np.trace(relative) < 1:  # more than a quarter turn
+                skew = skew + np.where(skew < 0, -1.0, 1.0)
+            found.append(np.concatenate([state.r[b] - state.r[c], -skew]))
+        return np.concatenate(found)
+
+    def jacobian(self, state: State) -> Array:
+        """Return J.
+
+        Args:
+            state: of the tree.
+
+        Returns:
+            (6 L, nu) for the rates ν of `velocity_jacobian`.
+
+        """
+        w = velocity_jacobian(self.model, state).reshape(self.model.n, 6, -1)
+        return np.concatenate([w[b] - w[c] for b, c in self.ends])
+
+
+def joint_coordinates(model: Model, state: State) -> tuple[Array, Array, Array, Array]:
+    """Return the coordinates of all joints: those of closing ones follow from the bodies.
+
+    Args:
+        model: the mechanism of J joints.
+        state: a state of it.
+
+    Returns:
+        u, u̇ (J, 3) of rods, x, ẋ (J, 2) of other joints, as those of `State`.
+
+    """
+    count, a = len(model.kind), rotation_matrix(state.p)
+    u, udot, x, xdot = (np.zeros((count, size)) for size in (3, 3, 2, 2))
+    for whole, given in zip((u, udot, x, xdot), (state.u, state.udot, state.x, state.xdot), strict=True):
+        whole[: model.n] = given
+    omega, d = rotate_vectors(a, state.omega), joint_vectors(model, state.r, state.p)
+    for k in range(model.n, count):
+        far, near = model.body[k]
+        above, spin = (a[far], omega[far]) if far >= 0 else (np.eye(3), np.zeros(3))
+        ends = [
+            state.v[i] + cross(omega[i], a[i] @ at) if i >= 0 else np.zeros(3)
+            for i, at in zip((far, near), model.point[k], strict=True)
+        ]
+        rate = ends[1] - ends[0]
+        if model.kind[k] == "rod":
+            u[k] = d[k] / np.linalg.norm(d[k])
+            udot[k] = (rate - u[k] * (u[k] @ rate)) / model.length[k]
+            continue
+        motions = KINDS[model.kind[k]].motions
+        frame = rotation_matrix(model.turn[k, 0]).T @ above.T
+        relative = frame @ a[near] @ rotation_matrix(model.turn[k, 1])
+        x[k, : len(motions)] = _coordinates(motions, frame @ d[k], relative)
+        axes = JointFrame(model, k, above).axes(x[k])
+        turns = np.array([axis for what, axis in axes if what == "turn"]).reshape(-1, 3)
+        turning = iter(np.linalg.lstsq(turns.T, omega[near] - spin)[0] if len(turns) else ())
+        for i, (what, axis) in enumerate(axes):
+            slide = axis @ (rate - cross(spin, d[k]))
+            xdot[k, i] = slide if what == "slide" else next(turning)
+    return u, udot, x, xdot
+
+
+@lru_cache(maxsize=64)  # mechanisms are never changed
+def cut_open(model: Model, are_parts_massless: bool = False) -> CutMechanism:
+    """Cut a mechanism open at its closing joints.
+
+    Args:
+        model: with loops.
+        are_parts_massless: whether the parts that closing joints carry have no mass.  Else a body with c of
+            them keeps 2⁻ᶜ of its mass and inertia, and they get ½, ¼, …: exact in binary.
+
+    Returns:
+        The tree.
+
+    """
+    n, (far, near) = model.n, model.body.T
+    order: list[int] = []
+
+    def visit(body: int) -> None:
+        for k in [*range(n, len(far)), *range(n)]:
+            if far[k] == body:
+                order.append(k)
+                if k < n:
+                    visit(k)
+
+    visit(-1)
+    place = np.argsort(order)
+    share = np.ones(len(far))
+    for k in range(n, len(far)):
+        share[near[k]], share[k] = (1.0, 0.0) if are_parts_massless else (share[near[k]] / 2,) * 2
+    changes = {name: (getattr(model, name)[near].T * share).T[order] for name in ("mass", "inertia")}
+    for name in BODY_FIELDS:
+        value = getattr(model, name)
+        changes[name] = np.concatenate([value, np.zeros((len(far) - n, *value.shape[1:]))])[order]
+    for name in JOINT_FIELDS[2:]:
+        changes[name] = getattr(model, name)[order]
+    above = np.where(far[order] < 0, -1, place[far[order]])
+    changes["body"] = np.stack([above, np.arange(len(order))], axis=1)
+    kinds = tuple(model.kind[k] for k in order)
+    ends = tuple((int(place[near[k]]), int(place[k])) for k in range(n, len(far)))
+    return CutMechanism(model, replace(model, kind=kinds, **changes), place, ends)
+
+
+def _coordinates(motions: tuple[tuple[str, int], ...], shift: Array, relative: Array) -> list[float]:
+    """Coordinates of a joint from its shift and its turn, both in the far axes: R or R_x R_y."""
+    turns = [axis for what, axis in motions if what == "turn"]
+    angles = []
+    for i, axis in enumerate(turns):
+        j, k = (axis + 1) % 3, (axis + 2) % 3
+        if len(turns) == 1:
+            angles.append(float(np.arctan2(relative[k, j], relative[j, j])))
+        elif i == 0:  # y and z of the near axes turned about x: y is left by the second turn
+            angles.append(float(np.arctan2(relative[2, 1], relative[1, 1])))
+        else:
+            angles.append(float(np.arctan2(relative[0, 2], relative[0, 0])))
+    found = iter(angles)
+    return [float(shift[axis]) if what == "slide" else next(found) for what, axis in motions]
+
+
+def displaced(model: Model, state: State, step: Array) -> State:
+    """Move a tree's coordinates.
+
+    Args:
+        model: a tree.
+        state: where it is.
+        step: (nu,) changes in the order of the rates of `velocity_jacobian`.
+
+    Returns:
+        The state there, with the same rates.
+
+    """
+    p, r, x, u = state.p.copy(), state.r.copy(), state.x.copy(), state.u.copy()
+    u[model.rods] += step[: 3 * int(model.rods.sum())].reshape(-1, 3)
+    u[model.rods] /= np.linalg.norm(u[model.rods], axis=1, keepdims=True)
+    for k, (kind, own) in enumerate(zip(model.kind, own_rates(model), strict=True)):
+        change = step[own]
+        if kind == "free":
+            r[k] += change[:3]
+        if KINDS[kind].has_attitude:
+            p[k] = quaternion_product(p[k], np.concatenate([[1.0], change[-3:] / 2]))
+            p[k] /= np.linalg.norm(p[k])
+        else:
+            x[k, : len(change)] += change
+    return complete_state(model, replace(state, p=p, r=r, x=x, u=u))
+
+
+def with_rates(model: Model, state: State, rates: Array) -> State:
+    """Give a tree other rates.
+
+    Args:
+        model: a tree.
+        state: where it is.
+        rates: (nu,) in the order of `velocity_jacobian`.
+
+    Returns:
+        The state with these rates.
+
+    """
+    omega, v, xdot, udot = state.omega.copy(), state.v.copy(), state.xdot.copy(), state.udot.copy()
+    u = state.u[model.rods]
+    swing = rates[: 3 * int(model.rods.sum())].reshape(-1, 3)
+    udot[model.rods] = swing - u * np.sum(u * swing, axis=1, keepdims=True)
+    for k, (kind, own) in enumerate(zip(model.kind, own_rates(model), strict=True)):
+        value = rates[own]
+        if kind == "free":
+            v[k] = value[:3]
+        if KINDS[kind].has_attitude:
+            omega[k] = value[-3:]
+        else:
+            xdot[k, : len(value)] = value
+    return complete_state(model, replace(state, omega=omega, v=v, xdot=xdot, udot=udot))
+
+
+def assembled(model: Model, state: State, movable: NDArray[np.bool_] | None = None) -> State:
+    """Close a mechanism's loops to rounding: the nearest coordinates (Newton's method) and rates.
+
+    Args:
+        model: the mechanism; a tree is left alone.
+        state: near an assembled state.
+        movable: (nu,) of the mechanism's rates, True for those that may change; absent: all.
+
+    Returns:
+        The state; where the loops cannot be closed from here, or the rates not, gaps remain.
+
+    """
+    if not model.has_loops:
+        return state
+    cut = cut_open(model)
+    best = cut.state(state)
+    gap = cut.gap(best)
+    for _ in range(NEWTON_STEPS):
+        tried = displaced(cut.model, best, _least_norm(cut.jacobian(best), -gap))
+        left = cut.gap(tried)
+        if not np.max(np.abs(left)) < np.max(np.abs(gap)):
+            break
+        best, gap = tried, left
+        if np.max(np.abs(gap)) <= np.finfo(float).eps:
+            break
+    free = np.ones(cut.jacobian(best).shape[1], bool)
+    if movable is not None:  # besides the closing joints' own, which follow
+        free[_rates_of_source(cut)] = movable
+    J, rates = cut.jacobian(best), minimal_rates(cut.model, best)
+    for _ in range(2):  # the second pass removes what rounding left of the first
+        rates[free] += _least_norm(J[:, free], -J @ rates)
+    return cut.source_state(with_rates(cut.model, best, rates))
+
+
+def allowed_rates(model: Model, state: State, rates: Array) -> Array:
+    """Project rates on those that the loops allow.
+
+    Args:
+        model: with loops.
+        state: assembled.
+        rates: (nu,) of the mechanism's tree.
+
+    Returns:
+        (nu,) rates that keep the loops closed.
+
+    """
+    cut = cut_open(model)
+    there = cut.state(state)
+    J, own = cut.jacobian(there), _rates_of_source(cut)
+    whole = np.zeros(J.shape[1])
+    whole[own] = rates
+    whole += _least_norm(J, -J @ whole)
+    return np.asarray(whole[own])
+
+
+def loop_gaps(model: Model, state: State) -> tuple[Array, Array]:
+    """Measure how far the loops of a state are from closed.
+
+    Args:
+        model: with L loops.
+        state: a state of the tree.
+
+    Returns:
+        (L,) largest gap of each [m, rad], and (L,) of its rate [m/s, rad/s].
+
+    """
+    cut = cut_open(model)
+    there = cut.state(state)
+    rate = cut.jacobian(there) @ minimal_rates(cut.model, there)
+    gaps, rates = (np.max(np.abs(x.reshape(-1, 6)), axis=1) for x in (cut.gap(there), rate))
+    return gaps, rates
+
+
+def smallest_singular_value(model: Model, state: State) -> float:
+    """Measure how near a pose is to a singular one, where rows that hold elsewhere depend on the others.
+
+    Args:
+        model: with loops.
+        state: assembled.
+
+    Returns:
+        The smallest singular value of J, rows scaled, of those that are not 0 at a pose nearby.
+
+    """
+    cut = cut_open(model)
+    there = cut.state(state)
+    values, base = _singular_values(cut, there)
+    step = np.random.default_rng(0).normal(size=base.shape[1])
+    drawn = np.random.default_rng(0).normal(size=base.shape[1])
+    step = drawn - base.T @ (base @ drawn)
+    size = float(np.linalg.norm(step))
+    nearby = displaced(cut.model, there, np.asarray(1e-2 * step / size)) if size > 1e-6 else there
+    nearby = cut.state(assembled(model, cut.source_state(nearby)))
+    rank = max(len(base), len(_singular_values(cut, nearby)[1]))
+    return float(values[rank - 1])
+
+
+def _singular_values(cut: CutMechanism, state: State) -> tuple[Array, Array]:
+    """Singular values of J, rows scaled, and the rows (rank, nu) that span its own."""
+    _, values, rows = np.linalg.svd(_scaled_rows(cut.jacobian(state))[0])
+    return values, rows[: int(np.sum(values > RANK_TOLERANCE * values[0]))]
+
+
+def _scaled_rows(matrix: Array) -> tuple[Array, Array]:
+    scale = np.linalg.norm(matrix, axis=1)
+    scale = 1 / np.where(scale > 0, scale, 1.0)
+    return matrix * scale[:, None], scale
+
+
+def _least_norm(matrix: Array, right: Array) -> Array:
+    scaled, scale = _scaled_rows(matrix)
+    return np.asarray(np.linalg.lstsq(scaled, right * scale, rcond=1e-9)[0])
+
+
+def _rates_of_source(cut: CutMechanism) -> NDArray[np.intp]:
+    """Where the rates of the source are in those of the tree."""
+    rods, own = np.cumsum(cut.model.rods) - 1, own_rates(cut.model)
+    bodies = cut.place[: cut.source.n]
+    swings = [3 * rods[b] + i for b in bodies if cut.model.rods[b] for i in range(3)]
+    return np.array([*swings, *(i for b in bodies for i in range(own[b].start, own[b].stop))], np.intp)
+
+
+def independent_rows(matrix: Array) -> NDArray[np.intp]:
+    """Choose rows that do not depend on others, by a pivoted QR of the scaled rows.
+
+    Args:
+        matrix: (m, n).
+
+    Returns:
+        Their numbers, ascending.
+
+    """
+    from scipy.linalg import qr  # not in a run's own process
+
+    scaled, _ = _scaled_rows(matrix)
+    _, triangle, order = qr(scaled.T, mode="economic", pivoting=True)
+    size = np.abs(np.diagonal(triangle))
+    return np.sort(order[: int(np.sum(size > RANK_TOLERANCE * size[0]))])
+
+
+def determinate_projectors(model: Model, state: State) -> Array | None:
+    """Find what dependent rows leave of each joint's wrench: forces F and moments N/ℓ about the near points.
+
+    Args:
+        model: with loops.
+        state: assembled.
+
+    Returns:
+        (J, 6, 6) orthogonal projectors, with the length ℓ of `wrench_length`; None where all is determinate.
+
+    """
+    cut = cut_open(model)
+    there = cut.state(state)
+    J, scale = _scaled_rows(cut.jacobian(there))
+    left, values, _ = np.linalg.svd(J)
+    rank = int(np.sum(values > RANK_TOLERANCE * values[0]))
+    if rank == len(J):
+        return None
+    held = (left[:, rank:] * scale[:, None]).reshape(len(cut.ends), 6, -1)  # λ with Jᵀ λ = 0
+    a, n = rotation_matrix(there.p), cut.model.n
+    near = there.r + rotate_vectors(a, cut.model.proximal)
+    change = np.zeros((n, 6, held.shape[-1]))
+    for (b, c), wrench in zip(cut.ends, held, strict=True):
+        for body, sign in ((b, 1.0), (c, -1.0)):
+            k = body
+            while k >= 0:
+                change[k, :3] += sign * wrench[:3]
+                moment = a[b] @ wrench[3:] + cross(there.r[b] - near[k], wrench[:3].T).T
+                change[k, 3:] += sign * moment / wrench_length(model)
+                k = cut.model.body[k, 0]
+    projectors = np.tile(np.eye(6), (n, 1, 1))
+    for k in range(n):
+        vectors, sizes, _ = np.linalg.svd(change[k])
+        lost = vectors[:, : len(sizes)][:, sizes > RANK_TOLERANCE * np.max(np.abs(change))]
+        projectors[k] -= lost @ lost.T
+    return projectors[cut.place]
+
+
+def wrench_length(model: Model) -> float:
+    """Return the length that makes moments comparable with forces.
+
+    Args:
+        model: with loops.
+
+    Returns:
+        ℓ [m], the mean distance of joints from centres of mass.
+
+    """
+    return float(np.mean(np.linalg.norm(model.point, axis=2))) or 1.0
+
+
+def determinate_part(model: Model, state: State, answer: StateQuantities) -> StateQuantities:
+    """Reduce the quantities of a mechanism with loops to what is unique.
+
+    Args:
+        model: with loops.
+        state: assembled.
+        answer: quantities at it.
+
+    Returns:
+        The same without the mass matrix, and of joint forces and moments the parts that dependent rows leave
+        determinate.
+
+    """
+    answer = replace(answer, mass_matrix=None)
+    projectors = determinate_projectors(model, state)
+    if projectors is None or answer.joint_reaction is None or answer.joint_moment is None:
+        return answer if projectors is None else replace(answer, joint_reaction=None, joint_moment=None)
+    length = wrench_length(model)
+    wrench = np.concatenate([answer.joint_reaction, answer.joint_moment / length], axis=1)
+    wrench = rotate_vectors(projectors, wrench)
+    return replace(answer, joint_reaction=wrench[:, :3], joint_moment=wrench[:, 3:] * length)
