@@ -25,6 +25,7 @@ from plumbline.model.datatypes import (
     StateQuantities,
     Trajectory,
 )
+from plumbline.model.loops import joint_coordinates
 from reference_impl.collocation import integrate_collocation
 from reference_impl.direct import DirectSystem, Solution
 from reference_impl.errors import SingularSystem
@@ -79,7 +80,8 @@ class Reference(MetamorphicHooks):
     def _quantities(system: DirectSystem, state: State, solve: Callable[..., Solution]) -> StateQuantities:
         at, elements = notes_state(state), system.elements
         S, _ = system.assemble(*at)
-        x = solve(*at, x=state.x) if elements else solve(*at)
+        joint_x = joint_coordinates(system.chain, state)[2]
+        x = solve(*at, x=joint_x) if elements else solve(*at)
         return state_quantities(
             system.chain,
             state,
@@ -89,7 +91,7 @@ class Reference(MetamorphicHooks):
             S,
             None if system.chain.is_chain else x.joint_moment,
             system.rotor_count,
-            elements.evaluate(*at, state.x).potential if elements else 0.0,
+            elements.evaluate(*at, joint_x).potential if elements else 0.0,
         )
 
     def _simulate(

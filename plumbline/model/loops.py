@@ -203,6 +203,7 @@ def cut_open(model: Model, are_parts_massless: bool = False) -> CutMechanism:
         changes[name] = getattr(model, name)[order]
     above = np.where(far[order] < 0, -1, place[far[order]])
     changes["body"] = np.stack([above, np.arange(len(order))], axis=1)
+    changes["spring_body"] = np.where(model.spring_body < 0, -1, place[model.spring_body])
     kinds = tuple(model.kind[k] for k in order)
     ends = tuple((int(place[near[k]]), int(place[k])) for k in range(n, len(far)))
     return CutMechanism(model, replace(model, kind=kinds, **changes), place, ends)
@@ -365,7 +366,6 @@ def smallest_singular_value(model: Model, state: State) -> float:
     cut = cut_open(model)
     there = cut.state(state)
     values, base = _singular_values(cut, there)
-    step = np.random.default_rng(0).normal(size=base.shape[1])
     drawn = np.random.default_rng(0).normal(size=base.shape[1])
     step = drawn - base.T @ (base @ drawn)
     size = float(np.linalg.norm(step))

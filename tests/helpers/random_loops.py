@@ -8,7 +8,7 @@ from itertools import count
 
 import numpy as np
 
-from plumbline.model.datatypes import KINDS, Kind, Model, State
+from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Kind, Model, State
 from plumbline.model.kinematics import (
     complete_state,
     quaternion_conjugate,
@@ -51,6 +51,7 @@ def close_loop(
         point=np.concatenate([model.point, [[point, at]]]),
         turn=np.concatenate([model.turn, [[axes / np.linalg.norm(axes), turn]]]),
         length=np.append(model.length, length),
+        **{name: np.vstack([getattr(model, name), np.zeros((1, 2))]) for name in JOINT_ELEMENTS},
     )
 
 
