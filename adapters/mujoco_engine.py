@@ -66,7 +66,7 @@ from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 JOINT_TYPES = {"turn": mujoco.mjtJoint.mjJNT_HINGE, "slide": mujoco.mjtJoint.mjJNT_SLIDE}
 FIRST_ORDER_POWERS = (1, 2, 3, 4, 5, 6)
 MAX_IMPEDANCE = 0.9999  # of soft constraints: the largest that MuJoCo accepts
-REGULARISATIONS = (1e-4, 1e-5, 1e-6)  # of MuJoCo's own R; below 1e-8 rounding spoils its solver
+REGULARISATIONS = (1e-3, 1e-4, 1e-5)  # of MuJoCo's own R; far below, rounding spoils its solver
 MIN_SOFTNESS = 1e-9  # a smaller relative effect of R is rounding
 ROD_AXIAL_INERTIA = 0.01  # J_z of a rod over the mean principal inertia of the body that it carries
 IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])

@@ -383,8 +383,8 @@ class PinocchioChain:
         a = pin.constraintDynamics(engine, data, q, v, push, self.welds, self.weld_data, settings).copy()
         for (b, c), solved in zip(self.ends, self.weld_data, strict=True):
             force = solved.contact_force  # on b, in the frame of b and c
-            self.loads[b] += self.placements[b].act(force)
-            self.loads[c] -= self.placements[c].act(force)
+            self.loads[b] = self.loads[b] + self.placements[b].act(force)
+            self.loads[c] = self.loads[c] - self.placements[c].act(force)
         self._add_up_loads()
         return np.asarray(a)
 

@@ -82,5 +82,8 @@ def _moves(model: Model, state: State) -> bool:
     """Whether the loops can move, with no row that depends on others, away from singular poses."""
     cut = cut_open(model)
     J = cut.jacobian(cut.state(state))
-    values = np.linalg.svd(J / np.linalg.norm(J, axis=1, keepdims=True))[1]
-    return J.shape[0] < J.shape[1] and bool(values[-1] > 2e-2)
+    size = np.linalg.norm(J, axis=1, keepdims=True)
+    if np.min(size) < 1e-9:
+        return False
+    values = np.linalg.svd(J / size)[1]
+    return J.shape[0] < J.shape[1] and bool(values[-1] > 5e-2)
