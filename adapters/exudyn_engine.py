@@ -59,6 +59,7 @@ from plumbline.model.kinematics import (
     JointFrame,
     angular_velocity,
     elastic_energy,
+    joint_coordinates,
     quaternion_rate,
     rotation_matrix,
     velocity_jacobian,
@@ -104,6 +105,7 @@ class ExudynChain:
         self.piece_centre = [part.centre for pieces in parts for part in pieces]
         # spring-dampers of joints: joint, connector, whether it pushes, and the axis in the world along which
         # the body below gets the opposite of the connector's force
+        self.x = joint_coordinates(model, state)[2]
         self.connectors: list[tuple[int, Any, bool, Array]] = []
         self.jacobian_rate = np.zeros((0, 0))  # d_t(C_q), where joints need it
         self.qdot = np.empty((len(self.piece_centre), 7))
@@ -169,7 +171,7 @@ class ExudynChain:
         """Add spring-dampers for the coordinates of joint k that have springs, dampers or efforts."""
         model, far = self.model, self.model.body[k, 0]
         above = rotation_matrix(self.state.p[far]) if far >= 0 else np.eye(3)
-        axes = JointFrame(model, k, above).axes(self.state.x[k])
+        axes = JointFrame(model, k, above).axes(self.x[k])
         for i, ((what, number), (_, axis)) in enumerate(zip(KINDS[model.kind[k]].motions, axes, strict=True)):
             stiffness, damping, effort = (x[k, i] for x in (model.stiffness, model.damping, model.effort))
             if not (stiffness or damping or effort):
@@ -184,7 +186,7 @@ class ExudynChain:
                 )  # fmt: skip
             else:
                 # the connector's angle is a principal value
-                whole = 2 * np.pi * np.round(self.state.x[k, i] / (2 * np.pi))
+                whole = 2 * np.pi * np.round(self.x[k, i] / (2 * np.pi))
                 local = np.roll(np.eye(3), -number - 1, axis=1) if sign > 0 else SECOND_AXIS
                 connector = items.ObjectConnectorTorsionalSpringDamper(
                     markerNumbers=ends[::sign], rotationMarker0=turns[::sign][0] @ local,

@@ -42,6 +42,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from itertools import pairwise
 from typing import Any, Literal
 
 import mujoco
@@ -59,14 +60,14 @@ from plumbline.model.datatypes import (
     StateQuantities,
     Trajectory,
 )
-from plumbline.model.loops import CutMechanism, cut_open, determinate_part
+from plumbline.model.loops import CutMechanism, cut_open, determinate_part, wrench_length
 from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
 from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 
 JOINT_TYPES = {"turn": mujoco.mjtJoint.mjJNT_HINGE, "slide": mujoco.mjtJoint.mjJNT_SLIDE}
 FIRST_ORDER_POWERS = (1, 2, 3, 4, 5, 6)
 MAX_IMPEDANCE = 0.9999  # of soft constraints: the largest that MuJoCo accepts
-REGULARISATIONS = (1e-3, 1e-4, 1e-5)  # of MuJoCo's own R; far below, rounding spoils its solver
+REGULARISATIONS = (1e-3, 1e-4, 1e-5, 1e-6)  # of MuJoCo's own R; far below, rounding spoils its solver
 MIN_SOFTNESS = 1e-9  # a smaller relative effect of R is rounding
 ROD_AXIAL_INERTIA = 0.01  # J_z of a rod over the mean principal inertia of the body that it carries
 IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
@@ -371,23 +372,33 @@ class _MujocoChain:
 
 
 def _rigid_limit(tree: _MujocoChain, cut: CutMechanism, state: State) -> StateQuantities:
-    """Evaluate at regularisations R falling by tens, check order 1, and extrapolate to none (Neville)."""
+    """Evaluate at regularisations R falling by tens, check order 1, and extrapolate to none (Neville).
+
+    The limit's uncertainty is twice the difference of the extrapolations from the first three and the last.
+    """
     there, found = cut.state(state), list[dict[str, Array]]()
     for scale in REGULARISATIONS:
         tree.soften(scale)
         answer = determinate_part(cut.source, state, cut.source_quantities(tree.quantities(there)))
-        found.append({name: np.asarray(x) for name, x in vars(answer).items() if x is not None})
+        found.append(
+            {name: np.asarray(x) for name, x in vars(answer).items() if isinstance(x, np.ndarray | float)}
+        )
     limit: dict[str, Any] = {}
-    for name, first in found[0].items():
-        second, third = found[1][name], found[2][name]
-        steps = [float(np.max(np.abs(x))) for x in (first - second, second - third)]
-        if steps[0] > MIN_SOFTNESS * np.max(np.abs(third)) and not 9 <= steps[0] / steps[1] <= 11:
+    errors: dict[str, float] = {}
+    for name, last in found[-1].items():
+        column = [answers[name] for answers in found]
+        steps = [float(np.max(np.abs(x - y))) for x, y in pairwise(column)]
+        size = float(np.max(np.abs(last)))
+        if name == "joint_moment":
+            size = max(size, wrench_length(cut.source) * float(np.max(np.abs(found[-1]["joint_reaction"]))))
+        if steps[0] > MIN_SOFTNESS * size and not 9 <= steps[0] / steps[1] <= 11:
             order = np.log10(steps[0] / steps[1])
             raise EngineFailure(f"MuJoCo's {name} is of order {order:.2g} in its regularisation, not 1")
-        pair = [(10 * x - y) / 9 for x, y in ((second, first), (third, second))]
-        value = (100 * pair[1] - pair[0]) / 99
-        limit[name] = value if value.ndim else float(value)
-    return StateQuantities(**limit)
+        for factor in (10, 100):
+            column = [(factor * x - y) / (factor - 1) for y, x in pairwise(column)]
+        limit[name] = column[0] if last.ndim else float(column[0])
+        errors[name] = 2 * float(np.max(np.linalg.norm(np.atleast_2d(column[1] - column[0]), axis=-1)))
+    return StateQuantities(**limit, limit_error=errors)
 
 
 def _add_load_actuators(spec: Any, body: Any, k: int, model: Model) -> None:

@@ -356,6 +356,7 @@ class PinocchioChain:
         """
         if self.ends:
             self.loads = list(self.constant_loads)
+            self._add_up_loads()
         self.update_loads(q, v)
         torque = self.joint_torque(q, v)
         if self.ends:

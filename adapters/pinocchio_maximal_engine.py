@@ -39,8 +39,8 @@ from adapters.pinocchio_common import (
     translation,
 )
 from plumbline.model.datatypes import KINDS, Array, Model, State, StateQuantities, Unsupported
-from plumbline.model.kinematics import JointFrame, rotation_matrix, velocity_jacobian
-from plumbline.model.loops import independent_rows, joint_coordinates
+from plumbline.model.kinematics import JointFrame, joint_coordinates, rotation_matrix, velocity_jacobian
+from plumbline.model.loops import independent_rows
 from plumbline.model.welding import BodyParts
 
 MAX_BODIES = 30  # bodies; the engine's workspace grows with N³: 0.4 GB here, 1.5 GB at 50

@@ -25,7 +25,7 @@ from plumbline.model.datatypes import (
     StateQuantities,
     Trajectory,
 )
-from plumbline.model.loops import joint_coordinates
+from plumbline.model.kinematics import joint_coordinates
 from reference_impl.collocation import integrate_collocation
 from reference_impl.direct import DirectSystem, Solution
 from reference_impl.errors import SingularSystem

@@ -9,6 +9,7 @@ velocity in the body frame (the notes' ω′ = 2 L(p) ṗ). N is the number of b
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -88,6 +89,8 @@ class StateQuantities:
     # (v, omega) of a free body, or the xdot of its joint); a rod's 3×3 part acts on udot through u × udot.
     mass_matrix: Array | None = None
     joint_moment: Array | None = None  # (J, 3) N m, moment on that body about that point, world frame
+    # by quantity the uncertainty of a limit that the engine's answers were extrapolated to, in its unit
+    limit_error: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)

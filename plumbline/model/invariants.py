@@ -383,6 +383,7 @@ def inertia_ratio(model: Model) -> float:
         the arm from its proximal to its distal point, J_max and J_min its extreme principal inertias.
 
     """
+    model = model.tree
     beyond = np.cumsum(model.mass[::-1])[::-1] - model.mass
     arm = np.linalg.norm(model.distal - model.proximal, axis=1)
     principal = np.linalg.eigvalsh(model.inertia)

@@ -19,10 +19,9 @@ from numpy.typing import NDArray
 
 from plumbline.model.datatypes import BODY_FIELDS, JOINT_FIELDS, KINDS, Array, Model, State, StateQuantities
 from plumbline.model.kinematics import (
-    JointFrame,
     complete_state,
     cross,
-    joint_vectors,
+    joint_coordinates,
     minimal_rates,
     own_rates,
     quaternion_product,
@@ -126,47 +125,6 @@ class CutMechanism:
         return np.concatenate([w[b] - w[c] for b, c in self.ends])
 
 
-def joint_coordinates(model: Model, state: State) -> tuple[Array, Array, Array, Array]:
-    """Return the coordinates of all joints: those of closing ones follow from the bodies.
-
-    Args:
-        model: the mechanism of J joints.
-        state: a state of it.
-
-    Returns:
-        u, u̇ (J, 3) of rods, x, ẋ (J, 2) of other joints, as those of `State`.
-
-    """
-    count, a = len(model.kind), rotation_matrix(state.p)
-    u, udot, x, xdot = (np.zeros((count, size)) for size in (3, 3, 2, 2))
-    for whole, given in zip((u, udot, x, xdot), (state.u, state.udot, state.x, state.xdot), strict=True):
-        whole[: model.n] = given
-    omega, d = rotate_vectors(a, state.omega), joint_vectors(model, state.r, state.p)
-    for k in range(model.n, count):
-        far, near = model.body[k]
-        above, spin = (a[far], omega[far]) if far >= 0 else (np.eye(3), np.zeros(3))
-        ends = [
-            state.v[i] + cross(omega[i], a[i] @ at) if i >= 0 else np.zeros(3)
-            for i, at in zip((far, near), model.point[k], strict=True)
-        ]
-        rate = ends[1] - ends[0]
-        if model.kind[k] == "rod":
-            u[k] = d[k] / np.linalg.norm(d[k])
-            udot[k] = (rate - u[k] * (u[k] @ rate)) / model.length[k]
-            continue
-        motions = KINDS[model.kind[k]].motions
-        frame = rotation_matrix(model.turn[k, 0]).T @ above.T
-        relative = frame @ a[near] @ rotation_matrix(model.turn[k, 1])
-        x[k, : len(motions)] = _coordinates(motions, frame @ d[k], relative)
-        axes = JointFrame(model, k, above).axes(x[k])
-        turns = np.array([axis for what, axis in axes if what == "turn"]).reshape(-1, 3)
-        turning = iter(np.linalg.lstsq(turns.T, omega[near] - spin)[0] if len(turns) else ())
-        for i, (what, axis) in enumerate(axes):
-            slide = axis @ (rate - cross(spin, d[k]))
-            xdot[k, i] = slide if what == "slide" else next(turning)
-    return u, udot, x, xdot
-
-
 @lru_cache(maxsize=64)  # mechanisms are never changed
 def cut_open(model: Model, are_parts_massless: bool = False) -> CutMechanism:
     """Cut a mechanism open at its closing joints.
@@ -207,22 +165,6 @@ def cut_open(model: Model, are_parts_massless: bool = False) -> CutMechanism:
     kinds = tuple(model.kind[k] for k in order)
     ends = tuple((int(place[near[k]]), int(place[k])) for k in range(n, len(far)))
     return CutMechanism(model, replace(model, kind=kinds, **changes), place, ends)
-
-
-def _coordinates(motions: tuple[tuple[str, int], ...], shift: Array, relative: Array) -> list[float]:
-    """Coordinates of a joint from its shift and its turn, both in the far axes: R or R_x R_y."""
-    turns = [axis for what, axis in motions if what == "turn"]
-    angles = []
-    for i, axis in enumerate(turns):
-        j, k = (axis + 1) % 3, (axis + 2) % 3
-        if len(turns) == 1:
-            angles.append(float(np.arctan2(relative[k, j], relative[j, j])))
-        elif i == 0:  # y and z of the near axes turned about x: y is left by the second turn
-            angles.append(float(np.arctan2(relative[2, 1], relative[1, 1])))
-        else:
-            angles.append(float(np.arctan2(relative[0, 2], relative[0, 0])))
-    found = iter(angles)
-    return [float(shift[axis]) if what == "slide" else next(found) for what, axis in motions]
 
 
 def displaced(model: Model, state: State, step: Array) -> State:

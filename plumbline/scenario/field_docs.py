@@ -22,6 +22,8 @@ SECTION_HEADINGS = {  # in the page's order
     "Load": "`load`",
     "Drag": "`drag`",
     "Spring": "`springs[]`: a spring between two points",
+    "ClosingJoint": "`closes[]`: a joint that closes a loop",
+    "ClosingRod": "`closes[].joint`, kind rod",
 }
 BOUND_FORMATS = {
     "exclusiveMinimum": "> {}",
@@ -36,8 +38,8 @@ INTRODUCTION = f"""\
 [Add a scenario](add-a-scenario.md) is a worked example.
 
 A scenario file is YAML 1.2 (UTF-8, no tabs for indentation) of schema version {SCHEMA_VERSION}.
-It describes one open chain or tree of rigid bodies, its state at t = 0 and its loads. Everything is in
-SI units; angles are in rad unless the field is called `degrees`; the world's z axis points up; a body's
+It describes rigid bodies on joints (a chain, a tree, loops), their state at t = 0 and their loads. Everything
+is in SI units; angles are in rad unless the field is called `degrees`; the world's z axis points up; a body's
 frame has its origin at the centre of mass. Write numbers without a unit. Unknown fields are errors.
 
 `python -m plumbline check FILE…` reports every mistake of every file with line and column;
@@ -79,6 +81,40 @@ springs:
     points: [[0, 0, -0.1], [0, 0, 0]]
     stiffness: 5
     length: 0.2
+```
+
+Joints beyond those of the tree close loops. This is a slider-crank: a crank on the world, a rod of 0.3 m on
+its end, and a slider that moves along x and on which the rod's other end is held. Of the rates only the
+crank's is given, the others follow. Loops are compared at state level only:
+
+```yaml
+schema_version: 1
+title: A slider-crank
+purpose: One loop of three hinges and a slide in a plane, with rows that depend on others.
+bodies:
+  - name: crank
+    mass: 0.4
+    inertia: {{principal: [0.0002, 0.002, 0.002]}}
+    joint: {{kind: hinge, axis: [0, 1, 0], coordinates: [0], rates: [3.0]}}
+    proximal: [-0.05, 0, 0]
+    distal: [0.05, 0, 0]
+  - name: rod
+    mass: 0.5
+    inertia: {{principal: [0.0003, 0.004, 0.004]}}
+    joint: {{kind: hinge, axis: [0, 1, 0]}}
+    proximal: [-0.15, 0, 0]
+  - name: slider
+    parent: world
+    mass: 0.3
+    inertia: {{principal: [0.0001, 0.0001, 0.0001]}}
+    joint: {{kind: slide, axis: [1, 0, 0], coordinates: [0.4]}}
+    proximal: [0, 0, 0]
+closes:
+  - body: slider
+    parent: rod
+    anchor: [0.15, 0, 0]
+    proximal: [0, 0, 0]
+    joint: {{kind: hinge, axis: [0, 1, 0]}}
 ```
 """
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,14 @@ from pydantic import ValidationError
 
 from plumbline.model.datatypes import JOINT_ELEMENTS, Array, Model, State
 from plumbline.model.kinematics import (
+    own_rates,
     quaternion_product,
+    rate_count,
     rotation_matrix,
     spring_vectors,
     state_from_minimal,
 )
+from plumbline.model.loops import assembled, loop_gaps
 from plumbline.scenario.errors import Problem, ScenarioError, closest_match, did_you_mean, shorten
 from plumbline.scenario.schema import (
     INPUT_ROUNDING,
@@ -28,6 +31,7 @@ from plumbline.scenario.schema import (
     Articulated,
     Body,
     BodySequence,
+    ClosingRod,
     Document,
     Free,
     Rod,
@@ -52,8 +56,9 @@ __all__ = [
 ]
 
 CATALOGUE_FOLDER = Path(__file__).resolve().parents[2] / "scenarios"
+LOOP_TOLERANCE = 1e-9  # of a loop's gap at t = 0 [m, rad], and of its rate over the largest speed
 MAX_MAGNITUDE = 1e30  # beyond it squares and products leave the range where engines can compute
-FAMILIES = ("single", "double", "chain", "hinge", "tree")
+FAMILIES = ("single", "double", "chain", "hinge", "tree", "loop")
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,13 +264,16 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
     bodies = list(_expand_repeats(document))
     far = _resolve_parents(source, document, [body for body, _ in bodies])
     springs = _resolve_springs(source, document, [body for body, _ in bodies])
+    closed = _resolve_closes(source, document, [body for body, _ in bodies])
     if len(bodies) > MAX_BODIES:
         raise source.fatal_error(
             f"has {len(bodies)} bodies", f"at most {MAX_BODIES}", source.value_positions[("bodies",)]
         )
     with np.errstate(all="ignore"):
-        model = _build_model(document, [body for body, _ in bodies], far, springs)
+        tree = _build_model(document, [body for body, _ in bodies], far, springs)
+        model = _add_closing_joints(tree, document, closed)
         state = state_from_minimal(model, *_minimal_coordinates(bodies))
+        state = _closed_state(source, model, state, [body for body, _ in bodies])
         distances = np.linalg.norm(spring_vectors(model, state.r, state.p), axis=-1)
     for k in np.flatnonzero(distances <= INPUT_ROUNDING * np.max(np.abs(model.spring_point), initial=0.0)):
         place = source.value_positions[("springs", int(k))]
@@ -428,12 +436,85 @@ def _resolve_springs(source: YamlSource, document: Document, bodies: list[Body])
     return found
 
 
-def _joint_elements(bodies: list[Body]) -> dict[str, Array]:
+def _resolve_closes(source: YamlSource, document: Document, bodies: list[Body]) -> NDArray[np.intp]:
+    """The far and near bodies (L, 2) of the closing joints, −1 the world."""
+    names, problems = [body.name for body in bodies], []
+    found = np.full((len(document.closes), 2), -1, np.intp)
+    for k, joint in enumerate(document.closes):
+        for side, field_name in enumerate(("parent", "body")):
+            name, message, valid = str(getattr(joint, field_name)), "", "the name of a body"
+            if names.count(name) > 1:
+                message = f"is {name!r}, the name of {names.count(name)} bodies"
+            elif name in names:
+                found[k, side] = names.index(name)
+            elif name != "world" or side:
+                hint = did_you_mean(name, [other for other in names if other])
+                message = f"is {name!r}, no body's name. {hint}".strip(" .")
+            if side and not message and found[k, 0] == found[k, 1]:
+                message, valid = f"is {name!r} like the parent", "two different bodies"
+            if side and not message and joint.joint.kind == "weld" and found[k, 0] < 0:
+                message, valid = f"is {name!r}, welded to the world, where it never moves", "another joint"
+            if message:
+                path = ("closes", k, field_name)
+                place = source.value_positions.get(path) or source.value_positions[("closes", k)]
+                problems.append(Problem(source.file, *place, dotted_path(path), message, valid))
+    if problems:
+        raise ScenarioError(problems)
+    return found
+
+
+def _add_closing_joints(tree: Model, document: Document, closed: NDArray[np.intp]) -> Model:
+    """The tree with its loops closed."""
+    if not len(closed):
+        return tree
+    joints = [end.joint for end in document.closes]
+    elements = _joint_elements(joints)
+    points = np.array([[end.anchor, end.proximal] for end in document.closes], dtype=float)
+    lengths = [joint.length if isinstance(joint, ClosingRod) else 0.0 for joint in joints]
+    return replace(
+        tree,
+        kind=(*tree.kind, *(joint.kind for joint in joints)),
+        body=np.concatenate([tree.body, closed]),
+        point=np.concatenate([tree.point, points]),
+        turn=np.concatenate([tree.turn, [_joint_turns(joint) for joint in joints]]),
+        length=np.concatenate([tree.length, lengths]),
+        **{name: np.concatenate([getattr(tree, name), values]) for name, values in elements.items()},
+    )
+
+
+def _closed_state(source: YamlSource, model: Model, state: State, bodies: list[Body]) -> State:
+    """Close the loops to rounding; refuse gaps and rates that do not fit."""
+    if not model.has_loops:
+        return state
+    movable = np.zeros(rate_count(model), bool)
+    rods = [body.joint for body in bodies if isinstance(body.joint, Rod)]
+    for i, rod in enumerate(rods):
+        movable[3 * i : 3 * i + 3] = rod.rate is None and rod.angular_velocity is None
+    for own, body in zip(own_rates(model), bodies, strict=True):
+        given = isinstance(body.joint, Articulated) and body.joint.rates is not None
+        movable[own] = not given and "angular_velocity" not in body.model_fields_set
+    gaps = loop_gaps(model, state)[0]
+    found = assembled(model, state, movable)
+    rates = loop_gaps(model, found)[1] / max(1.0, float(np.max(np.abs(found.v))))
+    for sizes, what in (
+        (gaps, "does not close: points or axes are apart"),
+        (rates, "has rates that open it,"),
+    ):
+        for k in np.flatnonzero(~(sizes <= LOOP_TOLERANCE)):
+            place = source.value_positions[("closes", int(k))]
+            valid = f"a state at t = 0 that fits the joint within {LOOP_TOLERANCE:g} (m, rad, m/s, rad/s)"
+            raise source.fatal_error(
+                f"has a loop, joint {k + 1} of closes, that {what} by {sizes[k]:.3g}", valid, place
+            )
+    return found
+
+
+def _joint_elements(joints: Sequence[Any]) -> dict[str, Array]:
     """The elements of all joints (N, 2), zeros where there are none."""
-    found = {name: np.zeros((len(bodies), 2)) for name in JOINT_ELEMENTS}
+    found = {name: np.zeros((len(joints), 2)) for name in JOINT_ELEMENTS}
     for name, values in found.items():
-        for k, body in enumerate(bodies):
-            given = getattr(body.joint, name, None) or []
+        for k, joint in enumerate(joints):
+            given = getattr(joint, name, None) or []
             values[k, : len(given)] = given
     return found
 
@@ -443,9 +524,9 @@ def _far_point(bodies: list[Body], k: int, far: int) -> list[float]:
     return bodies[k].anchor or (bodies[far].distal if far >= 0 else None) or [0.0, 0.0, 0.0]
 
 
-def _joint_turns(body: Body) -> tuple[Array, Array]:
+def _joint_turns(joint: Any) -> tuple[Array, Array]:
     """Quaternions of the joint's axes in the parent and in the body."""
-    joint, identity = body.joint, np.array([1.0, 0.0, 0.0, 0.0])
+    identity = np.array([1.0, 0.0, 0.0, 0.0])
     if not isinstance(joint, Articulated):
         return identity, identity
     if joint.axis is not None:
@@ -473,7 +554,7 @@ def _build_model(
         kind=tuple(body.joint.kind for body in bodies),
         body=np.stack([far, np.arange(len(bodies))], axis=1),
         point=np.where(free[:, None, None], 0.0, np.array(points, dtype=float)),
-        turn=np.array([_joint_turns(body) for body in bodies]),
+        turn=np.array([_joint_turns(body.joint) for body in bodies]),
         mass=np.array([body.mass for body in bodies], dtype=float),
         inertia=np.array([inertia_matrix(body.inertia) for body in bodies]),
         length=np.array([body.joint.length if isinstance(body.joint, Rod) else 0.0 for body in bodies]),
@@ -482,7 +563,7 @@ def _build_model(
         moment=np.array([body.load.moment for body in bodies], dtype=float),
         drag_force=np.array([body.drag.force for body in bodies], dtype=float),
         drag_moment=np.array([body.drag.moment for body in bodies], dtype=float),
-        **_joint_elements(bodies),
+        **_joint_elements([body.joint for body in bodies]),
         spring_body=spring_body,
         spring_point=np.array([spring.points for spring in document.springs], dtype=float).reshape(-1, 2, 3),
         spring_stiffness=np.array([spring.stiffness for spring in document.springs], dtype=float),

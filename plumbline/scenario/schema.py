@@ -389,7 +389,10 @@ class Articulated(JointElements):
         "first), the two angles of a universal joint. Absent: 0.",
         default=None,
     )
-    rates: list[float] | None = _field("Their rates at t = 0 [rad/s, m/s]. Absent: 0.", default=None)
+    rates: list[float] | None = _field(
+        "Their rates at t = 0 [rad/s, m/s]. Absent: 0, in a loop what the rates that are given require.",
+        default=None,
+    )
     rest: PerCoordinate | None = _field(
         "Coordinates φ₀ at which the springs are unloaded [rad, m]. With `stiffness` only. Absent: 0.",
         default=None,
@@ -583,6 +586,37 @@ class Spring(SchemaModel):
     length: float = _field("l₀ ≥ 0: the distance at which the spring is unloaded.", "m", 0.0, ge=0)
 
 
+class ClosingRod(SchemaModel):
+    """A massless rigid rod between two points that are there already."""
+
+    kind: Literal["rod"] = _field("`rod`.")
+    length: float = _field("Length, greater than 0.", "m", gt=0)
+
+
+class ClosingJoint(SchemaModel):
+    """A joint that closes a loop, between two bodies of the tree or a body and the world.
+
+    It must fit the state at t = 0: within 1e-9 (m, rad) the points and axes that it joins coincide, and the
+    rates that are given agree with it to 1e-9.  Its own coordinates follow.
+    """
+
+    body: str = _field("The name of its body.", examples=["rocker"])
+    parent: str = _field("The name of the other body, or `world`.", default="world")
+    joint: Annotated[Ball | ClosingRod | Articulated, Discriminator("kind")] = _field(
+        "As for a body, without `coordinates`, `rates`, `direction` and `rate`."
+    )
+    anchor: Vector = _field("Its point of the parent, in the parent's frame.", "m", [0.0, 0.0, 0.0])
+    proximal: Vector = _field("Its point of the body, body frame.", "m")
+
+    @field_validator("joint")
+    @classmethod
+    def _check_joint(cls, value: Any) -> Any:
+        for name in ("coordinates", "rates"):
+            if getattr(value, name, None) is not None:
+                raise invalid_value_error(f"gives {name}, which follow from the bodies", f"no {name}")
+        return value
+
+
 class Document(SchemaModel):
     """A scenario file: one open chain of rigid bodies, its initial state, its loads."""
 
@@ -623,6 +657,7 @@ class Document(SchemaModel):
     )
 
     springs: list[Spring] = _field("Springs and dampers between points.", default=[])
+    closes: list[ClosingJoint] = _field("Joints that close loops.", default=[])
 
     _text = field_validator("name", "family", "title", "purpose")(_require_printable)
 
@@ -648,9 +683,9 @@ class Document(SchemaModel):
 
     @model_serializer(mode="wrap")
     def _omit_absent_springs(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out an empty list of springs: a scenario's digest depends on its content alone."""
+        """Leave out empty lists of springs and loops: a scenario's digest depends on its content alone."""
         data: dict[str, Any] = handler(self)
-        return {k: v for k, v in data.items() if v or k != "springs"}
+        return {k: v for k, v in data.items() if v or k not in ("springs", "closes")}
 
 
 def attitude_quaternion(attitude: Attitude) -> Array:

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from plumbline.judging.rows import Level
-from plumbline.model.datatypes import CHAIN_FIELDS, JOINT_ELEMENTS, KINDS, SPRING_FIELDS, Model
+from plumbline.model.datatypes import CHAIN_FIELDS, JOINT_ELEMENTS, JOINT_FIELDS, KINDS, SPRING_FIELDS, Model
 from plumbline.processes.errors import PlumblineError
 from plumbline.scenario.errors import shorten
 from plumbline.scenario.schema import MAX_BODIES, invalid_value_error
@@ -76,15 +76,22 @@ class _Scenario(_Part):
         names = (
             [f.name for f in fields(Model) if f.name not in {"kind", *absent}] if is_tree else CHAIN_FIELDS
         )
+        joints = self._joint_count(model)
+        counts |= dict.fromkeys(JOINT_FIELDS, joints)
         shapes = {name: (counts.get(name, self.bodies), *_MODEL_SHAPES.get(name, (3,))) for name in names}
         _check_shapes("model", self.model, shapes | {"gravity": (3,)})
         state_shapes = _TREE_STATE_SHAPES if is_tree else _STATE_SHAPES
         _check_shapes("state", self.state, {k: (self.bodies, *shape) for k, shape in state_shapes.items()})
-        if is_tree and self.model is not None and not _are_kinds(self.model["kind"], self.bodies):
+        if is_tree and self.model is not None and not _are_kinds(self.model["kind"], joints):
             raise invalid_value_error("model.kind does not fit the bodies", f"{self.bodies} kinds of joints")
         if self.model is not None and min(self.model["mass"], default=1.0) <= 0:
             raise invalid_value_error("has a mass that is not positive", "masses above 0 kg")
         return self
+
+    def _joint_count(self, model: dict[str, Any]) -> int:
+        """As many joints as bodies, and those that close loops."""
+        kinds = model.get("kind")
+        return max(self.bodies, len(kinds)) if isinstance(kinds, list) else self.bodies
 
 
 def _are_kinds(given: Any, count: int) -> bool:

@@ -191,7 +191,7 @@ def _per_joint(values: list[Any], sizes: list[int]) -> list[list[Any]]:
 
 def _select(cut: CutMechanism, J: Array, sizes: list[int]) -> _Selection:
     """Choose independent rows; the closing joints' coordinates depend, and the best of the others."""
-    scaled, rows = J / np.linalg.norm(J, axis=1, keepdims=True), independent_rows(J)
+    rows, scaled = independent_rows(J), J / np.maximum(np.linalg.norm(J, axis=1, keepdims=True), 1e-9)
     first = np.cumsum([0, *sizes])
     parts = [i for k in cut.place[cut.source.n :] for i in range(first[k], first[k + 1])]
     others = np.setdiff1d(np.arange(J.shape[1]), parts)

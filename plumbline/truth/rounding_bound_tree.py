@@ -31,7 +31,7 @@ from plumbline.model.kinematics import (
     rotate_vectors,
     rotation_matrix,
 )
-from plumbline.model.loops import cut_open, smallest_singular_value
+from plumbline.model.loops import cut_open, smallest_singular_value, wrench_length
 from plumbline.truth.element_terms import joint_elements, spring_terms
 
 
@@ -405,11 +405,13 @@ def _loop_tolerances(
     terms = _TreeTerms(cut.model, cut.state(state), cut.ends)
     total, scale, sums, _ = _tolerances(terms)
     spread = 1 + 1 / smallest_singular_value(model, state)
-    total = (total + terms.weld_errors()) * spread
+    # what one body or joint has is found together with what all others of the loop have
+    largest = {name: float(np.max(value)) for name, value in scale.items() if isinstance(value, np.ndarray)}
+    largest["joint_moment"] = max(largest["joint_moment"], wrench_length(model) * largest["joint_reaction"])
+    total = (total + terms.weld_errors() + list(largest.values())) * spread
     sums = {name: size * spread for name, size in sums.items()}
-    for name, value in scale.items():
-        if isinstance(value, np.ndarray):
-            scale[name] = value[cut.place if name.startswith("joint") else cut.place[: model.n]]
+    for name, value in largest.items():
+        scale[name] = np.full(len(model.kind) if name.startswith("joint") else model.n, value)
     return total[cut.place], scale, sums, np.zeros(model.n)
 
 
