@@ -45,6 +45,12 @@ class CutMechanism:
     place: NDArray[np.intp]  # (J,) which body of the tree joint k of the source holds
     ends: tuple[tuple[int, int], ...]  # of each loop the bodies b and c of the tree that coincide
 
+    @property
+    def row_scale(self) -> Array:
+        """(6 L,) factors that make the rows of F and J comparable: 1/ℓ of lengths, ℓ of `wrench_length`."""
+        length = wrench_length(self.source)
+        return np.tile([1 / length] * 3 + [1.0] * 3, len(self.ends))
+
     def state(self, state: State) -> State:
         """Describe a state of the mechanism as one of the tree.
 
@@ -239,7 +245,7 @@ def assembled(model: Model, state: State, movable: NDArray[np.bool_] | None = No
     best = cut.state(state)
     gap = cut.gap(best)
     for _ in range(NEWTON_STEPS):
-        tried = displaced(cut.model, best, _least_norm(cut.jacobian(best), -gap))
+        tried = displaced(cut.model, best, _least_norm(cut, cut.jacobian(best), -gap))
         left = cut.gap(tried)
         if not np.max(np.abs(left)) < np.max(np.abs(gap)):
             break
@@ -251,7 +257,7 @@ def assembled(model: Model, state: State, movable: NDArray[np.bool_] | None = No
         free[_rates_of_source(cut)] = movable
     J, rates = cut.jacobian(best), minimal_rates(cut.model, best)
     for _ in range(2):  # the second pass removes what rounding left of the first
-        rates[free] += _least_norm(J[:, free], -J @ rates)
+        rates[free] += _least_norm(cut, J[:, free], -J @ rates)
     return cut.source_state(with_rates(cut.model, best, rates))
 
 
@@ -272,7 +278,7 @@ def allowed_rates(model: Model, state: State, rates: Array) -> Array:
     J, own = cut.jacobian(there), _rates_of_source(cut)
     whole = np.zeros(J.shape[1])
     whole[own] = rates
-    whole += _least_norm(J, -J @ whole)
+    whole += _least_norm(cut, J, -J @ whole)
     return np.asarray(whole[own])
 
 
@@ -302,7 +308,7 @@ def smallest_singular_value(model: Model, state: State) -> float:
         state: assembled.
 
     Returns:
-        The smallest singular value of J, rows scaled, of those that are not 0 at a pose nearby.
+        The smallest singular value of J (rows by `row_scale`) of those that are not 0 at a pose nearby.
 
     """
     cut = cut_open(model)
@@ -319,19 +325,13 @@ def smallest_singular_value(model: Model, state: State) -> float:
 
 def _singular_values(cut: CutMechanism, state: State) -> tuple[Array, Array]:
     """Singular values of J, rows scaled, and the rows (rank, nu) that span its own."""
-    _, values, rows = np.linalg.svd(_scaled_rows(cut.jacobian(state))[0])
+    _, values, rows = np.linalg.svd(cut.jacobian(state) * cut.row_scale[:, None])
     return values, rows[: int(np.sum(values > RANK_TOLERANCE * values[0]))]
 
 
-def _scaled_rows(matrix: Array) -> tuple[Array, Array]:
-    scale = np.linalg.norm(matrix, axis=1)
-    scale = 1 / np.where(scale > 0, scale, 1.0)
-    return matrix * scale[:, None], scale
-
-
-def _least_norm(matrix: Array, right: Array) -> Array:
-    scaled, scale = _scaled_rows(matrix)
-    return np.asarray(np.linalg.lstsq(scaled, right * scale, rcond=1e-9)[0])
+def _least_norm(cut: CutMechanism, matrix: Array, right: Array) -> Array:
+    scale = cut.row_scale
+    return np.asarray(np.linalg.lstsq(matrix * scale[:, None], right * scale, rcond=1e-9)[0])
 
 
 def _rates_of_source(cut: CutMechanism) -> NDArray[np.intp]:
@@ -342,11 +342,12 @@ def _rates_of_source(cut: CutMechanism) -> NDArray[np.intp]:
     return np.array([*swings, *(i for b in bodies for i in range(own[b].start, own[b].stop))], np.intp)
 
 
-def independent_rows(matrix: Array) -> NDArray[np.intp]:
+def independent_rows(matrix: Array, scale: Array | None = None) -> NDArray[np.intp]:
     """Choose rows that do not depend on others, by a pivoted QR of the scaled rows.
 
     Args:
         matrix: (m, n).
+        scale: (m,) factors of the rows; absent: to unit rows.
 
     Returns:
         Their numbers, ascending.
@@ -354,8 +355,8 @@ def independent_rows(matrix: Array) -> NDArray[np.intp]:
     """
     from scipy.linalg import qr  # not in a run's own process
 
-    scaled, _ = _scaled_rows(matrix)
-    _, triangle, order = qr(scaled.T, mode="economic", pivoting=True)
+    factor = 1 / np.linalg.norm(matrix, axis=1) if scale is None else scale
+    _, triangle, order = qr((matrix * factor[:, None]).T, mode="economic", pivoting=True)
     size = np.abs(np.diagonal(triangle))
     return np.sort(order[: int(np.sum(size > RANK_TOLERANCE * size[0]))])
 
@@ -373,7 +374,8 @@ def determinate_projectors(model: Model, state: State) -> Array | None:
     """
     cut = cut_open(model)
     there = cut.state(state)
-    J, scale = _scaled_rows(cut.jacobian(there))
+    scale = cut.row_scale
+    J = cut.jacobian(there) * scale[:, None]
     left, values, _ = np.linalg.svd(J)
     rank = int(np.sum(values > RANK_TOLERANCE * values[0]))
     if rank == len(J):

@@ -498,7 +498,7 @@ def _closed_state(source: YamlSource, model: Model, state: State, bodies: list[B
     rates = loop_gaps(model, found)[1] / max(1.0, float(np.max(np.abs(found.v))))
     for sizes, what in (
         (gaps, "does not close: points or axes are apart"),
-        (rates, "has rates that open it,"),
+        (rates, "opens: rates differ"),
     ):
         for k in np.flatnonzero(~(sizes <= LOOP_TOLERANCE)):
             place = source.value_positions[("closes", int(k))]

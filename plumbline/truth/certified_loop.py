@@ -191,7 +191,7 @@ def _per_joint(values: list[Any], sizes: list[int]) -> list[list[Any]]:
 
 def _select(cut: CutMechanism, J: Array, sizes: list[int]) -> _Selection:
     """Choose independent rows; the closing joints' coordinates depend, and the best of the others."""
-    rows, scaled = independent_rows(J), J / np.maximum(np.linalg.norm(J, axis=1, keepdims=True), 1e-9)
+    rows, scaled = independent_rows(J, cut.row_scale), J * cut.row_scale[:, None]
     first = np.cumsum([0, *sizes])
     parts = [i for k in cut.place[cut.source.n :] for i in range(first[k], first[k + 1])]
     others = np.setdiff1d(np.arange(J.shape[1]), parts)
