@@ -70,7 +70,7 @@ def _worst_error_per_state(quantity: str, truth: StateTruth, evaluation: Evaluat
     differences = [getattr(answer, quantity) - getattr(true, quantity) for answer, true in pairs]
     error = _error_norms(quantity, np.array(differences))
     bound = np.array([bound.tolerance(quantity) for bound in truth.bounds]).reshape(error.shape)
-    limit_error = [answer.limit_error.get(quantity, 0.0) for answer in evaluation.quantities]
+    limit_error = [(answer.limit_error or {}).get(quantity, 0.0) for answer in evaluation.quantities]
     bound = bound + np.array(limit_error)[:, None]
     scale = np.array([bound.scale[quantity] for bound in truth.bounds]).reshape(error.shape)
     known = np.isfinite(bound)

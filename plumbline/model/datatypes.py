@@ -90,7 +90,7 @@ class StateQuantities:
     mass_matrix: Array | None = None
     joint_moment: Array | None = None  # (J, 3) N m, moment on that body about that point, world frame
     # by quantity the uncertainty of a limit that the engine's answers were extrapolated to, in its unit
-    limit_error: Mapping[str, float] = field(default_factory=dict)
+    limit_error: Mapping[str, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,7 +35,7 @@ def test_states_of_random_loops_are_right(engine, closing):
                 value = getattr(truth, name)
                 error = np.asarray(getattr(found, name) - value)
                 error = np.linalg.norm(error, axis=-1) if error.shape[-1:] == (3,) else np.abs(error)
-                allowed = bound.tolerance(name) + found.limit_error.get(name, 0.0)
+                allowed = bound.tolerance(name) + (found.limit_error or {}).get(name, 0.0)
                 assert np.all(error <= allowed), (name, seed, model.kind)
                 assert np.max(allowed) < 1e-9 * np.max(scale), (name, seed)
                 assert bound.relative_bound(name) < MAX_RELATIVE_BOUND, (name, seed, scale)
