@@ -184,6 +184,7 @@ class Adapter(ABC):
 
         """
         self._check_mechanism(model, self.builds_elements)
+        _refuse_motions_of_loops(model)
         check_state(model, state)
         method = self.integrator(integrator)
         if method.kind == "step":
@@ -210,6 +211,7 @@ class Adapter(ABC):
 
         """
         self._check_mechanism(model, self.builds_elements)
+        _refuse_motions_of_loops(model)
         check_state(model, state)
         times = np.asarray(step * np.arange(count + 1), float)
         run = self._step(model, state, times, self.integrator(integrator), step)
@@ -233,6 +235,11 @@ class Adapter(ABC):
             raise Unsupported(
                 f"the adapter of {self.title} covers no {what} rotors, springs, dampers and efforts"
             )
+
+
+def _refuse_motions_of_loops(model: Model) -> None:
+    if model.has_loops:
+        raise Unsupported("mechanisms with loops are compared at state level only")
 
 
 def check_state(model: Model, state: State) -> None:

@@ -113,6 +113,8 @@ class ScenarioRun:
             if scenario.model.has_elements:
                 kinds += [TaskKind.MOTION_TRUTH, TaskKind.TRAJECTORY, TaskKind.LONG_RUN, TaskKind.RELATIONS]
             self._keys = [key for key in self._keys if key.kind not in kinds]
+        if scenario.model.has_loops:  # states are all that is compared of loops
+            self._keys = [key for key in self._keys if key.kind in (TaskKind.STATE_TRUTH, TaskKind.STATE)]
         self._pending = set(self._keys)  # without an outcome
         self._findings: dict[TaskKey, JudgingResult] = {}
         self._has_retried_truth = False
