@@ -67,7 +67,9 @@ from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 JOINT_TYPES = {"turn": mujoco.mjtJoint.mjJNT_HINGE, "slide": mujoco.mjtJoint.mjJNT_SLIDE}
 FIRST_ORDER_POWERS = (1, 2, 3, 4, 5, 6)
 MAX_IMPEDANCE = 0.9999  # of soft constraints: the largest that MuJoCo accepts
-REGULARISATIONS = (1e-3, 1e-4, 1e-5, 1e-6)  # of MuJoCo's own R; far below, rounding spoils its solver
+# of MuJoCo's own R: the largest, how they fall, and how many
+MAX_REGULARISATION, RATIO, REGULARISATIONS = 0.27, 3.0, 4
+MAX_ORDER_ERROR = 0.1
 MIN_SOFTNESS = 1e-9  # a smaller relative effect of R is rounding
 ROD_AXIAL_INERTIA = 0.01  # J_z of a rod over the mean principal inertia of the body that it carries
 IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
@@ -372,33 +374,42 @@ class _MujocoChain:
 
 
 def _rigid_limit(tree: _MujocoChain, cut: CutMechanism, state: State) -> StateQuantities:
-    """Evaluate at regularisations R falling by tens, check order 1, and extrapolate to none (Neville).
+    """Evaluate at falling regularisations R, check order 1, and extrapolate to none.
 
-    The limit's uncertainty is twice the difference of the extrapolations from the first three and the last.
+    Rounding of the forces grows with 1/R.  The limit's uncertainty, by rounding and by what is left of R, is
+    twice the difference from the extrapolation of another sequence.
     """
+    limits = [_extrapolated(tree, cut, state, factor) for factor in (1.0, 1.5)]
+    errors = {
+        name: 2 * float(np.max(np.linalg.norm(np.atleast_2d(limits[1][name] - limit), axis=-1)))
+        for name, limit in limits[0].items()
+    }
+    values: dict[str, Any] = {name: x if x.ndim else float(x) for name, x in limits[0].items()}
+    return StateQuantities(**values, limit_error=errors)
+
+
+def _extrapolated(tree: _MujocoChain, cut: CutMechanism, state: State, factor: float) -> dict[str, Array]:
+    """Extrapolate all quantities from one sequence of regularisations (Neville's scheme)."""
     there, found = cut.state(state), list[dict[str, Array]]()
-    for scale in REGULARISATIONS:
-        tree.soften(scale)
+    for k in range(REGULARISATIONS):
+        tree.soften(factor * MAX_REGULARISATION / RATIO**k)
         answer = determinate_part(cut.source, state, cut.source_quantities(tree.quantities(there)))
-        found.append(
-            {name: np.asarray(x) for name, x in vars(answer).items() if isinstance(x, np.ndarray | float)}
-        )
-    limit: dict[str, Any] = {}
-    errors: dict[str, float] = {}
+        found.append({name: np.asarray(x) for name, x in vars(answer).items() if x is not None})
+    limit: dict[str, Array] = {}
     for name, last in found[-1].items():
         column = [answers[name] for answers in found]
         steps = [float(np.max(np.abs(x - y))) for x, y in pairwise(column)]
         size = float(np.max(np.abs(last)))
         if name == "joint_moment":
             size = max(size, wrench_length(cut.source) * float(np.max(np.abs(found[-1]["joint_reaction"]))))
-        if steps[0] > MIN_SOFTNESS * size and not 9 <= steps[0] / steps[1] <= 11:
-            order = np.log10(steps[0] / steps[1])
-            raise EngineFailure(f"MuJoCo's {name} is of order {order:.2g} in its regularisation, not 1")
-        for factor in (10, 100):
-            column = [(factor * x - y) / (factor - 1) for y, x in pairwise(column)]
-        limit[name] = column[0] if last.ndim else float(column[0])
-        errors[name] = 2 * float(np.max(np.linalg.norm(np.atleast_2d(column[1] - column[0]), axis=-1)))
-    return StateQuantities(**limit, limit_error=errors)
+        if steps[0] > MIN_SOFTNESS * size:
+            order = np.log(steps[0] / steps[1]) / np.log(RATIO)
+            if abs(order - 1) > MAX_ORDER_ERROR:
+                raise EngineFailure(f"MuJoCo's {name} is of order {order:.2g} in its regularisation, not 1")
+        for power in range(1, REGULARISATIONS):
+            column = [(RATIO**power * x - y) / (RATIO**power - 1) for y, x in pairwise(column)]
+        limit[name] = column[0]
+    return limit
 
 
 def _add_load_actuators(spec: Any, body: Any, k: int, model: Model) -> None:
