@@ -192,7 +192,11 @@ def catalogue() -> dict[str, Path]:
         Name → file, family by family.
 
     """
-    files = (path for family in FAMILIES for path in sorted((CATALOGUE_FOLDER / family).glob("*.yaml")))
+    files = (
+        path
+        for family in FAMILIES
+        for path in sorted((CATALOGUE_FOLDER / family).glob("*.yaml"), key=lambda path: path.stem)
+    )
     return {path.stem: path for path in files}
 
 
