@@ -51,7 +51,8 @@ rate along the rod that rounding left is removed.
 
 A body hangs from the one before it unless it names another `parent`. This tree has an arm that turns about
 the world's vertical, and on it a pendulum on a hinge with a damper and a rotor, and a slider with a spring of
-its own and one to the pendulum:
+its own and one to the pendulum. Trees are compared at every level but that of steps; with rotors, springs,
+dampers or efforts a run compares states only:
 
 ```yaml
 schema_version: 1
