@@ -71,7 +71,9 @@ def render(document: Record) -> str:
                 "columns": {name: {row["quantity"]: row for row in rows} for name, rows in engines.items()},
                 "quantities": quantities,
                 "findings": [row for row in file["rows"] if needs_attention(row) and not row["diagnosis"]],
-                "lines": draw(file["drawing"], {cause["body"] for cause in file["causes"]}),
+                "lines": draw(
+                    file["drawing"], {body for cause in file["causes"] for body in cause["bodies"]}
+                ),
             }
         )
     counts = Counter(row["verdict"] for file in document["files"] for row in file["rows"])

@@ -223,6 +223,7 @@ def _cause_records(file: FileResult) -> Iterator[dict[str, Any]]:
             source = {"file": first.source.file, "line": first.source.line}
             yield {
                 "engine": name, "field": cause.field, "body": first.body, "joint": first.joint,
+                "bodies": sorted({change.carrier or change.body for change in cause.changes}),
                 "count": len(cause.changes), "source": source, "sentence": cause.sentence, "known": is_known,
             }  # fmt: skip
 

@@ -57,6 +57,7 @@ def test_a_difference_is_named_with_both_values_and_the_line(differing):
     (cause,) = file["causes"]
     assert cause["field"] == "gravity"
     assert cause["source"]["line"] == 1
+    assert cause["bodies"] == [""]
     assert "reads the gravity of the model as (0, 0, -9.81); the file says (0, 0, -1.62)" in cause["sentence"]
     bad = {row["quantity"] for row in file["rows"] if row["verdict"] == "disagrees"}
     assert bad == {"gravity_force", "bias_force", "acceleration", "potential_energy"}
