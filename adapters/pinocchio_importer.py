@@ -1,11 +1,11 @@
 """Pinocchio's importers of URDF and MJCF files.
 
 A body of the reading is a joint of the compiled model: links on fixed joints are lumped into its inertia.
-J: the joint's frame; B: the frame of its body, B = J P with the frame's placement P.  P_j: `jointPlacements`.
+J: the joint's frame; B: the frame of its body, B = J P with the frame's placement P.
 
     hinge, slide    q = x;  a continuous joint has q = (cos x, sin x)
     ball            R(q) = R_P R(x) R_Pᵀ, scalar last;  v_e = R_P v
-    free            X(q) = P_j⁻¹ X(x) P⁻¹, scalar last;  v_e = Ad_P (R_Bᵀ ṙ, ω),  so that
+    free            X(q) = X(x) P⁻¹, scalar last;  v_e = Ad_P (R_Bᵀ ṙ, ω),  so that
                     T = Ad_P diag(R_Bᵀ, 1),  Ṫv = Ad_P (−ω × R_Bᵀ ṙ, 0)
 
 Parts of a composite joint (several joints in an MJCF body) are not exposed to Python: their screws at q = 0
@@ -124,7 +124,6 @@ class _Place:
     kind: str  # scalars, continuous, ball or free
     body: NeutralBody
     placement: Any  # of the body's frame in the joint's frame
-    joint_placement: Any  # of the joint in its parent
     q: slice
     v: slice
     x: slice
@@ -152,7 +151,7 @@ class _Layout:
             nx = nv if kind == "continuous" else nq
             self.places.append(
                 _Place(
-                    kind, body, frame.placement, model.jointPlacements[j],
+                    kind, body, frame.placement,
                     slice(iq, iq + nq), slice(iv, iv + nv), slice(x, x + nx), slice(rate, rate + nv),
                 )
             )  # fmt: skip
@@ -265,7 +264,7 @@ class _Layout:
                 block = np.array(P.rotation)
                 q[place.q] = _scalar_last(block @ rotation_matrix(x) @ block.T)
             else:
-                X = place.joint_placement.inverse() * pin.SE3(pose_of_coordinates(x)) * P.inverse()
+                X = pin.SE3(pose_of_coordinates(x)) * P.inverse()
                 q[place.q] = [*X.translation, *_scalar_last(X.rotation)]
                 R_T = rotation_matrix(x[3:]).T
                 turned = P.action @ np.concatenate([-np.cross(rate[3:], R_T @ rate[:3]), np.zeros(3)])

@@ -17,13 +17,16 @@ GRAVITY = 9.81
 MASS, ARM, INERTIA = 2.0, 0.5, 0.375  # of the pendulum files: kg, m, kg m²
 CASES = [
     ("pendulum.urdf", "fixed"), ("arm.urdf", "fixed"), ("arm.urdf", "free"),
-    ("chain.xml", "fixed"), ("tree.xml", "fixed"),
+    ("chain.xml", "fixed"), ("tree.xml", "fixed"), ("turned.xml", "fixed"),
 ]  # fmt: skip
 # Differences from MuJoCo, which defines MJCF: examined by hand; the test fails when one ends.
 NO_INERTIA = "an <inertial> element without geometry: other masses or inertias than the file's"
 READ_OTHERWISE = {
     ("exudyn", "arm.urdf"): "axes askew turn the link; links on fixed joints lose their mass",
     ("drake", "tree.xml"): "a body with several joints: its pose is applied after the first of them",
+    ("pinocchio", "turned.xml"): "the pose of a turned free body moves its world frame",
+    ("dart", "turned.xml"): "<freejoint> is not read",
+    ("pybullet", "turned.xml"): "<freejoint> is not read",
     ("dart", "pendulum.xml"): NO_INERTIA,
     ("dart", "chain.xml"): NO_INERTIA,
     ("dart", "tree.xml"): NO_INERTIA,
@@ -31,7 +34,7 @@ READ_OTHERWISE = {
     ("pybullet", "chain.xml"): NO_INERTIA,
     ("pybullet", "tree.xml"): "joints without a type are not read",
 }
-REFUSED = {("exudyn", "pendulum.xml"), ("exudyn", "chain.xml"), ("exudyn", "tree.xml")}  # no MJCF
+REFUSED = {("exudyn", f"{name}.xml") for name in ("pendulum", "chain", "tree", "turned")}  # no MJCF
 # Larger than rounding: PyBullet diagonalises inertias to a limited accuracy.
 ACCURACY = {"pybullet": 1e-8}
 
