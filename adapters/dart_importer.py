@@ -28,6 +28,7 @@ from adapters.importer_common import (
     captured_output,
     free_joint_name,
     joint_from_screw,
+    joint_names,
     make_joint,
     merge_made_up_bodies,
     pose,
@@ -45,6 +46,11 @@ from plumbline.importers.neutral_model import (
 )
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import rotation_matrix
+
+# Joints with several degrees of freedom, a hinge or slide each; DART keeps one name for all.
+MULTIPLE_JOINTS = (
+    "PlanarJoint", "UniversalJoint", "EulerJoint", "TranslationalJoint", "TranslationalJoint2D",
+)  # fmt: skip
 
 
 class DartImporter(Importer):
@@ -169,10 +175,13 @@ class _Layout:
             joints = (make_joint(name, "hinge", T_C[:3, :3] @ joint.getAxis(), T_C[:3, 3]),)
         elif kind == "PrismaticJoint":
             joints = (joint_from_screw(name, np.zeros(3), T_C[:3, :3] @ joint.getAxis()),)
-        elif kind in ("PlanarJoint", "UniversalJoint", "EulerJoint", "TranslationalJoint"):
+        elif kind in MULTIPLE_JOINTS:
             joint.resetPositions()
             screws = np.array(joint.getRelativeJacobian()).T
-            joints = tuple(joint_from_screw(f"{name}/{k}", s[:3], s[3:]) for k, s in enumerate(screws))
+            names = joint_names(self.file).get(node.getName(), []) if self.file.format == "mjcf" else []
+            if len(names) != len(screws):
+                names = [f"{name}/{k}" for k in range(len(screws))]
+            joints = tuple(joint_from_screw(n, s[:3], s[3:]) for n, s in zip(names, screws, strict=True))
         else:
             raise NotImplementedError(f"a joint of type {kind}")
         return tuple(

@@ -205,10 +205,7 @@ class _Layout:
         M = np.array(plant.CalcMassMatrix(context))
         gravity = np.array(plant.CalcGravityGeneralizedForces(context))
         coriolis = np.array(plant.CalcBiasTerm(context))
-        accelerations = None
-        if not plant.num_constraints():
-            derivatives = plant.EvalTimeDerivatives(context)
-            accelerations = np.array(derivatives.get_generalized_velocity().CopyToVector())
+        accelerations = self._accelerations()
         poses = {}
         for index in self.order:
             body = plant.get_body(index)
@@ -221,6 +218,18 @@ class _Layout:
             None if has_springs else float(plant.CalcPotentialEnergy(context)),
         )  # fmt: skip
         return to_canonical(engine, T, np.zeros(len(v)))
+
+    def _accelerations(self) -> Array | None:
+        """Where the mass matrix is singular, Drake raises: there is no acceleration."""
+        if self.plant.num_constraints():
+            return None
+        try:
+            derivatives = self.plant.EvalTimeDerivatives(self.context)
+        except RuntimeError as error:
+            if "not positive-definite" in str(error):
+                return None
+            raise
+        return np.array(derivatives.get_generalized_velocity().CopyToVector())
 
     def _passive_force(self, coriolis: Array, gravity: Array) -> Array:
         plant, context = self.plant, self.context
