@@ -15,7 +15,7 @@ export UV_COMPILE_BYTECODE := 1
 export PYTHONDONTWRITEBYTECODE :=
 MUTANTS ?= --sample 300 --seed 1 --jobs 2
 
-.PHONY: help run test nightly bench mutants importers lint lock clean
+.PHONY: help run test nightly bench mutants importers models lint lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' Makefile | sed 's/:.*##/\t/' | expand -t 12
@@ -96,6 +96,9 @@ importers: .importers/.done .importers-exudyn/.done  ## more importers for `plum
 	UV_COMPILE_BYTECODE=0 $(UV) pip install --quiet --require-hashes --no-deps --python .corpora/bin/python \
 		-r locks/corpora.lock
 	@touch $@
+
+models: .venv/test.done importers .corpora/.done  ## public robots through every importer; writes docs/importers.md
+	$(PYTHON) -m tools.model_survey
 
 LOCK = $(UV) pip compile --quiet --universal --python-version 3.11 --generate-hashes \
 	--no-emit-index-url --no-header --no-annotate

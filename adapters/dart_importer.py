@@ -84,7 +84,8 @@ class DartImporter(Importer):
         with captured_output() as warnings:
             skeletons = _loaded(file)
         if not skeletons:
-            return Reading(self.version(), refusal=" ".join(warnings) or "no skeleton was made of the file")
+            reasons = [line for line in warnings if "Error" in line] or warnings
+            return Reading(self.version(), refusal=" ".join(reasons) or "no skeleton was made of the file")
         try:
             layout = _Layout(skeletons, file)
         except NotImplementedError as kind:

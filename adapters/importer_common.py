@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tempfile
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Sequence
@@ -22,6 +23,7 @@ from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
 
 MAX_WARNINGS = 20
+_COLOURS = re.compile(r"\x1b\[[0-9;]*m")
 _ROTATION_EPSILON = 1e-12  # |ω| of a unit screw below which the motion is a displacement
 
 
@@ -240,6 +242,6 @@ def captured_output() -> Iterator[list[str]]:
                 os.dup2(old, descriptor)
                 os.close(old)
             sink.seek(0)
-            text = sink.read(200_000).decode(errors="replace")
+            text = _COLOURS.sub("", sink.read(200_000).decode(errors="replace"))
             lines.extend(list(dict.fromkeys(line.strip() for line in text.splitlines() if line.strip())))
             del lines[MAX_WARNINGS:]

@@ -119,6 +119,7 @@ def _switch_off(m: Any) -> None:
         if hasattr(m, name):  # later versions have more of them
             getattr(m, name)[:] = 0
     m.opt.density = m.opt.viscosity = 0
+    m.opt.enableflags |= mujoco.mjtEnableBit.mjENBL_ENERGY  # without it older versions return zeros
     disabled = mujoco.mjtDisableBit
     m.opt.disableflags |= disabled.mjDSBL_ACTUATION | disabled.mjDSBL_CONTACT | disabled.mjDSBL_CONSTRAINT
 

@@ -221,7 +221,9 @@ class _Layout:
             v = list(state.velocities[k + base : k + count])
             rows = slice(k, k + count)
             if q or base:
-                M[rows, rows] = bullet.calculateMassMatrix(body, q) if q else _mass_of_base(body)
+                M[rows, rows] = (
+                    bullet.calculateMassMatrix(body, q) if bullet.getNumJoints(body) else _mass_of_base(body)
+                )
             if q and not base:
                 zero = [0.0] * len(q)
                 bullet.setGravity(*(_matrix(*bullet.getBasePositionAndOrientation(body))[:3, :3].T @ GRAVITY))
@@ -255,7 +257,7 @@ def _base_map(body: int, x: Array) -> Array:
 
 
 def _mass_of_base(body: int) -> Array:
-    """`calculateMassMatrix` needs a joint: of a single body it is what `getDynamicsInfo` says."""
+    """`calculateMassMatrix` needs a second link: of a single one it is what `getDynamicsInfo` says."""
     mass, _, diagonal = bullet.getDynamicsInfo(body, BASE)[:3]
     return np.diag([*diagonal, mass, mass, mass])
 

@@ -50,13 +50,16 @@ def pool():
         yield workers
 
 
-def call(pool, importer, function, *arguments, seconds=60.0):
-    """Call in a worker, as the command does: an importer may end its process."""
+def optional_python(importer):
     try:
-        python = importer_interpreter(importer)
+        return importer_interpreter(importer)
     except EnvironmentUnavailable as error:
         pytest.skip(str(error))
-    limits = Limits(seconds=seconds)
+
+
+def call(pool, importer, function, *arguments, seconds=60.0):
+    """Call in a worker, as the command does: an importer may end its process."""
+    limits, python = Limits(seconds=seconds), optional_python(importer)
     (outcome,) = pool.run([Task(0, function, (importer, *arguments), limits, python=python)])
     assert outcome.failure is None, outcome.failure
     return outcome.value
@@ -161,3 +164,26 @@ def test_a_bad_file_is_refused_in_the_importers_words(pool, tmp_path, importer, 
 def test_an_importer_describes_itself(pool, importer):
     info = call(pool, importer, describe_importer)
     assert info.missing is None and info.version and info.name == importer
+
+
+def test_an_importer_that_ends_its_process_is_survived(pool, tmp_path):
+    python = optional_python("drake")
+    path = tmp_path / "limits.urdf"
+    text = (FILES / "pendulum.urdf").read_text(encoding="utf-8")
+    path.write_text(text.replace('lower="-2" upper="2"', 'lower="2" upper="-2"'), encoding="utf-8")
+    file = ModelFile(str(path), "urdf", root=str(tmp_path))
+    (outcome,) = pool.run([Task(0, read_model_file, ("drake", file), Limits(60.0), python=python)])
+    assert outcome.failure is not None and outcome.failure.startswith("crashed: the worker")
+    assert call(pool, "drake", read_model_file, file_of("pendulum.urdf")).model is not None
+
+
+@pytest.mark.parametrize("importer", ["mujoco", "drake"])
+def test_an_importer_that_takes_too_long_is_killed(importer):
+    python = optional_python(importer)
+    with WorkerPool(1) as own:
+        task = Task(0, read_model_file, (importer, file_of("arm.urdf")), Limits(0.001), python=python)
+        (outcome,) = own.run([task])
+        assert outcome.failure == "timeout: no answer within 0.001 s, worker killed"
+        task = Task(1, read_model_file, (importer, file_of("arm.urdf")), Limits(60.0), python=python)
+        (outcome,) = own.run([task])
+        assert outcome.value.model is not None

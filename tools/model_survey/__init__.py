@@ -1,0 +1,1 @@
+"""Robots of public packages through every importer; the page docs/importers.md."""

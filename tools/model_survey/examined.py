@@ -1,0 +1,133 @@
+"""What was examined by hand: kinds of difference, by importer, format and parameter.
+
+A cause that `plumbline model` names belongs to the first entry that fits.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+Kind = Literal["differs from the file", "not supported", "left open by the file", "accuracy"]
+
+
+@dataclass(frozen=True)
+class Examined:
+    """One kind of difference."""
+
+    importer: str
+    format: str
+    fields: tuple[str, ...]  # of the causes
+    kind: Kind
+    title: str  # a clause about the importer
+    script: str = ""  # in docs/importers
+    pattern: str = ""  # regular expression that the cause's sentence matches
+
+    def fits(self, importer: str, form: str, field: str, sentence: str) -> bool:
+        """Whether a cause is of this kind.
+
+        Args:
+            importer: that differs.
+            form: urdf or mjcf.
+            field: parameter of the cause.
+            sentence: of the cause.
+
+        Returns:
+            Whether it is.
+
+        """
+        own = importer, form
+        return (
+            own == (self.importer, self.format)
+            and field in self.fields
+            and (not self.pattern or re.search(self.pattern, sentence) is not None)
+        )
+
+
+INERTIAL_FIELDS = ("mass", "center", "inertia", "inertial")
+JOINT_POSE = ("axis", "anchor", "position", "attitude", "reference")
+
+EXAMINED = (
+    Examined(
+        "mujoco", "urdf", ("inertial", "inertia"), "differs from the file",
+        "drops the inertia of a massless link that is fixed to another one", "mujoco_massless_link.py",
+    ),
+    Examined(
+        "pinocchio", "mjcf", ("gravity",), "not supported",
+        "does not read `<option gravity>`", "pinocchio_gravity.py",
+    ),
+    Examined(
+        "pinocchio", "mjcf", ("joints",), "not supported",
+        "reads only the first body of `<worldbody>`", "pinocchio_second_root.py", r"as none \(fixed\)",
+    ),
+    Examined(
+        "pinocchio", "mjcf", ("position",), "differs from the file",
+        "drops the pose of a root body without joint", "pinocchio_root_pose.py",
+    ),
+    Examined(
+        "drake", "urdf", INERTIAL_FIELDS, "differs from the file",
+        "replaces mass and inertia that no rigid body has by others, with a warning",
+        "drake_replaced_inertia.py",
+    ),
+    Examined(
+        "drake", "mjcf", ("axis", "anchor"), "differs from the file",
+        "applies the pose of a body with several joints after the first of them", "drake_several_joints.py",
+    ),
+    Examined("drake", "mjcf", ("stiffness",), "not supported", "does not read joint springs, with a warning"),
+    Examined(
+        "drake", "mjcf", ("armature",), "not supported",
+        "reads the armature only of joints with an actuator that it reads",
+    ),
+    Examined("drake", "mjcf", ("reference", "position"), "not supported", "does not read `ref` of joints"),
+    Examined(
+        "dart", "urdf", INERTIAL_FIELDS, "left open by the file",
+        "gives a link without `<inertial>` a mass of 1 kg and moments of 1 kg m²",
+    ),
+    Examined(
+        "dart", "mjcf", ("joints",), "differs from the file", "does not read `<freejoint>`",
+        "dart_freejoint.py",
+    ),
+    Examined(
+        "dart", "mjcf", INERTIAL_FIELDS, "differs from the file",
+        "reads `<inertial>` only beside a `<geom>`, and its moments never; where it infers mass, counts the "
+        "first `<geom>` only, with a warning", "dart_mjcf_inertial.py",
+    ),
+    Examined("dart", "mjcf", ("stiffness", "armature"), "not supported", "reads no springs and no armature"),
+    Examined("dart", "mjcf", ("gravity",), "not supported", "does not read `<option gravity>`"),
+    Examined("dart", "mjcf", ("reference",), "not supported", "does not read `ref` of joints"),
+    Examined(
+        "exudyn", "urdf", ("inertial", "mass", "center", "inertia"), "differs from the file",
+        "leaves links on fixed joints out, with their mass", "exudyn_fixed_link.py",
+    ),
+    Examined(
+        "exudyn", "urdf", (*JOINT_POSE, "parent"), "differs from the file",
+        "turns the frame of a link whose axis is none of x, y, z, and not what the link carries; attaches "
+        "children of links without joint to the world", "exudyn_turned_axis.py",
+    ),
+    Examined(
+        "pybullet", "mjcf", ("joints",), "not supported",
+        "reads no joints without `type` and no `<freejoint>`", "pybullet_joint_type.py",
+    ),
+    Examined(
+        "pybullet", "mjcf", INERTIAL_FIELDS, "differs from the file",
+        "does not read `diaginertia`, and keeps numbers in single precision", "pybullet_mjcf_inertial.py",
+    ),
+    Examined("pybullet", "mjcf", ("armature",), "not supported", "reads no armature"),
+    Examined("pybullet", "mjcf", ("gravity",), "not supported", "takes gravity from its caller"),
+    Examined(
+        "pybullet", "mjcf", JOINT_POSE, "accuracy", "keeps numbers in single precision",
+        "pybullet_mjcf_inertial.py",
+    ),
+    Examined(
+        "pybullet", "urdf", ("mass", "center"), "left open by the file",
+        "gives a link without `<inertial>` a mass of 1 kg and moments of 1 kg m²",
+    ),
+    Examined(
+        "pybullet", "urdf", ("inertia",), "accuracy",
+        "diagonalises inertias to a limited accuracy, and replaces those that no rigid body has",
+    ),
+    Examined(
+        "pybullet", "urdf", ("joints",), "differs from the file", "fixes a base without mass to the world"
+    ),
+)  # fmt: skip
