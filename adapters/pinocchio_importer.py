@@ -10,8 +10,7 @@ J: the joint's frame; B: the frame of its body, B = J P with the frame's placeme
 
 Parts of a composite joint (several joints in an MJCF body) are not exposed to Python: their screws at q = 0
 are the columns of its motion subspace, and their names come from the file, as Pinocchio keeps only one.
-Damping is in the model, and no routine of Pinocchio applies it; `aba` is called without forces.  The kinetic
-energy leaves the armature out and is not compared.
+Damping is in the model, and no routine of Pinocchio applies it; `aba` is called without forces.
 """
 
 from __future__ import annotations
@@ -57,7 +56,6 @@ class PinocchioImporter(Importer):
     extra_requirements = (("<4", "cmeel-urdfdom<5"), ("<4", "cmeel-tinyxml2<11"))
     unsupported: ClassVar[dict[str, str]] = {
         "passive_force": "no routine of Pinocchio applies the damping that its models hold",
-        "kinetic_energy": "computeKineticEnergy leaves the armature out, which M has",
     }
 
     def version(self) -> str:
@@ -241,11 +239,12 @@ class _Layout:
         bias = np.array(pin.nonLinearEffects(m, d, q, v))
         gravity = np.array(pin.computeGeneralizedGravity(m, d, q))
         acceleration = np.array(pin.aba(m, d, q, v, np.zeros(m.nv)))
+        kinetic = float(pin.computeKineticEnergy(m, d, q, v))
         potential = float(pin.computePotentialEnergy(m, d, q))
         pin.framesForwardKinematics(m, d, q)
         placements = ((f.name, d.oMi[f.parentJoint] * f.placement) for f in self.body_frames if f.parentJoint)
         poses = {name: pose(placement.rotation, placement.translation) for name, placement in placements}
-        engine = ModelQuantities(poses, M, bias, gravity, None, acceleration, None, potential)
+        engine = ModelQuantities(poses, M, bias, gravity, None, acceleration, kinetic, potential)
         return to_canonical(engine, T, Tdot_v)
 
     def _engine_state(self, state: CanonicalState) -> tuple[Array, Array, Array, Array]:
