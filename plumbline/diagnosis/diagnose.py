@@ -32,6 +32,7 @@ from plumbline.diagnosis.fit import (
     per_entry,
 )
 from plumbline.diagnosis.hypotheses import format_significant
+from plumbline.diagnosis.joint_causes import diagnose_joints
 from plumbline.diagnosis.output_defects import output_defects
 from plumbline.diagnosis.result import Diagnosis
 from plumbline.engines.registry import load_adapter
@@ -65,6 +66,8 @@ def explain_disagreement(
         The sentence of `diagnose`, or the scatter of the error.
 
     """
+    if not model.is_chain:
+        return Diagnosis("" if is_known else diagnose_joints(model, engine_quantities, truth))
     evaluate = load_adapter(engine).evaluate
     if not is_known:
         return Diagnosis(diagnose(model, engine_quantities, truth, evaluate))

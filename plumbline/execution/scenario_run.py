@@ -207,8 +207,7 @@ class ScenarioRun:
             following = [self._cell_task(k) for k in self._keys if k.needed_truth == key.kind]
         else:
             found = self._findings[key] = self._judged(outcome)
-            is_chain = self.scenario.model.is_chain  # the hypotheses are those of chains
-            if key.kind in (TaskKind.STATE, TaskKind.STEP) and is_chain:
+            if key.kind in (TaskKind.STATE, TaskKind.STEP):
                 following = self._diagnosis_tasks(outcome, found)
         self._pending |= {task.key for task in following}
         return following

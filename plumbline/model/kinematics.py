@@ -399,6 +399,26 @@ def elastic_energy(model: Model, state: State) -> float:
     return float(energy + np.sum(model.spring_stiffness * (length - model.spring_length) ** 2)) / 2
 
 
+def kinetic_energy_of_rotors(model: Model, state: State) -> float:
+    """Return the kinetic energy of all rotors.
+
+    Args:
+        model: the mechanism.
+        state: a state of it.
+
+    Returns:
+        Σ ½ a ẋ² + Σ ½ a ‖ω − ω_far‖² [J].
+
+    """
+    energy = np.sum(model.armature * state.xdot**2)
+    spin = rotate_vectors(rotation_matrix(state.p), state.omega)
+    for k in [k for k, kind in enumerate(model.kind) if kind == "ball"]:
+        far = model.body[k, 0]
+        relative = spin[k] - (spin[far] if far >= 0 else 0.0)
+        energy += model.armature[k, 0] * (relative @ relative - state.xdot[k, 0] ** 2)
+    return float(energy) / 2
+
+
 def rate_count(model: Model) -> int:
     """Count the minimal rates ν of `velocity_jacobian`.
 

@@ -378,6 +378,20 @@ def _directions_used(t: _TreeTerms) -> Array:
     return used
 
 
+def tree_solution(model: Model, state: State) -> Array:
+    """Solve the Newton–Euler system of a tree in doubles.
+
+    Args:
+        model: the mechanism; masses > 0, inertias positive definite.
+        state: a state of it.
+
+    Returns:
+        (4, N, 3): r̈ [m/s²], ω̇ [rad/s²], and force [N] and moment [N m] of the joints; world axes.
+
+    """
+    return np.asarray(_TreeTerms(model, state).solution)
+
+
 def tree_tolerances(
     model: Model, state: State
 ) -> tuple[Array, dict[str, Array | float], dict[str, float], Array]:

@@ -1,0 +1,53 @@
+"""Defects of joints and passive elements: every one is reported, and named by its own number."""
+
+from functools import cache
+
+import pytest
+
+from plumbline.diagnosis.joint_causes import diagnose_joints
+from plumbline.engines.calls import Evaluation
+from plumbline.engines.registry import load_adapter
+from plumbline.judging.rows import RowContext
+from plumbline.judging.state import judge_states
+from plumbline.model.kinematics import complete_state
+from plumbline.model.sampling import random_states
+from plumbline.truth.ground_truth import state_truth
+from tests.helpers.planted_elements import ELEMENT_DEFECTS, ElementDefect, subject
+
+
+@cache
+def right():
+    model = subject()
+    return model, state_truth(model, random_states(model, 5, seed=2))
+
+
+def report(defect):
+    """Quantities that disagree, and the diagnosis."""
+    model, truth = right()
+    wrong = defect.change(model) if defect.change else model
+    states = [complete_state(wrong, state) for state in truth.states]
+    found = load_adapter(defect.engine).evaluate(wrong, states)
+    if defect.answer:
+        found = [defect.answer(model, s, a) for s, a in zip(truth.states, found, strict=True)]
+    context = RowContext("planted", "planted", defect.name, defect.name, "0")
+    rows = judge_states(context, truth, Evaluation(found, None, None, 0.0)).rows
+    return [row.quantity for row in rows if row.verdict == "disagrees"], found
+
+
+@pytest.mark.parametrize("defect", ELEMENT_DEFECTS, ids=[d.name for d in ELEMENT_DEFECTS])
+def test_every_defect_is_reported_and_named(defect):
+    wrong, found = report(defect)
+    assert wrong, f"nothing reports {defect.name}"
+    text = diagnose_joints(*right()[:1], found, right()[1])
+    if defect.expected:
+        assert defect.expected in text and "cannot distinguish" not in text, f"{defect.name}: {text}"
+
+
+@pytest.mark.parametrize("engine", ["reference", "mujoco", "pinocchio", "pinocchio-aba"])
+def test_the_engines_without_defect_are_not_reported(engine):
+    assert report(ElementDefect("clean", engine=engine))[0] == []
+
+
+def test_there_are_forty_and_nine_of_ten_are_named():
+    assert len(ELEMENT_DEFECTS) >= 40 and len({d.name for d in ELEMENT_DEFECTS}) == len(ELEMENT_DEFECTS)
+    assert sum(bool(d.expected) for d in ELEMENT_DEFECTS) >= 0.9 * len(ELEMENT_DEFECTS)
