@@ -89,7 +89,8 @@ def _elements() -> Iterator[ElementDefect]:
         for name in ("armature", "damping", "stiffness", "rest", "effort"):
             if at == (0, 0) and name in ("rest", "effort"):
                 continue
-            for factor in [(0.0, 2.0, -1.0, 1 + 1e-6)[(index + len(name)) % 4]]:
+            signed = name not in ("armature", "stiffness")  # an engine refuses negative ones
+            for factor in [(0.0, 2.0, 1 + 1e-6, -1.0)[(index + len(name)) % (3 + signed)]]:
                 engine = ("mujoco", "pinocchio", "pinocchio-aba")[index % 3]
                 expected = f"{words.get(name, f'the {name} of')} {joint} "
                 yield ElementDefect(
