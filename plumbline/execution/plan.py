@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Literal
@@ -122,7 +122,7 @@ def task_keys(
     engines: Mapping[str, EngineInfo],
     level: LevelSelection | Literal["random"],
     has_long_runs: bool = False,
-    has_steps: bool = True,
+    left_out: Collection[TaskKind] = (),
 ) -> Iterator[TaskKey]:
     """List the tasks of a scenario that are known beforehand.
 
@@ -131,28 +131,23 @@ def task_keys(
         engines: descriptions of the engines; those that are missing get no task.
         level: which levels to compare at; "random" is state and step level.
         has_long_runs: whether invariants are judged over long runs.
-        has_steps: whether the scenario is small enough for the step level.
+        left_out: kinds that are not compared of the scenario.
 
     Yields:
         The truths, then the cells engine by engine.
 
     """
     has_states, has_runs = level in ("state", "random", "all"), level in ("trajectory", "all")
-    if has_states:
-        yield TaskKey(TaskKind.STATE_TRUTH, scenario)
-    if has_runs:
-        yield TaskKey(TaskKind.MOTION_TRUTH, scenario)
+    wanted = [TaskKind.STATE_TRUTH] * has_states + [TaskKind.MOTION_TRUTH] * has_runs
+    yield from (TaskKey(kind, scenario) for kind in wanted if kind not in left_out)
     for name, info in engines.items():
         if info.missing is not None:
             continue
-        if has_states:
-            yield TaskKey(TaskKind.STATE, scenario, name)
-        if has_steps and level in ("step", "random", "all"):
-            for one in info.integrators:
-                if one.method is not None:
-                    yield TaskKey(TaskKind.STEP, scenario, name, one.name)
-        if level == "all":
-            yield TaskKey(TaskKind.RELATIONS, scenario, name)
-        if has_runs:
-            for kind in (TaskKind.TRAJECTORY, TaskKind.LONG_RUN)[: 1 + has_long_runs]:
-                yield from (TaskKey(kind, scenario, name, one.name) for one in info.integrators)
+        keys = [TaskKey(TaskKind.STATE, scenario, name)] * has_states
+        if level in ("step", "random", "all"):
+            declared = (one for one in info.integrators if one.method is not None)
+            keys += [TaskKey(TaskKind.STEP, scenario, name, one.name) for one in declared]
+        keys += [TaskKey(TaskKind.RELATIONS, scenario, name)] * (level == "all")
+        runs = [TaskKind.TRAJECTORY] * has_runs + [TaskKind.LONG_RUN] * (has_runs and has_long_runs)
+        keys += [TaskKey(kind, scenario, name, one.name) for kind in runs for one in info.integrators]
+        yield from (key for key in keys if key.kind not in left_out)

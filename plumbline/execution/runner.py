@@ -19,7 +19,7 @@ from plumbline.engines.adapter import EngineInfo
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import Plan, ProgressCallback, RunObserver, TaskKey, TaskKind, task_keys
 from plumbline.execution.random_batch import RandomBatch
-from plumbline.execution.scenario_run import ScenarioRun, has_steps
+from plumbline.execution.scenario_run import ScenarioRun, uncompared_kinds
 from plumbline.judging import known_issues
 from plumbline.judging.identity import RUN_SCENARIO, IdentityCheck
 from plumbline.judging.rows import RUN_FAMILY, Row, Verdict
@@ -184,8 +184,8 @@ class _Run:
         self.observer.on_start(self.engines)
         has_long_runs = plan.long_run_seconds > 0
         total = sum(
-            sum(1 for _ in task_keys("", self.engines, plan.level, has_long_runs, has_steps(scenario)))
-            for scenario in plan.scenarios
+            sum(1 for _ in task_keys("", self.engines, plan.level, has_long_runs, uncompared_kinds(s.model)))
+            for s in plan.scenarios
         )
         runs = min(plan.random_trajectory_count, len(plan.random_scenarios))
         total += runs * sum(1 for _ in task_keys("", self.engines, plan.level))
@@ -197,12 +197,12 @@ class _Run:
             with self.cpu_times.measure("judging"):
                 following = self.open[outcome.key.scenario].on_outcome(outcome)
                 self._show_rows(self.open[outcome.key.scenario], outcome)
-                while self.open and (first := next(iter(self.open.values()))).is_done:
-                    self._finish(self.open.pop(first.scenario.name))
+                self._finish_done()
             for task in following:
                 scheduler.submit(task)
                 total += task.key.kind == TaskKind.DIAGNOSIS
             progress(done, total, str(outcome.key))
+        self._finish_done()  # the last ones may have no task at all
 
     def result(self) -> RunResult:
         if rows := self.known.mark_known(self.identity.rows(), bodies=0):
@@ -230,6 +230,11 @@ class _Run:
         if name in self.rows and rows:  # random scenarios are many
             rows = self.known_of_observer.mark_known(rows, bodies)
             self.observer.on_rows(name, rows, scenario_run.is_done)
+
+    def _finish_done(self) -> None:
+        """Finish scenarios in the order in which they were opened, up to the first with open tasks."""
+        while self.open and (first := next(iter(self.open.values()))).is_done:
+            self._finish(self.open.pop(first.scenario.name))
 
     def _finish(self, scenario_run: ScenarioRun) -> None:
         """Keep the rows and tables of a scenario whose tasks have all finished."""

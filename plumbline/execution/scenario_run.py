@@ -34,7 +34,7 @@ from plumbline.judging.step import (
     run_step_study,
 )
 from plumbline.judging.trajectory import judge_trajectory
-from plumbline.model.datatypes import Integrator
+from plumbline.model.datatypes import Integrator, Model
 from plumbline.model.invariants import inertia_ratio
 from plumbline.model.sampling import compared_states
 from plumbline.processes.workers import Outcome, Pickled, Task
@@ -53,6 +53,12 @@ _LEVELS: dict[TaskKind, Level] = {
 }
 
 
+# What of a scenario may be left out, by the level of the row that reports it.
+_GAP_LEVELS: dict[TaskKind, Level] = {
+    TaskKind.STEP: "step", TaskKind.TRAJECTORY: "trajectory", TaskKind.RELATIONS: "relations",
+}  # fmt: skip
+
+
 @dataclass(frozen=True)
 class TruthFailure:
     """The truth could not be computed."""
@@ -60,17 +66,29 @@ class TruthFailure:
     reason: str
 
 
-def has_steps(scenario: Scenario) -> bool:
-    """Return whether a scenario is compared at step level.
+def uncompared_kinds(model: Model) -> dict[TaskKind, str]:
+    """List what is not compared of a mechanism on any engine.
 
     Args:
-        scenario: any scenario.
+        model: the mechanism.
 
     Returns:
-        True for chains of at most `MAX_STEP_BODIES` bodies.
+        By kind of task why it is left out.
 
     """
-    return scenario.model.n <= MAX_STEP_BODIES
+    motions = (
+        TaskKind.MOTION_TRUTH, TaskKind.TRAJECTORY, TaskKind.LONG_RUN, TaskKind.RELATIONS, TaskKind.STEP,
+    )  # fmt: skip
+    if model.has_loops:
+        return dict.fromkeys(motions, "only states of mechanisms with loops are compared")
+    if model.has_elements:
+        reason = "only states of mechanisms with rotors, springs, dampers or efforts are compared"
+        return dict.fromkeys(motions, reason)
+    if not model.is_chain:
+        return {TaskKind.STEP: "formulas of single steps cover chains of rods and balls"}
+    if model.n > MAX_STEP_BODIES:
+        return {TaskKind.STEP: f"single steps are compared of at most {MAX_STEP_BODIES} bodies"}
+    return {}
 
 
 class ScenarioRun:
@@ -107,14 +125,10 @@ class ScenarioRun:
         self._plan, self._engines, self._known, self._is_random = plan, engines, known, is_random
         levels = level or (plan.random_level if is_random else plan.level)
         has_long_runs = plan.long_run_seconds > 0 and not is_random
-        self._keys = list(task_keys(scenario.name, engines, levels, has_long_runs, has_steps(scenario)))
-        if not scenario.model.is_chain:  # not yet covered of trees
-            kinds = [TaskKind.STEP]
-            if scenario.model.has_elements:
-                kinds += [TaskKind.MOTION_TRUTH, TaskKind.TRAJECTORY, TaskKind.LONG_RUN, TaskKind.RELATIONS]
-            self._keys = [key for key in self._keys if key.kind not in kinds]
-        if scenario.model.has_loops:  # states are all that is compared of loops
-            self._keys = [key for key in self._keys if key.kind in (TaskKind.STATE_TRUTH, TaskKind.STATE)]
+        self._left_out = uncompared_kinds(scenario.model)
+        every = list(task_keys(scenario.name, engines, levels, has_long_runs))
+        self._keys = [key for key in every if key.kind not in self._left_out]
+        self._gaps = dict.fromkeys((key.engine, key.kind) for key in every if key.kind in _GAP_LEVELS)
         self._pending = set(self._keys)  # without an outcome
         self._findings: dict[TaskKey, JudgingResult] = {}
         self._has_retried_truth = False
@@ -179,6 +193,11 @@ class ScenarioRun:
                 if key.engine == name and key in self._findings:
                     found.rows += self._findings[key].rows
                     found.tables += self._findings[key].tables
+            for engine, kind in self._gaps:
+                if engine == name and kind in self._left_out:
+                    reason = f"not compared: {self._left_out[kind]}"
+                    row = self._context(name).make_row
+                    found.rows.append(row(_GAP_LEVELS[kind], "-", "all", Verdict.INFORMATION, reason))
         found.rows = outlier.annotate_outliers(found.rows)
         return found
 

@@ -24,7 +24,7 @@ class Verdict(StrEnum):
     NOT_INSTALLED = "not installed"
     FAILED = "failed"
     HARNESS_FAILED = "harness failed"
-    INFORMATION = "information"  # implied by other rows: it cannot fail by itself
+    INFORMATION = "information"  # implied by other rows, or not compared: it cannot fail by itself
 
     @property
     def is_comparison(self) -> bool:
@@ -64,7 +64,9 @@ VERDICT_STYLES = {
     Verdict.UNSUPPORTED: VerdictStyle("–", "unsupported", "the engine cannot do this", 6, 2),
     Verdict.NOT_INSTALLED: VerdictStyle("∅", "not installed", "the engine is not on this machine", 1, 1),
     Verdict.AGREES: VerdictStyle("✓", "agree", "the error is within its derived tolerance", 4, 4),
-    Verdict.INFORMATION: VerdictStyle("i", "are information", "implied by other rows; not a check", 0, 0),
+    Verdict.INFORMATION: VerdictStyle(
+        "i", "are information", "implied by other rows, or not compared: not a check", 0, 0
+    ),
 }
 RUN_FAMILY = "run"  # of a row that is about the whole run, in place of a scenario's family
 RECORDED = "recorded"  # what terminal and report show for a disagreement or failure that is recorded

@@ -1,8 +1,8 @@
 """The product as tests: every scenario × engine × level is a test of its own.
 
 `pytest -k "double and mujoco"` runs those of one family and engine; the failure message is the
-verdict's own sentence.  By default the long chains run at state level only, and single steps of one and two
-bodies; `-m full` runs the rest.
+verdict's own sentence.  By default long chains and trees run at state level only, and single steps of one and
+two bodies; `-m full` runs the rest.
 """
 
 import os
@@ -12,7 +12,7 @@ import pytest
 from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.execution.plan import Plan, TaskKind
 from plumbline.execution.runner import describe_engines
-from plumbline.execution.scenario_run import ScenarioRun, has_steps
+from plumbline.execution.scenario_run import ScenarioRun, uncompared_kinds
 from plumbline.judging import known_issues
 from plumbline.model.invariants import inertia_ratio
 from plumbline.processes.workers import Limits, WorkerPool
@@ -23,16 +23,18 @@ MAX_BODIES_IN_FAST_FORM = {"state": 50, "step": 2, "trajectory": 5}  # longer ch
 
 def levels(engine, scenario):
     """Levels at which an engine is compared on a scenario."""
-    integrators = load_adapter(engine).integrators if scenario.model.is_chain else ()
-    has_formulas = any(i.method is not None for i in integrators) and has_steps(scenario)
-    return ("state", *["step"] * has_formulas, *["trajectory"] * bool(integrators))
+    integrators, left_out = load_adapter(engine).integrators, uncompared_kinds(scenario.model)
+    has_steps = any(i.method is not None for i in integrators) and TaskKind.STEP not in left_out
+    has_motions = bool(integrators) and TaskKind.TRAJECTORY not in left_out
+    return ("state", *["step"] * has_steps, *["trajectory"] * has_motions)
 
 
 def matrix_cells():
     for name, scenario in catalogue_scenarios().items():
         for engine in ENGINES:
             for level in levels(engine, scenario):
-                is_full = scenario.model.n > MAX_BODIES_IN_FAST_FORM[level]
+                is_motion_of_tree = level == "trajectory" and not scenario.model.is_chain
+                is_full = scenario.model.n > MAX_BODIES_IN_FAST_FORM[level] or is_motion_of_tree
                 marks = [pytest.mark.full] if is_full else []
                 label = name if scenario.family in name else f"{scenario.family}-{name}"
                 yield pytest.param(name, engine, level, id=f"{label}: {engine}-{level}", marks=marks)
