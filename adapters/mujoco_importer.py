@@ -15,7 +15,8 @@ fused and the root link gets a free joint.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import mujoco
@@ -73,7 +74,7 @@ class MujocoImporter(Importer):
             The description, or MuJoCo's refusal.
 
         """
-        with captured_output() as warnings:
+        with captured_output() as printed, _collected_warnings() as warnings:
             try:
                 m = _compiled(file)
             except ValueError as error:
@@ -82,7 +83,7 @@ class MujocoImporter(Importer):
         is_weightless = m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
         gravity = np.zeros(3) if is_weightless else np.array(m.opt.gravity)
         model = NeutralModel(_model_name(m), bodies, gravity)
-        return Reading(self.version(), model, warnings=tuple(warnings))
+        return Reading(self.version(), model, warnings=(*printed, *warnings))
 
     def evaluate(self, file: ModelFile, states: Sequence[CanonicalState]) -> list[ModelQuantities]:
         """Compute the quantities with MuJoCo's own routines.
@@ -95,10 +96,23 @@ class MujocoImporter(Importer):
             One record per state.
 
         """
-        m = _compiled(file)
-        _switch_off(m)
-        d = mujoco.MjData(m)
-        return [_quantities(m, d, state) for state in states]
+        with _collected_warnings():
+            m = _compiled(file)
+            _switch_off(m)
+            d = mujoco.MjData(m)
+            return [_quantities(m, d, state) for state in states]
+
+
+@contextmanager
+def _collected_warnings() -> Iterator[list[str]]:
+    """Collect MuJoCo's warnings, which it would write to a log file in the current folder."""
+    texts: list[str] = []
+    before = mujoco.get_mju_user_warning()
+    mujoco.set_mju_user_warning(texts.append)
+    try:
+        yield texts
+    finally:
+        mujoco.set_mju_user_warning(before)
 
 
 def _compiled(file: ModelFile) -> Any:

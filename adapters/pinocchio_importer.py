@@ -5,8 +5,9 @@ J: the joint's frame; B: the frame of its body, B = J P with the frame's placeme
 
     hinge, slide    q = x;  a continuous joint has q = (cos x, sin x)
     ball            R(q) = R_P R(x) R_Pᵀ, scalar last;  v_e = R_P v
-    free            X(q) = X(x) P⁻¹, scalar last;  v_e = Ad_P (R_Bᵀ ṙ, ω),  so that
-                    T = Ad_P diag(R_Bᵀ, 1),  Ṫv = Ad_P (−ω × R_Bᵀ ṙ, 0)
+    free            X(q) = O⁻¹ X(x) P⁻¹, scalar last;  v_e = Ad_P (R_Bᵀ ṙ, ω),  so that
+                    T = Ad_P diag(R_Bᵀ, 1),  Ṫv = Ad_P (−ω × R_Bᵀ ṙ, 0).  O is the joint's origin in a URDF,
+                    from which its coordinates count, and nothing in an MJCF, where they are in the world
 
 Parts of a composite joint (several joints in an MJCF body) are not exposed to Python: their screws at q = 0
 are the columns of its motion subspace, and their names come from the file, as Pinocchio keeps only one.
@@ -124,6 +125,7 @@ class _Place:
     kind: str  # scalars, continuous, ball or free
     body: NeutralBody
     placement: Any  # of the body's frame in the joint's frame
+    origin: Any  # from which a free joint's coordinates count, as the format says
     q: slice
     v: slice
     x: slice
@@ -149,9 +151,10 @@ class _Layout:
             nq, nv, iq, iv = model.nqs[j], model.nvs[j], model.idx_qs[j], model.idx_vs[j]
             kind = self._kind(j)
             nx = nv if kind == "continuous" else nq
+            origin = model.jointPlacements[j] if file.format == "urdf" else pin.SE3.Identity()
             self.places.append(
                 _Place(
-                    kind, body, frame.placement,
+                    kind, body, frame.placement, origin,
                     slice(iq, iq + nq), slice(iv, iv + nv), slice(x, x + nx), slice(rate, rate + nv),
                 )
             )  # fmt: skip
@@ -264,7 +267,7 @@ class _Layout:
                 block = np.array(P.rotation)
                 q[place.q] = _scalar_last(block @ rotation_matrix(x) @ block.T)
             else:
-                X = pin.SE3(pose_of_coordinates(x)) * P.inverse()
+                X = place.origin.inverse() * pin.SE3(pose_of_coordinates(x)) * P.inverse()
                 q[place.q] = [*X.translation, *_scalar_last(X.rotation)]
                 R_T = rotation_matrix(x[3:]).T
                 turned = P.action @ np.concatenate([-np.cross(rate[3:], R_T @ rate[:3]), np.zeros(3)])

@@ -33,6 +33,7 @@ VALID = {  # by option or argument, a word that is accepted
     "folder": "history/20260101T000000Z",
     "what": "scenarios", "rtols": "1e-6", "max_cpu_seconds": "3", "history_folder": "history", "pattern": "*",
     "duration": "1", "precision": "quad", "proof_cpu_seconds": "9",
+    "base": "free", "state_count": "3", "state": "hip=0.1", "root": "history", "form": "mujoco",
     "as_json": "", "self_test": "", "fresh": "", "help": "",
 }  # fmt: skip
 WORK = (  # where the work of a command begins
@@ -40,7 +41,7 @@ WORK = (  # where the work of a command begins
     "plumbline.execution.runner.describe_engines", "plumbline.cli.scenario_commands.describe_engines",
     "plumbline.studies.drift.measure_drift", "plumbline.cli.study_commands.run_plan",
     "plumbline.reproduce.write.make_script", "plumbline.truth.enclosure.prove_motion",
-    "plumbline.cli.nightly.prove_changed_motions",
+    "plumbline.cli.nightly.prove_changed_motions", "plumbline.cli.model_commands.run_model_files",
 )  # fmt: skip
 WORKERS = (
     "plumbline.cli.study_commands.WorkerPool", "plumbline.cli.scenario_commands.WorkerPool",

@@ -31,6 +31,7 @@ def test_a_tree_is_compared_with_its_joint_moments(tmp_path):
     results = json.loads((tmp_path / "results.json").read_text())
     rows = {row["quantity"]: row["verdict"] for row in results["rows"]}
     assert rows["joint_moment"] == rows["acceleration"] == "agrees"
-    levels = {"state", "trajectory", "invariants", "relations"}
+    levels = {"state", "step", "trajectory", "invariants", "relations"}
     assert {row["level"] for row in results["rows"]} == levels
+    assert [row["verdict"] for row in results["rows"] if row["level"] == "step"] == ["information"]
     assert results["scenarios"]["universal-pendulum"]["model"]["kind"] == ["universal"]

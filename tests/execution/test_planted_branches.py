@@ -15,6 +15,7 @@ from plumbline.execution.plan import RANDOM_STATES, STATES_PER_RANDOM_SCENARIO
 from plumbline.judging.rows import RowContext
 from plumbline.judging.state import judge_states
 from plumbline.judging.step import STEP_STATES
+from plumbline.model.datatypes import Unsupported
 from plumbline.model.sampling import compared_states
 from plumbline.scenario.generator import RandomScenarios
 from plumbline.truth import step_formulas
@@ -57,7 +58,10 @@ def is_altered(defect, model, state):
 
 def is_reported(defect, model, states):
     truth = state_truth(model, states)
-    answers = plant(type(load_adapter(defect.engine)), defect).evaluate(model, states)
+    try:
+        answers = plant(type(load_adapter(defect.engine)), defect).evaluate(model, states)
+    except Unsupported:  # the engine is not compared on this scenario
+        return False
     rows = judge_states(CONTEXT, truth, Evaluation(answers, None, None, 0.0)).rows
     return any(row.verdict == "disagrees" for row in rows)
 
