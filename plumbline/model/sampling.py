@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from functools import lru_cache
 
 import numpy as np
 
@@ -95,7 +96,8 @@ def random_states(model: Model, count: int, seed: int) -> list[State]:
     return [State(*parts) for parts in zip(p, omega, u, udot, r, v, x, xdot, strict=True)]
 
 
-def random_loop_states(model: Model, state: State, count: int, seed: int) -> list[State]:
+@lru_cache(maxsize=16)  # seconds for a dozen bodies, and every engine is compared at the same states
+def random_loop_states(model: Model, state: State, count: int, seed: int) -> tuple[State, ...]:
     """Draw states of a mechanism with loops, along its own motions from an assembled one.
 
     Steps of random directions that the loops allow are followed by Newton's method.  Rates are Gaussian as in
@@ -127,7 +129,7 @@ def random_loop_states(model: Model, state: State, count: int, seed: int) -> lis
         spread = own_rate * 10 ** rng.uniform(-1.0, np.log10(4.0))
         rates = allowed_rates(model, here, spread * rng.normal(size=own_rates(model)[-1].stop))
         found.append(assembled(model, with_rates(model.tree, here, rates)))
-    return found
+    return tuple(found)
 
 
 def _own_rate(model: Model) -> float:
