@@ -5,6 +5,8 @@ The tolerance is `plumbline.truth.rounding_bound`; `MAX_RELATIVE_BOUND` limits h
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from plumbline.engines.calls import Evaluation
@@ -55,10 +57,18 @@ def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation)
         worst, looseness = _worst_error_per_state(quantity, truth, evaluation)
         names = {"scenario": context.scenario, "engine": context.engine, "quantity": quantity}
         result.tables.append(("states", names | worst))
-        result.rows.append(
-            _quantity_row(context, quantity, unit, worst, looseness, truth.method, evaluation.cpu_time)
-        )
+        row = _quantity_row(context, quantity, unit, worst, looseness, truth.method, evaluation.cpu_time)
+        if limit_error := float(np.max(_limit_errors(quantity, evaluation))):
+            share = f"; of it up to {limit_error:.2g} {unit} is the uncertainty of the engine's limit"
+            extra = row.extra | {"limit_error": limit_error}
+            row = replace(row, derivation=row.derivation + share, extra=extra)
+        result.rows.append(row)
     return result
+
+
+def _limit_errors(quantity: str, evaluation: Evaluation) -> Array:
+    """(S,) uncertainty of the limit that the engine's answers were extrapolated to; 0 where they were not."""
+    return np.array([(answer.limit_error or {}).get(quantity, 0.0) for answer in evaluation.quantities])
 
 
 def _worst_error_per_state(quantity: str, truth: StateTruth, evaluation: Evaluation) -> tuple[Columns, Array]:
@@ -70,8 +80,7 @@ def _worst_error_per_state(quantity: str, truth: StateTruth, evaluation: Evaluat
     differences = [getattr(answer, quantity) - getattr(true, quantity) for answer, true in pairs]
     error = _error_norms(quantity, np.array(differences))
     bound = np.array([bound.tolerance(quantity) for bound in truth.bounds]).reshape(error.shape)
-    limit_error = [(answer.limit_error or {}).get(quantity, 0.0) for answer in evaluation.quantities]
-    bound = bound + np.array(limit_error)[:, None]
+    bound = bound + _limit_errors(quantity, evaluation)[:, None]
     scale = np.array([bound.scale[quantity] for bound in truth.bounds]).reshape(error.shape)
     known = np.isfinite(bound)
     ratio = np.where(known, error / np.maximum(bound, TINY), -1.0)  # without a bound nothing is compared

@@ -199,6 +199,28 @@ def test_vectors_count_by_their_length_and_matrices_by_their_worst_entry():
     assert all(rows[q].extra["body"] == 1 for q in ("mass_matrix", "angular_momentum", "kinetic_energy"))
 
 
+@pytest.mark.parametrize(("share", "verdict"), [(0.5, "disagrees"), (1.5, "agrees"), (1e6, "unresolved")])
+def test_the_uncertainty_of_a_limit_widens_the_bound_and_is_stated(share, verdict):
+    """An extrapolated answer off by two bounds, with an uncertainty of so many bounds."""
+    reported = load_adapter("reference").evaluate(MODEL, STATES)
+    bounds = [state_rounding_bound(MODEL, s) for s in STATES]
+    answers = [
+        replace(
+            a,
+            acceleration=a.acceleration + [0, 0, 2] * b.acceleration[:, None],
+            limit_error={"acceleration": share * float(np.max(b.acceleration))},
+        )
+        for a, b in zip(reported, bounds, strict=True)
+    ]
+    truth = StateTruth(STATES, reported, bounds, "itself")
+    rows = judge_states(WHO, truth, Evaluation(answers, None, None, 0.0)).rows
+    row, others = rows[0], rows[1:]
+    largest = share * max(float(np.max(b.acceleration)) for b in bounds)
+    assert row.quantity == "acceleration" and row.verdict == verdict
+    assert row.extra["limit_error"] == largest and f"{largest:.2g} m/s²" in row.derivation
+    assert not any("limit" in other.derivation or "limit_error" in other.extra for other in others)
+
+
 def test_a_scale_of_zero_is_no_reason_to_be_blunt():
     """At rest there is no kinetic energy, no tolerance for it, and 0 = 0."""
     still = [replace(s, omega=0 * s.omega, v=0 * s.v) for s in STATES]
