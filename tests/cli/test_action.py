@@ -1,0 +1,53 @@
+"""The GitHub Action: its steps, run by the shell as a runner would."""
+
+import os
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from ruamel.yaml import YAML
+
+ROOT = Path(__file__).resolve().parents[2]
+ACTION = YAML(typ="safe").load(ROOT / "action.yml")
+FILES = ROOT / "tests" / "adapters" / "model_files"
+
+
+def run_step(name, folder, **inputs):
+    """One step with the inputs' defaults, in a folder of the user's."""
+    (step,) = (step for step in ACTION["runs"]["steps"] if step["name"] == name)
+    values = {key: str(given.get("default", "")) for key, given in ACTION["inputs"].items()} | inputs
+    environment = {
+        key: re.sub(r"\$\{\{ inputs\.(\w+) \}\}", lambda found: values[found[1]], text)
+        for key, text in step["env"].items()
+    }
+    return subprocess.run(
+        ["bash", "-eo", "pipefail", "-c", step["run"]],
+        cwd=folder, env=os.environ | environment | {"GITHUB_ACTION_PATH": str(ROOT)},
+        capture_output=True, text=True, timeout=120, check=False,
+    )  # fmt: skip
+
+
+@pytest.fixture
+def robots(tmp_path):
+    for name in ("pendulum.urdf", "arm.urdf"):
+        shutil.copy(FILES / name, tmp_path)
+    (tmp_path / "known.yaml").write_text("")
+    return tmp_path
+
+
+def test_patterns_are_compared_and_results_written(robots):
+    done = run_step(
+        "Compare", robots, files="*.urdf", baseline="known.yaml", options="--engine mujoco --states 2"
+    )
+    assert done.returncode == 0, done.stderr
+    assert "pendulum.urdf" in done.stdout and "arm.urdf" in done.stdout
+    sarif = re.sub(r"\$\{\{ inputs\.report \}\}", "plumbline-model", ACTION["outputs"]["sarif"]["value"])
+    assert (robots / sarif).is_file() and (robots / "plumbline-model" / "junit.xml").is_file()
+
+
+def test_a_bad_file_fails_the_step(robots):
+    (robots / "bad.urdf").write_text("<robot name='r'><link name='a'/><link name='a'/></robot>")
+    done = run_step("Compare", robots, files="bad.urdf", options="--engine mujoco")
+    assert done.returncode == 2 and "bad.urdf:1" in done.stderr
