@@ -180,7 +180,7 @@ def _state_errors(name: str, tables: ScenarioTables, packer: ChunkBuilder) -> li
     for (engine, quantity), rows in group_rows(states, "engine", "quantity"):
         error, bound = states["error"][rows].astype(float), states["bound"][rows].astype(float)
         with np.errstate(divide="ignore", invalid="ignore"):
-            quotient = error / bound
+            quotient = np.where((error == 0) & (bound == 0), 0.0, error / bound)  # both of a body at rest
         order = np.argsort(states["state"][rows], kind="stable")
         top = int(np.argmax(np.where(np.isfinite(quotient), quotient, np.inf)))
         found.append(

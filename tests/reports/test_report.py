@@ -238,6 +238,18 @@ def test_log_codes_keep_half_a_percent_and_tell_zero_from_nothing():
     assert np.allclose(back, np.abs(y[4:]), rtol=0.0024)
 
 
+def test_an_error_of_zero_is_within_a_bound_of_zero():
+    """The kinetic energy of bodies at rest; without a bound there is no ratio."""
+    states = {
+        "engine": np.array(["e"] * 3), "quantity": np.array(["kinetic_energy"] * 3), "state": np.arange(3),
+        "body": np.zeros(3, int), "error": np.array([0.0, 1.0, 0.0]), "bound": np.array([0.0, 2.0, np.nan]),
+    }  # fmt: skip
+    packer = chunks.ChunkBuilder()
+    (spread,) = report_data._state_errors("s", {"states": {"s": states}}, packer)
+    (back,) = decode_chunk(packer.encode({"a": [spread["ratio"]]}))["a"]
+    assert back.tolist() == chunks.log_scale_codes(np.array([0.0, 0.5, np.nan])).tolist()
+
+
 def test_chunks_come_back_as_they_went_in():
     packer = chunks.ChunkBuilder()
     arrays = [
