@@ -28,7 +28,7 @@ the tree that is attached to the world, and are shifted to the near point.
 Rotors are the engine's armature, springs and dampers its own, a ball's spring unloaded at qpos q_a conj(q_b);
 efforts are `qfrc_applied`.  A spring between points is a spatial tendon over two sites.
 
-Loops: each closing joint's near body is cut in two parts, of which one hangs on that joint, and a weld holds
+Loops: each closing joint's near body is cut in two parts, one of them on that joint, and a weld holds
 the parts together.  MuJoCo's constraints are soft: the forces solve (A + R) f = a_ref − a₀ with R > 0.  At a
 closed state a_ref is 0 and all answers are linear in R to first order; they are extrapolated to R = 0.
 

@@ -16,7 +16,7 @@ B = A(q_near)ᵀ (q_far, q_near: the joint's axes in its bodies), and q_j = x, v
 slide, RX·RY for a universal, PZ·RZ for a cylindrical joint; a free body is a free flyer at its centre of
 mass, a welded body is appended to the joint of its far body.
 
-Loops: each closing joint's near body is cut in two parts, of which one hangs on that joint, and the parts are
+Loops: each closing joint's near body is cut in two parts, one of them on that joint, and the parts are
 welded by a CONTACT_6D constraint in `constraintDynamics`, which takes loads as joint torques only; its
 proximal iterations converge where rows depend on others too.  The constraint's forces are then `fext` of the
 `rnea` that gives the joints' wrenches.

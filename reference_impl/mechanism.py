@@ -210,7 +210,7 @@ class Mechanism:
 
     @property
     def is_chain(self) -> bool:
-        """Whether every body hangs on the one before, the first on the world, by bare rods and balls."""
+        """Whether every body is joined to the one before, the first to the world, by bare rods and balls."""
         if self.has_loops:
             return False
         is_row = bool(np.all(self.body[:, 0] == np.arange(self.n) - 1)) and not np.any(self.point[0, 0])

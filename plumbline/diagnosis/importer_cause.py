@@ -638,7 +638,7 @@ def _joint_words(joints: Sequence[ElementaryJoint]) -> str:
 
 
 def format_value(value: Any, other: Any) -> str:
-    """Write a value with as many digits as tell it from another one.
+    """Write a value with as many digits as it needs to differ from another one.
 
     Args:
         value: a number, an array or a text.

@@ -287,7 +287,7 @@ class _DefaultClasses:
                 walk.extend((child, inherited) for child in element.children)
 
     def source(self, joint: Element, attribute: str) -> Source | None:
-        """Where an attribute of a joint is said; None: nowhere."""
+        """Find where the file sets an attribute of a joint; None where it does not."""
         if attribute in joint.attributes:
             return joint.source
         if joint.tag == "freejoint":

@@ -64,7 +64,7 @@ class ElementaryJoint:
     spring_reference: float = 0.0  # rad or m
     friction_loss: float = 0.0  # N m or N; no part of the passive force
     source: Source = Source("", 0)
-    fields: Mapping[str, Source] = field(default_factory=dict)  # where single fields are said, if elsewhere
+    fields: Mapping[str, Source] = field(default_factory=dict)  # places of fields that are set elsewhere
 
 
 @dataclass(frozen=True, eq=False)

@@ -65,7 +65,7 @@ def _copied(root: Element, change: Callable[[list[Element]], None]) -> Element:
 
 
 def _without_branches(root: Element) -> Iterator[Element]:
-    """URDF: without a link and all that hangs on it, or with a link as the root."""
+    """URDF: without a link and its descendants, or with a link as the root."""
     joints = [j for j in root.find_all("joint") if j.find("parent") and j.find("child")]
     ends = {id(j): tuple(j.find(t).attributes.get("link", "") for t in ("parent", "child")) for j in joints}  # type: ignore[union-attr]
     for joint in joints:

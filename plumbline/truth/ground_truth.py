@@ -166,7 +166,7 @@ def stretched_length(model: Model) -> Array:
         model: the mechanism.
 
     Returns:
-        (N,) [m] rod length, and the far point's distance from the world's origin where the body hangs on the
+        (N,) [m] rod length, and the far point's distance from the world's origin where the joint is on the
         world, plus the largest of: distance from the near point to the far points of the joints beyond,
         distance from the near point to the centre of mass, radius of gyration.
 

@@ -15,6 +15,7 @@ from plumbline.processes.workers import Limits, Task, WorkerPool
 
 FILES = Path(__file__).parent / "model_files"
 GRAVITY = 9.81
+# Tolerances of these files of one to four bodies are some fifty roundings of numbers of size 1: 1e-14.
 MASS, ARM, INERTIA = 2.0, 0.5, 0.375  # of the pendulum files: kg, m, kg m²
 CASES = [
     ("pendulum.urdf", "fixed"), ("arm.urdf", "fixed"), ("arm.urdf", "free"),

@@ -14,6 +14,7 @@ from plumbline.truth.notes_motion import simulate_notes_form
 from tests.helpers.random_trees import random_tree
 
 TIMES = np.arange(5) / 32
+ORDER_MARGIN = 0.3  # orders are 1, 2 or 4; the next term of the error moves the slope less
 ENGINES = ["reference", "mujoco", "pinocchio", "exudyn", "exudyn-tree"]
 MIXES = {
     "jointed": ("hinge", "universal", "slide", "cylindrical", "weld"),
@@ -47,13 +48,15 @@ def test_motions_of_random_trees_converge_to_the_truth(engine, mix):
             compared += 1
             errors = [position_error(x.r, true.r)[-1] + attitude_error(x.p, true.p)[-1] for x in runs]
             if method.kind == "step":
-                assert np.log2(errors[0] / errors[1]) == pytest.approx(method.order, abs=0.3), method.name
+                assert np.log2(errors[0] / errors[1]) == pytest.approx(method.order, abs=ORDER_MARGIN), (
+                    method.name
+                )
             assert errors[1] < (1e-9 if method.kind == "tolerance" else 2e-7 if method.order == 4 else 5e-2)
             found = compute_invariants(model, runs[1])
             assert np.max(np.abs(found.joint_gap)) < 1e-4, method.name
             assert np.max(np.abs(found.gap_rate)) < 1e-2, method.name
             assert np.all(np.sum(runs[1].p[1:] * runs[1].p[:-1], axis=-1) > 0)
-            np.testing.assert_allclose(runs[1].v[0], state.v, atol=1e-12)
+            np.testing.assert_allclose(runs[1].v[0], state.v, atol=1e-12)  # the initial state, only converted
     assert compared
 
 
@@ -77,7 +80,9 @@ def test_motions_with_elements_converge_to_the_truth_and_conserve_energy(engine,
             continue
         errors = [position_error(x.r, true.r)[-1] + attitude_error(x.p, true.p)[-1] for x in runs]
         if method.kind == "step" and errors[1] > 1e-12:
-            assert np.log2(errors[0] / errors[1]) == pytest.approx(method.order, abs=0.3), method.name
+            assert np.log2(errors[0] / errors[1]) == pytest.approx(method.order, abs=ORDER_MARGIN), (
+                method.name
+            )
         assert errors[1] < (1e-8 if method.kind == "tolerance" or method.order == 4 else 5e-2)
         found = [compute_invariants(model, run) for run in runs]
         drift = [np.max(np.abs(x.energy_drift)) for x in found]

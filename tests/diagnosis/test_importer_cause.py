@@ -128,8 +128,8 @@ def test_damping_that_is_held_and_not_applied_is_judged_as_it_is_read(tmp_path):
     states = model_states(reading.model, STATES, state_seed(str(path)))
     answer = Answer(reading, states, tuple(evaluate_model_file("pinocchio", prepared.file, states)))
     model = prepared.neutral_model(None)
-    for said, verdict in ((0.3, Verdict.AGREES), (0.4, Verdict.DISAGREES)):
-        joint = replace(model.joints[0], damping=said)
+    for damping, verdict in ((0.3, Verdict.AGREES), (0.4, Verdict.DISAGREES)):
+        joint = replace(model.joints[0], damping=damping)
         bodies = tuple(replace(b, joints=(joint,)) if b.joints else b for b in model.bodies)
         result = judge_file(
             str(path), replace(model, bodies=bodies), [("pinocchio", info, answer)], STATES, None

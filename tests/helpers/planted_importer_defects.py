@@ -185,7 +185,7 @@ def _plant_fixed_mass(root: Element, rng: np.random.Generator) -> Expected | Non
 
 
 def _plant_parent(root: Element, rng: np.random.Generator) -> Expected | None:
-    """A joint hangs on the base, not on its parent; chosen where the parent moves."""
+    """A joint is attached to the base, not to its parent; chosen where the parent moves."""
     moving = {
         _child(j, "child").attributes["link"]
         for j in root.find_all("joint")
