@@ -78,7 +78,12 @@ CONSTRAINED_AXES = {
 }
 SECOND_AXIS = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # columns x, −z, y of the joint's axes
 SPECTRAL_RADIUS = 0.9
-STEP_TOLERANCES = {"solver_atol": NEWTON_TOLERANCE, "solver_rtol": NEWTON_TOLERANCE}
+STEP_SETTINGS = {
+    "solver_atol": NEWTON_TOLERANCE,
+    "solver_rtol": NEWTON_TOLERANCE,
+    # numericalDifferentiation: relativeEpsilon × minimumCoordinateSize, of displacements that start at zero
+    "difference_step": 1e-7 * 1e-2,
+}
 
 
 class ExudynChain:
@@ -299,7 +304,7 @@ class Exudyn(ExudynAdapter):
             is_symmetric=True,
             solver_rtol=NEWTON_TOLERANCE,
             note="TrapezoidalIndex2: implicit trapezoidal rule, constraints on velocities",
-            method=ConstrainedMethod(0.5, 0.5, 0.25, 0.5, "velocity", **STEP_TOLERANCES),
+            method=ConstrainedMethod(0.5, 0.5, 0.25, 0.5, "velocity", **STEP_SETTINGS),
         ),
         Integrator(
             "generalized-alpha",
@@ -308,14 +313,14 @@ class Exudyn(ExudynAdapter):
             (2, 3, 4, 5, 6),
             solver_rtol=NEWTON_TOLERANCE,
             note="generalized-α with spectral radius 0.9, constraints on positions (index 3)",
-            method=generalized_alpha(SPECTRAL_RADIUS, **STEP_TOLERANCES),
+            method=generalized_alpha(SPECTRAL_RADIUS, **STEP_SETTINGS),
         ),
     )
     usual_linear_solver = "EigenSparse"
     linear_solvers = ("EXUdense", "EigenDense")
     builds_trees = builds_elements = True
     welding_unsupported_reason = ""
-    is_single_step: bool = False  # full Newton iterations to `STEP_TOLERANCES`; multipliers are sampled too
+    is_single_step: bool = False  # full Newton iterations to `STEP_SETTINGS`; multipliers are sampled too
 
     def _check_elements(self, model: Model) -> None:
         balls = [k for k, kind in enumerate(model.kind) if kind == "ball"]
@@ -395,8 +400,8 @@ class Exudyn(ExudynAdapter):
             )
         newton = settings.timeIntegration.newton
         newton.useModifiedNewton = False
-        newton.absoluteTolerance = STEP_TOLERANCES["solver_atol"]
-        newton.relativeTolerance = STEP_TOLERANCES["solver_rtol"]
+        newton.absoluteTolerance = STEP_SETTINGS["solver_atol"]
+        newton.relativeTolerance = STEP_SETTINGS["solver_rtol"]
         self._samples = run_solver(
             solver, chain.mbs, settings, times, step,
             lambda: (*(part() for part in parts), chain.multipliers()),

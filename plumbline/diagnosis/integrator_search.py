@@ -392,7 +392,12 @@ def _generalized_alpha_family(base: ConstrainedMethod, at_level: str) -> Alterna
         return f"it took the generalised-α step with spectral radius {radius}{at_level}"
 
     def method(x: float) -> ConstrainedMethod:
-        other = generalized_alpha(x, solver_atol=base.solver_atol, solver_rtol=base.solver_rtol)
+        other = generalized_alpha(
+            x,
+            solver_atol=base.solver_atol,
+            solver_rtol=base.solver_rtol,
+            difference_step=base.difference_step,
+        )
         return replace(other, constraint_level=base.constraint_level)
 
     return Alternative(describe, method, declared, 0.95)

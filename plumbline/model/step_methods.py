@@ -62,6 +62,7 @@ class ConstrainedMethod:
     # Newton's iteration ends below solver_atol, or solver_rtol × the first residual [N, and m or m/s].
     solver_atol: float
     solver_rtol: float
+    difference_step: float  # of q in the forward differences of C(q) q̇ that the first q̈ contains [m or 1]
 
 
 StepMethod = JointSpaceMethod | ConstrainedMethod
@@ -89,13 +90,16 @@ def classical_runge_kutta(
     )
 
 
-def generalized_alpha(spectral_radius: float, *, solver_atol: float, solver_rtol: float) -> ConstrainedMethod:
+def generalized_alpha(
+    spectral_radius: float, *, solver_atol: float, solver_rtol: float, difference_step: float
+) -> ConstrainedMethod:
     """Return the generalised-α method with constraints on positions (index 3).
 
     Args:
         spectral_radius: ρ at infinite frequency, 0 … 1.
         solver_atol: absolute tolerance of Newton's iteration [N and m].
         solver_rtol: its tolerance relative to the norm of the first residual.
+        difference_step: of `ConstrainedMethod`.
 
     Returns:
         The method; parameters by Chung and Hulbert, J. Appl. Mech. 60 (1993) 371-375.
@@ -105,7 +109,9 @@ def generalized_alpha(spectral_radius: float, *, solver_atol: float, solver_rtol
     alpha_f = spectral_radius / (spectral_radius + 1)
     gamma = 0.5 + alpha_f - alpha_m
     beta = 0.25 * (gamma + 0.5) ** 2
-    return ConstrainedMethod(alpha_m, alpha_f, beta, gamma, "position", solver_atol, solver_rtol)
+    return ConstrainedMethod(
+        alpha_m, alpha_f, beta, gamma, "position", solver_atol, solver_rtol, difference_step
+    )
 
 
 def describe_method(method: JointSpaceMethod) -> str:

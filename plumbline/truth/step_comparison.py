@@ -34,6 +34,7 @@ from plumbline.truth.step_formulas import (
     constrained_quadrature,
     constrained_residual,
     engine_coordinates,
+    first_acceleration_bound,
     first_coordinate_acceleration,
     joint_space_steps,
 )
@@ -41,7 +42,6 @@ from plumbline.truth.step_formulas import (
 STEP_ROUNDINGS = 32
 ACCELERATION_FACTOR = 3.0
 DISTURBANCE = 1e-9  # of rates, to measure the growth of perturbations
-FIRST_ACCELERATION_RTOL = 1e-5  # Exudyn's are finite differences, off by 1e-7 of the largest
 RESIDUAL_STEPS = 2  # after one, Euler does not show the axial inertia of rods
 MAX_GROWTH = 1e4  # of perturbations; beyond it the method itself is unstable, and nothing is compared
 STEP_UNITS = {"step_position": "m", "step_attitude": "rad", "step_velocity": "m/s", "step_rate": "rad/s"}
@@ -375,7 +375,10 @@ def compare_parts(
             residual.size[worst_step : worst_step + 1], place,
         )  # fmt: skip
         first = first_coordinate_acceleration(model, states[index])
-        allowed = FIRST_ACCELERATION_RTOL * np.full(model.n, float(np.max(np.abs(first))))
+        solved = state_rounding_bound(model, states[index])
+        allowed = first_acceleration_bound(model, method, states[index]) + np.maximum(
+            solved.acceleration, solved.angular_acceleration
+        )
         error = np.asarray(np.max(np.abs(first - engine_coordinates(run)[2][0]), axis=-1), float)
         found["step_first_acceleration"].add(error, allowed, np.zeros(model.n), place)
     return found

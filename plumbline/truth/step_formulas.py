@@ -594,6 +594,53 @@ def first_coordinate_acceleration(model: Model, state: State) -> Array:
     return np.concatenate([acceleration, rate(q, body_turning) + rate(rate(q, rates), rates)], -1)
 
 
+def first_acceleration_bound(model: Model, method: ConstrainedMethod, state: State) -> Array:
+    """Bound what the engine's finite differences of C(q) q̇ leave in its first q̈.
+
+    It solves M q̈ + Cᵀ λ = f, C q̈ = γ = −∂(C q̇)/∂q q̇, with the derivative from forward differences of size δ.
+    C q̇ and q + δ are rounded, so a row of γ is off by up to
+
+        32 · 2⁻⁵³ (|C| |q̇|) √(Σ q̇ᵢ²) / δ,   over the coordinates i that this row of C depends on,
+
+    which are the Euler parameters and, of rods, the positions.  q̈ is off by |S⁻¹| times that.  What δ cuts
+    off is below the roundings.
+
+    Args:
+        model: the chain.
+        method: whose ``difference_step`` is δ.
+        state: where the step starts.
+
+    Returns:
+        (N,) largest error of a coordinate of each body [m/s² or 1/s²].
+
+    """
+    n, r, p = model.n, state.r, state.p
+    A, G = _euler_parameter_rotation(p), 2 * _body_rate_matrix(p)
+    rates = np.concatenate([state.v, 0.25 * _times(np.swapaxes(G, -1, -2), state.omega)], -1).ravel()
+    near, far = model.proximal, model.distal
+    d, _ = _joint_differences(A, r, state.v, state.omega, near, far)
+    M, rows, depends = np.zeros((7 * n, 7 * n)), [], []
+    for k in range(n):
+        positions, turns = slice(7 * k, 7 * k + 3), slice(7 * k + 3, 7 * k + 7)
+        M[positions, positions], M[turns, turns] = model.mass[k] * np.eye(3), G[k].T @ model.inertia[k] @ G[k]
+        point, norm = np.zeros((3, 7 * n)), np.zeros((1, 7 * n))
+        point[:, positions], point[:, turns] = np.eye(3), -A[k] @ _cross_matrix(near[k]) @ G[k]
+        if k:
+            point[:, 7 * k - 7 : 7 * k - 4] = -np.eye(3)
+            point[:, 7 * k - 4 : 7 * k] = A[k - 1] @ _cross_matrix(far[k - 1]) @ G[k - 1]
+        norm[0, turns] = 2 * p[k]
+        joint = _unit(d[k])[None] @ point if model.rods[k] else point
+        rows += [joint, norm]
+        depends += [np.abs(row) > 0 for row in (joint, norm)]
+        if not model.rods[k]:
+            depends[-2][:, np.arange(7 * n) % 7 < 3] = False
+    C, used = np.concatenate(rows), np.concatenate(depends)
+    S = np.block([[M, C.T], [C, np.zeros((len(C), len(C)))]])
+    gamma = 32 * 2.0**-53 * (np.abs(C) @ np.abs(rates)) * np.sqrt(used @ rates**2) / method.difference_step
+    error = np.abs(np.linalg.inv(S)[: 7 * n, 7 * n :]) @ gamma
+    return np.asarray(np.max(error.reshape(n, 7), axis=1))
+
+
 def _joint_differences(
     A: Array, r: Array, v: Array, omega: Array, near: Array, far: Array
 ) -> tuple[Array, Array]:

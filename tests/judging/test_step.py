@@ -15,7 +15,7 @@ from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.step import STEP_STATES, judge_steps, step_sizes
 from plumbline.model.sampling import random_states
 from plumbline.model.step_methods import ConstrainedMethod, classical_runge_kutta
-from plumbline.scenario.generator import RandomScenarios
+from plumbline.scenario.generator import RandomScenarios, random_scenario
 from plumbline.truth import step_formulas
 from plumbline.truth.certified import certify_state
 from plumbline.truth.step_comparison import step_counts
@@ -146,6 +146,27 @@ def test_an_engine_that_refuses_or_fails_has_one_row():
     failed = StepEvaluation([StepAttempt(0, 0.01, failure="it crashed")], 0.1)
     (row,) = judge_steps(CONTEXT, integrator, model, states, failed).rows
     assert (row.verdict, row.reason) == (Verdict.FAILED, "it crashed")
+
+
+@pytest.mark.parametrize("index", [0, 141])
+def test_first_accelerations_are_wrong_by_what_finite_differences_leave(index):
+    """The error grows with the conditioning: 1.1e-5 of the largest in random-601-141, 1e-7 in most chains."""
+    scenario = random_scenario(601, index)
+    model, states = scenario.model, [scenario.state, *random_states(scenario.model, STEP_STATES - 1, seed=1)]
+    integrator = load_adapter("exudyn").integrator("trapezoidal")
+    answer = stepped(load_adapter("exudyn"), integrator, model, states)
+
+    def first_row():
+        rows = judge_steps(CONTEXT, integrator, model, states, answer).rows
+        return next(row for row in rows if row.quantity == "step_first_acceleration")
+
+    first = first_row()
+    assert first.verdict == Verdict.AGREES
+    assert 1e-3 < first.ratio < 0.5, "the bound is that of other differences"
+    largest = max(np.max(np.abs(a.run.coordinate_acceleration[0])) for a in answer.attempts)
+    for attempt in answer.attempts:
+        attempt.run.coordinate_acceleration[0] += 1e-4 * largest
+    assert first_row().verdict == Verdict.DISAGREES
 
 
 @pytest.mark.parametrize("joints", ["rods", "mixed"])
