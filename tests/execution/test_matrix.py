@@ -1,43 +1,57 @@
 """The product as tests: every scenario × engine × level is a test of its own.
 
 `pytest -k "double and mujoco"` runs those of one family and engine; the failure message is the
-verdict's own sentence.  By default long chains and trees run at state level only, and single steps of one and
-two bodies; `-m full` runs the rest.
+verdict's own sentence.  By default steps and motions run on the scenarios that `tests.helpers.fast_matrix`
+selects; `-m full` runs the rest.
 """
 
 import os
+from pathlib import Path
 
 import pytest
 
-from plumbline.engines.registry import ENGINES, load_adapter
+from plumbline.engines.registry import ENGINES
 from plumbline.execution.plan import Plan, TaskKind
 from plumbline.execution.runner import describe_engines
-from plumbline.execution.scenario_run import ScenarioRun, uncompared_kinds
+from plumbline.execution.scenario_run import ScenarioRun
 from plumbline.judging import known_issues
 from plumbline.model.invariants import inertia_ratio
 from plumbline.processes.workers import Limits, WorkerPool
 from tests.helpers.catalogue import catalogue_scenarios
-
-MAX_BODIES_IN_FAST_FORM = {"state": 50, "step": 2, "trajectory": 5}  # longer chains in the full form only
-
-
-def levels(engine, scenario):
-    """Levels at which an engine is compared on a scenario."""
-    integrators, left_out = load_adapter(engine).integrators, uncompared_kinds(scenario.model)
-    has_steps = any(i.method is not None for i in integrators) and TaskKind.STEP not in left_out
-    has_motions = bool(integrators) and TaskKind.TRAJECTORY not in left_out
-    return ("state", *["step"] * has_steps, *["trajectory"] * has_motions)
+from tests.helpers.fast_matrix import KINDS, levels, representatives
 
 
 def matrix_cells():
     for name, scenario in catalogue_scenarios().items():
         for engine in ENGINES:
             for level in levels(engine, scenario):
-                is_motion_of_tree = level == "trajectory" and not scenario.model.is_chain
-                is_full = scenario.model.n > MAX_BODIES_IN_FAST_FORM[level] or is_motion_of_tree
-                marks = [pytest.mark.full] if is_full else []
+                is_fast = level == "state" or name in representatives(level)
                 label = name if scenario.family in name else f"{scenario.family}-{name}"
+                marks = [] if is_fast else [pytest.mark.full]
                 yield pytest.param(name, engine, level, id=f"{label}: {engine}-{level}", marks=marks)
+
+
+def joints_compared(cells):
+    """(engine, level, kind of joint) of the cells that an engine does not refuse."""
+    models = [(engine, level, catalogue_scenarios()[name].model) for name, engine, level in cells]
+    allowed = [x for x in models if x[0] != "reference-printed" or (x[2].n <= 2 and x[2].rods.all())]
+    return {(engine, level, kind) for engine, level, model in allowed for kind in model.kind}
+
+
+def test_the_fast_form_has_every_joint_on_every_engine_and_every_scenario_at_state_level():
+    cells = list(matrix_cells())
+    fast = [cell.values for cell in cells if not cell.marks]
+    left_out = joints_compared(cell.values for cell in cells) - joints_compared(fast)
+    in_tree_motions = {"cylindrical", "free", "weld"}  # tests/adapters/test_tree_motions.py: on every engine
+    assert {joint[1:] for joint in left_out} <= {("trajectory", kind) for kind in in_tree_motions}
+    assert {cell[:2] for cell in fast if cell[2] == "state"} == {cell.values[:2] for cell in cells}
+
+
+def test_the_nightly_page_lists_the_motions_and_steps_of_the_fast_form():
+    page = " ".join((Path(__file__).parents[2] / "docs" / "nightly.md").read_text("utf-8").split())
+    for level in KINDS:
+        names = ", ".join(sorted(representatives(level)))
+        assert f"{level}: {names}." in page, f"docs/nightly.md has to list: {level}: {names}."
 
 
 @pytest.fixture(scope="session")
