@@ -43,6 +43,7 @@ COMMANDS = {  # where each is, and its line in the list; imported when it is typ
     "report": ("result_commands:report", "Write the report of stored results again."),
     "check": ("scenario_commands:check", "Check scenario files."),
     "schema": ("scenario_commands:schema", "Print the JSON Schema of scenario files."),
+    "bisect": ("bisect_command:bisect", "Find the version of an engine that changed an answer."),
     "reproduce": ("result_commands:reproduce", "Write a stand-alone script of a disagreement."),
 }
 

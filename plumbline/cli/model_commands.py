@@ -22,7 +22,7 @@ from plumbline.engines.environments import split_version, version_problem
 from plumbline.engines.registry import IMPORTERS
 from plumbline.execution.model_run import ModelPlan, ModelRunResult, run_model_files
 from plumbline.importers.neutral_model import Feature
-from plumbline.judging.model_file import MODEL_UNITS, FileResult
+from plumbline.judging.model_file import MODEL_UNITS, REFUSED, FileResult
 from plumbline.judging.rows import Row, Verdict
 from plumbline.processes.workers import Limits
 from plumbline.scenario.errors import MAX_LISTED_PROBLEMS, did_you_mean
@@ -136,7 +136,8 @@ def model(
     compiled model, since MuJoCo defines that format. A difference is named by body or joint, parameter, both
     values and line where one change of the model reproduces all of the importer's numbers to rounding.
 
-    Actuators, tendons, equalities, contacts, limits and mimic joints are not compared, and listed.
+    Actuators, tendons, equalities, contacts, limits and mimic joints are not compared, and listed. An
+    importer that refuses the file has answered; the exit code is then 1 only if --engine named it.
     """
     plan = ModelPlan(
         files, engines, options.are_engines_named(), base, root, strip_geometry, state_count,
@@ -273,7 +274,8 @@ def _reasons(name: str, rows: Sequence[Row], file: FileResult) -> list[str]:
     if explanation is not None and explanation.causes and bad:
         lines = [f"{coloured_glyph(bad[0])} {escape(cause.sentence)}" for cause in explanation.causes]
         return lines + [f"{coloured_glyph(r)} {escape(r.reason)}" for r in bad if r.quantity == "damping"]
-    lines = [f"{coloured_glyph(row)} {escape(f'{row.engine}: {row.reason}')}" for row in bad]
+    refused = [row for row in rows if row.verdict == Verdict.INFORMATION and row.reason.startswith(REFUSED)]
+    lines = [f"{coloured_glyph(row)} {escape(f'{row.engine}: {row.reason}')}" for row in (*bad, *refused)]
     if explanation is not None and bad:
         fields = Counter(change.field for change in explanation.differences)
         words = ", ".join(f"{field} ({count})" for field, count in fields.items()) or "nothing"

@@ -64,6 +64,7 @@ def _reproduce_model(folder: Path, keys: tuple[str, ...], form: str | None) -> N
     """Write scripts of importers' differences, or list the differences."""
     from plumbline.reproduce.model_script import NoModelScript, stored_differences, write_model_script
     from plumbline.storage.results_store import write_atomically
+    from plumbline.storage.version_changes import read_version_changes
 
     document = json.loads((folder / "model.json").read_text(encoding="utf-8"))
     found = stored_differences(document)
@@ -73,6 +74,7 @@ def _reproduce_model(folder: Path, keys: tuple[str, ...], form: str | None) -> N
         click.echo(count_noun(len(found), "difference") if found else "nothing differs", err=True)
         return
     chosen, about = options.claim_folder(folder), document["options"]
+    changes = read_version_changes(folder)
     root = None if about["root"] is None else Path(about["root"])
     for key in keys:
         if key not in found:
@@ -81,8 +83,9 @@ def _reproduce_model(folder: Path, keys: tuple[str, ...], form: str | None) -> N
         engine = row["engine"].partition("@")[0]
         try:
             script = write_model_script(
-                row["scenario"], row["engine"], form or engine, about["base"], root, about["strip_geometry"]
-            )
+                row["scenario"], row["engine"], form or engine, about["base"], root, about["strip_geometry"],
+                since=str(changes.get(key, {}).get("sentence", "")),
+            )  # fmt: skip
         except NoModelScript as error:
             raise click.ClickException(f"{key}: {error}") from None
         path = chosen / "scripts" / f"{Path(row['scenario']).stem}-{row['engine'].replace('@', '-')}.py"

@@ -82,6 +82,7 @@ class Cause:
 
     field: str
     changes: tuple[Change, ...]
+    phrase: str  # what the importer does, without its name
     sentence: str
 
 
@@ -576,10 +577,9 @@ def _causes(title: str, changes: Sequence[Change], remaining: float) -> tuple[Ca
     found = []
     for (field, _), members in groups.items():
         proof = "this alone explains" if alone else f"with the other {len(groups) - 1} it explains"
-        sentence = (
-            f"{title} {_describe(members)}; {proof} every quantity (worst {remaining:.2g} of the rounding)."
-        )
-        found.append(Cause(field, tuple(members), sentence))
+        phrase = _describe(members)
+        sentence = f"{title} {phrase}; {proof} every quantity (worst {remaining:.2g} of the rounding)."
+        found.append(Cause(field, tuple(members), phrase, sentence))
     return tuple(found)
 
 

@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import ast
 import hashlib
+import json
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
 import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -140,11 +143,12 @@ def _read_attribute(module: str, class_name: str, attribute: str) -> Any:
     return next((value for value in found if value is not None), None)
 
 
-def ensure_interpreter(name: str) -> str:
+def ensure_interpreter(name: str, declared: Callable[[str, str], Any] = declared_attribute) -> str:
     """Find the Python of a version's environment; make the environment where there is none.
 
     Args:
         name: an engine with a version, as typed on the command line.
+        declared: reads the attributes of its column: `declared_attribute` or `declared_importer_attribute`.
 
     Returns:
         Path of the interpreter.
@@ -156,7 +160,7 @@ def ensure_interpreter(name: str) -> str:
 
     """
     base, version = split_version(name)
-    package = declared_attribute(base, "package")
+    package = declared(base, "package")
     if version.endswith(".whl"):
         wheel = Path(version).resolve()
         requirement, label = str(wheel), hashlib.sha256(wheel.read_bytes()).hexdigest()[:16]
@@ -166,7 +170,7 @@ def ensure_interpreter(name: str) -> str:
         if version in ("latest", "pre"):
             requirement = newest_requirement(package, pre=version == "pre")
         number = label = requirement.partition("==")[2]
-    extra = declared_attribute(base, "extra_requirements")
+    extra = declared(base, "extra_requirements") or ()
     wanted = [requirement, *BASE_REQUIREMENTS]
     wanted += [need for versions, need in extra if SpecifierSet(versions).contains(number)]
     tag = hashlib.sha256("\n".join([*wanted, sys.version]).encode()).hexdigest()[:8]
@@ -200,7 +204,7 @@ def importer_interpreter(name: str) -> str:
     """
     base, version = split_version(name)
     if version:
-        return ensure_interpreter(name)
+        return ensure_interpreter(name, declared_importer_attribute)
     folder = declared_importer_attribute(base, "environment")
     if not folder:
         return ""
@@ -236,7 +240,36 @@ def newest_requirement(package: str, *, pre: bool) -> str:
     return found.split()[0]
 
 
-def _run_uv(*arguments: str) -> str:
+@dataclass(frozen=True)
+class PublishedVersions:
+    """Versions of a distribution on the package index, oldest first."""
+
+    usable: tuple[str, ...]  # with a wheel for this Python and system, without pre-releases
+    without_wheel: tuple[str, ...]
+
+
+def published_versions(package: str) -> PublishedVersions:
+    """List the versions of a distribution that the package index offers.
+
+    Args:
+        package: name of the distribution.
+
+    Returns:
+        The versions.
+
+    `EnvironmentUnavailable` passes through where the index cannot be reached or has no such distribution.
+
+    """
+    listing = ("tool", "run", "--python", sys.executable, "pip", "index", "versions", package, "--json")
+    every, usable = (
+        json.loads(_run_uv(*listing, *option, purpose=f"list the versions of {package}"))["versions"]
+        for option in ((), ("--only-binary", ":all:"))
+    )
+    rest = set(every) - set(usable)
+    return PublishedVersions(*(tuple(sorted(found, key=Version)) for found in (usable, rest)))
+
+
+def _run_uv(*arguments: str, purpose: str = "make an environment for it") -> str:
     """Run uv and return its output; raise EnvironmentUnavailable with its error message."""
     program = shutil.which("uv") or str(ROOT / ".uv" / "bin" / "uv")
     environment = {"UV_PYTHON_DOWNLOADS": "never", "UV_SYSTEM_CERTS": "true", **os.environ}
@@ -248,7 +281,7 @@ def _run_uv(*arguments: str) -> str:
     except FileNotFoundError:
         raise EnvironmentUnavailable("uv is not on PATH; install it (pip install uv) for @versions") from None
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise EnvironmentUnavailable(f"uv cannot make an environment for it: {error}") from None
+        raise EnvironmentUnavailable(f"uv cannot {purpose}: {error}") from None
     if done.returncode:
-        raise EnvironmentUnavailable(f"uv cannot make an environment for it: {' '.join(done.stderr.split())}")
+        raise EnvironmentUnavailable(f"uv cannot {purpose}: {' '.join(done.stderr.split())}")
     return done.stdout

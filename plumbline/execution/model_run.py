@@ -40,7 +40,7 @@ class ModelPlan:
 
     files: tuple[str, ...]
     importers: tuple[str, ...] = tuple(IMPORTERS)
-    are_importers_required: bool = False  # named by the user: one that is missing has failed
+    are_importers_required: bool = False  # named by the user: missing is failed, a refusal is a gap
     base: BaseChoice = "auto"
     root: Path | None = None
     strip_geometry: bool = False
@@ -111,7 +111,10 @@ class _ModelRun:
         answers = self.evaluate({shown: prepared[shown] for shown in models}, readings)
         files = list(self.judge(models, answers))
         known = KnownIssues(self.plan.known_issues, False)
-        files = [replace(f, rows=tuple(known.mark_known(f.rows, len(f.model.bodies)))) for f in files]
+        files = [
+            replace(f, rows=tuple(known.mark_known(list(map(self.answered, f.rows)), len(f.model.bodies))))
+            for f in files
+        ]
         stale = known.stale_issues(is_full_matrix=False)
         return ModelRunResult(self.plan, tuple(files), self.engines, tuple(self.problems), tuple(stale))
 
@@ -163,6 +166,12 @@ class _ModelRun:
         if info.missing and self.plan.are_importers_required and info.name in self.plan.importers:
             return replace(info, has_failed=True)
         return info
+
+    def answered(self, row: Row) -> Row:
+        """A refusal is an answer: it counts as a gap only where the user named the importer."""
+        if row.verdict == Verdict.UNSUPPORTED and not self.plan.are_importers_required:
+            return replace(row, verdict=Verdict.INFORMATION)
+        return row
 
     def usable(self) -> list[str]:
         """The importers that can run."""

@@ -54,6 +54,7 @@ RowKind = tuple[str, str, str, str, str]  # of a row: engine, its version, level
 KNOWN_ISSUES_FILE = Path(__file__).with_name("known_issues.yaml")
 LEVELS: tuple[Level, ...] = ("state", "step", "invariants", "trajectory", "relations", "model")
 ANY_LENGTH = 10**9  # bodies
+OR_EARLIER = " or earlier"  # after a version that is the oldest that the column supports
 
 # Relations that give the same problem to the same algorithm in other numbers: only rounding can differ.
 SCATTER_RELATIONS = ("rotated world", "re-chosen body frame")
@@ -89,11 +90,15 @@ class KnownIssue:
     shown_by: str = ""  # the engine whose rows show the mechanism; empty: the row's own
     intermittent: str = ""  # why the verdict may or may not occur; empty: it must
     extra_refinements_only: bool = False  # only with the additional smaller steps of the nightly
+    since: str = ""  # the first version that shows it, as `plumbline bisect` finds it; empty: not searched
 
     @property
     def diagnosis(self) -> str | None:
         """The recorded mechanism and cause, for rows without a diagnosis; None where none is stated."""
-        return f"recorded: {MECHANISMS[self.mechanism]}. {self.reason}" if self.mechanism else None
+        if not self.mechanism:
+            return None
+        since = f" Since version {self.since}." if self.since else ""
+        return f"recorded: {MECHANISMS[self.mechanism]}. {self.reason}{since}"
 
     def matches_kind(self, kind: RowKind) -> bool:
         """Return whether the entry is about rows of this kind, in its scenarios.
@@ -227,6 +232,7 @@ class _Entry(BaseModel):
     shown_by: str = _field("The engine whose rows show the mechanism.", "")
     intermittent: str = _field("Why the verdict may or may not occur.", "")
     extra_refinements_only: bool = _field("Whether the nightly's smaller steps alone show it.", False)
+    since: str = _field("The first version that shows it, as '4.1.0' or '3.3.1 or earlier'.", "")
     evidence: str = _field("A measurement, a script, a document.")
     reason: str = _field("The cause.")
 
@@ -246,6 +252,16 @@ class _Entry(BaseModel):
             raise invalid_value_error(
                 f"is {shorten(repr(text))}", "a version range, written like '>=1.13,<2'"
             ) from None
+        return text
+
+    @field_validator("since")
+    @classmethod
+    def _check_since(cls, text: str) -> str:
+        try:
+            Version(text.removesuffix(OR_EARLIER) or "0")
+        except InvalidVersion:
+            valid = f"a version, written like '4.1.0' or '3.3.1{OR_EARLIER}'"
+            raise invalid_value_error(f"is {shorten(repr(text))}", valid) from None
         return text
 
     @model_validator(mode="after")

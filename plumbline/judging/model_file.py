@@ -51,6 +51,7 @@ MODEL_UNITS = {
     "potential_energy": "J",
 }
 MODEL_FAMILY = "model file"  # of the rows, in place of a scenario's family
+REFUSED = "refused: "  # before an importer's words
 SEED = 17
 MASS_ROUNDING = 2.0**-48  # relative, of the sum of the masses
 
@@ -114,7 +115,7 @@ def judge_answer(
     """
     if answer.reading is not None and answer.reading.model is None:
         return [
-            context.make_row("model", "-", "all", Verdict.UNSUPPORTED, f"refused: {answer.reading.refusal}")
+            context.make_row("model", "-", "all", Verdict.UNSUPPORTED, f"{REFUSED}{answer.reading.refusal}")
         ]
     if answer.failure or answer.reading is None or answer.reading.model is None:
         return [context.make_row("model", "-", "all", Verdict.FAILED, answer.failure or "no answer")]

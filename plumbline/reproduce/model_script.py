@@ -102,6 +102,7 @@ def write_model_script(
     root: Path | None = None,
     strip: bool = False,
     seconds: float = SHRINKING_SECONDS,
+    since: str = "",
 ) -> ModelScript:
     """Shrink a model file and write the script of its difference.
 
@@ -113,6 +114,7 @@ def write_model_script(
         root: as for the run.
         strip: as for the run.
         seconds: time for the search for a smaller file.
+        since: a sentence about the versions that show it.
 
     Returns:
         The script, which has not been run.
@@ -142,7 +144,7 @@ def write_model_script(
         path = bench.write(tree)
         result = bench.judged(path)
         assert result is not None
-        return _render(bench, form, result, write_xml(tree), shown)
+        return _render(bench, form, result, write_xml(tree), since)
 
 
 def _differs(result: FileResult) -> bool:
@@ -234,7 +236,7 @@ class _Bench:
         return found
 
 
-def _render(bench: _Bench, form: str, result: FileResult, text: str, shown: str) -> ModelScript:
+def _render(bench: _Bench, form: str, result: FileResult, text: str, since: str) -> ModelScript:
     """Write the script about the first quantity that differs at a simple state."""
     explanation = result.explanations.get(bench.importer)
     reading = bench.answer.reading
@@ -254,7 +256,8 @@ def _render(bench: _Bench, form: str, result: FileResult, text: str, shown: str)
         title=f"{bench.info.title} {bench.info.version}",
         why=_wrapped(
             why or f"{bench.info.title} {bench.info.version} reads another robot than the file says."
-        ),
+        )
+        + (f"\n{_wrapped(since)}" if since else ""),
         xml=text.rstrip(),
         number=number,
         x=_literal(number.state.coordinates),

@@ -15,6 +15,7 @@ import numpy as np
 
 from plumbline.engines import environments
 from plumbline.judging.convergence import STEP_EXPONENTS
+from plumbline.judging.known_issues import project_known_issues
 from plumbline.judging.rows import Verdict
 from plumbline.model.datatypes import BadInput, Model, State
 from plumbline.model.kinematics import state_from_minimal
@@ -27,6 +28,7 @@ from plumbline.reproduce.render import LONG_RUN_SUFFIXES, no_script_reason, rend
 from plumbline.reproduce.shrink import OutOfTime, ReproductionCase
 from plumbline.storage.results_store import read_results, write_atomically
 from plumbline.storage.script_index import read_script_index, scripts_folder, write_script_index
+from plumbline.storage.version_changes import read_version_changes
 
 REQUESTED_SECONDS, UNREQUESTED_SECONDS = (
     60.0,
@@ -101,6 +103,7 @@ def write_scripts(
             cells.setdefault(_cell(row), []).append(row)
         wanted = {cell: [r for r in rows if keys is None or r["key"] in keys] for cell, rows in cells.items()}
         wanted = {cell: rows for cell, rows in wanted.items() if rows}
+        changes = read_version_changes(folder)
         jobs = jobs or int(document.get("run", {}).get("machine", {}).get("jobs", 1))
         for cell, rows in wanted.items():
             try:
@@ -111,7 +114,8 @@ def write_scripts(
             except NotReproducible as error:
                 written.reasons |= {row["key"]: str(error) for row in rows}
                 continue
-            shown = rows[0] | {"quantity": ", ".join(row["quantity"] for row in rows)}
+            quantities = ", ".join(row["quantity"] for row in rows)
+            shown = rows[0] | {"quantity": quantities, "since": _version_sentence(rows, changes)}
             tasks.append(Task(cell, make_script, (disagreement, shown), limits or Limits()))
     index = {} if keys is None else read_script_index(folder)
     if keys is None and scripts.is_dir():  # of an earlier run in the same folder
@@ -218,6 +222,16 @@ def _checked(folder: Path) -> Iterator[None]:
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         found = f"{type(error).__name__}: {error}"
         raise NotReproducible(f"{folder / 'results.json'}: damaged results ({found})") from None
+
+
+def _version_sentence(rows: list[StoredRow], changes: dict[str, dict[str, Any]]) -> str:
+    """Since which version the rows are so, where `bisect` or a known issue says it; else empty."""
+    for row in rows:
+        if row["key"] in changes:
+            return str(changes[row["key"]]["sentence"])
+    ids = {row["known_issue"] for row in rows}
+    since = next((issue.since for issue in project_known_issues() if issue.id in ids and issue.since), "")
+    return f"Since version {since}." if since else ""
 
 
 def _check_key(key: str, known: list[str]) -> None:

@@ -7,6 +7,8 @@ import pytest
 from click.testing import CliRunner
 
 from plumbline.cli.main import main
+from plumbline.execution.model_run import ModelPlan, run_model_files
+from plumbline.judging.model_file import REFUSED
 
 ROBOT = """<robot name="arm">
 <link name="base"><inertial><mass value="3"/>
@@ -134,6 +136,22 @@ def test_bad_options_exit_with_2(tmp_path, arguments, message):
     result = run(path, *arguments)
     assert result.exit_code == 2
     assert message in " ".join(result.stderr.replace("│", "").split())
+
+
+@pytest.mark.parametrize("is_named", [False, True])
+def test_a_refusal_is_an_answer_and_a_gap_only_where_the_importer_was_named(tmp_path, is_named):
+    path = tmp_path / "massless.urdf"
+    path.write_text(ROBOT.replace('<joint name="f" type="fixed">', '<joint name="f" type="continuous">'))
+    plan = ModelPlan((str(path),), ("mujoco", "pinocchio"), is_named, state_count=2)
+    result = run_model_files(plan, lambda *_: None)
+    refused = [row for row in result.rows if row.reason.startswith(REFUSED)]
+    assert [(row.engine, row.verdict) for row in refused] == [
+        ("mujoco", "unsupported" if is_named else "information")
+    ]
+    assert "mjMINVAL" in refused[0].reason
+    assert result.exit_code == is_named
+    others = {row.verdict for row in result.rows if row.engine == "pinocchio"}
+    assert others == {"agrees", "information"}
 
 
 def test_one_state_can_be_given(tmp_path):

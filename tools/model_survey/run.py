@@ -66,7 +66,7 @@ def survey(folder: Path) -> dict[str, Any]:
         is_urdf = kind == "urdf"
         plan = ModelPlan(
             tuple(files), base=base if is_urdf else "auto", root=Path(), strip_geometry=is_urdf,
-            state_count=STATES, jobs=len(os.sched_getaffinity(0)),
+            state_count=STATES, are_importers_required=True, jobs=len(os.sched_getaffinity(0)),
         )  # fmt: skip
         document = model_document(run_model_files(plan, _print_progress))
         merged["engines"] |= document["engines"]

@@ -1,0 +1,316 @@
+"""Which version of an engine changed an answer: a binary search over the published versions.
+
+An answer is what an importer makes of a model file, or the verdict of a row of a run.  Each version runs in
+an environment of its own, which `plumbline.engines.environments` makes once and keeps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import metadata
+from typing import Any
+
+from packaging.specifiers import SpecifierSet
+from packaging.version import Version
+
+from plumbline.engines.environments import (
+    declared_attribute,
+    declared_importer_attribute,
+    published_versions,
+)
+from plumbline.execution.model_run import ModelPlan, run_model_files
+from plumbline.execution.plan import Plan
+from plumbline.execution.runner import run_plan
+from plumbline.judging.model_file import FileResult
+from plumbline.judging.rows import Row, Verdict
+from plumbline.processes.errors import PlumblineError
+
+
+class VersionUnusable(PlumblineError):
+    """A version gives no answer here; the message is the reason."""
+
+
+class NoSearch(PlumblineError, ValueError):
+    """There is nothing to search in, or the request is wrong; the message says why."""
+
+
+@dataclass(frozen=True)
+class VersionAnswer:
+    """What one version answers."""
+
+    key: str  # two versions answer alike where these are equal
+    text: str  # for the reader
+
+
+@dataclass(frozen=True)
+class VersionChange:
+    """The end of a search."""
+
+    engine: str
+    oldest: str  # of the versions that were compared
+    newest: str
+    answers: Mapping[str, VersionAnswer]  # of the versions that were tried
+    skipped: Mapping[str, str]  # why a version was not used
+    last_before: str = ""  # the last version that answers otherwise than the newest; empty: none was found
+    first_after: str = ""  # the first from which on the newest's answer holds
+
+    @property
+    def sentence(self) -> str:
+        """The result in one sentence."""
+        if not self.first_after:
+            return f"{self.engine} {self.oldest} and {self.newest} answer alike: {self.first.text}"
+        return (
+            f"{self.engine} {self.last_before}: {self.answers[self.last_before].text}; "
+            f"since {self.first_after}: {self.answers[self.first_after].text}"
+        )
+
+    @property
+    def first(self) -> VersionAnswer:
+        """The answer of the oldest version."""
+        return self.answers[self.oldest]
+
+
+@dataclass
+class _Answers:
+    """Asks versions, each once."""
+
+    ask: Callable[[str], VersionAnswer]
+    on_answer: Callable[[str, str], None]
+    found: dict[str, VersionAnswer] = field(default_factory=dict)
+    skipped: dict[str, str] = field(default_factory=dict)
+
+    def first_usable(self, versions: Sequence[str]) -> str:
+        """The first of the versions that answers; empty where none does."""
+        for version in versions:
+            if version in self.skipped:
+                continue
+            if version not in self.found:
+                try:
+                    self.found[version] = self.ask(version)
+                except VersionUnusable as reason:
+                    self.skipped[version] = str(reason)
+                    self.on_answer(version, f"skipped: {reason}")
+                    continue
+                self.on_answer(version, self.found[version].text)
+            return version
+        return ""
+
+
+def find_change(
+    engine: str,
+    versions: Sequence[str],
+    ask: Callable[[str], VersionAnswer],
+    on_answer: Callable[[str, str], None],
+) -> VersionChange:
+    """Search for the version from which on the newest version's answer holds.
+
+    Args:
+        engine: name for the sentences.
+        versions: oldest first; the first and the last that can be used are compared.
+        ask: gets a version's answer, or raises `VersionUnusable`.
+        on_answer: called with each version and its answer or why it was skipped.
+
+    Returns:
+        The change. Where the answer changed several times, one of the changes to the newest one's.
+
+    Raises:
+        NoSearch: fewer than two versions give an answer.
+
+    """
+    answers = _Answers(ask, on_answer)
+    oldest = answers.first_usable(versions)
+    newest = answers.first_usable([v for v in reversed(versions) if v != oldest])
+    if not newest:
+        reasons = "; ".join(f"{version}: {reason}" for version, reason in answers.skipped.items())
+        raise NoSearch(f"fewer than two versions of {engine} can be compared{reasons and ': ' + reasons}")
+    change = VersionChange(engine, oldest, newest, answers.found, answers.skipped)
+    wanted = answers.found[newest].key
+    if answers.found[oldest].key == wanted:
+        return change
+    low, high = versions.index(oldest), versions.index(newest)
+    while True:
+        middle = (low + high) / 2
+        between = sorted(range(low + 1, high), key=lambda k: abs(k - middle))
+        version = answers.first_usable([versions[k] for k in between])
+        if not version:
+            return replace(change, last_before=versions[low], first_after=versions[high])
+        if answers.found[version].key == wanted:
+            high = versions.index(version)
+        else:
+            low = versions.index(version)
+
+
+def choose_versions(
+    package: str, supported: str, good: str = "", bad: str = ""
+) -> tuple[list[str], list[str]]:
+    """Choose the versions to search in.
+
+    Args:
+        package: name of the distribution.
+        supported: range of versions that the column works with; empty: all.
+        good: one end; empty: the oldest version, or the newest if the other end is the oldest.
+        bad: the other end.
+
+    Returns:
+        Versions, oldest first, and sentences about those left out.
+
+    Raises:
+        NoSearch: an end is no usable version.
+
+    `EnvironmentUnavailable` passes through where the package index cannot be reached.
+
+    """
+    published = published_versions(package)
+    usable = [v for v in published.usable if not supported or Version(v) in SpecifierSet(supported)]
+    ends = []
+    for text in filter(None, (good, bad)):
+        same = [v for v in usable if Version(v) == Version(text)]
+        if not same:
+            reason = f"there are: {', '.join(usable)}"
+            if any(Version(v) == Version(text) for v in published.without_wheel):
+                reason = f"it has no wheel for this Python and system; {reason}"
+            elif any(Version(v) == Version(text) for v in published.usable):
+                reason = f"the column supports versions {supported}; {reason}"
+            raise NoSearch(f"{package} {text} cannot be used: {reason}")
+        ends += same
+    if len(ends) == 1 and usable:
+        ends.append(usable[-1] if ends[0] == usable[0] else usable[0])
+    places = sorted(usable.index(v) for v in ends) or [0, len(usable) - 1]
+    chosen = usable[places[0] : places[-1] + 1]
+    notes = []
+    if published.without_wheel:
+        rest = ", ".join(published.without_wheel)
+        notes.append(f"without a wheel for this Python and system, not tried: {rest}")
+    outside = [v for v in published.usable if v not in usable]
+    if outside:
+        notes.append(f"outside of {supported}, which the column supports, not tried: {', '.join(outside)}")
+    return chosen, notes
+
+
+def versioned_name(engine: str, version: str, package: str) -> str:
+    """Name a version of an engine; the installed one needs no environment.
+
+    Args:
+        engine: name in a registry.
+        version: one that the package index has.
+        package: its distribution.
+
+    Returns:
+        ``engine`` or ``engine@version``.
+
+    """
+    try:
+        is_installed = metadata.version(package) == version
+    except metadata.PackageNotFoundError:
+        is_installed = False
+    return engine if is_installed else f"{engine}@{version}"
+
+
+def search_model_file(
+    plan: ModelPlan, engine: str, good: str, bad: str, on_answer: Callable[[str, str], None]
+) -> tuple[VersionChange, list[str]]:
+    """Find the version of an importer that changed the reading of a model file.
+
+    Args:
+        plan: the file and how to load it.
+        engine: name in the registry of importers.
+        good: one end of the search, as for `choose_versions`.
+        bad: the other end.
+        on_answer: as for `find_change`.
+
+    Returns:
+        The change, and sentences about versions that were left out.
+
+    Raises:
+        NoSearch: the file cannot be used, or there is nothing to search in.
+
+    """
+    package = declared_importer_attribute(engine, "package")
+    supported = declared_importer_attribute(engine, "supported_versions") or ""
+    versions, notes = choose_versions(package, supported, good, bad)
+
+    def ask(version: str) -> VersionAnswer:
+        name = versioned_name(engine, version, package)
+        result = run_model_files(replace(plan, importers=(name,), are_importers_required=True), _silent)
+        if result.problems:
+            raise NoSearch("\n".join(map(str, result.problems)))
+        if reason := result.engines[name].missing:
+            raise VersionUnusable(reason)
+        return reading_answer(result.files[0], name)
+
+    return find_change(engine, versions, ask, on_answer), notes
+
+
+def reading_answer(file: FileResult, name: str) -> VersionAnswer:
+    """Describe how an importer reads a file, so that two versions can be compared.
+
+    Args:
+        file: the result of one file.
+        name: the importer.
+
+    Returns:
+        The causes of its differences, or the quantities that differ, or its refusal.
+
+    """
+    rows = [row for row in file.rows if row.engine == name]
+    whole = next((row for row in rows if row.quantity == "all"), None)
+    if whole is not None:
+        return VersionAnswer(str(whole.verdict), whole.reason)
+    bad = [row for row in rows if row.verdict == Verdict.DISAGREES]
+    explanation = file.explanations.get(name)
+    phrases = [cause.phrase for cause in explanation.causes] if explanation else []
+    if not phrases:
+        phrases = [f"{row.quantity.replace('_', ' ')} differs" for row in bad]
+        phrases += [row.reason for row in bad[:1] if row.quantity == "joints"]
+    text = "; ".join(phrases) or "reads what the file says"
+    return VersionAnswer(text, text)
+
+
+def search_row(
+    plan: Plan, row: Mapping[str, Any], good: str, bad: str, on_answer: Callable[[str, str], None]
+) -> tuple[VersionChange, list[str]]:
+    """Find the version of an engine that changed the verdict of a row.
+
+    Args:
+        plan: with the row's scenario; engines and level are set here.
+        row: the stored row.
+        good: one end of the search, as for `choose_versions`.
+        bad: the other end.
+        on_answer: as for `find_change`.
+
+    Returns:
+        The change, and sentences about versions that were left out.
+
+    Raises:
+        NoSearch: there is nothing to search in.
+
+    """
+    engine, _, _ = str(row["engine"]).partition("@")
+    package = declared_attribute(engine, "package")
+    supported = declared_attribute(engine, "supported_versions") or ""
+    versions, notes = choose_versions(package, supported, good, bad)
+    level = {"invariants": "trajectory", "relations": "all"}.get(row["level"], row["level"])
+
+    def ask(version: str) -> VersionAnswer:
+        name = versioned_name(engine, version, package)
+        run = run_plan(replace(plan, engines=[name], level=level), _silent)
+        if reason := run.engines[name].missing:
+            raise VersionUnusable(reason)
+        return _row_answer(run.rows, row)
+
+    return find_change(engine, versions, ask, on_answer), notes
+
+
+def _row_answer(rows: Sequence[Row], wanted: Mapping[str, Any]) -> VersionAnswer:
+    fields = ("scenario", "level", "integrator", "quantity")
+    same = [row for row in rows if all(getattr(row, f) == wanted[f] for f in fields)]
+    if not same:
+        whole = [row.reason for row in rows if row.quantity == "all" and row.level == wanted["level"]]
+        text = f"there is no such row{': ' + whole[0] if whole else ''}"
+        return VersionAnswer(text, text)
+    return VersionAnswer(str(same[0].verdict), f"{same[0].verdict}: {same[0].reason}")
+
+
+def _silent(*_: object) -> None:
+    pass

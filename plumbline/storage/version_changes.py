@@ -1,0 +1,41 @@
+"""Since which version an engine answers so: what `plumbline bisect` found, kept beside the results."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from plumbline.storage.results_store import write_atomically
+
+FILE = "version_changes.json"
+
+
+def read_version_changes(folder: Path) -> dict[str, dict[str, Any]]:
+    """Read what was found of the rows of a results folder.
+
+    Args:
+        folder: a results folder.
+
+    Returns:
+        By the row's key ``last_before``, ``first_after`` and ``sentence``; empty where nothing was searched.
+
+    """
+    try:
+        found: dict[str, dict[str, Any]] = json.loads((folder / FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return found
+
+
+def add_version_change(folder: Path, key: str, change: dict[str, Any]) -> None:
+    """Keep what was found of a row.
+
+    Args:
+        folder: a results folder.
+        key: of the row.
+        change: ``last_before``, ``first_after`` and ``sentence``.
+
+    """
+    text = json.dumps(read_version_changes(folder) | {key: change}, ensure_ascii=False, indent=1)
+    write_atomically(folder / FILE, text.encode())
