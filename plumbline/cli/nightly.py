@@ -109,7 +109,7 @@ def run_nightly(
         out: output folder of all nights.
         scenarios: scenarios of the catalogue to run.
         engines: names of the engines.
-        random_count: number of random scenarios.
+        random_count: number of random scenarios: half of them chains, the others mechanisms of any joints.
         seed: their seed; None for the interrupted night's, or a new one.
         jobs: number of worker processes.
         limits: limits of each task.
@@ -145,7 +145,10 @@ def run_nightly(
     log(f"random scenarios: {night.random_count}, seed {night.seed}")
     if finished:
         log(f"resuming the night begun {night.started}: {finished} cells are finished")
-    random_scenarios = RandomScenarios(night.seed, night.random_count, random_trajectory_count)
+    mechanisms = night.random_count // 2  # the others are chains
+    random_scenarios = RandomScenarios(
+        night.seed, night.random_count - mechanisms, random_trajectory_count, mechanisms
+    )
     plan = Plan(
         scenarios,
         engines,

@@ -116,7 +116,7 @@ def run(
     "random_count",
     type=click.IntRange(0, options.MAX_RANDOM_SCENARIOS),
     default=200,
-    help="Number of random scenarios.",
+    help="Number of random scenarios: half of them chains, the others mechanisms of any joints.",
 )
 @click.option(
     "--random-trajectories",

@@ -43,7 +43,7 @@ from plumbline.judging.state import STATE_UNITS
 from plumbline.judging.state_relations import STATE_RELATIONS, WELDED_HALVES
 from plumbline.model.invariants import INVARIANT_UNITS
 from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean, shorten
-from plumbline.scenario.generator import MOTION_PREFIX, RANDOM_FAMILY
+from plumbline.scenario.generator import MECHANISM_PREFIX, MOTION_PREFIX, RANDOM_FAMILY
 from plumbline.scenario.loader import catalogue
 from plumbline.scenario.schema import invalid_value_error
 from plumbline.scenario.validation_messages import problems_from_validation
@@ -350,7 +350,12 @@ def _name_problems(source: YamlSource, entries: Sequence[_Entry], others: set[st
     """Problems of names that nothing has, and of ids that are used twice."""
     seen: set[str] = set()
     known: dict[str, set[str]] = {
-        "scenario": {*catalogue(), *others, f"{RANDOM_FAMILY}-1-1", f"{MOTION_PREFIX}1-1"},
+        "scenario": {
+            *catalogue(),
+            *others,
+            f"{RANDOM_FAMILY}-1-1",
+            *(f"{prefix}1-1" for prefix in (MOTION_PREFIX, MECHANISM_PREFIX)),
+        },
         "engine": {*ENGINES, *IMPORTERS},
         "shown_by": set(ENGINES),
         "level": set(map(str, LEVELS)),

@@ -25,6 +25,7 @@ from plumbline.model.kinematics import (
     minimal_rates,
     own_rates,
     quaternion_product,
+    rate_count,
     rotate_vectors,
     rotation_matrix,
     velocity_jacobian,
@@ -33,6 +34,7 @@ from plumbline.model.kinematics import (
 MIN_SINGULAR_VALUE = 1e-6  # of the rows that hold, below it a pose counts as singular
 RANK_TOLERANCE = 1e-11  # of singular values of scaled rows: below it a row depends on the others
 NEWTON_STEPS = 30
+NEARLY_CLOSED = 1e-11  # of a gap [m, rad]: the next step of Newton's method leaves only rounding
 PER_BODY = ("acceleration", "angular_acceleration")  # quantities with one row per body
 
 
@@ -242,44 +244,58 @@ def assembled(model: Model, state: State, movable: NDArray[np.bool_] | None = No
     if not model.has_loops:
         return state
     cut = cut_open(model)
-    best = cut.state(state)
-    gap = cut.gap(best)
-    for _ in range(NEWTON_STEPS):
-        tried = displaced(cut.model, best, _least_norm(cut, cut.jacobian(best), -gap))
-        left = cut.gap(tried)
-        if not np.max(np.abs(left)) < np.max(np.abs(gap)):
-            break
-        best, gap = tried, left
-        if np.max(np.abs(gap)) <= np.finfo(float).eps:
-            break
-    free = np.ones(cut.jacobian(best).shape[1], bool)
+    best = closed_pose(cut, cut.state(state))
+    free = np.ones(rate_count(cut.model), bool)
     if movable is not None:  # besides the closing joints' own, which follow
         free[_rates_of_source(cut)] = movable
-    J, rates = cut.jacobian(best), minimal_rates(cut.model, best)
-    for _ in range(2):  # the second pass removes what rounding left of the first
-        rates[free] += _least_norm(cut, J[:, free], -J @ rates)
+    rates = closed_rates(cut, best, minimal_rates(cut.model, best), free)
     return cut.source_state(with_rates(cut.model, best, rates))
 
 
-def allowed_rates(model: Model, state: State, rates: Array) -> Array:
-    """Project rates on those that the loops allow.
+def closed_pose(cut: CutMechanism, state: State) -> State:
+    """Close the loops of a cut mechanism by Newton's method, with the shortest steps.
 
     Args:
-        model: with loops.
-        state: assembled.
-        rates: (nu,) of the mechanism's tree.
+        cut: the mechanism.
+        state: of the tree, near a pose where its ends are together.
 
     Returns:
-        (nu,) rates that keep the loops closed.
+        That pose, with the same rates; where the loops cannot be closed from here, gaps remain.
 
     """
-    cut = cut_open(model)
-    there = cut.state(state)
-    J, own = cut.jacobian(there), _rates_of_source(cut)
-    whole = np.zeros(J.shape[1])
-    whole[own] = rates
-    whole += _least_norm(cut, J, -J @ whole)
-    return np.asarray(whole[own])
+    best, gap = state, cut.gap(state)
+    for _ in range(NEWTON_STEPS):
+        tried = displaced(cut.model, best, _least_norm(cut, cut.jacobian(best), -gap))
+        left = cut.gap(tried)
+        before, after = np.max(np.abs(gap)), np.max(np.abs(left))
+        if not after < before:
+            break
+        best, gap = tried, left
+        if before < NEARLY_CLOSED or after <= np.finfo(float).eps:  # what is left is rounding
+            break
+    return best
+
+
+def closed_rates(
+    cut: CutMechanism, state: State, rates: Array, free: NDArray[np.bool_] | None = None
+) -> Array:
+    """Project rates on those that keep the loops of a cut mechanism closed.
+
+    Args:
+        cut: the mechanism.
+        state: of the tree, its ends together.
+        rates: (nu,) of the tree.
+        free: (nu,) True for those that may change; absent: all.
+
+    Returns:
+        (nu,) the nearest rates with J ν = 0; where there are none, rates of ends differ.
+
+    """
+    J, found = cut.jacobian(state), rates.copy()
+    chosen = np.ones(len(rates), bool) if free is None else free
+    for _ in range(2):  # the second pass removes what rounding left of the first
+        found[chosen] += _least_norm(cut, J[:, chosen], -J @ found)
+    return found
 
 
 def loop_gaps(model: Model, state: State) -> tuple[Array, Array]:
@@ -313,18 +329,26 @@ def smallest_singular_value(model: Model, state: State) -> float:
     """
     cut = cut_open(model)
     there = cut.state(state)
-    values, base = _singular_values(cut, there)
+    values, base = singular_values(cut, there)
     drawn = np.random.default_rng(0).normal(size=base.shape[1])
     step = drawn - base.T @ (base @ drawn)
     size = float(np.linalg.norm(step))
     nearby = displaced(cut.model, there, np.asarray(1e-2 * step / size)) if size > 1e-6 else there
-    nearby = cut.state(assembled(model, cut.source_state(nearby)))
-    rank = max(len(base), len(_singular_values(cut, nearby)[1]))
+    rank = max(len(base), len(singular_values(cut, closed_pose(cut, nearby))[1]))
     return float(values[rank - 1])
 
 
-def _singular_values(cut: CutMechanism, state: State) -> tuple[Array, Array]:
-    """Singular values of J, rows scaled, and the rows (rank, nu) that span its own."""
+def singular_values(cut: CutMechanism, state: State) -> tuple[Array, Array]:
+    """Return the singular values of J with its rows by `row_scale`.
+
+    Args:
+        cut: the mechanism.
+        state: of the tree, its ends together.
+
+    Returns:
+        All of them, descending, and the rows (rank, nu) that span J's own.
+
+    """
     _, values, rows = np.linalg.svd(cut.jacobian(state) * cut.row_scale[:, None])
     return values, rows[: int(np.sum(values > RANK_TOLERANCE * values[0]))]
 

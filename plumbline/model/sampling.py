@@ -8,13 +8,13 @@ from functools import lru_cache
 import numpy as np
 
 from plumbline.model.datatypes import KINDS, Model, State
-from plumbline.model.kinematics import forward_kinematics, own_rates
+from plumbline.model.kinematics import forward_kinematics, rate_count
 from plumbline.model.loops import (
-    allowed_rates,
-    assembled,
+    closed_pose,
+    closed_rates,
+    cut_open,
     displaced,
-    loop_gaps,
-    smallest_singular_value,
+    singular_values,
     with_rates,
 )
 
@@ -115,20 +115,23 @@ def random_loop_states(model: Model, state: State, count: int, seed: int) -> tup
 
     """
     rng, own_rate = np.random.default_rng(seed), _own_rate(model)
-    found, here = list[State](), state
+    cut = cut_open(model)
+    found, here, rank = list[State](), cut.state(state), 0
     for _ in range(MAX_DRAWS * count):
         if len(found) == count:
             break
         for _ in range(STEPS_BETWEEN):
-            step = allowed_rates(model, here, STEP_SIZE * rng.normal(size=own_rates(model)[-1].stop))
-            moved = assembled(model, displaced(model.tree, here, step))
-            if np.max(loop_gaps(model, moved)[0]) < CLOSED:
+            step = closed_rates(cut, here, STEP_SIZE * rng.normal(size=rate_count(cut.model)))
+            moved = closed_pose(cut, displaced(cut.model, here, step))
+            if np.max(np.abs(cut.gap(moved))) < CLOSED:
                 here = moved
-        if smallest_singular_value(model, here) < MIN_SAMPLED_SINGULAR_VALUE:
+        values, rows = singular_values(cut, here)
+        rank = max(rank, len(rows))  # rows that hold at one pose hold at all
+        if values[rank - 1] < MIN_SAMPLED_SINGULAR_VALUE:
             continue
         spread = own_rate * 10 ** rng.uniform(-1.0, np.log10(4.0))
-        rates = allowed_rates(model, here, spread * rng.normal(size=own_rates(model)[-1].stop))
-        found.append(assembled(model, with_rates(model.tree, here, rates)))
+        rates = closed_rates(cut, here, spread * rng.normal(size=rate_count(cut.model)))
+        found.append(cut.source_state(with_rates(cut.model, here, rates)))
     return tuple(found)
 
 

@@ -1,8 +1,10 @@
-"""Random scenarios: any mix of joints, full inertias, masses over decades, slow to fast, loads and drag.
+"""Random scenarios: full inertias, masses over decades, slow to fast, loads and drag.
 
-Scenario k of a seed depends on the seed and k alone, so one of ten thousand can be made without the others.
-Each is the content of a scenario file and passes the checks of one.  Two of five have special values in
-place of generic ones: rare branches of an engine are taken at exact zeros, identities and equalities.
+Chains on rods and balls, some of them compared along their motion, and mechanisms: trees and loops on any mix
+of joints, free bodies, rotors, springs, dampers and efforts.  Scenario k of a seed depends on the seed and k
+alone, so one of ten thousand can be made without the others.  Each is the content of a scenario file and
+passes the checks of one.  Two of five chains have special values in place of generic ones: rare branches of
+an engine are taken at exact zeros, identities and equalities.
 """
 
 from __future__ import annotations
@@ -13,8 +15,11 @@ from typing import Any, overload
 
 import numpy as np
 
-from plumbline.model.sampling import derive_seed
+from plumbline.model.datatypes import KINDS
+from plumbline.model.random_mechanisms import ELEMENTS, LOOP_KINDS, random_loop_mechanism, random_tree
+from plumbline.model.sampling import derive_seed, random_states
 from plumbline.scenario.loader import Scenario, scenario_from_dict
+from plumbline.scenario.mechanism_document import mechanism_document
 
 RANDOM_FAMILY = "random"
 MAX_RANDOM_BODIES = 10
@@ -22,6 +27,8 @@ MASS_DECADES = 3.0  # masses in a wild scenario reach from 1e-3 to 1e3 kg; in a 
 MAX_MOTION_BODIES = 3
 MOTION_MOMENT = 0.02  # moments of loads and drag in a random motion, over those of other random scenarios
 MOTION_PREFIX = "random-motion-"
+MECHANISM_PREFIX = "random-mechanism-"
+MAX_LOOP_BODIES = 8  # of random mechanisms with loops
 SPECIAL_INDICES = (0, 2)  # modulo 5: of scenarios with special values
 SPECIAL_CHANCE = 0.4  # of each kind of special value in such a scenario
 MOTION_SAMPLE = 2.0**-5  # s, the coarsest step of an order-4 method; the work of loads is a quadrature
@@ -35,18 +42,19 @@ RANDOM_PURPOSE = (
 
 
 class RandomScenarios(Sequence[Scenario]):
-    """The first scenarios of a seed: ``motion_count`` random motions, then ``count`` others.
+    """The first scenarios of a seed: ``motion_count`` random motions, ``count`` chains, then mechanisms.
 
     Each is made when it is accessed.
     """
 
-    def __init__(self, seed: int, count: int, motion_count: int = 0) -> None:
-        self.seed, self.motion_count = seed, motion_count
-        self.indices = range(-motion_count, count)
+    def __init__(self, seed: int, count: int, motion_count: int = 0, mechanism_count: int = 0) -> None:
+        self.seed = seed
+        counts = {random_motion: motion_count, random_scenario: count, random_mechanism: mechanism_count}
+        self._drawn = [(make, k) for make, some in counts.items() for k in range(some)]
 
     def __len__(self) -> int:
         """How many."""
-        return len(self.indices)
+        return len(self._drawn)
 
     @overload
     def __getitem__(self, index: int) -> Scenario: ...
@@ -55,26 +63,24 @@ class RandomScenarios(Sequence[Scenario]):
     def __getitem__(self, index: int | slice) -> Scenario | list[Scenario]:
         """Scenario k."""
         if isinstance(index, slice):
-            return [self._make(number) for number in self.indices[index]]
-        return self._make(self.indices[index])
+            return [make(self.seed, k) for make, k in self._drawn[index]]
+        make, k = self._drawn[index]
+        return make(self.seed, k)
 
     def named(self, name: str) -> Scenario:
         """Make the scenario of a name.
 
         Args:
-            name: ``random-SEED-INDEX`` or ``random-motion-SEED-INDEX``, of this seed.
+            name: ``random-SEED-INDEX``, ``random-motion-SEED-INDEX`` or ``random-mechanism-SEED-INDEX``, of
+                this seed.
 
         Returns:
             The scenario.
 
         """
-        number = int(name.rpartition("-")[2])
-        return self._make(number - self.motion_count if name.startswith(MOTION_PREFIX) else number)
-
-    def _make(self, number: int) -> Scenario:
-        if number >= 0:
-            return random_scenario(self.seed, number)
-        return random_motion(self.seed, number + self.motion_count)
+        makers = {MOTION_PREFIX: random_motion, MECHANISM_PREFIX: random_mechanism}
+        make = next((make for prefix, make in makers.items() if name.startswith(prefix)), random_scenario)
+        return make(self.seed, int(name.rpartition("-")[2]))
 
 
 def random_scenario(seed: int, index: int) -> Scenario:
@@ -126,6 +132,45 @@ def random_motion(seed: int, index: int) -> Scenario:
         "bodies": bodies,
     }
     _specialize(content, "random motion", seed, index, MOTION_MOMENT)
+    return scenario_from_dict(content, f"{content['name']}.yaml")
+
+
+def random_mechanism(seed: int, index: int) -> Scenario:
+    """Make one random mechanism of a seed: a tree where the index is even, else one with one or two loops.
+
+    Args:
+        seed: the seed of the whole batch.
+        index: the scenario's place among the batch's mechanisms, from 0.
+
+    Returns:
+        The scenario, named ``random-mechanism-SEED-INDEX``.
+
+    """
+    own = derive_seed("random mechanism", str(seed), str(index))
+    rng = np.random.default_rng(own)
+    # half of them bare, the others with some of the elements, or all
+    elements = tuple(name for name in ELEMENTS if rng.random() < 0.6) if rng.random() < 0.5 else ()
+    kinds = [kind for kind in KINDS if rng.random() < 0.7] or list(KINDS)
+    if index % 2:
+        n = int(np.clip(1 + rng.geometric(0.3), 2, MAX_LOOP_BODIES))
+        closing = (*LOOP_KINDS, "weld")
+        count = 1 if n < 4 else int(rng.integers(1, 3))
+        chosen = [closing[i] for i in rng.integers(len(closing), size=count)]
+        model, state = random_loop_mechanism(own, n, chosen, tuple(KINDS), elements)
+    else:
+        n = int(np.clip(rng.geometric(0.2), 1, MAX_RANDOM_BODIES))
+        model = random_tree(rng, n, kinds, bool(rng.random() < 0.5), elements)
+        (state,) = random_states(model, 1, own)
+    joints = ", ".join(dict.fromkeys(model.kind))
+    content = {
+        "schema_version": 1,
+        "name": f"{MECHANISM_PREFIX}{seed}-{index}",
+        "family": RANDOM_FAMILY,
+        "title": f"Random mechanism {index} of seed {seed}: {n} {'body' if n == 1 else 'bodies'}, {joints}",
+        "purpose": RANDOM_PURPOSE,
+        "duration": 1.0,
+        **mechanism_document(model, state),
+    }
     return scenario_from_dict(content, f"{content['name']}.yaml")
 
 

@@ -168,7 +168,8 @@ def enclose_loop(flint: Any, model: Model, state: State) -> dict[str, Any]:
     posed = _BallLoop(flint, cut.model, start, z, none)
     J = posed.rates_jacobian(cut.ends, False)
     kept = flint.arb_mat([[J[int(i), j] for j in range(J.ncols())] for i in chosen.rows])
-    nu = _closed_rates(flint, BallTree(flint, cut.model, start), kept, chosen.dependent)
+    moving = _dependent_columns(cut, midpoints(kept.tolist()), chosen.rows, sizes)
+    nu = _closed_rates(flint, BallTree(flint, cut.model, start), kept, moving)
     c = _BallLoop(flint, cut.model, start, z, _per_joint(nu, sizes))
     balls = _constrained_motion(flint, c, cut, J, chosen.rows)
     dropped = np.setdiff1d(np.arange(J.nrows()), chosen.rows)
@@ -190,17 +191,27 @@ def _per_joint(values: list[Any], sizes: list[int]) -> list[list[Any]]:
 
 
 def _select(cut: CutMechanism, J: Array, sizes: list[int]) -> _Selection:
-    """Choose independent rows; the closing joints' coordinates depend, and the best of the others."""
-    rows, scaled = independent_rows(J, cut.row_scale), J * cut.row_scale[:, None]
-    first = np.cumsum([0, *sizes])
+    """Choose independent rows, and the coordinates that they determine."""
+    rows = independent_rows(J, cut.row_scale)
+    dependent = _dependent_columns(cut, J[rows], rows, sizes)
+    return _Selection(rows, dependent, np.linalg.inv(J[np.ix_(rows, dependent)]))
+
+
+def _dependent_columns(
+    cut: CutMechanism, kept: Array, rows: NDArray[np.intp], sizes: list[int]
+) -> NDArray[np.intp]:
+    """Choose what the kept rows of J determine: what closing joints move by, and the best of the others.
+
+    Of coordinates and of rates each: an attitude's coordinates and its rates have different axes, so that a
+    choice that is good for one may be singular for the other.
+    """
+    first, block = np.cumsum([0, *sizes]), kept * cut.row_scale[rows, None]
     parts = [i for k in cut.place[cut.source.n :] for i in range(first[k], first[k + 1])]
-    others = np.setdiff1d(np.arange(J.shape[1]), parts)
-    block = scaled[rows]
+    others = np.setdiff1d(np.arange(block.shape[1]), parts)
     own, _ = np.linalg.qr(block[:, parts])
     left = block[:, others] - own @ (own.T @ block[:, others])
     _, _, order = qr(left, mode="economic", pivoting=True)
-    dependent = np.sort(np.concatenate([parts, others[order[: len(rows) - len(parts)]]])).astype(np.intp)
-    return _Selection(rows, dependent, np.linalg.inv(J[np.ix_(rows, dependent)]))
+    return np.sort(np.concatenate([parts, others[order[: len(rows) - len(parts)]]])).astype(np.intp)
 
 
 def _prove_pose(

@@ -9,10 +9,10 @@ from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import KINDS, EngineFailure, Unsupported
 from plumbline.model.kinematics import quaternion_product
 from plumbline.model.loops import assembled, cut_open, loop_gaps
+from plumbline.model.random_mechanisms import random_loop_mechanism
 from plumbline.model.sampling import random_loop_states
 from plumbline.truth.certified import certify_state
 from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, state_rounding_bound
-from tests.helpers.random_loops import random_loops
 
 ENGINES = ["reference", "mujoco", "pinocchio", "pinocchio-maximal", "exudyn"]
 CLOSING = {kind: [kind] for kind in KINDS if kind != "free"} | {"ball and rod": ["ball", "rod"]}
@@ -24,7 +24,7 @@ VECTORS = ("acceleration", "angular_acceleration", "joint_reaction", "joint_mome
 def test_states_of_random_loops_are_right(engine, closing):
     adapter = load_adapter(engine)
     for seed in range(2):
-        model, start = random_loops(seed, 6, CLOSING[closing])
+        model, start = random_loop_mechanism(seed, 6, CLOSING[closing])
         states = [start, *random_loop_states(model, start, 1, seed)]
         for state, found in zip(states, adapter.evaluate(model, states), strict=True):
             truth = certify_state(model, state).quantities
@@ -45,13 +45,13 @@ def test_states_of_random_loops_are_right(engine, closing):
 
 @pytest.mark.parametrize("engine", ["exudyn-tree", "pinocchio-aba", "reference-printed"])
 def test_an_engine_that_closes_no_loops_gives_the_reason(engine):
-    model, state = random_loops(0, 4, ["ball"])
+    model, state = random_loop_mechanism(0, 4, ["ball"])
     with pytest.raises(Unsupported, match=r"loops|constraints|chains of rods and balls"):
         load_adapter(engine).evaluate(model, [state])
 
 
 def test_motions_of_loops_are_refused():
-    model, state = random_loops(0, 4, ["ball"])
+    model, state = random_loop_mechanism(0, 4, ["ball"])
     with pytest.raises(Unsupported, match="state level only"):
         load_adapter("mujoco").simulate(model, state, np.array([0.0, 0.25]), "RK4", 0.125)
 
@@ -91,9 +91,9 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.parametrize("engine", [engine for engine in ENGINES if engine != "reference"])
 def test_a_fault_in_a_loop_is_seen(engine, fault):
-    model, state = random_loops(5, 4, ["hinge"], ("ball", "universal"))
+    model, state = random_loop_mechanism(5, 4, ["hinge"], ("ball", "universal"))
     while model.body[-1, 0] < 0:
-        model, state = random_loops(int(model.n * 7), 4, ["hinge"], ("ball", "universal"))
+        model, state = random_loop_mechanism(int(model.n * 7), 4, ["hinge"], ("ball", "universal"))
     wrong = FAULTS[fault](model)
     truth, bound = certify_state(model, state).quantities, state_rounding_bound(model, state)
     try:
@@ -105,7 +105,7 @@ def test_a_fault_in_a_loop_is_seen(engine, fault):
 
 
 def test_the_parts_of_a_cut_body_add_up_to_it():
-    model, state = random_loops(2, 6, ["ball", "rod"])
+    model, state = random_loop_mechanism(2, 6, ["ball", "rod"])
     cut = cut_open(model)
     there, near = cut.state(state), model.body[:, 1]
     for quantity in ("mass", "inertia"):

@@ -9,9 +9,9 @@ from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import Unsupported
 from plumbline.model.invariants import attitude_error, compute_invariants, position_error
 from plumbline.model.kinematics import complete_state
+from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from plumbline.truth.notes_motion import simulate_notes_form
-from tests.helpers.random_trees import random_tree
 
 TIMES = np.arange(5) / 32
 ORDER_MARGIN = 0.3  # orders are 1, 2 or 4; the next term of the error moves the slope less

@@ -8,10 +8,10 @@ import pytest
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import KINDS, Unsupported
 from plumbline.model.kinematics import complete_state, quaternion_product
+from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import random_states
 from plumbline.truth.certified import certify_state
 from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, state_rounding_bound
-from tests.helpers.random_trees import ELEMENTS, random_tree
 
 ENGINES = ["reference", "mujoco", "pinocchio", "pinocchio-aba", "pinocchio-maximal", "exudyn", "exudyn-tree"]
 MIXES = {**{kind: (kind,) for kind in KINDS}, "all": tuple(KINDS)}

@@ -14,6 +14,9 @@ from plumbline.execution.proofs import TRUTH_TOOLS
 from plumbline.execution.random_batch import RandomBatch
 from plumbline.execution.runner import RunResult
 from plumbline.judging.rows import RowContext
+from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS
+from plumbline.model.loops import loop_gaps
+from plumbline.model.random_mechanisms import ELEMENTS, random_loop_mechanism
 from plumbline.processes.cpu_time import CpuTimes
 from plumbline.processes.workers import Limits
 from plumbline.scenario import loader
@@ -22,8 +25,10 @@ from plumbline.scenario.generator import (
     RANDOM_FAMILY,
     RandomScenarios,
     random_document,
+    random_mechanism,
     random_scenario,
 )
+from plumbline.scenario.mechanism_document import mechanism_document
 from plumbline.storage.history import History
 from plumbline.storage.results_store import ResultTables, read_table
 
@@ -77,6 +82,45 @@ def test_a_random_scenario_is_a_file_like_any_other(tmp_path):
     assert loader.load_scenario(path).digest == random_scenario(3, 4).digest
 
 
+def test_random_mechanisms_cover_every_joint_element_and_topology():
+    drawn = list(RandomScenarios(1, 0, mechanism_count=120))
+    assert [s.digest for s in drawn[:3]] == [random_mechanism(1, k).digest for k in range(3)]
+    assert RandomScenarios(1, 2, 1, 3).named("random-mechanism-1-2").digest == drawn[2].digest
+    assert [s.model.has_loops for s in drawn] == [False, True] * 60
+    assert {len(s.model.kind) - s.model.n for s in drawn} == {0, 1, 2}
+    assert {s.model.n for s in drawn[::2]} == set(range(1, MAX_RANDOM_BODIES + 1))
+    for count in (lambda m: m.n, lambda m: len(m.kind)):  # tree joints, and with those that close loops
+        assert {kind for s in drawn for kind in s.model.kind[: count(s.model)]} == set(KINDS)
+    assert {s.model.kind[-1] for s in drawn[1::2]} == set(KINDS) - {"free"}
+    for element in (*JOINT_ELEMENTS, "spring_body"):
+        has = [np.any(getattr(s.model, element)) for s in drawn]
+        assert 0.15 < np.mean(has) < 0.5, element
+    rotors = [s for s in drawn if "free" in s.model.kind and np.any(s.model.armature)]
+    assert len(rotors) >= 5
+    assert max(np.max(loop_gaps(s.model, s.state)) for s in drawn[1::2]) < 1e-11
+
+
+def test_a_mechanism_comes_back_from_its_file():
+    """But for rounding of axes and attitudes; axes of balls, rods and free bodies are not in a file."""
+    model, state = random_loop_mechanism(3, 5, ["hinge", "rod"], tuple(KINDS), ELEMENTS)
+    texts = {"schema_version": 1, "name": "copy", "title": "copy", "purpose": "copy", "duration": 1.0}
+    found = loader.scenario_from_dict(texts | mechanism_document(model, state), "copy.yaml")
+    has_axes = [not KINDS[kind].has_attitude for kind in model.kind]
+    for name, value in vars(model).items():
+        other = getattr(found.model, name)
+        if name in ("kind", "body", "spring_body"):
+            assert np.array_equal(value, other)
+        elif name == "turn":
+            np.testing.assert_allclose(value[has_axes], other[has_axes], atol=1e-15)
+        elif name == "rest":  # of no account without a spring
+            used = model.stiffness > 0
+            np.testing.assert_array_equal(value[used], other[used])
+        else:
+            np.testing.assert_allclose(value, other, rtol=1e-15, atol=0)
+    for name in ("p", "omega", "u", "udot", "r", "v"):
+        np.testing.assert_allclose(getattr(state, name), getattr(found.state, name), atol=1e-13)
+
+
 def run_nightly(out, **more):
     chosen = loader.load_scenarios(["rest"])
     options = {"random_count": 3, "seed": 11, "jobs": 1, "limits": Limits(), "is_full_catalogue": False,
@@ -118,7 +162,7 @@ def test_a_night_is_whole_and_remembered(tmp_path):
         assert any(other.verdict != "agrees" for other in kept if other.scenario == row.scenario), row.key
     counted = result.random_batch.counts_by_verdict
     random = [r for r in read_table(place, "summary").to_pylist() if r["family"] == RANDOM_FAMILY]
-    assert {r["scenario"] for r in random} == {f"random-11-{k}" for k in range(3)}
+    assert {r["scenario"] for r in random} == {"random-11-0", "random-11-1", "random-mechanism-11-0"}
     assert {r["level"] for r in random} == {"state", "step"}
     assert counted.total() + len(kept) == len(random)
     assert stored["random_batch"]["scenarios"] == 3

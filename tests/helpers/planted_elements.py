@@ -9,7 +9,7 @@ import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State, StateQuantities
 from plumbline.model.kinematics import elastic_energy, kinetic_energy_of_rotors, quaternion_product
-from tests.helpers.random_trees import random_tree
+from plumbline.model.random_mechanisms import random_tree
 
 Change = Callable[[Model], Model]
 Answer = Callable[[Model, State, StateQuantities], StateQuantities]

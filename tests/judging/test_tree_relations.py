@@ -10,9 +10,9 @@ from adapters.reference_engine import Reference
 from plumbline.judging.run_relations import check_run_relations
 from plumbline.judging.state_relations import check_state_relations
 from plumbline.model.equivalent import reorder_bodies, rotate_world, siblings_reversed
+from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import find_scenario_file, load_scenario
-from tests.helpers.random_trees import random_tree
 
 Q = np.array([0.5, -0.5, 0.5, 0.5])
 TREE = load_scenario(find_scenario_file("tree-of-seven"))

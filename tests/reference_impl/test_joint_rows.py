@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from plumbline.model.datatypes import KINDS, Model
+from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from reference_impl.direct import DirectSystem
 from reference_impl.euler_parameters import euler_parameter_rate
 from reference_impl.joints import constraint_rows
 from reference_impl.structured import StructuredSystem
-from tests.helpers.random_trees import random_tree
 
 TESTED_KINDS = [kind for kind in KINDS if kind not in ("rod", "free")]  # the rod's row is the notes' own
 

@@ -5,6 +5,7 @@ import pytest
 
 from plumbline.model.datatypes import KINDS
 from plumbline.model.kinematics import quaternion_rate
+from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth.rounding_bound import state_rounding_bound
@@ -17,7 +18,6 @@ from reference_impl.joints import constraint_rows
 from reference_impl.structured import StructuredSystem, component_first
 from reference_impl.tree_elimination import TreeSystem, eliminated_system
 from tests.helpers.random_chains import random_model
-from tests.helpers.random_trees import random_tree
 
 
 def off_manifold(model, seed, size):

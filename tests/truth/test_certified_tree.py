@@ -11,13 +11,13 @@ from scipy.spatial.transform import Rotation
 from adapters.reference_engine import Reference
 from plumbline.model.datatypes import KINDS
 from plumbline.model.kinematics import complete_state, state_from_minimal
+from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import random_states
 from plumbline.truth.balls import midpoints
 from plumbline.truth.certified import certify_state, enclose_quantities
 from plumbline.truth.certified_tree import enclose_tree
 from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, state_rounding_bound
 from tests.helpers.random_chains import random_chain
-from tests.helpers.random_trees import ELEMENTS, random_tree
 
 
 @pytest.mark.parametrize("rods", [(0,), (1,), (1, 0, 0, 1, 1)])

@@ -9,6 +9,7 @@ import pytest
 from plumbline.model.datatypes import KINDS, Model
 from plumbline.model.invariants import attitude_error, compute_invariants, position_error
 from plumbline.model.kinematics import complete_state, quaternion_rate, state_from_minimal
+from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth import TruthUnavailable, ground_truth, trajectory
@@ -20,7 +21,6 @@ from plumbline.truth.sensitivity import perturbation_growth, perturbed_states, p
 from plumbline.truth.taylor import simulate_taylor, taylor_series
 from plumbline.truth.trajectory import NOTES_RTOL, trajectory_truth
 from reference_impl.joints import constraint_rows
-from tests.helpers.random_trees import random_tree
 
 TIMES = np.arange(9) * 0.125
 UNIT = np.array([1.0, 0.0, 0.0, 0.0])

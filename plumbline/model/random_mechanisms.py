@@ -1,0 +1,211 @@
+"""Random mechanisms: trees with any mix of joints, skew axes, full inertias, loads, elements, and loops."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import count
+from typing import Any
+
+import numpy as np
+
+from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Array, Kind, Model, State
+from plumbline.model.kinematics import (
+    complete_state,
+    quaternion_conjugate,
+    quaternion_product,
+    rotation_matrix,
+)
+from plumbline.model.loops import assembled, cut_open
+from plumbline.model.sampling import random_states
+
+ELEMENTS = ("armature", "damping", "stiffness", "effort", "springs")
+LOOP_KINDS: tuple[Kind, ...] = ("rod", "ball", "hinge", "universal", "slide", "cylindrical")
+MIN_FIRST_SINGULAR_VALUE = 5e-2  # of the unit rows of a new loop's mechanism: away from singular poses
+
+
+def random_tree(
+    rng: np.random.Generator,
+    n: int,
+    kinds: Sequence[Kind] = tuple(KINDS),
+    loads: bool = True,
+    elements: Sequence[str] = (),
+) -> Model:
+    """Draw a tree in depth-first order; free bodies hang on the world only, welds never.
+
+    Args:
+        rng: the source.
+        n: number of bodies.
+        kinds: kinds of joints to choose from.
+        loads: whether bodies have constant loads and drag.
+        elements: which of `ELEMENTS` its joints have.
+
+    Returns:
+        The tree.
+
+    """
+    far: list[int] = []
+    chosen: list[Kind] = []
+    for k in range(n):
+        path = [k - 1]
+        while path[-1] >= 0:
+            path.append(far[path[-1]])
+        far.append(int(rng.choice(path)))
+        fitting = [kind for kind in kinds if kind != ("free" if far[k] >= 0 else "weld")]
+        chosen.append(fitting[rng.integers(len(fitting))] if fitting else "hinge")
+    mass = 10 ** rng.uniform(-0.5, 0.5, n)
+    axes = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
+    size = rng.uniform(0.1, 0.6, (n, 3)) ** 2
+    principal = mass[:, None] / 5 * (size.sum(1, keepdims=True) - size)  # ellipsoids: always physical
+    inertia = axes @ (principal[..., None] * axes.mT)
+    point = 0.3 * rng.normal(size=(n, 2, 3))
+    point[[kind == "free" for kind in chosen]] = 0
+    bare = Model(
+        mass=mass,
+        inertia=(inertia + inertia.mT) / 2,
+        kind=tuple(chosen),
+        body=np.stack([far, np.arange(n)], axis=1),
+        point=point,
+        turn=_unit(rng.normal(size=(n, 2, 4))),
+        length=np.where([kind == "rod" for kind in chosen], rng.uniform(0.2, 1.0, n), 0.0),
+        gravity=np.array([0.7, -0.4, -9.7]),
+        force=loads * rng.normal(size=(n, 3)),
+        moment=loads * 0.3 * rng.normal(size=(n, 3)),
+        drag_force=loads * rng.uniform(0.1, 0.3, n),
+        drag_moment=loads * rng.uniform(0.01, 0.03, n),
+    )
+    return with_elements(rng, bare, elements) if elements else bare
+
+
+def with_elements(rng: np.random.Generator, model: Model, elements: Sequence[str] = ELEMENTS) -> Model:
+    """Add random elements to every joint, and two springs between points.
+
+    Args:
+        rng: the source.
+        model: a tree.
+        elements: which.
+
+    Returns:
+        The tree with the elements.
+
+    """
+    n, fields = model.n, dict[str, Any]()
+    scalar = np.array([[i < len(KINDS[kind].motions) for i in range(2)] for kind in model.kind])
+    balls = np.array([[kind == "ball", False] for kind in model.kind])
+    for name in ("armature", "damping", "stiffness"):
+        if name in elements:
+            fields[name] = rng.uniform(0.1, 2.0, (n, 2)) * (scalar | balls)
+    if "stiffness" in elements:
+        fields["rest"] = rng.normal(size=(n, 2)) * scalar
+    if "effort" in elements:
+        fields["effort"] = rng.normal(size=(n, 2)) * scalar
+    if "springs" in elements and n > 1:
+        fields |= {
+            "spring_body": np.array([rng.choice(np.arange(-1, n), 2, replace=False) for _ in range(2)]),
+            "spring_point": 0.5 * rng.normal(size=(2, 2, 3)),
+            "spring_stiffness": rng.uniform(1.0, 10.0, 2),
+            "spring_damping": rng.uniform(0.1, 1.0, 2),
+            "spring_length": rng.uniform(0.1, 1.0, 2),
+        }
+    return model.changed(**fields)
+
+
+def close_loop(
+    model: Model, state: State, kind: Kind, far: int, near: int, rng: np.random.Generator
+) -> Model:
+    """Add a joint that fits the state: its coordinates are at random, its far axes and point follow.
+
+    Args:
+        model: the mechanism.
+        state: its pose.
+        kind: of the joint.
+        far: its far body, −1 the world.
+        near: its near body.
+        rng: the source.
+
+    Returns:
+        The mechanism with one more closing joint.
+
+    """
+    a = rotation_matrix(state.p)
+    at, turn = 0.3 * rng.normal(size=3), rng.normal(size=4)
+    turn /= np.linalg.norm(turn)
+    point = state.r[near] + a[near] @ at
+    axes = quaternion_product(state.p[near], turn)  # the joint's axes in the world, as the near body has them
+    length = 0.0
+    for what, axis in KINDS[kind].motions[::-1]:
+        if what == "turn":
+            half = rng.uniform(-1, 1)
+            axes = quaternion_product(axes, np.array([np.cos(half), *(np.sin(half) * np.eye(3)[axis])]))
+        else:
+            point = point + rng.normal() * rotation_matrix(axes)[:, axis]
+    if kind == "rod":
+        step = rng.normal(size=3)
+        point, length = point + step, float(np.linalg.norm(step))
+    if far >= 0:
+        point = a[far].T @ (point - state.r[far])
+        axes = quaternion_product(quaternion_conjugate(state.p[far]), axes)
+    return replace(
+        model,
+        kind=(*model.kind, kind),
+        body=np.vstack([model.body, [[far, near]]]),
+        point=np.concatenate([model.point, [[point, at]]]),
+        turn=np.concatenate([model.turn, [[axes / np.linalg.norm(axes), turn]]]),
+        length=np.append(model.length, length),
+        **{name: np.vstack([getattr(model, name), np.zeros((1, 2))]) for name in JOINT_ELEMENTS},
+    )
+
+
+def random_loop_mechanism(
+    seed: int,
+    n: int,
+    kinds: Sequence[Kind],
+    tree: Sequence[Kind] = LOOP_KINDS,
+    elements: Sequence[str] = (),
+) -> tuple[Model, State]:
+    """Draw a tree whose last bodies are closed by joints of some kinds, at an assembled state.
+
+    Args:
+        seed: the same seed gives the same mechanism.
+        n: number of bodies.
+        kinds: of the closing joints.
+        tree: kinds of the tree's joints.
+        elements: which of `ELEMENTS` the tree's joints have.
+
+    Returns:
+        The mechanism, whose loops move and whose rows are independent, and the state.
+
+    """
+    for attempt in count():
+        rng = np.random.default_rng([seed, n, len(kinds), attempt])
+        model = random_tree(rng, n, tree, elements=elements)
+        (state,) = random_states(model, 1, seed)
+        for i, kind in enumerate(kinds):
+            near = n - 1 - i
+            path = {near}
+            while (above := int(model.body[min(path), 0])) >= 0 and rng.random() < 0.7:
+                path.add(above)
+            world = [] if kind == "weld" else [-1]
+            ends = [*world, *(b for b in range(n) if b not in path and b != model.body[near, 0])]
+            if not ends:
+                break
+            model = close_loop(model, state, kind, int(rng.choice(ends)), near, rng)
+        if len(model.kind) == n + len(kinds) and _moves(model, state):
+            return model, assembled(model, complete_state(model, state))
+    raise AssertionError
+
+
+def _moves(model: Model, state: State) -> bool:
+    """Whether the loops can move, with no row that depends on others, away from singular poses."""
+    cut = cut_open(model)
+    J = cut.jacobian(cut.state(state))
+    size = np.linalg.norm(J, axis=1, keepdims=True)
+    if np.min(size) < 1e-9:
+        return False
+    values = np.linalg.svd(J / size)[1]
+    moving = J.shape[1] - int(np.sum(cut.model.rods))  # a rod has two rates in three columns
+    return J.shape[0] < moving and bool(values[-1] > MIN_FIRST_SINGULAR_VALUE)
+
+
+def _unit(q: Array) -> Array:
+    return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))

@@ -1,0 +1,103 @@
+"""A mechanism at a state as the content of a scenario file."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Model, State
+
+
+def mechanism_document(model: Model, state: State) -> dict[str, Any]:
+    """Describe a mechanism at a state as a scenario file does.
+
+    The axes of ball joints are not part of a file; their springs are unloaded where both bodies' axes agree.
+
+    Args:
+        model: the mechanism; its loops are closed at the state.
+        state: a state of it.
+
+    Returns:
+        The fields ``gravity``, ``bodies``, ``springs`` and ``closes``: plain data.
+
+    """
+    found: dict[str, Any] = {
+        "gravity": model.gravity.tolist(),
+        "bodies": [_body(model, state, k) for k in range(model.n)],
+    }
+    if len(model.spring_body):
+        found["springs"] = [
+            {
+                "bodies": [_name(int(body)) for body in model.spring_body[i]],
+                "points": model.spring_point[i].tolist(),
+                "stiffness": float(model.spring_stiffness[i]),
+                "damping": float(model.spring_damping[i]),
+                "length": float(model.spring_length[i]),
+            }
+            for i in range(len(model.spring_body))
+        ]
+    if model.has_loops:
+        found["closes"] = [
+            {
+                "body": _name(int(model.body[k, 1])),
+                "parent": _name(int(model.body[k, 0])),
+                "joint": _joint(model, k),
+                "anchor": model.point[k, 0].tolist(),
+                "proximal": model.point[k, 1].tolist(),
+            }
+            for k in range(model.n, len(model.kind))
+        ]
+    return found
+
+
+def _name(body: int) -> str:
+    return "world" if body < 0 else f"body {body + 1}"
+
+
+def _body(model: Model, state: State, k: int) -> dict[str, Any]:
+    kind, joint = model.kind[k], _joint(model, k)
+    found: dict[str, Any] = {
+        "name": _name(k),
+        "mass": float(model.mass[k]),
+        "inertia": {"matrix": model.inertia[k].tolist()},
+        "joint": joint,
+        "proximal": model.point[k, 1].tolist(),
+    }
+    if kind == "free":
+        joint |= {"position": (state.r[k]).tolist(), "velocity": state.v[k].tolist()}
+    else:
+        found |= {"parent": _name(int(model.body[k, 0])), "anchor": model.point[k, 0].tolist()}
+    if kind == "rod":
+        spin = np.cross(state.u[k], state.udot[k])
+        joint |= {"direction": state.u[k].tolist(), "angular_velocity": spin.tolist()}
+    if KINDS[kind].has_attitude:
+        found["attitude"] = {"quaternion": state.p[k].tolist()}
+        found["angular_velocity"] = state.omega[k].tolist()
+    elif KINDS[kind].motions:
+        count = len(KINDS[kind].motions)
+        joint |= {"coordinates": state.x[k, :count].tolist(), "rates": state.xdot[k, :count].tolist()}
+    if np.any(model.force[k]) or np.any(model.moment[k]):
+        found["load"] = {"force": model.force[k].tolist(), "moment": model.moment[k].tolist()}
+    if model.drag_force[k] or model.drag_moment[k]:
+        found["drag"] = {"force": float(model.drag_force[k]), "moment": float(model.drag_moment[k])}
+    return found
+
+
+def _joint(model: Model, k: int) -> dict[str, Any]:
+    """The joint without what depends on the state."""
+    kind = model.kind[k]
+    found: dict[str, Any] = {"kind": kind}
+    if kind == "rod":
+        found["length"] = float(model.length[k])
+    elif not KINDS[kind].has_attitude:
+        frames = ({"quaternion": turn.tolist()} for turn in model.turn[k])
+        found |= zip(("frame", "body_frame"), frames, strict=True)
+    count = 1 if kind == "ball" else len(KINDS[kind].motions)
+    for name in JOINT_ELEMENTS:
+        values = getattr(model, name)[k, :count]
+        if np.any(values):
+            found[name] = values.tolist()
+    if "stiffness" not in found:
+        found.pop("rest", None)
+    return found
