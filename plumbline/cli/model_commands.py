@@ -32,9 +32,10 @@ COLUMN_HEADINGS = {
     "joints": "joints", "total_mass": "mass", "position": "position", "attitude": "attitude",
     "mass_matrix": "M", "gravity_force": "gravity", "bias_force": "h", "passive_force": "passive",
     "damping": "damping", "acceleration": "accel.",
-    "kinetic_energy": "kinetic", "potential_energy": "potential",
+    "kinetic_energy": "kinetic", "potential_energy": "potential", "rewritings": "rewritten",
 }  # fmt: skip
 MAX_STATES = 10_000
+OWN_REASONS = ("damping", "rewritings")  # quantities whose differences are no part of a cause
 
 
 def _choose_importers(_: click.Context, __: click.Parameter, names: Sequence[str]) -> tuple[str, ...]:
@@ -273,7 +274,7 @@ def _reasons(name: str, rows: Sequence[Row], file: FileResult) -> list[str]:
     explanation = file.explanations.get(name)
     if explanation is not None and explanation.causes and bad:
         lines = [f"{coloured_glyph(bad[0])} {escape(cause.sentence)}" for cause in explanation.causes]
-        return lines + [f"{coloured_glyph(r)} {escape(r.reason)}" for r in bad if r.quantity == "damping"]
+        return lines + [f"{coloured_glyph(r)} {escape(r.reason)}" for r in bad if r.quantity in OWN_REASONS]
     refused = [row for row in rows if row.verdict == Verdict.INFORMATION and row.reason.startswith(REFUSED)]
     lines = [f"{coloured_glyph(row)} {escape(f'{row.engine}: {row.reason}')}" for row in (*bad, *refused)]
     if explanation is not None and bad:

@@ -422,6 +422,35 @@ def differences(own: NeutralModel, theirs: NeutralModel) -> list[Change]:
     return [Change("additional body", b.name, "", None, b, Source("", 0)) for b in extra] + found
 
 
+def describe_difference(own: NeutralModel, theirs: NeutralModel) -> str:
+    """Describe the first parameter in which two readings of equivalent files differ.
+
+    Args:
+        own: of the file as written.
+        theirs: of the rewritten file, with the names of the first.
+
+    Returns:
+        A clause; empty where they differ by rounding only.
+
+    """
+    named = {body.name: body for body in theirs.bodies}
+    for body in own.bodies:
+        if body.name not in named:
+            return f"there is no body {body.name}"
+        kinds = [_joint_words(b.joints) for b in (named[body.name], body)]
+        if kinds[0] != kinds[1]:
+            return f"the joints of body {body.name} are {kinds[0]}, as written {kinds[1]}"
+    changes = differences(own, theirs)
+    if not changes:
+        return ""
+    first, word = changes[0], FIELD_WORDS.get(changes[0].field, changes[0].field)
+    if first.field == "additional body":
+        return f"there is another body, {first.body}"
+    values = format_value(first.theirs, first.own), format_value(first.own, first.theirs)
+    more = f" ({len(changes)} parameters differ)" if len(changes) > 1 else ""
+    return f"the {word} of {first.owner} is {values[0]}, as written {values[1]}{more}"
+
+
 def _parent_names(model: NeutralModel) -> dict[str, str]:
     return {b.name: model.bodies[b.parent].name if b.parent >= 0 else "world" for b in model.bodies}
 

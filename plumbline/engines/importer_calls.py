@@ -78,6 +78,20 @@ def read_model_file(name: str, file: ModelFile) -> Reading:
         return Reading(importer.version(), refusal=format_exception(error))
 
 
+def read_model_files(name: str, files: Mapping[str, ModelFile]) -> dict[str, Reading]:
+    """Have an importer read several files.
+
+    Args:
+        name: the importer's name in the registry.
+        files: by any key.
+
+    Returns:
+        The readings by the same keys, as of `read_model_file`.
+
+    """
+    return {key: read_model_file(name, file) for key, file in files.items()}
+
+
 def evaluate_model_file(
     name: str, file: ModelFile, states: Sequence[CanonicalState]
 ) -> list[ModelQuantities]:

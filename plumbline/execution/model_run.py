@@ -14,7 +14,12 @@ from plumbline.engines.environments import (
     importer_interpreter,
     split_version,
 )
-from plumbline.engines.importer_calls import describe_importer, evaluate_model_file, read_model_file
+from plumbline.engines.importer_calls import (
+    describe_importer,
+    evaluate_model_file,
+    read_model_file,
+    read_model_files,
+)
 from plumbline.engines.registry import IMPORTERS
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.runner import exit_code_of_rows
@@ -109,6 +114,7 @@ class _ModelRun:
         readings = self.read(prepared)
         models = self.neutral_models(prepared, readings)
         answers = self.evaluate({shown: prepared[shown] for shown in models}, readings)
+        answers = self.rewrite(prepared, answers)
         files = list(self.judge(models, answers))
         known = KnownIssues(self.plan.known_issues, False)
         files = [
@@ -246,6 +252,21 @@ class _ModelRun:
                 answers[key] = replace(answers[key], failure=outcome.failure)
             else:
                 answers[key] = replace(answers[key], quantities=tuple(outcome.value))
+        return answers
+
+    def rewrite(
+        self, prepared: Mapping[str, PreparedFile], answers: dict[tuple[str, str], Answer]
+    ) -> dict[tuple[str, str], Answer]:
+        """Have MuJoCo read equivalent rewritings of the MJCF files, which judge its compiler."""
+        tasks = []
+        for (shown, name), answer in answers.items():
+            file, is_read = prepared[shown].file, answer.reading is not None and answer.reading.model
+            if split_version(name)[0] == MJCF_READER and file.format == "mjcf" and is_read:
+                written = prepared[shown].write_rewritings(self.scratch)
+                tasks.append(self.task("rewritten", shown, name, read_model_files, written))
+        for outcome in self.outcomes(tasks):
+            key = outcome.key[1:]
+            answers[key] = replace(answers[key], rewritten=outcome.value or {})
         return answers
 
     def states(self, shown: str, model: NeutralModel) -> tuple[CanonicalState, ...]:

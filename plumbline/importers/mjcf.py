@@ -228,7 +228,7 @@ def with_sources(model: NeutralModel, root: Element) -> NeutralModel:
 
     """
     bodies = {e.attributes["name"]: e for e in body_elements(root)}
-    defaults = _DefaultClasses(root)
+    defaults = DefaultClasses(root)
     default_source = Source(root.source.file, 0)
     found = [_body_with_sources(body, bodies, defaults, default_source) for body in model.bodies]
     options = [e for o in root.find_all("option") for e in (*o.find_all("flag"), o)]
@@ -250,7 +250,7 @@ def _name_of(element: Element) -> str:
     return ""
 
 
-def _joint_features(root: Element, defaults: _DefaultClasses) -> list[Feature]:
+def _joint_features(root: Element, defaults: DefaultClasses) -> list[Feature]:
     found = []
     for body in body_elements(root):
         for joint in joint_elements(body):
@@ -263,36 +263,56 @@ def _joint_features(root: Element, defaults: _DefaultClasses) -> list[Feature]:
     return found
 
 
-class _DefaultClasses:
-    """Where an attribute of a joint comes from: the element, or a default class."""
+class DefaultClasses:
+    """Where an attribute of an element comes from: the element, or a default class."""
 
     def __init__(self, root: Element) -> None:
         self.classes: dict[str, list[Element]] = {}  # name → the elements <default>, the own one first
-        self.class_of: dict[int, str] = {}  # id of a joint element → its class
-        for top in root.find_all("default"):
-            stack: list[tuple[Element, list[Element]]] = [(top, [])]
-            while stack:
-                element, above = stack.pop()
-                chain = [element, *above]
-                name = element.attributes.get("class", "main")
-                self.classes[name] = chain + self.classes.get(name, [])
-                stack.extend((child, chain) for child in element.find_all("default"))
+        self.class_of: dict[int, str] = {}  # id of an element of the worldbody → its class
+        tops = root.find_all("default")[::-1]  # each is the class of all elements, whatever its name
+        stack = [(top, tops) for top in tops]
+        self.classes["main"] = tops
+        while stack:
+            element, chain = stack.pop()
+            if "class" in element.attributes:
+                self.classes[element.attributes["class"]] = chain
+            stack.extend((child, [child, *chain]) for child in element.find_all("default"))
         for world in root.find_all("worldbody"):
             walk: list[tuple[Element, str]] = [(world, "main")]
             while walk:
                 element, inherited = walk.pop()
-                if element.tag in ("joint", "freejoint"):
-                    self.class_of[id(element)] = element.attributes.get("class", inherited)
+                self.class_of[id(element)] = element.attributes.get("class", inherited)
                 inherited = element.attributes.get("childclass", inherited)
                 walk.extend((child, inherited) for child in element.children)
 
+    def chain(self, element: Element) -> list[Element]:
+        """List the elements <default> that hold for an element.
+
+        Args:
+            element: of the worldbody.
+
+        Returns:
+            The elements, that of the nearest class first.
+
+        """
+        return self.classes.get(self.class_of.get(id(element), "main"), [])
+
     def source(self, joint: Element, attribute: str) -> Source | None:
-        """Find where the file sets an attribute of a joint; None where it does not."""
+        """Find where the file sets an attribute.
+
+        Args:
+            joint: an element <joint> or <freejoint>.
+            attribute: its name.
+
+        Returns:
+            The place; None where the file does not set it.
+
+        """
         if attribute in joint.attributes:
             return joint.source
         if joint.tag == "freejoint":
             return None
-        for element in self.classes.get(self.class_of.get(id(joint), "main"), []):
+        for element in self.chain(joint):
             default = element.find("joint")
             if default is not None and attribute in default.attributes:
                 return default.source
@@ -300,7 +320,7 @@ class _DefaultClasses:
 
 
 def _body_with_sources(
-    body: NeutralBody, elements: Mapping[str, Element], defaults: _DefaultClasses, nowhere: Source
+    body: NeutralBody, elements: Mapping[str, Element], defaults: DefaultClasses, nowhere: Source
 ) -> NeutralBody:
     element = elements.get(body.name)
     if element is None:  # of a <replicate> or <attach>, whose names are made by the compiler
@@ -313,7 +333,7 @@ def _body_with_sources(
 
 
 def _joint_with_sources(
-    joint: ElementaryJoint, element: Element | None, defaults: _DefaultClasses, nowhere: Source
+    joint: ElementaryJoint, element: Element | None, defaults: DefaultClasses, nowhere: Source
 ) -> ElementaryJoint:
     if element is None:
         return replace(joint, source=nowhere)

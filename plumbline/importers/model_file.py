@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from copy import deepcopy
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 from urllib.parse import unquote
 
 from plumbline.importers import mjcf
 from plumbline.importers.importer import Base, Format, ModelFile, Reading
+from plumbline.importers.mjcf_rewriting import rewritings
 from plumbline.importers.neutral_model import NeutralModel
 from plumbline.importers.urdf import read_urdf
-from plumbline.importers.xml_tree import Element, ModelFileError, read_xml, write_xml_in_place
+from plumbline.importers.xml_tree import Element, ModelFileError, read_xml, write_xml, write_xml_in_place
 from plumbline.scenario.errors import Problem, shorten
 
 BaseChoice = Literal["fixed", "free", "auto"]
@@ -47,6 +49,25 @@ class PreparedFile:
             message = f"MuJoCo, which defines MJCF, refuses it: {shorten(words, 400)}"
             raise ModelFileError([Problem(self.shown, _line_in(words), 1, "", message)])
         return mjcf.with_sources(reading.model, self.tree)
+
+    def write_rewritings(self, folder: Path) -> dict[str, ModelFile]:
+        """Write equivalent rewritings of an MJCF file.
+
+        Args:
+            folder: for the files.
+
+        Returns:
+            Files for importers, by what was done to them.
+
+        """
+        tree = deepcopy(self.tree)
+        mjcf.make_paths_absolute(tree, Path(self.shown).parent.resolve())
+        found = {}
+        for name, rewritten in rewritings(tree).items():
+            path = folder / f"{len(list(folder.iterdir()))}.xml"
+            path.write_text(write_xml(rewritten), encoding="utf-8")
+            found[name] = replace(self.file, path=str(path))
+        return found
 
 
 def prepare_file(

@@ -8,14 +8,15 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from plumbline.diagnosis.importer_cause import Explanation, explain_importer
+from plumbline.diagnosis.importer_cause import Explanation, describe_difference, explain_importer
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.environments import declared_importer_attribute, split_version
 from plumbline.importers.importer import Reading
+from plumbline.importers.mjcf_rewriting import names_as_written
 from plumbline.importers.neutral_model import (
     CanonicalState,
     ModelQuantities,
@@ -24,6 +25,7 @@ from plumbline.importers.neutral_model import (
 )
 from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.model.datatypes import Array
+from plumbline.scenario.errors import shorten
 from plumbline.truth.certified_model import CertifiedModelQuantities
 from plumbline.truth.model_comparison import (
     TINY,
@@ -49,6 +51,7 @@ MODEL_UNITS = {
     "acceleration": "SI",
     "kinetic_energy": "J",
     "potential_energy": "J",
+    "rewritings": "1",
 }
 MODEL_FAMILY = "model file"  # of the rows, in place of a scenario's family
 REFUSED = "refused: "  # before an importer's words
@@ -75,6 +78,7 @@ class Answer:
     states: tuple[CanonicalState, ...] = ()  # of the reading's joints
     quantities: tuple[ModelQuantities, ...] = ()
     failure: str = ""
+    rewritten: Mapping[str, Reading] = field(default_factory=dict)  # of equivalent rewritings of the file
 
 
 def moving_mass(model: NeutralModel) -> float:
@@ -197,6 +201,40 @@ def _damping_row(context: RowContext, model: NeutralModel, reading: NeutralModel
     )
 
 
+def rewriting_row(context: RowContext, model: NeutralModel, rewritten: Mapping[str, Reading]) -> Row:
+    """Judge MuJoCo's compiler by equivalent rewritings of an MJCF file.
+
+    Args:
+        context: file and importer.
+        model: the importer's reading of the file.
+        rewritten: its readings of the rewritings, by what was done to the file.
+
+    Returns:
+        A row that agrees where all are the same model, up to `RELATIVE_CHANGE` of each number: MuJoCo
+        diagonalises inertias up to 1e-12.
+
+    """
+    wrong, refused = [], []
+    for name, reading in rewritten.items():
+        if reading.model is None:
+            refused.append(f"it refuses the file with {name}: {shorten(reading.refusal)}")
+            continue
+        other = replace(reading.model, bodies=tuple(names_as_written(reading.model.bodies)))
+        if words := describe_difference(model, other):
+            wrong.append(f"with {name}, {words}")
+    same = f"the same model of {len(rewritten)} equivalent rewritings ({', '.join(rewritten)})"
+    reason = "; ".join([*(wrong or [same]), *refused])
+    verdict = Verdict.DISAGREES if wrong else Verdict.AGREES
+    if wrong:
+        reason = f"{context.title} {context.version} compiles equivalent files to different models: {reason}"
+    if len(refused) == len(rewritten):
+        verdict = Verdict.INFORMATION
+    value, diagnosis = float(len(wrong)), reason if wrong else None
+    return context.make_row(
+        "model", "-", "rewritings", verdict, reason, "1", value=value, tolerance=0.0, diagnosis=diagnosis
+    )
+
+
 def _quantity_row(context: RowContext, quantity: str, unit: str, worst: Mismatch, count: int) -> Row:
     agrees = worst.ratio <= 1
     where = f" at {worst.where}" if worst.where else ""
@@ -276,6 +314,8 @@ def judge_file(
             found = [_with_diagnosis(row, explanation) for row in found]
         if not applies and answer.reading is not None and answer.reading.model is not None:
             found.append(_damping_row(context, model, answer.reading.model))
+        if answer.rewritten and answer.reading is not None and answer.reading.model is not None:
+            found.append(rewriting_row(context, answer.reading.model, answer.rewritten))
         rows += found
     poses = truths[0].quantities.poses if truths else {}
     return FileResult(shown, model, tuple(rows), explanations, poses)
