@@ -67,8 +67,9 @@ from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 JOINT_TYPES = {"turn": mujoco.mjtJoint.mjJNT_HINGE, "slide": mujoco.mjtJoint.mjJNT_SLIDE}
 FIRST_ORDER_POWERS = (1, 2, 3, 4, 5, 6)
 MAX_IMPEDANCE = 0.9999  # of soft constraints: the largest that MuJoCo accepts
-# of MuJoCo's own R: the largest, how they fall, and how many
-MAX_REGULARISATION, RATIO, REGULARISATIONS = 0.27, 3.0, 4
+# of MuJoCo's own R: the largest, how they fall, and how many. R is made for the tree at its reference pose:
+# where rotors make its joints heavy, 0.27 of it was not yet in the range where answers are linear in R
+MAX_REGULARISATION, RATIO, REGULARISATIONS = 0.027, 3.0, 4
 MAX_ORDER_ERROR = 0.1
 MIN_SOFTNESS = 1e-9  # a smaller relative effect of R is rounding
 ROD_AXIAL_INERTIA = 0.01  # J_z of a rod over the mean principal inertia of the body that it carries

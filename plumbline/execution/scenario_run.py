@@ -26,7 +26,7 @@ from plumbline.judging.long_run_study import plan_long_run, run_long_run_study
 from plumbline.judging.long_runs import judge_long_runs
 from plumbline.judging.refinement_study import run_refinement_study
 from plumbline.judging.rows import Fingerprints, JudgingResult, Level, Row, RowContext, Verdict, mark_aliases
-from plumbline.judging.state import judge_states
+from plumbline.judging.state import judge_states, singular_pose_row
 from plumbline.judging.step import (
     MAX_STEP_BODIES,
     STEP_STATES,
@@ -36,6 +36,7 @@ from plumbline.judging.step import (
 from plumbline.judging.trajectory import judge_trajectory
 from plumbline.model.datatypes import Integrator, Model
 from plumbline.model.invariants import inertia_ratio
+from plumbline.model.loops import is_singular, smallest_singular_value
 from plumbline.model.sampling import compared_states
 from plumbline.processes.workers import Outcome, Pickled, Task
 from plumbline.scenario.loader import Scenario
@@ -137,6 +138,9 @@ class ScenarioRun:
         count = min(count, STATES_PER_RANDOM_SCENARIO) if is_random else count
         states = compared_states(scenario.model, scenario.state, scenario.digest, count)
         self._states = Pickled.of(states)  # argument of many tasks
+        # how near the initial pose is to a singular one
+        loops = scenario.model.has_loops
+        self._singular_value = smallest_singular_value(scenario.model, scenario.state) if loops else np.inf
         self._step_states = states[:STEP_STATES]
 
     def tasks(self) -> Iterator[Task]:
@@ -376,6 +380,9 @@ class ScenarioRun:
             )
             return JudgingResult(rows=[row])
         found: JudgingResult = outcome.judge_result
+        is_refused = any(row.verdict == Verdict.UNSUPPORTED and row.quantity == "all" for row in found.rows)
+        if key.kind == TaskKind.STATE and is_singular(self._singular_value) and not is_refused:
+            found.rows.append(singular_pose_row(self._context(key.engine), self._singular_value))
         found.rows = mark_aliases(found.rows)
         if self._plan.user_rtol is not None:
             found.rows = [replace(row, user_rtol=self._plan.user_rtol) for row in found.rows]

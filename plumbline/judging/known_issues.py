@@ -39,7 +39,7 @@ from plumbline.judging.model_file import MODEL_UNITS
 from plumbline.judging.relation_result import REPEATABILITY
 from plumbline.judging.rows import Level, Row, Verdict
 from plumbline.judging.run_relations import REVERSED_IN_TIME
-from plumbline.judging.state import STATE_UNITS
+from plumbline.judging.state import SINGULAR_POSE, STATE_UNITS
 from plumbline.judging.state_relations import STATE_RELATIONS, WELDED_HALVES
 from plumbline.model.invariants import INVARIANT_UNITS
 from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean, shorten
@@ -395,6 +395,7 @@ def _quantities() -> set[str]:
     return {
         "all",
         *STATE_UNITS,
+        SINGULAR_POSE,
         *MODEL_UNITS,
         *steps,
         *trajectory,

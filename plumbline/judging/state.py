@@ -13,6 +13,7 @@ from plumbline.engines.calls import Evaluation
 from plumbline.judging.identity import state_fingerprints
 from plumbline.judging.rows import Columns, JudgingResult, Row, RowContext, Verdict
 from plumbline.model.datatypes import Array
+from plumbline.model.loops import MIN_SINGULAR_VALUE
 from plumbline.truth.ground_truth import StateTruth
 from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND
 
@@ -26,6 +27,7 @@ STATE_UNITS = {
     "angular_momentum": "kg m²/s",
     "mass_matrix": "kg m²",
 }
+SINGULAR_POSE = "singular_pose"  # quantity of the row of an initial pose that is not compared
 TINY = float(np.finfo(float).tiny)  # replaces a bound of zero, so that an error of zero has the ratio 0
 
 
@@ -64,6 +66,24 @@ def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation)
             row = replace(row, derivation=row.derivation + share, extra=extra)
         result.rows.append(row)
     return result
+
+
+def singular_pose_row(context: RowContext, value: float) -> Row:
+    """Make the row of an initial state whose pose is singular, at which no engine can be judged.
+
+    Args:
+        context: scenario and engine.
+        value: the smallest singular value of the loops' rows that hold at poses nearby.
+
+    Returns:
+        The row.
+
+    """
+    reason = (
+        f"singular: at t = 0 the smallest singular value of the loops' rows that hold elsewhere is {value:.2g}"
+        f" (limit {MIN_SINGULAR_VALUE:g}); accelerations and forces are not unique there, and are not compared"
+    )
+    return context.make_row("state", "-", SINGULAR_POSE, Verdict.UNRESOLVED, reason, value=value)
 
 
 def _limit_errors(quantity: str, evaluation: Evaluation) -> Array:

@@ -33,7 +33,7 @@ from plumbline.model.kinematics import (
 
 MIN_SINGULAR_VALUE = 1e-6  # of the rows that hold, below it a pose counts as singular
 RANK_TOLERANCE = 1e-11  # of singular values of scaled rows: below it a row depends on the others
-NEWTON_STEPS = 30
+NEWTON_STEPS, MAX_HALVINGS = 30, 6
 NEARLY_CLOSED = 1e-11  # of a gap [m, rad]: the next step of Newton's method leaves only rounding
 PER_BODY = ("acceleration", "angular_acceleration")  # quantities with one row per body
 
@@ -265,10 +265,14 @@ def closed_pose(cut: CutMechanism, state: State) -> State:
     """
     best, gap = state, cut.gap(state)
     for _ in range(NEWTON_STEPS):
-        tried = displaced(cut.model, best, _least_norm(cut, cut.jacobian(best), -gap))
-        left = cut.gap(tried)
-        before, after = np.max(np.abs(gap)), np.max(np.abs(left))
-        if not after < before:
+        step, before = _least_norm(cut, cut.jacobian(best), -gap), np.max(np.abs(gap))
+        for _ in range(MAX_HALVINGS if before > NEARLY_CLOSED else 1):  # near singular poses it is too long
+            tried = displaced(cut.model, best, step)
+            left = cut.gap(tried)
+            if (after := np.max(np.abs(left))) < before:
+                break
+            step = step / 2
+        else:
             break
         best, gap = tried, left
         if before < NEARLY_CLOSED or after <= np.finfo(float).eps:  # what is left is rounding
@@ -336,6 +340,19 @@ def smallest_singular_value(model: Model, state: State) -> float:
     nearby = displaced(cut.model, there, np.asarray(1e-2 * step / size)) if size > 1e-6 else there
     rank = max(len(base), len(singular_values(cut, closed_pose(cut, nearby))[1]))
     return float(values[rank - 1])
+
+
+def is_singular(value: float) -> bool:
+    """Return whether a pose counts as singular, so that its accelerations and forces are not unique.
+
+    Args:
+        value: its `smallest_singular_value`.
+
+    Returns:
+        Whether it is below `MIN_SINGULAR_VALUE`.
+
+    """
+    return value < MIN_SINGULAR_VALUE
 
 
 def singular_values(cut: CutMechanism, state: State) -> tuple[Array, Array]:

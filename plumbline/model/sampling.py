@@ -14,7 +14,9 @@ from plumbline.model.loops import (
     closed_rates,
     cut_open,
     displaced,
+    is_singular,
     singular_values,
+    smallest_singular_value,
     with_rates,
 )
 
@@ -47,12 +49,13 @@ def compared_states(model: Model, state: State, digest: str, count: int) -> list
         count: how many random states.
 
     Returns:
-        The initial state, then the random ones.
+        The initial state unless its pose is singular (`is_singular`), then the random ones.
 
     """
     seed = derive_seed("states", digest)
     if model.has_loops:
-        return [state, *random_loop_states(model, state, count, seed)]
+        initial = [] if is_singular(smallest_singular_value(model, state)) else [state]
+        return [*initial, *random_loop_states(model, state, count, seed)]
     return [state, *random_states(model, count, seed)]
 
 
@@ -102,7 +105,7 @@ def random_loop_states(model: Model, state: State, count: int, seed: int) -> tup
 
     Steps of random directions that the loops allow are followed by Newton's method.  Rates are Gaussian as in
     `random_states`, projected on those that the loops allow.  Poses nearer to a singular one than
-    `MIN_SAMPLED_SINGULAR_VALUE` are drawn again.
+    `MIN_SAMPLED_SINGULAR_VALUE` are drawn again, from the initial one.
 
     Args:
         model: the mechanism.
@@ -128,6 +131,7 @@ def random_loop_states(model: Model, state: State, count: int, seed: int) -> tup
         values, rows = singular_values(cut, here)
         rank = max(rank, len(rows))  # rows that hold at one pose hold at all
         if values[rank - 1] < MIN_SAMPLED_SINGULAR_VALUE:
+            here = cut.state(state)  # a branch may be singular all along
             continue
         spread = own_rate * 10 ** rng.uniform(-1.0, np.log10(4.0))
         rates = closed_rates(cut, here, spread * rng.normal(size=rate_count(cut.model)))

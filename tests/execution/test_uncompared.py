@@ -5,8 +5,10 @@ import pytest
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.registry import load_adapter
 from plumbline.execution.plan import Plan, TaskKind
+from plumbline.execution.runner import run_plan
 from plumbline.execution.scenario_run import ScenarioRun, uncompared_kinds
 from plumbline.judging.rows import Verdict
+from plumbline.judging.state import SINGULAR_POSE
 from tests.helpers.catalogue import catalogue_scenarios
 
 
@@ -31,3 +33,23 @@ def test_levels_that_are_left_out_are_reported(name, level, expected):
     left_out = uncompared_kinds(scenario.model)
     assert all(task.key.kind not in left_out for task in run.tasks())
     assert (TaskKind.STEP in left_out) == (name != "double-tumbling-rods")
+
+
+def test_a_singular_initial_pose_is_unresolved_and_the_others_are_compared():
+    scenario = catalogue_scenarios()["four-bars-2-flat"]
+    engines = ["reference", "mujoco", "pinocchio-aba"]
+    result = run_plan(Plan([scenario], engines, "state", random_state_count=3), lambda *_: None)
+    singular = {row.engine: row for row in result.rows if row.quantity == SINGULAR_POSE}
+    assert set(singular) == {"reference", "mujoco"}  # the third refuses loops
+    for row in singular.values():
+        assert row.verdict == Verdict.UNRESOLVED and row.known_issue == "flat-four-bars"
+        assert row.value < 1e-14 and row.reason.startswith("singular: ")
+    compared = [row for row in result.rows if row.verdict == Verdict.AGREES]
+    assert len(compared) == 2 * 7 and {row.extra["states"] for row in compared} == {3.0}
+    assert result.metadata["exit_code"] == 0
+
+
+def test_a_regular_pose_beside_a_singular_one_is_compared():
+    scenario = catalogue_scenarios()["slider-crank"]  # its dead centres are regular: the crank turns there
+    result = run_plan(Plan([scenario], ["reference"], "state", random_state_count=1), lambda *_: None)
+    assert {row.extra["states"] for row in result.rows} == {2.0}

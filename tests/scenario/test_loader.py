@@ -110,6 +110,7 @@ LOOP_JOINTS = {  # the tree's, then those that close loops
     "flyball-governor": ("hinge", "hinge", "hinge", "slide", "rod", "rod"),
     "four-bar": ("hinge",) * 4,
     "four-bars-2": ("hinge",) * 7,
+    "four-bars-2-flat": ("hinge",) * 7,
     "four-bars-6": ("hinge",) * 19,
     "slider-crank": ("hinge", "hinge", "slide", "hinge"),
     "squeezer": ("hinge",) * 10,

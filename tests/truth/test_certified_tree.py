@@ -12,7 +12,8 @@ from adapters.reference_engine import Reference
 from plumbline.model.datatypes import KINDS
 from plumbline.model.kinematics import complete_state, state_from_minimal
 from plumbline.model.random_mechanisms import ELEMENTS, random_tree
-from plumbline.model.sampling import random_states
+from plumbline.model.sampling import compared_states, random_states
+from plumbline.scenario.generator import random_mechanism
 from plumbline.truth.balls import midpoints
 from plumbline.truth.certified import certify_state, enclose_quantities
 from plumbline.truth.certified_tree import enclose_tree
@@ -30,6 +31,15 @@ def test_a_chain_as_a_tree_has_the_same_quantities(rods):
         a, b = midpoints(chain[name]), midpoints(tree[name])
         np.testing.assert_allclose(a, b, rtol=1e-15, atol=1e-15 * np.max(np.abs(a)), err_msg=name)
     assert np.max(np.abs(midpoints(tree["joint_moment"]))) < 1e-40
+
+
+def test_the_rates_of_a_loop_are_those_that_its_state_gives():
+    """A ball, a universal joint and a free body in one loop: good coordinates would be bad rates here."""
+    scenario = random_mechanism(1, 29)
+    assert scenario.model.kind == ("ball", "universal", "free", "weld")
+    for state in compared_states(scenario.model, scenario.state, "rates", 9):
+        found = midpoints(enclose_quantities(scenario.model, state, 300)["v"])
+        np.testing.assert_allclose(found, state.v, atol=1e-14 * np.max(np.abs(state.v)))
 
 
 def test_a_hinge_pendulum_obeys_its_equation():
