@@ -80,8 +80,9 @@ def singular_pose_row(context: RowContext, value: float) -> Row:
 
     """
     reason = (
-        f"singular: at t = 0 the smallest singular value of the loops' rows that hold elsewhere is {value:.2g}"
-        f" (limit {MIN_SINGULAR_VALUE:g}); accelerations and forces are not unique there, and are not compared"
+        f"singular: at t = 0 the smallest singular value of the loops' rows that hold elsewhere is "
+        f"{value:.2g} (limit {MIN_SINGULAR_VALUE:g}); accelerations and forces are not unique there, "
+        "and are not compared"
     )
     return context.make_row("state", "-", SINGULAR_POSE, Verdict.UNRESOLVED, reason, value=value)
 

@@ -37,9 +37,9 @@ def test_the_rates_of_a_loop_are_those_that_its_state_gives():
     """A ball, a universal joint and a free body in one loop: good coordinates would be bad rates here."""
     scenario = random_mechanism(1, 29)
     assert scenario.model.kind == ("ball", "universal", "free", "weld")
-    for state in compared_states(scenario.model, scenario.state, "rates", 9):
+    for state in compared_states(scenario.model, scenario.state, "rates 10", 9):
         found = midpoints(enclose_quantities(scenario.model, state, 300)["v"])
-        np.testing.assert_allclose(found, state.v, atol=1e-14 * np.max(np.abs(state.v)))
+        np.testing.assert_allclose(found, state.v, rtol=0, atol=1e-14 * np.max(np.abs(state.v)))
 
 
 def test_a_hinge_pendulum_obeys_its_equation():
