@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import qr
 
 from plumbline.model.datatypes import KINDS, Array, Model, State
 from plumbline.model.loops import CutMechanism, cut_open, independent_rows
@@ -205,6 +204,8 @@ def _dependent_columns(
     Of coordinates and of rates each: an attitude's coordinates and its rates have different axes, so that a
     choice that is good for one may be singular for the other.
     """
+    from scipy.linalg import qr  # a third of the time in which the command starts
+
     first, block = np.cumsum([0, *sizes]), kept * cut.row_scale[rows, None]
     parts = [i for k in cut.place[cut.source.n :] for i in range(first[k], first[k + 1])]
     others = np.setdiff1d(np.arange(block.shape[1]), parts)
