@@ -15,7 +15,7 @@ export UV_COMPILE_BYTECODE := 1
 export PYTHONDONTWRITEBYTECODE :=
 MUTANTS ?= --sample 300 --seed 1 --jobs 2
 
-.PHONY: help run test nightly bench mutants importers models lint lock clean
+.PHONY: help run test nightly bench benchmarks mutants importers models lint lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' Makefile | sed 's/:.*##/\t/' | expand -t 12
@@ -38,6 +38,9 @@ nightly: .venv/test.done  ## the full matrix with random scenarios, then the lon
 bench: .venv/test.done  ## right-hand sides and work-precision beside the engines, as ratios within one run; the daily loop
 	$(PYTHON) -m bench.summary
 	$(PYTHON) -m bench.daily_loop --all --random 600
+
+benchmarks: .venv/test.done  ## published problems on every engine; writes docs/benchmarks.md
+	$(PYTHON) -m bench.classics
 
 mutants: .venv/mutation.done  ## do the tests notice mistakes? a sample; MUTANTS="--jobs 2" tries all
 	$(PYTHON) -m tools.mutation reference_impl judging $(MUTANTS)

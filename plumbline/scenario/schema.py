@@ -44,6 +44,7 @@ ClosedForm = Literal[
     "free-top",
     "small-double",
     "small-chain",
+    "damped-oscillator",
 ]
 
 

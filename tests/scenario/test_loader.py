@@ -72,6 +72,10 @@ CLOSED_FORMS = {
     "double-planar-small": "small-double",
     "double-conical": "double-conical",
     "chain-10-small": "small-chain",
+    "hinge-pendulum": "planar-pendulum",
+    "sprung-slide": "damped-oscillator",
+    "a01-simple-pendulum": "planar-pendulum",
+    "nesc-tumbling-brick": "free-top",
 }
 
 
@@ -85,6 +89,7 @@ TREE_JOINTS = {
     "acrobot": ("hinge", "hinge"),
     "cart-pole": ("slide", "hinge"),
     "damped-hinge": ("hinge",),
+    "double-hinge-parallel": ("hinge", "hinge"),
     "double-hinge-skew": ("hinge", "hinge"),
     "furuta": ("hinge", "hinge"),
     "furuta-motor": ("hinge", "hinge"),
@@ -115,6 +120,11 @@ LOOP_JOINTS = {  # the tree's, then those that close loops
     "slider-crank": ("hinge", "hinge", "slide", "hinge"),
     "squeezer": ("hinge",) * 10,
 }
+CLASSIC_JOINTS = {
+    "a01-simple-pendulum": ("rod",),
+    "nesc-tumbling-brick": ("free",),
+    "wrecking-ball": ("hinge", "weld", "rod"),
+}
 
 
 def joint_pattern(name):
@@ -133,6 +143,7 @@ def test_the_catalogue_is_the_issues_list():
         *CHAIN_JOINTS,
         *TREE_JOINTS,
         *LOOP_JOINTS,
+        *CLASSIC_JOINTS,
     ]
     jointed = TREE_JOINTS | LOOP_JOINTS
     assert {name: load(name).model.kind for name in jointed} == jointed

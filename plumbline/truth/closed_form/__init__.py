@@ -3,8 +3,9 @@
 `closed_form_motion` takes a scenario that names its closed form, checks that the scenario fulfils the
 conditions of that motion, and returns the motion as a function of time.  One module per family: planar
 pendulum, heavy symmetric top (and spherical pendulum), free top, steady motions (equilibria and conical
-motions), small oscillations.  After 2 s the results are accurate to 3e-15 m and 2e-14 rad for the scenarios
-of the catalogue; an axis that passes the vertical at an angle δ loses a factor 1/δ² in its azimuth.
+motions), small oscillations, damped oscillator.  After 2 s the results are accurate to 3e-15 m and 2e-14 rad
+for the scenarios of the catalogue; an axis that passes the vertical at an angle δ loses a factor 1/δ² in its
+azimuth.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from plumbline.model.datatypes import Array, Model, State
 from plumbline.truth.closed_form.free_top import free_top
 from plumbline.truth.closed_form.heavy_top import lagrange_top, spherical_pendulum
 from plumbline.truth.closed_form.motion import ClosedFormMismatch, ClosedFormMotion
+from plumbline.truth.closed_form.oscillator import damped_oscillator
 from plumbline.truth.closed_form.planar_pendulum import planar_pendulum
 from plumbline.truth.closed_form.small_oscillation import small_oscillation
 from plumbline.truth.closed_form.steady_motion import equilibrium, steady_rotation
@@ -35,6 +37,7 @@ CLOSED_FORMS: dict[str, Callable[[Model, State], ClosedFormMotion]] = {
     "small-double": small_oscillation,
     "small-chain": small_oscillation,
     "rest": equilibrium,
+    "damped-oscillator": damped_oscillator,
 }
 
 

@@ -22,10 +22,10 @@ X, _, Z = np.eye(3)
 
 
 def free_top(model: Model, state: State) -> ClosedFormMotion:
-    """Solve one body that a ball joint holds at its centre of mass.
+    """Solve one body that a ball joint holds at its centre of mass, or a free one that falls.
 
     Args:
-        model: one body with its pivot at the centre of mass.
+        model: one body, free or with its pivot at the centre of mass.
         state: the initial state.
 
     Returns:
@@ -36,12 +36,15 @@ def free_top(model: Model, state: State) -> ClosedFormMotion:
 
     """
     require_no_loads(model)
-    require_single_body(model, rod=False)
-    require(not np.any(model.proximal[0]), "a pivot at the centre of mass")
+    is_free = model.kind == ("free",)
+    if not is_free:
+        require_single_body(model, rod=False)
+        require(not np.any(model.proximal[0]), "a pivot at the centre of mass")
     attitude = torque_free_attitude(model.inertia[0], state.p[0], state.omega[0])
 
     def evaluate(t: Array) -> tuple[Array, Array]:
-        return np.zeros((len(t), 1, 3)), attitude(t)[:, None]
+        time = t[:, None, None] * is_free
+        return state.r * is_free + time * state.v + time**2 / 2 * model.gravity, attitude(t)[:, None]
 
     source = "elliptic functions and integrals of the third kind, Landau & Lifshitz, Mechanics, § 37"
     return ClosedFormMotion(evaluate, source)

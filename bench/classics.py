@@ -1,0 +1,292 @@
+"""`python -m bench.classics [PROBLEM…]`: published problems on every engine; writes docs/benchmarks.md.
+
+Runs the named problems, or all, and keeps the figures of the others in bench/results/classics.json; with
+--page it writes the page of the stored figures again.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.classics_page import write_page
+from bench.classics_values import VALUES, find_problem_scenario, free_body_rates, true_slider_height
+from plumbline.engines.calls import RefinementRun, describe_engine, evaluate_states, run_refinement
+from plumbline.engines.registry import ENGINES, load_adapter
+from plumbline.judging.convergence import romberg, tightest_tolerance_limit
+from plumbline.model.datatypes import Array, Model, Trajectory
+from plumbline.model.kinematics import angular_velocity
+from plumbline.model.sampling import random_loop_states
+from plumbline.processes.processor import processor_name
+from plumbline.scenario.loader import Scenario
+from plumbline.storage.results_store import write_atomically
+from plumbline.truth.closed_form import exact_samples
+from plumbline.truth.ground_truth import state_truth
+from tests.helpers.classic_motions import four_bar_angle, light_cart_pole, squeezer_motion
+
+ROOT = Path(__file__).resolve().parents[1]
+STORED = ROOT / "bench" / "results" / "classics.json"
+PAGE = ROOT / "docs" / "benchmarks.md"
+RANDOM_STATES = 3
+Runs = Sequence[tuple[str, str, Sequence[float]]]  # engine, integrator, steps [s] or tolerances
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A published problem: what is measured, its true value, and which runs measure it."""
+
+    scenario: str
+    duration: float  # s
+    sample: float  # s
+    quantity: Callable[[Model, Trajectory], Array]  # (T, K), what the benchmark measures
+    exact: Callable[[Scenario, Array], Array]  # (T, K) at the times (T,)
+    threshold: float  # error that the benchmark asks for, in the quantity's unit
+    runs: Runs
+    is_rms: bool = False  # whether the error is the root of the mean square, else the maximum
+
+
+def _steps(unit: float, coarse: int, fine: int) -> list[float]:
+    return [unit * 2.0**-k for k in range(coarse, fine + 1)]
+
+
+def _pendulum_position(_: Model, run: Trajectory) -> Array:
+    return run.r[:, 0, [0, 2]]
+
+
+def _closed_form_position(scenario: Scenario, times: Array) -> Array:
+    samples = exact_samples(scenario, times)
+    assert samples is not None
+    return samples[0][:, 0, [0, 2]]
+
+
+def _cart_pole(_: Model, run: Trajectory) -> Array:
+    pole = run.r[:, 1] - run.r[:, 0]
+    return np.stack([run.r[:, 0, 0], np.arctan2(pole[:, 0], -pole[:, 2])], 1)
+
+
+def _body_rates(_: Model, run: Trajectory) -> Array:
+    return angular_velocity(run.p, run.pdot)[:, 0]
+
+
+def _slider_height(_: Model, run: Trajectory) -> Array:
+    return run.r[:, 3, 2:]
+
+
+def _first_bar_end(_: Model, run: Trajectory) -> Array:
+    return 2 * run.r[:, 0, [0, 2]]
+
+
+def _true_bar_end(windows: int) -> Callable[[Scenario, Array], Array]:
+    def exact(_: Scenario, times: Array) -> Array:
+        angle = four_bar_angle(windows, 0.05, times)
+        return np.stack([np.cos(angle), np.sin(angle)], 1)
+
+    return exact
+
+
+def _crank_direction(model: Model, run: Trajectory) -> Array:
+    return run.r[-1:, 0, :2] / np.linalg.norm(model.proximal[0])
+
+
+def _true_crank_direction(_: Scenario, times: Array) -> Array:
+    beta = squeezer_motion(f"{times[-1]:g}").angles["beta"]
+    return np.array([[np.cos(beta), np.sin(beta)]])
+
+
+EXPLICIT = (("mujoco", "RK4"), ("exudyn-tree", "RK44"), ("pinocchio", "rkmk4"))
+PROBLEMS = {
+    "A01": Problem(
+        "a01-simple-pendulum", 2000.0, 0.5, _pendulum_position, _closed_form_position, 1e-3,
+        [
+            ("reference", "collocation", [1e-6, 1e-9, 1e-12, 1e-14]),
+            ("mujoco", "RK4", _steps(1, 4, 9)),
+            ("exudyn-tree", "RK44", _steps(1, 4, 9)),
+            ("exudyn", "trapezoidal", _steps(1, 5, 9)),
+            ("pinocchio", "dop853", [1e-8, 1e-10, 1e-12]),
+            ("pinocchio", "rkmk4", _steps(1, 5, 5)),
+            ("pinocchio", "semi-implicit-euler", _steps(1, 6, 6)),
+            ("exudyn", "generalized-alpha", _steps(1, 7, 8)),
+            ("mujoco", "Euler", _steps(1, 8, 9)),
+            ("mujoco", "implicit", _steps(1, 8, 9)),
+        ],
+    ),
+    "A02": Problem(
+        "four-bars-2", 0.5, 0.03125, _first_bar_end, _true_bar_end(2), 1e-3,
+        [("reference", "collocation", [1e-10, 1e-12]), ("mujoco", "RK4", _steps(1, 6, 9)),
+         ("exudyn", "trapezoidal", _steps(1, 6, 10)), ("pinocchio", "dop853", [1e-10, 1e-12])],
+    ),
+    "A03": Problem(
+        "squeezer", 0.03, 0.03, _crank_direction, _true_crank_direction, 1e-3,
+        [("reference", "collocation", [1e-10, 1e-12]), ("mujoco", "RK4", _steps(0.03, 8, 11)),
+         ("exudyn", "trapezoidal", _steps(0.03, 8, 11)), ("pinocchio", "dop853", [1e-10, 1e-12])],
+    ),
+    "A05": Problem(
+        "a05-stiff-governor", 10.0, 0.0625, _slider_height, true_slider_height, 1e-3,
+        [
+            ("mujoco", "RK4", _steps(1, 13, 15)),
+            ("mujoco", "implicitfast", _steps(1, 9, 12)),
+            ("exudyn-tree", "RK44", _steps(1, 13, 15)),
+            ("exudyn", "trapezoidal", _steps(1, 7, 11)),
+        ],
+    ),
+    "cart-pole": Problem(
+        "light-cart-pole-rod", 10.0, 0.01, _cart_pole, lambda _, t: np.stack(light_cart_pole(t), 1), 1e-6,
+        [
+            ("reference", "collocation", [1e-10, 1e-12, 1e-14]),
+            ("pinocchio", "dop853", [1e-8, 1e-10, 1e-12]),
+            ("mujoco", "RK4", _steps(0.01, 5, 9)),
+            ("exudyn-tree", "RK44", _steps(0.01, 5, 9)),
+            ("exudyn", "trapezoidal", _steps(0.01, 5, 9)),
+        ],
+        is_rms=True,
+    ),
+    "NESC-2": Problem(
+        "nesc-tumbling-brick", 30.0, 0.125, _body_rates, free_body_rates, 1e-6,
+        [
+            ("reference", "collocation", [1e-8, 1e-12, 1e-14]),
+            ("mujoco", "RK4", _steps(1, 3, 8)),
+            ("exudyn-tree", "RK44", _steps(1, 3, 8)),
+            ("exudyn", "trapezoidal", _steps(1, 4, 9)),
+            ("pinocchio", "dop853", [1e-8, 1e-10, 1e-12]),
+            ("pinocchio", "rkmk4", _steps(1, 3, 6)),
+        ],
+    ),
+}  # fmt: skip
+STATE_PROBLEMS = {"A02": "four-bars-2", "A03": "squeezer", "A04": "bricard"}
+
+
+def measure_motion(problem: Problem) -> list[dict[str, Any]]:
+    """Run a problem on its engines.
+
+    Args:
+        problem: with its runs.
+
+    Returns:
+        One record per engine and integrator: its runs, each with error and CPU time [s], the error and the
+        uncertainty of their limit; or the reason why there are none.
+
+    """
+    scenario = find_problem_scenario(problem.scenario)
+    times = np.arange(round(problem.duration / problem.sample) + 1) * problem.sample
+    exact = problem.exact(scenario, times)
+    return [_measure_integrator(problem, scenario, times, exact, *run) for run in problem.runs]
+
+
+def _measure_integrator(
+    problem: Problem, scenario: Scenario, times: Array, exact: Array, engine: str, name: str,
+    resolutions: Sequence[float],
+) -> dict[str, Any]:  # fmt: skip
+    study = run_refinement(engine, name, scenario.model, scenario.state, times, resolutions)
+    record: dict[str, Any] = {"engine": engine, "integrator": name}
+    if study.unsupported is not None:
+        return record | {"unsupported": study.unsupported}
+    integrator = load_adapter(engine).integrator(name)
+
+    def error(y: Array) -> float:
+        size = np.linalg.norm(y - exact, axis=-1)
+        return float(np.sqrt(np.mean(size**2)) if problem.is_rms else np.max(size))
+
+    def measured(run: RefinementRun) -> Array | None:
+        return None if run.trajectory is None else problem.quantity(scenario.model, run.trajectory)
+
+    values = [measured(run) for run in study.runs]
+    record["runs"] = [
+        {"resolution": run.resolution, "cpu": run.cpu_time, "failure": run.failure}
+        | ({} if y is None else {"error": error(y)})
+        for run, y in zip(study.runs, values, strict=True)
+    ]
+    found = [y[:, None] for y in values if y is not None]
+    if len(found) > 1:
+        limit = (
+            romberg(found, integrator.error_exponents)
+            if integrator.kind == "step"
+            else tightest_tolerance_limit(found)
+        )
+        record |= {
+            "limit_error": error(limit.y[:, 0]),
+            "limit_uncertainty": float(limit.uncertainty[-1]),
+            "final": limit.y[-1, 0].tolist(),
+        }
+    return record
+
+
+def measure_states(name: str) -> list[dict[str, Any]]:
+    """Compare accelerations of a mechanism with loops, at its initial state and at random ones.
+
+    Args:
+        name: of a scenario.
+
+    Returns:
+        One record per engine: the largest error of r̈ and of ω̇′ over the largest true value at that state, or
+        the reason why there is none.
+
+    """
+    scenario = find_problem_scenario(name)
+    model, state = scenario.model, scenario.state
+    states = [state, *random_loop_states(model, state, RANDOM_STATES, 1)]
+    truth = state_truth(model, states).quantities
+    return [_measure_engine_states(engine, model, states, truth) for engine in ENGINES]
+
+
+def _measure_engine_states(engine: str, model: Model, states: Any, truth: Any) -> dict[str, Any]:
+    answer = evaluate_states(engine, model, states)
+    if answer.unsupported or answer.failure:
+        return {"engine": engine, "unsupported": answer.unsupported or answer.failure}
+
+    def worst(name: str) -> float:
+        pairs = [
+            (getattr(got, name), getattr(true, name))
+            for got, true in zip(answer.quantities, truth, strict=True)
+        ]
+        scale = [max(9.81, float(np.max(np.linalg.norm(true, axis=-1)))) for _, true in pairs]
+        return max(
+            float(np.max(np.linalg.norm(a - b, axis=-1))) / s for (a, b), s in zip(pairs, scale, strict=True)
+        )
+
+    return {
+        "engine": engine,
+        "acceleration": worst("acceleration"),
+        "angular_acceleration": worst("angular_acceleration"),
+        "cpu": answer.cpu_time,
+    }
+
+
+def _versions() -> dict[str, str]:
+    return {name: describe_engine(name).version for name in ENGINES}
+
+
+def _measure(names: Sequence[str]) -> Iterator[tuple[str, dict[str, Any]]]:
+    for name in names:
+        found: dict[str, Any] = {"processor": processor_name(), "versions": _versions()}
+        if name in VALUES:
+            found["values"] = [asdict(value) for value in VALUES[name]()]
+        if name in STATE_PROBLEMS:
+            found["states"] = measure_states(STATE_PROBLEMS[name])
+        if name in PROBLEMS:
+            found["motions"] = measure_motion(PROBLEMS[name])
+        yield name, found
+
+
+def main() -> None:
+    """Measure the named problems, store their figures and write the page."""
+    known = list(dict.fromkeys([*PROBLEMS, *STATE_PROBLEMS]))
+    names = [name for name in sys.argv[1:] if name != "--page"]
+    if unknown := set(names) - set(known):
+        sys.exit(f"no problem {', '.join(sorted(unknown))}; there are {', '.join(known)}")
+    stored = json.loads(STORED.read_text(encoding="utf-8")) if STORED.is_file() else {}
+    for name, found in _measure([] if "--page" in sys.argv else names or known):
+        stored[name] = found
+        write_atomically(STORED, (json.dumps(stored, indent=1) + "\n").encode())
+        print(f"{name}: measured")
+    write_atomically(PAGE, write_page(stored).encode())
+    print(f"page: {PAGE}")
+
+
+if __name__ == "__main__":
+    main()

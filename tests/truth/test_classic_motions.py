@@ -1,0 +1,157 @@
+"""Benchmark mechanisms: quadratures against certified accelerations and published figures."""
+
+from dataclasses import replace
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+from scipy.optimize import brentq
+
+from plumbline.model.kinematics import complete_state, rotation_matrix
+from plumbline.model.loops import assembled
+from plumbline.scenario.loader import find_scenario_file, load_scenario
+
+pytestmark = pytest.mark.skipif(
+    not (find_spec("heyoka") and find_spec("flint")), reason="the truth tools are not installed"
+)
+
+
+@pytest.fixture(scope="module")
+def motions():
+    from tests.helpers import classic_motions
+
+    return classic_motions
+
+
+def scenario(name):
+    return load_scenario(find_scenario_file(name))
+
+
+def certified_rates(s, x, xdot):
+    """ω̇′ of all bodies at joint coordinates and rates of a loop that close it, certified."""
+    from plumbline.truth.certified import certify_state
+
+    coordinates, rates = np.zeros((2, s.model.n, 2))
+    coordinates[:, 0], rates[:, 0] = x, xdot
+    at = complete_state(s.model, replace(s.state, x=coordinates, xdot=rates))
+    closed = assembled(s.model, at)
+    assert np.max(np.abs(closed.x - at.x)) < 1e-12
+    return certify_state(s.model, closed).quantities.angular_acceleration
+
+
+def test_the_squeezer_starts_as_published(motions):
+    assert motions.squeezer_start_acceleration() == 14222.4439199541138706
+
+
+def test_the_squeezer_accelerates_as_its_certified_equations_say(motions):
+    """β̈ from the quadrature's rates at two times, against Newton and Euler with closed loops in balls."""
+    before, at, after = (motions.squeezer_motion(t) for t in ("0.02999", "0.03", "0.03001"))
+    slope = (after.rates["beta"] - before.rates["beta"]) / 2e-5
+    order = ("beta", "Theta", "gamma", "delta", "Phi", "epsilon", "Omega")
+    x, xdot = ([values[name] for name in order] for values in (at.angles, at.rates))
+    found = certified_rates(scenario("squeezer"), x, xdot)[0, 2]
+    curvature = abs(after.rates["beta"] - 2 * at.rates["beta"] + before.rates["beta"]) / 1e-5
+    assert slope == pytest.approx(found, abs=0.05 * curvature + 1e-6 * abs(found))
+
+
+def test_the_published_squeezer_differs_by_more_than_the_uncertainty(motions):
+    """IVP test set, β and Θ at 0.03 s."""
+    found = motions.squeezer_motion("0.03")
+    assert found.uncertainty < 1e-20
+    for name, published in (("beta", 15.81077119629904), ("Theta", -15.75637105984298)):
+        assert 1e-9 < abs(found.angles[name] - published) < 2e-9
+    for name, published in (("delta", 0.5244099658805304), ("epsilon", 1.048080741042263)):
+        assert abs(found.angles[name] - published) < 1e-12
+
+
+def test_the_light_cart_pole_falls_as_published(motions):
+    x, theta = motions.light_cart_pole(np.array([0.2, 0.3, 10.0]))
+    published = [1.943608126629934e-2, 1.027140372631889e-1, 1.999763282461620]
+    np.testing.assert_allclose(x, published, atol=1e-11)
+    np.testing.assert_allclose(theta[1:], [1.113582331681891, -1.549129441897076], atol=1e-11)
+
+
+def test_the_light_cart_pole_falls_as_taylors_method_says(motions):
+    from bench.classics_values import find_problem_scenario
+    from plumbline.truth.taylor import simulate_taylor
+
+    s, times = find_problem_scenario("light-cart-pole-rod"), np.array([0.0, 0.125, 0.25, 0.5, 0.75])
+    run = simulate_taylor(s.model, s.state, times, "extended")
+    x, theta = motions.light_cart_pole(times)
+    pole = np.asarray(run.r[:, 1] - run.r[:, 0], float)
+    assert np.max(np.abs(np.asarray(run.r[:, 0, 0], float) - x)) < 1e-12
+    assert np.max(np.abs(np.arctan2(pole[:, 0], -pole[:, 2]) - theta)) < 1e-12
+
+
+@pytest.mark.parametrize("time", [0.1, 0.35])
+def test_four_bars_accelerate_as_their_certified_equations_say(motions, time):
+    h = 2.0**-10
+    before, at, after = motions.four_bar_angle(2, 0.05, np.array([time - h, time, time + h]))
+    tilt, rate = np.pi / 2 - at, -(after - before) / (2 * h)
+    pattern = np.array([1, -1, 1, -1, 1])
+    found = certified_rates(scenario("four-bars-2"), tilt * pattern, rate * pattern)
+    assert -(after - 2 * at + before) / h**2 == pytest.approx(found[0, 1], rel=1e-5)
+
+
+def test_a_furuta_pendulum_keeps_its_relative_equilibrium():
+    """Both angles stand where V − ½ I(angle) rate² has its minimum; I about the vertical."""
+    from plumbline.truth.taylor import simulate_taylor
+
+    s = scenario("furuta")
+    bare = {name: 0 * getattr(s.model, name) for name in ("force", "moment", "drag_force", "drag_moment")}
+    model = replace(s.model, **bare)
+    rate, step = 12.0, 1e-4
+
+    def at(angle, spin):
+        x, xdot = np.zeros((2, 2, 2))
+        x[1, 0], xdot[0, 0] = angle, spin
+        return complete_state(model, replace(s.state, x=x, xdot=xdot))
+
+    def amended_potential(angle):  # V − ½ I(angle) rate²: its minimum is the equilibrium
+        state = at(angle, rate)
+        A = rotation_matrix(state.p)
+        inertia = sum((A[k] @ model.inertia[k] @ A[k].T)[2, 2] for k in range(2))
+        inertia += float(np.sum(model.mass * np.sum(state.r[:, :2] ** 2, axis=1)))
+        return 9.81 * float(model.mass @ state.r[:, 2]) - inertia * rate**2 / 2
+
+    def slope(angle):
+        return (amended_potential(angle + step) - amended_potential(angle - step)) / (2 * step)
+
+    angle = brentq(slope, 0.9, 1.4, xtol=1e-14)
+    run = simulate_taylor(model, at(angle, rate), np.arange(5) * 0.25, "extended")
+    height = np.asarray(run.r[:, 1, 2], float)
+    assert abs(np.sin(angle)) > 0.1
+    assert np.ptp(height) < 1e-8 < np.max(np.abs(height))
+    turned = np.asarray(run.r[:, 0], float)
+    expected = np.cos(rate * np.arange(5) * 0.25)
+    np.testing.assert_allclose(turned @ turned[0] / (turned[0] @ turned[0]), expected, atol=1e-7)
+
+
+@pytest.mark.parametrize("mode", ["swing", "bounce"])
+def test_a_spring_pendulum_oscillates_in_its_small_modes(mode):
+    """√(g/L) across and √(k/m) along the stretched spring, up to the square of the amplitude."""
+    from plumbline.truth.taylor import simulate_taylor
+
+    s = scenario("spring-pendulum")
+    points = s.model.spring_point.copy()
+    points[0, 1] = 0.0  # at the centre of mass: the body does not turn
+    model = replace(s.model, spring_point=points, spring_damping=0 * s.model.spring_damping)
+    mass, stiffness, rest = (
+        float(model.mass[0]),
+        float(model.spring_stiffness[0]),
+        float(model.spring_length[0]),
+    )
+    length, times = rest + mass * 9.81 / stiffness, np.arange(17) * 0.0625
+    frequency = np.sqrt(9.81 / length if mode == "swing" else stiffness / mass)
+    along = np.array([1.0, 0, 0] if mode == "swing" else [0, 0, 1.0])
+    hanging = points[0, 0] - np.array([0, 0, length])
+    errors = []
+    for amplitude in (1e-3, 5e-4):
+        start = replace(
+            s.state, r=(hanging + amplitude * along)[None], v=np.zeros((1, 3)), omega=np.zeros((1, 3))
+        )
+        run = simulate_taylor(model, complete_state(model, start), times, "extended")
+        shift = np.asarray(run.r[:, 0], float) - hanging
+        errors.append(np.max(np.abs(shift @ along - amplitude * np.cos(frequency * times))) / amplitude)
+    assert errors[0] < 1e-4
+    assert errors[0] < 1e-11 or errors[0] / errors[1] == pytest.approx(4, rel=0.1)
