@@ -240,7 +240,11 @@ def _other_formulas(declared: JointSpaceMethod, model: Model) -> Iterator[tuple[
         "it exchanged the halves of semi-implicit Euler: positions first",
         replace(euler, formula="positions first"),
     )
-    yield "it took velocity Verlet's step", replace(euler, formula="velocity Verlet")
+    verlet = replace(euler, formula="velocity Verlet")
+    yield "it took velocity Verlet's step", verlet
+    for name, method in (("velocity Verlet's", verlet), ("its declared", declared)):
+        words = f"it took {name} step, with the last acceleration of the step before in place of its first"
+        yield words, replace(method, reuses_acceleration=True)
     mean = "it moved positions by the mean of the old and the new velocity"
     yield mean, replace(declared if is_euler else euler, new_velocity_share=0.5)
     if declared.coordinates == "joint rotations":

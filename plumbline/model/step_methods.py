@@ -43,6 +43,7 @@ class JointSpaceMethod:
     correction_terms: int | None = None  # of dexp⁻¹ after v; None: all
     step_factor: float = 1.0  # on h
     substeps: int = 1  # so many steps of h / substeps each
+    reuses_acceleration: bool = False  # the first of a step is the last one computed in the step before
 
 
 @dataclass(frozen=True)

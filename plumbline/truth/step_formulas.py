@@ -68,12 +68,16 @@ def joint_space_steps(
         if method.coordinates == "joint rotations"
         else _JointAngles(chain, states, [axes for axes in angle_axes if axes is not None])
     )
+    if method.reuses_acceleration:
+        system = _Reusing(system)
     q, v = system.start(states)
     h = np.array(steps, LongDouble)[:, None, None] * LongDouble(method.step_factor) / method.substeps
     found = [chain.bodies(*system.links(q, v))]
     with np.errstate(all="ignore"):
         for _ in range(count):
             for _ in range(method.substeps):
+                if isinstance(system, _Reusing):
+                    system.is_new_step = True
                 q, v = _STEPS[method.formula](system, method, q, v, h)
             found.append(chain.bodies(*system.links(q, v)))
     return found
@@ -224,6 +228,23 @@ class _System(Protocol):
     def displacement_rate(self, theta: Array, v: Array) -> Array: ...
 
     def links(self, q: Array, v: Array) -> tuple[Array, Array]: ...
+
+
+class _Reusing:
+    """A system whose first acceleration in a step is the last one of the step before, at an older state."""
+
+    def __init__(self, system: _System) -> None:
+        self.system, self.is_new_step = system, True
+        self.last: Array | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.system, name)
+
+    def acceleration(self, q: Array, v: Array) -> Array:
+        if self.last is None or not self.is_new_step:
+            self.last = self.system.acceleration(q, v)
+        self.is_new_step = False
+        return self.last
 
 
 class _JointRotations:
