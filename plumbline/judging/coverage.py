@@ -13,28 +13,32 @@ the level reports. docs/coverage.md explains the table.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from plumbline.judging.rows import Level, Row, Verdict
 from plumbline.judging.state import STATE_UNITS
 from plumbline.judging.step import MAX_STEP_BODIES, STEP_STATES, step_sizes
 from plumbline.model.datatypes import Array, Model, State, Trajectory
 from plumbline.model.invariants import INVARIANT_UNITS, attitude_error, compute_invariants, position_error
-from plumbline.model.kinematics import angular_velocity
+from plumbline.model.kinematics import angular_velocity, quaternion_rate, with_joint_coordinates
 from plumbline.model.step_methods import classical_runge_kutta
 from plumbline.truth.parameter_effects import (
     MOTION_MISTAKE,
     PerturbedMotion,
     StateSensitivity,
-    initial_state_effects,
+    difference_effects,
+    effects_at_states,
     perturbed_motions,
 )
 from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters, perturb
 from plumbline.truth.rounding_bound import EPS, state_rounding_bound
 from plumbline.truth.sensitivity import project_to_manifold
 from plumbline.truth.step_comparison import FormulaSteps
+from reference_impl.collocation import integrate_collocation
+from reference_impl.tree_elimination import eliminated_system
 
 COVERED_LEVELS: tuple[Level, ...] = ("state", "step", "trajectory", "invariants")
 MAX_MISTAKE = 0.1  # of a parameter's scale: only larger ones are reported, or none; the level does not see it
@@ -42,9 +46,15 @@ WEAK_MISTAKE = 1e-9  # from here on the order of an effect is found by a second 
 LARGER_MISTAKE = 4.0  # … that is larger by this factor
 DOUBTFUL_MISTAKE = 1e-6  # from here on an effect may be rounding of the runs: a proof is tried
 NO_EFFECT = 1e-9  # of the largest effect that a term could have: rounding
-PROOF_SAMPLES = 17  # of the motion, at which a parameter's term is shown to vanish
+MOTION_SAMPLES = 32  # of a motion, at which the effect of a mistake is measured; or all, where it has fewer
+PROOF_SAMPLES = 17  # of the motion, at which a parameter's term is shown to vanish …
+PROOF_RTOL = 1e-13  # … and of that motion
 TINY = float(np.finfo(float).tiny)
 STEP_METHOD = classical_runge_kutta("joint rotations")
+_PLACES: dict[str, str] = {
+    "state": "at every compared state",
+    "step": "at every state that a compared step starts from",
+}
 _TERMS = {  # the term of the equations of motion that contains a parameter, by kind
     "gravity": "m g",
     "mass": "m (r̈ − g)",
@@ -65,8 +75,8 @@ class CoverageEntry:
 
     scenario: str
     level: Level
-    body: int  # from 1; 0 for gravity
-    joint: str  # that the body hangs by: ball or rod; empty for gravity
+    body: int  # from 1; 0 for gravity; of springs between points the number of the spring
+    joint: str  # kind of the joint that the body hangs by; "spring"; empty for gravity
     kind: str  # of the parameter, as in `plumbline.truth.parameters.UNITS`
     parameter: str  # kind and component
     value: float
@@ -151,7 +161,7 @@ def scenario_coverage(
             by_engine,
             _proofs(model, states, parameters, by_engine, "state"),
         )
-    if "step" in levels and model.n <= MAX_STEP_BODIES:
+    if "step" in levels and model.is_chain and model.n <= MAX_STEP_BODIES:
         some = states[:STEP_STATES]
         by_engine = {"": _step_ratios(model, some, parameters)}
         found += _entries(
@@ -169,7 +179,7 @@ def _entries(
     proofs: Mapping[int, str],
 ) -> list[CoverageEntry]:  # fmt: skip
     """The entries of one level: of each parameter the bluntest engine."""
-    found, joints = [], ["", *("rod" if rod else "ball" for rod in model.rods)]
+    found = []
     for i, one in enumerate(parameters):
         engine = min(by_engine, key=lambda e: by_engine[e].ratio[i])
         ratio = float(by_engine[engine].ratio[i])
@@ -179,7 +189,7 @@ def _entries(
                 name,
                 level,
                 one.body + 1,
-                joints[one.body + 1],
+                "spring" if one.kind.startswith("spring_") else ("", *model.kind)[one.body + 1],
                 one.kind,
                 one.name,
                 one.value,
@@ -204,11 +214,13 @@ def _state_ratios(
     of_model = [i for i, one in enumerate(parameters) if one.kind not in STATE_KINDS]
     of_state = [i for i, one in enumerate(parameters) if one.kind in STATE_KINDS]
     ratios = {quantity: _Ratios(len(parameters)) for quantity in STATE_UNITS}
+    effects_of_model = effects_at_states(model, states, [parameters[i] for i in of_model])
+    of_initial = difference_effects(model, states[:1], [parameters[i] for i in of_state])
     for number, state in enumerate(states):
         bounds = state_rounding_bound(model, state)
-        found = [(of_model, StateSensitivity(model, state).effects([parameters[i] for i in of_model]))]
+        found = [(of_model, effects_of_model[number])]
         if number == 0:
-            found.append((of_state, initial_state_effects(model, state, [parameters[i] for i in of_state])))
+            found.append((of_state, of_initial[0]))
         for indices, effects in found:
             for quantity, effect in effects.items():
                 bound = np.maximum(np.asarray(bounds.tolerance(quantity)), TINY)
@@ -293,9 +305,11 @@ def _motion_entries(
     tolerances = [one for row in rows if (one := _motion_tolerance(row, times)) is not None]
     if not tolerances:
         return []
-    times = times[: max(one.last_sample for one in tolerances) + 1]
+    stride = max(1, (len(times) - 1) // MOTION_SAMPLES)
+    tolerances = [replace(one, last_sample=one.last_sample // stride) for one in tolerances]
+    times = times[::stride][: max(one.last_sample for one in tolerances) + 1]
     quantities = {one.quantity for one in tolerances}
-    effects, true = _motion_effects(model, state, times, parameters, quantities, MOTION_MISTAKE)
+    effects = _motion_effects(model, state, times, parameters, quantities, MOTION_MISTAKE)
     ratios = _motion_ratios(tolerances, len(parameters), effects, {})
     weak = [
         i
@@ -309,18 +323,27 @@ def _motion_entries(
     ]
     if weak:  # a second, larger mistake shows whether the effect grows with its square, or is rounding
         again = [parameters[i] for i in weak]
-        larger, true = _motion_effects(
-            model, state, times, again, quantities, LARGER_MISTAKE * MOTION_MISTAKE
-        )
+        larger = _motion_effects(model, state, times, again, quantities, LARGER_MISTAKE * MOTION_MISTAKE)
         by_index = {i: {q: x[k] for q, x in larger.items()} for k, i in enumerate(weak)}
         ratios = _motion_ratios(tolerances, len(parameters), effects, by_index)
-    along = np.linspace(0, len(times) - 1, PROOF_SAMPLES).astype(int)[1:]
-    visited = [project_to_manifold(model, true.r[at], true.p[at], true.v[at], true.pdot[at]) for at in along]
     found = []
+    visited = _visited_states(model, state, times)
     for level, by_engine in ratios.items():
-        proofs = _proofs(model, [state, *visited], parameters, by_engine, level)
+        proofs = _proofs(model, visited, parameters, by_engine, level)
         found += _entries(name, level, model, parameters, by_engine, proofs)
     return found
+
+
+def _visited_states(model: Model, state: State, times: Array) -> list[State]:
+    """States along the motion, to nearly rounding: a steady motion stays as steady as it can."""
+    along = times[np.linspace(0, len(times) - 1, PROOF_SAMPLES).astype(int)]
+    start = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+    run = integrate_collocation(eliminated_system([model], state.x), *start, along, PROOF_RTOL)
+    samples = zip(run.r, run.p, run.v, run.pdot, strict=True)
+    found = [project_to_manifold(model, *sample) for sample in samples]
+    if model.is_chain:
+        return found
+    return [with_joint_coordinates(model, one) for one in found]
 
 
 def _motion_effects(
@@ -331,8 +354,8 @@ def _motion_effects(
     quantities: set[str],
     size: float,
     refinement: int = 1,
-) -> tuple[dict[str, Array], Trajectory]:
-    """Running maxima (P, T) of what mistakes of a size do to a motion, by quantity; and the true motion."""
+) -> dict[str, Array]:
+    """Running maxima (P, T) of what mistakes of a size do to a motion, by quantity."""
     effects: dict[str, list[Array]] = {quantity: [] for quantity in quantities}
     true: Trajectory | None = None
     for motion in perturbed_motions(model, state, times, parameters, None, size, refinement):
@@ -350,8 +373,7 @@ def _motion_effects(
                 found[quantity] = np.max(np.linalg.norm(difference, axis=-1), axis=1)
         for quantity in quantities:
             effects[quantity].append(np.maximum.accumulate(found[quantity]))
-    assert true is not None
-    return {quantity: np.array(found) for quantity, found in effects.items()}, true
+    return {quantity: np.array(found) for quantity, found in effects.items()}
 
 
 def _motion_ratios(
@@ -396,16 +418,17 @@ def _proofs(
             for i, one in enumerate(parameters)
             if one.kind in STATE_KINDS
         }
+    ratio = np.min([ratios.ratio for ratios in by_engine.values()], axis=0)
+    of_state = np.array([one.kind in STATE_KINDS for one in parameters])
     if level == "state":
-        found = _state_proofs(model, states[0], parameters, by_engine)
-    blunt = np.min([ratios.ratio for ratios in by_engine.values()], axis=0) <= 1 / DOUBTFUL_MISTAKE
-    unseen = [i for i in map(int, np.flatnonzero(blunt)) if parameters[i].kind not in STATE_KINDS]
+        found = _vanishing(model, states[:1], parameters, of_state & (ratio <= 1 / MAX_MISTAKE), level)
+    if not model.is_chain:
+        blunt = ratio <= 1 / (MAX_MISTAKE if level == "state" else DOUBTFUL_MISTAKE)
+        return found | _vanishing(model, states, parameters, blunt & ~of_state, level)
+    unseen = [int(i) for i in np.flatnonzero((ratio <= 1 / DOUBTFUL_MISTAKE) & ~of_state)]
     if not unseen:
         return found
-    where = {
-        "state": "at every compared state",
-        "step": "at every state that a compared step starts from",
-    }.get(level, "along the whole motion")
+    where = _PLACES.get(level, "along the whole motion")
     some = [parameters[i] for i in unseen]
     terms, pull = np.zeros(len(unseen)), np.zeros(len(unseen))  # largest, over what they could be
     for state in states:
@@ -421,26 +444,44 @@ def _proofs(
     return found
 
 
-def _state_proofs(
-    model: Model, state: State, parameters: Sequence[Parameter], by_engine: Mapping[str, _Ratios]
-) -> dict[int, str]:
-    """The parameters of the initial state on which no compared quantity depends, up to a tenth."""
-    ratio = np.min([ratios.ratio for ratios in by_engine.values()], axis=0)
-    found = {}
-    for i, one in enumerate(parameters):
-        if one.kind not in STATE_KINDS or ratio[i] > 1 / MAX_MISTAKE:
-            continue
-        effects = []
-        for size in (0.0, MAX_MISTAKE / 3, MAX_MISTAKE):
-            changed = perturb(model, state, one, size)[1]
-            bounds = state_rounding_bound(model, changed)
-            effects += [
-                float(np.max(effect / np.maximum(np.asarray(bounds.tolerance(quantity)), TINY)))
-                for quantity, effect in initial_state_effects(model, changed, [one], MAX_MISTAKE).items()
-            ]
-        if max(effects) * one.scale * MAX_MISTAKE <= 1:
-            found[i] = "no quantity at the initial state changes with it: their derivatives vanish"
-    return found
+def _vanishing(
+    model: Model, states: Sequence[State], parameters: Sequence[Parameter], doubtful: NDArray[np.bool_],
+    level: Level,
+) -> dict[int, str]:  # fmt: skip
+    """The doubtful parameters with which nothing changes, of mistakes up to a tenth.
+
+    At state level no compared quantity changes by its bound, along a motion no acceleration by `NO_EFFECT`.
+    """
+    sizes = [_natural_sizes(model, state, level) for state in states]
+    what = "quantity" if level == "state" else "acceleration"
+    left = [int(i) for i in np.flatnonzero(doubtful)]
+    for size in (0.0, MAX_MISTAKE / 3, MAX_MISTAKE):
+        largest = []
+        for one in (parameters[i] for i in left):
+            changed = [perturb(model, state, one, size) for state in states] if size else []
+            there = [state for _, state in changed] or states
+            effects = difference_effects(changed[0][0] if changed else model, there, [one], MAX_MISTAKE)
+            pairs = zip(effects, sizes, strict=True)
+            ratios = [np.max(effect[name] / own[name]) for effect, own in pairs for name in own]
+            largest.append(float(np.max(ratios)) * one.scale * MAX_MISTAKE)
+        left = [i for i, ratio in zip(left, largest, strict=True) if ratio <= 1]
+    places = {
+        i: "at the initial state"
+        if parameters[i].kind in STATE_KINDS
+        else _PLACES.get(level, "along the whole motion")
+        for i in left
+    }
+    return {i: f"no {what} {at} changes with it: the derivatives vanish" for i, at in places.items()}
+
+
+def _natural_sizes(model: Model, state: State, level: Level) -> dict[str, Array]:
+    """What a change must pass to count, by quantity: bounds, or fractions of the accelerations."""
+    bounds = state_rounding_bound(model, state)
+    if level == "state":
+        names = [name for name in STATE_UNITS if getattr(bounds, name) is not None]
+        return {name: np.maximum(np.asarray(bounds.tolerance(name)), TINY) for name in names}
+    names = ["acceleration", "angular_acceleration"]
+    return {name: MAX_MISTAKE * NO_EFFECT * np.max(np.asarray(bounds.scale[name])) for name in names}
 
 
 def _relative_terms(sensitivity: StateSensitivity, parameters: Sequence[Parameter]) -> tuple[Array, Array]:

@@ -6,6 +6,7 @@ Imports nothing of the project but its types.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -479,56 +480,71 @@ def velocity_jacobian(model: Model, state: State) -> Array:
 
     Args:
         model: the mechanism of N bodies.
-        state: a state on the constraint manifold.
+        state: a state on the constraint manifold; or many, of arrays with leading axes.
 
     Returns:
-        (6N, nu) matrix; linear velocities in the world frame, angular in the body's.
+        (..., 6N, nu) matrix; linear velocities in the world frame, angular in the body's.
 
     """
     model = model.tree
     n, rods = model.n, np.flatnonzero(model.rods)
     a = rotation_matrix(state.p)
     near = cross(model.proximal[:, None, :], a)  # −A s̃ (N, 3, 3), row i: aᵢ·(ω′ × s) = (s × aᵢ)·ω′
-    out = np.zeros((n, 6, rate_count(model)))
+    out = np.zeros((*a.shape[:-3], n, 6, rate_count(model)))
     for k, (kind, far, own) in enumerate(zip(model.kind, model.body[:, 0], own_rates(model), strict=True)):
         if kind == "free":
-            out[k, :, own] = np.eye(6)
+            out[..., k, :, own] = np.eye(6)
             continue
-        tip, spin = np.zeros((2, 3, out.shape[-1]))  # velocity of the near point, angular velocity, world
+        # velocity of the near point, angular velocity, world
+        tip, spin = np.zeros((2, *a.shape[:-3], 3, out.shape[-1]))
+        above = a[..., far, :, :] if far >= 0 else np.eye(3)
         if far >= 0:
-            tip = out[far, :3] + cross(model.point[k, 0], a[far]) @ out[far, 3:]
-            spin = a[far] @ out[far, 3:]
+            tip = out[..., far, :3, :] + cross(model.point[k, 0], above) @ out[..., far, 3:, :]
+            spin = above @ out[..., far, 3:, :]
         if kind == "rod":
-            at = 3 * int(np.searchsorted(rods, k))
-            tip[:, at : at + 3] = model.length[k] * (np.eye(3) - np.outer(state.u[k], state.u[k]))
+            at, u = 3 * int(np.searchsorted(rods, k)), state.u[..., k, :]
+            across = np.eye(3) - u[..., :, None] * u[..., None, :]
+            tip[..., at : at + 3] = model.length[k] * across
         if KINDS[kind].has_attitude:
-            out[k, 3:, own] = np.eye(3)
+            out[..., k, 3:, own] = np.eye(3)
         else:
-            joint = JointFrame(model, k, a[far] if far >= 0 else np.eye(3))
-            shift = joint.motion(state.x[k], state.xdot[k])[0][0]
+            joint, x = JointFrame(model, k, above), state.x[..., k, :]
+            shift = joint.motion(x, state.xdot[..., k, :])[0][0]
             tip = tip + cross_matrix(-shift) @ spin
-            for i, (what, axis) in enumerate(joint.axes(state.x[k])):
-                (tip if what == "slide" else spin)[:, own.start + i] += axis
-            out[k, 3:] = a[k].T @ spin
-        out[k, :3] = tip - near[k] @ out[k, 3:]
-    return out.reshape(6 * n, -1)
+            for i, (what, axis) in enumerate(joint.axes(x)):
+                (tip if what == "slide" else spin)[..., own.start + i] += axis
+            out[..., k, 3:, :] = a[..., k, :, :].mT @ spin
+        out[..., k, :3, :] = tip - near[..., k, :, :] @ out[..., k, 3:, :]
+    return out.reshape(*a.shape[:-3], 6 * n, -1)
 
 
 def mass_matrix(model: Model, state: State) -> Array:
     """Return M = Wᵀ diag(m_k I, J_k) W with W of `velocity_jacobian`: the kinetic energy is ½ νᵀ M ν.
 
     Args:
-        model: the chain of N bodies.
-        state: a state on the constraint manifold.
+        model: the tree of N bodies.
+        state: a state on the constraint manifold; or many, of arrays with leading axes.
 
     Returns:
-        (nu, nu) symmetric matrix, as `StateQuantities.mass_matrix`.
+        (..., nu, nu) symmetric matrix, as `StateQuantities.mass_matrix`, with the rotors.
 
     """
-    w = velocity_jacobian(model, state).reshape(model.n, 6, -1)
-    linear, angular = w[:, :3], w[:, 3:]
-    out = np.einsum("k,kia,kib->ab", model.mass, linear, linear)
-    return np.asarray(out + np.einsum("kia,kij,kjb->ab", angular, model.inertia, angular, optimize=True))
+    flat = velocity_jacobian(model, state)
+    w = flat.reshape(*flat.shape[:-2], model.n, 6, -1)
+    linear, angular = w[..., :3, :], w[..., 3:, :]
+    out = np.sum(model.mass[:, None, None] * (linear.mT @ linear), axis=-3)
+    out += np.sum(angular.mT @ model.inertia @ angular, axis=-3)
+    for k, own in enumerate(own_rates(model) if np.any(model.armature) else ()):
+        if model.kind[k] != "ball":
+            for i in range(len(KINDS[model.kind[k]].motions)):
+                out[..., own.start + i, own.start + i] += model.armature[k, i]
+        elif model.armature[k, 0]:
+            a, far = rotation_matrix(state.p), model.body[k, 0]
+            relative = a[..., k, :, :] @ angular[..., k, :, :]
+            if far >= 0:
+                relative = relative - a[..., far, :, :] @ angular[..., far, :, :]
+            out += model.armature[k, 0] * (relative.mT @ relative)
+    return np.asarray(out)
 
 
 def joint_coordinates(model: Model, state: State) -> tuple[Array, Array, Array, Array]:
@@ -544,33 +560,66 @@ def joint_coordinates(model: Model, state: State) -> tuple[Array, Array, Array, 
     """
     if not model.has_loops:
         return state.u, state.udot, state.x, state.xdot
-    count, a = len(model.kind), rotation_matrix(state.p)
-    u, udot, x, xdot = (np.zeros((count, size)) for size in (3, 3, 2, 2))
-    for whole, given in zip((u, udot, x, xdot), (state.u, state.udot, state.x, state.xdot), strict=True):
-        whole[: model.n] = given
+    closing = coordinates_of_joints(model, state, range(model.n, len(model.kind)))
+    given = state.u, state.udot, state.x, state.xdot
+    u, udot, x, xdot = (np.concatenate(pair) for pair in zip(given, closing, strict=True))
+    return u, udot, x, xdot
+
+
+def with_joint_coordinates(model: Model, state: State) -> State:
+    """Compute the joint coordinates of a state from the motion of its bodies; angles in (−π, π].
+
+    Args:
+        model: a tree.
+        state: of which p, omega, r and v count.
+
+    Returns:
+        The whole state.
+
+    """
+    u, udot, x, xdot = coordinates_of_joints(model, state, range(model.n))
+    return replace(state, u=u, udot=udot, x=x, xdot=xdot)
+
+
+def coordinates_of_joints(
+    model: Model, state: State, joints: Sequence[int]
+) -> tuple[Array, Array, Array, Array]:
+    """Compute coordinates of joints from the motion of the bodies; angles in (−π, π].
+
+    Args:
+        model: the mechanism.
+        state: of which p, omega, r and v count.
+        joints: K joints.
+
+    Returns:
+        u, u̇ (K, 3) of rods, x, ẋ (K, 2) of other joints, as those of `State`.
+
+    """
+    a = rotation_matrix(state.p)
+    u, udot, x, xdot = (np.zeros((len(joints), size)) for size in (3, 3, 2, 2))
     omega, d = rotate_vectors(a, state.omega), joint_vectors(model, state.r, state.p)
-    for k in range(model.n, count):
+    for at, k in enumerate(joints):
         far, near = model.body[k]
         above, spin = (a[far], omega[far]) if far >= 0 else (np.eye(3), np.zeros(3))
         ends = [
-            state.v[i] + cross(omega[i], a[i] @ at) if i >= 0 else np.zeros(3)
-            for i, at in zip((far, near), model.point[k], strict=True)
+            state.v[i] + cross(omega[i], a[i] @ point) if i >= 0 else np.zeros(3)
+            for i, point in zip((far, near), model.point[k], strict=True)
         ]
         rate = ends[1] - ends[0]
         if model.kind[k] == "rod":
-            u[k] = d[k] / np.linalg.norm(d[k])
-            udot[k] = (rate - u[k] * (u[k] @ rate)) / model.length[k]
+            u[at] = d[k] / np.linalg.norm(d[k])
+            udot[at] = (rate - u[at] * (u[at] @ rate)) / model.length[k]
             continue
         motions = KINDS[model.kind[k]].motions
         frame = rotation_matrix(model.turn[k, 0]).T @ above.T
         relative = frame @ a[near] @ rotation_matrix(model.turn[k, 1])
-        x[k, : len(motions)] = _coordinates(motions, frame @ d[k], relative)
-        axes = JointFrame(model, k, above).axes(x[k])
+        x[at, : len(motions)] = _coordinates(motions, frame @ d[k], relative)
+        axes = JointFrame(model, k, above).axes(x[at])
         turns = np.array([axis for what, axis in axes if what == "turn"]).reshape(-1, 3)
         turning = iter(np.linalg.lstsq(turns.T, omega[near] - spin)[0] if len(turns) else ())
         for i, (what, axis) in enumerate(axes):
             slide = axis @ (rate - cross(spin, d[k]))
-            xdot[k, i] = slide if what == "slide" else next(turning)
+            xdot[at, i] = slide if what == "slide" else next(turning)
     return u, udot, x, xdot
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -87,6 +88,7 @@ COVERAGE_TABLE = _schema(
     row=TEXT,
     proof=TEXT,
 )
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 _STUDIES = {"drift": DRIFT_TABLE, "coverage": COVERAGE_TABLE}  # tables beside those of a run
 _NEVER_NULL = {  # columns by which readers group and sort
     "key", "scenario", "family", "engine", "level", "integrator", "quantity", "verdict", "state", "body",
@@ -319,6 +321,27 @@ def write_results(
     write_atomically(folder / "results.json", text.encode())
 
 
+def load_json(path: Path) -> Any:
+    """Read a JSON file; surrogates without their other half, which no other file can hold, become "?".
+
+    Args:
+        path: the file.
+
+    Returns:
+        The document.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: it is no JSON.
+
+    """
+    text = path.read_text(encoding="utf-8")
+    document = json.loads(text)
+    if _SURROGATE.search(text):
+        document = json.loads(json.dumps(document, ensure_ascii=False).encode("utf-8", "replace"))
+    return document
+
+
 def read_results(folder: Path) -> dict[str, Any]:
     """Read results.json, of any readable schema version.
 
@@ -335,7 +358,7 @@ def read_results(folder: Path) -> dict[str, Any]:
     """
     path = folder / "results.json"
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = load_json(path)
         version = document["schema_version"]
         if version in READABLE_VERSIONS:
             document = upgrade_document(document)

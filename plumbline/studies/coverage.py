@@ -9,6 +9,7 @@ import pyarrow as pa
 
 from plumbline.judging.coverage import COVERED_LEVELS, CoverageEntry, scenario_coverage
 from plumbline.judging.rows import Level, Row
+from plumbline.model.datatypes import CHAIN_FIELDS
 from plumbline.model.sampling import compared_states
 from plumbline.processes.cpu_time import CpuTimes
 from plumbline.processes.errors import PlumblineError
@@ -18,6 +19,7 @@ from plumbline.storage.results_store import COVERAGE_TABLE
 from plumbline.studies.tables import make_table
 
 FILE = "coverage.parquet"
+_CHAIN_KINDS = (*CHAIN_FIELDS, "attitude", "omega", "direction", "rod_rate")
 
 
 class CoverageFailure(PlumblineError):
@@ -51,7 +53,7 @@ def measure_coverage(
         CoverageFailure: a call failed.
 
     """
-    scenarios = [s for s in scenarios if s.model.is_chain]  # trees have no sensitivities yet
+    scenarios = [s for s in scenarios if not s.model.has_loops]
     by_scenario: dict[str, list[Row]] = {s.name: [] for s in scenarios}
     for row in rows:
         if row.scenario in by_scenario:
@@ -136,9 +138,10 @@ def summarize_coverage(entries: Iterable[CoverageEntry]) -> list[CoverageSummary
 def blind_spots(entries: Iterable[CoverageEntry]) -> list[str]:
     """List what no scenario shows at a level.
 
-    A parameter is looked for separately on the first body and on later ones, and by the joint that the body
-    hangs by. It counts as seen where its value is not zero and a mistake relative to that value is reported:
-    an engine that ignores drag is right wherever there is none.
+    A parameter is looked for by the kind of joint that the body hangs by, and of chains' parameters on rods
+    and balls separately on the first body and on later ones. It counts as seen where its value is not zero
+    and a mistake relative to that value is reported: an engine that ignores drag is right wherever there is
+    none.
 
     Args:
         entries: of a whole catalogue.
@@ -149,7 +152,9 @@ def blind_spots(entries: Iterable[CoverageEntry]) -> list[str]:
     """
     seen: dict[tuple[str, ...], bool] = {}
     for entry in entries:
-        place = ("first body" if entry.body == 1 else "later body") if entry.body else "gravity"
+        place = "body" if entry.body else "gravity"
+        if entry.joint in ("rod", "ball") and entry.kind in _CHAIN_KINDS:
+            place = "first body" if entry.body == 1 else "later body"
         key = entry.level, entry.parameter, place, entry.joint
         counts = entry.is_seen and (entry.scale == abs(entry.value) or entry.unit == "rad")
         always = entry.level == "invariants" and bool(entry.proof)

@@ -5,8 +5,9 @@ parameter θ of the model changes what the equations lack at that solution, and
 
     δ(r̈, α, F) = S⁻¹ (δf − δM x + δCᵀ λ, δγ − δC x)
 
-Every term is written out below, one per kind of parameter. Mistakes in the state itself are evaluated by
-central differences, motions by differences of two runs, both with the reference's structured form.
+Every term of a chain is written out below, one per kind of parameter. Mistakes in a tree and in the state
+itself are evaluated by central differences, motions by differences of two runs, all with the reference's O(N)
+form.
 """
 
 from __future__ import annotations
@@ -26,24 +27,37 @@ from plumbline.model.invariants import (
 )
 from plumbline.model.kinematics import (
     angular_velocity,
+    complete_state,
     cross_matrix,
+    elastic_energy,
     forward_kinematics,
     joint_vectors,
+    kinetic_energy_of_rotors,
     mass_matrix,
     quaternion_rate,
     rotate_vectors,
     rotation_matrix,
     velocity_jacobian,
 )
-from plumbline.truth.parameters import AXES, INERTIA_ENTRIES, Parameter, perturb
+from plumbline.truth.parameters import (
+    AXES,
+    INERTIA_ENTRIES,
+    STATE_KINDS,
+    Parameter,
+    perturb,
+    perturb_model,
+)
 from plumbline.truth.rounding_bound import NewtonEulerSystem
 from plumbline.truth.step_formulas import fastest_rates
-from reference_impl.structured import StructuredSystem, component_first
+from reference_impl.structured import component_first
+from reference_impl.tree_elimination import TreeSystem, eliminated_system
 
 STATE_MISTAKE = 1e-4  # of a state's parameters, in central differences
+TREE_MISTAKE = 0.02  # of a tree's: rounding in the difference is below a bound, its error below 0.1 %
 MOTION_MISTAKE = 1e-5  # of a parameter's scale, in the runs that show its effect on the motion
-MOTION_STEP = 2.0**-7  # s, largest step of those runs; both runs of a difference make the same error
+MOTION_STEP = 2.0**-6  # s, largest step of those runs; both runs of a difference make the same error
 MAX_STEP_ANGLE = 0.25  # rad that the fastest mode turns in a step
+TINY_RATE = 1e-3  # rad/s
 MAX_BATCH_BODIES = 4000  # of one batch of runs: more do not fit the processor's cache
 
 
@@ -221,49 +235,109 @@ def _suffix_sum(x: Array) -> Array:
     return np.asarray(np.cumsum(x[::-1], axis=0)[::-1])
 
 
-def initial_state_effects(
-    model: Model, state: State, parameters: Sequence[Parameter], mistake: float = STATE_MISTAKE
-) -> dict[str, Array]:
-    """Return the effects of unit changes of a state's parameters on every state quantity.
+def effects_at_states(
+    model: Model, states: Sequence[State], parameters: Sequence[Parameter]
+) -> list[dict[str, Array]]:
+    """Return the effects of unit changes of a model's parameters at many states.
 
     Args:
-        model: the mechanism.
-        state: minimal coordinates and rates, on the constraint manifold.
-        parameters: P parameters of the state, at least one.
-        mistake: size of the central differences, as a fraction of each scale.
+        model: the mechanism, a tree.
+        states: S states of it.
+        parameters: P parameters of the model, not of the state.
 
     Returns:
-        As `StateSensitivity.effects`.
+        Per state as `StateSensitivity.effects`: its terms for chains, central differences for other trees.
 
     """
-    d = mistake
-    states = [perturb(model, state, one, sign * d)[1] for one in parameters for sign in (1, -1)]
-    r, p, v, omega = (np.concatenate([getattr(s, name) for s in states]) for name in ("r", "p", "v", "omega"))
-    solved = StructuredSystem([model]).repeated(len(states)).solve(r, p, v, quaternion_rate(p, omega))
+    if model.is_chain:
+        return [StateSensitivity(model, state).effects(parameters) for state in states]
+    return difference_effects(model, states, parameters, TREE_MISTAKE)
 
-    def change(x: Array) -> Array:
-        """Central differences (P, …) of values in the order of the states."""
-        plus, minus = np.moveaxis(np.asarray(x).reshape(len(parameters), 2, *np.shape(x)[1:]), 1, 0)
-        scale = np.array([one.scale for one in parameters]).reshape(-1, *(1,) * (plus.ndim - 1))
-        return np.asarray((plus - minus) / (2 * d * scale))
 
-    def per_state(x: Array) -> Array:
-        return x.reshape(len(states), model.n, -1)
+def difference_effects(
+    model: Model, states: Sequence[State], parameters: Sequence[Parameter], mistake: float = STATE_MISTAKE
+) -> list[dict[str, Array]]:
+    """Return the effects of unit changes of parameters by central differences of the whole evaluation.
 
-    r, p, v, omega = map(per_state, (r, p, v, omega))
+    Args:
+        model: the mechanism, a tree.
+        states: S states of it, on the constraint manifold.
+        parameters: P parameters of the model or of the states.
+        mistake: size of the differences, as a fraction of each scale.
+
+    Returns:
+        Per state, as `StateSensitivity.effects`.
+
+    """
+    found: list[dict[str, list[Array]]] = [{} for _ in states]
+    size = max(1, MAX_BATCH_BODIES // (2 * model.n * len(states)))
+    for first in range(0, len(parameters), size):
+        part = parameters[first : first + size]
+        pairs = [_perturbed(model, states, one, sign * mistake) for one in part for sign in (1, -1)]
+        scale = 2 * mistake * np.array([one.scale for one in part])
+        for name, values in _evaluate(pairs).items():  # (2P, S, ...)
+            change = values[::2] - values[1::2]
+            change = change / scale.reshape(-1, *(1,) * (change.ndim - 1))
+            for at, own in enumerate(found):
+                own.setdefault(name, []).append(_sizes(name, change[:, at]))
+    return [{name: np.concatenate(parts) for name, parts in own.items()} for own in found]
+
+
+def _sizes(name: str, change: Array) -> Array:
+    """Norms (P, N) of vectors per body, (P, 1) of the rest: the largest entry of a matrix."""
+    if name == "mass_matrix":
+        return np.asarray(np.max(np.abs(change), axis=(1, 2))[:, None])
+    return np.asarray(np.linalg.norm(change.reshape(len(change), -1, 3 if change.ndim > 1 else 1), axis=-1))
+
+
+def _perturbed(
+    model: Model, states: Sequence[State], parameter: Parameter, size: float
+) -> tuple[Model, State]:
+    """A changed model with its states, stacked; the same minimal coordinates but for a changed one."""
+    if parameter.kind in STATE_KINDS:
+        states = [perturb(model, state, parameter, size)[1] for state in states]
+    stacked = State(**{name: np.array([getattr(s, name) for s in states]) for name in vars(states[0])})
+    if parameter.kind in STATE_KINDS:
+        return model, stacked
+    changed = perturb_model(model, parameter, size)
+    return changed, complete_state(changed, stacked)
+
+
+def _evaluate(cases: Sequence[tuple[Model, State]]) -> dict[str, Array]:
+    """All state quantities (cases, S, ...) of changed models with S states each."""
+    count = len(cases[0][1].p)
+    r, p, v, omega, x = (
+        np.concatenate([np.concatenate(getattr(state, name)) for _, state in cases])
+        for name in ("r", "p", "v", "omega", "x")
+    )
+    system = eliminated_system([model for model, _ in cases for _ in range(count)], x)
+    solved = system.solve(r, p, v, quaternion_rate(p, omega))
     vectors = {
         "acceleration": solved.acceleration,
-        "angular_acceleration": angular_velocity(p, per_state(solved.pddot)),
+        "angular_acceleration": angular_velocity(p, solved.pddot),
         "joint_reaction": solved.joint_reaction,
     }
-    found = {name: np.linalg.norm(change(per_state(x)), axis=-1) for name, x in vectors.items()}
-    scalars = kinetic_energy(model, v, omega), potential_energy(model, r)
-    found["kinetic_energy"], found["potential_energy"] = (np.abs(change(x))[:, None] for x in scalars)
-    momentum = change(angular_momentum(model, r, p, v, omega))
-    found["angular_momentum"] = np.linalg.norm(momentum, axis=-1, keepdims=True)
-    matrices = np.array([mass_matrix(model, s) for s in states])
-    found["mass_matrix"] = np.max(np.abs(change(matrices)), axis=(1, 2))[:, None]
-    return found
+    if solved.joint_moment is not None:
+        vectors["joint_moment"] = solved.joint_moment
+    found = {name: value.reshape(len(cases), count, -1, 3) for name, value in vectors.items()}
+    scalars = [_energies(model, state) for model, state in cases]
+    return found | {name: np.array([one[name] for one in scalars]) for name in scalars[0]}
+
+
+def _energies(model: Model, state: State) -> dict[str, Array]:
+    """Energies, angular momentum and mass matrix at stacked states."""
+    kinetic = kinetic_energy(model, state.v, state.omega)
+    potential = potential_energy(model, state.r)
+    if model.has_elements:
+        each = [State(*values) for values in zip(*vars(state).values(), strict=True)]
+        kinetic = kinetic + [kinetic_energy_of_rotors(model, one) for one in each]
+        potential = potential + [elastic_energy(model, one) for one in each]
+    return {
+        "kinetic_energy": kinetic,
+        "potential_energy": potential,
+        "angular_momentum": angular_momentum(model, state.r, state.p, state.v, state.omega),
+        "mass_matrix": mass_matrix(model, state),
+    }
 
 
 # -- motions -----------------------------------------------------------------------------------------
@@ -303,7 +377,9 @@ def perturbed_motions(
 
     """
     if substeps is None:
-        rates = [float(np.max(fastest_rates(model, [state]))), *np.linalg.norm(state.omega, axis=1) / 2]
+        rates = [TINY_RATE, *np.linalg.norm(state.omega, axis=1) / 2]
+        if model.is_chain:
+            rates.append(float(np.max(fastest_rates(model, [state]))))
         step = min(MOTION_STEP, MAX_STEP_ANGLE / max(rates))
         substeps = max(1, int(np.ceil((times[1] - times[0]) / step)))
     size = max(1, MAX_BATCH_BODIES // model.n - 1)
@@ -317,7 +393,7 @@ def perturbed_motions(
 
 def _simulate_batch(cases: Sequence[tuple[Model, State]], times: Array, substeps: int) -> list[Trajectory]:
     """Runs of all cases by the classical Runge-Kutta method in (r, p), unstabilised."""
-    system = StructuredSystem([model for model, _ in cases])
+    system = eliminated_system([model for model, _ in cases], np.concatenate([s.x for _, s in cases]))
     r, p, v = (np.concatenate([getattr(state, name) for _, state in cases]) for name in ("r", "p", "v"))
     pdot = quaternion_rate(p, np.concatenate([state.omega for _, state in cases]))
     y = np.stack([component_first(r, p), component_first(v, pdot)])  # (2, 7, M)
@@ -329,7 +405,7 @@ def _simulate_batch(cases: Sequence[tuple[Model, State]], times: Array, substeps
     for h in np.diff(times):
         for _ in range(substeps):
             y = runge_kutta_4(slope, y, h / substeps)
-        samples.append(y)
+        samples.append(np.stack(system.project(y[0], y[1])) if isinstance(system, TreeSystem) else y)
     # (cases, 2, T, N, 7)
     found = np.moveaxis(
         np.array(samples).reshape(len(times), 2, 7, len(cases), -1), (3, 1, 0, 4, 2), (0, 1, 2, 3, 4)
@@ -341,7 +417,9 @@ def _simulate_batch(cases: Sequence[tuple[Model, State]], times: Array, substeps
 
 
 def _on_manifold(model: Model, run: Trajectory) -> Trajectory:
-    """The run with unit quaternions, and positions and velocities that satisfy the joints exactly."""
+    """The run of a chain with unit quaternions, and points that satisfy the joints exactly."""
+    if not model.is_chain:  # its samples have been projected
+        return run
     omega = angular_velocity(run.p, run.pdot)
     ell = np.where(model.rods, model.length, np.inf)[:, None]
     u = joint_vectors(model, run.r, run.p) / ell

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from plumbline.model.datatypes import Array, Model, State
-from plumbline.model.kinematics import quaternion_product, state_from_minimal
+from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, SPRING_FIELDS, Array, Model, State
+from plumbline.model.kinematics import complete_state, quaternion_product
 from plumbline.truth.ground_truth import stretched_length
 
 AXES = ("x", "y", "z")
@@ -21,13 +21,20 @@ UNITS = {
     "gravity": "m/s²", "mass": "kg", "inertia": "kg m²", "proximal": "m", "distal": "m", "length": "m",
     "force": "N", "moment": "N m", "drag_force": "N s/m", "drag_moment": "N m s", "attitude": "rad",
     "omega": "rad/s", "direction": "rad", "rod_rate": "1/s",
+    # of trees: the far point of a joint, its axes in both bodies; elements of turns; springs between points
+    "anchor": "m", "frame": "rad", "body_frame": "rad", "armature": "kg m²", "damping": "N m s",
+    "stiffness": "N m", "rest": "rad", "effort": "N m", "coordinate": "rad", "rate": "rad/s",
+    "position": "m", "velocity": "m/s", "spring_point": "m", "spring_stiffness": "N/m",
+    "spring_damping": "N s/m", "spring_length": "m",
 }  # fmt: skip
+SLIDE_UNITS = {
+    "armature": "kg", "damping": "N s/m", "stiffness": "N/m", "rest": "m", "effort": "N",
+    "coordinate": "m", "rate": "m/s",
+}  # fmt: skip
+# of the initial state; the others are the model's
 STATE_KINDS = (
-    "attitude",
-    "omega",
-    "direction",
-    "rod_rate",
-)  # of the initial state; the others are the model's
+    "attitude", "omega", "direction", "rod_rate", "coordinate", "rate", "position", "velocity",
+)  # fmt: skip
 NEGLIGIBLE = 1e-9  # of the natural size: a value below is a rounded zero
 
 
@@ -35,9 +42,9 @@ NEGLIGIBLE = 1e-9  # of the natural size: a value below is a rounded zero
 class Parameter:
     """One number of a model or of its initial state."""
 
-    kind: str  # a key of `UNITS`: a field of `Model`, or one of `STATE_KINDS`
-    body: int  # 0 … N − 1; −1 for gravity
-    entry: str  # component: x, y, z, or xx … yz of the inertia; empty for scalars
+    kind: str  # a key of `UNITS`: a field of `Model` or a part of one, or one of `STATE_KINDS`
+    body: int  # 0 … N − 1, and its joint; −1 for gravity; of "spring_…" the number of the spring
+    entry: str  # component: x, y, z, or xx … yz of the inertia; turn or slide of a joint; empty for scalars
     value: float  # in the unit of the kind; 0 for the angles of attitudes and directions
     scale: (
         float  # what a relative mistake is relative to, same unit: |value|, or a natural size where that is 0
@@ -51,21 +58,22 @@ class Parameter:
     @property
     def unit(self) -> str:
         """Unit of value and scale."""
-        return UNITS[self.kind]
+        return (SLIDE_UNITS if self.entry == "slide" else UNITS)[self.kind]
 
 
 def list_parameters(model: Model, state: State) -> list[Parameter]:
     """List every parameter of a model and of its initial state.
 
-    The distal point of the last body is no parameter, because nothing hangs there. Attitudes and directions
-    of rods count as small rotations: about the body's axes, and about two axes across the rod.
+    The distal point of the last body of a chain is no parameter, because nothing hangs there.  Attitudes and
+    directions of rods count as small rotations: about the body's axes, and about two axes across the rod.
 
     Args:
-        model: the mechanism.
+        model: the mechanism, a tree.
         state: its initial state.
 
     Returns:
-        Gravity's components, then body by body its model parameters and its initial state.
+        Gravity's components, then body by body its model parameters, those of its joint and its initial
+        state; then those of springs.
 
     """
     g = max(float(np.linalg.norm(model.gravity)), 1e-3)
@@ -76,29 +84,90 @@ def list_parameters(model: Model, state: State) -> list[Parameter]:
         mass, trace = model.mass[k], float(np.trace(model.inertia[k]))
         span = max(
             float(np.linalg.norm(model.proximal[k])),
-            float(np.linalg.norm(model.distal[k])) if k + 1 < model.n else 0.0,
+            float(np.linalg.norm(model.distal[k])) if model.is_chain else 0.0,
             float(np.sqrt(trace / (2 * mass))),
         )
         spin = max(rate, float(np.linalg.norm(state.omega[k])), float(np.linalg.norm(state.udot[k])))
         found.append(Parameter("mass", k, "", float(mass), float(mass)))
         for entry, at in INERTIA_ENTRIES.items():
             found.append(_parameter("inertia", k, entry, model.inertia[k][at], trace / 3))
-        found += _components("proximal", k, model.proximal[k], span)
-        if k + 1 < model.n:
-            found += _components("distal", k, model.distal[k], span)
-        if model.rods[k]:
-            found.append(_parameter("length", k, "", model.length[k], model.length[k]))
+        found += _geometry(model, k, span)
         found += _components("force", k, model.force[k], mass * g)
         found += _components("moment", k, model.moment[k], mass * g * span)
         found.append(_parameter("drag_force", k, "", model.drag_force[k], mass * rate))
         found.append(_parameter("drag_moment", k, "", model.drag_moment[k], trace / 3 * rate))
-        found += [Parameter("attitude", k, axis, 0.0, 1.0) for axis in AXES]
-        found += _components("omega", k, state.omega[k], spin)
-        if model.rods[k]:
-            found += [Parameter("direction", k, axis, 0.0, 1.0) for axis in AXES[:2]]
-            across = rod_axes(state.u[k]) @ state.udot[k]
-            found += [_parameter("rod_rate", k, AXES[i], across[i], spin) for i in range(2)]
+        found += _joint_elements(model, k, (trace / 3, mass), rate)
+        found += _initial_state(model, state, k, span, spin)
+    found += _springs(model, length, rate)
     return found
+
+
+def _geometry(model: Model, k: int, span: float) -> Iterator[Parameter]:
+    """Points and axes of a body's joint, and of a chain the point where the next body hangs."""
+    kind = model.kind[k]
+    if kind == "free":
+        return
+    yield from _components("proximal", k, model.proximal[k], span)
+    if not model.is_chain:
+        yield from _components("anchor", k, model.point[k, 0], span)
+    elif k + 1 < model.n:
+        yield from _components("distal", k, model.distal[k], span)
+    if model.rods[k]:
+        yield _parameter("length", k, "", model.length[k], model.length[k])
+    if not KINDS[kind].has_attitude or (kind == "ball" and model.stiffness[k, 0]):
+        for frame in ("frame", "body_frame"):
+            yield from (Parameter(frame, k, axis, 0.0, 1.0) for axis in AXES)
+
+
+def _motions(model: Model, k: int) -> list[str]:
+    """Names of the scalar coordinates of a joint: what each does, or of two turns their axes."""
+    names: list[str] = [what for what, _ in KINDS[model.kind[k]].motions]
+    return names if len(set(names)) == len(names) else list(AXES[: len(names)])
+
+
+def _joint_elements(model: Model, k: int, inertia: tuple[float, float], rate: float) -> Iterator[Parameter]:
+    """Rotor, damper, spring and effort of each coordinate of a joint; of a ball's about all axes."""
+    if not model.has_joint_elements:
+        return
+    is_ball = model.kind[k] == "ball"
+    for i, what in enumerate(["turn"] if is_ball else _motions(model, k)):
+        size, arm = inertia[what == "slide"], float(np.sqrt(3 * inertia[0] / inertia[1]))
+        natural = (size, size * rate, size * rate**2, arm if what == "slide" else 1.0, size * rate**2)
+        for name, own in zip(JOINT_ELEMENTS, natural, strict=True):
+            if (name in ("rest", "effort") and is_ball) or (name == "rest" and not model.stiffness[k, i]):
+                continue
+            yield _parameter(name, k, what, getattr(model, name)[k, i], own)
+
+
+def _initial_state(model: Model, state: State, k: int, span: float, spin: float) -> Iterator[Parameter]:
+    """Minimal coordinates and rates of a body."""
+    if KINDS[model.kind[k]].has_attitude:
+        yield from (Parameter("attitude", k, axis, 0.0, 1.0) for axis in AXES)
+        yield from _components("omega", k, state.omega[k], spin)
+    if model.rods[k]:
+        yield from (Parameter("direction", k, axis, 0.0, 1.0) for axis in AXES[:2])
+        across = rod_axes(state.u[k]) @ state.udot[k]
+        yield from (_parameter("rod_rate", k, AXES[i], across[i], spin) for i in range(2))
+    if model.kind[k] == "free":
+        yield from _components("position", k, state.r[k], span)
+        yield from _components("velocity", k, state.v[k], span * spin)
+    for i, what in enumerate(_motions(model, k)):
+        is_slide = what == "slide"
+        angle = Parameter("coordinate", k, what, 0.0, 1.0)
+        yield _parameter("coordinate", k, what, state.x[k, i], span) if is_slide else angle
+        yield _parameter("rate", k, what, state.xdot[k, i], span * spin if is_slide else spin)
+
+
+def _springs(model: Model, length: float, rate: float) -> Iterator[Parameter]:
+    """Points and numbers of springs between points."""
+    for i, pair in enumerate(model.spring_body):
+        mass = float(np.max(model.mass[pair[pair >= 0]]))
+        for side, words in enumerate(("first", "second")):
+            for axis, value in zip(AXES, model.spring_point[i, side], strict=True):
+                yield _parameter("spring_point", i, f"{words} {axis}", value, length)
+        for name, own in zip(SPRING_FIELDS[2:], (mass * rate**2, mass * rate, length), strict=True):
+            if name != "spring_length" or model.spring_stiffness[i]:
+                yield _parameter(name, i, "", getattr(model, name)[i], own)
 
 
 def _components(kind: str, body: int, vector: Array, natural: float) -> Iterator[Parameter]:
@@ -139,39 +208,81 @@ def perturb(model: Model, state: State, parameter: Parameter, size: float) -> tu
         The changed model, and the changed state of the same minimal coordinates.
 
     """
-    kind, k, change = parameter.kind, parameter.body, size * parameter.scale
-    if kind in STATE_KINDS:
+    change = size * parameter.scale
+    if parameter.kind in STATE_KINDS:
         return model, _perturb_state(model, state, parameter, change)
-    array = getattr(model, kind).copy()
+    changed = perturb_model(model, parameter, size)
+    return changed, complete_state(changed, state)
+
+
+def perturb_model(model: Model, parameter: Parameter, size: float) -> Model:
+    """Change one parameter of a model.
+
+    Args:
+        model: the mechanism.
+        parameter: of `list_parameters` for this model, not of the state.
+        size: the change, as a fraction of the parameter's scale.
+
+    Returns:
+        The changed model.
+
+    """
+    kind, k, change = parameter.kind, parameter.body, size * parameter.scale
+    field = {"anchor": "point", "frame": "turn", "body_frame": "turn"}.get(kind, kind)
+    array = getattr(model, field).copy()
     if kind == "gravity":
         array[AXES.index(parameter.entry)] += change
     elif kind == "inertia":
         i, j = INERTIA_ENTRIES[parameter.entry]
         array[k, i, j] += change
         array[k, j, i] = array[k, i, j]
+    elif field == "turn":
+        side = int(kind == "body_frame")
+        array[k, side] = _turned(array[k, side], AXES.index(parameter.entry), change)
+    elif kind == "spring_point":
+        which, axis = parameter.entry.split()
+        array[k, int(which == "second"), AXES.index(axis)] += change
+    elif kind == "anchor":
+        array[k, 0, AXES.index(parameter.entry)] += change
+    elif kind in JOINT_ELEMENTS:
+        array[k, _column(model, parameter)] += change
     elif parameter.entry:
         array[k, AXES.index(parameter.entry)] += change
     else:
         array[k] += change
-    changed = model.changed(**{kind: array})
-    return changed, state_from_minimal(changed, state.p, state.omega, state.u, state.udot)
+    return model.changed(**{field: array})
+
+
+def _column(model: Model, parameter: Parameter) -> int:
+    """Which coordinate of its joint a parameter belongs to."""
+    motions = _motions(model, parameter.body)
+    return motions.index(parameter.entry) if motions else 0
+
+
+def _turned(p: Array, axis: int, angle: float) -> Array:
+    """A quaternion turned about one of its own axes."""
+    turned = quaternion_product(p, np.concatenate([[1.0], angle / 2 * np.eye(3)[axis]]))
+    return np.asarray(turned / np.linalg.norm(turned))
 
 
 def _perturb_state(model: Model, state: State, parameter: Parameter, change: float) -> State:
     """The state with one of its minimal coordinates or rates changed."""
-    k, i = parameter.body, AXES.index(parameter.entry)
-    p, omega, u, udot = (getattr(state, name).copy() for name in ("p", "omega", "u", "udot"))
-    if parameter.kind == "attitude":
-        turn = np.concatenate([[1.0], change / 2 * np.eye(3)[i]])
-        p[k] = quaternion_product(p[k], turn / np.linalg.norm(turn))
-        p[k] /= np.linalg.norm(p[k])
-    elif parameter.kind == "omega":
-        omega[k, i] += change
-    elif parameter.kind == "rod_rate":
+    kind, k = parameter.kind, parameter.body
+    names = ("p", "omega", "u", "udot", "r", "v", "x", "xdot")
+    p, omega, u, udot, r, v, x, xdot = (getattr(state, name).copy() for name in names)
+    if kind in ("coordinate", "rate"):
+        (x if kind == "coordinate" else xdot)[k, _column(model, parameter)] += change
+        return complete_state(model, State(p, omega, u, udot, r, v, x, xdot))
+    i = AXES.index(parameter.entry)
+    if kind == "attitude":
+        p[k] = _turned(p[k], i, change)
+    elif kind in ("omega", "position", "velocity"):
+        {"omega": omega, "position": r, "velocity": v}[kind][k, i] += change
+    elif kind == "rod_rate":
         udot[k] += change * rod_axes(u[k])[i]
     else:
         axis = rod_axes(u[k])[i]
         u[k], udot[k] = u[k] + change * np.cross(axis, u[k]), udot[k] + change * np.cross(axis, udot[k])
         u[k] /= np.linalg.norm(u[k])
         udot[k] -= (udot[k] @ u[k]) * u[k]
-    return state_from_minimal(model, p, omega, u, udot)
+    return complete_state(model, State(p, omega, u, udot, r, v, x, xdot))

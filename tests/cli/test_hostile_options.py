@@ -34,7 +34,7 @@ VALID = {  # by option or argument, a word that is accepted
     "what": "scenarios", "rtols": "1e-6", "max_cpu_seconds": "3", "history_folder": "history", "pattern": "*",
     "duration": "1", "precision": "quad", "proof_cpu_seconds": "9",
     "base": "free", "state_count": "3", "state": "hip=0.1", "root": "history", "form": "mujoco",
-    "as_json": "", "self_test": "", "fresh": "", "help": "",
+    "strip_geometry": "", "as_json": "", "self_test": "", "fresh": "", "help": "",
 }  # fmt: skip
 WORK = (  # where the work of a command begins
     "plumbline.cli.run_commands.run_plan", "plumbline.cli.nightly.run_plan", "plumbline.studies.sweep.run",

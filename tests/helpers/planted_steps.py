@@ -132,9 +132,7 @@ def reused_acceleration(system: Any, q: Array, v: Array, h: float) -> tuple[Arra
         moved = system.integrate(q, theta)
         slopes.append((inverse_differential(theta, rate), system.acceleration(moved, rate)))
     system.last = slopes[-1][1]
-    theta, change = (
-        h * (k[0] + 2 * k[1] + 2 * k[2] + k[3]) / 6 for k in zip(*slopes, strict=True)
-    )
+    theta, change = (h * (k[0] + 2 * k[1] + 2 * k[2] + k[3]) / 6 for k in zip(*slopes, strict=True))
     return system.integrate(q, theta), v + change
 
 
