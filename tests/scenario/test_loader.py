@@ -105,6 +105,7 @@ TREE_JOINTS = {
     "sprung-universal": ("universal",),
     "universal-pendulum": ("universal",),
     "free-body-with-rotors": ("free", "hinge", "hinge", "hinge"),
+    "loaded-tree": TREE_OF_SEVEN,
     "open-governor": ("hinge", "hinge", "hinge"),
     "robot-arm": ("hinge",) * 6,
     "tree-of-seven": TREE_OF_SEVEN,
