@@ -31,10 +31,14 @@ WORDS = ("-m", "plumbline", "run")
 
 def run(out, *words, **environment):
     return subprocess.run(
-        [sys.executable, *WORDS, *words, "--out", str(out)],
+        [sys.executable, *WORDS, *words, "--jobs", "1", "--out", str(out)],
         cwd=ROOT, capture_output=True, text=True, timeout=240,
         env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
     )  # fmt: skip
+
+
+def invoke(out, *words):
+    return CliRunner().invoke(main, ["run", *words, "--jobs", "1", "--out", str(out)])
 
 
 def with_module(folder, name, text):
@@ -62,15 +66,15 @@ def test_the_pages_have_the_same_table(page):
 
 
 def test_an_engine_without_the_level_compares_nothing(tmp_path):
-    result = run(tmp_path, "rest", "--engine", "pinocchio-aba", "--level", "trajectory")
-    assert result.returncode == ExitCode.DISAGREEMENT, result.stdout + result.stderr
+    result = invoke(tmp_path, "rest", "--engine", "pinocchio-aba", "--level", "trajectory")
+    assert result.exit_code == ExitCode.DISAGREEMENT, result.output
     assert "nothing was compared" in result.stdout
     assert "Every cell agrees" not in (tmp_path / "report.html").read_text()
 
 
 def test_recorded_gaps_alone_are_no_comparison(tmp_path):
-    result = run(tmp_path, "chain-3-balls", "--engine", "reference-printed", "--level", "state")
-    assert result.returncode == ExitCode.DISAGREEMENT, result.stdout + result.stderr
+    result = invoke(tmp_path, "chain-3-balls", "--engine", "reference-printed", "--level", "state")
+    assert result.exit_code == ExitCode.DISAGREEMENT, result.output
     assert "(1 as recorded), nothing was compared" in result.stdout
 
 
