@@ -2,7 +2,8 @@
 
 Every scenario is compared at state level.  At the other levels the scenarios are taken from small to large,
 of one size from generic (few zeros among their numbers) to special, those with a closed form last: a scenario
-of at most `MAX_BODIES` bodies is kept if it has a feature that none before it has.
+of at most `MAX_BODIES` bodies is kept if it has a feature that none before it has.  From the last to the first,
+those are dropped again whose features the others have.
 """
 
 from __future__ import annotations
@@ -30,11 +31,13 @@ def levels(engine: str, scenario: Scenario) -> list[str]:
 
 
 def features(scenario: Scenario) -> set[str]:
-    """What a comparison on the scenario exercises: size, joints, of chains also neighbours and loads."""
+    """What a comparison on the scenario exercises: joints, of chains also neighbours, loads and size."""
     model = scenario.model
-    found = {f"{min(model.n, 3)} bodies", *(["closed form"] if scenario.closed_form else [])}
     if not model.is_chain:
-        return found | set(model.kind)
+        return set(model.kind)
+    is_loaded = any(np.any(getattr(model, name)) for name in LOADS)
+    found = {f"{min(model.n, 3)} bodies{' with loads' * is_loaded}"}
+    found |= {"closed form"} if scenario.closed_form else set()
     above = ("the world", *model.kind[:-1])
     found |= {f"{kind} on {other}" for kind, other in zip(model.kind, above, strict=True)}
     for name in LOADS:
@@ -45,16 +48,16 @@ def features(scenario: Scenario) -> set[str]:
 
 @cache
 def representatives(level: str) -> dict[str, set[str]]:
-    """Scenarios of a level in the fast tests, each with the features that it adds."""
+    """Scenarios of a level in the fast tests, with their features."""
+    scenarios = [s for s in catalogue_scenarios().values() if s.model.n <= MAX_BODIES]
+    compared = [s for s in scenarios if KINDS[level] not in uncompared_kinds(s.model)]
     chosen: dict[str, set[str]] = {}
-    by_size = sorted(
-        (s for s in catalogue_scenarios().values() if s.model.n <= MAX_BODIES),
-        key=lambda s: (s.closed_form is not None, s.model.n, _zeros(s), s.name),
-    )
-    for scenario in by_size:
-        new = features(scenario).difference(*chosen.values())
-        if new and KINDS[level] not in uncompared_kinds(scenario.model):
-            chosen[scenario.name] = new
+    for scenario in sorted(compared, key=lambda s: (s.closed_form is not None, s.model.n, _zeros(s), s.name)):
+        if features(scenario).difference(*chosen.values()):
+            chosen[scenario.name] = features(scenario)
+    for name in reversed(list(chosen)):
+        if chosen[name] <= set().union(*(found for other, found in chosen.items() if other != name)):
+            del chosen[name]
     return chosen
 
 
