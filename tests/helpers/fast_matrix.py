@@ -2,8 +2,8 @@
 
 Every scenario is compared at state level.  At the other levels the scenarios are taken from small to large,
 of one size from generic (few zeros among their numbers) to special, those with a closed form last: a scenario
-of at most `MAX_BODIES` bodies is kept if it has a feature that none before it has.  From the last to the first,
-those are dropped again whose features the others have.
+of at most `MAX_BODIES` bodies is kept if it has a feature that none before it has.  Then those are dropped,
+from the last to the first, whose features the others have.
 """
 
 from __future__ import annotations
