@@ -59,6 +59,7 @@ from plumbline.model.datatypes import (
     State,
     StateQuantities,
     Trajectory,
+    Unsupported,
 )
 from plumbline.model.loops import CutMechanism, cut_open, determinate_part, wrench_length
 from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
@@ -67,11 +68,12 @@ from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 JOINT_TYPES = {"turn": mujoco.mjtJoint.mjJNT_HINGE, "slide": mujoco.mjtJoint.mjJNT_SLIDE}
 FIRST_ORDER_POWERS = (1, 2, 3, 4, 5, 6)
 MAX_IMPEDANCE = 0.9999  # of soft constraints: the largest that MuJoCo accepts
-# of MuJoCo's own R: the largest, how they fall, and how many. R is made for the tree at its reference pose:
-# where rotors make its joints heavy, 0.27 of it was not yet in the range where answers are linear in R
-MAX_REGULARISATION, RATIO, REGULARISATIONS = 0.027, 3.0, 4
+# of MuJoCo's own R, which is made for the tree at its reference pose: the largest (the next where answers are
+# not yet linear in it), how they fall, and how many
+LARGEST_REGULARISATIONS, RATIO, REGULARISATIONS = (0.027, 2.7e-4, 2.7e-6), 3.0, 4
 MAX_ORDER_ERROR = 0.1
 MIN_SOFTNESS = 1e-9  # a smaller relative effect of R is rounding
+MAX_NOISE = 1e-11  # relative, of differences that grow as R falls: more is too much to extrapolate
 ROD_AXIAL_INERTIA = 0.01  # J_z of a rod over the mean principal inertia of the body that it carries
 IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
 
@@ -380,7 +382,13 @@ def _rigid_limit(tree: _MujocoChain, cut: CutMechanism, state: State) -> StateQu
     Rounding of the forces grows with 1/R.  The limit's uncertainty, by rounding and by what is left of R, is
     twice the difference from the extrapolation of another sequence.
     """
-    limits = [_extrapolated(tree, cut, state, factor) for factor in (1.0, 1.5)]
+    for largest in LARGEST_REGULARISATIONS:
+        try:
+            limits = [_extrapolated(tree, cut, state, factor * largest) for factor in (1.0, 1.5)]
+            break
+        except EngineFailure:
+            if largest == LARGEST_REGULARISATIONS[-1]:
+                raise
     errors = {
         name: 2 * float(np.max(np.linalg.norm(np.atleast_2d(limits[1][name] - limit), axis=-1)))
         for name, limit in limits[0].items()
@@ -389,24 +397,28 @@ def _rigid_limit(tree: _MujocoChain, cut: CutMechanism, state: State) -> StateQu
     return StateQuantities(**values, limit_error=errors)
 
 
-def _extrapolated(tree: _MujocoChain, cut: CutMechanism, state: State, factor: float) -> dict[str, Array]:
+def _extrapolated(tree: _MujocoChain, cut: CutMechanism, state: State, largest: float) -> dict[str, Array]:
     """Extrapolate all quantities from one sequence of regularisations (Neville's scheme)."""
     there, found = cut.state(state), list[dict[str, Array]]()
     for k in range(REGULARISATIONS):
-        tree.soften(factor * MAX_REGULARISATION / RATIO**k)
+        tree.soften(largest / RATIO**k)
         answer = determinate_part(cut.source, state, cut.source_quantities(tree.quantities(there)))
         found.append({name: np.asarray(x) for name, x in vars(answer).items() if x is not None})
     limit: dict[str, Array] = {}
+    length, size = wrench_length(cut.source), float(np.max(np.abs(found[-1]["acceleration"])))
+    force = size * float(np.max(cut.source.mass))
+    # what rounding of the others leaves of each, where itself it is small
+    sizes = {"angular_acceleration": size / length, "joint_reaction": force, "joint_moment": length * force}
     for name, last in found[-1].items():
         column = [answers[name] for answers in found]
         steps = [float(np.max(np.abs(x - y))) for x, y in pairwise(column)]
-        size = float(np.max(np.abs(last)))
-        if name == "joint_moment":
-            size = max(size, wrench_length(cut.source) * float(np.max(np.abs(found[-1]["joint_reaction"]))))
+        size = max(float(np.max(np.abs(last))), sizes.get(name, 0.0))
         if steps[0] > MIN_SOFTNESS * size:
             order = np.log(steps[0] / steps[1]) / np.log(RATIO)
             if abs(order - 1) > MAX_ORDER_ERROR:
                 raise EngineFailure(f"MuJoCo's {name} is of order {order:.2g} in its regularisation, not 1")
+        if steps[-1] > max(steps[0], MAX_NOISE * size):
+            raise Unsupported(f"rounding of MuJoCo's constraint forces changes the {name} by {steps[-1]:.1g}")
         for power in range(1, REGULARISATIONS):
             column = [(RATIO**power * x - y) / (RATIO**power - 1) for y, x in pairwise(column)]
         limit[name] = column[0]

@@ -40,7 +40,7 @@ from plumbline.judging.relation_result import REPEATABILITY
 from plumbline.judging.rows import Level, Row, Verdict
 from plumbline.judging.run_relations import REVERSED_IN_TIME
 from plumbline.judging.state import SINGULAR_POSE, STATE_UNITS
-from plumbline.judging.state_relations import STATE_RELATIONS, WELDED_HALVES
+from plumbline.judging.state_relations import REDESCRIPTIONS, STATE_RELATIONS, WELDED_HALVES
 from plumbline.model.invariants import INVARIANT_UNITS
 from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean, shorten
 from plumbline.scenario.generator import MECHANISM_PREFIX, MOTION_PREFIX, RANDOM_FAMILY
@@ -389,7 +389,8 @@ def _quantities() -> set[str]:
     """Every quantity that a row may have, except of information."""
     trajectory = ("order", "position_limit", "attitude_limit")
     long_runs = ("all_long", "energy_drift_long_growth", *(f"{name}_long" for name in INVARIANT_UNITS))
-    relations = (*(r.name for r in STATE_RELATIONS), WELDED_HALVES, REVERSED_IN_TIME, REPEATABILITY)
+    own = (*REDESCRIPTIONS, WELDED_HALVES, REVERSED_IN_TIME, REPEATABILITY)
+    relations = (*(r.name for r in STATE_RELATIONS), *own)
     others = *(f"as {name}" for name in ENGINES), *(f"by {text}" for text in declared_texts())
     steps = (*STEP_UNITS, *CONSTRAINED_UNITS)
     return {

@@ -3,17 +3,19 @@
 Each relation changes model and state so that the effect on every answer is known exactly, and maps the
 answers back; or it asks for another algorithm of the same engine.  The two answers may differ by the sum of
 the first-order rounding bounds of both sides.  The bounds are the same on both sides (they are homogeneous in
-every unit and independent of axes), except for welded halves, whose equations have other terms.
+every unit and independent of axes), except for welded halves and other joints: their equations have other
+terms.
 
     rotated world        everything in world axes rotated by Q
     re-chosen body frame body axes rotated by Q: p Q*, s → Q s, J → Q J Qᵀ, ω′ → Q ω′ (inertias become full)
     masses doubled       m, J, loads, drag and elements × 2: the same motion, forces and energies × 2
     lengths × 4          s, ℓ × 4, J × 16, ω and u̇ / 2, moments × 4, c_t / 2, c_r × 8: r̈ and F the same
-    time reversed        ω, u̇ → −ω, −u̇ without drag: r̈, ω̇′, F, energies the same, L → −L
+    time reversed        ω, u̇ → −ω, −u̇, drag and dampers off: r̈, ω̇′, F, energies the same, L → −L
     siblings permuted    branches on the same body in another order: the same answers in that order
     as …                 the engine's other formulation (maximal or minimal coordinates)
     by …                 the engine's other algorithm for the accelerations (dense, sparse, …)
     two welded halves    every body built of two bodies that are rigidly joined
+    root moved, joints as rods, inertia as rotors, springs as loads: `plumbline.model.redescription`
 """
 
 from __future__ import annotations
@@ -37,10 +39,20 @@ from plumbline.model.equivalent import (
     unrotate,
 )
 from plumbline.model.kinematics import complete_state
+from plumbline.model.redescription import (
+    inertia_as_rotors,
+    joints_as_rods,
+    moved_root,
+    springs_as_loads,
+    state_of_balls,
+)
 from plumbline.model.welding import split_bodies
 from plumbline.truth.rounding_bound import RoundingBound, state_rounding_bound
 
 WELDED_HALVES = "two welded halves"
+ROOT_MOVED, JOINTS_AS_RODS = "root moved", "joints as rods"
+INERTIA_AS_ROTORS, SPRINGS_AS_LOADS = "inertia as rotors", "springs as loads"
+REDESCRIPTIONS = (ROOT_MOVED, JOINTS_AS_RODS, INERTIA_AS_ROTORS, SPRINGS_AS_LOADS)
 MAX_STATES, LONG_CHAIN_BODIES = 4, 12  # states per relation; half of them for chains of more bodies
 Q = np.array([1.0, 2.0, 3.0, 4.0]) / np.sqrt(30.0)  # unit quaternion that rotates no axis into an axis
 QUANTITIES = (
@@ -89,6 +101,9 @@ class Relation:
     name: str
     transform: Callable[[Model, State], tuple[Model, State]] = unchanged
     transform_back: Callable[[StateQuantities], dict[str, Array]] = quantity_values  # of the other answers
+    has_own_terms: bool = (
+        False  # whether the other equations have other terms, so that their bound is another
+    )
 
 
 def scale_fields(model: Model, **factors: float) -> Model:
@@ -187,6 +202,47 @@ def _permute_siblings(model: Model) -> Relation:
     return Relation("siblings permuted", lambda m, state: reorder_bodies(m, state, order), in_order)
 
 
+def _without(*names: str) -> Callable[[StateQuantities], dict[str, Array]]:
+    """Answers but for quantities that are others in the other description."""
+    return lambda answers: {q: x for q, x in quantity_values(answers).items() if q not in names}
+
+
+def _move_root(model: Model) -> Relation | None:
+    """The relation of a model with another root; moments are about other points there, and left out."""
+    moved = moved_root(model)
+    if moved is None:
+        return None
+    place = np.argsort(moved.order)
+    sign = np.where(moved.joint < 0, 0.0, np.where(moved.is_reversed, -1.0, 1.0))  # a free root has no force
+
+    def back(answers: StateQuantities) -> dict[str, Array]:
+        found = _without("joint_moment")(answers)
+        for q in found.keys() & {"acceleration", "angular_acceleration"}:
+            found[q] = found[q][place]
+        if "joint_reaction" in found:
+            found["joint_reaction"] = found["joint_reaction"][moved.joint] * sign[:, None]
+        return found
+
+    return Relation(ROOT_MOVED, lambda _, state: (moved.model, moved.state(state)), back, True)
+
+
+def _redescriptions(model: Model) -> Iterator[Relation]:
+    """The relations of the same mechanism made of other joints and elements, as far as it has such."""
+    if model.n <= LONG_CHAIN_BODIES and (relation := _move_root(model)) is not None:
+        yield relation
+    balls, rotors = joints_as_rods(model), inertia_as_rotors(model)
+    if balls is not model:
+        back = _without("joint_reaction", "joint_moment")
+        yield Relation(JOINTS_AS_RODS, lambda _, state: (balls, state_of_balls(balls, state)), back, True)
+    if rotors is not model:
+        # the momentum of rotors is not counted, nor their moment on the body
+        back = _without("angular_momentum", "joint_moment")
+        yield Relation(INERTIA_AS_ROTORS, lambda _, state: (rotors, state), back, True)
+    if np.any(model.stiffness) or np.any(model.damping) or len(model.spring_body):
+        back = _without("potential_energy")
+        yield Relation(SPRINGS_AS_LOADS, lambda m, state: (springs_as_loads(m, state), state), back, True)
+
+
 TIME_REVERSED = Relation(
     "time reversed", _reverse_time, lambda answers: quantity_values(answers, angular_momentum=-1.0)
 )
@@ -218,9 +274,15 @@ def check_state_relations(
     bounds = [state_rounding_bound(model, state) for state in states]
     others: list[tuple[Relation, Evaluate]] = [
         (relation, engine.evaluate)
-        for relation in STATE_RELATIONS
+        for relation in (*STATE_RELATIONS, *_redescriptions(model))
         if not (relation is TIME_REVERSED and model.is_dissipative)
     ]
+    if model.is_dissipative:
+        off = ("drag_force", "drag_moment", "damping", "spring_damping")
+        lossless = scale_fields(model, **dict.fromkeys(off, 0.0))
+        found = [evaluate_or_refusal(engine.evaluate, lossless, state) for state in states]
+        limits = [state_rounding_bound(lossless, state) for state in states]
+        yield check_state_relation(TIME_REVERSED, found, engine.evaluate, lossless, states, limits, limits)
     if np.any(np.diff(siblings_reversed(model)) < 0):
         others.append((_permute_siblings(model), engine.evaluate))
     others += [
@@ -286,15 +348,21 @@ def check_state_relation(
     worst, count, refusal = (0.0, "", 0), 0, ""
     for index, state in enumerate(states):
         here = answers[index]
-        other = evaluate_or_refusal(evaluate_other, *relation.transform(model, state))
+        there = relation.transform(model, state)
+        other = evaluate_or_refusal(evaluate_other, *there)
         if isinstance(here, Unsupported) or isinstance(other, Unsupported):
             refusal = str(here if isinstance(here, Unsupported) else other)
             continue
         count += 1
         mine, theirs = quantity_values(here), relation.transform_back(other)
+        other_bound = state_rounding_bound(*there) if relation.has_own_terms else other_bounds[index]
         for q in mine.keys() & theirs.keys():
             difference = np.linalg.norm(np.atleast_1d(mine[q] - theirs[q]), axis=-1)
-            both = np.asarray(bounds[index].tolerance(q)) + other_bounds[index].tolerance(q)
+            theirs_allowed = np.asarray(other_bound.tolerance(q))
+            if relation.has_own_terms:  # its bodies may have another order
+                theirs_allowed = np.max(theirs_allowed)
+            both = np.asarray(bounds[index].tolerance(q)) + theirs_allowed
+            both = both + sum((answer.limit_error or {}).get(q, 0.0) for answer in (here, other))
             allowed = np.maximum(both, np.finfo(float).tiny)
             worst = max(worst, (float(np.max(difference / allowed)), q, index))
     return RelationResult(relation.name, worst[0] if count else None, worst[1], worst[2], count, refusal)

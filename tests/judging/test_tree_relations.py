@@ -7,10 +7,16 @@ import pytest
 
 from adapters.mujoco_engine import Mujoco
 from adapters.reference_engine import Reference
+from plumbline.engines.metamorphic_hooks import metamorphic_hooks
+from plumbline.engines.registry import load_adapter
 from plumbline.judging.run_relations import check_run_relations
-from plumbline.judging.state_relations import check_state_relations
+from plumbline.judging.state_relations import REDESCRIPTIONS, check_state_relations
+from plumbline.model.datatypes import JOINT_ELEMENTS
 from plumbline.model.equivalent import reorder_bodies, rotate_world, siblings_reversed
+from plumbline.model.kinematics import quaternion_product
+from plumbline.model.loops import loop_gaps
 from plumbline.model.random_mechanisms import random_tree
+from plumbline.model.redescription import moved_root
 from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 
@@ -29,7 +35,7 @@ def test_relations_hold_on_random_trees_with_elements(engine, seed):
     model = random_tree(rng, 6, elements=("armature", "damping", "stiffness", "effort", "springs"))
     found = ratios(engine(), model, random_states(model, 2, seed))
     assert {"rotated world", "re-chosen body frame", "masses doubled", "lengths × 4"} <= set(found)
-    assert "time reversed" not in found  # dampers
+    assert {"time reversed", "springs as loads"} <= set(found)
     assert max(found.values()) <= 1, found
 
 
@@ -81,6 +87,107 @@ def test_planted_defects_break_a_relation(engine, relation):
     found = ratios(engine(), TREE.model, [TREE.state])
     assert found[relation] > 10
     assert found["masses doubled"] <= 1
+
+
+class Redescribed(Reference):
+    """Given another mechanism than it is asked about; equivalent descriptions are told apart."""
+
+    change = staticmethod(lambda model: model)
+
+    def _evaluate(self, model, states):
+        return super()._evaluate(self.change(model), states)
+
+
+def far_points_moved(model):
+    """Points of far bodies are a little off, as for a mistake in the offset of a child from its parent."""
+    point = model.point.copy()
+    point[:, 0] *= np.where(model.body[:, :1] >= 0, 1 + 1e-8, 1.0)
+    return model.changed(point=point)
+
+
+def near_axes_turned(model):
+    """The axes of joints with axes are a little off in the near body."""
+    turn = model.turn.copy()
+    for k, kind in enumerate(model.kind):
+        if kind in ("hinge", "universal"):
+            turn[k, 1] = quaternion_product(turn[k, 1], np.array([1.0, 1e-8, 0.0, 0.0]))
+    return model.changed(turn=turn)
+
+
+REDESCRIPTION_DEFECTS = {  # the change, and the relations that see it; no other does
+    "root moved": (far_points_moved, {"root moved", "joints as rods"}),
+    "joints as rods": (near_axes_turned, {"joints as rods", "root moved"}),
+    "inertia as rotors": (lambda m: m.changed(armature=m.armature * (1 + 1e-8)), {"inertia as rotors"}),
+    "springs as loads": (lambda m: m.changed(rest=m.rest * (1 + 1e-8)), {"springs as loads"}),
+    "springs as loads, between points": (
+        lambda m: m.changed(spring_stiffness=m.spring_stiffness * (1 + 1e-8)), {"springs as loads"},
+    ),
+}  # fmt: skip
+
+
+def redescribed_tree(elements=("stiffness", "damping", "springs")):
+    """Bodies on hinges, a universal joint and a weld, whose root is bare, so that it can move."""
+    tree = random_tree(np.random.default_rng(5), 4, ("hinge",), elements=elements)
+    bare = np.array([[True], [True], [True], [False]])
+    return replace(
+        tree,
+        kind=("hinge", "universal", "weld", "hinge"),
+        body=np.array([[-1, 0], [0, 1], [1, 2], [1, 3]]),
+        **{name: np.where(bare, 0.0, getattr(tree, name)) for name in JOINT_ELEMENTS},
+    )
+
+
+@pytest.mark.parametrize("defect", REDESCRIPTION_DEFECTS)
+def test_a_planted_defect_breaks_its_redescription(defect):
+    change, seen_by = REDESCRIPTION_DEFECTS[defect]
+    model = redescribed_tree()
+    (state,) = random_states(model, 1, 2)
+    engine = Redescribed()
+    honest = ratios(engine, model, [state])
+    assert max(honest.values()) <= 1 and set(REDESCRIPTIONS) <= set(honest)
+    engine.change = change
+    found = ratios(engine, model, [state])
+    assert {name for name, ratio in found.items() if ratio > 1} == seen_by, found
+
+
+def test_time_reversal_sees_a_wrong_sign_of_a_rate_though_there_are_dampers():
+    class Leaning(Reference):
+        def _evaluate(self, model, states):
+            found = super()._evaluate(model, states)
+            pushed = [a.acceleration + 1e-8 * s.v for a, s in zip(found, states, strict=True)]
+            return [replace(a, acceleration=x) for a, x in zip(found, pushed, strict=True)]
+
+    model = redescribed_tree()
+    found = ratios(Leaning(), model, random_states(model, 1, 2))
+    assert {"time reversed"} <= {name for name, ratio in found.items() if ratio > 1}
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "pinocchio", "pinocchio-maximal", "exudyn"])
+def test_redescriptions_hold_on_every_engine_that_closes_loops(engine):
+    model = redescribed_tree(elements=())
+    hooks = metamorphic_hooks(load_adapter(engine))
+    found = ratios(hooks, model, random_states(model, 1, 4))
+    rotors = {"inertia as rotors"} if engine in ("mujoco", "pinocchio") else set()
+    assert {"root moved", "joints as rods"} | rotors <= set(found)
+    assert max(found.values()) <= 1, found
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_moved_root_is_the_same_mechanism(seed):
+    """Every kind of joint reversed: the loop that the root's joint closes is closed, and bodies stay."""
+    model = random_tree(np.random.default_rng(seed), 5, elements=())
+    (state,) = random_states(model, 1, seed)
+    moved = moved_root(model)
+    if moved is None:  # a free body alone
+        assert model.kind[0] == "free" and (model.n == 1 or model.body[1, 0] < 0)
+        return
+    there = moved.state(state)
+    for name in ("r", "v", "p", "omega"):
+        value, expected = getattr(there, name), getattr(state, name)[moved.order]
+        sign = np.sign(np.sum(value * expected, axis=1, keepdims=True)) if name == "p" else 1.0
+        np.testing.assert_allclose(value * sign, expected, atol=1e-13 * max(1.0, np.max(np.abs(expected))))
+    if moved.model.has_loops:
+        assert max(np.max(gap) for gap in loop_gaps(moved.model, there)) < 1e-12
 
 
 def test_runs_of_trees_return_when_time_is_reversed():

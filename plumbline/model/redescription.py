@@ -1,0 +1,270 @@
+"""The same mechanism made of other joints and elements, whose answers follow from the answers to the first.
+
+    root moved         the last body of the first branch is the root, free; the joints between are reversed,
+                       and the joint that the root had on the world closes a loop
+    joints as rods     a hinge, universal joint or weld is a ball joint, and each of its rows aᵀB = 0 a rod,
+                       between points s along a and B: its length is √2 s
+    inertia as rotors  a body on a hinge on the world turns about its axis z only: δ z zᵀ of its inertia may
+                       be a rotor of inertia δ (on a moving body not: rotors have no gyroscopic terms)
+    springs as loads   at one state, springs and dampers of joints are efforts, those between points loads
+
+A universal joint is not described as two hinges with a body between them: that body would have no mass, and a
+small one would change the mechanism.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plumbline.model.datatypes import (
+    BODY_FIELDS,
+    JOINT_ELEMENTS,
+    JOINT_FIELDS,
+    KINDS,
+    SPRING_FIELDS,
+    Kind,
+    Model,
+    State,
+)
+from plumbline.model.kinematics import (
+    complete_state,
+    cross,
+    quaternion_product,
+    rotate_vectors,
+    rotation_matrix,
+    spring_vectors,
+)
+
+EXCHANGE = np.array([0.0, 1.0, 1.0, 0.0]) / np.sqrt(2)  # half a turn that exchanges x and y
+
+
+@dataclass(frozen=True, eq=False)
+class MovedRoot:
+    """A mechanism with another root."""
+
+    model: Model
+    order: NDArray[np.intp]  # (N,) the first mechanism's bodies in the new order
+    joint: NDArray[
+        np.intp
+    ]  # (J,) of each joint of the first mechanism its new number; −1: a root's free joint
+    is_reversed: NDArray[np.bool_]  # (J,) of the first mechanism's joints
+
+    def state(self, state: State) -> State:
+        """Describe a state of the first mechanism as one of this one.
+
+        Args:
+            state: of the first mechanism.
+
+        Returns:
+            The same state.
+
+        """
+        fields = {name: getattr(state, name)[self.order] for name in ("p", "omega", "r", "v")}
+        for name in ("u", "udot", "x", "xdot"):
+            values = np.zeros_like(getattr(state, name))
+            for k, value in enumerate(getattr(state, name)):
+                place = self.joint[k]
+                if 0 <= place < self.model.n:
+                    is_universal = self.model.kind[place] == "universal" and name.startswith("x")
+                    if self.is_reversed[k]:
+                        value = -value[::-1] if is_universal else -value
+                    values[place] = value
+            fields[name] = values
+        return complete_state(self.model, State(**fields))
+
+
+def moved_root(model: Model) -> MovedRoot | None:
+    """Make the last body of the first branch the root, a free body.
+
+    Args:
+        model: the mechanism.
+
+    Returns:
+        The same mechanism; None where the root's joint has elements, or there is no other body to be the root
+        of a free one.
+
+    """
+    n, far = model.n, model.body[: model.n, 0]
+    last = next((k for k in range(1, n) if far[k] != k - 1), n) - 1
+    path = [last]
+    while far[path[-1]] >= 0:
+        path.append(int(far[path[-1]]))
+    root = path[-1]
+    is_free = model.kind[root] == "free"
+    if any(np.any(getattr(model, name)[root]) for name in JOINT_ELEMENTS) or (is_free and last == root):
+        return None
+    above = far.copy()
+    for k in path[:-1]:
+        above[far[k]] = k
+    above[last] = -1
+    order: list[int] = []
+    waiting = [*np.flatnonzero(above < 0)[::-1]]
+    waiting.remove(last)
+    waiting.append(last)
+    while waiting:
+        order.append(int(waiting.pop()))
+        waiting += [k for k in range(n) if above[k] == order[-1]][::-1]
+    place = np.argsort(order)
+    count = len(model.kind)
+    joint = np.concatenate([place, np.arange(n, count)])
+    is_reversed = np.zeros(count, bool)
+    for k in path[:-1]:
+        joint[k], is_reversed[k] = place[far[k]], True
+    joint[root] = -1 if is_free else count
+    return MovedRoot(_rearranged(model, joint, is_reversed, place), np.array(order), joint, is_reversed)
+
+
+def _rearranged(
+    model: Model, joint: NDArray[np.intp], is_reversed: NDArray[np.bool_], place: NDArray[np.intp]
+) -> Model:
+    """The mechanism with its joints at their new numbers, some reversed, and a free root."""
+    sources = {int(to): k for k, to in enumerate(joint) if to >= 0}
+    fields: dict[str, list[Any]] = {name: [] for name in JOINT_FIELDS}
+    world = np.append(place, -1)  # the world is −1 in both
+    for to in range(len(model.kind) + int(np.max(joint) == len(model.kind))):
+        if to not in sources:  # the root
+            free = ("free", [-1, to], np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)), 0.0)
+            for name, value in zip(JOINT_FIELDS, (*free, *np.zeros((5, 2))), strict=True):
+                fields[name].append(value)
+            continue
+        k = sources[to]
+        flip = -1 if is_reversed[k] else 1
+        turn, swap = model.turn[k][::flip], slice(None)
+        if is_reversed[k] and model.kind[k] == "universal":  # its axes x and y change places
+            turn, swap = quaternion_product(turn, EXCHANGE), slice(None, None, -1)
+        fields["kind"].append(model.kind[k])
+        fields["body"].append(world[model.body[k]][::flip])
+        fields["point"].append(model.point[k][::flip])
+        fields["turn"].append(turn)
+        fields["length"].append(model.length[k])
+        for name in JOINT_ELEMENTS:
+            fields[name].append(getattr(model, name)[k][swap] * (flip if name in ("rest", "effort") else 1))
+    changes = {name: np.array(values) for name, values in fields.items() if name != "kind"}
+    order = np.argsort(place)
+    for name in ("mass", "inertia", *BODY_FIELDS):
+        changes[name] = getattr(model, name)[order]
+    return replace(model, kind=tuple(fields["kind"]), spring_body=world[model.spring_body], **changes)
+
+
+def joints_as_rods(model: Model) -> Model:
+    """Make ball joints and rods of hinges, universal joints and welds that have no elements.
+
+    Args:
+        model: a tree.
+
+    Returns:
+        The same mechanism; the model itself where it has none of them.
+
+    """
+    chosen = [k for k in range(model.n) if _is_ball_and_rows(model, k)]
+    size = float(np.mean(np.linalg.norm(model.point, axis=2))) or 1.0
+    body, point, kind = [], [], list[Kind](model.kind)
+    for k in chosen:
+        axes = rotation_matrix(model.turn[k]).mT * size  # [side, axis]: a vector in that side's body
+        for one, other in KINDS[model.kind[k]].rows[3:]:
+            ends = np.array([axes[0, "xyz".index(one)], axes[1, "XYZ".index(other)]])
+            body.append(model.body[k])
+            point.append(model.point[k] + ends)
+        kind[k] = "ball"
+    if not chosen:
+        return model
+    new = len(body)
+    kind += ["rod"] * new
+    identity = np.tile([1.0, 0.0, 0.0, 0.0], (new, 2, 1))
+    elements = {name: np.concatenate([getattr(model, name), np.zeros((new, 2))]) for name in JOINT_ELEMENTS}
+    return replace(
+        model,
+        kind=tuple(kind),
+        body=np.concatenate([model.body, body]),
+        point=np.concatenate([model.point, point]),
+        turn=np.concatenate([model.turn, identity]),
+        length=np.concatenate([model.length, np.full(new, np.sqrt(2.0) * size)]),
+        **elements,
+    )
+
+
+def _is_ball_and_rows(model: Model, k: int) -> bool:
+    rows = KINDS[model.kind[k]].rows
+    has_elements = any(np.any(getattr(model, name)[k]) for name in JOINT_ELEMENTS)
+    return rows[:3] == KINDS["ball"].rows and len(rows) > 3 and not has_elements
+
+
+def state_of_balls(model: Model, state: State) -> State:
+    """Describe a state for a mechanism in which ball joints have taken the place of other joints.
+
+    Args:
+        model: that mechanism.
+        state: of the first one.
+
+    Returns:
+        The same state.
+
+    """
+    has_coordinates = np.array([not KINDS[kind].has_attitude for kind in model.kind[: model.n]])[:, None]
+    x, xdot = (np.where(has_coordinates, values, 0.0) for values in (state.x, state.xdot))
+    return complete_state(model, replace(state, x=x, xdot=xdot))
+
+
+def inertia_as_rotors(model: Model) -> Model:
+    """Make rotors of a part of the inertia of bodies on hinges on the world; what is left is physical.
+
+    Args:
+        model: the mechanism.
+
+    Returns:
+        The same mechanism; the model itself where there are no such bodies.
+
+    """
+    inertia, armature = model.inertia.copy(), model.armature.copy()
+    for k in range(model.n):
+        if model.kind[k] == "hinge" and model.body[k, 0] < 0:
+            second = np.trace(inertia[k]) / 2 * np.eye(3) - inertia[k]  # moments of the mass, ∫ x xᵀ dm
+            part = float(np.linalg.eigvalsh(second)[0])
+            z = rotation_matrix(model.turn[k, 1])[:, 2]
+            inertia[k] -= part * np.outer(z, z)
+            armature[k, 0] += part
+    is_same = np.array_equal(armature, model.armature)
+    return model if is_same else replace(model, inertia=inertia, armature=armature)
+
+
+def springs_as_loads(model: Model, state: State) -> Model:
+    """Make efforts of springs and dampers of joints, and loads of those between points, at one state.
+
+    Args:
+        model: the mechanism.
+        state: the state.
+
+    Returns:
+        The mechanism with the same forces at this state; springs and dampers of ball joints, and of joints
+        that close loops, stay.
+
+    """
+    effort, stiffness, damping = model.effort.copy(), model.stiffness.copy(), model.damping.copy()
+    scalar = np.array([kind != "ball" for kind in model.kind[: model.n]])[:, None]
+    pull = -stiffness[: model.n] * (state.x - model.rest[: model.n]) - damping[: model.n] * state.xdot
+    effort[: model.n] += np.where(scalar, pull, 0.0)
+    for values in (stiffness, damping):
+        values[: model.n] = np.where(scalar, 0.0, values[: model.n])
+    force, moment = model.force.copy(), model.moment.copy()
+    a = rotation_matrix(state.p)
+    for i, d in enumerate(spring_vectors(model, state.r, state.p)):
+        length, pair = float(np.linalg.norm(d)), model.spring_body[i]
+        ends = [
+            state.v[b] + a[b] @ cross(state.omega[b], at) if b >= 0 else np.zeros(3)
+            for b, at in zip(pair, model.spring_point[i], strict=True)
+        ]
+        tension = model.spring_stiffness[i] * (length - model.spring_length[i])
+        tension += model.spring_damping[i] * float((ends[1] - ends[0]) @ d) / length
+        for b, at, sign in zip(pair, model.spring_point[i], (1.0, -1.0), strict=True):
+            if b >= 0:
+                push = sign * tension * d / length
+                force[b] += push
+                moment[b] += cross(at, rotate_vectors(a[b].T, push))
+    none: dict[str, Any] = {name: getattr(model, name)[:0] for name in SPRING_FIELDS}
+    return replace(
+        model, effort=effort, stiffness=stiffness, damping=damping, force=force, moment=moment, **none
+    )
