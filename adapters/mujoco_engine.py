@@ -405,10 +405,15 @@ def _extrapolated(tree: _MujocoChain, cut: CutMechanism, state: State, largest: 
         answer = determinate_part(cut.source, state, cut.source_quantities(tree.quantities(there)))
         found.append({name: np.asarray(x) for name, x in vars(answer).items() if x is not None})
     limit: dict[str, Array] = {}
-    length, size = wrench_length(cut.source), float(np.max(np.abs(found[-1]["acceleration"])))
+    length = wrench_length(cut.source)
+    size = max(
+        float(np.max(np.abs(found[-1][name]))) * unit
+        for name, unit in (("acceleration", 1.0), ("angular_acceleration", length))
+    )
     force = size * float(np.max(cut.source.mass))
     # what rounding of the others leaves of each, where itself it is small
-    sizes = {"angular_acceleration": size / length, "joint_reaction": force, "joint_moment": length * force}
+    sizes = {"joint_reaction": force, "joint_moment": length * force}
+    sizes |= {"acceleration": size, "angular_acceleration": size / length}
     for name, last in found[-1].items():
         column = [answers[name] for answers in found]
         steps = [float(np.max(np.abs(x - y))) for x, y in pairwise(column)]

@@ -236,7 +236,7 @@ def springs_as_loads(model: Model, state: State) -> Model:
 
     Args:
         model: the mechanism.
-        state: the state.
+        state: where it is; angles count full turns.
 
     Returns:
         The mechanism with the same forces at this state; springs and dampers of ball joints, and of joints
