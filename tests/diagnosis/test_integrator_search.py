@@ -11,12 +11,20 @@ from plumbline.diagnosis.integrator_search import UNEXPLAINED, explain_steps
 from plumbline.engines.registry import load_adapter
 from plumbline.truth import step_formulas
 from tests.helpers.planted_steps import STEP_DEFECTS, planted_step, words_for
+from tests.helpers.shared_answers import sharing
 from tests.judging.test_step import methods, stepped, subject
 
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(engine)
 if not step_formulas.HAS_EXTENDED_PRECISION:
     pytest.skip("no extended precision on this machine", allow_module_level=True)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_steps():
+    """Other formulas take the same steps for every defect of a pendulum."""
+    with sharing("plumbline.truth.step_comparison", "joint_space_steps", "state_rounding_bound"):
+        yield
 
 
 def explanation(adapter, integrator, joints="balls", has_drag=False, change=lambda model: model):

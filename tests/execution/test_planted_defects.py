@@ -4,8 +4,6 @@ The list, its sizes and the words a diagnosis must use are in `planted`, committ
 was written; the defects here that must *not* be named came after it.
 """
 
-import hashlib
-import pickle
 import zlib
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
@@ -15,7 +13,6 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from plumbline.diagnosis import fit
 from plumbline.diagnosis.diagnose import diagnose
 from plumbline.engines.calls import Evaluation
 from plumbline.engines.registry import load_adapter
@@ -42,31 +39,16 @@ from tests.helpers.planted_defects import (
     plant,
     with_coordinates,
 )
+from tests.helpers.shared_answers import sharing
 
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(engine)
 
 
-def by_content(function):
-    """The function with its answers kept by the content of the arguments."""
-    known = {}
-
-    def call(*arguments):
-        key = hashlib.sha256(pickle.dumps(arguments)).digest()
-        if key not in known:
-            known[key] = function(*arguments)
-        return known[key]
-
-    return call
-
-
 @pytest.fixture(scope="module", autouse=True)
 def shared_predictions():
-    """Most hypotheses predict the same for every defect of a pendulum, so that they are computed once."""
-    with (
-        patch.object(fit, "evaluate_case", by_content(fit.evaluate_case)),
-        patch.object(fit, "state_rounding_bound", by_content(fit.state_rounding_bound)),
-    ):
+    """Most hypotheses predict the same for every defect of a pendulum."""
+    with sharing("plumbline.diagnosis.fit", "evaluate_case", "state_rounding_bound"):
         yield
 
 
