@@ -7,6 +7,8 @@ the list (it has no joint) is the ground.
     hinge, slide    q = x;  v_e = v
     M, f of M q̈ = f by the implicit solver's ComputeMassMatrix and ComputeODE2RHS;  h = −f
     poses   Robot.JointHT
+    damping   motorViscousFriction of the list, which the caller may apply; the toolbox fills it with the
+              URDF's friction and reads no damping
 
 Exudyn 1.13 calls functions of the Robotics Toolbox that version 1.5 no longer has, and 1.1 needs NumPy 1: the
 loader has an environment of its own.
@@ -15,6 +17,7 @@ loader has an environment of its own.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -120,9 +123,10 @@ def _body(link: dict[str, Any], links: list[dict[str, Any]]) -> NeutralBody:
     kind, axis = link["jointType"][0], AXES[link["jointType"][1]]
     turning, shift = (axis, np.zeros(3)) if kind == "R" else (np.zeros(3), axis)
     placement = np.array(link["preHT"], float)
+    joint = joint_from_screw(link["joint"], turning, shift)
     return NeutralBody(
         link["name"], link["parent"], placement[:3, 3].copy(), quaternion_of(placement[:3, :3]),
-        (joint_from_screw(link["joint"], turning, shift),), float(link["mass"]),
+        (replace(joint, damping=float(link["motorViscousFriction"])),), float(link["mass"]),
         np.array(link["com"], float), np.array(link["inertiaCOM"], float),
     )  # fmt: skip
 

@@ -18,6 +18,7 @@ from plumbline.cli import options
 from plumbline.cli.console import ProgressDisplay, count_noun, make_console
 from plumbline.cli.help_texts import EXIT_CODES, examples
 from plumbline.cli.verdict_matrix import coloured_glyph, engine_heading
+from plumbline.diagnosis.importer_cause import Explanation
 from plumbline.engines.environments import split_version, version_problem
 from plumbline.engines.registry import IMPORTERS
 from plumbline.execution.model_run import ModelPlan, ModelRunResult, run_model_files
@@ -25,7 +26,7 @@ from plumbline.importers.neutral_model import Feature
 from plumbline.judging.model_file import MODEL_UNITS, REFUSED, FileResult
 from plumbline.judging.rows import Row, Verdict
 from plumbline.processes.workers import Limits
-from plumbline.scenario.errors import MAX_LISTED_PROBLEMS, did_you_mean
+from plumbline.scenario.errors import MAX_LISTED_PROBLEMS, did_you_mean, shorten
 from plumbline.storage.results_store import row_record, to_json_value
 
 COLUMN_HEADINGS = {
@@ -35,7 +36,7 @@ COLUMN_HEADINGS = {
     "kinetic_energy": "kinetic", "potential_energy": "potential", "rewritings": "rewritten",
 }  # fmt: skip
 MAX_STATES = 10_000
-OWN_REASONS = ("damping", "rewritings")  # quantities whose differences are no part of a cause
+MAX_REASON = 400  # characters on the terminal; the results have all
 
 
 def _choose_importers(_: click.Context, __: click.Parameter, names: Sequence[str]) -> tuple[str, ...]:
@@ -195,6 +196,7 @@ def model_document(result: ModelRunResult) -> dict[str, Any]:
                 "degrees_of_freedom": file.model.velocity_count,
                 "rows": [row_record(row) for row in file.rows],
                 "causes": list(_cause_records(file)),
+                "unproved": [name for name, e in file.explanations.items() if not e.is_proved],
                 "drawing": [
                     {
                         "name": body.name,
@@ -271,13 +273,14 @@ def _reasons(name: str, rows: Sequence[Row], file: FileResult) -> list[str]:
     """Say why an importer's rows do not agree: proved causes, else each row's reason."""
     silent = (Verdict.AGREES, Verdict.INFORMATION, Verdict.NOT_INSTALLED)
     bad = [row for row in rows if row.verdict not in silent and row.known_issue is None]
-    explanation = file.explanations.get(name)
-    if explanation is not None and explanation.causes and bad:
-        lines = [f"{coloured_glyph(bad[0])} {escape(cause.sentence)}" for cause in explanation.causes]
-        return lines + [f"{coloured_glyph(r)} {escape(r.reason)}" for r in bad if r.quantity in OWN_REASONS]
+    explanation = file.explanations.get(name) or Explanation(is_proved=True)
     refused = [row for row in rows if row.verdict == Verdict.INFORMATION and row.reason.startswith(REFUSED)]
-    lines = [f"{coloured_glyph(row)} {escape(f'{row.engine}: {row.reason}')}" for row in (*bad, *refused)]
-    if explanation is not None and bad:
+    unexplained = [row for row in bad if row.diagnosis is None]
+    lines = [f"{coloured_glyph(bad[0])} {escape(cause.sentence)}" for cause in explanation.causes if bad]
+    for row in (*unexplained, *refused):
+        words = shorten(" ".join(row.reason.split()), MAX_REASON)
+        lines.append(f"{coloured_glyph(row)} {escape(f'{row.engine}: {words}')}")
+    if bad and not explanation.is_proved:
         fields = Counter(change.field for change in explanation.differences)
         words = ", ".join(f"{field} ({count})" for field, count in fields.items()) or "nothing"
         lines.append(f"  no cause is proved; its description differs from the file in: {escape(words)}")

@@ -39,8 +39,10 @@ from plumbline.truth.model_comparison import (
 RELATIVE_CHANGE = 1e-11  # differences of descriptions below this are rounding
 JOINT_FIELDS = ("axis", "anchor", "reference", "armature", "damping", "stiffness", "spring_reference")
 BODY_FIELDS = ("position", "attitude", "mass", "center", "inertia")
-DEFAULT_INERTIAL = "default inertial"
+DEFAULT_INERTIAL = "default inertial"  # 1 kg and 1 kg m² for each body without mass
+ASSUMED_INERTIAL = "assumed inertial"  # other values for bodies without <inertial>, as from geometry
 FRAME = "frame"
+MISSING = "missing body"
 FRAME_FIELDS = ("position", "attitude", "anchor", "reference")  # which may describe one pose in several ways
 MAX_OMISSIONS = 4
 ARMATURE_ENERGY = "armature in the kinetic energy"
@@ -121,7 +123,29 @@ def explain_importer(
         The causes, each with a sentence, or the differences of the descriptions where nothing is proved.
 
     """
-    structure, moved = _with_joints_of(model, reading)
+    without = _without_missing(model, reading)
+    if without is not model:
+        found = _explain(title, without, model, reading, answers, states)
+        if found.is_proved:
+            return found
+    return _explain(title, model, model, reading, answers, states)
+
+
+def _explain(
+    title: str,
+    start: NeutralModel,
+    model: NeutralModel,
+    reading: NeutralModel,
+    answers: Sequence[ModelQuantities],
+    states: States,
+) -> Explanation:
+    """Explain from a model that lacks bodies already, or is whole."""
+    structure, moved = _with_joints_of(start, reading)
+    if start is not model:
+        read = {body.name for body in reading.bodies}
+        left_out = [body for body in model.bodies if body.joints and body.name not in read]
+        structure = [c for c in structure if c.body in read]
+        structure += [Change(MISSING, body.name, "", body, None, body.source) for body in left_out]
     own, theirs = lump_fixed_bodies(moved), lump_fixed_bodies(reading)
     changes = _single_parts(differences(own, theirs), moved, theirs)
     trial = _Trial(own, theirs, reading, answers, states, bool(structure))
@@ -135,6 +159,47 @@ def explain_importer(
     remaining = trial.remaining(found, len(answers))
     causes = _causes(title, [*structure, *found], remaining)
     return Explanation(causes, remaining, is_proved=True)
+
+
+def _without_missing(model: NeutralModel, reading: NeutralModel) -> NeutralModel:
+    """Take the mass from moving bodies that the importer does not have; the same object where it has all."""
+    read = {body.name for body in reading.bodies}
+    if all(body.name in read for body in model.bodies if body.joints):
+        return model
+    bodies, is_left_out = [], [False] * len(model.bodies)
+    for k, body in enumerate(model.bodies):
+        is_below = body.parent >= 0 and is_left_out[body.parent]
+        is_left_out[k] = body.name not in read and (bool(body.joints) or is_below)
+        empty = replace(body, mass=0.0, center=np.zeros(3), inertia=np.zeros((3, 3)))
+        bodies.append(empty if is_left_out[k] else body)
+    return replace(model, bodies=tuple(bodies))
+
+
+def damping_cause(title: str, model: NeutralModel, reading: NeutralModel) -> Cause | None:
+    """Compare the damping that an importer holds for the user's own forces and its engine does not apply.
+
+    It enters no quantity: the proof is the number in the importer's own model.
+
+    Args:
+        title: name and version of the importer's engine, for the sentence.
+        model: what the file says.
+        reading: the importer's description.
+
+    Returns:
+        The joints whose damping differs; None where there are none.
+
+    """
+    read = {joint.name: joint.damping for joint in reading.joints}
+    changes = [
+        Change("damping", body.name, j.name, j.damping, read[j.name], j.fields.get("damping", j.source))
+        for body in model.bodies
+        for j in body.joints
+        if j.name in read and _differs(j.damping, read[j.name], 0.0)
+    ]
+    if not changes:
+        return None
+    phrase = _describe(changes)
+    return Cause("damping", tuple(changes), phrase, f"{title} {phrase}; its equations do not use it.")
 
 
 def _with_joints_of(model: NeutralModel, reading: NeutralModel) -> tuple[list[Change], NeutralModel]:
@@ -183,13 +248,17 @@ def _single_part(parts: Sequence[tuple[NeutralBody, Array, Array]], read: Neutra
                 carrier = parts[0][0].name
                 return Change(name, part.name, "", own, new, source, also=also, carrier=carrier)
     empty = [part for part, _, _ in parts if part.mass == 0 and not np.any(part.inertia)]
-    given = [
-        (replace(part, mass=1.0, inertia=np.eye(3)) if part in empty else part, position, A)
-        for part, position, A in parts
-    ]
-    if empty and _is_same_inertial(_merge(given), read):
-        names, source = ", ".join(part.name for part in empty), empty[0].source
-        return Change(DEFAULT_INERTIAL, names, "", 0.0, 1.0, source, also=also, carrier=parts[0][0].name)
+    unsaid = [part for part in empty if "mass" not in part.fields]  # without <inertial>
+    for chosen in (empty, unsaid):
+        given = [
+            (replace(part, mass=1.0, inertia=np.eye(3)) if part in chosen else part, position, A)
+            for part, position, A in parts
+        ]
+        if chosen and _is_same_inertial(_merge(given), read):
+            return _default_inertial(DEFAULT_INERTIAL, chosen, 1.0, also, parts[0][0].name)
+    if unsaid and read.mass > lumped.mass and _differs(read.mass, lumped.mass, 0.0):
+        added = read.mass - lumped.mass
+        return _default_inertial(ASSUMED_INERTIAL, unsaid, added, also, parts[0][0].name)
     massless = [part for part, _, _ in parts[1:] if part.mass == 0 and np.any(part.inertia)]
     kept = [entry for entry in parts if entry[0] not in massless]
     if massless and not _differs(_merge(kept).inertia, read.inertia, 0.0):
@@ -197,6 +266,13 @@ def _single_part(parts: Sequence[tuple[NeutralBody, Array, Array]], read: Neutra
         source, carrier = massless[0].fields.get("inertia", massless[0].source), parts[0][0].name
         return Change("inertial", names, "", 0.0, 0.0, source, also=also, carrier=carrier)
     return None
+
+
+def _default_inertial(
+    field: str, parts: Sequence[NeutralBody], mass: float, also: Mapping[str, Any], carrier: str
+) -> Change:
+    names = ", ".join(part.name for part in parts)
+    return Change(field, names, "", 0.0, mass, parts[0].source, also=also, carrier=carrier)
 
 
 def _is_same_inertial(one: NeutralBody, read: NeutralBody) -> bool:
@@ -624,6 +700,15 @@ def _describe(members: Sequence[Change]) -> str:
     if first.field == DEFAULT_INERTIAL:
         names = "; ".join(f"{change.body} ({change.source})" for change in members[:6])
         return f"gives 1 kg and an inertia of 1 kg m² to bodies without mass: {names}"
+    if first.field == ASSUMED_INERTIAL:
+        names = "; ".join(f"{change.body} ({change.source})" for change in members[:6])
+        mass = sum(change.theirs for change in members)
+        return f"gives {mass:.6g} kg in all to bodies without <inertial>: {names}"
+    if first.field == MISSING:
+        names = ", ".join(f"{change.body} ({change.source})" for change in members[:6])
+        more = " …" if len(members) > 6 else ""
+        what = "the body" if len(members) == 1 else f"{len(members)} bodies with their joints and masses:"
+        return f"leaves out {what} {names}{more}"
     if first.field == "additional body":
         names = ", ".join(change.body for change in members[:6])
         return f"adds {'body' if len(members) == 1 else 'bodies'} {names}"

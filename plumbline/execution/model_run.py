@@ -33,7 +33,7 @@ from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.processes.isolation import ScratchFolder
 from plumbline.processes.workers import Executor, Limits, Outcome, Task, WorkerPool
 from plumbline.scenario.errors import Problem, did_you_mean, shorten
-from plumbline.truth.model_comparison import model_states
+from plumbline.truth.model_comparison import model_states, with_names_of
 
 MJCF_READER = "mujoco"  # whose compiled model is the neutral reading of MJCF
 ProgressCallback = Callable[[int, int, str], None]
@@ -113,7 +113,7 @@ class _ModelRun:
         self.describe()
         readings = self.read(prepared)
         models = self.neutral_models(prepared, readings)
-        answers = self.evaluate({shown: prepared[shown] for shown in models}, readings)
+        answers = self.evaluate(prepared, models, readings)
         answers = self.rewrite(prepared, answers)
         files = list(self.judge(models, answers))
         known = KnownIssues(self.plan.known_issues, False)
@@ -231,19 +231,25 @@ class _ModelRun:
         return found
 
     def evaluate(
-        self, prepared: Mapping[str, PreparedFile], readings: Mapping[tuple[str, str], Answer]
+        self,
+        prepared: Mapping[str, PreparedFile],
+        models: Mapping[str, NeutralModel],
+        readings: Mapping[tuple[str, str], Answer],
     ) -> dict[tuple[str, str], Answer]:
         """Evaluate the quantities at the states of each reading."""
         answers = {
             key: answer
             for key, answer in readings.items()
-            if key[0] in prepared and key[1] in self.plan.importers
+            if key[0] in models and key[1] in self.plan.importers
         }
         tasks = []
         for (shown, name), answer in answers.items():
             if answer.reading is not None and answer.reading.model is not None:
-                states = self.states(shown, answer.reading.model)
-                answers[shown, name] = replace(answer, states=states)
+                model = with_names_of(models[shown], answer.reading.model)
+                states = self.states(shown, model)
+                answers[shown, name] = replace(
+                    answer, reading=replace(answer.reading, model=model), states=states
+                )
                 file = prepared[shown].file
                 tasks.append(self.task("evaluate", shown, name, evaluate_model_file, file, states))
         for outcome in self.outcomes(tasks):

@@ -255,29 +255,39 @@ def write_xml_in_place(root: Element) -> str:
     return "".join(parts) + "\n"
 
 
-def write_xml(root: Element) -> str:
+def write_xml(root: Element, width: int = 0) -> str:
     """Write a tree as text.
 
     Args:
         root: the root element.
+        width: so many characters of a line are filled with whole elements; 0: an element per line.
 
     Returns:
-        The text, an element per line.
+        The text.
 
     """
-    lines: list[str] = []
+    lines: list[tuple[int, str, bool]] = []  # depth, text, whether it is whole elements
     stack: list[tuple[int, Element | str]] = [(0, root)]
     while stack:
         depth, item = stack.pop()
         if isinstance(item, str):
-            lines.append("  " * depth + item)
+            lines.append((depth, item, False))
             continue
         head = f"<{item.tag}" + "".join(f" {k}={quoteattr(v)}" for k, v in item.attributes.items())
+        flat = ""
         if not item.children:
             text = escape(item.text)
-            lines.append("  " * depth + (f"{head}>{text}</{item.tag}>" if text else f"{head}/>"))
+            flat = f"{head}>{text}</{item.tag}>" if text else f"{head}/>"
+        elif depth and len(head) < width:
+            whole = "".join(line.strip() for line in write_xml(item).splitlines())
+            flat = whole if len(whole) + 2 * depth <= width else ""
+        if flat:
+            before = lines[-1] if lines else (-1, "", False)
+            if before[0] == depth and before[2] and 2 * depth + len(before[1] + flat) <= width:
+                flat = lines.pop()[1] + flat
+            lines.append((depth, flat, True))
             continue
-        lines.append("  " * depth + head + ">" + escape(item.text))
+        lines.append((depth, head + ">" + escape(item.text), False))
         stack.append((depth, f"</{item.tag}>"))
         stack.extend((depth + 1, child) for child in reversed(item.children))
-    return "\n".join(lines) + "\n"
+    return "\n".join("  " * depth + text for depth, text, _ in lines) + "\n"

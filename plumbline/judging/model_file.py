@@ -12,7 +12,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from plumbline.diagnosis.importer_cause import Explanation, describe_difference, explain_importer
+from plumbline.diagnosis.importer_cause import (
+    Cause,
+    Explanation,
+    damping_cause,
+    describe_difference,
+    explain_importer,
+)
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.environments import declared_importer_attribute, split_version
 from plumbline.importers.importer import Reading
@@ -129,15 +135,19 @@ def judge_answer(
     if order is None:
         return rows
     worst = mismatches(model, truths, [permuted(one, order) for one in answer.quantities])
+    is_singular = bool(model.joints) and any(truth.quantities.acceleration is None for truth in truths)
     for quantity, unit in MODEL_UNITS.items():
         if quantity in unsupported:
             reason = unsupported[quantity]
             rows.append(context.make_row("model", "-", quantity, Verdict.INFORMATION, reason, unit))
         elif quantity in worst:
             rows.append(_quantity_row(context, quantity, unit, worst[quantity], len(truths)))
-    if model.joints and any(truth.quantities.acceleration is None for truth in truths):
-        reason = "the mass matrix is singular: a joint moves no mass, so that no acceleration is defined"
-        rows.append(context.make_row("model", "-", "acceleration", Verdict.INFORMATION, reason, "SI"))
+        elif quantity == "acceleration" and is_singular:
+            reason = "the mass matrix is singular: a joint moves no mass, so that no acceleration is defined"
+            rows.append(context.make_row("model", "-", quantity, Verdict.INFORMATION, reason, unit))
+        elif any(getattr(one, quantity, 0.0) is None for one in answer.quantities):
+            reason = "the importer's engine computes it of other files, not of this one"
+            rows.append(context.make_row("model", "-", quantity, Verdict.INFORMATION, reason, unit))
     return rows
 
 
@@ -175,30 +185,17 @@ def _mass_row(context: RowContext, model: NeutralModel, reading: NeutralModel) -
     )
 
 
-def _damping_row(context: RowContext, model: NeutralModel, reading: NeutralModel) -> Row:
+def _damping_row(context: RowContext, cause: Cause | None) -> Row:
     """The damping that an importer holds and whose engine does not apply: for the user's own forces."""
-    read = {joint.name: joint.damping for joint in reading.joints}
-    wrong = [
-        (joint, read[joint.name])
-        for joint in model.joints
-        if joint.name in read and abs(read[joint.name] - joint.damping) > MASS_ROUNDING * joint.damping
-    ]
-    if not wrong:
-        reason = "the damping of every joint is read as the file says"
-        return context.make_row(
-            "model", "-", "damping", Verdict.AGREES, reason, "SI", value=0.0, tolerance=0.0
-        )
-    joint, value = wrong[0]
-    error = max(abs(value - joint.damping) for joint, value in wrong)
-    count = f" and of {len(wrong) - 1} other joints" if len(wrong) > 1 else ""
-    source = joint.fields.get("damping", joint.source)
-    reason = (
-        f"{context.title} {context.version} reads the damping of joint {joint.name}{count} as {value:g}; "
-        f"the file says {joint.damping:g} ({source}); its equations do not use it"
-    )
+    if cause is None:
+        reason, error = "the damping of every joint is read as the file says", 0.0
+    else:
+        reason, error = cause.sentence, max(abs(change.theirs - change.own) for change in cause.changes)
+    verdict = Verdict.DISAGREES if cause else Verdict.AGREES
     return context.make_row(
-        "model", "-", "damping", Verdict.DISAGREES, reason, "SI", value=error, tolerance=0.0, diagnosis=reason
-    )
+        "model", "-", "damping", verdict, reason, "SI", value=error, tolerance=0.0,
+        diagnosis=reason if cause else None,
+    )  # fmt: skip
 
 
 def rewriting_row(context: RowContext, model: NeutralModel, rewritten: Mapping[str, Reading]) -> Row:
@@ -229,9 +226,8 @@ def rewriting_row(context: RowContext, model: NeutralModel, rewritten: Mapping[s
         reason = f"{context.title} {context.version} compiles equivalent files to different models: {reason}"
     if len(refused) == len(rewritten):
         verdict = Verdict.INFORMATION
-    value, diagnosis = float(len(wrong)), reason if wrong else None
     return context.make_row(
-        "model", "-", "rewritings", verdict, reason, "1", value=value, tolerance=0.0, diagnosis=diagnosis
+        "model", "-", "rewritings", verdict, reason, "1", value=float(len(wrong)), tolerance=0.0
     )
 
 
@@ -313,7 +309,11 @@ def judge_file(
             explanations[name] = explanation = _explain(context, judged[0], answer, states, applies)
             found = [_with_diagnosis(row, explanation) for row in found]
         if not applies and answer.reading is not None and answer.reading.model is not None:
-            found.append(_damping_row(context, model, answer.reading.model))
+            cause = damping_cause(f"{info.title} {info.version}", model, answer.reading.model)
+            found.append(_damping_row(context, cause))
+            if cause is not None:
+                known = explanations.get(name, Explanation(is_proved=True))
+                explanations[name] = replace(known, causes=(*known.causes, cause))
         if answer.rewritten and answer.reading is not None and answer.reading.model is not None:
             found.append(rewriting_row(context, answer.reading.model, answer.rewritten))
         rows += found
@@ -334,5 +334,6 @@ def _explain(
 def _with_diagnosis(row: Row, explanation: Explanation) -> Row:
     if row.verdict != Verdict.DISAGREES:
         return row
-    sentence = explanation.sentence or "no change of the model's parameters reproduces it"
-    return replace(row, diagnosis=sentence)
+    if explanation.is_proved:
+        return replace(row, diagnosis=explanation.sentence)
+    return replace(row, reason=f"{row.reason}; no change of the model's parameters reproduces it")

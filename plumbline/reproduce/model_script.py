@@ -38,16 +38,19 @@ from plumbline.truth.model_comparison import (
     mismatches,
     model_states,
     permuted,
+    with_names_of,
 )
 
-FORMS = ("mujoco", "pinocchio", "drake", "dart")
+FORMS = ("mujoco", "pinocchio", "exudyn", "drake", "dart")
 SHRINKING_SECONDS = 60.0
 SHRINKING_STATES = 2
 TASK_SECONDS = 30.0
 SHOWN_QUANTITIES = (  # in the order in which they are preferred: the simplest to understand first
     "position", "mass_matrix", "gravity_force", "passive_force", "bias_force", "acceleration",
 )  # fmt: skip
+PRINTED = ("joints", "damping", *SHOWN_QUANTITIES)
 MAX_LINES = 40
+XML_WIDTH = 110  # characters of a line of the file
 
 
 def stored_differences(document: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
@@ -144,7 +147,7 @@ def write_model_script(
         path = bench.write(tree)
         result = bench.judged(path)
         assert result is not None
-        return _render(bench, form, result, write_xml(tree), since)
+        return _render(bench, form, result, write_xml(tree, XML_WIDTH), since)
 
 
 def _differs(result: FileResult) -> bool:
@@ -158,8 +161,11 @@ def _signature(explanation: Explanation | None) -> frozenset[tuple[str, bool]]:
 
 
 def _shows(result: FileResult, importer: str, wanted: frozenset[tuple[str, bool]]) -> bool:
-    """Whether a file shows one of the causes and nothing else; without one: an unexplained difference."""
-    if not _differs(result):
+    """Whether a file shows one of the causes and nothing else; without one: an unexplained difference.
+
+    The number that a script prints has to differ too.
+    """
+    if not any(row.verdict == Verdict.DISAGREES and row.quantity in PRINTED for row in result.rows):
         return False
     found = _signature(result.explanations.get(importer))
     return bool(found) and found <= wanted if wanted else not found
@@ -197,7 +203,7 @@ class _Bench:
         """Write a changed file."""
         suffix = ".urdf" if tree.tag == "robot" else ".xml"
         path = self.folder / f"changed{suffix}"
-        path.write_text(write_xml(tree), encoding="utf-8")
+        path.write_text(write_xml(tree, XML_WIDTH), encoding="utf-8")
         return path
 
     def judged(self, path: Path) -> FileResult | None:
@@ -213,6 +219,8 @@ class _Bench:
         reading: Reading | None = self.call(read_model_file, self.name, prepared.file)
         if reading is None or reading.model is None or not model.joints:
             return None
+        reading = replace(reading, model=with_names_of(model, reading.model))
+        assert reading.model is not None
         states = model_states(reading.model, SHRINKING_STATES, state_seed(str(path)))
         quantities = self.call(evaluate_model_file, self.name, prepared.file, states)
         if quantities is None:
@@ -242,6 +250,8 @@ def _render(bench: _Bench, form: str, result: FileResult, text: str, since: str)
     reading = bench.answer.reading
     assert reading is not None and reading.model is not None
     number = _shown_number(bench, result.model, reading.model)
+    if number is None:
+        number = _shown_damping(form, explanation, reading.model)
     sentences = [] if explanation is None else [cause.sentence for cause in explanation.causes]
     why = " ".join(sentences).replace(f"{bench.prepared.shown}:", "line ")
     environment = Environment(
@@ -292,8 +302,18 @@ def _simple_states(model: NeutralModel) -> list[CanonicalState]:
     return rows
 
 
-def _shown_number(bench: _Bench, model: NeutralModel, reading: NeutralModel) -> _Shown:
-    """Choose the number that the script prints."""
+def _shown_damping(form: str, explanation: Explanation | None, reading: NeutralModel) -> _Shown:
+    """The damping that Exudyn's loader returns for the caller's use: no quantity of the engine shows it."""
+    change = next((c for cause in explanation.causes for c in cause.changes), None) if explanation else None
+    if form != "exudyn" or change is None or change.field != "damping":
+        raise NoModelScript("the difference does not show at a state with round numbers")
+    names = [joint.name for joint in reading.joints]
+    place, label = names.index(change.joint), f"damping of joint {change.joint}"
+    return _Shown("damping", (place,), label, _simple_states(reading)[0], change.theirs, change.own)
+
+
+def _shown_number(bench: _Bench, model: NeutralModel, reading: NeutralModel) -> _Shown | None:
+    """Choose the number that the script prints; None where no quantity differs at a simple state."""
     order = joint_permutation(model, reading)
     if order is None:
         count = float(reading.velocity_count)
@@ -323,7 +343,7 @@ def _shown_number(bench: _Bench, model: NeutralModel, reading: NeutralModel) -> 
             difference = np.abs(values[0] - values[1])
             index = tuple(int(i) for i in np.unravel_index(int(np.argmax(difference)), difference.shape))
             return _Shown(quantity, index, label, state, float(values[0][index]), float(values[1][index]))
-    raise NoModelScript("the difference does not show at a state with round numbers")
+    return None
 
 
 def _reordered(state: CanonicalState, reading: NeutralModel, model: NeutralModel) -> CanonicalState:

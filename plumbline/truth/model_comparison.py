@@ -94,6 +94,29 @@ def joint_keys(model: NeutralModel) -> list[tuple[str, str]]:
     ]
 
 
+def with_names_of(model: NeutralModel, reading: NeutralModel) -> NeutralModel:
+    """Name an importer's parts of a planar joint as the model does: a URDF gives one name for all three.
+
+    Args:
+        model: the neutral model, whose parts are called "<joint>/x", "<joint>/y" and "<joint>/angle".
+        reading: of an importer.
+
+    Returns:
+        The reading with the model's names where the kinds of the parts are the same; else unchanged.
+
+    """
+    named = {body.name: body.joints for body in model.bodies}
+    bodies = []
+    for body in reading.bodies:
+        own = named.get(body.name, ())
+        is_planar = len(own) == 3 and own[0].name.endswith("/x")
+        if is_planar and [j.kind for j in own] == [j.kind for j in body.joints]:
+            joints = tuple(replace(j, name=k.name) for j, k in zip(body.joints, own, strict=True))
+            body = replace(body, joints=joints)
+        bodies.append(body)
+    return replace(reading, bodies=tuple(bodies))
+
+
 def joint_permutation(model: NeutralModel, reading: NeutralModel) -> list[int] | None:
     """Find the velocities of a model among those of an importer's reading.
 

@@ -138,6 +138,45 @@ def test_bad_options_exit_with_2(tmp_path, arguments, message):
     assert message in " ".join(result.stderr.replace("│", "").split())
 
 
+LINK = '<link name="NAME"><inertial><mass value="1.5"/><inertia ixx="0.1" ixy="0.02" ixz="0" iyy="0.2" '
+LINK += 'iyz="0" izz="0.15"/></inertial></link>'
+BOX = "<geometry><box size='0.1 0.1 0.1'/></geometry>"
+ASSUMED = f"""<robot name="r"><link name="base"/><link name="a"/>
+<link name="b"><visual>{BOX}</visual><collision>{BOX}</collision></link>{LINK.replace("NAME", "d")}
+<joint name="j" type="continuous"><parent link="base"/><child link="a"/><axis xyz="0 0 1"/></joint>
+<joint name="f" type="fixed"><parent link="a"/><child link="b"/></joint>
+<joint name="g" type="fixed"><parent link="b"/><child link="d"/><origin xyz="0 0.2 0.1"/></joint></robot>"""
+PLANAR = f"""<robot name="r"><link name="base"/>{LINK.replace("NAME", "a")}
+<joint name="p" type="planar"><parent link="base"/><child link="a"/><axis xyz="0 0 1"/></joint></robot>"""
+FRAME = """<mujoco model="m"><worldbody><body name="trunk"><joint name="j0" axis="0 0 1"/>
+<inertial pos="0 0 0" mass="5" diaginertia="1 1 1"/>
+<frame pos="0.2 0 0"><body name="thigh"><joint name="j1"/><inertial pos="0 0 1" mass="1" diaginertia="1 1 1"/>
+<body name="shin"><joint name="j2"/><inertial pos="0 0 1" mass="1" diaginertia="1 1 1"/></body></body></frame>
+</body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "importer", "phrases"),
+    [
+        ("assumed.urdf", ASSUMED, "mujoco", ["gives 1 kg in all to bodies without <inertial>: a, b "]),
+        ("assumed.urdf", ASSUMED, "pinocchio", []),
+        ("planar.urdf", PLANAR, "mujoco", []),
+        ("frame.xml", FRAME, "pinocchio", ["leaves out 2 bodies with their joints and masses: thigh "]),
+        ("frame.xml", FRAME, "mujoco", []),
+    ],
+)
+def test_features_that_robots_use_are_described_in_their_own_words(tmp_path, name, text, importer, phrases):
+    path = tmp_path / name
+    path.write_text(text)
+    result = run_model_files(ModelPlan((str(path),), (importer,), True, state_count=2), lambda *_: None)
+    (file,) = result.files
+    explanation = file.explanations.get(importer)
+    found = [cause.phrase for cause in explanation.causes] if explanation else []
+    assert len(found) == len(phrases), found
+    assert all(one.startswith(wanted) for one, wanted in zip(found, phrases, strict=True)), found
+    assert result.exit_code == bool(phrases)
+
+
 @pytest.mark.parametrize("is_named", [False, True])
 def test_a_refusal_is_an_answer_and_a_gap_only_where_the_importer_was_named(tmp_path, is_named):
     path = tmp_path / "massless.urdf"

@@ -125,7 +125,7 @@ def test_a_simulated_defect_of_the_compiler_is_reported_with_the_rewriting(tmp_p
     written, row = judged(tmp_path, ROBOT, defect)
     assert row.verdict == "disagrees"
     assert names <= {name for name in written if f"with {name}, " in row.reason}, row.reason
-    assert row.diagnosis == row.reason and ", as written " in row.reason
+    assert ", as written " in row.reason
 
 
 @pytest.mark.parametrize("seed", range(6))

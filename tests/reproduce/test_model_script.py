@@ -10,6 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from plumbline.cli.main import main
+from plumbline.engines.environments import EnvironmentUnavailable, importer_interpreter
 from plumbline.importers.xml_tree import parse_xml, write_xml
 from plumbline.reproduce.model_script import MAX_LINES, NoModelScript, write_model_script
 from plumbline.reproduce.model_shrink import shrink_tree
@@ -42,6 +43,41 @@ def test_a_script_shows_the_difference_of_the_smallest_file(tmp_path):
     ran = subprocess.run(
         [sys.executable, str(written)], capture_output=True, text=True, cwd=tmp_path, timeout=60
     )
+    assert ran.returncode == 0, ran.stderr
+    value, expected = map(float, re.search(r": (\S+) expected: (\S+)", ran.stdout).groups())
+    assert value == pytest.approx(script.engine_value, rel=1e-12)
+    assert expected == script.expected
+    assert abs(value - expected) > 1e-6
+
+
+ARM = """<robot name="r"><link name="base"/>
+<link name="a"><inertial><origin xyz="0.1 1 0"/><mass value="1.5"/>
+<inertia ixx="0.1" ixy="0" ixz="0" iyy="0.2" iyz="0" izz="0.15"/></inertial></link>
+<joint name="j" type="continuous"><parent link="base"/><child link="a"/>
+<axis xyz="AXIS</joint></robot>
+"""
+
+
+@pytest.mark.parametrize(
+    ("axis", "words"),
+    [
+        ('0 0.6 0.8"/>', "reads the axis of joint j as (0, 0, 1)"),
+        ('0 0 1"/><dynamics damping="0.5" friction="0.2"/>', "reads the damping of joint j as "),
+    ],
+)
+def test_a_script_of_exudyns_loader(tmp_path, axis, words):
+    """The loader turns links about oblique axes, and takes the file's friction for a viscous one."""
+    try:
+        python = importer_interpreter("exudyn")
+    except EnvironmentUnavailable as error:
+        pytest.skip(str(error))
+    path = tmp_path / "arm.urdf"
+    path.write_text(ARM.replace("AXIS", axis))
+    script = write_model_script(str(path), "exudyn", "exudyn", seconds=30, since="Since version 1.9.0.")
+    assert len(script.text.splitlines()) <= MAX_LINES
+    head = " ".join(script.text.split('"""')[1].split())
+    assert words in head and "Since version 1.9.0." in head
+    ran = subprocess.run([python, "-W", "ignore", "-c", script.text], capture_output=True, text=True)
     assert ran.returncode == 0, ran.stderr
     value, expected = map(float, re.search(r": (\S+) expected: (\S+)", ran.stdout).groups())
     assert value == pytest.approx(script.engine_value, rel=1e-12)

@@ -48,7 +48,7 @@ def outcomes(document: Mapping[str, Any]) -> Iterator[tuple[str, str, str, str]]
         verdicts: dict[str, set[str]] = defaultdict(set)
         for row in entry["rows"]:
             verdicts[row["engine"]].add(row["verdict"])
-        explained = {cause["engine"] for cause in entry["causes"]}
+        explained = {cause["engine"] for cause in entry["causes"]} - set(entry.get("unproved", ()))
         for importer, found in verdicts.items():
             if found == {"information"}:
                 continue
