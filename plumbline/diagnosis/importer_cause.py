@@ -123,12 +123,13 @@ def explain_importer(
         The causes, each with a sentence, or the differences of the descriptions where nothing is proved.
 
     """
+    found = _explain(title, model, model, reading, answers, states)
     without = _without_missing(model, reading)
-    if without is not model:
-        found = _explain(title, without, model, reading, answers, states)
-        if found.is_proved:
-            return found
-    return _explain(title, model, model, reading, answers, states)
+    if without is model or (found.is_proved and len(found.causes) == 1):
+        return found
+    left_out = _explain(title, without, model, reading, answers, states)
+    is_simpler = left_out.is_proved and len(left_out.causes) < len(found.causes)
+    return left_out if is_simpler or (left_out.is_proved and not found.is_proved) else found
 
 
 def _explain(
