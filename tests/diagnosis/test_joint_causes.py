@@ -13,6 +13,14 @@ from plumbline.model.kinematics import complete_state
 from plumbline.model.sampling import random_states
 from plumbline.truth.ground_truth import state_truth
 from tests.helpers.planted_elements import ELEMENT_DEFECTS, ElementDefect, subject
+from tests.helpers.shared_answers import sharing
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_predictions():
+    """The effects of most causes are the same for every defect."""
+    with sharing("plumbline.diagnosis.joint_causes", "_predict"):
+        yield
 
 
 @cache
