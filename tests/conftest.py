@@ -20,12 +20,13 @@ ALLOWED_SKIPS = {  # pattern of the skip's reason: why continuous integration ca
 }
 
 LONGEST_FIRST = (  # begun last, one of these would keep one process busy while the others have no work
-    "planted_defects", "report_browser", "integrator_search", "exit_codes", "resume", "dask_cluster",
-    "isolation", "docs", "workers", "nightly", "command_line", "enclosure", "coverage", "step",
-    "honest_engines", "environments", "storage_faults", "damaged_files", "report", "adapter_contract",
-    "sweep", "certified", "scripts", "notes_drift", "mujoco_engine", "metamorphic", "trajectory_truth",
-    "planted_branches", "output_folder", "sensitivity", "rounding_bound", "diagnose", "reference_pages",
-    "selftest",
+    "report_browser", "planted_defects", "docs", "exit_codes", "nightly", "adapter_contract", "resume",
+    "tree_motion", "integrator_search", "command_line", "tree_motions", "trees", "step", "sweep",
+    "enclosure", "coverage", "loops", "workers", "dask_cluster", "honest_engines", "damaged_files",
+    "isolation", "storage_faults", "scripts", "model_script", "selftest", "joint_causes",
+    "planted_branches", "metamorphic", "certified", "pinocchio_engine", "mujoco_engine", "rounding_bound",
+    "collocation", "notes_drift", "output_folder", "exudyn_engine", "reference_pages", "trajectory_truth",
+    "identity", "diagnose", "sensitivity",
 )  # fmt: skip
 LAST = ("matrix",)  # scenario by scenario it fills what is left
 

@@ -99,7 +99,9 @@ def positions_by_step_size(model, state, integrator, coarsest, levels):
     )
 
 
-@pytest.mark.parametrize("joints", ["ball", "balls", "rod"])
+@pytest.mark.parametrize(
+    "joints", ["ball", *(pytest.param(x, marks=pytest.mark.full) for x in ("balls", "rod"))]
+)
 @in_engine_process
 def test_orders_and_limits_at_two_seconds(joints):
     model = pendulums.make_model(JOINT_PATTERNS[joints])
