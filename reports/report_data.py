@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from plumbline.judging.rows import RUN_FAMILY, SHOWN_STYLES
-from plumbline.model.datatypes import KINDS, Array, Model
+from plumbline.model.datatypes import KINDS, Array, Model, State
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
+from plumbline.model.loops import cut_open, determinate_projectors, singular_values
 from plumbline.storage.results_schema import DamagedResults
 from reports.chunks import ChunkBuilder, decimate, decimate_times, log_scale_codes
 from reports.history import History
@@ -164,7 +165,8 @@ def scenario_chunk(name: str, results: Results, tables: ScenarioTables, points: 
     header = {
         "scenario": {
             k: _json_number(v) if isinstance(v, float) else v for k, v in scenario.items() if k != "model"
-        },
+        }
+        | {"loops": _loop_facts(scenario)},
         "rows": details,
         "commands": commands,
         "states": _state_errors(name, tables, packer),
@@ -250,8 +252,10 @@ def _motion_frames(
     """
     poses = tables["trajectories"].get(name, {})
     runs = dict(group_rows(poses, "engine", "integrator"))
-    if not runs or scenario["model"] is None:
+    if scenario["model"] is None:
         return None
+    if not runs:
+        return _still(scenario, packer)
     n = int(scenario["bodies"])
     errors = _final_errors(name, tables)
     engines = dict.fromkeys(engine for engine, _ in runs)
@@ -292,6 +296,45 @@ def _motion_frames(
     return header
 
 
+def _still(scenario: Record, packer: ChunkBuilder) -> Record | None:
+    """Encode the initial state as a motion of one frame; None where the results do not hold its positions."""
+    state = scenario.get("state") or {}
+    if "r" not in state:  # of a chain
+        return None
+    r, p = (np.array(state[name], float) for name in ("r", "p"))
+    span = float(np.max(np.abs(r))) or 1.0
+    none = {"scale": packer.add(np.zeros(1, np.float32)), "d": packer.add(np.zeros(6 * len(r), np.int8))}
+    return {
+        "t": packer.add(np.zeros(1, np.float32)),
+        "bodies": len(r),
+        "base": ["", "t = 0"],
+        "span": span,
+        "r": packer.add(np.round(r / span * 32767).astype(np.int16)),
+        "p": packer.add(np.round(p * 32767).astype(np.int16)),
+        "shape": _body_shapes(scenario),
+        "runs": [{"engine": "", "integrator": "t = 0", **none}],
+    }
+
+
+def _loop_facts(scenario: Record) -> Record | None:
+    """Count the rows that close loops, and what they leave determinate of each joint's wrench."""
+    model = None if scenario["model"] is None else Model.from_fields(scenario["model"])
+    if model is None or not model.has_loops or "r" not in (scenario.get("state") or {}):
+        return None
+    state = State(**{name: np.array(value, float) for name, value in scenario["state"].items()})
+    cut = cut_open(model)
+    projectors = determinate_projectors(model, state)
+    whole = np.full(len(model.kind), 6)
+    return {
+        "closing": list(model.kind[model.n :]),
+        "rows": 6 * len(cut.ends),
+        "independent": len(singular_values(cut, cut.state(state))[1]),
+        "determinate": (whole if projectors is None else np.rint(np.trace(projectors, axis1=1, axis2=2)))
+        .astype(int)
+        .tolist(),
+    }
+
+
 def _run_poses(poses: Columns, rows: np.ndarray, n: int) -> tuple[Array, Array, Array]:
     """Return r (T, n, 3), unit p (T, n, 4) and t (T,) of one run; its records may be in any order."""
     order = rows[np.lexsort((poses["body"][rows], poses["t"][rows]))]
@@ -323,10 +366,12 @@ def rotation_vector(p: Array, p0: Array) -> Array:
 
 
 def _body_shapes(scenario: Record) -> list[Record]:
-    """Return each body's joint with its points and axes, and the box with its principal moments."""
+    """Return each joint's bodies, points and axes, and the box with its body's principal moments.
+
+    Joints that close loops follow those of the bodies, and have no box.
+    """
     model = Model.from_fields(scenario["model"])
-    mass = model.mass
-    shapes = []
+    shapes: list[Record] = []
 
     def axes_in(k: int, side: int, numbers: list[int]) -> list[list[float | None]]:
         turned = rotation_matrix(model.turn[k, side])
@@ -334,20 +379,24 @@ def _body_shapes(scenario: Record) -> list[Record]:
 
     for k, kind in enumerate(model.kind):
         moving = [axis for _, axis in KINDS[kind].motions]  # the first in the far, the last in the near body
-        moments, axes = np.linalg.eigh(model.inertia[k])
-        half = np.sqrt(np.clip(1.5 / mass[k] * (moments.sum() - 2 * moments), 0, None))
         shapes.append(
             {
                 "joint": kind,
                 "far": int(model.body[k, 0]),
+                "body": int(model.body[k, 1]),
                 "hang": [_json_number(x) for x in model.point[k, 0]],
                 "near": [_json_number(x) for x in model.point[k, 1]],
                 "far_axes": axes_in(k, 0, moving[:-1]),
                 "near_axes": axes_in(k, 1, moving[-1:]),
-                "axes": [[_json_number(x, 4) for x in axis] for axis in axes.T],
-                "half": [_json_number(x, 4) for x in half],
+                "axes": [],
+                "half": [],
             }
         )
+        if k < model.n:
+            moments, axes = np.linalg.eigh(model.inertia[k])
+            half = np.sqrt(np.clip(1.5 / model.mass[k] * (moments.sum() - 2 * moments), 0, None))
+            shapes[k]["axes"] = [[_json_number(x, 4) for x in axis] for axis in axes.T]
+            shapes[k]["half"] = [_json_number(x, 4) for x in half]
     return shapes
 
 

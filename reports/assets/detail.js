@@ -44,7 +44,7 @@ export async function showCell(root, index, fields, back) {
     h("h1", { class: "cell-title", tabindex: -1 }, fields.scenario, h("span", { class: "on" }, ` on ${title}`)),
     h("p", { class: "purpose" }, `${scenario.title}. ${scenario.purpose}`),
     h("dl", { class: "facts" },
-      fact("Bodies", scenario.bodies), fact("Joints", joints), fact("Duration", `${number(scenario.duration, 3)} s`),
+      fact("Bodies", scenario.bodies), fact("Joints", joints), ...loopFacts(scenario), fact("Duration", `${number(scenario.duration, 3)} s`),
       fact("Horizon", scenario.horizon === null ? "–" : `${number(scenario.horizon, 3)} s`),
       fact("Truth", scenario.truth ?? "–"), fact("Exact solution", typeof scenario.exact === "string" ? scenario.exact : scenario.exact ? "yes" : "none"),
       fact("Uncertainty of truth", scenario.truth_uncertainty === null ? "–" : `${number(scenario.truth_uncertainty)} m`),
@@ -102,6 +102,15 @@ function speaker(index, s, e) {
     if (found < 0 || outranks(index, i, found)) found = i;
   }
   return found < 0 ? null : found;
+}
+
+/** What closes loops, and what its rows leave determinate of the joints' forces and moments. @param {ScenarioChunk["scenario"]} scenario */
+function loopFacts({ loops }) {
+  if (!loops) return [];
+  const least = Math.min(...loops.determinate);
+  const wrench = least === 6 ? "forces and moments of all joints are determinate"
+    : `of force and moment ${least} of 6 components or more are determinate, and compared, at ${loops.determinate.filter((rank) => rank < 6).length} joints`;
+  return [fact("Closed by", loops.closing.join(", ")), fact("Rows that close", `${loops.rows}, ${loops.independent} of them independent; ${wrench}`)];
 }
 
 const LEVELS = ["state", "step", "trajectory", "invariants", "relations"];
@@ -220,7 +229,7 @@ function moving(root, index, data, fields) {
   const crossings = curves.filter((set) => set.engine === fields.engine && set.crossing !== null);
   const first = crossings.length ? crossings.reduce((a, b) => (/** @type {number} */ (b.crossing) < /** @type {number} */ (a.crossing) ? b : a)) : null;
   const room = h("section", { class: "moving", "aria-label": "Motion and curves" });
-  root.append(h("h2", { class: "sub" }, "Motion and curves"), room);
+  root.append(h("h2", { class: "sub" }, data.motion && !data.motion.base[0] ? "Initial state" : "Motion and curves"), room);
   /** @param {string} engine */
   const titleOf = (engine) => index.engine_titles[index.engines.indexOf(engine)];
   /** @type {ReturnType<typeof panels> | null} */
@@ -238,7 +247,7 @@ function moving(root, index, data, fields) {
   const legend = h("div");
   const area = h("div", { class: "panels" });
   if (curves.length) room.append(h("div", { class: "crumbs" }, choice, legend), area);
-  room.append(stage.transport);
+  if (end > 0) room.append(stage.transport);
   const draw = () => {
     drawn?.destroy();
     area.replaceChildren();

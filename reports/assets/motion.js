@@ -116,7 +116,7 @@ export function motion(data, o) {
   const root = h("div", { class: "motion" }, m ? stage : null);
 
   if (m) {
-    o.engines.forEach((engine, k) => {
+    (m.base[0] ? o.engines : [""]).forEach((engine, k) => { // "": a still of the initial state
       const runs = m.runs.filter((run) => run.engine === engine);
       if (!runs.length) return;
       const run = runs.reduce((a, b) => (final(b) < final(a) ? b : a));
@@ -124,17 +124,23 @@ export function motion(data, o) {
       const canvas = h("canvas", { tabindex: 0, role: "img" });
       /** @type {View} */
       const view = { canvas, note, run, runs, colour: `--c${k % 8}` };
-      const choice = h("select", { "aria-label": `Integrator of ${o.titleOf(engine)}`, change: () => { view.run = runs[Number(choice.value)]; label(view); draw(view); } }, runs.map((one, i) => h("option", { value: i, selected: one === run }, one.integrator)));
-      stage.append(h("figure", { class: engine === o.engine ? "mine" : "" }, h("figcaption", {}, h("b", { title: o.titleOf(engine) }, o.titleOf(engine)), runs.length > 1 ? choice : h("span", {}, run.integrator)), canvas, h("figcaption", {}, note)));
+      const choice = h("select", { "aria-label": `Integrator of ${name(engine)}`, change: () => { view.run = runs[Number(choice.value)]; label(view); draw(view); } }, runs.map((one, i) => h("option", { value: i, selected: one === run }, one.integrator)));
+      stage.append(h("figure", { class: engine === o.engine ? "mine" : "" }, h("figcaption", {}, h("b", { title: name(engine) }, name(engine)), runs.length > 1 ? choice : h("span", {}, run.integrator)), canvas, h("figcaption", {}, note)));
       label(view);
       orbit(canvas);
       views.push(view);
     });
+    if (m.shape.length > m.bodies) root.append(h("p", { class: "note" }, "Squares are the joints that close loops; short lines are the axes of joints."));
+  }
+
+  /** @param {string} engine */
+  function name(engine) {
+    return engine ? o.titleOf(engine) : "Initial state";
   }
 
   /** @param {View} view */
   function label(view) {
-    view.canvas.setAttribute("aria-label", `Motion of ${o.titleOf(view.run.engine)}, ${view.run.integrator}; arrow keys turn the view`);
+    view.canvas.setAttribute("aria-label", `Motion of ${name(view.run.engine)}, ${view.run.integrator}; arrow keys turn the view`);
   }
 
   /** @param {Run} run */
@@ -197,7 +203,7 @@ export function motion(data, o) {
     }
     let apart = 0;
     for (let k = 0; k < m.bodies; k++) apart = Math.max(apart, Math.hypot(difference[6 * k], difference[6 * k + 1], difference[6 * k + 2]));
-    view.note.textContent = isBase ? "the base of the differences" : `${number(apart)} m from ${o.titleOf(m.base[0])}`;
+    view.note.textContent = !m.base[0] ? "no motion was stored" : isBase ? "the base of the differences" : `${number(apart)} m from ${o.titleOf(m.base[0])}`;
     if (magnify !== null && !isBase) tree(context, see, m, poses, ink("--soft"), true, scene);
     tree(context, see, m, displaced(poses, difference, magnify === null ? 1 : 10 ** magnify), ink(view.colour), false, scene);
   }
@@ -268,7 +274,7 @@ function bounds(m) {
   const high = [0, 0, 0];
   /** @type {(k: number) => string} joint at the world of a body's branch */
   const root = (k) => (m.shape[k].far < 0 ? m.shape[k].joint : root(m.shape[k].far));
-  const held = m.shape.map((_, k) => root(k) !== "free");
+  const held = m.shape.slice(0, m.bodies).map((_, k) => root(k) !== "free");
   for (let i = 0; i < m.r.length; i++) {
     if (held.includes(true) && !held[Math.floor(i / 3) % m.bodies]) continue;
     const v = (m.r[i] * m.span) / 32767;
@@ -360,8 +366,9 @@ function tree(context, see, m, poses, colour, ghost, scene) {
   /** @type {{ depth: number, paint: () => void }[]} */
   const parts = [];
   const dense = m.bodies > 12;
-  poses.forEach(({ r, q }, k) => {
-    const shape = m.shape[k];
+  m.shape.forEach((shape, k) => {
+    const { r, q } = poses[shape.body];
+    const closes = k >= m.bodies;
     const parent = shape.far < 0 ? null : poses[shape.far];
     const hang = parent ? add(parent.r, turn(parent.q, shape.hang)) : shape.hang;
     const near = shape.joint === "free" ? r : add(r, turn(q, shape.near));
@@ -395,7 +402,7 @@ function tree(context, see, m, poses, colour, ghost, scene) {
       }
       context.globalAlpha = 1;
     } });
-    if (!dense) {
+    if (!dense && !closes) {
       const corners = Array.from({ length: 8 }, (_, i) => shape.axes.reduce((v, axis, j) => add(v, turn(q, axis), shape.half[j] * ((i >> (2 - j)) & 1 ? 1 : -1)), r));
       const seen = corners.map(see);
       for (const face of FACES) {
@@ -436,6 +443,14 @@ function tree(context, see, m, poses, colour, ghost, scene) {
     context.lineTo(x - 6, y - 9);
     context.lineTo(x + 6, y - 9);
     context.fill();
+  }
+  context.strokeStyle = ink("--ink");
+  context.fillStyle = paper;
+  context.lineWidth = 2;
+  for (const shape of m.shape.slice(m.bodies)) { // joints that close loops, in front of all bodies
+    const [x, y] = see(add(poses[shape.body].r, turn(poses[shape.body].q, shape.near)));
+    context.fillRect(x - 4, y - 4, 8, 8);
+    context.strokeRect(x - 4, y - 4, 8, 8);
   }
   context.strokeStyle = ink("--soft");
   context.globalAlpha = 0.25;

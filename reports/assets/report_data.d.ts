@@ -24,8 +24,8 @@ export interface CurveSet {
 }
 
 export type Vec = [number, number, number];
-/** Far body (−1 the world) and point, near point, and joint axes in the far and in the near body. */
-export interface Shape { joint: string; far: number; hang: Vec; near: Vec; far_axes: Vec[]; near_axes: Vec[]; axes: Vec[]; half: Vec }
+/** Far body (−1 the world) and point, near body and point, and joint axes in both; joints that close loops have no half. */
+export interface Shape { joint: string; far: number; body: number; hang: Vec; near: Vec; far_axes: Vec[]; near_axes: Vec[]; axes: Vec[]; half: Vec }
 export interface MotionData {
   t: Float32Array; bodies: number; base: [string, string]; span: number; r: Int16Array; p: Int16Array; shape: Shape[];
   runs: { engine: string; integrator: string; scale: Float32Array; d: Int8Array }[];
@@ -37,6 +37,7 @@ export interface ScenarioChunk {
   scenario: {
     family: string; title: string; purpose: string; file: string; bodies: number; joints: string[]; duration: number;
     sample: number; exact: string | null | boolean; horizon: number | null; truth_uncertainty: number | null; digest: string; truth: string | null;
+    loops: { closing: string[]; rows: number; independent: number; determinate: number[] } | null;
   };
   rows: Record<string, RowDetail>; commands: Record<string, string>;
   states: StateSpread[]; curves: CurveSet[] | null; motion: MotionData | null;
