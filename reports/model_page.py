@@ -70,7 +70,7 @@ def render(document: Record) -> str:
                 **file,
                 "columns": {name: {row["quantity"]: row for row in rows} for name, rows in engines.items()},
                 "quantities": quantities,
-                "findings": [row for row in file["rows"] if needs_attention(row) and not row["diagnosis"]],
+                "findings": [row for row in file["rows"] if _is_finding(row)],
                 "lines": draw(
                     file["drawing"], {body for cause in file["causes"] for body in cause["bodies"]}
                 ),
@@ -92,6 +92,12 @@ def render(document: Record) -> str:
             size=DRAWING_SIZE,
         )
     )
+
+
+def _is_finding(row: Record) -> bool:
+    """Whether a row is listed: what no cause explains, and refusals, which are answers."""
+    is_refusal = row["quantity"] == "all" and row["reason"].startswith("refused: ")
+    return is_refusal or (needs_attention(row) and not row["diagnosis"])
 
 
 def _sentence(document: Record) -> str:

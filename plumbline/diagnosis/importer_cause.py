@@ -403,6 +403,10 @@ class _Trial:
         found = self.worst(changes, count)
         return np.inf if found is None else max((m.ratio for m in found.values()), default=0.0)
 
+    def fits(self, changes: Sequence[Change], count: int) -> bool:
+        """Whether the changes reproduce everything; at the first state alone first, where most do not."""
+        return self.remaining(changes, 1) <= 1 and (count == 1 or self.remaining(changes, count) <= 1)
+
     def smallest(self, changes: Sequence[Change]) -> list[Change] | None:
         """Drop the changes that are not needed; None where all together do not reproduce the quantities."""
         count = min(PRUNING_STATES, len(self.answers))
@@ -411,25 +415,25 @@ class _Trial:
             return None
         if self.remaining(needed, count) > 1:
             needed += self.frame_changes(needed, count)
-        if not (needed or self.has_structure) or self.remaining(needed, count) > 1:
+        if not (needed or self.has_structure) or not self.fits(needed, count):
             return None
         for body in dict.fromkeys(change.body for change in changes if change.field in FRAME_FIELDS):
             rest = [c for c in needed if not (c.body == body and c.field in FRAME_FIELDS)]
-            if self.remaining(rest, count) <= 1:
+            if self.fits(rest, count):
                 needed = rest
         for field in dict.fromkeys(change.field for change in changes):
             rest = [change for change in needed if change.field != field]
-            if self.remaining(rest, count) <= 1:
+            if self.fits(rest, count):
                 needed = rest
         for field in dict.fromkeys(change.field for change in needed):
             members = [change for change in needed if change.field == field]
             if 1 < len(members) <= MAX_SINGLE_TRIALS:
                 for member in members:
                     rest = [change for change in needed if change is not member]
-                    if self.remaining(rest, count) <= 1:
+                    if self.fits(rest, count):
                         needed = rest
         is_some = bool(needed) or self.has_structure
-        return needed if is_some and self.remaining(needed, len(self.answers)) <= 1 else None
+        return needed if is_some and self.fits(needed, len(self.answers)) else None
 
 
 def _with_frames(truth: CertifiedModelQuantities, offsets: Mapping[str, Array]) -> CertifiedModelQuantities:

@@ -1,0 +1,76 @@
+"""The page of `plumbline model`: static, escaped, accessible, and complete in what does not agree."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import pytest
+
+from plumbline.cli.model_commands import model_document
+from plumbline.execution.model_run import ModelPlan, run_model_files
+from reports import model_page
+
+EVIL = "\"><img src=x onerror=alert(1)><script>alert('2')</script>"
+# Pinocchio keeps its own gravity; a massless moving body is refused by MuJoCo's URDF reader
+MOON = f"""<mujoco model={quoteattr(EVIL)}><option gravity="0 0 -1.62"/>
+<worldbody><body name={quoteattr(EVIL)}><joint name={quoteattr(EVIL)} axis="0 1 0" range="0 1"/>
+<inertial pos="0 0 -1" mass="2" diaginertia="1 1 1"/></body></worldbody></mujoco>
+"""
+MASSLESS = f"""<robot name="r"><link name="base"/><link name={quoteattr(EVIL)}/>
+<joint name="j" type="continuous"><parent link="base"/><child link={quoteattr(EVIL)}/><axis xyz="0 0 1"/></joint></robot>
+"""
+
+
+@pytest.fixture(scope="module")
+def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of a file with a cause, one that is refused, and one that cannot be used."""
+    folder = tmp_path_factory.mktemp("model page")
+    files = {"moon.xml": MOON, "massless.urdf": MASSLESS, "bad <b>.urdf": "<robot><link/></robot>"}
+    for name, text in files.items():
+        (folder / name).write_text(text)
+    plan = ModelPlan(tuple(str(folder / name) for name in files), ("mujoco", "pinocchio"), state_count=2)
+    document = model_document(run_model_files(plan, lambda *_: None))
+    return model_page.write(folder, document)
+
+
+def test_the_page_names_causes_refusals_and_bad_files_and_escapes_them(page_file):
+    text = page_file.read_text(encoding="utf-8")
+    assert "<script" not in text and "<img" not in text and "<b>.urdf" not in text
+    assert "reads the gravity of the model as (0, 0, -9.81)" in text
+    assert "1 cause named and proved" in text
+    assert "Files that cannot be used" in text
+    assert "mjMINVAL" in text, "a refusal is an answer"
+
+
+@pytest.mark.browser
+def test_the_page_makes_no_request_and_says_nothing_on_the_console(chromium, page_file):
+    context = chromium.new_context(offline=True, viewport={"width": 320, "height": 800})
+    page, trouble, requests = context.new_page(), [], []
+    page.on("pageerror", lambda error: trouble.append(str(error)))
+    page.on("console", lambda message: trouble.append(message.text))
+    page.on("dialog", lambda dialog: (trouble.append(dialog.message), dialog.dismiss()))
+    page.on("request", lambda request: requests.append(request.url))
+    page.goto(page_file.as_uri())
+    assert page.locator("svg.robot").first.is_visible()
+    for summary in page.locator("summary").all():
+        summary.click()
+    overflow = page.evaluate("document.documentElement.scrollWidth - innerWidth")
+    page.wait_for_timeout(200)
+    context.close()
+    assert trouble == []
+    assert [url for url in requests if not url.startswith(("data:", page_file.as_uri()))] == []
+    assert overflow <= 0, "a phone scrolls the tables, not the page"
+
+
+@pytest.mark.browser
+def test_axe_finds_no_violation(chromium: Any, page_file, violations):
+    context = chromium.new_context(bypass_csp=True, offline=True)
+    page = context.new_page()
+    page.goto(page_file.as_uri())
+    for summary in page.locator("summary").all():
+        summary.click()
+    found = [violation for scheme in ("light", "dark") for violation in violations(page, scheme)]
+    context.close()
+    assert found == []
