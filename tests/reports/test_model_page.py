@@ -19,7 +19,8 @@ MOON = f"""<mujoco model={quoteattr(EVIL)}><option gravity="0 0 -1.62"/>
 <inertial pos="0 0 -1" mass="2" diaginertia="1 1 1"/></body></worldbody></mujoco>
 """
 MASSLESS = f"""<robot name="r"><link name="base"/><link name={quoteattr(EVIL)}/>
-<joint name="j" type="continuous"><parent link="base"/><child link={quoteattr(EVIL)}/><axis xyz="0 0 1"/></joint></robot>
+<joint name="j" type="continuous"><parent link="base"/><child link={quoteattr(EVIL)}/>
+<axis xyz="0 0 1"/></joint></robot>
 """
 
 

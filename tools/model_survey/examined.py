@@ -97,6 +97,15 @@ EXAMINED = (
     Examined("dart", "mjcf", ("gravity",), "not supported", "does not read `<option gravity>`"),
     Examined("dart", "mjcf", ("reference",), "not supported", "does not read `ref` of joints"),
     Examined(
+        "exudyn", "urdf", ("damping",), "differs from the file",
+        "reads no damping, and takes a joint's friction for viscous friction, which the caller may apply",
+        "exudyn_friction.py",
+    ),
+    Examined(
+        "mujoco", "urdf", ("assumed inertial",), "left open by the file",
+        "takes the mass of a link without `<inertial>` from its geometry",
+    ),
+    Examined(
         "exudyn", "urdf", ("inertial", "mass", "center", "inertia"), "differs from the file",
         "leaves links on fixed joints out, with their mass", "exudyn_fixed_link.py",
     ),
