@@ -24,6 +24,24 @@ LOOP_KINDS: tuple[Kind, ...] = ("rod", "ball", "hinge", "universal", "slide", "c
 MIN_FIRST_SINGULAR_VALUE = 5e-2  # of the unit rows of a new loop's mechanism: away from singular poses
 
 
+def random_inertias(rng: np.random.Generator, mass: Array) -> Array:
+    """Draw inertias of ellipsoids of any attitude, which are always physical.
+
+    Args:
+        rng: the source.
+        mass: (N,) kg.
+
+    Returns:
+        (N, 3, 3) kg m², body frame.
+
+    """
+    axes = np.linalg.qr(rng.normal(size=(len(mass), 3, 3)))[0]
+    size = rng.uniform(0.1, 0.6, (len(mass), 3)) ** 2
+    principal = mass[:, None] / 5 * (size.sum(1, keepdims=True) - size)
+    inertia = axes @ (principal[..., None] * axes.mT)
+    return np.asarray((inertia + inertia.mT) / 2)
+
+
 def random_tree(
     rng: np.random.Generator,
     n: int,
@@ -54,15 +72,12 @@ def random_tree(
         fitting = [kind for kind in kinds if kind != ("free" if far[k] >= 0 else "weld")]
         chosen.append(fitting[rng.integers(len(fitting))] if fitting else "hinge")
     mass = 10 ** rng.uniform(-0.5, 0.5, n)
-    axes = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
-    size = rng.uniform(0.1, 0.6, (n, 3)) ** 2
-    principal = mass[:, None] / 5 * (size.sum(1, keepdims=True) - size)  # ellipsoids: always physical
-    inertia = axes @ (principal[..., None] * axes.mT)
+    inertia = random_inertias(rng, mass)
     point = 0.3 * rng.normal(size=(n, 2, 3))
     point[[kind == "free" for kind in chosen]] = 0
     bare = Model(
         mass=mass,
-        inertia=(inertia + inertia.mT) / 2,
+        inertia=inertia,
         kind=tuple(chosen),
         body=np.stack([far, np.arange(n)], axis=1),
         point=point,

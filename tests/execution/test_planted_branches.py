@@ -29,7 +29,6 @@ from tests.judging.test_step import judged
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(engine)
 
-pytestmark = pytest.mark.xdist_group("planted branches")  # the scenarios are made once
 CONTEXT = RowContext("branches", "test", "engine", "engine", "0")
 RANDOM_COUNT = 200  # of a night
 SEED = 404

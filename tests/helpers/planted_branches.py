@@ -54,11 +54,6 @@ def at_least_bodies(count: int) -> Condition:
     return lambda m, _: m.n >= count
 
 
-def all_of(*conditions: Condition) -> Condition:
-    """All of several conditions."""
-    return lambda m, s: all(condition(m, s) for condition in conditions)
-
-
 def on_last_body(change: Callable[[int], Inputs]) -> Inputs:
     """A change of the last body."""
     return lambda m, s: change(m.n - 1)(m, s)

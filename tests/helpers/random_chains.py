@@ -8,6 +8,7 @@ import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import state_from_minimal
+from plumbline.model.random_mechanisms import random_inertias
 
 
 def random_model(
@@ -20,13 +21,9 @@ def random_model(
     """A chain with a rod at each joint k with rods[k]; masses are log-uniform over ± ``decades``."""
     n = len(rods)
     mass = 10 ** rng.uniform(-mass_decades, mass_decades, n)
-    axes = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
-    size = rng.uniform(0.1, 0.6, (n, 3)) ** 2
-    principal = mass[:, None] / 5 * (size.sum(1, keepdims=True) - size)  # ellipsoids: always physical
-    inertia = axes @ (principal[..., None] * axes.mT)
     return Model.chain(
         mass=mass,
-        inertia=(inertia + inertia.mT) / 2,
+        inertia=random_inertias(rng, mass),
         proximal=0.3 * rng.normal(size=(n, 3)),
         distal=0.3 * rng.normal(size=(n, 3)) * (np.arange(n) < n - 1)[:, None],
         length=np.where(np.array(rods, dtype=bool), rng.uniform(0.2, 1.0, n), 0.0),
