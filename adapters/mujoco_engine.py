@@ -42,7 +42,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from itertools import pairwise
+from itertools import combinations, pairwise
 from typing import Any, Literal
 
 import mujoco
@@ -71,6 +71,7 @@ MAX_IMPEDANCE = 0.9999  # of soft constraints: the largest that MuJoCo accepts
 # of MuJoCo's own R, which is made for the tree at its reference pose: the largest (the next where answers are
 # not yet linear in it), how they fall, and how many
 LARGEST_REGULARISATIONS, RATIO, REGULARISATIONS = (0.027, 2.7e-4, 2.7e-6), 3.0, 4
+SEQUENCES = (1.0, 1.3, 1.7)  # of them: factors of the largest
 MAX_ORDER_ERROR = 0.1
 MIN_SOFTNESS = 1e-9  # a smaller relative effect of R is rounding
 MAX_NOISE = 1e-11  # relative, of differences that grow as R falls: more is too much to extrapolate
@@ -380,21 +381,25 @@ def _rigid_limit(tree: _MujocoChain, cut: CutMechanism, state: State) -> StateQu
     """Evaluate at falling regularisations R, check order 1, and extrapolate to none.
 
     Rounding of the forces grows with 1/R.  The limit's uncertainty, by rounding and by what is left of R, is
-    twice the difference from the extrapolation of another sequence.
+    three times the largest difference between the extrapolations of three sequences.
     """
     for largest in LARGEST_REGULARISATIONS:
         try:
-            limits = [_extrapolated(tree, cut, state, factor * largest) for factor in (1.0, 1.5)]
+            limits = [_extrapolated(tree, cut, state, factor * largest) for factor in SEQUENCES]
             break
         except EngineFailure:
             if largest == LARGEST_REGULARISATIONS[-1]:
                 raise
     errors = {
-        name: 2 * float(np.max(np.linalg.norm(np.atleast_2d(limits[1][name] - limit), axis=-1)))
-        for name, limit in limits[0].items()
+        name: 3 * max(_largest_norm(x[name] - y[name]) for x, y in combinations(limits, 2))
+        for name in limits[0]
     }
     values: dict[str, Any] = {name: x if x.ndim else float(x) for name, x in limits[0].items()}
     return StateQuantities(**values, limit_error=errors)
+
+
+def _largest_norm(difference: Array) -> float:
+    return float(np.max(np.linalg.norm(np.atleast_2d(difference), axis=-1)))
 
 
 def _extrapolated(tree: _MujocoChain, cut: CutMechanism, state: State, largest: float) -> dict[str, Array]:
