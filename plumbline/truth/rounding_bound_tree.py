@@ -7,8 +7,8 @@ leave, E_k (6, c).  With x = (r̈, α) per body, world axes, C the held rows of 
 
 Loops are cut open (`plumbline.model.loops`); rows a_b − a_c, α_b − α_c join the two parts of a body, and K
 has a pseudo-inverse where rows depend on others.  The dependent coordinates of a state are known only to
-rounding over the smallest singular value σ of these rows, which changes every term by as much: all
-tolerances are 1 + 1/σ times as large.
+rounding over the smallest singular value σ of these rows, which changes every term of the equations by as
+much: the answer to their roundings (tB, and that of the rows that join parts) counts 1 + 1/σ times.
 
 Roundings of the terms of each body's equations and of each joint's are propagated through the inverse (tB),
 those of the elimination C M⁻¹ f likewise (tS); a joint-space engine rounds the terms of M q̈ + h, which act as
@@ -422,7 +422,8 @@ def _loop_tolerances(
     # what one body or joint has is found together with what all others of the loop have
     largest = {name: float(np.max(value)) for name, value in scale.items() if isinstance(value, np.ndarray)}
     largest["joint_moment"] = max(largest["joint_moment"], wrench_length(model) * largest["joint_reaction"])
-    total = (total + terms.weld_errors() + list(largest.values())) * spread
+    of_terms = terms.propagate(*terms.body_errors()) + terms.weld_errors() + list(largest.values())
+    total += terms.weld_errors() + list(largest.values()) + of_terms * (spread - 1)
     sums = {name: size * spread for name, size in sums.items()}
     for name, value in largest.items():
         scale[name] = np.full(len(model.kind) if name.startswith("joint") else model.n, value)
