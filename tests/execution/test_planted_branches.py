@@ -38,8 +38,8 @@ MAX_EVALUATED = 3  # states of a scenario
 
 @cache
 def problems():
-    """Scenarios of the catalogue and of a night, each with the states that are compared."""
-    chosen = [s for s in catalogue_scenarios().values() if s.model.n <= MAX_BODIES]
+    """Chains of the catalogue and of a night, for which the defects are made, and their compared states."""
+    chosen = [s for s in catalogue_scenarios().values() if s.model.is_chain and s.model.n <= MAX_BODIES]
     counts = [RANDOM_STATES] * len(chosen) + [STATES_PER_RANDOM_SCENARIO] * RANDOM_COUNT
     chosen += list(RandomScenarios(SEED, RANDOM_COUNT))
     return [
