@@ -1,8 +1,8 @@
 """`python -m bench.classics [PROBLEM[/ENGINE]…]`: published problems on every engine, docs/benchmarks.md.
 
 Runs the named problems, or all, and keeps the figures of the others in bench/results/classics.json; with an
-engine the figures of its motions alone are measured again.  With --page it writes the page of the stored
-figures.
+engine only its motions are measured again, with PROBLEM/values only what needs no motion.  With --page it
+writes the page of the stored figures.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ ROOT = Path(__file__).resolve().parents[1]
 STORED = ROOT / "bench" / "results" / "classics.json"
 PAGE = ROOT / "docs" / "benchmarks.md"
 RANDOM_STATES = 3
+NO_ENGINE = "values"  # in the place of an engine: values and states, no motion
 Runs = Sequence[tuple[str, str, Sequence[float]]]  # engine, integrator, steps [s] or tolerances
 
 
@@ -263,7 +264,7 @@ def measure(name: str, engine: str, stored: dict[str, Any]) -> dict[str, Any]:
 
     Args:
         name: of the problem.
-        engine: the only one whose motions are measured; empty for all, values and states too.
+        engine: the only one whose motions are measured, or `NO_ENGINE`; empty for everything.
         stored: what is known of the problem.
 
     Returns:
@@ -272,9 +273,9 @@ def measure(name: str, engine: str, stored: dict[str, Any]) -> dict[str, Any]:
     """
     versions = {one: describe_engine(one).version for one in ENGINES}
     found = stored | {"processor": processor_name(), "versions": versions}
-    if name in VALUES and not engine:
+    if name in VALUES and engine in ("", NO_ENGINE):
         found["values"] = [asdict(value) for value in VALUES[name]()]
-    if name in STATE_PROBLEMS and not engine:
+    if name in STATE_PROBLEMS and engine in ("", NO_ENGINE):
         found["states"] = measure_states(STATE_PROBLEMS[name])
     if name in PROBLEMS:
         problem = PROBLEMS[name]
