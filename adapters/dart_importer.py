@@ -25,7 +25,8 @@ import dartpy as dart
 import numpy as np
 
 from adapters.importer_common import (
-    captured_output,
+    LoadingImporter,
+    Refused,
     free_joint_name,
     joint_from_screw,
     joint_names,
@@ -36,7 +37,7 @@ from adapters.importer_common import (
     quaternion_of,
     to_canonical,
 )
-from plumbline.importers.importer import Importer, ModelFile, Reading
+from plumbline.importers.importer import ModelFile
 from plumbline.importers.neutral_model import (
     CanonicalState,
     ElementaryJoint,
@@ -53,7 +54,7 @@ MULTIPLE_JOINTS = (
 )  # fmt: skip
 
 
-class DartImporter(Importer):
+class DartImporter(LoadingImporter):
     """DART's URDF loader and MJCF parser."""
 
     name = "dart"
@@ -62,50 +63,24 @@ class DartImporter(Importer):
     formats = ("urdf", "mjcf")
     environment = ".importers"
 
-    def version(self) -> str:
-        """Return the version of the dartpy wheel.
-
-        Returns:
-            As dartpy reports it.
-
-        """
-        return str(dart.__version__)
-
-    def read(self, file: ModelFile) -> Reading:
-        """Load a file and describe the skeletons.
-
-        Args:
-            file: the file and how to load it.
-
-        Returns:
-            The description, or DART's refusal with what it printed.
-
-        """
-        with captured_output() as warnings:
-            skeletons = _loaded(file)
+    def _load(self, file: ModelFile) -> Any:
+        skeletons = _loaded(file)
         if not skeletons:
-            reasons = [line for line in warnings if "Error" in line] or warnings
-            return Reading(self.version(), refusal=" ".join(reasons) or "no skeleton was made of the file")
-        try:
-            layout = _Layout(skeletons, file)
-        except NotImplementedError as kind:
-            return Reading(self.version(), refusal=f"this column does not describe {kind}")
-        gravity = np.array(skeletons[0].getGravity())
-        return Reading(self.version(), NeutralModel("", layout.bodies, gravity), warnings=tuple(warnings))
+            raise Refused
+        return skeletons
 
-    def evaluate(self, file: ModelFile, states: Sequence[CanonicalState]) -> list[ModelQuantities]:
-        """Compute the quantities with DART's own routines.
+    def _describe(self, loaded: Any, file: ModelFile) -> NeutralModel:
+        return NeutralModel("", _Layout(loaded, file).bodies, np.array(loaded[0].getGravity()))
 
-        Args:
-            file: a file that `read` accepts.
-            states: canonical states of the model that `read` returned.
-
-        Returns:
-            One record per state.
-
-        """
-        layout = _Layout(_loaded(file), file)
+    def _evaluate(
+        self, loaded: Any, file: ModelFile, states: Sequence[CanonicalState]
+    ) -> list[ModelQuantities]:
+        layout = _Layout(loaded, file)
         return [layout.quantities(state) for state in states]
+
+    def _refusal_words(self, refusal: str, printed: Sequence[str]) -> str:
+        reasons = [line for line in printed if "Error" in line] or printed
+        return " ".join(reasons) or "no skeleton was made of the file"
 
 
 def _loaded(file: ModelFile) -> list[Any]:

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from importlib import metadata
 from typing import Any
 
 import numpy as np
@@ -29,7 +28,8 @@ from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, MultibodyForces
 
 from adapters.importer_common import (
-    captured_output,
+    LoadingImporter,
+    Refused,
     free_joint_name,
     joint_from_screw,
     make_joint,
@@ -38,7 +38,7 @@ from adapters.importer_common import (
     quaternion_of,
     to_canonical,
 )
-from plumbline.importers.importer import Importer, ModelFile, Reading
+from plumbline.importers.importer import ModelFile
 from plumbline.importers.neutral_model import (
     CanonicalState,
     ElementaryJoint,
@@ -50,7 +50,7 @@ from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import rotation_matrix
 
 
-class DrakeImporter(Importer):
+class DrakeImporter(LoadingImporter):
     """Drake's URDF and MJCF parsers."""
 
     name = "drake"
@@ -59,49 +59,20 @@ class DrakeImporter(Importer):
     formats = ("urdf", "mjcf")
     environment = ".importers"
 
-    def version(self) -> str:
-        """Return the version of the drake wheel.
-
-        Returns:
-            As its metadata have it.
-
-        """
-        return metadata.version("drake")
-
-    def read(self, file: ModelFile) -> Reading:
-        """Parse a file and describe the plant.
-
-        Args:
-            file: the file and how to load it.
-
-        Returns:
-            The description, or Drake's refusal.
-
-        """
-        with captured_output() as warnings:
-            try:
-                plant = _parsed(file)
-            except RuntimeError as error:
-                return Reading(self.version(), refusal=str(error))
+    def _load(self, file: ModelFile) -> Any:
         try:
-            bodies = _Layout(plant, file).bodies
-        except NotImplementedError as kind:
-            return Reading(self.version(), refusal=f"this column does not describe {kind}")
-        gravity = np.array(plant.gravity_field().gravity_vector())
-        return Reading(self.version(), NeutralModel("", bodies, gravity), warnings=tuple(warnings))
+            return _parsed(file)
+        except RuntimeError as error:
+            raise Refused(str(error)) from None
 
-    def evaluate(self, file: ModelFile, states: Sequence[CanonicalState]) -> list[ModelQuantities]:
-        """Compute the quantities with Drake's own routines.
+    def _describe(self, loaded: Any, file: ModelFile) -> NeutralModel:
+        gravity = np.array(loaded.gravity_field().gravity_vector())
+        return NeutralModel("", _Layout(loaded, file).bodies, gravity)
 
-        Args:
-            file: a file that `read` accepts.
-            states: canonical states of the model that `read` returned.
-
-        Returns:
-            One record per state.
-
-        """
-        layout = _Layout(_parsed(file), file)
+    def _evaluate(
+        self, loaded: Any, file: ModelFile, states: Sequence[CanonicalState]
+    ) -> list[ModelQuantities]:
+        layout = _Layout(loaded, file)
         return [layout.quantities(state) for state in states]
 
 

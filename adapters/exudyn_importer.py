@@ -27,8 +27,8 @@ import exudyn.robotics.utilities as loader_module
 import numpy as np
 
 from adapters.exudyn_common import initialized_solver, mass_matrix_and_force
-from adapters.importer_common import captured_output, joint_from_screw, pose, quaternion_of
-from plumbline.importers.importer import Importer, ModelFile, Reading
+from adapters.importer_common import LoadingImporter, Refused, joint_from_screw, pose, quaternion_of
+from plumbline.importers.importer import ModelFile
 from plumbline.importers.neutral_model import CanonicalState, ModelQuantities, NeutralBody, NeutralModel
 from plumbline.model.datatypes import Array
 
@@ -39,7 +39,7 @@ GRAVITY = (0.0, 0.0, -9.81)  # m/s²: the caller of the loader sets it
 AXES = {"x": np.eye(3)[0], "y": np.eye(3)[1], "z": np.eye(3)[2]}
 
 
-class ExudynImporter(Importer):
+class ExudynImporter(LoadingImporter):
     """Exudyn's URDF loader."""
 
     name = "exudyn"
@@ -54,50 +54,23 @@ class ExudynImporter(Importer):
         "potential_energy": "a kinematic tree does not return its energies",
     }
 
-    def version(self) -> str:
-        """Return the version of the loaded module.
-
-        Returns:
-            As Exudyn reports it.
-
-        """
-        return str(exudyn.GetVersionString())
-
-    def read(self, file: ModelFile) -> Reading:
-        """Load a file and describe the links that the loader returns.
-
-        Args:
-            file: the file and how to load it.
-
-        Returns:
-            The description, or the loader's refusal.
-
-        """
+    def _load(self, file: ModelFile) -> Any:
         if file.base == "free":
-            return Reading(self.version(), refusal="the loader fixes the root link")
-        with captured_output() as warnings:
-            try:
-                links = _loaded(file)
-            except Exception as error:  # of the loader, the toolbox or the parser
-                return Reading(self.version(), refusal=f"{type(error).__name__}: {error}")
-        bodies = tuple(_body(link, links) for link in links)
-        return Reading(self.version(), NeutralModel("", bodies, np.array(GRAVITY)), warnings=tuple(warnings))
+            raise Refused("the loader fixes the root link")
+        try:
+            return _loaded(file)
+        except Exception as error:  # of the loader, the toolbox or the parser
+            raise Refused(f"{type(error).__name__}: {error}") from None
 
-    def evaluate(self, file: ModelFile, states: Sequence[CanonicalState]) -> list[ModelQuantities]:
-        """Compute the quantities with Exudyn's own routines.
+    def _describe(self, loaded: Any, file: ModelFile) -> NeutralModel:
+        return NeutralModel("", tuple(_body(link, loaded) for link in loaded), np.array(GRAVITY))
 
-        Args:
-            file: a file that `read` accepts.
-            states: canonical states of the model that `read` returned.
-
-        Returns:
-            One record per state.
-
-        """
-        links = _loaded(file)
-        if not links:
+    def _evaluate(
+        self, loaded: Any, file: ModelFile, states: Sequence[CanonicalState]
+    ) -> list[ModelQuantities]:
+        if not loaded:
             return [ModelQuantities({}) for _ in states]
-        tree = _Tree(links)
+        tree = _Tree(loaded)
         return [tree.quantities(state) for state in states]
 
 

@@ -6,18 +6,23 @@ import os
 import re
 import tempfile
 import xml.etree.ElementTree as ElementTree
+from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from importlib import metadata
+from typing import Any
 
 import numpy as np
 
-from plumbline.importers.importer import ModelFile
+from plumbline.importers.importer import Importer, ModelFile, Reading
 from plumbline.importers.neutral_model import (
+    CanonicalState,
     ElementaryJoint,
     JointKind,
     ModelQuantities,
     NeutralBody,
+    NeutralModel,
 )
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
@@ -220,6 +225,78 @@ def merge_made_up_bodies(bodies: Sequence[NeutralBody], file: ModelFile) -> list
             moved[i] = -1
     places = {i: k for k, i in enumerate(i for i in moved if i >= 0)}
     return [replace(kept[i], parent=places.get(kept[i].parent, -1)) for i in places]
+
+
+class Refused(Exception):
+    """An engine does not load a file; the message has its words, or is empty where it only printed them."""
+
+
+class LoadingImporter(Importer):
+    """An importer whose engine loads a file into an object, which is described and evaluated."""
+
+    def version(self) -> str:
+        """Return the version of the engine.
+
+        Returns:
+            As the metadata of its wheel have it.
+
+        """
+        return metadata.version(self.package)
+
+    def read(self, file: ModelFile) -> Reading:
+        """Load a file and describe what the engine made of it.
+
+        Args:
+            file: the file and how to load it.
+
+        Returns:
+            The description, or the engine's refusal.
+
+        """
+        refusal = None
+        with captured_output() as printed:
+            try:
+                loaded = self._load(file)
+            except Refused as words:
+                refusal = str(words)
+        if refusal is not None:
+            return Reading(self.version(), refusal=self._refusal_words(refusal, printed))
+        try:
+            model = self._describe(loaded, file)
+        except NotImplementedError as kind:
+            return Reading(self.version(), refusal=f"this column does not describe {kind}")
+        return Reading(self.version(), model, warnings=tuple(printed))
+
+    def evaluate(self, file: ModelFile, states: Sequence[CanonicalState]) -> list[ModelQuantities]:
+        """Compute the quantities with the engine's own routines.
+
+        Args:
+            file: a file that `read` accepts.
+            states: canonical states of the model that `read` returned.
+
+        Returns:
+            One record per state.
+
+        """
+        with captured_output():
+            return self._evaluate(self._load(file), file, states)
+
+    @abstractmethod
+    def _load(self, file: ModelFile) -> Any:
+        """Load a file; raise `Refused` with the engine's words."""
+
+    @abstractmethod
+    def _describe(self, loaded: Any, file: ModelFile) -> NeutralModel:
+        """Describe the engine's object; raise NotImplementedError with what the column does not know."""
+
+    @abstractmethod
+    def _evaluate(
+        self, loaded: Any, file: ModelFile, states: Sequence[CanonicalState]
+    ) -> list[ModelQuantities]:
+        """Compute the quantities at each state."""
+
+    def _refusal_words(self, refusal: str, printed: Sequence[str]) -> str:
+        return refusal or " ".join(printed)
 
 
 @contextmanager

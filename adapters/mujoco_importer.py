@@ -15,6 +15,7 @@ fused and the root link gets a free joint.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -22,8 +23,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from adapters.importer_common import captured_output, free_joint_name, pose
-from plumbline.importers.importer import Importer, ModelFile, Reading
+from adapters.importer_common import LoadingImporter, Refused, free_joint_name, pose
+from plumbline.importers.importer import ModelFile
 from plumbline.importers.neutral_model import (
     CanonicalState,
     ElementaryJoint,
@@ -46,7 +47,7 @@ NOT_COMPARED = (  # arrays of a compiled model whose features are not compared
 )  # fmt: skip
 
 
-class MujocoImporter(Importer):
+class MujocoImporter(LoadingImporter):
     """MuJoCo's URDF and MJCF compiler."""
 
     name = "mujoco"
@@ -55,62 +56,35 @@ class MujocoImporter(Importer):
     formats = ("urdf", "mjcf")
     supported_versions = ">=3.2,<5"
 
-    def version(self) -> str:
-        """Return the version of the loaded library.
-
-        Returns:
-            As MuJoCo reports it.
-
-        """
-        return str(mujoco.mj_versionString())
-
-    def read(self, file: ModelFile) -> Reading:
-        """Compile a file and describe the compiled model.
-
-        Args:
-            file: the file and how to load it.
-
-        Returns:
-            The description, or MuJoCo's refusal.
-
-        """
-        with captured_output() as printed, _collected_warnings() as warnings:
+    def _load(self, file: ModelFile) -> Any:
+        with _printed_warnings():
             try:
-                m = _compiled(file)
+                return _compiled(file)
             except ValueError as error:
-                return Reading(self.version(), refusal=str(error))
-        bodies = tuple(_body(m, i) for i in range(1, m.nbody))
-        is_weightless = m.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
-        gravity = np.zeros(3) if is_weightless else np.array(m.opt.gravity)
-        model = NeutralModel(_model_name(m), bodies, gravity)
-        return Reading(self.version(), model, warnings=(*printed, *warnings))
+                raise Refused(str(error)) from None
 
-    def evaluate(self, file: ModelFile, states: Sequence[CanonicalState]) -> list[ModelQuantities]:
-        """Compute the quantities with MuJoCo's own routines.
+    def _describe(self, loaded: Any, file: ModelFile) -> NeutralModel:
+        bodies = tuple(_body(loaded, i) for i in range(1, loaded.nbody))
+        is_weightless = loaded.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
+        gravity = np.zeros(3) if is_weightless else np.array(loaded.opt.gravity)
+        return NeutralModel(_model_name(loaded), bodies, gravity)
 
-        Args:
-            file: a file that `read` accepts.
-            states: canonical states.
-
-        Returns:
-            One record per state.
-
-        """
-        with _collected_warnings():
-            m = _compiled(file)
-            _switch_off(m)
-            d = mujoco.MjData(m)
-            return [_quantities(m, d, state) for state in states]
+    def _evaluate(
+        self, loaded: Any, file: ModelFile, states: Sequence[CanonicalState]
+    ) -> list[ModelQuantities]:
+        with _printed_warnings():
+            _switch_off(loaded)
+            d = mujoco.MjData(loaded)
+            return [_quantities(loaded, d, state) for state in states]
 
 
 @contextmanager
-def _collected_warnings() -> Iterator[list[str]]:
-    """Collect MuJoCo's warnings, which it would write to a log file in the current folder."""
-    texts: list[str] = []
+def _printed_warnings() -> Iterator[None]:
+    """Print MuJoCo's warnings, which it would write to a log file in the current folder."""
     before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(texts.append)
+    mujoco.set_mju_user_warning(lambda text: print(text, file=sys.stderr, flush=True))
     try:
-        yield texts
+        yield
     finally:
         mujoco.set_mju_user_warning(before)
 

@@ -24,7 +24,8 @@ import numpy as np
 import pinocchio as pin
 
 from adapters.importer_common import (
-    captured_output,
+    LoadingImporter,
+    Refused,
     free_joint_name,
     joint_from_screw,
     joint_names,
@@ -34,7 +35,7 @@ from adapters.importer_common import (
     quaternion_of,
     to_canonical,
 )
-from plumbline.importers.importer import Importer, ModelFile, Reading
+from plumbline.importers.importer import ModelFile
 from plumbline.importers.neutral_model import (
     CanonicalState,
     ElementaryJoint,
@@ -46,7 +47,7 @@ from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import rotation_matrix
 
 
-class PinocchioImporter(Importer):
+class PinocchioImporter(LoadingImporter):
     """Pinocchio's URDF and MJCF parsers."""
 
     name = "pinocchio"
@@ -59,55 +60,20 @@ class PinocchioImporter(Importer):
         "passive_force": "no routine of Pinocchio applies the damping that its models hold",
     }
 
-    def version(self) -> str:
-        """Return the version of the pin wheel.
-
-        Returns:
-            As Pinocchio reports it.
-
-        """
-        return str(pin.__version__)
-
-    def read(self, file: ModelFile) -> Reading:
-        """Parse a file and describe the model that Pinocchio built.
-
-        Args:
-            file: the file and how to load it.
-
-        Returns:
-            The description, or Pinocchio's refusal.
-
-        """
-        with captured_output() as warnings:
-            try:
-                model = _parsed(file)
-            except Exception as error:  # ValueError, RuntimeError and exceptions of Boost
-                return Reading(self.version(), refusal=str(error) or type(error).__name__)
+    def _load(self, file: ModelFile) -> Any:
         try:
-            bodies = _Layout(model, file).bodies()
-        except _Undescribed as kind:
-            return Reading(self.version(), refusal=f"this column does not describe {kind}")
-        gravity = np.array(model.gravity.linear)
-        return Reading(self.version(), NeutralModel(model.name, bodies, gravity), warnings=tuple(warnings))
+            return _parsed(file)
+        except Exception as error:  # ValueError, RuntimeError and exceptions of Boost
+            raise Refused(str(error) or type(error).__name__) from None
 
-    def evaluate(self, file: ModelFile, states: Sequence[CanonicalState]) -> list[ModelQuantities]:
-        """Compute the quantities with Pinocchio's own routines.
+    def _describe(self, loaded: Any, file: ModelFile) -> NeutralModel:
+        return NeutralModel(loaded.name, _Layout(loaded, file).bodies(), np.array(loaded.gravity.linear))
 
-        Args:
-            file: a file that `read` accepts.
-            states: canonical states of the model that `read` returned.
-
-        Returns:
-            One record per state.
-
-        """
-        model = _parsed(file)
-        layout = _Layout(model, file)
+    def _evaluate(
+        self, loaded: Any, file: ModelFile, states: Sequence[CanonicalState]
+    ) -> list[ModelQuantities]:
+        layout = _Layout(loaded, file)
         return [layout.quantities(state) for state in states]
-
-
-class _Undescribed(Exception):
-    """A joint of Pinocchio's that has no counterpart in the neutral model; the message is its kind."""
 
 
 def _parsed(file: ModelFile) -> Any:
@@ -167,7 +133,7 @@ class _Layout:
         short, nq, nv = self.m.joints[j].shortname(), self.m.nqs[j], self.m.nvs[j]
         if "FreeFlyer" in short:
             if self.m.parents[j] != 0:
-                raise _Undescribed("a free joint of a body that has a parent")
+                raise NotImplementedError("a free joint of a body that has a parent")
             return "free"
         if short == "JointModelSpherical":
             return "ball"
@@ -175,13 +141,13 @@ class _Layout:
             return "scalars"
         if (nq, nv) == (2, 1):
             return "continuous"
-        raise _Undescribed(f"a joint of type {short} with {nq} coordinates and {nv} velocities")
+        raise NotImplementedError(f"a joint of type {short} with {nq} coordinates and {nv} velocities")
 
     def _frame(self, j: int) -> Any:
         """The frame of the body that the joint moves: the first one added to it."""
         frame = next((f for f in self.body_frames if f.parentJoint == j), None)
         if frame is None:
-            raise _Undescribed(f"joint {self.m.names[j]!r}, which moves no body")
+            raise NotImplementedError(f"joint {self.m.names[j]!r}, which moves no body")
         return frame
 
     def _body(self, j: int, frame: Any, names: dict[str, list[str]]) -> NeutralBody:

@@ -21,14 +21,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from importlib import metadata
 from typing import Any, ClassVar
 
 import numpy as np
 import pybullet as bullet
 
 from adapters.importer_common import (
-    captured_output,
+    LoadingImporter,
+    Refused,
     free_joint_name,
     joint_from_screw,
     make_joint,
@@ -38,7 +38,7 @@ from adapters.importer_common import (
     quaternion_of,
     to_canonical,
 )
-from plumbline.importers.importer import Importer, ModelFile, Reading
+from plumbline.importers.importer import ModelFile
 from plumbline.importers.neutral_model import (
     CanonicalState,
     ElementaryJoint,
@@ -54,7 +54,7 @@ PROBE = 0.5  # rad or m: displacement by which a joint's screw is measured
 BASE = -1  # PyBullet's index of the base link
 
 
-class PybulletImporter(Importer):
+class PybulletImporter(LoadingImporter):
     """PyBullet's loadURDF and loadMJCF."""
 
     name = "pybullet"
@@ -71,52 +71,26 @@ class PybulletImporter(Importer):
         "gravity_force": "calculateInverseDynamics is used for fixed bases only",
     }
 
-    def version(self) -> str:
-        """Return the version of the pybullet wheel.
-
-        Returns:
-            As its metadata have it.
-
-        """
-        return metadata.version("pybullet")
-
-    def read(self, file: ModelFile) -> Reading:
-        """Load a file and describe the multibodies.
-
-        Args:
-            file: the file and how to load it.
-
-        Returns:
-            The description, or PyBullet's refusal with what it printed.
-
-        """
-        with captured_output() as warnings:
-            try:
-                ids = _loaded(file)
-            except bullet.error as error:
-                ids = str(error)
-        if isinstance(ids, str):
-            return Reading(self.version(), refusal=" ".join([ids, *warnings]))
+    def _load(self, file: ModelFile) -> Any:
         try:
-            bodies = _Layout(ids, file).bodies
-        except NotImplementedError as kind:
-            return Reading(self.version(), refusal=f"this column does not describe {kind}")
-        model = NeutralModel("", bodies, np.array(GRAVITY))
-        return Reading(self.version(), model, warnings=tuple(warnings))
+            ids = _loaded(file)
+        except bullet.error as error:
+            ids = str(error)
+        if isinstance(ids, str):
+            raise Refused(ids)
+        return ids
 
-    def evaluate(self, file: ModelFile, states: Sequence[CanonicalState]) -> list[ModelQuantities]:
-        """Compute the quantities with PyBullet's own routines.
+    def _describe(self, loaded: Any, file: ModelFile) -> NeutralModel:
+        return NeutralModel("", _Layout(loaded, file).bodies, np.array(GRAVITY))
 
-        Args:
-            file: a file that `read` accepts.
-            states: canonical states of the model that `read` returned.
-
-        Returns:
-            One record per state.
-
-        """
-        layout = _Layout(_loaded(file), file)
+    def _evaluate(
+        self, loaded: Any, file: ModelFile, states: Sequence[CanonicalState]
+    ) -> list[ModelQuantities]:
+        layout = _Layout(loaded, file)
         return [layout.quantities(state) for state in states]
+
+    def _refusal_words(self, refusal: str, printed: Sequence[str]) -> str:
+        return " ".join([refusal, *printed])
 
 
 @cache
