@@ -228,6 +228,11 @@ def _require_physical_inertia(matrix: Array) -> None:
     """
     values = np.linalg.eigvalsh(matrix)
     shown = ", ".join(f"{value:.6g}" for value in values)
+    if not np.any(matrix):
+        raise invalid_value_error(
+            "is all zeros: no rounding bound is derived for a point mass, so it could not be judged",
+            "moments above 0, such as 1e-6 m ℓ² of a small body at a distance ℓ from its joint",
+        )
     if values[0] <= INPUT_ROUNDING * values[2]:
         raise invalid_value_error(
             f"has the principal moments {shown}, not all positive", "three positive principal moments"
