@@ -26,7 +26,7 @@ def peak_megabytes():
     return size / (2**20 if sys.platform == "darwin" else 2**10)
 
 
-def run_random_scenarios(seed, count, states):
+def run_random_scenarios(seed, count, states, mechanisms=0):
     """The result, and the peak memory of this process [MB] at each tenth of the tasks."""
     peaks = []
 
@@ -41,7 +41,7 @@ def run_random_scenarios(seed, count, states):
         jobs=jobs,
         limits=Limits(600),
         random_state_count=states,
-        random_scenarios=RandomScenarios(seed, count),
+        random_scenarios=RandomScenarios(seed, count, 0, mechanisms),
     )
     return run_plan(plan, progress), peaks
 
@@ -76,6 +76,19 @@ def test_sound_engines_have_no_disagreement():
     assert counted["agrees"] > 200 * (len(ENGINES) - 1) * 6
     assert counted["unresolved"] < 0.01 * counted.total(), "too many inconclusive bounds"
     assert max(ratio for engine, ratio in worst_ratios(result).items() if engine not in DEFECTIVE) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("seed", "count", "states"),
+    [(2026, 16, 1), pytest.param(1, 2000, 9, marks=[pytest.mark.full, pytest.mark.timeout(7200)])],
+)
+def test_sound_engines_have_no_disagreement_on_random_mechanisms(seed, count, states):
+    result, _ = run_random_scenarios(seed, 0, states, count)
+    assert not disagreements(result) and result.metadata["exit_code"] == 0, disagreements(result)
+    assert result.random_batch.scenario_count == count
+    counted = count_by_verdict(result)
+    assert counted["agrees"] > 25 * count
+    assert counted["unresolved"] < 0.01 * counted.total(), "too many inconclusive bounds"
 
 
 @pytest.mark.full
