@@ -353,12 +353,11 @@ def _motion_effects(
     parameters: Sequence[Parameter],
     quantities: set[str],
     size: float,
-    refinement: int = 1,
 ) -> dict[str, Array]:
     """Running maxima (P, T) of what mistakes of a size do to a motion, by quantity."""
     effects: dict[str, list[Array]] = {quantity: [] for quantity in quantities}
     true: Trajectory | None = None
-    for motion in perturbed_motions(model, state, times, parameters, None, size, refinement):
+    for motion in perturbed_motions(model, state, times, parameters, None, size):
         if motion.true is not true:
             true = motion.true
             invariants = compute_invariants(model, true) if quantities & set(INVARIANT_UNITS) else None

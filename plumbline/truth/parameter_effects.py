@@ -21,6 +21,7 @@ from plumbline.engines.integrators import runge_kutta_4
 from plumbline.model.datatypes import Array, Model, State, Trajectory
 from plumbline.model.invariants import (
     angular_momentum,
+    attitude_error,
     joint_vector_rates,
     kinetic_energy,
     potential_energy,
@@ -48,14 +49,15 @@ from plumbline.truth.parameters import (
     perturb_model,
 )
 from plumbline.truth.rounding_bound import NewtonEulerSystem
-from plumbline.truth.step_formulas import fastest_rates
 from reference_impl.structured import component_first
 from reference_impl.tree_elimination import TreeSystem, eliminated_system
 
 STATE_MISTAKE = 1e-4  # of a state's parameters, in central differences
 TREE_MISTAKE = 0.02  # of a tree's: rounding in the difference is below a bound, its error below 0.1 %
 MOTION_MISTAKE = 1e-5  # of a parameter's scale, in the runs that show its effect on the motion
-MOTION_STEP = 2.0**-6  # s, largest step of those runs; both runs of a difference make the same error
+MOTION_STEP = 2.0**-6  # s, largest step of those runs; both runs of a difference make the same error …
+MAX_MOTION_ERROR = 1e-2  # rad, which must be small, or the difference is that of another motion
+MAX_HALVINGS = 4
 MAX_STEP_ANGLE = 0.25  # rad that the fastest mode turns in a step
 TINY_RATE = 1e-3  # rad/s
 MAX_BATCH_BODIES = 4000  # of one batch of runs: more do not fit the processor's cache
@@ -359,7 +361,6 @@ def perturbed_motions(
     parameters: Sequence[Parameter],
     substeps: int | None = None,
     mistake: float = MOTION_MISTAKE,
-    refinement: int = 1,
 ) -> Iterator[PerturbedMotion]:
     """Simulate a motion with each parameter off by a fraction of its scale.
 
@@ -370,25 +371,34 @@ def perturbed_motions(
         parameters: of `list_parameters`.
         substeps: Runge-Kutta steps between two samples; None for as many as the motion needs.
         mistake: the fraction.
-        refinement: multiplies the number of steps.
 
     Yields:
         The motions, in the order of the parameters.
 
     """
     if substeps is None:
-        rates = [TINY_RATE, *np.linalg.norm(state.omega, axis=1) / 2]
-        if model.is_chain:
-            rates.append(float(np.max(fastest_rates(model, [state]))))
-        step = min(MOTION_STEP, MAX_STEP_ANGLE / max(rates))
-        substeps = max(1, int(np.ceil((times[1] - times[0]) / step)))
+        substeps = _needed_substeps(model, state, times)
     size = max(1, MAX_BATCH_BODIES // model.n - 1)
     for first in range(0, len(parameters), size):
         part = parameters[first : first + size]
         cases = [(model, state), *(perturb(model, state, one, mistake) for one in part)]
-        true, *runs = _simulate_batch(cases, times, substeps * refinement)
+        true, *runs = _simulate_batch(cases, times, substeps)
         for parameter, run in zip(part, runs, strict=True):
             yield PerturbedMotion(parameter, run, true)
+
+
+def _needed_substeps(model: Model, state: State, times: Array) -> int:
+    """Steps between two samples with which the motion is accurate enough to show how mistakes grow."""
+    fastest = max(TINY_RATE, *np.linalg.norm(state.omega, axis=1) / 2)
+    step = min(MOTION_STEP, MAX_STEP_ANGLE / fastest)
+    count = max(1, int(np.ceil((times[1] - times[0]) / step)))
+    coarse = _simulate_batch([(model, state)], times, count)[0]
+    for _ in range(MAX_HALVINGS):
+        fine = _simulate_batch([(model, state)], times, 2 * count)[0]
+        if float(np.max(attitude_error(fine.p, coarse.p))) <= MAX_MOTION_ERROR:
+            break
+        count, coarse = 2 * count, fine
+    return count
 
 
 def _simulate_batch(cases: Sequence[tuple[Model, State]], times: Array, substeps: int) -> list[Trajectory]:
