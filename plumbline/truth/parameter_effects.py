@@ -253,7 +253,20 @@ def effects_at_states(
     """
     if model.is_chain:
         return [StateSensitivity(model, state).effects(parameters) for state in states]
-    return difference_effects(model, states, parameters, TREE_MISTAKE)
+    # the spring of a ball joint jumps at half a turn, which a smaller difference hardly ever meets
+    winds = [one.kind.endswith("frame") and model.kind[one.body] == "ball" for one in parameters]
+    order = np.argsort(winds, kind="stable")
+    split = len(parameters) - sum(winds)
+    parts = [
+        difference_effects(model, states, [parameters[i] for i in some], mistake)
+        for some, mistake in ((order[:split], TREE_MISTAKE), (order[split:], STATE_MISTAKE))
+        if len(some)
+    ]
+    back = np.argsort(order)
+    return [
+        {name: np.concatenate([part[at][name] for part in parts])[back] for name in parts[0][at]}
+        for at in range(len(states))
+    ]
 
 
 def difference_effects(
@@ -277,7 +290,7 @@ def difference_effects(
         part = parameters[first : first + size]
         pairs = [_perturbed(model, states, one, sign * mistake) for one in part for sign in (1, -1)]
         scale = 2 * mistake * np.array([one.scale for one in part])
-        for name, values in _evaluate(pairs).items():  # (2P, S, ...)
+        for name, values in evaluate_models(pairs).items():  # (2P, S, ...)
             change = values[::2] - values[1::2]
             change = change / scale.reshape(-1, *(1,) * (change.ndim - 1))
             for at, own in enumerate(found):
@@ -298,15 +311,36 @@ def _perturbed(
     """A changed model with its states, stacked; the same minimal coordinates but for a changed one."""
     if parameter.kind in STATE_KINDS:
         states = [perturb(model, state, parameter, size)[1] for state in states]
-    stacked = State(**{name: np.array([getattr(s, name) for s in states]) for name in vars(states[0])})
+    stacked = stack_states(states)
     if parameter.kind in STATE_KINDS:
         return model, stacked
     changed = perturb_model(model, parameter, size)
     return changed, complete_state(changed, stacked)
 
 
-def _evaluate(cases: Sequence[tuple[Model, State]]) -> dict[str, Array]:
-    """All state quantities (cases, S, ...) of changed models with S states each."""
+def stack_states(states: Sequence[State]) -> State:
+    """Put states into one, of arrays with a leading axis.
+
+    Args:
+        states: S states of as many bodies.
+
+    Returns:
+        The states, (S, ...) arrays.
+
+    """
+    return State(**{name: np.array([getattr(s, name) for s in states]) for name in vars(states[0])})
+
+
+def evaluate_models(cases: Sequence[tuple[Model, State]]) -> dict[str, Array]:
+    """Evaluate all state quantities of many trees at once, in the reference's O(N) form.
+
+    Args:
+        cases: mechanisms of as many bodies, each with S states of `stack_states`.
+
+    Returns:
+        By quantity (cases, S, ...), with the names and units of `StateQuantities`.
+
+    """
     count = len(cases[0][1].p)
     r, p, v, omega, x = (
         np.concatenate([np.concatenate(getattr(state, name)) for _, state in cases])

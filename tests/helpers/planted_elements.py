@@ -8,7 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State, StateQuantities
-from plumbline.model.kinematics import elastic_energy, kinetic_energy_of_rotors, quaternion_product
+from plumbline.model.kinematics import (
+    elastic_energy,
+    kinetic_energy_of_rotors,
+    quaternion_product,
+    rotation_matrix,
+)
 from plumbline.model.random_mechanisms import random_tree
 
 Change = Callable[[Model], Model]
@@ -132,7 +137,37 @@ def _without_springs(model: Model, state: State, found: StateQuantities) -> Stat
     return replace(found, potential_energy=found.potential_energy - elastic_energy(model, state))
 
 
+def _bodies() -> Iterator[ElementDefect]:
+    """Numbers of the bodies of a tree: mass, inertia, loads, drags, gravity."""
+    yield ElementDefect("mass of body 3", "the mass of body 3 were", "pinocchio", scaled("mass", (2,), 1.001))
+    yield ElementDefect(
+        "inertia of body 2", "the inertia xx of body 2", change=scaled("inertia", (1, 0, 0), 1.01)
+    )
+    yield ElementDefect("gravity", "gravity were", change=replace_all("gravity", 1.001))
+    for name, words in (("force", "applied force"), ("moment", "applied moment")):
+        dropped = scaled(name, (1,), 0.0)
+        yield ElementDefect(f"no {name} on body 2", f"the {words} of body 2 were missing", change=dropped)
+    for name in ("drag_force", "drag_moment"):
+        words = f"the {name.replace('_', ' ')} of body 4 were"
+        yield ElementDefect(f"{name} of body 4", words, "pinocchio", scaled(name, (3,), 0.0))
+
+
+def _arm_reversed(model: Model, state: State, found: StateQuantities) -> StateQuantities:
+    """The moments of joints with the arm to the centre of mass of the whole reversed."""
+    assert found.joint_moment is not None and found.joint_reaction is not None
+    near = state.r + np.matvec(rotation_matrix(state.p), model.proximal)
+    whole = model.mass @ state.r / np.sum(model.mass)
+    lever = np.cross(near - whole, found.joint_reaction)
+    return replace(found, joint_moment=found.joint_moment + 2 * lever)
+
+
 ELEMENT_DEFECTS = [
+    *_bodies(),
+    ElementDefect(
+        "moments with the arm reversed",
+        "arm of joint moments to the centre of mass of the whole counted -1 times",
+        answer=_arm_reversed,
+    ),
     *_elements(),
     ElementDefect("axis in the far body", "axes of joint 2 in the far body about x", change=turned(1, 0, 0)),
     ElementDefect(
