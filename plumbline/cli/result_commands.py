@@ -84,7 +84,7 @@ def _reproduce_model(folder: Path, keys: tuple[str, ...], form: str | None) -> N
         try:
             script = write_model_script(
                 row["scenario"], row["engine"], form or engine, about["base"], root, about["strip_geometry"],
-                since=str(changes.get(key, {}).get("sentence", "")),
+                since=str(changes.get(key, {}).get("note", "")),
             )  # fmt: skip
         except NoModelScript as error:
             raise click.ClickException(f"{key}: {error}") from None

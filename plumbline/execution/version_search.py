@@ -66,6 +66,14 @@ class VersionChange:
         )
 
     @property
+    def note(self) -> str:
+        """The same without details, for the head of a script."""
+        before, after = (self.answers[version].key for version in (self.last_before, self.first_after))
+        if {before, after} <= set(Verdict):
+            return f"{self.last_before}: {before}; since {self.first_after}: {after}."
+        return f"{self.last_before} answers otherwise than {self.first_after}, the next version."
+
+    @property
     def first(self) -> VersionAnswer:
         """The answer of the oldest version."""
         return self.answers[self.oldest]

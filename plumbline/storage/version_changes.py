@@ -18,7 +18,7 @@ def read_version_changes(folder: Path) -> dict[str, dict[str, Any]]:
         folder: a results folder.
 
     Returns:
-        By the row's key ``last_before``, ``first_after`` and ``sentence``; empty where nothing was searched.
+        By the row's key ``last_before``, ``first_after`` and ``note``; empty where nothing was searched.
 
     """
     try:
@@ -34,7 +34,7 @@ def add_version_change(folder: Path, key: str, change: dict[str, Any]) -> None:
     Args:
         folder: a results folder.
         key: of the row.
-        change: ``last_before``, ``first_after`` and ``sentence``.
+        change: ``last_before``, ``first_after`` and ``note``.
 
     """
     text = json.dumps(read_version_changes(folder) | {key: change}, ensure_ascii=False, indent=1)

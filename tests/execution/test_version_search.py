@@ -49,6 +49,9 @@ def test_neighbours_that_differ_are_found_by_halving(change_at):
     assert (change.last_before, change.first_after) == (VERSIONS[change_at - 1], VERSIONS[change_at])
     assert len(asked) == len(set(asked)) <= 2 + 6, "log2 of 38, rounded up"
     assert f"since {change.first_after}" in change.sentence
+    assert (
+        change.note == f"{change.last_before} answers otherwise than {change.first_after}, the next version."
+    )
 
 
 def test_versions_that_cannot_be_used_are_skipped_and_named():
