@@ -11,7 +11,8 @@ read as -C_rᵀ λ, whatever the constraint's scale and sign.
 
 Springs, dampers and efforts of a joint are torsional and linear spring-dampers between its markers: turned so
 that the axis is the connector's z (turns) or given (slides); of a universal joint's second axis, fixed in the
-near body, the markers are exchanged and the angle is −φ.  Their forces are not in −C_qᵀλ and are added to it.
+near body, the markers are exchanged and the angle is −φ.  A node keeps the angle of the last step, near which
+the next one is taken, so that it counts full turns.  Their forces are not in −C_qᵀλ and are added to it.
 
 Welded halves are nodes of their own with a rigid joint between: the body hangs by its first half, the next
 body on its last, and outputs of the body are read at the point on its first half where its centre is.
@@ -190,13 +191,15 @@ class ExudynChain:
                     force=float(-effort), **coefficients,
                 )  # fmt: skip
             else:
-                # the connector's angle is a principal value
-                whole = 2 * np.pi * np.round(self.x[k, i] / (2 * np.pi))
+                # the node keeps the angle of the last step, near which the next one is taken
+                last_angle = self.mbs.AddNode(
+                    items.NodeGenericData(initialCoordinates=[sign * self.x[k, i]], numberOfDataCoordinates=1)
+                )
                 local = np.roll(np.eye(3), -number - 1, axis=1) if sign > 0 else SECOND_AXIS
                 connector = items.ObjectConnectorTorsionalSpringDamper(
                     markerNumbers=ends[::sign], rotationMarker0=turns[::sign][0] @ local,
-                    rotationMarker1=turns[::sign][1] @ local, offset=float(sign * (model.rest[k, i] - whole)),
-                    torque=float(-sign * effort), **coefficients,
+                    rotationMarker1=turns[::sign][1] @ local, offset=float(sign * model.rest[k, i]),
+                    nodeNumber=last_angle, torque=float(-sign * effort), **coefficients,
                 )  # fmt: skip
             self.connectors.append((k, self.mbs.AddObject(connector), what == "slide", sign * axis))
 

@@ -100,18 +100,21 @@ class Reference(MetamorphicHooks):
         start = notes_state(state)
         try:
             if integrator.name == "collocation":
-                return trajectory(integrate_collocation([model], *start, times, resolution))
-            return trajectory(integrate_dop853(model, *start, times, resolution))
+                system = eliminated_system([model], state.x)
+                return trajectory(integrate_collocation(system, *start, times, resolution))
+            return trajectory(integrate_dop853(model, *start, times, resolution, x=state.x))
         except ArithmeticError as error:
             raise EngineFailure(f"{self.title}: {error}") from error
 
     def _simulate_round_trip(
         self, model: Model, state: State, end: float, integrator: Integrator, resolution: float
     ) -> Trajectory:
-        system, times = eliminated_system([model]), np.array([0.0, end, 2 * end])
+        times = np.array([0.0, end, 2 * end])
         try:
+            system = eliminated_system([model], state.x)
             there = integrate_collocation(system, *notes_state(state), times[:2], resolution)
             turned = there.r[-1], there.p[-1], -there.v[-1], -there.pdot[-1]
+            system = eliminated_system([model], there.x[-1])
             back = integrate_collocation(system, *turned, times[:2], resolution)
         except ArithmeticError as error:
             raise EngineFailure(f"{self.title}: {error}") from error

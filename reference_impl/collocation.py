@@ -23,7 +23,7 @@ from numpy.polynomial.legendre import leggauss, legvander
 from reference_impl.integrate import IntegrationResult, state_scales
 from reference_impl.mechanism import Array, Mechanism
 from reference_impl.structured import component_first
-from reference_impl.tree_elimination import EliminatedSystem, eliminated_system
+from reference_impl.tree_elimination import EliminatedSystem, TreeSystem, eliminated_system
 
 DEFAULT_NODES = 16  # a sweep of a small chain costs NumPy's calls and not its nodes: 8 … 20 were tried
 MAX_SWEEPS = 14  # at most in a step; more are better spent on a shorter step
@@ -39,6 +39,7 @@ class BatchIntegrationResult(IntegrationResult):
     rejected_steps: int  # steps that were repeated shorter
     stiff_steps: int  # steps whose size the sweeps' convergence decided and not the tolerance: stiffness
     note: str  # a sentence where the problem is stiff for the sweeps
+    x: Array  # (T, N, 2) rad or m, of joints with elements where springs act on angles; elsewhere no meaning
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +173,7 @@ def integrate_collocation(
     t, steps, rejected, hindered, done = float(times[0]), 0, 0, 0, 1
     samples = np.empty((2, len(times), 7, forest.body_count))
     samples[:, 0] = stepper.q, stepper.v
+    coordinates = np.tile(stepper.x, (len(times), 1, 1))
     while done < len(times):
         goal = float(times[-1] if dense else times[done])
         h = min(stepper.h, goal - t)
@@ -192,7 +194,7 @@ def integrate_collocation(
         reached_t = goal if ends else t + h
         reached = int(np.searchsorted(times, reached_t, side="right"))
         if reached > done:
-            within = stepper.dense_output((times[done:reached] - t) / h)
+            within, coordinates[done:reached] = stepper.dense_output((times[done:reached] - t) / h)
             if project:
                 within = np.stack([forest.project(q, v) for q, v in within.swapaxes(0, 1)], axis=1)
             samples[:, done:reached] = within
@@ -214,6 +216,7 @@ def integrate_collocation(
         rejected_steps=rejected,
         stiff_steps=hindered,
         note=note if 2 * hindered > steps > 2 else "",
+        x=coordinates,
     )
 
 
@@ -241,6 +244,10 @@ class _Stepper:
         self.tiles = [(slice(at[0], at[-1] + 1), forest.repeated(len(at))) for at in nodes]
         self.q, self.v, self.rtol, self.sweep_tolerance = q, v, rtol, quiet
         self.dense, self.baumgarte = dense, baumgarte
+        # joint coordinates near which the angles of springs are taken, carried on by their rates
+        self.x, self.x_rate = np.zeros((forest.body_count, 2)), np.zeros((len(table.c), forest.body_count, 2))
+        if isinstance(forest, TreeSystem) and forest.winding:
+            self.x = forest.winding.coordinates(q[:3].T, q[3:].T, v[:3].T, v[3:].T, forest.x)[0]
         self.q_compensation, self.v_compensation = (
             np.zeros_like(q),
             np.zeros_like(v),
@@ -279,7 +286,7 @@ class _Stepper:
             V += v0
             Q = hA @ V
             Q += q0
-            new = self._accelerations(Q, V)
+            new = self._accelerations(Q, V, hA)
             a -= new
             np.abs(a, out=a)
             a *= weight
@@ -309,13 +316,28 @@ class _Stepper:
         self._advance(a, h)
         return True, slow
 
-    def _accelerations(self, Q: Array, V: Array) -> Array:
+    def _accelerations(self, Q: Array, V: Array, hA: Array) -> Array:
         """The accelerations (7, S, M) at all nodes."""
         new = np.empty_like(Q)
+        if isinstance(self.forest, TreeSystem) and self.forest.winding:
+            self._carry_angles(Q, V, hA)
         for nodes, tile in self.tiles:
             part = tile.acceleration(Q[:, nodes].reshape(7, -1), V[:, nodes].reshape(7, -1), self.baumgarte)
             new[:, nodes] = part.reshape(7, -1, self.forest.body_count)
         return new
+
+    def _carry_angles(self, Q: Array, V: Array, hA: Array) -> None:
+        """Set the coordinates near which springs take their angles at the nodes: x₀ + h A ẋ."""
+        systems = [(nodes, tile) for nodes, tile in self.tiles if isinstance(tile, TreeSystem)]
+        for nodes, tile in systems:
+            (r, p), (v, pdot) = (
+                (y[:3].reshape(3, -1).T, y[3:].reshape(4, -1).T) for y in (Q[:, nodes], V[:, nodes])
+            )
+            if tile.winding:
+                rate = tile.winding.coordinates(r, p, v, pdot)[1]
+                self.x_rate[nodes] = rate.reshape(-1, *self.x.shape)
+        for nodes, tile in systems:
+            tile.x = (self.x + np.tensordot(hA[nodes], self.x_rate, 1)).reshape(-1, 2)
 
     def _extrapolated_acceleration(self, ratio: float) -> Array:
         """The last step's polynomial at the nodes of the next one, cut where its terms there are smallest.
@@ -344,18 +366,20 @@ class _Stepper:
         """To the end of the step, with compensated sums (Kahan)."""
         table = self.table
         self.modes, self.last_step, self.q0, self.v0 = self.new_modes, h, self.q, self.v
+        self.x0, self.x = self.x, self.x + h * np.tensordot(table.b, self.x_rate, 1)
         dv = h * np.einsum("j,ijm->im", table.b, a)
         dq = h * (self.v + h * np.einsum("j,ijm->im", table.b * (1 - table.c), a))
         self.q, self.q_compensation = _compensated_sum(self.q, dq + self.q_compensation)
         self.v, self.v_compensation = _compensated_sum(self.v, dv + self.v_compensation)
 
-    def dense_output(self, tau: Array) -> Array:
-        """(2, T, 7, M) q and v at fractions ``tau`` of the last step."""
+    def dense_output(self, tau: Array) -> tuple[Array, Array]:
+        """(2, T, 7, M) q and v, and x (T, M, 2), at fractions ``tau`` of the last step."""
         once, twice = self.table.mode_integrals(tau)
         modes, h = self.modes, self.last_step
         v = self.v0 + h * np.einsum("tk,ikm->tim", once, modes)
         q = self.q0 + h * (tau[:, None, None] * self.v0 + h * np.einsum("tk,ikm->tim", twice, modes))
-        return np.stack([q, v])
+        x = self.x0 + h * np.tensordot(once @ self.table.node_to_mode, self.x_rate, 1)
+        return np.stack([q, v]), x
 
     def project(self) -> None:
         """Onto the manifold."""

@@ -13,6 +13,8 @@ f = w, n_near = b × w, n_far = (a + d) × w of a slide: J_φ, and the wrench of
     rotor                    J_φ q̈ − μ/a = −φ̈₀,  μ = a φ̈           one row and one unknown more (L4)
     between points           t = k (l − l₀) + c l̇,  l̇ = dᵀḋ/l      pulls both points together, l = |d|
 
+An angle is known from r and p up to full turns; a motion carries it on by ẋ = φ̇, which chooses the turn.
+
 A ball joint has three coordinates about the near body's axes; φ is the rotation vector θ u of the turn from
 the far to the near body, along whose axis the torque −k θ u acts: V = ½ k θ².  Exact on the constraints.
 """
@@ -35,6 +37,8 @@ class ElementForces:
     p_near: Array  # (e, 4) J_φ of p of the near body
     p_far: Array  # (e, 4) J_φ of p of the far body
     bias: Array  # (e,) φ̈₀
+    stretch: Array  # (e,) rad or m, φ − φ₀
+    rate: Array  # (e,) rad/s or m/s, φ̇
     torque: Array  # (e,) N m or N, τ
     force: Array  # (N, 3) N, of all elements but rotors, world frame
     p_force: Array  # (N, 4) N m, the generalised force on p of the same
@@ -70,6 +74,27 @@ class Elements:
         self.bodies = m.body[self.joint, ::-1].T  # (2, e) near, far
         self.points = np.moveaxis(m.point[self.joint, ::-1], 1, 0)
         self.turns = np.moveaxis(m.turn[self.joint, ::-1], 1, 0)
+        self.has_winding_angles = bool(np.any((self.stiffness != 0) & ~self.is_slide & ~self.is_ball))
+
+    def coordinates(
+        self, r: Array, p: Array, v: Array, pdot: Array, x: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Return the joint coordinates that have elements, and their rates.
+
+        Args:
+            r: positions (N, 3) [m], world frame.
+            p: Euler parameters (N, 4).
+            v: velocities ṙ (N, 3) [m/s], world frame.
+            pdot: rates ṗ (N, 4) [1/s].
+            x: as for `evaluate`.
+
+        Returns:
+            (N, 2) each [rad or m, and 1/s of it]; zeros where there are no elements.
+
+        """
+        found, values = self.evaluate(r, p, v, pdot, x), np.zeros((2, len(p), 2))
+        values[:, self.joint, self.column] = found.stretch + self.rest, found.rate
+        return values[0], values[1]
 
     def evaluate(self, r: Array, p: Array, v: Array, pdot: Array, x: Array | None = None) -> ElementForces:
         """Evaluate all elements.
@@ -112,6 +137,8 @@ class Elements:
             p_near=np.vecmat(n_near, rates[0]),
             p_far=-np.vecmat(n_far, rates[1]),
             bias=np.where(self.is_slide, slide_bias, dot(w_rate, wb - wa)),
+            stretch=stretch,
+            rate=rate,
             torque=torque,
             force=total[:-1, :3],
             p_force=np.vecmat(total[:-1, 3:], 2 * G(p)),

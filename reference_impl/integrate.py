@@ -10,12 +10,14 @@ from scipy.integrate import DOP853
 
 from reference_impl import notes
 from reference_impl.direct import DirectSystem
+from reference_impl.elements import Elements
 from reference_impl.euler_parameters import angular_velocity
 from reference_impl.mechanism import Array, Mechanism
 from reference_impl.structured import component_first
-from reference_impl.tree_elimination import eliminated_system
+from reference_impl.tree_elimination import TreeSystem, eliminated_system
 
-Acceleration = Callable[[Array, Array, Array, Array], Array]  # r̈ and p̈, (7 N,), at r, p, ṙ, ṗ (N, ·)
+# r̈ and p̈, (7 N,), at r, p, ṙ, ṗ (N, ·) and joint coordinates (N, 2), near which angles of springs are taken
+Acceleration = Callable[[Array, Array, Array, Array, Array | None], Array]
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +77,11 @@ def direct_acceleration(chain: Mechanism, gamma_defect: float | Array = 0.0) -> 
 
     """
     system = DirectSystem(chain)
-    return lambda r, p, v, pdot: system.solve_unknowns(r, p, v, pdot, gamma_defect)[0][: 7 * chain.n]
+
+    def acceleration(r: Array, p: Array, v: Array, pdot: Array, x: Array | None = None) -> Array:
+        return system.solve_unknowns(r, p, v, pdot, gamma_defect, x)[0][: 7 * chain.n]
+
+    return acceleration
 
 
 def structured_acceleration(chain: Mechanism) -> Acceleration:
@@ -90,7 +96,9 @@ def structured_acceleration(chain: Mechanism) -> Acceleration:
     """
     system = eliminated_system([chain])
 
-    def acceleration(r: Array, p: Array, v: Array, pdot: Array) -> Array:
+    def acceleration(r: Array, p: Array, v: Array, pdot: Array, x: Array | None = None) -> Array:
+        if isinstance(system, TreeSystem):
+            system.x = x
         a = system.acceleration(component_first(r, p), component_first(v, pdot))
         return np.concatenate([a[:3].T.ravel(), a[3:].T.ravel()])
 
@@ -107,7 +115,11 @@ def notes_acceleration(chain: Mechanism) -> Acceleration:
         r̈ and p̈ (7 N,) as a function of r, p, ṙ, ṗ.
 
     """
-    return lambda *state: notes.solve_system(chain, *state)[: 7 * chain.n]
+
+    def acceleration(r: Array, p: Array, v: Array, pdot: Array, _: Array | None = None) -> Array:
+        return notes.solve_system(chain, r, p, v, pdot)[: 7 * chain.n]
+
+    return acceleration
 
 
 def state_scales(chain: Mechanism, r: Array, p: Array, v: Array, pdot: Array) -> Array:
@@ -147,8 +159,10 @@ def integrate_dop853(
     times: Array,
     rtol: float,
     acceleration: Acceleration | None = None,
+    x: Array | None = None,
+    atol: float | None = None,
 ) -> IntegrationResult:
-    """Integrate (N6) by scipy's DOP853.
+    """Integrate (N6) by scipy's DOP853; with springs on angles, beside it the angles by their rates.
 
     Args:
         chain: the mechanism.
@@ -157,8 +171,11 @@ def integrate_dop853(
         v: initial velocities ṙ (N, 3) [m/s].
         pdot: initial rates ṗ (N, 4) [1/s].
         times: sample times (T,) [s], ascending from the initial time; samples are dense output.
-        rtol: relative tolerance, 2.2e-14 at least; the absolute one is ``rtol`` times `state_scales`.
+        rtol: relative tolerance, 2.2e-14 at least.
         acceleration: the right-hand side; the direct form by default.
+        x: initial joint coordinates (N, 2) near which the angles of springs are taken; absent: principal
+            values.
+        atol: absolute tolerance, in the units of y; ``rtol`` times `state_scales` by default.
 
     Returns:
         The motion at ``times``.
@@ -169,16 +186,22 @@ def integrate_dop853(
 
     """
     n, accelerate = chain.n, acceleration or direct_acceleration(chain)
-    start = pack_state(r, p, v, pdot)
-    samples = np.empty((len(times), 14 * n))
-    samples[0], done, steps = start, 1, 0
+    elements, size = Elements(chain), 14 * n
+    y0, limits = pack_state(r, p, v, pdot), rtol * state_scales(chain, r, p, v, pdot)
+    limits = limits if atol is None else np.full(size, atol)
+    if elements.has_winding_angles:  # they only choose the turn of an angle: no error control
+        y0 = np.concatenate([y0, elements.coordinates(r, p, v, pdot, x)[0].ravel()])
+        limits = np.concatenate([limits, np.full(2 * n, np.inf)])
+    samples = np.empty((len(times), len(y0)))
+    samples[0], done, steps = y0, 1, 0
 
     def rate(_: float, y: Array) -> Array:
         """(N6) ẏ = (ṙ, ṗ, r̈, p̈)."""
-        return np.concatenate([y[7 * n :], accelerate(*unpack_state(y, n))])
+        state, angles = unpack_state(y[:size], n), y[size:].reshape(-1, 2) if len(y) > size else None
+        of_angles = np.zeros(0) if angles is None else elements.coordinates(*state)[1].ravel()
+        return np.concatenate([y[7 * n : size], accelerate(*state, angles), of_angles])
 
-    atol = rtol * state_scales(chain, r, p, v, pdot)
-    solver = DOP853(rate, times[0], start, times[-1], rtol=rtol, atol=atol)
+    solver = DOP853(rate, times[0], y0, times[-1], rtol=rtol, atol=limits)
     while done < len(times):
         message = solver.step()
         if solver.status == "failed":
@@ -190,4 +213,4 @@ def integrate_dop853(
             if times[reached - 1] == solver.t:
                 samples[reached - 1] = solver.y
             done = reached
-    return IntegrationResult(times, *unpack_state(samples, n), steps, solver.nfev)
+    return IntegrationResult(times, *unpack_state(samples[:, :size], n), steps, solver.nfev)

@@ -90,6 +90,8 @@ class StructuredSystem:
     what they call take the component-first q = (r; p), v = (ṙ; ṗ), (7, M) each.
     """
 
+    winding = None  # there are no springs
+
     def __init__(self, chains: Sequence[Mechanism]) -> None:
         self.chains = tuple(chains)
         if not all(chain.is_chain for chain in chains):

@@ -78,6 +78,8 @@ class TreeSystem:
         for k in np.flatnonzero(far >= 0):
             depth[k] = depth[far[k]] + 1
         self.x, self.elements = x, Elements(self.forest) if self.forest.has_elements else None
+        # springs on angles: the motion depends on their full turns, which r and p do not hold
+        self.winding = self.elements if self.elements and self.elements.has_winding_angles else None
         joint, self.compliance = joint_of_rows(self.forest), np.zeros(0)
         if self.elements:  # the rows of rotors follow those of all constraints
             rotors = self.elements.rotors
@@ -109,13 +111,14 @@ class TreeSystem:
             return self
         return TreeSystem(self.chains * count, None if self.x is None else np.tile(self.x, (count, 1)))
 
-    def acceleration(self, q: Array, v: Array, baumgarte: float = 0.0) -> Array:
+    def acceleration(self, q: Array, v: Array, baumgarte: float = 0.0, x: Array | None = None) -> Array:
         """Return the accelerations, on or off the constraints.
 
         Args:
             q: (r; p) (7, M) [m, –].
             v: (ṙ; ṗ) (7, M) [m/s, 1/s].
             baumgarte: a [1/s]; adds −2 a Ċ − a² C to γ and likewise to γ_E.  0 is the notes' raw form.
+            x: joint coordinates (M, 2) in place of those of the constructor.
 
         Returns:
             (r̈; p̈) (7, M) [m/s², 1/s²].
@@ -124,13 +127,15 @@ class TreeSystem:
             SingularSystem: S is singular.
 
         """
-        return self._solve_motion(q, v, baumgarte)[0]
+        return self._solve_motion(q, v, baumgarte, x)[0]
 
-    def _solve_motion(self, q: Array, v: Array, a: float, refine: bool = False) -> tuple[Array, Array, _Rows]:
+    def _solve_motion(
+        self, q: Array, v: Array, a: float, x: Array | None, refine: bool = False
+    ) -> tuple[Array, Array, _Rows]:
         """(r̈; p̈) (7, M), the multipliers of all rows, and the rows."""
         (p, rdot, pdot), forest = (q[3:].T, v[:3].T, v[3:].T), self.forest
         with np.errstate(all="ignore"):  # what is not finite raises SingularSystem
-            rows = self._rows(q, v)
+            rows = self._rows(q, v, x)
             gamma, norm, sigma, stretch = rows.gamma, dot(p, p), dot(p, pdot), dot(pdot, pdot)
             if a:
                 gamma[: len(rows.C)] -= 2 * a * rows.rate + a * a * rows.C
@@ -169,9 +174,8 @@ class TreeSystem:
             SingularSystem: S is singular.
 
         """
-        self.x = self.x if x is None else x
         q, qdot = component_first(r, p), component_first(v, pdot)
-        motion, multiplier, rows = self._solve_motion(q, qdot, 0.0, refine=True)
+        motion, multiplier, rows = self._solve_motion(q, qdot, 0.0, x, refine=True)
         forest, c = self.forest, len(rows.C)
         pull, of_p = np.zeros((self.body_count, 3)), np.zeros((self.body_count, 4))
         np.subtract.at(pull, self.joint, multiplier[:, None] * rows.r_near)
@@ -222,14 +226,15 @@ class TreeSystem:
         """Append zeros for the rows of rotors."""
         return np.concatenate([values, np.zeros(len(self.joint) - len(values))])
 
-    def _rows(self, q: Array, v: Array) -> _Rows:
+    def _rows(self, q: Array, v: Array, x: Array | None = None) -> _Rows:
         state = q[:3].T, q[3:].T, v[:3].T, v[3:].T
         rows = constraint_rows(self.forest, *state)
         rate = rows.constraint_rate(*state[2:])
         parts = rows.r_near, rows.p_near, rows.p_far, rows.gamma
         if self.elements is None:
             return _Rows(rows.C, rate, *parts)
-        found, rotors = self.elements.evaluate(*state, self.x), self.elements.rotors
+        found = self.elements.evaluate(*state, self.x if x is None else x)
+        rotors = self.elements.rotors
         p_far = np.where(self.forest.body[self.elements.joint, 0, None] < 0, 0.0, found.p_far)
         own = found.r_near, found.p_near, p_far, -found.bias
         r_near, p_near, p_far, gamma = (

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
@@ -191,7 +191,7 @@ class Adapter(ABC):
             check_times(times, resolution)
         trajectory = self._simulate(model, state, times, method, resolution)
         _check_trajectory(model, times, trajectory, f"{self.name} {integrator}")
-        return trajectory
+        return replace(trajectory, initial_x=state.x)
 
     def step(self, model: Model, state: State, integrator: str, step: float, count: int) -> StepRun:
         """Take a few steps from a state and sample after each; errors are those of `evaluate`.

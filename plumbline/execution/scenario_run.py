@@ -82,9 +82,6 @@ def uncompared_kinds(model: Model) -> dict[TaskKind, str]:
     )  # fmt: skip
     if model.has_loops:
         return dict.fromkeys(motions, "only states of mechanisms with loops are compared")
-    if model.has_elements:
-        reason = "only states of mechanisms with rotors, springs, dampers or efforts are compared"
-        return dict.fromkeys(motions, reason)
     if not model.is_chain:
         return {TaskKind.STEP: "formulas of single steps cover chains of rods and balls"}
     if model.n > MAX_STEP_BODIES:

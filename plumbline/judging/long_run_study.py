@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -165,8 +165,7 @@ def _reduce_run(
     scales, work_uncertainty = {}, {}
     for window_end in _window_ends(end):
         number = int(np.searchsorted(run.t, window_end)) + 1
-        t, r, p, v, pdot = (getattr(run, name)[:number] for name in ("t", "r", "p", "v", "pdot"))
-        part = Trajectory(t, r, p, v, pdot, run.steps)
+        part = replace(run, **{name: getattr(run, name)[:number] for name in ("t", "r", "p", "v", "pdot")})
         invariants = compute_invariants(model, part)
         scales[window_end] = invariant_scales(model, part, length)
         work_uncertainty[window_end] = invariants.work_uncertainty

@@ -106,6 +106,8 @@ class Trajectory:
     v: Array  # (T, N, 3) m/s, ṙ
     pdot: Array  # (T, N, 4) 1/s; ½ L(p)ᵀ ω′ where the engine holds ω′
     steps: int  # steps the integrator took
+    # (N, 2) rad or m: joint coordinates at t[0], angles unwrapped; None: angles are principal values there
+    initial_x: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)

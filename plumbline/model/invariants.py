@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy
+from numpy.polynomial.legendre import legder, leggauss, legvander
 
 from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Array, Model, Trajectory
 from plumbline.model.kinematics import (
@@ -18,6 +18,9 @@ from plumbline.model.kinematics import (
     rotation_vector,
     spring_vectors,
 )
+
+WINDOW = 8  # samples that the motion between two samples is interpolated from
+GAUSS_NODES = 5
 
 
 def position_error(a: Array, b: Array) -> Array:
@@ -123,14 +126,14 @@ INVARIANT_UNITS = {
 
 
 def work_of_loads(model: Model, run: Trajectory, omega: Array) -> tuple[Array, float]:
-    """Return the work of loads and drag since t = 0, and how uncertain its quadrature is.
+    """Return the work of loads, drag, dampers and efforts since t = 0, and how uncertain its quadrature is.
 
-    Constant world forces do the work F·Δr exactly.  The power of moments and drag is integrated over the
-    samples by a quintic spline; the uncertainty is its distance to the cubic one or to the quintic through
-    every other sample, whichever is larger.  Fewer than 13 samples are not integrated.
+    Constant world forces do the work F·Δr exactly.  Other power is integrated by Gauss's rule over the motion
+    between samples, a polynomial through positions and rates of `WINDOW` samples around each interval; the
+    uncertainty is the distance to half as many, or to every other sample, whichever is larger.
 
     Args:
-        model: the chain of N bodies.
+        model: the mechanism of N bodies.
         run: T samples of its motion.
         omega: (T, N, 3) angular velocities of the run, body frame [rad/s].
 
@@ -139,21 +142,69 @@ def work_of_loads(model: Model, run: Trajectory, omega: Array) -> tuple[Array, f
 
     """
     exact = np.einsum("ki,tki->t", model.force, run.r - run.r[0])
+    if not np.any(_power(model, run, omega)) or len(run.t) < 2:
+        return exact, 0.0
+    fine = _integrated_power(model, run, WINDOW)
+    others = [(fine, _integrated_power(model, run, WINDOW // 2))]
+    if len(run.t) > 2:
+        half = {name: getattr(run, name)[::2] for name in ("t", "r", "p", "v", "pdot")}
+        others.append((fine[::2], _integrated_power(model, replace(run, **half), WINDOW)))
+    return exact + fine, float(max(np.max(np.abs(a - b)) for a, b in others))
+
+
+def _power(model: Model, run: Trajectory, omega: Array) -> Array:
+    """Power (T,) [W] of all that is not a constant force in the world."""
     power = (
         np.einsum("ki,tki->t", model.moment, omega)
         - np.einsum("k,tki,tki->t", model.drag_force, run.v, run.v)
         - np.einsum("k,tki,tki->t", model.drag_moment, omega, omega)
-        + element_energies(model, run, omega).power
     )
-    if not np.any(power) or len(run.t) < 13:
-        return exact, 0.0
-    quintic, cubic = (
-        scipy.interpolate.make_interp_spline(run.t, power, k=k).antiderivative()(run.t) for k in (5, 3)
-    )
-    half = slice(None, None, 2)
-    coarse = scipy.interpolate.make_interp_spline(run.t[half], power[half], k=5).antiderivative()(run.t[half])
-    away = max(np.max(np.abs(quintic - cubic)), np.max(np.abs(quintic[half] - coarse)))
-    return exact + quintic, float(away)
+    return np.asarray(power + element_energies(model, run, omega).power)
+
+
+def _integrated_power(model: Model, run: Trajectory, width: int) -> Array:
+    """Integral (T,) [J] of the power, over a motion that is known from ``width`` samples around."""
+    nodes, weights = leggauss(GAUSS_NODES)
+    half = np.diff(run.t)[:, None] / 2
+    times = (run.t[:-1, None] + half + half * nodes).ravel()
+    sign = np.sum(run.p[1:] * run.p[:-1], axis=-1, keepdims=True) < 0
+    sign = np.cumprod(np.concatenate([np.ones_like(sign[:1]), 1 - 2 * sign]), axis=0)  # p and −p are the same
+    place, motion = (np.concatenate([a, sign * b], -1) for a, b in ((run.r, run.p), (run.v, run.pdot)))
+    y, rate = hermite_interpolation(run.t, place, motion, times.reshape(half.size, -1), width)
+    dense = Trajectory(times, y[..., :3], y[..., 3:], rate[..., :3], rate[..., 3:], run.steps, run.initial_x)
+    power = _power(model, dense, angular_velocity(dense.p, dense.pdot)).reshape(half.size, -1)
+    return np.concatenate([[0.0], np.cumsum(half[:, 0] * (power @ weights))])
+
+
+def hermite_interpolation(times: Array, y: Array, rate: Array, at: Array, width: int) -> tuple[Array, Array]:
+    """Interpolate by polynomials through values and rates of samples.
+
+    Args:
+        times: (T,) [s] of the samples, T ≥ 2.
+        y: (T, ...) values.
+        rate: (T, ...) their rates [1/s].
+        at: (T − 1, m) times [s] within each interval.
+        width: how many samples around an interval its polynomial passes through, all where there are fewer.
+
+    Returns:
+        Values and rates ((T − 1) m, ...) at these times.
+
+    """
+    count, width = len(times) - 1, min(width, len(times))
+    first = np.clip(np.arange(count) - (width - 2) // 2, 0, len(times) - width)
+    window = first[:, None] + np.arange(width)
+    middle, scale = times[window].mean(axis=1)[:, None], np.ptp(times[window], axis=1)[:, None] / 2
+    derivative = np.zeros((2 * width, 2 * width))
+    derivative[:-1] = legder(np.eye(2 * width), axis=0)  # of the coefficients
+
+    def basis(t: Array) -> tuple[Array, Array]:
+        values = legvander((t - middle) / scale, 2 * width - 1)
+        return values, values @ derivative / scale[..., None]
+
+    known = np.concatenate([x.reshape(len(times), -1)[window] for x in (y, rate)], axis=1)
+    coefficients = np.linalg.solve(np.concatenate(basis(times[window]), axis=1), known)
+    found = [(part @ coefficients).reshape(-1, *y.shape[1:]) for part in basis(at)]
+    return found[0], found[1]
 
 
 def compute_invariants(model: Model, run: Trajectory) -> Invariants:
@@ -210,7 +261,7 @@ class ElementEnergies:
 def element_energies(model: Model, run: Trajectory, omega: Array) -> ElementEnergies:
     """Compute the energies of passive elements and the power of efforts and dampers.
 
-    Angles start between −π and π and are continuous from sample to sample.
+    Angles start near the run's ``initial_x``, and their rates choose their turn at each further sample.
 
     Args:
         model: the mechanism.
@@ -256,8 +307,10 @@ def element_energies(model: Model, run: Trajectory, omega: Array) -> ElementEner
                     kept = (
                         two if model.kind[k] == "universal" and i == 1 else one
                     )  # perpendicular to both axes
-                    sine, cosine = relative[:, two, one], relative[:, kept, kept]
-                    x, rate = np.unwrap(np.arctan2(sine, cosine)), _dot(along, turning)
+                    x = np.arctan2(relative[:, two, one], relative[:, kept, kept])
+                    start = x[0] if run.initial_x is None else run.initial_x[k, i]
+                    rate = _dot(along, turning)
+                    x = _unwrapped(x, rate, run.t, start)
                 pairs.append((i, (x - model.rest[k, i])[:, None], rate[:, None]))
         for i, stretch, rates in pairs:
             squares = np.sum(rates**2, axis=-1)
@@ -278,6 +331,13 @@ def _with_point_springs(
     rate = _dot(d, ends[..., 1, :] - ends[..., 0, :]) / np.where(length > 0, length, 1.0)
     springs = found.springs + ((length - model.spring_length) ** 2) @ model.spring_stiffness / 2
     return ElementEnergies(found.rotors, springs, found.power - rate**2 @ model.spring_damping)
+
+
+def _unwrapped(angle: Array, rate: Array, times: Array, start: float) -> Array:
+    """Add full turns to an angle (T,): near ``start`` at first, then near what its rate makes of it."""
+    change = np.diff(times) * (rate[1:] + rate[:-1]) / 2
+    turns = np.round(np.concatenate([[start - angle[0]], change - np.diff(angle)]) / (2 * np.pi))
+    return np.asarray(angle + 2 * np.pi * np.cumsum(turns))
 
 
 def _dot(a: Array, b: Array) -> Array:

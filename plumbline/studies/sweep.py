@@ -159,9 +159,8 @@ def _run_reference_batch(group: Sequence[tuple[int, Scenario]]) -> list[Record]:
     records, first = [], 0
     for index, scenario in group:
         body = slice(first, first := first + scenario.model.n)
-        motion = Trajectory(
-            times, fine.r[:, body], fine.p[:, body], fine.v[:, body], fine.pdot[:, body], fine.steps
-        )
+        r, p, v, pdot = (getattr(fine, name)[:, body] for name in ("r", "p", "v", "pdot"))
+        motion = Trajectory(times, r, p, v, pdot, fine.steps, scenario.state.x)
         reason = "the reference; its uncertainty is the change to the tighter tolerance"
         records.append(
             {

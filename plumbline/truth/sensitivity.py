@@ -8,6 +8,7 @@ in one batch.  A neighbour whose distance has grown ten thousandfold is moved ba
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from plumbline.model.kinematics import (
 from plumbline.model.sampling import derive_seed
 from reference_impl.collocation import integrate_collocation
 from reference_impl.structured import component_first
-from reference_impl.tree_elimination import EliminatedSystem, eliminated_system
+from reference_impl.tree_elimination import eliminated_system
 
 PERTURBATION_SIZE = 1e-7  # of each angle [rad], of each rate relative to the largest rate of the motion
 PERTURBATION_COUNT = 4  # random directions
@@ -104,12 +105,9 @@ def perturbation_growth_and_runs(
     neighbours = range(1, PERTURBATION_COUNT + 1)
     states = [state, *perturbed_states(model, state), *(s for _, s in other_models)]
     models = [model] * (PERTURBATION_COUNT + 1) + [m for m, _ in other_models]
-    system = eliminated_system(models, np.concatenate([s.x for s in states]))
-    r, p, v, pdot = _integrate_batch(system, states, times)
+    r, p, v, pdot, x = _integrate_batch(models, states, times)
     unperturbed = [0, *range(PERTURBATION_COUNT + 1, len(states))]
     runs = r[unperturbed], p[unperturbed]
-    if other_models:
-        system = eliminated_system([model], state.x).repeated(PERTURBATION_COUNT + 1)
     size, growth = np.full(PERTURBATION_COUNT, PERTURBATION_SIZE), np.empty((PERTURBATION_COUNT, len(times)))
     earlier_growth, done, arm = np.ones(PERTURBATION_COUNT), 0, 1e-3
     while True:
@@ -123,15 +121,16 @@ def perturbation_growth_and_runs(
         if done + stop >= len(times) - 1:
             return np.asarray(np.maximum(np.max(growth, axis=0), 1.0)), *runs
         base, *moved = (
-            project_to_manifold(model, r[k, stop], p[k, stop], v[k, stop], pdot[k, stop])
+            replace(project_to_manifold(model, *(y[k, stop] for y in (r, p, v, pdot))), x=x[k, stop])
             for k in (0, *neighbours)
         )
         size = np.minimum(distance[:, stop], PERTURBATION_SIZE)
         earlier_growth = earlier_growth * distance[:, stop] / size
         parts = size / distance[:, stop]
-        near = [_interpolate_states(model, base, x, part) for x, part in zip(moved, parts, strict=True)]
+        near = [_interpolate_states(model, base, at, part) for at, part in zip(moved, parts, strict=True)]
         done += stop
-        r, p, v, pdot = _integrate_batch(system, [base, *near], times[done : done + 2 * stop + 1])
+        same = [model] * (PERTURBATION_COUNT + 1)
+        r, p, v, pdot, x = _integrate_batch(same, [base, *near], times[done : done + 2 * stop + 1])
 
 
 def perturbed_states(
@@ -172,16 +171,13 @@ def perturbed_states(
     return found
 
 
-def _integrate_batch(
-    system: EliminatedSystem, states: list[State], times: Array
-) -> tuple[Array, Array, Array, Array]:
-    """r, p, ṙ, ṗ (runs, T, N, ·) of a batch of chains of as many bodies, from times[0]."""
+def _integrate_batch(models: list[Model], states: list[State], times: Array) -> list[Array]:
+    """r, p, ṙ, ṗ, x (runs, T, N, ·) of a batch of mechanisms of as many bodies, from times[0]."""
+    system = eliminated_system(models, np.concatenate([state.x for state in states]))
     r, p, v = (np.concatenate([getattr(state, name) for state in states]) for name in ("r", "p", "v"))
     pdot = np.concatenate([quaternion_rate(state.p, state.omega) for state in states])
     run = integrate_collocation(system, r, p, v, pdot, times, RTOL)
-    parts = (np.split(x, len(states), axis=1) for x in (run.r, run.p, run.v, run.pdot))
-    r_, p_, v_, pdot_ = (np.array(part) for part in parts)
-    return r_, p_, v_, pdot_
+    return [np.array(np.split(y, len(states), axis=1)) for y in (run.r, run.p, run.v, run.pdot, run.x)]
 
 
 def project_to_manifold(model: Model, r: Array, p: Array, v: Array, pdot: Array) -> State:
@@ -226,7 +222,7 @@ def _interpolate_states(model: Model, base: State, other: State, part: float) ->
     if model.is_chain:
         return _make_state(model, p, *mixed)
     omega, r, v = mixed
-    return project_to_manifold(model, r, p, v, quaternion_rate(p, omega))
+    return replace(project_to_manifold(model, r, p, v, quaternion_rate(p, omega)), x=base.x)
 
 
 def _make_state(model: Model, p: Array, omega: Array, u: Array, udot: Array) -> State:

@@ -69,7 +69,8 @@ def trajectory_truth(
 
     """
     if proof is not None:
-        return TrajectoryTruth(proof.trajectory, proof.position_radius, proof.attitude_radius, proof.method)
+        run = replace(proof.trajectory, initial_x=state.x)
+        return TrajectoryTruth(run, proof.position_radius, proof.attitude_radius, proof.method)
     failure = ""
     try:
         run, method = _simulate_minimal_coordinates(model, state, times, max_compiled_bodies)
@@ -137,5 +138,5 @@ def _simulate_minimal_coordinates(
     precision: Precision = "extended" if model.n <= MAX_EXTENDED_PRECISION_BODIES else "double"
     found = simulate_taylor(model, state, times, precision)
     r, p, v, omega = (np.asarray(getattr(found, name), float) for name in ("r", "p", "v", "omega"))
-    run = Trajectory(times, r, p, v, quaternion_rate(p, omega), found.steps)
+    run = Trajectory(times, r, p, v, quaternion_rate(p, omega), found.steps, state.x)
     return run, f"Taylor's method in minimal coordinates and {precision} precision"

@@ -89,6 +89,35 @@ def test_motions_with_elements_converge_to_the_truth_and_conserve_energy(engine,
         assert drift[1] < 0.6 * drift[0] or drift[1] < 1e-6 + found[1].work_uncertainty, (method.name, drift)
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_spring_on_an_angle_counts_full_turns(engine):
+    """Torsional oscillator φ = φ₀ + a cos √(k/I) t of 8 rad amplitude: beyond half a turn both ways."""
+    inertia, stiffness, rest, amplitude = 0.02, 0.7, 0.5, 8.0
+    model = replace(
+        random_tree(np.random.default_rng(0), 1, ("hinge",), loads=False),
+        inertia=inertia * np.eye(3)[None], point=np.zeros((1, 2, 3)), stiffness=np.array([[stiffness, 0.0]]),
+        rest=np.array([[rest, 0.0]]), turn=np.tile([1.0, 0, 0, 0], (1, 2, 1)),
+    )  # fmt: skip
+    x, rate = np.array([[rest + amplitude, 0.0]]), np.sqrt(stiffness / inertia)
+    (state,) = random_states(model, 1, 0)
+    state = complete_state(model, replace(state, x=x, xdot=0 * x))
+    times = np.arange(33) / 16  # two periods, up to 2.9 rad from sample to sample
+    angle = rest + amplitude * np.cos(rate * times)
+    truth = np.zeros((len(times), 1, 4))
+    truth[:, 0, 0], truth[:, 0, 3] = np.cos(angle / 2), np.sin(angle / 2)
+    adapter = load_adapter(engine)
+    for method in adapter.integrators:
+        run = adapter.simulate(model, state, times, method.name, 2.0**-10 if method.kind == "step" else 1e-11)
+        error = np.max(attitude_error(run.p, truth))
+        assert error < {1: 0.3, 2: 2e-3}.get(method.order, 1e-7), (method.name, error)
+        drift = compute_invariants(model, run).energy_drift
+        allowed = 1e-6 if method.order > 2 else 0.05
+        assert np.max(np.abs(drift)) < allowed * stiffness * amplitude**2, method.name
+    notes = simulate_notes_form(model, state, times, 1e-12, "dop853")
+    assert np.max(attitude_error(notes.p, truth)) < 1e-8
+    assert np.max(attitude_error(simulate_notes_form(model, state, times, 1e-12).p, truth)) < 1e-10
+
+
 def test_an_engine_that_builds_no_trees_refuses_motions():
     model = random_tree(np.random.default_rng(0), 3, ("hinge",))
     (state,) = random_states(model, 1, 0)

@@ -19,6 +19,7 @@ from tests.helpers.catalogue import catalogue_scenarios
         ("chain-30-balls", "all", {"step"}),
         ("furuta", "all", {"step"}),
         ("furuta", "state", set()),
+        ("damped-hinge", "all", {"step"}),
         ("four-bar", "all", {"step", "trajectory", "relations"}),
         ("four-bar", "trajectory", {"trajectory"}),
     ],

@@ -18,9 +18,16 @@ from plumbline.model.invariants import (
     potential_energy,
     work_of_loads,
 )
-from plumbline.model.kinematics import joint_vectors, quaternion_product, quaternion_rate, state_from_minimal
+from plumbline.model.kinematics import (
+    angular_velocity,
+    joint_vectors,
+    quaternion_product,
+    quaternion_rate,
+    state_from_minimal,
+)
 from tests.helpers import newton_euler, pendulums
 from tests.helpers.random_chains import random_chain
+from tests.helpers.random_trees import random_tree
 
 TIMES = np.linspace(0.0, 1.0, 41)
 
@@ -73,34 +80,43 @@ def test_energies_and_momentum_are_sums_over_bodies(rods):
     assert kinetic_energy(model, *two)[1] == pytest.approx(4 * kinetic, rel=1e-14)
 
 
-def rotating_trajectory(model, power, times):
-    """A run in which body 1 turns about x, so that a moment of 1 N m about it does this power."""
+def rotating_trajectory(model, angle, rate, times):
+    """A run in which body 1 turns about x, so that a moment of 1 N m about it has the power ``rate``."""
     still = np.zeros((len(times), model.n, 3))
     omega = still.copy()
-    omega[:, 0, 0] = power
+    omega[:, 0, 0] = rate
     p = np.tile([1.0, 0, 0, 0], (len(times), model.n, 1))
+    p[:, 0, 0], p[:, 0, 1] = np.cos(angle / 2), np.sin(angle / 2)
     return Trajectory(times, still, p, still, quaternion_rate(p, omega), 1)
 
 
-@pytest.mark.parametrize("degree", [0, 1, 4, 5])
-def test_work_of_a_moment_is_the_integral_of_its_power(degree):
-    """Exact to degree 5; up to 3 both splines are, and say so."""
-    model, _ = random_chain(np.random.default_rng(73), [False, False])
-    moment = np.zeros((2, 3))
-    moment[0, 0] = 1.0
-    times = np.linspace(0, 2, 25)
-    run = rotating_trajectory(model, times**degree, times)
-    omega = 2 * run.pdot[..., 1:]
-    done, uncertainty = work_of_loads(model.changed(moment=moment), run, omega)
-    np.testing.assert_allclose(done, times ** (degree + 1) / (degree + 1), rtol=0, atol=1e-12)
-    assert (uncertainty < 1e-12) == (degree <= 3)
-    drag = model.changed(drag_moment=np.array([0.5, 0.0]))
-    lost, _ = work_of_loads(
-        drag,
-        rotating_trajectory(model, times**2, times),
-        2 * rotating_trajectory(model, times**2, times).pdot[..., 1:],
+def work_about_x(model, run):
+    """Work of a moment of 1 N m about x of body 1."""
+    return work_of_loads(
+        model.changed(moment=np.eye(1, 3 * model.n).reshape(-1, 3)),
+        run,
+        angular_velocity(run.p, run.pdot),
     )
-    np.testing.assert_allclose(lost, -0.5 * times**5 / 5, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 4])
+@pytest.mark.parametrize("flipped", [False, True])
+def test_work_of_a_moment_is_the_integral_of_its_power(degree, flipped):
+    """Also where quaternions change their sign from sample to sample."""
+    model, _ = random_chain(np.random.default_rng(73), [False, False])
+    times = np.linspace(0, 2, 65)
+    angle = times ** (degree + 1) / (degree + 1)
+    run = rotating_trajectory(model, angle, times**degree, times)
+    if flipped:
+        sign = np.where(np.arange(65) % 3, 1.0, -1.0)[:, None, None]
+        run = replace(run, p=sign * run.p, pdot=sign * run.pdot)
+    done, uncertainty = work_about_x(model, run)
+    np.testing.assert_allclose(done, angle, rtol=0, atol=1e-7 if degree == 4 else 1e-12)
+    assert uncertainty < (1e-4 if degree == 4 else 1e-10)
+    omega = angular_velocity(run.p, run.pdot)
+    lost, _ = work_of_loads(model.changed(drag_moment=np.array([0.5, 0.0])), run, omega)
+    expected = -0.5 * times ** (2 * degree + 1) / (2 * degree + 1)
+    np.testing.assert_allclose(lost, expected, rtol=0, atol=1e-5 if degree == 4 else 1e-12)
 
 
 def test_work_of_a_force_needs_no_quadrature_and_drag_takes():
@@ -115,31 +131,47 @@ def test_work_of_a_force_needs_no_quadrature_and_drag_takes():
     done, uncertainty = work_of_loads(model.changed(force=force), run, still)
     np.testing.assert_allclose(done, np.sum(force * (r - r[0]), axis=(1, 2)), rtol=0, atol=1e-14)
     assert uncertainty == 0.0
-    lost, _ = work_of_loads(model.changed(drag_force=np.array([7.0, 3.0])), run, still)
+    r[:, 1] = times[:, None] ** 3 / 3 * [0, 0, 1]
+    lost, _ = work_of_loads(model.changed(drag_force=np.array([0.0, 3.0])), run, still)
     np.testing.assert_allclose(lost, -3 * times**5 / 5, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("count, sharp", [(13, 1.0), (25, 0.2), (49, 1e-4)])
+@pytest.mark.parametrize("count, sharp", [(9, 0.1), (13, 1e-2), (25, 1e-4), (49, 1e-8)])
 def test_the_quadrature_knows_its_error(count, sharp):
     """Of a power that few samples hardly resolve the work is uncertain by at least its error."""
     model, _ = random_chain(np.random.default_rng(75), [False])
     times = np.linspace(0, 2, count)
-    run = rotating_trajectory(model, np.cos(9 * times), times)
-    done, uncertainty = work_of_loads(
-        model.changed(moment=np.array([[1.0, 0, 0]])), run, 2 * run.pdot[..., 1:]
-    )
+    run = rotating_trajectory(model, np.sin(9 * times) / 9, np.cos(9 * times), times)
+    done, uncertainty = work_about_x(model, run)
     error = float(np.max(np.abs(done - np.sin(9 * times) / 9)))
     assert 0 < error <= uncertainty < sharp
 
 
-def test_too_few_samples_do_no_quadrature():
+def test_two_samples_are_integrated_and_one_is_not():
     model, _ = random_chain(np.random.default_rng(76), [False])
-    times = np.linspace(0, 1, 12)
-    run = rotating_trajectory(model, 1 + times, times)
-    done, uncertainty = work_of_loads(
-        model.changed(moment=np.array([[1.0, 0, 0]])), run, 2 * run.pdot[..., 1:]
-    )
-    assert not np.any(done) and uncertainty == 0.0
+    for times in (np.array([0.0, 0.5]), np.zeros(1)):
+        done, _ = work_about_x(model, rotating_trajectory(model, times + times**2 / 2, 1 + times, times))
+        np.testing.assert_allclose(done, times + times**2 / 2, atol=1e-3)
+
+
+def test_the_energy_of_a_spring_counts_full_turns():
+    """Also where an angle moves by more than half a turn from sample to sample: its rate chooses the turn."""
+    model = replace(
+        random_tree(np.random.default_rng(0), 1, ("hinge",), loads=False),
+        point=np.zeros((1, 2, 3)), turn=np.tile([1.0, 0, 0, 0], (1, 2, 1)), gravity=np.zeros(3),
+        inertia=0.1 * np.eye(3)[None], stiffness=np.array([[2.5, 0.0]]), rest=np.array([[1.0, 0.0]]),
+    )  # fmt: skip
+    times = np.linspace(0, 3, 49)
+    angle = 1.0 + 13.0 * np.cos(5 * times)
+    rate = -65.0 * np.sin(5 * times)
+    assert np.max(np.abs(np.diff(angle))) > 4
+    p = np.stack([np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)], -1)[:, None]
+    still = np.zeros((49, 1, 3))
+    pdot = quaternion_rate(p, np.stack([0 * rate, 0 * rate, rate], -1)[:, None])
+    run = Trajectory(times, still, p, still, pdot, 1, np.array([[14.0, 0.0]]))
+    assert np.max(np.abs(compute_invariants(model, run).energy_drift)) < 1e-10
+    lost = compute_invariants(model, replace(run, initial_x=None)).energy_drift
+    assert np.max(np.abs(lost)) > 10
 
 
 @pytest.mark.parametrize("options", [{}, {"loads": True}, {"drag": True}], ids=str)
@@ -188,7 +220,7 @@ def test_a_gap_is_the_vector_of_a_ball_and_the_stretch_of_a_rod():
 def test_the_ends_of_a_rod_in_one_place_are_its_length_off():
     model, _ = random_chain(np.random.default_rng(78), [True])
     model = model.changed(proximal=np.zeros((1, 3)))
-    found = compute_invariants(model, rotating_trajectory(model, TIMES, TIMES))
+    found = compute_invariants(model, rotating_trajectory(model, TIMES**2 / 2, TIMES, TIMES))
     np.testing.assert_array_equal(found.joint_gap[:, 0, 0], -model.length[0])
     assert not np.any(found.gap_rate), "a stretch has no direction there"
 
