@@ -279,10 +279,13 @@ class ExudynChain:
         """Read the constraints' multipliers.
 
         Returns:
-            (N, 4): of joint k three (of a rod's distance one, then zeros), then that of the node's |p| = 1.
+            (N, 4): of joint k three (of a rod's distance one, then zeros), then that of the node's |p| = 1;
+            zeros where there are other joints.
 
         """
         data, found = self.mbs.systemData, np.zeros((self.model.n, 4))
+        if not self.model.is_chain:
+            return found
         values = np.array(data.GetAECoordinates())
         for k, (joint, node) in enumerate(zip(self.joints, self.nodes, strict=True)):
             of_joint = values[data.GetObjectLTGAE(joint)]

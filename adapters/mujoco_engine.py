@@ -79,7 +79,7 @@ ROD_AXIAL_INERTIA = 0.01  # J_z of a rod over the mean principal inertia of the 
 IDENTITY_QUATERNION = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def _euler(implicit_forces: Literal["none", "applied", "all"]) -> JointSpaceMethod:
+def _euler(implicit_forces: Literal["joint dampers", "applied", "all"]) -> JointSpaceMethod:
     return JointSpaceMethod(
         "semi-implicit Euler", "joint rotations", ROD_AXIAL_INERTIA / 3, implicit_forces=implicit_forces
     )
@@ -94,7 +94,14 @@ class Mujoco(MetamorphicHooks):
     reproduction_template = "mujoco"
     supported_versions = ">=3.2,<5"
     integrators = (
-        Integrator("Euler", "step", 1, FIRST_ORDER_POWERS, note="semi-implicit Euler", method=_euler("none")),
+        Integrator(
+            "Euler",
+            "step",
+            1,
+            FIRST_ORDER_POWERS,
+            note="semi-implicit Euler, implicit in joint dampers",
+            method=_euler("joint dampers"),
+        ),
         Integrator(
             "implicit",
             "step",

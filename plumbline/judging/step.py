@@ -85,9 +85,15 @@ def step_sizes(has_constraints: bool, model: Model, states: Sequence[State]) -> 
         turning = np.asarray(first_coordinate_acceleration(model, state)[:, 3:], float)
         squares = [2 * np.max(norm(turning, axis=1)), np.max(norm(state.udot, axis=1)) ** 2, fastest**2]
         if has_constraints:
-            force = np.asarray(state_rounding_bound(model, state).scale["joint_reaction"])
-            lever = norm(model.proximal, axis=1) + norm(model.distal, axis=1)
-            squares.append(np.max(force * lever / np.linalg.eigvalsh(model.inertia)[:, 0]))
+            bound = state_rounding_bound(model, state)
+            force = np.asarray(bound.scale["joint_reaction"])
+            lever, least = norm(model.proximal, axis=1), np.linalg.eigvalsh(model.inertia)[:, 0]
+            on_body = model.body[:, 0] >= 0
+            beyond = np.zeros(model.n)
+            np.maximum.at(beyond, model.body[on_body, 0], norm(model.point[on_body, 0], axis=1))
+            squares.append(np.max(force * (lever + beyond) / least))
+            if not model.is_chain:
+                squares.append(np.max(bound.scale["joint_moment"] / least))
             squares = [4 * np.max(squares)]
         rate = float(np.sqrt(np.max(squares)))
         found.append([h * min(1.0, MAX_STEP_RATE / rate if rate > 0 else 1.0) for h in STEP_SIZES])

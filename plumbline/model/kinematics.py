@@ -79,7 +79,7 @@ def cross_matrix(s: Array) -> Array:
         (..., 3, 3) matrices.
 
     """
-    half = np.zeros((*s.shape, 3))
+    half = np.zeros((*s.shape, 3), np.result_type(s, float))
     half[..., 0, 1], half[..., 0, 2], half[..., 1, 2] = -s[..., 2], s[..., 1], -s[..., 0]
     return half - half.swapaxes(-1, -2)
 
@@ -111,6 +111,22 @@ def quaternion_conjugate(p: Array) -> Array:
 
     """
     return np.asarray(p * np.array([1.0, -1.0, -1.0, -1.0]))
+
+
+def quaternion_exponential(half_turn: Array) -> Array:
+    """Return the quaternions of rotations by twice a vector.
+
+    Args:
+        half_turn: (..., 3) halves of rotation vectors [rad].
+
+    Returns:
+        (..., 4) unit quaternions, scalar first.
+
+    """
+    size = np.sqrt(np.sum(half_turn * half_turn, -1, keepdims=True))
+    small = size < 1e-5
+    ratio = np.where(small, 1 - size**2 / 6, np.sin(size) / np.where(small, 1.0, size))
+    return np.concatenate([np.cos(size), ratio * half_turn], -1)
 
 
 def rotation_vector(q: Array) -> Array:

@@ -22,7 +22,8 @@ class JointSpaceMethod:
 
     Coordinates "joint rotations": each ball joint and each rod's upper end has a relative quaternion, and as
     its velocity the relative angular velocity in the child's frame; q ⊕ t = q exp(t). "joint angles":
-    revolute joints; q ⊕ t = q + t and dexp⁻¹ is the identity.
+    revolute joints; q ⊕ t = q + t and dexp⁻¹ is the identity.  Coordinates of hinges, slides and their like
+    are numbers in both.
 
     The fields from ``new_velocity_share`` on are for formulas that an engine may take in place of its own.
     """
@@ -32,7 +33,10 @@ class JointSpaceMethod:
     # A rod's inertia about its own axis over the trace of the inertia that it carries. It changes no motion,
     # but a step: relative rates on a rod give it an axial spin of O(h²).
     rod_axial_inertia: float = 1.0
-    implicit_forces: Literal["none", "applied", "all"] = "none"  # forces in D: drag; drag and Coriolis terms
+    # forces in D: dampers of joints; drag and all dampers; all forces, Coriolis terms included
+    implicit_forces: Literal["none", "joint dampers", "applied", "all"] = "none"
+    # of a free body: r and ṙ in the world beside its rotation, or a rigid motion with the twist in its frame
+    free_coordinates: Literal["point and rotation", "rigid motion"] = "point and rotation"
     stages: tuple[tuple[float, ...], ...] = ()  # the tableau's rows below the diagonal
     weights: tuple[float, ...] = ()
     new_velocity_share: float = 1.0  # x in q₁ = q ⊕ h (x v₁ + (1−x) v): 0 is explicit Euler
@@ -70,13 +74,16 @@ StepMethod = JointSpaceMethod | ConstrainedMethod
 
 
 def classical_runge_kutta(
-    coordinates: Literal["joint rotations", "joint angles"], rod_axial_inertia: float = 1.0
+    coordinates: Literal["joint rotations", "joint angles"],
+    rod_axial_inertia: float = 1.0,
+    free_coordinates: Literal["point and rotation", "rigid motion"] = "point and rotation",
 ) -> JointSpaceMethod:
     """Return the classical Runge-Kutta method of order 4.
 
     Args:
         coordinates: of `JointSpaceMethod`.
         rod_axial_inertia: of `JointSpaceMethod`; of no effect for joint angles.
+        free_coordinates: of `JointSpaceMethod`.
 
     Returns:
         The method.
@@ -86,6 +93,7 @@ def classical_runge_kutta(
         "Runge-Kutta",
         coordinates,
         rod_axial_inertia,
+        free_coordinates=free_coordinates,
         stages=((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
         weights=(1 / 6, 1 / 3, 1 / 3, 1 / 6),
     )

@@ -19,18 +19,19 @@ own accelerations, the residual of their equations, and their first acceleration
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from plumbline.model.datatypes import Array, Model, State, StepRun
-from plumbline.model.kinematics import angular_velocity, state_from_minimal
+from plumbline.model.datatypes import KINDS, Array, Kind, Model, State, StepRun
+from plumbline.model.kinematics import angular_velocity, complete_state, state_from_minimal
 from plumbline.model.sampling import derive_seed
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod, StepMethod
 from plumbline.truth.ground_truth import stretched_length
+from plumbline.truth.link_tree import LinkStates
 from plumbline.truth.rounding_bound import EPS, RoundingBound, state_rounding_bound
 from plumbline.truth.step_formulas import (
-    LinkStates,
     constrained_quadrature,
     constrained_residual,
     engine_coordinates,
@@ -246,30 +247,55 @@ class FormulaSteps:
 
         """
         norm, model = np.linalg.norm, self.model
+        path, slides = _paths(model), np.array([_slides(kind) for kind in model.kind])
         rate = np.max([np.maximum(norm(s.omega, axis=1), norm(s.udot, axis=1)) for s in ends], axis=0)
         speed = np.max([norm(s.v, axis=1) for s in ends], axis=0)
-        W, V = np.maximum.accumulate(rate), np.maximum.accumulate(speed)
-        arm = np.cumsum(stretched_length(model))
-        rounding = STEP_ROUNDINGS * EPS * (np.arange(1, model.n + 1) + np.cumsum(model.rods))
+        W, V = (np.max(np.where(path, x, 0.0), axis=1) for x in (rate, speed))
+        arm = path @ stretched_length(model)
+        if np.any(slides):
+            arm = arm + np.max([np.max(np.where(path, norm(s.r, axis=1), 0.0), axis=1) for s in ends], axis=0)
+        links = [max(1, len(KINDS[kind].motions)) + (kind == "rod") for kind in model.kind]
+        rounding = STEP_ROUNDINGS * EPS * (path @ np.array(links))
         turning, acceleration, torque = (
             np.max([getattr(b, name) for b in bounds], axis=0)
             for name in ("angular_acceleration", "acceleration", "rod_torque")
         )
         # Rates are kept relative to the link before: what rounding does to one link, and to the spin of a
         # rod, reaches those beyond it once they have turned against it.
-        above = np.concatenate([[0.0], turning[:-1]])
+        far = model.body[:, 0]
+        above, shifted = (
+            np.where(far >= 0, x[far], 0.0) for x in (turning, acceleration * (slides @ path > 0))
+        )
         if self.method.coordinates == "joint rotations":
             axial = self.method.rod_axial_inertia * np.trace(model.inertia, axis1=1, axis2=2)
             above = above + torque / axial
-        leaked = count * np.minimum(1.0, h * W) * np.cumsum(above)
+        leaked, passed = (count * np.minimum(1.0, h * W) * (path @ x) for x in (above, shifted))
         omega = ACCELERATION_FACTOR * h * (turning + leaked) + rounding * W
-        velocity = ACCELERATION_FACTOR * h * (acceleration + leaked * arm) + rounding * np.maximum(V, W * arm)
+        velocity = ACCELERATION_FACTOR * h * (acceleration + leaked * arm + passed)
+        velocity += rounding * np.maximum(V, W * arm)
+        if self.method.free_coordinates == "rigid motion" and self.method.formula == "Runge-Kutta":
+            # closed forms of dexp⁻¹ of a rigid motion divide differences by the square of the turn
+            free = np.array([kind == "free" for kind in model.kind])
+            turn = np.clip(h * rate, 1e-4, 1.0)  # rad
+            velocity += path @ np.where(free, STEP_ROUNDINGS * EPS * speed / turn**2, 0.0)
         return {
             "step_rate": omega,
             "step_velocity": velocity,
             "step_attitude": count * h * omega + rounding,
             "step_position": count * h * velocity + rounding * arm,
         }
+
+
+def _paths(model: Model) -> NDArray[np.bool_]:
+    """[k, b] whether body b is k or between k and the world."""
+    path = np.eye(model.n, dtype=bool)
+    for k, far in enumerate(model.body[:, 0]):
+        path[k] |= path[far] & (far >= 0)
+    return path
+
+
+def _slides(kind: Kind) -> bool:
+    return kind == "free" or any(what == "slide" for what, _ in KINDS[kind].motions)
 
 
 def _pick(links: LinkStates, i: int) -> LinkStates:
@@ -282,7 +308,11 @@ def _disturbed(model: Model, state: State, bound: RoundingBound) -> State:
     tolerance = np.asarray(bound.angular_acceleration)
     size = DISTURBANCE * max(float(np.max(np.linalg.norm(state.omega, axis=1))), 1.0) / np.max(tolerance)
     omega = state.omega + (size * tolerance)[:, None] * rng.normal(size=(model.n, 3))
-    return state_from_minimal(model, state.p, omega, state.u, state.udot)
+    if model.is_chain:
+        return state_from_minimal(model, state.p, omega, state.u, state.udot)
+    xdot = state.xdot + (size * tolerance)[:, None] * rng.normal(size=(model.n, 2))
+    v = state.v + (size * np.asarray(bound.acceleration))[:, None] * rng.normal(size=(model.n, 3))
+    return complete_state(model, replace(state, omega=omega, xdot=xdot, v=v))
 
 
 def _separation(links: LinkStates, i: int, count: int, weights: dict[str, Array]) -> float:
@@ -297,8 +327,8 @@ def _separation(links: LinkStates, i: int, count: int, weights: dict[str, Array]
 
 
 def _rounded(links: LinkStates) -> State:
-    parts = (np.asarray(getattr(links, name), float) for name in ("p", "omega", "u", "udot", "r", "v"))
-    return State(*parts)
+    names = ("p", "omega", "u", "udot", "r", "v", "x", "xdot")
+    return State(*(np.asarray(getattr(links, name), float) for name in names))
 
 
 def _differences(true: LinkStates, run: StepRun, count: int) -> dict[str, Array]:
@@ -364,6 +394,8 @@ def compare_parts(
             worst = np.argmax(error / np.maximum(bound, np.finfo(float).tiny), axis=0)
             body = np.arange(model.n)
             found["step_quadrature"].add(error[worst, body], bound[worst, body], effect[worst, body], place)
+        if not model.is_chain:  # the rows of its other joints off |p| = 1 are not written here
+            continue
         residual = constrained_residual(model, method, run)
         allowed = (
             np.maximum(method.solver_atol, method.solver_rtol * residual.size)
@@ -381,7 +413,7 @@ def compare_parts(
         )
         error = np.asarray(np.max(np.abs(first - engine_coordinates(run)[2][0]), axis=-1), float)
         found["step_first_acceleration"].add(error, allowed, np.zeros(model.n), place)
-    return found
+    return {quantity: one for quantity, one in found.items() if one.errors}
 
 
 def quadrature_residuals(method: ConstrainedMethod, runs: Runs) -> Array:
