@@ -13,6 +13,9 @@ from plumbline.engines.calls import StepAttempt, StepEvaluation, run_steps
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.step import STEP_STATES, judge_steps, step_sizes
+from plumbline.model.datatypes import SPRING_FIELDS
+from plumbline.model.kinematics import complete_state
+from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod, classical_runge_kutta
 from plumbline.scenario.generator import RandomScenarios, random_scenario
@@ -197,3 +200,118 @@ def test_no_honest_engine_is_reported_on_random_scenarios(engine):
             if bad and not is_wild:
                 reported[scenario.name, integrator.name] = bad
     assert not reported
+
+
+# --- trees ---------------------------------------------------------------------------------------
+
+ELEMENTS = ("armature", "damping", "stiffness", "effort", "springs")
+
+
+@cache
+def tree(seed, elements=ELEMENTS):
+    """A random tree on every kind of joint, with elements on those that take them."""
+    model = random_tree(np.random.default_rng(seed), 7, elements=elements)
+    return model, random_states(model, 2, seed=5)
+
+
+@pytest.mark.parametrize("free", ["point and rotation", "rigid motion"])
+@pytest.mark.parametrize("seed", range(4))
+def test_accelerations_of_trees_equal_the_certified_ones(seed, free):
+    model, states = tree(seed)
+    method = JointSpaceMethod("Runge-Kutta", "joint rotations", 0.2, free_coordinates=free)
+    links = LinkTree(model, method, states)
+    start = links.bodies(*links.start())
+    for i, state in enumerate(states):
+        true = certify_state(model, state).quantities
+        for found, name in zip(
+            links.body_accelerations(), ("acceleration", "angular_acceleration"), strict=True
+        ):
+            scale = np.max(np.abs(getattr(true, name)))
+            np.testing.assert_allclose(
+                found[i].astype(float), getattr(true, name), rtol=0, atol=1e-15 * scale
+            )
+        for name in ("r", "v", "omega"):
+            value = getattr(state, name)
+            scale = max(1.0, np.max(np.abs(value)))
+            np.testing.assert_allclose(getattr(start, name)[i].astype(float), value, atol=1e-14 * scale)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("elements", [(), ELEMENTS], ids=["bare", "elements"])
+@pytest.mark.parametrize("seed", range(2))
+def test_honest_engines_take_the_declared_step_on_trees(engine, elements, seed):
+    model, states = tree(seed, elements)
+    for integrator in methods(engine):
+        rows = judged(load_adapter(engine), integrator, model, states)
+        if engine.startswith("exudyn") and rows[0].verdict == Verdict.UNSUPPORTED:
+            assert any(x in rows[0].reason for x in ("rotor", "rotation vector", "spring", "angles"))
+            continue
+        assert not disagreeing(rows), [row.reason for row in rows]
+
+
+def branches():
+    """Two hinged branches on a sliding body, a damper between them, and a free body."""
+    model = random_tree(np.random.default_rng(2), 4, ("hinge",), elements=("damping", "stiffness", "springs"))
+    body = np.array([[-1, 0], [0, 1], [0, 2], [-1, 3]])
+    springs = {name: getattr(model, name)[:1] for name in SPRING_FIELDS}
+    used = np.array([[1, 0], [1, 0], [1, 0], [0, 0]])
+    model = replace(
+        model, kind=("slide", "hinge", "hinge", "free"), body=body, point=0.2 + 0.1 * model.point,
+        damping=0.7 * used, stiffness=2.0 * used, armature=0.0 * used, effort=0.0 * used,
+        **(springs | {"spring_body": np.array([[1, 2]]), "spring_damping": np.array([0.8])}),
+    )  # fmt: skip
+    return model, random_states(model, 3, seed=8)
+
+
+WRONG_METHODS = {
+    "damping explicit for implicit": ("mujoco", "Euler", {"implicit_forces": "none"}),
+    "damping implicit for explicit": (
+        "pinocchio", "semi-implicit-euler", {"implicit_forces": "joint dampers"},
+    ),
+    "springs' damping implicit": ("mujoco", "Euler", {"implicit_forces": "applied"}),
+    "without Coriolis terms": ("mujoco", "implicit", {"implicit_forces": "applied"}),
+    "half the damping": ("mujoco", "implicitfast", {"damping_factor": 0.5}),
+    "halves exchanged": ("mujoco", "implicitfast", {"formula": "positions first"}),
+    "stale velocity": ("pinocchio", "semi-implicit-euler", {"new_velocity_share": 0.0}),
+    "a hinge moved by the old velocity": ("mujoco", "Euler", {"stale_joint": 1}),
+    "a free body moved along its twist": ("mujoco", "RK4", {"free_coordinates": "rigid motion"}),
+    "a free body moved by point and rotation": (
+        "pinocchio", "rkmk4", {"free_coordinates": "point and rotation"},
+    ),
+    "no correction of rotations": ("pinocchio", "rkmk4", {"correction_terms": 0}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG_METHODS)
+def test_every_other_step_of_a_tree_is_reported(name):
+    """The same as an engine that takes the other step where the right one is declared."""
+    engine, integrator, change = WRONG_METHODS[name]
+    model, states = branches()
+    method = load_adapter(engine).integrator(integrator)
+    assert not disagreeing(judged(load_adapter(engine), method, model, states))
+    wrong = replace(method, method=replace(method.method, **change))
+    assert disagreeing(judged(load_adapter(engine), wrong, model, states))
+
+
+@pytest.mark.parametrize(
+    "field", ["rest", "stiffness", "damping", "spring_length", "spring_damping", "point"]
+)
+@pytest.mark.parametrize("engine", ["mujoco", "pinocchio", "exudyn-tree"])
+def test_a_wrong_number_of_a_tree_is_reported_by_its_steps(engine, field):
+    model, states = branches()
+    integrator = methods(engine)[-1]
+    answer = stepped(load_adapter(engine), integrator, model, states)
+    wrong = replace(model, **{field: getattr(model, field) * (1 + 1e-6) + 1e-6 * (field == "rest")})
+    states = [complete_state(wrong, state) for state in states]
+    assert disagreeing(judge_steps(CONTEXT, integrator, wrong, states, answer).rows)
+
+
+def test_dampers_between_branches_are_explicit():
+    """D has the sparsity of M: a formula whose D has all entries is not MuJoCo's."""
+    model, states = branches()
+    integrator = load_adapter("mujoco").integrator("implicit")
+    with patch.object(LinkTree, "_on_one_path", lambda self: np.ones((self.nv, self.nv), bool)):
+        assert disagreeing(judged(load_adapter("mujoco"), integrator, model, states))
+    with patch.object(LinkTree, "_standalone_columns", lambda _: []):
+        fast = load_adapter("mujoco").integrator("implicitfast")
+        assert disagreeing(judged(load_adapter("mujoco"), fast, model, states))

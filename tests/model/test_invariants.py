@@ -25,9 +25,9 @@ from plumbline.model.kinematics import (
     quaternion_rate,
     state_from_minimal,
 )
+from plumbline.model.random_mechanisms import random_tree
 from tests.helpers import newton_euler, pendulums
 from tests.helpers.random_chains import random_chain
-from tests.helpers.random_trees import random_tree
 
 TIMES = np.linspace(0.0, 1.0, 41)
 
