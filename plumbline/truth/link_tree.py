@@ -176,7 +176,7 @@ class LinkTree:
     def _start_attitude(self, link: int | None, k: int = -1, body: int = -1) -> Array:
         """Attitude (B, 4) at the start: of a link that is a body or a rod, or of body or rod ``k``."""
         if link is not None:
-            if link < 0 or self.links[link].joint == "slide":  # of a free body: along the world's axes
+            if link < 0 or self._is_of_free_body(link):  # along the world's axes
                 return np.tile(UNIT, (len(self.states), 1))
             k, body = self.links[link].joint_of, self.links[link].body
         if body >= 0:
@@ -253,10 +253,13 @@ class LinkTree:
         return np.asarray(spins[:, link.body] if link.body >= 0 else self.rod_spin[:, link.joint_of])
 
     def _spin_before(self, link: _Link, spins: Array) -> Array:
-        is_still = link.parent < 0 or (
-            self.links[link.parent].joint == "slide" and self.links[link.parent].motion < 0
-        )
-        return np.zeros_like(spins[:, 0]) if is_still else self._start_spin(self.links[link.parent], spins)
+        if link.parent < 0 or self._is_of_free_body(link.parent):
+            return np.zeros_like(spins[:, 0])
+        return self._start_spin(self.links[link.parent], spins)
+
+    def _is_of_free_body(self, link: int) -> bool:
+        """Whether a link is a slide of a free body."""
+        return self.links[link].joint == "slide" and self.links[link].motion < 0
 
     def _start_angle_rates(self, v: Array, spins: Array) -> None:
         """Set the rates of the turns that balls and rods are made of.

@@ -13,7 +13,7 @@ from plumbline.engines.calls import StepAttempt, StepEvaluation, run_steps
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.step import STEP_STATES, judge_steps, step_sizes
-from plumbline.model.datatypes import SPRING_FIELDS
+from plumbline.model.datatypes import KINDS, SPRING_FIELDS
 from plumbline.model.kinematics import complete_state
 from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
@@ -216,8 +216,10 @@ def tree(seed, elements=ELEMENTS):
 
 @pytest.mark.parametrize("free", ["point and rotation", "rigid motion"])
 @pytest.mark.parametrize("seed", range(4))
-def test_accelerations_of_trees_equal_the_certified_ones(seed, free):
-    model, states = tree(seed)
+@pytest.mark.parametrize("kinds", [tuple(KINDS), ("slide", "ball", "rod")], ids=["every joint", "slides"])
+def test_accelerations_of_trees_equal_the_certified_ones(seed, free, kinds):
+    model = random_tree(np.random.default_rng(seed), 7, kinds, elements=ELEMENTS)
+    states = random_states(model, 2, seed=5)
     method = JointSpaceMethod("Runge-Kutta", "joint rotations", 0.2, free_coordinates=free)
     links = LinkTree(model, method, states)
     start = links.bodies(*links.start())
