@@ -82,8 +82,6 @@ def uncompared_kinds(model: Model) -> dict[TaskKind, str]:
     )  # fmt: skip
     if model.has_loops:
         return dict.fromkeys(motions, "only states of mechanisms with loops are compared")
-    if not model.is_chain:
-        return {TaskKind.STEP: "formulas of single steps cover chains of rods and balls"}
     if model.n > MAX_STEP_BODIES:
         return {TaskKind.STEP: f"single steps are compared of at most {MAX_STEP_BODIES} bodies"}
     return {}
