@@ -135,6 +135,8 @@ def explain_steps(model: Model, states: Sequence[State], method: StepMethod, ans
         return max(ratios) if len(ratios) and len(ratios) >= comparisons else np.inf
 
     comparisons = sum(len(c.ratios) for c in steps.compare(runs).values())
+    if method.implicit_forces == "joint dampers" and not np.any(model.damping):
+        method = replace(method, implicit_forces="none")  # the same step
     return _describe(list(_joint_space_alternatives(method, model)), residuals, remaining)
 
 
