@@ -17,7 +17,7 @@ import pytest
 
 from plumbline.scenario.loader import catalogue, find_scenario_file, load_scenario
 from plumbline.truth.certified import certify_state
-from plumbline.truth.enclosure import load_checker, make_certificate, prove_motion
+from plumbline.truth.enclosure import checked_numbers, load_checker, make_certificate, prove_motion
 from plumbline.truth.taylor import simulate_taylor
 from plumbline.truth.trajectory import trajectory_truth
 from tests.helpers.mutations import damaged_bytes, damaged_document, limited_time
@@ -33,22 +33,30 @@ if TRUTH_TOOLS:
 TIMES = np.arange(4) * 0.05
 CHAINS = {"ball": [0], "rod": [1], "rod-ball": [1, 0]}
 NAMES = ("r", "p", "v", "omega")
-CATALOGUE = [load_scenario(path) for path in catalogue().values()]
+NARROW = {"r": 100, "p": 10, "v": 100, "omega": 10}  # radius over error; as measured 43, 6, 49, 4
+SMALL_CHAINS = [
+    s for s in (load_scenario(path) for path in catalogue().values()) if s.model.is_chain and s.model.n <= 5
+]
+PUBLISHED = json.loads((Path(__file__).parents[2] / "docs" / "reference-solutions.json").read_text("utf-8"))
 
 
 def chain(rods, seed=1):
     return random_chain(np.random.default_rng(seed), rods, loads=True, drag=True)
 
 
+class Proofs(dict):
+    """Model, state, document of the certificate and enclosure by chain, found when first needed."""
+
+    def __missing__(self, name):
+        model, state = chain(CHAINS[name])
+        raw, enclosure = prove_motion(model, state, TIMES)
+        self[name] = model, state, json.loads(gzip.decompress(raw)), enclosure
+        return self[name]
+
+
 @pytest.fixture(scope="module")
 def proofs():
-    """Model, state, document of the certificate and enclosure by chain."""
-    found = {}
-    for name, rods in CHAINS.items():
-        model, state = chain(rods)
-        raw, enclosure = prove_motion(model, state, TIMES)
-        found[name] = model, state, json.loads(gzip.decompress(raw)), enclosure
-    return found
+    return Proofs()
 
 
 def enclose(document):
@@ -312,6 +320,16 @@ def test_an_enclosure_contains_the_motion_in_quad_precision(proofs, name):
                 assert abs(ball.mid() - arb(str(number))) < ball.rad() + arb("1e-28")  # error of the run
 
 
+@pytest.mark.parametrize(
+    "name, radii",
+    [("ball", (3.2e-30, 2.5e-29)), ("rod", (1.3e-28, 9.5e-28)), ("rod-ball", (1.3e-27, 1.1e-27))],
+)
+def test_enclosures_are_as_narrow_as_they_were(proofs, name, radii):
+    """A bound that is wider than it need be is true, but a mistake; r [m] and omega [rad/s] as measured."""
+    for quantity, radius in zip(("r", "omega"), radii, strict=True):
+        assert 0 < proofs[name][3].radius(quantity) < 2 * radius
+
+
 @pytest.mark.parametrize("name", CHAINS)
 def test_enclosures_of_two_precisions_overlap(proofs, name):
     model, state, _, enclosure = proofs[name]
@@ -331,6 +349,10 @@ def test_a_motion_from_perturbed_initial_values_stays_inside(proofs, name):
     assert 1e-13 < found.radius("omega") < 1e-10
     assert overlap(found, enclosure) and overlap(found, other)
     assert not overlap(enclosure, other)
+    for quantity in NAMES:  # a bound that is wider than it need be is true, but a mistake
+        pairs = zip(getattr(found, quantity).ravel(), getattr(enclosure, quantity).ravel(), strict=True)
+        error = max(abs(float((x - y).mid())) for x, y in pairs)
+        assert error < found.radius(quantity) < NARROW[quantity] * error
 
 
 @pytest.mark.parametrize("name", ["double-tumbling-balls", "tumbling-rod"])
@@ -339,7 +361,7 @@ def test_the_truth_of_runs_is_within_its_claimed_uncertainty(name):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("scenario", [s for s in CATALOGUE if s.model.n <= 5], ids=lambda s: s.name)
+@pytest.mark.parametrize("scenario", SMALL_CHAINS, ids=lambda s: s.name)
 def test_the_truth_of_every_small_scenario_is_within_its_claimed_uncertainty(scenario):
     check_present_truth(scenario, scenario.duration)
 
@@ -355,6 +377,35 @@ def check_present_truth(scenario, duration):
         rounding = 2.0**-53 * float(np.max(np.abs(truth.trajectory.r[k])))
         largest = max(float(np.linalg.norm([float(x.upper()) for x in row])) for row in error)
         assert largest <= truth.position_uncertainty[k] + 2 * rounding
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("scenario", [s for s in SMALL_CHAINS if s.model.n <= 2], ids=lambda s: s.name)
+def test_enclosures_of_small_scenarios_in_two_precisions_overlap_at_every_sample(scenario):
+    found = (
+        prove_motion(scenario.model, scenario.state, scenario.times, precision=x)[1]
+        for x in ("quad", "octuple")
+    )
+    assert overlap(*found)
+
+
+@pytest.mark.parametrize("name", PUBLISHED["motions"])
+def test_published_solutions_are_proved_again_up_to_their_first_time(name):
+    """docs/reference-solutions.json, in quad precision instead of octuple."""
+    record, scenario = PUBLISHED["motions"][name], load_scenario(find_scenario_file(name))
+    numbers = checked_numbers(scenario.model, scenario.state)
+    assert record["doubles"] == {
+        key: np.frompyfunc(float.hex, 1, 1)(x).tolist() for key, x in numbers.items()
+    }
+    assert record["times"] == [1, 2, 5, 10] and max(record["radius"]) < 1e-25
+    _, found = prove_motion(scenario.model, scenario.state, np.array(record["times"][:1]))
+    with ctx.workprec(200):
+        for quantity in NAMES:
+            texts, balls = np.array(record[quantity][0], dtype=object), getattr(found, quantity)[0]
+            for text, ball in zip(texts.ravel(), balls.ravel(), strict=True):
+                published = arb(text)
+                assert published.overlaps(ball) and published.rad() < 1e-19 * (1 + abs(float(ball)))
+                assert not (published + arb("1e-17")).overlaps(ball)
 
 
 # planted faults
@@ -439,6 +490,19 @@ def test_a_wrong_constant_of_the_bounds_is_noticed(monkeypatch, proofs, name, va
         test_roundings_are_in_the_radii(3)
         test_bounds_are_upper_bounds()
         test_the_bound_of_the_defect_holds_and_counts_every_power(proofs)
+
+
+def test_a_series_that_is_cut_without_its_remainder_is_noticed(monkeypatch):
+    usual = checker._convolution
+
+    def cut(a, b):
+        found = usual(a, b)
+        found[checker.DEGREE + 1 :] = 0
+        return found
+
+    monkeypatch.setattr(checker, "_convolution", cut)
+    with pytest.raises(AssertionError):
+        test_a_product_encloses_the_product(((3, 2), (2, 4)), 0.0)
 
 
 @pytest.mark.parametrize("name", ["_up", "_norm", "_inverse_guess", "_convolution", "_upper"])

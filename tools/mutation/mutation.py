@@ -76,8 +76,9 @@ TARGETS = {
         *(f"plumbline/diagnosis/{name}.py" for name in ("diagnose", "fit")),
         "plumbline/model/invariants.py",
     ],
+    "enclosures": ["plumbline/truth/enclosure*.py"],
 }
-TEST_FILES = {  # by top folder, the tests that must notice its mutants
+TEST_FILES = {  # by target or top folder, the tests that must notice its mutants
     "reference_impl": ["tests/reference_impl/test_*.py", "tests/adapters/test_reference_engine.py"],
     "plumbline": [
         *(
@@ -89,6 +90,7 @@ TEST_FILES = {  # by top folder, the tests that must notice its mutants
         "tests/model/test_invariants.py",
         "tests/execution/test_planted_defects.py",
     ],
+    "enclosures": ["tests/truth/test_enclosure.py"],
 }
 TOKEN = re.compile(r"\"[^\"]*\"|'[^']*'|\w+\.?\w*|[^\w\s]+")
 LiveFunctions = dict[tuple[str, int], list[FunctionType]]  # functions of a file by name and first line
@@ -384,8 +386,9 @@ def measure_coverage(tests: Sequence[str], files: Sequence[str]) -> CoverageMap:
         if status:
             raise SystemExit("the tests do not pass without any mutant: nothing can be said")
         said = json.load(answer)
-    lines = {file: {int(k): v for k, v in by_line.items()} for file, by_line in said["lines"].items()}
-    return CoverageMap(said["seconds"], lines, said["libraries"])
+    reached = said["tests_by_line"].items()
+    said["tests_by_line"] = {file: {int(k): v for k, v in lines.items()} for file, lines in reached}
+    return CoverageMap(**said)
 
 
 # --- trial --------------------------------------------------------------------------------------
