@@ -142,15 +142,18 @@ def without_terms_above(rng, rows, columns):
 def test_roundings_are_in_the_radii(rows):
     rng = np.random.default_rng(4)
     a, b, c = (without_terms_above(rng, *shape) for shape in ((rows, 3), (3, 5), (rows, 3)))
-    for found, values in (
-        (a @ b, lambda s: exact(a, s) @ exact(b, s)),
-        (a + c, lambda s: exact(a, s) + exact(c, s)),
-        (a - c, lambda s: exact(a, s) - exact(c, s)),
-        (a * 0.3, lambda s: exact(a, s) * Fraction(3, 10)),
-        (0.3 * a, lambda s: exact(a, s) * Fraction(3, 10)),
+    unit = (
+        2.0**-51
+    )  # (F): a sum of K products is off by at most K unit times the sum of their absolute values
+    for found, values, margin in (
+        (a @ b, lambda s: exact(a, s) @ exact(b, s), unit * (checker.DEGREE + 1) * 3 * (a.total @ b.total)),
+        (a + c, lambda s: exact(a, s) + exact(c, s), unit * np.abs(a.c + c.c).sum(0)),
+        (a - c, lambda s: exact(a, s) - exact(c, s), unit * np.abs(a.c - c.c).sum(0)),
+        (a * 0.3, lambda s: exact(a, s) * Fraction(3, 10), unit * 0.3 * a.total),
+        (0.3 * a, lambda s: exact(a, s) * Fraction(3, 10), unit * 0.3 * a.total),
     ):
         assert all(encloses(found, values(Fraction(s)), Fraction(s)) for s in (0, 0.4, 1))
-        assert np.all(found.r < 1e-13 * (1 + found.total))
+        assert np.allclose(found.r, margin, rtol=1e-8, atol=0)
         assert not encloses(checker._Series(found.c), values(Fraction(1)), Fraction(1)), "nothing was rounded"
 
 
@@ -515,7 +518,8 @@ def test_nan_is_never_accepted(proofs, monkeypatch, name):
 
 def test_a_truncated_file_is_malformed(proofs):
     model, state, _, _ = proofs["ball"]
-    raw = make_certificate(model, state, TIMES)
+    raw = make_certificate(model, state, TIMES, "a scenario's hash")
+    assert json.loads(gzip.decompress(raw))["scenario"] == "a scenario's hash"
     for length in (0, 1, 10, len(raw) // 2, len(raw) - 4):
         with pytest.raises(checker.MalformedCertificate, match="not a complete gzip or JSON file"):
             checker.parse_certificate(raw[:length])
