@@ -1,6 +1,6 @@
 """`python -m bench.proved_horizons SCENARIO [DURATION [STEP]]`: when engines provably leave the true motion.
 
-Needs `plumbline prove SCENARIO --duration DURATION --precision octuple` before.  An engine has left where a
+Needs `plumbline prove SCENARIO --duration DURATION` before.  An engine has left where a
 position is more than 1e-3 m, and the proved radius, from the midpoint of the enclosure.  Steps are STEP
 (default 1/1024 s), tolerances 1e-12.  Prints a table of docs/enclosures.md.
 """
@@ -61,7 +61,7 @@ def main(name: str, duration: float = 30.0, step: float = 2.0**-10) -> None:
     times = scenario.sample_interval * np.arange(count + 1.0)
     proof = find_proof(scenario.model, scenario.state, times)
     if proof is None:
-        sys.exit(f"not proved yet: plumbline prove {name} --duration {duration:g} --precision octuple")
+        sys.exit(f"not proved yet: plumbline prove {name} --duration {duration:g}")
     print("| engine | integrator | step or tolerance | leaves the true motion at, s |\n|---|---|---|---|")
     for engine in ENGINES:
         try:
