@@ -422,7 +422,7 @@ def _extrapolated(tree: _MujocoChain, cut: CutMechanism, state: State, largest: 
         float(np.max(np.abs(found[-1][name]))) * unit
         for name, unit in (("acceleration", 1.0), ("angular_acceleration", length))
     )
-    force = size * float(np.max(cut.source.mass))
+    force = max(size * float(np.max(cut.source.mass)), float(np.max(np.abs(found[-1]["joint_reaction"]))))
     # what rounding of the others leaves of each, where itself it is small
     sizes = {"joint_reaction": force, "joint_moment": length * force}
     sizes |= {"acceleration": size, "angular_acceleration": size / length}
