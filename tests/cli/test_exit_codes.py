@@ -201,6 +201,8 @@ def test_an_interrupted_run_explains_how_to_resume_and_leaves_no_process(tmp_pat
     process = subprocess.Popen(
         [sys.executable, *WORDS, "chain-3-balls", "--engine", "mujoco", "--jobs", "1", "--out", tmp_path],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
+        # also under nohup, where the signal would be ignored
+        preexec_fn=lambda: signal.signal(which, signal.SIG_DFL),
         env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     deadline = time.monotonic() + 60
