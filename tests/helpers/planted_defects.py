@@ -123,9 +123,11 @@ def parameter_change(answer_change: str, *index: int, by: float = 0.0, times: fl
 
 
 def model_change(change: Callable[[Model, State], dict[str, Array]]) -> Inputs:
-    """Fields of the model replaced, depending on the state or not."""
+    """Fields of the model replaced, depending on the state or not; of chains only."""
 
     def alter(model: Model, state: State) -> tuple[Model, State]:
+        if not model.is_chain:  # as a relation writes it anew
+            return model, state
         wrong = model.changed(**change(model, state))
         return wrong, with_coordinates(wrong, state)
 
