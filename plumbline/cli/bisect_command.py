@@ -20,9 +20,9 @@ from plumbline.execution.plan import Plan
 from plumbline.execution.version_search import NoSearch, VersionChange, search_model_file, search_row
 from plumbline.processes.workers import Limits
 from plumbline.scenario.errors import did_you_mean, shorten
-from plumbline.scenario.generator import MOTION_PREFIX, RANDOM_FAMILY, random_motion, random_scenario
+from plumbline.scenario.generator import RANDOM_FAMILY, RandomScenarios
 from plumbline.scenario.loader import Scenario
-from plumbline.storage.results_store import read_results
+from plumbline.storage.results_store import read_model_results, read_results
 from plumbline.storage.version_changes import add_version_change
 
 STATES = 3  # of a model file; a reading that differs shows at any
@@ -124,9 +124,9 @@ def _search_result(
     folder: Path, key: str, good: str, bad: str, jobs: int, limits: Limits
 ) -> tuple[VersionChange, list[str]]:
     """Search about a row of a results folder."""
-    path = folder / "model.json"
-    if path.is_file():
-        document = json.loads(path.read_text(encoding="utf-8"))
+    if (folder / "model.json").is_file():
+        with options.exit_on_damaged_results():
+            document = read_model_results(folder)
         row = _row(key, {row["key"]: row for file in document["files"] for row in file["rows"]})
         about = document["options"]
         plan = ModelPlan(
@@ -152,8 +152,7 @@ def _scenario(name: str, stored: Mapping[str, Any]) -> Scenario:
     """The scenario of a row: random ones are made again, others read from their file."""
     family, _, numbers = name.partition("-")
     if family == RANDOM_FAMILY and name in stored:
-        seed, index = map(int, numbers.rsplit("-", 2)[-2:])
-        return (random_motion if name.startswith(MOTION_PREFIX) else random_scenario)(seed, index)
+        return RandomScenarios(int(numbers.split("-")[-2]), 0).named(name)
     entry = stored.get(name, {})
     origin = str(entry.get("file", ""))
     (found,) = options.read_scenarios([origin if "/" in origin else name])

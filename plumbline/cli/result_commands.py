@@ -63,10 +63,11 @@ def _history_lines(document: dict[str, Any]) -> list[str]:
 def _reproduce_model(folder: Path, keys: tuple[str, ...], form: str | None) -> None:
     """Write scripts of importers' differences, or list the differences."""
     from plumbline.reproduce.model_script import NoModelScript, stored_differences, write_model_script
-    from plumbline.storage.results_store import write_atomically
+    from plumbline.storage.results_store import read_model_results, write_atomically
     from plumbline.storage.version_changes import read_version_changes
 
-    document = json.loads((folder / "model.json").read_text(encoding="utf-8"))
+    with options.exit_on_damaged_results():
+        document = read_model_results(folder)
     found = stored_differences(document)
     if not keys:
         for key, row in found.items():

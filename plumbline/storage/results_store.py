@@ -321,6 +321,35 @@ def write_results(
     write_atomically(folder / "results.json", text.encode())
 
 
+def read_model_results(folder: Path) -> dict[str, Any]:
+    """Read what `plumbline model --out` wrote.
+
+    Args:
+        folder: the results folder.
+
+    Returns:
+        The content of model.json: options, and of each file its rows.
+
+    Raises:
+        DamagedResults: the file is missing or damaged.
+
+    """
+    path = folder / "model.json"
+    texts = ("key", "scenario", "engine", "verdict", "reason")
+    try:
+        document = load_json(path)
+        rows = [row for file in document["files"] for row in file["rows"]]
+        sound = all(isinstance(row[name], str) for row in rows for name in texts)
+        about = document["options"]
+        sound &= about["base"] in ("auto", "fixed", "free") and isinstance(about["strip_geometry"], bool)
+        sound &= isinstance(about["root"], str | None)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DamagedResults(f"{path}: no results of `plumbline model`: {error!r}") from None
+    if not sound:
+        raise DamagedResults(f"{path}: no results of `plumbline model`: a row or an option is damaged")
+    return document  # type: ignore[no-any-return]
+
+
 def load_json(path: Path) -> Any:
     """Read a JSON file; surrogates without their other half, which no other file can hold, become "?".
 

@@ -34,6 +34,7 @@ VALID = {  # by option or argument, a word that is accepted
     "what": "scenarios", "rtols": "1e-6", "max_cpu_seconds": "3", "history_folder": "history", "pattern": "*",
     "duration": "1", "precision": "quad", "proof_cpu_seconds": "9",
     "base": "free", "state_count": "3", "state": "hip=0.1", "root": "history", "form": "mujoco",
+    "target": "mine.yaml", "key": "a/b", "engine": "mujoco", "good": "3.9.0", "bad": "4.0.0",
     "strip_geometry": "", "as_json": "", "self_test": "", "fresh": "", "help": "",
 }  # fmt: skip
 WORK = (  # where the work of a command begins
@@ -42,6 +43,7 @@ WORK = (  # where the work of a command begins
     "plumbline.studies.drift.measure_drift", "plumbline.cli.study_commands.run_plan",
     "plumbline.reproduce.write.make_script", "plumbline.truth.enclosure.prove_motion",
     "plumbline.cli.nightly.prove_changed_motions", "plumbline.cli.model_commands.run_model_files",
+    "plumbline.cli.bisect_command.search_model_file", "plumbline.cli.bisect_command.search_row",
 )  # fmt: skip
 WORKERS = (
     "plumbline.cli.study_commands.WorkerPool", "plumbline.cli.scenario_commands.WorkerPool",
