@@ -300,22 +300,27 @@ def _fitted(
 ) -> float | None:
     """The amount at which a cause explains the difference, to ``accepted`` bounds; None where it does not.
 
-    It is fitted to all but the last numbers, which are energies.
+    It is fitted to all but the last numbers, which are energies: of them more may be left, by what one bound
+    in each of the others changes the amount.
     """
     vectors, x, step = slice(-energies or None), cause.nominal, STEP * cause.scale
-    slope = (effect(cause, x + step) / step)[vectors]
-    left = difference
+    slopes = effect(cause, x + step) / step
+    slope, left = slopes[vectors], difference
+    most = np.full(len(slopes), accepted)
+    most[len(slope) :] += (
+        np.abs(slopes[len(slope) :]) * np.sum(np.abs(slope)) / max(float(slope @ slope), 1e-300)
+    )
     size, length = float(slope @ slope), float(np.linalg.norm(left[vectors]))
     if abs(float(slope @ left[vectors])) <= MIN_SIMILARITY * np.sqrt(size) * length:
         return None
     for factor in FACTORS if cause.nominal and cause.can_vanish else ():
-        if np.max(np.abs(difference - effect(cause, factor * x))) <= accepted:
+        if np.all(np.abs(difference - effect(cause, factor * x)) <= most):
             return factor * x
     for _ in range(MAX_STEPS):
         x += float(slope @ left[vectors]) / size
         with np.errstate(all="ignore"):
             left = difference - effect(cause, x)
-        if np.max(np.abs(left)) <= accepted:
+        if np.all(np.abs(left) <= most):
             return x
         before, length = length, float(np.linalg.norm(left[vectors]))
         if not length < before / 2:  # it converges quadratically, or the cause is another one
