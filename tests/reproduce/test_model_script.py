@@ -110,7 +110,11 @@ def test_the_command_lists_and_writes(tmp_path):
     wrong = runner.invoke(main, ["reproduce", str(out), key, "--form", "drake"])
     assert wrong.exit_code == 1
     assert "pinocchio differs; a script for drake cannot show that" in wrong.stderr
+    options = json.loads((out / "model.json").read_text())["options"]
     (out / "model.json").write_text(json.dumps({"files": [], "options": {}}))
+    damaged = runner.invoke(main, ["reproduce", str(out)])
+    assert damaged.exit_code == 2 and "model.json: no results of `plumbline model`" in damaged.stderr
+    (out / "model.json").write_text(json.dumps({"files": [], "options": options}))
     assert "nothing differs" in runner.invoke(main, ["reproduce", str(out)]).stderr
 
 
