@@ -587,7 +587,7 @@ class LinkTree:
         return found | found.T
 
     def _standalone_columns(self) -> list[int]:
-        """Columns of free bodies that no other joint hangs on."""
+        """Columns of free bodies without other bodies on them."""
         far = set(self.model.body[:, 0].tolist())
         alone = [k for k, kind in enumerate(self.model.kind) if kind == "free" and k not in far]
         return [i for k in alone for i in self.before[self.of_body[k]]]

@@ -112,7 +112,7 @@ def test_a_mechanism_comes_back_from_its_file():
             assert np.array_equal(value, other)
         elif name == "turn":
             np.testing.assert_allclose(value[has_axes], other[has_axes], atol=1e-15)
-        elif name == "rest":  # of no account without a spring
+        elif name == "rest":  # has no effect without a spring
             used = model.stiffness > 0
             np.testing.assert_array_equal(value[used], other[used])
         else:

@@ -90,7 +90,7 @@ def test_planted_defects_break_a_relation(engine, relation):
 
 
 class Redescribed(Reference):
-    """Given another mechanism than it is asked about; equivalent descriptions are told apart."""
+    """An engine that computes another mechanism than the given one; equivalent descriptions then differ."""
 
     change = staticmethod(lambda model: model)
 

@@ -385,10 +385,10 @@ def measure_coverage(tests: Sequence[str], files: Sequence[str]) -> CoverageMap:
         _, status = os.waitpid(child, 0)
         if status:
             raise SystemExit("the tests do not pass without any mutant: nothing can be said")
-        said = json.load(answer)
-    reached = said["tests_by_line"].items()
-    said["tests_by_line"] = {file: {int(k): v for k, v in lines.items()} for file, lines in reached}
-    return CoverageMap(**said)
+        document = json.load(answer)
+    reached = document["tests_by_line"].items()
+    document["tests_by_line"] = {file: {int(k): v for k, v in lines.items()} for file, lines in reached}
+    return CoverageMap(**document)
 
 
 # --- trial --------------------------------------------------------------------------------------
