@@ -550,7 +550,7 @@ class LinkTree:
     def damped_acceleration(self, q: list[Array], v: Array, h: Array, forces: Forces) -> Array:
         """Return (M + h D)⁻¹ f with D = −∂f/∂v of some of the forces, in the sparsity of M.
 
-        In "applied" forces, free bodies with nothing on them have the derivatives of all.
+        In "applied" forces, free bodies on which nothing moves have the derivatives of all.
 
         Args:
             q: coordinates.
@@ -587,10 +587,12 @@ class LinkTree:
         return found | found.T
 
     def _standalone_columns(self) -> list[int]:
-        """Columns of free bodies without other bodies on them."""
-        far = set(self.model.body[:, 0].tolist())
-        alone = [k for k, kind in enumerate(self.model.kind) if kind == "free" and k not in far]
-        return [i for k in alone for i in self.before[self.of_body[k]]]
+        """Columns of free bodies with nothing on them but welded bodies."""
+        related = self._on_one_path()
+        free = [
+            self.before[j] for j, kind in zip(self.of_body, self.model.kind, strict=True) if kind == "free"
+        ]
+        return [i for own in free if np.sum(related[own[0]]) == len(own) for i in own]
 
     # -- bodies --------------------------------------------------------------------------------------
 

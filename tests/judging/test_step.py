@@ -317,3 +317,16 @@ def test_dampers_between_branches_are_explicit():
     with patch.object(LinkTree, "_standalone_columns", lambda _: []):
         fast = load_adapter("mujoco").integrator("implicitfast")
         assert disagreeing(judged(load_adapter("mujoco"), fast, model, states))
+
+
+def test_a_body_welded_to_a_free_one_is_part_of_it():
+    """MuJoCo's implicitfast: D has all forces of a free body with another welded, not hinged, to it."""
+    engine, model = load_adapter("mujoco"), branches()[0]
+    body = np.array([[-1, 0], [0, 1], [-1, 2], [2, 3]])
+    for kind in ("weld", "hinge"):
+        used = np.array([[1, 0], [1, 0], [0, 0], [int(kind == "hinge"), 0]])
+        pair = replace(
+            model, kind=("slide", "hinge", "free", kind), body=body, damping=0.7 * used, stiffness=2.0 * used
+        )
+        states = random_states(pair, 3, seed=9)
+        assert not disagreeing(judged(engine, engine.integrator("implicitfast"), pair, states))
