@@ -75,6 +75,13 @@ def test_a_step_too_coarse_for_100_s_is_judged_where_it_is_not():
     assert energy.extra["by 100 s"] > 3.0 > energy.extra["scale"] / 2
 
 
+def test_two_steps_below_one_that_is_too_coarse_cannot_disagree():
+    """The drift of a rod driven to 100 rad/s falls with order 1.6 to 2⁻⁹ s, with 5 and more from there."""
+    energy = run_long("driven-rod", "mujoco", "RK4")["energy_drift_long"]
+    assert energy.verdict == "agrees" and energy.compared_until == 10.0 and energy.order > 3.5
+    assert "1.1 J within 100 s, which does not decide" in energy.reason
+
+
 SMALL_DRAG_DEFECT = Defect(
     "damping-1e-7", "drag of 1e-7 N m s on every body",
     inputs=model_change(lambda m, _: {"drag_moment": m.drag_moment + 1e-7}),
