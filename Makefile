@@ -37,7 +37,7 @@ nightly: .venv/test.done  ## the full matrix with random scenarios, then the lon
 
 bench: .venv/test.done  ## right-hand sides and work-precision beside the engines, as ratios within one run; the daily loop
 	$(PYTHON) -m bench.summary
-	$(PYTHON) -m bench.daily_loop --all --random 600
+	$(PYTHON) -m bench.daily_loop --all --random 600 --night
 
 benchmarks: .venv/test.done  ## published problems on every engine; writes docs/benchmarks.md
 	$(PYTHON) -m bench.classics

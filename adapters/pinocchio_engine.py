@@ -138,9 +138,7 @@ class PinocchioChain:
             for k, row in enumerate(self.body_rows)
             if model.kind[k] == "ball" or KINDS[model.kind[k]].motions
         ]  # joints that can have elements
-        for k, joint in self.moving:
-            own = slice(1 if model.kind[k] == "ball" else joint.nv)
-            self.pin_model.armature[joint.idx_v : joint.idx_v + joint.nv] = model.armature[k, own]
+        self._init_elements()
         self.ends = ends
         self.welds, self.weld_data = pin.StdVec_RigidConstraintModel(), pin.StdVec_RigidConstraintData()
         for ends_of_loop in ends:
@@ -172,6 +170,31 @@ class PinocchioChain:
         self.placements.append(place)
         return self._add_joint(parent, JOINT_MODELS[kind](), hang * far, f"body {k}")
 
+    def _init_elements(self) -> None:
+        """Set the joints' rotors, dampers, springs and efforts, (nv,) each, and where springs read q."""
+        model, nv = self.source_model, self.pin_model.nv
+        self.damping, self.stiffness, self.effort, rest = np.zeros((4, nv))
+        scalars: list[tuple[int, int]] = []  # places in q and in v
+        balls: list[tuple[Array, Array]] = []  # quaternion, scalar first, and rates
+        turns: list[Array] = []
+        for k, joint in self.moving:
+            is_ball = model.kind[k] == "ball"
+            at, own = slice(joint.idx_v, joint.idx_v + joint.nv), slice(1 if is_ball else joint.nv)
+            self.pin_model.armature[at] = model.armature[k, own]
+            self.damping[at], self.effort[at] = model.damping[k, own], model.effort[k, own]
+            self.stiffness[at] = model.stiffness[k, own]
+            if not is_ball:
+                rest[at] = model.rest[k, own]
+                scalars += [(joint.idx_q + i, joint.idx_v + i) for i in range(joint.nv)]
+            elif model.stiffness[k, 0]:
+                above = self._frame_in_joint(int(model.body[k, 0]), model.turn[k, 0])  # as q
+                turns.append(quaternion_product(model.turn[k, 1], quaternion_conjugate(above)))
+                balls.append((joint.idx_q + np.array([3, 0, 1, 2]), joint.idx_v + np.arange(3)))
+        self.scalars = np.array(scalars, np.intp).reshape(-1, 2).T
+        self.rest = rest[self.scalars[1]]
+        self.sprung_balls = [np.array([pair[i] for pair in balls], np.intp) for i in range(2)]
+        self.ball_rest = np.array(turns).reshape(-1, 4)
+
     def _init_loads(self) -> None:
         """Set `fext` to the constant loads; a moment is constant in the joint's frame, the others vary."""
         model = self.source_model
@@ -183,8 +206,19 @@ class PinocchioChain:
             for place, n in zip(self.placements, model.moment, strict=True)
         ]
         self.constant_loads = list(self.loads)
-        varying = np.any(model.force != 0, axis=1) | (model.drag_force != 0) | (model.drag_moment != 0)
+        self.has_force = np.any(model.force != 0, axis=1).tolist()
+        self.has_body_drag = ((model.drag_force != 0) | (model.drag_moment != 0)).tolist()
+        varying = np.logical_or(self.has_force, self.has_body_drag)
         varying[model.spring_body[model.spring_body >= 0]] = True
+        self.spring_ends = [
+            [
+                (self.body_joints[b], self.placements[b] * translation(at))
+                if b >= 0
+                else (0, translation(at))
+                for b, at in zip(bodies, points, strict=True)
+            ]
+            for bodies, points in zip(model.spring_body, model.spring_point, strict=True)
+        ]  # joint and place in its frame of each end; joint 0 is the world
         self.bodies_with_varying_loads = [int(k) for k in np.flatnonzero(varying)]
         self._add_up_loads()
 
@@ -280,14 +314,17 @@ class PinocchioChain:
         """
         if not self.bodies_with_varying_loads:
             return
-        pin.forwardKinematics(self.pin_model, self.data, q, v)
-        model = self.source_model
+        data, model = self.data, self.source_model
+        pin.forwardKinematics(self.pin_model, data, q, v)
         for k in self.bodies_with_varying_loads:
             j, centre = self.body_joints[k], self.placements[k]
-            motion = centre.actInv(self.data.v[j])  # of the centre of mass, body axes
-            force = centre.rotation.T @ (self.data.oMi[j].rotation.T @ model.force[k])
-            force = force - model.drag_force[k] * motion.linear
-            moment = model.moment[k] - model.drag_moment[k] * motion.angular
+            force, moment = np.zeros(3), model.moment[k]
+            if self.has_force[k]:
+                force = model.force[k].dot((data.oMi[j] * centre).rotation)  # Rᵀ F
+            if self.has_body_drag[k]:
+                motion = centre.actInv(data.v[j])  # of the centre of mass, body axes
+                force = force - model.drag_force[k] * motion.linear
+                moment = moment - model.drag_moment[k] * motion.angular
             self.loads[k] = centre.act(pin.Force(force, moment))
         for i in range(len(model.spring_body)):
             self._add_spring(i)
@@ -295,24 +332,21 @@ class PinocchioChain:
 
     def _add_spring(self, i: int) -> None:
         """Add to the loads what a spring between points does to its bodies."""
-        model = self.source_model
-        ends, velocities = model.spring_point[i].copy(), np.zeros((2, 3))
-        bodies = [(side, int(b)) for side, b in enumerate(model.spring_body[i]) if b >= 0]
-        for side, b in bodies:
-            joint, place = self.body_joints[b], self.placements[b]
-            pose, motion = self.data.oMi[joint] * place, place.actInv(self.data.v[joint])
-            velocities[side] = pose.rotation @ (motion.linear + np.cross(motion.angular, ends[side]))
-            ends[side] = pose.act(ends[side])
-        d, rate = ends[1] - ends[0], velocities[1] - velocities[0]
-        length = np.linalg.norm(d)
+        data, model, frames, rates = self.data, self.source_model, [], []
+        for joint, place in self.spring_ends[i]:
+            frames.append(data.oMi[joint] * place)
+            rates.append(frames[-1].rotation @ place.actInv(data.v[joint]).linear)
+        d, rate = frames[1].translation - frames[0].translation, rates[1] - rates[0]
+        length = np.sqrt(d @ d)
         tension = model.spring_stiffness[i] * (length - model.spring_length[i])
         tension += model.spring_damping[i] * (d @ rate) / length
-        for side, b in bodies:
-            place, sign = self.placements[b], 1 - 2 * side
-            turn = (self.data.oMi[self.body_joints[b]] * place).rotation
-            force = turn.T @ d * (sign * tension / length)
-            moment = np.cross(model.spring_point[i, side], force)
-            self.loads[b] = self.loads[b] + place.act(pin.Force(force, moment))
+        pull = d * (tension / length)
+        for b, sign, frame, (_, place) in zip(
+            model.spring_body[i], (1, -1), frames, self.spring_ends[i], strict=True
+        ):
+            if b >= 0:
+                force = pin.Force(sign * pull.dot(frame.rotation), np.zeros(3))
+                self.loads[b] = self.loads[b] + place.act(force)
 
     def joint_torque(self, q: Array, v: Array) -> Array:
         """Evaluate springs, dampers and efforts of the joints.
@@ -325,22 +359,14 @@ class PinocchioChain:
             τ (nv,).
 
         """
-        model, torque = self.source_model, self.zero_torque
-        if not model.has_joint_elements:
-            return torque
-        torque = torque.copy()
-        for k, joint in self.moving:
-            at, own = slice(joint.idx_v, joint.idx_v + joint.nv), slice(joint.nv)
-            if model.kind[k] == "ball":
-                turn, own = np.roll(q[joint.idx_q : joint.idx_q + 4], 1), slice(1)
-                above = self._frame_in_joint(int(model.body[k, 0]), model.turn[k, 0])  # as q
-                rest = quaternion_product(model.turn[k, 1], quaternion_conjugate(above))
-                stretch = rotation_vector(quaternion_product(rest, turn))  # body axes, as v
-            else:
-                stretch = q[joint.idx_q : joint.idx_q + joint.nv] - model.rest[k, own]
-            torque[at] = (
-                model.effort[k, own] - model.stiffness[k, own] * stretch - model.damping[k, own] * v[at]
-            )
+        if not self.source_model.has_joint_elements:
+            return self.zero_torque
+        torque: Array = self.effort - self.damping * v
+        torque[self.scalars[1]] -= self.stiffness[self.scalars[1]] * (q[self.scalars[0]] - self.rest)
+        if len(self.sprung_balls[0]):
+            at, own = self.sprung_balls
+            stretch = rotation_vector(quaternion_product(self.ball_rest, q[at]))  # body axes, as v
+            torque[own] -= self.stiffness[own] * stretch
         return torque
 
     def acceleration(self, q: Array, v: Array) -> Array:

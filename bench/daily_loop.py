@@ -1,10 +1,11 @@
-"""`python -m bench.daily_loop [--all] [--random COUNT]`: how long the commands of a day take.
+"""`python -m bench.daily_loop [--all] [--random COUNT] [--night]`: how long the commands of a day take.
 
-Measures `--help`, one scenario and the whole catalogue at state level, each for the first time and again
-unchanged; with `--all` also the whole catalogue at every level; with `--random COUNT` also COUNT random
-scenarios on one run with two workers against two independent runs at the same time.  Appends a record with
-date, commit, processor and load to bench/results/daily_loop.json.  Needs about two minutes on two idle cores;
-the load before and after shows whether the machine was idle.
+Measures `--help`, one scenario, and the scenarios that the catalogue had at commit 031e87a at state level,
+each for the first time and again unchanged; with `--all` also these scenarios, and all of today's, at every
+level; with `--random COUNT` also COUNT random scenarios on one run with two workers against two independent
+runs at the same time; with `--night` also a night of these scenarios and 200 random ones, without new
+certificates.  Appends a record with date, commit, processor and load to bench/results/daily_loop.json; the
+load before and after shows whether the machine was idle.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.runner import git_commit
 from plumbline.processes.processor import processor_name
 from plumbline.storage.results_store import write_atomically
@@ -28,6 +30,23 @@ ROOT = Path(__file__).resolve().parents[1]
 STORED = ROOT / "bench" / "results" / "daily_loop.json"
 SCENARIO = "double-tumbling-rods"
 RANDOM_SEED = 600
+CATALOGUE_COMMIT = "031e87a"  # scenarios of other commits are outside the figures that are compared
+NIGHT_OPTIONS = ("--random", "200", "--seed", "801", "--proof-cpu-seconds", "0")
+
+
+def earlier_scenarios() -> list[str]:
+    """List the scenarios of the catalogue at `CATALOGUE_COMMIT`.
+
+    Returns:
+        Their names.
+
+    Raises:
+        CalledProcessError: the checkout's history does not reach back to that commit.
+
+    """
+    words = ["git", "ls-tree", "-r", "--name-only", CATALOGUE_COMMIT, "scenarios"]
+    listed = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    return [Path(line).stem for line in listed.splitlines() if line.endswith(".yaml")]
 
 
 def time_command(arguments: list[str], cache: Path) -> dict[str, float]:
@@ -38,18 +57,23 @@ def time_command(arguments: list[str], cache: Path) -> dict[str, float]:
         cache: the folder of the user's cache.
 
     Returns:
-        Wall time and the CPU time of the command's own process, without its workers [s].
+        Wall time and the CPU time of the command's own process, without its workers [s], and its exit code.
+
+    Raises:
+        RuntimeError: the command failed.
 
     """
     environment = {**os.environ, "PLUMBLINE_CACHE": str(cache), "OMP_NUM_THREADS": "1"}
     begin, before = time.monotonic(), os.times()
-    subprocess.run(
+    code = subprocess.run(
         [sys.executable, "-m", "plumbline", *arguments],
-        cwd=ROOT, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, check=True,
-    )  # fmt: skip
+        cwd=ROOT, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+    ).returncode  # fmt: skip
+    if code not in (ExitCode.SUCCESS, ExitCode.DISAGREEMENT):
+        raise RuntimeError(f"plumbline {' '.join(arguments)} ended with exit code {code}")
     after = os.times()
     own = after.children_user + after.children_system - before.children_user - before.children_system
-    return {"wall": time.monotonic() - begin, "cpu of the command": own}
+    return {"wall": time.monotonic() - begin, "cpu of the command": own, "exit code": code}
 
 
 def time_run(words: list[str], folder: Path) -> dict[str, Any]:
@@ -60,15 +84,50 @@ def time_run(words: list[str], folder: Path) -> dict[str, Any]:
         folder: an empty folder.
 
     Returns:
-        Times [s] of the first run and of the second, with the first one's CPU time by kind.
+        Times [s] of the first run and of the second, with their CPU times by kind.
 
     """
-    found: dict[str, Any] = {}
+    found: dict[str, Any] = {"scenarios": sum(not word.startswith("-") for word in words) or "all"}
     for name in ("first", "again"):
         found[name] = time_command(["run", *words, "--jobs", "2", "--out", str(folder / "out")], folder)
-        run = json.loads((folder / "out" / "results.json").read_text(encoding="utf-8"))["run"]
-        found[name] |= {"cpu by kind": run["cpu"], "answers of earlier runs": run["cached_tasks"]}
+        found[name] |= cpu_times(folder / "out")
     return found
+
+
+def cpu_times(results: Path) -> dict[str, Any]:
+    """Read a run's CPU times.
+
+    Args:
+        results: the folder of the run.
+
+    Returns:
+        CPU time [s] in all, by kind, and in all over the engines' own; how many answers were in the cache.
+
+    """
+    run = json.loads((results / "results.json").read_text(encoding="utf-8"))["run"]
+    total, engines = sum(run["cpu"].values()), run["cpu"]["engines"]
+    return {
+        "cpu": total,
+        "cpu by kind": run["cpu"],
+        "cpu over the engines' own": total / engines if engines else None,
+        "answers of earlier runs": run["cached_tasks"],
+    }
+
+
+def time_night(folder: Path) -> dict[str, Any]:
+    """Run a night of the earlier catalogue.
+
+    Args:
+        folder: an empty folder.
+
+    Returns:
+        Times [s] with the CPU time by kind.
+
+    """
+    words = ["nightly", *earlier_scenarios(), *NIGHT_OPTIONS, "--jobs", "2", "--out", str(folder / "nights")]
+    found = time_command(words, folder)
+    (night,) = (folder / "nights" / "history").iterdir()
+    return found | cpu_times(night)
 
 
 def random_scenarios_per_second(count: int, jobs: int, part: int, parts: int) -> float:
@@ -121,12 +180,13 @@ def two_workers_over_two_runs(count: int) -> dict[str, float]:
     return {"one run": together, "two runs": apart, "ratio": together / apart}
 
 
-def measure(is_all_levels: bool, random_count: int) -> dict[str, Any]:
+def measure(is_all_levels: bool, random_count: int, has_night: bool) -> dict[str, Any]:
     """Measure the commands.
 
     Args:
-        is_all_levels: whether the whole catalogue is run at every level too.
+        is_all_levels: whether the catalogues are run at every level too.
         random_count: number of random scenarios for the comparison of two workers with two runs; 0: none.
+        has_night: whether a night is run.
 
     Returns:
         The record to store.
@@ -143,9 +203,13 @@ def measure(is_all_levels: bool, random_count: int) -> dict[str, Any]:
         folder = Path(scratch)
         record["--help"] = time_command(["--help"], folder)
         record[f"run {SCENARIO} --level state"] = time_run([SCENARIO, "--level", "state"], folder / "one")
-        record["run --level state"] = time_run(["--level", "state"], folder / "state")
+        earlier, of_earlier = earlier_scenarios(), f"of the catalogue of {CATALOGUE_COMMIT}"
+        record[f"run --level state {of_earlier}"] = time_run([*earlier, "--level", "state"], folder / "state")
         if is_all_levels:
+            record[f"run {of_earlier}"] = time_run(earlier, folder / "earlier")
             record["run"] = time_run([], folder / "all")
+        if has_night:
+            record[f"nightly {of_earlier}, {' '.join(NIGHT_OPTIONS)}"] = time_night(folder / "night")
     if random_count:
         record[f"{random_count} random scenarios"] = two_workers_over_two_runs(random_count)
     return record | {"load after": os.getloadavg()}
@@ -155,14 +219,15 @@ def main() -> None:
     """Measure, print and store; or run one part of the random scenarios for the measurement."""
     assert __doc__
     parser = argparse.ArgumentParser("python -m bench.daily_loop", description=__doc__.partition("\n\n")[2])
-    parser.add_argument("--all", action="store_true", help="run the whole catalogue at every level too")
+    parser.add_argument("--all", action="store_true", help="run the catalogues at every level too")
     parser.add_argument("--random", type=int, default=0, metavar="COUNT", help="number of random scenarios")
+    parser.add_argument("--night", action="store_true", help="run a night too")
     parser.add_argument("--part", type=int, nargs=4, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.part:
         print(random_scenarios_per_second(*options.part))
         return
-    record = measure(options.all, options.random)
+    record = measure(options.all, options.random, options.night)
     print(json.dumps(record, indent=1))
     stored = json.loads(STORED.read_text(encoding="utf-8")) if STORED.exists() else []
     write_atomically(STORED, (json.dumps([*stored, record], indent=1) + "\n").encode())

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reference_impl.euler_parameters import A, G, L, dot
+from reference_impl.euler_parameters import A, G, L, cross, dot
 from reference_impl.mechanism import KINDS, Array, Mechanism
 
 
@@ -118,13 +118,13 @@ class Elements:
         e, is_far, is_slide = np.arange(len(self.joint)), self.is_far[:, None], self.is_slide[:, None]
         w, carrier = np.where(is_far, f[e, self.axis], h[e, self.axis]), np.where(is_far, wa, wb)
         d = re[0] + b - re[1] - a
-        d_rate = ve[0] + np.cross(wb, b) - ve[1] - np.cross(wa, a)
+        d_rate = ve[0] + cross(wb, b) - ve[1] - cross(wa, a)
         push = w * is_slide
-        n_near, n_far = (np.where(is_slide, np.cross(arm, w), w) for arm in (b, a + d))
+        n_near, n_far = (np.where(is_slide, cross(arm, w), w) for arm in (b, a + d))
         rate = dot(push, ve[0] - ve[1]) + dot(n_near, wb) - dot(n_far, wa)
-        w_rate = np.cross(carrier, w)
-        bend = np.cross(wb, np.cross(wb, b)) - np.cross(wa, np.cross(wa, a))
-        slide_bias = dot(w, bend) + 2 * dot(w_rate, d_rate) + dot(np.cross(wa, w_rate), d)
+        w_rate = cross(carrier, w)
+        bend = cross(wb, cross(wb, b)) - cross(wa, cross(wa, a))
+        slide_bias = dot(w, bend) + 2 * dot(w_rate, d_rate) + dot(cross(wa, w_rate), d)
         stretch = np.where(self.is_slide, dot(w, d), self._angles(f, h, pe, x)) - self.rest
         torque = self.effort - self.stiffness * stretch - self.damping * rate
         wrench = torque[:, None] * np.stack([np.hstack([push, n_near]), -np.hstack([push, n_far])])
@@ -163,18 +163,20 @@ class Elements:
     def _point_springs(self, state: tuple[Array, ...]) -> tuple[Array, float, float]:
         """Wrenches (2, K, 6) on both bodies of each spring, its potential energy and dissipated power."""
         m = self.mechanism
+        if not len(m.spring_body):
+            return np.zeros((2, 0, 6)), 0.0, 0.0
         r, p, v, pdot = (y[m.spring_body.T] for y in state)
         arm = np.matvec(A(p), np.moveaxis(m.spring_point, 1, 0))
         d, d_rate = (
             np.diff(r + arm, axis=0)[0],
-            np.diff(v + np.cross(np.matvec(2 * G(p), pdot), arm), axis=0)[0],
+            np.diff(v + cross(np.matvec(2 * G(p), pdot), arm), axis=0)[0],
         )
         length = np.sqrt(dot(d, d))
         rate, stretch = dot(d, d_rate) / length, length - m.spring_length
         tension = m.spring_stiffness * stretch + m.spring_damping * rate
         pull = (tension / length)[:, None] * d * np.array([1.0, -1.0])[:, None, None]
         potential, lost = m.spring_stiffness @ stretch**2 / 2, m.spring_damping @ rate**2
-        return np.concatenate([pull, np.cross(arm, pull)], axis=-1), float(potential), float(lost)
+        return np.concatenate([pull, cross(arm, pull)], axis=-1), float(potential), float(lost)
 
 
 def _with_world(r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, ...]:

@@ -211,10 +211,7 @@ class Mechanism:
     @property
     def is_chain(self) -> bool:
         """Whether every body is joined to the one before, the first to the world, by bare rods and balls."""
-        if self.has_loops:
-            return False
-        is_row = bool(np.all(self.body[:, 0] == np.arange(self.n) - 1)) and not np.any(self.point[0, 0])
-        return is_row and set(self.kind) <= {"rod", "ball"} and not self.has_elements
+        return _is_chain(self)
 
     @property
     def has_loops(self) -> bool:
@@ -244,7 +241,7 @@ class Mechanism:
     @property
     def has_joint_elements(self) -> bool:
         """Whether any joint has a rotor, a damper, a spring or an effort."""
-        return any(np.any(getattr(self, name)) for name in JOINT_ELEMENTS)
+        return _has_joint_elements(self)
 
     @property
     def has_elements(self) -> bool:
@@ -270,6 +267,19 @@ class Mechanism:
 @lru_cache(maxsize=64)  # what is computed of a mechanism is remembered by its identity
 def _tree_of(mechanism: Mechanism) -> Mechanism:
     return replace(mechanism, **{name: getattr(mechanism, name)[: mechanism.n] for name in JOINT_FIELDS})
+
+
+@lru_cache(maxsize=64)
+def _has_joint_elements(mechanism: Mechanism) -> bool:
+    return any(np.any(getattr(mechanism, name)) for name in JOINT_ELEMENTS)
+
+
+@lru_cache(maxsize=64)
+def _is_chain(mechanism: Mechanism) -> bool:
+    if mechanism.has_loops or mechanism.has_elements or not set(mechanism.kind) <= {"rod", "ball"}:
+        return False
+    is_row = bool(np.all(mechanism.body[:, 0] == np.arange(mechanism.n) - 1))
+    return is_row and not np.any(mechanism.point[0, 0])
 
 
 def _chain_kinds(length: Array) -> tuple[Kind, ...]:

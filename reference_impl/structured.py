@@ -80,6 +80,7 @@ class FactoredJoints(NamedTuple):
     U_near: Array | None  # (3, c, M) as U, with the notes' own lever off pᵀp = 1 (E2)
     U_far: Array | None
     factor: tuple[Array, ...]
+    Rs: Array | None  # (2, 3, M) m, the points turned; None for balls only
 
 
 class StructuredSystem:
@@ -130,31 +131,36 @@ class StructuredSystem:
         self.drag_rate = drag_force / mass  # (M,) 1/s
         self.has_drag = bool(np.any(drag_force) or np.any(drag_moment))
         # β = K⁻¹ J⁻¹ (n′ − ω×Jω/π) and, in the body frame, the points about the centre, B β + ω×(ω×s)/π:
-        # (9, M) constant, and (9, 6, M) of the ωᵢ ωⱼ/π; with drag (9, 9, M), the last three of ω.
+        # (9, M) constant, and (9, 6, M) of the ωᵢ ωⱼ/π; with drag or rods (·, 9, M), the last three of ω.
         cross, one = _TO_TILDE.reshape(3, 3, 3), np.eye(3)
         gyro = -np.einsum("mki,kja,mjd->miad", K, cross, inertia)
         pull = np.einsum("ia,mcd->mciad", one, points) - np.einsum("ad,mci->mciad", one, points)
         B = -tilde(points) @ K[:, None]  # (M, 2, 3, 3)
-        self.B = last(B)
+        self.B, self.B_and_s = last(B), last(np.concatenate([B, points[..., None]], -1))  # (2, 3, 3 or 4, M)
         spin = np.concatenate([gyro, (np.einsum("mcik,mkad->mciad", B, gyro) + pull).reshape(-1, 6, 3, 3)], 1)
         spin = spin[..., _FIRST_FACTORS, _SECOND_FACTORS] + spin[..., _SECOND_FACTORS, _FIRST_FACTORS] * (
             np.arange(6) > 2
         )
         turned = np.concatenate([K.mT, (B @ K.mT[:, None]).reshape(-1, 6, 3)], 1)  # from a moment
+        constant = np.matvec(turned, moment)
+        self.rods = length > 0
+        self.has_only_balls = not np.any(self.rods)
         if self.has_drag:
             spin = np.concatenate([spin, -turned * drag_moment[:, None, None]], -1)
-        self.spin_terms, self.moment_terms = last(spin), last(np.matvec(turned, moment))
+        if not self.has_only_balls:  # and (6, M) ω×s
+            spin = np.pad(spin, ((0, 0), (0, 6), (0, 0 if self.has_drag else 3)))
+            spin[:, 9:, 6:] = -tilde(points).reshape(-1, 6, 3)
+            constant = np.pad(constant, ((0, 0), (0, 6)))
+        self.spin_terms, self.moment_terms = last(spin), last(constant)
         self.length = length
         self.is_linked = np.ones(self.body_count)  # 0 where a body hangs on the pivot
         self.is_linked[self.first_body[:-1]] = 0
-        self.rods = length > 0
         self.slack = np.where(self.rods, 0, np.inf)  # of d, which may be 0 at a ball
         self.pair_inverse_mass = self.inverse_mass + self._at_parent(self.inverse_mass)  # (M,) 1/kg
         self.child_inverse_mass = self.inverse_mass * self._at_child(
             np.ones(self.body_count)
         )  # 0 where nothing hangs on a body
         self.rows_per_joint = 1 if np.all(self.rods) else 3  # c
-        self.has_only_balls = not np.any(self.rods)
         self.constant_blocks = np.zeros(
             (2 * self.rows_per_joint**2 + 1, self.body_count)
         )  # D's blocks, see _joints
@@ -254,19 +260,21 @@ class StructuredSystem:
 
     # -- the joint system ---------------------------------------------------------------------------
 
-    def _factor_joints(self, q: Array, norm: Array, R: Array, As: Array | None) -> FactoredJoints:
-        """The joints' rows and D factored; A s where there are rods. SingularSystem with the cause."""
-        X = np.einsum("ijm,cjkm->cikm", R, self.B)
+    def _factor_joints(self, q: Array, norm: Array, R: Array) -> FactoredJoints:
+        """The joints' rows and D factored. SingularSystem with the cause."""
         c = self.rows_per_joint
-        d = U = U_near = U_far = None
+        d = U = U_near = U_far = Rs = None
         # D's blocks: (c, c, M) on the diagonal, (c, c, M) of joint k + 1 with joint k, and zeros to fill up.
         cells = self.constant_blocks.copy()
         own, after = cells[:-1].reshape(2, c, c, -1)
-        if As is None:
-            rows = X
-            rows[1] = self._at_parent(X[1])
+        if self.has_only_balls:
+            rows = np.einsum("ijm,cjkm->cikm", R, self.B)
+            rows[1] = self._at_parent(rows[1])
         else:
-            off = 2 * (norm - 1) * self.s
+            turned = np.einsum("ijm,cjkm->cikm", R, self.B_and_s)
+            X, Rs = turned[:, :, :3], turned[:, :, 3]
+            excess = (norm - 1) * self.s
+            As, off = norm * Rs + excess, 2 * excess
             far = self._at_parent(np.concatenate([q[:3] + As[1], off[1]]))
             d = q[:3] + As[0] - far[:3]
             self._check_rods(q, d)
@@ -292,7 +300,7 @@ class StructuredSystem:
             pivots, largest = cholesky[0] ** 2, band[:, 0]
         if info != 0 or not (pivots > 8 * EPS * largest).all():
             self._raise_singular(q, d)
-        return FactoredJoints(d=d, U=U, lever_rows=rows, U_near=U_near, U_far=U_far, factor=factor)
+        return FactoredJoints(d=d, U=U, lever_rows=rows, U_near=U_near, U_far=U_far, factor=factor, Rs=Rs)
 
     def _padded_rows(self, w: Array) -> Array:
         """U (3, c, M): w of rods, the identity of balls."""
@@ -362,29 +370,28 @@ class StructuredSystem:
     def _solve_motion(self, q: Array, v: Array, a: float) -> tuple[Array, Array, FactoredJoints, Array]:
         """(r̈; p̈), μ, the joints and ω."""
         norm, R = self._norm_and_rotation(q)
-        Rs, As = (None, None) if self.has_only_balls else self._attachment_points(norm, R)
-        joints = self._factor_joints(q, norm, R, As)
+        joints = self._factor_joints(q, norm, R)
         rates = self._rate_products(q, v)
         sigma, omega = rates[0], rates[1:4]
         terms = rates[1:7] * rates[7:] / norm
         linear = self.free_acceleration
         if self.has_drag:
-            terms = np.concatenate([terms, omega])
             linear = linear - self.drag_rate * v[:3]
+        if self.has_drag or not self.has_only_balls:
+            terms = np.concatenate([terms, omega])
         moved = self.moment_terms + _matrix_vector(self.spin_terms, terms)
-        beta, point = moved[:3], _matrix_vector(R, moved[3:].reshape(2, 3, -1))
-        point += linear
-        if Rs is None:
-            h = point[0] - self._at_parent(point[1])
+        beta, turned = moved[:3], _matrix_vector(R, moved[3:].reshape(-1, 3, self.body_count))
+        if self.has_only_balls:
+            turned += linear
+            h = turned[0] - self._at_parent(turned[1])
         else:
-            swing = _matrix_vector(R, _matrix_vector(_tilde(omega), self.s))
-            h = self._rod_rows(joints, linear, point - linear, v, sigma, swing, Rs)
+            h = self._rod_rows(joints, linear, turned[:2], v, sigma, turned[2:])
         if a:
             C, rate = self.constraints(q, v)
             h = h + 2 * a * rate + a * a * C
-        mu, pulled, turned = self._back_substitute(joints, h)
+        mu, pulled, turning = self._back_substitute(joints, h)
 
-        alpha = _matrix_vector(self.K, beta + turned) - 2 * (sigma / norm) * omega
+        alpha = _matrix_vector(self.K, beta + turning) - 2 * (sigma / norm) * omega
         p, pdot = q[3:], v[3:]
         stretch = _dot(pdot, pdot)  # −pᵀp̈, from (N4)
         if a:
@@ -405,7 +412,6 @@ class StructuredSystem:
         v: Array,
         sigma: Array,
         swing: Array,
-        Rs: Array,
     ) -> Array:
         """H (c, M) where there are rods: C̈ without the joints' forces, with the notes' E2 and E3.
 
@@ -413,13 +419,14 @@ class StructuredSystem:
         R(ω×s).
         """
         assert joints.U is not None and joints.U_near is not None and joints.U_far is not None
+        assert joints.Rs is not None
         terms = np.empty((2, 13, self.body_count))  # of both points
         velocity, excess, centre, point, product = (
             terms[:, rows] for rows in (slice(3), slice(3, 6), slice(6, 9), slice(9, 12), 12)
         )
         double = 2 * sigma
         np.multiply(double, self.s, out=excess)  # d_t(A s) − 2 G L̇ᵀ s (E3)
-        turning = swing + double * Rs + excess  # d_t(A s)
+        turning = swing + double * joints.Rs + excess  # d_t(A s)
         np.add(v[:3], turning, out=velocity)
         centre[:], point[:] = linear, relative
         np.einsum("cim,cim->cm", excess, turning, out=product)
@@ -513,9 +520,7 @@ class StructuredSystem:
     def _projection_step(self, q: Array, h: Array) -> Array:
         """(7, M) −M⁻¹ Cᵀ D⁻¹ h, tangent to pᵀp = const."""
         norm, R = self._norm_and_rotation(q)
-        joints = self._factor_joints(
-            q, norm, R, None if self.has_only_balls else self._attachment_points(norm, R)[1]
-        )
+        joints = self._factor_joints(q, norm, R)
         _, linear, turned = self._back_substitute(joints, h)
         turn = _HALF_LT @ (q[3:, None] * _matrix_vector(self.K, turned)).reshape(12, -1) / norm
         return np.concatenate([linear, turn])

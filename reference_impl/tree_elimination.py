@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from reference_impl.direct import Solution, joint_moments
 from reference_impl.elements import Elements
 from reference_impl.errors import SingularSystem
-from reference_impl.euler_parameters import L, angular_velocity, dot
+from reference_impl.euler_parameters import L, angular_velocity, cross, dot
 from reference_impl.joints import constraint_rows, joint_of_rows
 from reference_impl.mechanism import Array, Mechanism
 from reference_impl.structured import StructuredSystem, component_first
@@ -144,7 +144,7 @@ class TreeSystem:
             momentum = np.matvec(forest.inertia, omega)
             force = self.weight - forest.drag_force[:, None] * rdot
             moment = forest.moment - forest.drag_moment[:, None] * omega
-            moment = moment - (np.cross(omega, momentum) + 2 * sigma[:, None] * momentum) / norm[:, None]
+            moment = moment - (cross(omega, momentum) + 2 * sigma[:, None] * momentum) / norm[:, None]
             along = p * (stretch / norm)[:, None]  # −p̈ along p
             gamma = gamma + dot(rows.p_near, along[self.joint]) + dot(rows.p_far, along[self.far])
             if rows.element_force is not None:

@@ -15,7 +15,7 @@ from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict
 from plumbline.model.datatypes import Integrator, Model, State
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod
 from plumbline.processes.workers import Pickled
-from plumbline.truth.rounding_bound import state_rounding_bound
+from plumbline.truth.rounding_bound import remembered_rounding_bound
 from plumbline.truth.step_comparison import (
     CONSTRAINED_UNITS,
     STEP_UNITS,
@@ -85,7 +85,7 @@ def step_sizes(has_constraints: bool, model: Model, states: Sequence[State]) -> 
         turning = np.asarray(first_coordinate_acceleration(model, state)[:, 3:], float)
         squares = [2 * np.max(norm(turning, axis=1)), np.max(norm(state.udot, axis=1)) ** 2, fastest**2]
         if has_constraints:
-            bound = state_rounding_bound(model, state)
+            bound = remembered_rounding_bound(model, state)
             force = np.asarray(bound.scale["joint_reaction"])
             lever, least = norm(model.proximal, axis=1), np.linalg.eigvalsh(model.inertia)[:, 0]
             on_body = model.body[:, 0] >= 0

@@ -80,6 +80,7 @@ class _Pose:
     P: list[Array]  # (..., 3) m, their joints
     r: list[Array]  # (..., 3) m, their centres of mass
     S: Array  # (..., nv, 6)
+    inertias: list[Array]  # (..., 6, 6) about the world's origin; empty until they are needed
 
 
 class LinkTree:
@@ -114,6 +115,18 @@ class LinkTree:
         ends = np.cumsum([SIZES[link.joint] for link in self.links])
         self.own = [slice(end - SIZES[link.joint], end) for end, link in zip(ends, self.links, strict=True)]
         self.nv = int(ends[-1])
+        turns = {"ball": slice(3), "rigid motion": slice(3, 6)}  # places of ω among the coordinates
+        self.turns = np.array(
+            [
+                range(own.start, own.stop)[turns[link.joint]]
+                for own, link in zip(self.own, self.links, strict=True)
+                if link.joint in turns
+            ],
+            np.intp,
+        ).reshape(-1, 3)
+        self.free = [
+            own for own, link in zip(self.own, self.links, strict=True) if link.joint == "rigid motion"
+        ]
         self.before: list[list[int]] = []  # columns of each link's joint and of those before it
         for link, own in zip(self.links, self.own, strict=True):
             earlier = self.before[link.parent] if link.parent >= 0 else []
@@ -324,13 +337,11 @@ class LinkTree:
 
         """
         found = np.zeros(np.broadcast_shapes(a.shape, b.shape), LongDouble)
-        for link, own in zip(self.links, self.own, strict=True):
+        found[..., self.turns] = cross(a[..., self.turns], b[..., self.turns])
+        for own in self.free:
             x, y = a[..., own], b[..., own]
-            if link.joint == "ball":
-                found[..., own] = cross(x, y)
-            elif link.joint == "rigid motion":
-                shift = cross(x[..., 3:], y[..., :3]) + cross(x[..., :3], y[..., 3:])
-                found[..., own] = np.concatenate([shift, cross(x[..., 3:], y[..., 3:])], -1)
+            shift = cross(x[..., 3:], y[..., :3]) + cross(x[..., :3], y[..., 3:])
+            found[..., own.start : own.start + 3] = shift
         return found
 
     def displacement_rate(self, theta: Array, v: Array) -> Array:
@@ -344,6 +355,8 @@ class LinkTree:
             θ̇ (..., nv).
 
         """
+        if not len(self.turns):
+            return v
         terms = self.method.correction_terms
         once = self.bracket(theta, v)
         total, power = v + (terms is None or terms > 0) * once / 2, once
@@ -366,7 +379,7 @@ class LinkTree:
             Their attitudes, points, and the motions of all joints.
 
         """
-        found = _Pose([], [], [], [], np.zeros((*q[0].shape[:-1], self.nv, 6), LongDouble))
+        found = _Pose([], [], [], [], np.zeros((*q[0].shape[:-1], self.nv, 6), LongDouble), [])
         for link, own, at in zip(self.links, self.own, q, strict=True):
             if link.parent >= 0:
                 before, above = found.p[link.parent], found.A[link.parent]
@@ -426,7 +439,7 @@ class LinkTree:
         """
         S = pose.S
         M = np.zeros((*S.shape[:-1], self.nv), LongDouble)
-        total = [self._inertia(pose, j) for j in range(len(self.links))]
+        total = self._inertias(pose).copy()
         for j in reversed(range(len(self.links))):
             parent, own = self.links[j].parent, self.own[j]
             F = np.swapaxes(total[j] @ np.swapaxes(S[..., own, :], -1, -2), -1, -2)  # (..., own, 6)
@@ -440,14 +453,19 @@ class LinkTree:
         M[..., index, index] += self.armature
         return np.asarray(M)
 
-    def _inertia(self, pose: _Pose, j: int) -> Array:
-        """Spatial inertia (..., 6, 6) of a link about the world's origin."""
-        A, c = pose.A[j], self.mass[j] * cross_matrix(pose.r[j])
-        top = A @ self.inertia[j] @ np.swapaxes(A, -1, -2) - c @ cross_matrix(pose.r[j])
-        found = np.zeros((*top.shape[:-2], 6, 6), LongDouble)
-        found[..., :3, :3], found[..., :3, 3:], found[..., 3:, :3] = top, c, -c
-        found[..., 3:, 3:] = self.mass[j] * np.eye(3, dtype=LongDouble)
-        return found
+    def _inertias(self, pose: _Pose) -> list[Array]:
+        """Spatial inertias (..., 6, 6) of the links about the world's origin."""
+        if not pose.inertias:
+            A, arm, mass = np.stack(pose.A), cross_matrix(np.stack(pose.r)), self.mass
+            lead = (len(mass), *[1] * (A.ndim - 3))
+            mass, inertia = mass.reshape(*lead, 1, 1), self.inertia.reshape(*lead, 3, 3)
+            c = mass * arm
+            found = np.zeros((*A.shape[:-2], 6, 6), LongDouble)
+            found[..., :3, :3] = A @ inertia @ np.swapaxes(A, -1, -2) - c @ arm
+            found[..., :3, 3:], found[..., 3:, :3] = c, -c
+            found[..., 3:, 3:] = mass * np.eye(3, dtype=LongDouble)
+            pose.inertias.extend(found)
+        return pose.inertias
 
     def generalized_forces(self, q: list[Array], pose: _Pose, v: Array, forces: Forces = "all") -> Array:
         """Return f (..., nv), or those parts of it that depend on v by drag and dampers.
@@ -470,8 +488,7 @@ class LinkTree:
         self._add_point_springs(pose, twist, wrench, forces)
         if forces == "all":
             weightless = np.concatenate([np.zeros(3), -self.model.gravity]).astype(LongDouble)
-            for j in range(len(self.links)):
-                inertia = self._inertia(pose, j)
+            for j, inertia in enumerate(self._inertias(pose)):
                 momentum = rotate_vectors(inertia, twist[j])
                 wrench[j] = (
                     wrench[j]
@@ -562,6 +579,9 @@ class LinkTree:
             (B, nv).
 
         """
+        own = self._standalone_columns() if forces == "applied" else []
+        if forces != "all" and not own and not self._has_damping(forces):
+            return self.acceleration(q, v)
         pose = self.pose(q)
         if forces == "joint dampers":
             step = h[..., None] * np.diag(LongDouble(self.method.damping_factor) * self.damping)
@@ -570,14 +590,19 @@ class LinkTree:
         units = np.eye(self.nv, dtype=LongDouble)[:, None]
         sides = [self.generalized_forces(q, pose, v + sign * units, forces) for sign in (-1, 1)]
         D = np.moveaxis((sides[0] - sides[1]) / 2, 0, -1)
-        if forces == "applied":
+        if own:
             everything = [self.generalized_forces(q, pose, v + sign * units) for sign in (-1, 1)]
-            own = self._standalone_columns()
             D[..., own, :] = np.moveaxis((everything[0] - everything[1]) / 2, 0, -1)[..., own, :]
         D = LongDouble(self.method.damping_factor) * np.where(self._on_one_path(), D, 0)
         if self.method.is_damping_symmetric:
             D = (D + np.swapaxes(D, -1, -2)) / 2
         return _solve(self.mass_matrix(pose) + h[..., None] * D, self.generalized_forces(q, pose, v))
+
+    def _has_damping(self, forces: Forces) -> bool:
+        """Whether dampers of joints, or any applied forces, depend on velocities."""
+        model, of_joints = self.model, bool(np.any(self.damping))
+        parts = (model.drag_force, model.drag_moment, model.spring_damping)
+        return of_joints or (forces == "applied" and any(np.any(part) for part in parts))
 
     def _on_one_path(self) -> Array:
         """(nv, nv) whether a branch of the tree has both coordinates: the sparsity of M."""

@@ -21,6 +21,7 @@ lengths, masses or times are measured in other units.  World frame throughout: A
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import cast
 
 import numpy as np
@@ -28,6 +29,7 @@ import numpy as np
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import cross, cross_matrix, rotate_vectors, rotation_matrix
 from plumbline.model.welding import BodyParts, part_offsets
+from plumbline.processes.workers import Pickled
 from plumbline.truth.rounding_bound_tree import tree_tolerances
 
 EPS = 2.0**-53
@@ -100,6 +102,25 @@ class RoundingBound:
             how = f"{SUM_ROUNDING_FACTOR} roundings (2^-53) of the sum of the magnitudes of its terms"
         largest = float(np.max(self.tolerance(quantity)))
         return f"{how}: at most {largest:.1e}, {self.relative_bound(quantity):.1e} of its scale"
+
+
+def remembered_rounding_bound(model: Model, state: State) -> RoundingBound:
+    """Compute the bound of `state_rounding_bound`, or return that of an earlier call with the same numbers.
+
+    Args:
+        model: the mechanism.
+        state: the state at which quantities are compared.
+
+    Returns:
+        The tolerances and their scales; not to be changed.
+
+    """
+    return _remembered(Pickled.of((model, state)))
+
+
+@lru_cache(maxsize=64)  # a worker gets the integrators of a scenario in a row
+def _remembered(arguments: Pickled) -> RoundingBound:
+    return state_rounding_bound(*arguments.load())
 
 
 def state_rounding_bound(model: Model, state: State, parts: BodyParts | None = None) -> RoundingBound:

@@ -30,7 +30,7 @@ from plumbline.model.sampling import derive_seed
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod, StepMethod
 from plumbline.truth.ground_truth import stretched_length
 from plumbline.truth.link_tree import LinkStates
-from plumbline.truth.rounding_bound import EPS, RoundingBound, state_rounding_bound
+from plumbline.truth.rounding_bound import EPS, RoundingBound, remembered_rounding_bound
 from plumbline.truth.step_formulas import (
     constrained_quadrature,
     constrained_residual,
@@ -140,8 +140,10 @@ class FormulaSteps:
         self.method, self.model, self.places = method, model, [(index, h) for index, h, _ in starts]
         self.starts, sizes = [states[index] for index, *_ in starts], [h for _, h, _ in starts]
         axes = [angle_axes for *_, angle_axes in starts]
-        self.bounds = {index: state_rounding_bound(model, states[index]) for index, *_ in starts}
-        disturbed = [_disturbed(model, states[index], self.bounds[index]) for index, *_ in starts]
+        used = dict.fromkeys(index for index, *_ in starts)
+        self.bounds = {index: remembered_rounding_bound(model, states[index]) for index in used}
+        nearby = {index: _disturbed(model, states[index], self.bounds[index]) for index in used}
+        disturbed = [nearby[index] for index, *_ in starts]
         self.counts = tuple(counts) or step_counts(method)
         self._end_bounds: dict[tuple[int, int], _EndBounds] = {}
         count = max(self.counts)
@@ -227,7 +229,7 @@ class FormulaSteps:
         """Rounding bounds at both ends of a run's first steps, and those of the steps; computed once."""
         if (i, count) not in self._end_bounds:
             (index, h), end = self.places[i], _rounded(self.true[i][count])
-            ends = self.bounds[index], state_rounding_bound(self.model, end)
+            ends = self.bounds[index], remembered_rounding_bound(self.model, end)
             self._end_bounds[i, count] = ends, self.step_bound((self.starts[i], end), ends, h, count)
         return self._end_bounds[i, count]
 
@@ -387,6 +389,7 @@ def compare_parts(
 
     """
     found = {quantity: Comparisons() for quantity in CONSTRAINED_UNITS}
+    first: dict[int, tuple[Array, Array]] = {}  # by state: first accelerations and their bounds
     for index, h, run in runs:
         place = Place(index, h, len(run.trajectory.t) - 1)
         for difference, bound, effect in _quadrature_differences(method, run, h):
@@ -406,12 +409,14 @@ def compare_parts(
             residual.residual[worst_step : worst_step + 1], allowed[worst_step : worst_step + 1],
             residual.size[worst_step : worst_step + 1], place,
         )  # fmt: skip
-        first = first_coordinate_acceleration(model, states[index])
-        solved = state_rounding_bound(model, states[index])
-        allowed = first_acceleration_bound(model, method, states[index]) + np.maximum(
-            solved.acceleration, solved.angular_acceleration
-        )
-        error = np.asarray(np.max(np.abs(first - engine_coordinates(run)[2][0]), axis=-1), float)
+        if index not in first:
+            solved = remembered_rounding_bound(model, states[index])
+            allowed = first_acceleration_bound(model, method, states[index]) + np.maximum(
+                solved.acceleration, solved.angular_acceleration
+            )
+            first[index] = first_coordinate_acceleration(model, states[index]), allowed
+        true, allowed = first[index]
+        error = np.asarray(np.max(np.abs(true - engine_coordinates(run)[2][0]), axis=-1), float)
         found["step_first_acceleration"].add(error, allowed, np.zeros(model.n), place)
     return {quantity: one for quantity, one in found.items() if one.errors}
 
