@@ -586,17 +586,25 @@ class LinkTree:
         if forces == "joint dampers":
             step = h[..., None] * np.diag(LongDouble(self.method.damping_factor) * self.damping)
             return _solve(self.mass_matrix(pose) + step, self.generalized_forces(q, pose, v))
-        # f is quadratic in v: a central difference of any size is exact
-        units = np.eye(self.nv, dtype=LongDouble)[:, None]
-        sides = [self.generalized_forces(q, pose, v + sign * units, forces) for sign in (-1, 1)]
-        D = np.moveaxis((sides[0] - sides[1]) / 2, 0, -1)
+        every = list(range(self.nv))
+        D = np.zeros((*v.shape, self.nv), LongDouble)
+        if forces == "all" or self._has_damping(forces):
+            D[:] = self._force_derivatives(q, pose, v, every, forces)
         if own:
-            everything = [self.generalized_forces(q, pose, v + sign * units) for sign in (-1, 1)]
-            D[..., own, :] = np.moveaxis((everything[0] - everything[1]) / 2, 0, -1)[..., own, :]
+            D[..., own, :] = 0
+            D[..., np.array(own)[:, None], own] = self._force_derivatives(q, pose, v, own, "all")[..., own, :]
         D = LongDouble(self.method.damping_factor) * np.where(self._on_one_path(), D, 0)
         if self.method.is_damping_symmetric:
             D = (D + np.swapaxes(D, -1, -2)) / 2
         return _solve(self.mass_matrix(pose) + h[..., None] * D, self.generalized_forces(q, pose, v))
+
+    def _force_derivatives(
+        self, q: list[Array], pose: _Pose, v: Array, columns: list[int], forces: Forces
+    ) -> Array:
+        """−∂f/∂v (B, nv, columns); f is quadratic in v: a central difference of any size is exact."""
+        units = np.eye(self.nv, dtype=LongDouble)[columns, None]
+        before, after = (self.generalized_forces(q, pose, v + sign * units, forces) for sign in (-1, 1))
+        return np.asarray(np.moveaxis((before - after) / 2, 0, -1))
 
     def _has_damping(self, forces: Forces) -> bool:
         """Whether dampers of joints, or any applied forces, depend on velocities."""
