@@ -316,12 +316,14 @@ def first_acceleration_bound(model: Model, method: ConstrainedMethod, state: Sta
     """Bound what the engine's finite differences of C(q) q̇ leave in its first q̈.
 
     It solves M q̈ + Cᵀ λ = f, C q̈ = γ = −∂(C q̇)/∂q q̇, with the derivative from forward differences of size δ.
-    C q̇ and q + δ are rounded, so a row of γ is off by up to
+    C q̇ and the coordinates in it are rounded (two values, q + δ, A s and its sum with r in each), and the
+    differences cut off second derivatives, so a row of γ is off by up to
 
-        32 · 2⁻⁵³ (|C| |q̇|) √(Σ q̇ᵢ²) / δ,   over the coordinates i that this row of C depends on,
+        2⁻⁵³ (32 |C| |q̇| + 4 |∂(C q̇)/∂q| s) √(Σ q̇ᵢ²) / δ + Σ |∂²(C q̇)/∂qᵢ²| |q̇ᵢ| δ / 2
 
-    which are the Euler parameters and, of rods, the positions.  q̈ is off by |S⁻¹| times that.  What δ cuts
-    off is below the roundings.
+    over the coordinates i that this row of C depends on, which are the Euler parameters and, of rods, the
+    positions.  sᵢ is 1 for Euler parameters, and for a position its size and that of the lever of its joints.
+    q̈ is off by |S⁻¹| times that.
 
     Args:
         model: the chain.
@@ -332,31 +334,66 @@ def first_acceleration_bound(model: Model, method: ConstrainedMethod, state: Sta
         (N,) largest error of a coordinate of each body [m/s² or 1/s²].
 
     """
-    n, r, p = model.n, state.r, state.p
-    A, G = _euler_parameter_rotation(p), 2 * _body_rate_matrix(p)
+    n, q = model.n, np.concatenate([state.r, state.p], -1).ravel()
+    G = 2 * _body_rate_matrix(state.p)
     rates = np.concatenate([state.v, 0.25 * rotate_vectors(np.swapaxes(G, -1, -2), state.omega)], -1).ravel()
-    near, far = model.proximal, model.distal
-    d, _ = _joint_differences(A, r, state.v, state.omega, near, far)
-    M, rows, depends = np.zeros((7 * n, 7 * n)), [], []
+    M = np.zeros((7 * n, 7 * n))
     for k in range(n):
         positions, turns = slice(7 * k, 7 * k + 3), slice(7 * k + 3, 7 * k + 7)
         M[positions, positions], M[turns, turns] = model.mass[k] * np.eye(3), G[k].T @ model.inertia[k] @ G[k]
-        point, norm = np.zeros((3, 7 * n)), np.zeros((1, 7 * n))
-        point[:, positions], point[:, turns] = np.eye(3), -A[k] @ cross_matrix(near[k]) @ G[k]
-        if k:
-            point[:, 7 * k - 7 : 7 * k - 4] = -np.eye(3)
-            point[:, 7 * k - 4 : 7 * k] = A[k - 1] @ cross_matrix(far[k - 1]) @ G[k - 1]
-        norm[0, turns] = 2 * p[k]
-        joint = (d[k] / np.linalg.norm(d[k]))[None] @ point if model.rods[k] else point
-        rows += [joint, norm]
-        depends += [np.abs(row) > 0 for row in (joint, norm)]
-        if not model.rods[k]:
-            depends[-2][:, np.arange(7 * n) % 7 < 3] = False
-    C, used = np.concatenate(rows), np.concatenate(depends)
+    levers = np.linalg.norm(model.proximal, axis=-1) + np.linalg.norm(model.distal, axis=-1)
+    sizes = np.ones((n, 7))
+    sizes[:, :3] = np.abs(state.r) + levers[:, None]
+    h = 1e-4 * np.eye(7 * n)  # the derivatives vary over lengths and angles of order 1: exact to 1e-8
+    C = _chain_constraint_rows(model, q)
+    after, before = (_chain_constraint_rows(model, q + change) @ rates for change in (h, -h))
+    first, second = np.abs(after - before).T / 2e-4, np.abs(after - 2 * C @ rates + before).T / 1e-8
     S = np.block([[M, C.T], [C, np.zeros((len(C), len(C)))]])
-    gamma = 32 * 2.0**-53 * (np.abs(C) @ np.abs(rates)) * np.sqrt(used @ rates**2) / method.difference_step
+    speed = np.sqrt(_dependence(model) @ rates**2)
+    rounding = 2.0**-53 * (32 * np.abs(C) @ np.abs(rates) + 4 * first @ sizes.ravel())
+    gamma = rounding * speed / method.difference_step + second @ np.abs(rates) * method.difference_step / 2
     error = np.abs(np.linalg.inv(S)[: 7 * n, 7 * n :]) @ gamma
     return np.asarray(np.max(error.reshape(n, 7), axis=1))
+
+
+def _chain_constraint_rows(model: Model, q: Array) -> Array:
+    """C (..., rows, 7N) of a chain at q (..., 7N): of each body its joint's three rows or one, and |p|²."""
+    n = model.n
+    parts = q.reshape(*q.shape[:-1], n, 7)
+    r, p = parts[..., :3], parts[..., 3:]
+    A, G = _euler_parameter_rotation(p), 2 * _body_rate_matrix(p)
+    near, far = model.proximal, model.distal
+    here, there = (r + rotate_vectors(A, np.broadcast_to(s, r.shape)) for s in (near, far))
+    d, rows = here - _before(there), []
+    for k in range(n):
+        positions, turns = slice(7 * k, 7 * k + 3), slice(7 * k + 3, 7 * k + 7)
+        point, norm = np.zeros((*q.shape[:-1], 3, 7 * n)), np.zeros((*q.shape[:-1], 1, 7 * n))
+        point[..., positions], point[..., turns] = np.eye(3), _turning(A, G, near, k)
+        if k:
+            point[..., 7 * k - 7 : 7 * k - 4] = -np.eye(3)
+            point[..., 7 * k - 4 : 7 * k] = -_turning(A, G, far, k - 1)
+        norm[..., 0, turns] = 2 * p[..., k, :]
+        if model.rods[k]:
+            across = d[..., k, None, :]
+            point = across / np.linalg.norm(across, axis=-1, keepdims=True) @ point
+        rows += [point, norm]
+    return np.concatenate(rows, -2)
+
+
+def _turning(A: Array, G: Array, arm: Array, k: int) -> Array:
+    """(..., 3, 4) derivative of body k's point with arm (N, 3) by its Euler parameters."""
+    return -A[..., k, :, :] @ cross_matrix(arm[k]) @ G[..., k, :, :]
+
+
+def _dependence(model: Model) -> Array:
+    """(rows, 7N) whether a row of C changes with a coordinate, also where it is 0 at a state."""
+    blocks = []
+    for k in range(model.n):
+        joint, norm = np.zeros((2, model.n, 7), bool)
+        joint[max(k - 1, 0) : k + 1, 0 if model.rods[k] else 3 :] = True
+        norm[k, 3:] = True
+        blocks += [joint.ravel()] * (1 if model.rods[k] else 3) + [norm.ravel()]
+    return np.array(blocks)
 
 
 def _joint_differences(
