@@ -131,7 +131,7 @@ class ScenarioRun:
         self._pickled_truths: dict[TaskKind, Pickled] = {}  # for judges and diagnoses in workers
         count = plan.random_state_count
         count = min(count, STATES_PER_RANDOM_SCENARIO) if is_random else count
-        states = compared_states(scenario.model, scenario.state, scenario.digest, count)
+        states = compared_states(scenario.model, scenario.state, scenario.seed, count)
         self._states = Pickled.of(states)  # argument of many tasks
         # how near the initial pose is to a singular one
         loops = scenario.model.has_loops
@@ -278,6 +278,7 @@ class ScenarioRun:
             "sample": s.sample_interval,
             "exact": s.closed_form,
             "digest": s.digest,
+            "seed": s.seed,
             "model": {key: np.asarray(value).tolist() for key, value in s.model.fields.items()},
             "state": {key: getattr(s.state, key).tolist() for key in state_keys},
         }

@@ -39,24 +39,24 @@ def derive_seed(*parts: str) -> int:
     return int.from_bytes(hashlib.sha256("\0".join(parts).encode()).digest()[:8], "big")
 
 
-def compared_states(model: Model, state: State, digest: str, count: int) -> list[State]:
+def compared_states(model: Model, state: State, seed: str, count: int) -> list[State]:
     """Draw the states at which a scenario is compared.
 
     Args:
         model: the scenario's mechanism.
         state: its initial state.
-        digest: hash of its numbers, which the draw depends on.
+        seed: words that the draw depends on.
         count: how many random states.
 
     Returns:
         The initial state unless its pose is singular (`is_singular`), then the random ones.
 
     """
-    seed = derive_seed("states", digest)
+    number = derive_seed("states", seed)
     if model.has_loops:
         initial = [] if is_singular(smallest_singular_value(model, state)) else [state]
-        return [*initial, *random_loop_states(model, state, count, seed)]
-    return [state, *random_states(model, count, seed)]
+        return [*initial, *random_loop_states(model, state, count, number)]
+    return [state, *random_states(model, count, number)]
 
 
 def random_states(model: Model, count: int, seed: int) -> list[State]:

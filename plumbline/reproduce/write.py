@@ -198,7 +198,8 @@ def find_disagreement(document: dict[str, Any], rows: list[StoredRow], seconds: 
         case = _refinement_study(document, rows, model, state)
     else:
         index = int(row["extra"]["state"])
-        case = ReproductionCase(model, compared_states(model, state, scenario["digest"], index)[-1])
+        seed = scenario["seed"] or scenario["digest"]  # results of earlier versions have no seed
+        case = ReproductionCase(model, compared_states(model, state, seed, index)[-1])
         if row["level"] == "step":
             h = float(row["extra"]["step"])
             case = replace(case, until=h * row["extra"]["steps"], steps=(h,))

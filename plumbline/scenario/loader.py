@@ -84,6 +84,7 @@ class Scenario:
     body_names: tuple[str, ...]  # N names, for the reader
     path: Path
     digest: str  # sha256 of the checked content: layout and comments do not count
+    seed: str  # of the random states that it is compared at
     document: dict[str, Any] = field(repr=False, default_factory=dict)  # the checked content as plain data
 
     @property
@@ -296,6 +297,7 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
     content = document.model_dump(mode="json")
     content["name"] = document.name or path.stem
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    digest = hashlib.sha256(canonical.encode()).hexdigest()
     return Scenario(
         name=content["name"],
         family=document.family,
@@ -309,7 +311,8 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
         closed_form=document.exact,
         body_names=tuple(body.name or f"body {k + 1}" for k, (body, _) in enumerate(bodies)),
         path=path,
-        digest=hashlib.sha256(canonical.encode()).hexdigest(),
+        digest=digest,
+        seed=document.seed or digest,
         document=content,
     )
 

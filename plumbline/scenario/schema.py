@@ -664,10 +664,17 @@ class Document(SchemaModel):
 
     springs: list[Spring] = _field("Springs and dampers between points.", default=[])
     closes: list[ClosingJoint] = _field("Joints that close loops.", default=[])
+    seed: str | None = _field(
+        "Words that the random states are drawn from. Absent: the digest of the file's content, texts "
+        "included; the digest of before keeps the states where only a text changes.",
+        default=None,
+        min_length=1,
+        max_length=80,
+    )
 
-    _text = field_validator("name", "family", "title", "purpose")(_require_printable)
+    _text = field_validator("name", "family", "title", "purpose", "seed")(_require_printable)
 
-    @field_validator("name", "family", "title")
+    @field_validator("name", "family", "title", "seed")
     @classmethod
     def _one_line(cls, value: str | None) -> str | None:
         if value and (value != value.strip() or "\n" in value or "\t" in value):
@@ -688,10 +695,10 @@ class Document(SchemaModel):
         return value
 
     @model_serializer(mode="wrap")
-    def _omit_absent_springs(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Leave out empty lists of springs and loops: a scenario's digest depends on its content alone."""
+    def _omit_absent(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out absent springs, loops and seed: a scenario's digest depends on its content alone."""
         data: dict[str, Any] = handler(self)
-        return {k: v for k, v in data.items() if v or k not in ("springs", "closes")}
+        return {k: v for k, v in data.items() if v or k not in ("springs", "closes", "seed")}
 
 
 def attitude_quaternion(attitude: Attitude) -> Array:

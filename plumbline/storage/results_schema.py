@@ -58,6 +58,7 @@ class _Scenario(_Part):
     sample: _Duration = 0.0
     exact: str | None = None
     digest: str = ""
+    seed: str = ""
     horizon: float | None = None
     growth: float | None = None
     truth: str | None = None

@@ -60,7 +60,7 @@ def measure_coverage(
             by_scenario[row.scenario].append(row)
     tasks = []
     for s in sorted(scenarios, key=lambda s: -s.model.n):  # no long task alone at the end
-        states = compared_states(s.model, s.state, s.digest, state_count)
+        states = compared_states(s.model, s.state, s.seed, state_count)
         arguments = s.name, s.model, s.state, s.times, states, by_scenario[s.name], levels
         tasks.append(Task(s.name, scenario_coverage, arguments, executor.limits))
     found: dict[str, list[CoverageEntry]] = {}

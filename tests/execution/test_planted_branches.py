@@ -43,7 +43,7 @@ def problems():
     counts = [RANDOM_STATES] * len(chosen) + [STATES_PER_RANDOM_SCENARIO] * RANDOM_COUNT
     chosen += list(RandomScenarios(SEED, RANDOM_COUNT))
     return [
-        (s, compared_states(s.model, s.state, s.digest, count))
+        (s, compared_states(s.model, s.state, s.seed, count))
         for s, count in zip(chosen, counts, strict=True)
     ]
 

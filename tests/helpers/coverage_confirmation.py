@@ -45,7 +45,7 @@ def scenario(name: str) -> Scenario:
 def states(name: str) -> list[State]:
     """The states at which it is compared."""
     s = scenario(name)
-    return compared_states(s.model, s.state, s.digest, STATES)
+    return compared_states(s.model, s.state, s.seed, STATES)
 
 
 @cache

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from plumbline.engines.adapter import check_state, check_times
 from plumbline.model.datatypes import State
 from plumbline.model.kinematics import joint_vectors, quaternion_product, rotation_matrix
+from plumbline.model.sampling import compared_states
 from plumbline.scenario import loader as scenarios
 from plumbline.scenario.schema import Attitude, Document, Inertia, attitude_quaternion, inertia_matrix
 from tests.helpers.relative_equilibria import relative_equilibrium
@@ -486,6 +487,18 @@ def test_the_digest_is_of_the_content():
     assert scenarios.load_scenario_text(as_yaml(YAML(typ="safe").load(text))).digest == base
     for old, new in (("1.3", "1.3000000000000003"), ("tumbling", "rolling"), ("length: 0.4", "length: 0.5")):
         assert scenarios.load_scenario_text(text.replace(old, new)).digest != base
+
+
+def test_a_seed_keeps_the_states_where_only_a_text_changes():
+    first = load("nesc-tumbling-brick")
+    changed = first.document | {"purpose": "Another text."}
+    other, kept = (
+        scenarios.scenario_from_dict(document, "copy.yaml")
+        for document in (changed, changed | {"seed": first.digest})
+    )
+    assert len({first.digest, other.digest, kept.digest}) == 3
+    states = [compared_states(s.model, s.state, s.seed, 2)[1].p for s in (first, other, kept)]
+    assert np.array_equal(states[0], states[2]) and not np.any(states[0] == states[1])
 
 
 def test_names_may_be_any_text():
