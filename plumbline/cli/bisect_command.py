@@ -17,7 +17,7 @@ from plumbline.engines.registry import IMPORTERS
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.model_run import ModelPlan
 from plumbline.execution.plan import Plan
-from plumbline.execution.version_search import NoSearch, VersionChange, search_model_file, search_row
+from plumbline.execution.version_search import NoSearch, VersionChange, search_versions
 from plumbline.processes.workers import Limits
 from plumbline.scenario.errors import did_you_mean, shorten
 from plumbline.scenario.generator import RANDOM_FAMILY, RandomScenarios
@@ -87,7 +87,7 @@ def bisect(
                 (str(target),), base=base, root=root, strip_geometry=strip_geometry, state_count=STATES,
                 jobs=jobs, limits=limits,
             )  # fmt: skip
-            change, notes = search_model_file(plan, engine, good, bad, _report)
+            change, notes = search_versions(plan, engine, good, bad, _report)
     except NoSearch as error:
         raise click.UsageError(str(error)) from None
     except EnvironmentUnavailable as error:
@@ -133,12 +133,13 @@ def _search_result(
             (row["scenario"],), base=about["base"], root=about["root"] and Path(about["root"]),
             strip_geometry=about["strip_geometry"], state_count=STATES, jobs=jobs, limits=limits,
         )  # fmt: skip
-        return search_model_file(plan, row["engine"].partition("@")[0], good, bad, _report)
+        return search_versions(plan, row["engine"].partition("@")[0], good, bad, _report)
     with options.exit_on_damaged_results():
         document = read_results(folder)
     row = _row(key, {row["key"]: row for row in document["rows"]})
     scenario = _scenario(row["scenario"], document["scenarios"])
-    return search_row(Plan([scenario], [], jobs=jobs, limits=limits), row, good, bad, _report)
+    run = Plan([scenario], [], jobs=jobs, limits=limits)
+    return search_versions(run, row["engine"].partition("@")[0], good, bad, _report, row)
 
 
 def _row(key: str, rows: Mapping[str, dict[str, Any]]) -> dict[str, Any]:

@@ -215,17 +215,19 @@ def versioned_name(engine: str, version: str, package: str) -> str:
     return engine if is_installed else f"{engine}@{version}"
 
 
-def search_model_file(
-    plan: ModelPlan, engine: str, good: str, bad: str, on_answer: Callable[[str, str], None]
-) -> tuple[VersionChange, list[str]]:
-    """Find the version of an importer that changed the reading of a model file.
+def search_versions(
+    plan: ModelPlan | Plan, engine: str, good: str, bad: str, on_answer: Callable[[str, str], None],
+    row: Mapping[str, Any] | None = None,
+) -> tuple[VersionChange, list[str]]:  # fmt: skip
+    """Find the version that changed an importer's reading of a model file, or an engine's verdict of a row.
 
     Args:
-        plan: the file and how to load it.
-        engine: name in the registry of importers.
+        plan: the file and how to load it, or a run of the row's scenario; engines and level are set here.
+        engine: name in the registry of importers, or of engines, without a version.
         good: one end of the search, as for `choose_versions`.
         bad: the other end.
         on_answer: as for `find_change`.
+        row: the stored row, where the plan is a run.
 
     Returns:
         The change, and sentences about versions that were left out.
@@ -234,20 +236,34 @@ def search_model_file(
         NoSearch: the file cannot be used, or there is nothing to search in.
 
     """
-    package = declared_importer_attribute(engine, "package")
-    supported = declared_importer_attribute(engine, "supported_versions") or ""
-    versions, notes = choose_versions(package, supported, good, bad)
+    declared = declared_importer_attribute if isinstance(plan, ModelPlan) else declared_attribute
+    package = declared(engine, "package")
+    versions, notes = choose_versions(package, declared(engine, "supported_versions") or "", good, bad)
 
     def ask(version: str) -> VersionAnswer:
         name = versioned_name(engine, version, package)
-        result = run_model_files(replace(plan, importers=(name,), are_importers_required=True), _silent)
-        if result.problems:
-            raise NoSearch("\n".join(map(str, result.problems)))
-        if reason := result.engines[name].missing:
-            raise VersionUnusable(reason)
-        return reading_answer(result.files[0], name)
+        return (
+            _ask_reading(plan, name) if isinstance(plan, ModelPlan) else _ask_verdict(plan, name, row or {})
+        )
 
     return find_change(engine, versions, ask, on_answer), notes
+
+
+def _ask_reading(plan: ModelPlan, name: str) -> VersionAnswer:
+    result = run_model_files(replace(plan, importers=(name,), are_importers_required=True), _silent)
+    if result.problems:
+        raise NoSearch("\n".join(map(str, result.problems)))
+    if reason := result.engines[name].missing:
+        raise VersionUnusable(reason)
+    return reading_answer(result.files[0], name)
+
+
+def _ask_verdict(plan: Plan, name: str, row: Mapping[str, Any]) -> VersionAnswer:
+    level = {"invariants": "trajectory", "relations": "all"}.get(row["level"], row["level"])
+    run = run_plan(replace(plan, engines=[name], level=level), _silent)
+    if reason := run.engines[name].missing:
+        raise VersionUnusable(reason)
+    return _row_answer(run.rows, row)
 
 
 def reading_answer(file: FileResult, name: str) -> VersionAnswer:
@@ -273,41 +289,6 @@ def reading_answer(file: FileResult, name: str) -> VersionAnswer:
         phrases += [row.reason for row in bad[:1] if row.quantity == "joints"]
     text = "; ".join(phrases) or "reads what the file says"
     return VersionAnswer(text, text)
-
-
-def search_row(
-    plan: Plan, row: Mapping[str, Any], good: str, bad: str, on_answer: Callable[[str, str], None]
-) -> tuple[VersionChange, list[str]]:
-    """Find the version of an engine that changed the verdict of a row.
-
-    Args:
-        plan: with the row's scenario; engines and level are set here.
-        row: the stored row.
-        good: one end of the search, as for `choose_versions`.
-        bad: the other end.
-        on_answer: as for `find_change`.
-
-    Returns:
-        The change, and sentences about versions that were left out.
-
-    Raises:
-        NoSearch: there is nothing to search in.
-
-    """
-    engine, _, _ = str(row["engine"]).partition("@")
-    package = declared_attribute(engine, "package")
-    supported = declared_attribute(engine, "supported_versions") or ""
-    versions, notes = choose_versions(package, supported, good, bad)
-    level = {"invariants": "trajectory", "relations": "all"}.get(row["level"], row["level"])
-
-    def ask(version: str) -> VersionAnswer:
-        name = versioned_name(engine, version, package)
-        run = run_plan(replace(plan, engines=[name], level=level), _silent)
-        if reason := run.engines[name].missing:
-            raise VersionUnusable(reason)
-        return _row_answer(run.rows, row)
-
-    return find_change(engine, versions, ask, on_answer), notes
 
 
 def _row_answer(rows: Sequence[Row], wanted: Mapping[str, Any]) -> VersionAnswer:

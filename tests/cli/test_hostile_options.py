@@ -43,7 +43,7 @@ WORK = (  # where the work of a command begins
     "plumbline.studies.drift.measure_drift", "plumbline.cli.study_commands.run_plan",
     "plumbline.reproduce.write.make_script", "plumbline.truth.enclosure.prove_motion",
     "plumbline.cli.nightly.prove_changed_motions", "plumbline.cli.model_commands.run_model_files",
-    "plumbline.cli.bisect_command.search_model_file", "plumbline.cli.bisect_command.search_row",
+    "plumbline.cli.bisect_command.search_versions",
 )  # fmt: skip
 WORKERS = (
     "plumbline.cli.study_commands.WorkerPool", "plumbline.cli.scenario_commands.WorkerPool",
