@@ -120,13 +120,7 @@ def random_motion(seed: int, index: int) -> Scenario:
             body["load"]["moment"] = [MOTION_MOMENT * x for x in body["load"]["moment"]]
         if "drag" in body:
             body["drag"]["moment"] *= MOTION_MOMENT
-    content = {
-        "schema_version": 1,
-        "name": f"{MOTION_PREFIX}{seed}-{index}",
-        "family": RANDOM_FAMILY,
-        "title": f"Random motion {index} of seed {seed}: {'1 body' if n == 1 else f'{n} bodies'}",
-        "purpose": RANDOM_PURPOSE,
-        "duration": 0.5,
+    content = _document(MOTION_PREFIX, seed, index, n, "", 0.5) | {
         "sample": MOTION_SAMPLE,
         "gravity": (gravity / np.linalg.norm(direction) * direction).tolist(),
         "bodies": bodies,
@@ -162,15 +156,8 @@ def random_mechanism(seed: int, index: int) -> Scenario:
         model = random_tree(rng, n, kinds, bool(rng.random() < 0.5), elements)
         (state,) = random_states(model, 1, own)
     joints = ", ".join(dict.fromkeys(model.kind))
-    content = {
-        "schema_version": 1,
-        "name": f"{MECHANISM_PREFIX}{seed}-{index}",
-        "family": RANDOM_FAMILY,
-        "title": f"Random mechanism {index} of seed {seed}: {n} {'body' if n == 1 else 'bodies'}, {joints}",
-        "purpose": RANDOM_PURPOSE,
-        "duration": 1.0,
-        **mechanism_document(model, state),
-    }
+    content = _document(MECHANISM_PREFIX, seed, index, n, f", {joints}", 1.0)
+    content |= mechanism_document(model, state)
     return scenario_from_dict(content, f"{content['name']}.yaml")
 
 
@@ -191,20 +178,25 @@ def random_document(seed: int, index: int) -> dict[str, Any]:
     decades = MASS_DECADES if wild else 1.0
     rate = 10 ** rng.uniform(-1.0, 1.0)  # rad/s
     loaded, dragged = rng.random(2) < 0.3
-    size = "1 body" if n == 1 else f"{n} bodies"
-    content = {
-        "schema_version": 1,
-        "name": f"random-{seed}-{index}",
-        "family": RANDOM_FAMILY,
-        "title": f"Random {index} of seed {seed}: {size}{', wild masses' * wild}",
-        "purpose": RANDOM_PURPOSE,
-        "duration": 1.0,
-        "bodies": [
-            _random_body(rng, decades, rate, bool(loaded), bool(dragged), i == n - 1) for i in range(n)
-        ],
-    }
+    content = _document("random-", seed, index, n, ", wild masses" * wild, 1.0)
+    content["bodies"] = [
+        _random_body(rng, decades, rate, bool(loaded), bool(dragged), i == n - 1) for i in range(n)
+    ]
     _specialize(content, "random scenario", seed, index, 1.0)
     return content
+
+
+def _document(prefix: str, seed: int, index: int, n: int, more: str, duration: float) -> dict[str, Any]:
+    """The texts and the duration [s] of a scenario of n bodies; its title ends with ``more``."""
+    what = prefix.replace("-", " ").capitalize() + f"{index} of seed {seed}"
+    return {
+        "schema_version": 1,
+        "name": f"{prefix}{seed}-{index}",
+        "family": RANDOM_FAMILY,
+        "title": f"{what}: {n} {'body' if n == 1 else 'bodies'}{more}",
+        "purpose": RANDOM_PURPOSE,
+        "duration": duration,
+    }
 
 
 def _random_body(
