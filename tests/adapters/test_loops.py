@@ -13,10 +13,18 @@ from plumbline.model.random_mechanisms import random_loop_mechanism
 from plumbline.model.sampling import random_loop_states
 from plumbline.truth.certified import certify_state
 from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, state_rounding_bound
+from tests.helpers.shared_answers import sharing
 
 ENGINES = ["reference", "mujoco", "pinocchio", "pinocchio-maximal", "exudyn"]
 CLOSING = {kind: [kind] for kind in KINDS if kind != "free"} | {"ball and rod": ["ball", "rod"]}
 VECTORS = ("acceleration", "angular_acceleration", "joint_reaction", "joint_moment")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_truths():
+    """Mechanisms, certified truths and bounds are the same for every engine."""
+    with sharing(__name__, "random_loop_mechanism", "certify_state", "state_rounding_bound"):
+        yield
 
 
 @pytest.mark.parametrize("closing", CLOSING)

@@ -12,6 +12,7 @@ from plumbline.model.kinematics import complete_state
 from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from plumbline.truth.notes_motion import simulate_notes_form
+from tests.helpers.shared_answers import sharing
 
 TIMES = np.arange(5) / 32
 ORDER_MARGIN = 0.3  # orders are 1, 2 or 4; the next term of the error moves the slope less
@@ -28,6 +29,13 @@ def calm_state(model, seed):
     rates = {name: getattr(state, name) for name in ("omega", "udot", "v", "xdot")}
     fastest = max(np.max(np.abs(rate)) for rate in rates.values())
     return complete_state(model, replace(state, **{k: 2 / fastest * x for k, x in rates.items()}))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_truths():
+    """True motions are the same for every engine."""
+    with sharing(__name__, "simulate_notes_form"):
+        yield
 
 
 @pytest.mark.parametrize("mix", MIXES)
@@ -90,32 +98,45 @@ def test_motions_with_elements_converge_to_the_truth_and_conserve_energy(engine,
         assert drift[1] < 0.6 * drift[0] or drift[1] < 1e-6 + found[1].work_uncertainty, (method.name, drift)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_a_spring_on_an_angle_counts_full_turns(engine):
-    """Torsional oscillator φ = φ₀ + a cos √(k/I) t of 8 rad amplitude: beyond half a turn both ways."""
-    inertia, stiffness, rest, amplitude = 0.02, 0.7, 0.5, 8.0
+INERTIA, STIFFNESS, AMPLITUDE = 0.02, 0.7, 8.0  # kg m², N m/rad, rad
+
+
+def torsional_oscillator():
+    """Model, state, times and attitudes of φ = φ₀ + a cos √(k/I) t: beyond half a turn both ways."""
+    rest, rate = 0.5, np.sqrt(STIFFNESS / INERTIA)
     model = replace(
         random_tree(np.random.default_rng(0), 1, ("hinge",), loads=False),
-        inertia=inertia * np.eye(3)[None], point=np.zeros((1, 2, 3)), stiffness=np.array([[stiffness, 0.0]]),
+        inertia=INERTIA * np.eye(3)[None], point=np.zeros((1, 2, 3)), stiffness=np.array([[STIFFNESS, 0.0]]),
         rest=np.array([[rest, 0.0]]), turn=np.tile([1.0, 0, 0, 0], (1, 2, 1)),
     )  # fmt: skip
-    x, rate = np.array([[rest + amplitude, 0.0]]), np.sqrt(stiffness / inertia)
+    x = np.array([[rest + AMPLITUDE, 0.0]])
     (state,) = random_states(model, 1, 0)
     state = complete_state(model, replace(state, x=x, xdot=0 * x))
     times = np.arange(33) / 16  # two periods, up to 2.9 rad from sample to sample
-    angle = rest + amplitude * np.cos(rate * times)
+    angle = rest + AMPLITUDE * np.cos(rate * times)
     truth = np.zeros((len(times), 1, 4))
     truth[:, 0, 0], truth[:, 0, 3] = np.cos(angle / 2), np.sin(angle / 2)
+    return model, state, times, truth
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_spring_on_an_angle_counts_full_turns(engine):
+    model, state, times, truth = torsional_oscillator()
+    rate = np.sqrt(STIFFNESS / INERTIA)
     adapter = load_adapter(engine)
     for method in adapter.integrators:
         run = adapter.simulate(model, state, times, method.name, 2.0**-10 if method.kind == "step" else 1e-11)
         error = np.max(attitude_error(run.p, truth))
         # order 2 turns p, whose rate is ω/2, by less than (ω h / 2)²/4 of its angle too much or too little
-        second = (amplitude * rate * 2.0**-10 / 2) ** 2 / 4 * 8 * amplitude
+        second = (AMPLITUDE * rate * 2.0**-10 / 2) ** 2 / 4 * 8 * AMPLITUDE
         assert error < {1: 0.3, 2: second}.get(method.order, 1e-7), (method.name, error)
         drift = compute_invariants(model, run).energy_drift
         allowed = 1e-6 if method.order > 2 else 0.05
-        assert np.max(np.abs(drift)) < allowed * stiffness * amplitude**2, method.name
+        assert np.max(np.abs(drift)) < allowed * STIFFNESS * AMPLITUDE**2, method.name
+
+
+def test_a_spring_on_an_angle_counts_full_turns_in_the_truth():
+    model, state, times, truth = torsional_oscillator()
     notes = simulate_notes_form(model, state, times, 1e-12, "dop853")
     assert np.max(attitude_error(notes.p, truth)) < 1e-8
     assert np.max(attitude_error(simulate_notes_form(model, state, times, 1e-12).p, truth)) < 1e-10

@@ -12,9 +12,17 @@ from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import random_states
 from plumbline.truth.certified import certify_state
 from plumbline.truth.rounding_bound import MAX_RELATIVE_BOUND, state_rounding_bound
+from tests.helpers.shared_answers import sharing
 
 ENGINES = ["reference", "mujoco", "pinocchio", "pinocchio-aba", "pinocchio-maximal", "exudyn", "exudyn-tree"]
 MIXES = {**{kind: (kind,) for kind in KINDS}, "all": tuple(KINDS)}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_truths():
+    """Certified truths and bounds are the same for every engine."""
+    with sharing(__name__, "certify_state", "state_rounding_bound"):
+        yield
 
 
 @pytest.mark.parametrize("mix", MIXES)

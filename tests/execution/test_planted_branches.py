@@ -37,15 +37,24 @@ MAX_EVALUATED = 3  # states of a scenario
 
 
 @cache
+def catalogue_chains():
+    return [s for s in catalogue_scenarios().values() if s.model.is_chain and s.model.n <= MAX_BODIES]
+
+
+@cache
+def problem(index):
+    """A chain of the catalogue or of a night, for which the defects are made, and its compared states."""
+    chains = catalogue_chains()
+    if index < len(chains):
+        s, count = chains[index], RANDOM_STATES
+    else:
+        s, count = RandomScenarios(SEED, RANDOM_COUNT)[index - len(chains)], STATES_PER_RANDOM_SCENARIO
+    return s, compared_states(s.model, s.state, s.seed, count)
+
+
 def problems():
-    """Chains of the catalogue and of a night, for which the defects are made, and their compared states."""
-    chosen = [s for s in catalogue_scenarios().values() if s.model.is_chain and s.model.n <= MAX_BODIES]
-    counts = [RANDOM_STATES] * len(chosen) + [STATES_PER_RANDOM_SCENARIO] * RANDOM_COUNT
-    chosen += list(RandomScenarios(SEED, RANDOM_COUNT))
-    return [
-        (s, compared_states(s.model, s.state, s.seed, count))
-        for s, count in zip(chosen, counts, strict=True)
-    ]
+    """All of them, made as they are needed: most defects show early."""
+    return map(problem, range(len(catalogue_chains()) + RANDOM_COUNT))
 
 
 def is_altered(defect, model, state):

@@ -15,10 +15,10 @@ def by_content(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function with its answers kept by the content of the arguments."""
     known: dict[bytes, Any] = {}
 
-    def call(*arguments: Any) -> Any:
-        key = hashlib.sha256(pickle.dumps(arguments)).digest()
+    def call(*arguments: Any, **options: Any) -> Any:
+        key = hashlib.sha256(pickle.dumps((arguments, options))).digest()
         if key not in known:
-            known[key] = function(*arguments)
+            known[key] = function(*arguments, **options)
         return known[key]
 
     return call
