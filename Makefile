@@ -15,7 +15,7 @@ export UV_COMPILE_BYTECODE := 1
 export PYTHONDONTWRITEBYTECODE :=
 MUTANTS ?= --sample 300 --seed 1 --jobs 2
 
-.PHONY: help run test nightly bench benchmarks mutants importers models lint lock clean
+.PHONY: help run test fast-tests nightly bench benchmarks mutants importers models lint lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' Makefile | sed 's/:.*##/\t/' | expand -t 12
@@ -23,7 +23,10 @@ help:  ## this list
 run: .venv/truth.tried  ## the main job: the whole catalogue on all engines, table and report
 	$(PYTHON) -m plumbline run
 
-test: lint reports/node_modules/.tried  ## style, types and the fast tests
+test: .venv/test.done reports/node_modules/.tried  ## style, types and the fast tests
+	$(MAKE) --jobs 2 lint fast-tests
+
+fast-tests: .venv/test.done
 	$(PYTHON) -m pytest -n 3
 
 lint: .venv/test.done  ## style and types only

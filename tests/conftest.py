@@ -1,4 +1,4 @@
-"""Rules for every test: which process runs it, and which skips continuous integration allows.
+"""Rules for every test: which process runs it, which run nightly, which skips continuous integration allows.
 
 `pytest -n 3` keeps the tests of a file in one process, so that what they share is computed once; the
 scenarios of the matrix are distributed one by one.  Three processes keep two cores busy while a test waits
@@ -13,6 +13,7 @@ import re
 import pytest
 
 from plumbline.processes.user_cache import user_cache_folder
+from tests.helpers.nightly_tests import SLOW, is_nightly, stale_entries
 
 ALLOWED_SKIPS = {  # pattern of the skip's reason: why continuous integration cannot run the test
     r"root may read everything": "the test needs a user without root's permissions",
@@ -31,10 +32,19 @@ LONGEST_FIRST = (  # begun last, one of these would keep one process busy while 
 LAST = ("matrix",)  # scenario by scenario it fills what is left
 
 
-def pytest_collection_modifyitems(items):
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config, items):
     rank = {f"test_{name}.py": place for place, name in enumerate(LONGEST_FIRST)}
     rank |= {f"test_{name}.py": len(rank) + 1 for name in LAST}
     items.sort(key=lambda item: rank.get(item.path.name, len(LONGEST_FIRST)))
+    for item in items:
+        if is_nightly(item.nodeid):
+            for mark in SLOW:
+                item.add_marker(mark)
+    if config.args == ["tests"] and not config.getoption("ignore"):  # all tests are there
+        fast = {item.nodeid for item in items if not item.get_closest_marker("full")}
+        if stale := stale_entries({item.nodeid for item in items}, fast):
+            raise pytest.UsageError(f"tests/nightly_tests.txt: {'; '.join(stale)}")
 
 
 @pytest.hookimpl(optionalhook=True)

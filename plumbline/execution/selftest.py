@@ -14,6 +14,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 TEST_FILE = "tests/execution/test_planted_defects.py"
+MARKS = "slow or not full"  # with what `make test` leaves out for its time, without the long forms
 TIMEOUT = 1800.0  # s
 _CHILD_SCRIPT = (
     "import sys; from plumbline.processes.isolation import die_with_parent; "
@@ -49,7 +50,16 @@ def run_self_test(report: Path, tests: str = TEST_FILE, timeout: float = TIMEOUT
         The counts, or why they are not as they must be.
 
     """
-    arguments = ["-q", "-p", "no:cacheprovider", f"--rootdir={ROOT}", f"--junitxml={report}", tests]
+    arguments = [
+        "-q",
+        "-m",
+        MARKS,
+        "-p",
+        "no:cacheprovider",
+        f"--rootdir={ROOT}",
+        f"--junitxml={report}",
+        tests,
+    ]
     command = [sys.executable, "-c", _CHILD_SCRIPT, str(os.getpid()), *arguments]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     try:

@@ -140,7 +140,7 @@ def test_a_column_names_an_engines_version_once():
 
 
 def test_list_scenarios_and_engines_as_text_and_json():
-    names = [s["name"] for s in json.loads(run_plumbline("list", "scenarios", "--json").stdout)]
+    names = [s["name"] for s in json.loads(invoke("list", "scenarios", "--json").stdout)]
     assert len(names) >= 27
     text = invoke("list", "scenarios").stdout
     assert all(name in text for name in names)
@@ -265,4 +265,4 @@ def test_an_output_folder_that_cannot_be_written_is_an_error_before_any_work(tmp
 
 
 def test_schema_is_json():
-    assert json.loads(run_plumbline("schema").stdout)["properties"]
+    assert json.loads(invoke("schema").stdout)["properties"]

@@ -86,6 +86,7 @@ def test_recorded_gaps_alone_are_no_comparison(tmp_path):
         ("raise ImportError('libGL.so.1: cannot open')\n", "ImportError: libGL.so.1: cannot open"),
         ("import time\ntime.sleep(600)\n", "timeout: no answer within 5 s"),
     ],
+    ids=["crash", "exception", "missing library", "timeout"],
 )
 def test_an_engine_that_fails_at_import_has_failed(tmp_path, text, words):
     place = with_module(tmp_path, "mujoco", text)

@@ -10,6 +10,7 @@ import pytest
 from plumbline.diagnosis.integrator_search import UNEXPLAINED, explain_steps
 from plumbline.engines.registry import load_adapter
 from plumbline.truth import step_formulas
+from tests.helpers.nightly_tests import some_fast
 from tests.helpers.planted_steps import STEP_DEFECTS, planted_step, words_for
 from tests.helpers.shared_answers import sharing
 from tests.judging.test_step import methods, stepped, subject
@@ -34,7 +35,7 @@ def explanation(adapter, integrator, joints="balls", has_drag=False, change=lamb
     return explain_steps(model, states, integrator.method, answer)
 
 
-@pytest.mark.parametrize("defect", STEP_DEFECTS, ids=[d.name for d in STEP_DEFECTS])
+@pytest.mark.parametrize("defect", some_fast(STEP_DEFECTS, 3))
 def test_a_planted_integrator_is_named(defect):
     integrator = load_adapter(defect.engine).integrator(defect.integrator)
     with planted_step(defect) as adapter:

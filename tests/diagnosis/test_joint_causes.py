@@ -12,6 +12,7 @@ from plumbline.judging.state import judge_states
 from plumbline.model.kinematics import complete_state
 from plumbline.model.sampling import random_states
 from plumbline.truth.ground_truth import state_truth
+from tests.helpers.nightly_tests import some_fast
 from tests.helpers.planted_elements import ELEMENT_DEFECTS, ElementDefect, subject
 from tests.helpers.shared_answers import sharing
 
@@ -29,6 +30,7 @@ def right():
     return model, state_truth(model, random_states(model, 5, seed=2))
 
 
+@cache
 def report(defect):
     """Quantities that disagree, and the diagnosis."""
     model, truth = right()
@@ -43,12 +45,14 @@ def report(defect):
 
 
 @pytest.mark.parametrize("defect", ELEMENT_DEFECTS, ids=[d.name for d in ELEMENT_DEFECTS])
-def test_every_defect_is_reported_and_named(defect):
-    wrong, found = report(defect)
-    assert wrong, f"nothing reports {defect.name}"
-    text = diagnose_joints(*right()[:1], found, right()[1])
-    if defect.expected:
-        assert defect.expected in text and "cannot distinguish" not in text, f"{defect.name}: {text}"
+def test_every_defect_is_reported(defect):
+    assert report(defect)[0], f"nothing reports {defect.name}"
+
+
+@pytest.mark.parametrize("defect", some_fast([d for d in ELEMENT_DEFECTS if d.expected], 8))
+def test_every_defect_is_named(defect):
+    text = diagnose_joints(*right()[:1], report(defect)[1], right()[1])
+    assert defect.expected in text and "cannot distinguish" not in text, f"{defect.name}: {text}"
 
 
 @pytest.mark.parametrize("engine", ["reference", "mujoco", "pinocchio", "pinocchio-aba"])

@@ -1,8 +1,8 @@
 """The product as tests: every scenario × engine × level is a test of its own.
 
 `pytest -k "double and mujoco"` runs those of one family and engine; the failure message is the
-verdict's own sentence.  By default steps and motions run on the scenarios that `tests.helpers.fast_matrix`
-selects; `-m full` runs the rest.
+verdict's own sentence.  By default the cells that `tests.helpers.fast_matrix` selects run; `-m full` runs
+the rest.
 """
 
 import os
@@ -17,33 +17,33 @@ from plumbline.judging import known_issues
 from plumbline.model.invariants import inertia_ratio
 from plumbline.processes.workers import Limits, WorkerPool
 from tests.helpers.catalogue import catalogue_scenarios
-from tests.helpers.fast_matrix import levels, representatives
+from tests.helpers.fast_matrix import features, is_fast, levels
 
 
 def matrix_cells():
     for name, scenario in catalogue_scenarios().items():
         for engine in ENGINES:
             for level in levels(engine, scenario):
-                is_fast = level == "state" or name in representatives(level)
                 label = name if scenario.family in name else f"{scenario.family}-{name}"
-                marks = [] if is_fast else [pytest.mark.full]
+                marks = [] if is_fast(scenario, level) else [pytest.mark.full]
                 yield pytest.param(name, engine, level, id=f"{label}: {engine}-{level}", marks=marks)
 
 
-def joints_compared(cells):
-    """(engine, level, kind of joint) of the cells that an engine does not refuse."""
-    models = [(engine, level, catalogue_scenarios()[name].model) for name, engine, level in cells]
-    allowed = [x for x in models if x[0] != "reference-printed" or (x[2].n <= 2 and x[2].rods.all())]
-    return {(engine, level, kind) for engine, level, model in allowed for kind in model.kind}
-
-
-def test_the_fast_form_has_every_joint_on_every_engine_and_every_scenario_at_state_level():
-    cells = list(matrix_cells())
-    fast = [cell.values for cell in cells if not cell.marks]
-    left_out = joints_compared(cell.values for cell in cells) - joints_compared(fast)
-    in_tree_motions = {"cylindrical"}  # tests/adapters/test_tree_motions.py: on every engine
-    assert {joint[1:] for joint in left_out} <= {("trajectory", kind) for kind in in_tree_motions}
-    assert {cell[:2] for cell in fast if cell[2] == "state"} == {cell.values[:2] for cell in cells}
+@pytest.mark.parametrize("level", ["state", "step", "trajectory"])
+def test_the_fast_form_has_everything_on_every_engine(level):
+    """Motions of the joints that are left out: tests/adapters/test_tree_motions.py, on every engine."""
+    left_out = {"trajectory": {"universal", "cylindrical", "weld"}}.get(level, set())
+    found = {engine: (set(), set()) for engine in ENGINES}  # features of the fast cells, and of all
+    for cell in matrix_cells():
+        name, engine, of_cell = cell.values
+        model = catalogue_scenarios()[name].model
+        if of_cell == level and not (engine == "reference-printed" and (model.n > 2 or not model.rods.all())):
+            fast, every = found[engine]
+            every |= features(catalogue_scenarios()[name])
+            fast |= set() if cell.marks else features(catalogue_scenarios()[name])
+    for engine, (fast, every) in found.items():
+        if engine != "reference-printed" or level == "state":
+            assert every - fast <= left_out, engine
 
 
 @pytest.fixture(scope="session")

@@ -37,6 +37,7 @@ pytest.importorskip("no_such_module_at_all")
         ("import nothing_of_that_name", {}, "cannot be read"),
         ("", {}, "empty"),
     ],
+    ids=["passing", "failing", "skipped", "unreadable", "empty"],
 )
 def test_the_answer_is_that_of_the_tests(tmp_path, text, figures, trouble):
     (tmp_path / "test_it.py").write_text(text)

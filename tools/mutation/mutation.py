@@ -56,6 +56,7 @@ TEST_TIME_BUDGET = (
 )
 MEMORY_LIMIT = 8 * 2**30  # bytes of address space of a child
 EXIT_LATE_TEST, EXIT_NOT_TRIED = 253, 254  # exit codes of a child, see `Limit` and `Swaps`
+MARKS = "slow or not full"  # without the long forms
 PYTEST_PLUGINS = ("no:cacheprovider", "pytest_timeout", "_hypothesis_pytestplugin")  # others only take time
 TARGETS = {
     "reference_impl": ["reference_impl/*.py"],
@@ -368,7 +369,11 @@ class CoveragePlugin:
 def run_tests(tests: Sequence[str], *plugins: object) -> int:
     """Run pytest in this process: 0 where all pass."""
     options = [word for name in PYTEST_PLUGINS for word in ("-p", name)]
-    return int(pytest.main(["-q", "-x", "--timeout=0", "--hypothesis-seed=0", *options, *tests], [*plugins]))
+    return int(
+        pytest.main(
+            ["-q", "-x", "-m", MARKS, "--timeout=0", "--hypothesis-seed=0", *options, *tests], [*plugins]
+        )
+    )
 
 
 def measure_coverage(tests: Sequence[str], files: Sequence[str]) -> CoverageMap:

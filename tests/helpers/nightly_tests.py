@@ -1,0 +1,51 @@
+"""Tests that run nightly only, for their time: `tests/nightly_tests.txt` has the list and the rule."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import pytest
+
+_LINES = (Path(__file__).parents[1] / "nightly_tests.txt").read_text(encoding="utf-8").splitlines()
+_PAIRS = [line.split(" | ") for line in _LINES if not line.startswith("#")]
+NIGHTLY = {moved: tuple(fast.split(" ")) for moved, fast in _PAIRS}
+
+SLOW = (pytest.mark.full, pytest.mark.slow)
+
+
+def slow(test: Any) -> Any:
+    """Move a test function to the nightly."""
+    for mark in SLOW:
+        test = mark(test)
+    return test
+
+
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
+
+
+def some_fast(cases: Sequence[_Named], step: int) -> list[Any]:
+    """Parameters of a test, by name, of which every ``step``-th runs fast and the others nightly."""
+    return [pytest.param(case, id=case.name, marks=SLOW if k % step else []) for k, case in enumerate(cases)]
+
+
+def is_nightly(nodeid: str) -> bool:
+    """Whether the table moves a test, or one of its cases, to the nightly."""
+    name, _, case = nodeid.removeprefix("tests/").partition("[")
+    return name in NIGHTLY and case.removesuffix("]") not in NIGHTLY[name]
+
+
+def stale_entries(collected: set[str], fast: set[str]) -> list[str]:
+    """Entries of the table that name no test of a whole collection, or leave none fast."""
+    here = [{name.removeprefix("tests/") for name in names} for names in (collected, fast)]
+    every, still_fast = ({*names, *(name.partition("[")[0] for name in names)} for names in here)
+    stale = [moved for moved in NIGHTLY if moved not in every]
+    for moved, others in NIGHTLY.items():
+        file = moved.partition("::")[0]
+        for name in others:
+            if not {f"{moved}[{name}]", f"{file}::{name}", name} & still_fast:
+                stale.append(f"{moved}: {name}")
+    return stale
