@@ -20,14 +20,14 @@ ALLOWED_SKIPS = {  # pattern of the skip's reason: why continuous integration ca
     r"`make importers` installs it": "the other importers' wheels are large and optional",
 }
 
-LONGEST_FIRST = (  # begun last, one of these would keep one process busy while the others have no work
-    "report_browser", "planted_defects", "docs", "exit_codes", "nightly", "adapter_contract", "resume",
-    "tree_motion", "integrator_search", "command_line", "tree_motions", "trees", "step", "sweep",
-    "enclosure", "coverage", "loops", "workers", "dask_cluster", "honest_engines", "damaged_files",
-    "isolation", "storage_faults", "scripts", "model_script", "selftest", "joint_causes",
-    "planted_branches", "metamorphic", "certified", "pinocchio_engine", "mujoco_engine", "rounding_bound",
-    "collocation", "notes_drift", "output_folder", "exudyn_engine", "reference_pages", "trajectory_truth",
-    "identity", "diagnose", "sensitivity",
+LONGEST_FIRST = (  # begun last, one of these would keep one process busy while the others have no work;
+    # isolation, dask_cluster and workers mostly wait, so one begins when another ends
+    "isolation", "planted_defects", "report_browser", "adapter_contract", "exit_codes", "dask_cluster",
+    "step", "tree_motions", "scripts", "workers", "loops", "command_line", "trees", "metamorphic", "nightly",
+    "coverage", "planted_branches", "tree_motion", "sweep", "enclosure", "joint_causes", "integrator_search",
+    "importer_cause", "trajectory_truth", "tree_relations", "selftest", "environments", "model_command",
+    "reference_pages", "resume", "diagnose", "collocation", "docs", "rounding_bound", "long_runs", "report",
+    "sensitivity", "storage_faults",
 )  # fmt: skip
 LAST = ("matrix",)  # scenario by scenario it fills what is left
 
