@@ -97,8 +97,8 @@ def cross(a: AnyArray, b: AnyArray) -> AnyArray:
         (..., 3).
 
     """
-    a0, a1, a2, b0, b1, b2 = (x[..., i] for x in (a, b) for i in range(3))
-    return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], -1)
+    i, j = (1, 2, 0), (2, 0, 1)
+    return np.asarray(a.take(i, -1) * b.take(j, -1) - a.take(j, -1) * b.take(i, -1))
 
 
 def A(p: AnyArray) -> AnyArray:

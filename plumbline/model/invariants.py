@@ -11,6 +11,7 @@ from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Array, Model, Traje
 from plumbline.model.kinematics import (
     angular_velocity,
     ball_spring_rest,
+    cross,
     joint_vectors,
     quaternion_conjugate,
     quaternion_exponential,
@@ -104,7 +105,7 @@ def angular_momentum(model: Model, r: Array, p: Array, v: Array, omega: Array) -
 
     """
     spin = np.einsum("...kij,kjl,...kl->...i", rotation_matrix(p), model.inertia, omega)
-    return np.asarray(np.einsum("k,...ki->...i", model.mass, np.cross(r, v)) + spin)
+    return np.asarray(np.einsum("k,...ki->...i", model.mass, cross(r, v)) + spin)
 
 
 @dataclass(frozen=True, eq=False)
@@ -305,7 +306,7 @@ def element_energies(model: Model, run: Trajectory, omega: Array) -> ElementEner
             for i, (what, axis) in enumerate(KINDS[model.kind[k]].motions):
                 along = far_axes[..., axis] if i == 0 or what == "slide" else near_axes[..., axis]
                 if what == "slide":
-                    x, rate = _dot(along, d[:, k]), _dot(along, d_rate[:, k] - np.cross(far_spin, d[:, k]))
+                    x, rate = _dot(along, d[:, k]), _dot(along, d_rate[:, k] - cross(far_spin, d[:, k]))
                 else:
                     one, two = (axis + 1) % 3, (axis + 2) % 3
                     kept = (
@@ -330,7 +331,7 @@ def _with_point_springs(
     """Add springs and dampers between points."""
     d, body = spring_vectors(model, run.r, run.p), model.spring_body
     arm = np.matvec(rotation_matrix(run.p)[:, body], model.spring_point)
-    ends = np.where((body < 0)[..., None], 0.0, run.v[:, body] + np.cross(spin[:, body], arm))
+    ends = np.where((body < 0)[..., None], 0.0, run.v[:, body] + cross(spin[:, body], arm))
     length = np.linalg.norm(d, axis=-1)
     rate = _dot(d, ends[..., 1, :] - ends[..., 0, :]) / np.where(length > 0, length, 1.0)
     springs = found.springs + ((length - model.spring_length) ** 2) @ model.spring_stiffness / 2
@@ -361,9 +362,9 @@ def joint_vector_rates(model: Model, run: Trajectory, omega: Array) -> Array:
 
     """
     a = rotation_matrix(run.p)
-    near = run.v + np.einsum("tkij,tkj->tki", a, np.cross(omega, model.proximal))
+    near = run.v + np.einsum("tkij,tkj->tki", a, cross(omega, model.proximal))
     far = model.body[:, 0]
-    swing = np.einsum("tkij,tkj->tki", a[:, far], np.cross(omega[:, far], model.point[:, 0]))
+    swing = np.einsum("tkij,tkj->tki", a[:, far], cross(omega[:, far], model.point[:, 0]))
     return np.asarray(near - np.where((far < 0)[:, None], 0.0, run.v[:, far] + swing))
 
 
@@ -379,7 +380,7 @@ def _across_slides(model: Model, p: Array, omega: Array, d: Array, ddot: Array) 
         if far >= 0:
             above = rotation_matrix(p[:, far])
             axis, spin = np.matvec(above, axis), np.matvec(above, omega[:, far])
-        ddot[:, k] -= np.cross(spin, d[:, k])
+        ddot[:, k] -= cross(spin, d[:, k])
         for y in (d, ddot):
             y[:, k] -= axis * np.sum(axis * y[:, k], axis=-1, keepdims=True)
     return d, ddot
@@ -394,9 +395,9 @@ def _turns_freely_about_gravity(model: Model) -> bool:
             continue
         axis = rotation_matrix(model.turn[k, 0])[:, 2]
         turns = kind in ("rod", "ball") or (
-            kind in ("hinge", "cylindrical") and np.linalg.norm(np.cross(axis, along)) < 1e-14
+            kind in ("hinge", "cylindrical") and np.linalg.norm(cross(axis, along)) < 1e-14
         )
-        if not turns or np.linalg.norm(np.cross(at, along)) > 1e-14 * np.linalg.norm(at):
+        if not turns or np.linalg.norm(cross(at, along)) > 1e-14 * np.linalg.norm(at):
             return False
     return True
 

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from plumbline.model.datatypes import KINDS, Model, State
-from plumbline.model.kinematics import forward_kinematics, rate_count
+from plumbline.model.kinematics import cross, forward_kinematics, rate_count
 from plumbline.model.loops import (
     closed_pose,
     closed_rates,
@@ -85,7 +85,7 @@ def random_states(model: Model, count: int, seed: int) -> list[State]:
         udot[k] = spread * rng.normal(size=(model.n, 3))
     p /= np.linalg.norm(p, axis=-1, keepdims=True)
     u /= np.linalg.norm(u, axis=-1, keepdims=True)
-    u, udot = (np.where(model.rods[:, None], x, 0.0) for x in (u, np.cross(udot, u)))
+    u, udot = (np.where(model.rods[:, None], x, 0.0) for x in (u, cross(udot, u)))
     free = np.array([kind == "free" for kind in model.kind])[:, None]
     x, xdot, r, v = (np.zeros((count, model.n, size)) for size in (2, 2, 3, 3))
     for k in range(count if set(model.kind) - {"rod", "ball"} else 0):

@@ -17,6 +17,7 @@ from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import (
     angular_velocity,
     complete_state,
+    cross,
     joint_vectors,
     quaternion_conjugate,
     quaternion_product,
@@ -158,8 +159,8 @@ def perturbed_states(
         p = quaternion_product(state.p, quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True))
         spread = perturbation_size * fastest
         omega = state.omega + spread * rng.normal(size=(model.n, 3))
-        u = state.u + np.cross(perturbation_size * rng.normal(size=(model.n, 3)), state.u)
-        udot = state.udot + np.cross(spread * rng.normal(size=(model.n, 3)), state.u)
+        u = state.u + cross(perturbation_size * rng.normal(size=(model.n, 3)), state.u)
+        udot = state.udot + cross(spread * rng.normal(size=(model.n, 3)), state.u)
         if model.is_chain:
             found.append(_make_state(model, p, omega, u, udot))
             continue
@@ -204,7 +205,7 @@ def project_to_manifold(model: Model, r: Array, p: Array, v: Array, pdot: Array)
     p = p / np.linalg.norm(p, axis=1, keepdims=True)
     omega = angular_velocity(p, pdot)
     A = rotation_matrix(p)
-    near, far = (v + rotate_vectors(A, np.cross(omega, s)) for s in (model.proximal, model.distal))
+    near, far = (v + rotate_vectors(A, cross(omega, s)) for s in (model.proximal, model.distal))
     gap_rate = near - np.concatenate([np.zeros((1, 3)), far[:-1]])
     ell = np.where(model.rods, model.length, np.inf)[:, None]
     return _make_state(model, p, omega, joint_vectors(model, r, p) / ell, gap_rate / ell)
