@@ -16,7 +16,7 @@ import numpy as np
 
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.storage.results_store import write_atomically
-from plumbline.truth.enclosure import CertificatePrecision, checked_numbers, prove_motion
+from plumbline.truth.enclosure import CertificatePrecision, checked_numbers, checked_topology, prove_motion
 
 STORED = Path(__file__).resolve().parents[1] / "docs" / "reference-solutions.json"
 TIMES = (1.0, 2.0, 5.0, 10.0)
@@ -24,9 +24,11 @@ DIGITS, MAX_RADIUS = 20, 1e-15  # m
 PRECISIONS: tuple[CertificatePrecision, ...] = ("quad", "octuple")  # the first that gives this radius
 ABOUT = (
     "Motions enclosed rigorously (docs/enclosures.md): every number [midpoint +/- radius] contains the true "
-    "one, rounded here to 20 digits; radius is the largest one of r, in m, before. SI; world z up, first "
-    "joint at the origin; r and v of centres of mass, world frame; p unit quaternions, scalar first, body to "
-    "world; omega in body axes; the model and its initial state as doubles, p, u, udot normalised exactly."
+    "one, rounded here to 20 digits; radius is the largest one of r, in m, before. SI; world z up; r and v "
+    "of centres of mass, world frame; p unit quaternions, scalar first, body to world; omega in body axes. "
+    "Model and initial state as doubles: kind of each joint, its far body (-1 the world), point in the far "
+    "and the near body, turn of the joint's axes in both; p, turn, u, udot normalised exactly; of a free "
+    "body u and udot are place and velocity, and length is 1."
 )
 
 
@@ -48,7 +50,7 @@ def enclosed_motion(name: str) -> dict[str, Any]:
     text: Any = np.frompyfunc(lambda ball: ball.str(DIGITS), 1, 1)
     hexadecimal: Any = np.frompyfunc(float.hex, 1, 1)
     numbers = checked_numbers(scenario.model, scenario.state)
-    return {
+    return checked_topology(scenario.model) | {
         "doubles": {key: hexadecimal(x).tolist() for key, x in numbers.items()},
         "times": list(TIMES),
         "radius": [max(float(x.rad()) for x in r.ravel()) for r in enclosure.r],

@@ -56,8 +56,12 @@ def prove(names: tuple[str, ...], duration: float | None, precision: Any, out: P
     the truth, and the report says "proved".
     """
     from plumbline.storage.results_store import write_atomically
+    from plumbline.truth.enclosure import reason_not_provable
 
-    chosen = options.require_chains(options.read_scenarios(names))
+    chosen = options.read_scenarios(names)
+    for s in chosen:
+        if reason := reason_not_provable(s.model):
+            raise click.BadParameter(f"{s.name}: {reason}", param_hint="SCENARIO")
     folder = options.claim_folder(out)
     records = []
     with options.exit_on_io_error(), ProgressDisplay(sys.stderr) as progress:
@@ -119,6 +123,7 @@ def _prove(
 
 def _verify(path: Path, progress: Any) -> dict[str, Any]:
     from plumbline.truth.enclosure import load_checker
+    from plumbline.truth.enclosure_file import MalformedCertificate, parse_certificate
 
     try:
         checker = load_checker()
@@ -128,12 +133,12 @@ def _verify(path: Path, progress: Any) -> dict[str, Any]:
     began = time.process_time()
     try:
         if not stat.S_ISREG(path.stat().st_mode):  # a device may have no end
-            raise checker.MalformedCertificate("not a file")
-        certificate = checker.parse_certificate(path.read_bytes())
+            raise MalformedCertificate("not a file")
+        certificate = parse_certificate(path.read_bytes())
         enclosure = checker.enclose_motion(
             certificate, lambda done, of: progress(done, of, f"{path.name}: steps")
         )
-    except checker.MalformedCertificate as error:
+    except MalformedCertificate as error:
         return record | {"verdict": "malformed", "reason": str(error)}
     except (OSError, ValueError) as error:  # ValueError: a path with a null character
         words = getattr(error, "strerror", None) or error

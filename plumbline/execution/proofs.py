@@ -9,6 +9,7 @@ from importlib.util import find_spec
 from plumbline.processes.workers import Limits, Task, WorkerPool
 from plumbline.scenario.loader import Scenario
 from plumbline.truth.closed_form import exact_samples
+from plumbline.truth.enclosure import reason_not_provable
 from plumbline.truth.proved_motion import find_proof, store_proof
 from plumbline.truth.trajectory import prove_and_judge_claim
 
@@ -23,7 +24,7 @@ class ProofSummary:
     known: int = 0  # proved by earlier nights
     proved: list[str] = field(default_factory=list)  # names of scenarios
     failed: dict[str, str] = field(default_factory=dict)  # scenario → reason
-    left_out: list[str] = field(default_factory=list)  # no time was left, or too many bodies
+    left_out: list[str] = field(default_factory=list)  # no time was left, too many bodies, or not provable
     exceeded: dict[str, float] = field(
         default_factory=dict
     )  # scenario → error of the usual truth over its claim
@@ -71,7 +72,7 @@ def prove_changed_motions(
     for s in sorted(scenarios, key=lambda s: s.model.n):
         if find_proof(s.model, s.state, s.times) is not None:
             found.known += 1
-        elif s.model.n > MAX_PROVED_BODIES:
+        elif s.model.n > MAX_PROVED_BODIES or reason_not_provable(s.model):
             found.left_out.append(s.name)
         else:
             missing[s.name] = s

@@ -10,12 +10,14 @@ import gzip
 import json
 import math
 from collections.abc import Callable
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State
-from plumbline.truth import import_truth_tool
+from plumbline.truth import TruthUnavailable, import_truth_tool
+from plumbline.truth.enclosure_file import FORMAT, SHAPES, VERSION, Certificate, parse_certificate
 from plumbline.truth.taylor import taylor_series
 
 if TYPE_CHECKING:
@@ -44,6 +46,26 @@ def load_checker() -> Any:
     return enclosure_checker
 
 
+def reason_not_provable(model: Model) -> str:
+    """Say why motions of a mechanism cannot be proved.
+
+    Args:
+        model: the mechanism.
+
+    Returns:
+        A sentence; empty where they can.
+
+    """
+    if model.has_loops:
+        return "motions of closed loops are not proved: the checker has the equations of trees"
+    if any(kind == "ball" and k > 0 for kind, k in zip(model.kind, model.stiffness[:, 0], strict=False)):
+        return (
+            "motions with a spring on a ball joint are not proved: its moment k θ has no polynomial equation "
+            "that holds at θ = 0"
+        )
+    return ""
+
+
 def prove_motion(
     model: Model,
     state: State,
@@ -67,15 +89,18 @@ def prove_motion(
 
     Raises:
         Rejected: no candidate could be proved (of `plumbline.truth.enclosure_checker`).
-        TruthUnavailable: python-flint, heyoka (Linux only) or mpmath is not installed.
+        TruthUnavailable: python-flint, heyoka (Linux only) or mpmath is not installed, or such motions are
+            not proved.
         EngineFailure: heyoka stops, or was built without that precision.
 
     """
+    if reason := reason_not_provable(model):
+        raise TruthUnavailable(reason)
     checker = load_checker()
     for attempt, max_step in enumerate(MAX_STEPS_TRIED, 1):
         raw = make_certificate(model, state, times, scenario, precision, max_step)
         try:
-            return raw, checker.enclose_motion(checker.parse_certificate(raw), on_step)
+            return raw, checker.enclose_motion(parse_certificate(raw), on_step)
         except checker.Rejected:
             if attempt == len(MAX_STEPS_TRIED):
                 raise
@@ -108,18 +133,32 @@ def make_certificate(
         EngineFailure: heyoka stops, or was built without that precision.
 
     """
-    checker, bits, exponent = load_checker(), BITS[precision], time_exponent(model, state)
+    bits, exponent = BITS[precision], time_exponent(model, state)
     document = {
-        "format": checker.FORMAT,
-        "version": checker.VERSION,
+        "format": FORMAT,
+        "version": VERSION,
         "scenario": scenario,
         "time_exponent": exponent,
         "bits": bits,
+        **checked_topology(model),
         **{name: _hexadecimal(x) for name, x in checked_numbers(model, state).items()},
         "times": _hexadecimal(times),
         "steps": _candidate_steps(model, state, float(times[-1]), precision, exponent, max_step),
     }
     return gzip.compress(json.dumps(document, separators=(",", ":")).encode(), mtime=0)
+
+
+def checked_topology(model: Model) -> dict[str, Any]:
+    """Return the integers and names of a certificate.
+
+    Args:
+        model: the mechanism.
+
+    Returns:
+        The kinds of the joints, their far bodies, and the pairs of bodies of springs.
+
+    """
+    return {"kind": [*model.kind], "far": model.body[:, 0].tolist(), "springs": model.spring_body.tolist()}
 
 
 def checked_numbers(model: Model, state: State) -> dict[str, Array]:
@@ -130,12 +169,21 @@ def checked_numbers(model: Model, state: State) -> dict[str, Array]:
         state: its initial state.
 
     Returns:
-        Arrays of doubles as the checker's ``SHAPES`` lists them.
+        Arrays of doubles as ``SHAPES`` of `enclosure_file` lists them.
 
     """
+    names = ("p", "omega", "u", "udot", "x", "xdot")
+    found = {name: getattr(state if name in names else model, name) for name in SHAPES}
+    free = np.array([kind == "free" for kind in model.kind])
+    own: dict[str, Any] = {
+        "u": state.r,
+        "udot": state.v,
+        "length": 1.0,
+        "point": 0.0,
+    }  # u is the place of its centre of mass
     return {
-        name: getattr(state if name in ("p", "omega", "u", "udot") else model, name)
-        for name in load_checker().SHAPES
+        name: np.where(free.reshape(-1, *[1] * (x.ndim - 1)), own[name], x) if name in own else x
+        for name, x in found.items()
     }
 
 
@@ -150,12 +198,12 @@ def time_exponent(model: Model, state: State) -> int:
         The exponent.
 
     """
-    levers = np.linalg.norm(model.proximal, axis=1) + model.length
+    levers = np.linalg.norm(model.point[:, 1], axis=1) + model.length
     swing = (
         math.sqrt(float(np.linalg.norm(model.gravity)) / lever) if (lever := float(np.min(levers))) else 0.0
     )
-    rate = max(float(np.max(np.abs(state.omega))), float(np.max(np.abs(state.udot))), swing, 2.0**-10)
-    return -round(math.log2(rate))
+    rates = (float(np.max(np.abs(x))) for x in (state.omega, state.udot, state.xdot))
+    return -round(math.log2(max(*rates, swing, 2.0**-10)))
 
 
 def _hexadecimal(x: Array) -> Any:
@@ -176,13 +224,19 @@ def _candidate_steps(
     A Taylor coefficient c_j [1/sʲ] of a step of H seconds becomes the integer nearest to c_j Hʲ 2**bits, of a
     rate times the unit of time.
     """
-    mp, bits = import_truth_tool("mpmath"), BITS[precision]
+    mp, bits, checker = import_truth_tool("mpmath"), BITS[precision], load_checker()
     grain = 1 << (bits - LENGTH_BITS)  # lengths are multiples of it
     steps: list[list[Any]] = []
-    with mp.workprec(2 * bits):
+    numbers, context = checked_numbers(model, state), import_truth_tool("flint").ctx
+    certificate = Certificate(
+        **checked_topology(model), data=numbers, times=[], time_exponent=0, bits=bits, steps=[]
+    )
+    with mp.workprec(2 * bits), context.workprec(2 * bits):
+        mechanism = checker._Mechanism(certificate, import_truth_tool("flint").arb)
         left = max(1, math.ceil(math.ldexp(duration, LENGTH_BITS - exponent)))  # grains
         generator = taylor_series(model, state, round(ORDER_PER_BIT * bits), precision)
-        series = next(generator)
+        own = next(generator)
+        series = _add_functions(mechanism, own)
         start: list[int] = []
         while True:
             h = min(mp.ldexp(max_step, exponent), *(_longest_step(row, bits) for row, _ in series))
@@ -203,7 +257,34 @@ def _candidate_steps(
                 mp.ldexp(mp.mpf(value), -bits - (exponent if is_rate else 0))
                 for value, (_, is_rate) in zip(start, series, strict=True)
             ]
-            series = generator.send(values)
+            kept = {*map(id, own)}
+            own = generator.send([x for x, row in zip(values, series, strict=True) if id(row) in kept])
+            series = _add_functions(mechanism, own)
+
+
+def _add_functions(mechanism: Any, series: list[Any]) -> list[Any]:
+    """Add what makes the equations polynomial: cos x and sin x of turns, and 1/|d| of springs."""
+    flint, mp, checker = import_truth_tool("flint"), import_truth_tool("mpmath"), load_checker()
+    flint.ctx.cap = len(series[0][0])
+
+    def balls(row: Any) -> Any:
+        return flint.arb_series(row[0], flint.ctx.cap)
+
+    def numbers(function: Any) -> tuple[list[Any], bool]:
+        parts = (function[k].mid().man_exp() for k in range(flint.ctx.cap))
+        return [mp.ldexp(int(mantissa), int(exponent)) for mantissa, exponent in parts], False
+
+    rest, found = iter(series), list[Any]()
+    for u, p, slide, turns in mechanism.joints:
+        found += islice(rest, 4 * p + 3 * u + slide + len(turns))
+        for angle in found[len(found) - len(turns) :]:
+            found += [numbers(balls(angle).cos()), numbers(balls(angle).sin())]
+    rates = [*rest]
+    if mechanism.springs:
+        q, v = ([balls(row) for row in part] for part in (found, rates))
+        motion = checker._Motion(mechanism, [*q, *q[: len(mechanism.springs)], *v], v)
+        found += [numbers((d @ d).rsqrt()) for d in motion.spans(0)]
+    return found + rates
 
 
 def _longest_step(taylor: list[Any], bits: int) -> Any:

@@ -1,27 +1,48 @@
 """Check a certificate of a motion and enclose the motion: a proof that is read from the top.
 
-This file imports numpy, python-flint and the standard library only.  Inequality (2), the jumps in (7) and the
-result are evaluated in balls (python-flint), whose radii enclose every rounding; the other bounds in doubles
-by the rules (F).  Guesses (inverses, singular vectors, a fundamental matrix) need no trust: a wrong one makes
-a check fail and cannot make a false statement pass.  Nor does the program that wrote the certificate.
+This file imports numpy, python-flint, the standard library, and what reads the file, `enclosure_file`,
+which imports numpy and the standard library only. Inequality (2), the jumps in (7) and the result are
+evaluated in balls (python-flint), whose radii enclose every rounding; the other bounds in doubles by the
+rules (F). Guesses (inverses, singular vectors, a fundamental matrix) need no trust: a wrong one makes a
+check fail and cannot make a false statement pass. Nor does the program that wrote the certificate.
 
-THE MECHANISM.  A chain of N bodies, body k hung by a ball joint or by a massless rod of length l_k, with the
-doubles of the file as its numbers.  Its state y = (q, v) has q = (p_k, of rods u_k), the Euler parameters and
-the rod's direction, and v = (ω_k, of rods u̇_k), the rate in body axes and the rate of the direction.  With
-A(p) the homogeneous quadratic rotation matrix, m_k r̈_k = m_k g + f_k − c_k ṙ_k + F_k − F_{k+1} defines the
-joint forces F_k (world axes, on body k at its proximal point s_k; t_k is its distal point), and v̇ solves
+THE MECHANISM. A tree of N bodies with the doubles of the file as its numbers. Joint k holds body k at its
+near point s_k on a body before it or on the world, the far body, at its far point t_k:
 
-  G(y, v̇) = 0:  J_k ω̇ + ω × J_k ω + d_k ω − n_k − s_k × AᵀF_k + t_k × AᵀF_{k+1} = 0         for each body,
-                F_k − u (uᵀF_k) + m_k l_k u (uᵀü + u̇ᵀu̇) = 0                                for each rod:
+  rod, ball   by a massless rod of length l_k and direction u_k with ball joints at its ends; by a ball joint;
+  free        by nothing: l_k u_k is the place of s_k from t_k, and the far body is the world;
+  others      in axes of the joint, which `turn` sets in either body: slide, moved by x along z; hinge, turned
+              by x about z; cylindrical, both; universal, turned about x and then about y; weld, neither.
 
-Newton's and Euler's equations, with F_k along u_k and |u_k| = 1.  G is polynomial, and affine in v̇:
-G = M(y) v̇ + G(y, 0).  The kinematic equations are ṗ = ½ L(p)ᵀω and du/dt = u̇.  They conserve |p|; where
-|u| = 1 and uᵀu̇ = 0 they and G = 0 give d(uᵀu̇)/dt = 0, so that a solution that starts there stays there and
-is the motion.
+Its state y = (q, v) has as q per joint the Euler parameters p of a body on a rod or ball or free, u, each
+coordinate x, cos x and sin x of each turn, and at last λ = 1/|d| of each spring, d from its first point
+to its second; as v the rate ω of such a body in its own axes, u̇ and ẋ. With A the rotation of a body
+(the homogeneous quadratic A(p), or what the turns make of the far body's), and sums over the joints j on
+it,
 
-THEOREM.  Let y(t) solve these equations with y(0) the state of the file, normalised exactly: p/|p|, u/|u|,
-u̇ − u (uᵀu̇).  If `enclose_motion` returns, y exists up to the last sample time, and at every sample time each
-position, attitude, velocity and rate lies in the ball that is returned.
+  m r̈ = m g + f − c ṙ + F_k − Σ F_j + Σ pulls,
+  J ω̇ + ω × J ω + d ω = n + N_k + s × AᵀF_k − Σ (N_j + t_j × AᵀF_j) + Σ moments of pulls
+
+define the force F_k (world axes) and moment N_k (body axes, about s_k) of joint k on body k; N_j turns
+with its axes, t_j moves with the slide, and N_j = 0 for rods, free bodies and balls without elements. A
+spring pulls by (k (1 − l₀ λ) + c λ² dᵀḋ) d = (k (|d| − l₀) + c |d|˙) d/|d|. v̇ solves G(y, v̇) = 0, which
+is
+
+  N = 0                                          for each rod, free body and ball without elements,
+  N + a (ω̇ − ω̇₀ − ω₀ × ω) + c (ω − ω₀) = 0       for a ball, ω₀ and ω̇₀ of the far body in axes of the near,
+  F − u (uᵀF) + m l u (uᵀü + u̇ᵀu̇) = 0           for each rod,
+  F = 0                                          for each free body,
+  e·F or e·N + a ẍ + c ẋ + k (x − x₀) − τ = 0    for each x along or about an axis e:
+
+Newton's and Euler's equations with rotors, dampers, springs and efforts (a, c, k, τ), with F_k along u_k
+and |u_k| = 1. G is polynomial, and affine in v̇: G = M(y) v̇ + G(y, 0). The kinematic equations are ṗ = ½
+L(p)ᵀω, du/dt = u̇, dx/dt = ẋ, (cos x)˙ = −ẋ sin x, (sin x)˙ = ẋ cos x and λ˙ = −λ³ dᵀḋ. They conserve
+|p|; their only solutions from cos x, sin x and 1/|d| are these; where |u| = 1 and uᵀu̇ = 0 they and G = 0
+give d(uᵀu̇)/dt = 0 for rods, so that a solution that starts there stays there and is the motion.
+
+THEOREM. Let y(t) solve these equations with y(0) the state of the file, normalised exactly: p/|p|, u/|u|
+and u̇ − u (uᵀu̇) of rods, turn/|turn|. If `enclose_motion` returns, y exists up to the last sample time,
+and at every sample time each position, attitude, velocity and rate lies in the ball that is returned.
 
 PROOF.  The file has a unit of time, a power of two [s], into which every number is converted exactly.  On a
 step of length h let s ∈ [0, 1], t = t_k + h s, ỹ(s) the polynomials of the file, e = y − ỹ, ′ = d/ds.  ‖·‖ is
@@ -31,9 +52,9 @@ largest for s ∈ [0, 1] where it bounds a function.
  (F) Floating point. Assumed is that each operation of doubles is off by at most 2⁻⁵² of its result, or by
      2⁻¹⁰²² where it underflows (true of every direction of rounding), and that NumPy evaluates a product
      of arrays as sums of products, added in any order. Then a sum of K ≤ 2¹⁵ products is off by at most
-     2⁻⁵¹ K Σ|products| + 2⁻¹⁰⁰⁰, one product also where a factor is off by 2⁻⁵³ of itself; and an
-     expression of numbers ≥ 0, of at most ten nested sums, products, quotients and roots, by 2⁻³⁰ of
-     itself and 2⁻¹⁰⁰⁰ at most: `_up`.
+     2⁻⁵¹ K Σ|products| + 2⁻¹⁰⁰⁰, one product also where a factor (a number of the file, or an entry of a
+     joint's axes) is off by 2⁻⁵³ (1 + 2⁻⁷) of itself; and an expression of numbers ≥ 0, of at most ten
+     nested sums, products, quotients and roots, by 2⁻³⁰ of itself and 2⁻¹⁰⁰⁰ at most: `_up`.
  (1) A function is *enclosed* by c₀ + … + c_D s^D, D = DEGREE, and a radius r if they differ by at most r
      for all s ∈ [0, 1]. Products of enclosing polynomials are computed whole: their terms above s^D, the
      roundings and the products with the factors' radii go into r, so that no series is cut without its
@@ -61,113 +82,32 @@ Comparisons reject unless they hold: never for NaN.
 
 from __future__ import annotations
 
-import json
-import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import islice
 from typing import Any
 
 import numpy as np
 from flint import arb, arb_poly, ctx
 
-FORMAT, VERSION = "plumbline enclosure certificate", 1
+from plumbline.truth.enclosure_file import JOINTS, SHAPES, Array, Certificate
+
 DEGREE, GUARD_BITS = 11, 40  # of the linear part (R falls with h¹²); of (2) beyond the certificate's own
 MIN_TUBE, MAX_CONDITION = 2.0**-44, 100.0  # of ε and of T
-MAX_BITS, MAX_BODIES, MAX_TERMS = 2000, 100, 401
 ROUNDING, TINY = 2.0**-51, 2.0**-1000  # of (F)
 UNIT = arb(0.5, 0.5)  # [0, 1]
 SHIFTED = np.subtract.outer(np.arange(2 * DEGREE + 1), np.arange(DEGREE + 1))  # for `_convolution`
 SHIFTED[(SHIFTED < 0) | (SHIFTED > DEGREE)] = DEGREE + 1
-SHAPES: dict[str, tuple[tuple[int, ...], int]] = {  # and power of seconds; per body, but gravity
-    "gravity": ((3,), -2), "length": ((), 0), "mass": ((), 0), "inertia": ((3, 3), 0), "proximal": ((3,), 0),
-    "distal": ((3,), 0), "force": ((3,), -2), "moment": ((3,), -2), "drag_force": ((), -1),
-    "drag_moment": ((), -1), "p": ((4,), 0), "omega": ((3,), -1), "u": ((3,), 0), "udot": ((3,), -1),
-}  # fmt: skip
-Array = np.ndarray[Any, Any]
-
-
-class MalformedCertificate(ValueError):
-    """The file is no certificate; the message names the field and what is valid."""
 
 
 class Rejected(ArithmeticError):
     """The certificate proves nothing; the message names the step and the inequality that does not hold."""
 
 
-def _require(holds: Any, failure: str, error: type[Exception] = Rejected) -> None:
+def _require(holds: Any, failure: str) -> None:
     if not holds:
-        raise error(failure)
-
-
-# --- the file ---------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Certificate:
-    """A candidate motion, and what it is a motion of."""
-
-    data: dict[str, Array]  # the model and its initial state by the names of SHAPES; doubles, SI
-    times: list[float]  # s, of the samples
-    time_exponent: int  # the unit of time is 2**time_exponent s
-    bits: int  # lengths and coefficients are integers times 2**-bits
-    steps: list[Any]  # [length, then per coordinate (q, then v) its coefficients from the power 0 of s on]
-
-
-def parse_certificate(raw: bytes) -> Certificate:
-    """Validate a certificate.
-
-    Args:
-        raw: the file's bytes: gzip-compressed JSON, or JSON.
-
-    Returns:
-        The certificate, with every number finite and every shape as the model demands.
-
-    Raises:
-        MalformedCertificate: something is wrong with the file; the message says where and what is valid.
-
-    """
-    try:
-        data = json.loads(zlib.decompress(raw, 31) if raw[:2] == b"\x1f\x8b" else raw)
-    except (zlib.error, ValueError, RecursionError) as error:
-        raise MalformedCertificate(f"not a complete gzip or JSON file: {error}") from None
-    _expect(isinstance(data, dict) and data.get("format") == FORMAT, "format", f"the text {FORMAT!r}")
-    _expect(data.get("version") == VERSION, "version", str(VERSION))
-    bits, exponent, steps = (data.get(name) for name in ("bits", "time_exponent", "steps"))
-    _expect(type(bits) is int and 16 <= bits <= MAX_BITS, "bits", f"an integer from 16 to {MAX_BITS}")
-    _expect(type(exponent) is int and abs(exponent) <= 60, "time_exponent", "an integer from -60 to 60")
-    times, length = (_doubles(data, name, (-1,)) for name in ("times", "length"))
-    _expect(times[:1] >= 0 and np.all(np.diff(times) > 0), "times", "ascending numbers ≥ 0")
-    _expect(0 < len(length) <= MAX_BODIES and np.all(length >= 0), "length", f"1 to {MAX_BODIES} numbers ≥ 0")
-    arrays = {name: _doubles(data, name, shape if name == "gravity" else (len(length), *shape))
-              for name, (shape, _) in SHAPES.items()}  # fmt: skip
-    _expect(np.all(arrays["mass"] > 0), "mass", "positive numbers")
-    _expect(np.all(arrays["inertia"] == arrays["inertia"].mT), "inertia", "symmetric matrices")
-    _expect(isinstance(steps, list) and len(steps) > 0, "steps", "a list of steps")
-    size = 7 * len(length) + 6 * int(np.sum(length > 0))
-    for k, step in enumerate(steps):
-        fits = isinstance(step, list) and len(step) == 1 + size and type(step[0]) is int and step[0] > 0
-        _expect(fits, f"steps[{k}]", f"a positive length, then {size} lists of coefficients")
-        fits = all(type(x) is list and len(x) <= MAX_TERMS and {*map(type, x)} <= {int} for x in step[1:])
-        _expect(fits, f"steps[{k}]", f"lists of at most {MAX_TERMS} integers")
-    return Certificate(arrays, times.tolist(), exponent, bits, steps)
-
-
-def _expect(holds: Any, field: str, valid: str) -> None:
-    _require(holds, f"{field}: expected {valid}", MalformedCertificate)
-
-
-def _doubles(data: dict[str, Any], field: str, shape: tuple[int, ...]) -> Array:
-    """Array of doubles from nested lists of hexadecimal texts; the shape (-1,) stands for any length."""
-    try:
-        texts = np.array(data.get(field), dtype=object)
-        numbers = np.array([float.fromhex(text) for text in texts.ravel()]).reshape(texts.shape)
-    except (ValueError, TypeError, OverflowError):
-        numbers = np.array(np.nan)
-    fits = numbers.ndim == 1 if shape == (-1,) else numbers.shape == shape
-    sound = np.isfinite(numbers) & ((numbers == 0) | (np.abs(numbers) > 1e-100))  # exact in any unit
-    _expect(fits and np.all(sound), field, f"finite doubles as '0x1.8p+0', shape {shape}, not below 1e-100")
-    return numbers
+        raise Rejected(failure)
 
 
 # --- functions of s -----------------------------------------------------------------------------------
@@ -257,12 +197,17 @@ def _join(parts: Sequence[_Series], axis: int = 0) -> _Series:
     return _Series(np.concatenate([x.c for x in parts], 1 + axis), np.concatenate([x.r for x in parts], axis))
 
 
+def _recurrence(J: Array, first: Array, power: int) -> Array:
+    """Coefficients P_0, P_1, … with k**power P_k = J_0 P_(k−1) + J_1 P_(k−2) + … and P_0 given."""
+    P = [first]
+    for k in range(1, DEGREE + 1):
+        P.append(sum(J[i] @ P[k - 1 - i] for i in range(k)) / k**power)
+    return np.array(P)
+
+
 def _inverse_guess(a: Array) -> Array:
     """Coefficients of the inverse of a matrix polynomial."""
-    series = [np.linalg.inv(a[0])]
-    for k in range(1, DEGREE + 1):
-        series.append(-series[0] @ sum(a[i] @ series[k - i] for i in range(1, k + 1)))
-    return np.array(series)
+    return _recurrence(-np.linalg.inv(a[0]) @ a[1:], np.linalg.inv(a[0]), 0)
 
 
 def _inverse_error(a: _Series, b: _Series, failure: str) -> float:
@@ -275,6 +220,18 @@ def _inverse_error(a: _Series, b: _Series, failure: str) -> float:
 def _vector(x: Iterable[Any]) -> Array:
     """Array of objects, also of those that NumPy would take for sequences."""
     return np.fromiter(x, object)
+
+
+def _times(a: Array, b: Array) -> Any:
+    """Return the product of quaternions."""
+    return _vector([a[0] * b[0] - a[1:] @ b[1:], *(a[:1] * b[1:] + b[:1] * a[1:] + np.cross(a[1:], b[1:]))])
+
+
+def _turned(x: Array, axis: int, cosine: Array, sine: Array) -> Array:
+    """Components, the rows of x, in axes turned about one of them."""
+    (j, k), found = np.add.outer([1, 2], [axis]) % 3, x.copy()
+    found[j], found[k] = x[j] * cosine + x[k] * sine, x[k] * cosine - x[j] * sine
+    return found
 
 
 def _rotation(p: Array) -> Array:
@@ -292,60 +249,114 @@ def _rotation(p: Array) -> Array:
 class _Mechanism:
     """The model in the certificate's unit of time; vectors are arrays of balls, polynomials or `_Series`."""
 
-    def __init__(self, certificate: Certificate, number: Callable[[float], Any]) -> None:
-        self.unit = number(2.0) ** certificate.time_exponent
-        self.data: dict[str, Any] = {  # exact: powers of two
-            name: np.frompyfunc(number, 1, 1)(x) * self.unit ** -SHAPES[name][1]
-            for name, x in certificate.data.items()
-        }
-        self.rods = certificate.data["length"] > 0
-        self.has_drag = bool(np.any(certificate.data["drag_force"]))
-        self.n = len(self.rods)
-        self.nq, self.nv = (int(size * self.n + 3 * np.sum(self.rods)) for size in (4, 3))
-
-    def split(self, x: Sequence[Any], size: int) -> tuple[list[Array], list[Array]]:
-        """Per body its part (size,) of q, v or v̇ and that of its rod (3,), zero for a ball joint."""
-        own, of_rod, rest = [], [], list(x)
-        for rod in self.rods:
-            own.append(_vector(rest[:size]))
-            of_rod.append(_vector(rest[size : size + 3] if rod else [rest[0] * 0] * 3))
-            rest = rest[size + 3 * rod :]
-        return own, of_rod
-
-    def centres(self, A: list[Array], rod: list[Array], turn: Callable[[int, Array], Array]) -> list[Array]:
-        """Positions, velocities or accelerations of the centres of mass, from u, u̇ or ü and A turn(k, s)."""
-        found: list[Array] = []
-        for k in range(self.n):
-            tip = found[-1] + A[k - 1] @ turn(k - 1, self.data["distal"][k - 1]) if found else 0 * rod[0]
-            hang = tip + rod[k] * self.data["length"][k] if self.rods[k] else tip
-            found.append(hang - A[k] @ turn(k, self.data["proximal"][k]))
-        return found
-
-    def velocities(self, A: list[Array], w: list[Array], udot: list[Array]) -> list[Array]:
-        """Return ṙ of the centres of mass."""
-        return self.centres(A, udot, lambda k, s: np.cross(w[k], s))
+    def __init__(self, file: Certificate, number: Callable[[Any], Any]) -> None:
+        self.far, self.springs, self.kind = file.far, file.springs, file.kind
+        self.nq, self.nv, self.unit = file.nq, file.nv, arb(2) ** file.time_exponent
+        # exact, because the unit is a power of two
+        data: Any = {x: np.frompyfunc(arb, 1, 1)(c) / self.unit ** SHAPES[x][1] for x, c in file.data.items()}
+        data["axes"] = np.array([[_rotation(q) / (q @ q) for q in pair] for pair in data["turn"]])
+        _require(all(x.rel_accuracy_bits() > 60 for x in data["axes"].ravel()), "turn: axes too inexact")
+        self.data: dict[str, Any] = {name: np.frompyfunc(number, 1, 1)(x) for name, x in data.items()}
+        self.joints = [JOINTS[kind] for kind in file.kind]
+        self.needs_rates = bool(np.any(file.data["drag_force"]) or file.springs)
 
     def equations(self, y: Sequence[Any], vdot: Sequence[Any]) -> tuple[list[Any], list[Any]]:
         """Return q̇ (nq,) and the residual G(y, v̇) (nv,)."""
-        (p, u), (w, udot) = self.split(y[: self.nq], 4), self.split(y[self.nq :], 3)
-        wdot, uddot = self.split(vdot, 3)
-        A = [_rotation(x) for x in p]
-        a = self.centres(A, uddot, lambda k, s: np.cross(wdot[k], s) + np.cross(w[k], np.cross(w[k], s)))
-        v = self.velocities(A, w, udot) if self.has_drag else a
-        qdot, residual, F = list[Any](), list[Any](), 0 * a[0]
-        for k in reversed(range(self.n)):
-            length, m, J, s, t, f, n, c, d = (self.data[name][k] for name in list(SHAPES)[1:10])
-            below, F = F, F + (a[k] - self.data["gravity"]) * m - f
-            F = F + v[k] * c if self.has_drag else F
-            G = J @ wdot[k] + np.cross(w[k], J @ w[k]) + w[k] * d - n
-            G = [*(G - np.cross(s, A[k].T @ F) + np.cross(t, A[k].T @ below))]
-            half = w[k] * 0.5
-            rate = [-(p[k][1:] @ half), *(half * p[k][:1] + np.cross(p[k][1:], half))]
-            if self.rods[k]:
-                along = (u[k] @ uddot[k] + udot[k] @ udot[k]) * m * length - u[k] @ F
-                G, rate = [*G, *(F + u[k] * _vector([along]))], [*rate, *udot[k]]
-            qdot, residual = rate + qdot, G + residual
+        z, data, qdot, residual = _Motion(self, y, vdot), self.data, list[Any](), list[Any]()
+        a, v = z.centres(2), z.centres(1) if self.needs_rates else []
+        F, N = [z.zero] * len(z.A), [z.zero] * len(z.A)  # of springs and of the joints beyond, on each body
+        for j, (d, ddot) in enumerate(zip(z.spans(0), z.spans(1), strict=True)):
+            k, c, rest = (data[f"spring_{name}"][j] for name in ("stiffness", "damping", "length"))
+            inverse = y[self.nq - len(self.springs) + j]
+            change = inverse * inverse * (d @ ddot)
+            qdot.append(-(inverse * change))
+            pull = d * _vector([(inverse * -rest + 1) * k + change * c])
+            for b, s, f in zip(self.springs[j], data["spring_point"][j], (pull, -pull), strict=True):
+                F[b], N[b] = F[b] - f, N[b] - np.cross(s, z.A[b].T @ f)
+        for k, far in reversed([*enumerate(self.far)]):
+            m, J, (_, s), f, n, c, d, length, armature, damping = (data[x][k] for x in list(SHAPES)[1:11])
+            A, B, w, wdot, axes, rows = z.A[k], z.A[far], z.w[k], z.wdot[k], data["axes"][k], list[Any]()
+            (p, u, x, _), (_, udot, xdot, _), (_, uddot, xddot, _) = (part[k] for part in z.parts)
+            F[k] = F[k] + (a[k] - data["gravity"]) * m - f + (v[k] * c if self.needs_rates else 0)
+            N[k] = N[k] + J @ wdot + np.cross(w, J @ w) + w * d - n - np.cross(s, A.T @ F[k])
+            rates, moment = [*udot, *xdot], z.zero
+            if len(p):
+                rates, rows = [*_times(p, _vector([0, *(w * 0.5)])), *rates], [*N[k]]
+                if armature[0] != 0 or damping[0] != 0:
+                    w0, wdot0, moment = A.T @ (B @ z.w[far]), A.T @ (B @ z.wdot[far]), B.T @ (A @ N[k])
+                    rows = [*(N[k] + (wdot - wdot0 - np.cross(w0, w)) * armature[0] + (w - w0) * damping[0])]
+            else:
+                moment = axes[1].T @ N[k]
+                for i, (cosine, sine), *_ in reversed(z.turns[k]):
+                    rows, moment = [moment[i], *rows], _turned(moment, i, cosine, -sine)
+                along, moment = axes[0][:, 2] @ (B.T @ F[k]), axes[0] @ moment
+                rows = [along] * self.joints[k][2] + rows
+                every = zip(rows, x, xdot, xddot, *(data[e][k] for e in list(SHAPES)[9:14]), strict=False)
+                rows = [g + ẍ * a + ẋ * c + (x - x0) * k - τ for g, x, ẋ, ẍ, a, c, k, x0, τ in every]
+            if len(u):
+                along = (u @ uddot + udot @ udot) * m * length - u @ F[k] if self.kind[k] == "rod" else 0
+                rows += [*(F[k] + u * _vector([along]))]
+            if far >= 0:
+                F[far], N[far] = F[far] + F[k], N[far] + moment + np.cross(z.tips[k][0], B.T @ F[k])
+            rates += [x for _, (cos, sin), ẋ, _ in z.turns[k] for x in (-(sin * ẋ)[0], (cos * ẋ)[0])]
+            qdot, residual = rates + qdot, rows + residual
         return qdot, residual
+
+
+class _Motion:
+    """A state and v̇; of each body, the world last as body −1, its attitude A, and ω and ω̇ in its axes."""
+
+    def __init__(self, mechanism: _Mechanism, y: Sequence[Any], vdot: Sequence[Any]) -> None:
+        self.mechanism, self.zero, nq = mechanism, _vector([y[0] * 0] * 3), mechanism.nq
+        self.parts = [self._split(*x) for x in ((y[:nq], 4, 2), (y[nq:], 3, 0), (vdot, 3, 0))]  # of q, v, v̇
+        world: Any = (np.eye(3, dtype=object), 0, 0)
+        self.A, self.w, self.wdot = ([self.zero + x] * (1 + len(mechanism.far)) for x in world)
+        self.tips, self.turns = list[Any](), list[Any]()  # of each joint, see `arm` and below
+        for k, far in enumerate(mechanism.far):
+            p, w, wdot = (part[k][0] for part in self.parts)
+            (first, last), (*_, slide, axes) = mechanism.data["axes"][k], mechanism.joints[k]
+            tip = [first[:, 2] * part[k][2][:1] if slide else 0 for part in self.parts]
+            self.tips.append([tip[0] + mechanism.data["point"][k, 0], *tip[1:]])
+            rates = (part[k][2][slide:].reshape(-1, 1) for part in self.parts[1:])
+            self.turns.append([*zip(axes, self.parts[0][k][3].reshape(-1, 2, 1), *rates, strict=True)])
+            if len(p):
+                self.A[k], self.w[k], self.wdot[k] = _rotation(p), w, wdot
+                continue
+            A, w, dw = (first.T @ x for x in (self.A[far].T, self.w[far], self.wdot[far]))
+            for axis, (cosine, sine), rate, acc in self.turns[k]:
+                A, w, dw = (_turned(x, axis, cosine, sine) for x in (A, w, dw))
+                i, j, m = np.add.outer([0, 1, 2], [axis]) % 3
+                dw[i], dw[j], dw[m], w[i] = dw[i] + acc, dw[j] + w[m] * rate, dw[m] - w[j] * rate, w[i] + rate
+            self.A[k], self.w[k], self.wdot[k] = (last @ A).T, last @ w, last @ dw
+
+    def _split(self, x: Iterable[Any], of_p: int, of_turn: int) -> list[list[Array]]:
+        """Per joint its parts of q, v or v̇: of p, of u, of x, and cosine and sine of each turn."""
+        rest, joints = iter(x), self.mechanism.joints
+        sizes = ((of_p * p, 3 * u, slide + len(turns), of_turn * len(turns)) for u, p, slide, turns in joints)
+        return [[_vector(islice(rest, n)) for n in own] for own in sizes]
+
+    def arm(self, k: int, level: int, s: Any, rate: Any = 0, change: Any = 0) -> Any:
+        """From the centre of a body to the point s, which moves in it: place, velocity or acceleration."""
+        turn = np.cross(self.w[k], s) + rate if level else s
+        return turn if level < 2 else np.cross(self.wdot[k], s) + np.cross(self.w[k], turn + rate) + change
+
+    def centres(self, level: int) -> list[Any]:
+        """Places, velocities or accelerations of the centres of mass, the world's last."""
+        found, data = [self.zero] * len(self.A), self.mechanism.data
+        for k, far in enumerate(self.mechanism.far):
+            tip, reach = self.tips[k], self.parts[level][k][1]
+            hang = found[far] + (self.A[far] @ self.arm(far, level, *tip) if far >= 0 else tip[level])
+            hang = hang + reach * data["length"][k] if len(reach) else hang
+            found[k] = hang - self.A[k] @ self.arm(k, level, data["point"][k, 1])
+        return found
+
+    def spans(self, level: int) -> list[Any]:
+        """Of each spring d or its rate, from the first point to the second."""
+        springs = self.mechanism.springs
+        centres = self.centres(level) if springs else []
+        at = [[centres[b] + self.A[b] @ self.arm(b, level, s) for b, s in zip(*ends, strict=True)]
+              for ends in zip(springs, self.mechanism.data["spring_point"], strict=True)]  # fmt: skip
+        return [end - start for start, end in at]
 
 
 # --- one step -----------------------------------------------------------------------------------------
@@ -363,9 +374,8 @@ def _variables(coefficients: list[Array], radii: Array) -> list[_Series]:
     n, found = len(coefficients), []
     for i, row in enumerate(coefficients):
         x = _constant(np.eye(1, 1 + n, 1 + i))
-        low, above = row[: DEGREE + 1], row[DEGREE + 1 :]
-        x.c[: len(low), 0, 0] = low
-        found.append(_Series(x.c, np.eye(1, 1 + n) * _up(radii[i] + np.abs(above).sum()), 1))
+        x.c[: len(row), 0, 0] = row[: DEGREE + 1]
+        found.append(_Series(x.c, np.eye(1, 1 + n) * _up(radii[i] + np.abs(row[DEGREE + 1 :]).sum()), 1))
     return found
 
 
@@ -384,23 +394,13 @@ def _linearise(mechanism: _Mechanism, rows: list[Array], tube: float, g: Array) 
     raise Rejected("inequality (4): the accelerations leave their tube")
 
 
-def _fundamental_guess(J: Array, T: Array) -> Array:
-    """Power series of P′ = J P, P(0) = T."""
-    P = [T]
-    for k in range(DEGREE):
-        P.append(sum(J[i] @ P[k - i] for i in range(k + 1)) / (k + 1))
-    return np.array(P)
-
-
-def _prove_step(
-    mechanism: _Mechanism, rows: list[Array], h: float, defect: tuple[Array, Array], T: Array, rho: float
-) -> tuple[_Series, float]:
+def _prove_step(mechanism: _Mechanism, rows: list[Array], h: float, defect: Any, T: Array, rho: float) -> Any:
     """(3)–(6): P and ρ⁺."""
     q, v, n = slice(mechanism.nq), slice(mechanism.nq, None), len(T)
     tube = max(MIN_TUBE, 1024 * float(np.linalg.norm(T)) * rho)
     slopes, C, theta = _linearise(mechanism, rows, tube, defect[1])
     J = np.concatenate([slopes.c[:, q, :n], -_convolution(C.c, slopes.c[:, v, :n])[: DEGREE + 1]], 1)
-    P = _Series(_fundamental_guess(J * h, T))
+    P = _Series(_recurrence(J * h, T, 1))  # P′ = h J P
     Phi = _Series(_inverse_guess(P.c))
     derivative = _Series(np.roll(P.c * np.arange(DEGREE + 1.0)[:, None, None], -1, 0), roundings=1)
     product = slopes @ _join([P * h, derivative.block(v)])
@@ -417,10 +417,7 @@ def _prove_step(
 
 def _evaluate(P: _Series, s: float) -> _Series:
     """P(s), by Horner's rule, where s is rounded once."""
-    value = P.c[DEGREE]
-    for coefficient in P.c[DEGREE - 1 :: -1]:
-        value = value * s + coefficient
-    return _Series(_constant(value).c, _up(4 * DEGREE * ROUNDING * P.total))
+    return _Series(_constant(np.polyval(P.c[::-1], s)).c, _up(4 * DEGREE * ROUNDING * P.total))
 
 
 def _next_ellipsoid(X: _Series, rho: float, jump: Array) -> tuple[Array, float]:
@@ -508,21 +505,30 @@ def _rounded_coefficients(rows: list[list[int]], nq: int, length: int, bits: int
 def _initial_values(exact: _Mechanism) -> list[Any]:
     """y(0), normalised, in the certificate's unit of time."""
     q, v = list[Any](), list[Any]()
-    for k, rod in enumerate(exact.rods):
-        p, w, u, udot = (exact.data[name][k] for name in ("p", "omega", "u", "udot"))
-        q, v = [*q, *(p / (p @ p).sqrt())], [*v, *w]
-        if rod:
+    for k, (vector, attitude, slide, turns) in enumerate(exact.joints):
+        p, w, u, udot, x, xdot = (exact.data[name][k] for name in ("p", "omega", "u", "udot", "x", "xdot"))
+        if exact.kind[k] == "rod":
             u = u / (u @ u).sqrt()
-            q, v = [*q, *u], [*v, *(udot - u * (u @ udot))]
-    return [*q, *v]
+            udot = udot - u * (u @ udot)
+        scalars = slide + len(turns)
+        q += [*(p / (p @ p).sqrt() if attitude else []), *u[: 3 * vector], *x[:scalars]]
+        q += [f for angle in x[slide:scalars] for f in (angle.cos(), angle.sin())]
+        v += [*w[: 3 * attitude], *udot[: 3 * vector], *xdot[:scalars]]
+    motion = _Motion(exact, [*q, *[arb(0)] * len(exact.springs), *v], v)
+    return [*q, *(1 / (d @ d).sqrt() for d in motion.spans(0)), *v]
 
 
 def _sample(exact: _Mechanism, y: list[Any], P: _Series, rho: float, s: Fraction) -> tuple[list[Array], ...]:
     """Balls r, p, ṙ, ω′ of every body at s; |p| = |u| = 1, so that nothing is normalised."""
     spread = _up(_norm(_evaluate(P, s.numerator / s.denominator).size, axis=1) * rho)
-    at = arb(s.numerator) / s.denominator
-    z = [poly(at) + arb(0, float(e)) for poly, e in zip(y, spread, strict=True)]
-    (p, u), (w, udot) = exact.split(z[: exact.nq], 4), exact.split(z[exact.nq :], 3)
-    A = [_rotation(x) for x in p]
-    r, v = exact.centres(A, u, lambda _, s: s), exact.velocities(A, w, udot)
-    return r, p, [x / exact.unit for x in v], [x / exact.unit for x in w]
+    y = [f(arb(s.numerator) / s.denominator) + arb(0, float(e)) for f, e in zip(y, spread, strict=True)]
+    z = _Motion(exact, y, y[exact.nq :])
+    p = [_vector([arb(1), arb(0), arb(0), arb(0)])] * (1 + len(exact.far))
+    for k, (far, (own, _, x, _)) in enumerate(zip(exact.far, z.parts[0], strict=True)):
+        before, after = (q / (q @ q).sqrt() for q in exact.data["turn"][k])
+        p[k] = _times(p[far], before)
+        for (axis, *_), half in zip(z.turns[k], x[exact.joints[k][2] :] / 2, strict=True):
+            p[k] = _times(p[k], _vector([half.cos(), *(np.eye(3, dtype=object)[axis] * half.sin())]))
+        p[k] = own if len(own) else _times(p[k], after * [1, -1, -1, -1])
+    v, w = ([x / exact.unit for x in part[:-1]] for part in (z.centres(1), z.w))
+    return z.centres(0)[:-1], p[:-1], v, w

@@ -14,7 +14,7 @@ from plumbline.model.datatypes import Array, Model, State, Trajectory
 from plumbline.model.kinematics import quaternion_rate
 from plumbline.processes.user_cache import CheckedFiles, DamagedFile, content_key, user_cache_folder
 from plumbline.truth import import_truth_tool
-from plumbline.truth.enclosure import checked_numbers
+from plumbline.truth.enclosure import checked_numbers, checked_topology
 
 if TYPE_CHECKING:
     from plumbline.truth.enclosure_checker import Enclosure
@@ -121,6 +121,7 @@ def _name(model: Model, state: State, times: Array) -> str:
     numbers: dict[str, Any] = checked_numbers(model, state) | {"times": times}
     arrays = [np.ascontiguousarray(x, dtype=float).tobytes() for x in numbers.values()]
     code = [
-        Path(__file__).with_name(name).read_bytes() for name in ("enclosure_checker.py", Path(__file__).name)
+        Path(__file__).with_name(name).read_bytes()
+        for name in ("enclosure_checker.py", "enclosure_file.py", Path(__file__).name)
     ]
-    return f"{content_key(*code, *arrays)}.proof"
+    return f"{content_key(*code, repr(checked_topology(model)), *arrays)}.proof"

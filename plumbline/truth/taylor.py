@@ -24,7 +24,7 @@ from plumbline.model.datatypes import Array, EngineFailure, Model, State
 from plumbline.model.kinematics import forward_kinematics
 from plumbline.processes.processor import processor_features
 from plumbline.processes.user_cache import content_key, recall, remember
-from plumbline.truth import TruthUnavailable, import_truth_tool, taylor_tree
+from plumbline.truth import import_truth_tool, taylor_tree
 from plumbline.truth.taylor_tree import Topology, rotation_matrix, vector
 
 Precision = Literal["double", "extended", "quad", "octuple"]
@@ -89,16 +89,14 @@ def taylor_series(
 
     Yields:
         Per coordinate its Taylor coefficients with respect to time, from the power 0 on, and whether it is a
-        rate: p and u of each body, then ω′ and u̇ of each body; numbers of mpmath.  The caller sends the
-        values around which to expand next, in the same order.
+        rate: p, u or r, and x of each body, then ω′, u̇ or ṙ, and ẋ of each body; numbers of mpmath.  The
+        caller sends the values around which to expand next, in the same order.
 
     Raises:
-        TruthUnavailable: heyoka (Linux only) or mpmath is not installed, or the mechanism is no chain.
+        TruthUnavailable: heyoka (Linux only) or mpmath is not installed, or a ball joint has a spring.
         EngineFailure: a step fails, or heyoka was built without that precision.
 
     """
-    if not model.is_chain:
-        raise TruthUnavailable("motions are proved of chains of rods and balls only")
     mp = import_truth_tool("mpmath")
     integrator, number = _prepared_integrator(model, state, precision, order)
     places = _positions_then_rates(model)
@@ -112,15 +110,17 @@ def taylor_series(
 
 
 def _positions_then_rates(model: Model) -> list[tuple[int, bool]]:
-    """Places in heyoka's state of p and u of all bodies, then of ω′ and u̇, and whether each is a rate."""
+    """Places in heyoka's state of p, u or r, x of all bodies, then of rates, and whether each is one."""
     q: list[int] = []
     v: list[int] = []
     first = 0
-    for rod in model.rods:
-        own = first + 6 * bool(rod)
-        q += [*range(own, own + 4), *range(first, min(first + 3, own))]
-        v += [*range(own + 4, own + 7), *range(min(first + 3, own), own)]
-        first = own + 7
+    for kind in model.kind:
+        own: dict[str, list[int]] = {}
+        for name, size in taylor_tree.coordinate_names(kind):
+            own[name] = [*range(first, first + size)]
+            first += size
+        q += [i for name in ("p", "u", "r", "x") for i in own.get(name, [])]
+        v += [i for name in ("omega", "udot", "v", "xdot") for i in own.get(name, [])]
     return [(i, False) for i in q] + [(i, True) for i in v]
 
 

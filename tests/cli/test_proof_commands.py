@@ -128,3 +128,11 @@ def test_the_rounded_motion_is_within_its_radius():
             assert np.linalg.norm([float(x.upper()) for x in error]) <= proof.position_radius[k]
     assert np.all(np.diff(proof.position_radius) >= 0) and proof.position_radius[-1] < 1e-15
     assert 0 < proof.attitude_radius[-1] < 1e-15
+
+
+@pytest.mark.parametrize(
+    "name, reason", [("four-bar", "closed loops are not proved"), ("sprung-ball", "a spring on a ball joint")]
+)
+def test_motions_that_cannot_be_proved_are_refused_with_a_reason(name, reason):
+    result = type_command("prove", "tumbling-ball", name)
+    assert result.exit_code == 2 and reason in " ".join(result.stderr.split())

@@ -16,8 +16,17 @@ import numpy as np
 import pytest
 
 from plumbline.scenario.loader import catalogue, find_scenario_file, load_scenario
+from plumbline.truth import enclosure_file
 from plumbline.truth.certified import certify_state
-from plumbline.truth.enclosure import checked_numbers, load_checker, make_certificate, prove_motion
+from plumbline.truth.enclosure import (
+    checked_numbers,
+    checked_topology,
+    load_checker,
+    make_certificate,
+    prove_motion,
+    reason_not_provable,
+)
+from plumbline.truth.enclosure_file import MalformedCertificate, parse_certificate
 from plumbline.truth.taylor import simulate_taylor
 from plumbline.truth.trajectory import trajectory_truth
 from tests.helpers.mutations import damaged_bytes, damaged_document, limited_time
@@ -34,8 +43,12 @@ TIMES = np.arange(4) * 0.05
 CHAINS = {"ball": [0], "rod": [1], "rod-ball": [1, 0]}
 NAMES = ("r", "p", "v", "omega")
 NARROW = {"r": 100, "p": 10, "v": 100, "omega": 10}  # radius over error; as measured 43, 6, 49, 4
-SMALL_CHAINS = [
-    s for s in (load_scenario(path) for path in catalogue().values()) if s.model.is_chain and s.model.n <= 5
+# every joint but rod and ball, with elements, and a spring between points
+TREES = ("sprung-cylinder", "sprung-universal", "spring-pendulum", "balls-with-rotors")
+PROVABLE = [
+    s
+    for s in (load_scenario(path) for path in catalogue().values())
+    if s.model.n <= 8 and not reason_not_provable(s.model)
 ]
 PUBLISHED = json.loads((Path(__file__).parents[2] / "docs" / "reference-solutions.json").read_text("utf-8"))
 
@@ -48,7 +61,14 @@ class Proofs(dict):
     """Model, state, document of the certificate and enclosure by chain, found when first needed."""
 
     def __missing__(self, name):
-        model, state = chain(CHAINS[name])
+        if name in CHAINS:
+            model, state = chain(CHAINS[name])
+        elif name == "balls-with-rotors":
+            model, state = chain([0, 0])
+            model = replace(model, armature=np.array([[0.3, 0], [0.1, 0]]), damping=np.array([[0.2, 0]] * 2))
+        else:
+            scenario = load_scenario(find_scenario_file(name))
+            model, state = scenario.model, scenario.state
         raw, enclosure = prove_motion(model, state, TIMES)
         self[name] = model, state, json.loads(gzip.decompress(raw)), enclosure
         return self[name]
@@ -60,7 +80,7 @@ def proofs():
 
 
 def enclose(document):
-    return checker.enclose_motion(checker.parse_certificate(json.dumps(document).encode()))
+    return checker.enclose_motion(parse_certificate(json.dumps(document).encode()))
 
 
 def overlap(one, other):
@@ -75,17 +95,24 @@ def overlap(one, other):
 # the parts of the proof
 
 
-def test_the_checker_imports_numpy_flint_and_the_standard_library_only():
-    tree = ast.parse(Path(checker.__file__).read_text(encoding="utf-8"))
+def imported_modules(path):
+    tree = ast.parse(Path(path).read_text(encoding="utf-8"))
     imported = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
-    imported |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
-    standard = {"__future__", "json", "zlib", "collections.abc", "dataclasses", "fractions", "typing"}
-    assert imported == standard | {"numpy", "flint"}
+    return imported | {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
 
 
-def test_the_checker_has_at_most_300_lines_of_code():
+def test_the_checker_imports_numpy_flint_and_the_standard_library_only():
+    """And the file that reads certificates, which imports NumPy and the standard library only."""
+    standard = {"__future__", "collections.abc", "dataclasses", "fractions", "itertools", "typing"}
+    assert imported_modules(checker.__file__) == standard | {"numpy", "flint", enclosure_file.__name__}
+    standard = {"__future__", "json", "zlib", "dataclasses", "typing"}
+    assert imported_modules(enclosure_file.__file__) == standard | {"numpy"}
+
+
+@pytest.mark.parametrize("name, most", [("enclosure_checker", 300), ("enclosure_file", 100)])
+def test_the_checker_has_at_most_300_lines_of_code_and_its_reader_100(name, most):
     """Without docstrings, comments and blank lines."""
-    source = Path(checker.__file__).read_text(encoding="utf-8")
+    source = Path(enclosure_file.__file__).with_name(f"{name}.py").read_text(encoding="utf-8")
     kinds = (ast.Module, ast.ClassDef, ast.FunctionDef)
     nodes = [x for x in ast.walk(ast.parse(source)) if isinstance(x, kinds) and ast.get_docstring(x)]
     documentation = {
@@ -94,7 +121,7 @@ def test_the_checker_has_at_most_300_lines_of_code():
     layout = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
     tokens = [x for x in tokenize.generate_tokens(io.StringIO(source).readline) if x.type not in layout]
     lines = {line for x in tokens if x.string for line in range(x.start[0], x.end[0] + 1)}
-    assert 200 < len(lines - documentation) <= 300
+    assert most / 2 < len(lines - documentation) <= most
 
 
 def draw_series(rng, rows, columns, radius=0.0, positive=False):
@@ -202,7 +229,7 @@ def test_guesses_are_inverses():
     with pytest.raises(checker.Rejected, match="message"):
         checker._inverse_error(inverse, series * 3, "message")
     J = series.c
-    P = checker._fundamental_guess(J, np.eye(3))
+    P = checker._recurrence(J, np.eye(3), 1)
     for k in range(3):  # (k + 1) P_(k+1) = sum of J_i P_(k-i)
         assert np.allclose((k + 1) * P[k + 1], sum(J[i] @ P[k - i] for i in range(k + 1)))
 
@@ -251,7 +278,7 @@ def test_the_equations_hold_for_certified_accelerations(rods):
     model, state = chain(rods, seed=4)
     certified = certify_state(model, state).quantities
     document = json.loads(gzip.decompress(make_certificate(model, state, np.array([0.0, 1e-3]))))
-    certificate = checker.parse_certificate(json.dumps(document).encode())
+    certificate = parse_certificate(json.dumps(document).encode())
     mechanism = checker._Mechanism(certificate, arb)
     with ctx.workprec(100):
         y = [arb_poly([x]) for x in checker._initial_values(mechanism)]
@@ -282,16 +309,16 @@ def rod_and_body_accelerations(model, state, certified):
     return np.array(found)
 
 
-def test_derivatives_of_the_equations_agree_with_differences():
+@pytest.mark.parametrize("name", ["rod-ball", *TREES])
+def test_derivatives_of_the_equations_agree_with_differences(proofs, name):
     """Of the enclosed functions of s, at s = 0; the differences in 200 bits."""
-    model, state = chain([1, 0], seed=5)
-    certificate = checker.parse_certificate(make_certificate(model, state, np.array([0.0, 1e-3])))
-    exactly, rounded = (checker._Mechanism(certificate, number) for number in (arb, float))
-    x = np.random.default_rng(6).normal(size=exactly.nq + 2 * exactly.nv)
-    n = exactly.nq + exactly.nv
-    duals = checker._variables([np.array([c]) for c in x], np.zeros(len(x)))
-    found = [f for part in rounded.equations(duals[:n], duals[n:]) for f in part]
+    certificate = parse_certificate(json.dumps(proofs[name][2]).encode())
     with ctx.workprec(200):
+        exactly, rounded = (checker._Mechanism(certificate, number) for number in (arb, float))
+        x = np.random.default_rng(6).normal(size=exactly.nq + 2 * exactly.nv)
+        n = exactly.nq + exactly.nv
+        duals = checker._variables([np.array([c]) for c in x], np.zeros(len(x)))
+        found = [f for part in rounded.equations(duals[:n], duals[n:]) for f in part]
 
         def value(moved, step):
             y = [arb_poly([arb(float(c)) + (step if j == moved else 0)]) for j, c in enumerate(x)]
@@ -300,12 +327,43 @@ def test_derivatives_of_the_equations_agree_with_differences():
         step = arb(2) ** -100
         at = value(-1, step)
         for f, g in zip(found, at, strict=True):
-            assert abs(arb(float(f.c[0, 0, 0])) - g) < arb(float(f.r[0, 0]))
+            assert abs(arb(float(f.c[0, 0, 0])) - g) <= arb(float(f.r[0, 0]))
             assert f.r[0, 0] < 1e-11 * (1 + f.total[0, 0])
         for i in range(len(x)):
             for f, g, moved in zip(found, at, value(i, step), strict=True):
                 slope = arb(float(f.c[0, 0, 1 + i]))
                 assert abs((moved - g) / step - slope) < arb(float(f.r[0, 1 + i])) + arb(2) ** -60
+
+
+@pytest.mark.parametrize("name", TREES)
+def test_numbers_of_a_tree_off_by_one_ulp_give_wider_balls_that_are_true(proofs, name):
+    """Every number of joints, elements and springs that is not zero must be part of the equations."""
+    model, state, document, _ = proofs[name]
+    fields = ["armature", "damping", "stiffness", "rest", "effort", "x", "xdot", "point", "spring_point"]
+    fields += ["spring_length", "spring_stiffness", "spring_damping"]
+    for field in fields + ["turn"] * (model.kind[-1] not in ("ball", "free")):
+        record = state if field in ("x", "xdot") else model
+        array = getattr(record, field).copy()
+        last = array[-1:]  # of the joints, not a free body's
+        if not np.any(last):
+            continue
+        largest = np.unravel_index(np.argmax(np.abs(last)), last.shape)
+        last[largest] = np.nextafter(last[largest], np.inf)
+        if field == "turn":
+            last[0, 0, 1] += 2.0**-52  # the largest may be the only one, and is normalised
+        changed = replace(record, **{field: array})
+        pair = (model, changed) if record is state else (changed, state)
+        numbers = {key: hexadecimal(x) for key, x in checked_numbers(*pair).items()}
+        try:
+            found = enclose(document | numbers)
+        except checker.Rejected:
+            continue
+        assert found.radius("r") + found.radius("p") > 1e-18, f"{field} makes no difference"
+        assert overlap(found, prove_motion(*pair, TIMES)[1]), field
+
+
+def hexadecimal(x):
+    return np.frompyfunc(float.hex, 1, 1)(np.asarray(x, dtype=float)).tolist()
 
 
 # what an enclosure contains
@@ -333,7 +391,7 @@ def test_enclosures_are_as_narrow_as_they_were(proofs, name, radii):
         assert 0 < proofs[name][3].radius(quantity) < 2 * radius
 
 
-@pytest.mark.parametrize("name", CHAINS)
+@pytest.mark.parametrize("name", [*CHAINS, *TREES])
 def test_enclosures_of_two_precisions_overlap(proofs, name):
     model, state, _, enclosure = proofs[name]
     _, finer = prove_motion(model, state, TIMES, precision="octuple")
@@ -341,30 +399,31 @@ def test_enclosures_of_two_precisions_overlap(proofs, name):
     assert overlap(enclosure, finer)
 
 
-@pytest.mark.parametrize("name", CHAINS)
+@pytest.mark.parametrize("name", [*CHAINS, *TREES])
 def test_a_motion_from_perturbed_initial_values_stays_inside(proofs, name):
     """The candidate starts 1e-12 beside the state of the file: the balls must reach back to the motion."""
     model, state, document, enclosure = proofs[name]
-    moved = replace(state, omega=state.omega + 1e-12 * np.random.default_rng(7).normal(size=(model.n, 3)))
+    moves = 1e-12 * np.random.default_rng(7).normal(size=(model.n, 5))
+    moved = replace(state, omega=state.omega + moves[:, :3], xdot=state.xdot + moves[:, 3:])
     _, other = prove_motion(model, moved, TIMES)
     candidate = json.loads(gzip.decompress(make_certificate(model, moved, TIMES)))
     found = enclose(document | {"steps": candidate["steps"]})
     assert 1e-13 < found.radius("omega") < 1e-10
     assert overlap(found, enclosure) and overlap(found, other)
     assert not overlap(enclosure, other)
-    for quantity in NAMES:  # a bound that is wider than it need be is true, but a mistake
+    for quantity in NAMES if name in CHAINS else ():  # a bound wider than it need be is true, but a mistake
         pairs = zip(getattr(found, quantity).ravel(), getattr(enclosure, quantity).ravel(), strict=True)
         error = max(abs(float((x - y).mid())) for x, y in pairs)
         assert error < found.radius(quantity) < NARROW[quantity] * error
 
 
-@pytest.mark.parametrize("name", ["double-tumbling-balls", "tumbling-rod"])
+@pytest.mark.parametrize("name", ["double-tumbling-balls", "tumbling-rod", *TREES[:3], "loaded-tree"])
 def test_the_truth_of_runs_is_within_its_claimed_uncertainty(name):
     check_present_truth(load_scenario(find_scenario_file(name)), 0.3)
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("scenario", SMALL_CHAINS, ids=lambda s: s.name)
+@pytest.mark.parametrize("scenario", PROVABLE, ids=lambda s: s.name)
 def test_the_truth_of_every_small_scenario_is_within_its_claimed_uncertainty(scenario):
     check_present_truth(scenario, scenario.duration)
 
@@ -383,7 +442,7 @@ def check_present_truth(scenario, duration):
 
 
 @pytest.mark.full
-@pytest.mark.parametrize("scenario", [s for s in SMALL_CHAINS if s.model.n <= 2], ids=lambda s: s.name)
+@pytest.mark.parametrize("scenario", [s for s in PROVABLE if s.model.n <= 2], ids=lambda s: s.name)
 def test_enclosures_of_small_scenarios_in_two_precisions_overlap_at_every_sample(scenario):
     found = (
         prove_motion(scenario.model, scenario.state, scenario.times, precision=x)[1]
@@ -400,6 +459,7 @@ def test_published_solutions_are_proved_again_up_to_their_first_time(name):
     assert record["doubles"] == {
         key: np.frompyfunc(float.hex, 1, 1)(x).tolist() for key, x in numbers.items()
     }
+    assert record == record | checked_topology(scenario.model)
     assert record["times"] == [1, 2, 5, 10] and max(record["radius"]) < 1e-15
     _, found = prove_motion(scenario.model, scenario.state, np.array(record["times"][:1]))
     with ctx.workprec(200):
@@ -425,7 +485,7 @@ def true_enclosure(document, proof):
     return "wider"
 
 
-@pytest.mark.parametrize("name", CHAINS)
+@pytest.mark.parametrize("name", [*CHAINS, *TREES])
 @pytest.mark.parametrize("bits, expected", [(20, "wider"), (109, "reject")])
 @pytest.mark.parametrize("power", [0, 1, 5])
 def test_a_wrong_coefficient_is_rejected_or_covered(proofs, name, bits, expected, power):
@@ -436,7 +496,7 @@ def test_a_wrong_coefficient_is_rejected_or_covered(proofs, name, bits, expected
     assert (found == "wider") == (expected == "wider"), found
 
 
-@pytest.mark.parametrize("field", ["mass", "inertia", "proximal", "gravity", "drag_force", "p", "omega"])
+@pytest.mark.parametrize("field", ["mass", "inertia", "point", "gravity", "drag_force", "p", "omega"])
 def test_a_number_that_is_off_by_one_ulp_gives_wider_balls_that_are_true(proofs, field):
     """The balls must contain the motion of the file's own numbers: proved from a candidate of them."""
     model, state, document, _ = proofs["rod-ball"]
@@ -444,7 +504,7 @@ def test_a_number_that_is_off_by_one_ulp_gives_wider_balls_that_are_true(proofs,
     array = getattr(record, field).copy()
     largest = np.unravel_index(np.argmax(np.abs(array)), array.shape)  # of an inertia, on the diagonal
     array[largest] = np.nextafter(array[largest], np.inf)
-    changed = replace(state, **{field: array}) if record is state else model.changed(**{field: array})
+    changed = replace(state, **{field: array}) if record is state else replace(model, **{field: array})
     pair = (model, changed) if record is state else (changed, state)
     raw, right = prove_motion(*pair, TIMES)
     own = json.loads(gzip.decompress(raw))
@@ -464,7 +524,7 @@ def test_a_missing_step_is_rejected(proofs):
 def test_the_bound_of_the_defect_holds_and_counts_every_power(proofs):
     """Of the whole polynomials: at the end of a step all terms of a positive one count in full."""
     _, _, document, _ = proofs["ball"]
-    certificate = checker.parse_certificate(json.dumps(document).encode())
+    certificate = parse_certificate(json.dumps(document).encode())
     mechanism, (length, *rows) = checker._Mechanism(certificate, arb), certificate.steps[0]
     with ctx.workprec(certificate.bits + checker.GUARD_BITS):
         unit = arb(2) ** -certificate.bits
@@ -521,23 +581,33 @@ def test_a_truncated_file_is_malformed(proofs):
     raw = make_certificate(model, state, TIMES, "a scenario's hash")
     assert json.loads(gzip.decompress(raw))["scenario"] == "a scenario's hash"
     for length in (0, 1, 10, len(raw) // 2, len(raw) - 4):
-        with pytest.raises(checker.MalformedCertificate, match="not a complete gzip or JSON file"):
-            checker.parse_certificate(raw[:length])
+        with pytest.raises(MalformedCertificate, match="not a complete gzip or JSON file"):
+            parse_certificate(raw[:length])
 
 
 @pytest.mark.parametrize(
     "change, message",
     [
         ({"format": "x"}, "format: expected the text"),
-        ({"version": 2}, "version: expected 1"),
+        ({"version": 1}, "version: expected 2"),
         ({"mass": ["nan"]}, "mass: expected finite doubles"),
         ({"mass": [0.5]}, "mass: expected finite doubles"),
         ({"mass": ["-0x1p0"]}, "mass: expected positive"),
         ({"mass": ["0x1p0", "0x1p0"]}, r"mass: expected finite doubles as '0x1.8p\+0', shape \(1,\)"),
         ({"inertia": None}, "inertia: expected finite doubles"),
         ({"inertia": [[["0x1p0"] * 3, ["0x0p0"] * 3, ["0x0p0"] * 3]]}, "inertia: expected symmetric"),
-        ({"length": []}, "length: expected 1 to 100 numbers ≥ 0"),
-        ({"length": ["-0x1p0"]}, "length: expected 1 to 100 numbers ≥ 0"),
+        ({"kind": []}, "kind: expected 1 to 100 of rod, free, ball, .*, not welds alone"),
+        ({"kind": ["weld"]}, "kind: expected 1 to 100 of"),
+        ({"kind": ["spring"]}, "kind: expected 1 to 100 of"),
+        ({"kind": [["ball"]]}, "kind: expected 1 to 100 of"),
+        ({"far": [0]}, "far: expected of each joint -1 or a body before it"),
+        ({"far": [-2]}, "far: expected of each joint -1 or a body before it"),
+        ({"far": [-1, 0]}, "far: expected of each joint -1 or a body before it"),
+        ({"far": [True]}, "far: expected of each joint -1 or a body before it"),
+        ({"springs": [[0, 1]]}, "springs: expected pairs of bodies, -1 the world"),
+        ({"springs": [[0]]}, "springs: expected pairs of bodies, -1 the world"),
+        ({"springs": [[0, -1]]}, "spring_point: expected finite doubles"),
+        ({"stiffness": [["0x1p0", "0x0p0"]]}, "stiffness: expected zeros of rods, balls and free bodies"),
         ({"mass": ["0x1p-400"]}, "mass: expected finite doubles .* not below 1e-100"),
         ({"bits": 110.0}, "bits: expected an integer from 16 to"),
         ({"bits": True}, "bits: expected an integer"),
@@ -550,7 +620,7 @@ def test_a_truncated_file_is_malformed(proofs):
     ],
 )  # fmt: skip
 def test_a_malformed_field_is_named(proofs, change, message):
-    with pytest.raises(checker.MalformedCertificate, match=message):
+    with pytest.raises(MalformedCertificate, match=message):
         enclose(proofs["ball"][2] | change)
 
 
@@ -561,10 +631,10 @@ def test_damaged_documents_are_malformed_or_rejected(proofs):
         damaged = json.dumps(damaged_document(document | {"steps": document["steps"][:1]}, draw)).encode()
         with limited_time():
             try:
-                checker.enclose_motion(checker.parse_certificate(damaged))
-            except (checker.MalformedCertificate, checker.Rejected) as error:
+                checker.enclose_motion(parse_certificate(damaged))
+            except (MalformedCertificate, checker.Rejected) as error:
                 outcomes[type(error)] += 1
-    assert outcomes[checker.MalformedCertificate] and outcomes[checker.Rejected], outcomes
+    assert outcomes[MalformedCertificate] and outcomes[checker.Rejected], outcomes
 
 
 def test_damaged_files_are_malformed_or_read_whole(proofs):
@@ -575,11 +645,11 @@ def test_damaged_files_are_malformed_or_read_whole(proofs):
     for _ in range(100):
         with limited_time():
             try:
-                found = checker.parse_certificate(damaged_bytes(raw, draw))
-            except checker.MalformedCertificate:
+                found = parse_certificate(damaged_bytes(raw, draw))
+            except MalformedCertificate:
                 outcomes["malformed"] += 1
             else:
-                assert found.steps == checker.parse_certificate(raw).steps
+                assert found.steps == parse_certificate(raw).steps
     assert outcomes["malformed"] > 50
 
 
