@@ -148,18 +148,27 @@ def _explain(
         structure = [c for c in structure if c.body in read]
         structure += [Change(MISSING, body.name, "", body, None, body.source) for body in left_out]
     own, theirs = lump_fixed_bodies(moved), lump_fixed_bodies(reading)
-    changes = _single_parts(differences(own, theirs), moved, theirs)
     trial = _Trial(own, theirs, reading, answers, states, bool(structure))
-    without_frames = [change for change in changes if change.field not in FRAME_FIELDS]
-    bases = [changes]
-    if len(without_frames) < len(changes):
-        bases += [without_frames, trial.with_needed_frames(changes)]
-    found = next((f for f in (trial.smallest_with_omissions(base) for base in bases) if f is not None), None)
+    changes = _single_parts(differences(own, theirs), moved, theirs)
+    found = trial.first_that_explains(changes)
+    if found is None:
+        found = trial.smallest([*changes, *_finer(changes, differences(own, theirs, 0.0))])
+    if found is None and len(own.bodies) < len(moved.bodies):
+        # a fixed body that is elsewhere, though everything moves alike
+        trial = _Trial(moved, reading, reading, answers, states, bool(structure))
+        found = trial.smallest(differences(moved, reading))
     if found is None:
         return Explanation(differences=(*structure, *changes))
     remaining = trial.remaining(found, len(answers))
     causes = _causes(title, [*structure, *found], remaining)
     return Explanation(causes, remaining, is_proved=True)
+
+
+def _finer(changes: Sequence[Change], all_: Sequence[Change]) -> list[Change]:
+    """Differences below `RELATIVE_CHANGE`, which count where the larger ones do not explain everything."""
+    known = {(change.body, change.joint, change.field) for change in changes}
+    carriers = {change.carrier for change in changes if change.also is not None}
+    return [c for c in all_ if (c.body, c.joint, c.field) not in known and c.body not in carriers]
 
 
 def _without_missing(model: NeutralModel, reading: NeutralModel) -> NeutralModel:
@@ -236,7 +245,8 @@ def _single_part(parts: Sequence[tuple[NeutralBody, Array, Array]], read: Neutra
     lumped = _merge(parts)
     also = {name: getattr(read, name) for name in ("mass", "center", "inertia")}
     for place, (part, _, A) in enumerate(parts):
-        trials: list[tuple[str, dict[str, Any]]] = [("mass", {"mass": part.mass + read.mass - lumped.mass})]
+        mass = part.mass + read.mass - lumped.mass
+        trials: list[tuple[str, dict[str, Any]]] = [("mass", {"mass": mass})] if mass > 0 else []
         if part.mass:
             moment = read.mass * read.center - lumped.mass * lumped.center
             trials.append(("center", {"center": part.center + A.T @ moment / part.mass}))
@@ -342,6 +352,14 @@ class _Trial:
                     return found
         return None
 
+    def first_that_explains(self, changes: Sequence[Change]) -> list[Change] | None:
+        """Try all changes, then without those of frames, then with the frames that are needed."""
+        without_frames = [change for change in changes if change.field not in FRAME_FIELDS]
+        bases = [changes]
+        if len(without_frames) < len(changes):
+            bases += [without_frames, self.with_needed_frames(changes)]
+        return next((f for f in map(self.smallest_with_omissions, bases) if f is not None), None)
+
     def misplaced(self, changes: Sequence[Change]) -> float:
         """How many bodies are elsewhere at the first state, with the changes made."""
         changed = apply_changes(self.own, self.theirs, changes)
@@ -409,10 +427,15 @@ class _Trial:
 
     def smallest(self, changes: Sequence[Change]) -> list[Change] | None:
         """Drop the changes that are not needed; None where all together do not reproduce the quantities."""
-        count = min(PRUNING_STATES, len(self.answers))
-        needed = list(changes)
-        if self.wrong_at_first(needed):
+        if self.wrong_at_first(changes):
             return None
+        counts = dict.fromkeys((min(PRUNING_STATES, len(self.answers)), len(self.answers)))
+        found = (self._pruned(changes, count) for count in counts)  # what few states do not need, others may
+        return next((one for one in found if one is not None), None)
+
+    def _pruned(self, changes: Sequence[Change], count: int) -> list[Change] | None:
+        """Drop the changes that ``count`` states do not need; None where the rest does not fit all states."""
+        needed = list(changes)
         if self.remaining(needed, count) > 1:
             needed += self.frame_changes(needed, count)
         if not (needed or self.has_structure) or not self.fits(needed, count):
@@ -462,19 +485,20 @@ def _without_armature(
     return replace(truth, quantities=replace(truth.quantities, kinetic_energy=energy))
 
 
-def differences(own: NeutralModel, theirs: NeutralModel) -> list[Change]:
+def differences(own: NeutralModel, theirs: NeutralModel, least: float = RELATIVE_CHANGE) -> list[Change]:
     """List the parameters in which two descriptions differ by more than rounding.
 
     Args:
         own: the neutral model, fixed bodies lumped.
         theirs: an importer's description, fixed bodies lumped.
+        least: relative difference from which on two numbers differ.
 
     Returns:
         The changes that turn the first into the second; the structure of bodies and joints first.
 
     """
     found: list[Change] = []
-    if _differs(own.gravity, theirs.gravity, 0.0):
+    if _differs(own.gravity, theirs.gravity, 0.0, least):
         found.append(Change("gravity", "", "", own.gravity, theirs.gravity, own.gravity_source))
     named = {body.name: body for body in theirs.bodies}
     size = max((float(np.linalg.norm(body.position)) for body in own.bodies), default=0.0)
@@ -486,16 +510,16 @@ def differences(own: NeutralModel, theirs: NeutralModel) -> list[Change]:
         if parents[0][body.name] != parents[1][body.name]:
             names = parents[0][body.name], parents[1][body.name]
             found.append(Change("parent", body.name, "", *names, body.source))
-        found += _joint_changes(body, other, size)
+        found += _joint_changes(body, other, size, least)
         for field in BODY_FIELDS:
             values = getattr(body, field), getattr(other, field)
             scale = size if field in ("position", "center") else 0.0
-            if field == "attitude":
-                is_different = _differs(rotation_matrix(values[0]), rotation_matrix(values[1]), 0.0)
-            elif field in ("position", "attitude") and body.joints and body.joints[0].kind == "free":
+            if field in ("position", "attitude") and body.joints and body.joints[0].kind == "free":
                 is_different = False  # a free joint's coordinates are those of the body frame
+            elif field == "attitude":
+                is_different = _differs(rotation_matrix(values[0]), rotation_matrix(values[1]), 0.0, least)
             else:
-                is_different = _differs(*values, scale)
+                is_different = _differs(*values, scale, least)
             if is_different and not (field == "center" and body.mass == 0 == other.mass):
                 found.append(Change(field, body.name, "", *values, body.fields.get(field, body.source)))
     own_names = {body.name for body in own.bodies}
@@ -536,13 +560,13 @@ def _parent_names(model: NeutralModel) -> dict[str, str]:
     return {b.name: model.bodies[b.parent].name if b.parent >= 0 else "world" for b in model.bodies}
 
 
-def _differs(own: Any, theirs: Any, scale: float) -> bool:
+def _differs(own: Any, theirs: Any, scale: float, least: float = RELATIVE_CHANGE) -> bool:
     a, b = np.asarray(own, float), np.asarray(theirs, float)
     size = max(float(np.max(np.abs(a))), float(np.max(np.abs(b))), scale)
-    return bool(np.max(np.abs(a - b)) > RELATIVE_CHANGE * size)
+    return bool(np.max(np.abs(a - b)) > least * size)
 
 
-def _joint_changes(body: NeutralBody, other: NeutralBody, size: float) -> list[Change]:
+def _joint_changes(body: NeutralBody, other: NeutralBody, size: float, least: float) -> list[Change]:
     """Differences of the joints of one body."""
     found = []
     for joint, read in zip(body.joints, other.joints, strict=True):
@@ -551,9 +575,9 @@ def _joint_changes(body: NeutralBody, other: NeutralBody, size: float) -> list[C
             if field == "spring_reference" and joint.stiffness == 0 == read.stiffness:
                 continue
             if field == "anchor":
-                is_different = _differs(_across(joint), _across(read), size)
+                is_different = _differs(_across(joint), _across(read), size, least)
             else:
-                is_different = _differs(*values, 0.0)
+                is_different = _differs(*values, 0.0, least)
             if is_different:
                 source = joint.fields.get(field, joint.source)
                 found.append(Change(field, body.name, joint.name, *values, source))

@@ -31,7 +31,7 @@ from plumbline.truth.joint_tree import JointTree
 
 ROUNDING_FACTOR = 16.0
 EPSILON = 2.0**-53
-START_BITS, MAX_BITS = 128, 2048
+START_BITS, MAX_BITS = 192, 2048  # 128 are too few for a robot of 30 joints, and hardly faster
 MAX_RELATIVE_RADIUS = 1e-22  # of the magnitudes of the terms
 FLOOR = 2.0**-30  # of the largest entry, where the terms vanish exactly but not in an engine's frames
 MIN_MAGNITUDE = 1e-300  # so that terms that are all zero have a radius to compare with

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from plumbline.truth.certified_model import CertifiedModelQuantities, certify_mo
 
 TINY = float(np.finfo(float).tiny)  # replaces a tolerance of zero, so that an error of zero has the ratio 0
 _SPREAD = 0.5  # m: random displacements are up to this
+MAX_JOINTS = 1000  # whose values are kept
 
 
 @dataclass(frozen=True)
@@ -45,22 +47,27 @@ def model_states(
     """
     if at is not None:
         return (_given_state(model, at),)
-    coordinates = np.zeros((count, 0))
-    velocities = np.zeros((count, 0))
-    for joint, (name, kind) in zip(model.joints, joint_keys(model), strict=True):
-        rng = np.random.default_rng([seed, *f"{kind} {name}".encode()])
-        v = rng.normal(size=(count, {"ball": 3, "free": 6}.get(joint.kind, 1)))
-        q = rng.normal(size=(count, 4))
-        q /= np.linalg.norm(q, axis=1, keepdims=True)
-        place = rng.uniform(-_SPREAD, _SPREAD, (count, 3))
-        x = {
-            "hinge": rng.uniform(-np.pi, np.pi, (count, 1)),
-            "slide": place[:, :1],
-            "ball": q,
-            "free": np.hstack([place, q]),
-        }[joint.kind]
-        coordinates, velocities = np.hstack([coordinates, x]), np.hstack([velocities, v])
+    drawn = [_joint_values(name, kind, count, seed) for name, kind in joint_keys(model)]
+    coordinates = np.hstack([np.zeros((count, 0)), *(x for x, _ in drawn)])
+    velocities = np.hstack([np.zeros((count, 0)), *(v for _, v in drawn)])
     return tuple(map(CanonicalState, coordinates, velocities))
+
+
+@lru_cache(MAX_JOINTS)
+def _joint_values(name: str, kind: str, count: int, seed: int) -> tuple[Array, Array]:
+    """Coordinates and velocities of one joint; the search for causes asks for the same ones many times."""
+    rng = np.random.default_rng([seed, *f"{kind} {name}".encode()])
+    v = rng.normal(size=(count, {"ball": 3, "free": 6}.get(kind, 1)))
+    q = rng.normal(size=(count, 4))
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    place = rng.uniform(-_SPREAD, _SPREAD, (count, 3))
+    x = {
+        "hinge": rng.uniform(-np.pi, np.pi, (count, 1)),
+        "slide": place[:, :1],
+        "ball": q,
+        "free": np.hstack([place, q]),
+    }[kind]
+    return x, v
 
 
 def _given_state(model: NeutralModel, at: Mapping[str, float]) -> CanonicalState:

@@ -116,6 +116,39 @@ def test_mujoco_leaves_out_the_inertia_of_massless_fixed_links(tmp_path):
     assert "robot.urdf:4), fixed to body upper; this alone explains every quantity" in cause.sentence
 
 
+DISK = """<mujoco><worldbody><body name="disk"><joint name="j" axis="0 0 1"/>
+<inertial pos="0 0 0" mass="1" diaginertia="{}"/></body>
+<body name="post" pos="{}"><geom size="0.1"/></body></worldbody></mujoco>
+"""
+
+
+def test_a_difference_of_a_few_roundings_is_named(tmp_path):
+    """Below what counts as a difference of descriptions, and above the rounding of the mass matrix."""
+    text, other = (DISK.format(f"1 1 {moment!r}", "0 0 1") for moment in (1.5, 1.5 * (1 + 2e-12)))
+    result = judged(tmp_path, text, other, ".xml")
+    ((cause,),) = (explanation.causes for explanation in result.explanations.values())
+    assert (cause.field, cause.changes[0].body) == ("inertia", "disk")
+
+
+def test_a_fixed_body_elsewhere_is_named(tmp_path):
+    text, other = (DISK.format("1 1 1.5", place) for place in ("0 0 1", "0 0 1.25"))
+    result = judged(tmp_path, text, other, ".xml")
+    ((cause,),) = (explanation.causes for explanation in result.explanations.values())
+    assert "reads the position in its parent of body post as (0, 0, 1.25)" in cause.sentence
+
+
+def test_no_part_gets_a_negative_mass(tmp_path):
+    """Without a part of 0.1 kg the lumped body is lighter: not by −0.1 kg of the massless link beside it."""
+    frame = """<link name="frame"/><joint name="g" type="fixed"><parent link="upper"/><child link="frame"/>
+    </joint><link name="tip">"""
+    light = MASSLESS.replace('"0.1"', '"0"').replace('<link name="tip">', frame)
+    light = light.replace('type="fixed">', 'type="fixed"><origin xyz="0 0 0.5"/>')
+    text = light.replace('<mass value="0"/>', '<mass value="0.1"/>')
+    result = judged(tmp_path, text, light, ".urdf")
+    ((cause,),) = (explanation.causes for explanation in result.explanations.values())
+    assert "leaves out the mass and inertia of tip (0.1 kg" in cause.sentence
+
+
 def test_damping_that_is_held_and_not_applied_is_judged_as_it_is_read(tmp_path):
     text = MASSLESS.replace('value="0"', 'value="1"').replace(
         '<axis xyz="0 1 0"/>', '<axis xyz="0 1 0"/><dynamics damping="0.3"/>'

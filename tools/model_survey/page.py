@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from tools.model_survey.examined import EXAMINED, Examined
+from tools.model_survey.examined import EXAMINED, UNPROVED, Examined
 from tools.model_survey.run import ALIKE_COUNT, ALIKE_FOLDER, STATES
 
 TITLES = {
@@ -221,18 +221,18 @@ def _unexplained(document: Mapping[str, Any]) -> str:
     lines = [
         "## Differences without a proved cause",
         "",
-        "Where PyBullet's mass matrix is off by less than 1e-8, its inertias are: it diagonalises them to a",
-        "limited accuracy, below what the search for causes takes for a difference.",
+        "Looked into by hand, where the last column says what was found.",
         "",
-        "| importer | file | the first quantity that differs |",
-        "|---|---|---|",
+        "| importer | file | the first quantity that differs | by hand |",
+        "|---|---|---|---|",
     ]
     for importer, _, file, outcome in outcomes(document):
         if outcome == "unexplained":
             entry = next(one for one in document["files"] if one["file"] == file)
             row = next(r for r in entry["rows"] if r["engine"] == importer and r["verdict"] == "disagrees")
             reason = re.sub(r"<|>|\|", " ", row["reason"]).partition(";")[0]
-            lines.append(f"| {TITLES[importer]} | {_short(file)} | {reason} |")
+            note = UNPROVED.get((importer, Path(file).name), "–")
+            lines.append(f"| {TITLES[importer]} | {_short(file)} | {reason} | {note} |")
     return "\n".join(lines)
 
 
