@@ -7,6 +7,7 @@ the null space of these rows' transpose, and of a joint's wrench the part perpen
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -99,7 +100,9 @@ class DirectSystem:
         self._by_row, self._row, self._column = by_row, i[by_row], j[by_row]
         self._unsort = np.argsort(by_row)
 
-    def assemble(self, r: Array, p: Array, v: Array, pdot: Array) -> tuple[Array, Array]:
+    def assemble(
+        self, r: Array, p: Array, v: Array, pdot: Array, x: Array | None = None
+    ) -> tuple[Array, Array]:
         """Assemble S and b of (N5), on or off the constraints.
 
         Args:
@@ -107,12 +110,13 @@ class DirectSystem:
             p: Euler parameters (N, 4).
             v: velocities ṙ (N, 3) [m/s], world frame.
             pdot: rates ṗ (N, 4) [1/s].
+            x: as for `solve`.
 
         Returns:
             S (m, m) and b (m,), m = 8 N + c, for x = (r̈, p̈, λ, λ_E).
 
         """
-        values, b, *_ = self._entries(r, p, v, pdot)
+        values, b, *_ = self._entries(r, p, v, pdot, x)
         return self._dense(values), b
 
     def solve(
@@ -215,6 +219,35 @@ class DirectSystem:
         """
         values, b, joints, elements = self._entries(r, p, v, pdot, x)
         return self._solution_from_unknowns(p, solve_dense(self._dense(values), b), joints, elements)
+
+    def corrected(
+        self,
+        r: Array,
+        p: Array,
+        v: Array,
+        pdot: Array,
+        x: Array | None,
+        unknowns: Array,
+        correction: Callable[[Array], Array],
+    ) -> tuple[Solution, ElementForces | None]:
+        """Correct unknowns that nearly solve (N5): x + S₀⁻¹ (b − S x), with the S₀ of a system nearby.
+
+        Args:
+            r: positions (N, 3) [m], world frame.
+            p: Euler parameters (N, 4).
+            v: velocities ṙ (N, 3) [m/s], world frame.
+            pdot: rates ṗ (N, 4) [1/s].
+            x: as for `solve`.
+            unknowns: (m,) in the printed order.
+            correction: from b − S x (m,) to S₀⁻¹ (b − S x) (m,).
+
+        Returns:
+            The corrected solution, and what elements there are.
+
+        """
+        values, b, joints, elements = self._entries(r, p, v, pdot, x)
+        lack = b - np.bincount(self._i, values * unknowns[self._j], self.size)
+        return self._solution_from_unknowns(p, unknowns + correction(lack), joints, elements), elements
 
     def _solve_loops(
         self, r: Array, p: Array, v: Array, pdot: Array, gamma_defect: float | Array, x: Array | None

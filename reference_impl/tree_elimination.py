@@ -71,7 +71,7 @@ class TreeSystem:
         self.chains = tuple(chains)
         self.first_body = np.cumsum([0, *(chain.n for chain in chains)])
         self.body_count = int(self.first_body[-1])
-        self.forest = _joined(self.chains, self.first_body)
+        self.forest = side_by_side(self.chains)
         self.weight = np.concatenate([c.mass[:, None] * c.gravity + c.force for c in chains])
         far = self.forest.body[:, 0]
         depth: NDArray[np.intp] = np.zeros(self.body_count, np.intp)
@@ -310,8 +310,17 @@ def eliminated_system(mechanisms: Sequence[Mechanism], x: Array | None = None) -
     return TreeSystem(mechanisms, x)
 
 
-def _joined(mechanisms: Sequence[Mechanism], first: NDArray[np.intp]) -> Mechanism:
-    """One mechanism of all, without gravity, which may differ between them."""
+def side_by_side(mechanisms: Sequence[Mechanism]) -> Mechanism:
+    """Join mechanisms to one.
+
+    Args:
+        mechanisms: of any bodies and joints; of loops the rows are right, but joint k holds another body.
+
+    Returns:
+        All of them, without gravity, which may differ between them.
+
+    """
+    first = np.cumsum([0, *(mechanism.n for mechanism in mechanisms)])
     fields: dict[str, Any] = {}
     for name in vars(mechanisms[0]):
         parts = [getattr(mechanism, name) for mechanism in mechanisms]

@@ -31,9 +31,10 @@ from plumbline.truth.parameter_effects import (
     StateSensitivity,
     difference_effects,
     effects_at_states,
+    needed_substeps,
     perturbed_motions,
 )
-from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters, perturb
+from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters
 from plumbline.truth.rounding_bound import EPS, state_rounding_bound
 from plumbline.truth.sensitivity import project_to_manifold
 from plumbline.truth.step_comparison import FormulaSteps
@@ -43,7 +44,9 @@ from reference_impl.tree_elimination import eliminated_system
 COVERED_LEVELS: tuple[Level, ...] = ("state", "step", "trajectory", "invariants")
 MAX_MISTAKE = 0.1  # of a parameter's scale: only larger ones are reported, or none; the level does not see it
 WEAK_MISTAKE = 1e-9  # from here on the order of an effect is found by a second mistake …
-LARGER_MISTAKE = 4.0  # … that is larger by this factor
+LARGER_MISTAKE = (
+    4.0  # … that is larger by this factor, at half the step: the integrator's error falls to a 16th
+)
 DOUBTFUL_MISTAKE = 1e-6  # from here on an effect may be rounding of the runs: a proof is tried
 NO_EFFECT = 1e-9  # of the largest effect that a term could have: rounding
 MOTION_SAMPLES = 32  # of a motion, at which the effect of a mistake is measured; or all, where it has fewer
@@ -161,7 +164,7 @@ def scenario_coverage(
             by_engine,
             _proofs(model, states, parameters, by_engine, "state"),
         )
-    if "step" in levels and model.is_chain and model.n <= MAX_STEP_BODIES:
+    if "step" in levels and not model.has_loops and model.n <= MAX_STEP_BODIES:
         some = states[:STEP_STATES]
         by_engine = {"": _step_ratios(model, some, parameters)}
         found += _entries(
@@ -228,7 +231,33 @@ def _state_ratios(
                     worst = np.max(effect / bound, axis=1)
                 for i, value in zip(indices, worst, strict=True):
                     ratios[quantity].add(i, value * parameters[i].scale, quantity)
+    _add_squares(model, states, parameters, of_model, ratios)
+    _add_squares(model, states[:1], parameters, of_state, ratios)
     return ratios
+
+
+def _add_squares(
+    model: Model, states: Sequence[State], parameters: Sequence[Parameter], indices: Sequence[int],
+    ratios: Mapping[str, _Ratios],
+) -> None:  # fmt: skip
+    """Add the effects that grow with the square of a mistake, where that of first order is not seen."""
+    unseen = [i for i in indices if all(one.ratio[i] <= 1 / MAX_MISTAKE for one in ratios.values())]
+    some = [parameters[i] for i in unseen]
+    if not some:
+        return
+    sizes = [_natural_sizes(model, state, "state") for state in states]
+    scale, worst = np.array([one.scale for one in some]), dict[str, list[Array]]()
+    for mistake in (MAX_MISTAKE, MAX_MISTAKE / 3):
+        effects = difference_effects(model, states, some, mistake, is_central=False)
+        for name in sizes[0].keys() & effects[0].keys():
+            parts = [
+                np.max(effect[name] / own[name], axis=1) for effect, own in zip(effects, sizes, strict=True)
+            ]
+            worst.setdefault(name, []).append(np.max(parts, axis=0) * scale * mistake)
+    for name, (large, small) in worst.items():
+        is_square = (large > 1) & (large > LARGER_MISTAKE * small)
+        for k in np.flatnonzero(is_square):
+            ratios[name].add(unseen[k], float(np.sqrt(large[k])) / MAX_MISTAKE, name)
 
 
 # -- steps -------------------------------------------------------------------------------------------
@@ -309,7 +338,8 @@ def _motion_entries(
     tolerances = [replace(one, last_sample=one.last_sample // stride) for one in tolerances]
     times = times[::stride][: max(one.last_sample for one in tolerances) + 1]
     quantities = {one.quantity for one in tolerances}
-    effects = _motion_effects(model, state, times, parameters, quantities, MOTION_MISTAKE)
+    substeps = needed_substeps(model, state, times)
+    effects = _motion_effects(model, state, times, parameters, quantities, MOTION_MISTAKE, substeps)
     ratios = _motion_ratios(tolerances, len(parameters), effects, {})
     weak = [
         i
@@ -321,17 +351,44 @@ def _motion_entries(
             if not (level == "invariants" and parameters[i].kind in STATE_KINDS)
         )
     ]
-    if weak:  # a second, larger mistake shows whether the effect grows with its square, or is rounding
+    if weak:
         again = [parameters[i] for i in weak]
-        larger = _motion_effects(model, state, times, again, quantities, LARGER_MISTAKE * MOTION_MISTAKE)
+        size = LARGER_MISTAKE * MOTION_MISTAKE
+        larger = _motion_effects(model, state, times, again, quantities, size, 2 * substeps)
         by_index = {i: {q: x[k] for q, x in larger.items()} for k, i in enumerate(weak)}
         ratios = _motion_ratios(tolerances, len(parameters), effects, by_index)
     found = []
     visited = _visited_states(model, state, times)
     for level, by_engine in ratios.items():
         proofs = _proofs(model, visited, parameters, by_engine, level)
+        if level == "invariants":
+            ratio = np.min([one.ratio for one in by_engine.values()], axis=0)
+            unseen = [int(i) for i in np.flatnonzero(ratio <= 1 / MAX_MISTAKE) if i not in proofs]
+            proofs |= _conserved(model, state, times, parameters, unseen, tolerances, substeps)
         found += _entries(name, level, model, parameters, by_engine, proofs)
     return found
+
+
+def _conserved(
+    model: Model, state: State, times: Array, parameters: Sequence[Parameter], unseen: Sequence[int],
+    tolerances: Sequence[_MotionTolerance], substeps: int,
+) -> dict[int, str]:  # fmt: skip
+    """The parameters with which the invariants stay constant: what a mistake adds vanishes with the step."""
+    if not unseen:
+        return {}
+    least: dict[str, float] = {}
+    for one in tolerances:
+        least[one.quantity] = min(one.tolerance, least.get(one.quantity, np.inf))
+    found, some = np.ones(len(unseen), bool), [parameters[i] for i in unseen]
+    quantities = set(least) & set(INVARIANT_UNITS)
+    for mistake in (MAX_MISTAKE, -MAX_MISTAKE):
+        arguments = model, state, times, some, quantities, mistake
+        coarse, fine = (_motion_effects(*arguments, count * substeps) for count in (1, 2))
+        for name in quantities:
+            falls = fine[name][:, -1] <= coarse[name][:, -1] / LARGER_MISTAKE
+            found &= falls | (fine[name][:, -1] <= least[name])
+    why = f"every invariant is conserved with it too, at mistakes of up to {MAX_MISTAKE:g}"
+    return {i: why for i, holds in zip(unseen, found, strict=True) if holds}
 
 
 def _visited_states(model: Model, state: State, times: Array) -> list[State]:
@@ -353,11 +410,12 @@ def _motion_effects(
     parameters: Sequence[Parameter],
     quantities: set[str],
     size: float,
+    substeps: int,
 ) -> dict[str, Array]:
     """Running maxima (P, T) of what mistakes of a size do to a motion, by quantity."""
     effects: dict[str, list[Array]] = {quantity: [] for quantity in quantities}
     true: Trajectory | None = None
-    for motion in perturbed_motions(model, state, times, parameters, None, size):
+    for motion in perturbed_motions(model, state, times, parameters, substeps, size):
         if motion.true is not true:
             true = motion.true
             invariants = compute_invariants(model, true) if quantities & set(INVARIANT_UNITS) else None
@@ -390,7 +448,7 @@ def _motion_ratios(
             if i in larger:
                 growth = float(larger[i][one.quantity][one.last_sample]) / max(effect, TINY)
                 if growth < LARGER_MISTAKE / 2:
-                    ratio = 0.0  # rounding
+                    ratio = 0.0  # rounding, or the integrator's error
                 elif growth > 2 * LARGER_MISTAKE:  # grows with the square of the mistake
                     ratio = float(np.sqrt(effect / one.tolerance)) / MOTION_MISTAKE
             of_engine.add(i, ratio, label)
@@ -447,30 +505,32 @@ def _vanishing(
     model: Model, states: Sequence[State], parameters: Sequence[Parameter], doubtful: NDArray[np.bool_],
     level: Level,
 ) -> dict[int, str]:  # fmt: skip
-    """The doubtful parameters with which nothing changes, of mistakes up to a tenth.
+    """The doubtful parameters with which nothing changes, of mistakes of both signs up to a tenth.
 
     At state level no compared quantity changes by its bound, along a motion no acceleration by `NO_EFFECT`.
+    Changes at smaller mistakes count in proportion, and those of loops are of first order.
     """
     sizes = [_natural_sizes(model, state, level) for state in states]
     what = "quantity" if level == "state" else "acceleration"
     left = [int(i) for i in np.flatnonzero(doubtful)]
-    for size in (0.0, MAX_MISTAKE / 3, MAX_MISTAKE):
-        largest = []
-        for one in (parameters[i] for i in left):
-            changed = [perturb(model, state, one, size) for state in states] if size else []
-            there = [state for _, state in changed] or states
-            effects = difference_effects(changed[0][0] if changed else model, there, [one], MAX_MISTAKE)
-            pairs = zip(effects, sizes, strict=True)
-            ratios = [np.max(effect[name] / own[name]) for effect, own in pairs for name in own]
-            largest.append(float(np.max(ratios)) * one.scale * MAX_MISTAKE)
-        left = [i for i, ratio in zip(left, largest, strict=True) if ratio <= 1]
+    for mistake in (MAX_MISTAKE, -MAX_MISTAKE, MAX_MISTAKE / 3, -MAX_MISTAKE / 3):
+        some = [parameters[i] for i in left]
+        effects = difference_effects(model, states, some, mistake, is_central=False) if left else []
+        largest = np.zeros(len(left))
+        for effect, own in zip(effects, sizes, strict=False):
+            for name in own.keys() & effect.keys():
+                largest = np.maximum(largest, np.max(effect[name] / own[name], axis=1))
+        scale = np.array([one.scale for one in some])
+        left = [i for i, ratio in zip(left, largest * scale * MAX_MISTAKE, strict=True) if ratio <= 1]
     places = {
         i: "at the initial state"
         if parameters[i].kind in STATE_KINDS
         else _PLACES.get(level, "along the whole motion")
         for i in left
     }
-    return {i: f"no {what} {at} changes with it: the derivatives vanish" for i, at in places.items()}
+    return {
+        i: f"no {what} {at} changes with it, at mistakes of up to {MAX_MISTAKE:g}" for i, at in places.items()
+    }
 
 
 def _natural_sizes(model: Model, state: State, level: Level) -> dict[str, Array]:

@@ -425,12 +425,13 @@ def kinetic_energy_of_rotors(model: Model, state: State) -> float:
         Σ ½ a ẋ² + Σ ½ a ‖ω − ω_far‖² [J].
 
     """
-    energy = np.sum(model.armature * state.xdot**2)
+    rates = joint_coordinates(model, state)[3]
+    energy = np.sum(model.armature * rates**2)
     spin = rotate_vectors(rotation_matrix(state.p), state.omega)
     for k in [k for k, kind in enumerate(model.kind) if kind == "ball"]:
-        far = model.body[k, 0]
-        relative = spin[k] - (spin[far] if far >= 0 else 0.0)
-        energy += model.armature[k, 0] * (relative @ relative - state.xdot[k, 0] ** 2)
+        far, near = model.body[k]
+        relative = spin[near] - (spin[far] if far >= 0 else 0.0)
+        energy += model.armature[k, 0] * (relative @ relative - rates[k, 0] ** 2)
     return float(energy) / 2
 
 

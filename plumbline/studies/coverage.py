@@ -53,7 +53,6 @@ def measure_coverage(
         CoverageFailure: a call failed.
 
     """
-    scenarios = [s for s in scenarios if not s.model.has_loops]
     by_scenario: dict[str, list[Row]] = {s.name: [] for s in scenarios}
     for row in rows:
         if row.scenario in by_scenario:

@@ -40,6 +40,7 @@ from plumbline.model.kinematics import (
     rotation_matrix,
     velocity_jacobian,
 )
+from plumbline.truth.linear_effects import ChangedModels
 from plumbline.truth.parameters import (
     AXES,
     INERTIA_ENTRIES,
@@ -49,6 +50,7 @@ from plumbline.truth.parameters import (
     perturb_model,
 )
 from plumbline.truth.rounding_bound import NewtonEulerSystem
+from plumbline.truth.step_formulas import fastest_rates
 from reference_impl.structured import component_first
 from reference_impl.tree_elimination import TreeSystem, eliminated_system
 
@@ -59,6 +61,7 @@ MOTION_STEP = 2.0**-6  # s, largest step of those runs; both runs of a differenc
 MAX_MOTION_ERROR = 1e-2  # rad, which must be small, or the difference is that of another motion
 MAX_HALVINGS = 4
 MAX_STEP_ANGLE = 0.25  # rad that the fastest mode turns in a step
+MAX_STIFFNESS = 1.5  # of a step times the fastest rate of springs and dampers; stable up to 2.78
 TINY_RATE = 1e-3  # rad/s
 MAX_BATCH_BODIES = 4000  # of one batch of runs: more do not fit the processor's cache
 
@@ -270,27 +273,35 @@ def effects_at_states(
 
 
 def difference_effects(
-    model: Model, states: Sequence[State], parameters: Sequence[Parameter], mistake: float = STATE_MISTAKE
+    model: Model,
+    states: Sequence[State],
+    parameters: Sequence[Parameter],
+    mistake: float = STATE_MISTAKE,
+    is_central: bool = True,
 ) -> list[dict[str, Array]]:
-    """Return the effects of unit changes of parameters by central differences of the whole evaluation.
+    """Return the effects of unit changes of parameters by differences of the whole evaluation.
 
     Args:
         model: the mechanism, a tree.
         states: S states of it, on the constraint manifold.
         parameters: P parameters of the model or of the states.
         mistake: size of the differences, as a fraction of each scale.
+        is_central: whether differences are from the opposite mistake, or from none.
 
     Returns:
         Per state, as `StateSensitivity.effects`.
 
     """
     found: list[dict[str, list[Array]]] = [{} for _ in states]
-    size = max(1, MAX_BATCH_BODIES // (2 * model.n * len(states)))
+    at_once = 1 if model.has_loops else len(states)
+    size = max(1, MAX_BATCH_BODIES // (2 * model.n * at_once))
     for first in range(0, len(parameters), size):
         part = parameters[first : first + size]
-        pairs = [_perturbed(model, states, one, sign * mistake) for one in part for sign in (1, -1)]
-        scale = 2 * mistake * np.array([one.scale for one in part])
-        for name, values in evaluate_models(pairs).items():  # (2P, S, ...)
+        other = -1 if is_central else 0
+        pairs = [_perturbed(model, states, one, sign * mistake) for one in part for sign in (1, other)]
+        scale = (1 - other) * mistake * np.array([one.scale for one in part])
+        evaluated = _to_first_order(model, states, pairs) if model.has_loops else evaluate_models(pairs)
+        for name, values in evaluated.items():  # (2P, S, ...)
             change = values[::2] - values[1::2]
             change = change / scale.reshape(-1, *(1,) * (change.ndim - 1))
             for at, own in enumerate(found):
@@ -360,6 +371,17 @@ def evaluate_models(cases: Sequence[tuple[Model, State]]) -> dict[str, Array]:
     return found | {name: np.array([one[name] for one in scalars]) for name in scalars[0]}
 
 
+def _to_first_order(
+    model: Model, states: Sequence[State], cases: Sequence[tuple[Model, State]]
+) -> dict[str, Array]:
+    """As `evaluate_models`, of changed models of one mechanism with loops."""
+    changed, per_state = ChangedModels(model, [one for one, _ in cases]), []
+    for at, base in enumerate(states):
+        there = {name: np.array([getattr(own, name)[at] for _, own in cases]) for name in vars(base)}
+        per_state.append(changed.solve(base, State(**there)))
+    return {name: np.stack([one[name] for one in per_state], axis=1) for name in per_state[0]}
+
+
 def _energies(model: Model, state: State) -> dict[str, Array]:
     """Energies, angular momentum and mass matrix at stacked states."""
     kinetic = kinetic_energy(model, state.v, state.omega)
@@ -393,7 +415,7 @@ def perturbed_motions(
     state: State,
     times: Array,
     parameters: Sequence[Parameter],
-    substeps: int | None = None,
+    substeps: int,
     mistake: float = MOTION_MISTAKE,
 ) -> Iterator[PerturbedMotion]:
     """Simulate a motion with each parameter off by a fraction of its scale.
@@ -403,15 +425,13 @@ def perturbed_motions(
         state: its initial state.
         times: (T,) sample times [s], equally spaced.
         parameters: of `list_parameters`.
-        substeps: Runge-Kutta steps between two samples; None for as many as the motion needs.
+        substeps: Runge-Kutta steps between two samples.
         mistake: the fraction.
 
     Yields:
         The motions, in the order of the parameters.
 
     """
-    if substeps is None:
-        substeps = _needed_substeps(model, state, times)
     size = max(1, MAX_BATCH_BODIES // model.n - 1)
     for first in range(0, len(parameters), size):
         part = parameters[first : first + size]
@@ -421,10 +441,21 @@ def perturbed_motions(
             yield PerturbedMotion(parameter, run, true)
 
 
-def _needed_substeps(model: Model, state: State, times: Array) -> int:
-    """Steps between two samples with which the motion is accurate enough to show how mistakes grow."""
-    fastest = max(TINY_RATE, *np.linalg.norm(state.omega, axis=1) / 2)
-    step = min(MOTION_STEP, MAX_STEP_ANGLE / fastest)
+def needed_substeps(model: Model, state: State, times: Array) -> int:
+    """Choose steps with which a motion is accurate enough to show how mistakes grow.
+
+    Args:
+        model: the mechanism.
+        state: its initial state.
+        times: (T,) sample times [s], equally spaced.
+
+    Returns:
+        The number of Runge-Kutta steps between two samples.
+
+    """
+    turning = max(TINY_RATE, *np.linalg.norm(state.omega, axis=1) / 2)
+    stiffest = float(fastest_rates(model, [state])[0]) if model.has_elements else TINY_RATE
+    step = min(MOTION_STEP, MAX_STEP_ANGLE / turning, MAX_STIFFNESS / max(stiffest, TINY_RATE))
     count = max(1, int(np.ceil((times[1] - times[0]) / step)))
     coarse = _simulate_batch([(model, state)], times, count)[0]
     for _ in range(MAX_HALVINGS):
@@ -441,22 +472,32 @@ def _simulate_batch(cases: Sequence[tuple[Model, State]], times: Array, substeps
     r, p, v = (np.concatenate([getattr(state, name) for _, state in cases]) for name in ("r", "p", "v"))
     pdot = quaternion_rate(p, np.concatenate([state.omega for _, state in cases]))
     y = np.stack([component_first(r, p), component_first(v, pdot)])  # (2, 7, M)
+    winding = system.winding if isinstance(system, TreeSystem) else None
+    x = system.x if isinstance(system, TreeSystem) else None
 
     def slope(y: Array) -> Array:
-        return np.stack([y[1], system.acceleration(y[0], y[1])])
+        q, rate = y
+        if isinstance(system, TreeSystem):
+            return np.stack([rate, system.acceleration(q, rate, x=x)])
+        return np.stack([rate, system.acceleration(q, rate)])
 
     samples = [y]
     for h in np.diff(times):
         for _ in range(substeps):
             y = runge_kutta_4(slope, y, h / substeps)
+            if winding:  # full turns of springs' angles go on from step to step
+                r, p, v, pdot = (part.T for q in y for part in (q[:3], q[3:]))
+                x = winding.coordinates(r, p, v, pdot, x)[0]
         samples.append(np.stack(system.project(y[0], y[1])) if isinstance(system, TreeSystem) else y)
     # (cases, 2, T, N, 7)
     found = np.moveaxis(
         np.array(samples).reshape(len(times), 2, 7, len(cases), -1), (3, 1, 0, 4, 2), (0, 1, 2, 3, 4)
     )
     return [
-        _on_manifold(model, Trajectory(times, q[..., :3], q[..., 3:], rate[..., :3], rate[..., 3:], substeps))
-        for (model, _), (q, rate) in zip(cases, found, strict=True)
+        _on_manifold(
+            model, Trajectory(times, q[..., :3], q[..., 3:], rate[..., :3], rate[..., 3:], substeps, start.x)
+        )
+        for (model, start), (q, rate) in zip(cases, found, strict=True)
     ]
 
 

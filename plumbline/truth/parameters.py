@@ -43,7 +43,7 @@ class Parameter:
     """One number of a model or of its initial state."""
 
     kind: str  # a key of `UNITS`: a field of `Model` or a part of one, or one of `STATE_KINDS`
-    body: int  # 0 … N − 1, and its joint; −1 for gravity; of "spring_…" the number of the spring
+    body: int  # 0 … N − 1, and its joint, or a closing joint; −1: gravity; of "spring_…" the spring's number
     entry: str  # component: x, y, z, or xx … yz of the inertia; turn or slide of a joint; empty for scalars
     value: float  # in the unit of the kind; 0 for the angles of attitudes and directions
     scale: (
@@ -68,25 +68,20 @@ def list_parameters(model: Model, state: State) -> list[Parameter]:
     directions of rods count as small rotations: about the body's axes, and about two axes across the rod.
 
     Args:
-        model: the mechanism, a tree.
+        model: the mechanism.
         state: its initial state.
 
     Returns:
         Gravity's components, then body by body its model parameters, those of its joint and its initial
-        state; then those of springs.
+        state; those of joints that close loops; then those of springs.
 
     """
     g = max(float(np.linalg.norm(model.gravity)), 1e-3)
-    length = float(np.sum(stretched_length(model)))
+    length = float(np.sum(stretched_length(model.tree)))
     rate = float(np.sqrt(g / length))
     found = list(_components("gravity", -1, model.gravity, g))
     for k in range(model.n):
-        mass, trace = model.mass[k], float(np.trace(model.inertia[k]))
-        span = max(
-            float(np.linalg.norm(model.proximal[k])),
-            float(np.linalg.norm(model.distal[k])) if model.is_chain else 0.0,
-            float(np.sqrt(trace / (2 * mass))),
-        )
+        mass, trace, span = model.mass[k], float(np.trace(model.inertia[k])), _span(model, k)
         spin = max(rate, float(np.linalg.norm(state.omega[k])), float(np.linalg.norm(state.udot[k])))
         found.append(Parameter("mass", k, "", float(mass), float(mass)))
         for entry, at in INERTIA_ENTRIES.items():
@@ -96,10 +91,20 @@ def list_parameters(model: Model, state: State) -> list[Parameter]:
         found += _components("moment", k, model.moment[k], mass * g * span)
         found.append(_parameter("drag_force", k, "", model.drag_force[k], mass * rate))
         found.append(_parameter("drag_moment", k, "", model.drag_moment[k], trace / 3 * rate))
-        found += _joint_elements(model, k, (trace / 3, mass), rate)
+        found += _joint_elements(model, k, rate)
         found += _initial_state(model, state, k, span, spin)
+    for k in range(model.n, len(model.kind)):  # joints that close loops
+        found += _geometry(model, k, _span(model, int(model.body[k, 1])))
+        found += _joint_elements(model, k, rate)
     found += _springs(model, length, rate)
     return found
+
+
+def _span(model: Model, k: int) -> float:
+    """A body's size: distance of its points of a chain, or its near point, and radius of gyration."""
+    sizes = [model.proximal[k], model.distal[k] if model.is_chain else np.zeros(3)]
+    gyration = np.sqrt(np.trace(model.inertia[k]) / (2 * model.mass[k]))
+    return max(float(gyration), *(float(np.linalg.norm(x)) for x in sizes))
 
 
 def _geometry(model: Model, k: int, span: float) -> Iterator[Parameter]:
@@ -125,10 +130,12 @@ def _motions(model: Model, k: int) -> list[str]:
     return names if len(set(names)) == len(names) else list(AXES[: len(names)])
 
 
-def _joint_elements(model: Model, k: int, inertia: tuple[float, float], rate: float) -> Iterator[Parameter]:
+def _joint_elements(model: Model, k: int, rate: float) -> Iterator[Parameter]:
     """Rotor, damper, spring and effort of each coordinate of a joint; of a ball's about all axes."""
     if not model.has_joint_elements:
         return
+    near = model.body[k, 1]
+    inertia = float(np.trace(model.inertia[near])) / 3, float(model.mass[near])
     is_ball = model.kind[k] == "ball"
     for i, what in enumerate(["turn"] if is_ball else _motions(model, k)):
         size, arm = inertia[what == "slide"], float(np.sqrt(3 * inertia[0] / inertia[1]))
