@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from plumbline.engines.registry import load_adapter
 from plumbline.judging.coverage import COVERED_LEVELS, scenario_coverage
 from plumbline.model.datatypes import KINDS
 from plumbline.scenario import loader as scenarios
@@ -108,8 +109,6 @@ def test_effects_at_a_state_are_those_of_differences(name):
     Their error is of second order in d: 7e-6 of the effect at d = 1e-3, 7e-8 at 1e-4 and rounding below;
     those of trees are differences of 0.02 themselves.
     """
-    from plumbline.engines.registry import load_adapter
-
     reference, d = load_adapter("reference"), 1e-4
     model, state = scenario(name).model, scenario(name).state
     rtol = 1e-6 if model.is_chain else 1e-2
@@ -132,6 +131,24 @@ def test_effects_at_a_state_are_those_of_differences(name):
                     effect[i], norms.reshape(effect[i].shape), rtol=rtol, atol=rtol * 1e-3 * size,
                     err_msg=f"{one}, {quantity}",
                 )  # fmt: skip
+
+
+def test_effects_in_a_loop_are_those_of_differences():
+    """Of numbers with which the loop can still move; first-order effects are differences of 0.02."""
+    reference, d = load_adapter("reference"), 1e-6
+    model, state = scenario("flyball-governor").model, scenario("flyball-governor").state
+    kinds = ("mass", "inertia", "force", "moment", "drag_moment", "stiffness", "damping", "effort", "rest")
+    some = [one for one in list_parameters(model, state) if one.kind in kinds and one.body < 4]
+    effects = effects_at_states(model, [state], some)[0]
+    for i, one in enumerate(some):
+        plus, minus = (reference.evaluate(perturb(model, state, one, x)[0], [state])[0] for x in (d, -d))
+        for quantity, effect in effects.items():
+            rate = np.atleast_1d(getattr(plus, quantity) - getattr(minus, quantity)) / (2 * d * one.scale)
+            norms = np.abs(rate) if rate.ndim == 1 and len(rate) == 1 else np.linalg.norm(rate, axis=-1)
+            size = np.max(np.abs(getattr(plus, quantity))) / one.scale
+            np.testing.assert_allclose(
+                effect[i], norms, rtol=1e-3, atol=1e-6 * size, err_msg=f"{one}, {quantity}"
+            )
 
 
 def test_the_table_of_a_scenario_has_every_parameter_once():
