@@ -34,6 +34,7 @@ from adapters.exudyn_common import (
     Output,
     add_loads,
     add_point_spring,
+    ignore_dependent_rows,
     initialized_solver,
     items,
     kinetic_energy,
@@ -324,7 +325,7 @@ class Exudyn(ExudynAdapter):
     )
     usual_linear_solver = "EigenSparse"
     linear_solvers = ("EXUdense", "EigenDense")
-    builds_trees = builds_elements = True
+    builds_trees = builds_elements = moves_loops = True
     welding_unsupported_reason = ""
     is_single_step: bool = False  # full Newton iterations to `STEP_SETTINGS`; multipliers are sampled too
 
@@ -392,6 +393,9 @@ class Exudyn(ExudynAdapter):
         """Return displacements, rates and accelerations (7N,) at ``times``."""
         settings, data = make_settings(), chain.mbs.systemData
         set_linear_solver(settings, self.option or self.usual_linear_solver)
+        if chain.model.has_loops:  # rows that depend on others: the solvers without pivoting fail at them
+            set_linear_solver(settings, "EigenDense")
+            ignore_dependent_rows(settings)
         alpha = settings.timeIntegration.generalizedAlpha
         alpha.computeInitialAccelerations = compute_initial_accelerations
         if integrator.name == "trapezoidal":

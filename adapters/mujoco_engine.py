@@ -30,7 +30,8 @@ efforts are `qfrc_applied`.  A spring between points is a spatial tendon over tw
 
 Loops: each closing joint's near body is cut in two parts, one of them on that joint, and a weld holds
 the parts together.  MuJoCo's constraints are soft: the forces solve (A + R) f = a_ref − a₀ with R > 0.  At a
-closed state a_ref is 0 and all answers are linear in R to first order; they are extrapolated to R = 0.
+closed state a_ref is 0 and all answers are linear in R to first order; they are extrapolated to R = 0, and
+motions likewise.
 
 Welded halves are bodies without a joint on a massless one in their body's place.  The option "dense mass
 matrix" finds the accelerations by a dense solve with `mj_fullM`.  MuJoCo's solvers (PGS, CG, Newton) and
@@ -42,6 +43,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import combinations, pairwise
 from typing import Any, Literal
 
@@ -72,6 +74,7 @@ MAX_IMPEDANCE = 0.9999  # of soft constraints: the largest that MuJoCo accepts
 # not yet linear in it), how they fall, and how many
 LARGEST_REGULARISATIONS, RATIO, REGULARISATIONS = (0.027, 2.7e-4, 2.7e-6), 3.0, 4
 SEQUENCES = (1.0, 1.3, 1.7)  # of them: factors of the largest
+RUN_REGULARISATIONS = (2.7e-6, 9e-7)  # of motions
 MAX_ORDER_ERROR = 0.1
 MIN_SOFTNESS = 1e-9  # a smaller relative effect of R is rounding
 MAX_NOISE = 1e-11  # relative, of differences that grow as R falls: more is too much to extrapolate
@@ -129,7 +132,7 @@ class Mujoco(MetamorphicHooks):
         ),
     )
     options = ("dense mass matrix",)
-    builds_trees = builds_elements = True
+    builds_trees = builds_elements = moves_loops = True
     welding_unsupported_reason = ""
 
     def version(self) -> str:
@@ -154,7 +157,32 @@ class Mujoco(MetamorphicHooks):
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
-        chain = _MujocoChain(model)
+        if model.has_loops:
+            return self._rigid_run(model, state, times, integrator, resolution)
+        return self._sampled_run(_MujocoChain(model), state, times, integrator, resolution)
+
+    def _rigid_run(
+        self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
+    ) -> Trajectory:
+        """Run at two regularisations and extrapolate linearly to none; what that adds is the uncertainty."""
+        cut, runs = cut_open(model), []
+        for softness in RUN_REGULARISATIONS:
+            tree = _MujocoChain(cut.model, ends=cut.ends)
+            tree.soften(softness)
+            run = self._sampled_run(tree, cut.state(state), times, integrator, resolution)
+            runs.append(cut.source_run(run))
+        soft, stiff = runs
+        weight = RUN_REGULARISATIONS[1] / (RUN_REGULARISATIONS[0] - RUN_REGULARISATIONS[1])
+        change = {
+            name: weight * (getattr(stiff, name) - getattr(soft, name)) for name in ("r", "p", "v", "pdot")
+        }
+        limit = {name: getattr(stiff, name) + more for name, more in change.items()}
+        error = np.array([_largest_norm(change["r"]), 2 * _largest_norm(change["p"])])
+        return replace(stiff, **limit, limit_error=error)
+
+    def _sampled_run(
+        self, chain: _MujocoChain, state: State, times: Array, integrator: Integrator, resolution: float
+    ) -> Trajectory:
         chain.m.opt.timestep = resolution
         chain.m.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.name.upper()}")
         chain.set_state(state)

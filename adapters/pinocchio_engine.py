@@ -661,7 +661,7 @@ class Pinocchio(PinocchioAdapter):
         ),
         Integrator("dop853", "tolerance", 8, note="SciPy's DOP853 on (q, v) with crba and the tangent map"),
     )
-    builds_trees = builds_elements = True
+    builds_trees = builds_elements = moves_loops = True
     options: ClassVar[tuple[str, ...]] = ("cholesky", "forwardDynamics")
     usual_algorithm: ClassVar[str] = "crba"  # for the accelerations of state evaluation
 
@@ -676,7 +676,18 @@ class Pinocchio(PinocchioAdapter):
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
+        if model.has_loops:
+            cut = cut_open(model)
+            tree = PinocchioChain(cut.model, self.usual_algorithm, ends=cut.ends)
+            run = self._sampled_run(tree, cut.state(state), times, integrator, resolution)
+            return cut.source_run(run)
         chain = PinocchioChain(model, "crba" if integrator.kind == "tolerance" else "aba")
+        return self._sampled_run(chain, state, times, integrator, resolution)
+
+    @staticmethod
+    def _sampled_run(
+        chain: PinocchioChain, state: State, times: Array, integrator: Integrator, resolution: float
+    ) -> Trajectory:
         start = chain.coordinates(state)
         if integrator.kind == "tolerance":
             return chain.trajectory(times, *dop853(chain, *start, times, resolution))

@@ -52,7 +52,7 @@ class Reference(MetamorphicHooks):
         ),
     )
 
-    builds_trees = builds_elements = True
+    builds_trees = builds_elements = moves_loops = True
     options = ("dense factors", "O(N) form")
     welding_unsupported_reason = NO_WELD
 
@@ -97,12 +97,12 @@ class Reference(MetamorphicHooks):
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
-        start = notes_state(state)
+        start, x = notes_state(state), joint_coordinates(model, state)[2]
         try:
             if integrator.name == "collocation":
-                system = eliminated_system([model], state.x)
+                system = eliminated_system([model], x)
                 return trajectory(integrate_collocation(system, *start, times, resolution))
-            return trajectory(integrate_dop853(model, *start, times, resolution, x=state.x))
+            return trajectory(integrate_dop853(model, *start, times, resolution, x=x))
         except ArithmeticError as error:
             raise EngineFailure(f"{self.title}: {error}") from error
 

@@ -245,7 +245,10 @@ class _Stepper:
         self.q, self.v, self.rtol, self.sweep_tolerance = q, v, rtol, quiet
         self.dense, self.baumgarte = dense, baumgarte
         # joint coordinates near which the angles of springs are taken, carried on by their rates
-        self.x, self.x_rate = np.zeros((forest.body_count, 2)), np.zeros((len(table.c), forest.body_count, 2))
+        self.x, self.x_rate = (
+            np.zeros((forest.joint_count, 2)),
+            np.zeros((len(table.c), forest.joint_count, 2)),
+        )
         if isinstance(forest, TreeSystem) and forest.winding:
             self.x = forest.winding.coordinates(q[:3].T, q[3:].T, v[:3].T, v[3:].T, forest.x)[0]
         self.q_compensation, self.v_compensation = (

@@ -24,6 +24,7 @@ from reference_impl.mechanism import Array, Mechanism
 
 EPS = float(np.finfo(float).eps)
 RANK_TOLERANCE = 1e-11  # of scaled rows: below it a row of a loop depends on the others
+RUN_RANK_TOLERANCE = 1e-6  # the same along a run, whose drift makes dependent rows look independent
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +159,7 @@ class DirectSystem:
         gamma_defect: float | Array = 0.0,
         x: Array | None = None,
     ) -> tuple[Array, ConstraintRows, ElementForces | None]:
-        """Solve (N5) for its unknowns alone.
+        """Solve (N5) for its unknowns alone; in loops 0 for multipliers of rows that depend on others.
 
         S is equilibrated symmetrically by powers of two (its blocks have the units kg, kg m² and m,
         and would otherwise decide the pivots), factored with partial pivoting and refined once.  Measured
@@ -180,6 +181,9 @@ class DirectSystem:
             SingularSystem: S is singular; the message names the body and the cause (E1, E7).
 
         """
+        if self.chain.has_loops:
+            unknowns, _, _, *parts = self._loop_unknowns(r, p, v, pdot, gamma_defect, x, RUN_RANK_TOLERANCE)
+            return unknowns, *parts
         with np.errstate(all="ignore"):  # an overflow raises SingularSystem below
             values, b, joints, elements = self._entries(r, p, v, pdot, x)
             n, c = self.chain.n, len(self.joint)
@@ -252,7 +256,29 @@ class DirectSystem:
     def _solve_loops(
         self, r: Array, p: Array, v: Array, pdot: Array, gamma_defect: float | Array, x: Array | None
     ) -> Solution:
-        """Solve with the rows that do not depend on others, by dense factors."""
+        """Solve with the rows that do not depend on others, and find what the others leave determinate."""
+        n, c, plain = self.chain.n, len(self.joint), len(self.joint) - self.rotor_count
+        unknowns, used, scaled, joints, elements = self._loop_unknowns(
+            r, p, v, pdot, gamma_defect, x, RANK_TOLERANCE
+        )
+        rows, scale = scaled
+        solution = self._solution_from_unknowns(p, unknowns, joints, elements)
+        null = np.zeros((c, plain - int(np.sum(used[7 * n : 7 * n + plain]))))
+        null[:plain] = null_space(rows.T, rcond=RANK_TOLERANCE) * scale[:, None]
+        determinate = self._determinate(p, null, joints)
+        return replace(solution, kept=used[7 * n : 7 * n + c], determinate=determinate)
+
+    def _loop_unknowns(
+        self,
+        r: Array,
+        p: Array,
+        v: Array,
+        pdot: Array,
+        gamma_defect: float | Array,
+        x: Array | None,
+        tolerance: float,
+    ) -> tuple[Array, NDArray[np.bool_], tuple[Array, Array], ConstraintRows, ElementForces | None]:
+        """The unknowns by dense factors, which of them are used, the rows of C scaled and their scale."""
         n, c, plain = self.chain.n, len(self.joint), len(self.joint) - self.rotor_count
         values, b, joints, elements = self._entries(r, p, v, pdot, x)
         S = self._dense(values)
@@ -266,14 +292,10 @@ class DirectSystem:
         _, triangle, order = qr(rows.T, mode="economic", pivoting=True)
         size = np.abs(np.diagonal(triangle))
         used = np.ones(self.size, bool)
-        used[7 * n + order[int(np.sum(size > RANK_TOLERANCE * size[0])) :]] = False
+        used[7 * n + order[int(np.sum(size > tolerance * size[0])) :]] = False
         unknowns = np.zeros(self.size)
         unknowns[used] = solve_dense(S[np.ix_(used, used)], b[used])
-        solution = self._solution_from_unknowns(p, unknowns, joints, elements)
-        null = np.zeros((c, plain - int(np.sum(used[7 * n : 7 * n + plain]))))
-        null[:plain] = null_space(rows.T, rcond=RANK_TOLERANCE) * scale[:, None]
-        determinate = self._determinate(p, null, joints)
-        return replace(solution, kept=used[7 * n : 7 * n + c], determinate=determinate)
+        return unknowns, used, (rows, scale), joints, elements
 
     def _determinate(self, p: Array, null: Array, joints: ConstraintRows) -> Array:
         """Projectors (J, 6, 6) off the wrenches (F, N/ℓ) of multipliers (c, z) that hold nothing."""

@@ -89,10 +89,10 @@ class Elements:
             x: as for `evaluate`.
 
         Returns:
-            (N, 2) each [rad or m, and 1/s of it]; zeros where there are no elements.
+            (J, 2) each [rad or m, and 1/s of it]; zeros where there are no elements.
 
         """
-        found, values = self.evaluate(r, p, v, pdot, x), np.zeros((2, len(p), 2))
+        found, values = self.evaluate(r, p, v, pdot, x), np.zeros((2, len(self.mechanism.kind), 2))
         values[:, self.joint, self.column] = found.stretch + self.rest, found.rate
         return values[0], values[1]
 
@@ -104,7 +104,7 @@ class Elements:
             p: Euler parameters (N, 4).
             v: velocities ṙ (N, 3) [m/s], world frame.
             pdot: rates ṗ (N, 4) [1/s].
-            x: joint coordinates (N, 2) near which angles are taken [rad]; absent: principal values.
+            x: joint coordinates (J, 2) near which angles are taken [rad]; absent: principal values.
 
         Returns:
             Their rows and forces.

@@ -173,7 +173,7 @@ def integrate_dop853(
         times: sample times (T,) [s], ascending from the initial time; samples are dense output.
         rtol: relative tolerance, 2.2e-14 at least.
         acceleration: the right-hand side; the direct form by default.
-        x: initial joint coordinates (N, 2) near which the angles of springs are taken; absent: principal
+        x: initial joint coordinates (J, 2) near which the angles of springs are taken; absent: principal
             values.
         atol: absolute tolerance, in the units of y; ``rtol`` times `state_scales` by default.
 
@@ -191,7 +191,7 @@ def integrate_dop853(
     limits = limits if atol is None else np.full(size, atol)
     if elements.has_winding_angles:  # they only choose the turn of an angle: no error control
         y0 = np.concatenate([y0, elements.coordinates(r, p, v, pdot, x)[0].ravel()])
-        limits = np.concatenate([limits, np.full(2 * n, np.inf)])
+        limits = np.concatenate([limits, np.full(len(y0) - size, np.inf)])
     samples = np.empty((len(times), len(y0)))
     samples[0], done, steps = y0, 1, 0
 

@@ -350,6 +350,11 @@ class StructuredSystem:
 
     # -- accelerations ------------------------------------------------------------------------------
 
+    @property
+    def joint_count(self) -> int:
+        """Number of joints: one holds each body."""
+        return self.body_count
+
     def acceleration(self, q: Array, v: Array, baumgarte: float = 0.0) -> Array:
         """Return the accelerations, on or off the constraints.
 

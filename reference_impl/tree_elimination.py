@@ -1,4 +1,4 @@
-"""The system S x = b of the notes for trees with any joints, in O(bodies): eliminated leaves first.
+"""The system S x = b of the notes for any joints; trees in O(bodies), eliminated leaves first.
 
 The rows are those of `joints`.  With π = pᵀp and α of p̈ = Lᵀα/2π − p ṗᵀṗ/π as in `structured`, the rows of
 joint k are n_k a_k + f_k a_far = γ_k for a = (r̈, α), and every body obeys
@@ -13,6 +13,12 @@ leave
 A rotor (L4) is one row more of its joint, with 1/a on the diagonal of S_k; see `elements`.
 
 Joints of the same depth and number of rows are eliminated together, those of many trees at once.
+
+Mechanisms with loops have the same rows and are solved as they stand, by dense factors of
+
+    A a + nᵀ λ + fᵀ λ = b,    n a_k + f a_far − λ / a_rotor = γ
+
+with rows that do not depend on others.
 """
 
 from __future__ import annotations
@@ -23,8 +29,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import qr
 
-from reference_impl.direct import Solution, joint_moments
+from reference_impl.direct import RUN_RANK_TOLERANCE, Solution, joint_moments, power_of_two_scale
 from reference_impl.elements import Elements
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import L, angular_velocity, cross, dot
@@ -64,8 +71,8 @@ class TreeSystem:
 
         Args:
             chains: the mechanisms.
-            x: joint coordinates (M, 2) near which the angles of springs are taken [rad]; absent: principal
-                values.
+            x: joint coordinates (joints, 2) near which the angles of springs are taken [rad]; absent:
+                principal values.
 
         """
         self.chains = tuple(chains)
@@ -73,10 +80,6 @@ class TreeSystem:
         self.body_count = int(self.first_body[-1])
         self.forest = side_by_side(self.chains)
         self.weight = np.concatenate([c.mass[:, None] * c.gravity + c.force for c in chains])
-        far = self.forest.body[:, 0]
-        depth: NDArray[np.intp] = np.zeros(self.body_count, np.intp)
-        for k in np.flatnonzero(far >= 0):
-            depth[k] = depth[far[k]] + 1
         self.x, self.elements = x, Elements(self.forest) if self.forest.has_elements else None
         # springs on angles: the motion depends on their full turns, which r and p do not hold
         self.winding = self.elements if self.elements and self.elements.has_winding_angles else None
@@ -86,16 +89,24 @@ class TreeSystem:
             self.compliance = 1 / self.elements.armature[rotors]
             joint = np.concatenate([joint, self.elements.joint[rotors]])
         self.compliance = np.concatenate([np.zeros(len(joint) - len(self.compliance)), self.compliance])
-        self.joint, self.far = joint, far[joint]
-        count = np.bincount(joint, minlength=self.body_count)
-        first, in_order = np.cumsum(count) - count, np.argsort(joint, kind="stable")
-        self.levels = []
-        for level, rows in sorted(set(zip(depth.tolist(), count.tolist(), strict=True))):
-            at = np.flatnonzero((depth == level) & (count == rows))
-            self.levels.append(_Level(at, far[at], in_order[first[at, None] + np.arange(rows)]))
+        self.joint, self.joint_count = joint, len(self.forest.kind)
+        self.far, self.near = self.forest.body[joint].T
+        self.levels = self._levels()
         self.inertia = np.zeros((self.body_count, 6, 6))
         self.inertia[:, :3, :3] = self.forest.mass[:, None, None] * np.eye(3)
         self.inertia[:, 3:, 3:] = self.forest.inertia
+
+    def _levels(self) -> list[_Level]:
+        """The joints in the order from the world on."""
+        far, depth = self.forest.body[:, 0], np.zeros(self.body_count, np.intp)
+        for k in np.flatnonzero(far >= 0):
+            depth[k] = depth[far[k]] + 1
+        count = np.bincount(self.joint, minlength=self.body_count)
+        first, in_order, levels = np.cumsum(count) - count, np.argsort(self.joint, kind="stable"), []
+        for level, rows in sorted(set(zip(depth.tolist(), count.tolist(), strict=True))):
+            at = np.flatnonzero((depth == level) & (count == rows))
+            levels.append(_Level(at, far[at], in_order[first[at, None] + np.arange(rows)]))
+        return levels
 
     def repeated(self, count: int) -> TreeSystem:
         """Repeat the trees: all of them, then all again.
@@ -109,7 +120,7 @@ class TreeSystem:
         """
         if count == 1:
             return self
-        return TreeSystem(self.chains * count, None if self.x is None else np.tile(self.x, (count, 1)))
+        return type(self)(self.chains * count, None if self.x is None else np.tile(self.x, (count, 1)))
 
     def acceleration(self, q: Array, v: Array, baumgarte: float = 0.0, x: Array | None = None) -> Array:
         """Return the accelerations, on or off the constraints.
@@ -118,7 +129,7 @@ class TreeSystem:
             q: (r; p) (7, M) [m, –].
             v: (ṙ; ṗ) (7, M) [m/s, 1/s].
             baumgarte: a [1/s]; adds −2 a Ċ − a² C to γ and likewise to γ_E.  0 is the notes' raw form.
-            x: joint coordinates (M, 2) in place of those of the constructor.
+            x: joint coordinates (joints, 2) in place of those of the constructor.
 
         Returns:
             (r̈; p̈) (7, M) [m/s², 1/s²].
@@ -146,7 +157,7 @@ class TreeSystem:
             moment = forest.moment - forest.drag_moment[:, None] * omega
             moment = moment - (cross(omega, momentum) + 2 * sigma[:, None] * momentum) / norm[:, None]
             along = p * (stretch / norm)[:, None]  # −p̈ along p
-            gamma = gamma + dot(rows.p_near, along[self.joint]) + dot(rows.p_far, along[self.far])
+            gamma = gamma + dot(rows.p_near, along[self.near]) + dot(rows.p_far, along[self.far])
             if rows.element_force is not None:
                 force, of_p = force + rows.element_force[0], rows.element_force[1]
                 moment = moment + np.matvec(L(p), of_p) / (2 * norm)[:, None]
@@ -165,7 +176,7 @@ class TreeSystem:
             p: Euler parameters (M, 4).
             v: velocities ṙ (M, 3) [m/s], world frame.
             pdot: rates ṗ (M, 4) [1/s].
-            x: joint coordinates (M, 2) in place of those of the constructor.
+            x: joint coordinates (joints, 2) in place of those of the constructor.
 
         Returns:
             r̈, p̈, λ and the wrenches at the joints, those of elements included; λ_E is not computed (NaN).
@@ -177,13 +188,13 @@ class TreeSystem:
         q, qdot = component_first(r, p), component_first(v, pdot)
         motion, multiplier, rows = self._solve_motion(q, qdot, 0.0, x, refine=True)
         forest, c = self.forest, len(rows.C)
-        pull, of_p = np.zeros((self.body_count, 3)), np.zeros((self.body_count, 4))
+        pull, of_p = np.zeros((self.joint_count, 3)), np.zeros((self.joint_count, 4))
         np.subtract.at(pull, self.joint, multiplier[:, None] * rows.r_near)
         np.subtract.at(of_p, self.joint, multiplier[:, None] * rows.p_near)
         if rows.of_joints is not None and self.elements:
             np.add.at(pull, self.elements.joint, rows.of_joints[0])
             np.add.at(of_p, self.elements.joint, rows.of_joints[1])
-        tension, rod = np.full(self.body_count, np.nan), forest.rods
+        tension, rod = np.full(self.joint_count, np.nan), forest.rods
         tension[rod] = 2 * forest.length[rod] * multiplier[:c][rod[self.joint[:c]]]
         return Solution(
             acceleration=motion[:3].T,
@@ -254,16 +265,16 @@ class TreeSystem:
         Refined once, it keeps the digits that a light body before a heavy one costs.
         """
         turn = L(p).swapaxes(-1, -2) / (2 * dot(p, p))[:, None, None]
-        near = np.concatenate([rows.r_near, np.vecmat(rows.p_near, turn[self.joint])], 1)
+        near = np.concatenate([rows.r_near, np.vecmat(rows.p_near, turn[self.near])], 1)
         far = np.concatenate([-rows.r_near, np.vecmat(rows.p_far, turn[self.far])], 1)
         a, multiplier = self._substitute(near, far, wrench, gamma)
         if refine:
             left = wrench - np.matvec(self.inertia, a)
-            np.subtract.at(left, self.joint, multiplier[:, None] * near)
+            np.subtract.at(left, self.near, multiplier[:, None] * near)
             held = self.far >= 0
             np.subtract.at(left, self.far[held], (multiplier[:, None] * far)[held])
             far_a = np.where(held[:, None], a[self.far], 0.0)
-            open_ = gamma - dot(near, a[self.joint]) - dot(far, far_a) + self.compliance * multiplier
+            open_ = gamma - dot(near, a[self.near]) - dot(far, far_a) + self.compliance * multiplier
             a_change, change = self._substitute(near, far, left, open_)
             a, multiplier = a + a_change, multiplier + change
         return a[:, :3], np.matvec(turn, a[:, 3:]), multiplier
@@ -291,20 +302,78 @@ class TreeSystem:
         return a[:-1], multiplier
 
 
+class LoopSystem(TreeSystem):
+    """Mechanisms with loops, all of the same joints between the same bodies; solved by dense factors.
+
+    Rows that depend on others are those of the first mechanism: the others differ little from it.
+    """
+
+    def _levels(self) -> list[_Level]:
+        return []
+
+    def _substitute(self, near: Array, far: Array, wrench: Array, gamma: Array) -> tuple[Array, Array]:
+        """Solve for a (M, 6) and the multipliers, 0 of rows that depend on others."""
+        batch, n = len(self.chains), self.chains[0].n
+        c, each = len(gamma) // batch, np.arange(len(gamma) // batch)
+        C = np.zeros((batch, c, n, 6))
+        C[:, each, self.near[:c]] = near.reshape(batch, c, 6)
+        held = np.flatnonzero(self.far[:c] >= 0)
+        C[:, held, self.far[held]] += far.reshape(batch, c, 6)[:, held]
+        C = C.reshape(batch, c, 6 * n)
+        kept = _independent_rows(C[0], self.compliance[:c] > 0)
+        size = 6 * n + len(kept)
+        S = np.zeros((batch, size, size))
+        for k in range(n):
+            own = slice(6 * k, 6 * k + 6)
+            S[:, own, own] = self.inertia.reshape(batch, n, 6, 6)[:, k]
+        S[:, 6 * n :, : 6 * n] = C[:, kept]
+        S[:, : 6 * n, 6 * n :] = C[:, kept].mT
+        each = 6 * n + np.arange(len(kept))
+        S[:, each, each] = -self.compliance[kept]
+        right = np.concatenate([wrench.reshape(batch, -1), gamma.reshape(batch, -1)[:, kept]], axis=1)
+        scale = power_of_two_scale(np.max(np.abs(S), axis=-1))
+        S *= scale[:, :, None] * scale[:, None]
+        try:
+            found = scale * np.linalg.solve(S, (right * scale)[..., None])[..., 0]
+        except np.linalg.LinAlgError:
+            raise SingularSystem("S is singular: the rows of a loop are not independent") from None
+        multiplier = np.zeros((batch, c))
+        multiplier[:, kept] = found[:, 6 * n :]
+        return found[:, : 6 * n].reshape(-1, 6), multiplier.ravel()
+
+
+def _independent_rows(rows: Array, always: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Numbers of rows that do not depend on others, by a pivoted QR, and of those that are always kept.
+
+    The first of rows that do equally well, whatever their rounding.
+    """
+    if not np.isfinite(rows).all():
+        raise SingularSystem("the rows of a loop are not finite")
+    of_joints = np.flatnonzero(~always)
+    factor = np.linspace(1.0, 0.5, len(of_joints)) / np.linalg.norm(rows[of_joints], axis=1)
+    _, triangle, order = qr((rows[of_joints] * factor[:, None]).T, mode="economic", pivoting=True)
+    size = np.abs(np.diagonal(triangle))
+    kept = of_joints[order[: int(np.sum(size > RUN_RANK_TOLERANCE * size[0]))]]
+    return np.sort(np.concatenate([kept, np.flatnonzero(always)]))
+
+
 EliminatedSystem = StructuredSystem | TreeSystem
 
 
 def eliminated_system(mechanisms: Sequence[Mechanism], x: Array | None = None) -> EliminatedSystem:
-    """Make the O(bodies) form of the notes' system.
+    """Make the form of the notes' system that motions are integrated in: O(bodies) where there are no loops.
 
     Args:
-        mechanisms: chains of rods and balls, or trees with any joints.
+        mechanisms: chains of rods and balls, trees with any joints, or mechanisms with loops that have the
+            same joints between the same bodies.
         x: as of `TreeSystem`.
 
     Returns:
-        The form of chains where all are such, else that of trees.
+        The form of chains where all are such, else that of trees or of loops.
 
     """
+    if any(mechanism.has_loops for mechanism in mechanisms):
+        return LoopSystem(mechanisms, x)
     if all(mechanism.is_chain for mechanism in mechanisms):
         return StructuredSystem(mechanisms)
     return TreeSystem(mechanisms, x)

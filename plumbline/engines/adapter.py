@@ -80,6 +80,7 @@ class Adapter(ABC):
     builds_trees: ClassVar[bool] = False  # whether states of trees with any joints are evaluated
     builds_elements: ClassVar[bool] = False  # … and of mechanisms with rotors, springs, dampers and efforts
     loops_unsupported_reason: ClassVar[str] = ""  # why states of mechanisms with loops are not, if so
+    moves_loops: ClassVar[bool] = False  # whether motions of mechanisms with loops are simulated
     reproduction_template: ClassVar[str] = ""  # template of stand-alone scripts; without one there are none
 
     @abstractmethod
@@ -184,7 +185,8 @@ class Adapter(ABC):
 
         """
         self._check_mechanism(model, self.builds_elements)
-        _refuse_motions_of_loops(model)
+        if model.has_loops and not self.moves_loops:
+            raise Unsupported(f"the adapter of {self.title} covers no motions of mechanisms with loops")
         check_state(model, state)
         method = self.integrator(integrator)
         if method.kind == "step":

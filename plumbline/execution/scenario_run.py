@@ -36,7 +36,7 @@ from plumbline.judging.step import (
 from plumbline.judging.trajectory import judge_trajectory
 from plumbline.model.datatypes import Integrator, Model
 from plumbline.model.invariants import inertia_ratio
-from plumbline.model.loops import is_singular, smallest_singular_value
+from plumbline.model.loops import MIN_MOTION_SINGULAR_VALUE, is_singular, smallest_singular_value
 from plumbline.model.sampling import compared_states
 from plumbline.processes.workers import Outcome, Pickled, Task
 from plumbline.scenario.loader import Scenario
@@ -77,11 +77,9 @@ def uncompared_kinds(model: Model) -> dict[TaskKind, str]:
         By kind of task why it is left out.
 
     """
-    motions = (
-        TaskKind.MOTION_TRUTH, TaskKind.TRAJECTORY, TaskKind.LONG_RUN, TaskKind.RELATIONS, TaskKind.STEP,
-    )  # fmt: skip
     if model.has_loops:
-        return dict.fromkeys(motions, "only states of mechanisms with loops are compared")
+        kinds = (TaskKind.LONG_RUN, TaskKind.RELATIONS, TaskKind.STEP)
+        return dict.fromkeys(kinds, "of mechanisms with loops states and motions are compared")
     if model.n > MAX_STEP_BODIES:
         return {TaskKind.STEP: f"single steps are compared of at most {MAX_STEP_BODIES} bodies"}
     return {}
@@ -121,7 +119,15 @@ class ScenarioRun:
         self._plan, self._engines, self._known, self._is_random = plan, engines, known, is_random
         levels = level or (plan.random_level if is_random else plan.level)
         has_long_runs = plan.long_run_seconds > 0 and not is_random
+        # how near the initial pose is to a singular one
+        loops = scenario.model.has_loops
+        self._singular_value = smallest_singular_value(scenario.model, scenario.state) if loops else np.inf
         self._left_out = uncompared_kinds(scenario.model)
+        if self._singular_value < MIN_MOTION_SINGULAR_VALUE:
+            singular = (
+                f"singular: at the initial pose the smallest singular value is {self._singular_value:.2g}"
+            )
+            self._left_out |= dict.fromkeys((TaskKind.MOTION_TRUTH, TaskKind.TRAJECTORY), singular)
         every = list(task_keys(scenario.name, engines, levels, has_long_runs))
         self._keys = [key for key in every if key.kind not in self._left_out]
         self._gaps = dict.fromkeys((key.engine, key.kind) for key in every if key.kind in _GAP_LEVELS)
@@ -133,9 +139,6 @@ class ScenarioRun:
         count = min(count, STATES_PER_RANDOM_SCENARIO) if is_random else count
         states = compared_states(scenario.model, scenario.state, scenario.seed, count)
         self._states = Pickled.of(states)  # argument of many tasks
-        # how near the initial pose is to a singular one
-        loops = scenario.model.has_loops
-        self._singular_value = smallest_singular_value(scenario.model, scenario.state) if loops else np.inf
         self._step_states = states[:STEP_STATES]
 
     def tasks(self) -> Iterator[Task]:
@@ -335,7 +338,9 @@ class ScenarioRun:
             steps = refinement_resolutions(
                 integrator, s.model.n, s.duration, plan.extra_refinements, s.sample_interval
             )
-            return run_refinement_study, (integrator.name, s.model, s.state, s.times, steps)
+            truth = self.truths.get(TaskKind.MOTION_TRUTH)  # ends before a singular pose
+            times = truth.trajectory.t if isinstance(truth, MotionTruth) else s.times
+            return run_refinement_study, (integrator.name, s.model, s.state, times, steps)
         length = plan_long_run(integrator, s.model.n, plan.long_run_seconds, s.sample_interval)
         return run_long_run_study, (integrator.name, s.model, s.state, s.sample_interval, length)
 

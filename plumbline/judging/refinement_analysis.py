@@ -105,6 +105,11 @@ class RefinementAnalysis:
         return {"alias_of": alias, "cpu_time": sum(run.cpu_time for run in self.runs)}
 
     @property
+    def limit_error(self) -> Array:
+        """(2,) m and rad: of the finest run, where it is itself a limit."""
+        return np.zeros(2) if self.finest.limit_error is None else self.finest.limit_error
+
+    @property
     def rounding_description(self) -> str:
         """The formula of `rounding`, for derivations."""
         if not self.integrator.solver_rtol:

@@ -19,6 +19,7 @@ from plumbline.judging.identity import run_fingerprints
 from plumbline.judging.invariant_drift import invariant_rows
 from plumbline.judging.refinement_analysis import RefinementAnalysis
 from plumbline.judging.rows import Columns, JudgingResult, Row, RowContext, Verdict, first_decided
+from plumbline.judging.state import SINGULAR_POSE
 from plumbline.model.datatypes import Array, Integrator, Model, Trajectory
 from plumbline.model.invariants import INVARIANT_UNITS, attitude_error, position_error
 from plumbline.truth.ground_truth import DETECTABLE_PARAMETER_ERROR, MotionTruth
@@ -50,6 +51,8 @@ def judge_trajectory(
         return JudgingResult([context.make_row("trajectory", integrator.name, "all", Verdict.FAILED, reason)])
     analysis = RefinementAnalysis(context, model, truth, integrator, study.runs, truth.horizon)
     rows = [*trajectory_rows(analysis), *invariant_rows(analysis)]
+    if truth.singular:
+        rows.append(singular_motion_row(context, integrator.name, truth))
     names: Columns = {"scenario": context.scenario, "engine": context.engine, "integrator": integrator.name}
     of_finest = names | {"resolution": finest.resolution}
     tables = [
@@ -59,6 +62,25 @@ def judge_trajectory(
     ]
     finished = {run.resolution: run.trajectory for run in study.runs if run.trajectory is not None}
     return JudgingResult(rows, tables, run_fingerprints(integrator.name, finished))
+
+
+def singular_motion_row(context: RowContext, integrator: str, truth: MotionTruth) -> Row:
+    """Report that a motion is compared only up to a singular pose.
+
+    Args:
+        context: scenario and engine.
+        integrator: of the runs.
+        truth: the motion.
+
+    Returns:
+        The row, unresolved.
+
+    """
+    end = float(truth.trajectory.t[-1])
+    reason = f"{truth.singular}; compared up to t = {end:g} s"
+    return context.make_row(
+        "trajectory", integrator, SINGULAR_POSE, Verdict.UNRESOLVED, reason, compared_until=end
+    )
 
 
 def trajectory_rows(study: RefinementAnalysis) -> list[Row]:
@@ -78,14 +100,14 @@ def trajectory_rows(study: RefinementAnalysis) -> list[Row]:
         study,
         _ComparedQuantity(
             "position", "m", study.positions, truth.trajectory.r,
-            truth.position_uncertainty, truth.detectable_position, truth.length,
+            truth.position_uncertainty, truth.detectable_position, study.limit_error[0], truth.length,
         ),
     )  # fmt: skip
     rows += _rows_against_truth(
         study,
         _ComparedQuantity(
             "attitude", "rad", study.attitudes, truth.trajectory.p,
-            truth.attitude_uncertainty, truth.detectable_attitude, 2.0,
+            truth.attitude_uncertainty, truth.detectable_attitude, study.limit_error[1], 2.0,
         ),
     )  # fmt: skip
     return rows
@@ -134,6 +156,7 @@ class _ComparedQuantity:
     true: Array
     truth_uncertainty: Array  # (T,) in ``unit``
     detectable: Array  # (T,) in ``unit``: effect of the smallest mistake that must be detected
+    limit_error: float  # in ``unit``: of runs that are themselves the limit of softer ones
     scale: float  # of rounding, in ``unit``
 
     @property
@@ -165,7 +188,8 @@ def _rows_against_truth(study: RefinementAnalysis, quantity: _ComparedQuantity) 
     except ValueError as error:
         return [make_row("trajectory", method, f"{name}_limit", Verdict.UNRESOLVED, str(error), unit)]
     off = np.maximum.accumulate(quantity.error(limit.y, quantity.true))
-    limit_uncertainty, rounding = quantity.per_component * limit.uncertainty, quantity.scale * study.rounding
+    limit_uncertainty = quantity.per_component * limit.uncertainty + quantity.limit_error
+    rounding = quantity.scale * study.rounding
     tolerance = limit_uncertainty + quantity.truth_uncertainty + rounding
     found = _judge_windows(study, quantity, off, tolerance)
     at, end = found.last_sample, float(study.times[found.last_sample])

@@ -115,8 +115,8 @@ class Invariants:
     energy_drift: Array  # (T, 1, 1) J: E - E(0) - W, W the work of loads and drag
     # (T, 1, 1) kg m²/s: change of the angular momentum about the pivot along gravity; None if not conserved
     momentum_drift: Array | None
-    joint_gap: Array  # (T, N, 3) m: d of a ball joint; (|d| - ℓ, 0, 0) of a rod
-    gap_rate: Array  # (T, N, 3) m/s: its rate
+    joint_gap: Array  # (T, J, 3) m: d of a ball joint; (|d| - ℓ, 0, 0) of a rod
+    gap_rate: Array  # (T, J, 3) m/s: its rate
     norm_drift: Array  # (T, N, 1) –: |p| - 1
     work_uncertainty: float  # J: of W by quadrature over the samples
 
@@ -286,20 +286,20 @@ def element_energies(model: Model, run: Trajectory, omega: Array) -> ElementEner
         joint_vector_rates(model, run, omega),
     )
     spin = np.matvec(A, omega)
-    for k, far in enumerate(model.body[:, 0]):
+    for k, (far, b) in enumerate(model.body):
         if not any(np.any(getattr(model, name)[k]) for name in JOINT_ELEMENTS):
             continue
         still = np.tile(np.eye(3), (len(run.t), 1, 1))
-        above, far_spin = (A[:, far], spin[:, far]) if far >= 0 else (still, 0 * spin[:, k])
+        above, far_spin = (A[:, far], spin[:, far]) if far >= 0 else (still, 0 * spin[:, b])
         far_axes, near_axes = (
             above @ rotation_matrix(model.turn[k, 0]),
-            A[:, k] @ rotation_matrix(model.turn[k, 1]),
+            A[:, b] @ rotation_matrix(model.turn[k, 1]),
         )
-        relative, turning = far_axes.mT @ near_axes, spin[:, k] - far_spin
+        relative, turning = far_axes.mT @ near_axes, spin[:, b] - far_spin
         if model.kind[k] == "ball":
             rest = ball_spring_rest(model, k)
             unloaded = quaternion_product(run.p[:, far], rest) if far >= 0 else np.tile(rest, (len(run.t), 1))
-            turn = rotation_vector(quaternion_product(quaternion_conjugate(unloaded), run.p[:, k]))
+            turn = rotation_vector(quaternion_product(quaternion_conjugate(unloaded), run.p[:, b]))
             pairs = [(0, turn, turning)]
         else:
             pairs = []
@@ -313,7 +313,8 @@ def element_energies(model: Model, run: Trajectory, omega: Array) -> ElementEner
                         two if model.kind[k] == "universal" and i == 1 else one
                     )  # perpendicular to both axes
                     x = np.arctan2(relative[:, two, one], relative[:, kept, kept])
-                    start = x[0] if run.initial_x is None else run.initial_x[k, i]
+                    is_known = run.initial_x is not None and k < model.n
+                    start = run.initial_x[k, i] if is_known else x[0]
                     rate = _dot(along, turning)
                     x = _unwrapped(x, rate, run.t, start)
                 pairs.append((i, (x - model.rest[k, i])[:, None], rate[:, None]))
@@ -358,12 +359,12 @@ def joint_vector_rates(model: Model, run: Trajectory, omega: Array) -> Array:
         omega: (T, N, 3) angular velocities of the run, body frame [rad/s].
 
     Returns:
-        (T, N, 3) rates, world frame [m/s].
+        (T, J, 3) rates, world frame [m/s].
 
     """
     a = rotation_matrix(run.p)
-    near = run.v + np.einsum("tkij,tkj->tki", a, cross(omega, model.proximal))
-    far = model.body[:, 0]
+    far, body = model.body.T
+    near = run.v[:, body] + np.einsum("tkij,tkj->tki", a[:, body], cross(omega[:, body], model.proximal))
     swing = np.einsum("tkij,tkj->tki", a[:, far], cross(omega[:, far], model.point[:, 0]))
     return np.asarray(near - np.where((far < 0)[:, None], 0.0, run.v[:, far] + swing))
 

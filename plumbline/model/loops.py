@@ -17,7 +17,16 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from plumbline.model.datatypes import BODY_FIELDS, JOINT_FIELDS, KINDS, Array, Model, State, StateQuantities
+from plumbline.model.datatypes import (
+    BODY_FIELDS,
+    JOINT_FIELDS,
+    KINDS,
+    Array,
+    Model,
+    State,
+    StateQuantities,
+    Trajectory,
+)
 from plumbline.model.kinematics import (
     complete_state,
     cross,
@@ -32,6 +41,7 @@ from plumbline.model.kinematics import (
 )
 
 MIN_SINGULAR_VALUE = 1e-6  # of the rows that hold, below it a pose counts as singular
+MIN_MOTION_SINGULAR_VALUE = 1e-2  # the same of poses that a motion is compared at: it loses digits near them
 RANK_TOLERANCE = 1e-11  # of singular values of scaled rows: below it a row depends on the others
 NEWTON_STEPS, MAX_HALVINGS = 30, 6
 NEARLY_CLOSED = 1e-11  # of a gap [m, rad]: the next step of Newton's method leaves only rounding
@@ -99,6 +109,19 @@ class CutMechanism:
             places = self.place if of_joint else bodies if name in PER_BODY else None
             found[name] = value if value is None or places is None else value[places]
         return StateQuantities(**found | {"mass_matrix": None})
+
+    def source_run(self, run: Trajectory) -> Trajectory:
+        """Describe a run of the tree as one of the mechanism.
+
+        Args:
+            run: of the tree.
+
+        Returns:
+            The same samples of the mechanism's bodies.
+
+        """
+        bodies, names = self.place[: self.source.n], ("r", "p", "v", "pdot")
+        return replace(run, **{name: getattr(run, name)[:, bodies] for name in names})
 
     def gap(self, state: State) -> Array:
         """Return F.

@@ -14,9 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from plumbline.engines.registry import load_adapter
-from plumbline.model.datatypes import Array, Model, State, StateQuantities, Trajectory
+from plumbline.model.datatypes import KINDS, Array, EngineFailure, Model, State, StateQuantities, Trajectory
 from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import complete_state
+from plumbline.model.loops import MIN_MOTION_SINGULAR_VALUE, assembled
 from plumbline.model.sampling import derive_seed
 from plumbline.truth import TruthUnavailable
 from plumbline.truth.certified import certify_state
@@ -30,6 +31,7 @@ RUN_ROUNDING = 1e3 * 2.0**-52  # error of a whole run over its growth G; the lar
 TRUTHS_DIFFER = "the two truth methods differ by more than rounding explains: one is wrong, or at its limits"
 # an error of this relative size in a parameter must be detectable, or the verdict is "unresolved"
 DETECTABLE_PARAMETER_ERROR = 1e-4
+MIN_SAMPLES = 3  # of a motion that is compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +57,7 @@ class MotionTruth:
     length: float  # m, of the stretched chain: the scale of rounding in positions
     method: str
     conflict: str = ""  # how the two methods differ by more than rounding explains; empty where they do not
+    singular: str = ""  # why the motion ends before the scenario does: a pose that is singular, or nearly so
 
     @property
     def horizon(self) -> float:
@@ -122,12 +125,21 @@ def motion_truth(
         The motion with all that `MotionTruth` holds.
 
     Raises:
-        EngineFailure: the integrator of the notes' form stops early.
+        EngineFailure: the integrator of the notes' form stops early, or the motion of a loop is singular from
+            the start.
 
     """
     # with SciPy: not in a run's own process, which needs the classes of this module
     from plumbline.truth import sensitivity, trajectory
 
+    singular = ""
+    if model.has_loops:
+        times, singular = _regular_times(model, state, times)
+        closed_form = closed_form and (
+            closed_form[0][: len(times)],
+            closed_form[1][: len(times)],
+            closed_form[2],
+        )
     if max_compiled_bodies is None:
         max_compiled_bodies = trajectory.MAX_COMPILED_BODIES
     truth = trajectory.trajectory_truth(model, state, times, closed_form, max_compiled_bodies, proof)
@@ -156,6 +168,23 @@ def motion_truth(
         f"{excess[worst]:.2g} times what rounding explains; methods: {truth.method}"
         if differ
         else "",
+        singular=singular,
+    )
+
+
+def _regular_times(model: Model, state: State, times: Array) -> tuple[Array, str]:
+    """The sample times while the motion is regular, and why it ends before the last one."""
+    from plumbline.truth.regular_motion import regular_motion
+
+    regular = regular_motion(model, state, times)
+    if not regular.is_singular:
+        return times, ""
+    kept = times[times <= regular.end]
+    if len(kept) < MIN_SAMPLES:
+        raise EngineFailure(f"the motion comes to a singular pose at t = {regular.end:.3g} s")
+    return kept, (
+        f"singular: from t = {regular.end:.4g} s on the smallest singular value of the rows that close the "
+        f"loops is below {MIN_MOTION_SINGULAR_VALUE:g}; at a singular pose accelerations are not unique"
     )
 
 
@@ -171,6 +200,7 @@ def stretched_length(model: Model) -> Array:
         distance from the near point to the centre of mass, radius of gyration.
 
     """
+    model = model.tree
     span, far = np.zeros(model.n), model.body[:, 0]
     on_body = far >= 0
     distance = np.linalg.norm(model.proximal[far[on_body]] - model.point[on_body, 0], axis=1)
@@ -185,7 +215,8 @@ def perturbed_models(model: Model, state: State) -> list[tuple[Model, State]]:
     """Create models with parameter errors of one part in 10⁴.
 
     Gravity, the masses, the inertias and the attachment points are changed in turn, each entry by ±1e-4 of
-    itself with random signs (gravity as a whole).
+    itself with random signs (gravity as a whole; the points of mechanisms with loops too, which could not
+    move otherwise where rows depend on others).
 
     Args:
         model: the mechanism.
@@ -207,11 +238,27 @@ def perturbed_models(model: Model, state: State) -> list[tuple[Model, State]]:
         replace(model, gravity=model.gravity * (1 + DETECTABLE_PARAMETER_ERROR)),
         replace(model, mass=perturbed(model.mass)),
         replace(model, inertia=model.inertia * (factors + factors.mT) / 2),
+    ]
+    if model.has_loops:
+        size = 1 + DETECTABLE_PARAMETER_ERROR
+        larger = replace(model, point=size * model.point, length=size * model.length)
+        grown = replace(state, r=size * state.r, v=size * state.v, **_with_longer_slides(model, state, size))
+        return [*((m, state) for m in models), (larger, assembled(larger, complete_state(larger, grown)))]
+    models.append(
         model.changed(proximal=perturbed(model.proximal), distal=perturbed(model.distal))
         if model.is_chain
-        else replace(model, point=perturbed(model.point)),
-    ]
+        else replace(model, point=perturbed(model.point))
+    )
     return [(m, complete_state(m, state)) for m in models]
+
+
+def _with_longer_slides(model: Model, state: State, size: float) -> dict[str, Array]:
+    """The joint coordinates of a state with shifts ``size`` times as long."""
+    factors = np.ones((model.n, 2))
+    for k, kind in enumerate(model.kind[: model.n]):
+        for i, (what, _) in enumerate(KINDS[kind].motions):
+            factors[k, i] = size if what == "slide" else 1.0
+    return {"x": factors * state.x, "xdot": factors * state.xdot}
 
 
 def detectable_effect(model: Model, r: Array, p: Array) -> tuple[Array, Array]:

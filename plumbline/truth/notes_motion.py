@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from plumbline.model.datatypes import Array, EngineFailure, Model, State, Trajectory
-from plumbline.model.kinematics import quaternion_rate
+from plumbline.model.kinematics import joint_coordinates, quaternion_rate
 from reference_impl.collocation import integrate_collocation
 from reference_impl.integrate import IntegrationResult, integrate_dop853, structured_acceleration
 from reference_impl.tree_elimination import eliminated_system
@@ -35,16 +35,19 @@ def simulate_notes_form(
         EngineFailure: the integrator stops early.
 
     """
-    start = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+    start, x = (
+        (state.r, state.p, state.v, quaternion_rate(state.p, state.omega)),
+        joint_coordinates(model, state)[2],
+    )
     run: IntegrationResult
     try:
         if (
             method == "dop853"
         ):  # absolute tolerances of 1 m, 1, 1 m/s and 1 1/s: those by default are too coarse
             form = structured_acceleration(model)
-            run = integrate_dop853(model, *start, times, rtol, form, x=state.x, atol=rtol)
+            run = integrate_dop853(model, *start, times, rtol, form, x=x, atol=rtol)
         else:
-            system = eliminated_system([model], state.x)
+            system = eliminated_system([model], x)
             run = integrate_collocation(system, *start, times, rtol, project=True)
     except ArithmeticError as error:
         raise EngineFailure(str(error)) from None

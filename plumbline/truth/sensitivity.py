@@ -18,6 +18,7 @@ from plumbline.model.kinematics import (
     angular_velocity,
     complete_state,
     cross,
+    joint_coordinates,
     joint_vectors,
     quaternion_conjugate,
     quaternion_product,
@@ -26,6 +27,7 @@ from plumbline.model.kinematics import (
     rotation_matrix,
     state_from_minimal,
 )
+from plumbline.model.loops import assembled
 from plumbline.model.sampling import derive_seed
 from reference_impl.collocation import integrate_collocation
 from reference_impl.structured import component_first
@@ -122,7 +124,9 @@ def perturbation_growth_and_runs(
         if done + stop >= len(times) - 1:
             return np.asarray(np.maximum(np.max(growth, axis=0), 1.0)), *runs
         base, *moved = (
-            replace(project_to_manifold(model, *(y[k, stop] for y in (r, p, v, pdot))), x=x[k, stop])
+            replace(
+                project_to_manifold(model, *(y[k, stop] for y in (r, p, v, pdot))), x=x[k, stop, : model.n]
+            )
             for k in (0, *neighbours)
         )
         size = np.minimum(distance[:, stop], PERTURBATION_SIZE)
@@ -166,15 +170,15 @@ def perturbed_states(
             continue
         x, r = (y + perturbation_size * rng.normal(size=y.shape) for y in (state.x, state.r))
         xdot, v = (y + spread * rng.normal(size=y.shape) for y in (state.xdot, state.v))
-        found.append(
-            complete_state(model, State(*_unit_coordinates(model, p, omega, u, udot), r, v, x, xdot))
-        )
+        near = complete_state(model, State(*_unit_coordinates(model, p, omega, u, udot), r, v, x, xdot))
+        found.append(assembled(model, near))
     return found
 
 
 def _integrate_batch(models: list[Model], states: list[State], times: Array) -> list[Array]:
     """r, p, ṙ, ṗ, x (runs, T, N, ·) of a batch of mechanisms of as many bodies, from times[0]."""
-    system = eliminated_system(models, np.concatenate([state.x for state in states]))
+    pairs = zip(models, states, strict=True)
+    system = eliminated_system(models, np.concatenate([joint_coordinates(*pair)[2] for pair in pairs]))
     r, p, v = (np.concatenate([getattr(state, name) for state in states]) for name in ("r", "p", "v"))
     pdot = np.concatenate([quaternion_rate(state.p, state.omega) for state in states])
     run = integrate_collocation(system, r, p, v, pdot, times, RTOL)

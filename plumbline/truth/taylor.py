@@ -2,10 +2,10 @@
 
 Coordinates per body: the quaternion p, ω′, and for a rod u, u̇ (world frame).  The joint forces come from the
 block elimination described in `certified`, written as expressions in the coordinates; no constraint is
-integrated, so nothing drifts.  Trees with other joints have the equations of `taylor_tree`.  One compiled
-integrator serves every model with the same sequence of joints:
-the numbers of the model enter as parameters, which also keeps double-precision constants out of the quad
-model.  Vectors (3,) and matrices (3, 3) of expressions are NumPy arrays of objects.
+integrated, so nothing drifts.  Mechanisms with other joints have the equations of `taylor_tree`; loops are
+held by accelerations there, and drift by rounding.  One compiled integrator serves every model with the same
+sequence of joints: the numbers of the model enter as parameters, which also keeps double-precision constants
+out of the quad model.  Vectors (3,) and matrices (3, 3) of expressions are NumPy arrays of objects.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any, Literal
@@ -22,10 +22,11 @@ import numpy as np
 
 from plumbline.model.datatypes import Array, EngineFailure, Model, State
 from plumbline.model.kinematics import forward_kinematics
+from plumbline.model.loops import cut_open
 from plumbline.processes.processor import processor_features
 from plumbline.processes.user_cache import content_key, recall, remember
 from plumbline.truth import import_truth_tool, taylor_tree
-from plumbline.truth.taylor_tree import Topology, rotation_matrix, vector
+from plumbline.truth.taylor_tree import Closure, Topology, rotation_matrix, vector
 
 Precision = Literal["double", "extended", "quad", "octuple"]
 OCTUPLE_BITS, OCTUPLE_DIGITS = 237, 75
@@ -65,7 +66,20 @@ def simulate_taylor(
         EngineFailure: a step fails, or heyoka was built without quad precision.
 
     """
-    integrator, number = _prepared_integrator(model, state, precision)
+    if model.has_loops:
+        cut = cut_open(model)
+        there, bodies = cut.state(state), cut.place[: model.n]
+        run = _simulate(cut.model, there, times, precision, taylor_tree.closures(cut, there))
+        names = ("p", "omega", "u", "udot", "r", "v")
+        return replace(run, **{name: getattr(run, name)[:, bodies] for name in names})
+    return _simulate(model, state, times, precision, ())
+
+
+def _simulate(
+    model: Model, state: State, times: Array, precision: Precision, closures: tuple[Closure, ...]
+) -> MinimalCoordinateRun:
+    """Integrate a tree, its loops closed."""
+    integrator, number = _prepared_integrator(model, state, precision, closures=closures)
     outcome, _, _, steps, _, samples = integrator.propagate_grid([number(float(t)) for t in times])
     if "time_limit" not in str(outcome):
         raise EngineFailure(f"heyoka stopped: {outcome}")
@@ -149,11 +163,15 @@ def load_heyoka() -> Any:
 
 
 def _prepared_integrator(
-    model: Model, state: State, precision: Precision, order: int | None = None
+    model: Model,
+    state: State,
+    precision: Precision,
+    order: int | None = None,
+    closures: tuple[Closure, ...] = (),
 ) -> tuple[Any, Callable[[Any], Any]]:
     """The integrator of a model at time 0 in a state, and the conversion to its numbers."""
     mp, number = import_truth_tool("mpmath"), _number_conversion(precision)
-    joints: _Joints = taylor_tree.topology(model)
+    joints: _Joints = taylor_tree.topology(model)._replace(closures=closures)
     parameters, values = taylor_tree.parameter_values, taylor_tree.initial_values
     if model.is_chain:
         joints = tuple(bool(rod) for rod in model.rods)

@@ -6,6 +6,11 @@ Body Dynamics Algorithms, 2008, section 6.5).  A rod moves its near end by ℓ (
 rank two: m ℓ² u uᵀ added to its block of M leaves their part across u, and sets that along u to 0.
 Rotors, springs and dampers act on the relative rates ν of their joints, which those of a ball joint are too:
 Ω along the world's axes, whose rotor adds a (Ω̇ + Ω × ω) in the turning near body's axes.
+Loops are cut open (`plumbline.model.loops`): the ends b and c of each get forces λ on rows J of their
+relative acceleration in the axes of b, with X = M⁻¹ Jᵀ and ν̇₀ of the tree alone
+
+    J X λ = −(J ν̇₀ + A_bᵀ (a_b − a_c, α_b − α_c) at ν̇ = 0),      ν̇ = ν̇₀ + X λ.
+
 Coordinates per body: u, u̇ of a rod (world axes), r, ṙ of a free body, p and ω′ of both and of balls, x and ẋ
 of the other joints.
 """
@@ -18,7 +23,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Kind, Model, State
+from plumbline.model.loops import CutMechanism, independent_rows
 from plumbline.truth import TruthUnavailable
+
+# Of a loop the bodies b and c, and which of the six rows are held: shifts, then turns, in axes of b.
+Closure = tuple[int, int, tuple[int, ...]]
 
 
 class Topology(NamedTuple):
@@ -29,6 +38,7 @@ class Topology(NamedTuple):
     has_drag: bool
     has_joint_elements: bool = False
     springs: tuple[tuple[int, int], ...] = ()  # bodies of springs between points, −1 the world
+    closures: tuple[Closure, ...] = ()
 
 
 def topology(model: Model) -> Topology:
@@ -49,6 +59,27 @@ def topology(model: Model) -> Topology:
     far = tuple(int(far) for far in model.body[:, 0])
     springs = tuple((int(a), int(b)) for a, b in model.spring_body)
     return Topology(model.kind, far, model.has_drag, model.has_joint_elements, springs)
+
+
+def closures(cut: CutMechanism, state: State) -> tuple[Closure, ...]:
+    """Choose rows that close the loops and do not depend on others.
+
+    Args:
+        cut: the mechanism cut open.
+        state: of its tree, the ends together.
+
+    Returns:
+        The ends and rows of each loop.
+
+    """
+    J = cut.jacobian(state).reshape(len(cut.ends), 6, -1)
+    for block, (b, _) in zip(J, cut.ends, strict=True):
+        block[:3] = rotation_matrix(state.p[b]).astype(float).T @ block[:3]
+    rows = independent_rows(J.reshape(-1, J.shape[-1]), cut.row_scale)
+    return tuple(
+        (b, c, tuple(int(row) - 6 * loop for row in rows if row // 6 == loop))
+        for loop, (b, c) in enumerate(cut.ends)
+    )
 
 
 def coordinate_names(kind: Kind) -> list[tuple[str, int]]:
@@ -140,7 +171,11 @@ def equations_of_motion(hy: Any, tree: Topology) -> list[tuple[Any, Any]]:
     for j, ends in enumerate(tree.springs):
         _add_spring(hy, bodies, own_wrenches, ends, 3 + _PARAMETERS * len(bodies) + _SPRING_PARAMETERS * j)
     wrenches = _subtree_sums(tree, own_wrenches)
-    rates = _solve_sparse(*_mass_matrix(tree, bodies, inertias, wrenches))
+    mass, before, right = _mass_matrix(tree, bodies, inertias, wrenches)
+    _factor_sparse(mass, before)
+    rates = _substitute_sparse(mass, before, right)
+    if tree.closures:
+        rates = _close_loops(tree, bodies, mass, before, rates)
     gained: list[Any] = []
     system: list[tuple[Any, Any]] = []
     for k, (body, far) in enumerate(zip(bodies, tree.far, strict=True)):
@@ -360,26 +395,70 @@ def _mass_matrix(
     return H, before, right
 
 
-def _solve_sparse(H: list[list[Any]], before: list[int], b: list[Any]) -> list[Any]:
-    """Solve H x = b by H = Lᵀ D L, along the tree's branches only."""
-    x = list(b)
+def _path(before: list[int], i: int) -> Iterable[int]:
+    while (i := before[i]) >= 0:
+        yield i
 
-    def path(i: int) -> Iterable[int]:
-        while (i := before[i]) >= 0:
-            yield i
 
-    for k in reversed(range(len(x))):
-        for i in path(k):
+def _factor_sparse(H: list[list[Any]], before: list[int]) -> None:
+    """Factor H = Lᵀ D L in place, along the tree's branches only."""
+    for k in reversed(range(len(H))):
+        for i in _path(before, k):
             factor = H[k][i] / H[k][k]
-            for j in (i, *path(i)):
+            for j in (i, *_path(before, i)):
                 H[i][j] = H[i][j] - factor * H[k][j]
             H[k][i] = factor
-            x[i] = x[i] - factor * x[k]
+
+
+def _substitute_sparse(H: list[list[Any]], before: list[int], b: list[Any]) -> list[Any]:
+    """Solve H x = b by the factors of H."""
+    x = list(b)
+    for k in reversed(range(len(x))):
+        for i in _path(before, k):
+            x[i] = x[i] - H[k][i] * x[k]
     for k in range(len(x)):
         x[k] = x[k] / H[k][k]
-        for i in path(k):
+        for i in _path(before, k):
             x[k] = x[k] - H[k][i] * x[i]
     return x
+
+
+def _close_loops(
+    tree: Topology, bodies: list[_Body], H: list[list[Any]], before: list[int], free: list[Any]
+) -> list[Any]:
+    """ν̇ with the loops closed, from the factors of M and the ν̇₀ of the open tree."""
+    first = np.cumsum([0, *(len(body.S) for body in bodies)]).tolist()
+    J: list[list[Any]] = []
+    gap: list[Any] = []  # relative accelerations at ν̇ = ν̇₀
+    for b, c, rows in tree.closures:
+        turned = bodies[b].A.T
+        columns = np.full((6, first[-1]), 0.0, object)
+        for end, sign in ((b, 1.0), (c, -1.0)):
+            k = end
+            while k >= 0:
+                for i, S in enumerate(bodies[k].S):
+                    at = np.concatenate([S[3:] + np.cross(S[:3], bodies[end].r), S[:3]])
+                    columns[:, first[k] + i] = columns[:, first[k] + i] + sign * at
+                k = tree.far[k]
+        bend, twist = bodies[b].bend - bodies[c].bend, bodies[b].twist - bodies[c].twist
+        columns = np.concatenate([turned @ columns[:3], turned @ columns[3:]])
+        bias = np.concatenate([turned @ bend, turned @ twist])
+        J += [list(columns[row]) for row in rows]
+        gap += [
+            bias[row] + sum((x * y for x, y in zip(columns[row], free, strict=True)), 0.0) for row in rows
+        ]
+    X = [_substitute_sparse(H, before, row) for row in J]
+    S = [
+        [sum((x * y for x, y in zip(J[i], X[j], strict=True)), 0.0) for j in range(i + 1)]
+        for i in range(len(J))
+    ]
+    dense = [i - 1 for i in range(len(J))]
+    _factor_sparse(S, dense)
+    multipliers = _substitute_sparse(S, dense, [-x for x in gap])
+    return [
+        sum((X[i][j] * multiplier for i, multiplier in enumerate(multipliers)), rate)
+        for j, rate in enumerate(free)
+    ]
 
 
 def vector(entries: Iterable[Any]) -> Any:

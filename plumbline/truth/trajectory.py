@@ -139,4 +139,7 @@ def _simulate_minimal_coordinates(
     found = simulate_taylor(model, state, times, precision)
     r, p, v, omega = (np.asarray(getattr(found, name), float) for name in ("r", "p", "v", "omega"))
     run = Trajectory(times, r, p, v, quaternion_rate(p, omega), found.steps, state.x)
-    return run, f"Taylor's method in minimal coordinates and {precision} precision"
+    coordinates = (
+        "coordinates of the tree without its closing joints" if model.has_loops else "minimal coordinates"
+    )
+    return run, f"Taylor's method in {coordinates} and {precision} precision"

@@ -1,0 +1,49 @@
+"""Every integrator of every engine on mechanisms with loops: it converges to the truth with its order."""
+
+import numpy as np
+import pytest
+
+from plumbline.engines.registry import load_adapter
+from plumbline.model.datatypes import Unsupported
+from plumbline.model.invariants import attitude_error, compute_invariants, position_error
+from plumbline.truth.notes_motion import simulate_notes_form
+from tests.helpers.catalogue import catalogue_scenarios
+
+TIMES = np.arange(5) / 32
+ORDER_MARGIN = 0.3  # orders are 1, 2 or 4; the next term of the error moves the slope less
+ENGINES = ["reference", "mujoco", "pinocchio", "exudyn"]
+
+
+@pytest.mark.parametrize("name", ["four-bar", "slider-crank", "bricard"])
+@pytest.mark.parametrize("engine", ENGINES)
+def test_motions_of_loops_converge_to_the_truth(engine, name):
+    s, adapter = catalogue_scenarios()[name], load_adapter(engine)
+    true = simulate_notes_form(s.model, s.state, TIMES, 1e-13)
+    for method in adapter.integrators:
+        resolutions = (2.0**-8, 2.0**-9) if method.kind == "step" else (1e-8, 1e-11)
+        runs = [adapter.simulate(s.model, s.state, TIMES, method.name, h) for h in resolutions]
+        errors = [position_error(x.r, true.r)[-1] + attitude_error(x.p, true.p)[-1] for x in runs]
+        if method.kind == "step":
+            order = np.log2(errors[0] / errors[1])
+            assert order == pytest.approx(method.order, abs=ORDER_MARGIN), (method.name, errors)
+        assert errors[1] < {1: 5e-2, 2: 1e-4}.get(method.order, 1e-8), method.name
+        found = [compute_invariants(s.model, run) for run in runs]
+        gaps = [np.max(np.abs(x.joint_gap)) for x in found]
+        assert gaps[1] < max(gaps[0], 1e-12) and gaps[1] < 1e-3, method.name
+        np.testing.assert_allclose(runs[1].v[0], s.state.v, atol=1e-12)
+
+
+def test_mujoco_states_how_far_its_soft_loops_are_from_rigid_ones():
+    s, adapter = catalogue_scenarios()["four-bar"], load_adapter("mujoco")
+    true = simulate_notes_form(s.model, s.state, TIMES, 1e-13)
+    run = adapter.simulate(s.model, s.state, TIMES, "RK4", 2.0**-10)
+    assert run.limit_error.shape == (2,) and np.all(run.limit_error > 0) and np.all(run.limit_error < 1e-10)
+    assert np.max(position_error(run.r, true.r)) < 1e-10
+
+
+@pytest.mark.parametrize("engine", ["pinocchio-maximal", "exudyn-tree"])
+def test_other_columns_refuse_motions_of_loops(engine):
+    s, adapter = catalogue_scenarios()["four-bar"], load_adapter(engine)
+    for method in adapter.integrators:
+        with pytest.raises(Unsupported, match=r"loops|closes"):
+            adapter.simulate(s.model, s.state, TIMES, method.name, 2.0**-8)

@@ -1,0 +1,129 @@
+"""Motions of mechanisms with loops: two formulations against each other and against closed forms."""
+
+from dataclasses import replace
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+
+from plumbline.model.invariants import attitude_error, compute_invariants, position_error
+from plumbline.model.kinematics import complete_state
+from plumbline.model.loops import assembled, loop_gaps
+from plumbline.model.random_mechanisms import random_loop_mechanism
+from plumbline.truth.ground_truth import motion_truth, perturbed_models
+from plumbline.truth.notes_motion import simulate_notes_form
+from plumbline.truth.regular_motion import regular_motion
+from plumbline.truth.sensitivity import perturbed_states
+from plumbline.truth.taylor import simulate_taylor
+from plumbline.truth.trajectory import trajectory_truth
+from tests.helpers.catalogue import catalogue_scenarios
+
+pytestmark = pytest.mark.skipif(
+    not (find_spec("heyoka") and find_spec("flint")), reason="the truth tools are not installed"
+)
+
+
+def tops(motions, times, windows=2, thickness=0.05):
+    """Top ends of the upright bars of equal four-bars, before they lie flat."""
+    angle = motions.four_bar_angle(windows, thickness, times)
+    return np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
+
+
+@pytest.fixture(scope="module")
+def motions():
+    from tests.helpers import classic_motions
+
+    return classic_motions
+
+
+def test_equal_four_bars_move_as_their_closed_form(motions):
+    s = catalogue_scenarios()["four-bars-2"]
+    times = s.times[s.times <= 0.5]
+    truth = trajectory_truth(s.model, s.state, times)
+    for run in (truth.trajectory, simulate_notes_form(s.model, s.state, times, 1e-13)):
+        # links 0 and 1 (bodies 1 and 3) move with the bars' top ends and do not turn
+        shift = run.r[:, 1] - np.array([0.5, 0, 0])
+        np.testing.assert_allclose(shift, tops(motions, times), atol=2e-14)
+        np.testing.assert_allclose(
+            run.r[:, 3] - run.r[:, 1], np.tile([1.0, 0, 0], (len(times), 1)), atol=2e-14
+        )
+    assert truth.position_uncertainty[-1] < 2e-14
+
+
+def test_the_squeezer_moves_as_its_quadrature(motions):
+    s = catalogue_scenarios()["squeezer"]
+    exact = motions.squeezer_motion("0.01953125")
+    times = np.array([0.0, 0.01953125])
+    r = np.asarray(simulate_taylor(s.model, s.state, times).p, float)
+    notes = simulate_notes_form(s.model, s.state, times, 1e-13).p
+    for p in (r, notes):
+        crank = 2 * np.arctan2(p[-1, 0, 3], p[-1, 0, 0])
+        error = crank - exact.angles["beta"]
+        error -= 2 * np.pi * np.round(error / (2 * np.pi))
+        assert abs(error) < 1e-10
+
+
+@pytest.mark.parametrize("name", ["four-bar", "slider-crank", "bricard"])
+def test_the_catalogues_loops_stay_closed_and_keep_their_energy(name):
+    s = catalogue_scenarios()[name]
+    truth = trajectory_truth(s.model, s.state, s.times[:9])
+    assert "tree without its closing joints" in truth.method
+    assert np.max(truth.position_uncertainty) < 1e-13
+    found = compute_invariants(s.model, truth.trajectory)
+    assert found.joint_gap.shape[1] == len(s.model.kind) > s.model.n
+    for drift in (found.joint_gap, found.gap_rate, found.energy_drift):
+        assert np.max(np.abs(drift)) < 1e-13
+
+
+def test_both_methods_agree_on_random_loops():
+    times = np.arange(5) / 32
+    for seed in (2, 5):
+        model, state = random_loop_mechanism(seed, 5, ("hinge",), tree=("hinge", "universal", "ball"))
+        notes = simulate_notes_form(model, state, times, 1e-13)
+        run = simulate_taylor(model, state, times)
+        size = max(1.0, float(np.max(np.abs(notes.r))))
+        assert np.max(position_error(np.asarray(run.r, float), notes.r)) < 1e-11 * size
+        assert np.max(attitude_error(np.asarray(run.p, float), notes.p)) < 1e-11
+
+
+def test_a_motion_ends_before_its_singular_pose(motions):
+    s = catalogue_scenarios()["four-bars-2"]
+    found = regular_motion(s.model, s.state, s.times)
+    angle = motions.four_bar_angle(2, 0.05, np.array([found.end]))[0]
+    assert found.is_singular and 0 < angle < 0.05  # nearly flat
+    truth = motion_truth(s.model, s.state, s.times, None)
+    assert truth.trajectory.t[-1] <= found.end < truth.trajectory.t[-1] + s.sample_interval
+    assert truth.singular.startswith("singular: from t = ") and not truth.conflict
+    regular = catalogue_scenarios()["four-bar"]
+    assert regular_motion(regular.model, regular.state, regular.times[:5]) == (
+        0.25,
+        False,
+        pytest.approx(1, abs=0.9),
+    )
+
+
+def test_neighbours_of_a_loop_and_models_with_other_numbers_are_closed():
+    s = catalogue_scenarios()["slider-crank"]
+    pairs = [(s.model, state) for state in perturbed_states(s.model, s.state)]
+    others = perturbed_models(s.model, s.state)
+    for model, state in (*pairs, *others):
+        gaps, rates = loop_gaps(model, state)
+        assert np.max(gaps) < 1e-14 and np.max(rates) < 1e-13
+    distances = [position_error(state.r, s.state.r) for _, state in pairs]
+    assert 1e-9 < min(distances) < max(distances) < 1e-5
+    larger, grown = others[-1]
+    np.testing.assert_allclose(grown.r, 1.0001 * s.state.r, atol=1e-14)
+    np.testing.assert_allclose(larger.point, 1.0001 * s.model.point, rtol=1e-15)
+
+
+def test_a_loop_moved_on_its_manifold_is_the_same_motion():
+    """Started at a later sample, the motion goes on as before."""
+    s = catalogue_scenarios()["slider-crank"]
+    times = np.arange(9) / 16
+    whole = simulate_taylor(s.model, s.state, times)
+    x = {k: np.asarray(getattr(whole, k)[4], float) for k in ("p", "omega", "u", "udot", "r", "v")}
+    from plumbline.model.kinematics import with_joint_coordinates
+
+    there = with_joint_coordinates(s.model, replace(s.state, **x))
+    rest = simulate_taylor(s.model, assembled(s.model, complete_state(s.model, there)), times[:5])
+    assert np.max(position_error(np.asarray(rest.r[-1], float), np.asarray(whole.r[-1], float))) < 1e-13
