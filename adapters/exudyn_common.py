@@ -326,16 +326,6 @@ def set_linear_solver(settings: Any, name: str) -> None:
         settings.linearSolverType = kind
 
 
-def ignore_dependent_rows(settings: Any) -> None:
-    """Let the dense solver leave out rows that depend on others.
-
-    Args:
-        settings: the settings to change.
-
-    """
-    getattr(settings, "linearSolver", settings).ignoreSingularJacobian = True
-
-
 def set_rk44(settings: Any) -> None:
     """Choose RK44, without the accelerations at the end of a step, which nothing here reads.
 

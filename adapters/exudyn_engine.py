@@ -34,7 +34,6 @@ from adapters.exudyn_common import (
     Output,
     add_loads,
     add_point_spring,
-    ignore_dependent_rows,
     initialized_solver,
     items,
     kinetic_energy,
@@ -96,8 +95,14 @@ class ExudynChain:
     of mass is.
     """
 
-    def __init__(self, model: Model, state: State, parts: BodyParts | None = None) -> None:
-        self.model, self.state = model, state
+    def __init__(
+        self,
+        model: Model,
+        state: State,
+        parts: BodyParts | None = None,
+        left_out: frozenset[tuple[int, int]] = frozenset(),
+    ) -> None:
+        self.model, self.state, self.left_out = model, state, left_out
         self.mbs, self.container = make_system()
         mbs, parts = self.mbs, parts or undivided_bodies(model)
         self.ground = mbs.AddObject(items.ObjectGround())
@@ -159,15 +164,17 @@ class ExudynChain:
         if kind == "free":
             self.joints.append(None)
             return
+        held = enumerate(CONSTRAINED_AXES.get(kind, [1] * 3))
+        rows = [int(is_held and (k, i) not in self.left_out) for i, is_held in held]
         if kind == "rod":
             joint = items.ObjectConnectorDistance(markerNumbers=ends, distance=model.length[k])
         elif kind == "ball":
-            joint = items.ObjectJointSpherical(markerNumbers=ends)
+            joint = items.ObjectJointSpherical(markerNumbers=ends, constrainedAxes=rows)
         else:
             turns = rotation_matrix(model.turn[k])
             joint = items.ObjectJointGeneric(
                 markerNumbers=ends,
-                constrainedAxes=CONSTRAINED_AXES[kind],
+                constrainedAxes=rows,
                 rotationMarker0=turns[0],
                 rotationMarker1=turns[1],
             )
@@ -351,7 +358,7 @@ class Exudyn(ExudynAdapter):
     ) -> Trajectory:
         self._check_elements(model)
         with silence_engine():
-            chain = ExudynChain(model, state)
+            chain = _chain_that_moves(model, state)
             samples = self._run_samples(chain, times, integrator, resolution)
         return _trajectory(model, state, times, samples, resolution)
 
@@ -371,7 +378,7 @@ class Exudyn(ExudynAdapter):
         self._check_elements(model)
         initial, leg = exudyn.ConfigurationType.Initial, np.array([0.0, end])
         with silence_engine():
-            chain = ExudynChain(model, state)
+            chain = _chain_that_moves(model, state)
             data = chain.mbs.systemData
             there = self._run_samples(chain, leg, integrator, resolution)
             q, qdot, qddot = there[-1]
@@ -393,9 +400,6 @@ class Exudyn(ExudynAdapter):
         """Return displacements, rates and accelerations (7N,) at ``times``."""
         settings, data = make_settings(), chain.mbs.systemData
         set_linear_solver(settings, self.option or self.usual_linear_solver)
-        if chain.model.has_loops:  # rows that depend on others: the solvers without pivoting fail at them
-            set_linear_solver(settings, "EigenDense")
-            ignore_dependent_rows(settings)
         alpha = settings.timeIntegration.generalizedAlpha
         alpha.computeInitialAccelerations = compute_initial_accelerations
         if integrator.name == "trapezoidal":
@@ -417,6 +421,29 @@ class Exudyn(ExudynAdapter):
             lambda: (*(part() for part in parts), chain.multipliers()),
         )  # fmt: skip
         return [sample[:3] for sample in self._samples]
+
+
+def _chain_that_moves(model: Model, state: State) -> ExudynChain:
+    """Assemble a system; of a loop without rows that depend on others, at which the engine's solvers fail."""
+    chain = ExudynChain(model, state)
+    if not model.has_loops:
+        return chain
+    _, _, C = _system_matrices(chain)
+    for k in [k for k, kind in enumerate(model.kind) if CONSTRAINED_AXES.get(kind, [])[:3] == [1, 1, 1]]:
+        # of some displacements the engine holds those along the joint's axes, of all those along the world's
+        rows, far = chain.joint_rows(k)[:3], model.body[k, 0]
+        above = rotation_matrix(state.p[far]) if far >= 0 else np.eye(3)
+        C[rows] = (above @ rotation_matrix(model.turn[k, 0])).T @ C[rows]
+    used = np.flatnonzero(np.any(C != 0, axis=1))
+    kept = set(used[independent_rows(C[used])].tolist())
+    data = chain.mbs.systemData
+    left_out = frozenset(
+        (k, i)
+        for k, joint in enumerate(chain.joints)
+        for i, row in enumerate(data.GetObjectLTGAE(joint) if joint is not None else ())
+        if row not in kept
+    )
+    return ExudynChain(model, state, left_out=left_out)
 
 
 def _trajectory(

@@ -74,7 +74,9 @@ MAX_IMPEDANCE = 0.9999  # of soft constraints: the largest that MuJoCo accepts
 # not yet linear in it), how they fall, and how many
 LARGEST_REGULARISATIONS, RATIO, REGULARISATIONS = (0.027, 2.7e-4, 2.7e-6), 3.0, 4
 SEQUENCES = (1.0, 1.3, 1.7)  # of them: factors of the largest
-RUN_REGULARISATIONS = (2.7e-6, 9e-7)  # of motions
+# Of motions: the error of smaller ones is rounding, and as 1/R what steps leave of gaps in dependent rows.
+LARGEST_RUN_REGULARISATION, RUN_REGULARISATIONS = 2.7e-4, 3
+RUN_STABILISATION = 50.0  # 1/s: gaps that steps open die as (1 + a t) e^{-a t}
 MAX_ORDER_ERROR = 0.1
 MIN_SOFTNESS = 1e-9  # a smaller relative effect of R is rounding
 MAX_NOISE = 1e-11  # relative, of differences that grow as R falls: more is too much to extrapolate
@@ -164,21 +166,24 @@ class Mujoco(MetamorphicHooks):
     def _rigid_run(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
-        """Run at two regularisations and extrapolate linearly to none; what that adds is the uncertainty."""
-        cut, runs = cut_open(model), []
-        for softness in RUN_REGULARISATIONS:
+        """Run at falling regularisations, extrapolate to none; the last order's change is the uncertainty."""
+        cut, runs = cut_open(model), list[Trajectory]()
+        for k in range(RUN_REGULARISATIONS):
             tree = _MujocoChain(cut.model, ends=cut.ends)
-            tree.soften(softness)
+            tree.soften(LARGEST_RUN_REGULARISATION / RATIO**k)
+            tree.m.eq_solref[:] = -(RUN_STABILISATION**2), -2 * RUN_STABILISATION
             run = self._sampled_run(tree, cut.state(state), times, integrator, resolution)
             runs.append(cut.source_run(run))
-        soft, stiff = runs
-        weight = RUN_REGULARISATIONS[1] / (RUN_REGULARISATIONS[0] - RUN_REGULARISATIONS[1])
-        change = {
-            name: weight * (getattr(stiff, name) - getattr(soft, name)) for name in ("r", "p", "v", "pdot")
-        }
-        limit = {name: getattr(stiff, name) + more for name, more in change.items()}
+        limit: dict[str, Any] = {}
+        change: dict[str, Array] = {}
+        for name in ("r", "p", "v", "pdot"):
+            column = [getattr(run, name) for run in runs]
+            for power in range(1, RUN_REGULARISATIONS):
+                before = column[-1]
+                column = [(RATIO**power * x - y) / (RATIO**power - 1) for y, x in pairwise(column)]
+            limit[name], change[name] = column[0], column[0] - before
         error = np.array([_largest_norm(change["r"]), 2 * _largest_norm(change["p"])])
-        return replace(stiff, **limit, limit_error=error)
+        return replace(runs[-1], **limit, limit_error=error)
 
     def _sampled_run(
         self, chain: _MujocoChain, state: State, times: Array, integrator: Integrator, resolution: float

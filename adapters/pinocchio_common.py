@@ -156,6 +156,21 @@ def init_constraint_dynamics(pin_model: pin.Model, data: pin.Data, contacts: Any
         pin.initConstraintDynamics(pin_model, data, contacts)
 
 
+def set_corrector(contact: Any, rate: float) -> None:
+    """Set the engine's own correction of gaps in a constraint (Baumgarte's).
+
+    Args:
+        contact: the constraint model.
+        rate: a [1/s]; adds −2 a Ċ − a² C to its accelerations.
+
+    """
+    before = getattr(contact, "corrector", None)  # version 3
+    gains = contact.m_baumgarte_parameters if before is None else before
+    gains.Kp, gains.Kd = (
+        (rate**2, 2 * rate) if before is None else (np.full(6, rate**2), np.full(6, 2 * rate))
+    )
+
+
 def configuration_rate(pin_model: pin.Model, q: Array, v: Array) -> Array:
     """Map a velocity to the rate of the configuration.
 

@@ -54,6 +54,7 @@ from adapters.pinocchio_common import (
     energies_and_momentum,
     init_constraint_dynamics,
     point_acceleration,
+    set_corrector,
     translation,
 )
 from plumbline.engines.integrators import dop853, rkmk4, sample_steps, semi_implicit_euler
@@ -74,6 +75,7 @@ from plumbline.model.welding import BodyParts, undivided_bodies
 
 ROD_AXIAL_INERTIA = 1 / 3  # of a rod about its own axis, over the trace of the inertia that it carries
 PROXIMAL_DAMPING, MAX_PROXIMAL_STEPS = 1e-8, 50  # of constraintDynamics: any damping from 1e-12 to 1e-3 does
+STABILISATION = 50.0  # 1/s, of motions: gaps that steps open die as (1 + a t) e^{-a t}
 MAX_DENSE_JOINTS = 10  # joints up to which their 3 × 3 blocks are solved faster as one matrix
 JOINT_MODELS = {
     "hinge": pin.JointModelRZ,
@@ -679,6 +681,8 @@ class Pinocchio(PinocchioAdapter):
         if model.has_loops:
             cut = cut_open(model)
             tree = PinocchioChain(cut.model, self.usual_algorithm, ends=cut.ends)
+            for weld in tree.welds:
+                set_corrector(weld, STABILISATION)
             run = self._sampled_run(tree, cut.state(state), times, integrator, resolution)
             return cut.source_run(run)
         chain = PinocchioChain(model, "crba" if integrator.kind == "tolerance" else "aba")

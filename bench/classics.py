@@ -17,12 +17,18 @@ from typing import Any
 import numpy as np
 
 from bench.classics_page import write_page
-from bench.classics_values import VALUES, find_problem_scenario, free_body_rates, true_slider_height
+from bench.classics_values import (
+    VALUES,
+    find_problem_scenario,
+    free_body_rates,
+    true_rod_end,
+    true_slider_height,
+)
 from plumbline.engines.calls import RefinementRun, describe_engine, evaluate_states, run_refinement
 from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.judging.convergence import romberg, tightest_tolerance_limit
 from plumbline.model.datatypes import Array, Model, Trajectory
-from plumbline.model.kinematics import angular_velocity
+from plumbline.model.kinematics import angular_velocity, rotation_matrix
 from plumbline.model.sampling import random_loop_states
 from plumbline.processes.processor import processor_name
 from plumbline.scenario.loader import Scenario
@@ -92,6 +98,11 @@ def _true_bar_end(windows: int) -> Callable[[Scenario, Array], Array]:
     return exact
 
 
+def _third_rod_end(model: Model, run: Trajectory) -> Array:
+    near = np.matvec(rotation_matrix(run.p[:, 2]), model.proximal[2])
+    return run.r[:, 2] - near  # the far end: the rod's centre is in its middle
+
+
 def _crank_direction(model: Model, run: Trajectory) -> Array:
     return run.r[-1:, 0, :2] / np.linalg.norm(model.proximal[0])
 
@@ -127,6 +138,11 @@ PROBLEMS = {
         "squeezer", 0.03, 0.03, _crank_direction, _true_crank_direction, 1e-3,
         [("reference", "collocation", [1e-10, 1e-12]), ("mujoco", "RK4", _steps(0.03, 8, 11)),
          ("exudyn", "trapezoidal", _steps(0.03, 8, 11)), ("pinocchio", "dop853", [1e-10, 1e-12])],
+    ),
+    "A04": Problem(
+        "bricard", 1.0, 0.0625, _third_rod_end, true_rod_end, 1e-3,
+        [("reference", "collocation", [1e-10, 1e-12]), ("mujoco", "RK4", _steps(1, 7, 10)),
+         ("exudyn", "trapezoidal", _steps(1, 7, 10)), ("pinocchio", "dop853", [1e-10, 1e-12])],
     ),
     "A05": Problem(
         "a05-stiff-governor", 10.0, 0.0625, _slider_height, true_slider_height, 1e-3,

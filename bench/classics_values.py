@@ -95,6 +95,22 @@ def true_slider_height(scenario: Scenario, times: Array) -> Array:
     return np.asarray(run.r[:, 3, 2:], dtype=float)
 
 
+def true_rod_end(scenario: Scenario, times: Array) -> Array:
+    """Compute the end of the third rod of Bricard's mechanism by Taylor's method in extended precision.
+
+    Args:
+        scenario: the mechanism.
+        times: (T,) [s].
+
+    Returns:
+        (T, 3) [m].
+
+    """
+    run = simulate_taylor(scenario.model, scenario.state, times, "extended")
+    turn = rotation_matrix(np.asarray(run.p[:, 2], dtype=float))
+    return np.asarray(np.asarray(run.r[:, 2], dtype=float) - np.matvec(turn, scenario.model.proximal[2]))
+
+
 def _a01() -> list[Value]:
     samples = exact_samples(find_problem_scenario("a01-simple-pendulum"), np.array([2000.0]))
     assert samples is not None

@@ -182,8 +182,8 @@ class DirectSystem:
 
         """
         if self.chain.has_loops:
-            unknowns, _, _, *parts = self._loop_unknowns(r, p, v, pdot, gamma_defect, x, RUN_RANK_TOLERANCE)
-            return unknowns, *parts
+            found = self._loop_unknowns(r, p, v, pdot, gamma_defect, x, RUN_RANK_TOLERANCE)
+            return found[0], found[3], found[4]
         with np.errstate(all="ignore"):  # an overflow raises SingularSystem below
             values, b, joints, elements = self._entries(r, p, v, pdot, x)
             n, c = self.chain.n, len(self.joint)

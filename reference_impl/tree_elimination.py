@@ -315,11 +315,11 @@ class LoopSystem(TreeSystem):
         """Solve for a (M, 6) and the multipliers, 0 of rows that depend on others."""
         batch, n = len(self.chains), self.chains[0].n
         c, each = len(gamma) // batch, np.arange(len(gamma) // batch)
-        C = np.zeros((batch, c, n, 6))
-        C[:, each, self.near[:c]] = near.reshape(batch, c, 6)
+        by_body = np.zeros((batch, c, n, 6))
+        by_body[:, each, self.near[:c]] = near.reshape(batch, c, 6)
         held = np.flatnonzero(self.far[:c] >= 0)
-        C[:, held, self.far[held]] += far.reshape(batch, c, 6)[:, held]
-        C = C.reshape(batch, c, 6 * n)
+        by_body[:, held, self.far[held]] += far.reshape(batch, c, 6)[:, held]
+        C = by_body.reshape(batch, c, 6 * n)
         kept = _independent_rows(C[0], self.compliance[:c] > 0)
         size = 6 * n + len(kept)
         S = np.zeros((batch, size, size))

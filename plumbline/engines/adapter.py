@@ -185,8 +185,8 @@ class Adapter(ABC):
 
         """
         self._check_mechanism(model, self.builds_elements)
-        if model.has_loops and not self.moves_loops:
-            raise Unsupported(f"the adapter of {self.title} covers no motions of mechanisms with loops")
+        if not self.moves_loops:
+            _refuse_loops(model, f"the adapter of {self.title} covers no motions of mechanisms with loops")
         check_state(model, state)
         method = self.integrator(integrator)
         if method.kind == "step":
@@ -213,7 +213,7 @@ class Adapter(ABC):
 
         """
         self._check_mechanism(model, self.builds_elements)
-        _refuse_motions_of_loops(model)
+        _refuse_loops(model, "single steps of mechanisms with loops are not compared")
         check_state(model, state)
         times = np.asarray(step * np.arange(count + 1), float)
         run = self._step(model, state, times, self.integrator(integrator), step)
@@ -239,9 +239,9 @@ class Adapter(ABC):
             )
 
 
-def _refuse_motions_of_loops(model: Model) -> None:
+def _refuse_loops(model: Model, reason: str) -> None:
     if model.has_loops:
-        raise Unsupported("mechanisms with loops are compared at state level only")
+        raise Unsupported(reason)
 
 
 def check_state(model: Model, state: State) -> None:

@@ -313,8 +313,8 @@ def element_energies(model: Model, run: Trajectory, omega: Array) -> ElementEner
                         two if model.kind[k] == "universal" and i == 1 else one
                     )  # perpendicular to both axes
                     x = np.arctan2(relative[:, two, one], relative[:, kept, kept])
-                    is_known = run.initial_x is not None and k < model.n
-                    start = run.initial_x[k, i] if is_known else x[0]
+                    known = run.initial_x
+                    start = x[0] if known is None or k >= model.n else known[k, i]
                     rate = _dot(along, turning)
                     x = _unwrapped(x, rate, run.t, start)
                 pairs.append((i, (x - model.rest[k, i])[:, None], rate[:, None]))

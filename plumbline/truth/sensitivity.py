@@ -239,7 +239,7 @@ def _unit_coordinates(
     model: Model, p: Array, omega: Array, u: Array, udot: Array
 ) -> tuple[Array, Array, Array, Array]:
     """The coordinates on their unit spheres; u and u̇ are 0 for joints other than rods."""
-    rods = model.rods[:, None]
+    rods = model.rods[: model.n, None]
     u = np.where(rods, u / np.maximum(np.linalg.norm(u, axis=1, keepdims=True), np.finfo(float).tiny), 0.0)
     udot = np.where(rods, udot - np.sum(udot * u, axis=1, keepdims=True) * u, 0.0)
     return p / np.linalg.norm(p, axis=1, keepdims=True), omega, u, udot

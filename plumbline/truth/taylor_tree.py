@@ -448,13 +448,13 @@ def _close_loops(
             bias[row] + sum((x * y for x, y in zip(columns[row], free, strict=True)), 0.0) for row in rows
         ]
     X = [_substitute_sparse(H, before, row) for row in J]
-    S = [
+    held = [
         [sum((x * y for x, y in zip(J[i], X[j], strict=True)), 0.0) for j in range(i + 1)]
         for i in range(len(J))
     ]
     dense = [i - 1 for i in range(len(J))]
-    _factor_sparse(S, dense)
-    multipliers = _substitute_sparse(S, dense, [-x for x in gap])
+    _factor_sparse(held, dense)
+    multipliers = _substitute_sparse(held, dense, [-x for x in gap])
     return [
         sum((X[i][j] * multiplier for i, multiplier in enumerate(multipliers)), rate)
         for j, rate in enumerate(free)

@@ -58,12 +58,6 @@ def test_an_engine_that_closes_no_loops_gives_the_reason(engine):
         load_adapter(engine).evaluate(model, [state])
 
 
-def test_motions_of_loops_are_refused():
-    model, state = random_loop_mechanism(0, 4, ["ball"])
-    with pytest.raises(Unsupported, match="state level only"):
-        load_adapter("mujoco").simulate(model, state, np.array([0.0, 0.25]), "RK4", 0.125)
-
-
 def changed_joint(model, k, kind=None, point=None, turn=None):
     """Joint k of another kind, its near point moved or its axes turned by 1e-7 in the near body."""
     points, turns, kinds = model.point.copy(), model.turn.copy(), list(model.kind)

@@ -110,7 +110,7 @@ def test_neighbours_of_a_loop_and_models_with_other_numbers_are_closed():
         gaps, rates = loop_gaps(model, state)
         assert np.max(gaps) < 1e-14 and np.max(rates) < 1e-13
     distances = [position_error(state.r, s.state.r) for _, state in pairs]
-    assert 1e-9 < min(distances) < max(distances) < 1e-5
+    assert 1e-10 < min(distances) < max(distances) < 1e-5
     larger, grown = others[-1]
     np.testing.assert_allclose(grown.r, 1.0001 * s.state.r, atol=1e-14)
     np.testing.assert_allclose(larger.point, 1.0001 * s.model.point, rtol=1e-15)
