@@ -26,7 +26,7 @@ def test_motions_of_loops_converge_to_the_truth(engine, name):
         if method.kind == "step":
             order = np.log2(errors[0] / errors[1])
             assert order == pytest.approx(method.order, abs=ORDER_MARGIN), (method.name, errors)
-        assert errors[1] < {1: 5e-2, 2: 1e-3}.get(method.order, 1e-7), method.name
+        assert errors[1] < {1: 5e-2, 2: 1e-3, 4: 1e-6}.get(method.order, 1e-8), method.name
         found = [compute_invariants(s.model, run) for run in runs]
         gaps = [np.max(np.abs(x.joint_gap)) for x in found]
         assert gaps[1] < max(gaps[0], 1e-11) and gaps[1] < 1e-2, method.name
@@ -39,7 +39,7 @@ def test_mujoco_states_how_far_its_soft_loops_are_from_rigid_ones():
     run = adapter.simulate(s.model, s.state, TIMES, "RK4", 2.0**-10)
     assert run.limit_error.shape == (2,) and np.all(run.limit_error > 0) and np.all(run.limit_error < 1e-10)
     error, softness = np.max(position_error(run.r, true.r)), run.limit_error[0]
-    assert error < 1e-9 and softness < 1e-11
+    assert error < 1e-8 and softness < 1e-11
 
 
 @pytest.mark.parametrize("engine", ["pinocchio-maximal", "exudyn-tree"])
