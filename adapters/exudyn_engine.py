@@ -435,8 +435,13 @@ def _chain_that_moves(model: Model, state: State) -> ExudynChain:
         above = rotation_matrix(state.p[far]) if far >= 0 else np.eye(3)
         C[rows] = (above @ rotation_matrix(model.turn[k, 0])).T @ C[rows]
     used = np.flatnonzero(np.any(C != 0, axis=1))
-    kept = set(used[independent_rows(C[used])].tolist())
     data = chain.mbs.systemData
+    # Of joints that close loops: with one rotation left out the engine's row of another is a different one.
+    weight = np.ones(len(C))
+    for joint in chain.joints[model.n :]:
+        weight[data.GetObjectLTGAE(joint)[:3]], weight[data.GetObjectLTGAE(joint)[3:]] = 1e-4, 1e-2
+    scale = weight[used] / np.linalg.norm(C[used], axis=1)
+    kept = set(used[independent_rows(C[used], scale)].tolist())
     left_out = frozenset(
         (k, i)
         for k, joint in enumerate(chain.joints)

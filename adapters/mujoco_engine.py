@@ -76,6 +76,7 @@ LARGEST_REGULARISATIONS, RATIO, REGULARISATIONS = (0.027, 2.7e-4, 2.7e-6), 3.0, 
 SEQUENCES = (1.0, 1.3, 1.7)  # of them: factors of the largest
 # Of motions: the error of smaller ones is rounding, and as 1/R what steps leave of gaps in dependent rows.
 LARGEST_RUN_REGULARISATION, RUN_REGULARISATIONS = 2.7e-4, 3
+RUN_ITERATIONS = 3  # of Newton's method on welds, a linear problem: the second and third remove rounding
 RUN_STABILISATION = 50.0  # 1/s: gaps that steps open die as (1 + a t) e^{-a t}
 MAX_ORDER_ERROR = 0.1
 MIN_SOFTNESS = 1e-9  # a smaller relative effect of R is rounding
@@ -171,6 +172,7 @@ class Mujoco(MetamorphicHooks):
         for k in range(RUN_REGULARISATIONS):
             tree = _MujocoChain(cut.model, ends=cut.ends)
             tree.soften(LARGEST_RUN_REGULARISATION / RATIO**k)
+            tree.m.opt.iterations = RUN_ITERATIONS
             tree.m.eq_solref[:] = -(RUN_STABILISATION**2), -2 * RUN_STABILISATION
             run = self._sampled_run(tree, cut.state(state), times, integrator, resolution)
             runs.append(cut.source_run(run))

@@ -206,5 +206,9 @@ class PinocchioMaximal(PinocchioAdapter):
                 f"the engine's workspace for {model.n} free bodies, growing with their cube, is too large; "
                 f"in maximal coordinates Pinocchio is asked about {MAX_BODIES} at most"
             )
+        if model.lacks_inertia:
+            raise Unsupported(
+                "Pinocchio's constraint solvers invert the mass matrix, of free bodies without inertia singular"
+            )
         flyers = _FreeFlyerSystem(model, self.body_pieces(model), use_kkt_inverse=bool(self.option))
         return [flyers.quantities(state) for state in states]

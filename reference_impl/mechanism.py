@@ -36,6 +36,7 @@ KINDS: dict[Kind, JointKind] = {
     "weld": JointKind((*_POINT, *_ATTITUDE)),
     "free": JointKind((), has_attitude=True),
 }
+ZERO_INERTIA = 1e-14  # a principal moment that is this part of the largest is the rounding of 0
 CHAIN_FIELDS = (
     "mass", "inertia", "proximal", "distal", "length",
     "gravity", "force", "moment", "drag_force", "drag_moment",
@@ -210,13 +211,23 @@ class Mechanism:
 
     @property
     def is_chain(self) -> bool:
+        """Whether it `has_chain_joints`, and inertia about every axis, which forms of chains invert."""
+        return self.has_chain_joints and not self.lacks_inertia
+
+    @property
+    def has_chain_joints(self) -> bool:
         """Whether every body is joined to the one before, the first to the world, by bare rods and balls."""
-        return _is_chain(self)
+        return _has_chain_joints(self)
 
     @property
     def has_loops(self) -> bool:
         """Whether joints close loops."""
         return len(self.kind) > self.n
+
+    @property
+    def lacks_inertia(self) -> bool:
+        """Whether a body has no inertia about some axis: a point mass, or a thin rod."""
+        return _lacks_inertia(self)
 
     @property
     def tree(self) -> Mechanism:
@@ -275,11 +286,17 @@ def _has_joint_elements(mechanism: Mechanism) -> bool:
 
 
 @lru_cache(maxsize=64)
-def _is_chain(mechanism: Mechanism) -> bool:
+def _has_chain_joints(mechanism: Mechanism) -> bool:
     if mechanism.has_loops or mechanism.has_elements or not set(mechanism.kind) <= {"rod", "ball"}:
         return False
     is_row = bool(np.all(mechanism.body[:, 0] == np.arange(mechanism.n) - 1))
     return is_row and not np.any(mechanism.point[0, 0])
+
+
+@lru_cache(maxsize=64)
+def _lacks_inertia(mechanism: Mechanism) -> bool:
+    principal = np.linalg.eigvalsh(mechanism.inertia)
+    return bool(np.any(principal[:, 0] <= ZERO_INERTIA * principal[:, 2]))
 
 
 def _chain_kinds(length: Array) -> tuple[Kind, ...]:

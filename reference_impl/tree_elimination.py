@@ -14,7 +14,8 @@ A rotor (L4) is one row more of its joint, with 1/a on the diagonal of S_k; see 
 
 Joints of the same depth and number of rows are eliminated together, those of many trees at once.
 
-Mechanisms with loops have the same rows and are solved as they stand, by dense factors of
+Mechanisms with loops, or with bodies without inertia, have the same rows and are solved as they stand, by
+dense factors of
 
     A a + nᵀ λ + fᵀ λ = b,    n a_k + f a_far − λ / a_rotor = γ
 
@@ -302,10 +303,11 @@ class TreeSystem:
         return a[:-1], multiplier
 
 
-class LoopSystem(TreeSystem):
-    """Mechanisms with loops, all of the same joints between the same bodies; solved by dense factors.
+class DenseSystem(TreeSystem):
+    """Mechanisms of the same joints between the same bodies, with loops or not; solved by dense factors.
 
-    Rows that depend on others are those of the first mechanism: the others differ little from it.
+    Inertias may be singular where the joints leave no motion without inertia.  Rows that depend on others are
+    those of the first mechanism: the others differ little from it.
     """
 
     def _levels(self) -> list[_Level]:
@@ -369,11 +371,12 @@ def eliminated_system(mechanisms: Sequence[Mechanism], x: Array | None = None) -
         x: as of `TreeSystem`.
 
     Returns:
-        The form of chains where all are such, else that of trees or of loops.
+        The form of chains where all are such, else that of trees, or the dense one of loops and of bodies
+        without inertia about some axis.
 
     """
-    if any(mechanism.has_loops for mechanism in mechanisms):
-        return LoopSystem(mechanisms, x)
+    if any(mechanism.has_loops or mechanism.lacks_inertia for mechanism in mechanisms):
+        return DenseSystem(mechanisms, x)
     if all(mechanism.is_chain for mechanism in mechanisms):
         return StructuredSystem(mechanisms)
     return TreeSystem(mechanisms, x)

@@ -12,7 +12,7 @@ import numpy as np
 
 from plumbline.engines.calls import StepEvaluation, run_steps
 from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict
-from plumbline.model.datatypes import Integrator, Model, State
+from plumbline.model.datatypes import ZERO_INERTIA, Integrator, Model, State
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod
 from plumbline.processes.workers import Pickled
 from plumbline.truth.rounding_bound import remembered_rounding_bound
@@ -87,7 +87,8 @@ def step_sizes(has_constraints: bool, model: Model, states: Sequence[State]) -> 
         if has_constraints:
             bound = remembered_rounding_bound(model, state)
             force = np.asarray(bound.scale["joint_reaction"])
-            lever, least = norm(model.proximal, axis=1), np.linalg.eigvalsh(model.inertia)[:, 0]
+            lever, principal = norm(model.proximal, axis=1), np.linalg.eigvalsh(model.inertia)
+            least = np.where(principal[:, 0] > ZERO_INERTIA * principal[:, 2], principal[:, 0], np.inf)
             on_body = model.body[:, 0] >= 0
             beyond = np.zeros(model.n)
             np.maximum.at(beyond, model.body[on_body, 0], norm(model.point[on_body, 0], axis=1))

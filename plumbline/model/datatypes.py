@@ -23,6 +23,7 @@ from reference_impl.mechanism import JOINT_ELEMENTS as JOINT_ELEMENTS
 from reference_impl.mechanism import JOINT_FIELDS as JOINT_FIELDS
 from reference_impl.mechanism import KINDS as KINDS
 from reference_impl.mechanism import SPRING_FIELDS as SPRING_FIELDS
+from reference_impl.mechanism import ZERO_INERTIA as ZERO_INERTIA
 from reference_impl.mechanism import Array as Array
 from reference_impl.mechanism import Kind as Kind
 from reference_impl.mechanism import Mechanism

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.polynomial.legendre import legder, leggauss, legvander
 
-from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Array, Model, Trajectory
+from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, ZERO_INERTIA, Array, Model, Trajectory
 from plumbline.model.kinematics import (
     angular_velocity,
     ball_spring_rest,
@@ -446,11 +446,14 @@ def inertia_ratio(model: Model) -> float:
 
     Returns:
         The largest, over the bodies, of (M |c − s|² + J_max) / J_min: M the mass of the bodies beyond, c − s
-        the arm from its proximal to its distal point, J_max and J_min its extreme principal inertias.
+        the arm from its proximal to its distal point, J_max and J_min its extreme principal inertias; of
+        bodies with inertia about every axis.
 
     """
     model = model.tree
     beyond = np.cumsum(model.mass[::-1])[::-1] - model.mass
     arm = np.linalg.norm(model.distal - model.proximal, axis=1)
     principal = np.linalg.eigvalsh(model.inertia)
-    return float(np.max((beyond * arm**2 + principal[:, -1]) / principal[:, 0]))
+    has_all = principal[:, 0] > ZERO_INERTIA * principal[:, 2]
+    ratios = (beyond * arm**2 + principal[:, -1])[has_all] / principal[has_all, 0]
+    return float(np.max(ratios, initial=1.0))

@@ -21,6 +21,7 @@ from plumbline.model.datatypes import (
     BODY_FIELDS,
     JOINT_FIELDS,
     KINDS,
+    ZERO_INERTIA,
     Array,
     Model,
     State,
@@ -31,6 +32,7 @@ from plumbline.model.kinematics import (
     complete_state,
     cross,
     joint_coordinates,
+    mass_matrix,
     minimal_rates,
     own_rates,
     quaternion_product,
@@ -43,6 +45,7 @@ from plumbline.model.kinematics import (
 MIN_SINGULAR_VALUE = 1e-6  # of the rows that hold, below it a pose counts as singular
 MIN_MOTION_SINGULAR_VALUE = 1e-2  # the same of poses that a motion is compared at: it loses digits near them
 RANK_TOLERANCE = 1e-11  # of singular values of scaled rows: below it a row depends on the others
+MIN_MASS_RATIO = 1e-12  # of eigenvalues of a mass matrix of unit diagonal: below it a motion has no inertia
 NEWTON_STEPS, MAX_HALVINGS = 30, 6
 NEARLY_CLOSED = 1e-11  # of a gap [m, rad]: the next step of Newton's method leaves only rounding
 PER_BODY = ("acceleration", "angular_acceleration")  # quantities with one row per body
@@ -323,6 +326,40 @@ def closed_rates(
     for _ in range(2):  # the second pass removes what rounding left of the first
         found[chosen] += _least_norm(cut, J[:, chosen], -J @ found)
     return found
+
+
+def motion_without_inertia(model: Model, state: State) -> int | None:
+    """Find a body that can turn without inertia: the mass matrix on the joints' motions is singular then.
+
+    Args:
+        model: the mechanism.
+        state: a state of it, its loops closed.
+
+    Returns:
+        The body without inertia about some axis that moves most; None where there is no such motion.
+
+    """
+    if not model.lacks_inertia:
+        return None
+    tree, there, place = model, state, np.arange(model.n)
+    null = np.eye(rate_count(model))
+    if model.has_loops:
+        cut = cut_open(model)
+        tree, there, place = cut.model, cut.state(state), cut.place
+        held = singular_values(cut, there)[1]
+        null = np.linalg.svd(held)[2][len(held) :].T
+    M = mass_matrix(tree, there)
+    for i, u in enumerate(there.u[tree.rods]):  # a rod has no rate along itself
+        M[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += np.max(np.abs(M)) * np.outer(u, u)
+    own = null.T @ M @ null
+    size = np.sqrt(np.maximum(np.diag(own), np.finfo(float).tiny))
+    values, vectors = np.linalg.eigh(own / size / size[:, None])
+    if values[0] > MIN_MASS_RATIO:
+        return None
+    rates = velocity_jacobian(tree, there).reshape(tree.n, 6, -1) @ (null @ (vectors[:, 0] / size))
+    principal = np.linalg.eigvalsh(model.inertia)
+    lacking = principal[:, 0] <= ZERO_INERTIA * principal[:, 2]
+    return int(np.argmax(np.where(lacking, np.linalg.norm(rates[place[: model.n], 3:], axis=1), -1.0)))
 
 
 def loop_gaps(model: Model, state: State) -> tuple[Array, Array]:

@@ -23,7 +23,7 @@ from plumbline.model.kinematics import (
     spring_vectors,
     state_from_minimal,
 )
-from plumbline.model.loops import assembled, loop_gaps
+from plumbline.model.loops import assembled, loop_gaps, motion_without_inertia
 from plumbline.scenario.errors import Problem, ScenarioError, closest_match, did_you_mean, shorten
 from plumbline.scenario.schema import (
     INPUT_ROUNDING,
@@ -294,6 +294,14 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
                 "SI numbers of a pendulum",
                 (1, 1),
             )
+    turning = motion_without_inertia(model, state)
+    if turning is not None:
+        place = source.value_positions.get(("bodies", turning, "inertia")) or (1, 1)
+        raise source.fatal_error(
+            f"has a body, number {turning + 1}, that can turn without inertia: how fast is not determinate",
+            "principal moments above 0, or joints that hold that turn or carry it at a distance",
+            place,
+        )
     content = document.model_dump(mode="json")
     content["name"] = document.name or path.stem
     canonical = json.dumps(content, sort_keys=True, separators=(",", ":"), ensure_ascii=True)

@@ -222,20 +222,16 @@ def _matrix_of(values: list[Any]) -> Array:
 
 
 def _require_physical_inertia(matrix: Array) -> None:
-    """Refuse principal moments that are not positive or violate the triangle inequality.
+    """Refuse principal moments that are negative or violate the triangle inequality.
 
     The sums J1 + J2 − J3 are twice the second moments of the mass, so none is negative.
     """
     values = np.linalg.eigvalsh(matrix)
     shown = ", ".join(f"{value:.6g}" for value in values)
-    if not np.any(matrix):
+    if values[0] < -INPUT_ROUNDING * abs(values[2]):
         raise invalid_value_error(
-            "is all zeros: no rounding bound is derived for a point mass, so it could not be judged",
-            "moments above 0, such as 1e-6 m ℓ² of a small body at a distance ℓ from its joint",
-        )
-    if values[0] <= INPUT_ROUNDING * values[2]:
-        raise invalid_value_error(
-            f"has the principal moments {shown}, not all positive", "three positive principal moments"
+            f"has the principal moments {shown}, one of them negative",
+            "three principal moments that are not negative",
         )
     if values[0] + values[1] < values[2] * (1 - INPUT_ROUNDING):
         raise invalid_value_error(

@@ -5,6 +5,8 @@ leave, E_k (6, c).  With x = (r̈, α) per body, world axes, C the held rows of 
 
     M x − Cᵀ λ = f,    C x = γ,    K = C M⁻¹ Cᵀ
 
+Where a body has no inertia about some axis, M has no inverse and the whole matrix of (x, λ) is inverted.
+
 Loops are cut open (`plumbline.model.loops`); rows a_b − a_c, α_b − α_c join the two parts of a body, and K
 has a pseudo-inverse where rows depend on others.  The dependent coordinates of a state are known only to
 rounding over the smallest singular value σ of these rows, which changes every term of the equations by as
@@ -22,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.model.datatypes import KINDS, Array, Model, State
+from plumbline.model.datatypes import KINDS, ZERO_INERTIA, Array, Model, State
 from plumbline.model.kinematics import (
     JointFrame,
     cross,
@@ -109,25 +111,14 @@ class _TreeTerms:
             C[rows] = self._relative_rows(k, E)
             E_rows[k, :, rows] = E
             gamma[rows] = -E.T @ bend
-        M_inverse = np.zeros((n, 6, n, 6))
-        body = np.arange(n)
-        M_inverse[body, :3, body, :3] = np.eye(3) / model.mass[:, None, None]
-        M_inverse[body, 3:, body, 3:] = np.linalg.inv(self.inertia)
-        flat, M_flat = C.reshape(-1, 6 * n), M_inverse.reshape(6 * n, 6 * n)
         self.elements = joint_elements(model, self.state, [bend for _, bend in held])
-        J, directions, M_flat = self._rotors(M_flat)
-        CM = flat @ M_flat
-        K = CM @ flat.T
-        s = 1 / np.sqrt(np.diag(K))  # equilibrated: pivots must not depend on the units
-        scaled = K * s * s[:, None]
-        K_inverse = np.linalg.pinv(scaled, 1e-13, hermitian=True) if self.ends else np.linalg.inv(scaled)
-        K_inverse = K_inverse * s * s[:, None]
-        X = CM.T @ K_inverse
-        x_rows = np.concatenate([M_flat - X @ CM, X], 1)
-        wrench_rows = E_rows @ np.concatenate([-X.T, K_inverse], 1)
         armature, bias, torque = (
             np.array([getattr(e, name) for e in self.elements]) for name in ("armature", "bias", "torque")
         )
+        J, directions = self._element_rows()
+        x_rows, K_inverse = self._inverse(C.reshape(-1, 6 * n), J, armature)
+        X = x_rows[:, 6 * n :]
+        wrench_rows = E_rows @ np.concatenate([-X.T, K_inverse], 1)
         if len(armature):  # the joint's whole wrench: its elements' too
             wrench_rows -= directions @ (armature[:, None] * (J @ x_rows))
         x_rows, wrench_rows = (some.reshape(n, 2, 3, -1) for some in (x_rows, wrench_rows))
@@ -155,19 +146,44 @@ class _TreeTerms:
             rows[:, self.far[k], 3:] = E[:3].T @ cross_matrix(arm) - E[3:].T
         return rows
 
-    def _rotors(self, M_inverse: Array) -> tuple[Array, Array, Array]:
-        """Rows J (e, 6N) of the elements, their directions (N, 6, e), and (M + Jᵀ a J)⁻¹."""
+    def _inverse(self, C: Array, J: Array, armature: Array) -> tuple[Array, Array]:
+        """Rows (6N, 6N + c) of x of the inverse of (M, −Cᵀ; C, 0), rotors in M, and its block K⁻¹ (c, c)."""
+        n, body = self.n, np.arange(self.n)
+        masses = np.eye(3) * self.model.mass[:, None, None]
+        if self.model.lacks_inertia:
+            M = np.zeros((n, 6, n, 6))
+            M[body, :3, body, :3], M[body, 3:, body, 3:] = masses, self.inertia
+            S = np.block([[M.reshape(6 * n, -1) + (J.T * armature) @ J, C.T], [C, np.zeros((len(C),) * 2)]])
+            inverse = self._equilibrated_inverse(S, 1 / np.sqrt(np.max(np.abs(S), axis=1)))
+            return inverse[: 6 * n], -inverse[6 * n :, 6 * n :]
+        M_inverse = np.zeros((n, 6, n, 6))
+        M_inverse[body, :3, body, :3] = np.eye(3) / self.model.mass[:, None, None]
+        M_inverse[body, 3:, body, 3:] = np.linalg.inv(self.inertia)
+        M_flat = M_inverse.reshape(6 * n, 6 * n)
+        rotors = armature > 0
+        if np.any(rotors):
+            MJ = M_flat @ J[rotors].T
+            M_flat = M_flat - MJ @ np.linalg.inv(np.diag(1 / armature[rotors]) + J[rotors] @ MJ) @ MJ.T
+        CM = C @ M_flat
+        K = CM @ C.T
+        K_inverse = self._equilibrated_inverse(K, 1 / np.sqrt(np.diag(K)))
+        X = CM.T @ K_inverse
+        return np.concatenate([M_flat - X @ CM, X], 1), K_inverse
+
+    def _equilibrated_inverse(self, matrix: Array, s: Array) -> Array:
+        """The inverse, of loops the pseudo-inverse: pivots must not depend on the units."""
+        scaled = matrix * s * s[:, None]
+        found = np.linalg.pinv(scaled, 1e-13, hermitian=True) if self.ends else np.linalg.inv(scaled)
+        return np.asarray(found * s * s[:, None])
+
+    def _element_rows(self) -> tuple[Array, Array]:
+        """Rows J (e, 6N) of the elements, and their directions (N, 6, e)."""
         J = np.zeros((len(self.elements), 6 * self.n))
         directions = np.zeros((self.n, 6, len(self.elements)))
         for i, element in enumerate(self.elements):
             J[i] = self._relative_rows(element.k, element.direction[:, None]).ravel()
             directions[element.k, :, i] = element.direction
-        a = np.array([element.armature for element in self.elements])
-        if not np.any(a):
-            return J, directions, M_inverse
-        MJ = M_inverse @ J[a > 0].T
-        inner = np.linalg.inv(np.diag(1 / a[a > 0]) + J[a > 0] @ MJ)
-        return J, directions, M_inverse - MJ @ inner @ MJ.T
+        return J, directions
 
     def _measure(self) -> None:
         norm, model = np.linalg.norm, self.model
@@ -246,8 +262,9 @@ class _TreeTerms:
         return total
 
     def elimination_errors(self) -> tuple[Array, Array]:
-        """Terms of C M⁻¹ f in the linear and angular rows of each joint."""
-        least = np.linalg.eigvalsh(self.model.inertia)[:, 0]
+        """Terms of C M⁻¹ f in the linear and angular rows of each joint; of a body with an M⁻¹."""
+        principal = np.linalg.eigvalsh(self.model.inertia)
+        least = np.where(principal[:, 0] > ZERO_INERTIA * principal[:, 2], principal[:, 0], np.inf)
         free = (self.F + self.F_children + self.m * self.g + self.load_size) / self.m
         turn = self.arm * self.F + self.moment + self.moment_children + self.spin + self.torque_size
         turn = turn / least
@@ -463,7 +480,7 @@ def _tolerances(t: _TreeTerms) -> tuple[Array, dict[str, Array | float], dict[st
     }
     scale: dict[str, Array | float] = {
         "acceleration": result[:, 0],
-        "angular_acceleration": np.max([t.alpha, moment / t.J, turning], 0),
+        "angular_acceleration": np.max([t.alpha, moment / np.where(t.J > 0, t.J, np.inf), turning], 0),
         "joint_reaction": np.max([t.F, t.m * t.g, t.m * t.a], 0),
         "joint_moment": np.max(
             [t.moment, t.arm * t.F, t.J * t.alpha, t.element_size, lever @ (t.m * t.g)], 0

@@ -8,6 +8,7 @@ import pytest
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import KINDS, Unsupported
 from plumbline.model.kinematics import complete_state, quaternion_product
+from plumbline.model.loops import motion_without_inertia
 from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import random_states
 from plumbline.truth.certified import certify_state
@@ -44,6 +45,59 @@ def test_states_of_random_trees_are_right(engine, mix):
                 error = np.linalg.norm(error, axis=-1) if error.shape[-1:] == (3,) else np.abs(error)
                 assert np.all(error <= bound.tolerance(name)), (name, seed, model.kind)
                 assert bound.relative_bound(name) < MAX_RELATIVE_BOUND, (name, seed, scale)
+
+
+def without_inertia(seed):
+    """A random tree of points, thin rods and bodies; on hinges and slides that carry points at a distance."""
+    rng = np.random.default_rng(seed)
+    model = random_tree(rng, 5, ("hinge", "slide", "universal", "ball"))
+    inertia = model.inertia.copy()
+    for k, kind in enumerate(model.kind):
+        inertia[k] *= kind == "ball"
+        if kind == "ball":
+            thin = rng.normal(size=3)
+            inertia[k] = 0.05 * (thin @ thin * np.eye(3) - np.outer(thin, thin))
+    return replace(model, inertia=inertia)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_bodies_without_inertia_are_right_where_they_are_determinate(engine):
+    adapter, compared = load_adapter(engine), 0
+    for seed in range(6):
+        model = without_inertia(seed)
+        (state,) = random_states(model, 1, seed)
+        assert model.lacks_inertia and not model.is_chain
+        if motion_without_inertia(model, state) is not None:
+            continue
+        if engine == "pinocchio-maximal":
+            with pytest.raises(Unsupported, match="without inertia"):
+                adapter.evaluate(model, [state])
+            compared += 1
+            continue
+        try:
+            (found,) = adapter.evaluate(model, [state])
+        except Unsupported as reason:  # angles near their singularity
+            assert engine == "exudyn-tree" and "singularity" in str(reason)
+            continue
+        truth, bound = certify_state(model, state).quantities, state_rounding_bound(model, state)
+        for name in ("acceleration", "angular_acceleration", "joint_reaction", "joint_moment"):
+            if getattr(found, name) is not None:
+                error = np.linalg.norm(getattr(found, name) - getattr(truth, name), axis=1)
+                assert np.all(error <= bound.tolerance(name)), (name, seed)
+                assert bound.relative_bound(name) < 1e-6, (name, seed)
+        compared += 1
+    assert compared >= 3
+
+
+def test_a_turn_without_inertia_is_found():
+    model = without_inertia(1)
+    (state,) = random_states(model, 1, 1)
+    alone = random_tree(np.random.default_rng(0), 2, ("ball",))
+    point = replace(alone, inertia=alone.inertia * np.array([1.0, 0.0])[:, None, None])
+    (at,) = random_states(point, 1, 0)
+    assert motion_without_inertia(point, at) == 1  # it turns about the line to its joint
+    assert motion_without_inertia(alone, at) is None
+    assert motion_without_inertia(replace(model, inertia=model.inertia + 1e-3 * np.eye(3)), state) is None
 
 
 MOVING = ("ball", "hinge", "universal", "slide", "cylindrical")
