@@ -187,7 +187,13 @@ def integrate_dop853(
     """
     n, accelerate = chain.n, acceleration or direct_acceleration(chain)
     elements, size = Elements(chain), 14 * n
-    y0, limits = pack_state(r, p, v, pdot), rtol * state_scales(chain, r, p, v, pdot)
+    y0, sizes = pack_state(r, p, v, pdot), state_scales(chain, r, p, v, pdot)
+    if not sizes.all():  # at rest without gravity: what loads and springs reach
+        pushed = np.max(np.abs(accelerate(r, p, v, pdot, x)))
+        sizes = np.maximum(
+            sizes, np.where(sizes > 0, 0.0, np.sqrt(pushed * np.tile(sizes[: 7 * n], 2)) or 1.0)
+        )
+    limits = rtol * sizes
     limits = limits if atol is None else np.full(size, atol)
     if elements.has_winding_angles:  # they only choose the turn of an angle: no error control
         y0 = np.concatenate([y0, elements.coordinates(r, p, v, pdot, x)[0].ravel()])

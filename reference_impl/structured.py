@@ -95,7 +95,7 @@ class StructuredSystem:
 
     def __init__(self, chains: Sequence[Mechanism]) -> None:
         self.chains = tuple(chains)
-        if not all(chain.is_chain for chain in chains):
+        if not all(chain.has_chain_joints for chain in chains):
             raise ValueError("the structured form covers chains of rods and balls")
         mass, inertia, proximal, distal, length = (
             np.concatenate([getattr(chain, name) for chain in chains])
