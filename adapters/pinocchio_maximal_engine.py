@@ -208,7 +208,7 @@ class PinocchioMaximal(PinocchioAdapter):
             )
         if model.lacks_inertia:
             raise Unsupported(
-                "Pinocchio's constraint solvers invert the mass matrix, singular of free bodies without inertia"
+                "Pinocchio's constraint solvers invert the mass matrix, here singular: bodies without inertia"
             )
         flyers = _FreeFlyerSystem(model, self.body_pieces(model), use_kkt_inverse=bool(self.option))
         return [flyers.quantities(state) for state in states]

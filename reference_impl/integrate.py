@@ -189,10 +189,8 @@ def integrate_dop853(
     elements, size = Elements(chain), 14 * n
     y0, sizes = pack_state(r, p, v, pdot), state_scales(chain, r, p, v, pdot)
     if not sizes.all():  # at rest without gravity: what loads and springs reach
-        pushed = np.max(np.abs(accelerate(r, p, v, pdot, x)))
-        sizes = np.maximum(
-            sizes, np.where(sizes > 0, 0.0, np.sqrt(pushed * np.tile(sizes[: 7 * n], 2)) or 1.0)
-        )
+        reached = np.sqrt(np.max(np.abs(accelerate(r, p, v, pdot, x))) * np.tile(sizes[: 7 * n], 2))
+        sizes = np.where(sizes > 0, sizes, np.where(reached > 0, reached, 1.0))
     limits = rtol * sizes
     limits = limits if atol is None else np.full(size, atol)
     if elements.has_winding_angles:  # they only choose the turn of an angle: no error control

@@ -53,8 +53,8 @@ def refinement_resolutions(
         sample_interval: time between samples [s].
 
     Returns:
-        From coarse to fine at least four steps [s], powers of two of `step_unit`, smaller in proportion to the
-        duration where they would be longer than the sample interval; or two relative tolerances.
+        From coarse to fine at least four steps [s], powers of two of `step_unit`, smaller in proportion to
+        the duration where they would be longer than the sample interval; or two relative tolerances.
 
     """
     if integrator.kind == "tolerance":
