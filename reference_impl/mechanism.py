@@ -295,6 +295,8 @@ def _has_chain_joints(mechanism: Mechanism) -> bool:
 
 @lru_cache(maxsize=64)
 def _lacks_inertia(mechanism: Mechanism) -> bool:
+    if not np.all(np.isfinite(mechanism.inertia)):
+        return False
     principal = np.linalg.eigvalsh(mechanism.inertia)
     return bool(np.any(principal[:, 0] <= ZERO_INERTIA * principal[:, 2]))
 
