@@ -120,13 +120,16 @@ def prove_and_judge_claim(
     truth = trajectory_truth(model, state, times, closed_form)
     run, right = truth.trajectory, proof.trajectory
     size = float(np.max(np.abs(right.r)))
-    position = position_error(run.r, right.r) / (
-        truth.position_uncertainty + proof.position_radius + ROUNDING * size
-    )
-    attitude = attitude_error(run.p, right.p) / (
-        truth.attitude_uncertainty + proof.attitude_radius + 4 * ROUNDING
-    )
-    return proof, float(np.max([position, attitude]))
+    position = truth.position_uncertainty + proof.position_radius + ROUNDING * size
+    attitude = truth.attitude_uncertainty + proof.attitude_radius + 4 * ROUNDING
+    ratios = [
+        np.divide(error, claim, out=np.zeros_like(error), where=error != 0)  # 0 of 0 at a fixed point
+        for error, claim in (
+            (position_error(run.r, right.r), position),
+            (attitude_error(run.p, right.p), attitude),
+        )
+    ]
+    return proof, float(np.max(ratios))
 
 
 def _simulate_minimal_coordinates(

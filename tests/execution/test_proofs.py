@@ -48,7 +48,7 @@ def test_a_proof_that_fails_is_reported():
     assert sentences[0].startswith("tumbling-ball: not proved: ")
 
 
-@pytest.mark.parametrize("name", ["tumbling-ball", "lagrange-top", "rest", "drag-rod"])
+@pytest.mark.parametrize("name", ["tumbling-ball", "lagrange-top", "rest", "drag-rod", "free-top"])
 def test_the_usual_truth_is_within_its_claim(name):
     s = short(name)
     _, ratio = trajectory.prove_and_judge_claim(s.model, s.state, s.times, exact_samples(s, s.times))
