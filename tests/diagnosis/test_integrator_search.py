@@ -24,7 +24,7 @@ if not step_formulas.HAS_EXTENDED_PRECISION:
 @pytest.fixture(scope="module", autouse=True)
 def shared_steps():
     """Other formulas take the same steps for every defect of a pendulum."""
-    with sharing("plumbline.truth.step_comparison", "joint_space_steps", "state_rounding_bound"):
+    with sharing("plumbline.truth.step_comparison", "joint_space_steps"):
         yield
 
 
