@@ -100,9 +100,11 @@ def find_proof(model: Model, state: State, times: Array) -> ProvedMotion | None:
         times: (T,) [s] of the samples.
 
     Returns:
-        The motion; None where there is none, or none that can be read.
+        The motion; None where there is none, or none that can be read; motions of loops are not proved.
 
     """
+    if model.has_loops:
+        return None
     body = None
     with contextlib.suppress(OSError, DamagedFile):
         body = _files().read(_name(model, state, times))
