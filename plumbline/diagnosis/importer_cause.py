@@ -485,13 +485,16 @@ def _without_armature(
     return replace(truth, quantities=replace(truth.quantities, kinetic_energy=energy))
 
 
-def differences(own: NeutralModel, theirs: NeutralModel, least: float = RELATIVE_CHANGE) -> list[Change]:
+def differences(
+    own: NeutralModel, theirs: NeutralModel, least: float = RELATIVE_CHANGE, has_rest_poses: bool = False
+) -> list[Change]:
     """List the parameters in which two descriptions differ by more than rounding.
 
     Args:
         own: the neutral model, fixed bodies lumped.
         theirs: an importer's description, fixed bodies lumped.
         least: relative difference from which on two numbers differ.
+        has_rest_poses: whether poses of free bodies count, which are coordinates of their joints.
 
     Returns:
         The changes that turn the first into the second; the structure of bodies and joints first.
@@ -514,7 +517,8 @@ def differences(own: NeutralModel, theirs: NeutralModel, least: float = RELATIVE
         for field in BODY_FIELDS:
             values = getattr(body, field), getattr(other, field)
             scale = size if field in ("position", "center") else 0.0
-            if field in ("position", "attitude") and body.joints and body.joints[0].kind == "free":
+            is_free = bool(body.joints) and body.joints[0].kind == "free"
+            if field in ("position", "attitude") and is_free and not has_rest_poses:
                 is_different = False  # a free joint's coordinates are those of the body frame
             elif field == "attitude":
                 is_different = _differs(rotation_matrix(values[0]), rotation_matrix(values[1]), 0.0, least)
@@ -545,7 +549,7 @@ def describe_difference(own: NeutralModel, theirs: NeutralModel) -> str:
         kinds = [_joint_words(b.joints) for b in (named[body.name], body)]
         if kinds[0] != kinds[1]:
             return f"the joints of body {body.name} are {kinds[0]}, as written {kinds[1]}"
-    changes = differences(own, theirs)
+    changes = differences(own, theirs, has_rest_poses=True)
     if not changes:
         return ""
     first, word = changes[0], FIELD_WORDS.get(changes[0].field, changes[0].field)

@@ -8,7 +8,7 @@ from click.testing import CliRunner
 from plumbline.cli.main import main
 
 
-@pytest.mark.parametrize("command", ["prove", "coverage", "drift"])
+@pytest.mark.parametrize("command", ["coverage", "drift"])
 def test_commands_for_chains_refuse_trees(command, tmp_path):
     done = CliRunner().invoke(main, [command, "furuta", "--out", str(tmp_path / "out")])
     assert done.exit_code == 2 and "furuta is a tree" in done.output

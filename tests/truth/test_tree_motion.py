@@ -12,13 +12,13 @@ from plumbline.model.kinematics import complete_state, quaternion_rate, state_fr
 from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import find_scenario_file, load_scenario
-from plumbline.truth import TruthUnavailable, ground_truth, trajectory
+from plumbline.truth import ground_truth, trajectory
 from plumbline.truth.closed_form.free_top import free_top
 from plumbline.truth.closed_form.planar_pendulum import planar_pendulum
 from plumbline.truth.ground_truth import perturbed_models
 from plumbline.truth.notes_motion import simulate_notes_form
 from plumbline.truth.sensitivity import perturbation_growth, perturbed_states, project_to_manifold
-from plumbline.truth.taylor import simulate_taylor, taylor_series
+from plumbline.truth.taylor import simulate_taylor
 from plumbline.truth.trajectory import NOTES_RTOL, trajectory_truth
 from reference_impl.joints import constraint_rows
 
@@ -171,13 +171,6 @@ def test_a_free_body_turns_as_the_free_top_and_falls():
     fall = TIMES[:, None, None] * velocity + TIMES[:, None, None] ** 2 / 2 * model.gravity
     assert np.max(position_error(r, fall)) < 2e-15
     assert np.max(attitude_error(p, free_top(case.model, case.state)(TIMES)[1])) < 1e-14
-
-
-def test_series_for_proofs_are_refused():
-    model = random_tree(np.random.default_rng(0), 2, ("hinge",))
-    (state,) = random_states(model, 1, 0)
-    with pytest.raises(TruthUnavailable, match="chains"):
-        next(taylor_series(model, state, 10, "quad"))
 
 
 # a wrong truth is reported
