@@ -61,6 +61,8 @@ class DirectSystem:
         self.elements = Elements(chain) if chain.has_elements else None
         rotors = self.elements.joint[self.elements.rotors] if self.elements else np.zeros(0, np.intp)
         self.rotor_count = len(rotors)
+        self._run_rows: NDArray[np.intp] | None = None
+        self._run_independence = 0.0
         n, joint = chain.n, np.concatenate([joint_of_rows(chain), rotors])
         c = len(joint)
         r, p = np.arange(3 * n).reshape(n, 3), 3 * n + np.arange(4 * n).reshape(n, 4)
@@ -182,7 +184,7 @@ class DirectSystem:
 
         """
         if self.chain.has_loops:
-            found = self._loop_unknowns(r, p, v, pdot, gamma_defect, x, RUN_RANK_TOLERANCE)
+            found = self._loop_unknowns(r, p, v, pdot, gamma_defect, x, is_run=True)
             return found[0], found[3], found[4]
         with np.errstate(all="ignore"):  # an overflow raises SingularSystem below
             values, b, joints, elements = self._entries(r, p, v, pdot, x)
@@ -259,7 +261,7 @@ class DirectSystem:
         """Solve with the rows that do not depend on others, and find what the others leave determinate."""
         n, c, plain = self.chain.n, len(self.joint), len(self.joint) - self.rotor_count
         unknowns, used, scaled, joints, elements = self._loop_unknowns(
-            r, p, v, pdot, gamma_defect, x, RANK_TOLERANCE
+            r, p, v, pdot, gamma_defect, x, is_run=False
         )
         rows, scale = scaled
         solution = self._solution_from_unknowns(p, unknowns, joints, elements)
@@ -276,7 +278,7 @@ class DirectSystem:
         pdot: Array,
         gamma_defect: float | Array,
         x: Array | None,
-        tolerance: float,
+        is_run: bool,
     ) -> tuple[Array, NDArray[np.bool_], tuple[Array, Array], ConstraintRows, ElementForces | None]:
         """The unknowns by dense factors, which of them are used, the rows of C scaled and their scale."""
         n, c, plain = self.chain.n, len(self.joint), len(self.joint) - self.rotor_count
@@ -289,13 +291,26 @@ class DirectSystem:
         of_p -= p * (dot(of_p, p) / dot(p, p))[..., None]
         scale = 1 / np.linalg.norm(rows, axis=1)
         rows *= scale[:, None]
-        _, triangle, order = qr(rows.T, mode="economic", pivoting=True)
-        size = np.abs(np.diagonal(triangle))
         used = np.ones(self.size, bool)
-        used[7 * n + order[int(np.sum(size > tolerance * size[0])) :]] = False
+        used[7 * n : 7 * n + plain] = False
+        kept = self._rows_of_run(rows) if is_run else independent_rows(rows, RANK_TOLERANCE)
+        used[7 * n + kept] = True
         unknowns = np.zeros(self.size)
         unknowns[used] = solve_dense(S[np.ix_(used, used)], b[used])
         return unknowns, used, (rows, scale), joints, elements
+
+    def _rows_of_run(self, rows: Array) -> NDArray[np.intp]:
+        """The rows of a loop that a run keeps, as many as at its start, where it is assembled.
+
+        A step's stages are off the constraints by its error, where dependent rows look independent and other
+        rows give other accelerations: they stay the same until they are ten times as near to dependence.
+        """
+        kept = self._run_rows
+        if kept is None or _independence(rows[kept]) < 0.1 * self._run_independence:
+            chosen = (RUN_RANK_TOLERANCE, None) if kept is None else (0.0, len(kept))
+            kept = independent_rows(rows, *chosen)
+            self._run_rows, self._run_independence = kept, _independence(rows[kept])
+        return kept
 
     def _determinate(self, p: Array, null: Array, joints: ConstraintRows) -> Array:
         """Projectors (J, 6, 6) off the wrenches (F, N/ℓ) of multipliers (c, z) that hold nothing."""
@@ -417,6 +432,36 @@ def _band_order(chain: Mechanism) -> NDArray[np.intp]:
     far, near = chain.body[chain.body[:, 0] >= 0].T
     order = reverse_cuthill_mckee(csr_array((np.ones(len(far)), (far, near)), (chain.n, chain.n)))
     return np.argsort(order)
+
+
+def independent_rows(rows: Array, tolerance: float, count: int | None = None) -> NDArray[np.intp]:
+    """Find rows that do not depend on others, by a pivoted QR; of rows that do equally well the first.
+
+    Without that order rounding would choose among them, another set from step to step of a run.
+
+    Args:
+        rows: (c, m), of any scale.
+        tolerance: part of the largest pivot below which a row depends on others.
+        count: how many at most.
+
+    Returns:
+        Their numbers, in order.
+
+    Raises:
+        SingularSystem: a row is not finite.
+
+    """
+    if not np.isfinite(rows).all():
+        raise SingularSystem("the rows of a loop are not finite")
+    factor = np.linspace(1.0, 0.5, len(rows)) / np.linalg.norm(rows, axis=1)
+    _, triangle, order = qr((rows * factor[:, None]).T, mode="economic", pivoting=True)
+    size = np.abs(np.diagonal(triangle))
+    return np.sort(order[: int(np.sum(size > tolerance * size[0]))][:count])
+
+
+def _independence(rows: Array) -> float:
+    """The smallest singular value of scaled rows."""
+    return float(np.linalg.svd(rows, compute_uv=False)[-1])
 
 
 def solve_dense(S: Array, b: Array) -> Array:

@@ -30,9 +30,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import qr
 
-from reference_impl.direct import RUN_RANK_TOLERANCE, Solution, joint_moments, power_of_two_scale
+from reference_impl.direct import (
+    RUN_RANK_TOLERANCE,
+    Solution,
+    independent_rows,
+    joint_moments,
+    power_of_two_scale,
+)
 from reference_impl.elements import Elements
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import L, angular_velocity, cross, dot
@@ -322,7 +327,10 @@ class DenseSystem(TreeSystem):
         held = np.flatnonzero(self.far[:c] >= 0)
         by_body[:, held, self.far[held]] += far.reshape(batch, c, 6)[:, held]
         C = by_body.reshape(batch, c, 6 * n)
-        kept = _independent_rows(C[0], self.compliance[:c] > 0)
+        is_soft = self.compliance[:c] > 0
+        of_joints = np.flatnonzero(~is_soft)
+        kept = of_joints[independent_rows(C[0][of_joints], RUN_RANK_TOLERANCE)]
+        kept = np.sort(np.concatenate([kept, np.flatnonzero(is_soft)]))
         size = 6 * n + len(kept)
         S = np.zeros((batch, size, size))
         for k in range(n):
@@ -342,21 +350,6 @@ class DenseSystem(TreeSystem):
         multiplier = np.zeros((batch, c))
         multiplier[:, kept] = found[:, 6 * n :]
         return found[:, : 6 * n].reshape(-1, 6), multiplier.ravel()
-
-
-def _independent_rows(rows: Array, always: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Numbers of rows that do not depend on others, by a pivoted QR, and of those that are always kept.
-
-    The first of rows that do equally well, whatever their rounding.
-    """
-    if not np.isfinite(rows).all():
-        raise SingularSystem("the rows of a loop are not finite")
-    of_joints = np.flatnonzero(~always)
-    factor = np.linspace(1.0, 0.5, len(of_joints)) / np.linalg.norm(rows[of_joints], axis=1)
-    _, triangle, order = qr((rows[of_joints] * factor[:, None]).T, mode="economic", pivoting=True)
-    size = np.abs(np.diagonal(triangle))
-    kept = of_joints[order[: int(np.sum(size > RUN_RANK_TOLERANCE * size[0]))]]
-    return np.sort(np.concatenate([kept, np.flatnonzero(always)]))
 
 
 EliminatedSystem = StructuredSystem | TreeSystem
