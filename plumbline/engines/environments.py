@@ -22,7 +22,7 @@ from typing import Any
 
 from packaging.specifiers import SpecifierSet
 from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel_filename
-from packaging.version import InvalidVersion, Version
+from packaging.version import Version
 
 from plumbline.engines.registry import ENGINES, IMPORTERS
 from plumbline.processes.errors import PlumblineError
@@ -69,7 +69,7 @@ def version_problem(name: str) -> str | None:
         return _wheel_problem(Path(version), declared_attribute(base, "package"))
     try:
         Version(version)
-    except InvalidVersion:
+    except ValueError:  # InvalidVersion, or a number of thousands of digits
         return f"{version!r} is not a version; write one as 3.12.0, or latest, pre, or the path of a wheel"
     return None
 

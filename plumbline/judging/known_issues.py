@@ -18,7 +18,7 @@ from itertools import product
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from packaging.specifiers import InvalidSpecifier, SpecifierSet
+from packaging.specifiers import SpecifierSet
 from packaging.version import InvalidVersion, Version
 from pydantic import (
     BaseModel,
@@ -247,8 +247,8 @@ class _Entry(BaseModel):
     @classmethod
     def _check_version_range(cls, text: str) -> str:
         try:
-            SpecifierSet(text)
-        except InvalidSpecifier:
+            SpecifierSet(text).contains("1.0")
+        except ValueError:  # InvalidSpecifier, or a number of thousands of digits
             raise invalid_value_error(
                 f"is {shorten(repr(text))}", "a version range, written like '>=1.13,<2'"
             ) from None
@@ -259,7 +259,7 @@ class _Entry(BaseModel):
     def _check_since(cls, text: str) -> str:
         try:
             Version(text.removesuffix(OR_EARLIER) or "0")
-        except InvalidVersion:
+        except ValueError:  # InvalidVersion, or a number of thousands of digits
             valid = f"a version, written like '4.1.0' or '3.3.1{OR_EARLIER}'"
             raise invalid_value_error(f"is {shorten(repr(text))}", valid) from None
         return text

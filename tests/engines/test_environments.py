@@ -47,6 +47,7 @@ def quiet(*_):
         ("exudyn@pre", None),
         ("mujoco@", "is not a version"),
         ("mujoco@newest", "is not a version"),
+        ("mujoco@" + 5000 * "9", "is not a version"),
         ("mujoco@mujoco-9.9-py3-none-any.whl", "there is no file"),
         ("mujoco@elsewhere/absent-1.0-py3-none-any.whl", "is a wheel of absent, not of mujoco"),
         ("pinocchio-aba@pinocchio-4.0-py3-none-any.whl", "is a wheel of pinocchio, not of pin"),
