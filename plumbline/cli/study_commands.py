@@ -135,6 +135,7 @@ def drift(names: tuple[str, ...], rtols: tuple[float, ...], max_cpu_seconds: flo
 @click.command(
     epilog=examples(
         "coverage double-tumbling-rods",
+        "coverage furuta four-bar --level state",
         "coverage --level state --json | jq '.entries[] | select(.smallest == null)'",
         "coverage drag-rod --engine mujoco --engine exudyn",
     )
@@ -180,7 +181,6 @@ def coverage(
     from plumbline.studies.tables import write_table
 
     chosen = options.choose_scenarios(names, ())
-    chosen = options.require_chains(chosen) if names else [s for s in chosen if s.model.is_chain]
     levels: tuple[Level, ...] = COVERED_LEVELS if level == "all" else (level,)
     folder, limits = options.claim_folder(out), Limits(timeout, memory)
     with options.exit_on_io_error():

@@ -316,10 +316,10 @@ def first_acceleration_bound(model: Model, method: ConstrainedMethod, state: Sta
     """Bound what the engine's finite differences of C(q) q̇ leave in its first q̈.
 
     It solves M q̈ + Cᵀ λ = f, C q̈ = γ = −∂(C q̇)/∂q q̇, with the derivative from forward differences of size δ.
-    C q̇ and the coordinates in it are rounded (two values, q + δ, A s and its sum with r in each), and the
-    differences cut off second derivatives, so a row of γ is off by up to
+    C q̇ and the coordinates in it are rounded (in each of two values q + δ, an entry of A, A s and its sum
+    with r), and the differences cut off second derivatives, so a row of γ is off by up to
 
-        2⁻⁵³ (32 |C| |q̇| + 4 |∂(C q̇)/∂q| s) √(Σ q̇ᵢ²) / δ + Σ |∂²(C q̇)/∂qᵢ²| |q̇ᵢ| δ / 2
+        2⁻⁵³ (32 |C| |q̇| + 8 |∂(C q̇)/∂q| s) √(Σ q̇ᵢ²) / δ + Σ |∂²(C q̇)/∂qᵢ²| |q̇ᵢ| δ / 2
 
     over the coordinates i that this row of C depends on, which are the Euler parameters and, of rods, the
     positions.  sᵢ is 1 for Euler parameters, and for a position its size and that of the lever of its joints.
@@ -350,7 +350,7 @@ def first_acceleration_bound(model: Model, method: ConstrainedMethod, state: Sta
     first, second = np.abs(after - before).T / 2e-4, np.abs(after - 2 * C @ rates + before).T / 1e-8
     S = np.block([[M, C.T], [C, np.zeros((len(C), len(C)))]])
     speed = np.sqrt(_dependence(model) @ rates**2)
-    rounding = 2.0**-53 * (32 * np.abs(C) @ np.abs(rates) + 4 * first @ sizes.ravel())
+    rounding = 2.0**-53 * (32 * np.abs(C) @ np.abs(rates) + 8 * first @ sizes.ravel())
     gamma = rounding * speed / method.difference_step + second @ np.abs(rates) * method.difference_step / 2
     error = np.abs(np.linalg.inv(S)[: 7 * n, 7 * n :]) @ gamma
     return np.asarray(np.max(error.reshape(n, 7), axis=1))

@@ -2,15 +2,13 @@
 
 import json
 
-import pytest
 from click.testing import CliRunner
 
 from plumbline.cli.main import main
 
 
-@pytest.mark.parametrize("command", ["coverage", "drift"])
-def test_commands_for_chains_refuse_trees(command, tmp_path):
-    done = CliRunner().invoke(main, [command, "furuta", "--out", str(tmp_path / "out")])
+def test_a_drift_table_of_a_tree_is_refused(tmp_path):
+    done = CliRunner().invoke(main, ["drift", "furuta", "--out", str(tmp_path / "out")])
     assert done.exit_code == 2 and "furuta is a tree" in done.output
     assert not (tmp_path / "out").exists()
 
@@ -35,3 +33,13 @@ def test_a_tree_is_compared_with_its_joint_moments(tmp_path):
     assert {row["level"] for row in results["rows"]} == levels
     assert {row["verdict"] for row in results["rows"] if row["level"] == "step"} == {"agrees"}
     assert results["scenarios"]["universal-pendulum"]["model"]["kind"] == ["universal"]
+
+
+def test_coverage_of_a_tree(tmp_path):
+    done = CliRunner().invoke(
+        main, ["coverage", "hinge-pendulum", "--level", "state", "--json", "--out", str(tmp_path / "out")]
+    )
+    assert done.exit_code == 0, done.output
+    entries = json.loads(done.stdout)["entries"]
+    assert {"mass", "inertia", "frame", "body_frame", "coordinate", "rate"} <= {e["kind"] for e in entries}
+    assert all(entry["smallest"] is not None or entry["proof"] for entry in entries)
