@@ -63,7 +63,7 @@ from plumbline.model.datatypes import (
     Trajectory,
     Unsupported,
 )
-from plumbline.model.loops import CutMechanism, cut_open, determinate_part, wrench_length
+from plumbline.model.loops import STABILISATION, CutMechanism, cut_open, determinate_part, wrench_length
 from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
 from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 
@@ -77,7 +77,6 @@ SEQUENCES = (1.0, 1.3, 1.7)  # of them: factors of the largest
 # Of motions: the error of smaller ones is rounding, and as 1/R what steps leave of gaps in dependent rows.
 LARGEST_RUN_REGULARISATION, RUN_REGULARISATIONS = 2.7e-4, 3
 RUN_ITERATIONS = 3  # of Newton's method on welds, a linear problem: the second and third remove rounding
-RUN_STABILISATION = 50.0  # 1/s: gaps that steps open die as (1 + a t) e^{-a t}
 MAX_ORDER_ERROR = 0.1
 MIN_SOFTNESS = 1e-9  # a smaller relative effect of R is rounding
 MAX_NOISE = 1e-11  # relative, of differences that grow as R falls: more is too much to extrapolate
@@ -173,7 +172,7 @@ class Mujoco(MetamorphicHooks):
             tree = _MujocoChain(cut.model, ends=cut.ends)
             tree.soften(LARGEST_RUN_REGULARISATION / RATIO**k)
             tree.m.opt.iterations = RUN_ITERATIONS
-            tree.m.eq_solref[:] = -(RUN_STABILISATION**2), -2 * RUN_STABILISATION
+            tree.m.eq_solref[:] = -(STABILISATION**2), -2 * STABILISATION
             run = self._sampled_run(tree, cut.state(state), times, integrator, resolution)
             runs.append(cut.source_run(run))
         limit: dict[str, Any] = {}

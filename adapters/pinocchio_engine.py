@@ -69,13 +69,12 @@ from plumbline.model.kinematics import (
     rotation_vector,
     velocity_jacobian,
 )
-from plumbline.model.loops import cut_open
+from plumbline.model.loops import STABILISATION, cut_open
 from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
 from plumbline.model.welding import BodyParts, undivided_bodies
 
 ROD_AXIAL_INERTIA = 1 / 3  # of a rod about its own axis, over the trace of the inertia that it carries
 PROXIMAL_DAMPING, MAX_PROXIMAL_STEPS = 1e-8, 50  # of constraintDynamics: any damping from 1e-12 to 1e-3 does
-STABILISATION = 50.0  # 1/s, of motions: gaps that steps open die as (1 + a t) e^{-a t}
 MAX_DENSE_JOINTS = 10  # joints up to which their 3 × 3 blocks are solved faster as one matrix
 JOINT_MODELS = {
     "hinge": pin.JointModelRZ,

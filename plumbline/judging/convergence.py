@@ -53,8 +53,8 @@ def refinement_resolutions(
         sample_interval: time between samples [s].
 
     Returns:
-        From coarse to fine at least four steps [s], powers of two of `step_unit`, smaller in proportion to
-        the duration where they would be longer than the sample interval; or two relative tolerances.
+        From coarse to fine at least four steps [s], powers of two of `step_unit`, in proportion to a
+        duration below 1 s where they would be longer than the sample interval; or two relative tolerances.
 
     """
     if integrator.kind == "tolerance":
@@ -64,7 +64,7 @@ def refinement_resolutions(
     fine = max(min(fine, affordable), coarse + 3) + extra_refinements
     unit = step_unit(sample_interval)
     if unit * 2.0**-coarse > sample_interval:
-        unit *= 2.0 ** int(np.floor(np.log2(duration)))
+        unit *= 2.0 ** int(np.floor(np.log2(min(duration, 1.0))))
     return [unit * 2.0**-k for k in range(coarse, fine + 1)]
 
 

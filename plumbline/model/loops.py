@@ -46,6 +46,7 @@ MIN_SINGULAR_VALUE = 1e-6  # of the rows that hold, below it a pose counts as si
 MIN_MOTION_SINGULAR_VALUE = 1e-2  # the same of poses that a motion is compared at: it loses digits near them
 RANK_TOLERANCE = 1e-11  # of singular values of scaled rows: below it a row depends on the others
 MIN_MASS_RATIO = 1e-12  # of eigenvalues of a mass matrix of unit diagonal: below it a motion has no inertia
+STABILISATION = 50.0  # 1/s, of engines' motions: gaps that steps open die as (1 + a t) e^{-a t}
 NEWTON_STEPS, MAX_HALVINGS = 30, 6
 NEARLY_CLOSED = 1e-11  # of a gap [m, rad]: the next step of Newton's method leaves only rounding
 PER_BODY = ("acceleration", "angular_acceleration")  # quantities with one row per body

@@ -9,11 +9,13 @@ from hypothesis import strategies as st
 
 from plumbline.judging.convergence import (
     ORDER_MARGIN,
+    STEP_EXPONENTS,
     extrapolated_order,
     max_norm,
     observed_order,
     refinement_resolutions,
     romberg,
+    step_unit,
     tightest_tolerance_limit,
 )
 from plumbline.model.datatypes import Integrator
@@ -137,6 +139,16 @@ def test_steps_halve_and_are_at_least_four(bodies, order, duration):
 def test_a_study_has_as_many_steps_as_are_affordable(order, bodies, duration, extra, coarse, fine):
     steps = refinement_resolutions(Integrator("x", "step", order, (order,)), bodies, duration, extra)
     assert steps == [2.0**-k for k in range(coarse, fine + 1)]
+
+
+@given(st.sampled_from([1, 2, 4]), st.floats(0.01, 100), st.sampled_from([0.001, 1 / 64, 0.03, 1 / 4, 1.0]))
+def test_samples_and_durations_never_make_steps_longer(order, duration, sample_interval):
+    """Seen: at 2 s and samples closer than 1/32 s the steps were doubled."""
+    method = Integrator("x", "step", order, (order,))
+    steps = refinement_resolutions(method, 1, duration, 0, sample_interval)
+    usual = step_unit(sample_interval) * 2.0 ** -STEP_EXPONENTS[order][0]
+    assert steps[0] <= usual
+    assert steps[0] == usual or (usual > sample_interval and duration < 1)
 
 
 def test_an_adaptive_method_is_refined_by_tolerances():
