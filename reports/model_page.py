@@ -6,7 +6,6 @@ Input: the document that the command prints with --json.  Output: files in the s
 from __future__ import annotations
 
 import json
-import math
 import xml.etree.ElementTree as ET
 from collections import Counter
 from pathlib import Path
@@ -15,14 +14,11 @@ from typing import Any
 from markupsafe import Markup
 
 from plumbline.storage.results_store import write_atomically
-from reports import html_report, junit
+from reports import html_report, junit, robot_drawing
 from reports.results import Record, replace_unprintable
-from reports.verdicts import needs_attention
+from reports.verdicts import count_verdicts, needs_attention, rank
 
 SARIF_SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
-DRAWING_SIZE = 360  # px, width and height of the drawing's square
-_MARGIN = 24
-_AZIMUTH, _ELEVATION = math.radians(35), math.radians(25)  # of the view
 
 
 def write(folder: Path, document: Record) -> Path:
@@ -64,19 +60,17 @@ def render(document: Record) -> str:
         engines: dict[str, list[Record]] = {}
         for row in file["rows"]:
             engines.setdefault(row["engine"], []).append(row)
-        quantities = list(dict.fromkeys(row["quantity"] for row in file["rows"] if row["quantity"] != "all"))
         files.append(
             {
                 **file,
                 "columns": {name: {row["quantity"]: row for row in rows} for name, rows in engines.items()},
-                "quantities": quantities,
+                "worst": {name: max(rows, key=rank) for name, rows in engines.items()},
                 "findings": [row for row in file["rows"] if _is_finding(row)],
-                "lines": draw(
-                    file["drawing"], {body for cause in file["causes"] for body in cause["bodies"]}
-                ),
+                "drawing": robot_drawing.draw(file["drawing"], _marked(file)),
+                "counts_not_compared": Counter(feature["what"] for feature in file["not_compared"]),
+                "counts_ambiguous": Counter(feature["what"] for feature in file["ambiguous"]),
             }
         )
-    counts = Counter(row["verdict"] for file in document["files"] for row in file["rows"])
     style = html_report.stylesheet()
     return (
         html_report.template_environment()
@@ -88,16 +82,15 @@ def render(document: Record) -> str:
             engines=document["engines"],
             problems=document["problems"],
             files=files,
-            counts=counts,
-            size=DRAWING_SIZE,
+            counts=count_verdicts(row for file in document["files"] for row in file["rows"]),
+            is_state_given=document["options"]["at"] is not None,
         )
     )
 
 
 def _is_finding(row: Record) -> bool:
-    """Whether a row is listed: what no cause explains, and refusals, which are answers."""
-    is_refusal = row["quantity"] == "all" and row["reason"].startswith("refused: ")
-    return is_refusal or (needs_attention(row) and not row["diagnosis"])
+    """Whether a row is listed: what no cause explains; the table has the words of whole columns."""
+    return row["quantity"] != "all" and needs_attention(row) and not row["diagnosis"]
 
 
 def _sentence(document: Record) -> str:
@@ -106,40 +99,20 @@ def _sentence(document: Record) -> str:
     count = len(document["files"])
     what = f"{count} model file{'s' * (count != 1)}"
     if not bad:
-        return f"{what}: every importer that reads them reads the same robot"
+        return f"{what}: every importer that reads {'it' if count == 1 else 'them'} reads the same robot"
     return f"{what}, {bad} read differently: {causes} cause{'s' * (causes != 1)} named and proved"
 
 
-def draw(bodies: list[Record], marked: set[str]) -> list[Record]:
-    """Project a robot's bodies to the drawing.
-
-    Args:
-        bodies: name, parent's name and origin [m] of each body's frame.
-        marked: names of the bodies that differ.
-
-    Returns:
-        One line per body from its parent's origin to its own: x1, y1, x2, y2 [px], name, is_marked.
-
-    """
-    flat: dict[str, tuple[float, float]] = {"": (0.0, 0.0)}
-    for body in bodies:
-        x, y, z = body["origin"]
-        across = y * math.cos(_AZIMUTH) - x * math.sin(_AZIMUTH)
-        depth = x * math.cos(_AZIMUTH) + y * math.sin(_AZIMUTH)
-        flat[body["name"]] = across, -(z * math.cos(_ELEVATION) - depth * math.sin(_ELEVATION))
-    low = [min(p[i] for p in flat.values()) for i in (0, 1)]
-    span = max(max(p[i] for p in flat.values()) - low[i] for i in (0, 1)) or 1.0
-    scale = (DRAWING_SIZE - 2 * _MARGIN) / span
-
-    def place(name: str) -> list[float]:
-        return [round(_MARGIN + (flat[name][i] - low[i]) * scale, 1) for i in (0, 1)]
-
-    found = []
-    for body in bodies:
-        (x1, y1), (x2, y2) = place(body["parent"]), place(body["name"])
-        is_marked = body["name"] in marked
-        found.append({"x1": x1, "y1": y1, "x2": x2, "y2": y2, "name": body["name"], "is_marked": is_marked})
-    return found
+def _marked(file: Record) -> dict[str, list[str]]:
+    """What differs in each body, an entry per importer."""
+    fields: dict[str, dict[str, list[str]]] = {}
+    for cause in file["causes"]:
+        for body in cause["bodies"]:
+            fields.setdefault(body, {}).setdefault(cause["engine"], []).append(cause["field"])
+    return {
+        body: [f"{engine}: {', '.join(dict.fromkeys(found))}" for engine, found in by_engine.items()]
+        for body, by_engine in fields.items()
+    }
 
 
 def _junit(document: Record) -> bytes:

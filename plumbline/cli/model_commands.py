@@ -186,6 +186,7 @@ def model_document(result: ModelRunResult) -> dict[str, Any]:
             "base": plan.base,
             "root": None if plan.root is None else str(plan.root),
             "strip_geometry": plan.strip_geometry,
+            "at": plan.at,
         },
         "engines": {name: {"version": i.version, "missing": i.missing} for name, i in result.engines.items()},
         "files": [
@@ -194,6 +195,7 @@ def model_document(result: ModelRunResult) -> dict[str, Any]:
                 "name": file.model.name,
                 "bodies": len(file.model.bodies),
                 "degrees_of_freedom": file.model.velocity_count,
+                "quantities": _compared_quantities(file),
                 "rows": [row_record(row) for row in file.rows],
                 "causes": list(_cause_records(file)),
                 "unproved": [name for name, e in file.explanations.items() if not e.is_proved],
@@ -246,7 +248,7 @@ def _print_file(file: FileResult, result: ModelRunResult) -> None:
     by_engine: dict[str, list[Row]] = {}
     for row in file.rows:
         by_engine.setdefault(row.engine, []).append(row)
-    out.print(_file_table(by_engine, result))
+    out.print(_file_table(file, by_engine, result))
     for name, rows in by_engine.items():
         for line in _reasons(name, rows, file):
             out.print(line)
@@ -255,10 +257,16 @@ def _print_file(file: FileResult, result: ModelRunResult) -> None:
             out.print(f"[dim]{title}: {escape(_feature_words(features, file.file))}[/]")
 
 
-def _file_table(by_engine: dict[str, list[Row]], result: ModelRunResult) -> Table:
+def _compared_quantities(file: FileResult) -> list[str]:
+    """The quantities that any importer's rows have, in the order of the tables."""
+    found = {row.quantity for row in file.rows}
+    return [quantity for quantity in MODEL_UNITS if quantity in found]
+
+
+def _file_table(file: FileResult, by_engine: dict[str, list[Row]], result: ModelRunResult) -> Table:
     table = Table(box=None, pad_edge=False, header_style="bold")
     table.add_column("importer")
-    shown = [q for q in MODEL_UNITS if any(row.quantity == q for rows in by_engine.values() for row in rows)]
+    shown = _compared_quantities(file)
     for quantity in shown:
         table.add_column(COLUMN_HEADINGS[quantity])
     for name, rows in by_engine.items():

@@ -87,6 +87,19 @@ class Cause:
     phrase: str  # what the importer does, without its name
     sentence: str
 
+    def within(self, file: str) -> Cause:
+        """Write for a reader of a file: its lines without its path.
+
+        Args:
+            file: as in the sources.
+
+        Returns:
+            The cause.
+
+        """
+        phrase, sentence = (text.replace(f"{file}:", "line ") for text in (self.phrase, self.sentence))
+        return replace(self, phrase=phrase, sentence=sentence)
+
 
 @dataclass(frozen=True, eq=False)
 class Explanation:

@@ -73,7 +73,7 @@ class FileResult:
     model: NeutralModel
     rows: tuple[Row, ...]
     explanations: Mapping[str, Explanation]  # by importer
-    poses: Mapping[str, Array]  # of the bodies at the first state, for the drawing
+    poses: Mapping[str, Array]  # of the bodies at the reference, or at the one state, for the drawing
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,7 +294,8 @@ def judge_file(
     for name, info, answer in columns:
         context = RowContext(shown, MODEL_FAMILY, name, info.title, info.version)
         if answer.reading is None and not answer.failure:
-            reason = f"{info.title} reads no such files"
+            formats = declared_importer_attribute(split_version(name)[0], "formats")
+            reason = f"{info.title} reads {' and '.join(formats).upper()} files only"
             rows.append(context.make_row("model", "-", "all", Verdict.INFORMATION, reason))
             continue
         if info.missing is not None:
@@ -310,6 +311,7 @@ def judge_file(
             found = [_with_diagnosis(row, explanation) for row in found]
         if not applies and answer.reading is not None and answer.reading.model is not None:
             cause = damping_cause(f"{info.title} {info.version}", model, answer.reading.model)
+            cause = cause and cause.within(shown)
             found.append(_damping_row(context, cause))
             if cause is not None:
                 known = explanations.get(name, Explanation(is_proved=True))
@@ -317,7 +319,8 @@ def judge_file(
         if answer.rewritten and answer.reading is not None and answer.reading.model is not None:
             found.append(rewriting_row(context, answer.reading.model, answer.rewritten))
         rows += found
-    poses = truths[0].quantities.poses if truths else {}
+    (drawn,) = certify_states(model, model_states(model, 1, 0, at or {}))
+    poses = drawn.quantities.poses
     return FileResult(shown, model, tuple(rows), explanations, poses)
 
 
@@ -328,7 +331,9 @@ def _explain(
     reading = answer.reading.model
     if not applies_passive_forces:
         reading = without_passive_forces(reading)
-    return explain_importer(f"{context.title} {context.version}", model, reading, answer.quantities, states)
+    title = f"{context.title} {context.version}"
+    found = explain_importer(title, model, reading, answer.quantities, states)
+    return replace(found, causes=tuple(cause.within(context.scenario) for cause in found.causes))
 
 
 def _with_diagnosis(row: Row, explanation: Explanation) -> Row:

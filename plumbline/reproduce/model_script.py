@@ -253,7 +253,7 @@ def _render(bench: _Bench, form: str, result: FileResult, text: str, since: str)
     if number is None:
         number = _shown_damping(form, explanation, reading.model)
     sentences = [] if explanation is None else [cause.sentence for cause in explanation.causes]
-    why = " ".join(sentences).replace(f"{bench.prepared.shown}:", "line ")
+    why = " ".join(sentences)
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).with_name("templates")),
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,

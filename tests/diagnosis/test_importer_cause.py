@@ -113,7 +113,7 @@ def test_mujoco_leaves_out_the_inertia_of_massless_fixed_links(tmp_path):
     result = judged(tmp_path, MASSLESS, MASSLESS, ".urdf")
     ((cause,),) = (explanation.causes for explanation in result.explanations.values())
     assert "leaves out the inertia of tip (0 kg, " in cause.sentence
-    assert "robot.urdf:4), fixed to body upper; this alone explains every quantity" in cause.sentence
+    assert "line 4), fixed to body upper; this alone explains every quantity" in cause.sentence
 
 
 DISK = """<mujoco><worldbody><body name="disk"><joint name="j" axis="0 0 1"/>
@@ -194,7 +194,7 @@ def test_pinocchio_leaves_some_armatures_out_of_its_kinetic_energy(tmp_path):
     assert {row.quantity for row in result.rows if row.verdict == Verdict.DISAGREES} == {"kinetic_energy"}
     ((cause,),) = (explanation.causes for explanation in result.explanations.values())
     assert "leaves the armature of joint k out of its kinetic energy" in cause.sentence
-    assert "m.xml:3); this alone explains every quantity" in cause.sentence
+    assert "(line 3); this alone explains every quantity" in cause.sentence
 
 
 def test_a_default_inertial_is_named_by_the_links_that_have_none(tmp_path):

@@ -37,7 +37,7 @@ DOCUMENT = {
         {
             "file": "a/b/arm.xml", "degrees_of_freedom": 1,
             "rows": [row("mujoco", "unsupported", "all", "refused: bad <mesh> in /tmp/x.xml"),
-                     row("drake", "information", "all", "reads no such files")],
+                     row("drake", "information", "all", "Drake reads URDF files only")],
             "causes": [],
         },
     ],

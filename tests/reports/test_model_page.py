@@ -10,7 +10,7 @@ import pytest
 
 from plumbline.cli.model_commands import model_document
 from plumbline.execution.model_run import ModelPlan, run_model_files
-from reports import model_page
+from reports import model_page, robot_drawing
 
 EVIL = "\"><img src=x onerror=alert(1)><script>alert('2')</script>"
 # Pinocchio keeps its own gravity; a massless moving body is refused by MuJoCo's URDF reader
@@ -43,6 +43,32 @@ def test_the_page_names_causes_refusals_and_bad_files_and_escapes_them(page_file
     assert "1 cause named and proved" in text
     assert "Files that cannot be used" in text
     assert "mjMINVAL" in text, "a refusal is an answer"
+
+
+def test_the_page_gives_a_line_per_file_and_marks_the_bodies_that_differ():
+    entry = {"name": "", "parent": "", "origin": [0, 0, 0]}
+    bodies = [
+        entry | {"name": n, "parent": p, "origin": o}
+        for n, p, o in (
+            ("base", "", [0, 0, 0]),
+            ("upper", "base", [0, 0, 1]),
+            ("lower", "upper", [0, 0, 1]),
+            ("tip", "lower", [1, 0, 1]),
+        )
+    ]
+    marked = {"upper": ["dart: mass"], "lower": ["dart: axis"], "tip": ["drake: center"]}
+    drawing = robot_drawing.draw(bodies, marked)
+    assert [mark["text"] for mark in drawing["numbers"]] == ["1, 2", "3"], "two bodies at one point"
+    assert [entry["name"] for entry in drawing["legend"]] == list(marked)
+    assert len(drawing["lines"]) == 3 and drawing["size"][1] > drawing["size"][0]
+    assert robot_drawing.draw([], {}) is None
+
+
+def test_files_that_differ_and_files_that_agree(page_file):
+    text = page_file.read_text(encoding="utf-8")
+    assert text.count('href="#file-') == 2, "an overview where there are several files"
+    assert "pinocchio: gravity" not in text, "gravity belongs to no body"
+    assert "1 × limit" in text and "no body" not in text
 
 
 @pytest.mark.browser

@@ -22,7 +22,7 @@ class Examined:
     kind: Kind
     title: str  # a clause about the importer
     script: str = ""  # in docs/importers
-    pattern: str = ""  # regular expression that the cause's sentence matches
+    pattern: str = ""  # regular expression that the file's name and the cause's sentence match
 
     def fits(self, importer: str, form: str, field: str, sentence: str) -> bool:
         """Whether a cause is of this kind.
@@ -31,7 +31,7 @@ class Examined:
             importer: that differs.
             form: urdf or mjcf.
             field: parameter of the cause.
-            sentence: of the cause.
+            sentence: the file's name and the sentence of the cause.
 
         Returns:
             Whether it is.

@@ -141,10 +141,9 @@ def _differences(found: list[Cause]) -> str:
     by_entry: dict[Examined, list[Cause]] = defaultdict(list)
     others: dict[tuple[str, str, str], list[Cause]] = defaultdict(list)
     for cause in found:
-        importer, form, record, _ = cause
-        entry = next(
-            (e for e in EXAMINED if e.fits(importer, form, record["field"], record["sentence"])), None
-        )
+        importer, form, record, file = cause
+        said = f"{file}: {record['sentence']}"
+        entry = next((e for e in EXAMINED if e.fits(importer, form, record["field"], said)), None)
         if entry is not None:
             by_entry[entry].append(cause)
         else:

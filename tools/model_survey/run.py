@@ -73,7 +73,7 @@ def survey(folder: Path) -> dict[str, Any]:
         merged["files"] += document["files"]
         merged["problems"] += document["problems"]
         merged["bases"] |= dict.fromkeys(files, base) if is_urdf else {}
-        merged["version"] = document["version"]
+        merged |= {name: document[name] for name in ("version", "options")}
         merged["exit_code"] = max(merged.get("exit_code", 0), document["exit_code"])
     return merged
 
