@@ -47,6 +47,13 @@ class ExudynImporter(LoadingImporter):
     package = "exudyn"
     formats = ("urdf",)
     environment = ".importers-exudyn"
+    extra_requirements = (  # as the group exudyn-importer in pyproject.toml
+        (">=0", "roboticstoolbox-python>=1.1,<1.2"),
+        (">=0", "spatialgeometry<1.2"),
+        (">=0", "spatialmath-python<1.1.15"),
+        (">=0", "numpy<2"),
+        (">=0", "scipy<1.14"),
+    )
     unsupported: ClassVar[dict[str, str]] = {
         "passive_force": "the loader returns friction and leaves it to the caller to apply it",
         "acceleration": "Exudyn's initial accelerations are finite differences",

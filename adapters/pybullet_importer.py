@@ -62,6 +62,7 @@ class PybulletImporter(LoadingImporter):
     package = "pybullet"
     formats = ("urdf", "mjcf")
     environment = ".importers"
+    extra_requirements = (("<3.2.7", "numpy<2"),)
     unsupported: ClassVar[dict[str, str]] = {
         "passive_force": "PyBullet has no routine that returns the forces of dampers",
         "acceleration": "PyBullet has no routine that returns accelerations",

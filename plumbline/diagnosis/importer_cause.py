@@ -27,7 +27,7 @@ from plumbline.importers.neutral_model import (
 )
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import rotation_matrix
-from plumbline.truth.certified_model import CertifiedModelQuantities
+from plumbline.truth.certified_model import CertifiedModelQuantities, pose_tolerances
 from plumbline.truth.model_comparison import (
     Mismatch,
     certify_states,
@@ -161,14 +161,14 @@ def _explain(
         structure = [c for c in structure if c.body in read]
         structure += [Change(MISSING, body.name, "", body, None, body.source) for body in left_out]
     own, theirs = lump_fixed_bodies(moved), lump_fixed_bodies(reading)
-    trial = _Trial(own, theirs, reading, answers, states, bool(structure))
+    trial = _Trial(own, theirs, reading, answers, states, moved, bool(structure))
     changes = _single_parts(differences(own, theirs), moved, theirs)
     found = trial.first_that_explains(changes)
     if found is None:
         found = trial.smallest([*changes, *_finer(changes, differences(own, theirs, 0.0))])
     if found is None and len(own.bodies) < len(moved.bodies):
         # a fixed body that is elsewhere, though everything moves alike
-        trial = _Trial(moved, reading, reading, answers, states, bool(structure))
+        trial = _Trial(moved, reading, reading, answers, states, moved, bool(structure))
         found = trial.smallest(differences(moved, reading))
     if found is None:
         return Explanation(differences=(*structure, *changes))
@@ -334,10 +334,13 @@ class _Trial:
         reading: NeutralModel,
         answers: Sequence[ModelQuantities],
         states: States,
+        whole: NeutralModel,
         has_structure: bool,
     ) -> None:
         self.own, self.theirs, self.reading, self.answers, self.states = own, theirs, reading, answers, states
         self.has_structure = has_structure  # whether the own model has been given other joints already
+        # of the model before it was lumped: what is fixed to the world and cancels there counts too
+        self.placed = [pose_tolerances(whole, state) for state in states(whole)]
 
     def worst(self, changes: Sequence[Change], count: int) -> Mapping[str, Mismatch] | None:
         """Worst entries with the changes made; None where the joints still differ."""
@@ -346,12 +349,17 @@ class _Trial:
         if order is None:
             return None
         states = self.states(changed)[:count]
-        truths = certify_states(changed, states)
+        truths = self.certified(changed, count)
         still = {change.joint for change in changes if change.field == ARMATURE_ENERGY}
         truths = [_without_armature(changed, still, *pair) for pair in zip(states, truths, strict=True)]
         offsets = {change.body: change.theirs for change in changes if change.field == FRAME}
         truths = [_with_frames(truth, offsets) for truth in truths]
         return mismatches(changed, truths, [permuted(one, order) for one in self.answers[:count]])
+
+    def certified(self, changed: NeutralModel, count: int) -> list[CertifiedModelQuantities]:
+        """Certify a changed model; its poses within the bounds of the model before it was lumped."""
+        truths = certify_states(changed, self.states(changed)[:count])
+        return [_widened(*pair) for pair in zip(truths, self.placed, strict=False)]
 
     def smallest_with_omissions(self, changes: Sequence[Change]) -> list[Change] | None:
         """Try the changes alone, then with terms that the dynamics may leave out."""
@@ -378,7 +386,7 @@ class _Trial:
         changed = apply_changes(self.own, self.theirs, changes)
         if joint_permutation(changed, self.reading) is None:
             return np.inf
-        (truth,) = certify_states(changed, self.states(changed)[:1])
+        (truth,) = self.certified(changed, 1)
         own, theirs = truth.quantities.poses, self.answers[0].poses
         return sum(
             bool(np.any(np.abs(own[b] - theirs[b]) > truth.tolerance["poses"][b])) for b in own if b in theirs
@@ -470,6 +478,14 @@ class _Trial:
                         needed = rest
         is_some = bool(needed) or self.has_structure
         return needed if is_some and self.fits(needed, len(self.answers)) else None
+
+
+def _widened(truth: CertifiedModelQuantities, placed: Mapping[str, Array]) -> CertifiedModelQuantities:
+    poses = {
+        body: np.maximum(bound, placed[body]) if body in placed else bound
+        for body, bound in truth.tolerance["poses"].items()
+    }
+    return replace(truth, tolerance={**truth.tolerance, "poses": poses})
 
 
 def _with_frames(truth: CertifiedModelQuantities, offsets: Mapping[str, Array]) -> CertifiedModelQuantities:
@@ -819,5 +835,5 @@ def format_value(value: Any, other: Any) -> str:
 
 def _text(a: Array, digits: int) -> str:
     if a.ndim == 0:
-        return f"{float(a):.{digits}g}"
+        return f"{float(a) + 0.0:.{digits}g}"  # no negative zero
     return "(" + ", ".join(_text(part, digits) for part in a) + ")"

@@ -274,7 +274,7 @@ def _rotation_vector(c: _BallModel, q: Array) -> list[Any]:
 class _Magnitudes:
     """Sums of the magnitudes of the terms of each quantity, as the module's docstring defines them."""
 
-    length: Array  # (bodies,) m, with the way to the centre of mass, by which engines place bodies
+    length: Array  # (bodies,) m, with the way to centres of mass, by which engines place bodies
     turns: Array  # (bodies,) number of frames on the path, and the angles' sum
     mass_matrix: Array  # (n, n)
     bias_force: Array  # (n,)
@@ -320,8 +320,48 @@ def _magnitudes(model: NeutralModel, state: CanonicalState) -> _Magnitudes:
         potential += body.mass * g * ell
     for i, (armature, _) in enumerate(_armature_and_rate(model, state)):
         M[i, i] += armature
-    M, h, gravity = (terms + FLOOR * np.max(terms, initial=0.0) for terms in (M, h, gravity))
-    return _Magnitudes(reach, turns, M, h, gravity, passive, potential)
+    sums = _with_fixed_parts(model, reach), M, h, gravity
+    length, M, h, gravity = (terms + FLOOR * np.max(terms, initial=0.0) for terms in sums)
+    return _Magnitudes(length, turns, M, h, gravity, passive, potential)
+
+
+def _with_fixed_parts(model: NeutralModel, reach: Array) -> Array:
+    """Let the way to a body go through what is fixed to it and to those below it: engines lump them."""
+    found = reach.copy()
+    for k, body in reversed([*enumerate(model.bodies)]):
+        if body.parent >= 0 and not body.joints:
+            found[body.parent] = max(found[body.parent], found[k])
+    for k, body in enumerate(model.bodies):
+        if body.parent >= 0:
+            found[k] = max(found[k], found[body.parent])
+    return found
+
+
+def pose_tolerances(model: NeutralModel, state: CanonicalState) -> dict[str, Array]:
+    """Bound how far rounding may put an engine's bodies from where they are.
+
+    Args:
+        model: a tree of bodies.
+        state: canonical coordinates and velocities of its joints.
+
+    Returns:
+        By body name the bounds of rotation matrix and position (3, 4) [1 and m]; none is zero unless the
+        whole model lies in the world's origin.
+
+    """
+    return _pose_tolerances(model, _magnitudes(model, state))
+
+
+def _pose_tolerances(model: NeutralModel, size: _Magnitudes) -> dict[str, Array]:
+    return {
+        body.name: _unit(size) * np.tile([1.0, 1.0, 1.0, length], (3, 1))
+        for body, length in zip(model.bodies, size.length, strict=True)
+    }
+
+
+def _unit(size: _Magnitudes) -> float:
+    """The rounding of one sum of terms, relative to their magnitudes."""
+    return ROUNDING_FACTOR * EPSILON * (1 + float(np.max(size.turns, initial=0.0)))
 
 
 def _with_tolerances(
@@ -329,14 +369,11 @@ def _with_tolerances(
 ) -> CertifiedModelQuantities:
     """Attach the tolerances to the midpoints."""
     size = _magnitudes(model, state)
-    unit = ROUNDING_FACTOR * EPSILON * (1 + float(np.max(size.turns, initial=0.0)))
+    unit = _unit(size)
     n, speed = model.velocity_count, np.abs(state.velocities)
     M, a = middle["mass_matrix"].reshape(n, n), middle.get("acceleration")
     tolerance: dict[str, Any] = {
-        "poses": {
-            body.name: unit * np.tile([1.0, 1.0, 1.0, length], (3, 1))
-            for body, length in zip(model.bodies, size.length, strict=True)
-        },
+        "poses": _pose_tolerances(model, size),
         "mass_matrix": unit * size.mass_matrix,
         "bias_force": unit * size.bias_force,
         "gravity_force": unit * size.gravity_force,

@@ -20,8 +20,8 @@ STATES = 4
 ROBOTS = 10
 
 
-def judged(tmp_path, text, mutated, suffix):
-    """Judge MuJoCo, which reads the mutated text, about the file that has the text."""
+def judged(tmp_path, text, mutated, suffix, moved=""):
+    """Judge MuJoCo, which reads the mutated text, about the file that has the text; a body 1e-17 m off."""
     path = tmp_path / f"robot{suffix}"
     path.write_text(text)
     other = tmp_path / f"other{suffix}"
@@ -35,6 +35,8 @@ def judged(tmp_path, text, mutated, suffix):
         return None
     states = model_states(reading.model, STATES, state_seed(str(path)))
     answers = evaluate_model_file("mujoco", file, states)
+    for one in answers if moved else ():
+        one.poses[moved][0, 3] += 1e-17
     answer = Answer(reading, states, tuple(answers))
     return judge_file(str(path), model, [("mujoco", MUJOCO, answer)], STATES, None)
 
@@ -210,3 +212,18 @@ def test_a_default_inertial_is_named_by_the_links_that_have_none(tmp_path):
     ((cause,),) = (explanation.causes for explanation in result.explanations.values())
     assert cause.field == "default inertial"
     assert "gives 1 kg and an inertia of 1 kg m² to bodies without mass: tip (" in cause.sentence
+
+
+def test_a_cause_is_proved_beside_the_rounding_of_a_fixed_base(tmp_path):
+    """PyBullet places bodies by centres of mass, that of the base too, where a body's own way is zero."""
+    start, end = MASSLESS.index('<link name="tip">'), MASSLESS.index('<joint name="j"')
+    inertial = '<mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
+    base = f'<link name="base"><inertial><origin xyz="0.03 0 0"/>{inertial}</inertial></link>'
+    texts = [
+        (MASSLESS[:start] + tip + MASSLESS[end:]).replace('<link name="base"/>', base)
+        for tip in ('<link name="tip"/>', f'<link name="tip"><inertial>{inertial}</inertial></link>')
+    ]
+    assert base in texts[0]
+    result = judged(tmp_path, *texts, ".urdf", moved="upper")
+    ((cause,),) = (explanation.causes for explanation in result.explanations.values())
+    assert cause.field == "default inertial"

@@ -1,6 +1,7 @@
 """Certified quantities of model files: closed forms, energy, MuJoCo's dynamics, and no false alarms."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from plumbline.importers.model_file import prepare_file
 from plumbline.importers.neutral_model import CanonicalState, ElementaryJoint, NeutralBody, NeutralModel
 from plumbline.importers.urdf import read_urdf
 from plumbline.importers.xml_tree import parse_xml
-from plumbline.truth.certified_model import certify_model
+from plumbline.truth.certified_model import certify_model, pose_tolerances
 from plumbline.truth.model_comparison import certify_states, mismatches, model_states
 from tests.helpers.random_robots import random_mjcf, random_urdf
 
@@ -82,6 +83,21 @@ def test_mujoco_agrees_at_random_states_of_random_robots(tmp_path, seed):
         found = compare(tmp_path, make(rng, 5), suffix, 3)
         assert {"position", "attitude", "mass_matrix", "bias_force", "acceleration"} <= found.keys()
         assert max(found.values()) <= 1, found
+
+
+def test_no_bound_of_a_pose_is_zero_where_anything_lies_elsewhere():
+    """A fixed part's way counts for what carries it and for what hangs there; rounding passes through it."""
+    model = pendulum()
+    still = NeutralBody("still", -1, np.zeros(3), np.array([1.0, 0, 0, 0]), (), 1.0, np.zeros(3), np.eye(3))
+    far = replace(still, name="far", parent=0, position=np.array([2.0, 0, 0]))
+    hung = replace(
+        model.bodies[0], name="hung", parent=0, position=np.zeros(3), center=np.zeros(3), joints=()
+    )
+    state = CanonicalState(np.zeros(0), np.zeros(0))
+    alone = pose_tolerances(NeutralModel("m", (still, hung), model.gravity), state)
+    assert alone["hung"][0, 3] == 0, "all terms vanish"
+    bounds = pose_tolerances(NeutralModel("m", (still, far, hung), model.gravity), state)
+    assert bounds["still"][0, 3] == bounds["hung"][0, 3] == pytest.approx(2 * bounds["hung"][0, 0])
 
 
 @pytest.mark.full
