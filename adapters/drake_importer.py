@@ -56,6 +56,7 @@ class DrakeImporter(LoadingImporter):
     name = "drake"
     title = "Drake"
     package = "drake"
+    supported_versions = ">=1.32,<2"  # earlier ones need NumPy 1, and have other signatures
     formats = ("urdf", "mjcf")
     environment = ".importers"
 

@@ -96,7 +96,7 @@ def bisect(
     for note in notes:
         click.echo(note, err=True)
     document = _document(change) | {"not_tried": notes}
-    if key is not None and change.first_after:
+    if key is not None:
         about = {name: document[name] for name in ("last_before", "first_after")}
         add_version_change(target, key, about | {"note": change.note})
     click.echo(json.dumps(document, ensure_ascii=False, indent=1) if as_json else change.sentence)

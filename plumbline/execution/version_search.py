@@ -68,6 +68,8 @@ class VersionChange:
     @property
     def note(self) -> str:
         """The same without details, for the head of a script."""
+        if not self.first_after:
+            return f"{self.oldest}, the oldest version that was tried, answers alike."
         before, after = (self.answers[version].key for version in (self.last_before, self.first_after))
         if {before, after} <= set(Verdict):
             return f"{self.last_before}: {before}; since {self.first_after}: {after}."
@@ -158,7 +160,7 @@ def choose_versions(
         package: name of the distribution.
         supported: range of versions that the column works with; empty: all.
         good: one end; empty: the oldest version, or the newest if the other end is the oldest.
-        bad: the other end.
+        bad: the other end; empty: the newest version, or the oldest if the other end is the newest.
 
     Returns:
         Versions, oldest first, and sentences about those left out.
@@ -182,8 +184,10 @@ def choose_versions(
                 reason = f"the column supports versions {supported}; {reason}"
             raise NoSearch(f"{package} {text} cannot be used: {reason}")
         ends += same
-    if len(ends) == 1 and usable:
-        ends.append(usable[-1] if ends[0] == usable[0] else usable[0])
+    if len(ends) == 1:
+        oldest, newest = usable[0], usable[-1]
+        wanted = newest if good else oldest
+        ends.append(wanted if wanted != ends[0] else (oldest if good else newest))
     places = sorted(usable.index(v) for v in ends) or [0, len(usable) - 1]
     chosen = usable[places[0] : places[-1] + 1]
     notes = []

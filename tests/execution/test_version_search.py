@@ -68,6 +68,7 @@ def test_ends_that_answer_alike_are_no_change():
     assert (change.last_before, change.first_after) == ("", "")
     assert asked == [VERSIONS[0], VERSIONS[-1]]
     assert "1.0 and 1.39 answer alike" in change.sentence
+    assert change.note == "1.0, the oldest version that was tried, answers alike."
 
 
 def test_two_versions_have_to_answer():
@@ -85,7 +86,10 @@ def published(monkeypatch):
     ("good", "bad", "chosen"),
     [
         ("", "", ["3.2.0", "3.3.0", "4.0.0"]),
-        ("3.3", "", ["3.2.0", "3.3.0"]),
+        ("3.3", "", ["3.3.0", "4.0.0"]),
+        ("", "3.3", ["3.2.0", "3.3.0"]),
+        ("4.0.0", "", ["3.2.0", "3.3.0", "4.0.0"]),
+        ("", "3.2.0", ["3.2.0", "3.3.0", "4.0.0"]),
         ("3.2.0", "", ["3.2.0", "3.3.0", "4.0.0"]),
         ("4.0.0", "3.3.0", ["3.3.0", "4.0.0"]),
     ],

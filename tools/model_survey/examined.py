@@ -90,10 +90,13 @@ EXAMINED = (
         "drake", "mjcf", ("axis", "anchor"), "differs from the file",
         "applies the pose of a body with several joints after the first of them", "drake_several_joints.py",
     ),
-    Examined("drake", "mjcf", ("stiffness",), "not supported", "does not read joint springs, with a warning"),
+    Examined(
+        "drake", "mjcf", ("stiffness",), "not supported", "does not read joint springs, with a warning",
+        "drake_springs.py",
+    ),
     Examined(
         "drake", "mjcf", ("armature",), "not supported",
-        "reads the armature only of joints with an actuator that it reads",
+        "reads the armature only of joints with an actuator that it reads", "drake_springs.py",
     ),
     Examined(
         "drake", "mjcf", ("gravity", "damping", "mass", "inertia"), "differs from the file",
@@ -103,7 +106,7 @@ EXAMINED = (
     Examined("drake", "mjcf", ("reference", "position"), "not supported", "does not read `ref` of joints"),
     Examined(
         "dart", "urdf", (*INERTIAL_FIELDS, *WITHOUT_INERTIAL), "left open by the file",
-        "gives a link without `<inertial>` a mass of 1 kg and moments of 1 kg m²",
+        "gives a link without `<inertial>` a mass of 1 kg and moments of 1 kg m²", "dart_default_inertial.py",
     ),
     Examined(
         "dart", "mjcf", ("joints",), "differs from the file", "does not read `<freejoint>`",
@@ -118,9 +121,16 @@ EXAMINED = (
         "dart", "mjcf", ("position", "attitude"), "differs from the file",
         "puts a body without `pos` at its first `<geom>`", "dart_body_pose.py",
     ),
-    Examined("dart", "mjcf", ("stiffness", "armature"), "not supported", "reads no springs and no armature"),
-    Examined("dart", "mjcf", ("gravity",), "not supported", "does not read `<option gravity>`"),
-    Examined("dart", "mjcf", ("reference",), "not supported", "does not read `ref` of joints"),
+    Examined(
+        "dart", "mjcf", ("stiffness", "armature"), "not supported", "reads no springs and no armature",
+        "dart_joints.py",
+    ),
+    Examined(
+        "dart", "mjcf", ("gravity",), "not supported", "does not read `<option gravity>`", "dart_joints.py"
+    ),
+    Examined(
+        "dart", "mjcf", ("reference",), "not supported", "does not read `ref` of joints", "dart_joints.py"
+    ),
     Examined(
         "exudyn", "urdf", ("damping",), "differs from the file",
         "reads no damping, and takes a joint's friction for viscous friction, which the caller may apply",
@@ -143,13 +153,16 @@ EXAMINED = (
         "pybullet", "mjcf", ("joints", "missing body"), "not supported",
         "reads no joints without `type` and no `<freejoint>`", "pybullet_joint_type.py",
     ),
-    Examined("pybullet", "mjcf", ("damping",), "not supported", "reads no damping"),
+    Examined("pybullet", "mjcf", ("damping",), "not supported", "reads no damping", "pybullet_joints.py"),
     Examined(
         "pybullet", "mjcf", INERTIAL_FIELDS, "differs from the file",
         "does not read `diaginertia`, and keeps numbers in single precision", "pybullet_mjcf_inertial.py",
     ),
-    Examined("pybullet", "mjcf", ("armature",), "not supported", "reads no armature"),
-    Examined("pybullet", "mjcf", ("gravity",), "not supported", "takes gravity from its caller"),
+    Examined("pybullet", "mjcf", ("armature",), "not supported", "reads no armature", "pybullet_joints.py"),
+    Examined(
+        "pybullet", "mjcf", ("gravity",), "not supported", "takes gravity from its caller",
+        "pybullet_joints.py",
+    ),
     Examined(
         "pybullet", "mjcf", JOINT_POSE, "accuracy", "keeps numbers in single precision",
         "pybullet_mjcf_inertial.py",
@@ -157,10 +170,12 @@ EXAMINED = (
     Examined(
         "pybullet", "urdf", ("mass", "center", *WITHOUT_INERTIAL), "left open by the file",
         "gives a link without `<inertial>` a mass of 1 kg and moments of 1 kg m²",
+        "pybullet_urdf_inertial.py",
     ),
     Examined(
         "pybullet", "urdf", ("inertia",), "accuracy",
         "diagonalises inertias to a limited accuracy, and replaces those that no rigid body has",
+        "pybullet_urdf_inertial.py",
     ),
     Examined(
         "pybullet", "urdf", ("joints",), "differs from the file", "fixes a base without mass to the world"
@@ -176,6 +191,18 @@ UNPROVED = {
     "frames of bodies whose joints have several anchors (the shoulder blades, 5 mm), together",
     ("dart", "rodent.xml"): "armature, springs, inertias and masses as elsewhere; moments of 1e-7 kg m² are "
     "read as 1, and what remains is 3 to 58 times the bound of rounding, which the file's moments make",
-    ("pybullet", "human.urdf"): "19 links without `<inertial>` with 1 kg, and inertias diagonalised to a "
-    "limited accuracy; a position differs by 1e-17 m where the bound is zero",
 }  # fmt: skip
+
+# The first version that does what the entries say, found by running the scripts and `plumbline bisect` with
+# other versions: all entries of one importer and format have the same.
+SINCE = {
+    ("mujoco", "urdf"): "3.2.0 or earlier",
+    ("pinocchio", "mjcf"): "3.3.1 or earlier",
+    ("drake", "urdf"): "1.32.0 or earlier",
+    ("drake", "mjcf"): "1.32.0 or earlier",
+    ("dart", "urdf"): "6.16.2 or earlier",
+    ("dart", "mjcf"): "6.20.0, the first that reads the scripts' files",
+    ("exudyn", "urdf"): "1.10.0, the first with the loader",
+    ("pybullet", "urdf"): "3.2.6 or earlier",
+    ("pybullet", "mjcf"): "3.2.6 or earlier",
+}

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from tools.model_survey.examined import EXAMINED, UNPROVED, Examined
+from tools.model_survey.examined import EXAMINED, SINCE, UNPROVED, Examined
 from tools.model_survey.run import ALIKE_COUNT, ALIKE_FOLDER, STATES
 
 TITLES = {
@@ -153,9 +153,10 @@ def _differences(found: list[Cause]) -> str:
         "",
         "The command named each. A script shows it without Plumbline, with the number that",
         "the format's definition gives. *Left open by the file*: the format does not say what holds.",
+        "*Since*: the first version that does so; *or earlier*: the oldest that was tried.",
         "",
-        "| importer | format | it | kind | files | for example | script |",
-        "|---|---|---|---|---|---|---|",
+        "| importer | format | it | kind | since | files | for example | script |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for entry in (e for e in EXAMINED if e in by_entry):
         own = by_entry[entry]
@@ -163,7 +164,7 @@ def _differences(found: list[Cause]) -> str:
         script = f"[{entry.script}](importers/{entry.script})" if entry.script else "–"
         lines.append(
             f"| {TITLES[entry.importer]} | {entry.format.upper()} | {entry.title} | {entry.kind} | "
-            f"{len(files)} | {_place(own[0])} | {script} |"
+            f"{SINCE[entry.importer, entry.format]} | {len(files)} | {_place(own[0])} | {script} |"
         )
     lines += [
         "",
