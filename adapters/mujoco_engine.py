@@ -241,7 +241,7 @@ class _MujocoChain:
                 _set_attributes(links[k].add_site(), name=name)
             _set_attributes(
                 spec.add_equality(), type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_SITE,
-                name1=names[0], name2=names[1], solref=[-1.0, -1.0], solimp=[*[MAX_IMPEDANCE] * 2, 1, 0.5, 2],
+                name1=names[0], name2=names[1], solref=[0.0, 0.0], solimp=[*[MAX_IMPEDANCE] * 2, 1, 0.5, 2],
             )  # fmt: skip
         m = self.m = spec.compile()
         m.opt.gravity = model.gravity

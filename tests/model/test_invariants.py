@@ -147,6 +147,56 @@ def test_the_quadrature_knows_its_error(count, sharp):
     assert 0 < error <= uncertainty < sharp
 
 
+def random_rate(rng, times):
+    """A rate and its integral, analytic up to the sample interval from real time, resolved or hardly."""
+    h, amplitude = times[1] - times[0], rng.normal()
+    if rng.random() < 0.5:
+        frequency = 10 ** rng.uniform(-1.5, 0, 3) * np.pi / h
+        phase = rng.uniform(0, 2 * np.pi, 3)
+        return (
+            lambda t: amplitude * np.sum(np.sin(t[:, None] * frequency + phase), axis=1),
+            lambda t: -amplitude * np.sum(np.cos(t[:, None] * frequency + phase) / frequency, axis=1),
+        )
+    width, at = 10 ** rng.uniform(0, 1) * h, rng.uniform(0, 2)
+    return (
+        lambda t: amplitude / (1 + ((t - at) / width) ** 2),
+        lambda t: amplitude * width * np.arctan((t - at) / width),
+    )
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_the_work_of_random_motions_is_as_uncertain_as_it_is_wrong(seed):
+    """Of a moment and of a drag, in motions that their samples resolve and in some that they do not."""
+    rng = np.random.default_rng((1407, seed))
+    model, _ = random_chain(np.random.default_rng(73), [False, False])
+    times = np.linspace(0, 2, int(rng.integers(3, 66)))
+    rate, angle = random_rate(rng, times)
+    turned = angle(times) - angle(times[:1])
+    run = rotating_trajectory(model, turned, rate(times), times)
+    dragged = model.changed(drag_moment=np.array([0.5, 0.0]))
+    nodes, weights = np.polynomial.legendre.leggauss(60)
+    inside = times[:-1, None] + times[1] / 2 * (1 + nodes)
+    power = -0.5 * rate(inside.ravel()).reshape(inside.shape) ** 2
+    lost = np.concatenate([[0.0], np.cumsum(power @ weights * times[1] / 2)])
+    by_drag = work_of_loads(dragged, run, angular_velocity(run.p, run.pdot))
+    for true, (done, uncertainty) in ((turned, work_about_x(model, run)), (lost, by_drag)):
+        assert np.max(np.abs(done - true)) <= uncertainty + 1e-13 * np.max(np.abs(true))
+
+
+@pytest.mark.parametrize(("width", "least"), [(0.5, 1e-4), (1.0, 1e-6), (4.0, 0.0)])
+def test_a_peak_between_samples_is_not_passed_by_wider_polynomials(width, least):
+    """Six samples and eight differ by less than the error; what every second sample makes does not."""
+    model, _ = random_chain(np.random.default_rng(73), [False])
+    times, dragged = np.linspace(0, 2, 33), model.changed(drag_moment=np.array([0.5]))
+    peak = width * times[1]
+    rate, angle = 1 / (1 + ((times - 1) / peak) ** 2), peak * np.arctan((times - 1) / peak)
+    run = rotating_trajectory(model, angle - angle[0], rate, times)
+    lost = -0.25 * (peak * ((times - 1) / peak * rate + np.arctan((times - 1) / peak)))
+    done, uncertainty = work_of_loads(dragged, run, angular_velocity(run.p, run.pdot))
+    error = np.max(np.abs(done - (lost - lost[0])))
+    assert least <= error <= uncertainty < (0.1 if least else 1e-6)
+
+
 def test_two_samples_are_integrated_and_one_is_not():
     model, _ = random_chain(np.random.default_rng(76), [False])
     for times in (np.array([0.0, 0.5]), np.zeros(1)):
