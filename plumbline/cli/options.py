@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -388,6 +389,19 @@ def exit_on_damaged_results() -> Iterator[None]:
         yield
     except PlumblineError as error:  # DamagedResults or NotReproducible, whose modules load SciPy
         raise click.UsageError(str(error)) from None
+
+
+def check_history_tool() -> None:
+    """Check that histories can be read.
+
+    Raises:
+        UsageError: DuckDB, of the dependency group `history`, is not installed (exit code 2).
+
+    """
+    if find_spec("duckdb") is None:
+        raise click.UsageError(
+            "histories are read with DuckDB, which is not installed; `make test` installs it"
+        )
 
 
 @contextmanager

@@ -45,6 +45,7 @@ def history(folder: Path, pattern: str | None, as_json: bool) -> None:
 
 
 def _check_history_folder(folder: Path) -> None:
+    options.check_history_tool()
     if not folder.is_dir():
         what = f"{folder} is a file and no folder of nights" if folder.exists() else f"no folder {folder}"
         raise click.UsageError(f"{what}: no nights yet; `python -m plumbline nightly` makes one")

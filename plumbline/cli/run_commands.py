@@ -173,6 +173,7 @@ def nightly(
     from plumbline.cli.nightly import run_nightly
     from plumbline.execution.selftest import run_self_test
 
+    options.check_history_tool()
     chosen = options.choose_scenarios(names, ())
     known_issues = options.read_known_issues(known_files, chosen)
     folder = options.claim_folder(out)

@@ -15,8 +15,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import duckdb
-
 from plumbline.scenario.generator import RANDOM_FAMILY
 from plumbline.storage.results_schema import DamagedResults
 from plumbline.storage.results_store import Record, read_results, read_table
@@ -68,6 +66,8 @@ class History:
             folder: folder of runs, or a nightly's output folder, whose runs are in ``history``.
 
         """
+        import duckdb  # of the group `history`: the report of a run does without
+
         inside = folder / "history"
         self.nights: list[StoredRun] = []
         self.damaged: dict[str, str] = {}

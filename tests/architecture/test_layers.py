@@ -1,6 +1,9 @@
 """The import graph follows the layout: packages import only those below them, and there is no cycle."""
 
 import ast
+import re
+import sys
+import tomllib
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -117,3 +120,26 @@ def test_no_module_imports_itself_in_a_circle():
         TopologicalSorter(graph).prepare()
     except CycleError as error:
         pytest.fail(" → ".join(error.args[1]))
+
+
+def test_the_main_job_needs_no_optional_package():
+    """`make run` and the action install the dependencies without groups: what they load may need no more."""
+    declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["dependencies"]
+    names = {re.split(r"[\s;><=~\[]", need)[0].lower() for need in declared}
+    own = {"ruamel.yaml": "ruamel", "pin": "pinocchio"}
+    allowed = {own.get(name, name) for name in names} | set(sys.stdlib_module_names) | set(PROJECT)
+    allowed |= {"annotated_types", "markupsafe", "pydantic_core"}  # which those install
+    optional = {}
+    for name in (
+        m for m in MODULES if m.split(".")[0] in ("plumbline", "reports", "adapters", "reference_impl")
+    ):
+        body = ast.parse(MODULES[name].read_text(encoding="utf-8")).body
+        found = {a.name for node in body if isinstance(node, ast.Import) for a in node.names}
+        found |= {node.module for node in body if isinstance(node, ast.ImportFrom)}
+        if foreign := {module.split(".")[0] for module in found} - allowed:
+            optional[name] = foreign
+    users = {name: imports(name, at_import=True) & optional.keys() for name in MODULES}
+    users = {name: found for name, found in users.items() if found and name not in optional}
+    assert not users, "load them where they are used, with a sentence where they are missing"
+    assert "plumbline.processes.dask_cluster" in optional
+    assert not optional.keys() & {"plumbline.storage.history", "reports.history"}
