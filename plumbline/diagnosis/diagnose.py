@@ -32,7 +32,7 @@ from plumbline.diagnosis.fit import (
     per_entry,
 )
 from plumbline.diagnosis.hypotheses import format_significant
-from plumbline.diagnosis.joint_causes import diagnose_joints
+from plumbline.diagnosis.joint_diagnosis import diagnose_joints
 from plumbline.diagnosis.output_defects import output_defects
 from plumbline.diagnosis.result import Diagnosis
 from plumbline.engines.registry import load_adapter

@@ -4,7 +4,7 @@ from functools import cache
 
 import pytest
 
-from plumbline.diagnosis.joint_causes import diagnose_joints
+from plumbline.diagnosis.joint_diagnosis import diagnose_joints
 from plumbline.engines.calls import Evaluation
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import RowContext
@@ -20,7 +20,7 @@ from tests.helpers.shared_answers import sharing
 @pytest.fixture(scope="module", autouse=True)
 def shared_predictions():
     """The effects of most causes are the same for every defect."""
-    with sharing("plumbline.diagnosis.joint_causes", "_predict"):
+    with sharing("plumbline.diagnosis.joint_diagnosis", "_predict"):
         yield
 
 
