@@ -1,6 +1,8 @@
 """The numbers of bodies, joints and elements that an engine may have wrong, one at a time.
 
-A cause replaces one number, or multiplies a vector or one element of all joints by a factor.
+A cause replaces one number, or multiplies a vector or one element of all joints by a factor.  Where no number
+explains a difference, a point may be elsewhere, axes may be turned about any axis, and a load or gravity may
+be another vector: causes of three numbers.
 """
 
 from __future__ import annotations
@@ -11,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, SPRING_FIELDS, Model
-from plumbline.model.kinematics import quaternion_product
+from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, SPRING_FIELDS, Array, Model
+from plumbline.model.kinematics import quaternion_exponential, quaternion_product, rotation_matrix
 
 ACCEPTED_SHARE = 1e-6  # of the difference; evaluating in doubles leaves 1e-10 of it and less
 ELEMENT_WORDS = {"rest": "the rest position", "effort": "the effort"}
@@ -23,29 +25,41 @@ FACTORS = {0.0: "were missing", 2.0: "were doubled", -1.0: "had the opposite sig
 
 @dataclass(frozen=True)
 class JointCause:
-    """A change of the mechanism by a number x, of which ``nominal`` is right."""
+    """A change of the mechanism by a number or three, x, of which ``nominal`` are right."""
 
     subject: str
-    change: Callable[[Model, float], Model]
-    nominal: float
+    change: Callable[[Model, Any], Model]
+    nominal: float | tuple[float, float, float]
     scale: float  # natural size of a change of x
     unit: str = ""
     can_vanish: bool = True  # whether factors of `FACTORS` are possible
 
-    def describe(self, x: float) -> str:
+    def describe(self, x: Any) -> str:
         """Complete "behaves as if …".
 
         Args:
-            x: the fitted number.
+            x: the fitted number, or (3,) numbers.
 
         Returns:
             The subject and what it were.
 
         """
+        if isinstance(self.nominal, tuple):
+            return self._describe_vector(np.asarray(x))
         for factor, words in FACTORS.items() if self.nominal else ():
             if abs(x - factor * self.nominal) <= ACCEPTED_SHARE * abs(self.nominal):
                 return f"{self.subject} {words}"
         return f"{self.subject} were {x:.9g}{self.unit} instead of {self.nominal:.9g}{self.unit}"
+
+    def _describe_vector(self, x: Array) -> str:
+        if self.unit != " rad":
+            return f"{self.subject} were ({', '.join(f'{value:.9g}' for value in x)}){self.unit}"
+        angle = float(np.linalg.norm(x))
+        axis = x / angle
+        if angle > np.pi:
+            angle, axis = 2 * np.pi - angle, -axis
+        along = ", ".join(f"{value:.6g}" for value in axis)
+        return f"{self.subject} were turned by {angle:.9g} rad about their own ({along})"
 
 
 def joint_causes(model: Model) -> Iterator[JointCause]:
@@ -85,14 +99,51 @@ def joint_causes(model: Model) -> Iterator[JointCause]:
     for k, kind in enumerate(model.kind):
         if kind == "free":
             continue
+        if _is(model, (k, 0), "slide") and _shift_is_askew(model, k):
+            yield JointCause(f"the origin of the slide of joint {k + 1}", _shifted_slide(k), 0.0, 0.1, " m")
         for side, where in ((0, "far"), (1, "near")):
             for axis in range(3):
                 at = (k, side, axis)
                 subject = f"{'xyz'[axis]} of the {where} point of joint {k + 1}"
                 yield JointCause(subject, one_number("point", at), float(model.point[at]), 0.1, " m")
-                if kind not in ("rod", "ball"):
+                if kind not in ("rod", "ball") and (kind, where) != ("weld", "near"):  # equal to a far turn
                     subject = f"the turn of the axes of joint {k + 1} in the {where} body about {'xyz'[axis]}"
                     yield JointCause(subject, _turned(k, side, axis), 0.0, 0.1, " rad")
+
+
+def vector_causes(model: Model) -> Iterator[JointCause]:
+    """List the causes of three numbers.
+
+    Args:
+        model: the mechanism.
+
+    Yields:
+        Points and turns of the axes of each joint, loads of each body, and gravity.
+
+    """
+    for k, kind in enumerate(model.kind):
+        if kind == "free":
+            continue
+        for side, where in enumerate(("far", "near")):
+            if kind not in ("rod", "ball") and (kind, where) != ("weld", "near"):
+                subject = f"the axes of joint {k + 1} in the {where} body"
+                yield JointCause(subject, _turned_about(k, side), (0.0, 0.0, 0.0), 0.1, " rad")
+            subject = f"the {where} point of joint {k + 1}"
+            yield _vector(model, subject, "point", (k, side), 0.1, " m")
+    size = float(np.linalg.norm(model.gravity)) or 1.0
+    for k in range(model.n):
+        for name, unit in (("force", " N"), ("moment", " N m")):
+            weight = float(model.mass[k]) * size
+            yield _vector(model, f"{NAMES[name]} of body {k + 1}", name, (k,), weight, unit)
+    yield _vector(model, "gravity", "gravity", (slice(None),), size, " m/s²")
+
+
+def _vector(
+    model: Model, subject: str, name: str, at: tuple[Any, ...], scale: float, unit: str
+) -> JointCause:
+    """Replace a vector of a field."""
+    x, y, z = map(float, getattr(model, name)[at])
+    return JointCause(subject, one_number(name, at), (x, y, z), scale, unit)
 
 
 def _body_causes(model: Model) -> Iterator[JointCause]:
@@ -131,6 +182,12 @@ def _coordinates(model: Model) -> list[tuple[int, int]]:
     """Joint and column of all coordinates that can have elements."""
     counts = [1 if kind == "ball" else len(KINDS[kind].motions) for kind in model.kind]
     return [(k, i) for k, count in enumerate(counts) for i in range(count)]
+
+
+def _shift_is_askew(model: Model, k: int) -> bool:
+    """Whether another origin of a slide is more than a coordinate of its far point."""
+    along = rotation_matrix(model.turn[k, 0])[:, 2]
+    return bool(model.stiffness[k, 0] or np.count_nonzero(np.abs(along) > ACCEPTED_SHARE) > 1)
 
 
 def _is(model: Model, at: tuple[int, int], what: str) -> bool:
@@ -188,11 +245,26 @@ def _all(name: str) -> Callable[[Model, float], Model]:
 
 def _turned(k: int, side: int, axis: int) -> Callable[[Model, float], Model]:
     """Turn the axes of a joint in one body about one of themselves."""
+    turn = _turned_about(k, side)
+    return lambda model, x: turn(model, x * np.eye(3)[axis])
+
+
+def _turned_about(k: int, side: int) -> Callable[[Model, Array], Model]:
+    """Turn the axes of a joint in one body by a rotation vector in themselves."""
+
+    def change(model: Model, x: Array) -> Model:
+        turned = quaternion_product(model.turn[k, side], quaternion_exponential(np.asarray(x) / 2))
+        return one_number("turn", (k, side))(model, turned)
+
+    return change
+
+
+def _shifted_slide(k: int) -> Callable[[Model, float], Model]:
+    """Count a slide's coordinate, spring included, from a point further along its axis."""
 
     def change(model: Model, x: float) -> Model:
-        turn, half = model.turn.copy(), np.zeros(4)
-        half[0], half[1 + axis] = np.cos(x / 2), np.sin(x / 2)
-        turn[k, side] = quaternion_product(turn[k, side], half)
-        return replace(model, turn=turn)
+        along = rotation_matrix(model.turn[k, 0])[:, 2]
+        moved = one_number("point", (k, 0))(model, model.point[k, 0] + x * along)
+        return one_number("rest", (k, 0))(moved, model.rest[k, 0] - x)
 
     return change

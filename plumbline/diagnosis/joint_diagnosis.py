@@ -8,11 +8,12 @@ the difference is named.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import product
 
 import numpy as np
 
-from plumbline.diagnosis.joint_causes import ACCEPTED_SHARE, FACTORS, JointCause, joint_causes
-from plumbline.diagnosis.misreadings import misreadings
+from plumbline.diagnosis.joint_causes import ACCEPTED_SHARE, FACTORS, JointCause, joint_causes, vector_causes
+from plumbline.diagnosis.misreadings import Misreading, misreadings
 from plumbline.model.datatypes import Array, Model, State, StateQuantities
 from plumbline.model.invariants import kinetic_energy, potential_energy
 from plumbline.model.kinematics import (
@@ -27,16 +28,69 @@ from plumbline.truth.rounding_bound_tree import tree_solution
 
 MAX_STATES = 2
 STEP = 1e-4  # of a cause's scale, in differences
+MAX_CHECKED = 5  # states at which causes of three numbers are checked
 MAX_STEPS = 8  # of the least squares
+MAX_VECTOR_STEPS = 15  # of those of three numbers
+MAX_HALVINGS = 4  # of such a step
+MIN_PROGRESS = 0.9  # of what is left, in such a step
+MAX_STARTS = 6  # of such fits from small changes, and from large turns: those that explain most
+RANK_TOLERANCE = 1e-9  # of slopes: a direction that changes nothing
 MIN_SIMILARITY = 0.3  # cosine between the difference and a cause's effect, to be fitted at all
 ACCEPTED_RATIO = 4.0  # in bounds
+MIN_RATIO_OF_VECTORS = 100.0  # in bounds: three numbers explain a smaller difference by chance
+CHECKED_SHARE = 10.0  # of what is accepted, at the states that nothing was fitted to
 VECTORS = ("acceleration", "angular_acceleration", "joint_reaction", "joint_moment")
 ENERGIES = ("kinetic_energy", "potential_energy")
+QUARTER_TURNS = [  # rotation vectors of the turns of a cube, half turns twice
+    angle * np.array(axis) / np.linalg.norm(axis)
+    for axis in product((-1, 0, 1), repeat=3)
+    for angle in ((), (np.pi / 2, np.pi), (np.pi,), (2 * np.pi / 3,))[np.count_nonzero(axis)]
+]
 UNEXPLAINED = "no single number of a body, a joint, its elements or a spring explains the difference"
 
 
+class _Difference:
+    """How an engine differs from the truth at some states, and changes of the mechanism, in bounds."""
+
+    def __init__(
+        self, model: Model, reported: Sequence[StateQuantities], truth: StateTruth, places: Sequence[int]
+    ) -> None:
+        names = [q for q in (*VECTORS, *ENERGIES) if getattr(reported[0], q) is not None]
+        weights, off = [], []
+        for q, i in ((q, i) for q in names for i in places):
+            wrong = np.asarray(getattr(reported[i], q) - getattr(truth.quantities[i], q))
+            off.append(wrong.ravel())
+            weights.append(np.repeat(truth.bounds[i].tolerance(q), 3 if q in VECTORS else 1))
+        self.model, self.names, self.states = model, names, [truth.states[i] for i in places]
+        self.weight = np.concatenate(weights)
+        self.values = np.concatenate(off) / self.weight
+        energies = len([q for q in names if q in ENERGIES]) * len(places)
+        self.vectors = slice(len(self.values) - energies)  # the energies are the last
+        self.accepted = max(ACCEPTED_RATIO, ACCEPTED_SHARE * float(np.max(np.abs(self.values))))
+        self.right = _predict([model] * len(places), self.states, names)
+
+    def effect(self, misread: Misreading) -> Array:
+        """What an engine that sees another mechanism, or state, returns besides the truth."""
+        seen = [misread(self.model, state) for state in self.states]
+        try:
+            found = _predict([model for model, _ in seen], [state for _, state in seen], self.names)
+        except np.linalg.LinAlgError:  # no such mechanism
+            return np.full(len(self.values), np.inf)
+        return np.asarray((found - self.right) / self.weight)
+
+    def of_cause(self, cause: JointCause, x: Array) -> Array:
+        """The effect of a cause of one number or three."""
+        amount = x if len(x) > 1 else float(x[0])
+        return self.effect(lambda model, state: (cause.change(model, amount), state))
+
+    def slopes(self, cause: JointCause, x: Array, there: Array) -> Array:
+        """Derivatives (numbers, m) of an effect that is ``there`` at x."""
+        steps = STEP * cause.scale * np.eye(len(x))
+        return np.stack([(self.of_cause(cause, x + step) - there) / step.sum() for step in steps], axis=1)
+
+
 def diagnose_joints(model: Model, reported: Sequence[StateQuantities], truth: StateTruth) -> str:
-    """Name the number that explains how an engine differs from the truth on a tree.
+    """Name what explains how an engine differs from the truth on a tree.
 
     Args:
         model: the mechanism.
@@ -44,105 +98,136 @@ def diagnose_joints(model: Model, reported: Sequence[StateQuantities], truth: St
         truth: true quantities and bounds.
 
     Returns:
-        A sentence: "behaves as if …" or that no single number explains the difference.
+        A sentence: "behaves as if …" or that no single change explains the difference.
 
     """
     if model.has_loops:
         return "mechanisms with loops have no diagnosis yet"
-    names = [q for q in (*VECTORS, *ENERGIES) if getattr(reported[0], q) is not None]
-    states = range(min(len(reported), MAX_STATES))
-    weights, off = [], []
-    for q, i in ((q, i) for q in names for i in states):
-        wrong = np.asarray(getattr(reported[i], q) - getattr(truth.quantities[i], q))
-        off.append(wrong.ravel())
-        weights.append(np.repeat(truth.bounds[i].tolerance(q), 3 if q in VECTORS else 1))
-    weight = np.concatenate(weights)
-    difference = np.concatenate(off) / weight
-    vectors = 3 * len([q for q in names if q in VECTORS]) * model.n * len(states)
-    if np.max(np.abs(difference[:vectors])) <= ACCEPTED_RATIO:
+    difference = _Difference(model, reported, truth, range(min(len(reported), MAX_STATES)))
+    if np.max(np.abs(difference.values[difference.vectors])) <= ACCEPTED_RATIO:
         return _energy_cause(model, reported, truth)
-    some = truth.states[: len(states)]
-    right = _predict([model] * len(some), some, names)
-
-    def effect(cause: JointCause, x: float) -> Array:
-        try:
-            found = _predict([cause.change(model, x)] * len(some), some, names)
-        except np.linalg.LinAlgError:  # no such mechanism
-            return np.full(len(weight), np.inf)
-        return np.asarray((found - right) / weight)
-
-    accepted = max(ACCEPTED_RATIO, ACCEPTED_SHARE * float(np.max(np.abs(difference))))
-    found = [
-        cause.describe(x)
-        for cause in _similar(model, some, names, weight[:vectors], difference[:vectors])
-        if (x := _fitted(cause, effect, difference, len(difference) - vectors, accepted)) is not None
-    ]
+    found = []
+    for cause in _similar(difference, list(joint_causes(model))):
+        x = _fitted(cause, np.array([cause.nominal]), difference)
+        if x is not None:
+            found.append(cause.describe(float(x[0])))
+    first = _Difference(model, reported, truth, range(1))
     for words, misread in misreadings(model):
-        seen = [misread(model, state) for state in truth.states[: len(states)]]
-        changed = _predict([m for m, _ in seen], [state for _, state in seen], names)
-        if np.max(np.abs(difference - (changed - right) / weight)) <= accepted:
+        if np.max(np.abs(first.values - first.effect(misread))) > difference.accepted:
+            continue  # at half the cost
+        if np.max(np.abs(difference.values - difference.effect(misread))) <= difference.accepted:
             found.append(words)
+    if not found and np.max(np.abs(difference.values)) >= MIN_RATIO_OF_VECTORS:
+        others = _Difference(model, reported, truth, range(MAX_STATES, min(len(reported), MAX_CHECKED)))
+        found = _fitted_vectors(difference, others)
     if not found:
         return _moment_cause(model, reported, truth) or UNEXPLAINED
-    first, *others = found
-    return f"behaves as if {first}" + (
-        f"; the data cannot distinguish this from: {'; '.join(others)}" if others else ""
+    named, *equal = found
+    return f"behaves as if {named}" + (
+        f"; the data cannot distinguish this from: {'; '.join(equal)}" if equal else ""
     )
 
 
-def _similar(
-    model: Model, states: Sequence[State], names: Sequence[str], weight: Array, difference: Array
-) -> list[JointCause]:
-    """The causes whose effects on the vectors point in the direction of the difference; all in one batch."""
-    causes = list(joint_causes(model))
-    models = [model, *(cause.change(model, cause.nominal + STEP * cause.scale) for cause in causes)]
-    stacked = stack_states(states)
-    found = evaluate_models([(one, complete_state(one, stacked)) for one in models])
-    parts = [found[name].reshape(len(models), -1) for name in names if name in VECTORS]
+def _fitted_vectors(difference: _Difference, others: _Difference) -> list[str]:
+    """Causes of three numbers that explain the difference, and that of other states."""
+    found: dict[str, str] = {}
+    for starts in (_small_changes, _large_turns):
+        for cause, start in starts(difference) if not found else ():
+            x = None if cause.subject in found else _fitted(cause, start, difference)
+            if x is not None and np.all(
+                np.abs(others.values - others.of_cause(cause, x)) <= CHECKED_SHARE * others.accepted
+            ):
+                found[cause.subject] = cause.describe(x)
+    return list(found.values())
+
+
+def _small_changes(difference: _Difference) -> list[tuple[JointCause, Array]]:
+    """The causes of three numbers that explain most to first order, from the right numbers on."""
+    causes, wanted = list(vector_causes(difference.model)), difference.values[difference.vectors]
+    changed = [
+        cause.change(difference.model, np.array(cause.nominal) + STEP * cause.scale * e)
+        for cause in causes
+        for e in np.eye(3)
+    ]
+    slopes = _vectors_at(difference, changed).reshape(len(causes), 3, -1).mT
+    shares = np.matvec(np.linalg.pinv(slopes, RANK_TOLERANCE), wanted)
+    left = np.linalg.norm(np.matvec(slopes, shares) - wanted, axis=1)
+    return [(causes[i], np.array(causes[i].nominal)) for i in np.argsort(left)[:MAX_STARTS]]
+
+
+def _large_turns(difference: _Difference) -> list[tuple[JointCause, Array]]:
+    """The quarter turns of axes that explain most."""
+    turns = [(one, x) for one in vector_causes(difference.model) if one.unit == " rad" for x in QUARTER_TURNS]
+    effects = _vectors_at(difference, [cause.change(difference.model, x) for cause, x in turns])
+    left = np.linalg.norm(effects - difference.values[difference.vectors], axis=1)
+    return [turns[i] for i in np.argsort(left)[:MAX_STARTS]]
+
+
+def _vectors_at(difference: _Difference, models: Sequence[Model]) -> Array:
+    """Effects (models, ·) on accelerations and wrenches, in bounds; all in one batch."""
+    stacked = stack_states(difference.states)
+    found = evaluate_models([(one, complete_state(one, stacked)) for one in (difference.model, *models)])
+    parts = [found[q].reshape(len(models) + 1, -1) for q in difference.names if q in VECTORS]
     flat = np.concatenate(parts, axis=1)
-    slopes = (flat[1:] - flat[0]) / weight
-    sizes = np.linalg.norm(slopes, axis=1) * np.linalg.norm(difference)
-    near = np.abs(slopes @ difference) > MIN_SIMILARITY * sizes
+    return np.asarray((flat[1:] - flat[0]) / difference.weight[difference.vectors])
+
+
+def _similar(difference: _Difference, causes: Sequence[JointCause]) -> list[JointCause]:
+    """The causes whose effects on the vectors point in the direction of the difference."""
+    models = [
+        cause.change(difference.model, float(np.sum(cause.nominal)) + STEP * cause.scale) for cause in causes
+    ]
+    slopes = _vectors_at(difference, models)
+    wanted = difference.values[difference.vectors]
+    sizes = np.linalg.norm(slopes, axis=1) * np.linalg.norm(wanted)
+    near = np.abs(slopes @ wanted) > MIN_SIMILARITY * sizes
     return [cause for cause, is_near in zip(causes, near, strict=True) if is_near]
 
 
-def _fitted(
-    cause: JointCause,
-    effect: Callable[[JointCause, float], Array],
-    difference: Array,
-    energies: int,
-    accepted: float,
-) -> float | None:
-    """The amount at which a cause explains the difference, to ``accepted`` bounds; None where it does not.
+def _fitted(cause: JointCause, start: Array, difference: _Difference) -> Array | None:
+    """The x (m,) at which a cause explains the difference; None where it does not.
 
-    It is fitted to all but the last numbers, which are energies: of them more may be left, by what one bound
-    in each of the others changes the amount.
+    It is fitted by Gauss and Newton's method to the vectors.  Of energies more may be left, by what one bound
+    in each of the others changes x.
     """
-    vectors, x, step = slice(-energies or None), cause.nominal, STEP * cause.scale
-    slopes = effect(cause, x + step) / step
-    slope, left = slopes[vectors], difference
-    most = np.full(len(slopes), accepted)
-    most[len(slope) :] += (
-        np.abs(slopes[len(slope) :]) * np.sum(np.abs(slope)) / max(float(slope @ slope), 1e-300)
-    )
-    size, length = float(slope @ slope), float(np.linalg.norm(left[vectors]))
-    if abs(float(slope @ left[vectors])) <= MIN_SIMILARITY * np.sqrt(size) * length:
+    wanted, vectors, x = difference.values, difference.vectors, start
+    there = difference.of_cause(cause, x) if np.any(x != cause.nominal) else np.zeros_like(wanted)
+    slopes, left = difference.slopes(cause, x, there), wanted - there
+    length = float(np.linalg.norm(left[vectors]))
+    inverse: Array = np.asarray(np.linalg.pinv(slopes[vectors], RANK_TOLERANCE), float)
+    if np.linalg.norm(slopes[vectors] @ (inverse @ left[vectors])) <= MIN_SIMILARITY * length:
         return None
-    for factor in FACTORS if cause.nominal and cause.can_vanish else ():
-        if np.all(np.abs(difference - effect(cause, factor * x)) <= most):
-            return factor * x
-    for _ in range(MAX_STEPS):
-        x += float(slope @ left[vectors]) / size
-        with np.errstate(all="ignore"):
-            left = difference - effect(cause, x)
-        if np.all(np.abs(left) <= most):
-            return x
-        before, length = length, float(np.linalg.norm(left[vectors]))
-        if not length < before / 2:  # it converges quadratically, or the cause is another one
+    if len(x) == 1 and x[0] and cause.can_vanish:
+        most = _accepted(difference, slopes, inverse)
+        for factor in FACTORS:
+            if np.all(np.abs(wanted - difference.of_cause(cause, factor * x)) <= most):
+                return np.asarray(factor * x)
+    for _ in range(MAX_STEPS if len(x) == 1 else MAX_VECTOR_STEPS):
+        step, before = inverse @ left[vectors], length
+        for _ in range(1 if len(x) == 1 else MAX_HALVINGS):
+            with np.errstate(all="ignore"):
+                there = difference.of_cause(cause, x + step)
+            left = wanted - there
+            length = float(np.linalg.norm(left[vectors]))
+            if np.all(np.abs(left) <= _accepted(difference, slopes, inverse)):
+                return np.asarray(x + step)
+            if length < before / 2 or (len(x) > 1 and length < MIN_PROGRESS * before):
+                break
+            step = step / 2
+        else:  # it converges quadratically near the amount, or the cause is another one
             return None
-        slope = ((effect(cause, x + step) - effect(cause, x)) / step)[vectors]
-        size = max(float(slope @ slope), 1e-300)
+        x = x + step
+        slopes = difference.slopes(cause, x, there)
+        inverse = np.asarray(np.linalg.pinv(slopes[vectors], RANK_TOLERANCE), float)
     return None
+
+
+def _accepted(difference: _Difference, slopes: Array, inverse: Array) -> Array:
+    """What may be left of each number, in bounds."""
+    most = np.full(len(slopes), difference.accepted)
+    energies = slopes[difference.vectors.stop :]
+    most[difference.vectors.stop :] += np.abs(energies) @ np.sum(np.abs(inverse), axis=1)
+    return most
 
 
 def _energy_cause(model: Model, reported: Sequence[StateQuantities], truth: StateTruth) -> str:

@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
 
 from plumbline.diagnosis.joint_causes import one_number
-from plumbline.model.datatypes import KINDS, Model, State
-from plumbline.model.kinematics import complete_state, rotation_matrix, spring_vectors
+from plumbline.model.datatypes import KINDS, Array, Model, State
+from plumbline.model.kinematics import (
+    complete_state,
+    quaternion_conjugate,
+    quaternion_product,
+    rotation_matrix,
+    spring_vectors,
+)
 
+EQUAL = 1e-12  # of two readings
 Misreading = Callable[[Model, State], tuple[Model, State]]
 
 
@@ -42,8 +49,102 @@ def misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
             for name, words in (("x", "coordinate"), ("xdot", "rate")):
                 text = f"{words} {i + 1} of joint {k + 1} had the opposite sign"
                 yield text, _coordinate(name, k, i, lambda x: -x)
+    yield from _point_misreadings(model)
+    yield from _axes_misreadings(model)
     for number in map(int, np.flatnonzero(model.spring_damping)):
         yield f"the rate of spring {number + 1} were dᵀḋ, not over the length", _undivided_rate(number)
+
+
+def _point_misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
+    """Points of joints negated, exchanged, left out, or in other axes."""
+    for k, kind in enumerate(model.kind):
+        far, near = points = model.point[k]
+        readings = {
+            f"the points of joint {k + 1} in the two bodies were exchanged": (near, far),
+            f"the points of joint {k + 1} in both bodies were negated": (-far, -near),
+        }
+        for side, where in enumerate(("far", "near")):
+            turn = rotation_matrix(model.turn[k, side])
+            for words, point in (
+                ("were negated", -points[side]),
+                ("were left out", 0 * points[side]),
+                ("were that of the other body", points[1 - side]),
+                ("were given in the axes of the joint", turn @ points[side]),
+                ("were turned into the axes of the joint", turn.T @ points[side]),
+            ):
+                pair = (point, near) if side == 0 else (far, point)
+                readings[f"the {where} point of joint {k + 1} {words}"] = pair
+        if kind != "free":
+            yield from _different("point", k, points, readings)
+
+
+def _axes_misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
+    """Frames of joints left out, turned the other way, exchanged or misread; axes reversed or exchanged."""
+    for k, kind in enumerate(model.kind):
+        motions = [axis for _, axis in KINDS[kind].motions]
+        if not motions and kind != "weld":
+            continue
+        far, near = frames = model.turn[k]
+        axes = f"the axes of joint {k + 1}"
+        readings: dict[str, tuple[Array, Array]] = {}
+        for axis in dict.fromkeys(motions):
+            half = np.roll(np.eye(4)[1], int(axis == 0))  # about y for x, about x for the others
+            pair = (quaternion_product(far, half), quaternion_product(near, half))
+            readings[f"axis {'xyz'[axis]} of joint {k + 1} were reversed"] = pair
+        for sides, where in (
+            ((0,), "in the far body"),
+            ((1,), "in the near body"),
+            ((0, 1), "in both bodies"),
+        ):
+            for words, misread in QUATERNIONS.items():
+                read = [misread(q) if side in sides else q for side, q in enumerate(frames)]
+                readings[f"{axes} {where} {words}"] = read[0], read[1]
+        readings[f"{axes} in the two bodies were exchanged"] = near, far
+        readings[f"{axes} in the far body were those of the near body"] = near, near
+        readings[f"{axes} in the near body were those of the far body"] = far, far
+        for i, j in ((0, 1), (0, 2), (1, 2)) if kind == "universal" else ((0, 2), (1, 2)) if motions else ():
+            half = np.array([0.0, *(np.sqrt(0.5) * (np.eye(3)[i] + np.eye(3)[j]))])
+            pair = (quaternion_product(far, half), quaternion_product(near, half))
+            readings[f"axes {'xyz'[i]} and {'xyz'[j]} of joint {k + 1} were exchanged"] = pair
+        yield from _different("turn", k, frames, readings, kind == "weld")
+
+
+QUATERNIONS: dict[str, Callable[[Array], Array]] = {
+    "were not turned": lambda q: np.eye(4)[0],
+    "were turned the other way": quaternion_conjugate,
+    "were read with the scalar last": lambda q: np.roll(q, 1),
+    "were given with the scalar last": lambda q: np.roll(q, -1),
+}
+
+
+def _different(
+    name: str,
+    k: int,
+    right: Array,
+    readings: Mapping[str, tuple[Array, Array]],
+    is_relative: bool = False,
+) -> Iterator[tuple[str, Misreading]]:
+    """Readings of a pair (2, ·) that differ from the right one and from each other; of turns ±q are one."""
+    known: list[Array] = []
+
+    def key(pair: Array) -> Array:
+        if is_relative:
+            pair = quaternion_product(pair[0], quaternion_conjugate(pair[1]))[None]
+        if name != "turn":
+            return pair
+        return np.array([np.outer(q, q) for q in pair])
+
+    known.append(key(right))
+    for words, pair in readings.items():
+        value = np.array(pair)
+        here = key(value)
+        if all(np.max(np.abs(here - one)) > EQUAL for one in known):
+            known.append(here)
+            yield words, _joint_field(name, k, value)
+
+
+def _joint_field(name: str, k: int, value: Array) -> Misreading:
+    return lambda model, state: (one_number(name, (k,))(model, value), state)
 
 
 def _turned_state(name: str, k: int, to_body: bool) -> Misreading:

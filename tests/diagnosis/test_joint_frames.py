@@ -4,6 +4,7 @@ from functools import cache
 
 import pytest
 
+from plumbline.diagnosis.joint_diagnosis import diagnose_joints
 from plumbline.engines.calls import Evaluation
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import RowContext
@@ -36,3 +37,12 @@ def report(defect):
 @pytest.mark.parametrize("defect", some_fast(JOINT_DEFECTS, 6))
 def test_every_defect_is_reported(defect):
     assert report(defect)[0], f"nothing reports {defect.name}"
+
+
+@pytest.mark.parametrize("defect", some_fast(JOINT_DEFECTS, 6))
+def test_every_defect_is_named(defect):
+    model, truth = right(defect.scenario)
+    text = diagnose_joints(model, report(defect)[1], truth)
+    assert defect.expected in text, f"{defect.name}: {text}"
+    equal = text.split("the data cannot distinguish")[1:]
+    assert bool(equal) == bool(defect.others) and all(name in text for name in defect.others), text

@@ -185,7 +185,7 @@ JOINT_DEFECTS = [
     JointDefect(
         "universal: near frame with the scalar last",
         "loaded-tree",
-        "of joint 3 in the near body were read with the scalar last",
+        "of joint 3 in the near body were given with the scalar last",
         frames(2, (NEAR,), _scalar_last),
     ),
     JointDefect(
@@ -265,7 +265,7 @@ JOINT_DEFECTS = [
     JointDefect(
         "near point moved askew",
         "open-governor",
-        "the near point of joint 2 were moved by",
+        "the near point of joint 2 were (",
         points(1, _moved(NEAR, 0.01, -0.02, 0.005)),
         "pinocchio-aba",
     ),
