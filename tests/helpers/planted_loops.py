@@ -207,7 +207,7 @@ LOOP_DEFECTS = [
         "length of a rod that closes a loop",
         "flyball-governor",
         "the length of joint 6 were",
-        "exudyn",
+        "mujoco",
         changed("length", (5,), _times(1.001)),
     ),
     LoopDefect(
