@@ -33,6 +33,10 @@ the parts together.  MuJoCo's constraints are soft: the forces solve (A + R) f =
 closed state a_ref is 0 and all answers are linear in R to first order; they are extrapolated to R = 0, and
 motions likewise.
 
+The option "tendon equalities" makes bodies on rods free and each rod, also one that closes a loop, a spatial
+tendon of constant length; "joint equalities" makes hinges, slides and welds cylindrical joints and holds the
+coordinates that these have in addition at 0.  Both are soft, and extrapolated as loops are.
+
 Welded halves are bodies without a joint on a massless one in their body's place.  The option "dense mass
 matrix" finds the accelerations by a dense solve with `mj_fullM`.  MuJoCo's solvers (PGS, CG, Newton) and
 Jacobians (dense, sparse) concern active constraints: here there are none, and the answers are the same bit
@@ -43,12 +47,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
+from types import MappingProxyType
 from typing import Any, Literal
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.model import kinematics
@@ -63,10 +69,19 @@ from plumbline.model.datatypes import (
     Trajectory,
     Unsupported,
 )
-from plumbline.model.loops import STABILISATION, CutMechanism, cut_open, determinate_part, wrench_length
+from plumbline.model.loops import PER_BODY, STABILISATION, cut_open, determinate_part, wrench_length
+from plumbline.model.redescription import (
+    ADDED_MOTIONS,
+    Rearranged,
+    joints_as_cylinders,
+    rods_taken_out,
+    state_of_cylinders,
+)
 from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
 from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 
+DENSE, TENDONS, HELD = "dense mass matrix", "tendon equalities", "joint equalities"  # options
+SOFTNESS = ("body_invweight0", "dof_invweight0", "tendon_invweight0")  # R is proportional to
 JOINT_TYPES = {"turn": mujoco.mjtJoint.mjJNT_HINGE, "slide": mujoco.mjtJoint.mjJNT_SLIDE}
 FIRST_ORDER_POWERS = (1, 2, 3, 4, 5, 6)
 MAX_IMPEDANCE = 0.9999  # of soft constraints: the largest that MuJoCo accepts
@@ -133,7 +148,8 @@ class Mujoco(MetamorphicHooks):
             method=classical_runge_kutta("joint rotations", ROD_AXIAL_INERTIA / 3),
         ),
     )
-    options = ("dense mass matrix",)
+    options = loop_options = (DENSE,)
+    joint_options = MappingProxyType({TENDONS: ("rod",), HELD: tuple(ADDED_MOTIONS)})
     builds_trees = builds_elements = moves_loops = True
     welding_unsupported_reason = ""
 
@@ -147,12 +163,11 @@ class Mujoco(MetamorphicHooks):
         return str(mujoco.mj_versionString())
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-        if model.has_loops:
-            cut = cut_open(model)
-            tree = _MujocoChain(cut.model, ends=cut.ends)
-            with _raise_on_warnings(tree.d):
-                return [_rigid_limit(tree, cut, state) for state in states]
-        chain = _MujocoChain(model, self.body_pieces(model), dense=bool(self.option))
+        if model.has_loops or self.option in self.joint_options:
+            soft = _SoftMechanism(model, self.option)
+            with _raise_on_warnings(soft.tree.d):
+                return [_rigid_limit(soft, state) for state in states]
+        chain = _MujocoChain(model, self.body_pieces(model), dense=self.option == DENSE)
         with _raise_on_warnings(chain.d):
             return [chain.quantities(state) for state in states]
 
@@ -169,7 +184,7 @@ class Mujoco(MetamorphicHooks):
         """Run at falling regularisations, extrapolate to none; the last order's change is the uncertainty."""
         cut, runs = cut_open(model), list[Trajectory]()
         for k in range(RUN_REGULARISATIONS):
-            tree = _MujocoChain(cut.model, ends=cut.ends)
+            tree = _MujocoChain(cut.model, constraints=_Constraints(cut.ends))
             tree.soften(LARGEST_RUN_REGULARISATION / RATIO**k)
             tree.m.opt.iterations = RUN_ITERATIONS
             tree.m.eq_solref[:] = -(STABILISATION**2), -2 * STABILISATION
@@ -204,6 +219,25 @@ class Mujoco(MetamorphicHooks):
         return Trajectory(t=np.array(t), r=r, p=p, v=v, pdot=pdot, steps=int(counts[-1]))
 
 
+@dataclass(frozen=True)
+class _Tie:
+    """A rod in the shape of a tendon of constant length."""
+
+    bodies: NDArray[np.intp]  # (2,) that it holds, −1 the world
+    points: Array  # (2, 3) m, in these bodies
+    length: float  # m
+    softness: float  # 1/kg, what its R is proportional to
+
+
+@dataclass(frozen=True)
+class _Constraints:
+    """What holds a tree besides its joints."""
+
+    ends: tuple[tuple[int, int], ...] = ()  # bodies that stay together
+    held: tuple[tuple[int, ...], ...] = ()  # of each body's joint the motions that are held at 0
+    ties: tuple[_Tie, ...] = ()
+
+
 class _MujocoChain:
     """A compiled chain and its data.
 
@@ -215,7 +249,7 @@ class _MujocoChain:
         model: Model,
         parts: BodyParts | None = None,
         dense: bool = False,
-        ends: tuple[tuple[int, int], ...] = (),
+        constraints: _Constraints | None = None,
     ) -> None:
         spec = mujoco.MjSpec()
         _compiler_options(spec).autolimits = False
@@ -235,14 +269,8 @@ class _MujocoChain:
             links.append(self._add_link(parent, k, hang, pieces))
             _add_load_actuators(spec, links[k], k, model)
         _add_tendons(spec, links, model)
-        for loop, pair in enumerate(ends):
-            names = [f"end {loop} {side}" for side in (1, 2)]
-            for k, name in zip(pair, names, strict=True):
-                _set_attributes(links[k].add_site(), name=name)
-            _set_attributes(
-                spec.add_equality(), type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_SITE,
-                name1=names[0], name2=names[1], solref=[0.0, 0.0], solimp=[*[MAX_IMPEDANCE] * 2, 1, 0.5, 2],
-            )  # fmt: skip
+        constraints = constraints or _Constraints()
+        _add_equalities(spec, links, constraints)
         m = self.m = spec.compile()
         m.opt.gravity = model.gravity
         m.opt.disableflags = mujoco.mjtDisableBit.mjDSBL_CONTACT | _autoreset_flag()
@@ -254,7 +282,11 @@ class _MujocoChain:
         d = self.d = mujoco.MjData(m)
         mujoco.mj_setConst(m, d)
         m.opt.tolerance, m.opt.solver = 0.0, mujoco.mjtSolver.mjSOL_NEWTON
-        self.softness = m.body_invweight0.copy(), m.dof_invweight0.copy()
+        ties = constraints.ties
+        m.tendon_length0[m.ntendon - len(ties) :] = [tie.length for tie in ties]
+        # MuJoCo's own are of the reference pose, where free bodies are in one place
+        m.tendon_invweight0[m.ntendon - len(ties) :] = [tie.softness for tie in ties]
+        self.softness = tuple(np.copy(getattr(m, name)) for name in SOFTNESS)
         self.applied_wrenches = np.zeros((m.nbody, 6))
         self.applied_wrenches[self.link_ids, :3] = model.force
         self.readout_data = mujoco.MjData(m)
@@ -316,12 +348,14 @@ class _MujocoChain:
                 m.dof_armature[dofs], m.dof_damping[dofs] = model.armature[k, i], model.damping[k, i]
                 m.jnt_stiffness[joint], self.effort[dofs] = model.stiffness[k, i], model.effort[k, i]
                 m.qpos_spring[m.jnt_qposadr[joint] + np.arange(len(rest))] = rest
-        m.tendon_stiffness[:], m.tendon_damping[:] = model.spring_stiffness, model.spring_damping
-        m.tendon_lengthspring[:] = model.spring_length[:, None]
+        springs = slice(len(model.spring_body))
+        m.tendon_stiffness[springs], m.tendon_damping[springs] = model.spring_stiffness, model.spring_damping
+        m.tendon_lengthspring[springs] = model.spring_length[:, None]
 
     def soften(self, scale: float) -> None:
-        """Scale the regularisation R of the welds: nothing else depends on these numbers."""
-        self.m.body_invweight0[:], self.m.dof_invweight0[:] = (scale * x for x in self.softness)
+        """Scale the regularisation R of all constraints: nothing else depends on these numbers."""
+        for name, usual in zip(SOFTNESS, self.softness, strict=True):
+            getattr(self.m, name)[:] = scale * usual
 
     def body_frames(self, state: State) -> tuple[Array, Array]:
         """Return the quaternions (nbody, 4) of all bodies and E (nbody, 3, nu): their ω = E ν, own frames."""
@@ -372,7 +406,7 @@ class _MujocoChain:
         mujoco.mj_subtreeVel(m, d)
         M = _full_mass_matrix(m, d)
         if self.use_dense_solve:
-            d.qacc = np.linalg.solve(M, d.qfrc_smooth)
+            d.qacc = np.linalg.solve(M, d.qfrc_smooth + d.qfrc_constraint)
         velocity = self._spatial_motion(mujoco.mj_objectVelocity, d)
         d.xfrc_applied[link, :3] -= self.model.drag_force[:, None] * velocity[:, 3:]
         moment = np.matvec(d.xmat[link].reshape(-1, 3, 3), self.model.moment)
@@ -390,6 +424,12 @@ class _MujocoChain:
             angular_momentum=d.subtree_angmom[0] + np.cross(com, momentum),
             mass_matrix=T.T @ M @ T,
         )
+
+    def pushes(self) -> Array:
+        """Return the forces of the ties [N], positive where they push."""
+        d = self.d
+        of_tie = np.isin(d.efc_id, np.flatnonzero(self.m.eq_type == mujoco.mjtEq.mjEQ_TENDON))
+        return np.asarray(d.efc_force[of_tie & (d.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY)])
 
     def _joint_moments(self) -> Array:
         """Return the moments (N, 3) about the joints' near points, world frame."""
@@ -418,7 +458,53 @@ class _MujocoChain:
         return out
 
 
-def _rigid_limit(tree: _MujocoChain, cut: CutMechanism, state: State) -> StateQuantities:
+class _SoftMechanism:
+    """A mechanism that MuJoCo holds by soft constraints: loops closed, rods as ties, motions held."""
+
+    def __init__(self, model: Model, option: str) -> None:
+        self.source, ties = model, list[_Tie]()
+        self.rodless = rods_taken_out(model) if option == TENDONS else None
+        rest = self.rodless.model if self.rodless else model
+        self.cut = cut_open(rest) if rest.has_loops else None
+        self.opened = self.cut.model if self.cut else rest
+        self.rods = [k for k, kind in enumerate(model.kind) if self.rodless and kind == "rod"]
+        place = np.append(np.argsort(self.rodless.order), -1) if self.rodless else np.zeros(0, int)
+        place = np.append(self.cut.place, -1)[place] if self.cut else place
+        for k in self.rods:
+            softness = sum(1 / model.mass[b] for b in model.body[k] if b >= 0)
+            ties.append(_Tie(place[model.body[k]], model.point[k], model.length[k], softness))
+        held = joints_as_cylinders(self.opened) if option == HELD else self.opened
+        added = [ADDED_MOTIONS.get(kind, ()) if option == HELD else () for kind in self.opened.kind]
+        constraints = _Constraints(self.cut.ends if self.cut else (), tuple(added), tuple(ties))
+        self.tree = _MujocoChain(held, dense=option == DENSE, constraints=constraints)
+
+    def quantities(self, state: State) -> StateQuantities:
+        """Evaluate at one state what is determinate, without a mass matrix."""
+        there = self.rodless.state(state) if self.rodless else state
+        there = self.cut.state(there) if self.cut else there
+        if self.tree.model is not self.opened:
+            there = state_of_cylinders(self.opened, self.tree.model, there)
+        answer = self.tree.quantities(there)
+        answer = self.cut.source_quantities(answer) if self.cut else answer
+        if self.rodless:
+            answer = self._with_rods(state, answer, self.rodless)
+        if self.source.has_loops:
+            return determinate_part(self.source, state, answer)
+        return replace(answer, mass_matrix=None)
+
+    def _with_rods(self, state: State, answer: StateQuantities, rodless: Rearranged) -> StateQuantities:
+        """Bodies and joints in the order of the mechanism; rods push along themselves."""
+        bodies, found = np.argsort(rodless.order), vars(answer) | {"mass_matrix": None}
+        for name in PER_BODY:
+            found[name] = found[name][bodies]
+        for name in ("joint_reaction", "joint_moment"):
+            found[name] = np.where(rodless.joint[:, None] < 0, 0.0, found[name][rodless.joint])
+        u = kinematics.joint_coordinates(self.source, state)[0][self.rods]
+        found["joint_reaction"][self.rods] = self.tree.pushes()[:, None] * u
+        return StateQuantities(**found)
+
+
+def _rigid_limit(soft: _SoftMechanism, state: State) -> StateQuantities:
     """Evaluate at falling regularisations R, check order 1, and extrapolate to none.
 
     Rounding of the forces grows with 1/R.  The limit's uncertainty, by rounding and by what is left of R, is
@@ -426,7 +512,7 @@ def _rigid_limit(tree: _MujocoChain, cut: CutMechanism, state: State) -> StateQu
     """
     for largest in LARGEST_REGULARISATIONS:
         try:
-            limits = [_extrapolated(tree, cut, state, factor * largest) for factor in SEQUENCES]
+            limits = [_extrapolated(soft, state, factor * largest) for factor in SEQUENCES]
             break
         except EngineFailure:
             if largest == LARGEST_REGULARISATIONS[-1]:
@@ -443,20 +529,20 @@ def _largest_norm(difference: Array) -> float:
     return float(np.max(np.linalg.norm(np.atleast_2d(difference), axis=-1)))
 
 
-def _extrapolated(tree: _MujocoChain, cut: CutMechanism, state: State, largest: float) -> dict[str, Array]:
+def _extrapolated(soft: _SoftMechanism, state: State, largest: float) -> dict[str, Array]:
     """Extrapolate all quantities from one sequence of regularisations (Neville's scheme)."""
-    there, found = cut.state(state), list[dict[str, Array]]()
+    found = list[dict[str, Array]]()
     for k in range(REGULARISATIONS):
-        tree.soften(largest / RATIO**k)
-        answer = determinate_part(cut.source, state, cut.source_quantities(tree.quantities(there)))
+        soft.tree.soften(largest / RATIO**k)
+        answer = soft.quantities(state)
         found.append({name: np.asarray(x) for name, x in vars(answer).items() if x is not None})
     limit: dict[str, Array] = {}
-    length = wrench_length(cut.source)
+    length = wrench_length(soft.source)
     size = max(
         float(np.max(np.abs(found[-1][name]))) * unit
         for name, unit in (("acceleration", 1.0), ("angular_acceleration", length))
     )
-    force = max(size * float(np.max(cut.source.mass)), float(np.max(np.abs(found[-1]["joint_reaction"]))))
+    force = max(size * float(np.max(soft.source.mass)), float(np.max(np.abs(found[-1]["joint_reaction"]))))
     # what rounding of the others leaves of each, where itself it is small
     sizes = {"joint_reaction": force, "joint_moment": length * force}
     sizes |= {"acceleration": size, "angular_acceleration": size / length}
@@ -497,11 +583,41 @@ def _add_load_actuators(spec: Any, body: Any, k: int, model: Model) -> None:
 def _add_tendons(spec: Any, links: list[Any], model: Model) -> None:
     """Add a tendon between two sites for every spring between points."""
     for i, (bodies, points) in enumerate(zip(model.spring_body, model.spring_point, strict=True)):
-        tendon = _set_attributes(spec.add_tendon(), name=f"spring{i}")
-        for side, (body, point) in enumerate(zip(bodies, points, strict=True)):
-            owner = links[body] if body >= 0 else spec.worldbody
-            _set_attributes(owner.add_site(), name=f"end{i}{'ab'[side]}", pos=point)
-            tendon.wrap_site(f"end{i}{'ab'[side]}")
+        _add_tendon(spec, links, f"spring {i}", bodies, points)
+
+
+def _add_tendon(spec: Any, links: list[Any], name: str, bodies: NDArray[np.intp], points: Array) -> None:
+    tendon = _set_attributes(spec.add_tendon(), name=name)
+    for side, (body, point) in enumerate(zip(bodies, points, strict=True)):
+        owner = links[body] if body >= 0 else spec.worldbody
+        _set_attributes(owner.add_site(), name=f"{name} {side}", pos=point)
+        tendon.wrap_site(f"{name} {side}")
+
+
+def _add_equalities(spec: Any, links: list[Any], constraints: _Constraints) -> None:
+    """Add ties first: their numbers are those of their equalities."""
+    for i, tie in enumerate(constraints.ties):
+        _add_tendon(spec, links, f"tie {i}", tie.bodies, tie.points)
+        _add_equality(spec, "TENDON", f"tie {i}")
+    for k, motions in enumerate(constraints.held):
+        for i in motions:
+            joint = _set_attributes(links[k].joints[i], name=f"held {k} {i}")
+            _add_equality(spec, "JOINT", joint.name)
+    for loop, pair in enumerate(constraints.ends):
+        names = [f"end {loop} {side}" for side in (1, 2)]
+        for k, name in zip(pair, names, strict=True):
+            _set_attributes(links[k].add_site(), name=name)
+        _add_equality(spec, "WELD", *names)
+
+
+def _add_equality(spec: Any, kind: Literal["TENDON", "JOINT", "WELD"], name: str, other: str = "") -> None:
+    """Add a constraint at zero, as hard as MuJoCo accepts; of an other element only where there is one."""
+    of = {"WELD": "SITE"}.get(kind, kind)
+    _set_attributes(
+        spec.add_equality(), type=getattr(mujoco.mjtEq, f"mjEQ_{kind}"),
+        objtype=getattr(mujoco.mjtObj, f"mjOBJ_{of}"), name1=name, name2=other,
+        solref=[0.0, 0.0], solimp=[*[MAX_IMPEDANCE] * 2, 1, 0.5, 2],
+    )  # fmt: skip
 
 
 def _principal_inertia(J: Array) -> tuple[Array, Array]:

@@ -198,7 +198,7 @@ class PinocchioMaximal(PinocchioAdapter):
         "integrators": "Pinocchio in maximal coordinates is compared at state level only"
     }
     builds_trees = True
-    options = ("inverse of the KKT matrix",)
+    options = loop_options = ("inverse of the KKT matrix",)
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
         if model.n > MAX_BODIES:

@@ -113,7 +113,7 @@ class Reference(MetamorphicHooks):
     ) -> Trajectory:
         times = np.array([0.0, end, 2 * end])
         try:
-            system = eliminated_system([model], state.x)
+            system = eliminated_system([model], joint_coordinates(model, state)[2])
             there = integrate_collocation(system, *notes_state(state), times[:2], resolution)
             turned = there.r[-1], there.p[-1], -there.v[-1], -there.pdot[-1]
             system = eliminated_system([model], there.x[-1])

@@ -7,13 +7,14 @@ All are optional; an adapter without them is still tested with rotated, rescaled
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from copy import copy
 from typing import ClassVar, Self
 
 import numpy as np
 
 from plumbline.engines.adapter import Adapter, check_samples, check_state
-from plumbline.model.datatypes import Integrator, Model, State, Trajectory, Unsupported
+from plumbline.model.datatypes import Integrator, Kind, Model, State, Trajectory, Unsupported
 from plumbline.model.welding import BodyParts, split_bodies, undivided_bodies
 
 
@@ -25,17 +26,19 @@ class MetamorphicHooks(Adapter):
     """
 
     options: ClassVar[tuple[str, ...]] = ()  # other algorithms for the accelerations
+    loop_options: ClassVar[tuple[str, ...]] = ()  # those of them that mechanisms with loops have too
+    joint_options: ClassVar[Mapping[str, tuple[Kind, ...]]] = {}  # other ways to build joints of some kinds
     usual_linear_solver: ClassVar[str] = ""  # of implicit steps, or of the equations of motion
     linear_solvers: ClassVar[tuple[str, ...]] = ()  # the others
     welding_unsupported_reason: ClassVar[str] = "the adapter welds nothing"  # empty where it does
-    option: str = ""  # the one of `options` or `linear_solvers` in use
+    option: str = ""  # the one of `options`, `joint_options` or `linear_solvers` in use
     has_welded_halves: bool = False  # whether `body_pieces` divides every body
 
     def with_option(self, option: str) -> Self:
         """Copy the adapter, set to another algorithm or linear solver.
 
         Args:
-            option: one of `options` or `linear_solvers`.
+            option: one of `options`, `joint_options` or `linear_solvers`.
 
         Returns:
             The copy.
@@ -44,11 +47,28 @@ class MetamorphicHooks(Adapter):
             KeyError: the engine has no such option; the message lists those it has.
 
         """
-        if option not in (ways := (*self.options, *self.linear_solvers)):
+        if option not in (ways := (*self.options, *self.joint_options, *self.linear_solvers)):
             raise KeyError(f"{self.name} has no option {option!r}; it has {list(ways)}")
         other = copy(self)
         other.option = option
         return other
+
+    def options_for(self, model: Model) -> tuple[str, ...]:
+        """List the ways to the accelerations of a mechanism.
+
+        Args:
+            model: the mechanism.
+
+        Returns:
+            All `options` (with loops `loop_options`), and those of `joint_options` whose joints it has; of
+            these none where bodies without inertia need their joints.
+
+        """
+        usual = self.loop_options if model.has_loops else self.options
+        if model.lacks_inertia:
+            return usual
+        ways = (way for way, kinds in self.joint_options.items() if not set(kinds).isdisjoint(model.kind))
+        return (*usual, *ways)
 
     def with_welded_halves(self) -> Self:
         """Copy the adapter, set to build every body of two welded halves.

@@ -78,8 +78,8 @@ def uncompared_kinds(model: Model) -> dict[TaskKind, str]:
 
     """
     if model.has_loops:
-        kinds = (TaskKind.LONG_RUN, TaskKind.RELATIONS, TaskKind.STEP)
-        return dict.fromkeys(kinds, "of mechanisms with loops states and motions are compared")
+        kinds = (TaskKind.LONG_RUN, TaskKind.STEP)
+        return dict.fromkeys(kinds, "of mechanisms with loops states, motions and relations are compared")
     if model.n > MAX_STEP_BODIES:
         return {TaskKind.STEP: f"single steps are compared of at most {MAX_STEP_BODIES} bodies"}
     return {}

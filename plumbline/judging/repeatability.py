@@ -8,7 +8,7 @@ repeated.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 
 import numpy as np
@@ -148,7 +148,9 @@ def _largest_difference(
     """The largest difference of any quantity, relative to the quantity's largest entry; "" for equal bits."""
     worst: Difference = (0.0, "")
     for field in fields(other):
-        a, b = getattr(one, field.name), getattr(other, field.name)
+        a, b = (getattr(answer, field.name) for answer in (one, other))
+        if isinstance(b, Mapping):  # uncertainties by quantity
+            a, b = (list(errors.values()) for errors in (a, b))
         if a is None and b is None:
             continue
         name = field.name.replace("_", " ")

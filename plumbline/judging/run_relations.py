@@ -78,6 +78,8 @@ def check_integrator_relations(
 def fastest_rate(model: Model, state: State) -> float:
     """Return the fastest rate of a motion: of a body, of a rod, or of the shortest link as a pendulum.
 
+    With loops also that which an angular acceleration reaches within a radian.
+
     Args:
         model: the pendulum.
         state: a state of it.
@@ -88,7 +90,14 @@ def fastest_rate(model: Model, state: State) -> float:
     """
     swing = np.sqrt(np.linalg.norm(model.gravity) / np.min(stretched_length(model)))
     rates = [np.max(np.linalg.norm(rate, axis=1)) for rate in (state.omega, state.udot)]
-    return float(max(swing, *rates)) or 1.0
+    return float(max(swing, *rates, np.sqrt(2 * _loop_acceleration(model, state)))) or 1.0
+
+
+def _loop_acceleration(model: Model, state: State) -> float:
+    """The largest angular acceleration [rad/s²] of bodies in loops, which may start from rest; of trees 0."""
+    if not model.has_loops:
+        return 0.0
+    return float(np.max(state_rounding_bound(model, state).scale["angular_acceleration"]))
 
 
 def _check_time_reversal(
@@ -101,7 +110,11 @@ def _check_time_reversal(
         run = engine.simulate_round_trip(model, state, end, integrator.name, resolution)
     except (Unsupported, EngineFailure) as refusal:
         return refused_result(REVERSED_IN_TIME, integrator, refusal)
-    differences = relative_differences(model, state_at_sample(run, 0), state_at_sample(run, 2, -1.0))
+    ends, driven = (
+        (state_at_sample(run, 0), state_at_sample(run, 2, -1.0)),
+        _loop_acceleration(model, state) * end,
+    )
+    differences = relative_differences(model, *ends, driven)
     limit = run_tolerance(integrator, model, state, end, run.steps)
     return worst_difference_result(
         REVERSED_IN_TIME, integrator, differences, limit, run.steps, resolution, end
@@ -122,6 +135,7 @@ def _check_linear_solvers(
 
     usual = simulate(engine)
     limit = 2 * run_tolerance(integrator, model, state, end, RUN_STEPS)
+    driven = _loop_acceleration(model, state) * end
     for solver in engine.linear_solvers:
         name, other = OPTION_PREFIX + solver, simulate(engine.with_option(solver))
         if not isinstance(usual, Trajectory):
@@ -129,7 +143,8 @@ def _check_linear_solvers(
         elif not isinstance(other, Trajectory):
             yield refused_result(name, integrator, other)
         else:
-            differences = relative_differences(model, state_at_sample(usual, -1), state_at_sample(other, -1))
+            ends = state_at_sample(usual, -1), state_at_sample(other, -1)
+            differences = relative_differences(model, *ends, driven)
             yield worst_difference_result(name, integrator, differences, limit, RUN_STEPS, step, end)
 
 
@@ -173,7 +188,8 @@ def run_tolerance(integrator: Integrator, model: Model, state: State, end: float
         integrator.kind == "step"
     ):  # a residual is small compared with the heaviest body's, F = m a of a light one
         of_step = integrator.solver_rtol * float(np.max(model.mass) / np.min(model.mass))
-    bound, (_, spin, speed) = state_rounding_bound(model, state), characteristic_scales(model, state)
+    driven = _loop_acceleration(model, state) * end
+    bound, (_, spin, speed) = state_rounding_bound(model, state), characteristic_scales(model, state, driven)
     pushed = end * max(np.max(bound.acceleration) / speed, np.max(bound.angular_acceleration) / spin)
     from plumbline.truth.sensitivity import perturbation_growth  # with SciPy: not in a run's own process
 
@@ -181,12 +197,13 @@ def run_tolerance(integrator: Integrator, model: Model, state: State, end: float
     return float((RUN_ROUNDING + of_step * np.sqrt(steps) + pushed) * np.max(growth))
 
 
-def characteristic_scales(model: Model, state: State) -> tuple[float, float, float]:
+def characteristic_scales(model: Model, state: State, driven: float = 0.0) -> tuple[float, float, float]:
     """Return the scales that differences of runs are relative to.
 
     Args:
         model: the pendulum.
         state: a state of it.
+        driven: rate of rotation that the motion reaches from there [rad/s].
 
     Returns:
         The stretched pendulum's length [m], its rate of rotation [rad/s] and its speed [m/s].
@@ -194,7 +211,8 @@ def characteristic_scales(model: Model, state: State) -> tuple[float, float, flo
     """
     length = float(np.sum(stretched_length(model)))
     fall = float(np.sqrt(np.linalg.norm(model.gravity) * length))
-    spin = max(fall / length, float(np.max(np.linalg.norm(state.omega, axis=1))), np.finfo(float).tiny)
+    fastest = float(np.max(np.linalg.norm(state.omega, axis=1)))
+    spin = max(fall / length, fastest, driven, np.finfo(float).tiny)
     return length, spin, max(spin * length, float(np.max(np.linalg.norm(state.v, axis=1))))
 
 
@@ -215,20 +233,21 @@ def state_at_sample(run: Trajectory, at: int, sign: float = 1.0) -> State:
     return State(p, angular_velocity(p, pdot), zeros, zeros, run.r[at], sign * run.v[at])
 
 
-def relative_differences(model: Model, one: State, other: State) -> dict[str, float]:
+def relative_differences(model: Model, one: State, other: State, driven: float = 0.0) -> dict[str, float]:
     """Compare two samples.
 
     Args:
         model: the pendulum.
         one: a sample, whose rates set the scales.
         other: the other sample.
+        driven: of `characteristic_scales`.
 
     Returns:
         By quantity the largest difference of any body, relative to `characteristic_scales` [–]; of attitudes
         the angle [rad].
 
     """
-    length, spin, speed = characteristic_scales(model, one)
+    length, spin, speed = characteristic_scales(model, one, driven)
     return {
         "position": float(position_error(one.r, other.r)) / length,
         "attitude": float(attitude_error(one.p, other.p)),

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.datatypes import BODY_FIELDS, JOINT_FIELDS, Array, Model, State
 from plumbline.model.kinematics import (
     complete_state,
     quaternion_conjugate,
@@ -22,11 +22,6 @@ WORLD_VECTORS = (
     "joint_moment",
     "angular_momentum",
 )  # state quantities in world axes
-# fields of a model that have one entry per body or its joint
-BODY_FIELDS = (
-    "mass", "inertia", "point", "turn", "length", "force", "moment", "drag_force", "drag_moment", "armature",
-    "damping", "stiffness", "rest", "effort",
-)  # fmt: skip
 BODY_VECTORS = ("angular_acceleration",)  # … in body axes
 
 
@@ -114,10 +109,11 @@ def siblings_reversed(model: Model) -> NDArray[np.intp]:
 
     """
     order: list[int] = []
-    waiting = np.flatnonzero(model.body[:, 0] < 0).tolist()
+    far = model.body[: model.n, 0]
+    waiting = np.flatnonzero(far < 0).tolist()
     while waiting:
         order.append(waiting.pop())
-        waiting += np.flatnonzero(model.body[:, 0] == order[-1]).tolist()
+        waiting += np.flatnonzero(far == order[-1]).tolist()
     return np.array(order, np.intp)
 
 
@@ -134,10 +130,12 @@ def reorder_bodies(model: Model, state: State, order: NDArray[np.intp]) -> tuple
 
     """
     place = np.append(np.argsort(order), -1)  # the world is −1 in both
-    fields = {name: x[order] for name, x in vars(model).items() if name in BODY_FIELDS}
-    body = np.stack([place[model.body[order, 0]], np.arange(model.n)], axis=1)
-    kind = tuple(model.kind[k] for k in order)
-    reordered = replace(model, kind=kind, body=body, spring_body=place[model.spring_body], **fields)
+    joints = np.append(order, np.arange(model.n, len(model.kind)))  # those that close loops stay
+    fields = {name: getattr(model, name)[order] for name in ("mass", "inertia", *BODY_FIELDS)}
+    fields |= {name: getattr(model, name)[joints] for name in JOINT_FIELDS if name not in ("kind", "body")}
+    kind = tuple(model.kind[k] for k in joints)
+    spring_body = place[model.spring_body]
+    reordered = replace(model, kind=kind, body=place[model.body[joints]], spring_body=spring_body, **fields)
     return reordered, State(**{name: x[order] for name, x in vars(state).items()})
 
 

@@ -7,6 +7,10 @@
     inertia as rotors  a body on a hinge on the world turns about its axis z only: δ z zᵀ of its inertia may
                        be a rotor of inertia δ (on a moving body not: rotors have no gyroscopic terms)
     springs as loads   at one state, springs and dampers of joints are efforts, those between points loads
+    rods taken out     bodies on rods are free, rods that close loops are left out: an adapter puts ties in
+                       their place
+    joints as cylinders  hinges, slides and welds are cylindrical joints: an adapter holds the coordinates
+                       that these have in addition
 
 A universal joint is not described as two hinges with a body between them: that body would have no mass, and a
 small one would change the mechanism.
@@ -39,18 +43,18 @@ from plumbline.model.kinematics import (
     spring_vectors,
 )
 
+# of the cylindrical joints in their place
+ADDED_MOTIONS: dict[Kind, tuple[int, ...]] = {"hinge": (0,), "slide": (1,), "weld": (0, 1)}
 EXCHANGE = np.array([0.0, 1.0, 1.0, 0.0]) / np.sqrt(2)  # half a turn that exchanges x and y
 
 
 @dataclass(frozen=True, eq=False)
-class MovedRoot:
-    """A mechanism with another root."""
+class Rearranged:
+    """A mechanism with bodies and joints in another order, and with other free bodies."""
 
     model: Model
     order: NDArray[np.intp]  # (N,) the first mechanism's bodies in the new order
-    joint: NDArray[
-        np.intp
-    ]  # (J,) of each joint of the first mechanism its new number; −1: a root's free joint
+    joint: NDArray[np.intp]  # (J,) of each joint of the first mechanism its new number; −1: left out
     is_reversed: NDArray[np.bool_]  # (J,) of the first mechanism's joints
 
     def state(self, state: State) -> State:
@@ -77,7 +81,7 @@ class MovedRoot:
         return complete_state(self.model, State(**fields))
 
 
-def moved_root(model: Model) -> MovedRoot | None:
+def moved_root(model: Model) -> Rearranged | None:
     """Make the last body of the first branch the root, a free body.
 
     Args:
@@ -101,32 +105,53 @@ def moved_root(model: Model) -> MovedRoot | None:
     for k in path[:-1]:
         above[far[k]] = k
     above[last] = -1
-    order: list[int] = []
-    waiting = [*np.flatnonzero(above < 0)[::-1]]
-    waiting.remove(last)
-    waiting.append(last)
-    while waiting:
-        order.append(int(waiting.pop()))
-        waiting += [k for k in range(n) if above[k] == order[-1]][::-1]
-    place = np.argsort(order)
+    place = np.argsort(_depth_first(above, last))
     count = len(model.kind)
     joint = np.concatenate([place, np.arange(n, count)])
     is_reversed = np.zeros(count, bool)
     for k in path[:-1]:
         joint[k], is_reversed[k] = place[far[k]], True
     joint[root] = -1 if is_free else count
-    return MovedRoot(_rearranged(model, joint, is_reversed, place), np.array(order), joint, is_reversed)
+    return _rearranged(model, joint, is_reversed, place)
+
+
+def rods_taken_out(model: Model) -> Rearranged:
+    """Leave out every rod; a body that hung on one is free.
+
+    Args:
+        model: the mechanism.
+
+    Returns:
+        The mechanism without rods.
+
+    """
+    n, is_rod = model.n, np.array([kind == "rod" for kind in model.kind])
+    place = np.argsort(_depth_first(np.where(is_rod[:n], -1, model.body[:n, 0])))
+    closing = n + np.cumsum(~is_rod[n:]) - 1
+    joint = np.where(is_rod, -1, np.concatenate([place, closing]))
+    return _rearranged(model, joint, np.zeros(len(joint), bool), place)
+
+
+def _depth_first(above: NDArray[np.intp], first: int | None = None) -> list[int]:
+    """Order bodies by the ones they hang on (−1: the world), branch by branch, one root before all."""
+    order: list[int] = []
+    waiting = [int(k) for k in np.flatnonzero(above < 0)[::-1] if k != first]
+    waiting += [] if first is None else [first]
+    while waiting:
+        order.append(waiting.pop())
+        waiting += np.flatnonzero(above == order[-1])[::-1].tolist()
+    return order
 
 
 def _rearranged(
     model: Model, joint: NDArray[np.intp], is_reversed: NDArray[np.bool_], place: NDArray[np.intp]
-) -> Model:
-    """The mechanism with its joints at their new numbers, some reversed, and a free root."""
+) -> Rearranged:
+    """The mechanism with its joints at their new numbers, some reversed; bodies without a joint are free."""
     sources = {int(to): k for k, to in enumerate(joint) if to >= 0}
     fields: dict[str, list[Any]] = {name: [] for name in JOINT_FIELDS}
     world = np.append(place, -1)  # the world is −1 in both
-    for to in range(len(model.kind) + int(np.max(joint) == len(model.kind))):
-        if to not in sources:  # the root
+    for to in range(max(model.n, int(np.max(joint)) + 1)):
+        if to not in sources:
             free = ("free", [-1, to], np.zeros((2, 3)), np.tile([1.0, 0, 0, 0], (2, 1)), 0.0)
             for name, value in zip(JOINT_FIELDS, (*free, *np.zeros((5, 2))), strict=True):
                 fields[name].append(value)
@@ -147,7 +172,52 @@ def _rearranged(
     order = np.argsort(place)
     for name in ("mass", "inertia", *BODY_FIELDS):
         changes[name] = getattr(model, name)[order]
-    return replace(model, kind=tuple(fields["kind"]), spring_body=world[model.spring_body], **changes)
+    other = replace(model, kind=tuple(fields["kind"]), spring_body=world[model.spring_body], **changes)
+    return Rearranged(other, order, joint, is_reversed)
+
+
+def joints_as_cylinders(model: Model) -> Model:
+    """Make cylindrical joints of hinges, slides and welds.
+
+    Args:
+        model: a tree.
+
+    Returns:
+        The tree, whose joints have motions in addition.
+
+    """
+    kinds: list[Kind] = ["cylindrical" if kind in ADDED_MOTIONS else kind for kind in model.kind]
+    turns = _are_hinges(model)
+    elements: dict[str, Any] = {name: _exchanged(getattr(model, name), turns) for name in JOINT_ELEMENTS}
+    return replace(model, kind=tuple(kinds), **elements)
+
+
+def state_of_cylinders(model: Model, cylinders: Model, state: State) -> State:
+    """Describe a state for cylindrical joints in the place of others.
+
+    Args:
+        model: a tree.
+        cylinders: `joints_as_cylinders` of it.
+        state: of the tree.
+
+    Returns:
+        The same state; the coordinates that joints have in addition are zero.
+
+    """
+    own = np.ones((model.n, 2))
+    for k, kind in enumerate(model.kind):
+        own[k, ADDED_MOTIONS.get(kind, ())] = 0.0
+    x, xdot = (own * _exchanged(values, _are_hinges(model)) for values in (state.x, state.xdot))
+    return complete_state(cylinders, replace(state, x=x, xdot=xdot))
+
+
+def _are_hinges(model: Model) -> NDArray[np.bool_]:
+    return np.array([[kind == "hinge"] for kind in model.kind])
+
+
+def _exchanged(values: NDArray[np.float64], rows: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Exchange the two columns of some rows: a cylindrical joint's turn is its second coordinate."""
+    return np.where(rows, values[:, ::-1], values)
 
 
 def joints_as_rods(model: Model) -> Model:

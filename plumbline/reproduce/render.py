@@ -104,6 +104,7 @@ def render_script(row: dict[str, Any], evidence: Evidence) -> str:
         "way": way,
         "again": False,
         "option": option,
+        "ties": option == "tendon equalities",
         "rods": bool(np.any(model.rods)),
         "loads": model.has_loads or model.has_drag,
         "powered": model.has_drag or bool(np.any(model.moment)),

@@ -270,7 +270,8 @@ class FormulaSteps:
         )
         if self.method.coordinates == "joint rotations":
             axial = self.method.rod_axial_inertia * np.trace(model.inertia, axis1=1, axis2=2)
-            above = above + torque / axial
+            # a body without inertia hangs on no rod, and on none is there a torque
+            above = above + np.divide(torque, axial, out=np.zeros_like(axial), where=torque > 0)
         leaked, passed = (count * np.minimum(1.0, h * W) * (path @ x) for x in (above, shifted))
         omega = ACCELERATION_FACTOR * h * (turning + leaked) + rounding * W
         velocity = ACCELERATION_FACTOR * h * (acceleration + leaked * arm + passed)

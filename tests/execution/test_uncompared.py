@@ -20,9 +20,9 @@ from tests.helpers.catalogue import catalogue_scenarios
         ("furuta", "all", set()),
         ("furuta", "state", set()),
         ("damped-hinge", "all", set()),
-        ("four-bar", "all", {"step", "relations"}),
+        ("four-bar", "all", {"step"}),
         ("four-bar", "trajectory", set()),
-        ("four-bars-2-flat", "all", {"step", "relations", "trajectory"}),  # singular at the start
+        ("four-bars-2-flat", "all", {"step", "trajectory"}),  # singular at the start
     ],
 )
 def test_levels_that_are_left_out_are_reported(name, level, expected):

@@ -87,7 +87,9 @@ def every_evidence(engine: str, joints: str, loaded: bool):
     """Evidence of every kind of script of an engine."""
     case = state_case(joints, loaded, loaded)
     yield state_evidence(engine, case)
-    for relation in (STATE_RELATIONS[0].name, *second_ways(engine)):
+    hooks = metamorphic_hooks(load_adapter(engine))
+    of_joints = [OPTION_PREFIX + way for way in hooks.options_for(case.model) if way in hooks.joint_options]
+    for relation in (STATE_RELATIONS[0].name, *second_ways(engine), *of_joints):
         yield relation_evidence(engine, relation, case)
     for integrator in step_methods(engine):
         yield step_evidence(engine, integrator, case)

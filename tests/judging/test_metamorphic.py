@@ -87,7 +87,10 @@ def test_every_engine_keeps_every_relation(engine, joints):
     assert len(rows) >= (6 if engine == "reference-printed" else 7) and len(
         {(row.integrator, row.quantity) for row in rows}
     ) == len(rows)
-    assert all(row.verdict == "agrees" for row in rows if row.quantity not in refused), [
+    disagreeing = [row.quantity for row in rows if row.verdict == "disagrees"]
+    # known_issues.yaml records that they leave out a term
+    assert disagreeing == ["by tendon equalities"] * (engine == "mujoco" and "rod" in joints)
+    assert all(row.verdict == "agrees" for row in rows if row.quantity not in refused + disagreeing), [
         row.reason for row in rows
     ]
 

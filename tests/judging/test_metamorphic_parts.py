@@ -29,6 +29,7 @@ from plumbline.judging.state_relations import (
 )
 from plumbline.model.datatypes import EngineFailure, Integrator, StateQuantities, Trajectory, Unsupported
 from plumbline.model.kinematics import angular_velocity, quaternion_product, quaternion_rate
+from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth.ground_truth import RUN_ROUNDING, stretched_length
 from plumbline.truth.rounding_bound import state_rounding_bound
 from plumbline.truth.sensitivity import perturbation_growth
@@ -170,6 +171,12 @@ def test_the_quickest_is_a_body_a_rod_or_the_shortest_link():
     assert fastest_rate(MODEL, replace(still, omega=np.array([[0, 3.0, 4.0], [90.0, 0, 0]]))) == 90.0
     assert fastest_rate(MODEL, replace(still, udot=np.array([[0, 0, 0], [30.0, 0, 40.0]]))) == 50.0
     assert fastest_rate(replace(MODEL, gravity=np.zeros(3)), still) == 1.0
+
+
+def test_a_loop_that_a_motor_starts_from_rest_is_as_fast_as_its_acceleration_makes_it():
+    squeezer = load_scenario(find_scenario_file("squeezer"))
+    assert np.max(np.abs(squeezer.state.omega)) == 0 == np.max(np.abs(squeezer.model.gravity))
+    assert fastest_rate(squeezer.model, squeezer.state) > np.sqrt(2 * 1.4e4)  # ω̇ = 1.4e4 rad/s² at the start
 
 
 def test_rows_say_what_held_what_did_not_and_what_was_refused():

@@ -19,6 +19,7 @@ from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod, classical_runge_kutta
 from plumbline.scenario.generator import RandomScenarios, random_scenario
+from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth import step_formulas
 from plumbline.truth.certified import certify_state
 from plumbline.truth.link_tree import LinkTree
@@ -54,6 +55,14 @@ def judged(adapter, integrator, model, states):
     """Rows of an adapter's steps, judged by the integrator's declared method."""
     answer = stepped(adapter, integrator, model, states)
     return judge_steps(CONTEXT, integrator, model, states, answer).rows
+
+
+@pytest.mark.parametrize(("engine", "name"), [("mujoco", "RK4"), ("pinocchio", "semi-implicit-euler")])
+def test_steps_of_bodies_without_inertia_are_judged(engine, name):
+    scenario, adapter = load_scenario(find_scenario_file("point-mass-arm")), load_adapter(engine)
+    states = [scenario.state, *random_states(scenario.model, 1, 1)]
+    rows = judged(adapter, adapter.integrator(name), scenario.model, states)
+    assert len(rows) == 4 and all(row.verdict == Verdict.AGREES for row in rows)
 
 
 @cache

@@ -109,6 +109,7 @@ TREE_JOINTS = {
     "free-body-with-rotors": ("free", "hinge", "hinge", "hinge"),
     "loaded-tree": ("ball", "hinge", "universal", "weld", "slide", "cylindrical", "rod", "free"),
     "open-governor": ("hinge", "hinge", "hinge"),
+    "point-mass-arm": ("universal", "slide"),
     "robot-arm": ("hinge",) * 6,
     "tree-of-seven": TREE_OF_SEVEN,
     "tree-of-seven-sprung": TREE_OF_SEVEN,
