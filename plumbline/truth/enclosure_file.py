@@ -89,9 +89,10 @@ def parse_certificate(raw: bytes) -> Certificate:
     fits = type(far) is list and len(far) == len(kind) and {*map(type, far)} == {int}
     fits = fits and all(-1 <= a < (k if kind[k] != "free" else 0) for k, a in enumerate(far))
     _expect(fits, "far", "of each joint -1 or a body before it, of free bodies -1")
-    pairs = type(springs) is list and all(type(x) is list and len(x) == 2 for x in springs)
+    pairs = type(springs) is list and len(springs) <= MAX_BODIES  # which (F) needs
+    pairs = pairs and all(type(x) is list and len(x) == 2 for x in springs)
     fits = pairs and all(type(b) is int and -1 <= b < len(far) for x in springs for b in x)
-    _expect(fits, "springs", "pairs of bodies, -1 the world")
+    _expect(fits, "springs", f"at most {MAX_BODIES} pairs of bodies, -1 the world")
     times, arrays = _doubles(data, "times", (-1,)), {}
     _expect(times[:1] >= 0 and np.all(np.diff(times) > 0), "times", "ascending numbers ≥ 0")
     for name, (shape, _) in SHAPES.items():
@@ -99,8 +100,10 @@ def parse_certificate(raw: bytes) -> Certificate:
         arrays[name] = _doubles(data, name, count + shape)
     _expect(np.all(arrays["mass"] > 0), "mass", "positive numbers")
     _expect(np.all(arrays["inertia"] == arrays["inertia"].mT), "inertia", "symmetric matrices")
-    held = np.array([JOINTS[name][1] for name in kind])
-    _expect(not np.any(arrays["stiffness"][held > 0]), "stiffness", "zeros of rods, balls and free bodies")
+    held, hung = np.array([JOINTS[name][1::-1] for name in kind]).T > 0
+    _expect(not np.any(arrays["stiffness"][held]), "stiffness", "zeros of rods, balls and free bodies")
+    for name in ("armature", "damping"):
+        _expect(not np.any(arrays[name][hung]), name, "zeros of rods and free bodies")
     _expect(isinstance(steps, list) and len(steps) > 0, "steps", "a list of steps")
     found = Certificate(kind, far, springs, arrays, times.tolist(), exponent, bits, steps)
     size = found.nq + found.nv

@@ -77,7 +77,8 @@ TARGETS = {
         *(f"plumbline/diagnosis/{name}.py" for name in ("diagnose", "fit")),
         "plumbline/model/invariants.py",
     ],
-    "enclosures": ["plumbline/truth/enclosure*.py"],
+    "checker": ["plumbline/truth/enclosure_checker.py", "plumbline/truth/enclosure_file.py"],
+    "prover": ["plumbline/truth/enclosure.py"],
 }
 TEST_FILES = {  # by target or top folder, the tests that must notice its mutants
     "reference_impl": ["tests/reference_impl/test_*.py", "tests/adapters/test_reference_engine.py"],
@@ -91,7 +92,8 @@ TEST_FILES = {  # by target or top folder, the tests that must notice its mutant
         "tests/model/test_invariants.py",
         "tests/execution/test_planted_defects.py",
     ],
-    "enclosures": ["tests/truth/test_enclosure.py"],
+    "checker": ["tests/truth/test_enclosure_checker.py", "tests/truth/test_enclosure_file.py"],
+    "prover": ["tests/truth/test_enclosure.py"],
 }
 TOKEN = re.compile(r"\"[^\"]*\"|'[^']*'|\w+\.?\w*|[^\w\s]+")
 LiveFunctions = dict[tuple[str, int], list[FunctionType]]  # functions of a file by name and first line
@@ -654,7 +656,8 @@ def results_path(target: str, options: argparse.Namespace) -> Path:
 def run_target(target: str, options: argparse.Namespace) -> int:
     """In the copy: find the mutants of a target, try them, judge."""
     files = target_files(target)
-    tests = TEST_FILES.get(target.split("/")[0], TEST_FILES["plumbline"])
+    groups = [name for name in TARGETS if name in TEST_FILES and {*files} <= {*target_files(name)}]
+    tests = TEST_FILES[groups[0] if groups else target.split("/")[0]]
     found = find_mutants(files, options.sample, options.seed)
     table = results_path(target, options)
     if options.again:

@@ -1,0 +1,271 @@
+"""The checker of certificates: each bound against exact arithmetic, and stored certificates."""
+
+import ast
+import io
+import json
+import tokenize
+from fractions import Fraction
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from plumbline.truth import enclosure_file
+from plumbline.truth.enclosure_file import parse_certificate
+from tests.helpers.stored_certificates import NAMES, QUANTITIES, proved, stored_document
+
+pytestmark = pytest.mark.skipif(not find_spec("flint"), reason="the truth tools are not installed")
+if find_spec("flint"):
+    from flint import arb, arb_poly, ctx
+
+    from plumbline.truth import enclosure_checker as checker
+
+
+def parsed(document):
+    return parse_certificate(json.dumps(document).encode())
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_stored_certificate_proves_what_it_did(name):
+    """Balls that contain the motion, found in octuple precision, and that are no wider and no narrower."""
+    found = checker.enclose_motion(parsed(stored_document(name)))
+    for quantity in QUANTITIES:
+        balls, expected = getattr(found, quantity), proved(name)[quantity]
+        for ball, text in zip(balls.ravel(), np.ravel(expected["midpoint"]), strict=True):
+            assert ball.overlaps(arb(str(text)))
+        radii = np.frompyfunc(lambda ball: float(ball.rad()), 1, 1)(balls).astype(float)
+        assert found.radius(quantity) == np.max(radii)
+        np.testing.assert_allclose(radii, expected["radius"], rtol=1e-6)
+
+
+def imported_modules(path):
+    tree = ast.parse(Path(path).read_text(encoding="utf-8"))
+    imported = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    return imported | {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+
+
+def test_the_checker_imports_numpy_flint_and_the_standard_library_only():
+    """And the file that reads certificates, which imports NumPy and the standard library only."""
+    standard = {"__future__", "collections.abc", "dataclasses", "fractions", "itertools", "typing"}
+    assert imported_modules(checker.__file__) == standard | {"numpy", "flint", enclosure_file.__name__}
+    standard = {"__future__", "json", "zlib", "dataclasses", "typing"}
+    assert imported_modules(enclosure_file.__file__) == standard | {"numpy"}
+
+
+@pytest.mark.parametrize("name, most", [("enclosure_checker", 300), ("enclosure_file", 100)])
+def test_the_checker_has_at_most_300_lines_of_code_and_its_reader_100(name, most):
+    """Without docstrings, comments and blank lines."""
+    source = Path(enclosure_file.__file__).with_name(f"{name}.py").read_text(encoding="utf-8")
+    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    nodes = [x for x in ast.walk(ast.parse(source)) if isinstance(x, kinds) and ast.get_docstring(x)]
+    documentation = {
+        line for node in nodes for line in range(node.body[0].lineno, node.body[0].end_lineno + 1)
+    }
+    layout = (tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT)
+    tokens = [x for x in tokenize.generate_tokens(io.StringIO(source).readline) if x.type not in layout]
+    lines = {line for x in tokens if x.string for line in range(x.start[0], x.end[0] + 1)}
+    assert most / 2 < len(lines - documentation) <= most
+
+
+def draw_series(rng, rows, columns, radius=0.0, positive=False):
+    c = rng.normal(size=(checker.DEGREE + 1, rows, columns))
+    return checker._Series(np.abs(c) if positive else c, radius)
+
+
+def exact(series, s, radius=Fraction(0)):
+    """Exact values at s (rows, columns) as fractions, of c + radius r."""
+    s = Fraction(s)
+    to_fraction = np.frompyfunc(Fraction, 1, 1)
+    return sum(to_fraction(c) * s**k for k, c in enumerate(series.c)) + radius * to_fraction(series.r)
+
+
+def encloses(series, values, s):
+    """Whether a series encloses exact values, and whether no radius 4 times smaller would."""
+    distance = np.abs(exact(series, s) - values)
+    return bool(np.all(distance <= np.frompyfunc(Fraction, 1, 1)(series.r)))
+
+
+@pytest.mark.parametrize("shapes", [((3, 2), (2, 4)), ((1, 2), (2, 3))], ids=str)
+@pytest.mark.parametrize("radius", [0.0, 0.25])
+def test_a_product_encloses_the_product(shapes, radius):
+    """Radii of both signs; with positive coefficients and s = 1 every term counts in full."""
+    rng = np.random.default_rng(3)
+    for positive in (False, True):
+        a, b = (draw_series(rng, *shape, radius, positive) for shape in shapes)
+        found = a @ b
+        for s in (0, 0.4, 1):
+            for sign in (-1, 0, 1):
+                assert encloses(found, exact(a, s, sign) @ exact(b, s, sign), s)
+        if positive:  # not wider than the sum of the terms above the degree and those with the radii
+            most = exact(found, 1) + np.frompyfunc(Fraction, 1, 1)(found.r)
+            assert np.all(most <= (exact(a, 1, 1) @ exact(b, 1, 1)) * Fraction(1 + 1e-8))
+
+
+def without_terms_above(rng, rows, columns):
+    """A series of degree 5: products of two have no terms above DEGREE, only roundings."""
+    found = draw_series(rng, rows, columns)
+    found.c[6:] = 0
+    return checker._Series(found.c)
+
+
+@pytest.mark.parametrize("rows", [1, 3])
+def test_roundings_are_in_the_radii(rows):
+    rng = np.random.default_rng(4)
+    a, b, c = (without_terms_above(rng, *shape) for shape in ((rows, 3), (3, 5), (rows, 3)))
+    unit = (
+        2.0**-51
+    )  # (F): a sum of K products is off by at most K unit times the sum of their absolute values
+    for found, values, margin in (
+        (a @ b, lambda s: exact(a, s) @ exact(b, s), unit * (checker.DEGREE + 1) * 3 * (a.total @ b.total)),
+        (a + c, lambda s: exact(a, s) + exact(c, s), unit * np.abs(a.c + c.c).sum(0)),
+        (a - c, lambda s: exact(a, s) - exact(c, s), unit * np.abs(a.c - c.c).sum(0)),
+        (a * 0.3, lambda s: exact(a, s) * Fraction(3, 10), unit * 0.3 * a.total),
+        (0.3 * a, lambda s: exact(a, s) * Fraction(3, 10), unit * 0.3 * a.total),
+    ):
+        assert all(encloses(found, values(Fraction(s)), Fraction(s)) for s in (0, 0.4, 1))
+        assert np.allclose(found.r, margin, rtol=1e-8, atol=0)
+        assert not encloses(checker._Series(found.c), values(Fraction(1)), Fraction(1)), "nothing was rounded"
+
+
+def test_products_of_functions_have_their_derivatives():
+    """Row: value, derivatives; (f g)' = f g' + g f'."""
+    rng = np.random.default_rng(5)
+    f, g = (draw_series(rng, 1, 4, radius) for radius in (0.0, 0.125))
+    product, shifted = f * g, f + 0.7
+    for s in (0, 0.4, 1):
+        for sign in (-1, 0, 1):
+            (x,), (y,) = exact(f, s, sign), exact(g, s, sign)
+            values = np.array([[x[0] * y[0], *(x[0] * y[1:] + y[0] * x[1:])]])
+            assert encloses(product, values, s)
+        assert encloses(shifted, exact(f, s) + np.array([[Fraction(0.7), 0, 0, 0]]), s)
+    assert product.r[0, 0] < 4 * (0.125 * f.total[0, 0] + np.abs(f.c).sum() * np.abs(g.c).sum())
+
+
+def test_bounds_are_upper_bounds():
+    rng = np.random.default_rng(6)
+    for _ in range(20):
+        x = np.abs(rng.normal(size=(5, 7)))
+        squares = sum(Fraction(c) ** 2 for c in x.ravel())
+        assert squares < Fraction(float(checker._norm(x))) ** 2 < squares * Fraction(1 + 1e-8)
+        rows = checker._norm(x, axis=1)
+        assert all(
+            sum(Fraction(c) ** 2 for c in row) < Fraction(n) ** 2 for row, n in zip(x, rows, strict=True)
+        )
+        series = draw_series(rng, 2, 2, 0.5)
+        assert np.all(np.abs(exact(series, 1, 1)) <= np.frompyfunc(Fraction, 1, 1)(series.size))
+        assert np.allclose(series.size, np.abs(series.c).sum(0) + 0.5, rtol=1e-8)
+    assert (
+        0 < checker._norm(np.zeros(3)) < 1e-149 and checker._up(0.0) == 2.0**-1000
+    )  # underflows are covered
+    balls = [arb(-3, 0.5), arb(2), arb("0.1")]
+    assert all(
+        abs(ball) < arb(float(bound)) for ball, bound in zip(balls, checker._upper(balls), strict=True)
+    )
+    assert np.allclose(checker._upper(balls), [3.5, 2, 0.1], rtol=1e-8)
+
+
+def test_guesses_are_inverses():
+    rng = np.random.default_rng(7)
+    series = draw_series(rng, 3, 3) * 0.01 + checker._Series(checker._constant(np.eye(3)).c)
+    inverse = checker._Series(checker._inverse_guess(series.c))
+    assert checker._inverse_error(inverse, series, "") < 0.1
+    with pytest.raises(checker.Rejected, match="message"):
+        checker._inverse_error(inverse, series * 3, "message")
+    J = series.c
+    P = checker._recurrence(J, np.eye(3), 1)
+    for k in range(3):  # (k + 1) P_(k+1) = sum of J_i P_(k-i)
+        assert np.allclose((k + 1) * P[k + 1], sum(J[i] @ P[k - i] for i in range(k + 1)))
+
+
+def test_a_series_at_a_point_encloses_its_values():
+    series = draw_series(np.random.default_rng(8), 2, 3)
+    for s in (Fraction(0), Fraction(1, 3), Fraction(7, 9), Fraction(1)):
+        found = checker._evaluate(series, float(s))
+        assert not np.any(found.c[1:])
+        assert encloses(found, exact(series, s), 0)
+        assert np.all(found.r < 1e-13 * series.total)
+
+
+def test_variables_enclose_the_candidate_and_its_tube():
+    rows = [np.random.default_rng(9).normal(size=length) for length in (checker.DEGREE + 6, 3, 0)]
+    found = checker._variables(rows, [0.25, 0.5, 0.75])
+    for i, (row, x) in enumerate(zip(rows, found, strict=True)):
+        for s in (Fraction(0), Fraction(1, 3), Fraction(1)):
+            value = sum(Fraction(c) * s**k for k, c in enumerate(row))
+            for move in (Fraction(-1 - i, 4), Fraction(1 + i, 4)):
+                slopes = [Fraction(int(k == i)) for k in range(3)]
+                assert encloses(x, np.array([[value + move, *slopes]]), s)
+        above = np.abs(row[checker.DEGREE + 1 :]).sum()
+        assert x.r[0, 0] < (0.25 * (1 + i) + above) * (1 + 1e-8) and np.all(x.r[0, 1:] < 1e-14)
+
+
+def test_the_next_ellipsoid_contains_the_last_and_the_jump():
+    """All e = X w + j with |w| <= radius are T w' with |w'| <= the radius that is returned."""
+    rng = np.random.default_rng(10)
+    X = rng.normal(size=(4, 4)) @ np.diag([1, 1e-1, 1e-3, 1e-5])
+    error, radius, jump = 1e-6, 0.7, np.array([1e-3, 0, 2e-3, 1e-4])
+    T, bound = checker._next_ellipsoid(checker._Series(checker._constant(X).c, error), radius, jump)
+    assert np.isclose(np.linalg.cond(T), 100)
+    largest = 0.0
+    for _ in range(300):
+        w = rng.normal(size=4)
+        moved = (X + error * rng.choice([-1, 1], (4, 4))) @ (w * radius / np.linalg.norm(w))
+        e = moved + rng.choice([-1, 1], 4) * jump
+        largest = max(largest, float(np.linalg.norm(np.linalg.solve(T, e))))
+    assert largest <= bound < 1.5 * largest + 2 * np.linalg.norm(np.abs(np.linalg.inv(T)) @ jump)
+
+
+# planted faults
+
+
+def test_the_bound_of_the_defect_holds_and_counts_every_power():
+    """Of the whole polynomials: at the end of a step all terms of a positive one count in full."""
+    certificate = parsed(stored_document("one-ball"))
+    mechanism, (length, *rows) = checker._Mechanism(certificate, arb), certificate.steps[0]
+    with ctx.workprec(certificate.bits + checker.GUARD_BITS):
+        unit = arb(2) ** -certificate.bits
+        y, h = [arb_poly([c * unit for c in row]) for row in rows], length * unit
+        kinematic, bounds = checker._bound_defect(mechanism, y, h)
+        for s in (arb(0), arb(0.3), arb(1)):
+            at = [arb_poly([poly(s)]) for poly in y]
+            rates = [arb_poly([poly.derivative()(s) / h]) for poly in y[mechanism.nq :]]
+            qdot, g = mechanism.equations(at, rates)
+            for k, x in enumerate(g):
+                assert abs(x(arb(0))) < arb(float(bounds[k]))
+            for k, x in enumerate(qdot):
+                assert abs(x(arb(0)) * h - y[k].derivative()(s)) < arb(float(kinematic[k]))
+        longer = [
+            poly + arb_poly([0] * 60 + [arb(2) ** -40]) for poly in y
+        ]  # far above the candidate's order
+        assert np.all(checker._bound_defect(mechanism, longer, h)[0] > 2.0**-36)
+
+
+@pytest.mark.parametrize("name, value", [("ROUNDING", 0.0), ("TINY", -1.0), ("UNIT", (0.25, 0.25))])
+def test_a_wrong_constant_of_the_bounds_is_noticed(monkeypatch, name, value):
+    monkeypatch.setattr(checker, name, arb(*value) if name == "UNIT" else value)
+    with pytest.raises((AssertionError, checker.Rejected)):
+        test_roundings_are_in_the_radii(3)
+        test_bounds_are_upper_bounds()
+        test_the_bound_of_the_defect_holds_and_counts_every_power()
+
+
+def test_a_series_that_is_cut_without_its_remainder_is_noticed(monkeypatch):
+    usual = checker._convolution
+
+    def cut(a, b):
+        found = usual(a, b)
+        found[checker.DEGREE + 1 :] = 0
+        return found
+
+    monkeypatch.setattr(checker, "_convolution", cut)
+    with pytest.raises(AssertionError):
+        test_a_product_encloses_the_product(((3, 2), (2, 4)), 0.0)
+
+
+@pytest.mark.parametrize("name", ["_up", "_norm", "_inverse_guess", "_convolution", "_upper"])
+def test_nan_is_never_accepted(monkeypatch, name):
+    usual = getattr(checker, name)
+    monkeypatch.setattr(checker, name, lambda *a, **options: usual(*a, **options) * np.nan)
+    with pytest.raises(checker.Rejected):
+        checker.enclose_motion(parsed(stored_document("one-ball")))
