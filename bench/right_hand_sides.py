@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Literal
 
 import exudyn
 import mujoco
@@ -15,8 +16,11 @@ from adapters import exudyn_engine, mujoco_engine, pinocchio_engine
 from adapters.exudyn_common import make_settings
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import quaternion_rate
+from plumbline.model.random_mechanisms import random_tree
+from plumbline.model.sampling import random_states
 from reference_impl.direct import DirectSystem, solve_dense
 from reference_impl.structured import StructuredSystem, component_first
+from reference_impl.tree_elimination import TreeSystem
 from tests.helpers.random_chains import random_chain
 
 Call = Callable[[], object]
@@ -35,6 +39,64 @@ def random_pendulum(bodies: int, rods: bool = False, seed: int = 1) -> tuple[Mod
 
     """
     return random_chain(np.random.default_rng(seed), [rods] * bodies)
+
+
+def hinge_tree(shape: Literal["chain", "binary tree", "star"], bodies: int) -> tuple[Model, State]:
+    """Draw bodies on hinges with full inertia tensors and skew axes.
+
+    Args:
+        shape: each body on the one before; two on every body; all on the world.
+        bodies: number of bodies.
+
+    Returns:
+        The model and a state of it.
+
+    """
+    far = np.full(bodies, -1) if shape == "star" else np.arange(bodies) - 1
+    waiting = [(-1, 0, bodies)] if shape == "binary tree" else []
+    while waiting:  # bodies of a branch follow each other
+        above, first, count = waiting.pop()
+        far[first], half = above, count // 2
+        branches = (first, first + 1, half), (first, first + 1 + half, count - 1 - half)
+        waiting += [branch for branch in branches if branch[2] > 0]
+    drawn = random_tree(np.random.default_rng(1), bodies, ("hinge",), loads=False)
+    model = drawn.changed(body=np.stack([far, np.arange(bodies)], axis=1), kind=("hinge",) * bodies)
+    (state,) = random_states(model, 1, 1)
+    return model, state
+
+
+def tree_call(model: Model, state: State) -> Call:
+    """Prepare the reference's elimination of trees.
+
+    Args:
+        model: the tree.
+        state: attitudes and rates of its bodies.
+
+    Returns:
+        The call that computes the accelerations.
+
+    """
+    system = TreeSystem([model])
+    q = component_first(state.r, state.p)
+    v = component_first(state.v, quaternion_rate(state.p, state.omega))
+    return lambda: system.acceleration(q, v)
+
+
+def pinocchio_crba_call(model: Model, state: State) -> Call:
+    """Prepare Pinocchio's composite-rigid-body algorithm with a dense solve.
+
+    Args:
+        model: the tree.
+        state: attitudes and rates of its bodies.
+
+    Returns:
+        The call that computes the joints' accelerations.
+
+    """
+    held = pinocchio_engine.PinocchioChain(model, "crba")
+    q, v = held.coordinates(state)
+    engine, data = held.pin_model, held.data
+    return lambda: np.linalg.solve(pin.crba(engine, data, q), -pin.nonLinearEffects(engine, data, q, v))
 
 
 def structured_call(model: Model, state: State, batch: int = 1) -> Call:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -99,5 +99,27 @@ def test_growth(benchmark: Any, rods: bool) -> None:
             "joints": "rods" if rods else "balls",
             "exponent": float(slope),
             "1000 to 10000": float(last),
+        },
+    )
+
+
+@pytest.mark.parametrize("shape", ["chain", "binary tree", "star"])
+def test_trees(benchmark: Any, shape: Literal["chain", "binary tree", "star"]) -> None:
+    """A hundred hinges beside Pinocchio, and the cost exponent to 10,000 of them."""
+    hundred = right_hand_sides.hinge_tree(shape, 100)
+    calls = {
+        "pinocchio": right_hand_sides.pinocchio_crba_call(*hundred),
+        "100": right_hand_sides.tree_call(*hundred),
+        "10000": right_hand_sides.tree_call(*right_hand_sides.hinge_tree(shape, 10_000)),
+    }
+    timing = benchmark.pedantic(time_interleaved, args=(calls,), rounds=1, iterations=1)
+    record_table(
+        benchmark,
+        {
+            "kind": "tree",
+            "shape": shape,
+            "microseconds": {name: 1e6 * t.best for name, t in timing.items()},
+            "ratio": timing["100"].ratio_to(timing["pinocchio"]),
+            "exponent": float(np.log(timing["10000"].ratio_to(timing["100"])) / np.log(100)),
         },
     )
