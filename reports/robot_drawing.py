@@ -10,6 +10,7 @@ from reports.results import Record
 _SIZE = 312  # px, the larger of width and height of the robot
 _MARGIN = 26  # px around it, for the numbers
 _NEAR = 9.0  # px: marks that are nearer to each other share one
+_MAX_RANGES = 2  # of numbers at one place
 _AXIS = 22.0  # px, length of the world's axes in the drawing
 _AZIMUTH, _ELEVATION = math.radians(35), math.radians(25)  # of the view
 Point = tuple[float, float]
@@ -32,9 +33,9 @@ def draw(bodies: Sequence[Record], marked: Mapping[str, Sequence[str]]) -> Recor
 
     Returns:
         ``size``: width and height [px]; ``lines``: x1, y1, x2, y2 [px] from each parent's origin to the
-        body's; ``points``: x, y, name and is_marked of each body; ``numbers``: x, y and text beside marked
-        bodies; ``legend``: name and words by number; ``axes`` and ``world``: of the world's frame.  None
-        where there is nothing to draw.
+        body's; ``points``: x, y, name and is_marked of each body; ``numbers``: x, y, text and anchor beside
+        marked bodies; ``legend``: name and words by number; ``axes`` and ``world``: of the world's frame.
+        None where there is nothing to draw.
 
     """
     if not bodies:
@@ -76,12 +77,29 @@ def _axis(start: Point, k: int) -> Record:
 
 
 def _numbers(places: Sequence[Point]) -> list[Record]:
-    """Write the numbers of marks that lie together as one text."""
-    groups: list[tuple[Point, list[str]]] = []
+    """Write the numbers of marks that lie together as one text, towards the middle of the drawing."""
+    groups: list[tuple[Point, list[int]]] = []
     for number, place in enumerate(places, 1):
-        near = next((texts for first, texts in groups if math.dist(first, place) < _NEAR), None)
+        near = next((numbers for first, numbers in groups if math.dist(first, place) < _NEAR), None)
         if near is None:
-            groups.append((place, [str(number)]))
+            groups.append((place, [number]))
         else:
-            near.append(str(number))
-    return [{"x": x, "y": y, "text": ", ".join(texts)} for (x, y), texts in groups]
+            near.append(number)
+    found = []
+    for (x, y), numbers in groups:
+        is_right = x > _SIZE / 2
+        found.append({"x": x - 8 if is_right else x + 8, "y": y + 4, "text": _ranges(numbers),
+                      "anchor": "end" if is_right else "start"})  # fmt: skip
+    return found
+
+
+def _ranges(numbers: Sequence[int]) -> str:
+    """Write ascending numbers as "1–3, 5"; of many ranges the first."""
+    ranges: list[list[int]] = []
+    for number in numbers:
+        if ranges and ranges[-1][-1] == number - 1:
+            ranges[-1][1:] = [number]
+        else:
+            ranges.append([number])
+    texts = ["–".join(map(str, one)) for one in ranges]
+    return ", ".join(texts[:_MAX_RANGES]) + (" …" if len(texts) > _MAX_RANGES else "")

@@ -341,29 +341,41 @@ class _Trial:
         self.has_structure = has_structure  # whether the own model has been given other joints already
         # of the model before it was lumped: what is fixed to the world and cancels there counts too
         self.placed = [pose_tolerances(whole, state) for state in states(whole)]
+        # what was certified, by the changes' identities, which stay theirs while they are kept here
+        self.tried: dict[
+            tuple[int, ...], tuple[NeutralModel, list[CertifiedModelQuantities], Sequence[Change]]
+        ] = {}
 
     def worst(self, changes: Sequence[Change], count: int) -> Mapping[str, Mismatch] | None:
         """Worst entries with the changes made; None where the joints still differ."""
-        changed = apply_changes(self.own, self.theirs, changes)
+        changed, truths = self.certified(changes, count)
         order = joint_permutation(changed, self.reading)
         if order is None:
             return None
         states = self.states(changed)[:count]
-        truths = self.certified(changed, count)
         still = {change.joint for change in changes if change.field == ARMATURE_ENERGY}
         truths = [_without_armature(changed, still, *pair) for pair in zip(states, truths, strict=True)]
         offsets = {change.body: change.theirs for change in changes if change.field == FRAME}
         truths = [_with_frames(truth, offsets) for truth in truths]
         return mismatches(changed, truths, [permuted(one, order) for one in self.answers[:count]])
 
-    def certified(self, changed: NeutralModel, count: int) -> list[CertifiedModelQuantities]:
-        """Certify a changed model; its poses within the bounds of the model before it was lumped."""
-        truths = certify_states(changed, self.states(changed)[:count])
-        return [_widened(*pair) for pair in zip(truths, self.placed, strict=False)]
+    def certified(
+        self, changes: Sequence[Change], count: int
+    ) -> tuple[NeutralModel, list[CertifiedModelQuantities]]:
+        """Make changes and certify states, each once; poses within the bounds before bodies were lumped."""
+        key = tuple(map(id, changes))
+        if key not in self.tried:
+            self.tried[key] = apply_changes(self.own, self.theirs, changes), [], changes
+        changed, truths, _ = self.tried[key]
+        if joint_permutation(changed, self.reading) is not None:
+            new = slice(len(truths), count)
+            pairs = zip(certify_states(changed, self.states(changed)[new]), self.placed[new], strict=True)
+            truths += [_widened(*pair) for pair in pairs]
+        return changed, truths[:count]
 
     def smallest_with_omissions(self, changes: Sequence[Change]) -> list[Change] | None:
         """Try the changes alone, then with terms that the dynamics may leave out."""
-        changed, wrong = apply_changes(self.own, self.theirs, changes), self.wrong(changes)
+        (changed, _), wrong = self.certified(changes, 0), self.wrong(changes)
         is_energy_only = "kinetic_energy" in wrong and wrong <= {"kinetic_energy", "position", "attitude"}
         omitted = energy_omissions(changed) if is_energy_only else omissions(changed)
         for size in range(MAX_OMISSIONS + 1):
@@ -383,10 +395,10 @@ class _Trial:
 
     def misplaced(self, changes: Sequence[Change]) -> float:
         """How many bodies are elsewhere at the first state, with the changes made."""
-        changed = apply_changes(self.own, self.theirs, changes)
+        changed, truths = self.certified(changes, 1)
         if joint_permutation(changed, self.reading) is None:
             return np.inf
-        (truth,) = self.certified(changed, 1)
+        (truth,) = truths
         own, theirs = truth.quantities.poses, self.answers[0].poses
         return sum(
             bool(np.any(np.abs(own[b] - theirs[b]) > truth.tolerance["poses"][b])) for b in own if b in theirs
@@ -419,8 +431,7 @@ class _Trial:
         found = self.worst(changes, count)
         if found is None or {n for n, m in found.items() if m.ratio > 1} - {"position", "attitude"}:
             return []
-        changed = apply_changes(self.own, self.theirs, changes)
-        truths = certify_states(changed, self.states(changed)[:count])
+        changed, truths = self.certified(changes, count)
         frames = []
         for body in changed.bodies:
             pairs = [

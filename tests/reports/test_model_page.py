@@ -28,7 +28,7 @@ MASSLESS = f"""<robot name="r"><link name="base"/><link name={quoteattr(EVIL)}/>
 def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of a file with a cause, one that is refused, and one that cannot be used."""
     folder = tmp_path_factory.mktemp("model page")
-    files = {"moon.xml": MOON, "massless.urdf": MASSLESS, "bad <b>.urdf": "<robot><link/></robot>"}
+    files = {"moon.xml": MOON, f"{'massless_' * 9}.urdf": MASSLESS, "bad <b>.urdf": "<robot><link/></robot>"}
     for name, text in files.items():
         (folder / name).write_text(text)
     plan = ModelPlan(tuple(str(folder / name) for name in files), ("mujoco", "pinocchio"), state_count=2)
@@ -58,7 +58,7 @@ def test_the_page_gives_a_line_per_file_and_marks_the_bodies_that_differ():
     ]
     marked = {"upper": ["dart: mass"], "lower": ["dart: axis"], "tip": ["drake: center"]}
     drawing = robot_drawing.draw(bodies, marked)
-    assert [mark["text"] for mark in drawing["numbers"]] == ["1, 2", "3"], "two bodies at one point"
+    assert [mark["text"] for mark in drawing["numbers"]] == ["1–2", "3"], "two bodies at one point"
     assert [entry["name"] for entry in drawing["legend"]] == list(marked)
     assert len(drawing["lines"]) == 3 and drawing["size"][1] > drawing["size"][0]
     assert robot_drawing.draw([], {}) is None
