@@ -146,7 +146,11 @@ def write_model_script(
             tree = shrink_tree(tree, shows, seconds)
         path = bench.write(tree)
         result = bench.judged(path)
-        assert result is not None
+        if result is None:
+            raise NoModelScript(
+                f"a copy of {shown} outside of its folder cannot be compared; --strip-geometry of `model` "
+                "leaves meshes out"
+            )
         return _render(bench, form, result, write_xml(tree, XML_WIDTH), since)
 
 
