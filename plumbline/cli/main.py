@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import signal
 import sys
 import tempfile
@@ -112,6 +113,22 @@ class LazyGroup(click.Group):
             raise click.UsageError(f"no command {args[0]!r}; {hint}", ctx)
         return super().resolve_command(ctx, args)
 
+    def main(self, *args: Any, **extra: Any) -> Any:
+        """Run as a program; where not even an error can be written, the machine has failed.
+
+        Args:
+            *args: of `click.Group.main`.
+            **extra: of `click.Group.main`.
+
+        Returns:
+            What the command returns, where click does not exit.
+
+        """
+        try:
+            return super().main(*args, **extra)
+        except OSError:
+            sys.exit(ExitCode.MACHINE_FAILED)
+
     def invoke(self, ctx: click.Context) -> Any:
         """Run a command; an interruption or an internal error ends with its own exit code and a sentence.
 
@@ -122,6 +139,7 @@ class LazyGroup(click.Group):
             What the command returns.
 
         """
+        _make_streams_writable()
         try:
             with _termination_as_interrupt():
                 return super().invoke(ctx)
@@ -149,6 +167,16 @@ class LazyGroup(click.Group):
                 err=True,
             )
             sys.exit(ExitCode.HARNESS_FAILED)
+
+
+def _make_streams_writable() -> None:
+    """Let a closed stream take words, and one of another encoding take all letters."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:  # closed by the shell, as in `>&-`
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115
+        elif getattr(stream, "errors", "") == "strict":
+            stream.reconfigure(errors="backslashreplace")
 
 
 @contextmanager

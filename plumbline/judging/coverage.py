@@ -44,9 +44,7 @@ from reference_impl.tree_elimination import eliminated_system
 COVERED_LEVELS: tuple[Level, ...] = ("state", "step", "trajectory", "invariants")
 MAX_MISTAKE = 0.1  # of a parameter's scale: only larger ones are reported, or none; the level does not see it
 WEAK_MISTAKE = 1e-9  # from here on the order of an effect is found by a second mistake …
-LARGER_MISTAKE = (
-    4.0  # … that is larger by this factor, at half the step: the integrator's error falls to a 16th
-)
+LARGER_MISTAKE = 4.0  # … that is larger by this factor, both at half the step: the integrator's error falls
 DOUBTFUL_MISTAKE = 1e-6  # from here on an effect may be rounding of the runs: a proof is tried
 NO_EFFECT = 1e-9  # of the largest effect that a term could have: rounding
 MOTION_SAMPLES = 32  # of a motion, at which the effect of a mistake is measured; or all, where it has fewer
@@ -133,7 +131,7 @@ def scenario_coverage(
         model: its mechanism.
         state: its initial state.
         times: (T,) its sample times [s].
-        states: the states of the levels state and step, the initial one first.
+        states: the states of the levels state and step, the initial one first unless its pose is singular.
         rows: judged rows of the scenario, of correct engines; those that agree count, and only their engines,
             quantities and tolerances.
         levels: of `COVERED_LEVELS`.
@@ -151,7 +149,8 @@ def scenario_coverage(
         for row in judged:
             if row.level == "state":
                 offered.setdefault(row.engine, set()).add(row.quantity)
-        by_quantity = _state_ratios(model, states, parameters)
+        is_initial_compared = np.array_equal(states[0].p, state.p) and np.array_equal(states[0].r, state.r)
+        by_quantity = _state_ratios(model, states, parameters, is_initial_compared)
         by_engine = {
             engine: _sharpest([by_quantity[q] for q in STATE_UNITS if q in names])
             for engine, names in (offered or {"": set(STATE_UNITS)}).items()
@@ -162,7 +161,8 @@ def scenario_coverage(
             model,
             parameters,
             by_engine,
-            _proofs(model, states, parameters, by_engine, "state"),
+            _proofs(model, states, parameters, by_engine, "state")
+            | ({} if is_initial_compared else _uncompared_initial_state(parameters)),
         )
     if "step" in levels and not model.has_loops and model.n <= MAX_STEP_BODIES:
         some = states[:STEP_STATES]
@@ -212,18 +212,20 @@ def _entries(
 
 
 def _state_ratios(
-    model: Model, states: Sequence[State], parameters: Sequence[Parameter]
+    model: Model, states: Sequence[State], parameters: Sequence[Parameter], is_initial_first: bool
 ) -> dict[str, _Ratios]:
-    """Effects over rounding bounds at all states, by quantity; mistakes in the state at the first."""
+    """Effects over rounding bounds at all states, by quantity; mistakes in the initial state at the first."""
     of_model = [i for i, one in enumerate(parameters) if one.kind not in STATE_KINDS]
     of_state = [i for i, one in enumerate(parameters) if one.kind in STATE_KINDS]
     ratios = {quantity: _Ratios(len(parameters)) for quantity in STATE_UNITS}
     effects_of_model = effects_at_states(model, states, [parameters[i] for i in of_model])
-    of_initial = difference_effects(model, states[:1], [parameters[i] for i in of_state])
+    of_initial = difference_effects(
+        model, states[:1], [parameters[i] for i in of_state] if is_initial_first else []
+    )
     for number, state in enumerate(states):
         bounds = state_rounding_bound(model, state)
         found = [(of_model, effects_of_model[number])]
-        if number == 0:
+        if number == 0 and is_initial_first:
             found.append((of_state, of_initial[0]))
         for indices, effects in found:
             for quantity, effect in effects.items():
@@ -233,7 +235,8 @@ def _state_ratios(
                 for i, value in zip(indices, worst, strict=True):
                     ratios[quantity].add(i, value * parameters[i].scale, quantity)
     _add_squares(model, states, parameters, of_model, ratios)
-    _add_squares(model, states[:1], parameters, of_state, ratios)
+    if is_initial_first:
+        _add_squares(model, states[:1], parameters, of_state, ratios)
     return ratios
 
 
@@ -335,28 +338,31 @@ def _motion_entries(
     tolerances = [one for row in rows if (one := _motion_tolerance(row, times)) is not None]
     if not tolerances:
         return []
-    stride = max(1, (len(times) - 1) // MOTION_SAMPLES)
+    # the work of loads is a quadrature over the samples: fewer would add its error to the effects
+    has_power = bool(np.any(model.moment)) or model.has_drag or model.has_elements
+    is_work_judged = has_power and any(one.quantity == "energy_drift" for one in tolerances)
+    stride = 1 if is_work_judged else max(1, (len(times) - 1) // MOTION_SAMPLES)
     tolerances = [replace(one, last_sample=one.last_sample // stride) for one in tolerances]
     times = times[::stride][: max(one.last_sample for one in tolerances) + 1]
     quantities = {one.quantity for one in tolerances}
     substeps = needed_substeps(model, state, times)
     effects = _motion_effects(model, state, times, parameters, quantities, MOTION_MISTAKE, substeps)
     ratios = _motion_ratios(tolerances, len(parameters), effects, {})
+    # what integrators make of invariants is as sharp as small mistakes: there the order is always found
     weak = [
         i
-        for i in range(len(parameters))
+        for i, parameter in enumerate(parameters)
         if any(
-            one.ratio[i] <= 1 / WEAK_MISTAKE
+            parameter.kind not in STATE_KINDS if level == "invariants" else one.ratio[i] <= 1 / WEAK_MISTAKE
             for level, engines in ratios.items()
             for one in engines.values()
-            if not (level == "invariants" and parameters[i].kind in STATE_KINDS)
         )
     ]
     if weak:
         again = [parameters[i] for i in weak]
-        size = LARGER_MISTAKE * MOTION_MISTAKE
-        larger = _motion_effects(model, state, times, again, quantities, size, 2 * substeps)
-        by_index = {i: {q: x[k] for q, x in larger.items()} for k, i in enumerate(weak)}
+        sizes = MOTION_MISTAKE, LARGER_MISTAKE * MOTION_MISTAKE
+        finer = [_motion_effects(model, state, times, again, quantities, x, 2 * substeps) for x in sizes]
+        by_index = {i: [{q: x[k] for q, x in one.items()} for one in finer] for k, i in enumerate(weak)}
         ratios = _motion_ratios(tolerances, len(parameters), effects, by_index)
     found = []
     visited = _visited_states(model, state, times)
@@ -436,9 +442,13 @@ def _motion_effects(
 
 def _motion_ratios(
     tolerances: Sequence[_MotionTolerance], count: int, effects: Mapping[str, Array],
-    larger: Mapping[int, Mapping[str, Array]],
+    finer: Mapping[int, Sequence[Mapping[str, Array]]],
 ) -> dict[Level, dict[str, _Ratios]]:  # fmt: skip
-    """Effects over tolerances by level and engine; of some parameters by the order of the effect."""
+    """Effects over tolerances by level and engine; of some parameters by the order of the effect.
+
+    Those are given again at half the step, of the same mistake and of a larger one: an effect that falls with
+    the step is the integrator's error, which a run's study extrapolates away.
+    """
     ratios: dict[Level, dict[str, _Ratios]] = {}
     for one in tolerances:
         of_engine = ratios.setdefault(one.row.level, {}).setdefault(one.row.engine, _Ratios(count))
@@ -446,12 +456,17 @@ def _motion_ratios(
         for i in range(count):
             effect = float(effects[one.quantity][i, one.last_sample])
             ratio = effect / one.tolerance / MOTION_MISTAKE
-            if i in larger:
-                growth = float(larger[i][one.quantity][one.last_sample]) / max(effect, TINY)
-                if growth < LARGER_MISTAKE / 2:
+            if i in finer:
+                same, more = (float(x[one.quantity][one.last_sample]) for x in finer[i])
+                growth = more / max(same, TINY)
+                if (
+                    same < effect / LARGER_MISTAKE and growth < 2 * LARGER_MISTAKE
+                ) or growth < LARGER_MISTAKE / 2:
                     ratio = 0.0  # rounding, or the integrator's error
                 elif growth > 2 * LARGER_MISTAKE:  # grows with the square of the mistake
-                    ratio = float(np.sqrt(effect / one.tolerance)) / MOTION_MISTAKE
+                    ratio = float(np.sqrt(more / one.tolerance)) / (LARGER_MISTAKE * MOTION_MISTAKE)
+                else:
+                    ratio = same / one.tolerance / MOTION_MISTAKE
             of_engine.add(i, ratio, label)
     return ratios
 
@@ -500,6 +515,12 @@ def _proofs(
         elif pull[k] <= NO_EFFECT and level != "state":
             found[i] = f"joint forces alone take up its term, {term}, {where}: no acceleration changes"
     return found
+
+
+def _uncompared_initial_state(parameters: Sequence[Parameter]) -> dict[int, str]:
+    """The parameters of an initial state at which nothing is compared."""
+    why = "the initial pose is singular, and no engine is compared at it"
+    return {i: why for i, one in enumerate(parameters) if one.kind in STATE_KINDS}
 
 
 def _vanishing(

@@ -440,7 +440,7 @@ def _outcome_from_future(task: Task, future: Future[Outcome]) -> Outcome:
         return Outcome(task.key, failure=str(error))
     except MemoryError:
         return Outcome(task.key, failure=f"out of memory: over {task.limits.gigabytes:g} GB of address space")
-    except Exception as error:  # ImportError among them: the caller recognises "not installed" by its name
+    except (Exception, SystemExit) as error:  # ImportError: the caller recognises "not installed" by its name
         return Outcome(task.key, failure=f"{type(error).__name__}: {error}")
 
 

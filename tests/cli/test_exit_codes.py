@@ -81,12 +81,13 @@ def test_recorded_gaps_alone_are_no_comparison(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
+        ("raise SystemExit(0)\n", "SystemExit: 0"),
         ("import os\nos.abort()\n", "crashed: the worker died of SIGABRT"),
         ("raise RuntimeError('libGL broken')\n", "RuntimeError: libGL broken"),
         ("raise ImportError('libGL.so.1: cannot open')\n", "ImportError: libGL.so.1: cannot open"),
         ("import time\ntime.sleep(600)\n", "timeout: no answer within 5 s"),
     ],
-    ids=["crash", "exception", "missing library", "timeout"],
+    ids=["exit", "crash", "exception", "missing library", "timeout"],
 )
 def test_an_engine_that_fails_at_import_has_failed(tmp_path, text, words):
     place = with_module(tmp_path, "mujoco", text)
@@ -286,3 +287,22 @@ def test_known_issues_of_the_user_are_added_to_those_of_the_project(tmp_path, wh
     plan = called.call_args.args[0]
     assert [issue.id for issue in plan.known_issues] == [e.id for e in load_known_issues()] + ["mine"]
     assert plan.are_engines_required
+
+
+@pytest.mark.parametrize(
+    ("command", "code"),
+    [
+        ("list engines >&-", 0),
+        ("check nothing.yaml 2>/dev/full", 4),
+        ("list engines >/dev/full", 4),
+        ("run rest --level state --engine reference --out {} --jobs 1", 0),
+    ],
+)
+def test_streams_that_take_no_words_or_not_all_letters(tmp_path, command, code):
+    """Closed, full, or in an encoding without the glyphs of the table."""
+    done = subprocess.run(
+        f"{sys.executable} -m plumbline {command.format(tmp_path / 'out')}", shell=True, cwd=ROOT,
+        capture_output=True, text=True, timeout=240,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "ascii"},
+    )  # fmt: skip
+    assert done.returncode == code and "internal error" not in done.stderr, done

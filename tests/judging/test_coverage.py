@@ -1,12 +1,14 @@
 """The coverage table: its figures are what real runs report, and no parameter is blind."""
 
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.coverage import COVERED_LEVELS, scenario_coverage
+from plumbline.judging.rows import RowContext, Verdict
 from plumbline.model.datatypes import KINDS
 from plumbline.scenario import loader as scenarios
 from plumbline.studies.coverage import blind_spots, summarize_coverage
@@ -56,6 +58,22 @@ def test_figures_of_trees():
 
 def test_figures_of_loops():
     assert wrong_figures(confirmed_entries(("four-bar",), 6, seed=9)) == []
+
+
+@pytest.mark.parametrize(("name", "is_covered"), [("four-bar", False), ("hinge-pendulum", True)])
+def test_loops_have_no_entries_of_steps_and_motions(name, is_covered):
+    """With a wrong number an overconstrained loop locks: rows of its runs are left out."""
+    s, context = scenario(name), RowContext(name, "", "reference", "reference", "0")
+    levels = ("trajectory", "invariants")
+    rows = [
+        context.make_row(level, "dop853", "position_limit", Verdict.AGREES, "", compared_until=s.duration)
+        for level in levels
+    ]
+    with patch("plumbline.judging.coverage._motion_entries", return_value=["entry"]) as motions:
+        found = scenario_coverage(name, s.model, s.state, s.times, [s.state], rows, levels)
+    assert motions.called == bool(found) == is_covered
+    if not is_covered:
+        assert scenario_coverage(name, s.model, s.state, s.times, [s.state], rows, ("step",)) == []
 
 
 def test_mistakes_of_twice_the_figure_are_reported_and_of_half_are_not():

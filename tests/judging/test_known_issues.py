@@ -145,10 +145,11 @@ def test_a_malformed_file_is_a_problem_with_a_position(tmp_path, text, at, words
         ({"quantity": "by crbaa"}, "quantity: no quantity matches 'by crbaa'; did you mean 'by crba'?"),
         ({"verdict": "disagrees"}, "expects a disagreement without max_ratio and mechanism"),
         (OFF | {"mechanism": "magic"}, "mechanism: is 'magic'"),
-        (OFF | {"max_ratio": -1}, "max_ratio"),
+        (OFF | {"max_ratio": -1}, "max_ratio: is -1"),
         (OFF | {"max_ratio": "much"}, "max_ratio"),
         (OFF | {"max_ratio": {"ten": 3}}, "max_ratio.ten"),
         (OFF | {"max_ratio": None}, "max_ratio"),
+        (OFF | {"engine": "*"}, "expects a disagreement of every engine; valid would be the engine that"),
         (
             OFF | {"shown_by": "pinochio"},
             "shown_by: no shown_by matches 'pinochio'; did you mean 'pinocchio'?",
