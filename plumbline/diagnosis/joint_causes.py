@@ -99,6 +99,11 @@ def joint_causes(model: Model) -> Iterator[JointCause]:
     for k, kind in enumerate(model.kind):
         if kind == "free":
             continue
+        if kind == "rod":
+            length = float(model.length[k])
+            yield JointCause(
+                f"the length of joint {k + 1}", one_number("length", (k,)), length, length, " m", False
+            )
         if _is(model, (k, 0), "slide") and _shift_is_askew(model, k):
             yield JointCause(f"the origin of the slide of joint {k + 1}", _shifted_slide(k), 0.0, 0.1, " m")
         for side, where in ((0, "far"), (1, "near")):
@@ -150,7 +155,7 @@ def _body_causes(model: Model) -> Iterator[JointCause]:
     """Gravity, masses, inertias, loads and drags."""
     weight = model.gravity
     size = float(np.linalg.norm(weight)) or 1.0
-    if np.any(weight):
+    if np.count_nonzero(weight) > 1:  # else it is a component
         yield JointCause("gravity", _all("gravity"), 1.0, 1.0)
     for i in range(3):
         yield JointCause(f"gravity {'xyz'[i]}", one_number("gravity", (i,)), float(weight[i]), size, " m/s²")

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
 from plumbline.diagnosis.joint_causes import ACCEPTED_SHARE, FACTORS, JointCause, joint_causes, vector_causes
+from plumbline.diagnosis.joint_prediction import VECTORS, Predictor, Seen
 from plumbline.diagnosis.misreadings import Misreading, misreadings
+from plumbline.diagnosis.row_defects import row_defects
 from plumbline.model.datatypes import Array, Model, State, StateQuantities
-from plumbline.model.invariants import kinetic_energy, potential_energy
 from plumbline.model.kinematics import (
     complete_state,
     elastic_energy,
@@ -23,8 +25,8 @@ from plumbline.model.kinematics import (
     rotation_matrix,
 )
 from plumbline.truth.ground_truth import StateTruth
-from plumbline.truth.parameter_effects import evaluate_models, stack_states
-from plumbline.truth.rounding_bound_tree import tree_solution
+from plumbline.truth.parameter_effects import evaluate_models, evaluate_to_first_order, stack_states
+from reference_impl.errors import SingularSystem
 
 MAX_STATES = 2
 STEP = 1e-4  # of a cause's scale, in differences
@@ -39,8 +41,8 @@ MIN_SIMILARITY = 0.3  # cosine between the difference and a cause's effect, to b
 ACCEPTED_RATIO = 4.0  # in bounds
 MIN_RATIO_OF_VECTORS = 100.0  # in bounds: three numbers explain a smaller difference by chance
 CHECKED_SHARE = 10.0  # of what is accepted, at the states that nothing was fitted to
-VECTORS = ("acceleration", "angular_acceleration", "joint_reaction", "joint_moment")
 ENERGIES = ("kinetic_energy", "potential_energy")
+QUANTITIES = (*VECTORS, *ENERGIES)
 QUARTER_TURNS = [  # rotation vectors of the turns of a cube, half turns twice
     angle * np.array(axis) / np.linalg.norm(axis)
     for axis in product((-1, 0, 1), repeat=3)
@@ -49,39 +51,53 @@ QUARTER_TURNS = [  # rotation vectors of the turns of a cube, half turns twice
 UNEXPLAINED = "no single number of a body, a joint, its elements or a spring explains the difference"
 
 
+class _View(NamedTuple):
+    """Which quantities are explained, and how an engine with another mechanism takes a state."""
+
+    quantities: tuple[str, ...]
+    are_bodies_kept: bool = False
+
+
 class _Difference:
     """How an engine differs from the truth at some states, and changes of the mechanism, in bounds."""
 
     def __init__(
-        self, model: Model, reported: Sequence[StateQuantities], truth: StateTruth, places: Sequence[int]
+        self,
+        model: Model,
+        reported: Sequence[StateQuantities],
+        truth: StateTruth,
+        view: _View,
+        places: Sequence[int],
     ) -> None:
-        names = [q for q in (*VECTORS, *ENERGIES) if getattr(reported[0], q) is not None]
+        names = [q for q in view.quantities if getattr(reported[0], q) is not None]
         weights, off = [], []
         for q, i in ((q, i) for q in names for i in places):
             wrong = np.asarray(getattr(reported[i], q) - getattr(truth.quantities[i], q))
             off.append(wrong.ravel())
             weights.append(np.repeat(truth.bounds[i].tolerance(q), 3 if q in VECTORS else 1))
         self.model, self.names, self.states = model, names, [truth.states[i] for i in places]
-        self.weight = np.concatenate(weights)
+        bounds = np.concatenate(weights)
+        self.weight, self.view = np.where(bounds > 0, bounds, np.inf), view  # 0 explains nothing
         self.values = np.concatenate(off) / self.weight
         energies = len([q for q in names if q in ENERGIES]) * len(places)
         self.vectors = slice(len(self.values) - energies)  # the energies are the last
         self.accepted = max(ACCEPTED_RATIO, ACCEPTED_SHARE * float(np.max(np.abs(self.values))))
-        self.right = _predict([model] * len(places), self.states, names)
+        self.predictor = Predictor(model, self.states, view.are_bodies_kept)
+        self.right = _predict(self.predictor, [Seen(model, state) for state in self.states], names)
 
     def effect(self, misread: Misreading) -> Array:
         """What an engine that sees another mechanism, or state, returns besides the truth."""
         seen = [misread(self.model, state) for state in self.states]
         try:
-            found = _predict([model for model, _ in seen], [state for _, state in seen], self.names)
-        except np.linalg.LinAlgError:  # no such mechanism
+            found = _predict(self.predictor, seen, self.names)
+        except (np.linalg.LinAlgError, SingularSystem, ValueError):  # no such mechanism
             return np.full(len(self.values), np.inf)
         return np.asarray((found - self.right) / self.weight)
 
     def of_cause(self, cause: JointCause, x: Array) -> Array:
         """The effect of a cause of one number or three."""
         amount = x if len(x) > 1 else float(x[0])
-        return self.effect(lambda model, state: (cause.change(model, amount), state))
+        return self.effect(lambda model, state: Seen(cause.change(model, amount), state))
 
     def slopes(self, cause: JointCause, x: Array, there: Array) -> Array:
         """Derivatives (numbers, m) of an effect that is ``there`` at x."""
@@ -90,7 +106,7 @@ class _Difference:
 
 
 def diagnose_joints(model: Model, reported: Sequence[StateQuantities], truth: StateTruth) -> str:
-    """Name what explains how an engine differs from the truth on a tree.
+    """Name what explains how an engine differs from the truth on a mechanism of any joints.
 
     Args:
         model: the mechanism.
@@ -101,37 +117,53 @@ def diagnose_joints(model: Model, reported: Sequence[StateQuantities], truth: St
         A sentence: "behaves as if …" or that no single change explains the difference.
 
     """
-    if model.has_loops:
-        return "mechanisms with loops have no diagnosis yet"
-    difference = _Difference(model, reported, truth, range(min(len(reported), MAX_STATES)))
-    if np.max(np.abs(difference.values[difference.vectors])) <= ACCEPTED_RATIO:
+    every = _Difference(model, reported, truth, _View(QUANTITIES), range(min(len(reported), MAX_STATES)))
+    if np.max(np.abs(every.values[every.vectors])) <= ACCEPTED_RATIO:
         return _energy_cause(model, reported, truth)
-    found = []
+    views = [_View(QUANTITIES)]
+    if model.has_loops:
+        views.append(_View(QUANTITIES, are_bodies_kept=True))
+    for view in views:
+        found = _explanations(model, reported, truth, view)
+        if found:
+            named, *equal = found
+            return f"behaves as if {named}" + (
+                f"; the data cannot distinguish this from: {'; '.join(equal)}" if equal else ""
+            )
+    return (not model.has_loops and _moment_cause(model, reported, truth)) or UNEXPLAINED
+
+
+def _explanations(
+    model: Model, reported: Sequence[StateQuantities], truth: StateTruth, view: _View
+) -> list[str]:
+    """Every cause that explains the quantities of a view."""
+
+    def at(*places: int) -> _Difference:
+        return _Difference(model, reported, truth, view, range(*places))
+
+    difference, found = at(min(len(reported), MAX_STATES)), []
+    if np.max(np.abs(difference.values[difference.vectors])) <= ACCEPTED_RATIO:
+        return []
     for cause in _similar(difference, list(joint_causes(model))):
         x = _fitted(cause, np.array([cause.nominal]), difference)
         if x is not None:
             found.append(cause.describe(float(x[0])))
-    first = _Difference(model, reported, truth, range(1))
-    for words, misread in misreadings(model):
+    first, rows = at(1), dict[str, str]()
+    for words, misread in (*misreadings(model), *row_defects(model)) if view == _View(QUANTITIES) else ():
         if np.max(np.abs(first.values - first.effect(misread))) > difference.accepted:
             continue  # at half the cost
         if np.max(np.abs(difference.values - difference.effect(misread))) <= difference.accepted:
-            found.append(words)
+            rows.setdefault(words.partition(" along ")[0], words)  # of a joint's rows one is enough
+    found += rows.values()
     if not found and np.max(np.abs(difference.values)) >= MIN_RATIO_OF_VECTORS:
-        others = _Difference(model, reported, truth, range(MAX_STATES, min(len(reported), MAX_CHECKED)))
-        found = _fitted_vectors(difference, others)
-    if not found:
-        return _moment_cause(model, reported, truth) or UNEXPLAINED
-    named, *equal = found
-    return f"behaves as if {named}" + (
-        f"; the data cannot distinguish this from: {'; '.join(equal)}" if equal else ""
-    )
+        found = _fitted_vectors(difference, at(MAX_STATES, min(len(reported), MAX_CHECKED)))
+    return found
 
 
 def _fitted_vectors(difference: _Difference, others: _Difference) -> list[str]:
     """Causes of three numbers that explain the difference, and that of other states."""
     found: dict[str, str] = {}
-    for starts in (_small_changes, _large_turns):
+    for starts in (_small_changes,) if difference.model.has_loops else (_small_changes, _large_turns):
         for cause, start in starts(difference) if not found else ():
             x = None if cause.subject in found else _fitted(cause, start, difference)
             if x is not None and np.all(
@@ -165,8 +197,14 @@ def _large_turns(difference: _Difference) -> list[tuple[JointCause, Array]]:
 
 def _vectors_at(difference: _Difference, models: Sequence[Model]) -> Array:
     """Effects (models, ·) on accelerations and wrenches, in bounds; all in one batch."""
-    stacked = stack_states(difference.states)
-    found = evaluate_models([(one, complete_state(one, stacked)) for one in (difference.model, *models)])
+    stacked, model = stack_states(difference.states), difference.model
+    is_kept = difference.view.are_bodies_kept
+    cases = [(one, stacked if is_kept else complete_state(one, stacked)) for one in (model, *models)]
+    found = (
+        evaluate_to_first_order(model, difference.states, cases)
+        if model.has_loops
+        else evaluate_models(cases)
+    )
     parts = [found[q].reshape(len(models) + 1, -1) for q in difference.names if q in VECTORS]
     flat = np.concatenate(parts, axis=1)
     return np.asarray((flat[1:] - flat[0]) / difference.weight[difference.vectors])
@@ -285,15 +323,5 @@ def _moment_cause(model: Model, reported: Sequence[StateQuantities], truth: Stat
     return ""
 
 
-def _predict(models: Sequence[Model], states: Sequence[State], names: Sequence[str]) -> Array:
-    """Quantities of mechanisms at their states, one after the other."""
-    found: dict[str, list[Array]] = {name: [] for name in names}
-    for model, state in zip(models, states, strict=True):
-        at = complete_state(model, state)
-        values = dict(zip(VECTORS, tree_solution(model, at), strict=True))
-        values["angular_acceleration"] = np.matvec(rotation_matrix(at.p).mT, values["angular_acceleration"])
-        values["kinetic_energy"] = kinetic_energy(model, at.v, at.omega) + kinetic_energy_of_rotors(model, at)
-        values["potential_energy"] = potential_energy(model, at.r) + elastic_energy(model, at)
-        for name in names:
-            found[name].append(np.ravel(values[name]))
-    return np.concatenate([value for values_ in found.values() for value in values_])
+def _predict(predictor: Predictor, seen: Sequence[Seen], names: Sequence[str]) -> Array:
+    return predictor.predict(seen, names)

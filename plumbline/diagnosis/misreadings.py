@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from plumbline.diagnosis.joint_causes import one_number
+from plumbline.diagnosis.joint_prediction import Seen
 from plumbline.model.datatypes import KINDS, Array, Model, State
 from plumbline.model.kinematics import (
     complete_state,
@@ -18,7 +19,7 @@ from plumbline.model.kinematics import (
 )
 
 EQUAL = 1e-12  # of two readings
-Misreading = Callable[[Model, State], tuple[Model, State]]
+Misreading = Callable[[Model, State], Seen]
 
 
 def misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
@@ -144,40 +145,40 @@ def _different(
 
 
 def _joint_field(name: str, k: int, value: Array) -> Misreading:
-    return lambda model, state: (one_number(name, (k,))(model, value), state)
+    return lambda model, state: Seen(one_number(name, (k,))(model, value), state)
 
 
 def _turned_state(name: str, k: int, to_body: bool) -> Misreading:
-    def misread(model: Model, state: State) -> tuple[Model, State]:
+    def misread(model: Model, state: State) -> Seen:
         values, turn = getattr(state, name).copy(), rotation_matrix(state.p[k])
         values[k] = (turn.T if to_body else turn) @ values[k]
-        return model, replace(state, **{name: values})
+        return Seen(model, replace(state, **{name: values}))
 
     return misread
 
 
 def _turned_load(name: str, k: int, to_body: bool) -> Misreading:
-    def misread(model: Model, state: State) -> tuple[Model, State]:
+    def misread(model: Model, state: State) -> Seen:
         turn = rotation_matrix(complete_state(model, state).p[k])
         values = getattr(model, name).copy()
         values[k] = (turn.T if to_body else turn) @ values[k]
-        return replace(model, **{name: values}), state
+        return Seen(replace(model, **{name: values}), state)
 
     return misread
 
 
 def _coordinate(name: str, k: int, i: int, change: Callable[[float], float]) -> Misreading:
-    def misread(model: Model, state: State) -> tuple[Model, State]:
+    def misread(model: Model, state: State) -> Seen:
         values = getattr(state, name).copy()
         values[k, i] = change(float(values[k, i]))
-        return model, replace(state, **{name: values})
+        return Seen(model, replace(state, **{name: values}))
 
     return misread
 
 
 def _undivided_rate(i: int) -> Misreading:
-    def misread(model: Model, state: State) -> tuple[Model, State]:
+    def misread(model: Model, state: State) -> Seen:
         length = float(np.linalg.norm(spring_vectors(model, state.r, state.p)[i]))
-        return one_number("spring_damping", (i,))(model, length * float(model.spring_damping[i])), state
+        return Seen(one_number("spring_damping", (i,))(model, length * float(model.spring_damping[i])), state)
 
     return misread

@@ -36,12 +36,12 @@ NO_ROTOR = 1e-200  # kg m² or kg, of a coordinate without a rotor: its row stay
 class _Base:
     """S x = b at one state: S⁻¹ of the rows that do not depend on others, and x."""
 
-    def __init__(self, model: Model, state: State) -> None:
+    def __init__(self, model: Model, state: State, has_elements: bool) -> None:
         self.coordinates = joint_coordinates(model, state)[2]
         at = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
         plain = DirectSystem(model).solve(*at, x=self.coordinates)
         self.determinate = plain.determinate
-        system = DirectSystem(_with_rotor_rows(model))
+        system = DirectSystem(_with_rotor_rows(model) if has_elements else model)
         S, b = system.assemble(*at, self.coordinates)
         c = len(system.joint) - system.rotor_count  # rows of constraints
         used = np.ones(len(b), bool)
@@ -68,7 +68,9 @@ class ChangedModels:
         """
         self.model, self.changed = model, changed
         weighed = [replace(m, force=m.force + m.mass[:, None] * m.gravity) for m in changed]
-        self.system = DirectSystem(side_by_side([_with_rotor_rows(one) for one in weighed]))
+        self.has_elements = any(one.has_joint_elements for one in (model, *changed))
+        parts = [_with_rotor_rows(one) for one in weighed] if self.has_elements else weighed
+        self.system = DirectSystem(side_by_side(parts))
         self.length = DirectSystem(model).wrench_length
 
     def solve(self, base: State, states: State) -> dict[str, Array]:
@@ -83,7 +85,7 @@ class ChangedModels:
             determinate parts.
 
         """
-        solved, count, system = _Base(self.model, base), len(self.changed), self.system
+        solved, count, system = _Base(self.model, base, self.has_elements), len(self.changed), self.system
         sizes = np.array([3 * self.model.n, 4 * self.model.n, 0, 0, self.model.n])
         sizes[3] = system.rotor_count // count
         sizes[2] = len(solved.unknowns) - sizes.sum()
@@ -150,7 +152,5 @@ _SIZES = (("r", 3), ("p", 4), ("v", 3), ("omega", 3))
 
 
 def _with_rotor_rows(model: Model) -> Model:
-    """A model whose coordinates all have rotors, if only of a negligible inertia; itself without elements."""
-    if not model.has_joint_elements:
-        return model
+    """A model whose coordinates all have rotors, if only of a negligible inertia."""
     return replace(model, armature=np.where(model.armature == 0, NO_ROTOR, model.armature))

@@ -300,7 +300,9 @@ def difference_effects(
         other = -1 if is_central else 0
         pairs = [_perturbed(model, states, one, sign * mistake) for one in part for sign in (1, other)]
         scale = (1 - other) * mistake * np.array([one.scale for one in part])
-        evaluated = _to_first_order(model, states, pairs) if model.has_loops else evaluate_models(pairs)
+        evaluated = (
+            evaluate_to_first_order(model, states, pairs) if model.has_loops else evaluate_models(pairs)
+        )
         for name, values in evaluated.items():  # (2P, S, ...)
             change = values[::2] - values[1::2]
             change = change / scale.reshape(-1, *(1,) * (change.ndim - 1))
@@ -371,10 +373,20 @@ def evaluate_models(cases: Sequence[tuple[Model, State]]) -> dict[str, Array]:
     return found | {name: np.array([one[name] for one in scalars]) for name in scalars[0]}
 
 
-def _to_first_order(
+def evaluate_to_first_order(
     model: Model, states: Sequence[State], cases: Sequence[tuple[Model, State]]
 ) -> dict[str, Array]:
-    """As `evaluate_models`, of changed models of one mechanism with loops."""
+    """Evaluate all state quantities of changed models of one mechanism with loops.
+
+    Args:
+        model: the mechanism.
+        states: S states of it.
+        cases: changed mechanisms, each with its S states of `stack_states`.
+
+    Returns:
+        As `evaluate_models`, without mass matrices.
+
+    """
     changed, per_state = ChangedModels(model, [one for one, _ in cases]), []
     for at, base in enumerate(states):
         there = {name: np.array([getattr(own, name)[at] for _, own in cases]) for name in vars(base)}

@@ -19,7 +19,7 @@ torque pairs at turns and as force pairs at slides (tJ); d is the accumulation a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -36,6 +36,8 @@ from plumbline.model.kinematics import (
 from plumbline.model.loops import cut_open, smallest_singular_value, wrench_length
 from plumbline.truth.element_terms import joint_elements, spring_terms
 
+RowChange = Callable[[int, Array, Array], tuple[Array, Array]]
+
 
 class _TreeTerms:
     """The Newton–Euler system of a tree at one state, its solution, and the sizes of all that is rounded.
@@ -43,8 +45,15 @@ class _TreeTerms:
     Norms (N,) are named as their vectors: a, alpha, F, moment (of the joint), arm (centre to near point).
     """
 
-    def __init__(self, model: Model, state: State, ends: Sequence[tuple[int, int]] = ()) -> None:
-        self.ends = ends
+    def __init__(
+        self,
+        model: Model,
+        state: State,
+        ends: Sequence[tuple[int, int]] = (),
+        rows: RowChange | None = None,
+        has_end_terms: bool = True,
+    ) -> None:
+        self.ends, self.rows, self.has_end_terms = ends, rows, has_end_terms
         self.model, self.state, self.n, self.far = model, state, model.n, model.body[:, 0]
         self.A = rotation_matrix(state.p)
         self.inertia = self.A @ model.inertia @ self.A.mT
@@ -98,7 +107,8 @@ class _TreeTerms:
 
     def _solve(self) -> None:
         n, model = self.n, self.model
-        held = [self._held_and_bend(k) for k in range(n)]
+        true_rows = [self._held_and_bend(k) for k in range(n)]
+        held = [self.rows(k, *true_rows[k]) for k in range(n)] if self.rows else true_rows
         first = np.cumsum([0, *(E.shape[1] for E, _ in held)])
         C = np.zeros((first[-1] + 6 * len(self.ends), n, 6))
         E_rows = np.zeros((n, 6, len(C)))
@@ -111,7 +121,9 @@ class _TreeTerms:
             C[rows] = self._relative_rows(k, E)
             E_rows[k, :, rows] = E
             gamma[rows] = -E.T @ bend
-        self.elements = joint_elements(model, self.state, [bend for _, bend in held])
+        if not self.has_end_terms:
+            gamma[first[-1] :] = C.reshape(-1, 6 * n)[first[-1] :] @ self._resting_joints(true_rows)
+        self.elements = joint_elements(model, self.state, [bend for _, bend in true_rows])
         armature, bias, torque = (
             np.array([getattr(e, name) for e in self.elements]) for name in ("armature", "bias", "torque")
         )
@@ -135,6 +147,12 @@ class _TreeTerms:
         own = (directions @ (torque - armature * bias)).reshape(n, 2, 3)
         self.solution = np.moveaxis(inverse @ np.concatenate([body_terms, gamma]), 1, 0)  # (4, N, 3)
         self.solution[2:] += np.moveaxis(own, 1, 0)
+
+    def _resting_joints(self, rows: Sequence[tuple[Array, Array]]) -> Array:
+        """(6 N,) accelerations by the velocities alone, where no joint's coordinate accelerates."""
+        n = self.n
+        C = np.concatenate([self._relative_rows(k, np.eye(6)) for k in range(n)]).reshape(6 * n, 6 * n)
+        return np.linalg.solve(C, -np.concatenate([bend for _, bend in rows]))
 
     def _relative_rows(self, k: int, E: Array) -> Array:
         """Rows (c, N, 6) of the relative acceleration of joint k along the columns of E (6, c)."""
@@ -395,18 +413,28 @@ def _directions_used(t: _TreeTerms) -> Array:
     return used
 
 
-def tree_solution(model: Model, state: State) -> Array:
+def tree_solution(
+    model: Model,
+    state: State,
+    ends: Sequence[tuple[int, int]] = (),
+    rows: RowChange | None = None,
+    has_end_terms: bool = True,
+) -> Array:
     """Solve the Newton–Euler system of a tree in doubles.
 
     Args:
         model: the mechanism; masses > 0, inertias positive definite.
         state: a state of it.
+        ends: pairs of bodies that are joined besides, parts of one body.
+        rows: changes what joints hold, as a defect does: of joint k the directions E (6, c) and the relative
+            acceleration (6,) that velocities cause.
+        has_end_terms: whether the rows of ``ends`` count what velocities cause.
 
     Returns:
         (4, N, 3): r̈ [m/s²], ω̇ [rad/s²], and force [N] and moment [N m] of the joints; world axes.
 
     """
-    return np.asarray(_TreeTerms(model, state).solution)
+    return np.asarray(_TreeTerms(model, state, ends, rows, has_end_terms).solution)
 
 
 def tree_tolerances(

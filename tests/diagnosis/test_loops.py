@@ -4,6 +4,7 @@ from functools import cache
 
 import pytest
 
+from plumbline.diagnosis.joint_diagnosis import diagnose_joints
 from plumbline.engines.calls import Evaluation
 from plumbline.judging.rows import RowContext
 from plumbline.judging.state import judge_states
@@ -34,3 +35,16 @@ def report(defect):
 @pytest.mark.parametrize("defect", some_fast(LOOP_DEFECTS, 6))
 def test_every_defect_is_reported(defect):
     assert report(defect)[0], f"nothing reports {defect.name}"
+
+
+@pytest.mark.parametrize("defect", some_fast([d for d in LOOP_DEFECTS if d.expected], 6))
+def test_every_defect_with_words_is_named(defect):
+    model, truth = right(defect.scenario)
+    text = diagnose_joints(model, report(defect)[1], truth)
+    assert defect.expected in text and "cannot distinguish" not in text, text
+
+
+@pytest.mark.parametrize("defect", some_fast([d for d in LOOP_DEFECTS if not d.expected], 6))
+def test_what_has_no_words_gets_no_wrong_name(defect):
+    model, truth = right(defect.scenario)
+    assert "behaves as if" not in diagnose_joints(model, report(defect)[1], truth)
