@@ -16,7 +16,10 @@ def by_content(function: Callable[..., Any]) -> Callable[..., Any]:
     known: dict[bytes, Any] = {}
 
     def call(*arguments: Any, **options: Any) -> Any:
-        key = hashlib.sha256(pickle.dumps((arguments, options))).digest()
+        try:
+            key = hashlib.sha256(pickle.dumps((arguments, options))).digest()
+        except (AttributeError, pickle.PicklingError):  # a function among the arguments
+            return function(*arguments, **options)
         if key not in known:
             known[key] = function(*arguments, **options)
         return known[key]
