@@ -29,7 +29,10 @@ def parsed(document):
 @pytest.mark.parametrize("name", NAMES)
 def test_a_stored_certificate_proves_what_it_did(name):
     """Balls that contain the motion, found in octuple precision, and that are no wider and no narrower."""
-    found = checker.enclose_motion(parsed(stored_document(name)))
+    document, steps = stored_document(name), []
+    found = checker.enclose_motion(parsed(document), lambda *numbers: steps.append(numbers))
+    assert found.times == [float.fromhex(text) for text in document["times"]]
+    assert steps == [(k + 1, len(document["steps"])) for k in range(len(document["steps"]))]
     for quantity in QUANTITIES:
         balls, expected = getattr(found, quantity), proved(name)[quantity]
         for ball, text in zip(balls.ravel(), np.ravel(expected["midpoint"]), strict=True):
@@ -176,6 +179,14 @@ def test_guesses_are_inverses():
     P = checker._recurrence(J, np.eye(3), 1)
     for k in range(3):  # (k + 1) P_(k+1) = sum of J_i P_(k-i)
         assert np.allclose((k + 1) * P[k + 1], sum(J[i] @ P[k - i] for i in range(k + 1)))
+
+
+def test_a_guess_that_is_off_by_more_than_1_is_no_inverse():
+    one = checker._Series(checker._constant(np.eye(1)).c)
+    assert 0.5 <= checker._inverse_error(one, one * 0.5, "") < 0.51
+    for factor in (0, 2, -0.5, -0.9):
+        with pytest.raises(checker.Rejected, match="message"):
+            checker._inverse_error(one, one * factor, "message")
 
 
 def test_a_series_at_a_point_encloses_its_values():

@@ -49,6 +49,13 @@ def test_a_truncated_file_is_malformed():
         ({"springs": [[0, -1]] * 101}, "springs: expected at most 100 pairs of bodies, -1 the world"),
         ({"kind": ["rod"], "armature": [["0x1p0", "0x0p0"]]}, "armature: expected zeros of rods and"),
         ({"kind": ["free"], "damping": [["0x1p0", "0x0p0"]]}, "damping: expected zeros of rods and"),
+        ({"kind": ["ball", "free"], "far": [-1, 0]}, "far: expected of each joint -1 or a body before it"),
+        ({"springs": [[0, -2]]}, "springs: expected at most 100 pairs of bodies, -1 the world"),
+        ({"mass": ["0x0p0"]}, "mass: expected positive"),
+        ({"bits": 2001}, "bits: expected an integer from 16 to 2000"),
+        ({"bits": 15}, "bits: expected an integer from 16 to 2000"),
+        ({"time_exponent": 61}, "time_exponent: expected an integer from -60 to 60"),
+        ({"steps": [[1, *[[1] * 402] * 7]]}, r"steps\[0\]: expected lists of at most 401"),
         ({"mass": ["0x1p-400"]}, "mass: expected finite doubles .* not below 1e-100"),
         ({"bits": 110.0}, "bits: expected an integer from 16 to"),
         ({"bits": True}, "bits: expected an integer"),
@@ -79,6 +86,18 @@ def test_damaged_documents_are_malformed_or_rejected():
             except (MalformedCertificate, checker.Rejected) as error:
                 outcomes[type(error)] += 1
     assert outcomes[MalformedCertificate] and outcomes[checker.Rejected], outcomes
+
+
+@pytest.mark.parametrize(
+    "change", [{"bits": 16}, {"bits": 2000}, {"time_exponent": -60}, {"time_exponent": 60}]
+)
+def test_the_limits_themselves_are_valid(change):
+    assert parsed(stored_document("one-ball") | change)
+
+
+def test_a_compressed_file_is_read_as_its_text():
+    raw = (FOLDER / "one-ball.json.gz").read_bytes()
+    assert parse_certificate(raw).steps == parsed(stored_document("one-ball")).steps
 
 
 def test_damaged_files_are_malformed_or_read_whole():
