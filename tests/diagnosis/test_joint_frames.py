@@ -39,7 +39,7 @@ def test_every_defect_is_reported(defect):
     assert report(defect)[0], f"nothing reports {defect.name}"
 
 
-@pytest.mark.parametrize("defect", some_fast(JOINT_DEFECTS, 6))
+@pytest.mark.parametrize("defect", some_fast(JOINT_DEFECTS, 12))
 def test_every_defect_is_named(defect):
     model, truth = right(defect.scenario)
     text = diagnose_joints(model, report(defect)[1], truth)

@@ -11,7 +11,7 @@ from plumbline.judging.state import judge_states
 from plumbline.model.sampling import compared_states
 from plumbline.scenario.loader import load_scenarios
 from plumbline.truth.ground_truth import state_truth
-from tests.helpers.nightly_tests import some_fast
+from tests.helpers.nightly_tests import slow, some_fast
 from tests.helpers.planted_loops import LOOP_DEFECTS
 
 
@@ -37,14 +37,15 @@ def test_every_defect_is_reported(defect):
     assert report(defect)[0], f"nothing reports {defect.name}"
 
 
-@pytest.mark.parametrize("defect", some_fast([d for d in LOOP_DEFECTS if d.expected], 6))
+@pytest.mark.parametrize("defect", some_fast([d for d in LOOP_DEFECTS if d.expected], 14))
 def test_every_defect_with_words_is_named(defect):
     model, truth = right(defect.scenario)
     text = diagnose_joints(model, report(defect)[1], truth)
     assert defect.expected in text and "cannot distinguish" not in text, text
 
 
-@pytest.mark.parametrize("defect", some_fast([d for d in LOOP_DEFECTS if not d.expected], 6))
+@slow
+@pytest.mark.parametrize("defect", [d for d in LOOP_DEFECTS if not d.expected], ids=lambda d: d.name)
 def test_what_has_no_words_gets_no_wrong_name(defect):
     model, truth = right(defect.scenario)
     assert "behaves as if" not in diagnose_joints(model, report(defect)[1], truth)
