@@ -26,7 +26,7 @@ START = """
 Start with:
   python -m plumbline list scenarios
   python -m plumbline run double-tumbling-balls
-  python -m plumbline run                  (everything; a few minutes)
+  python -m plumbline run                  (everything; about ten minutes)
 """
 
 
@@ -220,6 +220,6 @@ def _write_traceback() -> str:
 @click.version_option(__version__, prog_name="plumbline", message="%(prog)s %(version)s")
 @click.pass_context
 def main(context: click.Context) -> None:
-    """Compare multibody engines with each other and with the notes' equations on identical pendulums."""
+    """Compare multibody engines with each other and with the notes' equations on identical mechanisms."""
     if context.invoked_subcommand is None:
         click.echo(context.get_help())
