@@ -301,7 +301,7 @@ def test_known_issues_of_the_user_are_added_to_those_of_the_project(tmp_path, wh
 def test_streams_that_take_no_words_or_not_all_letters(tmp_path, command, code):
     """Closed, full, or in an encoding without the glyphs of the table."""
     done = subprocess.run(
-        f"{sys.executable} -m plumbline {command.format(tmp_path / 'out')}", shell=True, cwd=ROOT,
+        f"'{sys.executable}' -m plumbline {command.format(tmp_path / 'out')}", shell=True, cwd=ROOT,
         capture_output=True, text=True, timeout=240,
         env={**os.environ, "PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "ascii"},
     )  # fmt: skip
