@@ -30,13 +30,22 @@ def history(folder: Path, pattern: str | None, as_json: bool) -> None:
     document = History(folder).to_document(pattern)
     if as_json:
         click.echo(json.dumps(document, ensure_ascii=False, indent=1))
-        return
+    else:
+        _print_history(folder, document, pattern)
+    if document["damaged"]:
+        raise click.UsageError(
+            "\n".join(f"damaged, left out: {sentence}" for sentence in document["damaged"])
+        )
+
+
+def _print_history(folder: Path, document: dict[str, Any], pattern: str | None) -> None:
     trend = document.get("trend", [])
     print_table(document["nights"], "nights")
     print_table(trend, "trend")
     lines = list(_history_lines(document))
     if not document["nights"]:
-        lines.append(f"no nights in {folder}; `python -m plumbline nightly` makes one")
+        which = "readable nights" if document["damaged"] else "nights"
+        lines.append(f"no {which} in {folder}; `python -m plumbline nightly` makes one")
     elif pattern is not None and not trend:
         lines.append(f"no row matches {pattern!r}")
     out = make_console(sys.stdout)
@@ -52,8 +61,7 @@ def _check_history_folder(folder: Path) -> None:
 
 
 def _history_lines(document: dict[str, Any]) -> list[str]:
-    lines = [f"damaged, left out: {sentence}" for sentence in document["damaged"]]
-    lines += [f"version: {sentence}" for sentence in document["versions"]]
+    lines = [f"version: {sentence}" for sentence in document["versions"]]
     for bad in document["first_bad"]:
         good = f"last good {bad['last_good']}" if bad["last_good"] else "never good"
         lines.append(f"{bad['key']} {bad['verdict']} since {bad['first_bad']} ({good}): {bad['reason']}")

@@ -243,6 +243,13 @@ class _Entry(BaseModel):
             raise invalid_value_error(f"is {shorten(repr(text))}", "one line of printable text")
         return text
 
+    @field_validator("evidence", "reason")
+    @classmethod
+    def _check_says_something(cls, text: str) -> str:
+        if not text.strip():
+            raise invalid_value_error("is empty", "a sentence")
+        return text
+
     @field_validator("versions")
     @classmethod
     def _check_version_range(cls, text: str) -> str:

@@ -15,11 +15,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from plumbline.scenario.errors import shorten
 from plumbline.scenario.generator import RANDOM_FAMILY
-from plumbline.storage.results_schema import DamagedResults
+from plumbline.storage.results_schema import VERDICT_WORDS, DamagedResults
 from plumbline.storage.results_store import Record, read_results, read_table
 
 UNEXPECTED_VERDICT_SQL = "verdict NOT IN ('agrees', 'information') AND known_issue IS NULL"
+MAX_REASON = 500  # letters of what is wrong with a damaged night
 _ROW_COLUMNS = {
     "key": "VARCHAR", "scenario": "VARCHAR", "family": "VARCHAR", "engine": "VARCHAR", "level": "VARCHAR",
     "quantity": "VARCHAR", "unit": "VARCHAR", "value": "DOUBLE", "tolerance": "DOUBLE", "ratio": "DOUBLE",
@@ -76,7 +78,7 @@ class History:
             try:
                 self.nights.append(_read_complete_run(path.parent))
             except (OSError, DamagedResults) as error:
-                self.damaged[path.parent.name] = " ".join(str(error).split())
+                self.damaged[path.parent.name] = shorten(" ".join(str(error).split()), MAX_REASON)
         self.nights.sort(key=lambda night: night.order)
         self._load_tables()
 
@@ -314,4 +316,8 @@ def _read_complete_run(folder: Path) -> StoredRun:
     expected += sum((run.metadata["random_batch"] or {}).get("counts_by_verdict", {}).values())
     if len(table) != expected:
         raise DamagedResults(f"summary.parquet has {len(table)} rows, results.json expects {expected}")
+    if unknown := set(table["verdict"].unique().to_pylist()) - VERDICT_WORDS:
+        raise DamagedResults(
+            f"summary.parquet has the verdict {shorten(repr(min(unknown)))}, which no run gives"
+        )
     return run

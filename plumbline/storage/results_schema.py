@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -37,6 +37,7 @@ _VerdictWord = Literal[
     "agrees", "disagrees", "unresolved", "unsupported", "not installed", "failed", "harness failed",
     "information",
 ]  # fmt: skip
+VERDICT_WORDS: frozenset[str] = frozenset(get_args(_VerdictWord))
 
 
 class DamagedResults(PlumblineError, ValueError):

@@ -11,6 +11,7 @@ import contextlib
 import json
 import os
 import re
+import stat
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -256,6 +257,7 @@ def read_table(folder: Path, name: str) -> pa.Table:
     path = folder / f"{name}.parquet"
     schema = _STUDIES.get(name) or TABLES[name]
     try:
+        _check_is_regular(path)
         with pq.ParquetFile(path, page_checksum_verification=True) as file:
             table = file.read()
         table.validate(full=True)
@@ -361,14 +363,21 @@ def load_json(path: Path) -> Any:
 
     Raises:
         OSError: the file cannot be read.
-        ValueError: it is no JSON.
+        ValueError: it is no regular file, or no JSON.
 
     """
+    _check_is_regular(path)
     text = path.read_text(encoding="utf-8")
     document = json.loads(text)
     if _SURROGATE.search(text):
         document = json.loads(json.dumps(document, ensure_ascii=False).encode("utf-8", "replace"))
     return document
+
+
+def _check_is_regular(path: Path) -> None:
+    """Raise ValueError for what is no regular file: a pipe would wait, a device never end."""
+    if not stat.S_ISREG(path.stat().st_mode):
+        raise ValueError("it is not a regular file")
 
 
 def read_results(folder: Path) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 
 from plumbline.storage.results_schema import DamagedResults
-from plumbline.storage.results_store import write_atomically
+from plumbline.storage.results_store import load_json, write_atomically
 
 MAX_NAME_BYTES = 255  # of a file's name, on most file systems
 
@@ -39,7 +39,7 @@ def read_script_index(folder: Path) -> dict[str, str]:
     """
     path = scripts_folder(folder) / "index.json"
     try:
-        index = json.loads(path.read_text(encoding="utf-8"))
+        index = load_json(path)
     except FileNotFoundError:
         return {}
     except (OSError, ValueError, RecursionError) as error:

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from plumbline.storage.results_store import write_atomically
+from plumbline.storage.results_store import load_json, write_atomically
 
 FILE = "version_changes.json"
 
@@ -22,7 +22,7 @@ def read_version_changes(folder: Path) -> dict[str, dict[str, Any]]:
 
     """
     try:
-        found: dict[str, dict[str, Any]] = json.loads((folder / FILE).read_text(encoding="utf-8"))
+        found: dict[str, dict[str, Any]] = load_json(folder / FILE)
     except (OSError, ValueError):
         return {}
     return found

@@ -107,6 +107,26 @@ def test_a_damaged_file_leaves_the_report_as_it_was(results, name, damage, words
     assert all(page.read_text() == "as it was" for page in pages)
 
 
+@pytest.mark.timeout(60)  # opening a pipe that nobody writes to blocks
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names here")
+@pytest.mark.parametrize("make", ["mkdir", "mkfifo"])
+def test_a_folder_or_a_pipe_in_the_place_of_a_file_is_a_bad_file(results, make):
+    files = {"results.json": ["report", "reproduce"], "scripts/index.json": ["report"]}
+    for name, commands in (files | {"states.parquet": ["report"]}).items():
+        path = results / name
+        path.parent.mkdir(exist_ok=True)
+        content = path.read_bytes() if path.exists() else b"{}"
+        path.unlink(missing_ok=True)
+        getattr(os, make)(path)
+        for command in commands:
+            result = invoke(command, results)
+            assert result.exit_code == ExitCode.BAD_USAGE, result.output
+            message = " ".join(result.stderr.split())
+            assert path.name in message and "not a regular file" in message
+        path.rmdir() if make == "mkdir" else path.unlink()
+        path.write_bytes(content)
+
+
 def test_the_command_that_repeats_a_cell_names_the_file_as_given(tmp_path, monkeypatch):
     """A file of the user that has the name of a catalogue file is not taken for that file."""
     monkeypatch.chdir(tmp_path)

@@ -316,6 +316,17 @@ def test_an_id_twice_is_refused(tmp_path):
     ]  # fmt: skip
 
 
+@pytest.mark.parametrize("field", ["evidence", "reason"])
+@pytest.mark.parametrize("text", ["", " \n"])
+def test_an_entry_says_why(tmp_path, field, text):
+    path = tmp_path / "known.yaml"
+    path.write_text(f"# a comment\n- {json.dumps(GOOD | {field: text})}\n")
+    with pytest.raises(ScenarioError) as caught:
+        known_issues.load_known_issues(path)
+    (problem,) = caught.value.problems
+    assert (problem.line, problem.field, problem.message) == (2, f"[0].{field}", "is empty")
+
+
 def test_the_projects_own_file_is_valid_and_gives_evidence():
     for e in known_issues.load_known_issues():
         assert len(e.evidence) > 20

@@ -1,11 +1,15 @@
 """The history over all nights of a folder; a damaged one is named and left out."""
 
 import json
+import os
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from click.testing import CliRunner
 
 from plumbline.cli.main import main
+from plumbline.execution.exit_codes import ExitCode
 from plumbline.judging.rows import RowContext
 from plumbline.storage import results_store
 from plumbline.storage.history import History, next_night_number
@@ -116,21 +120,60 @@ def change_schema_version(folder):
     (folder / "results.json").write_text(json.dumps(document | {"schema_version": 99}))
 
 
+def change_verdict(folder):
+    path = folder / "results.json"
+    path.write_text(path.read_text().replace('"verdict": "agrees"', '"verdict": "accords"'))
+
+
+def change_verdict_of_the_table(folder):
+    path = folder / "summary.parquet"
+    table = pq.read_table(path)
+    place = table.schema.get_field_index("verdict")
+    pq.write_table(table.set_column(place, "verdict", pa.array(["accords"] * len(table))), path)
+
+
+def replace_by_a_pipe(folder):
+    (folder / "results.json").unlink()
+    os.mkfifo(folder / "results.json")
+
+
+def replace_by_a_folder(folder):
+    (folder / "summary.parquet").unlink()
+    (folder / "summary.parquet").mkdir()
+
+
 def remove_rows(folder):
     document = json.loads((folder / "results.json").read_text())
     (folder / "results.json").write_text(json.dumps(document | {"rows": []}))
 
 
-@pytest.mark.parametrize(
-    "spoil", [truncate_json, truncate_parquet, delete_parquet, change_schema_version, remove_rows]
-)
+SPOILED = {
+    truncate_json: "results.json: not a results file",
+    truncate_parquet: "summary.parquet: is damaged",
+    delete_parquet: "summary.parquet",
+    change_schema_version: "results.json: schema_version 99, this version reads 2",
+    change_verdict: "results.json: rows[0].verdict: is 'accords'; valid would be 'agrees', 'disagrees'",
+    change_verdict_of_the_table: "summary.parquet has the verdict 'accords', which no run gives",
+    replace_by_a_pipe: "results.json: not a results file of plumbline (ValueError: it is not a regular file)",
+    replace_by_a_folder: "summary.parquet: is damaged: it is not a regular file",
+    remove_rows: "summary.parquet has 1 rows, results.json expects 0",
+}
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names here")
+@pytest.mark.parametrize("spoil", SPOILED)
 def test_a_damaged_night_is_named_and_left_out(tmp_path, spoil):
     for day in (1, 2, 3):
         store_run(tmp_path, day, ["agrees"])
     spoil(tmp_path / "20260102T000000Z")
     history = History(tmp_path)
     assert [n.id for n in history.nights] == ["20260101T000000Z", "20260103T000000Z"]
-    assert list(history.damaged) == ["20260102T000000Z"] and all(history.damaged.values())
+    assert list(history.damaged) == ["20260102T000000Z"]
+    assert SPOILED[spoil] in history.damaged["20260102T000000Z"]
+    for options in ([], ["--json"]):
+        shown = CliRunner().invoke(main, ["history", str(tmp_path), *options])
+        assert shown.exit_code == ExitCode.BAD_USAGE
+        assert "20260103" in shown.stdout and "damaged, left out: 20260102T000000Z: " in shown.stderr
 
 
 def test_an_empty_folder_has_no_nights(tmp_path):
