@@ -298,6 +298,14 @@ def test_a_checked_mechanism_is_in_the_rows_diagnosis():
     assert "Checked: they differ by 20 tolerances." in found[0].diagnosis
 
 
+def test_an_unresolved_row_has_the_size_of_its_entry():
+    """What the data decide of it agrees: an entry may require that."""
+    recorded = entry(verdict="unresolved", max_ratio={10: 1.0})
+    for ratio, known in ((0.3, "a"), (1.5, None), (None, None)):
+        found = judged_by([replace(row("unresolved"), ratio=ratio)], [recorded], whole=True)
+        assert found.rows[0].known_issue == known
+
+
 def test_smaller_steps_may_resolve_what_was_unresolved():
     open_ = entry(verdict="unresolved")
     assert judged_by([row("agrees")], [open_], whole=True).stale == [open_]
