@@ -51,7 +51,8 @@ MOTION_SAMPLES = 32  # of a motion, at which the effect of a mistake is measured
 PROOF_SAMPLES = 17  # of the motion, at which a parameter's term is shown to vanish …
 PROOF_RTOL = 1e-13  # … and of that motion
 TINY = float(np.finfo(float).tiny)
-STEP_METHOD = classical_runge_kutta("joint rotations")
+# of free bodies the coordinates of the wider bound: what it reports, the others report too
+STEP_METHOD = classical_runge_kutta("joint rotations", free_coordinates="rigid motion")
 _PLACES: dict[str, str] = {
     "state": "at every compared state",
     "step": "at every state that a compared step starts from",
