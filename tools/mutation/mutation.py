@@ -65,11 +65,17 @@ TARGETS = {
             f"plumbline/judging/{name}.py"
             for name in (
                 "convergence",
+                "coverage",
+                "identity",
+                "invariant_drift",
                 "known_issues",
+                "long_run*",
                 "metamorphic",
-                "refinement_analysis",
+                "outlier",
+                "refinement_*",
                 "run_relations",
                 "state*",
+                "step",
                 "trajectory",
             )
         ),
@@ -81,11 +87,28 @@ TARGETS = {
     "prover": ["plumbline/truth/enclosure.py"],
 }
 TEST_FILES = {  # by target or top folder, the tests that must notice its mutants
-    "reference_impl": ["tests/reference_impl/test_*.py", "tests/adapters/test_reference_engine.py"],
+    "reference_impl": [
+        "tests/reference_impl/test_*.py",
+        "tests/adapters/test_reference_engine.py",
+        "tests/scenario/test_loops.py",
+        *(f"tests/truth/test_{name}.py" for name in ("certified_tree", "loop_motion", "tree_motion")),
+    ],
     "plumbline": [
         *(
             f"tests/judging/test_{name}.py"
-            for name in ("convergence", "known_issues", "metamorphic*", "state", "trajectory*")
+            for name in (
+                "convergence",
+                "coverage",
+                "identity",
+                "known_issues",
+                "long_runs",
+                "metamorphic*",
+                "outlier",
+                "refinement_study",
+                "state",
+                "step",
+                "trajectory*",
+            )
         ),
         *(f"tests/truth/test_{name}.py" for name in ("ground_truth", "rounding_bound", "sensitivity")),
         "tests/diagnosis/test_diagnose.py",
