@@ -6,6 +6,7 @@ import json
 import tokenize
 from fractions import Fraction
 from importlib.util import find_spec
+from itertools import cycle
 from pathlib import Path
 
 import numpy as np
@@ -147,6 +148,7 @@ def test_products_of_functions_have_their_derivatives():
 
 def test_bounds_are_upper_bounds():
     rng = np.random.default_rng(6)
+    assert checker._up(1.0) == 1 + 2.0**-30  # (F): ten nested sums of up to 2^15 products
     for _ in range(20):
         x = np.abs(rng.normal(size=(5, 7)))
         squares = sum(Fraction(c) ** 2 for c in x.ravel())
@@ -227,6 +229,121 @@ def test_the_next_ellipsoid_contains_the_last_and_the_jump():
     assert largest <= bound < 1.5 * largest + 2 * np.linalg.norm(np.abs(np.linalg.inv(T)) @ jump)
 
 
+def test_the_roundings_of_the_candidate_are_in_the_radii_of_its_variables():
+    """Rational coefficients, each rounded to a double once."""
+    coefficients = [Fraction(1, 3 * k) for k in range(1, 9)]
+    (x,) = checker._variables([np.array(coefficients, dtype=float)], np.zeros(1))
+    values = [sum(c * s**k for k, c in enumerate(coefficients)) for s in (Fraction(1), Fraction(1, 3))]
+    for s, value in zip((Fraction(1), Fraction(1, 3)), values, strict=True):
+        assert encloses(x, np.array([[value, 1]]), s)
+    assert not encloses(checker._Series(x.c), np.array([[values[0], 1]]), Fraction(1)), "nothing was rounded"
+    assert np.allclose(x.r, 2.0**-51 * x.total, rtol=1e-8, atol=0)
+
+
+def test_a_series_at_a_point_that_is_rounded_encloses_its_value():
+    """1 - 2^-54 is rounded to 1, which changes s^11 by 11 roundings."""
+    s = 1 - Fraction(1, 2**54)
+    highest = checker._Series(np.eye(checker.DEGREE + 1)[:, -1].reshape(-1, 1, 1))
+    found = checker._evaluate(highest, s.numerator / s.denominator)
+    assert found.c[0, 0, 0] == 1
+    assert encloses(found, np.array([[s**checker.DEGREE]]), Fraction(0))
+    assert np.allclose(found.r, 4 * checker.DEGREE * 2.0**-51, rtol=1e-8, atol=0)
+
+
+# bounds with poor guesses, which need no trust: one that is off by half costs nothing but rounding here
+
+
+def test_the_next_ellipsoid_contains_matrices_that_are_off_by_their_radii():
+    """X = 1 + E, |E_ij| <= 1/2: the largest is 1 + J/2, of norm 3 in four dimensions."""
+    T, bound = checker._next_ellipsoid(checker._Series(checker._constant(np.eye(4)).c, 0.5), 0.7, np.zeros(4))
+    assert np.array_equal(np.abs(T), np.eye(4))
+    assert 3 * 0.7 <= bound < 3 * 0.7 * (1 + 1e-8)
+
+
+def test_the_next_ellipsoid_holds_with_a_poor_inverse(monkeypatch):
+    """e = 2 w + j is w' itself where T = 1."""
+    monkeypatch.setattr(np.linalg, "inv", lambda a: np.full_like(a, 0.5))
+    T, bound = checker._next_ellipsoid(checker._constant(np.array([[2.0]])), 0.7, np.array([0.125]))
+    assert np.array_equal(T, [[1]])
+    assert 2 * 0.7 + 0.125 <= bound < (2 * 0.7 + 0.125) * (1 + 1e-8)
+
+
+class LinearMechanism:
+    """v_k' = −stiffness_k y_0, with unit masses; y_0 is a place, or the rate itself where there is none."""
+
+    def __init__(self, stiffness, nq):
+        self.stiffness, self.nq, self.nv, self.beta = stiffness, nq, len(stiffness), 0.0
+
+    def equations(self, y, vdot):
+        self.beta = vdot[0].r[0, 0]
+        residual = [a + y[0] * k for a, k in zip(vdot, self.stiffness, strict=True)]
+        return [y[self.nq + i] * 1.0 for i in range(self.nq)], residual
+
+
+def poor_guesses(monkeypatch, *factors):
+    """Inverses are guessed with their rows times factors, of one guess after the other in turn."""
+    usual, rest = checker._inverse_guess, cycle(factors)
+    monkeypatch.setattr(checker, "_inverse_guess", lambda a: np.array(next(rest))[:, None] * usual(a))
+
+
+@pytest.mark.parametrize(
+    "stiffness, defect", [(4095.5, 0.0), (4097.0, 0.0), (600.0, 3495.5), (600.0, 3497.0)]
+)
+def test_the_tube_of_the_accelerations_contains_them(monkeypatch, stiffness, defect):
+    """For |e_0| <= 1 the first is off by stiffness + defect at most, and 16^3 is the least tube tried."""
+    poor_guesses(monkeypatch, [0.5, 1.0])
+    mechanism = LinearMechanism([stiffness, 0.0], 1)
+    *_, theta = checker._linearise(mechanism, [np.zeros(1)] * 5, 1.0, np.array([defect, 0.0]))
+    assert 0.5 <= theta < 0.5 + 1e-8
+    assert stiffness + defect <= mechanism.beta
+    assert np.isclose(mechanism.beta, 16**3 if stiffness + defect < 16**3 else 16**4)
+
+
+@pytest.mark.parametrize("h", [0.1, 0.15])
+def test_the_growth_of_the_error_is_bounded_with_a_poor_inverse_of_the_masses(monkeypatch, h):
+    """v' = 2 v; the poor inverse gives P = exp(h s), so that w = v / P grows by exp(h)."""
+    poor_guesses(monkeypatch, [0.5], [1.0])
+    found, rho = checker._prove_step(LinearMechanism([-2.0], 0), [np.zeros(1)] * 2, h,
+                                     (np.zeros(0), np.zeros(1)), np.eye(1), 1e-6)  # fmt: skip
+    assert np.isclose(found.total[0, 0], np.exp(h))
+    assert 1e-6 * np.exp(h) <= rho < 1e-6 / (1 - h * np.exp(2 * h)) * (1 + 1e-6)
+
+
+def test_an_error_that_grows_too_fast_is_rejected(monkeypatch):
+    """a = h exp(2 h) > 1, so that 1 − a is negative."""
+    poor_guesses(monkeypatch, [0.5], [1.0])
+    with pytest.raises(checker.Rejected, match=r"inequality \(5\): the error grows too fast"):
+        checker._prove_step(LinearMechanism([-2.0], 0), [np.zeros(1)] * 2, 0.5,
+                            (np.zeros(0), np.zeros(1)), np.eye(1), 1e-6)  # fmt: skip
+
+
+@pytest.mark.parametrize("field, rate", [("armature", "vdot"), ("damping", "v")])
+def test_a_ball_has_its_moment_with_either_element_alone(field, rate):
+    """a ω̇ or c ω about a ball on the world, for each of the two without the other."""
+    none, document = {"armature": [["0x0p0"] * 2], "damping": [["0x0p0"] * 2]}, stored_document("one-ball")
+    v = {"v": [arb(1), arb(2), arb(3)], "vdot": [arb(4), arb(5), arb(6)]}
+    one, two = (
+        checker._Mechanism(parsed(document | none | changed), arb)
+        for changed in ({}, {field: [["0x1p1", "0x0p0"]]})
+    )
+    y = [*checker._initial_values(one)[: one.nq], *v["v"]]
+    moments = zip(two.equations(y, v["vdot"])[1], one.equations(y, v["vdot"])[1], v[rate], strict=True)
+    coefficient = two.data[field][0, 0]
+    assert coefficient > 0
+    for with_it, without, x in moments:
+        assert abs(with_it - without - x * coefficient) < 1e-9
+
+
+def test_samples_are_at_their_times_of_their_steps(monkeypatch):
+    """The first at the start of the first step, exactly."""
+    usual, at = checker._sample, []
+    monkeypatch.setattr(checker, "_sample", lambda *a: at.append(a[-1]) or usual(*a))
+    document = stored_document("one-ball")
+    checker.enclose_motion(parsed(document))
+    assert float.fromhex(document["times"][0]) == 0 == at[0]
+    assert len(at) == len(document["times"]) and all(0 < s <= 1 for s in at[1:])
+
+
 # planted faults
 
 
@@ -278,5 +395,5 @@ def test_a_series_that_is_cut_without_its_remainder_is_noticed(monkeypatch):
 def test_nan_is_never_accepted(monkeypatch, name):
     usual = getattr(checker, name)
     monkeypatch.setattr(checker, name, lambda *a, **options: usual(*a, **options) * np.nan)
-    with pytest.raises(checker.Rejected):
+    with pytest.raises(checker.Rejected, match=r"^step 1 of"):
         checker.enclose_motion(parsed(stored_document("one-ball")))
