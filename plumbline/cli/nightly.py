@@ -35,7 +35,7 @@ from plumbline.scenario.loader import Scenario
 from plumbline.storage.history import next_night_number, stored_runs
 from plumbline.storage.results_store import write_atomically
 from plumbline.studies.coverage import FILE as COVERAGE_FILE
-from plumbline.studies.coverage import coverage_table, measure_coverage
+from plumbline.studies.coverage import CoverageFailure, coverage_table, measure_coverage
 from plumbline.studies.tables import write_table
 
 EXTRA_REFINEMENTS = 1  # halvings of the finest step beyond a run's refinement study
@@ -204,8 +204,10 @@ def run_nightly(
     return result, place
 
 
-def night_coverage(result: RunResult, plan: Plan, progress: ProgressCallback) -> pa.Table:
+def night_coverage(result: RunResult, plan: Plan, progress: ProgressCallback) -> pa.Table | None:
     """Compute the coverage of the night's catalogue, by the tolerances of its own rows.
+
+    Where that fails the night is kept, with the reason in its sentence and the exit code of a failed harness.
 
     Args:
         result: the night's result.
@@ -213,17 +215,19 @@ def night_coverage(result: RunResult, plan: Plan, progress: ProgressCallback) ->
         progress: called after every scenario.
 
     Returns:
-        The table of `plumbline.studies.coverage`.
-
-    Raises:
-        CoverageFailure: the coverage of a scenario could not be computed.
+        The table of `plumbline.studies.coverage`; None where it could not be computed.
 
     """
-    with WorkerPool(plan.jobs, plan.limits) as executor:
-        found = measure_coverage(
-            executor, plan.scenarios, result.rows, plan.random_state_count, progress=progress,
-            cpu_times=result.cpu_times,
-        )  # fmt: skip
+    try:
+        with WorkerPool(plan.jobs, plan.limits) as executor:
+            found = measure_coverage(
+                executor, plan.scenarios, result.rows, plan.random_state_count, progress=progress,
+                cpu_times=result.cpu_times,
+            )  # fmt: skip
+    except CoverageFailure as error:
+        result.metadata["sentence"] += f"; {error}"
+        result.metadata["exit_code"] = ExitCode.HARNESS_FAILED
+        return None
     return coverage_table(found)
 
 

@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from importlib.util import find_spec
+from unittest.mock import patch
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -31,6 +32,7 @@ from plumbline.scenario.generator import (
 from plumbline.scenario.mechanism_document import mechanism_document
 from plumbline.storage.history import History
 from plumbline.storage.results_store import ResultTables, read_table
+from plumbline.studies.coverage import CoverageFailure
 
 
 def ignore_output(*_):
@@ -178,6 +180,15 @@ def test_a_night_is_whole_and_remembered(tmp_path):
     assert {r.level for r in result.rows if r.scenario == "rest"} == levels
     (seen,) = History(tmp_path).overview()
     assert seen["id"] == place.name and seen["random"] == 3
+
+
+def test_a_night_is_kept_without_its_coverage(tmp_path):
+    reason = "no coverage of rest: SingularSystem: the joint rows are not independent"
+    with patch.object(nightly, "measure_coverage", side_effect=CoverageFailure(reason)):
+        result, place = run_nightly(tmp_path, random_count=0)
+    assert result.metadata["exit_code"] == 5 and not (place / "coverage.parquet").exists()
+    assert json.loads((place / "results.json").read_text())["run"]["sentence"].endswith(reason)
+    assert "no coverage of rest" in (place / "report.html").read_text(encoding="utf-8")
 
 
 class Killed(Exception):
