@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 from plumbline.storage.results_schema import DamagedResults
 from plumbline.storage.results_store import load_json, write_atomically
 
-MAX_NAME_BYTES = 255  # of a file's name, on most file systems
+# Letters, digits and a few signs, as the scripts are named; file systems allow 255 bytes for a name.
+_SCRIPT_NAME = re.compile(r"[\w-][\w.-]{0,250}\.py", re.ASCII)
 
 
 def scripts_folder(folder: Path) -> Path:
@@ -44,7 +46,7 @@ def read_script_index(folder: Path) -> dict[str, str]:
         return {}
     except (OSError, ValueError, RecursionError) as error:
         raise DamagedResults(f"{path}: not readable as JSON ({error}); remove it to go on") from None
-    if not isinstance(index, dict) or not all(_is_file_name(name) for name in index.values()):
+    if not isinstance(index, dict) or not all(_is_script_name(name) for name in index.values()):
         raise DamagedResults(f"{path}: not an object of row keys and file names; remove it to go on")
     return index
 
@@ -61,7 +63,5 @@ def write_script_index(folder: Path, index: dict[str, str]) -> None:
     write_atomically(scripts_folder(folder) / "index.json", data)
 
 
-def _is_file_name(name: object) -> bool:
-    if not isinstance(name, str) or not name.isprintable() or name != Path(name).name:
-        return False
-    return 0 < len(name.encode()) <= MAX_NAME_BYTES
+def _is_script_name(name: object) -> bool:
+    return isinstance(name, str) and _SCRIPT_NAME.fullmatch(name) is not None
