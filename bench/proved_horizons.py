@@ -14,10 +14,10 @@ import numpy as np
 
 from plumbline.engines.registry import ENGINES, load_adapter
 from plumbline.model.datatypes import EngineFailure, Unsupported
+from plumbline.model.invariants import first_departure, position_error
 from plumbline.scenario.loader import Scenario, find_scenario_file, load_scenario
 from plumbline.truth.proved_motion import ProvedMotion, find_proof
 
-DISTANCE = 1e-3  # m
 TOLERANCE = 1e-12
 
 
@@ -42,9 +42,8 @@ def departure(
         run = load_adapter(engine).simulate(scenario.model, scenario.state, times, integrator, resolution)
     except (Unsupported, EngineFailure) as error:
         return str(error)
-    distance = np.max(np.linalg.norm(run.r - proof.trajectory.r, axis=-1), axis=-1) - proof.position_radius
-    off = np.flatnonzero(distance > DISTANCE)
-    return f"{times[off[0]]:.2f}" if len(off) else f"not within {times[-1]:g}"
+    left = first_departure(times, position_error(run.r, proof.trajectory.r), proof.position_radius)
+    return f"not within {times[-1]:g}" if left is None else f"{left:.2f}"
 
 
 def main(name: str, duration: float = 30.0, step: float = 2.0**-10) -> None:

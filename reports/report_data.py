@@ -12,6 +12,7 @@ import numpy as np
 
 from plumbline.judging.rows import RUN_FAMILY, SHOWN_STYLES
 from plumbline.model.datatypes import KINDS, Array, Model, State
+from plumbline.model.invariants import DEPARTURE, first_departure
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product, rotation_matrix
 from plumbline.model.loops import cut_open, determinate_projectors, singular_values
 from plumbline.storage.results_schema import DamagedResults
@@ -35,6 +36,7 @@ DEFAULT_LONG_RUN_SECONDS = 100.0  # s: the default of the nightly's --long-run-s
 CATALOGUE_FOLDER = Path(__file__).parent.parent / "scenarios"
 RERUN_FOLDER = "repeated"
 MAX_MOTION_BYTES = 90_000  # of one scenario's motion, before compression
+PROVED = "proved: "  # how a truth that is a certificate's midpoints begins
 _NUMBER_FIELDS = ("value", "tolerance", "uncertainty", "compared_until", "order", "user_rtol", "cpu_time")
 _TEXT_FIELDS = (
     "unit",
@@ -169,6 +171,7 @@ def scenario_chunk(name: str, results: Results, tables: ScenarioTables, points: 
         | {"loops": _loop_facts(scenario)},
         "rows": details,
         "commands": commands,
+        "departures": _departures(name, results, tables),
         "states": _state_errors(name, tables, packer),
         "curves": _error_curves(name, tables, packer, points) if points else None,
         "motion": _motion_frames(name, scenario, tables, packer, points) if points else None,
@@ -225,6 +228,30 @@ def _error_curves(name: str, tables: ScenarioTables, packer: ChunkBuilder, point
                 one[curve] = packer.add(log_scale_codes(decimate(curves[curve][rows].astype(float), points)))
         found.append(one)
     return found
+
+
+def _departures(name: str, results: Results, tables: ScenarioTables) -> Record | None:
+    """Find when each run leaves a motion that is proved; None where the truth is not proved."""
+    scenario, curves = results.scenarios[name], tables["curves"].get(name, {})
+    radius = scenario.get("truth_uncertainty")
+    if not curves or radius is None or not (scenario.get("truth") or "").startswith(PROVED):
+        return None
+    found: list[Record] = []
+    for (engine, integrator), rows in group_rows(curves, "engine", "integrator"):
+        order = rows[np.argsort(curves["t"][rows], kind="stable")]
+        t, error = (curves[k][order].astype(float) for k in ("t", "position_error"))
+        kinds = {i["name"]: i["kind"] for i in results.engines[engine]["integrators"]}
+        found.append(
+            {
+                "engine": engine,
+                "integrator": integrator,
+                "kind": kinds.get(integrator, "step"),
+                "resolution": _json_number(curves["resolution"][order][0]),
+                "left": first_departure(t, error, radius),
+                "until": _json_number(t[-1]),
+            }
+        )
+    return {"distance": DEPARTURE, "runs": found}
 
 
 def _judged_curve(curves: Columns, rows: np.ndarray) -> str:

@@ -25,6 +25,7 @@ WINDOWS = 2, 4, 6, 8  # samples that the motion between two samples is interpola
 RESOLVED_FALL = 4.0  # of the differences of two widths: polynomials converge
 WINDOW_ROUNDING = 1600 * 2.0**-52  # of a polynomial through eight samples: the condition of its equations
 GAUSS_NODES = 5
+DEPARTURE = 1e-3  # m, beyond which a run has left the true motion
 
 
 def position_error(a: Array, b: Array) -> Array:
@@ -39,6 +40,24 @@ def position_error(a: Array, b: Array) -> Array:
 
     """
     return np.asarray(np.max(np.linalg.norm(a - b, axis=-1), axis=-1))
+
+
+def first_departure(t: Array, error: Array, radius: float | Array) -> float | None:
+    """Find when a run has provably left the true motion.
+
+    Args:
+        t: (T,) [s] sample times, ascending.
+        error: (T,) [m] `position_error` of the run and the midpoints of an enclosure.
+        radius: [m] of the enclosure, or (T,) of each sample.
+
+    Returns:
+        The first sample [s] at which the error less the radius is above `DEPARTURE`, or the error is not a
+        number; None where there is none.
+
+    """
+    rounding = 1e-12  # relative, of the error: a few differences, squares and a root
+    left = np.flatnonzero(~(error * (1 - rounding) - radius <= DEPARTURE))
+    return float(t[left[0]]) if len(left) else None
 
 
 def attitude_error(p: Array, q: Array) -> Array:

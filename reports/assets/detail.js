@@ -64,6 +64,7 @@ export async function showCell(root, index, fields, back) {
   }
   root.append(h("h2", { class: "sub" }, "What was compared"), compared(index, data, ours, fields));
   moving(root, index, data, fields);
+  if (data.departures) root.append(h("h2", { class: "sub" }, "When engines provably leave the true motion"), ...departures(index, data, data.departures));
   const plots = h("div", { class: "plots" });
   const study = studies.filter((one) => one.scenario === fields.scenario && one.engine === fields.engine);
   for (const kind of /** @type {const} */ (["step", "tolerance"])) {
@@ -264,6 +265,24 @@ function moving(root, index, data, fields) {
   });
   if (curves.length) draw();
   cleanups.push(() => drawn?.destroy());
+}
+
+/**
+ * Of every run the first sample at which it is off by more than the proof's radius and a fixed distance.
+ * @param {Index} index @param {ScenarioChunk} data @param {import("./report_data").Departures} found
+ */
+function departures(index, { scenario }, { distance, runs }) {
+  const absent = index.engines.filter((name) => !runs.some((run) => run.engine === name)).map((name) => index.engine_titles[index.engines.indexOf(name)]);
+  return [
+    h("p", { class: "why" }, `The true motion is ${scenario.truth}; the certificate is that of plumbline prove. A run has left it at the first sample (one every ${number(scenario.sample, 3)} s) at which a body's position is more than ${number(distance, 1)} m plus the radius from the midpoint: that it is wrong by then is a theorem. Of every integrator the finest run.${absent.length ? ` No finished run of ${absent.join(", ")}.` : ""}`),
+    h("div", { class: "scroll", tabindex: 0, role: "region", "aria-label": "When engines leave the true motion" },
+      h("table", { class: "plain departures" },
+        h("thead", {}, h("tr", {}, ["Engine", "Integrator", "Step or tolerance", "Leaves the true motion"].map((name) => h("th", { scope: "col" }, name)))),
+        h("tbody", {}, runs.map(({ engine, integrator, kind, resolution, left, until }) => h("tr", {},
+          h("th", { scope: "row" }, index.engine_titles[index.engines.indexOf(engine)]), h("td", {}, integrator),
+          h("td", {}, kind === "step" ? `step ${number(resolution, 3)} s` : `tolerance ${number(resolution, 1)}`),
+          h("td", {}, left === null ? `stays within ${number(distance, 1)} m up to ${number(until, 3)} s` : `at ${number(left, 4)} s`)))))),
+  ];
 }
 
 /**

@@ -31,6 +31,12 @@ export interface MotionData {
   runs: { engine: string; integrator: string; scale: Float32Array; d: Int8Array }[];
 }
 
+/** When runs leave the proved motion by more than `distance` [m], in s; null where they do not until the end. */
+export interface Departures {
+  distance: number;
+  runs: { engine: string; integrator: string; kind: "step" | "tolerance"; resolution: number; left: number | null; until: number }[];
+}
+
 export interface StateSpread { engine: string; quantity: string; ratio: Uint16Array; worst: [number, number]; bound: number; error: number }
 
 export interface ScenarioChunk {
@@ -40,7 +46,7 @@ export interface ScenarioChunk {
     loops: { closing: string[]; rows: number; independent: number; determinate: number[] } | null;
   };
   rows: Record<string, RowDetail>; commands: Record<string, string>;
-  states: StateSpread[]; curves: CurveSet[] | null; motion: MotionData | null;
+  departures: Departures | null; states: StateSpread[]; curves: CurveSet[] | null; motion: MotionData | null;
 }
 
 export interface Study {

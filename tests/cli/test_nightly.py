@@ -33,6 +33,7 @@ from plumbline.scenario.mechanism_document import mechanism_document
 from plumbline.storage.history import History
 from plumbline.storage.results_store import ResultTables, read_table
 from plumbline.studies.coverage import CoverageFailure
+from tests.reports.test_report import decoded_chunks
 
 
 def ignore_output(*_):
@@ -140,6 +141,8 @@ def test_a_night_proves_motions_and_uses_them(tmp_path):
     assert "; motions: 1 proved, 1 of them now" in result.metadata["sentence"]
     stored = json.loads((place / "results.json").read_text())
     assert stored["scenarios"]["rest"]["truth"].startswith("proved: ")
+    shown = decoded_chunks((place / "report.html").read_text(encoding="utf-8"))["scenario-0"]["departures"]
+    assert shown["runs"] and all(run["left"] is None and run["until"] == 2 for run in shown["runs"])
     result, _ = run_nightly(tmp_path, random_count=0, proof_cpu_seconds=10.0)
     assert result.metadata["proofs"]["proved"] == [] and result.metadata["proofs"]["known"] == 1
 

@@ -11,6 +11,7 @@ from plumbline.model.invariants import (
     angular_momentum,
     attitude_error,
     compute_invariants,
+    first_departure,
     inertia_ratio,
     joint_vector_rates,
     kinetic_energy,
@@ -43,6 +44,18 @@ def test_position_error_is_the_largest_distance_of_a_body():
     b[0, 1], b[0, 2], b[1, 0] = [3, 0, 4], [1, 1, 1], [0, 0, -2]
     assert position_error(a, b).tolist() == [5.0, 2.0]
     assert position_error(b[0], a[0]) == 5.0
+
+
+def test_a_run_has_left_where_error_less_radius_is_above_a_millimetre():
+    t = np.array([0, 0.5, 1, 1.5])
+    error = np.array([0, 1e-3, 1.4e-3, 2e-3])
+    assert first_departure(t, error, 0.0) == 1.0
+    assert first_departure(t, error, 5e-4) == 1.5
+    assert first_departure(t, error, np.array([0, 0, 5e-4, 2e-3])) is None
+    assert first_departure(t, np.array([0, 1e-4, np.nan, 0]), 0.0) == 1.0
+    assert first_departure(t, np.full(4, np.nextafter(1e-3, 1)), 0.0) is None, (
+        "within the rounding of the error"
+    )
 
 
 @pytest.mark.parametrize("angle", [1e-9, 1e-3, 1.0, 3.0, np.pi])
