@@ -12,6 +12,7 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
+from types import FrameType
 from typing import Any
 
 import click
@@ -21,6 +22,7 @@ from plumbline.cli.help_texts import EXIT_CODES
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.scenario.errors import did_you_mean, shorten
 
+SECONDS_TO_NEXT_TRY = 0.05  # of an interruption that came during an import
 START = """
 \b
 Start with:
@@ -181,22 +183,41 @@ def _make_streams_writable() -> None:
 
 @contextmanager
 def _termination_as_interrupt() -> Iterator[None]:
-    """Treat SIGTERM and SIGHUP like Ctrl-C, so that workers and temporary folders are removed."""
+    """Treat SIGTERM and SIGHUP like Ctrl-C, so that workers and temporary folders are removed.
 
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
+    A compiled module can swallow an exception that is raised while it is loaded (numpy.random does), so an
+    interruption waits until no import is under way.
+    """
+
+    def interrupt(_: int, frame: FrameType | None) -> None:
+        if _is_importing(frame) and hasattr(signal, "setitimer"):  # Windows has no timer
+            signal.setitimer(signal.ITIMER_REAL, SECONDS_TO_NEXT_TRY)
+        else:
+            raise KeyboardInterrupt
 
     before = {}
     if threading.current_thread() is threading.main_thread():
-        for name in ("SIGTERM", "SIGHUP"):
+        for name in ("SIGINT", "SIGTERM", "SIGHUP", "SIGALRM"):
             number = getattr(signal, name, None)  # Windows has no SIGHUP
-            if number is not None and signal.getsignal(number) == signal.SIG_DFL:  # nohup ignores it
+            usual = signal.default_int_handler if name == "SIGINT" else signal.SIG_DFL
+            if number is not None and signal.getsignal(number) == usual:  # nohup ignores it
                 before[number] = signal.signal(number, interrupt)
     try:
         yield
     finally:
+        if hasattr(signal, "setitimer"):
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    """Whether an import is under way in this frame or in one that called it."""
+    while frame is not None:
+        if frame.f_globals.get("__name__") == "importlib._bootstrap":
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _write_traceback() -> str:

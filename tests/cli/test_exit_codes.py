@@ -226,11 +226,26 @@ def test_an_interrupted_run_explains_how_to_resume_and_leaves_no_process(tmp_pat
     raise AssertionError("a process is left")
 
 
-def test_an_interruption_inside_exec_has_the_exit_code_too(tmp_path):
-    """As of a dataclass that is being made while a command is imported."""
+SWALLOWING_MODULE = """
+import contextlib, os, signal, time
+with contextlib.suppress(BaseException):
+    os.kill(os.getpid(), signal.{name})
+    time.sleep(0.2)
+"""
+
+
+@pytest.mark.parametrize(
+    "statement",
+    ["exec('raise KeyboardInterrupt')", "import swallow_SIGINT", "import swallow_SIGTERM"],
+)  # fmt: skip
+def test_an_interruption_inside_an_import_has_the_exit_code_too(tmp_path, statement):
+    """As of a dataclass that is being made, or of a compiled module that swallows exceptions."""
+    for name in ("SIGINT", "SIGTERM"):
+        (tmp_path / f"swallow_{name}.py").write_text(SWALLOWING_MODULE.format(name=name))
     (tmp_path / "interrupted.py").write_text(
-        "from unittest.mock import patch\nfrom plumbline.cli.main import main\n"
-        "def stop(*_, **__):\n    exec('raise KeyboardInterrupt')\n"
+        "import signal, time\nfrom unittest.mock import patch\nfrom plumbline.cli.main import main\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        f"def stop(*_, **__):\n    {statement}\n    time.sleep(5)\n"
         "with patch('plumbline.cli.run_commands.run_plan', stop):\n    main(['run', 'rest'])\n"
     )
     words = [sys.executable, "-m", "interrupted"]  # only of modules is the exit code replaced
