@@ -88,7 +88,7 @@ MAX_IMPEDANCE = 0.9999  # of soft constraints: the largest that MuJoCo accepts
 # of MuJoCo's own R, which is made for the tree at its reference pose: the largest (the next where answers are
 # not yet linear in it), how they fall, and how many
 LARGEST_REGULARISATIONS, RATIO, REGULARISATIONS = (0.027, 2.7e-4, 2.7e-6), 3.0, 4
-SEQUENCES = (1.0, 1.3, 1.7)  # of them: factors of the largest
+SEQUENCES = (1.0, 1.3, 1.7, 1.15, 1.5)  # of them: factors of the largest; three are compared
 # Of motions: the error of smaller ones is rounding, and as 1/R what steps leave of gaps in dependent rows.
 LARGEST_RUN_REGULARISATION, RUN_REGULARISATIONS = 2.7e-4, 3
 RUN_ITERATIONS = 3  # of Newton's method on welds, a linear problem: the second and third remove rounding
@@ -512,7 +512,7 @@ def _rigid_limit(soft: _SoftMechanism, state: State) -> StateQuantities:
     """
     for largest in LARGEST_REGULARISATIONS:
         try:
-            limits = [_extrapolated(soft, state, factor * largest) for factor in SEQUENCES]
+            limits = _three_limits(soft, state, largest)
             break
         except EngineFailure:
             if largest == LARGEST_REGULARISATIONS[-1]:
@@ -523,6 +523,19 @@ def _rigid_limit(soft: _SoftMechanism, state: State) -> StateQuantities:
     }
     values: dict[str, Any] = {name: x if x.ndim else float(x) for name, x in limits[0].items()}
     return StateQuantities(**values, limit_error=errors)
+
+
+def _three_limits(soft: _SoftMechanism, state: State, largest: float) -> list[dict[str, Array]]:
+    """Extrapolate three sequences: rounding can spoil one, and is another in the next."""
+    found, refusals = list[dict[str, Array]](), list[Unsupported]()
+    for factor in SEQUENCES:
+        try:
+            found.append(_extrapolated(soft, state, factor * largest))
+        except Unsupported as refusal:
+            refusals.append(refusal)
+        if len(found) == 3:
+            return found
+    raise refusals[0]
 
 
 def _largest_norm(difference: Array) -> float:
