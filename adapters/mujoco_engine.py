@@ -151,6 +151,10 @@ class Mujoco(MetamorphicHooks):
     options = loop_options = (DENSE,)
     joint_options = MappingProxyType({TENDONS: ("rod",), HELD: tuple(ADDED_MOTIONS)})
     builds_trees = builds_elements = moves_loops = True
+    loop_steps_unsupported_reason = (
+        "not compared: MuJoCo's loops are soft, the forces in a step are those of its regularised solver, "
+        "which has no formula; their limit is compared in motions"
+    )
     welding_unsupported_reason = ""
 
     def version(self) -> str:

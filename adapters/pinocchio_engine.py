@@ -649,7 +649,11 @@ class Pinocchio(PinocchioAdapter):
             error_exponents=(1, 2, 3, 4, 5),
             note="v += h a(q, v) by aba, then q = integrate(q, h v)",
             method=JointSpaceMethod(
-                "semi-implicit Euler", "joint rotations", ROD_AXIAL_INERTIA, free_coordinates="rigid motion"
+                "semi-implicit Euler",
+                "joint rotations",
+                ROD_AXIAL_INERTIA,
+                free_coordinates="rigid motion",
+                gap_correction=STABILISATION,
             ),
         ),
         Integrator(
@@ -658,7 +662,7 @@ class Pinocchio(PinocchioAdapter):
             4,
             error_exponents=(4, 5, 6, 7, 8),
             note="Munthe-Kaas form of the classical Runge–Kutta method, on aba, integrate and dIntegrate",
-            method=classical_runge_kutta("joint rotations", ROD_AXIAL_INERTIA, "rigid motion"),
+            method=classical_runge_kutta("joint rotations", ROD_AXIAL_INERTIA, "rigid motion", STABILISATION),
         ),
         Integrator("dop853", "tolerance", 8, note="SciPy's DOP853 on (q, v) with crba and the tangent map"),
     )

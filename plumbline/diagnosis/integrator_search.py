@@ -333,7 +333,7 @@ def _explain_constrained_steps(
 ) -> str:
     ratios = {name: max(c.ratios) for name, c in compare_parts(declared, model, states, runs).items()}
     parts = []
-    first = ratios.pop("step_first_acceleration")
+    first = ratios.pop("step_first_acceleration", 0.0)
     if first > MIN_DIAGNOSABLE_RATIO:
         accelerations = [run.coordinate_acceleration for *_, run in runs]
         if all(a is not None and not np.any(a[0]) for a in accelerations):
@@ -344,7 +344,7 @@ def _explain_constrained_steps(
 
         def residuals(other: StepMethod) -> Array:
             assert isinstance(other, ConstrainedMethod)
-            return quadrature_residuals(other, runs)
+            return quadrature_residuals(other, runs, model.has_loops)
 
         def remaining(names: Collection[str], other: StepMethod) -> float:
             assert isinstance(other, ConstrainedMethod)

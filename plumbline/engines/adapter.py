@@ -81,6 +81,7 @@ class Adapter(ABC):
     builds_elements: ClassVar[bool] = False  # … and of mechanisms with rotors, springs, dampers and efforts
     loops_unsupported_reason: ClassVar[str] = ""  # why states of mechanisms with loops are not, if so
     moves_loops: ClassVar[bool] = False  # whether motions of mechanisms with loops are simulated
+    loop_steps_unsupported_reason: ClassVar[str] = ""  # why single steps of such motions have no formula
     reproduction_template: ClassVar[str] = ""  # template of stand-alone scripts; without one there are none
 
     @abstractmethod
@@ -184,9 +185,7 @@ class Adapter(ABC):
             The trajectory at ``times``, not normalised and not projected.
 
         """
-        self._check_mechanism(model, self.builds_elements)
-        if not self.moves_loops:
-            _refuse_loops(model, f"the adapter of {self.title} covers no motions of mechanisms with loops")
+        self._check_motion(model)
         check_state(model, state)
         method = self.integrator(integrator)
         if method.kind == "step":
@@ -210,10 +209,12 @@ class Adapter(ABC):
 
         Raises:
             EngineFailure: a sample, acceleration or multiplier is missing, not finite or of another shape.
+            Unsupported: also where single steps of the mechanism have no formula.
 
         """
-        self._check_mechanism(model, self.builds_elements)
-        _refuse_loops(model, "single steps of mechanisms with loops are not compared")
+        self._check_motion(model)
+        if model.has_loops and self.loop_steps_unsupported_reason:
+            raise Unsupported(self.loop_steps_unsupported_reason)
         check_state(model, state)
         times = np.asarray(step * np.arange(count + 1), float)
         run = self._step(model, state, times, self.integrator(integrator), step)
@@ -226,6 +227,11 @@ class Adapter(ABC):
                     raise EngineFailure(f"{label} is not finite")
         return run
 
+    def _check_motion(self, model: Model) -> None:
+        self._check_mechanism(model, self.builds_elements)
+        if model.has_loops and not self.moves_loops:
+            raise Unsupported(f"the adapter of {self.title} covers no motions of mechanisms with loops")
+
     def _check_mechanism(self, model: Model, has_elements: bool) -> None:
         """Refuse what the adapter does not build, and elements unless it evaluates states with them."""
         if self.builds_trees and model.has_loops and self.loops_unsupported_reason:
@@ -237,11 +243,6 @@ class Adapter(ABC):
             raise Unsupported(
                 f"the adapter of {self.title} covers no {what} rotors, springs, dampers and efforts"
             )
-
-
-def _refuse_loops(model: Model, reason: str) -> None:
-    if model.has_loops:
-        raise Unsupported(reason)
 
 
 def check_state(model: Model, state: State) -> None:

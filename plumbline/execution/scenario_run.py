@@ -78,8 +78,7 @@ def uncompared_kinds(model: Model) -> dict[TaskKind, str]:
 
     """
     if model.has_loops:
-        kinds = (TaskKind.LONG_RUN, TaskKind.STEP)
-        return dict.fromkeys(kinds, "of mechanisms with loops states, motions and relations are compared")
+        return {TaskKind.LONG_RUN: "long runs of mechanisms with loops are not compared"}
     if model.n > MAX_STEP_BODIES:
         return {TaskKind.STEP: f"single steps are compared of at most {MAX_STEP_BODIES} bodies"}
     return {}
@@ -127,7 +126,9 @@ class ScenarioRun:
             singular = (
                 f"singular: at the initial pose the smallest singular value is {self._singular_value:.2g}"
             )
-            self._left_out |= dict.fromkeys((TaskKind.MOTION_TRUTH, TaskKind.TRAJECTORY), singular)
+            self._left_out |= dict.fromkeys(
+                (TaskKind.MOTION_TRUTH, TaskKind.TRAJECTORY, TaskKind.STEP), singular
+            )
         every = list(task_keys(scenario.name, engines, levels, has_long_runs))
         self._keys = [key for key in every if key.kind not in self._left_out]
         self._gaps = dict.fromkeys((key.engine, key.kind) for key in every if key.kind in _GAP_LEVELS)

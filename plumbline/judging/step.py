@@ -13,6 +13,7 @@ import numpy as np
 from plumbline.engines.calls import StepEvaluation, run_steps
 from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict
 from plumbline.model.datatypes import ZERO_INERTIA, Integrator, Model, State
+from plumbline.model.loops import STABILISATION, keeps_dependent_rows
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod
 from plumbline.processes.workers import Pickled
 from plumbline.truth.rounding_bound import remembered_rounding_bound
@@ -32,8 +33,14 @@ from plumbline.truth.step_formulas import (
 
 STEP_SIZES = (0.01, 0.0237)  # s; large: a bound grows as h, the effect of a wrong formula faster
 MAX_STEP_RATE = 10.0  # rad/s; in faster motions the steps are smaller: explicit methods become unstable
+# rad/s, of loops: at the larger step gaps close by half as fast as h a = 1, where Euler's method rings
+LOOP_RATE = 2 * STABILISATION * MAX_STEP_RATE * STEP_SIZES[-1]
 STEP_STATES = 5  # the initial state and random ones
 MAX_STEP_BODIES = 10
+OPEN_ROWS = (
+    "not compared: rows of the loops depend on others in closed poses only; where a step has opened the "
+    "loops, the accelerations are those of the solver's iterations"
+)
 MAX_STEP_BOUND = 1e-6  # of the accelerations' effect; a looser bound could hide a mistake
 
 
@@ -74,7 +81,8 @@ def step_sizes(has_constraints: bool, model: Model, states: Sequence[State]) -> 
         states: states of it.
 
     Returns:
-        Steps [s] per state: `STEP_SIZES` × `MAX_STEP_RATE` over the fastest rate, where that is larger.  It
+        Steps [s] per state: `STEP_SIZES` × `MAX_STEP_RATE` over the fastest rate, where that is larger.  Of
+        loops it is `LOOP_RATE` at least: engines' corrections of gaps have to be stable.  Else it
         is the largest of √(2 |p̈|) = (α² + ω⁴/4)^¼ of a body, of |u̇| of a rod, of the linearised equations'
         eigenvalues, and for methods with constraints of √(F |s| / J) of a joint's force, doubled: their
         Newton iteration leaves that stiffness out and diverges at large steps.
@@ -86,16 +94,18 @@ def step_sizes(has_constraints: bool, model: Model, states: Sequence[State]) -> 
         squares = [2 * np.max(norm(turning, axis=1)), np.max(norm(state.udot, axis=1)) ** 2, fastest**2]
         if has_constraints:
             bound = remembered_rounding_bound(model, state)
-            force = np.asarray(bound.scale["joint_reaction"])
-            lever, principal = norm(model.proximal, axis=1), np.linalg.eigvalsh(model.inertia)
+            force, near = np.asarray(bound.scale["joint_reaction"]), model.body[:, 1]
+            lever, principal = norm(model.point[:, 1], axis=1), np.linalg.eigvalsh(model.inertia)
             least = np.where(principal[:, 0] > ZERO_INERTIA * principal[:, 2], principal[:, 0], np.inf)
             on_body = model.body[:, 0] >= 0
             beyond = np.zeros(model.n)
             np.maximum.at(beyond, model.body[on_body, 0], norm(model.point[on_body, 0], axis=1))
-            squares.append(np.max(force * (lever + beyond) / least))
+            squares.append(np.max(force * (lever + beyond[near]) / least[near]))
             if not model.is_chain:
-                squares.append(np.max(bound.scale["joint_moment"] / least))
+                squares.append(np.max(bound.scale["joint_moment"] / least[near]))
             squares = [4 * np.max(squares)]
+        if model.has_loops:
+            squares.append(LOOP_RATE**2)
         rate = float(np.sqrt(np.max(squares)))
         found.append([h * min(1.0, MAX_STEP_RATE / rate if rate > 0 else 1.0) for h in STEP_SIZES])
     return found
@@ -130,6 +140,8 @@ def judge_steps(
         reason = next(attempt.refusal for attempt in answer.attempts)
     elif not HAS_EXTENDED_PRECISION:
         reason = "the formulas need an extended precision that this machine does not have"
+    elif isinstance(method, JointSpaceMethod) and not keeps_dependent_rows(model, states[0]):
+        verdict, reason = Verdict.INFORMATION, OPEN_ROWS
     if reason:
         return JudgingResult([context.make_row("step", integrator.name, "all", verdict, reason)])
     if isinstance(method, JointSpaceMethod):

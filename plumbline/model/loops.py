@@ -403,6 +403,26 @@ def smallest_singular_value(model: Model, state: State) -> float:
     return float(values[rank - 1])
 
 
+def keeps_dependent_rows(model: Model, state: State) -> bool:
+    """Find out whether rows that depend on the others do so in open poses too, as those out of a plane do.
+
+    Args:
+        model: the mechanism.
+        state: assembled.
+
+    Returns:
+        Whether the rows' rank is the same in poses nearby at which the loops are open; True of a tree.
+
+    """
+    if not model.has_loops:
+        return True
+    cut = cut_open(model)
+    there = cut.state(state)
+    closed = singular_values(cut, there)[1]
+    step = np.asarray(1e-2 * np.random.default_rng(0).normal(size=closed.shape[1]))
+    return len(singular_values(cut, displaced(cut.model, there, step))[1]) == len(closed)
+
+
 def is_singular(value: float) -> bool:
     """Return whether a pose counts as singular, so that its accelerations and forces are not unique.
 

@@ -37,6 +37,7 @@ class JointSpaceMethod:
     implicit_forces: Literal["none", "joint dampers", "applied", "all"] = "none"
     # of a free body: r and ṙ in the world beside its rotation, or a rigid motion with the twist in its frame
     free_coordinates: Literal["point and rotation", "rigid motion"] = "point and rotation"
+    gap_correction: float = 0.0  # a [1/s]: gaps x of loops are to follow ẍ = −2 a ẋ − a² x
     stages: tuple[tuple[float, ...], ...] = ()  # the tableau's rows below the diagonal
     weights: tuple[float, ...] = ()
     new_velocity_share: float = 1.0  # x in q₁ = q ⊕ h (x v₁ + (1−x) v): 0 is explicit Euler
@@ -77,6 +78,7 @@ def classical_runge_kutta(
     coordinates: Literal["joint rotations", "joint angles"],
     rod_axial_inertia: float = 1.0,
     free_coordinates: Literal["point and rotation", "rigid motion"] = "point and rotation",
+    gap_correction: float = 0.0,
 ) -> JointSpaceMethod:
     """Return the classical Runge-Kutta method of order 4.
 
@@ -84,6 +86,7 @@ def classical_runge_kutta(
         coordinates: of `JointSpaceMethod`.
         rod_axial_inertia: of `JointSpaceMethod`; of no effect for joint angles.
         free_coordinates: of `JointSpaceMethod`.
+        gap_correction: of `JointSpaceMethod`.
 
     Returns:
         The method.
@@ -94,6 +97,7 @@ def classical_runge_kutta(
         coordinates,
         rod_axial_inertia,
         free_coordinates=free_coordinates,
+        gap_correction=gap_correction,
         stages=((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0)),
         weights=(1 / 6, 1 / 3, 1 / 3, 1 / 6),
     )

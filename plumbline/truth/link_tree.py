@@ -72,7 +72,7 @@ class _Link:
 
 
 @dataclass(frozen=True, eq=False)
-class _Pose:
+class Pose:
     """Where the links are: lists over the links."""
 
     p: list[Array]  # (..., 4)
@@ -362,14 +362,14 @@ class LinkTree:
         total, power = v + (terms is None or terms > 0) * once / 2, once
         if terms is not None and terms < 2:
             return total
-        for weight in _BERNOULLI[: None if terms is None else 1]:
+        for weight in BERNOULLI[: None if terms is None else 1]:
             power = self.bracket(theta, power)
             total, power = total + weight * power, self.bracket(theta, power)
         return total
 
     # -- equations -----------------------------------------------------------------------------------
 
-    def pose(self, q: list[Array]) -> _Pose:
+    def pose(self, q: list[Array]) -> Pose:
         """Place the links.
 
         Args:
@@ -379,7 +379,7 @@ class LinkTree:
             Their attitudes, points, and the motions of all joints.
 
         """
-        found = _Pose([], [], [], [], np.zeros((*q[0].shape[:-1], self.nv, 6), LongDouble), [])
+        found = Pose([], [], [], [], np.zeros((*q[0].shape[:-1], self.nv, 6), LongDouble), [])
         for link, own, at in zip(self.links, self.own, q, strict=True):
             if link.parent >= 0:
                 before, above = found.p[link.parent], found.A[link.parent]
@@ -406,7 +406,7 @@ class LinkTree:
             _set_columns(found.S[..., own, :], link.joint, axis, A, P)
         return found
 
-    def twists(self, pose: _Pose, v: Array) -> tuple[list[Array], list[Array]]:
+    def twists(self, pose: Pose, v: Array) -> tuple[list[Array], list[Array]]:
         """Return the links' twists and what velocities alone add to their rates, (..., 6) each.
 
         Args:
@@ -422,12 +422,12 @@ class LinkTree:
         for link, own in zip(self.links, self.own, strict=True):
             gained = np.sum(pose.S[..., own, :] * v[..., own, None], axis=-2)
             before = twist[link.parent] if link.parent >= 0 else np.zeros_like(gained)
-            change = _spatial_cross(before, gained)
+            change = spatial_cross(before, gained)
             twist.append(before + gained)
             bias.append(change + (bias[link.parent] if link.parent >= 0 else 0))
         return twist, bias
 
-    def mass_matrix(self, pose: _Pose) -> Array:
+    def mass_matrix(self, pose: Pose) -> Array:
         """Return M (..., nv, nv), rotors included.
 
         Args:
@@ -453,7 +453,7 @@ class LinkTree:
         M[..., index, index] += self.armature
         return np.asarray(M)
 
-    def _inertias(self, pose: _Pose) -> list[Array]:
+    def _inertias(self, pose: Pose) -> list[Array]:
         """Spatial inertias (..., 6, 6) of the links about the world's origin."""
         if not pose.inertias:
             A, arm, mass = np.stack(pose.A), cross_matrix(np.stack(pose.r)), self.mass
@@ -467,7 +467,7 @@ class LinkTree:
             pose.inertias.extend(found)
         return pose.inertias
 
-    def generalized_forces(self, q: list[Array], pose: _Pose, v: Array, forces: Forces = "all") -> Array:
+    def generalized_forces(self, q: list[Array], pose: Pose, v: Array, forces: Forces = "all") -> Array:
         """Return f (..., nv), or those parts of it that depend on v by drag and dampers.
 
         Args:
@@ -503,7 +503,21 @@ class LinkTree:
             f[..., own] += np.sum(pose.S[..., own, :] * wrench[j][..., None, :], -1)
         return f
 
-    def _applied(self, pose: _Pose, twist: list[Array], j: int, forces: Forces) -> Array:
+    def total_forces(self, q: list[Array], pose: Pose, v: Array) -> Array:
+        """Return M v̇.
+
+        Args:
+            q: coordinates.
+            pose: of the links there.
+            v: (..., nv).
+
+        Returns:
+            (..., nv), of a tree the generalised forces.
+
+        """
+        return self.generalized_forces(q, pose, v)
+
+    def _applied(self, pose: Pose, twist: list[Array], j: int, forces: Forces) -> Array:
         """Loads and drag on a link (..., 6)."""
         model, k, r, omega = self.model, self.links[j].body, pose.r[j], twist[j][..., :3]
         if k < 0:
@@ -515,9 +529,7 @@ class LinkTree:
             moment = moment + rotate_vectors(pose.A[j], model.moment[k].astype(LongDouble))
         return np.concatenate([moment + cross(r, force), force], -1)
 
-    def _add_point_springs(
-        self, pose: _Pose, twist: list[Array], wrench: list[Array], forces: Forces
-    ) -> None:
+    def _add_point_springs(self, pose: Pose, twist: list[Array], wrench: list[Array], forces: Forces) -> None:
         model = self.model
         for i, (bodies, points) in enumerate(zip(model.spring_body, model.spring_point, strict=True)):
             links = [self.of_body[b] if b >= 0 else -1 for b in bodies]
@@ -562,7 +574,7 @@ class LinkTree:
 
         """
         pose = self.pose(q)
-        return _solve(self.mass_matrix(pose), self.generalized_forces(q, pose, v))
+        return solve_definite(self.mass_matrix(pose), self.total_forces(q, pose, v))
 
     def damped_acceleration(self, q: list[Array], v: Array, h: Array, forces: Forces) -> Array:
         """Return (M + h D)⁻¹ f with D = −∂f/∂v of some of the forces, in the sparsity of M.
@@ -585,7 +597,7 @@ class LinkTree:
         pose = self.pose(q)
         if forces == "joint dampers":
             step = h[..., None] * np.diag(LongDouble(self.method.damping_factor) * self.damping)
-            return _solve(self.mass_matrix(pose) + step, self.generalized_forces(q, pose, v))
+            return solve_definite(self.mass_matrix(pose) + step, self.total_forces(q, pose, v))
         every = list(range(self.nv))
         D = np.zeros((*v.shape, self.nv), LongDouble)
         if forces == "all" or self._has_damping(forces):
@@ -596,10 +608,10 @@ class LinkTree:
         D = LongDouble(self.method.damping_factor) * np.where(self._on_one_path(), D, 0)
         if self.method.is_damping_symmetric:
             D = (D + np.swapaxes(D, -1, -2)) / 2
-        return _solve(self.mass_matrix(pose) + h[..., None] * D, self.generalized_forces(q, pose, v))
+        return solve_definite(self.mass_matrix(pose) + h[..., None] * D, self.total_forces(q, pose, v))
 
     def _force_derivatives(
-        self, q: list[Array], pose: _Pose, v: Array, columns: list[int], forces: Forces
+        self, q: list[Array], pose: Pose, v: Array, columns: list[int], forces: Forces
     ) -> Array:
         """−∂f/∂v (B, nv, columns); f is quadratic in v: a central difference of any size is exact."""
         units = np.eye(self.nv, dtype=LongDouble)[columns, None]
@@ -666,7 +678,7 @@ class LinkTree:
         """
         q, v = self.start()
         pose = self.pose(q)
-        rates = _solve(self.mass_matrix(pose), self.generalized_forces(q, pose, v))
+        rates = solve_definite(self.mass_matrix(pose), self.total_forces(q, pose, v))
         twist, bias = self.twists(pose, v)
         gained: list[Array] = []
         for link, own in zip(self.links, self.own, strict=True):
@@ -694,7 +706,7 @@ def _set_columns(columns: Array, joint: str, axis: Array, A: Array, P: Array) ->
 
 
 # Bₖ/k! of even k from 2 on: 1/12, −1/720, …
-_BERNOULLI = [
+BERNOULLI = [
     LongDouble(a) / b
     for a, b in (
         (1, 12), (-1, 720), (1, 30240), (-1, 1209600), (1, 47900160), (-691, 1307674368000),
@@ -706,8 +718,17 @@ _BERNOULLI = [
 # -- algebra in extended precision -------------------------------------------------------------------
 
 
-def _spatial_cross(a: Array, b: Array) -> Array:
-    """Rate of a twist b that is carried by a."""
+def spatial_cross(a: Array, b: Array) -> Array:
+    """Return the rate of a twist that is carried by another.
+
+    Args:
+        a: (..., 6) the twist that carries.
+        b: (..., 6) the carried one.
+
+    Returns:
+        (..., 6).
+
+    """
     w, v = a[..., :3], a[..., 3:]
     return np.concatenate([cross(w, b[..., :3]), cross(w, b[..., 3:]) + cross(v, b[..., :3])], -1)
 
@@ -746,8 +767,17 @@ def _turn_of_z(u: Array) -> Array:
     return _unit(np.where((z >= 0)[..., None], up, down))
 
 
-def _solve(S: Array, b: Array) -> Array:
-    """Solve S x = b (..., n) without pivoting: the symmetric part of S is positive definite."""
+def solve_definite(S: Array, b: Array) -> Array:
+    """Solve S x = b without pivoting.
+
+    Args:
+        S: (..., n, n), its symmetric part positive definite.
+        b: (..., n).
+
+    Returns:
+        x (..., n).
+
+    """
     S, b = S.copy(), b.copy()
     n = S.shape[-1]
     for k in range(n - 1):

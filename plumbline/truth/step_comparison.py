@@ -12,6 +12,10 @@ quaternion products and of the way from joint rates to the bodies', c = h W Σ (
 rods about their own axes) what relative rates pass on.  Ten steps: the sum over the steps, times
 the growth of perturbations, as one.
 
+Of loops b is larger by what the roundings of gaps and of their rates (32 ε (ℓ′, 1) and 32 ε (V + W ℓ′, W) in
+length and angle, ℓ′ the mechanism's size) leave in accelerations, a² and 2 a times their sum with the
+method's correction a, through the forces that close the loops, M⁻¹ Jᵀ (J M⁻¹ Jᵀ)⁻¹.
+
 Engines that solve a step iteratively are compared in parts that need no iteration: the quadrature of their
 own accelerations, the residual of their equations, and their first accelerations.
 """
@@ -25,7 +29,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plumbline.model.datatypes import KINDS, Array, Kind, Model, State, StepRun
-from plumbline.model.kinematics import angular_velocity, complete_state, state_from_minimal
+from plumbline.model.kinematics import (
+    angular_velocity,
+    complete_state,
+    mass_matrix,
+    state_from_minimal,
+    velocity_jacobian,
+)
+from plumbline.model.loops import RANK_TOLERANCE, cut_open
 from plumbline.model.sampling import derive_seed
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod, StepMethod
 from plumbline.truth.ground_truth import stretched_length
@@ -141,7 +152,7 @@ class FormulaSteps:
         self.starts, sizes = [states[index] for index, *_ in starts], [h for _, h, _ in starts]
         axes = [angle_axes for *_, angle_axes in starts]
         used = dict.fromkeys(index for index, *_ in starts)
-        self.bounds = {index: remembered_rounding_bound(model, states[index]) for index in used}
+        self.bounds = {index: self._acceleration_bound(states[index]) for index in used}
         nearby = {index: _disturbed(model, states[index], self.bounds[index]) for index in used}
         disturbed = [nearby[index] for index, *_ in starts]
         self.counts = tuple(counts) or step_counts(method)
@@ -229,9 +240,21 @@ class FormulaSteps:
         """Rounding bounds at both ends of a run's first steps, and those of the steps; computed once."""
         if (i, count) not in self._end_bounds:
             (index, h), end = self.places[i], _rounded(self.true[i][count])
-            ends = self.bounds[index], remembered_rounding_bound(self.model, end)
+            ends = self.bounds[index], self._acceleration_bound(end)
             self._end_bounds[i, count] = ends, self.step_bound((self.starts[i], end), ends, h, count)
         return self._end_bounds[i, count]
+
+    def _acceleration_bound(self, state: State) -> RoundingBound:
+        """The state level's bound, and what the correction of gaps adds to its accelerations."""
+        bound, rate = remembered_rounding_bound(self.model, state), self.method.gap_correction
+        if not (self.model.has_loops and rate):
+            return bound
+        moving, turning = _correction_roundings(self.model, state, rate)
+        return replace(
+            bound,
+            acceleration=bound.acceleration + moving,
+            angular_acceleration=bound.angular_acceleration + turning,
+        )
 
     def step_bound(
         self, ends: tuple[State, ...], bounds: tuple[RoundingBound, ...], h: float, count: int
@@ -249,14 +272,15 @@ class FormulaSteps:
 
         """
         norm, model = np.linalg.norm, self.model
-        path, slides = _paths(model), np.array([_slides(kind) for kind in model.kind])
+        kinds, far = model.kind[: model.n], model.body[: model.n, 0]  # of the joints that bodies hang on
+        path, slides = _paths(far), np.array([_slides(kind) for kind in kinds])
         rate = np.max([np.maximum(norm(s.omega, axis=1), norm(s.udot, axis=1)) for s in ends], axis=0)
         speed = np.max([norm(s.v, axis=1) for s in ends], axis=0)
         W, V = (np.max(np.where(path, x, 0.0), axis=1) for x in (rate, speed))
         arm = path @ stretched_length(model)
         if np.any(slides):
             arm = arm + np.max([np.max(np.where(path, norm(s.r, axis=1), 0.0), axis=1) for s in ends], axis=0)
-        links = [max(1, len(KINDS[kind].motions)) + (kind == "rod") for kind in model.kind]
+        links = [max(1, len(KINDS[kind].motions)) + (kind == "rod") for kind in kinds]
         rounding = STEP_ROUNDINGS * EPS * (path @ np.array(links))
         turning, acceleration, torque = (
             np.max([getattr(b, name) for b in bounds], axis=0)
@@ -264,7 +288,6 @@ class FormulaSteps:
         )
         # Rates are kept relative to the link before: what rounding does to one link, and to the spin of a
         # rod, reaches those beyond it once they have turned against it.
-        far = model.body[:, 0]
         above, shifted = (
             np.where(far >= 0, x[far], 0.0) for x in (turning, acceleration * (slides @ path > 0))
         )
@@ -278,7 +301,7 @@ class FormulaSteps:
         velocity += rounding * np.maximum(V, W * arm)
         if self.method.free_coordinates == "rigid motion" and self.method.formula == "Runge-Kutta":
             # closed forms of dexp⁻¹ of a rigid motion divide differences by the square of the turn
-            free = np.array([kind == "free" for kind in model.kind])
+            free = np.array([kind == "free" for kind in kinds])
             turn = np.clip(h * rate, 1e-4, 1.0)  # rad
             velocity += path @ np.where(free, STEP_ROUNDINGS * EPS * speed / turn**2, 0.0)
         return {
@@ -289,11 +312,28 @@ class FormulaSteps:
         }
 
 
-def _paths(model: Model) -> NDArray[np.bool_]:
-    """[k, b] whether body b is k or between k and the world."""
-    path = np.eye(model.n, dtype=bool)
-    for k, far in enumerate(model.body[:, 0]):
-        path[k] |= path[far] & (far >= 0)
+def _correction_roundings(model: Model, state: State, rate: float) -> Array:
+    """(2, N) r̈ and ω̇′ by the roundings of gaps that a method corrects with a rate a [1/s]."""
+    cut = cut_open(model)
+    there, scale, norm = cut.state(state), cut.row_scale, np.linalg.norm
+    of_bodies = velocity_jacobian(cut.model, there).reshape(cut.model.n, 6, -1)
+    J = np.concatenate([of_bodies[b] - of_bodies[c] for b, c in cut.ends]) * scale[:, None]
+    # a rod has no rate along itself, and M no inverse
+    pushed = np.linalg.pinv(mass_matrix(cut.model, there), hermitian=True) @ J.T
+    response = pushed @ np.linalg.pinv(J @ pushed, rcond=RANK_TOLERANCE, hermitian=True) * scale
+    size = np.max(norm(state.r, axis=1)) + np.max(norm(model.point, axis=2))
+    turning = np.max(norm(state.omega, axis=1))
+    moving = np.max(norm(state.v, axis=1)) + turning * size
+    rows = STEP_ROUNDINGS * EPS * (rate**2 * np.array([size, 1.0]) + 2 * rate * np.array([moving, turning]))
+    found = np.abs(of_bodies @ response) @ np.tile(np.repeat(rows, 3), len(cut.ends))
+    return np.asarray(norm(found.reshape(-1, 2, 3), axis=2)[cut.place[: model.n]].T)
+
+
+def _paths(far: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """[k, b] whether body b is k or between k and the world, from each body's far body."""
+    path = np.eye(len(far), dtype=bool)
+    for k, above in enumerate(far):
+        path[k] |= path[above] & (above >= 0)
     return path
 
 
@@ -393,7 +433,7 @@ def compare_parts(
     first: dict[int, tuple[Array, Array]] = {}  # by state: first accelerations and their bounds
     for index, h, run in runs:
         place = Place(index, h, len(run.trajectory.t) - 1)
-        for difference, bound, effect in _quadrature_differences(method, run, h):
+        for difference, bound, effect in _quadrature_differences(method, run, h, model.has_loops):
             error = np.max(np.abs(difference), axis=-1)  # (T − 1, N)
             worst = np.argmax(error / np.maximum(bound, np.finfo(float).tiny), axis=0)
             body = np.arange(model.n)
@@ -422,12 +462,13 @@ def compare_parts(
     return {quantity: one for quantity, one in found.items() if one.errors}
 
 
-def quadrature_residuals(method: ConstrainedMethod, runs: Runs) -> Array:
+def quadrature_residuals(method: ConstrainedMethod, runs: Runs, has_loops: bool) -> Array:
     """Return the differences of an engine's steps from the quadrature of its accelerations.
 
     Args:
         method: a formula, declared or not.
         runs: the engine's steps.
+        has_loops: whether they are of a mechanism with loops.
 
     Returns:
         One vector over all runs, steps, bodies and coordinates, each in rounding bounds.
@@ -435,17 +476,19 @@ def quadrature_residuals(method: ConstrainedMethod, runs: Runs) -> Array:
     """
     found = []
     for _, h, run in runs:
-        for difference, bound, _ in _quadrature_differences(method, run, h):
+        for difference, bound, _ in _quadrature_differences(method, run, h, has_loops):
             found.append((difference / np.maximum(bound, np.finfo(float).tiny)[..., None]).ravel())
     return np.concatenate(found)
 
 
 def _quadrature_differences(
-    method: ConstrainedMethod, run: StepRun, h: float
+    method: ConstrainedMethod, run: StepRun, h: float, has_loops: bool
 ) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
     """Of q and q̇: differences (T − 1, N, 7), their bounds and the accelerations' effect (T − 1, N)."""
     q, qdot, qddot = engine_coordinates(run)
     size = [np.max(np.abs(np.asarray(x, float)), axis=-1) for x in (q, qdot, qddot)]
+    if has_loops:  # a body may be held still, whose iterates move as the others'
+        size[2] = np.broadcast_to(np.max(size[2], axis=1, keepdims=True), size[2].shape)
     size[2] = np.maximum.accumulate(size[2], axis=0)  # the averaged a depends on all earlier ones
     predicted_q, predicted_rate = constrained_quadrature(method, run, h)
     roundings = STEP_ROUNDINGS * EPS

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from plumbline.model.datatypes import Model, State, StepRun
 from plumbline.model.kinematics import cross, cross_matrix, quaternion_product, rotate_vectors
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod
+from plumbline.truth.closed_tree import ClosedTree
 from plumbline.truth.link_tree import LinkStates, LinkTree, LongDouble
 
 Array = NDArray[Any]  # in this module of extended precision, where nothing else is stated
@@ -50,7 +51,7 @@ def joint_space_steps(
         singularity.
 
     """
-    tree = (_ReusingTree if method.reuses_acceleration else LinkTree)(model, method, states, angle_axes)
+    tree = (_ReusingTree if method.reuses_acceleration else ClosedTree)(model, method, states, angle_axes)
     q, v = tree.start()
     h = np.array(steps, LongDouble)[:, None] * LongDouble(method.step_factor) / method.substeps
     found = [tree.bodies(q, v)]
@@ -75,7 +76,7 @@ def fastest_rates(model: Model, states: Sequence[State], iterations: int = 12) -
         (B,) [1/s].
 
     """
-    system = LinkTree(model, JointSpaceMethod("Runge-Kutta", "joint rotations"), states)
+    system = ClosedTree(model, JointSpaceMethod("Runge-Kutta", "joint rotations"), states)
     q, v = system.start()
     a = system.acceleration(q, v)
     rng = np.random.default_rng(0)
@@ -96,7 +97,7 @@ def fastest_rates(model: Model, states: Sequence[State], iterations: int = 12) -
     return np.asarray(np.exp(np.mean(later, axis=0)).ravel())
 
 
-class _ReusingTree(LinkTree):
+class _ReusingTree(ClosedTree):
     """A tree whose first acceleration in a step is the last one of the step before, at an older state."""
 
     last: Array | None = None
@@ -301,7 +302,7 @@ def first_coordinate_acceleration(model: Model, state: State) -> Array:
         (N, 7) m/s² and 1/s², extended precision.
 
     """
-    tree = LinkTree(model, JointSpaceMethod("Runge-Kutta", "joint rotations"), [state])
+    tree = ClosedTree(model, JointSpaceMethod("Runge-Kutta", "joint rotations"), [state])
     (acceleration,), (turning,) = tree.body_accelerations()
     here = tree.bodies(*tree.start())
 

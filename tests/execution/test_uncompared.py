@@ -20,7 +20,7 @@ from tests.helpers.catalogue import catalogue_scenarios
         ("furuta", "all", set()),
         ("furuta", "state", set()),
         ("damped-hinge", "all", set()),
-        ("four-bar", "all", {"step"}),
+        ("four-bar", "all", set()),
         ("four-bar", "trajectory", set()),
         ("four-bars-2-flat", "all", {"step", "trajectory"}),  # singular at the start
     ],
@@ -34,7 +34,7 @@ def test_levels_that_are_left_out_are_reported(name, level, expected):
     assert all(row.verdict == Verdict.INFORMATION and "not compared: " in row.reason for row in rows)
     left_out = uncompared_kinds(scenario.model)
     assert all(task.key.kind not in left_out for task in run.tasks())
-    assert (TaskKind.STEP in left_out) == (name == "chain-30-balls" or scenario.model.has_loops)
+    assert (TaskKind.STEP in left_out) == (name == "chain-30-balls")
 
 
 def test_a_singular_initial_pose_is_unresolved_and_the_others_are_compared():

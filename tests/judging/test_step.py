@@ -15,18 +15,27 @@ from plumbline.judging.rows import RowContext, Verdict
 from plumbline.judging.step import STEP_STATES, judge_steps, step_sizes
 from plumbline.model.datatypes import KINDS, SPRING_FIELDS
 from plumbline.model.kinematics import complete_state
-from plumbline.model.random_mechanisms import random_tree
-from plumbline.model.sampling import random_states
+from plumbline.model.loops import STABILISATION
+from plumbline.model.random_mechanisms import random_loop_mechanism, random_tree
+from plumbline.model.sampling import compared_states, random_states
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod, classical_runge_kutta
 from plumbline.scenario.generator import RandomScenarios, random_scenario
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth import step_formulas
 from plumbline.truth.certified import certify_state
+from plumbline.truth.closed_tree import ClosedTree
 from plumbline.truth.link_tree import LinkTree
 from plumbline.truth.step_comparison import step_counts
 from tests.helpers import pendulums
+from tests.helpers.nightly_tests import SLOW, some_fast
 from tests.helpers.pendulums import JOINT_PATTERNS
-from tests.helpers.planted_steps import STEP_DEFECTS, StepDefect, planted_step
+from tests.helpers.planted_steps import (
+    STEP_DEFECTS,
+    StepDefect,
+    planted_step,
+    stale_velocity,
+    velocity_verlet,
+)
 
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(engine)
@@ -99,8 +108,8 @@ def test_honest_engines_take_the_declared_step(engine, joints):
 
 
 @cache
-def defect_report(defect: StepDefect):
-    model, states = subject(defect.joints, defect.has_drag)
+def defect_report(defect: StepDefect, loop=""):
+    model, states = loop_subject(loop) if loop else subject(defect.joints, defect.has_drag)
     integrator = load_adapter(defect.engine).integrator(defect.integrator)
     with planted_step(defect) as adapter:
         return judged(adapter, integrator, model, states)
@@ -342,3 +351,106 @@ def test_a_body_welded_to_a_free_one_is_part_of_it():
         )
         states = random_states(pair, 3, seed=9)
         assert not disagreeing(judged(engine, engine.integrator("implicitfast"), pair, states))
+
+
+# --- loops ---------------------------------------------------------------------------------------
+
+LOOPS = ("four-bar", "slider-crank", "flyball-governor", "squeezer", "four-bars-2")
+
+
+@cache
+def loop_subject(name):
+    scenario = load_scenario(find_scenario_file(name))
+    return scenario.model, compared_states(scenario.model, scenario.state, scenario.seed, 1)
+
+
+@pytest.mark.parametrize("name", [*LOOPS[:3], *(pytest.param(x, marks=SLOW) for x in LOOPS[3:])])
+def test_accelerations_of_loops_equal_the_certified_ones(name):
+    """At the closed states, where a correction of gaps acts on what rounding leaves open only."""
+    model, states = loop_subject(name)
+    links = ClosedTree(model, JointSpaceMethod("Runge-Kutta", "joint rotations"), states)
+    found = links.body_accelerations()
+    for i, state in enumerate(states):
+        true = certify_state(model, state).quantities
+        exact = true.acceleration, true.angular_acceleration
+        scale = max(np.max(np.abs(x)) for x in exact)
+        for value, one in zip(found, exact, strict=True):
+            np.testing.assert_allclose(value[i].astype(float), one, rtol=0, atol=1e-12 * scale)
+
+
+def test_accelerations_of_generic_loops_equal_the_certified_ones():
+    """A loop in space, on any joints and with elements, whose rows do not depend on others."""
+    model, state = random_loop_mechanism(3, 6, ("universal",), elements=ELEMENTS)
+    true = certify_state(model, state).quantities
+    (found,), _ = ClosedTree(
+        model, JointSpaceMethod("Runge-Kutta", "joint rotations", free_coordinates="rigid motion"), [state]
+    ).body_accelerations()
+    scale = np.max(np.abs(true.acceleration))
+    np.testing.assert_allclose(found.astype(float), true.acceleration, rtol=0, atol=1e-12 * scale)
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "exudyn"])
+@pytest.mark.parametrize("name", [LOOPS[0], *(pytest.param(x, marks=SLOW) for x in LOOPS[1:])])
+def test_honest_engines_take_the_declared_step_on_loops(name, engine):
+    model, states = loop_subject(name)
+    for integrator in methods(engine):
+        rows = judged(load_adapter(engine), integrator, model, states)
+        assert len(rows) == (4 if engine == "pinocchio" else 1)
+        assert all(row.verdict == Verdict.AGREES and row.ratio < 0.5 for row in rows), rows
+
+
+def loop_defects():
+    """Steps that need no dexp⁻¹ of theirs, and Exudyn's that are seen in the quadrature."""
+    for one in STEP_DEFECTS:
+        is_step = one.engine == "pinocchio" and one.integrator == "semi-implicit-euler"
+        is_seen = one.engine == "exudyn" and one.name not in (
+            "trapezoidal-index-3", "first-accelerations-zero", "first-accelerations-zero-alpha",
+        )  # fmt: skip
+        if is_seen or (is_step and not one.name.startswith(("first-order-quaternion", "last-joint"))):
+            yield one
+    yield StepDefect("explicit-for-rk4", "", "pinocchio", "rkmk4", step=stale_velocity)
+    yield StepDefect("verlet-for-rk4", "", "pinocchio", "rkmk4", step=velocity_verlet)
+
+
+@pytest.mark.parametrize("defect", some_fast(list(loop_defects()), 5))
+def test_every_other_integrator_of_a_loop_is_reported(defect):
+    rows = defect_report(defect, "four-bar")
+    assert any(row.verdict == Verdict.DISAGREES for row in rows), [row.reason for row in rows]
+
+
+WRONG_LOOP_METHODS = {
+    "no correction of gaps": ("semi-implicit-euler", {"gap_correction": 0.0}),
+    "a correction wrong by 1e-6": ("rkmk4", {"gap_correction": 50 * (1 + 1e-6)}),
+    "weights wrong by 1e-6": ("rkmk4", {"weights": (1 / 6, 1 / 3 + 1e-6, 1 / 3 - 1e-6, 1 / 6)}),
+    "stale velocity": ("semi-implicit-euler", {"new_velocity_share": 0.0}),
+}
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=SLOW * ("by 1e-6" not in x)) for x in WRONG_LOOP_METHODS]
+)
+def test_every_other_step_of_a_loop_is_reported(name):
+    integrator, change = WRONG_LOOP_METHODS[name]
+    model, states = loop_subject("four-bar")
+    method = load_adapter("pinocchio").integrator(integrator)
+    wrong = replace(method, method=replace(method.method, **change))
+    assert disagreeing(judged(load_adapter("pinocchio"), wrong, model, states))
+
+
+def test_steps_that_have_no_formula_say_why():
+    model, states = loop_subject("bricard")
+    for engine, words in (
+        ("mujoco", "not compared: MuJoCo"),
+        ("pinocchio", "not compared: rows of the loops"),
+    ):
+        integrator = methods(engine)[0]
+        (row,) = judged(load_adapter(engine), integrator, model, states)
+        assert words in row.reason and row.verdict in (Verdict.UNSUPPORTED, Verdict.INFORMATION)
+
+
+def test_steps_of_loops_are_small_enough_to_close_gaps():
+    model, states = loop_subject("slider-crank")
+    slow_states = [replace(s, omega=0 * s.omega, v=0 * s.v, xdot=0 * s.xdot) for s in states]
+    sizes = step_sizes(False, model, slow_states)
+    assert all(h[1] <= 0.5 / STABILISATION and h[0] < h[1] for h in sizes)
+    assert all(np.log2(h) % 1 for pair in sizes for h in pair), "powers of two"
