@@ -5,7 +5,9 @@ What an importer raises becomes its refusal; what it computes is checked here, f
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
+from contextlib import redirect_stdout
 from importlib import metadata
 
 import numpy as np
@@ -116,6 +118,22 @@ def evaluate_model_file(
     for index, (state, answer) in enumerate(zip(states, answers, strict=True)):
         _check(answer, len(state.velocities), f"{name}, state {index}")
     return answers
+
+
+def run_script(text: str) -> str:
+    """Run a script about an importer as a user would.
+
+    Args:
+        text: of the script.
+
+    Returns:
+        What it prints.
+
+    """
+    printed = io.StringIO()
+    with redirect_stdout(printed):
+        exec(compile(text, "script", "exec"), {"__name__": "__main__"})
+    return printed.getvalue()
 
 
 def _check(answer: ModelQuantities, count: int, label: str) -> None:

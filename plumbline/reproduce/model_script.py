@@ -1,11 +1,13 @@
 """Stand-alone scripts of importers' differences: the smallest file, one number, and what it has to be.
 
-A script imports the engine and NumPy, and prints versions, the engine's number and the certified one.
+A script imports the engine, and NumPy where it has to, and prints the engine's version, its number and the
+certified one.  It is run before it is handed out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,12 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from plumbline.diagnosis.importer_cause import Explanation
 from plumbline.engines.environments import importer_interpreter, split_version
-from plumbline.engines.importer_calls import describe_importer, evaluate_model_file, read_model_file
+from plumbline.engines.importer_calls import (
+    describe_importer,
+    evaluate_model_file,
+    read_model_file,
+    run_script,
+)
 from plumbline.importers.importer import Reading
 from plumbline.importers.model_file import BaseChoice, PreparedFile, prepare_file
 from plumbline.importers.neutral_model import (
@@ -31,13 +38,13 @@ from plumbline.processes.errors import PlumblineError
 from plumbline.processes.isolation import ScratchFolder
 from plumbline.processes.workers import Limits, Task, WorkerPool
 from plumbline.reproduce.model_shrink import shrink_tree
+from plumbline.truth.certified_model import CertifiedModelQuantities
 from plumbline.truth.model_comparison import (
+    TINY,
     certify_states,
     joint_keys,
     joint_permutation,
-    mismatches,
     model_states,
-    permuted,
     with_names_of,
 )
 
@@ -51,6 +58,15 @@ SHOWN_QUANTITIES = (  # in the order in which they are preferred: the simplest t
 PRINTED = ("joints", "damping", *SHOWN_QUANTITIES)
 MAX_LINES = 40
 XML_WIDTH = 110  # characters of a line of the file
+EXPECTED = "The expected number follows from the file alone, in interval arithmetic."
+# Coordinates of free and ball joints where nothing is moved, as an engine's calls take them; else zeros.
+NEUTRAL = {
+    "mujoco": {"free": (0, 0, 0, 1, 0, 0, 0), "ball": (1, 0, 0, 0)},
+    "drake": {"free": (1, 0, 0, 0, 0, 0, 0), "ball": (0, 0, 0)},
+}
+PRINTED_PRECISION = (
+    1e-9  # relative: a script that prints another number than the comparison is not handed out
+)
 
 
 def stored_differences(document: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
@@ -120,7 +136,7 @@ def write_model_script(
         since: a sentence about the versions that show it.
 
     Returns:
-        The script, which has not been run.
+        The script, which printed its numbers when it was run.
 
     Raises:
         NoModelScript: nothing differs, or there is no script in that form.
@@ -139,7 +155,7 @@ def write_model_script(
 
         def shows(tree: Element) -> bool:
             found = bench.judged(bench.write(tree))
-            return found is not None and _shows(found, importer, wanted)
+            return found is not None and _shows(found, importer, wanted) and bench.shown(found) is not None
 
         tree = bench.prepared.tree
         if shows(tree):
@@ -151,7 +167,7 @@ def write_model_script(
                 f"a copy of {shown} outside of its folder cannot be compared; --strip-geometry of `model` "
                 "leaves meshes out"
             )
-        return _render(bench, form, result, write_xml(tree, XML_WIDTH), since)
+        return _write(bench, form, result, write_xml(tree, XML_WIDTH), since)
 
 
 def _differs(result: FileResult) -> bool:
@@ -233,6 +249,13 @@ class _Bench:
         column = (self.importer, self.info, self.answer)
         return judge_file(str(path), model, [column], SHRINKING_STATES, None)
 
+    def shown(self, result: FileResult) -> _Shown | None:
+        """The first number that a script of the file that was judged last can print."""
+        reading = self.answer.reading
+        assert reading is not None and reading.model is not None
+        explanation = result.explanations.get(self.importer)
+        return next(_shown_numbers(self, result.model, reading.model, explanation), None)
+
     def mjcf_reading(self, prepared: PreparedFile) -> Reading | None:
         """MuJoCo's reading of an MJCF file."""
         if prepared.file.format != "mjcf":
@@ -248,36 +271,65 @@ class _Bench:
         return found
 
 
-def _render(bench: _Bench, form: str, result: FileResult, text: str, since: str) -> ModelScript:
-    """Write the script about the first quantity that differs at a simple state."""
+def _write(bench: _Bench, form: str, result: FileResult, text: str, since: str) -> ModelScript:
+    """Write the script about the first quantity that differs at a simple state and that it prints."""
     explanation = result.explanations.get(bench.importer)
     reading = bench.answer.reading
     assert reading is not None and reading.model is not None
-    number = _shown_number(bench, result.model, reading.model)
-    if number is None:
-        number = _shown_damping(form, explanation, reading.model)
-    sentences = [] if explanation is None else [cause.sentence for cause in explanation.causes]
-    why = " ".join(sentences)
+    for number in _shown_numbers(bench, result.model, reading.model, explanation):
+        script = _render(bench, form, result, text, since, number)
+        value = _printed_number(bench.call(run_script, script) or "")
+        if math.isclose(value, number.engine_value, rel_tol=PRINTED_PRECISION):
+            return ModelScript(script, text, number.engine_value, number.expected)
+    raise NoModelScript("the difference does not show at a state with round numbers")
+
+
+def _printed_number(printed: str) -> float:
+    """The engine's number in what a script printed."""
+    words = printed.rpartition(" expected: ")[0].split()
+    try:
+        return float(words[-1])
+    except (ValueError, IndexError):
+        return math.nan
+
+
+def _render(bench: _Bench, form: str, result: FileResult, text: str, since: str, number: _Shown) -> str:
+    explanation = result.explanations.get(bench.importer)
+    title = f"{bench.info.title} {bench.info.version}"
+    phrases = [cause.phrase for cause in explanation.causes] if explanation else []
+    phrases = phrases or ["reads another robot than the file says"]
+    why = " ".join([*(f"{title} {phrase}." for phrase in phrases), EXPECTED, since])
+    moves = bool(np.any(number.state.velocities))
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).with_name("templates")),
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
     )  # fmt: skip
-    script = environment.get_template("model.py.j2").render(
+    return environment.get_template("model.py.j2").render(
         form=form,
         format=bench.prepared.file.format,
         is_fixed=bench.prepared.file.base == "fixed",
         root_body=result.model.bodies[0].name,
-        title=f"{bench.info.title} {bench.info.version}",
-        why=_wrapped(
-            why or f"{bench.info.title} {bench.info.version} reads another robot than the file says."
-        )
-        + (f"\n{_wrapped(since)}" if since else ""),
+        title=title,
+        why=_wrapped(why),
         xml=text.rstrip(),
         number=number,
-        x=_literal(number.state.coordinates),
-        v=_literal(number.state.velocities),
+        x=_coordinates(form, bench, number.state),
+        v=_literal(number.state.velocities) if moves else None,
     )
-    return ModelScript(script, text, number.engine_value, number.expected)
+
+
+def _coordinates(form: str, bench: _Bench, state: CanonicalState) -> str | None:
+    """The coordinates as an engine's calls take them; None where nothing is moved."""
+    reading = bench.answer.reading
+    assert reading is not None and reading.model is not None
+    values: list[float] = []
+    is_moved = False
+    for joint, x, _ in reading.model.joint_slices():
+        count = {"ball": 3, "free": 6}.get(joint.kind)
+        own = NEUTRAL.get(form, {}).get(joint.kind, (0,) * (count or 1)) if count else state.coordinates[x]
+        values.extend(own)
+        is_moved |= count is None and bool(np.any(state.coordinates[x]))
+    return _literal(values) if is_moved else None
 
 
 def _wrapped(text: str, width: int = 108) -> str:
@@ -290,7 +342,7 @@ def _wrapped(text: str, width: int = 108) -> str:
 
 
 def _literal(values: Any) -> str:
-    return "[" + ", ".join(repr(float(value)) for value in values) + "]"
+    return "[" + ", ".join(f"{float(value):.17g}" for value in values) + "]"
 
 
 def _simple_states(model: NeutralModel) -> list[CanonicalState]:
@@ -306,48 +358,87 @@ def _simple_states(model: NeutralModel) -> list[CanonicalState]:
     return rows
 
 
-def _shown_damping(form: str, explanation: Explanation | None, reading: NeutralModel) -> _Shown:
-    """The damping that Exudyn's loader returns for the caller's use: no quantity of the engine shows it."""
-    change = next((c for cause in explanation.causes for c in cause.changes), None) if explanation else None
-    if form != "exudyn" or change is None or change.field != "damping":
-        raise NoModelScript("the difference does not show at a state with round numbers")
-    names = [joint.name for joint in reading.joints]
-    place, label = names.index(change.joint), f"damping of joint {change.joint}"
-    return _Shown("damping", (place,), label, _simple_states(reading)[0], change.theirs, change.own)
-
-
-def _shown_number(bench: _Bench, model: NeutralModel, reading: NeutralModel) -> _Shown | None:
-    """Choose the number that the script prints; None where no quantity differs at a simple state."""
+def _shown_numbers(
+    bench: _Bench, model: NeutralModel, reading: NeutralModel, explanation: Explanation | None
+) -> Iterator[_Shown]:
+    """Go through the numbers that a script can print, the simplest to understand first."""
     order = joint_permutation(model, reading)
     if order is None:
         count = float(reading.velocity_count)
-        state = CanonicalState(np.zeros(0), np.zeros(0))
-        return _Shown("freedom", (), "degrees of freedom", state, count, float(model.velocity_count))
+        if count != model.velocity_count:
+            state = CanonicalState(np.zeros(0), np.zeros(0))
+            yield _Shown("freedom", (), "degrees of freedom", state, count, float(model.velocity_count))
+        return
     states = _simple_states(reading)
     answers = bench.evaluate(states)
     applied = all(answer.passive_force is not None for answer in answers)
-    judged = model if applied else without_passive_forces(model)
-    inverse = np.argsort(order)
-    shown = [q for q in SHOWN_QUANTITIES if q != "passive_force" or bench.name == "mujoco"]
-    for quantity in shown:
-        for state, answer in zip(states, answers, strict=True):
-            own = _reordered(state, reading, model)
-            (truth,) = certify_states(judged, [own])
-            worst = mismatches(judged, [truth], [permuted(answer, order)]).get(quantity)
-            if worst is None or worst.ratio <= 1:
-                continue
-            if quantity == "position":
-                body = worst.where.removeprefix("body ")
-                values = answer.poses[body][:, 3], truth.quantities.poses[body][:, 3]
-                label = f"position of body {body}"
-            else:
-                expected = getattr(truth.quantities, quantity)
-                expected = expected[np.ix_(*[inverse] * expected.ndim)]
-                values, label = (getattr(answer, quantity), expected), quantity.replace("_", " ")
-            difference = np.abs(values[0] - values[1])
-            index = tuple(int(i) for i in np.unravel_index(int(np.argmax(difference)), difference.shape))
-            return _Shown(quantity, index, label, state, float(values[0][index]), float(values[1][index]))
-    return None
+    judged, theirs = (m if applied else without_passive_forces(m) for m in (model, reading))
+    truths = [certify_states(judged, [_reordered(state, reading, model)])[0] for state in states]
+    read = certify_states(theirs, states)
+    for quantity in SHOWN_QUANTITIES:
+        if quantity == "passive_force" and bench.name != "mujoco":
+            continue
+        for state, answer, truth, other in zip(states, answers, truths, read, strict=True):
+            found = _worst_entry(quantity, answer, truth, other, order)
+            if found is not None:
+                yield _Shown(quantity, found[1], found[0], state, *found[2:])
+    if bench.name == "exudyn":
+        yield from _shown_damping(explanation, reading)
+
+
+def _worst_entry(
+    quantity: str,
+    answer: ModelQuantities,
+    truth: CertifiedModelQuantities,
+    read: CertifiedModelQuantities,
+    order: Sequence[int],
+) -> tuple[str, tuple[int, ...], float, float] | None:
+    """The entry that differs most beyond rounding: label, index, the engine's number, the expected one.
+
+    The bound is the larger one of what the file says and of what the importer reads, so that the engine's
+    rounding of large terms beside an expected zero is no evidence.
+    """
+    if quantity == "position":
+        triples = {
+            f"position of body {body}": (
+                answer.poses[body][:, 3],
+                pose[:, 3],
+                np.maximum(truth.tolerance["poses"][body], read.tolerance["poses"].get(body, 0.0))[:, 3],
+            )
+            for body, pose in truth.quantities.poses.items()
+            if body in answer.poses
+        }
+    else:
+        values, own = getattr(answer, quantity), getattr(truth.quantities, quantity)
+        if values is None or own is None:
+            return None
+        index = np.ix_(*[np.argsort(order)] * own.ndim)
+        limit = truth.tolerance[quantity][index]
+        if getattr(read.quantities, quantity) is not None:
+            limit = np.maximum(limit, read.tolerance[quantity])
+        triples = {quantity.replace("_", " "): (values, own[index], limit)}
+    worst = 1.0
+    found = None
+    for label, (values, expected, limit) in triples.items():
+        if not np.size(values):
+            continue
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            ratios = np.nan_to_num(np.abs(values - expected) / np.maximum(limit, TINY), nan=0.0)
+        place = tuple(sorted(int(i) for i in np.unravel_index(int(np.argmax(ratios)), ratios.shape)))
+        if ratios[place] > worst:
+            worst = ratios[place]
+            found = label, place, float(values[place]), float(expected[place])
+    return found
+
+
+def _shown_damping(explanation: Explanation | None, reading: NeutralModel) -> Iterator[_Shown]:
+    """The damping that Exudyn's loader returns for the caller's use: no quantity of the engine shows it."""
+    changes = [c for cause in explanation.causes for c in cause.changes] if explanation else []
+    names = [joint.name for joint in reading.joints]
+    for change in changes:
+        if change.field == "damping" and change.joint in names:
+            index, label = (names.index(change.joint),), f"damping of joint {change.joint}"
+            yield _Shown("damping", index, label, _simple_states(reading)[0], change.theirs, change.own)
 
 
 def _reordered(state: CanonicalState, reading: NeutralModel, model: NeutralModel) -> CanonicalState:

@@ -6,11 +6,13 @@ import time
 from collections.abc import Callable, Iterator
 from copy import deepcopy
 
+from plumbline.importers.mjcf_rewriting import rewritings
 from plumbline.importers.xml_tree import Element
 
 Shows = Callable[[Element], bool]
 _NUMBERS = set("0123456789+-.eE ")
-_KEPT_ATTRIBUTES = {"name", "link", "type", "joint"}
+_REFERRED = {"body", "joint", "freejoint", "link", "robot"}  # whose names the script or the format needs
+_EXPANDED_DEFAULTS = "defaults expanded"
 
 
 def shrink_tree(root: Element, shows: Shows, seconds: float) -> Element:
@@ -27,7 +29,8 @@ def shrink_tree(root: Element, shows: Shows, seconds: float) -> Element:
     """
     deadline = time.monotonic() + seconds
     best = root
-    for candidates in (_without_branches, _without_elements, _hoisted, _without_attributes, _rounded) * 2:
+    passes = (_without_branches, _without_elements, _hoisted, _without_attributes, _rounded)
+    for candidates in (_without_defaults, _without_kinds, *passes, _without_kinds, *passes):
         place = 0
         while time.monotonic() < deadline:
             candidate = next(_from(candidates(best), place), None)
@@ -87,6 +90,33 @@ def _without_links(root: Element, dropped: set[str]) -> Element:
     return copy
 
 
+def _without_defaults(root: Element) -> Iterator[Element]:
+    """MJCF: what is inherited written at each joint and geom, without the sections that are not compared."""
+    if root.tag == "mujoco" and (expanded := rewritings(root).get(_EXPANDED_DEFAULTS)):
+        yield expanded
+
+
+def _without_kinds(root: Element) -> Iterator[Element]:
+    """Without all elements of a tag, or one attribute of all of them: most of a file goes in few trials."""
+    elements = list(root.walk())
+    for tag in dict.fromkeys(element.tag for element in elements[1:]):
+        copy = deepcopy(root)
+        for element in copy.walk():
+            element.children = [child for child in element.children if child.tag != tag]
+        yield copy
+    for tag, name in dict.fromkeys((e.tag, name) for e in elements for name in e.attributes):
+        if not _is_kept(tag, name):
+            copy = deepcopy(root)
+            for element in copy.walk():
+                if element.tag == tag:
+                    element.attributes.pop(name, None)
+            yield copy
+
+
+def _is_kept(tag: str, attribute: str) -> bool:
+    return attribute == "link" or (attribute == "name" and tag in _REFERRED)
+
+
 def _without_elements(root: Element) -> Iterator[Element]:
     order = {id(element): i for i, element in enumerate(root.walk())}
     for parent, index in _paths(root):
@@ -131,7 +161,7 @@ def _hoisted(root: Element) -> Iterator[Element]:
 def _without_attributes(root: Element) -> Iterator[Element]:
     for place, element in enumerate(root.walk()):
         for name in element.attributes:
-            if name not in _KEPT_ATTRIBUTES:
+            if not _is_kept(element.tag, name):
 
                 def remove(elements: list[Element], place: int = place, name: str = name) -> None:
                     del elements[place].attributes[name]
@@ -144,7 +174,7 @@ def _rounded(root: Element) -> Iterator[Element]:
     for place, element in enumerate(root.walk()):
         for name, value in element.attributes.items():
             words = value.split()
-            if not words or not set(value) <= _NUMBERS or name in _KEPT_ATTRIBUTES:
+            if not words or not set(value) <= _NUMBERS or _is_kept(element.tag, name):
                 continue
             for simple in _simpler(words):
                 if simple == value or len(simple) > len(value):

@@ -11,9 +11,12 @@ from click.testing import CliRunner
 
 from plumbline.cli.main import main
 from plumbline.engines.environments import EnvironmentUnavailable, importer_interpreter
+from plumbline.importers.neutral_model import ModelQuantities
 from plumbline.importers.xml_tree import parse_xml, write_xml
-from plumbline.reproduce.model_script import MAX_LINES, NoModelScript, write_model_script
+from plumbline.reproduce import model_script
+from plumbline.reproduce.model_script import MAX_LINES, NoModelScript, _worst_entry, write_model_script
 from plumbline.reproduce.model_shrink import shrink_tree
+from plumbline.truth.certified_model import CertifiedModelQuantities
 from tests.helpers.random_robots import random_urdf
 
 # Pinocchio 4.1 keeps its own gravity and ignores references
@@ -116,6 +119,26 @@ def test_the_command_lists_and_writes(tmp_path):
     assert damaged.exit_code == 2 and "model.json: no results of `plumbline model`" in damaged.stderr
     (out / "model.json").write_text(json.dumps({"files": [], "options": options}))
     assert "nothing differs" in runner.invoke(main, ["reproduce", str(out)]).stderr
+
+
+def test_rounding_beside_an_expected_zero_is_no_evidence():
+    """The gravity of the file has no x; the gravity read leaves a rounded zero on a slide along x."""
+    truth, read = (
+        CertifiedModelQuantities(ModelQuantities({}, gravity_force=np.zeros(2)), {"gravity_force": limits})
+        for limits in (np.zeros(2), np.array([4e-14, 1e-3]))
+    )
+    answer = ModelQuantities({}, gravity_force=np.array([2.3e-14, 0.0]))
+    assert _worst_entry("gravity_force", answer, truth, read, [0, 1]) is None
+    answer = ModelQuantities({}, gravity_force=np.array([2.3e-14, 2e-3]))
+    assert _worst_entry("gravity_force", answer, truth, read, [0, 1]) == ("gravity force", (1,), 2e-3, 0.0)
+
+
+def test_a_script_that_prints_another_number_is_not_handed_out(tmp_path, monkeypatch):
+    path = tmp_path / "moon.xml"
+    path.write_text(MJCF)
+    monkeypatch.setattr(model_script, "EXPECTED", '"""\nprint(" 1.0 expected: 2.0")\nraise SystemExit\n"""')
+    with pytest.raises(NoModelScript, match="does not show"):
+        write_model_script(str(path), "pinocchio", "pinocchio", seconds=0)
 
 
 def test_an_importer_that_agrees_has_no_script(tmp_path):
