@@ -27,8 +27,9 @@ from plumbline.importers.neutral_model import (
 )
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import rotation_matrix
-from plumbline.truth.certified_model import CertifiedModelQuantities, pose_tolerances
+from plumbline.truth.certified_model import CertifiedModelQuantities, pose_tolerances, rough_quantities
 from plumbline.truth.model_comparison import (
+    TINY,
     Mismatch,
     certify_states,
     joint_permutation,
@@ -42,6 +43,7 @@ BODY_FIELDS = ("position", "attitude", "mass", "center", "inertia")
 DEFAULT_INERTIAL = "default inertial"  # 1 kg and 1 kg m² for each body without mass
 ASSUMED_INERTIAL = "assumed inertial"  # other values for bodies without <inertial>, as from geometry
 FRAME = "frame"
+SLIDE_SCALE = "displacement"  # of a slide, in the poses alone: its coordinate times a number
 MISSING = "missing body"
 FRAME_FIELDS = ("position", "attitude", "anchor", "reference")  # which may describe one pose in several ways
 MAX_OMISSIONS = 4
@@ -51,6 +53,7 @@ FIELD_WORDS = {
     "center": "centre of mass", "spring_reference": "spring reference", "position": "position in its parent",
     "attitude": "attitude in its parent", "reference": "reference coordinate", "joints": "joints",
 }  # fmt: skip
+FAR = 1e4  # times the bound of rounding: changes that leave so much are not worth a certificate
 MAX_SINGLE_TRIALS = 40  # changes of one field that are tried one by one
 PRUNING_STATES = 3
 States = Callable[[NeutralModel], Sequence[CanonicalState]]
@@ -345,6 +348,7 @@ class _Trial:
         self.tried: dict[
             tuple[int, ...], tuple[NeutralModel, list[CertifiedModelQuantities], Sequence[Change]]
         ] = {}
+        self.tolerance: Mapping[str, Any] = {}  # at the first state, of the first changes that were certified
 
     def worst(self, changes: Sequence[Change], count: int) -> Mapping[str, Mismatch] | None:
         """Worst entries with the changes made; None where the joints still differ."""
@@ -355,8 +359,7 @@ class _Trial:
         states = self.states(changed)[:count]
         still = {change.joint for change in changes if change.field == ARMATURE_ENERGY}
         truths = [_without_armature(changed, still, *pair) for pair in zip(states, truths, strict=True)]
-        offsets = {change.body: change.theirs for change in changes if change.field == FRAME}
-        truths = [_with_frames(truth, offsets) for truth in truths]
+        truths = [_with_placing(changed, changes, *pair) for pair in zip(states, truths, strict=True)]
         return mismatches(changed, truths, [permuted(one, order) for one in self.answers[:count]])
 
     def certified(
@@ -371,7 +374,25 @@ class _Trial:
             new = slice(len(truths), count)
             pairs = zip(certify_states(changed, self.states(changed)[new]), self.placed[new], strict=True)
             truths += [_widened(*pair) for pair in pairs]
+            if truths and not self.tolerance:
+                self.tolerance = truths[0].tolerance
         return changed, truths[:count]
+
+    def is_far(self, changes: Sequence[Change], with_poses: bool = True) -> bool:
+        """Whether M, or a pose, at the first state is so far off that no certificate is needed."""
+        if not self.tolerance:
+            self.certified((), 1)
+        changed, _ = self.certified(changes, 0)
+        if not self.tolerance or self.tried[tuple(map(id, changes))][1]:
+            return False
+        order = joint_permutation(changed, self.reading)
+        if order is None or len(order) != len(self.tolerance["mass_matrix"]):
+            return False
+        state = self.states(changed)[0]
+        truth = CertifiedModelQuantities(rough_quantities(changed, state), self.tolerance)
+        truth = _with_placing(changed, changes, state, truth)
+        found = mismatches(changed, [truth], [permuted(self.answers[0], order)])
+        return any(m.ratio > FAR for name, m in found.items() if with_poses or name == "mass_matrix")
 
     def smallest_with_omissions(self, changes: Sequence[Change]) -> list[Change] | None:
         """Try the changes alone, then with terms that the dynamics may leave out."""
@@ -395,14 +416,15 @@ class _Trial:
 
     def misplaced(self, changes: Sequence[Change]) -> float:
         """How many bodies are elsewhere at the first state, with the changes made."""
-        changed, truths = self.certified(changes, 1)
+        changed, _ = self.certified(changes, 0)
         if joint_permutation(changed, self.reading) is None:
             return np.inf
-        (truth,) = truths
-        own, theirs = truth.quantities.poses, self.answers[0].poses
-        return sum(
-            bool(np.any(np.abs(own[b] - theirs[b]) > truth.tolerance["poses"][b])) for b in own if b in theirs
-        )
+        state = self.states(changed)[0]
+        own, theirs = rough_quantities(changed, state).poses, self.answers[0].poses
+        bounds = {
+            b: np.maximum(X, self.placed[0].get(b, X)) for b, X in pose_tolerances(changed, state).items()
+        }
+        return sum(bool(np.any(np.abs(own[b] - theirs[b]) > bounds[b])) for b in own if b in theirs)
 
     def with_needed_frames(self, changes: Sequence[Change]) -> list[Change]:
         """Keep the changes of frames that put a body where the importer has it."""
@@ -416,6 +438,8 @@ class _Trial:
 
     def wrong_at_first(self, changes: Sequence[Change]) -> bool:
         """Whether more than poses is wrong at the first state, which is cheap to find out."""
+        if self.is_far(changes, with_poses=False):
+            return True
         found = self.worst(changes, 1)
         return found is None or any(
             m.ratio > 1 for name, m in found.items() if name not in ("position", "attitude")
@@ -426,10 +450,39 @@ class _Trial:
         found = self.worst(changes, min(PRUNING_STATES, len(self.answers)))
         return {name for name, m in (found or {}).items() if m.ratio > 1}
 
+    def has_wrong_poses_only(self, changes: Sequence[Change], count: int) -> bool:
+        """Whether poses are wrong with the changes made, and nothing else."""
+        found = self.worst(changes, count)
+        wrong = {name for name, m in (found or {}).items() if m.ratio > 1}
+        return bool(wrong) and wrong <= {"position", "attitude"}
+
+    def slide_changes(self, changes: Sequence[Change], count: int) -> list[Change]:
+        """Slides that put bodies at a multiple of their coordinates, as with an axis not of length one."""
+        if not self.has_wrong_poses_only(changes, count):
+            return []
+        changed, truths = self.certified(changes, count)
+        states, found = self.states(changed)[:count], []
+        slices = {joint.name: x for joint, x, _ in changed.joint_slices()}
+        for body in changed.bodies:
+            if [joint.kind for joint in body.joints] != ["slide"]:
+                continue
+            (joint,) = body.joints
+            axis = rotation_matrix(body.attitude) @ joint.axis
+            moved = [float(state.coordinates[slices[joint.name]][0]) - joint.reference for state in states]
+            places = [
+                [_in_parent(changed, body, poses) for poses in (answer.poses, truth.quantities.poses)]
+                for answer, truth in zip(self.answers, truths, strict=False)
+            ]
+            shifts = [float(axis @ (theirs - own)) for theirs, own in places]
+            scale = 1 + float(np.dot(shifts, moved)) / max(float(np.dot(moved, moved)), TINY)
+            if abs(scale - 1) > RELATIVE_CHANGE:
+                source = joint.fields.get("axis", joint.source)
+                found.append(Change(SLIDE_SCALE, body.name, joint.name, 1.0, scale, source))
+        return found
+
     def frame_changes(self, changes: Sequence[Change], count: int) -> list[Change]:
         """Frames that lie elsewhere in their bodies, where nothing but poses is wrong."""
-        found = self.worst(changes, count)
-        if found is None or {n for n, m in found.items() if m.ratio > 1} - {"position", "attitude"}:
+        if not self.has_wrong_poses_only(changes, count):
             return []
         changed, truths = self.certified(changes, count)
         frames = []
@@ -454,7 +507,9 @@ class _Trial:
         return np.inf if found is None else max((m.ratio for m in found.values()), default=0.0)
 
     def fits(self, changes: Sequence[Change], count: int) -> bool:
-        """Whether the changes reproduce everything; at the first state alone first, where most do not."""
+        """Whether the changes reproduce everything; roughly at the first state alone first: most do not."""
+        if self.is_far(changes):
+            return False
         return self.remaining(changes, 1) <= 1 and (count == 1 or self.remaining(changes, count) <= 1)
 
     def smallest(self, changes: Sequence[Change]) -> list[Change] | None:
@@ -469,7 +524,9 @@ class _Trial:
         """Drop the changes that ``count`` states do not need; None where the rest does not fit all states."""
         needed = list(changes)
         if self.remaining(needed, count) > 1:
-            needed += self.frame_changes(needed, count)
+            scaled = [*needed, *self.slide_changes(needed, count)]
+            is_scaled = len(scaled) > len(needed) and self.remaining(scaled, count) <= 1
+            needed = scaled if is_scaled else [*needed, *self.frame_changes(needed, count)]
         if not (needed or self.has_structure) or not self.fits(needed, count):
             return None
         for body in dict.fromkeys(change.body for change in changes if change.field in FRAME_FIELDS):
@@ -499,13 +556,30 @@ def _widened(truth: CertifiedModelQuantities, placed: Mapping[str, Array]) -> Ce
     return replace(truth, tolerance={**truth.tolerance, "poses": poses})
 
 
-def _with_frames(truth: CertifiedModelQuantities, offsets: Mapping[str, Array]) -> CertifiedModelQuantities:
-    """Poses of bodies whose frame is elsewhere in the body: X → X Y."""
-    poses = {
-        body: _composed(pose, offsets[body]) if body in offsets else pose
-        for body, pose in truth.quantities.poses.items()
-    }
+def _with_placing(
+    model: NeutralModel, changes: Sequence[Change], state: CanonicalState, truth: CertifiedModelQuantities
+) -> CertifiedModelQuantities:
+    """Poses with displacements of slides scaled, and of bodies whose frame is elsewhere in them: X → X Y."""
+    offsets = {change.body: change.theirs for change in changes if change.field == FRAME}
+    scales = {change.joint: change.theirs for change in changes if change.field == SLIDE_SCALE}
+    if not offsets and not scales:
+        return truth
+    poses = truth.quantities.poses
+    if scales:
+        x = state.coordinates.copy()
+        for joint, places, _ in model.joint_slices():
+            x[places] += (scales.get(joint.name, 1.0) - 1) * (x[places] - joint.reference)
+        poses = rough_quantities(model, replace(state, coordinates=x)).poses
+    poses = {body: _composed(X, offsets[body]) if body in offsets else X for body, X in poses.items()}
     return replace(truth, quantities=replace(truth.quantities, poses=poses))
+
+
+def _in_parent(model: NeutralModel, body: NeutralBody, poses: Mapping[str, Array]) -> Array:
+    """Where a body's origin is in its parent; zero where a pose is missing."""
+    parent = poses.get(model.bodies[body.parent].name) if body.parent >= 0 else np.eye(3, 4)
+    if parent is None or body.name not in poses:
+        return np.zeros(3)
+    return np.asarray(parent[:, :3].T @ (poses[body.name][:, 3] - parent[:, 3]), float)
 
 
 def _composed(pose: Array, offset: Array) -> Array:
@@ -710,7 +784,7 @@ def apply_changes(own: NeutralModel, theirs: NeutralModel, changes: Sequence[Cha
     }
     gravity = own.gravity
     for change in changes:
-        if change.field in (ARMATURE_ENERGY, FRAME):
+        if change.field in (ARMATURE_ENERGY, FRAME, SLIDE_SCALE):
             continue
         if change.field == "gravity":
             gravity = change.theirs
@@ -769,6 +843,13 @@ def _describe(members: Sequence[Change]) -> str:
         return (
             f"puts the frame of {len(members)} bodies ({_names(members)}) elsewhere in the body, that of "
             f"{first.body} at {shift} ({first.source}), which moves no mass"
+        )
+    if first.field == SLIDE_SCALE:
+        slides = f"slide {first.joint}" if len(members) == 1 else f"{len(members)} slides ({_names(members)})"
+        return (
+            f"multiplies the coordinate of {slides} by the length of its axis where it places bodies, "
+            f"that of {first.joint} by {format_value(first.theirs, 1.0)} ({first.source}), but not in its "
+            "equations"
         )
     if first.field == DEFAULT_INERTIAL:
         names = "; ".join(f"{change.body} ({change.source})" for change in members[:6])

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from plumbline.diagnosis.importer_cause import Explanation
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.environments import (
     EnvironmentUnavailable,
@@ -28,10 +29,19 @@ from plumbline.importers.model_file import BaseChoice, PreparedFile, prepare_fil
 from plumbline.importers.neutral_model import CanonicalState, NeutralModel
 from plumbline.importers.xml_tree import ModelFileError
 from plumbline.judging.known_issues import KnownIssue, KnownIssues
-from plumbline.judging.model_file import MODEL_FAMILY, Answer, FileResult, judge_file, state_seed
+from plumbline.judging.model_file import (
+    MODEL_FAMILY,
+    Answer,
+    FileResult,
+    FileTruth,
+    certify_file,
+    file_result,
+    judge_importer,
+    state_seed,
+)
 from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.processes.isolation import ScratchFolder
-from plumbline.processes.workers import Executor, Limits, Outcome, Task, WorkerPool
+from plumbline.processes.workers import Executor, Limits, Outcome, Pickled, Task, WorkerPool
 from plumbline.scenario.errors import Problem, did_you_mean, shorten
 from plumbline.truth.model_comparison import model_states, with_names_of
 
@@ -106,6 +116,7 @@ class _ModelRun:
         self.pythons: dict[str, str] = {}
         self.engines: dict[str, EngineInfo] = {}
         self.problems: list[Problem] = []
+        self.truths: dict[str, Pickled | str] = {}  # of each file, or why there is none
 
     def execute(self) -> ModelRunResult:
         """Run the phases."""
@@ -198,8 +209,12 @@ class _ModelRun:
             if file.file.format in declared_formats(name)
             and (name in self.plan.importers or file.file.format == "mjcf")
         ]
+        known = {shown: file.urdf_model for shown, file in prepared.items() if file.urdf_model is not None}
+        tasks += self.certificates(known)
         found = {}
         for outcome in self.outcomes(tasks):
+            if self.is_certificate(outcome):
+                continue
             reading: Reading | None = outcome.value
             if reading is not None:  # a copy's path would mean nothing to the user
                 shown = outcome.key[1]
@@ -252,8 +267,11 @@ class _ModelRun:
                 )
                 file = prepared[shown].file
                 tasks.append(self.task("evaluate", shown, name, evaluate_model_file, file, states))
+        tasks += self.certificates({s: model for s, model in models.items() if s not in self.truths})
         for outcome in self.outcomes(tasks):
             key = outcome.key[1:]
+            if self.is_certificate(outcome):
+                continue
             if outcome.failure:
                 answers[key] = replace(answers[key], failure=outcome.failure)
             else:
@@ -275,6 +293,21 @@ class _ModelRun:
             answers[key] = replace(answers[key], rewritten=outcome.value or {})
         return answers
 
+    def certificates(self, models: Mapping[str, NeutralModel]) -> list[Task]:
+        """Certify files' models: of URDF files while importers read them, of MJCF files afterwards."""
+        state = self.plan.state_count, self.plan.at
+        return [
+            Task(("certify", shown), certify_file, (shown, model, *state), self.plan.limits)
+            for shown, model in models.items()
+        ]
+
+    def is_certificate(self, outcome: Outcome) -> bool:
+        """Keep a certificate; False for other outcomes."""
+        if outcome.key[0] != "certify":
+            return False
+        self.truths[outcome.key[1]] = outcome.failure or outcome.pickled
+        return True
+
     def states(self, shown: str, model: NeutralModel) -> tuple[CanonicalState, ...]:
         """The states of one file; the same values for joints of one name and kind in every reading."""
         return model_states(model, self.plan.state_count, state_seed(shown), self.plan.at)
@@ -282,27 +315,43 @@ class _ModelRun:
     def judge(
         self, models: Mapping[str, NeutralModel], answers: Mapping[tuple[str, str], Answer]
     ) -> Iterator[FileResult]:
-        """Judge the files in workers, in the order in which they were named."""
-        tasks = []
-        for shown, model in models.items():
-            columns = []
-            for name in self.plan.importers:
-                info = self.engines[name]
-                answer = answers.get((shown, name))
-                columns.append((name, info, answer or Answer(failure=info.missing or "")))
-            arguments = (shown, model, tuple(columns), self.plan.state_count, self.plan.at)
-            tasks.append(Task(("judge", shown), judge_file, arguments, self.plan.limits))
-        found = {}
-        for outcome in self.outcomes(tasks):
-            shown = outcome.key[1]
-            if outcome.failure:
-                context = RowContext(shown, MODEL_FAMILY, "-", "Plumbline", "")
-                reason = f"the judging failed: {outcome.failure}"
-                row = context.make_row("model", "-", "all", Verdict.HARNESS_FAILED, reason)
-                found[shown] = FileResult(shown, models[shown], (row,), {}, {})
+        """Judge each file and importer in a worker, in the order in which the files were named."""
+        columns = {
+            (shown, name): (name, info, answers.get((shown, name)) or Answer(failure=info.missing or ""))
+            for shown in models
+            for name, info in ((name, self.engines[name]) for name in self.plan.importers)
+        }
+        tasks: list[Task] = []
+        judged: dict[tuple[str, str], tuple[list[Row], Explanation | None]] = {}
+        for (shown, name), column in columns.items():
+            truth, model = self.truths[shown], models[shown]
+            arguments = (shown, model, column, self.plan.state_count, self.plan.at)
+            if isinstance(truth, str):
+                judged[shown, name] = self.lost(shown, column, truth)
+            elif column[2].quantities:  # where it says which causes a difference has, which takes time
+                key = ("judge", shown, name)
+                tasks.append(Task(key, judge_importer, (*arguments, truth), self.plan.limits))
             else:
-                found[shown] = outcome.value
-        yield from (found[shown] for shown in models)
+                judged[shown, name] = judge_importer(*arguments, truth.load())
+        for outcome in self.outcomes(tasks):
+            (_, shown, name), failure = outcome.key, outcome.failure
+            judged[shown, name] = (
+                self.lost(shown, columns[shown, name], failure) if failure else outcome.value
+            )
+        for shown, model in models.items():
+            truth = self.truths[shown]
+            known = FileTruth((), (), {}) if isinstance(truth, str) else truth.load()
+            named = [(shown, name) for name in self.plan.importers]
+            yield file_result(shown, model, [columns[n] for n in named], [judged[n] for n in named], known)
+
+    def lost(
+        self, shown: str, column: tuple[str, EngineInfo, Answer], failure: str
+    ) -> tuple[list[Row], None]:
+        """The row of a judging that failed."""
+        name, info, _ = column
+        context = RowContext(shown, MODEL_FAMILY, name, info.title, info.version)
+        reason = f"the judging failed: {failure}"
+        return [context.make_row("model", "-", "all", Verdict.HARNESS_FAILED, reason)], None
 
 
 def declared_formats(name: str) -> tuple[str, ...]:

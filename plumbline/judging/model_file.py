@@ -262,6 +262,37 @@ def state_seed(shown: str) -> int:
     return int.from_bytes(hashlib.sha256(Path(shown).name.encode()).digest()[:4], "big") + SEED
 
 
+@dataclass(frozen=True, eq=False)
+class FileTruth:
+    """Certified quantities of a file's model at its states."""
+
+    states: Sequence[CertifiedModelQuantities]
+    without_passive: Sequence[CertifiedModelQuantities]  # for engines whose dynamics have no passive forces
+    poses: Mapping[str, Array]  # of the bodies at the reference, or at the one state, for the drawing
+
+
+def certify_file(
+    shown: str, model: NeutralModel, state_count: int, at: Mapping[str, float] | None
+) -> FileTruth:
+    """Certify a file's model at the states of a comparison.
+
+    Args:
+        shown: the path as typed.
+        model: what the file says.
+        state_count: number of random states.
+        at: the one state to compare at instead.
+
+    Returns:
+        The certified quantities.
+
+    """
+    states = model_states(model, state_count, state_seed(shown), at)
+    truths, bare = certify_states(model, states), without_passive_forces(model)
+    bare_truths = certify_states(bare, states) if bare is not model else truths
+    (drawn,) = certify_states(model, model_states(model, 1, 0, at or {}))
+    return FileTruth(truths, bare_truths, drawn.quantities.poses)
+
+
 def judge_file(
     shown: str,
     model: NeutralModel,
@@ -282,46 +313,90 @@ def judge_file(
         The file's result.
 
     """
+    truth = certify_file(shown, model, state_count, at)
+    judged = [judge_importer(shown, model, column, state_count, at, truth) for column in columns]
+    return file_result(shown, model, columns, judged, truth)
+
+
+def file_result(
+    shown: str,
+    model: NeutralModel,
+    columns: Sequence[tuple[str, EngineInfo, Answer]],
+    judged: Sequence[tuple[Sequence[Row], Explanation | None]],
+    truth: FileTruth,
+) -> FileResult:
+    """Collect what importers were judged to do with a file.
+
+    Args:
+        shown: the path as typed.
+        model: what the file says.
+        columns: as of `judge_file`.
+        judged: of `judge_importer`, for each column.
+        truth: of `certify_file`.
+
+    Returns:
+        The file's result.
+
+    """
+    rows = tuple(row for own, _ in judged for row in own)
+    pairs = zip(columns, judged, strict=True)
+    explanations = {name: found for (name, *_), (_, found) in pairs if found is not None}
+    return FileResult(shown, model, rows, explanations, truth.poses)
+
+
+def judge_importer(
+    shown: str,
+    model: NeutralModel,
+    column: tuple[str, EngineInfo, Answer],
+    state_count: int,
+    at: Mapping[str, float] | None,
+    truth: FileTruth,
+) -> tuple[list[Row], Explanation | None]:
+    """Judge one importer's answer about a file, and look for the causes of its differences.
+
+    Args:
+        shown: the path as typed.
+        model: what the file says.
+        column: name and description of the importer, and its answer.
+        state_count: number of random states.
+        at: the one state to compare at instead.
+        truth: of `certify_file`.
+
+    Returns:
+        The rows, and what explains the differences, if there are any.
+
+    """
 
     def states(one: NeutralModel) -> tuple[CanonicalState, ...]:
         return model_states(one, state_count, state_seed(shown), at)
 
-    truths = certify_states(model, states(model))
-    bare = without_passive_forces(model)
-    bare_truths = certify_states(bare, states(bare)) if bare is not model else truths
-    rows: list[Row] = []
-    explanations: dict[str, Explanation] = {}
-    for name, info, answer in columns:
-        context = RowContext(shown, MODEL_FAMILY, name, info.title, info.version)
-        if answer.reading is None and not answer.failure:
-            formats = declared_importer_attribute(split_version(name)[0], "formats")
-            reason = f"{info.title} reads {' and '.join(formats).upper()} files only"
-            rows.append(context.make_row("model", "-", "all", Verdict.INFORMATION, reason))
-            continue
-        if info.missing is not None:
-            verdict = Verdict.FAILED if info.has_failed else Verdict.NOT_INSTALLED
-            rows.append(context.make_row("model", "-", "all", verdict, info.missing))
-            continue
-        unsupported = declared_importer_attribute(split_version(name)[0], "unsupported") or {}
-        applies = "passive_force" not in unsupported
-        judged = (model, truths) if applies else (bare, bare_truths)
-        found = judge_answer(context, *judged, answer, unsupported)
-        if any(row.verdict == Verdict.DISAGREES for row in found):
-            explanations[name] = explanation = _explain(context, judged[0], answer, states, applies)
-            found = [_with_diagnosis(row, explanation) for row in found]
-        if not applies and answer.reading is not None and answer.reading.model is not None:
-            cause = damping_cause(f"{info.title} {info.version}", model, answer.reading.model)
-            cause = cause and cause.within(shown)
-            found.append(_damping_row(context, cause))
-            if cause is not None:
-                known = explanations.get(name, Explanation(is_proved=True))
-                explanations[name] = replace(known, causes=(*known.causes, cause))
-        if answer.rewritten and answer.reading is not None and answer.reading.model is not None:
-            found.append(rewriting_row(context, answer.reading.model, answer.rewritten))
-        rows += found
-    (drawn,) = certify_states(model, model_states(model, 1, 0, at or {}))
-    poses = drawn.quantities.poses
-    return FileResult(shown, model, tuple(rows), explanations, poses)
+    name, info, answer = column
+    context = RowContext(shown, MODEL_FAMILY, name, info.title, info.version)
+    if answer.reading is None and not answer.failure:
+        formats = declared_importer_attribute(split_version(name)[0], "formats")
+        reason = f"{info.title} reads {' and '.join(formats).upper()} files only"
+        return [context.make_row("model", "-", "all", Verdict.INFORMATION, reason)], None
+    if info.missing is not None:
+        verdict = Verdict.FAILED if info.has_failed else Verdict.NOT_INSTALLED
+        return [context.make_row("model", "-", "all", verdict, info.missing)], None
+    unsupported = declared_importer_attribute(split_version(name)[0], "unsupported") or {}
+    applies = "passive_force" not in unsupported
+    judged = (model, truth.states) if applies else (without_passive_forces(model), truth.without_passive)
+    found = judge_answer(context, *judged, answer, unsupported)
+    explanation = None
+    if any(row.verdict == Verdict.DISAGREES for row in found):
+        explanation = _explain(context, judged[0], answer, states, applies)
+        found = [_with_diagnosis(row, explanation) for row in found]
+    if not applies and answer.reading is not None and answer.reading.model is not None:
+        cause = damping_cause(f"{info.title} {info.version}", model, answer.reading.model)
+        cause = cause and cause.within(shown)
+        found.append(_damping_row(context, cause))
+        if cause is not None:
+            known = explanation or Explanation(is_proved=True)
+            explanation = replace(known, causes=(*known.causes, cause))
+    if answer.rewritten and answer.reading is not None and answer.reading.model is not None:
+        found.append(rewriting_row(context, answer.reading.model, answer.rewritten))
+    return found, explanation
 
 
 def _explain(

@@ -31,6 +31,7 @@ from plumbline.truth.joint_tree import JointTree
 
 ROUNDING_FACTOR = 16.0
 EPSILON = 2.0**-53
+ROUGH_BITS = 64
 START_BITS, MAX_BITS = 192, 2048  # 128 are too few for a robot of 30 joints, and hardly faster
 MAX_RELATIVE_RADIUS = 1e-22  # of the magnitudes of the terms
 FLOOR = 2.0**-30  # of the largest entry, where the terms vanish exactly but not in an engine's frames
@@ -75,6 +76,29 @@ def certify_model(model: NeutralModel, state: CanonicalState) -> CertifiedModelQ
         if (sharp and balls["acceleration"] is not None) or bits >= MAX_BITS:
             return certified
         bits *= 4
+
+
+def rough_quantities(model: NeutralModel, state: CanonicalState) -> ModelQuantities:
+    """Compute poses and the mass matrix alone, about as exactly as doubles are, in a third of the time.
+
+    Args:
+        model: a tree of bodies.
+        state: canonical coordinates and velocities of its joints.
+
+    Returns:
+        Poses and mass matrix.
+
+    Raises:
+        TruthUnavailable: python-flint is not installed.
+
+    """
+    flint = import_truth_tool("flint")
+    with flint.ctx.workprec(ROUGH_BITS):
+        balls = _BallModel(flint, model, state)
+        n, (M, _) = model.velocity_count, balls.joint_mass_matrix()
+        matrix = np.array(midpoints(M.tolist() if n else []), float).reshape(n, n)
+    armatures = [armature for armature, _ in _armature_and_rate(model, state)]
+    return ModelQuantities(_poses(balls), matrix + np.diag(np.array(armatures, float)))
 
 
 class _BallModel(JointTree):
@@ -224,13 +248,16 @@ def _enclose(c: _BallModel) -> tuple[dict[str, Any], dict[str, Array]]:
         "kinetic_energy": [kinetic],
         "potential_energy": [potential],
     }
-    poses = {
+    return balls, _poses(c)
+
+
+def _poses(c: _BallModel) -> dict[str, Array]:
+    return {
         body.name: np.array(
             [[float(c.A[k][i, j].mid()) for j in range(3)] + [float(c.o[k][i, 0].mid())] for i in range(3)]
         )
         for k, body in enumerate(c.model.bodies)
     }
-    return balls, poses
 
 
 def _armature_and_rate(model: NeutralModel, state: CanonicalState) -> list[tuple[float, float]]:

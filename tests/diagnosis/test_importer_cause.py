@@ -227,3 +227,29 @@ def test_a_cause_is_proved_beside_the_rounding_of_a_fixed_base(tmp_path):
     result = judged(tmp_path, *texts, ".urdf", moved="upper")
     ((cause,),) = (explanation.causes for explanation in result.explanations.values())
     assert cause.field == "default inertial"
+
+
+LIFT = """<robot name="lift"><link name="base"/>
+<link name="cage"><inertial><mass value="3"/>
+<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial></link>
+<joint name="j" type="prismatic"><origin xyz="0.1 0 0" rpy="0.3 0.2 0.1"/><parent link="base"/>
+<child link="cage"/><axis xyz="0 0 2"/><limit lower="-2" upper="2" effort="1" velocity="1"/></joint></robot>
+"""
+
+
+def test_a_slide_that_is_placed_by_the_length_of_its_axis_is_named(tmp_path):
+    """What PyBullet 3.2.7 does: its equations have the unit axis, its poses the file's."""
+    path = tmp_path / "lift.urdf"
+    path.write_text(LIFT)
+    prepared = prepare_file(str(path), tmp_path)
+    reading = read_model_file("mujoco", prepared.file)
+    states = model_states(reading.model, STATES, state_seed(str(path)))
+    far = [replace(state, coordinates=2 * state.coordinates) for state in states]
+    answers, placed = (evaluate_model_file("mujoco", prepared.file, given) for given in (states, far))
+    answers = [replace(own, poses=there.poses) for own, there in zip(answers, placed, strict=True)]
+    answer = Answer(reading, states, tuple(answers))
+    column = ("mujoco", MUJOCO, answer)
+    result = judge_file(str(path), prepared.neutral_model(None), [column], STATES, None)
+    ((cause,),) = (explanation.causes for explanation in result.explanations.values())
+    assert "multiplies the coordinate of slide j by the length of its axis" in cause.sentence
+    assert "that of j by 2 (line 5), but not in its equations; this alone explains" in cause.sentence

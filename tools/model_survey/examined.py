@@ -178,6 +178,11 @@ EXAMINED = (
         "pybullet_urdf_inertial.py",
     ),
     Examined(
+        "pybullet", "urdf", ("displacement",), "left open by the file",
+        "places a link on a slide by the coordinate times the length of its axis, and has the unit axis in its "
+        "equations", "pybullet_slide_axis.py",
+    ),
+    Examined(
         "pybullet", "urdf", ("joints",), "differs from the file", "fixes a base without mass to the world"
     ),
 )  # fmt: skip
