@@ -179,8 +179,8 @@ EXAMINED = (
     ),
     Examined(
         "pybullet", "urdf", ("displacement",), "left open by the file",
-        "places a link on a slide by the coordinate times the length of its axis, and has the unit axis in its "
-        "equations", "pybullet_slide_axis.py",
+        "places a link on a slide by the coordinate times the length of its axis, and has the unit axis in "
+        "its equations", "pybullet_slide_axis.py",
     ),
     Examined(
         "pybullet", "urdf", ("joints",), "differs from the file", "fixes a base without mass to the world"
