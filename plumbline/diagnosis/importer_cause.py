@@ -144,8 +144,8 @@ def explain_importer(
     if without is model or (found.is_proved and len(found.causes) == 1):
         return found
     left_out = _explain(title, without, model, reading, answers, states)
-    is_simpler = left_out.is_proved and len(left_out.causes) < len(found.causes)
-    return left_out if is_simpler or (left_out.is_proved and not found.is_proved) else found
+    is_simpler = len(left_out.causes) <= len(found.causes)  # of one length: the importer has no such body
+    return left_out if left_out.is_proved and (is_simpler or not found.is_proved) else found
 
 
 def _explain(
@@ -260,6 +260,10 @@ def _single_part(parts: Sequence[tuple[NeutralBody, Array, Array]], read: Neutra
     """The one part whose mass, centre or whole inertial explains a lumped body; None where there is none."""
     lumped = _merge(parts)
     also = {name: getattr(read, name) for name in ("mass", "center", "inertia")}
+    if len(parts) > 2 and lumped.mass > parts[0][0].mass and _is_same_inertial(parts[0][0], read):
+        fixed = [part for part, _, _ in parts[1:] if part.mass]
+        names, carrier, mass = ", ".join(p.name for p in fixed), parts[0][0].name, sum(p.mass for p in fixed)
+        return Change("inertial", names, "", mass, 0.0, fixed[0].source, also=also, carrier=carrier)
     for place, (part, _, A) in enumerate(parts):
         mass = part.mass + read.mass - lumped.mass
         trials: list[tuple[str, dict[str, Any]]] = [("mass", {"mass": mass})] if mass > 0 else []

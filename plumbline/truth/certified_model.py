@@ -11,6 +11,9 @@ a rotation,
     |h|_i  = |g|_i + Σ_b m_b u_bi (ℓ_b W_b² + 2 W_b V_b) + ‖J_b‖ w_bi W_b²
     |v̇|    = |M⁻¹| (|M| |v̇| + |h| + |f|)
 
+Of the damping in |f|, a ball's or free joint's three rates have one magnitude, their norm: engines have them
+in other axes.
+
 The tolerance is `ROUNDING_FACTOR` ε (1 + depth) times these.
 """
 
@@ -335,7 +338,8 @@ def _magnitudes(model: NeutralModel, state: CanonicalState) -> _Magnitudes:
             if joint.kind in ("slide", "free"):
                 path[k] += float(np.linalg.norm(x[:3])) + abs(joint.reference)
             turns[k] += 1 + (stretch if joint.kind == "hinge" else 0)
-            passive[vs] = joint.damping * np.abs(v) + joint.stiffness * (
+            speed = np.where(is_slide, np.linalg.norm(v[is_slide]), np.linalg.norm(v[~is_slide]))
+            passive[vs] = joint.damping * speed + joint.stiffness * (
                 stretch + abs(joint.spring_reference) + np.pi
             )
         ell, J = path[k] + float(np.linalg.norm(body.center)), float(np.linalg.norm(body.inertia))

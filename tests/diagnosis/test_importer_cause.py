@@ -253,3 +253,32 @@ def test_a_slide_that_is_placed_by_the_length_of_its_axis_is_named(tmp_path):
     ((cause,),) = (explanation.causes for explanation in result.explanations.values())
     assert "multiplies the coordinate of slide j by the length of its axis" in cause.sentence
     assert "that of j by 2 (line 5), but not in its equations; this alone explains" in cause.sentence
+
+
+def test_several_fixed_links_that_are_left_out_are_named(tmp_path):
+    """What Exudyn's loader does with the links on fixed joints."""
+    inertial = (
+        '<inertial><mass value="0.3"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
+    )
+    parts = "".join(
+        f'<link name="{name}">{inertial}</link><joint name="at_{name}" type="fixed">'
+        f'<origin xyz="0 0.1 {k}"/><parent link="cage"/><child link="{name}"/></joint>'
+        for k, name in enumerate(("lamp", "bell"))
+    )
+    result = judged(tmp_path, LIFT.replace("</robot>", f"{parts}</robot>"), LIFT, ".urdf")
+    ((cause,),) = (explanation.causes for explanation in result.explanations.values())
+    assert "leaves out the mass and inertia of lamp, bell (0.6 kg" in cause.sentence
+
+
+TWO_ROOTS = """<mujoco><worldbody><body name="a"><joint name="j" axis="0 1 0"/>
+<inertial pos="0 0 -1" mass="1" diaginertia="1 1 1"/></body>BODY</worldbody></mujoco>
+"""
+
+
+def test_a_body_that_is_missing_beside_another_cause_is_left_out_and_not_fixed(tmp_path):
+    more = '<body name="b"><joint name="k"/><inertial pos="1 0 0" mass="1" diaginertia="1 1 1"/></body>'
+    mutated = TWO_ROOTS.replace("BODY", "").replace('mass="1"', 'mass="1.5"')
+    result = judged(tmp_path, TWO_ROOTS.replace("BODY", more), mutated, ".xml")
+    (causes,) = (explanation.causes for explanation in result.explanations.values())
+    assert {cause.field for cause in causes} == {"missing body", "mass"}
+    assert "leaves out the body b (line 2)" in causes[0].sentence

@@ -81,9 +81,11 @@ def test_parts_of_models_and_most_alike_objects_are_left_out(tmp_path):
     (tmp_path / "model.xml").write_text("<mujoco/>")
     (tmp_path / "part.xml").write_text("<mujocoinclude/>")
     (tmp_path / "other.xml").write_text("<sdf/>")
+    for count in ("01", "02"):
+        (tmp_path / f"{count}_humanoids.xml").write_text("<mujoco/>")
     for k in range(12):
         folder = tmp_path / "random_urdfs" / f"{k:03}"
         folder.mkdir(parents=True)
         (folder / f"{k:03}.urdf").write_text("<robot/>")
     names = [path.name for path in robot_files(tmp_path)]
-    assert names == [f"{k:03}.urdf" for k in range(10)] + ["model.xml"]
+    assert names == [f"{k:03}.urdf" for k in range(10)] + ["01_humanoids.xml", "model.xml"]

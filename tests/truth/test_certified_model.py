@@ -66,6 +66,16 @@ def test_a_massless_moving_link_has_no_acceleration():
     assert certified.quantities.mass_matrix[1, 1] == 0
 
 
+def test_the_rounding_of_a_balls_damping_is_that_of_a_turned_vector():
+    """An engine that has the rates in other axes has the rounding of the largest in each."""
+    body = pendulum().bodies[0]
+    joint = replace(body.joints[0], kind="ball", damping=0.05, stiffness=0.0)
+    model = NeutralModel("m", (replace(body, joints=(joint,)),), np.array([0.0, 0, -10]))
+    state = CanonicalState(np.array([1.0, 0, 0, 0]), np.array([0.1, 3.0, 0]))
+    limits = certify_model(model, state).tolerance["passive_force"]
+    assert limits == pytest.approx([limits[1]] * 3) and limits[1] >= 0.05 * 3 * 2.0**-53
+
+
 def compare(tmp_path, text, suffix, count, importer="mujoco"):
     path = tmp_path / f"robot{suffix}"
     path.write_text(text)

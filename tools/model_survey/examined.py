@@ -59,8 +59,9 @@ EXAMINED = (
         "does not read `<option gravity>` and its flag", "pinocchio_gravity.py",
     ),
     Examined(
-        "pinocchio", "mjcf", ("joints",), "not supported",
-        "reads only the first body of `<worldbody>`", "pinocchio_second_root.py", r"as none \(fixed\)",
+        "pinocchio", "mjcf", ("joints", "missing body"), "not supported",
+        "reads only the first body of `<worldbody>`", "pinocchio_second_root.py",
+        r"as none \(fixed\)|leaves out",
     ),
     Examined(
         "pinocchio", "mjcf", ("position", "attitude"), "differs from the file",

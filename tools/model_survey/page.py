@@ -108,7 +108,8 @@ def _introduction(document: Mapping[str, Any], packages: Mapping[str, str]) -> s
     counts = Counter(format_of(entry["file"]) for entry in document["files"])
     template = (Path(__file__).parent / "introduction.md").read_text(encoding="utf-8")
     return template.strip().format(
-        urdf=counts["urdf"], mjcf=counts["mjcf"], states=STATES, alike_folder=ALIKE_FOLDER,
+        urdf=counts["urdf"], mjcf=counts["mjcf"], states=STATES,
+        unusable=len({problem["file"] for problem in document["problems"]}), alike_folder=ALIKE_FOLDER,
         alike_count=ALIKE_COUNT, importers=importers, packages=corpora,
     )  # fmt: skip
 
