@@ -73,7 +73,8 @@ def test_the_rounding_of_a_balls_damping_is_that_of_a_turned_vector():
     model = NeutralModel("m", (replace(body, joints=(joint,)),), np.array([0.0, 0, -10]))
     state = CanonicalState(np.array([1.0, 0, 0, 0]), np.array([0.1, 3.0, 0]))
     limits = certify_model(model, state).tolerance["passive_force"]
-    assert limits == pytest.approx([limits[1]] * 3) and limits[1] >= 0.05 * 3 * 2.0**-53
+    assert limits == pytest.approx([limits[1]] * 3, rel=1e-12, abs=0)
+    assert limits[1] >= 0.05 * 3 * 2.0**-53
 
 
 def compare(tmp_path, text, suffix, count, importer="mujoco"):
