@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from plumbline.engines.metamorphic_hooks import metamorphic_hooks
 from plumbline.engines.registry import load_adapter
-from plumbline.judging.relation_result import REPEATABILITY, RelationResult
+from plumbline.judging.relation_result import REPEATABILITY, UNEXPLAINED, RelationResult
 from plumbline.judging.repeatability import check_repeatability
 from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict
 from plumbline.judging.run_relations import check_run_relations
@@ -55,6 +55,8 @@ def _relation_row(context: RowContext, result: RelationResult) -> Row:
             "relations", result.integrator, result.relation, result.verdict, result.refusal_reason
         )
     extra = {"states": float(result.state_count), "state": float(result.worst_state)}
+    if result.unexplained is not None:
+        extra[UNEXPLAINED] = result.unexplained
     if result.relation == REPEATABILITY:
         return _repeatability_row(context, result, extra)
     if result.steps:

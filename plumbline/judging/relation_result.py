@@ -9,6 +9,7 @@ from plumbline.judging.rows import Verdict
 OTHER_FORMULATION_PREFIX = "as "  # names of relations: "as NAME" is the engine's other formulation NAME
 OPTION_PREFIX = "by "  # "by NAME" is another algorithm or linear solver of the same engine
 
+UNEXPLAINED = "unexplained"  # in a row's `extra`: `RelationResult.unexplained`
 REPEATABILITY = "repeatability"  # equal questions, equal bits: the ratio is the largest relative difference
 
 
@@ -27,3 +28,4 @@ class RelationResult:
     steps: int = 0  # of a run, there and back
     resolution: float = 0.0  # of a run: its step [s], or its relative tolerance
     end_time: float = 0.0  # [s] of a run, one way
+    unexplained: float | None = None  # the ratio without the effect of a term that the engine leaves out

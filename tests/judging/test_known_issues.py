@@ -200,6 +200,18 @@ def test_an_entry_covers_no_larger_error_than_it_states(tmp_path, max_ratio, bod
     assert judged.stale == [], "what exceeds an entry is no sign that the entry is stale"
 
 
+@pytest.mark.parametrize("left", [0.5, 1.5, math.nan, None])
+def test_a_missing_term_covers_what_its_effect_explains(tmp_path, left):
+    changes = OFF | {"scenario": "tumbling-ball", "mechanism": "missing term"}
+    entries = loaded(tmp_path, {x: value for x, value in changes.items() if x != "max_ratio"})
+    extra = {} if left is None else {"unexplained": left}
+    row = replace(ratio_row(1e12), extra=extra)
+    judged = judged_by([row], entries, whole=True).rows[0]
+    assert (judged.known_issue == "a") is (left == 0.5)
+    assert ("tolerances unexplained" in judged.reason) is (left != 0.5)
+    assert ("0.5 tolerances are left" in (judged.diagnosis or "")) is (left == 0.5)
+
+
 @pytest.mark.parametrize(
     ("mechanism", "scatter", "shown_by", "covered"),
     [
@@ -339,7 +351,8 @@ def test_the_projects_own_file_is_valid_and_gives_evidence():
     for e in known_issues.load_known_issues():
         assert len(e.evidence) > 20
         assert len(e.reason) > 20
-        assert e.verdict != "disagrees" or ((e.max_ratio or e.max_ratio_by_inertia) and e.mechanism)
+        has_size = e.max_ratio or e.max_ratio_by_inertia or e.mechanism == "missing term"
+        assert e.verdict != "disagrees" or (has_size and e.mechanism)
 
 
 @pytest.mark.parametrize(

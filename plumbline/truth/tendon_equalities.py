@@ -1,0 +1,110 @@
+"""What answers lack where rods are tendons held by J q̈ = 0, as MuJoCo's equalities of tendons require.
+
+A rod's length ℓ is constant: 0 = ℓ̈ = J q̈ + J̇ q̇, with the coordinates q of the mechanism without its rods. An
+engine that leaves out J̇ q̇ accelerates with ℓ̈ = J̇ q̇, which is ℓ̈ of the motion with q̈ = 0:
+
+    ℓ̈ = u · (a_near − a_far) + ℓ u̇ · u̇        a: accelerations of the rod's ends at q̈ = 0
+
+C = dᵀd − ℓ² of the rod's row in (N5) then has C̈ = 2 ℓ ℓ̈, and the rest of the equations is unchanged.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.kinematics import (
+    JointFrame,
+    angular_velocity,
+    cross,
+    joint_coordinates,
+    quaternion_rate,
+    rotate_vectors,
+    rotation_matrix,
+)
+from plumbline.model.loops import cut_open
+from plumbline.model.redescription import rods_taken_out
+from reference_impl.direct import DirectSystem
+
+
+def effects_of_missing_terms(model: Model, state: State) -> dict[str, Array]:
+    """Return what the answers change by where tendons lack their terms of velocities.
+
+    Args:
+        model: a mechanism with rods.
+        state: a state of it.
+
+    Returns:
+        By name of the quantity (N, 3) or, of joints, (J, 3); of wrenches in loops the determinate parts.
+        Other quantities do not depend on accelerations.
+
+    """
+    system = DirectSystem(model)
+    at = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+    u, udot, x, _ = joint_coordinates(model, state)
+    defect = np.zeros(len(system.joint))
+    for k, lengthening in _lengthening(model, state, u, udot).items():
+        defect[system.joint == k] = 2 * model.length[k] * lengthening
+    right, wrong = (system.solve(*at, gamma, x) for gamma in (0.0, defect))
+    assert right.joint_moment is not None and wrong.joint_moment is not None
+    wrench = np.concatenate(
+        [wrong.joint_reaction - right.joint_reaction, wrong.joint_moment - right.joint_moment], axis=1
+    )
+    if right.determinate is not None:
+        unit = np.repeat([1.0, system.wrench_length], 3)
+        wrench = rotate_vectors(right.determinate, wrench / unit) * unit
+    return {
+        "acceleration": wrong.acceleration - right.acceleration,
+        "angular_acceleration": angular_velocity(state.p, wrong.pddot - right.pddot),
+        "joint_reaction": wrench[:, :3],
+        "joint_moment": wrench[:, 3:],
+    }
+
+
+def _lengthening(model: Model, state: State, u: Array, udot: Array) -> dict[int, float]:
+    """Of each rod ℓ̈ [m/s²] at q̈ = 0, in the coordinates of the mechanism without rods, cut open."""
+    rodless = rods_taken_out(model)
+    tree, there, place = rodless.model, rodless.state(state), np.append(np.argsort(rodless.order), -1)
+    if tree.has_loops:
+        cut = cut_open(tree)
+        tree, there, place = cut.model, cut.state(there), np.append(cut.place, -1)[place]
+    A, spin, a, alpha = _at_constant_rates(tree, there)
+    found = {}
+    for k in np.flatnonzero([kind == "rod" for kind in model.kind]):
+        ends = np.zeros((2, 3))
+        for side, (body, point) in enumerate(zip(model.body[k], model.point[k], strict=True)):
+            if body >= 0:
+                b = place[body]
+                ends[side] = a[b] + _carried(alpha[b], spin[b], A[b] @ point)
+        found[int(k)] = float(u[k] @ (ends[1] - ends[0]) + model.length[k] * np.sum(udot[k] ** 2))
+    return found
+
+
+def _at_constant_rates(tree: Model, state: State) -> tuple[Array, Array, Array, Array]:
+    """Attitudes (N, 3, 3), ω, r̈ and ω̇ (N, 3) of all bodies, world axes, where all coordinates have q̈ = 0."""
+    A = rotation_matrix(state.p)
+    spin = rotate_vectors(A, state.omega)
+    a, alpha = np.zeros((tree.n, 3)), np.zeros((tree.n, 3))
+    for k, (kind, far) in enumerate(zip(tree.kind, tree.body[:, 0], strict=True)):
+        if kind == "free":
+            continue
+        above, turning, swing, tip = np.eye(3), np.zeros(3), np.zeros(3), np.zeros(3)
+        if far >= 0:
+            above, turning, swing = A[far], spin[far], alpha[far]
+            tip = a[far] + _carried(swing, turning, above @ tree.point[k, 0])
+        if kind == "ball":
+            swing = swing + cross(turning, spin[k])
+        for i, (what, axis) in enumerate(JointFrame(tree, k, above).axes(state.x[k])):
+            rate, shift = axis * state.xdot[k, i], axis * state.x[k, i]
+            if what == "turn":
+                swing, turning = swing + cross(turning, rate), turning + rate
+            else:
+                tip = tip + _carried(swing, turning, shift) + 2 * cross(turning, rate)
+        alpha[k] = swing
+        a[k] = tip - _carried(swing, spin[k], A[k] @ tree.proximal[k])
+    return A, spin, a, alpha
+
+
+def _carried(alpha: Array, omega: Array, s: Array) -> Array:
+    """Acceleration of a point at s from another one of the same body."""
+    return cross(alpha, s) + cross(omega, cross(omega, s))
