@@ -26,6 +26,7 @@ from plumbline.model.kinematics import (
 )
 from plumbline.truth.ground_truth import StateTruth
 from plumbline.truth.parameter_effects import evaluate_models, evaluate_to_first_order, stack_states
+from plumbline.truth.rounding_bound_tree import EndRows
 from reference_impl.errors import SingularSystem
 
 MAX_STATES = 2
@@ -48,6 +49,7 @@ QUARTER_TURNS = [  # rotation vectors of the turns of a cube, half turns twice
     for axis in product((-1, 0, 1), repeat=3)
     for angle in ((), (np.pi / 2, np.pi), (np.pi,), (2 * np.pi / 3,))[np.count_nonzero(axis)]
 ]
+LENGTHS = (" m", " rad")  # units of a mechanism's geometry, by which loops may open
 UNEXPLAINED = "no single number of a body, a joint, its elements or a spring explains the difference"
 
 
@@ -56,6 +58,7 @@ class _View(NamedTuple):
 
     quantities: tuple[str, ...]
     are_bodies_kept: bool = False
+    end_rows: EndRows = "accelerations"  # of loops that are not closed there
 
 
 class _Difference:
@@ -82,7 +85,7 @@ class _Difference:
         energies = len([q for q in names if q in ENERGIES]) * len(places)
         self.vectors = slice(len(self.values) - energies)  # the energies are the last
         self.accepted = max(ACCEPTED_RATIO, ACCEPTED_SHARE * float(np.max(np.abs(self.values))))
-        self.predictor = Predictor(model, self.states, view.are_bodies_kept)
+        self.predictor = Predictor(model, self.states, view.are_bodies_kept, view.end_rows)
         self.right = _predict(self.predictor, [Seen(model, state) for state in self.states], names)
 
     def effect(self, misread: Misreading) -> Array:
@@ -123,6 +126,8 @@ def diagnose_joints(model: Model, reported: Sequence[StateQuantities], truth: St
     views = [_View(QUANTITIES)]
     if model.has_loops:
         views.append(_View(QUANTITIES, are_bodies_kept=True))
+        # an engine's forces that close an open loop act on both ends, its own wrenches count them at one
+        views.append(_View((*VECTORS[:2], *ENERGIES), end_rows="twists"))
     for view in views:
         found = _explanations(model, reported, truth, view)
         if found:
@@ -144,7 +149,9 @@ def _explanations(
     difference, found = at(min(len(reported), MAX_STATES)), []
     if np.max(np.abs(difference.values[difference.vectors])) <= ACCEPTED_RATIO:
         return []
-    for cause in _similar(difference, list(joint_causes(model))):
+    is_open = view.end_rows == "twists"  # by a number of the geometry
+    causes = [cause for cause in joint_causes(model) if not is_open or cause.unit in LENGTHS]
+    for cause in _similar(difference, causes):
         x = _fitted(cause, np.array([cause.nominal]), difference)
         if x is not None:
             found.append(cause.describe(float(x[0])))
@@ -212,10 +219,13 @@ def _vectors_at(difference: _Difference, models: Sequence[Model]) -> Array:
 
 def _similar(difference: _Difference, causes: Sequence[JointCause]) -> list[JointCause]:
     """The causes whose effects on the vectors point in the direction of the difference."""
-    models = [
-        cause.change(difference.model, float(np.sum(cause.nominal)) + STEP * cause.scale) for cause in causes
-    ]
+    amounts = [float(np.sum(cause.nominal)) + STEP * cause.scale for cause in causes]
+    models = [one.change(difference.model, x) for one, x in zip(causes, amounts, strict=True)]
     slopes = _vectors_at(difference, models)
+    if difference.model.has_loops and not difference.view.are_bodies_kept:
+        for i, (cause, x) in enumerate(zip(causes, amounts, strict=True)):
+            if cause.unit in LENGTHS:  # to first order loops stay closed
+                slopes[i] = difference.of_cause(cause, np.array([x]))[difference.vectors]
     wanted = difference.values[difference.vectors]
     sizes = np.linalg.norm(slopes, axis=1) * np.linalg.norm(wanted)
     near = np.abs(slopes @ wanted) > MIN_SIMILARITY * sizes

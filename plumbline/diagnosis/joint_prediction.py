@@ -24,7 +24,7 @@ from plumbline.model.kinematics import (
     rotation_matrix,
 )
 from plumbline.model.loops import cut_open, determinate_projectors, wrench_length
-from plumbline.truth.rounding_bound_tree import RowChange, tree_solution
+from plumbline.truth.rounding_bound_tree import EndRows, RowChange, tree_solution
 from reference_impl.direct import DirectSystem
 
 VECTORS = ("acceleration", "angular_acceleration", "joint_reaction", "joint_moment")
@@ -38,22 +38,26 @@ class Seen:
     state: State
     rows: RowChange | None = None  # of its joints
     open_loop: int | None = None  # a loop that it does not close
-    has_end_terms: bool = True  # whether closing rows count what velocities cause
+    end_rows: EndRows | None = None  # of loops; None for the predictor's
 
 
 class Predictor:
     """Predicts quantities at states of a mechanism."""
 
-    def __init__(self, model: Model, states: Sequence[State], are_bodies_kept: bool) -> None:
+    def __init__(
+        self, model: Model, states: Sequence[State], are_bodies_kept: bool, end_rows: EndRows
+    ) -> None:
         """Prepare for the states.
 
         Args:
             model: the right mechanism.
             states: states of it.
             are_bodies_kept: whether bodies are where the states have them, not where coordinates put them.
+            end_rows: of `tree_solution`, of the loops.
 
         """
         self.model, self.states, self.are_bodies_kept = model, states, are_bodies_kept
+        self.end_rows: EndRows = end_rows
         self.projectors = [determinate_projectors(model, s) if model.has_loops else None for s in states]
 
     def predict(self, seen: Sequence[Seen], names: Sequence[str]) -> Array:
@@ -74,7 +78,11 @@ class Predictor:
         if not self.model.has_loops:
             at = complete_state(seen.model, seen.state)
             return _of_tree(seen.model, at, tree_solution(seen.model, at, rows=seen.rows))
-        values = _of_bodies(seen.model, seen.state) if self.are_bodies_kept else _of_cut(seen)
+        values = (
+            _of_bodies(seen.model, seen.state)
+            if self.are_bodies_kept
+            else _of_cut(seen, seen.end_rows or self.end_rows)
+        )
         projectors, length = self.projectors[place], wrench_length(self.model)
         if projectors is not None:
             wrench = np.concatenate([values["joint_reaction"], values["joint_moment"] / length], axis=1)
@@ -95,7 +103,7 @@ def _energies(model: Model, at: State) -> dict[str, Array]:
     return {"kinetic_energy": np.asarray(kinetic), "potential_energy": np.asarray(potential)}
 
 
-def _of_cut(seen: Seen) -> dict[str, Array]:
+def _of_cut(seen: Seen, end_rows: EndRows) -> dict[str, Array]:
     """Quantities in joint coordinates."""
     cut, joints, change = cut_open(seen.model), np.argsort(cut_open(seen.model).place), seen.rows
     there = cut.state(complete_state(seen.model, seen.state))
@@ -103,7 +111,7 @@ def _of_cut(seen: Seen) -> dict[str, Array]:
     if change is not None:
         rows = lambda k, held, bend: change(int(joints[k]), held, bend)  # noqa: E731
     ends = [pair for i, pair in enumerate(cut.ends) if i != seen.open_loop]
-    values = _of_tree(cut.model, there, tree_solution(cut.model, there, ends, rows, seen.has_end_terms))
+    values = _of_tree(cut.model, there, tree_solution(cut.model, there, ends, rows, end_rows))
     for name in VECTORS:
         values[name] = values[name][cut.place if name.startswith("joint") else cut.place[: seen.model.n]]
     return values

@@ -45,7 +45,7 @@ def _open(loop: int) -> Misreading:
 
 
 def _without_end_terms(model: Model, state: State) -> Seen:
-    return Seen(model, state, has_end_terms=False)
+    return Seen(model, state, end_rows="without velocity terms")
 
 
 def _without_bend(joint: int) -> RowChange:

@@ -20,7 +20,7 @@ torque pairs at turns and as force pairs at slides (tJ); d is the accumulation a
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -36,6 +36,7 @@ from plumbline.model.kinematics import (
 from plumbline.model.loops import cut_open, smallest_singular_value, wrench_length
 from plumbline.truth.element_terms import joint_elements, spring_terms
 
+EndRows = Literal["accelerations", "twists", "without velocity terms"]
 RowChange = Callable[[int, Array, Array], tuple[Array, Array]]
 
 
@@ -51,9 +52,9 @@ class _TreeTerms:
         state: State,
         ends: Sequence[tuple[int, int]] = (),
         rows: RowChange | None = None,
-        has_end_terms: bool = True,
+        end_rows: EndRows = "accelerations",
     ) -> None:
-        self.ends, self.rows, self.has_end_terms = ends, rows, has_end_terms
+        self.ends, self.rows, self.end_rows = ends, rows, end_rows
         self.model, self.state, self.n, self.far = model, state, model.n, model.body[:, 0]
         self.A = rotation_matrix(state.p)
         self.inertia = self.A @ model.inertia @ self.A.mT
@@ -116,12 +117,14 @@ class _TreeTerms:
         for loop, (b, c) in enumerate(self.ends):
             rows = slice(first[-1] + 6 * loop, first[-1] + 6 * loop + 6)
             C[rows, b], C[rows, c] = np.eye(6), -np.eye(6)
+            if self.end_rows == "twists":
+                C[rows.start : rows.start + 3, c, 3:], gamma[rows] = self._twist_terms(b, c)
         for k, (E, bend) in enumerate(held):
             rows = slice(first[k], first[k + 1])
             C[rows] = self._relative_rows(k, E)
             E_rows[k, :, rows] = E
             gamma[rows] = -E.T @ bend
-        if not self.has_end_terms:
+        if self.end_rows == "without velocity terms":
             gamma[first[-1] :] = C.reshape(-1, 6 * n)[first[-1] :] @ self._resting_joints(true_rows)
         self.elements = joint_elements(model, self.state, [bend for _, bend in true_rows])
         armature, bias, torque = (
@@ -147,6 +150,18 @@ class _TreeTerms:
         own = (directions @ (torque - armature * bias)).reshape(n, 2, 3)
         self.solution = np.moveaxis(inverse @ np.concatenate([body_terms, gamma]), 1, 0)  # (4, N, 3)
         self.solution[2:] += np.moveaxis(own, 1, 0)
+
+    def _twist_terms(self, b: int, c: int) -> tuple[Array, Array]:
+        """What the rows of V̇_b − V̇_c + (V_b − V_c) × V_c = 0, at r_b, have besides accelerations of centres.
+
+        Returns:
+            (3, 3) of α_c in the linear rows, and (6,) on the right; both 0 where the ends are together.
+
+        """
+        d, v, w = self.state.r[b] - self.state.r[c], self.state.v, self.omega
+        apart = v[b] - v[c]
+        linear = cross(w[b], apart - cross(w[c], d)) + cross(w[c], apart)
+        return cross_matrix(d), np.concatenate([linear, cross(w[c], w[b])])
 
     def _resting_joints(self, rows: Sequence[tuple[Array, Array]]) -> Array:
         """(6 N,) accelerations by the velocities alone, where no joint's coordinate accelerates."""
@@ -418,7 +433,7 @@ def tree_solution(
     state: State,
     ends: Sequence[tuple[int, int]] = (),
     rows: RowChange | None = None,
-    has_end_terms: bool = True,
+    end_rows: EndRows = "accelerations",
 ) -> Array:
     """Solve the Newton–Euler system of a tree in doubles.
 
@@ -428,13 +443,14 @@ def tree_solution(
         ends: pairs of bodies that are joined besides, parts of one body.
         rows: changes what joints hold, as a defect does: of joint k the directions E (6, c) and the relative
             acceleration (6,) that velocities cause.
-        has_end_terms: whether the rows of ``ends`` count what velocities cause.
+        end_rows: what the rows of ``ends`` make equal: accelerations of the bodies, or rates of their twists,
+            which is another law where the ends are apart; or accelerations, without what velocities cause.
 
     Returns:
         (4, N, 3): r̈ [m/s²], ω̇ [rad/s²], and force [N] and moment [N m] of the joints; world axes.
 
     """
-    return np.asarray(_TreeTerms(model, state, ends, rows, has_end_terms).solution)
+    return np.asarray(_TreeTerms(model, state, ends, rows, end_rows).solution)
 
 
 def tree_tolerances(

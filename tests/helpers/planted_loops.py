@@ -206,14 +206,14 @@ LOOP_DEFECTS = [
     LoopDefect(
         "length of a rod that closes a loop",
         "flyball-governor",
-        "",
+        "the length of joint 6 were",
         "mujoco",
         changed("length", (5,), _times(1.001)),
     ),
     LoopDefect(
         "length of such a rod, in joint coordinates",
         "flyball-governor",
-        "",
+        "the length of joint 5 were",
         "pinocchio",
         changed("length", (4,), _times(1.0001)),
     ),
@@ -234,7 +234,7 @@ LOOP_DEFECTS = [
     LoopDefect(
         "anchor of the closing joint",
         "four-bar",
-        "",
+        "x of the far point of joint 4 were 0.251 m",
         "pinocchio",
         changed("point", (3, 0, 0), _plus(1e-3)),
     ),
@@ -276,7 +276,7 @@ LOOP_DEFECTS = [
     LoopDefect(
         "anchor of a spatial loop",
         "flyball-governor",
-        "",
+        "x of the far point of joint 2 were",
         "pinocchio",
         changed("point", (1, 0, 0), _plus(1e-4)),
     ),
