@@ -44,6 +44,7 @@ DEFAULT_INERTIAL = "default inertial"  # 1 kg and 1 kg m² for each body without
 ASSUMED_INERTIAL = "assumed inertial"  # other values for bodies without <inertial>, as from geometry
 FRAME = "frame"
 SLIDE_SCALE = "displacement"  # of a slide, in the poses alone: its coordinate times a number
+ORIGIN = "origin"  # from which a free body's coordinates count
 MISSING = "missing body"
 FRAME_FIELDS = ("position", "attitude", "anchor", "reference")  # which may describe one pose in several ways
 MAX_OMISSIONS = 4
@@ -484,6 +485,20 @@ class _Trial:
                 found.append(Change(SLIDE_SCALE, body.name, joint.name, 1.0, scale, source))
         return found
 
+    def origin_changes(self, changes: Sequence[Change], count: int) -> list[Change]:
+        """Free bodies that are displaced by the same vector at every state, with all that they carry."""
+        if not self.has_wrong_poses_only(changes, count):
+            return []
+        changed, truths = self.certified(changes, 1)
+        own, theirs = truths[0].quantities.poses, self.answers[0].poses
+        found = []
+        for body in changed.bodies:
+            if [joint.kind for joint in body.joints] == ["free"] and body.name in theirs:
+                shift = theirs[body.name][:, 3] - own[body.name][:, 3]
+                source, name = body.fields.get("position", body.source), body.joints[0].name
+                found.append(Change(ORIGIN, body.name, name, np.zeros(3), shift, source))
+        return found
+
     def frame_changes(self, changes: Sequence[Change], count: int) -> list[Change]:
         """Frames that lie elsewhere in their bodies, where nothing but poses is wrong."""
         if not self.has_wrong_poses_only(changes, count):
@@ -528,9 +543,9 @@ class _Trial:
         """Drop the changes that ``count`` states do not need; None where the rest does not fit all states."""
         needed = list(changes)
         if self.remaining(needed, count) > 1:
-            scaled = [*needed, *self.slide_changes(needed, count)]
-            is_scaled = len(scaled) > len(needed) and self.remaining(scaled, count) <= 1
-            needed = scaled if is_scaled else [*needed, *self.frame_changes(needed, count)]
+            placed = ([*needed, *find(needed, count)] for find in (self.slide_changes, self.origin_changes))
+            fitting = (p for p in placed if len(p) > len(needed) and self.remaining(p, count) <= 1)
+            needed = next(fitting, []) or [*needed, *self.frame_changes(needed, count)]
         if not (needed or self.has_structure) or not self.fits(needed, count):
             return None
         for body in dict.fromkeys(change.body for change in changes if change.field in FRAME_FIELDS):
@@ -563,10 +578,11 @@ def _widened(truth: CertifiedModelQuantities, placed: Mapping[str, Array]) -> Ce
 def _with_placing(
     model: NeutralModel, changes: Sequence[Change], state: CanonicalState, truth: CertifiedModelQuantities
 ) -> CertifiedModelQuantities:
-    """Poses with displacements of slides scaled, and of bodies whose frame is elsewhere in them: X → X Y."""
+    """Poses with slides scaled, free bodies displaced, and frames elsewhere in their bodies: X → X Y."""
     offsets = {change.body: change.theirs for change in changes if change.field == FRAME}
     scales = {change.joint: change.theirs for change in changes if change.field == SLIDE_SCALE}
-    if not offsets and not scales:
+    shifts = {change.body: change.theirs for change in changes if change.field == ORIGIN}
+    if not offsets and not scales and not shifts:
         return truth
     poses = truth.quantities.poses
     if scales:
@@ -574,6 +590,11 @@ def _with_placing(
         for joint, places, _ in model.joint_slices():
             x[places] += (scales.get(joint.name, 1.0) - 1) * (x[places] - joint.reference)
         poses = rough_quantities(model, replace(state, coordinates=x)).poses
+    by: dict[str, Array] = {}
+    for body in model.bodies:
+        above = by[model.bodies[body.parent].name] if body.parent >= 0 else np.zeros(3)
+        by[body.name] = shifts.get(body.name, above)
+    poses = {name: np.column_stack([X[:, :3], X[:, 3] + by[name]]) for name, X in poses.items()}
     poses = {body: _composed(X, offsets[body]) if body in offsets else X for body, X in poses.items()}
     return replace(truth, quantities=replace(truth.quantities, poses=poses))
 
@@ -788,7 +809,7 @@ def apply_changes(own: NeutralModel, theirs: NeutralModel, changes: Sequence[Cha
     }
     gravity = own.gravity
     for change in changes:
-        if change.field in (ARMATURE_ENERGY, FRAME, SLIDE_SCALE):
+        if change.field in (ARMATURE_ENERGY, FRAME, SLIDE_SCALE, ORIGIN):
             continue
         if change.field == "gravity":
             gravity = change.theirs
@@ -847,6 +868,12 @@ def _describe(members: Sequence[Change]) -> str:
         return (
             f"puts the frame of {len(members)} bodies ({_names(members)}) elsewhere in the body, that of "
             f"{first.body} at {shift} ({first.source}), which moves no mass"
+        )
+    if first.field == ORIGIN:
+        shift = format_value(first.theirs, np.zeros(3))
+        return (
+            f"counts the coordinates of the free joint of body {first.body} from {shift} and not from the "
+            f"world's origin ({first.source}), so that all its bodies are displaced"
         )
     if first.field == SLIDE_SCALE:
         slides = f"slide {first.joint}" if len(members) == 1 else f"{len(members)} slides ({_names(members)})"

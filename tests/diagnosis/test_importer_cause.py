@@ -282,3 +282,26 @@ def test_a_body_that_is_missing_beside_another_cause_is_left_out_and_not_fixed(t
     (causes,) = (explanation.causes for explanation in result.explanations.values())
     assert {cause.field for cause in causes} == {"missing body", "mass"}
     assert "leaves out the body b (line 2)" in causes[0].sentence
+
+
+FREE = """<mujoco><worldbody><body name="a" pos="0 0 1" quat="1 1 0 0"><freejoint/>
+<inertial pos="0 0 -1" mass="1" diaginertia="1 1 1"/>
+<body name="b"><joint name="j" axis="0 1 0"/><inertial pos="1 0 0" mass="1" diaginertia="1 1 1"/></body>
+</body></worldbody></mujoco>
+"""
+
+
+def test_a_free_body_whose_coordinates_count_from_elsewhere_is_named(tmp_path):
+    """Pinocchio 4.1.0 itself: a root that the file turns by R is displaced by p − R p, here (0, 1, 1)."""
+    path = tmp_path / "free.xml"
+    path.write_text(FREE)
+    prepared = prepare_file(str(path), tmp_path)
+    model = prepared.neutral_model(read_model_file("mujoco", prepared.file))
+    reading = read_model_file("pinocchio", prepared.file)
+    states = model_states(reading.model, STATES, state_seed(str(path)))
+    answer = Answer(reading, states, tuple(evaluate_model_file("pinocchio", prepared.file, states)))
+    column = ("pinocchio", describe_importer("pinocchio"), answer)
+    result = judge_file(str(path), model, [column], STATES, None)
+    ((cause,),) = (explanation.causes for explanation in result.explanations.values())
+    assert "coordinates of the free joint of body a from (0, 1, 1) and not from" in cause.sentence
+    assert "this alone explains every quantity" in cause.sentence

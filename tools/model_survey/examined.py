@@ -68,6 +68,10 @@ EXAMINED = (
         "drops the pose of a root body without joint", "pinocchio_root_pose.py",
     ),
     Examined(
+        "pinocchio", "mjcf", ("origin",), "differs from the file",
+        "puts a free root body that the file turns elsewhere, by p − R p", "pinocchio_root_pose.py",
+    ),
+    Examined(
         "pinocchio", "mjcf", INERTIAL_FIELDS, "differs from the file",
         "reads no mass of geoms from the defaults, none of geoms that collide with nothing, and no "
         "`settotalmass`", "pinocchio_geom_mass.py",
@@ -190,8 +194,6 @@ EXAMINED = (
 
 # Differences that no change of parameters explains: what looking at them showed, by importer and file name.
 UNPROVED = {
-    ("pinocchio", "humanoid_CMU.xml"): "a free root body that the file turns is put elsewhere by p − R p "
-    "([pinocchio_root_pose.py](importers/pinocchio_root_pose.py)); a model has no such parameter",
     ("pinocchio", "rodent.xml"): "`pos` of joints from the defaults "
     "([pinocchio_joint_defaults.py](importers/pinocchio_joint_defaults.py)), the pose of the root, and the "
     "frames of bodies whose joints have several anchors (the shoulder blades, 5 mm), together",
