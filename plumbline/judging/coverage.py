@@ -12,7 +12,7 @@ the level reports. docs/coverage.md explains the table.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -45,6 +45,7 @@ COVERED_LEVELS: tuple[Level, ...] = ("state", "step", "trajectory", "invariants"
 MAX_MISTAKE = 0.1  # of a parameter's scale: only larger ones are reported, or none; the level does not see it
 WEAK_MISTAKE = 1e-9  # from here on the order of an effect is found by a second mistake …
 LARGER_MISTAKE = 4.0  # … that is larger by this factor, both at half the step: the integrator's error falls
+FURTHER_MISTAKES = (5e-4, MAX_MISTAKE / LARGER_MISTAKE)  # where smaller ones pass no tolerance
 DOUBTFUL_MISTAKE = 1e-6  # from here on an effect may be rounding of the runs: a proof is tried
 NO_EFFECT = 1e-9  # of the largest effect that a term could have: rounding
 MOTION_SAMPLES = 32  # of a motion, at which the effect of a mistake is measured; or all, where it has fewer
@@ -347,8 +348,13 @@ def _motion_entries(
     times = times[::stride][: max(one.last_sample for one in tolerances) + 1]
     quantities = {one.quantity for one in tolerances}
     substeps = needed_substeps(model, state, times)
-    effects = _motion_effects(model, state, times, parameters, quantities, MOTION_MISTAKE, substeps)
-    ratios = _motion_ratios(tolerances, len(parameters), effects, {})
+
+    def measured(chosen: Sequence[int], size: float, factor: int) -> dict[str, Array]:
+        some = [parameters[i] for i in chosen]
+        return _motion_effects(model, state, times, some, quantities, size, factor * substeps)
+
+    effects = measured(range(len(parameters)), MOTION_MISTAKE, 1)
+    ratios = _motion_ratios(tolerances, effects)
     # what integrators make of invariants is as sharp as small mistakes: there the order is always found
     weak = [
         i
@@ -360,21 +366,59 @@ def _motion_entries(
         )
     ]
     if weak:
-        again = [parameters[i] for i in weak]
         sizes = MOTION_MISTAKE, LARGER_MISTAKE * MOTION_MISTAKE
-        finer = [_motion_effects(model, state, times, again, quantities, x, 2 * substeps) for x in sizes]
-        by_index = {i: [{q: x[k] for q, x in one.items()} for one in finer] for k, i in enumerate(weak)}
-        ratios = _motion_ratios(tolerances, len(parameters), effects, by_index)
+        finer = [measured(weak, size, 2) for size in sizes]
+        ratios = _motion_ratios(tolerances, effects, _by_index(weak, finer))
     found = []
     visited = _visited_states(model, state, times)
     for level, by_engine in ratios.items():
         proofs = _proofs(model, visited, parameters, by_engine, level)
+        own = [one for one in tolerances if one.row.level == level]
+        _measure_further(own, by_engine, proofs, measured)
         if level == "invariants":
             ratio = np.min([one.ratio for one in by_engine.values()], axis=0)
             unseen = [int(i) for i in np.flatnonzero(ratio <= 1 / MAX_MISTAKE) if i not in proofs]
             proofs |= _conserved(model, state, times, parameters, unseen, tolerances, substeps)
         found += _entries(name, level, model, parameters, by_engine, proofs)
     return found
+
+
+def _measure_further(
+    tolerances: Sequence[_MotionTolerance], by_engine: Mapping[str, _Ratios], proven: Container[int],
+    measured: Callable[[Sequence[int], float, int], dict[str, Array]],
+) -> None:  # fmt: skip
+    """Put in place the ratios of parameters that pass no tolerance at the mistakes that were measured.
+
+    An effect that small may be rounding, or of another order than it seems, and is not extrapolated: a figure
+    counts where a mistake that is measured passes the tolerance.
+
+    Args:
+        tolerances: of one level.
+        by_engine: the ratios of that level, changed in place.
+        proven: indices of parameters that are left as they are.
+        measured: from indices, a mistake and a factor on the steps to the effects (`_motion_effects`).
+
+    """
+    largest = LARGER_MISTAKE * MOTION_MISTAKE
+    for size in FURTHER_MISTAKES:
+        ratio = np.min([one.ratio for one in by_engine.values()], axis=0)
+        left = [int(i) for i in np.flatnonzero(ratio < 1 / largest) if i not in proven]
+        if not left:
+            return
+        largest = LARGER_MISTAKE * size
+        several = measured(left, size, 2), measured(left, largest, 2), measured(left, largest, 1)
+        finer = _by_index(range(len(left)), several)
+        (again,) = _motion_ratios(tolerances, measured(left, size, 1), finer, size).values()
+        for engine, one in again.items():
+            for i, value, row in zip(left, one.ratio, one.row, strict=True):
+                by_engine[engine].ratio[i], by_engine[engine].row[i] = value, row
+
+
+def _by_index(
+    indices: Iterable[int], several: Sequence[Mapping[str, Array]]
+) -> dict[int, list[dict[str, Array]]]:
+    """Effects (P, T) at several mistakes as those of each parameter."""
+    return {i: [{q: x[k] for q, x in one.items()} for one in several] for k, i in enumerate(indices)}
 
 
 def _conserved(
@@ -442,32 +486,34 @@ def _motion_effects(
 
 
 def _motion_ratios(
-    tolerances: Sequence[_MotionTolerance], count: int, effects: Mapping[str, Array],
-    finer: Mapping[int, Sequence[Mapping[str, Array]]],
+    tolerances: Sequence[_MotionTolerance], effects: Mapping[str, Array],
+    finer: Mapping[int, Sequence[Mapping[str, Array]]] | None = None, size: float = MOTION_MISTAKE,
 ) -> dict[Level, dict[str, _Ratios]]:  # fmt: skip
-    """Effects over tolerances by level and engine; of some parameters by the order of the effect.
+    """Effects of mistakes of a size over tolerances by level and engine; of some by the order of the effect.
 
-    Those are given again at half the step, of the same mistake and of a larger one: an effect that falls with
-    the step is the integrator's error, which a run's study extrapolates away.
+    Those are given again at half the step, of the same mistake and of a larger one, which may follow at the
+    whole step: an effect that falls with the step is the integrator's error, which a run's study extrapolates
+    away.
     """
+    finer = finer or {}
     ratios: dict[Level, dict[str, _Ratios]] = {}
     for one in tolerances:
+        count = len(effects[one.quantity])
         of_engine = ratios.setdefault(one.row.level, {}).setdefault(one.row.engine, _Ratios(count))
         label = f"{one.row.integrator} {one.row.quantity}"
         for i in range(count):
             effect = float(effects[one.quantity][i, one.last_sample])
-            ratio = effect / one.tolerance / MOTION_MISTAKE
+            ratio = effect / one.tolerance / size
             if i in finer:
-                same, more = (float(x[one.quantity][one.last_sample]) for x in finer[i])
+                same, more, *coarse = (float(x[one.quantity][one.last_sample]) for x in finer[i])
                 growth = more / max(same, TINY)
-                if (
-                    same < effect / LARGER_MISTAKE and growth < 2 * LARGER_MISTAKE
-                ) or growth < LARGER_MISTAKE / 2:
+                falls = more < coarse[0] / LARGER_MISTAKE if coarse else same < effect / LARGER_MISTAKE
+                if (falls and (coarse or growth < 2 * LARGER_MISTAKE)) or growth < LARGER_MISTAKE / 2:
                     ratio = 0.0  # rounding, or the integrator's error
                 elif growth > 2 * LARGER_MISTAKE:  # grows with the square of the mistake
-                    ratio = float(np.sqrt(more / one.tolerance)) / (LARGER_MISTAKE * MOTION_MISTAKE)
+                    ratio = float(np.sqrt(more / one.tolerance)) / (LARGER_MISTAKE * size)
                 else:
-                    ratio = same / one.tolerance / MOTION_MISTAKE
+                    ratio = same / one.tolerance / size
             of_engine.add(i, ratio, label)
     return ratios
 
