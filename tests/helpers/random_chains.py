@@ -17,19 +17,30 @@ def random_model(
     mass_decades: float = 0.0,
     loads: bool = False,
     drag: bool = False,
+    moderate: bool = False,
 ) -> Model:
-    """A chain with a rod at each joint k with rods[k]; masses are log-uniform over ± ``decades``."""
+    """A chain with a rod at each joint k with rods[k]; masses are log-uniform over ± ``mass_decades``.
+
+    A ``moderate`` one has masses of 0.5 … 2 kg, joints 0.25 m from the centres of mass, rods of 0.4 m, loads of
+    a third and gravity along no axis, so that motions of some seconds are smooth.
+    """
     n = len(rods)
-    mass = 10 ** rng.uniform(-mass_decades, mass_decades, n)
+    decades = np.log10(2) if moderate else mass_decades
+    mass = 10 ** rng.uniform(-decades, decades, n)
+    inertia = random_inertias(rng, mass)
+    proximal, distal = points = rng.normal(size=(2, n, 3))
+    points *= 0.25 / np.linalg.norm(points, axis=-1, keepdims=True) if moderate else 0.3
+    length = np.full(n, 0.4) if moderate else rng.uniform(0.2, 1.0, n)
+    load = loads * (0.3 if moderate else 1.0) * mass[:, None]
     return Model.chain(
         mass=mass,
-        inertia=random_inertias(rng, mass),
-        proximal=0.3 * rng.normal(size=(n, 3)),
-        distal=0.3 * rng.normal(size=(n, 3)) * (np.arange(n) < n - 1)[:, None],
-        length=np.where(np.array(rods, dtype=bool), rng.uniform(0.2, 1.0, n), 0.0),
-        gravity=np.array([0.0, 0.0, -9.81]),
-        force=loads * mass[:, None] * rng.normal(size=(n, 3)),
-        moment=loads * mass[:, None] * rng.normal(size=(n, 3)),
+        inertia=inertia,
+        proximal=proximal,
+        distal=distal * (np.arange(n) < n - 1)[:, None],
+        length=np.where(np.array(rods, dtype=bool), length, 0.0),
+        gravity=np.array([0.7, -0.4, -9.7] if moderate else [0.0, 0.0, -9.81]),
+        force=load * rng.normal(size=(n, 3)),
+        moment=load * rng.normal(size=(n, 3)),
         drag_force=drag * mass * rng.uniform(0, 1, n),
         drag_moment=drag * mass * rng.uniform(0, 0.1, n),
     )

@@ -230,18 +230,18 @@ def test_rows_say_what_held_what_did_not_and_what_was_refused():
 
 @pytest.mark.parametrize("kind", ["step", "tolerance"])
 def test_a_run_may_be_off_by_its_rounding_its_solver_and_its_accelerations_grown(kind):
-    at, end, steps = STATES[2], 0.5, 81
+    model, at, end, steps = MODEL.changed(mass=np.array([1.0, 2.0])), STATES[2], 0.5, 81
     method = Integrator("x", kind, 2, solver_rtol=1e-9, min_rtol=3e-9)
-    bound, (_, spin, speed) = state_rounding_bound(MODEL, at), characteristic_scales(MODEL, at)
-    ratio = max(MODEL.mass) / min(MODEL.mass)
+    bound, (_, spin, speed) = state_rounding_bound(model, at), characteristic_scales(model, at)
+    ratio = 2.0
     solved = (1e-9 * ratio if kind == "step" else 3e-9) * 9
     pushed = end * max(max(bound.acceleration) / speed, max(bound.angular_acceleration) / spin)
-    grown = max(perturbation_growth(MODEL, at, np.array([0, end / 2, end])))
-    assert grown > 1.1 and ratio > 1.1
-    limit = run_tolerance(method, MODEL, at, end, steps)
+    grown = max(perturbation_growth(model, at, np.array([0, end / 2, end])))
+    assert grown > 1.1
+    limit = run_tolerance(method, model, at, end, steps)
     assert limit == pytest.approx((RUN_ROUNDING + solved + pushed) * grown, rel=1e-12, abs=0)
     bare = replace(method, solver_rtol=0.0, min_rtol=0.0)
-    assert run_tolerance(bare, MODEL, at, end, steps) == pytest.approx(
+    assert run_tolerance(bare, model, at, end, steps) == pytest.approx(
         (RUN_ROUNDING + pushed) * grown, rel=1e-12, abs=0
     )
 
