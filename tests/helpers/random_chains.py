@@ -21,8 +21,8 @@ def random_model(
 ) -> Model:
     """A chain with a rod at each joint k with rods[k]; masses are log-uniform over ± ``mass_decades``.
 
-    A ``moderate`` one has masses of 0.5 … 2 kg, joints 0.25 m from the centres of mass, rods of 0.4 m, loads of
-    a third and gravity along no axis, so that motions of some seconds are smooth.
+    A ``moderate`` one has masses of 0.5 … 2 kg, joints 0.25 m from the centres of mass, rods of 0.4 m, loads
+    of a third and gravity along no axis, so that motions of some seconds are smooth.
     """
     n = len(rods)
     decades = np.log10(2) if moderate else mass_decades
