@@ -168,14 +168,19 @@ def assert_agrees(engine, answer, name, expected, scale, relative=1e-11):
 def test_states_obey_newton_and_euler(engine, joints, loaded):
     subject, states, truth = expected_states(joints, loaded)
     answers = ask(engine, "evaluate", subject, states)
-    # Accelerations and reactions: what rounded terms of the equations may change in each body's.  Plain sums
-    # and products of the inputs allow more.
-    g = np.linalg.norm(subject.gravity)
+    # Conditioning allows 1e-11 of the largest acceleration or force in the chain, in joint coordinates what
+    # rounded terms may change in each body's.  Plain sums and products of the inputs allow more.
+    g, weight = np.linalg.norm(subject.gravity), np.linalg.norm(subject.gravity) * subject.mass.sum()
+    least = {"acceleration": g, "angular_acceleration": g / 0.25, "joint_reaction": weight}
     levers = np.cumsum(0.5 + subject.length)
     for at, true, got in zip(states, truth, answers or [], strict=False):
         bound = state_rounding_bound(subject, at)
-        for name in ("acceleration", "angular_acceleration", "joint_reaction"):
-            assert_agrees(engine, got, name, getattr(true, name), getattr(bound, name)[:, None], 1.0)
+        for name, size in least.items():
+            expected = getattr(true, name)
+            limit = 1e-11 * max(size, np.abs(expected).max())
+            if engine == "pinocchio-aba":
+                limit = getattr(bound, name)[:, None]
+            assert_agrees(engine, got, name, expected, limit, 1.0)
         energy, height = newton_euler.kinetic_energy(subject, at), newton_euler.potential_energy(subject, at)
         assert_agrees(engine, got, "kinetic_energy", energy, energy, 1e-12)
         assert_agrees(engine, got, "potential_energy", height, g * subject.mass @ levers, 1e-13)
