@@ -4,8 +4,9 @@ Measures `--help`, one scenario, and the scenarios that the catalogue had at com
 each for the first time and again unchanged; with `--all` also these scenarios, and all of today's, at every
 level; with `--random COUNT` also COUNT random scenarios on one run with two workers against two independent
 runs at the same time; with `--night` also a night of these scenarios and 200 random ones, without new
-certificates.  Appends a record with date, commit, processor and load to bench/results/daily_loop.json; the
-load before and after shows whether the machine was idle.
+certificates.  Appends a record with date, commit, processor and load to bench/results/daily_loop.json after
+every part, so that an interrupted measurement keeps what it has; the load before and after shows whether the
+machine was idle.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -180,7 +182,7 @@ def two_workers_over_two_runs(count: int) -> dict[str, float]:
     return {"one run": together, "two runs": apart, "ratio": together / apart}
 
 
-def measure(is_all_levels: bool, random_count: int, has_night: bool) -> dict[str, Any]:
+def measure(is_all_levels: bool, random_count: int, has_night: bool) -> Iterator[tuple[str, dict[str, Any]]]:
     """Measure the commands.
 
     Args:
@@ -188,8 +190,8 @@ def measure(is_all_levels: bool, random_count: int, has_night: bool) -> dict[str
         random_count: number of random scenarios for the comparison of two workers with two runs; 0: none.
         has_night: whether a night is run.
 
-    Returns:
-        The record to store.
+    Yields:
+        After each part its name and the record to store.
 
     """
     record: dict[str, Any] = {
@@ -199,20 +201,28 @@ def measure(is_all_levels: bool, random_count: int, has_night: bool) -> dict[str
         "cores": os.cpu_count(),
         "load before": os.getloadavg(),
     }
+    earlier, of_earlier = earlier_scenarios(), f"of the catalogue of {CATALOGUE_COMMIT}"
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        record["--help"] = time_command(["--help"], folder)
-        record[f"run {SCENARIO} --level state"] = time_run([SCENARIO, "--level", "state"], folder / "one")
-        earlier, of_earlier = earlier_scenarios(), f"of the catalogue of {CATALOGUE_COMMIT}"
-        record[f"run --level state {of_earlier}"] = time_run([*earlier, "--level", "state"], folder / "state")
+        parts: dict[str, Callable[[], dict[str, Any]]] = {
+            "--help": lambda: time_command(["--help"], folder),
+            f"run {SCENARIO} --level state": lambda: time_run([SCENARIO, "--level", "state"], folder / "one"),
+            f"run --level state {of_earlier}": lambda: time_run(
+                [*earlier, "--level", "state"], folder / "state"
+            ),
+        }
+        if random_count:
+            name = f"{random_count} random scenarios"
+            parts[name] = lambda: two_workers_over_two_runs(random_count)
         if is_all_levels:
-            record[f"run {of_earlier}"] = time_run(earlier, folder / "earlier")
-            record["run"] = time_run([], folder / "all")
+            parts[f"run {of_earlier}"] = lambda: time_run(earlier, folder / "earlier")
         if has_night:
-            record[f"nightly {of_earlier}, {' '.join(NIGHT_OPTIONS)}"] = time_night(folder / "night")
-    if random_count:
-        record[f"{random_count} random scenarios"] = two_workers_over_two_runs(random_count)
-    return record | {"load after": os.getloadavg()}
+            parts[f"nightly {of_earlier}, {' '.join(NIGHT_OPTIONS)}"] = lambda: time_night(folder / "night")
+        if is_all_levels:
+            parts["run"] = lambda: time_run([], folder / "all")
+        for name, measured in parts.items():
+            record |= {name: measured(), "load after": os.getloadavg()}
+            yield name, record
 
 
 def main() -> None:
@@ -227,10 +237,10 @@ def main() -> None:
     if options.part:
         print(random_scenarios_per_second(*options.part))
         return
-    record = measure(options.all, options.random, options.night)
-    print(json.dumps(record, indent=1))
     stored = json.loads(STORED.read_text(encoding="utf-8")) if STORED.exists() else []
-    write_atomically(STORED, (json.dumps([*stored, record], indent=1) + "\n").encode())
+    for name, record in measure(options.all, options.random, options.night):
+        write_atomically(STORED, (json.dumps([*stored, record], indent=1) + "\n").encode())
+        print(json.dumps({name: record[name]}, indent=1), flush=True)
 
 
 if __name__ == "__main__":
