@@ -20,6 +20,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -89,7 +90,8 @@ def time_run(words: list[str], folder: Path) -> dict[str, Any]:
         Times [s] of the first run and of the second, with their CPU times by kind.
 
     """
-    found: dict[str, Any] = {"scenarios": sum(not word.startswith("-") for word in words) or "all"}
+    names = list(takewhile(lambda word: not word.startswith("-"), words))
+    found: dict[str, Any] = {"scenarios": len(names) or "all"}
     for name in ("first", "again"):
         found[name] = time_command(["run", *words, "--jobs", "2", "--out", str(folder / "out")], folder)
         found[name] |= cpu_times(folder / "out")

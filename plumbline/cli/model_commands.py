@@ -22,8 +22,8 @@ from plumbline.diagnosis.importer_cause import Explanation
 from plumbline.engines.environments import split_version, version_problem
 from plumbline.engines.registry import IMPORTERS
 from plumbline.execution.model_run import ModelPlan, ModelRunResult, run_model_files
-from plumbline.importers.neutral_model import Feature
-from plumbline.judging.model_file import MODEL_UNITS, REFUSED, FileResult
+from plumbline.importers.neutral_model import MODEL_UNITS, Feature
+from plumbline.judging.model_file import REFUSED, FileResult
 from plumbline.judging.rows import Row, Verdict
 from plumbline.processes.workers import Limits
 from plumbline.scenario.errors import MAX_LISTED_PROBLEMS, did_you_mean, shorten

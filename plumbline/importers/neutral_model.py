@@ -135,6 +135,23 @@ class CanonicalState:
     velocities: Array  # (number of velocities,)
 
 
+MODEL_UNITS = {  # of what is compared, by the name of its row
+    "joints": "1",
+    "total_mass": "kg",
+    "position": "m",
+    "attitude": "1",
+    "mass_matrix": "SI",
+    "gravity_force": "SI",
+    "bias_force": "SI",
+    "passive_force": "SI",
+    "damping": "SI",
+    "acceleration": "SI",
+    "kinetic_energy": "J",
+    "potential_energy": "J",
+    "rewritings": "1",
+}
+
+
 @dataclass(frozen=True, eq=False)
 class ModelQuantities:
     """What is computed of a model at one state, in canonical velocities of the reading that was evaluated.

@@ -36,7 +36,7 @@ from pydantic import (
 
 from plumbline.engines.declared_names import declared_integrators, declared_texts
 from plumbline.engines.registry import ENGINES, IMPORTERS
-from plumbline.judging.model_file import MODEL_UNITS
+from plumbline.importers.neutral_model import MODEL_UNITS
 from plumbline.judging.relation_result import REPEATABILITY, UNEXPLAINED
 from plumbline.judging.rows import Level, Row, Verdict
 from plumbline.judging.run_relations import REVERSED_IN_TIME

@@ -24,6 +24,7 @@ from plumbline.engines.environments import declared_importer_attribute, split_ve
 from plumbline.importers.importer import Reading
 from plumbline.importers.mjcf_rewriting import names_as_written
 from plumbline.importers.neutral_model import (
+    MODEL_UNITS,
     CanonicalState,
     ModelQuantities,
     NeutralModel,
@@ -44,21 +45,6 @@ from plumbline.truth.model_comparison import (
     permuted,
 )
 
-MODEL_UNITS = {
-    "joints": "1",
-    "total_mass": "kg",
-    "position": "m",
-    "attitude": "1",
-    "mass_matrix": "SI",
-    "gravity_force": "SI",
-    "bias_force": "SI",
-    "passive_force": "SI",
-    "damping": "SI",
-    "acceleration": "SI",
-    "kinetic_energy": "J",
-    "potential_energy": "J",
-    "rewritings": "1",
-}
 MODEL_FAMILY = "model file"  # of the rows, in place of a scenario's family
 REFUSED = "refused: "  # before an importer's words
 SEED = 17

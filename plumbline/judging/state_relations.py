@@ -48,7 +48,6 @@ from plumbline.model.redescription import (
 )
 from plumbline.model.welding import split_bodies
 from plumbline.truth.rounding_bound import RoundingBound, state_rounding_bound
-from plumbline.truth.tendon_equalities import effects_of_missing_terms
 
 WELDED_HALVES = "two welded halves"
 ROOT_MOVED, JOINTS_AS_RODS = "root moved", "joints as rods"
@@ -60,8 +59,17 @@ QUANTITIES = (
     "acceleration", "angular_acceleration", "joint_reaction", "joint_moment", "kinetic_energy",
     "potential_energy", "angular_momentum",
 )  # fmt: skip
-MISSING_TERMS = {"tendon equalities": effects_of_missing_terms}  # by the option of an engine that lacks one
 Evaluate = Callable[[Model, list[State]], list[StateQuantities]]
+
+
+def _terms_of_tendons(model: Model, state: State) -> dict[str, Array]:
+    """Load what only this needs where it is needed: known issues are read at the start of every run."""
+    from plumbline.truth.tendon_equalities import effects_of_missing_terms
+
+    return effects_of_missing_terms(model, state)
+
+
+MISSING_TERMS = {"tendon equalities": _terms_of_tendons}  # by the option of an engine that lacks one
 
 
 def quantity_values(answers: StateQuantities, **factors: float) -> dict[str, Array]:
