@@ -19,7 +19,7 @@ from plumbline.engines.registry import ENGINES
 from plumbline.execution.plan import Plan
 from plumbline.execution.result_cache import DiskResultCache, user_cells_folder
 from plumbline.execution.runner import RunResult, run_plan, save
-from plumbline.processes.workers import Limits
+from plumbline.processes.workers import Limits, start_warm_process
 from plumbline.storage.results_store import row_record, to_json_value
 
 MAX_PROOF_CPU_SECONDS = 1e6
@@ -65,6 +65,8 @@ def run(
     fresh: bool, timeout: float, memory: float,
 ) -> None:  # fmt: skip
     """Compare scenarios (names of the catalogue, or paths of YAML files; default: all) on all engines."""
+    if scheduler is None:
+        start_warm_process()
     chosen = options.choose_scenarios(names, families)
     known_issues = options.read_known_issues(known_files, chosen)
     folder = options.claim_folder(out)

@@ -311,10 +311,9 @@ class WorkerPool(Executor):
     def _make_pool(self) -> ProcessPool:
         from pebble import ProcessPool  # with asyncio: not in a run whose answers all come from the cache
 
-        os.environ.update(_SINGLE_THREAD_ENV)  # inherited by the workers, before NumPy loads there
         return ProcessPool(
             max_workers=self._jobs,
-            context=_warm_context(),
+            context=start_warm_process(),
             initializer=initialize_worker,
             initargs=(str(self._scratch.path), self.limits.gigabytes, os.getpid(), dict(os.environ)),
         )
@@ -351,8 +350,16 @@ class WorkerPool(Executor):
                     future.cancel()
 
 
-def _warm_context() -> BaseContext:
-    """Fork workers from a process that has libraries loaded; start them anew where that is not possible."""
+def start_warm_process() -> BaseContext:
+    """Start the process that loads the engines' libraries and from which workers are forked, if none runs.
+
+    A command calls it first, so that the libraries are loaded while it reads its input.
+
+    Returns:
+        What starts workers: forked from that process, or anew where a platform cannot fork.
+
+    """
+    os.environ.update(_SINGLE_THREAD_ENV)  # inherited by the workers, before NumPy loads there
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
     _keep_sockets_in_scratch_folder()
