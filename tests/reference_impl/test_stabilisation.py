@@ -1,0 +1,64 @@
+"""Baumgarte and projection hold the manifold that the raw form drifts from, and change nothing else."""
+
+import numpy as np
+import pytest
+
+from plumbline.model.kinematics import quaternion_rate
+from reference_impl.collocation import integrate_collocation
+from reference_impl.joints import constraint_rows
+from reference_impl.structured import StructuredSystem, component_first
+from tests.helpers.random_chains import random_chain
+
+
+@pytest.mark.parametrize("rods", [[False], [True], [False, True, False]])
+def test_every_variant_converges_to_the_same_motion(rods):
+    model, state = random_chain(np.random.default_rng(60), rods, loads=True, drag=True)
+    start = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
+    times = np.linspace(0, 0.5, 6)
+    variants = {}, {"baumgarte": 10.0}, {"project": True}
+    runs = [integrate_collocation([model], *start, times, 1e-13, **variant) for variant in variants]
+    for other in runs[1:]:
+        assert np.max(np.abs(other.r - runs[0].r)) < 1e-10
+        assert np.max(np.abs(other.pdot - runs[0].pdot)) < 1e-9
+
+
+@pytest.mark.parametrize("rods", [[False], [True], [True, False, True]])
+def test_projection_is_newton_on_every_constraint(rods):
+    """From 1e-5 off the manifold to rounding; a state on it stays."""
+    rng = np.random.default_rng(61)
+    model, state = random_chain(rng, rods)
+    forest, pdot = StructuredSystem([model]), quaternion_rate(state.p, state.omega)
+    q, v = component_first(state.r, state.p), component_first(state.v, pdot)
+    near = forest.project(q + 1e-5 * rng.normal(size=q.shape), v + 1e-5 * rng.normal(size=q.shape))
+    for error in forest.constraints(*near):
+        assert np.max(np.abs(error)) < 1e-14
+    assert np.max(np.abs(np.sum(near[0][3:] ** 2, axis=0) - 1)) < 1e-15
+    assert np.max(np.abs(np.sum(near[0][3:] * near[1][3:], axis=0))) < 1e-15
+    assert np.max(np.abs(near[0] - q)) < 1e-4
+    for moved, was in zip(forest.project(q, v), (q, v), strict=True):
+        assert np.max(np.abs(moved - was)) < 1e-13
+
+
+def test_baumgarte_pulls_back_at_its_rate():
+    """A gap of 1e-6 with a = 10/s is critically damped: (1 + a t) e^{−a t} of it is left."""
+    model, state = random_chain(np.random.default_rng(63), [False])
+    r, times = state.r + np.array([1e-6, 0, 0]), np.linspace(0, 1, 5)
+    start = r, state.p, state.v, quaternion_rate(state.p, state.omega)
+    held = integrate_collocation([model], *start, times, 1e-12, baumgarte=10.0)
+    samples = zip(held.r, held.p, held.v, held.pdot, strict=True)
+    left = np.array([np.linalg.norm(constraint_rows(model, *sample).d) for sample in samples]) / 1e-6
+    assert np.max(np.abs(left - (1 + 10 * times) * np.exp(-10 * times))) < 1e-3
+
+
+def test_projection_from_afar_ends_on_unit_quaternions():
+    """From 5 % off what is left of the gaps is of higher order, but p is normalised to rounding."""
+    rng = np.random.default_rng(69)
+    model, state = random_chain(rng, [True, False, False])
+    forest = StructuredSystem([model])
+    q, v = component_first(state.r, state.p), component_first(state.v, quaternion_rate(state.p, state.omega))
+    far = q + 0.05 * rng.normal(size=q.shape)
+    near = forest.project(far, v + 0.05 * rng.normal(size=q.shape))
+    assert np.max(np.abs(np.sum(near[0][3:] ** 2, axis=0) - 1)) < 1e-15
+    assert np.max(np.abs(np.sum(near[0][3:] * near[1][3:], axis=0))) < 1e-15
+    left, before = (np.max(np.abs(forest.constraints(x, v)[0])) for x in (near[0], far))
+    assert left < 0.02 * before
