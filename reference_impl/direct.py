@@ -1,8 +1,8 @@
 """S x = b (N1–N5) for N bodies on joints: assembled, solved, and the multipliers as forces (E5).
 
 In a loop rows may depend on others.  Rows are then kept by a pivoted QR of the scaled rows, of C without its
-part along p, which the normalisation rows hold; the kept ones determine r̈ and p̈.  λ is determined up to Z,
-the null space of these rows' transpose, and of a joint's wrench the part perpendicular to the wrenches of Z.
+part along p, which the normalisation rows hold; the kept ones determine r̈ and p̈.  λ is determined up to the
+null space of these rows' transpose: it is 0 in the others.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import lapack, null_space, qr
+from scipy.linalg import lapack, qr
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 
@@ -41,10 +41,7 @@ class Solution:
     # (J, 3) N, force on the near body at the near point, world frame: −C_rᵀ λ, with elements
     joint_reaction: Array
     joint_moment: Array | None = None  # (J, 3) N m, moment on that body about that point, world frame
-    # Of loops: (c,) False where a row depends on others and was left out; (J, 6, 6) projectors of wrenches
-    # (F, N/ℓ) on their determinate parts, ℓ of `DirectSystem.wrench_length`
-    kept: NDArray[np.bool_] | None = None
-    determinate: Array | None = None
+    kept: NDArray[np.bool_] | None = None  # (c,) of loops: False where a row depends on others, left out
 
 
 class DirectSystem:
@@ -149,7 +146,8 @@ class DirectSystem:
 
         """
         if self.chain.has_loops:
-            return self._solve_loops(r, p, v, pdot, gamma_defect, x)
+            found, kept = self._loop_unknowns(r, p, v, pdot, gamma_defect, x, is_run=False)
+            return replace(self._solution_from_unknowns(p, *found), kept=kept)
         return self._solution_from_unknowns(p, *self.solve_unknowns(r, p, v, pdot, gamma_defect, x))
 
     def solve_unknowns(
@@ -184,8 +182,7 @@ class DirectSystem:
 
         """
         if self.chain.has_loops:
-            found = self._loop_unknowns(r, p, v, pdot, gamma_defect, x, is_run=True)
-            return found[0], found[3], found[4]
+            return self._loop_unknowns(r, p, v, pdot, gamma_defect, x, is_run=True)[0]
         with np.errstate(all="ignore"):  # an overflow raises SingularSystem below
             values, b, joints, elements = self._entries(r, p, v, pdot, x)
             n, c = self.chain.n, len(self.joint)
@@ -255,21 +252,6 @@ class DirectSystem:
         lack = b - np.bincount(self._i, values * unknowns[self._j], self.size)
         return self._solution_from_unknowns(p, unknowns + correction(lack), joints, elements), elements
 
-    def _solve_loops(
-        self, r: Array, p: Array, v: Array, pdot: Array, gamma_defect: float | Array, x: Array | None
-    ) -> Solution:
-        """Solve with the rows that do not depend on others, and find what the others leave determinate."""
-        n, c, plain = self.chain.n, len(self.joint), len(self.joint) - self.rotor_count
-        unknowns, used, scaled, joints, elements = self._loop_unknowns(
-            r, p, v, pdot, gamma_defect, x, is_run=False
-        )
-        rows, scale = scaled
-        solution = self._solution_from_unknowns(p, unknowns, joints, elements)
-        null = np.zeros((c, plain - int(np.sum(used[7 * n : 7 * n + plain]))))
-        null[:plain] = null_space(rows.T, rcond=RANK_TOLERANCE) * scale[:, None]
-        determinate = self._determinate(p, null, joints)
-        return replace(solution, kept=used[7 * n : 7 * n + c], determinate=determinate)
-
     def _loop_unknowns(
         self,
         r: Array,
@@ -279,8 +261,8 @@ class DirectSystem:
         gamma_defect: float | Array,
         x: Array | None,
         is_run: bool,
-    ) -> tuple[Array, NDArray[np.bool_], tuple[Array, Array], ConstraintRows, ElementForces | None]:
-        """The unknowns by dense factors, which of them are used, the rows of C scaled and their scale."""
+    ) -> tuple[tuple[Array, ConstraintRows, ElementForces | None], NDArray[np.bool_]]:
+        """As `solve_unknowns`, by dense factors; and which of the rows are kept."""
         n, c, plain = self.chain.n, len(self.joint), len(self.joint) - self.rotor_count
         values, b, joints, elements = self._entries(r, p, v, pdot, x)
         S = self._dense(values)
@@ -289,15 +271,14 @@ class DirectSystem:
         rows = S[7 * n : 7 * n + plain, : 7 * n].copy()
         of_p = rows[:, 3 * n :].reshape(plain, n, 4)
         of_p -= p * (dot(of_p, p) / dot(p, p))[..., None]
-        scale = 1 / np.linalg.norm(rows, axis=1)
-        rows *= scale[:, None]
+        rows *= 1 / np.linalg.norm(rows, axis=1)[:, None]
         used = np.ones(self.size, bool)
         used[7 * n : 7 * n + plain] = False
         kept = self._rows_of_run(rows) if is_run else independent_rows(rows, RANK_TOLERANCE)
         used[7 * n + kept] = True
         unknowns = np.zeros(self.size)
         unknowns[used] = solve_dense(S[np.ix_(used, used)], b[used])
-        return unknowns, used, (rows, scale), joints, elements
+        return (unknowns, joints, elements), used[7 * n : 7 * n + c]
 
     def _rows_of_run(self, rows: Array) -> NDArray[np.intp]:
         """The rows of a loop that a run keeps, as many as at its start, where it is assembled.
@@ -311,25 +292,6 @@ class DirectSystem:
             kept = independent_rows(rows, *chosen)
             self._run_rows, self._run_independence = kept, _independence(rows[kept])
         return kept
-
-    def _determinate(self, p: Array, null: Array, joints: ConstraintRows) -> Array:
-        """Projectors (J, 6, 6) off the wrenches (F, N/ℓ) of multipliers (c, z) that hold nothing."""
-        count = len(self.chain.kind)
-        found, projectors = np.zeros((null.shape[1], count, 6)), np.tile(np.eye(6), (count, 1, 1))
-        for wrench, multiplier in zip(found, null.T, strict=True):
-            force, of_p = self._constraint_forces(multiplier, joints)
-            moment = joint_moments(self.chain, p, force, of_p)
-            wrench[:] = np.concatenate([force, moment / self.wrench_length], axis=1)
-        for k, projector in enumerate(projectors):
-            vectors, sizes, _ = np.linalg.svd(found[:, k].T, full_matrices=False)
-            lost = vectors[:, sizes > RANK_TOLERANCE * np.max(np.abs(found), initial=0.0)]
-            projector -= lost @ lost.T
-        return projectors
-
-    @property
-    def wrench_length(self) -> float:
-        """ℓ [m], the mean distance of joints from centres of mass: N/ℓ is comparable with F."""
-        return float(np.mean(np.linalg.norm(self.chain.point, axis=2))) or 1.0
 
     def _constraint_forces(self, multiplier: Array, joints: ConstraintRows) -> tuple[Array, Array]:
         """Forces (J, 3) and generalised forces on p (J, 4) of the joints' rows on the near bodies."""

@@ -26,6 +26,7 @@ from plumbline.model.kinematics import (
     rotation_matrix,
     spring_vectors,
 )
+from plumbline.model.loops import determinate_projectors, wrench_length
 from reference_impl.direct import DirectSystem
 from reference_impl.elements import ElementForces
 from reference_impl.tree_elimination import side_by_side
@@ -40,7 +41,6 @@ class _Base:
         self.coordinates = joint_coordinates(model, state)[2]
         at = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
         plain = DirectSystem(model).solve(*at, x=self.coordinates)
-        self.determinate = plain.determinate
         system = DirectSystem(_with_rotor_rows(model) if has_elements else model)
         S, b = system.assemble(*at, self.coordinates)
         c = len(system.joint) - system.rotor_count  # rows of constraints
@@ -71,7 +71,6 @@ class ChangedModels:
         self.has_elements = any(one.has_joint_elements for one in (model, *changed))
         parts = [_with_rotor_rows(one) for one in weighed] if self.has_elements else weighed
         self.system = DirectSystem(side_by_side(parts))
-        self.length = DirectSystem(model).wrench_length
 
     def solve(self, base: State, states: State) -> dict[str, Array]:
         """Return the state quantities to first order.
@@ -117,10 +116,12 @@ class ChangedModels:
             "joint_moment": found.joint_moment,
         }
         values = {name: value.reshape(count, -1, 3) for name, value in per_copy.items()}
-        if solved.determinate is not None:
-            wrench = np.concatenate([values["joint_reaction"], values["joint_moment"] / self.length], axis=-1)
-            wrench = rotate_vectors(solved.determinate, wrench)
-            values |= {"joint_reaction": wrench[..., :3], "joint_moment": wrench[..., 3:] * self.length}
+        projectors = determinate_projectors(self.model, base) if self.model.has_loops else None
+        if projectors is not None:
+            length = wrench_length(self.model)
+            wrench = np.concatenate([values["joint_reaction"], values["joint_moment"] / length], axis=-1)
+            wrench = rotate_vectors(projectors, wrench)
+            values |= {"joint_reaction": wrench[..., :3], "joint_moment": wrench[..., 3:] * length}
         return values | self._energies(r, p, v, omega, elements)
 
     def _energies(

@@ -22,7 +22,7 @@ from plumbline.model.kinematics import (
     rotate_vectors,
     rotation_matrix,
 )
-from plumbline.model.loops import cut_open
+from plumbline.model.loops import cut_open, determinate_projectors, wrench_length
 from plumbline.model.redescription import rods_taken_out
 from reference_impl.direct import DirectSystem
 
@@ -50,9 +50,10 @@ def effects_of_missing_terms(model: Model, state: State) -> dict[str, Array]:
     wrench = np.concatenate(
         [wrong.joint_reaction - right.joint_reaction, wrong.joint_moment - right.joint_moment], axis=1
     )
-    if right.determinate is not None:
-        unit = np.repeat([1.0, system.wrench_length], 3)
-        wrench = rotate_vectors(right.determinate, wrench / unit) * unit
+    projectors = determinate_projectors(model, state) if model.has_loops else None
+    if projectors is not None:
+        unit = np.repeat([1.0, wrench_length(model)], 3)
+        wrench = rotate_vectors(projectors, wrench / unit) * unit
     return {
         "acceleration": wrong.acceleration - right.acceleration,
         "angular_acceleration": angular_velocity(state.p, wrong.pddot - right.pddot),
