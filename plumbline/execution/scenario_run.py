@@ -57,6 +57,7 @@ _LEVELS: dict[TaskKind, Level] = {
 # What of a scenario may be left out, by the level of the row that reports it.
 _GAP_LEVELS: dict[TaskKind, Level] = {
     TaskKind.STEP: "step", TaskKind.TRAJECTORY: "trajectory", TaskKind.RELATIONS: "relations",
+    TaskKind.LONG_RUN: "invariants",
 }  # fmt: skip
 
 
@@ -77,9 +78,7 @@ def uncompared_kinds(model: Model) -> dict[TaskKind, str]:
         By kind of task why it is left out.
 
     """
-    if model.has_loops:
-        return {TaskKind.LONG_RUN: "long runs of mechanisms with loops are not compared"}
-    if model.n > MAX_STEP_BODIES:
+    if model.n > MAX_STEP_BODIES and not model.has_loops:
         return {TaskKind.STEP: f"single steps are compared of at most {MAX_STEP_BODIES} bodies"}
     return {}
 
@@ -127,7 +126,7 @@ class ScenarioRun:
                 f"singular: at the initial pose the smallest singular value is {self._singular_value:.2g}"
             )
             self._left_out |= dict.fromkeys(
-                (TaskKind.MOTION_TRUTH, TaskKind.TRAJECTORY, TaskKind.STEP), singular
+                (TaskKind.MOTION_TRUTH, TaskKind.TRAJECTORY, TaskKind.STEP, TaskKind.LONG_RUN), singular
             )
         every = list(task_keys(scenario.name, engines, levels, has_long_runs))
         self._keys = [key for key in every if key.kind not in self._left_out]
@@ -342,7 +341,7 @@ class ScenarioRun:
             truth = self.truths.get(TaskKind.MOTION_TRUTH)  # ends before a singular pose
             times = truth.trajectory.t if isinstance(truth, MotionTruth) else s.times
             return run_refinement_study, (integrator.name, s.model, s.state, times, steps)
-        length = plan_long_run(integrator, s.model.n, plan.long_run_seconds, s.sample_interval)
+        length = plan_long_run(integrator, s.model.n, plan.long_run_seconds, s.sample_interval, s.duration)
         return run_long_run_study, (integrator.name, s.model, s.state, s.sample_interval, length)
 
     def _judge(self, key: TaskKey) -> tuple[Callable[..., JudgingResult] | None, tuple[Any, ...]]:

@@ -23,17 +23,23 @@ MAX_BODY_STEPS = 2**19  # most steps × bodies of the finest run, without extra 
 RTOL_FACTORS = 1e2, 1.0  # relative tolerances of an adaptive method, over its tightest: no verdict needs more
 
 
-def step_unit(sample_interval: float) -> float:
-    """Return the unit of the steps 1, 1/2, 1/4, … that hit every sample.
+def step_unit(sample_interval: float, duration: float, coarsest: int) -> float:
+    """Return the unit of the steps 2^−k, k ≥ ``coarsest``, that hit every sample.
 
     Args:
         sample_interval: time between samples [s].
+        duration: length of the motion [s].
+        coarsest: k of the coarsest step.
 
     Returns:
-        ``sample_interval`` times the power of two that brings it next to 1 [s]; 1 for a power of two.
+        ``sample_interval`` times the power of two that brings it next to 1 [s], 1 for a power of two; in
+        proportion to a duration below 1 s where the coarsest step would be longer than the sample interval.
 
     """
-    return float(sample_interval * 2.0 ** -round(np.log2(sample_interval)))
+    unit = float(sample_interval * 2.0 ** -round(np.log2(sample_interval)))
+    if unit * 2.0**-coarsest > sample_interval:
+        unit *= 2.0 ** int(np.floor(np.log2(min(duration, 1.0))))
+    return unit
 
 
 def refinement_resolutions(
@@ -53,8 +59,7 @@ def refinement_resolutions(
         sample_interval: time between samples [s].
 
     Returns:
-        From coarse to fine at least four steps [s], powers of two of `step_unit`, in proportion to a
-        duration below 1 s where they would be longer than the sample interval; or two relative tolerances.
+        From coarse to fine at least four steps [s], powers of two of `step_unit`; or two relative tolerances.
 
     """
     if integrator.kind == "tolerance":
@@ -62,9 +67,7 @@ def refinement_resolutions(
     coarse, fine = STEP_EXPONENTS[integrator.order]
     affordable = int(np.floor(np.log2(MAX_BODY_STEPS / (bodies * max(duration, 1.0)))))
     fine = max(min(fine, affordable), coarse + 3) + extra_refinements
-    unit = step_unit(sample_interval)
-    if unit * 2.0**-coarse > sample_interval:
-        unit *= 2.0 ** int(np.floor(np.log2(min(duration, 1.0))))
+    unit = step_unit(sample_interval, duration, coarse)
     return [unit * 2.0**-k for k in range(coarse, fine + 1)]
 
 

@@ -12,17 +12,32 @@ from plumbline.engines.calls import format_exception
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.convergence import step_unit
 from plumbline.model.datatypes import Array, Integrator, Model, State, Trajectory, Unsupported
-from plumbline.model.invariants import INVARIANT_UNITS, compute_invariants, invariant_scales
-from plumbline.truth.ground_truth import stretched_length
+from plumbline.model.invariants import (
+    INVARIANT_UNITS,
+    compute_invariants,
+    invariant_scales,
+    kinetic_energy,
+)
+from plumbline.model.kinematics import angular_velocity
+from plumbline.truth.ground_truth import singular_note, stretched_length
 
-# By order: coarsest and finest step, as -log2 of seconds.
+# By order: coarsest and finest step, as -log2 of the `step_unit`.
 LONG_RUN_STEP_EXPONENTS = {1: (9, 11), 2: (7, 9), 4: (7, 9)}
 RTOL_FACTORS = (1e6, 1e4)  # relative tolerances of a method with step control, over its tightest
 # By order: most steps × bodies of the finest run; a step of order 1 is cheap.
 MAX_BODY_STEPS = {1: 2**18, 2: 2**17, 4: 2**17}
-MAX_BODY_SECONDS = 100.0  # most s × bodies with step control, whose steps are not known beforehand
-WINDOW_ENDS = (0.1, 1.0, 10.0, 100.0, 1000.0)  # s: largest drifts are kept up to each, and up to the end
-MIN_WINDOW_SECONDS = 1.0  # s: shortest run that is tried, decade by decade, where longer ones fail
+MAX_BODY_SECONDS = (
+    100.0  # most time, in the unit of s, × bodies with step control, whose steps are not known beforehand
+)
+WINDOW_ENDS = (
+    0.1,
+    1.0,
+    10.0,
+    100.0,
+    1000.0,
+)  # of `time_unit`: largest drifts are kept up to each, and the end
+MIN_WINDOW = 1.0  # of `time_unit`: shortest run that is tried, decade by decade, where longer ones fail
+MAX_RELATIVE_DRIFT = 0.1  # of an invariant's scale: beyond, the step is too coarse for this motion
 BLOCK_COUNT = 16  # blocks of time in each window
 ADAPTIVE_SAMPLE_SPACING = 0.125  # s between samples of a method with step control, which ends a step at each
 
@@ -34,6 +49,7 @@ class LongRunPlan:
     seconds: float
     resolutions: tuple[float, ...]  # steps [s] or relative tolerances, coarse to fine
     requested_seconds: float  # s
+    time_unit: float = 1.0  # s, less for a motion faster than steps of seconds resolve
 
     @property
     def shortening_note(self) -> str:
@@ -73,10 +89,11 @@ class LongRunStudy:
     runs: list[LongRun]
     plan: LongRunPlan
     unsupported: str | None = None
+    singular: str = ""  # why the runs end before the plan's length: a pose that is singular, or nearly so
 
 
 def plan_long_run(
-    integrator: Integrator, bodies: int, seconds: float, sample_interval: float = 1.0
+    integrator: Integrator, bodies: int, seconds: float, sample_interval: float = 1.0, duration: float = 1.0
 ) -> LongRunPlan:
     """Choose the affordable length and the resolutions of long runs.
 
@@ -84,21 +101,24 @@ def plan_long_run(
         integrator: has fixed steps of an order, or a tolerance.
         bodies: number of bodies.
         seconds: requested length [s].
-        sample_interval: time between samples [s].
+        sample_interval: the scenario's time between samples [s].
+        duration: of the scenario [s]; where its samples are closer than the steps of seconds, a fast motion,
+            steps and length are those of seconds in proportion to it.
 
     Returns:
         The plan; its length is halved until the finest run keeps to `MAX_BODY_STEPS` or `MAX_BODY_SECONDS`.
 
     """
+    coarse, fine = LONG_RUN_STEP_EXPONENTS.get(integrator.order, LONG_RUN_STEP_EXPONENTS[4])
+    unit, usual = (step_unit(sample_interval, length, coarse) for length in (duration, 1.0))
     if integrator.kind == "tolerance":
-        affordable = MAX_BODY_SECONDS / bodies
+        affordable = MAX_BODY_SECONDS * (unit / usual) / bodies
         resolutions = tuple(integrator.min_rtol * factor for factor in RTOL_FACTORS)
     else:
-        coarse, fine = LONG_RUN_STEP_EXPONENTS[integrator.order]
-        affordable = MAX_BODY_STEPS[integrator.order] / bodies / 2**fine
-        resolutions = tuple(step_unit(sample_interval) * 2.0**-k for k in range(coarse, fine + 1))
+        affordable = MAX_BODY_STEPS[integrator.order] * (unit / usual) / bodies / 2**fine
+        resolutions = tuple(unit * 2.0**-k for k in range(coarse, fine + 1))
     halvings = max(0, int(np.ceil(np.log2(seconds / affordable))))
-    return LongRunPlan(seconds / 2**halvings, resolutions, seconds)
+    return LongRunPlan(seconds / 2**halvings, resolutions, seconds, unit / usual)
 
 
 def run_long_run_study(
@@ -115,47 +135,129 @@ def run_long_run_study(
         plan: length and resolutions.
 
     Returns:
-        The reduced runs, or the reason why the engine refused.
+        The reduced runs, or the reason why the engine refused; with loops up to a singular pose.
 
     Raises:
         MemoryError: the worker's limit was reached.
 
     """
     adapter = load_adapter(engine)
-    sample_interval = _sample_spacing(adapter.integrator(integrator), model, sample_interval)
-    lengths = [t for t in _window_ends(plan.seconds) if t >= min(MIN_WINDOW_SECONDS, plan.seconds)]
-    runs: list[LongRun] = []
-    for resolution in plan.resolutions:
-        begin, failure, trajectory = time.process_time(), None, None
-        for seconds in reversed(lengths):
-            times = np.arange(round(seconds / sample_interval) + 1, dtype=np.float64) * sample_interval
-            try:
-                trajectory = adapter.simulate(model, state, times, integrator, resolution)
-                break
-            except Unsupported as refusal:
-                return LongRunStudy(runs, plan, str(refusal))
-            except MemoryError:
-                raise
-            except Exception as error:  # an engine may raise anything; its message belongs in the results
-                failure = failure or format_exception(error)
-        runs.append(_reduce_run(model, trajectory, resolution, failure, begin))
-    return LongRunStudy(runs, plan)
+    spacing = _sample_spacing(adapter.integrator(integrator), model, sample_interval, plan)
+
+    def runs_until(end: float, is_checked: bool) -> LongRunStudy | float:
+        """All runs; where they are checked and a pose may be singular, when [s]."""
+        lengths = [t for t in _window_ends(end, plan) if t >= min(MIN_WINDOW * plan.time_unit, end)]
+        runs: list[LongRun] = []
+        for resolution in plan.resolutions:
+            begin, failure, trajectory = time.process_time(), None, None
+            for seconds in reversed(lengths):
+                try:
+                    trajectory = adapter.simulate(
+                        model, state, _samples(seconds, spacing), integrator, resolution
+                    )
+                    break
+                except Unsupported as refusal:
+                    return LongRunStudy(runs, plan, str(refusal))
+                except MemoryError:
+                    raise
+                except Exception as error:  # an engine may raise anything; its message belongs in the results
+                    failure = failure or format_exception(error)
+            runs.append(_reduce_run(model, plan, trajectory, resolution, failure, begin))
+            doubt = _first_doubt(model, state, trajectory, runs[-1], end) if is_checked else None
+            if doubt is not None:
+                return doubt
+        return LongRunStudy(runs, plan)
+
+    study = runs_until(plan.seconds, is_checked=model.has_loops)
+    if not isinstance(study, LongRunStudy):
+        times = _samples(plan.seconds, spacing)
+        end, singular = _regular_length(model, state, times[times <= study + spacing])
+        study = runs_until(end if singular else plan.seconds, is_checked=False)
+        assert isinstance(study, LongRunStudy)
+        study = replace(study, singular=singular)
+    return study
 
 
-def _window_ends(seconds: float) -> list[float]:
+def leaves_range(run: LongRun, seconds: float) -> bool:
+    """Return whether the energy, drifting on as it did, would leave its range: too coarse a step.
+
+    Args:
+        run: that reached a window's end.
+        seconds: the length that was planned [s].
+
+    Returns:
+        Whether the drift, as the power of time that the last two windows show, or in proportion to time
+        where that is more, passes `MAX_RELATIVE_DRIFT` of its scale.
+
+    """
+    windows = run.windows["energy_drift"]
+    *earlier, end = sorted(windows)
+    drift, growth = windows[end].max_drift, 1.0
+    if earlier and windows[earlier[-1]].max_drift > 0:
+        growth = max(growth, np.log(drift / windows[earlier[-1]].max_drift) / np.log(end / earlier[-1]))
+    drift *= (seconds / end) ** growth
+    return bool(drift > MAX_RELATIVE_DRIFT * run.invariant_scales[end]["energy_drift"])
+
+
+def _samples(seconds: float, spacing: float) -> Array:
+    return np.arange(round(seconds / spacing) + 1, dtype=np.float64) * spacing
+
+
+def _first_doubt(
+    model: Model, state: State, run: Trajectory | None, reduced: LongRun, seconds: float
+) -> float | None:
+    """When [s] a run may have come to a singular pose, its energy in range; inf where it failed in range."""
+    from plumbline.truth.regular_motion import first_doubt  # with SciPy: not in a run's own process
+
+    if run is None:
+        return np.inf
+    drift = np.abs(compute_invariants(model, run).energy_drift[:, 0, 0])
+    kinetic = np.maximum.accumulate(kinetic_energy(model, run.v, angular_velocity(run.p, run.pdot)))
+    scale = np.maximum(kinetic, reduced.invariant_scales[min(reduced.invariant_scales)]["energy_drift"])
+    out = np.flatnonzero(drift > MAX_RELATIVE_DRIFT * scale)  # the step is too coarse from there on
+    number = int(out[0]) if len(out) else len(run.t)
+    part = replace(run, **{name: getattr(run, name)[:number] for name in ("t", "r", "p", "v", "pdot")})
+    found = first_doubt(model, state, part)
+    if found is None and reduced.failure is not None and not leaves_range(reduced, seconds):
+        return np.inf
+    return found
+
+
+def _regular_length(model: Model, state: State, times: Array) -> tuple[float, str]:
+    """The last sample [s] before the motion comes to a singular pose, and what to say of it."""
+    from plumbline.truth.regular_motion import regular_motion
+
+    try:
+        regular = regular_motion(model, state, times)
+    except ArithmeticError:  # it ends for another reason: the engine's runs are judged as they are
+        return float(times[-1]), ""
+    if not regular.is_singular:
+        return float(times[-1]), ""
+    return float(times[times <= regular.end][-1]), singular_note(regular.end)
+
+
+def _window_ends(seconds: float, plan: LongRunPlan) -> list[float]:
     """Ends of the windows [s]: the decades and ``seconds`` itself."""
-    return [*(end for end in WINDOW_ENDS if end < seconds), seconds]
+    return [*(end * plan.time_unit for end in WINDOW_ENDS if end * plan.time_unit < seconds), seconds]
 
 
-def _sample_spacing(integrator: Integrator, model: Model, sample_interval: float) -> float:
+def _sample_spacing(integrator: Integrator, model: Model, sample_interval: float, plan: LongRunPlan) -> float:
     """Time between samples [s]: longer with step control, unless the work's quadrature needs them all."""
-    if integrator.kind == "tolerance" and not (model.has_drag or np.any(model.moment)):
+    if integrator.kind == "step":
+        return max(sample_interval, plan.resolutions[0])  # every run samples at the ends of steps
+    has_power = model.is_dissipative or np.any(model.moment) or np.any(model.effort)
+    if not has_power:
         sample_interval *= max(1, round(ADAPTIVE_SAMPLE_SPACING / sample_interval))
     return sample_interval
 
 
 def _reduce_run(
-    model: Model, run: Trajectory | None, resolution: float, failure: str | None, begin: float
+    model: Model,
+    plan: LongRunPlan,
+    run: Trajectory | None,
+    resolution: float,
+    failure: str | None,
+    begin: float,
 ) -> LongRun:
     """Reduce a run that began at ``begin`` (process time [s]) to its windows."""
     if run is None:
@@ -163,7 +265,7 @@ def _reduce_run(
     length, end = float(np.sum(stretched_length(model))), float(run.t[-1])
     windows: dict[str, dict[float, DriftWindow]] = {}
     scales, work_uncertainty = {}, {}
-    for window_end in _window_ends(end):
+    for window_end in _window_ends(end, plan):
         number = int(np.searchsorted(run.t, window_end)) + 1
         part = replace(run, **{name: getattr(run, name)[:number] for name in ("t", "r", "p", "v", "pdot")})
         invariants = compute_invariants(model, part)

@@ -20,18 +20,20 @@ from plumbline.judging.convergence import ORDER_MARGIN
 from plumbline.judging.invariant_drift import ROUNDING_PER_STEP
 from plumbline.judging.long_run_study import (
     BLOCK_COUNT,
-    MIN_WINDOW_SECONDS,
+    MAX_RELATIVE_DRIFT,
+    MIN_WINDOW,
     DriftWindow,
     LongRun,
     LongRunStudy,
+    leaves_range,
 )
 from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict, first_decided
+from plumbline.judging.trajectory import singular_motion_row
 from plumbline.model.datatypes import Array, Integrator, Model
 from plumbline.model.invariants import INVARIANT_UNITS
 from plumbline.truth.ground_truth import DETECTABLE_PARAMETER_ERROR
 
 MIN_ORDER_IN_TOLERANCE = 0.5  # order of a drift in the tolerance of a method with step control, at least
-MAX_RELATIVE_DRIFT = 0.1  # of an invariant's scale: beyond, the step is too coarse for this motion
 SIGMA_FACTOR = 3.0
 UNSTABLE_GROWTH_FACTOR = 2.0  # times as fast as time: neither a bounded drift nor a secular one grows so
 MAX_SYMMETRIC_GROWTH = 0.5  # log2 of the drift's growth when time doubles: 0 if it is bounded, 1 if secular
@@ -51,7 +53,8 @@ def judge_long_runs(
 
     Returns:
         Rows of level "invariants": ``*_long`` per invariant, ``energy_drift_long_growth`` for a symmetric
-        method in a regular motion, or ``all_long`` where the runs were refused or failed.
+        method in a regular motion, ``singular_pose`` where the runs end at one; or ``all_long`` where they
+        were refused or failed.
 
     """
     cost = sum(run.cpu_time for run in study.runs)
@@ -69,6 +72,9 @@ def judge_long_runs(
             has_bound = integrator.is_symmetric and integrator.kind == "step" and is_regular
             if quantity == "energy_drift" and has_bound:
                 rows.append(judge.growth_row())
+    if study.singular:
+        end = study.runs[-1].reached_time
+        rows.append(singular_motion_row(context, "invariants", integrator.name, study.singular, end))
     alias = None if model.has_drag else integrator.alias_of  # with drag the two methods differ
     return JudgingResult([replace(row, cpu_time=cost, alias_of=alias) for row in rows])
 
@@ -80,19 +86,9 @@ def _missing_runs(study: LongRunStudy) -> tuple[Verdict, str] | None:
     finest = study.runs[-1]
     if not finest.windows:
         return Verdict.FAILED, f"at the finest resolution {finest.resolution:g}: {finest.failure}"
-    if finest.failure is not None and not _has_blown_up(study):
+    if finest.failure is not None and not leaves_range(finest, study.plan.seconds):
         return Verdict.FAILED, f"within {study.plan.seconds:g} s at {finest.resolution:g}: {finest.failure}"
     return None
-
-
-def _has_blown_up(study: LongRunStudy) -> bool:
-    """Whether the finest run's energy, drifting on as it did, would leave its range: too coarse a step."""
-    finest = study.runs[-1]
-    drift = finest.windows["energy_drift"][finest.reached_time].max_drift
-    return (
-        drift * study.plan.seconds / finest.reached_time
-        > MAX_RELATIVE_DRIFT * finest.invariant_scales[finest.reached_time]["energy_drift"]
-    )
 
 
 @dataclass(frozen=True)
@@ -114,6 +110,11 @@ class _DriftJudge:
     def finest(self) -> LongRun:
         """The run that is judged."""
         return self.study.runs[-1]
+
+    @property
+    def shortest(self) -> float:
+        """The shortest window that decides [s]."""
+        return MIN_WINDOW * self.study.plan.time_unit
 
     @property
     def windows(self) -> dict[float, DriftWindow]:
@@ -154,7 +155,7 @@ class _DriftJudge:
 
     def window_row(self) -> Row:
         """The row of the longest window that decides; a shorter one never overrules its disagreement."""
-        ends = [end for end in sorted(self.windows, reverse=True) if end >= MIN_WINDOW_SECONDS]
+        ends = [end for end in sorted(self.windows, reverse=True) if end >= self.shortest]
         return first_decided(self.judge_window(end) for end in ends or [self.finest.reached_time])
 
     def judge_window(self, end: float) -> Row:
@@ -223,7 +224,7 @@ class _DriftJudge:
         window, first_half = self.windows[end], self.windows[end].max_drift_first_half
         growth = float(np.log2(window.max_drift / first_half)) if first_half > 0 else 0.0
         derivation, common = "", {"value": growth, "tolerance": MAX_SYMMETRIC_GROWTH}
-        long_enough = [t for t in sorted(self.windows) if t >= MIN_WINDOW_SECONDS]
+        long_enough = [t for t in sorted(self.windows) if t >= self.shortest]
         unstable = [
             (a, b)
             for a, b in itertools.pairwise(long_enough)

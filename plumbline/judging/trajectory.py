@@ -18,7 +18,7 @@ from plumbline.judging.convergence import ORDER_CHANGE_FACTOR, ORDER_MARGIN
 from plumbline.judging.identity import run_fingerprints
 from plumbline.judging.invariant_drift import invariant_rows
 from plumbline.judging.refinement_analysis import RefinementAnalysis
-from plumbline.judging.rows import Columns, JudgingResult, Row, RowContext, Verdict, first_decided
+from plumbline.judging.rows import Columns, JudgingResult, Level, Row, RowContext, Verdict, first_decided
 from plumbline.judging.state import SINGULAR_POSE
 from plumbline.model.datatypes import Array, Integrator, Model, Trajectory
 from plumbline.model.invariants import INVARIANT_UNITS, attitude_error, position_error
@@ -52,7 +52,8 @@ def judge_trajectory(
     analysis = RefinementAnalysis(context, model, truth, integrator, study.runs, truth.horizon)
     rows = [*trajectory_rows(analysis), *invariant_rows(analysis)]
     if truth.singular:
-        rows.append(singular_motion_row(context, integrator.name, truth))
+        end = float(truth.trajectory.t[-1])
+        rows.append(singular_motion_row(context, "trajectory", integrator.name, truth.singular, end))
     names: Columns = {"scenario": context.scenario, "engine": context.engine, "integrator": integrator.name}
     of_finest = names | {"resolution": finest.resolution}
     tables = [
@@ -64,23 +65,22 @@ def judge_trajectory(
     return JudgingResult(rows, tables, run_fingerprints(integrator.name, finished))
 
 
-def singular_motion_row(context: RowContext, integrator: str, truth: MotionTruth) -> Row:
+def singular_motion_row(context: RowContext, level: Level, integrator: str, note: str, end: float) -> Row:
     """Report that a motion is compared only up to a singular pose.
 
     Args:
         context: scenario and engine.
+        level: of the row.
         integrator: of the runs.
-        truth: the motion.
+        note: why the motion is compared no further.
+        end: time [s] up to which it is compared.
 
     Returns:
         The row, unresolved.
 
     """
-    end = float(truth.trajectory.t[-1])
-    reason = f"{truth.singular}; compared up to t = {end:g} s"
-    return context.make_row(
-        "trajectory", integrator, SINGULAR_POSE, Verdict.UNRESOLVED, reason, compared_until=end
-    )
+    reason = f"{note}; compared up to t = {end:g} s"
+    return context.make_row(level, integrator, SINGULAR_POSE, Verdict.UNRESOLVED, reason, compared_until=end)
 
 
 def trajectory_rows(study: RefinementAnalysis) -> list[Row]:

@@ -256,13 +256,16 @@ def with_rates(model: Model, state: State, rates: Array) -> State:
     return complete_state(model, replace(state, omega=omega, v=v, xdot=xdot, udot=udot))
 
 
-def assembled(model: Model, state: State, movable: NDArray[np.bool_] | None = None) -> State:
+def assembled(
+    model: Model, state: State, movable: NDArray[np.bool_] | None = None, is_pose_kept: bool = False
+) -> State:
     """Close a mechanism's loops to rounding: the nearest coordinates (Newton's method) and rates.
 
     Args:
         model: the mechanism; a tree is left alone.
         state: near an assembled state.
         movable: (nu,) of the mechanism's rates, True for those that may change; absent: all.
+        is_pose_kept: whether coordinates whose rates are not ``movable`` keep their values too.
 
     Returns:
         The state; where the loops cannot be closed from here, or the rates not, gaps remain.
@@ -271,20 +274,21 @@ def assembled(model: Model, state: State, movable: NDArray[np.bool_] | None = No
     if not model.has_loops:
         return state
     cut = cut_open(model)
-    best = closed_pose(cut, cut.state(state))
     free = np.ones(rate_count(cut.model), bool)
     if movable is not None:  # besides the closing joints' own, which follow
         free[_rates_of_source(cut)] = movable
+    best = closed_pose(cut, cut.state(state), free if is_pose_kept else None)
     rates = closed_rates(cut, best, minimal_rates(cut.model, best), free)
     return cut.source_state(with_rates(cut.model, best, rates))
 
 
-def closed_pose(cut: CutMechanism, state: State) -> State:
+def closed_pose(cut: CutMechanism, state: State, free: NDArray[np.bool_] | None = None) -> State:
     """Close the loops of a cut mechanism by Newton's method, with the shortest steps.
 
     Args:
         cut: the mechanism.
         state: of the tree, near a pose where its ends are together.
+        free: (nu,) True for coordinates that may change; absent: all.
 
     Returns:
         That pose, with the same rates; where the loops cannot be closed from here, gaps remain.
@@ -292,7 +296,8 @@ def closed_pose(cut: CutMechanism, state: State) -> State:
     """
     best, gap = state, cut.gap(state)
     for _ in range(NEWTON_STEPS):
-        step, before = _least_norm(cut, cut.jacobian(best), -gap), np.max(np.abs(gap))
+        J, before = cut.jacobian(best), np.max(np.abs(gap))
+        step = _least_norm(cut, J if free is None else J * free, -gap)
         for _ in range(MAX_HALVINGS if before > NEARLY_CLOSED else 1):  # near singular poses it is too long
             tried = displaced(cut.model, best, step)
             left = cut.gap(tried)
@@ -381,26 +386,42 @@ def loop_gaps(model: Model, state: State) -> tuple[Array, Array]:
     return gaps, rates
 
 
-def smallest_singular_value(model: Model, state: State) -> float:
+def smallest_singular_value(model: Model, state: State, rank: int | None = None) -> float:
     """Measure how near a pose is to a singular one, where rows that hold elsewhere depend on the others.
+
+    Args:
+        model: with loops.
+        state: assembled.
+        rank: of the rows at regular poses, as `regular_rank` finds it; absent: at a pose nearby.
+
+    Returns:
+        The smallest singular value of J (rows by `row_scale`) of those that are not 0 at regular poses.
+
+    """
+    cut = cut_open(model)
+    values = singular_values(cut, cut.state(state))[0]
+    return float(values[(rank or regular_rank(model, state)) - 1])
+
+
+def regular_rank(model: Model, state: State) -> int:
+    """Count the rows that close the loops and do not depend on others, but at singular poses.
 
     Args:
         model: with loops.
         state: assembled.
 
     Returns:
-        The smallest singular value of J (rows by `row_scale`) of those that are not 0 at a pose nearby.
+        The rank of J there, or at a pose nearby where it is larger.
 
     """
     cut = cut_open(model)
     there = cut.state(state)
-    values, base = singular_values(cut, there)
+    base = singular_values(cut, there)[1]
     drawn = np.random.default_rng(0).normal(size=base.shape[1])
     step = drawn - base.T @ (base @ drawn)
     size = float(np.linalg.norm(step))
     nearby = displaced(cut.model, there, np.asarray(1e-2 * step / size)) if size > 1e-6 else there
-    rank = max(len(base), len(singular_values(cut, closed_pose(cut, nearby))[1]))
-    return float(values[rank - 1])
+    return max(len(base), len(singular_values(cut, closed_pose(cut, nearby))[1]))
 
 
 def keeps_dependent_rows(model: Model, state: State) -> bool:

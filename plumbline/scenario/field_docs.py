@@ -86,8 +86,8 @@ springs:
 
 Joints beyond those of the tree close loops. This is a slider-crank: a crank on the world, a rod of 0.3 m on
 its end, and a slider that moves along x and on which the rod's other end is held. Of the rates only the
-crank's is given, the others follow. States, single steps, motions and relations of loops are compared,
-long runs are not; a motion that comes to a singular pose is compared up to it:
+crank's is given, the others follow. States, single steps, motions, long runs and relations of loops are
+compared; a motion or long run that comes to a singular pose is compared up to it:
 
 ```yaml
 schema_version: 1

@@ -182,8 +182,21 @@ def _regular_times(model: Model, state: State, times: Array) -> tuple[Array, str
     kept = times[times <= regular.end]
     if len(kept) < MIN_SAMPLES:
         raise EngineFailure(f"the motion comes to a singular pose at t = {regular.end:.3g} s")
-    return kept, (
-        f"singular: from t = {regular.end:.4g} s on the smallest singular value of the rows that close the "
+    return kept, singular_note(regular.end)
+
+
+def singular_note(end: float) -> str:
+    """Say why a motion is compared no further.
+
+    Args:
+        end: time [s] up to which the motion is regular.
+
+    Returns:
+        The sentence.
+
+    """
+    return (
+        f"singular: from t = {end:.4g} s on the smallest singular value of the rows that close the "
         f"loops is below {MIN_MOTION_SINGULAR_VALUE:g}; at a singular pose accelerations are not unique"
     )
 

@@ -10,14 +10,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.datatypes import Array, Model, State, Trajectory
 from plumbline.model.kinematics import (
     angular_velocity,
     joint_coordinates,
     quaternion_rate,
     with_joint_coordinates,
 )
-from plumbline.model.loops import MIN_MOTION_SINGULAR_VALUE, smallest_singular_value
+from plumbline.model.loops import MIN_MOTION_SINGULAR_VALUE, regular_rank, smallest_singular_value
 from reference_impl.collocation import integrate_collocation
 from reference_impl.tree_elimination import eliminated_system
 
@@ -51,7 +51,8 @@ def regular_motion(model: Model, state: State, times: Array) -> RegularMotion:
         ArithmeticError: the integration stops early for another reason.
 
     """
-    t, last, value = 0.0, float(times[-1]), smallest_singular_value(model, state)
+    rank = regular_rank(model, state)
+    t, last, value = 0.0, float(times[-1]), smallest_singular_value(model, state, rank)
     longest = stride = float(np.min(np.diff(times)))
     here, x = (
         (state.r, state.p, state.v, quaternion_rate(state.p, state.omega)),
@@ -64,7 +65,7 @@ def regular_motion(model: Model, state: State, times: Array) -> RegularMotion:
             run = integrate_collocation(eliminated_system([model], x), *here, grid, RTOL, project=True)
             poses = zip(run.r[1:], run.p[1:], run.v[1:], run.pdot[1:], strict=True)
             values = np.array(
-                [value, *(smallest_singular_value(model, _state(model, state, *y)) for y in poses)]
+                [value, *(smallest_singular_value(model, _state(model, state, *y), rank) for y in poses)]
             )
             is_safe = bool(np.all(2 * values[1:] - values[:-1] > 0))  # the next value as the last two go on
         except ArithmeticError:
@@ -79,6 +80,29 @@ def regular_motion(model: Model, state: State, times: Array) -> RegularMotion:
         else:
             stride /= 2
     return RegularMotion(t, value < MIN_MOTION_SINGULAR_VALUE, value)
+
+
+def first_doubt(model: Model, state: State, run: Trajectory) -> float | None:
+    """Find out from the samples of a run whether a singular pose may be among or between them.
+
+    Args:
+        model: with loops.
+        state: its initial state, assembled.
+        run: T samples, its loops closed but for the error of steps.
+
+    Returns:
+        The time [s] of the first sample whose singular value is below `MIN_MOTION_SINGULAR_VALUE`, or would
+        reach 0 before the next one, falling on as it fell: a value that falls to 0 evenly, between samples,
+        and rises again is noticed in any case.  None where there is no such sample.
+
+    """
+    rank, before = regular_rank(model, state), 0.0
+    for t, *sample in zip(run.t, run.r, run.p, run.v, run.pdot, strict=True):
+        value = smallest_singular_value(model, _state(model, state, *sample), rank)
+        if value < MIN_MOTION_SINGULAR_VALUE or 2 * value <= before:
+            return float(t)
+        before = value
+    return None
 
 
 def _state(model: Model, start: State, r: Array, p: Array, v: Array, pdot: Array) -> State:

@@ -146,7 +146,8 @@ def test_samples_and_durations_never_make_steps_longer(order, duration, sample_i
     """Seen: at 2 s and samples closer than 1/32 s the steps were doubled."""
     method = Integrator("x", "step", order, (order,))
     steps = refinement_resolutions(method, 1, duration, 0, sample_interval)
-    usual = step_unit(sample_interval) * 2.0 ** -STEP_EXPONENTS[order][0]
+    coarsest = STEP_EXPONENTS[order][0]
+    usual = step_unit(sample_interval, 1.0, coarsest) * 2.0**-coarsest
     assert steps[0] <= usual
     assert steps[0] == usual or (usual > sample_interval and duration < 1)
 

@@ -13,7 +13,10 @@ from plumbline.judging import long_run_study
 from plumbline.judging.long_run_study import (
     BLOCK_COUNT,
     MAX_BODY_STEPS,
+    DriftWindow,
+    LongRun,
     LongRunPlan,
+    leaves_range,
     plan_long_run,
     run_long_run_study,
 )
@@ -23,6 +26,7 @@ from plumbline.model.datatypes import Integrator, Trajectory
 from plumbline.processes.workers import Limits
 from plumbline.scenario import loader
 from tests.helpers import engine_process as worker
+from tests.helpers.nightly_tests import slow
 from tests.helpers.planted_defects import MOTION_DEFECTS, Defect, model_change, plant
 
 DEFECTS = {d.name: d for d in MOTION_DEFECTS}
@@ -36,7 +40,7 @@ def run_long(name, engine, integrator, seconds=100.0):
     """Rows by quantity of one integrator's long runs of a scenario."""
     s, chosen = load(name), load_adapter(engine) if isinstance(engine, str) else engine
     method = chosen.integrator(integrator)
-    plan = plan_long_run(method, s.model.n, seconds)
+    plan = plan_long_run(method, s.model.n, seconds, s.sample_interval, s.duration)
     study = run_long_run_study(chosen.name, integrator, s.model, s.state, s.sample_interval, plan)
     context = RowContext(name, s.family, chosen.name, chosen.title, "1")
     return {
@@ -160,6 +164,23 @@ def test_step_control_keeps_each_invariant_within_its_tolerance():
     assert "the error that the tolerance 1e-08 accepts in every step" in rows["energy_drift_long"].reason
 
 
+def test_a_mechanism_with_a_loop_keeps_what_is_conserved():
+    rows = run_long("slider-crank", "mujoco", "RK4", 2.0)
+    assert {row.verdict for row in rows.values()} == {"agrees"} and len(rows) == 4
+    assert rows["energy_drift_long"].compared_until == 2.0
+
+
+@slow
+def test_runs_end_before_a_singular_pose():
+    """By the closed form the bars lie flat at 0.7144 s."""
+    rows = run_long("four-bars-2", "mujoco", "RK4", 2.0)
+    singular = rows.pop("singular_pose")
+    assert singular.verdict == "unresolved" and singular.compared_until == 0.6875
+    assert "from t = 0.7129 s on" in singular.reason and "compared up to t = 0.6875 s" in singular.reason
+    assert {row.verdict for row in rows.values()} == {"agrees"}
+    assert {row.compared_until for row in rows.values()} == {0.6875}
+
+
 # --- lengths, and the statistic -----------------------------------------------------------------
 
 
@@ -173,6 +194,30 @@ def test_the_affordable_length_is_reported():
             "" if n < 3 else f"; the limit of steps × bodies allows {plan.seconds:g} s of 100 s"
         )
     assert plan_long_run(Integrator("d", "tolerance", 8), 10, 100.0).seconds == 6.25
+
+
+def test_steps_lengths_and_windows_are_in_proportion_to_a_motion_of_milliseconds():
+    """Samples of 2⁻¹¹ s, closer than steps of 2⁻⁷ s, in a motion of 2⁻⁵ s; others are not closer."""
+    for method in (Integrator("RK4", "step", 4), Integrator("d", "tolerance", 8)):
+        usual = plan_long_run(method, 7, 100.0)
+        fast = plan_long_run(method, 7, 100.0, 2.0**-11, 2.0**-5)
+        assert usual.time_unit == 1.0 and fast.time_unit == 2.0**-5 and fast.seconds == usual.seconds / 32
+    assert plan_long_run(method, 7, 100.0, 2.0**-7, 2.0**-5).time_unit == 1.0
+    rk4 = plan_long_run(Integrator("RK4", "step", 4), 7, 100.0, 2.0**-11, 2.0**-5)
+    assert rk4.resolutions == (2.0**-12, 2.0**-13, 2.0**-14)
+    assert long_run_study._window_ends(rk4.seconds, rk4) == [0.1 / 32, 1 / 32, 10 / 32, rk4.seconds]
+
+
+def test_a_drift_that_grows_as_a_power_of_time_leaves_its_range_earlier():
+    def run(*drifts):
+        windows = {t: DriftWindow(d, d, np.array([d])) for t, d in zip((0.1, 1.0), drifts, strict=True)}
+        scales = {t: {"energy_drift": 1.0} for t in windows}
+        return LongRun(0.01, 100, 1.0, "it failed", {}, scales, {"energy_drift": windows}, 0.0)
+
+    assert not leaves_range(run(5e-4, 5e-3), 10.0)  # linear: 0.05 of its scale by 10 s
+    assert leaves_range(run(5e-5, 5e-3), 10.0)  # quadratic: 0.5
+    assert leaves_range(run(5e-2, 5e-2), 10.0)  # at least linear: 0.5
+    assert not leaves_range(run(0.0, 5e-3), 10.0)
 
 
 def test_the_jackknife_knows_a_common_motion_from_two():

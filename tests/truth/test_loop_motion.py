@@ -12,7 +12,7 @@ from plumbline.model.loops import assembled, loop_gaps, smallest_singular_value
 from plumbline.model.random_mechanisms import random_loop_mechanism
 from plumbline.truth.ground_truth import motion_truth, perturbed_models
 from plumbline.truth.notes_motion import simulate_notes_form
-from plumbline.truth.regular_motion import RTOL, regular_motion
+from plumbline.truth.regular_motion import RTOL, first_doubt, regular_motion
 from plumbline.truth.sensitivity import perturbed_states
 from plumbline.truth.taylor import simulate_taylor
 from plumbline.truth.trajectory import trajectory_truth
@@ -113,6 +113,16 @@ def test_a_motion_ends_before_its_singular_pose(motions):
     value = smallest_singular_value(regular.model, state_at(regular, run, 4))
     near = pytest.approx(value, rel=1e3 * RTOL)  # of a motion followed with this tolerance
     assert regular_motion(regular.model, regular.state, times) == (times[4], False, near)
+
+
+def test_samples_of_a_run_show_whether_a_singular_pose_may_be_between_them():
+    """The bars come to lie flat at 0.7144 s, between two samples whose singular values are above 0.01."""
+    s = catalogue_scenarios()["four-bars-2"]
+    times = s.times[:12]
+    run = simulate_notes_form(s.model, s.state, times, 1e-9)
+    assert times[-1] == 0.6875 and first_doubt(s.model, s.state, run) == 0.6875
+    before = replace(run, **{name: getattr(run, name)[:8] for name in ("t", "r", "p", "v", "pdot")})
+    assert first_doubt(s.model, s.state, before) is None
 
 
 def test_neighbours_of_a_loop_and_models_with_other_numbers_are_closed():
