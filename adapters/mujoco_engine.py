@@ -81,6 +81,10 @@ from plumbline.model.step_methods import JointSpaceMethod, classical_runge_kutta
 from plumbline.model.welding import BodyParts, RigidPart, undivided_bodies
 
 DENSE, TENDONS, HELD = "dense mass matrix", "tendon equalities", "joint equalities"  # options
+TENDON_MOTIONS = (
+    "motions on tendons are not compared: their equality lacks J̇ q̇, so that they stretch; the lack itself is "
+    "computed and compared at states"
+)
 SOFTNESS = ("body_invweight0", "dof_invweight0", "tendon_invweight0")  # R is proportional to
 JOINT_TYPES = {"turn": mujoco.mjtJoint.mjJNT_HINGE, "slide": mujoco.mjtJoint.mjJNT_SLIDE}
 FIRST_ORDER_POWERS = (1, 2, 3, 4, 5, 6)
@@ -150,6 +154,9 @@ class Mujoco(MetamorphicHooks):
     )
     options = loop_options = (DENSE,)
     joint_options = MappingProxyType({TENDONS: ("rod",), HELD: tuple(ADDED_MOTIONS)})
+    # the matrices of implicit steps, in dampers too, depend on the coordinates
+    motion_options = MappingProxyType({HELD: ("RK4",)})
+    unmoved_options = MappingProxyType({TENDONS: TENDON_MOTIONS})
     builds_trees = builds_elements = moves_loops = True
     loop_steps_unsupported_reason = (
         "not compared: MuJoCo's loops are soft, the forces in a step are those of its regularised solver, "
@@ -178,7 +185,9 @@ class Mujoco(MetamorphicHooks):
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
-        if model.has_loops:
+        if self.option == TENDONS:
+            raise Unsupported(TENDON_MOTIONS)
+        if model.has_loops or self.option == HELD:
             return self._rigid_run(model, state, times, integrator, resolution)
         return self._sampled_run(_MujocoChain(model), state, times, integrator, resolution)
 
@@ -186,14 +195,15 @@ class Mujoco(MetamorphicHooks):
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
         """Run at falling regularisations, extrapolate to none; the last order's change is the uncertainty."""
-        cut, runs = cut_open(model), list[Trajectory]()
+        runs = list[Trajectory]()
         for k in range(RUN_REGULARISATIONS):
-            tree = _MujocoChain(cut.model, constraints=_Constraints(cut.ends))
+            soft = _SoftMechanism(model, self.option)
+            tree = soft.tree
             tree.soften(LARGEST_RUN_REGULARISATION / RATIO**k)
             tree.m.opt.iterations = RUN_ITERATIONS
             tree.m.eq_solref[:] = -(STABILISATION**2), -2 * STABILISATION
-            run = self._sampled_run(tree, cut.state(state), times, integrator, resolution)
-            runs.append(cut.source_run(run))
+            run = self._sampled_run(tree, soft.state(state), times, integrator, resolution)
+            runs.append(soft.cut.source_run(run) if soft.cut else run)
         limit: dict[str, Any] = {}
         change: dict[str, Array] = {}
         for name in ("r", "p", "v", "pdot"):
@@ -482,13 +492,17 @@ class _SoftMechanism:
         constraints = _Constraints(self.cut.ends if self.cut else (), tuple(added), tuple(ties))
         self.tree = _MujocoChain(held, dense=option == DENSE, constraints=constraints)
 
-    def quantities(self, state: State) -> StateQuantities:
-        """Evaluate at one state what is determinate, without a mass matrix."""
+    def state(self, state: State) -> State:
+        """The state of the tree."""
         there = self.rodless.state(state) if self.rodless else state
         there = self.cut.state(there) if self.cut else there
         if self.tree.model is not self.opened:
             there = state_of_cylinders(self.opened, self.tree.model, there)
-        answer = self.tree.quantities(there)
+        return there
+
+    def quantities(self, state: State) -> StateQuantities:
+        """Evaluate at one state what is determinate, without a mass matrix."""
+        answer = self.tree.quantities(self.state(state))
         answer = self.cut.source_quantities(answer) if self.cut else answer
         if self.rodless:
             answer = self._with_rods(state, answer, self.rodless)

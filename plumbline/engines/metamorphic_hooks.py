@@ -28,6 +28,9 @@ class MetamorphicHooks(Adapter):
     options: ClassVar[tuple[str, ...]] = ()  # other algorithms for the accelerations
     loop_options: ClassVar[tuple[str, ...]] = ()  # those of them that mechanisms with loops have too
     joint_options: ClassVar[Mapping[str, tuple[Kind, ...]]] = {}  # other ways to build joints of some kinds
+    # those of them with the same motions: the integrators, by name, whose steps do not depend on the way
+    motion_options: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    unmoved_options: ClassVar[Mapping[str, str]] = {}  # those whose motions are not compared: why
     usual_linear_solver: ClassVar[str] = ""  # of implicit steps, or of the equations of motion
     linear_solvers: ClassVar[tuple[str, ...]] = ()  # the others
     welding_unsupported_reason: ClassVar[str] = "the adapter welds nothing"  # empty where it does

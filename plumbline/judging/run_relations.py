@@ -1,7 +1,7 @@
-"""Metamorphic relations of short runs: reversed in time, and with another linear solver.
+"""Metamorphic relations of short runs: reversed in time, and made in another way of the engine.
 
     reversed in time     a symmetric integrator whose rates are reversed returns to its start, at any step
-    by …                 the same run with another linear solver of the engine
+    by …                 the same run with another linear solver of the engine, or with joints built otherwise
 
 The ends of the two runs may differ by rounding and by the tolerance of the step's solver, both grown as small
 perturbations of the motion grow.
@@ -43,6 +43,10 @@ def check_run_relations(engine: MetamorphicHooks, model: Model, state: State) ->
         One result per integrator and relation.
 
     """
+    for option in engine.options_for(model):
+        if reason := engine.unmoved_options.get(option):
+            words, verdict = f"not compared: {reason}", Verdict.INFORMATION
+            yield RelationResult(f"motions by {option}", None, "", 0, 0, words, verdict)
     step = 2.0 ** float(np.floor(-np.log2(STEPS_PER_RADIAN * fastest_rate(model, state))))
     for integrator in engine.integrators:
         results: list[RelationResult] = []
@@ -71,8 +75,17 @@ def check_integrator_relations(
     """
     if integrator.is_symmetric and not model.is_dissipative:
         yield _check_time_reversal(engine, integrator, model, state, step)
-    if integrator.kind == "step" and engine.linear_solvers:
-        yield from _check_linear_solvers(engine, integrator, model, state, step)
+    if integrator.kind == "step" and (options := _options_of_runs(engine, integrator, model)):
+        yield from _check_options(engine, options, integrator, model, state, step)
+
+
+def _options_of_runs(engine: MetamorphicHooks, integrator: Integrator, model: Model) -> list[str]:
+    """Other ways of an engine to the same steps."""
+    others = engine.options_for(model)
+    return [
+        *engine.linear_solvers,
+        *(way for way in others if integrator.name in engine.motion_options.get(way, ())),
+    ]
 
 
 def fastest_rate(model: Model, state: State) -> float:
@@ -121,10 +134,15 @@ def _check_time_reversal(
     )
 
 
-def _check_linear_solvers(
-    engine: MetamorphicHooks, integrator: Integrator, model: Model, state: State, step: float
+def _check_options(
+    engine: MetamorphicHooks,
+    options: list[str],
+    integrator: Integrator,
+    model: Model,
+    state: State,
+    step: float,
 ) -> Iterator[RelationResult]:
-    """Compare the same run with each of the engine's linear solvers."""
+    """Compare the same run with each of the engine's options."""
     end = RUN_STEPS * step
 
     def simulate(adapter: Adapter) -> Trajectory | Unsupported | EngineFailure:
@@ -136,8 +154,8 @@ def _check_linear_solvers(
     usual = simulate(engine)
     limit = 2 * run_tolerance(integrator, model, state, end, RUN_STEPS)
     driven = _loop_acceleration(model, state) * end
-    for solver in engine.linear_solvers:
-        name, other = OPTION_PREFIX + solver, simulate(engine.with_option(solver))
+    for option in options:
+        name, other = OPTION_PREFIX + option, simulate(engine.with_option(option))
         if not isinstance(usual, Trajectory):
             yield refused_result(name, integrator, usual)
         elif not isinstance(other, Trajectory):
