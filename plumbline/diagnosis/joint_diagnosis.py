@@ -15,8 +15,8 @@ import numpy as np
 
 from plumbline.diagnosis.joint_causes import ACCEPTED_SHARE, FACTORS, JointCause, joint_causes, vector_causes
 from plumbline.diagnosis.joint_prediction import VECTORS, Predictor, Seen
-from plumbline.diagnosis.misreadings import Misreading, misreadings
-from plumbline.diagnosis.row_defects import row_defects
+from plumbline.diagnosis.misreadings import Misreading, misreadings, other_branches
+from plumbline.diagnosis.row_defects import missing_gammas, row_defects
 from plumbline.model.datatypes import Array, Model, State, StateQuantities
 from plumbline.model.kinematics import (
     complete_state,
@@ -90,8 +90,8 @@ class _Difference:
 
     def effect(self, misread: Misreading) -> Array:
         """What an engine that sees another mechanism, or state, returns besides the truth."""
-        seen = [misread(self.model, state) for state in self.states]
         try:
+            seen = [misread(self.model, state) for state in self.states]
             found = _predict(self.predictor, seen, self.names)
         except (np.linalg.LinAlgError, SingularSystem, ValueError):  # no such mechanism
             return np.full(len(self.values), np.inf)
@@ -156,15 +156,27 @@ def _explanations(
         if x is not None:
             found.append(cause.describe(float(x[0])))
     first, rows = at(1), dict[str, str]()
-    for words, misread in (*misreadings(model), *row_defects(model)) if view == _View(QUANTITIES) else ():
+    without_numbers = (*misreadings(model), *row_defects(model)) if view == _View(QUANTITIES) else ()
+    for words, misread in missing_gammas(model) if view.are_bodies_kept else without_numbers:
         if np.max(np.abs(first.values - first.effect(misread))) > difference.accepted:
             continue  # at half the cost
         if np.max(np.abs(difference.values - difference.effect(misread))) <= difference.accepted:
             rows.setdefault(words.partition(" along ")[0], words)  # of a joint's rows one is enough
     found += rows.values()
+    if not found and model.has_loops and view == _View(QUANTITIES):
+        alone = [at(place, place + 1) for place in range(len(difference.states))]
+        found += [
+            words for words, poses in other_branches(model) if all(_is_one_of(one, poses) for one in alone)
+        ]
     if not found and np.max(np.abs(difference.values)) >= MIN_RATIO_OF_VECTORS:
         found = _fitted_vectors(difference, at(MAX_STATES, min(len(reported), MAX_CHECKED)))
     return found
+
+
+def _is_one_of(difference: _Difference, poses: Sequence[Misreading]) -> bool:
+    """Whether nothing, or one of several misreadings, explains the difference."""
+    effects = (np.zeros_like(difference.values), *map(difference.effect, poses))
+    return any(np.max(np.abs(difference.values - effect)) <= difference.accepted for effect in effects)
 
 
 def _fitted_vectors(difference: _Difference, others: _Difference) -> list[str]:

@@ -26,6 +26,7 @@ from plumbline.model.kinematics import (
 from plumbline.model.loops import cut_open, determinate_projectors, wrench_length
 from plumbline.truth.rounding_bound_tree import EndRows, RowChange, tree_solution
 from reference_impl.direct import DirectSystem
+from reference_impl.joints import constraint_rows
 
 VECTORS = ("acceleration", "angular_acceleration", "joint_reaction", "joint_moment")
 
@@ -39,6 +40,8 @@ class Seen:
     rows: RowChange | None = None  # of its joints
     open_loop: int | None = None  # a loop that it does not close
     end_rows: EndRows | None = None  # of loops; None for the predictor's
+    missing_gamma: int | None = None  # a joint whose rows of bodies it evaluates without γ
+    is_elsewhere: bool = False  # whether its state closes the loops in another pose
 
 
 class Predictor:
@@ -78,12 +81,10 @@ class Predictor:
         if not self.model.has_loops:
             at = complete_state(seen.model, seen.state)
             return _of_tree(seen.model, at, tree_solution(seen.model, at, rows=seen.rows))
-        values = (
-            _of_bodies(seen.model, seen.state)
-            if self.are_bodies_kept
-            else _of_cut(seen, seen.end_rows or self.end_rows)
-        )
+        values = _of_bodies(seen) if self.are_bodies_kept else _of_cut(seen, seen.end_rows or self.end_rows)
         projectors, length = self.projectors[place], wrench_length(self.model)
+        if seen.is_elsewhere:
+            projectors = determinate_projectors(seen.model, seen.state)
         if projectors is not None:
             wrench = np.concatenate([values["joint_reaction"], values["joint_moment"] / length], axis=1)
             wrench = rotate_vectors(projectors, wrench)
@@ -117,10 +118,14 @@ def _of_cut(seen: Seen, end_rows: EndRows) -> dict[str, Array]:
     return values
 
 
-def _of_bodies(model: Model, state: State) -> dict[str, Array]:
+def _of_bodies(seen: Seen) -> dict[str, Array]:
     """Quantities in maximal coordinates, by the notes' rows."""
+    model, state = seen.model, seen.state
     at = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
-    found = DirectSystem(model).solve(*at, x=joint_coordinates(model, state)[2])
+    system, rows = DirectSystem(model), constraint_rows(model, *at)
+    change = np.zeros(len(system.joint))
+    change[: len(rows.gamma)] = np.where(rows.joint == seen.missing_gamma, -rows.gamma, 0.0)
+    found = system.solve(*at, change, joint_coordinates(model, state)[2])
     assert found.joint_moment is not None
     values = {
         "acceleration": found.acceleration,

@@ -12,12 +12,16 @@ from plumbline.diagnosis.joint_prediction import Seen
 from plumbline.model.datatypes import KINDS, Array, Model, State
 from plumbline.model.kinematics import (
     complete_state,
+    own_rates,
     quaternion_conjugate,
     quaternion_product,
+    rate_count,
     rotation_matrix,
     spring_vectors,
 )
+from plumbline.model.loops import assembled, loop_gaps
 
+CLOSED = 1e-9  # m, rad: a larger gap is an open loop
 EQUAL = 1e-12  # of two readings
 Misreading = Callable[[Model, State], Seen]
 
@@ -54,6 +58,57 @@ def misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
     yield from _axes_misreadings(model)
     for number in map(int, np.flatnonzero(model.spring_damping)):
         yield f"the rate of spring {number + 1} were dᵀḋ, not over the length", _undivided_rate(number)
+
+
+def other_branches(model: Model) -> Iterator[tuple[str, list[Misreading]]]:
+    """List joints on the world at whose coordinates an engine may close the loops in other poses.
+
+    Args:
+        model: with loops.
+
+    Yields:
+        Words that complete "behaves as if", and what the engine may see: the poses that guesses lead to.
+
+    """
+    turns = [
+        (k, i)
+        for k in range(model.n)
+        for i, motion in enumerate(KINDS[model.kind[k]].motions)
+        if motion[0] == "turn"
+    ]
+    guesses: list[Callable[[Array], Array]] = [lambda x: -x, *map(_turned_over, turns)]
+    for given in map(int, np.flatnonzero(model.body[: model.n, 0] < 0)):
+        if len(KINDS[model.kind[given]].motions) == 1:
+            words = f"the loops were closed on another branch at the coordinate of joint {given + 1}"
+            yield words, [_branch(given, guess) for guess in guesses]
+
+
+def _turned_over(turn: tuple[int, int]) -> Callable[[Array], Array]:
+    """A guess: one angle is half a turn more."""
+
+    def guess(x: Array) -> Array:
+        y = x.copy()
+        y[turn] += np.pi
+        return y
+
+    return guess
+
+
+def _branch(given: int, guess: Callable[[Array], Array]) -> Misreading:
+    """The pose to which loops close from a guess of the coordinates (N, 2), joint ``given`` held."""
+
+    def misread(model: Model, state: State) -> Seen:
+        x = guess(state.x)
+        x[given] = state.x[given]
+        movable = np.ones(rate_count(model.tree), bool)
+        movable[own_rates(model)[given]] = False
+        there = complete_state(model, replace(state, x=x))
+        other = assembled(model, there, movable, is_pose_kept=True)
+        if max(map(np.max, loop_gaps(model, other))) > CLOSED:
+            raise ValueError("the loops do not close from this guess")
+        return Seen(model, other, is_elsewhere=True)
+
+    return misread
 
 
 def _point_misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:

@@ -36,6 +36,25 @@ def row_defects(model: Model) -> Iterator[tuple[str, Misreading]]:
         yield "the velocity terms of the rows that close loops were missing", _without_end_terms
 
 
+def missing_gammas(model: Model) -> Iterator[tuple[str, Misreading]]:
+    """List rows that an engine in maximal coordinates evaluates without γ.
+
+    Args:
+        model: the mechanism.
+
+    Yields:
+        Words that complete "behaves as if", and what the engine evaluates.
+
+    """
+    for k, kind in enumerate(model.kind):
+        if kind != "free":
+            yield f"γ of the rows of joint {k + 1} were missing", _without_gamma(k)
+
+
+def _without_gamma(joint: int) -> Misreading:
+    return lambda model, state: Seen(model, state, missing_gamma=joint)
+
+
 def _changed(rows: RowChange) -> Misreading:
     return lambda model, state: Seen(model, state, rows)
 
