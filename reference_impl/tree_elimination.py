@@ -316,6 +316,8 @@ class DenseSystem(TreeSystem):
     """
 
     def _levels(self) -> list[_Level]:
+        """None; the rows mechanism by mechanism, where those of rotors follow those of all constraints."""
+        self.by_mechanism = np.argsort(self.near // self.chains[0].n, kind="stable")
         return []
 
     def _substitute(self, near: Array, far: Array, wrench: Array, gamma: Array) -> tuple[Array, Array]:
@@ -323,11 +325,13 @@ class DenseSystem(TreeSystem):
         batch, n = len(self.chains), self.chains[0].n
         c, each = len(gamma) // batch, np.arange(len(gamma) // batch)
         by_body = np.zeros((batch, c, n, 6))
-        by_body[:, each, self.near[:c]] = near.reshape(batch, c, 6)
-        held = np.flatnonzero(self.far[:c] >= 0)
-        by_body[:, held, self.far[held]] += far.reshape(batch, c, 6)[:, held]
+        order, gamma = self.by_mechanism, gamma[self.by_mechanism]
+        first, compliance = order[:c], self.compliance[order].reshape(batch, c)
+        by_body[:, each, self.near[first]] = near[order].reshape(batch, c, 6)
+        held = np.flatnonzero(self.far[first] >= 0)
+        by_body[:, held, self.far[first[held]]] += far[order].reshape(batch, c, 6)[:, held]
         C = by_body.reshape(batch, c, 6 * n)
-        is_soft = self.compliance[:c] > 0
+        is_soft = compliance[0] > 0
         of_joints = np.flatnonzero(~is_soft)
         kept = of_joints[independent_rows(C[0][of_joints], RUN_RANK_TOLERANCE)]
         kept = np.sort(np.concatenate([kept, np.flatnonzero(is_soft)]))
@@ -339,7 +343,7 @@ class DenseSystem(TreeSystem):
         S[:, 6 * n :, : 6 * n] = C[:, kept]
         S[:, : 6 * n, 6 * n :] = C[:, kept].mT
         each = 6 * n + np.arange(len(kept))
-        S[:, each, each] = -self.compliance[kept]
+        S[:, each, each] = -compliance[:, kept]
         right = np.concatenate([wrench.reshape(batch, -1), gamma.reshape(batch, -1)[:, kept]], axis=1)
         scale = power_of_two_scale(np.max(np.abs(S), axis=-1))
         S *= scale[:, :, None] * scale[:, None]
@@ -347,9 +351,9 @@ class DenseSystem(TreeSystem):
             found = scale * np.linalg.solve(S, (right * scale)[..., None])[..., 0]
         except np.linalg.LinAlgError:
             raise SingularSystem("S is singular: the rows of a loop are not independent") from None
-        multiplier = np.zeros((batch, c))
-        multiplier[:, kept] = found[:, 6 * n :]
-        return found[:, : 6 * n].reshape(-1, 6), multiplier.ravel()
+        multiplier = np.zeros(len(gamma))
+        multiplier[order.reshape(batch, c)[:, kept]] = found[:, 6 * n :]
+        return found[:, : 6 * n].reshape(-1, 6), multiplier
 
 
 EliminatedSystem = StructuredSystem | TreeSystem

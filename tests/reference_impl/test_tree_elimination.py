@@ -1,5 +1,7 @@
 """The O(bodies) form of trees against the direct form, on and off the manifold."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -16,7 +18,7 @@ from reference_impl.euler_parameters import L, dot
 from reference_impl.integrate import integrate_dop853
 from reference_impl.joints import constraint_rows
 from reference_impl.structured import StructuredSystem, component_first
-from reference_impl.tree_elimination import TreeSystem, eliminated_system
+from reference_impl.tree_elimination import DenseSystem, TreeSystem, eliminated_system
 from tests.helpers.random_chains import random_model
 
 
@@ -60,6 +62,27 @@ def test_trees_side_by_side_do_not_touch_each_other():
     for model, own, first in zip(models, parts, system.first_body, strict=False):
         alone = TreeSystem([model]).acceleration(component_first(*own[:2]), component_first(*own[2:]))
         np.testing.assert_allclose(once[:, first : first + model.n], alone, rtol=1e-13, atol=1e-13)
+
+
+def test_loops_with_rotors_side_by_side_do_not_touch_each_other():
+    """The rows of rotors follow those of all constraints. Seen: an index beyond the first mechanism."""
+    s = load_scenario(find_scenario_file("four-bar"))
+    rotors = np.zeros((4, 2))
+    rotors[[0, 2], 0] = 0.02, 0.05
+    models = [replace(s.model, armature=factor * rotors) for factor in (1.0, 3.0)]
+    parts = s.state.r, s.state.p, s.state.v, quaternion_rate(s.state.p, s.state.omega)
+    expected = [DirectSystem(model).solve(*parts) for model in models]
+    found = DenseSystem(models).solve(*(np.tile(part, (2, 1)) for part in parts))
+    for at, one in zip((slice(3), slice(3, 6)), expected, strict=True):
+        np.testing.assert_allclose(found.acceleration[at], one.acceleration, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(found.pddot[at], one.pddot, rtol=1e-12, atol=1e-11)
+    assert np.max(np.abs(expected[0].pddot - expected[1].pddot)) > 0.1
+    times = np.linspace(0, 0.25, 3)
+    runs = [
+        integrate_collocation([models[0]], *parts, times, 1e-11),
+        integrate_dop853(models[0], *parts, times, 1e-11),
+    ]
+    np.testing.assert_allclose(runs[0].r, runs[1].r, atol=1e-9)
 
 
 @pytest.mark.parametrize("kind", KINDS)
