@@ -7,7 +7,7 @@ import pytest
 
 from plumbline.model.datatypes import KINDS
 from plumbline.model.kinematics import quaternion_rate
-from plumbline.model.random_mechanisms import random_tree
+from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth.rounding_bound import state_rounding_bound
@@ -149,3 +149,24 @@ def test_a_light_body_before_a_heavy_one_keeps_its_digits():
             assert np.all(error <= bound.tolerance(name)), name
         turning = 2 * np.matvec(L(state.p), found.pddot - expected.pddot)
         assert np.all(np.linalg.norm(turning, axis=1) <= bound.angular_acceleration)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_elements_act_as_in_the_direct_form_on_and_off_the_manifold(seed):
+    """Off it |p| differs from 1, so that a moment and the generalised force on p differ by a factor."""
+    rng = np.random.default_rng(seed)
+    model = random_tree(rng, 5, elements=ELEMENTS)
+    for size in (0.0, 0.1):
+        parts = off_manifold(model, seed, size)
+        expected, found = DirectSystem(model).solve(*parts), TreeSystem([model]).solve(*parts)
+        for name in ("acceleration", "pddot", "joint_reaction", "joint_moment"):
+            own, other = getattr(found, name), getattr(expected, name)
+            np.testing.assert_allclose(own, other, atol=1e-11 * np.max(np.abs(other)), err_msg=name)
+
+
+def test_projection_normalises_far_from_the_constraints():
+    """A free body has no constraint but pᵀp = 1, which one division meets however far p is off."""
+    model = random_tree(np.random.default_rng(3), 2, ("free",))
+    r, p, v, pdot = off_manifold(model, 4, 0.0)
+    q, _ = TreeSystem([model]).project(component_first(r, 3.0 * p), component_first(v, pdot))
+    np.testing.assert_allclose(q, component_first(r, p), rtol=1e-15, atol=1e-15)
