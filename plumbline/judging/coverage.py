@@ -125,6 +125,7 @@ def scenario_coverage(
     states: Sequence[State],
     rows: Iterable[Row],
     levels: Sequence[Level] = COVERED_LEVELS,
+    part: slice = slice(None),
 ) -> list[CoverageEntry]:
     """Compute the coverage table of one scenario.
 
@@ -137,13 +138,14 @@ def scenario_coverage(
         rows: judged rows of the scenario, of correct engines; those that agree count, and only their engines,
             quantities and tolerances.
         levels: of `COVERED_LEVELS`.
+        part: which of the parameters, in the order of `list_parameters`; each is measured by itself.
 
     Returns:
-        One entry per level and parameter. At trajectory and invariants level a mistake counts as seen if it
-        is reported in every engine that has rows there: the entry is that of the bluntest engine.
+        One entry per level and parameter of the part. At trajectory and invariants level a mistake counts as
+        seen if it is reported in every engine that has rows there: the entry is that of the bluntest engine.
 
     """
-    parameters = list_parameters(model, state)
+    parameters = list_parameters(model, state)[part]
     judged = [row for row in rows if row.scenario == name and row.verdict == Verdict.AGREES]
     found: list[CoverageEntry] = []
     if "state" in levels:

@@ -17,8 +17,12 @@ from plumbline.processes.workers import Executor, Task
 from plumbline.scenario.loader import Scenario
 from plumbline.storage.results_store import COVERAGE_TABLE
 from plumbline.studies.tables import make_table
+from plumbline.truth.parameters import list_parameters
 
 FILE = "coverage.parquet"
+PARAMETERS_PER_TASK = (
+    160  # those of a chain of 100 bodies take minutes, and no worker has them all at the end
+)
 _CHAIN_KINDS = (*CHAIN_FIELDS, "attitude", "omega", "direction", "rod_rate")
 
 
@@ -38,12 +42,12 @@ def measure_coverage(
     """Compute the coverage of scenarios.
 
     Args:
-        executor: makes the calls, one per scenario.
+        executor: makes the calls, one per scenario and `PARAMETERS_PER_TASK` of its parameters.
         scenarios: which to cover.
         rows: judged rows of correct engines on them.
         state_count: random states per scenario at state level.
         levels: of `COVERED_LEVELS`.
-        progress: called with scenarios done, scenarios in all and the last one.
+        progress: called with calls done, calls in all and the scenario of the last one.
         cpu_times: gets the CPU time as "judging".
 
     Returns:
@@ -61,16 +65,21 @@ def measure_coverage(
     for s in sorted(scenarios, key=lambda s: -s.model.n):  # no long task alone at the end
         states = compared_states(s.model, s.state, s.seed, state_count)
         arguments = s.name, s.model, s.state, s.times, states, by_scenario[s.name], levels
-        tasks.append(Task(s.name, scenario_coverage, arguments, executor.limits))
-    found: dict[str, list[CoverageEntry]] = {}
+        for first in range(0, len(list_parameters(s.model, s.state)), PARAMETERS_PER_TASK):
+            part = slice(first, first + PARAMETERS_PER_TASK)
+            tasks.append(Task((s.name, first), scenario_coverage, (*arguments, part), executor.limits))
+    found: dict[tuple[str, int], list[CoverageEntry]] = {}
     for outcome in executor.run(tasks):
+        name, _ = outcome.key
         if cpu_times is not None:
             cpu_times.add_outcome(outcome, "judging")
         if outcome.failure:
-            raise CoverageFailure(f"no coverage of {outcome.key}: {outcome.failure}")
+            raise CoverageFailure(f"no coverage of {name}: {outcome.failure}")
         found[outcome.key] = outcome.value
-        progress(len(found), len(tasks), outcome.key)
-    return [entry for s in scenarios for entry in found[s.name]]
+        progress(len(found), len(tasks), name)
+    order = {s.name: k for k, s in enumerate(scenarios)}
+    entries = [entry for key in sorted(found, key=lambda key: key[1]) for entry in found[key]]
+    return sorted(entries, key=lambda entry: (order[entry.scenario], COVERED_LEVELS.index(entry.level)))
 
 
 def coverage_table(entries: Iterable[CoverageEntry]) -> pa.Table:

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from plumbline.processes.isolation import remove_orphaned_folders
-from plumbline.processes.workers import Executor, Limits, Outcome, ResultCache, Scheduler, Task, WorkerPool
+from plumbline.processes.workers import Limits, Outcome, ResultCache, Scheduler, Task, WorkerPool
+from tests.helpers.immediate_executor import Immediate
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -91,24 +92,6 @@ def test_a_task_that_an_outcome_submits_runs_while_others_do():
             if outcome.key == "short":
                 scheduler.submit(Task("follows", sleep_for, (0.0,)))
     assert finished == ["short", "follows", "long"]
-
-
-class Immediate(Executor):
-    """Runs each task at once; of two that were started the last one finishes first."""
-
-    capacity = 2
-
-    def __init__(self):
-        self.limits, self.started, self.pending = Limits(), [], []
-
-    def start(self, task):
-        self.started.append(task.key)
-        self.pending.append(task)
-        assert len(self.pending) <= self.capacity
-
-    def collect(self):
-        task = self.pending.pop()
-        return [(task, Outcome(task.key, task.function(*task.arguments)))]
 
 
 class Remembering(ResultCache):
