@@ -170,3 +170,27 @@ def test_projection_normalises_far_from_the_constraints():
     r, p, v, pdot = off_manifold(model, 4, 0.0)
     q, _ = TreeSystem([model]).project(component_first(r, 3.0 * p), component_first(v, pdot))
     np.testing.assert_allclose(q, component_first(r, p), rtol=1e-15, atol=1e-15)
+
+
+def test_projection_far_off_ends_on_unit_quaternions():
+    """Newton's steps leave the unit sphere by the square of the gap; the last division returns to it."""
+    model = random_tree(np.random.default_rng(3), 5, ("hinge",))
+    r, p, v, pdot = off_manifold(model, 4, 0.03)
+    q, qdot = TreeSystem([model]).project(component_first(r, p), component_first(v, pdot))
+    assert np.max(np.abs(dot(q[3:].T, q[3:].T) - 1)) < 1e-15
+    assert np.max(np.abs(dot(q[3:].T, qdot[3:].T))) < 1e-13
+
+
+@pytest.mark.parametrize("a", [0.0, 3.0])
+def test_baumgarte_damps_the_length_of_quaternions(a):
+    """c = (pᵀp − 1) / 2 of every body: c̈ + 2 a ċ + a² c = 0."""
+    model = random_tree(np.random.default_rng(8), 4)
+    parts = off_manifold(model, 2, 0.05)
+    p, pdot = parts[1], parts[3]
+    pddot = (
+        TreeSystem([model])
+        .acceleration(component_first(*parts[:2]), component_first(*parts[2:]), baumgarte=a)[3:]
+        .T
+    )
+    left = dot(p, pddot) + dot(pdot, pdot) + 2 * a * dot(p, pdot) + a * a * (dot(p, p) - 1) / 2
+    np.testing.assert_allclose(left, 0.0, atol=1e-12 * np.max(np.abs(pddot)))
