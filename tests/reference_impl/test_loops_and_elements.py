@@ -55,6 +55,18 @@ def test_a_run_solves_for_the_same_accelerations_and_a_defect_of_gamma_reaches_i
     np.testing.assert_allclose(lack[one.kept], defect[one.kept], rtol=1e-9, atol=1e-10)
 
 
+@pytest.mark.parametrize("name", LOOPS)
+def test_a_run_chooses_as_many_rows_again_where_its_own_come_near_to_dependence(name):
+    """As if its first rows had been ten times as independent as they are."""
+    model, parts = loop_state(name)
+    system = DirectSystem(model)
+    (before, *_), count = system.solve_unknowns(*parts), len(system._run_rows)
+    system._run_independence *= 20
+    (after, *_) = system.solve_unknowns(*parts)
+    assert len(system._run_rows) == count
+    np.testing.assert_allclose(after[: 7 * model.n], before[: 7 * model.n], rtol=1e-10, atol=1e-10)
+
+
 def test_a_correction_ends_at_the_solution():
     """With S₀ = S one correction takes any unknowns there; of a loop whose rows are independent."""
     model, parts = loop_state("slider-crank")
