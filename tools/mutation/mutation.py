@@ -676,11 +676,16 @@ def results_path(target: str, options: argparse.Namespace) -> Path:
     return Path(options.out) / f"{target.replace('/', '-')}.json"
 
 
+def target_tests(files: Sequence[str]) -> list[str]:
+    """The test files that must notice the mutants of these files."""
+    groups = [name for name in TARGETS if name in TEST_FILES and {*files} <= {*target_files(name)}]
+    tests = TEST_FILES[groups[0] if groups else files[0].split("/")[0]]
+    return sorted({str(path) for pattern in tests for path in Path().glob(pattern)})
+
+
 def run_target(target: str, options: argparse.Namespace) -> int:
     """In the copy: find the mutants of a target, try them, judge."""
     files = target_files(target)
-    groups = [name for name in TARGETS if name in TEST_FILES and {*files} <= {*target_files(name)}]
-    tests = TEST_FILES[groups[0] if groups else target.split("/")[0]]
     found = find_mutants(files, options.sample, options.seed)
     table = results_path(target, options)
     if options.again:
@@ -692,8 +697,8 @@ def run_target(target: str, options: argparse.Namespace) -> int:
         }
         found = [mutant for mutant in found if mutant.key in left]
     start = time.monotonic()
-    existing = sorted({str(path) for pattern in tests for path in Path().glob(pattern)})
-    reach = measure_coverage(existing, files)
+    tests = target_tests(files)
+    reach = measure_coverage(tests, files)
     print(f"{len(reach.cpu_seconds)} tests in {time.monotonic() - start:.0f} s", flush=True)
     for name in reach.imported_libraries:
         try:
@@ -705,12 +710,11 @@ def run_target(target: str, options: argparse.Namespace) -> int:
     sound = {mutant.file: Path(mutant.file).read_text(encoding="utf-8") for mutant in found}
     controls = [Mutant(file, 0, (0, 10**6), "", "", code, "", "", 0) for file, code in sound.items()]
     if any(
-        what not in ("survived", "unreached")
-        for _, what in run_trials(controls, existing, reach, options.jobs)
+        what not in ("survived", "unreached") for _, what in run_trials(controls, tests, reach, options.jobs)
     ):
         raise SystemExit("the tests do not pass in a child without any mutant: nothing can be said")
     became = []
-    for mutant, what in run_trials(found, existing, reach, options.jobs):
+    for mutant, what in run_trials(found, tests, reach, options.jobs):
         became.append((mutant, what))
         if what in ("survived", "unreached"):
             print(f"{what}: {mutant.file}:{mutant.line}\n  - {mutant.was}\n  + {mutant.now}", flush=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from tools.mutation.mutation import TARGETS, target_files, target_tests
 from tools.mutation.survivors import load_survivors
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -36,3 +37,13 @@ def test_listed_survivors_belong_to_functions_that_exist(file: str) -> None:
         if name == file:
             assert function in names, f"no function {function}: run the mutants of {file} again"
             assert occurrence >= 1 and "→" in change and len(reason) > 20, change
+
+
+@pytest.mark.parametrize("target", [*TARGETS, "plumbline/judging/outlier.py", "reference_impl/direct.py"])
+def test_every_target_has_files_and_tests(target: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seen: ``judging``, the name of a target and of no folder, ended with a KeyError."""
+    monkeypatch.chdir(ROOT)
+    files = target_files(target)
+    assert files
+    assert all((ROOT / test).is_file() for test in target_tests(files))
+    assert len(target_tests(files)) >= 1
