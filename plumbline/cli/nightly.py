@@ -95,7 +95,7 @@ def run_nightly(
     long_run_seconds: float = 0.0,
     level: LevelSelection = "all",
     scheduler: str | None = None,
-    self_test: Callable[[Path], SelfTestResult] | None = None,
+    self_test: Callable[[Path, int], SelfTestResult] | None = None,
     proof_cpu_seconds: float = 0.0,
     known_issues: Sequence[KnownIssue] | None = None,
     are_engines_required: bool = False,
@@ -121,7 +121,8 @@ def run_nightly(
         level: levels to compare at.
         scheduler: address of a dask cluster to run on.
         proof_cpu_seconds: CPU time after which no further proof of a motion is begun [s]; 0: none is begun.
-        self_test: runs the self-test and writes its JUnit file to the given path; None for no self-test.
+        self_test: runs the self-test of a night, given by its number, and writes its JUnit file to the given
+            path; None for no self-test.
         known_issues: expected verdicts; None for those of the project's file.
         are_engines_required: whether an engine that is not installed has failed.
         progress: called after every task.
@@ -182,7 +183,7 @@ def run_nightly(
             result.metadata["exit_code"] = ExitCode.HARNESS_FAILED
     if self_test is not None:
         folder.mkdir()
-        answer = self_test(folder / "self_test.xml")
+        answer = self_test(folder / "self_test.xml", result.metadata["night"])
         result.metadata["self_test"] = answer.counts
         result.metadata["sentence"] += f"; {answer.summary}"
         if answer.failure:

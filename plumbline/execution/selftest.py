@@ -1,6 +1,7 @@
 """The self-test: defects planted in the engines must be reported, and named by their own term.
 
-Runs `tests/execution/test_planted_defects.py` of the checkout in a process that dies with this one.
+Runs `tests/execution/test_planted_defects.py` of the checkout, and of the further lists of planted defects
+every `NIGHTS`-th test, others each night, in a process that dies with this one.
 """
 
 from __future__ import annotations
@@ -9,18 +10,20 @@ import os
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from glob import glob
 from pathlib import Path
+from typing import Any, NoReturn
+
+from plumbline.processes.isolation import die_with_parent
 
 ROOT = Path(__file__).resolve().parents[2]
 TEST_FILE = "tests/execution/test_planted_defects.py"
-MARKS = "slow or not full"  # with what `make test` leaves out for its time, without the long forms
+LISTS = ("tests/diagnosis/test_*.py", "tests/execution/test_planted_*.py")  # with the long forms
+NIGHTS = 7  # in so many nights every test of the lists has run
 TIMEOUT = 1800.0  # s
-_CHILD_SCRIPT = (
-    "import sys; from plumbline.processes.isolation import die_with_parent; "
-    "die_with_parent(int(sys.argv[1])); "
-    "import pytest; sys.exit(pytest.main(sys.argv[2:]))"
-)
+_CHILD_SCRIPT = "from plumbline.execution.selftest import run_child; run_child()"
 
 
 @dataclass(frozen=True)
@@ -38,29 +41,64 @@ class SelfTestResult:
         return "self-test: " + ", ".join(f"{n} {what}" for what, n in self.counts.items())
 
 
-def run_self_test(report: Path, tests: str = TEST_FILE, timeout: float = TIMEOUT) -> SelfTestResult:
+class _Sample:
+    """A pytest plugin: all tests of the first file that `make test` has too, and a share of the others."""
+
+    def __init__(self, first: Path, night: int) -> None:
+        self.first, self.night = first, night
+
+    def pytest_collection_modifyitems(self, config: Any, items: list[Any]) -> None:
+        own = [item for item in items if item.path == self.first]
+        further = sorted((item for item in items if item.path != self.first), key=lambda item: item.nodeid)
+        chosen = [i for i in own if i.get_closest_marker("slow") or not i.get_closest_marker("full")]
+        chosen += further[self.night % NIGHTS :: NIGHTS]
+        config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
+        items[:] = chosen
+
+
+def run_child() -> NoReturn:
+    """Run the tests in this process; its arguments are the parent, the night, the first file and pytest's."""
+    import pytest
+
+    parent, night, first, *arguments = sys.argv[1:]
+    die_with_parent(int(parent))
+    sys.exit(pytest.main(arguments, plugins=[_Sample(Path(first), int(night))]))
+
+
+def run_self_test(
+    report: Path, night: int = 0, tests: str = TEST_FILE, lists: Sequence[str] = LISTS,
+    timeout: float = TIMEOUT,
+) -> SelfTestResult:  # fmt: skip
     """Run the tests of the planted defects.
 
     Args:
         report: path of the JUnit file to write.
-        tests: test file, relative to the checkout.
+        night: number of the night, which chooses the tests of the lists.
+        tests: test file that runs whole, relative to the checkout.
+        lists: patterns of the test files of which a share runs, relative to the checkout.
         timeout: limit of the wall time [s].
 
     Returns:
         The counts, or why they are not as they must be.
 
     """
+    first = str(ROOT / tests)
+    further = {path for pattern in lists for path in glob(str(ROOT / pattern))} - {first}
     arguments = [
+        str(os.getpid()),
+        str(night),
+        first,
         "-q",
         "-m",
-        MARKS,
+        "",
         "-p",
         "no:cacheprovider",
         f"--rootdir={ROOT}",
         f"--junitxml={report}",
-        tests,
+        first,
+        *sorted(further),
     ]
-    command = [sys.executable, "-c", _CHILD_SCRIPT, str(os.getpid()), *arguments]
+    command = [sys.executable, "-c", _CHILD_SCRIPT, *arguments]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
     try:
         done = subprocess.run(

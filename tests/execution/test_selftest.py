@@ -1,6 +1,7 @@
 """The nightly runs the self-test, and its result counts."""
 
 import json
+from types import SimpleNamespace
 
 import pytest
 
@@ -41,7 +42,7 @@ pytest.importorskip("no_such_module_at_all")
 )
 def test_the_answer_is_that_of_the_tests(tmp_path, text, figures, trouble):
     (tmp_path / "test_it.py").write_text(text)
-    answer = selftest.run_self_test(tmp_path / "results.xml", str(tmp_path / "test_it.py"))
+    answer = selftest.run_self_test(tmp_path / "results.xml", 0, str(tmp_path / "test_it.py"), ())
     assert answer.counts == figures
     assert trouble in answer.failure and bool(trouble) == bool(answer.failure)
     assert ("failed" in answer.summary) == bool(trouble)
@@ -49,15 +50,76 @@ def test_the_answer_is_that_of_the_tests(tmp_path, text, figures, trouble):
 
 def test_one_that_hangs_is_ended(tmp_path):
     (tmp_path / "test_it.py").write_text("import time\ndef test_a(): time.sleep(60)\n")
-    answer = selftest.run_self_test(tmp_path / "results.xml", str(tmp_path / "test_it.py"), timeout=3)
+    answer = selftest.run_self_test(tmp_path / "results.xml", 0, str(tmp_path / "test_it.py"), (), 3)
     assert answer.failure == "no answer within 3 s"
+
+
+LISTED_TESTS = """
+import pytest
+
+@pytest.mark.full
+@pytest.mark.parametrize("k", range(10))
+def test_defect(k):
+    assert k != 9
+"""
+
+
+def test_the_lists_are_shared_among_nights(tmp_path):
+    """Ten tests of a list: two of them in night 2, the last one among them, which fails."""
+    (tmp_path / "test_it.py").write_text(PASSING_TEST)
+    (tmp_path / "test_list.py").write_text(LISTED_TESTS)
+    report = tmp_path / "results.xml"
+    answers = [
+        selftest.run_self_test(report, night, str(tmp_path / "test_it.py"), [str(tmp_path / "test_l*.py")])
+        for night in (5, 9)
+    ]
+    assert answers[0].failure == ""
+    assert answers[0].counts == {"planted": 3, "reported": 3}
+    assert answers[1].failure == "test_defect[9]"
+    assert report.read_text(encoding="utf-8").count("<testcase") == 1 + 2
+
+
+def test_every_test_of_the_lists_runs_within_a_week_of_nights():
+    mark = {"full": {"full": True}, "slow": {"full": True, "slow": True}, "fast": {}}
+    first, other = selftest.ROOT / "test_first.py", selftest.ROOT / "test_other.py"
+
+    def item(path, kind, number):
+        return SimpleNamespace(
+            path=path, nodeid=f"{path.name}::{kind}[{number}]", get_closest_marker=mark[kind].get
+        )
+
+    config = SimpleNamespace(hook=SimpleNamespace(pytest_deselected=lambda items: None))
+    seen = []
+    for night in range(3, 3 + selftest.NIGHTS):
+        items = [item(path, kind, k) for k in range(8) for path in (other, first) for kind in mark]
+        selftest._Sample(first, night).pytest_collection_modifyitems(config, items)
+        own = {i.nodeid for i in items if i.path == first}
+        assert own == {f"test_first.py::{kind}[{k}]" for kind in ("slow", "fast") for k in range(8)}
+        seen += [i.nodeid for i in items if i.path == other]
+    assert sorted(seen) == sorted({f"test_other.py::{kind}[{k}]" for kind in mark for k in range(8)})
+
+
+def test_every_list_of_planted_defects_is_in_the_self_test():
+    """A test file of engines with planted defects that no pattern names would run in no night."""
+    root = selftest.ROOT
+    named = {path for pattern in (*selftest.LISTS, selftest.TEST_FILE) for path in root.glob(pattern)}
+    folders = ("diagnosis", "execution")
+    found = {
+        path
+        for folder in folders
+        for path in (root / "tests" / folder).glob("test_*.py")
+        if "\nfrom tests.helpers.planted_" in path.read_text(encoding="utf-8")
+    }
+    assert len(found) > 6
+    assert found <= named
 
 
 @pytest.mark.parametrize("trouble", ["", "half of them"])
 def test_a_night_whose_self_test_misses_a_defect_is_not_green(tmp_path, trouble):
     pytest.importorskip("mujoco")
 
-    def reported(report):
+    def reported(report, night):
+        assert night == 1
         report.write_text("<testsuite/>")
         return SelfTestResult({"planted": 67, "reported": 67}, trouble)
 
