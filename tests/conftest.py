@@ -62,6 +62,8 @@ def pytest_xdist_make_scheduler(config, log):
 @pytest.fixture(scope="session")
 def cache_folders(tmp_path_factory):
     """Paths of caches, one for each test: tmp_path_factory would look through all of them to name another."""
+    # The caches link to it: on a new machine `mkdir` would fail at the dangling link.
+    (user_cache_folder() / "engines").mkdir(parents=True, exist_ok=True)
     folder = tmp_path_factory.mktemp("caches")
     return (folder / str(number) for number in itertools.count())
 
