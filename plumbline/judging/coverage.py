@@ -22,35 +22,43 @@ from plumbline.judging.rows import Level, Row, Verdict
 from plumbline.judging.state import STATE_UNITS
 from plumbline.judging.step import MAX_STEP_BODIES, STEP_STATES, step_sizes
 from plumbline.model.datatypes import Array, Model, State, Trajectory
-from plumbline.model.invariants import INVARIANT_UNITS, attitude_error, compute_invariants, position_error
-from plumbline.model.kinematics import angular_velocity, quaternion_rate, with_joint_coordinates
+from plumbline.model.invariants import (
+    INVARIANT_UNITS,
+    Invariants,
+    attitude_error,
+    compute_invariants,
+    position_error,
+)
+from plumbline.model.kinematics import angular_velocity, with_joint_coordinates
 from plumbline.model.step_methods import classical_runge_kutta
 from plumbline.truth.parameter_effects import (
     MOTION_MISTAKE,
+    AccurateMotion,
     PerturbedMotion,
     StateSensitivity,
+    accurate_motion,
+    accurate_runs,
     difference_effects,
     effects_at_states,
-    needed_substeps,
     perturbed_motions,
+    resolved_motions,
 )
-from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters
+from plumbline.truth.parameters import STATE_KINDS, Parameter, list_parameters, perturb
 from plumbline.truth.rounding_bound import EPS, state_rounding_bound
 from plumbline.truth.sensitivity import project_to_manifold
 from plumbline.truth.step_comparison import FormulaSteps
-from reference_impl.collocation import integrate_collocation
-from reference_impl.tree_elimination import eliminated_system
 
 COVERED_LEVELS: tuple[Level, ...] = ("state", "step", "trajectory", "invariants")
 MAX_MISTAKE = 0.1  # of a parameter's scale: only larger ones are reported, or none; the level does not see it
 WEAK_MISTAKE = 1e-9  # from here on the order of an effect is found by a second mistake …
-LARGER_MISTAKE = 4.0  # … that is larger by this factor, both at half the step: the integrator's error falls
+LARGER_MISTAKE = 4.0  # … that is larger by this factor
+LEAST_FALL = 1.8  # at two thirds of a step, of an integrator's error: (4 + 1.5⁴) / 5 if a fifth of it is none
 FURTHER_MISTAKES = (5e-4, MAX_MISTAKE / LARGER_MISTAKE)  # where smaller ones pass no tolerance
 DOUBTFUL_MISTAKE = 1e-6  # from here on an effect may be rounding of the runs: a proof is tried
 NO_EFFECT = 1e-9  # of the largest effect that a term could have: rounding
+MAX_SLOWDOWN = 10  # of a motion by a mistake, in steps
 MOTION_SAMPLES = 32  # of a motion, at which the effect of a mistake is measured; or all, where it has fewer
-PROOF_SAMPLES = 17  # of the motion, at which a parameter's term is shown to vanish …
-PROOF_RTOL = 1e-13  # … and of that motion
+PROOF_SAMPLES = 17  # of the motion, at which a parameter's term is shown to vanish
 TINY = float(np.finfo(float).tiny)
 # of free bodies the coordinates of the wider bound: what it reports, the others report too
 STEP_METHOD = classical_runge_kutta("joint rotations", free_coordinates="rigid motion")
@@ -284,7 +292,8 @@ def _step_ratios(model: Model, states: Sequence[State], parameters: Sequence[Par
         index, h = steps.places[i]
         chosen = [k for k, one in enumerate(parameters) if index == 0 or one.kind not in STATE_KINDS]
         times = np.asarray(h * np.arange(max(counts) + 1), float)
-        motions = perturbed_motions(model, states[index], times, [parameters[k] for k in chosen], substeps=1)
+        accurate = accurate_motion(model, states[index], times, substeps=1)
+        motions = perturbed_motions(accurate, [parameters[k] for k in chosen])
         for k, motion in zip(chosen, motions, strict=True):
             for count, limit in counts.items():
                 for quantity, error in _step_errors(motion, count).items():
@@ -349,30 +358,32 @@ def _motion_entries(
     tolerances = [replace(one, last_sample=one.last_sample // stride) for one in tolerances]
     times = times[::stride][: max(one.last_sample for one in tolerances) + 1]
     quantities = {one.quantity for one in tolerances}
-    substeps = needed_substeps(model, state, times)
+    motions = resolved_motions(model, state, times, parameters)
 
-    def measured(chosen: Sequence[int], size: float, factor: int) -> dict[str, Array]:
-        some = [parameters[i] for i in chosen]
-        return _motion_effects(model, state, times, some, quantities, size, factor * substeps)
+    def measured(chosen: Sequence[int], size: float, is_fine: bool = False) -> dict[str, Array]:
+        return _motion_effects(motions[is_fine], [parameters[i] for i in chosen], quantities, size)
 
-    effects = measured(range(len(parameters)), MOTION_MISTAKE, 1)
+    def is_weak(ratios: Mapping[Level, Mapping[str, _Ratios]], i: int) -> bool:
+        is_conserved = parameters[i].kind in STATE_KINDS  # the invariants are, from every initial state
+        levels = [engines for level, engines in ratios.items() if level != "invariants" or not is_conserved]
+        return any(one.ratio[i] <= 1 / WEAK_MISTAKE for engines in levels for one in engines.values())
+
+    effects = measured(range(len(parameters)), MOTION_MISTAKE)
     ratios = _motion_ratios(tolerances, effects)
-    # what integrators make of invariants is as sharp as small mistakes: there the order is always found
-    weak = [
+    # what integrators make of invariants is as sharp as small mistakes: there the steps are always checked
+    checked = [
         i
-        for i, parameter in enumerate(parameters)
-        if any(
-            parameter.kind not in STATE_KINDS if level == "invariants" else one.ratio[i] <= 1 / WEAK_MISTAKE
-            for level, engines in ratios.items()
-            for one in engines.values()
-        )
+        for i, one in enumerate(parameters)
+        if ("invariants" in ratios and one.kind not in STATE_KINDS) or is_weak(ratios, i)
     ]
-    if weak:
-        sizes = MOTION_MISTAKE, LARGER_MISTAKE * MOTION_MISTAKE
-        finer = [measured(weak, size, 2) for size in sizes]
-        ratios = _motion_ratios(tolerances, effects, _by_index(weak, finer))
+    finer = _by_index(checked, [measured(checked, LARGER_MISTAKE * MOTION_MISTAKE, is_fine=True)])
+    ratios = _motion_ratios(tolerances, effects, finer)
+    weak = [i for i in checked if is_weak(ratios, i)]
+    for i, same in _by_index(weak, [measured(weak, MOTION_MISTAKE, is_fine=True)]).items():
+        finer[i] += same
+    ratios = _motion_ratios(tolerances, effects, finer)
     found = []
-    visited = _visited_states(model, state, times)
+    visited = _visited_states(motions[0])
     for level, by_engine in ratios.items():
         proofs = _proofs(model, visited, parameters, by_engine, level)
         own = [one for one in tolerances if one.row.level == level]
@@ -380,14 +391,14 @@ def _motion_entries(
         if level == "invariants":
             ratio = np.min([one.ratio for one in by_engine.values()], axis=0)
             unseen = [int(i) for i in np.flatnonzero(ratio <= 1 / MAX_MISTAKE) if i not in proofs]
-            proofs |= _conserved(model, state, times, parameters, unseen, tolerances, substeps)
+            proofs |= _conserved(motions[0], parameters, unseen, tolerances)
         found += _entries(name, level, model, parameters, by_engine, proofs)
     return found
 
 
 def _measure_further(
     tolerances: Sequence[_MotionTolerance], by_engine: Mapping[str, _Ratios], proven: Container[int],
-    measured: Callable[[Sequence[int], float, int], dict[str, Array]],
+    measured: Callable[..., dict[str, Array]],
 ) -> None:  # fmt: skip
     """Put in place the ratios of parameters that pass no tolerance at the mistakes that were measured.
 
@@ -398,7 +409,8 @@ def _measure_further(
         tolerances: of one level.
         by_engine: the ratios of that level, changed in place.
         proven: indices of parameters that are left as they are.
-        measured: from indices, a mistake and a factor on the steps to the effects (`_motion_effects`).
+        measured: from indices, a mistake and whether the steps are the finer ones to the effects
+            (`_motion_effects`).
 
     """
     largest = LARGER_MISTAKE * MOTION_MISTAKE
@@ -408,9 +420,8 @@ def _measure_further(
         if not left:
             return
         largest = LARGER_MISTAKE * size
-        several = measured(left, size, 2), measured(left, largest, 2), measured(left, largest, 1)
-        finer = _by_index(range(len(left)), several)
-        (again,) = _motion_ratios(tolerances, measured(left, size, 1), finer, size).values()
+        finer = _by_index(range(len(left)), [measured(left, one, is_fine=True) for one in (largest, size)])
+        (again,) = _motion_ratios(tolerances, measured(left, size), finer, size).values()
         for engine, one in again.items():
             for i, value, row in zip(left, one.ratio, one.row, strict=True):
                 by_engine[engine].ratio[i], by_engine[engine].row[i] = value, row
@@ -424,67 +435,80 @@ def _by_index(
 
 
 def _conserved(
-    model: Model, state: State, times: Array, parameters: Sequence[Parameter], unseen: Sequence[int],
-    tolerances: Sequence[_MotionTolerance], substeps: int,
+    motion: AccurateMotion, parameters: Sequence[Parameter], unseen: Sequence[int],
+    tolerances: Sequence[_MotionTolerance],
 ) -> dict[int, str]:  # fmt: skip
-    """The parameters with which the invariants stay constant: what a mistake adds vanishes with the step."""
+    """The parameters with which the invariants stay constant in accurate motions, of mistakes of a tenth.
+
+    Where such a mistake makes a motion of far more steps (wrong axes of a light cart: vibrations of
+    microseconds), of a hundredth.
+    """
     if not unseen:
         return {}
     least: dict[str, float] = {}
     for one in tolerances:
-        least[one.quantity] = min(one.tolerance, least.get(one.quantity, np.inf))
-    found, some = np.ones(len(unseen), bool), [parameters[i] for i in unseen]
-    quantities = set(least) & set(INVARIANT_UNITS)
-    for mistake in (MAX_MISTAKE, -MAX_MISTAKE):
-        arguments = model, state, times, some, quantities, mistake
-        coarse, fine = (_motion_effects(*arguments, count * substeps) for count in (1, 2))
-        for name in quantities:
-            falls = fine[name][:, -1] <= coarse[name][:, -1] / LARGER_MISTAKE
-            found &= falls | (fine[name][:, -1] <= least[name])
-    why = f"every invariant is conserved with it too, at mistakes of up to {MAX_MISTAKE:g}"
-    return {i: why for i, holds in zip(unseen, found, strict=True) if holds}
+        if one.quantity in INVARIANT_UNITS:
+            least[one.quantity] = min(one.tolerance, least.get(one.quantity, np.inf))
+    model, state = motion.model, motion.state
+    (run,) = accurate_runs([(model, state)], motion.times)
+    true, found = compute_invariants(model, run), {}
+    for i in unseen:
+        for mistake in (MAX_MISTAKE, MAX_MISTAKE / 10):
+            cases = [perturb(model, state, parameters[i], size) for size in (mistake, -mistake)]
+            try:
+                runs = accurate_runs(cases, motion.times, MAX_SLOWDOWN * run.steps)
+            except ArithmeticError:
+                continue
+            invariants = [compute_invariants(model, one) for one in runs]
+            if all(
+                np.max(_invariant_change(name, one, true)) <= tolerance
+                for name, tolerance in least.items()
+                for one in invariants
+            ):
+                found[i] = f"every invariant is conserved with it too, at mistakes of up to {mistake:g}"
+            break
+    return found
 
 
-def _visited_states(model: Model, state: State, times: Array) -> list[State]:
-    """States along the motion, to nearly rounding: a steady motion stays as steady as it can."""
-    along = times[np.linspace(0, len(times) - 1, PROOF_SAMPLES).astype(int)]
-    start = state.r, state.p, state.v, quaternion_rate(state.p, state.omega)
-    run = integrate_collocation(eliminated_system([model], state.x), *start, along, PROOF_RTOL)
-    samples = zip(run.r, run.p, run.v, run.pdot, strict=True)
-    found = [project_to_manifold(model, *sample) for sample in samples]
+def _visited_states(motion: AccurateMotion) -> list[State]:
+    """States along the motion."""
+    model, samples = motion.model, motion.samples.swapaxes(-1, -2)
+    along = np.linspace(0, len(samples) - 1, PROOF_SAMPLES).astype(int)
+    found = [
+        project_to_manifold(model, q[:, :3], q[:, 3:], rate[:, :3], rate[:, 3:]) for q, rate in samples[along]
+    ]
     if model.is_chain:
         return found
     return [with_joint_coordinates(model, one) for one in found]
 
 
 def _motion_effects(
-    model: Model,
-    state: State,
-    times: Array,
-    parameters: Sequence[Parameter],
-    quantities: set[str],
-    size: float,
-    substeps: int,
+    motion: AccurateMotion, parameters: Sequence[Parameter], quantities: set[str], size: float
 ) -> dict[str, Array]:
     """Running maxima (P, T) of what mistakes of a size do to a motion, by quantity."""
     effects: dict[str, list[Array]] = {quantity: [] for quantity in quantities}
     true: Trajectory | None = None
-    for motion in perturbed_motions(model, state, times, parameters, substeps, size):
-        if motion.true is not true:
-            true = motion.true
-            invariants = compute_invariants(model, true) if quantities & set(INVARIANT_UNITS) else None
+    for one in perturbed_motions(motion, parameters, size):
+        if one.true is not true:
+            true = one.true
+            invariants = compute_invariants(motion.model, true) if quantities & set(INVARIANT_UNITS) else None
         found = {
-            "position": position_error(motion.run.r, true.r),
-            "attitude": attitude_error(motion.run.p, true.p),
+            "position": position_error(one.run.r, true.r),
+            "attitude": attitude_error(one.run.p, true.p),
         }
         if invariants is not None:
-            own = compute_invariants(model, motion.run)
+            own = compute_invariants(motion.model, one.run)
             for quantity in quantities & set(INVARIANT_UNITS):
-                difference = getattr(own, quantity) - getattr(invariants, quantity)
-                found[quantity] = np.max(np.linalg.norm(difference, axis=-1), axis=1)
+                found[quantity] = _invariant_change(quantity, own, invariants)
         for quantity in quantities:
             effects[quantity].append(np.maximum.accumulate(found[quantity]))
     return {quantity: np.array(found) for quantity, found in effects.items()}
+
+
+def _invariant_change(quantity: str, one: Invariants, other: Invariants) -> Array:
+    """The largest difference over all bodies (T,)."""
+    difference = getattr(one, quantity) - getattr(other, quantity)
+    return np.asarray(np.max(np.linalg.norm(difference, axis=-1), axis=1))
 
 
 def _motion_ratios(
@@ -493,9 +517,8 @@ def _motion_ratios(
 ) -> dict[Level, dict[str, _Ratios]]:  # fmt: skip
     """Effects of mistakes of a size over tolerances by level and engine; of some by the order of the effect.
 
-    Those are given again at half the step, of the same mistake and of a larger one, which may follow at the
-    whole step: an effect that falls with the step is the integrator's error, which a run's study extrapolates
-    away.
+    Those are given at finer steps too: of a larger mistake, and then perhaps of the same one. An effect that
+    falls with the step is the integrator's error, which a run's study extrapolates away.
     """
     finer = finer or {}
     ratios: dict[Level, dict[str, _Ratios]] = {}
@@ -505,19 +528,23 @@ def _motion_ratios(
         label = f"{one.row.integrator} {one.row.quantity}"
         for i in range(count):
             effect = float(effects[one.quantity][i, one.last_sample])
-            ratio = effect / one.tolerance / size
-            if i in finer:
-                same, more, *coarse = (float(x[one.quantity][one.last_sample]) for x in finer[i])
-                growth = more / max(same, TINY)
-                falls = more < coarse[0] / LARGER_MISTAKE if coarse else same < effect / LARGER_MISTAKE
-                if (falls and (coarse or growth < 2 * LARGER_MISTAKE)) or growth < LARGER_MISTAKE / 2:
-                    ratio = 0.0  # rounding, or the integrator's error
-                elif growth > 2 * LARGER_MISTAKE:  # grows with the square of the mistake
-                    ratio = float(np.sqrt(more / one.tolerance)) / (LARGER_MISTAKE * size)
-                else:
-                    ratio = same / one.tolerance / size
-            of_engine.add(i, ratio, label)
+            again = [float(x[one.quantity][one.last_sample]) for x in finer.get(i, ())]
+            of_engine.add(i, _relative_effect(effect, again, one.tolerance, size), label)
     return ratios
+
+
+def _relative_effect(effect: float, finer: Sequence[float], tolerance: float, size: float) -> float:
+    """The effect of a mistake of 1 over the tolerance, from those that `_motion_ratios` is given."""
+    if not finer:
+        return effect / tolerance / size
+    larger, *same = finer
+    growth = larger / max(*same, TINY) if same else larger / max(effect, TINY)
+    falls = effect > LEAST_FALL * same[0] if same else LARGER_MISTAKE * effect > LEAST_FALL * larger
+    if falls or growth < LARGER_MISTAKE / 2 or (growth > 2 * LARGER_MISTAKE and not same):
+        return 0.0  # rounding, or the integrator's error, or not known without the same mistake
+    if growth > 2 * LARGER_MISTAKE:  # with the square of the mistake
+        return float(np.sqrt(larger / tolerance)) / (LARGER_MISTAKE * size)
+    return larger / tolerance / (LARGER_MISTAKE * size)
 
 
 # -- proofs ------------------------------------------------------------------------------------------

@@ -9,16 +9,24 @@ import pytest
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.coverage import (
     COVERED_LEVELS,
+    WEAK_MISTAKE,
     _measure_further,
     _MotionTolerance,
     _Ratios,
+    _relative_effect,
     scenario_coverage,
 )
 from plumbline.judging.rows import RowContext, Verdict
 from plumbline.model.datatypes import KINDS
 from plumbline.scenario import loader as scenarios
 from plumbline.studies.coverage import blind_spots, summarize_coverage
-from plumbline.truth.parameter_effects import difference_effects, effects_at_states
+from plumbline.truth.parameter_effects import (
+    accurate_runs,
+    difference_effects,
+    effects_at_states,
+    perturbed_motions,
+    resolved_motions,
+)
 from plumbline.truth.parameters import STATE_KINDS, list_parameters, perturb
 from plumbline.truth.rounding_bound import EPS, state_rounding_bound
 from tests.helpers.coverage_confirmation import coverage, is_reported, scenario, states
@@ -113,10 +121,51 @@ def test_an_effect_is_not_extrapolated(effect, figure):
     tolerance = _MotionTolerance(row, "norm_drift", 1e-12, 0)
     by_engine = {"e": _Ratios(1)}
     by_engine["e"].add(0, 13.3, "i norm_drift")
-    measured = lambda chosen, size, _: {"norm_drift": np.full((len(chosen), 1), effect(size))}  # noqa: E731
+
+    def measured(chosen, size, is_fine=False):
+        return {"norm_drift": np.full((len(chosen), 1), effect(size))}
+
     _measure_further([tolerance], by_engine, {}, measured)
     ratio = by_engine["e"].ratio[0]
     assert ratio == pytest.approx(1 / figure, rel=0.02) if figure else ratio < 10
+
+
+@pytest.mark.parametrize(
+    ("effect", "figure"),
+    [
+        (lambda size, step: size, 1e-12),
+        (lambda size, step: size * (1 + 0.2 * step**4), 1e-12),
+        (lambda size, step: size * step**4, None),  # the integrator's error
+        (lambda size, step: size**2, 1e-6),
+        (lambda size, step: size**2 + 2e-5 * size * step**4, None),
+        (lambda size, step: size**2 * step**4, None),
+        (lambda size, step: 1e-14 * (1 + 0.5 * (size > 1e-5)), None),  # rounding
+    ],
+)
+def test_the_order_of_an_effect_is_found(effect, figure):
+    """By a mistake of 1e-5, and at steps of two thirds by one of 4e-5 and the same."""
+    at = [effect(1e-5, 1.0), effect(4e-5, 2 / 3), effect(1e-5, 2 / 3)]
+    ratio = _relative_effect(at[0], at[1:], tolerance=1e-12, size=1e-5)
+    assert ratio == pytest.approx(1 / figure if figure else 0.0, rel=0.1)
+    without_the_last = _relative_effect(at[0], at[1:2], tolerance=1e-12, size=1e-5)
+    if figure == 1e-12:
+        assert without_the_last == ratio
+    else:  # nothing, or too weak an effect to count without the last
+        assert without_the_last * WEAK_MISTAKE <= 1
+
+
+@pytest.mark.parametrize("name", ["double-tumbling-rods", "drag-rod", "acrobot", "sprung-hinge"])
+def test_deviations_are_differences_of_accurate_motions(name):
+    s = scenario(name)
+    times, parameters, mistake = s.times[:9:2], list_parameters(s.model, s.state)[3::11], 1e-3
+    cases = [perturb(s.model, s.state, one, mistake) for one in parameters]
+    true, *others = accurate_runs([(s.model, s.state), *cases], times)
+    for motion in resolved_motions(s.model, s.state, times, parameters):
+        for one, other in zip(perturbed_motions(motion, parameters, mistake), others, strict=True):
+            for field in ("r", "v"):
+                change = getattr(other, field) - getattr(true, field)
+                error = getattr(one.run, field) - getattr(one.true, field) - change
+                assert np.max(np.abs(error)) <= 0.01 * np.max(np.abs(change)) + 1e-11, one.parameter
 
 
 @pytest.mark.full
