@@ -58,11 +58,6 @@ def reason_not_provable(model: Model) -> str:
     """
     if model.has_loops:
         return "motions of closed loops are not proved: the checker has the equations of trees"
-    if any(kind == "ball" and k > 0 for kind, k in zip(model.kind, model.stiffness[:, 0], strict=False)):
-        return (
-            "motions with a spring on a ball joint are not proved: its moment k θ has no polynomial equation "
-            "that holds at θ = 0"
-        )
     return ""
 
 
@@ -275,10 +270,11 @@ def _add_functions(mechanism: Any, series: list[Any]) -> list[Any]:
         return [mp.ldexp(int(mantissa), int(exponent)) for mantissa, exponent in parts], False
 
     rest, found = iter(series), list[Any]()
-    for u, p, slide, turns in mechanism.joints:
-        found += islice(rest, 4 * p + 3 * u + slide + len(turns))
+    for (_, _, _, _, turns), (*sizes, functions) in zip(mechanism.joints, mechanism.sizes[0], strict=True):
+        found += islice(rest, sum(sizes))
         for angle in found[len(found) - len(turns) :]:
             found += [numbers(balls(angle).cos()), numbers(balls(angle).sin())]
+        found += islice(rest, functions - 2 * len(turns))  # θ² and θ/(6 sin θ)
     rates = [*rest]
     if mechanism.springs:
         q, v = ([balls(row) for row in part] for part in (found, rates))

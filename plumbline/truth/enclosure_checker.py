@@ -15,34 +15,39 @@ near point s_k on a body before it or on the world, the far body, at its far poi
               by x about z; cylindrical, both; universal, turned about x and then about y; weld, neither.
 
 Its state y = (q, v) has as q per joint the Euler parameters p of a body on a rod or ball or free, u, each
-coordinate x, cos x and sin x of each turn, and at last λ = 1/|d| of each spring, d from its first point
-to its second; as v the rate ω of such a body in its own axes, u̇ and ẋ. With A the rotation of a body
-(the homogeneous quadratic A(p), or what the turns make of the far body's), and sums over the joints j on
-it,
+coordinate x, cos x and sin x of each turn, σ = φ² and γ = φ/(6 sin φ) of a ball with a spring (k ≠ 0), and
+at last λ = 1/|d| of each spring between points, d from its first point to its second; as v the rate ω of
+such a body in its own axes, u̇ and ẋ. Where `turn` sets the axes f_i in the far and h_i in the near body of
+a ball, the turn from f_i to h_i is φ about a unit vector z, 0 ≤ φ < π: ψ = z sin φ = ½ Σ f_i × h_i and cos
+φ = ½ (Σ f_iᵀh_i − 1), here in axes of the near body. With A the rotation of a body (the homogeneous
+quadratic A(p), or what the turns make of the far body's), and sums over the joints j on it,
 
   m r̈ = m g + f − c ṙ + F_k − Σ F_j + Σ pulls,
   J ω̇ + ω × J ω + d ω = n + N_k + s × AᵀF_k − Σ (N_j + t_j × AᵀF_j) + Σ moments of pulls
 
-define the force F_k (world axes) and moment N_k (body axes, about s_k) of joint k on body k; N_j turns
-with its axes, t_j moves with the slide, and N_j = 0 for rods, free bodies and balls without elements. A
-spring pulls by (k (1 − l₀ λ) + c λ² dᵀḋ) d = (k (|d| − l₀) + c |d|˙) d/|d|. v̇ solves G(y, v̇) = 0, which
-is
+define the force F_k (world axes) and moment N_k (body axes, about s_k) of joint k on body k; N_j turns with
+its axes, t_j moves with the slide, and N_j = 0 for rods, free bodies and balls without elements. A spring
+between points pulls by (k (1 − l₀ λ) + c λ² dᵀḋ) d = (k (|d| − l₀) + c |d|˙) d/|d|. v̇ solves G(y, v̇) = 0,
+which is
 
   N = 0                                          for each rod, free body and ball without elements,
-  N + a (ω̇ − ω̇₀ − ω₀ × ω) + c (ω − ω₀) = 0       for a ball, ω₀ and ω̇₀ of the far body in axes of the near,
+  N + a (ω̇ − ω̇₀ − ω₀ × ω) + c (ω − ω₀) + 6 k γ ψ = 0   for a ball, ω₀ and ω̇₀ of the far body,
   F − u (uᵀF) + m l u (uᵀü + u̇ᵀu̇) = 0           for each rod,
   F = 0                                          for each free body,
   e·F or e·N + a ẍ + c ẋ + k (x − x₀) − τ = 0    for each x along or about an axis e:
 
-Newton's and Euler's equations with rotors, dampers, springs and efforts (a, c, k, τ), with F_k along u_k
-and |u_k| = 1. G is polynomial, and affine in v̇: G = M(y) v̇ + G(y, 0). The kinematic equations are ṗ = ½
-L(p)ᵀω, du/dt = u̇, dx/dt = ẋ, (cos x)˙ = −ẋ sin x, (sin x)˙ = ẋ cos x and λ˙ = −λ³ dᵀḋ. They conserve
-|p|; their only solutions from cos x, sin x and 1/|d| are these; where |u| = 1 and uᵀu̇ = 0 they and G = 0
-give d(uᵀu̇)/dt = 0 for rods, so that a solution that starts there stays there and is the motion.
+Newton's and Euler's equations with rotors, dampers, springs and efforts (a, c, k, τ; the spring of a ball
+has the moment −k φ z, and 6 γ ψ = φ z), with F_k along u_k and |u_k| = 1. G is polynomial, and affine in
+v̇: G = M(y) v̇ + G(y, 0). The kinematic equations are ṗ = ½ L(p)ᵀω, du/dt = u̇, dx/dt = ẋ, (cos x)˙ = −ẋ
+sin x, (sin x)˙ = ẋ cos x, λ˙ = −λ³ dᵀḋ, σ̇ = 12 γ ψᵀ(ω − ω₀) and γ̇ = γ² f₀(σ) σ̇, polynomial but for the
+entire function f₀ = −6 S′, S(φ²) = sin φ/φ. They conserve |p|; their only solutions from cos x, sin x,
+1/|d|, φ² and φ/(6 sin φ) are these, the last two as long as φ < π; where |u| = 1 and uᵀu̇ = 0 they and G =
+0 give d(uᵀu̇)/dt = 0 for rods, so that a solution that starts there stays there and is the motion.
 
 THEOREM. Let y(t) solve these equations with y(0) the state of the file, normalised exactly: p/|p|, u/|u|
-and u̇ − u (uᵀu̇) of rods, turn/|turn|. If `enclose_motion` returns, y exists up to the last sample time,
-and at every sample time each position, attitude, velocity and rate lies in the ball that is returned.
+and u̇ − u (uᵀu̇) of rods, turn/|turn|. If `enclose_motion` returns, y exists up to the last sample time, no
+ball with a spring comes to half a turn φ = π, where its moment jumps, and at every sample time each
+position, attitude, velocity and rate lies in the ball that is returned.
 
 PROOF.  The file has a unit of time, a power of two [s], into which every number is converted exactly.  On a
 step of length h let s ∈ [0, 1], t = t_k + h s, ỹ(s) the polynomials of the file, e = y − ỹ, ′ = d/ds.  ‖·‖ is
@@ -52,9 +57,9 @@ largest for s ∈ [0, 1] where it bounds a function.
  (F) Floating point. Assumed is that each operation of doubles is off by at most 2⁻⁵² of its result, or by
      2⁻¹⁰²² where it underflows (true of every direction of rounding), and that NumPy evaluates a product
      of arrays as sums of products, added in any order. Then a sum of K ≤ 2¹⁵ products is off by at most
-     2⁻⁵¹ K Σ|products| + 2⁻¹⁰⁰⁰, one product also where a factor (a number of the file, or an entry of a
-     joint's axes) is off by 2⁻⁵³ (1 + 2⁻⁷) of itself; and an expression of numbers ≥ 0, of at most ten
-     nested sums, products, quotients and roots, by 2⁻³⁰ of itself and 2⁻¹⁰⁰⁰ at most: `_up`.
+     2⁻⁵¹ K Σ|products| + 2⁻¹⁰⁰⁰, one product also where a factor (a number of the file or six times it, an
+     entry of a joint's axes, or of (8)) is off by 2⁻⁵³ (1 + 2⁻⁷) of itself; and an expression of numbers ≥
+     0, of at most ten nested sums, products, quotients and roots, by 2⁻³⁰ of itself and 2⁻¹⁰⁰⁰: `_up`.
  (1) A function is *enclosed* by c₀ + … + c_D s^D, D = DEGREE, and a radius r if they differ by at most r
      for all s ∈ [0, 1]. Products of enclosing polynomials are computed whole: their terms above s^D, the
      roundings and the products with the factors' radii go into r, so that no series is cut without its
@@ -76,6 +81,11 @@ largest for s ∈ [0, 1] where it bounds a function.
  (7) Next step, with T = P⁺(0) and Q an approximate inverse, ‖I − Q T‖ ≤ θ″ < 1: e(0) = X w(1) + j, X =
      P(1), with the jump j = ỹ(1) − ỹ⁺(0) (at the start: j = y(0) − ỹ⁺(0), ρ⁺ = 0) is T w⁺(0), and ‖w⁺(0)‖
      ≤ (√(largest row sum of |B Bᵀ|) ρ⁺ + ‖|Q| |j|‖)/(1 − θ″) with B = Q X.
+ (8) f_n(σ) = 1 − σ f_{n+1}(σ)/(2 (n + 1)(2 n + 5)), f₀ = Σ 6 (n + 1)(−σ)ⁿ/(2 n + 3)!. For |σ| ≤ 10 and N ≥
+     1 |f_N − 1| ≤ 10/28 + (10/28)² + … < 1: along the motion f_N(σ(s)) is a function of s, r(s) = 1 ± 1.
+     With it in place of f_N the equations are polynomial, and the motion solves them: (2) encloses them at
+     ỹ for every such r, (3) their derivatives for the number r(s), which does not depend on y. |σ| < 9.86
+     must hold in the tube of (3), which is below π² and 10: before φ came to π, σ would have left it.
 
 Comparisons reject unless they hold: never for NaN.
 """
@@ -85,7 +95,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -96,9 +105,7 @@ from plumbline.truth.enclosure_file import JOINTS, SHAPES, Array, Certificate
 DEGREE, GUARD_BITS = 11, 40  # of the linear part (R falls with h¹²); of (2) beyond the certificate's own
 MIN_TUBE, MAX_CONDITION = 2.0**-44, 100.0  # of ε and of T
 ROUNDING, TINY = 2.0**-51, 2.0**-1000  # of (F)
-UNIT = arb(0.5, 0.5)  # [0, 1]
-SHIFTED = np.subtract.outer(np.arange(2 * DEGREE + 1), np.arange(DEGREE + 1))  # for `_convolution`
-SHIFTED[(SHIFTED < 0) | (SHIFTED > DEGREE)] = DEGREE + 1
+MAX_SIGMA, UNIT = 9.86, arb(0.5, 0.5)  # of (8), below π²; [0, 1]
 
 
 class Rejected(ArithmeticError):
@@ -168,8 +175,8 @@ class _Series:
     def __mul__(self, other: Any) -> _Series:
         if not isinstance(other, _Series):  # a constant
             return _Series(self.c * other, self.r * abs(other), 1)
-        values = _join([self.block(slice(None), slice(1)), other.block(slice(None), slice(1))], 1)
-        found = values @ _join([other, self])
+        c, r = (np.concatenate([getattr(x, name)[..., :1] for x in (self, other)], -1) for name in ("c", "r"))
+        found = _Series(c, r) @ _join([other, self])
         halves = 1 - np.eye(1, self.c.shape[2]) / 2  # of the value, which this adds twice
         return _Series(found.c * halves, found.r * halves)
 
@@ -178,23 +185,19 @@ class _Series:
 
 def _convolution(a: Array, b: Array) -> Array:
     """Coefficients (2 DEGREE + 1, m, n) of the product of two matrix polynomials."""
-    (m, k), n = a.shape[1:], b.shape[2]
-    if m > 1:
-        full = np.zeros((2 * DEGREE + 1, m, n))
-        for i, factor in enumerate(a):
-            full[i : i + DEGREE + 1] += factor @ b
-        return full
-    table = np.concatenate([a, np.zeros((1, m, k))])[SHIFTED].reshape(-1, (DEGREE + 1) * k)
-    return (table @ b.reshape(-1, n))[:, None]
+    full = np.zeros((2 * DEGREE + 1, a.shape[1], b.shape[2]))
+    for i, factor in enumerate(a):
+        full[i : i + DEGREE + 1] += factor @ b
+    return full
 
 
 def _constant(matrix: Array) -> _Series:
     return _Series(np.concatenate([matrix[None], np.zeros((DEGREE, *matrix.shape))]))
 
 
-def _join(parts: Sequence[_Series], axis: int = 0) -> _Series:
-    """Rows below rows, or columns beside columns."""
-    return _Series(np.concatenate([x.c for x in parts], 1 + axis), np.concatenate([x.r for x in parts], axis))
+def _join(parts: Sequence[_Series]) -> _Series:
+    """Rows below rows."""
+    return _Series(np.concatenate([x.c for x in parts], 1), np.concatenate([x.r for x in parts]))
 
 
 def _recurrence(J: Array, first: Array, power: int) -> Array:
@@ -236,8 +239,7 @@ def _turned(x: Array, axis: int, cosine: Array, sine: Array) -> Array:
 
 def _rotation(p: Array) -> Array:
     """Return A(p), homogeneous and quadratic: a rotation where |p| = 1."""
-    w, x, y, z = p
-    ww, xx, yy, zz = w * w, x * x, y * y, z * z
+    (w, x, y, z), (ww, xx, yy, zz) = p, p * p
     xy, wz, xz, wy, yz, wx = x * y * 2, w * z * 2, x * z * 2, w * y * 2, y * z * 2, w * x * 2
     return _vector([ww + xx - yy - zz, xy - wz, xz + wy, xy + wz, ww - xx + yy - zz, yz - wx,
                     xz - wy, yz + wx, ww - xx - yy + zz]).reshape(3, 3)  # fmt: skip
@@ -250,15 +252,17 @@ class _Mechanism:
     """The model in the certificate's unit of time; vectors are arrays of balls, polynomials or `_Series`."""
 
     def __init__(self, file: Certificate, number: Callable[[Any], Any]) -> None:
-        self.far, self.springs, self.kind = file.far, file.springs, file.kind
-        self.nq, self.nv, self.unit = file.nq, file.nv, arb(2) ** file.time_exponent
+        self.far, self.springs, self.joints = file.far, file.springs, [(k, *JOINTS[k]) for k in file.kind]
+        self.nq, self.nv, self.sizes, self.unit = file.nq, file.nv, file.sizes, arb(2) ** file.time_exponent
+        self.exact, self.needs_rates = number is arb, bool(np.any(file.data["drag_force"]) or file.springs)
         # exact, because the unit is a power of two
         data: Any = {x: np.frompyfunc(arb, 1, 1)(c) / self.unit ** SHAPES[x][1] for x, c in file.data.items()}
         data["axes"] = np.array([[_rotation(q) / (q @ q) for q in pair] for pair in data["turn"]])
         _require(all(x.rel_accuracy_bits() > 60 for x in data["axes"].ravel()), "turn: axes too inexact")
+        terms = reversed(range(ctx.prec // 7 if self.exact else 12))  # of (8): N, more hardly count
+        self.terms = [number(-1) / (2 * (n + 1) * (2 * n + 5)) for n in terms]
         self.data: dict[str, Any] = {name: np.frompyfunc(number, 1, 1)(x) for name, x in data.items()}
-        self.joints = [JOINTS[kind] for kind in file.kind]
-        self.needs_rates = bool(np.any(file.data["drag_force"]) or file.springs)
+        self.unknown = arb(0, 1) if self.exact else _Series(np.zeros((DEGREE + 1, 1, 1)), 1.0)  # 0 ± 1 of (8)
 
     def equations(self, y: Sequence[Any], vdot: Sequence[Any]) -> tuple[list[Any], list[Any]]:
         """Return q̇ (nq,) and the residual G(y, v̇) (nv,)."""
@@ -269,35 +273,41 @@ class _Mechanism:
             k, c, rest = (data[f"spring_{name}"][j] for name in ("stiffness", "damping", "length"))
             inverse = y[self.nq - len(self.springs) + j]
             change = inverse * inverse * (d @ ddot)
-            qdot.append(-(inverse * change))
-            pull = d * _vector([(inverse * -rest + 1) * k + change * c])
+            qdot, pull = [*qdot, -(inverse * change)], d * _vector([(inverse * -rest + 1) * k + change * c])
             for b, s, f in zip(self.springs[j], data["spring_point"][j], (pull, -pull), strict=True):
                 F[b], N[b] = F[b] - f, N[b] - np.cross(s, z.A[b].T @ f)
         for k, far in reversed([*enumerate(self.far)]):
-            m, J, (_, s), f, n, c, d, length, armature, damping = (data[x][k] for x in list(SHAPES)[1:11])
+            m, J, (_, s), f, n, c, d, length, *elements = (data[x][k] for x in list(SHAPES)[1:14])
             A, B, w, wdot, axes, rows = z.A[k], z.A[far], z.w[k], z.wdot[k], data["axes"][k], list[Any]()
-            (p, u, x, _), (_, udot, xdot, _), (_, uddot, xddot, _) = (part[k] for part in z.parts)
+            (p, u, x, functions), (_, udot, xdot, _), (_, uddot, xddot, _) = (part[k] for part in z.parts)
             F[k] = F[k] + (a[k] - data["gravity"]) * m - f + (v[k] * c if self.needs_rates else 0)
             N[k] = N[k] + J @ wdot + np.cross(w, J @ w) + w * d - n - np.cross(s, A.T @ F[k])
             rates, moment = [*udot, *xdot], z.zero
             if len(p):
                 rates, rows = [*_times(p, _vector([0, *(w * 0.5)])), *rates], [*N[k]]
-                if armature[0] != 0 or damping[0] != 0:
+                armature, damping, stiffness, *_ = (x[0] for x in elements)
+                if armature != 0 or damping != 0 or stiffness != 0:
                     w0, wdot0, moment = A.T @ (B @ z.w[far]), A.T @ (B @ z.wdot[far]), B.T @ (A @ N[k])
-                    rows = [*(N[k] + (wdot - wdot0 - np.cross(w0, w)) * armature[0] + (w - w0) * damping[0])]
+                    rows = [*(N[k] + (wdot - wdot0 - np.cross(w0, w)) * armature + (w - w0) * damping)]
+                if len(functions):
+                    (σ, γ), bend = functions, z.bend(k)[0]
+                    change, f = γ * (bend @ (w - w0)) * 12, σ * 0 + self.unknown + 1
+                    for term in self.terms:
+                        f = σ * f * term + 1
+                    _require(self.exact or σ.size[0, 0] < MAX_SIGMA, "inequality (8): near half a turn")
+                    rates += [change, γ * γ * change * f]
+                    rows = [*(_vector(rows) + bend * _vector([γ * (stiffness * 6)]))]
             else:
                 moment = axes[1].T @ N[k]
                 for i, (cosine, sine), *_ in reversed(z.turns[k]):
                     rows, moment = [moment[i], *rows], _turned(moment, i, cosine, -sine)
                 along, moment = axes[0][:, 2] @ (B.T @ F[k]), axes[0] @ moment
-                rows = [along] * self.joints[k][2] + rows
-                every = zip(rows, x, xdot, xddot, *(data[e][k] for e in list(SHAPES)[9:14]), strict=False)
+                every = zip([along] * self.joints[k][3] + rows, x, xdot, xddot, *elements, strict=False)
                 rows = [g + ẍ * a + ẋ * c + (x - x0) * k - τ for g, x, ẋ, ẍ, a, c, k, x0, τ in every]
             if len(u):
-                along = (u @ uddot + udot @ udot) * m * length - u @ F[k] if self.kind[k] == "rod" else 0
+                along = (u @ uddot + udot @ udot) * m * length - u @ F[k] if self.joints[k][0] == "rod" else 0
                 rows += [*(F[k] + u * _vector([along]))]
-            if far >= 0:
-                F[far], N[far] = F[far] + F[k], N[far] + moment + np.cross(z.tips[k][0], B.T @ F[k])
+            F[far], N[far] = F[far] + F[k], N[far] + moment + np.cross(z.tips[k][0], B.T @ F[k])
             rates += [x for _, (cos, sin), ẋ, _ in z.turns[k] for x in (-(sin * ẋ)[0], (cos * ẋ)[0])]
             qdot, residual = rates + qdot, rows + residual
         return qdot, residual
@@ -308,8 +318,9 @@ class _Motion:
 
     def __init__(self, mechanism: _Mechanism, y: Sequence[Any], vdot: Sequence[Any]) -> None:
         self.mechanism, self.zero, nq = mechanism, _vector([y[0] * 0] * 3), mechanism.nq
-        self.parts = [self._split(*x) for x in ((y[:nq], 4, 2), (y[nq:], 3, 0), (vdot, 3, 0))]  # of q, v, v̇
-        world: Any = (np.eye(3, dtype=object), 0, 0)
+        parts = map(np.split, map(_vector, (y[:nq], y[nq:], vdot)), map(np.cumsum, mechanism.sizes))
+        self.parts = [[x[4 * k : 4 * k + 4] for k in range(len(mechanism.far))] for x in parts]  # of q, v, v̇
+        world = np.eye(3), *np.zeros((2, 3))
         self.A, self.w, self.wdot = ([self.zero + x] * (1 + len(mechanism.far)) for x in world)
         self.tips, self.turns = list[Any](), list[Any]()  # of each joint, see `arm` and below
         for k, far in enumerate(mechanism.far):
@@ -318,7 +329,7 @@ class _Motion:
             tip = [first[:, 2] * part[k][2][:1] if slide else 0 for part in self.parts]
             self.tips.append([tip[0] + mechanism.data["point"][k, 0], *tip[1:]])
             rates = (part[k][2][slide:].reshape(-1, 1) for part in self.parts[1:])
-            self.turns.append([*zip(axes, self.parts[0][k][3].reshape(-1, 2, 1), *rates, strict=True)])
+            self.turns.append([*zip(axes, self.parts[0][k][3].reshape(-1, 2, 1), *rates, strict=False)])
             if len(p):
                 self.A[k], self.w[k], self.wdot[k] = _rotation(p), w, wdot
                 continue
@@ -329,11 +340,11 @@ class _Motion:
                 dw[i], dw[j], dw[m], w[i] = dw[i] + acc, dw[j] + w[m] * rate, dw[m] - w[j] * rate, w[i] + rate
             self.A[k], self.w[k], self.wdot[k] = (last @ A).T, last @ w, last @ dw
 
-    def _split(self, x: Iterable[Any], of_p: int, of_turn: int) -> list[list[Array]]:
-        """Per joint its parts of q, v or v̇: of p, of u, of x, and cosine and sine of each turn."""
-        rest, joints = iter(x), self.mechanism.joints
-        sizes = ((of_p * p, 3 * u, slide + len(turns), of_turn * len(turns)) for u, p, slide, turns in joints)
-        return [[_vector(islice(rest, n)) for n in own] for own in sizes]
+    def bend(self, k: int) -> tuple[Any, Any]:
+        """Of a ball joint, ψ and cos φ."""
+        first, last = self.mechanism.data["axes"][k]
+        far = self.A[k].T @ (self.A[self.mechanism.far[k]] @ first)
+        return np.cross(far.T, last.T).sum(0) * 0.5, (far * last).sum() * 0.5 - 0.5
 
     def arm(self, k: int, level: int, s: Any, rate: Any = 0, change: Any = 0) -> Any:
         """From the centre of a body to the point s, which moves in it: place, velocity or acceleration."""
@@ -352,10 +363,9 @@ class _Motion:
 
     def spans(self, level: int) -> list[Any]:
         """Of each spring d or its rate, from the first point to the second."""
-        springs = self.mechanism.springs
-        centres = self.centres(level) if springs else []
-        at = [[centres[b] + self.A[b] @ self.arm(b, level, s) for b, s in zip(*ends, strict=True)]
-              for ends in zip(springs, self.mechanism.data["spring_point"], strict=True)]  # fmt: skip
+        centres = self.centres(level) if self.mechanism.springs else []
+        ends = zip(self.mechanism.springs, self.mechanism.data["spring_point"], strict=True)
+        at = [[centres[b] + self.A[b] @ self.arm(b, level, s) for b, s in zip(*x, strict=True)] for x in ends]
         return [end - start for start, end in at]
 
 
@@ -473,15 +483,15 @@ def enclose_motion(certificate: Certificate, on_step: Callable[..., Any] = lambd
     """
     per_second = Fraction(2) ** (certificate.bits - certificate.time_exponent)
     remaining, samples, at = [Fraction(t) * per_second for t in certificate.times], [], 0
-    unit = arb(2) ** -certificate.bits
-    with ctx.workprec(certificate.bits + GUARD_BITS), np.errstate(all="ignore"):
+    unit, bits = arb(2) ** -certificate.bits, certificate.bits
+    with ctx.workprec(bits + GUARD_BITS), np.errstate(all="ignore"):
         exact, rounded = _Mechanism(certificate, arb), _Mechanism(certificate, float)
-        end = _initial_values(exact)
-        X, rho = _constant(np.eye(len(end))), 0.0
+        end, X, rho = _initial_values(exact), _constant(np.eye(exact.nq + exact.nv)), 0.0
         for k, (length, *rows) in enumerate(certificate.steps):
             y, h = [arb_poly([c * unit for c in row]) for row in rows], length * unit
             try:
-                rows = _rounded_coefficients(rows, exact.nq, length, certificate.bits)
+                rates = ([j * c / length for j, c in enumerate(row[1:], 1)] for row in rows[exact.nq :])
+                rows = [np.array(x) for x in (*([c / 2**bits for c in row] for row in rows), *rates)]
                 start = _next_ellipsoid(X, rho, _upper(x - f(arb(0)) for x, f in zip(end, y, strict=True)))
                 P, rho = _prove_step(rounded, rows, float(h), _bound_defect(exact, y, h), *start)
             except (Rejected, OverflowError, np.linalg.LinAlgError) as error:
@@ -495,26 +505,23 @@ def enclose_motion(certificate: Certificate, on_step: Callable[..., Any] = lambd
     return Enclosure(certificate.times, *(np.array(x, dtype=object) for x in zip(*samples, strict=True)))
 
 
-def _rounded_coefficients(rows: list[list[int]], nq: int, length: int, bits: int) -> list[Array]:
-    """Coefficients of ỹ and ṽ′/h, each rounded once."""
-    values = [[c / 2**bits for c in row] for row in rows]
-    values += [[j * c / length for j, c in enumerate(row[1:], 1)] for row in rows[nq:]]
-    return [np.array(row, dtype=float) for row in values]
-
-
 def _initial_values(exact: _Mechanism) -> list[Any]:
     """y(0), normalised, in the certificate's unit of time."""
     q, v = list[Any](), list[Any]()
-    for k, (vector, attitude, slide, turns) in enumerate(exact.joints):
+    for k, (joint, (n_p, n_u, n_x, n)) in enumerate(zip(exact.joints, exact.sizes[0], strict=True)):
         p, w, u, udot, x, xdot = (exact.data[name][k] for name in ("p", "omega", "u", "udot", "x", "xdot"))
-        if exact.kind[k] == "rod":
-            u = u / (u @ u).sqrt()
-            udot = udot - u * (u @ udot)
-        scalars = slide + len(turns)
-        q += [*(p / (p @ p).sqrt() if attitude else []), *u[: 3 * vector], *x[:scalars]]
-        q += [f for angle in x[slide:scalars] for f in (angle.cos(), angle.sin())]
-        v += [*w[: 3 * attitude], *udot[: 3 * vector], *xdot[:scalars]]
+        if joint[0] == "rod":
+            u, udot = u / (u @ u).sqrt(), udot - u * (u @ udot) / (u @ u)
+        functions = [f for angle in x[joint[3] : n_x] for f in (angle.cos(), angle.sin())] + [arb(0)] * 2
+        q += [*(p / (p @ p).sqrt())[:n_p], *u[:n_u], *x[:n_x], *functions[:n]]
+        v += [*w[:n_p], *udot[:n_u], *xdot[:n_x]]
     motion = _Motion(exact, [*q, *[arb(0)] * len(exact.springs), *v], v)
+    for k, (own, *_, bent) in enumerate(motion.parts[0]):
+        if len(own) and len(bent):
+            bend, cosine = motion.bend(k)
+            angle = arb.atan2((bend @ bend).nonnegative_part().sqrt(), cosine)
+            bent[:] = angle * angle, 1 / (6 * angle.sinc())
+    q = [x for joint in motion.parts[0] for part in joint for x in part]
     return [*q, *(1 / (d @ d).sqrt() for d in motion.spans(0)), *v]
 
 
@@ -527,7 +534,7 @@ def _sample(exact: _Mechanism, y: list[Any], P: _Series, rho: float, s: Fraction
     for k, (far, (own, _, x, _)) in enumerate(zip(exact.far, z.parts[0], strict=True)):
         before, after = (q / (q @ q).sqrt() for q in exact.data["turn"][k])
         p[k] = _times(p[far], before)
-        for (axis, *_), half in zip(z.turns[k], x[exact.joints[k][2] :] / 2, strict=True):
+        for (axis, *_), half in zip(z.turns[k], x[exact.joints[k][3] :] / 2, strict=True):
             p[k] = _times(p[k], _vector([half.cos(), *(np.eye(3, dtype=object)[axis] * half.sin())]))
         p[k] = own if len(own) else _times(p[k], after * [1, -1, -1, -1])
     v, w = ([x / exact.unit for x in part[:-1]] for part in (z.centres(1), z.w))

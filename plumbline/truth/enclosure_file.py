@@ -49,16 +49,23 @@ class Certificate:
     steps: list[Any]  # [length, then per coordinate (q, then v) its coefficients from the power 0 of s on]
 
     @property
+    def sizes(self) -> tuple[list[tuple[int, int, int, int]], ...]:
+        """Of q, of v and of v̇ per joint the number of entries of p or ω, of u, of x and of functions of q."""
+        springs = zip(self.kind, self.data["stiffness"][:, 0], strict=True)
+        joints = [(*JOINTS[kind], kind == "ball" and k != 0) for kind, k in springs]
+        q = [(4 * p, 3 * u, slide + len(t), 2 * (len(t) + bent)) for u, p, slide, t, bent in joints]
+        v = [(3 * p, 3 * u, slide + len(t), 0) for u, p, slide, t, _ in joints]
+        return q, v, v
+
+    @property
     def nv(self) -> int:
         """Number of rates v."""
-        return sum(
-            3 * u + 3 * p + slide + len(turns) for u, p, slide, turns in map(JOINTS.__getitem__, self.kind)
-        )
+        return sum(map(sum, self.sizes[1]))
 
     @property
     def nq(self) -> int:
         """Number of coordinates q."""
-        return self.nv + sum(JOINTS[x][1] + 2 * len(JOINTS[x][3]) for x in self.kind) + len(self.springs)
+        return sum(map(sum, self.sizes[0])) + len(self.springs)
 
 
 def parse_certificate(raw: bytes) -> Certificate:
@@ -100,9 +107,8 @@ def parse_certificate(raw: bytes) -> Certificate:
         arrays[name] = _doubles(data, name, count + shape)
     _expect(np.all(arrays["mass"] > 0), "mass", "positive numbers")
     _expect(np.all(arrays["inertia"] == arrays["inertia"].mT), "inertia", "symmetric matrices")
-    held, hung = np.array([JOINTS[name][1::-1] for name in kind]).T > 0
-    _expect(not np.any(arrays["stiffness"][held]), "stiffness", "zeros of rods, balls and free bodies")
-    for name in ("armature", "damping"):
+    hung = np.array([JOINTS[name][0] for name in kind]) > 0
+    for name in ("armature", "damping", "stiffness"):
         _expect(not np.any(arrays[name][hung]), name, "zeros of rods and free bodies")
     _expect(isinstance(steps, list) and len(steps) > 0, "steps", "a list of steps")
     found = Certificate(kind, far, springs, arrays, times.tolist(), exponent, bits, steps)

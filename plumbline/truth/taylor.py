@@ -63,7 +63,8 @@ def simulate_taylor(
 
     Raises:
         TruthUnavailable: heyoka (Linux only) or mpmath is not installed.
-        EngineFailure: a step fails, or heyoka was built without quad precision.
+        EngineFailure: a step fails, as where a ball joint with a spring comes to half a turn and its moment
+            jumps, or heyoka was built without quad precision.
 
     """
     if model.has_loops:
@@ -107,7 +108,7 @@ def taylor_series(
         caller sends the values around which to expand next, in the same order.
 
     Raises:
-        TruthUnavailable: heyoka (Linux only) or mpmath is not installed, or a ball joint has a spring.
+        TruthUnavailable: heyoka (Linux only) or mpmath is not installed.
         EngineFailure: a step fails, or heyoka was built without that precision.
 
     """
@@ -127,13 +128,17 @@ def _positions_then_rates(model: Model) -> list[tuple[int, bool]]:
     """Places in heyoka's state of p, u or r, x of all bodies, then of rates, and whether each is one."""
     q: list[int] = []
     v: list[int] = []
-    first = 0
-    for kind in model.kind:
+    springs = taylor_tree.topology(model).ball_springs
+    first, last = 0, sum(size for kind in model.kind for _, size in taylor_tree.coordinate_names(kind))
+    for k, kind in enumerate(model.kind):
         own: dict[str, list[int]] = {}
         for name, size in taylor_tree.coordinate_names(kind):
             own[name] = [*range(first, first + size)]
             first += size
-        q += [i for name in ("p", "u", "r", "x") for i in own.get(name, [])]
+        if k in springs:
+            own["turn"] = [last, last + 1]
+            last += 2
+        q += [i for name in ("p", "u", "r", "x", "turn") for i in own.get(name, [])]
         v += [i for name in ("omega", "udot", "v", "xdot") for i in own.get(name, [])]
     return [(i, False) for i in q] + [(i, True) for i in v]
 

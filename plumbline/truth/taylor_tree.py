@@ -6,6 +6,9 @@ Body Dynamics Algorithms, 2008, section 6.5).  A rod moves its near end by ℓ (
 rank two: m ℓ² u uᵀ added to its block of M leaves their part across u, and sets that along u to 0.
 Rotors, springs and dampers act on the relative rates ν of their joints, which those of a ball joint are too:
 Ω along the world's axes, whose rotor adds a (Ω̇ + Ω × ω) in the turning near body's axes.
+A spring of a ball joint adds 6 k γ n with n = sin θ times the axis of its turn θ, γ = θ/(6 sin θ).  θ² and γ
+are integrated beside the motion, because θ/sin θ has no Taylor series by recurrence where θ = 0; (8) of
+`enclosure_checker` has their rates, whose series in θ² is f₀.
 Loops are cut open (`plumbline.model.loops`): the ends b and c of each get forces λ on rows J of their
 relative acceleration in the axes of b, with X = M⁻¹ Jᵀ and ν̇₀ of the tree alone
 
@@ -22,9 +25,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Kind, Model, State
+from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Array, Kind, Model, State
 from plumbline.model.loops import CutMechanism, independent_rows
-from plumbline.truth import TruthUnavailable
 
 # Of a loop the bodies b and c, and which of the six rows are held: shifts, then turns, in axes of b.
 Closure = tuple[int, int, tuple[int, ...]]
@@ -39,6 +41,7 @@ class Topology(NamedTuple):
     has_joint_elements: bool = False
     springs: tuple[tuple[int, int], ...] = ()  # bodies of springs between points, −1 the world
     closures: tuple[Closure, ...] = ()
+    ball_springs: tuple[int, ...] = ()  # joints
 
 
 def topology(model: Model) -> Topology:
@@ -50,15 +53,14 @@ def topology(model: Model) -> Topology:
     Returns:
         Kinds of joints, far bodies, and what elements there are.
 
-    Raises:
-        TruthUnavailable: a spring acts on a ball joint; its torque has no Taylor series where it is at rest.
-
     """
-    if any(kind == "ball" and k > 0 for kind, k in zip(model.kind, model.stiffness[:, 0], strict=True)):
-        raise TruthUnavailable("not used for springs of ball joints, which are singular at rest")
     far = tuple(int(far) for far in model.body[:, 0])
     springs = tuple((int(a), int(b)) for a, b in model.spring_body)
-    return Topology(model.kind, far, model.has_drag, model.has_joint_elements, springs)
+    bent = (kind == "ball" and k != 0 for kind, k in zip(model.kind, model.stiffness[:, 0], strict=True))
+    ball_springs = tuple(k for k, is_bent in enumerate(bent) if is_bent)
+    return Topology(
+        model.kind, far, model.has_drag, model.has_joint_elements, springs, ball_springs=ball_springs
+    )
 
 
 def closures(cut: CutMechanism, state: State) -> tuple[Closure, ...]:
@@ -122,7 +124,27 @@ def initial_values(mp: Any, model: Model, state: State) -> list[Any]:
             x["u"] /= mp.norm(x["u"])
             x["udot"] -= x["u"] * (x["u"].T * x["udot"])[0]
         values += [entry for part in x.values() for entry in part]
+    for k in topology(model).ball_springs:
+        theta = _ball_angle(mp, model, state, k)
+        values += [theta**2, 1 / (6 * mp.sinc(theta))]
     return values
+
+
+def _ball_angle(mp: Any, model: Model, state: State, k: int) -> Any:
+    """The turn 0 ≤ θ ≤ π of ball joint k."""
+    quaternions, far = [*model.turn[k], state.p[k]], int(model.body[k, 0])
+    first, last, near = (_unit_rotation(mp, q) for q in quaternions)
+    turned = near @ last
+    if far >= 0:
+        turned = _unit_rotation(mp, state.p[far]).T @ turned
+    R = first.T @ turned
+    sine = mp.norm([R[i, j] - R[j, i] for i, j in ((2, 1), (0, 2), (1, 0))])
+    return mp.atan2(sine, R[0, 0] + R[1, 1] + R[2, 2] - 1)
+
+
+def _unit_rotation(mp: Any, q: Array) -> Any:
+    unit = mp.matrix(q.tolist())
+    return rotation_matrix(unit / mp.norm(unit))
 
 
 def parameter_values(mp: Any, model: Model) -> list[Any]:
@@ -140,15 +162,14 @@ def parameter_values(mp: Any, model: Model) -> list[Any]:
     for k in range(model.n):
         values += [float(model.mass[k]), *model.inertia[k].ravel().tolist(), *model.point[k].ravel().tolist()]
         for q in model.turn[k]:
-            unit = mp.matrix(q.tolist())
-            values += rotation_matrix(unit / mp.norm(unit)).ravel().tolist()
+            values += _unit_rotation(mp, q).ravel().tolist()
         values += [*model.force[k].tolist(), *model.moment[k].tolist()]
         values += [float(x[k]) for x in (model.drag_force, model.drag_moment, model.length)]
         values += [x for name in JOINT_ELEMENTS for x in getattr(model, name)[k].tolist()]
     for j, point in enumerate(model.spring_point):
         numbers = model.spring_stiffness, model.spring_damping, model.spring_length
         values += [*point.ravel().tolist(), *(float(x[j]) for x in numbers)]
-    return values
+    return [*values, *(-1 / mp.mpf(2 * (n + 1) * (2 * n + 5)) for n in reversed(range(_BALL_SPRING_TERMS)))]
 
 
 def equations_of_motion(hy: Any, tree: Topology) -> list[tuple[Any, Any]]:
@@ -183,6 +204,10 @@ def equations_of_motion(hy: Any, tree: Topology) -> list[tuple[Any, Any]]:
         above = gained[far] if far >= 0 else vector([0.0] * 6)
         gained.append(sum((column * rate for column, rate in zip(body.S, own, strict=True)), above))
         system += body.equations(tree.kind[k], above, gained[k], own)
+    first = 3 + _PARAMETERS * len(bodies) + _SPRING_PARAMETERS * len(tree.springs)
+    terms = [hy.par[first + n] for n in range(_BALL_SPRING_TERMS)]
+    for k in tree.ball_springs:
+        system += bodies[k].turn_equations(terms)
     return system
 
 
@@ -197,6 +222,7 @@ class _Body:
     A: Any
     r: Any
     relative_spin: Any  # Ω of a ball joint
+    turn: Any  # of a ball joint with a spring, n
     bend: Any
 
     def __init__(self, hy: Any, tree: Topology, k: int, far: _Body | None) -> None:
@@ -234,6 +260,11 @@ class _Body:
             columns = [(zero, e) for e in units]
         if KINDS[kind].has_attitude:
             self.A = rotation_matrix(self.x["p"])
+            self.turn = None
+            if k in tree.ball_springs:
+                pairs = zip(axes.T, (self.A @ turn_near).T, strict=True)
+                self.turn = sum((np.cross(a, b) for a, b in pairs), zero) * 0.5
+                self.square, self.ratio = hy.make_vars(f"square_{k}", f"ratio_{k}")
             far_spin = self.w
             self.w = self.A @ self.x["omega"]
             self.relative_spin = self.w - far_spin
@@ -276,12 +307,21 @@ class _Body:
         """Of each rate ν of the joint: what its rotor adds to M, and what its elements add to h."""
         a, c, k, rest, effort = self.elements
         if kind == "ball":
-            bend = np.cross(self.relative_spin, self.w)
-            return [(a[0], a[0] * bend[i] + c[0] * self.relative_spin[i]) for i in range(3)]
+            torque = a[0] * np.cross(self.relative_spin, self.w) + c[0] * self.relative_spin
+            if self.turn is not None:
+                torque = torque + (6.0 * k[0] * self.ratio) * self.turn
+            return [(a[0], torque[i]) for i in range(3)]
         if KINDS[kind].has_attitude:
             return []
         x, rate = (self.x.get(name, ()) for name in ("x", "xdot"))
         return [(a[i], c[i] * rate[i] + k[i] * (x[i] - rest[i]) - effort[i]) for i in range(len(x))]
+
+    def turn_equations(self, terms: list[Any]) -> list[tuple[Any, Any]]:
+        """Pairs (θ², rate) and (γ, rate) of a ball joint with a spring."""
+        change, f = 12.0 * self.ratio * (self.turn @ self.relative_spin), 1.0
+        for term in terms:
+            f = self.square * f * term + 1.0
+        return [(self.square, change), (self.ratio, self.ratio * self.ratio * change * f)]
 
     def spatial_inertia(self) -> Any:
         """Inertia (6, 6) about the world's origin: twist → momentum, angular part first."""
@@ -332,6 +372,7 @@ class _Body:
 
 _PARAMETERS = 1 + 9 + 6 + 18 + 6 + 3 + 10  # of a body
 _SPRING_PARAMETERS = 6 + 3
+_BALL_SPRING_TERMS = 40  # of f₀; they are parameters, because constants would be rounded to double
 
 
 def _add_spring(

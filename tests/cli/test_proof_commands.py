@@ -130,9 +130,6 @@ def test_the_rounded_motion_is_within_its_radius():
     assert 0 < proof.attitude_radius[-1] < 1e-15
 
 
-@pytest.mark.parametrize(
-    "name, reason", [("four-bar", "closed loops are not proved"), ("sprung-ball", "a spring on a ball joint")]
-)
-def test_motions_that_cannot_be_proved_are_refused_with_a_reason(name, reason):
-    result = type_command("prove", "tumbling-ball", name)
-    assert result.exit_code == 2 and reason in " ".join(result.stderr.split())
+def test_motions_of_loops_are_refused_with_a_reason():
+    result = type_command("prove", "tumbling-ball", "four-bar")
+    assert result.exit_code == 2 and "closed loops are not proved" in " ".join(result.stderr.split())

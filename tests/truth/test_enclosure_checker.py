@@ -51,7 +51,7 @@ def imported_modules(path):
 
 def test_the_checker_imports_numpy_flint_and_the_standard_library_only():
     """And the file that reads certificates, which imports NumPy and the standard library only."""
-    standard = {"__future__", "collections.abc", "dataclasses", "fractions", "itertools", "typing"}
+    standard = {"__future__", "collections.abc", "dataclasses", "fractions", "typing"}
     assert imported_modules(checker.__file__) == standard | {"numpy", "flint", enclosure_file.__name__}
     standard = {"__future__", "json", "zlib", "dataclasses", "typing"}
     assert imported_modules(enclosure_file.__file__) == standard | {"numpy"}
@@ -332,6 +332,106 @@ def test_a_ball_has_its_moment_with_either_element_alone(field, rate):
     assert coefficient > 0
     for with_it, without, x in moments:
         assert abs(with_it - without - x * coefficient) < 1e-9
+
+
+# (8): springs of ball joints
+
+SPRUNG = {"armature": [["0x0p0"] * 2], "damping": [["0x0p0"] * 2], "stiffness": [["0x1p1", "0x0p0"]]}
+
+
+def sprung_ball(number, terms=None):
+    """The mechanism of one ball with a spring alone; ``terms`` is N of (8)."""
+    mechanism = checker._Mechanism(parsed(without_steps(stored_document("one-ball") | SPRUNG)), number)
+    mechanism.terms = mechanism.terms[-terms:] if terms else mechanism.terms
+    return mechanism
+
+
+def without_steps(document):
+    return document | {"steps": [[1, *[[0]] * 9]]}
+
+
+def turn_rates(mechanism, sigma, constant):
+    """The rates of σ and γ as they are and as the turn φ has them, with γ = 1/2 and ψᵀω found from σ̇."""
+    y = [constant(x) for x in (0.5, 0.5, -0.5, 0.5, sigma, 0.5, 1.0, -2.0, 0.25)]
+    sigma_rate, gamma_rate = mechanism.equations(y, y[-3:])[0][4:]
+    return sigma_rate, gamma_rate
+
+
+def series_of_spring(sigma):
+    """f₀(σ) = 3 (sin φ/φ − cos φ)/σ, whose limit at 0 is 1."""
+    with ctx.workprec(400):
+        phi = arb(sigma).sqrt()
+        return 3 * (phi.sinc() - phi.cos()) / phi**2 if sigma else arb(1)
+
+
+@pytest.mark.parametrize("terms", [1, 2, 3, 5, 12, None])
+@pytest.mark.parametrize("sigma", [0.0, 2.0**-40, 1.5, 9.75])
+def test_the_ratio_of_a_turn_to_its_sine_changes_as_it_must(terms, sigma):
+    """Its rate γ² f₀(σ) σ̇ is enclosed with any number of terms, in balls and in doubles."""
+    with ctx.workprec(150):
+        change, rate = turn_rates(sprung_ball(arb, terms), sigma, lambda x: arb_poly([x]))
+        expected = change(arb(0)) / 4 * series_of_spring(sigma)
+        found = rate(arb(0))
+        assert found.overlaps(expected) and abs(found - expected).mid() <= found.rad()
+        assert terms or found.rad() < 1e-32 * abs(expected)
+        rate = turn_rates(sprung_ball(float, terms), sigma, series_without_radius)[1]
+        radius = float(rate.r[0, 0])
+        assert abs(arb(float(rate.c[0, 0, 0])) - expected) < radius
+        assert (terms or 12) < 12 or radius < 1e-12 * abs(float(expected))
+
+
+def series_without_radius(x):
+    return checker._constant(np.array([[x, 0.0]]))
+
+
+@pytest.mark.parametrize("is_exact", [True, False])
+def test_a_dropped_remainder_of_a_spring_is_noticed(monkeypatch, is_exact):
+    """With few terms the sum alone is far from f₀(σ)."""
+    usual = checker._Mechanism.__init__
+
+    def without_remainder(self, *arguments):
+        usual(self, *arguments)
+        if self.exact == is_exact:
+            self.unknown = arb(0) if is_exact else checker._constant(np.zeros((1, 1)))
+
+    monkeypatch.setattr(checker._Mechanism, "__init__", without_remainder)
+    with pytest.raises(AssertionError):
+        test_the_ratio_of_a_turn_to_its_sine_changes_as_it_must(2, 1.5)
+
+
+@pytest.mark.parametrize("sigma, is_near", [(9.859, False), (9.861, True), (-9.861, True), (np.nan, True)])
+def test_a_spring_near_half_a_turn_is_rejected(sigma, is_near):
+    """Its moment jumps where σ = π², which the tube must not reach: 9.86 is below it and below 10."""
+    assert checker.MAX_SIGMA < np.pi**2 < 10
+
+    def turn():
+        return turn_rates(sprung_ball(float), sigma, series_without_radius)
+
+    if is_near:
+        with pytest.raises(checker.Rejected, match=r"inequality \(8\): near half a turn"):
+            turn()
+    else:
+        assert turn()
+
+
+def test_a_spring_near_half_a_turn_counts_its_tube():
+    wide = {9.8: checker._Series(series_without_radius(9.8).c, np.array([[0.07, 0.0]]))}
+    with pytest.raises(checker.Rejected, match="near half a turn"):
+        turn_rates(sprung_ball(float), 9.8, lambda x: wide.get(x, series_without_radius(x)))
+
+
+@pytest.mark.parametrize("degrees", [0, 1e-9, 60, 179])
+def test_the_turn_of_a_spring_starts_as_the_attitude_has_it(degrees):
+    """σ = φ² and γ = φ/(6 sin φ), for a turn about any axis and either sign of the quaternion."""
+    half, axis = np.radians(degrees) / 2, np.array([2.0, -1.0, 2.0]) / 3
+    none = [[["0x1p0", *["0x0p0"] * 3]] * 2]
+    for sign in (1, -1):
+        p = sign * np.array([np.cos(half), *(np.sin(half) * axis)])
+        document = stored_document("one-ball") | SPRUNG | {"turn": none, "p": [[x.hex() for x in p.tolist()]]}
+        y = checker._initial_values(checker._Mechanism(parsed(without_steps(document)), arb))
+        phi = 2 * half
+        assert abs(float(y[4]) - phi**2) <= 1e-12 * phi and y[4].rad() < 1e-12
+        assert float(y[5]) == pytest.approx(phi / np.sin(phi) / 6 if phi else 1 / 6, rel=1e-10)
 
 
 def test_samples_are_at_their_times_of_their_steps(monkeypatch):

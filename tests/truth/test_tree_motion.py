@@ -8,7 +8,7 @@ import pytest
 
 from plumbline.model.datatypes import KINDS, Model
 from plumbline.model.invariants import attitude_error, compute_invariants, position_error
-from plumbline.model.kinematics import complete_state, quaternion_rate, state_from_minimal
+from plumbline.model.kinematics import ball_spring_rest, complete_state, quaternion_rate, state_from_minimal
 from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import find_scenario_file, load_scenario
@@ -74,10 +74,22 @@ def test_both_methods_agree_on_every_element(kinds, element):
     assert np.max(attitude_error(p, other.p)) < 1e-12
 
 
-def test_springs_of_balls_are_left_to_the_notes_form():
-    model = random_tree(np.random.default_rng(3), 2, ("ball",), elements=("stiffness",))
+@pytest.mark.parametrize("kinds", [("ball",), ("ball", "universal", "rod")], ids=str)
+def test_both_methods_agree_on_springs_of_balls(kinds):
+    model = random_tree(np.random.default_rng(3), 3, kinds, elements=("stiffness",))
     (state,) = random_states(model, 1, 2)
-    assert "springs of ball joints" in trajectory_truth(model, state, TIMES[:3]).method
+    truth = trajectory_truth(model, state, TIMES[:3])
+    assert "ball" in model.kind and truth.method.startswith("Taylor's method")
+    assert truth.position_uncertainty[-1] < 1e-13 and truth.attitude_uncertainty[-1] < 1e-12
+
+
+def test_a_spring_of_a_ball_at_rest_has_a_taylor_series():
+    """θ/sin θ is 0/0 where the spring is unloaded."""
+    model = random_tree(np.random.default_rng(3), 1, ("ball",), elements=("stiffness",))
+    (state,) = random_states(model, 1, 2)
+    unloaded = complete_state(model, replace(state, p=np.array([ball_spring_rest(model, 0)])))
+    truth = trajectory_truth(model, unloaded, TIMES[:3])
+    assert truth.method.startswith("Taylor's method") and truth.position_uncertainty[-1] < 1e-13
 
 
 def test_precisions_agree():
