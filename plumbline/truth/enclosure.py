@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 CertificatePrecision = Literal["quad", "octuple"]
 BITS: dict[CertificatePrecision, int] = {"quad": 110, "octuple": 230}  # after the binary point
 ORDER_PER_BIT = 0.5  # of the series: a step is a quarter of their radius of convergence
-LENGTH_BITS = 20  # after the binary point, of a step
-MAX_STEPS_TRIED = (0.5, 0.25, 0.125)  # longest step in units of time; a motion at rest has infinite ones
+LENGTH_BITS = 40  # after the binary point, of a step
+MAX_STEPS = (0.5, 0.25, 0.125)  # tried in turn, in units of time; a motion at rest has infinite ones
 
 
 def load_checker() -> Any:
@@ -69,14 +69,14 @@ def prove_motion(
     precision: CertificatePrecision = "quad",
     on_step: Callable[[int, int], None] = lambda _done, _of: None,
 ) -> tuple[bytes, Enclosure]:
-    """Find a candidate and prove it; where it is rejected, try again with shorter steps.
+    """Find a candidate and prove it; where it is rejected, try octuple precision and shorter steps.
 
     Args:
         model: the mechanism.
         state: initial state, of which the minimal coordinates are used.
         times: (T,) [s] of the samples, ascending from 0 on.
         scenario: content hash of the scenario, written to the certificate.
-        precision: of the candidate.
+        precision: of the first candidate.
         on_step: called after each proved step with the numbers of proved steps and of all.
 
     Returns:
@@ -92,12 +92,13 @@ def prove_motion(
     if reason := reason_not_provable(model):
         raise TruthUnavailable(reason)
     checker = load_checker()
-    for attempt, max_step in enumerate(MAX_STEPS_TRIED, 1):
-        raw = make_certificate(model, state, times, scenario, precision, max_step)
+    attempts = dict.fromkeys([(MAX_STEPS[0], precision), *((max_step, "octuple") for max_step in MAX_STEPS)])
+    for attempt, (max_step, bits) in enumerate(attempts, 1):
+        raw = make_certificate(model, state, times, scenario, bits, max_step)
         try:
             return raw, checker.enclose_motion(parse_certificate(raw), on_step)
         except checker.Rejected:
-            if attempt == len(MAX_STEPS_TRIED):
+            if attempt == len(attempts):
                 raise
     raise AssertionError("unreachable")
 
@@ -108,7 +109,7 @@ def make_certificate(
     times: Array,
     scenario: str = "",
     precision: CertificatePrecision = "quad",
-    max_step: float = MAX_STEPS_TRIED[0],
+    max_step: float = MAX_STEPS[0],
 ) -> bytes:
     """Write a candidate motion as a certificate, without proving it.
 
@@ -194,9 +195,8 @@ def time_exponent(model: Model, state: State) -> int:
 
     """
     levers = np.linalg.norm(model.point[:, 1], axis=1) + model.length
-    swing = (
-        math.sqrt(float(np.linalg.norm(model.gravity)) / lever) if (lever := float(np.min(levers))) else 0.0
-    )
+    lever = float(np.min(levers, where=levers > 0, initial=np.inf))
+    swing = math.sqrt(float(np.linalg.norm(model.gravity)) / lever)
     rates = (float(np.max(np.abs(x))) for x in (state.omega, state.udot, state.xdot))
     return -round(math.log2(max(*rates, swing, 2.0**-10)))
 

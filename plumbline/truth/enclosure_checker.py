@@ -103,7 +103,7 @@ from flint import arb, arb_poly, ctx
 from plumbline.truth.enclosure_file import JOINTS, SHAPES, Array, Certificate
 
 DEGREE, GUARD_BITS = 11, 40  # of the linear part (R falls with h¹²); of (2) beyond the certificate's own
-MIN_TUBE, MAX_CONDITION = 2.0**-44, 100.0  # of ε and of T
+MIN_TUBE, MAX_CONDITION, FAST = 2.0**-44, 100.0, 256.0  # of ε, of T, and of rates where steps are short
 ROUNDING, TINY = 2.0**-51, 2.0**-1000  # of (F)
 MAX_SIGMA, UNIT = 9.86, arb(0.5, 0.5)  # of (8), below π²; [0, 1]
 
@@ -259,8 +259,7 @@ class _Mechanism:
         data: Any = {x: np.frompyfunc(arb, 1, 1)(c) / self.unit ** SHAPES[x][1] for x, c in file.data.items()}
         data["axes"] = np.array([[_rotation(q) / (q @ q) for q in pair] for pair in data["turn"]])
         _require(all(x.rel_accuracy_bits() > 60 for x in data["axes"].ravel()), "turn: axes too inexact")
-        terms = reversed(range(ctx.prec // 7 if self.exact else 12))  # of (8): N, more hardly count
-        self.terms = [number(-1) / (2 * (n + 1) * (2 * n + 5)) for n in terms]
+        self.terms = [number(-1) / (2 * (n + 1) * (2 * n + 5)) for n in range(ctx.prec // 7)[::-1]]  # of (8)
         self.data: dict[str, Any] = {name: np.frompyfunc(number, 1, 1)(x) for name, x in data.items()}
         self.unknown = arb(0, 1) if self.exact else _Series(np.zeros((DEGREE + 1, 1, 1)), 1.0)  # 0 ± 1 of (8)
 
@@ -392,7 +391,7 @@ def _variables(coefficients: list[Array], radii: Array) -> list[_Series]:
 def _linearise(mechanism: _Mechanism, rows: list[Array], tube: float, g: Array) -> tuple[Any, Any, float]:
     """(3), (4): the derivatives of q̇ and G by y and v̇, C, and θ."""
     nq, n = mechanism.nq, mechanism.nq + mechanism.nv
-    for beta in tube * 16.0 ** np.arange(3, 9):
+    for beta in tube * 16.0 ** np.arange(3, 16):
         x = _variables(rows, np.repeat([tube, beta], [n, mechanism.nv]))
         qdot, residual = mechanism.equations(x[:n], x[n:])
         slopes = _join([*qdot, *residual]).block(slice(None), slice(1, None))
@@ -430,10 +429,10 @@ def _evaluate(P: _Series, s: float) -> _Series:
     return _Series(_constant(np.polyval(P.c[::-1], s)).c, _up(4 * DEGREE * ROUNDING * P.total))
 
 
-def _next_ellipsoid(X: _Series, rho: float, jump: Array) -> tuple[Array, float]:
+def _next_ellipsoid(X: _Series, rho: float, jump: Array, scale: Any = 1.0) -> tuple[Array, float]:
     """(7): T and the bound of ‖w⁺(0)‖."""
-    U, S, _ = np.linalg.svd(X.c[0])
-    T = U * np.maximum(S / S[0], 1 / MAX_CONDITION)
+    U, S, _ = np.linalg.svd(X.c[0] * scale)
+    T = U * np.maximum(S / S[0], 1 / MAX_CONDITION) / scale
     Q = _constant(np.linalg.inv(T))
     theta = _inverse_error(Q, _constant(T), "inequality (7): Q is no approximate inverse of T")
     B = Q @ X
@@ -489,10 +488,11 @@ def enclose_motion(certificate: Certificate, on_step: Callable[..., Any] = lambd
         end, X, rho = _initial_values(exact), _constant(np.eye(exact.nq + exact.nv)), 0.0
         for k, (length, *rows) in enumerate(certificate.steps):
             y, h = [arb_poly([c * unit for c in row]) for row in rows], length * unit
+            scale = np.repeat([1.0, min(1.0, FAST * float(h))], [exact.nq, exact.nv])[:, None]
             try:
                 rates = ([j * c / length for j, c in enumerate(row[1:], 1)] for row in rows[exact.nq :])
                 rows = [np.array(x) for x in (*([c / 2**bits for c in row] for row in rows), *rates)]
-                start = _next_ellipsoid(X, rho, _upper(x - f(arb(0)) for x, f in zip(end, y, strict=True)))
+                start = _next_ellipsoid(X, rho, _upper(x - f[0] for x, f in zip(end, y, strict=True)), scale)
                 P, rho = _prove_step(rounded, rows, float(h), _bound_defect(exact, y, h), *start)
             except (Rejected, OverflowError, np.linalg.LinAlgError) as error:
                 raise Rejected(f"step {k + 1} of {len(certificate.steps)}: {error}") from None

@@ -403,18 +403,34 @@ def test_a_motion_at_rest_is_enclosed():
     assert enclosure.radius("r") < 1e-30  # a thousand times the last of the coefficients' 110 bits
 
 
-def test_a_rejected_candidate_is_tried_again_with_shorter_steps(monkeypatch):
-    lengths = []
+def test_a_rejected_candidate_is_tried_again_in_octuple_precision_and_with_shorter_steps(monkeypatch):
+    tried = []
 
     def reject(certificate, _):
-        lengths.append(certificate.steps[0][0] / 2**certificate.bits)
+        tried.append((certificate.steps[0][0] / 2**certificate.bits, certificate.bits))
         raise checker.Rejected("never proved")
 
     monkeypatch.setattr(checker, "enclose_motion", reject)
     scenario = load_scenario(find_scenario_file("rest"))
     with pytest.raises(checker.Rejected, match="never proved"):
         prove_motion(scenario.model, scenario.state, np.array([0.0, 1.0]))
-    assert lengths == [0.5, 0.25, 0.125]
+    assert tried == [(0.5, 110), (0.5, 230), (0.25, 230), (0.125, 230)]
+
+
+def test_a_motion_is_enclosed_while_its_steps_shrink():
+    """A cart of a millionth of the mass of the bob on its pole, whose lowest point is at 0.4515 s."""
+    scenario = load_scenario(find_scenario_file("light-cart-pole"))
+    _, enclosure = prove_motion(scenario.model, scenario.state, np.array([0.0, 0.451]))
+    assert enclosure.radius("r") < 1e-24
+
+
+@pytest.mark.full
+def test_a_motion_is_enclosed_through_two_nearly_singular_poses():
+    """It turns there within microseconds; steps shrink by a million and grow again."""
+    scenario = load_scenario(find_scenario_file("light-cart-pole"))
+    raw, enclosure = prove_motion(scenario.model, scenario.state, np.arange(33) / 16)
+    lengths = [step[0] for step in parse_certificate(raw).steps]
+    assert enclosure.radius("r") < 1e-40 and max(lengths) > 1e5 * min(lengths)
 
 
 def test_fast_spin_is_enclosed():
