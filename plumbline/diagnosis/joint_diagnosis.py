@@ -122,7 +122,7 @@ def diagnose_joints(model: Model, reported: Sequence[StateQuantities], truth: St
     """
     every = _Difference(model, reported, truth, _View(QUANTITIES), range(min(len(reported), MAX_STATES)))
     if np.max(np.abs(every.values[every.vectors])) <= ACCEPTED_RATIO:
-        return _energy_cause(model, reported, truth)
+        return _energy_cause(every, reported, truth)
     views = [_View(QUANTITIES)]
     if model.has_loops:
         views.append(_View(QUANTITIES, are_bodies_kept=True))
@@ -290,8 +290,9 @@ def _accepted(difference: _Difference, slopes: Array, inverse: Array) -> Array:
     return most
 
 
-def _energy_cause(model: Model, reported: Sequence[StateQuantities], truth: StateTruth) -> str:
-    """Name what an energy leaves out, where accelerations and wrenches are right."""
+def _energy_cause(every: _Difference, reported: Sequence[StateQuantities], truth: StateTruth) -> str:
+    """Name what an energy leaves out or misreads, where accelerations and wrenches are right."""
+    model = every.model
     parts: list[tuple[str, str, Callable[[Model, State], float]]] = [
         ("kinetic_energy", "the rotors", kinetic_energy_of_rotors),
         ("potential_energy", "the springs", elastic_energy),
@@ -302,13 +303,28 @@ def _energy_cause(model: Model, reported: Sequence[StateQuantities], truth: Stat
         pairs = list(zip(reported, truth.quantities, truth.states, truth.bounds, strict=True))
         off = [getattr(a, name) - getattr(b, name) for a, b, _, _ in pairs]
         bounds = [ACCEPTED_RATIO * float(np.max(bound.tolerance(name))) for *_, bound in pairs]
-        if max(abs(x) / bound for x, bound in zip(off, bounds, strict=True)) <= 1:
+        if all(abs(x) <= bound for x, bound in zip(off, bounds, strict=True)):
             continue
         shares = [energy(model, state) for _, _, state, _ in pairs]
         for factor, words in ((-1.0, "without"), (1.0, "with twice")):
             if all(abs(x - factor * y) <= b for x, y, b in zip(off, shares, bounds, strict=True)):
                 return f"behaves as if it returned the {name.replace('_', ' ')} {words} that of {what}"
+    found = _misread_alone(every)
+    if found:
+        return f"behaves as if {found}"
     return "accelerations and joint wrenches are right; no part of an energy explains the difference"
+
+
+def _misread_alone(difference: _Difference) -> str:
+    """Name the only misreading that explains a difference which is more than rounding, or none."""
+    if np.max(np.abs(difference.values)) <= ACCEPTED_RATIO:
+        return ""
+    found = [
+        words
+        for words, misread in misreadings(difference.model)
+        if np.max(np.abs(difference.values - difference.effect(misread))) <= difference.accepted
+    ]
+    return found[0] if len(found) == 1 else ""
 
 
 def _moment_cause(model: Model, reported: Sequence[StateQuantities], truth: StateTruth) -> str:

@@ -1,7 +1,9 @@
 """Defects of joints and passive elements: every one is reported, and named by its own number."""
 
+from dataclasses import replace
 from functools import cache
 
+import numpy as np
 import pytest
 
 from plumbline.diagnosis.joint_diagnosis import diagnose_joints
@@ -9,8 +11,9 @@ from plumbline.engines.calls import Evaluation
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import RowContext
 from plumbline.judging.state import judge_states
-from plumbline.model.kinematics import complete_state
+from plumbline.model.kinematics import complete_state, rotation_matrix
 from plumbline.model.sampling import random_states
+from plumbline.scenario.loader import catalogue, load_scenario
 from plumbline.truth.ground_truth import state_truth
 from tests.helpers.nightly_tests import some_fast
 from tests.helpers.planted_elements import ELEMENT_DEFECTS, ElementDefect, subject
@@ -63,3 +66,13 @@ def test_the_engines_without_defect_are_not_reported(engine):
 def test_there_are_forty_and_nine_of_ten_are_named():
     assert len(ELEMENT_DEFECTS) >= 40 and len({d.name for d in ELEMENT_DEFECTS}) == len(ELEMENT_DEFECTS)
     assert sum(bool(d.expected) for d in ELEMENT_DEFECTS) >= 0.9 * len(ELEMENT_DEFECTS)
+
+
+def test_a_misread_velocity_that_only_energies_show_is_named_without_gravity():
+    scenario = load_scenario(catalogue()["free-body-with-rotors"])
+    model, states = scenario.model, random_states(scenario.model, 3, seed=2)
+    truth = state_truth(model, states)
+    assert not np.any(model.gravity) and truth.bounds[0].tolerance("potential_energy") == 0
+    turned = [replace(s, v=np.matvec(rotation_matrix(s.p), s.v)) for s in truth.states]
+    found = load_adapter("pinocchio").evaluate(model, turned)
+    assert "the velocity of body 1 were given in the body frame" in diagnose_joints(model, found, truth)
