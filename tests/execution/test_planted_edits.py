@@ -1,0 +1,39 @@
+"""Mistakes of one line in real adapters: a run reports and names them, and accuses no control."""
+
+from functools import cache
+
+import pytest
+
+from plumbline.judging.rows import Verdict
+from tests.helpers.nightly_tests import some_fast
+from tests.helpers.planted_edits import EDITS, rows_of_run
+
+for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
+    pytest.importorskip(engine)
+
+STATES = 8
+DEFECTS = [edit for edit in EDITS if not edit.is_control]
+
+
+@cache
+def attention(name):
+    """The rows of all runs of one edit that need attention."""
+    (edit,) = [edit for edit in EDITS if edit.name == name]
+    found = [row for run in edit.runs for row in rows_of_run(edit, *run, STATES)]
+    return [row for row in found if row.verdict.needs_attention and row.verdict != Verdict.UNSUPPORTED]
+
+
+@pytest.mark.parametrize("edit", some_fast(DEFECTS, 12))
+def test_every_defect_is_reported(edit):
+    assert attention(edit.name), f"nothing reports {edit.name}"
+
+
+@pytest.mark.parametrize("edit", some_fast([d for d in DEFECTS if d.expected], 12))
+def test_every_defect_with_words_is_named(edit):
+    names = {row.diagnosis for row in attention(edit.name) if row.diagnosis}
+    assert any(edit.expected in name and "cannot distinguish" not in name for name in names), names
+
+
+@pytest.mark.parametrize("edit", some_fast([edit for edit in EDITS if edit.is_control], 5))
+def test_no_control_is_accused(edit):
+    assert not [row.reason for row in attention(edit.name)]

@@ -1,0 +1,74 @@
+"""Defects as edits of an adapter's or the reference's text, and what a run of the catalogue makes of them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from unittest.mock import patch
+
+from ruamel.yaml import YAML
+
+from plumbline.engines.registry import ENGINES, load_adapter
+from plumbline.execution.plan import Plan
+from plumbline.execution.scenario_run import ScenarioRun
+from plumbline.judging.rows import Row
+from plumbline.processes.workers import run_task
+from plumbline.scenario.loader import load_scenarios
+
+ROOT = Path(__file__).parents[2]
+BETWEEN = {  # modules that hold parts of the edited one and are loaded between it and the adapter
+    "reference_impl.elements": ("reference_impl.direct",),
+    "reference_impl.joints": ("reference_impl.direct",),
+}
+
+
+@dataclass(frozen=True)
+class Edit:
+    """One mistake, and where a run of the catalogue would compare it."""
+
+    name: str
+    engine: str
+    file: str
+    old: str
+    new: str
+    runs: list[tuple[str, str]]  # scenario and level
+    expected: str = ""  # words of the diagnosis; empty: it need only be reported
+    is_control: bool = False  # another computation of the same numbers
+
+
+EDITS = [Edit(**entry) for entry in YAML(typ="safe").load(Path(__file__).with_suffix(".yaml"))]
+
+
+@contextmanager
+def edited(edit: Edit) -> Iterator[None]:
+    """Give every caller the engine whose text is edited."""
+    text = (ROOT / edit.file).read_text(encoding="utf-8")
+    assert text.count(edit.old) == 1, f"the edit {edit.name!r} does not fit {edit.file}"
+    first = edit.file.removesuffix(".py").replace("/", ".")
+    adapter, _, class_name = ENGINES[edit.engine].partition(":")
+    import_module(adapter)
+    with patch.dict(sys.modules):
+        for name in dict.fromkeys((first, *BETWEEN.get(first, ()), adapter)):
+            source = (ROOT / (name.replace(".", "/") + ".py")).read_text(encoding="utf-8")
+            module = sys.modules[name] = ModuleType(name)
+            exec(source.replace(edit.old, edit.new) if name == first else source, vars(module))
+        engine = getattr(sys.modules[adapter], class_name)
+    with patch("plumbline.engines.calls.load_adapter", lambda _: engine()):
+        yield
+
+
+def rows_of_run(edit: Edit, scenario_name: str, level: str, states: int) -> list[Row]:
+    """Run a scenario on the edited engine in this process, with the diagnosis of what disagrees."""
+    (scenario,) = load_scenarios([scenario_name])
+    plan = Plan([scenario], [edit.engine], level, random_state_count=states)  # type: ignore[arg-type]
+    run = ScenarioRun(plan, scenario, {edit.engine: load_adapter(edit.engine).describe()})
+    with edited(edit):
+        waiting = list(run.tasks())
+        while waiting:
+            waiting += run.on_outcome(run_task(waiting.pop(0)))
+    return run.findings().rows
