@@ -49,7 +49,8 @@ class JointCause:
         for factor, words in FACTORS.items() if self.nominal else ():
             if abs(x - factor * self.nominal) <= ACCEPTED_SHARE * abs(self.nominal):
                 return f"{self.subject} {words}"
-        return f"{self.subject} were {x:.9g}{self.unit} instead of {self.nominal:.9g}{self.unit}"
+        digits = 9 if abs(x - self.nominal) > 1e-8 * abs(self.nominal) else 15
+        return f"{self.subject} were {x:.{digits}g}{self.unit} instead of {self.nominal:.9g}{self.unit}"
 
     def _describe_vector(self, x: Array) -> str:
         if self.unit != " rad":
@@ -74,22 +75,23 @@ def joint_causes(model: Model) -> Iterator[JointCause]:
 
     """
     yield from _body_causes(model)
+    yield from _repeated_causes(model)
     for name in JOINT_ELEMENTS:
         values = getattr(model, name)
         if np.count_nonzero(values) > 1:
-            yield JointCause(f"{_word(name)} of all joints", _all(name), 1.0, 1.0)
+            yield JointCause(f"{element_words(name)} of all joints", _all(name), 1.0, 1.0)
             for what in ("slide", "turn"):
-                places = [at for at in _coordinates(model) if _is(model, at, what)]
-                if 0 < len(places) < np.count_nonzero(values):
+                places = [at for at in _coordinates(model) if _is(model, at, what) and values[at]]
+                if 1 < len(places) < np.count_nonzero(values):
                     change = _scaled_places(name, places)
-                    yield JointCause(f"{_word(name)} of all {what}s", change, 1.0, 1.0)
+                    yield JointCause(f"{element_words(name)} of all {what}s", change, 1.0, 1.0)
         for k, i in _coordinates(model):
             which = f" {'xy'[i] if model.kind[k] == 'universal' else ('slide', 'turn')[i]}"
             of = f"joint {k + 1}" + which * (len(KINDS[model.kind[k]].motions) > 1)
             if name not in ("rest", "effort") or model.kind[k] != "ball":
                 scale = float(abs(values[k, i])) or 1.0
                 yield JointCause(
-                    f"{_word(name)} of {of}", one_number(name, (k, i)), float(values[k, i]), scale
+                    f"{element_words(name)} of {of}", one_number(name, (k, i)), float(values[k, i]), scale
                 )
     for i in range(len(model.spring_body)):
         for name in SPRING_FIELDS[2:]:
@@ -179,8 +181,55 @@ def _body_causes(model: Model) -> Iterator[JointCause]:
                 yield JointCause(f"{words} {of}", one_number(name, (k,)), 0.0, mass)
 
 
-def _word(name: str) -> str:
-    return ELEMENT_WORDS.get(name, f"the {name}")
+def _repeated_causes(model: Model) -> Iterator[JointCause]:
+    """One factor in several places: of all bodies, joints or springs, or from one of them on."""
+    off_diagonal = 1 - np.eye(3)
+    fields = [
+        ("the products of inertia", "inertia", "bodies", off_diagonal),
+        ("the inertia", "inertia", "bodies", 1),
+    ]
+    fields += [(words, name, "bodies", 1) for name, words in NAMES.items()]
+    fields += [(element_words(name), name, "joints", 1) for name in JOINT_ELEMENTS]
+    for side, where in enumerate(("far", "near")):
+        fields.append((f"the {where} points", "point", "joints", np.eye(2)[side][:, None]))
+    fields += [(f"the {name.removeprefix('spring_')}", name, "springs", 1) for name in SPRING_FIELDS[2:]]
+    for words, name, things, part in fields:
+        scaled = [bool(np.any(one)) for one in getattr(model, name) * part]
+        places = np.flatnonzero(scaled)
+        for first in places[int(things == "joints" and name in JOINT_ELEMENTS) : -1]:
+            which = f"all {things}" if first == places[0] else f"{things} {first + 1} to {len(scaled)}"
+            yield JointCause(
+                f"{words} of {which}",
+                _scaled_from(name, int(first), part),
+                1.0,
+                1.0,
+                "",
+                words != "the inertia",
+            )
+
+
+def _scaled_from(name: str, first: int, part: Any) -> Callable[[Model, float], Model]:
+    """Multiply a part of a field by a factor, from one place on."""
+
+    def change(model: Model, x: float) -> Model:
+        values = getattr(model, name).copy()
+        values[first:] *= 1 + (x - 1) * part
+        return replace(model, **{name: values})
+
+    return change
+
+
+def element_words(name: str) -> str:
+    """Name a field of the mechanism.
+
+    Args:
+        name: the field.
+
+    Returns:
+        The words, with an article.
+
+    """
+    return ELEMENT_WORDS.get(name) or NAMES.get(name, f"the {name}")
 
 
 def _coordinates(model: Model) -> list[tuple[int, int]]:

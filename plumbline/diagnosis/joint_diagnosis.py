@@ -13,12 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from plumbline.diagnosis.force_location import is_spanned, locate_force
 from plumbline.diagnosis.joint_causes import ACCEPTED_SHARE, FACTORS, JointCause, joint_causes, vector_causes
 from plumbline.diagnosis.joint_prediction import VECTORS, Predictor, Seen
 from plumbline.diagnosis.misreadings import Misreading, misreadings, other_branches
-from plumbline.diagnosis.row_defects import missing_gammas, row_defects
+from plumbline.diagnosis.row_defects import missing_gammas, row_defects, velocity_terms
 from plumbline.model.datatypes import Array, Model, State, StateQuantities
 from plumbline.model.kinematics import (
+    JointFrame,
     complete_state,
     elastic_energy,
     kinetic_energy_of_rotors,
@@ -42,6 +44,7 @@ MIN_SIMILARITY = 0.3  # cosine between the difference and a cause's effect, to b
 ACCEPTED_RATIO = 4.0  # in bounds
 MIN_RATIO_OF_VECTORS = 100.0  # in bounds: three numbers explain a smaller difference by chance
 CHECKED_SHARE = 10.0  # of what is accepted, at the states that nothing was fitted to
+ELEMENT_MOMENTS = "those of their springs, dampers and efforts"
 ENERGIES = ("kinetic_energy", "potential_energy")
 QUANTITIES = (*VECTORS, *ENERGIES)
 QUARTER_TURNS = [  # rotation vectors of the turns of a cube, half turns twice
@@ -128,6 +131,8 @@ def diagnose_joints(model: Model, reported: Sequence[StateQuantities], truth: St
         views.append(_View(QUANTITIES, are_bodies_kept=True))
         # an engine's forces that close an open loop act on both ends, its own wrenches count them at one
         views.append(_View((*VECTORS[:2], *ENERGIES), end_rows="twists"))
+    elif np.all(np.abs(every.values[every.vectors.stop :]) <= ACCEPTED_RATIO):
+        views.append(_View(VECTORS))  # energies that are right may be found from other numbers
     for view in views:
         found = _explanations(model, reported, truth, view)
         if found:
@@ -135,7 +140,34 @@ def diagnose_joints(model: Model, reported: Sequence[StateQuantities], truth: St
             return f"behaves as if {named}" + (
                 f"; the data cannot distinguish this from: {'; '.join(equal)}" if equal else ""
             )
-    return (not model.has_loops and _moment_cause(model, reported, truth)) or UNEXPLAINED
+    if model.has_loops:
+        return UNEXPLAINED
+    return _moment_cause(model, reported, truth) or _force_cause(every, reported, truth) or UNEXPLAINED
+
+
+def _force_cause(every: _Difference, reported: Sequence[StateQuantities], truth: StateTruth) -> str:
+    """Name the place of unknown forces; only where the energies are right and accelerations are not."""
+    if np.any(np.abs(every.values[every.vectors.stop :]) > ACCEPTED_RATIO):
+        return ""
+    view = _View(tuple(q for q in VECTORS if q in every.names))
+    places = range(min(len(reported), MAX_CHECKED))
+    several = _Difference(every.model, reported, truth, view, places)
+    accelerations = _Difference(every.model, reported, truth, _View(VECTORS[:2]), places)
+    if np.max(np.abs(accelerations.values)) <= ACCEPTED_RATIO:
+        return ""
+    states = np.tile(np.repeat(np.arange(len(places)), 3 * every.model.n), len(view.quantities))
+    found = locate_force(
+        every.model, lambda models: _vectors_at(several, models), several.values, states, several.accepted
+    )
+    if not found:
+        values, kinds = several.values, enumerate(every.model.kind)
+        rows = {k: [several.effect(one) for one in velocity_terms(k)] for k, kind in kinds if kind != "free"}
+        found = [
+            f"the velocity term of joint {k + 1} were another"
+            for k, some in rows.items()
+            if is_spanned(np.stack(some, axis=1), values, states, several.accepted)
+        ]
+    return f"behaves as if {found[0]}" if len(found) == 1 else ""
 
 
 def _explanations(
@@ -156,11 +188,15 @@ def _explanations(
         if x is not None:
             found.append(cause.describe(float(x[0])))
     first, rows = at(1), dict[str, str]()
-    without_numbers = (*misreadings(model), *row_defects(model)) if view == _View(QUANTITIES) else ()
+    others = at(MAX_STATES, min(len(reported), MAX_CHECKED)) if len(reported) > MAX_STATES else difference
+    is_plain = not view.are_bodies_kept and not is_open
+    without_numbers = (*misreadings(model), *row_defects(model)) if is_plain else ()
     for words, misread in missing_gammas(model) if view.are_bodies_kept else without_numbers:
         if np.max(np.abs(first.values - first.effect(misread))) > difference.accepted:
             continue  # at half the cost
-        if np.max(np.abs(difference.values - difference.effect(misread))) <= difference.accepted:
+        if all(
+            np.max(np.abs(one.values - one.effect(misread))) <= one.accepted for one in (difference, others)
+        ):
             rows.setdefault(words.partition(" along ")[0], words)  # of a joint's rows one is enough
     found += rows.values()
     if not found and model.has_loops and view == _View(QUANTITIES):
@@ -168,8 +204,9 @@ def _explanations(
         found += [
             words for words, poses in other_branches(model) if all(_is_one_of(one, poses) for one in alone)
         ]
-    if not found and np.max(np.abs(difference.values)) >= MIN_RATIO_OF_VECTORS:
-        found = _fitted_vectors(difference, at(MAX_STATES, min(len(reported), MAX_CHECKED)))
+    is_large = np.max(np.abs(difference.values)) >= MIN_RATIO_OF_VECTORS
+    if not found and is_large and view != _View(VECTORS):  # three numbers explain fewer quantities by chance
+        found = _fitted_vectors(difference, others)
     return found
 
 
@@ -344,9 +381,11 @@ def _moment_cause(model: Model, reported: Sequence[StateQuantities], truth: Stat
         near = state.r + np.matvec(rotation_matrix(state.p), model.proximal)
         tree = model.mass @ state.r / np.sum(model.mass)
         points = {"the centres of mass": state.r, "the world's origin": 0 * near,
-                  "the centre of mass of the whole": np.broadcast_to(tree, near.shape)}  # fmt: skip
+                  "the centre of mass of the whole": np.broadcast_to(tree, near.shape),
+                  "the far points": _far_points(model, state)}  # fmt: skip
         for words, point in points.items():
             arms.setdefault(words, []).append(np.cross(near - point, true.joint_reaction).ravel())
+        arms.setdefault(ELEMENT_MOMENTS, []).append(_element_moments(model, state).ravel())
         off.append(np.ravel(np.asarray(answer.joint_moment) - true.joint_moment))
         sizes.append(np.repeat(bound.tolerance("joint_moment"), 3))
     difference, size = np.concatenate(off), np.concatenate(sizes)
@@ -355,10 +394,32 @@ def _moment_cause(model: Model, reported: Sequence[StateQuantities], truth: Stat
         lever = np.concatenate(parts)
         factor = float(lever @ difference) / max(float(lever @ lever), 1e-300)
         if np.max(np.abs(difference - factor * lever) / size) <= accepted:
+            if words == ELEMENT_MOMENTS:
+                kept = "without" if abs(factor + 1) < ACCEPTED_SHARE else f"with {1 + factor:.6g} times"
+                return f"behaves as if it returned the moments of joints {kept} {words}"
             if abs(factor - 1) < ACCEPTED_SHARE:
                 return f"behaves as if the moments of joints were about {words}"
             return f"behaves as if the arm of joint moments to {words} counted {1 - factor:.6g} times"
     return ""
+
+
+def _far_points(model: Model, state: State) -> Array:
+    """Where the joints' far points are (N, 3), world frame."""
+    far = model.body[:, 0]
+    place = state.r[far] + np.matvec(rotation_matrix(state.p[far]), model.point[:, 0])
+    return np.where(far[:, None] < 0, model.point[:, 0], place)
+
+
+def _element_moments(model: Model, state: State) -> Array:
+    """Moments (N, 3) of springs, dampers and efforts of the joints' turns; of ball joints none."""
+    found, turns = np.zeros((model.n, 3)), rotation_matrix(state.p)
+    torque = model.effort - model.stiffness * (state.x - model.rest) - model.damping * state.xdot
+    for k, far in enumerate(model.body[:, 0]):
+        axes = JointFrame(model, k, turns[far] if far >= 0 else np.eye(3)).axes(state.x[k])
+        for i, (what, axis) in enumerate(axes):
+            if what == "turn":
+                found[k] += torque[k, i] * axis
+    return found
 
 
 def _predict(predictor: Predictor, seen: Sequence[Seen], names: Sequence[str]) -> Array:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from plumbline.diagnosis.joint_causes import one_number
+from plumbline.diagnosis.joint_causes import element_words, one_number
 from plumbline.diagnosis.joint_prediction import Seen
-from plumbline.model.datatypes import KINDS, Array, Model, State
+from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Array, Model, State
 from plumbline.model.kinematics import (
     complete_state,
     own_rates,
@@ -24,6 +26,12 @@ from plumbline.model.loops import assembled, loop_gaps
 CLOSED = 1e-9  # m, rad: a larger gap is an open loop
 EQUAL = 1e-12  # of two readings
 Misreading = Callable[[Model, State], Seen]
+BODY_VALUES = ("mass", "inertia", "force", "moment", "drag_force", "drag_moment")
+PLACE, PLURALS = (
+    re.compile(r"of (body|joint|spring) \d+"),
+    {"body": "bodies", "joint": "joints", "spring": "springs"},
+)
+TURNS = {1: "as", -1: "against", 2: "twice as", -2: "twice against"}
 
 
 def misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
@@ -36,6 +44,24 @@ def misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
         Words that complete "behaves as if", and the mechanism and the state that the engine sees.
 
     """
+    alone = list(_single_misreadings(model))
+    yield from alone
+    yield from _repeated(alone)
+    for name, words in {
+        **dict.fromkeys(JOINT_ELEMENTS, "joint"),
+        **dict.fromkeys(BODY_VALUES, "body"),
+    }.items():
+        values = getattr(model, name)
+        for shift, where in ((1, "before"), (-1, "after")):
+            moved = np.roll(values, shift, axis=0)
+            moved[0 if shift > 0 else -1] = values[0 if shift > 0 else -1]
+            if len(values) > 2 and np.any(moved != values):
+                text = f"{element_words(name)} of every {words} were that of the {words} {where}"
+                yield text, _field(name, moved * _has_place(model, name))
+
+
+def _single_misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
+    """What may be read in another way of one body, joint or spring."""
     for k in range(model.n):
         of = f"of body {k + 1}"
         if KINDS[model.kind[k]].has_attitude:
@@ -54,6 +80,18 @@ def misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
             for name, words in (("x", "coordinate"), ("xdot", "rate")):
                 text = f"{words} {i + 1} of joint {k + 1} had the opposite sign"
                 yield text, _coordinate(name, k, i, lambda x: -x)
+                yield (
+                    f"{words} {i + 1} of joint {k + 1} were its absolute value",
+                    _coordinate(name, k, i, abs),
+                )
+        if len(KINDS[model.kind[k]].motions) == 2:
+            for name, words in (("x", "coordinates"), ("xdot", "rates")):
+                yield f"the {words} of joint {k + 1} were exchanged", _exchanged(name, k)
+        for times, how in TURNS.items() if not KINDS[model.kind[k]].has_attitude else ():
+            turn = np.linalg.matrix_power(rotation_matrix(model.turn[k, 1]), times)
+            inertia = turn @ model.inertia[k] @ turn.T
+            if np.max(np.abs(inertia - model.inertia[k])) > EQUAL * np.max(np.abs(inertia)):
+                yield f"the inertia {of} were turned {how} its joint's axes", _number("inertia", k, inertia)
     yield from _point_misreadings(model)
     yield from _axes_misreadings(model)
     for number in map(int, np.flatnonzero(model.spring_damping)):
@@ -197,6 +235,57 @@ def _different(
         if all(np.max(np.abs(here - one)) > EQUAL for one in known):
             known.append(here)
             yield words, _joint_field(name, k, value)
+
+
+def _repeated(found: Sequence[tuple[str, Misreading]]) -> Iterator[tuple[str, Misreading]]:
+    """The same reading of all bodies, joints or springs that it concerns."""
+    groups: dict[str, list[Misreading]] = {}
+    for words, misread in found:
+        groups.setdefault(PLACE.sub(lambda place: f"of all {PLURALS[place[1]]}", words, count=1), []).append(
+            misread
+        )
+    for words, parts in groups.items():
+        if len(parts) > 1:
+            yield words, _one_after_another(parts)
+
+
+def _one_after_another(parts: Sequence[Misreading]) -> Misreading:
+    def misread(model: Model, state: State) -> Seen:
+        for part in parts:
+            seen = part(model, state)
+            model, state = seen.model, seen.state
+        return Seen(model, state)
+
+    return misread
+
+
+def _exchanged(name: str, k: int) -> Misreading:
+    """The two coordinates of a joint, or their rates, exchanged."""
+
+    def misread(model: Model, state: State) -> Seen:
+        values = getattr(state, name).copy()
+        values[k] = values[k, ::-1]
+        return Seen(model, replace(state, **{name: values}))
+
+    return misread
+
+
+def _field(name: str, values: Array) -> Misreading:
+    changed: dict[str, Any] = {name: values}
+    return lambda model, state: Seen(replace(model, **changed), state)
+
+
+def _number(name: str, k: int, value: Array) -> Misreading:
+    return lambda model, state: Seen(one_number(name, (k,))(model, value), state)
+
+
+def _has_place(model: Model, name: str) -> Array:
+    """Where a field has a meaning: elements on a joint's coordinates (J, 2), 1 for all other fields."""
+    if name not in JOINT_ELEMENTS:
+        return np.ones(1)
+    is_idle = name in ("rest", "effort")
+    counts = [len(KINDS[kind].motions) or int(kind == "ball" and not is_idle) for kind in model.kind]
+    return np.asarray(np.arange(2) < np.array(counts)[:, None], float)
 
 
 def _joint_field(name: str, k: int, value: Array) -> Misreading:

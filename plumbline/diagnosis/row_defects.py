@@ -36,6 +36,24 @@ def row_defects(model: Model) -> Iterator[tuple[str, Misreading]]:
         yield "the velocity terms of the rows that close loops were missing", _without_end_terms
 
 
+def velocity_terms(joint: int) -> list[Misreading]:
+    """List units of another acceleration that velocities cause at a joint.
+
+    Args:
+        joint: its number from 0.
+
+    Returns:
+        What the engine evaluates, one entry per direction, the first three linear; those that the joint does
+        not hold change nothing.
+
+    """
+
+    def added(unit: Array) -> RowChange:
+        return lambda k, held, bend: (held, bend + unit if k == joint else bend)
+
+    return [_changed(added(unit)) for unit in np.eye(6)]
+
+
 def missing_gammas(model: Model) -> Iterator[tuple[str, Misreading]]:
     """List rows that an engine in maximal coordinates evaluates without γ.
 

@@ -5,7 +5,7 @@ from functools import cache
 import pytest
 
 from plumbline.judging.rows import Verdict
-from tests.helpers.nightly_tests import some_fast
+from tests.helpers.nightly_tests import SLOW
 from tests.helpers.planted_edits import EDITS, rows_of_run
 
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
@@ -13,6 +13,11 @@ for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
 
 STATES = 8
 DEFECTS = [edit for edit in EDITS if not edit.is_control]
+
+
+def two_fast(edits):
+    """Parameters of a test of which the first two, cheap ones, run fast and the others nightly."""
+    return [pytest.param(edit, id=edit.name, marks=SLOW if k > 1 else []) for k, edit in enumerate(edits)]
 
 
 @cache
@@ -23,17 +28,17 @@ def attention(name):
     return [row for row in found if row.verdict.needs_attention and row.verdict != Verdict.UNSUPPORTED]
 
 
-@pytest.mark.parametrize("edit", some_fast(DEFECTS, 12))
+@pytest.mark.parametrize("edit", two_fast(DEFECTS))
 def test_every_defect_is_reported(edit):
     assert attention(edit.name), f"nothing reports {edit.name}"
 
 
-@pytest.mark.parametrize("edit", some_fast([d for d in DEFECTS if d.expected], 12))
+@pytest.mark.parametrize("edit", two_fast([d for d in DEFECTS if d.expected]))
 def test_every_defect_with_words_is_named(edit):
     names = {row.diagnosis for row in attention(edit.name) if row.diagnosis}
     assert any(edit.expected in name and "cannot distinguish" not in name for name in names), names
 
 
-@pytest.mark.parametrize("edit", some_fast([edit for edit in EDITS if edit.is_control], 5))
+@pytest.mark.parametrize("edit", two_fast([edit for edit in EDITS if edit.is_control]))
 def test_no_control_is_accused(edit):
     assert not [row.reason for row in attention(edit.name)]
