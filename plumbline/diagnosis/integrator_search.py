@@ -231,7 +231,15 @@ def _joint_space_alternatives(declared: JointSpaceMethod, model: Model) -> Itera
 
 
 def _other_formulas(declared: JointSpaceMethod, model: Model) -> Iterator[tuple[str, JointSpaceMethod]]:
-    euler = JointSpaceMethod("semi-implicit Euler", declared.coordinates, declared.rod_axial_inertia)
+    if model.has_loops and declared.gap_correction:
+        yield "it did not correct the gaps of loops", replace(declared, gap_correction=0.0)
+    euler = JointSpaceMethod(
+        "semi-implicit Euler",
+        declared.coordinates,
+        declared.rod_axial_inertia,
+        free_coordinates=declared.free_coordinates,
+        gap_correction=declared.gap_correction,
+    )
     is_euler = declared.formula == "semi-implicit Euler"
     yield (
         "it took explicit Euler's step: positions by the old velocity",
@@ -278,7 +286,9 @@ def _other_formulas(declared: JointSpaceMethod, model: Model) -> Iterator[tuple[
 
 
 def _runge_kutta_formulas(declared: JointSpaceMethod) -> Iterator[tuple[str, JointSpaceMethod]]:
-    base = classical_runge_kutta(declared.coordinates, declared.rod_axial_inertia)
+    base = classical_runge_kutta(
+        declared.coordinates, declared.rod_axial_inertia, declared.free_coordinates, declared.gap_correction
+    )
     for name, (stages, weights) in TABLEAUS.items():
         yield f"it took the step of {name}", replace(base, stages=stages, weights=weights)
     if declared.coordinates == "joint rotations":

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from unittest.mock import patch
 
 from ruamel.yaml import YAML
 
@@ -50,16 +49,18 @@ def edited(edit: Edit) -> Iterator[None]:
     text = (ROOT / edit.file).read_text(encoding="utf-8")
     assert text.count(edit.old) == 1, f"the edit {edit.name!r} does not fit {edit.file}"
     first = edit.file.removesuffix(".py").replace("/", ".")
-    adapter, _, class_name = ENGINES[edit.engine].partition(":")
+    adapter = ENGINES[edit.engine].partition(":")[0]
     import_module(adapter)
-    with patch.dict(sys.modules):
-        for name in dict.fromkeys((first, *BETWEEN.get(first, ()), adapter)):
+    names = dict.fromkeys((first, *BETWEEN.get(first, ()), adapter))
+    right = {name: sys.modules[name] for name in names}
+    try:  # `load_adapter` finds the module by its name, wherever it is called
+        for name in names:
             source = (ROOT / (name.replace(".", "/") + ".py")).read_text(encoding="utf-8")
             module = sys.modules[name] = ModuleType(name)
             exec(source.replace(edit.old, edit.new) if name == first else source, vars(module))
-        engine = getattr(sys.modules[adapter], class_name)
-    with patch("plumbline.engines.calls.load_adapter", lambda _: engine()):
         yield
+    finally:
+        sys.modules.update(right)
 
 
 def rows_of_run(edit: Edit, scenario_name: str, level: str, states: int) -> list[Row]:
