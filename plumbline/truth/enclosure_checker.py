@@ -502,7 +502,7 @@ def enclose_motion(certificate: Certificate, on_step: Callable[..., Any] = lambd
             at += length
             on_step(k + 1, len(certificate.steps))
     _require(not remaining, f"the steps end at {float(at / per_second):g} s, before the last sample")
-    return Enclosure(certificate.times, *(np.array(x, dtype=object) for x in zip(*samples, strict=True)))
+    return Enclosure(certificate.times, *(np.array(x) for x in zip(*samples, strict=True)))
 
 
 def _initial_values(exact: _Mechanism) -> list[Any]:
@@ -535,7 +535,7 @@ def _sample(exact: _Mechanism, y: list[Any], P: _Series, rho: float, s: Fraction
         before, after = (q / (q @ q).sqrt() for q in exact.data["turn"][k])
         p[k] = _times(p[far], before)
         for (axis, *_), half in zip(z.turns[k], x[exact.joints[k][3] :] / 2, strict=True):
-            p[k] = _times(p[k], _vector([half.cos(), *(np.eye(3, dtype=object)[axis] * half.sin())]))
+            p[k] = _times(p[k], _vector([half.cos(), *(np.eye(3)[axis] * half.sin())]))
         p[k] = own if len(own) else _times(p[k], after * [1, -1, -1, -1])
     v, w = ([x / exact.unit for x in part[:-1]] for part in (z.centres(1), z.w))
     return z.centres(0)[:-1], p[:-1], v, w
