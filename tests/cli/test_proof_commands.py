@@ -62,7 +62,7 @@ def test_a_certificate_that_proves_nothing_exits_with_1(certificate, tmp_path):
     path.write_text(json.dumps(document))
     result = type_command("verify", path, certificate[0])
     assert result.exit_code == 1
-    assert f"{path}: rejected: step 1 of {len(document['steps'])}: inequality (4)" in result.stderr
+    assert f"{path}: rejected: step 1 of {len(document['steps'])}: inequality (5)" in result.stderr
     assert "tumbling-ball.json.gz" in result.stdout
 
 
