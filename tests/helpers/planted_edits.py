@@ -17,6 +17,7 @@ from plumbline.execution.plan import Plan
 from plumbline.execution.scenario_run import ScenarioRun
 from plumbline.judging.rows import Row
 from plumbline.processes.workers import run_task
+from plumbline.scenario.generator import RandomScenarios
 from plumbline.scenario.loader import load_scenarios
 
 ROOT = Path(__file__).parents[2]
@@ -65,7 +66,10 @@ def edited(edit: Edit) -> Iterator[None]:
 
 def rows_of_run(edit: Edit, scenario_name: str, level: str, states: int) -> list[Row]:
     """Run a scenario on the edited engine in this process, with the diagnosis of what disagrees."""
-    (scenario,) = load_scenarios([scenario_name])
+    is_random = scenario_name.startswith("random-")
+    seed = int(scenario_name.split("-")[-2]) if is_random else 0
+    night = RandomScenarios(seed, 0)
+    scenario = night.named(scenario_name) if is_random else load_scenarios([scenario_name])[0]
     plan = Plan([scenario], [edit.engine], level, random_state_count=states)  # type: ignore[arg-type]
     run = ScenarioRun(plan, scenario, {edit.engine: load_adapter(edit.engine).describe()})
     with edited(edit):
