@@ -530,7 +530,7 @@ def _sample(exact: _Mechanism, y: list[Any], P: _Series, rho: float, s: Fraction
     spread = _up(_norm(_evaluate(P, s.numerator / s.denominator).size, axis=1) * rho)
     y = [f(arb(s.numerator) / s.denominator) + arb(0, float(e)) for f, e in zip(y, spread, strict=True)]
     z = _Motion(exact, y, y[exact.nq :])
-    p = [_vector([arb(1), arb(0), arb(0), arb(0)])] * (1 + len(exact.far))
+    p = [np.eye(4)[0]] * (1 + len(exact.far))
     for k, (far, (own, _, x, _)) in enumerate(zip(exact.far, z.parts[0], strict=True)):
         before, after = (q / (q @ q).sqrt() for q in exact.data["turn"][k])
         p[k] = _times(p[far], before)

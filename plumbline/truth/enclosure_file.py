@@ -82,7 +82,7 @@ def parse_certificate(raw: bytes) -> Certificate:
 
     """
     try:
-        data = json.loads(zlib.decompress(raw, 31) if raw[:2] == b"\x1f\x8b" else raw)
+        data = json.loads(zlib.decompress(raw, 47) if raw[:2] == b"\x1f\x8b" else raw)
     except (zlib.error, ValueError, RecursionError) as error:
         raise MalformedCertificate(f"not a complete gzip or JSON file: {error}") from None
     _expect(isinstance(data, dict) and data.get("format") == FORMAT, "format", f"the text {FORMAT!r}")
@@ -135,6 +135,6 @@ def _doubles(data: dict[str, Any], field: str, shape: tuple[int, ...]) -> Array:
         numbers = np.array(np.nan)
     numbers = np.zeros(shape) if not numbers.size and 0 in shape else numbers
     fits = numbers.ndim == 1 if shape == (-1,) else numbers.shape == shape
-    sound = np.isfinite(numbers) & ((numbers == 0) | (np.abs(numbers) > 1e-100))  # exact in any unit
+    sound = np.isfinite(numbers) & ((numbers == 0) | (np.abs(numbers) >= 1e-100))  # exact in any unit
     _expect(fits and np.all(sound), field, f"finite doubles as '0x1.8p+0', shape {shape}, not below 1e-100")
     return numbers

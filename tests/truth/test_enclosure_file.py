@@ -4,10 +4,12 @@ import json
 import random
 from collections import Counter
 from importlib.util import find_spec
+from itertools import cycle, islice
 
+import numpy as np
 import pytest
 
-from plumbline.truth.enclosure_file import MalformedCertificate, parse_certificate
+from plumbline.truth.enclosure_file import JOINTS, SHAPES, MalformedCertificate, parse_certificate
 from tests.helpers.mutations import damaged_bytes, damaged_document, limited_time
 from tests.helpers.stored_certificates import FOLDER, stored_document
 
@@ -30,6 +32,7 @@ def test_a_truncated_file_is_malformed():
         ({"version": 1}, "version: expected 2"),
         ({"mass": ["nan"]}, "mass: expected finite doubles"),
         ({"mass": [0.5]}, "mass: expected finite doubles"),
+        ({"omega": [["0x1p0", 0.5, "0x1p0"]]}, "omega: expected finite doubles"),
         ({"mass": ["-0x1p0"]}, "mass: expected positive"),
         ({"mass": ["0x1p0", "0x1p0"]}, r"mass: expected finite doubles as '0x1.8p\+0', shape \(1,\)"),
         ({"inertia": None}, "inertia: expected finite doubles"),
@@ -94,6 +97,28 @@ def test_damaged_documents_are_malformed_or_rejected():
 )
 def test_the_limits_themselves_are_valid(change):
     assert parsed(stored_document("one-ball") | change)
+
+
+def many_joints(count, springs, terms):
+    """A document with joints of all kinds and springs between points, all numbers zero or the least."""
+    document = {name: stored_document("one-ball")[name] for name in ("format", "version", "bits", "times")}
+    kinds = [*islice(cycle(JOINTS), count)]
+    document |= {"time_exponent": 0, "kind": kinds, "far": [-1] * count, "springs": [[0, -1]] * springs}
+    for name, (shape, _) in SHAPES.items():
+        first = () if name == "gravity" else (springs if name.startswith("spring") else count,)
+        values = np.full(first + shape, 1e-100 if name == "mass" else 0.0)
+        document[name] = np.frompyfunc(float.hex, 1, 1)(values).tolist()
+    entries = (7 * p + 6 * u + 2 * slides + 4 * len(t) for u, p, slides, t in map(JOINTS.get, kinds))
+    return document | {"steps": [[1, *[[0] * terms] * (sum(entries) + springs)]]}
+
+
+@pytest.mark.parametrize("most", [(100, 0, 1), (1, 100, 1), (1, 0, 401)], ids=["bodies", "springs", "terms"])
+def test_as_much_as_is_allowed_is_valid(most):
+    """And one more is not."""
+    assert parsed(many_joints(*most)).nq
+    more = (n + (n > 1) for n in most)
+    with pytest.raises(MalformedCertificate, match=r"expected .*(100|401)"):
+        parsed(many_joints(*more))
 
 
 def test_a_compressed_file_is_read_as_its_text():

@@ -45,6 +45,7 @@ from typing import IO, Any, NoReturn
 import coverage
 import libcst as cst
 import pytest
+from libcst.helpers import get_full_name_for_node
 from libcst.metadata import CodeRange, MetadataWrapper, ParentNodeProvider, PositionProvider
 from mutmut.mutation.mutators import mutation_operators
 
@@ -173,8 +174,8 @@ def is_relevant_mutation(node: cst.CSTNode, mutated: cst.CSTNode) -> bool:
         return mutated.value.lower() != node.value  # einsum knows its indices by any letter
     if isinstance(node, cst.Assign | cst.AnnAssign):
         value = node.value
-        alias = isinstance(value, cst.Subscript) and isinstance(value.value, cst.Name)
-        named = alias and value.value.value in ("NDArray", "Callable")  # type: ignore[union-attr]
+        name = get_full_name_for_node(value) if isinstance(value, cst.Subscript) else None
+        named = name in ("NDArray", "np.ndarray", "Callable")  # aliases of types
         return not is_text(value) and not named
     if isinstance(node, cst.Call) and isinstance(mutated, cst.Call):
         arg = removed_argument(node, mutated)
