@@ -278,7 +278,7 @@ def _add_functions(mechanism: Any, series: list[Any]) -> list[Any]:
     rates = [*rest]
     if mechanism.springs:
         q, v = ([balls(row) for row in part] for part in (found, rates))
-        motion = checker._Motion(mechanism, [*q, *q[: len(mechanism.springs)], *v], v)
+        motion = checker._Motion(mechanism, [*q, *q[:1] * len(mechanism.springs), *v], v)
         found += [numbers((d @ d).rsqrt()) for d in motion.spans(0)]
     return found + rates
 

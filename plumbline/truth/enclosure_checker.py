@@ -76,7 +76,7 @@ largest for s ∈ [0, 1] where it bounds a function.
      defect, −h M⁻¹g): w′ = P⁻¹(δ − R w). ‖I − Φ P‖ ≤ θ′ < 1 gives ‖w‖′ ≤ a ‖w‖ + b with a = ‖|Φ| |R|‖/(1 −
      θ′) < 1 and b = ‖|Φ| |δ|‖/(1 − θ′), and from ‖w(0)‖ ≤ ρ follows ‖w(s)‖ ≤ exp(a) (ρ + b) ≤ ρ⁺ = (ρ +
      b)/(1 − a) as long as e has been in the tube |e_i| ≤ ε.
- (6) e stays in the tube: ‖row i of P‖ ρ⁺ < ε. It starts there, and e is continuous: it cannot leave before
+ (6) e stays in the tube: ‖P‖ ρ⁺ < ε. It starts there, and e is continuous: it cannot leave before
      s = 1, and y exists up to there because M has an inverse in the tube.
  (7) Next step, with T = P⁺(0) and Q an approximate inverse, ‖I − Q T‖ ≤ θ″ < 1: e(0) = X w(1) + j, X =
      P(1), with the jump j = ỹ(1) − ỹ⁺(0) (at the start: j = y(0) − ỹ⁺(0), ρ⁺ = 0) is T w⁺(0), and ‖w⁺(0)‖
@@ -85,7 +85,8 @@ largest for s ∈ [0, 1] where it bounds a function.
      1 |f_N − 1| ≤ 10/28 + (10/28)² + … < 1: along the motion f_N(σ(s)) is a function of s, r(s) = 1 ± 1.
      With it in place of f_N the equations are polynomial, and the motion solves them: (2) encloses them at
      ỹ for every such r, (3) their derivatives for the number r(s), which does not depend on y. |σ| < 9.86
-     must hold in the tube of (3), which is below π² and 10: before φ came to π, σ would have left it.
+     must hold in the tube of (3), which is below π² and 10: before φ came to π, σ would have left it. In (2)
+     the powers of s above the last of σ̃ stand in each f_n(σ̃) as a function of s in the ball of their sum.
 
 Comparisons reject unless they hold: never for NaN.
 """
@@ -259,7 +260,8 @@ class _Mechanism:
         data: Any = {x: np.frompyfunc(arb, 1, 1)(c) / self.unit ** SHAPES[x][1] for x, c in file.data.items()}
         data["axes"] = np.array([[_rotation(q) / (q @ q) for q in pair] for pair in data["turn"]])
         _require(all(x.rel_accuracy_bits() > 60 for x in data["axes"].ravel()), "turn: axes too inexact")
-        self.terms = [number(-1) / (2 * (n + 1) * (2 * n + 5)) for n in range(ctx.prec // 7)[::-1]]  # of (8)
+        # of (8), by n + 1
+        self.terms = [number(-1) / (4 * n * n + 6 * n) for n in range(1, ctx.prec // 6 if self.exact else 13)]
         self.data: dict[str, Any] = {name: np.frompyfunc(number, 1, 1)(x) for name, x in data.items()}
         self.unknown = arb(0, 1) if self.exact else _Series(np.zeros((DEGREE + 1, 1, 1)), 1.0)  # 0 ± 1 of (8)
 
@@ -291,8 +293,9 @@ class _Mechanism:
                 if len(functions):
                     (σ, γ), bend = functions, z.bend(k)[0]
                     change, f = γ * (bend @ (w - w0)) * 12, σ * 0 + self.unknown + 1
-                    for term in self.terms:
-                        f = σ * f * term + 1
+                    for term in self.terms[::-1]:
+                        f = σ * f * term
+                        f = (f.truncate(len(σ)) + f.right_shift(len(σ))(UNIT) * UNIT if self.exact else f) + 1
                     _require(self.exact or σ.size[0, 0] < MAX_SIGMA, "inequality (8): near half a turn")
                     rates += [change, γ * γ * change * f]
                     rows = [*(_vector(rows) + bend * _vector([γ * (stiffness * 6)]))]
@@ -420,7 +423,7 @@ def _prove_step(mechanism: _Mechanism, rows: list[Array], h: float, defect: Any,
     a, b = (_up(_norm(Phi.size @ x) / (1 - theta)) for x in map(np.concatenate, (R, delta)))
     _require(a < 1, "inequality (5): the error grows too fast")
     rho = _up((rho + b) / (1 - a))
-    _require(np.all(_up(_norm(P.size, axis=1) * rho) < tube), "inequality (6): the error leaves the tube")
+    _require(_up(_norm(P.size) * rho) < tube, "inequality (6): the error leaves the tube")
     return P, rho
 
 
@@ -512,10 +515,10 @@ def _initial_values(exact: _Mechanism) -> list[Any]:
         p, w, u, udot, x, xdot = (exact.data[name][k] for name in ("p", "omega", "u", "udot", "x", "xdot"))
         if joint[0] == "rod":
             u, udot = u / (u @ u).sqrt(), udot - u * (u @ udot) / (u @ u)
-        functions = [f for angle in x[joint[3] : n_x] for f in (angle.cos(), angle.sin())] + [arb(0)] * 2
-        q += [*(p / (p @ p).sqrt())[:n_p], *u[:n_u], *x[:n_x], *functions[:n]]
+        functions = [f for angle in x[joint[3] : n_x] for f in (angle.cos(), angle.sin())]
+        q += [*(p / (p @ p).sqrt())[:n_p], *u[:n_u], *x[:n_x], *[*functions, *x][:n]]
         v += [*w[:n_p], *udot[:n_u], *xdot[:n_x]]
-    motion = _Motion(exact, [*q, *[arb(0)] * len(exact.springs), *v], v)
+    motion = _Motion(exact, [*q, *q[:1] * len(exact.springs), *v], v)
     for k, (own, *_, bent) in enumerate(motion.parts[0]):
         if len(own) and len(bent):
             bend, cosine = motion.bend(k)
@@ -537,5 +540,4 @@ def _sample(exact: _Mechanism, y: list[Any], P: _Series, rho: float, s: Fraction
         for (axis, *_), half in zip(z.turns[k], x[exact.joints[k][3] :] / 2, strict=True):
             p[k] = _times(p[k], _vector([half.cos(), *(np.eye(3)[axis] * half.sin())]))
         p[k] = own if len(own) else _times(p[k], after * [1, -1, -1, -1])
-    v, w = ([x / exact.unit for x in part[:-1]] for part in (z.centres(1), z.w))
-    return z.centres(0)[:-1], p[:-1], v, w
+    return z.centres(0)[:-1], p[:-1], *([x / exact.unit for x in w[:-1]] for w in (z.centres(1), z.w))

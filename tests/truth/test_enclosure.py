@@ -397,6 +397,22 @@ def test_a_certificate_names_its_scenario(proofs):
     assert b", " not in gzip.decompress(raw)
 
 
+def test_a_mechanism_of_more_springs_than_coordinates_is_enclosed():
+    """A slide, which has one coordinate, between two springs."""
+    scenario = load_scenario(find_scenario_file("sprung-slide"))
+    points = np.array([[[0.0, 0.1, 1.0], [0.0, 0.0, 0.1]], [[0.1, 0.0, -1.0], [0.0, 0.0, -0.1]]])
+    model = replace(
+        scenario.model,
+        spring_body=np.array([[-1, 0]] * 2),
+        spring_point=points,
+        spring_stiffness=np.array([3.0, 2.0]),
+        spring_damping=np.array([0.0, 0.1]),
+        spring_length=np.array([0.5, 1.5]),
+    )
+    _, enclosure = prove_motion(model, scenario.state, TIMES)
+    assert enclosure.radius("r") < 1e-24
+
+
 def test_a_motion_at_rest_is_enclosed():
     scenario = load_scenario(find_scenario_file("rest"))
     _, enclosure = prove_motion(scenario.model, scenario.state, np.array([0.0, 1.0]))

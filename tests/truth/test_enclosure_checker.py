@@ -268,6 +268,29 @@ def test_the_next_ellipsoid_holds_with_a_poor_inverse(monkeypatch):
     assert 2 * 0.7 + 0.125 <= bound < (2 * 0.7 + 0.125) * (1 + 1e-8)
 
 
+def test_the_next_ellipsoid_is_round_in_the_given_scale():
+    """Rates of short steps count by what they do in a step: cond(T scale) is 100, not that of T."""
+    rng, scale = np.random.default_rng(11), np.array([[1.0], [1.0], [1e-3], [1e-3]])
+    X = np.linalg.qr(rng.normal(size=(4, 4)))[0] @ np.diag([1, 1e-1, 1e-4, 1e-5]) @ rng.normal(size=(4, 4))
+    T, _ = checker._next_ellipsoid(checker._constant(X / scale), 1.0, np.zeros(4), scale)
+    assert np.linalg.cond(T * scale) == pytest.approx(100)
+    assert np.allclose(T * scale, checker._next_ellipsoid(checker._constant(X), 1.0, np.zeros(4))[0])
+
+
+def test_rates_of_short_steps_have_their_scale(monkeypatch):
+    """256 steps in the unit of time are short: a rate counts by 256 times the step."""
+    usual, scales, document = checker._next_ellipsoid, [], stored_document("one-rod")
+    monkeypatch.setattr(checker, "_next_ellipsoid", lambda *a: scales.append(a[3].ravel()) or usual(*a))
+    lengths = [step[0] / 2 ** document["bits"] for step in document["steps"]]
+    assert checker.FAST * min(lengths) > 1
+    checker.enclose_motion(parsed(document))
+    assert np.array_equal(scales, np.ones((len(lengths), 13)))
+    monkeypatch.setattr(checker, "FAST", 0.25)
+    checker.enclose_motion(parsed(document))
+    expected = [[1.0] * 7 + [0.25 * length] * 6 for length in lengths]
+    assert np.array_equal(scales[len(lengths) :], expected)
+
+
 class LinearMechanism:
     """v_k' = −stiffness_k y_0, with unit masses; y_0 is a place, or the rate itself where there is none."""
 
@@ -342,7 +365,7 @@ SPRUNG = {"armature": [["0x0p0"] * 2], "damping": [["0x0p0"] * 2], "stiffness": 
 def sprung_ball(number, terms=None):
     """The mechanism of one ball with a spring alone; ``terms`` is N of (8)."""
     mechanism = checker._Mechanism(parsed(without_steps(stored_document("one-ball") | SPRUNG)), number)
-    mechanism.terms = mechanism.terms[-terms:] if terms else mechanism.terms
+    mechanism.terms = mechanism.terms[:terms]
     return mechanism
 
 
@@ -374,14 +397,32 @@ def test_the_ratio_of_a_turn_to_its_sine_changes_as_it_must(terms, sigma):
         found = rate(arb(0))
         assert found.overlaps(expected) and abs(found - expected).mid() <= found.rad()
         assert terms or found.rad() < 1e-32 * abs(expected)
+        largest = abs(change(arb(0))) / 4 * sigma / 10  # of the only term, where f₁ = 1 ± 1
+        assert terms != 1 or found.rad() <= largest * (1 + 1e-7) + 1e-40
         rate = turn_rates(sprung_ball(float, terms), sigma, series_without_radius)[1]
         radius = float(rate.r[0, 0])
         assert abs(arb(float(rate.c[0, 0, 0])) - expected) < radius
         assert (terms or 12) < 12 or radius < 1e-12 * abs(float(expected))
+        assert terms != 1 or radius <= largest * (1 + 1e-7) + 1e-12
 
 
 def series_without_radius(x):
     return checker._constant(np.array([[x, 0.0]]))
+
+
+@pytest.mark.parametrize("terms", [1, 3, None])
+def test_the_series_of_a_turn_that_changes_is_enclosed_with_few_powers(terms):
+    """σ = 2 + s and σ = 2 + s²/2: of f₀ no powers above those of σ are kept, but their sum."""
+    with ctx.workprec(150):
+        for powers in ([2, 1], [2, 0, 0.5]):
+            y = [arb_poly([x]) for x in (0.5, 0.5, -0.5, 0.5, 0, 0.5, 1.0, -2.0, 0.25)]
+            y[4] = arb_poly(powers)
+            change, rate = sprung_ball(arb, terms).equations(y, y[-3:])[0][4:]
+            assert len(rate) == len(powers)
+            for s in (arb(0), arb(0.25), arb(1)):
+                expected = change(s) / 4 * series_of_spring(y[4](s))
+                assert abs(rate(s) - expected).mid() <= rate(s).rad()
+                assert terms == 1 or rate(s).rad() < 0.1 * abs(expected)
 
 
 @pytest.mark.parametrize("is_exact", [True, False])
@@ -432,6 +473,22 @@ def test_the_turn_of_a_spring_starts_as_the_attitude_has_it(degrees):
         phi = 2 * half
         assert abs(float(y[4]) - phi**2) <= 1e-12 * phi and y[4].rad() < 1e-12
         assert float(y[5]) == pytest.approx(phi / np.sin(phi) / 6 if phi else 1 / 6, rel=1e-10)
+
+
+def test_a_rod_starts_normalised():
+    """u/|u|, and u̇ less what is along it."""
+    document = stored_document("one-rod") | {"u": [["0x1p0", "-0x1p1", "0x1p1"]], "udot": [["0x1p0"] * 3]}
+    y = checker._initial_values(checker._Mechanism(parsed(document), arb))
+    unit = 2.0 ** document["time_exponent"]
+    assert np.allclose(np.array(y[4:7], dtype=float), np.array([1, -2, 2]) / 3, rtol=1e-15)
+    assert np.allclose(np.array(y[10:], dtype=float), unit * (1 - np.array([1, -2, 2]) / 9), rtol=1e-15)
+
+
+def test_where_the_steps_end_is_said():
+    document = stored_document("one-ball")
+    end = document["steps"][0][0] * 2.0 ** (document["time_exponent"] - document["bits"])
+    with pytest.raises(checker.Rejected, match=f"^the steps end at {end:g} s, before the last sample"):
+        checker.enclose_motion(parsed(document | {"steps": document["steps"][:1]}))
 
 
 def test_samples_are_at_their_times_of_their_steps(monkeypatch):
