@@ -27,7 +27,7 @@ CertificatePrecision = Literal["quad", "octuple"]
 BITS: dict[CertificatePrecision, int] = {"quad": 110, "octuple": 230}  # after the binary point
 ORDER_PER_BIT = 0.5  # of the series: a step is a quarter of their radius of convergence
 LENGTH_BITS = 40  # after the binary point, of a step
-MAX_STEPS = (0.5, 0.25, 0.125)  # tried in turn, in units of time; a motion at rest has infinite ones
+MAX_STEPS = (0.25, 0.125, 0.0625)  # tried in turn, in units of time; a motion at rest has infinite ones
 
 
 def load_checker() -> Any:
@@ -263,7 +263,7 @@ def _add_functions(mechanism: Any, series: list[Any]) -> list[Any]:
     flint.ctx.cap = len(series[0][0])
 
     def balls(row: Any) -> Any:
-        return flint.arb_series(row[0], flint.ctx.cap)
+        return flint.arb_series(row[0])
 
     def numbers(function: Any) -> tuple[list[Any], bool]:
         parts = (function[k].mid().man_exp() for k in range(flint.ctx.cap))

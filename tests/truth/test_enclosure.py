@@ -430,7 +430,16 @@ def test_a_rejected_candidate_is_tried_again_in_octuple_precision_and_with_short
     scenario = load_scenario(find_scenario_file("rest"))
     with pytest.raises(checker.Rejected, match="never proved"):
         prove_motion(scenario.model, scenario.state, np.array([0.0, 1.0]))
-    assert tried == [(0.5, 110), (0.5, 230), (0.25, 230), (0.125, 230)]
+    assert tried == [(0.25, 110), (0.25, 230), (0.125, 230), (0.0625, 230)]
+
+
+def test_a_slow_motion_has_steps_that_its_linear_part_can_follow():
+    """Half a unit of time would be too long for a conical motion."""
+    scenario = load_scenario(find_scenario_file("conical"))
+    raw, enclosure = prove_motion(scenario.model, scenario.state, np.array([0.0, 0.5]))
+    certificate = parse_certificate(raw)
+    assert certificate.bits == 110 and enclosure.radius("r") < 1e-24
+    assert {step[0] for step in certificate.steps[:-1]} == {1 << 108}
 
 
 def test_a_motion_is_enclosed_while_its_steps_shrink():
