@@ -93,14 +93,13 @@ def prove_motion(
         raise TruthUnavailable(reason)
     checker = load_checker()
     attempts = dict.fromkeys([(MAX_STEPS[0], precision), *((max_step, "octuple") for max_step in MAX_STEPS)])
-    for attempt, (max_step, bits) in enumerate(attempts, 1):
+    for max_step, bits in attempts:
         raw = make_certificate(model, state, times, scenario, bits, max_step)
         try:
             return raw, checker.enclose_motion(parse_certificate(raw), on_step)
-        except checker.Rejected:
-            if attempt == len(attempts):
-                raise
-    raise AssertionError("unreachable")
+        except checker.Rejected as error:
+            rejection = error
+    raise rejection
 
 
 def make_certificate(
@@ -222,12 +221,12 @@ def _candidate_steps(
     mp, bits, checker = import_truth_tool("mpmath"), BITS[precision], load_checker()
     grain = 1 << (bits - LENGTH_BITS)  # lengths are multiples of it
     steps: list[list[Any]] = []
-    numbers, context = checked_numbers(model, state), import_truth_tool("flint").ctx
+    numbers, flint, working = checked_numbers(model, state), import_truth_tool("flint"), 2 * bits
     certificate = Certificate(
-        **checked_topology(model), data=numbers, times=[], time_exponent=0, bits=bits, steps=[]
+        **checked_topology(model), data=numbers, times=[], time_exponent=exponent, bits=bits, steps=[]
     )
-    with mp.workprec(2 * bits), context.workprec(2 * bits):
-        mechanism = checker._Mechanism(certificate, import_truth_tool("flint").arb)
+    with mp.workprec(working), flint.ctx.workprec(working):
+        mechanism = checker._Mechanism(certificate, flint.arb)
         left = max(1, math.ceil(math.ldexp(duration, LENGTH_BITS - exponent)))  # grains
         generator = taylor_series(model, state, round(ORDER_PER_BIT * bits), precision)
         own = next(generator)
@@ -235,7 +234,7 @@ def _candidate_steps(
         start: list[int] = []
         while True:
             h = min(mp.ldexp(max_step, exponent), *(_longest_step(row, bits) for row, _ in series))
-            count = min(left, max(1, int(mp.floor(mp.ldexp(h, LENGTH_BITS - exponent)))))
+            count = min(left, int(mp.ceil(mp.ldexp(h, LENGTH_BITS - exponent))))
             seconds = mp.ldexp(mp.mpf(count), exponent - LENGTH_BITS)
             rows = []
             for i, (taylor, is_rate) in enumerate(series):

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Array, Kind, Model, State
+from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Kind, Model, State
 from plumbline.model.loops import CutMechanism, independent_rows
 
 # Of a loop the bodies b and c, and which of the six rows are held: shifts, then turns, in axes of b.
@@ -132,18 +132,29 @@ def initial_values(mp: Any, model: Model, state: State) -> list[Any]:
 
 def _ball_angle(mp: Any, model: Model, state: State, k: int) -> Any:
     """The turn 0 ≤ θ ≤ π of ball joint k."""
-    quaternions, far = [*model.turn[k], state.p[k]], int(model.body[k, 0])
-    first, last, near = (_unit_rotation(mp, q) for q in quaternions)
-    turned = near @ last
-    if far >= 0:
-        turned = _unit_rotation(mp, state.p[far]).T @ turned
-    R = first.T @ turned
+    first, last = (_unit_rotation(mp, q) for q in model.turn[k])
+    far, near = (_attitude(mp, model, state, body) for body in (int(model.body[k, 0]), k))
+    R = (far @ first).T @ near @ last
     sine = mp.norm([R[i, j] - R[j, i] for i, j in ((2, 1), (0, 2), (1, 0))])
     return mp.atan2(sine, R[0, 0] + R[1, 1] + R[2, 2] - 1)
 
 
-def _unit_rotation(mp: Any, q: Array) -> Any:
-    unit = mp.matrix(q.tolist())
+def _attitude(mp: Any, model: Model, state: State, k: int) -> Any:
+    """Rotation matrix of a body by the joint coordinates: its quaternion in the state is rounded."""
+    if k < 0:
+        return np.eye(3)
+    kind = model.kind[k]
+    if KINDS[kind].has_attitude:
+        return _unit_rotation(mp, state.p[k])
+    A = _attitude(mp, model, state, int(model.body[k, 0])) @ _unit_rotation(mp, model.turn[k, 0])
+    for x, (what, number) in zip(state.x[k].tolist(), KINDS[kind].motions, strict=False):
+        half = mp.mpf(x) / 2 if what == "turn" else mp.mpf(0)
+        A = A @ _unit_rotation(mp, [mp.cos(half), *(mp.sin(half) * np.eye(3)[number])])
+    return A @ _unit_rotation(mp, model.turn[k, 1]).T
+
+
+def _unit_rotation(mp: Any, q: Iterable[Any]) -> Any:
+    unit = mp.matrix([*q])
     return rotation_matrix(unit / mp.norm(unit))
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from plumbline.model.datatypes import EngineFailure
 from plumbline.scenario.loader import catalogue, find_scenario_file, load_scenario
+from plumbline.truth import TruthUnavailable, enclosure, import_truth_tool
 from plumbline.truth.certified import certify_state
 from plumbline.truth.enclosure import (
     checked_numbers,
@@ -19,11 +20,14 @@ from plumbline.truth.enclosure import (
     make_certificate,
     prove_motion,
     reason_not_provable,
+    time_exponent,
 )
 from plumbline.truth.enclosure_file import Certificate, parse_certificate
 from plumbline.truth.taylor import simulate_taylor
 from plumbline.truth.trajectory import trajectory_truth
 from tests.helpers.random_chains import random_chain
+from tests.helpers.stored_certificates import FOLDER as STORED
+from tests.helpers.stored_certificates import stored_mechanism
 
 TRUTH_TOOLS = all(find_spec(module) for module in ("heyoka", "mpmath", "flint"))
 pytestmark = pytest.mark.skipif(not TRUTH_TOOLS, reason="the truth tools are not installed")
@@ -115,6 +119,9 @@ def test_the_numbers_of_a_certificate_are_those_of_the_scenario(scenario):
 
 
 def test_loops_are_refused():
+    bricard = load_scenario(find_scenario_file("bricard"))
+    with pytest.raises(TruthUnavailable, match="motions of closed loops are not proved"):
+        prove_motion(bricard.model, bricard.state, TIMES)
     for name in ("sprung-ball", "sprung-hinge"):
         assert not reason_not_provable(load_scenario(find_scenario_file(name)).model)
     assert "closed loops" in reason_not_provable(load_scenario(find_scenario_file("bricard")).model)
@@ -420,17 +427,80 @@ def test_a_motion_at_rest_is_enclosed():
 
 
 def test_a_rejected_candidate_is_tried_again_in_octuple_precision_and_with_shorter_steps(monkeypatch):
-    tried = []
+    """And the last rejection is what is said."""
+    tried, raw = [], (STORED / "one-ball.json.gz").read_bytes()
 
-    def reject(certificate, _):
-        tried.append((certificate.steps[0][0] / 2**certificate.bits, certificate.bits))
-        raise checker.Rejected("never proved")
+    def reject(certificate, on_step):
+        assert on_step is progress and certificate.steps
+        raise checker.Rejected(f"never proved, try {len(tried)}")
 
+    def progress(*_):
+        raise AssertionError("no step was proved")
+
+    monkeypatch.setattr(enclosure, "make_certificate", lambda *a: tried.append(a[3:]) or raw)
     monkeypatch.setattr(checker, "enclose_motion", reject)
-    scenario = load_scenario(find_scenario_file("rest"))
-    with pytest.raises(checker.Rejected, match="never proved"):
-        prove_motion(scenario.model, scenario.state, np.array([0.0, 1.0]))
-    assert tried == [(0.25, 110), (0.25, 230), (0.125, 230), (0.0625, 230)]
+    with pytest.raises(checker.Rejected, match="never proved, try 4"):
+        prove_motion(*chain([0]), TIMES, "some-hash", on_step=progress)
+    assert [precision for _, precision, _ in tried] == ["quad", *["octuple"] * 3]
+    assert tried == [("some-hash", *x[1:]) for x in tried]
+    assert [max_step for *_, max_step in tried] == [0.25, 0.25, 0.125, 0.0625]
+
+
+def test_an_octuple_candidate_has_its_digits_and_lengths_have_40():
+    """230 bits and 116 coefficients; a certificate of the start alone has one step of the least length."""
+    model, state = chain([0])
+    for end, count in ((1e-3, 1), (0.0, 1), (0.7, None)):
+        raw = make_certificate(model, state, np.array([0.0, end])[end == 0 :], precision="octuple")
+        certificate = parse_certificate(raw)
+        lengths = [step[0] for step in certificate.steps]
+        assert certificate.bits == 230 and json.loads(gzip.decompress(raw))["scenario"] == ""
+        assert {len(row) for step in certificate.steps for row in step[1:]} == {116}
+        assert not any(length % (1 << 190) for length in lengths)
+        assert count in (None, len(lengths))
+        grains = np.ldexp(end, 40 - certificate.time_exponent)
+        assert sum(lengths) == max(1, int(np.ceil(grains))) << 190
+        assert checker.enclose_motion(certificate).radius("r") < 1e-60
+
+
+@pytest.mark.parametrize("name", ["rod-hinge-ball", "free-with-slide-and-weld"])
+def test_a_candidate_starts_in_the_state_that_the_checker_proves(name):
+    """With the coordinates in its order, hinges behind rods and free bodies too."""
+    model, state = stored_mechanism(name)
+    certificate = parse_certificate(make_certificate(model, state, np.array([0.0, 1e-4])))
+    with ctx.workprec(200):
+        start = checker._initial_values(checker._Mechanism(certificate, arb))
+        for row, x in zip(certificate.steps[0][1:], start, strict=True):
+            assert abs(arb(row[0]) / 2**certificate.bits - x) < 1e-32
+
+
+@pytest.mark.parametrize("last", [(1e-20, 3e-22), (3e-22, 1e-20), (1e-20, 0.0), (0.0, -1e-20)], ids=str)
+def test_the_last_two_terms_of_a_step_are_an_eighth_of_the_last_bit(last):
+    mp = import_truth_tool("mpmath")
+    h = enclosure._longest_step([1, 2, 3, 4, 5, *last], 110)
+    terms = [abs(c) * h**power for power, c in zip((5, 6), last, strict=True)]
+    assert abs(max(terms) * mp.mpf(2) ** 113 - 1) < 1e-12
+    assert enclosure._longest_step([1, 2, 3, 0, 0], 110) == mp.inf
+
+
+def test_the_unit_of_time_makes_rates_about_one():
+    """The fastest of the rates and of a swing on the shortest lever, as a power of two; not below 2^-10."""
+    model, state = chain([1, 0])
+    still = replace(state, omega=0 * state.omega, udot=0 * state.udot, xdot=0 * state.xdot)
+    lever = np.linalg.norm(model.point[:, 1], axis=1) + np.array([model.length[0], 0])
+    for gravity in (1e-4, 10.0, 1e5):
+        heavy = replace(model, gravity=np.array([0.0, 0.6, -0.8]) * gravity)
+        swing = np.sqrt(gravity / min(lever))
+        assert time_exponent(heavy, still) == -round(np.log2(swing))
+    for name in ("omega", "udot", "xdot"):
+        for rate in (-300.0, 2000.0):
+            fast = replace(
+                still, **{name: getattr(still, name) + rate * np.eye(2, getattr(still, name).shape[1])}
+            )
+            assert time_exponent(model, fast) == -round(np.log2(abs(rate)))
+    weightless = replace(model, gravity=np.zeros(3))
+    assert time_exponent(weightless, still) == 10
+    centred = replace(weightless, point=0 * model.point, length=0 * model.length)
+    assert time_exponent(centred, still) == 10
 
 
 def test_a_slow_motion_has_steps_that_its_linear_part_can_follow():

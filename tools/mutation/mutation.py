@@ -158,6 +158,13 @@ def is_text(node: cst.CSTNode | None) -> bool:
     return False
 
 
+def is_type_alias(node: cst.CSTNode) -> bool:
+    """Whether a node assigns a type, as ``NDArray[…]``."""
+    value = node.value if isinstance(node, cst.Assign) else None
+    names = ("NDArray", "np.ndarray", "Callable", "Literal")
+    return isinstance(value, cst.Subscript) and get_full_name_for_node(value) in names
+
+
 def removed_argument(before: cst.Call, after: cst.Call) -> cst.Arg | None:
     """The argument that a mutated call has no longer, or has as None."""
     for i, arg in enumerate(before.args):
@@ -173,10 +180,7 @@ def is_relevant_mutation(node: cst.CSTNode, mutated: cst.CSTNode) -> bool:
     if isinstance(node, cst.SimpleString) and isinstance(mutated, cst.SimpleString) and "->" in node.value:
         return mutated.value.lower() != node.value  # einsum knows its indices by any letter
     if isinstance(node, cst.Assign | cst.AnnAssign):
-        value = node.value
-        name = get_full_name_for_node(value) if isinstance(value, cst.Subscript) else None
-        named = name in ("NDArray", "np.ndarray", "Callable")  # aliases of types
-        return not is_text(value) and not named
+        return not is_text(node.value)
     if isinstance(node, cst.Call) and isinstance(mutated, cst.Call):
         arg = removed_argument(node, mutated)
         function = node.func.attr.value if isinstance(node.func, cst.Attribute) else ""
@@ -209,6 +213,8 @@ class MutantFinder(cst.CSTVisitor):
     def on_visit(self, node: cst.CSTNode) -> bool:
         """Gather the node's mutants; False where nothing inside of it is looked at."""
         if isinstance(node, cst.Annotation | cst.Decorator | cst.Import | cst.ImportFrom | cst.Assert):
+            return False
+        if is_type_alias(node):
             return False
         if isinstance(node, cst.Expr) and isinstance(node.value, cst.SimpleString | cst.ConcatenatedString):
             return False  # a docstring
