@@ -27,7 +27,7 @@ CertificatePrecision = Literal["quad", "octuple"]
 BITS: dict[CertificatePrecision, int] = {"quad": 110, "octuple": 230}  # after the binary point
 ORDER_PER_BIT = 0.5  # of the series: a step is a quarter of their radius of convergence
 LENGTH_BITS = 40  # after the binary point, of a step
-MAX_STEPS = (0.25, 0.125, 0.0625)  # tried in turn, in units of time; a motion at rest has infinite ones
+MAX_STEPS = (0.5, 0.25, 0.125)  # tried in turn, in units of time; a motion at rest has infinite ones
 
 
 def load_checker() -> Any:
@@ -69,7 +69,7 @@ def prove_motion(
     precision: CertificatePrecision = "quad",
     on_step: Callable[[int, int], None] = lambda _done, _of: None,
 ) -> tuple[bytes, Enclosure]:
-    """Find a candidate and prove it; where it is rejected, try octuple precision and shorter steps.
+    """Find a candidate and prove it; where it is rejected, try shorter steps and octuple precision.
 
     Args:
         model: the mechanism.
@@ -92,8 +92,8 @@ def prove_motion(
     if reason := reason_not_provable(model):
         raise TruthUnavailable(reason)
     checker = load_checker()
-    attempts = dict.fromkeys([(MAX_STEPS[0], precision), *((max_step, "octuple") for max_step in MAX_STEPS)])
-    for max_step, bits in attempts:
+    tried = [(max_step, precision) for max_step in MAX_STEPS[:2]]
+    for max_step, bits in dict.fromkeys([*tried, *((max_step, "octuple") for max_step in MAX_STEPS)]):
         raw = make_certificate(model, state, times, scenario, bits, max_step)
         try:
             return raw, checker.enclose_motion(parse_certificate(raw), on_step)
