@@ -103,7 +103,7 @@ from flint import arb, arb_poly, ctx
 
 from plumbline.truth.enclosure_file import JOINTS, SHAPES, Array, Certificate
 
-DEGREE, GUARD_BITS = 11, 40  # of the linear part (R falls with h¹²); of (2) beyond the certificate's own
+DEGREE, GUARD_BITS = 11, 18  # of the linear part (R falls with h¹²); of (2) beyond the certificate's own
 MIN_TUBE, MAX_CONDITION, FAST = 2.0**-44, 100.0, 256.0  # of ε, of T, and of rates where steps are short
 ROUNDING, TINY = 2.0**-51, 2.0**-1000  # of (F)
 MAX_SIGMA, UNIT = 9.86, arb(0.5, 0.5)  # of (8), below π²; [0, 1]
@@ -177,19 +177,18 @@ class _Series:
         if not isinstance(other, _Series):  # a constant
             return _Series(self.c * other, self.r * abs(other), 1)
         c, r = (np.concatenate([getattr(x, name)[..., :1] for x in (self, other)], -1) for name in ("c", "r"))
-        found = _Series(c, r) @ _join([other, self])
-        halves = 1 - np.eye(1, self.c.shape[2]) / 2  # of the value, which this adds twice
-        return _Series(found.c * halves, found.r * halves)
+        slopes = 1 - np.eye(1, self.c.shape[2])  # of self, whose value `other` has
+        return _Series(c, r) @ _join([other, _Series(self.c * slopes, self.r * slopes)])
 
     __rmul__ = __mul__
 
 
 def _convolution(a: Array, b: Array) -> Array:
     """Coefficients (2 DEGREE + 1, m, n) of the product of two matrix polynomials."""
-    full = np.zeros((2 * DEGREE + 1, a.shape[1], b.shape[2]))
-    for i, factor in enumerate(a):
-        full[i : i + DEGREE + 1] += factor @ b
-    return full
+    m, *shape = *a.shape[:2], b.shape[2]
+    products = np.zeros((m, 2 * m, *shape))
+    np.matmul(a[:, None], b, out=products[:, :m])
+    return products.reshape(-1, *shape)[: m * (2 * m - 1)].reshape(m, -1, *shape).sum(0)  # row i starts at i
 
 
 def _constant(matrix: Array) -> _Series:
