@@ -183,9 +183,9 @@ class _Series:
     __rmul__ = __mul__
 
 
-def _convolution(a: Array, b: Array) -> Array:
+def _convolution(a: Array, b: Array) -> Any:
     """Coefficients (2 DEGREE + 1, m, n) of the product of two matrix polynomials."""
-    m, *shape = *a.shape[:2], b.shape[2]
+    m, shape = len(a), (a.shape[1], b.shape[2])
     products = np.zeros((m, 2 * m, *shape))
     np.matmul(a[:, None], b, out=products[:, :m])
     return products.reshape(-1, *shape)[: m * (2 * m - 1)].reshape(m, -1, *shape).sum(0)  # row i starts at i
