@@ -9,6 +9,7 @@ comparison with quad precision shows (tests).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +21,9 @@ from plumbline.truth.enclosure import prove_motion
 from plumbline.truth.notes_motion import simulate_notes_form
 from plumbline.truth.proved_motion import ProvedMotion, round_enclosure
 from plumbline.truth.taylor import Precision, simulate_taylor
+
+if TYPE_CHECKING:
+    from plumbline.truth.enclosure_checker import Enclosure
 
 NOTES_RTOL = 1e-13  # of the notes' form: at 1e-14 it is no closer to extended precision, the rest is rounding
 # 2 s of ten bodies take 2.0 s in extended precision, 0.6 s in double; of fifty 14 s and 4 s
@@ -106,8 +110,7 @@ def prove_and_judge_claim(
         closed_form: as for `trajectory_truth`.
 
     Returns:
-        The proved motion, and the largest error over claim of any sample; the claim includes the rounding of
-        both motions to double.
+        The proved motion, and the largest error over claim of any sample, as `judge_claim` has it.
 
     Raises:
         Rejected: no candidate could be proved.
@@ -116,6 +119,28 @@ def prove_and_judge_claim(
 
     """
     _, enclosure = prove_motion(model, state, times)
+    return round_enclosure(enclosure), judge_claim(model, state, times, enclosure, closed_form)
+
+
+def judge_claim(
+    model: Model, state: State, times: Array, enclosure: Enclosure, closed_form: ClosedFormSamples | None
+) -> float:
+    """Compare the error of the truth by two methods with the uncertainty that it claims.
+
+    Args:
+        model: the mechanism.
+        state: initial state.
+        times: (T,) [s] of the samples, times[0] = 0.
+        enclosure: of the motion.
+        closed_form: as for `trajectory_truth`.
+
+    Returns:
+        The largest error over claim of any sample; the claim includes the rounding of both motions to double.
+
+    Raises:
+        EngineFailure: an integrator stops early.
+
+    """
     proof = round_enclosure(enclosure)
     truth = trajectory_truth(model, state, times, closed_form)
     run, right = truth.trajectory, proof.trajectory
@@ -129,7 +154,7 @@ def prove_and_judge_claim(
             (attitude_error(run.p, right.p), attitude),
         )
     ]
-    return proof, float(np.max(ratios))
+    return float(np.max(ratios))
 
 
 def _simulate_minimal_coordinates(
