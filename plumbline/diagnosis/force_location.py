@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from plumbline.diagnosis.joint_causes import one_number
 from plumbline.model.datatypes import KINDS, Array, Model
+from plumbline.model.kinematics import quaternion_exponential, quaternion_product
 
 Place = tuple[str, list[Model]]  # words, and the mechanism with each of its forces
 RANK_TOLERANCE = 1e-9  # of effects: a force that changes nothing
@@ -28,10 +29,11 @@ def force_places(model: Model) -> Iterator[list[Place]]:
         model: a tree.
 
     Yields:
-        Places of one amount, of all springs together, of two amounts, of three and of six.
+        Places of one amount, of all springs together, of two amounts, of three and of six; of a single body
+        a moment on it and in its ball joint.
 
     """
-    single, joints = list[Place](), list[Place]()
+    single, joints, balls = list[Place](), list[Place](), list[Place]()
     for k, kind in enumerate(model.kind):
         motions = KINDS[kind].motions
         for i, (what, _) in enumerate(motions):
@@ -39,6 +41,8 @@ def force_places(model: Model) -> Iterator[list[Place]]:
             words = f"another {'force' if what == 'slide' else 'torque'} acted along joint {k + 1}{which}"
             effort = one_number("effort", (k, i))(model, model.effort[k, i] + 1.0)
             single.append((words, [effort]))
+        if kind == "ball":
+            balls.append((f"another moment acted in joint {k + 1}", _moments_in_ball(model, k)))
         if len(motions) > 1:
             joints.append((f"other efforts acted along joint {k + 1}", [one for _, (one,) in single[-2:]]))
     springs = [
@@ -50,8 +54,6 @@ def force_places(model: Model) -> Iterator[list[Place]]:
     if len(springs) > 1:
         yield [("the forces of the springs between points were others", springs)]
     yield joints
-    if model.n == 1:
-        return  # a force and a moment on the only body explain any accelerations and wrenches
     loads = {
         name: [
             [one_number(name, (k,))(model, getattr(model, name)[k] + e) for e in np.eye(3)]
@@ -59,11 +61,25 @@ def force_places(model: Model) -> Iterator[list[Place]]:
         ]
         for name in ("force", "moment")
     }
-    yield [
+    on_bodies = [
         (f"another {name} acted on body {k + 1}", loads[name][k]) for name in loads for k in range(model.n)
     ]
+    if model.n == 1:  # a force and a moment on the only body explain any accelerations and wrenches
+        if balls:
+            yield on_bodies[1:] + balls
+        return
+    yield on_bodies + balls
+    if len(balls) > 1:
+        yield [("other moments acted in the ball joints", [one for _, some in balls for one in some])]
     both = [loads["force"][k] + loads["moment"][k] for k in range(model.n)]
     yield [(f"another force and moment acted on body {k + 1}", some) for k, some in enumerate(both)]
+
+
+def _moments_in_ball(model: Model, k: int) -> list[Model]:
+    """Three other moments between the bodies of a ball joint: of a spring that rests at other attitudes."""
+    sprung = one_number("stiffness", (k, 0))(model, model.stiffness[k, 0] or 1.0)
+    turns = (quaternion_product(model.turn[k, 1], quaternion_exponential(e / 2)) for e in np.eye(3))
+    return [one_number("turn", (k, 1))(sprung, turn) for turn in turns]
 
 
 def locate_force(

@@ -100,6 +100,14 @@ class _Difference:
             return np.full(len(self.values), np.inf)
         return np.asarray((found - self.right) / self.weight)
 
+    def left_by(self, misread: Misreading) -> float:
+        """What a misreading leaves, in bounds; in loops energies may be right, found from other numbers."""
+        left = np.abs(self.values - self.effect(misread))
+        energies = slice(self.vectors.stop, None)
+        if self.model.has_loops and np.all(np.abs(self.values[energies]) <= ACCEPTED_RATIO):
+            left = left[self.vectors]
+        return float(np.max(left))
+
     def of_cause(self, cause: JointCause, x: Array) -> Array:
         """The effect of a cause of one number or three."""
         amount = x if len(x) > 1 else float(x[0])
@@ -192,11 +200,9 @@ def _explanations(
     is_plain = not view.are_bodies_kept and not is_open
     without_numbers = (*misreadings(model), *row_defects(model)) if is_plain else ()
     for words, misread in missing_gammas(model) if view.are_bodies_kept else without_numbers:
-        if np.max(np.abs(first.values - first.effect(misread))) > difference.accepted:
+        if first.left_by(misread) > difference.accepted:
             continue  # at half the cost
-        if all(
-            np.max(np.abs(one.values - one.effect(misread))) <= one.accepted for one in (difference, others)
-        ):
+        if all(one.left_by(misread) <= one.accepted for one in (difference, others)):
             rows.setdefault(words.partition(" along ")[0], words)  # of a joint's rows one is enough
     found += rows.values()
     if not found and model.has_loops and view == _View(QUANTITIES):
@@ -366,7 +372,7 @@ def _misread_alone(difference: _Difference) -> str:
 
 def _moment_cause(model: Model, reported: Sequence[StateQuantities], truth: StateTruth) -> str:
     """Name the point about which moments of joints are, where nothing else is wrong: λ (near − P) × F."""
-    off, sizes, arms = [], [], dict[str, list[Array]]()
+    off, sizes, arms = [], [], dict[tuple[str, str], list[Array]]()
     for answer, true, state, bound in zip(
         reported, truth.quantities, truth.states, truth.bounds, strict=True
     ):
@@ -382,15 +388,19 @@ def _moment_cause(model: Model, reported: Sequence[StateQuantities], truth: Stat
         tree = model.mass @ state.r / np.sum(model.mass)
         points = {"the centres of mass": state.r, "the world's origin": 0 * near,
                   "the centre of mass of the whole": np.broadcast_to(tree, near.shape),
-                  "the far points": _far_points(model, state)}  # fmt: skip
+                  "the far points": _far_points(model, state),
+                  "the points of the joints that carry welds": _carrying_points(model, near)}  # fmt: skip
         for words, point in points.items():
-            arms.setdefault(words, []).append(np.cross(near - point, true.joint_reaction).ravel())
-        arms.setdefault(ELEMENT_MOMENTS, []).append(_element_moments(model, state).ravel())
+            lever = np.cross(near - point, true.joint_reaction)
+            for kind in ("joint", *dict.fromkeys(model.kind)):
+                part = lever * np.array([kind in ("joint", own) for own in model.kind])[:, None]
+                arms.setdefault((kind, words), []).append(part.ravel())
+        arms.setdefault(("joint", ELEMENT_MOMENTS), []).append(_element_moments(model, state).ravel())
         off.append(np.ravel(np.asarray(answer.joint_moment) - true.joint_moment))
         sizes.append(np.repeat(bound.tolerance("joint_moment"), 3))
     difference, size = np.concatenate(off), np.concatenate(sizes)
     accepted = max(ACCEPTED_RATIO, ACCEPTED_SHARE * float(np.max(np.abs(difference / size))))
-    for words, parts in arms.items():
+    for (kind, words), parts in arms.items():
         lever = np.concatenate(parts)
         factor = float(lever @ difference) / max(float(lever @ lever), 1e-300)
         if np.max(np.abs(difference - factor * lever) / size) <= accepted:
@@ -398,9 +408,18 @@ def _moment_cause(model: Model, reported: Sequence[StateQuantities], truth: Stat
                 kept = "without" if abs(factor + 1) < ACCEPTED_SHARE else f"with {1 + factor:.6g} times"
                 return f"behaves as if it returned the moments of joints {kept} {words}"
             if abs(factor - 1) < ACCEPTED_SHARE:
-                return f"behaves as if the moments of joints were about {words}"
-            return f"behaves as if the arm of joint moments to {words} counted {1 - factor:.6g} times"
+                return f"behaves as if the moments of {kind}s were about {words}"
+            return f"behaves as if the arm of {kind} moments to {words} counted {1 - factor:.6g} times"
     return ""
+
+
+def _carrying_points(model: Model, near: Array) -> Array:
+    """Of each weld the near point (N, 3) of the joint within its branch that moves, of others their own."""
+    points = near.copy()
+    for k, far in enumerate(model.body[:, 0]):
+        if model.kind[k] == "weld" and far >= 0:
+            points[k] = points[far]
+    return points
 
 
 def _far_points(model: Model, state: State) -> Array:

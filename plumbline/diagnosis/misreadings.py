@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import permutations
 from typing import Any
 
 import numpy as np
 
 from plumbline.diagnosis.joint_causes import element_words, one_number
 from plumbline.diagnosis.joint_prediction import Seen
-from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Array, Model, State
+from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, SPRING_FIELDS, Array, Model, State
 from plumbline.model.kinematics import (
     complete_state,
     own_rates,
@@ -31,6 +32,19 @@ PLACE, PLURALS = (
     re.compile(r"of (body|joint|spring) \d+"),
     {"body": "bodies", "joint": "joints", "spring": "springs"},
 )
+MISSING = {
+    "the springs and dampers of all joints were missing": ("damping", "stiffness"),
+    "the springs and efforts of all joints were missing": ("stiffness", "effort"),
+    "the springs, dampers and efforts of all joints were missing": ("damping", "stiffness", "effort"),
+    "all elements of joints were missing": ("armature", "damping", "stiffness", "effort"),
+    "all springs and dampers between points were missing": ("spring_damping", "spring_stiffness"),
+    "all applied forces and moments were missing": ("force", "moment"),
+    "all drags were missing": ("drag_force", "drag_moment"),
+}
+OTHERS = {"before": "the {} before", "after": "the {} after", "first": "the first {}",
+          "parent": "the {} on which it hangs"}  # fmt: skip
+PRODUCTS = ("yz", "xz", "xy")  # entries of an inertia by the axis that they leave out
+MAX_PLACES = 12  # bodies of a tree in which a field may be another's from each of them on
 TURNS = {1: "as", -1: "against", 2: "twice as", -2: "twice against"}
 
 
@@ -47,17 +61,43 @@ def misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
     alone = list(_single_misreadings(model))
     yield from alone
     yield from _repeated(alone)
-    for name, words in {
+    yield from _fields_of_others(model)
+    known = []
+    for words, names in MISSING.items():
+        present = {name for name in names if np.any(getattr(model, name))}
+        if len(present) > 1 and present not in known:  # one field alone is a cause with a factor
+            known.append(present)
+            yield words, _fields({name: 0 * getattr(model, name) for name in present})
+
+
+def _fields_of_others(model: Model) -> Iterator[tuple[str, Misreading]]:
+    """A field of all bodies, joints or springs taken from another one, or only of those from one on."""
+    for name, things in {
         **dict.fromkeys(JOINT_ELEMENTS, "joint"),
         **dict.fromkeys(BODY_VALUES, "body"),
+        **dict.fromkeys(SPRING_FIELDS[1:], "spring"),
     }.items():
-        values = getattr(model, name)
-        for shift, where in ((1, "before"), (-1, "after")):
-            moved = np.roll(values, shift, axis=0)
-            moved[0 if shift > 0 else -1] = values[0 if shift > 0 else -1]
-            if len(values) > 2 and np.any(moved != values):
-                text = f"{element_words(name)} of every {words} were that of the {words} {where}"
-                yield text, _field(name, moved * _has_place(model, name))
+        values, words = getattr(model, name), element_words(name.removeprefix("spring_"))
+        count = len(values)
+        if count < 3:
+            continue
+        places, known = np.arange(count), [values]
+        sources = {
+            "before": np.maximum(places - 1, 0),
+            "after": np.minimum(places + 1, count - 1),
+            "first": 0 * places,
+        }
+        if things != "spring":
+            sources["parent"] = np.where(model.body[:count, 0] < 0, places, model.body[:count, 0])
+        for where, source in sources.items():
+            for first in range(count - 2 if where != "after" and count <= MAX_PLACES else 1):
+                taken = np.where(places > first, source, places) if first else source
+                moved = values[taken] * _has_place(model, name)
+                if np.sum(moved != values) < 2 or any(np.array_equal(moved, one) for one in known):
+                    continue  # a single number is a cause of its own
+                known.append(moved)
+                which = f"{PLURALS[things]} {first + 2} to {count}" if first else f"every {things}"
+                yield f"{words} of {which} were that of {OTHERS[where].format(things)}", _field(name, moved)
 
 
 def _single_misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
@@ -87,6 +127,15 @@ def _single_misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
         if len(KINDS[model.kind[k]].motions) == 2:
             for name, words in (("x", "coordinates"), ("xdot", "rates")):
                 yield f"the {words} of joint {k + 1} were exchanged", _exchanged(name, k)
+            for name in JOINT_ELEMENTS:
+                pair = getattr(model, name)[k]
+                if pair[0] != pair[1]:
+                    words = f"{element_words(name)} of the two coordinates of joint {k + 1} were exchanged"
+                    yield words, _number(name, k, pair[::-1])
+        yield from _body_misreadings(model, k)
+        for i in range(len(KINDS[model.kind[k]].motions)):
+            if model.stiffness[k, i]:
+                yield f"spring {i + 1} of joint {k + 1} did not count its coordinate", _unmoved_spring(k, i)
         for times, how in TURNS.items() if not KINDS[model.kind[k]].has_attitude else ():
             turn = np.linalg.matrix_power(rotation_matrix(model.turn[k, 1]), times)
             inertia = turn @ model.inertia[k] @ turn.T
@@ -94,6 +143,7 @@ def _single_misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
                 yield f"the inertia {of} were turned {how} its joint's axes", _number("inertia", k, inertia)
     yield from _point_misreadings(model)
     yield from _axes_misreadings(model)
+    yield from _spring_misreadings(model)
     for number in map(int, np.flatnonzero(model.spring_damping)):
         yield f"the rate of spring {number + 1} were dᵀḋ, not over the length", _undivided_rate(number)
 
@@ -147,6 +197,90 @@ def _branch(given: int, guess: Callable[[Array], Array]) -> Misreading:
         return Seen(model, other, is_elsewhere=True)
 
     return misread
+
+
+def _body_misreadings(model: Model, k: int) -> Iterator[tuple[str, Misreading]]:
+    """Products of inertia in another order, loads or drags exchanged, and drag by other velocities."""
+    of = f"of body {k + 1}"
+    inertia, known = model.inertia[k], [model.inertia[k]]
+    for order in permutations(range(3)):
+        other, signs = inertia.copy(), (-1.0, 1.0)
+        for sign in signs:
+            for i, j in enumerate(order):
+                a, b, c, d = (i + 1) % 3, (i + 2) % 3, (j + 1) % 3, (j + 2) % 3
+                other[a, b] = other[b, a] = sign * inertia[c, d]
+            if all(np.max(np.abs(other - one)) > EQUAL * np.max(np.abs(inertia)) for one in known):
+                known.append(other.copy())
+                taken = ", ".join("-" * (sign < 0) + PRODUCTS[j] for j in order)
+                words = f"the products of inertia yz, xz, xy {of} were {taken}"
+                yield words, _number("inertia", k, other.copy())
+    for one, other_name, words in (
+        ("force", "moment", "the applied force and moment"),
+        ("drag_force", "drag_moment", "the drag force and the drag moment"),
+    ):
+        a, b = getattr(model, one)[k], getattr(model, other_name)[k]
+        if np.any(a != b):
+            yield f"{words} {of} were exchanged", _two_numbers(k, {one: b, other_name: a})
+    if model.drag_moment[k]:
+        yield (
+            f"the drag moment {of} were taken with the world-frame angular velocity",
+            _other_drag("moment", k),
+        )
+    if model.drag_force[k]:
+        yield f"the drag force {of} were taken with the body-frame velocity", _other_drag("force", k)
+        yield (
+            f"the drag force {of} were taken with the velocity of its joint's point",
+            _other_drag("point", k),
+        )
+
+
+def _two_numbers(k: int, values: Mapping[str, Any]) -> Misreading:
+    def misread(model: Model, state: State) -> Seen:
+        for name, value in values.items():
+            model = one_number(name, (k,))(model, value)
+        return Seen(model, state)
+
+    return misread
+
+
+def _other_drag(what: str, k: int) -> Misreading:
+    """The drag of a body by another velocity than its own; the difference acts as a load."""
+
+    def misread(model: Model, state: State) -> Seen:
+        at = complete_state(model, state)
+        turn = rotation_matrix(at.p[k])
+        own, other = {
+            "moment": (at.omega[k], turn @ at.omega[k]),
+            "force": (at.v[k], turn.T @ at.v[k]),
+            "point": (at.v[k], at.v[k] + turn @ np.cross(at.omega[k], model.proximal[k])),
+        }[what]
+        name = "moment" if what == "moment" else "force"
+        load = getattr(model, name)[k] + getattr(model, f"drag_{name}")[k] * (own - other)
+        return Seen(one_number(name, (k,))(model, load), state)
+
+    return misread
+
+
+def _unmoved_spring(k: int, i: int) -> Misreading:
+    """A joint's spring that pulls with its rest position alone."""
+
+    def misread(model: Model, state: State) -> Seen:
+        effort = model.effort[k, i] + model.stiffness[k, i] * state.x[k, i]
+        return Seen(one_number("effort", (k, i))(model, effort), state)
+
+    return misread
+
+
+def _spring_misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
+    """Points of springs negated, left out or exchanged."""
+    for i, points in enumerate(model.spring_point):
+        readings = {f"the points of spring {i + 1} were exchanged": (points[1], points[0])}
+        for side, where in enumerate(("first", "second")):
+            where = f"the {where} point" if model.spring_body[i, side] >= 0 else "the world's point"
+            for words, point in (("negated", -points[side]), ("left out", 0 * points[side])):
+                pair = (point, points[1]) if side == 0 else (points[0], point)
+                readings[f"{where} of spring {i + 1} were {words}"] = pair
+        yield from _different("spring_point", i, points, readings)
 
 
 def _point_misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
@@ -271,7 +405,10 @@ def _exchanged(name: str, k: int) -> Misreading:
 
 
 def _field(name: str, values: Array) -> Misreading:
-    changed: dict[str, Any] = {name: values}
+    return _fields({name: values})
+
+
+def _fields(changed: Mapping[str, Any]) -> Misreading:
     return lambda model, state: Seen(replace(model, **changed), state)
 
 

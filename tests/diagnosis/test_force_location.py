@@ -70,6 +70,16 @@ def spring(i):
     return replace(found, potential_energy=truth.quantities[i].potential_energy)
 
 
+def ball(i):
+    """Another damping of the ball joint about one axis of the body: a moment on it in the joint."""
+    _, truth = right()
+    turn = rotation_matrix(truth.states[i].p[0])[:, 0]
+    found = added("moment", (0,), lambda x: x[0] * np.eye(3)[0])(i)
+    moment = found.joint_moment.copy()
+    moment[0] += DRAWS[i, 0] * turn  # on the world it acts with the opposite sign
+    return replace(found, joint_moment=moment)
+
+
 def velocity_term(i):
     """The universal joint's rows with another acceleration."""
     model, truth = right()
@@ -87,10 +97,22 @@ def few_fast(cases, *fast):
     ]
 
 
+def other_moment_point(i):
+    """Moments of the universal joint about its body's centre of mass."""
+    model, truth = right()
+    found, state = truth.quantities[i], truth.states[i]
+    arm = rotation_matrix(state.p[2]) @ model.proximal[2]
+    moment = found.joint_moment.copy()
+    moment[2] += np.cross(arm, found.joint_reaction[2])
+    return replace(found, joint_moment=moment)
+
+
 NAMED = {
+    "the moments of universals were about the centres of mass;": other_moment_point,
     "another torque acted along joint 2;": added("effort", (1, 0), lambda x: x[0]),
     "other efforts acted along joint 3;": added("effort", (2,), lambda x: x[:2]),
     "the force of spring 1 were another;": spring,
+    "another moment acted in joint 1;": ball,
     "another moment acted on body 3;": added("moment", (2,), lambda x: x[:3]),
     "another force acted on body 2;": added("force", (1,), lambda x: x[:3]),
     "another force and moment acted on body 3;": both,
@@ -115,7 +137,7 @@ def other_inertia(i):
     return added("inertia", (2,), lambda x: 0.01 * np.abs(x[0]) * np.diag([1, 2, 2.5]))(i)
 
 
-@pytest.mark.parametrize("expected", few_fast(NAMED))
+@pytest.mark.parametrize("expected", few_fast(NAMED, "moments of universals", "in joint 1"))
 def test_the_place_of_unknown_forces_is_named(expected):
     model, truth = right()
     text = diagnose_joints(model, [NAMED[expected](i) for i in range(STATES)], truth)
@@ -133,12 +155,28 @@ def test_other_differences_are_no_force_at_one_place(answer):
     few_fast(
         [
             "the coordinates of joint 3 were exchanged",
-            "coordinate 1 of joint 3 were its absolute value",
+            "rate 1 of joint 3 were its absolute value",
             "the applied moment of all bodies were given in the world frame",
             "the damping of every joint were that of the joint before",
             "the inertia of body 2 were turned against its joint's axes",
+            "the stiffness of the two coordinates of joint 3 were exchanged",
+            "the drag force and the drag moment of all bodies were exchanged",
+            "the products of inertia yz, xz, xy of all bodies were xy, xz, yz",
+            "the products of inertia yz, xz, xy of body 2 were -yz, -xz, -xy",
+            "the drag moment of all bodies were taken with the world-frame angular velocity",
+            "the drag force of body 3 were taken with the velocity of its joint's point",
+            "the drag force of body 3 were taken with the body-frame velocity",
+            "the world's point of spring 1 were negated",
+            "the first point of spring 2 were left out",
+            "spring 1 of joint 2 did not count its coordinate",
+            "the inertia of every body were that of the first body",
+            "the springs, dampers and efforts of all joints were missing",
+            "all drags were missing",
         ],
-        "exchanged",
+        "coordinates of joint 3 were exchanged",
+        "xy, xz, yz",
+        "world-frame angular",
+        "negated",
     ),
 )
 def test_a_reading_is_named_that_explains_every_state(words):
