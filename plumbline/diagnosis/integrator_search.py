@@ -26,6 +26,7 @@ from plumbline.diagnosis.result import Diagnosis
 from plumbline.engines.calls import StepEvaluation
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import Array, Model, State, StepRun
+from plumbline.model.kinematics import angular_velocity, quaternion_rate, rotation_matrix
 from plumbline.model.step_methods import (
     ConstrainedMethod,
     JointSpaceMethod,
@@ -135,9 +136,53 @@ def explain_steps(model: Model, states: Sequence[State], method: StepMethod, ans
         return max(ratios) if len(ratios) and len(ratios) >= comparisons else np.inf
 
     comparisons = sum(len(c.ratios) for c in steps.compare(runs).values())
+    read = [
+        words
+        for words, correct in sample_readings(model)
+        if all(max(c.ratios, default=0.0) <= 1.0 for c in steps.compare([correct(x) for x in runs]).values())
+    ]
+    if read:
+        return f"behaves as if {read[0]}" + "".join(f"; or as if {words}" for words in read[1:])
     if method.implicit_forces == "joint dampers" and not np.any(model.damping):
         method = replace(method, implicit_forces="none")  # the same step
     return _describe(list(_joint_space_alternatives(method, model)), residuals, remaining)
+
+
+def sample_readings(model: Model) -> Iterator[tuple[str, Callable[[StepRun], StepRun]]]:
+    """List in which other frames, or at which other points, an engine's samples may hold the velocities.
+
+    Args:
+        model: the mechanism.
+
+    Yields:
+        Words that complete "behaves as if", and what turns such samples into right ones.
+
+    """
+    frames = rotation_matrix(model.turn[: model.n, 1])
+
+    def corrected(
+        change: Callable[[Array, Array, Array], tuple[Array, Array]],
+    ) -> Callable[[StepRun], StepRun]:
+        def correct(run: StepRun) -> StepRun:
+            motion = run.trajectory
+            v, omega = change(rotation_matrix(motion.p), motion.v, angular_velocity(motion.p, motion.pdot))
+            return replace(run, trajectory=replace(motion, v=v, pdot=quaternion_rate(motion.p, omega)))
+
+        return correct
+
+    for words, change in {
+        "the velocities of samples were in the body frame": lambda a, v, w: (np.matvec(a, v), w),
+        "the velocities of samples were those of the joints' points": lambda a, v, w: (
+            v - np.matvec(a, np.cross(w, model.proximal)),
+            w,
+        ),
+        "the angular velocities of samples were in the world frame": lambda a, v, w: (v, np.matvec(a.mT, w)),
+        "the angular velocities of samples were in the joints' axes": lambda a, v, w: (
+            v,
+            np.matvec(frames, w),
+        ),
+    }.items():
+        yield words, corrected(change)
 
 
 def _describe(

@@ -9,6 +9,7 @@ import pytest
 
 from plumbline.diagnosis.integrator_search import UNEXPLAINED, explain_steps
 from plumbline.engines.registry import load_adapter
+from plumbline.model.kinematics import angular_velocity, quaternion_rate, rotation_matrix
 from plumbline.truth import step_formulas
 from tests.helpers.nightly_tests import some_fast
 from tests.helpers.planted_steps import STEP_DEFECTS, planted_step, words_for
@@ -68,6 +69,33 @@ def test_a_wrong_axial_inertia_of_rods_is_named(engine):
     wrong = replace(integrator, method=replace(integrator.method, rod_axial_inertia=2 * right))
     text = explanation(adapter, wrong, "mixed")
     assert f"axial inertia of rods were {right:.3g}"[:36] in text and "behaves as if" in text, text
+
+
+def _turned_rates(answer, other):
+    """The steps of an engine whose samples hold other velocities."""
+    attempts = []
+    for attempt in answer.attempts:
+        motion = attempt.run.trajectory
+        omega, turn = angular_velocity(motion.p, motion.pdot), rotation_matrix(motion.p)
+        v, omega = other(turn, motion.v, omega)
+        motion = replace(motion, v=v, pdot=quaternion_rate(motion.p, omega))
+        attempts.append(replace(attempt, run=replace(attempt.run, trajectory=motion)))
+    return replace(answer, attempts=attempts)
+
+
+@pytest.mark.parametrize("words", ["in the body frame", "joints' points", "in the world frame"])
+def test_samples_with_other_velocities_are_named(words):
+    model, states = subject("balls")
+    other = {
+        "in the body frame": lambda a, v, w: (np.matvec(a.mT, v), w),
+        "joints' points": lambda a, v, w: (v + np.matvec(a, np.cross(w, model.proximal)), w),
+        "in the world frame": lambda a, v, w: (v, np.matvec(a, w)),
+    }[words]
+    adapter = load_adapter("pinocchio")
+    integrator = methods("pinocchio")[0]
+    answer = _turned_rates(stepped(adapter, integrator, model, states), other)
+    text = explain_steps(model, states, integrator.method, answer)
+    assert text.endswith(words) and "or as if" not in text, text
 
 
 def test_noise_is_not_named():
