@@ -137,7 +137,7 @@ def other_inertia(i):
     return added("inertia", (2,), lambda x: 0.01 * np.abs(x[0]) * np.diag([1, 2, 2.5]))(i)
 
 
-@pytest.mark.parametrize("expected", few_fast(NAMED, "moments of universals", "in joint 1"))
+@pytest.mark.parametrize("expected", few_fast(NAMED))
 def test_the_place_of_unknown_forces_is_named(expected):
     model, truth = right()
     text = diagnose_joints(model, [NAMED[expected](i) for i in range(STATES)], truth)
