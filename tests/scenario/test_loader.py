@@ -99,6 +99,7 @@ TREE_JOINTS = {
     "slider-on-arm": ("hinge", "slide"),
     "spring-pendulum": ("free",),
     "sprung-ball": ("ball", "ball"),
+    "sprung-ball-on-slide": ("slide", "ball"),
     "sprung-cylinder": ("cylindrical",),
     "sprung-hinge": ("hinge",),
     "sprung-slide": ("slide",),
