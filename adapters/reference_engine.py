@@ -26,11 +26,11 @@ from plumbline.model.datatypes import (
     Trajectory,
 )
 from plumbline.model.kinematics import joint_coordinates
-from reference_impl.collocation import integrate_collocation
 from reference_impl.direct import DirectSystem, Solution
 from reference_impl.errors import SingularSystem
+from reference_impl.fast.collocation import integrate_collocation
+from reference_impl.fast.tree_elimination import eliminated_system
 from reference_impl.integrate import integrate_dop853, structured_acceleration
-from reference_impl.tree_elimination import eliminated_system
 
 
 class Reference(MetamorphicHooks):

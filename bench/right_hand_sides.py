@@ -19,8 +19,8 @@ from plumbline.model.kinematics import quaternion_rate
 from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from reference_impl.direct import DirectSystem, solve_dense
-from reference_impl.structured import StructuredSystem, component_first
-from reference_impl.tree_elimination import TreeSystem
+from reference_impl.fast.chain_elimination import StructuredSystem, component_first
+from reference_impl.fast.tree_elimination import TreeSystem
 from tests.helpers.random_chains import random_chain
 
 Call = Callable[[], object]

@@ -12,7 +12,7 @@ import numpy as np
 from plumbline.engines.adapter import Adapter
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import quaternion_rate
-from reference_impl.collocation import integrate_collocation
+from reference_impl.fast.collocation import integrate_collocation
 from reference_impl.integrate import integrate_dop853, structured_acceleration
 
 SAMPLE_TIMES = np.array([0.0, 2.0])

@@ -12,9 +12,9 @@ from reference_impl import notes
 from reference_impl.direct import DirectSystem
 from reference_impl.elements import Elements
 from reference_impl.euler_parameters import angular_velocity
+from reference_impl.fast.chain_elimination import component_first
+from reference_impl.fast.tree_elimination import TreeSystem, eliminated_system
 from reference_impl.mechanism import Array, Mechanism
-from reference_impl.structured import component_first
-from reference_impl.tree_elimination import TreeSystem, eliminated_system
 
 # r̈ and p̈, (7 N,), at r, p, ṙ, ṗ (N, ·) and joint coordinates (N, 2), near which angles of springs are taken
 Acceleration = Callable[[Array, Array, Array, Array, Array | None], Array]

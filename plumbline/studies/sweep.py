@@ -27,7 +27,7 @@ from plumbline.scenario.loader import Scenario
 from plumbline.studies.sweep_file import REFINEMENT_LEVELS, Sweep, SweepCell
 from plumbline.studies.tables import make_table
 from plumbline.truth.ground_truth import MotionTruth, motion_truth
-from reference_impl import collocation
+from reference_impl.fast import collocation
 
 REFERENCE_RTOLS = (1e-9, 1e-11)  # of the reference: a run, and the tighter run that gives its uncertainty
 MAX_REFERENCE_STEPS = 1e6  # about 20 min

@@ -6,9 +6,9 @@ from typing import Literal
 
 from plumbline.model.datatypes import Array, EngineFailure, Model, State, Trajectory
 from plumbline.model.kinematics import joint_coordinates, quaternion_rate
-from reference_impl.collocation import integrate_collocation
+from reference_impl.fast.collocation import integrate_collocation
+from reference_impl.fast.tree_elimination import eliminated_system
 from reference_impl.integrate import IntegrationResult, integrate_dop853, structured_acceleration
-from reference_impl.tree_elimination import eliminated_system
 
 NotesIntegrator = Literal["collocation", "dop853"]
 

@@ -52,9 +52,9 @@ from plumbline.truth.parameters import (
 )
 from plumbline.truth.rounding_bound import NewtonEulerSystem
 from plumbline.truth.step_formulas import fastest_rates
-from reference_impl.collocation import integrate_collocation
-from reference_impl.structured import component_first
-from reference_impl.tree_elimination import TreeSystem, eliminated_system
+from reference_impl.fast.chain_elimination import component_first
+from reference_impl.fast.collocation import integrate_collocation
+from reference_impl.fast.tree_elimination import TreeSystem, eliminated_system
 
 STATE_MISTAKE = 1e-4  # of a state's parameters, in central differences
 TREE_MISTAKE = 0.02  # of a tree's: rounding in the difference is below a bound, its error below 0.1 %

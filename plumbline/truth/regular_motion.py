@@ -18,8 +18,8 @@ from plumbline.model.kinematics import (
     with_joint_coordinates,
 )
 from plumbline.model.loops import MIN_MOTION_SINGULAR_VALUE, regular_rank, smallest_singular_value
-from reference_impl.collocation import integrate_collocation
-from reference_impl.tree_elimination import eliminated_system
+from reference_impl.fast.collocation import integrate_collocation
+from reference_impl.fast.tree_elimination import eliminated_system
 
 RTOL = 1e-9
 PARTS = 4  # of a stride, at which singular values are taken

@@ -29,9 +29,9 @@ from plumbline.model.kinematics import (
 )
 from plumbline.model.loops import assembled
 from plumbline.model.sampling import derive_seed
-from reference_impl.collocation import integrate_collocation
-from reference_impl.structured import component_first
-from reference_impl.tree_elimination import eliminated_system
+from reference_impl.fast.chain_elimination import component_first
+from reference_impl.fast.collocation import integrate_collocation
+from reference_impl.fast.tree_elimination import eliminated_system
 
 PERTURBATION_SIZE = 1e-7  # of each angle [rad], of each rate relative to the largest rate of the motion
 PERTURBATION_COUNT = 4  # random directions

@@ -9,7 +9,7 @@ import numpy as np
 
 from plumbline.model import kinematics
 from plumbline.model.datatypes import Array, Model, State, Trajectory
-from reference_impl.collocation import integrate_collocation
+from reference_impl.fast.collocation import integrate_collocation
 from tests.helpers.random_chains import random_model, random_state
 
 JOINT_PATTERNS = {  # b: hung by a ball joint, r: by a rod

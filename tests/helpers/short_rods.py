@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from reference_impl.collocation import BatchIntegrationResult, integrate_collocation
+from reference_impl.fast.chain_elimination import StructuredSystem
+from reference_impl.fast.collocation import BatchIntegrationResult, integrate_collocation
 from reference_impl.mechanism import Array, Mechanism
-from reference_impl.structured import StructuredSystem
 
 
 @dataclass(frozen=True, eq=False)

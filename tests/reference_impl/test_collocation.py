@@ -9,10 +9,10 @@ import pytest
 from numpy.polynomial.legendre import legval
 
 from plumbline.model.kinematics import quaternion_rate
-from reference_impl import collocation
 from reference_impl import integrate as raw
-from reference_impl.collocation import gauss_tables, integrate_collocation
-from reference_impl.structured import StructuredSystem, component_first
+from reference_impl.fast import collocation
+from reference_impl.fast.chain_elimination import StructuredSystem, component_first
+from reference_impl.fast.collocation import gauss_tables, integrate_collocation
 from tests.helpers.random_chains import in_other_units, random_chain
 
 TIMES = np.linspace(0.0, 1.0, 11)

@@ -10,8 +10,8 @@ from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from reference_impl.direct import DirectSystem
 from reference_impl.euler_parameters import euler_parameter_rate
+from reference_impl.fast.chain_elimination import StructuredSystem
 from reference_impl.joints import constraint_rows
-from reference_impl.structured import StructuredSystem
 
 TESTED_KINDS = [kind for kind in KINDS if kind not in ("rod", "free")]  # the rod's row is the notes' own
 

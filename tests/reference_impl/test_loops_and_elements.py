@@ -7,10 +7,11 @@ from plumbline.model.kinematics import quaternion_rate
 from plumbline.model.random_mechanisms import random_tree
 from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import find_scenario_file, load_scenario
-from reference_impl.collocation import integrate_collocation
 from reference_impl.direct import DirectSystem, solve_dense
 from reference_impl.elements import Elements
 from reference_impl.euler_parameters import L
+from reference_impl.fast.collocation import integrate_collocation
+from reference_impl.fast.tree_elimination import eliminated_system
 from reference_impl.integrate import (
     direct_acceleration,
     integrate_dop853,
@@ -18,7 +19,6 @@ from reference_impl.integrate import (
     state_scales,
 )
 from reference_impl.mechanism import JOINT_ELEMENTS, SPRING_FIELDS, Mechanism
-from reference_impl.tree_elimination import eliminated_system
 
 LOOPS = ("four-bar", "slider-crank", "bricard")  # the last is overconstrained: one row depends on the others
 

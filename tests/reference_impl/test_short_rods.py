@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from plumbline.model.kinematics import quaternion_rate
-from reference_impl.collocation import integrate_collocation
 from reference_impl.direct import DirectSystem
+from reference_impl.fast.collocation import integrate_collocation
 from tests.helpers.random_chains import in_other_units, random_chain
 from tests.helpers.short_rods import replace_balls_by_rods, slow_manifold_directions, study_rod_limit
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from plumbline.model.kinematics import quaternion_rate
-from reference_impl.collocation import integrate_collocation
+from reference_impl.fast.chain_elimination import StructuredSystem, component_first
+from reference_impl.fast.collocation import integrate_collocation
 from reference_impl.joints import constraint_rows
-from reference_impl.structured import StructuredSystem, component_first
 from tests.helpers.random_chains import random_chain
 
 

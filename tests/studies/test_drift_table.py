@@ -17,8 +17,8 @@ from plumbline.scenario import loader as scenarios
 from plumbline.storage.results_store import DRIFT_TABLE
 from plumbline.studies import drift
 from plumbline.studies.drift import VARIANTS, drift_errors
-from reference_impl.collocation import integrate_collocation
 from reference_impl.euler_parameters import angular_velocity
+from reference_impl.fast.collocation import integrate_collocation
 from reference_impl.joints import constraint_rows
 from tests.helpers.random_chains import random_chain
 

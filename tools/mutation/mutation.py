@@ -60,7 +60,7 @@ EXIT_LATE_TEST, EXIT_NOT_TRIED = 253, 254  # exit codes of a child, see `Limit` 
 MARKS = "slow or not full"  # without the long forms
 PYTEST_PLUGINS = ("no:cacheprovider", "pytest_timeout", "_hypothesis_pytestplugin")  # others only take time
 TARGETS = {
-    "reference_impl": ["reference_impl/*.py"],
+    "reference_impl": ["reference_impl/**/*.py"],
     "judging": [
         *(
             f"plumbline/judging/{name}.py"

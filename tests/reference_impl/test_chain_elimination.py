@@ -8,8 +8,8 @@ from plumbline.truth.rounding_bound import state_rounding_bound
 from reference_impl.direct import EPS, DirectSystem, Solution
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import L
+from reference_impl.fast.chain_elimination import StructuredSystem, component_first
 from reference_impl.joints import constraint_rows
-from reference_impl.structured import StructuredSystem, component_first
 from tests.helpers.random_chains import in_other_units, norms_per_body, random_chain
 
 JOINT_MIXES = {

@@ -1,7 +1,7 @@
 """The system S x = b of the notes for any joints; trees in O(bodies), eliminated leaves first.
 
-The rows are those of `joints`.  With π = pᵀp and α of p̈ = Lᵀα/2π − p ṗᵀṗ/π as in `structured`, the rows of
-joint k are n_k a_k + f_k a_far = γ_k for a = (r̈, α), and every body obeys
+The rows are those of `joints`.  With π = pᵀp and α of p̈ = Lᵀα/2π − p ṗᵀṗ/π as in `chain_elimination`, the
+rows of joint k are n_k a_k + f_k a_far = γ_k for a = (r̈, α), and every body obeys
 
     A_k a_k = b_k − n_kᵀ λ_k,   A = diag(m I, J),   b = (F, n′ − ω×Jω/π − 2 (σ/π) Jω)
 
@@ -41,9 +41,9 @@ from reference_impl.direct import (
 from reference_impl.elements import Elements
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import L, angular_velocity, cross, dot
+from reference_impl.fast.chain_elimination import StructuredSystem, component_first
 from reference_impl.joints import constraint_rows, joint_of_rows
 from reference_impl.mechanism import Array, Mechanism
-from reference_impl.structured import StructuredSystem, component_first
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,10 +20,10 @@ from functools import cache
 import numpy as np
 from numpy.polynomial.legendre import leggauss, legvander
 
+from reference_impl.fast.chain_elimination import component_first
+from reference_impl.fast.tree_elimination import EliminatedSystem, TreeSystem, eliminated_system
 from reference_impl.integrate import IntegrationResult, state_scales
 from reference_impl.mechanism import Array, Mechanism
-from reference_impl.structured import component_first
-from reference_impl.tree_elimination import EliminatedSystem, TreeSystem, eliminated_system
 
 DEFAULT_NODES = 16  # a sweep of a small chain costs NumPy's calls and not its nodes: 8 … 20 were tried
 MAX_SWEEPS = 14  # at most in a step; more are better spent on a shorter step
