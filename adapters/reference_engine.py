@@ -29,8 +29,8 @@ from plumbline.model.kinematics import joint_coordinates
 from reference_impl.direct import DirectSystem, Solution
 from reference_impl.errors import SingularSystem
 from reference_impl.fast.collocation import integrate_collocation
-from reference_impl.fast.tree_elimination import eliminated_system
-from reference_impl.integrate import integrate_dop853, structured_acceleration
+from reference_impl.fast.tree_elimination import eliminated_acceleration, eliminated_system
+from reference_impl.integrate import integrate_dop853
 
 
 class Reference(MetamorphicHooks):
@@ -103,7 +103,7 @@ class Reference(MetamorphicHooks):
                 system = eliminated_system([model], x)
                 return trajectory(integrate_collocation(system, *start, times, resolution))
             # Where the matrix may be singular the direct form, which says why, and keeps its rows in a run.
-            form = None if model.has_loops or model.lacks_inertia else structured_acceleration(model)
+            form = None if model.has_loops or model.lacks_inertia else eliminated_acceleration(model)
             return trajectory(integrate_dop853(model, *start, times, resolution, form, x))
         except ArithmeticError as error:
             raise EngineFailure(f"{self.title}: {error}") from error

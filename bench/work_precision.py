@@ -13,7 +13,8 @@ from plumbline.engines.adapter import Adapter
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import quaternion_rate
 from reference_impl.fast.collocation import integrate_collocation
-from reference_impl.integrate import integrate_dop853, structured_acceleration
+from reference_impl.fast.tree_elimination import eliminated_acceleration
+from reference_impl.integrate import integrate_dop853
 
 SAMPLE_TIMES = np.array([0.0, 2.0])
 TOLERANCES = (1e-3, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-12)
@@ -129,7 +130,7 @@ def dop853_curve(
                 *stack_states([state]),
                 SAMPLE_TIMES,
                 rtol,
-                acceleration=structured_acceleration(model) if structured else None,
+                acceleration=eliminated_acceleration(model) if structured else None,
             ).r[-1]
             for state in states
         ]

@@ -12,8 +12,6 @@ from reference_impl import notes
 from reference_impl.direct import DirectSystem
 from reference_impl.elements import Elements
 from reference_impl.euler_parameters import angular_velocity
-from reference_impl.fast.chain_elimination import component_first
-from reference_impl.fast.tree_elimination import TreeSystem, eliminated_system
 from reference_impl.mechanism import Array, Mechanism
 
 # r̈ and p̈, (7 N,), at r, p, ṙ, ṗ (N, ·) and joint coordinates (N, 2), near which angles of springs are taken
@@ -80,27 +78,6 @@ def direct_acceleration(chain: Mechanism, gamma_defect: float | Array = 0.0) -> 
 
     def acceleration(r: Array, p: Array, v: Array, pdot: Array, x: Array | None = None) -> Array:
         return system.solve_unknowns(r, p, v, pdot, gamma_defect, x)[0][: 7 * chain.n]
-
-    return acceleration
-
-
-def structured_acceleration(chain: Mechanism) -> Acceleration:
-    """Return the right-hand side of the O(bodies) form, which takes less time on long chains.
-
-    Args:
-        chain: the mechanism.
-
-    Returns:
-        r̈ and p̈ (7 N,) as a function of r, p, ṙ, ṗ.
-
-    """
-    system = eliminated_system([chain])
-
-    def acceleration(r: Array, p: Array, v: Array, pdot: Array, x: Array | None = None) -> Array:
-        if isinstance(system, TreeSystem):
-            system.x = x
-        a = system.acceleration(component_first(r, p), component_first(v, pdot))
-        return np.concatenate([a[:3].T.ravel(), a[3:].T.ravel()])
 
     return acceleration
 

@@ -7,8 +7,8 @@ from typing import Literal
 from plumbline.model.datatypes import Array, EngineFailure, Model, State, Trajectory
 from plumbline.model.kinematics import joint_coordinates, quaternion_rate
 from reference_impl.fast.collocation import integrate_collocation
-from reference_impl.fast.tree_elimination import eliminated_system
-from reference_impl.integrate import IntegrationResult, integrate_dop853, structured_acceleration
+from reference_impl.fast.tree_elimination import eliminated_acceleration, eliminated_system
+from reference_impl.integrate import IntegrationResult, integrate_dop853
 
 NotesIntegrator = Literal["collocation", "dop853"]
 
@@ -44,7 +44,7 @@ def simulate_notes_form(
         if (
             method == "dop853"
         ):  # absolute tolerances of 1 m, 1, 1 m/s and 1 1/s: those by default are too coarse
-            form = structured_acceleration(model)
+            form = eliminated_acceleration(model)
             run = integrate_dop853(model, *start, times, rtol, form, x=x, atol=rtol)
         else:
             system = eliminated_system([model], x)

@@ -42,6 +42,7 @@ from reference_impl.elements import Elements
 from reference_impl.errors import SingularSystem
 from reference_impl.euler_parameters import L, angular_velocity, cross, dot
 from reference_impl.fast.chain_elimination import StructuredSystem, component_first
+from reference_impl.integrate import Acceleration
 from reference_impl.joints import constraint_rows, joint_of_rows
 from reference_impl.mechanism import Array, Mechanism
 
@@ -377,6 +378,27 @@ def eliminated_system(mechanisms: Sequence[Mechanism], x: Array | None = None) -
     if all(mechanism.is_chain for mechanism in mechanisms):
         return StructuredSystem(mechanisms)
     return TreeSystem(mechanisms, x)
+
+
+def eliminated_acceleration(chain: Mechanism) -> Acceleration:
+    """Return the right-hand side of the eliminated form, which takes less time on long chains.
+
+    Args:
+        chain: the mechanism.
+
+    Returns:
+        r̈ and p̈ (7 N,) as a function of r, p, ṙ, ṗ.
+
+    """
+    system = eliminated_system([chain])
+
+    def acceleration(r: Array, p: Array, v: Array, pdot: Array, x: Array | None = None) -> Array:
+        if isinstance(system, TreeSystem):
+            system.x = x
+        a = system.acceleration(component_first(r, p), component_first(v, pdot))
+        return np.concatenate([a[:3].T.ravel(), a[3:].T.ravel()])
+
+    return acceleration
 
 
 def side_by_side(mechanisms: Sequence[Mechanism]) -> Mechanism:

@@ -104,6 +104,16 @@ def test_a_package_beside_the_core_imports_only_what_it_may(name):
         )
 
 
+def test_the_readable_reference_imports_no_fast_form():
+    """What is read beside the notes is complete without what was written for speed."""
+    readable = [
+        m for m in MODULES if m.startswith("reference_impl.") and not m.startswith("reference_impl.fast")
+    ]
+    for name in readable:
+        fast = {m for m in imports(name, at_import=False) if m.startswith("reference_impl.fast")}
+        assert not fast, f"{name} imports {fast}"
+
+
 def test_no_adapter_imports_another():
     engines = {
         m: imports(m, at_import=False) for m in MODULES if m.startswith("adapters.") and m.endswith("_engine")
