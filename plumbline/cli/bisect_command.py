@@ -20,7 +20,7 @@ from plumbline.execution.plan import Plan
 from plumbline.execution.version_search import NoSearch, VersionChange, search_versions
 from plumbline.processes.workers import Limits
 from plumbline.scenario.errors import did_you_mean, shorten
-from plumbline.scenario.generator import RANDOM_FAMILY, RandomScenarios
+from plumbline.scenario.generator import RANDOM_FAMILY, RandomScenarios, random_seed
 from plumbline.scenario.loader import Scenario
 from plumbline.storage.results_store import read_model_results, read_results
 from plumbline.storage.version_changes import add_version_change
@@ -151,10 +151,9 @@ def _row(key: str, rows: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
 
 def _scenario(name: str, stored: Mapping[str, Any]) -> Scenario:
     """The scenario of a row: random ones are made again, others read from their file."""
-    family, _, numbers = name.partition("-")
-    if family == RANDOM_FAMILY and name in stored:
-        return RandomScenarios(int(numbers.split("-")[-2]), 0).named(name)
-    entry = stored.get(name, {})
+    entry, seed = stored.get(name, {}), random_seed(name)
+    if entry.get("family") == RANDOM_FAMILY and seed is not None:
+        return RandomScenarios(seed, 0).named(name)
     origin = str(entry.get("file", ""))
     (found,) = options.read_scenarios([origin if "/" in origin else name])
     if entry.get("digest") not in (None, found.digest):

@@ -30,7 +30,7 @@ from plumbline.execution.selftest import SelfTestResult
 from plumbline.judging.known_issues import KnownIssue, project_known_issues
 from plumbline.processes.workers import Limits, WorkerPool
 from plumbline.reproduce.write import write_scripts
-from plumbline.scenario.generator import RANDOM_FAMILY, RandomScenarios
+from plumbline.scenario.generator import RANDOM_FAMILY, RandomScenarios, random_seed
 from plumbline.scenario.loader import Scenario
 from plumbline.storage.history import next_night_number, stored_runs
 from plumbline.storage.results_store import write_atomically
@@ -189,7 +189,7 @@ def run_nightly(
         if answer.failure:
             result.metadata["exit_code"] = result.metadata["exit_code"] or 1
     for name, about in result.scenarios.items():
-        if about["family"] == RANDOM_FAMILY:
+        if about["family"] == RANDOM_FAMILY and random_seed(name) == night.seed:
             about["file"] = (place / "scenarios" / f"{name}.yaml").as_posix()
     coverage = night_coverage(result, plan, progress) if level == "all" else None
     save(result, folder, command)
@@ -259,7 +259,7 @@ def write_random_scenario_files(result: RunResult, drawn: RandomScenarios, folde
 
     """
     names = {row.scenario for row in result.rows if row.family == RANDOM_FAMILY}
-    for s in map(drawn.named, sorted(names)):
+    for s in (drawn.named(name) for name in sorted(names) if random_seed(name) == drawn.seed):
         folder.mkdir(exist_ok=True)
         text = json.dumps(s.document, indent=1)  # JSON is YAML
         write_atomically(folder / f"{s.name}.yaml", text.encode())

@@ -73,6 +73,7 @@ def _reproduce_model(folder: Path, keys: tuple[str, ...], form: str | None) -> N
     """Write scripts of importers' differences, or list the differences."""
     from plumbline.reproduce.model_script import NoModelScript, stored_differences, write_model_script
     from plumbline.storage.results_store import read_model_results, write_atomically
+    from plumbline.storage.script_index import script_name, scripts_folder
     from plumbline.storage.version_changes import read_version_changes
 
     with options.exit_on_damaged_results():
@@ -98,7 +99,7 @@ def _reproduce_model(folder: Path, keys: tuple[str, ...], form: str | None) -> N
             )  # fmt: skip
         except NoModelScript as error:
             raise click.ClickException(f"{key}: {error}") from None
-        path = chosen / "scripts" / f"{Path(row['scenario']).stem}-{row['engine'].replace('@', '-')}.py"
+        path = scripts_folder(chosen) / script_name(f"{Path(row['scenario']).stem}-{row['engine']}")
         path.parent.mkdir(exist_ok=True)
         write_atomically(path, script.text.encode())
         click.echo(str(path))

@@ -27,7 +27,7 @@ from plumbline.reproduce.measure import Disagreement
 from plumbline.reproduce.render import LONG_RUN_SUFFIXES, no_script_reason, render_script
 from plumbline.reproduce.shrink import OutOfTime, ReproductionCase
 from plumbline.storage.results_store import read_results, write_atomically
-from plumbline.storage.script_index import read_script_index, scripts_folder, write_script_index
+from plumbline.storage.script_index import read_script_index, script_name, scripts_folder, write_script_index
 from plumbline.storage.version_changes import read_version_changes
 
 REQUESTED_SECONDS, UNREQUESTED_SECONDS = (
@@ -303,5 +303,4 @@ def _ratio(row: StoredRow) -> float:
 
 def _file_name(key: str) -> str:
     """Return a file name of safe characters, unique to the key."""
-    safe = re.sub(r"[^A-Za-z0-9._-]+", "-", key).strip("-.")[:80]
-    return f"{safe}-{hashlib.sha256(key.encode()).hexdigest()[:8]}.py"
+    return script_name(f"{key[:80]}-{hashlib.sha256(key.encode()).hexdigest()[:8]}")

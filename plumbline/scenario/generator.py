@@ -9,6 +9,7 @@ an engine are taken at exact zeros, identities and equalities.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, overload
@@ -81,6 +82,20 @@ class RandomScenarios(Sequence[Scenario]):
         makers = {MOTION_PREFIX: random_motion, MECHANISM_PREFIX: random_mechanism}
         make = next((make for prefix, make in makers.items() if name.startswith(prefix)), random_scenario)
         return make(self.seed, int(name.rpartition("-")[2]))
+
+
+def random_seed(name: str) -> int | None:
+    """Find the seed in the name of a random scenario.
+
+    Args:
+        name: name of any scenario.
+
+    Returns:
+        The seed; None where the name is not one that `RandomScenarios` gives.
+
+    """
+    found = re.fullmatch(rf"({MOTION_PREFIX}|{MECHANISM_PREFIX}|{RANDOM_FAMILY}-)(\d+)-\d+", name, re.ASCII)
+    return int(found[2]) if found else None
 
 
 def random_scenario(seed: int, index: int) -> Scenario:

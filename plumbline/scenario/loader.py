@@ -28,6 +28,7 @@ from plumbline.scenario.errors import Problem, ScenarioError, closest_match, did
 from plumbline.scenario.schema import (
     INPUT_ROUNDING,
     MAX_BODIES,
+    VALID_NAME,
     Articulated,
     Body,
     BodySequence,
@@ -37,6 +38,7 @@ from plumbline.scenario.schema import (
     Rod,
     attitude_quaternion,
     inertia_matrix,
+    name_error,
     unit_vector,
 )
 from plumbline.scenario.validation_messages import problems_from_validation
@@ -67,8 +69,8 @@ class Scenario:
 
     ``state`` holds the minimal coordinates (p, omega, u, udot) that the truth in high precision starts from:
     p and u are unit to rounding, udot is perpendicular to u to rounding.  ``name``, ``title`` and the other
-    texts are the file's own and may hold any printable character: escape them in HTML, XML, shells and file
-    names.
+    texts are the file's own and may hold any printable character: escape them in HTML, XML and shells. The
+    name has no slash and can name a file.
     """
 
     name: str
@@ -264,6 +266,11 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
             raise ScenarioError(problems_from_validation(source, version)) from None
         problems += problems_from_validation(source, error.errors())
     problems += _missing_distal_problems(source)
+    if document is not None and document.name is None and (wrong := name_error(path.stem)):
+        hint = "give the file another name, or a `name:`"
+        problems.append(
+            Problem(source.file, 1, 1, "name", f"is the file's name, which {wrong}", VALID_NAME, hint)
+        )
     if problems or document is None:
         raise ScenarioError(problems)
     bodies = list(_expand_repeats(document))

@@ -31,6 +31,11 @@ from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Array
 from plumbline.model.kinematics import quaternion_product, rotation_matrix
 
 SCHEMA_VERSION = 1
+MAX_NAME_BYTES = 200  # of a scenario's name in UTF-8; file systems allow 255 for a name with its endings
+VALID_NAME = (
+    f"a name for files: printable, at most {MAX_NAME_BYTES} bytes, without / and \\, no dot at its start, no "
+    "blank at its ends"
+)
 MAX_BODIES = 20_000
 MAX_SAMPLES = 1_000_000
 INPUT_ROUNDING = 1e-12  # relative: rounding of sixteen typed digits; larger deviations are mistakes
@@ -70,6 +75,27 @@ def _require_printable(value: str | None) -> str | None:
         if unicodedata.category(char) in ("Cc", "Cs", "Cn") and char not in "\n\t":
             raise invalid_value_error(f"has the character U+{ord(char):04X}", "printable text")
     return value
+
+
+def name_error(name: str) -> str:
+    """Check that a scenario's name can name a file and be one part of a row's key.
+
+    Args:
+        name: any text.
+
+    Returns:
+        What is wrong with it, as the end of a sentence; "" where nothing is. `VALID_NAME` says what is valid.
+
+    """
+    for char in name:
+        if char in "/\\" or not char.isprintable():
+            return f"has the character {char if char.isprintable() else f'U+{ord(char):04X}'}"
+    if not name or name != name.strip():
+        return "has blanks at its ends" if name else "is empty"
+    if name.startswith("."):
+        return "starts with a dot"
+    size = len(name.encode())
+    return f"has {size} bytes" if size > MAX_NAME_BYTES else ""
 
 
 def unit_vector(values: list[float]) -> Array:
@@ -624,7 +650,11 @@ class Document(SchemaModel):
 
     schema_version: Literal[1] = _field("Version of this format: 1.")
     name: str | None = _field(
-        "The name in results; absent: the file's name.", default=None, min_length=1, max_length=80
+        "The name in results and of the files made for it, so without `/` and `\\` and no dot at its start; "
+        "absent: the file's name.",
+        default=None,
+        min_length=1,
+        max_length=80,
     )
     family: str = _field(
         "Group in reports and for `--family`.",
@@ -668,9 +698,16 @@ class Document(SchemaModel):
         max_length=80,
     )
 
-    _text = field_validator("name", "family", "title", "purpose", "seed")(_require_printable)
+    _text = field_validator("family", "title", "purpose", "seed")(_require_printable)
 
-    @field_validator("name", "family", "title", "seed")
+    @field_validator("name")
+    @classmethod
+    def _check_name(cls, value: str | None) -> str | None:
+        if value is not None and (wrong := name_error(value)):
+            raise invalid_value_error(wrong, VALID_NAME)
+        return value
+
+    @field_validator("family", "title", "seed")
     @classmethod
     def _one_line(cls, value: str | None) -> str | None:
         if value and (value != value.strip() or "\n" in value or "\t" in value):

@@ -26,6 +26,19 @@ def scripts_folder(folder: Path) -> Path:
     return folder / "scripts"
 
 
+def script_name(text: str) -> str:
+    """Return a file name of safe characters for a script.
+
+    Args:
+        text: what the script is about; any text.
+
+    Returns:
+        Its letters, digits and signs, shortened, with the ending .py; different texts may have one name.
+
+    """
+    return f"{re.sub(r'[^A-Za-z0-9._-]+', '-', text).strip('-.')[:100] or 'script'}.py"
+
+
 def read_script_index(folder: Path) -> dict[str, str]:
     """Look up which rows of a run have a stand-alone script.
 

@@ -245,6 +245,7 @@ def test_remarkable_random_scenarios_are_kept_with_their_files(tmp_path):
     )
     excused = replace(kept[-1], known_issue="k")
     assert probes.add_scenario([excused]) == [], "a recorded gap of every probe is only counted"
+    kept.append(replace(kept[-1], scenario="a user's file of the family random"))
     nightly.write_random_scenario_files(
         RunResult(kept, [], {}, {}, probes, ResultTables(), CpuTimes(), {}), drawn, tmp_path
     )

@@ -46,6 +46,18 @@ def test_prove_writes_a_certificate_and_prints_radii(certificate):
     assert len(document["times"]) == round(0.25 / scenario.sample_interval) + 1
 
 
+@pytest.mark.parametrize("name", ["../../evil", "/ABSOLUTE/evil", "sub/evil", "..\\evil", ".evil"])
+def test_a_name_never_leads_out_of_the_folder(tmp_path, name):
+    source = find_scenario_file("tumbling-ball").read_text()
+    text = json.dumps(name.replace("/ABSOLUTE", str(tmp_path)))
+    (tmp_path / "x.yaml").write_text(source.replace("\ntitle", f"\nname: {text}\ntitle", 1))
+    before = sorted(tmp_path.rglob("*"))
+    result = type_command("prove", tmp_path / "x.yaml", "--duration", 0.125, "--out", tmp_path / "a" / "b")
+    assert result.exit_code == 2, result.output
+    assert f"{tmp_path / 'x.yaml'}:" in result.stderr and ": name: " in result.stderr
+    assert sorted(tmp_path.rglob("*")) == before
+
+
 def test_verify_proves_it_again_without_heyoka(certificate, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "heyoka", None)
     result = type_command("verify", certificate[0], "--json")

@@ -503,20 +503,57 @@ def test_a_seed_keeps_the_states_where_only_a_text_changes():
     assert np.array_equal(states[0], states[2]) and not np.any(states[0] == states[1])
 
 
-def test_names_may_be_any_text():
+def test_names_may_be_any_text_that_can_name_a_file():
     text = (scenarios.CATALOGUE_FOLDER / "single" / "rest.yaml").read_text(encoding="utf-8")
     for name in (
         "<img onerror=alert(1)>",
-        "../../etc/passwd",
         "$(x)",
         "ä ö",
-        "a\\b",
         "日本",
         "-x",
         "con",
         "Rest",
+        "a..b",
+        "v1.2",
+        "a" * 80,
     ):
         assert scenarios.load_scenario_text(text + f"name: {json.dumps(name)}\n").name == name
+
+
+BAD_NAMES = {  # and what the message says of it
+    "../../evil": "has the character /", "/abs/x": "has the character /", "a/b": "has the character /",
+    "..\\x": "has the character \\", "a\\b": "has the character \\", ".": "starts with a dot",
+    "..": "starts with a dot", ".hidden": "starts with a dot", " a": "has blanks at its ends",
+    "a\nb": "has the character U+000A", "a\tb": "has the character U+0009",
+    "a\x1b[1m": "has the character U+001B",
+    "a\x7f": "has the character U+007F", "a\u202eb": "has the character U+202E",
+    "\u2028": "has the character U+2028", "a ": "has blanks at its ends", "日" * 70: "has 210 bytes",
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD_NAMES)
+def test_a_name_that_cannot_name_a_file_is_refused(tmp_path, name):
+    text = (scenarios.CATALOGUE_FOLDER / "single" / "rest.yaml").read_text(encoding="utf-8")
+    lines = text.count("\n") + 1
+    with pytest.raises(scenarios.ScenarioError) as caught:
+        scenarios.load_scenario_text(text + f"name: {json.dumps(name)}\n", "x.yaml")
+    (problem,) = caught.value.problems
+    assert str(problem).startswith(
+        f"x.yaml:{lines}:7: name: {BAD_NAMES[name]}; valid would be a name for files"
+    )
+
+
+@pytest.mark.parametrize("stem", ["a\\b", ".hidden", "a\nb", " a"])
+def test_a_files_name_that_cannot_be_the_scenarios_is_refused(tmp_path, stem):
+    path = tmp_path / f"{stem}.yaml"
+    path.write_bytes((scenarios.CATALOGUE_FOLDER / "single" / "rest.yaml").read_bytes())
+    with pytest.raises(scenarios.ScenarioError) as caught:
+        scenarios.load_scenario(path)
+    (problem,) = caught.value.problems
+    assert (problem.line, problem.column, problem.field) == (1, 1, "name")
+    assert problem.message.startswith("is the file's name, which ") and "`name:`" in problem.hint
+    path.write_bytes(path.read_bytes() + b"\nname: good\n")
+    assert scenarios.load_scenario(path).name == "good"
 
 
 def test_load_many_takes_names_and_paths_and_keeps_their_order():
