@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import stat
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +13,18 @@ import click
 import numpy as np
 
 from plumbline.cli import options
-from plumbline.cli.console import ProgressDisplay, print_table
+from plumbline.cli.console import ProgressDisplay, count_noun, print_table
 from plumbline.cli.help_texts import EXIT_CODES, examples
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.model.datatypes import EngineFailure
+from plumbline.processes.workers import Limits
 from plumbline.scenario.loader import Scenario
 from plumbline.truth import TruthUnavailable
 
 PRECISIONS = ("quad", "octuple")
+_SUBJECT = (  # of what a certificate is a proof: printed as a sentence
+    "bodies", "joints", "springs", "gravity", "digest", "claimed", "scenarios", "duration", "warning",
+)  # fmt: skip
 MAX_DURATION = 1000.0  # s; two bodies take minutes for 30 s
 
 
@@ -56,12 +60,9 @@ def prove(names: tuple[str, ...], duration: float | None, precision: Any, out: P
     the truth, and the report says "proved".
     """
     from plumbline.storage.results_store import write_atomically
-    from plumbline.truth.enclosure import reason_not_provable
 
     chosen = options.read_scenarios(names)
-    for s in chosen:
-        if reason := reason_not_provable(s.model):
-            raise click.BadParameter(f"{s.name}: {reason}", param_hint="SCENARIO")
+    _require_provable(chosen, "SCENARIO")
     folder = options.claim_folder(out)
     records = []
     with options.exit_on_io_error(), ProgressDisplay(sys.stderr) as progress:
@@ -75,19 +76,54 @@ def prove(names: tuple[str, ...], duration: float | None, precision: Any, out: P
 
 
 @click.command(
-    epilog=examples("verify certificates/tumbling-ball.json.gz", "verify certificates/*.json.gz --json")
+    epilog=examples(
+        "verify certificates/tumbling-ball.json.gz",
+        "verify tumbling-ball.json.gz --scenario tumbling-ball",
+        "verify certificates/*.json.gz --json",
+    )
     + EXIT_CODES
 )
 @click.argument("files", nargs=-1, required=True, metavar="FILE...", type=click.Path(path_type=Path))
+@click.option(
+    "--scenario",
+    "expected",
+    metavar="SCENARIO",
+    help="Name of the catalogue or path of a scenario: certificates of other numbers are rejected.",
+)
+@options.jobs_option
+@options.timeout_option(3600.0)
+@options.memory_option
 @options.json_option
-def verify(files: tuple[Path, ...], as_json: bool) -> None:
-    """Prove certificates again, with nothing but python-flint and NumPy, and print the radii.
+def verify(
+    files: tuple[Path, ...], expected: str | None, jobs: int, timeout: float, memory: float, as_json: bool
+) -> None:
+    """Prove certificates again, with nothing but python-flint and NumPy; print of what they are a proof.
 
-    The checker is one file, which states its theorem at its head: plumbline/truth/enclosure_checker.py.
+    The proof is of the numbers in the certificate: it says which scenario of the catalogue has exactly
+    these numbers, whatever the certificate's own field `scenario` claims. The checker is one file, which
+    states its theorem at its head: plumbline/truth/enclosure_checker.py.
     """
+    from plumbline.execution.proofs import verify_certificates
+    from plumbline.truth.enclosure import load_checker
+
+    try:
+        load_checker()
+    except TruthUnavailable as error:
+        raise click.UsageError(str(error)) from None
+    wanted = options.read_scenarios([expected]) if expected is not None else []
+    _require_provable(wanted, "--scenario")
+    limits = Limits(timeout, memory)
     with ProgressDisplay(sys.stderr) as progress:
-        records = [_verify(path, progress) for path in files]
+        records = verify_certificates(files, wanted[0] if wanted else None, jobs, limits, progress)
     _finish(records, as_json)
+
+
+def _require_provable(chosen: Sequence[Scenario], option: str) -> None:
+    from plumbline.truth.enclosure import reason_not_provable
+
+    for s in chosen:
+        if reason := reason_not_provable(s.model):
+            raise click.BadParameter(f"{s.name}: {reason}", param_hint=option)
 
 
 def _times(scenario: Scenario, duration: float | None) -> Any:
@@ -101,6 +137,7 @@ def _prove(
     scenario: Scenario, times: Any, precision: Any, progress: Any
 ) -> tuple[dict[str, Any], bytes | None]:
     """Prove one scenario; keep the proof for runs; return its record and certificate."""
+    from plumbline.execution.proofs import proved_radii
     from plumbline.truth.enclosure import load_checker, prove_motion
     from plumbline.truth.proved_motion import round_enclosure, store_proof
 
@@ -117,55 +154,48 @@ def _prove(
     except (rejected, EngineFailure) as error:
         return record | {"verdict": "rejected", "reason": str(error)}, None
     store_proof(*pair, times, round_enclosure(enclosure))
-    record |= _radii(enclosure) | {"cpu": time.process_time() - began, "bytes": len(certificate)}
+    record |= proved_radii(enclosure) | {"cpu": time.process_time() - began, "bytes": len(certificate)}
     return record, certificate
 
 
-def _verify(path: Path, progress: Any) -> dict[str, Any]:
-    from plumbline.truth.enclosure import load_checker
-    from plumbline.truth.enclosure_file import MalformedCertificate, parse_certificate
-
-    try:
-        checker = load_checker()
-    except TruthUnavailable as error:
-        raise click.UsageError(str(error)) from None
-    record: dict[str, Any] = {"file": str(path)}
-    began = time.process_time()
-    try:
-        if not stat.S_ISREG(path.stat().st_mode):  # a device may have no end
-            raise MalformedCertificate("not a file")
-        certificate = parse_certificate(path.read_bytes())
-        enclosure = checker.enclose_motion(
-            certificate, lambda done, of: progress(done, of, f"{path.name}: steps")
-        )
-    except MalformedCertificate as error:
-        return record | {"verdict": "malformed", "reason": str(error)}
-    except (OSError, ValueError) as error:  # ValueError: a path with a null character
-        words = getattr(error, "strerror", None) or error
-        return record | {"verdict": "malformed", "reason": f"cannot be read: {words}"}
-    except checker.Rejected as error:
-        return record | {"verdict": "rejected", "reason": str(error)}
-    return record | _radii(enclosure) | {"cpu": time.process_time() - began}
-
-
-def _radii(enclosure: Any) -> dict[str, Any]:
-    """What a proof gives: the last time [s] and the largest radii [m, –, m/s, rad/s]."""
-    names = {"position": "r", "attitude": "p", "velocity": "v", "rate": "omega"}
-    radii = {f"{name}_radius": enclosure.radius(field) for name, field in names.items()}
-    return {"verdict": "proved", "until": enclosure.times[-1], **radii}
-
-
 def _finish(records: list[dict[str, Any]], as_json: bool) -> None:
-    """Print the records; exit with 2 if a file is malformed, else with 1 if a certificate is rejected."""
+    """Print the records; exit with 2 if a file is malformed, else 3 if one was not checked, 1 if rejected."""
     if as_json:
         click.echo(json.dumps(records, ensure_ascii=False, indent=1))
     else:
-        print_table(record for record in records if record["verdict"] == "proved")
+        proved = [record for record in records if record["verdict"] == "proved"]
+        print_table({k: v for k, v in record.items() if k not in _SUBJECT} for record in proved)
+        for record in proved:
+            if "digest" in record:
+                click.echo(f"{record['file']}: {_subject_words(record)}")
     for record in records:
+        if record.get("warning"):
+            click.echo(f"{record['file']}: warning: {record['warning']}", err=True)
         if record["verdict"] != "proved":
             name = record.get("scenario") or record["file"]
             click.echo(f"{name}: {record['verdict']}: {record['reason']}", err=True)
     verdicts = {record["verdict"] for record in records}
-    if "malformed" in verdicts:
-        sys.exit(ExitCode.BAD_USAGE)
-    sys.exit(ExitCode.DISAGREEMENT if "rejected" in verdicts else ExitCode.SUCCESS)
+    codes = {
+        "malformed": ExitCode.BAD_USAGE, "failed": ExitCode.ENGINE_FAILED, "rejected": ExitCode.DISAGREEMENT
+    }  # fmt: skip
+    sys.exit(next((code for verdict, code in codes.items() if verdict in verdicts), ExitCode.SUCCESS))
+
+
+def _subject_words(record: dict[str, Any]) -> str:
+    """Of what a certificate is a proof."""
+    names, until = record["scenarios"], f"{record['until']:g} s"
+    joints = ", ".join(f"{count} × {kind}" for kind, count in record["joints"].items())
+    parts = [
+        count_noun(record["bodies"], "body", "bodies"),
+        f"joints {joints}",
+        *([count_noun(record["springs"], "spring")] if record["springs"] else []),
+        f"gravity ({', '.join(f'{x:g}' for x in record['gravity'])}) m/s²",
+        f"numbers {record['digest'][:16]}",
+    ]
+    of = "no scenario of the catalogue has its numbers"
+    if names:
+        duration = record["duration"]
+        of = f"proof of {' = '.join(names)}" + (
+            f", whose {duration:g} s it covers up to {until}" if record["until"] < duration else ""
+        )
+    return f"{of}; 0 … {until}, {', '.join(parts)}"

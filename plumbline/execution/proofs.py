@@ -1,15 +1,23 @@
-"""Proofs of motions in worker processes: what a night proves before its runs use it."""
+"""Proofs of motions in worker processes: of what a night's runs will use, and of certificates."""
 
 from __future__ import annotations
 
+import re
+import stat
+import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
 
 from plumbline.processes.workers import Limits, Task, WorkerPool
-from plumbline.scenario.loader import Scenario
+from plumbline.scenario.errors import shorten
+from plumbline.scenario.loader import Scenario, catalogue, load_scenarios
 from plumbline.truth.closed_form import exact_samples
-from plumbline.truth.enclosure import reason_not_provable
+from plumbline.truth.enclosure import certificate_digest, load_checker, numbers_digest, reason_not_provable
+from plumbline.truth.enclosure_file import MAX_BYTES, Certificate, MalformedCertificate, parse_certificate
 from plumbline.truth.proved_motion import find_proof, store_proof
 from plumbline.truth.trajectory import prove_and_judge_claim
 
@@ -99,3 +107,130 @@ def prove_changed_motions(
             if not ratio <= 1:
                 found.exceeded[s.name] = ratio
     return found
+
+
+def verify_certificates(
+    paths: Sequence[Path],
+    expected: Scenario | None,
+    jobs: int,
+    limits: Limits,
+    progress: Callable[[int, int, str], None],
+) -> list[dict[str, Any]]:
+    """Prove certificates again in workers, which hostile files cannot fill or hold up for ever.
+
+    Args:
+        paths: the files.
+        expected: the scenario of which each has to be a proof; None: any.
+        jobs: number of worker processes.
+        limits: limits of each proof.
+        progress: called after each file with the numbers of files done and of all, and its name.
+
+    Returns:
+        A record per file in the order of the paths, each with its verdict: proved, rejected (it proves
+        nothing, or not what was expected), malformed, or failed (not checked within the limits).
+
+    """
+    wanted = expected and (expected.name, numbers_digest(expected.model, expected.state))
+    found: dict[int, dict[str, Any]] = {}
+    tasks = [Task(k, verify_certificate, (path.absolute(), wanted), limits) for k, path in enumerate(paths)]
+    with WorkerPool(min(jobs, len(paths)), limits) as workers:
+        for outcome in workers.run(tasks):
+            path = paths[outcome.key]
+            failed = {"verdict": "failed", "reason": f"not checked: {outcome.failure}"}
+            found[outcome.key] = {"file": str(path)} | (failed if outcome.failure else outcome.value)
+            progress(len(found), len(paths), path.name)
+    if not any("digest" in record for record in found.values()):
+        return [found[k] for k in range(len(paths))]
+    known = [s for s in load_scenarios(catalogue()) if not reason_not_provable(s.model)]
+    if expected is not None:
+        known = [expected, *(s for s in known if s.digest != expected.digest)]
+    numbers = [numbers_digest(s.model, s.state) for s in known]
+    records = [found[k] for k in range(len(paths))]
+    for record in records:
+        if "digest" in record:
+            same = [s for s, own in zip(known, numbers, strict=True) if own == record["digest"]]
+            record["scenarios"] = [s.name for s in same]
+            record["duration"] = max((s.duration for s in same), default=None)
+            record["warning"] = _claim_problem(record["claimed"], same, known)
+    return records
+
+
+def _claim_problem(claimed: str, same: Sequence[Scenario], known: Sequence[Scenario]) -> str:
+    """Compare the scenario that a certificate claims with those that have its numbers."""
+    if not claimed or any(claimed in (s.digest, s.name) for s in same):
+        return ""
+    other = next((s.name for s in known if claimed in (s.digest, s.name)), "")
+    if other:
+        return f"its field scenario claims {other}, whose numbers are others"
+    if same or not re.fullmatch("[0-9a-f]{64}", claimed):
+        names = " = ".join(s.name for s in same) or "no scenario"
+        return f"its field scenario claims {shorten(repr(claimed), 30)}, which is not {names}"
+    return ""
+
+
+def verify_certificate(path: Path, expected: tuple[str, str] | None) -> dict[str, Any]:
+    """Prove one certificate again.
+
+    Args:
+        path: the file.
+        expected: name and digest of the numbers of the scenario that it has to be about; None: any.
+
+    Returns:
+        The verdict with its reason, what the certificate is about, and the radii that it proves.
+
+    """
+    checker, began = load_checker(), time.process_time()
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):  # a device may have no end
+            raise MalformedCertificate("not a file")
+        with path.open("rb") as file:
+            certificate = parse_certificate(file.read(MAX_BYTES + 1))
+    except (OSError, ValueError) as error:  # ValueError: a path with a null character
+        words = getattr(error, "strerror", None) or error
+        prefix = "" if isinstance(error, MalformedCertificate) else "cannot be read: "
+        return {"verdict": "malformed", "reason": f"{prefix}{words}"}
+    record = certificate_subject(certificate)
+    if expected is not None and record["digest"] != expected[1]:
+        return record | {"verdict": "rejected", "reason": f"its numbers are not those of {expected[0]}"}
+    try:
+        enclosure = checker.enclose_motion(certificate)
+    except checker.Rejected as error:
+        return record | {"verdict": "rejected", "reason": str(error)}
+    return record | proved_radii(enclosure) | {"cpu": time.process_time() - began}
+
+
+def certificate_subject(certificate: Certificate) -> dict[str, Any]:
+    """Describe what a certificate is about.
+
+    Args:
+        certificate: of any motion.
+
+    Returns:
+        Numbers of bodies and of joints by kind, gravity [m/s²], time of the last sample [s], digest of the
+        numbers, and the digest of the scenario that it claims to be of.
+
+    """
+    return {
+        "bodies": len(certificate.far),
+        "joints": dict(Counter(certificate.kind)),
+        "springs": len(certificate.springs),
+        "gravity": certificate.data["gravity"].tolist(),
+        "until": certificate.times[-1],
+        "digest": certificate_digest(certificate),
+        "claimed": certificate.scenario,
+    }
+
+
+def proved_radii(enclosure: Any) -> dict[str, Any]:
+    """Summarise a proof.
+
+    Args:
+        enclosure: the balls that a certificate proves.
+
+    Returns:
+        The verdict, the last time [s] and the largest radii [m, –, m/s, rad/s].
+
+    """
+    names = {"position": "r", "attitude": "p", "velocity": "v", "rate": "omega"}
+    radii = {f"{name}_radius": enclosure.radius(field) for name, field in names.items()}
+    return {"verdict": "proved", "until": enclosure.times[-1], **radii}

@@ -114,6 +114,7 @@ class Outcome:
     judge_cpu_time: float = 0.0  # s of the judge
     overhead_cpu_time: float = 0.0  # s of the worker besides these, since its last outcome
     is_cached: bool = False  # whether an earlier call gave the answer
+    is_overdue: bool = False  # whether the call was ended at its time limit
 
     @property
     def value(self) -> Any:
@@ -436,9 +437,8 @@ def _outcome_from_future(task: Task, future: Future[Outcome]) -> Outcome:
     try:
         return future.result()
     except CancelledError:  # by `_cancel_overdue` only
-        return Outcome(
-            task.key, failure=f"timeout: no answer within {task.limits.seconds:g} s, worker killed"
-        )
+        failure = f"timeout: no answer within {task.limits.seconds:g} s, worker killed"
+        return Outcome(task.key, failure=failure, is_overdue=True)
     except ProcessExpired as expired:
         return Outcome(task.key, failure=f"crashed: the worker {describe_exit(expired.exitcode)}")
     except RemoteCrash as crashed:

@@ -7,6 +7,7 @@ certificate, or it proves a wider enclosure.
 from __future__ import annotations
 
 import gzip
+import hashlib
 import json
 import math
 from collections.abc import Callable
@@ -17,7 +18,14 @@ import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.truth import TruthUnavailable, import_truth_tool
-from plumbline.truth.enclosure_file import FORMAT, SHAPES, VERSION, Certificate, parse_certificate
+from plumbline.truth.enclosure_file import (
+    FORMAT,
+    SHAPES,
+    VERSION,
+    Certificate,
+    MalformedCertificate,
+    parse_certificate,
+)
 from plumbline.truth.taylor import taylor_series
 
 if TYPE_CHECKING:
@@ -97,6 +105,8 @@ def prove_motion(
         raw = make_certificate(model, state, times, scenario, bits, max_step)
         try:
             return raw, checker.enclose_motion(parse_certificate(raw), on_step)
+        except MalformedCertificate as error:  # too large
+            rejection = checker.Rejected(f"the certificate {error}: a shorter duration needs less")
         except checker.Rejected as error:
             rejection = error
     raise rejection
@@ -180,6 +190,39 @@ def checked_numbers(model: Model, state: State) -> dict[str, Array]:
         name: np.where(free.reshape(-1, *[1] * (x.ndim - 1)), own[name], x) if name in own else x
         for name, x in found.items()
     }
+
+
+def numbers_digest(model: Model, state: State) -> str:
+    """Identify what a proof is about: the mechanism and its initial state, whatever they are called.
+
+    Args:
+        model: the mechanism.
+        state: its initial state.
+
+    Returns:
+        The digest that `certificate_digest` gives of certificates with exactly these numbers.
+
+    """
+    return _digest(checked_topology(model), checked_numbers(model, state))
+
+
+def certificate_digest(certificate: Certificate) -> str:
+    """Identify what a certificate is about.
+
+    Args:
+        certificate: of any motion.
+
+    Returns:
+        SHA-256 of its joints, springs and numbers, hexadecimal; not of its duration and candidate motion.
+
+    """
+    topology = {"kind": certificate.kind, "far": certificate.far, "springs": certificate.springs}
+    return _digest(topology, certificate.data)
+
+
+def _digest(topology: dict[str, Any], numbers: dict[str, Array]) -> str:
+    doubles = {name: _hexadecimal(x + 0.0) for name, x in numbers.items()}  # −0 is 0
+    return hashlib.sha256(json.dumps([topology, doubles], sort_keys=True).encode()).hexdigest()
 
 
 def time_exponent(model: Model, state: State) -> int:

@@ -15,6 +15,9 @@ import numpy as np
 
 FORMAT, VERSION = "plumbline enclosure certificate", 2
 MAX_BITS, MAX_BODIES, MAX_TERMS = 2000, 100, 401
+_INCOMPLETE = "not a complete gzip or JSON file"
+MAX_CLAIM = 200  # characters of the field `scenario`
+MAX_BYTES = 256 * 2**20  # of the text: 30 s of two rods in octuple precision
 JOINTS: dict[Any, tuple[int, int, int, tuple[int, ...]]] = {  # counts of u, p and slides; axes of turns
     "rod": (1, 1, 0, ()), "free": (1, 1, 0, ()), "ball": (0, 1, 0, ()), "weld": (0, 0, 0, ()),
     "slide": (0, 0, 1, ()), "cylindrical": (0, 0, 1, (2,)), "hinge": (0, 0, 0, (2,)),
@@ -47,6 +50,7 @@ class Certificate:
     time_exponent: int  # the unit of time is 2**time_exponent s
     bits: int  # lengths and coefficients are integers times 2**-bits
     steps: list[Any]  # [length, then per coordinate (q, then v) its coefficients from the power 0 of s on]
+    scenario: str = ""  # the digest of the scenario that it claims to be of: no part of the theorem
 
     @property
     def sizes(self) -> tuple[list[tuple[int, int, int, int]], ...]:
@@ -81,10 +85,11 @@ def parse_certificate(raw: bytes) -> Certificate:
         MalformedCertificate: something is wrong with the file; the message says where and what is valid.
 
     """
+    text = _text(raw)
     try:
-        data = json.loads(zlib.decompress(raw, 47) if raw[:2] == b"\x1f\x8b" else raw)
-    except (zlib.error, ValueError, RecursionError) as error:
-        raise MalformedCertificate(f"not a complete gzip or JSON file: {error}") from None
+        data = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise MalformedCertificate(f"{_INCOMPLETE}: {error}") from None
     _expect(isinstance(data, dict) and data.get("format") == FORMAT, "format", f"the text {FORMAT!r}")
     _expect(data.get("version") == VERSION, "version", str(VERSION))
     names = ("bits", "time_exponent", "steps", "kind", "far", "springs")
@@ -101,7 +106,7 @@ def parse_certificate(raw: bytes) -> Certificate:
     fits = pairs and all(type(b) is int and -1 <= b < len(far) for x in springs for b in x)
     _expect(fits, "springs", f"at most {MAX_BODIES} pairs of bodies, -1 the world")
     times, arrays = _doubles(data, "times", (-1,)), {}
-    _expect(times[:1] >= 0 and np.all(np.diff(times) > 0), "times", "ascending numbers ≥ 0")
+    _expect(len(times) and times[0] >= 0 and np.all(np.diff(times) > 0), "times", "ascending numbers ≥ 0")
     for name, (shape, _) in SHAPES.items():
         count = () if name == "gravity" else (len(springs if name.startswith("spring") else far),)
         arrays[name] = _doubles(data, name, count + shape)
@@ -111,7 +116,9 @@ def parse_certificate(raw: bytes) -> Certificate:
     for name in ("armature", "damping", "stiffness"):
         _expect(not np.any(arrays[name][hung]), name, "zeros of rods and free bodies")
     _expect(isinstance(steps, list) and len(steps) > 0, "steps", "a list of steps")
-    found = Certificate(kind, far, springs, arrays, times.tolist(), exponent, bits, steps)
+    scenario = data.get("scenario", "")
+    _expect(isinstance(scenario, str) and len(scenario) <= MAX_CLAIM, "scenario", "a digest")
+    found = Certificate(kind, far, springs, arrays, times.tolist(), exponent, bits, steps, scenario)
     size = found.nq + found.nv
     for k, step in enumerate(steps):
         fits = isinstance(step, list) and len(step) == 1 + size and type(step[0]) is int and step[0] > 0
@@ -119,6 +126,24 @@ def parse_certificate(raw: bytes) -> Certificate:
         fits = all(type(x) is list and len(x) <= MAX_TERMS and {*map(type, x)} <= {int} for x in step[1:])
         _expect(fits, f"steps[{k}]", f"lists of at most {MAX_TERMS} integers")
     return found
+
+
+def _text(raw: bytes) -> bytes:
+    """Decompress the one gzip member that the file may be, up to the largest size of a certificate."""
+    stream = None
+    if raw[:2] == b"\x1f\x8b":
+        stream = zlib.decompressobj(47)
+        try:
+            raw = stream.decompress(raw, MAX_BYTES + 1)
+        except zlib.error as error:
+            raise MalformedCertificate(f"{_INCOMPLETE}: {error}") from None
+    if len(raw) > MAX_BYTES:
+        raise MalformedCertificate(f"holds more than {MAX_BYTES >> 20} MB, the largest size of a certificate")
+    if stream is not None and not stream.eof:
+        raise MalformedCertificate(f"{_INCOMPLETE}: the compressed data are cut off")
+    if stream is not None and stream.unused_data:
+        raise MalformedCertificate("not one gzip file: bytes follow the end of the compressed data")
+    return raw
 
 
 def _expect(holds: Any, field: str, valid: str) -> None:

@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import zlib
 from importlib.util import find_spec
 
 import numpy as np
@@ -65,6 +66,104 @@ def test_verify_proves_it_again_without_heyoka(certificate, monkeypatch):
     (record,) = json.loads(result.stdout)
     assert record["verdict"] == "proved" and record["until"] == 0.25
     assert 0 < record["position_radius"] < 1e-24
+
+
+def claiming(certificate, path, **changes):
+    """A copy of a certificate with other fields."""
+    document = json.loads(gzip.decompress(certificate[0].read_bytes())) | changes
+    path.write_bytes(gzip.compress(json.dumps(document).encode()))
+    return path
+
+
+def test_verify_prints_of_what_a_certificate_is_a_proof(certificate):
+    result = type_command("verify", certificate[0])
+    assert result.exit_code == 0, result.output
+    words = "proof of tumbling-ball, whose 2 s it covers up to 0.25 s; 0 … 0.25 s, 1 body, joints 1 × ball, "
+    assert f"{certificate[0]}: {words}gravity (0, 0, -9.81) m/s², numbers " in result.stdout
+    assert "warning" not in result.output
+
+
+@pytest.fixture(scope="module")
+def lighter(tmp_path_factory):
+    """A scenario with the name of one of the catalogue and another gravity, and its certificate."""
+    folder = tmp_path_factory.mktemp("lighter")
+    text = find_scenario_file("tumbling-ball").read_text(encoding="utf-8")
+    path = folder / "lighter.yaml"
+    path.write_text(f"name: tumbling-ball\ngravity: [0, 0, -9.8]\n{text}", encoding="utf-8")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PLUMBLINE_CACHE", str(folder / "cache"))
+        result = type_command("prove", path, "--duration", 0.125, "--out", folder)
+    assert result.exit_code == 0, result.output
+    return folder / "tumbling-ball.json.gz", path
+
+
+def test_numbers_decide_of_which_scenario_a_certificate_is_a_proof(certificate, lighter):
+    result = type_command("verify", lighter[0], certificate[0], "--json")
+    assert result.exit_code == 0, result.output
+    other, own = json.loads(result.stdout)
+    assert other["scenarios"] == [] and own["scenarios"] == ["tumbling-ball"]
+    assert other["gravity"] == [0, 0, -9.8] and other["digest"] != own["digest"]
+    assert other["bodies"] == 1 and other["joints"] == {"ball": 1} and other["until"] == 0.125
+    assert "no scenario of the catalogue has its numbers" in type_command("verify", lighter[0]).stdout
+
+
+@pytest.mark.parametrize("is_own, code", [(True, 0), (False, 1)])
+def test_a_named_scenario_has_to_have_the_numbers(certificate, lighter, is_own, code):
+    for path, scenario in ((certificate[0], "tumbling-ball"), lighter):
+        wanted = scenario if is_own else "tumbling-rod"
+        result = type_command("verify", path, "--scenario", wanted, "--json")
+        assert result.exit_code == code, result.output
+        assert json.loads(result.stdout)[0]["verdict"] == ("proved" if is_own else "rejected")
+    result = type_command("verify", lighter[0], "--scenario", "tumbling-ball")
+    assert result.exit_code == 1
+    assert "rejected: its numbers are not those of tumbling-ball" in result.stderr
+
+
+def test_a_claim_that_the_numbers_contradict_is_a_warning(certificate, tmp_path):
+    rod, ball = (load_scenario(find_scenario_file(f"tumbling-{name}")) for name in ("rod", "ball"))
+    named = "its field scenario claims tumbling-rod, whose numbers are others"
+    other = "which is not tumbling-ball"
+    claims = {
+        rod.digest: named,
+        "tumbling-rod": named,
+        "f" * 64: other,
+        ball.digest: "",
+        ball.name: "",
+        "": "",
+    }
+    paths = [
+        claiming(certificate, tmp_path / f"{k}.json.gz", scenario=claim) for k, claim in enumerate(claims)
+    ]
+    result = type_command("verify", *paths, "--json")
+    assert result.exit_code == 0
+    for record, message in zip(json.loads(result.stdout), claims.values(), strict=True):
+        assert record["scenarios"] == ["tumbling-ball"]
+        assert message in record["warning"] and bool(message) == bool(record["warning"])
+        assert (f"{record['file']}: warning: " in result.stderr) == bool(message)
+
+
+def blanks(size):
+    """A gzip file that begins with so many MB of blanks, made of one block that is repeated."""
+    block = zlib.compressobj(9, zlib.DEFLATED, -15)
+    data = block.compress(b" " * 2**20) + block.flush(zlib.Z_FULL_FLUSH)
+    return gzip.compress(b"")[:10] + data * size
+
+
+def test_a_file_that_holds_gigabytes_is_refused_at_its_limit(tmp_path):
+    path = tmp_path / "bomb.json.gz"
+    path.write_bytes(blanks(6700))
+    result = type_command("verify", path, "--memory", 1)
+    assert result.exit_code == 2
+    assert f"{path}: malformed: holds more than 256 MB" in result.stderr
+
+
+def test_a_proof_ends_at_its_time_limit(certificate, tmp_path):
+    """Here of a certificate with many samples."""
+    times = [float.hex(k * 1e-5) for k in range(20_000)]
+    path = claiming(certificate, tmp_path / "slow.json.gz", times=times)
+    result = type_command("verify", path, "--timeout", 1)
+    assert result.exit_code == 3
+    assert f"{path}: failed: not checked: timeout: no answer within 1 s" in result.stderr
 
 
 def test_a_certificate_that_proves_nothing_exits_with_1(certificate, tmp_path):

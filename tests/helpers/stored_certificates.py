@@ -9,6 +9,7 @@ from __future__ import annotations
 import gzip
 import json
 from functools import cache
+from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -20,7 +21,7 @@ from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import random_states
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth import enclosure
-from plumbline.truth.enclosure_file import parse_certificate
+from plumbline.truth.enclosure_file import JOINTS, SHAPES, parse_certificate
 from tests.helpers.random_chains import random_chain
 
 FOLDER = Path(__file__).parents[1] / "truth" / "certificates"
@@ -67,6 +68,20 @@ def stored_document(name: str) -> dict[str, Any]:
 def proved(name: str) -> dict[str, Any]:
     """Return what a certificate proves: texts of the midpoints and numbers, the radii, by quantity."""
     return _read(name)[1]
+
+
+def many_joints(count: int, springs: int, terms: int) -> dict[str, Any]:
+    """Make a document with joints of all kinds and springs between points, all numbers zero or the least."""
+    document = {name: stored_document("one-ball")[name] for name in ("format", "version", "bits", "times")}
+    kinds: list[Any] = [*islice(cycle(JOINTS), count)]
+    document |= {"time_exponent": 0, "kind": kinds, "far": [-1] * count, "springs": [[0, -1]] * springs}
+    first: tuple[int, ...]
+    for name, (shape, _) in SHAPES.items():
+        first = () if name == "gravity" else (springs if name.startswith("spring") else count,)
+        values = np.full(first + shape, 1e-100 if name == "mass" else 0.0)
+        document[name] = np.frompyfunc(float.hex, 1, 1)(values).tolist()
+    entries = (7 * p + 6 * u + 2 * slides + 4 * len(t) for u, p, slides, t in map(JOINTS.__getitem__, kinds))
+    return document | {"steps": [[1, *[[0] * terms] * (sum(entries) + springs)]]}
 
 
 def write_certificates() -> None:

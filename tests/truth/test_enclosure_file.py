@@ -4,14 +4,12 @@ import json
 import random
 from collections import Counter
 from importlib.util import find_spec
-from itertools import cycle, islice
 
-import numpy as np
 import pytest
 
-from plumbline.truth.enclosure_file import JOINTS, SHAPES, MalformedCertificate, parse_certificate
+from plumbline.truth.enclosure_file import MalformedCertificate, parse_certificate
 from tests.helpers.mutations import damaged_bytes, damaged_document, limited_time
-from tests.helpers.stored_certificates import FOLDER, stored_document
+from tests.helpers.stored_certificates import FOLDER, many_joints, stored_document
 
 
 def parsed(document):
@@ -65,6 +63,9 @@ def test_a_truncated_file_is_malformed():
         ({"bits": True}, "bits: expected an integer"),
         ({"time_exponent": 100}, "time_exponent: expected an integer from -60 to 60"),
         ({"times": ["0x0p0", "0x0p0"]}, "times: expected ascending"),
+        ({"times": []}, "times: expected ascending"),
+        ({"scenario": 7}, "scenario: expected a digest"),
+        ({"scenario": "a" * 300}, "scenario: expected a digest"),
         ({"steps": []}, "steps: expected a list of steps"),
         ({"steps": [[1]]}, r"steps\[0\]: expected a positive length, then 7 lists"),
         ({"steps": [[0, *[[1]] * 7]]}, r"steps\[0\]: expected a positive length"),
@@ -99,19 +100,6 @@ def test_the_limits_themselves_are_valid(change):
     assert parsed(stored_document("one-ball") | change)
 
 
-def many_joints(count, springs, terms):
-    """A document with joints of all kinds and springs between points, all numbers zero or the least."""
-    document = {name: stored_document("one-ball")[name] for name in ("format", "version", "bits", "times")}
-    kinds = [*islice(cycle(JOINTS), count)]
-    document |= {"time_exponent": 0, "kind": kinds, "far": [-1] * count, "springs": [[0, -1]] * springs}
-    for name, (shape, _) in SHAPES.items():
-        first = () if name == "gravity" else (springs if name.startswith("spring") else count,)
-        values = np.full(first + shape, 1e-100 if name == "mass" else 0.0)
-        document[name] = np.frompyfunc(float.hex, 1, 1)(values).tolist()
-    entries = (7 * p + 6 * u + 2 * slides + 4 * len(t) for u, p, slides, t in map(JOINTS.get, kinds))
-    return document | {"steps": [[1, *[[0] * terms] * (sum(entries) + springs)]]}
-
-
 @pytest.mark.parametrize("most", [(100, 0, 1), (1, 100, 1), (1, 0, 401)], ids=["bodies", "springs", "terms"])
 def test_as_much_as_is_allowed_is_valid(most):
     """And one more is not."""
@@ -124,6 +112,44 @@ def test_as_much_as_is_allowed_is_valid(most):
 def test_a_compressed_file_is_read_as_its_text():
     raw = (FOLDER / "one-ball.json.gz").read_bytes()
     assert parse_certificate(raw).steps == parsed(stored_document("one-ball")).steps
+
+
+def test_bytes_after_the_compressed_data_are_malformed():
+    raw = (FOLDER / "one-ball.json.gz").read_bytes()
+    for rest in (b"\0", b"x" * 1000, raw):
+        with pytest.raises(MalformedCertificate, match="bytes follow the end of the compressed data"):
+            parse_certificate(raw + rest)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 100_000,
+        '{"a":' * 100_000,
+        '{"bits": ' + "9" * 100_000 + "}",
+        '{"bits": 1e999999999}',
+        '{"bits": -' + "9" * 3000 + "}",
+        "[1] [2]",
+        '{"format": "\\ud800"}',
+        "NaN",
+    ],
+    ids=["lists", "objects", "digits", "exponent", "negative", "twice", "surrogate", "NaN"],
+)
+def test_extreme_texts_are_malformed(text):
+    with limited_time(1.0), pytest.raises(MalformedCertificate):
+        parse_certificate(text.encode())
+
+
+def test_extreme_numbers_are_malformed_or_rejected():
+    document = stored_document("one-ball")
+    changes = [{"mass": [f"0x1p{e}"]} for e in ("99999999999", "1023", "-1074")]
+    changes += [{"times": ["0x1p1023"]}, {"omega": [["0x1p1000"] * 3]}, {"gravity": ["-0x1.fp1023"] * 3}]
+    changes += [{"steps": [[10**n, *document["steps"][0][1:]]]} for n in (300, 4000)]
+    changes += [{"steps": [[1, *[[10**4000]] * 7]]}, {"bits": 2000, "time_exponent": -60}]
+    checker = pytest.importorskip("plumbline.truth.enclosure_checker")
+    for change in changes:
+        with limited_time(), pytest.raises((MalformedCertificate, checker.Rejected)):
+            checker.enclose_motion(parsed(document | change))
 
 
 def test_damaged_files_are_malformed_or_read_whole():
