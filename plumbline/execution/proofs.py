@@ -181,10 +181,7 @@ def verify_certificate(path: Path, expected: tuple[str, str] | None) -> dict[str
     """
     checker, began = load_checker(), time.process_time()
     try:
-        if not stat.S_ISREG(path.stat().st_mode):  # a device may have no end
-            raise MalformedCertificate("not a file")
-        with path.open("rb") as file:
-            certificate = parse_certificate(file.read(MAX_BYTES + 1))
+        certificate = parse_certificate(_content(path))
     except (OSError, ValueError) as error:  # ValueError: a path with a null character
         words = getattr(error, "strerror", None) or error
         prefix = "" if isinstance(error, MalformedCertificate) else "cannot be read: "
@@ -197,6 +194,13 @@ def verify_certificate(path: Path, expected: tuple[str, str] | None) -> dict[str
     except checker.Rejected as error:
         return record | {"verdict": "rejected", "reason": str(error)}
     return record | proved_radii(enclosure) | {"cpu": time.process_time() - began}
+
+
+def _content(path: Path) -> bytes:
+    if not stat.S_ISREG(path.stat().st_mode):  # a device may have no end
+        raise MalformedCertificate("not a file")
+    with path.open("rb") as file:
+        return file.read(MAX_BYTES + 1)
 
 
 def certificate_subject(certificate: Certificate) -> dict[str, Any]:

@@ -53,7 +53,7 @@ def adjusted(document, draw):
 def mutant(name, draw):
     """Bytes of a damaged file."""
     document = stored_document(name)
-    match draw.randrange(4):
+    match draw.randrange(5):
         case 0:
             return damaged_bytes((FOLDER / f"{name}.json.gz").read_bytes(), draw)
         case 1:
