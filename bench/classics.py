@@ -26,7 +26,7 @@ from bench.classics_values import (
 )
 from plumbline.engines.calls import RefinementRun, describe_engine, evaluate_states, run_refinement
 from plumbline.engines.registry import ENGINES, load_adapter
-from plumbline.judging.convergence import romberg, tightest_tolerance_limit
+from plumbline.measurements.order_and_limit import romberg, tightest_tolerance_limit
 from plumbline.model.datatypes import Array, Model, Trajectory
 from plumbline.model.kinematics import angular_velocity, rotation_matrix
 from plumbline.model.sampling import random_loop_states

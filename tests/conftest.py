@@ -23,7 +23,7 @@ ALLOWED_SKIPS = {  # pattern of the skip's reason: why continuous integration ca
 LONGEST_FIRST = (  # begun last, one of these would keep one process busy while the others have no work;
     # isolation, dask_cluster and workers mostly wait, so one begins when another ends
     "isolation", "planted_defects", "report_browser", "adapter_contract", "exit_codes", "dask_cluster",
-    "step", "tree_motions", "scripts", "workers", "loops", "command_line", "trees", "metamorphic", "nightly",
+    "step", "tree_motions", "scripts", "workers", "loops", "command_line", "trees", "relations", "nightly",
     "coverage", "planted_branches", "tree_motion", "sweep", "enclosure", "joint_causes", "integrator_search",
     "importer_cause", "trajectory_truth", "tree_relations", "selftest", "environments", "model_command",
     "reference_pages", "resume", "diagnose", "collocation", "docs", "rounding_bound", "long_runs", "report",

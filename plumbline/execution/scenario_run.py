@@ -19,21 +19,18 @@ from plumbline.execution.plan import (
     TaskKind,
     task_keys,
 )
-from plumbline.judging import metamorphic, outlier
-from plumbline.judging.convergence import refinement_resolutions
+from plumbline.judging import outlier, relation_rows
 from plumbline.judging.known_issues import KnownIssues
-from plumbline.judging.long_run_study import plan_long_run, run_long_run_study
 from plumbline.judging.long_runs import judge_long_runs
-from plumbline.judging.refinement_study import run_refinement_study
 from plumbline.judging.rows import Fingerprints, JudgingResult, Level, Row, RowContext, Verdict, mark_aliases
 from plumbline.judging.state import judge_states, singular_pose_row
-from plumbline.judging.step import (
-    MAX_STEP_BODIES,
-    STEP_STATES,
-    judge_steps,
-    run_step_study,
-)
+from plumbline.judging.step import judge_steps
 from plumbline.judging.trajectory import judge_trajectory
+from plumbline.measurements import relations
+from plumbline.measurements.long_run_study import plan_long_run, run_long_run_study
+from plumbline.measurements.order_and_limit import refinement_resolutions
+from plumbline.measurements.refinement_study import run_refinement_study
+from plumbline.measurements.single_steps import MAX_STEP_BODIES, STEP_STATES, run_step_study
 from plumbline.model.datatypes import Integrator, Model
 from plumbline.model.invariants import inertia_ratio
 from plumbline.model.loops import MIN_MOTION_SINGULAR_VALUE, is_singular, smallest_singular_value
@@ -330,7 +327,7 @@ class ScenarioRun:
         if key.kind == TaskKind.STATE:
             return calls.evaluate_states, (s.model, self._states)
         if key.kind == TaskKind.RELATIONS:
-            return metamorphic.check_relations, (s.model, self._states)
+            return relations.check_relations, (s.model, self._states)
         integrator = self._integrator(key)
         if key.kind == TaskKind.STEP:
             return run_step_study, (integrator, s.model, self._step_states)
@@ -348,7 +345,7 @@ class ScenarioRun:
         """The function that judges a cell's answer in the worker, and its arguments; None without a truth."""
         s, context = self.scenario, self._context(key.engine)
         if key.kind == TaskKind.RELATIONS:
-            return metamorphic.judge_relations, (context,)
+            return relation_rows.judge_relations, (context,)
         if key.kind == TaskKind.STEP:
             return judge_steps, (context, self._integrator(key), s.model, self._step_states)
         if key.kind == TaskKind.LONG_RUN:

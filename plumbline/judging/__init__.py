@@ -1,6 +1,6 @@
-"""Judge numbers: raw answers of engines and the truth go in, rows with verdicts come out.
+"""Judge numbers: raw answers of engines and the truth go in, rows with verdicts come out; no engine runs.
 
-`state` and `trajectory` compare with the truth, `convergence` finds orders and limits, `long_runs` and
-`metamorphic` need no truth.  `known_issues` marks expected verdicts, and `outlier` names the engine that
-differs from all others.  Rows, verdicts and their display are in `rows`.
+`state`, `step` and `trajectory` compare with the truth, `long_runs` and `relation_rows` need none.
+`known_issues` marks expected verdicts, and `outlier` names the engine that differs from all others.  Rows,
+verdicts and their display are in `rows`; what is judged comes from `plumbline.measurements`.
 """

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from plumbline.judging.rows import Level, Row, Verdict
 from plumbline.judging.state import STATE_UNITS
-from plumbline.judging.step import MAX_STEP_BODIES, STEP_STATES, step_sizes
+from plumbline.measurements.single_steps import MAX_STEP_BODIES, STEP_STATES, step_sizes
 from plumbline.model.datatypes import Array, Model, State, Trajectory
 from plumbline.model.invariants import (
     INVARIANT_UNITS,

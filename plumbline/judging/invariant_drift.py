@@ -7,14 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from plumbline.judging.convergence import observed_order
 from plumbline.judging.refinement_analysis import RefinementAnalysis
 from plumbline.judging.rows import Row, Verdict, first_decided
+from plumbline.measurements.order_and_limit import observed_order
+from plumbline.measurements.refinement_study import ROUNDING_PER_STEP, rounding_floor
 from plumbline.model.datatypes import Array
 from plumbline.model.invariants import INVARIANT_UNITS
 from plumbline.truth.ground_truth import DETECTABLE_PARAMETER_ERROR
-
-ROUNDING_PER_STEP = 8 * 2.0**-52  # of an invariant, relative to its scale: a handful of operations
 
 
 def invariant_rows(study: RefinementAnalysis) -> list[Row]:
@@ -34,21 +33,6 @@ def invariant_rows(study: RefinementAnalysis) -> list[Row]:
             ys = [np.full_like(series[-1], np.nan) if s is None else s for s in series]
             rows.append(_invariant_row(study, quantity, unit, ys))
     return rows
-
-
-def rounding_floor(steps: int, scale: float, accepted_error: float = 0.0) -> float:
-    """Return the drift of an invariant that the rounding of all steps explains.
-
-    Args:
-        steps: number of steps of the run.
-        scale: size of the quantities that the invariant is a difference of, in its unit.
-        accepted_error: what step control accepts in every step, relative to the scale.
-
-    Returns:
-        The drift, in the invariant's unit.
-
-    """
-    return (ROUNDING_PER_STEP + accepted_error) * max(steps, 64) * scale
 
 
 def _invariant_row(study: RefinementAnalysis, quantity: str, unit: str, samples: Sequence[Array]) -> Row:

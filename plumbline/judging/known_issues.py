@@ -37,11 +37,11 @@ from pydantic import (
 from plumbline.engines.declared_names import declared_integrators, declared_texts
 from plumbline.engines.registry import ENGINES, IMPORTERS
 from plumbline.importers.neutral_model import MODEL_UNITS
-from plumbline.judging.relation_result import REPEATABILITY, UNEXPLAINED
 from plumbline.judging.rows import Level, Row, Verdict
-from plumbline.judging.run_relations import REVERSED_IN_TIME
 from plumbline.judging.state import SINGULAR_POSE, STATE_UNITS
-from plumbline.judging.state_relations import REDESCRIPTIONS, STATE_RELATIONS, WELDED_HALVES
+from plumbline.measurements.relation_result import REPEATABILITY, UNEXPLAINED
+from plumbline.measurements.run_relations import REVERSED_IN_TIME
+from plumbline.measurements.state_relations import REDESCRIPTIONS, STATE_RELATIONS, WELDED_HALVES
 from plumbline.model.invariants import INVARIANT_UNITS
 from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean, shorten
 from plumbline.scenario.generator import MECHANISM_PREFIX, MOTION_PREFIX, RANDOM_FAMILY

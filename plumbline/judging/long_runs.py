@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.judging.convergence import ORDER_MARGIN
-from plumbline.judging.invariant_drift import ROUNDING_PER_STEP
-from plumbline.judging.long_run_study import (
+from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict, first_decided
+from plumbline.judging.trajectory import singular_motion_row
+from plumbline.measurements.long_run_study import (
     BLOCK_COUNT,
     MAX_RELATIVE_DRIFT,
     MIN_WINDOW,
@@ -27,8 +27,8 @@ from plumbline.judging.long_run_study import (
     LongRunStudy,
     leaves_range,
 )
-from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict, first_decided
-from plumbline.judging.trajectory import singular_motion_row
+from plumbline.measurements.order_and_limit import ORDER_MARGIN
+from plumbline.measurements.refinement_study import ROUNDING_PER_STEP
 from plumbline.model.datatypes import Array, Integrator, Model
 from plumbline.model.invariants import INVARIANT_UNITS
 from plumbline.truth.ground_truth import DETECTABLE_PARAMETER_ERROR

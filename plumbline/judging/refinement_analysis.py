@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from plumbline.engines.calls import RefinementRun
-from plumbline.judging.convergence import (
+from plumbline.judging.rows import RowContext
+from plumbline.measurements.order_and_limit import (
     ORDER_MARGIN,
     ExtrapolatedLimit,
     ObservedOrder,
@@ -17,32 +18,10 @@ from plumbline.judging.convergence import (
     romberg,
     tightest_tolerance_limit,
 )
-from plumbline.judging.rows import RowContext
+from plumbline.measurements.refinement_study import run_samples
 from plumbline.model.datatypes import Array, Integrator, Model, Trajectory
 from plumbline.model.invariants import Invariants, compute_invariants, invariant_scales
 from plumbline.truth.ground_truth import RUN_ROUNDING, MotionTruth
-
-
-def run_samples(runs: Sequence[RefinementRun], name: str) -> list[Array]:
-    """Collect one field of all runs of a study.
-
-    Args:
-        runs: coarse to fine; the finest one succeeded.
-        name: of a field of `Trajectory`.
-
-    Returns:
-        Per run (T, N, width); NaN where the run failed. Quaternions have the signs of the finest run's.
-
-    """
-    assert runs[-1].trajectory is not None
-    fine: Array = getattr(runs[-1].trajectory, name)
-    found = []
-    for run in runs:
-        y = np.full_like(fine, np.nan) if run.trajectory is None else getattr(run.trajectory, name)
-        if name == "p":
-            y = y * np.where(np.sum(y * fine, axis=-1, keepdims=True) < 0, -1.0, 1.0)
-        found.append(y)
-    return found
 
 
 @dataclass

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from plumbline.engines.calls import RefinementStudy
-from plumbline.judging.convergence import ORDER_CHANGE_FACTOR, ORDER_MARGIN
 from plumbline.judging.identity import run_fingerprints
 from plumbline.judging.invariant_drift import invariant_rows
 from plumbline.judging.refinement_analysis import RefinementAnalysis
 from plumbline.judging.rows import Columns, JudgingResult, Level, Row, RowContext, Verdict, first_decided
 from plumbline.judging.state import SINGULAR_POSE
+from plumbline.measurements.order_and_limit import ORDER_CHANGE_FACTOR, ORDER_MARGIN
 from plumbline.model.datatypes import Array, Integrator, Model, Trajectory
 from plumbline.model.invariants import INVARIANT_UNITS, attitude_error, position_error
 from plumbline.truth.ground_truth import DETECTABLE_PARAMETER_ERROR, MotionTruth

@@ -11,8 +11,8 @@ from typing import Any
 from plumbline.engines import calls
 from plumbline.engines.metamorphic_hooks import metamorphic_hooks
 from plumbline.engines.registry import load_adapter
-from plumbline.judging.relation_result import OPTION_PREFIX
-from plumbline.judging.state_relations import WELDED_HALVES
+from plumbline.measurements.relation_result import OPTION_PREFIX
+from plumbline.measurements.state_relations import WELDED_HALVES
 from plumbline.model.datatypes import Integrator, Model, State, StateQuantities
 from plumbline.processes.remote_python import call_remote
 

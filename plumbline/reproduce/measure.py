@@ -19,16 +19,16 @@ from plumbline.engines.calls import RefinementRun
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.invariant_drift import invariant_rows
 from plumbline.judging.refinement_analysis import RefinementAnalysis
-from plumbline.judging.relation_result import OTHER_FORMULATION_PREFIX
 from plumbline.judging.rows import Row, RowContext, Verdict
-from plumbline.judging.state_relations import (
+from plumbline.judging.trajectory import trajectory_rows
+from plumbline.measurements.relation_result import OTHER_FORMULATION_PREFIX
+from plumbline.measurements.state_relations import (
     STATE_RELATIONS,
     WELDED_HALVES,
     Relation,
     quantity_values,
     unchanged,
 )
-from plumbline.judging.trajectory import trajectory_rows
 from plumbline.model.datatypes import Array, Integrator, StateQuantities
 from plumbline.model.step_methods import JointSpaceMethod, describe_method
 from plumbline.model.welding import split_bodies

@@ -19,9 +19,9 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from packaging.version import InvalidVersion, Version
 
 from plumbline.engines.environments import declared_attribute, split_version
-from plumbline.judging.convergence import ORDER_MARGIN
-from plumbline.judging.relation_result import OPTION_PREFIX, OTHER_FORMULATION_PREFIX
-from plumbline.judging.state_relations import STATE_RELATIONS, WELDED_HALVES
+from plumbline.measurements.order_and_limit import ORDER_MARGIN
+from plumbline.measurements.relation_result import OPTION_PREFIX, OTHER_FORMULATION_PREFIX
+from plumbline.measurements.state_relations import STATE_RELATIONS, WELDED_HALVES
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import (
     quaternion_conjugate,

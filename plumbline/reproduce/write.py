@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from plumbline.engines import environments
-from plumbline.judging.convergence import STEP_EXPONENTS
 from plumbline.judging.known_issues import project_known_issues
 from plumbline.judging.rows import Verdict
+from plumbline.measurements.order_and_limit import STEP_EXPONENTS
 from plumbline.model.datatypes import BadInput, Model, State
 from plumbline.model.kinematics import state_from_minimal
 from plumbline.model.sampling import compared_states

@@ -16,9 +16,9 @@ import pyarrow as pa
 
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.calls import RefinementStudy, run_refinement
-from plumbline.judging.convergence import refinement_resolutions
 from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.judging.trajectory import judge_trajectory
+from plumbline.measurements.order_and_limit import refinement_resolutions
 from plumbline.model.datatypes import Integrator, Trajectory
 from plumbline.model.invariants import compute_invariants, position_error
 from plumbline.model.kinematics import quaternion_rate

@@ -8,7 +8,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from plumbline.judging.state_relations import QUANTITIES
+from plumbline.measurements.state_relations import QUANTITIES
 from plumbline.model import kinematics
 from plumbline.model.datatypes import EngineFailure
 from plumbline.model.kinematics import complete_state, rotation_matrix

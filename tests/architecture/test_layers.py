@@ -11,8 +11,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 LAYERS = (  # from the top; a package imports only what follows it
-    "cli", "execution", "studies", "reproduce", "storage", "judging", "diagnosis", "truth", "engines",
-    "importers", "scenario", "model", "processes",
+    "cli", "execution", "studies", "reproduce", "storage", "judging", "measurements", "diagnosis", "truth",
+    "engines", "importers", "scenario", "model", "processes",
 )  # fmt: skip
 OUTSIDE = {  # packages beside the core, and what of the project each may import
     "reference_impl": ("reference_impl",),
@@ -112,6 +112,17 @@ def test_the_readable_reference_imports_no_fast_form():
     for name in readable:
         fast = {m for m in imports(name, at_import=False) if m.startswith("reference_impl.fast")}
         assert not fast, f"{name} imports {fast}"
+
+
+@pytest.mark.parametrize("name", sorted(m for m in MODULES if m.startswith("plumbline.judging.")))
+def test_judging_runs_no_engine(name):
+    """Of calls to engines it imports the types of the answers; what calls engines is in measurements."""
+    nodes = ast.walk(ast.parse(MODULES[name].read_text(encoding="utf-8")))
+    taken = {(n.module, alias.name) for n in nodes if isinstance(n, ast.ImportFrom) for alias in n.names}
+    assert ("plumbline.engines.registry", "load_adapter") not in taken
+    for module, member in taken:
+        is_call = module in ("plumbline.engines.calls", "plumbline.processes.workers") and member.islower()
+        assert not is_call and module != "plumbline.engines.metamorphic_hooks", f"{module}.{member}"
 
 
 def test_no_adapter_imports_another():

@@ -14,7 +14,7 @@ from plumbline.engines.registry import load_adapter
 from plumbline.execution.plan import RANDOM_STATES, STATES_PER_RANDOM_SCENARIO
 from plumbline.judging.rows import RowContext
 from plumbline.judging.state import judge_states
-from plumbline.judging.step import STEP_STATES
+from plumbline.measurements.single_steps import STEP_STATES
 from plumbline.model.datatypes import Unsupported
 from plumbline.model.sampling import compared_states
 from plumbline.scenario.generator import RandomScenarios

@@ -16,11 +16,11 @@ import pytest
 from plumbline.diagnosis.diagnose import diagnose
 from plumbline.engines.calls import Evaluation
 from plumbline.engines.registry import load_adapter
-from plumbline.judging.convergence import refinement_resolutions
-from plumbline.judging.refinement_study import run_refinement_study
 from plumbline.judging.rows import RowContext
 from plumbline.judging.state import judge_states
 from plumbline.judging.trajectory import judge_trajectory
+from plumbline.measurements.order_and_limit import refinement_resolutions
+from plumbline.measurements.refinement_study import run_refinement_study
 from plumbline.model.sampling import random_states
 from plumbline.truth.ground_truth import motion_truth, state_truth
 from tests.helpers import pendulums

@@ -10,10 +10,10 @@ import pytest
 
 from adapters.pinocchio_engine import PinocchioChain
 from plumbline.engines.registry import load_adapter
-from plumbline.judging.convergence import refinement_resolutions
-from plumbline.judging.refinement_study import run_refinement_study
 from plumbline.judging.rows import RowContext
 from plumbline.judging.trajectory import judge_trajectory
+from plumbline.measurements.order_and_limit import refinement_resolutions
+from plumbline.measurements.refinement_study import run_refinement_study
 from plumbline.truth.ground_truth import motion_truth
 from tests.helpers.catalogue import catalogue_scenarios
 

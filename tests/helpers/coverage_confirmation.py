@@ -15,13 +15,14 @@ import numpy as np
 from plumbline.engines.adapter import Adapter
 from plumbline.engines.calls import Evaluation
 from plumbline.engines.registry import load_adapter
-from plumbline.judging.convergence import refinement_resolutions
 from plumbline.judging.coverage import CoverageEntry, scenario_coverage
-from plumbline.judging.refinement_study import run_refinement_study
 from plumbline.judging.rows import Level, Row, RowContext
 from plumbline.judging.state import judge_states
-from plumbline.judging.step import STEP_STATES, judge_steps, run_step_study
+from plumbline.judging.step import judge_steps
 from plumbline.judging.trajectory import judge_trajectory
+from plumbline.measurements.order_and_limit import refinement_resolutions
+from plumbline.measurements.refinement_study import run_refinement_study
+from plumbline.measurements.single_steps import STEP_STATES, run_step_study
 from plumbline.model.datatypes import Array, Integrator, Model, State, StateQuantities, StepRun, Trajectory
 from plumbline.model.sampling import compared_states
 from plumbline.scenario.loader import Scenario, load_scenarios

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from plumbline.engines.metamorphic_hooks import metamorphic_hooks
 from plumbline.engines.registry import load_adapter
-from plumbline.judging.relation_result import OPTION_PREFIX, OTHER_FORMULATION_PREFIX
-from plumbline.judging.state_relations import QUANTITIES, STATE_RELATIONS, WELDED_HALVES
+from plumbline.measurements.relation_result import OPTION_PREFIX, OTHER_FORMULATION_PREFIX
+from plumbline.measurements.state_relations import QUANTITIES, STATE_RELATIONS, WELDED_HALVES
 from plumbline.model.step_methods import JointSpaceMethod
 from plumbline.reproduce.engine_client import EngineClient
 from plumbline.reproduce.measure import ConvergenceMeasure, RelationMeasure, StateMeasure, StepMeasure

@@ -9,8 +9,10 @@ from adapters.mujoco_engine import Mujoco
 from plumbline.engines.registry import load_adapter
 from plumbline.execution.plan import Plan
 from plumbline.execution.runner import run_plan
-from plumbline.judging import long_run_study
-from plumbline.judging.long_run_study import (
+from plumbline.judging.long_runs import DriftOrder, judge_long_runs
+from plumbline.judging.rows import RowContext
+from plumbline.measurements import long_run_study
+from plumbline.measurements.long_run_study import (
     BLOCK_COUNT,
     MAX_BODY_STEPS,
     DriftWindow,
@@ -20,8 +22,6 @@ from plumbline.judging.long_run_study import (
     plan_long_run,
     run_long_run_study,
 )
-from plumbline.judging.long_runs import DriftOrder, judge_long_runs
-from plumbline.judging.rows import RowContext
 from plumbline.model.datatypes import Integrator, Trajectory
 from plumbline.processes.workers import Limits
 from plumbline.scenario import loader

@@ -12,7 +12,8 @@ import pytest
 from plumbline.engines.calls import StepAttempt, StepEvaluation, run_steps
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.rows import RowContext, Verdict
-from plumbline.judging.step import STEP_STATES, judge_steps, step_sizes
+from plumbline.judging.step import judge_steps
+from plumbline.measurements.single_steps import STEP_STATES, step_sizes
 from plumbline.model.datatypes import KINDS, SPRING_FIELDS
 from plumbline.model.kinematics import complete_state
 from plumbline.model.loops import STABILISATION

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from plumbline.engines.calls import RefinementRun, RefinementStudy
-from plumbline.judging.convergence import romberg
-from plumbline.judging.invariant_drift import ROUNDING_PER_STEP
 from plumbline.judging.refinement_analysis import RefinementAnalysis
 from plumbline.judging.rows import RowContext
 from plumbline.judging.trajectory import judge_trajectory, pose_columns
+from plumbline.measurements.order_and_limit import romberg
+from plumbline.measurements.refinement_study import ROUNDING_PER_STEP
 from plumbline.model.datatypes import Integrator, Trajectory
 from plumbline.model.invariants import compute_invariants
 from plumbline.model.kinematics import angular_velocity, quaternion_product, rotate_vectors, rotation_matrix

@@ -13,7 +13,7 @@ import pytest
 
 from plumbline.engines import environments
 from plumbline.engines.registry import load_adapter
-from plumbline.judging.convergence import refinement_resolutions
+from plumbline.measurements.order_and_limit import refinement_resolutions
 from plumbline.reproduce.engine_client import EngineClient
 from plumbline.reproduce.measure import Disagreement, StateMeasure
 from plumbline.reproduce.render import render_script

@@ -12,7 +12,7 @@ import pytest
 from plumbline.engines.registry import ENGINES as REGISTERED
 from plumbline.judging.refinement_analysis import RefinementAnalysis
 from plumbline.judging.rows import RowContext
-from plumbline.judging.state_relations import STATE_RELATIONS
+from plumbline.measurements.state_relations import STATE_RELATIONS
 from plumbline.reproduce.engine_client import EngineClient
 from plumbline.reproduce.measure import StateMeasure
 from plumbline.reproduce.render import TEMPLATES, no_script_reason, render_script

@@ -14,9 +14,9 @@ from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.calls import run_refinement
 from plumbline.engines.registry import load_adapter
 from plumbline.execution.runner import describe_engines
-from plumbline.judging.convergence import refinement_resolutions
 from plumbline.judging.rows import RowContext
 from plumbline.judging.trajectory import judge_trajectory
+from plumbline.measurements.order_and_limit import refinement_resolutions
 from plumbline.processes.workers import Limits, WorkerPool
 from plumbline.scenario import loader as scenarios
 from plumbline.scenario.errors import ScenarioError

@@ -65,19 +65,27 @@ TARGETS = {
         *(
             f"plumbline/judging/{name}.py"
             for name in (
-                "convergence",
                 "coverage",
                 "identity",
                 "invariant_drift",
                 "known_issues",
-                "long_run*",
-                "metamorphic",
+                "long_runs",
                 "outlier",
-                "refinement_*",
-                "run_relations",
-                "state*",
+                "refinement_analysis",
+                "relation_rows",
+                "state",
                 "step",
                 "trajectory",
+            )
+        ),
+        *(
+            f"plumbline/measurements/{name}.py"
+            for name in (
+                "long_run_study",
+                "order_and_limit",
+                "refinement_study",
+                "*relations",
+                "single_steps",
             )
         ),
         *(f"plumbline/truth/{name}.py" for name in ("ground_truth", "rounding_bound", "sensitivity")),
@@ -98,18 +106,19 @@ TEST_FILES = {  # by target or top folder, the tests that must notice its mutant
         *(
             f"tests/judging/test_{name}.py"
             for name in (
-                "convergence",
                 "coverage",
                 "identity",
                 "known_issues",
                 "long_runs",
-                "metamorphic*",
                 "outlier",
-                "refinement_study",
                 "state",
                 "step",
                 "trajectory*",
             )
+        ),
+        *(
+            f"tests/measurements/test_{name}.py"
+            for name in ("order_and_limit", "refinement_study", "relation*")
         ),
         *(f"tests/truth/test_{name}.py" for name in ("ground_truth", "rounding_bound", "sensitivity")),
         "tests/diagnosis/test_diagnose.py",

@@ -11,10 +11,10 @@ from adapters.reference_engine import Reference
 from plumbline.engines.metamorphic_hooks import metamorphic_hooks
 from plumbline.engines.registry import load_adapter
 from plumbline.judging.known_issues import KnownIssues, project_known_issues
-from plumbline.judging.metamorphic import judge_relations
+from plumbline.judging.relation_rows import judge_relations
 from plumbline.judging.rows import RowContext
-from plumbline.judging.run_relations import check_run_relations
-from plumbline.judging.state_relations import (
+from plumbline.measurements.run_relations import check_run_relations
+from plumbline.measurements.state_relations import (
     MISSING_TERMS,
     REDESCRIPTIONS,
     Relation,

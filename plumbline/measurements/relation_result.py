@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-
-from plumbline.judging.rows import Verdict
+from typing import Literal
 
 OTHER_FORMULATION_PREFIX = "as "  # names of relations: "as NAME" is the engine's other formulation NAME
 OPTION_PREFIX = "by "  # "by NAME" is another algorithm or linear solver of the same engine
 
 UNEXPLAINED = "unexplained"  # in a row's `extra`: `RelationResult.unexplained`
 REPEATABILITY = "repeatability"  # equal questions, equal bits: the ratio is the largest relative difference
+
+Refusal = Literal["unsupported", "failed", "not compared"]
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class RelationResult:
     worst_state: int  # index of its state
     state_count: int  # number of states that were compared
     refusal_reason: str = ""
-    verdict: Verdict = Verdict.UNSUPPORTED  # of a refusal
+    refusal: Refusal = "unsupported"  # where there is no ratio
     integrator: str = "-"  # of a relation of runs
     steps: int = 0  # of a run, there and back
     resolution: float = 0.0  # of a run: its step [s], or its relative tolerance

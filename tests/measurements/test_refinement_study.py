@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from plumbline.engines.calls import RefinementStudy, run_refinement
-from plumbline.judging import refinement_study
-from plumbline.judging.convergence import refinement_resolutions
-from plumbline.judging.refinement_study import MIN_RUNS, STOP_MARGIN, is_resolved, run_refinement_study
 from plumbline.judging.trajectory import judge_trajectory
+from plumbline.measurements import refinement_study
+from plumbline.measurements.order_and_limit import refinement_resolutions
+from plumbline.measurements.refinement_study import MIN_RUNS, STOP_MARGIN, is_resolved, run_refinement_study
 from plumbline.model.datatypes import Integrator
 from plumbline.scenario.loader import load_scenarios
 from plumbline.truth.ground_truth import motion_truth

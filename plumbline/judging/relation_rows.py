@@ -1,37 +1,17 @@
-"""Metamorphic relations: one engine compared with itself on equivalent problems; no truth is needed."""
+"""Rows of metamorphic relations: an engine's two answers differ by no more than rounding explains."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from plumbline.engines.metamorphic_hooks import metamorphic_hooks
-from plumbline.engines.registry import load_adapter
-from plumbline.judging.relation_result import REPEATABILITY, UNEXPLAINED, RelationResult
-from plumbline.judging.repeatability import check_repeatability
 from plumbline.judging.rows import JudgingResult, Row, RowContext, Verdict
-from plumbline.judging.run_relations import check_run_relations
-from plumbline.judging.state_relations import check_state_relations
-from plumbline.model.datatypes import Model, State
+from plumbline.measurements.relation_result import REPEATABILITY, UNEXPLAINED, Refusal, RelationResult
 
-
-def check_relations(engine: str, model: Model, states: Sequence[State]) -> list[RelationResult]:
-    """Check every relation on one engine; runs inside a worker.
-
-    Args:
-        engine: name of the engine.
-        model: the pendulum.
-        states: states of it; runs start from the first.
-
-    Returns:
-        The results of repeatability, of the relations at states, and of those of runs.
-
-    """
-    adapter = metamorphic_hooks(load_adapter(engine))
-    return [
-        *check_repeatability(adapter, model, states),  # first: the adapter has not been asked before
-        *check_state_relations(adapter, model, states),
-        *check_run_relations(adapter, model, states[0]),
-    ]
+REFUSALS: dict[Refusal, Verdict] = {
+    "unsupported": Verdict.UNSUPPORTED,
+    "failed": Verdict.FAILED,
+    "not compared": Verdict.INFORMATION,
+}
 
 
 def judge_relations(context: RowContext, results: Sequence[RelationResult]) -> JudgingResult:
@@ -52,7 +32,7 @@ def judge_relations(context: RowContext, results: Sequence[RelationResult]) -> J
 def _relation_row(context: RowContext, result: RelationResult) -> Row:
     if result.ratio is None:
         return context.make_row(
-            "relations", result.integrator, result.relation, result.verdict, result.refusal_reason
+            "relations", result.integrator, result.relation, REFUSALS[result.refusal], result.refusal_reason
         )
     extra = {"states": float(result.state_count), "state": float(result.worst_state)}
     if result.unexplained is not None:

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from plumbline.engines.registry import load_adapter
-from plumbline.judging.metamorphic import check_relations, judge_relations
-from plumbline.judging.relation_result import RelationResult
+from plumbline.judging.relation_rows import judge_relations
 from plumbline.judging.rows import RowContext
-from plumbline.judging.run_relations import (
+from plumbline.measurements.relation_result import RelationResult
+from plumbline.measurements.relations import check_relations
+from plumbline.measurements.run_relations import (
     characteristic_scales,
     fastest_rate,
     refused_result,
@@ -18,7 +19,7 @@ from plumbline.judging.run_relations import (
     state_at_sample,
     worst_difference_result,
 )
-from plumbline.judging.state_relations import (
+from plumbline.measurements.state_relations import (
     QUANTITIES,
     Relation,
     check_state_relation,
@@ -93,7 +94,7 @@ def test_equal_answers_and_refused_ones():
     assert (mine.state_count, mine.worst_state, mine.refusal_reason) == (2, 1, "nor state 2")
     none = self_relation_result(refuse=(0, 1, 2))
     assert (none.ratio, none.quantity, none.worst_state, none.state_count) == (None, "", 0, 0)
-    assert none.verdict == "unsupported"
+    assert none.refusal == "unsupported"
 
     def refusing(_model, _states):
         raise Unsupported("never")

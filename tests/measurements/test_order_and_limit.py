@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from plumbline.judging.convergence import (
+from plumbline.measurements.order_and_limit import (
     ORDER_MARGIN,
     STEP_EXPONENTS,
     extrapolated_order,

@@ -10,7 +10,7 @@ import numpy as np
 
 from plumbline.engines.calls import format_exception
 from plumbline.engines.registry import load_adapter
-from plumbline.judging.convergence import step_unit
+from plumbline.measurements.order_and_limit import step_unit
 from plumbline.model.datatypes import Array, Integrator, Model, State, Trajectory, Unsupported
 from plumbline.model.invariants import (
     INVARIANT_UNITS,

@@ -14,15 +14,15 @@ from dataclasses import fields, replace
 import numpy as np
 
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
-from plumbline.judging.relation_result import REPEATABILITY, RelationResult
-from plumbline.judging.run_relations import (
+from plumbline.measurements.relation_result import REPEATABILITY, RelationResult
+from plumbline.measurements.run_relations import (
     RUN_STEPS,
     STEP_DIVISORS,
     STEPS_PER_RADIAN,
     fastest_rate,
     refused_result,
 )
-from plumbline.judging.state_relations import LONG_CHAIN_BODIES, MAX_STATES, evaluate_or_refusal
+from plumbline.measurements.state_relations import LONG_CHAIN_BODIES, MAX_STATES, evaluate_or_refusal
 from plumbline.model.datatypes import (
     Array,
     EngineFailure,

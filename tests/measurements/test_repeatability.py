@@ -9,9 +9,10 @@ import pytest
 
 from plumbline.engines.metamorphic_hooks import metamorphic_hooks
 from plumbline.engines.registry import ENGINES, load_adapter
-from plumbline.judging.metamorphic import check_relations, judge_relations
-from plumbline.judging.repeatability import check_repeatability
+from plumbline.judging.relation_rows import judge_relations
 from plumbline.judging.rows import RowContext
+from plumbline.measurements.relations import check_relations
+from plumbline.measurements.repeatability import check_repeatability
 from plumbline.model.datatypes import EngineFailure, Unsupported
 from tests.helpers import pendulums
 from tests.helpers.pendulums import JOINT_PATTERNS

@@ -10,9 +10,10 @@ import pytest
 
 from plumbline.diagnosis.defect_model import evaluate_case, make_defect_case
 from plumbline.engines.registry import ENGINES, load_adapter
-from plumbline.judging.metamorphic import check_relations, judge_relations
+from plumbline.judging.relation_rows import judge_relations
 from plumbline.judging.rows import RowContext
-from plumbline.judging.run_relations import (
+from plumbline.measurements.relations import check_relations
+from plumbline.measurements.run_relations import (
     check_integrator_relations,
     check_run_relations,
     fastest_rate,
@@ -20,7 +21,12 @@ from plumbline.judging.run_relations import (
     run_tolerance,
     state_at_sample,
 )
-from plumbline.judging.state_relations import QUANTITIES, STATE_RELATIONS, WELDED_HALVES, check_state_relation
+from plumbline.measurements.state_relations import (
+    QUANTITIES,
+    STATE_RELATIONS,
+    WELDED_HALVES,
+    check_state_relation,
+)
 from plumbline.model.datatypes import EngineFailure, Unsupported
 from plumbline.model.welding import split_bodies, split_body
 from plumbline.truth.rounding_bound import state_rounding_bound
@@ -139,7 +145,7 @@ def test_a_defect_of_its_kind_breaks_it(relation):
     for defect in DEFECTS_BY_RELATION[relation]:
         engine = plant(type(load_adapter(defect.engine)), defect)
         with patch(
-            "plumbline.judging.metamorphic.load_adapter",
+            "plumbline.measurements.relations.load_adapter",
             lambda n, e=engine, d=defect: e if n == d.engine else load_adapter(n),
         ):
             results = check_relations(defect.engine, model, random_states_of(model))
@@ -155,7 +161,7 @@ def test_a_refused_state_is_left_out_and_a_refusing_engine_is_reported():
             raise Unsupported("not on a Monday")
 
     model = pendulums.make_model(JOINT_PATTERNS["ball"])
-    with patch("plumbline.judging.metamorphic.load_adapter", lambda _: Refusing()):
+    with patch("plumbline.measurements.relations.load_adapter", lambda _: Refusing()):
         rows = judge_relations(
             RowContext("s", "f", "e", "E", "0"), check_relations("mujoco", model, random_states_of(model))
         ).rows
@@ -170,7 +176,7 @@ def test_noise_breaks_what_is_not_bitwise():
         "acceleration", lambda _, __, a: a * (1 + 1e-9 * rng.normal(size=a.shape))))  # fmt: skip
     engine = plant(type(load_adapter("mujoco")), noisy)
     model = pendulums.make_model(JOINT_PATTERNS["balls"])
-    with patch("plumbline.judging.metamorphic.load_adapter", lambda _: engine):
+    with patch("plumbline.measurements.relations.load_adapter", lambda _: engine):
         found = check_relations("mujoco", model, random_states_of(model))
     for result in found:
         if result.integrator == "-":  # its runs are as before; a repetition must be the same to the bit
@@ -205,7 +211,7 @@ def test_a_defect_in_one_way_of_the_engine_breaks_it(engine, relation, defect):
     model = pendulums.make_model(JOINT_PATTERNS["balls"])
     faulty = defect_in_default_formulation(replace(defect_named(defect), engine=engine))
     with patch(
-        "plumbline.judging.metamorphic.load_adapter", lambda n: faulty if n == engine else load_adapter(n)
+        "plumbline.measurements.relations.load_adapter", lambda n: faulty if n == engine else load_adapter(n)
     ):
         (found,) = (
             h for h in check_relations(engine, model, random_states_of(model)) if h.relation == relation
@@ -268,7 +274,7 @@ def test_halves_have_roundings_of_their_own():
     for q in set(QUANTITIES) - {"joint_moment"}:  # chains have none
         assert np.all(np.asarray(welded.tolerance(q)) >= plain.tolerance(q))
     with patch(
-        "plumbline.judging.state_relations.check_state_relation", wraps=check_state_relation
+        "plumbline.measurements.state_relations.check_state_relation", wraps=check_state_relation
     ) as requested:
         check_relations("mujoco", model, [at])
     (_, *_, (one,), (other,)) = next(
@@ -431,7 +437,7 @@ def test_a_solver_with_which_a_run_fails_is_reported():
         Half(), trapezoidal_integrator(), model, pendulums.state_from_seed(model), 1 / 512
     )
     assert back.ratio < 0.3
-    assert [(h.relation, h.integrator, h.refusal_reason, h.verdict) for h in others] == [
+    assert [(h.relation, h.integrator, h.refusal_reason, h.refusal) for h in others] == [
         (way, "trapezoidal", "it stopped", "failed") for way in LINEAR_SOLVER_RELATIONS
     ]
 
@@ -465,7 +471,7 @@ def test_runs_by_tolerance_have_no_solvers_and_are_not_tried_finer():
 
     model = pendulums.make_model(JOINT_PATTERNS["ball"])
     (held,) = check_run_relations(Failing(), model, pendulums.state_from_seed(model))
-    assert (held.relation, held.verdict, len(tried)) == ("reversed in time", "failed", 1)
+    assert (held.relation, held.refusal, len(tried)) == ("reversed in time", "failed", 1)
 
 
 def test_a_step_too_coarse_to_be_solved_is_taken_finer():

@@ -22,13 +22,12 @@ import numpy as np
 
 from plumbline.engines import calls
 from plumbline.engines.calls import RefinementRun, RefinementStudy
-from plumbline.judging.convergence import ORDER_MARGIN, max_norm, observed_order, romberg
-from plumbline.judging.invariant_drift import rounding_floor
-from plumbline.judging.refinement_analysis import run_samples
+from plumbline.measurements.order_and_limit import ORDER_MARGIN, max_norm, observed_order, romberg
 from plumbline.model.datatypes import Array, Integrator, Model, State
 from plumbline.model.invariants import INVARIANT_UNITS, compute_invariants, invariant_scales
 from plumbline.truth.ground_truth import RUN_ROUNDING, stretched_length  # constants, no truth
 
+ROUNDING_PER_STEP = 8 * 2.0**-52  # of an invariant, relative to its scale: a handful of operations
 STOP_MARGIN = 1 / 8  # μ: what a finer step could lower a bound by, relative to the bound
 MIN_RUNS = 4  # three differences between consecutive runs, two orders
 
@@ -96,3 +95,40 @@ def is_resolved(model: Model, integrator: Integrator, runs: Sequence[RefinementR
         if romberg(series, integrator.error_exponents).uncertainty[-1] > floor:
             return False
     return True
+
+
+def run_samples(runs: Sequence[RefinementRun], name: str) -> list[Array]:
+    """Collect one field of all runs of a study.
+
+    Args:
+        runs: coarse to fine; the finest one succeeded.
+        name: of a field of `Trajectory`.
+
+    Returns:
+        Per run (T, N, width); NaN where the run failed. Quaternions have the signs of the finest run's.
+
+    """
+    assert runs[-1].trajectory is not None
+    fine: Array = getattr(runs[-1].trajectory, name)
+    found = []
+    for run in runs:
+        y = np.full_like(fine, np.nan) if run.trajectory is None else getattr(run.trajectory, name)
+        if name == "p":
+            y = y * np.where(np.sum(y * fine, axis=-1, keepdims=True) < 0, -1.0, 1.0)
+        found.append(y)
+    return found
+
+
+def rounding_floor(steps: int, scale: float, accepted_error: float = 0.0) -> float:
+    """Return the drift of an invariant that the rounding of all steps explains.
+
+    Args:
+        steps: number of steps of the run.
+        scale: size of the quantities that the invariant is a difference of, in its unit.
+        accepted_error: what step control accepts in every step, relative to the scale.
+
+    Returns:
+        The drift, in the invariant's unit.
+
+    """
+    return (ROUNDING_PER_STEP + accepted_error) * max(steps, 64) * scale

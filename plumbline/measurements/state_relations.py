@@ -27,7 +27,7 @@ import numpy as np
 
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
 from plumbline.engines.registry import load_adapter
-from plumbline.judging.relation_result import OPTION_PREFIX, OTHER_FORMULATION_PREFIX, RelationResult
+from plumbline.measurements.relation_result import OPTION_PREFIX, OTHER_FORMULATION_PREFIX, RelationResult
 from plumbline.model.datatypes import KINDS, Array, Model, State, StateQuantities, Unsupported
 from plumbline.model.equivalent import (
     BODY_VECTORS,

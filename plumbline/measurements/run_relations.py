@@ -15,8 +15,7 @@ import numpy as np
 
 from plumbline.engines.adapter import Adapter
 from plumbline.engines.metamorphic_hooks import MetamorphicHooks
-from plumbline.judging.relation_result import OPTION_PREFIX, RelationResult
-from plumbline.judging.rows import Verdict
+from plumbline.measurements.relation_result import OPTION_PREFIX, Refusal, RelationResult
 from plumbline.model.datatypes import EngineFailure, Integrator, Model, State, Trajectory, Unsupported
 from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import angular_velocity
@@ -45,14 +44,14 @@ def check_run_relations(engine: MetamorphicHooks, model: Model, state: State) ->
     """
     for option in engine.options_for(model):
         if reason := engine.unmoved_options.get(option):
-            words, verdict = f"not compared: {reason}", Verdict.INFORMATION
-            yield RelationResult(f"motions by {option}", None, "", 0, 0, words, verdict)
+            words = f"not compared: {reason}"
+            yield RelationResult(f"motions by {option}", None, "", 0, 0, words, "not compared")
     step = 2.0 ** float(np.floor(-np.log2(STEPS_PER_RADIAN * fastest_rate(model, state))))
     for integrator in engine.integrators:
         results: list[RelationResult] = []
         for divisor in STEP_DIVISORS:
             results = list(check_integrator_relations(engine, integrator, model, state, step / divisor))
-            if integrator.kind == "tolerance" or all(r.verdict != Verdict.FAILED for r in results):
+            if integrator.kind == "tolerance" or all(r.refusal != "failed" for r in results):
                 break
         yield from results
 
@@ -178,8 +177,8 @@ def refused_result(name: str, integrator: Integrator, refusal: Unsupported | Eng
         The result, without a ratio.
 
     """
-    verdict = Verdict.UNSUPPORTED if isinstance(refusal, Unsupported) else Verdict.FAILED
-    return RelationResult(name, None, "", 0, 0, str(refusal), verdict, integrator.name)
+    kind: Refusal = "unsupported" if isinstance(refusal, Unsupported) else "failed"
+    return RelationResult(name, None, "", 0, 0, str(refusal), kind, integrator.name)
 
 
 def run_tolerance(integrator: Integrator, model: Model, state: State, end: float, steps: int) -> float:

@@ -1,0 +1,91 @@
+"""Take single steps of fixed-step integrators: from which states, of which sizes; runs inside a worker."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+
+import numpy as np
+
+from plumbline.engines.calls import StepEvaluation, run_steps
+from plumbline.model.datatypes import ZERO_INERTIA, Integrator, Model, State
+from plumbline.model.loops import STABILISATION
+from plumbline.model.step_methods import ConstrainedMethod
+from plumbline.processes.workers import Pickled
+from plumbline.truth.rounding_bound import remembered_rounding_bound
+from plumbline.truth.step_comparison import step_counts
+from plumbline.truth.step_formulas import fastest_rates, first_coordinate_acceleration
+
+STEP_SIZES = (0.01, 0.0237)  # s; large: a bound grows as h, the effect of a wrong formula faster
+MAX_STEP_RATE = 10.0  # rad/s; in faster motions the steps are smaller: explicit methods become unstable
+# rad/s, of loops: at the larger step gaps close by half as fast as h a = 1, where Euler's method rings
+LOOP_RATE = 2 * STABILISATION * MAX_STEP_RATE * STEP_SIZES[-1]
+STEP_STATES = 5  # the initial state and random ones
+MAX_STEP_BODIES = 10
+
+
+def run_step_study(
+    engine: str, integrator: Integrator, model: Model, states: Sequence[State]
+) -> StepEvaluation:
+    """Take the steps of one integrator (to be called in a worker).
+
+    Args:
+        engine: name of the engine in the registry.
+        integrator: one of its integrators, with a declared formula.
+        model: the pendulum.
+        states: states of it.
+
+    Returns:
+        The steps.
+
+    """
+    assert integrator.method is not None
+    sizes = _remembered_step_sizes(
+        isinstance(integrator.method, ConstrainedMethod), Pickled.of((model, states))
+    )
+    return run_steps(engine, integrator.name, model, states, sizes, step_counts(integrator.method))
+
+
+@lru_cache(maxsize=4)
+def _remembered_step_sizes(has_constraints: bool, arguments: Pickled) -> list[list[float]]:
+    """The steps of a scenario, whose integrators a worker gets in a row."""
+    return step_sizes(has_constraints, *arguments.load())
+
+
+def step_sizes(has_constraints: bool, model: Model, states: Sequence[State]) -> list[list[float]]:
+    """Choose the steps from each state: `STEP_SIZES`, in proportion smaller where the motion is fast.
+
+    Args:
+        has_constraints: whether the declared formula is a `ConstrainedMethod`.
+        model: the pendulum.
+        states: states of it.
+
+    Returns:
+        Steps [s] per state: `STEP_SIZES` × `MAX_STEP_RATE` over the fastest rate, where that is larger.  Of
+        loops it is `LOOP_RATE` at least: engines' corrections of gaps have to be stable.  Else it
+        is the largest of √(2 |p̈|) = (α² + ω⁴/4)^¼ of a body, of |u̇| of a rod, of the linearised equations'
+        eigenvalues, and for methods with constraints of √(F |s| / J) of a joint's force, doubled: their
+        Newton iteration leaves that stiffness out and diverges at large steps.
+
+    """
+    norm, found = np.linalg.norm, []
+    for state, fastest in zip(states, fastest_rates(model, states), strict=True):
+        turning = np.asarray(first_coordinate_acceleration(model, state)[:, 3:], float)
+        squares = [2 * np.max(norm(turning, axis=1)), np.max(norm(state.udot, axis=1)) ** 2, fastest**2]
+        if has_constraints:
+            bound = remembered_rounding_bound(model, state)
+            force, near = np.asarray(bound.scale["joint_reaction"]), model.body[:, 1]
+            lever, principal = norm(model.point[:, 1], axis=1), np.linalg.eigvalsh(model.inertia)
+            least = np.where(principal[:, 0] > ZERO_INERTIA * principal[:, 2], principal[:, 0], np.inf)
+            on_body = model.body[:, 0] >= 0
+            beyond = np.zeros(model.n)
+            np.maximum.at(beyond, model.body[on_body, 0], norm(model.point[on_body, 0], axis=1))
+            squares.append(np.max(force * (lever + beyond[near]) / least[near]))
+            if not model.is_chain:
+                squares.append(np.max(bound.scale["joint_moment"] / least[near]))
+            squares = [4 * np.max(squares)]
+        if model.has_loops:
+            squares.append(LOOP_RATE**2)
+        rate = float(np.sqrt(np.max(squares)))
+        found.append([h * min(1.0, MAX_STEP_RATE / rate if rate > 0 else 1.0) for h in STEP_SIZES])
+    return found
