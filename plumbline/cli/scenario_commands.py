@@ -12,6 +12,7 @@ from plumbline.cli import options
 from plumbline.cli.console import count_noun, print_table
 from plumbline.engines.registry import ENGINES
 from plumbline.execution.runner import describe_engines
+from plumbline.model.loops import immovable_joints
 from plumbline.processes.workers import WorkerPool
 from plumbline.scenario import loader as scenarios
 
@@ -65,7 +66,29 @@ def check(files: tuple[Path, ...]) -> None:
     for s in options.read_scenarios(files):
         joints = ", ".join(s.model.kind[:6])
         more = " …" if s.model.n > 6 else ""
-        click.echo(f"{s.path}: ok: {s.name}, {count_noun(s.model.n, 'body', 'bodies')} ({joints}{more})")
+        still = f"; {describe_immovable_joints(s)}" if s.model.has_loops else ""
+        bodies = count_noun(s.model.n, "body", "bodies")
+        click.echo(f"{s.path}: ok: {s.name}, {bodies} ({joints}{more}){still}".removesuffix("; "))
+
+
+def describe_immovable_joints(s: scenarios.Scenario) -> str:
+    """Name the joints that loops keep from moving.
+
+    Args:
+        s: a scenario.
+
+    Returns:
+        What cannot move: the mechanism, or the joints by the bodies that they carry and by their number
+        among `closes`; empty where every joint can.
+
+    """
+    still, n = immovable_joints(s.model, s.state), s.model.n
+    if not still:
+        return ""
+    if len(still) == sum(kind != "weld" for kind in s.model.kind):
+        return "the mechanism cannot move: its loops hold every joint"
+    names = [s.body_names[k] if k < n else f"closes[{k - n}]" for k in still]
+    return f"the loops hold these joints, which cannot move: {', '.join(names)}"
 
 
 @click.command()

@@ -46,8 +46,12 @@ MIN_SINGULAR_VALUE = 1e-6  # of the rows that hold, below it a pose counts as si
 MIN_MOTION_SINGULAR_VALUE = 1e-2  # the same of poses that a motion is compared at: it loses digits near them
 RANK_TOLERANCE = 1e-11  # of singular values of scaled rows: below it a row depends on the others
 MIN_MASS_RATIO = 1e-12  # of eigenvalues of a mass matrix of unit diagonal: below it a motion has no inertia
+NEARBY = 1e-2  # [rad, m]: how far a pose nearby is, where what holds at one pose alone does not
 STABILISATION = 50.0  # 1/s, of engines' motions: gaps that steps open die as (1 + a t) e^{-a t}
 NEWTON_STEPS, MAX_HALVINGS = 30, 6
+SHARE_ROUNDING = (
+    64 * np.finfo(float).eps
+)  # of a rate in unit motions of the loops, times nu and the condition
 NEARLY_CLOSED = 1e-11  # of a gap [m, rad]: the next step of Newton's method leaves only rounding
 PER_BODY = ("acceleration", "angular_acceleration")  # quantities with one row per body
 
@@ -324,14 +328,100 @@ def closed_rates(
         free: (nu,) True for those that may change; absent: all.
 
     Returns:
-        (nu,) the nearest rates with J ν = 0; where there are none, rates of ends differ.
+        (nu,) the nearest rates with J ν = 0; where there are none, rates of ends differ.  Those that may
+        change and cannot move are exactly 0, not what rounding leaves: a comparison would be relative to it.
 
     """
     J, found = cut.jacobian(state), rates.copy()
     chosen = np.ones(len(rates), bool) if free is None else free
     for _ in range(2):  # the second pass removes what rounding left of the first
         found[chosen] += _least_norm(cut, J[:, chosen], -J @ found)
+    found[chosen & ~np.any(allowed_rates(cut, state), axis=0)] = 0.0
     return found
+
+
+def allowed_rates(cut: CutMechanism, state: State) -> Array:
+    """Return the rates that keep the loops of a cut mechanism closed.
+
+    Args:
+        cut: the mechanism.
+        state: of the tree, its ends together.
+
+    Returns:
+        (mobility, nu) orthonormal rates that span them; a rate that none of them moves is exactly 0 in all.
+
+    """
+    rods = np.zeros((int(cut.model.rods.sum()), rate_count(cut.model)))
+    for i, u in enumerate(state.u[cut.model.rods]):  # a rod has no rate along itself
+        rods[i, 3 * i : 3 * i + 3] = u
+    _, values, vectors = np.linalg.svd(np.concatenate([cut.jacobian(state) * cut.row_scale[:, None], rods]))
+    rank = int(np.sum(values > RANK_TOLERANCE * values[0]))
+    found = vectors[rank:]
+    rounding = SHARE_ROUNDING * len(vectors) * values[0] / values[rank - 1]
+    return np.where(np.linalg.norm(found, axis=0) > rounding, found, 0.0)
+
+
+def immovable_joints(model: Model, state: State) -> list[int]:
+    """Find the joints that the loops keep from moving.
+
+    Args:
+        model: the mechanism.
+        state: a state of it, its loops closed.
+
+    Returns:
+        Numbers of joints, closing ones too, whose bodies do not move relative to each other, neither here nor
+        at a pose nearby (at a dead point a joint rests); none of welds, which never move, and of trees.
+
+    """
+    if not model.has_loops:
+        return []
+    cut = cut_open(model)
+    there = cut.state(state)
+    rates = allowed_rates(cut, there)
+    is_still = _joints_at_rest(cut, there, rates)
+    step = np.random.default_rng(0).normal(size=len(rates)) @ rates
+    if size := float(np.linalg.norm(step)):
+        nearby = closed_pose(cut, displaced(cut.model, there, np.asarray(NEARBY * step / size)))
+        is_still &= _joints_at_rest(cut, nearby, allowed_rates(cut, nearby))
+    return [k for k, at in enumerate(cut.place) if is_still[at] and model.kind[k] != "weld"]
+
+
+def _joints_at_rest(cut: CutMechanism, state: State, rates: Array) -> NDArray[np.bool_]:
+    """(J,) of the tree: whether no allowed rates (mobility, nu) move a joint's bodies against each other."""
+    a, tree, mobility = rotation_matrix(state.p), cut.model, len(rates)
+    moving = (velocity_jacobian(tree, state) @ rates.T).reshape(tree.n, 6, mobility)
+    moving[:, 3:] = a @ moving[:, 3:]
+    motion = np.concatenate([moving.mT, np.zeros((1, mobility, 6))])  # the world last, where body −1 is
+    place = np.concatenate([state.r, np.zeros((1, 3))])
+    near = state.r + rotate_vectors(a, tree.proximal)
+
+    def at_near_points(body: NDArray[np.intp]) -> Array:
+        carried = motion[body, :, :3] + cross(motion[body, :, 3:], (near - place[body])[:, None])
+        return np.concatenate([carried / wrench_length(cut.source), motion[body, :, 3:]], axis=-1)
+
+    relative = at_near_points(np.arange(tree.n)) - at_near_points(tree.body[:, 0])
+    return np.asarray(np.linalg.norm(relative, axis=(1, 2)) <= NEARLY_CLOSED)
+
+
+def without_still_rates(model: Model, state: State) -> State:
+    """Set rates that the loops do not allow to exactly 0, where rounding or a nearly fitting file left more.
+
+    Args:
+        model: the mechanism; a tree is left alone.
+        state: a state of it, its loops closed and its rates fitting.
+
+    Returns:
+        The state.
+
+    """
+    if not model.has_loops:
+        return state
+    cut = cut_open(model)
+    there = cut.state(state)
+    rates, still = minimal_rates(cut.model, there), ~np.any(allowed_rates(cut, there), axis=0)
+    if not np.any(rates[still]):
+        return state
+    return cut.source_state(with_rates(cut.model, there, np.where(still, 0.0, rates)))
 
 
 def motion_without_inertia(model: Model, state: State) -> int | None:
@@ -420,7 +510,7 @@ def regular_rank(model: Model, state: State) -> int:
     drawn = np.random.default_rng(0).normal(size=base.shape[1])
     step = drawn - base.T @ (base @ drawn)
     size = float(np.linalg.norm(step))
-    nearby = displaced(cut.model, there, np.asarray(1e-2 * step / size)) if size > 1e-6 else there
+    nearby = displaced(cut.model, there, np.asarray(NEARBY * step / size)) if size > 1e-6 else there
     return max(len(base), len(singular_values(cut, closed_pose(cut, nearby))[1]))
 
 
@@ -440,7 +530,7 @@ def keeps_dependent_rows(model: Model, state: State) -> bool:
     cut = cut_open(model)
     there = cut.state(state)
     closed = singular_values(cut, there)[1]
-    step = np.asarray(1e-2 * np.random.default_rng(0).normal(size=closed.shape[1]))
+    step = np.asarray(NEARBY * np.random.default_rng(0).normal(size=closed.shape[1]))
     return len(singular_values(cut, displaced(cut.model, there, step))[1]) == len(closed)
 
 

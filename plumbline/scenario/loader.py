@@ -23,7 +23,7 @@ from plumbline.model.kinematics import (
     spring_vectors,
     state_from_minimal,
 )
-from plumbline.model.loops import assembled, loop_gaps, motion_without_inertia
+from plumbline.model.loops import assembled, loop_gaps, motion_without_inertia, without_still_rates
 from plumbline.scenario.errors import Problem, ScenarioError, closest_match, did_you_mean, shorten
 from plumbline.scenario.schema import (
     INPUT_ROUNDING,
@@ -528,7 +528,7 @@ def _closed_state(source: YamlSource, model: Model, state: State, bodies: list[B
             raise source.fatal_error(
                 f"has a loop, joint {k + 1} of closes, that {what} by {sizes[k]:.3g}", valid, place
             )
-    return found
+    return without_still_rates(model, found)
 
 
 def _joint_elements(joints: Sequence[Any]) -> dict[str, Array]:

@@ -64,7 +64,8 @@ def ball_elements(c: Any) -> BallElements:
             armature[k][i] = a[i]
             effort[k][i] = push - stiffness[i] * (x - rest) - d[i] * rate
             kinetic += a[i] * rate * rate / 2
-            potential += stiffness[i] * (x - rest) ** 2 / 2
+            stretch = x - rest  # a ball that contains 0 has no square by `**` in python-flint
+            potential += stiffness[i] * stretch * stretch / 2
     wrench = [c.mat(6, 1, [0] * 6) for _ in range(c.n)]
     for number in range(len(model.spring_body)):
         potential += _add_spring(c, number, wrench)
@@ -104,4 +105,5 @@ def _add_spring(c: Any, number: int, wrench: list[Any]) -> Any:
     for body, at, force in zip(model.spring_body[number], ends, (pull, -pull), strict=True):
         if body >= 0:
             wrench[body] = wrench[body] + c.mat(6, 1, [*entries(c.cross_matrix(at) * force), *entries(force)])
-    return stiffness * (length - rest) ** 2 / 2
+    stretch = length - rest  # a ball that contains 0 has no square by `**` in python-flint
+    return stiffness * stretch * stretch / 2

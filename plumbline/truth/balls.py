@@ -169,7 +169,13 @@ def midpoints(ball: list[Any]) -> Array:
     )
 
 
-def term_scales(model: Model, balls: dict[str, Any], lever: float, rate: float) -> dict[str, float]:
+def term_scales(
+    model: Model,
+    balls: dict[str, Any],
+    lever: float,
+    rate: float,
+    element_sizes: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> dict[str, float]:
     """Estimate the sizes of the terms of each quantity.
 
     Radii are compared with them, because a quantity itself may be zero.
@@ -179,6 +185,8 @@ def term_scales(model: Model, balls: dict[str, Any], lever: float, rate: float) 
         balls: entries of each quantity, by name.
         lever: largest distance of a body from the world's origin [m].
         rate: largest rate of rotation [rad/s].
+        element_sizes: forces [N], moments [N m] and potential energy [J] of springs and their like, before
+            they cancel.
 
     Returns:
         By quantity the size, in its unit.
@@ -186,17 +194,22 @@ def term_scales(model: Model, balls: dict[str, Any], lever: float, rate: float) 
     """
     size = {name: float(np.max(np.abs(midpoints(ball)), initial=0.0)) for name, ball in balls.items()}
     g = float(np.linalg.norm(model.gravity))
-    a = max(size["acceleration"], g, rate**2 * lever)
     mass, inertia = float(np.sum(model.mass)), float(np.sum(np.linalg.norm(model.inertia, axis=(1, 2))))
+    push = float(np.sum(np.linalg.norm(model.force, axis=1))) + element_sizes[0]
+    torque = float(np.sum(np.linalg.norm(model.moment, axis=1))) + element_sizes[1]
+    a = max(size["acceleration"], g, rate**2 * lever, push / mass)
+    a = max(a, torque / (mass * lever) if lever else 0.0)
     force = max(size["joint_reaction"], mass * a)
     scales = {
         "acceleration": a,
-        "angular_acceleration": max(size["angular_acceleration"], rate**2, a / lever if lever else 0.0),
+        "angular_acceleration": max(
+            size["angular_acceleration"], rate**2, a / lever if lever else torque / inertia
+        ),
         "joint_reaction": force,
         "joint_moment": max(size.get("joint_moment", 0.0), force * lever),
         "tension": force,
         "kinetic_energy": size["kinetic_energy"],
-        "potential_energy": max(size["potential_energy"], mass * g * lever),
+        "potential_energy": max(size["potential_energy"], mass * g * lever + element_sizes[2]),
         "angular_momentum": max(size["angular_momentum"], (mass * lever**2 + inertia) * rate),
         "r": max(size["r"], lever),
         "v": max(size["v"], lever * rate),

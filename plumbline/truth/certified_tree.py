@@ -24,6 +24,7 @@ from plumbline.model.datatypes import KINDS, Model, State
 from plumbline.model.kinematics import own_rates, rate_count
 from plumbline.truth.ball_elements import ball_elements
 from plumbline.truth.balls import BallArithmetic, entries, midpoints, term_scales
+from plumbline.truth.element_terms import joint_elements, spring_terms
 from plumbline.truth.joint_tree import JointTree
 
 
@@ -372,4 +373,8 @@ def quantity_scales(c: BallTree, balls: dict[str, Any]) -> dict[str, float]:
     lever = max(lever, float(np.max(np.abs(midpoints(balls["r"])))))
     rate = float(np.max(norm(midpoints([entries(w) for w in c.w]), axis=1)))
     rate = max(rate, float(np.max(np.abs(c.state.xdot))), float(np.max(np.abs(c.state.udot))))
-    return term_scales(model, balls, lever, rate)
+    elements, springs = joint_elements(model, c.state, [np.zeros(6)] * model.n), spring_terms(model, c.state)
+    push, turn = (sum(e.size for e in elements if e.is_slide == is_slide) for is_slide in (True, False))
+    potential = springs.potential + sum(e.potential for e in elements)
+    sizes = push + float(np.sum(springs.size)), turn + float(np.sum(springs.moment_size)), potential
+    return term_scales(model, balls, lever, rate, sizes)
