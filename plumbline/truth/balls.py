@@ -214,5 +214,7 @@ def term_scales(
         "r": max(size["r"], lever),
         "v": max(size["v"], lever * rate),
         "mass_matrix": size.get("mass_matrix", 0.0),
+        "attitude": 1.0,
+        "angular_velocity": max(size["angular_velocity"], rate),
     }
     return {name: scale for name, scale in scales.items() if name in balls}

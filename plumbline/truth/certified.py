@@ -27,6 +27,7 @@ from plumbline.truth import import_truth_tool
 from plumbline.truth.balls import BallArithmetic, entries, flatten, midpoints, term_scales
 from plumbline.truth.certified_loop import enclose_loop
 from plumbline.truth.certified_tree import enclose_tree
+from plumbline.truth.definition import definition_holds
 
 MAX_RELATIVE_RADIUS = 1e-25  # relative to the largest magnitude of the quantity's own terms
 MAX_BITS = 20_000
@@ -65,22 +66,24 @@ def certify_state(
 
     Raises:
         CertificationFailure: the system is singular at this state, or nearly so.
+        DefinitionViolated: the solution contradicts the definition of the mechanism: the harness is wrong.
         TruthUnavailable: python-flint is not installed.
 
     """
     while bits <= MAX_BITS:
         balls = enclose_quantities(model, state, bits, mass_matrix)
         if balls is not None and all(_is_sharp(name, balls) for name in balls if name != "scale"):
-            break
+            gap, size = balls["scale"].get("gap", 0.0), max(1.0, balls["scale"]["r"], balls["scale"]["v"])
+            if gap > MAX_GAP * size:
+                raise CertificationFailure(
+                    f"a loop is not closed: rows that depend on others leave a gap of {gap:.1g}"
+                )
+            if _definition_holds(model, state, balls, bits):
+                break
         bits = bits * 3 // 2
     else:
         raise CertificationFailure(
             f"no enclosure below {MAX_RELATIVE_RADIUS:g} relative at {MAX_BITS} bits: singular or nearly so"
-        )
-    gap, size = balls["scale"].get("gap", 0.0), max(1.0, balls["scale"]["r"], balls["scale"]["v"])
-    if gap > MAX_GAP * size:
-        raise CertificationFailure(
-            f"a loop is not closed: rows that depend on others leave a gap of {gap:.1g}"
         )
     quantities = {name: ball for name, ball in balls.items() if name != "scale"}
     middle = {name: midpoints(ball) for name, ball in quantities.items()}
@@ -99,6 +102,12 @@ def certify_state(
     elif mass_matrix:
         found = replace(found, mass_matrix=middle["mass_matrix"])
     return CertifiedQuantities(found, middle.get("tension", np.zeros(model.n)), radius, bits)
+
+
+def _definition_holds(model: Model, state: State, balls: dict[str, Any], bits: int) -> bool:
+    flint = import_truth_tool("flint")
+    with flint.ctx.workprec(bits):
+        return definition_holds(flint, model, state, balls)
 
 
 def enclose_quantities(
@@ -185,6 +194,8 @@ def _solve_and_enclose(c: _BallChain, mass_matrix: bool) -> dict[str, Any]:
         "tension": [-c.dot(c.u[k], F[k]) for k in range(c.n)],
         "r": [entries(r) for r in c.r],
         "v": [entries(v) for v in c.v],
+        "attitude": [entries(A) for A in c.A],
+        "angular_velocity": [entries(A.transpose() * w) for A, w in zip(c.A, c.w, strict=True)],
     }
     if mass_matrix:
         balls["mass_matrix"] = _mass_matrix(c)

@@ -173,10 +173,9 @@ def enclose_loop(flint: Any, model: Model, state: State) -> dict[str, Any]:
     balls = _constrained_motion(flint, c, cut, J, chosen.rows)
     dropped = np.setdiff1d(np.arange(J.nrows()), chosen.rows)
     gap, rate = c.gap(cut.ends), entries(J * flint.arb_mat(len(nu), 1, nu))
-    at = {
-        name: cut.place if name.startswith("joint") else cut.place[: model.n]
-        for name in ("acceleration", "angular_acceleration", "joint_reaction", "joint_moment", "r", "v")
-    }
+    of_body = ("acceleration", "angular_acceleration", "r", "v", "attitude", "angular_velocity")
+    at = dict.fromkeys(of_body, cut.place[: model.n])
+    at |= dict.fromkeys(("joint_reaction", "joint_moment"), cut.place)
     scale = quantity_scales(c, balls)
     scale["gap"] = max((float(abs(x[int(i)]).upper()) for x in (gap, rate) for i in dropped), default=0.0)
     return {

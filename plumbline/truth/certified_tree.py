@@ -312,6 +312,8 @@ def moving_quantities(
         "angular_momentum": entries(momentum),
         "r": [entries(r) for r in c.r],
         "v": [entries(v) for v in c.v],
+        "attitude": [entries(A) for A in c.A],
+        "angular_velocity": [entries(A.transpose() * w) for A, w in zip(c.A, c.w, strict=True)],
     }
 
 

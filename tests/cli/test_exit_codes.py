@@ -166,6 +166,16 @@ def test_a_truth_with_a_wrong_gravity_fails_the_harness(monkeypatch, tmp_path, c
     assert 'type="harness failed"' in (tmp_path / "junit.xml").read_text()
 
 
+def test_a_certified_state_that_contradicts_the_definition_fails_the_harness(monkeypatch, tmp_path):
+    monkeypatch.setattr(workers, "initialize_worker", wrong_truths.prepare_states)
+    chosen = ["run", "double-loaded-rods", "--engine", "pinocchio", "--level", "state"]
+    result = CliRunner().invoke(main, [*chosen, "--jobs", "1", "--out", str(tmp_path)])
+    assert result.exit_code == ExitCode.HARNESS_FAILED, result.output
+    assert "contradicts the definition of the mechanism" in " ".join(result.stdout.split())
+    document = json.loads((tmp_path / "results.json").read_text())
+    assert {row["verdict"] for row in document["rows"]} == {"harness failed"}
+
+
 def test_the_same_run_without_the_mistake_is_green():
     chosen = loader.load_scenarios(["tumbling-ball"])
     result = run_plan(Plan(chosen, ["mujoco"], "trajectory", limits=Limits(120)), lambda *_: None)

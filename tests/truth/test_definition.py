@@ -1,0 +1,179 @@
+"""The check of certified solutions by definition: right ones are accepted, every planted mistake rejected."""
+
+from dataclasses import replace
+
+import flint
+import numpy as np
+import pytest
+
+from plumbline.model.sampling import compared_states
+from plumbline.scenario.generator import random_mechanism, random_scenario
+from plumbline.truth.certified import certify_state, enclose_quantities
+from plumbline.truth.definition import DefinitionViolated, definition_holds
+from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.nightly_tests import slow
+
+BITS, MISTAKE = 200, 1e-9  # relative to the size of the quantity's terms
+PLANTED_IN = ("double-loaded-rods", "chain-3-rods", "sprung-without-rotors", "free-body-with-rotors",
+              "tree-of-seven-sprung", "four-bar", "flyball-governor", "squeezer", "bricard")  # fmt: skip
+# what a solution says, besides the mass matrix, which is checked at the state's rates only
+CHECKED = (
+    "acceleration", "angular_acceleration", "joint_reaction", "joint_moment", "kinetic_energy",
+    "potential_energy", "angular_momentum", "r", "v", "attitude", "angular_velocity",
+)  # fmt: skip
+
+
+def solved(scenario, index=1):
+    state = compared_states(scenario.model, scenario.state, scenario.seed, 4)[index]
+    return scenario.model, state, enclose_quantities(scenario.model, state, BITS, mass_matrix=True)
+
+
+def holds(model, state, balls):
+    with flint.ctx.workprec(BITS):
+        return definition_holds(flint, model, state, balls)
+
+
+@pytest.mark.parametrize("name", PLANTED_IN)
+def test_a_right_solution_is_accepted(name):
+    assert holds(*solved(catalogue_scenarios()[name]))
+
+
+@slow
+def test_every_right_solution_of_the_catalogue_is_accepted():
+    for scenario in catalogue_scenarios().values():
+        for state in compared_states(scenario.model, scenario.state, scenario.seed, 5):
+            certify_state(scenario.model, state, mass_matrix=True)
+
+
+@pytest.mark.parametrize("seed", [3, *(pytest.param(seed, marks=pytest.mark.full) for seed in range(10, 30))])
+def test_right_solutions_of_random_mechanisms_are_accepted(seed):
+    for make in (random_mechanism, random_scenario):
+        for index in range(6):
+            scenario = make(seed, index)
+            for state in compared_states(scenario.model, scenario.state, scenario.seed, 2):
+                certify_state(scenario.model, state, mass_matrix=True)
+
+
+def entries(balls, name):
+    """The places of a quantity's balls, as (row, column); column None where it is a list of balls."""
+    rows = balls.get(name) or []
+    return [
+        (i, j) for i, row in enumerate(rows) for j in (range(len(row)) if isinstance(row, list) else [None])
+    ]
+
+
+def with_mistake(balls, name, i, j):
+    """The solution with one ball moved."""
+    changed = [list(row) if isinstance(row, list) else row for row in balls[name]]
+    move = MISTAKE * (balls["scale"][name] or 1.0)
+    if j is None:
+        changed[i] += move
+    else:
+        changed[i][j] += move
+    return balls | {name: changed}
+
+
+@pytest.mark.parametrize("name", PLANTED_IN)
+def test_a_mistake_in_any_number_of_a_solution_is_rejected(name):
+    model, state, balls = solved(catalogue_scenarios()[name])
+    accepted, tried = [], 0
+    for quantity in CHECKED:
+        for i, j in entries(balls, quantity):
+            tried += 1
+            try:
+                holds(model, state, with_mistake(balls, quantity, i, j))
+            except DefinitionViolated:
+                continue
+            accepted.append((quantity, i, j))
+    assert not accepted
+    assert tried > 20 * model.n
+
+
+def test_a_mass_matrix_of_another_mechanism_is_rejected():
+    model, state, balls = solved(catalogue_scenarios()["tree-of-seven-sprung"])
+    for k in range(model.n):
+        heavier = replace(model, mass=model.mass * (1 + MISTAKE * (np.arange(model.n) == k)))
+        other = enclose_quantities(heavier, state, BITS, mass_matrix=True)
+        with pytest.raises(DefinitionViolated, match="mass matrix"):
+            holds(model, state, balls | {"mass_matrix": other["mass_matrix"]})
+
+
+PARAMETERS = (
+    "mass", "inertia", "point", "turn", "length", "gravity", "force", "moment", "drag_force", "drag_moment",
+    "armature", "damping", "stiffness", "rest", "effort", "spring_point", "spring_stiffness",
+    "spring_damping", "spring_length",
+)  # fmt: skip
+COORDINATES = ("p", "omega", "u", "udot", "x", "xdot", "r", "v")
+
+
+def is_another(balls, other):
+    """Whether two solutions differ for certain; none is another too."""
+    if other is None:
+        return True
+    return any(
+        not x.overlaps(y)
+        for name in CHECKED
+        for (i, j) in entries(balls, name)
+        for x, y in [(b[name][i] if j is None else b[name][i][j] for b in (balls, other))]
+    )
+
+
+def check_changes(record, names, solve, check, balls):
+    """Change each number of a record by a part in 10⁹: if that changes the solution, the old is rejected."""
+    accepted, rejected = [], 0
+    for name in names:
+        value = np.asarray(getattr(record, name), float)
+        for at in np.argwhere(value):
+            other = value.copy()
+            other[tuple(at)] *= 1 + MISTAKE
+            changed = replace(record, **{name: other})
+            try:
+                check(changed, balls)
+            except DefinitionViolated:
+                rejected += 1
+                continue
+            if is_another(balls, solve(changed)):
+                accepted.append((name, *at))
+    assert not accepted
+    return rejected
+
+
+@pytest.mark.parametrize("name", ["double-loaded-rods", "sprung-without-rotors", "tree-of-seven-sprung"])
+def test_a_solution_of_another_mechanism_is_rejected(name):
+    """The changed parameter is one of a body, joint, rotor, damper, spring, motor or load."""
+    model, state, balls = solved(catalogue_scenarios()[name])
+    rejected = check_changes(
+        model,
+        PARAMETERS,
+        lambda other: enclose_quantities(other, state, BITS),
+        lambda other, found: holds(other, state, found),
+        balls,
+    )
+    assert rejected > 10 * model.n
+
+
+@pytest.mark.parametrize("name", ["double-loaded-rods", "tree-of-seven-sprung", "free-body-with-rotors"])
+def test_a_solution_at_another_state_is_rejected(name):
+    model, state, balls = solved(catalogue_scenarios()[name])
+    rejected = check_changes(
+        state,
+        COORDINATES,
+        lambda other: enclose_quantities(model, other, BITS),
+        lambda other, found: holds(model, other, found),
+        balls,
+    )
+    assert rejected > 2 * model.n
+
+
+def test_a_loop_of_other_forces_is_rejected():
+    """Elements of a loop, and the mass of each of its bodies."""
+    model, state, balls = solved(catalogue_scenarios()["squeezer"])
+    names = ("mass", "moment", "spring_stiffness", "spring_length")
+    rejected = check_changes(
+        model,
+        names,
+        lambda other: enclose_quantities(other, state, BITS),
+        lambda other, found: holds(other, state, found),
+        balls,
+    )
+    assert rejected > model.n
