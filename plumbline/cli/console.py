@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+from rich.cells import cell_len
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -15,9 +17,11 @@ from plumbline.cli.verdict_matrix import VerdictMatrix, coloured_glyph
 from plumbline.execution.runner import RunResult
 from plumbline.judging.rows import SHOWN_STYLES, Verdict
 
+PIPED_WIDTH = 10_000  # columns: in a pipe or a log nothing is cut or wrapped, unless COLUMNS is set
+
 
 def make_console(file: Any) -> Console:
-    """Make a console that wraps to the terminal, or at 200 columns where the output is piped.
+    """Make a console of the terminal's width; piped, of the width COLUMNS, or wide enough for all tables.
 
     Args:
         file: an open text file, as sys.stdout.
@@ -26,7 +30,28 @@ def make_console(file: Any) -> Console:
         The console.
 
     """
-    return Console(file=file, width=None if file.isatty() else 200, highlight=False)
+    columns = os.environ.get("COLUMNS", "")
+    is_set = file.isatty() or (columns.isdecimal() and int(columns) > 0)
+    return Console(file=file, width=None if is_set else PIPED_WIDTH, highlight=False)
+
+
+def wrap_items(items: Iterable[str], width: int) -> str:
+    """Write items side by side and begin a line before one that does not fit; none is broken.
+
+    Args:
+        items: texts without line breaks.
+        width: of the lines, in columns.
+
+    Returns:
+        The lines.
+
+    """
+    lines = [""]
+    for item in items:
+        if lines[-1] and cell_len(lines[-1]) + 2 + cell_len(item) > width:
+            lines.append("")
+        lines[-1] += f"  {item}" if lines[-1] else item
+    return "\n".join(lines)
 
 
 def count_noun(count: int, singular: str, plural: str = "") -> str:
@@ -113,10 +138,10 @@ def print_matrix(matrix: VerdictMatrix) -> None:
     """
     out = make_console(sys.stdout)
     out.print(matrix.table())
+    legend = wrap_items((f"{style.glyph} {shown}" for shown, style in SHOWN_STYLES.items()), out.width)
     out.print(
-        "[dim]each cell: worst verdict, agreeing checks / all checks, error over tolerance of the worst row; "
-        + "  ".join(f"{style.glyph} {shown}" for shown, style in SHOWN_STYLES.items())
-        + "[/]"
+        "[dim]each cell: worst verdict, agreeing checks / all checks, error over tolerance of the worst row\n"
+        f"{legend}[/]"
     )
 
 

@@ -259,17 +259,12 @@ def read_user_known_issues(files: Sequence[Path], names: Sequence[str]) -> list[
 
 def _read_known_issues(files: Sequence[Path], names: Sequence[str]) -> list[KnownIssue]:
     found: list[KnownIssue] = []
+    places: dict[str, str] = {}
     for path in files:
         try:
-            entries = load_known_issues(path, names)
+            found += load_known_issues(path, names, places)
         except ScenarioError as error:
             exit_on_bad_file(error)
-        twice = {entry.id for entry in entries} & {entry.id for entry in found}
-        if twice:
-            exit_on_bad_file(
-                ScenarioError([Problem(str(path), 0, 0, "id", f"{min(twice)!r} is in another file too")])
-            )
-        found += entries
     return found
 
 

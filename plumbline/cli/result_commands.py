@@ -15,6 +15,8 @@ from plumbline.cli.console import count_noun, make_console, print_table
 from plumbline.cli.help_texts import examples
 from plumbline.storage.results_store import read_results
 
+MAKES_ONE = "`python -m plumbline nightly` makes one in the folder `nightly`"
+
 
 @click.command(
     epilog=examples("history nightly", 'history nightly --key "double-*/mujoco/state/*"'),
@@ -44,8 +46,7 @@ def _print_history(folder: Path, document: dict[str, Any], pattern: str | None) 
     print_table(trend, "trend")
     lines = list(_history_lines(document))
     if not document["nights"]:
-        which = "readable nights" if document["damaged"] else "nights"
-        lines.append(f"no {which} in {folder}; `python -m plumbline nightly` makes one")
+        lines.append(f"no readable nights in {folder}")
     elif pattern is not None and not trend:
         lines.append(f"no row matches {pattern!r}")
     out = make_console(sys.stdout)
@@ -57,7 +58,11 @@ def _check_history_folder(folder: Path) -> None:
     options.check_history_tool()
     if not folder.is_dir():
         what = f"{folder} is a file and no folder of nights" if folder.exists() else f"no folder {folder}"
-        raise click.UsageError(f"{what}: no nights yet; `python -m plumbline nightly` makes one")
+        raise click.UsageError(f"{what}: no nights yet; {MAKES_ONE}")
+    from plumbline.storage.history import night_folders
+
+    if not night_folders(folder):
+        raise click.UsageError(f"no complete night in {folder}; {MAKES_ONE}")
 
 
 def _history_lines(document: dict[str, Any]) -> list[str]:

@@ -174,6 +174,8 @@ def parse_xml(data: bytes, shown: str) -> Element:
         words = expat.ErrorString(error.code)
         problem = Problem(shown, error.lineno, error.offset + 1, "", f"is not well-formed XML: {words}")
         raise ModelFileError([problem]) from None
+    except ModelFileError:  # of the handler
+        raise
     except (ValueError, LookupError) as error:  # of an encoding that expat leaves to Python
         raise ModelFileError([Problem(shown, 1, 1, "", f"cannot be decoded: {error}")]) from None
     assert handler.root is not None

@@ -312,7 +312,9 @@ class _Entry(BaseModel):
 
 
 def load_known_issues(
-    path: Path = KNOWN_ISSUES_FILE, other_scenarios: Iterable[str] = ()
+    path: Path = KNOWN_ISSUES_FILE,
+    other_scenarios: Iterable[str] = (),
+    places: dict[str, str] | None = None,
 ) -> list[KnownIssue]:
     """Read a file of known issues.
 
@@ -320,6 +322,7 @@ def load_known_issues(
         path: the file.
         other_scenarios: names of scenarios that entries may be about, besides the catalogue, the random ones
             and the files beside ``path``.
+        places: of each id that other files have used, file and line; receives those of this file.
 
     Returns:
         One entry for each scenario, integrator and quantity of the file's lists.
@@ -345,7 +348,8 @@ def load_known_issues(
         problems = problems_from_validation(source, found, _Entry)
         raise ScenarioError([*source.problems, *problems]) from None
     beside = (file.stem for file in path.parent.glob("*.yaml")) if path != KNOWN_ISSUES_FILE else ()
-    problems = [*source.problems, *_name_problems(source, entries, {*other_scenarios, *beside})]
+    problems = [*source.problems, *_id_problems(source, entries, {} if places is None else places)]
+    problems += _name_problems(source, entries, {*other_scenarios, *beside})
     if problems:
         raise ScenarioError(problems)
     return [issue for entry in entries for issue in entry.issues()]
@@ -365,9 +369,19 @@ def project_known_issues() -> tuple[KnownIssue, ...]:
     return tuple(load_known_issues())
 
 
+def _id_problems(source: YamlSource, entries: Sequence[_Entry], places: dict[str, str]) -> Iterator[Problem]:
+    """Problems of ids that are used twice, in one file or in two."""
+    for number, entry in enumerate(entries):
+        path = (number, "id")
+        ids = {entry.id, *(issue.id for issue in entry.issues())}
+        if twice := sorted(ids & places.keys()):
+            message = f"the id {shorten(repr(twice[0]))} is used twice, first at {places[twice[0]]}"
+            yield _problem(source, path, message, "an id of its own")
+        places.update(dict.fromkeys(ids - places.keys(), f"{source.file}:{source.value_positions[path][0]}"))
+
+
 def _name_problems(source: YamlSource, entries: Sequence[_Entry], others: set[str]) -> Iterator[Problem]:
-    """Problems of names that nothing has, and of ids that are used twice."""
-    seen: set[str] = set()
+    """Problems of names that nothing has."""
     known: dict[str, set[str]] = {
         "scenario": {
             *catalogue(),
@@ -382,10 +396,6 @@ def _name_problems(source: YamlSource, entries: Sequence[_Entry], others: set[st
         "quantity": _quantities(),
     }
     for number, entry in enumerate(entries):
-        if entry.id in seen:
-            message = f"the id {shorten(repr(entry.id))} is used twice"
-            yield _problem(source, (number, "id"), message, "an id of its own")
-        seen.add(entry.id)
         for name, words in known.items():
             given = getattr(entry, name)
             for place, pattern in enumerate(given if isinstance(given, list) else [given]):

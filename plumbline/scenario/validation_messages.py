@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterable
-from typing import Any, get_args
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -12,28 +15,26 @@ from pydantic_core import ErrorDetails
 
 from plumbline.model.datatypes import KINDS as JOINT_KINDS
 from plumbline.scenario.errors import Problem, closest_match, did_you_mean, shorten
-from plumbline.scenario.schema import (
-    SCHEMA_VERSION,
-    Articulated,
-    Ball,
-    Body,
-    BodySequence,
-    Document,
-    Free,
-    Rod,
-)
+from plumbline.scenario.schema import SCHEMA_VERSION, Body, BodySequence, Document
 from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path
 
-UNION_TAGS: dict[str, type[BaseModel]] = {
-    **dict.fromkeys(JOINT_KINDS, Articulated),
-    "ball": Ball,
-    "rod": Rod,
-    "free": Free,
-    "body": Body,
-    "sequence": BodySequence,
-}
 KINDS = "one of kind: " + ", ".join(JOINT_KINDS)
 MAX_NUMBER_LENGTH = 100  # characters; a longer text is not taken for a mistyped number
+KEY_OF_MAPPING = "[key]"  # pydantic's word in the place of an error about a key
+BOUNDS = {"greater_than": "above", "greater_than_equal": "at least", "less_than": "below"} | {
+    "less_than_equal": "at most"
+}
+_Places = dict[str, list[tuple[tuple[str, ...], type[BaseModel]]]]
+
+
+@dataclass(frozen=True)
+class _Location:
+    """Where an error is, in the file and in the schema."""
+
+    path: tuple[PathKey, ...]  # in the file, which has no union tags
+    fields: tuple[str, ...]  # those of the schema on the path, without indices and keys of mappings
+    model: type[BaseModel]  # the innermost one
+    info: FieldInfo | None  # of the last field
 
 
 def problems_from_validation(
@@ -50,54 +51,65 @@ def problems_from_validation(
         The problems, in the order of the errors.
 
     """
-    located = [(error, *_locate_field(source, error["loc"], root)) for error in errors]
+    located = [(error, _locate(error["loc"], root)) for error in errors]
     misspelt = {
-        (*path[:-1], closest_match(str(path[-1]), list(model.model_fields)))
-        for error, path, model, _ in located
+        (*at.path[:-1], closest_match(str(at.path[-1]), list(_fields(at.model))))
+        for error, at in located
         if error["type"] == "extra_forbidden"
     }
     return [
-        _problem_from_error(source, error, path, model, info)
-        for error, path, model, info in located
-        if error["type"] != "missing" or path not in misspelt
+        _problem_from_error(source, error, at, root)
+        for error, at in located
+        if error["type"] != "missing" or at.path not in misspelt
     ]
 
 
 def _problem_from_error(
-    source: YamlSource,
-    error: ErrorDetails,
-    path: tuple[PathKey, ...],
-    model: type[BaseModel],
-    info: FieldInfo | None,
+    source: YamlSource, error: ErrorDetails, at: _Location, root: type[BaseModel]
 ) -> Problem:
+    path = at.path
     conflicting = error.get("ctx", {}).get("default_conflicts_with")
     if conflicting and path not in source.value_positions:
         path = (*path[:-1], conflicting)
-    extra = error["type"] == "extra_forbidden"
-    place = source.key_positions.get(path) if extra else source.value_positions.get(path)
-    place = place or source.value_positions.get(path[:-1]) or (1, 1)
-    message, valid = _message_and_valid(error, model, info)
-    return Problem(source.file, *place, dotted_path(path), message, valid)
+    place = source.key_positions.get(path) if error["type"] == "extra_forbidden" else None
+    above = (path[:size] for size in range(len(path), -1, -1))
+    found = place or next((source.value_positions[p] for p in above if p in source.value_positions), (1, 1))
+    return Problem(source.file, *found, dotted_path(path), *_message_and_valid(error, at, root))
 
 
-def _locate_field(
-    source: YamlSource, loc: tuple[PathKey, ...], root: type[BaseModel]
-) -> tuple[tuple[PathKey, ...], type[BaseModel], FieldInfo | None]:
-    """Find the path in the file, which has no union tags, the model that the field is in, and the field."""
+def _fields(model: type[BaseModel]) -> dict[str, FieldInfo]:
+    """The fields by the names that the file has for them."""
+    return {info.alias or name: info for name, info in model.model_fields.items()}
+
+
+def _kinds(model: type[BaseModel]) -> tuple[str, ...]:
+    """Kinds of joints that a model describes."""
+    return get_args(model.model_fields["kind"].annotation) if "kind" in model.model_fields else ()
+
+
+def _tags(model: type[BaseModel]) -> tuple[str, ...]:
+    """Names by which pydantic tells the models of a union apart."""
+    return {Body: ("body",), BodySequence: ("sequence",)}.get(model) or _kinds(model)
+
+
+def _locate(loc: tuple[PathKey, ...], root: type[BaseModel]) -> _Location:
     path: tuple[PathKey, ...] = ()
-    model = root
-    info: FieldInfo | None = None
+    fields: tuple[str, ...] = ()
+    choices, info, is_mapping = [root], None, False
     for key in loc:
-        if isinstance(key, str) and key in UNION_TAGS and (*path, key) not in source.value_positions:
-            model = UNION_TAGS[key]
-            continue
-        path = (*path, key)
-        if isinstance(key, str):
-            info = model.model_fields.get(key)
-            for inner in _models_in_annotation(info.annotation if info else None):
-                if inner not in UNION_TAGS.values() or inner is Body:
-                    model = inner
-    return path, model, info
+        if isinstance(key, int) or is_mapping or not choices:
+            path, is_mapping = (*path, key), False
+        elif len(choices) > 1:
+            choices = [model for model in choices if key in _tags(model)] or choices[:1]
+        else:
+            path, info = (*path, key), _fields(choices[0]).get(key)
+            if info is not None:
+                fields, is_mapping = (*fields, key), get_origin(info.annotation) is dict
+                inner = _models_in_annotation(info.annotation)
+                choices = inner or choices
+    while path and path[-1] == KEY_OF_MAPPING:
+        path = path[:-1]
+    return _Location(path, fields, choices[0], info)
 
 
 def _models_in_annotation(annotation: Any) -> list[type[BaseModel]]:
@@ -106,52 +118,105 @@ def _models_in_annotation(annotation: Any) -> list[type[BaseModel]]:
     return [model for inner in get_args(annotation) for model in _models_in_annotation(inner)]
 
 
-def _message_and_valid(
-    error: ErrorDetails, model: type[BaseModel], info: FieldInfo | None
-) -> tuple[str, str]:
-    kind, given, context = error["type"], error.get("input"), error.get("ctx", {})
-    name = str(error["loc"][-1]) if error["loc"] else ""
+@cache
+def _places(root: type[BaseModel]) -> _Places:
+    """Where each field may stand: by its name the fields that lead to it, and the model that has it."""
+    found: _Places = {}
+
+    def walk(model: type[BaseModel], fields: tuple[str, ...]) -> None:
+        for name, info in _fields(model).items():
+            found.setdefault(name, []).append((fields, model))
+            for inner in _models_in_annotation(info.annotation):
+                walk(inner, (*fields, name))
+
+    walk(root, ())
+    return found
+
+
+def _unknown_field(name: str, at: _Location, root: type[BaseModel]) -> str:
+    """Say where a field belongs that stands elsewhere, or which one may be meant."""
+    own, elsewhere = list(_fields(at.model)), _places(root)
+    if name in elsewhere:
+        own_hint = did_you_mean(name, own) if closest_match(name, own, cutoff=0.75) else ""
+        return f"`{name}` is a field of {_belongs(name, at, root)}. {own_hint}"
+    near = closest_match(name, [*own, *elsewhere])
+    if near in own or not near:
+        return did_you_mean(name, own)
+    return f"did you mean {near!r}, a field of {_belongs(near, at, root)}?"
+
+
+def _belongs(name: str, at: _Location, root: type[BaseModel]) -> str:
+    """Write the nearest places of a field: inside of where it stands, else around it, else anywhere."""
+    if inside := _places(at.model).get(name):
+        return _places_phrase(inside, at.model, ())
+    places = _places(root)[name]
+    around = {model: (fields, model) for fields, model in places if fields == at.fields[: len(fields)]}
+    if around:
+        innermost_first = sorted(around.values(), key=lambda place: -len(place[0]))
+        return _places_phrase(innermost_first, root, at.fields)
+    return _places_phrase(places, root, ())
+
+
+def _places_phrase(
+    places: list[tuple[tuple[str, ...], type[BaseModel]]], root: type[BaseModel], here: tuple[str, ...]
+) -> str:
+    """Write places; of joints the kinds that have the field, where they are few or the place is right."""
+    nearest = min(len(fields) for fields, _ in places)
+    words = []
+    for fields in dict.fromkeys(fields for fields, _ in places if here or len(fields) == nearest):
+        kinds = [tag for where, model in places if where == fields for tag in _kinds(model)]
+        of_all = {
+            tag
+            for some in _places(root).values()
+            for at, model in some
+            if at == fields
+            for tag in _kinds(model)
+        }
+        is_shown = len(kinds) < len(of_all) and (fields == here or len(kinds) == 1)
+        shown = fields[-1:] if fields == here else fields
+        words.append(f"`{'.'.join(shown)}:`" if fields else "the file's top level")
+        words[-1] += f" of kind {', '.join(kinds)}" if is_shown else ""
+    return " or ".join(words)
+
+
+def _message_and_valid(error: ErrorDetails, at: _Location, root: type[BaseModel]) -> tuple[str, str]:
+    """What is wrong and what would be valid, in words of this project for every type of error."""
+    kind, given, context, info = error["type"], error.get("input"), error.get("ctx", {}), at.info
     match kind:
         case "plumbline":
             return str(context["message"]), str(context["valid"])
         case "missing":
             return "is missing", _field_description(info)
         case "extra_forbidden":
-            fields = list(model.model_fields)
-            return f"unknown field. {did_you_mean(name, fields)}".strip(" ."), "one of " + ", ".join(fields)
-        case "literal_error" if name == "schema_version":
+            words = _unknown_field(str(error["loc"][-1]), at, root)
+            return f"unknown field. {words}".strip(" ."), "one of " + ", ".join(_fields(at.model))
+        case "literal_error" if error["loc"][-1:] == ("schema_version",):
             return f"is {_quote(given)}; this version of Plumbline reads {SCHEMA_VERSION}", str(
                 SCHEMA_VERSION
             )
         case "literal_error":
-            options = (
-                [o for arg in get_args(info.annotation) for o in (get_args(arg) or (arg,))] if info else []
-            )
-            words = [str(o) for o in options if isinstance(o, str)]
-            hint = did_you_mean(str(given), words)
-            return f"is {_quote(given)}. {hint}".strip(" ."), str(context.get("expected"))
+            options = [str(o) for o in _literals(info.annotation if info else None)]
+            hint = did_you_mean(str(given), options)
+            return f"is {_quote(given)}. {hint}".strip(" ."), "one of " + ", ".join(options)
         case "union_tag_not_found":
             close = [k for k in given if did_you_mean(k, ["kind"])] if isinstance(given, dict) else []
             hint = f" ({_quote(close[0])} is not a field of it)" if close else ""
             return f"has no kind{hint}", KINDS
         case "union_tag_invalid":
             return f"has the kind {_quote(context.get('tag'))}", KINDS
-        case "int_type" | "int_from_float":
+        case "int_type" | "int_from_float" | "int_parsing" | "int_parsing_size":
             return f"is {_describe_value(given)}, not a whole number", "a whole number"
-        case "float_type":
+        case "bool_type" | "bool_parsing":
+            return f"is {_describe_value(given)}, neither true nor false", "true or false"
+        case "float_type" | "float_parsing":
             return _describe_non_number(given), _number_phrase(info)
         case "finite_number":
             return f"is {_quote(given)}, not a finite number", _number_phrase(info)
-        case "greater_than" | "greater_than_equal" | "less_than_equal":
-            sign = {"greater_than": "above", "greater_than_equal": "at least", "less_than_equal": "at most"}[
-                kind
-            ]
-            bound = context.get("gt", context.get("ge", context.get("le")))
-            return f"is {_quote(given)}", f"a number {sign} {bound:g}"
+        case _ if kind in BOUNDS:
+            bound = next((context[name] for name in ("gt", "ge", "lt", "le") if name in context), math.nan)
+            return f"is {_quote(given)}", f"a number {BOUNDS[kind]} {bound:g}"
         case "model_type" | "model_attributes_type" | "dict_type" if not error["loc"]:
             return f"is {_describe_value(given)}", "a mapping that starts with schema_version: 1"
-        case "list_type" | "model_type" | "model_attributes_type" | "dict_type" | "string_type":
-            return f"is {_describe_value(given)}", _field_description(info, kind)
         case "too_short" | "too_long":
             bound = context.get("min_length", context.get("max_length"))
             fixed = isinstance(given, list) and bound in (
@@ -168,8 +233,15 @@ def _message_and_valid(
             return f"has {len(str(given))} characters", f"{few} {length}"
         case "string_pattern_mismatch":
             return f"is {_quote(given)}", "intrinsic or extrinsic and three axes, as 'intrinsic zxz'"
-        case _:
-            return error["msg"], _field_description(info)
+        case _:  # list_type, model_type, string_type, …: pydantic's own words never reach a user
+            return f"is {_describe_value(given)}", _field_description(info, kind)
+
+
+def _literals(annotation: Any) -> Iterator[Any]:
+    """The values of all Literal parts of an annotation."""
+    for part in get_args(annotation):
+        inner = list(_literals(part))
+        yield from inner or ([part] if isinstance(part, str | int) else [])
 
 
 def _quote(given: Any) -> str:

@@ -52,6 +52,20 @@ class StoredRun:
         return int(self.metadata.get("night", 0)), str(self.metadata["started"])
 
 
+def night_folders(folder: Path) -> list[Path]:
+    """List the folders of the stored runs of a history, readable or not.
+
+    Args:
+        folder: folder of runs, or a nightly's output folder, whose runs are in ``history``.
+
+    Returns:
+        The folders, by name.
+
+    """
+    inside = folder / "history"
+    return sorted(path.parent for path in (inside if inside.is_dir() else folder).glob("*/results.json"))
+
+
 class History:
     """The nights of a folder, oldest first, and queries over them.
 
@@ -70,15 +84,14 @@ class History:
         """
         import duckdb  # of the group `history`: the report of a run does without
 
-        inside = folder / "history"
         self.nights: list[StoredRun] = []
         self.damaged: dict[str, str] = {}
         self._database = duckdb.connect()
-        for path in sorted((inside if inside.is_dir() else folder).glob("*/results.json")):
+        for path in night_folders(folder):
             try:
-                self.nights.append(_read_complete_run(path.parent))
+                self.nights.append(_read_complete_run(path))
             except (OSError, DamagedResults) as error:
-                self.damaged[path.parent.name] = shorten(" ".join(str(error).split()), MAX_REASON)
+                self.damaged[path.name] = shorten(" ".join(str(error).split()), MAX_REASON)
         self.nights.sort(key=lambda night: night.order)
         self._load_tables()
 
@@ -289,9 +302,9 @@ def stored_runs(folder: Path) -> Iterator[StoredRun]:
         One run at a time, in the order of the folders' names.
 
     """
-    for path in sorted(folder.glob("*/results.json")):
+    for path in night_folders(folder):
         with contextlib.suppress(OSError, DamagedResults):
-            yield StoredRun(path.parent, read_results(path.parent)["run"])
+            yield StoredRun(path, read_results(path)["run"])
 
 
 def next_night_number(folder: Path) -> int:

@@ -286,7 +286,10 @@ MINE = "- {id: mine, scenario: rest, engine: mujoco, verdict: unresolved, eviden
         ("- {id: [red]x[/nope]}", ":1:13: "),
         (MINE.replace("mujoco", "mujocoo"), ":1:38: [0].engine: no engine matches 'mujocoo'; did you mean"),
         (None, "cannot be read: No such file"),
-        (MINE.replace("mine", "conical-is-unstable"), "id: 'conical-is-unstable' is in another file too"),
+        (
+            MINE.replace("mine", "conical-is-unstable"),
+            "[0].id: the id 'conical-is-unstable' is used twice, first at ",
+        ),
     ],
 )
 def test_a_bad_file_of_known_issues_is_bad_usage(tmp_path, command, text, words):

@@ -6,6 +6,7 @@ from unittest.mock import patch
 import pytest
 from click.testing import CliRunner
 
+from plumbline.cli.console import make_console, print_matrix
 from plumbline.cli.main import main
 from plumbline.cli.run_display import RunDisplay
 from plumbline.cli.verdict_matrix import VerdictMatrix
@@ -13,7 +14,7 @@ from plumbline.engines.adapter import EngineInfo
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import Plan, RunObserver
 from plumbline.execution.runner import run_plan
-from plumbline.judging.rows import Row, Verdict
+from plumbline.judging.rows import SHOWN_STYLES, Row, Verdict
 from plumbline.scenario import loader
 
 ENGINES = {"mujoco": EngineInfo("mujoco", "MuJoCo", "4.0.0", ())}
@@ -102,3 +103,40 @@ def test_an_observer_gets_the_rows_of_the_result(level):
     assert [r for s in chosen for r in recorder.complete[s.name]] == result.rows
     assert {r.key for r in recorder.partial} <= {r.key for r in result.rows}
     assert bool(recorder.partial) == (level == "trajectory")
+
+
+@pytest.mark.parametrize(
+    ("columns", "width"), [("", None), ("80", 80), ("120", 120), ("0", None), ("wide", None)]
+)
+def test_a_pipe_has_the_width_columns_or_room_for_everything(monkeypatch, columns, width):
+    monkeypatch.setenv("COLUMNS", columns)
+    file = StringIO()
+    words = "word " * 100
+    make_console(file).print(words.strip())
+    longest = max(map(len, file.getvalue().splitlines()))
+    assert longest == len(words) - 1 if width is None else width - 5 < longest <= width
+
+
+def test_a_terminal_keeps_its_width(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "77")
+    assert make_console(Terminal()).width == 77
+
+
+@pytest.mark.parametrize("width", [30, 40, 80, 200])
+def test_no_item_of_the_legend_is_broken(monkeypatch, capsys, width):
+    monkeypatch.setenv("COLUMNS", str(width))
+    print_matrix(VerdictMatrix(ENGINES))
+    shown = capsys.readouterr().out
+    assert max(map(len, shown.splitlines())) <= width
+    for name, style in SHOWN_STYLES.items():
+        assert f"{style.glyph} {name}" in shown
+
+
+def test_no_column_of_many_engines_is_cut_in_a_pipe(monkeypatch, capsys):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    engines = {
+        f"engine-{k}-of-a-long-name": EngineInfo("", "", f"4.0.0.dev2026110{k}", ()) for k in range(10)
+    }
+    print_matrix(VerdictMatrix(engines))
+    shown = capsys.readouterr().out
+    assert all(f"{name} {info.version}" in shown for name, info in engines.items()) and "…" not in shown

@@ -99,6 +99,7 @@ def test_a_bad_file_gets_a_clear_error_with_its_line(tmp_path, name):
         prepare_file(str(path), tmp_path)
     assert message in str(caught.value)
     assert all(str(problem).startswith(f"{path}:") for problem in caught.value.problems), caught.value
+    assert all(f"{path}:1:1:" not in problem.message for problem in caught.value.problems), caught.value
 
 
 def test_every_mistake_of_a_file_is_listed(tmp_path):

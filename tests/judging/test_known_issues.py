@@ -332,8 +332,34 @@ def test_an_id_twice_is_refused(tmp_path):
     with pytest.raises(ScenarioError) as caught:
         known_issues.load_known_issues(path)
     assert [(p.line, p.column, p.message) for p in caught.value.problems] == [
-        (2, 8, "the id 'a' is used twice"), (4, 8, "the id 'b' is used twice"),
-    ]  # fmt: skip
+        (2, 8, f"the id 'a' is used twice, first at {path}:1"),
+        (4, 8, f"the id 'b' is used twice, first at {path}:3"),
+    ]
+
+
+@pytest.mark.parametrize("text", ["- {id: a, ", "- {id: 'a: state', ", "# a comment\n- {id: a, "])
+def test_an_id_of_another_file_is_refused_with_both_places(tmp_path, text):
+    rest = "scenario: rest, engine: mujoco, verdict: failed, evidence: e, reason: r}\n"
+    first, second, places = tmp_path / "first.yaml", tmp_path / "second.yaml", {}
+    first.write_text("- {id: a, " + rest.replace("rest", "[rest, state, conical]"))
+    (tmp_path / "state.yaml").write_text("")
+    second.write_text(text + rest)
+    assert len(known_issues.load_known_issues(first, (), places)) == 3
+    with pytest.raises(ScenarioError) as caught:
+        known_issues.load_known_issues(second, (), places)
+    (problem,) = caught.value.problems
+    line = text.count("\n") + 1
+    assert str(problem).startswith(f"{second}:{line}:8: [0].id: the id 'a")
+    assert f" is used twice, first at {first}:1; valid would be an id of its own" in str(problem)
+
+
+def test_two_entries_of_one_line_are_two(tmp_path):
+    entry = "{id: a, scenario: rest, engine: mujoco, verdict: failed, evidence: e, reason: r}"
+    (tmp_path / "known.yaml").write_text(f"[{entry}, {entry}]")
+    with pytest.raises(
+        ScenarioError, match=r"known.yaml:1:\d+: \[1\].id: the id 'a' is used twice, first at .*:1;"
+    ):
+        known_issues.load_known_issues(tmp_path / "known.yaml")
 
 
 @pytest.mark.parametrize("field", ["evidence", "reason"])

@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
+import math
 import os
 import pickle
+import re
 import time
 from functools import reduce
 from pathlib import Path
+from typing import get_args
 
 import pytest
+from pydantic_core.core_schema import ErrorType
 from ruamel.yaml import YAML
 
 from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean
-from plumbline.scenario.loader import find_scenario_file, load_scenario, load_scenario_text, load_scenarios
+from plumbline.scenario.loader import (
+    find_scenario_file,
+    json_schema,
+    load_scenario,
+    load_scenario_text,
+    load_scenarios,
+)
+from plumbline.scenario.schema import Document
+from plumbline.scenario.validation_messages import problems_from_validation
+from plumbline.scenario.yaml_source import YamlSource
+from plumbline.studies.sweep_file import Sweep
 
 VALID_SCENARIO = """\
 schema_version: 1
@@ -58,6 +72,48 @@ def test_one_mistake_gives_one_problem_at_its_place(case):
     assert old in VALID_SCENARIO
     found, expected = errors_in(VALID_SCENARIO.replace(old, new, 1)), ERROR_CASES[case]["problem"]
     assert [p.startswith(expected) for p in found] == [True], f"got {found}, expected {expected!r}"
+
+
+def all_fields():
+    """Every field of the schema."""
+    parts = [json_schema(), *json_schema()["$defs"].values()]
+    return sorted({name for part in parts for name in part.get("properties", ())})
+
+
+@pytest.mark.parametrize("holder", ["title", "mass", "kind", "principal", "quaternion"])
+def test_each_field_in_a_wrong_place_gets_its_right_ones(holder):
+    def unknown(name):
+        block = {"title": f"{name}: 1\n", "mass": f"{name}: 1\n    "}.get(holder, f"{name}: 1, ")
+        found = errors_in(VALID_SCENARIO.replace(f"{holder}:", f"{block}{holder}:", 1))
+        return [problem for problem in found if ": unknown field" in problem]
+
+    own = unknown("zzzzz")[0].rpartition("one of ")[2].split(", ")
+    for name in {*all_fields()} - {*own, "repeat", "cycle"}:  # these two make a body a sequence
+        (problem,) = unknown(name)
+        belongs = rf": unknown field\. `{name}` is a field of (`[\w.]+:`|the file's top level)"
+        assert re.search(belongs, problem), problem
+
+
+INPUTS = (3, "x", None, [], {}, True, math.inf, [1, 2])
+LOCATIONS = (
+    (Document, ()), (Document, ("duration",)), (Document, ("nothing", "like", 3, "it")),
+    (Document, ("bodies", 0, "body", "joint", "hinge", "axis", 1)),
+    (Document, ("bodies", 0, "sequence", "cycle", 0, "name")),
+    (Sweep, ("vary", "bodies[0].mass", "log")), (Sweep, ("engines", "mujoco", "[key]")),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", get_args(ErrorType))
+def test_no_words_of_pydantic_reach_the_user(kind):
+    words = "Input should be a valid thing"
+    context = {"message": "m", "valid": "v", "expected": words, "error": words, "gt": 1.0, "min_length": 3}
+    for model, loc in LOCATIONS[kind == "extra_forbidden" :]:  # a file is no field
+        source = YamlSource("x.yaml", {}, {loc[:1]: (2, 3), (): (1, 1)})
+        for given in INPUTS:
+            details = {"type": kind, "loc": loc, "msg": words, "input": given, "ctx": context}
+            for problem in problems_from_validation(source, [details], model):
+                assert words not in str(problem) and problem.message and "[key]" not in problem.field
+                assert (problem.line, problem.column) == ((2, 3) if loc else (1, 1))
 
 
 def test_all_mistakes_of_a_file_come_at_once():

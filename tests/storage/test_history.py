@@ -152,7 +152,7 @@ SPOILED = {
     truncate_parquet: "summary.parquet: is damaged",
     delete_parquet: "summary.parquet",
     change_schema_version: "results.json: schema_version 99, this version reads 2",
-    change_verdict: "results.json: rows[0].verdict: is 'accords'; valid would be 'agrees', 'disagrees'",
+    change_verdict: "results.json: rows[0].verdict: is 'accords'; valid would be one of agrees, disagrees",
     change_verdict_of_the_table: "summary.parquet has the verdict 'accords', which no run gives",
     replace_by_a_pipe: "results.json: not a results file of plumbline (ValueError: it is not a regular file)",
     replace_by_a_folder: "summary.parquet: is damaged: it is not a regular file",
@@ -181,6 +181,21 @@ def test_an_empty_folder_has_no_nights(tmp_path):
     assert document.pop("last_green") is None
     assert set(document) == {"nights", "damaged", "versions", "first_bad", "since_green", "trend"}
     assert all(part == [] for part in document.values())
+
+
+@pytest.mark.parametrize("made", ["", "history", "unfinished/night", "20260101T000000Z"])
+@pytest.mark.parametrize("words", [["history"], ["history", "--json"], ["report", "RESULTS", "--history"]])
+def test_a_folder_without_nights_is_bad_usage(tmp_path, made, words):
+    folder = tmp_path / "some folder"
+    (folder / made).mkdir(parents=True)
+    store_run(tmp_path, 1, ["agrees"])
+    known = str(tmp_path / "20260101T000000Z")
+    result = CliRunner().invoke(
+        main, [known if word == "RESULTS" else word for word in words] + [str(folder)]
+    )
+    assert (result.exit_code, result.stdout) == (ExitCode.BAD_USAGE, ""), result.output
+    assert f"no complete night in {folder}; `python -m plumbline nightly` makes one" in result.stderr
+    assert "Traceback" not in result.output
 
 
 def test_the_command_reports_it(tmp_path):
