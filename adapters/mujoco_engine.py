@@ -380,7 +380,8 @@ class _MujocoChain:
         q[self.link_ids] = state.p
         E[self.link_ids] = kinematics.velocity_jacobian(self.model, state).reshape(self.model.n, 6, -1)[:, 3:]
         for j, (b, u) in enumerate(zip(np.array(self.link_ids)[rods] - 1, state.u[rods], strict=True)):
-            q[b] = _rod_quaternion(u)
+            q[b] = kinematics.turn_of_z(-u)  # the rod's turn about its own axis has no effect
+            q[b] /= np.linalg.norm(q[b])
             E[b, :, 3 * j : 3 * j + 3] = kinematics.rotation_matrix(q[b]).T @ np.cross(u, np.eye(3)).T
         return q, E
 
@@ -663,16 +664,6 @@ def _principal_inertia(J: Array) -> tuple[Array, Array]:
     q = np.empty(4)
     mujoco.mju_mat2Quat(q, axes.ravel())
     return values, q
-
-
-def _rod_quaternion(u: Array) -> Array:
-    """Return a unit quaternion that turns −z into u; the rod's turn about its own axis has no effect.
-
-    It is the shortest turn; for u above the horizontal after half a turn about y, away from its singularity.
-    """
-    x, y, z = u
-    q = np.array([1 - z, y, -x, 0] if z <= 0 else [-x, 0, 1 + z, -y])
-    return np.asarray(q / np.linalg.norm(q))
 
 
 def _to_body_frame(xmat: Array, vector: Array) -> Array:

@@ -127,6 +127,22 @@ def quaternion_exponential(half_turn: Array) -> Array:
     return np.concatenate([np.cos(size), ratio * half_turn], -1)
 
 
+def turn_of_z(u: Array) -> Array:
+    """Return quaternions that turn z into u; into a u below the horizontal after half a turn about x.
+
+    Args:
+        u: (..., 3) unit vectors.
+
+    Returns:
+        (..., 4) quaternions of a length between √2 and 2.
+
+    """
+    x, y, z = np.moveaxis(u, -1, 0)
+    o = np.zeros_like(x)
+    up, down = np.stack([1 + z, -y, x, o], -1), np.stack([o - y, 1 - z, o, x], -1)
+    return np.where((z >= 0)[..., None], up, down)
+
+
 def rotation_vector(q: Array) -> Array:
     """Return the rotation vector θ u of quaternions, 0 ≤ θ ≤ π.
 

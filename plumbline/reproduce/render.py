@@ -28,6 +28,7 @@ from plumbline.model.kinematics import (
     quaternion_product,
     quaternion_rate,
     rotation_matrix,
+    turn_of_z,
     velocity_jacobian,
 )
 from plumbline.model.welding import split_bodies
@@ -263,7 +264,8 @@ def _derived_fields(model: Model, state: State) -> dict[str, Array]:
     links: list[tuple[Array, Array, Array]] = []
     for k in range(n):
         if model.rods[k]:
-            x = _pointing(state.u[k])
+            x = turn_of_z(state.u[k])
+            x = x / np.linalg.norm(x)
             own = rotation_matrix(x) * np.array([1.0, 1.0, 0.0])  # the rod does not spin about its axis
             spins = np.cross(state.u[k], state.udot[k]), np.cross(state.u[k], unit_udot[:, k])
             links.append((x, spins[0] @ own, spins[1] @ own))
@@ -285,12 +287,3 @@ def _derived_fields(model: Model, state: State) -> dict[str, Array]:
         "unit_udot": unit_udot,
         "unit_omega": unit_omega,
     }
-
-
-def _pointing(u: Array) -> Array:
-    """Return a quaternion (4,) that turns z into the unit vector u."""
-    if u[2] >= 0:
-        x = np.array([1 + u[2], -u[1], u[0], 0.0])
-    else:  # by way of a half turn about x
-        x = quaternion_product(np.array([1 - u[2], u[1], -u[0], 0.0]), np.array([0.0, 1.0, 0.0, 0.0]))
-    return np.asarray(x / np.linalg.norm(x))

@@ -22,6 +22,7 @@ from plumbline.model.kinematics import (
     rotation_matrix,
     spring_vectors,
     state_from_minimal,
+    turn_of_z,
 )
 from plumbline.model.loops import assembled, loop_gaps, motion_without_inertia, without_still_rates
 from plumbline.scenario.errors import Problem, ScenarioError, closest_match, did_you_mean, shorten
@@ -552,19 +553,10 @@ def _joint_turns(joint: Any) -> tuple[Array, Array]:
     if not isinstance(joint, Articulated):
         return identity, identity
     if joint.axis is not None:
-        turn = _turn_to(unit_vector(joint.axis))
+        turn = unit_vector(turn_of_z(unit_vector(joint.axis)).tolist())
         return turn, turn
     frame = attitude_quaternion(joint.frame) if joint.frame else identity
     return frame, attitude_quaternion(joint.body_frame) if joint.body_frame else frame
-
-
-def _turn_to(axis: Array) -> Array:
-    """A unit quaternion that takes z to a unit vector; below the horizontal after half a turn about x."""
-    x, y, z = axis
-    if z >= 0:
-        return unit_vector([1 + z, -y, x, 0.0])
-    below = quaternion_product(np.array([1 - z, y, -x, 0.0]), np.array([0.0, 1.0, 0.0, 0.0]))
-    return unit_vector(below.tolist())
 
 
 def _build_model(

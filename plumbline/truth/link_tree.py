@@ -32,6 +32,7 @@ from plumbline.model.kinematics import (
     rotate_vectors,
     rotation_matrix,
     rotation_vector,
+    turn_of_z,
 )
 from plumbline.model.step_methods import JointSpaceMethod
 
@@ -107,7 +108,7 @@ class LinkTree:
         self.of_rod: dict[int, int] = {}
         p, u, udot = (np.array([getattr(s, name) for s in states], LongDouble) for name in ("p", "u", "udot"))
         u = _unit(np.where(model.rods[:, None], u, UNIT[:3]))
-        self.attitudes, self.rods, self.rod_spin = _unit(p), _turn_of_z(u), cross(u, udot)
+        self.attitudes, self.rods, self.rod_spin = _unit(p), _unit(turn_of_z(u)), cross(u, udot)
         self.axes = np.array([a for a in angle_axes if a is not None], LongDouble).reshape(len(states), -1, 3)
         self._next_axis = 0
         for k in range(model.n):
@@ -757,14 +758,6 @@ def _left_jacobian(t: Array) -> Array:
 
 def _unit(x: Array) -> Array:
     return np.asarray(x / np.sqrt(np.sum(x * x, -1, keepdims=True)))
-
-
-def _turn_of_z(u: Array) -> Array:
-    """Unit quaternions (..., 4) that turn z into u; half turns about z + u or, if u points down, near it."""
-    x, y, z = np.moveaxis(u, -1, 0)
-    o = np.zeros_like(x)
-    up, down = np.stack([1 + z, -y, x, o], -1), np.stack([-y, 1 - z, o, x], -1)
-    return _unit(np.where((z >= 0)[..., None], up, down))
 
 
 def solve_definite(S: Array, b: Array) -> Array:
