@@ -24,7 +24,7 @@ from plumbline.processes.isolation import FileLock, LockHeld
 from plumbline.processes.workers import ExecutorLost, ExecutorUnavailable
 from plumbline.scenario import loader as scenarios
 from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean, shorten
-from plumbline.scenario.yaml_source import read_yaml
+from plumbline.scenario.yaml_reader import read_yaml
 from plumbline.truth.closed_form import ClosedFormMismatch, closed_form_motion
 
 DEFAULT_OUT = Path("reports") / "out"

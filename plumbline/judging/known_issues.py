@@ -48,7 +48,8 @@ from plumbline.scenario.generator import MECHANISM_PREFIX, MOTION_PREFIX, RANDOM
 from plumbline.scenario.loader import catalogue
 from plumbline.scenario.schema import invalid_value_error
 from plumbline.scenario.validation_messages import problems_from_validation
-from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path, read_yaml
+from plumbline.scenario.yaml_reader import read_yaml
+from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path
 from plumbline.truth.step_comparison import CONSTRAINED_UNITS, STEP_UNITS
 
 RowKind = tuple[str, str, str, str, str]  # of a row: engine, its version, level, integrator, quantity

@@ -43,7 +43,8 @@ from plumbline.scenario.schema import (
     unit_vector,
 )
 from plumbline.scenario.validation_messages import problems_from_validation
-from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path, is_file, read_yaml
+from plumbline.scenario.yaml_reader import is_file, read_yaml
+from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path
 
 __all__ = [
     "Problem",

@@ -40,7 +40,8 @@ from plumbline.scenario.errors import Problem, ScenarioError, shorten
 from plumbline.scenario.loader import Scenario
 from plumbline.scenario.schema import SchemaModel
 from plumbline.scenario.validation_messages import problems_from_validation
-from plumbline.scenario.yaml_source import PathKey, YamlSource, is_file, read_yaml
+from plumbline.scenario.yaml_reader import is_file, read_yaml
+from plumbline.scenario.yaml_source import PathKey, YamlSource
 
 MAX_CELLS = 100_000
 MAX_TOTAL_BODIES = 1_000_000  # of all cells: a gigabyte

@@ -7,7 +7,7 @@ import pytest
 
 from plumbline.processes.user_cache import CheckedFiles, DamagedFile, content_key, recall, remember
 from plumbline.scenario import loader
-from plumbline.scenario.yaml_source import read_yaml
+from plumbline.scenario.yaml_reader import read_yaml
 from plumbline.truth import taylor
 
 
