@@ -173,7 +173,7 @@ def sample_readings(model: Model) -> Iterator[tuple[str, Callable[[StepRun], Ste
     for words, change in {
         "the velocities of samples were in the body frame": lambda a, v, w: (np.matvec(a, v), w),
         "the velocities of samples were those of the joints' points": lambda a, v, w: (
-            v - np.matvec(a, np.cross(w, model.proximal)),
+            v - np.matvec(a, np.cross(w, model.proximal[: model.n])),
             w,
         ),
         "the angular velocities of samples were in the world frame": lambda a, v, w: (v, np.matvec(a.mT, w)),

@@ -31,9 +31,9 @@ from plumbline.truth.parameter_effects import evaluate_models, evaluate_to_first
 from plumbline.truth.rounding_bound_tree import EndRows
 from reference_impl.errors import SingularSystem
 
-MAX_STATES = 2
+MAX_STATES = 2  # at which causes are fitted: those of the largest difference
 STEP = 1e-4  # of a cause's scale, in differences
-MAX_CHECKED = 5  # states at which causes of three numbers are checked
+MAX_CHECKED = 5  # states at which a cause has to explain what is seen, those of the fit included
 MAX_STEPS = 8  # of the least squares
 MAX_VECTOR_STEPS = 15  # of those of three numbers
 MAX_HALVINGS = 4  # of such a step
@@ -47,6 +47,7 @@ CHECKED_SHARE = 10.0  # of what is accepted, at the states that nothing was fitt
 ELEMENT_MOMENTS = "those of their springs, dampers and efforts"
 ENERGIES = ("kinetic_energy", "potential_energy")
 QUANTITIES = (*VECTORS, *ENERGIES)
+TINY = float(np.finfo(float).tiny)
 QUARTER_TURNS = [  # rotation vectors of the turns of a cube, half turns twice
     angle * np.array(axis) / np.linalg.norm(axis)
     for axis in product((-1, 0, 1), repeat=3)
@@ -131,9 +132,20 @@ def diagnose_joints(model: Model, reported: Sequence[StateQuantities], truth: St
         A sentence: "behaves as if …" or that no single change explains the difference.
 
     """
-    every = _Difference(model, reported, truth, _View(QUANTITIES), range(min(len(reported), MAX_STATES)))
-    if np.max(np.abs(every.values[every.vectors])) <= ACCEPTED_RATIO:
-        return _energy_cause(every, reported, truth)
+    ratios = {q: _ratios(reported, truth, q) for q in (*QUANTITIES, "angular_momentum", "mass_matrix")}
+    wrong = [q.replace("_", " ") for q, values in ratios.items() if np.max(values) > 1]
+    order = np.argsort(-np.max([values for q, values in ratios.items() if q in QUANTITIES], axis=0))
+    fitted, checked = order[:MAX_STATES].tolist(), _spread(order[MAX_STATES:].tolist())
+    every = _Difference(model, reported, truth, _View(QUANTITIES), fitted)
+    of_vectors = max(float(np.max(ratios[q])) for q in VECTORS)
+    if of_vectors <= 1:
+        return _energy_cause(every, reported, truth) or (
+            f"accelerations and joint wrenches are right; nothing known explains the {' and '.join(wrong)}"
+        )
+    if of_vectors <= ACCEPTED_RATIO:
+        return (
+            f"the difference of the {' and '.join(wrong)} is too close to the rounding bound to name a cause"
+        )
     views = [_View(QUANTITIES)]
     if model.has_loops:
         views.append(_View(QUANTITIES, are_bodies_kept=True))
@@ -142,7 +154,7 @@ def diagnose_joints(model: Model, reported: Sequence[StateQuantities], truth: St
     elif np.all(np.abs(every.values[every.vectors.stop :]) <= ACCEPTED_RATIO):
         views.append(_View(VECTORS))  # energies that are right may be found from other numbers
     for view in views:
-        found = _explanations(model, reported, truth, view)
+        found = _explanations(model, reported, truth, view, fitted, checked)
         if found:
             named, *equal = found
             return f"behaves as if {named}" + (
@@ -150,15 +162,41 @@ def diagnose_joints(model: Model, reported: Sequence[StateQuantities], truth: St
             )
     if model.has_loops:
         return UNEXPLAINED
-    return _moment_cause(model, reported, truth) or _force_cause(every, reported, truth) or UNEXPLAINED
+    return (
+        _moment_cause(model, reported, truth)
+        or _force_cause(every, reported, truth, [*fitted, *checked])
+        or UNEXPLAINED
+    )
 
 
-def _force_cause(every: _Difference, reported: Sequence[StateQuantities], truth: StateTruth) -> str:
+def _ratios(reported: Sequence[StateQuantities], truth: StateTruth, quantity: str) -> Array:
+    """Errors (S,) of a quantity in bounds, of the worst body of each state; 0 where there is none."""
+    found = np.zeros(len(reported))
+    for i, (answer, true, bound) in enumerate(zip(reported, truth.quantities, truth.bounds, strict=True)):
+        value, right = getattr(answer, quantity), getattr(true, quantity)
+        if value is None or right is None:
+            continue
+        off = np.abs(np.asarray(value) - right)
+        if quantity in (*VECTORS, "angular_momentum"):
+            off = np.linalg.norm(off, axis=-1)
+        limit = bound.tolerance(quantity) + (answer.limit_error or {}).get(quantity, 0.0)
+        found[i] = np.max(off / np.maximum(limit, TINY))
+    return found
+
+
+def _spread(places: Sequence[int]) -> list[int]:
+    """States besides those of the fit, at most `MAX_CHECKED` in all, from the worst to the best."""
+    count = min(len(places), MAX_CHECKED - MAX_STATES)
+    return [places[i] for i in np.linspace(0, len(places) - 1, count).round().astype(int)] if count else []
+
+
+def _force_cause(
+    every: _Difference, reported: Sequence[StateQuantities], truth: StateTruth, places: Sequence[int]
+) -> str:
     """Name the place of unknown forces; only where the energies are right and accelerations are not."""
     if np.any(np.abs(every.values[every.vectors.stop :]) > ACCEPTED_RATIO):
         return ""
     view = _View(tuple(q for q in VECTORS if q in every.names))
-    places = range(min(len(reported), MAX_CHECKED))
     several = _Difference(every.model, reported, truth, view, places)
     accelerations = _Difference(every.model, reported, truth, _View(VECTORS[:2]), places)
     if np.max(np.abs(accelerations.values)) <= ACCEPTED_RATIO:
@@ -179,24 +217,29 @@ def _force_cause(every: _Difference, reported: Sequence[StateQuantities], truth:
 
 
 def _explanations(
-    model: Model, reported: Sequence[StateQuantities], truth: StateTruth, view: _View
+    model: Model,
+    reported: Sequence[StateQuantities],
+    truth: StateTruth,
+    view: _View,
+    fitted: Sequence[int],
+    checked: Sequence[int],
 ) -> list[str]:
-    """Every cause that explains the quantities of a view."""
+    """Every cause that explains the quantities of a view, fitted at some states and checked at others."""
 
     def at(*places: int) -> _Difference:
-        return _Difference(model, reported, truth, view, range(*places))
+        return _Difference(model, reported, truth, view, places)
 
-    difference, found = at(min(len(reported), MAX_STATES)), []
+    difference, found = at(*fitted), list[str]()
+    others = at(*checked) if checked else difference
     if np.max(np.abs(difference.values[difference.vectors])) <= ACCEPTED_RATIO:
         return []
     is_open = view.end_rows == "twists"  # by a number of the geometry
     causes = [cause for cause in joint_causes(model) if not is_open or cause.unit in LENGTHS]
     for cause in _similar(difference, causes):
         x = _fitted(cause, np.array([cause.nominal]), difference)
-        if x is not None:
+        if x is not None and _holds(cause, x, others):
             found.append(cause.describe(float(x[0])))
-    first, rows = at(1), dict[str, str]()
-    others = at(MAX_STATES, min(len(reported), MAX_CHECKED)) if len(reported) > MAX_STATES else difference
+    first, rows = at(fitted[0]), dict[str, str]()
     is_plain = not view.are_bodies_kept and not is_open
     without_numbers = (*misreadings(model), *row_defects(model)) if is_plain else ()
     for words, misread in missing_gammas(model) if view.are_bodies_kept else without_numbers:
@@ -206,7 +249,7 @@ def _explanations(
             rows.setdefault(words.partition(" along ")[0], words)  # of a joint's rows one is enough
     found += rows.values()
     if not found and model.has_loops and view == _View(QUANTITIES):
-        alone = [at(place, place + 1) for place in range(len(difference.states))]
+        alone = [at(place) for place in fitted]
         found += [
             words for words, poses in other_branches(model) if all(_is_one_of(one, poses) for one in alone)
         ]
@@ -228,11 +271,15 @@ def _fitted_vectors(difference: _Difference, others: _Difference) -> list[str]:
     for starts in (_small_changes,) if difference.model.has_loops else (_small_changes, _large_turns):
         for cause, start in starts(difference) if not found else ():
             x = None if cause.subject in found else _fitted(cause, start, difference)
-            if x is not None and np.all(
-                np.abs(others.values - others.of_cause(cause, x)) <= CHECKED_SHARE * others.accepted
-            ):
+            if x is not None and _holds(cause, x, others):
                 found[cause.subject] = cause.describe(x)
     return list(found.values())
+
+
+def _holds(cause: JointCause, x: Array, others: _Difference) -> bool:
+    """Whether a cause with fitted numbers explains the vectors at the states that nothing was fitted to."""
+    left = (others.values - others.of_cause(cause, x))[others.vectors]
+    return bool(np.all(np.abs(left) <= CHECKED_SHARE * others.accepted))
 
 
 def _small_changes(difference: _Difference) -> list[tuple[JointCause, Array]]:
@@ -259,6 +306,8 @@ def _large_turns(difference: _Difference) -> list[tuple[JointCause, Array]]:
 
 def _vectors_at(difference: _Difference, models: Sequence[Model]) -> Array:
     """Effects (models, ·) on accelerations and wrenches, in bounds; all in one batch."""
+    if not models:
+        return np.zeros((0, difference.vectors.stop))
     stacked, model = stack_states(difference.states), difference.model
     is_kept = difference.view.are_bodies_kept
     cases = [(one, stacked if is_kept else complete_state(one, stacked)) for one in (model, *models)]
@@ -334,7 +383,7 @@ def _accepted(difference: _Difference, slopes: Array, inverse: Array) -> Array:
 
 
 def _energy_cause(every: _Difference, reported: Sequence[StateQuantities], truth: StateTruth) -> str:
-    """Name what an energy leaves out or misreads, where accelerations and wrenches are right."""
+    """Name what an energy leaves out or misreads, where accelerations and wrenches are right; or nothing."""
     model = every.model
     parts: list[tuple[str, str, Callable[[Model, State], float]]] = [
         ("kinetic_energy", "the rotors", kinetic_energy_of_rotors),
@@ -353,9 +402,7 @@ def _energy_cause(every: _Difference, reported: Sequence[StateQuantities], truth
             if all(abs(x - factor * y) <= b for x, y, b in zip(off, shares, bounds, strict=True)):
                 return f"behaves as if it returned the {name.replace('_', ' ')} {words} that of {what}"
     found = _misread_alone(every)
-    if found:
-        return f"behaves as if {found}"
-    return "accelerations and joint wrenches are right; no part of an energy explains the difference"
+    return f"behaves as if {found}" if found else ""
 
 
 def _misread_alone(difference: _Difference) -> str:

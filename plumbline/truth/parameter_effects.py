@@ -358,6 +358,17 @@ def evaluate_models(cases: Sequence[tuple[Model, State]]) -> dict[str, Array]:
         By quantity (cases, S, ...), with the names and units of `StateQuantities`.
 
     """
+    if not any(model.lacks_inertia for model, _ in cases):
+        return _evaluate_together(cases)
+    # dense factors are of mechanisms with the same rows, and each rotor is a row
+    patterns = [np.flatnonzero(model.armature).tobytes() for model, _ in cases]
+    groups = [[i for i, one in enumerate(patterns) if one == own] for own in dict.fromkeys(patterns)]
+    parts = [_evaluate_together([cases[i] for i in group]) for group in groups]
+    order = np.argsort(np.concatenate(groups))
+    return {name: np.concatenate([part[name] for part in parts])[order] for name in parts[0]}
+
+
+def _evaluate_together(cases: Sequence[tuple[Model, State]]) -> dict[str, Array]:
     count = len(cases[0][1].p)
     r, p, v, omega, x = (
         np.concatenate([np.concatenate(getattr(state, name)) for _, state in cases])

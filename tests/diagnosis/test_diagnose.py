@@ -315,7 +315,9 @@ def test_a_failure_of_the_second_evaluation_is_reported():
         ]
 
     text = diagnose(model, reported, truth, evaluate)
-    assert text.startswith("behaves as if it returned the acceleration multiplied by 1.5 (the difference ")
+    assert text.startswith(
+        "behaves as if it returned the acceleration multiplied by 1.5 (at the 4 states where "
+    )
     assert text.endswith("persists at rest, fails without gravity: no weight)")
 
 
@@ -356,7 +358,9 @@ def test_a_state_at_rest_is_evaluated_at_rest_again():
         return [replace(t, acceleration=1.5 * t.acceleration) for t in right]
 
     text = diagnose(model, evaluate(model, still), truth, evaluate)
-    assert text.endswith("(the difference persists at rest, vanishes without gravity)")
+    assert text.endswith(
+        "(at the 4 states where it is largest, the difference persists at rest, vanishes without gravity)"
+    )
 
 
 @pytest.mark.parametrize(("loads", "drag"), [(True, True), (True, False), (False, True)])
@@ -382,7 +386,28 @@ def test_an_error_in_velocity_terms_vanishes_at_rest():
         return state_truth(requested, still).quantities
 
     text = diagnose(model, evaluate(model, truth.states), truth, evaluate)
-    assert text.endswith("(the difference vanishes at rest, persists without gravity)")
+    assert text.endswith(
+        "(at the 4 states where it is largest, the difference vanishes at rest, persists without gravity)"
+    )
+
+
+def test_nothing_is_concluded_from_states_at_which_the_difference_does_not_show():
+    model, reported, truth = changed("acceleration", lambda i, x, b: 1.5 * x if i == 5 else x, count=9)
+
+    def evaluate(requested, states):
+        """The engine is wrong at the sixth state only, with and without gravity, moving or at rest."""
+        right = state_truth(requested, states).quantities
+        return [
+            replace(t, acceleration=1.5 * t.acceleration) if np.array_equal(s.p, truth.states[5].p) else t
+            for t, s in zip(right, states, strict=True)
+        ]
+
+    text = diagnose(model, reported, truth, evaluate)
+    assert "at the state where it is largest, the difference persists at rest" in text, text
+    text = diagnose(
+        model, reported, truth, lambda requested, states: state_truth(requested, states).quantities
+    )
+    assert text.endswith("the difference does not show again when these are evaluated alone)"), text
 
 
 def test_a_failure_is_reported_in_eighty_characters_and_the_next_trial_runs():
@@ -396,7 +421,7 @@ def test_a_failure_is_reported_in_eighty_characters_and_the_next_trial_runs():
         ]
 
     text = diagnose(model, reported, truth, evaluate)
-    assert text.endswith(f"(the difference fails at rest: {'x' * 80}, persists without gravity)")
+    assert text.endswith(f"the difference fails at rest: {'x' * 80}, persists without gravity)")
 
 
 def with_a_mass(factor, noise=0.0, count=4):

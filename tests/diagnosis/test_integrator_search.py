@@ -14,7 +14,7 @@ from plumbline.truth import step_formulas
 from tests.helpers.nightly_tests import some_fast
 from tests.helpers.planted_steps import STEP_DEFECTS, planted_step, words_for
 from tests.helpers.shared_answers import sharing
-from tests.judging.test_step import methods, stepped, subject
+from tests.judging.test_step import loop_subject, methods, stepped, subject
 
 for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
     pytest.importorskip(engine)
@@ -106,3 +106,33 @@ def test_noise_is_not_named():
     for attempt in answer.attempts:
         attempt.run.trajectory.v[...] *= 1 + 1e-9 * rng.normal(size=attempt.run.trajectory.v.shape)
     assert explain_steps(model, states, integrator.method, answer) == UNEXPLAINED
+
+
+LOOP_STEPS = [
+    d
+    for d in STEP_DEFECTS
+    if d.engine == "pinocchio"
+    and d.name.startswith(("exchanged-halves", "stale-velocity", "mean-velocity", "verlet", "two-half"))
+    and d.integrator == "semi-implicit-euler"
+]
+
+
+@pytest.mark.parametrize("defect", some_fast(LOOP_STEPS, 3))
+def test_a_planted_integrator_is_named_on_a_loop(defect):
+    """A mechanism with loops has more joints than bodies."""
+    model, states = loop_subject("four-bar")
+    integrator = load_adapter(defect.engine).integrator(defect.integrator)
+    with planted_step(defect) as adapter:
+        answer = stepped(adapter, integrator, model, states)
+    assert words_for(defect) in explain_steps(model, states, integrator.method, answer)
+
+
+def test_samples_with_other_velocities_are_named_on_a_loop():
+    model, states = loop_subject("four-bar")
+    integrator = methods("pinocchio")[0]
+    near = model.proximal[: model.n]
+    answer = _turned_rates(
+        stepped(load_adapter("pinocchio"), integrator, model, states),
+        lambda a, v, w: (v + np.matvec(a, np.cross(w, near)), w),
+    )
+    assert "those of the joints' points" in explain_steps(model, states, integrator.method, answer)

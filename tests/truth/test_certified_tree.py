@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from adapters.reference_engine import Reference
 from plumbline.model.datatypes import KINDS
-from plumbline.model.kinematics import complete_state, state_from_minimal
+from plumbline.model.kinematics import complete_state, spring_vectors, state_from_minimal
 from plumbline.model.random_mechanisms import ELEMENTS, random_tree
 from plumbline.model.sampling import compared_states, random_states
 from plumbline.scenario.generator import random_mechanism
@@ -134,6 +134,22 @@ def test_a_sprung_hinge_counts_whole_turns(turns):
     assert np.linalg.norm(b) == pytest.approx(np.linalg.norm(a) * abs(2 * np.pi * turns - 0.1) / 0.1)
     (found,) = Reference().evaluate(model, [far])
     np.testing.assert_allclose(found.angular_acceleration[0], b, rtol=1e-12)
+
+
+def test_springs_at_exactly_their_rest_length_are_certified():
+    """A ball around 0, squared by `**`, is NaN in python-flint."""
+    model = random_tree(
+        np.random.default_rng(8), 2, ("slide", "hinge"), loads=False, elements=("stiffness", "springs")
+    )
+    (state,) = random_states(model, 1, 3)
+    length = np.linalg.norm(spring_vectors(model, state.r, state.p), axis=-1)
+    at_rest = replace(model, rest=state.x, spring_length=length)
+    found = certify_state(at_rest, state).quantities
+    assert abs(found.potential_energy + np.sum(model.mass * (state.r @ model.gravity))) < 1e-12
+    bare = replace(at_rest, stiffness=0 * model.stiffness, spring_stiffness=0 * model.spring_stiffness)
+    right = certify_state(bare, state).quantities
+    np.testing.assert_allclose(found.acceleration, right.acceleration, rtol=1e-10, atol=1e-10)
+    assert model.stiffness.any() and len(length)
 
 
 def test_a_rotor_is_a_body_that_spins_with_the_joint():
