@@ -1,4 +1,4 @@
-"""Public functions document arguments, return values and exceptions, and the check notices gaps."""
+"""Docstrings of public functions are informative, and the check notices what is not."""
 
 import pytest
 
@@ -7,16 +7,16 @@ from tools import check_docstrings
 CASES = {
     "no docstring": "def f(x: int) -> None:\n    pass\n",
     "the first line repeats the name": 'def load_file() -> None:\n    """Load the file."""\n',
-    "Args lacks 'x'": 'def f(x: int) -> None:\n    """Do a thing that matters."""\n',
+    "Args has 'y', which is no parameter": (
+        'def f(x: int) -> None:\n    """Weigh it.\n\n    Args:\n        y: kg, at least 0.\n    """\n'
+    ),
     "Args repeats the name 'mass'": (
         'def f(mass: int) -> None:\n    """Weigh it.\n\n    Args:\n        mass: the mass.\n    """\n'
     ),
-    "no Returns": 'def f() -> int:\n    """Count the joints."""\n    return 1\n',
-    "Raises lacks ValueError": 'def f() -> None:\n    """Refuse to work."""\n    raise ValueError("no")\n',
 }  # fmt: skip
 
 
-def test_every_public_function_is_documented(capsys):
+def test_the_docstring_of_every_public_function_is_informative(capsys):
     assert check_docstrings.main([]) == 0, capsys.readouterr().out
 
 
