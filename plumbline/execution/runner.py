@@ -23,7 +23,6 @@ from plumbline.execution.scenario_run import ScenarioRun, uncompared_kinds
 from plumbline.judging import known_issues
 from plumbline.judging.identity import RUN_SCENARIO, IdentityCheck
 from plumbline.judging.rows import RUN_FAMILY, Row, Verdict
-from plumbline.model.invariants import inertia_ratio
 from plumbline.processes.cpu_time import CpuTimes
 from plumbline.processes.processor import processor_name
 from plumbline.processes.workers import (
@@ -226,9 +225,13 @@ class _Run:
 
     def _show_rows(self, scenario_run: ScenarioRun, outcome: Outcome) -> None:
         name, bodies = scenario_run.scenario.name, scenario_run.scenario.model.n
-        rows = scenario_run.findings().rows if scenario_run.is_done else scenario_run.new_rows(outcome)
-        if name in self.rows and rows:  # random scenarios are many
-            rows = self.known_of_observer.mark_known(rows, bodies)
+        if name not in self.rows:  # random scenarios are many
+            return
+        if scenario_run.is_done:
+            rows = scenario_run.judged_rows(scenario_run.findings(), self.known_of_observer)
+        else:
+            rows = self.known_of_observer.mark_known(scenario_run.new_rows(outcome), bodies)
+        if rows:
             self.observer.on_rows(name, rows, scenario_run.is_done)
 
     def _finish_done(self) -> None:
@@ -239,8 +242,7 @@ class _Run:
     def _finish(self, scenario_run: ScenarioRun) -> None:
         """Keep the rows and tables of a scenario whose tasks have all finished."""
         found, name = scenario_run.findings(), scenario_run.scenario.name
-        model = scenario_run.scenario.model
-        rows = self.known.mark_known(found.rows, model.n, inertia_ratio(model))
+        rows = scenario_run.judged_rows(found, self.known)
         self.truth_methods.update(scenario_run.truth_methods())
         if fingerprints := scenario_run.fingerprints():
             self.identity.add_scenario(fingerprints)
@@ -308,7 +310,7 @@ def summarize_verdicts(result: RunResult) -> str:
 
     """
     parts, checks = [], 0
-    for verdict in Verdict:
+    for verdict in sorted(Verdict, key=lambda verdict: verdict != Verdict.HARNESS_FAILED):  # it comes first
         rows = [row for row in result.rows if row.verdict == verdict]
         count = len(rows) + result.random_batch.counts_by_verdict[verdict]
         if not count:

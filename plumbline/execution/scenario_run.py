@@ -65,6 +65,12 @@ class TruthFailure:
     reason: str
 
 
+def _family(engine: str) -> str:
+    """What an engine is a formulation or version of: its distribution."""
+    base = environments.split_version(engine)[0]
+    return environments.declared_attribute(base, "package") or base
+
+
 def uncompared_kinds(model: Model) -> dict[TaskKind, str]:
     """List what is not compared of a mechanism on any engine.
 
@@ -192,6 +198,7 @@ class ScenarioRun:
                 if key.engine == name and key in self._findings:
                     found.rows += self._findings[key].rows
                     found.tables += self._findings[key].tables
+                    found.deviations |= self._findings[key].deviations
             for engine, kind in self._gaps:
                 if engine == name and kind in self._left_out:
                     reason = f"not compared: {self._left_out[kind]}"
@@ -199,6 +206,25 @@ class ScenarioRun:
                     found.rows.append(row(_GAP_LEVELS[kind], "-", "all", Verdict.INFORMATION, reason))
         found.rows = outlier.annotate_outliers(found.rows)
         return found
+
+    def judged_rows(self, found: JudgingResult, known: KnownIssues) -> list[Row]:
+        """Mark what is recorded, and where all engines stand against the truth.
+
+        Args:
+            found: of `findings`.
+            known: the entries of the run.
+
+        Returns:
+            The rows in the same order.
+
+        """
+        model, truth = self.scenario.model, self.truths.get(TaskKind.STATE_TRUTH)
+        rows = known.mark_known(found.rows, model.n, inertia_ratio(model))
+        families = {name: _family(name) for name in self._engines}
+        is_certified = not isinstance(truth, StateTruth) or truth.is_certified
+        return outlier.doubt_truth(
+            rows, found.deviations, families, "" if is_certified else _family("reference")
+        )
 
     def on_outcome(self, outcome: Outcome) -> list[Task]:
         """Take the outcome of a task: keep a truth or what the judge found.

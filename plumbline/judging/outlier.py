@@ -1,15 +1,95 @@
 """Outliers: which engines of a scenario disagree at state level, and which others agree with the truth.
 
 Answers are not compared again: two engines that are each within their bound of one truth are within the sum
-of both bounds of each other.
+of both bounds of each other.  Where no engine agrees, the outlier may be the truth (`doubt_truth`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 
-from plumbline.judging.rows import Row, Verdict
+from plumbline.judging.rows import Deviation, Level, Row, Verdict
+from plumbline.judging.state import STATE_UNITS
+from plumbline.judging.trajectory import LIMIT_QUANTITIES
+
+# What is compared with the truth; steps are with each method's formula, relations with the engine itself.
+COMPARED_WITH_TRUTH: Mapping[Level, frozenset[str]] = {
+    "state": frozenset(STATE_UNITS),
+    "trajectory": frozenset(LIMIT_QUANTITIES),
+}
+MIN_FAMILIES = 2  # independent engines against the truth, whose answers agree with each other
+ENOUGH_FAMILIES = 3  # the same, whether they agree with each other or not
+
+
+def doubt_truth(
+    rows: Sequence[Row],
+    deviations: Mapping[str, Deviation],
+    families: Mapping[str, str],
+    defines_truth: str = "",
+) -> list[Row]:
+    """Find the quantities in which all engines stand on one side against the truth: the harness is in doubt.
+
+    Of a quantity count the rows that were decided and that no known issue explains.  None may agree, and they
+    are of two independent engines or more which agree with each other, or of three or more: that each has a
+    mistake of its own is less likely than one in the truth, in its bound, or in what all adapters share.
+
+    Args:
+        rows: all rows of one scenario, known issues marked.
+        deviations: of rows that disagree, by their keys.
+        families: by engine what it is a formulation or version of; those of one family may share a mistake.
+        defines_truth: the family whose answers are the truth where nothing is certified, which is no witness.
+
+    Returns:
+        The rows in the same order; where the harness is in doubt, the verdict says so.
+
+    """
+    doubtful: dict[tuple[str, str], str] = {}
+    for level, quantities in COMPARED_WITH_TRUTH.items():
+        for quantity in quantities:
+            decided = [
+                row
+                for row in rows
+                if (row.level, row.quantity) == (level, quantity)
+                and row.verdict in (Verdict.AGREES, Verdict.DISAGREES)
+                and row.known_issue is None
+                and families[row.engine] != defines_truth
+            ]
+            against = {families[row.engine]: row for row in decided}
+            if len(against) < MIN_FAMILIES or any(row.verdict == Verdict.AGREES for row in decided):
+                continue
+            are_alike = all(
+                deviations[one.key].is_like(deviations[other.key])
+                for one, other in combinations(decided, 2)
+                if families[one.engine] != families[other.engine]
+            )
+            if are_alike or len(against) >= ENOUGH_FAMILIES:
+                doubtful[level, quantity] = _describe_doubt(decided, are_alike)
+    return [
+        replace(
+            row,
+            verdict=Verdict.HARNESS_FAILED,
+            reason=doubtful[row.level, row.quantity],
+            diagnosis="; ".join(filter(None, (row.reason, row.diagnosis))),
+        )
+        if (row.level, row.quantity) in doubtful
+        and row.verdict == Verdict.DISAGREES
+        and row.known_issue is None
+        else row
+        for row in rows
+    ]
+
+
+def _describe_doubt(rows: Sequence[Row], are_alike: bool) -> str:
+    names = _join_words(list(dict.fromkeys(row.engine for row in rows)))
+    ratios = [row.ratio or 0.0 for row in rows]
+    alike = ", and agree with each other" if are_alike else ""
+    return (
+        f"{rows[0].scenario}, {rows[0].level}: all engines that were compared ({names}) differ from the true "
+        f"{rows[0].quantity.replace('_', ' ')}, by {min(ratios):.2g} to {max(ratios):.2g} times the bound"
+        f"{alike}: suspect the truth, its bound or what the adapters share first"
+    )
 
 
 def annotate_outliers(rows: Sequence[Row]) -> list[Row]:

@@ -8,6 +8,10 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Any, Literal, NamedTuple, Protocol, TypeVar
 
+import numpy as np
+
+from plumbline.model.datatypes import Array
+
 Level = Literal["state", "step", "invariants", "trajectory", "relations", "model"]
 # hash of an answer's bits, by integrator ("-" at states), quantity and resolution ("" at states)
 Fingerprints = dict[tuple[str, str, str], bytes]
@@ -279,6 +283,28 @@ def first_decided(candidates: Iterable[_DecidableT]) -> _DecidableT:
     return first
 
 
+@dataclass(frozen=True, eq=False)
+class Deviation:
+    """By how much an answer that disagrees is off the truth, state by state or sample by sample."""
+
+    vectors: Array  # (S, n, d) answer − truth, in the quantity's unit
+    tolerance: Array  # (S, n), same unit
+
+    def is_like(self, other: Deviation) -> bool:
+        """Return whether the two answers agree with each other within the sum of their tolerances.
+
+        Args:
+            other: of another engine, for the same quantity.
+
+        Returns:
+            Whether they do, wherever both were compared.
+
+        """
+        count = min(len(self.vectors), len(other.vectors))
+        apart = np.linalg.norm(self.vectors[:count] - other.vectors[:count], axis=-1)
+        return bool(np.all(apart <= self.tolerance[:count] + other.tolerance[:count]))
+
+
 @dataclass
 class JudgingResult:
     """Rows, parts of the stored tables behind them, and what identifies the judged answers."""
@@ -286,6 +312,7 @@ class JudgingResult:
     rows: list[Row] = field(default_factory=list)
     tables: list[tuple[str, Columns]] = field(default_factory=list)  # name of the stored table, its columns
     fingerprints: Fingerprints = field(default_factory=dict)
+    deviations: dict[str, Deviation] = field(default_factory=dict)  # by the key of a row that disagrees
 
     def has_disagreement(self) -> bool:
         """Find out whether a row disagrees.

@@ -11,7 +11,7 @@ import numpy as np
 
 from plumbline.engines.calls import Evaluation
 from plumbline.judging.identity import state_fingerprints
-from plumbline.judging.rows import Columns, JudgingResult, Row, RowContext, Verdict
+from plumbline.judging.rows import Columns, Deviation, JudgingResult, Row, RowContext, Verdict
 from plumbline.model.datatypes import Array
 from plumbline.model.loops import MIN_SINGULAR_VALUE
 from plumbline.truth.ground_truth import StateTruth
@@ -56,7 +56,8 @@ def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation)
             reason = f"{context.title} offers no {quantity.replace('_', ' ')} of its own"
             result.rows.append(context.make_row("state", "-", quantity, Verdict.UNSUPPORTED, reason, unit))
             continue
-        worst, looseness = _worst_error_per_state(quantity, truth, evaluation)
+        deviation = _deviation(quantity, truth, evaluation)
+        worst, looseness = _worst_error_per_state(quantity, truth, deviation)
         names = {"scenario": context.scenario, "engine": context.engine, "quantity": quantity}
         result.tables.append(("states", names | worst))
         row = _quantity_row(context, quantity, unit, worst, looseness, truth.method, evaluation.cpu_time)
@@ -65,6 +66,8 @@ def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation)
             extra = row.extra | {"limit_error": limit_error}
             row = replace(row, derivation=row.derivation + share, extra=extra)
         result.rows.append(row)
+        if row.verdict == Verdict.DISAGREES:
+            result.deviations[row.key] = deviation
     return result
 
 
@@ -92,16 +95,26 @@ def _limit_errors(quantity: str, evaluation: Evaluation) -> Array:
     return np.array([(answer.limit_error or {}).get(quantity, 0.0) for answer in evaluation.quantities])
 
 
-def _worst_error_per_state(quantity: str, truth: StateTruth, evaluation: Evaluation) -> tuple[Columns, Array]:
+def _deviation(quantity: str, truth: StateTruth, evaluation: Evaluation) -> Deviation:
+    """Answer − truth: vectors (S, N, 3), of scalars (S, 1, 1), of the matrix each entry (S, nu², 1)."""
+    pairs = zip(evaluation.quantities, truth.quantities, strict=True)
+    differences = np.array([getattr(answer, quantity) - getattr(true, quantity) for answer, true in pairs])
+    count, has_entries = len(differences), quantity == "mass_matrix"
+    components = 1 if differences.ndim == 1 or has_entries else 3
+    vectors = differences.reshape(count, -1, components)
+    bound = np.array([bound.tolerance(quantity) for bound in truth.bounds]).reshape(count, -1)
+    bound = bound + _limit_errors(quantity, evaluation)[:, None]
+    return Deviation(vectors, np.broadcast_to(bound, vectors.shape[:2]) if has_entries else bound)
+
+
+def _worst_error_per_state(quantity: str, truth: StateTruth, deviation: Deviation) -> tuple[Columns, Array]:
     """Per state (S,): error, bound and scale of the body with the largest ratio of error and bound.
 
     Besides them the ratio of bound and scale (S, N) of every body; inf where a bound is not a number.
     """
-    pairs = zip(evaluation.quantities, truth.quantities, strict=True)
-    differences = [getattr(answer, quantity) - getattr(true, quantity) for answer, true in pairs]
-    error = _error_norms(quantity, np.array(differences))
-    bound = np.array([bound.tolerance(quantity) for bound in truth.bounds]).reshape(error.shape)
-    bound = bound + _limit_errors(quantity, evaluation)[:, None]
+    error, bound = np.linalg.norm(deviation.vectors, axis=-1), deviation.tolerance
+    if quantity == "mass_matrix":
+        error, bound = np.max(error, axis=1, keepdims=True), bound[:, :1]
     scale = np.array([bound.scale[quantity] for bound in truth.bounds]).reshape(error.shape)
     known = np.isfinite(bound)
     ratio = np.where(known, error / np.maximum(bound, TINY), -1.0)  # without a bound nothing is compared
@@ -111,15 +124,6 @@ def _worst_error_per_state(quantity: str, truth: StateTruth, evaluation: Evaluat
     looseness = np.where(known, relative, np.inf)
     worst = {"state": state, "body": body, "error": error[at], "bound": bound[at], "scale": scale[at]}
     return worst, looseness
-
-
-def _error_norms(quantity: str, difference: Array) -> Array:
-    """(S, N) Euclidean norms per state and body; (S, 1) of scalars, momentum, the matrix's worst entry."""
-    count = len(difference)
-    if quantity == "mass_matrix":
-        return np.asarray(np.max(np.abs(difference.reshape(count, -1)), axis=1, keepdims=True))
-    components = 1 if difference.ndim == 1 else 3
-    return np.asarray(np.linalg.norm(difference.reshape(count, -1, components), axis=-1))
 
 
 def _quantity_row(

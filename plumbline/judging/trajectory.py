@@ -17,12 +17,23 @@ from plumbline.engines.calls import RefinementStudy
 from plumbline.judging.identity import run_fingerprints
 from plumbline.judging.invariant_drift import invariant_rows
 from plumbline.judging.refinement_analysis import RefinementAnalysis
-from plumbline.judging.rows import Columns, JudgingResult, Level, Row, RowContext, Verdict, first_decided
+from plumbline.judging.rows import (
+    Columns,
+    Deviation,
+    JudgingResult,
+    Level,
+    Row,
+    RowContext,
+    Verdict,
+    first_decided,
+)
 from plumbline.judging.state import SINGULAR_POSE
 from plumbline.measurements.order_and_limit import ORDER_CHANGE_FACTOR, ORDER_MARGIN
 from plumbline.model.datatypes import Array, Integrator, Model, Trajectory
 from plumbline.model.invariants import INVARIANT_UNITS, attitude_error, position_error
 from plumbline.truth.ground_truth import DETECTABLE_PARAMETER_ERROR, MotionTruth
+
+LIMIT_QUANTITIES = ("position_limit", "attitude_limit")
 
 
 def judge_trajectory(
@@ -51,6 +62,11 @@ def judge_trajectory(
         return JudgingResult([context.make_row("trajectory", integrator.name, "all", Verdict.FAILED, reason)])
     analysis = RefinementAnalysis(context, model, truth, integrator, study.runs, truth.horizon)
     rows = [*trajectory_rows(analysis), *invariant_rows(analysis)]
+    deviations = {
+        row.key: _limit_deviation(analysis, row)
+        for row in rows
+        if row.verdict == Verdict.DISAGREES and row.quantity in LIMIT_QUANTITIES
+    }
     if truth.singular:
         end = float(truth.trajectory.t[-1])
         rows.append(singular_motion_row(context, "trajectory", integrator.name, truth.singular, end))
@@ -62,7 +78,21 @@ def judge_trajectory(
         ("trajectories", of_finest | pose_columns(finest.trajectory)),
     ]
     finished = {run.resolution: run.trajectory for run in study.runs if run.trajectory is not None}
-    return JudgingResult(rows, tables, run_fingerprints(integrator.name, finished))
+    return JudgingResult(rows, tables, run_fingerprints(integrator.name, finished), deviations)
+
+
+def _limit_deviation(study: RefinementAnalysis, row: Row) -> Deviation:
+    """By how much a limit that disagrees is off the truth, in the window of its row."""
+    count = int(np.searchsorted(study.times, row.compared_until or 0.0, side="right"))
+    if row.quantity == "position_limit":
+        vectors = study.extrapolated_limit(study.positions).y - study.truth.trajectory.r
+    else:
+        true = study.truth.trajectory.p
+        p = study.extrapolated_limit(study.attitudes).y
+        p = p / (np.linalg.norm(p, axis=-1) * np.sign(np.sum(p * true, axis=-1)))[..., None]
+        vectors = 2 * (p - true)  # |δp| of a unit quaternion is half the rotation angle
+    tolerance = np.full(vectors.shape[:-1], row.tolerance)  # at the window's end, where it is largest
+    return Deviation(vectors[:count], tolerance[:count])
 
 
 def singular_motion_row(context: RowContext, level: Level, integrator: str, note: str, end: float) -> Row:

@@ -42,6 +42,7 @@ class StateTruth:
     quantities: list[StateQuantities]
     bounds: list[RoundingBound]
     method: str
+    is_certified: bool = True  # else the answers of the reference are the truth
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +97,7 @@ def state_truth(model: Model, states: Sequence[State]) -> StateTruth:
     except TruthUnavailable:
         quantities = load_adapter("reference").evaluate(model, states)
         method = "the notes' direct system in double precision (truth tools are not installed)"
-        return StateTruth(list(states), quantities, bounds, method)
+        return StateTruth(list(states), quantities, bounds, method, is_certified=False)
     bits = max(answer.bits for answer in certified)
     method = f"certified: enclosed in ball arithmetic of {bits} bits"
     return StateTruth(list(states), [answer.quantities for answer in certified], bounds, method)

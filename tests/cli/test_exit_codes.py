@@ -176,6 +176,26 @@ def test_a_certified_state_that_contradicts_the_definition_fails_the_harness(mon
     assert {row["verdict"] for row in document["rows"]} == {"harness failed"}
 
 
+@pytest.mark.parametrize(("level", "quantity"), [("state", "acceleration"), ("trajectory", "position_limit")])
+def test_engines_that_agree_against_an_accepted_truth_put_the_harness_in_doubt(
+    level, quantity, monkeypatch, tmp_path
+):
+    monkeypatch.setattr(workers, "initialize_worker", wrong_truths.prepare_accepted)
+    chosen = ["run", "tumbling-ball", "--engine", "mujoco", "--engine", "reference", "--level", level]
+    result = CliRunner().invoke(main, [*chosen, "--jobs", "1", "--out", str(tmp_path)])
+    assert result.exit_code == ExitCode.HARNESS_FAILED, result.output
+    shown = " ".join(result.stdout.split())
+    assert shown.startswith(
+        f"☒ the harness failed: tumbling-ball, {level}: all engines that were compared (reference and "
+        f"mujoco) differ from the true {quantity.replace('_', ' ')}, by "
+    )
+    assert "and agree with each other: suspect the truth" in shown
+    rows = json.loads((tmp_path / "results.json").read_text())["rows"]
+    assert {row["quantity"] for row in rows if row["verdict"] == "harness failed"} == {quantity}
+    assert not [row for row in rows if row["verdict"] == "disagrees"]
+    assert 'type="harness failed"' in (tmp_path / "junit.xml").read_text()
+
+
 def test_the_same_run_without_the_mistake_is_green():
     chosen = loader.load_scenarios(["tumbling-ball"])
     result = run_plan(Plan(chosen, ["mujoco"], "trajectory", limits=Limits(120)), lambda *_: None)

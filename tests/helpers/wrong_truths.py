@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from plumbline.model.datatypes import Model
 from plumbline.processes import workers
-from plumbline.truth import certified, trajectory
+from plumbline.truth import certified, ground_truth, trajectory
 
 GRAVITY_ERROR = 1e-7  # relative
 
@@ -31,6 +32,24 @@ def prepare_states(*arguments: Any) -> None:
         return right(model.changed(gravity=model.gravity * (1 + GRAVITY_ERROR)), *rest)
 
     certified.enclose_quantities = wrong  # type: ignore[assignment]
+
+
+def prepare_accepted(*arguments: Any) -> None:
+    """Initialise a worker, and change true accelerations and positions by 1e-7 behind all their checks."""
+    initialize_worker(*arguments)
+    right_states, right_motion = ground_truth.state_truth, ground_truth.motion_truth
+    factor = 1 + GRAVITY_ERROR
+
+    def wrong_states(*rest: Any) -> Any:
+        truth = right_states(*rest)
+        changed = [replace(answer, acceleration=factor * answer.acceleration) for answer in truth.quantities]
+        return replace(truth, quantities=changed)
+
+    def wrong_motion(*rest: Any) -> Any:
+        truth = right_motion(*rest)
+        return replace(truth, trajectory=replace(truth.trajectory, r=factor * truth.trajectory.r))
+
+    ground_truth.state_truth, ground_truth.motion_truth = wrong_states, wrong_motion  # type: ignore[assignment]
 
 
 initialize_worker = workers.initialize_worker

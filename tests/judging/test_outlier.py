@@ -7,7 +7,7 @@ import pytest
 
 from plumbline.engines.calls import Evaluation
 from plumbline.engines.registry import load_adapter
-from plumbline.judging.outlier import annotate_outliers, describe_outliers
+from plumbline.judging.outlier import annotate_outliers, describe_outliers, doubt_truth
 from plumbline.judging.rows import RowContext
 from plumbline.judging.state import judge_states
 from plumbline.model.sampling import random_states
@@ -24,6 +24,67 @@ for engine in ("mujoco", "pinocchio", "exudyn", "flint"):
 def model_and_truth():
     model = pendulums.make_model("bb")
     return model, state_truth(model, random_states(model, 3, seed=1))
+
+
+def doubted_rows(engines, factors, *, recorded=(), defines_truth=""):
+    """Rows of engines whose accelerations are each multiplied by a factor, judged by the right truth."""
+    _, right = model_and_truth()
+    rows, deviations = [], {}
+    for name, factor in zip(engines, factors, strict=True):
+        answers = [replace(a, acceleration=factor * a.acceleration) for a in sound_answers(name)]
+        context = RowContext("s", "f", name, name, "0")
+        found = judge_states(context, right, Evaluation(answers, None, None, 0.0))
+        rows += [replace(row, known_issue="entry" if name in recorded else None) for row in found.rows]
+        deviations |= found.deviations
+    families = {name: name.partition("-")[0] for name in engines}
+    return doubt_truth(rows, deviations, families, defines_truth)
+
+
+@cache
+def sound_answers(name):
+    model, right = model_and_truth()
+    return load_adapter(name).evaluate(model, right.states)
+
+
+WRONG = 1 + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("engines", "factors", "options"),
+    [
+        (["reference", "mujoco"], [WRONG, WRONG], {}),
+        (["reference", "mujoco", "exudyn", "exudyn-tree"], [WRONG] * 4, {}),
+        (["reference", "mujoco", "pinocchio"], [WRONG, 1 - 1e-6, 1 + 3e-6], {}),
+        (["mujoco", "reference", "pinocchio"], [WRONG, 1, WRONG], {"defines_truth": "reference"}),
+    ],
+)
+def test_engines_that_all_stand_against_the_truth_put_it_in_doubt(engines, factors, options):
+    rows = doubted_rows(engines, factors, **options)
+    in_doubt = [row for row in rows if row.verdict == "harness failed"]
+    wrong = [name for name, factor in zip(engines, factors, strict=True) if factor != 1]
+    assert [(row.engine, row.quantity) for row in in_doubt] == [(name, "acceleration") for name in wrong]
+    assert len({row.reason for row in in_doubt}) == 1 and in_doubt[0].ratio > 1
+    assert all("is off by" in row.diagnosis for row in in_doubt)
+    assert not [row for row in rows if row.verdict == "disagrees"]
+
+
+@pytest.mark.parametrize(
+    ("engines", "factors", "options"),
+    [
+        (["mujoco"], [WRONG], {}),
+        (["exudyn", "exudyn-tree"], [WRONG, WRONG], {}),  # of one engine
+        (["reference", "mujoco"], [WRONG, 1 + 3e-6], {}),  # each has a mistake of its own
+        (["reference", "mujoco", "pinocchio", "exudyn"], [WRONG, WRONG, WRONG, 1], {}),  # one agrees
+        (["reference", "mujoco"], [WRONG, WRONG], {"recorded": ["mujoco"]}),
+        (["reference", "mujoco"], [WRONG, WRONG], {"defines_truth": "reference"}),
+    ],
+)
+def test_others_that_disagree_leave_the_truth_alone(engines, factors, options):
+    rows = doubted_rows(engines, factors, **options)
+    assert {row.verdict for row in rows if row.quantity == "acceleration"} <= {"disagrees", "agrees"}
+    assert [row.engine for row in rows if row.verdict == "disagrees"] == [
+        name for name, factor in zip(engines, factors, strict=True) if factor != 1
+    ]
 
 
 def rows_of_engines(*defective_engines, defect="mass-1-1e-5", leave_out=()):
