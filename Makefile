@@ -15,10 +15,18 @@ export UV_COMPILE_BYTECODE := 1
 export PYTHONDONTWRITEBYTECODE :=
 MUTANTS ?= --sample 300 --seed 1 --jobs 2
 
-.PHONY: help run test fast-tests nightly bench benchmarks mutants importers models lint lock clean
+.PHONY: help install run test fast-tests nightly bench benchmarks mutants importers models lint lock clean
 
 help:  ## this list
 	@grep -hE '^[a-z-]+:.*##' Makefile | sed 's/:.*##/\t/' | expand -t 12
+
+install: .venv/truth.tried  ## install what runs need, then try it: one scenario on all engines
+	$(PYTHON) -m plumbline run tumbling-ball --level state
+	@printf '%s\n' '' 'Installed. Next:' \
+		'  . .venv/bin/activate                then `plumbline` is a command; `plumbline --help` lists what it does' \
+		'  plumbline run double-tumbling-balls  another scenario, with its motion; `plumbline list scenarios` has all' \
+		'  plumbline model FILE                 what importers make of your URDF or MJCF file' \
+		'  make run                             the whole catalogue (about ten minutes)'
 
 run: .venv/truth.tried  ## the main job: the whole catalogue on all engines, table and report
 	$(PYTHON) -m plumbline run
@@ -55,10 +63,8 @@ mutants: .venv/mutation.done  ## do the tests notice mistakes? a sample; MUTANTS
 .venv/pyvenv.cfg: | $(filter .uv/bin/uv,$(UV))
 	$(UV) venv --quiet --allow-existing .venv
 
-# `plumbline` runs this checkout's package from any folder; -P keeps the current folder off the module path.
-$(LAUNCHER): Makefile | .venv/pyvenv.cfg
-	@printf '%s\n' '#!/bin/sh' 'PYTHONPATH="$(CURDIR)$${PYTHONPATH:+:$$PYTHONPATH}" \' \
-		'exec "$(CURDIR)/$(PYTHON)" -P -m plumbline "$$@"' > $@
+$(LAUNCHER): tools/launcher.sh Makefile | .venv/pyvenv.cfg
+	@{ echo '#!/bin/sh'; echo 'made_in="$(CURDIR)"'; cat tools/launcher.sh; } > $@
 	@chmod +x $@
 
 .venv/main.done: locks/main.lock | .venv/pyvenv.cfg $(LAUNCHER)

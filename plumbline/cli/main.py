@@ -9,7 +9,7 @@ import sys
 import tempfile
 import threading
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from types import FrameType
@@ -20,9 +20,10 @@ import click
 from plumbline import __version__
 from plumbline.cli.help_texts import EXIT_CODES
 from plumbline.execution.exit_codes import ExitCode
-from plumbline.scenario.errors import did_you_mean, shorten
+from plumbline.scenario.errors import Problem, did_you_mean, shorten
 
 SECONDS_TO_NEXT_TRY = 0.05  # of an interruption that came during an import
+FILE_COMMANDS = ("run", "nightly", "check", "sweep", "prove", "coverage")  # whose arguments are YAML files
 START = """
 \b
 Start with:
@@ -113,6 +114,11 @@ class LazyGroup(click.Group):
         if args and args[0] not in COMMANDS:
             hint = did_you_mean(args[0], list(COMMANDS)) or f"there are: {', '.join(COMMANDS)}"
             raise click.UsageError(f"no command {args[0]!r}; {hint}", ctx)
+        if args and args[0] in FILE_COMMANDS and (missing := _missing_files(args[1:])):
+            for word in missing:
+                problem = Problem(word, 0, 0, "", "cannot be read: No such file or directory")
+                click.echo(str(problem), err=True)
+            sys.exit(ExitCode.BAD_USAGE)
         return super().resolve_command(ctx, args)
 
     def main(self, *args: Any, **extra: Any) -> Any:
@@ -169,6 +175,32 @@ class LazyGroup(click.Group):
                 err=True,
             )
             sys.exit(ExitCode.HARNESS_FAILED)
+
+
+def _missing_files(words: Sequence[str]) -> list[str]:
+    """Name the YAML files among a command's arguments if none of its arguments exists.
+
+    A misspelt path is so reported before the imports of the command, which take longer. What follows an
+    option may be its value; where another file exists the command reports the mistakes of all files.
+    """
+    pairs = zip(("", *words), words, strict=False)
+    arguments = [
+        word
+        for before, word in pairs
+        if not word.startswith("-") and ("=" in before or not before.startswith("-"))
+    ]
+    are_missing = all(word.endswith((".yaml", ".yml")) and _is_missing(word) for word in arguments)
+    return arguments if are_missing and not {"-h", "--help"} & {*words} else []
+
+
+def _is_missing(path: str) -> bool:
+    try:
+        os.lstat(path)
+    except FileNotFoundError:
+        return True
+    except (OSError, ValueError):  # without permission, too long, or with a null character
+        return False
+    return False
 
 
 def _make_streams_writable() -> None:

@@ -24,7 +24,7 @@ from plumbline.processes.isolation import FileLock, LockHeld
 from plumbline.processes.workers import ExecutorLost, ExecutorUnavailable
 from plumbline.scenario import loader as scenarios
 from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean, shorten
-from plumbline.scenario.yaml_reader import read_yaml
+from plumbline.scenario.yaml_reader import is_file, read_yaml
 from plumbline.truth.closed_form import ClosedFormMismatch, closed_form_motion
 
 DEFAULT_OUT = Path("reports") / "out"
@@ -216,6 +216,22 @@ def read_scenarios(names: Iterable[str | Path]) -> list[scenarios.Scenario]:
     if error.problems:
         exit_on_bad_file(error)
     return found
+
+
+def are_scenarios_found(names: Iterable[str]) -> bool:
+    """Find out whether each scenario's file exists, before anything is started for them.
+
+    Args:
+        names: names of the catalogue, or paths of YAML files.
+
+    Returns:
+        False where `read_scenarios` will exit because there is no such file.
+
+    """
+    try:
+        return all(is_file(scenarios.find_scenario_file(name)) for name in names)
+    except ScenarioError:
+        return False
 
 
 def exit_on_bad_file(error: ScenarioError) -> NoReturn:

@@ -65,7 +65,7 @@ def run(
     fresh: bool, timeout: float, memory: float,
 ) -> None:  # fmt: skip
     """Compare scenarios (names of the catalogue, or paths of YAML files; default: all) on all engines."""
-    if scheduler is None:
+    if scheduler is None and options.are_scenarios_found(names):
         start_warm_process()
     chosen = options.choose_scenarios(names, families)
     known_issues = options.read_known_issues(known_files, chosen)

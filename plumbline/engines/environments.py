@@ -271,7 +271,9 @@ def published_versions(package: str) -> PublishedVersions:
 
 def _run_uv(*arguments: str, purpose: str = "make an environment for it") -> str:
     """Run uv and return its output; raise EnvironmentUnavailable with its error message."""
-    program = shutil.which("uv") or str(ROOT / ".uv" / "bin" / "uv")
+    # The environment may be a link to that of another checkout, where make has put uv beside it.
+    beside = [folder / ".uv" / "bin" / "uv" for folder in (ROOT, Path(sys.prefix).resolve().parent)]
+    program = shutil.which("uv") or next((str(path) for path in beside if path.exists()), "uv")
     environment = {"UV_PYTHON_DOWNLOADS": "never", "UV_SYSTEM_CERTS": "true", **os.environ}
     try:
         done = subprocess.run(

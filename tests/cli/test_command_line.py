@@ -3,12 +3,14 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
 from collections import Counter
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import patch
 from xml.etree import ElementTree
 
 import pytest
@@ -90,6 +92,65 @@ def test_the_launcher_runs_this_checkout_from_another_folder(tmp_path):
     scenario.write_text((ROOT / "scenarios" / "single" / "rest.yaml").read_text())
     result = subprocess.run([launcher, "check", "a b.yaml"], cwd=elsewhere, capture_output=True, text=True)
     assert (result.returncode, result.stdout) == (0, "a b.yaml: ok: a b, 1 body (ball)\n"), result.stderr
+
+
+@pytest.fixture(scope="module")
+def checkouts(tmp_path_factory):
+    """Checkouts: a, with an environment; linked, with a link to it; copied, with its copy; bare, without."""
+    folder = tmp_path_factory.mktemp("checkouts").resolve()
+    for name in ("a", "linked", "copied", "bare"):
+        place = folder / name
+        for part in ("plumbline", "tools"):
+            shutil.copytree(ROOT / part, place / part, ignore=shutil.ignore_patterns("__pycache__"))
+        shutil.copy(ROOT / "Makefile", place)
+        (place / "plumbline" / "__init__.py").write_text(f'"""A copy."""\n\n__version__ = "{name}"\n')
+    environment = folder / "a" / ".venv"
+    (environment / "bin").mkdir(parents=True)
+    (environment / "bin" / "python").symlink_to(Path(sys.executable).resolve())
+    shutil.copy(Path(sys.prefix) / "pyvenv.cfg", environment)
+    (environment / "lib").symlink_to((Path(sys.prefix) / "lib").resolve())
+    make = ["make", "--silent", "--old-file=.venv/pyvenv.cfg", ".venv/bin/plumbline"]
+    subprocess.run(make, cwd=folder / "a", check=True)
+    (folder / "linked" / ".venv").symlink_to(environment)
+    shutil.copytree(environment, folder / "copied" / ".venv", symlinks=True)
+    (folder / "elsewhere").mkdir()
+    (folder / "link to the launcher").symlink_to(environment / "bin" / "plumbline")
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("current", "launcher", "expected"),
+    [
+        ("a", ".venv/bin/plumbline", "a"),
+        ("a/tools", "../.venv/bin/plumbline", "a"),
+        ("a/.venv/bin", "./plumbline", "a"),
+        ("elsewhere", "CHECKOUTS/a/.venv/bin/plumbline", "a"),
+        ("elsewhere", "CHECKOUTS/link to the launcher", "a"),
+        ("linked", ".venv/bin/plumbline", "linked"),
+        ("linked/tools", "CHECKOUTS/linked/.venv/bin/plumbline", "linked"),
+        ("elsewhere", "CHECKOUTS/linked/.venv/bin/plumbline", "linked"),
+        ("copied", ".venv/bin/plumbline", "copied"),
+        ("elsewhere", "../copied/.venv/bin/plumbline", "copied"),
+        ("linked", "CHECKOUTS/a/.venv/bin/plumbline", None),
+        ("bare/plumbline/cli", "CHECKOUTS/a/.venv/bin/plumbline", None),
+        ("a", "CHECKOUTS/copied/.venv/bin/plumbline", None),
+        ("bare", "CHECKOUTS/link to the launcher", None),
+    ],
+)
+def test_a_launcher_never_silently_runs_another_checkout(checkouts, current, launcher, expected):
+    done = subprocess.run(
+        [launcher.replace("CHECKOUTS", str(checkouts)), "--version"], cwd=checkouts / current,
+        env={key: value for key, value in os.environ.items() if key != "PYTHONPATH"},
+        capture_output=True, text=True,
+    )  # fmt: skip
+    if expected:
+        assert (done.returncode, done.stdout) == (0, f"plumbline {expected}\n"), done.stderr
+        return
+    assert (done.returncode, done.stdout) == (2, "")
+    here = checkouts / current.partition("/")[0]
+    assert (
+        f"the current folder is in another checkout, {here}: call {here}/.venv/bin/plumbline" in done.stderr
+    )
 
 
 def test_numbers_agree_with_their_nouns():
@@ -243,6 +304,33 @@ def test_bad_usage_ends_with_2_and_a_suggestion(words, expected):
     result = CliRunner().invoke(main, words)
     assert result.exit_code == 2, result.output
     assert expected in " ".join(result.stderr.split())
+
+
+@pytest.mark.parametrize("command", ["run", "check", "sweep", "nightly", "prove", "coverage"])
+def test_missing_files_are_reported_before_the_imports_of_the_command(command, tmp_path):
+    words = [command, "--jobs=1", "no file.yaml", "none.yml"] if command == "run" else [command, "none.yml"]
+    code = (
+        "import sys\nfrom plumbline.cli.main import main\ntry:\n    main(sys.argv[1:])\n"
+        "finally:\n    assert not {'numpy', 'pydantic', 'ruamel.yaml'} & {*sys.modules}, 'loaded'\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True, text=True,
+    )  # fmt: skip
+    files = words[2:] if command == "run" else words[1:]
+    assert done.stderr.splitlines() == [
+        f"{name}: cannot be read: No such file or directory" for name in files
+    ]
+    assert (done.returncode, done.stdout, sorted(tmp_path.iterdir())) == (2, "", [])
+
+
+def test_mistakes_of_other_files_are_reported_beside_a_missing_one(tmp_path):
+    (tmp_path / "bad.yaml").write_text("schema_version: 1\n")
+    with patch("plumbline.cli.run_commands.start_warm_process") as started:
+        result = invoke("run", tmp_path / "bad.yaml", tmp_path / "none.yaml", "--out", tmp_path / "out")
+    assert result.exit_code == 2 and not started.called
+    assert "none.yaml: cannot be read: No such file" in result.stderr and "title: is missing" in result.stderr
+    assert "Usage" in invoke("run", "none.yaml", "--help").stdout
 
 
 def test_a_closed_form_that_does_not_fit_is_reported_with_line_and_column(tmp_path):

@@ -239,8 +239,26 @@ def test_without_uv_the_reason_names_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(environments, "ROOT", tmp_path)
+    monkeypatch.setattr("sys.prefix", str(tmp_path / ".venv"))
     with pytest.raises(environments.EnvironmentUnavailable, match="uv is not on PATH; install it"):
         environments.newest_requirement("packaging", pre=False)
+
+
+@pytest.mark.parametrize("place", ["checkout", "environment"])
+def test_the_uv_that_make_installed_is_found(tmp_path, monkeypatch, place):
+    """In the checkout, or beside the environment that a second checkout has a link to."""
+    checkout, other = tmp_path / "checkout", tmp_path / "other"
+    for folder in (checkout, other / ".venv"):
+        folder.mkdir(parents=True)
+    (checkout / ".venv").symlink_to(other / ".venv")
+    program = (checkout if place == "checkout" else other) / ".uv" / "bin" / "uv"
+    program.parent.mkdir(parents=True)
+    program.write_text("#!/bin/sh\necho packaging==1.2.3\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", "/nowhere")
+    monkeypatch.setattr(environments, "ROOT", checkout)
+    monkeypatch.setattr("sys.prefix", str(checkout / ".venv"))
+    assert environments.newest_requirement("packaging", pre=False) == "packaging==1.2.3"
 
 
 @needs_uv
