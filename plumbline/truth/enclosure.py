@@ -269,14 +269,14 @@ def _candidate_steps(
         **checked_topology(model), data=numbers, times=[], time_exponent=exponent, bits=bits, steps=[]
     )
     with mp.workprec(working), flint.ctx.workprec(working):
-        mechanism = checker._Mechanism(certificate, flint.arb)
+        mechanism = checker.Mechanism(certificate, flint.arb)
         left = max(1, math.ceil(math.ldexp(duration, LENGTH_BITS - exponent)))  # grains
         generator = taylor_series(model, state, round(ORDER_PER_BIT * bits), precision)
         own = next(generator)
         series = _add_functions(mechanism, own)
         start: list[int] = []
         while True:
-            h = min(mp.ldexp(max_step, exponent), *(_longest_step(row, bits) for row, _ in series))
+            h = min(mp.ldexp(max_step, exponent), *(longest_step(row, bits) for row, _ in series))
             count = min(left, int(mp.ceil(mp.ldexp(h, LENGTH_BITS - exponent))))
             seconds = mp.ldexp(mp.mpf(count), exponent - LENGTH_BITS)
             rows = []
@@ -320,12 +320,12 @@ def _add_functions(mechanism: Any, series: list[Any]) -> list[Any]:
     rates = [*rest]
     if mechanism.springs:
         q, v = ([balls(row) for row in part] for part in (found, rates))
-        motion = checker._Motion(mechanism, [*q, *q[:1] * len(mechanism.springs), *v], v)
+        motion = checker.Motion(mechanism, [*q, *q[:1] * len(mechanism.springs), *v], v)
         found += [numbers((d @ d).rsqrt()) for d in motion.spans(0)]
     return found + rates
 
 
-def _longest_step(taylor: list[Any], bits: int) -> Any:
+def longest_step(taylor: list[Any], bits: int) -> Any:
     """The step [s] at which the last two terms of a Taylor series are 2**-(bits + 3)."""
     mp, last = import_truth_tool("mpmath"), len(taylor) - 1
     terms = ((k, abs(taylor[k])) for k in (last, last - 1))

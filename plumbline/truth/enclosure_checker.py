@@ -59,7 +59,7 @@ largest for s ∈ [0, 1] where it bounds a function.
      of arrays as sums of products, added in any order. Then a sum of K ≤ 2¹⁵ products is off by at most
      2⁻⁵¹ K Σ|products| + 2⁻¹⁰⁰⁰, one product also where a factor (a number of the file or six times it, an
      entry of a joint's axes, or of (8)) is off by 2⁻⁵³ (1 + 2⁻⁷) of itself; and an expression of numbers ≥
-     0, of at most ten nested sums, products, quotients and roots, by 2⁻³⁰ of itself and 2⁻¹⁰⁰⁰: `_up`.
+     0, of at most ten nested sums, products, quotients and roots, by 2⁻³⁰ of itself and 2⁻¹⁰⁰⁰: `round_up`.
  (1) A function is *enclosed* by c₀ + … + c_D s^D, D = DEGREE, and a radius r if they differ by at most r
      for all s ∈ [0, 1]. Products of enclosing polynomials are computed whole: their terms above s^D, the
      roundings and the products with the factors' radii go into r, so that no series is cut without its
@@ -121,22 +121,22 @@ def _require(holds: Any, failure: str) -> None:
 # --- functions of s -----------------------------------------------------------------------------------
 
 
-def _up(x: Any) -> Any:
+def round_up(x: Any) -> Any:
     """(F): an upper bound of an expression of numbers ≥ 0 that was evaluated in doubles."""
     return x * (1 + 2.0**-30) + TINY
 
 
-def _norm(bounds: Array, axis: int | None = None) -> Any:
+def norm_bound(bounds: Array, axis: int | None = None) -> Any:
     """Upper bound of the Frobenius norm, or of the Euclidean norms along an axis."""
-    return _up(np.sqrt(_up(np.sum(bounds * bounds, axis))))
+    return round_up(np.sqrt(round_up(np.sum(bounds * bounds, axis))))
 
 
-def _upper(balls: Iterable[Any]) -> Array:
+def upper_bounds(balls: Iterable[Any]) -> Array:
     """Doubles above the absolute values of balls."""
-    return np.array([_up(float(abs(ball).upper())) for ball in balls])
+    return np.array([round_up(float(abs(ball).upper())) for ball in balls])
 
 
-class _Series:
+class Series:
     """(F), (1): a matrix of functions of s, each within r of c₀ + c₁ s + … + c_D s^D, where D = DEGREE.
 
     c has the shape (D + 1, rows, columns), r (rows, columns).  `@` is the product of matrices; `*` is that of
@@ -145,45 +145,45 @@ class _Series:
 
     def __init__(self, c: Array, r: Any = 0.0, roundings: int = 0) -> None:
         self.c, self.total = c, np.abs(c).sum(0)
-        self.r = _up(r + roundings * ROUNDING * self.total) if roundings else r + 0 * self.total
+        self.r = round_up(r + roundings * ROUNDING * self.total) if roundings else r + 0 * self.total
 
     @property
     def size(self) -> Array:
         """Upper bounds of the absolute values on [0, 1]."""
-        return _up(self.total + self.r)  # type: ignore[no-any-return]
+        return round_up(self.total + self.r)  # type: ignore[no-any-return]
 
-    def block(self, rows: slice, columns: slice = slice(None)) -> _Series:
+    def block(self, rows: slice, columns: slice = slice(None)) -> Series:
         """Some rows and columns."""
-        return _Series(self.c[:, rows, columns], self.r[rows, columns])
+        return Series(self.c[:, rows, columns], self.r[rows, columns])
 
-    def __neg__(self) -> _Series:
-        return _Series(-self.c, self.r)
+    def __neg__(self) -> Series:
+        return Series(-self.c, self.r)
 
-    def __add__(self, other: Any) -> _Series:
-        if not isinstance(other, _Series):  # a constant, whose derivatives are zero
-            other = _constant(np.eye(1, self.c.shape[2]) * other)
-        return _Series(self.c + other.c, self.r + other.r, 1)
+    def __add__(self, other: Any) -> Series:
+        if not isinstance(other, Series):  # a constant, whose derivatives are zero
+            other = constant_series(np.eye(1, self.c.shape[2]) * other)
+        return Series(self.c + other.c, self.r + other.r, 1)
 
-    def __sub__(self, other: Any) -> _Series:
+    def __sub__(self, other: Any) -> Series:
         return self.__add__(-other)
 
-    def __matmul__(self, other: _Series) -> _Series:
-        full = _convolution(self.c, other.c)
+    def __matmul__(self, other: Series) -> Series:
+        full = convolution(self.c, other.c)
         rounding = ROUNDING * (DEGREE + 1) * self.c.shape[2] * other.total
         r = self.total @ (other.r + rounding) + self.r @ (other.total + other.r)
-        return _Series(full[: DEGREE + 1], _up(r + np.abs(full[DEGREE + 1 :]).sum(0)))
+        return Series(full[: DEGREE + 1], round_up(r + np.abs(full[DEGREE + 1 :]).sum(0)))
 
-    def __mul__(self, other: Any) -> _Series:
-        if not isinstance(other, _Series):  # a constant
-            return _Series(self.c * other, self.r * abs(other), 1)
+    def __mul__(self, other: Any) -> Series:
+        if not isinstance(other, Series):  # a constant
+            return Series(self.c * other, self.r * abs(other), 1)
         c, r = (np.concatenate([getattr(x, name)[..., :1] for x in (self, other)], -1) for name in ("c", "r"))
         slopes = 1 - np.eye(1, self.c.shape[2])  # of self, whose value `other` has
-        return _Series(c, r) @ _join([other, _Series(self.c * slopes, self.r * slopes)])
+        return Series(c, r) @ _join([other, Series(self.c * slopes, self.r * slopes)])
 
     __rmul__ = __mul__
 
 
-def _convolution(a: Array, b: Array) -> Any:
+def convolution(a: Array, b: Array) -> Any:
     """Coefficients (2 DEGREE + 1, m, n) of the product of two matrix polynomials."""
     m, shape = len(a), (a.shape[1], b.shape[2])
     products = np.zeros((m, 2 * m, *shape))
@@ -191,16 +191,17 @@ def _convolution(a: Array, b: Array) -> Any:
     return products.reshape(-1, *shape)[: m * (2 * m - 1)].reshape(m, -1, *shape).sum(0)  # row i starts at i
 
 
-def _constant(matrix: Array) -> _Series:
-    return _Series(np.concatenate([matrix[None], np.zeros((DEGREE, *matrix.shape))]))
+def constant_series(matrix: Array) -> Series:
+    """Make the series of a matrix that does not change."""
+    return Series(np.concatenate([matrix[None], np.zeros((DEGREE, *matrix.shape))]))
 
 
-def _join(parts: Sequence[_Series]) -> _Series:
+def _join(parts: Sequence[Series]) -> Series:
     """Rows below rows."""
-    return _Series(np.concatenate([x.c for x in parts], 1), np.concatenate([x.r for x in parts]))
+    return Series(np.concatenate([x.c for x in parts], 1), np.concatenate([x.r for x in parts]))
 
 
-def _recurrence(J: Array, first: Array, power: int) -> Array:
+def recurrence(J: Array, first: Array, power: int) -> Array:
     """Coefficients P_0, P_1, … with k**power P_k = J_0 P_(k−1) + J_1 P_(k−2) + … and P_0 given."""
     P = [first]
     for k in range(1, DEGREE + 1):
@@ -208,14 +209,14 @@ def _recurrence(J: Array, first: Array, power: int) -> Array:
     return np.array(P)
 
 
-def _inverse_guess(a: Array) -> Array:
+def inverse_guess(a: Array) -> Array:
     """Coefficients of the inverse of a matrix polynomial."""
-    return _recurrence(-np.linalg.inv(a[0]) @ a[1:], np.linalg.inv(a[0]), 0)
+    return recurrence(-np.linalg.inv(a[0]) @ a[1:], np.linalg.inv(a[0]), 0)
 
 
-def _inverse_error(a: _Series, b: _Series, failure: str) -> float:
+def inverse_error(a: Series, b: Series, failure: str) -> float:
     """Bound of ‖I − a b‖, which must be below 1."""
-    theta = _norm((_constant(np.eye(len(a.r))) - a @ b).size)
+    theta = norm_bound((constant_series(np.eye(len(a.r))) - a @ b).size)
     _require(theta < 1, failure)
     return float(theta)
 
@@ -248,8 +249,8 @@ def _rotation(p: Array) -> Array:
 # --- the mechanism ------------------------------------------------------------------------------------
 
 
-class _Mechanism:
-    """The model in the certificate's unit of time; vectors are arrays of balls, polynomials or `_Series`."""
+class Mechanism:
+    """The model in the certificate's unit of time; vectors are arrays of balls, polynomials or `Series`."""
 
     def __init__(self, file: Certificate, number: Callable[[Any], Any]) -> None:
         self.far, self.springs, self.joints = file.far, file.springs, [(k, *JOINTS[k]) for k in file.kind]
@@ -262,11 +263,11 @@ class _Mechanism:
         # of (8), by n + 1
         self.terms = [number(-1) / (4 * n * n + 6 * n) for n in range(1, ctx.prec // 6 if self.exact else 13)]
         self.data: dict[str, Any] = {name: np.frompyfunc(number, 1, 1)(x) for name, x in data.items()}
-        self.unknown = arb(0, 1) if self.exact else _Series(np.zeros((DEGREE + 1, 1, 1)), 1.0)  # 0 ± 1 of (8)
+        self.unknown = arb(0, 1) if self.exact else Series(np.zeros((DEGREE + 1, 1, 1)), 1.0)  # 0 ± 1 of (8)
 
     def equations(self, y: Sequence[Any], vdot: Sequence[Any]) -> tuple[list[Any], list[Any]]:
         """Return q̇ (nq,) and the residual G(y, v̇) (nv,)."""
-        z, data, qdot, residual = _Motion(self, y, vdot), self.data, list[Any](), list[Any]()
+        z, data, qdot, residual = Motion(self, y, vdot), self.data, list[Any](), list[Any]()
         a, v = z.centres(2), z.centres(1) if self.needs_rates else []
         F, N = [z.zero] * len(z.A), [z.zero] * len(z.A)  # of springs and of the joints beyond, on each body
         for j, (d, ddot) in enumerate(zip(z.spans(0), z.spans(1), strict=True)):
@@ -314,10 +315,10 @@ class _Mechanism:
         return qdot, residual
 
 
-class _Motion:
+class Motion:
     """A state and v̇; of each body, the world last as body −1, its attitude A, and ω and ω̇ in its axes."""
 
-    def __init__(self, mechanism: _Mechanism, y: Sequence[Any], vdot: Sequence[Any]) -> None:
+    def __init__(self, mechanism: Mechanism, y: Sequence[Any], vdot: Sequence[Any]) -> None:
         self.mechanism, self.zero, nq = mechanism, _vector([y[0] * 0] * 3), mechanism.nq
         parts = map(np.split, map(_vector, (y[:nq], y[nq:], vdot)), map(np.cumsum, mechanism.sizes))
         self.parts = [[x[4 * k : 4 * k + 4] for k in range(len(mechanism.far))] for x in parts]  # of q, v, v̇
@@ -373,73 +374,73 @@ class _Motion:
 # --- one step -----------------------------------------------------------------------------------------
 
 
-def _bound_defect(exact: _Mechanism, y: list[Any], h: Any) -> tuple[Array, Array]:
+def bound_defect(exact: Mechanism, y: list[Any], h: Any) -> tuple[Array, Array]:
     """(2): bounds of h q̇ − q̃′ and of g."""
     qdot, g = exact.equations(y, [poly.derivative() * (1 / h) for poly in y[exact.nq :]])
     kinematic = (x * h - poly.derivative() for x, poly in zip(qdot, y[: exact.nq], strict=True))
-    return _upper(x(UNIT) for x in kinematic), _upper(x(UNIT) for x in g)
+    return upper_bounds(x(UNIT) for x in kinematic), upper_bounds(x(UNIT) for x in g)
 
 
-def _variables(coefficients: list[Array], radii: Array) -> list[_Series]:
+def dual_variables(coefficients: list[Array], radii: Array) -> list[Series]:
     """Functions of s with their derivatives by each other, from coefficients that are rounded once."""
     n, found = len(coefficients), []
     for i, row in enumerate(coefficients):
-        x = _constant(np.eye(1, 1 + n, 1 + i))
+        x = constant_series(np.eye(1, 1 + n, 1 + i))
         x.c[: len(row), 0, 0] = row[: DEGREE + 1]
-        found.append(_Series(x.c, np.eye(1, 1 + n) * _up(radii[i] + np.abs(row[DEGREE + 1 :]).sum()), 1))
+        found.append(Series(x.c, np.eye(1, 1 + n) * round_up(radii[i] + np.abs(row[DEGREE + 1 :]).sum()), 1))
     return found
 
 
-def _linearise(mechanism: _Mechanism, rows: list[Array], tube: float, g: Array) -> tuple[Any, Any, float]:
+def linearise(mechanism: Mechanism, rows: list[Array], tube: float, g: Array) -> tuple[Any, Any, float]:
     """(3), (4): the derivatives of q̇ and G by y and v̇, C, and θ."""
     nq, n = mechanism.nq, mechanism.nq + mechanism.nv
     for beta in tube * 16.0 ** np.arange(3, 16):
-        x = _variables(rows, np.repeat([tube, beta], [n, mechanism.nv]))
+        x = dual_variables(rows, np.repeat([tube, beta], [n, mechanism.nv]))
         qdot, residual = mechanism.equations(x[:n], x[n:])
         slopes = _join([*qdot, *residual]).block(slice(None), slice(1, None))
         D, M = slopes.block(slice(nq, None), slice(n)), slopes.block(slice(nq, None), slice(n, None))
-        C = _Series(_inverse_guess(M.c))
-        theta = _inverse_error(C, M, "inequality (3): M is not proved to be invertible over the step")
-        if _up(_norm(C.size @ _up(g + tube * D.size.sum(1))) / (1 - theta)) <= beta:
+        C = Series(inverse_guess(M.c))
+        theta = inverse_error(C, M, "inequality (3): M is not proved to be invertible over the step")
+        if round_up(norm_bound(C.size @ round_up(g + tube * D.size.sum(1))) / (1 - theta)) <= beta:
             return slopes, C, theta
     raise Rejected("inequality (4): the accelerations leave their tube")
 
 
-def _prove_step(mechanism: _Mechanism, rows: list[Array], h: float, defect: Any, T: Array, rho: float) -> Any:
+def prove_step(mechanism: Mechanism, rows: list[Array], h: float, defect: Any, T: Array, rho: float) -> Any:
     """(3)–(6): P and ρ⁺."""
     q, v, n = slice(mechanism.nq), slice(mechanism.nq, None), len(T)
     tube = max(MIN_TUBE, 1024 * float(np.linalg.norm(T)) * rho)
-    slopes, C, theta = _linearise(mechanism, rows, tube, defect[1])
-    J = np.concatenate([slopes.c[:, q, :n], -_convolution(C.c, slopes.c[:, v, :n])[: DEGREE + 1]], 1)
-    P = _Series(_recurrence(J * h, T, 1))  # P′ = h J P
-    Phi = _Series(_inverse_guess(P.c))
-    derivative = _Series(np.roll(P.c * np.arange(DEGREE + 1.0)[:, None, None], -1, 0), roundings=1)
+    slopes, C, theta = linearise(mechanism, rows, tube, defect[1])
+    J = np.concatenate([slopes.c[:, q, :n], -convolution(C.c, slopes.c[:, v, :n])[: DEGREE + 1]], 1)
+    P = Series(recurrence(J * h, T, 1))  # P′ = h J P
+    Phi = Series(inverse_guess(P.c))
+    derivative = Series(np.roll(P.c * np.arange(DEGREE + 1.0)[:, None, None], -1, 0), roundings=1)
     product = slopes @ _join([P * h, derivative.block(v)])
-    accelerations = _norm(_up(C.size @ product.block(v).size), axis=0) / (1 - theta)  # of each column
-    R = [(derivative.block(q) - product.block(q)).size, np.tile(_up(accelerations), (mechanism.nv, 1))]
-    delta = [defect[0], np.full(mechanism.nv, _up(h * _norm(C.size @ defect[1]) / (1 - theta)))]
-    theta = _inverse_error(Phi, P, "inequality (5): Φ is no approximate inverse of P")
-    a, b = (_up(_norm(Phi.size @ x) / (1 - theta)) for x in map(np.concatenate, (R, delta)))
+    of_columns = norm_bound(round_up(C.size @ product.block(v).size), axis=0) / (1 - theta)
+    R = [(derivative.block(q) - product.block(q)).size, np.tile(round_up(of_columns), (mechanism.nv, 1))]
+    delta = [defect[0], np.full(mechanism.nv, round_up(h * norm_bound(C.size @ defect[1]) / (1 - theta)))]
+    theta = inverse_error(Phi, P, "inequality (5): Φ is no approximate inverse of P")
+    a, b = (round_up(norm_bound(Phi.size @ x) / (1 - theta)) for x in map(np.concatenate, (R, delta)))
     _require(a < 1, "inequality (5): the error grows too fast")
-    rho = _up((rho + b) / (1 - a))
-    _require(_up(_norm(P.size) * rho) < tube, "inequality (6): the error leaves the tube")
+    rho = round_up((rho + b) / (1 - a))
+    _require(round_up(norm_bound(P.size) * rho) < tube, "inequality (6): the error leaves the tube")
     return P, rho
 
 
-def _evaluate(P: _Series, s: float) -> _Series:
+def evaluate_series(P: Series, s: float) -> Series:
     """P(s), by Horner's rule, where s is rounded once."""
-    return _Series(_constant(np.polyval(P.c[::-1], s)).c, _up(4 * DEGREE * ROUNDING * P.total))
+    return Series(constant_series(np.polyval(P.c[::-1], s)).c, round_up(4 * DEGREE * ROUNDING * P.total))
 
 
-def _next_ellipsoid(X: _Series, rho: float, jump: Array, scale: Any = 1.0) -> tuple[Array, float]:
+def next_ellipsoid(X: Series, rho: float, jump: Array, scale: Any = 1.0) -> tuple[Array, float]:
     """(7): T and the bound of ‖w⁺(0)‖."""
     U, S, _ = np.linalg.svd(X.c[0] * scale)
     T = U * np.maximum(S / S[0], 1 / MAX_CONDITION) / scale
-    Q = _constant(np.linalg.inv(T))
-    theta = _inverse_error(Q, _constant(T), "inequality (7): Q is no approximate inverse of T")
+    Q = constant_series(np.linalg.inv(T))
+    theta = inverse_error(Q, constant_series(T), "inequality (7): Q is no approximate inverse of T")
     B = Q @ X
-    largest = np.sqrt(_up(np.max((B @ _Series(B.c.mT, B.r.T)).size.sum(1))))
-    return T, _up((largest * rho + _norm(Q.size @ jump)) / (1 - theta))
+    largest = np.sqrt(round_up(np.max((B @ Series(B.c.mT, B.r.T)).size.sum(1))))
+    return T, round_up((largest * rho + norm_bound(Q.size @ jump)) / (1 - theta))
 
 
 # --- the motion ---------------------------------------------------------------------------------------
@@ -486,28 +487,30 @@ def enclose_motion(certificate: Certificate, on_step: Callable[..., Any] = lambd
     remaining, samples, at = [Fraction(t) * per_second for t in certificate.times], [], 0
     unit, bits = arb(2) ** -certificate.bits, certificate.bits
     with ctx.workprec(bits + GUARD_BITS), np.errstate(all="ignore"):
-        exact, rounded = _Mechanism(certificate, arb), _Mechanism(certificate, float)
-        end, X, rho = _initial_values(exact), _constant(np.eye(exact.nq + exact.nv)), 0.0
+        exact, rounded = Mechanism(certificate, arb), Mechanism(certificate, float)
+        end, X, rho = initial_values(exact), constant_series(np.eye(exact.nq + exact.nv)), 0.0
         for k, (length, *rows) in enumerate(certificate.steps):
             y, h = [arb_poly([c * unit for c in row]) for row in rows], length * unit
             scale = np.repeat([1.0, min(1.0, FAST * float(h))], [exact.nq, exact.nv])[:, None]
             try:
                 rates = ([j * c / length for j, c in enumerate(row[1:], 1)] for row in rows[exact.nq :])
                 rows = [np.array(x) for x in (*([c / 2**bits for c in row] for row in rows), *rates)]
-                start = _next_ellipsoid(X, rho, _upper(x - f[0] for x, f in zip(end, y, strict=True)), scale)
-                P, rho = _prove_step(rounded, rows, float(h), _bound_defect(exact, y, h), *start)
+                start = next_ellipsoid(
+                    X, rho, upper_bounds(x - f[0] for x, f in zip(end, y, strict=True)), scale
+                )
+                P, rho = prove_step(rounded, rows, float(h), bound_defect(exact, y, h), *start)
             except (Rejected, OverflowError, np.linalg.LinAlgError) as error:
                 raise Rejected(f"step {k + 1} of {len(certificate.steps)}: {error}") from None
-            end, X = [poly(arb(1)) for poly in y], _evaluate(P, 1.0)
+            end, X = [poly(arb(1)) for poly in y], evaluate_series(P, 1.0)
             while remaining and remaining[0] <= at + length:  # exact
-                samples.append(_sample(exact, y, P, rho, (remaining.pop(0) - at) / length))
+                samples.append(sample_at(exact, y, P, rho, (remaining.pop(0) - at) / length))
             at += length
             on_step(k + 1, len(certificate.steps))
     _require(not remaining, f"the steps end at {float(at / per_second):g} s, before the last sample")
     return Enclosure(certificate.times, *(np.array(x) for x in zip(*samples, strict=True)))
 
 
-def _initial_values(exact: _Mechanism) -> list[Any]:
+def initial_values(exact: Mechanism) -> list[Any]:
     """y(0), normalised, in the certificate's unit of time."""
     q, v = list[Any](), list[Any]()
     for k, (joint, (n_p, n_u, n_x, n)) in enumerate(zip(exact.joints, exact.sizes[0], strict=True)):
@@ -517,7 +520,7 @@ def _initial_values(exact: _Mechanism) -> list[Any]:
         functions = [f for angle in x[joint[3] : n_x] for f in (angle.cos(), angle.sin())]
         q += [*(p / (p @ p).sqrt())[:n_p], *u[:n_u], *x[:n_x], *[*functions, *x][:n]]
         v += [*w[:n_p], *udot[:n_u], *xdot[:n_x]]
-    motion = _Motion(exact, [*q, *q[:1] * len(exact.springs), *v], v)
+    motion = Motion(exact, [*q, *q[:1] * len(exact.springs), *v], v)
     for k, (own, *_, bent) in enumerate(motion.parts[0]):
         if len(own) and len(bent):
             bend, cosine = motion.bend(k)
@@ -527,11 +530,11 @@ def _initial_values(exact: _Mechanism) -> list[Any]:
     return [*q, *(1 / (d @ d).sqrt() for d in motion.spans(0)), *v]
 
 
-def _sample(exact: _Mechanism, y: list[Any], P: _Series, rho: float, s: Fraction) -> tuple[list[Array], ...]:
+def sample_at(exact: Mechanism, y: list[Any], P: Series, rho: float, s: Fraction) -> tuple[list[Array], ...]:
     """Balls r, p, ṙ, ω′ of every body at s; |p| = |u| = 1, so that nothing is normalised."""
-    spread = _up(_norm(_evaluate(P, s.numerator / s.denominator).size, axis=1) * rho)
+    spread = round_up(norm_bound(evaluate_series(P, s.numerator / s.denominator).size, axis=1) * rho)
     y = [f(arb(s.numerator) / s.denominator) + arb(0, float(e)) for f, e in zip(y, spread, strict=True)]
-    z = _Motion(exact, y, y[exact.nq :])
+    z = Motion(exact, y, y[exact.nq :])
     p = [np.eye(4)[0]] * (1 + len(exact.far))
     for k, (far, (own, _, x, _)) in enumerate(zip(exact.far, z.parts[0], strict=True)):
         before, after = (q / (q @ q).sqrt() for q in exact.data["turn"][k])

@@ -107,9 +107,9 @@ def test_the_numbers_of_a_certificate_are_those_of_the_scenario(scenario):
     )
     assert certificate.far == model.body[:, 0].tolist() and certificate.kind == list(model.kind)
     with ctx.workprec(200):
-        mechanism = checker._Mechanism(certificate, arb)
-        y = checker._initial_values(mechanism)
-        motion = checker._Motion(mechanism, y, y[mechanism.nq :])
+        mechanism = checker.Mechanism(certificate, arb)
+        y = checker.initial_values(mechanism)
+        motion = checker.Motion(mechanism, y, y[mechanism.nq :])
         vectors = motion.centres(0), motion.centres(1), motion.w
         pairs = zip(vectors, (state.r, state.v, state.omega), strict=True)
         for found, true in pairs:
@@ -151,9 +151,9 @@ def test_the_equations_hold_for_certified_accelerations(rods, stiffness):
     certified = certify_state(model, state).quantities
     document = json.loads(gzip.decompress(make_certificate(model, state, np.array([0.0, 1e-3]))))
     certificate = parse_certificate(json.dumps(document).encode())
-    mechanism = checker._Mechanism(certificate, arb)
+    mechanism = checker.Mechanism(certificate, arb)
     with ctx.workprec(100):
-        y = [arb_poly([x]) for x in checker._initial_values(mechanism)]
+        y = [arb_poly([x]) for x in checker.initial_values(mechanism)]
         unit = float(2.0**certificate.time_exponent)
         vdot = rod_and_body_accelerations(model, state, certified) * unit**2
         qdot, residual = mechanism.equations(y, [arb_poly([arb(float(x))]) for x in vdot])
@@ -186,10 +186,10 @@ def test_derivatives_of_the_equations_agree_with_differences(proofs, name):
     """Of the enclosed functions of s, at s = 0; the differences in 200 bits."""
     certificate = parse_certificate(json.dumps(proofs[name][2]).encode())
     with ctx.workprec(200):
-        exactly, rounded = (checker._Mechanism(certificate, number) for number in (arb, float))
+        exactly, rounded = (checker.Mechanism(certificate, number) for number in (arb, float))
         x = np.random.default_rng(6).normal(size=exactly.nq + 2 * exactly.nv)
         n = exactly.nq + exactly.nv
-        duals = checker._variables([np.array([c]) for c in x], np.zeros(len(x)))
+        duals = checker.dual_variables([np.array([c]) for c in x], np.zeros(len(x)))
         found = [f for part in rounded.equations(duals[:n], duals[n:]) for f in part]
 
         def value(moved, step):
@@ -465,7 +465,7 @@ def test_a_candidate_starts_in_the_state_that_the_checker_proves(name):
     model, state = stored_mechanism(name)
     certificate = parse_certificate(make_certificate(model, state, np.array([0.0, 1e-4])))
     with ctx.workprec(200):
-        start = checker._initial_values(checker._Mechanism(certificate, arb))
+        start = checker.initial_values(checker.Mechanism(certificate, arb))
         for row, x in zip(certificate.steps[0][1:], start, strict=True):
             assert abs(arb(row[0]) / 2**certificate.bits - x) < 1e-32
 
@@ -473,10 +473,10 @@ def test_a_candidate_starts_in_the_state_that_the_checker_proves(name):
 @pytest.mark.parametrize("last", [(1e-20, 3e-22), (3e-22, 1e-20), (1e-20, 0.0), (0.0, -1e-20)], ids=str)
 def test_the_last_two_terms_of_a_step_are_an_eighth_of_the_last_bit(last):
     mp = import_truth_tool("mpmath")
-    h = enclosure._longest_step([1, 2, 3, 4, 5, *last], 110)
+    h = enclosure.longest_step([1, 2, 3, 4, 5, *last], 110)
     terms = [abs(c) * h**power for power, c in zip((5, 6), last, strict=True)]
     assert abs(max(terms) * mp.mpf(2) ** 113 - 1) < 1e-12
-    assert enclosure._longest_step([1, 2, 3, 0, 0], 110) == mp.inf
+    assert enclosure.longest_step([1, 2, 3, 0, 0], 110) == mp.inf
 
 
 def test_the_unit_of_time_makes_rates_about_one():

@@ -74,7 +74,7 @@ def test_the_checker_has_at_most_300_lines_of_code_and_its_reader_100(name, most
 
 def draw_series(rng, rows, columns, radius=0.0, positive=False):
     c = rng.normal(size=(checker.DEGREE + 1, rows, columns))
-    return checker._Series(np.abs(c) if positive else c, radius)
+    return checker.Series(np.abs(c) if positive else c, radius)
 
 
 def exact(series, s, radius=Fraction(0)):
@@ -110,7 +110,7 @@ def without_terms_above(rng, rows, columns):
     """A series of degree 5: products of two have no terms above DEGREE, only roundings."""
     found = draw_series(rng, rows, columns)
     found.c[6:] = 0
-    return checker._Series(found.c)
+    return checker.Series(found.c)
 
 
 @pytest.mark.parametrize("rows", [1, 3])
@@ -129,7 +129,7 @@ def test_roundings_are_in_the_radii(rows):
     ):
         assert all(encloses(found, values(Fraction(s)), Fraction(s)) for s in (0, 0.4, 1))
         assert np.allclose(found.r, margin, rtol=1e-8, atol=0)
-        assert not encloses(checker._Series(found.c), values(Fraction(1)), Fraction(1)), "nothing was rounded"
+        assert not encloses(checker.Series(found.c), values(Fraction(1)), Fraction(1)), "nothing was rounded"
 
 
 def test_products_of_functions_have_their_derivatives():
@@ -148,12 +148,12 @@ def test_products_of_functions_have_their_derivatives():
 
 def test_bounds_are_upper_bounds():
     rng = np.random.default_rng(6)
-    assert checker._up(1.0) == 1 + 2.0**-30  # (F): ten nested sums of up to 2^15 products
+    assert checker.round_up(1.0) == 1 + 2.0**-30  # (F): ten nested sums of up to 2^15 products
     for _ in range(20):
         x = np.abs(rng.normal(size=(5, 7)))
         squares = sum(Fraction(c) ** 2 for c in x.ravel())
-        assert squares < Fraction(float(checker._norm(x))) ** 2 < squares * Fraction(1 + 1e-8)
-        rows = checker._norm(x, axis=1)
+        assert squares < Fraction(float(checker.norm_bound(x))) ** 2 < squares * Fraction(1 + 1e-8)
+        rows = checker.norm_bound(x, axis=1)
         assert all(
             sum(Fraction(c) ** 2 for c in row) < Fraction(n) ** 2 for row, n in zip(x, rows, strict=True)
         )
@@ -161,40 +161,40 @@ def test_bounds_are_upper_bounds():
         assert np.all(np.abs(exact(series, 1, 1)) <= np.frompyfunc(Fraction, 1, 1)(series.size))
         assert np.allclose(series.size, np.abs(series.c).sum(0) + 0.5, rtol=1e-8)
     assert (
-        0 < checker._norm(np.zeros(3)) < 1e-149 and checker._up(0.0) == 2.0**-1000
+        0 < checker.norm_bound(np.zeros(3)) < 1e-149 and checker.round_up(0.0) == 2.0**-1000
     )  # underflows are covered
     balls = [arb(-3, 0.5), arb(2), arb("0.1")]
     assert all(
-        abs(ball) < arb(float(bound)) for ball, bound in zip(balls, checker._upper(balls), strict=True)
+        abs(ball) < arb(float(bound)) for ball, bound in zip(balls, checker.upper_bounds(balls), strict=True)
     )
-    assert np.allclose(checker._upper(balls), [3.5, 2, 0.1], rtol=1e-8)
+    assert np.allclose(checker.upper_bounds(balls), [3.5, 2, 0.1], rtol=1e-8)
 
 
 def test_guesses_are_inverses():
     rng = np.random.default_rng(7)
-    series = draw_series(rng, 3, 3) * 0.01 + checker._Series(checker._constant(np.eye(3)).c)
-    inverse = checker._Series(checker._inverse_guess(series.c))
-    assert checker._inverse_error(inverse, series, "") < 0.1
+    series = draw_series(rng, 3, 3) * 0.01 + checker.Series(checker.constant_series(np.eye(3)).c)
+    inverse = checker.Series(checker.inverse_guess(series.c))
+    assert checker.inverse_error(inverse, series, "") < 0.1
     with pytest.raises(checker.Rejected, match="message"):
-        checker._inverse_error(inverse, series * 3, "message")
+        checker.inverse_error(inverse, series * 3, "message")
     J = series.c
-    P = checker._recurrence(J, np.eye(3), 1)
+    P = checker.recurrence(J, np.eye(3), 1)
     for k in range(3):  # (k + 1) P_(k+1) = sum of J_i P_(k-i)
         assert np.allclose((k + 1) * P[k + 1], sum(J[i] @ P[k - i] for i in range(k + 1)))
 
 
 def test_a_guess_that_is_off_by_more_than_1_is_no_inverse():
-    one = checker._Series(checker._constant(np.eye(1)).c)
-    assert 0.5 <= checker._inverse_error(one, one * 0.5, "") < 0.51
+    one = checker.Series(checker.constant_series(np.eye(1)).c)
+    assert 0.5 <= checker.inverse_error(one, one * 0.5, "") < 0.51
     for factor in (0, 2, -0.5, -0.9):
         with pytest.raises(checker.Rejected, match="message"):
-            checker._inverse_error(one, one * factor, "message")
+            checker.inverse_error(one, one * factor, "message")
 
 
 def test_a_series_at_a_point_encloses_its_values():
     series = draw_series(np.random.default_rng(8), 2, 3)
     for s in (Fraction(0), Fraction(1, 3), Fraction(7, 9), Fraction(1)):
-        found = checker._evaluate(series, float(s))
+        found = checker.evaluate_series(series, float(s))
         assert not np.any(found.c[1:])
         assert encloses(found, exact(series, s), 0)
         assert np.all(found.r < 1e-13 * series.total)
@@ -202,7 +202,7 @@ def test_a_series_at_a_point_encloses_its_values():
 
 def test_variables_enclose_the_candidate_and_its_tube():
     rows = [np.random.default_rng(9).normal(size=length) for length in (checker.DEGREE + 6, 3, 0)]
-    found = checker._variables(rows, [0.25, 0.5, 0.75])
+    found = checker.dual_variables(rows, [0.25, 0.5, 0.75])
     for i, (row, x) in enumerate(zip(rows, found, strict=True)):
         for s in (Fraction(0), Fraction(1, 3), Fraction(1)):
             value = sum(Fraction(c) * s**k for k, c in enumerate(row))
@@ -218,7 +218,7 @@ def test_the_next_ellipsoid_contains_the_last_and_the_jump():
     rng = np.random.default_rng(10)
     X = rng.normal(size=(4, 4)) @ np.diag([1, 1e-1, 1e-3, 1e-5])
     error, radius, jump = 1e-6, 0.7, np.array([1e-3, 0, 2e-3, 1e-4])
-    T, bound = checker._next_ellipsoid(checker._Series(checker._constant(X).c, error), radius, jump)
+    T, bound = checker.next_ellipsoid(checker.Series(checker.constant_series(X).c, error), radius, jump)
     assert np.isclose(np.linalg.cond(T), 100)
     largest = 0.0
     for _ in range(300):
@@ -232,19 +232,19 @@ def test_the_next_ellipsoid_contains_the_last_and_the_jump():
 def test_the_roundings_of_the_candidate_are_in_the_radii_of_its_variables():
     """Rational coefficients, each rounded to a double once."""
     coefficients = [Fraction(1, 3 * k) for k in range(1, 9)]
-    (x,) = checker._variables([np.array(coefficients, dtype=float)], np.zeros(1))
+    (x,) = checker.dual_variables([np.array(coefficients, dtype=float)], np.zeros(1))
     values = [sum(c * s**k for k, c in enumerate(coefficients)) for s in (Fraction(1), Fraction(1, 3))]
     for s, value in zip((Fraction(1), Fraction(1, 3)), values, strict=True):
         assert encloses(x, np.array([[value, 1]]), s)
-    assert not encloses(checker._Series(x.c), np.array([[values[0], 1]]), Fraction(1)), "nothing was rounded"
+    assert not encloses(checker.Series(x.c), np.array([[values[0], 1]]), Fraction(1)), "nothing was rounded"
     assert np.allclose(x.r, 2.0**-51 * x.total, rtol=1e-8, atol=0)
 
 
 def test_a_series_at_a_point_that_is_rounded_encloses_its_value():
     """1 - 2^-54 is rounded to 1, which changes s^11 by 11 roundings."""
     s = 1 - Fraction(1, 2**54)
-    highest = checker._Series(np.eye(checker.DEGREE + 1)[:, -1].reshape(-1, 1, 1))
-    found = checker._evaluate(highest, s.numerator / s.denominator)
+    highest = checker.Series(np.eye(checker.DEGREE + 1)[:, -1].reshape(-1, 1, 1))
+    found = checker.evaluate_series(highest, s.numerator / s.denominator)
     assert found.c[0, 0, 0] == 1
     assert encloses(found, np.array([[s**checker.DEGREE]]), Fraction(0))
     assert np.allclose(found.r, 4 * checker.DEGREE * 2.0**-51, rtol=1e-8, atol=0)
@@ -255,7 +255,9 @@ def test_a_series_at_a_point_that_is_rounded_encloses_its_value():
 
 def test_the_next_ellipsoid_contains_matrices_that_are_off_by_their_radii():
     """X = 1 + E, |E_ij| <= 1/2: the largest is 1 + J/2, of norm 3 in four dimensions."""
-    T, bound = checker._next_ellipsoid(checker._Series(checker._constant(np.eye(4)).c, 0.5), 0.7, np.zeros(4))
+    T, bound = checker.next_ellipsoid(
+        checker.Series(checker.constant_series(np.eye(4)).c, 0.5), 0.7, np.zeros(4)
+    )
     assert np.array_equal(np.abs(T), np.eye(4))
     assert 3 * 0.7 <= bound < 3 * 0.7 * (1 + 1e-8)
 
@@ -263,7 +265,7 @@ def test_the_next_ellipsoid_contains_matrices_that_are_off_by_their_radii():
 def test_the_next_ellipsoid_holds_with_a_poor_inverse(monkeypatch):
     """e = 2 w + j is w' itself where T = 1."""
     monkeypatch.setattr(np.linalg, "inv", lambda a: np.full_like(a, 0.5))
-    T, bound = checker._next_ellipsoid(checker._constant(np.array([[2.0]])), 0.7, np.array([0.125]))
+    T, bound = checker.next_ellipsoid(checker.constant_series(np.array([[2.0]])), 0.7, np.array([0.125]))
     assert np.array_equal(T, [[1]])
     assert 2 * 0.7 + 0.125 <= bound < (2 * 0.7 + 0.125) * (1 + 1e-8)
 
@@ -272,14 +274,14 @@ def test_the_next_ellipsoid_is_round_in_the_given_scale():
     """Rates of short steps count by what they do in a step: cond(T scale) is 100, not that of T."""
     rng, scale = np.random.default_rng(11), np.array([[1.0], [1.0], [1e-3], [1e-3]])
     X = np.linalg.qr(rng.normal(size=(4, 4)))[0] @ np.diag([1, 1e-1, 1e-4, 1e-5]) @ rng.normal(size=(4, 4))
-    T, _ = checker._next_ellipsoid(checker._constant(X / scale), 1.0, np.zeros(4), scale)
+    T, _ = checker.next_ellipsoid(checker.constant_series(X / scale), 1.0, np.zeros(4), scale)
     assert np.linalg.cond(T * scale) == pytest.approx(100)
-    assert np.allclose(T * scale, checker._next_ellipsoid(checker._constant(X), 1.0, np.zeros(4))[0])
+    assert np.allclose(T * scale, checker.next_ellipsoid(checker.constant_series(X), 1.0, np.zeros(4))[0])
 
 
 def test_rates_of_short_steps_have_their_scale(monkeypatch):
     """256 steps in the unit of time are short: a rate counts by 256 times the step."""
-    usual, scales, document = checker._next_ellipsoid, [], stored_document("one-rod")
+    usual, scales, document = checker.next_ellipsoid, [], stored_document("one-rod")
     monkeypatch.setattr(checker, "_next_ellipsoid", lambda *a: scales.append(a[3].ravel()) or usual(*a))
     lengths = [step[0] / 2 ** document["bits"] for step in document["steps"]]
     assert checker.FAST * min(lengths) > 1
@@ -305,8 +307,8 @@ class LinearMechanism:
 
 def poor_guesses(monkeypatch, *factors):
     """Inverses are guessed with their rows times factors, of one guess after the other in turn."""
-    usual, rest = checker._inverse_guess, cycle(factors)
-    monkeypatch.setattr(checker, "_inverse_guess", lambda a: np.array(next(rest))[:, None] * usual(a))
+    usual, rest = checker.inverse_guess, cycle(factors)
+    monkeypatch.setattr(checker, "inverse_guess", lambda a: np.array(next(rest))[:, None] * usual(a))
 
 
 @pytest.mark.parametrize(
@@ -316,7 +318,7 @@ def test_the_tube_of_the_accelerations_contains_them(monkeypatch, stiffness, def
     """For |e_0| <= 1 the first is off by stiffness + defect at most, and 16^3 is the least tube tried."""
     poor_guesses(monkeypatch, [0.5, 1.0])
     mechanism = LinearMechanism([stiffness, 0.0], 1)
-    *_, theta = checker._linearise(mechanism, [np.zeros(1)] * 5, 1.0, np.array([defect, 0.0]))
+    *_, theta = checker.linearise(mechanism, [np.zeros(1)] * 5, 1.0, np.array([defect, 0.0]))
     assert 0.5 <= theta < 0.5 + 1e-8
     assert stiffness + defect <= mechanism.beta
     assert np.isclose(mechanism.beta, 16**3 if stiffness + defect < 16**3 else 16**4)
@@ -326,7 +328,7 @@ def test_the_tube_of_the_accelerations_contains_them(monkeypatch, stiffness, def
 def test_the_growth_of_the_error_is_bounded_with_a_poor_inverse_of_the_masses(monkeypatch, h):
     """v' = 2 v; the poor inverse gives P = exp(h s), so that w = v / P grows by exp(h)."""
     poor_guesses(monkeypatch, [0.5], [1.0])
-    found, rho = checker._prove_step(LinearMechanism([-2.0], 0), [np.zeros(1)] * 2, h,
+    found, rho = checker.prove_step(LinearMechanism([-2.0], 0), [np.zeros(1)] * 2, h,
                                      (np.zeros(0), np.zeros(1)), np.eye(1), 1e-6)  # fmt: skip
     assert np.isclose(found.total[0, 0], np.exp(h))
     assert 1e-6 * np.exp(h) <= rho < 1e-6 / (1 - h * np.exp(2 * h)) * (1 + 1e-6)
@@ -336,7 +338,7 @@ def test_an_error_that_grows_too_fast_is_rejected(monkeypatch):
     """a = h exp(2 h) > 1, so that 1 − a is negative."""
     poor_guesses(monkeypatch, [0.5], [1.0])
     with pytest.raises(checker.Rejected, match=r"inequality \(5\): the error grows too fast"):
-        checker._prove_step(LinearMechanism([-2.0], 0), [np.zeros(1)] * 2, 0.5,
+        checker.prove_step(LinearMechanism([-2.0], 0), [np.zeros(1)] * 2, 0.5,
                             (np.zeros(0), np.zeros(1)), np.eye(1), 1e-6)  # fmt: skip
 
 
@@ -346,10 +348,10 @@ def test_a_ball_has_its_moment_with_either_element_alone(field, rate):
     none, document = {"armature": [["0x0p0"] * 2], "damping": [["0x0p0"] * 2]}, stored_document("one-ball")
     v = {"v": [arb(1), arb(2), arb(3)], "vdot": [arb(4), arb(5), arb(6)]}
     one, two = (
-        checker._Mechanism(parsed(document | none | changed), arb)
+        checker.Mechanism(parsed(document | none | changed), arb)
         for changed in ({}, {field: [["0x1p1", "0x0p0"]]})
     )
-    y = [*checker._initial_values(one)[: one.nq], *v["v"]]
+    y = [*checker.initial_values(one)[: one.nq], *v["v"]]
     moments = zip(two.equations(y, v["vdot"])[1], one.equations(y, v["vdot"])[1], v[rate], strict=True)
     coefficient = two.data[field][0, 0]
     assert coefficient > 0
@@ -364,7 +366,7 @@ SPRUNG = {"armature": [["0x0p0"] * 2], "damping": [["0x0p0"] * 2], "stiffness": 
 
 def sprung_ball(number, terms=None):
     """The mechanism of one ball with a spring alone; ``terms`` is N of (8)."""
-    mechanism = checker._Mechanism(parsed(without_steps(stored_document("one-ball") | SPRUNG)), number)
+    mechanism = checker.Mechanism(parsed(without_steps(stored_document("one-ball") | SPRUNG)), number)
     mechanism.terms = mechanism.terms[:terms]
     return mechanism
 
@@ -407,7 +409,7 @@ def test_the_ratio_of_a_turn_to_its_sine_changes_as_it_must(terms, sigma):
 
 
 def series_without_radius(x):
-    return checker._constant(np.array([[x, 0.0]]))
+    return checker.constant_series(np.array([[x, 0.0]]))
 
 
 @pytest.mark.parametrize("terms", [1, 3, None])
@@ -428,14 +430,14 @@ def test_the_series_of_a_turn_that_changes_is_enclosed_with_few_powers(terms):
 @pytest.mark.parametrize("is_exact", [True, False])
 def test_a_dropped_remainder_of_a_spring_is_noticed(monkeypatch, is_exact):
     """With few terms the sum alone is far from f₀(σ)."""
-    usual = checker._Mechanism.__init__
+    usual = checker.Mechanism.__init__
 
     def without_remainder(self, *arguments):
         usual(self, *arguments)
         if self.exact == is_exact:
-            self.unknown = arb(0) if is_exact else checker._constant(np.zeros((1, 1)))
+            self.unknown = arb(0) if is_exact else checker.constant_series(np.zeros((1, 1)))
 
-    monkeypatch.setattr(checker._Mechanism, "__init__", without_remainder)
+    monkeypatch.setattr(checker.Mechanism, "__init__", without_remainder)
     with pytest.raises(AssertionError):
         test_the_ratio_of_a_turn_to_its_sine_changes_as_it_must(2, 1.5)
 
@@ -456,7 +458,7 @@ def test_a_spring_near_half_a_turn_is_rejected(sigma, is_near):
 
 
 def test_a_spring_near_half_a_turn_counts_its_tube():
-    wide = {9.8: checker._Series(series_without_radius(9.8).c, np.array([[0.07, 0.0]]))}
+    wide = {9.8: checker.Series(series_without_radius(9.8).c, np.array([[0.07, 0.0]]))}
     with pytest.raises(checker.Rejected, match="near half a turn"):
         turn_rates(sprung_ball(float), 9.8, lambda x: wide.get(x, series_without_radius(x)))
 
@@ -469,7 +471,7 @@ def test_the_turn_of_a_spring_starts_as_the_attitude_has_it(degrees):
     for sign in (1, -1):
         p = sign * np.array([np.cos(half), *(np.sin(half) * axis)])
         document = stored_document("one-ball") | SPRUNG | {"turn": none, "p": [[x.hex() for x in p.tolist()]]}
-        y = checker._initial_values(checker._Mechanism(parsed(without_steps(document)), arb))
+        y = checker.initial_values(checker.Mechanism(parsed(without_steps(document)), arb))
         phi = 2 * half
         assert abs(float(y[4]) - phi**2) <= 1e-12 * phi and y[4].rad() < 1e-12
         assert float(y[5]) == pytest.approx(phi / np.sin(phi) / 6 if phi else 1 / 6, rel=1e-10)
@@ -478,7 +480,7 @@ def test_the_turn_of_a_spring_starts_as_the_attitude_has_it(degrees):
 def test_a_rod_starts_normalised():
     """u/|u|, and u̇ less what is along it."""
     document = stored_document("one-rod") | {"u": [["0x1p0", "-0x1p1", "0x1p1"]], "udot": [["0x1p0"] * 3]}
-    y = checker._initial_values(checker._Mechanism(parsed(document), arb))
+    y = checker.initial_values(checker.Mechanism(parsed(document), arb))
     unit = 2.0 ** document["time_exponent"]
     assert np.allclose(np.array(y[4:7], dtype=float), np.array([1, -2, 2]) / 3, rtol=1e-15)
     assert np.allclose(np.array(y[10:], dtype=float), unit * (1 - np.array([1, -2, 2]) / 9), rtol=1e-15)
@@ -493,8 +495,8 @@ def test_where_the_steps_end_is_said():
 
 def test_samples_are_at_their_times_of_their_steps(monkeypatch):
     """The first at the start of the first step, exactly."""
-    usual, at = checker._sample, []
-    monkeypatch.setattr(checker, "_sample", lambda *a: at.append(a[-1]) or usual(*a))
+    usual, at = checker.sample_at, []
+    monkeypatch.setattr(checker, "sample_at", lambda *a: at.append(a[-1]) or usual(*a))
     document = stored_document("one-ball")
     checker.enclose_motion(parsed(document))
     assert float.fromhex(document["times"][0]) == 0 == at[0]
@@ -507,11 +509,11 @@ def test_samples_are_at_their_times_of_their_steps(monkeypatch):
 def test_the_bound_of_the_defect_holds_and_counts_every_power():
     """Of the whole polynomials: at the end of a step all terms of a positive one count in full."""
     certificate = parsed(stored_document("one-ball"))
-    mechanism, (length, *rows) = checker._Mechanism(certificate, arb), certificate.steps[0]
+    mechanism, (length, *rows) = checker.Mechanism(certificate, arb), certificate.steps[0]
     with ctx.workprec(certificate.bits + checker.GUARD_BITS):
         unit = arb(2) ** -certificate.bits
         y, h = [arb_poly([c * unit for c in row]) for row in rows], length * unit
-        kinematic, bounds = checker._bound_defect(mechanism, y, h)
+        kinematic, bounds = checker.bound_defect(mechanism, y, h)
         for s in (arb(0), arb(0.3), arb(1)):
             at = [arb_poly([poly(s)]) for poly in y]
             rates = [arb_poly([poly.derivative()(s) / h]) for poly in y[mechanism.nq :]]
@@ -523,7 +525,7 @@ def test_the_bound_of_the_defect_holds_and_counts_every_power():
         longer = [
             poly + arb_poly([0] * 60 + [arb(2) ** -40]) for poly in y
         ]  # far above the candidate's order
-        assert np.all(checker._bound_defect(mechanism, longer, h)[0] > 2.0**-36)
+        assert np.all(checker.bound_defect(mechanism, longer, h)[0] > 2.0**-36)
 
 
 @pytest.mark.parametrize("name, value", [("ROUNDING", 0.0), ("TINY", -1.0), ("UNIT", (0.25, 0.25))])
@@ -536,19 +538,19 @@ def test_a_wrong_constant_of_the_bounds_is_noticed(monkeypatch, name, value):
 
 
 def test_a_series_that_is_cut_without_its_remainder_is_noticed(monkeypatch):
-    usual = checker._convolution
+    usual = checker.convolution
 
     def cut(a, b):
         found = usual(a, b)
         found[checker.DEGREE + 1 :] = 0
         return found
 
-    monkeypatch.setattr(checker, "_convolution", cut)
+    monkeypatch.setattr(checker, "convolution", cut)
     with pytest.raises(AssertionError):
         test_a_product_encloses_the_product(((3, 2), (2, 4)), 0.0)
 
 
-@pytest.mark.parametrize("name", ["_up", "_norm", "_inverse_guess", "_convolution", "_upper"])
+@pytest.mark.parametrize("name", ["round_up", "norm_bound", "inverse_guess", "convolution", "upper_bounds"])
 def test_nan_is_never_accepted(monkeypatch, name):
     usual = getattr(checker, name)
     monkeypatch.setattr(checker, name, lambda *a, **options: usual(*a, **options) * np.nan)
