@@ -153,7 +153,9 @@ class LazyGroup(click.Group):
                 return super().invoke(ctx)
         except KeyboardInterrupt as interruption:
             resume = " ".join(("run the same command", *interruption.args, "to resume"))
-            is_kept = ctx.invoked_subcommand in ("run", "nightly")
+            is_kept = (
+                ctx.obj is not None and ctx.obj.holds_everything
+            )  # the result cache of `run` and `nightly`
             end = f"; finished cells are kept, {resume}" if is_kept else ""
             click.echo(f"\ninterrupted{end}", err=True)
             # CPython remembers an interruption that passed through exec(), as of a dataclass being made, and

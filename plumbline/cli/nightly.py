@@ -1,9 +1,10 @@
 """The nightly: runs everything unattended, resumes after interruption, keeps the history of earlier nights.
 
-OUT/unfinished/plan.json   seed and number of the random scenarios, start of the night
-OUT/unfinished/cells/      finished cells (`plumbline.execution.result_cache`)
+OUT/unfinished/plan.json   seed and number of the random scenarios, start and token of the night
 OUT/unfinished/night/      results while they are written, and the self-test's JUnit file
 OUT/history/ID/            a complete night, moved there by one rename
+
+Finished cells are in the user's cache (`plumbline.execution.result_cache`), under a name made of the token.
 """
 
 from __future__ import annotations
@@ -21,10 +22,11 @@ from pathlib import Path
 import pyarrow as pa
 
 import reports
+from plumbline.cli.options import announce_result_cache
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import LevelSelection, Plan, ProgressCallback, RunObserver
 from plumbline.execution.proofs import prove_changed_motions
-from plumbline.execution.result_cache import DiskResultCache
+from plumbline.execution.result_cache import DiskResultCache, night_cells_folder
 from plumbline.execution.runner import RunResult, run_plan, save
 from plumbline.execution.selftest import SelfTestResult
 from plumbline.judging.known_issues import KnownIssue, project_known_issues
@@ -48,6 +50,7 @@ class NightPlan:
     seed: int
     random_count: int
     started: str  # ISO 8601, UTC
+    token: str  # tells its cells from those of other nights
 
     @classmethod
     def resume_or_start(cls, folder: Path, seed: int | None, random_count: int) -> NightPlan:
@@ -68,12 +71,14 @@ class NightPlan:
         path = folder / "plan.json"
         try:
             night = cls(**json.loads(path.read_text(encoding="utf-8")))
-            if night.random_count == random_count and seed in (None, night.seed):
+            is_wanted = night.random_count == random_count and seed in (None, night.seed)
+            if is_wanted and isinstance(night.token, str):
                 return night
         except (OSError, ValueError, TypeError):
             pass  # missing or damaged: a new one
         started = datetime.now(UTC).isoformat(timespec="seconds")
-        night = cls(secrets.randbits(32) if seed is None else seed, random_count, started)
+        seed = secrets.randbits(32) if seed is None else seed
+        night = cls(seed, random_count, started, secrets.token_hex(8))
         folder.mkdir(parents=True, exist_ok=True)
         write_atomically(path, json.dumps(asdict(night)).encode())
         return night
@@ -139,10 +144,14 @@ def run_nightly(
     """
     unfinished, history = out / "unfinished", out / "history"
     night = NightPlan.resume_or_start(unfinished, seed, random_count)
-    if _is_recorded(night, unfinished, history):  # interrupted when only the clean-up was left
+    if _is_recorded(night, history):  # interrupted when only the clean-up was left
         shutil.rmtree(unfinished)
+        DiskResultCache(night_cells_folder(night.token)).clear()
         night = NightPlan.resume_or_start(unfinished, seed, random_count)
-    finished = sum(1 for _ in unfinished.glob("cells/*.cell"))
+    cells = night_cells_folder(night.token)
+    finished = sum(1 for _ in cells.glob("*.cell"))
+    result_cache = DiskResultCache(cells, log)
+    announce_result_cache(result_cache)
     log(f"random scenarios: {night.random_count}, seed {night.seed}")
     if finished:
         log(f"resuming the night begun {night.started}: {finished} cells are finished")
@@ -163,7 +172,7 @@ def run_nightly(
         random_scenarios=random_scenarios,
         random_level="random",
         random_trajectory_count=random_trajectory_count,
-        result_cache=DiskResultCache(unfinished / "cells", log),
+        result_cache=result_cache,
         are_engines_required=are_engines_required,
         known_issues=project_known_issues() if known_issues is None else known_issues,
     )
@@ -202,6 +211,7 @@ def run_nightly(
     history.mkdir(exist_ok=True)
     os.replace(folder, place)
     shutil.rmtree(unfinished)
+    result_cache.clear()
     return result, place
 
 
@@ -265,10 +275,10 @@ def write_random_scenario_files(result: RunResult, drawn: RandomScenarios, folde
         write_atomically(folder / f"{s.name}.yaml", text.encode())
 
 
-def _is_recorded(night: NightPlan, unfinished: Path, history: Path) -> bool:
+def _is_recorded(night: NightPlan, history: Path) -> bool:
     """Whether the unfinished night is complete in the history already."""
     wanted = night.started, night.seed, night.random_count
-    return (unfinished / "cells").is_dir() and any(
+    return any(
         tuple(run.metadata.get(name) for name in ("started", "seed", "random")) == wanted
         for run in stored_runs(history)
     )

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 from click.core import ParameterSource
@@ -26,6 +26,9 @@ from plumbline.scenario import loader as scenarios
 from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean, shorten
 from plumbline.scenario.yaml_reader import is_file, read_yaml
 from plumbline.truth.closed_form import ClosedFormMismatch, closed_form_motion
+
+if TYPE_CHECKING:
+    from plumbline.execution.result_cache import DiskResultCache
 
 DEFAULT_OUT = Path("reports") / "out"
 LOCK_FILE = ".lock"  # of an output folder, held by the command that writes to it
@@ -415,9 +418,20 @@ def check_history_tool() -> None:
         )
 
 
+def announce_result_cache(result_cache: DiskResultCache) -> None:
+    """Let the messages of errors and interruptions report whether finished cells are kept.
+
+    Args:
+        result_cache: that of the command that runs.
+
+    """
+    if context := click.get_current_context(silent=True):
+        context.find_root().obj = result_cache
+
+
 @contextmanager
 def exit_on_io_error() -> Iterator[None]:
-    """Exit with 4 when a write fails; finished cells are kept.
+    """Exit with 4 when a write fails.
 
     Yields:
         Nothing.
@@ -432,5 +446,9 @@ def exit_on_io_error() -> Iterator[None]:
         raise click.BadParameter(str(error), param_hint="--scheduler") from None
     except (OSError, ExecutorLost) as error:
         what = "I/O error" if isinstance(error, OSError) else "the cluster was lost"
-        click.echo(f"{what}: {error}. Finished cells were saved; run the same command to resume.", err=True)
+        result_cache = click.get_current_context().find_root().obj
+        kept = "Finished cells were saved; run the same command to resume."
+        if result_cache is None or not result_cache.holds_everything:
+            kept = "Finished cells were not saved; the same command begins again."
+        click.echo(f"{what}: {error}. {kept}", err=True)
         sys.exit(ExitCode.MACHINE_FAILED)

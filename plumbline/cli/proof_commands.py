@@ -153,7 +153,8 @@ def _prove(
         raise click.UsageError(str(error)) from None
     except (rejected, EngineFailure) as error:
         return record | {"verdict": "rejected", "reason": str(error)}, None
-    store_proof(*pair, times, round_enclosure(enclosure))
+    if unkept := store_proof(*pair, times, round_enclosure(enclosure)):
+        click.echo(unkept, err=True)
     record |= proved_radii(enclosure) | {"cpu": time.process_time() - began, "bytes": len(certificate)}
     return record, certificate
 

@@ -71,6 +71,7 @@ def run(
     known_issues = options.read_known_issues(known_files, chosen)
     folder = options.claim_folder(out)
     cache = DiskResultCache(user_cells_folder(), _log, is_fresh=fresh)
+    options.announce_result_cache(cache)
     plan = Plan(
         chosen,
         engines,

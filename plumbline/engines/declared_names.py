@@ -38,7 +38,9 @@ def _declared_names() -> tuple[frozenset[str], frozenset[str]]:
     """Names of integrators, and all texts; remembered, because parsing all adapters takes a while."""
     sources = [path.read_bytes() for path in sorted((ROOT / "adapters").glob("*.py"))]
     key = content_key("adapters", Path(__file__).read_bytes(), *sources)
-    found: tuple[frozenset[str], frozenset[str]] | None = recall(key)
+    found: tuple[frozenset[str], frozenset[str]] | None = recall(
+        key, lambda names: all(isinstance(one, frozenset) for one in names) and len(names) == 2
+    )
     if found is None:
         nodes = [node for source in sources for node in ast.walk(ast.parse(source))]
         found = _integrators(nodes), _texts(nodes)

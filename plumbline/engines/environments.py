@@ -27,7 +27,12 @@ from packaging.version import Version
 from plumbline.engines.registry import ENGINES, IMPORTERS
 from plumbline.processes.errors import PlumblineError
 from plumbline.processes.isolation import ScratchFolder
-from plumbline.processes.user_cache import user_cache_folder
+from plumbline.processes.user_cache import (
+    UntrustedFolder,
+    check_ownership,
+    make_private_folder,
+    user_cache_folder,
+)
 
 ROOT = Path(__file__).resolve().parents[2]
 BASE_REQUIREMENTS = ("numpy", "scipy", "packaging")  # imported by adapters and by the core in workers
@@ -175,8 +180,14 @@ def ensure_interpreter(name: str, declared: Callable[[str, str], Any] = declared
     wanted += [need for versions, need in extra if SpecifierSet(versions).contains(number)]
     tag = hashlib.sha256("\n".join([*wanted, sys.version]).encode()).hexdigest()[:8]
     place = user_cache_folder() / "engines" / f"{package}-{label}-{tag}"
+    try:
+        check_ownership(place)
+    except FileNotFoundError:
+        pass  # it is made below
+    except UntrustedFolder as error:
+        raise EnvironmentUnavailable(f"{error.filename} is not used: {error.strerror}") from None
     if not _interpreter_path(place).exists():
-        place.parent.mkdir(parents=True, exist_ok=True)
+        make_private_folder(place.parent)
         with ScratchFolder(".making-", place.parent) as scratch:
             made = scratch / "environment"
             _run_uv("venv", "--relocatable", "--python", sys.executable, str(made))
@@ -274,7 +285,12 @@ def _run_uv(*arguments: str, purpose: str = "make an environment for it") -> str
     # The environment may be a link to that of another checkout, where make has put uv beside it.
     beside = [folder / ".uv" / "bin" / "uv" for folder in (ROOT, Path(sys.prefix).resolve().parent)]
     program = shutil.which("uv") or next((str(path) for path in beside if path.exists()), "uv")
-    environment = {"UV_PYTHON_DOWNLOADS": "never", "UV_SYSTEM_CERTS": "true", **os.environ}
+    environment = {
+        "UV_PYTHON_DOWNLOADS": "never",
+        "UV_SYSTEM_CERTS": "true",
+        "UV_LINK_MODE": "copy",  # a file that is patched in one environment stays as it is in the others
+        **os.environ,
+    }
     try:
         done = subprocess.run(
             [program, "--quiet", "--no-config", *arguments],

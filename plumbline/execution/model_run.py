@@ -41,7 +41,7 @@ from plumbline.judging.model_file import (
 )
 from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.processes.isolation import ScratchFolder
-from plumbline.processes.workers import Executor, Limits, Outcome, Pickled, Task, WorkerPool
+from plumbline.processes.workers import Executor, Limits, Outcome, Packed, Task, WorkerPool
 from plumbline.scenario.errors import Problem, did_you_mean, shorten
 from plumbline.truth.model_comparison import model_states, with_names_of
 
@@ -116,7 +116,7 @@ class _ModelRun:
         self.pythons: dict[str, str] = {}
         self.engines: dict[str, EngineInfo] = {}
         self.problems: list[Problem] = []
-        self.truths: dict[str, Pickled | str] = {}  # of each file, or why there is none
+        self.truths: dict[str, Packed | str] = {}  # of each file, or why there is none
 
     def execute(self) -> ModelRunResult:
         """Run the phases."""
@@ -305,7 +305,7 @@ class _ModelRun:
         """Keep a certificate; False for other outcomes."""
         if outcome.key[0] != "certify":
             return False
-        self.truths[outcome.key[1]] = outcome.failure or outcome.pickled
+        self.truths[outcome.key[1]] = outcome.failure or outcome.packed
         return True
 
     def states(self, shown: str, model: NeutralModel) -> tuple[CanonicalState, ...]:

@@ -66,13 +66,10 @@ def prove_changed_motions(
         log: called with a sentence about each proof that fails.
 
     Returns:
-        What was proved; each proof is stored.
-
-    Raises:
-        OSError: a proof cannot be stored.
+        What was proved; each proof is kept for later runs, where the user's cache can be written.
 
     """
-    found, used = ProofSummary(), 0.0
+    found, used, logged = ProofSummary(), 0.0, set[str]()
     if absent := [module for module in TRUTH_TOOLS if find_spec(module) is None]:
         log(f"no motions are proved: {', '.join(absent)} not installed")
         return ProofSummary(left_out=[s.name for s in scenarios])
@@ -102,7 +99,10 @@ def prove_changed_motions(
                 log(f"{s.name}: not proved: {outcome.failure}")
                 continue
             proof, ratio = outcome.value
-            store_proof(s.model, s.state, s.times, proof)
+            unkept = store_proof(s.model, s.state, s.times, proof)
+            if unkept and unkept not in logged:
+                log(unkept)
+                logged.add(unkept)
             found.proved.append(s.name)
             if not ratio <= 1:
                 found.exceeded[s.name] = ratio

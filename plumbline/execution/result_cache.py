@@ -2,41 +2,41 @@
 
 A cell is one task's answer and what its judge returned, in FOLDER/HASH.cell.  The hash covers everything that
 they depend on: the calls and their arguments (model, states, times, steps, integrator, truth), the engine's
-version, this project's code below `execution`, and the files that can be imported.  A file is the SHA-256 of
-the rest, then a pickle, written whole or not at all; the cell of a damaged file is reported and runs again.
-Loading a pickle can run any code: share results, never this folder.
+version, and what `plumbline.execution.environment_fingerprint` lists.  A file is a checksum, then two records
+(`plumbline.processes.record_encoding`), written whole or not at all; a damaged file is reported, and its cell
+runs again.  Where the folder cannot be used, the run goes on without it and says so once.
 """
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
-import pickle
 import shutil
 import struct
-import sys
-import sysconfig
+import types
 from collections.abc import Callable
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 
 import numpy as np
 
-from plumbline.processes.processor import processor_features
-from plumbline.processes.user_cache import CheckedFiles, DamagedFile, user_cache_folder
+from plumbline.execution.environment_fingerprint import environment_fingerprint
+from plumbline.judging.rows import JudgingResult
+from plumbline.processes.record_encoding import EncodedRecord, UnfitRecord, decode_record, encode_record
+from plumbline.processes.user_cache import (
+    CheckedFiles,
+    DamagedFile,
+    content_key,
+    describe_failure,
+    user_cache_folder,
+)
 from plumbline.processes.workers import Outcome, Pickled, ResultCache, Task
 
-ROOT = Path(__file__).resolve().parents[2]
-_HASHED_PACKAGES = ("plumbline", "adapters", "reference_impl")
-# Tasks call functions of the packages below these; tests/architecture checks that those import none of them.
-_UNHASHED_PACKAGES = ("plumbline/cli", "plumbline/execution", "plumbline/reproduce", "plumbline/storage",
-                      "plumbline/studies")  # fmt: skip
-# never read by an import; half of the files that are installed
-_SOURCES_OF_COMPILERS = (".hpp", ".hxx", ".ipp", ".h", ".c", ".cpp", ".f90", ".pxd", ".pyi", ".cmake")
 MAX_BYTES = 2 * 2**30  # of the cells that runs share
+MAX_UNFINISHED_NIGHTS = 4  # that keep their cells
+_SIZE = struct.Struct("<Q")
 
 
 class DiskResultCache(ResultCache):
@@ -49,13 +49,18 @@ class DiskResultCache(ResultCache):
 
         Args:
             folder: folder of the cells, made when the first one is written.
-            log: called with a sentence about each damaged file.
+            log: called with a sentence about each damaged file, and where the folder cannot be used.
             is_fresh: whether cells of earlier runs are computed again.
 
         """
-        self._folder, self._log, self._is_fresh = folder, log, is_fresh
-        self._files = CheckedFiles(folder)
+        self._files, self._log, self._is_fresh = CheckedFiles(folder), log, is_fresh
+        self._is_off = False  # the folder cannot be read or written, or is not the user's own
         self._names: dict[Any, str] = {}  # files of running tasks, by their keys
+
+    @property
+    def holds_everything(self) -> bool:
+        """Whether all cells that were finished so far are on disk."""
+        return not self._is_off
 
     def get(self, task: Task) -> Outcome | None:
         """Read a stored answer.
@@ -67,44 +72,59 @@ class DiskResultCache(ResultCache):
             The outcome, or None where there is no undamaged file.
 
         """
+        if self._is_off:
+            return None
         name = self._names[task.key] = _file_name(task)
         try:
             body = None if self._is_fresh else self._files.read(name)
-        except DamagedFile as error:
-            self._log(f"{error}; the cell runs again")
+            outcome = None if body is None else _decode_outcome(task, body)
+        except (DamagedFile, UnfitRecord) as error:
+            damage = (
+                error if isinstance(error, DamagedFile) else f"{self._files.path(name)}: damaged ({error})"
+            )
+            self._log(f"{damage}; the cell runs again")
             return None
         except OSError as error:
-            self._log(f"{self._files.path(name)}: cannot be read ({error.strerror}); the cell runs again")
+            self._switch_off(error, "used")
             return None
-        if body is None:
-            return None
-        del self._names[task.key]
-        answer, cost, judged = pickle.loads(body)
-        return Outcome(
-            task.key, None if answer is None else Pickled(answer), cpu_time=cost, judge_result=judged,
-            is_cached=True,
-        )  # fmt: skip
+        if outcome is not None:
+            del self._names[task.key]
+        return outcome
 
-    def put(self, task: Task, outcome: Outcome) -> None:
+    def put(self, task: Task, outcome: Outcome) -> Outcome:
         """Write an answer to disk, except a failure, whose cause may have been the machine.
 
         Args:
             task: the call that was made.
             outcome: its answer.
 
-        Raises:
-            OSError: the file cannot be written.
+        Returns:
+            The outcome as `get` will return it, but not marked as cached.
 
         """
+        if self._is_off or outcome.failure is not None or outcome.judge_failure:
+            self._names.pop(task.key, None)
+            return outcome
         name = self._names.pop(task.key, None) or _file_name(task)
-        if outcome.failure is None and not outcome.judge_failure:
-            answer = None if outcome.raw_value is None else outcome.pickled.data
-            content = answer, outcome.cpu_time, outcome.judge_result
-            self._files.write(name, pickle.dumps(content, protocol=5))
+        try:
+            body = _encode_outcome(outcome)
+            stored = _decode_outcome(task, body)
+        except UnfitRecord:  # an answer of another type than the call promises is judged, but not kept
+            return outcome
+        try:
+            self._files.write(name, body)
+        except OSError as error:
+            self._switch_off(error, "written")
+        return replace(outcome, raw_value=stored.raw_value, judge_result=stored.judge_result)
+
+    def _switch_off(self, error: OSError, what: str) -> None:
+        self._is_off = True
+        reason = describe_failure(error, self._files.folder)
+        self._log(f"the result cache cannot be {what}, the run goes on without it: {reason}")
 
     def clear(self) -> None:
         """Remove all cells, after the run has been stored."""
-        shutil.rmtree(self._folder, ignore_errors=True)
+        shutil.rmtree(self._files.folder, ignore_errors=True)
 
     def trim(self, max_bytes: int = MAX_BYTES) -> None:
         """Remove the cells that were not used for longest, until the others fit.
@@ -124,6 +144,61 @@ def user_cells_folder() -> Path:
 
     """
     return user_cache_folder() / "cells"
+
+
+def night_cells_folder(token: str) -> Path:
+    """Locate the cells of an unfinished night, and remove those of nights that were left unfinished long ago.
+
+    Args:
+        token: identifies the night; any text.
+
+    Returns:
+        The folder; it need not exist.
+
+    """
+    place = user_cache_folder() / "nights"
+    with contextlib.suppress(OSError):
+        nights = sorted(place.iterdir(), key=lambda folder: folder.stat().st_mtime)
+        folder = place / content_key(token)
+        for old in [night for night in nights if night != folder][:-MAX_UNFINISHED_NIGHTS]:
+            shutil.rmtree(old, ignore_errors=True)
+    return place / content_key(token)
+
+
+def _encode_outcome(outcome: Outcome) -> bytes:
+    """The answer as a record, preceded by its size; then the call's CPU time and what the judge returned."""
+    answer = b"" if outcome.raw_value is None else encode_record(outcome.value)
+    return _SIZE.pack(len(answer)) + answer + encode_record((outcome.cpu_time, outcome.judge_result))
+
+
+def _decode_outcome(task: Task, body: bytes) -> Outcome:
+    """Read what `_encode_outcome` wrote; raise UnfitRecord if the task has no such answer."""
+    if len(body) < _SIZE.size:
+        raise UnfitRecord("too short")
+    end = _SIZE.size + _SIZE.unpack_from(body)[0]
+    answer = (
+        EncodedRecord(body[_SIZE.size : end], _returned_type(task.function)) if end > _SIZE.size else None
+    )
+    hint = _returned_type(task.judge) if task.judge else None
+    cost, judged = decode_record(body[end:], tuple[float, hint])  # type: ignore[valid-type]
+    if answer is None and (task.judge is None or task.needs_answer is None or task.needs_answer(judged)):
+        raise UnfitRecord("there is no answer")
+    if answer is not None:
+        answer.load()
+    if isinstance(judged, JudgingResult) and not all(map(_is_table, judged.tables)):
+        raise UnfitRecord("columns of a table differ in length")
+    return Outcome(task.key, answer, cpu_time=cost, judge_result=judged, is_cached=True)
+
+
+def _is_table(table: tuple[str, dict[str, Any]]) -> bool:
+    return len({len(column) for column in table[1].values() if isinstance(column, list | np.ndarray)}) <= 1
+
+
+@cache
+def _returned_type(function: Callable[..., Any]) -> Any:
+    """The type that a function is annotated to return; other annotations need not be known at run time."""
+    returned = types.SimpleNamespace(__annotations__={"return": function.__annotations__.get("return")})
+    return get_type_hints(returned, function.__globals__)["return"]
 
 
 def _file_name(task: Task) -> str:
@@ -146,54 +221,13 @@ def task_hash(task: Task) -> str:
     digest = hashlib.sha256()
     parts = _function_name(task.function), task.version, task.python, task.arguments
     judge = _function_name(task.judge), task.judge_arguments, _function_name(task.needs_answer)
-    for part in (_environment_fingerprint(), *parts, *judge):
+    for part in (environment_fingerprint(task.python), *parts, *judge):
         _update_hash(digest, part)
     return digest.hexdigest()
 
 
 def _function_name(function: Callable[..., Any] | None) -> str:
     return f"{function.__module__}.{function.__qualname__}" if function else ""
-
-
-@cache
-def _environment_fingerprint() -> str:
-    """Hash the project's code, the interpreter, what can be imported, and the processor."""
-    digest = hashlib.sha256()
-    for folder in _HASHED_PACKAGES:
-        for path in sorted((ROOT / folder).rglob("*.py")):
-            name = path.relative_to(ROOT).as_posix()
-            if not name.startswith(_UNHASHED_PACKAGES):
-                _update_hash(digest, (name, path.read_bytes()))
-    _update_hash(digest, (sys.version, processor_features(), *_importable_files()))
-    return digest.hexdigest()
-
-
-def _importable_files() -> list[tuple[str, int, int]]:
-    """Name, size and time of change [ns] of every file below the folders that Python imports from.
-
-    An engine may be built again under the same version, patched where it is installed, or replaced by a
-    module on PYTHONPATH; none of that changes the versions of what is installed.  The standard library
-    belongs to the interpreter's version; of this checkout the code that tasks call is hashed by content.
-    """
-    standard = {os.path.realpath(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib")}
-    skipped = {*standard, *(os.path.join(path, "lib-dynload") for path in standard)}
-    folders = [path for path in map(os.path.realpath, sys.path) if path not in skipped]
-    seen, found = set(skipped), []
-    while folders:
-        folder = folders.pop()
-        if folder in seen:
-            continue
-        seen.add(folder)
-        with contextlib.suppress(OSError), os.scandir(folder) as entries:
-            for entry in entries:
-                if not entry.is_dir():
-                    if entry.name.endswith(_SOURCES_OF_COMPILERS):
-                        continue
-                    about = entry.stat()
-                    found.append((entry.path, about.st_size, about.st_mtime_ns))
-                elif entry.name != "__pycache__" and folder != str(ROOT):
-                    folders.append(entry.path)
-    return sorted(found)
 
 
 def _update_hash(digest: Any, value: Any) -> None:
@@ -209,7 +243,7 @@ def _update_hash(digest: Any, value: Any) -> None:
             head, body = "str", value.encode()
         case bytes():
             head, body = "bytes", value
-        case Pickled():
+        case Pickled() | EncodedRecord():
             head, body = "packed", value.digest
         case np.ndarray():
             head, body = f"array {value.dtype.str} {value.shape}", np.ascontiguousarray(value).tobytes()

@@ -31,11 +31,12 @@ from plumbline.measurements.long_run_study import plan_long_run, run_long_run_st
 from plumbline.measurements.order_and_limit import refinement_resolutions
 from plumbline.measurements.refinement_study import run_refinement_study
 from plumbline.measurements.single_steps import MAX_STEP_BODIES, STEP_STATES, run_step_study
-from plumbline.model.datatypes import Integrator, Model
+from plumbline.model.datatypes import Integrator, Model, State
 from plumbline.model.invariants import inertia_ratio
 from plumbline.model.loops import MIN_MOTION_SINGULAR_VALUE, is_singular, smallest_singular_value
 from plumbline.model.sampling import compared_states
-from plumbline.processes.workers import Outcome, Pickled, Task
+from plumbline.processes.record_encoding import EncodedRecord
+from plumbline.processes.workers import Outcome, Packed, Task
 from plumbline.scenario.loader import Scenario
 from plumbline.truth import ground_truth
 from plumbline.truth.closed_form import exact_samples
@@ -137,11 +138,11 @@ class ScenarioRun:
         self._pending = set(self._keys)  # without an outcome
         self._findings: dict[TaskKey, JudgingResult] = {}
         self._has_retried_truth = False
-        self._pickled_truths: dict[TaskKind, Pickled] = {}  # for judges and diagnoses in workers
+        self._packed_truths: dict[TaskKind, Packed] = {}  # for judges and diagnoses in workers
         count = plan.random_state_count
         count = min(count, STATES_PER_RANDOM_SCENARIO) if is_random else count
         states = compared_states(scenario.model, scenario.state, scenario.seed, count)
-        self._states = Pickled.of(states)  # argument of many tasks
+        self._states = EncodedRecord.of(states, list[State])  # argument of many tasks
         self._step_states = states[:STEP_STATES]
 
     def tasks(self) -> Iterator[Task]:
@@ -247,7 +248,7 @@ class ScenarioRun:
         elif key.is_truth:
             self.truths[key.kind] = TruthFailure(outcome.failure) if outcome.failure else outcome.value
             if not outcome.failure:
-                self._pickled_truths[key.kind] = outcome.pickled
+                self._packed_truths[key.kind] = outcome.packed
             following = [self._cell_task(k) for k in self._keys if k.needed_truth == key.kind]
         else:
             found = self._findings[key] = self._judged(outcome)
@@ -378,7 +379,7 @@ class ScenarioRun:
             is_regular = s.closed_form is not None
             return judge_long_runs, (context, s.model, self._integrator(key), is_regular)
         assert key.needed_truth is not None
-        truth = self._pickled_truths.get(key.needed_truth)
+        truth = self._packed_truths.get(key.needed_truth)
         if truth is None:
             return None, ()
         if key.kind == TaskKind.STATE:
@@ -434,7 +435,7 @@ class ScenarioRun:
         call: Callable[..., Diagnosis] = explain_disagreement
         arguments: tuple[Any, ...] = ()
         if key.kind == TaskKind.STATE:
-            truth = self._pickled_truths[TaskKind.STATE_TRUTH]
+            truth = self._packed_truths[TaskKind.STATE_TRUTH]
             arguments = (base, model, answer.value.quantities, truth, is_known)
         else:
             call = explain_disagreeing_steps

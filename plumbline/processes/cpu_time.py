@@ -92,9 +92,9 @@ class CpuTimes:
                 with times.measure("storage"):
                     return result_cache.get(task)
 
-            def put(self, task: Task, outcome: Outcome) -> None:
+            def put(self, task: Task, outcome: Outcome) -> Outcome:
                 with times.measure("storage"):
-                    result_cache.put(task, outcome)
+                    return result_cache.put(task, outcome)
 
         return TimedCache()
 

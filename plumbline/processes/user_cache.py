@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import os
 import pickle
+import shlex
+import stat
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +22,15 @@ class DamagedFile(ValueError):
     """The content of a file does not fit its checksum."""
 
 
-class CheckedFiles:
-    """Files of one folder, each written whole or not at all.
+class UntrustedFolder(PermissionError):
+    """Another user owns a folder of the cache or can write to it; ``strerror`` says so."""
 
-    No file is flushed to the disk: after a power failure, its checksum shows that it is damaged.
+
+class CheckedFiles:
+    """Files of one folder of the user's cache, each written whole or not at all.
+
+    No file is flushed to the disk: after a power failure, its checksum shows that it is damaged.  It covers
+    the file's name too.  Nothing is read from or written to a folder that `check_ownership` refuses.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -32,6 +41,11 @@ class CheckedFiles:
 
         """
         self._folder = folder
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the files."""
+        return self._folder
 
     def path(self, name: str) -> Path:
         """Locate a file.
@@ -61,11 +75,14 @@ class CheckedFiles:
         """
         path = self.path(name)
         try:
-            data = path.read_bytes()
+            with path.open("rb") as file:
+                check_ownership(self._folder)
+                _check_owner(path, os.fstat(file.fileno()))
+                data = file.read()
         except FileNotFoundError:
             return None
         body = data[_CHECKSUM_SIZE:]
-        if hashlib.sha256(body).digest() != data[:_CHECKSUM_SIZE]:
+        if _checksum(name, body) != data[:_CHECKSUM_SIZE]:
             raise DamagedFile(f"{path}: damaged")
         with contextlib.suppress(OSError):
             os.utime(path)
@@ -82,11 +99,11 @@ class CheckedFiles:
             OSError: the file cannot be written.
 
         """
-        self._folder.mkdir(parents=True, exist_ok=True)
+        make_private_folder(self._folder)
         handle, temporary = tempfile.mkstemp(dir=self._folder, prefix=".new-")
         try:
             with os.fdopen(handle, "wb") as file:
-                file.write(hashlib.sha256(body).digest() + body)
+                file.write(_checksum(name, body) + body)
             os.replace(temporary, self.path(name))
         except BaseException:
             with contextlib.suppress(OSError):  # the first error is the one to report
@@ -101,7 +118,8 @@ class CheckedFiles:
 
         """
         found = []
-        with contextlib.suppress(FileNotFoundError):
+        with contextlib.suppress(OSError):
+            check_ownership(self._folder)
             for entry in os.scandir(self._folder):
                 with contextlib.suppress(OSError):  # another run may have removed it
                     about = entry.stat()
@@ -113,6 +131,53 @@ class CheckedFiles:
             with contextlib.suppress(OSError):
                 os.unlink(path)
                 excess -= size
+
+
+def _checksum(name: str, body: bytes) -> bytes:
+    return hashlib.sha256(name.encode() + b"\0" + body).digest()
+
+
+def make_private_folder(folder: Path) -> None:
+    """Make a folder of the user's cache, in which only the user may write; raise OSError where others may."""
+    for part in _parts_in_cache(folder):
+        part.parent.mkdir(parents=True, exist_ok=True)
+        part.mkdir(mode=0o700, exist_ok=True)
+    check_ownership(folder)
+
+
+def check_ownership(folder: Path) -> None:
+    """Raise `UntrustedFolder` if another user may have written to a folder of the cache.
+
+    Some files of the cache are code, and all of them are answers that are believed.
+    """
+    for part in _parts_in_cache(folder):
+        _check_owner(part, part.stat())
+
+
+def describe_failure(error: OSError, folder: Path) -> str:
+    """Describe why a folder of the user's cache cannot be used, and where another one is named."""
+    place = folder if error.filename is None else error.filename
+    return f"{place}: {error.strerror} (the variable PLUMBLINE_CACHE names another folder for the cache)"
+
+
+def _parts_in_cache(folder: Path) -> list[Path]:
+    """The cache folder and those in it that lead to ``folder``; a folder elsewhere alone."""
+    top = user_cache_folder()
+    if not folder.is_relative_to(top):
+        return [folder]
+    return [part for part in (*reversed(folder.parents), folder) if part.is_relative_to(top)]
+
+
+def _check_owner(path: Path, about: os.stat_result) -> None:
+    if os.name == "nt":
+        return
+    if about.st_uid not in (os.geteuid(), 0):
+        reason = f"it belongs to another user (number {about.st_uid})"
+    elif about.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        reason = f"other users may write to it; `chmod go-w {shlex.quote(str(path))}` ends that"
+    else:
+        return
+    raise UntrustedFolder(errno.EPERM, reason, str(path))
 
 
 def user_cache_folder() -> Path:
@@ -149,11 +214,12 @@ def content_key(*parts: bytes | str) -> str:
     return digest.hexdigest()
 
 
-def recall(key: str) -> Any:
+def recall(key: str, is_fit: Callable[[Any], bool] = lambda _: True) -> Any:
     """Read a remembered value.
 
     Args:
         key: of `content_key`.
+        is_fit: whether a value is one that was remembered under this key.
 
     Returns:
         The value; None where there is none, or none that can be read.
@@ -161,7 +227,8 @@ def recall(key: str) -> Any:
     """
     try:
         body = _remembered().read(key)
-        return None if body is None else pickle.loads(body)
+        value = None if body is None else pickle.loads(body)
+        return value if is_fit(value) else None
     except Exception:  # damaged, or of another version of what made it: it is made again
         return None
 

@@ -29,14 +29,13 @@ from typing import TYPE_CHECKING, Any, Self
 
 from plumbline.processes.errors import PlumblineError
 from plumbline.processes.isolation import ScratchFolder, die_with_parent
+from plumbline.processes.record_encoding import EncodedRecord
 from plumbline.processes.remote_python import RemoteCrash, RemoteError, call_remote, call_timed, describe_exit
+from plumbline.processes.worker_environment import SINGLE_THREAD, TEMPORARY_FOLDER, worker_environment
 
 if TYPE_CHECKING:
     from pebble import ProcessPool
 
-_SINGLE_THREAD_ENV = dict.fromkeys(
-    ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"), "1"
-)
 _POLL_INTERVAL = 0.2  # s between checks for tasks that run too long
 _MAX_POLL_GAP = 2.0  # s: a longer time between two checks is one in which this process was stopped, or busy
 _WARM_MODULE = "plumbline.processes.warm"
@@ -77,6 +76,9 @@ class Pickled:
         return pickle.loads(self.data)
 
 
+Packed = Pickled | EncodedRecord
+
+
 @dataclass(frozen=True)
 class Limits:
     """What one task may use."""
@@ -87,7 +89,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Task:
-    """A call to make in a worker; pickled arguments are loaded there."""
+    """A call to make in a worker; arguments that are bytes of a value are loaded there."""
 
     key: Any  # hashable
     function: Callable[..., Any]  # can be pickled
@@ -106,7 +108,7 @@ class Outcome:
     """The answer to a task, or the reason why there is none."""
 
     key: Any
-    raw_value: Any = None  # the answer, or its pickle as the worker sent it
+    raw_value: Any = None  # the answer, or bytes of it as the worker or the result cache gave them
     failure: str | None = None
     cpu_time: float = 0.0  # s of the call
     judge_result: Any = None  # what the task's judge returned
@@ -119,12 +121,12 @@ class Outcome:
     @property
     def value(self) -> Any:
         """The answer, loaded anew at every access."""
-        return self.raw_value.load() if isinstance(self.raw_value, Pickled) else self.raw_value
+        return _load(self.raw_value)
 
     @property
-    def pickled(self) -> Pickled:
-        """The answer as a pickle."""
-        return self.raw_value if isinstance(self.raw_value, Pickled) else Pickled.of(self.raw_value)
+    def packed(self) -> Packed:
+        """The answer as bytes, to be loaded where it is used."""
+        return self.raw_value if isinstance(self.raw_value, Packed) else Pickled.of(self.raw_value)
 
 
 class ExecutorUnavailable(PlumblineError):
@@ -150,14 +152,18 @@ class ResultCache:
         """
         return None
 
-    def put(self, task: Task, outcome: Outcome) -> None:
+    def put(self, task: Task, outcome: Outcome) -> Outcome:
         """Take note of an outcome.
 
         Args:
             task: the call that was made.
             outcome: its answer or failure.
 
+        Returns:
+            The outcome; its answer may have another representation, of which a later run has an equal one.
+
         """
+        return outcome
 
 
 class Executor(ABC):
@@ -261,8 +267,7 @@ class Scheduler:
                 return
             for task, outcome in self._executor.collect():
                 pending -= 1
-                self._cache.put(task, outcome)
-                yield outcome
+                yield self._cache.put(task, outcome)
 
 
 class WorkerPool(Executor):
@@ -316,7 +321,7 @@ class WorkerPool(Executor):
             max_workers=self._jobs,
             context=start_warm_process(),
             initializer=initialize_worker,
-            initargs=(str(self._scratch.path), self.limits.gigabytes, os.getpid(), dict(os.environ)),
+            initargs=(str(self._scratch.path), self.limits.gigabytes, os.getpid(), worker_environment()),
         )
 
     def collect(self) -> list[tuple[Task, Outcome]]:
@@ -360,7 +365,7 @@ def start_warm_process() -> BaseContext:
         What starts workers: forked from that process, or anew where a platform cannot fork.
 
     """
-    os.environ.update(_SINGLE_THREAD_ENV)  # inherited by the workers, before NumPy loads there
+    os.environ.update(SINGLE_THREAD)  # inherited by the workers, before NumPy loads there
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return multiprocessing.get_context("spawn")
     _keep_sockets_in_scratch_folder()
@@ -403,7 +408,7 @@ def run_task(task: Task) -> Outcome:
 
 
 def _call_and_judge(task: Task) -> Outcome:
-    arguments = _load(task.arguments)
+    arguments = [_load(one) for one in task.arguments]
     if task.python:
         value, cost = call_remote(task.python, call_timed, task.function, *arguments)
     else:
@@ -413,7 +418,7 @@ def _call_and_judge(task: Task) -> Outcome:
         begin = time.process_time()
         try:
             # a copy, whose arrays lie in memory alike wherever the call was made: sums depend on that
-            judged = task.judge(*_load(task.judge_arguments), answer.load())
+            judged = task.judge(*map(_load, task.judge_arguments), answer.load())
         except MemoryError:
             raise
         except Exception as error:  # the harness's, not the engine's
@@ -426,8 +431,8 @@ def _call_and_judge(task: Task) -> Outcome:
     return Outcome(task.key, answer if is_needed else None, None, cost, judged, failure, judging, overhead)
 
 
-def _load(arguments: Sequence[Any]) -> list[Any]:
-    return [one.load() if isinstance(one, Pickled) else one for one in arguments]
+def _load(value: Any) -> Any:
+    return value.load() if isinstance(value, Packed) else value
 
 
 def _outcome_from_future(task: Task, future: Future[Outcome]) -> Outcome:
@@ -464,6 +469,10 @@ def initialize_worker(scratch: str, gigabytes: float, parent: int, environment: 
     os.environ.clear()
     os.environ.update(environment)
     os.chdir(tempfile.mkdtemp(dir=scratch))
+    os.environ.update(
+        dict.fromkeys(TEMPORARY_FOLDER, os.getcwd())
+    )  # removed with it, if the worker is killed
+    tempfile.tempdir = None  # as found before
     sink = os.open(os.devnull, os.O_WRONLY)
     os.dup2(sink, 1)
     os.dup2(sink, 2)

@@ -63,7 +63,7 @@ def read_yaml(path: Path) -> YamlSource:
         at = before.count(b"\n") + 1, len(before.rpartition(b"\n")[2].decode("utf-8-sig", "replace")) + 1
         raise source.fatal_error(f"byte 0x{raw[error.start]:02x} is not UTF-8", "UTF-8 text", at) from None
     key = content_key("YAML", *_parser_code(), raw)
-    if (parsed := recall(key)) is not None:
+    if (parsed := recall(key, lambda found: len(found) == 3)) is not None:
         source.data, source.value_positions, source.key_positions = parsed
         return source
     from plumbline.scenario.yaml_parser import parse_yaml  # only files that no run has read yet need it

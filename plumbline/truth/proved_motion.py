@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import pickle
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +11,14 @@ import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State, Trajectory
 from plumbline.model.kinematics import quaternion_rate
-from plumbline.processes.user_cache import CheckedFiles, DamagedFile, content_key, user_cache_folder
+from plumbline.processes.record_encoding import UnfitRecord, decode_record, encode_record
+from plumbline.processes.user_cache import (
+    CheckedFiles,
+    DamagedFile,
+    content_key,
+    describe_failure,
+    user_cache_folder,
+)
 from plumbline.truth import import_truth_tool
 from plumbline.truth.enclosure import checked_numbers, checked_topology
 
@@ -73,7 +79,7 @@ def _rounded(balls: Array) -> tuple[Array, Array]:
     return rounded, np.max(np.linalg.norm(distance.astype(float), axis=-1), axis=-1) * up
 
 
-def store_proof(model: Model, state: State, times: Array, proof: ProvedMotion) -> None:
+def store_proof(model: Model, state: State, times: Array, proof: ProvedMotion) -> str:
     """Keep a proved motion for later runs.
 
     Args:
@@ -82,13 +88,17 @@ def store_proof(model: Model, state: State, times: Array, proof: ProvedMotion) -
         times: (T,) [s] of the samples.
         proof: the motion.
 
-    Raises:
-        OSError: the file cannot be written.
+    Returns:
+        Why it is not kept; empty where it is.
 
     """
     files = _files()
-    files.write(_name(model, state, times), pickle.dumps(proof, protocol=5))
+    try:
+        files.write(_name(model, state, times), encode_record(proof))
+    except OSError as error:
+        return f"the proved motion is not kept for later runs: {describe_failure(error, files.folder)}"
     files.trim(MAX_BYTES)
+    return ""
 
 
 def find_proof(model: Model, state: State, times: Array) -> ProvedMotion | None:
@@ -105,12 +115,10 @@ def find_proof(model: Model, state: State, times: Array) -> ProvedMotion | None:
     """
     if model.has_loops:
         return None
-    body = None
-    with contextlib.suppress(OSError, DamagedFile):
-        body = _files().read(_name(model, state, times))
-    if body is None:
-        return None
-    proof: ProvedMotion = pickle.loads(body)
+    proof: ProvedMotion | None = None
+    with contextlib.suppress(OSError, DamagedFile, UnfitRecord):
+        if body := _files().read(_name(model, state, times)):
+            proof = decode_record(body, ProvedMotion)
     return proof
 
 

@@ -255,7 +255,7 @@ def _compiled_integrator(joints: _Joints, drag: bool, precision: Precision, orde
     key = content_key(
         "Taylor", code, hy.__version__, processor_features(), repr((joints, drag, precision, order))
     )
-    integrator = recall(key)
+    integrator = recall(key, lambda found: hasattr(found, "propagate_grid"))
     if integrator is None:
         integrator = _compile_integrator(hy, joints, drag, precision, order)
         remember(key, integrator)

@@ -198,7 +198,7 @@ class Killed(Exception):
     pass
 
 
-def test_an_unfinished_night_goes_on_with_its_seed(tmp_path):
+def test_an_unfinished_night_goes_on_with_its_seed(tmp_path, own_cells):
     def progress(done, *_):
         if done == 4:
             raise Killed
@@ -207,12 +207,14 @@ def test_an_unfinished_night_goes_on_with_its_seed(tmp_path):
         run_nightly(tmp_path, seed=None, progress=progress)
     begun = json.loads((tmp_path / "unfinished" / "plan.json").read_text())
     assert not (tmp_path / "history").exists()
-    kept = sorted(tmp_path.glob("unfinished/cells/*.cell"))
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["plan.json", "unfinished"], "cells are private"
+    kept = sorted(own_cells.parent.glob("nights/*/*.cell"))
     assert len(kept) == 1 + 4, "the description of the engine and the finished cells"
     for path in kept:  # what is kept is used: no cell of it is written again
         path.chmod(0o400)
     result, _ = run_nightly(tmp_path, seed=None)
     assert result.metadata["seed"] == begun["seed"] and result.metadata["started"] == begun["started"]
+    assert not any(path.exists() for path in kept), "a finished night removes its cells"
     uninterrupted, _ = run_nightly(tmp_path / "calm", seed=begun["seed"])
     assert [(r.key, r.value, r.verdict) for r in result.rows] == [
         (r.key, r.value, r.verdict) for r in uninterrupted.rows

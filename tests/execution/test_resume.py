@@ -19,7 +19,7 @@ from click.testing import CliRunner
 
 from plumbline.cli.main import main
 from plumbline.engines import calls
-from plumbline.execution import result_cache
+from plumbline.execution import environment_fingerprint
 from plumbline.execution.plan import Plan
 from plumbline.execution.result_cache import DiskResultCache, task_hash
 from plumbline.execution.runner import run_plan
@@ -158,7 +158,7 @@ def run_and_count(cells, stop_after=None):
     def counting(task, outcome):
         nonlocal ran
         ran += 1
-        put(task, outcome)
+        return put(task, outcome)
 
     cells.put = counting
 
@@ -287,9 +287,9 @@ def test_another_installation_has_other_cells(tmp_path, monkeypatch, file):
     hashes = set()
     for size in (1, 2):
         (tmp_path / file).write_text("x" * size)
-        result_cache._environment_fingerprint.cache_clear()
+        environment_fingerprint.environment_fingerprint.cache_clear()
         hashes.add(task_hash(task))
-    result_cache._environment_fingerprint.cache_clear()
+    environment_fingerprint.environment_fingerprint.cache_clear()
     assert len(hashes) == 2
 
 
@@ -297,8 +297,8 @@ def test_another_processor_has_other_cells(monkeypatch):
     """The last bits of results depend on its vector instructions."""
     task, hashes = Task("a", quiet), set()
     for features in ("flags: fma", "flags: fma avx512f"):
-        monkeypatch.setattr(result_cache, "processor_features", lambda features=features: features)
-        result_cache._environment_fingerprint.cache_clear()
+        monkeypatch.setattr(environment_fingerprint, "processor_features", lambda features=features: features)
+        environment_fingerprint.environment_fingerprint.cache_clear()
         hashes.add(task_hash(task))
-    result_cache._environment_fingerprint.cache_clear()
+    environment_fingerprint.environment_fingerprint.cache_clear()
     assert len(hashes) == 2

@@ -1,0 +1,153 @@
+"""What answers depend on besides their task: code, installed files, variables and the processor, as one hash.
+
+The files that tasks import from this checkout are hashed by content.  Of the ten thousand others path, size
+and times are hashed.  No program can set the time at which a file's inode changed last (ctime): a file that
+is patched and given its old time, or replaced by another of its size, differs too.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import sys
+import sysconfig
+from collections.abc import Iterable, Iterator
+from functools import cache
+from importlib.machinery import all_suffixes
+from pathlib import Path
+from typing import Any
+from urllib.parse import unquote, urlsplit
+
+from plumbline.processes.processor import processor_features
+from plumbline.processes.worker_environment import hashed_environment
+
+ROOT = Path(__file__).resolve().parents[2]
+_HASHED_PACKAGES = ("plumbline", "adapters", "reference_impl")
+# Tasks call functions of the packages below these; tests/architecture checks that those import none of them.
+_UNHASHED_PACKAGES = ("plumbline/cli", "plumbline/execution", "plumbline/reproduce", "plumbline/storage",
+                      "plumbline/studies", "plumbline/judging/known_issues.yaml")  # fmt: skip
+_UNIMPORTED_FOLDERS = {"tests", "reports", "bench", "tools"}  # of the checkout, by tasks
+# never read by an import; half of the files that are installed
+_SOURCES_OF_COMPILERS = (".hpp", ".hxx", ".ipp", ".h", ".c", ".cpp", ".f90", ".pxd", ".pyi", ".cmake")
+_UNREAD_FOLDERS = {"__pycache__", ".git"}
+_LIBRARY_FOLDERS = ("LD_", "DYLD_")  # variables whose folders the dynamic linker searches
+
+_FileIdentity = tuple[str, int, int, int]  # path, size, times of change of content and inode [ns]
+
+
+@cache
+def environment_fingerprint(python: str = "") -> str:
+    """Hash what every answer of this process's tasks depends on.
+
+    Args:
+        python: interpreter of another environment that makes the calls; empty: that of this process.
+
+    Returns:
+        The SHA-256 as hexadecimal text.
+
+    """
+    digest = hashlib.sha256()
+    if python:
+        digest.update(environment_fingerprint().encode())
+        facts: list[Any] = sorted(installed_files([Path(python).parent.parent]))
+    else:
+        for path in _project_files():
+            digest.update(f"{path.relative_to(ROOT)} {path.stat().st_size}\n".encode())
+            digest.update(path.read_bytes())
+        variables = hashed_environment()
+        facts = [sys.version, processor_features(), sys.path, sorted(variables.items())]
+        facts += [*sorted(installed_files(_import_folders())), *_named_files(variables)]
+    digest.update(json.dumps(facts).encode())
+    return digest.hexdigest()
+
+
+def _project_files() -> Iterator[Path]:
+    for folder in _HASHED_PACKAGES:
+        for path in sorted((ROOT / folder).rglob("*")):
+            name = path.relative_to(ROOT).as_posix()
+            if "__pycache__" not in path.parts and not name.startswith(_UNHASHED_PACKAGES) and path.is_file():
+                yield path
+
+
+def _import_folders() -> list[Path]:
+    """The folders that Python imports from, without the standard library, which belongs to its version."""
+    standard = {os.path.realpath(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib")}
+    skipped = {*standard, *(os.path.join(path, "lib-dynload") for path in standard)}
+    return [Path(path) for path in map(os.path.realpath, sys.path) if path not in skipped]
+
+
+def installed_files(folders: Iterable[Path]) -> set[_FileIdentity]:
+    """Identify the files in folders, and in those that are linked from there.
+
+    A package that is installed for editing lies elsewhere: its `direct_url.json` (PEP 610) or a `.pth` file
+    names the folder.
+
+    Args:
+        folders: folders that Python imports from, or environments.
+
+    Returns:
+        The identities of all files but those that no import reads.
+
+    """
+    waiting, seen, found = [str(folder) for folder in folders], set[tuple[int, int]](), set[_FileIdentity]()
+    while waiting:
+        folder = waiting.pop()
+        with contextlib.suppress(OSError):
+            about = os.stat(folder)
+            if (about.st_dev, about.st_ino) in seen:
+                continue
+            seen.add((about.st_dev, about.st_ino))
+            with os.scandir(folder) as entries:
+                for entry in entries:
+                    if not _may_be_read(folder, entry):
+                        continue
+                    if entry.is_dir():  # a link comes last, so that files have the same paths each time
+                        waiting.insert(0 if entry.is_symlink() else len(waiting), entry.path)
+                    else:
+                        with contextlib.suppress(OSError):  # a link to nothing
+                            found.add(_identity(entry.path, entry.stat()))
+                        if entry.name == "direct_url.json" or entry.name.endswith(".pth"):
+                            waiting += _linked_folders(Path(entry.path))
+    return found
+
+
+def _may_be_read(folder: str, entry: os.DirEntry[str]) -> bool:
+    """Whether tasks may read a file or what is in a folder; this checkout has results besides its modules."""
+    if folder == str(ROOT):
+        if entry.name in (*_HASHED_PACKAGES, *_UNIMPORTED_FOLDERS):  # the former by content
+            return False
+        return Path(entry, "__init__.py").exists() or entry.name.endswith(tuple(all_suffixes()))
+    return entry.name not in _UNREAD_FOLDERS and not entry.name.endswith(_SOURCES_OF_COMPILERS)
+
+
+def _linked_folders(path: Path) -> list[str]:
+    """The folders elsewhere that a file of an installation names."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        if path.suffix == ".pth":
+            lines = (line.strip() for line in text.splitlines())
+            names = [line for line in lines if line and not line.startswith(("#", "import ", "import\t"))]
+            return [str(path.parent / name) for name in names]
+        about = json.loads(text)
+        return [unquote(urlsplit(about["url"]).path)] if about["dir_info"]["editable"] else []
+    except (OSError, ValueError, LookupError, TypeError):
+        return []
+
+
+def _named_files(variables: dict[str, str]) -> list[_FileIdentity]:
+    """Identify the files that variables name, and those in folders that the dynamic linker searches."""
+    found = []
+    for name, value in variables.items():
+        for part in filter(os.path.isabs, value.split(os.pathsep)):
+            with contextlib.suppress(OSError, ValueError):
+                paths = [part]
+                if os.path.isdir(part) and name.startswith(_LIBRARY_FOLDERS):
+                    paths = sorted(entry.path for entry in os.scandir(part))
+                found += [_identity(path, os.stat(path)) for path in paths if os.path.isfile(path)]
+    return found
+
+
+def _identity(path: str, about: os.stat_result) -> _FileIdentity:
+    return path, about.st_size, about.st_mtime_ns, about.st_ctime_ns
