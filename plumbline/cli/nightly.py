@@ -143,8 +143,9 @@ def run_nightly(
 
     """
     unfinished, history = out / "unfinished", out / "history"
+    was_begun = unfinished.exists()
     night = NightPlan.resume_or_start(unfinished, seed, random_count)
-    if _is_recorded(night, history):  # interrupted when only the clean-up was left
+    if was_begun and _is_recorded(night, history):  # interrupted when only the clean-up was left
         shutil.rmtree(unfinished)
         DiskResultCache(night_cells_folder(night.token)).clear()
         night = NightPlan.resume_or_start(unfinished, seed, random_count)

@@ -207,7 +207,9 @@ def test_an_unfinished_night_goes_on_with_its_seed(tmp_path, own_cells):
         run_nightly(tmp_path, seed=None, progress=progress)
     begun = json.loads((tmp_path / "unfinished" / "plan.json").read_text())
     assert not (tmp_path / "history").exists()
-    assert sorted(path.name for path in tmp_path.rglob("*")) == ["plan.json", "unfinished"], "cells are private"
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["plan.json", "unfinished"], (
+        "cells are private"
+    )
     kept = sorted(own_cells.parent.glob("nights/*/*.cell"))
     assert len(kept) == 1 + 4, "the description of the engine and the finished cells"
     for path in kept:  # what is kept is used: no cell of it is written again

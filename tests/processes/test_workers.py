@@ -105,6 +105,7 @@ class Remembering(ResultCache):
 
     def put(self, task, outcome):
         self.kept.append(outcome.key)
+        return outcome
 
 
 def test_the_scheduler_takes_submitted_tasks_first_and_cached_answers_at_once():

@@ -15,28 +15,13 @@ import pytest
 from plumbline.cli import nightly
 from plumbline.execution import runner
 from plumbline.execution.plan import Plan
-from plumbline.processes import workers
-from plumbline.processes.workers import Executor, Limits
+from plumbline.processes.workers import Limits
 from plumbline.scenario import loader
 from plumbline.storage.history import History
+from tests.helpers.in_process import InProcessWorkers
 
 ROOT = Path(__file__).resolve().parents[2]
 DISK_ERRORS = [errno.ENOSPC, errno.EIO, errno.EROFS, errno.EDQUOT]
-
-
-class InProcessWorkers(Executor):
-    """Stands for the pool of workers: the same calls in this process, so that hundreds of runs are quick."""
-
-    capacity = 1
-
-    def __init__(self, jobs, limits=None):
-        self.limits = limits or Limits()
-
-    def start(self, task):
-        self.task = task
-
-    def collect(self):
-        return [(self.task, workers.run_task(self.task))]
 
 
 class FaultyDisk:
