@@ -23,6 +23,16 @@ class JointKind(NamedTuple):
     motions: tuple[tuple[Literal["turn", "slide"], int], ...] = ()
     has_attitude: bool = False  # whether p of the near body is a coordinate, not a result
 
+    @property
+    def holds_distance(self) -> bool:
+        """Whether it holds the distance of its two points, not the points together."""
+        return ("d", "d") in self.rows
+
+    @property
+    def holds_nothing(self) -> bool:
+        """Whether the near body is free."""
+        return not self.rows
+
 
 _POINT = (("i", "d"), ("j", "d"), ("k", "d"))
 _ATTITUDE = (("x", "Y"), ("y", "Z"), ("z", "X"))

@@ -207,7 +207,6 @@ def term_scales(
         ),
         "joint_reaction": force,
         "joint_moment": max(size.get("joint_moment", 0.0), force * lever),
-        "tension": force,
         "kinetic_energy": size["kinetic_energy"],
         "potential_energy": max(size["potential_energy"], mass * g * lever + element_sizes[2]),
         "angular_momentum": max(size["angular_momentum"], (mass * lever**2 + inertia) * rate),

@@ -1,16 +1,9 @@
 """Certified truth at one state: rigorous enclosures in ball arithmetic (python-flint).
 
-Of a chain on rods and balls; other mechanisms are in `certified_tree` and `certified_loop`.
-The minimal coordinates (p, ω′, u, u̇ as doubles) are normalised, positions and velocities follow from them,
-and the Newton–Euler equations are solved for the joint forces: eliminated onto the joints, the system is
-symmetric, positive definite and block-tridiagonal, so that a chain costs O(N).  With s̃ the cross-product
-matrix, and s and I in world axes, the mobility between two points of a body is
-
-    Y(s, t) = 1/m − s̃ I⁻¹ t̃        (force at t → acceleration at s)
-
-and joint k, with E = 1 for a ball and u for a rod, requires E_kᵀ d̈_k = −ℓ u̇² (rod) or 0 (ball), with the
-force F_k = E_k λ_k.
-Every quantity has a radius that encloses all roundings of its computation.
+The minimal coordinates as doubles are normalised, positions and velocities follow from them, and the
+equations of motion of `plumbline.equations.tree` are solved in balls; mechanisms with loops are in
+`certified_loop`.  Every quantity has a radius that encloses all roundings of its computation, and the whole
+solution is checked by the definition of the mechanism (`definition`).
 """
 
 from __future__ import annotations
@@ -18,18 +11,19 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
-import numpy as np
-
-from plumbline.model.datatypes import Array, Model, State, StateQuantities
+from plumbline.equations.balls import balls as ball_arithmetic
+from plumbline.equations.tree import Tree
+from plumbline.model.datatypes import Model, State, StateQuantities
 from plumbline.model.loops import determinate_part
 from plumbline.processes.errors import PlumblineError
 from plumbline.truth import import_truth_tool
-from plumbline.truth.balls import BallArithmetic, entries, flatten, midpoints, term_scales
+from plumbline.truth.balls import entries, flatten, midpoints
 from plumbline.truth.certified_loop import enclose_loop
-from plumbline.truth.certified_tree import enclose_tree
+from plumbline.truth.certified_tree import quantity_scales
 from plumbline.truth.definition import definition_holds
 
 MAX_RELATIVE_RADIUS = 1e-25  # relative to the largest magnitude of the quantity's own terms
+FIRST_BITS, BITS_PER_BODY = 200, 4  # balls lose up to 4 bits from one body to the next
 MAX_BITS = 20_000
 MAX_GAP = 1e-13  # of rows of loops that depend on others, over lengths and speeds: more is another mechanism
 
@@ -43,13 +37,12 @@ class CertifiedQuantities:
     """State quantities with a bound of their error."""
 
     quantities: StateQuantities  # midpoints of the enclosures, rounded to double
-    tension: Array  # (J,) N, of each rod: 2 ℓ λ of the notes (E5), positive when it pulls; 0 for a ball joint
     radius: dict[str, float]  # per quantity: largest error of the midpoints, before rounding to double
     bits: int  # precision that was needed
 
 
 def certify_state(
-    model: Model, state: State, mass_matrix: bool = False, bits: int = 200
+    model: Model, state: State, mass_matrix: bool = False, bits: int | None = None
 ) -> CertifiedQuantities:
     """Compute state quantities with a rigorous bound of their error.
 
@@ -59,7 +52,7 @@ def certify_state(
         model: the mechanism.
         state: the state, of which the minimal coordinates are used.
         mass_matrix: whether to compute the mass matrix too.
-        bits: precision to start with.
+        bits: precision to start with; absent: `FIRST_BITS` and `BITS_PER_BODY`.
 
     Returns:
         The quantities, in SI units and the frames of `StateQuantities`.
@@ -70,6 +63,7 @@ def certify_state(
         TruthUnavailable: python-flint is not installed.
 
     """
+    bits = FIRST_BITS + BITS_PER_BODY * model.n if bits is None else bits
     while bits <= MAX_BITS:
         balls = enclose_quantities(model, state, bits, mass_matrix)
         if balls is not None and all(_is_sharp(name, balls) for name in balls if name != "scale"):
@@ -101,7 +95,7 @@ def certify_state(
         found = determinate_part(model, state, found)
     elif mass_matrix:
         found = replace(found, mass_matrix=middle["mass_matrix"])
-    return CertifiedQuantities(found, middle.get("tension", np.zeros(model.n)), radius, bits)
+    return CertifiedQuantities(found, radius, bits)
 
 
 def _definition_holds(model: Model, state: State, balls: dict[str, Any], bits: int) -> bool:
@@ -134,159 +128,36 @@ def enclose_quantities(
         try:
             if model.has_loops:
                 return enclose_loop(flint, model, state)
-            if not model.is_chain:
-                return enclose_tree(flint, model, state, mass_matrix)
-            return _solve_and_enclose(_BallChain(flint, model, state), mass_matrix)
+            return _enclose_tree(flint, model, state, mass_matrix)
         except ZeroDivisionError:
             return None
 
 
-class _BallChain(BallArithmetic):
-    """Model and state in balls: every vector is a 3×1 ``arb_mat`` in world axes; ``J`` is in body axes."""
+def _enclose_tree(flint: Any, model: Model, state: State, mass_matrix: bool) -> dict[str, Any]:
+    """All quantities of `enclose_quantities`, of a mechanism without loops."""
+    tree = Tree(ball_arithmetic(flint), model, state)
+    solution = tree.solve()
 
-    def __init__(self, flint: Any, model: Model, state: State) -> None:
-        super().__init__(flint, model)
-        self.A = [self.rotation(p) for p in state.p]
-        self.ell = [self.arb(float(length)) for length in model.length]
-        self.w = [a * self.vector(w) for a, w in zip(self.A, state.omega, strict=True)]
-        self.sp = [a * self.vector(s) for a, s in zip(self.A, model.proximal, strict=True)]
-        self.sd = [a * self.vector(s) for a, s in zip(self.A, model.distal, strict=True)]
-        self.I = [a * J * a.transpose() for a, J in zip(self.A, self.J, strict=True)]
-        self.I_inverse = [a * J.inv() * a.transpose() for a, J in zip(self.A, self.J, strict=True)]
-        self.u, self.udot = [], []
-        for k in range(self.n):
-            u, udot = self.rod_direction(state, k) if model.rods[k] else (self.zero, self.zero)
-            self.u.append(u)
-            self.udot.append(udot)
-        self.r, self.v = self.positions_and_velocities()
+    def in_body(vectors: list[Any]) -> list[list[Any]]:
+        return [entries(A.transpose() * x) for A, x in zip(tree.A, vectors, strict=True)]
 
-    def positions_and_velocities(self) -> tuple[list[Any], list[Any]]:
-        """Centres of mass and their velocities, from the pivot outwards."""
-        tip, tip_v, r, v = self.zero, self.zero, [], []
-        for k in range(self.n):
-            w = self.cross_matrix(self.w[k])
-            r.append(tip + self.u[k] * self.ell[k] - self.sp[k])
-            v.append(tip_v + self.udot[k] * self.ell[k] - w * self.sp[k])
-            tip, tip_v = r[k] + self.sd[k], v[k] + w * self.sd[k]
-        return r, v
-
-
-def _solve_and_enclose(c: _BallChain, mass_matrix: bool) -> dict[str, Any]:
-    """All quantities of `enclose_quantities`."""
-    free, turn, F = _solve_joint_forces(c)
-    acceleration, angular, kinetic, potential, momentum = [], [], c.arb(0), c.arb(0), c.zero
-    for k in range(c.n):
-        below = F[k + 1] if k + 1 < c.n else c.zero
-        acceleration.append(free[k] + (F[k] - below) * (1 / c.m[k]))
-        couple = c.cross_matrix(c.sp[k]) * F[k] - c.cross_matrix(c.sd[k]) * below
-        angular.append(c.A[k].transpose() * (turn[k] + c.I_inverse[k] * couple))
-        spin = c.I[k] * c.w[k]
-        kinetic += (c.m[k] * c.dot(c.v[k], c.v[k]) + c.dot(c.w[k], spin)) / 2
-        potential -= c.m[k] * c.dot(c.g, c.r[k])
-        momentum += c.cross_matrix(c.r[k]) * c.v[k] * c.m[k] + spin
     balls: dict[str, Any] = {
-        "acceleration": [entries(a) for a in acceleration],
-        "angular_acceleration": [entries(a) for a in angular],
-        "joint_reaction": [entries(f) for f in F],
-        "kinetic_energy": [kinetic],
-        "potential_energy": [potential],
-        "angular_momentum": entries(momentum),
-        "tension": [-c.dot(c.u[k], F[k]) for k in range(c.n)],
-        "r": [entries(r) for r in c.r],
-        "v": [entries(v) for v in c.v],
-        "attitude": [entries(A) for A in c.A],
-        "angular_velocity": [entries(A.transpose() * w) for A, w in zip(c.A, c.w, strict=True)],
+        "acceleration": [entries(a) for a in solution.acceleration],
+        "angular_acceleration": in_body(solution.turning),
+        "joint_reaction": [entries(f) for f in solution.force],
+        "kinetic_energy": [tree.kinetic],
+        "potential_energy": [tree.potential],
+        "angular_momentum": entries(tree.momentum),
+        "r": [entries(r) for r in tree.r],
+        "v": [entries(v) for v in tree.v],
+        "attitude": [entries(A) for A in tree.A],
+        "angular_velocity": in_body(tree.w),
     }
+    if not model.is_chain:  # whose joints hold no moments
+        balls["joint_moment"] = [entries(tree.zero if m is None else m) for m in solution.moment]
     if mass_matrix:
-        balls["mass_matrix"] = _mass_matrix(c)
-    return balls | {"scale": _term_scales(c, balls)}
-
-
-def _solve_joint_forces(c: _BallChain) -> tuple[list[Any], list[Any], list[Any]]:
-    """Accelerations r̈ and A ω̇′ without joint forces, and joint forces F, by block elimination."""
-    model, n = c.model, c.n
-    free, turn, near, far, Ypp, Ypd, Ydd = [], [], [], [], [], [], []
-    for k in range(n):
-        force = c.vector(model.force[k]) - c.v[k] * c.arb(float(model.drag_force[k])) + c.g * c.m[k]
-        moment = c.A[k] * c.vector(model.moment[k]) - c.w[k] * c.arb(float(model.drag_moment[k]))
-        w, sp, sd = c.cross_matrix(c.w[k]), c.cross_matrix(c.sp[k]), c.cross_matrix(c.sd[k])
-        free.append(force * (1 / c.m[k]))
-        turn.append(c.I_inverse[k] * (moment - w * (c.I[k] * c.w[k])))
-        near.append(free[k] - sp * turn[k] + w * (w * c.sp[k]))
-        far.append(free[k] - sd * turn[k] + w * (w * c.sd[k]))
-        inverse_mass = c.eye * (1 / c.m[k])
-        Ypp.append(inverse_mass - sp * c.I_inverse[k] * sp)
-        Ypd.append(inverse_mass - sp * c.I_inverse[k] * sd)
-        Ydd.append(inverse_mass - sd * c.I_inverse[k] * sd)
-
-    # K λ = e: forward elimination, back-substitution
-    E = [c.u[k] if model.rods[k] else c.eye for k in range(n)]
-    pivot: list[Any] = []
-    rhs: list[Any] = []
-    off: list[Any] = []
-    for k in range(n):
-        D, e = Ypp[k], near[k] * -1
-        if k:
-            D, e = D + Ydd[k - 1], e + far[k - 1]
-        D, e = E[k].transpose() * D * E[k], E[k].transpose() * e
-        if model.rods[k]:
-            e = e - c.mat(1, 1, [c.ell[k] * c.dot(c.udot[k], c.udot[k])])
-        if k:
-            off.append((E[k - 1].transpose() * Ypd[k - 1] * E[k]) * -1)
-            gain = off[-1].transpose() * pivot[-1]
-            D, e = D - gain * off[-1], e - gain * rhs[-1]
-        pivot.append(D.inv())
-        rhs.append(e)
-    F: list[Any] = [None] * n
-    multiplier = None
-    for k in reversed(range(n)):
-        e = rhs[k] if multiplier is None else rhs[k] - off[k] * multiplier
-        multiplier = pivot[k] * e
-        F[k] = E[k] * multiplier
-    return free, turn, F
-
-
-def _mass_matrix(c: _BallChain) -> list[list[Any]]:
-    """M (nu, nu) of `StateQuantities.mass_matrix`, from the velocities Σ T_bi ν_i of the centres b.
-
-    T_bi = c_i is the same for every body below i, so that with μ_j the mass below j, M_ij = c_iᵀ (m_j T_jj +
-    μ_j c_j) for i < j.
-    """
-    rods = [k for k in range(c.n) if c.model.rods[k]]
-    mass_below = [sum(c.m[k + 1 :], c.arb(0)) for k in range(c.n)]
-    # per column: its body, and the velocities of the centres below it and of its own centre
-    columns = []
-    for k in rods:
-        u_cross = c.cross_matrix(c.u[k])
-        swing = u_cross * u_cross * -c.ell[k]
-        columns.append((k, swing, swing))
-    for k in range(c.n):
-        sp, sd = c.cross_matrix(c.sp[k]), c.cross_matrix(c.sd[k])
-        columns.append((k, (sp - sd) * c.A[k], sp * c.A[k]))
-    size = 3 * len(columns)
-    M = [[c.arb(0)] * size for _ in range(size)]
-    for i, (bi, below_i, own_i) in enumerate(columns):
-        for j, (bj, below_j, own_j) in enumerate(columns):
-            if bj < bi:
-                continue
-            at_j = own_i if bi == bj else below_i
-            block = at_j.transpose() * own_j * c.m[bj] + below_i.transpose() * below_j * mass_below[bj]
-            if i == j and i >= len(rods):
-                block = block + c.J[bi]
-            for row in range(3):
-                for column in range(3):
-                    M[3 * i + row][3 * j + column] = block[row, column]
-                    M[3 * j + column][3 * i + row] = block[row, column]
-    return M
-
-
-def _term_scales(c: _BallChain, balls: dict[str, Any]) -> dict[str, float]:
-    """Sizes of the terms of each quantity, see `term_scales`."""
-    norm, model = np.linalg.norm, c.model
-    lever = float(np.sum(norm(model.proximal, axis=1) + norm(model.distal, axis=1) + model.length))
-    spins = c.w + [c.cross_matrix(c.u[k]) * c.udot[k] for k in range(c.n)]
-    rate = float(np.max(norm(midpoints([entries(w) for w in spins]), axis=1)))
-    return term_scales(model, balls, lever, rate)
+        balls["mass_matrix"] = tree.mass_matrix().tolist()
+    return balls | {"scale": quantity_scales(tree, balls)}
 
 
 def _is_sharp(name: str, balls: dict[str, Any]) -> bool:

@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from plumbline.equations.tree import Tree
 from plumbline.model.datatypes import KINDS, Model, State
-from plumbline.model.kinematics import own_rates, rate_count
 from plumbline.truth.ball_elements import ball_elements
 from plumbline.truth.balls import BallArithmetic, entries, midpoints, term_scales
 from plumbline.truth.element_terms import joint_elements, spring_terms
@@ -196,33 +196,6 @@ class BallTree(JointTree, BallArithmetic):
         return self.mat(6, 1, [*entries(moment), *entries(force)])
 
 
-def enclose_tree(flint: Any, model: Model, state: State, mass_matrix: bool) -> dict[str, Any]:
-    """Enclose every quantity of a tree at the working precision.
-
-    Args:
-        flint: the module python-flint.
-        model: the mechanism.
-        state: the state, of which the minimal coordinates are used.
-        mass_matrix: whether to compute the mass matrix too.
-
-    Returns:
-        As `plumbline.truth.certified.enclose_quantities`.
-
-    Raises:
-        ZeroDivisionError: the mass matrix is not invertible, at this precision.
-
-    """
-    c = BallTree(flint, model, state)
-    equations = equations_of_motion(c)
-    M, right = equations.M, equations.right
-    rates = entries(M.solve(c.mat(len(right), 1, right))) if right else []
-    balls = moving_quantities(c, equations, rates)
-    if mass_matrix:
-        T = _relative_rates(c, equations.first)
-        balls["mass_matrix"] = (T.transpose() * M * T).tolist()
-    return balls | {"scale": quantity_scales(c, balls)}
-
-
 @dataclass(frozen=True, eq=False)
 class TreeEquations:
     """M ν̇ = right in a tree's relative rates."""
@@ -275,7 +248,7 @@ def moving_quantities(
         applied: further wrenches (6, 1) on bodies: moment about the origin, force.
 
     Returns:
-        By quantity, as `enclose_tree`, without the mass matrix and the scales.
+        By quantity, as `plumbline.truth.certified.enclose_quantities`, without mass matrix and scales.
 
     """
     first, wrenches = equations.first, list(equations.wrenches)
@@ -317,49 +290,7 @@ def moving_quantities(
     }
 
 
-def _relative_rates(c: BallTree, first: list[int]) -> Any:
-    """The matrix from the rates ν of `StateQuantities.mass_matrix` to the relative ones.
-
-    A ball joint's are A ω′ − ω_far, a rod's besides tᵀ(u̇ − ω_far × u)/tᵀt along its tangents t.
-    """
-    rows = [[c.arb(0)] * rate_count(c.model) for _ in range(first[-1])]
-    spins: list[dict[int, Any]] = []  # of each body: column of ν → its angular velocity, world axes
-    rods = np.cumsum(c.model.rods) - 1
-    for k, own in enumerate(own_rates(c.model)):
-        kind, far = c.model.kind[k], c.far[k]
-        above = spins[far] if far >= 0 and kind != "free" else {}
-        spin, at = dict(above), first[k]
-        if kind == "rod":
-            u, _ = c.rod_direction(c.state, k)
-            for row, t in enumerate(c.tangents[k]):
-                scale = 1 / c.dot(t, t)
-                for i in range(3):
-                    rows[at + row][3 * int(rods[k]) + i] = t[i, 0] * scale
-                for column, w in above.items():
-                    rows[at + row][column] = -c.dot(t, c.cross_matrix(w) * u) * scale
-            at += 2
-        if kind == "free":
-            for i in range(3):
-                rows[at + i][own.start + i] = c.arb(1)
-            at += 3
-        if KINDS[kind].has_attitude:
-            spin = {}
-            for i in range(3):
-                spin[own.stop - 3 + i] = w = c.A[k] * c.units[i]
-                for row in range(3):
-                    rows[at + row][own.stop - 3 + i] = w[row, 0]
-            for column, w in above.items():
-                for row in range(3):
-                    rows[at + row][column] = -w[row, 0]
-        else:
-            for i in range(c.S[k].ncols()):
-                rows[at + i][own.start + i] = c.arb(1)
-                spin[own.start + i] = c.mat(3, 1, [c.S[k][row, i] for row in range(3)])
-        spins.append(spin)
-    return c.mat(rows) if rows else c.mat(0, 0)
-
-
-def quantity_scales(c: BallTree, balls: dict[str, Any]) -> dict[str, float]:
+def quantity_scales(c: BallTree | Tree, balls: dict[str, Any]) -> dict[str, float]:
     """Estimate the sizes of the terms of each quantity, see `term_scales`.
 
     Args:
@@ -375,8 +306,13 @@ def quantity_scales(c: BallTree, balls: dict[str, Any]) -> dict[str, float]:
     lever = max(lever, float(np.max(np.abs(midpoints(balls["r"])))))
     rate = float(np.max(norm(midpoints([entries(w) for w in c.w]), axis=1)))
     rate = max(rate, float(np.max(np.abs(c.state.xdot))), float(np.max(np.abs(c.state.udot))))
-    elements, springs = joint_elements(model, c.state, [np.zeros(6)] * model.n), spring_terms(model, c.state)
-    push, turn = (sum(e.size for e in elements if e.is_slide == is_slide) for is_slide in (True, False))
-    potential = springs.potential + sum(e.potential for e in elements)
-    sizes = push + float(np.sum(springs.size)), turn + float(np.sum(springs.moment_size)), potential
+    sizes = (0.0, 0.0, 0.0)
+    if model.has_elements:
+        elements, springs = (
+            joint_elements(model, c.state, [np.zeros(6)] * model.n),
+            spring_terms(model, c.state),
+        )
+        push, turn = (sum(e.size for e in elements if e.is_slide == is_slide) for is_slide in (True, False))
+        potential = springs.potential + sum(e.potential for e in elements)
+        sizes = push + float(np.sum(springs.size)), turn + float(np.sum(springs.moment_size)), potential
     return term_scales(model, balls, lever, rate, sizes)

@@ -211,14 +211,14 @@ class _Check:
         spin = self.omega[k] - self._vector(state.omega[k])
         self._equal(name, turned, 1.0, self._deviation)
         self._equal(f"rates of body {k + 1}", spin, self.unit_sizes[1], self._deviation)
-        rows = KINDS[model.kind[k]].rows
-        if ("d", "d") in rows:
+        kind = KINDS[model.kind[k]]
+        if kind.holds_distance:
             u, rate = (self._vector(x) for x in given[:2])
             u = u * (1 / self._dot(u, u).sqrt())
             rate = rate - u * self._dot(u, rate)
             ell = self.arb(float(model.length[k]))
             d = [d[0] - u * ell, d[1] - rate * ell]
-        elif not rows:
+        elif kind.holds_nothing:
             d = [self.r[k] - self._vector(state.r[k]), self.v[k] - self._vector(state.v[k])]
         else:
             return
@@ -229,7 +229,7 @@ class _Check:
 
     def _work_at_point(self, k: int, axes: list[list[Any]], d: Any) -> tuple[Any, Any]:
         """Of a joint that leaves the attitude free: it holds its point, its distance or nothing."""
-        model, rows, name = self.model, KINDS[self.model.kind[k]].rows, f"wrench of joint {k + 1}"
+        model, kind, name = self.model, KINDS[self.model.kind[k]], f"wrench of joint {k + 1}"
         a, c, stiffness = (self.arb(float(x[k, 0])) for x in (model.armature, model.damping, model.stiffness))
         (wa, ra), (wb, rb) = (self._spin(int(body)) for body in model.body[k])
         spin = wb - wa
@@ -242,10 +242,10 @@ class _Check:
         turn = z * (1 / theta.sinc()) if model.stiffness[k, 0] else self.zero
         moment = turn * stiffness + spin * c + (rb - ra - self._cross(wa) * spin) * a
         self._equal(name, self.moment[k] + moment, self.moment_size, self.slack)
-        if ("d", "d") in rows:
+        if kind.holds_distance:
             across = self._cross(d) * self.force[k]
             self._equal(name, across, self.moment_size, self.slack)
-        elif not rows:
+        elif kind.holds_nothing:
             self._equal(name, self.force[k], self.scale["joint_reaction"], self.slack)
         return a * self._dot(spin, spin) / 2, stiffness * self._dot(turn, turn) / 2
 

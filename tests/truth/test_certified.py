@@ -128,7 +128,6 @@ def test_a_rod_at_rest_hangs_by_its_weight():
     state = state_from_minimal(model, np.array([[1.0, 0, 0, 0]]), np.zeros((1, 3)), down, np.zeros((1, 3)))
     answer = certify_state(model, state)
     weight = model.mass * 9.81
-    assert answer.tension == pytest.approx(weight, rel=1e-15)
     assert np.all(answer.quantities.acceleration == 0)
     assert answer.quantities.joint_reaction[0] == pytest.approx([0, 0, weight[0]], rel=1e-15)
 

@@ -1,0 +1,540 @@
+"""The equations of motion of a tree of bodies on joints, in any kind of numbers.
+
+Articulated bodies (Featherstone, Rigid Body Dynamics Algorithms, 2008, chapter 7), each about its own joint's
+near point P and in world axes.  With the acceleration a of P and the angular acceleration α, the bodies from
+a joint on need the wrench
+
+    F = c a + b α + f,    N = bᵀa + i α + n,
+
+N about P.  A joint is made of at most two blocks: all turns, all slides, one turn or one slide, or the
+swing of a rod.  Each block takes its motions out, from the near body to the far one:
+
+    one motion S with effort τ and rotor a      M ← M − U Uᵀ/D,  U = M S,  D = SᵀU + a
+    all turns without rotors                    c ← c − b i⁻¹ bᵀ,  b = i = 0
+    the swing of a rod along u                  c ← u uᵀ/(uᵀ c⁻¹ u)
+
+What is exactly 0 after a block is not computed (None).  About the world's origin the same recursion loses a
+digit per body.  Whether a mechanism is a chain or a tree plays no part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from plumbline.equations.arithmetic import Arithmetic
+from plumbline.model.datatypes import KINDS, Model, State
+from plumbline.model.kinematics import own_rates, rate_count
+
+
+@dataclass(frozen=True, eq=False)
+class Articulated:
+    """F = c a + b α + f, N = bᵀa + i α + n; b, i and n are None where they are exactly 0."""
+
+    c: Any
+    b: Any
+    i: Any
+    f: Any
+    n: Any
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """What a tree does: lists over bodies and their joints, world axes."""
+
+    acceleration: list[Any]  # of the centres of mass
+    turning: list[Any]  # angular acceleration
+    force: list[Any]  # of joint k on body k
+    moment: list[Any]  # the same about the near point; None where it is exactly 0
+
+
+class _Swing:
+    """The near point moves on a sphere: uᵀa = uᵀa_far − ℓ u̇², F along u."""
+
+    armature = None
+
+    def __init__(self, num: Arithmetic, u: Any, pull: Any, length: Any) -> None:
+        self.num, self.u, self.pull, self.length = num, u, pull, length
+
+    def reduce(self, x: Articulated) -> Articulated:
+        num = self.num
+        self.f, self.inverse = x.f, num.inverse(x.c)
+        self.w = num.mul(self.inverse, self.u)
+        self.size = 1 / num.dot(self.u, self.w)
+        offset = (self.pull + num.dot(self.w, x.f)) * self.size
+        c = num.mul(self.u, num.transpose(self.u)) * self.size
+        return Articulated(c, None, None, self.u * offset, None)
+
+    def advance(self, a: Any, alpha: Any) -> tuple[Any, Any]:
+        num = self.num
+        tension = (num.dot(self.u, a) + self.pull + num.dot(self.w, self.f)) * self.size
+        return num.mul(self.inverse, self.u * tension - self.f), alpha
+
+
+class _Slides:
+    """The near point moves freely, with no force on it."""
+
+    armature = None
+
+    def __init__(self, num: Arithmetic) -> None:
+        self.num = num
+
+    def reduce(self, x: Articulated) -> Articulated:
+        self.x = x
+        nothing = self.num.vector(np.zeros(3))
+        return Articulated(self.num.matrix(np.zeros((3, 3))), None, None, nothing, None)
+
+    def advance(self, a: Any, alpha: Any) -> tuple[Any, Any]:
+        num = self.num
+        return num.mul(num.inverse(self.x.c), -self.x.f), alpha
+
+
+class _Turns:
+    """The body turns freely about the near point, under a moment and with a rotor about every axis."""
+
+    def __init__(self, num: Arithmetic, effort: Any, armature: Any) -> None:
+        self.num, self.effort, self.armature = num, effort, armature
+
+    def reduce(self, x: Articulated) -> Articulated:
+        num, a = self.num, self.armature
+        i = x.i if a is None else x.i + num.matrix(np.eye(3)) * a
+        self.b, self.inverse = x.b, num.inverse(i)
+        self.push = -x.n if self.effort is None else self.effort - x.n
+        gain = num.mul(x.b, self.inverse)
+        c = num.symmetric(x.c - num.mul(gain, num.transpose(x.b)))
+        f = x.f + num.mul(gain, self.push)
+        if a is None:
+            return Articulated(c, None, None, f, self.effort)
+        n = -num.mul(self.inverse, self.push) * a
+        n = n if self.effort is None else n + self.effort
+        return Articulated(c, gain * a, num.matrix(np.eye(3)) * a - self.inverse * (a * a), f, n)
+
+    def advance(self, a: Any, alpha: Any) -> tuple[Any, Any]:
+        num = self.num
+        push = self.push - num.mul(num.transpose(self.b), a)
+        return a, num.mul(self.inverse, push if self.armature is None else push + alpha * self.armature)
+
+
+class _Single:
+    """One turn about or one slide along an axis through the near point."""
+
+    def __init__(self, num: Arithmetic, what: str, axis: Any, effort: Any, armature: Any) -> None:
+        self.num, self.turns, self.axis = num, what == "turn", axis
+        self.effort, self.armature = effort, armature
+
+    def reduce(self, x: Articulated) -> Articulated:
+        num, e = self.num, self.axis
+        blocks = (x.b, x.i) if self.turns else (x.c, num.transpose(x.b))
+        self.U, self.V = U, V = [num.mul(block, e) for block in blocks]
+        size = num.dot(e, V if self.turns else U)
+        self.inverse = 1 / (size if self.armature is None else size + self.armature)
+        self.push = self.effort - num.dot(e, x.n if self.turns else x.f)
+        u, v, q = U * self.inverse, V * self.inverse, self.push
+        return Articulated(
+            num.symmetric(x.c - num.mul(u, num.transpose(U))),
+            x.b - num.mul(u, num.transpose(V)),
+            num.symmetric(x.i - num.mul(v, num.transpose(V))),
+            x.f + u * q,
+            x.n + v * q,
+        )
+
+    def advance(self, a: Any, alpha: Any) -> tuple[Any, Any]:
+        num = self.num
+        rate = (self.push - num.dot(self.U, a) - num.dot(self.V, alpha)) * self.inverse
+        gained = self.axis * rate
+        return (a, alpha + gained) if self.turns else (a + gained, alpha)
+
+
+class Tree:
+    """A tree at a state: lists over the bodies, in world axes; of closing joints nothing is used.
+
+    Attributes:
+        A: attitudes; ``r``, ``v``: centres of mass and their velocities; ``w``: angular velocities.
+        near: from the centre of mass to the near point of the body's joint.
+        arm: from the far body's near point to the point that this joint carries: the near point, or of a rod
+            the far one; from the world's origin where the far body is the world.
+        kinetic: energy of bodies and rotors [J]; ``potential``: of weight and springs [J].
+
+    """
+
+    def __init__(self, num: Arithmetic, model: Model, state: State) -> None:
+        """Place and move every body.
+
+        Args:
+            num: kind of numbers.
+            model: the mechanism.
+            state: of which the minimal coordinates are used; of many, arrays with leading axes.
+
+        """
+        self.num, self.model, self.state = num, model, state
+        self.zero, self.one = num.vector(np.zeros(3)), num.matrix(np.eye(3))
+        self.far = [int(far) for far in model.body[: model.n, 0]]
+        self.A: list[Any] = []
+        self.r: list[Any] = []
+        self.v: list[Any] = []
+        self.w: list[Any] = []
+        self.near: list[Any] = []
+        self.arm: list[Any] = []
+        self._bias: list[tuple[Any, Any]] = []  # acceleration of the carried point, angular acceleration
+        self._blocks: list[list[Any]] = []
+        self.kinetic = self.potential = num.scalar(0.0)
+        for k in range(model.n):
+            self._add_body(k)
+        self._spring_pulls = self._pulls()
+        self._weigh()
+
+    def rotation(self, p: Any) -> Any:
+        """A of a quaternion of any length but 0.
+
+        Args:
+            p: (..., 4) doubles, scalar first.
+
+        Returns:
+            A matrix, body → world.
+
+        """
+        w, x, y, z = (self.num.scalar(p[..., i]) for i in range(4))
+        ww, xx, yy, zz = w * w, x * x, y * y, z * z
+        rows = [
+            [ww + xx - yy - zz, (x * y - w * z) * 2, (x * z + w * y) * 2],
+            [(x * y + w * z) * 2, ww - xx + yy - zz, (y * z - w * x) * 2],
+            [(x * z - w * y) * 2, (y * z + w * x) * 2, ww - xx - yy + zz],
+        ]
+        return self.num.from_rows(rows) * (1 / (ww + xx + yy + zz))
+
+    def _add_body(self, k: int) -> None:
+        """Go from the far body along joint k to body k."""
+        num, model, state, far = self.num, self.model, self.state, self.far[k]
+        kind = KINDS[model.kind[k]]
+        hang = num.vector(model.point[..., k, 0, :])
+        above, w, arm, bend = self.one, self.zero, hang, self.zero
+        P, v = hang, self.zero
+        if far >= 0:
+            above, w, lever = self.A[far], self.w[far], num.mul(self.A[far], hang)
+            P, v = self.r[far] + lever, self.v[far] + num.cross(w, lever)
+            arm = lever - self.near[far]
+            bend = num.cross(w, num.cross(w, arm))
+        swing, blocks = self.zero, list[Any]()
+        if kind.has_attitude:
+            A = self.rotation(state.p[..., k, :])
+            own = num.mul(A, num.vector(state.omega[..., k, :]))
+            if kind.holds_distance:
+                u, udot = self.rod_direction(k)
+                ell = num.scalar(model.length[..., k])
+                P, v = P + u * ell, v + udot * ell
+                blocks.append(_Swing(num, u, -(ell * num.dot(udot, udot)), ell))
+            elif kind.holds_nothing:
+                P, v = num.vector(state.r[..., k, :]), num.vector(state.v[..., k, :])
+                blocks.append(_Slides(num))
+            relative = own - w
+            effort, armature = self._ball_elements(k, above, A, relative)
+            blocks.append(_Turns(num, effort, armature))
+            swing, w = num.cross(w, relative), own
+        else:
+            A, P, v, w, arm, bend, swing, blocks = self._move(k, above, P, v, w, arm, bend)
+        near = self.zero if kind.holds_nothing else num.mul(A, num.vector(model.point[..., k, 1, :]))
+        self.A.append(A)
+        self.w.append(w)
+        self.near.append(near)
+        self.arm.append(arm)
+        self.r.append(P - near)
+        self.v.append(v - num.cross(w, near))
+        self._bias.append((bend, swing))
+        self._blocks.append(blocks)
+
+    def rod_direction(self, k: int) -> tuple[Any, Any]:
+        """U of rod k as a unit vector and u̇ perpendicular to it.
+
+        Args:
+            k: the rod.
+
+        Returns:
+            Two vectors, and per second.
+
+        """
+        num = self.num
+        u, udot = (num.vector(x[..., k, :]) for x in (self.state.u, self.state.udot))
+        u = u * (1 / num.sqrt(num.dot(u, u)))
+        return u, udot - u * num.dot(u, udot)
+
+    def _move(self, k: int, above: Any, P: Any, v: Any, w: Any, arm: Any, bend: Any) -> tuple[Any, ...]:
+        """Go along the scalar motions of joint k."""
+        num, model, state = self.num, self.model, self.state
+        A, swing, blocks = num.mul(above, self.rotation(model.turn[..., k, 0, :])), self.zero, []
+        elements = ("armature", "damping", "stiffness", "rest", "effort")
+        for i, (what, number) in enumerate(KINDS[model.kind[k]].motions):
+            x, rate = (num.scalar(y[..., k, i]) for y in (state.x, state.xdot))
+            unit = num.vector(np.eye(3)[number])
+            axis = num.mul(A, unit)
+            effort, armature = num.scalar(0.0), None
+            if np.any([getattr(model, name)[..., k, i] for name in elements]):
+                a, d, stiffness, rest, push = (
+                    num.scalar(getattr(model, name)[..., k, i]) for name in elements
+                )
+                stretch = x - rest
+                effort, armature = push - stiffness * stretch - d * rate, a
+                self.kinetic = self.kinetic + a * rate * rate / 2
+                self.potential = self.potential + stiffness * stretch * stretch / 2
+            blocks.append(_Single(num, what, axis, effort, armature))
+            if what == "slide":
+                shift = axis * x
+                P, arm, bend = P + shift, arm + shift, bend + num.cross(w, num.cross(w, shift))
+                bend = bend + num.cross(swing, shift) + num.cross(w, axis) * (rate * 2)
+                v = v + num.cross(w, shift) + axis * rate
+            else:
+                swing, w = swing + num.cross(w, axis) * rate, w + axis * rate
+                A = num.mul(A, self._turn_about(number, x))
+        A = num.mul(A, num.transpose(self.rotation(model.turn[..., k, 1, :])))
+        return A, P, v, w, arm, bend, swing, blocks
+
+    def _turn_about(self, axis: int, angle: Any) -> Any:
+        """The rotation about a coordinate axis."""
+        s, c = self.num.sin_cos(angle)
+        zero, one = self.num.scalar(0.0), self.num.scalar(1.0)
+        rows = [[one if i == j else zero for j in range(3)] for i in range(3)]
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        rows[i][i], rows[i][j], rows[j][i], rows[j][j] = c, -s, s, c
+        return self.num.from_rows(rows)
+
+    def _ball_elements(self, k: int, above: Any, A: Any, spin: Any) -> tuple[Any, Any]:
+        """Moment of spring and damper of a joint with all turns, and its rotor; None where there is none."""
+        num, model = self.num, self.model
+        numbers = [getattr(model, name)[..., k, 0] for name in ("armature", "damping", "stiffness")]
+        if not np.any(numbers):
+            return None, None
+        a, damping, stiffness = (num.scalar(x) for x in numbers)
+        effort = -spin * damping
+        if np.any(numbers[2]):
+            axes = num.mul(above, self.rotation(model.turn[..., k, 0, :]))
+            R = num.mul(num.transpose(axes), num.mul(A, self.rotation(model.turn[..., k, 1, :])))
+
+            def entry(i: int, j: int) -> Any:
+                return num.entry(R, i, j)
+
+            sine = [[(entry(i, j) - entry(j, i)) / 2] for i, j in ((2, 1), (0, 2), (1, 0))]
+            z = num.mul(axes, num.from_rows(sine))
+            cosine = (entry(0, 0) + entry(1, 1) + entry(2, 2) - 1) / 2
+            turn = z * num.turn_over_sine(num.sqrt(num.dot(z, z)), cosine)
+            effort = effort - turn * stiffness
+            self.potential = self.potential + stiffness * num.dot(turn, turn) / 2
+        self.kinetic = self.kinetic + a * num.dot(spin, spin) / 2
+        return effort, a if np.any(numbers[0]) else None
+
+    def _pulls(self) -> dict[int, tuple[Any, Any]]:
+        """Force and moment about the near point of each body that springs between points pull at."""
+        num, model, pulls = self.num, self.model, dict[int, tuple[Any, Any]]()
+        for number in range(model.spring_body.shape[-2]):
+            bodies, ends = [int(body) for body in model.spring_body[number]], list[tuple[Any, Any, Any]]()
+            for end, body in enumerate(bodies):
+                at, rate, lever = num.vector(model.spring_point[..., number, end, :]), self.zero, None
+                if body >= 0:
+                    arm = num.mul(self.A[body], at)
+                    at, rate = self.r[body] + arm, self.v[body] + num.cross(self.w[body], arm)
+                    lever = arm - self.near[body]
+                ends.append((at, rate, lever))
+            d, change = ends[1][0] - ends[0][0], ends[1][1] - ends[0][1]
+            length = num.sqrt(num.dot(d, d))
+            stiffness, damping, rest = (
+                num.scalar(x[..., number])
+                for x in (model.spring_stiffness, model.spring_damping, model.spring_length)
+            )
+            stretch = length - rest
+            tension = stiffness * stretch + damping * num.dot(d, change) / length
+            self.potential = self.potential + stiffness * stretch * stretch / 2
+            pull = d * (tension / length)
+            for body, (_, _, lever), force in zip(bodies, ends, (pull, -pull), strict=True):
+                if body >= 0:
+                    own = force, num.cross(lever, force)
+                    before = pulls.get(body)
+                    pulls[body] = (before[0] + own[0], before[1] + own[1]) if before else own
+        return pulls
+
+    def _weigh(self) -> None:
+        """Energies and the angular momentum about the origin of all bodies."""
+        num, model, self.momentum = self.num, self.model, self.zero
+        g = num.vector(model.gravity)
+        self.spin = []
+        for k in range(model.n):
+            m, J = num.scalar(model.mass[..., k]), num.matrix(model.inertia[..., k, :, :])
+            spin = num.mul(self.A[k], num.mul(J, num.mul(num.transpose(self.A[k]), self.w[k])))
+            v, w = self.v[k], self.w[k]
+            self.kinetic = self.kinetic + (m * num.dot(v, v) + num.dot(w, spin)) / 2
+            self.potential = self.potential - m * num.dot(g, self.r[k])
+            self.momentum = self.momentum + num.cross(self.r[k], v) * m + spin
+            self.spin.append(spin)
+
+    def _body_alone(self, k: int) -> Articulated:
+        """What body k needs by itself."""
+        num, model, s, w = self.num, self.model, self.near[k], self.w[k]
+        c, b, i = self._inertia(k)
+        m = num.scalar(model.mass[..., k])
+        load = num.vector(model.gravity) * m + num.vector(model.force[..., k, :])
+        moment = num.mul(self.A[k], num.vector(model.moment[..., k, :])) - num.cross(w, self.spin[k])
+        if np.any(model.drag_force[..., k]):
+            load = load - self.v[k] * num.scalar(model.drag_force[..., k])
+        if np.any(model.drag_moment[..., k]):
+            moment = moment - w * num.scalar(model.drag_moment[..., k])
+        f = -num.cross(w, num.cross(w, s)) * m - load
+        n = -num.cross(s, f) - moment
+        if k in self._spring_pulls:
+            force, about = self._spring_pulls[k]
+            f, n = f - force, n - about
+        return Articulated(c, b, i, f, n)
+
+    def _inertia(self, k: int) -> tuple[Any, Any, Any]:
+        """c, b and i of body k by itself."""
+        num, m, s = self.num, self.num.scalar(self.model.mass[..., k]), self.num.cross_matrix(self.near[k])
+        J = num.matrix(self.model.inertia[..., k, :, :])
+        inertia = num.mul(num.mul(self.A[k], J), num.transpose(self.A[k]))
+        b = s * m
+        return self.one * m, b, num.symmetric(inertia - num.mul(b, s))
+
+    def solve(self) -> Solution:
+        """Solve for the accelerations and the wrenches of the joints.
+
+        Returns:
+            The solution.
+
+        Raises:
+            ZeroDivisionError: of balls, where an articulated inertia has no inverse.
+
+        """
+        num, n = self.num, self.model.n
+        total = [self._body_alone(k) for k in range(n)]
+        carried: list[Any] = [None] * n
+        for k in reversed(range(n)):
+            x = total[k]
+            for block in reversed(self._blocks[k]):
+                x = block.reduce(x)
+            carried[k] = x
+            if self.far[k] >= 0:
+                total[self.far[k]] = self._carry(k, x, total[self.far[k]])
+        acceleration, turning, forces, moments = list[Any](), list[Any](), list[Any](), list[Any]()
+        at: list[Any] = []  # accelerations of the near points
+        for k in range(n):
+            (a, alpha), far, x = self._bias[k], self.far[k], carried[k]
+            if far >= 0:
+                a, alpha = a + at[far] + num.cross(turning[far], self.arm[k]), alpha + turning[far]
+            force, moment = num.mul(x.c, a) + x.f, x.n
+            if x.b is not None:
+                force = force + num.mul(x.b, alpha)
+                moment = num.mul(num.transpose(x.b), a) + num.mul(x.i, alpha) + x.n
+            for block in self._blocks[k]:
+                a, alpha = block.advance(a, alpha)
+            at.append(a)
+            turning.append(alpha)
+            forces.append(force)
+            moments.append(moment)
+            w, s = self.w[k], self.near[k]
+            acceleration.append(a - num.cross(alpha, s) - num.cross(w, num.cross(w, s)))
+        return Solution(acceleration, turning, forces, moments)
+
+    def _carry(self, k: int, x: Articulated, far: Articulated) -> Articulated:
+        """Add to the far body what joint k and all beyond need of it."""
+        num, (bend, swing) = self.num, self._bias[k]
+        f, n = x.f + num.mul(x.c, bend), x.n
+        if x.b is not None:
+            f = f + num.mul(x.b, swing)
+            n = n + num.mul(num.transpose(x.b), bend) + num.mul(x.i, swing)
+        c, b, i = self._carried_inertia(k, x.c, x.b, x.i)
+        moment = num.cross(self.arm[k], f)
+        moment = moment if n is None else moment + n
+        return Articulated(far.c + c, far.b + b, far.i + i, far.f + f, far.n + moment)
+
+    def _carried_inertia(self, k: int, c: Any, b: Any, i: Any) -> tuple[Any, Any, Any]:
+        """Move c, b and i of joint k to the far body's near point."""
+        num, R = self.num, self.num.cross_matrix(self.arm[k])
+        moved = -num.mul(c, R) if b is None else b - num.mul(c, R)
+        product = num.mul(R, moved)
+        if b is not None:
+            product = product + i - num.mul(num.transpose(b), R)
+        return c, moved, num.symmetric(product)
+
+    def mass_matrix(self) -> Any:
+        """Compute M of the rates ν of `StateQuantities.mass_matrix`.
+
+        A rate ω′ or u̇ turns or swings its own body alone: what hangs on a body with an attitude of its own
+        is carried without a turn, as by a joint whose b and i are 0.
+
+        Returns:
+            A matrix.
+
+        """
+        num, model, n = self.num, self.model, self.model.n
+        total = [self._inertia(k) for k in range(n)]
+        for k in reversed(range(n)):
+            far, keeps = self.far[k], KINDS[model.kind[k]].has_attitude
+            if far >= 0:
+                c, b, i = total[k]
+                moved = self._carried_inertia(k, c, None if keeps else b, None if keeps else i)
+                c, b, i = (x + y for x, y in zip(total[far], moved, strict=True))
+                total[far] = c, b, i
+        columns = self._rate_columns()
+        blocks: dict[tuple[int, int], Any] = {}
+
+        def add(row: int, column: int, block: Any) -> None:
+            blocks[row, column] = blocks[row, column] + block if (row, column) in blocks else block
+            if row != column:
+                blocks[column, row] = num.transpose(blocks[row, column])
+
+        for k in range(n):
+            c, b, i = total[k]
+            for at, slide, turn in columns[k]:
+                push = num.mul(c, slide) if turn is None else num.mul(b, turn)
+                moment = num.mul(num.transpose(b), slide) if turn is None else num.mul(i, turn)
+                j = k
+                while j >= 0:
+                    for row, along, about in columns[j]:
+                        if j < k or row <= at:
+                            add(row, at, num.mul(num.transpose(along if about is None else about),
+                                                 push if about is None else moment))  # fmt: skip
+                    lever = num.mul(num.cross_matrix(self.arm[j]), push)
+                    moment = lever if KINDS[model.kind[j]].has_attitude else moment + lever
+                    j = self.far[j]
+        for pairs, armature in self._rotors(columns):
+            for number, (row, left) in enumerate(pairs):
+                for column, right in pairs[number:]:
+                    add(row, column, num.mul(num.transpose(left), right) * armature)
+        return num.assemble(rate_count(model), blocks)
+
+    def _rate_columns(self) -> list[list[tuple[int, Any, Any]]]:
+        """Of each joint's rates in ν: where they are, and the velocities of the near point or the turns."""
+        num, model, found, rods = self.num, self.model, list[list[tuple[int, Any, Any]]](), 0
+        for k, own in enumerate(own_rates(model)):
+            kind, columns = KINDS[model.kind[k]], list[tuple[int, Any, Any]]()
+            if kind.holds_distance:
+                swing = self._blocks[k][0]
+                across = self.one - num.mul(swing.u, num.transpose(swing.u))
+                columns.append((3 * rods, across * swing.length, None))
+                rods += 1
+            if kind.holds_nothing:
+                columns.append((own.start, self.one, None))
+            if kind.has_attitude:
+                columns.append((own.stop - 3, None, self.A[k]))
+            else:
+                for i, block in enumerate(self._blocks[k]):
+                    pair = (None, block.axis) if block.turns else (block.axis, None)
+                    columns.append((own.start + i, *pair))
+            found.append(columns)
+        return found
+
+    def _rotors(
+        self, columns: list[list[tuple[int, Any, Any]]]
+    ) -> Iterator[tuple[list[tuple[int, Any]], Any]]:
+        """Of each rotor the turns that the rates give it, by their places in ν, and its inertia."""
+        for k in range(self.model.n):
+            for block, (at, _, turn) in zip(reversed(self._blocks[k]), reversed(columns[k]), strict=True):
+                if block.armature is None:
+                    continue
+                if not KINDS[self.model.kind[k]].has_attitude:
+                    axis = block.axis  # of length 1: ½ a ẋ²
+                    yield [(at, axis)], block.armature
+                    continue
+                turns, j = [(at, turn)], self.far[k]
+                while j >= 0:
+                    turns += [(place, -about) for place, _, about in columns[j] if about is not None]
+                    j = -1 if KINDS[self.model.kind[j]].has_attitude else self.far[j]
+                yield turns, block.armature

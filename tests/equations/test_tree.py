@@ -1,0 +1,150 @@
+"""One set of equations in balls and in floating-point numbers, against what they replaced."""
+
+import flint
+import numpy as np
+import pytest
+
+from plumbline.equations.arithmetic import floats
+from plumbline.equations.balls import balls as ball_arithmetic
+from plumbline.equations.tree import Tree
+from plumbline.model.datatypes import State
+from plumbline.model.sampling import compared_states
+from plumbline.scenario.generator import random_mechanism, random_scenario
+from plumbline.truth.certified import MAX_RELATIVE_RADIUS, certify_state, enclose_quantities
+from plumbline.truth.rounding_bound import state_rounding_bound
+from tests.helpers.catalogue import catalogue_scenarios
+from tests.helpers.former_equations.chain import enclose_chain
+from tests.helpers.former_equations.tree import enclose_tree
+from tests.helpers.nightly_tests import slow
+
+BITS = 400
+SHARE = 0.1  # of the rounding bound that doubles may be off by
+SAMPLE = (
+    "double-loaded-rods", "chain-5-mixed", "chain-10-balls", "light-cart-pole", "loaded-tree",
+    "tree-of-seven-sprung", "sprung-without-rotors", "free-body-with-rotors", "point-mass-arm",
+)  # fmt: skip
+TREES = [name for name, scenario in catalogue_scenarios().items() if not scenario.model.has_loops]
+
+
+def states_of(scenario, count=2):
+    return compared_states(scenario.model, scenario.state, scenario.seed, count)
+
+
+def check_overlap(model, state):
+    former = enclose_chain if model.is_chain else enclose_tree
+    with flint.ctx.workprec(BITS):
+        before = former(flint, model, state, True)
+    now = enclose_quantities(model, state, BITS, mass_matrix=True)
+    assert before.keys() == now.keys()
+    for name in before.keys() - {"scale"}:
+        old, new = (np.ravel(np.array(balls[name], dtype=object)) for balls in (before, now))
+        assert all(x.overlaps(y) for x, y in zip(old, new, strict=True)), name
+        limit = MAX_RELATIVE_RADIUS * (now["scale"][name] or 1.0)
+        assert all(float(x.rad()) <= limit for x in np.concatenate([old, new])), name
+
+
+@pytest.mark.parametrize("name", SAMPLE)
+def test_enclosures_overlap_those_of_the_former_equations(name):
+    scenario = catalogue_scenarios()[name]
+    for state in states_of(scenario):
+        check_overlap(scenario.model, state)
+
+
+@slow
+@pytest.mark.parametrize("name", sorted(set(TREES) - set(SAMPLE)))
+def test_enclosures_overlap_those_of_the_former_equations_everywhere(name):
+    test_enclosures_overlap_those_of_the_former_equations(name)
+
+
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.full) for seed in range(40, 60))])
+def test_enclosures_of_random_mechanisms_overlap_those_of_the_former_equations(seed):
+    for scenario in (random_mechanism(seed, 0), random_mechanism(seed, 2), random_scenario(seed, 1)):
+        for state in states_of(scenario):
+            check_overlap(scenario.model, state)
+
+
+def batch(states):
+    """Many states as one, of arrays with a leading axis."""
+    return State(**{name: np.stack([getattr(state, name) for state in states]) for name in vars(states[0])})
+
+
+def evaluated(num, model, state):
+    """Quantities in floating-point numbers, arrays (S, ...)."""
+    tree = Tree(num, model, state)
+    solution, lead = tree.solve(), state.p.shape[:-2]
+
+    def rows(vectors):
+        return np.stack([np.broadcast_to(v, (*lead, 3, 1))[..., 0] for v in vectors], -2)
+
+    return {
+        "acceleration": rows(solution.acceleration),
+        "angular_acceleration": rows([A.mT @ x for A, x in zip(tree.A, solution.turning, strict=True)]),
+        "joint_reaction": rows(solution.force),
+        "joint_moment": rows([tree.zero if m is None else m for m in solution.moment]),
+        "kinetic_energy": tree.kinetic[..., 0, 0],
+        "potential_energy": tree.potential[..., 0, 0],
+        "angular_momentum": tree.momentum[..., 0],
+        "mass_matrix": tree.mass_matrix(),
+    }
+
+
+def check_doubles(name):
+    """The errors of doubles over the rounding bounds that engines are judged by."""
+    model, states = catalogue_scenarios()[name].model, states_of(catalogue_scenarios()[name], 4)
+    found = evaluated(floats(), model, batch(states))
+    for i, state in enumerate(states):
+        truth = certify_state(model, state, mass_matrix=True).quantities
+        bound = state_rounding_bound(model, state)
+        for quantity, values in found.items():
+            if (true := getattr(truth, quantity)) is None:
+                assert not np.any(values[i])
+                continue
+            error = np.abs(np.broadcast_to(values, (len(states), *np.shape(true)))[i] - true)
+            if quantity not in ("mass_matrix", "kinetic_energy", "potential_energy"):
+                error = np.linalg.norm(error, axis=-1)
+            assert np.all(error <= SHARE * bound.tolerance(quantity)), quantity
+
+
+@pytest.mark.parametrize("name", SAMPLE)
+def test_doubles_in_a_batch_are_within_a_tenth_of_the_rounding_bound(name):
+    check_doubles(name)
+
+
+@slow
+@pytest.mark.parametrize("name", sorted(set(TREES) - set(SAMPLE)))
+def test_doubles_in_a_batch_are_within_a_tenth_of_the_rounding_bound_everywhere(name):
+    check_doubles(name)
+
+
+@pytest.mark.parametrize("name", ["double-loaded-rods", "tree-of-seven-sprung", "free-body-with-rotors"])
+def test_long_doubles_have_their_digits(name):
+    """Against balls, which have more digits: the errors are below the rounding of doubles."""
+    model, state = catalogue_scenarios()[name].model, states_of(catalogue_scenarios()[name])[1]
+    found = evaluated(floats(np.longdouble), model, state)
+    with flint.ctx.workprec(BITS):
+        balls = enclose_quantities(model, state, BITS, mass_matrix=True)
+        for quantity, values in found.items():
+            true = np.ravel(np.array(balls.get(quantity, np.zeros(values.shape)), dtype=object))
+            errors = [
+                abs(float(flint.arb(np.format_float_positional(x, unique=False, precision=40)) - y))
+                for x, y in zip(np.ravel(values), true, strict=True)
+            ]
+            assert max(errors) <= 3e-18 * balls["scale"].get(quantity, 1.0), quantity
+
+
+def test_a_batch_is_its_states():
+    scenario = catalogue_scenarios()["tree-of-seven-sprung"]
+    states = states_of(scenario, 3)
+    together = evaluated(floats(), scenario.model, batch(states))
+    for i, state in enumerate(states):
+        for quantity, value in evaluated(floats(), scenario.model, state).items():
+            scale = max(1.0, np.max(np.abs(value)))
+            np.testing.assert_allclose(together[quantity][i], value, rtol=0, atol=1e-13 * scale)
+
+
+def test_balls_that_cannot_be_inverted_raise():
+    """Nothing resists the spin of a point mass on a ball joint."""
+    scenario = catalogue_scenarios()["double-loaded-balls"]
+    model = scenario.model.changed(inertia=np.zeros((2, 3, 3)))
+    with pytest.raises(ZeroDivisionError):
+        Tree(ball_arithmetic(flint), model, scenario.state).solve()
