@@ -495,9 +495,8 @@ def enclose_motion(certificate: Certificate, on_step: Callable[..., Any] = lambd
             try:
                 rates = ([j * c / length for j, c in enumerate(row[1:], 1)] for row in rows[exact.nq :])
                 rows = [np.array(x) for x in (*([c / 2**bits for c in row] for row in rows), *rates)]
-                start = next_ellipsoid(
-                    X, rho, upper_bounds(x - f[0] for x, f in zip(end, y, strict=True)), scale
-                )
+                jump = upper_bounds(x - f[0] for x, f in zip(end, y, strict=True))
+                start = next_ellipsoid(X, rho, jump, scale)
                 P, rho = prove_step(rounded, rows, float(h), bound_defect(exact, y, h), *start)
             except (Rejected, OverflowError, np.linalg.LinAlgError) as error:
                 raise Rejected(f"step {k + 1} of {len(certificate.steps)}: {error}") from None

@@ -282,7 +282,7 @@ def test_the_next_ellipsoid_is_round_in_the_given_scale():
 def test_rates_of_short_steps_have_their_scale(monkeypatch):
     """256 steps in the unit of time are short: a rate counts by 256 times the step."""
     usual, scales, document = checker.next_ellipsoid, [], stored_document("one-rod")
-    monkeypatch.setattr(checker, "_next_ellipsoid", lambda *a: scales.append(a[3].ravel()) or usual(*a))
+    monkeypatch.setattr(checker, "next_ellipsoid", lambda *a: scales.append(a[3].ravel()) or usual(*a))
     lengths = [step[0] / 2 ** document["bits"] for step in document["steps"]]
     assert checker.FAST * min(lengths) > 1
     checker.enclose_motion(parsed(document))
