@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.classic_motions import four_bar_angle, light_cart_pole, squeezer_motion
 from bench.classics_page import write_page
 from bench.classics_values import (
     VALUES,
@@ -35,7 +36,6 @@ from plumbline.scenario.loader import Scenario
 from plumbline.storage.results_store import write_atomically
 from plumbline.truth.closed_form import exact_samples
 from plumbline.truth.ground_truth import state_truth
-from tests.helpers.classic_motions import four_bar_angle, light_cart_pole, squeezer_motion
 
 ROOT = Path(__file__).resolve().parents[1]
 STORED = ROOT / "bench" / "results" / "classics.json"

@@ -7,18 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.classic_motions import (
+    four_bar_angle,
+    light_cart_pole,
+    squeezer_motion,
+    squeezer_start_acceleration,
+)
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import rotation_matrix
 from plumbline.scenario.loader import Scenario, find_scenario_file, load_scenario
 from plumbline.truth.certified import certify_state
 from plumbline.truth.closed_form import exact_samples
 from plumbline.truth.taylor import simulate_taylor
-from tests.helpers.classic_motions import (
-    four_bar_angle,
-    light_cart_pole,
-    squeezer_motion,
-    squeezer_start_acceleration,
-)
 
 OWN_SCENARIOS = Path(__file__).with_name("scenarios")  # too hard for a run of the catalogue
 ROUNDING = 2.0**-52

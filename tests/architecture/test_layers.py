@@ -23,7 +23,7 @@ OUTSIDE = {  # packages beside the core, and what of the project each may import
     "reports": (
         "reports", "plumbline.storage", "plumbline.judging.rows", "plumbline.model", "plumbline.processes",
     ),
-    "bench": ("bench", "plumbline", "reference_impl", "adapters", "tests.helpers"),
+    "bench": ("bench", "plumbline", "reference_impl", "adapters", "tests.helpers.random_chains"),
 }  # fmt: skip
 PROJECT = ("plumbline", "reference_impl", "adapters", "reports", "bench", "tests", "tools")
 

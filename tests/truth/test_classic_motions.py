@@ -18,7 +18,7 @@ pytestmark = pytest.mark.skipif(
 
 @pytest.fixture(scope="module")
 def motions():
-    from tests.helpers import classic_motions
+    from bench import classic_motions
 
     return classic_motions
 

@@ -34,7 +34,7 @@ def tops(motions, times, windows=2, thickness=0.05):
 
 @pytest.fixture(scope="module")
 def motions():
-    from tests.helpers import classic_motions
+    from bench import classic_motions
 
     return classic_motions
 
