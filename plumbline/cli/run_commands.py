@@ -16,6 +16,7 @@ from plumbline.cli.console import print_matrix, print_result
 from plumbline.cli.help_texts import EXIT_CODES, examples
 from plumbline.cli.run_display import RunDisplay
 from plumbline.engines.registry import ENGINES
+from plumbline.execution import scenario_run
 from plumbline.execution.plan import Plan
 from plumbline.execution.result_cache import DiskResultCache, user_cells_folder
 from plumbline.execution.runner import RunResult, run_plan, save
@@ -66,7 +67,7 @@ def run(
 ) -> None:  # fmt: skip
     """Compare scenarios (names of the catalogue, or paths of YAML files; default: all) on all engines."""
     if scheduler is None and options.are_scenarios_found(names):
-        start_warm_process()
+        start_warm_process([scenario_run.__name__])
     chosen = options.choose_scenarios(names, families)
     known_issues = options.read_known_issues(known_files, chosen)
     folder = options.claim_folder(out)

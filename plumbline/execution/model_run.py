@@ -169,7 +169,11 @@ class _ModelRun:
                 self.engines[name] = self.missing(EngineInfo(name, name, "", (), str(error)))
                 continue
             key = ("version", name)
-            tasks.append(Task(key, describe_importer, (base,), self.plan.limits, python=self.pythons[name]))
+            tasks.append(
+                Task(
+                    key, describe_importer, (base,), self.plan.limits, python=self.pythons[name], engine=name
+                )
+            )
         for outcome in self.outcomes(tasks):
             name = outcome.key[1]
             info = outcome.value or EngineInfo(
@@ -198,7 +202,9 @@ class _ModelRun:
         """A call of an importer."""
         base = split_version(name)[0]
         key = (kind, shown, name)
-        return Task(key, function, (base, *arguments), self.plan.limits, python=self.pythons[name])
+        return Task(
+            key, function, (base, *arguments), self.plan.limits, python=self.pythons[name], engine=name
+        )
 
     def read(self, prepared: Mapping[str, PreparedFile]) -> dict[tuple[str, str], Answer]:
         """Have every importer read every file of a format that it reads; MuJoCo always reads MJCF."""

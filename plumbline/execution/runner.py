@@ -96,7 +96,7 @@ def describe_engines(
             found[name] = EngineInfo(name, name, "", (), str(error), has_failed=True)
             continue
         key = TaskKey(TaskKind.DESCRIPTION, engine=name)
-        tasks.append(Task(key, calls.describe_engine, (base,), executor.limits, python=python))
+        tasks.append(Task(key, calls.describe_engine, (base,), executor.limits, python=python, engine=name))
     pythons = {task.key: task.python for task in tasks}
     for outcome in Scheduler(executor, result_cache).run(tasks):
         name, python = outcome.key.engine, pythons[outcome.key]

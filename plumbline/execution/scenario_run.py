@@ -344,7 +344,7 @@ class ScenarioRun:
         (base, _), info = environments.split_version(key.engine), self._engines[key.engine]
         judge, judge_arguments = self._judge(key)
         return Task(
-            key, call, (base, *arguments), self._plan.limits, info.version, info.python, judge,
+            key, call, (base, *arguments), self._plan.limits, info.version, info.python, key.engine, judge,
             judge_arguments, JudgingResult.has_disagreement,  # only a diagnosis needs the answer
         )  # fmt: skip
 
@@ -440,7 +440,7 @@ class ScenarioRun:
         else:
             call = explain_disagreeing_steps
             arguments = (base, key.integrator, model, self._step_states, answer.value, is_known)
-        return [Task(subject, call, arguments, self._plan.limits, info.version, info.python)]
+        return [Task(subject, call, arguments, self._plan.limits, info.version, info.python, key.engine)]
 
     def _add_diagnosis(self, outcome: Outcome) -> None:
         diagnosis: Diagnosis = outcome.value or Diagnosis(f"no diagnosis: {outcome.failure}")

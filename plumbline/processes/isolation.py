@@ -7,6 +7,7 @@ the same ones.
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import ctypes
 import errno
@@ -15,6 +16,7 @@ import shutil
 import signal
 import sys
 import tempfile
+from collections.abc import Collection
 from pathlib import Path
 from typing import IO, Self
 
@@ -27,21 +29,80 @@ except ImportError:  # Windows: orphaned folders stay there
 
 _LOCK_FILE = "owner.lock"
 _RANDOM_NAME = "[a-z0-9_]" * 8  # what mkdtemp adds to a prefix
-_PR_SET_PDEATHSIG = 1  # linux/prctl.h
+_PR_SET_PDEATHSIG, _PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
+_PROC = Path("/proc")
 
 
-def die_with_parent(parent: int) -> None:
-    """Have Linux kill this process when its parent ends, however that ends; elsewhere do nothing.
+def die_with_parent(parent: int, number: int = 9) -> None:
+    """Have Linux send this process a signal when its parent ends, however that ends; elsewhere do nothing.
 
     Args:
         parent: process id of the parent.
+        number: the signal; 9 kills.
 
     """
     if not sys.platform.startswith("linux"):
         return
-    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent and not Path(f"/proc/{parent}").exists():
+    ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, number)
+    if os.getppid() != parent and not (_PROC / str(parent)).exists():
         os._exit(1)  # the parent ended before the call
+
+
+def adopt_orphans() -> None:
+    """Become the parent of descendants whose parent ends, on Linux; and when ended, kill all descendants."""
+
+    def end(*_: object) -> None:
+        kill_orphans(os.getpid(), ())
+        os._exit(1)
+
+    signal.signal(signal.SIGTERM, end)
+    atexit.register(kill_orphans, os.getpid(), ())
+    if sys.platform.startswith("linux"):
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_CHILD_SUBREAPER, 1)
+
+
+def kill_tree(pid: int) -> None:
+    """Kill a process that leads a session, that session and all descendants. What ends on the way is ignored.
+
+    Args:
+        pid: process id.
+
+    """
+    found = _descendants(pid)
+    with contextlib.suppress(OSError, AttributeError):
+        os.killpg(pid, signal.SIGKILL)
+    for one in (pid, *found):
+        with contextlib.suppress(OSError):
+            os.kill(one, signal.SIGKILL)
+
+
+def kill_orphans(reaper: int, spared: Collection[int]) -> None:
+    """Kill the children of a process and their descendants, again until no new one has appeared.
+
+    Args:
+        reaper: process id of one that adopts orphans.
+        spared: those of its children that are none.
+
+    """
+    killed: set[int] = set()
+    while found := [pid for pid in _descendants(reaper, spared) if pid not in killed]:
+        for pid in found:
+            with contextlib.suppress(OSError):
+                os.kill(pid, signal.SIGKILL)
+        killed.update(found)
+
+
+def _descendants(pid: int, spared: Collection[int] = ()) -> list[int]:
+    """The processes below one, parents first, where Linux lists them; without the spared ones and theirs."""
+    children: dict[int, list[int]] = {}
+    for path in _PROC.glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):  # it has ended
+            parent = path.read_bytes().rpartition(b")")[2].split()[1]
+            children.setdefault(int(parent), []).append(int(path.parent.name))
+    found = [pid]
+    for one in found:
+        found += [child for child in children.get(one, ()) if child not in spared]
+    return found[1:]
 
 
 class LockHeld(PlumblineError):

@@ -1,82 +1,33 @@
-"""Worker processes that can be killed, and the scheduler that hands tasks to them.
+"""The tasks of a run, the workers that make their calls, and the scheduler that hands tasks to them.
 
-Each worker runs in a scratch folder of its own, discards its output at the level of file descriptors (engines
-print from C++), uses one BLAS thread and a limited address space, and dies with its parent. A crash, a
-timeout or a lack of memory loses one task, whose outcome holds the reason.
+A crash, a timeout or a lack of memory loses one task, whose outcome holds the reason.
 """
 
 from __future__ import annotations
 
-import atexit
-import contextlib
-import gc
-import hashlib
-import multiprocessing
 import os
 import pickle
-import tempfile
+import threading
 import time
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
-from dataclasses import dataclass, field
-from functools import cache, cached_property
-from multiprocessing import forkserver
-from multiprocessing.context import BaseContext
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, field, replace
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, NamedTuple, Self
 
-from plumbline.processes.errors import PlumblineError
-from plumbline.processes.isolation import ScratchFolder, die_with_parent
-from plumbline.processes.record_encoding import EncodedRecord
-from plumbline.processes.remote_python import RemoteCrash, RemoteError, call_remote, call_timed, describe_exit
-from plumbline.processes.worker_environment import SINGLE_THREAD, TEMPORARY_FOLDER, worker_environment
-
-if TYPE_CHECKING:
-    from pebble import ProcessPool
+from plumbline.processes import worker_process
+from plumbline.processes.errors import PlumblineError, describe_exception
+from plumbline.processes.isolation import ScratchFolder
+from plumbline.processes.worker_environment import worker_environment
+from plumbline.processes.worker_process import Packed as Packed
+from plumbline.processes.worker_process import Pickled as Pickled
+from plumbline.processes.worker_process import Reply, WorkerLost, WorkerProcess, load_packed, make_reply
+from plumbline.processes.worker_process import start_warm_process as start_warm_process
 
 _POLL_INTERVAL = 0.2  # s between checks for tasks that run too long
 _MAX_POLL_GAP = 2.0  # s: a longer time between two checks is one in which this process was stopped, or busy
-_WARM_MODULE = "plumbline.processes.warm"
-_worker_cpu_time = {"reported": 0.0}  # s that this worker has reported in outcomes
-
-
-@dataclass(frozen=True)
-class Pickled:
-    """A pickled value: pickled once, and loaded only where it is used. Loading a pickle can run any code."""
-
-    data: bytes
-
-    @classmethod
-    def of(cls, value: Any) -> Pickled:
-        """Pickle a value.
-
-        Args:
-            value: any value that can be pickled.
-
-        Returns:
-            The pickle.
-
-        """
-        return cls(pickle.dumps(value, protocol=5))
-
-    @cached_property
-    def digest(self) -> bytes:
-        """SHA-256 of the pickle."""
-        return hashlib.sha256(self.data).digest()
-
-    def load(self) -> Any:
-        """Load the pickle.
-
-        Returns:
-            A new copy of the value.
-
-        """
-        return pickle.loads(self.data)
-
-
-Packed = Pickled | EncodedRecord
 
 
 @dataclass(frozen=True)
@@ -97,7 +48,8 @@ class Task:
     limits: Limits = field(default_factory=Limits)
     version: str = ""  # of the engine, a part of the content hash of the answer
     python: str = ""  # interpreter of another environment that makes the call; empty: the worker itself
-    judge: Callable[..., Any] | None = None  # called in the worker with judge_arguments and the answer
+    engine: str = ""  # that the call runs: engines share no process, with each other or with the judges
+    judge: Callable[..., Any] | None = None  # called in a worker with judge_arguments and the answer
     judge_arguments: tuple[Any, ...] = ()
     # asked of what the judge returned, whether the answer is needed besides; None: it is
     needs_answer: Callable[[Any], bool] | None = None
@@ -121,7 +73,7 @@ class Outcome:
     @property
     def value(self) -> Any:
         """The answer, loaded anew at every access."""
-        return _load(self.raw_value)
+        return load_packed(self.raw_value)
 
     @property
     def packed(self) -> Packed:
@@ -270,32 +222,54 @@ class Scheduler:
                 yield self._cache.put(task, outcome)
 
 
+@dataclass(eq=False)
+class _Call:
+    """A task in the pool."""
+
+    task: Task
+    process: WorkerProcess | None = None  # that computes it now
+    is_overdue: bool = False
+    started: float | None = None  # `WorkerPool._clock` when it was first seen running
+
+
 class WorkerPool(Executor):
-    """Worker processes on this machine."""
+    """Worker processes on this machine.
+
+    Engines change the process that they run in: modules, locale, threads. Each has processes of its own, and
+    the judges have theirs. At most one process per job computes at a time.
+    """
 
     def __init__(self, jobs: int, limits: Limits | None = None) -> None:
         """Prepare the pool; its workers start with the first task.
 
         Args:
-            jobs: number of worker processes.
+            jobs: number of tasks that run at a time.
             limits: their limits; the time limit is each task's own.
 
         """
         self.limits = limits or Limits()
         self._jobs = jobs
-        self._pool: ProcessPool | None = None
+        self._threads: ThreadPoolExecutor | None = None  # each waits for a process
         self._scratch = ScratchFolder()
-        self._tasks: dict[Future[Any], Task] = {}
-        self._started: dict[Future[Any], float] = {}  # `_clock` when a task was first seen running
+        self._calls: dict[Future[Outcome], _Call] = {}
+        self._lock = threading.Lock()  # of what follows and of the calls
+        self._idle: dict[str, list[WorkerProcess]] = {}  # by what they run: an engine, or "" for the judges
+        self._is_closed = False
         self._clock, self._last_poll = 0.0, time.monotonic()  # s
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Kill what still runs and remove the scratch folders."""
-        if self._pool is not None:
-            self._pool.stop()  # type: ignore[no-untyped-call]
-            self._pool.join()
+        with self._lock:
+            self._is_closed = True
+            for call in self._calls.values():
+                if call.process is not None:
+                    call.process.kill()
+        if self._threads is not None:
+            self._threads.shutdown(cancel_futures=True)
+        for process in (process for idle in self._idle.values() for process in idle):
+            process.end()
         self._scratch.remove()
 
     @property
@@ -310,177 +284,146 @@ class WorkerPool(Executor):
             task: the call to make there.
 
         """
-        if self._pool is None:
-            self._pool = self._make_pool()
-        self._tasks[self._pool.schedule(run_task, args=(task,))] = task
-
-    def _make_pool(self) -> ProcessPool:
-        from pebble import ProcessPool  # with asyncio: not in a run whose answers all come from the cache
-
-        return ProcessPool(
-            max_workers=self._jobs,
-            context=start_warm_process(),
-            initializer=initialize_worker,
-            initargs=(str(self._scratch.path), self.limits.gigabytes, os.getpid(), worker_environment()),
-        )
+        if self._threads is None:
+            start_warm_process()  # in this thread, with which it ends
+            self._threads = ThreadPoolExecutor(self._jobs)
+        call = _Call(task)
+        self._calls[self._threads.submit(self._run, call)] = call
 
     def collect(self) -> list[tuple[Task, Outcome]]:
-        """Wait for a task to finish, at most `_POLL_INTERVAL`, and cancel those over their time limit.
+        """Wait for a task to finish, at most `_POLL_INTERVAL`, and kill what is over its time limit.
 
         Returns:
             The finished tasks and their outcomes.
 
         """
-        done, _ = wait(self._tasks, timeout=_POLL_INTERVAL, return_when=FIRST_COMPLETED)
-        self._cancel_overdue()
-        found = []
-        for future in done:
-            task = self._tasks.pop(future)
-            self._started.pop(future, None)
-            found.append((task, _outcome_from_future(task, future)))
-        return found
+        done, _ = wait(self._calls, timeout=_POLL_INTERVAL, return_when=FIRST_COMPLETED)
+        self._kill_overdue()
+        return [(self._calls.pop(future).task, future.result()) for future in done]
 
-    def _cancel_overdue(self) -> None:
-        """Cancel tasks over their time limit, which kills their workers.
+    def _kill_overdue(self) -> None:
+        """Kill the workers of tasks over their time limit.
 
-        The pool's own timeout goes by the wall clock: set forward it would kill tasks that are in time. While
-        this process is stopped, as by Ctrl-Z, its workers are too, and that time does not count.
+        While this process is stopped, as by Ctrl-Z, that time does not count.
         """
         now = time.monotonic()
         self._clock += min(now - self._last_poll, _MAX_POLL_GAP)
         self._last_poll = now
-        for future, task in self._tasks.items():
-            if future.running():
-                started = self._started.setdefault(future, self._clock)
-                if self._clock - started > task.limits.seconds:
-                    future.cancel()
+        with self._lock:
+            for call in self._calls.values():
+                if call.process is None:
+                    continue
+                if call.started is None:
+                    call.started = self._clock
+                elif self._clock - call.started > call.task.limits.seconds:
+                    call.is_overdue = True
+                    call.process.kill()
+
+    def _run(self, call: _Call) -> Outcome:
+        """Run a task, in a thread."""
+
+        def make_call(name: str, *arguments: Any) -> Reply:
+            return self._call_in_process(call, name, *arguments)
+
+        return run_task(call.task, make_call)
+
+    def _call_in_process(
+        self, call: _Call, name: str, function: Callable[..., Any], arguments: Sequence[Any], python: str
+    ) -> Reply:
+        """Make a call in a process that runs nothing but ``name``."""
+        with self._lock:
+            idle = self._idle.setdefault(name, [])
+            process = idle.pop() if idle else None
+        reply = Reply()
+        try:
+            process = process or self._start_process()
+            with self._lock:
+                call.process = process
+                if self._is_closed or call.is_overdue:
+                    process.kill()
+            reply = process.call(function, arguments, python, self.limits.gigabytes)
+        except (WorkerLost, OSError) as lost:
+            reply = Reply(failure=f"crashed: the worker {lost}", is_lost=True)
+        with self._lock:
+            call.process = None
+            is_lost = reply.is_lost or self._is_closed or call.is_overdue
+            if process is not None and not is_lost:
+                self._idle[name].append(process)
+        if process is not None and is_lost:
+            process.end()
+        if call.is_overdue:
+            seconds = call.task.limits.seconds
+            failure = f"timeout: no answer within {seconds:g} s, worker killed"
+            return Reply(failure=failure, is_lost=True, is_overdue=True)
+        return reply
+
+    def _start_process(self) -> WorkerProcess:
+        arguments = str(self._scratch.path), self.limits.gigabytes, os.getpid(), worker_environment()
+        return WorkerProcess(start_warm_process(), worker_process.initialize_worker, arguments)
 
 
-def start_warm_process() -> BaseContext:
-    """Start the process that loads the engines' libraries and from which workers are forked, if none runs.
+class _Judged(NamedTuple):
+    """What a judge made of an answer."""
 
-    A command calls it first, so that the libraries are loaded while it reads its input.
-
-    Returns:
-        What starts workers: forked from that process, or anew where a platform cannot fork.
-
-    """
-    os.environ.update(SINGLE_THREAD)  # inherited by the workers, before NumPy loads there
-    if "forkserver" not in multiprocessing.get_all_start_methods():
-        return multiprocessing.get_context("spawn")
-    _keep_sockets_in_scratch_folder()
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([_WARM_MODULE])
-    try:
-        forkserver.ensure_running()  # in this thread: the warm process ends with the thread that started it
-    except OSError:  # the path of its socket has at most 107 bytes, and TMPDIR may be longer
-        return multiprocessing.get_context("spawn")
-    return context
+    result: Any = None
+    is_answer_needed: bool = True
+    unreadable: str = ""  # why the pickle of the answer cannot be loaded: the engine's fault
 
 
-@cache
-def _keep_sockets_in_scratch_folder() -> None:
-    """Have multiprocessing put its sockets where the next run removes them if this process is killed."""
-    folder = ScratchFolder()
-    atexit.register(folder.remove)
-    multiprocessing.current_process()._config["tempdir"] = str(folder.path)  # type: ignore[attr-defined]
-
-
-def run_task(task: Task) -> Outcome:
-    """Make a task's call in this process, or in the environment that the task names.
+def run_task(task: Task, make_call: Callable[..., Reply] | None = None) -> Outcome:
+    """Make a task's call, and have its answer judged.
 
     Args:
         task: the call to make and to judge.
+        make_call: makes a call in a process of a name: (name, function, arguments, interpreter) → reply;
+            None to make it in this process.
 
     Returns:
-        The outcome; exceptions of the call are raised.
-
-    Raises:
-        MemoryError: the call needs more memory than there is.
+        The outcome.
 
     """
+    make_call = make_call or _call_here
+    reply = make_call(task.engine, task.function, task.arguments, task.python)
+    outcome = Outcome(
+        task.key,
+        reply.answer,
+        reply.failure,
+        reply.cpu_time,
+        overhead_cpu_time=reply.overhead_cpu_time,
+        is_overdue=reply.is_overdue,
+    )
+    if task.judge is None or reply.answer is None:
+        return outcome
+    arguments = task.judge, task.needs_answer, reply.answer.data, *task.judge_arguments
+    judging = make_call("", _judge_answer, arguments, "")
+    outcome = replace(
+        outcome,
+        judge_failure=judging.failure or "",
+        judge_cpu_time=judging.cpu_time,
+        overhead_cpu_time=reply.overhead_cpu_time + judging.overhead_cpu_time,
+    )
+    if judging.answer is None:
+        return outcome
+    judged: _Judged = judging.answer.load()
+    if judged.unreadable:
+        return Outcome(task.key, failure=f"the answer cannot be read: {judged.unreadable}")
+    value = reply.answer if judged.is_answer_needed else None
+    return replace(outcome, raw_value=value, judge_result=judged.result)
+
+
+def _call_here(_: str, function: Callable[..., Any], arguments: Sequence[Any], python: str) -> Reply:
+    return make_reply(pickle.dumps((function, tuple(arguments), python, 0.0), protocol=5))
+
+
+def _judge_answer(
+    judge: Callable[..., Any], needs_answer: Callable[[Any], bool] | None, data: bytes, *arguments: Any
+) -> _Judged:
     try:
-        return _call_and_judge(task)
+        # a copy, whose arrays lie in memory alike wherever the call was made: sums depend on that
+        answer = pickle.loads(data)
     except MemoryError:
-        pass  # the traceback, which the pool would keep during the next task, references what filled it
-    gc.collect()
-    raise MemoryError
-
-
-def _call_and_judge(task: Task) -> Outcome:
-    arguments = [_load(one) for one in task.arguments]
-    if task.python:
-        value, cost = call_remote(task.python, call_timed, task.function, *arguments)
-    else:
-        value, cost = call_timed(task.function, *arguments)
-    answer, judged, failure, judging = Pickled.of(value), None, "", 0.0
-    if task.judge:
-        begin = time.process_time()
-        try:
-            # a copy, whose arrays lie in memory alike wherever the call was made: sums depend on that
-            judged = task.judge(*map(_load, task.judge_arguments), answer.load())
-        except MemoryError:
-            raise
-        except Exception as error:  # the harness's, not the engine's
-            failure = f"{type(error).__name__}: {error}"
-        judging = time.process_time() - begin
-    is_needed = task.needs_answer is None or judged is None or task.needs_answer(judged)
-    total = time.process_time()
-    overhead = total - _worker_cpu_time["reported"] - judging - (0.0 if task.python else cost)
-    _worker_cpu_time["reported"] = total
-    return Outcome(task.key, answer if is_needed else None, None, cost, judged, failure, judging, overhead)
-
-
-def _load(value: Any) -> Any:
-    return value.load() if isinstance(value, Packed) else value
-
-
-def _outcome_from_future(task: Task, future: Future[Outcome]) -> Outcome:
-    """The outcome of a finished future, or how its worker was lost."""
-    from pebble import ProcessExpired
-
-    try:
-        return future.result()
-    except CancelledError:  # by `_cancel_overdue` only
-        failure = f"timeout: no answer within {task.limits.seconds:g} s, worker killed"
-        return Outcome(task.key, failure=failure, is_overdue=True)
-    except ProcessExpired as expired:
-        return Outcome(task.key, failure=f"crashed: the worker {describe_exit(expired.exitcode)}")
-    except RemoteCrash as crashed:
-        return Outcome(task.key, failure=f"crashed: the worker {crashed}")
-    except RemoteError as error:
-        return Outcome(task.key, failure=str(error))
-    except MemoryError:
-        return Outcome(task.key, failure=f"out of memory: over {task.limits.gigabytes:g} GB of address space")
-    except (Exception, SystemExit) as error:  # ImportError: the caller recognises "not installed" by its name
-        return Outcome(task.key, failure=f"{type(error).__name__}: {error}")
-
-
-def initialize_worker(scratch: str, gigabytes: float, parent: int, environment: Mapping[str, str]) -> None:
-    """Prepare a worker process before its first task.
-
-    Args:
-        scratch: folder in which the worker makes its working folder.
-        gigabytes: limit of its address space.
-        parent: process id of the pool's process.
-        environment: its environment variables; those of the warm process may be older.
-
-    """
-    os.environ.clear()
-    os.environ.update(environment)
-    os.chdir(tempfile.mkdtemp(dir=scratch))
-    os.environ.update(
-        dict.fromkeys(TEMPORARY_FOLDER, os.getcwd())
-    )  # removed with it, if the worker is killed
-    tempfile.tempdir = None  # as found before
-    sink = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(sink, 1)
-    os.dup2(sink, 2)
-    os.close(sink)
-    die_with_parent(parent)
-    with contextlib.suppress(ImportError, ValueError, OSError):  # no such limit on Windows
-        import resource
-
-        size = int(gigabytes * 2**30)
-        resource.setrlimit(resource.RLIMIT_AS, (size, size))
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        raise
+    except Exception as error:
+        return _Judged(unreadable=describe_exception(error))
+    result = judge(*arguments, answer)
+    return _Judged(result, needs_answer is None or needs_answer(result))

@@ -213,9 +213,8 @@ class _Bench:
 
     def call(self, function: Any, *arguments: Any, python: str | None = None) -> Any:
         """Make a call in a worker; None where it is lost."""
-        task = Task(
-            0, function, arguments, Limits(TASK_SECONDS), python=self.python if python is None else python
-        )
+        python = self.python if python is None else python
+        task = Task(0, function, arguments, Limits(TASK_SECONDS), python=python, engine=self.importer)
         (outcome,) = self.workers.run([task])
         return outcome.value
 

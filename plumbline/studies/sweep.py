@@ -131,7 +131,9 @@ def _run_references(counted: _Progress, valid: Mapping[int, Scenario]) -> Iterat
     batches = _batches(valid)
     while batches:
         tasks = [
-            Task(k, _run_reference_batch, ([(i, valid[i]) for i in batch],), counted.limits)
+            Task(
+                k, _run_reference_batch, ([(i, valid[i]) for i in batch],), counted.limits, engine="reference"
+            )
             for k, batch in enumerate(batches)
         ]
         failed: list[list[int]] = []
@@ -219,6 +221,7 @@ def _run_engines(
             run_refinement,
             (name, integrator.name, s.model, s.state, s.times, _resolutions(integrator, s, sweep.step)),
             counted.limits,
+            engine=name,
         )
         for name, integrator in integrators.items()
         for index, s in solvable.items()

@@ -19,7 +19,7 @@ from plumbline.execution.exit_codes import EXIT_CODE_MEANINGS, ExitCode
 from plumbline.execution.plan import Plan
 from plumbline.execution.runner import run_plan
 from plumbline.judging.known_issues import load_known_issues
-from plumbline.processes import workers
+from plumbline.processes import worker_process
 from plumbline.processes.workers import ExecutorLost, Limits
 from plumbline.scenario import loader
 from plumbline.truth.ground_truth import TRUTHS_DIFFER
@@ -151,7 +151,7 @@ def test_a_sweep_needs_the_engines_that_its_file_names(verdicts, code):
 
 
 def test_a_truth_with_a_wrong_gravity_fails_the_harness(monkeypatch, tmp_path, capsys):
-    monkeypatch.setattr(workers, "initialize_worker", wrong_truths.prepare)
+    monkeypatch.setattr(worker_process, "initialize_worker", wrong_truths.prepare)
     result = CliRunner().invoke(
         main, ["run", "tumbling-ball", "--engine", "mujoco", "--jobs", "1", "--out", str(tmp_path)]
     )
@@ -167,7 +167,7 @@ def test_a_truth_with_a_wrong_gravity_fails_the_harness(monkeypatch, tmp_path, c
 
 
 def test_a_certified_state_that_contradicts_the_definition_fails_the_harness(monkeypatch, tmp_path):
-    monkeypatch.setattr(workers, "initialize_worker", wrong_truths.prepare_states)
+    monkeypatch.setattr(worker_process, "initialize_worker", wrong_truths.prepare_states)
     chosen = ["run", "double-loaded-rods", "--engine", "pinocchio", "--level", "state"]
     result = CliRunner().invoke(main, [*chosen, "--jobs", "1", "--out", str(tmp_path)])
     assert result.exit_code == ExitCode.HARNESS_FAILED, result.output
@@ -180,7 +180,7 @@ def test_a_certified_state_that_contradicts_the_definition_fails_the_harness(mon
 def test_engines_that_agree_against_an_accepted_truth_put_the_harness_in_doubt(
     level, quantity, monkeypatch, tmp_path
 ):
-    monkeypatch.setattr(workers, "initialize_worker", wrong_truths.prepare_accepted)
+    monkeypatch.setattr(worker_process, "initialize_worker", wrong_truths.prepare_accepted)
     chosen = ["run", "tumbling-ball", "--engine", "mujoco", "--engine", "reference", "--level", level]
     result = CliRunner().invoke(main, [*chosen, "--jobs", "1", "--out", str(tmp_path)])
     assert result.exit_code == ExitCode.HARNESS_FAILED, result.output

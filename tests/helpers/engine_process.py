@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import atexit
-import multiprocessing
-import os
 from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # before any child loads a BLAS
-
-from pebble import ProcessPool
-
 from plumbline.engines.adapter import Adapter
 from plumbline.engines.registry import load_adapter
+from plumbline.processes.workers import Limits, Task, WorkerPool
 
 TIMEOUT = 60.0  # s
+
+
+class ProcessLost(Exception):
+    """The process ended or was killed; the message says why."""
 
 
 def call_adapter(
@@ -29,8 +28,8 @@ def call_adapter(
     """``adapter(engine).method(*args)`` in the engine's own process; what it raises is raised here.
 
     ``tamper`` replaces methods of the adapter by functions of (its own method, *args), to see
-    what the contract's checks make of it.  Raises pebble.ProcessExpired when the process dies,
-    TimeoutError when it must be killed; the next call gets a new process.
+    what the contract's checks make of it.  Raises ProcessLost when the process dies or must be
+    killed; the next call gets a new process.
     """
     return run_in_engine_process(engine, _call_method, engine, method, args, overrides or {}, timeout=timeout)
 
@@ -44,19 +43,28 @@ def run_in_engine_process(
     engine: str, function: Callable[..., Any], *args: Any, timeout: float = TIMEOUT
 ) -> Any:
     """Any picklable function in the engine's process."""
-    return _pool(engine).schedule(function, args=args, timeout=timeout).result()
+    task = Task(0, _call_and_catch, (function, *args), Limits(timeout), engine=engine)
+    (outcome,) = _pool().run([task])
+    if outcome.failure:
+        raise ProcessLost(outcome.failure)
+    error, value = outcome.value
+    if error is not None:
+        raise error
+    return value
+
+
+def _call_and_catch(function: Callable[..., Any], *args: Any) -> tuple[Exception | None, Any]:
+    try:
+        return None, function(*args)
+    except Exception as error:
+        return error, None
 
 
 @cache
-def _pool(engine: str) -> ProcessPool:
-    pool = ProcessPool(max_workers=1, context=multiprocessing.get_context("spawn"))
-    atexit.register(_close, pool)
+def _pool() -> WorkerPool:
+    pool = WorkerPool(1)
+    atexit.register(pool.__exit__, None, None, None)
     return pool
-
-
-def _close(pool: ProcessPool) -> None:
-    pool.stop()
-    pool.join()
 
 
 @cache

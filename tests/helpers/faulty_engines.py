@@ -18,7 +18,7 @@ import numpy as np
 from adapters.mujoco_engine import Mujoco
 from plumbline.engines import registry
 from plumbline.model.datatypes import Array, Integrator, Model, State, Trajectory
-from plumbline.processes import workers
+from plumbline.processes import worker_process
 
 SimulateCall = Callable[[], Trajectory]
 
@@ -127,5 +127,5 @@ def register_faulty_engines() -> None:
 
 def prepare_worker(*arguments: Any) -> None:
     """Initialise a worker and register the faulty engines there."""
-    workers.initialize_worker(*arguments)
+    worker_process.initialize_worker(*arguments)
     register_faulty_engines()

@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from plumbline.model.datatypes import Model
-from plumbline.processes import workers
+from plumbline.processes import worker_process
 from plumbline.truth import certified, ground_truth, trajectory
 
 GRAVITY_ERROR = 1e-7  # relative
@@ -52,4 +52,4 @@ def prepare_accepted(*arguments: Any) -> None:
     ground_truth.state_truth, ground_truth.motion_truth = wrong_states, wrong_motion  # type: ignore[assignment]
 
 
-initialize_worker = workers.initialize_worker
+initialize_worker = worker_process.initialize_worker

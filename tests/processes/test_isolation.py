@@ -9,7 +9,7 @@ import psutil
 
 from plumbline.cli import nightly
 from plumbline.engines import registry
-from plumbline.processes import workers
+from plumbline.processes import worker_process
 from plumbline.processes.workers import Limits
 from plumbline.scenario import loader
 from plumbline.storage.history import History
@@ -38,7 +38,7 @@ def comparable_rows(rows, engine):
 
 def test_every_fault_at_once_loses_exactly_its_own_cell(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(registry, "ENGINES", dict(registry.ENGINES))
-    monkeypatch.setattr(workers, "initialize_worker", faulty.prepare_worker)
+    monkeypatch.setattr(worker_process, "initialize_worker", faulty.prepare_worker)
     monkeypatch.chdir(tmp_path)
     faulty.register_faulty_engines()
     names = [fault.__name__ for fault in faulty.ERROR_BY_FAULT]

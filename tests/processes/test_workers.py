@@ -1,14 +1,17 @@
 """Worker processes: every way to lose one costs one task and is reported."""
 
+import contextlib
 import ctypes
 import os
 import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from plumbline.processes.isolation import remove_orphaned_folders
@@ -47,6 +50,91 @@ def exit_process():
     os._exit(7)
 
 
+def exit_quietly():
+    os._exit(0)
+
+
+def exit_from_c():
+    ctypes.CDLL(None).exit(0)
+
+
+def exit_from_a_thread():
+    threading.Thread(target=os._exit, args=(0,)).start()
+    time.sleep(600)
+
+
+def exit_beside_a_child():
+    """The child, which holds the pipe open, lives longer than its parent."""
+    if os.fork():
+        os._exit(0)
+    time.sleep(600)
+
+
+def interrupt():
+    raise KeyboardInterrupt
+
+
+def interrupt_by_signal():
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(600)
+
+
+def leave():
+    sys.exit(0)
+
+
+class Unprintable(BaseException):
+    """Has neither a message nor a representation, and cannot be pickled."""
+
+    def __str__(self):
+        raise RuntimeError
+
+    __repr__ = __reduce__ = __str__
+
+
+def raise_unprintable():
+    raise Unprintable
+
+
+def raise_long_text():
+    raise RuntimeError("word " * 200_000 + "\x1b[2J")
+
+
+def return_what_cannot_be_pickled():
+    return lambda: 0
+
+
+class Unloadable:
+    """Can be pickled, and not loaded."""
+
+    def __reduce__(self):
+        return int, ("x",)
+
+
+def write_into_every_descriptor():
+    for descriptor in range(3, 64):
+        with contextlib.suppress(OSError):
+            os.write(descriptor, b"noise")
+    time.sleep(600)
+
+
+def close_every_descriptor():
+    os.closerange(0, 4096)
+
+
+def stop_itself():
+    os.kill(os.getpid(), signal.SIGSTOP)
+
+
+def end_process_group():
+    os.killpg(0, signal.SIGTERM)
+
+
+def come_back_twice():
+    os.fork()
+    return "twice"
+
+
 def write_file_and_flood_output():
     """Write a file into the working folder and flood both outputs, as engines do."""
     Path("dropped.txt").write_text("x")
@@ -66,7 +154,180 @@ LOSSES = [
     (exhaust_memory, "out of memory"),
     (hang, "timeout: no answer within"),
     (hang_holding_gil, "timeout: no answer within"),
+    (stop_itself, "timeout: no answer within"),
 ]
+
+
+# Each is noticed at once: a time limit that no test waits for.
+FAULTS = [
+    (exit_quietly, "crashed: the worker exited with code 0"),
+    (exit_from_c, "crashed: the worker exited with code 0"),
+    (exit_from_a_thread, "crashed: the worker exited with code 0"),
+    (exit_beside_a_child, "crashed: the worker exited with code 0"),
+    (interrupt, "KeyboardInterrupt: no message"),
+    (interrupt_by_signal, "KeyboardInterrupt: no message"),
+    (leave, "SystemExit: 0"),
+    (raise_unprintable, "Unprintable: no readable message"),
+    (raise_long_text, "word  … (cut: 1,000,004 characters)"),
+    (return_what_cannot_be_pickled, "Can't pickle local object"),
+    (write_into_every_descriptor, "crashed: the worker did not reply, but"),
+    (close_every_descriptor, "crashed: the worker"),
+    (end_process_group, "crashed: the worker died of SIGTERM"),
+]
+
+
+def test_faults_are_reported_at_once_and_change_no_other_task():
+    limits = Limits(seconds=600, gigabytes=4)
+    with WorkerPool(2, limits) as workers:
+        tasks = [Task(fault.__name__, fault, (), limits, engine="faulty") for fault, _ in FAULTS]
+        tasks += [Task(i, double, (i,), limits) for i in range(len(FAULTS))]
+        outcomes = {o.key: o for o in workers.run(tasks)}
+    for fault, words in FAULTS:
+        assert words in (outcomes[fault.__name__].failure or ""), fault.__name__
+        assert len(outcomes[fault.__name__].failure) < 2200
+    assert [outcomes[i].value for i in range(len(FAULTS))] == [2 * i for i in range(len(FAULTS))]
+
+
+def test_an_engine_that_forks_answers_once():
+    with WorkerPool(1) as workers:
+        tasks = [Task(0, come_back_twice, engine="e"), Task(1, double, (3,), engine="e")]
+        found = {outcome.key: outcome.value for outcome in workers.run(tasks)}
+    assert found == {0: "twice", 1: 6}
+
+
+def abort_on(_):
+    os.abort()
+
+
+def raise_on(_):
+    raise ValueError("the judge's")
+
+
+def test_answers_that_cannot_be_loaded_are_the_engine_s_fault_and_judges_their_own():
+    with WorkerPool(1) as workers:
+        tasks = [
+            Task("unloadable", Unloadable, judge=double, engine="e"),
+            Task("judge", double, (1,), judge=raise_on, engine="e"),
+            Task("judge dies", double, (1,), judge=abort_on, engine="e"),
+        ]
+        found = {outcome.key: outcome for outcome in workers.run(tasks)}
+    assert "the answer cannot be read: ValueError" in found["unloadable"].failure
+    assert found["judge"].failure is None and found["judge"].judge_failure == "ValueError: the judge's"
+    assert found["judge dies"].failure is None and "crashed" in found["judge dies"].judge_failure
+
+
+def spoil_process():
+    """Change everything that calls in the same process share."""
+    np.sum = np.cross = None
+    np.seterr(all="raise")
+    os.environ["SPOILED"] = "yes"
+    os.chdir("/")
+    sys.path.clear()
+
+
+def is_spoiled():
+    return np.sum is None or os.getcwd() == "/" or "SPOILED" in os.environ or not sys.path
+
+
+def is_spoiled_beside(answer):
+    return is_spoiled()
+
+
+def test_an_engine_changes_neither_others_nor_judges():
+    with WorkerPool(1) as workers:
+        tasks = [
+            Task("spoils", spoil_process, judge=is_spoiled_beside, engine="bad"),
+            Task("itself", is_spoiled, engine="bad"),
+            Task("other", is_spoiled, engine="good"),
+            Task("truth", is_spoiled),
+        ]
+        found = {outcome.key: outcome for outcome in workers.run(tasks)}
+    assert found["spoils"].judge_result is False and found["itself"].value is True
+    assert found["other"].value is False and found["truth"].value is False
+
+
+def leave_processes():
+    """A child, a child in a session of its own, a grandchild whose parent has ended."""
+    started = []
+    for make in (lambda: None, os.setsid):
+        child = os.fork()
+        if not child:
+            make()
+            time.sleep(600)
+            os._exit(0)
+        started.append(child)
+    read, write = os.pipe()
+    if not os.fork():
+        os.setsid()
+        grandchild = os.fork()
+        if grandchild:
+            os.write(write, str(grandchild).encode())
+            os._exit(0)
+        time.sleep(600)
+        os._exit(0)
+    os.wait()
+    started.append(int(os.read(read, 100)))
+    started.append(subprocess.Popen(["sleep", "600"], start_new_session=True).pid)
+    return started
+
+
+def leave_processes_and_hang(path):
+    Path(path).write_text(" ".join(map(str, leave_processes())))
+    time.sleep(600)
+
+
+def wait_until_ended(processes):
+    deadline = time.monotonic() + 20
+    while (left := [p for p in processes if is_alive(p)]) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return not left
+
+
+def is_alive(process):
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except OSError:
+        return False
+
+
+linux_only = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="subreapers are Linux's")
+
+
+@linux_only
+def test_processes_that_an_engine_starts_end_with_the_pool(tmp_path):
+    limits = Limits(seconds=4)
+    with WorkerPool(1, limits) as workers:
+        found = workers.run(
+            [
+                Task("answers", leave_processes, engine="e"),
+                Task("hangs", leave_processes_and_hang, (str(tmp_path / "started"),), limits, engine="e"),
+            ]
+        )
+        answered, lost = found
+    assert "timeout" in lost.failure
+    started = [*answered.value, *map(int, (tmp_path / "started").read_text().split())]
+    assert len(started) == 8 and wait_until_ended(started)
+
+
+@linux_only
+def test_processes_that_an_engine_starts_end_with_a_killed_run(tmp_path):
+    script = tmp_path / "parent.py"
+    script.write_text(
+        "import sys\n"
+        f"sys.path[:0] = {[str(ROOT), str(Path(__file__).parent)]!r}\n"
+        "from test_workers import hang, leave_processes\n"
+        "from plumbline.processes.workers import Task, WorkerPool\n"
+        "if __name__ == '__main__':\n"
+        "    with WorkerPool(1) as workers:\n"
+        "        for outcome in workers.run([Task(0, leave_processes), Task(1, hang)]):\n"
+        "            print(*outcome.value, flush=True)\n"
+    )
+    parent = subprocess.Popen([sys.executable, script], stdout=subprocess.PIPE, text=True)
+    started = [int(word) for word in parent.stdout.readline().split()]
+    assert len(started) == 4 and all(map(is_alive, started))
+    parent.send_signal(signal.SIGKILL)
+    parent.wait()
+    assert wait_until_ended(started)
 
 
 def test_each_loss_costs_one_task_and_is_reported():
