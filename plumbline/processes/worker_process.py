@@ -123,8 +123,10 @@ class WorkerProcess:
 
         """
         self._connection, other = context.Pipe()
+        is_forked = context.get_start_method() == "forkserver"
+        call = other, is_forked, initialize, tuple(arguments)
         with _process_table:
-            process = context.Process(target=serve_calls, args=(other, initialize, tuple(arguments)))  # type: ignore[attr-defined]
+            process = context.Process(target=serve_calls, args=call)  # type: ignore[attr-defined]
             process.daemon = True  # ended by multiprocessing where its owner does not
             process.start()
         self._process: multiprocessing.process.BaseProcess = process
@@ -176,12 +178,13 @@ class WorkerProcess:
 
     def _lost(self) -> WorkerLost:
         """How the process ended; it is killed where it has only closed its pipe."""
-        if not connection.wait([self._process.sentinel], timeout=1.0):
-            self.kill()
-            return WorkerLost("closed its pipe")
+        connection.wait([self._process.sentinel], timeout=1.0)
         with _process_table:
-            self._process.join()
-        return WorkerLost(describe_exit(self._process.exitcode or 0))
+            self._process.join(timeout=1.0)
+        code = self._process.exitcode
+        if code is None:
+            self.kill()
+        return WorkerLost("closed its pipe" if code is None else describe_exit(code))
 
     def kill(self) -> None:
         """Kill the process and its descendants; whoever waits for its reply gets `WorkerLost`."""
@@ -203,11 +206,14 @@ class WorkerProcess:
                 )
 
 
-def serve_calls(pipe: Any, initialize: Callable[..., None], arguments: Sequence[Any]) -> None:
+def serve_calls(
+    pipe: Any, is_forked: bool, initialize: Callable[..., None], arguments: Sequence[Any]
+) -> None:
     """Make the calls that arrive through a pipe until it is closed; the process ends with this function.
 
     Args:
         pipe: connection to the `WorkerProcess`.
+        is_forked: whether no other descriptor is needed; the owner of a spawned process waits for one.
         initialize: called first.
         arguments: of that call.
 
@@ -215,7 +221,8 @@ def serve_calls(pipe: Any, initialize: Callable[..., None], arguments: Sequence[
     own = os.getpid()
     try:
         multiprocessing.current_process()._config["daemon"] = False  # type: ignore[attr-defined]  # may have children
-        _close_descriptors_except(pipe.fileno())
+        if is_forked:
+            _close_descriptors_except(pipe.fileno())
         try:
             initialize(*arguments)
             ready: int | str = os.getppid()
@@ -235,8 +242,6 @@ def serve_calls(pipe: Any, initialize: Callable[..., None], arguments: Sequence[
 
 def _close_descriptors_except(own: int) -> None:
     """Close what connects this process to others: an engine may write into every descriptor."""
-    if os.name != "posix":
-        return
     os.set_inheritable(own, False)
     os.closerange(3, own)
     os.closerange(own + 1, _MAX_DESCRIPTOR)
