@@ -15,7 +15,9 @@ from typing import ClassVar
 
 import numpy as np
 from packaging.specifiers import SpecifierSet
+from packaging.version import InvalidVersion
 
+from plumbline.engines.answers import check_declarations, check_evaluation, check_record, check_text
 from plumbline.model.datatypes import (
     Array,
     BadInput,
@@ -28,7 +30,6 @@ from plumbline.model.datatypes import (
     Trajectory,
     Unsupported,
 )
-from plumbline.model.kinematics import rate_count
 from plumbline.model.loops import determinate_part
 
 UNIT_NORM_TOLERANCE = 8 * np.finfo(float).eps  # a quaternion normalised in double is this close to |p| = 1
@@ -115,10 +116,14 @@ class Adapter(ABC):
             the loaded version.
 
         """
-        version, missing = self.version(), None
+        check_declarations(self)
+        version, missing = check_text(self.version(), f"{self.name}: version()"), None
         supported = self.supported_versions
-        if supported and not SpecifierSet(supported).contains(version, prereleases=True):
-            missing = f"the adapter supports versions {supported} of {self.package}, this is {version}"
+        try:
+            if supported and not SpecifierSet(supported).contains(version, prereleases=True):
+                missing = f"the adapter supports versions {supported} of {self.package}, this is {version}"
+        except InvalidVersion:
+            raise EngineFailure(f"{self.name}: version() is {version!r}, must be a PEP 440 version") from None
         return EngineInfo(self.name, self.title, version, self.integrators, missing)
 
     def integrator(self, name: str) -> Integrator:
@@ -160,13 +165,10 @@ class Adapter(ABC):
         for state in states:
             check_state(model, state)
         answers = self._evaluate(model, states)
-        if len(answers) != len(states):
-            raise EngineFailure(f"{self.name} answered {len(answers)} of {len(states)} states")
+        check_evaluation(answers, model, len(states), f"{self.name}._evaluate")
         if model.has_loops:
             pairs = zip(states, answers, strict=True)
             answers = [determinate_part(model, state, answer) for state, answer in pairs]
-        for index, answer in enumerate(answers):
-            _check_quantities(model, answer, f"{self.name}, state {index}")
         return answers
 
     def simulate(
@@ -191,7 +193,7 @@ class Adapter(ABC):
         if method.kind == "step":
             check_times(times, resolution)
         trajectory = self._simulate(model, state, times, method, resolution)
-        _check_trajectory(model, times, trajectory, f"{self.name} {integrator}")
+        _check_trajectory(model, times, trajectory, f"{self.name}._simulate, {integrator}")
         return replace(trajectory, initial_x=state.x)
 
     def step(self, model: Model, state: State, integrator: str, step: float, count: int) -> StepRun:
@@ -218,13 +220,9 @@ class Adapter(ABC):
         check_state(model, state)
         times = np.asarray(step * np.arange(count + 1), float)
         run = self._step(model, state, times, self.integrator(integrator), step)
-        _check_trajectory(model, times, run.trajectory, f"{self.name} {integrator}")
-        for name, width in (("coordinate_acceleration", 7), ("multipliers", 4)):
-            value, label = getattr(run, name), f"{self.name} {integrator}: {name}"
-            if value is not None:
-                _check_shape(value, (len(times), model.n, width), label)
-                if not np.all(np.isfinite(value)):
-                    raise EngineFailure(f"{label} is not finite")
+        label = f"{self.name}._step, {integrator}"
+        check_record(run, StepRun, {"N": model.n, "T": len(times)}, label)
+        _check_trajectory(model, times, run.trajectory, label)
         return run
 
     def _check_motion(self, model: Model) -> None:
@@ -306,42 +304,25 @@ def check_samples(model: Model, times: Array, run: Trajectory, label: str) -> No
         EngineFailure: the run stopped early, or a row has another shape or is not finite.
 
     """
-    if np.shape(run.t) != np.shape(times) or np.max(np.abs(run.t - times)) > 1e-9 * max(1.0, times[-1]):
-        last = run.t[-1] if len(run.t) else float("nan")
-        raise EngineFailure(f"{label}: sampled {len(run.t)} of {len(times)} times, last at t = {last} s")
-    shape = (len(times), model.n)
-    for name, width in (("r", 3), ("p", 4), ("v", 3), ("pdot", 4)):
+    check_record(run, Trajectory, {"N": model.n, "T": len(times)}, label)
+    common = min(len(run.t), len(times))
+    with np.errstate(invalid="ignore"):
+        wrong = np.flatnonzero(~(np.abs(run.t[:common] - times[:common]) <= 1e-9 * max(1.0, times[-1])))
+    if len(wrong) or len(run.t) != len(times):
+        first = wrong[0] if len(wrong) else common
+        text = f"{label}: sampled {len(run.t)} of {len(times)} times"
+        if len(run.t):
+            text += f", last at t = {run.t[-1]:.9g} s, asked for up to t = {times[-1]:.9g} s"
+        if len(wrong):
+            text += f"; sample {first} is at t = {run.t[first]:.9g} s, asked for t = {times[first]:.9g} s"
+        raise EngineFailure(text)
+    for name in ("r", "p", "v", "pdot"):
         array = getattr(run, name)
-        _check_shape(array, (*shape, width), f"{label}: {name}")
+        if len(array) != len(times):
+            raise EngineFailure(f"{label}: {name} has {len(array)} samples, expected {len(times)}")
         finite = np.all(np.isfinite(array), axis=(1, 2))
         if not np.all(finite):
             raise EngineFailure(f"{label}: {name} is not finite from t = {times[np.argmin(finite)]} s")
-
-
-def _check_shape(array: Array | float, shape: tuple[int, ...], label: str) -> None:
-    if np.shape(array) != shape:
-        raise EngineFailure(f"{label} has shape {np.shape(array)}, expected {shape}")
-
-
-def _check_quantities(model: Model, answer: StateQuantities, label: str) -> None:
-    """Check the shapes and the finiteness of an engine's answer at one state."""
-    shapes = {
-        "acceleration": (model.n, 3),
-        "angular_acceleration": (model.n, 3),
-        "joint_reaction": (len(model.kind), 3),
-        "angular_momentum": (3,),
-        "kinetic_energy": (),
-        "potential_energy": (),
-        "joint_moment": (len(model.kind), 3),
-        "mass_matrix": (rate_count(model),) * 2,
-    }
-    for name, shape in shapes.items():
-        value = getattr(answer, name)
-        if value is None:
-            continue
-        _check_shape(value, shape, f"{label}: {name}")
-        if not np.all(np.isfinite(value)):
-            raise EngineFailure(f"{label}: {name} is not finite")
 
 
 def _check_trajectory(model: Model, times: Array, run: Trajectory, label: str) -> None:

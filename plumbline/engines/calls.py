@@ -16,8 +16,6 @@ from plumbline.engines.environments import BASE_REQUIREMENTS, declared_attribute
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import (
     Array,
-    BadInput,
-    EngineFailure,
     Integrator,
     Model,
     State,
@@ -26,6 +24,7 @@ from plumbline.model.datatypes import (
     Trajectory,
     Unsupported,
 )
+from plumbline.processes.errors import describe_exception
 
 # What every environment has: where one of these is missing, the checkout or the environment is broken.
 _OWN_PACKAGES = {"plumbline", "adapters", "reference_impl", *BASE_REQUIREMENTS, ""}
@@ -124,11 +123,11 @@ def evaluate_states(engine: str, model: Model, states: Sequence[State]) -> Evalu
     try:
         quantities = load_adapter(engine).evaluate(model, states)
     except Unsupported as refusal:
-        unsupported = str(refusal)
+        unsupported = describe_exception(refusal)
     except MemoryError:
         raise
     except Exception as error:  # an engine may raise anything: its message belongs in the results
-        failure = format_exception(error)
+        failure = describe_exception(error)
     return Evaluation(quantities, unsupported, failure, time.process_time() - begin)
 
 
@@ -167,11 +166,11 @@ def run_refinement(
         try:
             trajectory = adapter.simulate(model, state, times, integrator, resolution)
         except Unsupported as refusal:
-            return RefinementStudy(runs, str(refusal))
+            return RefinementStudy(runs, describe_exception(refusal))
         except MemoryError:
             raise
         except Exception as error:  # as above
-            failure = format_exception(error)
+            failure = describe_exception(error)
         runs.append(RefinementRun(resolution, trajectory, failure, time.process_time() - begin))
         if is_enough is not None and is_enough(model, adapter.integrator(integrator), runs):
             break
@@ -214,24 +213,10 @@ def run_steps(
                     attempt = replace(attempt, run=adapter.step(model, state, integrator, step, count))
                     break
                 except Unsupported as refusal:
-                    attempt = replace(attempt, refusal=attempt.refusal or str(refusal))
+                    attempt = replace(attempt, refusal=attempt.refusal or describe_exception(refusal))
                 except MemoryError:
                     raise
                 except Exception as error:  # as above
-                    attempt = replace(attempt, failure=attempt.failure or format_exception(error))
+                    attempt = replace(attempt, failure=attempt.failure or describe_exception(error))
             attempts.append(attempt)
     return StepEvaluation(attempts, time.process_time() - begin)
-
-
-def format_exception(error: Exception) -> str:
-    """Write an exception as one sentence.
-
-    Args:
-        error: what was raised.
-
-    Returns:
-        Its message on one line; after the class name unless the error is one of the project's own.
-
-    """
-    text = " ".join(str(error).split()) or "no message"
-    return text if isinstance(error, EngineFailure | BadInput) else f"{type(error).__name__}: {text}"

@@ -10,19 +10,27 @@ from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
 from importlib import metadata
 
-import numpy as np
 from packaging.specifiers import SpecifierSet
 
 from plumbline.engines.adapter import EngineInfo
-from plumbline.engines.calls import format_exception
+from plumbline.engines.answers import check_numbers, check_text, describe_value
 from plumbline.engines.environments import BASE_REQUIREMENTS, declared_attribute
 from plumbline.engines.registry import load_importer
 from plumbline.importers.importer import ModelFile, Reading
 from plumbline.importers.neutral_model import CanonicalState, ModelQuantities
-from plumbline.model.datatypes import Array, EngineFailure
+from plumbline.model.datatypes import EngineFailure
+from plumbline.processes.errors import describe_exception
 
 _OWN_PACKAGES = {"plumbline", "adapters", *BASE_REQUIREMENTS, ""}
-_VECTORS = ("bias_force", "gravity_force", "passive_force", "acceleration")
+_FIELDS = {  # shapes, as of `plumbline.engines.answers.FIELDS`; V velocities
+    "mass_matrix": "V V",
+    "bias_force": "V",
+    "gravity_force": "V",
+    "passive_force": "V",
+    "acceleration": "V",  # infinite where M is singular
+    "kinetic_energy": "",
+    "potential_energy": "",
+}
 
 
 def describe_importer(name: str) -> EngineInfo:
@@ -48,7 +56,7 @@ def describe_importer(name: str) -> EngineInfo:
     except AttributeError as error:  # an interface that this version does not have
         version = metadata.version(declared_attribute(name, "package"))
         return EngineInfo(name, name, version, (), f"the column cannot use version {version}: {error}")
-    version, missing = importer.version(), None
+    version, missing = check_text(importer.version(), f"{name}: version()"), None
     supported = importer.supported_versions
     if supported and not SpecifierSet(supported).contains(version, prereleases=True):
         missing = f"the column supports versions {supported} of {importer.package}, this is {version}"
@@ -77,7 +85,7 @@ def read_model_file(name: str, file: ModelFile) -> Reading:
     except MemoryError:
         raise
     except Exception as error:  # an importer may raise anything: its message is the answer
-        return Reading(importer.version(), refusal=format_exception(error))
+        return Reading(importer.version(), refusal=describe_exception(error))
 
 
 def read_model_files(name: str, files: Mapping[str, ModelFile]) -> dict[str, Reading]:
@@ -137,21 +145,14 @@ def run_script(text: str) -> str:
 
 
 def _check(answer: ModelQuantities, count: int, label: str) -> None:
-    """Check the shapes and the finiteness of an answer."""
-    shapes: Mapping[str, tuple[int, ...]] = {
-        "mass_matrix": (count, count),
-        **dict.fromkeys(_VECTORS, (count,)),
-        "kinetic_energy": (),
-        "potential_energy": (),
-    }
-    arrays: dict[str, tuple[Array | float | None, tuple[int, ...]]] = {
-        name: (getattr(answer, name), shape) for name, shape in shapes.items()
-    }
-    arrays |= {f"pose of {body}": (matrix, (3, 4)) for body, matrix in answer.poses.items()}
-    for name, (value, shape) in arrays.items():
-        if value is None:
-            continue
-        if np.shape(value) != shape:
-            raise EngineFailure(f"{label}: {name} has shape {np.shape(value)}, expected {shape}")
-        if name != "acceleration" and not np.all(np.isfinite(value)):
-            raise EngineFailure(f"{label}: {name} is not finite")
+    """Check the types, shapes and finiteness of an answer."""
+    if not isinstance(answer, ModelQuantities):
+        raise EngineFailure(f"{label} returned {describe_value(answer)}, must be a ModelQuantities")
+    fields = {name: (getattr(answer, name), shape) for name, shape in _FIELDS.items()}
+    fields |= {f"pose of {body}": (matrix, "3 4") for body, matrix in answer.poses.items()}
+    for name, (value, shape) in fields.items():
+        if value is not None:
+            is_finite = name != "acceleration"
+            check_numbers(
+                value, shape, {"V": count}, f"{label}: {name}", is_optional=True, must_be_finite=is_finite
+            )

@@ -122,7 +122,9 @@ class MetamorphicHooks(Adapter):
         """
         check_state(model, state)
         run = self._simulate_round_trip(model, state, end, self.integrator(integrator), resolution)
-        check_samples(model, np.array([0.0, end, 2 * end]), run, f"{self.name} {integrator}")
+        check_samples(
+            model, np.array([0.0, end, 2 * end]), run, f"{self.name}._simulate_round_trip, {integrator}"
+        )
         return run
 
     def _simulate_round_trip(

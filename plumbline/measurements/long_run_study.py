@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from plumbline.engines.calls import format_exception
 from plumbline.engines.registry import load_adapter
 from plumbline.measurements.order_and_limit import step_unit
 from plumbline.model.datatypes import Array, Integrator, Model, State, Trajectory, Unsupported
@@ -19,6 +18,7 @@ from plumbline.model.invariants import (
     kinetic_energy,
 )
 from plumbline.model.kinematics import angular_velocity
+from plumbline.processes.errors import describe_exception
 from plumbline.truth.ground_truth import singular_note, stretched_length
 
 # By order: coarsest and finest step, as -log2 of the `step_unit`.
@@ -157,11 +157,11 @@ def run_long_run_study(
                     )
                     break
                 except Unsupported as refusal:
-                    return LongRunStudy(runs, plan, str(refusal))
+                    return LongRunStudy(runs, plan, describe_exception(refusal))
                 except MemoryError:
                     raise
                 except Exception as error:  # an engine may raise anything; its message belongs in the results
-                    failure = failure or format_exception(error)
+                    failure = failure or describe_exception(error)
             runs.append(_reduce_run(model, plan, trajectory, resolution, failure, begin))
             doubt = _first_doubt(model, state, trajectory, runs[-1], end) if is_checked else None
             if doubt is not None:

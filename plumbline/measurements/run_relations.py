@@ -19,6 +19,7 @@ from plumbline.measurements.relation_result import OPTION_PREFIX, Refusal, Relat
 from plumbline.model.datatypes import EngineFailure, Integrator, Model, State, Trajectory, Unsupported
 from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import angular_velocity
+from plumbline.processes.errors import describe_exception
 from plumbline.truth.ground_truth import RUN_ROUNDING, stretched_length
 from plumbline.truth.rounding_bound import state_rounding_bound
 
@@ -178,7 +179,7 @@ def refused_result(name: str, integrator: Integrator, refusal: Unsupported | Eng
 
     """
     kind: Refusal = "unsupported" if isinstance(refusal, Unsupported) else "failed"
-    return RelationResult(name, None, "", 0, 0, str(refusal), kind, integrator.name)
+    return RelationResult(name, None, "", 0, 0, describe_exception(refusal), kind, integrator.name)
 
 
 def run_tolerance(integrator: Integrator, model: Model, state: State, end: float, steps: int) -> float:

@@ -22,7 +22,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import IO, Any
 
-from plumbline.processes.errors import PlumblineError
+from plumbline.processes.errors import PlumblineError, describe_exception
 
 ROOT = Path(__file__).resolve().parents[2]
 _FRAME_LENGTH = struct.Struct("<Q")
@@ -94,9 +94,7 @@ def call_remote(python: str, function: Callable[..., Any], *arguments: Any) -> A
         _child_process.cache_clear()
         raise RemoteCrash(describe_exit(process.wait())) from None
     if raised:
-        if value[0] == "MemoryError":
-            raise MemoryError
-        raise RemoteError(": ".join(value))
+        raise RemoteError(value) if value else MemoryError
     return value
 
 
@@ -159,8 +157,10 @@ def _serve_calls(parent: int) -> None:
             return
         try:
             answer = False, getattr(import_module(module), name)(*arguments)
-        except Exception as error:
-            answer = True, (type(error).__name__, str(error))
+        except MemoryError:
+            answer = True, ""
+        except BaseException as error:  # the engine's own failure
+            answer = True, describe_exception(error)
         _send_frame(answers, answer)
 
 
