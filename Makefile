@@ -23,7 +23,7 @@ help:  ## this list
 install: .venv/truth.tried  ## install what runs need, then try it: one scenario on all engines
 	$(PYTHON) -m plumbline run tumbling-ball --level state
 	@printf '%s\n' '' 'Installed. Next:' \
-		'  . .venv/bin/activate                then `plumbline` is a command; `plumbline --help` lists what it does' \
+		'  . .venv/bin/activate                 then `plumbline` is a command; `plumbline --help` lists what it does' \
 		'  plumbline run double-tumbling-balls  another scenario, with its motion; `plumbline list scenarios` has all' \
 		'  plumbline model FILE                 what importers make of your URDF or MJCF file' \
 		'  make run                             the whole catalogue (about ten minutes)'

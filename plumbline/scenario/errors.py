@@ -25,9 +25,15 @@ class Problem:
 
     def __str__(self) -> str:
         where = f"{self.file}:{self.line}:{self.column}" if self.line else self.file
-        parts = [where, self.field, self.message] if self.field else [where, self.message]
+        parts = [self.field, self.message] if self.field else [self.message]
         valid = f"; valid would be {self.valid}" if self.valid else ""
-        return ": ".join(parts) + valid + (f"; {self.hint}" if self.hint else "")
+        return where + _on_one_line(": ".join(["", *parts]) + valid + (f"; {self.hint}" if self.hint else ""))
+
+
+def _on_one_line(text: str) -> str:
+    """Escape what a terminal would not print, and make line breaks blanks: files can hold any character."""
+    shown = (c if c.isprintable() else " " if c.isspace() else ascii(c)[1:-1] for c in text)
+    return text if text.isprintable() else "".join(shown)
 
 
 class ScenarioError(PlumblineError, ValueError):

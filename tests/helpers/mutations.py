@@ -45,10 +45,10 @@ def damaged_document(document: Any, draw: random.Random) -> Any:
     """A copy of plain data in which one to three values, keys or entries are changed, doubled or removed."""
     found = copy.deepcopy(document)
     for _ in range(draw.choice((1, 1, 1, 2, 3))):
-        places = list(_places(found))
-        if not places:
+        every = list(places(found))
+        if not every:
             return draw.choice(HOSTILE_VALUES)
-        holder, key = draw.choice(places)
+        holder, key = draw.choice(every)
         match draw.randrange(5):
             case 0 | 1:
                 holder[key] = copy.deepcopy(draw.choice(HOSTILE_VALUES))
@@ -59,18 +59,18 @@ def damaged_document(document: Any, draw: random.Random) -> Any:
             case 3:
                 holder.insert(key, copy.deepcopy(holder[key]))
             case 4:
-                value, (_, other) = holder[key], draw.choice(places)
+                value, (_, other) = holder[key], draw.choice(every)
                 holder[key] = {other: value} if draw.random() < 0.3 else _scaled(value, draw)
     return found
 
 
-def _places(document: Any) -> Iterator[tuple[Any, Any]]:
+def places(document: Any) -> Iterator[tuple[Any, Any]]:
     """Every (holder, key) of a document; of long lists the first entries, so that all parts have a chance."""
     pairs = document.items() if isinstance(document, dict) else enumerate(document[:6])
     for key, value in pairs:
         yield document, key
         if isinstance(value, dict | list):
-            yield from _places(value)
+            yield from places(value)
 
 
 def _scaled(value: Any, draw: random.Random) -> Any:

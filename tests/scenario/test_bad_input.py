@@ -292,6 +292,16 @@ def test_two_scenarios_of_one_name_are_refused(tmp_path):
     assert len(load_scenarios([tmp_path / "a.yaml", tmp_path / "a.yaml"])) == 1
 
 
+def test_a_problem_is_one_line_of_printable_text():
+    (problem,) = errors_in(VALID_SCENARIO.replace("mass:", '"mass\\e[2J\\u202e\\L\\n": 2\n    mass:'))
+    assert problem.startswith(
+        r"5:5: bodies[0].mass\x1b[2J\u202e  : unknown field. did you mean 'mass'?; valid"
+    )
+    assert problem.isprintable()
+    two_lines = Problem("a\nb.xml", 3, 1, "", "refused:\n\nbad\udcff")
+    assert str(two_lines) == "a\nb.xml:3:1: refused:  bad\\udcff"
+
+
 def test_errors_cross_processes():
     error = ScenarioError([Problem("a.yaml", 1, 2, "mass", "is -1", "more")])
     assert (
