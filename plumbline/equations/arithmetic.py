@@ -22,6 +22,8 @@ class Arithmetic(Protocol):
     matrix: Callable[[Any], Any]  # of doubles (..., 3, 3)
     entry: Callable[..., Any]  # x, row, column = 0: a scalar
     from_rows: Callable[[Sequence[Sequence[Any]]], Any]  # the matrix of scalars
+    columns: Callable[[Sequence[Any]], Any]  # the matrix of columns
+    widened: Callable[[Any, Any], Any]  # x and columns of 0, as many as a matrix has
     assemble: Callable[[int, Mapping[tuple[int, int], Any]], Any]  # size, blocks by first row and column
     mul: Callable[[Any, Any], Any]  # product of two matrices
     transpose: Callable[[Any], Any]
@@ -69,6 +71,12 @@ class _Floats:
     def from_rows(self, rows: Sequence[Sequence[Any]]) -> Any:
         entries = iter(np.broadcast_arrays(*(x for row in rows for x in row)))
         return np.concatenate([np.concatenate([next(entries) for _ in row], -1) for row in rows], -2)
+
+    def columns(self, vectors: Sequence[Any]) -> Any:
+        return np.concatenate(np.broadcast_arrays(*vectors), -1)
+
+    def widened(self, x: Any, like: Any) -> Any:
+        return x if like.shape[-1] == 1 else self.columns([x] + [np.zeros_like(x)] * (like.shape[-1] - 1))
 
     def assemble(self, size: int, blocks: Mapping[tuple[int, int], Any]) -> Any:
         lead = np.broadcast_shapes(*(block.shape[:-2] for block in blocks.values()))

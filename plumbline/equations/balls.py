@@ -44,6 +44,18 @@ class _Balls:
     def from_rows(self, rows: Sequence[Sequence[Any]]) -> Any:
         return self.mat(len(rows), len(rows[0]), [e for row in rows for e in row])
 
+    def columns(self, vectors: Sequence[Any]) -> Any:
+        rows = range(vectors[0].nrows())
+        return self.mat(len(rows), len(vectors), [v[row, 0] for row in rows for v in vectors])
+
+    def widened(self, x: Any, like: Any) -> Any:
+        if like.ncols() == 1:
+            return x
+        out = self.mat(x.nrows(), like.ncols())
+        for row in range(x.nrows()):
+            out[row, 0] = x[row, 0]
+        return out
+
     def assemble(self, size: int, blocks: Mapping[tuple[int, int], Any]) -> Any:
         out = self.mat(size, size)
         for (i, j), block in blocks.items():

@@ -19,7 +19,7 @@ digit per body.  Whether a mechanism is a chain or a tree plays no part.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,6 +50,18 @@ class Solution:
     force: list[Any]  # of joint k on body k
     moment: list[Any]  # the same about the near point; None where it is exactly 0
 
+    def combined(self, combine: Callable[[Any], Any]) -> Solution:
+        """Apply one function to every vector.
+
+        Args:
+            combine: of a matrix with a column per wrench, to a vector.
+
+        Returns:
+            The solution of one column.
+
+        """
+        return Solution(*([x if x is None else combine(x) for x in rows] for rows in vars(self).values()))
+
 
 class _Swing:
     """The near point moves on a sphere: uᵀa = uᵀa_far − ℓ u̇², F along u."""
@@ -57,21 +69,21 @@ class _Swing:
     armature = None
 
     def __init__(self, num: Arithmetic, u: Any, pull: Any, length: Any) -> None:
-        self.num, self.u, self.pull, self.length = num, u, pull, length
+        self.num, self.u, self.pull, self.length = num, u, num.from_rows([[pull]]), length
 
     def reduce(self, x: Articulated) -> Articulated:
         num = self.num
         self.f, self.inverse = x.f, num.inverse(x.c)
         self.w = num.mul(self.inverse, self.u)
         self.size = 1 / num.dot(self.u, self.w)
-        offset = (self.pull + num.dot(self.w, x.f)) * self.size
+        self.push = num.widened(self.pull, x.f) + num.mul(num.transpose(self.w), x.f)
         c = num.mul(self.u, num.transpose(self.u)) * self.size
-        return Articulated(c, None, None, self.u * offset, None)
+        return Articulated(c, None, None, num.mul(self.u, self.push * self.size), None)
 
     def advance(self, a: Any, alpha: Any) -> tuple[Any, Any]:
         num = self.num
-        tension = (num.dot(self.u, a) + self.pull + num.dot(self.w, self.f)) * self.size
-        return num.mul(self.inverse, self.u * tension - self.f), alpha
+        tension = (num.mul(num.transpose(self.u), a) + self.push) * self.size
+        return num.mul(self.inverse, num.mul(self.u, tension) - self.f), alpha
 
 
 class _Slides:
@@ -84,8 +96,7 @@ class _Slides:
 
     def reduce(self, x: Articulated) -> Articulated:
         self.x = x
-        nothing = self.num.vector(np.zeros(3))
-        return Articulated(self.num.matrix(np.zeros((3, 3))), None, None, nothing, None)
+        return Articulated(self.num.matrix(np.zeros((3, 3))), None, None, x.f * self.num.scalar(0.0), None)
 
     def advance(self, a: Any, alpha: Any) -> tuple[Any, Any]:
         num = self.num
@@ -102,14 +113,15 @@ class _Turns:
         num, a = self.num, self.armature
         i = x.i if a is None else x.i + num.matrix(np.eye(3)) * a
         self.b, self.inverse = x.b, num.inverse(i)
-        self.push = -x.n if self.effort is None else self.effort - x.n
+        effort = None if self.effort is None else num.widened(self.effort, x.n)
+        self.push = -x.n if effort is None else effort - x.n
         gain = num.mul(x.b, self.inverse)
         c = num.symmetric(x.c - num.mul(gain, num.transpose(x.b)))
         f = x.f + num.mul(gain, self.push)
         if a is None:
-            return Articulated(c, None, None, f, self.effort)
+            return Articulated(c, None, None, f, effort)
         n = -num.mul(self.inverse, self.push) * a
-        n = n if self.effort is None else n + self.effort
+        n = n if effort is None else n + effort
         return Articulated(c, gain * a, num.matrix(np.eye(3)) * a - self.inverse * (a * a), f, n)
 
     def advance(self, a: Any, alpha: Any) -> tuple[Any, Any]:
@@ -123,7 +135,7 @@ class _Single:
 
     def __init__(self, num: Arithmetic, what: str, axis: Any, effort: Any, armature: Any) -> None:
         self.num, self.turns, self.axis = num, what == "turn", axis
-        self.effort, self.armature = effort, armature
+        self.effort, self.armature = num.from_rows([[effort]]), armature
 
     def reduce(self, x: Articulated) -> Articulated:
         num, e = self.num, self.axis
@@ -131,32 +143,35 @@ class _Single:
         self.U, self.V = U, V = [num.mul(block, e) for block in blocks]
         size = num.dot(e, V if self.turns else U)
         self.inverse = 1 / (size if self.armature is None else size + self.armature)
-        self.push = self.effort - num.dot(e, x.n if self.turns else x.f)
-        u, v, q = U * self.inverse, V * self.inverse, self.push
+        push = num.mul(num.transpose(e), x.n if self.turns else x.f)
+        self.push = q = num.widened(self.effort, push) - push
+        u, v = U * self.inverse, V * self.inverse
         return Articulated(
             num.symmetric(x.c - num.mul(u, num.transpose(U))),
             x.b - num.mul(u, num.transpose(V)),
             num.symmetric(x.i - num.mul(v, num.transpose(V))),
-            x.f + u * q,
-            x.n + v * q,
+            x.f + num.mul(u, q),
+            x.n + num.mul(v, q),
         )
 
     def advance(self, a: Any, alpha: Any) -> tuple[Any, Any]:
         num = self.num
-        rate = (self.push - num.dot(self.U, a) - num.dot(self.V, alpha)) * self.inverse
-        gained = self.axis * rate
+        U, V = num.transpose(self.U), num.transpose(self.V)
+        gained = num.mul(self.axis, (self.push - num.mul(U, a) - num.mul(V, alpha)) * self.inverse)
         return (a, alpha + gained) if self.turns else (a + gained, alpha)
 
 
 class Tree:
-    """A tree at a state: lists over the bodies, in world axes; of closing joints nothing is used.
+    """A tree at a state: lists over the bodies, in world axes.
+
+    Coordinates are the state's doubles; a subclass may give others of the kind of numbers.
 
     Attributes:
         A: attitudes; ``r``, ``v``: centres of mass and their velocities; ``w``: angular velocities.
         near: from the centre of mass to the near point of the body's joint.
         arm: from the far body's near point to the point that this joint carries: the near point, or of a rod
             the far one; from the world's origin where the far body is the world.
-        kinetic: energy of bodies and rotors [J]; ``potential``: of weight and springs [J].
+        blocks: what each joint is made of, from the far body on.
 
     """
 
@@ -179,12 +194,10 @@ class Tree:
         self.near: list[Any] = []
         self.arm: list[Any] = []
         self._bias: list[tuple[Any, Any]] = []  # acceleration of the carried point, angular acceleration
-        self._blocks: list[list[Any]] = []
-        self.kinetic = self.potential = num.scalar(0.0)
+        self.blocks: list[list[Any]] = []
+        self._kinetic = self._potential = num.scalar(0.0)  # of the joints' elements
         for k in range(model.n):
             self._add_body(k)
-        self._spring_pulls = self._pulls()
-        self._weigh()
 
     def rotation(self, p: Any) -> Any:
         """A of a quaternion of any length but 0.
@@ -196,7 +209,19 @@ class Tree:
             A matrix, body → world.
 
         """
-        w, x, y, z = (self.num.scalar(p[..., i]) for i in range(4))
+        return self.rotation_of([self.num.scalar(p[..., i]) for i in range(4)])
+
+    def rotation_of(self, p: Sequence[Any]) -> Any:
+        """A of a quaternion of four scalars.
+
+        Args:
+            p: scalar part first.
+
+        Returns:
+            A matrix, body → world.
+
+        """
+        w, x, y, z = p
         ww, xx, yy, zz = w * w, x * x, y * y, z * z
         rows = [
             [ww + xx - yy - zz, (x * y - w * z) * 2, (x * z + w * y) * 2],
@@ -207,7 +232,7 @@ class Tree:
 
     def _add_body(self, k: int) -> None:
         """Go from the far body along joint k to body k."""
-        num, model, state, far = self.num, self.model, self.state, self.far[k]
+        num, model, far = self.num, self.model, self.far[k]
         kind = KINDS[model.kind[k]]
         hang = num.vector(model.point[..., k, 0, :])
         above, w, arm, bend = self.one, self.zero, hang, self.zero
@@ -219,15 +244,14 @@ class Tree:
             bend = num.cross(w, num.cross(w, arm))
         swing, blocks = self.zero, list[Any]()
         if kind.has_attitude:
-            A = self.rotation(state.p[..., k, :])
-            own = num.mul(A, num.vector(state.omega[..., k, :]))
+            A, own = self.attitude(k)
             if kind.holds_distance:
                 u, udot = self.rod_direction(k)
                 ell = num.scalar(model.length[..., k])
                 P, v = P + u * ell, v + udot * ell
                 blocks.append(_Swing(num, u, -(ell * num.dot(udot, udot)), ell))
             elif kind.holds_nothing:
-                P, v = num.vector(state.r[..., k, :]), num.vector(state.v[..., k, :])
+                P, v = self.free_point(k)
                 blocks.append(_Slides(num))
             relative = own - w
             effort, armature = self._ball_elements(k, above, A, relative)
@@ -243,10 +267,60 @@ class Tree:
         self.r.append(P - near)
         self.v.append(v - num.cross(w, near))
         self._bias.append((bend, swing))
-        self._blocks.append(blocks)
+        self.blocks.append(blocks)
+
+    def coordinate(self, k: int, i: int) -> tuple[Any, Any]:
+        """Return a scalar coordinate and its rate.
+
+        Args:
+            k: the joint.
+            i: which of its motions.
+
+        Returns:
+            Two scalars [rad, m] and per second.
+
+        """
+        return self.num.scalar(self.state.x[..., k, i]), self.num.scalar(self.state.xdot[..., k, i])
+
+    def attitude(self, k: int) -> tuple[Any, Any]:
+        """Return A and the angular velocity of a body whose joint leaves its attitude free.
+
+        Args:
+            k: the body.
+
+        Returns:
+            A matrix, and a vector in world axes [rad/s].
+
+        """
+        A = self.rotation(self.state.p[..., k, :])
+        return A, self.num.mul(A, self.num.vector(self.state.omega[..., k, :]))
+
+    def free_point(self, k: int) -> tuple[Any, Any]:
+        """Return the centre of mass of a free body and its velocity.
+
+        Args:
+            k: the body.
+
+        Returns:
+            Two vectors, world axes [m, m/s].
+
+        """
+        return self.num.vector(self.state.r[..., k, :]), self.num.vector(self.state.v[..., k, :])
+
+    def inertia(self, k: int) -> Any:
+        """Return the inertia of a body about its centre of mass.
+
+        Args:
+            k: the body.
+
+        Returns:
+            A matrix, body axes [kg m²].
+
+        """
+        return self.num.matrix(self.model.inertia[..., k, :, :])
 
     def rod_direction(self, k: int) -> tuple[Any, Any]:
-        """U of rod k as a unit vector and u̇ perpendicular to it.
+        """Return the direction u of rod k as a unit vector and u̇ perpendicular to it.
 
         Args:
             k: the rod.
@@ -262,11 +336,11 @@ class Tree:
 
     def _move(self, k: int, above: Any, P: Any, v: Any, w: Any, arm: Any, bend: Any) -> tuple[Any, ...]:
         """Go along the scalar motions of joint k."""
-        num, model, state = self.num, self.model, self.state
+        num, model = self.num, self.model
         A, swing, blocks = num.mul(above, self.rotation(model.turn[..., k, 0, :])), self.zero, []
         elements = ("armature", "damping", "stiffness", "rest", "effort")
         for i, (what, number) in enumerate(KINDS[model.kind[k]].motions):
-            x, rate = (num.scalar(y[..., k, i]) for y in (state.x, state.xdot))
+            x, rate = self.coordinate(k, i)
             unit = num.vector(np.eye(3)[number])
             axis = num.mul(A, unit)
             effort, armature = num.scalar(0.0), None
@@ -276,8 +350,8 @@ class Tree:
                 )
                 stretch = x - rest
                 effort, armature = push - stiffness * stretch - d * rate, a
-                self.kinetic = self.kinetic + a * rate * rate / 2
-                self.potential = self.potential + stiffness * stretch * stretch / 2
+                self._kinetic = self._kinetic + a * rate * rate / 2
+                self._potential = self._potential + stiffness * stretch * stretch / 2
             blocks.append(_Single(num, what, axis, effort, armature))
             if what == "slide":
                 shift = axis * x
@@ -319,13 +393,14 @@ class Tree:
             cosine = (entry(0, 0) + entry(1, 1) + entry(2, 2) - 1) / 2
             turn = z * num.turn_over_sine(num.sqrt(num.dot(z, z)), cosine)
             effort = effort - turn * stiffness
-            self.potential = self.potential + stiffness * num.dot(turn, turn) / 2
-        self.kinetic = self.kinetic + a * num.dot(spin, spin) / 2
+            self._potential = self._potential + stiffness * num.dot(turn, turn) / 2
+        self._kinetic = self._kinetic + a * num.dot(spin, spin) / 2
         return effort, a if np.any(numbers[0]) else None
 
-    def _pulls(self) -> dict[int, tuple[Any, Any]]:
-        """Force and moment about the near point of each body that springs between points pull at."""
+    def _pulls(self) -> tuple[dict[int, tuple[Any, Any]], Any]:
+        """What springs between points do to bodies: force, moment about the near point; and their energy."""
         num, model, pulls = self.num, self.model, dict[int, tuple[Any, Any]]()
+        energy = num.scalar(0.0)
         for number in range(model.spring_body.shape[-2]):
             bodies, ends = [int(body) for body in model.spring_body[number]], list[tuple[Any, Any, Any]]()
             for end, body in enumerate(bodies):
@@ -343,71 +418,88 @@ class Tree:
             )
             stretch = length - rest
             tension = stiffness * stretch + damping * num.dot(d, change) / length
-            self.potential = self.potential + stiffness * stretch * stretch / 2
+            energy = energy + stiffness * stretch * stretch / 2
             pull = d * (tension / length)
             for body, (_, _, lever), force in zip(bodies, ends, (pull, -pull), strict=True):
                 if body >= 0:
                     own = force, num.cross(lever, force)
                     before = pulls.get(body)
                     pulls[body] = (before[0] + own[0], before[1] + own[1]) if before else own
-        return pulls
+        return pulls, energy
 
-    def _weigh(self) -> None:
-        """Energies and the angular momentum about the origin of all bodies."""
-        num, model, self.momentum = self.num, self.model, self.zero
+    def _spin(self, k: int) -> Any:
+        """Angular momentum of body k about its centre of mass."""
+        num, J = self.num, self.inertia(k)
+        return num.mul(self.A[k], num.mul(J, num.mul(num.transpose(self.A[k]), self.w[k])))
+
+    def totals(self) -> tuple[Any, Any, Any]:
+        """Sum over bodies, rotors and springs.
+
+        Returns:
+            Kinetic and potential energy [J], and the angular momentum about the origin [kg m²/s].
+
+        """
+        num, model, momentum = self.num, self.model, self.zero
+        kinetic, potential = self._kinetic, self._potential + self._pulls()[1]
         g = num.vector(model.gravity)
-        self.spin = []
         for k in range(model.n):
-            m, J = num.scalar(model.mass[..., k]), num.matrix(model.inertia[..., k, :, :])
-            spin = num.mul(self.A[k], num.mul(J, num.mul(num.transpose(self.A[k]), self.w[k])))
-            v, w = self.v[k], self.w[k]
-            self.kinetic = self.kinetic + (m * num.dot(v, v) + num.dot(w, spin)) / 2
-            self.potential = self.potential - m * num.dot(g, self.r[k])
-            self.momentum = self.momentum + num.cross(self.r[k], v) * m + spin
-            self.spin.append(spin)
+            m, spin, v = num.scalar(model.mass[..., k]), self._spin(k), self.v[k]
+            kinetic = kinetic + (m * num.dot(v, v) + num.dot(self.w[k], spin)) / 2
+            potential = potential - m * num.dot(g, self.r[k])
+            momentum = momentum + num.cross(self.r[k], v) * m + spin
+        return kinetic, potential, momentum
 
-    def _body_alone(self, k: int) -> Articulated:
-        """What body k needs by itself."""
+    def _body_alone(
+        self, k: int, pull: tuple[Any, Any] | None, wrenches: Sequence[Mapping[int, tuple[Any, Any]]]
+    ) -> Articulated:
+        """What body k needs by itself: under its loads, and in further columns against each wrench alone."""
         num, model, s, w = self.num, self.model, self.near[k], self.w[k]
         c, b, i = self._inertia(k)
         m = num.scalar(model.mass[..., k])
         load = num.vector(model.gravity) * m + num.vector(model.force[..., k, :])
-        moment = num.mul(self.A[k], num.vector(model.moment[..., k, :])) - num.cross(w, self.spin[k])
+        moment = num.mul(self.A[k], num.vector(model.moment[..., k, :])) - num.cross(w, self._spin(k))
         if np.any(model.drag_force[..., k]):
             load = load - self.v[k] * num.scalar(model.drag_force[..., k])
         if np.any(model.drag_moment[..., k]):
             moment = moment - w * num.scalar(model.drag_moment[..., k])
         f = -num.cross(w, num.cross(w, s)) * m - load
         n = -num.cross(s, f) - moment
-        if k in self._spring_pulls:
-            force, about = self._spring_pulls[k]
-            f, n = f - force, n - about
+        if pull is not None:
+            f, n = f - pull[0], n - pull[1]
+        if wrenches:
+            own = [wrench.get(k, (self.zero, self.zero)) for wrench in wrenches]
+            f = num.columns([f, *(-force for force, _ in own)])
+            n = num.columns([n, *(num.cross(s, force) - moment for force, moment in own)])
         return Articulated(c, b, i, f, n)
 
     def _inertia(self, k: int) -> tuple[Any, Any, Any]:
         """c, b and i of body k by itself."""
         num, m, s = self.num, self.num.scalar(self.model.mass[..., k]), self.num.cross_matrix(self.near[k])
-        J = num.matrix(self.model.inertia[..., k, :, :])
-        inertia = num.mul(num.mul(self.A[k], J), num.transpose(self.A[k]))
+        inertia = num.mul(num.mul(self.A[k], self.inertia(k)), num.transpose(self.A[k]))
         b = s * m
         return self.one * m, b, num.symmetric(inertia - num.mul(b, s))
 
-    def solve(self) -> Solution:
+    def solve(self, wrenches: Sequence[Mapping[int, tuple[Any, Any]]] = ()) -> Solution:
         """Solve for the accelerations and the wrenches of the joints.
 
+        Args:
+            wrenches: further ones, by bodies: force at the centre of mass, and moment.
+
         Returns:
-            The solution.
+            The solution; with ``wrenches``, matrices whose first column is the solution and the further
+            ones what each wrench alone adds.
 
         Raises:
             ZeroDivisionError: of balls, where an articulated inertia has no inverse.
 
         """
         num, n = self.num, self.model.n
-        total = [self._body_alone(k) for k in range(n)]
+        pulls, _ = self._pulls()
+        total = [self._body_alone(k, pulls.get(k), wrenches) for k in range(n)]
         carried: list[Any] = [None] * n
         for k in reversed(range(n)):
             x = total[k]
-            for block in reversed(self._blocks[k]):
+            for block in reversed(self.blocks[k]):
                 x = block.reduce(x)
             carried[k] = x
             if self.far[k] >= 0:
@@ -415,32 +507,36 @@ class Tree:
         acceleration, turning, forces, moments = list[Any](), list[Any](), list[Any](), list[Any]()
         at: list[Any] = []  # accelerations of the near points
         for k in range(n):
-            (a, alpha), far, x = self._bias[k], self.far[k], carried[k]
+            far, x = self.far[k], carried[k]
+            a, alpha = (num.widened(bias, x.f) for bias in self._bias[k])
             if far >= 0:
-                a, alpha = a + at[far] + num.cross(turning[far], self.arm[k]), alpha + turning[far]
+                a = a + at[far] - num.mul(num.cross_matrix(self.arm[k]), turning[far])
+                alpha = alpha + turning[far]
             force, moment = num.mul(x.c, a) + x.f, x.n
             if x.b is not None:
                 force = force + num.mul(x.b, alpha)
                 moment = num.mul(num.transpose(x.b), a) + num.mul(x.i, alpha) + x.n
-            for block in self._blocks[k]:
+            for block in self.blocks[k]:
                 a, alpha = block.advance(a, alpha)
             at.append(a)
             turning.append(alpha)
             forces.append(force)
             moments.append(moment)
             w, s = self.w[k], self.near[k]
-            acceleration.append(a - num.cross(alpha, s) - num.cross(w, num.cross(w, s)))
+            swing = num.widened(num.cross(w, num.cross(w, s)), a)
+            acceleration.append(a + num.mul(num.cross_matrix(s), alpha) - swing)
         return Solution(acceleration, turning, forces, moments)
 
     def _carry(self, k: int, x: Articulated, far: Articulated) -> Articulated:
         """Add to the far body what joint k and all beyond need of it."""
         num, (bend, swing) = self.num, self._bias[k]
-        f, n = x.f + num.mul(x.c, bend), x.n
+        push, n = num.mul(x.c, bend), x.n
         if x.b is not None:
-            f = f + num.mul(x.b, swing)
-            n = n + num.mul(num.transpose(x.b), bend) + num.mul(x.i, swing)
+            push = push + num.mul(x.b, swing)
+            n = n + num.widened(num.mul(num.transpose(x.b), bend) + num.mul(x.i, swing), n)
+        f = x.f + num.widened(push, x.f)
         c, b, i = self._carried_inertia(k, x.c, x.b, x.i)
-        moment = num.cross(self.arm[k], f)
+        moment = num.mul(num.cross_matrix(self.arm[k]), f)
         moment = moment if n is None else moment + n
         return Articulated(far.c + c, far.b + b, far.i + i, far.f + f, far.n + moment)
 
@@ -506,7 +602,7 @@ class Tree:
         for k, own in enumerate(own_rates(model)):
             kind, columns = KINDS[model.kind[k]], list[tuple[int, Any, Any]]()
             if kind.holds_distance:
-                swing = self._blocks[k][0]
+                swing = self.blocks[k][0]
                 across = self.one - num.mul(swing.u, num.transpose(swing.u))
                 columns.append((3 * rods, across * swing.length, None))
                 rods += 1
@@ -515,7 +611,7 @@ class Tree:
             if kind.has_attitude:
                 columns.append((own.stop - 3, None, self.A[k]))
             else:
-                for i, block in enumerate(self._blocks[k]):
+                for i, block in enumerate(self.blocks[k]):
                     pair = (None, block.axis) if block.turns else (block.axis, None)
                     columns.append((own.start + i, *pair))
             found.append(columns)
@@ -526,7 +622,7 @@ class Tree:
     ) -> Iterator[tuple[list[tuple[int, Any]], Any]]:
         """Of each rotor the turns that the rates give it, by their places in ν, and its inertia."""
         for k in range(self.model.n):
-            for block, (at, _, turn) in zip(reversed(self._blocks[k]), reversed(columns[k]), strict=True):
+            for block, (at, _, turn) in zip(reversed(self.blocks[k]), reversed(columns[k]), strict=True):
                 if block.armature is None:
                     continue
                 if not KINDS[self.model.kind[k]].has_attitude:

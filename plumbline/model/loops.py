@@ -165,13 +165,13 @@ class CutMechanism:
 
 
 @lru_cache(maxsize=64)  # mechanisms are never changed
-def cut_open(model: Model, are_parts_massless: bool = False) -> CutMechanism:
+def cut_open(model: Model) -> CutMechanism:
     """Cut a mechanism open at its closing joints.
+
+    A body with c of them keeps 2⁻ᶜ of its mass and inertia, and their parts get ½, ¼, …: exact in binary.
 
     Args:
         model: with loops.
-        are_parts_massless: whether the parts that closing joints carry have no mass.  Else a body with c of
-            them keeps 2⁻ᶜ of its mass and inertia, and they get ½, ¼, …: exact in binary.
 
     Returns:
         The tree.
@@ -191,7 +191,7 @@ def cut_open(model: Model, are_parts_massless: bool = False) -> CutMechanism:
     place = np.argsort(order)
     share = np.ones(len(far))
     for k in range(n, len(far)):
-        share[near[k]], share[k] = (1.0, 0.0) if are_parts_massless else (share[near[k]] / 2,) * 2
+        share[near[k]] = share[k] = share[near[k]] / 2
     changes = {name: (getattr(model, name)[near].T * share).T[order] for name in ("mass", "inertia")}
     for name in BODY_FIELDS:
         value = getattr(model, name)

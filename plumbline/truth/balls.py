@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from plumbline.model.datatypes import Array, Model, State
+from plumbline.equations.tree import Solution, Tree
+from plumbline.model.datatypes import Array, Model
+from plumbline.truth.element_terms import joint_elements, spring_terms
 
 
 class BallVectors:
@@ -102,32 +104,6 @@ class BallVectors:
         return self.mat(entries_) * (1 / (ww + xx + yy + zz))
 
 
-class BallArithmetic(BallVectors):
-    """A model in balls; ``J`` is in body axes, gravity ``g`` in world axes."""
-
-    def __init__(self, flint: Any, model: Model) -> None:
-        super().__init__(flint)
-        self.model, self.n = model, model.n
-        self.m = [self.arb(float(m)) for m in model.mass]
-        self.J = [self.matrix(J) for J in model.inertia]
-        self.g = self.vector(model.gravity)
-
-    def rod_direction(self, state: State, k: int) -> tuple[Any, Any]:
-        """U of rod k as a unit vector and u̇ perpendicular to it.
-
-        Args:
-            state: a state of the model.
-            k: the rod.
-
-        Returns:
-            u, and u̇ [1/s].
-
-        """
-        u, udot = self.vector(state.u[k]), self.vector(state.udot[k])
-        u = u * (1 / self.dot(u, u).sqrt())
-        return u, udot - u * self.dot(u, udot)
-
-
 def entries(v: Any) -> list[Any]:
     """List the balls of a matrix of one column.
 
@@ -217,3 +193,62 @@ def term_scales(
         "angular_velocity": max(size["angular_velocity"], rate),
     }
     return {name: scale for name, scale in scales.items() if name in balls}
+
+
+def tree_quantities(tree: Tree, solution: Solution) -> dict[str, Any]:
+    """List the balls of a solved tree.
+
+    Args:
+        tree: in balls.
+        solution: its motion.
+
+    Returns:
+        By quantity, as `plumbline.truth.certified.enclose_quantities`, without mass matrix and scales.
+
+    """
+    kinetic, potential, momentum = tree.totals()
+
+    def in_body(vectors: list[Any]) -> list[list[Any]]:
+        return [entries(A.transpose() * x) for A, x in zip(tree.A, vectors, strict=True)]
+
+    return {
+        "acceleration": [entries(a) for a in solution.acceleration],
+        "angular_acceleration": in_body(solution.turning),
+        "joint_reaction": [entries(f) for f in solution.force],
+        "joint_moment": [entries(tree.zero if m is None else m) for m in solution.moment],
+        "kinetic_energy": [kinetic],
+        "potential_energy": [potential],
+        "angular_momentum": entries(momentum),
+        "r": [entries(r) for r in tree.r],
+        "v": [entries(v) for v in tree.v],
+        "attitude": [entries(A) for A in tree.A],
+        "angular_velocity": in_body(tree.w),
+    }
+
+
+def quantity_scales(c: Any, balls: dict[str, Any]) -> dict[str, float]:
+    """Estimate the sizes of the terms of each quantity, see `term_scales`.
+
+    Args:
+        c: the tree.
+        balls: its quantities.
+
+    Returns:
+        Sizes by quantity.
+
+    """
+    norm, model = np.linalg.norm, c.model
+    lever = float(np.sum(norm(model.point, axis=2)) + np.sum(model.length) + np.sum(np.abs(c.state.x)))
+    lever = max(lever, float(np.max(np.abs(midpoints(balls["r"])))))
+    rate = float(np.max(norm(midpoints([entries(w) for w in c.w]), axis=1)))
+    rate = max(rate, float(np.max(np.abs(c.state.xdot))), float(np.max(np.abs(c.state.udot))))
+    sizes = (0.0, 0.0, 0.0)
+    if model.has_elements:
+        elements, springs = (
+            joint_elements(model, c.state, [np.zeros(6)] * model.n),
+            spring_terms(model, c.state),
+        )
+        push, turn = (sum(e.size for e in elements if e.is_slide == is_slide) for is_slide in (True, False))
+        potential = springs.potential + sum(e.potential for e in elements)
+        sizes = push + float(np.sum(springs.size)), turn + float(np.sum(springs.moment_size)), potential
+    return term_scales(model, balls, lever, rate, sizes)

@@ -17,9 +17,8 @@ from plumbline.model.datatypes import Model, State, StateQuantities
 from plumbline.model.loops import determinate_part
 from plumbline.processes.errors import PlumblineError
 from plumbline.truth import import_truth_tool
-from plumbline.truth.balls import entries, flatten, midpoints
+from plumbline.truth.balls import flatten, midpoints, quantity_scales, tree_quantities
 from plumbline.truth.certified_loop import enclose_loop
-from plumbline.truth.certified_tree import quantity_scales
 from plumbline.truth.definition import definition_holds
 
 MAX_RELATIVE_RADIUS = 1e-25  # relative to the largest magnitude of the quantity's own terms
@@ -136,25 +135,9 @@ def enclose_quantities(
 def _enclose_tree(flint: Any, model: Model, state: State, mass_matrix: bool) -> dict[str, Any]:
     """All quantities of `enclose_quantities`, of a mechanism without loops."""
     tree = Tree(ball_arithmetic(flint), model, state)
-    solution = tree.solve()
-
-    def in_body(vectors: list[Any]) -> list[list[Any]]:
-        return [entries(A.transpose() * x) for A, x in zip(tree.A, vectors, strict=True)]
-
-    balls: dict[str, Any] = {
-        "acceleration": [entries(a) for a in solution.acceleration],
-        "angular_acceleration": in_body(solution.turning),
-        "joint_reaction": [entries(f) for f in solution.force],
-        "kinetic_energy": [tree.kinetic],
-        "potential_energy": [tree.potential],
-        "angular_momentum": entries(tree.momentum),
-        "r": [entries(r) for r in tree.r],
-        "v": [entries(v) for v in tree.v],
-        "attitude": [entries(A) for A in tree.A],
-        "angular_velocity": in_body(tree.w),
-    }
-    if not model.is_chain:  # whose joints hold no moments
-        balls["joint_moment"] = [entries(tree.zero if m is None else m) for m in solution.moment]
+    balls = tree_quantities(tree, tree.solve())
+    if model.is_chain:  # whose joints hold no moments
+        del balls["joint_moment"]
     if mass_matrix:
         balls["mass_matrix"] = tree.mass_matrix().tolist()
     return balls | {"scale": quantity_scales(tree, balls)}

@@ -1,7 +1,7 @@
 """Certified quantities of a mechanism with loops, in ball arithmetic, with a proof that its pose is the one.
 
-The mechanism is cut open at its closing joints (`plumbline.model.loops`): each carries a massless body c
-that coincides with its near body b.  In coordinates z of the tree's joints (angles and shifts; Cayley's three
+The mechanism is cut open at its closing joints (`plumbline.model.loops`): each carries a part c of its near
+body b that coincides with b.  In coordinates z of the tree's joints (angles and shifts; Cayley's three
 numbers of a ball joint, seen from the far body; two tangents of a rod)
 
     F(z) = (r_b − r_c, −vex(A_bᵀ A_c)) = 0.
@@ -9,9 +9,9 @@ numbers of a ball joint, seen from the far body; two tangents of a rod)
 As many rows are kept as are independent, and as many coordinates depend on the others, whose doubles are
 exact.  Krawczyk's operator proves that the dependent ones have exactly one solution near their doubles, and
 encloses it:  K(Z) = z − Y F(z) + (1 − Y F_z(Z)) (Z − z) inside Z, Y ≈ F_z⁻¹.  Rates follow likewise, linear.
-The loops' forces λ solve, with `certified_tree`'s joint-space equations and J = F_z for the rates ν,
+The forces λ that hold b and c together follow from the tree's response to unit wrenches on the two,
 
-    M ν̇ + h = Jᵀ λ,    J ν̇ = −(a_b − a_c, α_b − α_c) at ν̇ = 0.
+    K λ = −(a_b − a_c, A_bᵀ (α_b − α_c)) at λ = 0,    K = what λ adds to the right-hand side.
 
 Of dependent rows λ is one of many: only the determinate parts of joint wrenches are unique.
 """
@@ -24,30 +24,35 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from plumbline.model.datatypes import KINDS, Array, Model, State
+from plumbline.equations.balls import balls as ball_arithmetic
+from plumbline.equations.tree import Tree
+from plumbline.model.datatypes import KINDS, ZERO_INERTIA, Array, Model, State
 from plumbline.model.loops import CutMechanism, cut_open, independent_rows
-from plumbline.truth.balls import entries, midpoints
-from plumbline.truth.certified_tree import BallTree, equations_of_motion, moving_quantities, quantity_scales
+from plumbline.truth.balls import entries, midpoints, quantity_scales, tree_quantities
 
 UNIQUENESS_RADIUS = 1e-10  # of dependent coordinates [rad, m], in which the pose is the only one
 NEWTON_STEPS = 40
 
 
-class _BallLoop(BallTree):
-    """A tree at coordinates ``z`` (lists of balls per joint, from the state's doubles) and rates ν."""
+class _LoopTree(Tree):
+    """A tree at coordinates ``z`` (lists of balls per joint, from the state's doubles) and rates ν.
+
+    ν are relative: tangents of a rod, shifts of a free body, turns about the world's axes, ẋ.
+    """
 
     def __init__(
         self, flint: Any, model: Model, state: State, z: list[list[Any]], nu: list[list[Any]]
     ) -> None:
-        self.z, self.nu = z, nu
-        self.chart: list[Any] = []
-        super().__init__(flint, model, state)
+        self.mat, self.arb, self.z, self.nu = flint.arb_mat, flint.arb, z, nu
+        self.chart: dict[int, list[list[Any]]] = {}
+        self.shifted: dict[int, float] = {}
+        super().__init__(ball_arithmetic(flint), model, state)
 
     def _above(self, k: int) -> tuple[Any, Any, Any]:
         """Attitude and angular velocity of the far body, and its attitude in doubles."""
         far = self.far[k]
         if far < 0:
-            return self.eye, self.zero, self.eye
+            return self.one, self.zero, self.one
         return self.A[far], self.w[far], self.rotation(self.state.p[far])
 
     def coordinate(self, k: int, i: int) -> tuple[Any, Any]:
@@ -60,44 +65,56 @@ class _BallLoop(BallTree):
         return A, w + self.mat(3, 1, self.nu[k][-3:])
 
     def free_point(self, k: int) -> tuple[Any, Any]:
-        return self.vector(self.state.r[k]) + self.mat(3, 1, self.z[k][:3]), self.mat(3, 1, self.nu[k][:3])
+        r, _ = super().free_point(k)
+        return r + self.mat(3, 1, self.z[k][:3]), self.mat(3, 1, self.nu[k][:3])
 
-    def rod(self, k: int) -> tuple[Any, Any]:
+    def rod_direction(self, k: int) -> tuple[Any, Any]:
         above, w, doubles = self._above(k)
-        given = self.vector(self.state.u[k])
-        given = given * (1 / self.dot(given, given).sqrt())
-        sides = self._sides(given, k)
+        given, _ = super().rod_direction(k)
+        sides = _tangents(self, given, k)
         moved = given + sides[0] * self.z[k][0] + sides[1] * self.z[k][1]
-        size = 1 / self.dot(moved, moved).sqrt()
+        size = 1 / self.num.sqrt(self.num.dot(moved, moved))
         turn = above * doubles.transpose()
         u = turn * moved * size
-        tangents = self._sides(u, k)
+        tangents = _tangents(self, u, k)
         ways = [turn * side * size for side in sides]  # ∂u/∂z, but for the part along u
-        self.chart.append([[self.dot(t, way) / self.dot(t, t) for way in ways] for t in tangents])
-        return u, self.cross_matrix(w) * u + tangents[0] * self.nu[k][0] + tangents[1] * self.nu[k][1]
+        self.chart[k] = [[self.num.dot(t, way) / self.num.dot(t, t) for way in ways] for t in tangents]
+        return u, self.num.cross(w, u) + tangents[0] * self.nu[k][0] + tangents[1] * self.nu[k][1]
 
-    def _sides(self, u: Any, k: int) -> list[Any]:
-        """The tangents that `BallTree` moves a rod along."""
-        first = self.cross_matrix(u) * self.units[int(np.argmin(np.abs(self.state.u[k])))]
-        return [first, self.cross_matrix(u) * first]
+    def inertia(self, k: int) -> Any:
+        J = super().inertia(k)
+        return J + self.one * self.arb(self.shifted[k]) if k in self.shifted else J
 
     def chart_matrix(self) -> Any:
-        """The matrix from ż to the rates ν that the columns S stand for."""
-        sizes = [len(z) for z in self.z]
-        first, rods = np.cumsum([0, *sizes]), iter(self.chart)
+        """The matrix from ż to ν."""
+        first = np.cumsum([0, *map(len, self.z)])
         rows = [[self.arb(int(i == j)) for j in range(first[-1])] for i in range(first[-1])]
         for k, kind in enumerate(self.model.kind):
-            blocks = []
-            if kind == "rod":
-                blocks.append((int(first[k]), next(rods)))
+            blocks = [(int(first[k]), self.chart[k])] if k in self.chart else []
             if KINDS[kind].has_attitude:
                 d = self.mat(3, 1, self.z[k][-3:])
-                spin = self.A[k] * (self.eye - self.cross_matrix(d)) * (2 / (1 + self.dot(d, d)))
+                spin = self.A[k] * (self.one - self.num.cross_matrix(d)) * (2 / (1 + self.num.dot(d, d)))
                 blocks.append((int(first[k + 1]) - 3, spin.tolist()))
             for at, block in blocks:
                 for i, row in enumerate(block):
                     rows[at + i][at : at + len(row)] = row
         return self.mat(rows)
+
+    def motions(self, k: int) -> tuple[Any, Any]:
+        """Velocities of the near point and angular velocities that each of joint k's rates gives."""
+        kind, num, zero = KINDS[self.model.kind[k]], self.num, self.zero
+        units = [self.mat(3, 1, [int(i == j) for i in range(3)]) for j in range(3)]
+        pairs = [(e, zero) for e in units] if kind.holds_nothing else []
+        if kind.holds_distance:
+            swing = self.blocks[k][0]
+            pairs += [(t * swing.length, zero) for t in _tangents(self, swing.u, k)]
+        if kind.has_attitude:
+            pairs += [(zero, e) for e in units]
+        else:
+            pairs += [(zero, b.axis) if b.turns else (b.axis, zero) for b in self.blocks[k]]
+        empty = self.mat(3, 0)
+        slides, turns = zip(*pairs, strict=True) if pairs else ((), ())
+        return (num.columns(slides), num.columns(turns)) if pairs else (empty, empty)
 
     def gap(self, ends: tuple[tuple[int, int], ...]) -> list[Any]:
         """F."""
@@ -110,25 +127,33 @@ class _BallLoop(BallTree):
 
     def rates_jacobian(self, ends: tuple[tuple[int, int], ...], of_gap: bool) -> Any:
         """J (6 L, nν): of relative rates, in body axes, or of F where b and c do not coincide yet."""
-        columns = np.cumsum([0, *(S.ncols() for S in self.S)])
-        rows: list[list[Any]] = [[self.arb(0)] * int(columns[-1]) for _ in range(6 * len(ends))]
+        columns = np.cumsum([0, *map(len, self.z)])
+        out = self.mat(6 * len(ends), int(columns[-1]))
+        motions: dict[int, tuple[Any, Any]] = {}
         for loop, (b, c) in enumerate(ends):
             R = self.A[b].transpose() * self.A[c]
             turned = self.A[b].transpose()
             if of_gap:
-                turned = (self.eye * (R[0, 0] + R[1, 1] + R[2, 2]) - R) * self.arb("0.5") * turned
+                turned = (self.one * (R[0, 0] + R[1, 1] + R[2, 2]) - R) * self.arb("0.5") * turned
             for body, sign in ((b, 1), (c, -1)):
                 k = body
                 while k >= 0:
-                    for i in range(self.S[k].ncols()):
-                        spin = self.mat(3, 1, [self.S[k][row, i] for row in range(3)])
-                        along = self.mat(3, 1, [self.S[k][row, i] for row in range(3, 6)])
-                        along = along + self.cross_matrix(spin) * self.r[body]
-                        for row, x in enumerate([*entries(along), *entries(turned * spin)]):
-                            at = rows[6 * loop + row]
-                            at[int(columns[k]) + i] = at[int(columns[k]) + i] + sign * x
+                    motions[k] = slides, turns = motions.get(k) or self.motions(k)
+                    lever = self.num.cross_matrix(self.r[k] + self.near[k] - self.r[body])
+                    for block, at in ((slides + lever * turns, 6 * loop), (turned * turns, 6 * loop + 3)):
+                        for row in range(3):
+                            for i in range(block.ncols()):
+                                place = at + row, int(columns[k]) + i
+                                out[place] = out[place] + sign * block[row, i]
                     k = self.far[k]
-        return self.mat(rows)
+        return out
+
+
+def _tangents(tree: Tree, u: Any, k: int) -> list[Any]:
+    """Two vectors across rod k, of which a small change of u changes little."""
+    unit = tree.num.vector(np.eye(3)[int(np.argmin(np.abs(tree.state.u[k])))])
+    first = tree.num.cross(u, unit)
+    return [first, tree.num.cross(u, first)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,21 +181,24 @@ def enclose_loop(flint: Any, model: Model, state: State) -> dict[str, Any]:
         ZeroDivisionError: no pose was proved to exist and to be unique, or a matrix has no inverse.
 
     """
-    cut = cut_open(model, are_parts_massless=True)
+    cut = cut_open(model)
     start = cut.state(state)
-    sizes = [S.ncols() for S in BallTree(flint, cut.model, start).S]
+    given = Tree(ball_arithmetic(flint), cut.model, start)
+    sizes = [_rate_count(kind) for kind in cut.model.kind]
     none = _per_joint([flint.arb(0)] * sum(sizes), sizes)
-    here = _BallLoop(flint, cut.model, start, none, none)
+    here = _LoopTree(flint, cut.model, start, none, none)
     J = here.rates_jacobian(cut.ends, True) * here.chart_matrix()
     chosen = _select(cut, midpoints(J.tolist()), sizes)
     z = _prove_pose(flint, cut, start, sizes, chosen)
-    posed = _BallLoop(flint, cut.model, start, z, none)
+    posed = _LoopTree(flint, cut.model, start, z, none)
     J = posed.rates_jacobian(cut.ends, False)
     kept = flint.arb_mat([[J[int(i), j] for j in range(J.ncols())] for i in chosen.rows])
     moving = _dependent_columns(cut, midpoints(kept.tolist()), chosen.rows, sizes)
-    nu = _closed_rates(flint, BallTree(flint, cut.model, start), kept, moving)
-    c = _BallLoop(flint, cut.model, start, z, _per_joint(nu, sizes))
-    balls = _constrained_motion(flint, c, cut, J, chosen.rows)
+    nu = _closed_rates(flint, given, kept, moving)
+    c = _LoopTree(flint, cut.model, start, z, _per_joint(nu, sizes))
+    if model.lacks_inertia:
+        c.shifted = _shifted_inertia(cut)
+    balls = _constrained_motion(flint, c, cut, chosen.rows)
     dropped = np.setdiff1d(np.arange(J.nrows()), chosen.rows)
     gap, rate = c.gap(cut.ends), entries(J * flint.arb_mat(len(nu), 1, nu))
     of_body = ("acceleration", "angular_acceleration", "r", "v", "attitude", "angular_velocity")
@@ -181,6 +209,29 @@ def enclose_loop(flint: Any, model: Model, state: State) -> dict[str, Any]:
     return {
         name: [ball[int(k)] for k in at[name]] if name in at else ball for name, ball in balls.items()
     } | {"scale": scale}
+
+
+def _rate_count(kind: str) -> int:
+    """Relative rates of a joint."""
+    joint = KINDS[kind]  # type: ignore[index]
+    if not joint.has_attitude:
+        return len(joint.motions)
+    return 3 + 2 * joint.holds_distance + 3 * joint.holds_nothing
+
+
+def _shifted_inertia(cut: CutMechanism) -> dict[int, float]:
+    """Inertia that parts get and their bodies lose: open, the tree may not turn a body without any.
+
+    Since b and c move as one, only the forces between them change.
+    """
+    inertia, found = cut.model.inertia, dict[int, float]()
+    share = 2.0 ** np.round(np.log2(np.max(np.trace(inertia, axis1=1, axis2=2)) or 1.0))
+    for b, c in cut.ends:
+        principal = np.linalg.eigvalsh(inertia[b])
+        if principal[0] <= ZERO_INERTIA * principal[2]:
+            found[b] = found.get(b, 0.0) - share
+            found[c] = share
+    return found
 
 
 def _per_joint(values: list[Any], sizes: list[int]) -> list[list[Any]]:
@@ -222,11 +273,11 @@ def _prove_pose(
     Y = flint.arb_mat([[flint.arb(float(x)) for x in row] for row in chosen.inverse])
     none = _per_joint([flint.arb(0)] * count, sizes)
 
-    def loop_at(values: list[Any]) -> _BallLoop:
+    def loop_at(values: list[Any]) -> _LoopTree:
         z = [flint.arb(0)] * count
         for i, value in zip(dependent, values, strict=True):
             z[int(i)] = value
-        return _BallLoop(flint, cut.model, start, _per_joint(z, sizes), none)
+        return _LoopTree(flint, cut.model, start, _per_joint(z, sizes), none)
 
     def correction(values: list[Any]) -> list[Any]:
         gap = loop_at(values).gap(cut.ends)
@@ -265,7 +316,7 @@ def _prove_pose(
     return _per_joint(z, sizes)
 
 
-def _closed_rates(flint: Any, given: BallTree, kept: Any, dependent: NDArray[np.intp]) -> list[Any]:
+def _closed_rates(flint: Any, given: Tree, kept: Any, dependent: NDArray[np.intp]) -> list[Any]:
     """Rates ν: the independent ones are the state's, the others close the loops."""
     nu = _relative_rates(given)
     for i in dependent:
@@ -277,48 +328,39 @@ def _closed_rates(flint: Any, given: BallTree, kept: Any, dependent: NDArray[np.
     return nu
 
 
-def _relative_rates(c: BallTree) -> list[Any]:
+def _relative_rates(c: Tree) -> list[Any]:
     """The rates ν of a tree's state."""
-    found: list[Any] = []
-    for k, kind in enumerate(c.model.kind):
-        far_w = c.w[c.far[k]] if c.far[k] >= 0 else c.zero
-        if kind == "rod":
-            u, udot = c.rod(k)
-            swing = udot - c.cross_matrix(far_w) * u
-            found += [c.dot(t, swing) / c.dot(t, t) for t in c.tangents[k]]
-        if kind == "free":
+    num, found = c.num, list[Any]()
+    for k, name in enumerate(c.model.kind):
+        kind, far_w = KINDS[name], c.w[c.far[k]] if c.far[k] >= 0 else c.zero
+        if kind.holds_distance:
+            u, udot = c.rod_direction(k)
+            swing = udot - num.cross(far_w, u)
+            found += [num.dot(t, swing) / num.dot(t, t) for t in _tangents(c, u, k)]
+        if kind.holds_nothing:
             found += entries(c.v[k])
-        if KINDS[kind].has_attitude:
+        if kind.has_attitude:
             found += entries(c.w[k] - far_w)
-        found += [c.coordinate(k, i)[1] for i in range(len(KINDS[kind].motions))]
+        found += [c.coordinate(k, i)[1] for i in range(len(kind.motions))]
     return found
 
 
 def _constrained_motion(
-    flint: Any, c: _BallLoop, cut: CutMechanism, J: Any, rows: NDArray[np.intp]
+    flint: Any, c: _LoopTree, cut: CutMechanism, rows: NDArray[np.intp]
 ) -> dict[str, Any]:
-    """Solve for ν̇ and λ, and compute all quantities of the tree's bodies."""
-    equations = equations_of_motion(c)
-    M = equations.M
-    bias: list[Any] = []
+    """Solve for λ, and compute all quantities of the tree's bodies."""
+    units = [flint.arb_mat(3, 1, [int(i == j) for i in range(3)]) for j in range(3)]
+    wrenches = []
+    for row in rows:
+        (b, part), axis = cut.ends[row // 6], units[row % 3]
+        force, moment = (axis, c.zero) if row % 6 < 3 else (c.zero, c.A[b] * axis)
+        wrenches.append({b: (force, moment), part: (-force, -moment)})
+    found = c.solve(wrenches)
+    relative = []
     for b, part in cut.ends:
-        turned = c.A[b].transpose()
-        bias += entries(c.bend[b] - c.bend[part]) + entries(turned * (c.twist[b] - c.twist[part]))
-    n, m = len(equations.right), len(rows)
-    top = [[M[i, j] for j in range(n)] + [-J[int(row), i] for row in rows] for i in range(n)]
-    below = [[J[int(row), j] for j in range(n)] + [flint.arb(0)] * m for row in rows]
-    right = equations.right + [-bias[int(row)] for row in rows]
-    x = entries(flint.arb_mat(top + below).solve(flint.arb_mat(n + m, 1, right)))
-    multiplier = [flint.arb(0)] * (6 * len(cut.ends))
-    for row, value in zip(rows, x[n:], strict=True):
-        multiplier[int(row)] = value
-    applied: dict[int, Any] = {}
-    for loop, (b, part) in enumerate(cut.ends):
-        force = c.mat(3, 1, multiplier[6 * loop : 6 * loop + 3])
-        moment = (
-            c.A[b] * c.mat(3, 1, multiplier[6 * loop + 3 : 6 * loop + 6]) + c.cross_matrix(c.r[b]) * force
-        )
-        wrench = c.mat(6, 1, [*entries(moment), *entries(force)])
-        for body, on in ((b, wrench), (part, -wrench)):
-            applied[body] = applied[body] + on if body in applied else on
-    return moving_quantities(c, equations, x[:n], applied)
+        relative += (found.acceleration[b] - found.acceleration[part]).tolist()
+        relative += (c.A[b].transpose() * (found.turning[b] - found.turning[part])).tolist()
+    kept = [relative[int(row)] for row in rows]
+    K, opening = flint.arb_mat([row[1:] for row in kept]), flint.arb_mat([[-row[0]] for row in kept])
+    shares = flint.arb_mat(len(rows) + 1, 1, [1, *entries(K.solve(opening))])
+    return tree_quantities(c, found.combined(lambda x: x * shares))

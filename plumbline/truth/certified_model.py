@@ -1,7 +1,7 @@
 """Certified quantities of a neutral model (a URDF or MJCF file) at given states, with bounds of rounding.
 
-The equations of `certified_tree` on the joints of `plumbline.importers.neutral_model`: composite rigid bodies
-for M, recursive Newton–Euler for h, in ball arithmetic.  The bound of an engine's rounding is made of the
+On the joints of `plumbline.importers.neutral_model`, in ball arithmetic: composite rigid bodies for M,
+recursive Newton–Euler for h.  The bound of an engine's rounding is made of the
 magnitudes of the terms, so that it does not vanish where terms cancel: with ℓ_b the length of the path from
 the world to the centre of mass of body b (offsets, anchors, displacements), W_b and V_b the sums of the rates
 of rotations and of slides on that path, u_bi = ℓ_b for a rotation on the path and 1 for a slide, w_bi = 1 for

@@ -74,7 +74,8 @@ class _Check:
     def __init__(self, flint: Any, model: Model, state: State, balls: dict[str, Any]) -> None:
         self.mat, self.arb, self.model, self.state, self.balls = flint.arb_mat, flint.arb, model, state, balls
         self.is_sharp, self.scale = True, balls["scale"]
-        self.slack = MAX_OPEN_DEVIATION if self.scale.get("gap", 0.0) > 0 else 0.0
+        is_open = self.scale.get("gap", 0.0) > MAX_DIFFERENCE * max(self.scale["r"], self.scale["v"])
+        self.slack = MAX_OPEN_DEVIATION if is_open else 0.0
         self.zero, self.one = self.mat(3, 1, [0] * 3), self.mat(3, 3, [1, 0, 0, 0, 1, 0, 0, 0, 1])
         self.world = _Series([self.one, self.mat(3, 3), self.mat(3, 3)], [self.zero] * 3)
         self.A = [self.mat(3, 3, own) for own in balls["attitude"]]

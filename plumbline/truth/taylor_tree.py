@@ -1,6 +1,6 @@
 """The equations of motion of a tree with any joints, as expressions in joint coordinates for `taylor`.
 
-The same sums over subtrees as in `certified_tree` (composite rigid bodies, recursive Newton–Euler), about
+Sums over subtrees (composite rigid bodies, recursive Newton–Euler; Featherstone, tables 5.1 and 6.2), about
 the world's origin, and M ν̇ = −h by M = Lᵀ D L, which keeps the zeros between branches (Featherstone, Rigid
 Body Dynamics Algorithms, 2008, section 6.5).  A rod moves its near end by ℓ (I − u uᵀ) ν̇, three columns of
 rank two: m ℓ² u uᵀ added to its block of M leaves their part across u, and sets that along u to 0.

@@ -94,6 +94,7 @@ TARGETS = {
     ],
     "checker": ["plumbline/truth/enclosure_checker.py", "plumbline/truth/enclosure_file.py"],
     "prover": ["plumbline/truth/enclosure.py"],
+    "equations": ["plumbline/equations/*.py", "plumbline/truth/definition.py"],
 }
 TEST_FILES = {  # by target or top folder, the tests that must notice its mutants
     "reference_impl": [
@@ -127,6 +128,7 @@ TEST_FILES = {  # by target or top folder, the tests that must notice its mutant
     ],
     "checker": ["tests/truth/test_enclosure_checker.py", "tests/truth/test_enclosure_file.py"],
     "prover": ["tests/truth/test_enclosure.py"],
+    "equations": ["tests/equations/test_*.py", "tests/truth/test_definition.py"],
 }
 TOKEN = re.compile(r"\"[^\"]*\"|'[^']*'|\w+\.?\w*|[^\w\s]+")
 LiveFunctions = dict[tuple[str, int], list[FunctionType]]  # functions of a file by name and first line

@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from plumbline.model.datatypes import Model, State
-from plumbline.truth.balls import BallArithmetic, entries, midpoints, term_scales
+from plumbline.truth.balls import entries, midpoints, term_scales
+from tests.helpers.former_equations.tree import BallArithmetic
 
 
 def enclose_chain(flint: Any, model: Model, state: State, mass_matrix: bool) -> dict[str, Any]:

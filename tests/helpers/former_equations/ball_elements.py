@@ -1,6 +1,6 @@
 """Rotors, springs, dampers and efforts of a tree in balls, by Lagrange's equations in its coordinates.
 
-With the relative rates ν of `plumbline.truth.certified_tree`, T gains ½ a ν², so M gains a on its diagonal,
+With the relative rates ν of `tree`, T gains ½ a ν², so M gains a on its diagonal,
 and h loses e − k (x − x₀) − c ν.  The rates of a ball joint are Ω = ω − ω_far along the world's axes; its
 rotors have the momentum a Ω as the far body sees it, so that h gains a (Ω̇ − ω_far × Ω) at ν̇ = 0.
 """
