@@ -15,7 +15,7 @@ from typing import ClassVar
 
 import numpy as np
 from packaging.specifiers import SpecifierSet
-from packaging.version import InvalidVersion
+from packaging.version import InvalidVersion, Version
 
 from plumbline.engines.answers import check_declarations, check_evaluation, check_record, check_text
 from plumbline.model.datatypes import (
@@ -120,7 +120,7 @@ class Adapter(ABC):
         version, missing = check_text(self.version(), f"{self.name}: version()"), None
         supported = self.supported_versions
         try:
-            if supported and not SpecifierSet(supported).contains(version, prereleases=True):
+            if supported and not SpecifierSet(supported).contains(Version(version), prereleases=True):
                 missing = f"the adapter supports versions {supported} of {self.package}, this is {version}"
         except InvalidVersion:
             raise EngineFailure(f"{self.name}: version() is {version!r}, must be a PEP 440 version") from None

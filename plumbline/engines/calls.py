@@ -98,7 +98,10 @@ def describe_engine(engine: str) -> EngineInfo:
             raise
         return EngineInfo(engine, engine, "", (), f"{engine} is not installed here: {error}")
     except AttributeError as error:  # an interface that this version does not have
-        version = metadata.version(declared_attribute(engine, "package"))
+        package = declared_attribute(engine, "package")
+        if not isinstance(package, str):  # no class of that name
+            raise
+        version = metadata.version(package)
         return EngineInfo(engine, engine, version, (), f"the adapter cannot use version {version}: {error}")
 
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from importlib import import_module
 
 from plumbline.engines.adapter import Adapter
+from plumbline.engines.answers import describe_value
 from plumbline.importers.importer import Importer
+from plumbline.model.datatypes import EngineFailure
 
 ENGINES = {
     "reference": "adapters.reference_engine:Reference",
@@ -38,9 +40,16 @@ def load_adapter(name: str) -> Adapter:
     Returns:
         A new instance of the adapter.
 
+    Raises:
+        EngineFailure: the registry names something else than an adapter.
+
     """
     module, _, class_name = ENGINES[name].partition(":")
     found: type[Adapter] = getattr(import_module(module), class_name)
+    if not isinstance(found, type) or not issubclass(found, Adapter):
+        raise EngineFailure(
+            f"{ENGINES[name]} is {describe_value(found)}, must be a class derived from Adapter"
+        )
     return found()
 
 
