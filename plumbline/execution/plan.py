@@ -117,6 +117,22 @@ class TaskKey:
         )
 
 
+def scenario_level(
+    scenario: Scenario, level: LevelSelection | Literal["random"]
+) -> LevelSelection | Literal["random"]:
+    """Return the levels of a run at which a scenario is compared.
+
+    Args:
+        scenario: whose file may ask for states only.
+        level: of the run.
+
+    Returns:
+        "state", or the level of the run.
+
+    """
+    return level if scenario.level == "all" else "state"
+
+
 def task_keys(
     scenario: str,
     engines: Mapping[str, EngineInfo],

@@ -17,7 +17,15 @@ from typing import Any
 from plumbline.engines import calls, environments
 from plumbline.engines.adapter import EngineInfo
 from plumbline.execution.exit_codes import ExitCode
-from plumbline.execution.plan import Plan, ProgressCallback, RunObserver, TaskKey, TaskKind, task_keys
+from plumbline.execution.plan import (
+    Plan,
+    ProgressCallback,
+    RunObserver,
+    TaskKey,
+    TaskKind,
+    scenario_level,
+    task_keys,
+)
 from plumbline.execution.random_batch import RandomBatch
 from plumbline.execution.scenario_run import ScenarioRun, uncompared_kinds
 from plumbline.judging import known_issues
@@ -183,8 +191,10 @@ class _Run:
         self.observer.on_start(self.engines)
         has_long_runs = plan.long_run_seconds > 0
         total = sum(
-            sum(1 for _ in task_keys("", self.engines, plan.level, has_long_runs, uncompared_kinds(s.model)))
-            for s in plan.scenarios
+            sum(
+                1 for _ in task_keys("", self.engines, scenario_level(s, plan.level), has_long_runs, left_out)
+            )
+            for s, left_out in ((s, uncompared_kinds(s.model)) for s in plan.scenarios)
         )
         runs = min(plan.random_trajectory_count, len(plan.random_scenarios))
         total += runs * sum(1 for _ in task_keys("", self.engines, plan.level))

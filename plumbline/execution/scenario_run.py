@@ -17,6 +17,7 @@ from plumbline.execution.plan import (
     Plan,
     TaskKey,
     TaskKind,
+    scenario_level,
     task_keys,
 )
 from plumbline.judging import outlier, relation_rows
@@ -119,7 +120,7 @@ class ScenarioRun:
         self.scenario = scenario
         self.truths: dict[TaskKind, StateTruth | MotionTruth | TruthFailure] = {}
         self._plan, self._engines, self._known, self._is_random = plan, engines, known, is_random
-        levels = level or (plan.random_level if is_random else plan.level)
+        levels = scenario_level(scenario, level or (plan.random_level if is_random else plan.level))
         has_long_runs = plan.long_run_seconds > 0 and not is_random
         # how near the initial pose is to a singular one
         loops = scenario.model.has_loops

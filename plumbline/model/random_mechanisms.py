@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS, Array, Kind, Model, State
+from plumbline.model.features import Place, Role
 from plumbline.model.kinematics import (
     complete_state,
     quaternion_conjugate,
@@ -21,6 +22,7 @@ from plumbline.model.sampling import random_states
 
 ELEMENTS = ("armature", "damping", "stiffness", "effort", "springs")
 LOOP_KINDS: tuple[Kind, ...] = ("rod", "ball", "hinge", "universal", "slide", "cylindrical")
+SPRINGS = 4  # between points
 MIN_FIRST_SINGULAR_VALUE = 5e-2  # of the unit rows of a new loop's mechanism: away from singular poses
 
 
@@ -71,15 +73,24 @@ def random_tree(
         far.append(int(rng.choice(path)))
         fitting = [kind for kind in kinds if kind != ("free" if far[k] >= 0 else "weld")]
         chosen.append(fitting[rng.integers(len(fitting))] if fitting else "hinge")
+    bare = _with_numbers(rng, chosen, far, loads)
+    return with_elements(rng, bare, elements) if elements else bare
+
+
+def _with_numbers(
+    rng: np.random.Generator, chosen: Sequence[Kind], far: Sequence[int], loads: bool = True
+) -> Model:
+    """Draw the numbers of a tree of given joints."""
+    n = len(chosen)
     mass = 10 ** rng.uniform(-0.5, 0.5, n)
     inertia = random_inertias(rng, mass)
     point = 0.3 * rng.normal(size=(n, 2, 3))
     point[[kind == "free" for kind in chosen]] = 0
-    bare = Model(
+    return Model(
         mass=mass,
         inertia=inertia,
         kind=tuple(chosen),
-        body=np.stack([far, np.arange(n)], axis=1),
+        body=np.stack([np.array(far), np.arange(n)], axis=1),
         point=point,
         turn=_unit(rng.normal(size=(n, 2, 4))),
         length=np.where([kind == "rod" for kind in chosen], rng.uniform(0.2, 1.0, n), 0.0),
@@ -89,38 +100,39 @@ def random_tree(
         drag_force=loads * rng.uniform(0.1, 0.3, n),
         drag_moment=loads * rng.uniform(0.01, 0.03, n),
     )
-    return with_elements(rng, bare, elements) if elements else bare
 
 
 def with_elements(rng: np.random.Generator, model: Model, elements: Sequence[str] = ELEMENTS) -> Model:
-    """Add random elements to every joint, and two springs between points.
+    """Add random elements to every joint, closing ones too, and springs between points.
 
     Args:
         rng: the source.
-        model: a tree.
+        model: the mechanism.
         elements: which.
 
     Returns:
-        The tree with the elements.
+        The mechanism with the elements.
 
     """
-    n, fields = model.n, dict[str, Any]()
+    n, count, fields = model.n, len(model.kind), dict[str, Any]()
     scalar = np.array([[i < len(KINDS[kind].motions) for i in range(2)] for kind in model.kind])
     balls = np.array([[kind == "ball", False] for kind in model.kind])
     for name in ("armature", "damping", "stiffness"):
         if name in elements:
-            fields[name] = rng.uniform(0.1, 2.0, (n, 2)) * (scalar | balls)
+            fields[name] = rng.uniform(0.1, 2.0, (count, 2)) * (scalar | balls)
     if "stiffness" in elements:
-        fields["rest"] = rng.normal(size=(n, 2)) * scalar
+        fields["rest"] = rng.normal(size=(count, 2)) * scalar
     if "effort" in elements:
-        fields["effort"] = rng.normal(size=(n, 2)) * scalar
+        fields["effort"] = rng.normal(size=(count, 2)) * scalar
     if "springs" in elements and n > 1:
+        ends = [rng.choice(n, 2, replace=False) for _ in range(SPRINGS)]
+        ends[0][rng.integers(2)] = -1
         fields |= {
-            "spring_body": np.array([rng.choice(np.arange(-1, n), 2, replace=False) for _ in range(2)]),
-            "spring_point": 0.5 * rng.normal(size=(2, 2, 3)),
-            "spring_stiffness": rng.uniform(1.0, 10.0, 2),
-            "spring_damping": rng.uniform(0.1, 1.0, 2),
-            "spring_length": rng.uniform(0.1, 1.0, 2),
+            "spring_body": np.array(ends),
+            "spring_point": 0.5 * rng.normal(size=(SPRINGS, 2, 3)),
+            "spring_stiffness": rng.uniform(1.0, 10.0, SPRINGS),
+            "spring_damping": rng.uniform(0.1, 1.0, SPRINGS),
+            "spring_length": rng.uniform(0.1, 1.0, SPRINGS),
         }
     return model.changed(**fields)
 
@@ -208,6 +220,101 @@ def random_loop_mechanism(
         if len(model.kind) == n + len(kinds) and _moves(model, state):
             return model, assembled(model, complete_state(model, state))
     raise AssertionError
+
+
+class _Node:
+    """A body of a mechanism in the making: the kind of its joint, and what hangs on it."""
+
+    def __init__(self, kind: Kind) -> None:
+        self.kind, self.children, self.place = kind, list[_Node](), -1
+
+    def hang(self, kinds: Sequence[Kind]) -> _Node:
+        """Hang a chain on the body and return its last one."""
+        last = self
+        for kind in kinds:
+            last.children.append(_Node(kind))
+            last = last.children[-1]
+        return last
+
+
+def mechanism_with_places(
+    seed: int, places: Sequence[Place], elements: Sequence[str] = ELEMENTS, is_hub_world: bool = False
+) -> tuple[Model, State]:
+    """Draw a mechanism that has joints of given kinds in given roles, as far as they can be together.
+
+    A chain of the single joints ends at a hub, or at the world, that carries branches and loops; other loops
+    hang on the world.
+
+    Args:
+        seed: the same seed gives the same mechanism.
+        places: kinds and roles (`plumbline.model.features.Place`); one that comes twice gives two joints.
+        elements: which of `ELEMENTS` the joints have.
+        is_hub_world: whether branches and loops hang on the world.
+
+    Returns:
+        The mechanism, with all loads, whose loops move, and an assembled state.
+
+    """
+    for attempt in count():
+        rng = np.random.default_rng([seed, attempt])
+        world = _Node("weld")
+        shuffled = [places[i] for i in rng.permutation(len(places))]
+        wanted: dict[Role, list[Kind]] = {"single": [], "beside": [], "loop": [], "closing": []}
+        for kind, role in shuffled:
+            wanted[role].append(kind)
+        is_base_free = "free" in wanted["single"]
+        singles = [kind for kind in wanted["single"] if kind != "free"]
+        base = (
+            world.hang(["free" if is_base_free else "ball"])
+            if singles or is_base_free or not is_hub_world
+            else world
+        )
+        last = base.hang(singles)
+        if last is world and "weld" in (*wanted["beside"], *wanted["closing"], *wanted["loop"]):
+            last = world.hang(["ball"])
+        hub = world if is_hub_world else last
+        for kind in wanted["beside"]:
+            (world if kind == "free" else last if kind == "weld" else hub).hang([kind])
+        if len(hub.children) == 1 and wanted["beside"]:
+            hub.hang(["hinge"])
+        rings: list[tuple[_Node, _Node, Kind]] = []
+        if wanted["loop"] and not wanted["closing"]:
+            wanted["closing"] = ["ball"]
+        for i, closing in enumerate(wanted["closing"]):
+            own = wanted["loop"][i :: len(wanted["closing"])]
+            foot = world if "free" in own or (rng.random() < 0.5 and not is_base_free) else hub
+            if closing == "weld" and foot is world:
+                foot = last
+            freedom = sum(_freedom(kind) for kind in own)
+            while freedom < 6 - _freedom(closing) + 2:
+                own.insert(int(rng.integers(len(own) + 1)), "ball")
+                freedom += 3
+            own.sort(key=lambda kind: (kind != "free", kind == "weld"))  # neither hangs where the other may
+            rings.append((foot, (world if "free" in own else foot).hang(own), closing))
+        kinds, far = list[Kind](), list[int]()
+        _number(world, kinds, far)
+        model = _with_numbers(rng, kinds, far)
+        (state,) = random_states(model, 1, int(rng.integers(2**32)))
+        for foot, near, closing in rings:
+            model = close_loop(model, state, closing, foot.place, near.place, rng)
+        if not rings or _moves(model, state):
+            model = with_elements(rng, model, elements) if elements else model
+            return model, assembled(model, complete_state(model, state))
+    raise AssertionError
+
+
+def _freedom(kind: Kind) -> int:
+    """How many independent rates a joint leaves."""
+    return 6 - len(KINDS[kind].rows)
+
+
+def _number(node: _Node, kinds: list[Kind], far: list[int]) -> None:
+    """List kinds and far bodies of all below a node, depth first."""
+    for child in node.children:
+        child.place = len(kinds)
+        kinds.append(child.kind)
+        far.append(node.place)
+        _number(child, kinds, far)
 
 
 def _moves(model: Model, state: State) -> bool:

@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,6 +85,7 @@ class Scenario:
     duration: float  # s
     sample_interval: float  # s, between compared samples
     closed_form: str | None  # id of its closed-form solution
+    level: Literal["state", "all"]  # "state": its motion is not compared
     body_names: tuple[str, ...]  # N names, for the reader
     path: Path
     digest: str  # sha256 of the checked content: layout and comments do not count
@@ -326,6 +327,7 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
         duration=document.duration,
         sample_interval=document.sample,
         closed_form=document.exact,
+        level=document.level,
         body_names=tuple(body.name or f"body {k + 1}" for k, (body, _) in enumerate(bodies)),
         path=path,
         digest=digest,

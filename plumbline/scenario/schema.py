@@ -683,6 +683,10 @@ class Document(SchemaModel):
         gt=0,
         validate_default=True,
     )
+    level: Literal["state", "all"] = _field(
+        "What is compared: `all` levels, or only quantities at states (`state`), without a motion.",
+        default="all",
+    )
     gravity: Vector = _field("Acceleration of gravity, world frame.", "m/s²", [0.0, 0.0, -9.81])
     bodies: list[ChainItem] = _field(
         "The chain, from the pivot outwards: single and repeated bodies.", min_length=1, max_length=MAX_BODIES
@@ -731,6 +735,8 @@ class Document(SchemaModel):
     def _omit_absent(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
         """Leave out absent springs, loops and seed: a scenario's digest depends on its content alone."""
         data: dict[str, Any] = handler(self)
+        if self.level == "all":
+            del data["level"]
         return {k: v for k, v in data.items() if v or k not in ("springs", "closes", "seed")}
 
 

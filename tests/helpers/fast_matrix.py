@@ -31,6 +31,8 @@ KINDS = {"step": TaskKind.STEP, "trajectory": TaskKind.TRAJECTORY}
 
 def levels(engine: str, scenario: Scenario) -> list[str]:
     """Levels at which an engine is compared on a scenario."""
+    if scenario.level == "state":
+        return ["state"]
     integrators, left_out = load_adapter(engine).integrators, uncompared_kinds(scenario.model)
     has = {"step": any(one.method is not None for one in integrators), "trajectory": bool(integrators)}
     return ["state", *(level for level, kind in KINDS.items() if has[level] and kind not in left_out)]
