@@ -7,7 +7,7 @@ that ignores it would.  docs/coverage.md defines what a pair of features is and 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +16,16 @@ from plumbline.model.datatypes import JOINT_ELEMENTS, Array, Kind, Model
 
 Index = tuple[int | NDArray[np.bool_], ...]
 Role = Literal["single", "beside", "loop", "closing"]
-ROLE_PHRASES: dict[Role, str] = {
+ROLE_PHRASES: dict[str, str] = {
     "single": "a {} alone on its parent",
     "beside": "a {} beside another branch",
     "loop": "a {} in a loop",
     "closing": "a {} that closes a loop",
 }
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+ROLES: tuple[Role, ...] = get_args(Role)
 
 
 class Place(NamedTuple):
@@ -40,7 +43,7 @@ class Feature(NamedTuple):
     role: str = ""  # of the joint, or which bodies a spring joins
 
     def __str__(self) -> str:
-        where = dict[str, str](ROLE_PHRASES).get(self.role, self.role).format(self.kind)
+        where = ROLE_PHRASES.get(self.role, self.role).format(self.kind)
         return f"{self.field} of {where}" if where else self.field
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from plumbline.model.datatypes import KINDS, Model, State
-from plumbline.model.features import ROLE_PHRASES, Feature, Place, features, without_feature
+from plumbline.model.features import ROLES, Feature, Place, features, without_feature
 from plumbline.model.kinematics import complete_state
 from plumbline.model.random_mechanisms import mechanism_with_places
 from plumbline.model.sampling import compared_states
@@ -41,7 +41,7 @@ def feature_pairs(some: Iterable[Feature]) -> set[Pair]:
 
 def legal_places() -> list[Place]:
     """Return the kinds and roles of joints that the scenario format accepts."""
-    every = [Place(kind, role) for role in ROLE_PHRASES for kind in KINDS]
+    every = [Place(kind, role) for role in ROLES for kind in KINDS]
     return [
         place for place in every if any(_example([place], is_hub_world) for is_hub_world in (False, True))
     ]
