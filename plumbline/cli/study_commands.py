@@ -7,7 +7,7 @@ import json
 import sys
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import click
 import pyarrow as pa
@@ -24,6 +24,7 @@ from plumbline.judging.coverage import COVERED_LEVELS, CoverageEntry
 from plumbline.judging.rows import Level, Verdict
 from plumbline.processes.workers import Limits, WorkerPool
 from plumbline.scenario.errors import ScenarioError
+from plumbline.scenario.loader import Scenario
 
 MAX_LISTED_CELLS = 10
 
@@ -138,6 +139,7 @@ def drift(names: tuple[str, ...], rtols: tuple[float, ...], max_cpu_seconds: flo
         "coverage furuta four-bar --level state",
         "coverage --level state --json | jq '.entries[] | select(.smallest == null)'",
         "coverage drag-rod --engine mujoco --engine exudyn",
+        "coverage --pairs",
     )
     + EXIT_CODES,
 )
@@ -158,14 +160,20 @@ def drift(names: tuple[str, ...], rtols: tuple[float, ...], max_cpu_seconds: flo
     default="all",
     help="Only this level. state and step need no engine; the others run each engine's refinement studies.",
 )
+@click.option(
+    "--pairs",
+    "has_pairs",
+    is_flag=True,
+    help="Instead: how many legal pairs of features the scenarios cover, and which are not covered.",
+)
 @options.jobs_option
 @options.out_option(options.DEFAULT_OUT)
 @options.json_option
 @options.timeout_option(600.0)
 @options.memory_option
 def coverage(
-    names: tuple[str, ...], engines: tuple[str, ...], level: Any, jobs: int, out: Path, as_json: bool,
-    timeout: float, memory: float,
+    names: tuple[str, ...], engines: tuple[str, ...], level: Any, has_pairs: bool, jobs: int, out: Path,
+    as_json: bool, timeout: float, memory: float,
 ) -> None:  # fmt: skip
     """Compute, for every number of every body, the smallest mistake that a run would report.
 
@@ -175,12 +183,15 @@ def coverage(
     is zero), and the row that reports it first; or the proof that no mistake can be seen there.
 
     Prints the range per kind of number, and everything with --json. Writes coverage.parquet, and report.html
-    again where OUT holds results: the report shows the table.
+    again where OUT holds results: the report shows the table. With --pairs it writes nothing and ends with 1
+    where a legal pair is not covered.
     """
     from plumbline.studies import coverage as study
     from plumbline.studies.tables import write_table
 
     chosen = options.choose_scenarios(names, ())
+    if has_pairs:
+        _print_pairs(chosen, jobs, Limits(timeout, memory), as_json)
     levels: tuple[Level, ...] = COVERED_LEVELS if level == "all" else (level,)
     folder, limits = options.claim_folder(out), Limits(timeout, memory)
     with options.exit_on_io_error():
@@ -202,6 +213,29 @@ def coverage(
     for kind, written in (("results", path), ("report", report)):
         if written is not None:
             click.echo(f"{kind}: {written}", err=as_json)
+
+
+def _print_pairs(chosen: list[Scenario], jobs: int, limits: Limits, as_json: bool) -> NoReturn:
+    """Print how many legal pairs of features the scenarios cover; exit with 1 if one is not covered."""
+    from plumbline.studies import feature_pairs
+
+    with ProgressDisplay(sys.stderr) as progress, WorkerPool(jobs, limits) as executor:
+        shown = feature_pairs.measure_features(executor, chosen, progress)
+    legal = feature_pairs.legal_pairs()
+    lacking = sorted(legal.difference(*map(feature_pairs.all_pairs, shown.values())))
+    if as_json:
+        lists = {name: [str(one) for one in some] for name, some in shown.items()}
+        missing = [[str(one), str(other)] for one, other in lacking]
+        click.echo(json.dumps({"legal": len(legal), "lacking": missing, "shown": lists}, indent=1))
+    else:
+        count = len({one for pair in legal for one in pair})
+        click.echo(
+            f"{count} features, {len(legal):,} legal pairs: {len(legal) - len(lacking):,} covered by "
+            f"{count_noun(len(chosen), 'scenario')}, {len(lacking):,} not"
+        )
+        for one, other in lacking[:MAX_LISTED_CELLS]:
+            click.echo(f"not covered: {one} and {other}")
+    sys.exit(ExitCode.DISAGREEMENT if lacking else ExitCode.SUCCESS)
 
 
 def _print_coverage_json(found: list[CoverageEntry]) -> None:

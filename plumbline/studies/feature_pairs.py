@@ -34,7 +34,7 @@ _EXAMPLE = {"schema_version": 1, "name": "example", "title": "Example", "purpose
 Pair = tuple[Feature, Feature]
 
 
-def feature_pairs(some: Iterable[Feature]) -> set[Pair]:
+def all_pairs(some: Iterable[Feature]) -> set[Pair]:
     """Return all pairs of features."""
     return set(itertools.combinations(sorted(some), 2))
 
@@ -43,7 +43,9 @@ def legal_places() -> list[Place]:
     """Return the kinds and roles of joints that the scenario format accepts."""
     every = [Place(kind, role) for role in ROLES for kind in KINDS]
     return [
-        place for place in every if any(_example([place], is_hub_world) for is_hub_world in (False, True))
+        place
+        for place in every
+        if any(example_scenario([place], is_hub_world) for is_hub_world in (False, True))
     ]
 
 
@@ -64,13 +66,13 @@ def legal_pairs(size: int = EXAMPLE_PLACES) -> set[Pair]:
     found = set[Pair]()
     for one, other in itertools.combinations_with_replacement(groups, 2):
         for is_hub_world in (False, True):
-            if (example := _example([*one, *other], is_hub_world)) is not None:
-                found |= feature_pairs(features(example.model))
+            if (example := example_scenario([*one, *other], is_hub_world)) is not None:
+                found |= all_pairs(features(example.model))
     return found
 
 
-def _example(places: Sequence[Place], is_hub_world: bool) -> Scenario | None:
-    """A scenario with joints in these places and all fields; None where the format has none."""
+def example_scenario(places: Sequence[Place], is_hub_world: bool) -> Scenario | None:
+    """Make a scenario with joints in these places and all fields; None where the format has none."""
     model, state = mechanism_with_places(0, places, is_hub_world=is_hub_world)
     try:
         return scenario_from_dict(_EXAMPLE | mechanism_document(model, state), "example")

@@ -142,7 +142,8 @@ def assert_close(got, expected, ulps=4):
 
 
 def test_the_catalogue_is_the_issues_list():
-    assert list(scenarios.catalogue()) == [
+    named = [name for name in scenarios.catalogue() if not name.startswith("crowded-")]
+    assert named == [
         *SINGLE_NAMES,
         *DOUBLE_JOINTS,
         *CHAIN_JOINTS,

@@ -1,0 +1,122 @@
+"""Pairs of features: legal where the format accepts them, covered where a scenario shows either left out."""
+
+import itertools
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from plumbline.engines.calls import Evaluation
+from plumbline.engines.registry import load_adapter
+from plumbline.judging.rows import RowContext, Verdict
+from plumbline.judging.state import judge_states
+from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS
+from plumbline.model.features import ROLES, Feature, Place, features, joint_roles, without_feature
+from plumbline.model.kinematics import complete_state
+from plumbline.model.sampling import compared_states
+from plumbline.scenario.loader import catalogue, load_scenario
+from plumbline.studies import feature_pairs
+from plumbline.truth.ground_truth import state_truth
+from tests.helpers.immediate_executor import Immediate
+
+PARTS = [f"crowded-loops-{k}" for k in range(1, 7)]  # together they have all pairs
+GROUP = 14  # places: larger groups make fewer examples of the same pairs
+
+
+def load(name):
+    return load_scenario(catalogue()[name])
+
+
+def test_every_kind_is_legal_in_every_role_but_a_free_body_that_closes_a_loop():
+    every = {Place(kind, role) for kind in KINDS for role in ROLES}
+    assert every - set(feature_pairs.legal_places()) == {Place("free", "closing")}
+
+
+def test_no_legal_pair_is_lost():
+    legal = feature_pairs.legal_pairs(GROUP)
+    counts = Counter(pair for name in PARTS for pair in feature_pairs.all_pairs(features(load(name).model)))
+    assert not [pair for pair in legal if not counts[pair]], "no scenario has these pairs"
+    assert {counts[pair] for pair in legal} >= {1, 2}  # without any of the scenarios pairs were lost
+    for one, other in (
+        (Feature("stiffness 1", "ball", "closing"), Feature("armature 2", "cylindrical", "closing")),
+        (Feature("drag force", "hinge", "loop"), Feature("length", "rod", "beside")),
+        (Feature("effort 2", "universal", "closing"), Feature("rest 1", "slide", "loop")),
+        (Feature("gravity x"), Feature("damping", "", "a spring between two trees")),
+        (Feature("mass", "free", "beside"), Feature("moment", "free", "loop")),
+    ):
+        assert tuple(sorted((one, other))) in legal, (one, other)
+    illegal = Feature("mass", "free", "single"), Feature("mass", "free", "beside")
+    assert tuple(sorted(illegal)) not in legal
+
+
+def test_every_legal_pair_of_places_is_in_the_examples():
+    places = feature_pairs.legal_places()
+    legal = feature_pairs.legal_pairs()
+    assert legal == feature_pairs.legal_pairs(GROUP)
+    for one, other in itertools.combinations_with_replacement(places, 2):
+        for is_hub_world in (False, True):
+            example = feature_pairs.example_scenario([one, other], is_hub_world)
+            assert example is None or feature_pairs.all_pairs(features(example.model)) <= legal, (one, other)
+
+
+def test_every_legal_pair_is_covered():
+    shown = feature_pairs.measure_features(Immediate(), [load(name) for name in PARTS])
+    covered = set().union(*map(feature_pairs.all_pairs, shown.values()))
+    assert feature_pairs.legal_pairs() <= covered
+
+
+def test_roles_of_joints():
+    model = load("flyball-governor").model
+    assert joint_roles(model)[model.n :] == ["closing"] * (len(model.kind) - model.n)
+    tree = load("tree-of-seven-sprung").model
+    assert dict(zip(tree.kind, joint_roles(tree), strict=True)) == {
+        "ball": "beside",  # the drifter is on the world too
+        "hinge": "beside", "universal": "single", "weld": "single", "cylindrical": "beside", "rod": "single",
+        "slide": "beside", "free": "beside",
+    }  # fmt: skip
+
+
+def test_features_are_what_is_not_neutral_and_can_be_left_out():
+    model = load("crowded-loops-6").model
+    for one in features(model)[::5]:
+        left = features(without_feature(model, one))
+        assert one not in left or one.field == "parent", one
+    bare = model.changed(**{name: np.zeros_like(getattr(model, name)) for name in JOINT_ELEMENTS})
+    gone = {one.field for one in features(model)} - {one.field for one in features(bare)}
+    assert gone == {f"{name} {i}" for name in JOINT_ELEMENTS for i in (1, 2)}
+
+
+def wrong_rows(engine, name, feature):
+    """Rows of a real engine on a scenario that disagree if its adapter leaves the feature out."""
+    scenario = load(name)
+    states = compared_states(scenario.model, scenario.state, scenario.seed, feature_pairs.STATES)
+    changed = without_feature(scenario.model, feature)
+    answers = load_adapter(engine).evaluate(changed, [complete_state(changed, one) for one in states])
+    context = RowContext(name, "", engine, engine, "0")
+    rows = judge_states(
+        context, state_truth(scenario.model, states), Evaluation(answers, None, None, 0.0)
+    ).rows
+    return [row.quantity for row in rows if row.verdict == Verdict.DISAGREES]
+
+
+def confirmed(engine, name, count):
+    """Features of a scenario drawn at random, and those of them that a wrong adapter shows as predicted."""
+    scenario = load(name)
+    states = compared_states(scenario.model, scenario.state, scenario.seed, feature_pairs.STATES)
+    shown = feature_pairs.shown_features(scenario.model, states)
+    # without a point or an axis a loop is open, and what an engine makes of that is its own
+    some = [one for one in shown if not one.field.startswith(("point", "axes", "parent", "length"))]
+    chosen = [some[i] for i in np.random.default_rng(28).permutation(len(some))[:count]]
+    return [one for one in chosen if wrong_rows(engine, name, one)], chosen
+
+
+@pytest.mark.parametrize("engine", ["pinocchio", "mujoco", "reference"])
+@pytest.mark.parametrize("name", ["crowded-loops-6", "crowded-tree"])
+def test_what_is_shown_by_prediction_is_shown_by_an_engine(engine, name):
+    found, chosen = confirmed(engine, name, 12)
+    assert found == chosen and len(chosen) == 12
+
+
+def test_a_feature_that_is_left_out_by_an_engine_is_reported():
+    found, chosen = confirmed("pinocchio", "tree-of-seven-sprung", 3)
+    assert found == chosen and len(chosen) == 3
