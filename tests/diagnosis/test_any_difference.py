@@ -42,6 +42,7 @@ def noisy(truth, quantity, ratio, places):
     return found
 
 
+@pytest.mark.timeout(1800)  # a minute of CPU time on the largest loops
 @pytest.mark.parametrize("quantity", STATE_UNITS)
 @pytest.mark.parametrize("name", SUBJECTS)
 def test_random_errors_of_states_are_diagnosed_without_an_exception(name, quantity):

@@ -108,6 +108,7 @@ TREE_JOINTS = {
     "sprung-without-rotors": ("slide", "hinge", "cylindrical", "universal"),
     "universal-pendulum": ("universal",),
     "free-body-with-rotors": ("free", "hinge", "hinge", "hinge"),
+    "hand-on-welds": ("hinge", "weld", "weld", "rod", "free"),
     "loaded-tree": ("ball", "hinge", "universal", "weld", "slide", "cylindrical", "rod", "free"),
     "open-governor": ("hinge", "hinge", "hinge"),
     "point-mass-arm": ("universal", "slide"),
