@@ -37,7 +37,8 @@ def comparable_rows(rows, engine):
 
 
 def test_every_fault_at_once_loses_exactly_its_own_cell(tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr(registry, "ENGINES", dict(registry.ENGINES))
+    for fault in faulty.ERROR_BY_FAULT:
+        monkeypatch.setitem(registry.ENGINES, fault.__name__, "")  # registered below, removed afterwards
     monkeypatch.setattr(worker_process, "initialize_worker", faulty.prepare_worker)
     monkeypatch.chdir(tmp_path)
     faulty.register_faulty_engines()
