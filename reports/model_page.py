@@ -18,6 +18,7 @@ from reports import html_report, junit, robot_drawing
 from reports.results import Record, replace_unprintable
 from reports.verdicts import count_verdicts, needs_attention, rank
 
+MADE = {"Plumbline": "version", "commit": "commit", "date": "started", "command": "command"}
 SARIF_SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
 
 
@@ -66,6 +67,7 @@ def render(document: Record) -> str:
                 "columns": {name: {row["quantity"]: row for row in rows} for name, rows in engines.items()},
                 "worst": {name: max(rows, key=rank) for name, rows in engines.items()},
                 "findings": [row for row in file["rows"] if _is_finding(row)],
+                "errors": [row for row in file["rows"] if row["verdict"] == "disagrees"],
                 "drawing": robot_drawing.draw(file["drawing"], _marked(file)),
                 "counts_not_compared": Counter(feature["what"] for feature in file["not_compared"]),
                 "counts_ambiguous": Counter(feature["what"] for feature in file["ambiguous"]),
@@ -80,6 +82,7 @@ def render(document: Record) -> str:
             css=Markup(style),
             sentence=_sentence(document),
             engines=document["engines"],
+            made=[(name, document[key]) for name, key in MADE.items() if document.get(key)],
             problems=document["problems"],
             files=files,
             counts=count_verdicts(row for file in document["files"] for row in file["rows"]),
@@ -149,7 +152,8 @@ def sarif(document: Record) -> dict[str, Any]:
                 text = f"{row['engine']}: {row['reason']}"
                 results.append(_sarif_result(f"importer/{row['verdict']}", text, source, row["engine"]))
     for problem in document["problems"]:
-        source = {"file": problem["file"], "line": max(1, problem["line"])}
+        place = {name: max(1, problem.get(name, 1)) for name in ("line", "column")}
+        source = {"file": problem["file"], **place}
         results.append(_sarif_result("file/bad", problem["text"], source, ""))
     rules = [{"id": name} for name in dict.fromkeys(result["ruleId"] for result in results)]
     driver = {"name": "Plumbline", "version": document["version"], "rules": rules}
@@ -163,7 +167,7 @@ def sarif(document: Record) -> dict[str, Any]:
 def _sarif_result(rule: str, text: str, source: Record, engine: str) -> Record:
     place = {
         "artifactLocation": {"uri": Path(source["file"]).as_posix()},
-        "region": {"startLine": source["line"]},
+        "region": {"startLine": source["line"], "startColumn": source.get("column", 1)},
     }
     return {
         "ruleId": rule,

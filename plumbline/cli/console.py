@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -52,6 +53,16 @@ def wrap_items(items: Iterable[str], width: int) -> str:
             lines.append("")
         lines[-1] += f"  {item}" if lines[-1] else item
     return "\n".join(lines)
+
+
+def command_line() -> str:
+    """Write the command as it can be typed again.
+
+    Returns:
+        The line for a shell.
+
+    """
+    return shlex.join(["python", "-m", "plumbline", *sys.argv[1:]])
 
 
 def count_noun(count: int, singular: str, plural: str = "") -> str:

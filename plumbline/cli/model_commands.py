@@ -6,6 +6,7 @@ import json
 import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,14 @@ from rich.table import Table
 
 from plumbline import __version__
 from plumbline.cli import options
-from plumbline.cli.console import ProgressDisplay, count_noun, make_console
+from plumbline.cli.console import ProgressDisplay, command_line, count_noun, make_console
 from plumbline.cli.help_texts import EXIT_CODES, examples
 from plumbline.cli.verdict_matrix import coloured_glyph, engine_heading
 from plumbline.diagnosis.importer_cause import Explanation
-from plumbline.engines.environments import split_version, version_problem
+from plumbline.engines.environments import is_optional_importer, split_version, version_problem
 from plumbline.engines.registry import IMPORTERS
 from plumbline.execution.model_run import ModelPlan, ModelRunResult, run_model_files
+from plumbline.execution.runner import git_commit
 from plumbline.importers.neutral_model import MODEL_UNITS, Feature
 from plumbline.judging.model_file import REFUSED, FileResult
 from plumbline.judging.rows import Row, Verdict
@@ -149,23 +151,25 @@ def model(
     folder = options.claim_folder(out) if out is not None else None
     with options.exit_on_io_error(), ProgressDisplay(sys.stderr) as progress:
         result = run_model_files(plan, progress)
+    document = model_document(result)
     if as_json:
-        click.echo(json.dumps(model_document(result), ensure_ascii=False, indent=1))
+        click.echo(json.dumps(document, ensure_ascii=False, indent=1))
     else:
         for file in result.files:
             _print_file(file, result)
+        _print_missing(result)
     for problem in result.problems[:MAX_LISTED_PROBLEMS]:
         click.echo(str(problem), err=True)
     if folder is not None:
-        _write_reports(result, folder, as_json)
+        _write_reports(document, folder, as_json)
     sys.exit(result.exit_code)
 
 
-def _write_reports(result: ModelRunResult, folder: Path, as_json: bool) -> None:
+def _write_reports(document: dict[str, Any], folder: Path, as_json: bool) -> None:
     from reports import model_page
 
     with options.exit_on_io_error():
-        page = model_page.write(folder, model_document(result))
+        page = model_page.write(folder, document)
     click.echo(f"report: {page}", err=as_json)
 
 
@@ -182,6 +186,9 @@ def model_document(result: ModelRunResult) -> dict[str, Any]:
     plan = result.plan
     document = {
         "version": __version__,
+        "commit": git_commit(),
+        "started": datetime.now(UTC).isoformat(timespec="seconds"),
+        "command": command_line(),
         "options": {
             "base": plan.base,
             "root": None if plan.root is None else str(plan.root),
@@ -213,7 +220,9 @@ def model_document(result: ModelRunResult) -> dict[str, Any]:
             }
             for file in result.files
         ],
-        "problems": [{"file": p.file, "line": p.line, "text": str(p)} for p in result.problems],
+        "problems": [
+            {"file": p.file, "line": p.line, "column": p.column, "text": str(p)} for p in result.problems
+        ],
         "exit_code": int(result.exit_code),
     }
     found: dict[str, Any] = to_json_value(document)
@@ -255,6 +264,19 @@ def _print_file(file: FileResult, result: ModelRunResult) -> None:
     for title, features in (("not compared", file.model.not_compared), ("left open", file.model.ambiguous)):
         if features:
             out.print(f"[dim]{title}: {escape(_feature_words(features, file.file))}[/]")
+
+
+def _print_missing(result: ModelRunResult) -> None:
+    """Print why importers are missing, those with one reason together."""
+    glyph = Verdict.NOT_INSTALLED.style.glyph
+    absent = [name for name in result.plan.importers if result.engines[name].missing]
+    optional = [n for n in absent if is_optional_importer(n) and not result.engines[n].version]
+    if optional:
+        it = "it" if len(optional) == 1 else "them"
+        click.echo(f"{glyph} {', '.join(optional)}: not installed here; `make importers` installs {it}")
+    for name in absent:
+        if name not in optional:
+            click.echo(f"{glyph} {name}: {result.engines[name].missing}")
 
 
 def _compared_quantities(file: FileResult) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shlex
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import click
 
 import reports
 from plumbline.cli import options
-from plumbline.cli.console import print_matrix, print_result
+from plumbline.cli.console import command_line, print_matrix, print_result
 from plumbline.cli.help_texts import EXIT_CODES, examples
 from plumbline.cli.run_display import RunDisplay
 from plumbline.engines.registry import ENGINES
@@ -90,7 +89,7 @@ def run(
 
     with options.exit_on_io_error():
         result = _run_visibly(plan, as_json, fresh)
-        save(result, folder, _command_line())
+        save(result, folder, command_line())
         with result.cpu_times.measure("report"):
             write_scripts(folder)
             report = reports.write(folder)
@@ -190,7 +189,7 @@ def nightly(
             extra_refinements=extra_refinements, long_run_seconds=long_run_seconds, scheduler=scheduler,
             self_test=run_self_test if self_test else None, progress=progress,
             proof_cpu_seconds=proof_cpu_seconds,
-            observer=display, command=_command_line(), log=_log, known_issues=known_issues,
+            observer=display, command=command_line(), log=_log, known_issues=known_issues,
             are_engines_required=options.are_engines_named(),
         )  # fmt: skip
     _finish(result, place / "report.html", as_json=False)
@@ -209,10 +208,6 @@ def _run_visibly(plan: Plan, as_json: bool, is_fresh: bool) -> RunResult:
         if is_fresh:  # with it the finished cells would be computed again
             raise KeyboardInterrupt("without --fresh") from None
         raise
-
-
-def _command_line() -> str:
-    return shlex.join(["python", "-m", "plumbline", *sys.argv[1:]])
 
 
 def _log(sentence: str) -> None:

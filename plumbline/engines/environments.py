@@ -225,6 +225,20 @@ def importer_interpreter(name: str) -> str:
     return str(python)
 
 
+def is_optional_importer(name: str) -> bool:
+    """Find out whether `make importers` installs an importer, into an environment of its own.
+
+    Args:
+        name: an importer, with or without a version.
+
+    Returns:
+        Whether it does; not of another version, which has another environment.
+
+    """
+    base, version = split_version(name)
+    return not version and bool(declared_importer_attribute(base, "environment"))
+
+
 def _interpreter_path(environment: Path) -> Path:
     return environment / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
 

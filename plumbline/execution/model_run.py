@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from plumbline.diagnosis.importer_cause import Explanation
 from plumbline.engines.adapter import EngineInfo
@@ -24,9 +25,8 @@ from plumbline.engines.importer_calls import (
 from plumbline.engines.registry import IMPORTERS
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.runner import exit_code_of_rows
-from plumbline.importers.importer import Reading
 from plumbline.importers.model_file import BaseChoice, PreparedFile, prepare_file
-from plumbline.importers.neutral_model import CanonicalState, NeutralModel
+from plumbline.importers.neutral_model import CanonicalState, NeutralModel, extreme_numbers
 from plumbline.importers.xml_tree import ModelFileError
 from plumbline.judging.known_issues import KnownIssue, KnownIssues
 from plumbline.judging.model_file import (
@@ -46,6 +46,7 @@ from plumbline.scenario.errors import Problem, did_you_mean, shorten
 from plumbline.truth.model_comparison import model_states, with_names_of
 
 MJCF_READER = "mujoco"  # whose compiled model is the neutral reading of MJCF
+T = TypeVar("T")
 ProgressCallback = Callable[[int, int, str], None]
 
 
@@ -75,6 +76,7 @@ class ModelRunResult:
     engines: Mapping[str, EngineInfo]
     problems: tuple[Problem, ...]  # of files that cannot be used
     stale_issues: tuple[KnownIssue, ...]
+    has_internal_error: bool = False  # a mistake of this program about one of the files
 
     @property
     def rows(self) -> list[Row]:
@@ -83,13 +85,14 @@ class ModelRunResult:
 
     @property
     def exit_code(self) -> ExitCode:
-        """2 where a file cannot be used, else as everywhere."""
-        if self.problems:
-            return ExitCode.BAD_USAGE
+        """5 where the harness failed, else 2 where a file cannot be used, else as everywhere."""
         has_comparison = any(row.verdict.is_comparison for row in self.rows)
-        return exit_code_of_rows(
+        code = exit_code_of_rows(
             self.rows, has_stale_issues=bool(self.stale_issues), has_comparison=has_comparison
         )
+        if self.has_internal_error or code == ExitCode.HARNESS_FAILED:
+            return ExitCode.HARNESS_FAILED
+        return ExitCode.BAD_USAGE if self.problems else code
 
 
 def run_model_files(plan: ModelPlan, progress: ProgressCallback) -> ModelRunResult:
@@ -116,7 +119,8 @@ class _ModelRun:
         self.pythons: dict[str, str] = {}
         self.engines: dict[str, EngineInfo] = {}
         self.problems: list[Problem] = []
-        self.truths: dict[str, Packed | str] = {}  # of each file, or why there is none
+        self.has_internal_error = False
+        self.truths: dict[str, Packed | tuple[Verdict, str]] = {}  # of each file, or why there is none
 
     def execute(self) -> ModelRunResult:
         """Run the phases."""
@@ -133,7 +137,9 @@ class _ModelRun:
             for f in files
         ]
         stale = known.stale_issues(is_full_matrix=False)
-        return ModelRunResult(self.plan, tuple(files), self.engines, tuple(self.problems), tuple(stale))
+        return ModelRunResult(
+            self.plan, tuple(files), self.engines, tuple(self.problems), tuple(stale), self.has_internal_error
+        )
 
     def outcomes(self, tasks: Sequence[Task]) -> Iterator[Outcome]:
         """Run tasks and report the progress."""
@@ -143,18 +149,38 @@ class _ModelRun:
             self.progress(self.done, total, " ".join(map(str, outcome.key)))
             yield outcome
 
+    def of_file(self, shown: str, call: Callable[[], T]) -> T | None:
+        """Call what handles one file: its problems, and a mistake of this program, do not stop the others."""
+        try:
+            return call()
+        except ModelFileError as error:
+            self.problems += error.problems
+        except Exception as error:
+            words = shorten(" ".join(f"{type(error).__name__}: {error}".split()), 400)
+            self.problems.append(
+                Problem(shown, 0, 0, "", f"internal error: {words}", hint="please report it")
+            )
+            self.has_internal_error = True
+        return None
+
+    def limit_words(self, outcome: Outcome, what: str) -> str:
+        """Why there is no answer, with the option that sets the limit; empty where there is an answer."""
+        seconds, gigabytes = self.plan.limits.seconds, self.plan.limits.gigabytes
+        if outcome.is_overdue:
+            return f"{what} within the time limit of {seconds:g} s (--timeout)"
+        if outcome.is_out_of_memory:
+            return f"{what} within the memory limit of {gigabytes:g} GB (--memory)"
+        return outcome.failure or ""
+
     def prepare(self) -> dict[str, PreparedFile]:
         """Check the files."""
         found: dict[str, PreparedFile] = {}
         for number, shown in enumerate(dict.fromkeys(self.plan.files)):
             folder = self.scratch / str(number)
             folder.mkdir()
-            try:
-                found[shown] = prepare_file(
-                    shown, folder, self.plan.root, self.plan.base, self.plan.strip_geometry
-                )
-            except ModelFileError as error:
-                self.problems += error.problems
+            how = folder, self.plan.root, self.plan.base, self.plan.strip_geometry
+            if (file := self.of_file(shown, partial(prepare_file, shown, *how))) is not None:
+                found[shown] = file
         return found
 
     def describe(self) -> None:
@@ -221,12 +247,8 @@ class _ModelRun:
         for outcome in self.outcomes(tasks):
             if self.is_certificate(outcome):
                 continue
-            reading: Reading | None = outcome.value
-            if reading is not None:  # a copy's path would mean nothing to the user
-                shown = outcome.key[1]
-                words = reading.refusal.replace(prepared[shown].file.path, shown)
-                reading = replace(reading, refusal=words)
-            found[outcome.key[1:]] = Answer(reading, failure=outcome.failure or "")
+            failure = self.limit_words(outcome, "did not load the file")
+            found[outcome.key[1:]] = Answer(outcome.value, failure=failure)
         return found
 
     def neutral_models(
@@ -235,11 +257,9 @@ class _ModelRun:
         """What the files say."""
         found = {}
         for shown, file in prepared.items():
-            answer = readings.get((shown, MJCF_READER))
-            try:
-                model = file.neutral_model(answer.reading if answer else None)
-            except ModelFileError as error:
-                self.problems += error.problems
+            answer = readings.get((shown, MJCF_READER), Answer(failure="is missing or failed to load"))
+            described = partial(file.neutral_model, answer.reading, answer.failure)
+            if (model := self.of_file(shown, described)) is None:
                 continue
             names = [joint.name for joint in model.joints if joint.kind in ("hinge", "slide")]
             unknown = [name for name in self.plan.at or () if name not in names]
@@ -265,7 +285,14 @@ class _ModelRun:
         }
         tasks = []
         for (shown, name), answer in answers.items():
-            if answer.reading is not None and answer.reading.model is not None:
+            if answer.reading is not None and answer.reading.model is None:
+                words = prepared[shown].in_users_words(answer.reading.refusal)
+                answers[shown, name] = replace(answer, reading=replace(answer.reading, refusal=words))
+            elif answer.reading is not None and answer.reading.model is not None:
+                if extreme := next(extreme_numbers(answer.reading.model), None):
+                    failure = f"no engine can compute with what it read: {extreme[0]} is {extreme[1]:g}"
+                    answers[shown, name] = Answer(failure=failure)
+                    continue
                 model = with_names_of(models[shown], answer.reading.model)
                 states = self.states(shown, model)
                 answers[shown, name] = replace(
@@ -279,7 +306,8 @@ class _ModelRun:
             if self.is_certificate(outcome):
                 continue
             if outcome.failure:
-                answers[key] = replace(answers[key], failure=outcome.failure)
+                failure = self.limit_words(outcome, "did not compute the quantities")
+                answers[key] = replace(answers[key], failure=failure)
             else:
                 answers[key] = replace(answers[key], quantities=tuple(outcome.value))
         return answers
@@ -292,8 +320,8 @@ class _ModelRun:
         for (shown, name), answer in answers.items():
             file, is_read = prepared[shown].file, answer.reading is not None and answer.reading.model
             if split_version(name)[0] == MJCF_READER and file.format == "mjcf" and is_read:
-                written = prepared[shown].write_rewritings(self.scratch)
-                tasks.append(self.task("rewritten", shown, name, read_model_files, written))
+                written = self.of_file(shown, partial(prepared[shown].write_rewritings, self.scratch))
+                tasks.append(self.task("rewritten", shown, name, read_model_files, written or {}))
         for outcome in self.outcomes(tasks):
             key = outcome.key[1:]
             answers[key] = replace(answers[key], rewritten=outcome.value or {})
@@ -311,8 +339,15 @@ class _ModelRun:
         """Keep a certificate; False for other outcomes."""
         if outcome.key[0] != "certify":
             return False
-        self.truths[outcome.key[1]] = outcome.failure or outcome.packed
+        what = "the certified values of the file were not computed"
+        self.truths[outcome.key[1]] = self.unjudged(outcome, what) if outcome.failure else outcome.packed
         return True
+
+    def unjudged(self, outcome: Outcome, what: str) -> tuple[Verdict, str]:
+        """The verdict where an importer cannot be judged: at a limit it is open, else the harness failed."""
+        if outcome.is_overdue or outcome.is_out_of_memory:
+            return Verdict.UNRESOLVED, f"not judged: {self.limit_words(outcome, what)}"
+        return Verdict.HARNESS_FAILED, f"the judging failed: {outcome.failure}"
 
     def states(self, shown: str, model: NeutralModel) -> tuple[CanonicalState, ...]:
         """The states of one file; the same values for joints of one name and kind in every reading."""
@@ -332,32 +367,34 @@ class _ModelRun:
         for (shown, name), column in columns.items():
             truth, model = self.truths[shown], models[shown]
             arguments = (shown, model, column, self.plan.state_count, self.plan.at)
-            if isinstance(truth, str):
-                judged[shown, name] = self.lost(shown, column, truth)
+            if isinstance(truth, tuple):
+                judged[shown, name] = self.lost(shown, column, *truth)
             elif column[2].quantities:  # where it says which causes a difference has, which takes time
                 key = ("judge", shown, name)
                 tasks.append(Task(key, judge_importer, (*arguments, truth), self.plan.limits))
             else:
                 judged[shown, name] = judge_importer(*arguments, truth.load())
         for outcome in self.outcomes(tasks):
-            (_, shown, name), failure = outcome.key, outcome.failure
+            _, shown, name = outcome.key
+            what = "its differences were not explained"
             judged[shown, name] = (
-                self.lost(shown, columns[shown, name], failure) if failure else outcome.value
+                self.lost(shown, columns[shown, name], *self.unjudged(outcome, what))
+                if outcome.failure
+                else outcome.value
             )
         for shown, model in models.items():
             truth = self.truths[shown]
-            known = FileTruth((), (), {}) if isinstance(truth, str) else truth.load()
+            known = FileTruth((), (), {}) if isinstance(truth, tuple) else truth.load()
             named = [(shown, name) for name in self.plan.importers]
             yield file_result(shown, model, [columns[n] for n in named], [judged[n] for n in named], known)
 
     def lost(
-        self, shown: str, column: tuple[str, EngineInfo, Answer], failure: str
+        self, shown: str, column: tuple[str, EngineInfo, Answer], verdict: Verdict, reason: str
     ) -> tuple[list[Row], None]:
-        """The row of a judging that failed."""
+        """The row of an importer that is not judged."""
         name, info, _ = column
         context = RowContext(shown, MODEL_FAMILY, name, info.title, info.version)
-        reason = f"the judging failed: {failure}"
-        return [context.make_row("model", "-", "all", Verdict.HARNESS_FAILED, reason)], None
+        return [context.make_row("model", "-", "all", verdict, reason)], None
 
 
 def declared_formats(name: str) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ from pathlib import Path
 from plumbline.importers.neutral_model import ElementaryJoint, Feature, NeutralBody, NeutralModel, Source
 from plumbline.importers.xml_tree import Element, ModelFileError, read_xml
 from plumbline.scenario.errors import shorten
+from plumbline.scenario.yaml_source import is_file
 
 MAX_INCLUDES = 200
 _JOINT_FIELDS = {
@@ -66,7 +67,7 @@ def _include_target(element: Element, folder: Path, root_folder: Path) -> Path:
         message = f"{shorten(repr(name))} is outside {root_folder}"
         hint = "name a folder that holds both with --root"
         raise ModelFileError([element.problem(message, "file", hint=hint)])
-    if not target.is_file():
+    if not is_file(target):
         raise ModelFileError([element.problem(f"there is no file {shorten(repr(name))}", "file")])
     return target
 

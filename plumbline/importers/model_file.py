@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,12 +13,16 @@ from urllib.parse import unquote
 from plumbline.importers import mjcf
 from plumbline.importers.importer import Base, Format, ModelFile, Reading
 from plumbline.importers.mjcf_rewriting import rewritings
-from plumbline.importers.neutral_model import NeutralModel
+from plumbline.importers.neutral_model import NeutralModel, Source, extreme_numbers, zero_directions
 from plumbline.importers.urdf import read_urdf
 from plumbline.importers.xml_tree import Element, ModelFileError, read_xml, write_xml, write_xml_in_place
 from plumbline.scenario.errors import Problem, shorten
+from plumbline.scenario.yaml_source import is_file
 
 BaseChoice = Literal["fixed", "free", "auto"]
+_LINE = re.compile(r"\bline (\d{1,9})\b")
+_ELEMENT = re.compile(r"\bElement '([^']*)'")  # as MuJoCo names elements; other importers name lines at most
+_ELEMENT_NAME = re.compile(r"\bElement name '([^']*)'")
 _ROOT_TAGS: dict[str, Format] = {"robot": "urdf", "mujoco": "mjcf"}
 
 
@@ -28,27 +34,78 @@ class PreparedFile:
     tree: Element  # of the file that importers open; sources are those of the user's files
     file: ModelFile
     urdf_model: NeutralModel | None  # the own reading; None for MJCF, which MuJoCo compiles in a worker
+    lines: Mapping[int, Sequence[Element]]  # that begin in each line of the file that importers open
 
-    def neutral_model(self, reading: Reading | None) -> NeutralModel:
+    def neutral_model(self, reading: Reading | None, failure: str = "") -> NeutralModel:
         """Return what the file says.
 
         Args:
             reading: MuJoCo's reading of an MJCF file; not used for a URDF.
+            failure: why there is none, as "did not compile it within 20 s".
 
         Returns:
             The neutral model with sources.
 
         Raises:
-            ModelFileError: MuJoCo, which defines MJCF, refuses the file.
+            ModelFileError: MuJoCo, which defines MJCF, refuses the file or fails, or numbers are so large
+                or small that no engine can compute with them.
 
         """
-        if self.urdf_model is not None:
-            return self.urdf_model
-        if reading is None or reading.model is None:
-            words = reading.refusal if reading else "MuJoCo did not answer"
-            message = f"MuJoCo, which defines MJCF, refuses it: {shorten(words, 400)}"
-            raise ModelFileError([Problem(self.shown, _line_in(words), 1, "", message)])
-        return mjcf.with_sources(reading.model, self.tree)
+        model = self.urdf_model
+        if model is None and (reading is None or reading.model is None):
+            place = self.place_of(reading.refusal) if reading else Source(self.shown, 1)
+            words = f"refuses it: {self.in_users_words(reading.refusal)}" if reading else failure
+            message = f"MuJoCo, which defines MJCF, {shorten(words, 400)}"
+            raise ModelFileError([Problem(place.file, place.line, place.column, "", message)])
+        if model is None:
+            assert reading is not None and reading.model is not None
+            model = mjcf.with_sources(reading.model, self.tree)
+        problems = [
+            Problem(place.file, place.line, place.column, "", f"{what} is {value:g}", valid)
+            for what, value, valid, place in [*extreme_numbers(model)] or [*zero_directions(model)]
+        ]
+        if problems:
+            raise ModelFileError(problems)
+        return model
+
+    def place_of(self, words: str) -> Source:
+        """Find the place in the user's files that an importer's message is about.
+
+        Args:
+            words: of the importer, about the file that it opened.
+
+        Returns:
+            The place of the last line that the message names, else of the element, else of the root.
+
+        """
+        lines, names = _LINE.findall(words), _ELEMENT_NAME.findall(words)
+        found = self._elements(int(lines[-1]), words) if lines else []
+        if not found and names:
+            found = [e for e in self.tree.walk() if e.attributes.get("name") == names[-1]][-1:]
+        return (found or [self.tree])[0].source
+
+    def in_users_words(self, words: str) -> str:
+        """Write an importer's message on one line, with the user's files and lines.
+
+        Args:
+            words: of the importer, about the file that it opened.
+
+        Returns:
+            The message.
+
+        """
+
+        def line_of_user(match: re.Match[str]) -> str:
+            found = self._elements(int(match[1]), words)
+            place = found[0].source if found else Source(self.shown, int(match[1]))
+            return f"line {place.line}" + (f" of {place.file}" if place.file != self.shown else "")
+
+        return _LINE.sub(line_of_user, " ".join(words.replace(self.file.path, self.shown).split()))
+
+    def _elements(self, line: int, words: str) -> list[Element]:
+        """The elements that begin in a line of the opened file, those first whose tag the words name."""
+        tags = _ELEMENT.findall(words)
+        return sorted(self.lines.get(line, ()), key=lambda element: element.tag not in tags)
 
     def write_rewritings(self, folder: Path) -> dict[str, ModelFile]:
         """Write equivalent rewritings of an MJCF file.
@@ -114,13 +171,17 @@ def prepare_file(
             link.children = [c for c in link.children if c.tag not in ("visual", "collision")]
     model = read_urdf(tree, chosen) if kind == "urdf" else None
     _check_references(tree, kind, path.parent, folder)
-    opened = path.resolve()
+    opened, lines = path.resolve(), dict[int, list[Element]]()
     if is_copied:
         if kind == "mjcf":
             mjcf.make_paths_absolute(tree, path.parent.resolve())
         opened = scratch / path.name
-        opened.write_text(write_xml_in_place(tree), encoding="utf-8")
-    return PreparedFile(shown, tree, ModelFile(str(opened), kind, chosen, str(folder)), model)
+        text, lines = write_xml_in_place(tree)
+        opened.write_text(text, encoding="utf-8")
+    else:
+        for element in tree.walk():
+            lines.setdefault(element.source.line, []).append(element)
+    return PreparedFile(shown, tree, ModelFile(str(opened), kind, chosen, str(folder)), model, lines)
 
 
 def package_folder(path: Path) -> Path:
@@ -134,7 +195,7 @@ def package_folder(path: Path) -> Path:
 
     """
     folder = path.resolve().parent
-    return next((p for p in (folder, *folder.parents) if (p / "package.xml").is_file()), folder)
+    return next((p for p in (folder, *folder.parents) if is_file(p / "package.xml")), folder)
 
 
 def _format_of(tree: Element, shown: str) -> Format:
@@ -184,7 +245,7 @@ def _check_references(tree: Element, kind: Format, folder: Path, root: Path) -> 
         hint = "--strip-geometry leaves meshes out; --root names another folder"
         if not inside:
             problems.append(element.problem(f"{shorten(repr(name))} is outside {root}", attribute, hint=hint))
-        elif not any(target.is_file() for target in inside):
+        elif not any(is_file(target) for target in inside):
             problems.append(
                 element.problem(f"there is no file {shorten(repr(name))} in {root}", attribute, hint=hint)
             )
@@ -196,10 +257,3 @@ def _package_paths(rest: str, root: Path) -> list[Path]:
     """Where package://NAME/REST may be: in the root, which is the package or holds it."""
     inner = rest.partition("/")[2]
     return [root / rest, root / inner, *([root.parent / rest] if root.name == rest.partition("/")[0] else [])]
-
-
-def _line_in(words: str) -> int:
-    """The line that MuJoCo's message names; 1 where it names none."""
-    _, found, rest = words.partition("line ")
-    digits = "".join(c for c in rest[:8] if c.isdigit())
-    return int(digits) if found and digits else 1

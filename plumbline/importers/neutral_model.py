@@ -25,8 +25,15 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
+import numpy as np
+
 from plumbline.model.datatypes import Array
 
+MAX_MAGNITUDE = 1e30  # of a file's SI numbers: beyond it products leave the range where engines can compute
+MIN_INERTIA = 1e-100  # kg, kg m²: below it products lose digits, or vanish
+_JOINT_NUMBERS = (
+    "axis", "anchor", "reference", "armature", "damping", "stiffness", "spring_reference", "friction_loss"
+)  # fmt: skip
 JointKind = Literal["hinge", "slide", "ball", "free"]
 COORDINATE_COUNT: dict[JointKind, int] = {"hinge": 1, "slide": 1, "ball": 4, "free": 7}
 VELOCITY_COUNT: dict[JointKind, int] = {"hinge": 1, "slide": 1, "ball": 3, "free": 6}
@@ -38,6 +45,7 @@ class Source:
 
     file: str  # as the user typed it, or relative to the root
     line: int  # from 1; 0: the file does not say it, the format's default holds
+    column: int = 1  # from 1, of the element's beginning
 
     def __str__(self) -> str:
         """Write as ``file:line``."""
@@ -186,3 +194,57 @@ def without_passive_forces(model: NeutralModel) -> NeutralModel:
         for body in model.bodies
     )
     return replace(model, bodies=bodies)
+
+
+def zero_directions(model: NeutralModel) -> Iterator[tuple[str, float, str, Source]]:
+    """Find axes and attitudes without a direction, as normalising extreme numbers leaves them.
+
+    Args:
+        model: what a file says; its numbers are finite.
+
+    Yields:
+        As `extreme_numbers`: the parameter, its length, what would be valid, and where the file says it.
+
+    """
+    for body in model.bodies:
+        found = [("attitude", f"body {body.name}", body.attitude, body.fields.get("attitude", body.source))]
+        found += [
+            ("axis", f"joint {joint.name}", joint.axis, joint.fields.get("axis", joint.source))
+            for joint in body.joints
+            if joint.kind in ("hinge", "slide")
+        ]
+        for name, owner, values, place in found:
+            if not 0.5 < (length := float(np.linalg.norm(values))) < 2:
+                yield f"the normalised {name} of {owner}", length, "numbers whose squares are in range", place
+
+
+def extreme_numbers(model: NeutralModel) -> Iterator[tuple[str, float, str, Source]]:
+    """Find numbers with which no engine can compute: not finite, too large, or inertia that is nearly none.
+
+    Args:
+        model: what a file says, or an importer's reading of it.
+
+    Yields:
+        The parameter with its owner in words, the number, what would be valid, and where the file says it.
+
+    """
+    large, small = f"a number up to {MAX_MAGNITUDE:g}", f"0, or at least {MIN_INERTIA:g}"
+    if not (worst := _largest(model.gravity)) <= MAX_MAGNITUDE:
+        yield "gravity of the model", worst, large, model.gravity_source
+    for body in model.bodies:
+        for name in ("position", "attitude", "mass", "center", "inertia"):
+            worst, place = _largest(getattr(body, name)), body.fields.get(name, body.source)
+            what = f"{name} of body {body.name}"
+            if not worst <= MAX_MAGNITUDE:
+                yield what, worst, large, place
+            elif name in ("mass", "inertia") and 0 < worst < MIN_INERTIA:
+                yield what, worst, small, place
+        for joint in body.joints:
+            for name in _JOINT_NUMBERS:
+                if not (worst := _largest(getattr(joint, name))) <= MAX_MAGNITUDE:
+                    words = f"{name.replace('_', ' ')} of joint {joint.name}"
+                    yield words, worst, large, joint.fields.get(name, joint.source)
+
+
+def _largest(values: Array | float) -> float:
+    return float(np.max(np.abs(values)))

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from plumbline.importers.neutral_model import (
+    MAX_MAGNITUDE,
     ElementaryJoint,
     Feature,
     JointKind,
@@ -165,11 +166,17 @@ class _UrdfReader:
             return ""
         return name
 
-    def numbers(self, element: Element | None, attribute: str, default: tuple[float, ...]) -> list[float]:
+    def numbers(
+        self,
+        element: Element | None,
+        attribute: str,
+        default: tuple[float, ...],
+        largest: float = MAX_MAGNITUDE,
+    ) -> list[float]:
         """Read an attribute's numbers; the default where the attribute or its element is missing."""
         if element is None or attribute not in element.attributes:
             return list(default)
-        return parse_numbers(element, attribute, len(default), self.problems)
+        return parse_numbers(element, attribute, len(default), self.problems, largest)
 
     def required(self, element: Element | None, owner: Element, tag: str, attribute: str) -> float:
         """Read one number that must be there."""
@@ -278,7 +285,7 @@ class _UrdfReader:
     def axis(self, joint: Element) -> Array:
         """Read a joint's axis as a unit vector; (1, 0, 0) where the file has none."""
         element = joint.find("axis")
-        values = np.array(self.numbers(element, "xyz", (1.0, 0.0, 0.0)))
+        values = np.array(self.numbers(element, "xyz", (1.0, 0.0, 0.0), math.inf))
         largest = float(np.max(np.abs(values)))
         if largest == 0:
             if not self.problems or self.problems[-1].line != (element or joint).source.line:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import stat
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 from xml.parsers import expat
 from xml.sax.saxutils import escape, quoteattr
 
-from plumbline.importers.neutral_model import Source
+from plumbline.importers.neutral_model import MAX_MAGNITUDE, Source
 from plumbline.scenario.errors import Problem, ScenarioError, shorten
 
 MAX_BYTES = 64 * 2**20  # the largest robot of the known collections has 2 MB
@@ -90,7 +91,7 @@ class Element:
         return Problem(
             self.source.file,
             self.source.line,
-            1,
+            self.source.column,
             f"{where} {attribute}".strip(),
             message,
             valid,
@@ -98,7 +99,9 @@ class Element:
         )
 
 
-def parse_numbers(element: Element, attribute: str, count: int, problems: list[Problem]) -> list[float]:
+def parse_numbers(
+    element: Element, attribute: str, count: int, problems: list[Problem], largest: float = MAX_MAGNITUDE
+) -> list[float]:
     """Read the numbers of an attribute, each rounded to double once.
 
     Args:
@@ -106,6 +109,7 @@ def parse_numbers(element: Element, attribute: str, count: int, problems: list[P
         attribute: its name.
         count: how many numbers it must have.
         problems: gets what is wrong.
+        largest: magnitude that none may exceed.
 
     Returns:
         ``count`` finite numbers; zeros where something is wrong.
@@ -118,6 +122,9 @@ def parse_numbers(element: Element, attribute: str, count: int, problems: list[P
         problems.append(element.problem(f"has {len(words)} numbers", attribute, valid))
     elif bad := [word for word, value in zip(words, values, strict=True) if not math.isfinite(value)]:
         problems.append(element.problem(f"{shorten(repr(bad[0]))} is no finite number", attribute, valid))
+    elif large := [word for word, value in zip(words, values, strict=True) if abs(value) > largest]:
+        message = f"{shorten(repr(large[0]))} is too large"
+        problems.append(element.problem(message, attribute, f"{valid} up to {largest:g}"))
     else:
         return values
     return [0.0] * count
@@ -138,8 +145,9 @@ def read_xml(path: Path, shown: str) -> Element:
 
     """
     try:
-        if path.is_dir():
-            raise ModelFileError([Problem(shown, 0, 0, "", "is a folder", "a URDF or MJCF file")])
+        if not stat.S_ISREG(kind := path.stat().st_mode):  # opening a pipe waits for its writer
+            message = "is a folder" if stat.S_ISDIR(kind) else "is a pipe or a device"
+            raise ModelFileError([Problem(shown, 0, 0, "", message, "a URDF or MJCF file")])
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
     except (OSError, ValueError) as error:
@@ -209,7 +217,8 @@ class _Handler:
         self.parser.ExternalEntityRefHandler = self.refuse_entity
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
-        element = Element(tag, attributes, Source(self.shown, self.parser.CurrentLineNumber))
+        place = Source(self.shown, self.parser.CurrentLineNumber, self.parser.CurrentColumnNumber + 1)
+        element = Element(tag, attributes, place)
         if len(self.stack) >= MAX_DEPTH:
             raise ModelFileError([element.problem(f"is nested more than {MAX_DEPTH} deep")])
         if self.stack:
@@ -228,33 +237,38 @@ class _Handler:
         raise ModelFileError([problem])
 
 
-def write_xml_in_place(root: Element) -> str:
+def write_xml_in_place(root: Element) -> tuple[str, dict[int, list[Element]]]:
     """Write a tree so that its elements are on the lines of their file, which messages of engines then name.
+
+    Elements of an included file begin lines of their own; what follows in the file that includes it is then
+    further down than in that file.
 
     Args:
         root: the root element.
 
     Returns:
-        The text; elements of included files stand on the line of what precedes them.
+        The text, and which elements begin in each of its lines.
 
     """
     parts: list[str] = []
-    line = 1
+    line, file, begun = 1, root.source.file, dict[int, list[Element]]()
     stack: list[Element | str] = [root]
     while stack:
         item = stack.pop()
         if isinstance(item, str):
             parts.append(item)
             continue
-        if item.source.file == root.source.file and item.source.line > line:
-            parts.append("\n" * (item.source.line - line))
-            line = item.source.line
+        is_alone = item.source.file != root.source.file or file != root.source.file
+        count = max(int(is_alone), item.source.line - line if item.source.file == root.source.file else 0)
+        parts.append("\n" * count)
+        line, file = line + count, item.source.file
+        begun.setdefault(line, []).append(item)
         attributes = "".join(f" {k}={quoteattr(v)}" for k, v in item.attributes.items())
         text = " ".join(item.text.split("\n"))  # its line breaks would move what follows
         parts.append(f"<{item.tag}{attributes}>{escape(text)}")
         stack.append(f"</{item.tag}>")
         stack.extend(reversed(item.children))
-    return "".join(parts) + "\n"
+    return "".join(parts) + "\n", begun
 
 
 def write_xml(root: Element, width: int = 0) -> str:

@@ -129,7 +129,10 @@ def judge_answer(
         elif quantity in worst:
             rows.append(_quantity_row(context, quantity, unit, worst[quantity], len(truths)))
         elif quantity == "acceleration" and is_singular:
-            reason = "the mass matrix is singular: a joint moves no mass, so that no acceleration is defined"
+            reason = (
+                "no acceleration is determined: the mass matrix is singular in double precision, as where "
+            )
+            reason += "a joint moves no mass, or where masses or lengths differ by many orders of magnitude"
             rows.append(context.make_row("model", "-", quantity, Verdict.INFORMATION, reason, unit))
         elif any(getattr(one, quantity, 0.0) is None for one in answer.quantities):
             reason = "the importer's engine computes it of other files, not of this one"

@@ -99,6 +99,7 @@ class Reply:
     overhead_cpu_time: float = 0.0  # s of the worker besides it, since its last reply
     is_lost: bool = False  # whether the worker ended instead
     is_overdue: bool = False  # whether it was ended at the time limit
+    is_out_of_memory: bool = False  # whether it reached the memory limit
 
 
 class WorkerLost(PlumblineError):
@@ -259,6 +260,7 @@ def make_reply(message: bytes) -> Reply:
 
     """
     answer, failure, cost, python, gigabytes = None, None, 0.0, "", 0.0
+    is_out_of_memory = False
     try:
         function, arguments, python, gigabytes = pickle.loads(message)
         loaded = [load_packed(one) for one in arguments]
@@ -268,6 +270,7 @@ def make_reply(message: bytes) -> Reply:
             value, cost = call_timed(function, *loaded)
         answer = Pickled.of(value)
     except MemoryError:
+        is_out_of_memory = True
         failure = f"out of memory: over {gigabytes:g} GB of address space"
     except RemoteCrash as crash:
         failure = f"crashed: the worker {crash}"
@@ -278,7 +281,7 @@ def make_reply(message: bytes) -> Reply:
     total = time.process_time()
     overhead = total - _cpu_time["reported"] - (0.0 if python else cost)
     _cpu_time["reported"] = total
-    return Reply(answer, failure, cost, overhead)
+    return Reply(answer, failure, cost, overhead, is_out_of_memory=is_out_of_memory)
 
 
 def start_warm_process(modules: Sequence[str] = ()) -> BaseContext:

@@ -69,6 +69,7 @@ class Outcome:
     overhead_cpu_time: float = 0.0  # s of the worker besides these, since its last outcome
     is_cached: bool = False  # whether an earlier call gave the answer
     is_overdue: bool = False  # whether the call was ended at its time limit
+    is_out_of_memory: bool = False  # whether the call reached its memory limit
 
     @property
     def value(self) -> Any:
@@ -391,6 +392,7 @@ def run_task(task: Task, make_call: Callable[..., Reply] | None = None) -> Outco
         reply.cpu_time,
         overhead_cpu_time=reply.overhead_cpu_time,
         is_overdue=reply.is_overdue,
+        is_out_of_memory=reply.is_out_of_memory,
     )
     if task.judge is None or reply.answer is None:
         return outcome

@@ -38,6 +38,7 @@ ROUGH_BITS = 64
 START_BITS, MAX_BITS = 192, 2048  # 128 are too few for a robot of 30 joints, and hardly faster
 MAX_RELATIVE_RADIUS = 1e-22  # of the magnitudes of the terms
 FLOOR = 2.0**-30  # of the largest entry, where the terms vanish exactly but not in an engine's frames
+MAX_LOSS = 0.1  # of M v̇ by rounding: beyond it doubles do not determine v̇
 MIN_MAGNITUDE = 1e-300  # so that terms that are all zero have a radius to compare with
 
 
@@ -414,7 +415,12 @@ def _with_tolerances(
     }
     if a is not None:
         work = size.mass_matrix @ np.abs(a) + size.bias_force + size.passive_force
-        tolerance["acceleration"] = unit * (np.abs(np.linalg.pinv(M)) @ work) if n else np.zeros(0)
+        scale = np.sqrt(np.maximum(np.diag(M), MIN_MAGNITUDE))  # slides and turns, long and short arms
+        scales = np.outer(scale, scale)
+        inverse = np.abs(np.linalg.pinv(M / scales)) if n else M
+        tolerance["acceleration"] = unit * (inverse / scales @ work)
+        loss = unit * np.max(inverse @ (size.mass_matrix / scales) @ np.ones(n), initial=0.0)
+        a = a if loss <= MAX_LOSS else None
     quantities = ModelQuantities(
         poses=poses, mass_matrix=M, bias_force=middle["bias_force"], gravity_force=middle["gravity_force"],
         passive_force=middle["passive_force"], acceleration=a,

@@ -106,7 +106,7 @@ def test_a_bad_file_exits_with_2_and_does_not_stop_the_others(tmp_path):
         "--states", 2,
     )  # fmt: skip
     assert result.exit_code == 2
-    assert "bad.urdf:5:1: <mass> value: is -2.5 kg" in result.stderr
+    assert "bad.urdf:5:77: <mass> value: is -2.5 kg" in result.stderr
     assert "none.urdf: cannot be read: No such file or directory" in result.stderr
     assert "good.urdf: 3 bodies" in result.stdout.replace("[bold]", "")
 

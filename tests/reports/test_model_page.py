@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -42,6 +43,10 @@ def test_the_page_names_causes_refusals_and_bad_files_and_escapes_them(page_file
     assert "reads the gravity of the model as (0, 0, -9.81)" in text
     assert "1 cause named and proved" in text
     assert "Files that cannot be used" in text
+    assert "largest error over what rounding explains" in text and "Rounding explains" in text
+    for name in ("command", "date", "commit", "Plumbline"):
+        assert f"<dt>{name}</dt>" in text
+    assert re.search(r'gravity force</td><td class="r">[1-9.]', text), "the size of an error"
     assert "mjMINVAL" in text, "a refusal is an answer"
 
 
@@ -60,7 +65,10 @@ def test_the_page_gives_a_line_per_file_and_marks_the_bodies_that_differ():
     drawing = robot_drawing.draw(bodies, marked)
     assert [mark["text"] for mark in drawing["numbers"]] == ["1–2", "3"], "two bodies at one point"
     assert [entry["name"] for entry in drawing["legend"]] == list(marked)
-    assert len(drawing["lines"]) == 3 and drawing["size"][1] > drawing["size"][0]
+    assert len(drawing["lines"]) == 3
+    assert [label["text"] for label in drawing["labels"]] == ["base", "upper", "tip"], "where there is room"
+    assert max(drawing["size"]) < 300, "a small robot has a small drawing"
+    assert max(robot_drawing.draw(bodies[:1], {})["size"]) < 200
     assert robot_drawing.draw([], {}) is None
 
 
