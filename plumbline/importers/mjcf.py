@@ -12,7 +12,7 @@ from pathlib import Path
 from plumbline.importers.neutral_model import ElementaryJoint, Feature, NeutralBody, NeutralModel, Source
 from plumbline.importers.xml_tree import Element, ModelFileError, read_xml
 from plumbline.scenario.errors import shorten
-from plumbline.scenario.yaml_source import is_file
+from plumbline.scenario.yaml_reader import is_file
 
 MAX_INCLUDES = 200
 _JOINT_FIELDS = {

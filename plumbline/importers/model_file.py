@@ -17,7 +17,7 @@ from plumbline.importers.neutral_model import NeutralModel, Source, extreme_numb
 from plumbline.importers.urdf import read_urdf
 from plumbline.importers.xml_tree import Element, ModelFileError, read_xml, write_xml, write_xml_in_place
 from plumbline.scenario.errors import Problem, shorten
-from plumbline.scenario.yaml_source import is_file
+from plumbline.scenario.yaml_reader import is_file
 
 BaseChoice = Literal["fixed", "free", "auto"]
 _LINE = re.compile(r"\bline (\d{1,9})\b")

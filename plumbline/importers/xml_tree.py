@@ -150,7 +150,9 @@ def read_xml(path: Path, shown: str) -> Element:
             raise ModelFileError([Problem(shown, 0, 0, "", message, "a URDF or MJCF file")])
         with path.open("rb") as file:
             data = file.read(MAX_BYTES + 1)
-    except (OSError, ValueError) as error:
+    except ModelFileError:
+        raise
+    except (OSError, ValueError) as error:  # ValueError: a path with a null character
         reason = getattr(error, "strerror", None) or error
         raise ModelFileError([Problem(shown, 0, 0, "", f"cannot be read: {reason}")]) from None
     if len(data) > MAX_BYTES:

@@ -116,7 +116,7 @@ def test_mujocos_refusal_of_an_mjcf_is_a_bad_file_with_its_line(tmp_path):
     path.write_text(MJCF.replace('axis="0 1 0"', 'axis="0 1"'))
     result = run(path, "--engine", "mujoco")
     assert result.exit_code == 2
-    assert f"{path}:2:1: MuJoCo, which defines MJCF, refuses it" in result.stderr
+    assert f"{path}:2:18: MuJoCo, which defines MJCF, refuses it" in result.stderr
 
 
 @pytest.mark.parametrize(
