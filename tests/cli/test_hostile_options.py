@@ -35,7 +35,7 @@ VALID = {  # by option or argument, a word that is accepted
     "duration": "1", "precision": "quad", "proof_cpu_seconds": "9",
     "base": "free", "state_count": "3", "state": "hip=0.1", "root": "history", "form": "mujoco",
     "target": "mine.yaml", "key": "a/b", "engine": "mujoco", "good": "3.9.0", "bad": "4.0.0",
-    "strip_geometry": "", "as_json": "", "self_test": "", "fresh": "", "help": "",
+    "expected": "rest", "strip_geometry": "", "as_json": "", "self_test": "", "fresh": "", "help": "",
 }  # fmt: skip
 WORK = (  # where the work of a command begins
     "plumbline.cli.run_commands.run_plan", "plumbline.cli.nightly.run_plan", "plumbline.studies.sweep.run",
