@@ -20,7 +20,7 @@ body on its last, and outputs of the body are read at the point on its first hal
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from typing import Any, ClassVar
 
@@ -54,7 +54,6 @@ from plumbline.model.datatypes import (
     StateQuantities,
     StepRun,
     Trajectory,
-    Unsupported,
 )
 from plumbline.model.kinematics import (
     JointFrame,
@@ -332,31 +331,23 @@ class Exudyn(ExudynAdapter):
     )
     usual_linear_solver = "EigenSparse"
     linear_solvers = ("EXUdense", "EigenDense")
+    gaps: ClassVar[Mapping[str, str]] = {
+        "rotors": "Exudyn has no rotor between two bodies in maximal coordinates",
+        "ball springs": "Exudyn has no spring along the rotation vector of a ball joint",
+        "universal springs": "the angle of Exudyn's torsional spring, atan2(-A01, A00) of the relative turn, "
+        "is that of a joint with one turn, not of a universal joint",
+    }
     builds_trees = builds_elements = moves_loops = True
     welding_unsupported_reason = ""
     is_single_step: bool = False  # full Newton iterations to `STEP_SETTINGS`; multipliers are sampled too
 
-    def _check_elements(self, model: Model) -> None:
-        balls = [k for k, kind in enumerate(model.kind) if kind == "ball"]
-        if np.any(model.armature):
-            raise Unsupported("Exudyn has no rotor between two bodies in maximal coordinates")
-        if np.any(model.stiffness[balls]) or np.any(model.damping[balls]):
-            raise Unsupported("Exudyn has no spring along the rotation vector of a ball joint")
-        if np.any(model.stiffness[[k for k, kind in enumerate(model.kind) if kind == "universal"]]):
-            raise Unsupported(
-                "the angle of Exudyn's torsional spring, atan2(-A01, A00) of the relative turn A, is that "
-                "of a joint with one turn, not of a universal joint"
-            )
-
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-        self._check_elements(model)
         with silence_engine():
             return [_evaluate_state(ExudynChain(model, at, self.body_pieces(model))) for at in states]
 
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
-        self._check_elements(model)
         with silence_engine():
             chain = _chain_that_moves(model, state)
             samples = self._run_samples(chain, times, integrator, resolution)
@@ -375,7 +366,6 @@ class Exudyn(ExudynAdapter):
     def _simulate_round_trip(
         self, model: Model, state: State, end: float, integrator: Integrator, resolution: float
     ) -> Trajectory:
-        self._check_elements(model)
         initial, leg = exudyn.ConfigurationType.Initial, np.array([0.0, end])
         with silence_engine():
             chain = _chain_that_moves(model, state)

@@ -381,7 +381,8 @@ class _KinematicTree:
                 what = "rod" if group.angle_count == 2 else "ball joint"
                 raise Unsupported(
                     f"the angles of the {what} of body {group.body + 1} come near their singularity at "
-                    f"t = {t:.6g} s (middle angle {np.degrees(remainder(middle, tau)):.1f}°)"
+                    f"t = {t:.6g} s (middle angle {np.degrees(remainder(middle, tau)):.1f}°)",
+                    "angles",
                 )
 
 
@@ -422,6 +423,13 @@ class ExudynTree(ExudynAdapter):
     unsupported: ClassVar[Mapping[str, str]] = {
         "joint_reaction": "minimal coordinates have no forces at the joints"
     }
+    gaps: ClassVar[Mapping[str, str]] = {
+        "ball elements": "a ball joint of Exudyn's kinematic tree is three revolutes, whose angles are not "
+        "the rotation vector that springs, dampers and rotors of ball joints act on",
+        "joint_moment": "minimal coordinates have no moments at the joints",
+        "angular_momentum": "a kinematic tree has no output variable for the angular momentum of the whole",
+        "angles": "each ball of the tree is three revolute joints, each rod two: singular at a right angle",
+    }
     builds_trees = builds_elements = True
     loops_unsupported_reason = "a kinematic tree of Exudyn has no joints that close loops"
     usual_linear_solver = "EXUdense"
@@ -430,23 +438,13 @@ class ExudynTree(ExudynAdapter):
         "a kinematic tree has revolute and prismatic joints, none that holds two links rigidly"
     )
 
-    def _check_elements(self, model: Model) -> None:
-        balls = [k for k, kind in enumerate(model.kind) if kind == "ball"]
-        if any(np.any(x[balls]) for x in (model.armature, model.damping, model.stiffness)):
-            raise Unsupported(
-                "a ball joint of Exudyn's kinematic tree is three revolutes, whose angles are not the "
-                "rotation vector that springs, dampers and rotors of ball joints act on"
-            )
-
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
-        self._check_elements(model)
         with silence_engine():
             return [_evaluate_state(_KinematicTree(model, state)) for state in states]
 
     def _simulate(
         self, model: Model, state: State, times: Array, integrator: Integrator, resolution: float
     ) -> Trajectory:
-        self._check_elements(model)
         with silence_engine():
             tree = _KinematicTree(model, state)
             settings = _rk44_settings()

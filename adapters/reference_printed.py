@@ -85,6 +85,6 @@ class ReferencePrinted(MetamorphicHooks):
 
     def _check_printed(self, model: Model) -> None:
         if not np.all(model.rods):
-            raise Unsupported(self.unsupported["balls"])
+            raise Unsupported(self.unsupported["balls"], "balls")
         if model.n > 2:
-            raise Unsupported(f"{self.unsupported['chains']}, not of {model.n}")
+            raise Unsupported(f"{self.unsupported['chains']}, not of {model.n}", "chains")

@@ -16,7 +16,7 @@ from urllib.parse import urlencode
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from plumbline.judging.rows import SHOWN_STYLES
+from plumbline.judging.rows import SHOWN_STYLES, is_declared
 from plumbline.storage.results_store import write_atomically
 from reports import coverage_table, reference_tables, report_data
 from reports.history import History
@@ -202,12 +202,11 @@ def _unexpected_findings(rows: list[Record]) -> list[Record]:
 
 def _known_findings(rows: list[Record]) -> list[Record]:
     """Group the rows of known issues by entry of known_issues.yaml, with one of them as example."""
-    found: dict[str, Record] = {}
+    found: dict[tuple[str, str], Record] = {}
     for row in rows:
-        if row.get("known_issue"):
-            entry = found.setdefault(
-                row["known_issue"], {"row": row, "count": 0, "engines": {}, "scenarios": {}}
-            )
+        if known := row.get("known_issue"):
+            key = known, row["engine"] if is_declared(known) else ""
+            entry = found.setdefault(key, {"row": row, "count": 0, "engines": {}, "scenarios": {}})
             entry["count"] += 1
             entry["engines"][row["engine"]] = entry["scenarios"][row["scenario"]] = None
     return sorted(found.values(), key=lambda e: (-severity(e["row"]), -e["count"]))

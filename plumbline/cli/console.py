@@ -179,6 +179,8 @@ def print_result(result: RunResult) -> None:
         is_silent = row.verdict in (Verdict.AGREES, Verdict.INFORMATION, Verdict.HARNESS_FAILED)
         if not is_silent and row.known_issue is None:
             out.print(f"{coloured_glyph(row)} {escape(row.key)}: {escape(row.reason)}")
+    for sentence in result.wide_issues:
+        out.print(f"[yellow]i[/] {escape(sentence)}")
     for entry in result.stale_issues:
         out.print(f"[red]![/] known entry {escape(entry.id)} no longer occurs: remove it from its file")
     out.print(f"[bold]{escape(result.metadata['sentence'])}[/]")

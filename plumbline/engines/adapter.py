@@ -9,7 +9,8 @@ repeated row or a number that is not finite is reported as a failure.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -47,6 +48,19 @@ UNSUPPORTED_KINDS = {
     "loads": "the engine refuses models with applied forces, moments and drag, or some of them",
     "integrators": "the engine evaluates states and does not simulate",
 }
+# Mechanisms that an adapter may declare as gaps: it is not asked about them, and must not refuse others so.
+MODEL_GAPS: Mapping[str, Callable[[Model], bool]] = {
+    "rods": lambda model: bool(np.any(model.rods)),
+    "balls": lambda model: "ball" in model.kind,
+    "chains": lambda model: model.n > 1,
+    "loads": lambda model: model.has_loads or model.has_drag,
+    "rotors": lambda model: bool(np.any(model.armature)),
+    "ball elements": lambda model: _has_elements(model, "ball", "armature", "damping", "stiffness"),
+    "ball springs": lambda model: _has_elements(model, "ball", "damping", "stiffness"),
+    "universal springs": lambda model: _has_elements(model, "universal", "stiffness"),
+    "point masses": lambda model: model.lacks_inertia,
+    "angles": lambda model: not {"rod", "ball"}.isdisjoint(model.kind),  # only where they become singular
+}
 
 
 @dataclass(frozen=True)
@@ -74,6 +88,10 @@ class Adapter(ABC):
     integrators: ClassVar[tuple[Integrator, ...]]
     # What the engine does not do (a key of `UNSUPPORTED_KINDS`), and why, in a sentence.
     unsupported: ClassVar[Mapping[str, str]] = {}
+    # What some mechanisms have that the engine cannot express, and why: a key of `MODEL_GAPS`, or a quantity
+    # that it does not return for them.  Like all declared gaps these are shown and fail no run.
+    gaps: ClassVar[Mapping[str, str]] = {}
+    max_bodies: ClassVar[int] = 0  # most bodies that it is asked about; 0: any number
     supported_versions: ClassVar[str] = ""  # PEP 440 range of versions that the adapter works with
     # Requirements of environments with another version: (range of versions, additional requirement).
     extra_requirements: ClassVar[tuple[tuple[str, str], ...]] = ()
@@ -164,7 +182,8 @@ class Adapter(ABC):
         self._check_mechanism(model, self.builds_elements)
         for state in states:
             check_state(model, state)
-        answers = self._evaluate(model, states)
+        with self._checked_refusals(model):
+            answers = self._evaluate(model, states)
         check_evaluation(answers, model, len(states), f"{self.name}._evaluate")
         if model.has_loops:
             pairs = zip(states, answers, strict=True)
@@ -192,7 +211,8 @@ class Adapter(ABC):
         method = self.integrator(integrator)
         if method.kind == "step":
             check_times(times, resolution)
-        trajectory = self._simulate(model, state, times, method, resolution)
+        with self._checked_refusals(model):
+            trajectory = self._simulate(model, state, times, method, resolution)
         _check_trajectory(model, times, trajectory, f"{self.name}._simulate, {integrator}")
         return replace(trajectory, initial_x=state.x)
 
@@ -216,10 +236,11 @@ class Adapter(ABC):
         """
         self._check_motion(model)
         if model.has_loops and self.loop_steps_unsupported_reason:
-            raise Unsupported(self.loop_steps_unsupported_reason)
+            raise Unsupported(self.loop_steps_unsupported_reason, "steps of loops")
         check_state(model, state)
         times = np.asarray(step * np.arange(count + 1), float)
-        run = self._step(model, state, times, self.integrator(integrator), step)
+        with self._checked_refusals(model):
+            run = self._step(model, state, times, self.integrator(integrator), step)
         label = f"{self.name}._step, {integrator}"
         check_record(run, StepRun, {"N": model.n, "T": len(times)}, label)
         _check_trajectory(model, times, run.trajectory, label)
@@ -228,19 +249,45 @@ class Adapter(ABC):
     def _check_motion(self, model: Model) -> None:
         self._check_mechanism(model, self.builds_elements)
         if model.has_loops and not self.moves_loops:
-            raise Unsupported(f"the adapter of {self.title} covers no motions of mechanisms with loops")
+            reason = f"the adapter of {self.title} covers no motions of mechanisms with loops"
+            raise Unsupported(reason, "motions of loops")
 
     def _check_mechanism(self, model: Model, has_elements: bool) -> None:
         """Refuse what the adapter does not build, and elements unless it evaluates states with them."""
         if self.builds_trees and model.has_loops and self.loops_unsupported_reason:
-            raise Unsupported(self.loops_unsupported_reason)
+            raise Unsupported(self.loops_unsupported_reason, "loops")
         if not (self.builds_trees or model.is_chain):
-            raise Unsupported(f"the adapter of {self.title} covers chains of rods and balls from the origin")
+            reason = f"the adapter of {self.title} covers chains of rods and balls from the origin"
+            raise Unsupported(reason, "trees")
+        if self.max_bodies and model.n > self.max_bodies:
+            reason = f"{self.gaps['bodies']}; it is asked about {self.max_bodies} at most, not {model.n}"
+            raise Unsupported(reason, "bodies")
+        for gap, reason in self.gaps.items():
+            if gap != "angles" and gap in MODEL_GAPS and MODEL_GAPS[gap](model):
+                raise Unsupported(reason, gap)
         if model.has_elements and not has_elements:
             what = "motions with" if self.builds_elements else "joints with"
-            raise Unsupported(
-                f"the adapter of {self.title} covers no {what} rotors, springs, dampers and efforts"
-            )
+            reason = f"the adapter of {self.title} covers no {what} rotors, springs, dampers and efforts"
+            raise Unsupported(reason, "elements")
+
+    @contextmanager
+    def _checked_refusals(self, model: Model) -> Iterator[None]:
+        """Hold the adapter's own refusals to what it declares: others count, false ones are failures."""
+        try:
+            yield
+        except Unsupported as refusal:
+            if refusal.gap not in {*self.unsupported, *self.gaps}:
+                raise Unsupported(str(refusal)) from None
+            if refusal.gap in MODEL_GAPS and not MODEL_GAPS[refusal.gap](model):
+                raise EngineFailure(
+                    f"{self.name} refuses a mechanism for its {refusal.gap}, and it has none: {refusal}"
+                ) from None
+            raise
+
+
+def _has_elements(model: Model, kind: str, *elements: str) -> bool:
+    joints = [k for k, own in enumerate(model.kind) if own == kind]
+    return any(bool(np.any(getattr(model, element)[joints])) for element in elements)
 
 
 def check_state(model: Model, state: State) -> None:

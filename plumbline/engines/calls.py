@@ -38,6 +38,8 @@ class Evaluation:
     unsupported: str | None  # the engine's reason for refusing
     failure: str | None  # what the engine did instead
     cpu_time: float  # CPU s inside the engine's calls
+    gap: str = ""  # the declared gap that the refusal follows from
+    declared: tuple[str, ...] = ()  # all gaps that the adapter declares
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +58,7 @@ class RefinementStudy:
 
     runs: list[RefinementRun]
     unsupported: str | None  # the engine's reason for refusing
+    gap: str = ""  # the declared gap that this follows from
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,6 +70,7 @@ class StepAttempt:
     run: StepRun | None = None  # the steps, fewer where more were refused or failed
     refusal: str = ""  # why the engine refused to take more steps
     failure: str = ""  # what it did instead of taking more steps
+    gap: str = ""  # the declared gap that the refusal follows from
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,16 +126,21 @@ def evaluate_states(engine: str, model: Model, states: Sequence[State]) -> Evalu
     """
     begin = time.process_time()
     quantities: list[StateQuantities] = []
-    unsupported = failure = None
+    unsupported, failure, gap, declared = None, None, "", tuple[str, ...]()
     try:
-        quantities = load_adapter(engine).evaluate(model, states)
+        adapter = load_adapter(engine)
+        declared = (*adapter.unsupported, *adapter.gaps)
+        quantities = adapter.evaluate(model, states)
+        for name in adapter.unsupported:
+            if any(getattr(answer, name, None) is not None for answer in quantities):
+                failure = f"{engine} returns the {name} that its adapter declares as unsupported"
     except Unsupported as refusal:
-        unsupported = describe_exception(refusal)
+        unsupported, gap = describe_exception(refusal), refusal.gap
     except MemoryError:
         raise
     except Exception as error:  # an engine may raise anything: its message belongs in the results
         failure = describe_exception(error)
-    return Evaluation(quantities, unsupported, failure, time.process_time() - begin)
+    return Evaluation(quantities, unsupported, failure, time.process_time() - begin, gap, declared)
 
 
 def run_refinement(
@@ -169,7 +178,7 @@ def run_refinement(
         try:
             trajectory = adapter.simulate(model, state, times, integrator, resolution)
         except Unsupported as refusal:
-            return RefinementStudy(runs, describe_exception(refusal))
+            return RefinementStudy(runs, describe_exception(refusal), refusal.gap)
         except MemoryError:
             raise
         except Exception as error:  # as above
@@ -216,7 +225,8 @@ def run_steps(
                     attempt = replace(attempt, run=adapter.step(model, state, integrator, step, count))
                     break
                 except Unsupported as refusal:
-                    attempt = replace(attempt, refusal=attempt.refusal or describe_exception(refusal))
+                    if not attempt.refusal:
+                        attempt = replace(attempt, refusal=describe_exception(refusal), gap=refusal.gap)
                 except MemoryError:
                     raise
                 except Exception as error:  # as above

@@ -84,7 +84,7 @@ class MetamorphicHooks(Adapter):
 
         """
         if self.welding_unsupported_reason:
-            raise Unsupported(self.welding_unsupported_reason)
+            raise Unsupported(self.welding_unsupported_reason, "welded halves")
         other = copy(self)
         other.has_welded_halves = True
         return other

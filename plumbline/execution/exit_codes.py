@@ -18,9 +18,10 @@ class ExitCode(IntEnum):
 
 
 EXIT_CODE_MEANINGS = {
-    ExitCode.SUCCESS: "everything agrees, or differs as recorded in known_issues.yaml",
-    ExitCode.DISAGREEMENT: "a disagreement, an unrecorded gap, a stale record, a certificate that proves "
-    "nothing, or nothing was compared",
+    ExitCode.SUCCESS: "everything agrees, or differs as recorded in known_issues.yaml; rows of your own "
+    "scenarios may be unresolved",
+    ExitCode.DISAGREEMENT: "a disagreement, a gap that is neither declared nor recorded, a stale record, a "
+    "certificate that proves nothing, or nothing was compared",
     ExitCode.BAD_USAGE: "bad usage or a bad file",
     ExitCode.ENGINE_FAILED: "an engine failed: raised, crashed, hung, or is missing though it was named",
     ExitCode.MACHINE_FAILED: "the machine failed: disk full, input/output error, cluster lost",

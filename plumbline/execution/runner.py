@@ -30,7 +30,7 @@ from plumbline.execution.random_batch import RandomBatch
 from plumbline.execution.scenario_run import ScenarioRun, uncompared_kinds
 from plumbline.judging import known_issues
 from plumbline.judging.identity import RUN_SCENARIO, IdentityCheck
-from plumbline.judging.rows import RUN_FAMILY, Row, Verdict
+from plumbline.judging.rows import RUN_FAMILY, Row, Verdict, is_declared
 from plumbline.processes.cpu_time import CpuTimes
 from plumbline.processes.processor import processor_name
 from plumbline.processes.workers import (
@@ -72,6 +72,8 @@ class RunResult:
     tables: results_store.ResultTables
     cpu_times: CpuTimes
     metadata: dict[str, Any]  # the entry ``run`` of results.json
+    own_scenarios: frozenset[str] = frozenset()  # names of those of the user's own files
+    wide_issues: tuple[str, ...] = ()  # what `KnownIssues.wide_issues` describes
 
 
 def describe_engines(
@@ -157,6 +159,7 @@ def run_plan(plan: Plan, progress: ProgressCallback, observer: RunObserver | Non
         "cached_tasks": run.cpu_times.cached_count,
         "identity": run.identity.summary(),
         "stale_issues": [issue.id for issue in result.stale_issues],
+        "wide_issues": list(result.wide_issues),
     }
     if len(plan.random_scenarios):
         count = min(plan.random_trajectory_count, len(plan.random_scenarios))
@@ -221,6 +224,8 @@ class _Run:
             [row for rows in self.rows.values() for row in rows],
             self.known.stale_issues(is_full_matrix=self.plan.is_full_catalogue),
             self.engines, self.summaries, self.random_batch, self.tables, self.cpu_times, {},
+            frozenset(s.name for s in self.plan.scenarios if not s.is_in_catalogue),
+            tuple(self.known.wide_issues()),
         )  # fmt: skip
 
     def _tasks(self) -> Iterator[Task]:
@@ -334,10 +339,12 @@ def summarize_verdicts(result: RunResult) -> str:
             part += f" ({'; '.join(named[:3])}{more})"
         # rows of random scenarios that are only counted are expected, except where there is nothing to expect
         if verdict.needs_attention and count > len(new):
-            part += f" ({count - len(new)} as recorded)"
+            declared = sum(is_declared(row.known_issue) for row in rows)
+            expected = {"as declared": declared, "as recorded": count - len(new) - declared}
+            part += _share(expected, count)
         parts.append(part)
     if not has_comparison(result):
-        parts.append("nothing was compared")
+        parts.append("nothing was compared" if not checks else "nothing was decided")
     text = f"{checks:,} independent check{'s' * (checks != 1)}: {', '.join(parts)}"
     if result.stale_issues:
         ids = ", ".join(issue.id for issue in result.stale_issues)
@@ -348,18 +355,26 @@ def summarize_verdicts(result: RunResult) -> str:
     return text
 
 
+def _share(expected: dict[str, int], count: int) -> str:
+    """Say how many of ``count`` rows were expected, and why: " as recorded" where all were for one reason."""
+    parts = [why if number == count else f"{number:,} {why}" for why, number in expected.items() if number]
+    return f" {parts[0]}" if count in expected.values() else f" ({', '.join(parts)})"
+
+
 def exit_code(result: RunResult) -> ExitCode:
     """Return the exit code of a run.
 
     Args:
-        result: the run.
+        result: the run; unresolved rows of the user's own scenarios do not count.
 
     Returns:
         As `exit_code_of_rows`.
 
     """
+    own = result.own_scenarios
+    counted = [row for row in result.rows if not (row.verdict == Verdict.UNRESOLVED and row.scenario in own)]
     return exit_code_of_rows(
-        result.rows, has_stale_issues=bool(result.stale_issues), has_comparison=has_comparison(result)
+        counted, has_stale_issues=bool(result.stale_issues), has_comparison=has_comparison(result)
     )
 
 
@@ -386,17 +401,19 @@ def exit_code_of_rows(rows: Iterable[Row], *, has_stale_issues: bool, has_compar
 
 
 def has_comparison(result: RunResult) -> bool:
-    """Find out whether a run compared anything.
+    """Find out whether a run compared anything; of the user's own scenarios, with a result.
 
     Args:
         result: the run.
 
     Returns:
-        Whether a row agrees, disagrees or is unresolved.
+        Whether a row agrees, disagrees or, in other scenarios, is unresolved.
 
     """
-    found = {row.verdict for row in result.rows} | set(result.random_batch.counts_by_verdict)
-    return any(verdict.is_comparison for verdict in found)
+    found = set(result.random_batch.counts_by_verdict)
+    found |= {row.verdict for row in result.rows if row.scenario not in result.own_scenarios}
+    decided = {row.verdict for row in result.rows} & {Verdict.AGREES, Verdict.DISAGREES}
+    return bool(decided) or any(verdict.is_comparison for verdict in found)
 
 
 def git_commit() -> str | None:

@@ -300,6 +300,7 @@ class ScenarioRun:
             "title": s.title,
             "purpose": s.purpose,
             "file": s.origin,
+            "own": not s.is_in_catalogue,
             "bodies": s.model.n,
             "joints": list(s.model.kind),
             "duration": s.duration,

@@ -22,6 +22,7 @@ from typing import Annotated, Any, Literal
 from packaging.specifiers import SpecifierSet
 from packaging.version import InvalidVersion, Version
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -37,7 +38,7 @@ from pydantic import (
 from plumbline.engines.declared_names import declared_integrators, declared_texts
 from plumbline.engines.registry import ENGINES, IMPORTERS
 from plumbline.importers.neutral_model import MODEL_UNITS
-from plumbline.judging.rows import Level, Row, Verdict
+from plumbline.judging.rows import DECLARED_PREFIX, Level, Row, Verdict
 from plumbline.judging.state import SINGULAR_POSE, STATE_UNITS
 from plumbline.measurements.relation_result import REPEATABILITY, UNEXPLAINED
 from plumbline.measurements.run_relations import REVERSED_IN_TIME
@@ -56,6 +57,10 @@ RowKind = tuple[str, str, str, str, str]  # of a row: engine, its version, level
 KNOWN_ISSUES_FILE = Path(__file__).with_name("known_issues.yaml")
 LEVELS: tuple[Level, ...] = ("state", "step", "invariants", "trajectory", "relations", "model")
 ANY_LENGTH = 10**9  # bodies
+# Bounds are 64 roundings of the largest term and more: an answer that is off by a million times the quantity
+# is 1e20 bounds off.
+MAX_RATIO = 1e20
+WIDE_FACTOR = 1e3  # an entry covers 3 … 10 times the worst case of its scenarios; this is two decades beyond
 OR_EARLIER = " or earlier"  # after a version that is the oldest that the column supports
 
 # Relations that give the same problem to the same algorithm in other numbers: only rounding can differ.
@@ -209,6 +214,14 @@ def _as_ratios(value: Any) -> Any:
     return value if isinstance(value, dict) else {ANY_LENGTH: value}
 
 
+def _check_ratio(value: float) -> float:
+    if value > MAX_RATIO:
+        valid = f"a number up to {MAX_RATIO:g}: beyond it is no error that an engine's cause explains"
+        raise invalid_value_error(f"is {value:g}", valid)
+    return value
+
+
+_Ratio = Annotated[PositiveFloat, AfterValidator(_check_ratio)]
 _Texts = Annotated[list[str], BeforeValidator(_as_list), Field(min_length=1)]
 
 
@@ -229,10 +242,10 @@ class _Entry(BaseModel):
     integrator: _Texts = _field("Name or pattern of integrators, or a list of them.", ["*"])
     quantity: _Texts = _field("Name or pattern of quantities, or a list of them.", ["*"])
     verdict: Literal["disagrees", "unresolved", "unsupported", "failed"] = _field("The expected verdict.")
-    max_ratio: Annotated[dict[PositiveInt, PositiveFloat], BeforeValidator(_as_ratios)] = _field(
+    max_ratio: Annotated[dict[PositiveInt, _Ratio], BeforeValidator(_as_ratios)] = _field(
         "The largest ratio of error and tolerance, or a mapping from numbers of bodies to it.", {}
     )
-    max_ratio_by_inertia: PositiveFloat | None = _field(
+    max_ratio_by_inertia: _Ratio | None = _field(
         "The largest ratio of error and tolerance, over the chain's largest ratio of inertias.", None
     )
     mechanism: Mechanism | None = _field("The mechanism of a disagreement.", None)
@@ -246,6 +259,8 @@ class _Entry(BaseModel):
     @field_validator("id")
     @classmethod
     def _check_id(cls, text: str) -> str:
+        if text.startswith(DECLARED_PREFIX):
+            raise invalid_value_error(f"is {shorten(repr(text))}", f"an id without {DECLARED_PREFIX!r}")
         if not text or not text.isprintable():
             raise invalid_value_error(f"is {shorten(repr(text))}", "one line of printable text")
         return text
@@ -453,6 +468,7 @@ class KnownIssues:
         self._by_kind: dict[RowKind, list[KnownIssue]] = {}  # a cache: rows are many, kinds few
         self.used_ids: set[str] = set()
         self.matched_ids: set[str] = set()
+        self.worst_ratios: dict[str, tuple[float, float]] = {}  # by id: worst ratio over covered, and covered
 
     def issues_for(self, row: Row) -> list[KnownIssue]:
         """Find the entries about a row's cell, whatever its verdict.
@@ -505,6 +521,10 @@ class KnownIssues:
         if "" in objections:
             match = expecting[objections.index("")]
             self.used_ids.add(match.id)
+            covered = match.covered_ratio(*chain)
+            if row.ratio is not None and covered < math.inf:
+                known = self.worst_ratios.get(match.id, (0.0, covered))
+                self.worst_ratios[match.id] = max(known, (row.ratio / covered, covered))
             diagnosis = row.diagnosis or match.diagnosis
             shown = match.scatter_of(row, scatter)
             if match.mechanism == "rounding" and not row.diagnosis and shown is not None:
@@ -515,6 +535,20 @@ class KnownIssues:
                 )
             return replace(row, known_issue=match.id, diagnosis=diagnosis)
         return replace(row, reason=f"{row.reason}; {objections[0]}") if objections else row
+
+    def wide_issues(self) -> list[str]:
+        """Describe the entries that cover far more than the run has seen, and might hide another mistake.
+
+        Returns:
+            A sentence each, where the worst ratio is more than `WIDE_FACTOR` times below what is covered.
+
+        """
+        return [
+            f"known entry {name} covers {share * covered:.2g} tolerances of at most {covered:.2g}: "
+            "a max_ratio nearer to what occurs hides less"
+            for name, (share, covered) in self.worst_ratios.items()
+            if share * WIDE_FACTOR < 1
+        ]
 
     def stale_issues(self, *, is_full_matrix: bool) -> list[KnownIssue]:
         """Find the entries that match rows of the run and none of their verdicts.

@@ -58,9 +58,9 @@ def judge_long_runs(
 
     """
     cost = sum(run.cpu_time for run in study.runs)
-    if gap := _missing_runs(study):
+    if missing := _missing_runs(study):
         row = context.make_row(
-            "invariants", integrator.name, "all_long", *gap,
+            "invariants", integrator.name, "all_long", *missing, gap=study.gap,
             cpu_time=cost, extra={"asked": study.plan.requested_seconds},
         )  # fmt: skip
         return JudgingResult([row])

@@ -32,8 +32,9 @@ def judge_relations(context: RowContext, results: Sequence[RelationResult]) -> J
 def _relation_row(context: RowContext, result: RelationResult) -> Row:
     if result.ratio is None:
         return context.make_row(
-            "relations", result.integrator, result.relation, REFUSALS[result.refusal], result.refusal_reason
-        )
+            "relations", result.integrator, result.relation, REFUSALS[result.refusal], result.refusal_reason,
+            gap=result.gap,
+        )  # fmt: skip
     extra = {"states": float(result.state_count), "state": float(result.worst_state)}
     if result.unexplained is not None:
         extra[UNEXPLAINED] = result.unexplained

@@ -72,6 +72,7 @@ VERDICT_STYLES = {
         "i", "are information", "implied by other rows, or not compared: not a check", 0, 0
     ),
 }
+DECLARED_PREFIX = "declared: "
 RUN_FAMILY = "run"  # of a row that is about the whole run, in place of a scenario's family
 RECORDED = "recorded"  # what terminal and report show for a disagreement or failure that is recorded
 SHOWN_STYLES: dict[str, VerdictStyle] = {
@@ -81,6 +82,19 @@ SHOWN_STYLES: dict[str, VerdictStyle] = {
     ),
 }
 ATTENTION_SEVERITY = 6  # from here on a verdict needs attention
+
+
+def is_declared(known_issue: str | None) -> bool:
+    """Return whether a gap is expected because the engine's column declares it.
+
+    Args:
+        known_issue: of a row.
+
+    Returns:
+        Whether it names a declared gap.
+
+    """
+    return known_issue is not None and known_issue.startswith(DECLARED_PREFIX)
 
 
 def shown_verdict(verdict: str, known_issue: str | None) -> str:
@@ -168,7 +182,9 @@ class Row:
     order: float | None = None  # observed order
     declared_order: int | None = None
     alias_of: str | None = None
-    known_issue: str | None = None  # id of the entry of known_issues.yaml that expects this verdict
+    # id of the entry of known_issues.yaml that expects this verdict, or `DECLARED_PREFIX` and a gap that the
+    # engine's column declares
+    known_issue: str | None = None
     diagnosis: str | None = None  # the wrong term, in a sentence
     user_rtol: float | None = None  # the user's own tolerance, shown beside the verdict
     cpu_time: float = 0.0  # s, of the work behind this row
@@ -208,6 +224,7 @@ class RowContext:
         verdict: Verdict,
         reason: str,
         unit: str = "1",
+        gap: str = "",
         **more: Any,
     ) -> Row:
         """Make a row about this scenario and engine.
@@ -219,6 +236,7 @@ class RowContext:
             verdict: one of `Verdict`.
             reason: the verdict's reason, one sentence.
             unit: unit of ``value`` and ``tolerance``.
+            gap: declared by the engine's column, from which a refusal follows; it is expected then.
             **more: other fields of `Row`. ``ratio`` is the quotient of ``value`` and ``tolerance`` unless
                 given: of many comparisons the worst ratio need not belong to the largest error.
 
@@ -227,6 +245,8 @@ class RowContext:
 
         """
         more = {"value": None, "tolerance": None} | more
+        if gap and verdict == Verdict.UNSUPPORTED:
+            more["known_issue"] = DECLARED_PREFIX + gap
         if more.get("ratio") is None:
             more["ratio"] = error_ratio(more["value"], more["tolerance"])
         return Row(

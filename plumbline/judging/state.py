@@ -44,7 +44,9 @@ def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation)
 
     """
     if evaluation.unsupported is not None:
-        row = context.make_row("state", "-", "all", Verdict.UNSUPPORTED, evaluation.unsupported)
+        row = context.make_row(
+            "state", "-", "all", Verdict.UNSUPPORTED, evaluation.unsupported, gap=evaluation.gap
+        )
         return JudgingResult([row])
     if evaluation.failure is not None:
         return JudgingResult([context.make_row("state", "-", "all", Verdict.FAILED, evaluation.failure)])
@@ -53,8 +55,11 @@ def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation)
         if all(getattr(true, quantity) is None for true in truth.quantities):
             continue  # a chain of rods and balls has no joint moments
         if any(getattr(answer, quantity) is None for answer in evaluation.quantities):
+            gap = quantity if quantity in evaluation.declared else ""
             reason = f"{context.title} offers no {quantity.replace('_', ' ')} of its own"
-            result.rows.append(context.make_row("state", "-", quantity, Verdict.UNSUPPORTED, reason, unit))
+            result.rows.append(
+                context.make_row("state", "-", quantity, Verdict.UNSUPPORTED, reason, unit, gap)
+            )
             continue
         deviation = _deviation(quantity, truth, evaluation)
         worst, looseness = _worst_error_per_state(quantity, truth, deviation)

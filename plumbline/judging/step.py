@@ -49,7 +49,7 @@ def judge_steps(
         One row per quantity.
 
     """
-    method, verdict, reason = integrator.method, Verdict.UNSUPPORTED, ""
+    method, verdict, reason, gap = integrator.method, Verdict.UNSUPPORTED, "", ""
     attempts = [attempt for attempt in answer.attempts if attempt.run is not None]
     runs = [(attempt.state, attempt.step, attempt.run) for attempt in attempts if attempt.run is not None]
     if isinstance(method, ConstrainedMethod):
@@ -59,13 +59,13 @@ def judge_steps(
     if any(failures):
         verdict, reason = Verdict.FAILED, next(filter(None, failures))
     elif not runs:
-        reason = next(attempt.refusal for attempt in answer.attempts)
+        reason, gap = next((attempt.refusal, attempt.gap) for attempt in answer.attempts)
     elif not HAS_EXTENDED_PRECISION:
         reason = "the formulas need an extended precision that this machine does not have"
     elif isinstance(method, JointSpaceMethod) and not keeps_dependent_rows(model, states[0]):
         verdict, reason = Verdict.INFORMATION, OPEN_ROWS
     if reason:
-        return JudgingResult([context.make_row("step", integrator.name, "all", verdict, reason)])
+        return JudgingResult([context.make_row("step", integrator.name, "all", verdict, reason, gap=gap)])
     if isinstance(method, JointSpaceMethod):
         starts = [(index, h, run.angle_axes) for index, h, run in runs]
         steps = FormulaSteps(method, model, states, starts)

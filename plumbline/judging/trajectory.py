@@ -54,7 +54,16 @@ def judge_trajectory(
     """
     if study.unsupported is not None:
         return JudgingResult(
-            [context.make_row("trajectory", integrator.name, "all", Verdict.UNSUPPORTED, study.unsupported)]
+            [
+                context.make_row(
+                    "trajectory",
+                    integrator.name,
+                    "all",
+                    Verdict.UNSUPPORTED,
+                    study.unsupported,
+                    gap=study.gap,
+                )
+            ]
         )
     finest = study.runs[-1]
     if finest.trajectory is None:

@@ -90,6 +90,7 @@ class LongRunStudy:
     plan: LongRunPlan
     unsupported: str | None = None
     singular: str = ""  # why the runs end before the plan's length: a pose that is singular, or nearly so
+    gap: str = ""  # the declared gap that the refusal follows from
 
 
 def plan_long_run(
@@ -157,7 +158,7 @@ def run_long_run_study(
                     )
                     break
                 except Unsupported as refusal:
-                    return LongRunStudy(runs, plan, describe_exception(refusal))
+                    return LongRunStudy(runs, plan, describe_exception(refusal), gap=refusal.gap)
                 except MemoryError:
                     raise
                 except Exception as error:  # an engine may raise anything; its message belongs in the results

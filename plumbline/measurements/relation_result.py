@@ -30,3 +30,4 @@ class RelationResult:
     resolution: float = 0.0  # of a run: its step [s], or its relative tolerance
     end_time: float = 0.0  # [s] of a run, one way
     unexplained: float | None = None  # the ratio without the effect of a term that the engine leaves out
+    gap: str = ""  # the declared gap that the refusal follows from

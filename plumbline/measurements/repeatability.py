@@ -70,7 +70,8 @@ def _check_states(engine: MetamorphicHooks, model: Model, states: Sequence[State
     alone = [evaluate_or_refusal(engine.evaluate, model, state) for state in states]
     used = [k for k, answer in enumerate(alone) if not isinstance(answer, Unsupported)]
     if not used:
-        return RelationResult(REPEATABILITY, None, "", 0, 0, str(alone[0]))
+        (refused, *_) = (answer for answer in alone if isinstance(answer, Unsupported))
+        return RelationResult(REPEATABILITY, None, "", 0, 0, str(refused), gap=refused.gap)
     asked = [states[k] for k in used]
     try:
         together = engine.evaluate(model, asked)

@@ -179,7 +179,9 @@ def refused_result(name: str, integrator: Integrator, refusal: Unsupported | Eng
 
     """
     kind: Refusal = "unsupported" if isinstance(refusal, Unsupported) else "failed"
-    return RelationResult(name, None, "", 0, 0, describe_exception(refusal), kind, integrator.name)
+    gap = refusal.gap if isinstance(refusal, Unsupported) else ""
+    reason = describe_exception(refusal)
+    return RelationResult(name, None, "", 0, 0, reason, kind, integrator.name, gap=gap)
 
 
 def run_tolerance(integrator: Integrator, model: Model, state: State, end: float, steps: int) -> float:

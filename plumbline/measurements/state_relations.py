@@ -372,13 +372,17 @@ def check_state_relation(
         left of it without the effect of the relation's missing term.
 
     """
-    worst, count, refusal, unexplained = (0.0, "", 0), 0, "", 0.0
+    worst, count, unexplained = (0.0, "", 0), 0, 0.0
+    refused: Unsupported | None = None
     for index, state in enumerate(states):
         here = answers[index]
         there = relation.transform(model, state)
         other = evaluate_or_refusal(evaluate_other, *there)
-        if isinstance(here, Unsupported) or isinstance(other, Unsupported):
-            refusal = str(here if isinstance(here, Unsupported) else other)
+        if isinstance(here, Unsupported):
+            refused = here
+            continue
+        if isinstance(other, Unsupported):
+            refused = other
             continue
         count += 1
         mine, theirs = quantity_values(here), relation.transform_back(other)
@@ -396,8 +400,9 @@ def check_state_relation(
             unexplained = max(unexplained, _largest_ratio(difference - missing.get(q, 0.0), allowed))
     left = unexplained if count and relation.missing_term else None
     return RelationResult(
-        relation.name, worst[0] if count else None, worst[1], worst[2], count, refusal, unexplained=left
-    )
+        relation.name, worst[0] if count else None, worst[1], worst[2], count,
+        str(refused or ""), unexplained=left, gap=refused.gap if refused else "",
+    )  # fmt: skip
 
 
 def _largest_ratio(difference: Array, allowed: Array) -> float:

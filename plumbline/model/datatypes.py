@@ -38,6 +38,11 @@ def _no_coordinates() -> Array:
 class Unsupported(PlumblineError):
     """The engine has no such feature; the message is the sentence that results and report show."""
 
+    def __init__(self, reason: str, gap: str = "") -> None:
+        """Refuse because of a gap that the column declares, or of none: then the refusal counts."""
+        super().__init__(reason)
+        self.gap = gap
+
 
 class EngineFailure(PlumblineError):
     """The engine failed at something that it offers; the message says how."""

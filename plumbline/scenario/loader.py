@@ -29,6 +29,7 @@ from plumbline.scenario.errors import Problem, ScenarioError, closest_match, did
 from plumbline.scenario.schema import (
     INPUT_ROUNDING,
     MAX_BODIES,
+    MIN_INERTIA,
     VALID_NAME,
     Articulated,
     Body,
@@ -93,9 +94,14 @@ class Scenario:
     document: dict[str, Any] = field(repr=False, default_factory=dict)  # the checked content as plain data
 
     @property
+    def is_in_catalogue(self) -> bool:
+        """Whether it comes with the project."""
+        return CATALOGUE_FOLDER in self.path.parents
+
+    @property
     def origin(self) -> str:
         """The file: its name where it is of the catalogue, else its path as given, which has a slash."""
-        if CATALOGUE_FOLDER in self.path.parents:
+        if self.is_in_catalogue:
             return self.path.name
         path = self.path.as_posix()
         return path if "/" in path else f"./{path}"
@@ -304,6 +310,13 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
                 "SI numbers of a pendulum",
                 (1, 1),
             )
+    sizes = np.linalg.norm(model.inertia, axis=(1, 2))
+    for body in np.flatnonzero((sizes > 0) & (sizes < MIN_INERTIA)):
+        raise source.fatal_error(
+            f"has a body, number {body + 1}, with an inertia too small to divide by",
+            f"principal moments of 0, or at least {MIN_INERTIA:g} kg m²",
+            source.value_positions.get(("bodies", int(body), "inertia")) or (1, 1),
+        )
     turning = motion_without_inertia(model, state)
     if turning is not None:
         place = source.value_positions.get(("bodies", turning, "inertia")) or (1, 1)

@@ -7,6 +7,7 @@ SI units; world z up; a body's frame has its origin at the centre of mass.
 from __future__ import annotations
 
 import math
+import sys
 import unicodedata
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -38,6 +39,7 @@ VALID_NAME = (
 )
 MAX_BODIES = 20_000
 MAX_SAMPLES = 1_000_000
+MIN_INERTIA = 1e-30  # kg, m or kg m²: engines divide by it, and squares of the quotient stay finite
 INPUT_ROUNDING = 1e-12  # relative: rounding of sixteen typed digits; larger deviations are mistakes
 ClosedForm = Literal[
     "rest",
@@ -117,7 +119,18 @@ def _require_nonzero(values: list[float] | None) -> list[float] | None:
     """Refuse the zero vector: it has no direction."""
     if values is not None and not any(values):
         raise invalid_value_error("is all zeros, which has no direction", "at least one number other than 0")
+    if values is not None and max(map(abs, values)) < sys.float_info.min:
+        message = f"is {values!r}, too short: doubles as small lose the digits of the direction"
+        raise invalid_value_error(message, "a vector of any usual length; it is normalised")
     return values
+
+
+def _require_invertible(value: float | list[float] | None) -> float | list[float] | None:
+    """Refuse what is not 0 and so small that engines which divide by it overflow."""
+    for number in value if isinstance(value, list) else [value]:
+        if number is not None and 0 < number < MIN_INERTIA:
+            raise invalid_value_error(f"is {number!r}, too small to divide by", f"at least {MIN_INERTIA:g}")
+    return value
 
 
 def _field(description: str, unit: str = "", default: Any = ..., **limits: Any) -> Any:
@@ -302,6 +315,7 @@ class JointElements(SchemaModel):
     )
 
     _not_negative = field_validator("armature", "damping", "stiffness")(_require_not_negative)
+    _invertible = field_validator("armature")(_require_invertible)
 
     @field_validator("armature", "damping", "stiffness", "rest", "effort", check_fields=False)
     @classmethod
@@ -522,6 +536,8 @@ class Body(SchemaModel):
     drag: Drag = Field(default_factory=Drag, description="Linear drag on this body.")
 
     _name = field_validator("name")(_require_printable)
+
+    _invertible = field_validator("mass")(_require_invertible)
 
     @field_validator("attitude")
     @classmethod

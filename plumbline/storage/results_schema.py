@@ -53,6 +53,7 @@ class _Scenario(_Part):
     title: str
     purpose: str = ""
     file: str = ""
+    own: bool = False  # of a file of the user's, whose unresolved rows fail no run
     bodies: int = Field(ge=0, le=MAX_BODIES)
     joints: list[str] = []
     duration: _Duration = 0.0

@@ -170,6 +170,7 @@ def test_the_summary_counts_one_and_several():
             rows=count * [row(Verdict.AGREES), row(Verdict.DISAGREES)],
             stale_issues=count * [SimpleNamespace(id="k")],
             random_batch=SimpleNamespace(counts_by_verdict=Counter()),
+            own_scenarios=frozenset(),
         )
         for count in (1, 2)
     )
@@ -186,11 +187,52 @@ def test_information_is_counted_apart_and_changes_no_exit_code():
         rows=[CONTEXT.make_row("state", "-", "q", verdict, "why") for verdict in verdicts],
         stale_issues=[],
         random_batch=SimpleNamespace(counts_by_verdict=Counter()),
+        own_scenarios=frozenset(),
     )
     assert summarize_verdicts(result) == "1,200 independent checks: 1,200 agree, 3 are information"
     assert exit_code(result) == 0
     result.rows.append(CONTEXT.make_row("state", "-", "all", Verdict.UNSUPPORTED, "why"))
     assert summarize_verdicts(result).startswith("1,200 independent checks: "), "nothing was compared there"
+
+
+def test_the_summary_says_why_rows_were_expected():
+    def rows(count, verdict, known):
+        return count * [CONTEXT.make_row("state", "-", "q", verdict, "why", known_issue=known)]
+
+    found = SimpleNamespace(
+        rows=[*rows(1, Verdict.DISAGREES, "entry"), *rows(2, Verdict.UNSUPPORTED, "declared: loops"),
+              *rows(1, Verdict.UNSUPPORTED, "entry"), *rows(2, Verdict.UNRESOLVED, "entry"),
+              *rows(1, Verdict.UNRESOLVED, None)],
+        stale_issues=[],
+        random_batch=SimpleNamespace(counts_by_verdict=Counter()),
+        own_scenarios=frozenset(),
+    )  # fmt: skip
+    assert summarize_verdicts(found) == (
+        "4 independent checks: 1 disagrees as recorded, 3 unresolved (2 as recorded), "
+        "3 unsupported (2 as declared, 1 as recorded)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "own", "catalogue"),
+    [
+        (["agrees", "unresolved"], 0, 1),
+        (["unresolved"], 1, 1),
+        (["agrees", "disagrees"], 1, 1),
+        (["agrees", "unsupported"], 1, 1),
+        (["agrees", "failed"], 3, 3),
+        (["agrees"], 0, 0),
+    ],
+)
+def test_unresolved_rows_of_own_scenarios_fail_no_run(verdicts, own, catalogue):
+    for names, code in ((frozenset({CONTEXT.scenario}), own), (frozenset(), catalogue)):
+        found = SimpleNamespace(
+            rows=[CONTEXT.make_row("state", "-", "q", Verdict(verdict), "why") for verdict in verdicts],
+            stale_issues=[],
+            random_batch=SimpleNamespace(counts_by_verdict=Counter()),
+            own_scenarios=names,
+        )
+        assert exit_code(found) == code
 
 
 def test_a_column_names_an_engines_version_once():

@@ -460,3 +460,37 @@ def test_an_issue_of_smaller_steps_alone_is_expected_only_there():
     assert usual.rows[0].known_issue is None and usual.stale == []
     assert finer.rows[0].known_issue == "a" and finer.stale == []
     assert judged_by([row("agrees")], [nightly], whole=True, finer=True).stale == [nightly]
+
+
+def test_an_entry_that_covers_far_more_than_the_run_saw_is_named():
+    excuses = known_issues.KnownIssues([entry(max_ratio={1: 1e19}, mechanism="method")], False)
+    for ratio in (5e12, 2e3):
+        (found,) = excuses.mark_known([ratio_row(ratio, engine="mujoco")], bodies=1)
+        assert found.known_issue == "a"
+    (sentence,) = excuses.wide_issues()
+    assert sentence.startswith("known entry a covers 5e+12 tolerances of at most 1e+19: ")
+    near = known_issues.KnownIssues([entry(max_ratio={1: 50.0}, mechanism="method")], False)
+    near.mark_known([ratio_row(5.0, engine="mujoco")], bodies=1)
+    assert near.wide_issues() == []
+
+
+@pytest.mark.parametrize(
+    "field", ["max_ratio: 1.0e+300", "max_ratio: {3: 1.0e+21}", "max_ratio_by_inertia: 1.0e+300"]
+)
+def test_a_ratio_that_no_cause_explains_is_refused(field, tmp_path):
+    path = tmp_path / "known.yaml"
+    path.write_text(
+        "- {id: a, scenario: rest, engine: mujoco, verdict: disagrees, mechanism: method, evidence: e,\n"
+        f"   {field}, reason: r}}\n"
+    )
+    with pytest.raises(ScenarioError, match=r"known.yaml:2:\d+: .*up to 1e\+20"):
+        known_issues.load_known_issues(path)
+
+
+def test_an_id_cannot_look_like_a_declared_gap(tmp_path):
+    path = tmp_path / "known.yaml"
+    path.write_text(
+        "- {id: 'declared: rods', scenario: rest, engine: mujoco, verdict: failed, evidence: e, reason: r}\n"
+    )
+    with pytest.raises(ScenarioError, match="an id without 'declared: '"):
+        known_issues.load_known_issues(path)
