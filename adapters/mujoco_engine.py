@@ -509,7 +509,8 @@ class _SoftMechanism:
             answer = self._with_rods(state, answer, self.rodless)
         if self.source.has_loops:
             return determinate_part(self.source, state, answer)
-        return replace(answer, mass_matrix=None)
+        moment = None if self.source.is_chain else answer.joint_moment  # balls and rods transmit none
+        return replace(answer, mass_matrix=None, joint_moment=moment)
 
     def _with_rods(self, state: State, answer: StateQuantities, rodless: Rearranged) -> StateQuantities:
         """Bodies and joints in the order of the mechanism; rods push along themselves."""
