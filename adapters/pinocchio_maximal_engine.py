@@ -38,7 +38,7 @@ from adapters.pinocchio_common import (
     point_acceleration,
     translation,
 )
-from plumbline.model.datatypes import KINDS, Array, Model, State, StateQuantities
+from plumbline.model.datatypes import KINDS, Array, Model, State, StateQuantities, Unsupported
 from plumbline.model.kinematics import JointFrame, joint_coordinates, rotation_matrix, velocity_jacobian
 from plumbline.model.loops import independent_rows
 from plumbline.model.welding import BodyParts
@@ -199,12 +199,18 @@ class PinocchioMaximal(PinocchioAdapter):
     }
     gaps: ClassVar[Mapping[str, str]] = {
         "bodies": "the engine's workspace grows with the cube of the number of free bodies",
-        "point masses": "Pinocchio's constraint solvers invert the mass matrix: each body needs inertia",
+        "point masses": "Pinocchio's constraint solvers invert the mass matrix, singular for bodies "
+        "without inertia",
     }
-    max_bodies = MAX_BODIES
     builds_trees = True
     options = loop_options = ("inverse of the KKT matrix",)
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:
+        if model.n > MAX_BODIES:
+            raise Unsupported(
+                f"the engine's workspace for {model.n} free bodies, growing with their cube, is too large; "
+                f"in maximal coordinates Pinocchio is asked about {MAX_BODIES} at most",
+                "bodies",
+            )
         flyers = _FreeFlyerSystem(model, self.body_pieces(model), use_kkt_inverse=bool(self.option))
         return [flyers.quantities(state) for state in states]

@@ -59,8 +59,10 @@ MODEL_GAPS: Mapping[str, Callable[[Model], bool]] = {
     "ball springs": lambda model: _has_elements(model, "ball", "damping", "stiffness"),
     "universal springs": lambda model: _has_elements(model, "universal", "stiffness"),
     "point masses": lambda model: model.lacks_inertia,
-    "angles": lambda model: not {"rod", "ball"}.isdisjoint(model.kind),  # only where they become singular
+    "bodies": lambda model: model.n > 1,
+    "angles": lambda model: not {"rod", "ball"}.isdisjoint(model.kind),
 }
+PARTIAL_GAPS = {"bodies", "angles"}  # of some such mechanisms, which the adapter refuses itself
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,6 @@ class Adapter(ABC):
     # What some mechanisms have that the engine cannot express, and why: a key of `MODEL_GAPS`, or a quantity
     # that it does not return for them.  Like all declared gaps these are shown and fail no run.
     gaps: ClassVar[Mapping[str, str]] = {}
-    max_bodies: ClassVar[int] = 0  # most bodies that it is asked about; 0: any number
     supported_versions: ClassVar[str] = ""  # PEP 440 range of versions that the adapter works with
     # Requirements of environments with another version: (range of versions, additional requirement).
     extra_requirements: ClassVar[tuple[tuple[str, str], ...]] = ()
@@ -259,11 +260,8 @@ class Adapter(ABC):
         if not (self.builds_trees or model.is_chain):
             reason = f"the adapter of {self.title} covers chains of rods and balls from the origin"
             raise Unsupported(reason, "trees")
-        if self.max_bodies and model.n > self.max_bodies:
-            reason = f"{self.gaps['bodies']}; it is asked about {self.max_bodies} at most, not {model.n}"
-            raise Unsupported(reason, "bodies")
         for gap, reason in self.gaps.items():
-            if gap != "angles" and gap in MODEL_GAPS and MODEL_GAPS[gap](model):
+            if gap not in PARTIAL_GAPS and gap in MODEL_GAPS and MODEL_GAPS[gap](model):
                 raise Unsupported(reason, gap)
         if model.has_elements and not has_elements:
             what = "motions with" if self.builds_elements else "joints with"
