@@ -17,6 +17,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -124,12 +125,17 @@ def declared_importer_attribute(importer: str, attribute: str) -> Any:
     return _read_attribute(module, class_name, attribute)
 
 
+@cache
+def _parse(source: Path) -> list[ast.stmt]:
+    return ast.parse(source.read_text(encoding="utf-8")).body
+
+
 def _read_attribute(module: str, class_name: str, attribute: str) -> Any:
     """Read an attribute in the source of a class, or of the first of its bases that has it."""
     source = ROOT / f"{module.replace('.', '/')}.py"
     if not source.is_file():
         return None
-    body = ast.parse(source.read_text(encoding="utf-8")).body
+    body = _parse(source)
     bases: list[str] = []
     for definition in (node for node in body if isinstance(node, ast.ClassDef) and node.name == class_name):
         bases = [base.id for base in definition.bases if isinstance(base, ast.Name)]

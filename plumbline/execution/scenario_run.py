@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -142,9 +143,23 @@ class ScenarioRun:
         self._packed_truths: dict[TaskKind, Packed] = {}  # for judges and diagnoses in workers
         count = plan.random_state_count
         count = min(count, STATES_PER_RANDOM_SCENARIO) if is_random else count
-        states = compared_states(scenario.model, scenario.state, scenario.seed, count)
-        self._states = EncodedRecord.of(states, list[State])  # argument of many tasks
-        self._step_states = states[:STEP_STATES]
+        self._states = self._compared_states(count)  # argument of many tasks
+
+    def _compared_states(self, count: int) -> EncodedRecord:
+        """Draw the states that are compared, which takes long for loops; named scenarios keep them."""
+        s, cache = self.scenario, self._plan.result_cache
+        task = Task(("states", s.name), compared_states, (s.model, s.state, s.seed, count))
+        if not self._is_random and (known := cache.get(task)):
+            return known.raw_value  # type: ignore[no-any-return]
+        states = compared_states(*task.arguments)
+        if not self._is_random:
+            cache.put(task, Outcome(task.key, states))
+        return EncodedRecord.of(states, list[State])
+
+    @cached_property
+    def _step_states(self) -> list[State]:
+        states: list[State] = self._states.load()[:STEP_STATES]
+        return states
 
     def tasks(self) -> Iterator[Task]:
         """Make the tasks that can start: the truths that are missing, and the cells that need none.

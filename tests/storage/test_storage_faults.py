@@ -169,7 +169,7 @@ def test_the_command_reports_the_damage_and_continues(tmp_path, own_cells):
     assert limited.returncode == 4, limited.stderr
     assert "I/O error" in limited.stderr and "run the same command to resume" in limited.stderr
     assert not (tmp_path / "report.html").exists()
-    assert len(list(own_cells.glob("*.cell"))) == 3  # description, truth, answer
+    assert len(list(own_cells.glob("*.cell"))) == 4  # description, states, truth, answer
     again = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert again.returncode == 0, again.stderr
     assert (tmp_path / "report.html").exists() and "2 answers of earlier runs" in again.stderr
