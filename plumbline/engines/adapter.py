@@ -215,6 +215,11 @@ class Adapter(ABC):
         with self._checked_refusals(model):
             trajectory = self._simulate(model, state, times, method, resolution)
         _check_trajectory(model, times, trajectory, f"{self.name}._simulate, {integrator}")
+        if method.kind == "step" and trajectory.steps != (count := round(float(times[-1] / resolution))):
+            raise EngineFailure(  # tolerances grow with the number of steps
+                f"{self.name}._simulate, {integrator}: steps is {trajectory.steps!r}, but {count} steps of "
+                f"{resolution:g} s lead to t = {times[-1]:g} s"
+            )
         return replace(trajectory, initial_x=state.x)
 
     def step(self, model: Model, state: State, integrator: str, step: float, count: int) -> StepRun:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import time
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import cache
 
@@ -525,6 +526,26 @@ def test_detects_in_a_trajectory(engine, integrator, tampering, message):
     worker.call_adapter(engine, "simulate", *args, overrides={"_simulate": unchanged})
     with pytest.raises(EngineFailure, match=message):
         worker.call_adapter(engine, "simulate", *args, overrides={"_simulate": tampering})
+
+
+def one_step_more(real, *args):
+    run = real(*args)
+    return replace(run, steps=run.steps + 1)
+
+
+@every_integrator
+def test_detects_another_number_of_steps(engine, integrator):
+    """Of fixed steps: those of a tolerance are the engine's own choice."""
+    subject = one_body(engine)
+    args = (
+        subject,
+        pendulums.state_from_seed(subject),
+        TIMES,
+        integrator.name,
+        step_or_tolerance(integrator),
+    )
+    with pytest.raises(EngineFailure, match="steps is") if integrator.kind == "step" else nullcontext():
+        worker.call_adapter(engine, "simulate", *args, overrides={"_simulate": one_step_more})
 
 
 def nan_acceleration(real, *args):
