@@ -507,6 +507,8 @@ class _SoftMechanism:
         answer = self.cut.source_quantities(answer) if self.cut else answer
         if self.rodless:
             answer = self._with_rods(state, answer, self.rodless)
+        if self.source.is_chain:  # balls and rods transmit no moments
+            answer = replace(answer, joint_moment=None)
         if self.source.has_loops:
             return determinate_part(self.source, state, answer)
         moment = None if self.source.is_chain else answer.joint_moment  # balls and rods transmit none
