@@ -30,16 +30,20 @@ from plumbline.execution.result_cache import DiskResultCache, night_cells_folder
 from plumbline.execution.runner import RunResult, run_plan, save
 from plumbline.execution.selftest import SelfTestResult
 from plumbline.judging.known_issues import KnownIssue, project_known_issues
+from plumbline.model.features import Feature, features
 from plumbline.processes.workers import Limits, WorkerPool
 from plumbline.reproduce.write import write_scripts
-from plumbline.scenario.generator import RANDOM_FAMILY, RandomScenarios, random_seed
+from plumbline.scenario.generator import MECHANISM_PREFIX, RANDOM_FAMILY, RandomScenarios, random_seed
 from plumbline.scenario.loader import Scenario
 from plumbline.storage.history import next_night_number, stored_runs
 from plumbline.storage.results_store import write_atomically
 from plumbline.studies.coverage import FILE as COVERAGE_FILE
 from plumbline.studies.coverage import CoverageFailure, coverage_table, measure_coverage
+from plumbline.studies.feature_pairs import count_triples
 from plumbline.studies.tables import write_table
 
+FEATURES_FILE = "features.json"  # features of each random mechanism of a night
+WEEK = 7  # nights
 EXTRA_REFINEMENTS = 1  # halvings of the finest step beyond a run's refinement study
 
 
@@ -202,7 +206,18 @@ def run_nightly(
         if about["family"] == RANDOM_FAMILY and random_seed(name) == night.seed:
             about["file"] = (place / "scenarios" / f"{name}.yaml").as_posix()
     coverage = night_coverage(result, plan, progress) if level == "all" else None
+    drawn = [features(s.model) for s in random_scenarios if s.name.startswith(MECHANISM_PREFIX)]
+    if drawn:
+        earlier = itertools.chain(
+            *map(_stored_features, [run.folder for run in stored_runs(history)][1 - WEEK :])
+        )
+        found, new = count_triples(drawn, earlier)
+        result.metadata["feature_triples"] = {"found": found, "new": new}
+        result.metadata["sentence"] += (
+            f"; random mechanisms: {found:,} triples of features, {new:,} of them new in {WEEK} nights"
+        )
     save(result, folder, command)
+    write_atomically(folder / FEATURES_FILE, json.dumps(drawn).encode())
     if coverage is not None:
         write_table(coverage, folder / COVERAGE_FILE)
     write_random_scenario_files(result, random_scenarios, folder / "scenarios")
@@ -241,6 +256,15 @@ def night_coverage(result: RunResult, plan: Plan, progress: ProgressCallback) ->
         result.metadata["exit_code"] = ExitCode.HARNESS_FAILED
         return None
     return coverage_table(found)
+
+
+def _stored_features(folder: Path) -> list[list[Feature]]:
+    """The features of each random mechanism of an earlier night; none where they cannot be read."""
+    try:
+        stored = json.loads((folder / FEATURES_FILE).read_text(encoding="utf-8"))
+        return [[Feature(*map(str, one)) for one in some] for some in stored]
+    except (OSError, ValueError, TypeError):
+        return []
 
 
 def unused_path(place: Path) -> Path:

@@ -197,7 +197,7 @@ def random_loop_mechanism(
         n: number of bodies.
         kinds: of the closing joints.
         tree: kinds of the tree's joints.
-        elements: which of `ELEMENTS` the tree's joints have.
+        elements: which of `ELEMENTS` the joints have.
 
     Returns:
         The mechanism, whose loops move and whose rows are independent, and the state.
@@ -205,7 +205,7 @@ def random_loop_mechanism(
     """
     for attempt in count():
         rng = np.random.default_rng([seed, n, len(kinds), attempt])
-        model = random_tree(rng, n, tree, elements=elements)
+        model = random_tree(rng, n, tree)
         (state,) = random_states(model, 1, seed)
         for i, kind in enumerate(kinds):
             near = n - 1 - i
@@ -218,6 +218,8 @@ def random_loop_mechanism(
                 break
             model = close_loop(model, state, kind, int(rng.choice(ends)), near, rng)
         if len(model.kind) == n + len(kinds) and _moves(model, state):
+            if elements:  # of closing joints too
+                model = with_elements(rng, model, elements)
             return model, assembled(model, complete_state(model, state))
     raise AssertionError
 

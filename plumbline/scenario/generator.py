@@ -17,7 +17,14 @@ from typing import Any, overload
 import numpy as np
 
 from plumbline.model.datatypes import KINDS
-from plumbline.model.random_mechanisms import ELEMENTS, LOOP_KINDS, random_loop_mechanism, random_tree
+from plumbline.model.features import ROLES, Place
+from plumbline.model.random_mechanisms import (
+    ELEMENTS,
+    LOOP_KINDS,
+    mechanism_with_places,
+    random_loop_mechanism,
+    random_tree,
+)
 from plumbline.model.sampling import derive_seed, random_states
 from plumbline.scenario.loader import Scenario, scenario_from_dict
 from plumbline.scenario.mechanism_document import mechanism_document
@@ -29,6 +36,10 @@ MAX_MOTION_BODIES = 3
 MOTION_MOMENT = 0.02  # moments of loads and drag in a random motion, over those of other random scenarios
 MOTION_PREFIX = "random-motion-"
 MECHANISM_PREFIX = "random-mechanism-"
+PLACES = [
+    Place(kind, role) for role in ROLES for kind in KINDS if (kind, role) != ("free", "closing")
+]  # of joints in random mechanisms
+MAX_PLACES = 12  # of a random mechanism; it has a few joints more
 MAX_LOOP_BODIES = 8  # of random mechanisms with loops
 SPECIAL_INDICES = (0, 2)  # modulo 5: of scenarios with special values
 SPECIAL_CHANCE = 0.4  # of each kind of special value in such a scenario
@@ -145,7 +156,10 @@ def random_motion(seed: int, index: int) -> Scenario:
 
 
 def random_mechanism(seed: int, index: int) -> Scenario:
-    """Make one random mechanism of a seed: a tree where the index is even, else one with one or two loops.
+    """Make one random mechanism of a seed.
+
+    Of four, one is a tree, one has one or two loops, and two have joints of random kinds in random roles: any
+    three features of mechanisms come together in some of them.
 
     Args:
         seed: the seed of the whole batch.
@@ -160,7 +174,12 @@ def random_mechanism(seed: int, index: int) -> Scenario:
     # half of them bare, the others with some of the elements, or all
     elements = tuple(name for name in ELEMENTS if rng.random() < 0.6) if rng.random() < 0.5 else ()
     kinds = [kind for kind in KINDS if rng.random() < 0.7] or list(KINDS)
-    if index % 2:
+    if index % 4 > 1:
+        places = rng.choice(len(PLACES), size=int(rng.integers(6, MAX_PLACES + 1)), replace=False)
+        few = tuple(name for name in ELEMENTS if rng.random() < 0.8)
+        model, state = mechanism_with_places(own, [PLACES[i] for i in places], few, rng.random() < 0.3)
+        n = model.n
+    elif index % 4 == 1:
         n = int(np.clip(1 + rng.geometric(0.3), 2, MAX_LOOP_BODIES))
         closing = (*LOOP_KINDS, "weld")
         count = 1 if n < 4 else int(rng.integers(1, 3))

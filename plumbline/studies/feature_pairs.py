@@ -147,3 +147,29 @@ def measure_features(
         found[outcome.key] = outcome.value
         progress(len(found), len(tasks), outcome.key)
     return found
+
+
+def count_triples(
+    mechanisms: Iterable[Sequence[Feature]], earlier: Iterable[Sequence[Feature]]
+) -> tuple[int, int]:
+    """Count triples of features that stand together in a mechanism.
+
+    Args:
+        mechanisms: the features of each.
+        earlier: the features of each mechanism of before.
+
+    Returns:
+        The number of triples, and of those among them that stood together in none of before.
+
+    """
+    groups = [list(mechanisms), list(earlier)]
+    index = {
+        one: i for i, one in enumerate(dict.fromkeys(f for group in groups for some in group for f in some))
+    }
+    together, before = np.zeros((2, *[len(index)] * 3), bool)
+    for table, group in zip((together, before), groups, strict=True):
+        for some in group:
+            table[np.ix_(*[[index[one] for one in some]] * 3)] = True
+    every = np.arange(len(index))
+    together[every, every] = together[:, every, every] = together[every, :, every] = False  # fewer than three
+    return int(np.count_nonzero(together)) // 6, int(np.count_nonzero(together & ~before)) // 6

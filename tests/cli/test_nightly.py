@@ -185,6 +185,19 @@ def test_a_night_is_whole_and_remembered(tmp_path):
     assert seen["id"] == place.name and seen["random"] == 3
 
 
+def test_a_night_counts_what_its_random_mechanisms_add(tmp_path):
+    options = {"random_count": 8, "level": "state"}
+    first, place = run_nightly(tmp_path, **options)
+    found = first.metadata["feature_triples"]
+    assert found["found"] == found["new"] > 1000
+    assert f"{found['new']:,} of them new in 7 nights" in first.metadata["sentence"]
+    again, _ = run_nightly(tmp_path, **options)
+    assert again.metadata["feature_triples"] == {"found": found["found"], "new": 0}
+    (place / "features.json").write_text("{", encoding="utf-8")
+    other, _ = run_nightly(tmp_path, **options | {"seed": 12})
+    assert 0 < other.metadata["feature_triples"]["new"] < other.metadata["feature_triples"]["found"]
+
+
 def test_a_night_is_kept_without_its_coverage(tmp_path):
     reason = "no coverage of rest: SingularSystem: the joint rows are not independent"
     with patch.object(nightly, "measure_coverage", side_effect=CoverageFailure(reason)):

@@ -14,6 +14,7 @@ from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS
 from plumbline.model.features import ROLES, Feature, Place, features, joint_roles, without_feature
 from plumbline.model.kinematics import complete_state
 from plumbline.model.sampling import compared_states
+from plumbline.scenario.generator import random_mechanism
 from plumbline.scenario.loader import catalogue, load_scenario
 from plumbline.studies import feature_pairs
 from plumbline.truth.ground_truth import state_truth
@@ -120,3 +121,26 @@ def test_what_is_shown_by_prediction_is_shown_by_an_engine(engine, name):
 def test_a_feature_that_is_left_out_by_an_engine_is_reported():
     found, chosen = confirmed("pinocchio", "tree-of-seven-sprung", 3)
     assert found == chosen and len(chosen) == 3
+
+
+def test_triples_are_counted_once():
+    a, b, c, d = (Feature(f"gravity {letter}") for letter in "xyzw")
+    assert feature_pairs.count_triples([[a, b]], []) == (0, 0)
+    assert feature_pairs.count_triples([[a, b, c], [c, b, a]], []) == (1, 1)
+    assert feature_pairs.count_triples([[a, b, c, d]], [[d, b, c], [a, d]]) == (4, 3)
+
+
+@pytest.mark.full
+def test_a_week_of_nights_has_the_legal_triples():
+    legal = feature_pairs.legal_pairs(GROUP)
+    known = sorted({one for pair in legal for one in pair})
+    index = {one: i for i, one in enumerate(known)}
+    pairs = np.zeros((len(known),) * 2, bool)
+    for one, other in legal:
+        pairs[index[one], index[other]] = pairs[index[other], index[one]] = True
+    found = np.zeros((len(known),) * 3, bool)
+    for night, k in itertools.product(range(7), range(100)):  # as many as nights have by default
+        some = [index[one] for one in features(random_mechanism(night, k).model) if one in index]
+        found[np.ix_(some, some, some)] = True
+    wanted = pairs[:, :, None] & pairs[:, None, :] & pairs[None, :, :]
+    assert np.count_nonzero(found & wanted) > 0.99 * np.count_nonzero(wanted)
