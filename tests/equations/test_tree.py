@@ -9,9 +9,10 @@ import pytest
 from plumbline.equations.arithmetic import floats
 from plumbline.equations.balls import balls as ball_arithmetic
 from plumbline.equations.tree import Tree
-from plumbline.model.datatypes import State
+from plumbline.model.datatypes import KINDS, State
 from plumbline.model.loops import motion_without_inertia
-from plumbline.model.sampling import compared_states
+from plumbline.model.random_mechanisms import ELEMENTS, random_tree
+from plumbline.model.sampling import compared_states, random_states
 from plumbline.scenario.generator import random_mechanism, random_scenario
 from plumbline.truth.certified import MAX_RELATIVE_RADIUS, certify_state, enclose_quantities
 from plumbline.truth.rounding_bound import state_rounding_bound
@@ -72,6 +73,21 @@ def test_enclosures_of_random_mechanisms_overlap_those_of_the_former_equations(s
     for scenario in (*(random_mechanism(seed, index) for index in range(4)), random_scenario(seed, 1)):
         for state in states_of(scenario):
             check_overlap(scenario.model, state)
+
+
+@pytest.mark.parametrize("kinds", [("ball",), ("hinge", "ball"), tuple(KINDS)], ids=len)
+@pytest.mark.parametrize("seed", [1, 2, *(pytest.param(n, marks=pytest.mark.full) for n in range(3, 20))])
+def test_enclosures_of_trees_with_every_element_overlap_those_of_the_former_equations(kinds, seed):
+    """Rotors of ball joints on moving bodies, and several springs at one body."""
+    model = random_tree(np.random.default_rng(seed), 5, kinds, elements=ELEMENTS)
+    ends = np.array([[0, 1], [1, 2], [2, -1]])
+    model = model.changed(
+        spring_body=ends,
+        spring_point=0.5 * np.random.default_rng(seed).normal(size=(3, 2, 3)),
+        **{f"spring_{name}": np.array([0.7, 1.1, 1.3]) for name in ("stiffness", "damping", "length")},
+    )
+    for state in random_states(model, 2, seed):
+        check_overlap(model, state)
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.full) for seed in range(40, 50))])
