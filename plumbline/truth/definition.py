@@ -315,12 +315,12 @@ class _Check:
             bound = float(abs(x).upper())
             if bound <= slack * size:
                 continue
-            if not x.contains(0) and float(abs(x).lower()) > slack * size:
+            if float(abs(x).lower()) > slack * size:
                 raise DefinitionViolated(
                     f"{what}: the certified solution contradicts the definition of the mechanism by "
                     f"{float(abs(x).mid()):.3g}, terms of {size:.3g}"
                 )
-            if not (x.contains(0) and bound <= MAX_DIFFERENCE * size):
+            if not bound <= MAX_DIFFERENCE * size:
                 self.is_sharp = False
 
     def _vector(self, v: Iterable[float]) -> Any:
