@@ -462,7 +462,7 @@ class ExudynTree(ExudynAdapter):
         groups = _Linkage(model, state).revolute_groups
         axes = [group.axes[:, 2 - i] for group in groups for i in range(group.angle_count)]
         run = self._simulate(model, state, times, integrator, step)
-        return StepRun(run, angle_axes=np.array(axes))
+        return StepRun(run, angle_axes=np.array(axes).reshape(-1, 3))
 
 
 def _rk44_settings() -> Any:
