@@ -511,8 +511,7 @@ class _SoftMechanism:
             answer = replace(answer, joint_moment=None)
         if self.source.has_loops:
             return determinate_part(self.source, state, answer)
-        moment = None if self.source.is_chain else answer.joint_moment  # balls and rods transmit none
-        return replace(answer, mass_matrix=None, joint_moment=moment)
+        return replace(answer, mass_matrix=None)
 
     def _with_rods(self, state: State, answer: StateQuantities, rodless: Rearranged) -> StateQuantities:
         """Bodies and joints in the order of the mechanism; rods push along themselves."""
