@@ -36,7 +36,7 @@ from plumbline.processes.user_cache import (
 )
 
 ROOT = Path(__file__).resolve().parents[2]
-BASE_REQUIREMENTS = ("numpy", "scipy", "packaging")  # imported by adapters and by the core in workers
+BASE_REQUIREMENTS = ("numpy", "scipy", "packaging", "pydantic")  # imported by adapters and core in workers
 INSTALL_TIMEOUT = 900  # s for uv to fetch and install
 
 
