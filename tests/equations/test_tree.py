@@ -69,7 +69,7 @@ def test_enclosures_overlap_those_of_the_former_equations_everywhere(name):
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.full) for seed in range(40, 60))])
 def test_enclosures_of_random_mechanisms_overlap_those_of_the_former_equations(seed):
-    """Of trees where the index is even, of loops where it is odd, and of a chain."""
+    """Of a tree, of loops, of joints in random roles, and of a chain."""
     for scenario in (*(random_mechanism(seed, index) for index in range(4)), random_scenario(seed, 1)):
         for state in states_of(scenario):
             check_overlap(scenario.model, state)
@@ -94,7 +94,7 @@ def test_enclosures_of_trees_with_every_element_overlap_those_of_the_former_equa
 def test_a_loop_may_hold_a_body_that_could_turn_without_inertia(seed):
     """Cut open, a thin rod or a point mass would turn freely about its axis or its joint."""
     regular = 0
-    for index in (1, 3, 5, 7):
+    for index in (1, 5, 9, 13):  # mechanisms with loops
         scenario = random_mechanism(seed, index)
         axis = np.linalg.qr(np.random.default_rng(index).normal(size=(3, 3)))[0][0]
         for thin in (0.1 * (np.eye(3) - np.outer(axis, axis)), np.zeros((3, 3))):
