@@ -96,6 +96,7 @@ TREE_JOINTS = {
     "furuta-motor": ("hinge", "hinge"),
     "hinge-pendulum": ("hinge",),
     "light-cart-pole": ("slide", "hinge"),
+    "long-hinge": ("hinge",),
     "slider-on-arm": ("hinge", "slide"),
     "spring-pendulum": ("free",),
     "sprung-ball": ("ball", "ball"),
