@@ -14,7 +14,7 @@ from plumbline.processes.workers import Limits, ResultCache
 from plumbline.scenario.loader import Scenario
 
 RANDOM_STATES = 50  # random states per scenario, besides the initial one
-STATES_PER_RANDOM_SCENARIO = 9  # the same for a random scenario: there are many of them
+STATES_PER_RANDOM_SCENARIO = 9  # the same for a random scenario, or one that asks for states only
 
 LevelSelection = Literal["state", "step", "trajectory", "all"]
 ProgressCallback = Callable[[int, int, str], None]  # finished tasks, all tasks, name of the last one

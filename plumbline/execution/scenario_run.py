@@ -142,7 +142,8 @@ class ScenarioRun:
         self._has_retried_truth = False
         self._packed_truths: dict[TaskKind, Packed] = {}  # for judges and diagnoses in workers
         count = plan.random_state_count
-        count = min(count, STATES_PER_RANDOM_SCENARIO) if is_random else count
+        has_few_states = is_random or scenario.level == "state"
+        count = min(count, STATES_PER_RANDOM_SCENARIO) if has_few_states else count
         self._states = self._compared_states(count)  # argument of many tasks
 
     def _compared_states(self, count: int) -> EncodedRecord:

@@ -700,7 +700,7 @@ class Document(SchemaModel):
         validate_default=True,
     )
     level: Literal["state", "all"] = _field(
-        "What is compared: `all` levels, or only quantities at states (`state`), without a motion.",
+        "What is compared: `all` levels, or only quantities at the initial and nine random states (`state`).",
         default="all",
     )
     gravity: Vector = _field("Acceleration of gravity, world frame.", "m/s²", [0.0, 0.0, -9.81])

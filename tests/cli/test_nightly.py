@@ -16,6 +16,7 @@ from plumbline.execution.random_batch import RandomBatch
 from plumbline.execution.runner import RunResult
 from plumbline.judging.rows import RowContext
 from plumbline.model.datatypes import JOINT_ELEMENTS, KINDS
+from plumbline.model.features import joint_roles
 from plumbline.model.loops import loop_gaps
 from plumbline.model.random_mechanisms import ELEMENTS, random_loop_mechanism
 from plumbline.processes.cpu_time import CpuTimes
@@ -23,6 +24,7 @@ from plumbline.processes.workers import Limits
 from plumbline.scenario import loader
 from plumbline.scenario.generator import (
     MAX_RANDOM_BODIES,
+    PLACES,
     RANDOM_FAMILY,
     RandomScenarios,
     random_document,
@@ -89,18 +91,24 @@ def test_random_mechanisms_cover_every_joint_element_and_topology():
     drawn = list(RandomScenarios(1, 0, mechanism_count=120))
     assert [s.digest for s in drawn[:3]] == [random_mechanism(1, k).digest for k in range(3)]
     assert RandomScenarios(1, 2, 1, 3).named("random-mechanism-1-2").digest == drawn[2].digest
-    assert [s.model.has_loops for s in drawn] == [False, True] * 60
-    assert {len(s.model.kind) - s.model.n for s in drawn} == {0, 1, 2}
-    assert {s.model.n for s in drawn[::2]} == set(range(1, MAX_RANDOM_BODIES + 1))
+    trees, loops, mixed = drawn[::4], drawn[1::4], [*drawn[2::4], *drawn[3::4]]
+    assert not any(s.model.has_loops for s in trees) and all(s.model.has_loops for s in loops)
+    assert {len(s.model.kind) - s.model.n for s in loops} == {1, 2}
+    assert {s.model.n for s in trees} <= set(range(1, MAX_RANDOM_BODIES + 1))
+    assert {place for s in mixed for place in zip(s.model.kind, joint_roles(s.model), strict=True)} == set(
+        PLACES
+    )
+    assert any(s.model.kind.count("free") > 1 for s in mixed)
+    assert any(np.any(s.model.stiffness[s.model.n :]) for s in loops)
     for count in (lambda m: m.n, lambda m: len(m.kind)):  # tree joints, and with those that close loops
         assert {kind for s in drawn for kind in s.model.kind[: count(s.model)]} == set(KINDS)
-    assert {s.model.kind[-1] for s in drawn[1::2]} == set(KINDS) - {"free"}
+    assert {s.model.kind[-1] for s in loops} == set(KINDS) - {"free"}
     for element in (*JOINT_ELEMENTS, "spring_body"):
         has = [np.any(getattr(s.model, element)) for s in drawn]
-        assert 0.15 < np.mean(has) < 0.5, element
+        assert 0.5 < np.mean(has) < 0.75, element
     rotors = [s for s in drawn if "free" in s.model.kind and np.any(s.model.armature)]
     assert len(rotors) >= 5
-    assert max(np.max(loop_gaps(s.model, s.state)) for s in drawn[1::2]) < 1e-11
+    assert max(np.max(loop_gaps(s.model, s.state)) for s in [*loops, *mixed]) < 1e-11
 
 
 def test_a_mechanism_comes_back_from_its_file():
