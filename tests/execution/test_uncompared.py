@@ -1,5 +1,7 @@
 """What is not compared of a scenario has a row that says so."""
 
+from dataclasses import replace
+
 import pytest
 
 from plumbline.engines.adapter import EngineInfo
@@ -55,3 +57,13 @@ def test_a_regular_pose_beside_a_singular_one_is_compared():
     scenario = catalogue_scenarios()["slider-crank"]  # its dead centres are regular: the crank turns there
     result = run_plan(Plan([scenario], ["reference"], "state", random_state_count=1), lambda *_: None)
     assert {row.extra["states"] for row in result.rows} == {2.0}
+
+
+@pytest.mark.parametrize("level", ["all", "trajectory", "state"])
+def test_a_scenario_that_asks_for_states_is_compared_at_ten_only(level):
+    assert catalogue_scenarios()["crowded-tree"].level == "state"
+    scenario = replace(catalogue_scenarios()["damped-hinge"], level="state")
+    result = run_plan(Plan([scenario], ["reference"], level), lambda *_: None)
+    assert {(row.level, row.verdict, row.extra["states"]) for row in result.rows} == {
+        ("state", Verdict.AGREES, 10.0)
+    }
