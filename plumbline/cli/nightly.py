@@ -245,10 +245,11 @@ def night_coverage(result: RunResult, plan: Plan, progress: ProgressCallback) ->
         The table of `plumbline.studies.coverage`; None where it could not be computed.
 
     """
+    moving = [s for s in plan.scenarios if s.level == "all"]  # of the others pairs of features are computed
     try:
         with WorkerPool(plan.jobs, plan.limits) as executor:
             found = measure_coverage(
-                executor, plan.scenarios, result.rows, plan.random_state_count, progress=progress,
+                executor, moving, result.rows, plan.random_state_count, progress=progress,
                 cpu_times=result.cpu_times,
             )  # fmt: skip
     except CoverageFailure as error:

@@ -192,6 +192,7 @@ def coverage(
     chosen = options.choose_scenarios(names, ())
     if has_pairs:
         _print_pairs(chosen, jobs, Limits(timeout, memory), as_json)
+    chosen = [s for s in chosen if names or s.level == "all"]
     levels: tuple[Level, ...] = COVERED_LEVELS if level == "all" else (level,)
     folder, limits = options.claim_folder(out), Limits(timeout, memory)
     with options.exit_on_io_error():
