@@ -45,7 +45,7 @@ from plumbline.scenario.schema import (
 )
 from plumbline.scenario.validation_messages import problems_from_validation
 from plumbline.scenario.yaml_reader import is_file, read_yaml
-from plumbline.scenario.yaml_source import PathKey, YamlSource, dotted_path
+from plumbline.scenario.yaml_source import PathKey, YamlSource
 
 __all__ = [
     "Problem",
@@ -370,13 +370,7 @@ def _missing_distal_problems(source: YamlSource) -> Iterator[Problem]:
                 continue  # hangs elsewhere, or is checked with its parent
             if any(closest_match(key, ["distal"]) for key in body if key not in Body.model_fields):
                 continue  # misspelt, and named as such
-            yield Problem(
-                source.file,
-                *source.value_positions[path],
-                dotted_path((*path, "distal")),
-                "is missing: a body follows",
-                valid,
-            )
+            yield source.problem((*path, "distal"), "is missing: a body follows", valid)
 
 
 def _expand_repeats(document: Document) -> Iterator[tuple[Body, Array]]:
@@ -407,14 +401,11 @@ def _resolve_parents(source: YamlSource, document: Document, bodies: list[Body])
         far.append(parent)
         if message:
             path = (*paths[k], field_name)
-            place = source.value_positions.get(path) or source.value_positions[paths[k]]
-            problems.append(Problem(source.file, *place, dotted_path(path), message, valid))
+            problems.append(source.problem(path, message, valid))
         elif parent >= 0 and body.anchor is None and bodies[parent].distal is None:
             path, valid = (*paths[k], "anchor"), "the point of the parent, as [0, 0, -0.2] (m)"
             message = "is missing: the parent has no distal"
-            problems.append(
-                Problem(source.file, *source.value_positions[paths[k]], dotted_path(path), message, valid)
-            )
+            problems.append(source.problem(path, message, valid))
     if problems:
         raise ScenarioError(problems)
     return far
@@ -452,24 +443,16 @@ def _parent_of(bodies: list[Body], k: int, far: list[int]) -> tuple[int, str, st
 
 def _resolve_springs(source: YamlSource, document: Document, bodies: list[Body]) -> NDArray[np.intp]:
     """The bodies (K, 2) of the springs, −1 the world."""
-    names, problems = [body.name for body in bodies], []
+    problems: list[Problem] = []
     found = np.full((len(document.springs), 2), -1, np.intp)
     for k, spring in enumerate(document.springs):
         for side, name in enumerate(spring.bodies):
-            message, valid = "", "the name of a body, or world"
-            if names.count(name) > 1:
-                message = f"is {name!r}, the name of {names.count(name)} bodies"
-            elif name in names:
-                found[k, side] = names.index(name)
-            elif name != "world":
-                hint = did_you_mean(name, [other for other in names if other])
-                message = f"is {name!r}, no body's name. {hint}".strip(" .")
+            found[k, side], message = _body_named(name, bodies, may_be_world=True)
+            valid = "the name of a body, or world"
             if side and not message and found[k, 0] == found[k, 1]:
                 message, valid = f"is {name!r} like the other end", "two different bodies"
             if message:
-                path = ("springs", k, "bodies", side)
-                place = source.value_positions.get(path) or source.value_positions[("springs", k)]
-                problems.append(Problem(source.file, *place, dotted_path(path), message, valid))
+                problems.append(source.problem(("springs", k, "bodies", side), message, valid))
     if problems:
         raise ScenarioError(problems)
     return found
@@ -477,29 +460,34 @@ def _resolve_springs(source: YamlSource, document: Document, bodies: list[Body])
 
 def _resolve_closes(source: YamlSource, document: Document, bodies: list[Body]) -> NDArray[np.intp]:
     """The far and near bodies (L, 2) of the closing joints, −1 the world."""
-    names, problems = [body.name for body in bodies], []
+    problems: list[Problem] = []
     found = np.full((len(document.closes), 2), -1, np.intp)
     for k, joint in enumerate(document.closes):
-        for side, field_name in enumerate(("parent", "body")):
-            name, message, valid = str(getattr(joint, field_name)), "", "the name of a body"
-            if names.count(name) > 1:
-                message = f"is {name!r}, the name of {names.count(name)} bodies"
-            elif name in names:
-                found[k, side] = names.index(name)
-            elif name != "world" or side:
-                hint = did_you_mean(name, [other for other in names if other])
-                message = f"is {name!r}, no body's name. {hint}".strip(" .")
+        for side, name in enumerate((joint.parent, joint.body)):
+            found[k, side], message = _body_named(name, bodies, may_be_world=not side)
+            valid = "the name of a body"
             if side and not message and found[k, 0] == found[k, 1]:
                 message, valid = f"is {name!r} like the parent", "two different bodies"
             if side and not message and joint.joint.kind == "weld" and found[k, 0] < 0:
                 message, valid = f"is {name!r}, welded to the world, where it never moves", "another joint"
             if message:
-                path = ("closes", k, field_name)
-                place = source.value_positions.get(path) or source.value_positions[("closes", k)]
-                problems.append(Problem(source.file, *place, dotted_path(path), message, valid))
+                problems.append(source.problem(("closes", k, ("parent", "body")[side]), message, valid))
     if problems:
         raise ScenarioError(problems)
     return found
+
+
+def _body_named(name: str, bodies: list[Body], *, may_be_world: bool) -> tuple[int, str]:
+    """The number of a body, −1 the world, and what is wrong with its name."""
+    names = [body.name for body in bodies]
+    if names.count(name) > 1:
+        return -1, f"is {name!r}, the name of {names.count(name)} bodies"
+    if name in names:
+        return names.index(name), ""
+    if name == "world" and may_be_world:
+        return -1, ""
+    hint = did_you_mean(name, [other for other in names if other])
+    return -1, f"is {name!r}, no body's name. {hint}".strip(" .")
 
 
 def _add_closing_joints(tree: Model, document: Document, closed: NDArray[np.intp]) -> Model:

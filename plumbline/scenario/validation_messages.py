@@ -72,8 +72,7 @@ def _problem_from_error(
     if conflicting and path not in source.value_positions:
         path = (*path[:-1], conflicting)
     place = source.key_positions.get(path) if error["type"] == "extra_forbidden" else None
-    above = (path[:size] for size in range(len(path), -1, -1))
-    found = place or next((source.value_positions[p] for p in above if p in source.value_positions), (1, 1))
+    found = place or source.position(path)
     return Problem(source.file, *found, dotted_path(path), *_message_and_valid(error, at, root))
 
 

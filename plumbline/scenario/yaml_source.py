@@ -38,6 +38,33 @@ class YamlSource:
         """
         return ScenarioError([Problem(self.file, *at, "", message, valid, hint)])
 
+    def position(self, path: tuple[PathKey, ...]) -> Position:
+        """Find the value of a field.
+
+        Args:
+            path: the field, which the file may leave out.
+
+        Returns:
+            Where its value begins, else that of the innermost field around it.
+
+        """
+        above = (path[:size] for size in range(len(path), -1, -1))
+        return next((self.value_positions[p] for p in above if p in self.value_positions), (1, 1))
+
+    def problem(self, path: tuple[PathKey, ...], message: str, valid: str) -> Problem:
+        """Describe what is wrong with a field.
+
+        Args:
+            path: the field.
+            message: what is wrong.
+            valid: what would be valid, a noun phrase.
+
+        Returns:
+            The problem, at the field's position.
+
+        """
+        return Problem(self.file, *self.position(path), dotted_path(path), message, valid)
+
     def add_problem(self, at: Position, path: tuple[PathKey, ...], message: str, valid: str) -> None:
         """Note a problem that does not stop the parsing.
 
