@@ -143,8 +143,9 @@ class Results:
 
 
 def _clean_texts(values: np.ndarray) -> np.ndarray:
-    known: dict[Any, Any] = {}
-    return np.array([known.setdefault(v, replace_unprintable(v)) for v in values.tolist()], dtype=object)
+    texts = values.tolist()
+    clean = {text: replace_unprintable(text) for text in set(texts)}
+    return np.array([clean[text] for text in texts], dtype=object)
 
 
 def group_rows(columns: Columns, *by: str) -> Iterator[tuple[tuple[str, ...], np.ndarray]]:

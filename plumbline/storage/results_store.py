@@ -312,14 +312,9 @@ def write_results(
         for path in folder.glob(pattern):
             path.unlink(missing_ok=True)
     tables.write_parquet(folder)
-    document = {
-        "schema_version": SCHEMA_VERSION,
-        "run": run,
-        "scenarios": scenarios,
-        "engines": engines,
-        "rows": [row_record(row) for row in rows],
-    }
-    text = json.dumps(to_json_value(document), ensure_ascii=False, indent=1)
+    head = {"schema_version": SCHEMA_VERSION, "run": run, "scenarios": scenarios, "engines": engines}
+    document = {**to_json_value(head), "rows": [row_record(row) for row in rows]}
+    text = json.dumps(document, ensure_ascii=False)  # an indent takes the encoder in Python
     write_atomically(folder / "results.json", text.encode())
 
 
