@@ -15,10 +15,8 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from packaging.specifiers import SpecifierSet
-from packaging.version import InvalidVersion, Version
 
-from plumbline.engines.answers import check_declarations, check_evaluation, check_record, check_text
+from plumbline.engines.answers import check_declarations, check_evaluation, check_record, check_version
 from plumbline.model.datatypes import (
     Array,
     BadInput,
@@ -136,13 +134,7 @@ class Adapter(ABC):
 
         """
         check_declarations(self)
-        version, missing = check_text(self.version(), f"{self.name}: version()"), None
-        supported = self.supported_versions
-        try:
-            if supported and not SpecifierSet(supported).contains(Version(version), prereleases=True):
-                missing = f"the adapter supports versions {supported} of {self.package}, this is {version}"
-        except InvalidVersion:
-            raise EngineFailure(f"{self.name}: version() is {version!r}, must be a PEP 440 version") from None
+        version, missing = check_version(self, "adapter")
         return EngineInfo(self.name, self.title, version, self.integrators, missing)
 
     def integrator(self, name: str) -> Integrator:

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 from packaging.specifiers import InvalidSpecifier, SpecifierSet
+from packaging.version import InvalidVersion, Version
 from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 
 from plumbline.model.datatypes import EngineFailure, Model, StateQuantities, StepRun, Trajectory
@@ -163,13 +164,12 @@ def _words(dimensions: tuple[int | str, ...]) -> str:
     return f"({', '.join(map(str, dimensions))}{',' * (len(dimensions) == 1)})"
 
 
-def check_text(value: Any, label: str, max_length: int = MAX_NAME) -> str:
+def check_text(value: Any, label: str) -> str:
     """Check a name, a title or a version.
 
     Args:
         value: what the adapter declared or returned.
         label: adapter and field, for the message.
-        max_length: characters that it may have.
 
     Returns:
         The text.
@@ -178,10 +178,34 @@ def check_text(value: Any, label: str, max_length: int = MAX_NAME) -> str:
         EngineFailure: it is not a text, or an empty or a very long one.
 
     """
-    if not isinstance(value, str) or not 0 < len(value) <= max_length or not value.isprintable():
+    if not isinstance(value, str) or not 0 < len(value) <= MAX_NAME or not value.isprintable():
         found = describe_value(value)
-        raise EngineFailure(f"{label} is {found}, must be a line of 1 to {max_length} characters")
+        raise EngineFailure(f"{label} is {found}, must be a line of 1 to {MAX_NAME} characters")
     return value
+
+
+def check_version(column: Any, subject: str) -> tuple[str, str | None]:
+    """Check the version of the engine that is loaded.
+
+    Args:
+        column: an adapter or an importer.
+        subject: what it is called: "adapter" or "column".
+
+    Returns:
+        The version, and a sentence where the column does not support it.
+
+    Raises:
+        EngineFailure: it is not a PEP 440 version.
+
+    """
+    version, supported = check_text(column.version(), f"{column.name}: version()"), column.supported_versions
+    try:
+        if supported and not SpecifierSet(supported).contains(Version(version), prereleases=True):
+            words = f"supports versions {supported} of {column.package}, this is {version}"
+            return version, f"the {subject} {words}"
+    except InvalidVersion:
+        raise EngineFailure(f"{column.name}: version() is {version!r}, must be a PEP 440 version") from None
+    return version, None
 
 
 def check_declarations(adapter: Any) -> None:

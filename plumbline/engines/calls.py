@@ -97,16 +97,31 @@ def describe_engine(engine: str) -> EngineInfo:
     """
     try:
         return load_adapter(engine).describe()
-    except ModuleNotFoundError as error:
+    except (ModuleNotFoundError, AttributeError) as error:
+        return describe_missing(engine, error, "adapter")
+
+
+def describe_missing(name: str, error: ModuleNotFoundError | AttributeError, subject: str) -> EngineInfo:
+    """Describe an engine that cannot be loaded, or raise the error again where it is not the engine's.
+
+    Args:
+        name: of an engine or an importer, in the registry.
+        error: a module or an interface that is missing.
+        subject: what translates to the engine: "adapter" or "column".
+
+    Returns:
+        A description whose ``missing`` is a sentence.
+
+    """
+    if isinstance(error, ModuleNotFoundError):
         if (error.name or "").partition(".")[0] in _OWN_PACKAGES:
-            raise
-        return EngineInfo(engine, engine, "", (), f"{engine} is not installed here: {error}")
-    except AttributeError as error:  # an interface that this version does not have
-        package = declared_attribute(engine, "package")
-        if not isinstance(package, str):  # no class of that name
-            raise
-        version = metadata.version(package)
-        return EngineInfo(engine, engine, version, (), f"the adapter cannot use version {version}: {error}")
+            raise error
+        return EngineInfo(name, name, "", (), f"{name} is not installed here: {error}")
+    package = declared_attribute(name, "package")
+    if not isinstance(package, str):  # no class of that name
+        raise error
+    version = metadata.version(package)
+    return EngineInfo(name, name, version, (), f"the {subject} cannot use version {version}: {error}")
 
 
 def evaluate_states(engine: str, model: Model, states: Sequence[State]) -> Evaluation:

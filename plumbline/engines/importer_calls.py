@@ -8,20 +8,16 @@ from __future__ import annotations
 import io
 from collections.abc import Mapping, Sequence
 from contextlib import redirect_stdout
-from importlib import metadata
-
-from packaging.specifiers import SpecifierSet
 
 from plumbline.engines.adapter import EngineInfo
-from plumbline.engines.answers import check_numbers, check_text, describe_value
-from plumbline.engines.environments import BASE_REQUIREMENTS, declared_attribute
+from plumbline.engines.answers import check_numbers, check_version, describe_value
+from plumbline.engines.calls import describe_missing
 from plumbline.engines.registry import load_importer
 from plumbline.importers.importer import ModelFile, Reading
 from plumbline.importers.neutral_model import CanonicalState, ModelQuantities
 from plumbline.model.datatypes import EngineFailure
 from plumbline.processes.errors import describe_exception
 
-_OWN_PACKAGES = {"plumbline", "adapters", *BASE_REQUIREMENTS, ""}
 _FIELDS = {  # shapes, as of `plumbline.engines.answers.FIELDS`; V velocities
     "mass_matrix": "V V",
     "bias_force": "V",
@@ -49,17 +45,9 @@ def describe_importer(name: str) -> EngineInfo:
     """
     try:
         importer = load_importer(name)
-    except ModuleNotFoundError as error:
-        if (error.name or "").partition(".")[0] in _OWN_PACKAGES:
-            raise
-        return EngineInfo(name, name, "", (), f"{name} is not installed here: {error}")
-    except AttributeError as error:  # an interface that this version does not have
-        version = metadata.version(declared_attribute(name, "package"))
-        return EngineInfo(name, name, version, (), f"the column cannot use version {version}: {error}")
-    version, missing = check_text(importer.version(), f"{name}: version()"), None
-    supported = importer.supported_versions
-    if supported and not SpecifierSet(supported).contains(version, prereleases=True):
-        missing = f"the column supports versions {supported} of {importer.package}, this is {version}"
+    except (ModuleNotFoundError, AttributeError) as error:
+        return describe_missing(name, error, "column")
+    version, missing = check_version(importer, "column")
     return EngineInfo(name, importer.title, version, (), missing)
 
 

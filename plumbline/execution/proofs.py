@@ -139,13 +139,13 @@ def verify_certificates(
             failed = {"verdict": "failed", "reason": f"not checked: {outcome.failure}"}
             found[outcome.key] = {"file": str(path)} | (failed if outcome.failure else outcome.value)
             progress(len(found), len(paths), path.name)
-    if not any("digest" in record for record in found.values()):
-        return [found[k] for k in range(len(paths))]
+    records = [found[k] for k in range(len(paths))]
+    if not any("digest" in record for record in records):
+        return records
     known = [s for s in load_scenarios(catalogue()) if not reason_not_provable(s.model)]
     if expected is not None:
         known = [expected, *(s for s in known if s.digest != expected.digest)]
     numbers = [numbers_digest(s.model, s.state) for s in known]
-    records = [found[k] for k in range(len(paths))]
     for record in records:
         if "digest" in record:
             same = [s for s, own in zip(known, numbers, strict=True) if own == record["digest"]]
