@@ -15,6 +15,8 @@ import pytest
 from plumbline.processes.user_cache import user_cache_folder
 from tests.helpers.nightly_tests import SLOW, is_nightly, stale_entries
 
+os.environ.pop("COLUMNS", None)  # GNU readline sets it for processes of pytest-xdist; lines would wrap
+
 ALLOWED_SKIPS = {  # pattern of the skip's reason: why continuous integration cannot run the test
     r"root may read everything": "the test needs a user without root's permissions",
     r"`make importers` installs it": "the other importers' wheels are large and optional",

@@ -32,7 +32,6 @@ def certificate(tmp_path_factory):
     folder = tmp_path_factory.mktemp("certificates")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PLUMBLINE_CACHE", str(folder / "cache"))
-        patch.delenv("COLUMNS", raising=False)  # a narrow table breaks its headings
         result = type_command("prove", "tumbling-ball", "--duration", 0.25, "--out", folder)
     assert result.exit_code == 0, result.output
     return folder / "tumbling-ball.json.gz", result.output
