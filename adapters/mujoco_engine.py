@@ -212,7 +212,11 @@ class Mujoco(MetamorphicHooks):
                 before = column[-1]
                 column = [(RATIO**power * x - y) / (RATIO**power - 1) for y, x in pairwise(column)]
             limit[name], change[name] = column[0], column[0] - before
-        error = np.array([_largest_norm(change["r"]), 2 * _largest_norm(change["p"])])
+        error = np.array([_largest_norm(change[name]) for name in ("r", "p", "v")])
+        error[1] *= 2  # |δp| of a unit quaternion is half the rotation angle
+        before = limit["p"] - change["p"], limit["pdot"] - change["pdot"]
+        spins = [kinematics.angular_velocity(*pair) for pair in (before, (limit["p"], limit["pdot"]))]
+        error = np.append(error, _largest_norm(spins[1] - spins[0]))
         return replace(runs[-1], **limit, limit_error=error)
 
     def _sampled_run(

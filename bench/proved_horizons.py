@@ -42,7 +42,7 @@ def departure(
         run = load_adapter(engine).simulate(scenario.model, scenario.state, times, integrator, resolution)
     except (Unsupported, EngineFailure) as error:
         return str(error)
-    left = first_departure(times, position_error(run.r, proof.trajectory.r), proof.position_radius)
+    left = first_departure(times, position_error(run.r, proof.trajectory.r), proof.radius["position"])
     return f"not within {times[-1]:g}" if left is None else f"{left:.2f}"
 
 

@@ -332,7 +332,7 @@ class ScenarioRun:
                 "horizon": truth.horizon,
                 "growth": float(truth.growth[-1]),
                 "truth": truth.method,
-                "truth_uncertainty": float(truth.position_uncertainty[-1]),
+                "truth_uncertainty": float(truth.uncertainty["position"][-1]),
             }
         return about
 

@@ -24,10 +24,10 @@ from plumbline.measurements.single_steps import MAX_STEP_BODIES, STEP_STATES, st
 from plumbline.model.datatypes import Array, Model, State, Trajectory
 from plumbline.model.invariants import (
     INVARIANT_UNITS,
+    MOTION_UNITS,
     Invariants,
-    attitude_error,
     compute_invariants,
-    position_error,
+    motion_errors,
 )
 from plumbline.model.kinematics import angular_velocity, with_joint_coordinates
 from plumbline.model.step_methods import classical_runge_kutta
@@ -323,7 +323,7 @@ class _MotionTolerance:
     """What a row of a run compares: the running maximum of a difference up to a time with a tolerance."""
 
     row: Row
-    quantity: str  # "position", "attitude", or an invariant
+    quantity: str  # of `MOTION_UNITS`, or an invariant
     tolerance: float
     last_sample: int
 
@@ -335,7 +335,7 @@ def _motion_tolerance(row: Row, times: Array) -> _MotionTolerance | None:
     the uncertainty that a mistaken motion would have.
     """
     quantity = row.quantity.removesuffix("_limit")
-    if quantity not in ("position", "attitude", *INVARIANT_UNITS) or not row.tolerance:
+    if quantity not in (*MOTION_UNITS, *INVARIANT_UNITS) or not row.tolerance:
         return None
     if quantity in INVARIANT_UNITS and row.value == 0:
         return None
@@ -492,10 +492,7 @@ def _motion_effects(
         if one.true is not true:
             true = one.true
             invariants = compute_invariants(motion.model, true) if quantities & set(INVARIANT_UNITS) else None
-        found = {
-            "position": position_error(one.run.r, true.r),
-            "attitude": attitude_error(one.run.p, true.p),
-        }
+        found = motion_errors(one.run, true)
         if invariants is not None:
             own = compute_invariants(motion.model, one.run)
             for quantity in quantities & set(INVARIANT_UNITS):

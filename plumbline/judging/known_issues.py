@@ -43,7 +43,7 @@ from plumbline.judging.state import SINGULAR_POSE, STATE_UNITS
 from plumbline.measurements.relation_result import REPEATABILITY, UNEXPLAINED
 from plumbline.measurements.run_relations import REVERSED_IN_TIME
 from plumbline.measurements.state_relations import REDESCRIPTIONS, STATE_RELATIONS, WELDED_HALVES
-from plumbline.model.invariants import INVARIANT_UNITS
+from plumbline.model.invariants import INVARIANT_UNITS, MOTION_UNITS
 from plumbline.scenario.errors import Problem, ScenarioError, did_you_mean, shorten
 from plumbline.scenario.generator import MECHANISM_PREFIX, MOTION_PREFIX, RANDOM_FAMILY
 from plumbline.scenario.loader import catalogue
@@ -432,7 +432,7 @@ def _problem(
 
 def _quantities() -> set[str]:
     """Every quantity that a row may have, except of information."""
-    trajectory = ("order", "position_limit", "attitude_limit")
+    trajectory = ("order", *(f"{name}_limit" for name in MOTION_UNITS))
     long_runs = ("all_long", "energy_drift_long_growth", *(f"{name}_long" for name in INVARIANT_UNITS))
     own = (*REDESCRIPTIONS, WELDED_HALVES, REVERSED_IN_TIME, REPEATABILITY)
     relations = (*(r.name for r in STATE_RELATIONS), *own)

@@ -20,7 +20,14 @@ from plumbline.measurements.order_and_limit import (
 )
 from plumbline.measurements.refinement_study import run_samples
 from plumbline.model.datatypes import Array, Integrator, Model, Trajectory
-from plumbline.model.invariants import Invariants, compute_invariants, invariant_scales
+from plumbline.model.invariants import (
+    MOTION_UNITS,
+    Invariants,
+    compute_invariants,
+    invariant_scales,
+    motion_scales,
+)
+from plumbline.model.kinematics import angular_velocity
 from plumbline.truth.ground_truth import RUN_ROUNDING, MotionTruth
 
 
@@ -35,8 +42,9 @@ class RefinementAnalysis:
     runs: Sequence[RefinementRun]
     horizon: float  # s, up to which positions may be compared
     finest: Trajectory = field(init=False)
-    positions: list[Array] = field(init=False)  # per run (T, N, 3) m; NaN where the run failed
-    attitudes: list[Array] = field(init=False)  # per run (T, N, 4)
+    # by the names of `MOTION_UNITS`, per run (T, N, ·); NaN where the run failed
+    samples: dict[str, list[Array]] = field(init=False)
+    motion_scales: dict[str, float] = field(init=False)  # of rounding in them
     scaled_states: list[Array] = field(init=False)  # per run (T, N, 6): r and ṙ over their scales
     invariant_drifts: list[Invariants | None] = field(init=False)
     invariant_scales: dict[str, float] = field(init=False)  # of the true motion, units as `INVARIANT_UNITS`
@@ -48,14 +56,16 @@ class RefinementAnalysis:
         last = self.runs[-1].trajectory
         assert last is not None
         self.finest = last
-        self.positions, self.attitudes = run_samples(self.runs, "r"), run_samples(self.runs, "p")
+        r, p, v, pdot = (run_samples(self.runs, name) for name in ("r", "p", "v", "pdot"))
+        omega = [angular_velocity(*pair) for pair in zip(p, pdot, strict=True)]
+        self.samples = dict(zip(MOTION_UNITS, (r, p, v, omega), strict=True))
+        self.motion_scales = motion_scales(self.model, self.truth.trajectory, self.truth.length)
         self.invariant_scales = invariant_scales(self.model, self.truth.trajectory, self.truth.length)
         # Positions alone may converge faster than the method: symplectic Euler from a state without
         # torque is a leapfrog in r, and shows its order 1 in ṙ only.
         sizes = self.truth.length, self.invariant_scales["gap_rate"]
         self.scaled_states = [
-            np.concatenate([r / sizes[0], v / sizes[1]], axis=-1)
-            for r, v in zip(self.positions, run_samples(self.runs, "v"), strict=True)
+            np.concatenate([a / sizes[0], b / sizes[1]], axis=-1) for a, b in zip(r, v, strict=True)
         ]
         trajectories = [run.trajectory for run in self.runs]
         self.invariant_drifts = [
@@ -84,9 +94,10 @@ class RefinementAnalysis:
         return {"alias_of": alias, "cpu_time": sum(run.cpu_time for run in self.runs)}
 
     @property
-    def limit_error(self) -> Array:
-        """(2,) m and rad: of the finest run, where it is itself a limit."""
-        return np.zeros(2) if self.finest.limit_error is None else self.finest.limit_error
+    def limit_error(self) -> dict[str, float]:
+        """Of each name of `MOTION_UNITS`, in its unit: of the finest run, where it is itself a limit."""
+        found = np.zeros(len(MOTION_UNITS)) if self.finest.limit_error is None else self.finest.limit_error
+        return dict(zip(MOTION_UNITS, found.tolist(), strict=True))
 
     @property
     def rounding_description(self) -> str:

@@ -30,10 +30,18 @@ from plumbline.judging.rows import (
 from plumbline.judging.state import SINGULAR_POSE
 from plumbline.measurements.order_and_limit import ORDER_CHANGE_FACTOR, ORDER_MARGIN
 from plumbline.model.datatypes import Array, Integrator, Model, Trajectory
-from plumbline.model.invariants import INVARIANT_UNITS, attitude_error, position_error
+from plumbline.model.invariants import (
+    INVARIANT_UNITS,
+    MOTION_UNITS,
+    attitude_error,
+    motion_error,
+    motion_samples,
+    position_error,
+)
 from plumbline.truth.ground_truth import DETECTABLE_PARAMETER_ERROR, MotionTruth
 
-LIMIT_QUANTITIES = ("position_limit", "attitude_limit")
+LIMIT_QUANTITIES = tuple(f"{quantity}_limit" for quantity in MOTION_UNITS)
+FINEST_RUN_SHOWN = ("position", "attitude")  # quantities with a row of information on the finest run
 
 
 def judge_trajectory(
@@ -93,13 +101,12 @@ def judge_trajectory(
 def _limit_deviation(study: RefinementAnalysis, row: Row) -> Deviation:
     """By how much a limit that disagrees is off the truth, in the window of its row."""
     count = int(np.searchsorted(study.times, row.compared_until or 0.0, side="right"))
-    if row.quantity == "position_limit":
-        vectors = study.extrapolated_limit(study.positions).y - study.truth.trajectory.r
-    else:
-        true = study.truth.trajectory.p
-        p = study.extrapolated_limit(study.attitudes).y
-        p = p / (np.linalg.norm(p, axis=-1) * np.sign(np.sum(p * true, axis=-1)))[..., None]
-        vectors = 2 * (p - true)  # |δp| of a unit quaternion is half the rotation angle
+    quantity = row.quantity.removesuffix("_limit")
+    true = motion_samples(study.truth.trajectory)[quantity]
+    limit = study.extrapolated_limit(study.samples[quantity]).y
+    if quantity == "attitude":
+        limit = limit / (np.linalg.norm(limit, axis=-1) * np.sign(np.sum(limit * true, axis=-1)))[..., None]
+    vectors = (limit - true) * _per_component(quantity)
     tolerance = np.full(vectors.shape[:-1], row.tolerance)  # at the window's end, where it is largest
     return Deviation(vectors[:count], tolerance[:count])
 
@@ -123,33 +130,33 @@ def singular_motion_row(context: RowContext, level: Level, integrator: str, note
 
 
 def trajectory_rows(study: RefinementAnalysis) -> list[Row]:
-    """Judge the order of an integrator, and its positions and attitudes against the truth.
+    """Judge the order of an integrator, and its positions, attitudes and velocities against the truth.
 
     Args:
         study: the refinement study.
 
     Returns:
-        A row on the order, for fixed steps; then per quantity one on the limit, and for information one on
-        the finest run.
+        A row on the order, for fixed steps; then per quantity one on the limit, and of positions and
+        attitudes for information one on the finest run.
 
     """
     truth = study.truth
     rows = [_order_row(study)] if study.has_steps else []
-    rows += _rows_against_truth(
-        study,
-        _ComparedQuantity(
-            "position", "m", study.positions, truth.trajectory.r,
-            truth.position_uncertainty, truth.detectable_position, study.limit_error[0], truth.length,
-        ),
-    )  # fmt: skip
-    rows += _rows_against_truth(
-        study,
-        _ComparedQuantity(
-            "attitude", "rad", study.attitudes, truth.trajectory.p,
-            truth.attitude_uncertainty, truth.detectable_attitude, study.limit_error[1], 2.0,
-        ),
-    )  # fmt: skip
+    for name, true in motion_samples(truth.trajectory).items():
+        found = _rows_against_truth(
+            study,
+            _ComparedQuantity(
+                name, MOTION_UNITS[name], study.samples[name], true, truth.uncertainty[name],
+                truth.detectable[name], study.limit_error[name], study.motion_scales[name],
+            ),
+        )  # fmt: skip
+        rows += found if name in FINEST_RUN_SHOWN else found[:1]
     return rows
+
+
+def _per_component(quantity: str) -> float:
+    """Unit of a quantity per unit of its samples: |δp| of a unit quaternion is half the rotation angle."""
+    return 2.0 if quantity == "attitude" else 1.0
 
 
 def _order_row(study: RefinementAnalysis) -> Row:
@@ -187,25 +194,16 @@ def _order_row(study: RefinementAnalysis) -> Row:
 
 @dataclass(frozen=True, eq=False)
 class _ComparedQuantity:
-    """Positions or attitudes: the samples of all runs and the truth."""
+    """A quantity of `MOTION_UNITS`: the samples of all runs and the truth."""
 
     name: str
     unit: str
-    samples: Sequence[Array]  # per run (T, N, 3) or (T, N, 4)
+    samples: Sequence[Array]  # per run (T, N, ·)
     true: Array
     truth_uncertainty: Array  # (T,) in ``unit``
     detectable: Array  # (T,) in ``unit``: effect of the smallest mistake that must be detected
     limit_error: float  # in ``unit``: of runs that are themselves the limit of softer ones
     scale: float  # of rounding, in ``unit``
-
-    @property
-    def per_component(self) -> float:
-        """``unit`` per unit of the samples: |δp| of a unit quaternion is half the rotation angle."""
-        return 1.0 if self.name == "position" else 2.0
-
-    def error(self, a: Array, b: Array) -> Array:
-        """(T,) largest difference of any body, in ``unit``."""
-        return position_error(a, b) if self.name == "position" else attitude_error(a, b)
 
 
 @dataclass(frozen=True)
@@ -226,8 +224,8 @@ def _rows_against_truth(study: RefinementAnalysis, quantity: _ComparedQuantity) 
         limit = study.extrapolated_limit(samples)
     except ValueError as error:
         return [make_row("trajectory", method, f"{name}_limit", Verdict.UNRESOLVED, str(error), unit)]
-    off = np.maximum.accumulate(quantity.error(limit.y, quantity.true))
-    limit_uncertainty = quantity.per_component * limit.uncertainty + quantity.limit_error
+    off = np.maximum.accumulate(motion_error(name, limit.y, quantity.true))
+    limit_uncertainty = _per_component(name) * limit.uncertainty + quantity.limit_error
     rounding = quantity.scale * study.rounding
     tolerance = limit_uncertainty + quantity.truth_uncertainty + rounding
     found = _judge_windows(study, quantity, off, tolerance)
@@ -245,8 +243,8 @@ def _rows_against_truth(study: RefinementAnalysis, quantity: _ComparedQuantity) 
         "uncertainty": float(limit_uncertainty[at] + quantity.truth_uncertainty[at]),
         **study.common_fields,
     }
-    own = float(np.maximum.accumulate(quantity.error(samples[-1], quantity.true))[at])
-    estimate = float(np.max(quantity.error(samples[-1], limit.y)[: at + 1]) + tolerance[at])
+    own = float(np.maximum.accumulate(motion_error(name, samples[-1], quantity.true))[at])
+    estimate = float(np.max(motion_error(name, samples[-1], limit.y)[: at + 1]) + tolerance[at])
     finest = study.runs[-1].resolution
     limit_row = make_row(
         "trajectory",
@@ -290,7 +288,7 @@ def _judge_windows(
     study: RefinementAnalysis, quantity: _ComparedQuantity, off: Array, tolerance: Array
 ) -> _WindowVerdict:
     """The longest window that decides; where none does, the longest one and the reason."""
-    name, unit, detectable = quantity.name, quantity.unit, quantity.detectable
+    name, unit, detectable = quantity.name.replace("_", " "), quantity.unit, quantity.detectable
     is_trusted = not study.has_steps or study.observed.is_asymptotic or study.observed.is_at_rounding_floor
 
     def judge_window(at: int) -> _WindowVerdict:
@@ -331,8 +329,8 @@ def _convergence_columns(study: RefinementAnalysis) -> Columns:
     for i, run in enumerate(study.runs):
         steps = run.trajectory.steps if run.trajectory else 0
         for name, error in (
-            ("position", position_error(study.positions[i][:end], true.r[:end])),
-            ("attitude", attitude_error(study.attitudes[i][:end], true.p[:end])),
+            ("position", position_error(study.samples["position"][i][:end], true.r[:end])),
+            ("attitude", attitude_error(study.samples["attitude"][i][:end], true.p[:end])),
         ):
             records.append((run.resolution, name, np.max(error), run.cpu_time, steps, orders[i]))
     names = ("resolution", "quantity", "error", "cost", "steps", "order")
@@ -352,13 +350,13 @@ def _time_series_columns(study: RefinementAnalysis) -> Columns:
         "tolerance": missing,
     }
     try:
-        limit = study.extrapolated_limit(study.positions)
+        limit = study.extrapolated_limit(study.samples["position"])
     except ValueError:
         pass
     else:
         columns["limit_error"] = position_error(limit.y, true.r)
         rounding = study.truth.length * study.rounding
-        columns["tolerance"] = limit.uncertainty + study.truth.position_uncertainty + rounding
+        columns["tolerance"] = limit.uncertainty + study.truth.uncertainty["position"] + rounding
     for name in INVARIANT_UNITS:
         series = getattr(last, name)
         columns[name] = missing if series is None else np.max(np.linalg.norm(series, axis=-1), axis=1)

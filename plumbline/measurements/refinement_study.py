@@ -105,16 +105,18 @@ def run_samples(runs: Sequence[RefinementRun], name: str) -> list[Array]:
         name: of a field of `Trajectory`.
 
     Returns:
-        Per run (T, N, width); NaN where the run failed. Quaternions have the signs of the finest run's.
+        Per run (T, N, width); NaN where the run failed. Quaternions and their rates have the signs of the
+        finest run's.
 
     """
     assert runs[-1].trajectory is not None
-    fine: Array = getattr(runs[-1].trajectory, name)
+    finest = runs[-1].trajectory
+    fine: Array = getattr(finest, name)
     found = []
     for run in runs:
         y = np.full_like(fine, np.nan) if run.trajectory is None else getattr(run.trajectory, name)
-        if name == "p":
-            y = y * np.where(np.sum(y * fine, axis=-1, keepdims=True) < 0, -1.0, 1.0)
+        if name in ("p", "pdot") and run.trajectory is not None:
+            y = y * np.where(np.sum(run.trajectory.p * finest.p, axis=-1, keepdims=True) < 0, -1.0, 1.0)
         found.append(y)
     return found
 

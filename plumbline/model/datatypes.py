@@ -114,7 +114,8 @@ class Trajectory:
     steps: int  # steps the integrator took
     # (N, 2) rad or m: joint coordinates at t[0], angles unwrapped; None: angles are principal values there
     initial_x: Array | None = None
-    # (2,) m and rad: uncertainty of positions and attitudes, where the run is the limit of softer ones
+    # (4,) m, rad, m/s, rad/s: uncertainty of positions, attitudes, ṙ and ω′, where the run is the limit of
+    # softer ones
     limit_error: Array | None = None
 
 

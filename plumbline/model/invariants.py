@@ -42,6 +42,66 @@ def position_error(a: Array, b: Array) -> Array:
     return np.asarray(np.max(np.linalg.norm(a - b, axis=-1), axis=-1))
 
 
+def motion_samples(run: Trajectory) -> dict[str, Array]:
+    """Return what is compared of a motion, by the names of `MOTION_UNITS`.
+
+    Args:
+        run: T samples of N bodies.
+
+    Returns:
+        r (T, N, 3), p (T, N, 4), ṙ (T, N, 3) in the world frame and ω′ (T, N, 3) in the body frame.
+
+    """
+    omega = angular_velocity(run.p, run.pdot)
+    return {"position": run.r, "attitude": run.p, "velocity": run.v, "angular_velocity": omega}
+
+
+def motion_error(quantity: str, a: Array, b: Array) -> Array:
+    """Return the largest difference of any body between two motions.
+
+    Args:
+        quantity: a name of `MOTION_UNITS`.
+        a: (..., N, ·) samples of the first.
+        b: (..., N, ·) samples of the second.
+
+    Returns:
+        (...) differences in the quantity's unit.
+
+    """
+    return attitude_error(a, b) if quantity == "attitude" else position_error(a, b)
+
+
+def motion_errors(a: Trajectory, b: Trajectory) -> dict[str, Array]:
+    """Return the largest difference of any body between two motions, up to each time.
+
+    Args:
+        a: T samples of the first.
+        b: T samples of the second.
+
+    Returns:
+        (T,) running maxima for each name of `MOTION_UNITS`, in its unit.
+
+    """
+    pairs, others = motion_samples(a), motion_samples(b)
+    return {q: np.maximum.accumulate(motion_error(q, y, others[q])) for q, y in pairs.items()}
+
+
+def motion_scales(model: Model, run: Trajectory, length: float) -> dict[str, float]:
+    """Return the scales of rounding in a motion.
+
+    Args:
+        model: the mechanism.
+        run: T samples of its motion.
+        length: the length of the stretched mechanism [m].
+
+    Returns:
+        A scale for each name of `MOTION_UNITS`, in its unit.
+
+    """
+    speed = invariant_scales(model, run, length)["gap_rate"]
+    return {"position": length, "attitude": 2.0, "velocity": speed, "angular_velocity": 2 * speed / length}
+
+
 def first_departure(t: Array, error: Array, radius: float | Array) -> float | None:
     """Find when a run has provably left the true motion.
 
@@ -139,6 +199,7 @@ class Invariants:
     work_uncertainty: float  # J: of W by quadrature over the samples
 
 
+MOTION_UNITS = {"position": "m", "attitude": "rad", "velocity": "m/s", "angular_velocity": "rad/s"}
 INVARIANT_UNITS = {
     "energy_drift": "J",
     "momentum_drift": "kg m²/s",

@@ -20,7 +20,7 @@ from plumbline.engines.registry import load_adapter
 from plumbline.judging.invariant_drift import invariant_rows
 from plumbline.judging.refinement_analysis import RefinementAnalysis
 from plumbline.judging.rows import Row, RowContext, Verdict
-from plumbline.judging.trajectory import trajectory_rows
+from plumbline.judging.trajectory import FINEST_RUN_SHOWN, LIMIT_QUANTITIES, trajectory_rows
 from plumbline.measurements.relation_result import OTHER_FORMULATION_PREFIX
 from plumbline.measurements.state_relations import (
     STATE_RELATIONS,
@@ -30,6 +30,7 @@ from plumbline.measurements.state_relations import (
     unchanged,
 )
 from plumbline.model.datatypes import Array, Integrator, StateQuantities
+from plumbline.model.invariants import MOTION_UNITS, motion_samples
 from plumbline.model.step_methods import JointSpaceMethod, describe_method
 from plumbline.model.welding import split_bodies
 from plumbline.reproduce.engine_client import EngineClient
@@ -40,7 +41,7 @@ from plumbline.truth.ground_truth import MotionTruth, motion_truth
 from plumbline.truth.rounding_bound import state_rounding_bound
 from plumbline.truth.step_comparison import FormulaSteps
 
-LIMITS = ("position_limit", "position", "attitude_limit", "attitude")
+LIMITS = (*LIMIT_QUANTITIES, *FINEST_RUN_SHOWN)
 WORK_SAMPLES = 64  # of a run where the work of moments and drag is integrated
 TINY = 1e-300
 
@@ -384,8 +385,7 @@ class ConvergenceMeasure:
         groups = [wanted] if of_invariants else [g for g in ({"order"}, set(LIMITS)) if g & wanted]
         ratios = [max((_excess(rows[q]) for q in group if q in rows), default=0.0) for group in groups]
         series, limits = self._disputed_series(analysis, rows)
-        end = truth.trajectory
-        expected = {"position": end.r[-1], "attitude": end.p[-1]}
+        expected = {q: samples[-1] for q, samples in motion_samples(truth.trajectory).items()}
         uncertain = {
             q: float(row.tolerance or 0.0) / (2 if q == "attitude" else 1) for q, row in limits.items()
         }
@@ -415,9 +415,9 @@ class ConvergenceMeasure:
             return drifts, {q: rows[q] for q in off}
         if not set(LIMITS) & set(self.quantities):
             return {}, {}
-        limits = {q: rows[f"{q}_limit"] for q in ("position", "attitude") if rows.get(f"{q}_limit")}
+        limits = {q: rows[f"{q}_limit"] for q in MOTION_UNITS if rows.get(f"{q}_limit")}
         limits = {q: row for q, row in limits.items() if row.tolerance}
-        return {q: getattr(analysis, f"{q}s") for q in limits}, limits
+        return {q: analysis.samples[q] for q in limits}, limits
 
 
 def _zeros(case: ReproductionCase, invariant: str) -> Array:

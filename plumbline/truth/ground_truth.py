@@ -7,7 +7,7 @@ difference from a method of another kind (`trajectory`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from plumbline.engines.registry import load_adapter
 from plumbline.model.datatypes import KINDS, Array, EngineFailure, Model, State, StateQuantities, Trajectory
-from plumbline.model.invariants import attitude_error, position_error
+from plumbline.model.invariants import MOTION_UNITS, motion_errors, motion_scales
 from plumbline.model.kinematics import complete_state
 from plumbline.model.loops import MIN_MOTION_SINGULAR_VALUE, assembled
 from plumbline.model.sampling import derive_seed
@@ -50,11 +50,10 @@ class MotionTruth:
     """The true motion at T sample times, and what a comparison with it can resolve."""
 
     trajectory: Trajectory
-    position_uncertainty: Array  # (T,) m, running maximum
-    attitude_uncertainty: Array  # (T,) rad, running maximum
+    uncertainty: Mapping[str, Array]  # by the names of `MOTION_UNITS` (T,) in its unit, running maximum
     growth: Array  # (T,) of a small perturbation, running maximum
-    detectable_position: Array  # (T,) m, smallest effect up to t of a parameter that is wrong by 1e-4
-    detectable_attitude: Array  # (T,) rad, the same
+    # by the same names (T,) in its unit: smallest effect up to t of a parameter that is wrong by 1e-4
+    detectable: Mapping[str, Array]
     length: float  # m, of the stretched chain: the scale of rounding in positions
     method: str
     conflict: str = ""  # how the two methods differ by more than rounding explains; empty where they do not
@@ -66,7 +65,7 @@ class MotionTruth:
         from plumbline.truth.sensitivity import predictability_horizon
 
         rounding = self.length * RUN_ROUNDING
-        return predictability_horizon(self.trajectory.t, self.growth, rounding, self.position_uncertainty)
+        return predictability_horizon(self.trajectory.t, self.growth, rounding, self.uncertainty["position"])
 
     @property
     def wanted_time(self) -> float:
@@ -144,29 +143,26 @@ def motion_truth(
     if max_compiled_bodies is None:
         max_compiled_bodies = trajectory.MAX_COMPILED_BODIES
     truth = trajectory.trajectory_truth(model, state, times, closed_form, max_compiled_bodies, proof)
-    growth, r, p = sensitivity.perturbation_growth_and_runs(
+    growth, runs = sensitivity.perturbation_growth_and_runs(
         model, state, times, perturbed_models(model, state)
     )
     growth, length = np.maximum.accumulate(growth), float(np.sum(stretched_length(model)))
     if not model.is_chain:  # what is free or slides leaves the stretched mechanism
         length = max(length, float(np.max(np.linalg.norm(truth.trajectory.r, axis=-1))))
-    excess = np.maximum(
-        truth.position_uncertainty / (length * RUN_ROUNDING * growth),
-        truth.attitude_uncertainty / (2 * RUN_ROUNDING * growth),
-    )
-    # not a number: one of the two is not finite
+    scales = motion_scales(model, truth.trajectory, length)
+    excess = np.max([truth.uncertainty[q] / (scales[q] * RUN_ROUNDING * growth) for q in scales], axis=0)
+    # not a number: one of them is not finite
     worst, differ = int(np.argmax(excess)), not np.all(excess <= 1)
     return MotionTruth(
         truth.trajectory,
-        truth.position_uncertainty,
-        truth.attitude_uncertainty,
+        truth.uncertainty,
         growth,
-        *detectable_effect(model, r, p),
+        detectable_effect(model, runs),
         length=length,
         method=truth.method,
         conflict=f"{TRUTHS_DIFFER}; at t = {times[worst]:g} s they differ by "
-        f"{truth.position_uncertainty[worst]:.2g} m and {truth.attitude_uncertainty[worst]:.2g} rad, "
-        f"{excess[worst]:.2g} times what rounding explains; methods: {truth.method}"
+        f"{', '.join(f'{truth.uncertainty[q][worst]:.2g} {unit}' for q, unit in MOTION_UNITS.items())}; "
+        f"up to {excess[worst]:.2g} times what rounding explains; methods: {truth.method}"
         if differ
         else "",
         singular=singular,
@@ -275,28 +271,26 @@ def _with_longer_slides(model: Model, state: State, size: float) -> dict[str, Ar
     return {"x": factors * state.x, "xdot": factors * state.xdot}
 
 
-def detectable_effect(model: Model, r: Array, p: Array) -> tuple[Array, Array]:
-    """Measure the smallest effect of the parameter errors on positions and attitudes.
+def detectable_effect(model: Model, runs: Sequence[Trajectory]) -> dict[str, Array]:
+    """Measure the smallest effect of the parameter errors on a motion.
 
     Errors without effect in this scenario (the mass of a single body, any parameter of a body at rest) are
     ignored.
 
     Args:
         model: the mechanism.
-        r: (1 + K, T, N, 3) [m] positions of the true motion, then of K perturbed models.
-        p: (1 + K, T, N, 4) attitudes of the same motions.
+        runs: the true motion, then those of K perturbed models.
 
     Returns:
-        Effects (T,) [m] and (T,) [rad], running maxima.
+        Effects (T,), running maxima, for each name of `MOTION_UNITS` in its unit.
 
     """
-    scale = DETECTABLE_PARAMETER_ERROR * float(np.sum(stretched_length(model)))
-    return (
-        least_detectable_effect([position_error(r[0], wrong) for wrong in r[1:]], 1e-3 * scale),
-        least_detectable_effect(
-            [attitude_error(p[0], wrong) for wrong in p[1:]], 1e-3 * DETECTABLE_PARAMETER_ERROR
-        ),
-    )
+    scales = motion_scales(model, runs[0], float(np.sum(stretched_length(model)))) | {"attitude": 1.0}
+    effects = [motion_errors(runs[0], wrong) for wrong in runs[1:]]
+    return {
+        q: least_detectable_effect([e[q] for e in effects], 1e-3 * DETECTABLE_PARAMETER_ERROR * scale)
+        for q, scale in scales.items()
+    }
 
 
 def least_detectable_effect(effects: Sequence[Array], threshold: float) -> Array:

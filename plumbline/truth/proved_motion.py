@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State, Trajectory
+from plumbline.model.invariants import motion_samples
 from plumbline.model.kinematics import quaternion_rate
 from plumbline.processes.record_encoding import UnfitRecord, decode_record, encode_record
 from plumbline.processes.user_cache import (
@@ -33,8 +35,9 @@ class ProvedMotion:
     """The midpoints of an enclosure, rounded to double, and bounds of their error that hold for certain."""
 
     trajectory: Trajectory
-    position_radius: Array  # (T,) m, largest of any body up to each time, with the rounding to double
-    attitude_radius: Array  # (T,) rad, the same
+    # by the names of `MOTION_UNITS` (T,) in its unit, largest of any body up to each time, with the rounding
+    # to double
+    radius: Mapping[str, Array]
     enclosure_radius: float  # m, largest of the enclosure's positions, without the rounding to double
 
     @property
@@ -56,27 +59,24 @@ def round_enclosure(enclosure: Enclosure) -> ProvedMotion:
         The motion with its error bounds.
 
     """
-    r, position_error = _rounded(enclosure.r)
-    p, attitude_error = _rounded(enclosure.p)
-    v, _ = _rounded(enclosure.v)
-    omega, _ = _rounded(enclosure.omega)
-    times = np.array(enclosure.times)
-    return ProvedMotion(
-        Trajectory(times, r, p, v, quaternion_rate(p, omega), 0),
-        np.maximum.accumulate(position_error),
-        # unit quaternions at a distance d differ by a rotation of 4 asin(d / 2), others by 2 asin(d)
-        np.maximum.accumulate(2.1 * attitude_error),
-        enclosure.radius("r"),
-    )
+    balls = [getattr(enclosure, name) for name in ("r", "p", "v", "omega")]
+    r, p, v, omega = (np.frompyfunc(lambda x: float(x.mid()), 1, 1)(y).astype(float) for y in balls)
+    run = Trajectory(np.array(enclosure.times), r, p, v, quaternion_rate(p, omega), 0)
+    radius = {
+        name: np.maximum.accumulate(_distance(of_name, rounded))
+        for (name, rounded), of_name in zip(motion_samples(run).items(), balls, strict=True)
+    }
+    # unit quaternions at a distance d differ by a rotation of 4 asin(d / 2), others by 2 asin(d)
+    radius["attitude"] = 2.1 * radius["attitude"]
+    return ProvedMotion(run, radius, enclosure.radius("r"))
 
 
-def _rounded(balls: Array) -> tuple[Array, Array]:
-    """Midpoints (T, N, …) as doubles, and (T,) the largest distance of any body's vector from its balls."""
+def _distance(balls: Array, rounded: Array) -> Array:
+    """(T,) largest distance of any body's vector from its balls (T, N, …)."""
     arb = import_truth_tool("flint").arb
-    rounded = np.frompyfunc(lambda ball: float(ball.mid()), 1, 1)(balls).astype(float)
     distance = np.frompyfunc(lambda ball, x: float(abs(ball - arb(x)).upper()), 2, 1)(balls, rounded)
     up = 1 + 1e-12  # for the roundings here
-    return rounded, np.max(np.linalg.norm(distance.astype(float), axis=-1), axis=-1) * up
+    return np.asarray(np.max(np.linalg.norm(distance.astype(float), axis=-1), axis=-1) * up)
 
 
 def store_proof(model: Model, state: State, times: Array, proof: ProvedMotion) -> str:

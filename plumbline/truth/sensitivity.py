@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from plumbline.model.datatypes import Array, Model, State
+from plumbline.model.datatypes import Array, Model, State, Trajectory
 from plumbline.model.invariants import attitude_error, position_error
 from plumbline.model.kinematics import (
     angular_velocity,
@@ -91,7 +91,7 @@ def perturbation_growth(model: Model, state: State, times: Array) -> Array:
 
 def perturbation_growth_and_runs(
     model: Model, state: State, times: Array, other_models: Sequence[tuple[Model, State]]
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, list[Trajectory]]:
     """Compute the growth of small perturbations, and motions of other models in the same batch.
 
     Args:
@@ -101,8 +101,7 @@ def perturbation_growth_and_runs(
         other_models: K models of as many bodies, with their initial states.
 
     Returns:
-        The growth (T,) of `perturbation_growth`, and of the unperturbed motion and the K others the positions
-        r (1 + K, T, N, 3) [m] and attitudes p (1 + K, T, N, 4).
+        The growth (T,) of `perturbation_growth`, and 1 + K runs: the unperturbed motion and the others.
 
     """
     neighbours = range(1, PERTURBATION_COUNT + 1)
@@ -110,7 +109,7 @@ def perturbation_growth_and_runs(
     models = [model] * (PERTURBATION_COUNT + 1) + [m for m, _ in other_models]
     r, p, v, pdot, x = _integrate_batch(models, states, times)
     unperturbed = [0, *range(PERTURBATION_COUNT + 1, len(states))]
-    runs = r[unperturbed], p[unperturbed]
+    runs = [Trajectory(times, r[k], p[k], v[k], pdot[k], 0) for k in unperturbed]
     size, growth = np.full(PERTURBATION_COUNT, PERTURBATION_SIZE), np.empty((PERTURBATION_COUNT, len(times)))
     earlier_growth, done, arm = np.ones(PERTURBATION_COUNT), 0, 1e-3
     while True:
@@ -122,7 +121,7 @@ def perturbation_growth_and_runs(
         far = np.flatnonzero(np.any(distance > RENORMALISATION_GROWTH * PERTURBATION_SIZE, axis=0))
         stop = max(int(far[0]), 1) if len(far) else distance.shape[1] - 1
         if done + stop >= len(times) - 1:
-            return np.asarray(np.maximum(np.max(growth, axis=0), 1.0)), *runs
+            return np.asarray(np.maximum(np.max(growth, axis=0), 1.0)), runs
         base, *moved = (
             replace(
                 project_to_manifold(model, *(y[k, stop] for y in (r, p, v, pdot))), x=x[k, stop, : model.n]

@@ -8,14 +8,15 @@ comparison with quad precision shows (tests).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State, Trajectory
-from plumbline.model.invariants import attitude_error, position_error
-from plumbline.model.kinematics import quaternion_rate
+from plumbline.model.invariants import motion_error, motion_errors, motion_samples
+from plumbline.model.kinematics import angular_velocity, quaternion_rate
 from plumbline.truth import TruthUnavailable
 from plumbline.truth.enclosure import prove_motion
 from plumbline.truth.notes_motion import simulate_notes_form
@@ -39,8 +40,8 @@ class TrajectoryTruth:
     """The true motion and its uncertainty."""
 
     trajectory: Trajectory
-    position_uncertainty: Array  # (T,) m, largest of any body up to each time
-    attitude_uncertainty: Array  # (T,) rad, largest of any body up to each time
+    # by the names of `MOTION_UNITS` (T,) in its unit, largest of any body up to each time
+    uncertainty: Mapping[str, Array]
     method: str  # the two methods, in words
 
 
@@ -61,7 +62,8 @@ def trajectory_truth(
         model: the mechanism.
         state: initial state.
         times: (T,) [s] of the samples, times[0] = 0.
-        closed_form: samples of a closed form at ``times``; they replace r and p of the result.
+        closed_form: samples of a closed form at ``times``; they replace r and p of the result; velocities
+            remain those of the first method, uncertain by the difference between the two.
         max_compiled_bodies: longest chain that heyoka compiles; 0 to avoid heyoka.
         proof: the motion as a certificate proves it, if there is one; nothing is computed then.
 
@@ -74,28 +76,28 @@ def trajectory_truth(
     """
     if proof is not None:
         run = replace(proof.trajectory, initial_x=state.x)
-        return TrajectoryTruth(run, proof.position_radius, proof.attitude_radius, proof.method)
+        return TrajectoryTruth(run, proof.radius, proof.method)
     failure = ""
     try:
         run, method = _simulate_minimal_coordinates(model, state, times, max_compiled_bodies)
     except Exception as error:  # whatever fails in heyoka, the notes' form remains
         run, method = simulate_notes_form(model, state, times, NOTES_RTOL), NOTES_METHOD
         failure = str(error) if isinstance(error, TruthUnavailable) else f"{type(error).__name__}: {error}"
-    if closed_form is not None:
-        r, p, source = closed_form
-        other, other_method, method = run, method, f"closed form: {source}"
-        run = replace(run, r=r, p=p)
-    elif failure:
+    if failure:
         other = simulate_notes_form(model, state, times, NOTES_RTOL, "dop853")
         other_method = f"the same by DOP853, no Taylor series: {failure}"
     else:
         other, other_method = simulate_notes_form(model, state, times, NOTES_RTOL), NOTES_METHOD
-    return TrajectoryTruth(
-        run,
-        np.maximum.accumulate(position_error(run.r, other.r)),
-        np.maximum.accumulate(attitude_error(run.p, other.p)),
-        f"{method}; uncertainty: its difference from {other_method}",
-    )
+    uncertainty = motion_errors(run, other)
+    if closed_form is not None:
+        r, p, source = closed_form
+        of_velocities = f"of velocities that of {method} from {other_method}"
+        other, other_method, method = run, f"{method}; {of_velocities}", f"closed form: {source}"
+        # rates refer to the sign of the quaternion
+        run = replace(run, r=r, p=p, pdot=quaternion_rate(p, angular_velocity(run.p, run.pdot)))
+        found = motion_errors(run, other)
+        uncertainty |= {name: found[name] for name in ("position", "attitude")}
+    return TrajectoryTruth(run, uncertainty, f"{method}; uncertainty: its difference from {other_method}")
 
 
 def prove_and_judge_claim(
@@ -144,16 +146,13 @@ def judge_claim(
     proof = round_enclosure(enclosure)
     truth = trajectory_truth(model, state, times, closed_form)
     run, right = truth.trajectory, proof.trajectory
-    size = float(np.max(np.abs(right.r)))
-    position = truth.position_uncertainty + proof.position_radius + ROUNDING * size
-    attitude = truth.attitude_uncertainty + proof.attitude_radius + 4 * ROUNDING
-    ratios = [
-        np.divide(error, claim, out=np.zeros_like(error), where=error != 0)  # 0 of 0 at a fixed point
-        for error, claim in (
-            (position_error(run.r, right.r), position),
-            (attitude_error(run.p, right.p), attitude),
-        )
-    ]
+    samples, ratios = motion_samples(run), []
+    for name, true in motion_samples(right).items():
+        error = motion_error(name, samples[name], true)
+        size = 4.0 if name == "attitude" else float(np.max(np.abs(true)))
+        claim = truth.uncertainty[name] + proof.radius[name] + ROUNDING * size
+        # 0 of 0 at a fixed point
+        ratios.append(np.divide(error, claim, out=np.zeros_like(error), where=error != 0))
     return float(np.max(ratios))
 
 

@@ -216,10 +216,10 @@ def test_a_run_uses_the_proof_of_its_own_numbers_only():
     truth = task.function(*task.arguments)
     assert truth.method.startswith("proved: enclosed in ball arithmetic within ") and not truth.conflict
     assert np.array_equal(truth.trajectory.r, proof.trajectory.r)
-    assert 0 < truth.position_uncertainty[-1] < 1e-15
+    assert 0 < truth.uncertainty["position"][-1] < 1e-15
     usual = trajectory_truth(scenario.model, scenario.state, times)
     distance = np.linalg.norm(usual.trajectory.r - proof.trajectory.r, axis=-1).max()
-    assert distance <= usual.position_uncertainty[-1] + truth.position_uncertainty[-1]
+    assert distance <= usual.uncertainty["position"][-1] + truth.uncertainty["position"][-1]
 
     assert proved_motion.find_proof(scenario.model, scenario.state, times[:-1]) is None
     mass = np.nextafter(scenario.model.mass, np.inf)
@@ -236,9 +236,9 @@ def test_the_rounded_motion_is_within_its_radius():
     for k in range(len(times)):
         for exact, rounded in zip(balls.r[k], proof.trajectory.r[k], strict=True):
             error = [abs(ball - float(x)) for ball, x in zip(exact, rounded, strict=True)]
-            assert np.linalg.norm([float(x.upper()) for x in error]) <= proof.position_radius[k]
-    assert np.all(np.diff(proof.position_radius) >= 0) and proof.position_radius[-1] < 1e-15
-    assert 0 < proof.attitude_radius[-1] < 1e-15
+            assert np.linalg.norm([float(x.upper()) for x in error]) <= proof.radius["position"][k]
+    assert np.all(np.diff(proof.radius["position"]) >= 0) and proof.radius["position"][-1] < 1e-15
+    assert 0 < proof.radius["attitude"][-1] < 1e-15
 
 
 def test_motions_of_loops_are_refused_with_a_reason():

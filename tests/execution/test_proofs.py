@@ -32,7 +32,7 @@ def test_only_motions_without_a_proof_are_proved_and_short_chains_first():
     assert found.left_out == ["chain-30-balls"]
     assert found.sentence == "motions: 2 proved, 2 of them now, 1 left out"
     for s in scenarios[1:]:
-        assert find_proof(s.model, s.state, s.times).position_radius[-1] < 1e-15
+        assert find_proof(s.model, s.state, s.times).radius["position"][-1] < 1e-15
     again = prove_changed_motions(scenarios, 1, LIMITS, 100.0)
     assert (again.known, again.proved) == (2, [])
     heavier = replace(scenarios[1], model=replace(scenarios[1].model, mass=2 * scenarios[1].model.mass))

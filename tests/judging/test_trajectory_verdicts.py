@@ -12,7 +12,7 @@ from plumbline.judging.trajectory import judge_trajectory, pose_columns
 from plumbline.measurements.order_and_limit import romberg
 from plumbline.measurements.refinement_study import ROUNDING_PER_STEP
 from plumbline.model.datatypes import Integrator, Trajectory
-from plumbline.model.invariants import compute_invariants
+from plumbline.model.invariants import compute_invariants, motion_samples
 from plumbline.model.kinematics import angular_velocity, quaternion_product, rotate_vectors, rotation_matrix
 from plumbline.truth.ground_truth import RUN_ROUNDING, MotionTruth, stretched_length
 from tests.helpers import pendulums
@@ -26,21 +26,31 @@ TRUE_TRAJECTORY = pendulums.reference_trajectory(
 WHO = RowContext("s", "f", "mujoco", "MuJoCo", "4")
 METHOD = Integrator("Heun", "step", 2, (2, 3, 4))
 STEPS = tuple(2.0**-k for k in range(5, 11))
+LIMITS = {
+    "position_limit": "m", "attitude_limit": "rad",
+    "velocity_limit": "m/s", "angular_velocity_limit": "rad/s",
+}  # fmt: skip
 DIRECTION = np.array([2.0, -1.0, 2.0]) / 3
 ROUNDED = 1e-3  # of uncertainties of 1e-12: Romberg's own is a rounding of positions of 0.25 m, some 1e-16
 
 
+UNCERTAINTY = {"position": 1e-12, "attitude": 2e-12, "velocity": 3e-12, "angular_velocity": 4e-12}
+DETECTABLE = {"position": 1e-6, "attitude": 2e-6, "velocity": 3e-6, "angular_velocity": 4e-6}
+
+
+def of_each(sizes, **changes):
+    """(17,) of each quantity; the changes in place of some."""
+    return {name: size * np.ones(17) for name, size in (sizes | changes).items()}
+
+
 def make_truth(horizon=2.0, **changes):
     """A truth that is compared with up to ``horizon``, whatever its uncertainty and growth."""
-    one = np.ones(17)
     made = type("MadeTruth", (MotionTruth,), {"horizon": horizon})
     held = made(
         TRUE_TRAJECTORY,
-        1e-12 * one,
-        2e-12 * one,
+        of_each(UNCERTAINTY),
         1 + TIMES,
-        1e-6 * one,
-        2e-6 * one,
+        of_each(DETECTABLE),
         length=LENGTH,
         method="made",
     )
@@ -89,15 +99,16 @@ def test_a_sound_study_agrees_in_everything_and_states_what_it_measured():
     found = judged_rows()
     assert list(found) == [
         "order", "position_limit", "position", "attitude_limit", "attitude",
+        "velocity_limit", "angular_velocity_limit",
         "energy_drift", "momentum_drift", "joint_gap", "gap_rate", "norm_drift",
     ]  # fmt: skip
     information = {quantity for quantity, row in found.items() if row.verdict == "information"}
     assert information == {"position", "attitude"}, "the limits imply them"
     assert {found[quantity].verdict for quantity in found.keys() - information} == {"agrees"}
     assert {row.integrator for row in found.values()} == {"Heun"}
-    units = ["1", "m", "m", "rad", "rad", "J", "kg m²/s", "m", "m/s", "1"]
+    units = ["1", "m", "m", "rad", "rad", "m/s", "rad/s", "J", "kg m²/s", "m", "m/s", "1"]
     assert [row.unit for row in found.values()] == units
-    assert [row.level for row in found.values()] == ["trajectory"] * 5 + ["invariants"] * 5
+    assert [row.level for row in found.values()] == ["trajectory"] * 7 + ["invariants"] * 5
     assert {row.cpu_time for row in found.values()} == {21.0}
     order = found["order"]
     assert (order.value, order.order) == (pytest.approx(0, abs=1e-6), pytest.approx(2, abs=1e-6))
@@ -121,6 +132,12 @@ def test_a_sound_study_agrees_in_everything_and_states_what_it_measured():
         2e-12 + 2 * RUN_ROUNDING * 3.0, rel=ROUNDED, abs=0
     )
     assert found["attitude_limit"].extra["visible"] == 2e-6
+    speed = analysis().invariant_scales["gap_rate"]
+    for name, size, scale in (("velocity", 3, speed), ("angular_velocity", 4, 2 * speed / LENGTH)):
+        rate = found[f"{name}_limit"]
+        allowed = 1e-12 * size + RUN_ROUNDING * 3.0 * scale
+        assert rate.tolerance == pytest.approx(allowed, rel=ROUNDED, abs=0) and rate.value < 1e-3 * allowed
+        assert rate.extra["visible"] == pytest.approx(size * 1e-6)
     assert "powers of h from (2, 3, 4) eliminated over 6 steps" in limit.derivation
     assert "a mistake of 0.0001 in a parameter changes it by 1e-06" in limit.derivation
 
@@ -189,21 +206,39 @@ def test_a_limit_elsewhere_disagrees_only_where_the_study_shows_its_order():
     assert tight.verdict == "disagrees"
 
 
+@pytest.mark.parametrize("quantity", ["velocity", "angular_velocity"])
+def test_velocities_that_are_off_alone_are_reported(quantity):
+    """Sampled rates × (1 + 1e-7) after 1 s: a motion that is right in every other respect."""
+    factors = 1 + 1e-7 * (TIMES > 1)[:, None, None]
+    name = {"velocity": "v", "angular_velocity": "pdot"}[quantity]
+    study = refinement_study()
+    for index, run in enumerate(study.runs):
+        scaled = getattr(run.trajectory, name) * factors
+        study.runs[index] = replace(run, trajectory=replace(run.trajectory, **{name: scaled}))
+    found = judge_trajectory(WHO, MODEL, make_truth(), METHOD, study)
+    rows = {row.quantity: row for row in found.rows}
+    assert {name for name in LIMITS if rows[name].verdict == "disagrees"} == {f"{quantity}_limit"}
+    row, true = rows[f"{quantity}_limit"], motion_samples(TRUE_TRAJECTORY)[quantity]
+    largest = 1e-7 * np.max(np.linalg.norm(true[TIMES > 1], axis=-1))
+    assert row.value == pytest.approx(largest, rel=1e-3) and row.compared_until == 2.0
+    np.testing.assert_allclose(found.deviations[row.key].vectors, (factors - 1) * true, atol=1e-3 * largest)
+
+
 def test_a_shorter_window_may_tell_where_the_long_one_cannot():
     late = np.where(TIMES > 1, 1e-3, 1e-12)
-    found = judged_rows(position_uncertainty=late)
+    found = judged_rows(uncertainty=of_each(UNCERTAINTY, position=late))
     limit = found["position_limit"]
     assert (limit.verdict, limit.compared_until) == ("agrees", 1.0)
     assert limit.extra["growth"] == 2.0 and "up to t = 1 s" in limit.reason
     assert found["position"].value == pytest.approx(0.01 * STEPS[-1] ** 2, rel=1e-6)
     assert found["position"].tolerance == pytest.approx(0.01 * STEPS[-1] ** 2 + limit.tolerance, rel=1e-6)
     assert found["attitude_limit"].compared_until == 2.0
-    both = judged_rows(detectable_position=np.full(17, 1e-14))
+    both = judged_rows(detectable=of_each(DETECTABLE, position=1e-14))
     blind = both["position_limit"]
     assert both["position"].verdict == "information"
     assert (blind.verdict, blind.compared_until) == ("unresolved", 2.0)
     assert "is above the 1e-14 m that a mistake of 0.0001 would make" in blind.reason
-    endless = judged_rows(detectable_position=np.full(17, np.inf))["position_limit"]
+    endless = judged_rows(detectable=of_each(DETECTABLE, position=np.inf))["position_limit"]
     assert endless.verdict == "agrees" and endless.extra["visible"] == 1e308
     short = judged_rows(horizon=0.5)["position_limit"]
     assert short.compared_until == 0.5
@@ -218,7 +253,8 @@ def test_the_border_is_the_tolerance_and_the_tolerance_what_is_visible():
         )
     for visible, horizon in ((1.01 * tolerance, 2.0), (0.99 * tolerance, 1.0)):  # rounding grows with time
         assert (
-            judged_rows(detectable_position=np.full(17, visible))["position_limit"].compared_until == horizon
+            judged_rows(detectable=of_each(DETECTABLE, position=visible))["position_limit"].compared_until
+            == horizon
         )
 
 
@@ -233,10 +269,10 @@ def test_runs_that_did_not_stay_finite_are_points_of_the_study():
         some.runs[index] = replace(some.runs[index], trajectory=None)
     alone = judge_trajectory(WHO, MODEL, make_truth(), METHOD, some)
     reported = {row.quantity: row for row in alone.rows}
-    for name in ("position_limit", "attitude_limit"):
+    for name, unit in LIMITS.items():
         assert reported[name].verdict == "unresolved" and "fewer than two" in reported[name].reason
         assert (reported[name].level, reported[name].integrator) == ("trajectory", "Heun")
-        assert reported[name].unit == ("m" if name == "position_limit" else "rad")
+        assert reported[name].unit == unit
     assert "position" not in reported
     curves = dict(alone.tables)["curves"]
     assert np.all(np.isnan([curves["limit_error"], curves["tolerance"]]))
@@ -290,11 +326,12 @@ def test_attitudes_have_two_signs():
     some, right = refinement_study(), analysis()
     for index in (2, 4):
         run = some.runs[index].trajectory
-        some.runs[index] = replace(some.runs[index], trajectory=replace(run, p=-run.p))
-    for mine, theirs in zip(analysis(some).attitudes, right.attitudes, strict=True):
+        some.runs[index] = replace(some.runs[index], trajectory=replace(run, p=-run.p, pdot=-run.pdot))
+    for mine, theirs in zip(analysis(some).samples["attitude"], right.samples["attitude"], strict=True):
         assert np.array_equal(mine, theirs)
-    assert np.array_equal(right.positions[1], refinement_study().runs[1].trajectory.r)
-    assert judged_rows(some)["attitude_limit"].verdict == "agrees"
+    assert np.array_equal(right.samples["position"][1], refinement_study().runs[1].trajectory.r)
+    rows = judged_rows(some)
+    assert rows["attitude_limit"].verdict == rows["angular_velocity_limit"].verdict == "agrees"
 
 
 def test_the_sign_of_an_attitude_is_that_of_its_body_and_time():
@@ -308,7 +345,8 @@ def test_the_sign_of_an_attitude_is_that_of_its_body_and_time():
     runs = [Trajectory(TIMES, still, x, still, 0 * x, 1) for x in (signs * other, p)]
     made = [RefinementRun(h, run, None, 0.0) for h, run in zip(STEPS, runs, strict=False)]
     held = RefinementAnalysis(WHO, model, make_truth(trajectory=runs[1]), METHOD, made, 2.0)
-    assert np.array_equal(held.attitudes[0], other) and np.array_equal(held.attitudes[1], p)
+    assert np.array_equal(held.samples["attitude"][0], other)
+    assert np.array_equal(held.samples["attitude"][1], p)
 
 
 # --- invariants ---------------------------------------------------------------------------------
@@ -501,12 +539,12 @@ def test_poses_are_in_order_of_time_then_body():
 )
 def test_a_comparison_of_less_than_half_of_the_time_decides_nothing(until, verdict, words):
     rows = judged_rows(horizon=until)
-    for name in ("position_limit", "position", "attitude_limit", "attitude"):
+    for name in (*LIMITS, "position", "attitude"):
         expected = verdict if name.endswith("_limit") else "information"
         assert rows[name].verdict == expected and rows[name].compared_until == until
         reason = rows[name].reason
         assert reason.endswith(words) if words else "covers" not in reason
-    for name in ("position_limit", "attitude_limit"):
+    for name in LIMITS:
         reason = rows[name].reason
         assert reason.startswith("too short a time to decide: ") == (verdict == "unresolved")
 

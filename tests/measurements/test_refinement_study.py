@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from plumbline.engines.calls import RefinementStudy, run_refinement
+from plumbline.engines.registry import load_adapter
 from plumbline.judging.trajectory import judge_trajectory
 from plumbline.measurements import refinement_study
 from plumbline.measurements.order_and_limit import refinement_resolutions
@@ -21,9 +22,11 @@ from tests.judging.test_trajectory_verdicts import (
     METHOD,
     MODEL,
     STEPS,
+    UNCERTAINTY,
     WHO,
     judged_rows,
     make_truth,
+    of_each,
     trajectory_with_error,
 )
 from tests.judging.test_trajectory_verdicts import (
@@ -31,7 +34,7 @@ from tests.judging.test_trajectory_verdicts import (
 )
 
 H = np.array(STEPS)
-SHARP = {"position_uncertainty": np.zeros(17), "attitude_uncertainty": np.zeros(17), "growth": np.ones(17)}
+SHARP = {"uncertainty": of_each(dict.fromkeys(UNCERTAINTY, 0.0)), "growth": np.ones(17)}
 
 
 def stops_after(study, method=METHOD, model=MODEL):
@@ -150,6 +153,24 @@ def test_a_stopped_study_has_the_first_runs_of_the_whole_one_and_its_verdicts(en
     sharp, sharpest = bounds
     for quantity in ("position_limit", "attitude_limit"):
         assert sharp[quantity] <= (1 + STOP_MARGIN) * sharpest[quantity]
+
+
+def test_sampled_rates_that_are_scaled_late_are_reported():
+    """By 1e-7 after 1 s: neither positions and attitudes nor the step level up to its ten steps show it."""
+    (s,) = load_scenarios(["double-hinge-skew"])
+    integrator = load_adapter("mujoco").integrator("RK4")
+    steps = refinement_resolutions(integrator, s.model.n, s.duration)
+    study = run_refinement_study("mujoco", "RK4", s.model, s.state, s.times, steps)
+    truth = motion_truth(s.model, s.state, s.times, None)
+    factors = 1 + 1e-7 * (s.times > 1)[:, None, None]
+    sampled = [run.trajectory for run in study.runs]
+    scaled = [replace(run, v=factors * run.v, pdot=factors * run.pdot) for run in sampled]
+    wrong = {}
+    for name, motions in (("as sampled", sampled), ("scaled", scaled)):
+        runs = [replace(run, trajectory=motion) for run, motion in zip(study.runs, motions, strict=True)]
+        rows = judge_trajectory(WHO, s.model, truth, integrator, RefinementStudy(runs, None)).rows
+        wrong[name] = {r.quantity for r in rows if r.level == "trajectory" and r.verdict == "disagrees"}
+    assert wrong == {"as sampled": set(), "scaled": {"velocity_limit", "angular_velocity_limit"}}
 
 
 def test_the_rule_cannot_see_the_truth():

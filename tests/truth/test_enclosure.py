@@ -310,7 +310,7 @@ def check_present_truth(scenario, duration):
                  for pair in zip(r, truth.trajectory.r[k], strict=True)]  # fmt: skip
         rounding = 2.0**-53 * float(np.max(np.abs(truth.trajectory.r[k])))
         largest = max(float(np.linalg.norm([float(x.upper()) for x in row])) for row in error)
-        assert largest <= truth.position_uncertainty[k] + 2 * rounding
+        assert largest <= truth.uncertainty["position"][k] + 2 * rounding
 
 
 @pytest.mark.full

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from plumbline.engines.registry import load_adapter
-from plumbline.model.datatypes import StateQuantities
-from plumbline.model.kinematics import quaternion_product, state_from_minimal
+from plumbline.model.datatypes import StateQuantities, Trajectory
+from plumbline.model.invariants import MOTION_UNITS, invariant_scales
+from plumbline.model.kinematics import quaternion_product, quaternion_rate, state_from_minimal
 from plumbline.model.sampling import random_states
 from plumbline.truth import TruthUnavailable, ground_truth
 from plumbline.truth.ground_truth import (
@@ -84,10 +85,12 @@ def test_each_perturbed_model_has_one_kind_of_error_of_one_part_in_ten_thousand(
     assert np.any(offsets > 1) and np.any(offsets < 1), "signs are drawn"
 
 
-def test_detectable_effects_are_the_least_on_positions_and_attitudes():
+def test_detectable_effects_are_the_least_on_each_quantity():
     model = pendulums.make_model("b")
     length = float(np.sum(stretched_length(model)))
     r, p = np.zeros((4, 9, 1, 3)), np.tile([1.0, 0, 0, 0], (4, 9, 1, 1))
+    v, omega = np.zeros((2, 4, 9, 1, 3))
+    speed = np.sqrt(np.linalg.norm(model.gravity) * length)  # of a fall: at rest nothing is faster
     for k, size in enumerate((2e-5, 5e-5, 0.9e-3 * DETECTABLE_PARAMETER_ERROR * length), start=1):
         r[k, :, 0, 1] = size * TIMES
     for k, angle in enumerate((1e-5, 3e-5, 0.9e-3 * DETECTABLE_PARAMETER_ERROR), start=1):
@@ -95,11 +98,25 @@ def test_detectable_effects_are_the_least_on_positions_and_attitudes():
             [np.cos(angle * TIMES / 2), *(np.sin(angle * TIMES / 2) * np.eye(3)[k - 1][:, None])], -1
         )
         p[k] = quaternion_product(p[k], turn[:, None])
-    position, attitude = detectable_effect(model, r, p)
-    assert position == pytest.approx(2e-5 * TIMES, abs=1e-18)  # the third is no effect
-    assert attitude == pytest.approx(1e-5 * TIMES, rel=1e-6, abs=0)
+    threshold = 0.9e-3 * DETECTABLE_PARAMETER_ERROR * speed
+    for k, size in enumerate((3e-5, 4e-5, threshold), start=1):
+        v[k, :, 0, 2] = size * TIMES
+    for k, size in enumerate((5e-5, 4e-5, 2 * threshold / length), start=1):
+        omega[k, :, 0, 0] = size * TIMES
+
+    def found():
+        rates = quaternion_rate(p, omega)
+        return detectable_effect(
+            model, [Trajectory(TIMES, *run, 0) for run in zip(r, p, v, rates, strict=True)]
+        )
+
+    effects = found()
+    assert effects["position"] == pytest.approx(2e-5 * TIMES, abs=1e-18)  # the third is no effect
+    assert effects["attitude"] == pytest.approx(1e-5 * TIMES, rel=1e-6, abs=0)
+    assert effects["velocity"] == pytest.approx(3e-5 * TIMES, abs=1e-18)
+    assert effects["angular_velocity"] == pytest.approx(4e-5 * TIMES, rel=1e-9, abs=1e-18)
     r[3] *= 1.2 / 0.9
-    assert detectable_effect(model, r, p)[0] == pytest.approx(
+    assert found()["position"] == pytest.approx(
         1.2e-3 * DETECTABLE_PARAMETER_ERROR * length * TIMES, rel=1e-9, abs=0
     )
 
@@ -130,8 +147,9 @@ def test_motion_truth_holds_growth_length_and_detectable_effects():
     found, run = motion_truth(model, at, TIMES, None), trajectory_truth(model, at, TIMES)
     for name in ("r", "p", "v", "pdot"):
         assert np.array_equal(getattr(found.trajectory, name), getattr(run.trajectory, name))
-    assert np.array_equal(found.position_uncertainty, run.position_uncertainty)
-    assert np.array_equal(found.attitude_uncertainty, run.attitude_uncertainty)
+    assert found.uncertainty.keys() == run.uncertainty.keys() == MOTION_UNITS.keys()
+    for name, size in found.uncertainty.items():
+        assert np.array_equal(size, run.uncertainty[name])
     assert found.method == run.method and found.length == pytest.approx(
         float(np.sum(stretched_length(model)))
     )
@@ -140,42 +158,41 @@ def test_motion_truth_holds_growth_length_and_detectable_effects():
         np.maximum.accumulate(perturbation_growth(model, at, TIMES)),
         rel=1e-4,  # in other company, so by other steps
     )
-    wrong = [pendulums.reference_trajectory(m, s, TIMES) for m, s in perturbed_models(model, at)]
-    right = pendulums.reference_trajectory(model, at, TIMES)
-    shown = detectable_effect(
-        model, np.array([x.r for x in (right, *wrong)]), np.array([x.p for x in (right, *wrong)])
-    )
-    for mine, theirs in zip((found.detectable_position, found.detectable_attitude), shown, strict=True):
+    runs = [
+        pendulums.reference_trajectory(m, s, TIMES) for m, s in [(model, at), *perturbed_models(model, at)]
+    ]
+    for name, theirs in detectable_effect(model, runs).items():
+        mine = found.detectable[name]
         assert mine[1:] == pytest.approx(theirs[1:], rel=1e-5) and mine[-1] > 1e-7
 
 
-@pytest.mark.parametrize(
-    ("position", "attitude", "diverged"), [(0.9, 0.9, False), (1.1, 0.9, True), (0.9, 1.1, True)]
-)
-def test_two_methods_that_differ_by_more_than_rounding_are_reported(position, attitude, diverged):
+@pytest.mark.parametrize("wrong", ["", *MOTION_UNITS])
+def test_two_methods_that_differ_by_more_than_rounding_are_reported(wrong):
     model = pendulums.make_model("b")
     at = pendulums.state_from_seed(model, seed=2, rate=0.5)
     sound = motion_truth(model, at, TIMES, None)
     limit = 1e3 * np.finfo(float).eps * sound.growth  # 10³ ε G(t), as the rows say
     off = np.zeros(9)
     off[-1] = 1.0
-    made = TrajectoryTruth(
-        sound.trajectory,
-        position * sound.length * limit * off,
-        2 * attitude * limit * off,
-        "made",
-    )
+    speed = invariant_scales(model, sound.trajectory, sound.length)["gap_rate"]
+    scales = sound.length, 2.0, speed, 2 * speed / sound.length
+    differences = {
+        name: (1.1 if name == wrong else 0.9) * scale * limit * off
+        for name, scale in zip(MOTION_UNITS, scales, strict=True)
+    }
+    made = TrajectoryTruth(sound.trajectory, differences, "made")
     with patch("plumbline.truth.trajectory.trajectory_truth", lambda *_: made):
         found = motion_truth(model, at, TIMES, None)
-    assert found.method == "made" and bool(found.conflict) is diverged
-    assert not diverged or (found.conflict.startswith(TRUTHS_DIFFER) and "1.1 times what" in found.conflict)
+    assert found.method == "made" and bool(found.conflict) is bool(wrong)
+    assert not wrong or (found.conflict.startswith(TRUTHS_DIFFER) and "1.1 times what" in found.conflict)
 
 
-def test_a_truth_that_is_not_a_number_is_in_doubt() -> None:
+@pytest.mark.parametrize("name", MOTION_UNITS)
+def test_a_truth_that_is_not_a_number_is_in_doubt(name: str) -> None:
     model = pendulums.make_model("b")
     at = pendulums.state_from_seed(model, seed=2, rate=0.5)
     sound = motion_truth(model, at, TIMES, None)
-    made = TrajectoryTruth(sound.trajectory, np.full(9, np.nan), np.zeros(9), "made")
+    made = TrajectoryTruth(sound.trajectory, sound.uncertainty | {name: np.full(9, np.nan)}, "made")
     with patch("plumbline.truth.trajectory.trajectory_truth", lambda *_: made):
         assert motion_truth(model, at, TIMES, None).conflict
 
@@ -184,7 +201,7 @@ def test_the_wanted_time_does_not_shrink_with_the_uncertainty() -> None:
     model = pendulums.make_model("b")
     at = pendulums.state_from_seed(model, seed=2, rate=0.5)
     sound = motion_truth(model, at, TIMES, None)
-    vague = replace(sound, position_uncertainty=np.linspace(0, 1e-8, 9))
+    vague = replace(sound, uncertainty=sound.uncertainty | {"position": np.linspace(0, 1e-8, 9)})
     assert sound.horizon == sound.wanted_time == vague.wanted_time == 1.0
     assert vague.horizon == 0.0
 
@@ -203,4 +220,4 @@ def test_a_closed_form_replaces_the_motion():
     run = pendulums.reference_trajectory(model, at, TIMES)
     found = motion_truth(model, at, TIMES, (run.r + 1e-9, run.p, "a book"))
     assert np.array_equal(found.trajectory.r, run.r + 1e-9) and "closed form: a book" in found.method
-    assert found.position_uncertainty[-1] == pytest.approx(1e-9 * np.sqrt(3), rel=1e-6, abs=0)
+    assert found.uncertainty["position"][-1] == pytest.approx(1e-9 * np.sqrt(3), rel=1e-6, abs=0)

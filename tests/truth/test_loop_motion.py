@@ -49,7 +49,7 @@ def test_equal_four_bars_move_as_their_closed_form(motions):
     s = catalogue_scenarios()["four-bars-2"]
     times = s.times[s.times <= 0.5]
     truth = trajectory_truth(s.model, s.state, times)
-    claimed = float(np.max(truth.position_uncertainty))
+    claimed = float(np.max(truth.uncertainty["position"]))
     bound = claimed + 4 * EPS  # and the rounding of coordinates up to 2 m on both sides
     for run in (truth.trajectory, simulate_notes_form(s.model, s.state, times, 1e-13)):
         # links 0 and 1 (bodies 1 and 3) move with the bars' top ends and do not turn
@@ -66,7 +66,9 @@ def test_the_squeezer_moves_as_its_quadrature(motions):
     times = np.array([0.0, 0.01953125])
     truth = trajectory_truth(s.model, s.state, times)
     notes = simulate_notes_form(s.model, s.state, times, 1e-13).p
-    bound = truth.attitude_uncertainty[-1] + 4 * EPS * abs(exact.angles["beta"])  # and the angle's rounding
+    bound = truth.uncertainty["attitude"][-1] + 4 * EPS * abs(
+        exact.angles["beta"]
+    )  # and the angle's rounding
     assert bound < 1e-10
     for p in (truth.trajectory.p, notes):
         crank = 2 * np.arctan2(p[-1, 0, 3], p[-1, 0, 0])
@@ -81,7 +83,7 @@ def test_the_catalogues_loops_stay_closed_and_keep_their_energy(name):
     truth = trajectory_truth(s.model, s.state, s.times[:9])
     assert "tree without its closing joints" in truth.method
     # The uncertainty is what two methods differ by, one of them with a tolerance of 1e-13: it is no smaller.
-    assert np.max(truth.position_uncertainty) < 1e-13
+    assert np.max(truth.uncertainty["position"]) < 1e-13
     found = compute_invariants(s.model, truth.trajectory)
     assert found.joint_gap.shape[1] == len(s.model.kind) > s.model.n
     for drift in (found.joint_gap, found.gap_rate, found.energy_drift):

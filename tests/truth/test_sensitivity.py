@@ -127,12 +127,13 @@ def test_other_models_in_the_batch_move_as_they_do_alone():
     heavier = model.changed(mass=2 * model.mass, inertia=3 * model.inertia)
     leaning = perturbed_states(heavier, state, perturbation_size=1e-3, count=1)[0]
     times = np.linspace(0, 16 / own, 41)
-    found, r, p = perturbation_growth_and_runs(model, state, times, [(heavier, leaning)])
+    found, runs = perturbation_growth_and_runs(model, state, times, [(heavier, leaning)])
     assert found == pytest.approx(perturbation_growth(model, state, times), rel=1e-5)
-    for run, (m, s) in enumerate([(model, state), (heavier, leaning)]):
+    for run, (m, s) in zip(runs, [(model, state), (heavier, leaning)], strict=True):
         alone = simulate_notes_form(m, s, times, 1e-12)
-        assert np.max(position_error(r[run], alone.r)) < 1e-7
-        assert np.max(np.abs(p[run] - alone.p)) < 1e-6
+        assert np.max(position_error(run.r, alone.r)) < 1e-7
+        assert np.max(np.abs(run.p - alone.p)) < 1e-6
+        assert max(np.max(np.abs(run.v - alone.v)), np.max(np.abs(run.pdot - alone.pdot))) < 1e-6 * own
 
 
 def second_order(growth):

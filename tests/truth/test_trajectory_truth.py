@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from plumbline.model.datatypes import EngineFailure
-from plumbline.model.invariants import attitude_error, position_error
+from plumbline.model.invariants import attitude_error, motion_errors, motion_scales, position_error
 from plumbline.processes.workers import Limits, Task, WorkerPool
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth import ground_truth, trajectory
@@ -73,10 +73,10 @@ def test_the_uncertainty_covers_the_error_measured_in_higher_precision(scenario)
     r, p = (np.asarray(y, dtype=float) for y in (fine.r, fine.p))
     size = scenario.model.n * 2.0**-52 * max(1.0, float(np.max(np.abs(r))))
     off = position_error(truth.trajectory.r, r)
-    print(f"{scenario.name}: {np.max(off):.1e} m off, uncertain by {truth.position_uncertainty[-1]:.1e} m")
-    assert np.all(off <= 2 * truth.position_uncertainty + size)
+    print(f"{scenario.name}: {np.max(off):.1e} m off, uncertain by {truth.uncertainty['position'][-1]:.1e} m")
+    assert np.all(off <= 2 * truth.uncertainty["position"] + size)
     turned = attitude_error(truth.trajectory.p, p)
-    assert np.all(turned <= 2 * truth.attitude_uncertainty + 4 * 2.0**-52)
+    assert np.all(turned <= 2 * truth.uncertainty["attitude"] + 4 * 2.0**-52)
 
 
 # what the truth is, and how sure
@@ -86,11 +86,12 @@ def check_uncertainty_on_balls(scenario):
     truth = trajectory_truth(scenario.model, scenario.state, TIMES)
     precision = "extended" if scenario.model.n <= MAX_EXTENDED_PRECISION_BODIES else "double"
     print(
-        f"{scenario.name}: {truth.position_uncertainty[-1]:.1e} m, {truth.attitude_uncertainty[-1]:.1e} rad"
+        f"{scenario.name}: {truth.uncertainty['position'][-1]:.1e} m, "
+        f"{truth.uncertainty['attitude'][-1]:.1e} rad"
     )
     assert f"Taylor's method in minimal coordinates and {precision} precision" in truth.method
-    assert np.max(truth.position_uncertainty) < 1e-12
-    assert np.all(np.diff(truth.position_uncertainty) >= 0)
+    assert np.max(truth.uncertainty["position"]) < 1e-12
+    assert np.all(np.diff(truth.uncertainty["position"]) >= 0)
 
 
 @pytest.mark.parametrize(
@@ -114,8 +115,15 @@ def test_the_truth_agrees_with_the_closed_forms(scenario):
     truth = trajectory_truth(scenario.model, scenario.state, TIMES, (r, p, "a book"))
     assert truth.method.startswith("closed form: a book; uncertainty: its difference from Taylor's method")
     assert np.array_equal(truth.trajectory.r, r)
-    assert np.max(truth.position_uncertainty) < 1e-14
-    assert np.max(truth.attitude_uncertainty) < 3e-14
+    assert np.max(truth.uncertainty["position"]) < 1e-14
+    assert np.max(truth.uncertainty["attitude"]) < 3e-14
+    speed = motion_scales(scenario.model, truth.trajectory, 1.0)["velocity"]
+    # its quaternions may have the other sign
+    usual = trajectory_truth(scenario.model, scenario.state, TIMES)
+    for name in ("velocity", "angular_velocity"):
+        assert motion_errors(truth.trajectory, usual.trajectory)[name][-1] < 1e-14 * speed
+        assert np.array_equal(truth.uncertainty[name], usual.uncertainty[name])
+        assert truth.uncertainty[name][-1] < 2e-13 * speed
 
 
 def test_accelerations_along_a_run_agree_with_the_certified_ones():
@@ -151,7 +159,7 @@ def test_a_parameter_error_of_1e_11_in_one_method_is_detected(monkeypatch, side,
 
     monkeypatch.setattr(trajectory, side, wrong)
     planted = ground_truth.motion_truth(scenario.model, scenario.state, TIMES, None)
-    assert planted.position_uncertainty[-1] > 1e2 * usual.position_uncertainty[-1]
+    assert planted.uncertainty["position"][-1] > 1e2 * usual.uncertainty["position"][-1]
     assert planted.method == usual.method and not usual.conflict
     assert planted.conflict.startswith(ground_truth.TRUTHS_DIFFER)
 
@@ -175,7 +183,7 @@ def check_fall_back(reason, **arguments):
         "the notes' form by collocation; uncertainty: its difference from the same by DOP853, "
         f"no Taylor series: {reason}"
     )
-    assert 0 < truth.position_uncertainty[-1] < 1e-12
+    assert 0 < truth.uncertainty["position"][-1] < 1e-12
 
 
 def test_long_chains_fall_back_to_the_notes_equations():
@@ -198,10 +206,11 @@ def test_the_closed_form_is_compared_without_heyoka_too():
     scenario = load_scenario(find_scenario_file("lagrange-top"))
     r, p = closed_form_motion(scenario)(TIMES)
     truth = trajectory_truth(scenario.model, scenario.state, TIMES, (r, p, "a book"), max_compiled_bodies=0)
-    assert (
-        truth.method == "closed form: a book; uncertainty: its difference from the notes' form by collocation"
+    assert truth.method.startswith(
+        "closed form: a book; uncertainty: its difference from the notes' form by collocation; "
+        "of velocities that of the notes' form by collocation from the same by DOP853"
     )
-    assert 0 < truth.position_uncertainty[-1] < 1e-13
+    assert 0 < truth.uncertainty["position"][-1] < 1e-13
 
 
 def test_the_truth_survives_a_failure_of_heyoka(monkeypatch):

@@ -59,7 +59,7 @@ def test_both_methods_agree_on_mixed_trees():
         growth = np.max(position_error(r, truth.trajectory.r)) / 1e-9
         # every step of the notes' form rounds the rates by ε at most, which grows as the disturbance does
         steps = simulate_notes_form(model, state, TIMES, NOTES_RTOL).steps
-        assert np.max(truth.position_uncertainty) < steps * np.finfo(float).eps * growth
+        assert np.max(truth.uncertainty["position"]) < steps * np.finfo(float).eps * growth
 
 
 @pytest.mark.parametrize("element", ["armature", "damping", "stiffness", "effort", "springs"])
@@ -80,7 +80,7 @@ def test_both_methods_agree_on_springs_of_balls(kinds):
     (state,) = random_states(model, 1, 2)
     truth = trajectory_truth(model, state, TIMES[:3])
     assert "ball" in model.kind and truth.method.startswith("Taylor's method")
-    assert truth.position_uncertainty[-1] < 1e-13 and truth.attitude_uncertainty[-1] < 1e-12
+    assert truth.uncertainty["position"][-1] < 1e-13 and truth.uncertainty["attitude"][-1] < 1e-12
 
 
 def test_a_spring_of_a_ball_at_rest_has_a_taylor_series():
@@ -89,7 +89,7 @@ def test_a_spring_of_a_ball_at_rest_has_a_taylor_series():
     (state,) = random_states(model, 1, 2)
     unloaded = complete_state(model, replace(state, p=np.array([ball_spring_rest(model, 0)])))
     truth = trajectory_truth(model, unloaded, TIMES[:3])
-    assert truth.method.startswith("Taylor's method") and truth.position_uncertainty[-1] < 1e-13
+    assert truth.method.startswith("Taylor's method") and truth.uncertainty["position"][-1] < 1e-13
 
 
 def test_precisions_agree():
