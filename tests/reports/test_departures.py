@@ -15,7 +15,7 @@ from reports.results import Results
 from tests.reports.test_report import decoded_chunks
 
 RADIUS = 2e-4  # m, so large that it matters
-METHOD = ProvedMotion(None, None, None, 1.9e-25).method
+METHOD = ProvedMotion(None, {}, 1.9e-25).method
 PLAIN, NAMES = "planar-small", ("double-tumbling", "chain-10")  # the second has a run that blows up
 
 
