@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from plumbline.model.datatypes import Array, Model, State, StateQuantities
+from plumbline.model.datatypes import SPRING_FIELDS, Array, Model, State, StateQuantities
 from plumbline.model.kinematics import (
     elastic_energy,
     kinetic_energy_of_rotors,
@@ -47,7 +47,8 @@ def subject() -> Model:
     point = np.where(
         np.all(bare.point == 0, axis=2, keepdims=True), 0.3 * rng.normal(size=(5, 2, 3)), bare.point
     )
-    springs = {"spring_body": np.array([[-1, 3], [2, 4]])}
+    springs = {name: getattr(bare, name)[:2] for name in SPRING_FIELDS}
+    springs["spring_body"] = np.array([[-1, 3], [2, 4]])
     return bare.changed(point=point, length=np.zeros(5), **fields, **springs)
 
 
