@@ -16,8 +16,9 @@ from plumbline.processes.workers import Limits, Task, WorkerPool
 from plumbline.scenario.errors import shorten
 from plumbline.scenario.loader import Scenario, catalogue, load_scenarios
 from plumbline.truth.closed_form import exact_samples
+from plumbline.truth.compressed_json import MAX_BYTES, MalformedCertificate
 from plumbline.truth.enclosure import certificate_digest, load_checker, numbers_digest, reason_not_provable
-from plumbline.truth.enclosure_file import MAX_BYTES, Certificate, MalformedCertificate, parse_certificate
+from plumbline.truth.enclosure_file import Certificate, parse_certificate
 from plumbline.truth.proved_motion import find_proof, store_proof
 from plumbline.truth.trajectory import prove_and_judge_claim
 

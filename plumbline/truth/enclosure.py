@@ -18,12 +18,12 @@ import numpy as np
 
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.truth import TruthUnavailable, import_truth_tool
+from plumbline.truth.compressed_json import MalformedCertificate
 from plumbline.truth.enclosure_file import (
     FORMAT,
     SHAPES,
     VERSION,
     Certificate,
-    MalformedCertificate,
     parse_certificate,
 )
 from plumbline.truth.taylor import taylor_series

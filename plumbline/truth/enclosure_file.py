@@ -1,23 +1,21 @@
 """Certificates of motions as files: compressed JSON with doubles as hexadecimal texts, read and validated.
 
-This file imports numpy and the standard library only.  What it returns is what `enclosure_checker` proves a
-theorem about.
+This file and `compressed_json` import numpy and the standard library only.  What it returns is what
+`enclosure_checker` proves a theorem about.
 """
 
 from __future__ import annotations
 
-import json
-import zlib
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from plumbline.truth.compressed_json import MalformedCertificate, read_json
+
 FORMAT, VERSION = "plumbline enclosure certificate", 2
 MAX_BITS, MAX_BODIES, MAX_TERMS = 2000, 100, 401
-_INCOMPLETE = "not a complete gzip or JSON file"
 MAX_CLAIM = 200  # characters of the field `scenario`
-MAX_BYTES = 256 * 2**20  # of the text: 30 s of two rods in octuple precision
 JOINTS: dict[Any, tuple[int, int, int, tuple[int, ...]]] = {  # counts of u, p and slides; axes of turns
     "rod": (1, 1, 0, ()), "free": (1, 1, 0, ()), "ball": (0, 1, 0, ()), "weld": (0, 0, 0, ()),
     "slide": (0, 0, 1, ()), "cylindrical": (0, 0, 1, (2,)), "hinge": (0, 0, 0, (2,)),
@@ -32,10 +30,6 @@ SHAPES: dict[str, tuple[tuple[int, ...], int]] = {  # and power of seconds; per 
     "spring_stiffness": ((), -2), "spring_damping": ((), -1), "spring_length": ((), 0),
 }  # fmt: skip
 Array = np.ndarray[Any, Any]
-
-
-class MalformedCertificate(ValueError):
-    """The file is no certificate; the message names the field and what is valid."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,11 +79,7 @@ def parse_certificate(raw: bytes) -> Certificate:
         MalformedCertificate: something is wrong with the file; the message says where and what is valid.
 
     """
-    text = _text(raw)
-    try:
-        data = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise MalformedCertificate(f"{_INCOMPLETE}: {error}") from None
+    data = read_json(raw)
     _expect(isinstance(data, dict) and data.get("format") == FORMAT, "format", f"the text {FORMAT!r}")
     _expect(data.get("version") == VERSION, "version", str(VERSION))
     names = ("bits", "time_exponent", "steps", "kind", "far", "springs")
@@ -126,24 +116,6 @@ def parse_certificate(raw: bytes) -> Certificate:
         fits = all(type(x) is list and len(x) <= MAX_TERMS and {*map(type, x)} <= {int} for x in step[1:])
         _expect(fits, f"steps[{k}]", f"lists of at most {MAX_TERMS} integers")
     return found
-
-
-def _text(raw: bytes) -> bytes:
-    """Decompress the one gzip member that the file may be, up to the largest size of a certificate."""
-    stream = None
-    if raw[:2] == b"\x1f\x8b":
-        stream = zlib.decompressobj(47)
-        try:
-            raw = stream.decompress(raw, MAX_BYTES + 1)
-        except zlib.error as error:
-            raise MalformedCertificate(f"{_INCOMPLETE}: {error}") from None
-    if len(raw) > MAX_BYTES:
-        raise MalformedCertificate(f"holds more than {MAX_BYTES >> 20} MB, the largest size of a certificate")
-    if stream is not None and not stream.eof:
-        raise MalformedCertificate(f"{_INCOMPLETE}: the compressed data are cut off")
-    if stream is not None and stream.unused_data:
-        raise MalformedCertificate("not one gzip file: bytes follow the end of the compressed data")
-    return raw
 
 
 def _expect(holds: Any, field: str, valid: str) -> None:

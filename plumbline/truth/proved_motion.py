@@ -132,6 +132,6 @@ def _name(model: Model, state: State, times: Array) -> str:
     arrays = [np.ascontiguousarray(x, dtype=float).tobytes() for x in numbers.values()]
     code = [
         Path(__file__).with_name(name).read_bytes()
-        for name in ("enclosure_checker.py", "enclosure_file.py", Path(__file__).name)
+        for name in ("enclosure_checker.py", "enclosure_file.py", "compressed_json.py", Path(__file__).name)
     ]
     return f"{content_key(*code, repr(checked_topology(model)), *arrays)}.proof"

@@ -8,8 +8,9 @@ from functools import cache
 
 import pytest
 
+from plumbline.truth.compressed_json import MalformedCertificate
 from plumbline.truth.enclosure import certificate_digest
-from plumbline.truth.enclosure_file import MalformedCertificate, parse_certificate
+from plumbline.truth.enclosure_file import parse_certificate
 from tests.helpers.mutations import damaged_bytes, damaged_document, limited_time
 from tests.helpers.stored_certificates import FOLDER, NAMES, QUANTITIES, stored_document
 

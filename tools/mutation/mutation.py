@@ -92,7 +92,9 @@ TARGETS = {
         *(f"plumbline/diagnosis/{name}.py" for name in ("diagnose", "fit")),
         "plumbline/model/invariants.py",
     ],
-    "checker": ["plumbline/truth/enclosure_checker.py", "plumbline/truth/enclosure_file.py"],
+    "checker": [
+        f"plumbline/truth/{name}.py" for name in ("enclosure_checker", "enclosure_file", "compressed_json")
+    ],
     "prover": ["plumbline/truth/enclosure.py"],
     "equations": ["plumbline/equations/*.py", "plumbline/truth/definition.py"],
 }
