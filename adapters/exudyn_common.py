@@ -28,12 +28,7 @@ class ExudynAdapter(MetamorphicHooks):
     supported_versions = ">=1.9,<2"
 
     def version(self) -> str:
-        """Return the version of the Exudyn that is loaded.
-
-        Returns:
-            As Exudyn reports it.
-
-        """
+        """Return the version of the Exudyn that is loaded."""
         return _version()
 
 
@@ -49,12 +44,7 @@ def make_system() -> tuple[Any, Any]:
 
 
 def make_settings() -> Any:
-    """Make settings with fixed steps, Newton iterations to `NEWTON_TOLERANCE` and no files.
-
-    Returns:
-        The settings.
-
-    """
+    """Make settings with fixed steps, Newton iterations to `NEWTON_TOLERANCE` and no files."""
     settings: Any = exudyn.SimulationSettings()
     _write_no_files(settings)
     time = settings.timeIntegration
@@ -73,11 +63,6 @@ def add_loads(mbs: Any, model: Model, k: int, marker: Any, ground: Any, moment: 
     the body.
 
     Args:
-        mbs: the system under construction.
-        model: the pendulum.
-        k: the body.
-        marker: a marker at its centre of mass.
-        ground: a marker on the ground.
         moment: the applied moment (3,) [N m] in the marker's frame, with which it turns.
 
     """
@@ -95,15 +80,7 @@ def add_loads(mbs: Any, model: Model, k: int, marker: Any, ground: Any, moment: 
 
 
 def add_point_spring(mbs: Any, model: Model, i: int, markers: list[Any]) -> None:
-    """Add a spring and damper between two points.
-
-    Args:
-        mbs: the system under construction.
-        model: the mechanism.
-        i: the spring.
-        markers: markers at its points.
-
-    """
+    """Add a spring and damper between two points."""
     mbs.AddObject(
         items.ObjectConnectorSpringDamper(
             markerNumbers=markers,
@@ -121,7 +98,6 @@ def initialized_solver(solver: Any, mbs: Any, settings: Any) -> Iterator[None]:
     Args:
         solver: one of Exudyn's main solvers, not initialised.
         mbs: the assembled system.
-        settings: the simulation settings to initialise it with.
 
     Yields:
         Nothing.
@@ -140,10 +116,6 @@ def initialized_solver(solver: Any, mbs: Any, settings: Any) -> Iterator[None]:
 
 def mass_matrix_and_force(solver: Any, mbs: Any) -> tuple[Array, Array]:
     """Evaluate M and f of M q̈ = f, without constraints.
-
-    Args:
-        solver: an initialised solver.
-        mbs: its system.
 
     Returns:
         M (nq, nq) and f (nq,).
@@ -197,7 +169,6 @@ def run_solver(
         settings: its settings; the number of steps and the end time are set here.
         times: sample times (T,) [s], multiples of the step from 0.
         step: step [s].
-        read_sample: reads a sample from the system.
         check_step: called with the time after every step; may raise.
 
     Returns:
@@ -297,7 +268,6 @@ def kinetic_energy(mbs: Any, bodies: list[Any], quadratic_form: float) -> float:
 
     Args:
         mbs: the assembled system.
-        bodies: object numbers of rigid bodies in it.
         quadratic_form: ½ q̇ᵀ M q̇ [J] with the engine's mass matrix, for versions before 1.12, in which
             bodies have no such output.
 
@@ -314,7 +284,6 @@ def set_linear_solver(settings: Any, name: str) -> None:
     """Choose the linear solver.
 
     Args:
-        settings: the settings to change.
         name: a member of ``exudyn.LinearSolverType``.
 
     """
@@ -327,12 +296,7 @@ def set_linear_solver(settings: Any, name: str) -> None:
 
 
 def set_rk44(settings: Any) -> None:
-    """Choose RK44, without the accelerations at the end of a step, which nothing here reads.
-
-    Args:
-        settings: the settings to change.
-
-    """
+    """Choose RK44, without the accelerations at the end of a step, which nothing here reads."""
     time, kind = settings.timeIntegration, exudyn.DynamicSolverType.RK44
     if hasattr(time, "solverType"):
         time.solverType = kind

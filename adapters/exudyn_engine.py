@@ -217,15 +217,7 @@ class ExudynChain:
         return self.mbs.AddMarker(items.MarkerBodyRigid(bodyNumber=self.ground, localPosition=point.tolist()))
 
     def joint_rows(self, k: int) -> list[int]:
-        """List the rows of joint k that hold something; a generic joint has a row λ = 0 per free axis.
-
-        Args:
-            k: the joint.
-
-        Returns:
-            Their indices.
-
-        """
+        """List the rows of joint k that hold something; a generic joint has a row λ = 0 per free axis."""
         if self.joints[k] is None:
             return []
         rows = list(self.mbs.systemData.GetObjectLTGAE(self.joints[k]))
@@ -269,7 +261,6 @@ class ExudynChain:
         """Read an output of joint k: at its near point, less that at its far point.
 
         Args:
-            k: the joint.
             output_type: a member of ``exudyn.OutputVariableType``.
 
         Returns:

@@ -66,7 +66,6 @@ def joint_from_screw(name: str, angular: Array, linear: Array) -> ElementaryJoin
     """Describe a joint of one degree of freedom by its motion at the reference.
 
     Args:
-        name: of the joint.
         angular: angular velocity (3,) of the body at unit rate, body axes.
         linear: velocity (3,) of the body frame's origin at unit rate, body axes [m].
 
@@ -86,8 +85,6 @@ def make_joint(
     """Make a joint without passive forces.
 
     Args:
-        name: of the joint.
-        kind: its kind of motion.
         axis: unit vector (3,), body frame; zero where None.
         anchor: point (3,) [m], body frame; zero where None.
 
@@ -156,7 +153,6 @@ def free_joint_name(body: str, file: ModelFile) -> str:
     """Return the name of a body's free joint, which most engines do not keep.
 
     Args:
-        body: name of the body.
         file: the file that says it, if it is an MJCF.
 
     Returns:
@@ -169,9 +165,6 @@ def free_joint_name(body: str, file: ModelFile) -> str:
 
 def joint_names(file: ModelFile) -> dict[str, list[str]]:
     """Read the names of the joints of each body of an MJCF file.
-
-    Args:
-        file: an MJCF file.
 
     Returns:
         Names of the joints, in their order, by the body's name.
@@ -245,9 +238,6 @@ class LoadingImporter(Importer):
 
     def read(self, file: ModelFile) -> Reading:
         """Load a file and describe what the engine made of it.
-
-        Args:
-            file: the file and how to load it.
 
         Returns:
             The description, or the engine's refusal.

@@ -165,12 +165,7 @@ class Mujoco(MetamorphicHooks):
     welding_unsupported_reason = ""
 
     def version(self) -> str:
-        """Return the version of the loaded library.
-
-        Returns:
-            As MuJoCo reports it.
-
-        """
+        """Return the version of the loaded library."""
         return str(mujoco.mj_versionString())
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:

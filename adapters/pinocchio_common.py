@@ -25,12 +25,7 @@ class PinocchioAdapter(MetamorphicHooks):
     welding_unsupported_reason = ""
 
     def version(self) -> str:
-        """Return the version of the pin wheel.
-
-        Returns:
-            As Pinocchio reports it.
-
-        """
+        """Return the version of the pin wheel."""
         return str(pin.__version__)
 
 
@@ -40,9 +35,6 @@ def translation(point: Array) -> pin.SE3:
     Args:
         point: its origin (3,) [m] in the parent frame.
 
-    Returns:
-        The placement.
-
     """
     return pin.SE3(np.eye(3), point)
 
@@ -51,7 +43,6 @@ def append_parts(pin_model: pin.Model, joint: int, parts: tuple[RigidPart, ...],
     """Append the parts of a body to a joint; Pinocchio welds everything appended to one joint.
 
     Args:
-        pin_model: the model under construction.
         joint: index of the joint that carries the body.
         parts: the body's parts.
         placement: of the body's frame in the joint's frame.
@@ -68,9 +59,6 @@ def composite(*joints: Any) -> pin.JointModelComposite:
     Args:
         *joints: Pinocchio's models of them, from the parent on.
 
-    Returns:
-        The joint.
-
     """
     joint = pin.JointModelComposite()
     for part in joints:
@@ -82,13 +70,9 @@ def add_frame(pin_model: pin.Model, name: str, joint: int, point: Array) -> int:
     """Add an operational frame with the axes of a joint.
 
     Args:
-        pin_model: the model under construction.
         name: a name that no other frame has.
         joint: index of the joint that carries the frame.
         point: its origin (3,) [m] in the joint's frame.
-
-    Returns:
-        The frame's index.
 
     """
     frame = pin.Frame(name, joint, translation(point), pin.FrameType.OP_FRAME)
@@ -99,7 +83,6 @@ def point_acceleration(pin_model: pin.Model, data: pin.Data, frame: int) -> Arra
     """Read the acceleration of a frame's origin from the last forward kinematics.
 
     Args:
-        pin_model: Pinocchio's description of the mechanism.
         data: the workspace made for it, with frame placements up to date.
         frame: index of the frame.
 
@@ -116,7 +99,6 @@ def energies_and_momentum(
     """Evaluate the quantities of the whole mechanism.
 
     Args:
-        pin_model: Pinocchio's description of the mechanism.
         data: the workspace made for it.
         q: configuration, in Pinocchio's convention.
         v: velocity, in Pinocchio's convention.
@@ -144,9 +126,7 @@ def init_constraint_dynamics(pin_model: pin.Model, data: pin.Data, contacts: Any
     """Allocate what `constraintDynamics` needs.
 
     Args:
-        pin_model: Pinocchio's description of the mechanism.
         data: the workspace made for it.
-        contacts: the constraint models.
         contact_data: their data, which version 3 does not take.
 
     """
@@ -160,7 +140,6 @@ def set_corrector(contact: Any, rate: float) -> None:
     """Set the engine's own correction of gaps in a constraint (Baumgarte's).
 
     Args:
-        contact: the constraint model.
         rate: a [1/s]; adds −2 a Ċ − a² C to its accelerations.
 
     """

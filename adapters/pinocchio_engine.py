@@ -233,9 +233,6 @@ class PinocchioChain:
     def coordinates(self, state: State) -> tuple[Array, Array]:
         """Map a state to Pinocchio's coordinates.
 
-        Args:
-            state: a state of the model.
-
         Returns:
             q (4 nj,) and v (3 nj,).
 
@@ -476,9 +473,6 @@ class PinocchioChain:
     def quantities(self, state: State) -> StateQuantities:
         """Evaluate all state quantities.
 
-        Args:
-            state: a state of the model.
-
         Returns:
             The quantities, in the project's frames.
 
@@ -577,7 +571,6 @@ class PinocchioChain:
             times: sample times (T,) [s].
             q: configurations (T, 4 nj).
             v: velocities (T, 3 nj).
-            steps: number of steps taken.
 
         Returns:
             The trajectory in the project's frames.

@@ -28,21 +28,13 @@ DOP853 = Integrator(
 
 
 def checkout_version() -> str:
-    """Read the version of this checkout.
-
-    Returns:
-        The project's version in pyproject.toml.
-
-    """
+    """Read the version of this checkout."""
     project = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
     return str(project["project"]["version"])
 
 
 def notes_state(state: State) -> tuple[Array, Array, Array, Array]:
     """Convert a state to the notes' variables.
-
-    Args:
-        state: of N bodies.
 
     Returns:
         r (N, 3) [m], p (N, 4), ṙ (N, 3) [m/s] and ṗ (N, 4) [1/s].
@@ -65,7 +57,6 @@ def state_quantities(
     """Compute the contract's quantities of one state from the solution of S x = b.
 
     Args:
-        model: the pendulum.
         state: one on the constraint manifold.
         acceleration: r̈ (N, 3) [m/s²], world frame.
         pddot: p̈ (N, 4) [1/s²].
@@ -75,9 +66,6 @@ def state_quantities(
             and balls, where it is 0.
         rotor_count: rows of rotors in S, behind those of the constraints.
         spring_energy: potential energy of springs [J].
-
-    Returns:
-        Every quantity of the contract.
 
     """
     n = model.n
@@ -103,13 +91,5 @@ def state_quantities(
 
 
 def trajectory(run: IntegrationResult) -> Trajectory:
-    """Convert a run of the reference's integrators.
-
-    Args:
-        run: samples at the requested times.
-
-    Returns:
-        The same samples.
-
-    """
+    """Convert a run of the reference's integrators."""
     return Trajectory(t=run.t, r=run.r, p=run.p, v=run.v, pdot=run.pdot, steps=run.steps)

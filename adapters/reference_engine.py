@@ -57,12 +57,7 @@ class Reference(MetamorphicHooks):
     welding_unsupported_reason = NO_WELD
 
     def version(self) -> str:
-        """Return the version of this checkout.
-
-        Returns:
-            The project's version in pyproject.toml.
-
-        """
+        """Return the version of this checkout."""
         return checkout_version()
 
     def _evaluate(self, model: Model, states: Sequence[State]) -> list[StateQuantities]:

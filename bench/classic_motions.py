@@ -26,7 +26,6 @@ def four_bar_angle(windows: int, thickness: float, times: Array) -> Array:
     κ = g ((N + 1)/2 + N) / ((N + 1)(J + ¼) + N) and J = (1 + thickness²)/12: a pendulum.
 
     Args:
-        windows: N.
         thickness: width of the bars [m].
         times: (T,) [s].
 
@@ -205,9 +204,6 @@ def squeezer_motion(time: str) -> SqueezerMotion:
 
     Args:
         time: decimal [s]; the crank turns forward up to then.
-
-    Returns:
-        Angles and rates.
 
     """
     ctx.prec = PRECISION

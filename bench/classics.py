@@ -237,9 +237,6 @@ def _measure_integrator(
 def measure_states(name: str) -> list[dict[str, Any]]:
     """Compare accelerations of a mechanism with loops, at its initial state and at random ones.
 
-    Args:
-        name: of a scenario.
-
     Returns:
         One record per engine: the largest error of r̈ and of ω̇′ over the largest true value at that state, or
         the reason why there is none.
@@ -279,9 +276,7 @@ def measure(name: str, engine: str, stored: dict[str, Any]) -> dict[str, Any]:
     """Measure a problem.
 
     Args:
-        name: of the problem.
         engine: the only one whose motions are measured, or `NO_ENGINE`; empty for everything.
-        stored: what is known of the problem.
 
     Returns:
         Its figures: values, motions and states.

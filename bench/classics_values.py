@@ -54,9 +54,6 @@ def find_problem_scenario(name: str) -> Scenario:
     Args:
         name: of the file, without its suffix.
 
-    Returns:
-        The scenario.
-
     """
     own = OWN_SCENARIOS / f"{name}.yaml"
     return load_scenario(own if own.is_file() else find_scenario_file(name))
@@ -99,7 +96,6 @@ def true_rod_end(scenario: Scenario, times: Array) -> Array:
     """Compute the end of the third rod of Bricard's mechanism by Taylor's method in extended precision.
 
     Args:
-        scenario: the mechanism.
         times: (T,) [s].
 
     Returns:

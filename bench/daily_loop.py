@@ -40,9 +40,6 @@ NIGHT_OPTIONS = ("--random", "200", "--seed", "801", "--proof-cpu-seconds", "0")
 def earlier_scenarios() -> list[str]:
     """List the scenarios of the catalogue at `CATALOGUE_COMMIT`.
 
-    Returns:
-        Their names.
-
     Raises:
         CalledProcessError: the checkout's history does not reach back to that commit.
 
@@ -57,7 +54,6 @@ def time_command(arguments: list[str], cache: Path) -> dict[str, float]:
 
     Args:
         arguments: what follows ``plumbline``.
-        cache: the folder of the user's cache.
 
     Returns:
         Wall time and the CPU time of the command's own process, without its workers [s], and its exit code.
@@ -101,9 +97,6 @@ def time_run(words: list[str], folder: Path) -> dict[str, Any]:
 def cpu_times(results: Path) -> dict[str, Any]:
     """Read a run's CPU times.
 
-    Args:
-        results: the folder of the run.
-
     Returns:
         CPU time [s] in all, by kind, and in all over the engines' own; how many answers were in the cache.
 
@@ -139,7 +132,6 @@ def random_scenarios_per_second(count: int, jobs: int, part: int, parts: int) ->
 
     Args:
         count: number of scenarios of all parts.
-        jobs: number of workers.
         part: index of the part to run.
         parts: number of parts.
 
@@ -160,9 +152,6 @@ def random_scenarios_per_second(count: int, jobs: int, part: int, parts: int) ->
 
 def two_workers_over_two_runs(count: int) -> dict[str, float]:
     """Compare one run with two workers and two runs with one worker each, at the same time.
-
-    Args:
-        count: number of random scenarios.
 
     Returns:
         Scenarios per second of both, and their ratio.
@@ -190,7 +179,6 @@ def measure(is_all_levels: bool, random_count: int, has_night: bool) -> Iterator
     Args:
         is_all_levels: whether the catalogues are run at every level too.
         random_count: number of random scenarios for the comparison of two workers with two runs; 0: none.
-        has_night: whether a night is run.
 
     Yields:
         After each part its name and the record to store.

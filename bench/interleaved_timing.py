@@ -40,7 +40,6 @@ def time_interleaved(
 
     Args:
         calls: what is timed, by name.
-        rounds: number of rounds.
         min_seconds: CPU time [s] that one timing takes at least; short calls are repeated.
 
     Returns:

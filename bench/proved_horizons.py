@@ -27,10 +27,7 @@ def departure(
     """Run an engine up to the end of a proof.
 
     Args:
-        scenario: what is proved.
-        proof: its enclosure.
         engine: a key of `ENGINES`.
-        integrator: one of the engine's.
         resolution: step [s] or tolerance.
 
     Returns:
@@ -50,7 +47,6 @@ def main(name: str, duration: float = 30.0, step: float = 2.0**-10) -> None:
     """Print the table of a scenario.
 
     Args:
-        name: of the scenario.
         duration: of the proof [s].
         step: of the engines [s].
 

@@ -25,9 +25,6 @@ def table_row(scenario: Scenario) -> str:
     Args:
         scenario: what is proved, over its duration.
 
-    Returns:
-        A row of the table.
-
     """
     start = time.process_time()
     raw, enclosure = prove_motion(scenario.model, scenario.state, scenario.times)

@@ -33,15 +33,7 @@ ABOUT = (
 
 
 def enclosed_motion(name: str) -> dict[str, Any]:
-    """Prove the motion of a scenario.
-
-    Args:
-        name: of the scenario.
-
-    Returns:
-        Its record in the file.
-
-    """
+    """Prove the motion of a scenario."""
     scenario = load_scenario(find_scenario_file(name))
     for precision in PRECISIONS:
         _, enclosure = prove_motion(scenario.model, scenario.state, np.array(TIMES), precision=precision)

@@ -30,9 +30,7 @@ def random_pendulum(bodies: int, rods: bool = False, seed: int = 1) -> tuple[Mod
     """Draw a random chain with full inertia tensors and offset attachments.
 
     Args:
-        bodies: number of bodies.
         rods: whether every joint is a rod; else every joint is a ball joint.
-        seed: of the random numbers.
 
     Returns:
         The model and a state on its manifold.
@@ -46,7 +44,6 @@ def hinge_tree(shape: Literal["chain", "binary tree", "star"], bodies: int) -> t
 
     Args:
         shape: each body on the one before; two on every body; all on the world.
-        bodies: number of bodies.
 
     Returns:
         The model and a state of it.
@@ -70,7 +67,6 @@ def tree_call(model: Model, state: State) -> Call:
 
     Args:
         model: the tree.
-        state: attitudes and rates of its bodies.
 
     Returns:
         The call that computes the accelerations.
@@ -87,7 +83,6 @@ def pinocchio_crba_call(model: Model, state: State) -> Call:
 
     Args:
         model: the tree.
-        state: attitudes and rates of its bodies.
 
     Returns:
         The call that computes the joints' accelerations.
@@ -103,7 +98,6 @@ def structured_call(model: Model, state: State, batch: int = 1) -> Call:
     """Prepare the reference's structured form.
 
     Args:
-        model: the pendulum.
         state: its state; the copies of a batch have rates within ± 10 % of it.
         batch: number of chains that one call evaluates.
 
@@ -127,7 +121,6 @@ def direct_call(model: Model, state: State) -> tuple[sparse.csc_matrix, Array, C
     """Prepare the direct form and assemble its system S x = b.
 
     Args:
-        model: the pendulum.
         state: attitudes, directions and rates of its bodies.
 
     Returns:
@@ -144,7 +137,6 @@ def superlu_call(S: sparse.csc_matrix, b: Array) -> Call:
     """Prepare SciPy's sparse LU of an assembled system: the call factors and solves only.
 
     Args:
-        S: matrix in SuperLU's format.
         b: right-hand side.
 
     Returns:
@@ -173,7 +165,6 @@ def mujoco_forward_call(model: Model, state: State) -> Call:
     """Prepare MuJoCo's mj_forward.
 
     Args:
-        model: the pendulum.
         state: attitudes, directions and rates of its bodies.
 
     Returns:
@@ -189,7 +180,6 @@ def pinocchio_aba_call(model: Model, state: State) -> Call:
     """Prepare Pinocchio's articulated-body algorithm, pin.aba.
 
     Args:
-        model: the pendulum.
         state: attitudes, directions and rates of its bodies.
 
     Returns:
@@ -205,10 +195,7 @@ def exudyn_steps_call(model: Model, state: State, step: float = 1e-4, count: int
     """Prepare Exudyn's trapezoidal rule: a step costs about two right-hand sides and a Jacobian.
 
     Args:
-        model: the pendulum.
-        state: its initial state.
         step: of the integrator [s].
-        count: number of steps in one call.
 
     Returns:
         The call, and its number of steps.

@@ -73,10 +73,6 @@ def work_precision_svg(curves: dict[str, list[dict[str, float]]], title: str) ->
 
     Args:
         curves: points with ``error`` [m] and ``seconds`` (CPU time [s]), by name of the integrator.
-        title: heading of the picture.
-
-    Returns:
-        The SVG document.
 
     """
     points = [p for curve in curves.values() for p in curve if 0 < p["error"] < 1 and p["seconds"] > 0]
@@ -152,9 +148,6 @@ def run_benchmarks(folder: Path) -> Path:
 
     Args:
         folder: where pytest-benchmark stores its results; created where it is missing.
-
-    Returns:
-        Path of the results.
 
     """
     folder.mkdir(parents=True, exist_ok=True)

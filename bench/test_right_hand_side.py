@@ -17,7 +17,6 @@ def record_table(benchmark: Any, table: dict[str, Any]) -> None:
     """Put a table beside pytest-benchmark's own figures and print it.
 
     Args:
-        benchmark: pytest-benchmark's fixture.
         table: entries of ``extra_info``.
 
     """

@@ -34,9 +34,6 @@ def perturbed_pendulums(count: int) -> tuple[Model, list[State]]:
     Args:
         count: number of states; all but the first have rates that differ by about a fifth.
 
-    Returns:
-        The model and its states.
-
     """
     scenario = load_scenario(find_scenario_file("double-tumbling-balls"))
     model, state = scenario.model, scenario.state

@@ -32,9 +32,6 @@ class WorkPrecisionPoint:
 def stack_states(states: Sequence[State]) -> tuple[Array, Array, Array, Array]:
     """Stack the coordinates of a batch of states.
 
-    Args:
-        states: B states of N bodies.
-
     Returns:
         r (BN, 3) [m], p (BN, 4), ṙ (BN, 3) [m/s] and ṗ (BN, 4) [1/s], state by state.
 
@@ -48,7 +45,6 @@ def reference_positions(model: Model, states: Sequence[State]) -> Array:
 
     Args:
         model: the pendulum, N bodies.
-        states: B initial states.
 
     Returns:
         Positions of all bodies (BN, 3) [m].
@@ -67,7 +63,6 @@ def measure_run(
         run: computes the positions at the end (BN, 3) [m].
         expected: the exact positions (BN, 3) [m].
         resolution: step [s] or tolerance, kept with the result.
-        repeats: number of runs.
 
     Returns:
         Largest error of a body and the shortest CPU time.
@@ -87,8 +82,6 @@ def collocation_curve(model: Model, states: Sequence[State], expected: Array) ->
     """Measure the reference's collocation on all states in one batch.
 
     Args:
-        model: the pendulum.
-        states: initial states.
         expected: positions at the end (BN, 3) [m].
 
     Returns:
@@ -113,8 +106,6 @@ def dop853_curve(
     """Measure the reference's DOP853, state by state.
 
     Args:
-        model: the pendulum.
-        states: initial states.
         expected: positions at the end (BN, 3) [m].
         structured: whether the structured form evaluates the right-hand side; else the direct form.
 
@@ -150,10 +141,6 @@ def fixed_step_curve(
     """Measure an engine's own integrator with a fixed step, halved until a run takes too long.
 
     Args:
-        engine: adapter of the engine.
-        integrator: name of the integrator.
-        model: the pendulum.
-        states: initial states.
         expected: positions at the end (BN, 3) [m].
         max_seconds: CPU time of a run [s] after which no finer step is tried.
 

@@ -371,7 +371,6 @@ def joint_moments(chain: Mechanism, p: Array, force: Array, of_p: Array) -> Arra
     A ½ L Q_p is the moment about the centre of mass; L p = 0 takes the normalisation's share out (E2).
 
     Args:
-        chain: the mechanism.
         p: Euler parameters (N, 4).
         force: (J, 3) [N], on the near bodies, world frame.
         of_p: Q_p (J, 4) [N m].
@@ -483,7 +482,6 @@ def check_state_solvable(
     """Check that the state alone does not make S singular (E1, E7).
 
     Args:
-        chain: the mechanism.
         r: positions (N, 3) [m], world frame.
         p: Euler parameters (N, 4).
         d: vectors along the rods (N, 3) [m].  One below its own rounding (16 ε of the vectors that it is the

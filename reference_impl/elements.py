@@ -106,9 +106,6 @@ class Elements:
             pdot: rates ṗ (N, 4) [1/s].
             x: joint coordinates (J, 2) near which angles are taken [rad]; absent: principal values.
 
-        Returns:
-            Their rows and forces.
-
         """
         state = _with_world(r, p, v, pdot)
         re, pe, ve, pdot_e = (y[self.bodies] for y in state)  # (2, e, ·) near, far

@@ -52,7 +52,6 @@ def unpack_state(y: Array, n: int) -> tuple[Array, Array, Array, Array]:
 
     Args:
         y: states (..., 14 N).
-        n: number of bodies N.
 
     Returns:
         r (..., N, 3), p (..., N, 4), ṙ (..., N, 3) and ṗ (..., N, 4).
@@ -67,7 +66,6 @@ def direct_acceleration(chain: Mechanism, gamma_defect: float | Array = 0.0) -> 
     """Return the right-hand side of the direct form.
 
     Args:
-        chain: the mechanism.
         gamma_defect: added to γ, one number or one per row (c,): a planted fault of known growth (E4).
 
     Returns:
@@ -107,7 +105,6 @@ def state_scales(chain: Mechanism, r: Array, p: Array, v: Array, pdot: Array) ->
     falling through the chain's own length reaches.
 
     Args:
-        chain: the mechanism.
         r: initial positions (N, 3) [m].
         p: initial Euler parameters (N, 4).
         v: initial velocities ṙ (N, 3) [m/s].
@@ -142,7 +139,6 @@ def integrate_dop853(
     """Integrate (N6) by scipy's DOP853; with springs on angles, beside it the angles by their rates.
 
     Args:
-        chain: the mechanism.
         r: initial positions (N, 3) [m].
         p: initial Euler parameters (N, 4).
         v: initial velocities ṙ (N, 3) [m/s].

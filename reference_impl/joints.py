@@ -55,9 +55,6 @@ class ConstraintRows:
             joint: (m,) their joints.
             *rows: their near and far bodies (m,), and ∂/∂r near, ∂/∂p near, ∂/∂p far and γ.
 
-        Returns:
-            All rows.
-
         """
         names = ("joint", "near", "far", "r_near", "p_near", "p_far", "gamma", "C")
         more = zip(names, (joint, *rows, np.zeros(len(joint))), strict=True)
@@ -170,7 +167,6 @@ def constraint_rows(
     """Evaluate C, C_r, C_p and γ of every joint (S1–S4, D2–D6 for rods; L1–L3 for the others).
 
     Args:
-        mechanism: bodies and joints.
         r: positions (N, 3) [m], world frame.
         p: Euler parameters (N, 4).
         v: velocities ṙ (N, 3) [m/s], world frame.

@@ -142,9 +142,6 @@ class Mechanism:
             drag_force: (N,) c_t [N s/m].
             drag_moment: (N,) c_r [N m s].
 
-        Returns:
-            The chain.
-
         """
         k = np.arange(len(length))
         far = np.concatenate([np.zeros_like(distal[:1]), distal[:-1]])
@@ -169,9 +166,6 @@ class Mechanism:
         Args:
             **changes: fields by name.  Of a chain also ``proximal`` and ``distal`` as `chain` takes them, and
                 a new ``length`` decides which joints are rods.
-
-        Returns:
-            The copy.
 
         """
         near, far = changes.pop("proximal", None), changes.pop("distal", None)
@@ -199,9 +193,6 @@ class Mechanism:
 
         Args:
             fields: as `fields` returns them; lists will do for arrays.
-
-        Returns:
-            The mechanism.
 
         """
         if "proximal" in fields:

@@ -13,11 +13,7 @@ def write(folder: Path, history: Path | None = None) -> Path:
     """Write report.html, junit.xml and summary.md of a stored run.
 
     Args:
-        folder: output folder of the run.
         history: folder of earlier nights, or None.
-
-    Returns:
-        The path of report.html.
 
     Raises:
         OSError: a file cannot be read or written.

@@ -24,7 +24,6 @@ def bucket_edges(count: int, points: int) -> np.ndarray:
     """Divide samples into buckets of consecutive ones.
 
     Args:
-        count: number of samples.
         points: number of values that may remain; each bucket keeps two.
 
     Returns:
@@ -124,9 +123,6 @@ class ChunkBuilder:
 
     def encode(self, header: Any) -> str:
         """Finish the chunk.
-
-        Args:
-            header: JSON values and references to arrays.
 
         Returns:
             The chunk, base64.

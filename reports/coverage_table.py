@@ -10,9 +10,6 @@ from reports.results import Record, Results
 def coverage_tables(folder: Path) -> Record | None:
     """Arrange the coverage of a run for the template.
 
-    Args:
-        folder: output folder of the run.
-
     Returns:
         Levels, kinds of parameters, the range per kind and level over all scenarios and of each scenario, and
         where nothing can be seen the reasons; None where the folder has no coverage.parquet.

@@ -63,9 +63,6 @@ class History:
     def is_new(self, row: Record) -> bool:
         """Report whether a row's disagreement was not in the last run that passed.
 
-        Args:
-            row: a row of the current run.
-
         Returns:
             True where the verdict differs from that run's, or is unexpected and the key is new.
 

@@ -48,11 +48,7 @@ def write(results: Results, history: Path | None = None) -> Path:
     """Write report.html beside the stored results.
 
     Args:
-        results: the run.
         history: folder of earlier nights, or None.
-
-    Returns:
-        The page's path.
 
     Raises:
         OSError: the page cannot be written.
@@ -64,16 +60,7 @@ def write(results: Results, history: Path | None = None) -> Path:
 
 
 def render(results: Results, history: History) -> str:
-    """Render the page, with as many points per curve as its size limit allows.
-
-    Args:
-        results: the run.
-        history: earlier runs.
-
-    Returns:
-        HTML.
-
-    """
+    """Render the page, with as many points per curve as its size limit allows."""
     budget = MAX_NIGHTLY_PAGE_BYTES if history.nights or len(results.scenarios) > 60 else MAX_PAGE_BYTES
     shown = results.restricted_to(_scenarios_to_show(results))
     tables = {k: shown.table_by_scenario(k) for k in ("states", "curves", "trajectories")}
@@ -252,9 +239,6 @@ def _random_scenario_summary(results: Results) -> Record | None:
 def bundle_script() -> str:
     """Join uPlot and the page's modules into one classic script, without their import and export keywords.
 
-    Returns:
-        JavaScript.
-
     Raises:
         ValueError: two modules use a name, or the script contains the end of a script element.
 
@@ -308,9 +292,6 @@ def content_security_policy(style: str, script: str | None = None) -> str:
         style: content of the style element.
         script: content of the script element; None for none.
 
-    Returns:
-        The policy.
-
     """
     sources = ["default-src 'none'", f"style-src {_csp_hash(style)}", "img-src data:"]
     if script is not None:
@@ -319,12 +300,7 @@ def content_security_policy(style: str, script: str | None = None) -> str:
 
 
 def stylesheet() -> str:
-    """Join uPlot's style and the pages' own.
-
-    Returns:
-        CSS.
-
-    """
+    """Join uPlot's style and the pages' own."""
     vendor = (REPORTS_FOLDER / "assets" / "vendor" / "uPlot.min.css").read_text(encoding="utf-8")
     return vendor + (REPORTS_FOLDER / "assets" / "style.css").read_text(encoding="utf-8")
 

@@ -20,13 +20,6 @@ def write(results: Results) -> Path:
     An unexpected row is a failure (a disagreement, a gap) or an error (the engine failed). A row that a known
     issue expects, and one of an engine that is not installed, is skipped with its reason.
     Rows that are information are only counted, in a property of the suite.
-
-    Args:
-        results: the run.
-
-    Returns:
-        The file's path.
-
     """
     suites = ET.Element("testsuites", name="plumbline", time=f"{float(results.run['duration']):.3f}")
     totals = {"tests": 0, "failures": 0, "errors": 0, "skipped": 0}
@@ -50,8 +43,6 @@ def add_suite(
     """Add a suite with a test case per check.
 
     Args:
-        suites: the root element.
-        name: of the suite.
         found: all rows; those that are information are only counted, in a property.
         properties: further properties of the suite.
 

@@ -26,11 +26,7 @@ def write(folder: Path, document: Record) -> Path:
     """Write model.json, model.html, junit.xml and model.sarif.
 
     Args:
-        folder: output folder.
         document: result of a run, as the command prints it with --json.
-
-    Returns:
-        The path of model.html.
 
     Raises:
         OSError: a file cannot be written.
@@ -48,9 +44,6 @@ def write(folder: Path, document: Record) -> Path:
 
 def render(document: Record) -> str:
     """Render the page.
-
-    Args:
-        document: of a run.
 
     Returns:
         HTML, one file without a script.
@@ -128,9 +121,6 @@ def _junit(document: Record) -> bytes:
 
 def sarif(document: Record) -> dict[str, Any]:
     """Write the findings for code scanning.
-
-    Args:
-        document: of a run.
 
     Returns:
         A SARIF 2.1.0 log: a result per cause at the line of the file, per other finding, and per bad file.

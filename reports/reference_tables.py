@@ -29,7 +29,6 @@ def drift_table(folder: Path, stored: Path = STORED_RESULTS) -> Record | None:
     """Arrange the drift of the reference's variants for the template.
 
     Args:
-        folder: output folder of the run.
         stored: folder with a stored measurement, used where ``folder`` has none.
 
     Returns:
@@ -64,7 +63,6 @@ def benchmark_table(folder: Path, stored: Path = STORED_RESULTS) -> Record | Non
     The pictures are included as images, in which no script can run and from which no request can start.
 
     Args:
-        folder: output folder of the run.
         stored: folder with a stored measurement, used where ``folder`` has none.
 
     Returns:

@@ -56,7 +56,6 @@ def rerun_command(row: Record, scenario: Record) -> str:
 
     Args:
         row: a stored row of the cell; long runs are repeated by ``nightly``, all others by ``run``.
-        scenario: description of the row's scenario.
 
     Returns:
         The command line, quoted for a POSIX shell.
@@ -96,7 +95,6 @@ def index_chunk(results: Results, history: History) -> str:
 
     Args:
         results: the run, restricted to the scenarios of the page.
-        history: earlier runs.
 
     Returns:
         The chunk, see `reports.chunks`; its header is ``Index`` in report_data.d.ts.
@@ -142,8 +140,6 @@ def scenario_chunk(name: str, results: Results, tables: ScenarioTables, points: 
     """Encode everything that the cells of one scenario show.
 
     Args:
-        name: the scenario.
-        results: the run.
         tables: states, curves and trajectories by scenario.
         points: largest number of values per curve; 0 for no curves and no motion.
 
@@ -430,9 +426,6 @@ def _body_shapes(scenario: Record) -> list[Record]:
 def convergence_chunk(results: Results) -> str:
     """Encode every convergence study: error, cost and observed order at each resolution, coarse to fine.
 
-    Args:
-        results: the run.
-
     Returns:
         The chunk, see `reports.chunks`; its header is a list of ``Study`` in report_data.d.ts.
 
@@ -469,7 +462,6 @@ def history_chunk(results: Results, history: History) -> str:
     """Encode value, error over tolerance and verdict of each row's key over the nights, this run last.
 
     Args:
-        results: the run.
         history: earlier runs, at least one.
 
     Returns:

@@ -30,9 +30,6 @@ def replace_unprintable(value: Any) -> Any:
     Args:
         value: texts, and lists and dictionaries of them, between other values.
 
-    Returns:
-        The same structure.
-
     """
     if isinstance(value, str):
         plain = value.isascii() and value.isprintable()  # most are, and this test is faster
@@ -57,12 +54,6 @@ class Results:
     @classmethod
     def load(cls, folder: Path) -> Results:
         """Read results.json of any readable schema version.
-
-        Args:
-            folder: output folder of the run.
-
-        Returns:
-            The run.
 
         Raises:
             DamagedResults: the file is missing or damaged.
@@ -153,7 +144,6 @@ def group_rows(columns: Columns, *by: str) -> Iterator[tuple[tuple[str, ...], np
 
     Args:
         columns: (n,) arrays by column.
-        *by: names of the columns.
 
     Yields:
         Each distinct combination of values, in order of first appearance, and the indices of its records.

@@ -25,8 +25,6 @@ def take_screenshot(
     """Open the report in Chromium and save the visible part as PNG.
 
     Args:
-        report: path of report.html.
-        image_path: the picture.
         view: the part of the address after the file, for example "#scenario=…&engine=…"; "" for the matrix.
         width: of the window [px].
         height: of the window [px].

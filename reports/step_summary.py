@@ -17,15 +17,7 @@ _MARKDOWN_SPECIAL = re.compile(r"[^0-9A-Za-z .,;:()/+%=\u0080-\uffff-]")
 
 
 def write(results: Results) -> Path:
-    """Write summary.md beside the stored results.
-
-    Args:
-        results: the run.
-
-    Returns:
-        The file's path.
-
-    """
+    """Write summary.md beside the stored results."""
     path = results.folder / "summary.md"
     write_atomically(path, render(results).encode())
     return path
@@ -50,9 +42,6 @@ def escape_markdown(text: Any, max_length: int = 400) -> str:
 
 def render(results: Results) -> str:
     """Render the summary: sentence, counts, engines by family, then as many findings as fit.
-
-    Args:
-        results: the run.
 
     Returns:
         Markdown of at most `MAX_SUMMARY_BYTES`.

@@ -41,9 +41,6 @@ class Axis(NamedTuple):
     def index_of(self, value: float) -> int:
         """Find the place of a value along the axis.
 
-        Args:
-            value: a value of the parameter.
-
         Returns:
             The index of the value, or of the interval that holds it.
 
@@ -55,12 +52,6 @@ class Axis(NamedTuple):
 
 def write(folder: Path) -> Path:
     """Render sweep.html from sweep.parquet.
-
-    Args:
-        folder: output folder of the sweep.
-
-    Returns:
-        The page's path.
 
     Raises:
         OSError: the table cannot be read, or the page not be written.
@@ -80,12 +71,8 @@ def render(parameters: Sequence[str], rows: Sequence[Record], sweep_info: Record
     """Render the page of a sweep.
 
     Args:
-        parameters: names of the varied columns.
         rows: the sweep's records, one per cell and implementation.
         sweep_info: content of the sweep's file; may be empty.
-
-    Returns:
-        HTML.
 
     """
     varied = [name for name in parameters if len({row[name] for row in rows}) > 1] or list(parameters)
@@ -132,16 +119,7 @@ def render(parameters: Sequence[str], rows: Sequence[Record], sweep_info: Record
 
 
 def make_axis(name: str, rows: Sequence[Record]) -> Axis:
-    """Lay out a parameter's values along an axis, as intervals where there are too many values.
-
-    Args:
-        name: the parameter's column.
-        rows: records of the sweep.
-
-    Returns:
-        The axis.
-
-    """
+    """Lay out a parameter's values along an axis, as intervals where there are too many values."""
     values = sorted({float(row[name]) for row in rows})
     if len(values) <= MAX_AXIS_VALUES:
         return Axis(name, [f"{value:.4g}" for value in values], values, None)
@@ -154,9 +132,7 @@ def map_cells(rows: Sequence[Record], column: str, across: Axis, down: Axis | No
     """Summarise the records at each place of the map.
 
     Args:
-        rows: records of one implementation.
         column: the column whose largest value is shown.
-        across: parameter along the rows.
         down: parameter along the columns, or None.
 
     Returns:

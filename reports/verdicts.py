@@ -17,9 +17,6 @@ from reports.results import Record, Results
 def severity(row: Record) -> int:
     """Rank the verdict of one row.
 
-    Args:
-        row: a stored row.
-
     Returns:
         10 (the harness failed) … 1 (not installed), see `plumbline.judging.rows.severity`.
 
@@ -29,9 +26,6 @@ def severity(row: Record) -> int:
 
 def shown_verdict(row: Record) -> str:
     """Return what one row is shown as.
-
-    Args:
-        row: a stored row.
 
     Returns:
         A key of `plumbline.judging.rows.SHOWN_STYLES`.
@@ -43,9 +37,6 @@ def shown_verdict(row: Record) -> str:
 def needs_attention(row: Record) -> bool:
     """Report a disagreement, failure or gap that no entry of known_issues.yaml expects.
 
-    Args:
-        row: a stored row.
-
     Returns:
         True where the row is listed as needing attention.
 
@@ -55,9 +46,6 @@ def needs_attention(row: Record) -> bool:
 
 def error_ratio(row: Record) -> float | None:
     """Return a row's error over its tolerance, as judged.
-
-    Args:
-        row: a stored row.
 
     Returns:
         The ratio; None where the row has none or it is not finite.
@@ -70,9 +58,6 @@ def error_ratio(row: Record) -> float | None:
 def rank(row: Record) -> tuple[int, float]:
     """Return the sort key whose maximum over a cell's rows is the row that stands for the cell.
 
-    Args:
-        row: a stored row.
-
     Returns:
         Severity, then ratio, see `plumbline.judging.rows.cell_rank`.
 
@@ -82,9 +67,6 @@ def rank(row: Record) -> tuple[int, float]:
 
 def unexpected_rows(candidates: Iterable[Record]) -> list[Record]:
     """Select the rows that need attention.
-
-    Args:
-        candidates: stored rows.
 
     Returns:
         Those of them that need attention, the most severe first.
@@ -96,9 +78,6 @@ def unexpected_rows(candidates: Iterable[Record]) -> list[Record]:
 def count_verdicts(records: Iterable[Record]) -> Counter[str]:
     """Count rows by what they are shown as: recorded disagreements apart.
 
-    Args:
-        records: stored rows.
-
     Returns:
         The number of rows of each key of `plumbline.judging.rows.SHOWN_STYLES` that occurs.
 
@@ -108,9 +87,6 @@ def count_verdicts(records: Iterable[Record]) -> Counter[str]:
 
 def count_all_verdicts(results: Results) -> Counter[str]:
     """Count all rows of a run, including those of random scenarios that are stored as counts only.
-
-    Args:
-        results: the run.
 
     Returns:
         The number of rows of each verdict that occurs.
@@ -142,7 +118,6 @@ def format_number(x: Any, digits: int = 2) -> str:
 
     Args:
         x: a number, or None.
-        digits: significant digits.
 
     Returns:
         For example 0.031 or 4.2×10⁻⁶; "–" for None.

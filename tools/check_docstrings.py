@@ -26,9 +26,6 @@ FunctionNode = ast.FunctionDef | ast.AsyncFunctionDef
 def problems_in_file(path: Path) -> Iterator[str]:
     """Find the problems of the public functions and classes of one file.
 
-    Args:
-        path: the Python file.
-
     Yields:
         One message per problem, as ``file:line: name: what is missing``.
 

@@ -27,9 +27,6 @@ def make_console(file: Any) -> Console:
     Args:
         file: an open text file, as sys.stdout.
 
-    Returns:
-        The console.
-
     """
     columns = os.environ.get("COLUMNS", "")
     is_set = file.isatty() or (columns.isdecimal() and int(columns) > 0)
@@ -42,9 +39,6 @@ def wrap_items(items: Iterable[str], width: int) -> str:
     Args:
         items: texts without line breaks.
         width: of the lines, in columns.
-
-    Returns:
-        The lines.
 
     """
     lines = [""]
@@ -69,12 +63,8 @@ def count_noun(count: int, singular: str, plural: str = "") -> str:
     """Write a number with its noun, as "1 body" or "2 bodies".
 
     Args:
-        count: how many.
         singular: the noun for one.
         plural: the noun for several; absent: ``singular`` with an s.
-
-    Returns:
-        The words.
 
     """
     return f"{count} {singular if count == 1 else plural or singular + 's'}"
@@ -85,7 +75,6 @@ def print_table(records: Iterable[Mapping[str, Any]], title: str | None = None) 
 
     Args:
         records: rows that have the same keys, which become the header.
-        title: a line above the table.
 
     """
     table = Table(box=None, pad_edge=False, header_style="bold", title=title)
@@ -129,7 +118,6 @@ class ProgressDisplay:
         """Show how far the run is.
 
         Args:
-            done: finished tasks.
             total: tasks that are known so far.
             task_name: the task that finished last.
 
@@ -141,12 +129,7 @@ class ProgressDisplay:
 
 
 def print_matrix(matrix: VerdictMatrix) -> None:
-    """Print the matrix of verdicts and its legend on stdout.
-
-    Args:
-        matrix: scenarios × engines.
-
-    """
+    """Print the matrix of verdicts and its legend on stdout."""
     out = make_console(sys.stdout)
     out.print(matrix.table())
     legend = wrap_items((f"{style.glyph} {shown}" for shown, style in SHOWN_STYLES.items()), out.width)
@@ -157,12 +140,7 @@ def print_matrix(matrix: VerdictMatrix) -> None:
 
 
 def print_result(result: RunResult) -> None:
-    """Print the matrix of scenarios × engines, the reason of every row that does not agree, and the summary.
-
-    Args:
-        result: a judged run.
-
-    """
+    """Print the matrix of scenarios × engines, why rows do not agree, and the summary."""
     out = make_console(sys.stdout)
     in_doubt = {row.reason: None for row in result.rows if row.verdict == Verdict.HARNESS_FAILED}
     for reason in in_doubt:

@@ -56,23 +56,11 @@ class LazyGroup(click.Group):
     """A group that imports a command when it is used, and suggests the nearest name for an unknown one."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """List the names of the commands.
-
-        Args:
-            ctx: the group's context.
-
-        Returns:
-            The names in alphabetical order.
-
-        """
+        """List the names of the commands."""
         return sorted(COMMANDS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Import a command.
-
-        Args:
-            ctx: the group's context.
-            cmd_name: the command's name.
 
         Returns:
             The command; None where there is none of that name.
@@ -85,13 +73,7 @@ class LazyGroup(click.Group):
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Write the list of commands without importing them.
-
-        Args:
-            ctx: the group's context.
-            formatter: takes the list.
-
-        """
+        """Write the list of commands without importing them."""
         with formatter.section("Commands"):
             formatter.write_dl([(name, COMMANDS[name][1]) for name in self.list_commands(ctx)])
 
@@ -99,10 +81,6 @@ class LazyGroup(click.Group):
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         """Find the command that the first argument names.
-
-        Args:
-            ctx: the group's context.
-            args: what follows the group's own options.
 
         Returns:
             The command's name, the command and its arguments.
@@ -138,15 +116,7 @@ class LazyGroup(click.Group):
             sys.exit(ExitCode.MACHINE_FAILED)
 
     def invoke(self, ctx: click.Context) -> Any:
-        """Run a command; an interruption or an internal error ends with its own exit code and a sentence.
-
-        Args:
-            ctx: the group's context.
-
-        Returns:
-            What the command returns.
-
-        """
+        """Run a command; an interruption or an internal error ends with its own exit code and a sentence."""
         _make_streams_writable()
         try:
             with _termination_as_interrupt():

@@ -174,15 +174,7 @@ def _write_reports(document: dict[str, Any], folder: Path, as_json: bool) -> Non
 
 
 def model_document(result: ModelRunResult) -> dict[str, Any]:
-    """Write a result as a document for other programs.
-
-    Args:
-        result: of a run.
-
-    Returns:
-        JSON values.
-
-    """
+    """Write a result as a document for other programs."""
     plan = result.plan
     document = {
         "version": __version__,

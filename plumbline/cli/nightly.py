@@ -61,9 +61,7 @@ class NightPlan:
         """Read the plan of the unfinished night, or write a new one.
 
         Args:
-            folder: folder of the unfinished night.
             seed: seed of the random scenarios; None for the unfinished night's, or a new one.
-            random_count: number of random scenarios.
 
         Returns:
             The plan of the unfinished night if it has this seed and number, else a new one.
@@ -115,19 +113,13 @@ def run_nightly(
     """Run a night, or what is left of an interrupted one.
 
     Args:
-        out: output folder of all nights.
-        scenarios: scenarios of the catalogue to run.
-        engines: names of the engines.
         random_count: number of random scenarios: half of them chains, the others mechanisms of any joints.
         seed: their seed; None for the interrupted night's, or a new one.
-        jobs: number of worker processes.
         limits: limits of each task.
-        is_full_catalogue: whether every known issue must occur.
         command: the command line, stored with the results.
         random_trajectory_count: number of random motions, which are compared at every level.
         extra_refinements: halvings of the finest step beyond a run's refinement study.
         long_run_seconds: length of the long runs [s]; 0 for none.
-        level: levels to compare at.
         scheduler: address of a dask cluster to run on.
         proof_cpu_seconds: CPU time after which no further proof of a motion is begun [s]; 0: none is begun.
         self_test: runs the self-test of a night, given by its number, and writes its JUnit file to the given
@@ -237,8 +229,6 @@ def night_coverage(result: RunResult, plan: Plan, progress: ProgressCallback) ->
     Where that fails the night is kept, with the reason in its sentence and the exit code of a failed harness.
 
     Args:
-        result: the night's result.
-        plan: what was run.
         progress: called after every scenario.
 
     Returns:
@@ -271,9 +261,6 @@ def _stored_features(folder: Path) -> list[list[Feature]]:
 def unused_path(place: Path) -> Path:
     """Return a path that does not exist: a clock that was set back can give two nights the same name.
 
-    Args:
-        place: the wanted path.
-
     Returns:
         ``place``, or with -2, -3, … after it.
 
@@ -284,11 +271,6 @@ def unused_path(place: Path) -> Path:
 
 def write_random_scenario_files(result: RunResult, drawn: RandomScenarios, folder: Path) -> None:
     """Write the files of the random scenarios that have rows in the result, so that `run FILE` repeats them.
-
-    Args:
-        result: the night's result.
-        drawn: the random scenarios.
-        folder: folder of the files.
 
     Raises:
         OSError: a file cannot be written.

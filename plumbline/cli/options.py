@@ -53,9 +53,6 @@ class FiniteNumber(click.FloatRange):
             param: the option, for the message.
             ctx: the command's context, for the message.
 
-        Returns:
-            The number.
-
         """
         if not math.isfinite(click.FLOAT.convert(value, param, ctx)):
             self.fail(f"{value} is not a finite number.", param, ctx)
@@ -75,9 +72,6 @@ class FolderPath(click.Path):
             value: the text of the command line, or a default.
             param: the option or argument, for the message.
             ctx: the command's context, for the message.
-
-        Returns:
-            The path.
 
         """
         if not os.fspath(value):
@@ -102,9 +96,6 @@ class ResultsPath(FolderPath):
             value: the text of the command line, or a default.
             param: the option or argument, for the message.
             ctx: the command's context, for the message.
-
-        Returns:
-            The path of the folder.
 
         """
         path = super().convert(value, param, ctx)
@@ -252,11 +243,7 @@ def read_known_issues(files: Sequence[Path], chosen: Sequence[scenarios.Scenario
     """Load the project's known issues and the user's; exit with 2 where a file has a problem.
 
     Args:
-        files: files of the user.
         chosen: the scenarios of the run, which entries of the user may name.
-
-    Returns:
-        The entries of all files.
 
     """
     return _read_known_issues((KNOWN_ISSUES_FILE, *files), [s.name for s in chosen])
@@ -266,11 +253,7 @@ def read_user_known_issues(files: Sequence[Path], names: Sequence[str]) -> list[
     """Load the user's known issues of model files; exit with 2 where a file has a problem.
 
     Args:
-        files: files of the user.
         names: the model files as typed, which entries may name as their scenario.
-
-    Returns:
-        The entries of all files.
 
     """
     return _read_known_issues(files, names)
@@ -315,9 +298,6 @@ def choose_scenarios(names: Sequence[str], families: Sequence[str]) -> list[scen
         names: names of the catalogue or paths; empty for the whole catalogue.
         families: names of families; empty for all.
 
-    Returns:
-        The scenarios.
-
     Raises:
         BadParameter: no scenario is of one of the families.
 
@@ -337,9 +317,6 @@ def require_chains(found: Sequence[scenarios.Scenario]) -> list[scenarios.Scenar
 
     Args:
         found: scenarios that the user named.
-
-    Returns:
-        The same.
 
     Raises:
         BadParameter: one of them is not a chain of rods and ball joints from the origin.
@@ -365,9 +342,6 @@ def claim_folder(folder: Path) -> Path:
 
     Args:
         folder: the folder; parents are made too.
-
-    Returns:
-        The folder.
 
     Raises:
         BadParameter: the folder cannot be made or written to, or another command uses it (exit code 2).

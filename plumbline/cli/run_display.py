@@ -59,9 +59,7 @@ class RunDisplay(ProgressDisplay, RunObserver):
         """Take rows of a scenario.
 
         Args:
-            scenario: its name.
             rows: new rows; all rows of the scenario where it is complete.
-            is_complete: whether all its tasks have finished.
 
         """
         if not is_complete:
@@ -76,7 +74,6 @@ class RunDisplay(ProgressDisplay, RunObserver):
         """Show how far the run is.
 
         Args:
-            done: finished tasks.
             total: tasks that are known so far.
             task_name: the task that finished last.
 

@@ -74,9 +74,6 @@ def check(files: tuple[Path, ...]) -> None:
 def describe_immovable_joints(s: scenarios.Scenario) -> str:
     """Name the joints that loops keep from moving.
 
-    Args:
-        s: a scenario.
-
     Returns:
         What cannot move: the mechanism, or the joints by the bodies that they carry and by their number
         among `closes`; empty where every joint can.

@@ -29,12 +29,7 @@ class VerdictMatrix:
     """
 
     def __init__(self, engines: Mapping[str, EngineInfo]) -> None:
-        """Start without rows.
-
-        Args:
-            engines: descriptions of the columns.
-
-        """
+        """Start without rows."""
         self._engines = engines
         self._rows: dict[str, list[Row]] = {}
 
@@ -44,23 +39,11 @@ class VerdictMatrix:
         return len(self._rows)
 
     def add_rows(self, scenario: str, rows: Sequence[Row]) -> None:
-        """Add rows of a scenario.
-
-        Args:
-            scenario: its name.
-            rows: judged rows.
-
-        """
+        """Add rows of a scenario."""
         self._rows.setdefault(scenario, []).extend(rows)
 
     def replace_rows(self, scenario: str, rows: Sequence[Row]) -> None:
-        """Replace the rows of a scenario.
-
-        Args:
-            scenario: its name.
-            rows: all its rows.
-
-        """
+        """Replace the rows of a scenario."""
         self._rows[scenario] = list(rows)
 
     def table(self, max_lines: int | None = None) -> Table:
@@ -86,15 +69,7 @@ class VerdictMatrix:
         return table
 
     def line(self, scenario: str) -> str:
-        """Format the cells of a scenario.
-
-        Args:
-            scenario: its name.
-
-        Returns:
-            A line of rich markup.
-
-        """
+        """Format the cells of a scenario."""
         of = {engine: [r for r in self._rows[scenario] if r.engine == engine] for engine in self._engines}
         cells = ", ".join(f"{engine} {_format_cell(rows)}" for engine, rows in of.items() if rows)
         return f"{escape(scenario)}: {cells}"
@@ -108,9 +83,6 @@ class VerdictMatrix:
 
 def coloured_glyph(row: Row) -> str:
     """Format the glyph of a row's verdict.
-
-    Args:
-        row: a judged row.
 
     Returns:
         The glyph as rich markup, dimmed where a known issue expects the verdict.

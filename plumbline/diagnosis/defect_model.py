@@ -93,9 +93,6 @@ def make_defect_case(model: Model, states: Sequence[State]) -> DefectCase:
 def concatenate_cases(cases: Sequence[DefectCase]) -> DefectCase:
     """Join batches of mechanisms that have the same number of bodies.
 
-    Args:
-        cases: the batches.
-
     Returns:
         One batch, in the order of ``cases``.
 
@@ -108,7 +105,6 @@ def select_states(case: DefectCase, states: Sequence[int]) -> DefectCase:
     """Take some mechanisms out of a batch.
 
     Args:
-        case: the batch.
         states: their indices, 0 … B − 1.
 
     Returns:
@@ -120,9 +116,6 @@ def select_states(case: DefectCase, states: Sequence[int]) -> DefectCase:
 
 def relative_rates(c: DefectCase) -> Array:
     """Return the angular velocity of every body relative to the body before it.
-
-    Args:
-        c: mechanisms and states.
 
     Returns:
         ω′ − A₂ᵀA₁ω′₁ (B, N, 3), in each body's own frame; of the first body its absolute one.
@@ -145,9 +138,6 @@ def _carried_rates(c: DefectCase, a: Array) -> Array:
 def centre_positions_and_velocities(c: DefectCase) -> tuple[Array, Array]:
     """Compute the centres of mass and their velocities from the minimal coordinates.
 
-    Args:
-        c: mechanisms and states.
-
     Returns:
         r [m] and ṙ [m/s], (B, N, 3) each, world frame.
 
@@ -165,9 +155,6 @@ def _centre_positions_and_velocities(c: DefectCase, a: Array) -> tuple[Array, Ar
 
 def evaluate_case(c: DefectCase) -> dict[str, Array]:
     """Evaluate the state quantities of every mechanism, with its defects.
-
-    Args:
-        c: mechanisms and states.
 
     Returns:
         The fields of `StateQuantities` by name, units and frames as there: accelerations and joint reactions

@@ -58,10 +58,7 @@ def explain_disagreement(
     """Diagnose quantities that disagree with the truth; loads the engine, so call it in a worker.
 
     Args:
-        engine: its name in the registry.
-        model: the mechanism.
         engine_quantities: what the engine returned at the states of ``truth``.
-        truth: true quantities and bounds.
         is_known: whether the cause is on record as rounding: then only the scatter of the error is measured.
 
     Returns:
@@ -87,9 +84,7 @@ def diagnose(
     """Name the defect that explains how an engine differs from the truth.
 
     Args:
-        model: the mechanism.
         reported: what the engine returned at the states of ``truth``.
-        truth: true quantities and bounds.
         evaluate: evaluates the engine again, at rest, without gravity, without loads and drag, to localise
             the difference; None to skip that.
 
@@ -155,9 +150,7 @@ def observe_difference(
     """Select consecutive states around the one with the largest error, so that stale fields can be detected.
 
     Args:
-        model: the mechanism.
         reported: what the engine returned at the states of ``truth``.
-        truth: true quantities and bounds.
 
     Returns:
         The data to be explained: at most `MAX_STATES` states, the quantities that the engine offers at all.
@@ -230,7 +223,6 @@ def diagnose_quantity(difference: ObservedDifference, quantity: str) -> str | No
     """Find what an engine returned in place of one quantity.
 
     Args:
-        difference: the data to be explained.
         quantity: name of the wrong quantity.
 
     Returns:

@@ -84,11 +84,6 @@ class DigitLoss:
 def find_digit_loss(difference: ObservedDifference, model: Model, evaluate: Evaluate) -> DigitLoss | None:
     """Test whether the error at the worst state scatters when all axes are turned by a tiny angle.
 
-    Args:
-        difference: the data to be explained.
-        model: the mechanism.
-        evaluate: evaluates the engine.
-
     Returns:
         The loss; None where the error has a cause, or where the engine fails on the turned problems.
 
@@ -102,11 +97,6 @@ def find_digit_loss(difference: ObservedDifference, model: Model, evaluate: Eval
 
 def measure_scatter(difference: ObservedDifference, model: Model, evaluate: Evaluate) -> float | None:
     """Measure how the error at the worst state scatters when all axes are turned by a tiny angle.
-
-    Args:
-        difference: an engine's error.
-        model: the mechanism.
-        evaluate: evaluates the engine.
 
     Returns:
         The median distance of the errors from their mean, over their size; None where the engine fails.
@@ -124,11 +114,8 @@ def measure_step_scatter(
     """Measure how the error of a step scatters when all axes are turned by a tiny angle.
 
     Args:
-        model: the mechanism.
         state: where the step starts.
         h: step [s].
-        method: the declared formula.
-        step: takes one step of the engine.
 
     Returns:
         As `measure_scatter`.

@@ -54,15 +54,7 @@ class ObservedDifference:
         return float(np.max(ratios))  # not a number where any of them is
 
     def wrong_quantities(self, ratio: float = MAX_EXPLAINED_RATIO) -> list[str]:
-        """List the quantities whose error exceeds a number of bounds.
-
-        Args:
-            ratio: the number.
-
-        Returns:
-            Their names.
-
-        """
+        """List the quantities whose error exceeds a number of bounds."""
         return [
             q
             for q, x in self.expected.items()
@@ -75,22 +67,11 @@ class ObservedDifference:
         Args:
             i: its index.
 
-        Returns:
-            The data at this state.
-
         """
         return self._restricted(slice(i, i + 1), self.reported)
 
     def of_quantities(self, quantities: Sequence[str]) -> ObservedDifference:
-        """Restrict the data to some quantities.
-
-        Args:
-            quantities: their names.
-
-        Returns:
-            The data of these quantities.
-
-        """
+        """Restrict the data to some quantities."""
         return self._restricted(slice(None), quantities)
 
     def _restricted(self, states: slice, quantities: Iterable[str]) -> ObservedDifference:
@@ -170,7 +151,6 @@ def find_explanations(
     """Fit all causes and keep those that explain all quantities.
 
     Args:
-        difference: the data to be explained.
         are_conventions_only: whether to try only causes without an amount: where the error scatters, no
             number explains it.
 
@@ -191,9 +171,7 @@ def remaining_ratio(difference: ObservedDifference, model_answers: Answers, fit:
     """Measure what a fitted cause leaves unexplained.
 
     Args:
-        difference: the data to be explained.
         model_answers: quantities of the fast model without defect.
-        fit: the cause and its amount.
 
     Returns:
         The largest remaining difference over the bounds of the true and, where needed, also of the altered
@@ -230,7 +208,6 @@ def derivatives_by_amount(difference: ObservedDifference, at: Sequence[tuple[Cau
     """Differentiate the quantities by the amounts of causes, by central differences.
 
     Args:
-        difference: the data to be explained.
         at: causes with the amounts at which to differentiate.
 
     Returns:
@@ -272,7 +249,6 @@ def fit_causes(
     """Fit the causes whose first-order effect is most nearly parallel to the difference.
 
     Args:
-        difference: the data to be explained.
         model_answers: quantities of the fast model without defect.
         causes: causes with an amount.
 
@@ -298,7 +274,6 @@ def fit_cause(
     """Fit the amount of one cause by Gauss–Newton, starting from its nominal amount.
 
     Args:
-        difference: the data to be explained.
         model_answers: quantities of the fast model without defect.
         cause: a cause with an amount.
         slope: (K,) derivative of the data by the amount at its nominal value, in bounds per unit.

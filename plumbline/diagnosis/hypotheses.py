@@ -316,7 +316,6 @@ def format_significant(x: float, reference: float, resolution: float) -> str:
     """Format a number with the digits that show its difference from a reference.
 
     Args:
-        x: the number.
         reference: the number it is compared with; three digits of the difference are shown.
         resolution: uncertainty of ``x``; no digit below it is shown.
 

@@ -97,9 +97,6 @@ class Cause:
         Args:
             file: as in the sources.
 
-        Returns:
-            The cause.
-
         """
         phrase, sentence = (text.replace(f"{file}:", "line ") for text in (self.phrase, self.sentence))
         return replace(self, phrase=phrase, sentence=sentence)
@@ -131,8 +128,6 @@ def explain_importer(
 
     Args:
         title: name and version of the importer's engine, for the sentences.
-        model: what the file says.
-        reading: the importer's description.
         answers: the importer's quantities at the states of its reading.
         states: gives the states of a model; of joints with one name and kind the same values.
 
@@ -209,8 +204,6 @@ def damping_cause(title: str, model: NeutralModel, reading: NeutralModel) -> Cau
 
     Args:
         title: name and version of the importer's engine, for the sentence.
-        model: what the file says.
-        reading: the importer's description.
 
     Returns:
         The joints whose damping differs; None where there are none.
@@ -674,7 +667,6 @@ def describe_difference(own: NeutralModel, theirs: NeutralModel) -> str:
     """Describe the first parameter in which two readings of equivalent files differ.
 
     Args:
-        own: of the file as written.
         theirs: of the rewritten file, with the names of the first.
 
     Returns:
@@ -798,9 +790,6 @@ def apply_changes(own: NeutralModel, theirs: NeutralModel, changes: Sequence[Cha
         own: the neutral model, fixed bodies lumped.
         theirs: the importer's description, from which additional bodies are taken.
         changes: of `differences` and `omissions`.
-
-    Returns:
-        The changed model.
 
     """
     bodies = {body.name: body for body in own.bodies}
@@ -942,9 +931,6 @@ def format_value(value: Any, other: Any) -> str:
     Args:
         value: a number, an array or a text.
         other: the value that it is compared with.
-
-    Returns:
-        The text.
 
     """
     if isinstance(value, str):

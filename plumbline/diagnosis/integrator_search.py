@@ -69,11 +69,8 @@ def explain_disagreeing_steps(
     """Diagnose steps that disagree with their formula; loads the engine, so call it in a worker.
 
     Args:
-        engine: its name in the registry.
         integrator: name of one of its integrators, with a declared method.
-        model: the pendulum.
         states: states that the steps start from.
-        answer: the engine's steps.
         is_known: whether the cause is on record as rounding: then only the scatter of the error is measured.
 
     Returns:
@@ -106,10 +103,8 @@ def explain_steps(model: Model, states: Sequence[State], method: StepMethod, ans
     """Name the integrator that explains an engine's steps.
 
     Args:
-        model: the pendulum.
         states: states that the steps start from.
         method: the declared formula, from which the steps differ.
-        answer: the engine's steps.
 
     Returns:
         A sentence: "behaves as if …" or that no other formula explains the steps.
@@ -150,9 +145,6 @@ def explain_steps(model: Model, states: Sequence[State], method: StepMethod, ans
 
 def sample_readings(model: Model) -> Iterator[tuple[str, Callable[[StepRun], StepRun]]]:
     """List in which other frames, or at which other points, an engine's samples may hold the velocities.
-
-    Args:
-        model: the mechanism.
 
     Yields:
         Words that complete "behaves as if", and what turns such samples into right ones.

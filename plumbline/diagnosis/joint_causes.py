@@ -66,9 +66,6 @@ class JointCause:
 def joint_causes(model: Model) -> Iterator[JointCause]:
     """List the causes of a mechanism.
 
-    Args:
-        model: the mechanism.
-
     Yields:
         Numbers of the bodies; elements of all joints together, of each coordinate and of each spring; points
         and axes of each joint.
@@ -120,9 +117,6 @@ def joint_causes(model: Model) -> Iterator[JointCause]:
 
 def vector_causes(model: Model) -> Iterator[JointCause]:
     """List the causes of three numbers.
-
-    Args:
-        model: the mechanism.
 
     Yields:
         Points and turns of the axes of each joint, loads of each body, and gravity.
@@ -222,9 +216,6 @@ def _scaled_from(name: str, first: int, part: Any) -> Callable[[Model, float], M
 def element_words(name: str) -> str:
     """Name a field of the mechanism.
 
-    Args:
-        name: the field.
-
     Returns:
         The words, with an article.
 
@@ -264,10 +255,6 @@ def _scaled_places(name: str, places: Sequence[tuple[int, int]]) -> Callable[[Mo
 
 def one_number(name: str, at: tuple[int, ...]) -> Callable[[Model, Any], Model]:
     """Change one number of a field, or one vector.
-
-    Args:
-        name: the field.
-        at: its place there.
 
     Returns:
         The change: of a model, to a value.

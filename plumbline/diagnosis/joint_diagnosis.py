@@ -124,9 +124,7 @@ def diagnose_joints(model: Model, reported: Sequence[StateQuantities], truth: St
     """Name what explains how an engine differs from the truth on a mechanism of any joints.
 
     Args:
-        model: the mechanism.
         reported: what the engine returned at the states of ``truth``.
-        truth: true quantities and bounds.
 
     Returns:
         A sentence: "behaves as if …" or that no single change explains the difference.

@@ -53,8 +53,6 @@ class Predictor:
         """Prepare for the states.
 
         Args:
-            model: the right mechanism.
-            states: states of it.
             are_bodies_kept: whether bodies are where the states have them, not where coordinates put them.
             end_rows: of `tree_solution`, of the loops.
 
@@ -68,7 +66,6 @@ class Predictor:
 
         Args:
             seen: what the engine evaluates in place of each state.
-            names: of the quantities.
 
         Returns:
             Quantity by quantity, and of each state by state.

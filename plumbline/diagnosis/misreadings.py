@@ -51,9 +51,6 @@ TURNS = {1: "as", -1: "against", 2: "twice as", -2: "twice against"}
 def misreadings(model: Model) -> Iterator[tuple[str, Misreading]]:
     """List what an engine may read in another frame, or not as the number that it is.
 
-    Args:
-        model: the mechanism.
-
     Yields:
         Words that complete "behaves as if", and the mechanism and the state that the engine sees.
 

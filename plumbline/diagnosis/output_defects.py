@@ -100,7 +100,6 @@ def output_defects(case: DefectCase, quantity: str) -> Iterator[OutputDefect]:
 
     Args:
         case: the mechanism, at the states to be explained.
-        quantity: its name.
 
     Yields:
         The table's defects of the quantity, then those in one force, one body or one term of it.

@@ -18,9 +18,6 @@ NOT_HELD = 1e-9  # of a direction: what the joint holds of it
 def row_defects(model: Model) -> Iterator[tuple[str, Misreading]]:
     """List defects of rows.
 
-    Args:
-        model: the mechanism.
-
     Yields:
         Words that complete "behaves as if", and what the engine evaluates.
 
@@ -56,9 +53,6 @@ def velocity_terms(joint: int) -> list[Misreading]:
 
 def missing_gammas(model: Model) -> Iterator[tuple[str, Misreading]]:
     """List rows that an engine in maximal coordinates evaluates without γ.
-
-    Args:
-        model: the mechanism.
 
     Yields:
         Words that complete "behaves as if", and what the engine evaluates.

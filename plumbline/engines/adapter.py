@@ -143,9 +143,6 @@ class Adapter(ABC):
         Args:
             name: its name, as in `integrators`.
 
-        Returns:
-            The integrator's description.
-
         Raises:
             KeyError: the engine has none of that name; the message lists those it has.
 
@@ -159,7 +156,6 @@ class Adapter(ABC):
         """Evaluate the state quantities at each state.
 
         Args:
-            model: the pendulum.
             states: states of it on the constraint manifold, double precision, unit quaternions.
 
         Returns:
@@ -189,8 +185,6 @@ class Adapter(ABC):
         """Simulate from a state and sample at given times; errors are those of `evaluate`.
 
         Args:
-            model: the pendulum.
-            state: the initial state.
             times: sample times (T,) [s], ascending from 0; multiples of the step for fixed-step methods.
             integrator: name of one of `integrators`.
             resolution: step [s], or relative tolerance, by the integrator's ``kind``.
@@ -218,11 +212,8 @@ class Adapter(ABC):
         """Take a few steps from a state and sample after each; errors are those of `evaluate`.
 
         Args:
-            model: the pendulum.
-            state: the initial state.
             integrator: name of a fixed-step integrator of `integrators` with a declared method.
             step: step [s].
-            count: number of steps.
 
         Returns:
             The samples, not normalised and not projected.
@@ -337,7 +328,6 @@ def check_samples(model: Model, times: Array, run: Trajectory, label: str) -> No
     """Check that a run was sampled at the given times, with finite rows of the right shapes.
 
     Args:
-        model: the pendulum.
         times: sample times (T,) [s] that the engine was given.
         run: the trajectory that the engine returned.
         label: engine and integrator, for the message.

@@ -53,7 +53,6 @@ def check_record(record: Any, kind: type, sizes: Mapping[str, int], label: str) 
     """Check that a record is of its class and its fields of the types and shapes of `FIELDS`.
 
     Args:
-        record: what the adapter returned.
         kind: the class that it must be of.
         sizes: the sizes that the shapes name.
         label: adapter and method, for the message.
@@ -82,9 +81,6 @@ def check_evaluation(answers: Any, model: Model, count: int, label: str) -> None
     """Check the answers of an evaluation: one record per state, of quantities that the mechanism has.
 
     Args:
-        answers: what the adapter returned.
-        model: the mechanism.
-        count: number of states.
         label: adapter and method, for the message.
 
     Raises:
@@ -124,12 +120,10 @@ def check_numbers(
     """Check that a value is a number, a count, or an array of doubles of a shape.
 
     Args:
-        value: what the adapter returned.
         shape: as in `FIELDS`.
         sizes: the sizes that the shape names.
         label: adapter, method and field, for the message.
         is_optional: whether None is valid too, for the message.
-        must_be_finite: whether NaN and infinities are refused.
 
     Raises:
         EngineFailure: it is not.
@@ -168,11 +162,7 @@ def check_text(value: Any, label: str) -> str:
     """Check a name, a title or a version.
 
     Args:
-        value: what the adapter declared or returned.
         label: adapter and field, for the message.
-
-    Returns:
-        The text.
 
     Raises:
         EngineFailure: it is not a text, or an empty or a very long one.
@@ -188,7 +178,6 @@ def check_version(column: Any, subject: str) -> tuple[str, str | None]:
     """Check the version of the engine that is loaded.
 
     Args:
-        column: an adapter or an importer.
         subject: what it is called: "adapter" or "column".
 
     Returns:
@@ -275,15 +264,7 @@ def _validators(annotated: type) -> dict[str, tuple[str, TypeAdapter[Any]]]:
 
 
 def describe_value(value: Any) -> str:
-    """Describe what came instead of a valid value.
-
-    Args:
-        value: anything.
-
-    Returns:
-        A noun phrase.
-
-    """
+    """Describe what came instead of a valid value."""
     if value is None or isinstance(value, bool):
         return str(value)
     if isinstance(value, np.ndarray):

@@ -84,9 +84,6 @@ class StepEvaluation:
 def describe_engine(engine: str) -> EngineInfo:
     """Load an engine and describe it.
 
-    Args:
-        engine: its name in the registry.
-
     Returns:
         Its description; ``missing`` holds a sentence where the engine is not installed here, or in a
         version that the adapter cannot use.
@@ -127,11 +124,6 @@ def describe_missing(name: str, error: ModuleNotFoundError | AttributeError, sub
 def evaluate_states(engine: str, model: Model, states: Sequence[State]) -> Evaluation:
     """Evaluate the state quantities of one engine; what the engine raises becomes a reason.
 
-    Args:
-        engine: its name in the registry.
-        model: the pendulum.
-        states: states of it.
-
     Returns:
         The quantities at each state, or the reason why there are none.
 
@@ -170,10 +162,6 @@ def run_refinement(
     """Simulate the same motion at each resolution; a run that fails is kept with its reason.
 
     Args:
-        engine: its name in the registry.
-        integrator: name of one of the engine's integrators.
-        model: the pendulum.
-        state: the initial state.
         times: sample times (T,) [s].
         resolutions: steps [s] or relative tolerances, coarse to fine.
         is_enough: asked after every run whether those so far will do; None to run at all resolutions.
@@ -215,16 +203,9 @@ def run_steps(
     """Take a few steps of each size from each state; what the engine raises becomes a reason.
 
     Args:
-        engine: its name in the registry.
-        integrator: name of one of the engine's integrators.
-        model: the pendulum.
-        states: states of it.
         steps: steps [s] from each state.
         counts: numbers of steps, ascending; where the engine refuses the largest or fails, the next
             smaller is tried: angles may become singular on the way, and an explicit method unstable.
-
-    Returns:
-        The steps.
 
     Raises:
         MemoryError: the worker reached its memory limit, which the pool reports.

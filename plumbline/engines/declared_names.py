@@ -24,12 +24,7 @@ def declared_integrators() -> frozenset[str]:
 
 @cache
 def declared_texts() -> frozenset[str]:
-    """Collect the texts in the adapters' source: names of algorithms and solvers are among them.
-
-    Returns:
-        Every string literal.
-
-    """
+    """Collect the texts in the adapters' source: names of algorithms and solvers are among them."""
     return _declared_names()[1]
 
 

@@ -99,7 +99,6 @@ def declared_attribute(engine: str, attribute: str) -> Any:
     The name of the distribution, for one, is needed where the engine is not installed.
 
     Args:
-        engine: name in the registry.
         attribute: name of a class attribute of the class or of one of its bases, written as a literal.
 
     Returns:
@@ -112,10 +111,6 @@ def declared_attribute(engine: str, attribute: str) -> Any:
 
 def declared_importer_attribute(importer: str, attribute: str) -> Any:
     """Read a literal class attribute of an importer column without importing it.
-
-    Args:
-        importer: name in the registry of importers.
-        attribute: name of a class attribute.
 
     Returns:
         Its value; None where no class declares it.
@@ -160,9 +155,6 @@ def ensure_interpreter(name: str, declared: Callable[[str, str], Any] = declared
     Args:
         name: an engine with a version, as typed on the command line.
         declared: reads the attributes of its column: `declared_attribute` or `declared_importer_attribute`.
-
-    Returns:
-        Path of the interpreter.
 
     Raises:
         OSError: the finished environment could not be moved into the cache.
@@ -253,7 +245,6 @@ def newest_requirement(package: str, *, pre: bool) -> str:
     """Look up the newest version of a distribution.
 
     Args:
-        package: name of the distribution.
         pre: whether pre-releases count.
 
     Returns:
@@ -282,14 +273,7 @@ class PublishedVersions:
 def published_versions(package: str) -> PublishedVersions:
     """List the versions of a distribution that the package index offers.
 
-    Args:
-        package: name of the distribution.
-
-    Returns:
-        The versions.
-
     `EnvironmentUnavailable` passes through where the index cannot be reached or has no such distribution.
-
     """
     listing = ("tool", "run", "--python", sys.executable, "pip", "index", "versions", package, "--json")
     every, usable = (

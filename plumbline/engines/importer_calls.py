@@ -32,9 +32,6 @@ _FIELDS = {  # shapes, as of `plumbline.engines.answers.FIELDS`; V velocities
 def describe_importer(name: str) -> EngineInfo:
     """Load an importer and describe it.
 
-    Args:
-        name: its name in the registry of importers.
-
     Returns:
         Its title and version; ``missing`` is a sentence where it is not installed here, or in a version that
         the column does not support.
@@ -53,10 +50,6 @@ def describe_importer(name: str) -> EngineInfo:
 
 def read_model_file(name: str, file: ModelFile) -> Reading:
     """Have an importer read a file; what it raises is its refusal.
-
-    Args:
-        name: the importer's name in the registry.
-        file: the file and how to load it.
 
     Returns:
         The engine's reading, or its refusal.
@@ -80,7 +73,6 @@ def read_model_files(name: str, files: Mapping[str, ModelFile]) -> dict[str, Rea
     """Have an importer read several files.
 
     Args:
-        name: the importer's name in the registry.
         files: by any key.
 
     Returns:
@@ -96,7 +88,6 @@ def evaluate_model_file(
     """Have an importer's engine compute the quantities at each state.
 
     Args:
-        name: the importer's name in the registry.
         file: a file that the importer accepts.
         states: canonical states of the importer's own reading, all of the same length.
 
@@ -117,15 +108,7 @@ def evaluate_model_file(
 
 
 def run_script(text: str) -> str:
-    """Run a script about an importer as a user would.
-
-    Args:
-        text: of the script.
-
-    Returns:
-        What it prints.
-
-    """
+    """Run a script about an importer as a user would."""
     printed = io.StringIO()
     with redirect_stdout(printed):
         exec(compile(text, "script", "exec"), {"__name__": "__main__"})

@@ -86,13 +86,9 @@ def semi_implicit_euler(system: LieGroupSystem, q: Array, v: Array, h: float) ->
     """Take one step of v₁ = v + h a(q, v), q₁ = q ⊕ h v₁.
 
     Args:
-        system: accelerations and group operations.
         q: configuration (nq,).
         v: velocity (nv,).
         h: step [s].
-
-    Returns:
-        q₁ and v₁.
 
     """
     v = v + h * system.acceleration(q, v)
@@ -106,7 +102,6 @@ def rkmk4(system: LieGroupSystem, q: Array, v: Array, h: float) -> tuple[Array, 
     115–127).  With θ̇ = v instead the order would be 2.
 
     Args:
-        system: accelerations and group operations.
         q: configuration (nq,).
         v: velocity (nv,).
         h: step [s].
@@ -133,9 +128,6 @@ def runge_kutta_4(slope: Callable[[Array], Array], y: Array, h: float) -> Array:
         slope: the right-hand side.
         y: array of any shape.
         h: step [s].
-
-    Returns:
-        y after the step.
 
     """
     k1 = slope(y)
@@ -173,7 +165,6 @@ def dop853(system: LieGroupSystem, q: Array, v: Array, times: Array, rtol: float
     The integrated q is not normalised; accelerations are evaluated at the normalised q.
 
     Args:
-        system: accelerations and group operations.
         q: initial configuration (nq,).
         v: initial velocity (nv,).
         times: sample times (T,) [s], ascending from 0.

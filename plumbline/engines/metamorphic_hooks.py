@@ -43,9 +43,6 @@ class MetamorphicHooks(Adapter):
         Args:
             option: one of `options`, `joint_options` or `linear_solvers`.
 
-        Returns:
-            The copy.
-
         Raises:
             KeyError: the engine has no such option; the message lists those it has.
 
@@ -58,9 +55,6 @@ class MetamorphicHooks(Adapter):
 
     def options_for(self, model: Model) -> tuple[str, ...]:
         """List the ways to the accelerations of a mechanism.
-
-        Args:
-            model: the mechanism.
 
         Returns:
             All `options` (with loops `loop_options`), and those of `joint_options` whose joints it has; of
@@ -76,9 +70,6 @@ class MetamorphicHooks(Adapter):
     def with_welded_halves(self) -> Self:
         """Copy the adapter, set to build every body of two welded halves.
 
-        Returns:
-            The copy.
-
         Raises:
             Unsupported: the engine cannot weld; the message is `welding_unsupported_reason`.
 
@@ -91,9 +82,6 @@ class MetamorphicHooks(Adapter):
 
     def body_pieces(self, model: Model) -> BodyParts:
         """Divide the bodies of a model into the parts that the engine is to weld.
-
-        Args:
-            model: the pendulum.
 
         Returns:
             Per body one part, or two where the adapter is set to welded halves.
@@ -111,9 +99,7 @@ class MetamorphicHooks(Adapter):
 
         Args:
             model: the pendulum, without drag.
-            state: the initial state.
             end: duration one way [s].
-            integrator: name of a symmetric integrator.
             resolution: step [s], or relative tolerance, by the integrator's ``kind``.
 
         Returns:

@@ -40,9 +40,6 @@ class Arithmetic(Protocol):
 def floats(dtype: Any = np.float64) -> Arithmetic:
     """Take NumPy's floating-point numbers, in batches.
 
-    Args:
-        dtype: their type.
-
     Returns:
         Operations on arrays (..., rows, columns); scalars are (..., 1, 1).
 

@@ -13,9 +13,6 @@ from plumbline.equations.arithmetic import Arithmetic
 def balls(flint: Any) -> Arithmetic:
     """Take balls at the working precision of ``flint.ctx``.
 
-    Args:
-        flint: the module python-flint.
-
     Returns:
         Operations on ``arb_mat``; scalars are ``arb``.
 

@@ -56,9 +56,6 @@ class Solution:
         Args:
             combine: of a matrix with a column per wrench, to a vector.
 
-        Returns:
-            The solution of one column.
-
         """
         return Solution(*([x if x is None else combine(x) for x in rows] for rows in vars(self).values()))
 
@@ -179,8 +176,6 @@ class Tree:
         """Place and move every body.
 
         Args:
-            num: kind of numbers.
-            model: the mechanism.
             state: of which the minimal coordinates are used; of many, arrays with leading axes.
 
         """
@@ -213,9 +208,6 @@ class Tree:
 
     def rotation_of(self, p: Sequence[Any]) -> Any:
         """A of a quaternion of four scalars.
-
-        Args:
-            p: scalar part first.
 
         Returns:
             A matrix, body → world.
@@ -273,7 +265,6 @@ class Tree:
         """Return a scalar coordinate and its rate.
 
         Args:
-            k: the joint.
             i: which of its motions.
 
         Returns:
@@ -285,9 +276,6 @@ class Tree:
     def attitude(self, k: int) -> tuple[Any, Any]:
         """Return A and the angular velocity of a body whose joint leaves its attitude free.
 
-        Args:
-            k: the body.
-
         Returns:
             A matrix, and a vector in world axes [rad/s].
 
@@ -298,9 +286,6 @@ class Tree:
     def free_point(self, k: int) -> tuple[Any, Any]:
         """Return the centre of mass of a free body and its velocity.
 
-        Args:
-            k: the body.
-
         Returns:
             Two vectors, world axes [m, m/s].
 
@@ -310,9 +295,6 @@ class Tree:
     def inertia(self, k: int) -> Any:
         """Return the inertia of a body about its centre of mass.
 
-        Args:
-            k: the body.
-
         Returns:
             A matrix, body axes [kg m²].
 
@@ -321,9 +303,6 @@ class Tree:
 
     def rod_direction(self, k: int) -> tuple[Any, Any]:
         """Return the direction u of rod k as a unit vector and u̇ perpendicular to it.
-
-        Args:
-            k: the rod.
 
         Returns:
             Two vectors, and per second.
@@ -554,10 +533,6 @@ class Tree:
 
         A rate ω′ or u̇ turns or swings its own body alone: what hangs on a body with an attitude of its own
         is carried without a turn, as by a joint whose b and i are 0.
-
-        Returns:
-            A matrix.
-
         """
         num, model, n = self.num, self.model, self.model.n
         total = [self._inertia(k) for k in range(n)]

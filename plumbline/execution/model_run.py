@@ -99,7 +99,6 @@ def run_model_files(plan: ModelPlan, progress: ProgressCallback) -> ModelRunResu
     """Compare files across importers.
 
     Args:
-        plan: the files and how to compare them.
         progress: called after every task.
 
     Returns:
@@ -402,9 +401,6 @@ def declared_formats(name: str) -> tuple[str, ...]:
 
     Args:
         name: its name, with or without a version.
-
-    Returns:
-        The formats.
 
     """
     return tuple(declared_importer_attribute(split_version(name)[0], "formats") or ())

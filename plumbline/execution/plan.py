@@ -35,9 +35,7 @@ class RunObserver:
         """Take rows of a scenario of the catalogue or the user, as they are judged.
 
         Args:
-            scenario: its name.
             rows: new rows; all rows of the scenario where it is complete.
-            is_complete: whether all its tasks have finished.
 
         """
 
@@ -124,7 +122,6 @@ def scenario_level(
 
     Args:
         scenario: whose file may ask for states only.
-        level: of the run.
 
     Returns:
         "state", or the level of the run.
@@ -143,10 +140,8 @@ def task_keys(
     """List the tasks of a scenario that are known beforehand.
 
     Args:
-        scenario: name of the scenario.
         engines: descriptions of the engines; those that are missing get no task.
         level: which levels to compare at; "random" is state and step level.
-        has_long_runs: whether invariants are judged over long runs.
         left_out: kinds that are not compared of the scenario.
 
     Yields:

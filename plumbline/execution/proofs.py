@@ -60,8 +60,6 @@ def prove_changed_motions(
     """Prove the motions that have no proof yet, short chains first, and judge the usual truth by them.
 
     Args:
-        scenarios: scenarios of the catalogue.
-        jobs: number of worker processes.
         limits: limits of each proof.
         max_cpu_seconds: when so much has been used, no further proof is begun.
         log: called with a sentence about each proof that fails.
@@ -120,9 +118,7 @@ def verify_certificates(
     """Prove certificates again in workers, which hostile files cannot fill or hold up for ever.
 
     Args:
-        paths: the files.
         expected: the scenario of which each has to be a proof; None: any.
-        jobs: number of worker processes.
         limits: limits of each proof.
         progress: called after each file with the numbers of files done and of all, and its name.
 
@@ -173,7 +169,6 @@ def verify_certificate(path: Path, expected: tuple[str, str] | None) -> dict[str
     """Prove one certificate again.
 
     Args:
-        path: the file.
         expected: name and digest of the numbers of the scenario that it has to be about; None: any.
 
     Returns:

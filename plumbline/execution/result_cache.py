@@ -65,9 +65,6 @@ class DiskResultCache(ResultCache):
     def get(self, task: Task) -> Outcome | None:
         """Read a stored answer.
 
-        Args:
-            task: the call to look up.
-
         Returns:
             The outcome, or None where there is no undamaged file.
 
@@ -96,7 +93,6 @@ class DiskResultCache(ResultCache):
 
         Args:
             task: the call that was made.
-            outcome: its answer.
 
         Returns:
             The outcome as `get` will return it, but not marked as cached.

@@ -86,7 +86,6 @@ def describe_engines(
     """Ask every engine for its description, in the version that its name demands.
 
     Args:
-        executor: makes the calls.
         engines: names, as ``mujoco`` or ``mujoco@3.12.0``.
         are_required: whether an engine that is not installed has failed, since the user named it.
         result_cache: descriptions of earlier runs with the same installation.
@@ -126,7 +125,6 @@ def run_plan(plan: Plan, progress: ProgressCallback, observer: RunObserver | Non
     """Run a whole plan.
 
     Args:
-        plan: what to run.
         progress: called after every task.
         observer: gets the rows as they are judged.
 
@@ -274,9 +272,6 @@ class _Run:
 def make_executor(plan: Plan) -> Executor:
     """Start the workers of a plan, or connect to its cluster.
 
-    Args:
-        plan: what to run.
-
     Returns:
         A context manager that makes the calls.
 
@@ -298,7 +293,6 @@ def save(result: RunResult, folder: Path, command: str) -> None:
 
     Args:
         result: of `run_plan`.
-        folder: output folder.
         command: the command line that made the result.
 
     Raises:
@@ -315,15 +309,7 @@ def save(result: RunResult, folder: Path, command: str) -> None:
 
 
 def summarize_verdicts(result: RunResult) -> str:
-    """Return the verdicts of a run in one sentence: independent checks, verdicts, disagreements by name.
-
-    Args:
-        result: the run.
-
-    Returns:
-        The sentence.
-
-    """
+    """Return the verdicts of a run in one sentence: independent checks, verdicts, disagreements by name."""
     parts, checks = [], 0
     for verdict in sorted(Verdict, key=lambda verdict: verdict != Verdict.HARNESS_FAILED):  # it comes first
         rows = [row for row in result.rows if row.verdict == verdict]
@@ -383,8 +369,6 @@ def exit_code_of_rows(rows: Iterable[Row], *, has_stale_issues: bool, has_compar
 
     Args:
         rows: all rows, or those that need a look.
-        has_stale_issues: whether a known issue no longer occurs.
-        has_comparison: whether anything was compared.
 
     Returns:
         5 where the truth is in doubt or missing; else 3 where an engine failed unexpectedly; else 1 for other
@@ -402,9 +386,6 @@ def exit_code_of_rows(rows: Iterable[Row], *, has_stale_issues: bool, has_compar
 
 def has_comparison(result: RunResult) -> bool:
     """Find out whether a run compared anything; of the user's own scenarios, with a result.
-
-    Args:
-        result: the run.
 
     Returns:
         Whether a row agrees, disagrees or, in other scenarios, is unresolved.

@@ -77,9 +77,6 @@ def _family(engine: str) -> str:
 def uncompared_kinds(model: Model) -> dict[TaskKind, str]:
     """List what is not compared of a mechanism on any engine.
 
-    Args:
-        model: the mechanism.
-
     Returns:
         By kind of task why it is left out.
 
@@ -110,9 +107,6 @@ class ScenarioRun:
         """Draw the states of the scenario and list its tasks.
 
         Args:
-            plan: what to run.
-            scenario: the scenario.
-            engines: description of each engine of the plan.
             is_random: whether it is a random scenario, which is compared at few states and without long runs.
             known: discrepancies whose cause is on record, so that it is not searched again.
             level: levels to compare at; None for the plan's, or for those of its random scenarios.
@@ -179,11 +173,7 @@ class ScenarioRun:
         """Make the task of a truth.
 
         Args:
-            key: of a truth.
             compiled_bodies: 0 to compute the motion without compiled code.
-
-        Returns:
-            The task.
 
         """
         s = self.scenario
@@ -230,7 +220,6 @@ class ScenarioRun:
 
         Args:
             found: of `findings`.
-            known: the entries of the run.
 
         Returns:
             The rows in the same order.
@@ -246,9 +235,6 @@ class ScenarioRun:
 
     def on_outcome(self, outcome: Outcome) -> list[Task]:
         """Take the outcome of a task: keep a truth or what the judge found.
-
-        Args:
-            outcome: of a task of this scenario.
 
         Returns:
             The tasks that follow from it.

@@ -72,7 +72,6 @@ def run_self_test(
     """Run the tests of the planted defects.
 
     Args:
-        report: path of the JUnit file to write.
         night: number of the night, which chooses the tests of the lists.
         tests: test file that runs whole, relative to the checkout.
         lists: patterns of the test files of which a share runs, relative to the checkout.
@@ -115,9 +114,6 @@ def run_self_test(
 
 def read_junit_report(report: Path) -> SelfTestResult:
     """Read the result of the self-test.
-
-    Args:
-        report: path of pytest's JUnit file.
 
     Returns:
         The counts, which the tests record as properties, and the tests that failed or were skipped.

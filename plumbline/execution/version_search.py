@@ -157,7 +157,6 @@ def choose_versions(
     """Choose the versions to search in.
 
     Args:
-        package: name of the distribution.
         supported: range of versions that the column works with; empty: all.
         good: one end; empty: the oldest version, or the newest if the other end is the oldest.
         bad: the other end; empty: the newest version, or the oldest if the other end is the newest.
@@ -204,9 +203,7 @@ def versioned_name(engine: str, version: str, package: str) -> str:
     """Name a version of an engine; the installed one needs no environment.
 
     Args:
-        engine: name in a registry.
         version: one that the package index has.
-        package: its distribution.
 
     Returns:
         ``engine`` or ``engine@version``.
@@ -229,7 +226,6 @@ def search_versions(
         plan: the file and how to load it, or a run of the row's scenario; engines and level are set here.
         engine: name in the registry of importers, or of engines, without a version.
         good: one end of the search, as for `choose_versions`.
-        bad: the other end.
         on_answer: as for `find_change`.
         row: the stored row, where the plan is a run.
 
@@ -272,10 +268,6 @@ def _ask_verdict(plan: Plan, name: str, row: Mapping[str, Any]) -> VersionAnswer
 
 def reading_answer(file: FileResult, name: str) -> VersionAnswer:
     """Describe how an importer reads a file, so that two versions can be compared.
-
-    Args:
-        file: the result of one file.
-        name: the importer.
 
     Returns:
         The causes of its differences, or the quantities that differ, or its refusal.

@@ -70,9 +70,6 @@ class Importer(ABC):
     def read(self, file: ModelFile) -> Reading:
         """Load a file and describe what the engine made of it.
 
-        Args:
-            file: the file and how to load it.
-
         Returns:
             The engine's model object in neutral terms, lumped links left out; or its refusal.
 

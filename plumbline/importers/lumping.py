@@ -67,7 +67,6 @@ def merge_bodies(body: NeutralBody, added: NeutralBody, position: Array, A: Arra
     """Give a body the mass of another one that is fixed to it.
 
     Args:
-        body: the carrier.
         added: the body that is fixed to it.
         position: of the added body's frame (3,) [m] in the carrier's.
         A: rotation matrix (3, 3), added body → carrier.

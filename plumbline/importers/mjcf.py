@@ -30,9 +30,7 @@ def expand_includes(root: Element, path: Path, root_folder: Path, shown: str) ->
 
     Args:
         root: the file's root element, which is changed.
-        path: the file.
         root_folder: folder outside of which nothing is read.
-        shown: the file's name in messages.
 
     Raises:
         ModelFileError: an included file is missing, outside the folder, or included in a circle.
@@ -93,9 +91,6 @@ def resolve_inside(path: Path, folder: Path) -> Path | None:
 def body_elements(root: Element) -> Iterator[Element]:
     """Go through the bodies of a file.
 
-    Args:
-        root: the file's root element.
-
     Yields:
         Elements <body>, a parent before its children.
 
@@ -131,9 +126,6 @@ def name_elements(root: Element) -> bool:
     Args:
         root: the file's root element, which is changed.
 
-    Returns:
-        Whether anything was named.
-
     """
     used = {element.attributes.get("name", "") for element in root.walk()}
     changed = False
@@ -159,7 +151,6 @@ def make_paths_absolute(root: Element, folder: Path) -> None:
 
     Args:
         root: the file's root element, which is changed.
-        folder: the file's folder.
 
     """
     for element, attribute, path in asset_files(root, folder):
@@ -171,10 +162,6 @@ def make_paths_absolute(root: Element, folder: Path) -> None:
 
 def asset_files(root: Element, folder: Path) -> Iterator[tuple[Element, str, Path]]:
     """Go through the files that a MJCF refers to, besides includes.
-
-    Args:
-        root: the file's root element.
-        folder: the file's folder.
 
     Yields:
         Element, attribute, path.
@@ -221,7 +208,6 @@ def with_sources(model: NeutralModel, root: Element) -> NeutralModel:
     """Add to a compiled model where the file says each of its numbers.
 
     Args:
-        model: MuJoCo's reading of the file.
         root: the file's root element, with all names.
 
     Returns:
@@ -289,9 +275,6 @@ class DefaultClasses:
     def chain(self, element: Element) -> list[Element]:
         """List the elements <default> that hold for an element.
 
-        Args:
-            element: of the worldbody.
-
         Returns:
             The elements, that of the nearest class first.
 
@@ -303,7 +286,6 @@ class DefaultClasses:
 
         Args:
             joint: an element <joint> or <freejoint>.
-            attribute: its name.
 
         Returns:
             The place; None where the file does not set it.

@@ -365,9 +365,6 @@ def _text(values: Array | list[float]) -> str:
 def names_as_written(bodies: tuple[NeutralBody, ...]) -> Iterator[NeutralBody]:
     """Take `RENAMED` from names of bodies and joints.
 
-    Args:
-        bodies: of a rewriting's compiled model.
-
     Yields:
         The bodies with the names of the file.
 

@@ -90,9 +90,6 @@ class PreparedFile:
         Args:
             words: of the importer, about the file that it opened.
 
-        Returns:
-            The message.
-
         """
 
         def line_of_user(match: re.Match[str]) -> str:
@@ -109,9 +106,6 @@ class PreparedFile:
 
     def write_rewritings(self, folder: Path) -> dict[str, ModelFile]:
         """Write equivalent rewritings of an MJCF file.
-
-        Args:
-            folder: for the files.
 
         Returns:
             Files for importers, by what was done to them.
@@ -133,15 +127,10 @@ def prepare_file(
     """Check a model file and make it ready for importers.
 
     Args:
-        shown: the path as typed.
         scratch: a folder for a copy with all names, or without geometry.
         root: folder outside of which no file is read; None: the nearest folder above the file that has a
             package.xml, else the file's own.
         base: of a URDF, whether the root link is fixed; "auto" is fixed.
-        strip: leave visual and collision geometry out.
-
-    Returns:
-        The file.
 
     Raises:
         ModelFileError: the file cannot be used; every mistake that was found has its line.
@@ -186,9 +175,6 @@ def prepare_file(
 
 def package_folder(path: Path) -> Path:
     """Find the package that a file is in.
-
-    Args:
-        path: a model file.
 
     Returns:
         The nearest folder above it that has a package.xml, else its own folder.

@@ -41,7 +41,6 @@ def read_urdf(root: Element, base: str) -> NeutralModel:
     """Translate a parsed file to the neutral model; gravity is (0, 0, −9.81).
 
     Args:
-        root: the file's root element.
         base: "fixed" or "free": whether the root link is fixed to the world.
 
     Returns:

@@ -52,9 +52,6 @@ class Element:
     def find_all(self, tag: str) -> list[Element]:
         """List the children of a tag.
 
-        Args:
-            tag: their tag.
-
         Returns:
             The children, in the order of the file.
 
@@ -79,11 +76,6 @@ class Element:
         Args:
             message: what is wrong.
             attribute: the attribute that it is about, if any.
-            valid: what would be valid.
-            hint: how to correct it.
-
-        Returns:
-            The problem.
 
         """
         name = self.attributes.get("name")
@@ -105,9 +97,6 @@ def parse_numbers(
     """Read the numbers of an attribute, each rounded to double once.
 
     Args:
-        element: has the attribute.
-        attribute: its name.
-        count: how many numbers it must have.
         problems: gets what is wrong.
         largest: magnitude that none may exceed.
 
@@ -132,13 +121,6 @@ def parse_numbers(
 
 def read_xml(path: Path, shown: str) -> Element:
     """Parse a file.
-
-    Args:
-        path: the file.
-        shown: its name in messages and sources.
-
-    Returns:
-        The root element.
 
     Raises:
         ModelFileError: the file cannot be read, is not well-formed, or declares entities.
@@ -165,10 +147,6 @@ def parse_xml(data: bytes, shown: str) -> Element:
 
     Args:
         data: the content.
-        shown: the file's name in messages and sources.
-
-    Returns:
-        The root element.
 
     Raises:
         ModelFileError: it is not well-formed, or declares entities.
@@ -245,9 +223,6 @@ def write_xml_in_place(root: Element) -> tuple[str, dict[int, list[Element]]]:
     Elements of an included file begin lines of their own; what follows in the file that includes it is then
     further down than in that file.
 
-    Args:
-        root: the root element.
-
     Returns:
         The text, and which elements begin in each of its lines.
 
@@ -277,11 +252,7 @@ def write_xml(root: Element, width: int = 0) -> str:
     """Write a tree as text.
 
     Args:
-        root: the root element.
         width: so many characters of a line are filled with whole elements; 0: an element per line.
-
-    Returns:
-        The text.
 
     """
     lines: list[tuple[int, str, bool]] = []  # depth, text, whether it is whole elements

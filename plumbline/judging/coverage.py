@@ -138,9 +138,6 @@ def scenario_coverage(
     """Compute the coverage table of one scenario.
 
     Args:
-        name: of the scenario.
-        model: its mechanism.
-        state: its initial state.
         times: (T,) its sample times [s].
         states: the states of the levels state and step, the initial one first unless its pose is singular.
         rows: judged rows of the scenario, of correct engines; those that agree count, and only their engines,
@@ -406,7 +403,6 @@ def _measure_further(
     counts where a mistake that is measured passes the tolerance.
 
     Args:
-        tolerances: of one level.
         by_engine: the ratios of that level, changed in place.
         proven: indices of parameters that are left as they are.
         measured: from indices, a mistake and whether the steps are the finer ones to the effects

@@ -27,9 +27,6 @@ _Column = tuple[str, str, str]  # engine, integrator ("-" at states), quantity (
 def state_fingerprints(answers: Sequence[StateQuantities]) -> Fingerprints:
     """Hash the answers of an engine at states.
 
-    Args:
-        answers: one record per state.
-
     Returns:
         By quantity the hash of its bits at all states, of the quantities that the engine offers.
 
@@ -46,7 +43,6 @@ def run_fingerprints(integrator: str, runs: Mapping[float, Trajectory]) -> Finge
     """Hash the runs of an integrator.
 
     Args:
-        integrator: its name.
         runs: trajectory by resolution.
 
     Returns:
@@ -75,12 +71,7 @@ class IdentityCheck:
     """
 
     def __init__(self, engines: Mapping[str, EngineInfo]) -> None:
-        """Start without scenarios.
-
-        Args:
-            engines: description of each engine of the run.
-
-        """
+        """Start without scenarios."""
         self._engines = engines
         self._equal: Counter[tuple[_Column, _Column]] = Counter()  # scenarios with equal bits
         self._shared: Counter[tuple[_Column, _Column]] = Counter()  # scenarios that both columns answered

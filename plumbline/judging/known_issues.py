@@ -152,7 +152,6 @@ class KnownIssue:
         """Return how far results for equivalent descriptions of a row's problem differ.
 
         Args:
-            row: a row of the expected verdict.
             scatter: of `objection`.
 
         Returns:
@@ -335,7 +334,6 @@ def load_known_issues(
     """Read a file of known issues.
 
     Args:
-        path: the file.
         other_scenarios: names of scenarios that entries may be about, besides the catalogue, the random ones
             and the files beside ``path``.
         places: of each id that other files have used, file and line; receives those of this file.
@@ -459,7 +457,6 @@ class KnownIssues:
         """Select the entries.
 
         Args:
-            entries: all entries of the files.
             has_extra_refinements: whether the run takes smaller steps than usual.
 
         """
@@ -472,9 +469,6 @@ class KnownIssues:
 
     def issues_for(self, row: Row) -> list[KnownIssue]:
         """Find the entries about a row's cell, whatever its verdict.
-
-        Args:
-            row: a judged row.
 
         Returns:
             The entries, in the order of the file; none for information, which needs no excuse.
@@ -494,7 +488,6 @@ class KnownIssues:
         reason then says so.
 
         Args:
-            rows: all judged rows of one scenario.
             bodies: length of its chain.
             inertia_ratio: its `plumbline.model.invariants.inertia_ratio`.
 
@@ -558,9 +551,6 @@ class KnownIssues:
         Args:
             is_full_matrix: whether all scenarios ran on all engines. If not, an entry with a pattern for its
                 scenario is not stale: its case may be among the cells that did not run.
-
-        Returns:
-            The stale entries.
 
         """
         return [

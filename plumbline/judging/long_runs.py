@@ -45,11 +45,7 @@ def judge_long_runs(
     """Judge the invariants of one integrator's long runs.
 
     Args:
-        context: scenario and engine.
-        model: the pendulum.
-        integrator: the integrator of the runs.
         is_regular: whether the motion is known to be without chaos.
-        study: the runs.
 
     Returns:
         Rows of level "invariants": ``*_long`` per invariant, ``energy_drift_long_growth`` for a symmetric
@@ -336,8 +332,6 @@ class DriftOrder:
 
         Args:
             coarse: the run with the larger step or tolerance.
-            fine: the other run.
-            quantity: name of the invariant.
             end: end of the window [s].
 
         Returns:

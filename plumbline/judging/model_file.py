@@ -99,10 +99,6 @@ def judge_answer(
     """Judge one importer's reading of a file.
 
     Args:
-        context: file and importer.
-        model: the neutral model.
-        truths: its certified quantities at the states.
-        answer: the importer's.
         unsupported: quantities that the engine does not compute, and why.
 
     Returns:
@@ -191,8 +187,6 @@ def rewriting_row(context: RowContext, model: NeutralModel, rewritten: Mapping[s
     """Judge MuJoCo's compiler by equivalent rewritings of an MJCF file.
 
     Args:
-        context: file and importer.
-        model: the importer's reading of the file.
         rewritten: its readings of the rewritings, by what was done to the file.
 
     Returns:
@@ -239,15 +233,7 @@ def _quantity_row(context: RowContext, quantity: str, unit: str, worst: Mismatch
 
 
 def state_seed(shown: str) -> int:
-    """Derive the seed of a file's random states from its name, so that its folder does not matter.
-
-    Args:
-        shown: the path as typed.
-
-    Returns:
-        The seed.
-
-    """
+    """Derive the seed of a file's random states from its name, so that its folder does not matter."""
     return int.from_bytes(hashlib.sha256(Path(shown).name.encode()).digest()[:4], "big") + SEED
 
 
@@ -263,18 +249,7 @@ class FileTruth:
 def certify_file(
     shown: str, model: NeutralModel, state_count: int, at: Mapping[str, float] | None
 ) -> FileTruth:
-    """Certify a file's model at the states of a comparison.
-
-    Args:
-        shown: the path as typed.
-        model: what the file says.
-        state_count: number of random states.
-        at: the one state to compare at instead.
-
-    Returns:
-        The certified quantities.
-
-    """
+    """Certify a file's model at the states of a comparison."""
     states = model_states(model, state_count, state_seed(shown), at)
     truths, bare = certify_states(model, states), without_passive_forces(model)
     bare_truths = certify_states(bare, states) if bare is not model else truths
@@ -292,14 +267,7 @@ def judge_file(
     """Judge every importer's answer about one file, and look for causes.
 
     Args:
-        shown: the path as typed.
-        model: what the file says.
         columns: name and description of each importer, and its answer.
-        state_count: number of random states.
-        at: the one state to compare at instead.
-
-    Returns:
-        The file's result.
 
     """
     truth = certify_file(shown, model, state_count, at)
@@ -317,14 +285,9 @@ def file_result(
     """Collect what importers were judged to do with a file.
 
     Args:
-        shown: the path as typed.
-        model: what the file says.
         columns: as of `judge_file`.
         judged: of `judge_importer`, for each column.
         truth: of `certify_file`.
-
-    Returns:
-        The file's result.
 
     """
     rows = tuple(row for own, _ in judged for row in own)
@@ -344,11 +307,7 @@ def judge_importer(
     """Judge one importer's answer about a file, and look for the causes of its differences.
 
     Args:
-        shown: the path as typed.
-        model: what the file says.
         column: name and description of the importer, and its answer.
-        state_count: number of random states.
-        at: the one state to compare at instead.
         truth: of `certify_file`.
 
     Returns:

@@ -95,9 +95,6 @@ def _describe_doubt(rows: Sequence[Row], are_alike: bool) -> str:
 def annotate_outliers(rows: Sequence[Row]) -> list[Row]:
     """Append the outliers to the diagnosis of every row that disagrees at state level.
 
-    Args:
-        rows: all rows of one scenario.
-
     Returns:
         The rows, in the same order.
 
@@ -113,9 +110,6 @@ def annotate_outliers(rows: Sequence[Row]) -> list[Row]:
 
 def describe_outliers(rows: Sequence[Row]) -> str:
     """Describe the engines that disagree at state level, in which quantities, and those that agree.
-
-    Args:
-        rows: all rows of one scenario.
 
     Returns:
         The end of a sentence; "" where nothing disagrees.

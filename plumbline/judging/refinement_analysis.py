@@ -112,9 +112,6 @@ class RefinementAnalysis:
         Args:
             samples: per run (T, N, width) of one quantity.
 
-        Returns:
-            The limit and its uncertainty.
-
         Raises:
             ValueError: fewer than two runs are finite.
 

@@ -18,7 +18,6 @@ def judge_relations(context: RowContext, results: Sequence[RelationResult]) -> J
     """Judge relations: a difference may be what rounding explains on both sides.
 
     Args:
-        context: scenario and engine.
         results: the results of `check_relations`.
 
     Returns:

@@ -87,9 +87,6 @@ ATTENTION_SEVERITY = 6  # from here on a verdict needs attention
 def is_declared(known_issue: str | None) -> bool:
     """Return whether a gap is expected because the engine's column declares it.
 
-    Args:
-        known_issue: of a row.
-
     Returns:
         Whether it names a declared gap.
 
@@ -230,18 +227,13 @@ class RowContext:
         """Make a row about this scenario and engine.
 
         Args:
-            level: level of comparison.
             integrator: name of the integrator, "-" for none.
-            quantity: name of the judged quantity.
             verdict: one of `Verdict`.
             reason: the verdict's reason, one sentence.
             unit: unit of ``value`` and ``tolerance``.
             gap: declared by the engine's column, from which a refusal follows; it is expected then.
             **more: other fields of `Row`. ``ratio`` is the quotient of ``value`` and ``tolerance`` unless
                 given: of many comparisons the worst ratio need not belong to the largest error.
-
-        Returns:
-            The row.
 
         """
         more = {"value": None, "tolerance": None} | more
@@ -257,9 +249,6 @@ class RowContext:
 
 def mark_aliases(rows: Iterable[Row]) -> list[Row]:
     """Turn the agreement of an integrator that equals another one into information.
-
-    Args:
-        rows: judged rows.
 
     Returns:
         The rows in the same order. Only agreement changes: an alias that disagrees or is unresolved where

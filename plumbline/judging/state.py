@@ -35,7 +35,6 @@ def judge_states(context: RowContext, truth: StateTruth, evaluation: Evaluation)
     """Judge every state quantity of one engine, by the worst of all bodies and states.
 
     Args:
-        context: scenario and engine.
         truth: true quantities and rounding bounds at S states.
         evaluation: the engine's quantities at the same states, or why there are none.
 
@@ -80,11 +79,7 @@ def singular_pose_row(context: RowContext, value: float) -> Row:
     """Make the row of an initial state whose pose is singular, at which no engine can be judged.
 
     Args:
-        context: scenario and engine.
         value: the smallest singular value of the loops' rows that hold at poses nearby.
-
-    Returns:
-        The row.
 
     """
     reason = (

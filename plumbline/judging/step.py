@@ -39,9 +39,7 @@ def judge_steps(
     """Judge the steps of one integrator by its declared formula.
 
     Args:
-        context: scenario and engine.
         integrator: the integrator, with a declared method.
-        model: the pendulum.
         states: the states that the steps start from.
         answer: the engine's steps, or why there are none.
 

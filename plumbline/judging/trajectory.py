@@ -50,10 +50,6 @@ def judge_trajectory(
     """Judge one integrator's refinement study: order, limits and invariants, up to the truth's horizon.
 
     Args:
-        context: scenario and engine.
-        model: the pendulum.
-        truth: its true motion.
-        integrator: the integrator of the runs.
         study: the runs, coarse to fine.
 
     Returns:
@@ -115,9 +111,6 @@ def singular_motion_row(context: RowContext, level: Level, integrator: str, note
     """Report that a motion is compared only up to a singular pose.
 
     Args:
-        context: scenario and engine.
-        level: of the row.
-        integrator: of the runs.
         note: why the motion is compared no further.
         end: time [s] up to which it is compared.
 

@@ -100,7 +100,6 @@ def plan_long_run(
 
     Args:
         integrator: has fixed steps of an order, or a tolerance.
-        bodies: number of bodies.
         seconds: requested length [s].
         sample_interval: the scenario's time between samples [s].
         duration: of the scenario [s]; where its samples are closer than the steps of seconds, a fast motion,
@@ -128,10 +127,6 @@ def run_long_run_study(
     """Run at every resolution of a plan; a run that fails is repeated a decade shorter.
 
     Args:
-        engine: name of the engine.
-        integrator: name of its integrator.
-        model: the pendulum.
-        state: the initial state.
         sample_interval: the scenario's time between samples [s].
         plan: length and resolutions.
 

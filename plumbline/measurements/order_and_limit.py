@@ -179,9 +179,6 @@ def romberg(ys: Sequence[Array], powers: Sequence[int]) -> ExtrapolatedLimit:
             not finite are left out.
         powers: exponents of h in the error expansion, ascending.
 
-    Returns:
-        The limit.
-
     Raises:
         ValueError: fewer than two runs are finite.
 

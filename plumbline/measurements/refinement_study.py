@@ -38,10 +38,6 @@ def run_refinement_study(
     """Simulate the same motion at each step until the study is resolved.
 
     Args:
-        engine: its name in the registry.
-        integrator: name of one of the engine's integrators.
-        model: the pendulum.
-        state: the initial state.
         times: sample times (T,) [s].
         steps: steps [s] or relative tolerances, coarse to fine.
 
@@ -59,8 +55,6 @@ def is_resolved(model: Model, integrator: Integrator, runs: Sequence[RefinementR
     """Return whether order and limits are resolved, so that a finer step could lower no bound by much.
 
     Args:
-        model: the pendulum.
-        integrator: the integrator of the runs.
         runs: coarse to fine.
 
     Returns:
@@ -125,7 +119,6 @@ def rounding_floor(steps: int, scale: float, accepted_error: float = 0.0) -> flo
     """Return the drift of an invariant that the rounding of all steps explains.
 
     Args:
-        steps: number of steps of the run.
         scale: size of the quantities that the invariant is a difference of, in its unit.
         accepted_error: what step control accepts in every step, relative to the scale.
 

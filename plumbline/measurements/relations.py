@@ -17,8 +17,6 @@ def check_relations(engine: str, model: Model, states: Sequence[State]) -> list[
     """Check every relation on one engine; runs inside a worker.
 
     Args:
-        engine: name of the engine.
-        model: the pendulum.
         states: states of it; runs start from the first.
 
     Returns:

@@ -45,7 +45,6 @@ def check_repeatability(
 
     Args:
         engine: the adapter; the same instance answers all questions.
-        model: the pendulum.
         states: states of it; the first few are used, and runs start from the first.
 
     Yields:

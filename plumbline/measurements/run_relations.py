@@ -34,11 +34,6 @@ def check_run_relations(engine: MetamorphicHooks, model: Model, state: State) ->
 
     Where an implicit integrator fails, a shorter run with a shorter step follows.
 
-    Args:
-        engine: the adapter.
-        model: the pendulum.
-        state: the initial state.
-
     Yields:
         One result per integrator and relation.
 
@@ -63,10 +58,6 @@ def check_integrator_relations(
     """Check the relations of one integrator's runs.
 
     Args:
-        engine: the adapter.
-        integrator: one of its integrators.
-        model: the pendulum.
-        state: the initial state.
         step: step of the runs [s]; with step control it sets only their duration.
 
     Yields:
@@ -92,10 +83,6 @@ def fastest_rate(model: Model, state: State) -> float:
     """Return the fastest rate of a motion: of a body, of a rod, or of the shortest link as a pendulum.
 
     With loops also that which an angular acceleration reaches within a radian.
-
-    Args:
-        model: the pendulum.
-        state: a state of it.
 
     Returns:
         The rate [1/s]; 1 where everything rests without gravity.
@@ -169,11 +156,6 @@ def _check_options(
 def refused_result(name: str, integrator: Integrator, refusal: Unsupported | EngineFailure) -> RelationResult:
     """Make the result of a run that the engine refused or failed.
 
-    Args:
-        name: name of the relation.
-        integrator: the run's integrator.
-        refusal: the engine's exception.
-
     Returns:
         The result, without a ratio.
 
@@ -193,9 +175,6 @@ def run_tolerance(integrator: Integrator, model: Model, state: State, end: float
     run), and its singular values are pairs σ, 1/σ.
 
     Args:
-        integrator: the run's integrator.
-        model: the pendulum.
-        state: the initial state.
         end: duration of the run, one way [s].
         steps: number of its steps, there and back.
 
@@ -221,8 +200,6 @@ def characteristic_scales(model: Model, state: State, driven: float = 0.0) -> tu
     """Return the scales that differences of runs are relative to.
 
     Args:
-        model: the pendulum.
-        state: a state of it.
         driven: rate of rotation that the motion reaches from there [rad/s].
 
     Returns:
@@ -240,7 +217,6 @@ def state_at_sample(run: Trajectory, at: int, sign: float = 1.0) -> State:
     """Return one sample of a run as the engine returned it, on the constraint manifold or off it.
 
     Args:
-        run: samples of poses and rates.
         at: index of the sample.
         sign: number to multiply the rates by, ±1.
 
@@ -257,9 +233,7 @@ def relative_differences(model: Model, one: State, other: State, driven: float =
     """Compare two samples.
 
     Args:
-        model: the pendulum.
         one: a sample, whose rates set the scales.
-        other: the other sample.
         driven: of `characteristic_scales`.
 
     Returns:
@@ -288,11 +262,8 @@ def worst_difference_result(
     """Make the result of a relation of runs.
 
     Args:
-        name: name of the relation.
-        integrator: the runs' integrator.
         differences: by quantity, from `relative_differences`.
         limit: tolerance of each difference, from `run_tolerance`.
-        steps: number of steps.
         resolution: step [s], or relative tolerance.
         end: duration, one way [s].
 

@@ -30,13 +30,7 @@ def run_step_study(
     """Take the steps of one integrator (to be called in a worker).
 
     Args:
-        engine: name of the engine in the registry.
         integrator: one of its integrators, with a declared formula.
-        model: the pendulum.
-        states: states of it.
-
-    Returns:
-        The steps.
 
     """
     assert integrator.method is not None
@@ -57,8 +51,6 @@ def step_sizes(has_constraints: bool, model: Model, states: Sequence[State]) -> 
 
     Args:
         has_constraints: whether the declared formula is a `ConstrainedMethod`.
-        model: the pendulum.
-        states: states of it.
 
     Returns:
         Steps [s] per state: `STEP_SIZES` × `MAX_STEP_RATE` over the fastest rate, where that is larger.  Of

@@ -76,7 +76,6 @@ def quantity_values(answers: StateQuantities, **factors: float) -> dict[str, Arr
     """Return the state quantities that an engine offers.
 
     Args:
-        answers: the engine's answers at one state.
         **factors: by name of a quantity, the number to multiply it by.
 
     Returns:
@@ -91,16 +90,7 @@ def quantity_values(answers: StateQuantities, **factors: float) -> dict[str, Arr
 
 
 def unchanged(model: Model, state: State) -> tuple[Model, State]:
-    """Return model and state as they are: the transformation of relations between two algorithms.
-
-    Args:
-        model: the pendulum.
-        state: minimal coordinates and what follows from them.
-
-    Returns:
-        Both.
-
-    """
+    """Return model and state as they are: the transformation of relations between two algorithms."""
     return model, state
 
 
@@ -122,11 +112,7 @@ def scale_fields(model: Model, **factors: float) -> Model:
     """Multiply fields of a model.
 
     Args:
-        model: the pendulum.
         **factors: by name of a field, the number to multiply it by.
-
-    Returns:
-        The other pendulum.
 
     """
     return model.changed(**{name: getattr(model, name) * factor for name, factor in factors.items()})
@@ -281,8 +267,6 @@ def check_state_relations(
     """Check every relation on one engine, at each state.
 
     Args:
-        engine: the adapter.
-        model: the pendulum.
         states: states of it; the first few are used.
 
     Yields:
@@ -333,8 +317,6 @@ def evaluate_or_refusal(evaluate: Evaluate, model: Model, state: State) -> State
 
     Args:
         evaluate: the engine's function for a list of states.
-        model: the pendulum.
-        state: a state of it.
 
     Returns:
         The engine's answers, or the exception with which it refused.
@@ -362,7 +344,6 @@ def check_state_relation(
         relation: maps the state there and the answers back.
         answers: the engine's usual answer at each state.
         evaluate_other: evaluates the transformed states.
-        model: the pendulum.
         states: states of it on the constraint manifold.
         bounds: rounding bound of the usual answer at each state.
         other_bounds: rounding bound of the other answer at each state, mapped back.

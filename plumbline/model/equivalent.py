@@ -29,8 +29,6 @@ def rotate_world(model: Model, state: State, q: Array) -> tuple[Model, State]:
     """Rotate everything in world axes: gravity, applied forces, attitudes and rod directions.
 
     Args:
-        model: the mechanism.
-        state: a state of it.
         q: (4,) unit quaternion of the rotation, scalar first.
 
     Returns:
@@ -56,8 +54,6 @@ def rotate_body_frames(model: Model, state: State, q: Array) -> tuple[Model, Sta
     """Describe every body in other axes of its own: a body vector x becomes Q x.
 
     Args:
-        model: the mechanism.
-        state: a state of it.
         q: (4,) unit quaternion of the rotation Q, scalar first.
 
     Returns:
@@ -101,9 +97,6 @@ def _normalised(q: Array) -> Array:
 def siblings_reversed(model: Model) -> NDArray[np.intp]:
     """Order the bodies depth first with the branches on every body, and on the world, in reverse.
 
-    Args:
-        model: the mechanism.
-
     Returns:
         (N,) the bodies in the new order; ascending where no two joints hang on the same body.
 
@@ -121,12 +114,7 @@ def reorder_bodies(model: Model, state: State, order: NDArray[np.intp]) -> tuple
     """Number the bodies and joints in another order.
 
     Args:
-        model: the mechanism.
-        state: a state of it.
         order: (N,) the bodies in the new order, each behind its far body.
-
-    Returns:
-        The same mechanism and state.
 
     """
     place = np.append(np.argsort(order), -1)  # the world is −1 in both
@@ -143,8 +131,6 @@ def first_bodies(model: Model, state: State, count: int) -> tuple[Model, State]:
     """Cut a chain behind some bodies.
 
     Args:
-        model: the mechanism.
-        state: a state of it.
         count: number of bodies that remain, from the pivot.
 
     Returns:

@@ -59,9 +59,6 @@ class _Value(NamedTuple):
 def joint_roles(model: Model) -> list[Role]:
     """Tell what part each joint has in the mechanism.
 
-    Args:
-        model: the mechanism.
-
     Returns:
         (J,) "closing" of joints that close loops, "loop" of joints of the tree on a loop, "beside" where the
         parent, or the world, carries another joint of the tree, else "single".
@@ -81,9 +78,6 @@ def joint_roles(model: Model) -> list[Role]:
 
 def features(model: Model) -> list[Feature]:
     """List the features of a mechanism.
-
-    Args:
-        model: the mechanism.
 
     Returns:
         The features, each once.

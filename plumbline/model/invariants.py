@@ -45,9 +45,6 @@ def position_error(a: Array, b: Array) -> Array:
 def motion_samples(run: Trajectory) -> dict[str, Array]:
     """Return what is compared of a motion, by the names of `MOTION_UNITS`.
 
-    Args:
-        run: T samples of N bodies.
-
     Returns:
         r (T, N, 3), p (T, N, 4), ṙ (T, N, 3) in the world frame and ω′ (T, N, 3) in the body frame.
 
@@ -74,10 +71,6 @@ def motion_error(quantity: str, a: Array, b: Array) -> Array:
 def motion_errors(a: Trajectory, b: Trajectory) -> dict[str, Array]:
     """Return the largest difference of any body between two motions, up to each time.
 
-    Args:
-        a: T samples of the first.
-        b: T samples of the second.
-
     Returns:
         (T,) running maxima for each name of `MOTION_UNITS`, in its unit.
 
@@ -90,8 +83,6 @@ def motion_scales(model: Model, run: Trajectory, length: float) -> dict[str, flo
     """Return the scales of rounding in a motion.
 
     Args:
-        model: the mechanism.
-        run: T samples of its motion.
         length: the length of the stretched mechanism [m].
 
     Returns:
@@ -224,8 +215,6 @@ def work_of_loads(model: Model, run: Trajectory, omega: Array) -> tuple[Array, f
     difference shows e; e²/C and all differences are the uncertainty.
 
     Args:
-        model: the mechanism of N bodies.
-        run: T samples of its motion.
         omega: (T, N, 3) angular velocities of the run, body frame [rad/s].
 
     Returns:
@@ -317,7 +306,6 @@ def compute_invariants(model: Model, run: Trajectory) -> Invariants:
 
     Args:
         model: the chain of N bodies.
-        run: T samples of its motion.
 
     Returns:
         The series; ``momentum_drift`` is None with loads, drag or without gravity, and where a joint at the
@@ -369,12 +357,7 @@ def element_energies(model: Model, run: Trajectory, omega: Array) -> ElementEner
     Angles start near the run's ``initial_x``, and their rates choose their turn at each further sample.
 
     Args:
-        model: the mechanism.
-        run: T samples of its motion.
         omega: (T, N, 3) angular velocities of the run, body frame [rad/s].
-
-    Returns:
-        Their time series.
 
     """
     rotors, springs, power = np.zeros((3, len(run.t)))
@@ -455,7 +438,6 @@ def joint_vector_rates(model: Model, run: Trajectory, omega: Array) -> Array:
 
     Args:
         model: the chain of N bodies.
-        run: T samples of its motion.
         omega: (T, N, 3) angular velocities of the run, body frame [rad/s].
 
     Returns:
@@ -510,7 +492,6 @@ def invariant_scales(model: Model, run: Trajectory, length: float) -> dict[str, 
 
     Args:
         model: the chain of N bodies.
-        run: T samples of its motion.
         length: the length of the stretched chain [m].
 
     Returns:
@@ -540,9 +521,6 @@ def invariant_scales(model: Model, run: Trajectory, length: float) -> dict[str, 
 
 def inertia_ratio(model: Model) -> float:
     """Return how strongly inertias differ along a chain, which algorithms that pass them inward feel.
-
-    Args:
-        model: the mechanism.
 
     Returns:
         The largest, over the bodies, of (M |c − s|² + J_max) / J_min: M the mass of the bodies beyond, c − s

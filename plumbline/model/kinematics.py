@@ -162,10 +162,6 @@ def rotation_vector(q: Array) -> Array:
 def ball_spring_rest(model: Model, k: int) -> Array:
     """Return the turn of a ball joint at which its spring is unloaded.
 
-    Args:
-        model: the mechanism.
-        k: the joint.
-
     Returns:
         (4,) quaternion, near → far body.
 
@@ -215,7 +211,6 @@ def state_from_minimal(
     """Complete minimal coordinates to a state, from the world outwards.
 
     Args:
-        model: the mechanism of N bodies.
         p: (N, 4) unit quaternions, body → world; of bodies whose joint leaves their attitude free.
         omega: (N, 3) angular velocities of the same bodies, body frame [rad/s].
         u: (N, 3) unit directions of the rods, world frame; zero for other joints.
@@ -272,7 +267,6 @@ def forward_kinematics(
     """Return attitudes, angular velocities, centres of mass and their velocities, of one state or of many.
 
     Args:
-        model: the mechanism of N bodies.
         p: (..., N, 4) unit quaternions, body → world, where they are coordinates.
         omega: (..., N, 3) angular velocities of the same bodies, body frame [rad/s].
         u: (..., N, 3) unit directions of the rods, world frame; zero for other joints.
@@ -374,7 +368,6 @@ def joint_vectors(model: Model, r: Array, p: Array) -> Array:
     Zero for a joint that is closed, of length ℓ_k for a rod, along the axis for a slide.
 
     Args:
-        model: the mechanism of N bodies.
         r: (..., N, 3) centres of mass, world frame [m].
         p: (..., N, 4) quaternions, normalised here.
 
@@ -410,10 +403,6 @@ def spring_vectors(model: Model, r: Array, p: Array) -> Array:
 def elastic_energy(model: Model, state: State) -> float:
     """Return the potential energy of all springs.
 
-    Args:
-        model: the mechanism.
-        state: a state of it.
-
     Returns:
         Σ ½ k (x − x₀)² + Σ ½ k θ² + Σ ½ k (l − l₀)² [J].
 
@@ -433,10 +422,6 @@ def elastic_energy(model: Model, state: State) -> float:
 def kinetic_energy_of_rotors(model: Model, state: State) -> float:
     """Return the kinetic energy of all rotors.
 
-    Args:
-        model: the mechanism.
-        state: a state of it.
-
     Returns:
         Σ ½ a ẋ² + Σ ½ a ‖ω − ω_far‖² [J].
 
@@ -454,9 +439,6 @@ def kinetic_energy_of_rotors(model: Model, state: State) -> float:
 def rate_count(model: Model) -> int:
     """Count the minimal rates ν of `velocity_jacobian`.
 
-    Args:
-        model: the mechanism.
-
     Returns:
         Their number: the size of `StateQuantities.mass_matrix`.
 
@@ -470,25 +452,13 @@ def _own_rate_count(kind: Kind) -> int:
 
 
 def own_rates(model: Model) -> list[slice]:
-    """Return where each body's own rates are in ν, behind those of the rods.
-
-    Args:
-        model: the mechanism.
-
-    Returns:
-        N slices of ν.
-
-    """
+    """Return where each body's own rates are in ν, behind those of the rods."""
     first = 3 * int(model.tree.rods.sum()) + np.cumsum([0, *map(_own_rate_count, model.tree.kind)])
     return [slice(int(start), int(end)) for start, end in pairwise(first)]
 
 
 def minimal_rates(model: Model, state: State) -> Array:
     """Return ν, the minimal rates of a state.
-
-    Args:
-        model: the mechanism.
-        state: a state of it.
 
     Returns:
         (nu,) in the order of `velocity_jacobian`.
@@ -510,7 +480,6 @@ def velocity_jacobian(model: Model, state: State) -> Array:
     point s by −A s̃ ω′ (world frame).
 
     Args:
-        model: the mechanism of N bodies.
         state: a state on the constraint manifold; or many, of arrays with leading axes.
 
     Returns:
@@ -581,10 +550,6 @@ def mass_matrix(model: Model, state: State) -> Array:
 def joint_coordinates(model: Model, state: State) -> tuple[Array, Array, Array, Array]:
     """Return the coordinates of all joints: those of closing ones follow from the bodies.
 
-    Args:
-        model: the mechanism of J joints.
-        state: a state of it.
-
     Returns:
         u, u̇ (J, 3) of rods, x, ẋ (J, 2) of other joints, as those of `State`.
 
@@ -604,9 +569,6 @@ def with_joint_coordinates(model: Model, state: State) -> State:
         model: a tree.
         state: of which p, omega, r and v count.
 
-    Returns:
-        The whole state.
-
     """
     u, udot, x, xdot = coordinates_of_joints(model, state, range(model.n))
     return replace(state, u=u, udot=udot, x=x, xdot=xdot)
@@ -618,9 +580,7 @@ def coordinates_of_joints(
     """Compute coordinates of joints from the motion of the bodies; angles in (−π, π].
 
     Args:
-        model: the mechanism.
         state: of which p, omega, r and v count.
-        joints: K joints.
 
     Returns:
         u, u̇ (K, 3) of rods, x, ẋ (K, 2) of other joints, as those of `State`.

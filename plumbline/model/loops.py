@@ -92,9 +92,6 @@ class CutMechanism:
         Args:
             state: of the tree, its ends together.
 
-        Returns:
-            The mechanism's state.
-
         """
         bodies = self.place[: self.source.n]
         return complete_state(
@@ -172,9 +169,6 @@ def cut_open(model: Model) -> CutMechanism:
 
     Args:
         model: with loops.
-
-    Returns:
-        The tree.
 
     """
     n, (far, near) = model.n, model.body.T
@@ -290,7 +284,6 @@ def closed_pose(cut: CutMechanism, state: State, free: NDArray[np.bool_] | None 
     """Close the loops of a cut mechanism by Newton's method, with the shortest steps.
 
     Args:
-        cut: the mechanism.
         state: of the tree, near a pose where its ends are together.
         free: (nu,) True for coordinates that may change; absent: all.
 
@@ -322,7 +315,6 @@ def closed_rates(
     """Project rates on those that keep the loops of a cut mechanism closed.
 
     Args:
-        cut: the mechanism.
         state: of the tree, its ends together.
         rates: (nu,) of the tree.
         free: (nu,) True for those that may change; absent: all.
@@ -344,7 +336,6 @@ def allowed_rates(cut: CutMechanism, state: State) -> Array:
     """Return the rates that keep the loops of a cut mechanism closed.
 
     Args:
-        cut: the mechanism.
         state: of the tree, its ends together.
 
     Returns:
@@ -365,7 +356,6 @@ def immovable_joints(model: Model, state: State) -> list[int]:
     """Find the joints that the loops keep from moving.
 
     Args:
-        model: the mechanism.
         state: a state of it, its loops closed.
 
     Returns:
@@ -410,9 +400,6 @@ def without_still_rates(model: Model, state: State) -> State:
         model: the mechanism; a tree is left alone.
         state: a state of it, its loops closed and its rates fitting.
 
-    Returns:
-        The state.
-
     """
     if not model.has_loops:
         return state
@@ -428,7 +415,6 @@ def motion_without_inertia(model: Model, state: State) -> int | None:
     """Find a body that can turn without inertia: the mass matrix on the joints' motions is singular then.
 
     Args:
-        model: the mechanism.
         state: a state of it, its loops closed.
 
     Returns:
@@ -518,7 +504,6 @@ def keeps_dependent_rows(model: Model, state: State) -> bool:
     """Find out whether rows that depend on the others do so in open poses too, as those out of a plane do.
 
     Args:
-        model: the mechanism.
         state: assembled.
 
     Returns:
@@ -551,7 +536,6 @@ def singular_values(cut: CutMechanism, state: State) -> tuple[Array, Array]:
     """Return the singular values of J with its rows by `row_scale`.
 
     Args:
-        cut: the mechanism.
         state: of the tree, its ends together.
 
     Returns:
@@ -652,7 +636,6 @@ def determinate_part(model: Model, state: State, answer: StateQuantities) -> Sta
     Args:
         model: with loops.
         state: assembled.
-        answer: quantities at it.
 
     Returns:
         The same without the mass matrix, and of joint forces and moments the parts that dependent rows leave

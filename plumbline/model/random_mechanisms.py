@@ -30,7 +30,6 @@ def random_inertias(rng: np.random.Generator, mass: Array) -> Array:
     """Draw inertias of ellipsoids of any attitude, which are always physical.
 
     Args:
-        rng: the source.
         mass: (N,) kg.
 
     Returns:
@@ -54,14 +53,7 @@ def random_tree(
     """Draw a tree in depth-first order; free bodies hang on the world only, welds never.
 
     Args:
-        rng: the source.
-        n: number of bodies.
-        kinds: kinds of joints to choose from.
-        loads: whether bodies have constant loads and drag.
         elements: which of `ELEMENTS` its joints have.
-
-    Returns:
-        The tree.
 
     """
     far: list[int] = []
@@ -106,8 +98,6 @@ def with_elements(rng: np.random.Generator, model: Model, elements: Sequence[str
     """Add random elements to every joint, closing ones too, and springs between points.
 
     Args:
-        rng: the source.
-        model: the mechanism.
         elements: which.
 
     Returns:
@@ -143,12 +133,8 @@ def close_loop(
     """Add a joint that fits the state: its coordinates are at random, its far axes and point follow.
 
     Args:
-        model: the mechanism.
-        state: its pose.
-        kind: of the joint.
         far: its far body, −1 the world.
         near: its near body.
-        rng: the source.
 
     Returns:
         The mechanism with one more closing joint.
@@ -194,8 +180,6 @@ def random_loop_mechanism(
 
     Args:
         seed: the same seed gives the same mechanism.
-        n: number of bodies.
-        kinds: of the closing joints.
         tree: kinds of the tree's joints.
         elements: which of `ELEMENTS` the joints have.
 

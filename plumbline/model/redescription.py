@@ -58,15 +58,7 @@ class Rearranged:
     is_reversed: NDArray[np.bool_]  # (J,) of the first mechanism's joints
 
     def state(self, state: State) -> State:
-        """Describe a state of the first mechanism as one of this one.
-
-        Args:
-            state: of the first mechanism.
-
-        Returns:
-            The same state.
-
-        """
+        """Describe a state of the first mechanism as one of this one."""
         fields = {name: getattr(state, name)[self.order] for name in ("p", "omega", "r", "v")}
         for name in ("u", "udot", "x", "xdot"):
             values = np.zeros_like(getattr(state, name))
@@ -83,9 +75,6 @@ class Rearranged:
 
 def moved_root(model: Model) -> Rearranged | None:
     """Make the last body of the first branch the root, a free body.
-
-    Args:
-        model: the mechanism.
 
     Returns:
         The same mechanism; None where the root's joint has elements, or there is no other body to be the root
@@ -117,9 +106,6 @@ def moved_root(model: Model) -> Rearranged | None:
 
 def rods_taken_out(model: Model) -> Rearranged:
     """Leave out every rod; a body that hung on one is free.
-
-    Args:
-        model: the mechanism.
 
     Returns:
         The mechanism without rods.
@@ -268,10 +254,6 @@ def state_of_balls(model: Model, state: State) -> State:
 
     Args:
         model: that mechanism.
-        state: of the first one.
-
-    Returns:
-        The same state.
 
     """
     has_coordinates = np.array([not KINDS[kind].has_attitude for kind in model.kind[: model.n]])[:, None]
@@ -281,9 +263,6 @@ def state_of_balls(model: Model, state: State) -> State:
 
 def inertia_as_rotors(model: Model) -> Model:
     """Make rotors of a part of the inertia of bodies on hinges on the world; what is left is physical.
-
-    Args:
-        model: the mechanism.
 
     Returns:
         The same mechanism; the model itself where there are no such bodies.
@@ -305,7 +284,6 @@ def springs_as_loads(model: Model, state: State) -> Model:
     """Make efforts of springs and dampers of joints, and loads of those between points, at one state.
 
     Args:
-        model: the mechanism.
         state: where it is; angles count full turns.
 
     Returns:

@@ -43,10 +43,7 @@ def compared_states(model: Model, state: State, seed: str, count: int) -> list[S
     """Draw the states at which a scenario is compared.
 
     Args:
-        model: the scenario's mechanism.
-        state: its initial state.
         seed: words that the draw depends on.
-        count: how many random states.
 
     Returns:
         The initial state unless its pose is singular (`is_singular`), then the random ones.
@@ -68,7 +65,6 @@ def random_states(model: Model, count: int, seed: int) -> list[State]:
 
     Args:
         model: the chain of N bodies; only its geometry and gravity count.
-        count: how many states.
         seed: the same seed gives the same states.
 
     Returns:
@@ -108,9 +104,7 @@ def random_loop_states(model: Model, state: State, count: int, seed: int) -> tup
     `MIN_SAMPLED_SINGULAR_VALUE` are drawn again, from the initial one.
 
     Args:
-        model: the mechanism.
         state: assembled.
-        count: how many states.
         seed: the same seed gives the same states.
 
     Returns:

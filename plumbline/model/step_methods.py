@@ -88,9 +88,6 @@ def classical_runge_kutta(
         free_coordinates: of `JointSpaceMethod`.
         gap_correction: of `JointSpaceMethod`.
 
-    Returns:
-        The method.
-
     """
     return JointSpaceMethod(
         "Runge-Kutta",
@@ -129,9 +126,6 @@ def generalized_alpha(
 
 def describe_method(method: JointSpaceMethod) -> str:
     """Write the declared formula as one line of text.
-
-    Args:
-        method: of an integrator.
 
     Returns:
         The formula with its symbols explained, without its coordinates' definition.

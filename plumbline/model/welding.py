@@ -67,9 +67,6 @@ def split_body(mass: float, inertia: Array) -> tuple[RigidPart, RigidPart]:
         mass: the body's mass [kg].
         inertia: (3, 3) about its centre of mass, body frame [kg m²].
 
-    Returns:
-        The halves.
-
     """
     principal, axes = np.linalg.eigh(inertia)
     moments = np.maximum(np.sum(principal) / 2 - principal, 0.0)  # of a flat body one is a rounding of zero
@@ -82,9 +79,6 @@ def split_body(mass: float, inertia: Array) -> tuple[RigidPart, RigidPart]:
 
 def part_offsets(parts: BodyParts) -> Array:
     """Return how far the centres of the pieces are from their body's centre of mass.
-
-    Args:
-        parts: the pieces of each of N bodies.
 
     Returns:
         (N,) the largest distance in each body [m].

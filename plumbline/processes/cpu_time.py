@@ -33,7 +33,6 @@ class CpuTimes:
         An answer from the result cache took nothing.
 
         Args:
-            outcome: the task's outcome.
             kind: the kind of the call, of `CPU_TIME_KINDS`.
 
         """
@@ -47,9 +46,6 @@ class CpuTimes:
     @contextmanager
     def measure(self, kind: str) -> Iterator[None]:
         """Count what this process takes inside the context.
-
-        Args:
-            kind: the kind to count it as.
 
         Yields:
             Nothing.
@@ -77,9 +73,6 @@ class CpuTimes:
 
     def timed_cache(self, result_cache: ResultCache) -> ResultCache:
         """Wrap a result cache so that its work is counted as storage.
-
-        Args:
-            result_cache: does the work of the returned one.
 
         Returns:
             A cache with the same content.

@@ -29,9 +29,6 @@ def one_line(text: str) -> str:
 def describe_exception(error: BaseException) -> str:
     """Write an exception as one line, whatever its class does.
 
-    Args:
-        error: what was raised.
-
     Returns:
         Its message; after the class name unless the error is one of the project's own.
 

@@ -62,12 +62,7 @@ def adopt_orphans() -> None:
 
 
 def kill_tree(pid: int) -> None:
-    """Kill a process that leads a session, that session and all descendants. What ends on the way is ignored.
-
-    Args:
-        pid: process id.
-
-    """
+    """Kill a process that leads a session, that session and all descendants; some may end on the way."""
     found = _descendants(pid)
     with contextlib.suppress(OSError, AttributeError):
         os.killpg(pid, signal.SIGKILL)
@@ -114,9 +109,6 @@ class FileLock:
 
     def __init__(self, path: Path) -> None:
         """Make the file where it is missing, and lock it.
-
-        Args:
-            path: the file.
 
         Raises:
             LockHeld: another process holds it.
@@ -178,7 +170,6 @@ class ScratchFolder:
         """Make the folder.
 
         Args:
-            prefix: beginning of the folder's name.
             parent: folder to make it in; None for the system's temporary folder.
 
         """
@@ -209,11 +200,7 @@ def remove_orphaned_folders(prefix: str, parent: Path | None = None) -> list[Pat
     """Remove the scratch folders whose owner has ended.
 
     Args:
-        prefix: beginning of the folders' names.
         parent: folder that they are in; None for the system's temporary folder.
-
-    Returns:
-        The removed folders.
 
     """
     removed = []

@@ -76,9 +76,6 @@ def call_remote(python: str, function: Callable[..., Any], *arguments: Any) -> A
         function: a function of a module that can be imported there.
         arguments: its positional arguments, which can be pickled.
 
-    Returns:
-        The function's result.
-
     Raises:
         RemoteCrash: the child ended before it answered.
         RemoteError: the function raised an exception.
@@ -103,7 +100,6 @@ def call_timed(function: Callable[..., Any], *arguments: Any) -> tuple[Any, floa
 
     Args:
         function: any function.
-        arguments: its positional arguments.
 
     Returns:
         The function's result and the CPU time [s].

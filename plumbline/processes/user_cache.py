@@ -50,9 +50,6 @@ class CheckedFiles:
     def path(self, name: str) -> Path:
         """Locate a file.
 
-        Args:
-            name: the last part of its path.
-
         Returns:
             Its path; it need not exist.
 
@@ -61,9 +58,6 @@ class CheckedFiles:
 
     def read(self, name: str) -> bytes | None:
         """Read a file, and note that it was used.
-
-        Args:
-            name: the last part of its path.
 
         Returns:
             Its content; None where there is no such file.
@@ -92,7 +86,6 @@ class CheckedFiles:
         """Write or replace a file.
 
         Args:
-            name: the last part of its path.
             body: its content.
 
         Raises:
@@ -202,9 +195,6 @@ def content_key(*parts: bytes | str) -> str:
 
     Args:
         *parts: everything that the value depends on, the code that makes it included.
-
-    Returns:
-        A hash of the parts.
 
     """
     digest = hashlib.sha256()

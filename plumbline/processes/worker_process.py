@@ -52,9 +52,6 @@ class Pickled:
         Args:
             value: any value that can be pickled.
 
-        Returns:
-            The pickle.
-
         """
         return cls(pickle.dumps(value, protocol=5))
 
@@ -149,9 +146,6 @@ class WorkerProcess:
             arguments: its arguments; pickled ones are loaded there.
             python: interpreter of another environment that makes the call; empty: the process itself.
             gigabytes: its limit of memory, for the message.
-
-        Returns:
-            The reply.
 
         Raises:
             WorkerLost: the process ended before it replied.
@@ -255,9 +249,6 @@ def make_reply(message: bytes) -> Reply:
     Args:
         message: pickle of function, arguments, interpreter of another environment or "", memory limit [GB].
 
-    Returns:
-        The reply.
-
     """
     answer, failure, cost, python, gigabytes = None, None, 0.0, "", 0.0
     is_out_of_memory = False
@@ -323,7 +314,6 @@ def initialize_worker(scratch: str, gigabytes: float, parent: int, environment: 
     Args:
         scratch: folder in which the worker makes its working folder.
         gigabytes: limit of its address space.
-        parent: process id of the pool's process.
         environment: its environment variables; those of the warm process may be older.
 
     """

@@ -96,9 +96,6 @@ class ResultCache:
     def get(self, task: Task) -> Outcome | None:
         """Look a task's answer up.
 
-        Args:
-            task: the call to look up.
-
         Returns:
             Its outcome, or None where the task has to run.
 
@@ -110,7 +107,6 @@ class ResultCache:
 
         Args:
             task: the call that was made.
-            outcome: its answer or failure.
 
         Returns:
             The outcome; its answer may have another representation, of which a later run has an equal one.
@@ -176,7 +172,6 @@ class Scheduler:
         """Make a scheduler.
 
         Args:
-            executor: makes the calls.
             result_cache: its answers are not computed again; it gets every other outcome before the caller.
 
         """
@@ -185,12 +180,7 @@ class Scheduler:
         self._submitted: deque[Task] = deque()
 
     def submit(self, task: Task) -> None:
-        """Add a task that arose from an outcome; it starts before those that `run` was given.
-
-        Args:
-            task: the call to make.
-
-        """
+        """Add a task that arose from an outcome; it starts before those that `run` was given."""
         self._submitted.append(task)
 
     def run(self, tasks: Iterable[Task]) -> Iterator[Outcome]:
@@ -279,12 +269,7 @@ class WorkerPool(Executor):
         return 2 * self._jobs
 
     def start(self, task: Task) -> None:
-        """Queue a task for the next idle worker.
-
-        Args:
-            task: the call to make there.
-
-        """
+        """Queue a task for the next idle worker."""
         if self._threads is None:
             start_warm_process()  # in this thread, with which it ends
             self._threads = ThreadPoolExecutor(self._jobs)
@@ -375,12 +360,8 @@ def run_task(task: Task, make_call: Callable[..., Reply] | None = None) -> Outco
     """Make a task's call, and have its answer judged.
 
     Args:
-        task: the call to make and to judge.
         make_call: makes a call in a process of a name: (name, function, arguments, interpreter) → reply;
             None to make it in this process.
-
-    Returns:
-        The outcome.
 
     """
     make_call = make_call or _call_here

@@ -31,9 +31,6 @@ class EngineClient:
             function: a module-level function whose first parameter is the engine's name.
             *arguments: its other arguments; picklable.
 
-        Returns:
-            The function's result.
-
         """
         if self.python:
             return call_remote(self.python, function, self.name, *arguments)
@@ -43,7 +40,6 @@ class EngineClient:
         """Evaluate one state.
 
         Args:
-            model: the mechanism.
             state: a state on its constraint manifold.
             variant: name of the relation whose second answer is wanted ("by cholesky", "two welded
                 halves"); empty for the engine's usual answer.
@@ -58,9 +54,6 @@ class EngineClient:
     def integrator(self, name: str) -> Integrator:
         """Return the declaration of one of the engine's integrators.
 
-        Args:
-            name: the integrator's name.
-
         Returns:
             The integrator as this version's adapter declares it.
 
@@ -71,9 +64,6 @@ class EngineClient:
 
     def run_script(self, script: str) -> str:
         """Run a reproduction script in the engine's environment.
-
-        Args:
-            script: the script's text.
 
         Returns:
             What it prints, up to its end or its failure.

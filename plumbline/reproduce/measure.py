@@ -119,9 +119,6 @@ class Disagreement:
     def measure(self, case: ReproductionCase) -> Evidence | None:
         """Measure by how much a case shows this disagreement.
 
-        Args:
-            case: the case to evaluate or to run.
-
         Returns:
             The evidence, or None where the engine or the truth refuses the case.
 

@@ -126,7 +126,6 @@ def write_model_script(
     """Shrink a model file and write the script of its difference.
 
     Args:
-        shown: path of the file.
         importer: the one that differs, with or without a version.
         form: engine whose calls the script uses, one of `FORMS`.
         base: as for the run.

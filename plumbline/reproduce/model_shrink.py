@@ -20,7 +20,6 @@ def shrink_tree(root: Element, shows: Shows, seconds: float) -> Element:
 
     Args:
         root: of a file that shows it.
-        shows: whether a changed file shows it too.
         seconds: after which the best file so far is returned.
 
     Returns:

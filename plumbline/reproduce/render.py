@@ -81,9 +81,6 @@ def render_script(row: dict[str, Any], evidence: Evidence) -> str:
         row: the stored row; its texts are written as escaped comments, whatever characters they hold.
         evidence: the shrunk case, with what is expected there.
 
-    Returns:
-        The script's text.
-
     """
     engine, shows = split_version(row["engine"])[0], _KINDS[type(evidence)]
     try:
@@ -129,7 +126,6 @@ def no_script_reason(engine: str, row: dict[str, Any]) -> str:
 
     Args:
         engine: registered name of the engine, without a version.
-        row: the stored row.
 
     Returns:
         A sentence, or an empty string where the row has a script.

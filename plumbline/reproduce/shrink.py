@@ -105,7 +105,6 @@ def smallest_case(
     """Find the smallest case that shows what a given case shows.
 
     Args:
-        case: the case to shrink.
         measure: returns a case's measurement, or None for a case that cannot be measured.
         ratio: by how much the given case exceeds its tolerance.
         seconds: time for the search [s], on the clock below.
@@ -140,9 +139,6 @@ def smallest_case(
 
 def starting_cases(case: ReproductionCase) -> Iterator[ReproductionCase]:
     """List cases to begin with.
-
-    Args:
-        case: the case to shrink.
 
     Yields:
         Shorter runs of fewer bodies from cheap to expensive, the whole case last; a single state as it is.

@@ -55,9 +55,6 @@ class WrittenScripts:
 def list_disagreements(folder: Path) -> dict[str, str]:
     """List the rows that disagree.
 
-    Args:
-        folder: a results folder.
-
     Returns:
         Diagnosis, or else the verdict's reason, by the key of the row.
 
@@ -78,10 +75,8 @@ def write_scripts(
     All rows of a cell and level (of one relation) share a script. Engines run in worker processes.
 
     Args:
-        folder: a results folder.
         keys: the wanted rows; by default all that disagree: less time is spent on each, and scripts of an
             earlier run are removed.
-        limits: of the workers' memory and time.
         jobs: number of workers; by default as many as the run had.
 
     Returns:
@@ -144,7 +139,6 @@ def make_script(disagreement: Disagreement, row: StoredRow) -> tuple[str, str]:
     script rounds differently from an adapter, which can matter next to a bound.
 
     Args:
-        disagreement: what to shrink.
         row: the stored row that the script's head describes.
 
     Returns:
@@ -166,12 +160,8 @@ def find_disagreement(document: dict[str, Any], rows: list[StoredRow], seconds: 
     """Find what to measure again for the rows of one cell.
 
     Args:
-        document: the stored results.
         rows: rows of one cell that disagree.
         seconds: time for shrinking [s].
-
-    Returns:
-        The disagreement.
 
     Raises:
         NotReproducible: there is no script for such rows, or the results do not hold what is needed.

@@ -54,8 +54,6 @@ def closest_match(word: str, known: Sequence[str], cutoff: float = 0.5) -> str:
     """Find the known word that is most similar to a misspelt one; capitals do not count.
 
     Args:
-        word: what was written.
-        known: what may be written.
         cutoff: the least similarity, from 0 to 1 (difflib's ratio).
 
     Returns:
@@ -68,10 +66,6 @@ def closest_match(word: str, known: Sequence[str], cutoff: float = 0.5) -> str:
 
 def did_you_mean(word: str, known: Sequence[str]) -> str:
     """Write the hint ``did you mean …?`` for a misspelt word.
-
-    Args:
-        word: what was written.
-        known: what may be written.
 
     Returns:
         The hint, or an empty string where no known word is similar.

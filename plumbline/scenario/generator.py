@@ -86,9 +86,6 @@ class RandomScenarios(Sequence[Scenario]):
             name: ``random-SEED-INDEX``, ``random-motion-SEED-INDEX`` or ``random-mechanism-SEED-INDEX``, of
                 this seed.
 
-        Returns:
-            The scenario.
-
         """
         makers = {MOTION_PREFIX: random_motion, MECHANISM_PREFIX: random_mechanism}
         make = next((make for prefix, make in makers.items() if name.startswith(prefix)), random_scenario)
@@ -113,7 +110,6 @@ def random_scenario(seed: int, index: int) -> Scenario:
     """Make one scenario of a seed.
 
     Args:
-        seed: the seed of the whole batch.
         index: the scenario's place in the batch, from 0; other scenarios need not be made first.
 
     Returns:
@@ -128,7 +124,6 @@ def random_motion(seed: int, index: int) -> Scenario:
     """Make one random scenario whose motion can be resolved in time: short, moderate rates, similar masses.
 
     Args:
-        seed: the seed of the whole batch.
         index: the scenario's place among the batch's motions, from 0.
 
     Returns:
@@ -162,7 +157,6 @@ def random_mechanism(seed: int, index: int) -> Scenario:
     three features of mechanisms come together in some of them.
 
     Args:
-        seed: the seed of the whole batch.
         index: the scenario's place among the batch's mechanisms, from 0.
 
     Returns:
@@ -199,7 +193,6 @@ def random_document(seed: int, index: int) -> dict[str, Any]:
     """Make the content of the file of one random scenario.
 
     Args:
-        seed: the seed of the whole batch.
         index: the scenario's place in the batch, from 0.
 
     Returns:

@@ -118,9 +118,6 @@ class Scenario:
 def load_scenario(path: str | Path) -> Scenario:
     """Read and check a scenario file.
 
-    Args:
-        path: a YAML file.
-
     Returns:
         The scenario, named after the file unless the file has a name.
 
@@ -134,13 +131,6 @@ def load_scenario(path: str | Path) -> Scenario:
 def load_scenario_text(content: str, name: str = "scenario") -> Scenario:
     """Check the text of a scenario file.
 
-    Args:
-        content: YAML text.
-        name: what problems show as the file's name.
-
-    Returns:
-        The scenario.
-
     Raises:
         ScenarioError: the text has problems; the error holds all of them.
 
@@ -152,13 +142,6 @@ def load_scenario_text(content: str, name: str = "scenario") -> Scenario:
 
 def scenario_from_dict(content: dict[str, Any], name: str) -> Scenario:
     """Check plain data that a program made, as the content of a file is checked.
-
-    Args:
-        content: the fields of a scenario file.
-        name: what problems show as the file's name.
-
-    Returns:
-        The scenario.
 
     Raises:
         ScenarioError: the data have problems; the error holds all of them.
@@ -254,9 +237,6 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
     Args:
         source: the data of a file with their positions.
         path: the file; its stem is the scenario's name unless the data have a name.
-
-    Returns:
-        The scenario.
 
     Raises:
         ScenarioError: the data have problems; the error holds all of them.

@@ -16,7 +16,6 @@ def mechanism_document(model: Model, state: State) -> dict[str, Any]:
 
     Args:
         model: the mechanism; its loops are closed at the state.
-        state: a state of it.
 
     Returns:
         The fields ``gravity``, ``bodies``, ``springs`` and ``closes``: plain data.

@@ -106,9 +106,6 @@ def unit_vector(values: list[float]) -> Array:
     Args:
         values: numbers, not all zero.
 
-    Returns:
-        The unit vector.
-
     """
     vector = np.array(values, dtype=float)
     vector = vector / np.max(np.abs(vector))
@@ -759,9 +756,6 @@ class Document(SchemaModel):
 def attitude_quaternion(attitude: Attitude) -> Array:
     """Return the unit quaternion of an attitude, in whichever form the file gives it.
 
-    Args:
-        attitude: a checked field.
-
     Returns:
         (4,) scalar first, body → world, unit to rounding.
 
@@ -789,9 +783,6 @@ def _euler_quaternion(euler: Euler) -> Array:
 
 def inertia_matrix(inertia: Inertia) -> Array:
     """Return the inertia matrix, in whichever form the file gives it.
-
-    Args:
-        inertia: a checked field.
 
     Returns:
         (3, 3) about the centre of mass, body frame, exactly symmetric [kg m²].

@@ -43,8 +43,6 @@ def problems_from_validation(
     """Make one problem of each validation error; a misspelt field is not reported as missing too.
 
     Args:
-        source: the file's positions.
-        errors: pydantic's errors.
         root: the model of the file, or of the items of a file that is a list.
 
     Returns:

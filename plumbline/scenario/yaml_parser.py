@@ -84,7 +84,6 @@ def parse_yaml(source: YamlSource, content: str) -> YamlSource:
 
     Args:
         source: receives data, positions and problems.
-        content: the text.
 
     Returns:
         ``source``.

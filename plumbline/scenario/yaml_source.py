@@ -30,7 +30,6 @@ class YamlSource:
             message: what is wrong.
             valid: what would be valid, a noun phrase.
             at: line and column of the mistake; (0, 0) for the whole file.
-            hint: how to correct it.
 
         Returns:
             The error, to be raised by the caller.
@@ -55,7 +54,6 @@ class YamlSource:
         """Describe what is wrong with a field.
 
         Args:
-            path: the field.
             message: what is wrong.
             valid: what would be valid, a noun phrase.
 
@@ -70,7 +68,6 @@ class YamlSource:
 
         Args:
             at: line and column of the mistake.
-            path: the field.
             message: what is wrong.
             valid: what would be valid, a noun phrase.
 

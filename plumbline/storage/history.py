@@ -98,9 +98,6 @@ class History:
     def before(self, run_id: str) -> list[tuple[int, StoredRun]]:
         """List the nights before a run; all of them where the run is not in this history.
 
-        Args:
-            run_id: identifier of the run.
-
         Returns:
             Index in ``nights`` and run, oldest first.
 
@@ -114,7 +111,6 @@ class History:
 
         Args:
             night: index in ``nights``.
-            keys: keys of the wanted rows.
 
         Returns:
             Value, tolerance, ratio, verdict and known issue by key, of the keys that the night has.
@@ -147,7 +143,6 @@ class History:
         """Run a query over the tables ``nights`` and ``rows``.
 
         Args:
-            query: SQL of DuckDB.
             parameters: values of the question marks in the query.
 
         Returns:
@@ -295,9 +290,6 @@ class History:
 def stored_runs(folder: Path) -> Iterator[StoredRun]:
     """Read the runs of a folder whose results.json is readable.
 
-    Args:
-        folder: the folder of runs.
-
     Yields:
         One run at a time, in the order of the folders' names.
 
@@ -309,9 +301,6 @@ def stored_runs(folder: Path) -> Iterator[StoredRun]:
 
 def next_night_number(folder: Path) -> int:
     """Return the number of a new night: nights are ordered by it, whatever the clock shows.
-
-    Args:
-        folder: the folder of complete nights.
 
     Returns:
         One more than the highest number there.

@@ -242,7 +242,6 @@ def read_table(folder: Path, name: str) -> pa.Table:
     """Read one table of a run, or the table of `plumbline drift` in its folder.
 
     Args:
-        folder: output folder of the run.
         name: a key of `TABLES`, or ``drift``.
 
     Returns:
@@ -296,10 +295,8 @@ def write_results(
 
     Args:
         folder: output folder, made where it is missing.
-        run: metadata of the run.
         scenarios: model, truth and description by scenario.
         engines: description by engine.
-        rows: the rows of results.json.
         tables: the Parquet tables, whose summary may have more rows than results.json (of random scenarios).
 
     Raises:
@@ -320,9 +317,6 @@ def write_results(
 
 def read_model_results(folder: Path) -> dict[str, Any]:
     """Read what `plumbline model --out` wrote.
-
-    Args:
-        folder: the results folder.
 
     Returns:
         The content of model.json: options, and of each file its rows.
@@ -350,12 +344,6 @@ def read_model_results(folder: Path) -> dict[str, Any]:
 def load_json(path: Path) -> Any:
     """Read a JSON file; surrogates without their other half, which no other file can hold, become "?".
 
-    Args:
-        path: the file.
-
-    Returns:
-        The document.
-
     Raises:
         OSError: the file cannot be read.
         ValueError: it is no regular file, or no JSON.
@@ -377,9 +365,6 @@ def _check_is_regular(path: Path) -> None:
 
 def read_results(folder: Path) -> dict[str, Any]:
     """Read results.json, of any readable schema version.
-
-    Args:
-        folder: output folder of a run.
 
     Returns:
         The document, with the names of the present schema version.

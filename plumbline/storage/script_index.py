@@ -16,9 +16,6 @@ _SCRIPT_NAME = re.compile(r"[\w-][\w.-]{0,250}\.py", re.ASCII)
 def scripts_folder(folder: Path) -> Path:
     """Return where stand-alone scripts of a run are kept.
 
-    Args:
-        folder: a results folder.
-
     Returns:
         Where its scripts and their index are, or would be.
 
@@ -41,9 +38,6 @@ def script_name(text: str) -> str:
 
 def read_script_index(folder: Path) -> dict[str, str]:
     """Look up which rows of a run have a stand-alone script.
-
-    Args:
-        folder: a results folder.
 
     Returns:
         File name of the script of each row key that has one; empty where there is no index.
@@ -68,7 +62,6 @@ def write_script_index(folder: Path, index: dict[str, str]) -> None:
     """Write the index; the scripts' folder exists.
 
     Args:
-        folder: a results folder.
         index: file name of the script of each row key.
 
     """

@@ -31,9 +31,6 @@ _RANDOM_BATCH_NAMES = {"folded": "counts_by_verdict", "worst": "worst_ratios"}
 def upgrade_document(document: Record) -> Record:
     """Bring the document of a results.json of version 1 or 2 to version 2.
 
-    Args:
-        document: the document as stored.
-
     Returns:
         The document with the names of version 2. In version 1 the ratio of a row was in its ``extra``, or
         followed from its value and tolerance.

@@ -14,9 +14,6 @@ FILE = "version_changes.json"
 def read_version_changes(folder: Path) -> dict[str, dict[str, Any]]:
     """Read what was found of the rows of a results folder.
 
-    Args:
-        folder: a results folder.
-
     Returns:
         By the row's key ``last_before``, ``first_after`` and ``note``; empty where nothing was searched.
 
@@ -32,8 +29,6 @@ def add_version_change(folder: Path, key: str, change: dict[str, Any]) -> None:
     """Keep what was found of a row.
 
     Args:
-        folder: a results folder.
-        key: of the row.
         change: ``last_before``, ``first_after`` and ``note``.
 
     """

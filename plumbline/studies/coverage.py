@@ -44,8 +44,6 @@ def measure_coverage(
     Args:
         executor: makes the calls, one per scenario and `PARAMETERS_PER_TASK` of its parameters.
         scenarios: which to cover.
-        rows: judged rows of correct engines on them.
-        state_count: random states per scenario at state level.
         levels: of `COVERED_LEVELS`.
         progress: called with calls done, calls in all and the scenario of the last one.
         cpu_times: gets the CPU time as "judging".
@@ -150,9 +148,6 @@ def blind_spots(entries: Iterable[CoverageEntry]) -> list[str]:
     and balls separately on the first body and on later ones. It counts as seen where its value is not zero
     and a mistake relative to that value is reported: an engine that ignores drag is right wherever there is
     none.
-
-    Args:
-        entries: of a whole catalogue.
 
     Returns:
         Sentences; empty where every parameter is seen at every level, or has a proof wherever it is not.

@@ -118,7 +118,6 @@ def drift_errors(model: Model, run: BatchIntegrationResult) -> dict[str, Array]:
 
     Args:
         model: a chain of rods and balls.
-        run: T samples of its motion.
 
     Returns:
         (T,) each: "gap" [m], "gap_rate" [m/s], "norm" |‖p‖ − 1|, and "energy" |E − E(0)| over Σ m g (reach

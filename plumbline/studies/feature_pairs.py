@@ -56,9 +56,6 @@ def legal_pairs(size: int = EXAMPLE_PLACES) -> set[Pair]:
         size: the places are taken in groups of so many, and each two groups stand in one example; free bodies
             by themselves, as one alone on the world excludes others.
 
-    Returns:
-        The pairs.
-
     """
     places = sorted(legal_places(), key=lambda place: (place.kind != "free", place.role != "single"))
     free = sum(place.kind == "free" for place in places)
@@ -153,10 +150,6 @@ def count_triples(
     mechanisms: Iterable[Sequence[Feature]], earlier: Iterable[Sequence[Feature]]
 ) -> tuple[int, int]:
     """Count triples of features that stand together in a mechanism.
-
-    Args:
-        mechanisms: the features of each.
-        earlier: the features of each mechanism of before.
 
     Returns:
         The number of triples, and of those among them that stood together in none of before.

@@ -64,10 +64,8 @@ def run(
     """Run and judge all cells of a sweep.
 
     Args:
-        sweep: the sweep's file.
         cells: its cells, from `plumbline.studies.sweep_file.load`.
         workers: run the reference, the truths and the engines.
-        engines: description of each engine of the sweep.
         progress: called after every task with tasks done, tasks in all and the task's name.
 
     Returns:

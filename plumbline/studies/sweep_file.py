@@ -82,9 +82,6 @@ class Axis(SchemaModel):
     def sample(self, rng: np.random.Generator) -> float:
         """Draw one value of the distribution.
 
-        Args:
-            rng: source of random numbers.
-
         Returns:
             The value, in the field's unit.
 
@@ -155,7 +152,6 @@ def load(
     """Read a sweep file and make its cells.
 
     Args:
-        path: the file.
         progress: called now and then with cells made and cells in all: a hundred thousand take minutes.
 
     Returns:
@@ -236,7 +232,6 @@ def check_integrators(path: Path, sweep: Sweep, engines: Mapping[str, EngineInfo
     """Check that each engine has the integrator that the file names for it.
 
     Args:
-        path: the file.
         sweep: its content.
         engines: description of each of its engines; one that is missing is not checked.
 

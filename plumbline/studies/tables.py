@@ -16,10 +16,6 @@ def make_table(records: list[dict[str, Any]], schema: pa.Schema) -> pa.Table:
 
     Args:
         records: one dictionary per row, by column; missing columns are null.
-        schema: columns and their types.
-
-    Returns:
-        The table.
 
     """
     return pa.Table.from_pylist([to_json_value(record) for record in records], schema=schema)
@@ -29,7 +25,6 @@ def write_table(table: pa.Table, path: Path) -> Path:
     """Write a table as Parquet, as a whole or not at all.
 
     Args:
-        table: what to write.
         path: the file, in an existing folder.
 
     Returns:

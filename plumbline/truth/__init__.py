@@ -21,12 +21,6 @@ class TruthUnavailable(PlumblineError, ImportError):
 def import_truth_tool(module: str) -> Any:
     """Import an optional module.
 
-    Args:
-        module: its full name.
-
-    Returns:
-        The module.
-
     Raises:
         TruthUnavailable: it is not installed.
 

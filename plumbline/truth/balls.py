@@ -48,9 +48,6 @@ class BallVectors:
     def cross_matrix(self, a: Any) -> Any:
         """ã: ã b = a × b.
 
-        Args:
-            a: a vector.
-
         Returns:
             A 3×3 matrix.
 
@@ -60,16 +57,7 @@ class BallVectors:
 
     @staticmethod
     def dot(a: Any, b: Any) -> Any:
-        """aᵀb.
-
-        Args:
-            a: a vector.
-            b: a vector.
-
-        Returns:
-            A ball.
-
-        """
+        """aᵀb."""
         return a[0, 0] * b[0, 0] + a[1, 0] * b[1, 0] + a[2, 0] * b[2, 0]
 
     def rotation(self, p: Array) -> Any:
@@ -110,9 +98,6 @@ def entries(v: Any) -> list[Any]:
     Args:
         v: an ``arb_mat`` (m, 1).
 
-    Returns:
-        Its m entries.
-
     """
     return list(v.entries())
 
@@ -122,9 +107,6 @@ def flatten(ball: list[Any]) -> list[Any]:
 
     Args:
         ball: balls, or lists of them.
-
-    Returns:
-        All balls.
 
     """
     return [x for row in ball for x in row] if isinstance(ball[0], list) else ball
@@ -157,7 +139,6 @@ def term_scales(
     Radii are compared with them, because a quantity itself may be zero.
 
     Args:
-        model: the mechanism.
         balls: entries of each quantity, by name.
         lever: largest distance of a body from the world's origin [m].
         rate: largest rate of rotation [rad/s].
@@ -200,7 +181,6 @@ def tree_quantities(tree: Tree, solution: Solution) -> dict[str, Any]:
 
     Args:
         tree: in balls.
-        solution: its motion.
 
     Returns:
         By quantity, as `plumbline.truth.certified.enclose_quantities`, without mass matrix and scales.
@@ -231,7 +211,6 @@ def quantity_scales(c: Any, balls: dict[str, Any]) -> dict[str, float]:
 
     Args:
         c: the tree.
-        balls: its quantities.
 
     Returns:
         Sizes by quantity.

@@ -48,9 +48,7 @@ def certify_state(
     The precision rises until every radius is below `MAX_RELATIVE_RADIUS` of the quantity's terms.
 
     Args:
-        model: the mechanism.
         state: the state, of which the minimal coordinates are used.
-        mass_matrix: whether to compute the mass matrix too.
         bits: precision to start with; absent: `FIRST_BITS` and `BITS_PER_BODY`.
 
     Returns:
@@ -109,10 +107,8 @@ def enclose_quantities(
     """Enclose every quantity at one precision.
 
     Args:
-        model: the mechanism.
         state: the state, of which the minimal coordinates are used.
         bits: precision of the balls.
-        mass_matrix: whether to compute the mass matrix too.
 
     Returns:
         Balls (python-flint ``arb``) by quantity: N lists of 3 for vectors per body, lists of one for scalars;

@@ -169,8 +169,6 @@ def enclose_loop(flint: Any, model: Model, state: State) -> dict[str, Any]:
     """Enclose every quantity of a mechanism with loops at the working precision.
 
     Args:
-        flint: the module python-flint.
-        model: the mechanism.
         state: near an assembled state.
 
     Returns:

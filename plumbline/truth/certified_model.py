@@ -89,9 +89,6 @@ def rough_quantities(model: NeutralModel, state: CanonicalState) -> ModelQuantit
         model: a tree of bodies.
         state: canonical coordinates and velocities of its joints.
 
-    Returns:
-        Poses and mass matrix.
-
     Raises:
         TruthUnavailable: python-flint is not installed.
 

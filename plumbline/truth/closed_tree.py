@@ -52,7 +52,6 @@ class ClosedTree(LinkTree):
         """Set up the links.
 
         Args:
-            model: the mechanism.
             method: the declared coordinates, and its correction of gaps.
             states: B states, of loops closed or nearly.
             angle_axes: as of `LinkTree`.
@@ -69,8 +68,6 @@ class ClosedTree(LinkTree):
         """Return M v̇: the generalised forces, and those that hold the loops closed.
 
         Args:
-            q: coordinates.
-            pose: of the links there.
             v: (..., nv).
 
         Returns:
@@ -119,7 +116,6 @@ class ClosedTree(LinkTree):
         """Return the motion of the mechanism's bodies.
 
         Args:
-            q: coordinates.
             v: (B, nv).
 
         Returns:

@@ -51,8 +51,6 @@ def definition_holds(flint: Any, model: Model, state: State, balls: dict[str, An
     """Check a solution at the working precision.
 
     Args:
-        flint: the module python-flint.
-        model: the mechanism.
         state: the state, of which the minimal coordinates are used.
         balls: the solution, as `plumbline.truth.certified.enclose_quantities` returns it.
 

@@ -55,8 +55,6 @@ def joint_elements(model: Model, state: State, bends: list[Array]) -> list[Joint
     """List the elements of all joints.
 
     Args:
-        model: the mechanism.
-        state: a state of it.
         bends: per joint the relative acceleration (6,) that velocities alone cause.
 
     Returns:
@@ -125,10 +123,6 @@ def _coordinates(
 
 def spring_terms(model: Model, state: State) -> SpringTerms:
     """Sum the springs between points over the bodies.
-
-    Args:
-        model: the mechanism.
-        state: a state of it.
 
     Returns:
         Their forces and the sizes of what is rounded in them.

@@ -57,9 +57,6 @@ def load_checker() -> Any:
 def reason_not_provable(model: Model) -> str:
     """Say why motions of a mechanism cannot be proved.
 
-    Args:
-        model: the mechanism.
-
     Returns:
         A sentence; empty where they can.
 
@@ -80,11 +77,9 @@ def prove_motion(
     """Find a candidate and prove it; where it is rejected, try shorter steps and octuple precision.
 
     Args:
-        model: the mechanism.
         state: initial state, of which the minimal coordinates are used.
         times: (T,) [s] of the samples, ascending from 0 on.
         scenario: content hash of the scenario, written to the certificate.
-        precision: of the first candidate.
         on_step: called after each proved step with the numbers of proved steps and of all.
 
     Returns:
@@ -123,11 +118,9 @@ def make_certificate(
     """Write a candidate motion as a certificate, without proving it.
 
     Args:
-        model: the mechanism.
         state: initial state, of which the minimal coordinates are used.
         times: (T,) [s] of the samples, ascending from 0 on.
         scenario: content hash of the scenario.
-        precision: of the candidate.
         max_step: longest step, in the certificate's unit of time.
 
     Returns:
@@ -156,9 +149,6 @@ def make_certificate(
 def checked_topology(model: Model) -> dict[str, Any]:
     """Return the integers and names of a certificate.
 
-    Args:
-        model: the mechanism.
-
     Returns:
         The kinds of the joints, their far bodies, and the pairs of bodies of springs.
 
@@ -168,10 +158,6 @@ def checked_topology(model: Model) -> dict[str, Any]:
 
 def checked_numbers(model: Model, state: State) -> dict[str, Array]:
     """Return the numbers of a certificate by the checker's names: the one place that knows both records.
-
-    Args:
-        model: the mechanism.
-        state: its initial state.
 
     Returns:
         Arrays of doubles as ``SHAPES`` of `enclosure_file` lists them.
@@ -194,10 +180,6 @@ def checked_numbers(model: Model, state: State) -> dict[str, Array]:
 
 def numbers_digest(model: Model, state: State) -> str:
     """Identify what a proof is about: the mechanism and its initial state, whatever they are called.
-
-    Args:
-        model: the mechanism.
-        state: its initial state.
 
     Returns:
         The digest that `certificate_digest` gives of certificates with exactly these numbers.
@@ -226,16 +208,7 @@ def _digest(topology: dict[str, Any], numbers: dict[str, Array]) -> str:
 
 
 def time_exponent(model: Model, state: State) -> int:
-    """Choose the unit of time 2**exponent s, in which the rates of the motion are about 1.
-
-    Args:
-        model: the mechanism.
-        state: its initial state.
-
-    Returns:
-        The exponent.
-
-    """
+    """Choose the unit of time 2**exponent s, in which the rates of the motion are about 1."""
     levers = np.linalg.norm(model.point[:, 1], axis=1) + model.length
     lever = float(np.min(levers, where=levers > 0, initial=np.inf))
     swing = math.sqrt(float(np.linalg.norm(model.gravity)) / lever)

@@ -476,9 +476,6 @@ def enclose_motion(certificate: Certificate, on_step: Callable[..., Any] = lambd
         certificate: candidate motion, model and initial state.
         on_step: called after each step with the numbers of proved steps and of all.
 
-    Returns:
-        Balls at every sample time.
-
     Raises:
         Rejected: an inequality does not hold.
 

@@ -79,7 +79,6 @@ def state_truth(model: Model, states: Sequence[State]) -> StateTruth:
     """Compute true state quantities and their rounding bounds.
 
     Args:
-        model: the mechanism.
         states: S states on the constraint manifold.
 
     Returns:
@@ -113,8 +112,6 @@ def motion_truth(
     """Compute the true motion, the growth of perturbations and the effects of small parameter errors.
 
     Args:
-        model: the mechanism.
-        state: initial state.
         times: (T,) [s] of the samples, times[0] = 0.
         closed_form: samples of a closed form at ``times``, if the scenario has one.
         max_compiled_bodies: longest chain for Taylor's method, None for `MAX_COMPILED_BODIES` of
@@ -188,9 +185,6 @@ def singular_note(end: float) -> str:
     Args:
         end: time [s] up to which the motion is regular.
 
-    Returns:
-        The sentence.
-
     """
     return (
         f"singular: from t = {end:.4g} s on the smallest singular value of the rows that close the "
@@ -200,9 +194,6 @@ def singular_note(end: float) -> str:
 
 def stretched_length(model: Model) -> Array:
     """Measure how far each body and its rod extend the stretched mechanism.
-
-    Args:
-        model: the mechanism.
 
     Returns:
         (N,) [m] rod length, and the far point's distance from the world's origin where the joint is on the
@@ -227,10 +218,6 @@ def perturbed_models(model: Model, state: State) -> list[tuple[Model, State]]:
     Gravity, the masses, the inertias and the attachment points are changed in turn, each entry by ±1e-4 of
     itself with random signs (gravity as a whole; the points of mechanisms with loops too, which could not
     move otherwise where rows depend on others).
-
-    Args:
-        model: the mechanism.
-        state: its initial state.
 
     Returns:
         Four models, each with the state of the same minimal coordinates.
@@ -278,7 +265,6 @@ def detectable_effect(model: Model, runs: Sequence[Trajectory]) -> dict[str, Arr
     ignored.
 
     Args:
-        model: the mechanism.
         runs: the true motion, then those of K perturbed models.
 
     Returns:

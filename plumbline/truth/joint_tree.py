@@ -28,9 +28,6 @@ class JointTree(BallVectors):
     def spatial_inertia(self, k: int) -> Any:
         """Return the inertia of a body about the world's origin: twist → momentum, angular part first.
 
-        Args:
-            k: the body.
-
         Returns:
             A 6×6 matrix.
 
@@ -59,9 +56,6 @@ class JointTree(BallVectors):
 
     def subtree_sums(self, wrenches: list[Any]) -> list[Any]:
         """Sum over each body and all bodies beyond it.
-
-        Args:
-            wrenches: one matrix per body.
 
         Returns:
             One sum per body.

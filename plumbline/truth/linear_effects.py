@@ -62,7 +62,6 @@ class ChangedModels:
         """Join the models.
 
         Args:
-            model: the mechanism.
             changed: K models with its joints.
 
         """
@@ -76,7 +75,6 @@ class ChangedModels:
         """Return the state quantities to first order.
 
         Args:
-            base: a state of the mechanism.
             states: of the K models, (K, N, ·) arrays: the same, or nearly the same, minimal coordinates.
 
         Returns:

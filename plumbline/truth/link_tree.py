@@ -96,9 +96,6 @@ class LinkTree:
         """Set up the links.
 
         Args:
-            model: the mechanism.
-            method: the declared coordinates.
-            states: B states.
             angle_axes: for "joint angles", the axes (angles, 3) of the turns of balls and rods at each state.
 
         """
@@ -300,11 +297,7 @@ class LinkTree:
         """Displace the coordinates.
 
         Args:
-            q: coordinates.
             displacement: (..., nv), joint by joint: rotation vectors, twists, numbers.
-
-        Returns:
-            The coordinates reached.
 
         """
         moved = []
@@ -373,9 +366,6 @@ class LinkTree:
     def pose(self, q: list[Array]) -> Pose:
         """Place the links.
 
-        Args:
-            q: coordinates.
-
         Returns:
             Their attitudes, points, and the motions of all joints.
 
@@ -411,7 +401,6 @@ class LinkTree:
         """Return the links' twists and what velocities alone add to their rates, (..., 6) each.
 
         Args:
-            pose: of the links.
             v: (..., nv).
 
         Returns:
@@ -429,15 +418,7 @@ class LinkTree:
         return twist, bias
 
     def mass_matrix(self, pose: Pose) -> Array:
-        """Return M (..., nv, nv), rotors included.
-
-        Args:
-            pose: of the links.
-
-        Returns:
-            The matrix.
-
-        """
+        """Return M (..., nv, nv), rotors included."""
         S = pose.S
         M = np.zeros((*S.shape[:-1], self.nv), LongDouble)
         total = self._inertias(pose).copy()
@@ -472,13 +453,8 @@ class LinkTree:
         """Return f (..., nv), or those parts of it that depend on v by drag and dampers.
 
         Args:
-            q: coordinates.
-            pose: of the links there.
             v: (..., nv).
             forces: "all", "applied" (drag and dampers), or "joint dampers".
-
-        Returns:
-            The generalised forces.
 
         """
         f: Array = -self.damping * v
@@ -508,8 +484,6 @@ class LinkTree:
         """Return M v̇.
 
         Args:
-            q: coordinates.
-            pose: of the links there.
             v: (..., nv).
 
         Returns:
@@ -567,7 +541,6 @@ class LinkTree:
         """Return v̇.
 
         Args:
-            q: coordinates.
             v: (..., nv).
 
         Returns:
@@ -583,10 +556,8 @@ class LinkTree:
         In "applied" forces, free bodies on which nothing moves have the derivatives of all.
 
         Args:
-            q: coordinates.
             v: (B, nv).
             h: (B, 1) [s].
-            forces: those in D.
 
         Returns:
             (B, nv).
@@ -646,7 +617,6 @@ class LinkTree:
         """Return the motion of the bodies.
 
         Args:
-            q: coordinates.
             v: (B, nv).
 
         Returns:

@@ -36,13 +36,8 @@ def model_states(
 
     Args:
         model: whose joints.
-        count: how many states.
-        seed: of the random numbers.
         at: coordinates of hinges and slides by name, instead of random states; the others are at their
             reference and nothing moves.
-
-    Returns:
-        Canonical states.
 
     """
     if at is not None:
@@ -106,7 +101,6 @@ def with_names_of(model: NeutralModel, reading: NeutralModel) -> NeutralModel:
 
     Args:
         model: the neutral model, whose parts are called "<joint>/x", "<joint>/y" and "<joint>/angle".
-        reading: of an importer.
 
     Returns:
         The reading with the model's names where the kinds of the parts are the same; else unchanged.
@@ -126,10 +120,6 @@ def with_names_of(model: NeutralModel, reading: NeutralModel) -> NeutralModel:
 
 def joint_permutation(model: NeutralModel, reading: NeutralModel) -> list[int] | None:
     """Find the velocities of a model among those of an importer's reading.
-
-    Args:
-        model: the neutral model.
-        reading: of an importer.
 
     Returns:
         For each velocity of the model its index in the reading; None where the joints differ in name or kind.
@@ -172,8 +162,6 @@ def mismatches(
     """Find the worst entry of every quantity that both sides have.
 
     Args:
-        model: the certified model.
-        truths: its quantities at each state.
         answers: an importer's at the same states, in the model's order.
 
     Returns:
@@ -220,10 +208,6 @@ def mismatches(
 
 def certify_states(model: NeutralModel, states: Sequence[CanonicalState]) -> list[CertifiedModelQuantities]:
     """Certify a model at several states.
-
-    Args:
-        model: a neutral model.
-        states: its canonical states.
 
     Returns:
         One record per state.

@@ -22,11 +22,8 @@ def simulate_notes_form(
     on fifty, the raw form by 7e-13 m and 2e-12 m at any tolerance, because it drifts.
 
     Args:
-        model: the mechanism.
-        state: initial state.
         times: (T,) [s] of the samples, times[0] = 0.
         rtol: relative tolerance.
-        method: the integrator.
 
     Returns:
         The motion at ``times``.

@@ -77,7 +77,6 @@ class StateSensitivity:
         """Solve the equations at the state.
 
         Args:
-            model: the mechanism.
             state: a state on the constraint manifold.
 
         """
@@ -251,7 +250,6 @@ def effects_at_states(
 
     Args:
         model: the mechanism, a tree.
-        states: S states of it.
         parameters: P parameters of the model, not of the state.
 
     Returns:
@@ -338,9 +336,6 @@ def _perturbed(
 def stack_states(states: Sequence[State]) -> State:
     """Put states into one, of arrays with a leading axis.
 
-    Args:
-        states: S states of as many bodies.
-
     Returns:
         The states, (S, ...) arrays.
 
@@ -394,8 +389,6 @@ def evaluate_to_first_order(
     """Evaluate all state quantities of changed models of one mechanism with loops.
 
     Args:
-        model: the mechanism.
-        states: S states of it.
         cases: changed mechanisms, each with its S states of `stack_states`.
 
     Returns:
@@ -458,9 +451,7 @@ def accurate_motion(model: Model, state: State, times: Array, substeps: int) -> 
 
     Args:
         model: the mechanism, without loops.
-        state: its initial state.
         times: (T,) sample times [s], equally spaced.
-        substeps: Runge-Kutta steps between two samples.
 
     Returns:
         The motion. A steady motion stays as steady as it can.
@@ -511,7 +502,6 @@ def resolved_motions(
 
     Args:
         model: the mechanism, without loops.
-        state: its initial state.
         times: (T,) sample times [s], equally spaced.
         parameters: mistakes in some of them are tried.
 
@@ -551,7 +541,6 @@ def perturbed_motions(
     Args:
         motion: without mistakes.
         parameters: of `list_parameters`.
-        mistake: the fraction.
 
     Yields:
         The motions, in the order of the parameters.

@@ -67,10 +67,6 @@ def list_parameters(model: Model, state: State) -> list[Parameter]:
     The distal point of the last body of a chain is no parameter, because nothing hangs there.  Attitudes and
     directions of rods count as small rotations: about the body's axes, and about two axes across the rod.
 
-    Args:
-        model: the mechanism.
-        state: its initial state.
-
     Returns:
         Gravity's components, then body by body its model parameters, those of its joint and its initial
         state; those of joints that close loops; then those of springs.
@@ -206,7 +202,6 @@ def perturb(model: Model, state: State, parameter: Parameter, size: float) -> tu
     """Change one parameter.
 
     Args:
-        model: the mechanism.
         state: a state of it, of which the minimal coordinates count.
         parameter: of `list_parameters` for this model.
         size: the change, as a fraction of the parameter's scale.
@@ -226,12 +221,8 @@ def perturb_model(model: Model, parameter: Parameter, size: float) -> Model:
     """Change one parameter of a model.
 
     Args:
-        model: the mechanism.
         parameter: of `list_parameters` for this model, not of the state.
         size: the change, as a fraction of the parameter's scale.
-
-    Returns:
-        The changed model.
 
     """
     kind, k, change = parameter.kind, parameter.body, size * parameter.scale

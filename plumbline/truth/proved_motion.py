@@ -52,9 +52,6 @@ class ProvedMotion:
 def round_enclosure(enclosure: Enclosure) -> ProvedMotion:
     """Round an enclosure to doubles.
 
-    Args:
-        enclosure: what a certificate proves.
-
     Returns:
         The motion with its error bounds.
 
@@ -84,9 +81,7 @@ def store_proof(model: Model, state: State, times: Array, proof: ProvedMotion) -
 
     Args:
         model: the mechanism that it is proved for.
-        state: its initial state.
         times: (T,) [s] of the samples.
-        proof: the motion.
 
     Returns:
         Why it is not kept; empty where it is.
@@ -105,8 +100,6 @@ def find_proof(model: Model, state: State, times: Array) -> ProvedMotion | None:
     """Read the proved motion of a model, if there is one by the present checker.
 
     Args:
-        model: the mechanism.
-        state: its initial state.
         times: (T,) [s] of the samples.
 
     Returns:

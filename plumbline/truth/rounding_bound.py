@@ -108,7 +108,6 @@ def remembered_rounding_bound(model: Model, state: State) -> RoundingBound:
     """Compute the bound of `state_rounding_bound`, or return that of an earlier call with the same numbers.
 
     Args:
-        model: the mechanism.
         state: the state at which quantities are compared.
 
     Returns:
@@ -300,7 +299,6 @@ class NewtonEulerSystem:
         """Assemble, invert and solve the system.
 
         Args:
-            model: the mechanism.
             state: a state on the constraint manifold.
 
         """

@@ -439,7 +439,6 @@ def tree_solution(
 
     Args:
         model: the mechanism; masses > 0, inertias positive definite.
-        state: a state of it.
         ends: pairs of bodies that are joined besides, parts of one body.
         rows: changes what joints hold, as a defect does: of joint k the directions E (6, c) and the relative
             acceleration (6,) that velocities cause.

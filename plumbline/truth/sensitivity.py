@@ -78,8 +78,6 @@ def perturbation_growth(model: Model, state: State, times: Array) -> Array:
     of attitudes over the size itself, whichever is larger.
 
     Args:
-        model: the mechanism.
-        state: initial state.
         times: (T,) [s] of the samples.
 
     Returns:
@@ -95,8 +93,6 @@ def perturbation_growth_and_runs(
     """Compute the growth of small perturbations, and motions of other models in the same batch.
 
     Args:
-        model: the mechanism.
-        state: initial state.
         times: (T,) [s] of the samples.
         other_models: K models of as many bodies, with their initial states.
 
@@ -143,11 +139,8 @@ def perturbed_states(
     """Create neighbours of a state on the constraint manifold, with normally distributed perturbations.
 
     Args:
-        model: the mechanism.
-        state: the state to perturb.
         perturbation_size: standard deviation of each angle [rad], and of each rate relative to the largest
             rate of the state (or 1 rad/s).
-        count: number of neighbours.
 
     Returns:
         The neighbours, always the same for the same arguments.
@@ -191,14 +184,10 @@ def project_to_manifold(model: Model, r: Array, p: Array, v: Array, pdot: Array)
     and joint coordinates are not computed.
 
     Args:
-        model: the mechanism.
         r: (N, 3) centres of mass [m], world frame.
         p: (N, 4) quaternions, normalised here.
         v: (N, 3) ṙ [m/s].
         pdot: (N, 4) ṗ [1/s].
-
-    Returns:
-        The state.
 
     """
     if not model.is_chain:

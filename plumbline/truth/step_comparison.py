@@ -69,9 +69,6 @@ Runs = Sequence[tuple[int, float, StepRun]]  # index of the state, step [s], ste
 def step_counts(method: StepMethod | None) -> tuple[int, ...]:
     """Choose after how many steps engine and formula are compared.
 
-    Args:
-        method: the declared formula.
-
     Returns:
         Counts, ascending; few where each step is compared with the one before.
 
@@ -114,7 +111,6 @@ class Comparisons:
             errors: (K,) sizes of differences.
             bounds: (K,) what rounding explains, in the same unit.
             effects: (K,) effect of the accelerations on the quantity.
-            place: state and steps.
 
         """
         for k, (error, bound, effect) in enumerate(zip(errors, bounds, effects, strict=True)):
@@ -141,9 +137,6 @@ class FormulaSteps:
         """Take the steps.
 
         Args:
-            method: the declared formula.
-            model: the pendulum.
-            states: states of it.
             starts: of each run the index of its state, the step [s], and the axes of revolute joints or None.
             counts: numbers of steps that are compared, ascending; empty for `step_counts`.
 
@@ -265,7 +258,6 @@ class FormulaSteps:
             ends: the states at the ends of the steps.
             bounds: rounding bounds at ``ends``.
             h: step [s].
-            count: number of steps.
 
         Returns:
             By quantity the bounds (N,), in its unit of `STEP_UNITS`.
@@ -420,10 +412,7 @@ def compare_parts(
     """Compare an iterative engine's steps in parts that need no iteration.
 
     Args:
-        method: the declared formula.
-        model: the pendulum.
         states: states that the steps start from.
-        runs: the engine's steps.
 
     Returns:
         The differences by quantity: quadrature, equations, first acceleration.
@@ -467,7 +456,6 @@ def quadrature_residuals(method: ConstrainedMethod, runs: Runs, has_loops: bool)
 
     Args:
         method: a formula, declared or not.
-        runs: the engine's steps.
         has_loops: whether they are of a mechanism with loops.
 
     Returns:

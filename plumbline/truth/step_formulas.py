@@ -39,11 +39,7 @@ def joint_space_steps(
     """Take steps of a declared method from each state.
 
     Args:
-        model: the mechanism.
-        states: B initial states.
         steps: the step [s] from each.
-        method: the declared formula.
-        count: how many steps.
         angle_axes: for "joint angles", the axes (angles, 3) of the revolute joints at each state.
 
     Returns:
@@ -68,8 +64,6 @@ def fastest_rates(model: Model, states: Sequence[State], iterations: int = 12) -
     """Estimate the spectral radius of the linearised equations of motion by power iteration.
 
     Args:
-        model: the mechanism.
-        states: B states.
         iterations: how many; the growth over the second half counts.
 
     Returns:
@@ -174,7 +168,6 @@ def constrained_quadrature(method: ConstrainedMethod, run: StepRun, h: float) ->
     """Predict q₁ and q̇₁ of every step from the engine's own q̈ and its coordinates before the step.
 
     Args:
-        method: the declared formula.
         run: T samples of consecutive steps with accelerations.
         h: step [s].
 
@@ -228,7 +221,6 @@ def constrained_residual(model: Model, method: ConstrainedMethod, run: StepRun) 
     f = −Gᵀ(ω′ × Jω′), a point's rows are [1, −A s̃ G], moments enter as (2E(p))ᵀ (A n′ − c_r A ω′).
 
     Args:
-        model: the mechanism.
         method: whose constraint level and coordinates these are.
         run: T samples with accelerations and multipliers.
 
@@ -293,10 +285,6 @@ def constrained_residual(model: Model, method: ConstrainedMethod, run: StepRun) 
 
 def first_coordinate_acceleration(model: Model, state: State) -> Array:
     """Compute q̈ of q = (r, p) at a state, p̈ = ½ L(p)ᵀ ω̇′ + ½ L(ṗ)ᵀ ω′.
-
-    Args:
-        model: the mechanism.
-        state: a state of it.
 
     Returns:
         (N, 7) m/s² and 1/s², extended precision.

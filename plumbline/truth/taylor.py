@@ -53,10 +53,8 @@ def simulate_taylor(
     """Integrate the motion from a state.
 
     Args:
-        model: the mechanism.
         state: initial state, of which the minimal coordinates are used, normalised in that precision.
         times: (T,) [s] of the samples, times[0] = 0.
-        precision: number type of the integration.
 
     Returns:
         The motion at ``times``.
@@ -97,9 +95,7 @@ def taylor_series(
     """Expand the motion in Taylor series, each around the values that the caller sends.
 
     Args:
-        model: the mechanism.
         state: initial state, of which the minimal coordinates are used.
-        order: of the series.
         precision: "quad" or "octuple".
 
     Yields:
@@ -148,9 +144,6 @@ def load_heyoka() -> Any:
     """Import heyoka without SymPy, which it would load for conversions that are not used here (2 s).
 
     One thread, as in every worker; no cache of heyoka's own on disk: `_compiled_integrator` has one.
-
-    Returns:
-        The module.
 
     Raises:
         TruthUnavailable: heyoka is not installed.

@@ -47,9 +47,6 @@ class Topology(NamedTuple):
 def topology(model: Model) -> Topology:
     """Return the topology of a model.
 
-    Args:
-        model: the mechanism.
-
     Returns:
         Kinds of joints, far bodies, and what elements there are.
 
@@ -67,7 +64,6 @@ def closures(cut: CutMechanism, state: State) -> tuple[Closure, ...]:
     """Choose rows that close the loops and do not depend on others.
 
     Args:
-        cut: the mechanism cut open.
         state: of its tree, the ends together.
 
     Returns:
@@ -87,9 +83,6 @@ def closures(cut: CutMechanism, state: State) -> tuple[Closure, ...]:
 def coordinate_names(kind: Kind) -> list[tuple[str, int]]:
     """List the coordinates of a joint in the order of the equations.
 
-    Args:
-        kind: of the joint.
-
     Returns:
         Names of fields of `State`, with the number of components each.
 
@@ -103,11 +96,6 @@ def coordinate_names(kind: Kind) -> list[tuple[str, int]]:
 
 def initial_values(mp: Any, model: Model, state: State) -> list[Any]:
     """Return the coordinates at a state, quaternions and directions normalised.
-
-    Args:
-        mp: the module mpmath.
-        model: the mechanism.
-        state: a state of it.
 
     Returns:
         Numbers of mpmath in the order of `equations_of_motion`.
@@ -161,10 +149,6 @@ def _unit_rotation(mp: Any, q: Iterable[Any]) -> Any:
 def parameter_values(mp: Any, model: Model) -> list[Any]:
     """Return the numbers of the model in the order of `_Body`: gravity, then per body.
 
-    Args:
-        mp: the module mpmath.
-        model: the mechanism.
-
     Returns:
         Numbers of mpmath or Python.
 
@@ -185,10 +169,6 @@ def parameter_values(mp: Any, model: Model) -> list[Any]:
 
 def equations_of_motion(hy: Any, tree: Topology) -> list[tuple[Any, Any]]:
     """Write the equations of a tree.
-
-    Args:
-        hy: the module heyoka.
-        tree: its topology.
 
     Returns:
         Pairs (coordinate, its rate).
@@ -518,9 +498,6 @@ def vector(entries: Iterable[Any]) -> Any:
 
     Args:
         entries: expressions, numbers or arrays.
-
-    Returns:
-        The array.
 
     """
     return np.fromiter(entries, dtype=object)

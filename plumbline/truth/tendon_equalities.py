@@ -32,7 +32,6 @@ def effects_of_missing_terms(model: Model, state: State) -> dict[str, Array]:
 
     Args:
         model: a mechanism with rods.
-        state: a state of it.
 
     Returns:
         By name of the quantity (N, 3) or, of joints, (J, 3); of wrenches in loops the determinate parts.

@@ -59,8 +59,6 @@ def trajectory_truth(
     equations takes its place: another integrator but the same equations, and ``method`` states that.
 
     Args:
-        model: the mechanism.
-        state: initial state.
         times: (T,) [s] of the samples, times[0] = 0.
         closed_form: samples of a closed form at ``times``; they replace r and p of the result; velocities
             remain those of the first method, uncertain by the difference between the two.
@@ -106,8 +104,6 @@ def prove_and_judge_claim(
     """Prove a motion, and compare the error of the truth by two methods with the uncertainty that it claims.
 
     Args:
-        model: the mechanism.
-        state: initial state.
         times: (T,) [s] of the samples, times[0] = 0.
         closed_form: as for `trajectory_truth`.
 
@@ -130,10 +126,7 @@ def judge_claim(
     """Compare the error of the truth by two methods with the uncertainty that it claims.
 
     Args:
-        model: the mechanism.
-        state: initial state.
         times: (T,) [s] of the samples, times[0] = 0.
-        enclosure: of the motion.
         closed_form: as for `trajectory_truth`.
 
     Returns:

@@ -173,9 +173,6 @@ class StructuredSystem:
     def repeated(self, count: int) -> StructuredSystem:
         """Repeat the chains: all of them, then all again.
 
-        Args:
-            count: how many times.
-
         Returns:
             A system of ``count`` times as many chains.
 

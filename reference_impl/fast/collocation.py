@@ -94,9 +94,6 @@ class GaussTables:
 def gauss_tables(S: int) -> GaussTables:
     """Compute the tables of Gauss–Legendre collocation.
 
-    Args:
-        S: number of nodes.
-
     Returns:
         The tables, the same object at every call.
 

@@ -77,7 +77,6 @@ class TreeSystem:
         """Join the mechanisms.
 
         Args:
-            chains: the mechanisms.
             x: joint coordinates (joints, 2) near which the angles of springs are taken [rad]; absent:
                 principal values.
 
@@ -117,9 +116,6 @@ class TreeSystem:
 
     def repeated(self, count: int) -> TreeSystem:
         """Repeat the trees: all of them, then all again.
-
-        Args:
-            count: how many times.
 
         Returns:
             A system of ``count`` times as many trees.
@@ -382,9 +378,6 @@ def eliminated_system(mechanisms: Sequence[Mechanism], x: Array | None = None) -
 
 def eliminated_acceleration(chain: Mechanism) -> Acceleration:
     """Return the right-hand side of the eliminated form, which takes less time on long chains.
-
-    Args:
-        chain: the mechanism.
 
     Returns:
         r̈ and p̈ (7 N,) as a function of r, p, ṙ, ṗ.

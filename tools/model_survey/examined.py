@@ -29,12 +29,7 @@ class Examined:
 
         Args:
             importer: that differs.
-            form: urdf or mjcf.
-            field: parameter of the cause.
             sentence: the file's name and the sentence of the cause.
-
-        Returns:
-            Whether it is.
 
         """
         own = importer, form

@@ -24,9 +24,6 @@ Cause = tuple[str, str, Mapping[str, Any], str]  # importer, format, cause, file
 def format_of(file: str) -> str:
     """Tell the format by the file's name.
 
-    Args:
-        file: path.
-
     Returns:
         urdf or mjcf.
 
@@ -36,9 +33,6 @@ def format_of(file: str) -> str:
 
 def outcomes(document: Mapping[str, Any]) -> Iterator[tuple[str, str, str, str]]:
     """Sum up each file's rows of each importer.
-
-    Args:
-        document: of a survey.
 
     Yields:
         Importer, format, file, one of `OUTCOMES`; nothing where the importer does not read the format.
@@ -66,9 +60,6 @@ def outcomes(document: Mapping[str, Any]) -> Iterator[tuple[str, str, str, str]]
 def causes(document: Mapping[str, Any]) -> Iterator[Cause]:
     """Go through the causes of all files.
 
-    Args:
-        document: of a survey.
-
     Yields:
         Importer, format, cause, file.
 
@@ -82,11 +73,7 @@ def write_page(document: Mapping[str, Any], packages: Mapping[str, str]) -> str:
     """Write the page.
 
     Args:
-        document: of a survey.
         packages: versions of the robots' packages by name.
-
-    Returns:
-        Markdown.
 
     """
     found = list(outcomes(document))

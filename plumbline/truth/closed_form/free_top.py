@@ -26,10 +26,6 @@ def free_top(model: Model, state: State) -> ClosedFormMotion:
 
     Args:
         model: one body, free or with its pivot at the centre of mass.
-        state: the initial state.
-
-    Returns:
-        The exact motion.
 
     Raises:
         ClosedFormMismatch: the scenario is not a free top, or its motion is exactly on the separatrix.

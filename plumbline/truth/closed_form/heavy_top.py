@@ -29,10 +29,6 @@ def lagrange_top(model: Model, state: State) -> ClosedFormMotion:
 
     Args:
         model: one body whose inertia about the pivot is symmetric about the axis to the pivot.
-        state: the initial state.
-
-    Returns:
-        The exact motion.
 
     Raises:
         ClosedFormMismatch: the scenario is not a Lagrange top, or its axis reaches the vertical.
@@ -67,10 +63,6 @@ def spherical_pendulum(model: Model, state: State) -> ClosedFormMotion:
 
     Args:
         model: one body, on either joint.
-        state: the initial state.
-
-    Returns:
-        The exact motion.
 
     Raises:
         ClosedFormMismatch: the scenario is not a spherical pendulum, or it reaches the vertical.

@@ -53,7 +53,6 @@ def require(holds: bool | np.bool_, condition: str) -> None:
     """Refuse a scenario that violates a condition.
 
     Args:
-        holds: whether the scenario fulfils it.
         condition: completes "this closed form needs …".
 
     Raises:
@@ -66,9 +65,6 @@ def require(holds: bool | np.bool_, condition: str) -> None:
 
 def require_gravity_without_loads(model: Model) -> tuple[Array, float]:
     """Check that gravity is the only applied force.
-
-    Args:
-        model: the mechanism of the scenario.
 
     Returns:
         The upward unit vector (3,), world frame, and |g| [m/s²].
@@ -86,9 +82,6 @@ def require_gravity_without_loads(model: Model) -> tuple[Array, float]:
 def require_no_loads(model: Model) -> None:
     """Check that no force, moment or drag is applied.
 
-    Args:
-        model: the mechanism of the scenario.
-
     Raises:
         ClosedFormMismatch: there are loads or drag.
 
@@ -100,7 +93,6 @@ def require_single_body(model: Model, rod: bool) -> None:
     """Check that the mechanism is one body on the right kind of joint.
 
     Args:
-        model: the mechanism of the scenario.
         rod: whether the joint must be a rod; otherwise it must be a ball joint.
 
     Raises:
@@ -113,10 +105,6 @@ def require_single_body(model: Model, rod: bool) -> None:
 
 def require_heavy_body_on_ball(model: Model, state: State) -> tuple[Array, Array, float, float]:
     """Check that the mechanism is one body on a ball joint, driven by gravity alone.
-
-    Args:
-        model: the mechanism of the scenario.
-        state: its initial state.
 
     Returns:
         The body's rotation matrix A (3, 3), the upward unit vector (3,) in the world frame, |g| [m/s²] and

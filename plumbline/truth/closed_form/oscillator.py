@@ -23,10 +23,6 @@ def damped_oscillator(model: Model, state: State) -> ClosedFormMotion:
 
     Args:
         model: one body on a slide or hinge at the world.
-        state: the initial state.
-
-    Returns:
-        The exact motion.
 
     Raises:
         ClosedFormMismatch: the scenario is not a linear oscillator.

@@ -39,10 +39,6 @@ def planar_pendulum(model: Model, state: State) -> ClosedFormMotion:
 
     Args:
         model: one body; on a ball joint its principal axis of rotation is horizontal.
-        state: the initial state.
-
-    Returns:
-        The exact motion.
 
     Raises:
         ClosedFormMismatch: the scenario is not a planar pendulum.

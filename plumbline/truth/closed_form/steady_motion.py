@@ -23,9 +23,6 @@ def steady_rotation(model: Model, state: State) -> ClosedFormMotion:
         model: a chain of any length, moved by gravity alone.
         state: all angular velocities vertical and equal, forces balanced in the rotating frame.
 
-    Returns:
-        The exact motion.
-
     Raises:
         ClosedFormMismatch: the state is not a relative equilibrium.
 
@@ -56,9 +53,6 @@ def equilibrium(model: Model, state: State) -> ClosedFormMotion:
     Args:
         model: a chain of any length without loads.
         state: no velocity, forces and moments balanced.
-
-    Returns:
-        The constant motion.
 
     Raises:
         ClosedFormMismatch: the state moves or is not balanced.
