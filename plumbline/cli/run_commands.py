@@ -91,7 +91,7 @@ def run(
         result = _run_visibly(plan, as_json, fresh)
         save(result, folder, command_line())
         with result.cpu_times.measure("report"):
-            write_scripts(folder)
+            write_scripts(folder, results=cache)
             report = reports.write(folder)
         cache.trim()
     if as_json:

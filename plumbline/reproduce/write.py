@@ -21,7 +21,7 @@ from plumbline.model.datatypes import BadInput, Model, State
 from plumbline.model.kinematics import state_from_minimal
 from plumbline.model.sampling import compared_states
 from plumbline.processes.errors import PlumblineError
-from plumbline.processes.workers import Limits, Task, WorkerPool
+from plumbline.processes.workers import Limits, Outcome, ResultCache, Task, WorkerPool
 from plumbline.reproduce.engine_client import EngineClient
 from plumbline.reproduce.measure import Disagreement
 from plumbline.reproduce.render import LONG_RUN_SUFFIXES, no_script_reason, render_script
@@ -68,7 +68,11 @@ def list_disagreements(folder: Path) -> dict[str, str]:
 
 
 def write_scripts(
-    folder: Path, keys: Sequence[str] | None = None, limits: Limits | None = None, jobs: int | None = None
+    folder: Path,
+    keys: Sequence[str] | None = None,
+    limits: Limits | None = None,
+    jobs: int | None = None,
+    results: ResultCache | None = None,
 ) -> WrittenScripts:
     """Write scripts of rows into the results folder, and list them in scripts/index.json.
 
@@ -78,6 +82,7 @@ def write_scripts(
         keys: the wanted rows; by default all that disagree: less time is spent on each, and scripts of an
             earlier run are removed.
         jobs: number of workers; by default as many as the run had.
+        results: scripts of earlier runs, used where nothing that they depend on has changed.
 
     Returns:
         The files, and for rows without one the reason.
@@ -119,17 +124,36 @@ def write_scripts(
     if not tasks:
         return written
     scripts.mkdir(exist_ok=True)
-    with WorkerPool(min(jobs, len(tasks)), limits) as workers:
-        for outcome in workers.run(tasks):
-            text, reason = outcome.value or ("", outcome.failure)
-            if text:
-                path = scripts / _file_name("/".join(outcome.key))
-                write_atomically(path, text.encode())
-                written.files |= {row["key"]: path for row in wanted[outcome.key]}
-            else:
-                written.reasons |= {row["key"]: reason for row in wanted[outcome.key]}
+    for outcome in _outcomes(tasks, results or ResultCache(), jobs, limits):
+        text, reason = outcome.value or ("", outcome.failure)
+        if text:
+            path = scripts / _file_name("/".join(outcome.key))
+            write_atomically(path, text.encode())
+            written.files |= {row["key"]: path for row in wanted[outcome.key]}
+        else:
+            written.reasons |= {row["key"]: reason for row in wanted[outcome.key]}
     write_script_index(folder, index | {key: path.name for key, path in written.files.items()})
     return written
+
+
+def _outcomes(
+    tasks: Sequence[Task], results: ResultCache, jobs: int, limits: Limits | None
+) -> Iterator[Outcome]:
+    """Take scripts from the cache, and make the others in workers.
+
+    What the environment of another version answers is not in a task's hash, and a script that was not found
+    in time may be found the next time: neither is kept.
+    """
+    kept = {task.key: task for task in tasks if not task.arguments[0].engine.python}
+    found = [outcome for task in kept.values() if (outcome := results.get(task)) is not None]
+    yield from found
+    missing = [task for task in tasks if task.key not in {outcome.key for outcome in found}]
+    if missing:
+        with WorkerPool(min(jobs, len(missing)), limits) as workers:
+            for outcome in workers.run(missing):
+                if outcome.key in kept and outcome.failure is None and outcome.value[0]:
+                    results.put(kept[outcome.key], outcome)
+                yield outcome
 
 
 def make_script(disagreement: Disagreement, row: StoredRow) -> tuple[str, str]:

@@ -9,6 +9,7 @@ from click.testing import CliRunner
 
 from plumbline.cli.main import main
 from plumbline.engines.registry import load_adapter
+from plumbline.execution.result_cache import DiskResultCache
 from plumbline.judging.rows import RowContext
 from plumbline.processes.workers import Outcome
 from plumbline.reproduce import write
@@ -121,6 +122,20 @@ def test_a_lost_worker_leaves_no_script(results):
     assert written.reasons["a"] == "hung" and "relations of runs" in written.reasons["b"]
     assert "the state-level script" in written.reasons["d"] and not written.files
     assert not list((results / "scripts").glob("*.py"))
+
+
+def test_a_script_is_made_again_only_where_its_rows_have_changed(results):
+    cells = DiskResultCache(results / "cells")
+    no_worker = patch("plumbline.reproduce.write.WorkerPool", side_effect=AssertionError("began"))
+    with patch("plumbline.reproduce.write.UNREQUESTED_SECONDS", 0.0):
+        text = write_scripts(results, results=cells).files["a"].read_text(encoding="utf-8")
+        with no_worker:
+            assert write_scripts(results, results=cells).files["a"].read_text(encoding="utf-8") == text
+        document = results_store.read_results(results)
+        document["rows"][0]["engine_version"] = "9.9.9"
+        store(results, document)
+        with no_worker, pytest.raises(AssertionError, match="began"):
+            write_scripts(results, results=cells)
 
 
 def test_at_the_end_of_a_run_nothing_long_is_begun(results):
