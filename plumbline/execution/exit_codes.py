@@ -26,5 +26,6 @@ EXIT_CODE_MEANINGS = {
     ExitCode.ENGINE_FAILED: "an engine failed: raised, crashed, hung, or is missing though it was named",
     ExitCode.MACHINE_FAILED: "the machine failed: disk full, input/output error, cluster lost",
     ExitCode.HARNESS_FAILED: "the harness failed: the truth is in doubt, or an internal error",
-    ExitCode.INTERRUPTED: "interrupted: finished cells are kept, the same command resumes",
+    ExitCode.INTERRUPTED: "interrupted: the same command resumes; finished cells are kept where the result "
+    "cache can be used",
 }
