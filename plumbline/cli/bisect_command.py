@@ -15,15 +15,15 @@ from plumbline.cli.help_texts import EXIT_CODES, examples
 from plumbline.engines.environments import EnvironmentUnavailable, version_problem
 from plumbline.engines.registry import IMPORTERS
 from plumbline.execution.exit_codes import ExitCode
-from plumbline.execution.model_run import ModelPlan
 from plumbline.execution.plan import Plan
-from plumbline.execution.version_search import NoSearch, VersionChange, search_versions
+from plumbline.model_files.model_run import ModelPlan
 from plumbline.processes.workers import Limits
 from plumbline.scenario.errors import did_you_mean, shorten
 from plumbline.scenario.generator import RANDOM_FAMILY, RandomScenarios, random_seed
 from plumbline.scenario.loader import Scenario
 from plumbline.storage.results_store import read_model_results, read_results
 from plumbline.storage.version_changes import add_version_change
+from plumbline.studies.version_search import NoSearch, VersionChange, search_versions
 
 STATES = 3  # of a model file; a reading that differs shows at any
 

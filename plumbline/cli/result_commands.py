@@ -76,7 +76,7 @@ def _history_lines(document: dict[str, Any]) -> list[str]:
 
 def _reproduce_model(folder: Path, keys: tuple[str, ...], form: str | None) -> None:
     """Write scripts of importers' differences, or list the differences."""
-    from plumbline.reproduce.model_script import NoModelScript, stored_differences, write_model_script
+    from plumbline.model_files.model_script import NoModelScript, stored_differences, write_model_script
     from plumbline.storage.results_store import read_model_results, write_atomically
     from plumbline.storage.script_index import script_name, scripts_folder
     from plumbline.storage.version_changes import read_version_changes

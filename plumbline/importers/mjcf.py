@@ -1,6 +1,6 @@
 """MJCF files: includes expanded, unnamed bodies and joints named, and where the file says each number.
 
-MuJoCo defines the format: its compiled model is the neutral reading (`plumbline.importers.model_file`).
+MuJoCo defines the format: its compiled model is the neutral reading (`plumbline.model_files.prepared_file`).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Studies of one scenario: parameter sweeps, and the drift of the reference over long times.
+"""Studies: parameter sweeps, drift of the reference over long times, coverage, the search of versions.
 
-Scenarios go in; tables with one row per cell, or per variant and time, come out as Parquet files.
+Of sweeps and drift, tables with one row per cell, or per variant and time, come out as Parquet files.
 """

@@ -7,8 +7,8 @@ import pytest
 from click.testing import CliRunner
 
 from plumbline.cli.main import main
-from plumbline.execution.model_run import ModelPlan, run_model_files
-from plumbline.judging.model_file import REFUSED
+from plumbline.model_files.model_rows import REFUSED
+from plumbline.model_files.model_run import ModelPlan, run_model_files
 
 ROBOT = """<robot name="arm">
 <link name="base"><inertial><mass value="3"/>

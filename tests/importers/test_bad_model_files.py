@@ -5,8 +5,8 @@ import time
 import numpy as np
 import pytest
 
-from plumbline.importers.model_file import prepare_file
 from plumbline.importers.xml_tree import ModelFileError, parse_xml, write_xml, write_xml_in_place
+from plumbline.model_files.prepared_file import prepare_file
 from tests.helpers.random_robots import random_mjcf, random_urdf
 
 INERTIAL = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'

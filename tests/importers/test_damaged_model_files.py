@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from plumbline.execution.exit_codes import ExitCode
-from plumbline.execution.model_run import ModelPlan, run_model_files
 from plumbline.judging.rows import Verdict
+from plumbline.model_files.model_run import ModelPlan, run_model_files
 from plumbline.processes.workers import Limits
 from tests.helpers.model_mutations import damaged_model, extreme_model, robots
 

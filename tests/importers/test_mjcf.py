@@ -3,8 +3,8 @@
 import pytest
 
 from plumbline.engines.importer_calls import read_model_file
-from plumbline.importers.model_file import package_folder, prepare_file
 from plumbline.importers.xml_tree import ModelFileError
+from plumbline.model_files.prepared_file import package_folder, prepare_file
 
 MAIN = """<mujoco model="m">
 <compiler angle="degree"/>

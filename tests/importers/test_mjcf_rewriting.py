@@ -5,10 +5,10 @@ import pytest
 
 from plumbline.engines.importer_calls import read_model_file
 from plumbline.importers.mjcf_rewriting import rewritings
-from plumbline.importers.model_file import prepare_file
 from plumbline.importers.xml_tree import write_xml
-from plumbline.judging.model_file import rewriting_row
 from plumbline.judging.rows import RowContext
+from plumbline.model_files.model_rows import rewriting_row
+from plumbline.model_files.prepared_file import prepare_file
 from tests.helpers.random_robots import random_mjcf
 
 ROBOT = """<mujoco model="m"><compiler angle="degree" eulerseq="zyX"/>

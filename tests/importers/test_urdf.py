@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 from plumbline.engines.importer_calls import evaluate_model_file, read_model_file
-from plumbline.importers.model_file import prepare_file
 from plumbline.importers.neutral_model import without_passive_forces
-from plumbline.truth.model_comparison import (
+from plumbline.model_files.model_comparison import (
     certify_states,
     joint_permutation,
     mismatches,
     model_states,
     permuted,
 )
+from plumbline.model_files.prepared_file import prepare_file
 from tests.helpers.random_robots import random_urdf
 
 

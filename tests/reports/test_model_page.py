@@ -10,7 +10,7 @@ from xml.sax.saxutils import quoteattr
 import pytest
 
 from plumbline.cli.model_commands import model_document
-from plumbline.execution.model_run import ModelPlan, run_model_files
+from plumbline.model_files.model_run import ModelPlan, run_model_files
 from reports import model_page, robot_drawing
 
 EVIL = "\"><img src=x onerror=alert(1)><script>alert('2')</script>"

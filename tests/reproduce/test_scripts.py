@@ -67,7 +67,7 @@ def test_every_template_renders_to_what_ruff_accepts(engine, tmp_path):
 
 
 def test_every_template_is_used():
-    frame = {"script", "state", "step", "relation", "motion", "invariants", "model", "exudyn-common"}
+    frame = {"script", "state", "step", "relation", "motion", "invariants", "exudyn-common"}
     assert {path.name.removesuffix(".py.j2") for path in TEMPLATES.iterdir()} - frame == {
         name for name in REGISTERED if not no_script_reason(name, {"level": "state", "quantity": "energy"})
     } - {"pinocchio-aba"}

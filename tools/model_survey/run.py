@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from plumbline.cli.model_commands import model_document
-from plumbline.execution.model_run import ModelPlan, run_model_files
 from plumbline.importers.importer import Base
-from plumbline.importers.model_file import prepare_file
 from plumbline.importers.xml_tree import ModelFileError
+from plumbline.model_files.model_run import ModelPlan, run_model_files
+from plumbline.model_files.prepared_file import prepare_file
 from plumbline.processes.isolation import ScratchFolder
 
 STATES = 5  # random states of each file

@@ -1,7 +1,7 @@
 """Model files: each importer's reading and quantities against the certified values of the neutral model.
 
 A quantity agrees where its largest ratio of error and tolerance over all states and entries is at most 1; the
-tolerance is made of the magnitudes of the terms (`plumbline.truth.certified_model`).
+tolerance is made of the magnitudes of the terms (`plumbline.model_files.certified_model`).
 """
 
 from __future__ import annotations
@@ -12,13 +12,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from plumbline.diagnosis.importer_cause import (
-    Cause,
-    Explanation,
-    damping_cause,
-    describe_difference,
-    explain_importer,
-)
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.environments import declared_importer_attribute, split_version
 from plumbline.importers.importer import Reading
@@ -32,9 +25,15 @@ from plumbline.importers.neutral_model import (
 )
 from plumbline.judging.rows import Row, RowContext, Verdict
 from plumbline.model.datatypes import Array
-from plumbline.scenario.errors import shorten
-from plumbline.truth.certified_model import CertifiedModelQuantities
-from plumbline.truth.model_comparison import (
+from plumbline.model_files.certified_model import CertifiedModelQuantities
+from plumbline.model_files.importer_cause import (
+    Cause,
+    Explanation,
+    damping_cause,
+    describe_difference,
+    explain_importer,
+)
+from plumbline.model_files.model_comparison import (
     TINY,
     Mismatch,
     certify_states,
@@ -44,6 +43,7 @@ from plumbline.truth.model_comparison import (
     model_states,
     permuted,
 )
+from plumbline.scenario.errors import shorten
 
 MODEL_FAMILY = "model file"  # of the rows, in place of a scenario's family
 REFUSED = "refused: "  # before an importer's words
@@ -228,7 +228,7 @@ def _quantity_row(context: RowContext, quantity: str, unit: str, worst: Mismatch
     return context.make_row(
         "model", "-", quantity, Verdict.AGREES if agrees else Verdict.DISAGREES, reason, unit,
         value=worst.error, tolerance=worst.tolerance, ratio=worst.ratio,
-        derivation="magnitudes of the terms × rounding (plumbline/truth/certified_model.py)",
+        derivation="magnitudes of the terms × rounding (plumbline/model_files/certified_model.py)",
     )  # fmt: skip
 
 

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from plumbline.diagnosis.importer_cause import Explanation
 from plumbline.engines.environments import importer_interpreter, split_version
 from plumbline.engines.importer_calls import (
     describe_importer,
@@ -24,7 +23,6 @@ from plumbline.engines.importer_calls import (
     run_script,
 )
 from plumbline.importers.importer import Reading
-from plumbline.importers.model_file import BaseChoice, PreparedFile, prepare_file
 from plumbline.importers.neutral_model import (
     CanonicalState,
     ModelQuantities,
@@ -32,14 +30,10 @@ from plumbline.importers.neutral_model import (
     without_passive_forces,
 )
 from plumbline.importers.xml_tree import Element, ModelFileError, write_xml
-from plumbline.judging.model_file import Answer, FileResult, judge_file, state_seed
 from plumbline.judging.rows import Verdict
-from plumbline.processes.errors import PlumblineError
-from plumbline.processes.isolation import ScratchFolder
-from plumbline.processes.workers import Limits, Task, WorkerPool
-from plumbline.reproduce.model_shrink import shrink_tree
-from plumbline.truth.certified_model import CertifiedModelQuantities
-from plumbline.truth.model_comparison import (
+from plumbline.model_files.certified_model import CertifiedModelQuantities
+from plumbline.model_files.importer_cause import Explanation
+from plumbline.model_files.model_comparison import (
     TINY,
     certify_states,
     joint_keys,
@@ -47,6 +41,12 @@ from plumbline.truth.model_comparison import (
     model_states,
     with_names_of,
 )
+from plumbline.model_files.model_rows import Answer, FileResult, judge_file, state_seed
+from plumbline.model_files.prepared_file import BaseChoice, PreparedFile, prepare_file
+from plumbline.model_files.xml_shrink import shrink_tree
+from plumbline.processes.errors import PlumblineError
+from plumbline.processes.isolation import ScratchFolder
+from plumbline.processes.workers import Limits, Task, WorkerPool
 
 FORMS = ("mujoco", "pinocchio", "exudyn", "drake", "dart")
 SHRINKING_SECONDS = 60.0
@@ -299,10 +299,10 @@ def _render(bench: _Bench, form: str, result: FileResult, text: str, since: str,
     why = " ".join([*(f"{title} {phrase}." for phrase in phrases), EXPECTED, since])
     moves = bool(np.any(number.state.velocities))
     environment = Environment(
-        loader=FileSystemLoader(Path(__file__).with_name("templates")),
+        loader=FileSystemLoader(Path(__file__).parent),
         undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True,
     )  # fmt: skip
-    return environment.get_template("model.py.j2").render(
+    return environment.get_template("model_script.py.j2").render(
         form=form,
         format=bench.prepared.file.format,
         is_fixed=bench.prepared.file.base == "fixed",

@@ -11,8 +11,8 @@ from click.testing import CliRunner
 from plumbline.cli.main import main
 from plumbline.engines import environments
 from plumbline.engines.environments import EnvironmentUnavailable, PublishedVersions
-from plumbline.execution import version_search
-from plumbline.execution.version_search import (
+from plumbline.studies import version_search
+from plumbline.studies.version_search import (
     NoSearch,
     VersionAnswer,
     VersionUnusable,

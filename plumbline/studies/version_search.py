@@ -19,11 +19,11 @@ from plumbline.engines.environments import (
     declared_importer_attribute,
     published_versions,
 )
-from plumbline.execution.model_run import ModelPlan, run_model_files
 from plumbline.execution.plan import Plan
 from plumbline.execution.runner import run_plan
-from plumbline.judging.model_file import FileResult
 from plumbline.judging.rows import Row, Verdict
+from plumbline.model_files.model_rows import FileResult
+from plumbline.model_files.model_run import ModelPlan, run_model_files
 from plumbline.processes.errors import PlumblineError
 
 

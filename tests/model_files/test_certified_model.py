@@ -8,12 +8,12 @@ import pytest
 
 from plumbline.engines.importer_calls import evaluate_model_file, read_model_file
 from plumbline.importers.lumping import lump_fixed_bodies
-from plumbline.importers.model_file import prepare_file
 from plumbline.importers.neutral_model import CanonicalState, ElementaryJoint, NeutralBody, NeutralModel
 from plumbline.importers.urdf import read_urdf
 from plumbline.importers.xml_tree import parse_xml
-from plumbline.truth.certified_model import certify_model, pose_tolerances
-from plumbline.truth.model_comparison import certify_states, mismatches, model_states
+from plumbline.model_files.certified_model import certify_model, pose_tolerances
+from plumbline.model_files.model_comparison import certify_states, mismatches, model_states
+from plumbline.model_files.prepared_file import prepare_file
 from tests.helpers.random_robots import random_mjcf, random_urdf
 
 FALSE_ALARM_ROBOTS = 500  # of each format, with 10 states

@@ -27,8 +27,8 @@ from plumbline.importers.neutral_model import (
 )
 from plumbline.model.datatypes import Array
 from plumbline.model.kinematics import rotation_matrix
-from plumbline.truth.certified_model import CertifiedModelQuantities, pose_tolerances, rough_quantities
-from plumbline.truth.model_comparison import (
+from plumbline.model_files.certified_model import CertifiedModelQuantities, pose_tolerances, rough_quantities
+from plumbline.model_files.model_comparison import (
     TINY,
     Mismatch,
     certify_states,

@@ -13,10 +13,10 @@ from plumbline.cli.main import main
 from plumbline.engines.environments import EnvironmentUnavailable, importer_interpreter
 from plumbline.importers.neutral_model import ModelQuantities
 from plumbline.importers.xml_tree import parse_xml, write_xml
-from plumbline.reproduce import model_script
-from plumbline.reproduce.model_script import MAX_LINES, NoModelScript, _worst_entry, write_model_script
-from plumbline.reproduce.model_shrink import shrink_tree
-from plumbline.truth.certified_model import CertifiedModelQuantities
+from plumbline.model_files import model_script
+from plumbline.model_files.certified_model import CertifiedModelQuantities
+from plumbline.model_files.model_script import MAX_LINES, NoModelScript, _worst_entry, write_model_script
+from plumbline.model_files.xml_shrink import shrink_tree
 from tests.helpers.random_robots import random_urdf
 
 # Pinocchio 4.1 keeps its own gravity and ignores references

@@ -11,7 +11,7 @@ import numpy as np
 
 from plumbline.importers.neutral_model import CanonicalState, ModelQuantities, NeutralModel
 from plumbline.model.datatypes import Array
-from plumbline.truth.certified_model import CertifiedModelQuantities, certify_model
+from plumbline.model_files.certified_model import CertifiedModelQuantities, certify_model
 
 TINY = float(np.finfo(float).tiny)  # replaces a tolerance of zero, so that an error of zero has the ratio 0
 _SPREAD = 0.5  # m: random displacements are up to this

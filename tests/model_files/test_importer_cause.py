@@ -7,11 +7,11 @@ import pytest
 
 from plumbline.engines.importer_calls import describe_importer, evaluate_model_file, read_model_file
 from plumbline.importers.importer import ModelFile
-from plumbline.importers.model_file import prepare_file
 from plumbline.importers.xml_tree import parse_xml, write_xml
-from plumbline.judging.model_file import Answer, judge_file, state_seed
 from plumbline.judging.rows import Verdict
-from plumbline.truth.model_comparison import model_states
+from plumbline.model_files.model_comparison import model_states
+from plumbline.model_files.model_rows import Answer, judge_file, state_seed
+from plumbline.model_files.prepared_file import prepare_file
 from tests.helpers.importer_columns import MUJOCO
 from tests.helpers.planted_importer_defects import MJCF_DEFECTS, URDF_DEFECTS
 from tests.helpers.random_robots import random_mjcf, random_urdf

@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from plumbline.diagnosis.importer_cause import Explanation
 from plumbline.engines.adapter import EngineInfo
 from plumbline.engines.environments import (
     EnvironmentUnavailable,
@@ -25,11 +24,13 @@ from plumbline.engines.importer_calls import (
 from plumbline.engines.registry import IMPORTERS
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.runner import exit_code_of_rows
-from plumbline.importers.model_file import BaseChoice, PreparedFile, prepare_file
 from plumbline.importers.neutral_model import CanonicalState, NeutralModel, extreme_numbers
 from plumbline.importers.xml_tree import ModelFileError
 from plumbline.judging.known_issues import KnownIssue, KnownIssues
-from plumbline.judging.model_file import (
+from plumbline.judging.rows import Row, RowContext, Verdict
+from plumbline.model_files.importer_cause import Explanation
+from plumbline.model_files.model_comparison import model_states, with_names_of
+from plumbline.model_files.model_rows import (
     MODEL_FAMILY,
     Answer,
     FileResult,
@@ -39,11 +40,10 @@ from plumbline.judging.model_file import (
     judge_importer,
     state_seed,
 )
-from plumbline.judging.rows import Row, RowContext, Verdict
+from plumbline.model_files.prepared_file import BaseChoice, PreparedFile, prepare_file
 from plumbline.processes.isolation import ScratchFolder
 from plumbline.processes.workers import Executor, Limits, Outcome, Packed, Task, WorkerPool
 from plumbline.scenario.errors import Problem, did_you_mean, shorten
-from plumbline.truth.model_comparison import model_states, with_names_of
 
 MJCF_READER = "mujoco"  # whose compiled model is the neutral reading of MJCF
 T = TypeVar("T")

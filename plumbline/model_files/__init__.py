@@ -1,0 +1,1 @@
+"""Model files: read, run, judge, cause, certified, script, shrink (`plumbline model`)."""
