@@ -16,6 +16,7 @@ from typing import Any
 
 from plumbline.engines import calls, environments
 from plumbline.engines.adapter import EngineInfo
+from plumbline.engines.importer_calls import describe_importer
 from plumbline.execution.exit_codes import ExitCode
 from plumbline.execution.plan import (
     Plan,
@@ -82,6 +83,7 @@ def describe_engines(
     *,
     are_required: bool = False,
     result_cache: ResultCache | None = None,
+    are_importers: bool = False,
 ) -> dict[str, EngineInfo]:
     """Ask every engine for its description, in the version that its name demands.
 
@@ -89,6 +91,7 @@ def describe_engines(
         engines: names, as ``mujoco`` or ``mujoco@3.12.0``.
         are_required: whether an engine that is not installed has failed, since the user named it.
         result_cache: descriptions of earlier runs with the same installation.
+        are_importers: whether the names are importers of model files.
 
     Returns:
         Description by name; an engine that raises, crashes or hangs when it is imported, and a version whose
@@ -97,15 +100,19 @@ def describe_engines(
     """
     found: dict[str, EngineInfo] = {}
     tasks = []
+    describe = describe_importer if are_importers else calls.describe_engine
     for name in engines:
         base, version = environments.split_version(name)
         try:
-            python = environments.ensure_interpreter(name) if version else ""
+            if are_importers:
+                python = environments.importer_interpreter(name)
+            else:
+                python = environments.ensure_interpreter(name) if version else ""
         except environments.EnvironmentUnavailable as error:
-            found[name] = EngineInfo(name, name, "", (), str(error), has_failed=True)
+            found[name] = EngineInfo(name, name, "", (), str(error), has_failed=bool(version))
             continue
         key = TaskKey(TaskKind.DESCRIPTION, engine=name)
-        tasks.append(Task(key, calls.describe_engine, (base,), executor.limits, python=python, engine=name))
+        tasks.append(Task(key, describe, (base,), executor.limits, python=python, engine=name))
     pythons = {task.key: task.python for task in tasks}
     for outcome in Scheduler(executor, result_cache).run(tasks):
         name, python = outcome.key.engine, pythons[outcome.key]
@@ -114,10 +121,9 @@ def describe_engines(
         )
         if are_required and info.missing is not None and not info.version and not info.has_failed:
             info = replace(info, missing=f"{info.missing} (it was named explicitly)", has_failed=True)
-        if python:
-            title = info.title if info.missing else f"{info.title} {info.version}"
-            info = replace(info, name=name, title=title, python=python)
-        found[name] = info
+        if python and not info.missing and not are_importers:
+            info = replace(info, title=f"{info.title} {info.version}")
+        found[name] = replace(info, name=name, python=python)
     return {name: found[name] for name in engines}
 
 

@@ -60,6 +60,7 @@ class FileResult:
     rows: tuple[Row, ...]
     explanations: Mapping[str, Explanation]  # by importer
     poses: Mapping[str, Array]  # of the bodies at the reference, or at the one state, for the drawing
+    answers: Mapping[str, Answer]  # by importer
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,45 +256,6 @@ def certify_file(
     bare_truths = certify_states(bare, states) if bare is not model else truths
     (drawn,) = certify_states(model, model_states(model, 1, 0, at or {}))
     return FileTruth(truths, bare_truths, drawn.quantities.poses)
-
-
-def judge_file(
-    shown: str,
-    model: NeutralModel,
-    columns: Sequence[tuple[str, EngineInfo, Answer]],
-    state_count: int,
-    at: Mapping[str, float] | None,
-) -> FileResult:
-    """Judge every importer's answer about one file, and look for causes.
-
-    Args:
-        columns: name and description of each importer, and its answer.
-
-    """
-    truth = certify_file(shown, model, state_count, at)
-    judged = [judge_importer(shown, model, column, state_count, at, truth) for column in columns]
-    return file_result(shown, model, columns, judged, truth)
-
-
-def file_result(
-    shown: str,
-    model: NeutralModel,
-    columns: Sequence[tuple[str, EngineInfo, Answer]],
-    judged: Sequence[tuple[Sequence[Row], Explanation | None]],
-    truth: FileTruth,
-) -> FileResult:
-    """Collect what importers were judged to do with a file.
-
-    Args:
-        columns: as of `judge_file`.
-        judged: of `judge_importer`, for each column.
-        truth: of `certify_file`.
-
-    """
-    rows = tuple(row for own, _ in judged for row in own)
-    pairs = zip(columns, judged, strict=True)
-    explanations = {name: found for (name, *_), (_, found) in pairs if found is not None}
-    return FileResult(shown, model, rows, explanations, truth.poses)
 
 
 def judge_importer(

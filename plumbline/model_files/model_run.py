@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple
 
 from plumbline.engines.adapter import EngineInfo
-from plumbline.engines.environments import (
-    EnvironmentUnavailable,
-    declared_importer_attribute,
-    importer_interpreter,
-    split_version,
-)
+from plumbline.engines.environments import declared_importer_attribute, split_version
 from plumbline.engines.importer_calls import (
-    describe_importer,
     evaluate_model_file,
     read_model_file,
     read_model_files,
 )
 from plumbline.engines.registry import IMPORTERS
 from plumbline.execution.exit_codes import ExitCode
-from plumbline.execution.runner import exit_code_of_rows
-from plumbline.importers.neutral_model import CanonicalState, NeutralModel, extreme_numbers
+from plumbline.execution.runner import describe_engines, exit_code_of_rows
+from plumbline.importers.neutral_model import NeutralModel, extreme_numbers
 from plumbline.importers.xml_tree import ModelFileError
 from plumbline.judging.known_issues import KnownIssue, KnownIssues
 from plumbline.judging.rows import Row, RowContext, Verdict
@@ -34,19 +27,16 @@ from plumbline.model_files.model_rows import (
     MODEL_FAMILY,
     Answer,
     FileResult,
-    FileTruth,
     certify_file,
-    file_result,
     judge_importer,
     state_seed,
 )
 from plumbline.model_files.prepared_file import BaseChoice, PreparedFile, prepare_file
 from plumbline.processes.isolation import ScratchFolder
-from plumbline.processes.workers import Executor, Limits, Outcome, Packed, Task, WorkerPool
+from plumbline.processes.workers import Executor, Limits, Outcome, Packed, Scheduler, Task, WorkerPool
 from plumbline.scenario.errors import Problem, did_you_mean, shorten
 
 MJCF_READER = "mujoco"  # whose compiled model is the neutral reading of MJCF
-T = TypeVar("T")
 ProgressCallback = Callable[[int, int, str], None]
 
 
@@ -96,304 +86,258 @@ class ModelRunResult:
 
 
 def run_model_files(plan: ModelPlan, progress: ProgressCallback) -> ModelRunResult:
-    """Compare files across importers.
+    """Compare files across importers; a file with mistakes is in the problems and does not stop the others.
 
     Args:
         progress: called after every task.
 
-    Returns:
-        The result; a file with mistakes is in its problems and does not stop the others.
-
     """
     with ScratchFolder("plumbline-model-") as scratch, WorkerPool(plan.jobs, plan.limits) as workers:
-        return _ModelRun(plan, scratch, workers, progress).execute()
+        engines = describe_importers(plan, workers)
+        files = enumerate(dict.fromkeys(plan.files))
+        runs = [FileRun(plan, engines, shown, scratch / str(k)) for k, shown in files]
+        run_files(runs, workers, progress)
+        return _collect(plan, engines, runs)
 
 
-class _ModelRun:
-    """The phases of one run: describe, read, evaluate, judge."""
+def describe_importers(plan: ModelPlan, executor: Executor) -> dict[str, EngineInfo]:
+    """Describe the importers of a plan, and MuJoCo's; a missing one that the user named has failed."""
+    names = tuple(dict.fromkeys((*plan.importers, MJCF_READER)))
+    found = describe_engines(executor, names, are_importers=True)
+    required = plan.importers if plan.are_importers_required else ()
+    return {
+        name: replace(info, has_failed=True) if info.missing and name in required else info
+        for name, info in found.items()
+    }
 
-    def __init__(self, plan: ModelPlan, scratch: Path, workers: Executor, progress: ProgressCallback) -> None:
-        self.plan, self.scratch, self.workers, self.progress = plan, scratch, workers, progress
-        self.done = 0
-        self.pythons: dict[str, str] = {}
-        self.engines: dict[str, EngineInfo] = {}
+
+def run_files(runs: list[FileRun], executor: Executor, progress: ProgressCallback) -> None:
+    """Make the tasks of files until none is left."""
+    by_file = {run.shown: run for run in runs}
+    tasks = [task for run in runs for task in run.follow(run.start)]
+    total, scheduler = len(tasks), Scheduler(executor)
+    for done, outcome in enumerate(scheduler.run(tasks), start=1):
+        run = by_file[outcome.key.file]
+        following = run.follow(run.on_outcome, outcome)
+        for task in following:
+            scheduler.submit(task)
+        total += len(following)
+        progress(done, total, " ".join(outcome.key))
+
+
+def _collect(plan: ModelPlan, engines: Mapping[str, EngineInfo], runs: list[FileRun]) -> ModelRunResult:
+    known = KnownIssues(plan.known_issues, False)
+
+    def answered(row: Row) -> Row:
+        """A refusal is an answer: it counts as a gap only where the user named the importer."""
+        is_gap = row.verdict == Verdict.UNSUPPORTED and not plan.are_importers_required
+        return replace(row, verdict=Verdict.INFORMATION) if is_gap else row
+
+    files = []
+    for run in runs:
+        for file in run.follow(run.result):
+            rows = known.mark_known(list(map(answered, file.rows)), len(file.model.bodies))
+            files.append(replace(file, rows=tuple(rows)))
+    return ModelRunResult(
+        plan, tuple(files), engines, tuple(problem for run in runs for problem in run.problems),
+        tuple(known.stale_issues(is_full_matrix=False)), any(run.has_internal_error for run in runs),
+    )  # fmt: skip
+
+
+class FileTask(NamedTuple):
+    """The identity of a task."""
+
+    kind: str  # certify, read, evaluate, rewritten or judge
+    file: str
+    importer: str = ""
+
+
+class FileRun:
+    """One file on all importers: makes its tasks, and judges the answers once the file's truth is known."""
+
+    def __init__(self, plan: ModelPlan, engines: Mapping[str, EngineInfo], shown: str, scratch: Path) -> None:
+        self.plan, self.engines, self.shown, self.scratch = plan, engines, shown, scratch
         self.problems: list[Problem] = []
         self.has_internal_error = False
-        self.truths: dict[str, Packed | tuple[Verdict, str]] = {}  # of each file, or why there is none
+        self.prepared: PreparedFile
+        self.model: NeutralModel | None = None  # what the file says, once that is known
+        self.truth: Packed | None = None
+        self.doubt: tuple[Verdict, str] | None = None  # why there is no truth
+        self.answers: dict[str, Answer] = {}
+        self.complete: list[str] = []  # importers whose answer is complete and not judged yet
+        self.judged: dict[str, tuple[list[Row], Explanation | None]] = {}
 
-    def execute(self) -> ModelRunResult:
-        """Run the phases."""
-        prepared = self.prepare()
-        self.describe()
-        readings = self.read(prepared)
-        models = self.neutral_models(prepared, readings)
-        answers = self.evaluate(prepared, models, readings)
-        answers = self.rewrite(prepared, answers)
-        files = list(self.judge(models, answers))
-        known = KnownIssues(self.plan.known_issues, False)
-        files = [
-            replace(f, rows=tuple(known.mark_known(list(map(self.answered, f.rows)), len(f.model.bodies))))
-            for f in files
-        ]
-        stale = known.stale_issues(is_full_matrix=False)
-        return ModelRunResult(
-            self.plan, tuple(files), self.engines, tuple(self.problems), tuple(stale), self.has_internal_error
-        )
-
-    def outcomes(self, tasks: Sequence[Task]) -> Iterator[Outcome]:
-        """Run tasks and report the progress."""
-        total = self.done + len(tasks)
-        for outcome in self.workers.run(tasks):
-            self.done += 1
-            self.progress(self.done, total, " ".join(map(str, outcome.key)))
-            yield outcome
-
-    def of_file(self, shown: str, call: Callable[[], T]) -> T | None:
-        """Call what handles one file: its problems, and a mistake of this program, do not stop the others."""
+    def follow(self, make: Callable[..., list[Any]], *arguments: Any) -> list[Any]:
+        """Call a step of this file: its problems, and a mistake of this program, do not stop other files."""
         try:
-            return call()
+            return make(*arguments)
         except ModelFileError as error:
             self.problems += error.problems
         except Exception as error:
             words = shorten(" ".join(f"{type(error).__name__}: {error}".split()), 400)
-            self.problems.append(
-                Problem(shown, 0, 0, "", f"internal error: {words}", hint="please report it")
-            )
+            words = f"internal error: {words}"
+            self.problems.append(Problem(self.shown, 0, 0, "", words, hint="please report it"))
             self.has_internal_error = True
-        return None
+        self.model = None
+        return []
 
-    def limit_words(self, outcome: Outcome, what: str) -> str:
+    def start(self) -> list[Task]:
+        """Check the file; have every importer read it that reads its format, and MuJoCo any MJCF file."""
+        plan = self.plan
+        self.scratch.mkdir()
+        self.prepared = prepare_file(self.shown, self.scratch, plan.root, plan.base, plan.strip_geometry)
+        file = self.prepared.file
+        tasks = [
+            self._task("read", name, read_model_file, file)
+            for name, info in self.engines.items()
+            if info.missing is None
+            and file.format in declared_formats(name)
+            and (name in plan.importers or file.format == "mjcf")
+        ]
+        if file.format == "urdf":
+            return self._know(self.prepared.neutral_model(None)) + tasks
+        if self.engines[MJCF_READER].missing is not None:
+            self.prepared.neutral_model(None, "is missing or failed to load")
+        return tasks
+
+    def on_outcome(self, outcome: Outcome) -> list[Task]:
+        """Take the outcome of a task; return the tasks that follow from it."""
+        kind, name = outcome.key.kind, outcome.key.importer
+        if kind == "certify":
+            what = "the certified values of the file were not computed"
+            self.doubt = self._doubt(outcome, what) if outcome.failure else None
+            self.truth = None if outcome.failure else outcome.packed
+            return self._judge()
+        if kind == "judge":
+            doubt = self._doubt(outcome, "its differences were not explained")
+            self.judged[name] = self._lost(name, *doubt) if outcome.failure else outcome.value
+            return []
+        if kind == "read":
+            failure = self._failure(outcome, "did not load the file")
+            self.answers[name] = Answer(outcome.value, failure=failure)
+            if self.prepared.file.format == "mjcf" and name == MJCF_READER:
+                model = self.prepared.neutral_model(outcome.value, failure)
+                read = [other for other in self.answers if other != name]
+                return self._know(model) + [t for other in (*read, name) for t in self._evaluate(other)]
+            return self._evaluate(name) if self.model is not None else []
+        if kind == "evaluate":
+            failure = self._failure(outcome, "did not compute the quantities")
+            quantities = () if outcome.failure else tuple(outcome.value)
+            self.answers[name] = replace(self.answers[name], quantities=quantities, failure=failure)
+            if split_version(name)[0] == MJCF_READER and self.prepared.file.format == "mjcf":
+                # equivalent rewritings judge MuJoCo's compiler
+                written = self.prepared.write_rewritings(self.scratch)
+                return [self._task("rewritten", name, read_model_files, written)]
+        else:
+            self.answers[name] = replace(self.answers[name], rewritten=outcome.value or {})
+        self.complete.append(name)
+        return self._judge()
+
+    def result(self) -> list[FileResult]:
+        """Collect what the importers were judged to do; nothing of a file with mistakes."""
+        if self.model is None:
+            return []
+        for name in self.plan.importers:
+            if name not in self.judged:  # it has read nothing
+                self._judge_at_once(name)
+        rows = [row for name in self.plan.importers for row in self.judged[name][0]]
+        found = {name: self.judged[name][1] for name in self.plan.importers}
+        explanations = {name: e for name, e in found.items() if e is not None}
+        poses = {} if self.truth is None else self.truth.load().poses
+        return [FileResult(self.shown, self.model, tuple(rows), explanations, poses, self.answers)]
+
+    def _task(self, kind: str, name: str, function: Any, *arguments: Any) -> Task:
+        key, base, python = (
+            FileTask(kind, self.shown, name),
+            split_version(name)[0],
+            self.engines[name].python,
+        )
+        return Task(key, function, (base, *arguments), self.plan.limits, python=python, engine=name)
+
+    def _know(self, model: NeutralModel) -> list[Task]:
+        """Take what the file says, and certify it."""
+        names = [joint.name for joint in model.joints if joint.kind in ("hinge", "slide")]
+        if unknown := [name for name in self.plan.at or () if name not in names]:
+            listed = f"there are: {', '.join(names[:20])}"
+            raise ModelFileError([
+                Problem(
+                    self.shown, 0, 0, "", f"no hinge or slide {shorten(repr(name))}, which --at names",
+                    hint=did_you_mean(name, names) or listed,
+                )
+                for name in unknown
+            ])  # fmt: skip
+        self.model = model
+        arguments = (self.shown, model, self.plan.state_count, self.plan.at)
+        return [Task(FileTask("certify", self.shown), certify_file, arguments, self.plan.limits)]
+
+    def _evaluate(self, name: str) -> list[Task]:
+        """Have an importer's engine compute the quantities at the states of its reading."""
+        answer, model = self.answers[name], self.model
+        assert model is not None
+        if name not in self.plan.importers:
+            return []
+        if (reading := answer.reading) is not None and reading.model is None:
+            words = self.prepared.in_users_words(reading.refusal)
+            self.answers[name] = replace(answer, reading=replace(reading, refusal=words))
+        elif reading is not None and reading.model is not None:
+            if (extreme := next(extreme_numbers(reading.model), None)) is None:
+                named = with_names_of(model, reading.model)
+                states = model_states(named, self.plan.state_count, state_seed(self.shown), self.plan.at)
+                self.answers[name] = replace(answer, reading=replace(reading, model=named), states=states)
+                return [self._task("evaluate", name, evaluate_model_file, self.prepared.file, states)]
+            failure = f"no engine can compute with what it read: {extreme[0]} is {extreme[1]:g}"
+            self.answers[name] = Answer(failure=failure)
+        self.complete.append(name)
+        return self._judge()
+
+    def _judge(self) -> list[Task]:
+        """Judge the complete answers, once the truth is known; the search for causes takes time."""
+        tasks = []
+        while self.complete and (self.truth or self.doubt):
+            name = self.complete.pop(0)
+            if self.truth is not None and self.answers[name].quantities:
+                key, arguments = (
+                    FileTask("judge", self.shown, name),
+                    (*self._judge_arguments(name), self.truth),
+                )
+                tasks.append(Task(key, judge_importer, arguments, self.plan.limits))
+            else:
+                self._judge_at_once(name)
+        return tasks
+
+    def _judge_at_once(self, name: str) -> None:
+        if self.truth is None:
+            assert self.doubt is not None
+            self.judged[name] = self._lost(name, *self.doubt)
+            return
+        arguments = (*self._judge_arguments(name), self.truth.load())
+        self.judged[name] = judge_importer(*arguments)
+
+    def _judge_arguments(self, name: str) -> tuple[Any, ...]:
+        info = self.engines[name]
+        column = name, info, self.answers.get(name) or Answer(failure=info.missing or "")
+        return self.shown, self.model, column, self.plan.state_count, self.plan.at
+
+    def _lost(self, name: str, verdict: Verdict, reason: str) -> tuple[list[Row], None]:
+        """The row of an importer that is not judged."""
+        info = self.engines[name]
+        context = RowContext(self.shown, MODEL_FAMILY, name, info.title, info.version)
+        return [context.make_row("model", "-", "all", verdict, reason)], None
+
+    def _failure(self, outcome: Outcome, what: str) -> str:
         """Why there is no answer, with the option that sets the limit; empty where there is an answer."""
-        seconds, gigabytes = self.plan.limits.seconds, self.plan.limits.gigabytes
+        limits = self.plan.limits
         if outcome.is_overdue:
-            return f"{what} within the time limit of {seconds:g} s (--timeout)"
+            return f"{what} within the time limit of {limits.seconds:g} s (--timeout)"
         if outcome.is_out_of_memory:
-            return f"{what} within the memory limit of {gigabytes:g} GB (--memory)"
+            return f"{what} within the memory limit of {limits.gigabytes:g} GB (--memory)"
         return outcome.failure or ""
 
-    def prepare(self) -> dict[str, PreparedFile]:
-        """Check the files."""
-        found: dict[str, PreparedFile] = {}
-        for number, shown in enumerate(dict.fromkeys(self.plan.files)):
-            folder = self.scratch / str(number)
-            folder.mkdir()
-            how = folder, self.plan.root, self.plan.base, self.plan.strip_geometry
-            if (file := self.of_file(shown, partial(prepare_file, shown, *how))) is not None:
-                found[shown] = file
-        return found
-
-    def describe(self) -> None:
-        """Ask the importers for their versions."""
-        wanted = dict.fromkeys((*self.plan.importers, MJCF_READER))
-        tasks = []
-        for name in wanted:
-            base = split_version(name)[0]
-            try:
-                self.pythons[name] = importer_interpreter(name)
-            except EnvironmentUnavailable as error:
-                self.engines[name] = self.missing(EngineInfo(name, name, "", (), str(error)))
-                continue
-            key = ("version", name)
-            tasks.append(
-                Task(
-                    key, describe_importer, (base,), self.plan.limits, python=self.pythons[name], engine=name
-                )
-            )
-        for outcome in self.outcomes(tasks):
-            name = outcome.key[1]
-            info = outcome.value or EngineInfo(
-                name, name, "", (), f"cannot be loaded: {outcome.failure}", has_failed=True
-            )
-            self.engines[name] = self.missing(replace(info, name=name))
-        self.engines = {name: self.engines[name] for name in wanted}
-
-    def missing(self, info: EngineInfo) -> EngineInfo:
-        """A missing importer that the user named has failed."""
-        if info.missing and self.plan.are_importers_required and info.name in self.plan.importers:
-            return replace(info, has_failed=True)
-        return info
-
-    def answered(self, row: Row) -> Row:
-        """A refusal is an answer: it counts as a gap only where the user named the importer."""
-        if row.verdict == Verdict.UNSUPPORTED and not self.plan.are_importers_required:
-            return replace(row, verdict=Verdict.INFORMATION)
-        return row
-
-    def usable(self) -> list[str]:
-        """The importers that can run."""
-        return [name for name, info in self.engines.items() if info.missing is None]
-
-    def task(self, kind: str, shown: str, name: str, function: Any, *arguments: Any) -> Task:
-        """A call of an importer."""
-        base = split_version(name)[0]
-        key = (kind, shown, name)
-        return Task(
-            key, function, (base, *arguments), self.plan.limits, python=self.pythons[name], engine=name
-        )
-
-    def read(self, prepared: Mapping[str, PreparedFile]) -> dict[tuple[str, str], Answer]:
-        """Have every importer read every file of a format that it reads; MuJoCo always reads MJCF."""
-        tasks = [
-            self.task("read", shown, name, read_model_file, file.file)
-            for shown, file in prepared.items()
-            for name in self.usable()
-            if file.file.format in declared_formats(name)
-            and (name in self.plan.importers or file.file.format == "mjcf")
-        ]
-        known = {shown: file.urdf_model for shown, file in prepared.items() if file.urdf_model is not None}
-        tasks += self.certificates(known)
-        found = {}
-        for outcome in self.outcomes(tasks):
-            if self.is_certificate(outcome):
-                continue
-            failure = self.limit_words(outcome, "did not load the file")
-            found[outcome.key[1:]] = Answer(outcome.value, failure=failure)
-        return found
-
-    def neutral_models(
-        self, prepared: Mapping[str, PreparedFile], readings: Mapping[tuple[str, str], Answer]
-    ) -> dict[str, NeutralModel]:
-        """What the files say."""
-        found = {}
-        for shown, file in prepared.items():
-            answer = readings.get((shown, MJCF_READER), Answer(failure="is missing or failed to load"))
-            described = partial(file.neutral_model, answer.reading, answer.failure)
-            if (model := self.of_file(shown, described)) is None:
-                continue
-            names = [joint.name for joint in model.joints if joint.kind in ("hinge", "slide")]
-            unknown = [name for name in self.plan.at or () if name not in names]
-            for name in unknown:
-                hint = did_you_mean(name, names) or f"there are: {', '.join(names[:20])}"
-                message = f"no hinge or slide {shorten(repr(name))}, which --at names"
-                self.problems.append(Problem(shown, 0, 0, "", message, hint=hint))
-            if not unknown:
-                found[shown] = model
-        return found
-
-    def evaluate(
-        self,
-        prepared: Mapping[str, PreparedFile],
-        models: Mapping[str, NeutralModel],
-        readings: Mapping[tuple[str, str], Answer],
-    ) -> dict[tuple[str, str], Answer]:
-        """Evaluate the quantities at the states of each reading."""
-        answers = {
-            key: answer
-            for key, answer in readings.items()
-            if key[0] in models and key[1] in self.plan.importers
-        }
-        tasks = []
-        for (shown, name), answer in answers.items():
-            if answer.reading is not None and answer.reading.model is None:
-                words = prepared[shown].in_users_words(answer.reading.refusal)
-                answers[shown, name] = replace(answer, reading=replace(answer.reading, refusal=words))
-            elif answer.reading is not None and answer.reading.model is not None:
-                if extreme := next(extreme_numbers(answer.reading.model), None):
-                    failure = f"no engine can compute with what it read: {extreme[0]} is {extreme[1]:g}"
-                    answers[shown, name] = Answer(failure=failure)
-                    continue
-                model = with_names_of(models[shown], answer.reading.model)
-                states = self.states(shown, model)
-                answers[shown, name] = replace(
-                    answer, reading=replace(answer.reading, model=model), states=states
-                )
-                file = prepared[shown].file
-                tasks.append(self.task("evaluate", shown, name, evaluate_model_file, file, states))
-        tasks += self.certificates({s: model for s, model in models.items() if s not in self.truths})
-        for outcome in self.outcomes(tasks):
-            key = outcome.key[1:]
-            if self.is_certificate(outcome):
-                continue
-            if outcome.failure:
-                failure = self.limit_words(outcome, "did not compute the quantities")
-                answers[key] = replace(answers[key], failure=failure)
-            else:
-                answers[key] = replace(answers[key], quantities=tuple(outcome.value))
-        return answers
-
-    def rewrite(
-        self, prepared: Mapping[str, PreparedFile], answers: dict[tuple[str, str], Answer]
-    ) -> dict[tuple[str, str], Answer]:
-        """Have MuJoCo read equivalent rewritings of the MJCF files, which judge its compiler."""
-        tasks = []
-        for (shown, name), answer in answers.items():
-            file, is_read = prepared[shown].file, answer.reading is not None and answer.reading.model
-            if split_version(name)[0] == MJCF_READER and file.format == "mjcf" and is_read:
-                written = self.of_file(shown, partial(prepared[shown].write_rewritings, self.scratch))
-                tasks.append(self.task("rewritten", shown, name, read_model_files, written or {}))
-        for outcome in self.outcomes(tasks):
-            key = outcome.key[1:]
-            answers[key] = replace(answers[key], rewritten=outcome.value or {})
-        return answers
-
-    def certificates(self, models: Mapping[str, NeutralModel]) -> list[Task]:
-        """Certify files' models: of URDF files while importers read them, of MJCF files afterwards."""
-        state = self.plan.state_count, self.plan.at
-        return [
-            Task(("certify", shown), certify_file, (shown, model, *state), self.plan.limits)
-            for shown, model in models.items()
-        ]
-
-    def is_certificate(self, outcome: Outcome) -> bool:
-        """Keep a certificate; False for other outcomes."""
-        if outcome.key[0] != "certify":
-            return False
-        what = "the certified values of the file were not computed"
-        self.truths[outcome.key[1]] = self.unjudged(outcome, what) if outcome.failure else outcome.packed
-        return True
-
-    def unjudged(self, outcome: Outcome, what: str) -> tuple[Verdict, str]:
+    def _doubt(self, outcome: Outcome, what: str) -> tuple[Verdict, str]:
         """The verdict where an importer cannot be judged: at a limit it is open, else the harness failed."""
         if outcome.is_overdue or outcome.is_out_of_memory:
-            return Verdict.UNRESOLVED, f"not judged: {self.limit_words(outcome, what)}"
+            return Verdict.UNRESOLVED, f"not judged: {self._failure(outcome, what)}"
         return Verdict.HARNESS_FAILED, f"the judging failed: {outcome.failure}"
-
-    def states(self, shown: str, model: NeutralModel) -> tuple[CanonicalState, ...]:
-        """The states of one file; the same values for joints of one name and kind in every reading."""
-        return model_states(model, self.plan.state_count, state_seed(shown), self.plan.at)
-
-    def judge(
-        self, models: Mapping[str, NeutralModel], answers: Mapping[tuple[str, str], Answer]
-    ) -> Iterator[FileResult]:
-        """Judge each file and importer in a worker, in the order in which the files were named."""
-        columns = {
-            (shown, name): (name, info, answers.get((shown, name)) or Answer(failure=info.missing or ""))
-            for shown in models
-            for name, info in ((name, self.engines[name]) for name in self.plan.importers)
-        }
-        tasks: list[Task] = []
-        judged: dict[tuple[str, str], tuple[list[Row], Explanation | None]] = {}
-        for (shown, name), column in columns.items():
-            truth, model = self.truths[shown], models[shown]
-            arguments = (shown, model, column, self.plan.state_count, self.plan.at)
-            if isinstance(truth, tuple):
-                judged[shown, name] = self.lost(shown, column, *truth)
-            elif column[2].quantities:  # where it says which causes a difference has, which takes time
-                key = ("judge", shown, name)
-                tasks.append(Task(key, judge_importer, (*arguments, truth), self.plan.limits))
-            else:
-                judged[shown, name] = judge_importer(*arguments, truth.load())
-        for outcome in self.outcomes(tasks):
-            _, shown, name = outcome.key
-            what = "its differences were not explained"
-            judged[shown, name] = (
-                self.lost(shown, columns[shown, name], *self.unjudged(outcome, what))
-                if outcome.failure
-                else outcome.value
-            )
-        for shown, model in models.items():
-            truth = self.truths[shown]
-            known = FileTruth((), (), {}) if isinstance(truth, tuple) else truth.load()
-            named = [(shown, name) for name in self.plan.importers]
-            yield file_result(shown, model, [columns[n] for n in named], [judged[n] for n in named], known)
-
-    def lost(
-        self, shown: str, column: tuple[str, EngineInfo, Answer], verdict: Verdict, reason: str
-    ) -> tuple[list[Row], None]:
-        """The row of an importer that is not judged."""
-        name, info, _ = column
-        context = RowContext(shown, MODEL_FAMILY, name, info.title, info.version)
-        return [context.make_row("model", "-", "all", verdict, reason)], None
 
 
 def declared_formats(name: str) -> tuple[str, ...]:

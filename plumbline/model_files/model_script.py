@@ -6,6 +6,7 @@ certified one.  It is run before it is handed out.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,34 +16,22 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
-from plumbline.engines.environments import importer_interpreter, split_version
-from plumbline.engines.importer_calls import (
-    describe_importer,
-    evaluate_model_file,
-    read_model_file,
-    run_script,
-)
-from plumbline.importers.importer import Reading
+from plumbline.engines.environments import split_version
+from plumbline.engines.importer_calls import evaluate_model_file, run_script
 from plumbline.importers.neutral_model import (
     CanonicalState,
     ModelQuantities,
     NeutralModel,
     without_passive_forces,
 )
-from plumbline.importers.xml_tree import Element, ModelFileError, write_xml
+from plumbline.importers.xml_tree import Element, write_xml
 from plumbline.judging.rows import Verdict
 from plumbline.model_files.certified_model import CertifiedModelQuantities
 from plumbline.model_files.importer_cause import Explanation
-from plumbline.model_files.model_comparison import (
-    TINY,
-    certify_states,
-    joint_keys,
-    joint_permutation,
-    model_states,
-    with_names_of,
-)
-from plumbline.model_files.model_rows import Answer, FileResult, judge_file, state_seed
-from plumbline.model_files.prepared_file import BaseChoice, PreparedFile, prepare_file
+from plumbline.model_files.model_comparison import TINY, certify_states, joint_keys, joint_permutation
+from plumbline.model_files.model_rows import FileResult
+from plumbline.model_files.model_run import FileRun, ModelPlan, describe_importers, run_files
+from plumbline.model_files.prepared_file import BaseChoice
 from plumbline.model_files.xml_shrink import shrink_tree
 from plumbline.processes.errors import PlumblineError
 from plumbline.processes.isolation import ScratchFolder
@@ -145,8 +134,13 @@ def write_model_script(
         raise NoModelScript(f"there are scripts for {', '.join(FORMS)}, not for {form}")
     if split_version(importer)[0] != form:
         raise NoModelScript(f"{importer} differs; a script for {form} cannot show that")
-    with ScratchFolder("plumbline-script-") as scratch, WorkerPool(1, Limits(TASK_SECONDS)) as workers:
-        bench = _Bench(importer, base, root, strip, scratch, workers)
+    limits = Limits(TASK_SECONDS)
+    plan = ModelPlan(
+        (shown,), (importer,), base=base, root=root, strip_geometry=strip, state_count=SHRINKING_STATES,
+        limits=limits,
+    )  # fmt: skip
+    with ScratchFolder("plumbline-script-") as scratch, WorkerPool(1, limits) as workers:
+        bench = _Bench(plan, scratch, workers)
         original = bench.judged(Path(shown))
         if original is None or not _differs(original):
             raise NoModelScript(f"{importer} does not differ on {shown}")
@@ -156,7 +150,7 @@ def write_model_script(
             found = bench.judged(bench.write(tree))
             return found is not None and _shows(found, importer, wanted) and bench.shown(found) is not None
 
-        tree = bench.prepared.tree
+        tree = bench.run.prepared.tree
         if shows(tree):
             tree = shrink_tree(tree, shows, seconds)
         path = bench.write(tree)
@@ -191,80 +185,59 @@ def _shows(result: FileResult, importer: str, wanted: frozenset[tuple[str, bool]
 
 
 class _Bench:
-    """Loads changed files with one importer and judges it."""
+    """Compares changed files on one importer."""
 
-    def __init__(
-        self,
-        importer: str,
-        base: BaseChoice,
-        root: Path | None,
-        strip: bool,
-        scratch: Path,
-        workers: WorkerPool,
-    ) -> None:
-        self.importer, self.base, self.root, self.strip = importer, base, root, strip
-        self.scratch, self.workers, self.count = scratch, workers, 0
-        self.name, self.python = split_version(importer)[0], importer_interpreter(importer)
-        self.info = replace(self.call(describe_importer, self.name), name=importer)
-        self.prepared: PreparedFile
-        self.answer = Answer()
-        self.folder = scratch
+    def __init__(self, plan: ModelPlan, scratch: Path, workers: WorkerPool) -> None:
+        self.plan, self.scratch, self.workers = plan, scratch, workers
+        (self.importer,) = plan.importers
+        self.name = split_version(self.importer)[0]
+        self.engines = describe_importers(plan, workers)
+        self.info = self.engines[self.importer]
+        self.run: FileRun
+        self.folders = itertools.count()
 
-    def call(self, function: Any, *arguments: Any, python: str | None = None) -> Any:
+    def call(self, function: Any, *arguments: Any) -> Any:
         """Make a call in a worker; None where it is lost."""
-        python = self.python if python is None else python
-        task = Task(0, function, arguments, Limits(TASK_SECONDS), python=python, engine=self.importer)
+        task = Task(0, function, arguments, self.plan.limits, python=self.info.python, engine=self.importer)
         (outcome,) = self.workers.run([task])
         return outcome.value
 
     def write(self, tree: Element) -> Path:
         """Write a changed file."""
         suffix = ".urdf" if tree.tag == "robot" else ".xml"
-        path = self.folder / f"changed{suffix}"
+        path = self.scratch / f"changed{suffix}"
         path.write_text(write_xml(tree, XML_WIDTH), encoding="utf-8")
         return path
 
     def judged(self, path: Path) -> FileResult | None:
-        """Judge the importer about a file; None where the file is bad or the importer refuses it."""
-        inside = path.is_relative_to(self.scratch)
-        try:
-            prepared = prepare_file(
-                str(path), self.scratch, None if inside else self.root, self.base, self.strip
-            )
-            model = prepared.neutral_model(self.mjcf_reading(prepared))
-        except ModelFileError:
+        """Judge the importer about a file; None where the file is bad or the importer has no answer."""
+        is_inside = path.is_relative_to(self.scratch)
+        plan = replace(self.plan, root=None) if is_inside else self.plan
+        run = FileRun(plan, self.engines, str(path), self.scratch / str(next(self.folders)))
+        run_files([run], self.workers, lambda *_: None)
+        found = run.follow(run.result)
+        if not found or not run.answers[self.importer].quantities or not found[0].model.joints:
             return None
-        reading: Reading | None = self.call(read_model_file, self.name, prepared.file)
-        if reading is None or reading.model is None or not model.joints:
-            return None
-        reading = replace(reading, model=with_names_of(model, reading.model))
-        assert reading.model is not None
-        states = model_states(reading.model, SHRINKING_STATES, state_seed(str(path)))
-        quantities = self.call(evaluate_model_file, self.name, prepared.file, states)
-        if quantities is None:
-            return None
-        self.prepared, self.answer = prepared, Answer(reading, states, tuple(quantities))
-        column = (self.importer, self.info, self.answer)
-        return judge_file(str(path), model, [column], SHRINKING_STATES, None)
+        self.run = run
+        result: FileResult = found[0]
+        return result
+
+    @property
+    def reading(self) -> NeutralModel:
+        """The importer's reading of the file that was judged last."""
+        reading = self.run.answers[self.importer].reading
+        assert reading is not None and reading.model is not None
+        return reading.model
 
     def shown(self, result: FileResult) -> _Shown | None:
         """The first number that a script of the file that was judged last can print."""
-        reading = self.answer.reading
-        assert reading is not None and reading.model is not None
         explanation = result.explanations.get(self.importer)
-        return next(_shown_numbers(self, result.model, reading.model, explanation), None)
-
-    def mjcf_reading(self, prepared: PreparedFile) -> Reading | None:
-        """MuJoCo's reading of an MJCF file."""
-        if prepared.file.format != "mjcf":
-            return None
-        found: Reading | None = self.call(read_model_file, "mujoco", prepared.file, python="")
-        return found
+        return next(_shown_numbers(self, result.model, self.reading, explanation), None)
 
     def evaluate(self, states: Sequence[CanonicalState]) -> list[ModelQuantities]:
         """The importer's quantities of the file that was judged last."""
         found: list[ModelQuantities] = self.call(
-            evaluate_model_file, self.name, self.prepared.file, tuple(states)
+            evaluate_model_file, self.name, self.run.prepared.file, tuple(states)
         )
         return found
 
@@ -272,9 +245,7 @@ class _Bench:
 def _write(bench: _Bench, form: str, result: FileResult, text: str, since: str) -> ModelScript:
     """Write the script about the first quantity that differs at a simple state and that it prints."""
     explanation = result.explanations.get(bench.importer)
-    reading = bench.answer.reading
-    assert reading is not None and reading.model is not None
-    for number in _shown_numbers(bench, result.model, reading.model, explanation):
+    for number in _shown_numbers(bench, result.model, bench.reading, explanation):
         script = _render(bench, form, result, text, since, number)
         value = _printed_number(bench.call(run_script, script) or "")
         if math.isclose(value, number.engine_value, rel_tol=PRINTED_PRECISION):
@@ -304,8 +275,8 @@ def _render(bench: _Bench, form: str, result: FileResult, text: str, since: str,
     )  # fmt: skip
     return environment.get_template("model_script.py.j2").render(
         form=form,
-        format=bench.prepared.file.format,
-        is_fixed=bench.prepared.file.base == "fixed",
+        format=bench.run.prepared.file.format,
+        is_fixed=bench.run.prepared.file.base == "fixed",
         root_body=result.model.bodies[0].name,
         title=title,
         why=_wrapped(why),
@@ -318,11 +289,9 @@ def _render(bench: _Bench, form: str, result: FileResult, text: str, since: str,
 
 def _coordinates(form: str, bench: _Bench, state: CanonicalState) -> str | None:
     """The coordinates as an engine's calls take them; None where nothing is moved."""
-    reading = bench.answer.reading
-    assert reading is not None and reading.model is not None
     values: list[float] = []
     is_moved = False
-    for joint, x, _ in reading.model.joint_slices():
+    for joint, x, _ in bench.reading.joint_slices():
         count = {"ball": 3, "free": 6}.get(joint.kind)
         own = NEUTRAL.get(form, {}).get(joint.kind, (0,) * (count or 1)) if count else state.coordinates[x]
         values.extend(own)

@@ -10,9 +10,9 @@ from plumbline.importers.importer import ModelFile
 from plumbline.importers.xml_tree import parse_xml, write_xml
 from plumbline.judging.rows import Verdict
 from plumbline.model_files.model_comparison import model_states
-from plumbline.model_files.model_rows import Answer, judge_file, state_seed
+from plumbline.model_files.model_rows import Answer, state_seed
 from plumbline.model_files.prepared_file import prepare_file
-from tests.helpers.importer_columns import MUJOCO
+from tests.helpers.importer_columns import MUJOCO, judge_file
 from tests.helpers.planted_importer_defects import MJCF_DEFECTS, URDF_DEFECTS
 from tests.helpers.random_robots import random_mjcf, random_urdf
 
@@ -38,7 +38,7 @@ def judged(tmp_path, text, mutated, suffix, moved=""):
     for one in answers if moved else ():
         one.poses[moved][0, 3] += 1e-17
     answer = Answer(reading, states, tuple(answers))
-    return judge_file(str(path), model, [("mujoco", MUJOCO, answer)], STATES, None)
+    return judge_file(str(path), model, ("mujoco", MUJOCO, answer), STATES)
 
 
 def planted(tmp_path, name, seed):
@@ -166,9 +166,7 @@ def test_damping_that_is_held_and_not_applied_is_judged_as_it_is_read(tmp_path):
     for damping, verdict in ((0.3, Verdict.AGREES), (0.4, Verdict.DISAGREES)):
         joint = replace(model.joints[0], damping=damping)
         bodies = tuple(replace(b, joints=(joint,)) if b.joints else b for b in model.bodies)
-        result = judge_file(
-            str(path), replace(model, bodies=bodies), [("pinocchio", info, answer)], STATES, None
-        )
+        result = judge_file(str(path), replace(model, bodies=bodies), ("pinocchio", info, answer), STATES)
         verdicts = {row.quantity: row.verdict for row in result.rows}
         assert verdicts["damping"] == verdict
         assert verdicts["acceleration"] == Verdict.AGREES
@@ -190,9 +188,7 @@ def test_pinocchio_leaves_some_armatures_out_of_its_kinetic_energy(tmp_path):
     reading = read_model_file("pinocchio", prepared.file)
     states = model_states(reading.model, STATES, state_seed(str(path)))
     answer = Answer(reading, states, tuple(evaluate_model_file("pinocchio", prepared.file, states)))
-    result = judge_file(
-        str(path), model, [("pinocchio", describe_importer("pinocchio"), answer)], STATES, None
-    )
+    result = judge_file(str(path), model, ("pinocchio", describe_importer("pinocchio"), answer), STATES)
     assert {row.quantity for row in result.rows if row.verdict == Verdict.DISAGREES} == {"kinetic_energy"}
     ((cause,),) = (explanation.causes for explanation in result.explanations.values())
     assert "leaves the armature of joint k out of its kinetic energy" in cause.sentence
@@ -249,7 +245,7 @@ def test_a_slide_that_is_placed_by_the_length_of_its_axis_is_named(tmp_path):
     answers = [replace(own, poses=there.poses) for own, there in zip(answers, placed, strict=True)]
     answer = Answer(reading, states, tuple(answers))
     column = ("mujoco", MUJOCO, answer)
-    result = judge_file(str(path), prepared.neutral_model(None), [column], STATES, None)
+    result = judge_file(str(path), prepared.neutral_model(None), column, STATES)
     ((cause,),) = (explanation.causes for explanation in result.explanations.values())
     assert "multiplies the coordinate of slide j by the length of its axis" in cause.sentence
     assert "that of j by 2 (line 5), but not in its equations; this alone explains" in cause.sentence
@@ -301,7 +297,7 @@ def test_a_free_body_whose_coordinates_count_from_elsewhere_is_named(tmp_path):
     states = model_states(reading.model, STATES, state_seed(str(path)))
     answer = Answer(reading, states, tuple(evaluate_model_file("pinocchio", prepared.file, states)))
     column = ("pinocchio", describe_importer("pinocchio"), answer)
-    result = judge_file(str(path), model, [column], STATES, None)
+    result = judge_file(str(path), model, column, STATES)
     ((cause,),) = (explanation.causes for explanation in result.explanations.values())
     assert "coordinates of the free joint of body a from (0, 1, 1) and not from" in cause.sentence
     assert "this alone explains every quantity" in cause.sentence
