@@ -89,7 +89,7 @@ STEP_SETTINGS = {
 class ExudynChain:
     """The assembled system at one state; the pieces of all bodies in a row.
 
-    ``first_piece[k]``, ``last_piece[k]``: the pieces that body k hangs by and that the next one hangs on;
+    ``first_piece[k]``, ``last_piece[k]``: the pieces of body k with its proximal and with its distal point;
     ``body_of_piece[i]``, ``piece_centre[i]``: the body of piece i, and where in it the piece's own centre
     of mass is.
     """

@@ -4,7 +4,7 @@ Frames, quaternion order and offsets (R_b: rotation of engine body b, body → w
 rod's own axis):
 
     link k    body frame: the project's, at the centre of mass;  joint at s_prox(k)
-              pos = s_dist(k−1) − s_prox(k), or (0, 0, −ℓ_k) − s_prox(k) where it hangs on a rod
+              pos = s_dist(k−1) − s_prox(k), or (0, 0, −ℓ_k) − s_prox(k) where its joint is a rod
     hinge, universal, slide, cylindrical, weld, with (q_a, q_b) the joint's axes in its far and near body:
               quat = q_a conj(q_b);  pos = s_far − A(quat) s_near;  axis e of joint at s_near: A(q_b) e
               a cylindrical joint is a slide and a hinge, a universal joint two hinges, a weld none

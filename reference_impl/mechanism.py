@@ -133,8 +133,8 @@ class Mechanism:
         Args:
             mass: (N,) [kg].
             inertia: (N, 3, 3) about the centres of mass, body frames [kg m²].
-            proximal: (N, 3) where body k hangs: the notes' s_1 of body 1, s_3 of body 2; body frame [m].
-            distal: (N, 3) where body k+1 hangs on body k: s_2; body frame, unused for the last body [m].
+            proximal: (N, 3) the joint of body k: the notes' s_1 of body 1, s_3 of body 2; body frame [m].
+            distal: (N, 3) the joint of body k+1 on body k: s_2; body frame, unused for the last body [m].
             length: (N,) of the rods, 0 for a ball joint [m].
             gravity: (3,) world frame [m/s²].
             force: (N, 3) constant applied forces at the centres of mass, world frame [N].

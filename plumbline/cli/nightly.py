@@ -54,7 +54,7 @@ class NightPlan:
     seed: int
     random_count: int
     started: str  # ISO 8601, UTC
-    token: str  # tells its cells from those of other nights
+    token: str  # names the folder of its cells
 
     @classmethod
     def resume_or_start(cls, folder: Path, seed: int | None, random_count: int) -> NightPlan:

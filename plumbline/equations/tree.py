@@ -531,8 +531,8 @@ class Tree:
     def mass_matrix(self) -> Any:
         """Compute M of the rates ν of `StateQuantities.mass_matrix`.
 
-        A rate ω′ or u̇ turns or swings its own body alone: what hangs on a body with an attitude of its own
-        is carried without a turn, as by a joint whose b and i are 0.
+        A rate ω′ or u̇ turns or swings its own body alone: what is attached to a body with an attitude of
+        its own is carried without a turn, as by a joint whose b and i are 0.
         """
         num, model, n = self.num, self.model, self.model.n
         total = [self._inertia(k) for k in range(n)]

@@ -98,7 +98,7 @@ def siblings_reversed(model: Model) -> NDArray[np.intp]:
     """Order the bodies depth first with the branches on every body, and on the world, in reverse.
 
     Returns:
-        (N,) the bodies in the new order; ascending where no two joints hang on the same body.
+        (N,) the bodies in the new order; ascending where no two joints have the same far body.
 
     """
     order: list[int] = []

@@ -50,7 +50,7 @@ def random_tree(
     loads: bool = True,
     elements: Sequence[str] = (),
 ) -> Model:
-    """Draw a tree in depth-first order; free bodies hang on the world only, welds never.
+    """Draw a tree in depth-first order; the parent of free bodies is the world, of welds another body.
 
     Args:
         elements: which of `ELEMENTS` its joints have.
@@ -209,13 +209,13 @@ def random_loop_mechanism(
 
 
 class _Node:
-    """A body of a mechanism in the making: the kind of its joint, and what hangs on it."""
+    """A body of a mechanism in the making: the kind of its joint, and its children."""
 
     def __init__(self, kind: Kind) -> None:
         self.kind, self.children, self.place = kind, list[_Node](), -1
 
-    def hang(self, kinds: Sequence[Kind]) -> _Node:
-        """Hang a chain on the body and return its last one."""
+    def attach(self, kinds: Sequence[Kind]) -> _Node:
+        """Attach a chain to the body and return its last one."""
         last = self
         for kind in kinds:
             last.children.append(_Node(kind))
@@ -229,13 +229,13 @@ def mechanism_with_places(
     """Draw a mechanism that has joints of given kinds in given roles, as far as they can be together.
 
     A chain of the single joints ends at a hub, or at the world, that carries branches and loops; other loops
-    hang on the world.
+    begin at the world.
 
     Args:
         seed: the same seed gives the same mechanism.
         places: kinds and roles (`plumbline.model.features.Place`); one that comes twice gives two joints.
         elements: which of `ELEMENTS` the joints have.
-        is_hub_world: whether branches and loops hang on the world.
+        is_hub_world: whether branches and loops begin at the world.
 
     Returns:
         The mechanism, with all loads, whose loops move, and an assembled state.
@@ -251,18 +251,18 @@ def mechanism_with_places(
         is_base_free = "free" in wanted["single"]
         singles = [kind for kind in wanted["single"] if kind != "free"]
         base = (
-            world.hang(["free" if is_base_free else "ball"])
+            world.attach(["free" if is_base_free else "ball"])
             if singles or is_base_free or not is_hub_world
             else world
         )
-        last = base.hang(singles)
+        last = base.attach(singles)
         if last is world and "weld" in (*wanted["beside"], *wanted["closing"], *wanted["loop"]):
-            last = world.hang(["ball"])
+            last = world.attach(["ball"])
         hub = world if is_hub_world else last
         for kind in wanted["beside"]:
-            (world if kind == "free" else last if kind == "weld" else hub).hang([kind])
+            (world if kind == "free" else last if kind == "weld" else hub).attach([kind])
         if len(hub.children) == 1 and wanted["beside"]:
-            hub.hang(["hinge"])
+            hub.attach(["hinge"])
         rings: list[tuple[_Node, _Node, Kind]] = []
         if wanted["loop"] and not wanted["closing"]:
             wanted["closing"] = ["ball"]
@@ -275,8 +275,8 @@ def mechanism_with_places(
             while freedom < 6 - _freedom(closing) + 2:
                 own.insert(int(rng.integers(len(own) + 1)), "ball")
                 freedom += 3
-            own.sort(key=lambda kind: (kind != "free", kind == "weld"))  # neither hangs where the other may
-            rings.append((foot, (world if "free" in own else foot).hang(own), closing))
+            own.sort(key=lambda kind: (kind != "free", kind == "weld"))  # free bodies first, welds last
+            rings.append((foot, (world if "free" in own else foot).attach(own), closing))
         kinds, far = list[Kind](), list[int]()
         _number(world, kinds, far)
         model = _with_numbers(rng, kinds, far)

@@ -119,7 +119,7 @@ def rods_taken_out(model: Model) -> Rearranged:
 
 
 def _depth_first(above: NDArray[np.intp], first: int | None = None) -> list[int]:
-    """Order bodies by the ones they hang on (−1: the world), branch by branch, one root before all."""
+    """Order bodies by their parents (−1: the world), branch by branch, one root before all."""
     order: list[int] = []
     waiting = [int(k) for k in np.flatnonzero(above < 0)[::-1] if k != first]
     waiting += [] if first is None else [first]

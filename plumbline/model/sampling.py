@@ -135,6 +135,6 @@ def random_loop_states(model: Model, state: State, count: int, seed: int) -> tup
 
 def _own_rate(model: Model) -> float:
     """√(g/ℓ) of the pendulums [rad/s]."""
-    hanging_length = np.linalg.norm(model.proximal, axis=1) + model.length
+    lengths = np.linalg.norm(model.proximal, axis=1) + model.length
     g = max(float(np.linalg.norm(model.gravity)), 1e-3)
-    return float(np.sqrt(g / max(float(np.mean(hanging_length)), 1e-3)))
+    return float(np.sqrt(g / max(float(np.mean(lengths)), 1e-3)))

@@ -128,7 +128,7 @@ def _without_elements(root: Element) -> Iterator[Element]:
 
 
 def _hoisted(root: Element) -> Iterator[Element]:
-    """MJCF: a body replaced by the bodies in it; a fixed link of a URDF by the links that hang on it."""
+    """MJCF: a body replaced by the bodies in it; a fixed link of a URDF by the links below it."""
     order = {id(element): i for i, element in enumerate(root.walk())}
     for parent, index in _paths(root):
         if parent.children[index].tag != "body":

@@ -589,7 +589,7 @@ class BodySequence(SchemaModel):
     def _check_cycle(cls, value: list[Body]) -> list[Body]:
         if any(body.parent is not None or body.joint.kind in ("free", "weld") for body in value):
             raise invalid_value_error(
-                "has a parent, a weld or a free body", "bodies that hang on the one before"
+                "has a parent, a weld or a free body", "bodies whose parent is the one before"
             )
         return value
 

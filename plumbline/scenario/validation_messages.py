@@ -85,7 +85,7 @@ def _kinds(model: type[BaseModel]) -> tuple[str, ...]:
 
 
 def _tags(model: type[BaseModel]) -> tuple[str, ...]:
-    """Names by which pydantic tells the models of a union apart."""
+    """Names that pydantic gives the models of a union."""
     return {Body: ("body",), BodySequence: ("sequence",)}.get(model) or _kinds(model)
 
 

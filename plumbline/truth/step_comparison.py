@@ -264,7 +264,7 @@ class FormulaSteps:
 
         """
         norm, model = np.linalg.norm, self.model
-        kinds, far = model.kind[: model.n], model.body[: model.n, 0]  # of the joints that bodies hang on
+        kinds, far = model.kind[: model.n], model.body[: model.n, 0]  # of the joints of the tree
         path, slides = _paths(far), np.array([_slides(kind) for kind in kinds])
         rate = np.max([np.maximum(norm(s.omega, axis=1), norm(s.udot, axis=1)) for s in ends], axis=0)
         speed = np.max([norm(s.v, axis=1) for s in ends], axis=0)
@@ -285,7 +285,7 @@ class FormulaSteps:
         )
         if self.method.coordinates == "joint rotations":
             axial = self.method.rod_axial_inertia * np.trace(model.inertia, axis1=1, axis2=2)
-            # a body without inertia hangs on no rod, and on none is there a torque
+            # bodies on rods have inertia; of others there is no torque here
             above = above + np.divide(torque, axial, out=np.zeros_like(axial), where=torque > 0)
         leaked, passed = (count * np.minimum(1.0, h * W) * (path @ x) for x in (above, shifted))
         omega = ACCELERATION_FACTOR * h * (turning + leaked) + rounding * W

@@ -153,13 +153,13 @@ class StructuredSystem:
             constant = np.pad(constant, ((0, 0), (0, 6)))
         self.spin_terms, self.moment_terms = last(spin), last(constant)
         self.length = length
-        self.is_linked = np.ones(self.body_count)  # 0 where a body hangs on the pivot
+        self.is_linked = np.ones(self.body_count)  # 0 where a body is attached to the pivot
         self.is_linked[self.first_body[:-1]] = 0
         self.slack = np.where(self.rods, 0, np.inf)  # of d, which may be 0 at a ball
         self.pair_inverse_mass = self.inverse_mass + self._at_parent(self.inverse_mass)  # (M,) 1/kg
         self.child_inverse_mass = self.inverse_mass * self._at_child(
             np.ones(self.body_count)
-        )  # 0 where nothing hangs on a body
+        )  # 0 where nothing is attached to a body
         self.rows_per_joint = 1 if np.all(self.rods) else 3  # c
         self.constant_blocks = np.zeros(
             (2 * self.rows_per_joint**2 + 1, self.body_count)
@@ -189,14 +189,14 @@ class StructuredSystem:
     # -- kinematics ---------------------------------------------------------------------------------
 
     def _at_parent(self, x: Array) -> Array:
-        """(..., M): the value at the body that body k hangs on, 0 for the pivot."""
+        """(..., M): the value at the parent of body k, 0 for the pivot."""
         moved = np.empty_like(x)
         moved[..., 0] = 0
         np.multiply(x[..., :-1], self.is_linked[1:], out=moved[..., 1:])
         return moved
 
     def _at_child(self, x: Array) -> Array:
-        """(..., M): the value at the body that hangs on body k, 0 for the last of a chain."""
+        """(..., M): the value at the child of body k, 0 for the last of a chain."""
         moved = np.empty_like(x)
         moved[..., -1] = 0
         np.multiply(x[..., 1:], self.is_linked[1:], out=moved[..., :-1])

@@ -31,7 +31,7 @@ TIMES = np.linspace(0, 1, 9)
 
 
 def test_stretched_length_is_the_largest_extent_of_each_body():
-    """At least to its centre, at least its radius of gyration; nothing hangs on the last."""
+    """At least to its centre, at least its radius of gyration; nothing is attached to the last."""
     model = pendulums.make_model("rbb").changed(
         mass=np.array([1.0, 2.0, 4.0]),
         inertia=np.array([1e-4, 1e-4, 8.0 * 2 / 3])[:, None, None] * np.eye(3),
@@ -64,7 +64,7 @@ def test_each_perturbed_model_has_one_kind_of_error_of_one_part_in_ten_thousand(
     for (wrong, state), names in zip(found, altered, strict=True):
         for name in model.fields:
             was, now = getattr(model, name), getattr(wrong, name)
-            if name == "distal":  # nothing hangs on the last body
+            if name == "distal":  # nothing is attached to the last body
                 was, now = was[:-1], now[:-1]
             if name not in names:
                 assert np.array_equal(was, now), name
