@@ -33,7 +33,6 @@ from plumbline.scenario.schema import (
     VALID_NAME,
     Articulated,
     Body,
-    BodySequence,
     ClosingRod,
     Document,
     Free,
@@ -290,16 +289,17 @@ def build_scenario(source: YamlSource, path: Path) -> Scenario:
                 "SI numbers of a pendulum",
                 (1, 1),
             )
+    places = list(_written_places(document))
     sizes = np.linalg.norm(model.inertia, axis=(1, 2))
     for body in np.flatnonzero((sizes > 0) & (sizes < MIN_INERTIA)):
         raise source.fatal_error(
             f"has a body, number {body + 1}, with an inertia too small to divide by",
             f"principal moments of 0, or at least {MIN_INERTIA:g} kg m²",
-            source.value_positions.get(("bodies", int(body), "inertia")) or (1, 1),
+            source.position((*places[body], "inertia")),
         )
     turning = motion_without_inertia(model, state)
     if turning is not None:
-        place = source.value_positions.get(("bodies", turning, "inertia")) or (1, 1)
+        place = source.position((*places[turning], "inertia"))
         raise source.fatal_error(
             f"has a body, number {turning + 1}, that can turn without inertia: how fast is not determinate",
             "principal moments above 0, or joints that hold that turn or carry it at a distance",
@@ -364,6 +364,16 @@ def _expand_repeats(document: Document) -> Iterator[tuple[Body, Array]]:
             yield item.cycle[j % len(item.cycle)], turn
 
 
+def _written_places(document: Document) -> Iterator[tuple[PathKey, ...]]:
+    """Where the file has each body of the chain."""
+    for index, item in enumerate(document.bodies):
+        if isinstance(item, Body):
+            yield "bodies", index
+        else:
+            for j in range(item.repeat):
+                yield "bodies", index, "cycle", j % len(item.cycle)
+
+
 def _is_free(item: dict[str, Any]) -> bool:
     joint = item.get("joint")
     return isinstance(joint, dict) and joint.get("kind") == "free"
@@ -371,9 +381,7 @@ def _is_free(item: dict[str, Any]) -> bool:
 
 def _resolve_parents(source: YamlSource, document: Document, bodies: list[Body]) -> list[int]:
     """The far body of each body, −1 the world; refuses parents that do not exist or come too late."""
-    paths: list[tuple[PathKey, ...]] = []
-    for index, item in enumerate(document.bodies):
-        paths += [("bodies", index)] * (item.repeat if isinstance(item, BodySequence) else 1)
+    paths = list(_written_places(document))
     far: list[int] = []
     problems: list[Problem] = []
     for k, body in enumerate(bodies):
