@@ -187,7 +187,10 @@ class _TreeTerms:
             M = np.zeros((n, 6, n, 6))
             M[body, :3, body, :3], M[body, 3:, body, 3:] = masses, self.inertia
             S = np.block([[M.reshape(6 * n, -1) + (J.T * armature) @ J, C.T], [C, np.zeros((len(C),) * 2)]])
-            inverse = self._equilibrated_inverse(S, 1 / np.sqrt(np.max(np.abs(S), axis=1)))
+            sizes = np.max(np.abs(S), axis=1)
+            if not np.all(sizes):  # where the rows of a joint are left out
+                raise np.linalg.LinAlgError("a body can turn without inertia")
+            inverse = self._equilibrated_inverse(S, 1 / np.sqrt(sizes))
             return inverse[: 6 * n], -inverse[6 * n :, 6 * n :]
         M_inverse = np.zeros((n, 6, n, 6))
         M_inverse[body, :3, body, :3] = np.eye(3) / self.model.mass[:, None, None]

@@ -58,6 +58,12 @@ def test_random_errors_of_states_are_diagnosed_without_an_exception(name, quanti
         assert f"{quantity.replace('_', ' ')} are right" not in text
 
 
+@pytest.mark.filterwarnings("error")
+def test_rows_that_hold_a_body_without_inertia_are_no_division_by_zero():
+    """One cause that is tried leaves out the joint that keeps the point mass from turning."""
+    test_random_errors_of_states_are_diagnosed_without_an_exception("point-mass-arm", "acceleration")
+
+
 def steppers():
     """Scenarios whose steps are compared, with the engines that have formulas for them."""
     for name, scenario in catalogue_scenarios().items():
