@@ -12,10 +12,13 @@ from plumbline.cli import options
 from plumbline.cli.console import count_noun, print_table
 from plumbline.engines.registry import ENGINES
 from plumbline.execution.runner import describe_engines
-from plumbline.model.loops import immovable_joints
+from plumbline.execution.scenario_run import NO_REGULAR_POSE
+from plumbline.model.loops import immovable_joints, is_singular, smallest_singular_value
+from plumbline.model.sampling import compared_states
 from plumbline.processes.workers import WorkerPool
 from plumbline.scenario import loader as scenarios
 
+SINGULAR_TRIES = 10  # states that are looked for where the initial pose is singular
 JSON_ONLY = ("purpose", "file")  # columns too long for a terminal
 
 
@@ -66,9 +69,9 @@ def check(files: tuple[Path, ...]) -> None:
     for s in options.read_scenarios(files):
         joints = ", ".join(s.model.kind[:6])
         more = " …" if s.model.n > 6 else ""
-        still = f"; {describe_immovable_joints(s)}" if s.model.has_loops else ""
+        notes = [describe_immovable_joints(s), _describe_singular_pose(s)] if s.model.has_loops else []
         bodies = count_noun(s.model.n, "body", "bodies")
-        click.echo(f"{s.path}: ok: {s.name}, {bodies} ({joints}{more}){still}".removesuffix("; "))
+        click.echo("; ".join([f"{s.path}: ok: {s.name}, {bodies} ({joints}{more})", *filter(None, notes)]))
 
 
 def describe_immovable_joints(s: scenarios.Scenario) -> str:
@@ -86,6 +89,16 @@ def describe_immovable_joints(s: scenarios.Scenario) -> str:
         return "the mechanism cannot move: its loops hold every joint"
     names = [s.body_names[k] if k < n else f"closes[{k - n}]" for k in still]
     return f"the loops hold these joints, which cannot move: {', '.join(names)}"
+
+
+def _describe_singular_pose(s: scenarios.Scenario) -> str:
+    if not is_singular(smallest_singular_value(s.model, s.state)):
+        return ""
+    if compared_states(s.model, s.state, s.seed, SINGULAR_TRIES):
+        return (
+            "at t = 0 the pose is singular, as at a dead point: states at other poses are compared, no motion"
+        )
+    return f"nothing can be compared: {NO_REGULAR_POSE}"
 
 
 @click.command()

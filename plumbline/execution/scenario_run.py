@@ -52,13 +52,10 @@ _LEVELS: dict[TaskKind, Level] = {
     TaskKind.TRAJECTORY: "trajectory",
     TaskKind.LONG_RUN: "invariants",
 }
-
-
-# What of a scenario may be left out, by the level of the row that reports it.
-_GAP_LEVELS: dict[TaskKind, Level] = {
-    TaskKind.STEP: "step", TaskKind.TRAJECTORY: "trajectory", TaskKind.RELATIONS: "relations",
-    TaskKind.LONG_RUN: "invariants",
-}  # fmt: skip
+NO_REGULAR_POSE = (
+    "every pose that the loops allow is singular, as of a truss with its bars in one line: forces have no "
+    "unique values"
+)
 
 
 @dataclass(frozen=True)
@@ -128,17 +125,19 @@ class ScenarioRun:
             self._left_out |= dict.fromkeys(
                 (TaskKind.MOTION_TRUTH, TaskKind.TRAJECTORY, TaskKind.STEP, TaskKind.LONG_RUN), singular
             )
-        every = list(task_keys(scenario.name, engines, levels, has_long_runs))
-        self._keys = [key for key in every if key.kind not in self._left_out]
-        self._gaps = dict.fromkeys((key.engine, key.kind) for key in every if key.kind in _GAP_LEVELS)
-        self._pending = set(self._keys)  # without an outcome
-        self._findings: dict[TaskKey, JudgingResult] = {}
-        self._has_retried_truth = False
-        self._packed_truths: dict[TaskKind, Packed] = {}  # for judges and diagnoses in workers
         count = plan.random_state_count
         has_few_states = is_random or scenario.level == "state"
         count = min(count, STATES_PER_RANDOM_SCENARIO) if has_few_states else count
         self._states = self._compared_states(count)  # argument of many tasks
+        if loops and not self._states.load():
+            self._left_out |= dict.fromkeys((TaskKind.STATE_TRUTH, *_LEVELS), NO_REGULAR_POSE)
+        every = list(task_keys(scenario.name, engines, levels, has_long_runs))
+        self._keys = [key for key in every if key.kind not in self._left_out]
+        self._gaps = dict.fromkeys((key.engine, key.kind) for key in every if key.kind in _LEVELS)
+        self._pending = set(self._keys)  # without an outcome
+        self._findings: dict[TaskKey, JudgingResult] = {}
+        self._has_retried_truth = False
+        self._packed_truths: dict[TaskKind, Packed] = {}  # for judges and diagnoses in workers
 
     def _compared_states(self, count: int) -> EncodedRecord:
         """Draw the states that are compared, which takes long for loops; named scenarios keep them."""
@@ -211,7 +210,7 @@ class ScenarioRun:
                 if engine == name and kind in self._left_out:
                     reason = f"not compared: {self._left_out[kind]}"
                     row = self._context(name).make_row
-                    found.rows.append(row(_GAP_LEVELS[kind], "-", "all", Verdict.INFORMATION, reason))
+                    found.rows.append(row(_LEVELS[kind], "-", "all", Verdict.INFORMATION, reason))
         found.rows = outlier.annotate_outliers(found.rows)
         return found
 

@@ -15,6 +15,7 @@ from plumbline.model.loops import (
     cut_open,
     displaced,
     is_singular,
+    regular_rank,
     singular_values,
     smallest_singular_value,
     with_rates,
@@ -23,6 +24,7 @@ from plumbline.model.loops import (
 MIN_SAMPLED_SINGULAR_VALUE = 1e-2  # of a loop's rows: nearer to a singular pose bounds are loose
 STEPS_BETWEEN, STEP_SIZE = 2, 0.5  # random steps between two states of a loop [rad, m]
 MAX_DRAWS = 10  # draws per state that is wanted
+MAX_FIRST_DRAWS = 100  # draws of the first state: a mechanism without regular poses is given up
 CLOSED = 1e-12  # gap of a loop that Newton's method has closed [m, rad]
 
 
@@ -113,9 +115,9 @@ def random_loop_states(model: Model, state: State, count: int, seed: int) -> tup
     """
     rng, own_rate = np.random.default_rng(seed), _own_rate(model)
     cut = cut_open(model)
-    found, here, rank = list[State](), cut.state(state), 0
-    for _ in range(MAX_DRAWS * count):
-        if len(found) == count:
+    found, here, rank = list[State](), cut.state(state), regular_rank(model, state)
+    for draw in range(MAX_DRAWS * count):
+        if len(found) == count or (draw == MAX_FIRST_DRAWS and not found):
             break
         for _ in range(STEPS_BETWEEN):
             step = closed_rates(cut, here, STEP_SIZE * rng.normal(size=rate_count(cut.model)))

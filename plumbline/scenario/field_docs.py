@@ -88,7 +88,8 @@ Joints beyond those of the tree close loops. This is a slider-crank: a crank on 
 its end, and a slider that moves along x and on which the rod's other end is held. Of the rates only the
 crank's is given, the others follow. States, single steps, motions, long runs and relations of loops are
 compared; a motion or long run that comes to a singular pose is compared up to it, and `plumbline check`
-names the joints that the loops keep from moving:
+names the joints that the loops keep from moving, and says where every pose is singular, so that nothing can
+be compared:
 
 ```yaml
 schema_version: 1

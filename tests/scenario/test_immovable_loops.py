@@ -1,5 +1,6 @@
 """Loops that cannot move: `check` names them, sampled rates are exactly 0, and no engine disagrees."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from click.testing import CliRunner
 
 from plumbline.cli.main import main
 from plumbline.engines.calls import evaluate_states
+from plumbline.execution.exit_codes import ExitCode
 from plumbline.judging.rows import RowContext
 from plumbline.judging.state import judge_states
 from plumbline.model.loops import immovable_joints
@@ -65,6 +67,9 @@ TEXTS = {
     "bob beside truss": TRUSS.replace("closes:\n", BOB.replace("PARENT", "world")),
     "carts": CARTS,
 }
+FLAT = TRUSS.replace("[0, 0, -0.5], distal: [0, 0, 0.5]", "[-0.5, 0, 0], distal: [0.5, 0, 0]").replace(
+    "anchor: [1, 0, 1], proximal: [0, 0, 0.5]", "anchor: [2, 0, 0], proximal: [0.5, 0, 0]"
+)
 STILL = {"truss": [0, 1, 2], "bricard held": list(range(6)), "carts": [2]}
 
 
@@ -124,3 +129,20 @@ def test_check_names_what_cannot_move(tmp_path, monkeypatch):
     first, second = done.output.splitlines()
     assert first.endswith("; the mechanism cannot move: its loops hold every joint")
     assert second.endswith("; the loops hold these joints, which cannot move: left, right, closes[0]")
+
+
+@pytest.mark.timeout(300)
+def test_a_truss_with_its_bars_in_one_line_is_not_compared(tmp_path, monkeypatch):
+    """Its rows allow a rate, but no motion: neither a false "harness failed", nor green."""
+    monkeypatch.chdir(tmp_path)
+    Path("flat.yaml").write_text(FLAT)
+    done = CliRunner().invoke(main, ["check", "flat.yaml", str(find_scenario_file("four-bars-2-flat"))])
+    flat, dead_point = done.output.splitlines()
+    assert "; nothing can be compared: every pose that the loops allow is singular" in flat
+    assert "; at t = 0 the pose is singular, as at a dead point: states at other poses are" in dead_point
+    ran = CliRunner().invoke(main, ["run", "flat.yaml", "--engine", "mujoco", "--jobs", "1", "--out", "out"])
+    assert ran.exit_code == ExitCode.DISAGREEMENT, ran.output
+    assert "0 independent checks: 4 are information, nothing was compared" in ran.output
+    rows = json.loads(Path("out/results.json").read_text())["rows"]
+    assert {row["level"] for row in rows} == {"state", "step", "trajectory", "relations"}
+    assert all("every pose that the loops allow is singular" in row["reason"] for row in rows)
