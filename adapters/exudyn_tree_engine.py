@@ -378,9 +378,8 @@ class _KinematicTree:
         for group in self.revolute_groups:
             middle = angles[group.first_angle + 1]
             if cos(middle) < MIN_COS_MIDDLE_ANGLE:
-                what = "rod" if group.angle_count == 2 else "ball joint"
                 raise Unsupported(
-                    f"the angles of the {what} of body {group.body + 1} come near their singularity at "
+                    f"the angles of body {group.body + 1} come near their singularity at "
                     f"t = {t:.6g} s (middle angle {np.degrees(remainder(middle, tau)):.1f}°)",
                     "angles",
                 )

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import glob
 import shlex
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +51,11 @@ _TEXT_FIELDS = (
 ScenarioTables = dict[str, dict[str, Columns]]  # by table, then scenario
 
 
+@cache
+def _catalogue_files() -> frozenset[str]:
+    return frozenset(path.name for path in CATALOGUE_FOLDER.glob("*/*"))
+
+
 def rerun_command(row: Record, scenario: Record) -> str:
     """Return the command that repeats one cell, in a folder of its own: the run that it explains is kept.
 
@@ -62,7 +67,7 @@ def rerun_command(row: Record, scenario: Record) -> str:
 
     """
     file = str(scenario.get("file") or "")
-    ours = not file or ("/" not in file and any(CATALOGUE_FOLDER.glob(f"*/{glob.escape(file)}")))
+    ours = not file or file in _catalogue_files()
     what = row["scenario"] if ours else file
     words = ["python", "-m", "plumbline", "run", "--engine", row["engine"]]
     if _is_long_run(row):

@@ -18,6 +18,7 @@ import numpy as np
 
 from plumbline.engines.answers import check_declarations, check_evaluation, check_record, check_version
 from plumbline.model.datatypes import (
+    KINDS,
     Array,
     BadInput,
     EngineFailure,
@@ -58,7 +59,7 @@ MODEL_GAPS: Mapping[str, Callable[[Model], bool]] = {
     "universal springs": lambda model: _has_elements(model, "universal", "stiffness"),
     "point masses": lambda model: model.lacks_inertia,
     "bodies": lambda model: model.n > 1,
-    "angles": lambda model: not {"rod", "ball"}.isdisjoint(model.kind),
+    "angles": lambda model: any(KINDS[kind].has_attitude for kind in model.kind),
 }
 PARTIAL_GAPS = {"bodies", "angles"}  # of some such mechanisms, which the adapter refuses itself
 

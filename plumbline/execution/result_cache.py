@@ -172,15 +172,13 @@ def _decode_outcome(task: Task, body: bytes) -> Outcome:
     if len(body) < _SIZE.size:
         raise UnfitRecord("too short")
     end = _SIZE.size + _SIZE.unpack_from(body)[0]
-    answer = (
-        EncodedRecord(body[_SIZE.size : end], _returned_type(task.function)) if end > _SIZE.size else None
-    )
-    hint = _returned_type(task.judge) if task.judge else None
+    answer = EncodedRecord(body[_SIZE.size : end], returned_type(task.function)) if end > _SIZE.size else None
+    hint = returned_type(task.judge) if task.judge else None
     cost, judged = decode_record(body[end:], tuple[float, hint])  # type: ignore[valid-type]
     if answer is None and (task.judge is None or task.needs_answer is None or task.needs_answer(judged)):
         raise UnfitRecord("there is no answer")
     if answer is not None:
-        answer.load()
+        answer.check()
     if isinstance(judged, JudgingResult) and not all(map(_is_table, judged.tables)):
         raise UnfitRecord("columns of a table differ in length")
     return Outcome(task.key, answer, cpu_time=cost, judge_result=judged, is_cached=True)
@@ -191,7 +189,7 @@ def _is_table(table: tuple[str, dict[str, Any]]) -> bool:
 
 
 @cache
-def _returned_type(function: Callable[..., Any]) -> Any:
+def returned_type(function: Callable[..., Any]) -> Any:
     """The type that a function is annotated to return; other annotations need not be known at run time."""
     returned = types.SimpleNamespace(__annotations__={"return": function.__annotations__.get("return")})
     return get_type_hints(returned, function.__globals__)["return"]

@@ -21,6 +21,7 @@ from plumbline.execution.plan import (
     scenario_level,
     task_keys,
 )
+from plumbline.execution.result_cache import returned_type
 from plumbline.judging import outlier, relation_rows
 from plumbline.judging.known_issues import KnownIssues
 from plumbline.judging.long_runs import judge_long_runs
@@ -115,8 +116,10 @@ class ScenarioRun:
         levels = scenario_level(scenario, level or (plan.random_level if is_random else plan.level))
         has_long_runs = plan.long_run_seconds > 0 and not is_random
         # how near the initial pose is to a singular one
-        loops = scenario.model.has_loops
-        self._singular_value = smallest_singular_value(scenario.model, scenario.state) if loops else np.inf
+        self._singular_value = np.inf
+        if scenario.model.has_loops:
+            arguments = scenario.model, scenario.state
+            self._singular_value = self._kept("singular value", smallest_singular_value, *arguments).load()
         self._left_out = uncompared_kinds(scenario.model)
         if self._singular_value < MIN_MOTION_SINGULAR_VALUE:
             singular = (
@@ -129,7 +132,7 @@ class ScenarioRun:
         has_few_states = is_random or scenario.level == "state"
         count = min(count, STATES_PER_RANDOM_SCENARIO) if has_few_states else count
         self._states = self._compared_states(count)  # argument of many tasks
-        if loops and not self._states.load():
+        if scenario.model.has_loops and not self._states.load():
             self._left_out |= dict.fromkeys((TaskKind.STATE_TRUTH, *_LEVELS), NO_REGULAR_POSE)
         every = list(task_keys(scenario.name, engines, levels, has_long_runs))
         self._keys = [key for key in every if key.kind not in self._left_out]
@@ -140,15 +143,20 @@ class ScenarioRun:
         self._packed_truths: dict[TaskKind, Packed] = {}  # for judges and diagnoses in workers
 
     def _compared_states(self, count: int) -> EncodedRecord:
-        """Draw the states that are compared, which takes long for loops; named scenarios keep them."""
-        s, cache = self.scenario, self._plan.result_cache
-        task = Task(("states", s.name), compared_states, (s.model, s.state, s.seed, count))
+        """Draw the states that are compared."""
+        s = self.scenario
+        return self._kept("states", compared_states, s.model, s.state, s.seed, count)
+
+    def _kept(self, what: str, function: Callable[..., Any], *arguments: Any) -> EncodedRecord:
+        """Call a function that takes long for loops; named scenarios keep its value."""
+        cache = self._plan.result_cache
+        task = Task((what, self.scenario.name), function, arguments)
         if not self._is_random and (known := cache.get(task)):
             return known.raw_value  # type: ignore[no-any-return]
-        states = compared_states(*task.arguments)
+        value = function(*arguments)
         if not self._is_random:
-            cache.put(task, Outcome(task.key, states))
-        return EncodedRecord.of(states, list[State])
+            cache.put(task, Outcome(task.key, value))
+        return EncodedRecord.of(value, returned_type(function))
 
     @cached_property
     def _step_states(self) -> list[State]:

@@ -39,16 +39,25 @@ class EncodedRecord:
     def of(cls, value: Any, hint: Any) -> EncodedRecord:
         """Encode a value; raise `UnfitRecord` where it is not of the type ``hint``."""
         record = cls(encode_record(value), hint)
-        record.load()
+        record.check()
         return record
+
+    def __reduce__(self) -> tuple[type[EncodedRecord], tuple[bytes, Any]]:
+        return type(self), (self.data, self.hint)
 
     @cached_property
     def digest(self) -> bytes:
         """SHA-256 of the bytes, which are the same for equal values."""
         return hashlib.sha256(self.data).digest()
 
+    def check(self) -> None:
+        """Decode the record, for the next `load`; raise `UnfitRecord` where it is not of its type."""
+        vars(self)["_decoded"] = [decode_record(self.data, self.hint)]
+
     def load(self) -> Any:
         """Decode the record; the value is a new copy."""
+        for decoded in vars(self).pop("_decoded", ()):
+            return decoded
         return decode_record(self.data, self.hint)
 
 

@@ -17,6 +17,7 @@ from plumbline.model.kinematics import joint_vectors, state_from_minimal
 from plumbline.reproduce.engine_client import EngineClient
 from plumbline.reproduce.measure import StepMeasure
 from plumbline.reproduce.shrink import ReproductionCase
+from plumbline.scenario.loader import find_scenario_file, load_scenario
 from tests.helpers import newton_euler, pendulums
 from tests.helpers.refinement import extrapolated, observed_orders
 
@@ -139,6 +140,14 @@ def test_the_tree_reports_singular_angles():
     run = ExudynTree().simulate(subject, start, before, "RK44", 2.0**-11)
     true = newton_euler.integrate(subject, start, before)[-1]
     assert np.abs(np.abs(run.p[-1] @ true.p.T) - 1).max() < 1e-10
+
+
+def test_the_tree_reports_singular_angles_of_a_free_body():
+    """Three revolutes carry a free body as well: its refusal is one that the column declares."""
+    s = load_scenario(find_scenario_file("spring-pendulum"))
+    with pytest.raises(Unsupported, match=r"body 1 come near their singularity") as reported:
+        ExudynTree().simulate(s.model, s.state, s.times, "RK44", 2.0**-11)
+    assert reported.value.gap == "angles"
 
 
 def test_tree_turns_for_ever_about_its_first_axis():

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-import scipy
 
 from plumbline.model.datatypes import Array, Model, State
 from plumbline.model.kinematics import quaternion_conjugate, quaternion_product
@@ -66,7 +65,7 @@ def torque_free_attitude(inertia: Array, p: Array, omega: Array) -> Callable[[Ar
         ClosedFormMismatch: the motion is exactly on the separatrix.
 
     """
-    moments, axes = scipy.linalg.eigh(inertia)
+    moments, axes = np.linalg.eigh(inertia)
     w = axes.T @ omega
     gap = (
         moments[2] * (moments[2] - moments[1]) * w[2] ** 2
