@@ -66,8 +66,12 @@ class _Floats:
         return x[..., row : row + 1, column : column + 1]
 
     def from_rows(self, rows: Sequence[Sequence[Any]]) -> Any:
-        entries = iter(np.broadcast_arrays(*(x for row in rows for x in row)))
-        return np.concatenate([np.concatenate([next(entries) for _ in row], -1) for row in rows], -2)
+        lead = np.broadcast_shapes(*(x.shape[:-2] for row in rows for x in row))
+        out = np.empty((*lead, len(rows), len(rows[0])), self.dtype)
+        for i, row in enumerate(rows):
+            for j, x in enumerate(row):
+                out[..., i, j] = x[..., 0, 0]
+        return out
 
     def columns(self, vectors: Sequence[Any]) -> Any:
         return np.concatenate(np.broadcast_arrays(*vectors), -1)

@@ -49,6 +49,9 @@ class Solution:
     turning: list[Any]  # angular acceleration
     force: list[Any]  # of joint k on body k
     moment: list[Any]  # the same about the near point; None where it is exactly 0
+    # of each joint's blocks: ẍ of one motion, α of the body, a of a free point, or of the near end of a rod
+    # what it has more than the far end
+    rates: list[list[Any]]
 
     def combined(self, combine: Callable[[Any], Any]) -> Solution:
         """Apply one function to every vector.
@@ -57,30 +60,36 @@ class Solution:
             combine: of a matrix with a column per wrench, to a vector.
 
         """
-        return Solution(*([x if x is None else combine(x) for x in rows] for rows in vars(self).values()))
+        vectors = {name: rows for name, rows in vars(self).items() if name != "rates"}
+        found = {name: [x if x is None else combine(x) for x in rows] for name, rows in vectors.items()}
+        return Solution(**found, rates=[[combine(x) for x in blocks] for blocks in self.rates])
 
 
 class _Swing:
-    """The near point moves on a sphere: uᵀa = uᵀa_far − ℓ u̇², F along u."""
+    """The near point moves on a sphere: uᵀa = uᵀa_far − ℓ u̇², F along u but for what a spinning rod holds."""
 
     armature = None
 
-    def __init__(self, num: Arithmetic, u: Any, pull: Any, length: Any) -> None:
+    def __init__(self, num: Arithmetic, u: Any, pull: Any, length: Any, across: Any) -> None:
         self.num, self.u, self.pull, self.length = num, u, num.from_rows([[pull]]), length
+        self.across = across
 
     def reduce(self, x: Articulated) -> Articulated:
         num = self.num
-        self.f, self.inverse = x.f, num.inverse(x.c)
+        across = None if self.across is None else num.widened(self.across, x.f)
+        self.f, self.inverse = x.f if across is None else x.f - across, num.inverse(x.c)
         self.w = num.mul(self.inverse, self.u)
         self.size = 1 / num.dot(self.u, self.w)
-        self.push = num.widened(self.pull, x.f) + num.mul(num.transpose(self.w), x.f)
+        self.push = num.widened(self.pull, x.f) + num.mul(num.transpose(self.w), self.f)
         c = num.mul(self.u, num.transpose(self.u)) * self.size
-        return Articulated(c, None, None, num.mul(self.u, self.push * self.size), None)
+        f = num.mul(self.u, self.push * self.size)
+        return Articulated(c, None, None, f if across is None else f + across, None)
 
-    def advance(self, a: Any, alpha: Any) -> tuple[Any, Any]:
+    def advance(self, a: Any, alpha: Any) -> tuple[Any, Any, Any]:
         num = self.num
         tension = (num.mul(num.transpose(self.u), a) + self.push) * self.size
-        return num.mul(self.inverse, num.mul(self.u, tension) - self.f), alpha
+        near = num.mul(self.inverse, num.mul(self.u, tension) - self.f)
+        return near, alpha, near - a
 
 
 class _Slides:
@@ -95,9 +104,9 @@ class _Slides:
         self.x = x
         return Articulated(self.num.matrix(np.zeros((3, 3))), None, None, x.f * self.num.scalar(0.0), None)
 
-    def advance(self, a: Any, alpha: Any) -> tuple[Any, Any]:
-        num = self.num
-        return num.mul(num.inverse(self.x.c), -self.x.f), alpha
+    def advance(self, a: Any, alpha: Any) -> tuple[Any, Any, Any]:
+        near = self.num.mul(self.num.inverse(self.x.c), -self.x.f)
+        return near, alpha, near
 
 
 class _Turns:
@@ -121,10 +130,11 @@ class _Turns:
         n = n if effort is None else n + effort
         return Articulated(c, gain * a, num.matrix(np.eye(3)) * a - self.inverse * (a * a), f, n)
 
-    def advance(self, a: Any, alpha: Any) -> tuple[Any, Any]:
+    def advance(self, a: Any, alpha: Any) -> tuple[Any, Any, Any]:
         num = self.num
         push = self.push - num.mul(num.transpose(self.b), a)
-        return a, num.mul(self.inverse, push if self.armature is None else push + alpha * self.armature)
+        turning = num.mul(self.inverse, push if self.armature is None else push + alpha * self.armature)
+        return a, turning, turning
 
 
 class _Single:
@@ -151,11 +161,12 @@ class _Single:
             x.n + num.mul(v, q),
         )
 
-    def advance(self, a: Any, alpha: Any) -> tuple[Any, Any]:
+    def advance(self, a: Any, alpha: Any) -> tuple[Any, Any, Any]:
         num = self.num
         U, V = num.transpose(self.U), num.transpose(self.V)
-        gained = num.mul(self.axis, (self.push - num.mul(U, a) - num.mul(V, alpha)) * self.inverse)
-        return (a, alpha + gained) if self.turns else (a + gained, alpha)
+        rate = (self.push - num.mul(U, a) - num.mul(V, alpha)) * self.inverse
+        gained = num.mul(self.axis, rate)
+        return (a, alpha + gained, rate) if self.turns else (a + gained, alpha, rate)
 
 
 class Tree:
@@ -241,7 +252,7 @@ class Tree:
                 u, udot = self.rod_direction(k)
                 ell = num.scalar(model.length[..., k])
                 P, v = P + u * ell, v + udot * ell
-                blocks.append(_Swing(num, u, -(ell * num.dot(udot, udot)), ell))
+                blocks.append(_Swing(num, u, -(ell * num.dot(udot, udot)), ell, self.force_across(k)))
             elif kind.holds_nothing:
                 P, v = self.free_point(k)
                 blocks.append(_Slides(num))
@@ -313,6 +324,15 @@ class Tree:
         u = u * (1 / num.sqrt(num.dot(u, u)))
         return u, udot - u * num.dot(u, udot)
 
+    def force_across(self, k: int) -> Any:
+        """Return the force across rod k on its body, which a rod without inertia has not.
+
+        Returns:
+            A vector, or None.
+
+        """
+        return None
+
     def _move(self, k: int, above: Any, P: Any, v: Any, w: Any, arm: Any, bend: Any) -> tuple[Any, ...]:
         """Go along the scalar motions of joint k."""
         num, model = self.num, self.model
@@ -323,7 +343,7 @@ class Tree:
             unit = num.vector(np.eye(3)[number])
             axis = num.mul(A, unit)
             effort, armature = num.scalar(0.0), None
-            if np.any([getattr(model, name)[..., k, i] for name in elements]):
+            if any(np.any(getattr(model, name)[..., k, i]) for name in elements):
                 a, d, stiffness, rest, push = (
                     num.scalar(getattr(model, name)[..., k, i]) for name in elements
                 )
@@ -356,7 +376,7 @@ class Tree:
         """Moment of spring and damper of a joint with all turns, and its rotor; None where there is none."""
         num, model = self.num, self.model
         numbers = [getattr(model, name)[..., k, 0] for name in ("armature", "damping", "stiffness")]
-        if not np.any(numbers):
+        if not any(np.any(x) for x in numbers):
             return None, None
         a, damping, stiffness = (num.scalar(x) for x in numbers)
         effort = -spin * damping
@@ -484,6 +504,7 @@ class Tree:
             if self.far[k] >= 0:
                 total[self.far[k]] = self._carry(k, x, total[self.far[k]])
         acceleration, turning, forces, moments = list[Any](), list[Any](), list[Any](), list[Any]()
+        rates: list[list[Any]] = [[] for _ in range(n)]
         at: list[Any] = []  # accelerations of the near points
         for k in range(n):
             far, x = self.far[k], carried[k]
@@ -496,7 +517,8 @@ class Tree:
                 force = force + num.mul(x.b, alpha)
                 moment = num.mul(num.transpose(x.b), a) + num.mul(x.i, alpha) + x.n
             for block in self.blocks[k]:
-                a, alpha = block.advance(a, alpha)
+                a, alpha, rate = block.advance(a, alpha)
+                rates[k].append(rate)
             at.append(a)
             turning.append(alpha)
             forces.append(force)
@@ -504,7 +526,7 @@ class Tree:
             w, s = self.w[k], self.near[k]
             swing = num.widened(num.cross(w, num.cross(w, s)), a)
             acceleration.append(a + num.mul(num.cross_matrix(s), alpha) - swing)
-        return Solution(acceleration, turning, forces, moments)
+        return Solution(acceleration, turning, forces, moments, rates)
 
     def _carry(self, k: int, x: Articulated, far: Articulated) -> Articulated:
         """Add to the far body what joint k and all beyond need of it."""

@@ -40,8 +40,8 @@ from plumbline.model.loops import RANK_TOLERANCE, cut_open
 from plumbline.model.sampling import derive_seed
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod, StepMethod
 from plumbline.truth.ground_truth import stretched_length
-from plumbline.truth.link_tree import LinkStates
 from plumbline.truth.rounding_bound import EPS, RoundingBound, remembered_rounding_bound
+from plumbline.truth.step_charts import BodyStates
 from plumbline.truth.step_formulas import (
     constrained_quadrature,
     constrained_residual,
@@ -333,8 +333,8 @@ def _slides(kind: Kind) -> bool:
     return kind == "free" or any(what == "slide" for what, _ in KINDS[kind].motions)
 
 
-def _pick(links: LinkStates, i: int) -> LinkStates:
-    return LinkStates(*(getattr(links, name)[i] for name in LinkStates.__match_args__))
+def _pick(links: BodyStates, i: int) -> BodyStates:
+    return BodyStates(*(getattr(links, name)[i] for name in BodyStates.__match_args__))
 
 
 def _disturbed(model: Model, state: State, bound: RoundingBound) -> State:
@@ -350,7 +350,7 @@ def _disturbed(model: Model, state: State, bound: RoundingBound) -> State:
     return complete_state(model, replace(state, omega=omega, xdot=xdot, v=v))
 
 
-def _separation(links: LinkStates, i: int, count: int, weights: dict[str, Array]) -> float:
+def _separation(links: BodyStates, i: int, count: int, weights: dict[str, Array]) -> float:
     """How far the motion nearby is from motion i of ``count``, in units of the bounds of a step."""
     found = []
     for name, quantity in (("omega", "step_rate"), ("v", "step_velocity")):
@@ -361,12 +361,12 @@ def _separation(links: LinkStates, i: int, count: int, weights: dict[str, Array]
     return float(np.max(found))
 
 
-def _rounded(links: LinkStates) -> State:
+def _rounded(links: BodyStates) -> State:
     names = ("p", "omega", "u", "udot", "r", "v", "x", "xdot")
     return State(*(np.asarray(getattr(links, name), float) for name in names))
 
 
-def _differences(true: LinkStates, run: StepRun, count: int) -> dict[str, Array]:
+def _differences(true: BodyStates, run: StepRun, count: int) -> dict[str, Array]:
     """Differences (N, ·) per body; of attitudes twice those of quaternions as they are, not normalised."""
     t = run.trajectory
     p = t.p[count].astype(np.longdouble)
@@ -380,7 +380,7 @@ def _differences(true: LinkStates, run: StepRun, count: int) -> dict[str, Array]
     return {name: np.asarray(a - b, float) for name, (a, b) in pairs.items()}
 
 
-def _errors(true: LinkStates, run: StepRun, count: int) -> dict[str, Array]:
+def _errors(true: BodyStates, run: StepRun, count: int) -> dict[str, Array]:
     """Sizes (N,) of the differences."""
     found = _differences(true, run, count)
     return {name: np.linalg.norm(difference, axis=-1) for name, difference in found.items()}

@@ -1,7 +1,7 @@
 """One step of a declared method, computed from its formula in extended precision (x87 long double).
 
-Joint-space methods: the accelerations at the states that a step visits come from `link_tree`; nothing is
-shared with an engine, the reference or the certified truth.
+Joint-space methods: the accelerations at the states that a step visits come from `step_charts`; nothing is
+shared with an engine or the reference.
 Constrained methods are not solved: their quadrature and their equations are evaluated at the engine's answer.
 docs/integrators.md states every formula with its source.
 
@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from plumbline.model.datatypes import Model, State, StepRun
 from plumbline.model.kinematics import cross, cross_matrix, quaternion_product, rotate_vectors
 from plumbline.model.step_methods import ConstrainedMethod, JointSpaceMethod
-from plumbline.truth.closed_tree import ClosedTree
-from plumbline.truth.link_tree import LinkStates, LinkTree, LongDouble
+from plumbline.truth.step_charts import BodyStates, LongDouble, StepCharts
 
 Array = NDArray[Any]  # in this module of extended precision, where nothing else is stated
 Coordinates = list[Array]
@@ -35,7 +34,7 @@ def joint_space_steps(
     method: JointSpaceMethod,
     count: int,
     angle_axes: Sequence[Array | None],
-) -> list[LinkStates]:
+) -> list[BodyStates]:
     """Take steps of a declared method from each state.
 
     Args:
@@ -47,7 +46,7 @@ def joint_space_steps(
         singularity.
 
     """
-    tree = (_ReusingTree if method.reuses_acceleration else ClosedTree)(model, method, states, angle_axes)
+    tree = (_ReusingCharts if method.reuses_acceleration else StepCharts)(model, method, states, angle_axes)
     q, v = tree.start()
     h = np.array(steps, LongDouble)[:, None] * LongDouble(method.step_factor) / method.substeps
     found = [tree.bodies(q, v)]
@@ -70,7 +69,7 @@ def fastest_rates(model: Model, states: Sequence[State], iterations: int = 12) -
         (B,) [1/s].
 
     """
-    system = ClosedTree(model, JointSpaceMethod("Runge-Kutta", "joint rotations"), states)
+    system = StepCharts(model, JointSpaceMethod("Runge-Kutta", "joint rotations"), states)
     q, v = system.start()
     a = system.acceleration(q, v)
     rng = np.random.default_rng(0)
@@ -91,7 +90,7 @@ def fastest_rates(model: Model, states: Sequence[State], iterations: int = 12) -
     return np.asarray(np.exp(np.mean(later, axis=0)).ravel())
 
 
-class _ReusingTree(ClosedTree):
+class _ReusingCharts(StepCharts):
     """A tree whose first acceleration in a step is the last one of the step before, at an older state."""
 
     last: Array | None = None
@@ -107,7 +106,7 @@ class _ReusingTree(ClosedTree):
 
 
 def _semi_implicit_euler(
-    system: LinkTree, method: JointSpaceMethod, q: Coordinates, v: Array, h: Array
+    system: StepCharts, method: JointSpaceMethod, q: Coordinates, v: Array, h: Array
 ) -> tuple[Coordinates, Array]:
     if method.implicit_forces == "none":
         new = v + h * system.acceleration(q, v)
@@ -122,14 +121,14 @@ def _semi_implicit_euler(
 
 
 def _positions_first(
-    system: LinkTree, method: JointSpaceMethod, q: Coordinates, v: Array, h: Array
+    system: StepCharts, method: JointSpaceMethod, q: Coordinates, v: Array, h: Array
 ) -> tuple[Coordinates, Array]:
     q = system.move(q, h * v)
     return q, v + h * system.acceleration(q, v)
 
 
 def _velocity_verlet(
-    system: LinkTree, method: JointSpaceMethod, q: Coordinates, v: Array, h: Array
+    system: StepCharts, method: JointSpaceMethod, q: Coordinates, v: Array, h: Array
 ) -> tuple[Coordinates, Array]:
     a = system.acceleration(q, v)
     q = system.move(q, h * v + h * h * a / 2)
@@ -137,7 +136,7 @@ def _velocity_verlet(
 
 
 def _runge_kutta(
-    system: LinkTree, method: JointSpaceMethod, q: Coordinates, v: Array, h: Array
+    system: StepCharts, method: JointSpaceMethod, q: Coordinates, v: Array, h: Array
 ) -> tuple[Coordinates, Array]:
     rates: list[Array] = []
     accelerations: list[Array] = []
@@ -290,7 +289,7 @@ def first_coordinate_acceleration(model: Model, state: State) -> Array:
         (N, 7) m/s² and 1/s², extended precision.
 
     """
-    tree = ClosedTree(model, JointSpaceMethod("Runge-Kutta", "joint rotations"), [state])
+    tree = StepCharts(model, JointSpaceMethod("Runge-Kutta", "joint rotations"), [state])
     (acceleration,), (turning,) = tree.body_accelerations()
     here = tree.bodies(*tree.start())
 

@@ -24,8 +24,7 @@ from plumbline.scenario.generator import RandomScenarios, random_scenario
 from plumbline.scenario.loader import find_scenario_file, load_scenario
 from plumbline.truth import step_formulas
 from plumbline.truth.certified import certify_state
-from plumbline.truth.closed_tree import ClosedTree
-from plumbline.truth.link_tree import LinkTree
+from plumbline.truth.step_charts import StepCharts
 from plumbline.truth.step_comparison import step_counts
 from tests.helpers import pendulums
 from tests.helpers.nightly_tests import SLOW, some_fast
@@ -93,7 +92,7 @@ def test_accelerations_equal_the_certified_ones(joints):
     scale = np.max(np.abs(true.acceleration))
     np.testing.assert_allclose(found[:, :3].astype(float), true.acceleration, rtol=0, atol=4e-16 * scale)
     method = JointSpaceMethod("Runge-Kutta", "joint rotations", 0.2)
-    alpha = LinkTree(model, method, states[:1]).body_accelerations()[1][0]
+    alpha = StepCharts(model, method, states[:1]).body_accelerations()[1][0]
     scale = np.max(np.abs(true.angular_acceleration))
     np.testing.assert_allclose(alpha.astype(float), true.angular_acceleration, rtol=0, atol=4e-16 * scale)
 
@@ -243,7 +242,7 @@ def test_accelerations_of_trees_equal_the_certified_ones(seed, free, kinds):
     model = random_tree(np.random.default_rng(seed), 7, kinds, elements=ELEMENTS)
     states = random_states(model, 2, seed=5)
     method = JointSpaceMethod("Runge-Kutta", "joint rotations", 0.2, free_coordinates=free)
-    links = LinkTree(model, method, states)
+    links = StepCharts(model, method, states)
     start = links.bodies(*links.start())
     for i, state in enumerate(states):
         true = certify_state(model, state).quantities
@@ -334,9 +333,9 @@ def test_dampers_between_branches_are_explicit():
     """D has the sparsity of M: a formula whose D has all entries is not MuJoCo's."""
     model, states = branches()
     integrator = load_adapter("mujoco").integrator("implicit")
-    with patch.object(LinkTree, "_on_one_path", lambda self: np.ones((self.nv, self.nv), bool)):
+    with patch.object(StepCharts, "_on_one_path", lambda self: np.ones((self.nv, self.nv), bool)):
         assert disagreeing(judged(load_adapter("mujoco"), integrator, model, states))
-    with patch.object(LinkTree, "_standalone_columns", lambda _: []):
+    with patch.object(StepCharts, "_standalone_columns", lambda _: []):
         fast = load_adapter("mujoco").integrator("implicitfast")
         assert disagreeing(judged(load_adapter("mujoco"), fast, model, states))
 
@@ -369,7 +368,7 @@ def loop_subject(name):
 def test_accelerations_of_loops_equal_the_certified_ones(name):
     """At the closed states, where a correction of gaps acts on what rounding leaves open only."""
     model, states = loop_subject(name)
-    links = ClosedTree(model, JointSpaceMethod("Runge-Kutta", "joint rotations"), states)
+    links = StepCharts(model, JointSpaceMethod("Runge-Kutta", "joint rotations"), states)
     found = links.body_accelerations()
     for i, state in enumerate(states):
         true = certify_state(model, state).quantities
@@ -383,7 +382,7 @@ def test_accelerations_of_generic_loops_equal_the_certified_ones():
     """A loop in space, on any joints and with elements, whose rows do not depend on others."""
     model, state = random_loop_mechanism(3, 6, ("universal",), elements=ELEMENTS)
     true = certify_state(model, state).quantities
-    (found,), _ = ClosedTree(
+    (found,), _ = StepCharts(
         model, JointSpaceMethod("Runge-Kutta", "joint rotations", free_coordinates="rigid motion"), [state]
     ).body_accelerations()
     scale = np.max(np.abs(true.acceleration))

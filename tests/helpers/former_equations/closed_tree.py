@@ -27,7 +27,7 @@ from plumbline.model.kinematics import (
 )
 from plumbline.model.loops import cut_open
 from plumbline.model.step_methods import JointSpaceMethod
-from plumbline.truth.link_tree import (
+from tests.helpers.former_equations.link_tree import (
     BERNOULLI,
     Array,
     LinkStates,

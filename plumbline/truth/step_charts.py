@@ -1,0 +1,687 @@
+"""Coordinates of the declared steps of a mechanism, in extended precision, and accelerations in them.
+
+A joint's coordinates q and velocities v, from the far body on: of a rod its turn, a quaternion against the
+far body with the relative angular velocity in the rod's own frame; of a body on a rod or a ball the same
+against the rod or the far body; the numbers of the other joints.  A free body has r and ṙ in the world before
+its turn, or a rigid motion with the twist in its own frame.  Turns of "joint angles" are angles about two or
+three axes.  The accelerations are those of `plumbline.equations.tree`.
+
+Cut open, the ends b and c of a loop are two parts of one body.  With the twists V, about the world's origin,
+
+    V̇_b − V̇_c = −(V_b − V_c) × V_c − 2 a (V_b − V_c) + a² log(b⁻¹ c)
+
+in the frame of b, with the correction of gaps a that the method declares.  The forces λ of rows that depend
+on others are not unique, v̇ is: proximal iterations find it.
+
+Arrays have leading axes ``...`` for many states at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from itertools import islice
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plumbline.equations.arithmetic import floats
+from plumbline.equations.tree import Solution, Tree
+from plumbline.model.datatypes import KINDS, Model, State
+from plumbline.model.kinematics import (
+    cross,
+    cross_matrix,
+    quaternion_conjugate,
+    quaternion_exponential,
+    quaternion_product,
+    rotate_vectors,
+    rotation_matrix,
+    rotation_vector,
+    turn_of_z,
+)
+from plumbline.model.loops import cut_open
+from plumbline.model.step_methods import JointSpaceMethod
+
+Array = NDArray[Any]  # in this module of extended precision, where nothing else is stated
+LongDouble: Any = np.longdouble
+Forces = Literal["all", "applied", "joint dampers"]
+UNIT: Array = np.array([1, 0, 0, 0], LongDouble)
+PROXIMAL_DAMPING = LongDouble(1e-10)  # of rows scaled to a unit diagonal of J M⁻¹ Jᵀ
+PROXIMAL_STEPS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class BodyStates:
+    """Motion of the bodies, extended precision; leading axes as in the coordinates it was made from."""
+
+    r: Array  # (..., N, 3) m, world
+    p: Array  # (..., N, 4) unit quaternions
+    v: Array  # (..., N, 3) m/s, world
+    omega: Array  # (..., N, 3) rad/s, body frame
+    u: Array  # (..., N, 3) directions of the rods, world; zero for other joints
+    udot: Array  # (..., N, 3) 1/s
+    x: Array  # (..., N, 2) rad or m, coordinates of the other joints
+    xdot: Array  # (..., N, 2)
+
+
+@dataclass(frozen=True, eq=False)
+class _Chart:
+    """Coordinates of a rod or of the rest of a joint."""
+
+    q: Array  # (B, ·) at the states
+    v: Array  # (B, size)
+    is_group: bool = False  # a quaternion comes first in q, and a turn last in v
+    is_point: bool = False  # of a free body
+    axes: tuple[Array, ...] = ()  # (B, 3) of angles, in the frame before
+    rest: Array = field(default_factory=lambda: UNIT)  # attitude in that frame at angles of 0
+
+
+class StepCharts:
+    """Coordinates and accelerations of a mechanism; q is a list over the charts, v is (..., nv)."""
+
+    is_new_step = True  # for formulas that keep accelerations from step to step
+
+    def __init__(
+        self, model: Model, method: JointSpaceMethod, states: Sequence[State],
+        angle_axes: Sequence[Array | None] = (),
+    ) -> None:  # fmt: skip
+        """Set up the charts.
+
+        Args:
+            states: B states, of loops closed or nearly.
+            angle_axes: for "joint angles", the axes (angles, 3) of the turns of balls and rods at each state.
+
+        """
+        self.cut = cut_open(model) if model.has_loops else None
+        if self.cut:
+            model, states = self.cut.model, [self.cut.state(state) for state in states]
+        self.model, self.method, self.ends = model, method, self.cut.ends if self.cut else ()
+        self.state = s = State(
+            **{name: np.array([getattr(x, name) for x in states], LongDouble) for name in vars(states[0])}
+        )
+        u = _unit(np.where(model.rods[:, None], s.u, UNIT[:3]))
+        attitudes, rods = _unit(s.p), _unit(turn_of_z(u))
+        spins, rod_spins = rotate_vectors(rotation_matrix(attitudes), s.omega), cross(s.u, s.udot)
+        axes = np.array([a for a in angle_axes if a is not None], LongDouble).reshape(len(u), -1, 3)
+        rest = iter(np.moveaxis(axes, 1, 0) if method.coordinates == "joint angles" else ())
+        self.charts: list[_Chart] = []
+        self.of_body: list[int] = []
+        self.of_rod: dict[int, int] = {}
+        for k, name in enumerate(model.kind):
+            kind, far = KINDS[name], int(model.body[k, 0])
+            before, w = np.tile(UNIT, (len(u), 1)), np.zeros_like(u[:, 0])
+            if far >= 0:
+                before, w = attitudes[:, far], spins[:, far]
+            if kind.holds_distance:
+                self.of_rod[k] = len(self.charts)
+                w = self._add_turn(before, rods[:, k], w, rod_spins[:, k], [*islice(rest, 2)], u[:, k])
+                before = rods[:, k]
+            self.of_body.append(len(self.charts))
+            if kind.has_attitude:
+                point = (s.r[:, k], s.v[:, k]) if kind.holds_nothing else None
+                own = attitudes[:, k], w, spins[:, k], [*islice(rest, 3)]
+                self._add_turn(before, *own, point=point)
+            else:
+                count = len(kind.motions)
+                self.charts.append(_Chart(s.x[:, k, :count], s.xdot[:, k, :count]))
+        sizes = [chart.v.shape[1] for chart in self.charts]
+        self.own = [slice(end - size, end) for end, size in zip(np.cumsum(sizes), sizes, strict=True)]
+        self.nv = sum(sizes)
+        pairs = [*zip(self.own, self.charts, strict=True)]
+        places = [range(own.stop - 3, own.stop) for own, chart in pairs if chart.is_group]
+        self.turns = np.array(places, np.intp).reshape(-1, 3)  # places of ω among the velocities
+        self.rigid = [own for own, chart in pairs if self.is_rigid(chart)]
+
+    def _add_turn(
+        self, before: Array, here: Array, w_before: Array, w: Array, axes: list[Array],
+        rod: Array | None = None, point: tuple[Array, Array] | None = None,
+    ) -> Array:  # fmt: skip
+        """Add a turn, after the point of a free body; returns the angular velocity after it."""
+        relative = quaternion_product(quaternion_conjugate(before), here)
+        if axes:
+            # A rod has two angles: what it turns about itself is theirs, and acts on nothing.
+            found = _solve3(axes if rod is None else [*axes, rod], w - w_before)[:, : len(axes)]
+            q, v, back = [0 * found], [found], np.swapaxes(rotation_matrix(before), -1, -2)
+            turned = tuple(rotate_vectors(back, axis) for axis in axes)
+            if point is not None:
+                q, v = [point[0], *q], [point[1], *v]
+            chart = _Chart(_joined(q), _joined(v), False, point is not None, turned, relative)
+            self.charts.append(chart)
+            return w_before + sum(axis * found[:, i : i + 1] for i, axis in enumerate(axes))
+        back = np.swapaxes(rotation_matrix(here), -1, -2)
+        q, v = [relative], [rotate_vectors(back, w - w_before)]
+        if point is not None:
+            is_twist = self.method.free_coordinates == "rigid motion"
+            q, v = [*q, point[0]], [rotate_vectors(back, point[1]) if is_twist else point[1], *v]
+        self.charts.append(_Chart(_joined(q), _joined(v), True, point is not None))
+        return w
+
+    def is_rigid(self, chart: _Chart) -> bool:
+        """Whether coordinates are a rigid motion."""
+        return chart.is_group and chart.is_point and self.method.free_coordinates == "rigid motion"
+
+    # -- coordinates ---------------------------------------------------------------------------------
+
+    def start(self) -> tuple[list[Array], Array]:
+        """Return the coordinates of the states.
+
+        Returns:
+            q, a list over the charts, and v (B, nv).
+
+        """
+        return [chart.q for chart in self.charts], _joined([chart.v for chart in self.charts])
+
+    def move(self, q: list[Array], displacement: Array) -> list[Array]:
+        """Displace the coordinates.
+
+        Args:
+            displacement: (..., nv), chart by chart: rotation vectors, twists, numbers.
+
+        """
+        moved = []
+        for chart, own, at in zip(self.charts, self.own, q, strict=True):
+            change = displacement[..., own]
+            if not chart.is_group:
+                moved.append(at + change)
+                continue
+            turn, point = change[..., -3:], at[..., 4:]
+            if self.is_rigid(chart):
+                shift = rotate_vectors(_left_jacobian(turn), change[..., :3])
+                point = point + rotate_vectors(rotation_matrix(at[..., :4]), shift)
+            elif chart.is_point:
+                point = point + change[..., :3]
+            moved.append(_joined([self._turned(at[..., :4], turn), point]))
+        return moved
+
+    def _turned(self, q: Array, turn: Array) -> Array:
+        if self.method.is_rotation_exact:
+            return quaternion_product(q, quaternion_exponential(turn / 2))
+        return _unit(quaternion_product(q, np.concatenate([np.ones_like(turn[..., :1]), turn / 2], -1)))
+
+    def bracket(self, a: Array, b: Array) -> Array:
+        """Return the Lie bracket of displacements, chart by chart: a × b of rotations, 0 of numbers.
+
+        Args:
+            a: (..., nv).
+            b: (..., nv).
+
+        Returns:
+            (..., nv).
+
+        """
+        found = np.zeros(np.broadcast_shapes(a.shape, b.shape), LongDouble)
+        found[..., self.turns] = cross(a[..., self.turns], b[..., self.turns])
+        for own in self.rigid:
+            x, y = a[..., own], b[..., own]
+            shift = cross(x[..., 3:], y[..., :3]) + cross(x[..., :3], y[..., 3:])
+            found[..., own.start : own.start + 3] = shift
+        return found
+
+    def displacement_rate(self, theta: Array, v: Array) -> Array:
+        """Apply dexp⁻¹(θ) v = Σ Bₖ/k! adₖ(θ) v of displacements on the right (B₁ = ½).
+
+        Args:
+            theta: (..., nv), turns of less than 2 rad.
+            v: (..., nv).
+
+        Returns:
+            θ̇ (..., nv).
+
+        """
+        if not len(self.turns):
+            return v
+        terms = self.method.correction_terms
+        once = self.bracket(theta, v)
+        total, power = v + (terms is None or terms > 0) * once / 2, once
+        if terms is not None and terms < 2:
+            return total
+        for weight in BERNOULLI[: None if terms is None else 1]:
+            power = self.bracket(theta, power)
+            total, power = total + weight * power, self.bracket(theta, power)
+        return total
+
+    # -- accelerations -------------------------------------------------------------------------------
+
+    def acceleration(self, q: list[Array], v: Array) -> Array:
+        """Return v̇.
+
+        Args:
+            v: (..., nv).
+
+        Returns:
+            (..., nv).
+
+        """
+        return self._solved(q, v)[0]
+
+    def damped_acceleration(self, q: list[Array], v: Array, h: Array, forces: Forces) -> Array:
+        """Return (M + h D)⁻¹ M v̇ with D = −∂(M v̇)/∂v of some of the forces, in the sparsity of M.
+
+        In "applied" forces, free bodies on which nothing moves have the derivatives of all.
+
+        Args:
+            v: (B, nv).
+            h: (B, 1) [s].
+
+        Returns:
+            (B, nv).
+
+        """
+        own = self._standalone_columns() if forces == "applied" else []
+        factor = LongDouble(self.method.damping_factor)
+        if forces == "joint dampers":  # as rotors of inertia h c
+            added = factor * h[..., None] * self.model.damping
+            damped = replace(self.model, armature=self.model.armature + added)
+            return self._solved(q, v, damped)[0]
+        if forces == "applied" and not own and not self.model.is_dissipative:
+            return self.acceleration(q, v)
+        M, D = self._mass_matrix(q), np.zeros((*v.shape, self.nv), LongDouble)
+        if forces == "all" or self.model.is_dissipative:
+            D = self._damping(q, v, M, forces)
+        if own:
+            D[..., own, :] = 0
+            D[..., np.array(own)[:, None], own] = self._damping(q, v, M, "all")[
+                ..., np.array(own)[:, None], own
+            ]
+        D = factor * np.where(self._on_one_path(), D, 0)
+        if self.method.is_damping_symmetric:
+            D = (D + np.swapaxes(D, -1, -2)) / 2
+        return solve_definite(M + h[..., None] * D, rotate_vectors(M, self.acceleration(q, v)))
+
+    def _solved(
+        self, q: list[Array], v: Array, damped: Model | None = None
+    ) -> tuple[Array, Solution, _MovingTree]:
+        """v̇ with the loops closed; ``damped`` has further rotors."""
+        tree = _MovingTree(self, q, v)
+        wrenches = tree.closing_wrenches(self.ends)
+        found = tree.solve(wrenches)
+        shares = tree.closing_shares(self.ends, found) if self.ends else None
+        if damped is not None:
+            found = _MovingTree(self, q, v, damped).solve(wrenches)
+        if shares is not None:
+            found = found.combined(lambda x: x @ shares)
+        return tree.velocity_rates(found), found, tree
+
+    def _damping(self, q: list[Array], v: Array, M: Array, forces: Forces) -> Array:
+        """−∂(M v̇)/∂v (B, nv, nv); M v̇ is quadratic in v: a central difference of any size is exact."""
+        units, found = np.eye(self.nv, dtype=LongDouble)[:, None], np.zeros((), LongDouble)
+        parts = ("drag_force", "drag_moment", "damping", "spring_damping")
+        undamped = replace(self.model, **{name: 0 * getattr(self.model, name) for name in parts})
+        for model, sign in ((self.model, 1), (undamped, -1))[: 1 + (forces == "applied")]:
+            before, after = (
+                (tree := _MovingTree(self, q, v + side * units, model)).velocity_rates(tree.solve())
+                for side in (-1, 1)
+            )
+            found = found + sign * (before - after) / 2
+        return np.asarray(M @ np.moveaxis(found, 0, -1))
+
+    def _mass_matrix(self, q: list[Array]) -> Array:
+        """M (B, nv, nv), by the velocities that each rate alone gives the bodies; rotors included."""
+        tree, model = _MovingTree(self, q, np.eye(self.nv, dtype=LongDouble)[:, None]), self.model
+        M = np.zeros((len(q[0]), self.nv, self.nv), LongDouble)
+        for k in range(model.n):
+            v, w = (np.broadcast_to(x, (self.nv, *M.shape[:1], 3, 1)) for x in (tree.v[k], tree.w[k]))
+            spin = tree.num.mul(tree.A[k].mT, w)
+            parts = [(v, v * LongDouble(model.mass[k])), (spin, tree.num.mul(tree.inertia(k), spin))]
+            if k in self.of_rod:
+                about = tree.rod_spin(k)
+                parts.append((about, about * self.axial_inertia(k)))
+            for x, y in parts:
+                a, b = (np.moveaxis(z[..., 0], 0, 1) for z in (x, y))
+                M += a @ b.mT
+            if np.any(model.armature[k]):
+                places = range(*self.own[self.of_body[k]].indices(self.nv))
+                of_all = KINDS[model.kind[k]].has_attitude
+                for i, place in enumerate(places):
+                    M[..., place, place] += LongDouble(model.armature[k, 0 if of_all else i])
+        return M
+
+    def axial_inertia(self, k: int) -> Any:
+        """Return the inertia of rod k about itself, of which only relative rotations take account."""
+        if self.method.coordinates == "joint angles":
+            return LongDouble(0)
+        return LongDouble(self.method.rod_axial_inertia) * np.trace(self.model.inertia[k].astype(LongDouble))
+
+    def _on_one_path(self) -> Array:
+        """(nv, nv) whether a branch of the tree has both coordinates: the sparsity of M."""
+        found, paths = np.zeros((self.nv, self.nv), bool), list[list[int]]()
+        for k, far in enumerate(self.model.body[:, 0]):
+            path = [*(paths[far] if far >= 0 else [])]
+            for chart in (*((self.of_rod[k],) if k in self.of_rod else ()), self.of_body[k]):
+                path += range(*self.own[chart].indices(self.nv))
+                found[self.own[chart], path] = True
+            paths.append(path)
+        return found | found.T
+
+    def _standalone_columns(self) -> list[int]:
+        """Columns of free bodies with nothing on them but welded bodies."""
+        related, found = self._on_one_path(), list[int]()
+        for own, chart in zip(self.own, self.charts, strict=True):
+            if chart.is_point and np.sum(related[own.start]) == own.stop - own.start:
+                found += range(own.start, own.stop)
+        return found
+
+    # -- bodies --------------------------------------------------------------------------------------
+
+    def quaternions(self, q: list[Array]) -> tuple[list[Array], dict[int, Array]]:
+        """Compute attitudes.
+
+        Returns:
+            (..., 4) of the bodies, and of the rods by joint.
+
+        """
+        bodies, rods = list[Array](), dict[int, Array]()
+        for k, name in enumerate(self.model.kind):
+            far, own = int(self.model.body[k, 0]), q[self.of_body[k]]
+            here = bodies[far] if far >= 0 else UNIT
+            if k in self.of_rod:
+                at = self.of_rod[k]
+                here = rods[k] = _turned_by(here, self.charts[at], q[at])
+            if KINDS[name].has_attitude:
+                here = _turned_by(here, self.charts[self.of_body[k]], own)
+            else:
+                first, last = _unit(self.model.turn[k].astype(LongDouble))
+                here = quaternion_product(here, first)
+                for i, (what, axis) in enumerate(KINDS[name].motions):
+                    if what == "turn":
+                        half = np.eye(3, dtype=LongDouble)[axis] * own[..., i : i + 1] / 2
+                        here = quaternion_product(here, quaternion_exponential(half))
+                here = quaternion_product(here, quaternion_conjugate(last))
+            bodies.append(np.broadcast_to(here, (*own.shape[:-1], 4)))
+        return bodies, rods
+
+    def bodies(self, q: list[Array], v: Array) -> BodyStates:
+        """Return the motion of the mechanism's bodies.
+
+        Args:
+            v: (B, nv).
+
+        Returns:
+            Positions, attitudes, rates, and coordinates of joints.
+
+        """
+        tree, n = _MovingTree(self, q, v), self.model.n
+        lead = v.shape[:-1]
+        omega = [A.mT @ w for A, w in zip(tree.A, tree.w, strict=True)]
+        r, velocity, omega_ = (_stacked(x, lead) for x in (tree.r, tree.v, omega))
+        u, udot, x, xdot = (np.zeros((*lead, n, size), LongDouble) for size in (3, 3, 2, 2))
+        for k, (chart, name) in enumerate(zip(self.of_body, self.model.kind, strict=True)):
+            if k in self.of_rod:
+                u[..., k, :], udot[..., k, :] = (part[..., 0] for part in tree.rod_direction(k))
+            if count := len(KINDS[name].motions):
+                x[..., k, :count], xdot[..., k, :count] = q[chart], v[..., self.own[chart]]
+        found = BodyStates(r, np.stack(tree.p, -2), velocity, omega_, u, udot, x, xdot)
+        if not self.cut:
+            return found
+        place = self.cut.place[: self.cut.source.n]
+        return BodyStates(*(getattr(found, one.name)[..., place, :] for one in fields(found)))
+
+    def body_accelerations(self) -> tuple[Array, Array]:
+        """Return r̈ (B, N, 3), world axes, and ω̇′ (B, N, 3), body axes, at the states.
+
+        Returns:
+            Both [m/s², rad/s²].
+
+        """
+        q, v = self.start()
+        _, found, tree = self._solved(q, v)
+        turning = [A.mT @ alpha for A, alpha in zip(tree.A, found.turning, strict=True)]
+        place = self.cut.place[: self.cut.source.n] if self.cut else slice(None)
+        linear, angular = (_stacked(x, v.shape[:-1])[..., place, :] for x in (found.acceleration, turning))
+        return linear, angular
+
+
+class _MovingTree(Tree):
+    """The mechanism at coordinates of its charts: scalars are (..., 1, 1), vectors (..., 3, 1)."""
+
+    def __init__(self, charts: StepCharts, q: list[Array], v: Array, model: Model | None = None) -> None:
+        self.charts, self.q = charts, q
+        self.rates = [v[..., own] for own in charts.own]
+        self.p, self.rod_p = charts.quaternions(q)
+        self.rod_w: dict[int, Array] = {}
+        self.rods: dict[int, tuple[Array, Array]] = {}  # u and u̇
+        self.axes: dict[int, tuple[list[Array], Array]] = {}  # by chart: of its angles; α at q̈ = 0 of them
+        super().__init__(floats(LongDouble), model or charts.model, charts.state)
+
+    def coordinate(self, k: int, i: int) -> tuple[Any, Any]:
+        at = self.charts.of_body[k]
+        return self.q[at][..., i, None, None], self.rates[at][..., i, None, None]
+
+    def attitude(self, k: int) -> tuple[Any, Any]:
+        w = self.w[self.far[k]] if self.far[k] >= 0 else self.zero
+        before = self.p[self.far[k]] if self.far[k] >= 0 else UNIT
+        if k in self.charts.of_rod:
+            w = self.rod_w[k] = self._spin_after(self.charts.of_rod[k], before, self.rod_p[k], w)
+            before = self.rod_p[k]
+            u = rotation_matrix(before)[..., 2:]
+            self.rods[k] = u, self.num.cross(w, u)
+        return rotation_matrix(self.p[k]), self._spin_after(self.charts.of_body[k], before, self.p[k], w)
+
+    def _spin_after(self, at: int, before: Array, here: Array, w: Array) -> Array:
+        """The angular velocity after a turn, w before it."""
+        chart, rates = self.charts.charts[at], self.rates[at]
+        if not chart.axes:
+            return w + rotation_matrix(here) @ rates[..., -3:, None]
+        turned, bias, count = list[Array](), self.zero, len(chart.axes)
+        for i, axis in enumerate(chart.axes):
+            angle, rate = self.q[at][..., i - count, None], rates[..., i - count, None, None]
+            turned.append(rotation_matrix(before) @ axis[..., None])
+            bias = bias + self.num.cross(w, turned[-1]) * rate
+            w = w + turned[-1] * rate
+            before = quaternion_product(before, quaternion_exponential(axis * angle / 2))
+        self.axes[at] = turned, bias
+        return w
+
+    def free_point(self, k: int) -> tuple[Any, Any]:
+        at = self.charts.of_body[k]
+        chart, r, v = self.charts.charts[at], self.q[at][..., :3], self.rates[at][..., :3, None]
+        if not chart.axes:
+            r = self.q[at][..., 4:]
+        return r[..., None], rotation_matrix(self.p[k]) @ v if self.charts.is_rigid(chart) else v
+
+    def rod_direction(self, k: int) -> tuple[Any, Any]:
+        return self.rods[k]
+
+    def rod_spin(self, k: int) -> Any:
+        """The rod's angular velocity about itself."""
+        return self.num.dot(self.rods[k][0], self.rod_w[k])
+
+    def force_across(self, k: int) -> Any:
+        """What turns the angular momentum J σ u of rod k: F ⟂ u with −ℓ u × F = J σ u̇."""
+        momentum = self.rod_spin(k) * self.charts.axial_inertia(k)
+        u, udot = self.rods[k]
+        return self.num.cross(u, udot) * (momentum / LongDouble(self.model.length[k]))
+
+    def velocity_rates(self, found: Solution) -> Array:
+        """Return v̇ (..., nv) of accelerations."""
+        out: list[Array] = []
+        for k, name in enumerate(self.model.kind):
+            kind, far = KINDS[name], self.far[k]
+            own, w, alpha = self.charts.of_body[k], self.zero, self.zero
+            if far >= 0:
+                w, alpha = self.w[far], found.turning[far]
+            if not kind.has_attitude:
+                out += [rate[..., 0] for rate in found.rates[k]]
+                continue
+            if kind.holds_distance:
+                u, udot = self.rods[k]
+                bend = found.rates[k][0] / LongDouble(self.model.length[k])  # ü
+                wanted = self.num.cross(u, bend) + udot * self.rod_spin(k)
+                rates, alpha_rod = self._rates_of_turn(
+                    self.charts.of_rod[k], self.rod_p[k], (w, self.rod_w[k]), (alpha, wanted), u
+                )
+                out.append(rates)
+                w, alpha = self.rod_w[k], alpha_rod
+            if kind.holds_nothing:
+                shift = found.acceleration[k]
+                if self.charts.is_rigid(self.charts.charts[own]):
+                    shift = self.A[k].mT @ (shift - self.num.cross(self.w[k], self.v[k]))
+                out.append(shift[..., 0])
+            out.append(self._rates_of_turn(own, self.p[k], (w, self.w[k]), (alpha, found.turning[k]))[0])
+        return _joined(out)
+
+    def _rates_of_turn(
+        self, at: int, here: Array, w: tuple[Array, Array], alpha: tuple[Array, Array], rod: Any = None
+    ) -> tuple[Array, Array]:
+        """Rates (..., 2 or 3) of a turn's velocities by w and α before and after it, and that α after it.
+
+        A rod's α along itself is what its angles make it.
+        """
+        if at not in self.axes:
+            gained = alpha[1] - alpha[0] - self.num.cross(w[1], w[1] - w[0])
+            return (rotation_matrix(here).mT @ gained)[..., 0], alpha[1]
+        turned, bias = self.axes[at]
+        three = [x[..., 0] for x in (*turned, *(() if rod is None else (rod,)))]
+        rates = _solve3(three, (alpha[1] - alpha[0] - bias)[..., 0])[..., : len(turned)]
+        after = alpha[0] + bias + sum(a * rates[..., i, None, None] for i, a in enumerate(turned))
+        return rates, after
+
+    def closing_wrenches(self, ends: Sequence[tuple[int, int]]) -> list[Mapping[int, tuple[Any, Any]]]:
+        """Moments about and forces along the axes of each end b, at its centre, and against them on c."""
+        found: list[Mapping[int, tuple[Any, Any]]] = []
+        for b, c in ends:
+            lever = self.r[b] - self.r[c]
+            axes = [self.A[b][..., i : i + 1] for i in range(3)]
+            found += [{b: (self.zero, e), c: (self.zero, -e)} for e in axes]
+            found += [{b: (e, self.zero), c: (-e, -self.num.cross(lever, e))} for e in axes]
+        return found
+
+    def closing_shares(self, ends: Sequence[tuple[int, int]], found: Solution) -> Array:
+        """Compute 1 and the λ (..., 1 + 6 L, 1) of the wrenches that hold the loops closed."""
+        num, a = self.num, LongDouble(self.charts.method.gap_correction)
+        answers, lead = list[Array](), self.rates[0].shape[:-1]
+        for b, c in ends:
+            back, here = self.A[b].mT, self.r[b]
+            twist, change = list[Array](), list[Array]()
+            for k in (b, c):
+                w, v, at, A, alpha = (
+                    np.broadcast_to(x[k], (*lead, *x[k].shape[-2:]))
+                    for x in (self.w, self.v, self.r, found.acceleration, found.turning)
+                )
+                twist.append(np.concatenate([w, v - num.cross(w, at)], -2)[..., 0])
+                carried = num.widened(num.cross(w, v), A)
+                change.append(np.concatenate([alpha, A + num.mul(num.cross_matrix(at), alpha) - carried], -2))
+            apart = twist[0] - twist[1]
+            turn = rotation_vector(quaternion_product(quaternion_conjugate(self.p[b]), self.p[c]))
+            gap = np.concatenate([turn, _log_shift(turn, (back @ (self.r[c] - here))[..., 0])], -1)
+            wanted = (-_twist_cross(apart, twist[1]) - 2 * a * apart)[..., None]
+            missing = change[0] - change[1]
+            missing = np.concatenate([missing[..., :1] - wanted, missing[..., 1:]], -1)
+            moving = missing[..., 3:, :] - num.mul(num.cross_matrix(here), missing[..., :3, :])
+            rows = np.concatenate([back @ missing[..., :3, :], back @ moving], -2)
+            rows[..., 0] -= a * a * gap
+            answers.append(rows)
+        rows = np.concatenate(answers, -2)
+        K, missing = rows[..., 1:], -rows[..., 0]
+        size = np.einsum("...ii->...i", K)
+        # a row that is 0, as those out of a plane, is met anyway
+        scale = 1 / np.sqrt(np.maximum(size, LongDouble(1e-30) * np.max(size, -1, keepdims=True)))
+        K, missing = K * scale[..., None] * scale[..., None, :], missing * scale
+        unit = np.eye(K.shape[-1], dtype=LongDouble)
+        damped = (K + PROXIMAL_DAMPING * unit)[..., None, :, :]
+        inverse = solve_definite(damped, np.broadcast_to(unit, K.shape))
+        push = np.zeros_like(missing)
+        for _ in range(PROXIMAL_STEPS):
+            push = push + rotate_vectors(inverse, missing - rotate_vectors(K, push))
+        return np.concatenate([np.ones_like(push[..., :1]), scale * push], -1)[..., None]
+
+
+# Bₖ/k! of even k from 2 on: 1/12, −1/720, …
+BERNOULLI = [
+    LongDouble(a) / b
+    for a, b in (
+        (1, 12), (-1, 720), (1, 30240), (-1, 1209600), (1, 47900160), (-691, 1307674368000),
+        (1, 74724249600), (-3617, 10670622842880000),
+    )
+]  # fmt: skip
+
+
+# -- algebra in extended precision -------------------------------------------------------------------
+
+
+def _stacked(vectors: Sequence[Array], lead: tuple[int, ...]) -> Array:
+    """(..., N, 3) of a list of (..., 3, 1)."""
+    return np.stack([np.broadcast_to(x[..., 0], (*lead, 3)) for x in vectors], -2)
+
+
+def _joined(parts: Sequence[Array]) -> Array:
+    """(..., Σ ·) of (..., ·)."""
+    lead = np.broadcast_shapes(*(x.shape[:-1] for x in parts))
+    return np.concatenate([np.broadcast_to(x, (*lead, x.shape[-1])) for x in parts], -1)
+
+
+def _turned_by(before: Array, chart: _Chart, q: Array) -> Array:
+    """The attitude (..., 4) after a turn."""
+    if not chart.axes:
+        return quaternion_product(before, q[..., :4])
+    for i, axis in enumerate(chart.axes):
+        half = axis * q[..., i - len(chart.axes), None] / 2
+        before = quaternion_product(before, quaternion_exponential(half))
+    return quaternion_product(before, chart.rest)
+
+
+def _twist_cross(a: Array, b: Array) -> Array:
+    """Rate of a twist b (..., 6) that is carried by the twist a."""
+    w, v = a[..., :3], a[..., 3:]
+    return np.concatenate([cross(w, b[..., :3]), cross(w, b[..., 3:]) + cross(v, b[..., :3])], -1)
+
+
+def _log_shift(turn: Array, shift: Array) -> Array:
+    """The linear part of log of a pose: Σ Bₖ/k! (turn ×)ᵏ shift, B₁ = −½; turns of less than 2 rad."""
+    once = cross(turn, shift)
+    total, power = shift - once / 2, once
+    for weight in BERNOULLI:
+        power = cross(turn, power)
+        total, power = total + weight * power, cross(turn, power)
+    return total
+
+
+def _left_jacobian(t: Array) -> Array:
+    """V (..., 3, 3) with exp(twist) = (exp(t), V ρ): 1 + (1 − cos θ)/θ² t̃ + (θ − sin θ)/θ³ t̃²."""
+    square = np.sum(t * t, -1)[..., None, None]
+    angle, small = np.sqrt(square), square < 1e-4
+    safe = np.where(small, LongDouble(1), angle)
+    first = np.where(
+        small, 0.5 - square / 24 + square**2 / 720 - square**3 / 40320, (1 - np.cos(safe)) / safe**2
+    )
+    sixth = LongDouble(1) / 6
+    second = np.where(
+        small, sixth - square / 120 + square**2 / 5040 - square**3 / 362880, (safe - np.sin(safe)) / safe**3
+    )
+    skew = cross_matrix(t)
+    return np.asarray(np.eye(3, dtype=LongDouble) + first * skew + second * (skew @ skew))
+
+
+def _unit(x: Array) -> Array:
+    return np.asarray(x / np.sqrt(np.sum(x * x, -1, keepdims=True)))
+
+
+def solve_definite(S: Array, b: Array) -> Array:
+    """Solve S x = b without pivoting.
+
+    Args:
+        S: (..., n, n), its symmetric part positive definite.
+        b: (..., n).
+
+    Returns:
+        x (..., n).
+
+    """
+    S, b = S.copy(), b.copy()
+    n = S.shape[-1]
+    for k in range(n - 1):
+        factor = S[..., k + 1 :, k] / S[..., k, k, None]
+        S[..., k + 1 :, k + 1 :] -= factor[..., None] * S[..., k, None, k + 1 :]
+        b[..., k + 1 :] -= factor * b[..., k, None]
+    for k in reversed(range(n)):
+        b[..., k] = (b[..., k] - np.sum(S[..., k, k + 1 :] * b[..., k + 1 :], -1)) / S[..., k, k]
+    return b
+
+
+def _solve3(three: Sequence[Array], x: Array) -> Array:
+    """Coefficients (..., 3) of x in three vectors: Cramer's rule."""
+    a, b, c = three
+    bc = cross(b, c)
+    parts = [np.sum(x * bc, -1), np.sum(x * cross(c, a), -1), np.sum(x * cross(a, b), -1)]
+    return np.asarray(np.stack(parts, -1) / np.sum(a * bc, -1)[..., None])
